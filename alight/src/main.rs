@@ -1,0 +1,2 @@
+//! Lands a UAV on a printed marker.
+fn main() {}

@@ -1,0 +1,1 @@
+//! Marker detections in, velocity setpoints out.

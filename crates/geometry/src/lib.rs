@@ -1,0 +1,18 @@
+//! Coordinate frames as types, rigid transforms, and camera models.
+//!
+//! A number that is a place says in its type where it is measured: `Point<Camera>` cannot be added to a
+//! `Vector<Ned>`. Transforms are named `to_from_from` and compose like fractions:
+//! `ned_from_body * body_from_camera * point_in_camera`.
+//!
+//! This crate knows no image, no marker, no clock and no file.
+//!
+//! Modules in reading order: [`frame`] names the coordinate frames, [`transform`] moves between them,
+//! [`camera`] goes from the camera frame to pixels and back.
+
+pub mod camera;
+pub mod frame;
+pub mod transform;
+
+pub use camera::{CameraModel, Distortion, Pixel};
+pub use frame::{Body, Camera, Frame, Marker, Ned, Pad};
+pub use transform::{Point, Rotation, Transform, Vector};

@@ -1,0 +1,208 @@
+//! Grey images: borrowed views and owned buffers, 8 bits a pixel.
+
+/// Why bytes are not an image.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum ViewError {
+    /// An image without pixels, or wider or higher than [`GrayView::LARGEST_EDGE_PX`].
+    Size {
+        /// Stated width in pixels.
+        width: usize,
+        /// Stated height in pixels.
+        height: usize,
+    },
+    /// Rows that are shorter than the image is wide.
+    Stride {
+        /// Stated width in pixels.
+        width: usize,
+        /// Stated bytes from row to row.
+        stride: usize,
+    },
+    /// Fewer bytes than the size asks for.
+    Length {
+        /// Bytes there are.
+        len: usize,
+        /// Bytes the size asks for.
+        needed: usize,
+    },
+}
+
+impl std::fmt::Display for ViewError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let largest = GrayView::LARGEST_EDGE_PX;
+        match *self {
+            Self::Size { width, height } => {
+                write!(
+                    f,
+                    "an image of {width} x {height} pixels; each edge must be from 1 to {largest}"
+                )
+            }
+            Self::Stride { width, stride } => {
+                write!(f, "rows of {stride} bytes in an image {width} pixels wide")
+            }
+            Self::Length { len, needed } => {
+                write!(f, "{len} bytes of pixels where {needed} are needed")
+            }
+        }
+    }
+}
+
+impl std::error::Error for ViewError {}
+
+/// A borrowed 8-bit grey image. Row 0 is at the top.
+#[derive(Copy, Clone, Debug)]
+pub struct GrayView<'a> {
+    data: &'a [u8],
+    width: usize,
+    height: usize,
+    stride: usize,
+}
+
+impl<'a> GrayView<'a> {
+    /// The largest width and height that are taken, in pixels.
+    pub const LARGEST_EDGE_PX: usize = 65_535;
+
+    /// A view of `width` x `height` pixels whose rows begin `stride` bytes apart.
+    ///
+    /// # Errors
+    /// [`ViewError`] when the size is nought or too large, or the bytes are too few for it.
+    pub fn new(
+        data: &'a [u8],
+        width: usize,
+        height: usize,
+        stride: usize,
+    ) -> Result<Self, ViewError> {
+        let in_range = |edge: usize| (1..=Self::LARGEST_EDGE_PX).contains(&edge);
+        if !in_range(width) || !in_range(height) {
+            return Err(ViewError::Size { width, height });
+        }
+        if stride < width {
+            return Err(ViewError::Stride { width, stride });
+        }
+        let needed = stride.saturating_mul(height - 1).saturating_add(width);
+        if data.len() < needed {
+            return Err(ViewError::Length { len: data.len(), needed });
+        }
+        Ok(Self { data, width, height, stride })
+    }
+
+    /// A view of pixels without gaps between the rows.
+    ///
+    /// # Errors
+    /// As [`GrayView::new`].
+    pub fn packed(data: &'a [u8], width: usize, height: usize) -> Result<Self, ViewError> {
+        Self::new(data, width, height, width)
+    }
+
+    /// Width in pixels.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height in pixels.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// The pixels of row `y`.
+    ///
+    /// # Panics
+    /// When `y` is not below the height, as a slice does.
+    pub fn row(&self, y: usize) -> &'a [u8] {
+        assert!(y < self.height, "row {y} of an image {} rows high", self.height);
+        &self.data[y * self.stride..][..self.width]
+    }
+
+    /// The pixel at column `x` of row `y`.
+    ///
+    /// # Panics
+    /// When the place lies outside the image, as a slice does.
+    pub fn at(&self, x: usize, y: usize) -> u8 {
+        self.row(y)[x]
+    }
+}
+
+/// An owned 8-bit grey image without gaps between the rows; a buffer that is used again grows only when needed.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct GrayImage {
+    data: Vec<u8>,
+    width: usize,
+    height: usize,
+}
+
+impl GrayImage {
+    /// An image of `width` x `height` pixels, all of value `value`.
+    pub fn filled(width: usize, height: usize, value: u8) -> Self {
+        Self { data: vec![value; width * height], width, height }
+    }
+
+    /// Takes the size of another image; the pixels' values are then of no meaning.
+    pub fn resize(&mut self, width: usize, height: usize) {
+        self.data.resize(width * height, 0);
+        (self.width, self.height) = (width, height);
+    }
+
+    /// Width in pixels.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height in pixels.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// All pixels, row by row.
+    pub fn pixels(&self) -> &[u8] {
+        &self.data
+    }
+
+    /// All pixels, row by row, to be written.
+    pub fn pixels_mut(&mut self) -> &mut [u8] {
+        &mut self.data
+    }
+
+    /// The pixels of row `y`.
+    pub fn row(&self, y: usize) -> &[u8] {
+        &self.data[y * self.width..][..self.width]
+    }
+
+    /// The pixels of row `y`, to be written.
+    pub fn row_mut(&mut self, y: usize) -> &mut [u8] {
+        &mut self.data[y * self.width..][..self.width]
+    }
+
+    /// The image, borrowed; `None` while it has no pixels.
+    pub fn view(&self) -> Option<GrayView<'_>> {
+        GrayView::packed(&self.data, self.width, self.height).ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn impossible_images_are_refused() {
+        let check = |len: usize, size: (usize, usize), stride, expected| {
+            let data = vec![0; len];
+            assert_eq!(GrayView::new(&data, size.0, size.1, stride).map(|v| v.width()), expected);
+        };
+        check(0, (0, 0), 0, Err(ViewError::Size { width: 0, height: 0 }));
+        check(1, (1, 1), 1, Ok(1));
+        check(9, (5, 2), 4, Err(ViewError::Stride { width: 5, stride: 4 }));
+        check(9, (5, 2), 5, Err(ViewError::Length { len: 9, needed: 10 }));
+        check(9, (65_536, 1), 65_536, Err(ViewError::Size { width: 65_536, height: 1 }));
+        check(
+            9,
+            (65_535, 65_535),
+            usize::MAX,
+            Err(ViewError::Length { len: 9, needed: usize::MAX }),
+        );
+    }
+
+    #[test]
+    fn a_view_with_a_stride_skips_what_lies_between_the_rows() {
+        let view = GrayView::new(&[1, 2, 9, 3, 4], 2, 2, 3).unwrap();
+        assert_eq!((view.row(0), view.row(1)), (&[1, 2][..], &[3, 4][..]));
+    }
+}

@@ -1,0 +1,1 @@
+//! The landing decision, a pure function of time and events.

@@ -1,0 +1,1 @@
+//! What crosses a process: types, the topic table, the codec.

@@ -1,0 +1,1 @@
+//! What every service needs: configuration, session, presence, typed topics, shutdown.

@@ -1,0 +1,1 @@
+//! Frames in, marker detections out.

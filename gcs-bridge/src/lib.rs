@@ -1,0 +1,1 @@
+//! Topics to and from the ground station.
