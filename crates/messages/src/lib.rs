@@ -1,1 +1,28 @@
-//! What crosses a process: types, the topic table, the codec.
+//! What crosses a process: types, the topic table, and the codec.
+//!
+//! Wire types are plain data. They say nothing of what is done with them, and this crate knows no Zenoh, no
+//! clock and no algorithm. Units are in the fields' names; frames and pixel conventions are those of the
+//! `geometry` crate.
+//!
+//! Modules in reading order: [`topic`] is the table of everything that is published, [`codec`] turns it into
+//! bytes and back, and the others are the types by publisher.
+
+pub mod camera;
+pub mod codec;
+pub mod controller;
+pub mod detector;
+pub mod health;
+pub mod simulation;
+pub mod topic;
+pub mod vehicle;
+
+pub use camera::{CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3};
+pub use codec::{DecodeError, Message, decode, encode};
+pub use controller::{
+    Candidate, CommandReply, ControllerCommand, ControllerStatus, Setpoint, TargetEstimate,
+};
+pub use detector::{Detection, Detections, MarkerPose, StageTime};
+pub use health::{Count, Health, Latency, Rate};
+pub use simulation::{Touchdown, Truth, Wind};
+pub use topic::{Delivery, Row, TOPICS, Topic};
+pub use vehicle::{LandedState, MavlinkBytes, VehicleState};

@@ -1,0 +1,79 @@
+//! What a camera publishes: frame headers and its calibration.
+
+use serde::{Deserialize, Serialize};
+
+use crate::codec::wire;
+
+wire! {
+    FrameHeader = 1 v 1;
+    CameraInfo = 2 v 1;
+}
+
+/// How a frame's pixels lie in its payload, row by row without gaps.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum PixelFormat {
+    /// One byte a pixel, grey.
+    Mono8,
+    /// A JPEG file.
+    Jpeg,
+}
+
+/// What travels with a frame, and unchanged with everything that is derived from it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameHeader {
+    /// The camera's name.
+    pub camera: String,
+    /// Counts the frames of this camera since it started.
+    pub sequence: u64,
+    /// Mid-exposure, in nanoseconds of `clock`.
+    pub stamp_ns: i64,
+    /// The clock of the stamp: a name that is the same for all processes that share it.
+    pub clock: String,
+    /// How long the shutter was open, in nanoseconds; 0 when unknown.
+    pub exposure_ns: u32,
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// How the pixels lie in the payload.
+    pub format: PixelFormat,
+}
+
+/// A rigid transform on the wire, `to_from_from` as its field's name says.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Transform3 {
+    /// Origin of `from` as seen in `to`, in metres.
+    pub translation_m: [f64; 3],
+    /// The rotation as a unit quaternion w, x, y, z.
+    pub rotation_wxyz: [f64; 4],
+}
+
+/// A lens, as far as it departs from a pinhole.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum LensModel {
+    /// None.
+    Pinhole,
+    /// Brown-Conrady: k1, k2, p1, p2, k3, k4, k5, k6.
+    BrownConrady([f64; 8]),
+    /// Kannala-Brandt fisheye: k1 to k4.
+    KannalaBrandt([f64; 4]),
+}
+
+/// A camera's calibration and mount.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CameraInfo {
+    /// The camera's name.
+    pub camera: String,
+    /// Width of its frames in pixels.
+    pub width: u32,
+    /// Height of its frames in pixels.
+    pub height: u32,
+    /// Focal lengths fx, fy in pixels; `None` for a camera that is not calibrated.
+    pub focal_px: Option<[f64; 2]>,
+    /// Principal point cx, cy in pixels, the centre of the top-left pixel being (0, 0).
+    pub principal_px: [f64; 2],
+    /// The lens.
+    pub lens: LensModel,
+    /// The mount: the camera frame in the vehicle's body frame (FRD).
+    pub body_from_camera: Transform3,
+}

@@ -1,0 +1,133 @@
+//! The only two functions that know the wire format: [`encode`] and [`decode`].
+//!
+//! A payload is the letter `A`, the message's type, its version, and the postcard encoding of its fields.
+//! Positional encodings break silently when a type changes; the version makes them break loudly.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+/// A type that may be sent.
+pub trait Message: Serialize + DeserializeOwned {
+    /// The type's number on the wire; no two types share one.
+    const TYPE: u8;
+    /// Raised with every change of the type's fields.
+    const VERSION: u8;
+    /// The type's name, for messages to people.
+    const NAME: &'static str;
+}
+
+/// First byte of every payload.
+pub const MAGIC: u8 = b'A';
+
+const HEADER_LEN: usize = 3;
+
+/// Why a payload was refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum DecodeError {
+    /// Not a payload of this system.
+    #[error("{len} bytes that are no Alight payload, where a {expected} was expected")]
+    Foreign {
+        /// Bytes there are.
+        len: usize,
+        /// The message that was expected.
+        expected: &'static str,
+    },
+    /// A payload of another type.
+    #[error("a payload of type {found}, where a {expected} (type {wanted}) was expected")]
+    Type {
+        /// The type found.
+        found: u8,
+        /// The type expected.
+        wanted: u8,
+        /// The message that was expected.
+        expected: &'static str,
+    },
+    /// A payload of another version of the program.
+    #[error(
+        "a {expected} of version {found}, where this program speaks version {wanted}; run the same version everywhere"
+    )]
+    Version {
+        /// The version found.
+        found: u8,
+        /// The version expected.
+        wanted: u8,
+        /// The message that was expected.
+        expected: &'static str,
+    },
+    /// Bytes that end too early or hold impossible values.
+    #[error("a {expected} of {len} bytes that is cut short or damaged")]
+    Damaged {
+        /// Bytes there are.
+        len: usize,
+        /// The message that was expected.
+        expected: &'static str,
+    },
+    /// Bytes after the end of the message.
+    #[error("a {expected} with {extra} bytes after its end")]
+    Trailing {
+        /// Bytes too many.
+        extra: usize,
+        /// The message that was expected.
+        expected: &'static str,
+    },
+}
+
+impl DecodeError {
+    /// A short name, by which refusals are counted.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::Foreign { .. } => "foreign",
+            Self::Type { .. } => "wrong type",
+            Self::Version { .. } => "wrong version",
+            Self::Damaged { .. } => "damaged",
+            Self::Trailing { .. } => "trailing bytes",
+        }
+    }
+}
+
+/// The bytes of a message.
+pub fn encode<M: Message>(message: &M) -> Vec<u8> {
+    let mut bytes = vec![MAGIC, M::TYPE, M::VERSION];
+    // Postcard fails only on sequences of unknown length, which no message has; were one to appear, the receiver
+    // would refuse the header without a body.
+    if let Ok(body) = postcard::to_stdvec(message) {
+        bytes.extend_from_slice(&body);
+    }
+    bytes
+}
+
+/// The message in some bytes.
+///
+/// # Errors
+/// [`DecodeError`] when the bytes are not exactly one message of this type and version.
+pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, DecodeError> {
+    let expected = M::NAME;
+    let len = bytes.len();
+    let &[MAGIC, found_type, found_version, ref body @ ..] = bytes else {
+        return Err(DecodeError::Foreign { len, expected });
+    };
+    if found_type != M::TYPE {
+        return Err(DecodeError::Type { found: found_type, wanted: M::TYPE, expected });
+    }
+    if found_version != M::VERSION {
+        return Err(DecodeError::Version { found: found_version, wanted: M::VERSION, expected });
+    }
+    let (message, rest) = postcard::take_from_bytes(body)
+        .map_err(|_cause| DecodeError::Damaged { len: len.max(HEADER_LEN), expected })?;
+    match rest.len() {
+        0 => Ok(message),
+        extra => Err(DecodeError::Trailing { extra, expected }),
+    }
+}
+
+/// Gives types their numbers and versions on the wire.
+macro_rules! wire {
+    ($($type:ty = $number:literal v $version:literal;)*) => {$(
+        impl $crate::codec::Message for $type {
+            const TYPE: u8 = $number;
+            const VERSION: u8 = $version;
+            const NAME: &'static str = stringify!($type);
+        }
+    )*};
+}
+pub(crate) use wire;

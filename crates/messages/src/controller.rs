@@ -1,0 +1,121 @@
+//! What the controller publishes, and what it can be told.
+
+use serde::{Deserialize, Serialize};
+
+use crate::codec::wire;
+
+wire! {
+    TargetEstimate = 6 v 1;
+    ControllerStatus = 7 v 1;
+    ControllerCommand = 8 v 1;
+    CommandReply = 9 v 1;
+}
+
+/// The landing point, as estimated.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TargetEstimate {
+    /// When the estimate holds, in nanoseconds of the controller's clock.
+    pub stamp_ns: i64,
+    /// The landing point in local NED, in metres; `None` while it was never seen.
+    pub position_ned_m: Option<[f64; 3]>,
+    /// Horizontal distance from the vehicle to it, in metres.
+    pub lateral_error_m: Option<f64>,
+    /// Height of the vehicle above it, in metres.
+    pub height_m: Option<f64>,
+    /// Since the capture of the frame that was used last, in milliseconds.
+    pub age_ms: Option<f64>,
+    /// Why the latest detection was not used, if it was not.
+    pub rejected: Option<String>,
+}
+
+/// The velocity the autopilot was last asked for.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Setpoint {
+    /// In local NED, in m/s.
+    pub velocity_ned_m_s: [f64; 3],
+    /// Clockwise seen from above, in rad/s.
+    pub yaw_rate_rad_s: f64,
+}
+
+/// A detector that could be used.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Candidate {
+    /// Its name.
+    pub detector: String,
+    /// Since the capture of the frame of its latest detections, in milliseconds.
+    pub age_ms: f64,
+    /// Detections messages a second.
+    pub rate_hz: f64,
+    /// True while it tells of its presence.
+    pub alive: bool,
+    /// Distance between its latest marker and the estimate, in metres.
+    pub disagreement_m: Option<f64>,
+}
+
+/// What the controller is doing, and why.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ControllerStatus {
+    /// When, in nanoseconds of the controller's clock.
+    pub stamp_ns: i64,
+    /// The phase of the flight.
+    pub phase: String,
+    /// Why it does what it does, in words.
+    pub why: String,
+    /// The guidance in use.
+    pub guidance: String,
+    /// The link to the autopilot, in words.
+    pub autopilot: String,
+    /// The detector in use.
+    pub active_detector: Option<String>,
+    /// All detectors there are, the active one included.
+    pub candidates: Vec<Candidate>,
+    /// Since the capture of the frame that was used last, in milliseconds.
+    pub detection_age_ms: Option<f64>,
+    /// Height above the target, in metres; above the take-off point while no target was seen.
+    pub height_m: Option<f64>,
+    /// Horizontal distance to the target, in metres.
+    pub lateral_error_m: Option<f64>,
+    /// The setpoint that was sent last.
+    pub setpoint: Option<Setpoint>,
+    /// When the landing began, in nanoseconds of the controller's clock.
+    pub started_ns: Option<i64>,
+    /// When the motors stopped after the landing, in nanoseconds of the controller's clock.
+    pub disarmed_ns: Option<i64>,
+    /// True once nothing more will happen without a command.
+    pub finished: bool,
+    /// Detections of the marker that were used.
+    pub detections_used: u64,
+    /// Median and 99th percentile from a frame's stamp to the setpoint that used it, in milliseconds.
+    pub latency_ms: Option<[f64; 2]>,
+}
+
+/// What the controller can be told.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum ControllerCommand {
+    /// Begin to land.
+    Start,
+    /// Stop where it is, and wait.
+    Hold,
+    /// Go on after a hold.
+    Resume,
+    /// Give the landing up.
+    Abort,
+    /// Use this detector from now on.
+    UseDetector(String),
+    /// Change a parameter.
+    SetParameter {
+        /// Its key in the controller's configuration.
+        key: String,
+        /// Its new value, in TOML.
+        value: String,
+    },
+}
+
+/// The answer to a command.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CommandReply {
+    /// Whether it is carried out.
+    pub accepted: bool,
+    /// Why not, or what happens now.
+    pub reason: String,
+}

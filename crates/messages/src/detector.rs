@@ -1,0 +1,61 @@
+//! What a detector publishes.
+
+use serde::{Deserialize, Serialize};
+
+use crate::camera::FrameHeader;
+pub use crate::camera::Transform3;
+use crate::codec::wire;
+
+wire! {
+    Detections = 3 v 1;
+}
+
+/// What a detector found in one frame; also sent when it found nothing.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Detections {
+    /// The detector's name.
+    pub detector: String,
+    /// The header of the frame, unchanged.
+    pub header: FrameHeader,
+    /// The markers that were found, best first.
+    pub detections: Vec<Detection>,
+    /// How long each stage took, in the order in which they ran.
+    pub stages: Vec<StageTime>,
+}
+
+/// A marker found in a frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Detection {
+    /// The marker's family.
+    pub family: String,
+    /// Its id, where the family has ids.
+    pub id: Option<u32>,
+    /// The projection of its centre, in pixels.
+    pub centre_px: [f64; 2],
+    /// Its corners in pixels, its own top-left first, then clockwise as seen in the image.
+    pub corners_px: Option<[[f64; 2]; 4]>,
+    /// Its largest extent in the image, in pixels.
+    pub size_px: f64,
+    /// From 0 (a guess) to 1 (certain).
+    pub confidence: f64,
+    /// Where it is, when its size and the camera are known.
+    pub pose: Option<MarkerPose>,
+}
+
+/// Where a marker is.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MarkerPose {
+    /// The marker frame in the camera frame.
+    pub camera_from_marker: Transform3,
+    /// Root mean square distance, in pixels, between the image's edges and the pose's.
+    pub reprojection_rms_px: f64,
+}
+
+/// How long a stage took.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StageTime {
+    /// The stage's name.
+    pub stage: String,
+    /// Its duration in microseconds.
+    pub micros: u32,
+}

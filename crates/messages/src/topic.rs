@@ -1,0 +1,178 @@
+//! The topic table: every key, its type, how it is delivered and who publishes it.
+//!
+//! Keys carry no vehicle: that is the Zenoh namespace of the session.
+
+use std::marker::PhantomData;
+
+use crate::camera::{CameraInfo, FrameHeader};
+use crate::codec::Message;
+use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
+use crate::detector::Detections;
+use crate::health::Health;
+use crate::simulation::{Truth, Wind};
+use crate::vehicle::{MavlinkBytes, VehicleState};
+
+/// How messages of a topic travel.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Delivery {
+    /// A stream: a subscriber sees the newest, older ones are dropped under congestion.
+    Newest,
+    /// A stream that steers the vehicle: as `Newest`, before everything else on the link.
+    NewestFirst,
+    /// A state: as `Newest`, and who comes late gets the last value.
+    LastValue,
+    /// A dialogue: everything, in order, as long as the bounded queues last.
+    InOrder,
+    /// A question that gets one answer.
+    Query,
+}
+
+/// A row of the table, without its type.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Row {
+    /// The key, with placeholders in braces.
+    pub key: &'static str,
+    /// Name of the type of its payload; for pixels and JPEG of their attachment.
+    pub message: &'static str,
+    /// The type's version.
+    pub version: u8,
+    /// How it travels.
+    pub delivery: Delivery,
+    /// The services that may publish it (or, for a query, ask).
+    pub publishers: &'static [&'static str],
+}
+
+/// A row of the table, with its type.
+#[derive(Debug)]
+pub struct Topic<M> {
+    row: Row,
+    message: PhantomData<fn() -> M>,
+}
+
+impl<M> Clone for Topic<M> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<M> Copy for Topic<M> {}
+
+impl<M: Message> Topic<M> {
+    const fn new(
+        key: &'static str,
+        delivery: Delivery,
+        publishers: &'static [&'static str],
+    ) -> Self {
+        let row = Row { key, message: M::NAME, version: M::VERSION, delivery, publishers };
+        Self { row, message: PhantomData }
+    }
+
+    /// How its messages travel.
+    pub fn delivery(&self) -> Delivery {
+        self.row.delivery
+    }
+
+    /// The key with its placeholders filled in, in order; `*` stands for any. Placeholders beyond `names` become `*`.
+    pub fn key(&self, names: &[&str]) -> String {
+        let mut names = names.iter();
+        let chunks = self.row.key.split('/').map(|chunk| {
+            if chunk.starts_with('{') { names.next().copied().unwrap_or("*") } else { chunk }
+        });
+        chunks.collect::<Vec<_>>().join("/")
+    }
+}
+
+const CAMERAS: &[&str] = &["camera-pub", "simulator"];
+const DETECTOR: &[&str] = &["detector"];
+const CONTROLLER: &[&str] = &["controller"];
+const SIMULATOR: &[&str] = &["simulator"];
+
+/// Pixels as they are; the message is the attachment.
+pub const FRAME: Topic<FrameHeader> =
+    Topic::new("camera/{camera}/frame", Delivery::Newest, CAMERAS);
+/// A JPEG file; the message is the attachment.
+pub const JPEG: Topic<FrameHeader> = Topic::new("camera/{camera}/jpeg", Delivery::Newest, CAMERAS);
+/// A camera's calibration and mount.
+pub const CAMERA_INFO: Topic<CameraInfo> =
+    Topic::new("camera/{camera}/info", Delivery::LastValue, CAMERAS);
+/// What a detector found.
+pub const DETECTIONS: Topic<Detections> =
+    Topic::new("detector/{detector}/detections", Delivery::NewestFirst, DETECTOR);
+/// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
+pub const DEBUG_IMAGE: Topic<FrameHeader> =
+    Topic::new("detector/{detector}/debug/{image}", Delivery::Newest, DETECTOR);
+/// Attitude, position, velocity, mode.
+pub const VEHICLE_STATE: Topic<VehicleState> =
+    Topic::new("vehicle/state", Delivery::NewestFirst, CONTROLLER);
+/// The estimate of the landing point.
+pub const TARGET: Topic<TargetEstimate> =
+    Topic::new("controller/target", Delivery::Newest, CONTROLLER);
+/// What the controller does and why.
+pub const STATUS: Topic<ControllerStatus> =
+    Topic::new("controller/status", Delivery::LastValue, CONTROLLER);
+/// What the controller is told; answered with a [`CommandReply`].
+pub const COMMAND: Topic<ControllerCommand> =
+    Topic::new("controller/command", Delivery::Query, &["alight", "gcs-bridge"]);
+/// The answer to a command; travels as the reply, on the command's key.
+pub const COMMAND_REPLY: Topic<CommandReply> =
+    Topic::new("controller/command", Delivery::Query, CONTROLLER);
+/// The wind, as it really is.
+pub const WIND: Topic<Wind> = Topic::new("wind", Delivery::Newest, SIMULATOR);
+/// Where everything really is.
+pub const TRUTH: Topic<Truth> = Topic::new("truth", Delivery::Newest, SIMULATOR);
+/// Packets from the autopilot.
+pub const FROM_AUTOPILOT: Topic<MavlinkBytes> =
+    Topic::new("mavlink/from-autopilot", Delivery::InOrder, CONTROLLER);
+/// Packets for the autopilot.
+pub const TO_AUTOPILOT: Topic<MavlinkBytes> =
+    Topic::new("mavlink/to-autopilot", Delivery::InOrder, &["gcs-bridge", "simulator"]);
+/// How a service fares.
+pub const HEALTH: Topic<Health> = Topic::new(
+    "health/{service}/{instance}",
+    Delivery::LastValue,
+    &["camera-pub", "controller", "detector", "gcs-bridge", "simulator"],
+);
+
+/// Key of the liveliness token a service declares when it is ready.
+pub fn alive_key(service: &str, instance: &str) -> String {
+    format!("alive/{service}/{instance}")
+}
+
+/// Every topic there is.
+pub const TOPICS: &[Row] = &[
+    FRAME.row,
+    JPEG.row,
+    CAMERA_INFO.row,
+    DETECTIONS.row,
+    DEBUG_IMAGE.row,
+    VEHICLE_STATE.row,
+    TARGET.row,
+    STATUS.row,
+    COMMAND.row,
+    COMMAND_REPLY.row,
+    WIND.row,
+    TRUTH.row,
+    FROM_AUTOPILOT.row,
+    TO_AUTOPILOT.row,
+    HEALTH.row,
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn placeholders_are_filled_in_order_and_default_to_any() {
+        assert_eq!(DEBUG_IMAGE.key(&["main", "rings"]), "detector/main/debug/rings");
+        assert_eq!(DEBUG_IMAGE.key(&["main"]), "detector/main/debug/*");
+        assert_eq!(WIND.key(&[]), "wind");
+    }
+
+    #[test]
+    fn keys_are_unique_but_for_a_query_and_its_reply() {
+        let mut keys: Vec<_> = TOPICS.iter().map(|row| row.key).collect();
+        keys.sort_unstable();
+        keys.dedup();
+        assert_eq!(keys.len(), TOPICS.len() - 1);
+    }
+}

@@ -1,0 +1,243 @@
+//! The bytes on the wire: they change only with a version.
+
+use messages::{
+    CameraInfo, Candidate, CommandReply, ControllerCommand, ControllerStatus, Count, DecodeError,
+    Detection, Detections, FrameHeader, Health, LandedState, Latency, LensModel, MarkerPose,
+    MavlinkBytes, Message, PixelFormat, Rate, Setpoint, StageTime, TargetEstimate, Touchdown,
+    Transform3, Truth, VehicleState, Wind, decode, encode,
+};
+use proptest::prelude::*;
+
+fn header() -> FrameHeader {
+    FrameHeader {
+        camera: "down".into(),
+        sequence: 300,
+        stamp_ns: -1,
+        clock: "c".into(),
+        exposure_ns: 2,
+        width: 1296,
+        height: 972,
+        format: PixelFormat::Mono8,
+    }
+}
+
+fn transform() -> Transform3 {
+    Transform3 { translation_m: [0.0, 0.0, 1.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] }
+}
+
+/// The message reads back as it was, its encoding has the bytes it always had, and every damaged copy is refused.
+fn check<M: Message + PartialEq + std::fmt::Debug>(message: &M, golden: &str) {
+    let bytes = encode(message);
+    let hex: String = bytes.iter().map(|b| format!("{b:02x}")).collect();
+    assert_eq!(hex, golden, "wire bytes of {}", M::NAME);
+    assert_eq!(decode::<M>(&bytes).as_ref(), Ok(message));
+    for len in 0..bytes.len() {
+        assert!(decode::<M>(&bytes[..len]).is_err(), "{} cut to {len} bytes", M::NAME);
+    }
+    let mut longer = bytes.clone();
+    longer.push(0);
+    assert_eq!(decode::<M>(&longer), Err(DecodeError::Trailing { extra: 1, expected: M::NAME }));
+    let mut older = bytes.clone();
+    older[2] -= 1;
+    assert!(matches!(decode::<M>(&older), Err(DecodeError::Version { .. })));
+    let mut other = bytes;
+    other[1] = 200;
+    assert!(matches!(decode::<M>(&other), Err(DecodeError::Type { found: 200, .. })));
+}
+
+#[test]
+fn frame_header() {
+    let message = header();
+    check(&message, "41010104646f776eac0201016302900acc0700");
+}
+
+#[test]
+fn camera_info() {
+    let message = CameraInfo {
+        camera: "down".into(),
+        width: 2,
+        height: 1,
+        focal_px: Some([1.0, 2.0]),
+        principal_px: [0.5, 0.0],
+        lens: LensModel::BrownConrady([0.0; 8]),
+        body_from_camera: transform(),
+    };
+    check(
+        &message,
+        "41020104646f776e020101000000000000f03f0000000000000040000000000000e03f0000000000000000010000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000",
+    );
+}
+
+#[test]
+fn detections() {
+    let message = Detections {
+        detector: "main".into(),
+        header: header(),
+        detections: vec![Detection {
+            family: "rings".into(),
+            id: None,
+            centre_px: [1.0, 2.0],
+            corners_px: None,
+            size_px: 3.0,
+            confidence: 1.0,
+            pose: Some(MarkerPose { camera_from_marker: transform(), reprojection_rms_px: 0.5 }),
+        }],
+        stages: vec![StageTime { stage: "threshold".into(), micros: 7 }],
+    };
+    check(
+        &message,
+        "410301046d61696e04646f776eac0201016302900acc0700010572696e677300000000000000f03f0000000000000040000000000000000840000000000000f03f0100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000e03f01097468726573686f6c6407",
+    );
+}
+
+#[test]
+fn vehicle_state() {
+    let message = VehicleState {
+        stamp_ns: 5,
+        ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+        position_ned_m: [0.0, 0.0, -10.0],
+        velocity_ned_m_s: [0.0; 3],
+        mode: "GUIDED".into(),
+        armed: true,
+        landed: LandedState::InAir,
+        battery: Some(0.5),
+    };
+    check(
+        &message,
+        "4104010a000000000000f03f0000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000024c0000000000000000000000000000000000000000000000000064755494445440103010000003f",
+    );
+}
+
+#[test]
+fn mavlink_bytes() {
+    let message = MavlinkBytes { packet: vec![0xfd, 0, 1] };
+    check(&message, "41050103fd0001");
+}
+
+#[test]
+fn target_estimate() {
+    let message = TargetEstimate {
+        stamp_ns: 1,
+        position_ned_m: Some([1.5, -1.5, 0.0]),
+        lateral_error_m: Some(0.25),
+        height_m: Some(2.0),
+        age_ms: Some(50.0),
+        rejected: Some("stale".into()),
+    };
+    check(
+        &message,
+        "4106010201000000000000f83f000000000000f8bf000000000000000001000000000000d03f01000000000000004001000000000000494001057374616c65",
+    );
+}
+
+#[test]
+fn controller_status() {
+    let message = ControllerStatus {
+        stamp_ns: 1,
+        phase: "descend".into(),
+        why: "w".into(),
+        guidance: "metric".into(),
+        autopilot: "ok".into(),
+        active_detector: Some("main".into()),
+        candidates: vec![Candidate {
+            detector: "main".into(),
+            age_ms: 1.0,
+            rate_hz: 15.0,
+            alive: true,
+            disagreement_m: None,
+        }],
+        detection_age_ms: None,
+        height_m: None,
+        lateral_error_m: None,
+        setpoint: Some(Setpoint { velocity_ned_m_s: [0.0; 3], yaw_rate_rad_s: 0.0 }),
+        started_ns: None,
+        disarmed_ns: None,
+        finished: false,
+        detections_used: 9,
+        latency_ms: Some([1.0, 2.0]),
+    };
+    check(
+        &message,
+        "410701020764657363656e640177066d6574726963026f6b01046d61696e01046d61696e000000000000f03f0000000000002e4001000000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f0000000000000040",
+    );
+}
+
+#[test]
+fn controller_command() {
+    let message = ControllerCommand::UseDetector("spare".into());
+    check(&message, "41080104057370617265");
+}
+
+#[test]
+fn command_reply() {
+    let message = CommandReply { accepted: false, reason: "no".into() };
+    check(&message, "41090100026e6f");
+}
+
+#[test]
+fn truth() {
+    let message = Truth {
+        stamp_ns: 1,
+        ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+        position_ned_m: [0.0; 3],
+        velocity_ned_m_s: [0.0; 3],
+        pad_ned_m: [1.5, -1.5, 0.0],
+        on_ground: true,
+        touchdown: Some(Touchdown {
+            stamp_ns: 1,
+            error_m: 0.5,
+            vertical_speed_m_s: 0.25,
+            lateral_speed_m_s: 0.0,
+        }),
+        max_tilt_rad: 0.0,
+        frames: 3,
+    };
+    check(
+        &message,
+        "410a0102000000000000f03f000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000f83f000000000000f8bf0000000000000000010102000000000000e03f000000000000d03f0000000000000000000000000000000003",
+    );
+}
+
+#[test]
+fn wind() {
+    let message = Wind { stamp_ns: 1, velocity_ned_m_s: [1.0, 0.0, 0.0] };
+    check(&message, "410b0102000000000000f03f00000000000000000000000000000000");
+}
+
+#[test]
+fn health() {
+    let message = Health {
+        service: "detector".into(),
+        instance: "main".into(),
+        stamp_ns: 1,
+        pid: 2,
+        cpu_s: 0.5,
+        uptime_s: 1.0,
+        rates: vec![Rate { name: "frames".into(), count: 1, hz: 15.0 }],
+        latencies: vec![Latency { name: "detect".into(), p50_ms: 1.0, p99_ms: 2.0 }],
+        drops: vec![],
+        errors: vec![Count { reason: "damaged".into(), count: 1 }],
+    };
+    check(
+        &message,
+        "410c01086465746563746f72046d61696e0202000000000000e03f000000000000f03f01066672616d6573010000000000002e400106646574656374000000000000f03f000000000000004000010764616d6167656401",
+    );
+}
+
+proptest! {
+    #[test]
+    fn no_bytes_make_decoding_panic(mut bytes in prop::collection::vec(any::<u8>(), 0..200), kind in 0u8..16) {
+        if bytes.len() > 2 {
+            (bytes[0], bytes[1], bytes[2]) = (b'A', kind, 1);
+        }
+        let refused = [
+            decode::<FrameHeader>(&bytes).is_err(),
+            decode::<CameraInfo>(&bytes).is_err(),
+            decode::<Detections>(&bytes).is_err(),
+            decode::<VehicleState>(&bytes).is_err(),
+            decode::<ControllerStatus>(&bytes).is_err(),
+            decode::<Health>(&bytes).is_err(),
+        ];
+        prop_assert!(refused.iter().filter(|r| !**r).count() <= 1, "two types took the same bytes");
+    }
+}
