@@ -1,0 +1,276 @@
+//! Every number the lander uses, with its default, unit and range.
+
+use std::fmt;
+
+pub use crate::guidance::metric::MetricConfig;
+pub use crate::guidance::thesis::ThesisConfig;
+
+/// All settings of a landing. Plain data: check it with [`Config::validate`].
+#[derive(Copy, Clone, Debug, PartialEq, Default)]
+pub struct Config {
+    /// What turns the target into a velocity.
+    pub guidance: Guidance,
+    /// How detections become a target.
+    pub target: TargetConfig,
+    /// What no setpoint exceeds.
+    pub envelope: EnvelopeConfig,
+    /// When the phases end.
+    pub phases: PhaseConfig,
+}
+
+/// What turns the target into a velocity.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub enum Guidance {
+    /// The thesis' pixel controller (its section 3.2).
+    Thesis(ThesisConfig),
+    /// Our controller in metres.
+    Metric(MetricConfig),
+}
+
+impl Default for Guidance {
+    fn default() -> Self {
+        Self::Metric(MetricConfig::default())
+    }
+}
+
+/// How detections become a target.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct TargetConfig {
+    /// A frame older than this on arrival is not used, in s (0.05 to 5).
+    pub max_latency_s: f64,
+    /// A frame from further in the future than this is not used, in s (0 to 1).
+    pub max_future_s: f64,
+    /// The vehicle's states are extrapolated over at most this time, in s (0 to 1).
+    pub max_extrapolation_s: f64,
+    /// A detection less certain than this is not used (0 to 1).
+    pub min_confidence: f64,
+    /// A detection further than this is not used, in m (1 to 200).
+    pub max_range_m: f64,
+    /// Horizontal distance from the estimate beyond which a detection is an outlier, at height 0, in m (0.02 to 10).
+    pub gate_m: f64,
+    /// What the gate grows by per metre of height (0 to 1).
+    pub gate_per_height: f64,
+    /// Time constant of the filter over detections at height 0, in s (0 to 5).
+    pub smoothing_s: f64,
+    /// What the time constant grows by per metre of height, in s/m (0 to 1).
+    pub smoothing_s_per_height: f64,
+    /// Outliers in a row that agree with each other and so begin a new estimate (2 to 100).
+    pub restart_after: u32,
+    /// Detections that make a target (1 to 100).
+    pub confirm_after: u32,
+}
+
+impl Default for TargetConfig {
+    fn default() -> Self {
+        Self {
+            max_latency_s: 0.5,
+            max_future_s: 0.02,
+            max_extrapolation_s: 0.1,
+            min_confidence: 0.0,
+            max_range_m: 40.0,
+            gate_m: 0.15,
+            gate_per_height: 0.1,
+            smoothing_s: 0.1,
+            smoothing_s_per_height: 0.05,
+            restart_after: 6,
+            confirm_after: 3,
+        }
+    }
+}
+
+/// What no setpoint exceeds, whatever the guidance wants.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct EnvelopeConfig {
+    /// Horizontal speed in m/s (0.05 to 10).
+    pub horizontal_m_s: f64,
+    /// Speed upwards in m/s (0 to 5).
+    pub climb_m_s: f64,
+    /// Speed downwards in m/s (0.05 to 5).
+    pub descend_m_s: f64,
+}
+
+impl Default for EnvelopeConfig {
+    fn default() -> Self {
+        Self { horizontal_m_s: 2.0, climb_m_s: 1.0, descend_m_s: 2.0 }
+    }
+}
+
+/// When the phases end.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct PhaseConfig {
+    /// Age of the target beyond which nothing descends, in s (0.1 to 5).
+    pub stale_target_s: f64,
+    /// Below this height over the target the descent goes on for `low_grace_s` more, in m (0 to 5).
+    pub low_height_m: f64,
+    /// What a low vehicle adds to `stale_target_s`, in s (0 to 5).
+    pub low_grace_s: f64,
+    /// Age of the target beyond which the vehicle stops and holds, in s (0.1 to 10).
+    pub lost_target_s: f64,
+    /// Age of the vehicle's state beyond which the vehicle holds, in s (0.1 to 5).
+    pub stale_vehicle_s: f64,
+    /// Longest search before a hold, in s (1 to 600).
+    pub search_timeout_s: f64,
+    /// Longest approach before a hold, in s (1 to 600).
+    pub approach_timeout_s: f64,
+    /// Longest descent before a hold, in s (1 to 600).
+    pub descend_timeout_s: f64,
+    /// Longest hold for a lost target or vehicle state before the landing is aborted, in s (1 to 600).
+    pub hold_timeout_s: f64,
+    /// Longest hold by the operator before the landing is aborted, in s (1 to 3600).
+    pub operator_hold_timeout_s: f64,
+    /// Interval at which LAND is asked for again, in s (0.1 to 5).
+    pub land_retry_s: f64,
+    /// Longest wait for the LAND mode before the landing is aborted, in s (0.5 to 60).
+    pub land_timeout_s: f64,
+    /// Longest time in LAND before the landing is aborted, in s (5 to 600).
+    pub touchdown_timeout_s: f64,
+    /// Longest landing, from start to LAND, before it is aborted, in s (10 to 3600).
+    pub landing_timeout_s: f64,
+    /// Height over the local origin below which a start in LAND mode just watches the touchdown, in m (0 to 20).
+    pub watch_height_m: f64,
+    /// What an aborted landing does.
+    pub on_abort: OnAbort,
+    /// How long an aborted landing hovers before it falls silent, in s (0 to 60).
+    pub release_after_s: f64,
+}
+
+impl Default for PhaseConfig {
+    fn default() -> Self {
+        Self {
+            stale_target_s: 0.4,
+            low_height_m: 0.7,
+            low_grace_s: 0.4,
+            lost_target_s: 1.0,
+            stale_vehicle_s: 0.5,
+            search_timeout_s: 20.0,
+            approach_timeout_s: 60.0,
+            descend_timeout_s: 120.0,
+            hold_timeout_s: 60.0,
+            operator_hold_timeout_s: 600.0,
+            land_retry_s: 0.5,
+            land_timeout_s: 5.0,
+            touchdown_timeout_s: 60.0,
+            landing_timeout_s: 300.0,
+            watch_height_m: 2.0,
+            on_abort: OnAbort::Hover,
+            release_after_s: 5.0,
+        }
+    }
+}
+
+/// What an aborted landing does.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum OnAbort {
+    /// Hover for `release_after_s`, then fall silent: the autopilot holds its position by itself.
+    Hover,
+    /// Land where it is, by the autopilot's LAND mode.
+    Land,
+}
+
+/// A setting that cannot be used.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ConfigError {
+    /// The key, with dots, as in `phases.hold_timeout_s`.
+    pub key: &'static str,
+    /// What it was set to.
+    pub value: f64,
+    /// The smallest value allowed.
+    pub min: f64,
+    /// The largest value allowed.
+    pub max: f64,
+}
+
+impl fmt::Display for ConfigError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} is {}, must lie between {} and {}", self.key, self.value, self.min, self.max)
+    }
+}
+
+impl std::error::Error for ConfigError {}
+
+impl Config {
+    /// Checks every number against its range; the first that lies outside is named.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        match &self.guidance {
+            Guidance::Thesis(thesis) => thesis.validate()?,
+            Guidance::Metric(metric) => metric.validate()?,
+        }
+        self.target.validate()?;
+        self.envelope.validate()?;
+        self.phases.validate()
+    }
+}
+
+impl TargetConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        check("target.max_latency_s", self.max_latency_s, 0.05, 5.0)?;
+        check("target.max_future_s", self.max_future_s, 0.0, 1.0)?;
+        check("target.max_extrapolation_s", self.max_extrapolation_s, 0.0, 1.0)?;
+        check("target.min_confidence", self.min_confidence, 0.0, 1.0)?;
+        check("target.max_range_m", self.max_range_m, 1.0, 200.0)?;
+        check("target.gate_m", self.gate_m, 0.02, 10.0)?;
+        check("target.gate_per_height", self.gate_per_height, 0.0, 1.0)?;
+        check("target.smoothing_s", self.smoothing_s, 0.0, 5.0)?;
+        check("target.smoothing_s_per_height", self.smoothing_s_per_height, 0.0, 1.0)?;
+        check("target.restart_after", f64::from(self.restart_after), 2.0, 100.0)?;
+        check("target.confirm_after", f64::from(self.confirm_after), 1.0, 100.0)
+    }
+}
+
+impl EnvelopeConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        check("envelope.horizontal_m_s", self.horizontal_m_s, 0.05, 10.0)?;
+        check("envelope.climb_m_s", self.climb_m_s, 0.0, 5.0)?;
+        check("envelope.descend_m_s", self.descend_m_s, 0.05, 5.0)
+    }
+}
+
+impl PhaseConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        check("phases.stale_target_s", self.stale_target_s, 0.1, 5.0)?;
+        check("phases.low_height_m", self.low_height_m, 0.0, 5.0)?;
+        check("phases.low_grace_s", self.low_grace_s, 0.0, 5.0)?;
+        check("phases.lost_target_s", self.lost_target_s, 0.1, 10.0)?;
+        check("phases.stale_vehicle_s", self.stale_vehicle_s, 0.1, 5.0)?;
+        check("phases.search_timeout_s", self.search_timeout_s, 1.0, 600.0)?;
+        check("phases.approach_timeout_s", self.approach_timeout_s, 1.0, 600.0)?;
+        check("phases.descend_timeout_s", self.descend_timeout_s, 1.0, 600.0)?;
+        check("phases.hold_timeout_s", self.hold_timeout_s, 1.0, 600.0)?;
+        check("phases.operator_hold_timeout_s", self.operator_hold_timeout_s, 1.0, 3600.0)?;
+        check("phases.land_retry_s", self.land_retry_s, 0.1, 5.0)?;
+        check("phases.land_timeout_s", self.land_timeout_s, 0.5, 60.0)?;
+        check("phases.touchdown_timeout_s", self.touchdown_timeout_s, 5.0, 600.0)?;
+        check("phases.landing_timeout_s", self.landing_timeout_s, 10.0, 3600.0)?;
+        check("phases.watch_height_m", self.watch_height_m, 0.0, 20.0)?;
+        check("phases.release_after_s", self.release_after_s, 0.0, 60.0)
+    }
+}
+
+/// Refuses a value outside its range; not a number lies outside every range.
+pub(crate) fn check(key: &'static str, value: f64, min: f64, max: f64) -> Result<(), ConfigError> {
+    if (min..=max).contains(&value) { Ok(()) } else { Err(ConfigError { key, value, min, max }) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_defaults_are_within_their_ranges() {
+        assert_eq!(Config::default().validate(), Ok(()));
+        let thesis =
+            Config { guidance: Guidance::Thesis(ThesisConfig::default()), ..Config::default() };
+        assert_eq!(thesis.validate(), Ok(()));
+    }
+
+    #[test]
+    fn a_value_out_of_range_is_named_with_its_limits() {
+        let mut config = Config::default();
+        config.phases.hold_timeout_s = 0.0;
+        let error = config.validate().unwrap_err();
+        assert_eq!(error.to_string(), "phases.hold_timeout_s is 0, must lie between 1 and 600");
+        config = Config::default();
+        config.envelope.climb_m_s = f64::NAN;
+        assert_eq!(config.validate().unwrap_err().key, "envelope.climb_m_s");
+    }
+}

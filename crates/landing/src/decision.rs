@@ -1,0 +1,169 @@
+//! What the lander answers, with its reasons.
+
+use std::fmt;
+
+use geometry::{Ned, Point, Vector};
+
+use crate::phase::Phase;
+
+/// What to do now, and why.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Decision {
+    /// Where the landing stands.
+    pub phase: Phase,
+    /// What the autopilot must be told.
+    pub action: Action,
+    /// Why this phase and this action.
+    pub why: Reason,
+    /// The landing point as estimated; `None` before the marker was measured.
+    pub target: Option<TargetEstimate>,
+    /// Why this event was not used; `None` when it was.
+    pub rejected: Option<Rejection>,
+}
+
+/// What the autopilot must be told.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub enum Action {
+    /// Nothing: stop streaming setpoints.
+    None,
+    /// Stream this velocity setpoint until the next decision.
+    Velocity {
+        /// In m/s.
+        velocity: Vector<Ned>,
+        /// In rad/s, clockwise seen from above.
+        yaw_rate: f64,
+    },
+    /// Change to the autopilot's own LAND mode. Given again, at the configured interval, until the mode changes.
+    Land,
+}
+
+impl Action {
+    /// The setpoint that stops all motion.
+    pub fn hover() -> Self {
+        Self::Velocity { velocity: Vector::zero(), yaw_rate: 0.0 }
+    }
+}
+
+/// The landing point as estimated from the detections.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct TargetEstimate {
+    /// Where it is.
+    pub position: Point<Ned>,
+    /// Horizontal distance between the vehicle and the target, in metres.
+    pub lateral_error_m: f64,
+    /// Height of the vehicle's body origin above the target, in metres.
+    pub height_m: f64,
+    /// Time since the exposure of the newest detection used, in seconds.
+    pub age_s: f64,
+    /// Root mean square horizontal distance of recent detections from the estimate, in metres.
+    pub spread_m: f64,
+    /// Detections used since the estimate was begun.
+    pub detections: u32,
+}
+
+macro_rules! named {
+    ($(#[$doc:meta])* $name:ident { $($(#[$variant_doc:meta])* $variant:ident = $key:literal, $text:literal;)* }) => {
+        $(#[$doc])*
+        #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
+        pub enum $name { $($(#[$variant_doc])* $variant,)* }
+
+        impl $name {
+            /// A short name for machines, in kebab-case; it does not change between versions.
+            pub fn name(self) -> &'static str {
+                match self { $(Self::$variant => $key,)* }
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(match self { $(Self::$variant => $text,)* })
+            }
+        }
+    };
+}
+
+named! {
+    /// Why the lander does what it does.
+    Reason {
+        /// Nobody asked for a landing.
+        WaitingForStart = "waiting-for-start", "waiting for the start of a landing";
+        /// A start was refused: no vehicle state is known, or it is stale.
+        NoVehicleState = "no-vehicle-state", "no recent vehicle state is known";
+        /// A start was refused: the vehicle is disarmed.
+        NotArmed = "not-armed", "the vehicle is not armed";
+        /// A start was refused: the vehicle is on the ground.
+        OnTheGround = "on-the-ground", "the vehicle is on the ground";
+        /// A start was refused: the autopilot does not follow setpoints.
+        NotGuided = "not-guided", "the vehicle is not in GUIDED mode";
+        /// A setpoint would abort the take-off.
+        TakingOff = "taking-off", "waiting for the end of the take-off";
+        /// The marker has not been seen often enough.
+        Searching = "searching", "looking for the marker";
+        /// The lateral error is too large for a descent at this height.
+        Aligning = "aligning", "moving over the marker before descending";
+        /// All is well.
+        Descending = "descending", "descending over the marker";
+        /// No recent detection: the descent stops until there is one.
+        TargetAging = "target-aging", "no recent detection, descent stopped";
+        /// Low over the marker, waiting for a small error and a small speed.
+        Settling = "settling", "settling over the marker before the touchdown";
+        /// Low over the marker and settled.
+        LowAndAligned = "low-and-aligned", "low and settled over the marker, handing over to LAND";
+        /// The marker left the view when it was already right below.
+        LowAndUnseen = "low-and-unseen", "marker out of view right below, handing over to LAND";
+        /// The vehicle touched the ground before LAND was asked for.
+        TouchedEarly = "touched-early", "on the ground already, handing over to LAND";
+        /// The autopilot is in its LAND mode.
+        AutopilotLands = "autopilot-lands", "the autopilot is landing";
+        /// On the ground, disarmed.
+        TouchedDown = "touched-down", "landed and disarmed";
+        /// The operator asked to wait.
+        OperatorHold = "operator-hold", "held by the operator";
+        /// The marker was seen and is no longer.
+        TargetLost = "target-lost", "marker lost, holding";
+        /// The marker was never seen.
+        TargetNotFound = "target-not-found", "marker not found, holding";
+        /// The autopilot's reports stopped.
+        VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
+        /// The vehicle came no nearer in the time allowed.
+        NoProgress = "no-progress", "too long in one phase, holding";
+        /// The operator gave up.
+        OperatorAbort = "operator-abort", "aborted by the operator";
+        /// A hold lasted too long.
+        HeldTooLong = "held-too-long", "aborted: held too long";
+        /// The whole landing lasted too long.
+        LandingTooLong = "landing-too-long", "aborted: the landing took too long";
+        /// The autopilot did not enter its LAND mode.
+        LandRefused = "land-refused", "aborted: the autopilot did not enter LAND";
+        /// The autopilot did not reach the ground.
+        TouchdownOverdue = "touchdown-overdue", "aborted: no touchdown in the time allowed";
+        /// The motors stopped in the middle of the landing.
+        Disarmed = "disarmed", "aborted: disarmed before the touchdown";
+        /// Somebody changed the flight mode.
+        PilotTookOver = "pilot-took-over", "the flight mode was changed, the pilot flies";
+    }
+}
+
+named! {
+    /// Why an event was not used.
+    Rejection {
+        /// Too old when it arrived.
+        Stale = "stale", "too old when it arrived";
+        /// Its stamp lies in the future.
+        FromTheFuture = "from-the-future", "its stamp lies in the future";
+        /// Not newer than what was already used.
+        OutOfOrder = "out-of-order", "not newer than what was already used";
+        /// A number is infinite or not a number, or an image has no size.
+        NotFinite = "not-finite", "a number in it is not finite";
+        /// The vehicle's attitude at the stamp is not known.
+        NoAttitude = "no-attitude", "the vehicle's attitude at its stamp is not known";
+        /// The guidance needs metres and the detector gave none.
+        NoPose = "no-pose", "it has no pose";
+        /// The pose puts the marker beside or above the vehicle, or out of reach.
+        Implausible = "implausible", "its pose is not below the vehicle";
+        /// The detector was not sure enough.
+        LowConfidence = "low-confidence", "its confidence is too low";
+        /// Too far from the estimate.
+        Outlier = "outlier", "too far from the estimate";
+    }
+}

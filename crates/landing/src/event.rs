@@ -1,0 +1,126 @@
+//! What the lander is told.
+
+use geometry::{Body, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
+
+use crate::time::Timestamp;
+
+/// Something the lander must know of.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub enum Event {
+    /// The autopilot reported the vehicle's state.
+    Vehicle(VehicleState),
+    /// A detector has looked at a frame.
+    Frame(Frame),
+    /// A person decided something.
+    Operator(OperatorCommand),
+    /// Time has passed.
+    Tick,
+}
+
+/// What an operator can ask for.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum OperatorCommand {
+    /// Begin a landing, or begin again after a terminal phase.
+    Start,
+    /// Stop and hover until `Resume`.
+    Hold,
+    /// Go on after `Hold`.
+    Resume,
+    /// Give the landing up.
+    Abort,
+}
+
+/// The vehicle as the autopilot estimates it at one moment.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct VehicleState {
+    /// When this was so.
+    pub stamp: Timestamp,
+    /// The attitude.
+    pub ned_from_body: Rotation<Ned, Body>,
+    /// Where the body's origin is, in metres from the autopilot's local origin.
+    pub position: Point<Ned>,
+    /// Velocity in m/s.
+    pub velocity: Vector<Ned>,
+    /// The flight mode.
+    pub mode: Mode,
+    /// True when the motors may turn.
+    pub armed: bool,
+    /// What the autopilot thinks of the ground.
+    pub landed: Landed,
+}
+
+/// A flight mode, as far as a landing cares.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// The autopilot follows velocity setpoints.
+    Guided,
+    /// The autopilot lands where it is.
+    Land,
+    /// Somebody else flies.
+    Other,
+}
+
+/// Contact with the ground, as the autopilot sees it.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Landed {
+    /// Not told yet.
+    Unknown,
+    /// On the ground.
+    OnGround,
+    /// A take-off is under way.
+    TakingOff,
+    /// Flying.
+    InAir,
+    /// The autopilot is landing.
+    Landing,
+}
+
+/// What a detector found in one frame; a frame without the marker is told too.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Mid-exposure.
+    pub stamp: Timestamp,
+    /// Which detector looked, for reports.
+    pub detector: u32,
+    /// Width and height of the image in pixels.
+    pub image_size: (u32, u32),
+    /// The marker, when it was found.
+    pub marker: Option<MarkerInFrame>,
+}
+
+/// A marker found in a frame.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct MarkerInFrame {
+    /// The projection of its centre.
+    pub centre: Pixel,
+    /// Where it is, seen from the vehicle; `None` when its size or the camera is unknown.
+    pub body_from_marker: Option<Transform<Body, Marker>>,
+    /// From 0 (a guess) to 1 (certain).
+    pub confidence: f64,
+}
+
+impl VehicleState {
+    /// True when no number is infinite or not a number.
+    pub fn is_finite(&self) -> bool {
+        self.position.is_finite()
+            && self.velocity.is_finite()
+            && self.ned_from_body.wxyz().iter().all(|c| c.is_finite())
+    }
+
+    /// Heading in radians, from north towards east.
+    pub fn heading_rad(&self) -> f64 {
+        self.ned_from_body.euler().2
+    }
+}
+
+impl MarkerInFrame {
+    /// True when no number is infinite or not a number.
+    pub fn is_finite(&self) -> bool {
+        self.centre.x.is_finite()
+            && self.centre.y.is_finite()
+            && self.confidence.is_finite()
+            && self.body_from_marker.is_none_or(|t| {
+                t.origin().is_finite() && t.rotation().wxyz().iter().all(|c| c.is_finite())
+            })
+    }
+}

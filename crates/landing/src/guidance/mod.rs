@@ -1,0 +1,4 @@
+//! From the target to a velocity.
+
+pub mod metric;
+pub mod thesis;
