@@ -1,1 +1,6 @@
 //! A world with wind, a pad, a vehicle, an autopilot and a camera in it.
+
+pub mod drift;
+mod laws;
+pub mod vehicle;
+pub mod wind;
