@@ -1,7 +1,21 @@
 //! Grey images as borrowed views, and what detectors do to them.
 //!
 //! This crate knows no marker, no camera, no file and no thread.
+//!
+//! Modules in reading order: [`view`] is an image, [`mod@filter`] smooths it, [`mod@threshold`] makes it black and
+//! white, [`contour`] follows the borders between the two, [`ellipse`] fits ellipses to borders, [`sample`] reads
+//! grey values between the pixels.
 
+pub mod contour;
+pub mod ellipse;
+pub mod filter;
+pub mod sample;
+pub mod threshold;
 pub mod view;
 
+pub use contour::{Contour, Contours, Limits, contour_area, contour_length};
+pub use ellipse::{Ellipse, fit_ellipse};
+pub use filter::{BilateralRows, bilateral_5x5};
+pub use sample::bilinear;
+pub use threshold::{LocalThreshold, threshold};
 pub use view::{GrayImage, GrayView, ViewError};

@@ -1,0 +1,205 @@
+//! From grey to black and white.
+
+use crate::view::{GrayImage, GrayView};
+
+/// Binarises with one threshold (Equation 3.3 with M = 255): 255 where the pixel is at least `threshold`, else 0.
+///
+/// OpenCV's `threshold` asks for more than its threshold, so its T is one less.
+pub fn threshold(view: GrayView<'_>, threshold: u8, out: &mut GrayImage) {
+    out.resize(view.width(), view.height());
+    for y in 0..view.height() {
+        for (to, from) in out.row_mut(y).iter_mut().zip(view.row(y)) {
+            *to = if *from >= threshold { 255 } else { 0 };
+        }
+    }
+}
+
+/// Edge of the smallest tile, in pixels.
+const TILE: usize = 4;
+
+/// Binarises with a threshold that follows the light.
+///
+/// Each tile's threshold is the middle between the darkest and the brightest pixel of the tile and its eight
+/// neighbours; where these differ by less than a least contrast, the tile takes the threshold of the tile of
+/// twice the size that contains it. So an edge is found at its own brightness, in shade or sun, sharp or
+/// blurred, and a plain surface takes the side it has on the scale on which there is something to see.
+#[derive(Clone, Debug, Default)]
+pub struct LocalThreshold {
+    levels: Vec<Level>,
+    row: Vec<u8>,
+}
+
+/// The tiles of one size.
+#[derive(Clone, Debug, Default)]
+struct Level {
+    width: usize,
+    height: usize,
+    /// Darkest and brightest pixel of each tile.
+    extremes: Vec<[u8; 2]>,
+    thresholds: Vec<u8>,
+}
+
+impl LocalThreshold {
+    /// Writes 255 where the pixel is at least its tile's threshold, else 0. Differences of less than
+    /// `least_contrast` grey levels are not edges.
+    pub fn apply(&mut self, view: GrayView<'_>, least_contrast: u8, out: &mut GrayImage) {
+        let count = self.measure(view);
+        for index in (0..count).rev() {
+            let (fine, coarse) = self.levels.split_at_mut(index + 1);
+            if let Some(level) = fine.last_mut() {
+                level.decide(coarse.first().filter(|_| index + 1 < count), least_contrast);
+            }
+        }
+        self.binarise(view, out);
+    }
+
+    /// Fills the extremes of all levels; returns how many levels this image has.
+    fn measure(&mut self, view: GrayView<'_>) -> usize {
+        if self.levels.is_empty() {
+            self.levels.push(Level::default());
+        }
+        self.levels[0].measure_pixels(view);
+        let mut count = 1;
+        while self.levels[count - 1].width > 1 || self.levels[count - 1].height > 1 {
+            if self.levels.len() == count {
+                self.levels.push(Level::default());
+            }
+            let (fine, coarse) = self.levels.split_at_mut(count);
+            if let (Some(fine), Some(coarse)) = (fine.last(), coarse.first_mut()) {
+                coarse.measure_tiles(fine);
+            }
+            count += 1;
+        }
+        count
+    }
+
+    fn binarise(&mut self, view: GrayView<'_>, out: &mut GrayImage) {
+        out.resize(view.width(), view.height());
+        let level = &self.levels[0];
+        self.row.resize(view.width(), 0);
+        for y in 0..view.height() {
+            if y % TILE == 0 {
+                let thresholds = &level.thresholds[y / TILE * level.width..];
+                for (pixels, threshold) in self.row.chunks_mut(TILE).zip(thresholds) {
+                    pixels.fill(*threshold);
+                }
+            }
+            for ((to, from), threshold) in out.row_mut(y).iter_mut().zip(view.row(y)).zip(&self.row)
+            {
+                *to = if from >= threshold { 255 } else { 0 };
+            }
+        }
+    }
+}
+
+impl Level {
+    fn resize(&mut self, width: usize, height: usize) {
+        (self.width, self.height) = (width, height);
+        self.extremes.clear();
+        self.extremes.resize(width * height, [255, 0]);
+        self.thresholds.resize(width * height, 0);
+    }
+
+    fn measure_pixels(&mut self, view: GrayView<'_>) {
+        self.resize(view.width().div_ceil(TILE), view.height().div_ceil(TILE));
+        for y in 0..view.height() {
+            let tiles = &mut self.extremes[y / TILE * self.width..];
+            for (tile, pixels) in tiles.iter_mut().zip(view.row(y).chunks(TILE)) {
+                for pixel in pixels {
+                    tile[0] = tile[0].min(*pixel);
+                    tile[1] = tile[1].max(*pixel);
+                }
+            }
+        }
+    }
+
+    fn measure_tiles(&mut self, fine: &Self) {
+        self.resize(fine.width.div_ceil(2), fine.height.div_ceil(2));
+        for (y, row) in fine.extremes.chunks(fine.width).enumerate() {
+            let tiles = &mut self.extremes[y / 2 * self.width..];
+            for (tile, pair) in tiles.iter_mut().zip(row.chunks(2)) {
+                for [min, max] in pair {
+                    tile[0] = tile[0].min(*min);
+                    tile[1] = tile[1].max(*max);
+                }
+            }
+        }
+    }
+
+    fn decide(&mut self, coarse: Option<&Self>, least_contrast: u8) {
+        for y in 0..self.height {
+            let rows = y.saturating_sub(1)..(y + 2).min(self.height);
+            for x in 0..self.width {
+                let (mut min, mut max) = (255, 0);
+                let columns = x.saturating_sub(1)..(x + 2).min(self.width);
+                for row in rows.clone() {
+                    for [low, high] in &self.extremes[row * self.width..][columns.clone()] {
+                        min = min.min(*low);
+                        max = max.max(*high);
+                    }
+                }
+                let middle = min + (max.saturating_sub(min)).div_ceil(2);
+                self.thresholds[y * self.width + x] = match coarse {
+                    Some(coarse) if max.saturating_sub(min) < least_contrast => {
+                        coarse.thresholds[y / 2 * coarse.width + x / 2]
+                    }
+                    _ => middle,
+                };
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pixel_at_the_threshold_is_white() {
+        let view = GrayView::packed(&[69, 70, 71], 3, 1).unwrap();
+        let mut out = GrayImage::default();
+        threshold(view, 70, &mut out);
+        assert_eq!(out.pixels(), [0, 255, 255]);
+    }
+
+    /// A dark disc on bright ground whose light falls from 250 on the left to a tenth of that on the right.
+    #[test]
+    fn dark_stays_dark_in_sun_and_shade() {
+        let (width, height) = (400, 100);
+        let dark = |x: usize, y: usize| {
+            [80_usize, 300].iter().any(|cx| x.abs_diff(*cx) < 25 && y.abs_diff(50) < 25)
+        };
+        let data: Vec<u8> = (0..width * height)
+            .map(|i| {
+                let (x, y) = (i % width, i / width);
+                let light = 250.0 - 225.0 * x as f64 / width as f64;
+                (light * if dark(x, y) { 0.2 } else { 1.0 }) as u8
+            })
+            .collect();
+        let mut out = GrayImage::default();
+        let view = GrayView::packed(&data, width, height).unwrap();
+        LocalThreshold::default().apply(view, 16, &mut out);
+        for cx in [80, 300] {
+            // Just inside and just outside of the edges, all along them.
+            for t in 30..70 {
+                assert_eq!((out.row(t)[cx - 24], out.row(t)[cx - 25]), (0, 255));
+                assert_eq!((out.row(26)[cx + t - 50], out.row(25)[cx + t - 50]), (0, 255));
+            }
+        }
+    }
+
+    #[test]
+    fn odd_sizes_are_covered_to_the_last_pixel() {
+        for (width, height) in [(1, 1), (1, 7), (9, 1), (5, 5), (17, 3)] {
+            let mut data = vec![10; width * height];
+            if let Some(last) = data.last_mut() {
+                *last = 200;
+            }
+            let mut out = GrayImage::default();
+            let view = GrayView::packed(&data, width, height).unwrap();
+            LocalThreshold::default().apply(view, 16, &mut out);
+            assert_eq!(out.pixels().last(), Some(&255));
+            assert_eq!(out.pixels().len(), width * height);
+        }
+    }
+}
