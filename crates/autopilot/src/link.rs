@@ -1,0 +1,620 @@
+//! Bytes to and from the autopilot over UDP, TCP or a serial line, for ever.
+//!
+//! What cannot heal (a port held by another program) is an error at once; what can (no device yet, nobody answers,
+//! a cable pulled) is retried for ever. Nothing here waits for a slow reader or a slow line: queues are bounded, the
+//! newest packet received wins, and a packet that cannot be sent is refused, because a late command is a wrong one.
+
+use std::collections::VecDeque;
+use std::io;
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream, UdpSocket};
+use tokio::sync::{Notify, mpsc};
+use tokio::task::JoinHandle;
+use tokio::time::{sleep, sleep_until, timeout};
+use tokio_serial::{SerialPortBuilderExt, SerialStream};
+
+use crate::address::{Address, Endpoint};
+use crate::dialect::{MavAutopilot, MavMessage};
+use crate::frame::{Frame, Parser};
+
+/// Packets received and not yet read, about 4 s of an autopilot's talk.
+const INCOMING: usize = 1024;
+/// Packets to be sent and not yet taken by the line.
+const OUTGOING: usize = 256;
+const FIRST_RETRY: Duration = Duration::from_millis(200);
+const LAST_RETRY: Duration = Duration::from_secs(2);
+/// How long opening a connection may take.
+const CONNECT_LIMIT: Duration = Duration::from_secs(3);
+/// How long the line may take to accept one packet.
+const WRITE_LIMIT: Duration = Duration::from_secs(2);
+/// After this silence the beginning of a packet has no end any more.
+const PACKET_GAP: Duration = Duration::from_millis(200);
+/// A TCP connection on which an autopilot says nothing for so long is dead, though TCP does not notice.
+const TCP_SILENCE: Duration = Duration::from_secs(10);
+/// A peer that was silent for so long gives way to another one.
+const PEER_SILENCE: Duration = Duration::from_secs(3);
+const MAX_PEERS: usize = 8;
+
+/// A connection to an autopilot that repairs itself.
+#[derive(Debug)]
+pub struct Link {
+    shared: Arc<Shared>,
+    sender: LinkSender,
+    task: JoinHandle<()>,
+    local: Option<SocketAddr>,
+}
+
+/// Sends packets over a [`Link`], from any task.
+#[derive(Clone, Debug)]
+pub struct LinkSender {
+    shared: Arc<Shared>,
+    queue: mpsc::Sender<Vec<u8>>,
+}
+
+/// What happens on a link.
+#[derive(Clone, Debug, PartialEq)]
+pub enum LinkEvent {
+    /// Packets can be sent; over `udpin` it says whom the packets now come from and go to.
+    Connected {
+        /// The other side, for people.
+        peer: String,
+    },
+    /// Packets cannot be sent; it is being retried. Said once per reason.
+    Disconnected {
+        /// Why, for people.
+        reason: String,
+    },
+    /// A packet.
+    Frame {
+        /// The packet.
+        frame: Box<Frame>,
+        /// When its last byte was received.
+        received: Instant,
+    },
+}
+
+/// Why a link cannot be opened at all.
+#[derive(Debug, thiserror::Error)]
+pub enum LinkError {
+    /// Another program listens there.
+    #[error(
+        "{address}: port {port} is already in use by another program, often a ground station \
+         (QGroundControl, MAVProxy) or a second controller; stop that program, or listen on another \
+         port and send the autopilot's packets there"
+    )]
+    PortInUse {
+        /// What was to be opened.
+        address: Address,
+        /// The port that is taken.
+        port: u16,
+    },
+    /// The host to listen on belongs to another machine.
+    #[error(
+        "{address}: this machine has no network address `{host}`, so it cannot listen there; \
+         0.0.0.0 listens on every network, 127.0.0.1 on this machine only"
+    )]
+    NotLocal {
+        /// What was to be opened.
+        address: Address,
+        /// The host that is not here.
+        host: String,
+    },
+    /// Anything else that listening may meet.
+    #[error("{address}: cannot listen there: {source}")]
+    Listen {
+        /// What was to be opened.
+        address: Address,
+        /// What the operating system says.
+        source: io::Error,
+    },
+}
+
+/// Why a packet was not sent.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SendError {
+    /// There is nobody to send to yet, or not any more.
+    #[error("not sent: the link to the autopilot is not connected")]
+    NotConnected,
+    /// The line does not keep up.
+    #[error("not sent: {OUTGOING} packets already wait, the line to the autopilot is too slow")]
+    Full,
+}
+
+impl Link {
+    /// Opens the link; needs a tokio runtime with network and time, and ends when it is dropped.
+    pub async fn open(address: Address) -> Result<Self, LinkError> {
+        let listener = listen(&address).await?;
+        let local = match &listener {
+            Listener::Udp(socket) => socket.local_addr().ok(),
+            Listener::Tcp(listener) => listener.local_addr().ok(),
+            Listener::None => None,
+        };
+        let (queue, outgoing) = mpsc::channel(OUTGOING);
+        let shared = Arc::new(Shared::new());
+        let port = Port { shared: Arc::clone(&shared), outgoing };
+        let task = tokio::spawn(run(address, listener, port));
+        let sender = LinkSender { shared: Arc::clone(&shared), queue };
+        Ok(Self { shared, sender, task, local })
+    }
+
+    /// The next event; may be cancelled without losing one.
+    pub async fn recv(&mut self) -> LinkEvent {
+        loop {
+            if let Some(event) = self.try_recv() {
+                return event;
+            }
+            self.shared.arrived.notified().await;
+        }
+    }
+
+    /// The next event if there is one already.
+    pub fn try_recv(&mut self) -> Option<LinkEvent> {
+        self.shared.events().pop_front()
+    }
+
+    /// Sends a packet without waiting; see [`LinkSender::send`].
+    pub fn send(&self, packet: &[u8]) -> Result<(), SendError> {
+        self.sender.send(packet)
+    }
+
+    /// A handle that sends over this link from elsewhere.
+    pub fn sender(&self) -> LinkSender {
+        self.sender.clone()
+    }
+
+    /// Where it listens, for `udpin` and `tcpin`.
+    pub fn local_address(&self) -> Option<SocketAddr> {
+        self.local
+    }
+
+    /// How many received packets were thrown away because nobody read them in time.
+    pub fn dropped(&self) -> u64 {
+        self.shared.dropped.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Link {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+impl LinkSender {
+    /// Sends a packet without waiting. It is refused when there is nobody to send it to or the line is too slow, and
+    /// packets that wait when a connection breaks are not sent on the next one.
+    pub fn send(&self, packet: &[u8]) -> Result<(), SendError> {
+        if !self.shared.connected.load(Ordering::Acquire) {
+            return Err(SendError::NotConnected);
+        }
+        self.queue.try_send(packet.to_vec()).map_err(|refused| match refused {
+            mpsc::error::TrySendError::Full(_) => SendError::Full,
+            mpsc::error::TrySendError::Closed(_) => SendError::NotConnected,
+        })
+    }
+}
+
+#[derive(Debug)]
+struct Shared {
+    events: Mutex<VecDeque<LinkEvent>>,
+    arrived: Notify,
+    connected: AtomicBool,
+    dropped: AtomicU64,
+    opened: Instant,
+    /// When bytes came last, in milliseconds since the link was opened.
+    heard_ms: AtomicU64,
+}
+
+impl Shared {
+    fn new() -> Self {
+        Self {
+            events: Mutex::new(VecDeque::with_capacity(INCOMING)),
+            arrived: Notify::new(),
+            connected: AtomicBool::new(false),
+            dropped: AtomicU64::new(0),
+            opened: Instant::now(),
+            heard_ms: AtomicU64::new(0),
+        }
+    }
+
+    fn events(&self) -> MutexGuard<'_, VecDeque<LinkEvent>> {
+        self.events.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn push(&self, event: LinkEvent) {
+        let mut events = self.events();
+        if events.len() >= INCOMING {
+            // The oldest packet goes; what was said about the connection stays, unless there is nothing else.
+            let oldest = events.iter().position(|event| matches!(event, LinkEvent::Frame { .. }));
+            events.remove(oldest.unwrap_or(0));
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+        events.push_back(event);
+        drop(events);
+        self.arrived.notify_one();
+    }
+
+    fn hear(&self) {
+        let now = self.opened.elapsed().as_millis().try_into().unwrap_or(u64::MAX);
+        self.heard_ms.store(now, Ordering::Relaxed);
+    }
+
+    fn silence(&self) -> Duration {
+        let heard = Duration::from_millis(self.heard_ms.load(Ordering::Relaxed));
+        self.opened.elapsed().saturating_sub(heard)
+    }
+}
+
+/// The task's side of a link.
+struct Port {
+    shared: Arc<Shared>,
+    outgoing: mpsc::Receiver<Vec<u8>>,
+}
+
+impl Port {
+    fn connected(&mut self, peer: String) {
+        while self.outgoing.try_recv().is_ok() {}
+        self.shared.hear();
+        tracing::info!(%peer, "autopilot link connected");
+        self.shared.connected.store(true, Ordering::Release);
+        self.shared.push(LinkEvent::Connected { peer });
+    }
+
+    fn disconnected(&mut self, reason: String) {
+        self.shared.connected.store(false, Ordering::Release);
+        self.shared.push(LinkEvent::Disconnected { reason });
+    }
+
+    fn received(&self, frames: Vec<Frame>) {
+        let received = Instant::now();
+        for frame in frames {
+            self.shared.push(LinkEvent::Frame { frame: Box::new(frame), received });
+        }
+    }
+}
+
+/// What is bound before anything else, so that a port in use is an error at once.
+enum Listener {
+    None,
+    Udp(UdpSocket),
+    Tcp(TcpListener),
+}
+
+async fn listen(address: &Address) -> Result<Listener, LinkError> {
+    let (bound, Endpoint { host, port }) = match address {
+        Address::UdpIn(at) => {
+            (UdpSocket::bind((at.host.as_str(), at.port)).await.map(Listener::Udp), at)
+        }
+        Address::TcpIn(at) => {
+            (TcpListener::bind((at.host.as_str(), at.port)).await.map(Listener::Tcp), at)
+        }
+        Address::UdpOut(_) | Address::Tcp(_) | Address::Serial { .. } => return Ok(Listener::None),
+    };
+    bound.map_err(|source| {
+        let address = address.clone();
+        match source.kind() {
+            io::ErrorKind::AddrInUse => LinkError::PortInUse { address, port: *port },
+            io::ErrorKind::AddrNotAvailable => LinkError::NotLocal { address, host: host.clone() },
+            _ => LinkError::Listen { address, source },
+        }
+    })
+}
+
+/// Serves one connection after the other, with a pause that grows while nothing works.
+async fn run(address: Address, mut listener: Listener, mut port: Port) {
+    let mut pause = FIRST_RETRY;
+    let mut said = String::new();
+    loop {
+        let began = Instant::now();
+        let (worked, reason) = serve(&address, &mut listener, &mut port).await;
+        let reason = format!("{address}: {reason}");
+        if worked || reason != said {
+            tracing::warn!(%reason, "autopilot link lost, trying again");
+            port.disconnected(reason.clone());
+            said = reason;
+        }
+        if worked && began.elapsed() > LAST_RETRY {
+            pause = FIRST_RETRY;
+        }
+        sleep(pause).await;
+        pause = (pause * 2).min(LAST_RETRY);
+    }
+}
+
+/// Serves one connection to its end; returns whether there was one, and why it ended.
+async fn serve(address: &Address, listener: &mut Listener, port: &mut Port) -> (bool, String) {
+    match address {
+        Address::UdpIn(_) => {
+            if let Listener::None = listener {
+                match listen(address).await {
+                    Ok(again) => *listener = again,
+                    Err(error) => return (false, error.to_string()),
+                }
+            }
+            let Listener::Udp(socket) = &*listener else { return (false, "no socket".into()) };
+            let reason = serve_udp(socket, port, None).await;
+            *listener = Listener::None;
+            (true, reason)
+        }
+        Address::UdpOut(to) => match call_udp(to).await {
+            Ok((socket, peer)) => (true, serve_udp(&socket, port, Some(peer)).await),
+            Err(error) => (false, explain_socket(&error)),
+        },
+        Address::Tcp(to) => match call_tcp(to).await {
+            Ok(stream) => {
+                port.connected(to.to_string());
+                (true, serve_stream(stream, port, Some(TCP_SILENCE)).await)
+            }
+            Err(error) => (false, explain_socket(&error)),
+        },
+        Address::TcpIn(_) => {
+            let Listener::Tcp(listener) = &*listener else { return (false, "no socket".into()) };
+            serve_tcp_in(listener, port).await
+        }
+        Address::Serial { device, baud } => match open_serial(device, *baud) {
+            Ok(stream) => {
+                port.connected(address.to_string());
+                (true, serve_stream(stream, port, None).await)
+            }
+            Err(error) => (false, explain_serial(device, &error)),
+        },
+    }
+}
+
+async fn call_udp(to: &Endpoint) -> io::Result<(UdpSocket, SocketAddr)> {
+    let mut found = tokio::net::lookup_host((to.host.as_str(), to.port)).await?;
+    let peer = found.next().ok_or(io::ErrorKind::HostUnreachable)?;
+    let local: SocketAddr = match peer {
+        SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
+        SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
+    };
+    let socket = UdpSocket::bind(local).await?;
+    socket.connect(peer).await?;
+    Ok((socket, peer))
+}
+
+async fn call_tcp(to: &Endpoint) -> io::Result<TcpStream> {
+    let connecting = TcpStream::connect((to.host.as_str(), to.port));
+    let stream =
+        timeout(CONNECT_LIMIT, connecting).await.map_err(|_| io::ErrorKind::TimedOut)??;
+    stream.set_nodelay(true)?;
+    Ok(stream)
+}
+
+fn open_serial(device: &str, baud: u32) -> tokio_serial::Result<SerialStream> {
+    tokio_serial::new(device, baud).open_native_async()
+}
+
+fn explain_socket(error: &io::Error) -> String {
+    match error.kind() {
+        io::ErrorKind::ConnectionRefused => {
+            "nobody listens there; is the autopilot (or its simulator) running?".into()
+        }
+        io::ErrorKind::TimedOut => "no answer; is the autopilot switched on and in reach?".into(),
+        _ => format!("cannot reach it: {error}"),
+    }
+}
+
+fn explain_serial(device: &str, error: &tokio_serial::Error) -> String {
+    use tokio_serial::ErrorKind;
+    match error.kind() {
+        ErrorKind::NoDevice | ErrorKind::Io(io::ErrorKind::NotFound) => {
+            format!(
+                "there is no device {device}; is the cable plugged in and the autopilot switched on?"
+            )
+        }
+        ErrorKind::Io(io::ErrorKind::PermissionDenied) => format!(
+            "this user may not open {device}; on most systems the group `dialout` may (then log in again)"
+        ),
+        _ => format!("cannot open {device} (another program may hold it): {error}"),
+    }
+}
+
+/// One connection at a time; a newcomer takes the place of one that has been silent.
+async fn serve_tcp_in(listener: &TcpListener, port: &mut Port) -> (bool, String) {
+    let mut next = match listener.accept().await {
+        Ok(next) => next,
+        Err(error) => return (false, format!("cannot accept a connection: {error}")),
+    };
+    loop {
+        let (stream, peer) = next;
+        // A connection without this works too, only later.
+        let _ = stream.set_nodelay(true);
+        port.connected(peer.to_string());
+        let shared = Arc::clone(&port.shared);
+        tokio::select! {
+            reason = serve_stream(stream, port, None) => return (true, reason),
+            newcomer = accept_when_silent(listener, &shared) => next = newcomer,
+        }
+    }
+}
+
+async fn accept_when_silent(listener: &TcpListener, shared: &Shared) -> (TcpStream, SocketAddr) {
+    loop {
+        match listener.accept().await {
+            Ok(newcomer) if shared.silence() > PEER_SILENCE => return newcomer,
+            Ok((_, peer)) => tracing::warn!(%peer, "refused: another connection is in use"),
+            Err(error) => {
+                tracing::warn!(%error, "cannot accept a connection");
+                sleep(LAST_RETRY).await;
+            }
+        }
+    }
+}
+
+/// Moves bytes both ways until the line breaks; returns why.
+async fn serve_stream<S>(stream: S, port: &mut Port, silence: Option<Duration>) -> String
+where
+    S: AsyncRead + AsyncWrite,
+{
+    let (mut reader, mut writer) = tokio::io::split(stream);
+    let mut parser = Parser::new();
+    let mut bytes = [0; 4096];
+    let mut heard = tokio::time::Instant::now();
+    loop {
+        let patience = silence.unwrap_or(Duration::from_secs(3600));
+        tokio::select! {
+            read = reader.read(&mut bytes) => match read {
+                Ok(0) => return "the other side closed the connection".into(),
+                Ok(count) => {
+                    heard = tokio::time::Instant::now();
+                    port.shared.hear();
+                    port.received(parser.push(bytes.get(..count).unwrap_or(&[])));
+                }
+                Err(error) => return format!("reading failed: {error}"),
+            },
+            packet = port.outgoing.recv() => {
+                let Some(packet) = packet else { return "closed".into() };
+                match timeout(WRITE_LIMIT, writer.write_all(&packet)).await {
+                    Ok(Ok(())) => {}
+                    Ok(Err(error)) => return format!("writing failed: {error}"),
+                    Err(_) => return "the other side takes no more bytes".into(),
+                }
+            }
+            () = sleep_until(heard + PACKET_GAP), if parser.is_waiting() => {
+                port.received(parser.finish());
+            }
+            () = sleep_until(heard + patience), if silence.is_some() => {
+                return format!("silent for {} s", patience.as_secs());
+            }
+        }
+    }
+}
+
+/// Moves datagrams both ways until the socket breaks; returns why. Without a `fixed` peer, the peer is whoever sends
+/// the autopilot's heartbeat.
+async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr>) -> String {
+    let mut peers = Peers::new(fixed);
+    if let Some(peer) = fixed {
+        port.connected(peer.to_string());
+    }
+    let mut bytes = vec![0; 65_536];
+    loop {
+        tokio::select! {
+            read = socket.recv_from(&mut bytes) => match read {
+                Ok((count, from)) => {
+                    let before = peers.chosen;
+                    let frames = peers.take(from, bytes.get(..count).unwrap_or(&[]), Instant::now());
+                    if let Some(peer) = peers.chosen.filter(|_| peers.chosen != before) {
+                        port.connected(peer.to_string());
+                    }
+                    port.received(frames);
+                }
+                // A datagram of ours found nobody: the other side is not running yet, or not now.
+                Err(error) if is_refusal(&error) => {}
+                Err(error) => return format!("receiving failed: {error}"),
+            },
+            packet = port.outgoing.recv() => {
+                let Some(packet) = packet else { return "closed".into() };
+                let sent = match (fixed, peers.chosen) {
+                    (Some(_), _) => socket.send(&packet).await,
+                    (None, Some(peer)) => socket.send_to(&packet, peer).await,
+                    (None, None) => continue,
+                };
+                // A network that is away for a moment comes back; the packet is as good as lost in the air.
+                if let Err(error) = sent {
+                    tracing::debug!(%error, "datagram not sent");
+                }
+            }
+        }
+    }
+}
+
+fn is_refusal(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::ConnectionRefused | io::ErrorKind::ConnectionReset)
+}
+
+/// Those who send to a UDP port, each with its own stream of packets.
+struct Peers {
+    known: Vec<Peer>,
+    chosen: Option<SocketAddr>,
+}
+
+struct Peer {
+    address: SocketAddr,
+    parser: Parser,
+    heard: Instant,
+    /// When the heartbeat of an autopilot came from there last.
+    autopilot: Option<Instant>,
+}
+
+impl Peers {
+    fn new(chosen: Option<SocketAddr>) -> Self {
+        Self { known: Vec::new(), chosen }
+    }
+
+    /// Takes a datagram and returns its packets if they come from the chosen peer.
+    fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> Vec<Frame> {
+        let peer = self.peer(from, now);
+        if now.duration_since(peer.heard) > PACKET_GAP {
+            // What began so long ago has lost its end.
+            peer.parser.finish();
+        }
+        peer.heard = now;
+        let frames = peer.parser.push(bytes);
+        let is_autopilot = frames.iter().any(is_autopilot_heartbeat);
+        if is_autopilot {
+            peer.autopilot = Some(now);
+        }
+        if !frames.is_empty() && self.chosen != Some(from) && self.gives_way(is_autopilot, now) {
+            self.chosen = Some(from);
+        }
+        if self.chosen == Some(from) { frames } else { Vec::new() }
+    }
+
+    /// Whether the chosen peer gives way to one that just sent a packet.
+    fn gives_way(&self, to_autopilot: bool, now: Instant) -> bool {
+        let recent = |at: Instant| now.duration_since(at) <= PEER_SILENCE;
+        let Some(chosen) = self.chosen else { return true };
+        let Some(chosen) = self.known.iter().find(|peer| peer.address == chosen) else {
+            return true;
+        };
+        match chosen.autopilot {
+            Some(at) => to_autopilot && !recent(at),
+            None => to_autopilot || !recent(chosen.heard),
+        }
+    }
+
+    fn peer(&mut self, address: SocketAddr, now: Instant) -> &mut Peer {
+        let index = match self.known.iter().position(|peer| peer.address == address) {
+            Some(index) => index,
+            None => {
+                self.forget_one();
+                self.known.push(Peer {
+                    address,
+                    parser: Parser::new(),
+                    heard: now,
+                    autopilot: None,
+                });
+                self.known.len() - 1
+            }
+        };
+        &mut self.known[index]
+    }
+
+    /// Makes room by forgetting the peer that was silent for longest, never the chosen one.
+    fn forget_one(&mut self) {
+        if self.known.len() < MAX_PEERS {
+            return;
+        }
+        let others = self.known.iter().enumerate().filter(|(_, p)| Some(p.address) != self.chosen);
+        if let Some((oldest, _)) = others.min_by_key(|(_, peer)| peer.heard) {
+            self.known.swap_remove(oldest);
+        }
+    }
+}
+
+/// True for the heartbeat of a flight controller, as opposed to that of a ground station, camera or companion.
+fn is_autopilot_heartbeat(frame: &Frame) -> bool {
+    match &frame.message {
+        Some(MavMessage::HEARTBEAT(heartbeat)) => {
+            heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
+                && frame.sender.component == 1
+        }
+        _ => false,
+    }
+}

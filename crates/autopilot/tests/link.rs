@@ -1,0 +1,238 @@
+//! Links over the loopback: who is answered, what is retried, what is an error at once.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "helpers of tests may fail like tests")]
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use autopilot::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage, MavType, SYSTEM_TIME_DATA};
+use autopilot::frame::{self, Sender};
+use autopilot::link::SendError;
+use autopilot::{Address, Link, LinkEvent};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, UdpSocket};
+use tokio::time::timeout;
+
+const PATIENCE: Duration = Duration::from_secs(30);
+const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
+
+fn heartbeat(autopilot: bool) -> Vec<u8> {
+    let message = HEARTBEAT_DATA {
+        mavtype: if autopilot { MavType::MAV_TYPE_QUADROTOR } else { MavType::MAV_TYPE_GCS },
+        autopilot: if autopilot {
+            MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA
+        } else {
+            MavAutopilot::MAV_AUTOPILOT_INVALID
+        },
+        ..Default::default()
+    };
+    let sender = if autopilot { AUTOPILOT } else { Sender { system: 255, component: 190 } };
+    frame::encode(sender, 0, &MavMessage::HEARTBEAT(message))
+}
+
+fn time() -> Vec<u8> {
+    let message = SYSTEM_TIME_DATA { time_unix_usec: 7, time_boot_ms: 9 };
+    frame::encode(AUTOPILOT, 1, &MavMessage::SYSTEM_TIME(message))
+}
+
+async fn open(address: String) -> Link {
+    Link::open(address.parse().unwrap()).await.unwrap()
+}
+
+async fn next(link: &mut Link) -> LinkEvent {
+    timeout(PATIENCE, link.recv()).await.expect("an event of the link")
+}
+
+async fn packet(link: &mut Link) -> Vec<u8> {
+    loop {
+        if let LinkEvent::Frame { frame, .. } = next(link).await {
+            return frame.raw;
+        }
+    }
+}
+
+async fn peer(link: &mut Link) -> String {
+    loop {
+        if let LinkEvent::Connected { peer } = next(link).await {
+            return peer;
+        }
+    }
+}
+
+async fn lost(link: &mut Link) -> String {
+    loop {
+        if let LinkEvent::Disconnected { reason } = next(link).await {
+            return reason;
+        }
+    }
+}
+
+async fn datagram(socket: &UdpSocket) -> (Vec<u8>, SocketAddr) {
+    let mut bytes = [0; 2048];
+    let (count, from) = timeout(PATIENCE, socket.recv_from(&mut bytes)).await.unwrap().unwrap();
+    (bytes[..count].to_vec(), from)
+}
+
+#[tokio::test]
+async fn udpin_answers_to_whoever_sends_the_autopilots_heartbeat() {
+    let mut link = open("udpin:127.0.0.1:0".into()).await;
+    let at = link.local_address().unwrap();
+    assert_eq!(link.send(&time()), Err(SendError::NotConnected));
+
+    let station = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    station.send_to(&heartbeat(false), at).await.unwrap();
+    assert_eq!(peer(&mut link).await, station.local_addr().unwrap().to_string());
+
+    let autopilot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    autopilot.send_to(&heartbeat(true), at).await.unwrap();
+    assert_eq!(peer(&mut link).await, autopilot.local_addr().unwrap().to_string());
+    assert_eq!(packet(&mut link).await, heartbeat(true));
+
+    // The ground station is heard no more, and not answered.
+    station.send_to(&heartbeat(false), at).await.unwrap();
+    autopilot.send_to(&time(), at).await.unwrap();
+    assert_eq!(packet(&mut link).await, time());
+    link.send(&heartbeat(false)).unwrap();
+    assert_eq!(datagram(&autopilot).await.0, heartbeat(false));
+}
+
+#[tokio::test]
+async fn a_packet_cut_over_datagrams_survives_another_sender_in_between() {
+    let mut link = open("udpin:127.0.0.1:0".into()).await;
+    let at = link.local_address().unwrap();
+    let autopilot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    let other = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    autopilot.send_to(&heartbeat(true), at).await.unwrap();
+    assert_eq!(packet(&mut link).await, heartbeat(true));
+    let time = time();
+    autopilot.send_to(&time[..9], at).await.unwrap();
+    other.send_to(&heartbeat(false), at).await.unwrap();
+    autopilot.send_to(&time[9..], at).await.unwrap();
+    assert_eq!(packet(&mut link).await, time);
+}
+
+#[tokio::test]
+async fn a_port_in_use_is_an_error_at_once_that_says_what_to_do() {
+    let holder = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    let port = holder.local_addr().unwrap().port();
+    let address: Address = format!("udpin:127.0.0.1:{port}").parse().unwrap();
+    let error = Link::open(address).await.unwrap_err().to_string();
+    assert!(error.contains(&format!("udpin:127.0.0.1:{port}")), "{error}");
+    assert!(error.contains("already in use") && error.contains("stop that program"), "{error}");
+
+    let holder = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = holder.local_addr().unwrap().port();
+    let address: Address = format!("tcpin:127.0.0.1:{port}").parse().unwrap();
+    let error = Link::open(address).await.unwrap_err().to_string();
+    assert!(error.contains("already in use"), "{error}");
+}
+
+#[tokio::test]
+async fn listening_on_the_address_of_another_machine_is_explained() {
+    let address: Address = "udpin:192.0.2.1:14550".parse().unwrap();
+    let error = Link::open(address).await.unwrap_err().to_string();
+    assert!(error.contains("no network address `192.0.2.1`"), "{error}");
+}
+
+#[tokio::test]
+async fn udpout_calls_first_and_outlives_a_peer_that_is_away() {
+    let reserved = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    let at = reserved.local_addr().unwrap();
+    drop(reserved);
+    let mut link = open(format!("udpout:{at}")).await;
+    assert_eq!(peer(&mut link).await, at.to_string());
+    link.send(&heartbeat(false)).unwrap();
+
+    let autopilot = UdpSocket::bind(at).await.unwrap();
+    let from = loop {
+        link.send(&heartbeat(false)).unwrap();
+        let mut bytes = [0; 512];
+        let read = timeout(Duration::from_millis(50), autopilot.recv_from(&mut bytes)).await;
+        if let Ok(Ok((_, from))) = read {
+            break from;
+        }
+    };
+    autopilot.send_to(&time(), from).await.unwrap();
+    assert_eq!(packet(&mut link).await, time());
+}
+
+#[tokio::test]
+async fn tcp_connects_again_and_sends_nothing_old() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let at = listener.local_addr().unwrap();
+    let mut link = open(format!("tcp:{at}")).await;
+    let (mut server, _) = listener.accept().await.unwrap();
+    peer(&mut link).await;
+    server.write_all(&heartbeat(true)).await.unwrap();
+    assert_eq!(packet(&mut link).await, heartbeat(true));
+
+    drop(server);
+    drop(listener);
+    let reason = lost(&mut link).await;
+    assert!(reason.contains(&at.to_string()), "{reason}");
+    assert_eq!(link.send(&time()), Err(SendError::NotConnected));
+    let reason = lost(&mut link).await;
+    assert!(reason.contains("nobody listens"), "{reason}");
+
+    let listener = TcpListener::bind(at).await.unwrap();
+    let (mut server, _) = timeout(PATIENCE, listener.accept()).await.unwrap().unwrap();
+    peer(&mut link).await;
+    link.send(&heartbeat(false)).unwrap();
+    let mut bytes = vec![0; heartbeat(false).len()];
+    timeout(PATIENCE, server.read_exact(&mut bytes)).await.unwrap().unwrap();
+    assert_eq!(bytes, heartbeat(false));
+}
+
+#[tokio::test]
+async fn tcpin_takes_one_client_after_the_other() {
+    let mut link = open("tcpin:127.0.0.1:0".into()).await;
+    let at = link.local_address().unwrap();
+    for _ in 0..2 {
+        let mut client =
+            timeout(PATIENCE, tokio::net::TcpStream::connect(at)).await.unwrap().unwrap();
+        client.write_all(&heartbeat(true)).await.unwrap();
+        peer(&mut link).await;
+        assert_eq!(packet(&mut link).await, heartbeat(true));
+        link.send(&time()).unwrap();
+        let mut bytes = vec![0; time().len()];
+        timeout(PATIENCE, client.read_exact(&mut bytes)).await.unwrap().unwrap();
+        assert_eq!(bytes, time());
+        drop(client);
+        lost(&mut link).await;
+    }
+}
+
+#[tokio::test]
+async fn a_device_that_is_missing_is_waited_for() {
+    let mut link = open("serial:/dev/no-such-autopilot:57600".into()).await;
+    let reason = lost(&mut link).await;
+    assert!(reason.contains("no device /dev/no-such-autopilot"), "{reason}");
+    assert_eq!(link.send(&time()), Err(SendError::NotConnected));
+}
+
+#[tokio::test]
+async fn a_reader_that_sleeps_gets_the_newest_packets() {
+    let mut link = open("udpin:127.0.0.1:0".into()).await;
+    let at = link.local_address().unwrap();
+    let autopilot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    autopilot.send_to(&heartbeat(true), at).await.unwrap();
+    peer(&mut link).await;
+    let mut sent = 0_u32;
+    while link.dropped() < 100 {
+        for _ in 0..20 {
+            sent += 1;
+            let message = SYSTEM_TIME_DATA { time_unix_usec: 7, time_boot_ms: sent };
+            let raw = frame::encode(AUTOPILOT, 0, &MavMessage::SYSTEM_TIME(message));
+            autopilot.send_to(&raw, at).await.unwrap();
+        }
+        tokio::task::yield_now().await;
+    }
+    let mut newest = 0;
+    while newest < sent {
+        if let LinkEvent::Frame { frame, .. } = next(&mut link).await
+            && let Some(MavMessage::SYSTEM_TIME(time)) = frame.message
+        {
+            newest = time.time_boot_ms;
+        }
+    }
+}
