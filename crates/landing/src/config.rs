@@ -54,6 +54,8 @@ pub struct TargetConfig {
     pub smoothing_s: f64,
     /// What the time constant grows by per metre of height, in s/m (0 to 1).
     pub smoothing_s_per_height: f64,
+    /// After so long without a detection the estimate is forgotten, in s (0.5 to 600).
+    pub forget_after_s: f64,
     /// Outliers in a row that agree with each other and so begin a new estimate (2 to 100).
     pub restart_after: u32,
     /// Detections that make a target (1 to 100).
@@ -72,6 +74,7 @@ impl Default for TargetConfig {
             gate_per_height: 0.1,
             smoothing_s: 0.1,
             smoothing_s_per_height: 0.05,
+            forget_after_s: 5.0,
             restart_after: 6,
             confirm_after: 3,
         }
@@ -118,6 +121,12 @@ pub struct PhaseConfig {
     pub hold_timeout_s: f64,
     /// Longest hold by the operator before the landing is aborted, in s (1 to 3600).
     pub operator_hold_timeout_s: f64,
+    /// A vehicle that has held for a lost marker so long climbs to `regain_height_m`, in s (0 to 60).
+    pub regain_after_s: f64,
+    /// Height over the target up to which a vehicle climbs to see a lost marker again, in m; 0 is never (0 to 10).
+    pub regain_height_m: f64,
+    /// Speed of that climb, in m/s (0.1 to 2).
+    pub regain_climb_m_s: f64,
     /// Interval at which LAND is asked for again, in s (0.1 to 5).
     pub land_retry_s: f64,
     /// Longest wait for the LAND mode before the landing is aborted, in s (0.5 to 60).
@@ -147,6 +156,9 @@ impl Default for PhaseConfig {
             descend_timeout_s: 120.0,
             hold_timeout_s: 60.0,
             operator_hold_timeout_s: 600.0,
+            regain_after_s: 2.0,
+            regain_height_m: 1.5,
+            regain_climb_m_s: 0.3,
             land_retry_s: 0.5,
             land_timeout_s: 5.0,
             touchdown_timeout_s: 60.0,
@@ -212,6 +224,7 @@ impl TargetConfig {
         check("target.gate_per_height", self.gate_per_height, 0.0, 1.0)?;
         check("target.smoothing_s", self.smoothing_s, 0.0, 5.0)?;
         check("target.smoothing_s_per_height", self.smoothing_s_per_height, 0.0, 1.0)?;
+        check("target.forget_after_s", self.forget_after_s, 0.5, 600.0)?;
         check("target.restart_after", f64::from(self.restart_after), 2.0, 100.0)?;
         check("target.confirm_after", f64::from(self.confirm_after), 1.0, 100.0)
     }
@@ -237,6 +250,9 @@ impl PhaseConfig {
         check("phases.descend_timeout_s", self.descend_timeout_s, 1.0, 600.0)?;
         check("phases.hold_timeout_s", self.hold_timeout_s, 1.0, 600.0)?;
         check("phases.operator_hold_timeout_s", self.operator_hold_timeout_s, 1.0, 3600.0)?;
+        check("phases.regain_after_s", self.regain_after_s, 0.0, 60.0)?;
+        check("phases.regain_height_m", self.regain_height_m, 0.0, 10.0)?;
+        check("phases.regain_climb_m_s", self.regain_climb_m_s, 0.1, 2.0)?;
         check("phases.land_retry_s", self.land_retry_s, 0.1, 5.0)?;
         check("phases.land_timeout_s", self.land_timeout_s, 0.5, 60.0)?;
         check("phases.touchdown_timeout_s", self.touchdown_timeout_s, 5.0, 600.0)?;

@@ -1,37 +1,285 @@
 //! The landing decision as one function of time and events.
 
-use crate::config::{Config, ConfigError};
-use crate::decision::{Action, Decision, Reason};
-use crate::event::Event;
-use crate::phase::Phase;
+use geometry::Vector;
+
+use crate::config::{Config, ConfigError, OnAbort};
+use crate::decision::{Action, Decision, Reason, Rejection, TargetEstimate};
+use crate::envelope;
+use crate::event::{Event, Frame, MarkerInFrame, Mode, VehicleState};
+use crate::guidance::{Guide, Progress, Situation};
+use crate::history::History;
+use crate::phase::{Facts, Machine, Phase, VehicleFacts};
+use crate::target::Target;
 use crate::time::Timestamp;
+
+/// Positions and velocities beyond this are no flight of ours, in m and m/s.
+const FARTHEST: f64 = 1e6;
 
 /// One landing after the other: told what happens, it answers what to do.
 #[derive(Clone, Debug)]
 pub struct Lander {
-    phase: Phase,
+    config: Config,
+    now: Option<Timestamp>,
+    history: History,
+    target: Target,
+    sightings: Sightings,
+    newest_frame: Option<Timestamp>,
+    guide: Guide,
+    machine: Machine,
+    land_asked: Option<Timestamp>,
+}
+
+/// The markers used, as moments.
+#[derive(Copy, Clone, Debug, Default)]
+struct Sightings {
+    newest: Option<Timestamp>,
+    /// How many there were without a long gap.
+    in_a_row: u32,
 }
 
 impl Lander {
     /// A lander that waits for a start; refuses settings out of range.
     pub fn new(config: Config) -> Result<Self, ConfigError> {
         config.validate()?;
-        Ok(Self { phase: Phase::Idle })
+        Ok(Self {
+            config,
+            now: None,
+            history: History::new(config.target.max_extrapolation_s),
+            target: Target::new(config.target),
+            sightings: Sightings::default(),
+            newest_frame: None,
+            guide: Guide::new(config.guidance),
+            machine: Machine::new(config.phases),
+            land_asked: None,
+        })
     }
 
-    /// What to do now that `event` has happened.
-    pub fn step(&mut self, _now: Timestamp, _event: Event) -> Decision {
+    /// What to do now that `event` has happened. A `now` earlier than the last one counts as the last one.
+    pub fn step(&mut self, now: Timestamp, event: Event) -> Decision {
+        let now = self.now.map_or(now, |last| last.max(now));
+        self.now = Some(now);
+        let (operator, refused) = match event {
+            Event::Vehicle(state) => (None, self.vehicle(now, state)),
+            Event::Frame(frame) => (None, self.frame(now, &frame)),
+            Event::Operator(command) => (Some(command), Ok(())),
+            Event::Tick => (None, Ok(())),
+        };
+        let facts = Facts {
+            now,
+            operator,
+            vehicle: self.history.newest().map(|state| facts_of(state, now)),
+            target_age_s: self.sightings.age_s(now),
+            target_confirmed: self.sightings.in_a_row >= self.config.target.confirm_after,
+            progress: self.progress(now),
+        };
+        if self.machine.advance(&facts) {
+            self.guide = Guide::new(self.config.guidance);
+        }
+        let (action, why) = self.act(now);
         Decision {
-            phase: self.phase,
-            action: Action::None,
-            why: Reason::WaitingForStart,
-            target: None,
-            rejected: None,
+            phase: self.machine.phase(),
+            action,
+            why,
+            target: self
+                .history
+                .newest()
+                .and_then(|state| self.target.seen_from(state.position, now)),
+            rejected: refused.err(),
         }
     }
 
     /// Where the landing stands.
     pub fn phase(&self) -> Phase {
-        self.phase
+        self.machine.phase()
     }
+
+    fn vehicle(&mut self, now: Timestamp, state: VehicleState) -> Result<(), Rejection> {
+        if !state.is_finite() {
+            return Err(Rejection::NotFinite);
+        }
+        if (state.position - geometry::Point::origin()).norm() > FARTHEST
+            || state.velocity.norm() > FARTHEST
+        {
+            return Err(Rejection::Implausible);
+        }
+        self.timely(now, state.stamp, self.config.phases.stale_vehicle_s)?;
+        if self.history.push(state) { Ok(()) } else { Err(Rejection::OutOfOrder) }
+    }
+
+    fn frame(&mut self, now: Timestamp, frame: &Frame) -> Result<(), Rejection> {
+        if frame.image_size.0 == 0
+            || frame.image_size.1 == 0
+            || frame.marker.is_some_and(|m| !m.is_finite())
+        {
+            return Err(Rejection::NotFinite);
+        }
+        self.timely(now, frame.stamp, self.config.target.max_latency_s)?;
+        if self.newest_frame.is_some_and(|newest| frame.stamp <= newest) {
+            return Err(Rejection::OutOfOrder);
+        }
+        self.newest_frame = Some(frame.stamp);
+        let seen = frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
+        self.tell_guide(frame, seen.is_ok());
+        seen
+    }
+
+    /// A marker with a pose goes through the target's gates; one without serves only a guidance that needs none.
+    fn marker(&mut self, frame: &Frame, marker: &MarkerInFrame) -> Result<(), Rejection> {
+        if marker.confidence < self.config.target.min_confidence {
+            return Err(Rejection::LowConfidence);
+        }
+        match self.target.observe(frame, marker, &self.history) {
+            Err(Rejection::NoPose) if !self.guide.needs_pose() => {}
+            Err(rejection) => return Err(rejection),
+            Ok(()) => {}
+        }
+        self.sightings.add(frame.stamp, self.config.phases.lost_target_s);
+        Ok(())
+    }
+
+    /// The thesis' controller runs once per frame, and only while it descends.
+    fn tell_guide(&mut self, frame: &Frame, used: bool) {
+        let Some(state) = self.history.newest() else { return };
+        if !matches!(self.machine.phase(), Phase::Approach | Phase::Descend) {
+            return;
+        }
+        let motion = self.history.at(frame.stamp);
+        let heading_rad =
+            motion.map_or(state.heading_rad(), |motion| motion.ned_from_body.euler().2);
+        let altitude_m = self.target.seen_from(state.position, frame.stamp);
+        let altitude_m = altitude_m.map_or(-state.position.z(), |target| target.height_m);
+        let marker = frame.marker.filter(|_| used);
+        self.guide.frame(&Frame { marker, ..*frame }, heading_rad, altitude_m);
+    }
+
+    fn timely(&self, now: Timestamp, stamp: Timestamp, max_age_s: f64) -> Result<(), Rejection> {
+        let age_s = now.seconds_since(stamp);
+        if age_s < -self.config.target.max_future_s {
+            Err(Rejection::FromTheFuture)
+        } else if age_s > max_age_s {
+            Err(Rejection::Stale)
+        } else {
+            Ok(())
+        }
+    }
+
+    fn progress(&mut self, now: Timestamp) -> Progress {
+        if !matches!(self.machine.phase(), Phase::Approach | Phase::Descend) {
+            return Progress::Unchanged;
+        }
+        let Some(vehicle) = self.history.newest().copied() else { return Progress::Unchanged };
+        let target = self.target.seen_from(vehicle.position, now);
+        self.guide.progress(&situation(&self.config, now, &vehicle, target, self.sightings))
+    }
+
+    /// What the present phase does.
+    fn act(&mut self, now: Timestamp) -> (Action, Reason) {
+        let why = self.machine.why();
+        let guided = matches!(self.machine.phase(), Phase::Approach | Phase::Descend);
+        if !guided {
+            self.guide.rest();
+        }
+        match self.machine.phase() {
+            Phase::Idle | Phase::Landed | Phase::PilotInCommand => (Action::None, why),
+            Phase::Search if why == Reason::TakingOff => (Action::None, why),
+            Phase::Search => (Action::hover(), why),
+            Phase::Approach | Phase::Descend => self.guided(now),
+            Phase::Hold => (self.hold(now), why),
+            Phase::Final if self.machine.is_landing() => (Action::None, why),
+            Phase::Final => (self.ask_for_land(now), why),
+            Phase::Aborted => (self.aborted(now), why),
+        }
+    }
+
+    fn guided(&mut self, now: Timestamp) -> (Action, Reason) {
+        let Some(vehicle) = self.history.newest().copied() else {
+            return (Action::hover(), Reason::VehicleStale);
+        };
+        let target = self.target.seen_from(vehicle.position, now);
+        let situation = situation(&self.config, now, &vehicle, target, self.sightings);
+        let (wanted, why) = self.guide.velocity(&situation);
+        let velocity = envelope::admit(&self.config.envelope, wanted, situation.may_descend());
+        (Action::Velocity { velocity, yaw_rate: 0.0 }, why)
+    }
+
+    /// Hovers; where the marker was lost so low that it may just have left the view, climbs a little.
+    fn hold(&self, now: Timestamp) -> Action {
+        let phases = &self.config.phases;
+        let lost = self.machine.why() == Reason::TargetLost
+            && self.machine.elapsed_s(now) > phases.regain_after_s;
+        let low = self.history.newest().is_some_and(|vehicle| {
+            let age_s = now.seconds_since(vehicle.stamp);
+            let target = self.target.seen_from(vehicle.position, now);
+            age_s <= phases.stale_vehicle_s
+                && target.is_some_and(|target| target.height_m < phases.regain_height_m)
+        });
+        if !(lost && low) {
+            return Action::hover();
+        }
+        let wanted = Vector::new(0.0, 0.0, -phases.regain_climb_m_s);
+        Action::Velocity {
+            velocity: envelope::admit(&self.config.envelope, wanted, false),
+            yaw_rate: 0.0,
+        }
+    }
+
+    /// Asks for LAND at once and at intervals, and hovers in between.
+    fn ask_for_land(&mut self, now: Timestamp) -> Action {
+        let first = self.machine.elapsed_s(now) <= 0.0;
+        let again = |asked: Timestamp| now.seconds_since(asked) >= self.config.phases.land_retry_s;
+        if first || self.land_asked.is_none_or(again) {
+            self.land_asked = Some(now);
+            return Action::Land;
+        }
+        Action::hover()
+    }
+
+    fn aborted(&mut self, now: Timestamp) -> Action {
+        let phases = &self.config.phases;
+        let follows = self.history.newest().is_some_and(|state| {
+            let fresh = now.seconds_since(state.stamp) <= phases.stale_vehicle_s;
+            fresh && state.armed && state.mode == Mode::Guided
+        });
+        if self.machine.is_released() || !follows {
+            return Action::None;
+        }
+        let elapsed_s = self.machine.elapsed_s(now);
+        match phases.on_abort {
+            OnAbort::Hover if elapsed_s <= phases.release_after_s => Action::hover(),
+            OnAbort::Land if elapsed_s <= phases.land_timeout_s => self.ask_for_land(now),
+            OnAbort::Hover | OnAbort::Land => Action::None,
+        }
+    }
+}
+
+impl Sightings {
+    fn add(&mut self, stamp: Timestamp, longest_gap_s: f64) {
+        let gap_s = self.age_s(stamp);
+        self.in_a_row = if gap_s > longest_gap_s { 1 } else { self.in_a_row.saturating_add(1) };
+        self.newest = Some(stamp);
+    }
+
+    fn age_s(&self, now: Timestamp) -> f64 {
+        self.newest.map_or(f64::INFINITY, |newest| now.seconds_since(newest))
+    }
+}
+
+fn facts_of(state: &VehicleState, now: Timestamp) -> VehicleFacts {
+    VehicleFacts {
+        age_s: now.seconds_since(state.stamp),
+        mode: state.mode,
+        armed: state.armed,
+        landed: state.landed,
+        altitude_m: -state.position.z(),
+    }
+}
+
+fn situation<'a>(
+    config: &'a Config,
+    now: Timestamp,
+    vehicle: &'a VehicleState,
+    target: Option<TargetEstimate>,
+    sightings: Sightings,
+) -> Situation<'a> {
+    Situation { now, vehicle, target, age_s: sightings.age_s(now), phases: &config.phases }
 }

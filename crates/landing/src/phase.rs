@@ -1,6 +1,28 @@
-//! The phases of a landing.
+//! The phases of a landing: an explicit machine over plain facts.
+//!
+//! ```text
+//!            start            seen             inside the funnel       low and settled        disarmed
+//!   Idle -----------> Search ------> Approach <-----------------> Descend ----------> Final ----------> Landed
+//!                       |                |        outside            |                  |
+//!                       | not found      | lost, no progress         | lost             | LAND refused, no touchdown
+//!                       v                v                           v                  v
+//!                      Hold <------------+---------------------------+               Aborted
+//!                       |  seen again: Approach · resumed, vehicle heard again: Search   ^
+//!                       +------------------------- held too long -----------------------+
+//! ```
+//!
+//! From every phase that is not terminal: the operator's abort and too long a landing lead to Aborted, the operator's hold to Hold
+//! (not once the autopilot lands), a stale vehicle state to Hold (Final just waits), a mode that is neither GUIDED nor the
+//! LAND we asked for to PilotInCommand, the ground to Final, disarmed motors to Landed or Aborted. Idle, Landed, Aborted and
+//! PilotInCommand are terminal: only a new start leaves them.
 
 use std::fmt;
+
+use crate::config::PhaseConfig;
+use crate::decision::Reason;
+use crate::event::{Landed, Mode, OperatorCommand};
+use crate::guidance::Progress;
+use crate::time::Timestamp;
 
 /// Where the landing stands.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
@@ -23,6 +45,52 @@ pub enum Phase {
     Aborted,
     /// Somebody else flies; silent until a new start.
     PilotInCommand,
+}
+
+/// What the machine looks at.
+#[derive(Copy, Clone, Debug)]
+pub struct Facts {
+    /// The time.
+    pub now: Timestamp,
+    /// What the operator has just asked for.
+    pub operator: Option<OperatorCommand>,
+    /// The vehicle; `None` before its first state.
+    pub vehicle: Option<VehicleFacts>,
+    /// Time since the exposure of the newest marker used, in seconds; infinite when there was none.
+    pub target_age_s: f64,
+    /// True when the marker was seen often enough, without a long gap.
+    pub target_confirmed: bool,
+    /// How far the guidance is.
+    pub progress: Progress,
+}
+
+/// The vehicle as far as phases care.
+#[derive(Copy, Clone, Debug)]
+pub struct VehicleFacts {
+    /// Age of the state, in seconds.
+    pub age_s: f64,
+    /// The flight mode.
+    pub mode: Mode,
+    /// True when the motors may turn.
+    pub armed: bool,
+    /// Contact with the ground.
+    pub landed: Landed,
+    /// Height over the autopilot's local origin, in metres.
+    pub altitude_m: f64,
+}
+
+/// The machine: a phase, since when, and why.
+#[derive(Clone, Debug)]
+pub struct Machine {
+    config: PhaseConfig,
+    phase: Phase,
+    why: Reason,
+    entered: Timestamp,
+    started: Timestamp,
+    /// The autopilot has entered the LAND mode we asked for.
+    landing: bool,
+    /// Somebody has taken an aborted vehicle over, so it is never spoken to again.
+    released: bool,
 }
 
 impl Phase {
@@ -50,5 +118,255 @@ impl Phase {
 impl fmt::Display for Phase {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
+    }
+}
+
+impl Machine {
+    /// A machine that waits for a start.
+    pub fn new(config: PhaseConfig) -> Self {
+        Self {
+            config,
+            phase: Phase::Idle,
+            why: Reason::WaitingForStart,
+            entered: Timestamp::default(),
+            started: Timestamp::default(),
+            landing: false,
+            released: false,
+        }
+    }
+
+    /// Where the landing stands.
+    pub fn phase(&self) -> Phase {
+        self.phase
+    }
+
+    /// Why the landing stands there.
+    pub fn why(&self) -> Reason {
+        self.why
+    }
+
+    /// Seconds since the phase was entered.
+    pub fn elapsed_s(&self, now: Timestamp) -> f64 {
+        now.seconds_since(self.entered)
+    }
+
+    /// True when the autopilot has entered the LAND mode we asked for.
+    pub fn is_landing(&self) -> bool {
+        self.landing
+    }
+
+    /// True when somebody has taken an aborted vehicle over.
+    pub fn is_released(&self) -> bool {
+        self.released
+    }
+
+    /// Takes at most one step; true when a landing has just begun.
+    pub fn advance(&mut self, facts: &Facts) -> bool {
+        if facts.operator == Some(OperatorCommand::Start) && self.phase.is_terminal() {
+            return self.start(facts);
+        }
+        if self.phase.is_terminal() {
+            self.watch_release(facts);
+            return false;
+        }
+        if let Some(vehicle) = facts.vehicle
+            && self.phase == Phase::Final
+            && vehicle.mode == Mode::Land
+            && !self.landing
+        {
+            self.landing = true;
+            self.entered = facts.now;
+            self.why = Reason::AutopilotLands;
+        }
+        if let Some((phase, why)) = self.interruption(facts).or_else(|| self.next(facts)) {
+            self.enter(phase, why, facts.now);
+        }
+        false
+    }
+
+    /// A start is refused, with the reason, while the autopilot would not follow.
+    fn start(&mut self, facts: &Facts) -> bool {
+        let fresh = |vehicle: &VehicleFacts| vehicle.age_s <= self.config.stale_vehicle_s;
+        let Some(vehicle) = facts.vehicle.filter(fresh) else {
+            self.why = Reason::NoVehicleState;
+            return false;
+        };
+        let watching =
+            vehicle.mode == Mode::Land && vehicle.altitude_m <= self.config.watch_height_m;
+        if !vehicle.armed {
+            self.why = Reason::NotArmed;
+        } else if watching {
+            self.begin(Phase::Final, Reason::AutopilotLands, facts.now);
+            self.landing = true;
+        } else if vehicle.mode != Mode::Guided {
+            self.why = Reason::NotGuided;
+        } else if vehicle.landed == Landed::OnGround {
+            self.why = Reason::OnTheGround;
+        } else {
+            self.begin(Phase::Search, Reason::Searching, facts.now);
+        }
+        !self.phase.is_terminal()
+    }
+
+    fn begin(&mut self, phase: Phase, why: Reason, now: Timestamp) {
+        self.enter(phase, why, now);
+        self.started = now;
+        self.released = false;
+    }
+
+    fn enter(&mut self, phase: Phase, why: Reason, now: Timestamp) {
+        self.phase = phase;
+        self.why = why;
+        self.entered = now;
+        self.landing = false;
+    }
+
+    /// After an abort, the first mode that is not ours ends our say.
+    fn watch_release(&mut self, facts: &Facts) {
+        if let Some(vehicle) = facts.vehicle {
+            self.released |= vehicle.mode != Mode::Guided;
+        }
+    }
+
+    /// What ends or stops a landing in whatever phase it is.
+    fn interruption(&self, facts: &Facts) -> Option<(Phase, Reason)> {
+        if let Some(vehicle) = facts.vehicle {
+            let ours = vehicle.mode == Mode::Guided && !self.landing
+                || vehicle.mode == Mode::Land && self.phase == Phase::Final;
+            if !ours {
+                return Some((Phase::PilotInCommand, Reason::PilotTookOver));
+            }
+            if !vehicle.armed {
+                return Some(self.disarmed(vehicle));
+            }
+        }
+        if facts.operator == Some(OperatorCommand::Abort) {
+            return Some((Phase::Aborted, Reason::OperatorAbort));
+        }
+        if self.landing {
+            return None;
+        }
+        if facts.operator == Some(OperatorCommand::Hold) {
+            return Some((Phase::Hold, Reason::OperatorHold));
+        }
+        if facts.now.seconds_since(self.started) > self.config.landing_timeout_s {
+            return Some((Phase::Aborted, Reason::LandingTooLong));
+        }
+        let touched = facts.vehicle.is_some_and(|vehicle| vehicle.landed == Landed::OnGround);
+        if touched && self.phase != Phase::Final {
+            return Some((Phase::Final, Reason::TouchedEarly));
+        }
+        None
+    }
+
+    fn disarmed(&self, vehicle: VehicleFacts) -> (Phase, Reason) {
+        if self.landing || vehicle.landed == Landed::OnGround {
+            (Phase::Landed, Reason::TouchedDown)
+        } else {
+            (Phase::Aborted, Reason::Disarmed)
+        }
+    }
+
+    /// What comes after the present phase by itself.
+    fn next(&mut self, facts: &Facts) -> Option<(Phase, Reason)> {
+        let deaf = facts.vehicle.is_none_or(|vehicle| vehicle.age_s > self.config.stale_vehicle_s);
+        match self.phase {
+            Phase::Idle | Phase::Landed | Phase::Aborted | Phase::PilotInCommand => None,
+            Phase::Search | Phase::Approach | Phase::Descend if deaf => {
+                Some((Phase::Hold, Reason::VehicleStale))
+            }
+            Phase::Search => self.after_search(facts),
+            Phase::Approach => self.after_approach(facts),
+            Phase::Descend => self.after_descend(facts),
+            Phase::Hold => self.after_hold(facts, deaf),
+            Phase::Final => self.after_final(facts),
+        }
+    }
+
+    fn after_search(&mut self, facts: &Facts) -> Option<(Phase, Reason)> {
+        if facts.vehicle.is_some_and(|vehicle| vehicle.landed == Landed::TakingOff) {
+            self.why = Reason::TakingOff;
+            self.entered = facts.now;
+            return None;
+        }
+        self.why = Reason::Searching;
+        if self.sees(facts) {
+            return Some((Phase::Approach, Reason::Aligning));
+        }
+        self.over(facts, self.config.search_timeout_s)
+            .then_some((Phase::Hold, Reason::TargetNotFound))
+    }
+
+    fn after_approach(&self, facts: &Facts) -> Option<(Phase, Reason)> {
+        match facts.progress {
+            Progress::Ready(why) => Some((Phase::Final, why)),
+            _ if self.lost(facts) => Some((Phase::Hold, Reason::TargetLost)),
+            Progress::Descending => Some((Phase::Descend, Reason::Descending)),
+            Progress::Aligning | Progress::Unchanged => self
+                .over(facts, self.config.approach_timeout_s)
+                .then_some((Phase::Hold, Reason::NoProgress)),
+        }
+    }
+
+    fn after_descend(&self, facts: &Facts) -> Option<(Phase, Reason)> {
+        match facts.progress {
+            Progress::Ready(why) => Some((Phase::Final, why)),
+            _ if self.lost(facts) => Some((Phase::Hold, Reason::TargetLost)),
+            Progress::Aligning => Some((Phase::Approach, Reason::Aligning)),
+            Progress::Descending | Progress::Unchanged => self
+                .over(facts, self.config.descend_timeout_s)
+                .then_some((Phase::Hold, Reason::NoProgress)),
+        }
+    }
+
+    fn after_hold(&self, facts: &Facts, deaf: bool) -> Option<(Phase, Reason)> {
+        if facts.operator == Some(OperatorCommand::Resume) {
+            return Some((Phase::Search, Reason::Searching));
+        }
+        let by_operator = self.why == Reason::OperatorHold;
+        let timeout_s = if by_operator {
+            self.config.operator_hold_timeout_s
+        } else {
+            self.config.hold_timeout_s
+        };
+        if self.over(facts, timeout_s) {
+            return Some((Phase::Aborted, Reason::HeldTooLong));
+        }
+        let resumes = match self.why {
+            Reason::TargetLost | Reason::TargetNotFound => self.sees(facts) && !deaf,
+            Reason::VehicleStale => !deaf,
+            _ => false,
+        };
+        resumes.then_some((Phase::Search, Reason::Searching))
+    }
+
+    fn after_final(&mut self, facts: &Facts) -> Option<(Phase, Reason)> {
+        if !self.landing {
+            return self
+                .over(facts, self.config.land_timeout_s)
+                .then_some((Phase::Aborted, Reason::LandRefused));
+        }
+        if !self.over(facts, self.config.touchdown_timeout_s) {
+            return None;
+        }
+        // Some autopilots are set up never to disarm by themselves.
+        let down = facts.vehicle.is_some_and(|vehicle| vehicle.landed == Landed::OnGround);
+        Some(if down {
+            (Phase::Landed, Reason::TouchedDown)
+        } else {
+            (Phase::Aborted, Reason::TouchdownOverdue)
+        })
+    }
+
+    fn sees(&self, facts: &Facts) -> bool {
+        facts.target_confirmed && facts.target_age_s <= self.config.stale_target_s
+    }
+
+    fn lost(&self, facts: &Facts) -> bool {
+        facts.target_age_s > self.config.lost_target_s
+    }
+
+    fn over(&self, facts: &Facts, timeout_s: f64) -> bool {
+        self.elapsed_s(facts.now) > timeout_s
     }
 }

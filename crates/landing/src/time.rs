@@ -12,7 +12,7 @@ impl Timestamp {
 
     /// The moment so many seconds after the clock's origin; not a number gives the origin.
     pub fn from_seconds(seconds: f64) -> Self {
-        Self((seconds * 1e9) as i64)
+        Self((seconds * 1e9).round() as i64)
     }
 
     /// Nanoseconds after the clock's origin.
@@ -33,7 +33,7 @@ impl Timestamp {
 
     /// The moment so many seconds later, at the ends of time at most.
     pub fn plus_seconds(self, seconds: f64) -> Self {
-        Self(self.0.saturating_add((seconds * 1e9) as i64))
+        Self(self.0.saturating_add((seconds * 1e9).round() as i64))
     }
 }
 
