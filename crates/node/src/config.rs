@@ -1,0 +1,388 @@
+//! Layered configuration: defaults, a user's file, and `key=value` settings.
+//!
+//! Each service ships a TOML file with every key, its default, and a comment with meaning, unit and range. A user's
+//! file and single settings are laid over it. A key that is not among the defaults, a value of another type and a
+//! value out of range are refused with the place it came from, the key, the value and the limit.
+
+use std::fmt::Display;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use toml::{Table, Value};
+
+/// A service's configuration.
+pub trait Settings: DeserializeOwned {
+    /// The TOML file with the defaults of all keys.
+    const DEFAULTS: &'static str;
+
+    /// Checks the values' ranges.
+    fn check(&self, check: &mut Check<'_>);
+}
+
+/// What a user lays over the defaults.
+#[derive(Clone, Debug, Default)]
+pub struct Layers {
+    /// A file.
+    pub file: Option<PathBuf>,
+    /// Settings `key=value`, with dotted keys and TOML values; the quotes of a string may be left out.
+    pub set: Vec<String>,
+}
+
+/// Why a configuration was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// A file that cannot be read.
+    #[error(
+        "reading the configuration file {path:?}: {cause}; check the path, or leave `--config` out for the defaults"
+    )]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        cause: std::io::Error,
+    },
+    /// Text that is no TOML.
+    #[error("{source_name} is not valid TOML: {cause}")]
+    Syntax {
+        /// The file or setting.
+        source_name: String,
+        /// The parser's reason.
+        cause: String,
+    },
+    /// A setting without `=`.
+    #[error("the setting `{text}` is not of the form key=value")]
+    Form {
+        /// The setting.
+        text: String,
+    },
+    /// A key that does not exist.
+    #[error("{source_name}: there is no key `{key}`{hint}")]
+    UnknownKey {
+        /// The file or setting.
+        source_name: String,
+        /// The key.
+        key: String,
+        /// A similar key, or nothing.
+        hint: String,
+    },
+    /// A value of a type that the key does not take.
+    #[error("{source_name}: `{key}` = {value} is {found}, where {wanted} is needed")]
+    WrongType {
+        /// The file or setting.
+        source_name: String,
+        /// The key.
+        key: String,
+        /// The value.
+        value: String,
+        /// Its type.
+        found: &'static str,
+        /// The default's type.
+        wanted: &'static str,
+    },
+    /// A value that the service does not take.
+    #[error("{source_name}: `{key}` = {value} is refused: {limit}")]
+    Refused {
+        /// The file or setting.
+        source_name: String,
+        /// The key.
+        key: String,
+        /// The value.
+        value: String,
+        /// What it must be.
+        limit: String,
+    },
+}
+
+/// A configuration, and what it was made from.
+#[derive(Clone, Debug)]
+pub struct Effective<T> {
+    /// The values.
+    pub settings: T,
+    /// The same as TOML.
+    pub table: Table,
+}
+
+/// A layer with its name.
+struct Layer {
+    name: String,
+    table: Table,
+}
+
+impl Layers {
+    /// The configuration of a service under these layers.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the layer, the key, the value and the limit.
+    pub fn load<T: Settings>(&self) -> Result<Effective<T>, ConfigError> {
+        let defaults = parse("the defaults", T::DEFAULTS)?;
+        let mut table = defaults.clone();
+        let mut layers = Vec::new();
+        if let Some(path) = &self.file {
+            layers.push(file_layer(path)?);
+        }
+        for text in &self.set {
+            layers.push(setting_layer(text, &defaults)?);
+        }
+        for layer in &layers {
+            lay_over(&mut table, &layer.table, &layer.name, &mut String::new())?;
+        }
+        let settings: T =
+            Value::Table(table.clone()).try_into().map_err(|cause: toml::de::Error| {
+                let message = cause.message().to_owned();
+                let source_name =
+                    layers.last().map_or("the defaults".to_owned(), |l| l.name.clone());
+                ConfigError::Syntax { source_name, cause: message }
+            })?;
+        let mut check = Check { table: &table, layers: &layers, problem: None };
+        settings.check(&mut check);
+        match check.problem {
+            Some(problem) => Err(problem),
+            None => Ok(Effective { settings, table }),
+        }
+    }
+}
+
+fn parse(name: &str, text: &str) -> Result<Table, ConfigError> {
+    text.parse::<Table>().map_err(|cause| ConfigError::Syntax {
+        source_name: name.to_owned(),
+        cause: cause.to_string().trim_end().to_owned(),
+    })
+}
+
+fn file_layer(path: &Path) -> Result<Layer, ConfigError> {
+    let text = std::fs::read_to_string(path)
+        .map_err(|cause| ConfigError::Unreadable { path: path.to_owned(), cause })?;
+    let name = path.display().to_string();
+    let table = parse(&name, &text)?;
+    Ok(Layer { name, table })
+}
+
+fn setting_layer(text: &str, defaults: &Table) -> Result<Layer, ConfigError> {
+    let name = format!("--set {text}");
+    let (key, value) =
+        text.split_once('=').ok_or_else(|| ConfigError::Form { text: text.to_owned() })?;
+    let (key, value) = (key.trim(), value.trim());
+    // A bare word is a string where the default is one, so that the shell's quotes are enough.
+    let quoted = || parse(&name, &format!("{key} = {}", Value::String(value.to_owned())));
+    let default_is_text = matches!(look_up(defaults, key), Some(Value::String(_)));
+    let table = match parse(&name, &format!("{key} = {value}")) {
+        Ok(table) if default_is_text && !matches!(look_up(&table, key), Some(Value::String(_))) => {
+            quoted()?
+        }
+        Ok(table) => table,
+        Err(_) if default_is_text => quoted()?,
+        Err(problem) => return Err(problem),
+    };
+    Ok(Layer { name, table })
+}
+
+fn look_up<'a>(table: &'a Table, dotted: &str) -> Option<&'a Value> {
+    let (first, rest) = match dotted.split_once('.') {
+        Some((first, rest)) => (first, Some(rest)),
+        None => (dotted, None),
+    };
+    let value = table.get(first.trim())?;
+    match rest {
+        Some(rest) => look_up(value.as_table()?, rest),
+        None => Some(value),
+    }
+}
+
+fn lay_over(
+    base: &mut Table,
+    over: &Table,
+    source_name: &str,
+    prefix: &mut String,
+) -> Result<(), ConfigError> {
+    for (name, value) in over {
+        let key = format!("{prefix}{name}");
+        let Some(slot) = base.get_mut(name) else {
+            let hint = similar(base.keys(), name)
+                .map_or_else(String::new, |near| format!("; did you mean `{prefix}{near}`?"));
+            return Err(ConfigError::UnknownKey { source_name: source_name.to_owned(), key, hint });
+        };
+        match (slot, value) {
+            (Value::Table(slot), Value::Table(value)) => {
+                lay_over(slot, value, source_name, &mut format!("{key}."))?;
+            }
+            // Whole numbers are numbers.
+            (Value::Float(slot), Value::Integer(value)) => *slot = *value as f64,
+            (slot, value) if slot.same_type(value) => *slot = value.clone(),
+            (slot, value) => {
+                return Err(ConfigError::WrongType {
+                    source_name: source_name.to_owned(),
+                    key,
+                    value: value.to_string(),
+                    found: kind(value),
+                    wanted: kind(slot),
+                });
+            }
+        }
+    }
+    Ok(())
+}
+
+fn kind(value: &Value) -> &'static str {
+    match value {
+        Value::String(_) => "a string",
+        Value::Integer(_) => "a whole number",
+        Value::Float(_) => "a number",
+        Value::Boolean(_) => "true or false",
+        Value::Datetime(_) => "a date",
+        Value::Array(_) => "a list",
+        Value::Table(_) => "a table",
+    }
+}
+
+fn similar<'a>(keys: impl Iterator<Item = &'a String>, wanted: &str) -> Option<&'a String> {
+    keys.map(|key| (strsim::jaro_winkler(key, wanted), key))
+        .filter(|(likeness, _)| *likeness > 0.75)
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, key)| key)
+}
+
+/// Collects the first value that is out of range, with the layer it came from.
+pub struct Check<'a> {
+    table: &'a Table,
+    layers: &'a [Layer],
+    problem: Option<ConfigError>,
+}
+
+impl Check<'_> {
+    /// The number `key` must lie within `range`.
+    pub fn range<N: PartialOrd + Display>(
+        &mut self,
+        key: &str,
+        value: N,
+        range: RangeInclusive<N>,
+    ) {
+        let limit = || format!("it must be from {} to {}", range.start(), range.end());
+        self.holds(key, range.contains(&value), limit);
+    }
+
+    /// The value of `key` must be one of `allowed`.
+    pub fn one_of(&mut self, key: &str, value: &str, allowed: &[&str]) {
+        self.holds(key, allowed.contains(&value), || {
+            format!("it must be one of {}", allowed.join(", "))
+        });
+    }
+
+    /// The value of `key` must be a name: letters, digits, `-` and `_`, as it becomes a part of topic keys.
+    pub fn name(&mut self, key: &str, value: &str) {
+        let is_name = !value.is_empty()
+            && value.len() <= 64
+            && value.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c));
+        self.holds(key, is_name, || "a name is 1 to 64 letters, digits, `-` and `_`".to_owned());
+    }
+
+    /// The value of `key` must be accepted by `parse`.
+    pub fn parses<T, E: Display>(&mut self, key: &str, result: Result<T, E>) {
+        let problem = result.err().map(|e| e.to_string());
+        self.holds(key, problem.is_none(), || problem.unwrap_or_default());
+    }
+
+    fn holds(&mut self, key: &str, holds: bool, limit: impl FnOnce() -> String) {
+        if holds || self.problem.is_some() {
+            return;
+        }
+        let source_name = self
+            .layers
+            .iter()
+            .rev()
+            .find(|layer| look_up(&layer.table, key).is_some())
+            .map_or_else(|| "the defaults".to_owned(), |layer| layer.name.clone());
+        let value = look_up(self.table, key).map_or_else(String::new, ToString::to_string);
+        self.problem =
+            Some(ConfigError::Refused { source_name, key: key.to_owned(), value, limit: limit() });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde::Deserialize;
+
+    #[derive(Debug, Deserialize, PartialEq)]
+    #[serde(deny_unknown_fields)]
+    struct Camera {
+        name: String,
+        rate_hz: f64,
+        lens: Lens,
+    }
+
+    #[derive(Debug, Deserialize, PartialEq)]
+    #[serde(deny_unknown_fields)]
+    struct Lens {
+        focal_px: f64,
+    }
+
+    impl Settings for Camera {
+        const DEFAULTS: &'static str =
+            "name = \"down\"\nrate_hz = 15.0\n[lens]\nfocal_px = 1818.0\n";
+        fn check(&self, check: &mut Check<'_>) {
+            check.name("name", &self.name);
+            check.range("rate_hz", self.rate_hz, 0.1..=1000.0);
+            check.range("lens.focal_px", self.lens.focal_px, 1.0..=1e5);
+        }
+    }
+
+    fn load(file: Option<&str>, set: &[&str]) -> Result<Camera, String> {
+        let holder = tempfile::Builder::new().suffix(".toml").tempfile().unwrap();
+        if let Some(text) = file {
+            std::fs::write(holder.path(), text).unwrap();
+        }
+        let layers = Layers {
+            file: file.map(|_| holder.path().to_owned()),
+            set: set.iter().map(|s| (*s).to_owned()).collect(),
+        };
+        layers.load::<Camera>().map(|c| c.settings).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn settings_lie_over_the_file_and_the_file_over_the_defaults() {
+        let camera =
+            load(Some("rate_hz = 20\n[lens]\nfocal_px = 900.0"), &["rate_hz=30", "name=left"]);
+        let lens = Lens { focal_px: 900.0 };
+        assert_eq!(camera, Ok(Camera { name: "left".into(), rate_hz: 30.0, lens }));
+    }
+
+    #[test]
+    fn a_text_that_looks_like_a_number_stays_a_text() {
+        assert_eq!(load(None, &["name=7"]).unwrap().name, "7");
+    }
+
+    #[test]
+    fn refusals_name_place_key_value_and_limit() {
+        let check = |file: Option<&str>, set: &[&str], parts: &[&str]| {
+            let problem = load(file, set).unwrap_err();
+            for part in parts {
+                assert!(problem.contains(part), "`{part}` is not in: {problem}");
+            }
+        };
+        check(
+            None,
+            &["rate_hx=1"],
+            &["--set rate_hx=1", "no key `rate_hx`", "did you mean `rate_hz`"],
+        );
+        check(Some("[lens]\nfocal = 1.0"), &[], &[".toml", "`lens.focal`", "`lens.focal_px`?"]);
+        check(Some("rate_hz = 0"), &[], &[".toml", "`rate_hz` = 0", "from 0.1 to 1000"]);
+        check(None, &["rate_hz=nan"], &["from 0.1 to 1000"]);
+        check(
+            None,
+            &["rate_hz=true"],
+            &["`rate_hz` = true is true or false, where a number is needed"],
+        );
+        check(None, &["rate_hz"], &["not of the form key=value"]);
+        check(None, &["rate_hz=1 2"], &["--set rate_hz=1 2 is not valid TOML"]);
+        check(Some("rate_hz = = 1"), &[], &["is not valid TOML", ".toml"]);
+        check(None, &["name=a/b"], &["letters, digits"]);
+    }
+
+    #[test]
+    fn a_missing_file_is_named() {
+        let layers = Layers { file: Some("no/such/file.toml".into()), set: Vec::new() };
+        let problem = layers.load::<Camera>().unwrap_err().to_string();
+        assert!(problem.contains("no/such/file.toml"), "{problem}");
+    }
+}

@@ -1,0 +1,209 @@
+//! Pixels: written in place into shared memory, read where they lie.
+//!
+//! On one host a frame is never copied between the camera and the detector: the camera borrows a buffer
+//! ([`FramePublisher::loan`]), writes into it and publishes it; a subscriber reads the same memory. When shared
+//! memory cannot be had, the buffer is ordinary memory and Zenoh copies it: slower, never silent.
+
+use std::borrow::Cow;
+use std::ops::{Deref, DerefMut};
+use std::sync::Arc;
+
+use anyhow::anyhow;
+use messages::{Delivery, FrameHeader, PixelFormat, Topic, decode, encode};
+use zenoh::Wait;
+use zenoh::bytes::ZBytes;
+use zenoh::handlers::{RingChannel, RingChannelHandler};
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::sample::Sample;
+use zenoh::shm::{
+    GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShmMut,
+};
+
+use crate::health::HealthCounters;
+use crate::session::Node;
+use crate::topics::report_refused;
+
+/// Frames the shared memory holds: one being written, one in flight, and one each for two slow readers. Few,
+/// because every subscriber keeps the whole pool mapped and locked.
+const FRAMES_IN_POOL: usize = 4;
+
+/// Publishes frames on one key.
+pub struct FramePublisher {
+    publisher: zenoh::pubsub::Publisher<'static>,
+    pool: Option<ShmProvider<PosixShmProviderBackend>>,
+    health: Arc<HealthCounters>,
+}
+
+/// A buffer for one frame.
+pub enum Loan {
+    /// In shared memory.
+    Shared(ZShmMut),
+    /// In this process.
+    Private(Vec<u8>),
+}
+
+/// A frame that was received.
+pub struct Frame {
+    /// Its header.
+    pub header: FrameHeader,
+    payload: ZBytes,
+}
+
+/// Receives frames; always the newest.
+pub struct FrameSubscriber {
+    subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
+    health: Arc<HealthCounters>,
+}
+
+impl Node {
+    /// A publisher of frames of at most `largest_frame_bytes`.
+    ///
+    /// # Errors
+    /// When the session is closed or a name makes no key.
+    pub async fn frame_publisher(
+        &self,
+        topic: Topic<FrameHeader>,
+        names: &[&str],
+        largest_frame_bytes: usize,
+    ) -> anyhow::Result<FramePublisher> {
+        let key = topic.key(names);
+        debug_assert_eq!(topic.delivery(), Delivery::Newest);
+        let publisher = self
+            .session
+            .declare_publisher(key.clone())
+            .priority(Priority::DataLow)
+            // Drop would lose large frames almost entirely on a lossy link; this sheds whole frames.
+            .congestion_control(CongestionControl::BlockFirst)
+            .await
+            .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
+        let pool_bytes = FRAMES_IN_POOL * largest_frame_bytes.next_multiple_of(4096) + 4096;
+        let pool = match ShmProviderBuilder::default_backend(pool_bytes).wait() {
+            Ok(pool) => Some(pool),
+            Err(cause) => {
+                tracing::warn!(pool_bytes, %cause, "No shared memory: frames are copied instead");
+                None
+            }
+        };
+        Ok(FramePublisher { publisher, pool, health: self.shared_health() })
+    }
+
+    /// A subscriber to the frames of the keys that match.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub async fn frame_subscriber(
+        &self,
+        topic: Topic<FrameHeader>,
+        names: &[&str],
+    ) -> anyhow::Result<FrameSubscriber> {
+        let key = topic.key(names);
+        let subscriber = self
+            .session
+            .declare_subscriber(key.clone())
+            .with(RingChannel::new(1))
+            .await
+            .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
+        Ok(FrameSubscriber { subscriber, health: self.shared_health() })
+    }
+}
+
+impl FramePublisher {
+    /// A buffer of `len` bytes to write a frame into.
+    pub fn loan(&self, len: usize) -> Loan {
+        let shared = self
+            .pool
+            .as_ref()
+            .and_then(|pool| pool.alloc(len).with_policy::<GarbageCollect>().wait().ok());
+        match shared {
+            Some(buffer) => Loan::Shared(buffer),
+            None => {
+                self.health.dropped("shared memory full, frame copied");
+                Loan::Private(vec![0; len])
+            }
+        }
+    }
+
+    /// Publishes a frame that was written into its loan.
+    pub async fn publish(&self, header: &FrameHeader, frame: Loan) {
+        let payload: ZBytes = match frame {
+            Loan::Shared(buffer) => buffer.into(),
+            Loan::Private(buffer) => buffer.into(),
+        };
+        match self.publisher.put(payload).attachment(encode(header)).await {
+            Ok(()) => self.health.count("frames"),
+            Err(cause) => {
+                if self.health.failed("publish frame") {
+                    tracing::warn!(%cause, "A frame could not be published");
+                }
+            }
+        }
+    }
+
+    /// True while somebody subscribes: what is costly to make is made only then.
+    pub async fn has_subscribers(&self) -> bool {
+        self.publisher.matching_status().await.is_ok_and(|status| status.matching())
+    }
+}
+
+impl Deref for Loan {
+    type Target = [u8];
+    fn deref(&self) -> &[u8] {
+        match self {
+            Self::Shared(buffer) => buffer,
+            Self::Private(buffer) => buffer,
+        }
+    }
+}
+
+impl DerefMut for Loan {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        match self {
+            Self::Shared(buffer) => buffer,
+            Self::Private(buffer) => buffer,
+        }
+    }
+}
+
+impl Frame {
+    /// The payload's bytes, where they lie.
+    pub fn bytes(&self) -> Cow<'_, [u8]> {
+        self.payload.to_bytes()
+    }
+}
+
+impl FrameSubscriber {
+    /// The newest frame; `None` once the session is closed. A frame whose header cannot be read, or whose bytes do
+    /// not fit its header, is counted and logged once.
+    pub async fn next(&self) -> Option<Frame> {
+        loop {
+            let sample = self.subscriber.recv_async().await.ok()?;
+            let attachment = sample.attachment().map(|a| a.to_bytes()).unwrap_or_default();
+            match decode::<FrameHeader>(&attachment) {
+                Err(problem) => {
+                    report_refused(&self.health, sample.key_expr().as_str(), &problem);
+                }
+                Ok(header) if !fits(&header, sample.payload().len()) => {
+                    if self.health.failed("frame of the wrong length") {
+                        tracing::warn!(
+                            ?header,
+                            len = sample.payload().len(),
+                            "A frame was refused: its bytes do not fit its header"
+                        );
+                    }
+                }
+                Ok(header) => return Some(Frame { header, payload: sample.payload().clone() }),
+            }
+        }
+    }
+}
+
+fn fits(header: &FrameHeader, len: usize) -> bool {
+    match header.format {
+        PixelFormat::Mono8 => {
+            header.width > 0
+                && header.height > 0
+                && u64::from(header.width) * u64::from(header.height) == len as u64
+        }
+        PixelFormat::Jpeg => len > 0,
+    }
+}

@@ -1,0 +1,163 @@
+//! A service's counters, and the health it publishes from them once a second.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use messages::{Count, Health, Latency, Rate};
+
+use crate::clock::now_ns;
+use crate::session::Identity;
+
+/// Latencies kept for the percentiles.
+const LATENCIES_KEPT: usize = 512;
+
+/// Counters that any thread of a service may raise.
+#[derive(Debug, Default)]
+pub struct HealthCounters {
+    inner: Mutex<Counters>,
+}
+
+#[derive(Debug, Default)]
+struct Counters {
+    rates: BTreeMap<&'static str, (u64, u64)>,
+    latencies: BTreeMap<&'static str, VecDeque<f64>>,
+    drops: BTreeMap<String, u64>,
+    errors: BTreeMap<String, u64>,
+    last_report_ns: Option<i64>,
+}
+
+impl HealthCounters {
+    /// Something happened once more.
+    pub fn count(&self, name: &'static str) {
+        self.lock().rates.entry(name).or_default().0 += 1;
+    }
+
+    /// Something took this long.
+    pub fn latency(&self, name: &'static str, took: Duration) {
+        let mut counters = self.lock();
+        let kept = counters.latencies.entry(name).or_default();
+        if kept.len() == LATENCIES_KEPT {
+            kept.pop_front();
+        }
+        kept.push_back(took.as_secs_f64() * 1e3);
+    }
+
+    /// Something was dropped.
+    pub fn dropped(&self, reason: &str) {
+        raise(&mut self.lock().drops, reason);
+    }
+
+    /// Something failed; true when it is the first failure for this reason, which is the one to log.
+    pub fn failed(&self, reason: &str) -> bool {
+        raise(&mut self.lock().errors, reason) == 1
+    }
+
+    /// Median and 99th percentile of a latency, in milliseconds.
+    pub fn percentiles(&self, name: &'static str) -> Option<[f64; 2]> {
+        self.lock().latencies.get(name).and_then(percentiles)
+    }
+
+    /// The health now.
+    pub fn report(&self, identity: &Identity, started_ns: i64) -> Health {
+        let now = now_ns();
+        let mut counters = self.lock();
+        let since = counters.last_report_ns.replace(now).unwrap_or(started_ns);
+        let period_s = ((now - since) as f64 * 1e-9).max(1e-3);
+        let rates = counters
+            .rates
+            .iter_mut()
+            .map(|(name, (count, reported))| {
+                let hz = (*count - *reported) as f64 / period_s;
+                *reported = *count;
+                Rate { name: (*name).to_owned(), count: *count, hz }
+            })
+            .collect();
+        let latencies = counters
+            .latencies
+            .iter()
+            .filter_map(|(name, kept)| {
+                let [p50_ms, p99_ms] = percentiles(kept)?;
+                Some(Latency { name: (*name).to_owned(), p50_ms, p99_ms })
+            })
+            .collect();
+        Health {
+            service: identity.service.to_owned(),
+            instance: identity.instance.clone(),
+            stamp_ns: now,
+            pid: std::process::id(),
+            cpu_s: process_cpu_s(),
+            uptime_s: (now - started_ns) as f64 * 1e-9,
+            rates,
+            latencies,
+            drops: counts(&counters.drops),
+            errors: counts(&counters.errors),
+        }
+    }
+
+    // A thread that panicked while counting leaves counts that are still counts.
+    fn lock(&self) -> MutexGuard<'_, Counters> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn raise(counts: &mut BTreeMap<String, u64>, reason: &str) -> u64 {
+    match counts.get_mut(reason) {
+        Some(count) => {
+            *count += 1;
+            *count
+        }
+        None => {
+            counts.insert(reason.to_owned(), 1);
+            1
+        }
+    }
+}
+
+fn counts(counts: &BTreeMap<String, u64>) -> Vec<Count> {
+    counts.iter().map(|(reason, count)| Count { reason: reason.clone(), count: *count }).collect()
+}
+
+fn percentiles(kept: &VecDeque<f64>) -> Option<[f64; 2]> {
+    let mut sorted: Vec<f64> = kept.iter().copied().collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let at = |fraction: f64| {
+        let rank = (fraction * (sorted.len() as f64 - 1.0)).round();
+        sorted.get(rank as usize).copied()
+    };
+    Some([at(0.5)?, at(0.99)?])
+}
+
+/// Processor time this process has used, user and system, in seconds.
+fn process_cpu_s() -> f64 {
+    let time = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_report_tells_what_was_counted() {
+        let counters = HealthCounters::default();
+        for ms in 1..=100 {
+            counters.count("frames");
+            counters.latency("detect", Duration::from_millis(ms));
+        }
+        counters.dropped("late");
+        assert!(counters.failed("damaged"));
+        assert!(!counters.failed("damaged"));
+        let identity = Identity { service: "detector", instance: "main".into() };
+        let health = counters.report(&identity, now_ns() - 1_000_000_000);
+        assert_eq!(
+            (health.rates[0].count, health.drops[0].count, health.errors[0].count),
+            (100, 1, 2)
+        );
+        assert!((health.rates[0].hz - 100.0).abs() < 5.0);
+        assert!(
+            (health.latencies[0].p50_ms - 51.0).abs() < 1.0 && health.latencies[0].p99_ms >= 98.0
+        );
+        assert!(counters.percentiles("none").is_none());
+    }
+}

@@ -1,0 +1,278 @@
+//! Typed publishers and subscribers: the topic table on the network.
+//!
+//! Every mailbox is a ring: a reader that is slow loses the oldest messages, and nobody ever waits for it.
+
+use std::marker::PhantomData;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use anyhow::anyhow;
+use messages::{Delivery, Message, Topic, decode, encode, topic};
+use zenoh::handlers::{RingChannel, RingChannelHandler};
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::query::{Query, Queryable};
+use zenoh::sample::Sample;
+
+use crate::health::HealthCounters;
+use crate::session::Node;
+
+/// How long a command waits for its answer.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Publishes messages of one type on one key.
+pub struct Publisher<M> {
+    publisher: zenoh::pubsub::Publisher<'static>,
+    /// Answers those who come late; only for states.
+    last_value: Option<LastValue>,
+    health: Arc<HealthCounters>,
+    message: PhantomData<fn(M)>,
+}
+
+/// What is answered to those who come late, and the answering itself, which ends when this is dropped.
+struct LastValue {
+    bytes: Arc<Mutex<Vec<u8>>>,
+    _answers: Queryable<()>,
+}
+
+/// Receives messages of one type from the keys that match.
+pub struct Subscriber<M> {
+    subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
+    /// States that were there before the subscription.
+    early: Mutex<Vec<M>>,
+    health: Arc<HealthCounters>,
+    message: PhantomData<fn() -> M>,
+}
+
+/// A command with the way to answer it.
+pub struct Request<M> {
+    /// What is asked.
+    pub message: M,
+    query: Query,
+}
+
+/// Zenoh's terms for a delivery.
+struct Qos {
+    priority: Priority,
+    congestion: CongestionControl,
+    /// Messages a mailbox keeps.
+    depth: usize,
+}
+
+fn qos(delivery: Delivery) -> Qos {
+    let (priority, congestion, depth) = match delivery {
+        Delivery::Newest => (Priority::Data, CongestionControl::Drop, 4),
+        // Deep enough for several detectors at once.
+        Delivery::NewestFirst => (Priority::RealTime, CongestionControl::Drop, 16),
+        Delivery::LastValue => (Priority::InteractiveHigh, CongestionControl::Drop, 16),
+        Delivery::InOrder => (Priority::InteractiveLow, CongestionControl::Block, 512),
+        Delivery::Query => (Priority::InteractiveHigh, CongestionControl::Block, 16),
+    };
+    Qos { priority, congestion, depth }
+}
+
+impl Node {
+    /// A publisher on the topic's key with its placeholders filled in.
+    ///
+    /// # Errors
+    /// When the session is closed or a name makes no key.
+    pub async fn publisher<M: Message>(
+        &self,
+        topic: Topic<M>,
+        names: &[&str],
+    ) -> anyhow::Result<Publisher<M>> {
+        let key = topic.key(names);
+        let Qos { priority, congestion, .. } = qos(topic.delivery());
+        let publisher = self
+            .session
+            .declare_publisher(key.clone())
+            .priority(priority)
+            .congestion_control(congestion)
+            .await
+            .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
+        let last_value = match topic.delivery() {
+            Delivery::LastValue => Some(self.last_value(&key).await?),
+            Delivery::Newest | Delivery::NewestFirst | Delivery::InOrder | Delivery::Query => None,
+        };
+        Ok(Publisher { publisher, last_value, health: self.shared_health(), message: PhantomData })
+    }
+
+    async fn last_value(&self, key: &str) -> anyhow::Result<LastValue> {
+        let bytes = Arc::new(Mutex::new(Vec::new()));
+        let kept = Arc::clone(&bytes);
+        let answer = move |query: Query| {
+            let bytes: Vec<u8> = kept.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            if !bytes.is_empty() {
+                let key = query.key_expr().clone();
+                // Whoever asked may be gone; there is nobody to tell.
+                drop(zenoh::Wait::wait(query.reply(key, bytes)));
+            }
+        };
+        let answers = self
+            .session
+            .declare_queryable(key.to_owned())
+            .callback(answer)
+            .await
+            .map_err(|cause| anyhow!("declaring the last value of {key}: {cause}"))?;
+        Ok(LastValue { bytes, _answers: answers })
+    }
+
+    /// A subscriber to the topic's keys; names that are left out stand for any.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub async fn subscriber<M: Message>(
+        &self,
+        topic: Topic<M>,
+        names: &[&str],
+    ) -> anyhow::Result<Subscriber<M>> {
+        let key = topic.key(names);
+        let subscriber = self
+            .session
+            .declare_subscriber(key.clone())
+            .with(RingChannel::new(qos(topic.delivery()).depth))
+            .await
+            .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
+        let subscriber = Subscriber {
+            subscriber,
+            early: Mutex::default(),
+            health: self.shared_health(),
+            message: PhantomData,
+        };
+        if topic.delivery() == Delivery::LastValue {
+            self.fetch_last_values(&key, &subscriber).await;
+        }
+        Ok(subscriber)
+    }
+
+    async fn fetch_last_values<M: Message>(&self, key: &str, subscriber: &Subscriber<M>) {
+        // No publisher yet is the usual case at the start of a system, not an error.
+        let Ok(replies) = self.session.get(key).timeout(ANSWER_TIMEOUT).await else { return };
+        while let Ok(reply) = replies.recv_async().await {
+            if let Ok(sample) = reply.result()
+                && let Some(message) = subscriber.decode(sample)
+            {
+                subscriber.early.lock().unwrap_or_else(PoisonError::into_inner).push(message);
+            }
+        }
+    }
+
+    /// The commands that are sent to the controller.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub async fn commands(&self) -> anyhow::Result<Commands> {
+        let key = topic::COMMAND.key(&[]);
+        let queryable = self
+            .session
+            .declare_queryable(key.clone())
+            .with(RingChannel::new(qos(topic::COMMAND.delivery()).depth))
+            .await
+            .map_err(|cause| anyhow!("answering on {key}: {cause}"))?;
+        Ok(Commands { queryable, health: self.shared_health() })
+    }
+
+    /// Sends a command to the controller and waits for its answer.
+    ///
+    /// # Errors
+    /// When no controller answers in time.
+    pub async fn command(
+        &self,
+        command: &messages::ControllerCommand,
+    ) -> anyhow::Result<messages::CommandReply> {
+        let key = topic::COMMAND.key(&[]);
+        let replies = self
+            .session
+            .get(&key)
+            .payload(encode(command))
+            .timeout(ANSWER_TIMEOUT)
+            .await
+            .map_err(|cause| anyhow!("sending a command on {key}: {cause}"))?;
+        while let Ok(reply) = replies.recv_async().await {
+            if let Ok(sample) = reply.result() {
+                return Ok(decode(&sample.payload().to_bytes())?);
+            }
+        }
+        Err(anyhow!(
+            "no controller answered within {ANSWER_TIMEOUT:?}; is one running for this vehicle?"
+        ))
+    }
+}
+
+/// The controller's side of its commands.
+pub struct Commands {
+    queryable: Queryable<RingChannelHandler<Query>>,
+    health: Arc<HealthCounters>,
+}
+
+impl Commands {
+    /// The next command; `None` once the session is closed. A payload that is no command is answered as such.
+    pub async fn next(&self) -> Option<Request<messages::ControllerCommand>> {
+        loop {
+            let query = self.queryable.recv_async().await.ok()?;
+            let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
+            match decode(&payload) {
+                Ok(message) => return Some(Request { message, query }),
+                Err(problem) => {
+                    report_refused(&self.health, query.key_expr().as_str(), &problem);
+                    let reply =
+                        messages::CommandReply { accepted: false, reason: problem.to_string() };
+                    Request { message: (), query }.answer(&reply).await;
+                }
+            }
+        }
+    }
+}
+
+impl<M> Request<M> {
+    /// Answers the command.
+    pub async fn answer(self, reply: &messages::CommandReply) {
+        let key = self.query.key_expr().clone();
+        if let Err(cause) = self.query.reply(key, encode(reply)).await {
+            tracing::debug!(%cause, "A command's answer was not delivered");
+        }
+    }
+}
+
+impl<M: Message> Publisher<M> {
+    /// Publishes a message. A failure is counted: a stream goes on with the next one.
+    pub async fn publish(&self, message: &M) {
+        let bytes = encode(message);
+        if let Some(last_value) = &self.last_value {
+            last_value.bytes.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&bytes);
+        }
+        if let Err(cause) = self.publisher.put(bytes).await
+            && self.health.failed("publish")
+        {
+            tracing::warn!(key = %self.publisher.key_expr(), %cause, "A message could not be published");
+        }
+    }
+}
+
+impl<M: Message> Subscriber<M> {
+    /// The next message that can be read; `None` once the session is closed. Others are counted and logged once.
+    pub async fn next(&self) -> Option<M> {
+        let early = self.early.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        if early.is_some() {
+            return early;
+        }
+        loop {
+            let sample = self.subscriber.recv_async().await.ok()?;
+            if let Some(message) = self.decode(&sample) {
+                return Some(message);
+            }
+        }
+    }
+
+    fn decode(&self, sample: &Sample) -> Option<M> {
+        decode(&sample.payload().to_bytes())
+            .map_err(|problem| report_refused(&self.health, sample.key_expr().as_str(), &problem))
+            .ok()
+    }
+}
+
+/// Counts a payload that was refused, and logs the first of its kind.
+pub(crate) fn report_refused(health: &HealthCounters, key: &str, problem: &messages::DecodeError) {
+    if health.failed(&format!("payload: {}", problem.reason())) {
+        tracing::warn!(key, %problem, "A payload was refused; further ones are counted only");
+    }
+}

@@ -1,0 +1,199 @@
+//! Sessions that meet: the local configuration's promises, on a port of the test's own.
+
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use messages::{
+    CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, PixelFormat, Wind, encode, topic,
+};
+use node::{Identity, Node, ZenohSource, clock_name, now_ns};
+use tokio::time::timeout;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// The local configuration with another meeting point.
+fn local(port: u16) -> ZenohSource {
+    let text = include_str!("../../../zenoh-config/local.json5");
+    assert!(text.contains(":7447"));
+    ZenohSource::Text(text.replace(":7447", &format!(":{port}")))
+}
+
+fn free_port() -> anyhow::Result<u16> {
+    Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+}
+
+async fn open(service: &'static str, instance: &str, port: u16) -> anyhow::Result<Node> {
+    Node::open(Identity { service, instance: instance.into() }, &local(port)).await
+}
+
+fn header(sequence: u64) -> FrameHeader {
+    FrameHeader {
+        camera: "down".into(),
+        sequence,
+        stamp_ns: now_ns(),
+        clock: clock_name().into(),
+        exposure_ns: 0,
+        width: 64,
+        height: 48,
+        format: PixelFormat::Mono8,
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn frames_arrive_as_they_were_written_and_misfits_are_skipped() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let camera = open("camera-pub", "down", port).await?;
+    let detector = open("detector", "main", port).await?;
+    let subscriber = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let publisher = camera.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
+    while !publisher.has_subscribers().await {
+        tokio::task::yield_now().await;
+    }
+    let too_short = publisher.loan(5);
+    publisher.publish(&header(1), too_short).await;
+    let mut frame = publisher.loan(64 * 48);
+    for (i, pixel) in frame.iter_mut().enumerate() {
+        *pixel = (i % 251) as u8;
+    }
+    publisher.publish(&header(2), frame).await;
+    let received = timeout(PATIENCE, subscriber.next()).await?.context("a frame")?;
+    assert_eq!(received.header.sequence, 2);
+    assert!(received.bytes().iter().enumerate().all(|(i, p)| *p == (i % 251) as u8));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_pool_that_is_full_falls_back_to_copies() -> anyhow::Result<()> {
+    let camera = open("camera-pub", "down", free_port()?).await?;
+    let publisher = camera.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
+    let loans: Vec<_> = (0..8).map(|_| publisher.loan(64 * 48)).collect();
+    let shared = loans.iter().filter(|l| matches!(l, node::Loan::Shared(_))).count();
+    assert!((3..8).contains(&shared), "{shared} of 8 loans were in shared memory");
+    assert!(loans.iter().all(|l| l.len() == 64 * 48));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_others_still_meet_after_the_first_process_is_gone() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let first = open("simulator", "main", port).await?;
+    let second = open("detector", "main", port).await?;
+    let presence = second.presence("controller").await?;
+    second.announce().await?;
+    first.close().await;
+    // The third knows only the meeting point, and must find the second.
+    let third = open("controller", "main", port).await?;
+    third.announce().await?;
+    let arrived = timeout(PATIENCE, presence.next()).await?;
+    assert_eq!(arrived, Some(("main".to_owned(), true)));
+    third.close().await;
+    let left = timeout(PATIENCE, presence.next()).await?;
+    assert_eq!(left, Some(("main".to_owned(), false)));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_second_one_of_the_same_name_is_told_so() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let first = open("detector", "main", port).await?;
+    first.ensure_alone("main").await?;
+    first.announce().await?;
+    let second = open("detector", "main", port).await?;
+    let refusal = second.ensure_alone("main").await.err().context("two of one name")?.to_string();
+    assert!(refusal.contains("`main` already") && refusal.contains("--set id="), "{refusal}");
+    let spare = open("detector", "spare", port).await?;
+    spare.ensure_alone("spare").await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_state_is_told_to_those_who_come_late() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let controller = open("controller", "main", port).await?;
+    let health = controller.publisher(topic::HEALTH, &["controller", "main"]).await?;
+    let report = controller.health().report(controller.identity(), now_ns());
+    health.publish(&report).await;
+    let late = open("alight", "main", port).await?;
+    let subscriber = late.subscriber(topic::HEALTH, &[]).await?;
+    assert_eq!(timeout(PATIENCE, subscriber.next()).await?, Some(report));
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn foreign_payloads_are_counted_and_skipped() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let listener = open("alight", "main", port).await?;
+    let winds = listener.subscriber(topic::WIND, &[]).await?;
+    let foreign = Foreign::open(port).await?;
+    let wind = Wind { stamp_ns: 7, velocity_ned_m_s: [1.0, 2.0, 3.0] };
+    let other_type = encode(&MavlinkBytes { packet: vec![1] });
+    let mut older = encode(&wind);
+    older[2] = 0;
+    let cut = &encode(&wind)[..9];
+    for payload in [&b"not ours"[..], &other_type, &older, cut] {
+        let mut arrived = None;
+        for _ in 0..50 {
+            foreign.put("drone/wind", payload).await?;
+            foreign.put("drone/wind", &encode(&wind)).await?;
+            arrived = timeout(Duration::from_millis(200), winds.next()).await.ok().flatten();
+            if arrived.is_some() {
+                break;
+            }
+        }
+        assert_eq!(arrived, Some(wind));
+    }
+    let refused = listener.health().report(listener.identity(), now_ns()).errors;
+    for reason in ["foreign", "wrong type", "wrong version", "damaged"] {
+        let reason = format!("payload: {reason}");
+        assert!(refused.iter().any(|c| c.reason == reason), "{reason} is not in {refused:?}");
+    }
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let operator = open("alight", "main", port).await?;
+    let nobody = operator.command(&ControllerCommand::Hold).await.err().context("nobody")?;
+    assert!(nobody.to_string().contains("no controller answered"), "{nobody}");
+    let controller = open("controller", "main", port).await?;
+    let commands = controller.commands().await?;
+    let answering = tokio::spawn(async move {
+        while let Some(request) = commands.next().await {
+            let reason = format!("{:?}", request.message);
+            request.answer(&CommandReply { accepted: true, reason }).await;
+        }
+    });
+    // Until the two sessions know each other, the answer is that nobody is there.
+    let answered = async {
+        loop {
+            if let Ok(reply) = operator.command(&ControllerCommand::Abort).await {
+                return reply;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    let reply = timeout(PATIENCE, answered).await?;
+    assert_eq!(reply, CommandReply { accepted: true, reason: "Abort".into() });
+    answering.abort();
+    Ok(())
+}
+
+/// A Zenoh program that knows nothing of ours.
+struct Foreign {
+    session: zenoh::Session,
+}
+
+impl Foreign {
+    async fn open(port: u16) -> anyhow::Result<Self> {
+        let text = format!(
+            "{{ mode: 'client', connect: {{ endpoints: ['tcp/127.0.0.1:{port}'] }}, scouting: {{ multicast: {{ enabled: false }} }} }}"
+        );
+        let config = zenoh::Config::from_json5(&text).map_err(|cause| anyhow!("{cause}"))?;
+        let session = zenoh::open(config).await.map_err(|cause| anyhow!("{cause}"))?;
+        Ok(Self { session })
+    }
+
+    async fn put(&self, key: &str, bytes: &[u8]) -> anyhow::Result<()> {
+        self.session.put(key, bytes).await.map_err(|cause| anyhow!("{cause}"))
+    }
+}
