@@ -4,12 +4,24 @@
 //! clock and no thread; a stage of a detection that wants to be timed tells a [`Stages`] observer.
 //!
 //! Modules in reading order: [`marker`] names what is looked for, [`drawing`] says what it looks like,
-//! [`observation`] is what was found.
+//! [`observation`] is what was found, [`detector`] finds it; [`ring`] and [`rings_thesis`] are the thesis' way
+//! (Algorithms 1-15), [`rings`] the mended one, with `circles` for the pose; [`trace`] is what they saw on the way,
+//! [`debug`] draws that.
 
+mod circles;
+pub mod debug;
+pub mod detector;
 pub mod drawing;
 pub mod marker;
 pub mod observation;
+pub mod ring;
+pub mod rings;
+pub mod rings_thesis;
+pub mod trace;
 
+pub use detector::{Detector, DetectorError, Settings};
 pub use drawing::{Drawing, Ink, Layer, Shape};
 pub use marker::{Family, Marker, MarkerError};
 pub use observation::{MarkerPose, Observation, Stages};
+pub use ring::{Ring, RingKind};
+pub use trace::{Reason, Refusal, Trace, TracedMarker};

@@ -104,16 +104,11 @@ fn least_squares<const N: usize>(rows: impl Iterator<Item = [f64; N]>) -> Option
     let mut normal = [[0.0; N]; N];
     let mut right = [0.0; N];
     for row in rows {
-        for i in 0..N {
-            for j in i..N {
-                normal[i][j] += row[i] * row[j];
+        for ((line, sum), a) in normal.iter_mut().zip(&mut right).zip(row) {
+            for (entry, b) in line.iter_mut().zip(row) {
+                *entry += a * b;
             }
-            right[i] += row[i];
-        }
-    }
-    for i in 0..N {
-        for j in 0..i {
-            normal[i][j] = normal[j][i];
+            *sum += a;
         }
     }
     eliminate(normal, right)
@@ -138,8 +133,9 @@ fn eliminate<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; N]) -> 
         }
         for row in column + 1..N {
             let factor = matrix[row][column] / head;
-            for k in column..N {
-                matrix[row][k] -= factor * matrix[column][k];
+            let upper = matrix[column];
+            for (entry, above) in matrix[row].iter_mut().zip(upper).skip(column) {
+                *entry -= factor * above;
             }
             right[row] -= factor * right[column];
         }

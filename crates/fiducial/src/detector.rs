@@ -1,0 +1,103 @@
+//! The detector: markers in, observations out.
+
+use geometry::CameraModel;
+use imaging::GrayView;
+
+use crate::marker::{Family, Marker};
+use crate::observation::{Observation, Stages};
+use crate::rings::Rings;
+use crate::rings_thesis::RingsThesis;
+use crate::trace::{Trace, TracedMarker};
+
+/// What can be chosen about a detection.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Settings {
+    /// T of Equation 3.3, in grey levels, for `rings-thesis`. The thesis does not state it; 70 finds most in
+    /// renderings of its camera.
+    pub thesis_threshold: u8,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { thesis_threshold: 70 }
+    }
+}
+
+/// Why there is no detector for these markers.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum DetectorError {
+    /// Nothing to look for.
+    #[error("a detector needs at least one marker to look for")]
+    NoMarker,
+    /// Two markers that look the same.
+    #[error("the marker `{name}` is listed twice; one image cannot tell two sizes of it apart")]
+    Twice {
+        /// The marker's name.
+        name: String,
+    },
+}
+
+/// Finds markers in images. It keeps its memory from image to image.
+#[derive(Debug)]
+pub struct Detector {
+    markers: Vec<Marker>,
+    settings: Settings,
+    rings: Rings,
+    thesis: RingsThesis,
+    found: Vec<Observation>,
+    trace: Trace,
+}
+
+impl Detector {
+    /// A detector for these markers.
+    ///
+    /// # Errors
+    /// [`DetectorError`] when there are none, or two of the same name.
+    pub fn new(markers: &[Marker], settings: Settings) -> Result<Self, DetectorError> {
+        if markers.is_empty() {
+            return Err(DetectorError::NoMarker);
+        }
+        for (i, marker) in markers.iter().enumerate() {
+            if markers[..i].iter().any(|m| m.family == marker.family && m.id == marker.id) {
+                return Err(DetectorError::Twice { name: marker.name() });
+            }
+        }
+        Ok(Self {
+            markers: markers.to_vec(),
+            settings,
+            rings: Rings::default(),
+            thesis: RingsThesis::default(),
+            found: Vec::new(),
+            trace: Trace::default(),
+        })
+    }
+
+    /// Finds the markers in an image. Without `camera` there are no poses; with it, `camera` must be the model of
+    /// this image's size. Of one family's markers the surest comes first.
+    pub fn detect(
+        &mut self,
+        view: GrayView<'_>,
+        camera: Option<&CameraModel>,
+        stages: &mut impl Stages,
+    ) -> &[Observation] {
+        self.found.clear();
+        self.trace.clear();
+        for marker in &self.markers {
+            let watch = (&mut self.trace, &mut *stages);
+            match marker.family {
+                Family::Rings => self.rings.detect(view, marker, camera, watch, &mut self.found),
+                Family::RingsThesis => {
+                    let threshold = self.settings.thesis_threshold;
+                    self.found.extend(self.thesis.detect(view, marker, threshold, camera, watch));
+                }
+            }
+        }
+        self.trace.markers.extend(self.found.iter().map(TracedMarker::from));
+        &self.found
+    }
+
+    /// What the last detection saw on its way.
+    pub fn trace(&self) -> &Trace {
+        &self.trace
+    }
+}
