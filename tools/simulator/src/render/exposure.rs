@@ -1,0 +1,130 @@
+//! Where the camera is while the shutter is open.
+
+use geometry::{Body, Camera, CameraModel, Ned, Pixel, Point, Transform};
+
+use super::RenderError;
+
+/// The camera's way through one exposure.
+#[derive(Debug)]
+pub(super) struct Exposure {
+    /// Half-way through the exposure.
+    pub(super) middle: Transform<Ned, Camera>,
+    /// When the shutter opens and when it closes.
+    pub(super) ends: [Transform<Ned, Camera>; 2],
+    /// Evenly spaced instants over which the picture of the markers is averaged.
+    pub(super) instants: Vec<Transform<Ned, Camera>>,
+    /// The longest way of any pixel over the scene, in pixels.
+    pub(super) motion_px: f64,
+}
+
+/// Two instants of an average lie at most this far apart, as long as there are fewer than [`MOST_INSTANTS`]: the
+/// blur of a pixel and a lens leaves no ripple from steps of this size.
+const STEP_PX: f64 = 1.0;
+
+/// Instants of an average at most.
+pub(super) const MOST_INSTANTS: usize = 16;
+
+/// Below this the camera stands still.
+const STILL_PX: f64 = 0.02;
+
+/// Places farther than this from the origin are refused: a picture of the ground makes no sense there.
+const FARTHEST_M: f64 = 1e5;
+
+impl Exposure {
+    pub(super) fn new() -> Self {
+        let still = Transform::identity();
+        let instants = Vec::with_capacity(MOST_INSTANTS);
+        Self { middle: still, ends: [still; 2], instants, motion_px: 0.0 }
+    }
+
+    /// Follows the vehicle through `poses`, evenly spaced in time over the exposure.
+    pub(super) fn follow(
+        &mut self,
+        poses: &[Transform<Ned, Body>],
+        body_from_camera: &Transform<Body, Camera>,
+        model: &CameraModel,
+    ) -> Result<(), RenderError> {
+        let (Some(first), Some(last)) = (poses.first(), poses.last()) else {
+            return Err(RenderError::NoPose);
+        };
+        if let Some(index) = poses.iter().position(|pose| !is_sound(pose)) {
+            return Err(RenderError::Pose { index });
+        }
+        let camera_at = |fraction: f64| between(poses, fraction) * *body_from_camera;
+        self.middle = camera_at(0.5);
+        self.ends = [*first * *body_from_camera, *last * *body_from_camera];
+        self.motion_px = motion_px(poses, &self.middle, body_from_camera, model);
+        let count = (self.motion_px / STEP_PX).ceil().clamp(1.0, MOST_INSTANTS as f64);
+        self.instants.clear();
+        let fractions = (0..count as usize).map(|k| (k as f64 + 0.5) / count);
+        self.instants.extend(fractions.map(camera_at));
+        if self.motion_px < STILL_PX {
+            self.motion_px = 0.0;
+        }
+        Ok(())
+    }
+}
+
+/// The vehicle's pose at a fraction of the exposure from 0 to 1.
+pub(super) fn between(poses: &[Transform<Ned, Body>], fraction: f64) -> Transform<Ned, Body> {
+    let place = fraction.clamp(0.0, 1.0) * poses.len().saturating_sub(1) as f64;
+    let index = (place.floor() as usize).min(poses.len().saturating_sub(2));
+    match (poses.get(index), poses.get(index + 1)) {
+        (Some(a), Some(b)) => {
+            let part = place - index as f64;
+            let origin = a.origin() + (b.origin() - a.origin()) * part;
+            Transform::new(a.rotation().interpolate(&b.rotation(), part), origin)
+        }
+        (Some(only), None) => *only,
+        _ => Transform::identity(),
+    }
+}
+
+fn is_sound(pose: &Transform<Ned, Body>) -> bool {
+    let place = pose.origin();
+    let norm = pose.isometry.rotation.norm();
+    place.is_finite() && place.coords.coords.norm() < FARTHEST_M && (norm - 1.0).abs() < 1e-3
+}
+
+/// The longest way, in pixels, of what nine pixels all over the image see half-way through the exposure.
+fn motion_px(
+    poses: &[Transform<Ned, Body>],
+    middle: &Transform<Ned, Camera>,
+    body_from_camera: &Transform<Body, Camera>,
+    model: &CameraModel,
+) -> f64 {
+    let mut longest = 0.0f64;
+    for (i, j) in (0..9).map(|k| (f64::from(k % 3) / 2.0, f64::from(k / 3) / 2.0)) {
+        let edge = |size: u32| f64::from(size.saturating_sub(1));
+        let pixel = Pixel::new(edge(model.width) * i, edge(model.height) * j);
+        let seen = seen_by(model, middle, pixel);
+        let mut before = None;
+        let mut way = 0.0;
+        for pose in poses {
+            let camera_from_ned = (*pose * *body_from_camera).inverse();
+            let now = model.project(camera_from_ned * seen);
+            way += match (before, now) {
+                (None, _) => 0.0,
+                (Some(Some(a)), Some(b)) => Pixel::distance(&a, &b),
+                // Seen and not seen in one exposure: the vehicle tumbles.
+                _ => f64::from(model.width),
+            };
+            before = Some(now);
+        }
+        longest = longest.max(way);
+    }
+    longest
+}
+
+/// What a pixel sees: a place on the ground, or one far away.
+fn seen_by(
+    model: &CameraModel,
+    ned_from_camera: &Transform<Ned, Camera>,
+    pixel: Pixel,
+) -> Point<Ned> {
+    let origin = ned_from_camera.origin();
+    let direction = *ned_from_camera * model.unproject(pixel);
+    let reach = -origin.z() / direction.z();
+    let reach = if reach > 0.0 && reach < 1e3 { reach } else { 1e3 };
+    origin + direction * reach
+}

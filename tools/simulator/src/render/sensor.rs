@@ -1,0 +1,102 @@
+//! From light to grey levels: vignetting, noise, quantisation.
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+use super::CameraSettings;
+
+/// Turns the light on rows of pixels into grey levels.
+#[derive(Debug)]
+pub(super) struct Sensor {
+    seed: u64,
+    /// Grey levels squared of noise per grey level of signal, and without signal.
+    shot: f32,
+    read: f32,
+    /// Normal deviates of variance 1/2, two of which from different places add up to one of variance 1.
+    deviates: Vec<f32>,
+    /// Loss of light with the square of the distance from the axis, for each column and for each row.
+    column_loss: Vec<f32>,
+    row_loss: Vec<f32>,
+}
+
+/// Deviates to start from; a power of two.
+const STARTS: usize = 1 << 15;
+
+/// Pixels that take their deviates from one pair of places. Two stretches with the same pair, which would show as
+/// repeated noise, are a matter of one in 2^30.
+const STRETCH: usize = 128;
+
+impl Sensor {
+    pub(super) fn new(settings: &CameraSettings, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x7365_6e73_6f72);
+        let deviates = (0..STARTS + STRETCH)
+            .map(|_| {
+                let deviate: f32 = StandardNormal.sample(&mut rng);
+                deviate * std::f32::consts::FRAC_1_SQRT_2
+            })
+            .collect();
+        let levels_per_electron = 255.0 * settings.gain / settings.full_well_e;
+        let model = &settings.model;
+        let loss = |count: u32, centre: f64, focal: f64| {
+            // cos^4 of the angle off axis is 1 - 2 tan^2 to first order, less what the lens maker mends.
+            let at =
+                |i| (settings.vignetting * 2.0 * ((f64::from(i) - centre) / focal).powi(2)) as f32;
+            (0..count).map(at).collect()
+        };
+        Self {
+            seed: mix(seed),
+            shot: if settings.noise { levels_per_electron as f32 } else { 0.0 },
+            read: if settings.noise {
+                (settings.read_noise_e * levels_per_electron).powi(2) as f32
+            } else {
+                0.0
+            },
+            deviates,
+            column_loss: loss(model.width, model.cx, model.fx),
+            row_loss: loss(model.height, model.cy, model.fy),
+        }
+    }
+
+    /// Exposes row `v` of frame `frame_index`: `light` in grey levels before vignetting.
+    pub(super) fn expose(&self, frame_index: u64, v: usize, light: &[f32], out: &mut [u8]) {
+        let row_gain = 1.0 - self.row_loss.get(v).copied().unwrap_or(0.0);
+        let frame_seed = mix(self.seed ^ mix(frame_index)).wrapping_add((v as u64) << 16);
+        let stretches = light
+            .chunks(STRETCH)
+            .zip(self.column_loss.chunks(STRETCH))
+            .zip(out.chunks_mut(STRETCH))
+            .enumerate();
+        for (index, ((light, loss), out)) in stretches {
+            let (a, b) = self.pair(frame_seed.wrapping_add(index as u64));
+            for ((((level, light), loss), a), b) in
+                out.iter_mut().zip(light).zip(loss).zip(a).zip(b)
+            {
+                let signal = light * (row_gain - loss).max(0.0);
+                let noise = (signal * self.shot + self.read).sqrt() * (a + b);
+                *level = quantise(signal + noise);
+            }
+        }
+    }
+
+    /// Two stretches of deviates.
+    fn pair(&self, key: u64) -> (&[f32], &[f32]) {
+        let bits = mix(key) as usize;
+        let stretch = |start: usize| self.deviates.get(start..start + STRETCH).unwrap_or(&[]);
+        (stretch(bits % STARTS), stretch((bits / STARTS) % STARTS))
+    }
+}
+
+/// The nearest grey level.
+fn quantise(level: f32) -> u8 {
+    // Adding 2^23 leaves the rounded integer in the lowest bits; unlike a cast from float it needs no test for NaN.
+    (level.clamp(0.0, 255.0) + 8_388_608.0).to_bits() as u8
+}
+
+/// A bijection that scatters (splitmix64's finaliser).
+fn mix(key: u64) -> u64 {
+    let key = key.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    let key = (key ^ (key >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    let key = (key ^ (key >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    key ^ (key >> 31)
+}
