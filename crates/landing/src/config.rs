@@ -66,7 +66,7 @@ impl Default for TargetConfig {
     fn default() -> Self {
         Self {
             max_latency_s: 0.5,
-            max_future_s: 0.02,
+            max_future_s: 0.05,
             max_extrapolation_s: 0.1,
             min_confidence: 0.0,
             max_range_m: 40.0,
@@ -147,7 +147,7 @@ impl Default for PhaseConfig {
     fn default() -> Self {
         Self {
             stale_target_s: 0.4,
-            low_height_m: 0.7,
+            low_height_m: 0.8,
             low_grace_s: 0.4,
             lost_target_s: 1.0,
             stale_vehicle_s: 0.5,

@@ -2,58 +2,224 @@
 
 mod world;
 
-use landing::{Config, Guidance, Phase, ThesisConfig};
+use geometry::Point;
+use landing::{Action, Config, Guidance, OnAbort, OperatorCommand, Phase, Reason, ThesisConfig};
 use world::{Flight, Scene};
 
-fn median(mut values: Vec<f64>) -> f64 {
+/// The median and the largest of what `of` says about the flights.
+fn spread(flights: &[Flight], of: fn(&Flight) -> f64) -> (f64, f64) {
+    let mut values: Vec<f64> = flights.iter().map(of).collect();
     values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+    let at = |i: usize| values.get(i).copied().unwrap_or(f64::NAN);
+    (at(values.len() / 2), at(values.len().saturating_sub(1)))
 }
 
 fn summary(flights: &[Flight]) -> String {
-    let of = |f: fn(&Flight) -> f64| {
-        let values: Vec<f64> = flights.iter().map(f).collect();
-        let worst = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        (median(values), worst)
-    };
-    let (land, _) = of(|f| f.land_s.unwrap_or(f64::INFINITY));
-    let (disarm, slowest) = of(|f| f.disarm_s.unwrap_or(f64::INFINITY));
-    let (error, worst) = of(|f| f.error_m);
-    let (overshoot, most) = of(|f| f.overshoot_m);
-    let (_, tilt) = of(|f| f.max_tilt_rad.to_degrees());
+    let (land, _) = spread(flights, |f| f.land_s.unwrap_or(f64::INFINITY));
+    let (disarm, slowest) = spread(flights, |f| f.disarm_s.unwrap_or(f64::INFINITY));
+    let (error, worst) = spread(flights, |f| f.error_m);
+    let (overshoot, most) = spread(flights, |f| f.overshoot_m);
+    let (_, tilt) = spread(flights, |f| f.max_tilt_rad.to_degrees());
     format!(
         "LAND {land:.1} s, disarmed {disarm:.1} (slowest {slowest:.1}) s, error {error:.3} (worst {worst:.3}) m, \
          overshoot {overshoot:.2} ({most:.2}) m, tilt {tilt:.1} deg"
     )
 }
 
+fn fly(seeds: std::ops::Range<u64>, scene: impl Fn(u64) -> Scene) -> Vec<Flight> {
+    seeds.map(|seed| scene(seed).fly()).collect()
+}
+
+fn thesis(seed: u64, constants: ThesisConfig) -> Scene {
+    let guidance = Guidance::Thesis(ThesisConfig { seed, ..constants });
+    Scene { config: Config { guidance, ..Config::default() }, ..Scene::new(seed) }
+}
+
+/// The largest speed downwards that was asked for between two times.
+fn deepest(flight: &Flight, from_s: f64, to_s: f64) -> f64 {
+    let within = flight.samples.iter().filter(|s| (from_s..to_s).contains(&s.seconds));
+    within.fold(0.0, |deepest, sample| match sample.decision.action {
+        Action::Velocity { velocity, .. } => velocity.z().max(deepest),
+        Action::None | Action::Land => deepest,
+    })
+}
+
 #[test]
-fn table() {
-    for (name, gust, error) in [("calm", 0.0, 0.0), ("light", 0.03, 0.03), ("windy", 0.06, 0.03)] {
-        let flights: Vec<Flight> = (0..20)
-            .map(|seed| Scene { gust_m_s: gust, estimator_error: error, ..Scene::new(seed) }.fly())
-            .collect();
-        println!("metric {name}: {}", summary(&flights));
-        for f in &flights {
-            if f.phase != Phase::Landed || f.error_m > 0.1 {
-                println!("  bad: {} {:?} {:?} err {:.3}", f.phase, f.land_s, f.disarm_s, f.error_m);
-                let mut last = None;
-                for s in &f.samples {
-                    let key = (s.decision.phase, s.decision.why);
-                    if last != Some(key) {
-                        println!("    {:.2} {} {} h {:.2} v {:.2} lat {:?} age {:?}", s.seconds, key.0, key.1, -s.position.z(), s.velocity.z(), s.decision.target.map(|t| (t.lateral_error_m*1000.0).round()), s.decision.target.map(|t| t.age_s));
-                        last = Some(key);
-                    }
-                }
-            }
-        }
-        let flights: Vec<Flight> = (0..20)
-            .map(|seed| {
-                let thesis = ThesisConfig { seed, ..ThesisConfig::default() };
-                let config = Config { guidance: Guidance::Thesis(thesis), ..Config::default() };
-                Scene { config, gust_m_s: gust, estimator_error: error, ..Scene::new(seed) }.fly()
-            })
-            .collect();
-        println!("thesis {name}: {}", summary(&flights));
+fn the_metric_guidance_lands_on_the_pad_from_the_thesis_start() {
+    let flights = fly(0..20, Scene::new);
+    println!("metric: {}", summary(&flights));
+    assert!(flights.iter().all(|f| f.phase == Phase::Landed));
+    let (error, worst) = spread(&flights, |f| f.error_m);
+    let (disarm, slowest) = spread(&flights, |f| f.disarm_s.unwrap_or(f64::INFINITY));
+    assert!(error <= 0.05 && worst <= 0.15, "{error} {worst}");
+    assert!(disarm <= 14.0 && slowest <= 18.0, "{disarm} {slowest}");
+}
+
+#[test]
+fn without_disturbance_it_does_not_overshoot() {
+    let flights =
+        fly(0..5, |seed| Scene { gust_m_s: 0.0, estimator_error: 0.0, ..Scene::new(seed) });
+    println!("metric, calm: {}", summary(&flights));
+    let (_, overshoot) = spread(&flights, |f| f.overshoot_m);
+    let (_, worst) = spread(&flights, |f| f.error_m);
+    assert!(overshoot < 0.02 && worst < 0.02, "{overshoot} {worst}");
+}
+
+#[test]
+fn any_heading_height_and_offset_will_do() {
+    let flights = fly(0..40, |seed| {
+        let angle = seed as f64 * 2.4;
+        let height_m = 4.0 + (seed % 7) as f64 * 1.5;
+        let offset_m = (seed % 9) as f64 / 8.0 * 0.24 * height_m;
+        let start =
+            Point::new(1.5 + offset_m * angle.cos(), -1.5 + offset_m * angle.sin(), -height_m);
+        Scene { start, heading_rad: 1.7 * angle, ..Scene::new(seed) }
+    });
+    println!("metric, 4 to 13 m: {}", summary(&flights));
+    assert!(flights.iter().all(|f| f.phase == Phase::Landed));
+    let (error, worst) = spread(&flights, |f| f.error_m);
+    assert!(error <= 0.05 && worst <= 0.15, "{error} {worst}");
+}
+
+#[test]
+fn gusts_latency_and_missed_frames_are_survived() {
+    let flights =
+        fly(0..20, |seed| Scene { gust_m_s: 0.06, latency_s: 0.2, miss: 0.3, ..Scene::new(seed) });
+    println!("metric, gusts, 200 ms, 30 % missed: {}", summary(&flights));
+    assert!(flights.iter().all(|f| f.phase == Phase::Landed));
+    let (error, worst) = spread(&flights, |f| f.error_m);
+    assert!(error <= 0.1 && worst <= 0.3, "{error} {worst}");
+}
+
+#[test]
+fn a_pad_above_the_origin_is_met_at_its_own_height() {
+    // The pad lies 3 m above the place of take-off, so the small world's ground comes after it: LAND must begin above the pad.
+    let pad = Point::new(1.0, 0.5, -3.0);
+    let flight = Scene { pad, limit_s: 15.0, ..Scene::new(3) }.fly();
+    let land = flight.at(flight.land_s.unwrap()).unwrap();
+    assert!((-land.position.z() - 3.4).abs() < 0.15, "{:?}", land.position);
+}
+
+#[test]
+fn a_lost_target_stops_the_descent_and_the_vehicle_holds_until_it_is_seen_again() {
+    for seed in 0..5 {
+        let flight = Scene { outage_s: Some((3.0, 10.0)), ..Scene::new(seed) }.fly();
+        assert!(deepest(&flight, 2.0, 3.0) > 1.0);
+        assert_eq!(deepest(&flight, 3.45, 10.0), 0.0);
+        let hold = flight.at(5.0).unwrap();
+        assert_eq!((hold.decision.phase, hold.decision.why), (Phase::Hold, Reason::TargetLost));
+        let (from, to) = (flight.at(5.0).unwrap().position, flight.at(9.9).unwrap().position);
+        assert!((to - from).norm() < 0.4, "held within {} m", (to - from).norm());
+        assert_eq!(flight.phase, Phase::Landed);
+        assert!(flight.error_m < 0.15, "{}", flight.error_m);
     }
+}
+
+#[test]
+fn a_target_lost_for_good_ends_in_an_abort_and_silence() {
+    let flight = Scene { outage_s: Some((3.0, 1e9)), limit_s: 90.0, ..Scene::new(1) }.fly();
+    assert_eq!(flight.phase, Phase::Aborted);
+    let last = flight.samples.last().unwrap();
+    assert_eq!((last.decision.action, last.decision.why), (Action::None, Reason::HeldTooLong));
+    let mut scene = Scene { outage_s: Some((3.0, 1e9)), ..Scene::new(1) };
+    scene.config.phases.on_abort = OnAbort::Land;
+    assert!(scene.fly().touchdown_s.is_some());
+}
+
+#[test]
+fn a_marker_lost_low_over_it_does_not_keep_the_vehicle_in_the_air() {
+    let undisturbed = Scene::new(2).fly();
+    let low_s = undisturbed.samples.iter().find(|s| s.position.z() > -0.7).unwrap().seconds;
+    let flight = Scene { outage_s: Some((low_s, 1e9)), ..Scene::new(2) }.fly();
+    assert_eq!(flight.phase, Phase::Landed);
+    assert!(flight.error_m < 0.15, "{}", flight.error_m);
+}
+
+#[test]
+fn the_pilot_silences_us_at_once() {
+    let flight = Scene { pilot_s: Some(3.0), limit_s: 20.0, ..Scene::new(1) }.fly();
+    assert!(
+        flight
+            .samples
+            .iter()
+            .filter(|s| s.seconds > 3.03)
+            .all(|s| s.decision.action == Action::None)
+    );
+    assert_eq!(flight.phase, Phase::PilotInCommand);
+}
+
+#[test]
+fn the_operator_can_hold_resume_and_abort() {
+    let commands = vec![
+        (0.0, OperatorCommand::Start),
+        (3.0, OperatorCommand::Hold),
+        (8.0, OperatorCommand::Resume),
+    ];
+    let flight = Scene { commands, ..Scene::new(1) }.fly();
+    assert_eq!(deepest(&flight, 3.01, 7.9), 0.0);
+    assert_eq!(flight.phase, Phase::Landed);
+    let commands = vec![(0.0, OperatorCommand::Start), (3.0, OperatorCommand::Abort)];
+    let flight = Scene { commands, limit_s: 20.0, ..Scene::new(1) }.fly();
+    assert_eq!(flight.phase, Phase::Aborted);
+}
+
+#[test]
+fn land_is_asked_for_again_and_given_up_when_refused() {
+    let flight = Scene { refuses_land: true, limit_s: 40.0, ..Scene::new(1) }.fly();
+    let asked = flight.samples.iter().filter(|s| s.decision.action == Action::Land).count();
+    assert!((8..=12).contains(&asked), "{asked}");
+    let last = flight.samples.last().unwrap();
+    assert_eq!((last.decision.phase, last.decision.why), (Phase::Aborted, Reason::LandRefused));
+}
+
+#[test]
+fn a_lander_started_in_mid_air_takes_the_landing_up() {
+    let start = Point::new(1.0, -1.2, -5.0);
+    let flights = fly(0..10, |seed| Scene { start, ..Scene::new(seed) });
+    assert!(flights.iter().all(|f| f.phase == Phase::Landed && f.error_m < 0.15));
+}
+
+#[test]
+fn the_thesis_landing_takes_about_its_55_seconds() {
+    let calm = |scene: Scene| Scene { gust_m_s: 0.0, estimator_error: 0.0, ..scene };
+    let flights = fly(0..20, |seed| calm(thesis(seed, ThesisConfig::default())));
+    println!("thesis: {}", summary(&flights));
+    assert!(flights.iter().all(|f| f.phase == Phase::Landed));
+    let (disarm, _) = spread(&flights, |f| f.disarm_s.unwrap_or(f64::INFINITY));
+    let (error, worst) = spread(&flights, |f| f.error_m);
+    assert!((50.0..60.0).contains(&disarm), "{disarm}");
+    assert!((0.03..0.1).contains(&error) && worst < 0.2, "{error} {worst}");
+    for sample in flights.iter().flat_map(|f| &f.samples) {
+        if let Action::Velocity { velocity, .. } = sample.decision.action {
+            // The limits of x and y, and five standard deviations of the wind noise on each.
+            assert!(
+                velocity.x().abs() <= 0.62
+                    && velocity.y().abs() <= 0.62
+                    && velocity.z().abs() <= 0.62
+            );
+        }
+    }
+}
+
+#[test]
+fn the_thesis_guidance_works_with_any_heading() {
+    let flights = fly(0..6, |seed| Scene {
+        heading_rad: seed as f64,
+        ..thesis(seed, ThesisConfig::default())
+    });
+    println!("thesis, any heading, gusts: {}", summary(&flights));
+    assert!(flights.iter().all(|f| f.phase == Phase::Landed));
+}
+
+#[test]
+fn the_thesis_gain_as_printed_does_not_land() {
+    let flights = fly(0..5, |seed| thesis(seed, ThesisConfig::as_printed()));
+    assert!(flights.iter().all(|f| f.land_s.is_none()));
+}
+
+#[test]
+fn the_same_flight_twice_is_the_same() {
+    let (a, b) = (Scene::new(7).fly(), Scene::new(7).fly());
+    assert_eq!(a.samples.len(), b.samples.len());
+    assert!(a.samples.iter().zip(&b.samples).all(|(a, b)| a.decision == b.decision));
 }

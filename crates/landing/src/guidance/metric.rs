@@ -11,7 +11,7 @@
 //! The end: low over the target, with a small error and a small speed, the autopilot's LAND mode takes over. LAND
 //! holds the place where the vehicle comes to rest, so the error that counts is the one after coasting.
 
-use geometry::{Ned, Point, Vector};
+use geometry::{Ned, Vector};
 
 use crate::config::{ConfigError, check};
 use crate::decision::{Reason, TargetEstimate};
@@ -23,14 +23,14 @@ use crate::time::Timestamp;
 pub struct MetricConfig {
     /// Lateral speed per metre of predicted error, in 1/s (0.1 to 3).
     pub lateral_gain: f64,
-    /// Lateral speed gained per metre of error and second, in 1/s^2; counters a biased velocity (0 to 1).
-    pub lateral_integral_gain: f64,
     /// Largest lateral speed, in m/s (0.1 to 5).
     pub max_lateral_m_s: f64,
     /// Largest change of the lateral setpoint, in m/s^2; tilts the camera (0.1 to 2.5).
     pub lateral_acceleration_m_s2: f64,
-    /// How far ahead the lateral error is predicted: what passes until a setpoint shows, in s (0 to 1).
-    pub lead_s: f64,
+    /// Time from a setpoint to the first motion, in s (0 to 1).
+    pub dead_time_s: f64,
+    /// Time constant with which the velocity then follows, in s (0 to 1).
+    pub lag_s: f64,
     /// Largest speed of descent, in m/s (0.1 to 3).
     pub max_descend_m_s: f64,
     /// Speed of descent at the hand-over to LAND, in m/s (0.05 to 1).
@@ -57,35 +57,35 @@ pub struct MetricConfig {
     pub settle_s: f64,
     /// Largest lateral error at which the vehicle lands on although the marker left the view, in m (0.01 to 1).
     pub blind_error_m: f64,
-    /// The integral grows only while the error is smaller than this, in m (0 to 5).
-    pub integral_within_m: f64,
-    /// Largest integral, in m/s (0 to 1).
-    pub max_integral_m_s: f64,
+    /// Time constant of the observer of the drift that the autopilot's velocity does not show, in s (0.2 to 60).
+    pub drift_time_s: f64,
+    /// Largest drift countered, in m/s; 0 turns the observer off (0 to 1).
+    pub max_drift_m_s: f64,
 }
 
 impl Default for MetricConfig {
     fn default() -> Self {
         Self {
-            lateral_gain: 0.9,
-            lateral_integral_gain: 0.2,
+            lateral_gain: 1.1,
             max_lateral_m_s: 1.5,
             lateral_acceleration_m_s2: 1.0,
-            lead_s: 0.4,
+            dead_time_s: 0.25,
+            lag_s: 0.43,
             max_descend_m_s: 1.8,
             final_descend_m_s: 0.25,
             descend_gain: 0.5,
             descend_acceleration_m_s2: 1.5,
             funnel_m: 0.06,
             funnel_per_height: 0.25,
-            fresh_target_s: 0.25,
-            land_height_m: 0.45,
+            fresh_target_s: 0.3,
+            land_height_m: 0.4,
             land_error_m: 0.05,
             land_speed_m_s: 0.1,
             coast_s: 0.6,
             settle_s: 5.0,
             blind_error_m: 0.15,
-            integral_within_m: 0.4,
-            max_integral_m_s: 0.1,
+            drift_time_s: 1.0,
+            max_drift_m_s: 0.1,
         }
     }
 }
@@ -93,10 +93,10 @@ impl Default for MetricConfig {
 impl MetricConfig {
     pub(crate) fn validate(&self) -> Result<(), ConfigError> {
         check("metric.lateral_gain", self.lateral_gain, 0.1, 3.0)?;
-        check("metric.lateral_integral_gain", self.lateral_integral_gain, 0.0, 1.0)?;
         check("metric.max_lateral_m_s", self.max_lateral_m_s, 0.1, 5.0)?;
         check("metric.lateral_acceleration_m_s2", self.lateral_acceleration_m_s2, 0.1, 2.5)?;
-        check("metric.lead_s", self.lead_s, 0.0, 1.0)?;
+        check("metric.dead_time_s", self.dead_time_s, 0.0, 1.0)?;
+        check("metric.lag_s", self.lag_s, 0.0, 1.0)?;
         check("metric.max_descend_m_s", self.max_descend_m_s, 0.1, 3.0)?;
         check("metric.final_descend_m_s", self.final_descend_m_s, 0.05, 1.0)?;
         check("metric.descend_gain", self.descend_gain, 0.1, 2.0)?;
@@ -110,8 +110,8 @@ impl MetricConfig {
         check("metric.coast_s", self.coast_s, 0.0, 2.0)?;
         check("metric.settle_s", self.settle_s, 0.1, 60.0)?;
         check("metric.blind_error_m", self.blind_error_m, 0.01, 1.0)?;
-        check("metric.integral_within_m", self.integral_within_m, 0.0, 5.0)?;
-        check("metric.max_integral_m_s", self.max_integral_m_s, 0.0, 1.0)
+        check("metric.drift_time_s", self.drift_time_s, 0.2, 60.0)?;
+        check("metric.max_drift_m_s", self.max_drift_m_s, 0.0, 1.0)
     }
 }
 
@@ -127,25 +127,36 @@ const BRAKING: f64 = 0.7;
 /// Steps are taken as if no longer than this apart, in seconds.
 const LONGEST_STEP_S: f64 = 0.1;
 
-/// Our guidance with its memory: the last setpoint, the integral, and since when the vehicle settles.
+/// An observed error further than this from the expected one is a jump of the estimate, not drift, in metres.
+const JUMP_M: f64 = 0.3;
+
+/// Our guidance with its memory: the last setpoint, the drift, and since when the vehicle settles.
 #[derive(Clone, Debug)]
 pub struct Metric {
     config: MetricConfig,
     last: Option<(Timestamp, Vector<Ned>)>,
-    integral: Vector<Ned>,
+    drift: Option<Drift>,
     settling_since: Option<Timestamp>,
+}
+
+/// What moves the vehicle although the autopilot's velocity does not show it.
+#[derive(Copy, Clone, Debug)]
+struct Drift {
+    /// The lateral error expected now.
+    expected: Vector<Ned>,
+    velocity: Vector<Ned>,
 }
 
 impl Metric {
     /// A guidance without memory.
     pub fn new(config: MetricConfig) -> Self {
-        Self { config, last: None, integral: Vector::zero(), settling_since: None }
+        Self { config, last: None, drift: None, settling_since: None }
     }
 
     /// Forgets what builds up while guiding.
     pub fn rest(&mut self) {
         self.last = None;
-        self.integral = Vector::zero();
+        self.drift = None;
         self.settling_since = None;
     }
 
@@ -180,7 +191,8 @@ impl Metric {
         let Some(target) = situation.target else { return (Vector::zero(), Reason::Searching) };
         let (before, last) = self.last.unwrap_or((situation.now, situation.vehicle.velocity));
         let step_s = situation.now.seconds_since(before).clamp(0.0, LONGEST_STEP_S);
-        let lateral = self.lateral(situation, &target, step_s);
+        self.observe_drift(situation, &target, step_s);
+        let lateral = self.lateral(situation, &target, last);
         let (descent_m_s, why) = self.descent(situation, &target);
         let down =
             approach_speed(last.z(), descent_m_s, self.config.descend_acceleration_m_s2 * step_s);
@@ -222,10 +234,30 @@ impl Metric {
         ahead_s: f64,
     ) -> Vector<Ned> {
         let age_s = situation.now.seconds_since(situation.vehicle.stamp).clamp(0.0, LONGEST_STEP_S);
-        let vehicle: Point<Ned> =
-            situation.vehicle.position + situation.vehicle.velocity * (age_s + ahead_s);
-        let way = target.position - vehicle;
+        let drift = self.drift.map_or(Vector::zero(), |drift| drift.velocity);
+        let vehicle = situation.vehicle.position + situation.vehicle.velocity * age_s;
+        let way = target.position - vehicle - (situation.vehicle.velocity + drift) * ahead_s;
         Vector::new(way.x(), way.y(), 0.0)
+    }
+
+    /// A critically damped observer: the error should shrink by the velocity reported; what is left over is drift.
+    fn observe_drift(&mut self, situation: &Situation<'_>, target: &TargetEstimate, step_s: f64) {
+        let error = self.error(situation, target, 0.0);
+        let moved = situation.vehicle.velocity * step_s;
+        let fresh = Drift { expected: error, velocity: Vector::zero() };
+        let mut drift = self.drift.unwrap_or(fresh);
+        let expected =
+            drift.expected - (Vector::new(moved.x(), moved.y(), 0.0) + drift.velocity * step_s);
+        let surprise = error - expected;
+        if surprise.norm() > JUMP_M {
+            self.drift = Some(fresh);
+            return;
+        }
+        let time_s = self.config.drift_time_s;
+        drift.expected = expected + surprise * (2.0 * step_s / time_s).min(1.0);
+        let grown = drift.velocity - surprise * (step_s / time_s.powi(2));
+        drift.velocity = shortened(grown, self.config.max_drift_m_s);
+        self.drift = Some(drift);
     }
 
     fn funnel_m(&self, height_m: f64) -> f64 {
@@ -234,26 +266,22 @@ impl Metric {
     }
 
     fn lateral(
-        &mut self,
+        &self,
         situation: &Situation<'_>,
         target: &TargetEstimate,
-        step_s: f64,
+        last: Vector<Ned>,
     ) -> Vector<Ned> {
         let config = &self.config;
-        let error = self.error(situation, target, config.lead_s);
+        // What the setpoints already sent will still move the vehicle by.
+        let under_way = Vector::new(last.x(), last.y(), 0.0) * config.dead_time_s;
+        let error = self.error(situation, target, config.lag_s) - under_way;
         let distance_m = error.norm();
-        if situation.age_s <= situation.phases.stale_target_s
-            && distance_m <= config.integral_within_m
-        {
-            let grown = self.integral + error * (config.lateral_integral_gain * step_s);
-            self.integral = shortened(grown, config.max_integral_m_s);
-        }
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * distance_m).sqrt();
         let speed_m_s =
             (config.lateral_gain * distance_m).min(braking_m_s).min(config.max_lateral_m_s);
         let towards =
             if distance_m > 1e-9 { error * (speed_m_s / distance_m) } else { Vector::zero() };
-        towards + self.integral
+        towards - self.drift.map_or(Vector::zero(), |drift| drift.velocity)
     }
 
     fn descent(&self, situation: &Situation<'_>, target: &TargetEstimate) -> (f64, Reason) {

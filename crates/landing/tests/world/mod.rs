@@ -60,7 +60,6 @@ pub(crate) struct Scene {
 pub(crate) struct Sample {
     pub(crate) seconds: f64,
     pub(crate) position: Point<Ned>,
-    pub(crate) velocity: Vector<Ned>,
     pub(crate) decision: Decision,
 }
 
@@ -162,7 +161,7 @@ impl Flight {
         self.samples.push(Sample {
             seconds: world.seconds - 0.5,
             position: world.position,
-            velocity: world.velocity,
+
             decision,
         });
     }

@@ -1,0 +1,294 @@
+//! Whatever happens, in whatever order: setpoints stay inside the envelope, nothing descends on a stale target,
+//! nobody who took over is disturbed, and every landing ends.
+
+use geometry::{Body, Ned, Pixel, Point, Rotation, Transform, Vector};
+use landing::{
+    Action, Config, Event, Frame, Guidance, Landed, Lander, MarkerInFrame, Mode, OperatorCommand,
+    Phase, ThesisConfig, Timestamp, VehicleState,
+};
+use proptest::prelude::*;
+
+/// An event and the seconds that pass before it.
+#[derive(Clone, Debug)]
+struct Happening {
+    after_s: f64,
+    event: Kind,
+}
+
+/// An event whose stamp is an age, because the time is only known when it is told.
+#[derive(Clone, Debug)]
+enum Kind {
+    Vehicle {
+        age_s: f64,
+        position: [f64; 3],
+        velocity: [f64; 3],
+        mode: Mode,
+        armed: bool,
+        landed: Landed,
+    },
+    Frame {
+        age_s: f64,
+        centre: Option<[f64; 2]>,
+        origin: Option<[f64; 3]>,
+        width: u32,
+    },
+    Operator(OperatorCommand),
+    Tick,
+    /// The vehicle is near the pad, and the camera sees it.
+    Usual {
+        north: f64,
+        height_m: f64,
+    },
+}
+
+/// Mostly a sensible number, sometimes any at all.
+fn number(around: f64, width: f64) -> impl Strategy<Value = f64> {
+    prop_oneof![30 => around - width..around + width, 1 => prop::num::f64::ANY]
+}
+
+fn age() -> impl Strategy<Value = f64> {
+    prop_oneof![20 => 0.0..0.15f64, 2 => -1.0..1.0f64, 1 => -1e12..1e12f64]
+}
+
+fn mode() -> impl Strategy<Value = Mode> {
+    prop_oneof![90 => Just(Mode::Guided), 2 => Just(Mode::Land), 1 => Just(Mode::Other)]
+}
+
+fn landed() -> impl Strategy<Value = Landed> {
+    prop_oneof![
+        90 => Just(Landed::InAir), 2 => Just(Landed::Unknown), 1 => Just(Landed::OnGround),
+        1 => Just(Landed::TakingOff), 1 => Just(Landed::Landing)
+    ]
+}
+
+fn vehicle() -> impl Strategy<Value = Kind> {
+    let place =
+        (number(0.0, 1.0), number(0.0, 1.0), number(-1.5, 1.4)).prop_map(|(x, y, z)| [x, y, z]);
+    let speed =
+        (number(0.0, 0.2), number(0.0, 0.2), number(0.0, 0.5)).prop_map(|(x, y, z)| [x, y, z]);
+    (age(), place, speed, mode(), prop::bool::weighted(0.995), landed()).prop_map(
+        |(age_s, position, velocity, mode, armed, landed)| Kind::Vehicle {
+            age_s,
+            position,
+            velocity,
+            mode,
+            armed,
+            landed,
+        },
+    )
+}
+
+fn frame() -> impl Strategy<Value = Kind> {
+    let centre = (number(648.0, 400.0), number(486.0, 300.0)).prop_map(|(x, y)| [x, y]);
+    let origin =
+        (number(0.0, 0.3), number(0.0, 0.3), number(1.5, 1.0)).prop_map(|(x, y, z)| [x, y, z]);
+    let width = prop_oneof![20 => Just(1296u32), 1 => Just(0), 1 => any::<u32>()];
+    (age(), prop::option::weighted(0.8, centre), prop::option::weighted(0.95, origin), width)
+        .prop_map(|(age_s, centre, origin, width)| Kind::Frame { age_s, centre, origin, width })
+}
+
+fn operator() -> impl Strategy<Value = Kind> {
+    prop_oneof![
+        6 => Just(OperatorCommand::Start), 1 => Just(OperatorCommand::Hold), 2 => Just(OperatorCommand::Resume),
+        1 => Just(OperatorCommand::Abort)
+    ]
+    .prop_map(Kind::Operator)
+}
+
+fn happening() -> impl Strategy<Value = Happening> {
+    let after_s = prop_oneof![200 => 0.0..0.08f64, 3 => 0.0..2.0f64, 1 => -1.0..200.0f64];
+    let usual =
+        (-0.3..0.3f64, 0.3..6.0f64).prop_map(|(north, height_m)| Kind::Usual { north, height_m });
+    let event = prop_oneof![
+        200 => usual, 15 => vehicle(), 10 => frame(), 1 => operator(), 20 => Just(Kind::Tick)
+    ];
+    (after_s, event).prop_map(|(after_s, event)| Happening { after_s, event })
+}
+
+fn events(kind: &Kind, now: Timestamp) -> [Event; 2] {
+    let Kind::Usual { north, height_m } = *kind else { return [event(kind, now), Event::Tick] };
+    let attitude = Rotation::from_euler(0.02, -0.03, 1.0);
+    let in_body = Rotation::<Ned, Body>::inverse(&attitude) * Vector::new(-north, 0.0, height_m);
+    let vehicle = Kind::Vehicle {
+        age_s: 0.0,
+        position: [north, 0.0, -height_m],
+        velocity: [0.01, 0.0, 0.1],
+        mode: Mode::Guided,
+        armed: true,
+        landed: Landed::InAir,
+    };
+    let origin = Some([in_body.x(), in_body.y(), in_body.z()]);
+    let frame = Kind::Frame { age_s: 0.0, centre: Some([650.0, 500.0]), origin, width: 1296 };
+    [event(&vehicle, now), event(&frame, now)]
+}
+
+fn event(kind: &Kind, now: Timestamp) -> Event {
+    match *kind {
+        Kind::Tick | Kind::Usual { .. } => Event::Tick,
+        Kind::Operator(command) => Event::Operator(command),
+        Kind::Vehicle { age_s, position: p, velocity: v, mode, armed, landed } => {
+            Event::Vehicle(VehicleState {
+                stamp: now.plus_seconds(-age_s),
+                ned_from_body: Rotation::from_euler(0.02, -0.03, 1.0),
+                position: Point::new(p[0], p[1], p[2]),
+                velocity: Vector::new(v[0], v[1], v[2]),
+                mode,
+                armed,
+                landed,
+            })
+        }
+        Kind::Frame { age_s, centre, origin, width } => Event::Frame(Frame {
+            stamp: now.plus_seconds(-age_s),
+            detector: 3,
+            image_size: (width, 972),
+            marker: centre.map(|c| MarkerInFrame {
+                centre: Pixel::new(c[0], c[1]),
+                body_from_marker: origin
+                    .map(|o| Transform::new(Rotation::identity(), Point::new(o[0], o[1], o[2]))),
+                confidence: 0.8,
+            }),
+        }),
+    }
+}
+
+/// What a watcher outside knows.
+#[derive(Default)]
+struct Watcher {
+    newest_marker: Option<Timestamp>,
+    pilot_flies: bool,
+}
+
+impl Watcher {
+    fn check(
+        &mut self,
+        config: &Config,
+        lander: &mut Lander,
+        now: Timestamp,
+        told: Event,
+    ) -> Result<(), TestCaseError> {
+        let before = lander.phase();
+        let decision = lander.step(now, told);
+        prop_assert_eq!(decision.phase, lander.phase());
+        if decision.rejected.is_none() {
+            match told {
+                Event::Frame(frame) if frame.marker.is_some() => {
+                    self.newest_marker = Some(frame.stamp)
+                }
+                Event::Vehicle(state) if state.mode == Mode::Other => {
+                    self.pilot_flies = !before.is_terminal()
+                }
+                Event::Operator(OperatorCommand::Start) => self.pilot_flies = false,
+                _ => {}
+            }
+        }
+        prop_assert!(!self.pilot_flies || decision.action == Action::None);
+        match decision.action {
+            Action::None => {}
+            Action::Land => prop_assert_eq!(decision.phase, Phase::Final),
+            Action::Velocity { velocity, yaw_rate } => {
+                prop_assert!(velocity.is_finite() && yaw_rate == 0.0);
+                prop_assert!(velocity.horizontal_norm() <= config.envelope.horizontal_m_s + 1e-9);
+                prop_assert!(velocity.z() >= -config.envelope.climb_m_s);
+                prop_assert!(velocity.z() <= config.envelope.descend_m_s);
+                if velocity.z() > 0.0 {
+                    prop_assert!(matches!(decision.phase, Phase::Approach | Phase::Descend));
+                    self.may_descend(config, now, decision.target.map(|t| t.height_m))?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn may_descend(
+        &self,
+        config: &Config,
+        now: Timestamp,
+        height_m: Option<f64>,
+    ) -> Result<(), TestCaseError> {
+        let age_s = self.newest_marker.map_or(f64::INFINITY, |stamp| now.seconds_since(stamp));
+        let phases = &config.phases;
+        prop_assert!(
+            age_s <= phases.stale_target_s + phases.low_grace_s + 1e-6,
+            "descends at age {}",
+            age_s
+        );
+        if height_m.is_some_and(|height_m| height_m > phases.low_height_m) {
+            prop_assert!(age_s <= phases.stale_target_s + 1e-6, "descends at age {}", age_s);
+        }
+        Ok(())
+    }
+}
+
+fn good_state(now: Timestamp) -> Event {
+    event(
+        &Kind::Vehicle {
+            age_s: 0.0,
+            position: [0.0, 0.0, -3.0],
+            velocity: [0.0; 3],
+            mode: Mode::Guided,
+            armed: true,
+            landed: Landed::InAir,
+        },
+        now,
+    )
+}
+
+fn survives(config: Config, start: f64, happenings: &[Happening]) -> Result<(), TestCaseError> {
+    let mut lander = Lander::new(config).map_err(|error| TestCaseError::fail(error.to_string()))?;
+    let mut watcher = Watcher::default();
+    let mut clock = Timestamp::from_seconds(start);
+    let mut latest = clock;
+    watcher.check(&config, &mut lander, latest, good_state(latest))?;
+    watcher.check(&config, &mut lander, latest, Event::Operator(OperatorCommand::Start))?;
+    prop_assert_eq!(lander.phase(), Phase::Search);
+    for happening in happenings {
+        clock = clock.plus_seconds(happening.after_s);
+        latest = latest.max(clock);
+        for event in events(&happening.event, latest) {
+            watcher.check(&config, &mut lander, latest, event)?;
+        }
+    }
+    // Left alone with a vehicle that hovers, whatever state it is in ends.
+    for i in 0..16_000u32 {
+        latest = latest.plus_seconds(0.1);
+        let told = if i.is_multiple_of(2) { good_state(latest) } else { Event::Tick };
+        watcher.check(&config, &mut lander, latest, told)?;
+        if lander.phase().is_terminal() {
+            return Ok(());
+        }
+    }
+    Err(TestCaseError::fail(format!("still in {} after 1600 s", lander.phase())))
+}
+
+proptest! {
+    #[test]
+    fn the_metric_guidance_survives_anything(
+        start in -1e9..1e9f64, happenings in prop::collection::vec(happening(), 0..400),
+    ) {
+        survives(Config::default(), start, &happenings)?;
+    }
+
+    #[test]
+    fn the_thesis_guidance_survives_anything(
+        seed: u64, happenings in prop::collection::vec(happening(), 0..400),
+    ) {
+        let guidance = Guidance::Thesis(ThesisConfig { seed, ..ThesisConfig::default() });
+        survives(Config { guidance, ..Config::default() }, 0.0, &happenings)?;
+    }
+}
+
+#[test]
+fn stamps_at_the_ends_of_time_are_refused() {
+    let mut lander = Lander::new(Config::default()).unwrap();
+    let now = Timestamp::from_seconds(10.0);
+    for nanos in [i64::MIN, i64::MAX] {
+        let mut told = good_state(now);
+        if let Event::Vehicle(state) = &mut told {
+            state.stamp = Timestamp::from_nanos(nanos);
+        }
+        assert!(lander.step(now, told).rejected.is_some());
+    }
+    lander.step(Timestamp::from_nanos(i64::MAX), Event::Tick);
+    lander.step(Timestamp::from_nanos(i64::MIN), Event::Operator(OperatorCommand::Start));
+    assert_eq!(lander.phase(), Phase::Idle);
+}
