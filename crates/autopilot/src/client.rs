@@ -1,0 +1,685 @@
+//! The conversation with one autopilot, as a state machine without input and output.
+//!
+//! Feed it every packet ([`Autopilot::handle`]) and the time ([`Autopilot::tick`], 20 times a second or more); send what
+//! [`Autopilot::poll_outgoing`] returns and act on what [`Autopilot::poll_event`] returns. Only the heartbeat says what
+//! is true: an acknowledgement is a promise, and the pilot may have changed the mode in between.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use geometry::{Ned, Vector};
+
+use crate::command::{
+    Command, CommandError, CommandId, CommandStatus, Patience, Request, SetpointError, Step, ns,
+};
+use crate::compose;
+use crate::dialect::{
+    COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
+    MavType,
+};
+use crate::frame::{self, Frame, Sender};
+use crate::mode::{Firmware, FlightMode};
+use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
+use crate::stream::{Notice, Stream, Streams};
+use crate::text::Joiner;
+
+/// The component number of every autopilot.
+const AUTOPILOT: u8 = 1;
+/// Events and packets that nobody takes: the oldest go.
+const MAX_QUEUED: usize = 1024;
+/// Finished commands whose outcome is remembered.
+const MAX_OUTCOMES: usize = 32;
+const HEARTBEAT_NS: i64 = 1_000_000_000;
+/// The autopilot's clock going back by so much means that it restarted.
+const RESTART_MS: u32 = 1_000;
+
+/// How to talk to the autopilot.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Config {
+    /// The vehicle's system number; `None` takes the first autopilot that is heard, and stays with it.
+    pub system_id: Option<u8>,
+    /// Our own system number; `None` takes the vehicle's, as a part of it.
+    pub our_system: Option<u8>,
+    /// Our own component number.
+    pub our_component: u8,
+    /// Whether to send our own heartbeat once a second.
+    pub heartbeat: bool,
+    /// The silence after which the autopilot counts as lost.
+    pub heartbeat_timeout: Duration,
+    /// The messages to ask for.
+    pub streams: Vec<Stream>,
+    /// How long commands are tried.
+    pub patience: Patience,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            system_id: None,
+            our_system: None,
+            our_component: 191,
+            heartbeat: true,
+            heartbeat_timeout: Duration::from_secs(3),
+            streams: default_streams(50.0),
+            patience: Patience::default(),
+        }
+    }
+}
+
+/// The messages that landing needs, with attitude and position at this rate in Hz.
+pub fn default_streams(rate_hz: f64) -> Vec<Stream> {
+    let required = |message_id, rate_hz| Stream { message_id, rate_hz, required: true };
+    let welcome = |message_id, rate_hz| Stream { message_id, rate_hz, required: false };
+    vec![
+        required(30, rate_hz), // ATTITUDE
+        required(32, rate_hz), // LOCAL_POSITION_NED
+        required(245, 5.0),    // EXTENDED_SYS_STATE
+        required(1, 2.0),      // SYS_STATUS
+        required(193, 2.0),    // EKF_STATUS_REPORT
+        welcome(132, 10.0),    // DISTANCE_SENSOR
+        welcome(147, 1.0),     // BATTERY_STATUS
+    ]
+}
+
+/// What happened.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Event {
+    /// The autopilot was heard for the first time.
+    Found {
+        /// Its system number.
+        system: u8,
+        /// What flies it.
+        firmware: Firmware,
+    },
+    /// Another vehicle is on the same link; it is ignored. Said once: pin the right one in the configuration.
+    OtherVehicle {
+        /// Its system number.
+        system: u8,
+    },
+    /// The heartbeat is not heard any more.
+    Lost {
+        /// For how long.
+        silence: Duration,
+    },
+    /// The heartbeat is heard again.
+    Returned,
+    /// The autopilot restarted: what it was told is forgotten, and its origin may be another one.
+    Restarted,
+    /// A new attitude.
+    Attitude(Attitude),
+    /// A new position.
+    Position(Position),
+    /// A new distance measured downwards.
+    Range(Range),
+    /// The whole state, after each attitude and position.
+    State(VehicleState),
+    /// The flight mode changed, by whoever.
+    ModeChanged {
+        /// The mode before; none at the beginning.
+        from: Option<FlightMode>,
+        /// The mode now.
+        to: FlightMode,
+    },
+    /// The motors were armed (true) or disarmed.
+    ArmedChanged(bool),
+    /// It left the ground, or came down.
+    LandedChanged {
+        /// The state before.
+        from: LandedState,
+        /// The state now.
+        to: LandedState,
+    },
+    /// It became ready to fly, or ceased to be.
+    ReadyChanged {
+        /// Whether it is ready.
+        ready: bool,
+        /// What is missing, for people.
+        reasons: Vec<String>,
+    },
+    /// The autopilot says something to people.
+    Text {
+        /// How urgent it is.
+        severity: MavSeverity,
+        /// The whole text.
+        text: String,
+    },
+    /// A command is finished.
+    Command {
+        /// Which request.
+        id: CommandId,
+        /// What was asked.
+        command: Command,
+        /// Whether it was done.
+        result: Result<(), CommandError>,
+    },
+    /// A required message does not come as asked, though it was asked for repeatedly.
+    StreamMissing {
+        /// Its name.
+        message: &'static str,
+        /// How often it should come, in Hz.
+        wanted_hz: f64,
+        /// How often it comes, in Hz.
+        measured_hz: f64,
+    },
+    /// A missing message comes again.
+    StreamRestored {
+        /// Its name.
+        message: &'static str,
+        /// How often it comes, in Hz.
+        measured_hz: f64,
+    },
+}
+
+/// The conversation with one autopilot.
+#[derive(Clone, Debug)]
+pub struct Autopilot {
+    config: Config,
+    vehicle: Option<Vehicle>,
+    streams: Streams,
+    requests: Vec<Request>,
+    outcomes: VecDeque<(CommandId, CommandStatus)>,
+    next_id: u64,
+    events: VecDeque<Event>,
+    outgoing: VecDeque<Vec<u8>>,
+    sequence: u8,
+    heartbeat_due_ns: i64,
+    other_vehicle: bool,
+    refused_numbers: u64,
+}
+
+#[derive(Clone, Debug)]
+struct Vehicle {
+    system: u8,
+    firmware: Firmware,
+    state: VehicleState,
+    readiness: Readiness,
+    heartbeat_ns: i64,
+    boot_ms: u32,
+    joiner: Joiner,
+}
+
+impl Autopilot {
+    /// A conversation that has not begun.
+    pub fn new(config: Config) -> Self {
+        Self {
+            streams: Streams::new(&config.streams),
+            config,
+            vehicle: None,
+            requests: Vec::new(),
+            outcomes: VecDeque::new(),
+            next_id: 1,
+            events: VecDeque::new(),
+            outgoing: VecDeque::new(),
+            sequence: 0,
+            heartbeat_due_ns: i64::MIN,
+            other_vehicle: false,
+            refused_numbers: 0,
+        }
+    }
+
+    /// Takes a packet that was received at `now_ns`.
+    pub fn handle(&mut self, now_ns: i64, frame: &Frame) {
+        let Some(message) = &frame.message else { return };
+        if frame.sender.component != AUTOPILOT {
+            return;
+        }
+        if let MavMessage::HEARTBEAT(heartbeat) = message {
+            self.take_heartbeat(now_ns, frame.sender.system, heartbeat);
+            return;
+        }
+        if self.vehicle.as_ref().is_none_or(|vehicle| vehicle.system != frame.sender.system) {
+            return;
+        }
+        self.streams.received(frame.message_id);
+        match message {
+            MavMessage::COMMAND_ACK(ack) => self.take_acknowledgement(now_ns, ack),
+            MavMessage::STATUSTEXT(text) => {
+                let texts = self.vehicle.as_mut().map(|v| v.joiner.push(now_ns, text));
+                for (severity, text) in texts.unwrap_or_default() {
+                    self.take_text(severity, text);
+                }
+            }
+            _ => self.take_state(now_ns, message),
+        }
+        self.step_requests(now_ns);
+    }
+
+    /// Lets time pass: call it often (20 Hz), also when nothing is received.
+    pub fn tick(&mut self, now_ns: i64) {
+        if self.config.heartbeat && now_ns >= self.heartbeat_due_ns {
+            self.send(&compose::heartbeat());
+            // The next one is a second after this one was due, unless time has run far ahead.
+            let regular = self.heartbeat_due_ns.saturating_add(HEARTBEAT_NS);
+            self.heartbeat_due_ns = if regular > now_ns { regular } else { now_ns + HEARTBEAT_NS };
+        }
+        self.check_silence(now_ns);
+        let late = self.vehicle.as_mut().and_then(|vehicle| vehicle.joiner.tick(now_ns));
+        if let Some((severity, text)) = late {
+            self.take_text(severity, text);
+        }
+        if self.is_connected() {
+            let (notices, request) = self.streams.tick(now_ns);
+            for notice in notices {
+                self.push(notice.into());
+            }
+            if let Some(request) = request {
+                self.send_to_vehicle(request);
+            }
+        }
+        self.step_requests(now_ns);
+    }
+
+    /// The next event, until there is none.
+    pub fn poll_event(&mut self) -> Option<Event> {
+        self.events.pop_front()
+    }
+
+    /// The next packet to send, until there is none.
+    pub fn poll_outgoing(&mut self) -> Option<Vec<u8>> {
+        self.outgoing.pop_front()
+    }
+
+    /// What is known about the vehicle; none before it is found.
+    pub fn state(&self) -> Option<&VehicleState> {
+        self.vehicle.as_ref().map(|vehicle| &vehicle.state)
+    }
+
+    /// What flies the vehicle; none before it is found.
+    pub fn firmware(&self) -> Option<Firmware> {
+        self.vehicle.as_ref().map(|vehicle| vehicle.firmware)
+    }
+
+    /// The vehicle's system number; none before it is found.
+    pub fn system(&self) -> Option<u8> {
+        self.vehicle.as_ref().map(|vehicle| vehicle.system)
+    }
+
+    /// Whether the heartbeat is heard.
+    pub fn is_connected(&self) -> bool {
+        self.vehicle.as_ref().is_some_and(|vehicle| vehicle.state.connected)
+    }
+
+    /// Why the vehicle cannot be armed and flown yet, for people; empty when it can.
+    pub fn not_ready_because(&self) -> Vec<String> {
+        match &self.vehicle {
+            None => vec!["waiting for the autopilot's heartbeat".to_owned()],
+            Some(vehicle) => vehicle.readiness.reasons(),
+        }
+    }
+
+    /// How many messages were refused because a number in them was not finite.
+    pub fn refused_numbers(&self) -> u64 {
+        self.refused_numbers
+    }
+
+    /// Asks for something. It is sent with the next [`Autopilot::tick`], and takes the place of an earlier request for
+    /// the same thing; [`Autopilot::status`] and [`Event::Command`] tell how it went.
+    pub fn request(&mut self, now_ns: i64, command: Command) -> CommandId {
+        let id = CommandId(self.next_id);
+        self.next_id += 1;
+        let same = |request: &Request| request.command.concerns_same_as(&command);
+        if let Some(index) = self.requests.iter().position(same) {
+            let old = self.requests.swap_remove(index);
+            let error = CommandError::Replaced { command: old.command, by: command };
+            self.finish(old.id, old.command, Err(error));
+        }
+        match self.refusal(command) {
+            Some(error) => self.finish(id, command, Err(error)),
+            None => self.requests.push(Request::new(id, command, now_ns)),
+        }
+        id
+    }
+
+    /// How a request stands.
+    pub fn status(&self, id: CommandId) -> CommandStatus {
+        if self.requests.iter().any(|request| request.id == id) {
+            return CommandStatus::Pending;
+        }
+        let outcome = self.outcomes.iter().find(|(known, _)| *known == id);
+        outcome.map_or(CommandStatus::Unknown, |(_, status)| status.clone())
+    }
+
+    /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second, because the
+    /// autopilot flies on with the last one for 3 s. To stop, send noughts.
+    pub fn set_velocity(
+        &mut self,
+        now_ns: i64,
+        velocity: Vector<Ned>,
+        yaw_rate: f64,
+    ) -> Result<(), SetpointError> {
+        let vehicle = self.vehicle.as_ref().ok_or(SetpointError::NoAutopilot)?;
+        let state = &vehicle.state;
+        let fits = |value: f64| (value as f32).is_finite();
+        if !velocity.coords.iter().copied().all(fits) || !fits(yaw_rate) {
+            return Err(SetpointError::NotFinite(velocity.coords.into(), yaw_rate));
+        }
+        if !state.connected {
+            return Err(SetpointError::NoAutopilot);
+        }
+        if vehicle.firmware != Firmware::Copter {
+            return Err(SetpointError::Unsupported(vehicle.firmware));
+        }
+        if state.mode != FlightMode::Guided {
+            return Err(SetpointError::NotGuided(state.mode));
+        }
+        // "Landing" lasts a moment after LAND was left. During the takeoff a setpoint would end it.
+        if !state.armed || !matches!(state.landed, LandedState::InAir | LandedState::Landing) {
+            return Err(SetpointError::NotFlying(state.landed));
+        }
+        let time_ms = (now_ns / 1_000_000) as u32;
+        let target = (vehicle.system, AUTOPILOT);
+        self.send(&compose::velocity(time_ms, velocity, yaw_rate, target));
+        Ok(())
+    }
+
+    /// Sends any message in our name (LANDING_TARGET, STATUSTEXT, ...).
+    pub fn send(&mut self, message: &MavMessage) {
+        let packet = frame::encode(self.our_address(), self.sequence, message);
+        self.sequence = self.sequence.wrapping_add(1);
+        if self.outgoing.len() >= MAX_QUEUED {
+            self.outgoing.pop_front();
+        }
+        self.outgoing.push_back(packet);
+    }
+
+    /// In whose name messages are sent.
+    pub fn our_address(&self) -> Sender {
+        let system = self.config.our_system.or(self.config.system_id).or(self.system());
+        Sender { system: system.unwrap_or(1), component: self.config.our_component }
+    }
+
+    fn send_to_vehicle(&mut self, mut message: MavMessage) {
+        if let (MavMessage::COMMAND_LONG(command), Some(vehicle)) = (&mut message, &self.vehicle) {
+            command.target_system = vehicle.system;
+            command.target_component = AUTOPILOT;
+        }
+        self.send(&message);
+    }
+
+    fn push(&mut self, event: Event) {
+        if self.events.len() >= MAX_QUEUED {
+            self.events.pop_front();
+        }
+        self.events.push_back(event);
+    }
+
+    fn take_heartbeat(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
+        let flies = heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
+            && heartbeat.mavtype != MavType::MAV_TYPE_GCS;
+        if !flies || self.config.system_id.is_some_and(|pinned| pinned != system) {
+            return;
+        }
+        match &self.vehicle {
+            None => self.find(now_ns, system, heartbeat),
+            Some(vehicle) if vehicle.system != system => {
+                if !std::mem::replace(&mut self.other_vehicle, true) {
+                    self.push(Event::OtherVehicle { system });
+                }
+                return;
+            }
+            Some(_) => {}
+        }
+        self.follow_heartbeat(now_ns, heartbeat);
+        self.step_requests(now_ns);
+    }
+
+    fn find(&mut self, now_ns: i64, system: u8, heartbeat: &HEARTBEAT_DATA) {
+        let firmware = Firmware::of(heartbeat);
+        let mode = FlightMode::of(firmware, heartbeat.custom_mode);
+        self.vehicle = Some(Vehicle {
+            system,
+            firmware,
+            state: VehicleState {
+                stamp_ns: now_ns,
+                attitude: None,
+                position: None,
+                range: None,
+                mode,
+                armed: false,
+                landed: LandedState::Unknown,
+                ready: false,
+                battery: Battery::default(),
+                connected: true,
+            },
+            readiness: Readiness::default(),
+            heartbeat_ns: now_ns,
+            boot_ms: 0,
+            joiner: Joiner::default(),
+        });
+        self.streams.restart();
+        self.push(Event::Found { system, firmware });
+        self.push(Event::ModeChanged { from: None, to: mode });
+    }
+
+    fn follow_heartbeat(&mut self, now_ns: i64, heartbeat: &HEARTBEAT_DATA) {
+        let Some(vehicle) = &mut self.vehicle else { return };
+        let state = &mut vehicle.state;
+        let mode = FlightMode::of(vehicle.firmware, heartbeat.custom_mode);
+        let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
+        vehicle.heartbeat_ns = now_ns;
+        state.stamp_ns = now_ns;
+        let before = state.mode;
+        let returned = !std::mem::replace(&mut state.connected, true);
+        let mode_changed = std::mem::replace(&mut state.mode, mode) != mode;
+        let armed_changed = std::mem::replace(&mut state.armed, armed) != armed;
+        if returned {
+            self.streams.restart();
+            self.push(Event::Returned);
+        }
+        if mode_changed {
+            self.push(Event::ModeChanged { from: Some(before), to: mode });
+        }
+        if armed_changed {
+            self.push(Event::ArmedChanged(armed));
+        }
+    }
+
+    fn check_silence(&mut self, now_ns: i64) {
+        let limit_ns = ns(self.config.heartbeat_timeout);
+        let Some(vehicle) = &mut self.vehicle else { return };
+        let silence_ns = now_ns.saturating_sub(vehicle.heartbeat_ns);
+        if vehicle.state.connected && silence_ns > limit_ns {
+            vehicle.state.connected = false;
+            let silence = Duration::from_nanos(silence_ns.max(0) as u64);
+            self.push(Event::Lost { silence });
+            self.fail_requests(|command| CommandError::NoAutopilot { command });
+        }
+    }
+
+    fn take_text(&mut self, severity: MavSeverity, text: String) {
+        // Information ("Arming motors") explains no refusal.
+        if (severity as u8) <= MavSeverity::MAV_SEVERITY_WARNING as u8 {
+            for request in &mut self.requests {
+                request.hear(&text);
+            }
+        }
+        if let Some(vehicle) = &mut self.vehicle {
+            vehicle.readiness.take_text(&text);
+        }
+        self.push(Event::Text { severity, text });
+    }
+
+    fn take_acknowledgement(&mut self, now_ns: i64, ack: &COMMAND_ACK_DATA) {
+        // Old autopilots do not say whom they answer; others name a ground station that asked the same.
+        let ours = self.our_address();
+        let for_us = ack.target_system == 0
+            || (ack.target_system == ours.system
+                && [0, ours.component].contains(&ack.target_component));
+        if !for_us {
+            return;
+        }
+        if ack.command == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL {
+            self.streams.acknowledged(now_ns, ack.result);
+            return;
+        }
+        let patience = self.config.patience;
+        for request in self.requests.iter_mut().filter(|r| r.command.is_answered_by(ack.command)) {
+            request.answer(now_ns, ack.result, &patience);
+        }
+    }
+
+    fn take_state(&mut self, now_ns: i64, message: &MavMessage) {
+        let Some(vehicle) = &mut self.vehicle else { return };
+        let state = &mut vehicle.state;
+        match message {
+            MavMessage::ATTITUDE(message) => {
+                let attitude = Attitude::from_angles(now_ns, message);
+                self.take_attitude(now_ns, attitude);
+            }
+            MavMessage::ATTITUDE_QUATERNION(message) => {
+                let attitude = Attitude::from_quaternion(now_ns, message);
+                self.take_attitude(now_ns, attitude);
+            }
+            MavMessage::LOCAL_POSITION_NED(message) => {
+                let position = Position::from_local(now_ns, message);
+                self.take_position(now_ns, position);
+            }
+            MavMessage::DISTANCE_SENSOR(message) => {
+                if let Some(range) = Range::downwards(now_ns, message) {
+                    state.range = Some(range);
+                    self.push(Event::Range(range));
+                }
+            }
+            MavMessage::EXTENDED_SYS_STATE(message) => {
+                let to = LandedState::from(message.landed_state);
+                let from = std::mem::replace(&mut state.landed, to);
+                if from != to {
+                    self.push(Event::LandedChanged { from, to });
+                }
+            }
+            MavMessage::SYS_STATUS(message) => {
+                state.battery = Battery::from_status(message);
+                vehicle.readiness.take_status(message);
+                self.check_readiness();
+            }
+            MavMessage::BATTERY_STATUS(message) if message.id == 0 => {
+                state.battery = state.battery.with_details(message);
+            }
+            MavMessage::EKF_STATUS_REPORT(message) => {
+                vehicle.readiness.take_ekf(message.flags);
+                self.check_readiness();
+            }
+            _ => {}
+        }
+    }
+
+    fn take_attitude(&mut self, now_ns: i64, attitude: Option<Attitude>) {
+        let Some(attitude) = attitude else {
+            self.refused_numbers += 1;
+            return;
+        };
+        self.take_boot_time(attitude.boot_ms);
+        if let Some(vehicle) = &mut self.vehicle {
+            vehicle.state.attitude = Some(attitude);
+            vehicle.state.stamp_ns = now_ns;
+            let state = vehicle.state;
+            self.push(Event::Attitude(attitude));
+            self.push(Event::State(state));
+        }
+    }
+
+    fn take_position(&mut self, now_ns: i64, position: Option<Position>) {
+        let Some(position) = position else {
+            self.refused_numbers += 1;
+            return;
+        };
+        self.take_boot_time(position.boot_ms);
+        if let Some(vehicle) = &mut self.vehicle {
+            vehicle.readiness.take_position();
+            vehicle.state.position = Some(position);
+            vehicle.state.stamp_ns = now_ns;
+            let state = vehicle.state;
+            self.push(Event::Position(position));
+            self.push(Event::State(state));
+            self.check_readiness();
+        }
+    }
+
+    /// Notices a restart by the autopilot's clock, which may be quicker than a lost heartbeat.
+    fn take_boot_time(&mut self, boot_ms: u32) {
+        let Some(vehicle) = &mut self.vehicle else { return };
+        let restarted = boot_ms.saturating_add(RESTART_MS) < vehicle.boot_ms;
+        vehicle.boot_ms = boot_ms;
+        if restarted {
+            vehicle.readiness = Readiness::default();
+            vehicle.state.attitude = None;
+            vehicle.state.position = None;
+            vehicle.state.range = None;
+            vehicle.state.ready = false;
+            vehicle.state.landed = LandedState::Unknown;
+            self.streams.restart();
+            self.push(Event::Restarted);
+            self.fail_requests(|command| CommandError::Restarted { command });
+        }
+    }
+
+    fn check_readiness(&mut self) {
+        let Some(vehicle) = &mut self.vehicle else { return };
+        let ready = vehicle.readiness.is_ready();
+        if std::mem::replace(&mut vehicle.state.ready, ready) != ready {
+            let reasons = vehicle.readiness.reasons();
+            self.push(Event::ReadyChanged { ready, reasons });
+        }
+    }
+
+    /// Why a command is not even sent.
+    fn refusal(&self, command: Command) -> Option<CommandError> {
+        let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.state.connected);
+        let Some(vehicle) = vehicle else { return Some(CommandError::NoAutopilot { command }) };
+        if vehicle.firmware != Firmware::Copter {
+            return Some(CommandError::Unsupported { command, firmware: vehicle.firmware });
+        }
+        let problem = command.problem(Some(&vehicle.state))?;
+        Some(CommandError::Invalid { command, problem })
+    }
+
+    fn step_requests(&mut self, now_ns: i64) {
+        let Some(state) = self.state().copied() else { return };
+        let patience = self.config.patience;
+        let mut index = 0;
+        while let Some(request) = self.requests.get_mut(index) {
+            match request.step(now_ns, &state, &patience) {
+                Step::Wait => index += 1,
+                Step::Send(message) => {
+                    index += 1;
+                    self.send_to_vehicle(MavMessage::COMMAND_LONG(message));
+                }
+                Step::Finish(result) => {
+                    let request = self.requests.remove(index);
+                    self.finish(request.id, request.command, result);
+                }
+            }
+        }
+    }
+
+    fn fail_requests(&mut self, error: impl Fn(Command) -> CommandError) {
+        for request in std::mem::take(&mut self.requests) {
+            self.finish(request.id, request.command, Err(error(request.command)));
+        }
+    }
+
+    fn finish(&mut self, id: CommandId, command: Command, result: Result<(), CommandError>) {
+        let status = match &result {
+            Ok(()) => CommandStatus::Done,
+            Err(error) => CommandStatus::Failed(error.clone()),
+        };
+        if self.outcomes.len() >= MAX_OUTCOMES {
+            self.outcomes.pop_front();
+        }
+        self.outcomes.push_back((id, status));
+        self.push(Event::Command { id, command, result });
+    }
+}
+
+impl From<Notice> for Event {
+    fn from(notice: Notice) -> Self {
+        match notice {
+            Notice::Missing { message, wanted_hz, measured_hz } => {
+                Self::StreamMissing { message, wanted_hz, measured_hz }
+            }
+            Notice::Restored { message, measured_hz } => {
+                Self::StreamRestored { message, measured_hz }
+            }
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! The messages that a companion sends on its own.
+
+use geometry::{Body, Ned, Point, Vector};
+
+use crate::dialect::{
+    HEARTBEAT_DATA, LANDING_TARGET_DATA, LandingTargetType, MavAutopilot, MavBool, MavFrame,
+    MavMessage, MavModeFlag, MavSeverity, MavState, MavType, PositionTargetTypemask,
+    SET_POSITION_TARGET_LOCAL_NED_DATA, STATUSTEXT_DATA,
+};
+
+/// Bytes of text in one packet.
+const PART: usize = 50;
+/// A longer text is cut.
+const MAX_PARTS: usize = 10;
+
+/// The heartbeat of a companion computer.
+pub fn heartbeat() -> MavMessage {
+    MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        custom_mode: 0,
+        mavtype: MavType::MAV_TYPE_ONBOARD_CONTROLLER,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
+        base_mode: MavModeFlag::empty(),
+        system_status: MavState::MAV_STATE_ACTIVE,
+        mavlink_version: 3,
+    })
+}
+
+/// A text for the ground station's message window, in as many packets as it needs.
+///
+/// `id` joins the packets of one text: take another number from 1 to 65535 for each text.
+pub fn status_text(severity: MavSeverity, text: &str, id: u16) -> Vec<MavMessage> {
+    // Every part but the last is full, because a part that is not full is the end: so a character may be cut in two,
+    // and an empty part ends a text that fills its last one.
+    let mut parts: Vec<&[u8]> = text.trim_end().as_bytes().chunks(PART).take(MAX_PARTS).collect();
+    let id = if parts.len() > 1 { id.max(1) } else { 0 };
+    if parts.len() > 1 && parts.last().is_some_and(|last| last.len() >= PART) {
+        parts.push(&[]);
+    }
+    let packet = |(chunk, part): (usize, &[u8])| {
+        let mut text = [0; PART];
+        text.iter_mut().zip(part).for_each(|(to, from)| *to = *from);
+        let chunk_seq = chunk.min(255) as u8;
+        MavMessage::STATUSTEXT(STATUSTEXT_DATA { severity, text: text.into(), id, chunk_seq })
+    };
+    parts.into_iter().enumerate().map(packet).collect()
+}
+
+/// A velocity in m/s, with a yaw rate in rad/s that holds the heading when it is nought.
+///
+/// Type mask 1479: position, acceleration and yaw are ignored. With the yaw rate ignored as well, ArduPilot would turn
+/// the nose into the direction of travel.
+pub fn velocity(
+    time_ms: u32,
+    velocity: Vector<Ned>,
+    yaw_rate: f64,
+    target: (u8, u8),
+) -> MavMessage {
+    MavMessage::SET_POSITION_TARGET_LOCAL_NED(SET_POSITION_TARGET_LOCAL_NED_DATA {
+        time_boot_ms: time_ms,
+        vx: velocity.x() as f32,
+        vy: velocity.y() as f32,
+        vz: velocity.z() as f32,
+        yaw_rate: yaw_rate as f32,
+        type_mask: PositionTargetTypemask::from_bits_retain(1479),
+        target_system: target.0,
+        target_component: target.1,
+        coordinate_frame: MavFrame::MAV_FRAME_LOCAL_NED,
+        ..Default::default()
+    })
+}
+
+/// The landing target at a place in the body frame (m from the vehicle's origin): needs no rangefinder.
+///
+/// `time_usec` is the capture time by one steady clock. `None` when a number is not finite or the target is not below.
+pub fn landing_target_position(time_usec: u64, target: Point<Body>) -> Option<MavMessage> {
+    let sight = target - Point::origin();
+    let (angle_x, angle_y) = angles(sight)?;
+    Some(MavMessage::LANDING_TARGET(LANDING_TARGET_DATA {
+        time_usec,
+        angle_x,
+        angle_y,
+        distance: sight.norm() as f32,
+        frame: MavFrame::MAV_FRAME_BODY_FRD,
+        x: target.x() as f32,
+        y: target.y() as f32,
+        z: target.z() as f32,
+        q: [1.0, 0.0, 0.0, 0.0],
+        mavtype: LandingTargetType::LANDING_TARGET_TYPE_VISION_FIDUCIAL,
+        position_valid: MavBool::from_bits_retain(1),
+        ..Default::default()
+    }))
+}
+
+/// The landing target in a direction in the body frame, of any length: without a distance (m along the line of sight)
+/// it needs a rangefinder.
+///
+/// `time_usec` is the capture time by one steady clock. `None` when a number is not finite or the target is not below.
+pub fn landing_target_angles(
+    time_usec: u64,
+    sight: Vector<Body>,
+    distance_m: Option<f64>,
+) -> Option<MavMessage> {
+    let (angle_x, angle_y) = angles(sight)?;
+    let distance = distance_m.unwrap_or(0.0) as f32;
+    distance.is_finite().then_some(MavMessage::LANDING_TARGET(LANDING_TARGET_DATA {
+        time_usec,
+        angle_x,
+        angle_y,
+        distance,
+        frame: MavFrame::MAV_FRAME_BODY_FRD,
+        q: [1.0, 0.0, 0.0, 0.0],
+        mavtype: LandingTargetType::LANDING_TARGET_TYPE_VISION_FIDUCIAL,
+        position_valid: MavBool::empty(),
+        ..Default::default()
+    }))
+}
+
+/// ArduPilot takes the line of sight to be (-tan `angle_y`, tan `angle_x`, 1).
+fn angles(sight: Vector<Body>) -> Option<(f32, f32)> {
+    let below = sight.is_finite() && sight.z() > 1e-6;
+    below.then(|| (sight.y().atan2(sight.z()) as f32, (-sight.x()).atan2(sight.z()) as f32))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::text::Joiner;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_text_of_any_length_arrives_whole(text in "[a-z\u{e4}\u{1F681} ]{0,200}") {
+            let mut joiner = Joiner::default();
+            let mut arrived = String::new();
+            for message in status_text(MavSeverity::MAV_SEVERITY_INFO, &text, 0) {
+                let MavMessage::STATUSTEXT(part) = message else { unreachable!() };
+                for (_, text) in joiner.push(0, &part) {
+                    arrived.push_str(&text);
+                }
+            }
+            arrived.extend(joiner.tick(i64::MAX).map(|text| text.1));
+            prop_assert!(text.len() > 450 || arrived == text.trim_end());
+        }
+    }
+
+    #[test]
+    fn the_angles_point_where_ardupilot_looks() {
+        // 1 m ahead and 2 m to the right, 4 m below.
+        let message = landing_target_position(7, Point::new(1.0, 2.0, 4.0)).unwrap();
+        let MavMessage::LANDING_TARGET(target) = message else { unreachable!() };
+        assert!((-target.angle_y.tan() - 0.25).abs() < 1e-6);
+        assert!((target.angle_x.tan() - 0.5).abs() < 1e-6);
+        assert!((f64::from(target.distance) - 21_f64.sqrt()).abs() < 1e-6);
+        assert_eq!(target.frame as u8, 12);
+        assert_eq!(target.position_valid.bits(), 1);
+    }
+
+    #[test]
+    fn a_target_beside_or_above_is_refused() {
+        assert!(landing_target_position(0, Point::new(1.0, 0.0, 0.0)).is_none());
+        assert!(landing_target_angles(0, Vector::new(0.0, 0.0, -1.0), None).is_none());
+        assert!(landing_target_angles(0, Vector::new(0.0, f64::NAN, 1.0), None).is_none());
+        assert!(landing_target_angles(0, Vector::new(0.0, 0.0, 1.0), Some(f64::NAN)).is_none());
+    }
+}

@@ -1,0 +1,181 @@
+//! Which firmware flies, and in which mode.
+
+use std::fmt;
+
+use crate::dialect::{HEARTBEAT_DATA, MavAutopilot, MavType};
+
+/// What flies the vehicle.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Firmware {
+    /// ArduPilot on a multicopter or helicopter: supported.
+    Copter,
+    /// ArduPilot on a vehicle of another kind, whose modes have other numbers: not supported.
+    OtherArduPilot,
+    /// PX4: recognised, not yet supported.
+    Px4,
+    /// Anything else: not supported.
+    Unknown,
+}
+
+/// A flight mode.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
+pub enum FlightMode {
+    /// ArduPilot Copter follows the setpoints of a companion.
+    Guided,
+    /// ArduPilot Copter lands where it is.
+    Land,
+    /// Another mode of ArduPilot Copter, by its number.
+    Other(u32),
+    /// A mode of PX4: main mode in bits 16 to 23, sub mode in bits 24 to 31.
+    Px4(u32),
+    /// A mode of a firmware that is not known.
+    Foreign(u32),
+}
+
+const GUIDED: u32 = 4;
+const LAND: u32 = 9;
+
+impl Firmware {
+    /// What a heartbeat says.
+    pub fn of(heartbeat: &HEARTBEAT_DATA) -> Self {
+        match heartbeat.autopilot {
+            MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA => match heartbeat.mavtype {
+                MavType::MAV_TYPE_QUADROTOR
+                | MavType::MAV_TYPE_COAXIAL
+                | MavType::MAV_TYPE_HELICOPTER
+                | MavType::MAV_TYPE_HEXAROTOR
+                | MavType::MAV_TYPE_OCTOROTOR
+                | MavType::MAV_TYPE_TRICOPTER
+                | MavType::MAV_TYPE_DODECAROTOR
+                | MavType::MAV_TYPE_DECAROTOR => Self::Copter,
+                _ => Self::OtherArduPilot,
+            },
+            MavAutopilot::MAV_AUTOPILOT_PX4 => Self::Px4,
+            _ => Self::Unknown,
+        }
+    }
+}
+
+impl fmt::Display for Firmware {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Copter => "ArduPilot Copter",
+            Self::OtherArduPilot => "ArduPilot on a vehicle that is no copter",
+            Self::Px4 => "PX4",
+            Self::Unknown => "an unknown firmware",
+        })
+    }
+}
+
+impl FlightMode {
+    /// The mode that `firmware` means by this number.
+    pub fn of(firmware: Firmware, custom_mode: u32) -> Self {
+        match (firmware, custom_mode) {
+            (Firmware::Copter, GUIDED) => Self::Guided,
+            (Firmware::Copter, LAND) => Self::Land,
+            (Firmware::Copter, number) => Self::Other(number),
+            (Firmware::Px4, number) => Self::Px4(number),
+            (_, number) => Self::Foreign(number),
+        }
+    }
+
+    /// The number by which its firmware means this mode.
+    pub fn custom_mode(self) -> u32 {
+        match self {
+            Self::Guided => GUIDED,
+            Self::Land => LAND,
+            Self::Other(number) | Self::Px4(number) | Self::Foreign(number) => number,
+        }
+    }
+}
+
+impl fmt::Display for FlightMode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Guided => f.write_str("GUIDED"),
+            Self::Land => f.write_str("LAND"),
+            Self::Other(number) => match copter_name(*number) {
+                Some(name) => f.write_str(name),
+                None => write!(f, "mode {number}"),
+            },
+            Self::Px4(number) => match px4_name(*number) {
+                Some(name) => write!(f, "PX4 {name}"),
+                None => write!(f, "PX4 mode {number:#x}"),
+            },
+            Self::Foreign(number) => write!(f, "mode {number}"),
+        }
+    }
+}
+
+/// ArduPilot's enumeration COPTER_MODE.
+fn copter_name(number: u32) -> Option<&'static str> {
+    Some(match number {
+        0 => "STABILIZE",
+        1 => "ACRO",
+        2 => "ALT_HOLD",
+        3 => "AUTO",
+        5 => "LOITER",
+        6 => "RTL",
+        7 => "CIRCLE",
+        11 => "DRIFT",
+        13 => "SPORT",
+        14 => "FLIP",
+        15 => "AUTOTUNE",
+        16 => "POSHOLD",
+        17 => "BRAKE",
+        18 => "THROW",
+        19 => "AVOID_ADSB",
+        20 => "GUIDED_NOGPS",
+        21 => "SMART_RTL",
+        22 => "FLOWHOLD",
+        23 => "FOLLOW",
+        24 => "ZIGZAG",
+        25 => "SYSTEMID",
+        26 => "AUTOROTATE",
+        27 => "AUTO_RTL",
+        _ => return None,
+    })
+}
+
+/// PX4's main and sub modes (`px4_custom_mode.h`).
+fn px4_name(number: u32) -> Option<&'static str> {
+    let [_, _, main, sub] = number.to_le_bytes();
+    Some(match (main, sub) {
+        (1, _) => "MANUAL",
+        (2, _) => "ALTITUDE",
+        (3, _) => "POSITION",
+        (4, 2) => "TAKEOFF",
+        (4, 3) => "HOLD",
+        (4, 4) => "MISSION",
+        (4, 5) => "RETURN",
+        (4, 6) => "LAND",
+        (4, 8) => "FOLLOW",
+        (4, 9) => "PRECISION LAND",
+        (5, _) => "ACRO",
+        (6, _) => "OFFBOARD",
+        (7, _) => "STABILIZED",
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_mode_keeps_its_number_and_its_firmwares_name() {
+        for (firmware, number, name) in [
+            (Firmware::Copter, 4, "GUIDED"),
+            (Firmware::Copter, 9, "LAND"),
+            (Firmware::Copter, 5, "LOITER"),
+            (Firmware::Copter, 99, "mode 99"),
+            (Firmware::Px4, 6 << 16, "PX4 OFFBOARD"),
+            (Firmware::Px4, 0x0604_0000, "PX4 LAND"),
+            (Firmware::OtherArduPilot, 4, "mode 4"),
+        ] {
+            let mode = FlightMode::of(firmware, number);
+            assert_eq!(mode.custom_mode(), number);
+            assert_eq!(mode.to_string(), name);
+        }
+    }
+}

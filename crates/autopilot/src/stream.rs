@@ -1,0 +1,251 @@
+//! Messages that must keep coming: asked for, counted, and asked for again when they stop.
+//!
+//! An autopilot forgets what it was asked when it restarts, another station may overwrite it, and some messages begin
+//! long after they were promised; so nothing is believed but the rate at which messages arrive.
+
+use crate::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage, MavResult, Message};
+
+const SECOND_NS: i64 = 1_000_000_000;
+/// A message is missing below this part of the rate that was asked for.
+const ENOUGH: f64 = 0.7;
+/// How long to wait for the acknowledgement of one request.
+const ACK_NS: i64 = SECOND_NS;
+/// How long to leave an autopilot alone that refused.
+const REFUSED_NS: i64 = 30 * SECOND_NS;
+/// Shortest and longest time over which messages are counted; it grows with the number of vain requests.
+const COUNT_NS: (i64, i64) = (2 * SECOND_NS, 10 * SECOND_NS);
+/// A missing message is worth a word after this many requests.
+const VAIN: u32 = 2;
+
+/// A message that the autopilot is asked to send.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Stream {
+    /// The message's number.
+    pub message_id: u32,
+    /// How often it should come, in Hz.
+    pub rate_hz: f64,
+    /// Whether it is missed when it does not come (a rangefinder may not exist).
+    pub required: bool,
+}
+
+/// What is to be said about a stream.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Notice {
+    Missing { message: &'static str, wanted_hz: f64, measured_hz: f64 },
+    Restored { message: &'static str, measured_hz: f64 },
+}
+
+/// All streams of one autopilot.
+#[derive(Clone, Debug)]
+pub(crate) struct Streams {
+    list: Vec<Watched>,
+    /// The stream whose request waits for its acknowledgement (which does not name it), and until when.
+    asking: Option<(usize, i64)>,
+}
+
+#[derive(Clone, Debug)]
+struct Watched {
+    stream: Stream,
+    name: &'static str,
+    /// When to ask; none while messages are being counted.
+    ask_at_ns: Option<i64>,
+    asked: u32,
+    count: u32,
+    since_ns: i64,
+    missing: bool,
+}
+
+impl Streams {
+    pub(crate) fn new(streams: &[Stream]) -> Self {
+        let list =
+            streams.iter().filter(|s| s.rate_hz.is_finite() && s.rate_hz > 0.0).map(|&stream| {
+                Watched {
+                    stream,
+                    name: message_name(stream.message_id),
+                    ask_at_ns: Some(i64::MIN),
+                    asked: 0,
+                    count: 0,
+                    since_ns: 0,
+                    missing: false,
+                }
+            });
+        Self { list: list.collect(), asking: None }
+    }
+
+    /// Asks for everything anew.
+    pub(crate) fn restart(&mut self) {
+        self.asking = None;
+        for watched in &mut self.list {
+            watched.ask_at_ns = Some(i64::MIN);
+            watched.asked = 0;
+        }
+    }
+
+    pub(crate) fn received(&mut self, message_id: u32) {
+        for watched in &mut self.list {
+            if watched.stream.message_id == message_id {
+                watched.count = watched.count.saturating_add(1);
+            }
+        }
+    }
+
+    /// The autopilot answered the request that is under way.
+    pub(crate) fn acknowledged(&mut self, now_ns: i64, result: MavResult) {
+        let Some((index, _)) = self.asking.take() else { return };
+        let Some(watched) = self.list.get_mut(index) else { return };
+        match result {
+            MavResult::MAV_RESULT_ACCEPTED => watched.count_anew(now_ns),
+            MavResult::MAV_RESULT_TEMPORARILY_REJECTED | MavResult::MAV_RESULT_IN_PROGRESS => {
+                watched.ask_at_ns = Some(now_ns + SECOND_NS);
+            }
+            _ => watched.ask_at_ns = Some(now_ns + REFUSED_NS),
+        }
+    }
+
+    /// Judges the rates; returns what there is to say and what is to be requested.
+    pub(crate) fn tick(&mut self, now_ns: i64) -> (Vec<Notice>, Option<MavMessage>) {
+        let notices = self.list.iter_mut().filter_map(|watched| watched.judge(now_ns)).collect();
+        if let Some((index, until_ns)) = self.asking {
+            if now_ns < until_ns {
+                return (notices, None);
+            }
+            // Without an answer it is asked again after the others; it may have been heard all the same.
+            self.asking = None;
+            if let Some(watched) = self.list.get_mut(index) {
+                watched.ask_at_ns = Some(now_ns);
+            }
+        }
+        let due = self.list.iter().enumerate().filter_map(|(i, w)| Some((w.ask_at_ns?, i)));
+        let Some((at_ns, index)) = due.min() else { return (notices, None) };
+        let Some(watched) = self.list.get_mut(index).filter(|_| at_ns <= now_ns) else {
+            return (notices, None);
+        };
+        watched.asked = watched.asked.saturating_add(1);
+        self.asking = Some((index, now_ns + ACK_NS));
+        (notices, Some(request(watched.stream)))
+    }
+}
+
+impl Watched {
+    fn count_anew(&mut self, now_ns: i64) {
+        self.ask_at_ns = None;
+        self.count = 0;
+        self.since_ns = now_ns;
+    }
+
+    fn judge(&mut self, now_ns: i64) -> Option<Notice> {
+        if self.ask_at_ns.is_some() {
+            return None;
+        }
+        let periods_ns = (5.0 / self.stream.rate_hz * SECOND_NS as f64) as i64;
+        let patience_ns = COUNT_NS.0.saturating_mul(self.asked.into());
+        let window_ns = patience_ns.clamp(COUNT_NS.0, COUNT_NS.1).max(periods_ns);
+        let elapsed_ns = now_ns.saturating_sub(self.since_ns);
+        if elapsed_ns < window_ns {
+            return None;
+        }
+        let measured_hz = f64::from(self.count) / (elapsed_ns as f64 / SECOND_NS as f64);
+        let asked = self.asked;
+        self.count_anew(now_ns);
+        if measured_hz >= ENOUGH * self.stream.rate_hz {
+            self.asked = 1;
+            let restored = std::mem::take(&mut self.missing);
+            return restored.then_some(Notice::Restored { message: self.name, measured_hz });
+        }
+        if !self.stream.required && measured_hz == 0.0 {
+            return None;
+        }
+        self.ask_at_ns = Some(now_ns);
+        let news = asked >= VAIN && self.stream.required && !self.missing;
+        self.missing |= news;
+        let wanted_hz = self.stream.rate_hz;
+        news.then_some(Notice::Missing { message: self.name, wanted_hz, measured_hz })
+    }
+}
+
+fn request(stream: Stream) -> MavMessage {
+    MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
+        // A message number has 24 bits, which a 32-bit float holds exactly.
+        param1: stream.message_id as f32,
+        param2: (1e6 / stream.rate_hz).round() as f32,
+        ..Default::default()
+    })
+}
+
+fn message_name(id: u32) -> &'static str {
+    MavMessage::default_message_from_id(id).map_or("unknown message", |m| m.message_name())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ATTITUDE: Stream = Stream { message_id: 30, rate_hz: 50.0, required: true };
+    const RANGE: Stream = Stream { message_id: 132, rate_hz: 10.0, required: false };
+
+    /// Runs for `seconds` in steps of 20 ms; an acknowledged message then comes in every `every`-th step.
+    fn run(
+        streams: &mut Streams,
+        from_s: i64,
+        seconds: i64,
+        result: Option<MavResult>,
+        every: i64,
+    ) -> (Vec<Notice>, Vec<u32>) {
+        let (mut said, mut asked) = (Vec::new(), Vec::new());
+        for step in 0..seconds * 50 {
+            let now_ns = from_s * SECOND_NS + step * 20_000_000;
+            let (notices, request) = streams.tick(now_ns);
+            said.extend(notices);
+            if let Some(MavMessage::COMMAND_LONG(request)) = request {
+                asked.push(request.param1 as u32);
+                if let Some(result) = result {
+                    streams.acknowledged(now_ns, result);
+                }
+            }
+            if every > 0 && step % every == 0 {
+                streams.received(30);
+            }
+        }
+        (said, asked)
+    }
+
+    const OK: Option<MavResult> = Some(MavResult::MAV_RESULT_ACCEPTED);
+
+    #[test]
+    fn what_comes_as_asked_is_asked_for_once() {
+        let mut streams = Streams::new(&[ATTITUDE, RANGE]);
+        let (said, asked) = run(&mut streams, 0, 30, OK, 1);
+        assert_eq!(asked, [30, 132]);
+        assert!(said.is_empty());
+    }
+
+    #[test]
+    fn what_stops_is_asked_for_again_and_its_return_is_told() {
+        let mut streams = Streams::new(&[ATTITUDE]);
+        run(&mut streams, 0, 10, OK, 1);
+        let (said, asked) = run(&mut streams, 10, 40, OK, 12);
+        assert!((3..12).contains(&asked.len()), "{asked:?}");
+        assert!(matches!(said[..], [Notice::Missing { message: "ATTITUDE", wanted_hz: 50.0, .. }]));
+        let (said, _) = run(&mut streams, 50, 20, OK, 1);
+        assert!(matches!(said[..], [Notice::Restored { message: "ATTITUDE", .. }]));
+    }
+
+    #[test]
+    fn a_lost_request_is_repeated_and_a_refused_one_rests() {
+        let mut streams = Streams::new(&[ATTITUDE]);
+        let (_, asked) = run(&mut streams, 0, 5, None, 0);
+        assert_eq!(asked.len(), 5);
+        let mut streams = Streams::new(&[ATTITUDE]);
+        let (_, asked) = run(&mut streams, 0, 29, Some(MavResult::MAV_RESULT_DENIED), 0);
+        assert_eq!(asked.len(), 1);
+    }
+
+    #[test]
+    fn a_restart_asks_for_everything_anew() {
+        let mut streams = Streams::new(&[ATTITUDE, RANGE]);
+        run(&mut streams, 0, 10, OK, 1);
+        streams.restart();
+        assert_eq!(run(&mut streams, 10, 10, OK, 1).1, [30, 132]);
+    }
+}

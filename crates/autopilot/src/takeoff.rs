@@ -1,0 +1,373 @@
+//! From the ground into the air: wait until ready, GUIDED, arm, climb.
+
+use std::fmt;
+use std::time::Duration;
+
+use crate::client::Autopilot;
+use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
+use crate::mode::FlightMode;
+use crate::state::{LandedState, VehicleState};
+
+/// How close to its height the vehicle must be, in m.
+const HEIGHT_M: f64 = 0.5;
+/// How slow it must be vertically, in m/s.
+const CLIMB_M_S: f64 = 0.3;
+/// Pause between two attempts to arm.
+const ARM_AGAIN: Duration = Duration::from_secs(2);
+
+/// How long each part of a takeoff may take.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// Until the autopilot is heard and ready; ArduPilot needs about 42 s after it was switched on.
+    pub ready: Duration,
+    /// Until arming succeeds, with all its attempts.
+    pub arm: Duration,
+    /// Until it flies at its height, for each 10 m of it.
+    pub climb_10_m: Duration,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            ready: Duration::from_secs(120),
+            arm: Duration::from_secs(30),
+            climb_10_m: Duration::from_secs(30),
+        }
+    }
+}
+
+/// A takeoff under way: call [`Takeoff::step`] after each packet or each tick until it says that it is finished.
+#[derive(Clone, Debug)]
+pub struct Takeoff {
+    height_m: f64,
+    limits: Limits,
+    part: Part,
+    /// The end of the current part.
+    until_ns: Option<i64>,
+    /// The vertical position before the climb, in m downwards from the origin.
+    ground_z: Option<f64>,
+    guided: bool,
+}
+
+/// Where a takeoff stands.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TakeoffProgress {
+    /// The vehicle is not ready, for these reasons.
+    Waiting(Vec<String>),
+    /// GUIDED is asked for.
+    ChangingMode,
+    /// Arming; a number of attempts was refused, the last one for a reason.
+    Arming {
+        /// Why the last attempt failed, if one did.
+        refused: Option<String>,
+    },
+    /// It climbs.
+    Climbing {
+        /// The height in m above the ground.
+        height_m: f64,
+    },
+    /// It flies in GUIDED: setpoints may be sent.
+    Done,
+    /// It ended before; nothing more will be sent.
+    Failed(TakeoffError),
+}
+
+/// Why a takeoff ended before it was done.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum TakeoffError {
+    /// Somebody else flies, or has taken over.
+    #[error(
+        "no takeoff: the vehicle is {landed} in {mode}, so the pilot is in command; change to GUIDED to hand over"
+    )]
+    PilotInCommand {
+        /// The mode the pilot chose.
+        mode: FlightMode,
+        /// Whether it flies.
+        landed: LandedState,
+    },
+    /// It did not become ready.
+    #[error("no takeoff: not ready after {} s: {}", after.as_secs(), reasons.join("; "))]
+    NotReady {
+        /// For how long it was waited for.
+        after: Duration,
+        /// What is missing.
+        reasons: Vec<String>,
+    },
+    /// A command failed.
+    #[error("no takeoff: {0}")]
+    Command(#[from] CommandError),
+    /// The heartbeat is not heard any more.
+    #[error("takeoff interrupted: the autopilot's heartbeat is lost")]
+    Lost,
+    /// The motors were stopped.
+    #[error("takeoff ended: the autopilot or the pilot disarmed the motors")]
+    Disarmed,
+    /// It flies lower than it should for too long.
+    #[error("takeoff not finished after {} s: {height_m:.1} m of {wanted_m:.1} m, {landed}", after.as_secs())]
+    TooSlow {
+        /// For how long it climbed.
+        after: Duration,
+        /// The height reached in m.
+        height_m: f64,
+        /// The height asked for in m.
+        wanted_m: f64,
+        /// Whether it flies.
+        landed: LandedState,
+    },
+}
+
+#[derive(Clone, Debug)]
+enum Part {
+    Ready,
+    Mode(CommandId),
+    Arm { request: Option<CommandId>, again_ns: i64, refused: Option<CommandError> },
+    Lift(CommandId),
+    Climb,
+    Done,
+    Failed(TakeoffError),
+}
+
+impl Takeoff {
+    /// A takeoff to this height in m above the ground.
+    pub fn new(height_m: f64) -> Self {
+        Self::with_limits(height_m, Limits::default())
+    }
+
+    /// The same with other time limits.
+    pub fn with_limits(height_m: f64, limits: Limits) -> Self {
+        Self { height_m, limits, part: Part::Ready, until_ns: None, ground_z: None, guided: false }
+    }
+
+    /// Does what is due and says where the takeoff stands.
+    ///
+    /// A vehicle that already flies in GUIDED is done at once; one that flies in another mode is left alone.
+    pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> TakeoffProgress {
+        if let Err(error) = self.advance(now_ns, autopilot) {
+            self.part = Part::Failed(error);
+        }
+        self.progress(autopilot)
+    }
+
+    /// True when it is done or has failed.
+    pub fn is_finished(&self) -> bool {
+        matches!(self.part, Part::Done | Part::Failed(_))
+    }
+
+    fn advance(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> Result<(), TakeoffError> {
+        if self.is_finished() {
+            return Ok(());
+        }
+        let state = autopilot.state().copied();
+        if let Some(state) = &state {
+            self.check_pilot(state)?;
+        }
+        match self.part.clone() {
+            Part::Ready => self.wait_until_ready(now_ns, autopilot, state.as_ref()),
+            Part::Mode(request) => self.wait_for_mode(now_ns, autopilot, request),
+            Part::Arm { request, again_ns, refused } => {
+                self.arm(now_ns, autopilot, (request, again_ns, refused))
+            }
+            Part::Lift(request) => self.wait_for_lift(now_ns, autopilot, request),
+            Part::Climb => self.climb(now_ns, state.as_ref()),
+            Part::Done | Part::Failed(_) => Ok(()),
+        }
+    }
+
+    /// The pilot's mode switch wins at once, and so do hands on an armed vehicle.
+    fn check_pilot(&mut self, state: &VehicleState) -> Result<(), TakeoffError> {
+        let waiting = matches!(self.part, Part::Ready);
+        if !state.connected {
+            return if waiting { Ok(()) } else { Err(TakeoffError::Lost) };
+        }
+        let guided = state.mode == FlightMode::Guided;
+        self.guided |= guided;
+        let taken = if waiting { state.armed } else { self.guided };
+        if taken && !guided {
+            let (mode, landed) = (state.mode, state.landed);
+            return Err(TakeoffError::PilotInCommand { mode, landed });
+        }
+        if matches!(self.part, Part::Lift(_) | Part::Climb) && !state.armed {
+            return Err(TakeoffError::Disarmed);
+        }
+        Ok(())
+    }
+
+    fn wait_until_ready(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        state: Option<&VehicleState>,
+    ) -> Result<(), TakeoffError> {
+        let connected = state.filter(|state| state.connected);
+        match connected {
+            Some(state) if state.armed && state.landed == LandedState::InAir => {
+                self.part = Part::Done;
+            }
+            Some(state) if state.armed && state.landed == LandedState::TakingOff => {
+                self.begin(now_ns, Part::Climb, self.climb_limit());
+            }
+            Some(state) if state.ready && state.landed == LandedState::OnGround => {
+                let request = autopilot.request(now_ns, Command::SetMode(FlightMode::Guided));
+                self.begin(now_ns, Part::Mode(request), self.limits.ready);
+            }
+            _ => {
+                let until_ns =
+                    *self.until_ns.get_or_insert(now_ns.saturating_add(ns(self.limits.ready)));
+                if now_ns >= until_ns {
+                    let reasons = reasons(autopilot);
+                    return Err(TakeoffError::NotReady { after: self.limits.ready, reasons });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn wait_for_mode(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        request: CommandId,
+    ) -> Result<(), TakeoffError> {
+        if finished(autopilot, request)? {
+            let part = Part::Arm { request: None, again_ns: now_ns, refused: None };
+            self.begin(now_ns, part, self.limits.arm);
+        }
+        Ok(())
+    }
+
+    fn arm(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        (request, again_ns, refused): (Option<CommandId>, i64, Option<CommandError>),
+    ) -> Result<(), TakeoffError> {
+        let Some(id) = request else {
+            if now_ns >= again_ns {
+                let request = Some(autopilot.request(now_ns, Command::Arm));
+                self.part = Part::Arm { request, again_ns, refused };
+            }
+            return Ok(());
+        };
+        match finished(autopilot, id) {
+            Ok(false) => {}
+            Ok(true) => {
+                let height_m = self.height_m;
+                self.ground_z = autopilot.state().and_then(|s| s.position).map(|p| p.position.z());
+                let request = autopilot.request(now_ns, Command::Takeoff { height_m });
+                self.begin(now_ns, Part::Lift(request), self.climb_limit());
+            }
+            // Shortly after it was switched on, checks may pass and fail by turns.
+            Err(error @ CommandError::Refused { .. })
+                if self.until_ns.is_some_and(|until_ns| now_ns < until_ns) =>
+            {
+                let again_ns = now_ns.saturating_add(ns(ARM_AGAIN));
+                self.part = Part::Arm { request: None, again_ns, refused: Some(error) };
+            }
+            Err(error) => return Err(error.into()),
+        }
+        Ok(())
+    }
+
+    fn wait_for_lift(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        request: CommandId,
+    ) -> Result<(), TakeoffError> {
+        if finished(autopilot, request)? {
+            self.begin(now_ns, Part::Climb, self.climb_limit());
+        }
+        Ok(())
+    }
+
+    fn climb(&mut self, now_ns: i64, state: Option<&VehicleState>) -> Result<(), TakeoffError> {
+        let Some(state) = state else { return Ok(()) };
+        let height_m = self.height(state);
+        let level = state.position.is_some_and(|p| p.velocity.z().abs() < CLIMB_M_S);
+        if state.landed == LandedState::InAir
+            && level
+            && (height_m - self.height_m).abs() < HEIGHT_M
+        {
+            self.part = Part::Done;
+        } else if self.until_ns.is_some_and(|until_ns| now_ns >= until_ns) {
+            let (after, landed, wanted_m) = (self.climb_limit(), state.landed, self.height_m);
+            return Err(TakeoffError::TooSlow { after, height_m, wanted_m, landed });
+        }
+        Ok(())
+    }
+
+    /// Height above the place where it stood, in m; above the origin when it was not seen standing.
+    fn height(&self, state: &VehicleState) -> f64 {
+        let z = state.position.map_or(0.0, |position| position.position.z());
+        self.ground_z.unwrap_or(0.0) - z
+    }
+
+    fn climb_limit(&self) -> Duration {
+        self.limits.climb_10_m.mul_f64((self.height_m / 10.0).clamp(0.5, 100.0))
+    }
+
+    fn begin(&mut self, now_ns: i64, part: Part, limit: Duration) {
+        self.part = part;
+        self.until_ns = Some(now_ns.saturating_add(ns(limit)));
+    }
+
+    fn progress(&self, autopilot: &Autopilot) -> TakeoffProgress {
+        match &self.part {
+            Part::Ready => TakeoffProgress::Waiting(reasons(autopilot)),
+            Part::Mode(_) => TakeoffProgress::ChangingMode,
+            Part::Arm { refused, .. } => {
+                TakeoffProgress::Arming { refused: refused.as_ref().map(ToString::to_string) }
+            }
+            Part::Lift(_) | Part::Climb => TakeoffProgress::Climbing {
+                height_m: autopilot.state().map_or(0.0, |state| self.height(state)),
+            },
+            Part::Done => TakeoffProgress::Done,
+            Part::Failed(error) => TakeoffProgress::Failed(error.clone()),
+        }
+    }
+}
+
+impl fmt::Display for TakeoffProgress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Waiting(reasons) => write!(f, "waiting: {}", reasons.join("; ")),
+            Self::ChangingMode => f.write_str("changing to GUIDED"),
+            Self::Arming { refused: None } => f.write_str("arming"),
+            Self::Arming { refused: Some(reason) } => write!(f, "arming again: {reason}"),
+            Self::Climbing { height_m } => write!(f, "climbing, {height_m:.1} m"),
+            Self::Done => f.write_str("flying"),
+            Self::Failed(error) => error.fmt(f),
+        }
+    }
+}
+
+/// Whether a request is done; its error when it failed.
+fn finished(autopilot: &Autopilot, request: CommandId) -> Result<bool, CommandError> {
+    match autopilot.status(request) {
+        CommandStatus::Pending => Ok(false),
+        CommandStatus::Done => Ok(true),
+        CommandStatus::Failed(error) => Err(error),
+        // Only this takeoff is under way, so its request is forgotten only if it was finished long ago.
+        CommandStatus::Unknown => Ok(true),
+    }
+}
+
+fn reasons(autopilot: &Autopilot) -> Vec<String> {
+    let mut reasons = autopilot.not_ready_because();
+    match autopilot.state() {
+        Some(state) if !state.connected => {
+            reasons = vec!["the autopilot's heartbeat is lost".to_owned()];
+        }
+        Some(state) if state.landed == LandedState::Unknown => {
+            reasons.push("waiting for EXTENDED_SYS_STATE (whether it stands or flies)".to_owned());
+        }
+        Some(state) if state.landed == LandedState::Landing => {
+            reasons.push("waiting for the end of a landing".to_owned());
+        }
+        Some(state) if state.landed != LandedState::OnGround && !state.armed => {
+            reasons.push(format!("the motors are off, and yet it is {}", state.landed));
+        }
+        _ => {}
+    }
+    reasons
+}

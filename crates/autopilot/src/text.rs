@@ -1,0 +1,113 @@
+//! Texts of the autopilot, which may come in several packets.
+
+use crate::dialect::{MavSeverity, STATUSTEXT_DATA};
+
+/// Characters in one packet; a part of this length is followed by another one.
+const PART: usize = 50;
+/// No text is longer.
+const MAX_PARTS: u8 = 20;
+const MAX_BYTES: usize = PART * 20;
+/// A text whose next part does not come within this time is complete as it is.
+const PATIENCE_NS: i64 = 500_000_000;
+
+/// Joins the parts of a text.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Joiner {
+    partial: Option<Partial>,
+}
+
+#[derive(Clone, Debug)]
+struct Partial {
+    id: u16,
+    severity: MavSeverity,
+    bytes: Vec<u8>,
+    next: u8,
+    since_ns: i64,
+}
+
+/// A whole text.
+pub(crate) type Text = (MavSeverity, String);
+
+impl Joiner {
+    /// Takes a packet and returns the texts that it completes, an interrupted one first.
+    pub(crate) fn push(&mut self, now_ns: i64, message: &STATUSTEXT_DATA) -> Vec<Text> {
+        let mut texts = Vec::new();
+        let bytes: &[u8] = &*message.text;
+        let length = bytes.iter().position(|&byte| byte == 0).unwrap_or(bytes.len());
+        let part = bytes.get(..length).unwrap_or(&[]);
+        let continues = self.partial.as_ref().is_some_and(|partial| partial.id == message.id);
+        if !continues {
+            texts.extend(self.take());
+        }
+        if message.id == 0 {
+            texts.push((message.severity, clean(part)));
+            return texts;
+        }
+        let partial = self.partial.get_or_insert_with(|| Partial {
+            id: message.id,
+            severity: message.severity,
+            bytes: Vec::new(),
+            next: 0,
+            since_ns: now_ns,
+        });
+        if message.chunk_seq != partial.next {
+            partial.bytes.extend_from_slice(b" ... ");
+        }
+        partial.bytes.extend_from_slice(part);
+        partial.next = message.chunk_seq.saturating_add(1);
+        partial.since_ns = now_ns;
+        if length < PART || partial.next >= MAX_PARTS || partial.bytes.len() > MAX_BYTES {
+            texts.extend(self.take());
+        }
+        texts
+    }
+
+    /// Returns a text whose end did not come in time.
+    pub(crate) fn tick(&mut self, now_ns: i64) -> Option<Text> {
+        let late = |partial: &Partial| now_ns.saturating_sub(partial.since_ns) > PATIENCE_NS;
+        if self.partial.as_ref().is_some_and(late) { self.take() } else { None }
+    }
+
+    fn take(&mut self) -> Option<Text> {
+        self.partial.take().map(|partial| (partial.severity, clean(&partial.bytes)))
+    }
+}
+
+/// Text from outside (its characters may have been cut between parts, so all parts are decoded together), without what would disturb a terminal or a log.
+fn clean(bytes: &[u8]) -> String {
+    let text = String::from_utf8_lossy(bytes);
+    text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn part(id: u16, chunk_seq: u8, text: &str) -> STATUSTEXT_DATA {
+        STATUSTEXT_DATA { text: text.into(), id, chunk_seq, ..Default::default() }
+    }
+
+    #[test]
+    fn a_long_text_is_joined() {
+        let mut joiner = Joiner::default();
+        let first = "Arm: AHRS: EKF3 Yaw inconsistent 77 deg. Wait or r";
+        assert!(joiner.push(0, &part(3, 0, first)).is_empty());
+        let texts = joiner.push(1, &part(3, 1, "eboot"));
+        assert_eq!(texts[0].1, format!("{first}eboot"));
+        assert_eq!(joiner.push(2, &part(0, 0, "short\u{7}"))[0].1, "short ");
+    }
+
+    #[test]
+    fn a_lost_part_hides_nothing_else() {
+        let mut joiner = Joiner::default();
+        let long = "x".repeat(PART);
+        joiner.push(0, &part(3, 0, &long));
+        let texts = joiner.push(1, &part(4, 0, "next"));
+        assert_eq!(texts.iter().map(|text| text.1.as_str()).collect::<Vec<_>>(), [&long, "next"]);
+        joiner.push(2, &part(5, 0, &long));
+        assert!(joiner.tick(2 + PATIENCE_NS).is_none());
+        assert_eq!(joiner.tick(3 + PATIENCE_NS).unwrap().1, long);
+        joiner.push(2, &part(6, 0, &long));
+        assert!(joiner.push(3, &part(6, 2, "end"))[0].1.contains(" ... end"));
+    }
+}

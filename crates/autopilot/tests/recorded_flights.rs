@@ -1,0 +1,213 @@
+//! Logs of real and simulated flights: every packet is found, and the client tells what happened when.
+//!
+//! The logs are not part of the repository; without them these tests say so and pass.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::print_stdout,
+    reason = "helpers of tests may fail and tell like tests"
+)]
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use autopilot::frame::Counters;
+use autopilot::{Autopilot, Config, Event, FlightMode, Frame, LandedState, Parser};
+use serde_json::Value;
+
+fn data(path: &str) -> Option<PathBuf> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data").join(path);
+    if !folder.exists() {
+        println!("skipped: ../shared/data/{path} is missing");
+    }
+    folder.exists().then_some(folder)
+}
+
+/// All logs under a folder.
+fn logs(folder: &Path) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(logs(&path));
+        } else if path.extension().is_some_and(|extension| extension == "tlog") {
+            found.push(path);
+        }
+    }
+    found.sort();
+    found
+}
+
+/// A log is, for each packet, the time in microseconds (8 bytes, big endian) and the packet; the parser gets it as it
+/// is, with the times as noise between the packets.
+fn parse(log: &[u8]) -> (Vec<Frame>, Counters) {
+    let mut parser = Parser::new();
+    let mut frames: Vec<Frame> = log.chunks(1000).flat_map(|piece| parser.push(piece)).collect();
+    frames.extend(parser.finish());
+    (frames, parser.counters())
+}
+
+/// The packets with their times in ns, of a log without bad bytes.
+fn timed(log: &[u8]) -> Vec<(i64, Frame)> {
+    let mut at = 0;
+    let stamp = |frame: Frame| {
+        let time = i64::from_be_bytes(log[at..at + 8].try_into().unwrap()) * 1000;
+        at += 8 + frame.raw.len();
+        (time, frame)
+    };
+    parse(log).0.into_iter().map(stamp).collect()
+}
+
+#[test]
+fn every_packet_of_the_simulated_flights_is_found() {
+    let Some(folder) = data("ardupilot") else { return };
+    for path in logs(&folder) {
+        let log = std::fs::read(&path).unwrap();
+        let (frames, counters) = parse(&log);
+        println!("{}: {counters:?}", path.display());
+        assert_eq!(counters.bad_bytes, 8 * frames.len() as u64, "only the times are no packets");
+        assert_eq!((counters.undecodable, counters.unknown_ids), (0, 0));
+        assert!(frames.len() > 10_000);
+    }
+}
+
+#[test]
+fn the_real_logs_give_what_pymavlink_finds_in_them() {
+    let Some(folder) = data("autopilot-logs") else { return };
+    let summary = std::fs::read(folder.join("logs_summary.json")).unwrap();
+    let summary: Value = serde_json::from_slice(&summary).unwrap();
+    for path in logs(&folder) {
+        let (frames, counters) = parse(&std::fs::read(&path).unwrap());
+        let mut names = BTreeMap::<&str, u64>::new();
+        for frame in &frames {
+            *names.entry(frame.name().unwrap_or("unknown")).or_default() += 1;
+        }
+        let file = path.strip_prefix(&folder).unwrap().to_str().unwrap();
+        let entries = summary.as_array().unwrap();
+        let Some(entry) = entries.iter().find(|e| e["file"].as_str().unwrap().ends_with(file))
+        else {
+            continue;
+        };
+        let good = entry["messages"].as_u64().unwrap() - entry["bad_data"].as_u64().unwrap();
+        println!("{file}: {} packets, {counters:?}", frames.len());
+        assert_eq!(frames.len() as u64, good, "{file}");
+        for (name, count) in entry["message_counts"].as_object().unwrap() {
+            assert_eq!(names.get(name.as_str()), count.as_u64().as_ref(), "{name} in {file}");
+        }
+    }
+}
+
+/// What the client must tell, in seconds since the first heartbeat.
+#[derive(Debug, PartialEq)]
+enum Told {
+    Mode(FlightMode),
+    Armed(bool),
+    Landed(LandedState),
+}
+
+fn told_by_client(log: &[u8]) -> (Vec<(f64, Told)>, Autopilot) {
+    let mut client = Autopilot::new(Config::default());
+    let mut told = Vec::new();
+    let mut first_ns = None;
+    for (now_ns, frame) in timed(log) {
+        client.handle(now_ns, &frame);
+        client.tick(now_ns);
+        while client.poll_outgoing().is_some() {}
+        while let Some(event) = client.poll_event() {
+            let what = match event {
+                Event::Found { system: 1, .. } => {
+                    first_ns = Some(now_ns);
+                    continue;
+                }
+                Event::ModeChanged { from: Some(_), to } => Told::Mode(to),
+                Event::ArmedChanged(armed) => Told::Armed(armed),
+                Event::LandedChanged { to, .. } => Told::Landed(to),
+                // The simulator pauses for 3 s while it starts.
+                Event::Lost { .. } if !client.state().unwrap().armed => continue,
+                Event::Lost { .. } | Event::Restarted | Event::OtherVehicle { .. } => {
+                    panic!("{event:?} in a log without losses")
+                }
+                _ => continue,
+            };
+            let first_ns = first_ns.expect("the vehicle is found before it does anything");
+            told.push(((now_ns - first_ns) as f64 * 1e-9, what));
+        }
+    }
+    (told, client)
+}
+
+fn told_by_events(events: &[Value]) -> Vec<(f64, Told)> {
+    let text = |event: &Value| event["name"].as_str().unwrap().to_owned();
+    let first =
+        events.iter().find(|event| text(event) == "HEARTBEAT").unwrap()["wall"].as_f64().unwrap();
+    let mut told = Vec::new();
+    let (mut mode, mut armed) = (0, false);
+    for event in events {
+        let at = event["wall"].as_f64().unwrap() - first;
+        match text(event).as_str() {
+            "HEARTBEAT" => {
+                let now = event["custom_mode"].as_u64().unwrap() as u32;
+                if std::mem::replace(&mut mode, now) != now {
+                    told.push((at, Told::Mode(FlightMode::of(autopilot::Firmware::Copter, now))));
+                }
+                let now = event["base_mode"].as_u64().unwrap() & 128 != 0;
+                if std::mem::replace(&mut armed, now) != now {
+                    told.push((at, Told::Armed(now)));
+                }
+            }
+            "LANDED_STATE" => {
+                let state = match event["v"].as_u64().unwrap() {
+                    1 => LandedState::OnGround,
+                    2 => LandedState::InAir,
+                    3 => LandedState::TakingOff,
+                    4 => LandedState::Landing,
+                    other => panic!("landed state {other}"),
+                };
+                told.push((at, Told::Landed(state)));
+            }
+            _ => {}
+        }
+    }
+    told
+}
+
+#[test]
+fn the_client_tells_what_happened_when_it_happened() {
+    let Some(folder) = data("ardupilot") else { return };
+    let mut compared = 0;
+    for path in logs(&folder) {
+        let events = path.with_extension("tlog.events.json");
+        let Ok(events) = std::fs::read(events) else { continue };
+        let events: Vec<Value> = serde_json::from_slice(&events).unwrap();
+        let (told, client) = told_by_client(&std::fs::read(&path).unwrap());
+        let expected = told_by_events(&events);
+        assert_eq!(told.len(), expected.len(), "{told:?}\n{expected:?}");
+        for ((at, what), (expected_at, expected)) in told.iter().zip(&expected) {
+            assert_eq!(what, expected, "at {at} s");
+            assert!(
+                (at - expected_at).abs() < 0.1,
+                "{what:?} at {at} s, expected at {expected_at} s"
+            );
+            compared += 1;
+        }
+        assert!(expected.iter().any(|(_, what)| *what == Told::Mode(FlightMode::Land)));
+        assert_eq!(client.refused_numbers(), 0);
+        assert!(client.state().unwrap().position.is_some());
+    }
+    println!("{compared} changes told at the right time");
+    assert!(compared > 10);
+}
+
+#[test]
+fn a_precision_landing_is_followed_to_the_ground() {
+    let Some(folder) = data("ardupilot") else { return };
+    for path in logs(&folder) {
+        let (told, client) = told_by_client(&std::fs::read(&path).unwrap());
+        let state = client.state().unwrap();
+        assert!(!state.armed && state.landed == LandedState::OnGround, "{}", path.display());
+        assert!(told.iter().any(|(_, what)| *what == Told::Landed(LandedState::InAir)));
+        println!("{}: {} changes, {state:?}", path.display(), told.len());
+    }
+}
