@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use serde::Deserialize;
+
 pub use crate::guidance::metric::MetricConfig;
 pub use crate::guidance::thesis::ThesisConfig;
 
@@ -34,7 +36,8 @@ impl Default for Guidance {
 }
 
 /// How detections become a target.
-#[derive(Copy, Clone, Debug, PartialEq)]
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct TargetConfig {
     /// A frame older than this on arrival is not used, in s (0.05 to 5).
     pub max_latency_s: f64,
@@ -82,7 +85,8 @@ impl Default for TargetConfig {
 }
 
 /// What no setpoint exceeds, whatever the guidance wants.
-#[derive(Copy, Clone, Debug, PartialEq)]
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct EnvelopeConfig {
     /// Horizontal speed in m/s (0.05 to 10).
     pub horizontal_m_s: f64,
@@ -99,7 +103,8 @@ impl Default for EnvelopeConfig {
 }
 
 /// When the phases end.
-#[derive(Copy, Clone, Debug, PartialEq)]
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct PhaseConfig {
     /// Age of the target beyond which nothing descends, in s (0.1 to 5).
     pub stale_target_s: f64,
@@ -155,7 +160,7 @@ impl Default for PhaseConfig {
             approach_timeout_s: 60.0,
             descend_timeout_s: 120.0,
             hold_timeout_s: 60.0,
-            operator_hold_timeout_s: 600.0,
+            operator_hold_timeout_s: 180.0,
             regain_after_s: 2.0,
             regain_height_m: 1.5,
             regain_climb_m_s: 0.3,
@@ -171,7 +176,8 @@ impl Default for PhaseConfig {
 }
 
 /// What an aborted landing does.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum OnAbort {
     /// Hover for `release_after_s`, then fall silent: the autopilot holds its position by itself.
     Hover,

@@ -370,3 +370,171 @@ impl Machine {
         self.elapsed_s(facts.now) > timeout_s
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FLYING: VehicleFacts = VehicleFacts {
+        age_s: 0.0,
+        mode: Mode::Guided,
+        armed: true,
+        landed: Landed::InAir,
+        altitude_m: 5.0,
+    };
+
+    fn at(seconds: f64) -> Facts {
+        Facts {
+            now: Timestamp::from_seconds(seconds),
+            operator: None,
+            vehicle: Some(FLYING),
+            target_age_s: f64::INFINITY,
+            target_confirmed: false,
+            progress: Progress::Unchanged,
+        }
+    }
+
+    fn seen(seconds: f64, progress: Progress) -> Facts {
+        Facts { target_age_s: 0.1, target_confirmed: true, progress, ..at(seconds) }
+    }
+
+    fn told(seconds: f64, command: OperatorCommand) -> Facts {
+        Facts { operator: Some(command), ..at(seconds) }
+    }
+
+    fn flown(seconds: f64, change: impl Fn(&mut VehicleFacts)) -> Facts {
+        let mut vehicle = FLYING;
+        change(&mut vehicle);
+        Facts { vehicle: Some(vehicle), ..at(seconds) }
+    }
+
+    /// Takes a new machine through the facts and compares where it ends.
+    fn check(facts: &[Facts], phase: Phase, why: Reason) {
+        let mut machine = Machine::new(PhaseConfig::default());
+        for fact in facts {
+            machine.advance(fact);
+        }
+        assert_eq!((machine.phase(), machine.why()), (phase, why), "after {facts:#?}");
+    }
+
+    fn start() -> Facts {
+        told(0.0, OperatorCommand::Start)
+    }
+
+    #[test]
+    fn a_start_is_refused_with_the_reason() {
+        let starting = |change: fn(&mut VehicleFacts)| Facts {
+            operator: start().operator,
+            ..flown(0.0, change)
+        };
+        check(&[Facts { vehicle: None, ..start() }], Phase::Idle, Reason::NoVehicleState);
+        check(&[starting(|v| v.age_s = 0.6)], Phase::Idle, Reason::NoVehicleState);
+        check(&[starting(|v| v.armed = false)], Phase::Idle, Reason::NotArmed);
+        check(&[starting(|v| v.landed = Landed::OnGround)], Phase::Idle, Reason::OnTheGround);
+        check(&[starting(|v| v.mode = Mode::Other)], Phase::Idle, Reason::NotGuided);
+        check(&[starting(|v| v.mode = Mode::Land)], Phase::Idle, Reason::NotGuided);
+        check(&[start()], Phase::Search, Reason::Searching);
+    }
+
+    #[test]
+    fn a_start_low_in_land_mode_watches_the_touchdown() {
+        let low = |v: &mut VehicleFacts| (v.mode, v.altitude_m) = (Mode::Land, 0.4);
+        let starting = Facts { operator: start().operator, ..flown(0.0, low) };
+        check(&[starting], Phase::Final, Reason::AutopilotLands);
+        let down =
+            flown(3.0, |v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround));
+        check(&[starting, down], Phase::Landed, Reason::TouchedDown);
+    }
+
+    #[test]
+    fn a_landing_goes_through_its_phases() {
+        let aligned = seen(2.0, Progress::Descending);
+        let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+        let land = flown(9.2, |v| v.mode = Mode::Land);
+        let down =
+            flown(12.0, |v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround));
+        let all = [start(), seen(1.0, Progress::Unchanged), aligned, ready, land, down];
+        check(&all[..2], Phase::Approach, Reason::Aligning);
+        check(&all[..3], Phase::Descend, Reason::Descending);
+        check(&all[..4], Phase::Final, Reason::LowAndAligned);
+        check(&all[..5], Phase::Final, Reason::AutopilotLands);
+        check(&all, Phase::Landed, Reason::TouchedDown);
+    }
+
+    #[test]
+    fn nothing_is_waited_for_without_end() {
+        let approach = [start(), seen(1.0, Progress::Unchanged)];
+        check(&[start(), at(20.1)], Phase::Hold, Reason::TargetNotFound);
+        check(&[start(), at(20.1), at(80.3)], Phase::Aborted, Reason::HeldTooLong);
+        check(
+            &[approach[0], approach[1], seen(61.2, Progress::Aligning)],
+            Phase::Hold,
+            Reason::NoProgress,
+        );
+        check(
+            &[start(), told(1.0, OperatorCommand::Hold), at(290.0)],
+            Phase::Hold,
+            Reason::OperatorHold,
+        );
+        check(
+            &[start(), told(1.0, OperatorCommand::Hold), at(301.0)],
+            Phase::Aborted,
+            Reason::LandingTooLong,
+        );
+        let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+        check(&[approach[0], approach[1], ready, at(14.1)], Phase::Aborted, Reason::LandRefused);
+        let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
+        check(
+            &[approach[0], approach[1], ready, land(9.1), land(69.3)],
+            Phase::Aborted,
+            Reason::TouchdownOverdue,
+        );
+    }
+
+    #[test]
+    fn a_lost_vehicle_or_target_is_waited_for() {
+        let approach = [start(), seen(1.0, Progress::Unchanged)];
+        let deaf = flown(2.0, |v| v.age_s = 0.6);
+        check(&[approach[0], approach[1], deaf], Phase::Hold, Reason::VehicleStale);
+        check(&[approach[0], approach[1], deaf, at(3.0)], Phase::Search, Reason::Searching);
+        check(&[approach[0], approach[1], at(2.0)], Phase::Hold, Reason::TargetLost);
+        let again = seen(3.0, Progress::Unchanged);
+        check(
+            &[approach[0], approach[1], at(2.0), again, again],
+            Phase::Approach,
+            Reason::Aligning,
+        );
+    }
+
+    #[test]
+    fn the_pilot_and_only_the_pilot_takes_over() {
+        let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
+        let taken = (Phase::PilotInCommand, Reason::PilotTookOver);
+        check(&[start(), flown(1.0, |v| v.mode = Mode::Other)], taken.0, taken.1);
+        check(&[start(), land(1.0)], taken.0, taken.1);
+        let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+        let finals = [start(), seen(1.0, Progress::Unchanged), ready, land(9.1)];
+        check(&[finals[0], finals[1], finals[2], finals[3], at(10.0)], taken.0, taken.1);
+        check(&[start(), land(1.0), at(2.0), start()], Phase::Search, Reason::Searching);
+    }
+
+    #[test]
+    fn disarmed_motors_end_the_landing() {
+        check(&[start(), flown(1.0, |v| v.armed = false)], Phase::Aborted, Reason::Disarmed);
+        let down = |v: &mut VehicleFacts| (v.armed, v.landed) = (false, Landed::OnGround);
+        check(&[start(), flown(1.0, down)], Phase::Landed, Reason::TouchedDown);
+        check(
+            &[start(), flown(1.0, |v| v.landed = Landed::OnGround)],
+            Phase::Final,
+            Reason::TouchedEarly,
+        );
+    }
+
+    #[test]
+    fn a_take_off_is_waited_for_in_silence() {
+        let rising = |seconds| flown(seconds, |v| v.landed = Landed::TakingOff);
+        let starting = Facts { operator: start().operator, ..rising(0.0) };
+        check(&[starting, rising(0.1)], Phase::Search, Reason::TakingOff);
+        check(&[starting, rising(30.0), at(31.0)], Phase::Search, Reason::Searching);
+    }
+}

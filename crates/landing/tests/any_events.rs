@@ -172,10 +172,10 @@ impl Watcher {
         if decision.rejected.is_none() {
             match told {
                 Event::Frame(frame) if frame.marker.is_some() => {
-                    self.newest_marker = Some(frame.stamp)
+                    self.newest_marker = Some(frame.stamp);
                 }
                 Event::Vehicle(state) if state.mode == Mode::Other => {
-                    self.pilot_flies = !before.is_terminal()
+                    self.pilot_flies = !before.is_terminal();
                 }
                 Event::Operator(OperatorCommand::Start) => self.pilot_flies = false,
                 _ => {}

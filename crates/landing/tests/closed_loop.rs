@@ -92,6 +92,15 @@ fn gusts_latency_and_missed_frames_are_survived() {
 }
 
 #[test]
+fn stamps_that_are_50_ms_wrong_are_survived() {
+    for stamp_error_s in [-0.05, 0.05] {
+        let flights = fly(0..10, |seed| Scene { stamp_error_s, ..Scene::new(seed) });
+        println!("metric, stamps off by {stamp_error_s} s: {}", summary(&flights));
+        assert!(flights.iter().all(|f| f.phase == Phase::Landed && f.error_m < 0.15));
+    }
+}
+
+#[test]
 fn a_pad_above_the_origin_is_met_at_its_own_height() {
     // The pad lies 3 m above the place of take-off, so the small world's ground comes after it: LAND must begin above the pad.
     let pad = Point::new(1.0, 0.5, -3.0);

@@ -12,6 +12,7 @@
 //! holds the place where the vehicle comes to rest, so the error that counts is the one after coasting.
 
 use geometry::{Ned, Vector};
+use serde::Deserialize;
 
 use crate::config::{ConfigError, check};
 use crate::decision::{Reason, TargetEstimate};
@@ -19,7 +20,8 @@ use crate::guidance::{Progress, Situation};
 use crate::time::Timestamp;
 
 /// How the vehicle is brought over the target and down.
-#[derive(Copy, Clone, Debug, PartialEq)]
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct MetricConfig {
     /// Lateral speed per metre of predicted error, in 1/s (0.1 to 3).
     pub lateral_gain: f64,

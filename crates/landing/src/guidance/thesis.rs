@@ -12,7 +12,7 @@
 //! | unit of the altitude in `K_pz e_z` | centimetres, as in "80 cm" | -5e-4 * 1000 cm is the limit 0.5 m/s at 10 m exactly, and 20 s * ln(10 / 0.8) = 50.5 s until LAND; with metres the descent would take hours |
 //! | sign of `K_pz` and the limits 1e-5 to 0.5 m/s | the limits are of the speed of descent: `u_z = -limit(-K_pz e_z)` (up positive) | to the letter every command would be the lower limit, a climb |
 //! | `K_p` = 1e-6 | 1e-3 (`kp`) | see below |
-//! | errors of x and y inside the tolerance | used as they are, as Algorithm 18 lists them: the tolerance only gates the descent | set to nought, as the text can be read, the vehicle drifts through the circle: 55 to 64 s, an error of 0.11 m, and the centre is reached after 30 s instead of 8 s |
+//! | errors of x and y inside the tolerance | used as they are, as Algorithm 18 lists them: the tolerance only gates the descent | set to nought, as the text can be read, the vehicle drifts through the circle: it is over the pad after 31 s instead of 8 s, LAND comes after 55.5 s instead of 50.4 s, and the error is 0.11 m instead of 0.065 m |
 //! | how fast the loop runs, and the sum's time step | once per frame; the sum counts frames, not seconds (Equation 3.14) | "upon receiving a message" |
 //! | anti-windup | none: the sum grows while the output is limited | none is described; with these gains x and y hardly reach their limit |
 //! | altitude over the marker | the target's height where the detector gives a pose, else the altitude over the autopilot's origin | the text says "relative to the marker", the algorithm `drone.altitude()`; on the thesis' field they are equal |
@@ -35,6 +35,7 @@ use geometry::{Ned, Vector};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
+use serde::Deserialize;
 
 use crate::config::{ConfigError, check};
 use crate::decision::Reason;
@@ -42,7 +43,8 @@ use crate::event::Frame;
 use crate::guidance::Progress;
 
 /// The constants of the thesis' section 3.2.1.
-#[derive(Copy, Clone, Debug, PartialEq)]
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct ThesisConfig {
     /// Proportional gain for x and y, in m/s per pixel (0 to 0.1); printed as 1e-6, see the module.
     pub kp: f64,

@@ -41,6 +41,8 @@ pub(crate) struct Scene {
     /// Size of the autopilot's velocity bias and of its slow error of position, in m/s and m.
     pub(crate) estimator_error: f64,
     pub(crate) latency_s: f64,
+    /// By how much the vehicle's stamps are later than the truth, in seconds.
+    pub(crate) stamp_error_s: f64,
     /// Part of the frames in which the marker is missed.
     pub(crate) miss: f64,
     /// The detector is silent between these seconds.
@@ -91,6 +93,7 @@ impl Scene {
             gust_m_s: 0.03,
             estimator_error: 0.03,
             latency_s: 0.08,
+            stamp_error_s: 0.0,
             miss: 0.03,
             outage_s: None,
             commands: vec![(0.0, OperatorCommand::Start)],
@@ -332,7 +335,7 @@ impl World {
             _ => Landed::InAir,
         };
         VehicleState {
-            stamp: Timestamp::from_seconds(self.seconds - 0.01),
+            stamp: Timestamp::from_seconds(self.seconds - 0.01 + scene.stamp_error_s),
             ned_from_body: self.ned_from_body(scene),
             position: self.position + self.position_error,
             velocity: self.velocity + self.velocity_bias + self.noise() * 0.01,
