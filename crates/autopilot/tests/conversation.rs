@@ -1,0 +1,707 @@
+//! The client against a scripted autopilot: lost and refused commands, restarts, silence, other senders.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "helpers of tests may fail like tests"
+)]
+
+use std::collections::BTreeMap;
+
+use autopilot::command::SetpointError;
+use autopilot::dialect::{
+    ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, EKF_STATUS_REPORT_DATA,
+    EXTENDED_SYS_STATE_DATA, EkfStatusFlags, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot,
+    MavCmd, MavLandedState, MavMessage, MavModeFlag, MavResult, MavSeverity, MavSysStatusSensor,
+    MavType, STATUSTEXT_DATA, SYS_STATUS_DATA,
+};
+use autopilot::frame::{self, Sender};
+use autopilot::{
+    Autopilot, Command, CommandError, CommandId, CommandStatus, Config, Event, Firmware,
+    FlightMode, LandedState, Parser, Takeoff, TakeoffError, TakeoffProgress,
+};
+use geometry::Vector;
+
+const SECOND: i64 = 1_000_000_000;
+const STEP: i64 = SECOND / 50;
+const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
+
+/// An autopilot that does what ArduPilot was measured to do, and what a test tells it.
+struct Fake {
+    firmware: MavAutopilot,
+    boot_ns: i64,
+    mode: u32,
+    armed: bool,
+    landed: MavLandedState,
+    height: f64,
+    climbs_to: Option<f64>,
+    ready: bool,
+    intervals: BTreeMap<u32, i64>,
+    /// Commands as they were received.
+    heard: Vec<MavCmd>,
+    velocities: Vec<[f32; 3]>,
+    /// So many commands are lost on the way here, and so many acknowledgements on the way back.
+    lose_commands: u32,
+    lose_acks: u32,
+    /// A command that is refused so many times, and what is said about it.
+    refuse: Option<(MavCmd, MavResult, &'static str, u32)>,
+    silent: bool,
+    ignores_modes: bool,
+    queue: Vec<MavMessage>,
+    parser: Parser,
+}
+
+impl Fake {
+    fn new() -> Self {
+        Self {
+            firmware: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            boot_ns: 0,
+            mode: 0,
+            armed: false,
+            landed: MavLandedState::MAV_LANDED_STATE_ON_GROUND,
+            height: 0.0,
+            climbs_to: None,
+            ready: true,
+            intervals: BTreeMap::new(),
+            heard: Vec::new(),
+            velocities: Vec::new(),
+            lose_commands: 0,
+            lose_acks: 0,
+            refuse: None,
+            silent: false,
+            ignores_modes: false,
+            queue: Vec::new(),
+            parser: Parser::new(),
+        }
+    }
+
+    fn receive(&mut self, packet: &[u8]) {
+        for frame in self.parser.push(packet) {
+            match frame.message.unwrap() {
+                MavMessage::COMMAND_LONG(_) if self.lose_commands > 0 => self.lose_commands -= 1,
+                MavMessage::COMMAND_LONG(command) => {
+                    assert_eq!((command.target_system, command.target_component), (1, 1));
+                    self.heard.push(command.command);
+                    self.obey(&command, frame.sender);
+                }
+                MavMessage::SET_POSITION_TARGET_LOCAL_NED(setpoint) => {
+                    assert_eq!(
+                        (setpoint.type_mask.bits(), setpoint.coordinate_frame as u8),
+                        (1479, 1)
+                    );
+                    self.velocities.push([setpoint.vx, setpoint.vy, setpoint.vz]);
+                }
+                MavMessage::HEARTBEAT(heartbeat) => {
+                    assert_eq!(heartbeat.mavtype, MavType::MAV_TYPE_ONBOARD_CONTROLLER);
+                    assert_eq!(frame.sender, Sender { system: 1, component: 191 });
+                }
+                other => panic!("unexpected {other:?}"),
+            }
+        }
+    }
+
+    fn obey(&mut self, command: &COMMAND_LONG_DATA, from: Sender) {
+        let mut said = None;
+        let result = match &mut self.refuse {
+            Some((refused, result, text, times)) if *refused == command.command && *times > 0 => {
+                *times -= 1;
+                said = Some(*text);
+                *result
+            }
+            _ => self.carry_out(command),
+        };
+        if self.lose_acks > 0 {
+            self.lose_acks -= 1;
+        } else {
+            self.queue.push(MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
+                command: command.command,
+                result,
+                target_system: from.system,
+                target_component: from.component,
+                ..Default::default()
+            }));
+        }
+        // The reason comes after the refusal.
+        if let Some(text) = said {
+            self.say(text);
+        }
+    }
+
+    fn carry_out(&mut self, command: &COMMAND_LONG_DATA) -> MavResult {
+        match command.command {
+            MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => {
+                let interval = (f64::from(command.param2) * 1e3) as i64;
+                self.intervals.insert(command.param1 as u32, interval);
+            }
+            MavCmd::MAV_CMD_DO_SET_MODE if self.ignores_modes => {}
+            MavCmd::MAV_CMD_DO_SET_MODE => {
+                self.mode = command.param2 as u32;
+                self.queue.push(self.heartbeat());
+            }
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => self.armed = command.param1 == 1.0,
+            MavCmd::MAV_CMD_NAV_TAKEOFF => {
+                if !self.armed || self.mode != 4 || self.height > 0.0 {
+                    return MavResult::MAV_RESULT_FAILED;
+                }
+                self.climbs_to = Some(f64::from(command.param7));
+                self.landed = MavLandedState::MAV_LANDED_STATE_TAKEOFF;
+            }
+            other => panic!("unexpected {other:?}"),
+        }
+        MavResult::MAV_RESULT_ACCEPTED
+    }
+
+    fn say(&mut self, text: &str) {
+        self.queue.push(MavMessage::STATUSTEXT(STATUSTEXT_DATA {
+            severity: MavSeverity::MAV_SEVERITY_CRITICAL,
+            text: text.into(),
+            ..Default::default()
+        }));
+    }
+
+    fn heartbeat(&self) -> MavMessage {
+        let armed = MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED;
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            custom_mode: self.mode,
+            mavtype: MavType::MAV_TYPE_QUADROTOR,
+            autopilot: self.firmware,
+            base_mode: if self.armed { armed } else { MavModeFlag::empty() },
+            ..Default::default()
+        })
+    }
+
+    fn step(&mut self, now: i64) -> Vec<MavMessage> {
+        if let Some(height) = self.climbs_to {
+            self.height += 0.04;
+            if self.height >= height {
+                self.climbs_to = None;
+                self.landed = MavLandedState::MAV_LANDED_STATE_IN_AIR;
+            }
+        }
+        let mut sent = std::mem::take(&mut self.queue);
+        if now % SECOND == 0 {
+            sent.push(self.heartbeat());
+        }
+        for (&id, &interval) in &self.intervals {
+            if now % interval < STEP {
+                sent.extend(self.report(id, now));
+            }
+        }
+        if self.silent { Vec::new() } else { sent }
+    }
+
+    fn report(&self, id: u32, now: i64) -> Option<MavMessage> {
+        let time_boot_ms = ((now - self.boot_ns) / 1_000_000) as u32;
+        let prearm = MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK;
+        let vz = if self.climbs_to.is_some() { -2.0 } else { 0.0 };
+        Some(match id {
+            30 => {
+                MavMessage::ATTITUDE(ATTITUDE_DATA { time_boot_ms, yaw: 0.5, ..Default::default() })
+            }
+            32 if self.ready => MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
+                time_boot_ms,
+                // The origin lies 2 m below the ground.
+                z: (-2.0 - self.height) as f32,
+                vz,
+                ..Default::default()
+            }),
+            1 => MavMessage::SYS_STATUS(SYS_STATUS_DATA {
+                onboard_control_sensors_present: prearm,
+                onboard_control_sensors_health: if self.ready {
+                    prearm
+                } else {
+                    MavSysStatusSensor::empty()
+                },
+                ..Default::default()
+            }),
+            193 => MavMessage::EKF_STATUS_REPORT(EKF_STATUS_REPORT_DATA {
+                flags: EkfStatusFlags::from_bits_retain(if self.ready { 831 } else { 167 }),
+                ..Default::default()
+            }),
+            245 => MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA {
+                landed_state: self.landed,
+                ..Default::default()
+            }),
+            _ => return None,
+        })
+    }
+}
+
+struct World {
+    now: i64,
+    client: Autopilot,
+    fake: Fake,
+    events: Vec<Event>,
+    sequence: u8,
+}
+
+impl World {
+    fn new() -> Self {
+        Self::with(Fake::new(), Config::default())
+    }
+
+    fn with(fake: Fake, config: Config) -> Self {
+        Self {
+            now: 100 * SECOND,
+            client: Autopilot::new(config),
+            fake,
+            events: Vec::new(),
+            sequence: 0,
+        }
+    }
+
+    fn flying() -> Self {
+        let mut fake = Fake::new();
+        (fake.mode, fake.armed, fake.height) = (4, true, 10.0);
+        fake.landed = MavLandedState::MAV_LANDED_STATE_IN_AIR;
+        let mut world = Self::with(fake, Config::default());
+        world.run(5);
+        world
+    }
+
+    fn standing() -> Self {
+        let mut world = Self::new();
+        world.run(5);
+        world
+    }
+
+    fn hear(&mut self, sender: Sender, message: &MavMessage) {
+        let packet = frame::encode(sender, self.sequence, message);
+        self.sequence = self.sequence.wrapping_add(1);
+        for frame in Parser::new().push(&packet) {
+            self.client.handle(self.now, &frame);
+        }
+    }
+
+    fn step(&mut self) {
+        self.now += STEP;
+        for message in self.fake.step(self.now) {
+            self.hear(AUTOPILOT, &message);
+        }
+        self.client.tick(self.now);
+        while let Some(packet) = self.client.poll_outgoing() {
+            self.fake.receive(&packet);
+        }
+        while let Some(event) = self.client.poll_event() {
+            self.events.push(event);
+        }
+    }
+
+    fn run(&mut self, seconds: i64) {
+        for _ in 0..seconds * SECOND / STEP {
+            self.step();
+        }
+    }
+
+    /// Asks and waits for the outcome.
+    fn ask(&mut self, command: Command) -> Result<(), CommandError> {
+        let id = self.client.request(self.now, command);
+        self.outcome(id)
+    }
+
+    fn outcome(&mut self, id: CommandId) -> Result<(), CommandError> {
+        for _ in 0..1000 {
+            match self.client.status(id) {
+                CommandStatus::Pending => self.step(),
+                CommandStatus::Done => return Ok(()),
+                CommandStatus::Failed(error) => return Err(error),
+                CommandStatus::Unknown => panic!("forgotten"),
+            }
+        }
+        panic!("a command without an end");
+    }
+
+    /// Takes off; returns the end, and all that was said on the way.
+    fn take_off(&mut self, takeoff: &mut Takeoff, seconds: i64) -> (TakeoffProgress, Vec<String>) {
+        let mut said = Vec::<String>::new();
+        for _ in 0..seconds * SECOND / STEP {
+            self.step();
+            let progress = takeoff.step(self.now, &mut self.client);
+            let words = progress.to_string();
+            if said.last() != Some(&words) {
+                said.push(words);
+            }
+            if takeoff.is_finished() {
+                return (progress, said);
+            }
+        }
+        panic!("a takeoff without an end: {said:?}");
+    }
+
+    fn count(&self, wanted: impl Fn(&Event) -> bool) -> usize {
+        self.events.iter().filter(|event| wanted(event)).count()
+    }
+
+    fn heard(&self, command: MavCmd) -> usize {
+        self.fake.heard.iter().filter(|&&heard| heard == command).count()
+    }
+}
+
+#[test]
+fn it_finds_the_vehicle_and_gets_its_messages_at_their_rates() {
+    let mut world = World::standing();
+    assert!(world.events.contains(&Event::Found { system: 1, firmware: Firmware::Copter }));
+    let before = world.count(|event| matches!(event, Event::Position(_)));
+    world.run(10);
+    let positions = world.count(|event| matches!(event, Event::Position(_))) - before;
+    assert_eq!(positions, 500);
+    assert_eq!(world.heard(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL), 7, "each is asked for once");
+    let state = world.client.state().unwrap();
+    assert!(state.ready && state.connected && !state.armed);
+    assert_eq!(state.landed, LandedState::OnGround);
+    let (_, _, yaw) = state.attitude.unwrap().ned_from_body.euler();
+    assert!((yaw - 0.5).abs() < 1e-6);
+    assert_eq!(world.count(|event| matches!(event, Event::StreamMissing { .. })), 0);
+}
+
+#[test]
+fn other_senders_on_the_link_are_not_the_autopilot() {
+    let mut world = World::new();
+    let station = MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        mavtype: MavType::MAV_TYPE_GCS,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
+        ..Default::default()
+    });
+    world.hear(Sender { system: 255, component: 190 }, &station);
+    world.hear(Sender { system: 255, component: 1 }, &station);
+    let camera = MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        mavtype: MavType::MAV_TYPE_CAMERA,
+        ..Default::default()
+    });
+    world.hear(Sender { system: 1, component: 100 }, &camera);
+    assert!(world.client.state().is_none());
+
+    world.run(3);
+    let armed = HEARTBEAT_DATA {
+        base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        ..Default::default()
+    };
+    for _ in 0..3 {
+        world.hear(Sender { system: 2, component: 1 }, &MavMessage::HEARTBEAT(armed.clone()));
+    }
+    world.step();
+    assert!(!world.client.state().unwrap().armed, "that was another vehicle");
+    assert_eq!(world.count(|event| *event == Event::OtherVehicle { system: 2 }), 1);
+}
+
+#[test]
+fn a_pinned_system_is_waited_for() {
+    let config = Config { system_id: Some(7), ..Config::default() };
+    let mut world = World::with(Fake::new(), config);
+    world.client.tick(world.now);
+    while world.client.poll_outgoing().is_some() {}
+    world.hear(AUTOPILOT, &world.fake.heartbeat());
+    assert!(world.client.state().is_none());
+    world.hear(Sender { system: 7, component: 1 }, &world.fake.heartbeat());
+    assert_eq!(world.client.system(), Some(7));
+    assert_eq!(world.client.our_address(), Sender { system: 7, component: 191 });
+}
+
+#[test]
+fn a_lost_command_and_a_lost_acknowledgement_do_no_harm() {
+    for (lose_commands, lose_acks) in [(0, 0), (2, 0), (0, 2), (1, 1)] {
+        let mut world = World::standing();
+        (world.fake.lose_commands, world.fake.lose_acks) = (lose_commands, lose_acks);
+        assert_eq!(world.ask(Command::SetMode(FlightMode::Guided)), Ok(()));
+        assert_eq!(world.client.state().unwrap().mode, FlightMode::Guided);
+        (world.fake.lose_commands, world.fake.lose_acks) = (lose_commands, lose_acks);
+        assert_eq!(world.ask(Command::Arm), Ok(()));
+        assert!(world.client.state().unwrap().armed, "done only when the heartbeat shows it");
+        (world.fake.lose_commands, world.fake.lose_acks) = (lose_commands, lose_acks);
+        assert_eq!(world.ask(Command::Takeoff { height_m: 10.0 }), Ok(()));
+        assert!(world.fake.climbs_to.is_some());
+    }
+}
+
+#[test]
+fn silence_after_a_command_is_an_error_that_names_it() {
+    let mut world = World::standing();
+    world.fake.lose_commands = 100;
+    let error = world.ask(Command::Arm).unwrap_err();
+    assert_eq!(error, CommandError::NoAnswer { command: Command::Arm, attempts: 4 });
+    assert!(error.to_string().starts_with("arm: no answer to 4 requests"), "{error}");
+}
+
+#[test]
+fn a_refusal_is_told_with_the_autopilots_own_reason() {
+    let mut world = World::standing();
+    let denied = MavResult::MAV_RESULT_FAILED;
+    world.fake.refuse =
+        Some((MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, denied, "Arm: Accels inconsistent", 9));
+    let error = world.ask(Command::Arm).unwrap_err().to_string();
+    assert!(error.contains("failed") && error.contains("Arm: Accels inconsistent"), "{error}");
+    assert_eq!(world.heard(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM), 1, "a refusal is not repeated");
+}
+
+#[test]
+fn a_temporary_refusal_is_tried_again() {
+    let mut world = World::standing();
+    let later = MavResult::MAV_RESULT_TEMPORARILY_REJECTED;
+    world.fake.refuse = Some((MavCmd::MAV_CMD_DO_SET_MODE, later, "wait", 2));
+    assert_eq!(world.ask(Command::SetMode(FlightMode::Land)), Ok(()));
+}
+
+#[test]
+fn an_accepted_mode_that_never_shows_is_an_error() {
+    let mut world = World::standing();
+    world.fake.ignores_modes = true;
+    let error = world.ask(Command::SetMode(FlightMode::Land)).unwrap_err();
+    assert!(matches!(error, CommandError::NotConfirmed { .. }));
+    assert!(error.to_string().contains("still shows STABILIZE"), "{error}");
+}
+
+#[test]
+fn an_answer_to_another_station_is_not_taken_for_ours() {
+    let mut world = World::standing();
+    world.fake.lose_commands = 1;
+    let id = world.client.request(world.now, Command::Arm);
+    world.step();
+    let ack = COMMAND_ACK_DATA {
+        command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+        result: MavResult::MAV_RESULT_FAILED,
+        target_system: 255,
+        target_component: 190,
+        ..Default::default()
+    };
+    world.hear(AUTOPILOT, &MavMessage::COMMAND_ACK(ack));
+    assert_eq!(world.outcome(id), Ok(()));
+}
+
+#[test]
+fn a_later_command_takes_the_place_of_an_earlier_one() {
+    let mut world = World::standing();
+    world.fake.lose_commands = 1;
+    let first = world.client.request(world.now, Command::SetMode(FlightMode::Guided));
+    world.step();
+    assert_eq!(world.ask(Command::SetMode(FlightMode::Land)), Ok(()));
+    assert!(matches!(
+        world.client.status(first),
+        CommandStatus::Failed(CommandError::Replaced { .. })
+    ));
+}
+
+#[test]
+fn a_lost_heartbeat_is_told_ends_commands_and_returns() {
+    let mut world = World::flying();
+    let id = world.client.request(world.now, Command::SetMode(FlightMode::Land));
+    world.fake.silent = true;
+    world.run(5);
+    assert_eq!(world.count(|event| matches!(event, Event::Lost { .. })), 1);
+    let lost = CommandError::NoAutopilot { command: Command::SetMode(FlightMode::Land) };
+    assert_eq!(world.outcome(id), Err(lost));
+    let velocity = world.client.set_velocity(world.now, Vector::zero(), 0.0);
+    assert_eq!(velocity, Err(SetpointError::NoAutopilot));
+    assert!(world.ask(Command::Arm).unwrap_err().to_string().contains("no heartbeat"));
+
+    let asked = world.heard(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL);
+    world.fake.silent = false;
+    world.run(5);
+    assert_eq!(world.count(|event| *event == Event::Returned), 1);
+    assert!(
+        world.heard(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL) >= asked + 7,
+        "rates are asked for again"
+    );
+}
+
+#[test]
+fn a_restart_is_noticed_and_everything_is_asked_for_again() {
+    let mut world = World::standing();
+    world.run(5);
+    let boot_ns = world.now;
+    world.fake = Fake { boot_ns, ready: false, ..Fake::new() };
+    world.run(10);
+    assert_eq!(world.count(|event| *event == Event::Restarted), 1);
+    let state = *world.client.state().unwrap();
+    assert!(!state.ready && state.position.is_none(), "the old position is not the new one's");
+    world.fake.ready = true;
+    world.run(15);
+    assert!(world.client.state().unwrap().ready);
+    assert!(world.client.state().unwrap().position.is_some());
+}
+
+#[test]
+fn rates_that_another_station_overwrote_are_restored() {
+    let mut world = World::standing();
+    for interval in world.fake.intervals.values_mut() {
+        *interval = SECOND / 2;
+    }
+    world.run(6);
+    let before = world.count(|event| matches!(event, Event::Attitude(_)));
+    world.run(4);
+    assert_eq!(world.count(|event| matches!(event, Event::Attitude(_))) - before, 200);
+}
+
+#[test]
+fn a_message_that_never_comes_is_named() {
+    let mut world = World::with(Fake { ready: false, ..Fake::new() }, Config::default());
+    world.run(20);
+    assert_eq!(
+        world.count(|event| matches!(
+            event,
+            Event::StreamMissing { message: "LOCAL_POSITION_NED", .. }
+        )),
+        1
+    );
+    world.fake.ready = true;
+    world.run(15);
+    assert_eq!(
+        world.count(|event| matches!(
+            event,
+            Event::StreamRestored { message: "LOCAL_POSITION_NED", .. }
+        )),
+        1
+    );
+}
+
+#[test]
+fn velocities_are_sent_only_where_they_mean_something() {
+    let mut world = World::flying();
+    let forward = Vector::new(0.5, 0.0, -0.1);
+    assert_eq!(world.client.set_velocity(world.now, forward, 0.0), Ok(()));
+    world.step();
+    assert_eq!(world.fake.velocities, [[0.5, 0.0, -0.1]]);
+
+    for bad in [f64::NAN, f64::INFINITY, 1e300] {
+        let velocity = Vector::new(0.0, bad, 0.0);
+        let refused = world.client.set_velocity(world.now, velocity, 0.0);
+        assert!(matches!(refused, Err(SetpointError::NotFinite(..))));
+        let refused = world.client.set_velocity(world.now, forward, bad);
+        assert!(matches!(refused, Err(SetpointError::NotFinite(..))));
+    }
+    world.fake.mode = 5;
+    world.run(2);
+    let refused = world.client.set_velocity(world.now, forward, 0.0);
+    assert_eq!(refused, Err(SetpointError::NotGuided(FlightMode::Other(5))));
+    world.fake.mode = 4;
+    world.fake.landed = MavLandedState::MAV_LANDED_STATE_TAKEOFF;
+    world.run(2);
+    let refused = world.client.set_velocity(world.now, forward, 0.0);
+    assert_eq!(refused, Err(SetpointError::NotFlying(LandedState::TakingOff)));
+    assert_eq!(world.fake.velocities.len(), 1);
+}
+
+#[test]
+fn px4_is_recognised_and_refused_by_name() {
+    let fake = Fake { firmware: MavAutopilot::MAV_AUTOPILOT_PX4, mode: 6 << 16, ..Fake::new() };
+    let mut world = World::with(fake, Config::default());
+    world.run(3);
+    assert_eq!(world.client.state().unwrap().mode.to_string(), "PX4 OFFBOARD");
+    let error = world.ask(Command::Arm).unwrap_err().to_string();
+    assert!(error.contains("PX4") && error.contains("only ArduPilot Copter"), "{error}");
+    let error = world.client.set_velocity(world.now, Vector::zero(), 0.0).unwrap_err();
+    assert_eq!(error, SetpointError::Unsupported(Firmware::Px4));
+}
+
+#[test]
+fn a_takeoff_waits_arms_again_and_ends_at_its_height() {
+    let mut world = World::with(Fake { ready: false, ..Fake::new() }, Config::default());
+    let mut takeoff = Takeoff::new(10.0);
+    world.run(3);
+    world.fake.say("PreArm: Need Position Estimate");
+    for _ in 0..100 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+    }
+    let waiting = takeoff.step(world.now, &mut world.client).to_string();
+    assert!(
+        waiting.contains("EKF origin") && waiting.contains("prearm: Need Position"),
+        "{waiting}"
+    );
+
+    world.fake.ready = true;
+    let failed = MavResult::MAV_RESULT_FAILED;
+    world.fake.refuse =
+        Some((MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, failed, "Arm: Gyros not healthy", 2));
+    let (end, said) = world.take_off(&mut takeoff, 60);
+    assert_eq!(end, TakeoffProgress::Done, "{said:?}");
+    assert!((world.fake.height - 10.0).abs() < 0.5);
+    assert!(said.iter().any(|words| words.contains("Gyros not healthy")), "{said:?}");
+    assert!(world.fake.velocities.is_empty());
+    let orders: Vec<MavCmd> = world
+        .fake
+        .heard
+        .iter()
+        .copied()
+        .filter(|command| *command != MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL)
+        .collect();
+    assert_eq!(
+        orders,
+        [
+            MavCmd::MAV_CMD_DO_SET_MODE,
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+            MavCmd::MAV_CMD_NAV_TAKEOFF,
+        ]
+    );
+}
+
+#[test]
+fn a_vehicle_that_flies_already_needs_no_takeoff() {
+    let mut world = World::flying();
+    let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
+    assert_eq!(end, TakeoffProgress::Done);
+    assert_eq!(world.heard(MavCmd::MAV_CMD_NAV_TAKEOFF), 0);
+}
+
+#[test]
+fn a_vehicle_that_the_pilot_flies_is_left_alone() {
+    let mut world = World::flying();
+    world.fake.mode = 5;
+    world.run(2);
+    let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
+    let TakeoffProgress::Failed(TakeoffError::PilotInCommand { mode, .. }) = &end else {
+        panic!("{end:?}")
+    };
+    assert_eq!(*mode, FlightMode::Other(5));
+    assert!(end.to_string().contains("in the air in LOITER"), "{end}");
+    assert_eq!(world.heard(MavCmd::MAV_CMD_DO_SET_MODE), 0);
+}
+
+#[test]
+fn the_pilots_mode_switch_ends_a_takeoff() {
+    let mut world = World::standing();
+    let mut takeoff = Takeoff::new(10.0);
+    while world.fake.height < 3.0 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+    }
+    world.fake.mode = 16;
+    let (end, _) = world.take_off(&mut takeoff, 5);
+    assert!(matches!(end, TakeoffProgress::Failed(TakeoffError::PilotInCommand { .. })));
+    world.fake.mode = 4;
+    world.run(3);
+    assert_eq!(takeoff.step(world.now, &mut world.client), end, "an end stays an end");
+}
+
+#[test]
+fn a_takeoff_gives_up_with_the_reasons() {
+    let mut world = World::with(Fake { ready: false, ..Fake::new() }, Config::default());
+    let (end, _) = world.take_off(&mut Takeoff::new(10.0), 125);
+    assert!(end.to_string().contains("not ready after 120 s: waiting for the EKF origin"), "{end}");
+
+    let mut world = World::standing();
+    let mut takeoff = Takeoff::new(10.0);
+    while world.fake.height < 1.0 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+    }
+    world.fake.armed = false;
+    let (end, _) = world.take_off(&mut takeoff, 5);
+    assert_eq!(end, TakeoffProgress::Failed(TakeoffError::Disarmed));
+
+    let mut world = World::standing();
+    let mut takeoff = Takeoff::new(10.0);
+    while world.fake.height < 1.9 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+    }
+    world.fake.climbs_to = None;
+    world.fake.landed = MavLandedState::MAV_LANDED_STATE_IN_AIR;
+    let (end, _) = world.take_off(&mut takeoff, 40);
+    assert!(end.to_string().contains("1.9 m of 10.0 m, in the air"), "{end}");
+}
