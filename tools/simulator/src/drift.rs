@@ -2,7 +2,7 @@
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, StandardNormal};
+use rand_distr::{Distribution, StandardNormal, StandardUniform};
 
 /// The random stream number `stream` of a seed: streams of one seed are independent of each other, so a part of the
 /// world that draws more numbers does not change what the others see.
@@ -15,6 +15,11 @@ pub fn random_stream(seed: u64, stream: u64) -> ChaCha8Rng {
 /// One number from the normal distribution with mean 0 and deviation 1.
 pub fn normal(random: &mut ChaCha8Rng) -> f64 {
     StandardNormal.sample(random)
+}
+
+/// One number from 0 to 1.
+pub fn uniform(random: &mut ChaCha8Rng) -> f64 {
+    StandardUniform.sample(random)
 }
 
 /// A first-order Gauss-Markov process: a normal variable that forgets its value with a time constant.

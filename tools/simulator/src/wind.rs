@@ -14,6 +14,9 @@ const FEET_PER_METRE: f64 = 3.280_84;
 const LOWEST_FT: f64 = 10.0;
 const HIGHEST_FT: f64 = 1000.0;
 
+/// Part of the Dryden model's intensity that a turbulence of 1 has.
+const DRYDEN_SHARE: f64 = 0.3;
+
 /// What blows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WindConfig {
@@ -21,7 +24,8 @@ pub struct WindConfig {
     pub mean_m_s: f64,
     /// Where the mean wind comes from, in radians from north to east.
     pub from_rad: f64,
-    /// Intensity of the turbulence: 1 is what the Dryden model gives for the mean wind, 0 none.
+    /// Strength of the turbulence: 1 disturbs a landing as much as "turbulence 1" of ArduPilot's simulation does, which
+    /// is three tenths of the intensity that the Dryden model gives for the mean wind; 0 is none.
     pub turbulence: f64,
     /// The thesis' noise, added to the rest.
     pub noise: Option<WindNoise>,
@@ -91,7 +95,7 @@ impl Wind {
         }
         let height_ft = (height_m * FEET_PER_METRE).clamp(LOWEST_FT, HIGHEST_FT);
         let shape = 0.177 + 0.000_823 * height_ft;
-        let sigma_vertical = 0.1 * speed * self.config.turbulence;
+        let sigma_vertical = 0.1 * speed * DRYDEN_SHARE * self.config.turbulence;
         let sigma_level = sigma_vertical / shape.powf(0.4);
         let pace_level_s = height_ft / shape.powf(1.2) / FEET_PER_METRE / speed;
         let pace_vertical_s = height_ft / FEET_PER_METRE / speed;
@@ -176,7 +180,8 @@ mod tests {
 
     #[test]
     fn turbulence_has_the_intensities_of_the_dryden_model() {
-        let config = WindConfig { mean_m_s: 5.0, turbulence: 1.0, ..WindConfig::default() };
+        let whole = 1.0 / DRYDEN_SHARE;
+        let config = WindConfig { mean_m_s: 5.0, turbulence: whole, ..WindConfig::default() };
         let (mean, deviation) = statistics(config, 10.0);
         let level = 0.5 / (0.177 + 0.000_823 * 32.8084f64).powf(0.4);
         for (axis, expected) in [level, level, 0.5].into_iter().enumerate() {

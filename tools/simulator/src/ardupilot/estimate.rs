@@ -1,0 +1,165 @@
+//! What the autopilot believes of its motion: the truth with the errors of a state estimator.
+
+use rand_chacha::ChaCha8Rng;
+
+use crate::drift::{Drift, normal, random_stream};
+use crate::laws::{lag, wrap};
+use crate::vehicle::VehicleTruth;
+
+/// Sizes of the errors; the defaults are those seen in the logs of a real autopilot in simulation.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EstimateConfig {
+    /// Deviation of the constant part of the horizontal velocity's error, in m/s per axis.
+    pub velocity_bias_m_s: f64,
+    /// Deviation of its slow part (a time constant of 10 s), in m/s per axis.
+    pub velocity_drift_m_s: f64,
+    /// Deviation of the horizontal position's slow error (a time constant of 10 s), in metres per axis.
+    pub position_drift_m: f64,
+    /// Deviation of the height's slow error (a time constant of 10 s), in metres.
+    pub height_drift_m: f64,
+    /// Believed height over true height: the barometer's error.
+    pub height_scale: f64,
+    /// Time constant with which the estimate takes that error over, in seconds.
+    pub height_lag_s: f64,
+    /// Believed vertical speed over the true one.
+    pub climb_scale: f64,
+    /// Deviation of the constant error of roll and pitch, in radians.
+    pub trim_rad: f64,
+    /// Deviation of the slow error of roll and pitch (a time constant of 5 s), in radians.
+    pub lean_drift_rad: f64,
+    /// Deviation of the constant error of the heading, in radians.
+    pub heading_bias_rad: f64,
+}
+
+impl Default for EstimateConfig {
+    fn default() -> Self {
+        Self {
+            velocity_bias_m_s: 0.015,
+            velocity_drift_m_s: 0.006,
+            position_drift_m: 0.012,
+            height_drift_m: 0.02,
+            height_scale: 1.042,
+            height_lag_s: 4.0,
+            climb_scale: 1.022,
+            trim_rad: 0.13f64.to_radians(),
+            lean_drift_rad: 0.05f64.to_radians(),
+            heading_bias_rad: 0.7f64.to_radians(),
+        }
+    }
+}
+
+impl EstimateConfig {
+    /// An estimator that knows the truth.
+    pub fn perfect() -> Self {
+        Self {
+            velocity_bias_m_s: 0.0,
+            velocity_drift_m_s: 0.0,
+            position_drift_m: 0.0,
+            height_drift_m: 0.0,
+            height_scale: 1.0,
+            height_lag_s: 1.0,
+            climb_scale: 1.0,
+            trim_rad: 0.0,
+            lean_drift_rad: 0.0,
+            heading_bias_rad: 0.0,
+        }
+    }
+}
+
+/// Believed motion. Arrays are north, east, down, from where the autopilot has its local origin.
+#[derive(Copy, Clone, Debug, Default, PartialEq)]
+pub(super) struct Estimate {
+    /// In metres.
+    pub(super) position: [f64; 3],
+    /// In m/s.
+    pub(super) velocity: [f64; 3],
+    /// Downwards, in m/s^2.
+    pub(super) acceleration_z: f64,
+    /// In radians.
+    pub(super) roll: f64,
+    /// In radians.
+    pub(super) pitch: f64,
+    /// In radians from north to east.
+    pub(super) yaw: f64,
+    /// About the body's axes, in rad/s.
+    pub(super) rates: [f64; 3],
+    /// Believed minus true roll, in radians.
+    pub(super) roll_error: f64,
+    /// Believed minus true pitch, in radians.
+    pub(super) pitch_error: f64,
+    /// Believed minus true heading, in radians.
+    pub(super) yaw_error: f64,
+}
+
+/// Makes the errors.
+#[derive(Clone, Debug)]
+pub(super) struct Estimator {
+    config: EstimateConfig,
+    random: ChaCha8Rng,
+    velocity_bias: [f64; 2],
+    velocity: [Drift; 2],
+    position: [Drift; 3],
+    trim: [f64; 2],
+    lean: [Drift; 2],
+    yaw_error: f64,
+    height_error: f64,
+}
+
+impl Estimator {
+    pub(super) fn new(config: EstimateConfig, seed: u64) -> Self {
+        let mut random = random_stream(seed, 3);
+        let draw = &mut random;
+        let velocity_bias = [(); 2].map(|()| config.velocity_bias_m_s * normal(draw));
+        let velocity = [(); 2].map(|()| Drift::new(config.velocity_drift_m_s, 10.0, draw));
+        let position = [config.position_drift_m, config.position_drift_m, config.height_drift_m]
+            .map(|deviation| Drift::new(deviation, 10.0, draw));
+        let trim = [(); 2].map(|()| config.trim_rad * normal(draw));
+        let lean = [(); 2].map(|()| Drift::new(config.lean_drift_rad, 5.0, draw));
+        let yaw_error = config.heading_bias_rad * normal(draw);
+        Self {
+            config,
+            random,
+            velocity_bias,
+            velocity,
+            position,
+            trim,
+            lean,
+            yaw_error,
+            height_error: 0.0,
+        }
+    }
+
+    /// Lets `dt_s` pass and gives what is believed of `truth`.
+    pub(super) fn step(&mut self, dt_s: f64, truth: &VehicleTruth) -> Estimate {
+        let random = &mut self.random;
+        let position = self.position.each_mut().map(|drift| drift.step(dt_s, random));
+        let velocity = self.velocity.each_mut().map(|drift| drift.step(dt_s, random));
+        let lean = self.lean.each_mut().map(|drift| drift.step(dt_s, random));
+        let (p, v) = (truth.position, truth.velocity);
+        let barometer_error = p.z() * (self.config.height_scale - 1.0);
+        self.height_error +=
+            (barometer_error - self.height_error) * lag(dt_s, self.config.height_lag_s);
+        let (roll, pitch, yaw) = truth.ned_from_body.euler();
+        let (roll_error, pitch_error) = (self.trim[0] + lean[0], self.trim[1] + lean[1]);
+        Estimate {
+            position: [
+                p.x() + position[0],
+                p.y() + position[1],
+                p.z() + self.height_error + position[2],
+            ],
+            velocity: [
+                v.x() + self.velocity_bias[0] + velocity[0],
+                v.y() + self.velocity_bias[1] + velocity[1],
+                v.z() * self.config.climb_scale,
+            ],
+            acceleration_z: truth.acceleration.z(),
+            roll: roll + roll_error,
+            pitch: pitch + pitch_error,
+            yaw: wrap(yaw + self.yaw_error),
+            rates: [truth.angular_rate.x(), truth.angular_rate.y(), truth.angular_rate.z()],
+            roll_error,
+            pitch_error,
+            yaw_error: self.yaw_error,
+        }
+    }
+}
