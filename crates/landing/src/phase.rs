@@ -472,9 +472,9 @@ mod tests {
             Reason::NoProgress,
         );
         check(
-            &[start(), told(1.0, OperatorCommand::Hold), at(290.0)],
-            Phase::Hold,
-            Reason::OperatorHold,
+            &[start(), told(1.0, OperatorCommand::Hold), at(182.0)],
+            Phase::Aborted,
+            Reason::HeldTooLong,
         );
         check(
             &[start(), told(1.0, OperatorCommand::Hold), at(301.0)],
