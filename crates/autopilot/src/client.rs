@@ -250,7 +250,8 @@ impl Autopilot {
             self.send(&compose::heartbeat());
             // The next one is a second after this one was due, unless time has run far ahead.
             let regular = self.heartbeat_due_ns.saturating_add(HEARTBEAT_NS);
-            self.heartbeat_due_ns = if regular > now_ns { regular } else { now_ns + HEARTBEAT_NS };
+            self.heartbeat_due_ns =
+                if regular > now_ns { regular } else { now_ns.saturating_add(HEARTBEAT_NS) };
         }
         self.check_silence(now_ns);
         let late = self.vehicle.as_mut().and_then(|vehicle| vehicle.joiner.tick(now_ns));

@@ -96,9 +96,9 @@ impl Streams {
         match result {
             MavResult::MAV_RESULT_ACCEPTED => watched.count_anew(now_ns),
             MavResult::MAV_RESULT_TEMPORARILY_REJECTED | MavResult::MAV_RESULT_IN_PROGRESS => {
-                watched.ask_at_ns = Some(now_ns + SECOND_NS);
+                watched.ask_at_ns = Some(now_ns.saturating_add(SECOND_NS));
             }
-            _ => watched.ask_at_ns = Some(now_ns + REFUSED_NS),
+            _ => watched.ask_at_ns = Some(now_ns.saturating_add(REFUSED_NS)),
         }
     }
 
@@ -121,7 +121,7 @@ impl Streams {
             return (notices, None);
         };
         watched.asked = watched.asked.saturating_add(1);
-        self.asking = Some((index, now_ns + ACK_NS));
+        self.asking = Some((index, now_ns.saturating_add(ACK_NS)));
         (notices, Some(request(watched.stream)))
     }
 }

@@ -705,3 +705,49 @@ fn a_takeoff_gives_up_with_the_reasons() {
     let (end, _) = world.take_off(&mut takeoff, 40);
     assert!(end.to_string().contains("1.9 m of 10.0 m, in the air"), "{end}");
 }
+
+proptest::proptest! {
+    #[test]
+    fn no_message_of_the_autopilot_and_no_time_panics(
+        messages in proptest::collection::vec((
+            proptest::sample::select(vec![0, 1, 30, 31, 32, 77, 132, 147, 193, 245, 253]),
+            proptest::collection::vec(proptest::num::u8::ANY, 0..80),
+            proptest::num::i64::ANY,
+        ), 0..60),
+    ) {
+        use autopilot::dialect::Message;
+        let mut client = Autopilot::new(Config::default());
+        let mut takeoff = Takeoff::new(10.0);
+        let copter = Fake::new().heartbeat();
+        let found = frame::encode(AUTOPILOT, 0, &copter);
+        client.handle(0, &Parser::new().push(&found)[0]);
+        for (id, payload, now) in messages {
+            let plain = MavMessage::default_message_from_id(id).unwrap();
+            let mut packet = frame::encode(AUTOPILOT, 0, &plain);
+            packet.truncate(10);
+            packet[1] = payload.len() as u8;
+            packet.extend_from_slice(&payload);
+            let crc = checksum(&packet[1..], MavMessage::extra_crc(id));
+            packet.extend_from_slice(&crc.to_le_bytes());
+            for frame in Parser::new().push(&packet) {
+                client.handle(now, &frame);
+                client.tick(now);
+                takeoff.step(now, &mut client);
+                let _ = client.set_velocity(now, Vector::zero(), 0.0);
+                if let Some(state) = client.state() {
+                    assert!(state.attitude.is_none_or(|a| a.rate_in_body.is_finite()));
+                    assert!(state.position.is_none_or(|p| p.position.is_finite() && p.velocity.is_finite()));
+                }
+            }
+        }
+    }
+}
+
+/// The X.25 checksum of a packet with its extra byte.
+fn checksum(bytes: &[u8], extra: u8) -> u16 {
+    bytes.iter().chain([&extra]).fold(0xFFFF, |crc: u16, byte| {
+        let mixed = byte ^ crc as u8;
+        let mixed = u16::from(mixed ^ (mixed << 4));
+        (crc >> 8) ^ (mixed << 8) ^ (mixed << 3) ^ (mixed >> 4)
+    })
+}
