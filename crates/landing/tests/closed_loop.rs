@@ -145,6 +145,19 @@ fn a_marker_lost_low_over_it_does_not_keep_the_vehicle_in_the_air() {
 }
 
 #[test]
+fn a_marker_lost_at_little_height_is_looked_for_a_little_higher() {
+    let undisturbed = Scene::new(2).fly();
+    let lost_s = undisturbed.samples.iter().find(|s| s.position.z() > -1.3).unwrap().seconds;
+    let flight = Scene { outage_s: Some((lost_s, lost_s + 8.0)), ..Scene::new(2) }.fly();
+    let highest = flight.samples.iter().filter(|s| s.seconds > lost_s);
+    let highest_m = highest.fold(0.0, |m: f64, s| m.max(-s.position.z()));
+    let lowest = flight.samples.iter().filter(|s| (lost_s..lost_s + 3.0).contains(&s.seconds));
+    let lowest_m = lowest.fold(9.0, |m: f64, s| m.min(-s.position.z()));
+    assert!((1.4..1.8).contains(&highest_m) && lowest_m < 1.2, "{lowest_m} to {highest_m} m");
+    assert_eq!(flight.phase, Phase::Landed);
+}
+
+#[test]
 fn the_pilot_silences_us_at_once() {
     let flight = Scene { pilot_s: Some(3.0), limit_s: 20.0, ..Scene::new(1) }.fly();
     assert!(
