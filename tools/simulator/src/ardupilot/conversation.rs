@@ -1,0 +1,241 @@
+//! What the autopilot answers to what it is sent.
+
+use autopilot::dialect::{
+    MavCmd, MavFrame, MavMessage, MavModeFlag, MavResult, MavSeverity, Message, PARAM_VALUE_DATA,
+    SET_POSITION_TARGET_LOCAL_NED_DATA, TIMESYNC_DATA,
+};
+use autopilot::{Frame, Sender};
+
+use super::flight::{Mode, Setpoint};
+use super::parameters::{Parameters, Shown};
+use super::steering::Nose;
+use super::{SimulatedAutopilot, nanoseconds, packet};
+
+/// Setpoints that wait out their latency.
+const MOST_SETPOINTS: usize = 64;
+/// param2 of the arm command that makes it unconditional.
+const FORCE: f32 = 21196.0;
+/// Number of the command with which SET_MODE is acknowledged: its own message number.
+const SET_MODE: u16 = 11;
+
+const ACCEPTED: MavResult = MavResult::MAV_RESULT_ACCEPTED;
+const FAILED: MavResult = MavResult::MAV_RESULT_FAILED;
+
+fn accepted(yes: bool) -> MavResult {
+    if yes { ACCEPTED } else { FAILED }
+}
+
+impl SimulatedAutopilot {
+    /// Takes one packet from the link.
+    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+    pub fn handle(&mut self, now_s: f64, frame: &Frame) {
+        let Some(message) = frame.message.as_ref().filter(|message| self.is_for_me(message)) else {
+            return;
+        };
+        let from = frame.sender;
+        match message {
+            MavMessage::COMMAND_LONG(c) => {
+                let values = [c.param1, c.param2, c.param3, c.param4, c.param5, c.param6, c.param7];
+                self.command(now_s, from, c.command, values);
+            }
+            MavMessage::COMMAND_INT(c) => {
+                let values = [c.param1, c.param2, c.param3, c.param4, c.x as f32, c.y as f32, c.z];
+                self.command(now_s, from, c.command, values);
+            }
+            MavMessage::SET_MODE(m) => {
+                let custom = m.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED);
+                let result = if custom { self.set_mode(now_s, m.custom_mode) } else { FAILED };
+                self.acknowledge(SET_MODE, result, from);
+            }
+            MavMessage::SET_POSITION_TARGET_LOCAL_NED(target) => self.take_setpoint(now_s, target),
+            MavMessage::REQUEST_DATA_STREAM(r) => {
+                let rate = f64::from(r.req_message_rate);
+                let interval_s = (r.start_stop != 0 && rate > 0.0).then(|| 1.0 / rate);
+                self.schedule.set_stream(now_s, r.req_stream_id as u8, interval_s);
+            }
+            MavMessage::TIMESYNC(t) if t.tc1 == 0 => {
+                let reply = TIMESYNC_DATA { tc1: nanoseconds(now_s), ts1: t.ts1 };
+                self.send(&MavMessage::TIMESYNC(reply));
+            }
+            other => self.talk_of_parameters(other),
+        }
+    }
+
+    fn talk_of_parameters(&mut self, message: &MavMessage) {
+        match message {
+            MavMessage::PARAM_REQUEST_LIST(_) => {
+                for index in 0..usize::from(Parameters::COUNT) {
+                    self.show(self.parameters.by_index(index), true);
+                }
+            }
+            MavMessage::PARAM_REQUEST_READ(r) => {
+                let by_name = || self.parameters.by_name(r.param_id.to_str().ok()?);
+                let index = usize::try_from(r.param_index);
+                self.show(
+                    index.map_or_else(|_| by_name(), |index| self.parameters.by_index(index)),
+                    true,
+                );
+            }
+            MavMessage::PARAM_SET(p) => {
+                let shown =
+                    self.parameters.set(p.param_id.to_str().unwrap_or_default(), p.param_value);
+                self.show(shown, false);
+            }
+            _ => {}
+        }
+    }
+
+    /// Addressed to this autopilot, to all, or to nobody.
+    fn is_for_me(&self, message: &MavMessage) -> bool {
+        let me = self.me();
+        let system = message.target_system_id().unwrap_or(0);
+        let component = message.target_component_id().unwrap_or(0);
+        (system == 0 || system == me.system) && (component == 0 || component == me.component)
+    }
+
+    #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+    fn command(&mut self, now_s: f64, from: Sender, command: MavCmd, values: [f32; 7]) {
+        let [first, second, ..] = values;
+        let result = match command {
+            MavCmd::MAV_CMD_DO_SET_MODE => {
+                let custom = (first as i64) & 1 == 1;
+                // A number that is none names no mode.
+                let number = if second >= 0.0 { second as u32 } else { u32::MAX };
+                if custom { self.set_mode(now_s, number) } else { FAILED }
+            }
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => {
+                self.arm_or_disarm(now_s, first, second == FORCE)
+            }
+            MavCmd::MAV_CMD_NAV_TAKEOFF => {
+                accepted(self.flight.take_off(now_s, f64::from(values[6]), &self.estimate))
+            }
+            MavCmd::MAV_CMD_NAV_LAND => self.set_mode(now_s, Mode::Land as u32),
+            MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => self.set_interval(now_s, first, second),
+            MavCmd::MAV_CMD_REQUEST_MESSAGE => {
+                self.acknowledge(command as u16, accepted(self.can_tell(first as u32)), from);
+                self.tell_one(first as u32);
+                return;
+            }
+            MavCmd::MAV_CMD_GET_HOME_POSITION => {
+                self.tell_one(242);
+                ACCEPTED
+            }
+            MavCmd::MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES => {
+                self.tell_one(148);
+                ACCEPTED
+            }
+            _ => MavResult::MAV_RESULT_UNSUPPORTED,
+        };
+        self.acknowledge(command as u16, result, from);
+        if command == MavCmd::MAV_CMD_COMPONENT_ARM_DISARM && first == 0.0 {
+            self.report_happenings();
+        }
+    }
+
+    fn set_mode(&mut self, now_s: f64, number: u32) -> MavResult {
+        let Some(mode) = Mode::from_number(number) else {
+            self.text(MavSeverity::MAV_SEVERITY_WARNING, &format!("No such mode {number}"));
+            return FAILED;
+        };
+        let changes = mode != self.flight.mode();
+        self.flight.set_mode(now_s, mode, &self.estimate);
+        if changes {
+            self.tell_one(0);
+        }
+        ACCEPTED
+    }
+
+    fn arm_or_disarm(&mut self, now_s: f64, which: f32, forced: bool) -> MavResult {
+        if which == 0.0 {
+            return accepted(self.flight.disarm(forced));
+        }
+        if which != 1.0 {
+            return MavResult::MAV_RESULT_UNSUPPORTED;
+        }
+        if self.flight.armed() {
+            return ACCEPTED;
+        }
+        if !self.ready() && !forced {
+            self.text(MavSeverity::MAV_SEVERITY_CRITICAL, "Arm: Need Position Estimate");
+            let long = "Arm: AHRS: EKF3 Yaw inconsistent 77 deg. Wait or reboot";
+            self.text(MavSeverity::MAV_SEVERITY_CRITICAL, long);
+            return FAILED;
+        }
+        match self.flight.arm(now_s) {
+            Ok(()) => {
+                self.text(MavSeverity::MAV_SEVERITY_INFO, "Arming motors");
+                self.tell_one(49);
+                self.tell_one(242);
+                ACCEPTED
+            }
+            Err(reason) => {
+                self.text(MavSeverity::MAV_SEVERITY_CRITICAL, &format!("Arm: {reason}"));
+                FAILED
+            }
+        }
+    }
+
+    fn set_interval(&mut self, now_s: f64, id: f32, interval_us: f32) -> MavResult {
+        let interval_s = (interval_us > 0.0).then(|| f64::from(interval_us) * 1e-6);
+        if self.schedule.set(now_s, id as u32, interval_s) {
+            return ACCEPTED;
+        }
+        let text = format!("No ap_message for mavlink id ({})", id as u32);
+        self.text(MavSeverity::MAV_SEVERITY_INFO, &text);
+        MavResult::MAV_RESULT_DENIED
+    }
+
+    /// Velocities in the frames that ArduPilot takes; everything else it cannot fly is a stop.
+    fn take_setpoint(&mut self, now_s: f64, target: &SET_POSITION_TARGET_LOCAL_NED_DATA) {
+        let setpoint = self.setpoint(target).unwrap_or(Setpoint::STOP);
+        if self.setpoints.len() >= MOST_SETPOINTS {
+            self.setpoints.pop_front();
+        }
+        self.setpoints.push_back((now_s + self.config.setpoint_latency_s, setpoint));
+    }
+
+    fn setpoint(&self, target: &SET_POSITION_TARGET_LOCAL_NED_DATA) -> Option<Setpoint> {
+        const POSITION: u16 = 0x007;
+        const VELOCITY: u16 = 0x038;
+        const FORCE_SET: u16 = 0x200;
+        const YAW: u16 = 0x400;
+        const YAW_RATE: u16 = 0x800;
+        let mask = target.type_mask.bits();
+        let relative = match target.coordinate_frame {
+            MavFrame::MAV_FRAME_LOCAL_NED | MavFrame::MAV_FRAME_LOCAL_OFFSET_NED => false,
+            #[allow(deprecated, reason = "ArduPilot takes these and stops at their successor")]
+            MavFrame::MAV_FRAME_BODY_NED | MavFrame::MAV_FRAME_BODY_OFFSET_NED => true,
+            _ => return None,
+        };
+        let numbers = [target.vx, target.vy, target.vz, target.yaw, target.yaw_rate].map(f64::from);
+        let [x, y, down, yaw, yaw_rate] = numbers;
+        let flown = mask & POSITION != 0 && mask & (VELOCITY | FORCE_SET) == 0;
+        if !flown || !numbers.iter().all(|number| number.is_finite()) {
+            return None;
+        }
+        let heading = self.estimate.yaw;
+        let (sin, cos) = if relative { heading.sin_cos() } else { (0.0, 1.0) };
+        let nose = match (mask & YAW == 0, mask & YAW_RATE == 0) {
+            (true, _) => Nose::Angle(if relative { heading + yaw } else { yaw }),
+            (false, true) => Nose::Rate(yaw_rate),
+            (false, false) => Nose::Follow,
+        };
+        Some(Setpoint { velocity: [cos * x - sin * y, sin * x + cos * y, down], nose })
+    }
+
+    fn show(&mut self, shown: Option<Shown>, indexed: bool) {
+        let Some(Shown { index, name, kind, value }) = shown else { return };
+        self.send(&MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
+            param_value: value,
+            param_count: Parameters::COUNT,
+            param_index: if indexed { index } else { u16::MAX },
+            param_id: name.into(),
+            param_type: kind,
+        }));
+    }
+
+    fn acknowledge(&mut self, command: u16, result: MavResult, to: Sender) {
+        const COMMAND_ACK: u32 = 77;
+        self.send_raw(COMMAND_ACK, &packet::acknowledgement(command, result, to));
+    }
+}
