@@ -27,8 +27,8 @@ use crate::trace::{Reason, Trace, TracedMarker};
 const LEAST_CONTRAST: u8 = 16;
 /// Bounds, far above what a frame with a marker needs, so that no image takes long.
 const MOST_CONTOUR_POINTS: usize = 2_000_000;
-const MOST_ELLIPSES: usize = 4_000;
-const MOST_PAIRS: usize = 8_000;
+const MOST_ELLIPSES: usize = 20_000;
+const MOST_PAIRS: usize = 40_000;
 const MOST_CANDIDATES: usize = 64;
 const MOST_MARKERS: usize = 8;
 
@@ -105,7 +105,7 @@ impl Rings {
         self.outlines.clear();
         for contour in self.contours.iter() {
             if let Some(ellipse) = ellipse_of(contour.points, contour.hole) {
-                self.outlines.push(Outline { ellipse, black_within: contour.hole });
+                self.outlines.push(Outline { ellipse, black_within: !contour.hole });
             }
             if self.outlines.len() >= MOST_ELLIPSES {
                 break;
@@ -187,8 +187,8 @@ fn nominal_camera(view: GrayView<'_>) -> CameraModel {
     CameraModel::pinhole(width, height, 1.2 * f64::from(width.max(height)))
 }
 
-/// The ellipse that a contour is, on the edge itself (Algorithm 1). Contours run along white pixels, half a
-/// pixel outside of black regions and half a pixel inside of white ones.
+/// The ellipse that a contour is, on the edge itself (Algorithm 1). Contours run along dark pixels, half a pixel
+/// inside of dark regions and half a pixel outside of bright ones.
 fn ellipse_of(points: &[[i32; 2]], hole: bool) -> Option<Ellipse> {
     let area = contour_area(points);
     let length = contour_length(points);
@@ -260,7 +260,10 @@ fn ring_contrast(view: GrayView<'_>, inner: &Ellipse, outer: &Ellipse) -> Option
     let mut count = 0;
     for i in 0..DIRECTIONS {
         let t = f64::from(i) * TAU / f64::from(DIRECTIONS);
-        let (from, to) = (inner.at(t), outer.at(t));
+        // Near-circles have axes in any direction: the place on the inner one is found from the outer one's.
+        let to = outer.at(t);
+        let share = inner.radius_of(to).max(1e-9);
+        let from = [0, 1].map(|axis| inner.centre[axis] + (to[axis] - inner.centre[axis]) / share);
         let at = |place: f64| {
             let between = |axis: usize| from[axis] + (to[axis] - from[axis]) * place;
             bilinear(view, between(0), between(1))
