@@ -1,1 +1,18 @@
 //! Marker detections in, velocity setpoints out.
+//!
+//! The service listens to detectors and to the autopilot, lets the lander decide, and tells the autopilot. It stands
+//! between three crates that do not know each other: `messages` (what detectors say), `landing` (what to do) and
+//! `autopilot` (how to ask for it).
+//!
+//! Modules in reading order: [`config`] is what it is told, [`service`] joins network and link to the [`flight`],
+//! which takes everything in and tells the lander; [`selection`] chooses the detector; [`wire`] turns messages into
+//! the lander's types and back.
+
+pub mod config;
+pub mod flight;
+pub mod selection;
+pub mod service;
+pub mod wire;
+
+pub use config::Config;
+pub use service::run;

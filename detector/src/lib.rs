@@ -1,1 +1,15 @@
 //! Frames in, marker detections out.
+//!
+//! The service takes the newest frame of its camera, searches it for its markers and publishes what it found, with
+//! the frame's header unchanged; also when it found nothing. It knows nothing of the vehicle and of control, and it
+//! runs as well on the drone as on the ground.
+//!
+//! Modules in reading order: [`config`] is what it is told, [`service`] joins the network to the image work, and
+//! [`wire`] turns the algorithm's types into messages and back.
+
+pub mod config;
+pub mod service;
+pub mod wire;
+
+pub use config::Config;
+pub use service::run;

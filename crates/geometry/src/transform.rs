@@ -143,6 +143,11 @@ impl<To: Frame, From: Frame> Rotation<To, From> {
         Self::from_quaternion(UnitQuaternion::from_euler_angles(roll, pitch, yaw))
     }
 
+    /// From a rotation vector: its direction is the axis, its length the angle in radians.
+    pub fn from_rotation_vector(vector: Vector<From>) -> Self {
+        Self::from_quaternion(UnitQuaternion::from_scaled_axis(vector.coords))
+    }
+
     /// Aerospace Euler angles (roll, pitch, yaw) in radians.
     pub fn euler(&self) -> (f64, f64, f64) {
         self.quaternion.euler_angles()

@@ -56,7 +56,7 @@ pub struct FrameSubscriber {
 }
 
 impl Node {
-    /// A publisher of frames of at most `largest_frame_bytes`.
+    /// A publisher of frames of at most `largest_frame_bytes`; with 0 it has no shared memory of its own.
     ///
     /// # Errors
     /// When the session is closed or a name makes no key.
@@ -76,6 +76,9 @@ impl Node {
             .congestion_control(CongestionControl::BlockFirst)
             .await
             .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
+        if largest_frame_bytes == 0 {
+            return Ok(FramePublisher { publisher, pool: None, health: self.shared_health() });
+        }
         let pool_bytes = FRAMES_IN_POOL * largest_frame_bytes.next_multiple_of(4096) + 4096;
         let pool = match ShmProviderBuilder::default_backend(pool_bytes).wait() {
             Ok(pool) => Some(pool),

@@ -16,6 +16,14 @@ use crate::health::HealthCounters;
 /// The configuration for one machine, used unless another is named.
 pub const LOCAL_CONFIG: &str = include_str!("../../../zenoh-config/local.json5");
 
+/// The port at which the processes of one machine meet, by [`LOCAL_CONFIG`].
+pub const LOCAL_PORT: u16 = 7447;
+
+/// [`LOCAL_CONFIG`] with another meeting point.
+pub fn local_config(port: u16) -> String {
+    LOCAL_CONFIG.replace(&format!(":{LOCAL_PORT}"), &format!(":{port}"))
+}
+
 /// How long a question about presence may take.
 const PRESENCE_TIMEOUT: Duration = Duration::from_millis(500);
 

@@ -13,9 +13,7 @@ const PATIENCE: Duration = Duration::from_secs(20);
 
 /// The local configuration with another meeting point.
 fn local(port: u16) -> ZenohSource {
-    let text = include_str!("../../../zenoh-config/local.json5");
-    assert!(text.contains(":7447"));
-    ZenohSource::Text(text.replace(":7447", &format!(":{port}")))
+    ZenohSource::Text(node::session::local_config(port))
 }
 
 fn free_port() -> anyhow::Result<u16> {

@@ -1,0 +1,171 @@
+//! The controller's configuration.
+
+use autopilot::Address;
+use landing::{EnvelopeConfig, Guidance, MetricConfig, PhaseConfig, TargetConfig, ThesisConfig};
+use node::{Check, Settings};
+use serde::Deserialize;
+
+/// The keys of `controller.toml`; meanings, units and ranges are told there.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Name of this controller.
+    pub id: String,
+    /// When the landing begins.
+    pub start: Start,
+    /// Height of the take-off in metres.
+    pub takeoff_height_m: f64,
+    /// Which guidance is used.
+    pub guidance: GuidanceName,
+    /// The marker to land on.
+    pub marker: String,
+    /// The link to the autopilot.
+    pub autopilot: AutopilotSettings,
+    /// The choice of the detector.
+    pub detectors: DetectorSettings,
+    /// How detections become a target.
+    pub target: TargetConfig,
+    /// What no setpoint exceeds.
+    pub envelope: EnvelopeConfig,
+    /// When the phases end.
+    pub phases: PhaseConfig,
+    /// Our guidance.
+    pub metric: MetricConfig,
+    /// The thesis' guidance.
+    pub thesis: ThesisConfig,
+}
+
+/// When the landing begins.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Start {
+    /// When the operator says so.
+    Command,
+    /// As soon as the vehicle is seen flying in GUIDED.
+    Airborne,
+    /// After a take-off.
+    Takeoff,
+}
+
+/// Which guidance is used.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum GuidanceName {
+    /// Our own.
+    Metric,
+    /// The thesis'.
+    Thesis,
+}
+
+/// The link to the autopilot.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AutopilotSettings {
+    /// Where it is.
+    pub address: String,
+    /// The vehicle's system number, or 0.
+    pub system_id: u8,
+    /// Our own component number.
+    pub component_id: u8,
+    /// How often attitude and position are asked for, in Hz.
+    pub state_rate_hz: f64,
+    /// How often setpoints are sent, in Hz.
+    pub setpoint_rate_hz: f64,
+}
+
+/// The choice of the detector.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DetectorSettings {
+    /// The detector to use while it is healthy, or nothing.
+    pub preferred: String,
+    /// The age of its last frame, in seconds, up to which a detector is healthy.
+    pub max_age_s: f64,
+}
+
+impl Settings for Config {
+    const DEFAULTS: &'static str = include_str!("../controller.toml");
+
+    fn check(&self, check: &mut Check<'_>) {
+        check.name("id", &self.id);
+        check.range("takeoff_height_m", self.takeoff_height_m, 1.0..=100.0);
+        check.parses("autopilot.address", self.autopilot.address.parse::<Address>());
+        check.range("autopilot.component_id", self.autopilot.component_id, 1..=255);
+        check.range("autopilot.state_rate_hz", self.autopilot.state_rate_hz, 10.0..=200.0);
+        check.range("autopilot.setpoint_rate_hz", self.autopilot.setpoint_rate_hz, 5.0..=100.0);
+        if !self.detectors.preferred.is_empty() {
+            check.name("detectors.preferred", &self.detectors.preferred);
+        }
+        check.range("detectors.max_age_s", self.detectors.max_age_s, 0.05..=5.0);
+        // Both guidances are checked, used or not: a wrong number should not wait for the day it is used.
+        for guidance in [Guidance::Metric(self.metric), Guidance::Thesis(self.thesis)] {
+            if let Err(problem) = self.landing(guidance).validate() {
+                let (key, min, max) = (problem.key, problem.min, problem.max);
+                check.range(key, problem.value, min..=max);
+            }
+        }
+    }
+}
+
+impl Config {
+    /// The lander's settings.
+    pub fn lander(&self) -> landing::Config {
+        self.landing(match self.guidance {
+            GuidanceName::Metric => Guidance::Metric(self.metric),
+            GuidanceName::Thesis => Guidance::Thesis(self.thesis),
+        })
+    }
+
+    fn landing(&self, guidance: Guidance) -> landing::Config {
+        landing::Config {
+            guidance,
+            target: self.target,
+            envelope: self.envelope,
+            phases: self.phases,
+        }
+    }
+}
+
+impl GuidanceName {
+    /// Its name in the configuration.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Metric => "metric",
+            Self::Thesis => "thesis",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use node::Layers;
+
+    fn load(set: &[&str]) -> Result<Config, String> {
+        let set = set.iter().map(|s| (*s).to_owned()).collect();
+        let layers = Layers { file: None, set };
+        layers.load::<Config>().map(|c| c.settings).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn the_shipped_defaults_are_the_landers() {
+        let metric = load(&[]).unwrap();
+        assert_eq!(metric.lander(), landing::Config::default());
+        assert_eq!(metric.thesis, ThesisConfig::default());
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused_with_their_limits() {
+        let check = |set: &str, parts: &[&str]| {
+            let problem = load(&[set]).unwrap_err();
+            for part in parts {
+                assert!(problem.contains(part), "`{part}` is not in: {problem}");
+            }
+        };
+        check("phases.hold_timeout_s=0", &["phases.hold_timeout_s", "from 1 to 600"]);
+        check("thesis.kp=5", &["`thesis.kp` = 5", "from 0 to 0.1"]);
+        check("autopilot.address=usb", &["autopilot.address", "usb"]);
+        check("guidance=magic", &["magic", "metric"]);
+        check("metric.gain=1", &["no key `metric.gain`"]);
+    }
+}

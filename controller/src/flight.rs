@@ -1,0 +1,508 @@
+//! One vehicle's flight: everything that is heard goes in, everything that is to be said comes out.
+//!
+//! No network and no waiting here: the service feeds packets, detections, commands and the time, and sends what
+//! [`Flight::poll_outgoing`] returns.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use autopilot::{
+    Autopilot, Command, Event, FlightMode, Frame, Takeoff, TakeoffError, TakeoffProgress,
+};
+use geometry::Vector;
+use landing::{Action, Decision, Event as LanderEvent, Lander, OperatorCommand, Phase, Timestamp};
+use messages::{
+    CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, Setpoint,
+    TargetEstimate,
+};
+use node::{HealthCounters, clock_name};
+
+use crate::config::{Config, Start};
+use crate::selection::Selection;
+use crate::wire;
+
+/// The latency that matters, as health and status name it.
+const STAMP_TO_SETPOINT: &str = "stamp to setpoint";
+/// Cameras whose calibration is kept; more are a mistake in the network.
+const MOST_CAMERAS: usize = 16;
+
+/// A flight.
+pub struct Flight {
+    config: Config,
+    autopilot: Autopilot,
+    lander: Lander,
+    mission: Mission,
+    selection: Selection,
+    cameras: BTreeMap<String, CameraInfo>,
+    decision: Option<Decision>,
+    setpoint: Option<Setpoint>,
+    setpoint_ns: i64,
+    used_stamp_ns: Option<i64>,
+    detections_used: u64,
+    started_ns: Option<i64>,
+    disarmed_ns: Option<i64>,
+    rejected: Option<String>,
+    health: Arc<HealthCounters>,
+}
+
+/// What comes before and after the landing.
+enum Mission {
+    /// Until the operator says so.
+    AwaitsCommand,
+    /// Until the vehicle flies in GUIDED.
+    AwaitsAir,
+    /// From the ground into the air.
+    TakesOff { takeoff: Takeoff, why: String },
+    /// The lander decides.
+    Lands,
+    /// Nothing more happens without a command.
+    Failed { why: String },
+}
+
+impl Flight {
+    /// A flight that has not begun.
+    ///
+    /// # Errors
+    /// When the lander refuses its settings.
+    pub fn new(config: Config, health: Arc<HealthCounters>) -> anyhow::Result<Self> {
+        let mission = match config.start {
+            Start::Command => Mission::AwaitsCommand,
+            Start::Airborne => Mission::AwaitsAir,
+            Start::Takeoff => Mission::TakesOff {
+                takeoff: Takeoff::new(config.takeoff_height_m),
+                why: "waiting for the autopilot".to_owned(),
+            },
+        };
+        let settings = &config.autopilot;
+        let autopilot = Autopilot::new(autopilot::Config {
+            system_id: Some(settings.system_id).filter(|id| *id != 0),
+            our_component: settings.component_id,
+            streams: autopilot::client::default_streams(settings.state_rate_hz),
+            ..autopilot::Config::default()
+        });
+        let preferred = Some(config.detectors.preferred.clone()).filter(|name| !name.is_empty());
+        Ok(Self {
+            autopilot,
+            lander: Lander::new(config.lander())?,
+            mission,
+            selection: Selection::new(config.detectors.max_age_s, preferred),
+            cameras: BTreeMap::new(),
+            decision: None,
+            setpoint: None,
+            setpoint_ns: i64::MIN,
+            used_stamp_ns: None,
+            detections_used: 0,
+            started_ns: None,
+            disarmed_ns: None,
+            rejected: None,
+            health,
+            config,
+        })
+    }
+
+    /// Takes a packet from the autopilot's link.
+    pub fn packet(&mut self, now_ns: i64, frame: &Frame) {
+        self.autopilot.handle(now_ns, frame);
+        self.take_autopilot_events(now_ns);
+    }
+
+    /// Lets time pass; to be called 20 times a second or more.
+    pub fn tick(&mut self, now_ns: i64) {
+        self.autopilot.tick(now_ns);
+        self.take_autopilot_events(now_ns);
+        self.selection.tick(now_ns);
+        self.advance_mission(now_ns);
+        self.decide(now_ns, LanderEvent::Tick);
+    }
+
+    /// Takes what a detector found.
+    pub fn detections(&mut self, now_ns: i64, message: &Detections) {
+        self.health.count("detections");
+        let header = &message.header;
+        if header.clock != clock_name() {
+            self.reject("another-clock");
+            return;
+        }
+        let mount = self.cameras.get(&header.camera).and_then(wire::body_from_camera);
+        let marker = wire::wanted(message, &self.config.marker)
+            .map(|detection| wire::marker_in_frame(detection, mount));
+        let distance_m = marker.as_ref().and_then(|marker| self.disagreement_m(marker));
+        if !self.selection.heard(now_ns, &message.detector, header.stamp_ns, distance_m) {
+            return;
+        }
+        let frame = landing::Frame {
+            stamp: Timestamp::from_nanos(header.stamp_ns),
+            detector: 0,
+            image_size: (header.width, header.height),
+            marker,
+        };
+        let sent_before = self.setpoint_ns;
+        self.decide(now_ns, LanderEvent::Frame(frame));
+        let rejection = self.decision.and_then(|decision| decision.rejected);
+        self.rejected = None;
+        match rejection {
+            Some(rejection) => self.reject(rejection.name()),
+            None if marker.is_some() => {
+                self.detections_used += u64::from(self.is_landing());
+                self.used_stamp_ns = Some(header.stamp_ns);
+                if self.setpoint_ns != sent_before {
+                    let age_ns = now_ns.saturating_sub(header.stamp_ns).max(0);
+                    self.health
+                        .latency(STAMP_TO_SETPOINT, Duration::from_nanos(age_ns.unsigned_abs()));
+                }
+            }
+            None => {}
+        }
+    }
+
+    /// Takes a camera's calibration and mount.
+    pub fn camera(&mut self, info: CameraInfo) {
+        if self.cameras.len() < MOST_CAMERAS || self.cameras.contains_key(&info.camera) {
+            self.cameras.insert(info.camera.clone(), info);
+        }
+    }
+
+    /// A detector came or went.
+    pub fn presence(&mut self, now_ns: i64, detector: &str, alive: bool) {
+        self.selection.presence(now_ns, detector, alive);
+    }
+
+    /// Does what the operator asks for, or says why not.
+    pub fn command(&mut self, now_ns: i64, command: &ControllerCommand) -> CommandReply {
+        let result = match command {
+            ControllerCommand::Start => self.start(now_ns),
+            ControllerCommand::Hold => self.operator(now_ns, OperatorCommand::Hold),
+            ControllerCommand::Resume => self.operator(now_ns, OperatorCommand::Resume),
+            ControllerCommand::Abort => self.operator(now_ns, OperatorCommand::Abort),
+            ControllerCommand::UseDetector(name) => self
+                .selection
+                .prefer(now_ns, name)
+                .map(|()| format!("detector `{name}` is used while it is healthy")),
+            ControllerCommand::SetParameter { key, .. } => Err(format!(
+                "`{key}` cannot be changed while the controller runs; start it with --set {key}=VALUE"
+            )),
+        };
+        match result {
+            Ok(reason) => CommandReply { accepted: true, reason },
+            Err(reason) => CommandReply { accepted: false, reason },
+        }
+    }
+
+    /// Stops the vehicle where it is, as the last thing that is said: silence would stop it only after 3 s.
+    pub fn leave(&mut self, now_ns: i64) {
+        if self.is_landing() && self.setpoint.is_some() {
+            self.send_velocity(now_ns, Vector::zero(), 0.0);
+        }
+    }
+
+    /// The next packet for the autopilot.
+    pub fn poll_outgoing(&mut self) -> Option<Vec<u8>> {
+        self.autopilot.poll_outgoing()
+    }
+
+    /// The vehicle, once attitude and position are known.
+    pub fn vehicle(&self) -> Option<messages::VehicleState> {
+        wire::vehicle_message(self.autopilot.state()?)
+    }
+
+    /// The estimate of the landing point.
+    pub fn target(&self, now_ns: i64) -> TargetEstimate {
+        let target = self.decision.and_then(|decision| decision.target);
+        TargetEstimate {
+            stamp_ns: now_ns,
+            position_ned_m: target.map(|t| t.position.coords.into()),
+            lateral_error_m: target.map(|t| t.lateral_error_m),
+            height_m: target.map(|t| t.height_m),
+            age_ms: self.detection_age_ms(now_ns),
+            rejected: self.rejected.clone(),
+        }
+    }
+
+    /// What is being done, and why.
+    pub fn status(&self, now_ns: i64) -> ControllerStatus {
+        let target = self.decision.and_then(|decision| decision.target);
+        let above_origin_m =
+            self.autopilot.state().and_then(|s| s.position).map(|p| -p.position.z());
+        let (phase, why) = self.phase();
+        ControllerStatus {
+            stamp_ns: now_ns,
+            phase: phase.to_owned(),
+            why,
+            guidance: self.config.guidance.name().to_owned(),
+            autopilot: self.link_in_words(),
+            active_detector: self.selection.active().map(str::to_owned),
+            candidates: self.selection.candidates(now_ns),
+            detection_age_ms: self.detection_age_ms(now_ns),
+            height_m: target.map(|t| t.height_m).or(above_origin_m),
+            lateral_error_m: target.map(|t| t.lateral_error_m),
+            setpoint: self.setpoint,
+            started_ns: self.started_ns,
+            disarmed_ns: self.disarmed_ns,
+            finished: self.is_finished(),
+            detections_used: self.detections_used,
+            latency_ms: self.health.percentiles(STAMP_TO_SETPOINT),
+        }
+    }
+
+    fn phase(&self) -> (&'static str, String) {
+        match &self.mission {
+            Mission::AwaitsCommand => ("idle", "waiting for the start of a landing".to_owned()),
+            Mission::AwaitsAir => ("idle", "waiting for the vehicle to fly in GUIDED".to_owned()),
+            Mission::TakesOff { why, .. } => ("takeoff", why.clone()),
+            Mission::Failed { why } => ("failed", why.clone()),
+            Mission::Lands => {
+                let why = self.decision.map_or_else(String::new, |d| d.why.to_string());
+                (self.lander.phase().name(), why)
+            }
+        }
+    }
+
+    fn is_finished(&self) -> bool {
+        let silent = self.decision.is_none_or(|decision| decision.action == Action::None);
+        match self.mission {
+            Mission::Failed { .. } => true,
+            Mission::Lands => self.lander.phase().is_terminal() && silent,
+            Mission::AwaitsCommand | Mission::AwaitsAir | Mission::TakesOff { .. } => false,
+        }
+    }
+
+    fn is_landing(&self) -> bool {
+        matches!(self.mission, Mission::Lands) && !self.lander.phase().is_terminal()
+    }
+
+    fn link_in_words(&self) -> String {
+        match (self.autopilot.system(), self.autopilot.is_connected()) {
+            (Some(system), true) => {
+                let mode = self.autopilot.state().map(|state| state.mode);
+                let mode = mode.map_or_else(String::new, |mode| format!(" in {mode}"));
+                format!("system {system}{mode}")
+            }
+            (Some(system), false) => format!("system {system} is silent"),
+            (None, _) => "not heard yet".to_owned(),
+        }
+    }
+
+    fn detection_age_ms(&self, now_ns: i64) -> Option<f64> {
+        self.used_stamp_ns.map(|stamp| now_ns.saturating_sub(stamp) as f64 * 1e-6)
+    }
+
+    fn reject(&mut self, reason: &str) {
+        self.health.dropped(&format!("detection: {reason}"));
+        self.rejected = Some(reason.to_owned());
+    }
+
+    /// How far a detection's marker is from the estimate, horizontally, taken at the vehicle's present place.
+    fn disagreement_m(&self, marker: &landing::MarkerInFrame) -> Option<f64> {
+        let target = self.decision.and_then(|decision| decision.target)?;
+        let vehicle = wire::vehicle(self.autopilot.state()?)?;
+        let offset = marker.body_from_marker?.origin() - geometry::Point::origin();
+        let seen = vehicle.position + vehicle.ned_from_body * offset;
+        Some((seen - target.position).horizontal_norm())
+    }
+
+    fn start(&mut self, now_ns: i64) -> Result<String, String> {
+        if self.is_landing() {
+            return Err(format!("a landing is under way, in phase `{}`", self.lander.phase()));
+        }
+        if self.autopilot.state().and_then(wire::vehicle).is_none() {
+            return Err("attitude and position of the vehicle are not known".to_owned());
+        }
+        self.begin(now_ns);
+        let why = self.decision.map_or_else(String::new, |d| d.why.to_string());
+        match self.lander.phase() {
+            Phase::Idle | Phase::PilotInCommand | Phase::Aborted => {
+                self.mission = Mission::AwaitsCommand;
+                self.started_ns = None;
+                Err(format!("no landing was started: {why}"))
+            }
+            phase => Ok(format!("in phase `{phase}`: {why}")),
+        }
+    }
+
+    fn operator(&mut self, now_ns: i64, command: OperatorCommand) -> Result<String, String> {
+        if let Mission::TakesOff { .. } = self.mission {
+            if command == OperatorCommand::Resume {
+                return Err("the vehicle is taking off; there is nothing to resume".to_owned());
+            }
+            let why =
+                "broken off by the operator; the autopilot ends the take-off by itself".to_owned();
+            self.mission = Mission::Failed { why: why.clone() };
+            return Ok(why);
+        }
+        let before = self.lander.phase();
+        if !self.is_landing() {
+            return Err(format!("no landing is under way (phase `{}`)", self.phase().0));
+        }
+        self.decide(now_ns, LanderEvent::Operator(command));
+        let why = self.decision.map_or_else(String::new, |d| d.why.to_string());
+        let after = self.lander.phase();
+        if before == after {
+            return Err(format!("it changes nothing in phase `{after}`: {why}"));
+        }
+        Ok(format!("in phase `{after}`: {why}"))
+    }
+
+    fn begin(&mut self, now_ns: i64) {
+        self.mission = Mission::Lands;
+        self.started_ns = Some(now_ns);
+        self.disarmed_ns = None;
+        self.decide(now_ns, LanderEvent::Operator(OperatorCommand::Start));
+    }
+
+    fn advance_mission(&mut self, now_ns: i64) {
+        match &mut self.mission {
+            Mission::AwaitsAir => {
+                let flies = self.autopilot.state().is_some_and(|state| {
+                    state.armed && state.mode == FlightMode::Guided && state.landed.is_flying()
+                });
+                let lands = self.autopilot.state().is_some_and(|state| {
+                    state.armed && state.mode == FlightMode::Land && state.landed.is_flying()
+                });
+                if flies || lands {
+                    self.begin(now_ns);
+                }
+            }
+            Mission::TakesOff { takeoff, why } => {
+                match takeoff.step(now_ns, &mut self.autopilot) {
+                    TakeoffProgress::Done => self.begin(now_ns),
+                    // LAND may be the end of the landing that an earlier controller began.
+                    TakeoffProgress::Failed(TakeoffError::PilotInCommand {
+                        mode: FlightMode::Land,
+                        ..
+                    }) => self.begin(now_ns),
+                    TakeoffProgress::Failed(problem) => {
+                        tracing::error!(%problem, "No take-off");
+                        self.mission = Mission::Failed { why: problem.to_string() };
+                    }
+                    progress => {
+                        let now_why = progress.to_string();
+                        if *why != now_why {
+                            *why = now_why;
+                        }
+                    }
+                }
+            }
+            Mission::AwaitsCommand | Mission::Lands | Mission::Failed { .. } => {}
+        }
+    }
+
+    fn take_autopilot_events(&mut self, now_ns: i64) {
+        while let Some(event) = self.autopilot.poll_event() {
+            match event {
+                Event::State(state) => {
+                    if let Some(vehicle) = wire::vehicle(&state) {
+                        self.decide(now_ns, LanderEvent::Vehicle(vehicle));
+                    }
+                }
+                Event::ArmedChanged(armed) => {
+                    if !armed && self.started_ns.is_some() {
+                        self.disarmed_ns = self.disarmed_ns.or(Some(now_ns));
+                    }
+                    tracing::info!(armed, "Motors");
+                }
+                Event::Restarted => {
+                    let why = "the autopilot restarted in flight".to_owned();
+                    tracing::error!("The autopilot restarted");
+                    if self.started_ns.is_some() {
+                        self.mission = Mission::Failed { why };
+                    }
+                }
+                Event::Attitude(_) | Event::Position(_) | Event::Range(_) => {}
+                other => self.log(other),
+            }
+        }
+    }
+
+    fn log(&self, event: Event) {
+        match event {
+            Event::Found { system, firmware } => {
+                tracing::info!(system, %firmware, "Autopilot found");
+            }
+            Event::OtherVehicle { system } => {
+                tracing::warn!(
+                    system,
+                    "Another vehicle is on the link and is ignored; pin ours with autopilot.system_id"
+                );
+            }
+            Event::Lost { silence } => tracing::error!(?silence, "The autopilot is silent"),
+            Event::Returned => tracing::info!("The autopilot is heard again"),
+            Event::ModeChanged { from, to } => tracing::info!(?from, %to, "Flight mode"),
+            Event::LandedChanged { from, to } => {
+                tracing::info!(%from, %to, "Contact with the ground")
+            }
+            Event::ReadyChanged { ready, reasons } => tracing::info!(ready, ?reasons, "Readiness"),
+            Event::Text { severity, text } => tracing::info!(?severity, text, "Autopilot"),
+            Event::Command { command, result, .. } => match result {
+                Ok(()) => tracing::info!(%command, "Done"),
+                Err(problem) => {
+                    self.health.failed("commands");
+                    tracing::warn!(%problem, "A command was not carried out");
+                }
+            },
+            Event::StreamMissing { message, wanted_hz, measured_hz } => {
+                self.health.failed("missing messages");
+                tracing::warn!(
+                    message,
+                    wanted_hz,
+                    measured_hz,
+                    "A message of the autopilot does not come as asked"
+                );
+            }
+            Event::StreamRestored { message, measured_hz } => {
+                tracing::info!(message, measured_hz, "A message of the autopilot comes again");
+            }
+            Event::State(_)
+            | Event::ArmedChanged(_)
+            | Event::Restarted
+            | Event::Attitude(_)
+            | Event::Position(_)
+            | Event::Range(_) => {}
+        }
+    }
+
+    fn decide(&mut self, now_ns: i64, event: LanderEvent) {
+        let before = self.lander.phase();
+        let decision = self.lander.step(Timestamp::from_nanos(now_ns), event);
+        if decision.phase != before {
+            tracing::info!(from = %before, to = %decision.phase, why = %decision.why, "Phase");
+        }
+        self.decision = Some(decision);
+        if !matches!(self.mission, Mission::Lands) {
+            return;
+        }
+        match decision.action {
+            Action::None => self.setpoint = None,
+            Action::Land => {
+                self.autopilot.request(now_ns, Command::SetMode(FlightMode::Land));
+                // Sent at once: at half a metre every tick counts.
+                self.autopilot.tick(now_ns);
+            }
+            Action::Velocity { velocity, yaw_rate } => {
+                let period_ns = (1e9 / self.config.autopilot.setpoint_rate_hz) as i64;
+                let is_frame = matches!(event, LanderEvent::Frame(_));
+                if is_frame || now_ns.saturating_sub(self.setpoint_ns) >= period_ns {
+                    self.send_velocity(now_ns, velocity, yaw_rate);
+                }
+            }
+        }
+    }
+
+    fn send_velocity(&mut self, now_ns: i64, velocity: Vector<geometry::Ned>, yaw_rate: f64) {
+        match self.autopilot.set_velocity(now_ns, velocity, yaw_rate) {
+            Ok(()) => {
+                self.health.count("setpoints");
+                self.setpoint_ns = now_ns;
+                self.setpoint = Some(Setpoint {
+                    velocity_ned_m_s: velocity.coords.into(),
+                    yaw_rate_rad_s: yaw_rate,
+                });
+            }
+            Err(problem) => {
+                if self.health.failed("setpoints") {
+                    tracing::warn!(%problem, "A setpoint was not sent; further ones are counted only");
+                }
+            }
+        }
+    }
+}

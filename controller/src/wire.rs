@@ -1,0 +1,146 @@
+//! Between messages, the autopilot's types and the lander's types.
+
+use autopilot::{FlightMode, VehicleState};
+use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform};
+use landing::{Landed, MarkerInFrame, Mode, Timestamp};
+use messages::{CameraInfo, Detection, Detections, Transform3};
+
+/// A transform as a message tells it; `None` when its numbers make none.
+pub fn transform<To: geometry::Frame, From: geometry::Frame>(
+    wire: &Transform3,
+) -> Option<Transform<To, From>> {
+    let [x, y, z] = wire.translation_m;
+    let origin = Point::new(x, y, z);
+    let rotation = Rotation::from_wxyz(wire.rotation_wxyz)?;
+    origin.is_finite().then(|| Transform::new(rotation, origin))
+}
+
+/// Where a camera is mounted.
+pub fn body_from_camera(info: &CameraInfo) -> Option<Transform<Body, Camera>> {
+    transform(&info.body_from_camera)
+}
+
+/// The best detection of a marker, named `family` or `family:id`, among those in a frame.
+pub fn wanted<'a>(message: &'a Detections, marker: &str) -> Option<&'a Detection> {
+    let (family, id) = match marker.split_once(':') {
+        Some((family, id)) => (family, id.parse().ok()),
+        None => (marker, None),
+    };
+    message.detections.iter().find(|d| d.family == family && (id.is_none() || d.id == id))
+}
+
+/// A detection as the lander sees it.
+pub fn marker_in_frame(
+    detection: &Detection,
+    mount: Option<Transform<Body, Camera>>,
+) -> MarkerInFrame {
+    let camera_from_marker: Option<Transform<Camera, Marker>> =
+        detection.pose.as_ref().and_then(|pose| transform(&pose.camera_from_marker));
+    let body_from_marker = mount.zip(camera_from_marker).map(|(mount, pose)| mount * pose);
+    let [x, y] = detection.centre_px;
+    MarkerInFrame { centre: Pixel::new(x, y), body_from_marker, confidence: detection.confidence }
+}
+
+/// The vehicle as the lander sees it: attitude and position at one moment, that of the newer of the two.
+pub fn vehicle(state: &VehicleState) -> Option<landing::VehicleState> {
+    let (attitude, position) = (state.attitude?, state.position?);
+    let stamp_ns = attitude.stamp_ns.max(position.stamp_ns);
+    let since = |ns: i64| (stamp_ns - ns) as f64 * 1e-9;
+    let turned = Rotation::from_rotation_vector(attitude.rate_in_body * since(attitude.stamp_ns));
+    Some(landing::VehicleState {
+        stamp: Timestamp::from_nanos(stamp_ns),
+        ned_from_body: attitude.ned_from_body * turned,
+        position: position.position + position.velocity * since(position.stamp_ns),
+        velocity: position.velocity,
+        mode: match state.mode {
+            FlightMode::Guided => Mode::Guided,
+            FlightMode::Land => Mode::Land,
+            FlightMode::Other(_) | FlightMode::Px4(_) | FlightMode::Foreign(_) => Mode::Other,
+        },
+        armed: state.armed,
+        landed: match state.landed {
+            autopilot::LandedState::Unknown => Landed::Unknown,
+            autopilot::LandedState::OnGround => Landed::OnGround,
+            autopilot::LandedState::TakingOff => Landed::TakingOff,
+            autopilot::LandedState::InAir => Landed::InAir,
+            autopilot::LandedState::Landing => Landed::Landing,
+        },
+    })
+}
+
+/// The vehicle as it is published.
+pub fn vehicle_message(state: &VehicleState) -> Option<messages::VehicleState> {
+    let seen = vehicle(state)?;
+    let landed = match state.landed {
+        autopilot::LandedState::Unknown => messages::LandedState::Unknown,
+        autopilot::LandedState::OnGround => messages::LandedState::OnGround,
+        autopilot::LandedState::TakingOff => messages::LandedState::TakingOff,
+        autopilot::LandedState::InAir => messages::LandedState::InAir,
+        autopilot::LandedState::Landing => messages::LandedState::Landing,
+    };
+    Some(messages::VehicleState {
+        stamp_ns: seen.stamp.nanos(),
+        ned_from_body_wxyz: seen.ned_from_body.wxyz(),
+        position_ned_m: seen.position.coords.into(),
+        velocity_ned_m_s: seen.velocity.coords.into(),
+        mode: state.mode.to_string(),
+        armed: state.armed,
+        landed,
+        battery: state.battery.remaining.map(|remaining| remaining as f32),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use messages::{FrameHeader, PixelFormat};
+
+    fn detection(family: &str, id: Option<u32>) -> Detection {
+        Detection {
+            family: family.into(),
+            id,
+            centre_px: [1.0, 2.0],
+            corners_px: None,
+            size_px: 3.0,
+            confidence: 1.0,
+            pose: None,
+        }
+    }
+
+    #[test]
+    fn the_wanted_marker_is_found_by_family_and_id() {
+        let header = FrameHeader {
+            camera: "down".into(),
+            sequence: 0,
+            stamp_ns: 0,
+            clock: "c".into(),
+            exposure_ns: 0,
+            width: 1,
+            height: 1,
+            format: PixelFormat::Mono8,
+        };
+        let detections = vec![
+            detection("aruco-4x4-50", Some(3)),
+            detection("aruco-4x4-50", Some(7)),
+            detection("rings", None),
+        ];
+        let message =
+            Detections { detector: "main".into(), header, detections, stages: Vec::new() };
+        let id = |marker: &str| wanted(&message, marker).map(|d| d.id);
+        assert_eq!(id("rings"), Some(None));
+        assert_eq!(id("aruco-4x4-50:7"), Some(Some(7)));
+        assert_eq!(id("aruco-4x4-50"), Some(Some(3)));
+        assert_eq!(id("stag-hd23:0"), None);
+    }
+
+    #[test]
+    fn numbers_that_make_no_transform_make_none() {
+        let good =
+            Transform3 { translation_m: [0.0, 0.0, 1.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
+        assert!(transform::<Body, Camera>(&good).is_some());
+        let nan = Transform3 { translation_m: [f64::NAN, 0.0, 1.0], ..good };
+        assert!(transform::<Body, Camera>(&nan).is_none());
+        let flat = Transform3 { rotation_wxyz: [0.0; 4], ..good };
+        assert!(transform::<Body, Camera>(&flat).is_none());
+    }
+}
