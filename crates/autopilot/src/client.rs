@@ -481,6 +481,9 @@ impl Autopilot {
         let silence_ns = now_ns.saturating_sub(vehicle.heartbeat_ns);
         if vehicle.state.connected && silence_ns > limit_ns {
             vehicle.state.connected = false;
+            // It may have restarted when it returns, so it must show again that it is ready.
+            vehicle.readiness = Readiness::default();
+            vehicle.state.ready = false;
             let silence = Duration::from_nanos(silence_ns.max(0) as u64);
             self.push(Event::Lost { silence });
             self.fail_requests(|command| CommandError::NoAutopilot { command });

@@ -310,7 +310,20 @@ impl Request {
 
     /// The autopilot said something while this was under way.
     pub(crate) fn hear(&mut self, text: &str) {
-        if self.attempts > 0 && self.said.len() < MAX_SAID && !self.said.iter().any(|s| s == text) {
+        let about_arming = is_about_arming(text);
+        if about_arming && self.command != Command::Arm {
+            return;
+        }
+        if about_arming && !self.said.iter().any(|said| is_about_arming(said)) {
+            // It names the reason, so what was said before is about something else.
+            self.said.clear();
+        }
+        let needed = about_arming || !self.said.iter().any(|said| is_about_arming(said));
+        if needed
+            && self.attempts > 0
+            && self.said.len() < MAX_SAID
+            && !self.said.iter().any(|s| s == text)
+        {
             self.said.push(text.to_owned());
         }
     }
@@ -370,6 +383,11 @@ impl Request {
         self.phase = Phase::Sent(now_ns.saturating_add(ns(patience.answer)));
         Step::Send(self.command.message(self.attempts))
     }
+}
+
+/// How ArduPilot begins the reasons why it does not arm.
+fn is_about_arming(text: &str) -> bool {
+    text.starts_with("Arm: ") || text.starts_with("PreArm: ")
 }
 
 /// A duration in the unit of stamps.

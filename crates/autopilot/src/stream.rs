@@ -12,8 +12,10 @@ const ENOUGH: f64 = 0.7;
 const ACK_NS: i64 = SECOND_NS;
 /// How long to leave an autopilot alone that refused.
 const REFUSED_NS: i64 = 30 * SECOND_NS;
-/// Shortest and longest time over which messages are counted; it grows with the number of vain requests.
-const COUNT_NS: (i64, i64) = (2 * SECOND_NS, 10 * SECOND_NS);
+/// The time over which messages are counted, unless they are rare.
+const COUNT_NS: i64 = 2 * SECOND_NS;
+/// Longest pause between vain requests; it grows with their number.
+const MAX_PAUSE_NS: i64 = 10 * SECOND_NS;
 /// A missing message is worth a word after this many requests.
 const VAIN: u32 = 2;
 
@@ -49,7 +51,9 @@ struct Watched {
     name: &'static str,
     /// When to ask; none while messages are being counted.
     ask_at_ns: Option<i64>,
+    /// How often it was asked for in vain, or once, and when last.
     asked: u32,
+    asked_ns: i64,
     count: u32,
     since_ns: i64,
     missing: bool,
@@ -64,6 +68,7 @@ impl Streams {
                     name: message_name(stream.message_id),
                     ask_at_ns: Some(i64::MIN),
                     asked: 0,
+                    asked_ns: 0,
                     count: 0,
                     since_ns: 0,
                     missing: false,
@@ -121,6 +126,7 @@ impl Streams {
             return (notices, None);
         };
         watched.asked = watched.asked.saturating_add(1);
+        watched.asked_ns = now_ns;
         self.asking = Some((index, now_ns.saturating_add(ACK_NS)));
         (notices, Some(request(watched.stream)))
     }
@@ -138,14 +144,11 @@ impl Watched {
             return None;
         }
         let periods_ns = (5.0 / self.stream.rate_hz * SECOND_NS as f64) as i64;
-        let patience_ns = COUNT_NS.0.saturating_mul(self.asked.into());
-        let window_ns = patience_ns.clamp(COUNT_NS.0, COUNT_NS.1).max(periods_ns);
         let elapsed_ns = now_ns.saturating_sub(self.since_ns);
-        if elapsed_ns < window_ns {
+        if elapsed_ns < COUNT_NS.max(periods_ns) {
             return None;
         }
         let measured_hz = f64::from(self.count) / (elapsed_ns as f64 / SECOND_NS as f64);
-        let asked = self.asked;
         self.count_anew(now_ns);
         if measured_hz >= ENOUGH * self.stream.rate_hz {
             self.asked = 1;
@@ -155,8 +158,11 @@ impl Watched {
         if !self.stream.required && measured_hz == 0.0 {
             return None;
         }
-        self.ask_at_ns = Some(now_ns);
-        let news = asked >= VAIN && self.stream.required && !self.missing;
+        let pause_ns = COUNT_NS.saturating_mul(self.asked.into()).min(MAX_PAUSE_NS);
+        if now_ns.saturating_sub(self.asked_ns) >= pause_ns {
+            self.ask_at_ns = Some(now_ns);
+        }
+        let news = self.asked >= VAIN && self.stream.required && !self.missing;
         self.missing |= news;
         let wanted_hz = self.stream.rate_hz;
         news.then_some(Notice::Missing { message: self.name, wanted_hz, measured_hz })

@@ -334,7 +334,7 @@ impl fmt::Display for TakeoffProgress {
             Self::ChangingMode => f.write_str("changing to GUIDED"),
             Self::Arming { refused: None } => f.write_str("arming"),
             Self::Arming { refused: Some(reason) } => write!(f, "arming again: {reason}"),
-            Self::Climbing { height_m } => write!(f, "climbing, {height_m:.0} m"),
+            Self::Climbing { height_m } => write!(f, "climbing, {:.0} m", height_m.max(0.0)),
             Self::Done => f.write_str("flying"),
             Self::Failed(error) => error.fmt(f),
         }

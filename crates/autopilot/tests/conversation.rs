@@ -438,6 +438,28 @@ fn a_refusal_is_told_with_the_autopilots_own_reason() {
 }
 
 #[test]
+fn each_refusal_gets_its_own_reason() {
+    let mut world = World::standing();
+    let arm = world.client.request(world.now, Command::Arm);
+    let takeoff = world.client.request(world.now, Command::Takeoff { height_m: 5.0 });
+    world.fake.refuse = Some((
+        MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+        MavResult::MAV_RESULT_FAILED,
+        "Arm: Accels inconsistent",
+        1,
+    ));
+    world.fake.say("No such mode 99");
+    world.step();
+    world.fake.say("No such mode 99");
+    let said = |error| match error {
+        Err(CommandError::Refused { said, .. }) => said,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(said(world.outcome(arm)), ["Arm: Accels inconsistent"]);
+    assert_eq!(said(world.outcome(takeoff)), ["No such mode 99"]);
+}
+
+#[test]
 fn a_temporary_refusal_is_tried_again() {
     let mut world = World::standing();
     let later = MavResult::MAV_RESULT_TEMPORARILY_REJECTED;
@@ -491,6 +513,7 @@ fn a_lost_heartbeat_is_told_ends_commands_and_returns() {
     world.fake.silent = true;
     world.run(5);
     assert_eq!(world.count(|event| matches!(event, Event::Lost { .. })), 1);
+    assert!(!world.client.state().unwrap().ready, "it may have restarted when it returns");
     let lost = CommandError::NoAutopilot { command: Command::SetMode(FlightMode::Land) };
     assert_eq!(world.outcome(id), Err(lost));
     let velocity = world.client.set_velocity(world.now, Vector::zero(), 0.0);
