@@ -12,8 +12,8 @@ use std::f64::consts::{PI, TAU};
 
 use geometry::{CameraModel, Pixel};
 use imaging::{
-    Contours, Ellipse, GrayImage, GrayView, Limits, LocalThreshold, bilinear, contour_area,
-    contour_length, fit_ellipse,
+    Contours, Ellipse, GrayImage, GrayView, LeastContrast, Limits, LocalThreshold, bilinear,
+    contour_area, contour_length, fit_ellipse,
 };
 
 use crate::circles::{Circles, EdgePoint, project};
@@ -23,8 +23,11 @@ use crate::observation::{MarkerPose, Observation, Stages};
 use crate::ring::{Ring, RingKind};
 use crate::trace::{Reason, Trace, TracedMarker};
 
-/// Differences of fewer grey levels than this are not edges.
-const LEAST_CONTRAST: u8 = 16;
+/// Smaller differences are not edges. Black ink seldom has more than a quarter of white paper's brightness; a thin ring
+/// far away keeps half of that difference.
+const LEAST_CONTRAST: LeastContrast = LeastContrast { levels: 14, percent: 20 };
+/// Outlines that enclose fewer square pixels say nothing about their shape.
+const LEAST_AREA_PX2: f64 = 18.0;
 /// Bounds, far above what a frame with a marker needs, so that no image takes long.
 const MOST_CONTOUR_POINTS: usize = 2_000_000;
 const MOST_ELLIPSES: usize = 20_000;
@@ -192,9 +195,9 @@ fn nominal_camera(view: GrayView<'_>) -> CameraModel {
 fn ellipse_of(points: &[[i32; 2]], hole: bool) -> Option<Ellipse> {
     let area = contour_area(points);
     let length = contour_length(points);
-    // Cheap first: an ellipse three times as long as wide has 0.6 of a circle's area per squared length, and a
+    // Cheap first: an ellipse three times as long as wide has 0.65 of a circle's area per squared length, and a
     // contour along pixels is up to a tenth longer than its curve.
-    if area < 4.0 || 4.0 * PI * area < 0.4 * length * length {
+    if area < LEAST_AREA_PX2 || 4.0 * PI * area < 0.5 * length * length {
         return None;
     }
     let ellipse = fit_ellipse(points.iter().map(|p| p.map(f64::from)))?;
@@ -282,7 +285,7 @@ fn ring_contrast(view: GrayView<'_>, inner: &Ellipse, outer: &Ellipse) -> Option
     steps.sort_by(f64::total_cmp);
     let median = steps.get(count / 2).copied()?;
     let low = steps.get(count / 5).copied()?;
-    (median >= f64::from(LEAST_CONTRAST) / 2.0 && low > 0.25 * median).then_some(median)
+    (median >= f64::from(LEAST_CONTRAST.levels) / 2.0 && low > 0.25 * median).then_some(median)
 }
 
 /// How many of the places at which an edge of the marker should be were looked at, and how many had it.

@@ -13,7 +13,7 @@ use crate::view::GrayView;
 pub struct Contours {
     /// One byte per pixel with a border of one: 0 black, 1 white, [`SEEN`] on a border, [`SEEN_RIGHT`] on a border
     /// with black to the right.
-    labels: Vec<i8>,
+    labels: Vec<u8>,
     points: Vec<[i32; 2]>,
     spans: Vec<Span>,
 }
@@ -43,8 +43,8 @@ pub struct Limits {
     pub most_points: usize,
 }
 
-const SEEN: i8 = 2;
-const SEEN_RIGHT: i8 = -2;
+const SEEN: u8 = 2;
+const SEEN_RIGHT: u8 = 3;
 
 /// The eight neighbours, counter-clockwise as seen in the image, from the one to the right.
 const NEIGHBOURS: [[i32; 2]; 8] =
@@ -66,7 +66,7 @@ impl Contours {
                 let (before, here) = (self.labels[at - 1], self.labels[at]);
                 if before == 0 && here == 1 {
                     self.keep(at, [x as i32 - 1, y as i32], false, stride, limits);
-                } else if here == 0 && before > 0 {
+                } else if here == 0 && matches!(before, 1 | SEEN) {
                     self.keep(at - 1, [x as i32 - 2, y as i32], true, stride, limits);
                 }
                 if self.points.len() >= limits.most_points {
@@ -107,21 +107,27 @@ impl Contours {
         for y in 0..binary.height() {
             let row = &mut self.labels[(y + 1) * stride + 1..];
             for (label, pixel) in row.iter_mut().zip(binary.row(y)) {
-                *label = i8::from(*pixel != 0);
+                *label = u8::from(*pixel != 0);
             }
         }
     }
 
     /// The first column from `x` on whose label differs from its left neighbour's, up to the right border's.
-    fn next_change(&self, row: usize, x: usize, stride: usize) -> Option<usize> {
-        let labels = self.labels.get(row + x - 1..row + stride)?;
-        let first = *labels.first()?;
-        // Most pixels lie in long runs: eight at a time, then one by one.
-        let run = [first; 8];
-        let skipped = labels.chunks_exact(8).take_while(|chunk| **chunk == run).count() * 8;
-        let rest = labels.get(skipped..)?;
-        let step = rest.iter().position(|label| *label != first)?;
-        Some(x - 1 + skipped + step)
+    fn next_change(&self, row: usize, mut x: usize, stride: usize) -> Option<usize> {
+        let labels = self.labels.get(row..row + stride)?;
+        // Eight pairs of neighbours at a time: the first byte that is not 0 in the difference is the change.
+        let word = |from: usize| {
+            let bytes = labels.get(from..from + 8)?;
+            Some(u64::from_le_bytes(bytes.try_into().ok()?))
+        };
+        while let (Some(left), Some(here)) = (word(x - 1), word(x)) {
+            let difference = left ^ here;
+            if difference != 0 {
+                return Some(x + difference.trailing_zeros() as usize / 8);
+            }
+            x += 8;
+        }
+        (x..stride).find(|x| labels[x - 1] != labels[*x])
     }
 
     fn keep(&mut self, at: usize, pixel: [i32; 2], hole: bool, stride: usize, limits: Limits) {

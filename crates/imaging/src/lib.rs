@@ -17,5 +17,5 @@ pub use contour::{Contour, Contours, Limits, contour_area, contour_length};
 pub use ellipse::{Ellipse, fit_ellipse};
 pub use filter::{BilateralRows, bilateral_5x5};
 pub use sample::bilinear;
-pub use threshold::{LocalThreshold, threshold};
+pub use threshold::{LeastContrast, LocalThreshold, threshold};
 pub use view::{GrayImage, GrayView, ViewError};

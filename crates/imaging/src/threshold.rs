@@ -30,6 +30,23 @@ pub struct LocalThreshold {
     row: Vec<u8>,
 }
 
+/// What differences in brightness count as edges.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct LeastContrast {
+    /// At least this many grey levels, which noise does not reach.
+    pub levels: u8,
+    /// At least this share of the brighter side: ink on paper keeps its ratio in any light.
+    pub percent: u8,
+}
+
+impl LeastContrast {
+    fn is_met(self, min: u8, max: u8) -> bool {
+        let difference = u32::from(max.saturating_sub(min));
+        difference >= u32::from(self.levels)
+            && 100 * difference >= u32::from(self.percent) * u32::from(max)
+    }
+}
+
 /// The tiles of one size.
 #[derive(Clone, Debug, Default)]
 struct Level {
@@ -41,14 +58,13 @@ struct Level {
 }
 
 impl LocalThreshold {
-    /// Writes 255 where the pixel is darker than its tile's threshold, else 0. Differences of less than
-    /// `least_contrast` grey levels are not edges.
-    pub fn apply(&mut self, view: GrayView<'_>, least_contrast: u8, out: &mut GrayImage) {
+    /// Writes 255 where the pixel is darker than its tile's threshold, else 0.
+    pub fn apply(&mut self, view: GrayView<'_>, least: LeastContrast, out: &mut GrayImage) {
         let count = self.measure(view);
         for index in (0..count).rev() {
             let (fine, coarse) = self.levels.split_at_mut(index + 1);
             if let Some(level) = fine.last_mut() {
-                level.decide(coarse.first().filter(|_| index + 1 < count), least_contrast);
+                level.decide(coarse.first().filter(|_| index + 1 < count), least);
             }
         }
         self.binarise(view, out);
@@ -127,7 +143,7 @@ impl Level {
         }
     }
 
-    fn decide(&mut self, coarse: Option<&Self>, least_contrast: u8) {
+    fn decide(&mut self, coarse: Option<&Self>, least: LeastContrast) {
         for y in 0..self.height {
             let rows = y.saturating_sub(1)..(y + 2).min(self.height);
             for x in 0..self.width {
@@ -141,7 +157,7 @@ impl Level {
                 }
                 let middle = min + (max.saturating_sub(min)).div_ceil(2);
                 self.thresholds[y * self.width + x] = match coarse {
-                    Some(coarse) if max.saturating_sub(min) < least_contrast => {
+                    Some(coarse) if !least.is_met(min, max) => {
                         coarse.thresholds[y / 2 * coarse.width + x / 2]
                     }
                     _ => middle,
@@ -179,7 +195,7 @@ mod tests {
             .collect();
         let mut out = GrayImage::default();
         let view = GrayView::packed(&data, width, height).unwrap();
-        LocalThreshold::default().apply(view, 16, &mut out);
+        LocalThreshold::default().apply(view, LeastContrast { levels: 16, percent: 20 }, &mut out);
         for cx in [80, 300] {
             // Just inside and just outside of the edges, all along them.
             for t in 30..70 {
@@ -198,7 +214,11 @@ mod tests {
             }
             let mut out = GrayImage::default();
             let view = GrayView::packed(&data, width, height).unwrap();
-            LocalThreshold::default().apply(view, 16, &mut out);
+            LocalThreshold::default().apply(
+                view,
+                LeastContrast { levels: 16, percent: 20 },
+                &mut out,
+            );
             assert_eq!(out.pixels().last(), Some(&0));
             assert_eq!(out.pixels().len(), width * height);
         }
