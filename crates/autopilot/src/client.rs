@@ -96,6 +96,11 @@ pub enum Event {
         /// Its system number.
         system: u8,
     },
+    /// Somebody else speaks in our name, probably a second controller of the same vehicle. Said once.
+    SameAddress {
+        /// Our name.
+        sender: Sender,
+    },
     /// The heartbeat is not heard any more.
     Lost {
         /// For how long.
@@ -184,6 +189,7 @@ pub struct Autopilot {
     sequence: u8,
     heartbeat_due_ns: i64,
     other_vehicle: bool,
+    same_address: bool,
     refused_numbers: u64,
 }
 
@@ -213,6 +219,7 @@ impl Autopilot {
             sequence: 0,
             heartbeat_due_ns: i64::MIN,
             other_vehicle: false,
+            same_address: false,
             refused_numbers: 0,
         }
     }
@@ -220,6 +227,9 @@ impl Autopilot {
     /// Takes a packet that was received at `now_ns`.
     pub fn handle(&mut self, now_ns: i64, frame: &Frame) {
         let Some(message) = &frame.message else { return };
+        if frame.sender == self.our_address() && !std::mem::replace(&mut self.same_address, true) {
+            self.push(Event::SameAddress { sender: frame.sender });
+        }
         if frame.sender.component != AUTOPILOT {
             return;
         }

@@ -70,6 +70,16 @@ pub struct Parser {
     counters: Counters,
 }
 
+impl Counters {
+    pub(crate) fn add(&mut self, more: Self) {
+        self.frames += more.frames;
+        self.bad_bytes += more.bad_bytes;
+        self.bad_checksums += more.bad_checksums;
+        self.unknown_ids += more.unknown_ids;
+        self.undecodable += more.undecodable;
+    }
+}
+
 impl Parser {
     /// A parser that has seen nothing.
     pub fn new() -> Self {
@@ -102,6 +112,11 @@ impl Parser {
     /// What was seen so far.
     pub fn counters(&self) -> Counters {
         self.counters
+    }
+
+    /// What was seen since this was asked last.
+    pub(crate) fn take_counters(&mut self) -> Counters {
+        std::mem::take(&mut self.counters)
     }
 
     fn scan(&mut self, frames: &mut Vec<Frame>, last: bool) {

@@ -20,7 +20,7 @@ use tokio_serial::{SerialPortBuilderExt, SerialStream};
 
 use crate::address::{Address, Endpoint};
 use crate::dialect::{MavAutopilot, MavMessage};
-use crate::frame::{Frame, Parser};
+use crate::frame::{Counters, Frame, Parser};
 
 /// Packets received and not yet read, about 4 s of an autopilot's talk.
 const INCOMING: usize = 1024;
@@ -172,6 +172,11 @@ impl Link {
         self.local
     }
 
+    /// What was received so far, good and bad.
+    pub fn counters(&self) -> Counters {
+        *self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// How many received packets were thrown away because nobody read them in time.
     pub fn dropped(&self) -> u64 {
         self.shared.dropped.load(Ordering::Relaxed)
@@ -204,6 +209,7 @@ struct Shared {
     arrived: Notify,
     connected: AtomicBool,
     dropped: AtomicU64,
+    counters: Mutex<Counters>,
     opened: Instant,
     /// When bytes came last, in milliseconds since the link was opened.
     heard_ms: AtomicU64,
@@ -216,6 +222,7 @@ impl Shared {
             arrived: Notify::new(),
             connected: AtomicBool::new(false),
             dropped: AtomicU64::new(0),
+            counters: Mutex::new(Counters::default()),
             opened: Instant::now(),
             heard_ms: AtomicU64::new(0),
         }
@@ -269,7 +276,8 @@ impl Port {
         self.shared.push(LinkEvent::Disconnected { reason });
     }
 
-    fn received(&self, frames: Vec<Frame>) {
+    fn received(&self, frames: Vec<Frame>, counted: Counters) {
+        self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner).add(counted);
         let received = Instant::now();
         for frame in frames {
             self.shared.push(LinkEvent::Frame { frame: Box::new(frame), received });
@@ -463,7 +471,8 @@ where
                 Ok(count) => {
                     heard = tokio::time::Instant::now();
                     port.shared.hear();
-                    port.received(parser.push(bytes.get(..count).unwrap_or(&[])));
+                    let frames = parser.push(bytes.get(..count).unwrap_or(&[]));
+                    port.received(frames, parser.take_counters());
                 }
                 Err(error) => return format!("reading failed: {error}"),
             },
@@ -476,7 +485,8 @@ where
                 }
             }
             () = sleep_until(heard + PACKET_GAP), if parser.is_waiting() => {
-                port.received(parser.finish());
+                let frames = parser.finish();
+                port.received(frames, parser.take_counters());
             }
             () = sleep_until(heard + patience), if silence.is_some() => {
                 return format!("silent for {} s", patience.as_secs());
@@ -498,11 +508,12 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
             read = socket.recv_from(&mut bytes) => match read {
                 Ok((count, from)) => {
                     let before = peers.chosen;
-                    let frames = peers.take(from, bytes.get(..count).unwrap_or(&[]), Instant::now());
+                    let datagram = bytes.get(..count).unwrap_or(&[]);
+                    let (frames, counted) = peers.take(from, datagram, Instant::now());
                     if let Some(peer) = peers.chosen.filter(|_| peers.chosen != before) {
                         port.connected(peer.to_string());
                     }
-                    port.received(frames);
+                    port.received(frames, counted);
                 }
                 // A datagram of ours found nobody: the other side is not running yet, or not now.
                 Err(error) if is_refusal(&error) => {}
@@ -548,7 +559,7 @@ impl Peers {
     }
 
     /// Takes a datagram and returns its packets if they come from the chosen peer.
-    fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> Vec<Frame> {
+    fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> (Vec<Frame>, Counters) {
         let peer = self.peer(from, now);
         if now.duration_since(peer.heard) > PACKET_GAP {
             // What began so long ago has lost its end.
@@ -556,6 +567,7 @@ impl Peers {
         }
         peer.heard = now;
         let frames = peer.parser.push(bytes);
+        let counted = peer.parser.take_counters();
         let is_autopilot = frames.iter().any(is_autopilot_heartbeat);
         if is_autopilot {
             peer.autopilot = Some(now);
@@ -563,7 +575,7 @@ impl Peers {
         if !frames.is_empty() && self.chosen != Some(from) && self.gives_way(is_autopilot, now) {
             self.chosen = Some(from);
         }
-        if self.chosen == Some(from) { frames } else { Vec::new() }
+        (if self.chosen == Some(from) { frames } else { Vec::new() }, counted)
     }
 
     /// Whether the chosen peer gives way to one that just sent a packet.

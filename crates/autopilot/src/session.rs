@@ -7,7 +7,7 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::address::Address;
 use crate::client::{Autopilot, Config, Event};
-use crate::frame::Frame;
+use crate::frame::{Counters, Frame};
 use crate::link::{Link, LinkError, LinkEvent, LinkSender, SendError};
 
 /// How often time passes for the client when nothing is received.
@@ -109,6 +109,11 @@ impl<Clock: Fn() -> i64> Session<Clock> {
     /// How many packets the link did not take because it was down or too slow.
     pub fn refused(&self) -> u64 {
         self.refused
+    }
+
+    /// What was received so far, good and bad.
+    pub fn counters(&self) -> Counters {
+        self.link.counters()
     }
 
     /// How many received packets were thrown away because nobody read them in time.

@@ -389,6 +389,17 @@ fn other_senders_on_the_link_are_not_the_autopilot() {
 }
 
 #[test]
+fn a_second_controller_in_our_name_is_told_once() {
+    let mut world = World::standing();
+    let companion = Sender { system: 1, component: 191 };
+    for _ in 0..3 {
+        world.hear(companion, &autopilot::compose::heartbeat());
+        world.step();
+    }
+    assert_eq!(world.count(|event| *event == Event::SameAddress { sender: companion }), 1);
+}
+
+#[test]
 fn a_pinned_system_is_waited_for() {
     let config = Config { system_id: Some(7), ..Config::default() };
     let mut world = World::with(Fake::new(), config);

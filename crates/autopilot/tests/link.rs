@@ -210,6 +210,27 @@ async fn a_device_that_is_missing_is_waited_for() {
     assert_eq!(link.send(&time()), Err(SendError::NotConnected));
 }
 
+#[cfg(unix)]
+#[tokio::test]
+async fn a_serial_line_carries_packets_both_ways_and_its_end_is_noticed() {
+    use tokio_serial::SerialPort;
+    let (mut autopilot, end) = tokio_serial::SerialStream::pair().unwrap();
+    let device = end.name().unwrap();
+    let mut link = open(format!("serial:{device}:115200")).await;
+    peer(&mut link).await;
+    autopilot.write_all(b"Init ArduCopter\r\n").await.unwrap();
+    autopilot.write_all(&heartbeat(true)).await.unwrap();
+    assert_eq!(packet(&mut link).await, heartbeat(true));
+    assert_eq!(link.counters().bad_bytes, 17);
+    link.send(&time()).unwrap();
+    let mut bytes = vec![0; time().len()];
+    timeout(PATIENCE, autopilot.read_exact(&mut bytes)).await.unwrap().unwrap();
+    assert_eq!(bytes, time());
+    drop((autopilot, end));
+    let reason = lost(&mut link).await;
+    assert!(reason.contains(&device), "{reason}");
+}
+
 #[tokio::test]
 async fn a_reader_that_sleeps_gets_the_newest_packets() {
     let mut link = open("udpin:127.0.0.1:0".into()).await;
