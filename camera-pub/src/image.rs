@@ -1,0 +1,466 @@
+//! Image files: which ones there are, and their pixels in grey.
+
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use ::image::{DynamicImage, ImageDecoder, ImageReader, Limits};
+use imaging::{GrayImage, GrayView};
+
+/// Pixels an image may have unless another limit is chosen.
+pub const MOST_PIXELS: u64 = 100_000_000;
+
+/// Folders within folders that are entered.
+const DEEPEST_FOLDER: usize = 16;
+
+/// Bytes of a file beyond its pixels: thumbnails, profiles and comments.
+const MOST_EXTRA_BYTES: u64 = 64 << 20;
+
+/// Why an image was not read, and what to do about it.
+#[derive(Debug, thiserror::Error)]
+pub enum ImageError {
+    /// A file or folder that the system does not open.
+    #[error("{path:?} cannot be read: {cause}; check the path and its permissions")]
+    Unreadable {
+        /// The file or folder.
+        path: PathBuf,
+        /// The system's reason.
+        cause: std::io::Error,
+    },
+    /// A pipe, device or folder in the place of a file.
+    #[error("{path:?} is not a file")]
+    NotAFile {
+        /// What it is called.
+        path: PathBuf,
+    },
+    /// A folder without images.
+    #[error("the folder {path:?} holds no images; names of images end in .png, .jpg or .jpeg")]
+    EmptyFolder {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// Bytes that are neither PNG nor JPEG.
+    #[error("{path:?} is neither a PNG nor a JPEG image; convert it to one of them")]
+    Format {
+        /// The file.
+        path: PathBuf,
+    },
+    /// An image larger than the limit.
+    #[error(
+        "{path:?} has {width} x {height} pixels, more than the {most_pixels} that are allowed (or an edge of more \
+         than {edge}); make it smaller or raise the limit",
+        edge = GrayView::LARGEST_EDGE_PX
+    )]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// Its width in pixels.
+        width: u32,
+        /// Its height in pixels.
+        height: u32,
+        /// The limit.
+        most_pixels: u64,
+    },
+    /// A file that is larger than its pixels could be.
+    #[error("{path:?} is {len} bytes long, more than an image of the allowed size can be")]
+    TooLong {
+        /// The file.
+        path: PathBuf,
+        /// Its length in bytes.
+        len: u64,
+    },
+    /// A JPEG file without an end.
+    #[error("{path:?} ends in the middle of the image; copy or record it again")]
+    Cut {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Bytes that cannot be decoded.
+    #[error("{path:?} is damaged or cut short: {cause}; copy or record it again")]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// The decoder's reason.
+        cause: String,
+    },
+}
+
+/// The images that a path names: the file itself, or those in a folder and in the folders in it, in the order of
+/// their names. Whether a file can be read turns out when it is read.
+///
+/// # Errors
+/// [`ImageError`] for a folder that cannot be listed or holds no images.
+pub fn images_in(path: &Path) -> Result<Vec<PathBuf>, ImageError> {
+    if !path.is_dir() {
+        return Ok(vec![path.to_owned()]);
+    }
+    let mut images = Vec::new();
+    collect(path, DEEPEST_FOLDER, &mut images)?;
+    if images.is_empty() {
+        return Err(ImageError::EmptyFolder { path: path.to_owned() });
+    }
+    images.sort_unstable();
+    Ok(images)
+}
+
+fn collect(folder: &Path, depth: usize, images: &mut Vec<PathBuf>) -> Result<(), ImageError> {
+    let unreadable = |cause| ImageError::Unreadable { path: folder.to_owned(), cause };
+    for entry in std::fs::read_dir(folder).map_err(unreadable)? {
+        let entry = entry.map_err(unreadable)?;
+        let path = entry.path();
+        if entry.file_name().as_encoded_bytes().starts_with(b".") {
+            continue;
+        }
+        // A link to a folder is not followed, as it may lead back here.
+        if entry.file_type().map_err(unreadable)?.is_dir() {
+            if depth > 0 {
+                collect(&path, depth - 1, images)?;
+            }
+        } else if is_named_as_image(&path) {
+            images.push(path);
+        }
+    }
+    Ok(())
+}
+
+fn is_named_as_image(path: &Path) -> bool {
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    ["png", "jpg", "jpeg"].iter().any(|known| extension.eq_ignore_ascii_case(known))
+}
+
+/// An image file (PNG or JPEG) in grey, the way up that its Exif data says. Colours are weighted by Rec. 601, 16-bit
+/// values scaled to 8 bits, transparent pixels laid over white.
+///
+/// # Errors
+/// [`ImageError`] when the file cannot be read, is no complete image, or has more than `most_pixels`.
+pub fn read_image(path: &Path, most_pixels: u64) -> Result<GrayImage, ImageError> {
+    let decoded = Decoded::read(path, most_pixels)?;
+    let mut image = GrayImage::filled(decoded.width(), decoded.height(), 0);
+    decoded.write_grey(image.pixels_mut());
+    Ok(image)
+}
+
+/// Width and height of an image file in pixels, from its first bytes alone.
+pub(crate) fn image_size(path: &Path, most_pixels: u64) -> Result<(usize, usize), ImageError> {
+    let bytes = file_bytes(path, most_pixels)?;
+    let mut decoder = decoder(path, &bytes, most_pixels)?;
+    let (width, height) = decoder.dimensions();
+    let turned = decoder.orientation().is_ok_and(turns_sideways);
+    let size = (width as usize, height as usize);
+    Ok(if turned { (size.1, size.0) } else { size })
+}
+
+fn turns_sideways(orientation: ::image::metadata::Orientation) -> bool {
+    use ::image::metadata::Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
+}
+
+/// An image in the form its file has.
+pub(crate) struct Decoded {
+    image: DynamicImage,
+}
+
+impl Decoded {
+    /// Reads and decodes a file.
+    pub(crate) fn read(path: &Path, most_pixels: u64) -> Result<Self, ImageError> {
+        let bytes = file_bytes(path, most_pixels)?;
+        let mut decoder = decoder(path, &bytes, most_pixels)?;
+        // The decoder fills up what is missing of a JPEG with grey, which is no picture of anything.
+        if bytes.starts_with(JPEG_START) && !jpeg_is_complete(&bytes) {
+            return Err(ImageError::Cut { path: path.to_owned() });
+        }
+        let damaged = |cause: ::image::ImageError| ImageError::Damaged {
+            path: path.to_owned(),
+            cause: cause.to_string(),
+        };
+        let orientation = decoder.orientation().map_err(damaged)?;
+        let mut image = DynamicImage::from_decoder(decoder).map_err(damaged)?;
+        image.apply_orientation(orientation);
+        Ok(Self { image })
+    }
+
+    /// Width in pixels.
+    pub(crate) fn width(&self) -> usize {
+        self.image.width() as usize
+    }
+
+    /// Height in pixels.
+    pub(crate) fn height(&self) -> usize {
+        self.image.height() as usize
+    }
+
+    /// Writes the pixels, row by row, into a buffer of width times height bytes.
+    pub(crate) fn write_grey(&self, out: &mut [u8]) {
+        match &self.image {
+            DynamicImage::ImageLuma8(image) => fill(out, image, |[v]| v),
+            DynamicImage::ImageLumaA8(image) => fill(out, image, |[v, a]| over_white(v, a)),
+            DynamicImage::ImageRgb8(image) => fill(out, image, grey),
+            DynamicImage::ImageRgba8(image) => {
+                fill(out, image, |[r, g, b, a]| over_white(grey([r, g, b]), a));
+            }
+            DynamicImage::ImageLuma16(image) => fill(out, image, |[v]| eight_bits(v)),
+            DynamicImage::ImageLumaA16(image) => {
+                fill(out, image, |[v, a]| over_white(eight_bits(v), eight_bits(a)));
+            }
+            DynamicImage::ImageRgb16(image) => fill(out, image, grey_of_16_bits),
+            DynamicImage::ImageRgba16(image) => fill(out, image, |[r, g, b, a]| {
+                over_white(grey_of_16_bits([r, g, b]), eight_bits(a))
+            }),
+            // Neither PNG nor JPEG has other forms.
+            other => fill(out, &other.to_rgb8(), grey),
+        }
+    }
+}
+
+fn fill<T: Copy, const N: usize>(out: &mut [u8], samples: &[T], grey: impl Fn([T; N]) -> u8) {
+    let (pixels, _) = samples.as_chunks::<N>();
+    for (out, pixel) in out.iter_mut().zip(pixels) {
+        *out = grey(*pixel);
+    }
+}
+
+/// Luma of ITU-R BT.601.
+fn luma(rgb: [u32; 3]) -> u32 {
+    let [r, g, b] = rgb;
+    (299 * r + 587 * g + 114 * b + 500) / 1000
+}
+
+fn grey(rgb: [u8; 3]) -> u8 {
+    luma(rgb.map(u32::from)) as u8
+}
+
+fn grey_of_16_bits(rgb: [u16; 3]) -> u8 {
+    eight_bits(luma(rgb.map(u32::from)) as u16)
+}
+
+fn eight_bits(value: u16) -> u8 {
+    ((u32::from(value) * 255 + 32_767) / 65_535) as u8
+}
+
+fn over_white(grey: u8, alpha: u8) -> u8 {
+    let (grey, alpha) = (u32::from(grey), u32::from(alpha));
+    ((grey * alpha + 255 * (255 - alpha) + 127) / 255) as u8
+}
+
+fn file_bytes(path: &Path, most_pixels: u64) -> Result<Vec<u8>, ImageError> {
+    let unreadable = |cause| ImageError::Unreadable { path: path.to_owned(), cause };
+    let metadata = std::fs::metadata(path).map_err(unreadable)?;
+    // Opening a pipe would wait for its writer.
+    if !metadata.is_file() {
+        return Err(ImageError::NotAFile { path: path.to_owned() });
+    }
+    if metadata.len() > most_pixels.saturating_mul(8).saturating_add(MOST_EXTRA_BYTES) {
+        return Err(ImageError::TooLong { path: path.to_owned(), len: metadata.len() });
+    }
+    std::fs::read(path).map_err(unreadable)
+}
+
+/// A decoder of an image whose size was found to be within the limit.
+fn decoder<'a>(
+    path: &Path,
+    bytes: &'a [u8],
+    most_pixels: u64,
+) -> Result<impl ImageDecoder + 'a, ImageError> {
+    let damaged = |cause: &dyn std::fmt::Display| ImageError::Damaged {
+        path: path.to_owned(),
+        cause: cause.to_string(),
+    };
+    let mut reader = ImageReader::new(Cursor::new(bytes))
+        .with_guessed_format()
+        .map_err(|cause| damaged(&cause))?;
+    if reader.format().is_none() {
+        return Err(ImageError::Format { path: path.to_owned() });
+    }
+    reader.no_limits();
+    let mut decoder = reader.into_decoder().map_err(|cause| match cause {
+        ::image::ImageError::Unsupported(_) => ImageError::Format { path: path.to_owned() },
+        cause => damaged(&cause),
+    })?;
+    let (width, height) = decoder.dimensions();
+    let edge = GrayView::LARGEST_EDGE_PX as u64;
+    let pixels = u64::from(width) * u64::from(height);
+    if pixels > most_pixels || u64::from(width.max(height)) > edge {
+        return Err(ImageError::TooLarge { path: path.to_owned(), width, height, most_pixels });
+    }
+    if pixels == 0 {
+        return Err(damaged(&format!("an image of {width} x {height} pixels")));
+    }
+    // Eight bytes a pixel is the widest form there is, and a decoder may need it twice.
+    let mut limits = Limits::no_limits();
+    limits.max_alloc = Some(most_pixels.saturating_mul(16).saturating_add(MOST_EXTRA_BYTES));
+    decoder.set_limits(limits).map_err(|cause| damaged(&cause))?;
+    Ok(decoder)
+}
+
+const JPEG_START: &[u8] = &[0xff, 0xd8];
+
+/// True when the segments of a JPEG file lead to its end marker (ISO/IEC 10918-1, Annex B).
+fn jpeg_is_complete(bytes: &[u8]) -> bool {
+    let mut rest = bytes.get(JPEG_START.len()..).unwrap_or_default();
+    loop {
+        // Between segments, and through the coded data after a scan's header, up to the next marker.
+        let Some(at) = rest.iter().position(|byte| *byte == 0xff) else { return false };
+        let Some(marker) = rest.get(at + 1) else { return false };
+        rest = &rest[at + 1..];
+        match marker {
+            // Fill, stuffed byte, temporary marker, restart: none has a length.
+            0xff | 0x00 | 0x01 | 0xd0..=0xd8 => {}
+            0xd9 => return true,
+            _ => {
+                let &[_, high, low, ..] = rest else { return false };
+                let len = usize::from(u16::from_be_bytes([high, low]));
+                let Some(after) = rest.get(1 + len.max(2)..) else { return false };
+                rest = after;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ::image::{ImageBuffer, ImageFormat, Luma, LumaA, Rgb, Rgba};
+
+    fn bytes_of(image: &DynamicImage, format: ImageFormat) -> Vec<u8> {
+        let mut bytes = Cursor::new(Vec::new());
+        image.write_to(&mut bytes, format).unwrap();
+        bytes.into_inner()
+    }
+
+    fn read_bytes(bytes: &[u8], most_pixels: u64) -> Result<GrayImage, String> {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), bytes).unwrap();
+        read_image(file.path(), most_pixels).map_err(|e| e.to_string())
+    }
+
+    fn photo() -> DynamicImage {
+        ImageBuffer::from_fn(64, 48, |x, y| Rgb([(x * 4) as u8, (y * 5) as u8, (x ^ y) as u8]))
+            .into()
+    }
+
+    #[test]
+    fn every_form_of_png_becomes_grey() {
+        let check = |image: DynamicImage, expected: u8| {
+            let read = read_bytes(&bytes_of(&image, ImageFormat::Png), 100).unwrap();
+            assert_eq!((read.width(), read.height(), read.pixels()), (1, 1, &[expected][..]));
+        };
+        check(ImageBuffer::from_pixel(1, 1, Luma([77_u8])).into(), 77);
+        check(ImageBuffer::from_pixel(1, 1, LumaA([77_u8, 255])).into(), 77);
+        check(ImageBuffer::from_pixel(1, 1, LumaA([0_u8, 0])).into(), 255);
+        // 0.299 * 200 + 0.587 * 100 + 0.114 * 50 = 124.2
+        check(ImageBuffer::from_pixel(1, 1, Rgb([200_u8, 100, 50])).into(), 124);
+        check(ImageBuffer::from_pixel(1, 1, Rgba([200_u8, 100, 50, 255])).into(), 124);
+        check(ImageBuffer::from_pixel(1, 1, Luma([77_u16 * 257])).into(), 77);
+        check(ImageBuffer::from_pixel(1, 1, LumaA([77_u16 * 257, 65_535])).into(), 77);
+        check(ImageBuffer::from_pixel(1, 1, Rgb([65_535_u16, 65_535, 65_535])).into(), 255);
+        check(
+            ImageBuffer::from_pixel(1, 1, Rgba([51_400_u16, 25_700, 12_850, 65_535])).into(),
+            124,
+        );
+    }
+
+    #[test]
+    fn a_jpeg_keeps_its_grey_levels() {
+        let read = read_bytes(&bytes_of(&photo(), ImageFormat::Jpeg), MOST_PIXELS).unwrap();
+        let mut exact = vec![0; 64 * 48];
+        Decoded { image: photo() }.write_grey(&mut exact);
+        let error: u32 =
+            read.pixels().iter().zip(&exact).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
+        assert!(error / (64 * 48) < 6, "{error}");
+    }
+
+    #[test]
+    fn files_that_are_cut_anywhere_are_refused() {
+        for format in [ImageFormat::Png, ImageFormat::Jpeg] {
+            let whole = bytes_of(&photo(), format);
+            assert!(read_bytes(&whole, MOST_PIXELS).is_ok());
+            // A PNG without its 12 last bytes has all its pixels.
+            for len in (0..whole.len() - 12).step_by(7) {
+                assert!(read_bytes(&whole[..len], MOST_PIXELS).is_err(), "{format:?} cut at {len}");
+            }
+        }
+    }
+
+    #[test]
+    fn damaged_files_never_stop_the_reader() {
+        for format in [ImageFormat::Png, ImageFormat::Jpeg] {
+            let whole = bytes_of(&photo(), format);
+            for at in 0..whole.len() {
+                let mut damaged = whole.clone();
+                damaged[at] ^= 0x5a;
+                // Whether it can be read depends on the place; what counts is that there is an answer.
+                drop(read_bytes(&damaged, 100_000));
+            }
+        }
+    }
+
+    #[test]
+    fn an_image_is_measured_before_it_is_decoded() {
+        let problem = |width, height, most| {
+            let image: DynamicImage = ImageBuffer::from_pixel(width, height, Luma([9_u8])).into();
+            read_bytes(&bytes_of(&image, ImageFormat::Png), most).map(|i| i.width())
+        };
+        assert_eq!(problem(65_535, 1, MOST_PIXELS), Ok(65_535));
+        assert!(problem(65_536, 1, MOST_PIXELS).unwrap_err().contains("65536 x 1 pixels"));
+        assert!(problem(11, 10, 100).unwrap_err().contains("more than the 100 that are allowed"));
+        // The header of a PNG of 65535 x 65535 pixels, without pixels.
+        let small = bytes_of(&photo(), ImageFormat::Png);
+        let header = png_of_size(&small, 65_535, 65_535);
+        assert!(read_bytes(&header, MOST_PIXELS).unwrap_err().contains("65535 x 65535"));
+        let nothing = png_of_size(&small, 0, 0);
+        assert!(read_bytes(&nothing, MOST_PIXELS).is_err());
+        // The same of a JPEG, whose size stands in its frame header.
+        let mut jpeg = bytes_of(&photo(), ImageFormat::Jpeg);
+        let at = jpeg.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
+        jpeg[at + 5..at + 9].copy_from_slice(&[0xff; 4]);
+        assert!(read_bytes(&jpeg, MOST_PIXELS).unwrap_err().contains("65535 x 65535"));
+        jpeg[at + 5..at + 9].copy_from_slice(&[0; 4]);
+        assert!(read_bytes(&jpeg, MOST_PIXELS).is_err());
+    }
+
+    /// A PNG with another size in its header, and the checksum to go with it.
+    fn png_of_size(png: &[u8], width: u32, height: u32) -> Vec<u8> {
+        let mut png = png.to_vec();
+        png[16..20].copy_from_slice(&width.to_be_bytes());
+        png[20..24].copy_from_slice(&height.to_be_bytes());
+        let mut crc = u32::MAX;
+        for byte in &png[12..29] {
+            crc ^= u32::from(*byte);
+            for _ in 0..8 {
+                crc = if crc & 1 == 1 { (crc >> 1) ^ 0xedb8_8320 } else { crc >> 1 };
+            }
+        }
+        png[29..33].copy_from_slice(&(!crc).to_be_bytes());
+        png
+    }
+
+    #[test]
+    fn what_is_no_image_is_named() {
+        let problem = |path: &Path| read_image(path, MOST_PIXELS).unwrap_err().to_string();
+        let folder = tempfile::tempdir().unwrap();
+        assert!(problem(Path::new("no/such.png")).contains("no/such.png"));
+        assert!(problem(folder.path()).contains("is not a file"));
+        let text = folder.path().join("notes.png");
+        std::fs::write(&text, "not an image").unwrap();
+        assert!(problem(&text).contains("neither a PNG nor a JPEG"));
+        std::fs::write(&text, "GIF89a").unwrap();
+        assert!(problem(&text).contains("neither a PNG nor a JPEG"), "{}", problem(&text));
+    }
+
+    #[test]
+    fn a_folder_is_listed_by_name_and_to_the_bottom() {
+        let folder = tempfile::tempdir().unwrap();
+        let empty = images_in(folder.path()).unwrap_err().to_string();
+        assert!(empty.contains("holds no images"), "{empty}");
+        std::fs::create_dir(folder.path().join("b")).unwrap();
+        for name in ["c.PNG", "a.jpeg", "b/2.jpg", "b/1.png", ".hidden.png", "notes.txt"] {
+            std::fs::write(folder.path().join(name), []).unwrap();
+        }
+        let names: Vec<_> = images_in(folder.path())
+            .unwrap()
+            .iter()
+            .map(|p| p.strip_prefix(folder.path()).unwrap().display().to_string())
+            .collect();
+        assert_eq!(names, ["a.jpeg", "b/1.png", "b/2.jpg", "c.PNG"]);
+        assert_eq!(images_in(Path::new("any.bin")).unwrap(), [Path::new("any.bin")]);
+    }
+}

@@ -1,0 +1,280 @@
+//! The camera service: images in the order of their names, published as frames at a steady rate.
+
+use std::convert::Infallible;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail, ensure};
+use geometry::{CameraModel, Distortion};
+use jpeg_encoder::{ColorType, Encoder};
+use messages::{CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
+use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
+use tokio::sync::oneshot;
+use tokio::time::{Interval, MissedTickBehavior};
+
+use crate::config::Config;
+use crate::image::{Decoded, image_size, images_in};
+
+/// Images whose size is looked up at the start, to make room for the largest in shared memory. Frames that are larger
+/// than these are published all the same, by a copy.
+const IMAGES_MEASURED: usize = 1000;
+/// A JPEG of a photograph is hardly ever larger than this part of its pixels.
+const JPEG_PART: usize = 4;
+/// How often a service that waits for a subscriber looks for one.
+const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
+
+/// Publishes frames until the images end, the service is asked to stop, or no image can be read.
+///
+/// # Errors
+/// When there is no image to publish, or another camera of this name.
+pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+    node.ensure_alone(config.instance()).await?;
+    let found = {
+        let config = config.clone();
+        tokio::task::spawn_blocking(move || find_images(&config)).await??
+    };
+    let info = camera_info(&config, found.first_size)?;
+    let infos = node.publisher(topic::CAMERA_INFO, &[config.instance()]).await?;
+    infos.publish(&info).await;
+    let stream = Stream::new(&node, &config, found).await?;
+    node.announce().await?;
+    tokio::select! {
+        result = on_own_thread(stream, shutdown) => result,
+        never = republish(&infos, &info) => match never {},
+    }
+}
+
+async fn republish(infos: &Publisher<CameraInfo>, info: &CameraInfo) -> Infallible {
+    let mut second = tokio::time::interval(Duration::from_secs(1));
+    loop {
+        second.tick().await;
+        infos.publish(info).await;
+    }
+}
+
+/// Runs the stream where its decoding holds up nobody else.
+async fn on_own_thread(mut stream: Stream, shutdown: Shutdown) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Handle::current();
+    let (mut done, ended) = oneshot::channel();
+    let work = move || {
+        let result = runtime.block_on(async {
+            tokio::select! {
+                result = stream.run() => result,
+                () = shutdown.requested() => Ok(()),
+                // The service is gone, and with it whoever waits for the result.
+                () = done.closed() => Ok(()),
+            }
+        });
+        drop(done.send(result));
+    };
+    std::thread::Builder::new()
+        .name("camera".to_owned())
+        .spawn(work)
+        .context("starting the camera's thread")?;
+    ended.await.context("the camera's thread ended without a result")?
+}
+
+/// What there is to publish.
+struct Found {
+    images: Vec<PathBuf>,
+    /// Width and height of the first image that can be read, in pixels.
+    first_size: (usize, usize),
+    /// Pixels of the largest image that was measured.
+    largest: usize,
+}
+
+fn find_images(config: &Config) -> anyhow::Result<Found> {
+    let mut images = Vec::new();
+    ensure!(
+        !config.source.paths.is_empty(),
+        "the camera `{}` has no images to publish; name files or folders in `source.paths`",
+        config.instance()
+    );
+    for path in &config.source.paths {
+        ensure!(path.exists(), "there is no {path:?}, which `source.paths` names");
+        images.extend(images_in(path)?);
+    }
+    let most_pixels = config.most_pixels();
+    let mut first_problem = None;
+    let first_size = images.iter().find_map(|path| match Decoded::read(path, most_pixels) {
+        Ok(image) => Some((image.width(), image.height())),
+        Err(problem) => {
+            first_problem.get_or_insert(problem);
+            None
+        }
+    });
+    let Some(first_size) = first_size else {
+        let problem = first_problem.map_or_else(String::new, |problem| problem.to_string());
+        bail!("none of the {} images can be read; the first one: {problem}", images.len());
+    };
+    let sizes =
+        images.iter().take(IMAGES_MEASURED).filter_map(|path| image_size(path, most_pixels).ok());
+    let largest = sizes.map(|(width, height)| width.saturating_mul(height)).max();
+    Ok(Found { images, first_size, largest: largest.unwrap_or(first_size.0 * first_size.1) })
+}
+
+fn camera_info(config: &Config, size: (usize, usize)) -> anyhow::Result<CameraInfo> {
+    let intrinsics = config.intrinsics(size)?;
+    let (width, height) = (size.0 as u32, size.1 as u32);
+    let shape = intrinsics.unwrap_or_else(|| CameraModel::pinhole(width, height, 1.0));
+    let lens = match shape.distortion {
+        Distortion::None => LensModel::Pinhole,
+        Distortion::BrownConrady(k) => LensModel::BrownConrady(k),
+        Distortion::KannalaBrandt(k) => LensModel::KannalaBrandt(k),
+    };
+    let body_from_camera = config.body_from_camera();
+    let origin = body_from_camera.origin();
+    Ok(CameraInfo {
+        camera: config.instance().to_owned(),
+        width,
+        height,
+        focal_px: intrinsics.map(|camera| [camera.fx, camera.fy]),
+        principal_px: [shape.cx, shape.cy],
+        lens,
+        body_from_camera: Transform3 {
+            translation_m: [origin.x(), origin.y(), origin.z()],
+            rotation_wxyz: body_from_camera.rotation().wxyz(),
+        },
+    })
+}
+
+/// Reads images and publishes them.
+struct Stream {
+    config: Config,
+    images: Vec<PathBuf>,
+    first_size: (usize, usize),
+    frames: FramePublisher,
+    jpegs: FramePublisher,
+    health: Arc<HealthCounters>,
+    sequence: u64,
+}
+
+/// A frame that waits for its time.
+struct Prepared {
+    width: usize,
+    height: usize,
+    pixels: Loan,
+    jpeg: Option<Vec<u8>>,
+}
+
+impl Stream {
+    async fn new(node: &Node, config: &Config, found: Found) -> anyhow::Result<Self> {
+        let names = [config.instance()];
+        let jpeg_bytes = (found.largest / JPEG_PART).max(4096);
+        Ok(Self {
+            config: config.clone(),
+            images: found.images,
+            first_size: found.first_size,
+            frames: node.frame_publisher(topic::FRAME, &names, found.largest).await?,
+            jpegs: node.frame_publisher(topic::JPEG, &names, jpeg_bytes).await?,
+            health: node.shared_health(),
+            sequence: 0,
+        })
+    }
+
+    async fn run(&mut self) -> anyhow::Result<()> {
+        while self.config.source.wait_for_subscriber && !self.frames.has_subscribers().await {
+            tokio::time::sleep(SUBSCRIBER_POLL).await;
+        }
+        let period = Duration::from_secs_f64(1.0 / self.config.source.rate_hz);
+        let mut clock = tokio::time::interval(period);
+        clock.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        self.pass(&mut clock, true).await?;
+        while self.config.source.repeat {
+            self.pass(&mut clock, false).await?;
+        }
+        Ok(())
+    }
+
+    /// Publishes every image once.
+    async fn pass(&mut self, clock: &mut Interval, is_first: bool) -> anyhow::Result<()> {
+        let before = self.sequence;
+        for index in 0..self.images.len() {
+            let Some(path) = self.images.get(index) else { break };
+            match self.prepare(path).await {
+                Ok(frame) => {
+                    clock.tick().await;
+                    self.publish(frame).await;
+                }
+                Err(problem) => {
+                    self.health.failed("image that cannot be read");
+                    if is_first {
+                        tracing::warn!(%problem, "An image is skipped");
+                    }
+                }
+            }
+        }
+        // Without this a folder that was emptied meanwhile would keep a processor busy with nothing.
+        ensure!(
+            self.sequence > before,
+            "none of the {} images can be read any more",
+            self.images.len()
+        );
+        Ok(())
+    }
+
+    /// Decodes an image into the buffer it is published from.
+    async fn prepare(&self, path: &Path) -> anyhow::Result<Prepared> {
+        let began = Instant::now();
+        let image = Decoded::read(path, self.config.most_pixels())?;
+        let (width, height) = (image.width(), image.height());
+        if (width, height) != self.first_size && self.health.failed("image of another size") {
+            tracing::warn!(
+                ?path,
+                width,
+                height,
+                "An image is not of the size that the camera info states"
+            );
+        }
+        let mut pixels = self.frames.loan(width * height);
+        image.write_grey(&mut pixels);
+        self.health.latency("read", began.elapsed());
+        let jpeg = if self.jpegs.has_subscribers().await {
+            self.encode(&pixels, width, height)
+        } else {
+            None
+        };
+        Ok(Prepared { width, height, pixels, jpeg })
+    }
+
+    fn encode(&self, pixels: &[u8], width: usize, height: usize) -> Option<Vec<u8>> {
+        let began = Instant::now();
+        let mut bytes = Vec::new();
+        let encoder = Encoder::new(&mut bytes, self.config.jpeg_quality());
+        // No edge is longer than a JPEG can be.
+        match encoder.encode(pixels, width as u16, height as u16, ColorType::Luma) {
+            Ok(()) => {
+                self.health.latency("jpeg", began.elapsed());
+                Some(bytes)
+            }
+            Err(cause) => {
+                if self.health.failed("jpeg") {
+                    tracing::warn!(%cause, "A frame could not be made a JPEG");
+                }
+                None
+            }
+        }
+    }
+
+    async fn publish(&mut self, frame: Prepared) {
+        let header = FrameHeader {
+            camera: self.config.instance().to_owned(),
+            sequence: self.sequence,
+            stamp_ns: now_ns(),
+            clock: clock_name().to_owned(),
+            exposure_ns: 0,
+            width: frame.width as u32,
+            height: frame.height as u32,
+            format: PixelFormat::Mono8,
+        };
+        self.frames.publish(&header, frame.pixels).await;
+        if let Some(jpeg) = frame.jpeg {
+            let mut bytes = self.jpegs.loan(jpeg.len());
+            bytes.copy_from_slice(&jpeg);
+            let header = FrameHeader { format: PixelFormat::Jpeg, ..header };
+            self.jpegs.publish(&header, bytes).await;
+        }
+        self.sequence += 1;
+    }
+}

@@ -1,0 +1,147 @@
+//! A camera service and its subscribers, on a port of the test's own.
+
+use std::path::Path;
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use camera_pub::Config;
+use image::{GrayImage, Luma, RgbImage};
+use messages::{PixelFormat, topic};
+use node::{Identity, Layers, Node, Shutdown, ZenohSource, now_ns};
+use tokio::time::timeout;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// The local configuration with another meeting point.
+fn local(port: u16) -> ZenohSource {
+    let text = include_str!("../../zenoh-config/local.json5");
+    ZenohSource::Text(text.replace(":7447", &format!(":{port}")))
+}
+
+fn free_port() -> anyhow::Result<u16> {
+    Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+}
+
+async fn open(service: &'static str, port: u16) -> anyhow::Result<Node> {
+    Node::open(Identity { service, instance: "down".into() }, &local(port)).await
+}
+
+fn config(folder: &Path, set: &[&str]) -> anyhow::Result<Config> {
+    let mut layers = Layers::default();
+    layers.set.push(format!("source.paths=[{:?}]", folder.display().to_string()));
+    layers.set.extend(set.iter().map(|s| (*s).to_owned()));
+    Ok(layers.load::<Config>()?.settings)
+}
+
+/// Two grey images, a smaller coloured one, and two files that are none.
+fn folder_of_images() -> anyhow::Result<tempfile::TempDir> {
+    let folder = tempfile::tempdir()?;
+    let path = |name: &str| folder.path().join(name);
+    let image = GrayImage::from_fn(64, 48, |x, y| Luma([(x + y) as u8]));
+    image.save(path("1.png"))?;
+    std::fs::write(path("2.png"), "not an image")?;
+    RgbImage::from_pixel(32, 24, image::Rgb([0, 255, 0])).save(path("3.png"))?;
+    let whole = std::fs::read(path("1.png"))?;
+    std::fs::write(path("4.jpg"), whole.get(..60).context("a longer file")?)?;
+    GrayImage::from_pixel(64, 48, Luma([200])).save(path("5.jpg"))?;
+    Ok(folder)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn images_become_frames_in_order_and_the_unreadable_are_counted() -> anyhow::Result<()> {
+    let folder = folder_of_images()?;
+    let port = free_port()?;
+    let (camera, detector) = (open("camera-pub", port).await?, open("detector", port).await?);
+    let frames = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let set =
+        ["source.rate_hz=50", "source.wait_for_subscriber=true", "calibration.focal_px=[100, 100]"];
+    let service =
+        camera_pub::run(camera.clone(), config(folder.path(), &set)?, Shutdown::on_signals()?);
+    let listening = async {
+        let mut expected = None;
+        for _ in 0..7 {
+            let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+            let header = &frame.header;
+            ensure!(header.camera == "down" && header.format == PixelFormat::Mono8);
+            ensure!(header.stamp_ns <= now_ns());
+            // The newest wins, so that a slow test may miss some.
+            ensure!(expected.is_none_or(|expected| header.sequence >= expected));
+            expected = Some(header.sequence + 1);
+            let bytes = frame.bytes();
+            match header.sequence % 3 {
+                0 => ensure!((header.width, header.height, bytes[64 + 5]) == (64, 48, 6)),
+                1 => ensure!((header.width, header.height, bytes[0]) == (32, 24, 150)),
+                _ => ensure!((header.width, header.height, bytes[0]) == (64, 48, 200)),
+            }
+        }
+        let infos = detector.subscriber(topic::CAMERA_INFO, &["down"]).await?;
+        let info = timeout(PATIENCE, infos.next()).await?.context("a camera info")?;
+        ensure!(info.focal_px == Some([100.0, 100.0]) && (info.width, info.height) == (64, 48));
+        ensure!(detector.alive("camera-pub", "*").await? == ["down"]);
+        Ok(())
+    };
+    tokio::select! {
+        result = service => result.and(Err(anyhow::anyhow!("the service ended"))),
+        result = listening => result,
+    }?;
+    let health = camera.health().report(camera.identity(), now_ns());
+    let failed = |reason: &str| health.errors.iter().find(|e| e.reason == reason).map(|e| e.count);
+    ensure!(failed("image that cannot be read").is_some_and(|count| count >= 2), "{health:?}");
+    ensure!(failed("image of another size").is_some(), "{health:?}");
+    ensure!(health.drops.is_empty(), "{health:?}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn jpegs_are_made_while_somebody_subscribes() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    GrayImage::from_pixel(64, 48, Luma([200])).save(folder.path().join("1.png"))?;
+    let port = free_port()?;
+    let (camera, viewer) = (open("camera-pub", port).await?, open("gcs-bridge", port).await?);
+    let config = config(folder.path(), &["source.rate_hz=50"])?;
+    let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
+    let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
+    timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+    ensure!(camera.health().percentiles("jpeg").is_none(), "a JPEG was made for nobody");
+    let jpegs = viewer.frame_subscriber(topic::JPEG, &["down"]).await?;
+    let jpeg = timeout(PATIENCE, jpegs.next()).await?.context("a JPEG")?;
+    ensure!(jpeg.header.format == PixelFormat::Jpeg && jpeg.header.width == 64);
+    let decoded = image::load_from_memory(&jpeg.bytes())?.to_luma8();
+    ensure!(decoded.dimensions() == (64, 48) && decoded.get_pixel(9, 9)[0].abs_diff(200) < 3);
+    service.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_folder_is_published_once_when_it_should() -> anyhow::Result<()> {
+    let folder = folder_of_images()?;
+    let camera = open("camera-pub", free_port()?).await?;
+    let config = config(folder.path(), &["source.rate_hz=1000", "source.repeat=false"])?;
+    timeout(PATIENCE, camera_pub::run(camera.clone(), config, Shutdown::on_signals()?)).await??;
+    let health = camera.health().report(camera.identity(), now_ns());
+    ensure!(health.rates.iter().any(|r| r.name == "frames" && r.count == 3), "{health:?}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_start_without_images_says_why() -> anyhow::Result<()> {
+    let camera = open("camera-pub", free_port()?).await?;
+    let folder = tempfile::tempdir()?;
+    let problem = async |config: Config| -> anyhow::Result<String> {
+        let result = camera_pub::run(camera.clone(), config, Shutdown::on_signals()?).await;
+        Ok(result.err().context("an error")?.to_string())
+    };
+    let nothing = problem(Layers::default().load::<Config>()?.settings).await?;
+    ensure!(nothing.contains("`source.paths`"), "{nothing}");
+    let missing = problem(config(&folder.path().join("none"), &[])?).await?;
+    ensure!(missing.contains("there is no") && missing.contains("none"), "{missing}");
+    let empty = problem(config(folder.path(), &[])?).await?;
+    ensure!(empty.contains("holds no images"), "{empty}");
+    std::fs::write(folder.path().join("1.png"), "text")?;
+    let unreadable = problem(config(folder.path(), &[])?).await?;
+    ensure!(unreadable.contains("none of the 1 images can be read"), "{unreadable}");
+    GrayImage::from_pixel(64, 48, Luma([200])).save(folder.path().join("2.png"))?;
+    let too_large = problem(config(folder.path(), &["source.largest_megapixels=0.003"])?).await?;
+    ensure!(too_large.contains("none of the 2 images"), "{too_large}");
+    Ok(())
+}
