@@ -1,0 +1,259 @@
+//! A vehicle flown by a real autopilot: its true motion from what the autopilot reports.
+//!
+//! ArduPilot in simulation tells the truth in SIM_STATE, with the position in steps of about a centimetre and the
+//! velocity exactly; the two together give a smooth motion. Any other autopilot's own estimate has to do.
+
+use std::collections::VecDeque;
+
+use autopilot::Frame;
+use autopilot::dialect::{ATTITUDE_DATA, LOCAL_POSITION_NED_DATA, MavMessage, SIM_STATE_DATA};
+use geometry::{Body, Ned, Point, Rotation, Vector};
+
+use crate::vehicle::VehicleTruth;
+
+/// The past that is kept: a second at 200 Hz.
+const MOST_PAST: usize = 200;
+/// A degree of latitude in metres (mean radius of the earth, 6371 km), per 1e-7 degree.
+const M_PER_E7: f64 = 6_371_000.0 * std::f64::consts::PI / 180.0 * 1e-7;
+/// Part of the difference between the told and the predicted position that is taken over at each report.
+const CORRECTION: f64 = 0.05;
+/// A larger difference is a jump, in metres.
+const JUMP_M: f64 = 0.5;
+/// Motion is predicted at most so far, in seconds.
+const LONGEST_PREDICTION_S: f64 = 0.2;
+/// Without SIM_STATE for so long the autopilot's own estimate is used, in seconds.
+const TRUTH_PATIENCE_S: f64 = 1.0;
+/// Over the ground by less than this and slower than that is on it, in metres and m/s.
+const ON_GROUND: (f64, f64) = (0.03, 0.05);
+
+/// The vehicle that an autopilot reports.
+#[derive(Debug, Default)]
+pub struct Reported {
+    /// Latitude and longitude in 1e-7 degrees, and altitude in metres, where it was heard first.
+    home: Option<(i32, i32, f64)>,
+    past: VecDeque<VehicleTruth>,
+    sim_state_s: Option<f64>,
+    attitude: Option<(Rotation<Ned, Body>, Vector<Body>)>,
+    fastest_fall: VecDeque<(f64, f64)>,
+}
+
+impl Reported {
+    /// Takes a packet that arrived at `now_s`.
+    pub fn handle(&mut self, now_s: f64, frame: &Frame) {
+        if frame.sender.component != 1 {
+            return;
+        }
+        match &frame.message {
+            Some(MavMessage::SIM_STATE(state)) => self.sim_state(now_s, state),
+            Some(MavMessage::ATTITUDE(attitude)) => self.attitude(attitude),
+            Some(MavMessage::LOCAL_POSITION_NED(position)) => self.local(now_s, position),
+            _ => {}
+        }
+    }
+
+    /// True once the autopilot tells where the vehicle is.
+    pub fn is_known(&self) -> bool {
+        !self.past.is_empty()
+    }
+
+    /// True while the simulation's truth is told, not only the autopilot's estimate.
+    pub fn is_true(&self, now_s: f64) -> bool {
+        self.sim_state_s.is_some_and(|told| now_s - told < TRUTH_PATIENCE_S)
+    }
+
+    /// The latest motion.
+    pub fn truth(&self) -> Option<VehicleTruth> {
+        self.past.back().copied()
+    }
+
+    /// The motion at `time_s`, between reports or a little beyond the latest.
+    pub fn truth_at(&self, time_s: f64) -> Option<VehicleTruth> {
+        let after = self.past.partition_point(|truth| truth.time_s <= time_s);
+        let before = after.checked_sub(1).and_then(|index| self.past.get(index));
+        match (before, self.past.get(after)) {
+            (Some(before), Some(next)) => Some(before.interpolate(next, time_s)),
+            (Some(last), None) => Some(predicted(last, time_s)),
+            (None, first) => first.copied(),
+        }
+    }
+
+    fn sim_state(&mut self, now_s: f64, state: &SIM_STATE_DATA) {
+        let numbers = [state.roll, state.pitch, state.yaw, state.alt, state.vn, state.ve, state.vd];
+        let rates = [state.xgyro, state.ygyro, state.zgyro];
+        if !numbers.iter().chain(&rates).all(|n| n.is_finite()) {
+            return;
+        }
+        let altitude_m = f64::from(state.alt);
+        let home = *self.home.get_or_insert((state.lat_int, state.lon_int, altitude_m));
+        let told = position_from(home, state.lat_int, state.lon_int, altitude_m);
+        let velocity = Vector::new(f64::from(state.vn), f64::from(state.ve), f64::from(state.vd));
+        let [roll, pitch, yaw] = [state.roll, state.pitch, state.yaw].map(f64::from);
+        let [p, q, r] = rates.map(f64::from);
+        let position = match self.past.back() {
+            Some(last) => {
+                let dt_s = (now_s - last.time_s).clamp(0.0, LONGEST_PREDICTION_S);
+                let expected = last.position + (last.velocity + velocity) * (0.5 * dt_s);
+                let difference = told - expected;
+                if difference.norm() > JUMP_M { told } else { expected + difference * CORRECTION }
+            }
+            None => told,
+        };
+        self.sim_state_s = Some(now_s);
+        let attitude = (Rotation::from_euler(roll, pitch, yaw), Vector::new(p, q, r));
+        self.push(now_s, position, velocity, attitude);
+    }
+
+    fn attitude(&mut self, message: &ATTITUDE_DATA) {
+        let angles = [message.roll, message.pitch, message.yaw].map(f64::from);
+        let rates = [message.rollspeed, message.pitchspeed, message.yawspeed].map(f64::from);
+        if angles.iter().chain(&rates).all(|n| n.is_finite()) {
+            let [roll, pitch, yaw] = angles;
+            let [p, q, r] = rates;
+            self.attitude = Some((Rotation::from_euler(roll, pitch, yaw), Vector::new(p, q, r)));
+        }
+    }
+
+    fn local(&mut self, now_s: f64, message: &LOCAL_POSITION_NED_DATA) {
+        if self.is_true(now_s) {
+            return;
+        }
+        let [x, y, z] = [message.x, message.y, message.z].map(f64::from);
+        let [vx, vy, vz] = [message.vx, message.vy, message.vz].map(f64::from);
+        let (position, velocity) = (Point::new(x, y, z), Vector::new(vx, vy, vz));
+        if let Some(attitude) = self.attitude
+            && position.is_finite()
+            && velocity.is_finite()
+        {
+            self.push(now_s, position, velocity, attitude);
+        }
+    }
+
+    fn push(
+        &mut self,
+        now_s: f64,
+        position: Point<Ned>,
+        velocity: Vector<Ned>,
+        (ned_from_body, angular_rate): (Rotation<Ned, Body>, Vector<Body>),
+    ) {
+        let last = self.past.back().copied();
+        if last.is_some_and(|last| now_s <= last.time_s) {
+            return;
+        }
+        let dt_s = last.map_or(f64::INFINITY, |last| now_s - last.time_s);
+        let before = last.map_or(velocity, |last| last.velocity);
+        let height_m = -position.z();
+        self.fastest_fall.push_back((now_s, velocity.z()));
+        while self.fastest_fall.front().is_some_and(|(time_s, _)| now_s - time_s > 0.3) {
+            self.fastest_fall.pop_front();
+        }
+        let on_ground = height_m < ON_GROUND.0 && velocity.z().abs() < ON_GROUND.1;
+        let impact = self.fastest_fall.iter().map(|(_, fall)| *fall).fold(0.0, f64::max);
+        self.past.push_back(VehicleTruth {
+            time_s: now_s,
+            position,
+            velocity,
+            acceleration: (velocity - before) * (1.0 / dt_s),
+            ned_from_body,
+            angular_rate,
+            on_ground,
+            height_m,
+            impact_m_s: on_ground.then_some(impact),
+        });
+        if self.past.len() > MOST_PAST {
+            self.past.pop_front();
+        }
+    }
+}
+
+fn position_from(home: (i32, i32, f64), lat_e7: i32, lon_e7: i32, altitude_m: f64) -> Point<Ned> {
+    let (home_lat, home_lon, home_altitude_m) = home;
+    let north_m = (f64::from(lat_e7) - f64::from(home_lat)) * M_PER_E7;
+    let shrink = (f64::from(home_lat) * 1e-7).to_radians().cos();
+    let east_m = (f64::from(lon_e7) - f64::from(home_lon)) * M_PER_E7 * shrink;
+    Point::new(north_m, east_m, home_altitude_m - altitude_m)
+}
+
+fn predicted(last: &VehicleTruth, time_s: f64) -> VehicleTruth {
+    let dt_s = (time_s - last.time_s).clamp(0.0, LONGEST_PREDICTION_S);
+    VehicleTruth {
+        time_s,
+        position: last.position + last.velocity * dt_s,
+        ned_from_body: last.ned_from_body
+            * Rotation::from_rotation_vector(last.angular_rate * dt_s),
+        ..*last
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autopilot::Sender;
+
+    fn frame(message: MavMessage) -> Frame {
+        let sender = Sender { system: 1, component: 1 };
+        let mut parser = autopilot::Parser::new();
+        let mut frames = parser.push(&autopilot::frame::encode(sender, 0, &message));
+        frames.extend(parser.finish());
+        frames.remove(0)
+    }
+
+    fn sim_state(north_e7: i32, altitude_m: f32, velocity: [f32; 3]) -> Frame {
+        let [vn, ve, vd] = velocity;
+        frame(MavMessage::SIM_STATE(SIM_STATE_DATA {
+            lat_int: -353_632_620 + north_e7,
+            lon_int: 1_491_652_370,
+            alt: altitude_m,
+            vn,
+            ve,
+            vd,
+            ..SIM_STATE_DATA::default()
+        }))
+    }
+
+    #[test]
+    fn positions_in_centimetres_become_a_smooth_motion() {
+        let mut reported = Reported::default();
+        let mut worst_m: f64 = 0.0;
+        for i in 0..200 {
+            let time_s = f64::from(i) * 0.02;
+            // 0.5 m/s northwards; the grid of SIM_STATE is 1e-7 degrees.
+            let grid = (0.5 * time_s / M_PER_E7) as i32;
+            reported.handle(time_s, &sim_state(grid, 594.0, [0.5, 0.0, 0.0]));
+            let truth = reported.truth().unwrap();
+            if time_s > 1.0 {
+                worst_m = worst_m.max((truth.position.x() - 0.5 * time_s).abs());
+            }
+        }
+        assert!(worst_m < 0.012, "{worst_m} m off");
+        let ahead = reported.truth_at(3.98 + 0.05).unwrap().position.x();
+        assert!((ahead - 0.5 * 4.03).abs() < 0.013);
+    }
+
+    #[test]
+    fn the_ground_is_where_it_was_first_heard_and_the_impact_is_remembered() {
+        let mut reported = Reported::default();
+        reported.handle(0.0, &sim_state(0, 584.09, [0.0; 3]));
+        assert!(reported.truth().unwrap().on_ground);
+        reported.handle(0.1, &sim_state(0, 586.09, [0.0, 0.0, 0.5]));
+        let flying = reported.truth().unwrap();
+        assert!(!flying.on_ground && (flying.height_m - 2.0).abs() < 1e-3);
+        reported.handle(10.0, &sim_state(0, 584.2, [0.0, 0.0, 0.48]));
+        reported.handle(10.02, &sim_state(0, 584.09, [0.0, 0.0, 0.0]));
+        for i in 0..10 {
+            reported.handle(10.04 + f64::from(i) * 0.02, &sim_state(0, 584.09, [0.0; 3]));
+        }
+        let landed = reported.truth().unwrap();
+        assert!(landed.on_ground && (landed.impact_m_s.unwrap() - 0.48).abs() < 1e-6);
+    }
+
+    #[test]
+    fn without_a_simulation_the_autopilots_estimate_is_used() {
+        let mut reported = Reported::default();
+        let position = LOCAL_POSITION_NED_DATA { x: 1.0, y: 2.0, z: -3.0, ..Default::default() };
+        reported.handle(0.0, &frame(MavMessage::LOCAL_POSITION_NED(position.clone())));
+        assert!(!reported.is_known(), "no attitude yet");
+        reported.handle(0.01, &frame(MavMessage::ATTITUDE(ATTITUDE_DATA::default())));
+        reported.handle(0.02, &frame(MavMessage::LOCAL_POSITION_NED(position)));
+        assert!((reported.truth().unwrap().height_m - 3.0).abs() < 1e-6 && !reported.is_true(0.02));
+    }
+}

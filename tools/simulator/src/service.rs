@@ -1,0 +1,439 @@
+//! The service: a world in real time, its autopilot on a MAVLink link, its camera on the topics.
+//!
+//! The world advances on a task of its own; the camera renders on a thread of its own, named `camera`, and reads
+//! the world's recent past, so that neither waits for the other longer than it takes to copy a pose.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use anyhow::Context;
+use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
+use autopilot::{Address, Link, LinkEvent, Parser, Sender};
+use geometry::{Body, Ned, Transform};
+use messages::{
+    CameraInfo, FrameHeader, LensModel, MavlinkBytes, PixelFormat, Touchdown, Transform3, Truth,
+    Wind, topic,
+};
+use node::{FramePublisher, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
+use tokio::runtime::Handle;
+use tokio::sync::oneshot;
+use tokio::time::{MissedTickBehavior, interval};
+
+use crate::config::{Config, Flown};
+use crate::render::Renderer;
+use crate::reported::Reported;
+use crate::vehicle::VehicleTruth;
+use crate::world::World;
+
+/// How often the world is brought up to date.
+const TICK: Duration = Duration::from_millis(4);
+/// Every so many ticks the truth is published: 50 Hz.
+const TRUTH_EVERY: u64 = 5;
+/// Every so many ticks the wind is published: 10 Hz.
+const WIND_EVERY: u64 = 25;
+/// Poses through an exposure.
+const POSES: usize = 5;
+/// After this time without SIM_STATE it is asked for (again).
+const ASK_PERIOD: Duration = Duration::from_secs(1);
+/// Time between two SIM_STATE messages, in microseconds.
+const SIM_STATE_INTERVAL_US: f32 = 10_000.0;
+/// Height at which the vehicle counts as having been in the air, in metres.
+const IN_AIR_M: f64 = 0.3;
+
+/// Runs the service until it is asked to stop.
+///
+/// # Errors
+/// When another simulator has the same name, the link cannot be opened, or the scene makes no sense.
+pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+    node.ensure_alone(&config.id).await?;
+    let stage = Arc::new(Stage::new(&config));
+    let (stopped, _thread) = Camera::new(&node, &config, Arc::clone(&stage)).await?.start()?;
+    let world = advance(&node, &config, &stage);
+    tokio::select! {
+        () = shutdown.requested() => Ok(()),
+        result = world => result,
+        _ = stopped => anyhow::bail!("the camera's thread ended"),
+    }
+}
+
+/// What the world's task and the camera's thread share.
+struct Stage {
+    actor: Mutex<Actor>,
+    /// The moment of the world's time 0, on the host's clock.
+    start_ns: i64,
+    witness: Mutex<Witness>,
+}
+
+/// What flies.
+enum Actor {
+    Simulated(Box<World>),
+    Reported(Reported),
+}
+
+impl Stage {
+    fn new(config: &Config) -> Self {
+        let actor = match config.vehicle {
+            Flown::Simulated => {
+                Actor::Simulated(Box::new(World::new(&config.world(), config.seed)))
+            }
+            Flown::Reported => Actor::Reported(Reported::default()),
+        };
+        let pad = [config.pad.north_m, config.pad.east_m];
+        Self {
+            actor: Mutex::new(actor),
+            start_ns: now_ns(),
+            witness: Mutex::new(Witness { pad, ..Witness::default() }),
+        }
+    }
+
+    fn now_s(&self) -> f64 {
+        (now_ns() - self.start_ns) as f64 * 1e-9
+    }
+
+    fn stamp_ns(&self, time_s: f64) -> i64 {
+        self.start_ns.saturating_add((time_s * 1e9).round() as i64)
+    }
+
+    // A thread that panicked leaves a world that still is one.
+    fn actor(&self) -> MutexGuard<'_, Actor> {
+        self.actor.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn witness(&self) -> MutexGuard<'_, Witness> {
+        self.witness.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The motion at a moment; `None` while an autopilot has not told where the vehicle is.
+    fn truth_at(&self, time_s: f64) -> Option<VehicleTruth> {
+        match &*self.actor() {
+            Actor::Simulated(world) => Some(world.truth_at(time_s)),
+            Actor::Reported(reported) => reported.truth_at(time_s),
+        }
+    }
+}
+
+/// Sees the touchdown.
+#[derive(Default)]
+struct Witness {
+    pad: [f64; 2],
+    was_in_air: bool,
+    last: Option<VehicleTruth>,
+    touchdown: Option<Touchdown>,
+    max_tilt_rad: f64,
+    frames: u64,
+}
+
+impl Witness {
+    fn see(&mut self, truth: &VehicleTruth, stamp_ns: i64) {
+        if truth.height_m > IN_AIR_M && !self.was_in_air {
+            self.was_in_air = true;
+            self.touchdown = None;
+            self.max_tilt_rad = 0.0;
+        }
+        if self.was_in_air && !truth.on_ground {
+            self.max_tilt_rad = self.max_tilt_rad.max(truth.tilt_rad());
+        }
+        if self.was_in_air && truth.on_ground {
+            self.was_in_air = false;
+            let before = self.last.unwrap_or(*truth);
+            let [north, east] = self.pad;
+            self.touchdown = Some(Touchdown {
+                stamp_ns,
+                error_m: (truth.position.x() - north).hypot(truth.position.y() - east),
+                vertical_speed_m_s: truth.impact_m_s.unwrap_or(before.velocity.z()),
+                lateral_speed_m_s: before.velocity.horizontal_norm(),
+            });
+        }
+        self.last = Some(*truth);
+    }
+
+    fn message(&self, truth: &VehicleTruth, stamp_ns: i64, pad_z_m: f64) -> Truth {
+        let [north, east] = self.pad;
+        Truth {
+            stamp_ns,
+            ned_from_body_wxyz: truth.ned_from_body.wxyz(),
+            position_ned_m: truth.position.coords.into(),
+            velocity_ned_m_s: truth.velocity.coords.into(),
+            pad_ned_m: [north, east, pad_z_m],
+            on_ground: truth.on_ground,
+            touchdown: self.touchdown,
+            max_tilt_rad: self.max_tilt_rad,
+            frames: self.frames,
+        }
+    }
+}
+
+/// Lets the world's time pass as the host's does, and tells the truth.
+async fn advance(node: &Node, config: &Config, stage: &Stage) -> anyhow::Result<()> {
+    let pad_z_m = config
+        .scene()
+        .map_err(anyhow::Error::msg)?
+        .pads
+        .first()
+        .map_or(0.0, |pad| pad.ned_from_marker.origin().z());
+    let truths = node.publisher(topic::TRUTH, &[]).await?;
+    let winds = node.publisher(topic::WIND, &[]).await?;
+    let mut outside = Outside::open(node, config).await?;
+    node.announce().await?;
+    let mut ticks = interval(TICK);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    let mut tick: u64 = 0;
+    loop {
+        tokio::select! {
+            biased;
+            () = outside.listen(stage) => continue,
+            _ = ticks.tick() => {}
+        }
+        tick += 1;
+        outside.speak(node, stage).await;
+        let now_s = stage.now_s();
+        let truth = match &*stage.actor() {
+            Actor::Simulated(world) => Some(world.truth()),
+            Actor::Reported(reported) => reported.truth(),
+        };
+        let Some(truth) = truth else { continue };
+        let stamp_ns = stage.stamp_ns(truth.time_s);
+        stage.witness().see(&truth, stamp_ns);
+        if tick.is_multiple_of(TRUTH_EVERY) {
+            let message = stage.witness().message(&truth, stamp_ns, pad_z_m);
+            truths.publish(&message).await;
+        }
+        let air = match &*stage.actor() {
+            Actor::Simulated(world) => Some(world.wind()),
+            Actor::Reported(_) => None,
+        };
+        if let Some(air) = air.filter(|_| tick.is_multiple_of(WIND_EVERY)) {
+            let stamp_ns = stage.stamp_ns(now_s);
+            winds.publish(&Wind { stamp_ns, velocity_ned_m_s: air.coords.into() }).await;
+        }
+    }
+}
+
+/// The autopilot's side: our own on a link, or a real one through the controller.
+enum Outside {
+    Link(Link),
+    Topics {
+        packets: node::Subscriber<MavlinkBytes>,
+        requests: Publisher<MavlinkBytes>,
+        asked_s: f64,
+    },
+}
+
+impl Outside {
+    async fn open(node: &Node, config: &Config) -> anyhow::Result<Self> {
+        Ok(match config.vehicle {
+            Flown::Simulated => {
+                let address: Address = config.autopilot.address.parse()?;
+                let link = Link::open(address).await;
+                Self::Link(link.context("opening the simulated autopilot's link")?)
+            }
+            Flown::Reported => Self::Topics {
+                packets: node.subscriber(topic::FROM_AUTOPILOT, &[]).await?,
+                requests: node.publisher(topic::TO_AUTOPILOT, &[]).await?,
+                asked_s: f64::NEG_INFINITY,
+            },
+        })
+    }
+
+    /// Takes the next packet in.
+    async fn listen(&mut self, stage: &Stage) {
+        match self {
+            Self::Link(link) => {
+                if let LinkEvent::Frame { frame, .. } = link.recv().await
+                    && let Actor::Simulated(world) = &mut *stage.actor()
+                {
+                    world.advance_to(stage.now_s());
+                    world.handle(&frame);
+                }
+            }
+            Self::Topics { packets, .. } => {
+                let Some(message) = packets.next().await else {
+                    return std::future::pending().await;
+                };
+                let mut parser = Parser::new();
+                let mut frames = parser.push(&message.packet);
+                frames.extend(parser.finish());
+                let now_s = stage.now_s();
+                if let Actor::Reported(reported) = &mut *stage.actor() {
+                    frames.iter().for_each(|frame| reported.handle(now_s, frame));
+                }
+            }
+        }
+    }
+
+    /// Brings the world up to date and sends what its autopilot says; or asks a real one for the truth.
+    async fn speak(&mut self, node: &Node, stage: &Stage) {
+        match self {
+            Self::Link(link) => {
+                let packets: Vec<Vec<u8>> = match &mut *stage.actor() {
+                    Actor::Simulated(world) => {
+                        world.advance_to(stage.now_s());
+                        world.outgoing().collect()
+                    }
+                    Actor::Reported(_) => Vec::new(),
+                };
+                for packet in packets {
+                    if link.send(&packet).is_err() {
+                        node.health().dropped("packets without a listener");
+                    }
+                }
+            }
+            Self::Topics { requests, asked_s, .. } => {
+                let now_s = stage.now_s();
+                let is_true = match &*stage.actor() {
+                    Actor::Reported(reported) => reported.is_true(now_s),
+                    Actor::Simulated(_) => true,
+                };
+                if !is_true && now_s - *asked_s > ASK_PERIOD.as_secs_f64() {
+                    *asked_s = now_s;
+                    requests.publish(&MavlinkBytes { packet: request_for_sim_state() }).await;
+                }
+            }
+        }
+    }
+}
+
+/// SET_MESSAGE_INTERVAL for SIM_STATE, to any system.
+fn request_for_sim_state() -> Vec<u8> {
+    let message = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+        param1: 108.0,
+        param2: SIM_STATE_INTERVAL_US,
+        command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
+        target_system: 0,
+        target_component: 1,
+        ..COMMAND_LONG_DATA::default()
+    });
+    autopilot::frame::encode(Sender { system: 255, component: 192 }, 0, &message)
+}
+
+/// The camera's thread.
+struct Camera {
+    node: Node,
+    stage: Arc<Stage>,
+    renderer: Renderer,
+    frames: FramePublisher,
+    jpegs: FramePublisher,
+    infos: Publisher<CameraInfo>,
+    info: CameraInfo,
+    period_s: f64,
+    jpeg_quality: u8,
+}
+
+impl Camera {
+    async fn new(node: &Node, config: &Config, stage: Arc<Stage>) -> anyhow::Result<Self> {
+        let scene = config.scene().map_err(anyhow::Error::msg)?;
+        let settings = config.camera_settings();
+        let name = &config.camera.name;
+        let bytes = config.camera.width as usize * config.camera.height as usize;
+        let mount = settings.body_from_camera;
+        let origin = mount.origin();
+        let info = CameraInfo {
+            camera: name.clone(),
+            width: config.camera.width,
+            height: config.camera.height,
+            focal_px: Some([settings.model.fx, settings.model.fy]),
+            principal_px: [settings.model.cx, settings.model.cy],
+            lens: LensModel::Pinhole,
+            body_from_camera: Transform3 {
+                translation_m: [origin.x(), origin.y(), origin.z()],
+                rotation_wxyz: mount.rotation().wxyz(),
+            },
+        };
+        Ok(Self {
+            renderer: Renderer::new(&scene, settings, config.seed)
+                .context("setting the simulated camera up")?,
+            frames: node.frame_publisher(topic::FRAME, &[name], bytes).await?,
+            jpegs: node.frame_publisher(topic::JPEG, &[name], 0).await?,
+            infos: node.publisher(topic::CAMERA_INFO, &[name]).await?,
+            info,
+            period_s: 1.0 / config.camera.rate_hz,
+            jpeg_quality: config.camera.jpeg_quality,
+            node: node.clone(),
+            stage,
+        })
+    }
+
+    /// Starts the thread. The receiver hears when it ends.
+    fn start(mut self) -> anyhow::Result<(oneshot::Receiver<()>, std::thread::JoinHandle<()>)> {
+        let runtime = Handle::current();
+        let (running, stopped) = oneshot::channel();
+        let thread = std::thread::Builder::new()
+            .name("camera".to_owned())
+            .spawn(move || {
+                // The frames' grid begins now; the world may have begun long before.
+                let mut sequence = (self.stage.now_s() / self.period_s) as u64 + 1;
+                while !running.is_closed() {
+                    let time_s = sequence as f64 * self.period_s;
+                    let exposed_s = time_s + self.renderer.settings().exposure_s / 2.0;
+                    // A tick later the world's past holds the whole exposure.
+                    let wait_s = exposed_s + TICK.as_secs_f64() * 1.5 - self.stage.now_s();
+                    if wait_s > 0.0 {
+                        std::thread::sleep(Duration::from_secs_f64(wait_s));
+                    }
+                    runtime.block_on(self.take(sequence, time_s));
+                    let due = (self.stage.now_s() / self.period_s) as u64;
+                    if due > sequence + 1 {
+                        self.node.health().dropped("frames that took too long to render");
+                    }
+                    sequence = (sequence + 1).max(due);
+                }
+            })
+            .context("starting the camera's thread")?;
+        Ok((stopped, thread))
+    }
+
+    /// Takes the frame of a moment and publishes it.
+    async fn take(&mut self, sequence: u64, time_s: f64) {
+        if sequence.is_multiple_of((1.0 / self.period_s).ceil() as u64) {
+            self.infos.publish(&self.info).await;
+        }
+        let Some(poses) = self.poses(time_s) else { return };
+        let started_ns = now_ns();
+        let mut frame = self.frames.loan(self.info.width as usize * self.info.height as usize);
+        if let Err(problem) = self.renderer.render(&poses, sequence, &mut frame) {
+            if self.node.health().failed("render") {
+                tracing::error!(%problem, "A frame could not be rendered");
+            }
+            return;
+        }
+        let took = Duration::from_nanos((now_ns() - started_ns).max(0).unsigned_abs());
+        self.node.health().latency("render", took);
+        let header = FrameHeader {
+            camera: self.info.camera.clone(),
+            sequence,
+            stamp_ns: self.stage.stamp_ns(time_s),
+            clock: clock_name().to_owned(),
+            exposure_ns: (self.renderer.settings().exposure_s * 1e9) as u32,
+            width: self.info.width,
+            height: self.info.height,
+            format: PixelFormat::Mono8,
+        };
+        if self.jpegs.has_subscribers().await {
+            self.publish_jpeg(&header, &frame).await;
+        }
+        self.frames.publish(&header, frame).await;
+        self.stage.witness().frames += 1;
+    }
+
+    /// Where the vehicle is through the exposure about a moment.
+    fn poses(&self, time_s: f64) -> Option<Vec<Transform<Ned, Body>>> {
+        let exposure_s = self.renderer.settings().exposure_s;
+        let instant = |i: usize| time_s + exposure_s * (i as f64 / (POSES - 1) as f64 - 0.5);
+        let pose = |truth: VehicleTruth| Transform::new(truth.ned_from_body, truth.position);
+        (0..POSES).map(|i| self.stage.truth_at(instant(i)).map(pose)).collect()
+    }
+
+    async fn publish_jpeg(&self, header: &FrameHeader, pixels: &[u8]) {
+        let size = u16::try_from(header.width).ok().zip(u16::try_from(header.height).ok());
+        let Some((width, height)) = size else { return };
+        let mut bytes = Vec::new();
+        let encoder = jpeg_encoder::Encoder::new(&mut bytes, self.jpeg_quality);
+        match encoder.encode(pixels, width, height, jpeg_encoder::ColorType::Luma) {
+            Ok(()) => {
+                let header = FrameHeader { format: PixelFormat::Jpeg, ..header.clone() };
+                self.jpegs.publish(&header, Loan::Private(bytes)).await;
+            }
+            Err(_) => self.node.health().dropped("JPEG frames that could not be encoded"),
+        }
+    }
+}
