@@ -54,7 +54,12 @@ impl SimulatedAutopilot {
                 self.schedule.set_stream(now_s, r.req_stream_id as u8, interval_s);
             }
             MavMessage::TIMESYNC(t) if t.tc1 == 0 => {
-                let reply = TIMESYNC_DATA { tc1: nanoseconds(now_s), ts1: t.ts1 };
+                let reply = TIMESYNC_DATA {
+                    tc1: nanoseconds(now_s),
+                    ts1: t.ts1,
+                    target_system: frame.sender.system,
+                    target_component: frame.sender.component,
+                };
                 self.send(&MavMessage::TIMESYNC(reply));
             }
             other => self.talk_of_parameters(other),
@@ -235,7 +240,7 @@ impl SimulatedAutopilot {
     }
 
     fn acknowledge(&mut self, command: u16, result: MavResult, to: Sender) {
-        const COMMAND_ACK: u32 = 77;
-        self.send_raw(COMMAND_ACK, &packet::acknowledgement(command, result, to));
+        let me = self.me();
+        self.push(|sequence| packet::acknowledgement(me, sequence, command, result, to));
     }
 }

@@ -34,7 +34,7 @@ use crate::vehicle::{Demand, VehicleTruth};
 use estimate::{Estimate, Estimator};
 use flight::{Flight, Happening, Setpoint};
 use parameters::Parameters;
-use telemetry::{Readiness, SIM_STATE, Schedule, Situation};
+use telemetry::{Readiness, Schedule, Situation};
 
 /// The simulated autopilot's settings.
 #[derive(Clone, Debug, PartialEq)]
@@ -230,7 +230,8 @@ impl SimulatedAutopilot {
         }
         if self.now_s + 5e-7 >= self.timesync_due_s {
             self.timesync_due_s += TIMESYNC_S;
-            let request = TIMESYNC_DATA { tc1: 0, ts1: nanoseconds(self.now_s) };
+            let request =
+                TIMESYNC_DATA { ts1: nanoseconds(self.now_s), ..TIMESYNC_DATA::default() };
             self.send(&MavMessage::TIMESYNC(request));
         }
         for id in self.schedule.due(self.now_s) {
@@ -255,35 +256,26 @@ impl SimulatedAutopilot {
 
     fn can_tell(&self, id: u32) -> bool {
         let Some(truth) = &self.truth else { return false };
-        id == SIM_STATE || self.situation(truth).message(id).is_some()
+        self.situation(truth).message(id).is_some()
     }
 
     fn tell_one(&mut self, id: u32) {
         let Some(truth) = self.truth else { return };
-        if id == SIM_STATE {
-            let payload = self.situation(&truth).sim_state();
-            self.send_raw(SIM_STATE, &payload);
-        } else if let Some(message) = self.situation(&truth).message(id) {
+        if let Some(message) = self.situation(&truth).message(id) {
             self.send(&message);
         }
     }
 
     fn text(&mut self, severity: MavSeverity, text: &str) {
-        const STATUSTEXT: u32 = 253;
         self.texts = self.texts.wrapping_add(1).max(1);
-        for payload in packet::texts(severity, text, self.texts) {
-            self.send_raw(STATUSTEXT, &payload);
+        for part in packet::texts(severity, text, self.texts) {
+            self.send(&part);
         }
     }
 
     fn send(&mut self, message: &MavMessage) {
         let me = self.me();
         self.push(|sequence| encode(me, sequence, message));
-    }
-
-    fn send_raw(&mut self, message_id: u32, payload: &[u8]) {
-        let me = self.me();
-        self.push(|sequence| packet::packet(me, sequence, message_id, payload));
     }
 
     fn push(&mut self, make: impl FnOnce(u8) -> Vec<u8>) {

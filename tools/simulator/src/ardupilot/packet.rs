@@ -1,27 +1,44 @@
-//! Packets with the extension fields of MAVLink 2, which the dialect's types leave out.
+//! Messages that take more than the dialect's types: texts in parts, and acknowledgements of any number.
 
 use autopilot::Sender;
-use autopilot::dialect::{MavMessage, MavResult, MavSeverity, Message};
+use autopilot::dialect::{
+    COMMAND_ACK_DATA, MavMessage, MavResult, MavSeverity, Message, STATUSTEXT_DATA,
+};
+use autopilot::frame::encode;
 
 /// Longest text of one STATUSTEXT.
 const TEXT: usize = 50;
+/// Where the payload of a MAVLink 2 packet begins.
+const PAYLOAD: usize = 10;
 
-/// A MAVLink 2 packet with this payload (<https://mavlink.io/en/guide/serialization.html>).
-pub(super) fn packet(sender: Sender, sequence: u8, message_id: u32, payload: &[u8]) -> Vec<u8> {
-    let zeros = payload.iter().rev().take_while(|byte| **byte == 0).count();
-    let length = (payload.len() - zeros).clamp(1, 255);
-    let [id0, id1, id2, _] = message_id.to_le_bytes();
-    let mut raw =
-        vec![0xFD, length as u8, 0, 0, sequence, sender.system, sender.component, id0, id1, id2];
-    raw.extend(payload.iter().copied().chain(std::iter::repeat(0)).take(length));
-    let extra = MavMessage::extra_crc(message_id);
+/// The acknowledgement of a command number, which need not be one that the dialect knows, addressed to who sent it.
+pub(super) fn acknowledgement(
+    me: Sender,
+    sequence: u8,
+    command: u16,
+    result: MavResult,
+    to: Sender,
+) -> Vec<u8> {
+    let message = MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
+        result,
+        target_system: to.system,
+        target_component: to.component,
+        ..COMMAND_ACK_DATA::default()
+    });
+    let mut raw = encode(me, sequence, &message);
+    let end = raw.len().saturating_sub(2);
+    raw.truncate(end);
+    for (byte, number) in raw.iter_mut().skip(PAYLOAD).zip(command.to_le_bytes()) {
+        *byte = number;
+    }
+    let extra = MavMessage::extra_crc(message.message_id());
     let checksum =
         raw.iter().skip(1).chain([&extra]).fold(0xFFFF, |sum, byte| accumulate(sum, *byte));
     raw.extend_from_slice(&checksum.to_le_bytes());
     raw
 }
 
-/// CRC-16/MCRF4XX.
+/// CRC-16/MCRF4XX (<https://mavlink.io/en/guide/serialization.html>).
 fn accumulate(sum: u16, byte: u8) -> u16 {
     let mut low = byte ^ (sum as u8);
     low ^= low << 4;
@@ -29,56 +46,62 @@ fn accumulate(sum: u16, byte: u8) -> u16 {
     (sum >> 8) ^ (low << 8) ^ (low << 3) ^ (low >> 4)
 }
 
-/// The payload of COMMAND_ACK, for any command number, addressed to whoever sent the command.
-pub(super) fn acknowledgement(command: u16, result: MavResult, to: Sender) -> Vec<u8> {
-    let mut payload = command.to_le_bytes().to_vec();
-    payload.push(result as u8);
-    payload.extend_from_slice(&[0; 5]);
-    payload.extend_from_slice(&[to.system, to.component]);
-    payload
-}
-
-/// The payloads of the STATUSTEXTs that carry one text: a long one comes in numbered parts.
-pub(super) fn texts(severity: MavSeverity, text: &str, id: u16) -> Vec<Vec<u8>> {
+/// The STATUSTEXTs that carry one text: a long one comes in numbered parts.
+pub(super) fn texts(severity: MavSeverity, text: &str, id: u16) -> Vec<MavMessage> {
     let parts: Vec<&[u8]> = text.as_bytes().chunks(TEXT).collect();
     let id = if parts.len() > 1 { id } else { 0 };
-    let payload = |(number, part): (usize, &&[u8])| {
-        let mut payload = vec![severity as u8];
-        payload.extend(part.iter().copied().chain(std::iter::repeat(0)).take(TEXT));
-        payload.extend_from_slice(&id.to_le_bytes());
-        payload.push(number as u8);
-        payload
+    let message = |(number, part): (usize, &&[u8])| {
+        let mut text = [0; TEXT];
+        for (to, from) in text.iter_mut().zip(part.iter()) {
+            *to = *from;
+        }
+        MavMessage::STATUSTEXT(STATUSTEXT_DATA {
+            severity,
+            text: text.into(),
+            id,
+            chunk_seq: number as u8,
+        })
     };
-    parts.iter().enumerate().map(payload).collect()
+    parts.iter().enumerate().map(message).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use autopilot::Parser;
-    use autopilot::frame::encode;
 
-    const SENDER: Sender = Sender { system: 1, component: 1 };
+    const ME: Sender = Sender { system: 1, component: 1 };
+    const OTHER: Sender = Sender { system: 255, component: 190 };
 
     #[test]
-    fn a_packet_is_the_one_that_the_dialect_makes() {
-        let message = MavMessage::default_message_from_id(30).unwrap();
-        let mut payload = vec![0; 28];
-        payload[3] = 1;
-        let raw = packet(SENDER, 7, 30, &payload);
-        let frames = Parser::new().push(&raw);
-        assert_eq!(frames.len(), 1);
-        assert_eq!((frames[0].sequence, frames[0].message_id), (7, 30));
-        assert_eq!(packet(SENDER, 7, 30, &[0; 28]), encode(SENDER, 7, &message));
+    fn an_acknowledgement_is_a_right_packet_for_any_number() {
+        for command in [0_u16, 11, 22, 400, 65535] {
+            let raw = acknowledgement(ME, 7, command, MavResult::MAV_RESULT_FAILED, OTHER);
+            let frames = Parser::new().push(&raw);
+            assert_eq!(frames.len(), 1, "{command}");
+            assert_eq!((frames[0].sequence, frames[0].message_id), (7, 77));
+            let mut expected = command.to_le_bytes().to_vec();
+            expected.extend_from_slice(&[4, 0, 0, 0, 0, 0, 255, 190]);
+            assert_eq!(frames[0].payload(), expected);
+        }
     }
 
     #[test]
-    fn a_long_text_comes_in_two_parts() {
+    fn a_long_text_comes_in_numbered_parts() {
         let text = "AHRS: EKF3 Yaw inconsistent 77 deg. Wait or reboot the thing";
-        let parts = texts(MavSeverity::MAV_SEVERITY_CRITICAL, text, 9);
-        assert_eq!(parts.len(), 2);
-        assert_eq!(parts[1][1..].iter().position(|b| *b == 0), Some(text.len() - 50));
-        assert_eq!((parts[0][51], parts[0][53], parts[1][53]), (9, 0, 1));
-        assert_eq!(texts(MavSeverity::MAV_SEVERITY_INFO, "short", 9)[0][51], 0);
+        let critical = MavSeverity::MAV_SEVERITY_CRITICAL;
+        let parts: Vec<(String, u16, u8)> = texts(critical, text, 9)
+            .into_iter()
+            .map(|part| match part {
+                MavMessage::STATUSTEXT(part) => {
+                    (part.text.to_str().unwrap().to_owned(), part.id, part.chunk_seq)
+                }
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        let (first, second) = text.split_at(50);
+        assert_eq!(parts, [(first.to_owned(), 9, 0), (second.to_owned(), 9, 1)]);
+        let short = texts(critical, "short", 9);
+        assert!(matches!(&short[..], [MavMessage::STATUSTEXT(part)] if part.id == 0));
     }
 }

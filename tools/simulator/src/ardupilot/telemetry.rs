@@ -7,7 +7,8 @@ use autopilot::dialect::{
     HOME_POSITION_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot, MavDistanceSensor, MavFrame,
     MavLandedState, MavMessage, MavModeFlag, MavSensorOrientation, MavState, MavSysStatusSensor,
     MavType, MavVtolState, POSITION_TARGET_LOCAL_NED_DATA, PositionTargetTypemask,
-    RANGEFINDER_DATA, SIMSTATE_DATA, SYS_STATUS_DATA, SYSTEM_TIME_DATA, VFR_HUD_DATA,
+    RANGEFINDER_DATA, SIM_STATE_DATA, SIMSTATE_DATA, SYS_STATUS_DATA, SYSTEM_TIME_DATA,
+    VFR_HUD_DATA,
 };
 use geometry::{Body, Ned, Vector};
 
@@ -27,7 +28,7 @@ const MESSAGES: [(u32, u8); 18] = [
     (49, 0),
     (74, 11),
     (85, 2),
-    (SIM_STATE, 0),
+    (108, 0),
     (132, 12),
     (147, 12),
     (164, 10),
@@ -36,9 +37,6 @@ const MESSAGES: [(u32, u8); 18] = [
     (242, 0),
     (245, 0),
 ];
-
-/// SIM_STATE, whose useful fields are extensions.
-pub(super) const SIM_STATE: u32 = 108;
 
 /// When each message is due.
 #[derive(Clone, Debug, Default)]
@@ -154,6 +152,10 @@ impl Situation<'_> {
         (self.now_s * 1000.0).round().max(0.0) as u32
     }
 
+    fn time_usec(&self) -> u64 {
+        (self.now_s * 1e6) as u64
+    }
+
     pub(super) fn heartbeat(&self) -> MavMessage {
         let mut base_mode = MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
             | MavModeFlag::MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -192,6 +194,7 @@ impl Situation<'_> {
             49 if self.readiness >= Readiness::OriginSet => self.gps_global_origin(),
             74 => self.vfr_hud(),
             85 => self.position_target_local_ned()?,
+            108 => self.sim_state(),
             132 if self.rangefinder => self.distance_sensor(),
             147 => battery_status(),
             148 => autopilot_version(),
@@ -226,7 +229,7 @@ impl Situation<'_> {
         let (lat, lon) = self.global();
         let [_, _, down] = self.estimate.position;
         MavMessage::GPS_RAW_INT(GPS_RAW_INT_DATA {
-            time_usec: (self.now_s * 1e6) as u64,
+            time_usec: self.time_usec(),
             lat,
             lon,
             alt: millimetres(self.origin.altitude_m - down),
@@ -240,6 +243,7 @@ impl Situation<'_> {
                 GpsFixType::GPS_FIX_TYPE_NO_FIX
             },
             satellites_visible: if fixed { 10 } else { 0 },
+            ..GPS_RAW_INT_DATA::default()
         })
     }
 
@@ -269,6 +273,7 @@ impl Situation<'_> {
             rollspeed: e.rates[0] as f32,
             pitchspeed: e.rates[1] as f32,
             yawspeed: e.rates[2] as f32,
+            ..ATTITUDE_QUATERNION_DATA::default()
         })
     }
 
@@ -315,7 +320,12 @@ impl Situation<'_> {
     pub(super) fn gps_global_origin(&self) -> MavMessage {
         let (latitude, longitude) = self.origin.global(0.0, 0.0);
         let altitude = millimetres(self.origin.altitude_m);
-        MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA { latitude, longitude, altitude })
+        MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA {
+            latitude,
+            longitude,
+            altitude,
+            time_usec: self.time_usec(),
+        })
     }
 
     pub(super) fn home_position(&self) -> MavMessage {
@@ -325,6 +335,7 @@ impl Situation<'_> {
             longitude,
             altitude: millimetres(self.origin.altitude_m),
             q: [f32::NAN; 4],
+            time_usec: self.time_usec(),
             ..HOME_POSITION_DATA::default()
         })
     }
@@ -370,7 +381,7 @@ impl Situation<'_> {
             mavtype: MavDistanceSensor::MAV_DISTANCE_SENSOR_UNKNOWN,
             id: 0,
             orientation: MavSensorOrientation::MAV_SENSOR_ROTATION_PITCH_270,
-            covariance: 0,
+            ..DISTANCE_SENSOR_DATA::default()
         })
     }
 
@@ -427,31 +438,38 @@ impl Situation<'_> {
         })
     }
 
-    /// The payload of SIM_STATE, the truth, with its exact latitude and longitude.
-    pub(super) fn sim_state(&self) -> Vec<u8> {
+    /// The truth.
+    fn sim_state(&self) -> MavMessage {
+        let [w, x, y, z] = self.truth.ned_from_body.wxyz();
         let (roll, pitch, yaw) = self.truth.ned_from_body.euler();
         let [force, rate] = self.inertial();
         let (p, v) = (self.truth.position, self.truth.velocity);
         let (lat, lon) = self.origin.global(p.x(), p.y());
-        let attitude = self.truth.ned_from_body.wxyz().into_iter().chain([roll, pitch, yaw]);
-        let motion = [force.x(), force.y(), force.z(), rate.x(), rate.y(), rate.z()];
-        let place = [
-            f64::from(lat),
-            f64::from(lon),
-            self.origin.altitude_m - p.z(),
-            0.0,
-            0.0,
-            v.x(),
-            v.y(),
-            v.z(),
-        ];
-        let mut payload = Vec::with_capacity(92);
-        for value in attitude.chain(motion).chain(place) {
-            payload.extend_from_slice(&(value as f32).to_le_bytes());
-        }
-        payload.extend_from_slice(&lat.to_le_bytes());
-        payload.extend_from_slice(&lon.to_le_bytes());
-        payload
+        MavMessage::SIM_STATE(SIM_STATE_DATA {
+            q1: w as f32,
+            q2: x as f32,
+            q3: y as f32,
+            q4: z as f32,
+            roll: roll as f32,
+            pitch: pitch as f32,
+            yaw: yaw as f32,
+            xacc: force.x() as f32,
+            yacc: force.y() as f32,
+            zacc: force.z() as f32,
+            xgyro: rate.x() as f32,
+            ygyro: rate.y() as f32,
+            zgyro: rate.z() as f32,
+            // ArduPilot puts 1e-7 degrees here; they are exact only in the integers.
+            lat: lat as f32,
+            lon: lon as f32,
+            alt: (self.origin.altitude_m - p.z()) as f32,
+            vn: v.x() as f32,
+            ve: v.y() as f32,
+            vd: v.z() as f32,
+            lat_int: lat,
+            lon_int: lon,
+            ..SIM_STATE_DATA::default()
+        })
     }
 }
 

@@ -1,0 +1,119 @@
+//! The project's own client flies the simulated autopilot, packet by packet.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a test says what it found, and where it fails"
+)]
+
+use autopilot::{
+    Autopilot, Command, CommandStatus, Config, Event, FlightMode, Parser, Takeoff, TakeoffProgress,
+};
+use geometry::Vector;
+use simulator::wind::WindConfig;
+use simulator::world::{World, WorldConfig};
+
+const TICK_S: f64 = 0.02;
+
+struct Pair {
+    world: World,
+    client: Autopilot,
+    from_world: Parser,
+    from_client: Parser,
+    events: Vec<Event>,
+}
+
+impl Pair {
+    fn new(config: &WorldConfig, seed: u64) -> Self {
+        Self {
+            world: World::new(config, seed),
+            client: Autopilot::new(Config::default()),
+            from_world: Parser::new(),
+            from_client: Parser::new(),
+            events: Vec::new(),
+        }
+    }
+
+    fn now_ns(&self) -> i64 {
+        (self.world.now_s() * 1e9) as i64
+    }
+
+    fn tick(&mut self) {
+        let next_s = self.world.now_s() + TICK_S;
+        self.world.advance_to(next_s);
+        let now_ns = self.now_ns();
+        let bytes: Vec<u8> = self.world.outgoing().flatten().collect();
+        for frame in self.from_world.push(&bytes) {
+            self.client.handle(now_ns, &frame);
+        }
+        self.client.tick(now_ns);
+        while let Some(packet) = self.client.poll_outgoing() {
+            for frame in self.from_client.push(&packet) {
+                self.world.handle(&frame);
+            }
+        }
+        while let Some(event) = self.client.poll_event() {
+            self.events.push(event);
+        }
+    }
+
+    fn take_off(&mut self, height_m: f64) {
+        let mut takeoff = Takeoff::new(height_m);
+        for _ in 0..6000 {
+            self.tick();
+            let now_ns = self.now_ns();
+            match takeoff.step(now_ns, &mut self.client) {
+                TakeoffProgress::Done => return,
+                TakeoffProgress::Failed(error) => unreachable!("{error}"),
+                _ => {}
+            }
+        }
+        unreachable!("no takeoff: {:?}", self.events);
+    }
+
+    fn fly(&mut self, seconds: f64, velocity: [f64; 3]) {
+        for _ in 0..(seconds / TICK_S) as usize {
+            let [north, east, down] = velocity;
+            let now_ns = self.now_ns();
+            self.client.set_velocity(now_ns, Vector::new(north, east, down), 0.0).unwrap();
+            self.tick();
+        }
+    }
+}
+
+#[test]
+fn the_client_takes_off_flies_and_lands() {
+    let wind = WindConfig { mean_m_s: 5.0, turbulence: 1.0, ..WindConfig::default() };
+    let mut config = WorldConfig { wind, ..WorldConfig::default() };
+    config.autopilot.forward_ground_station = true;
+    let mut pair = Pair::new(&config, 4);
+    pair.take_off(10.0);
+    println!("flying after {:.1} s", pair.world.now_s());
+    pair.fly(5.0, [0.5, -0.5, 0.2]);
+    let truth = pair.world.truth();
+    assert!((truth.velocity - Vector::new(0.5, -0.5, 0.2)).norm() < 0.2, "{truth:?}");
+    let state = pair.client.state().unwrap();
+    let position = state.position.unwrap();
+    assert!((position.position - truth.position).horizontal_norm() < 0.1);
+    let now_ns = pair.now_ns();
+    let land = pair.client.request(now_ns, Command::SetMode(FlightMode::Land));
+    for _ in 0..3000 {
+        pair.tick();
+    }
+    assert_eq!(pair.client.status(land), CommandStatus::Done);
+    let state = pair.client.state().unwrap();
+    assert!(!state.armed && !state.landed.is_flying() && pair.world.truth().on_ground);
+    assert_eq!(pair.client.refused_numbers(), 0);
+    assert!(
+        pair.events.iter().all(|event| !matches!(event, Event::Lost { .. } | Event::Restarted))
+    );
+}
+
+#[test]
+fn the_client_waits_for_an_autopilot_that_starts_slowly() {
+    let mut config = WorldConfig::default();
+    config.autopilot.ready_after_s = 42.0;
+    let mut pair = Pair::new(&config, 4);
+    pair.take_off(3.0);
+    assert!(pair.world.now_s() > 42.0 && pair.world.now_s() < 65.0, "{}", pair.world.now_s());
+}
