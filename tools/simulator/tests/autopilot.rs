@@ -471,6 +471,26 @@ fn what_cannot_be_flown_is_a_stop() {
 }
 
 #[test]
+fn absurd_numbers_leave_the_vehicle_finite() {
+    let mut bench = Bench::flying(&WorldConfig::default(), 1, 10.0);
+    let most = f32::MAX;
+    for number in [most, -most, f32::INFINITY, f32::NAN] {
+        bench.velocity(LOCAL, HOLD_HEADING, [number; 3], [number; 2]);
+        bench.run(0.5);
+        bench.velocity(LOCAL, WITH_YAW, [0.0, 0.0, -number], [number; 2]);
+        bench.run(0.5);
+        for command in [22, 176, 178, 400, 511, 512] {
+            bench.command(command, [number; 7]);
+            bench.run(0.1);
+        }
+    }
+    let truth = bench.world.truth();
+    assert!(truth.position.is_finite() && truth.velocity.is_finite(), "{truth:?}");
+    assert!(truth.ned_from_body.wxyz().iter().all(|part| part.is_finite()));
+    assert!(bench.world.autopilot().armed());
+}
+
+#[test]
 fn when_setpoints_stop_coming_the_vehicle_flies_on_for_three_seconds_and_brakes() {
     let mut bench = Bench::flying(&steady(), 1, 10.0);
     bench.fly(4.0, [0.5, 0.0, 0.0]);
