@@ -1,0 +1,108 @@
+//! How well the marker is found in renderings of the thesis' camera, at both its binnings.
+
+mod render;
+
+use fiducial::{Detector, Observation, Settings};
+use geometry::{Camera, CameraModel, Marker as MarkerFrame, Transform};
+use render::{SIZE_M, Scene};
+
+const RANGES_M: [f64; 8] = [0.3, 0.6, 1.0, 2.0, 4.0, 7.0, 10.0, 13.0];
+
+/// What came of the frames at one range.
+#[derive(Default)]
+struct Row {
+    frames: usize,
+    centre_px: Vec<f64>,
+    range_percent: Vec<f64>,
+    tilt_degrees: Vec<f64>,
+}
+
+impl Row {
+    fn note(&mut self, scene: &Scene, found: &[Observation]) {
+        self.frames += 1;
+        let Some(marker) = found.first() else { return };
+        let pose = marker.pose.unwrap().camera_from_marker;
+        self.centre_px.push(marker.centre.distance(&scene.centre()));
+        let range_m = pose.origin().coords.coords.norm();
+        self.range_percent.push((range_m / scene.range_m() - 1.0) * 100.0);
+        let tilt = normal(&pose).angle(&normal(&scene.camera_from_marker));
+        self.tilt_degrees.push(tilt.to_degrees());
+    }
+
+    fn worst(values: &[f64]) -> f64 {
+        values.iter().fold(0.0, |worst, value| value.abs().max(worst))
+    }
+
+    fn mean(values: &[f64]) -> f64 {
+        values.iter().sum::<f64>() / values.len() as f64
+    }
+}
+
+fn normal(pose: &Transform<Camera, MarkerFrame>) -> nalgebra::Vector3<f64> {
+    pose.rotation().quaternion * nalgebra::Vector3::z()
+}
+
+fn table(family: &str, camera: CameraModel) -> Vec<Row> {
+    let marker = format!("{family}:{SIZE_M}").parse().unwrap();
+    let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+    let mut rows = Vec::new();
+    println!("{family}, focal length {} px", camera.fx);
+    for range_m in RANGES_M {
+        let mut row = Row::default();
+        for k in 0..6 {
+            let tilt = [0.0, 0.1, 0.3][k % 3];
+            let place =
+                [(k as f64 - 2.6) * 0.05, (k as f64 - 3.1) * 0.03, 1.0].map(|v| v * range_m);
+            let mut scene = Scene::new(camera, place, tilt, k as f64);
+            scene.seed = k as u64 + 1;
+            let image = scene.render();
+            row.note(&scene, detector.detect(image.view().unwrap(), Some(&camera), &mut ()));
+        }
+        println!(
+            "{range_m:5.1} m: {}/{} found, centre worst {:.3} px, range mean {:+.3} % worst {:.3} %, normal worst {:.1} deg",
+            row.centre_px.len(),
+            row.frames,
+            Row::worst(&row.centre_px),
+            Row::mean(&row.range_percent),
+            Row::worst(&row.range_percent),
+            Row::worst(&row.tilt_degrees),
+        );
+        rows.push(row);
+    }
+    rows
+}
+
+#[test]
+fn the_true_centre_and_range_at_two_by_two_binning() {
+    for (range_m, row) in
+        RANGES_M.iter().zip(table("rings", CameraModel::pinhole(1296, 972, 1818.0)))
+    {
+        assert_eq!(row.centre_px.len(), row.frames, "at {range_m} m");
+        assert!(Row::worst(&row.centre_px) < 0.05, "at {range_m} m");
+        assert!(Row::worst(&row.range_percent) < 0.35, "at {range_m} m");
+    }
+}
+
+#[test]
+fn the_true_centre_and_range_at_four_by_four_binning() {
+    for (range_m, row) in RANGES_M.iter().zip(table("rings", CameraModel::pinhole(648, 486, 909.0)))
+    {
+        if *range_m > 10.0 {
+            continue;
+        }
+        assert_eq!(row.centre_px.len(), row.frames, "at {range_m} m");
+        assert!(Row::worst(&row.centre_px) < 0.06, "at {range_m} m");
+        assert!(Row::worst(&row.range_percent) < 1.0, "at {range_m} m");
+    }
+}
+
+#[test]
+fn to_the_letter_the_marker_is_found_sometimes_and_near() {
+    let rows = table("rings-thesis", CameraModel::pinhole(1296, 972, 1818.0));
+    let found = |rows: &[Row]| rows.iter().map(|r| r.centre_px.len()).sum::<usize>();
+    assert!(found(&rows[..5]) > 15);
+    assert_eq!(found(&rows[6..]), 0, "the filter closes a ring of three pixels");
+    for row in &rows {
+        assert!(Row::worst(&row.range_percent) < 4.0);
+    }
+}
