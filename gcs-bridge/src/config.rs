@@ -1,0 +1,75 @@
+//! What can be set.
+
+use autopilot::Address;
+use serde::Deserialize;
+
+/// The configuration; `gcs-bridge.toml` explains every key.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Name of this instance.
+    pub id: String,
+    /// Where the ground station is, as an [`Address`].
+    pub ground: String,
+    /// The vehicle's MAVLink system number; 0 when it is to be learned.
+    pub system_id: u8,
+    /// How long to wait for the vehicle's number before 1 is assumed, in seconds.
+    pub assume_system_after_s: f64,
+    /// MAVLink component number of this companion.
+    pub component_id: u8,
+    /// Whether the ground station's packets reach the autopilot.
+    pub forward_to_autopilot: bool,
+    /// How often the landing point is shown, in Hz.
+    pub target_rate_hz: f64,
+    /// Age above which the landing point is not shown, in milliseconds.
+    pub target_max_age_ms: f64,
+}
+
+impl node::Settings for Config {
+    const DEFAULTS: &'static str = include_str!("../gcs-bridge.toml");
+
+    fn check(&self, check: &mut node::Check<'_>) {
+        check.name("id", &self.id);
+        check.parses("ground", self.ground.parse::<Address>());
+        check.range("assume_system_after_s", self.assume_system_after_s, 0.0..=3600.0);
+        check.range("component_id", self.component_id, 2..=255);
+        check.range("target_rate_hz", self.target_rate_hz, 0.1..=50.0);
+        check.range("target_max_age_ms", self.target_max_age_ms, 1.0..=60_000.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(set: &[&str]) -> Result<Config, String> {
+        let set = set.iter().map(|text| (*text).to_owned()).collect();
+        let layers = node::Layers { file: None, set };
+        layers.load::<Config>().map(|c| c.settings).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn the_defaults_are_what_qgroundcontrol_expects() {
+        let config = load(&[]).unwrap();
+        assert_eq!(config.ground, "udpout:127.0.0.1:14550");
+        assert_eq!((config.system_id, config.component_id), (0, 191));
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused_by_name() {
+        for (setting, part) in [
+            ("ground=127.0.0.1:14550", "`ground`"),
+            ("ground=udpout:127.0.0.1", "`ground`"),
+            ("component_id=1", "from 2 to 255"),
+            ("component_id=256", "component_id"),
+            ("system_id=-1", "system_id"),
+            ("target_rate_hz=0", "from 0.1 to 50"),
+            ("target_max_age_ms=inf", "`target_max_age_ms`"),
+            ("id=a/b", "letters, digits"),
+            ("grund='x'", "did you mean `ground`"),
+        ] {
+            let problem = load(&[setting]).unwrap_err();
+            assert!(problem.contains(part), "{setting}: {problem}");
+        }
+    }
+}

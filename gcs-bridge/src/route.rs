@@ -1,0 +1,163 @@
+//! What passes between the autopilot and the ground station, and what is answered here.
+//!
+//! The rules are those of <https://mavlink.io/en/guide/routing.html>: what is addressed to a component goes to that
+//! component, everything else to everybody, and nothing back to where it came from.
+
+use autopilot::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message};
+use autopilot::{Frame, Sender};
+
+use crate::vehicle::Vehicle;
+
+/// What becomes of a packet.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Route {
+    /// It goes to the other side, byte for byte.
+    Pass,
+    /// It ends here and is answered.
+    Answer(Box<MavMessage>),
+    /// It ends here, for this reason.
+    Drop(&'static str),
+}
+
+/// What becomes of a packet from the ground station; `me` is the bridge, once it has a number.
+pub(crate) fn from_ground(frame: &Frame, me: Option<Sender>, vehicle: &Vehicle) -> Route {
+    if Some(frame.sender) == me || vehicle.is_aboard(frame.sender) {
+        // A ground program that repeats everything would otherwise make the vehicle hear itself.
+        return Route::Drop("from ground: an echo of the vehicle");
+    }
+    match me.filter(|me| is_for(frame, *me)) {
+        Some(_) => match answer(frame) {
+            Some(message) => Route::Answer(Box::new(message)),
+            None => Route::Drop("from ground: for the companion, which does not know it"),
+        },
+        None => Route::Pass,
+    }
+}
+
+/// What becomes of a packet from the autopilot's side.
+pub(crate) fn from_autopilot(frame: &Frame, me: Option<Sender>) -> Route {
+    match me {
+        Some(me) if frame.sender == me => Route::Drop("from autopilot: an echo of the companion"),
+        // The autopilot answers the controller, which speaks as this companion; a ground station would take such an
+        // acknowledgement for that of its own command.
+        Some(me) if is_for(frame, me) => Route::Drop("from autopilot: for the companion"),
+        _ => Route::Pass,
+    }
+}
+
+fn is_for(frame: &Frame, me: Sender) -> bool {
+    frame.message.as_ref().is_some_and(|message| {
+        message.target_system_id() == Some(me.system)
+            && message.target_component_id() == Some(me.component)
+    })
+}
+
+fn answer(frame: &Frame) -> Option<MavMessage> {
+    let to = frame.sender;
+    match frame.message.as_ref()? {
+        MavMessage::COMMAND_LONG(command) => Some(unsupported(command.command, to)),
+        MavMessage::COMMAND_INT(command) => Some(unsupported(command.command, to)),
+        _ => None,
+    }
+}
+
+fn unsupported(command: MavCmd, to: Sender) -> MavMessage {
+    MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
+        command,
+        result: MavResult::MAV_RESULT_UNSUPPORTED,
+        target_system: to.system,
+        target_component: to.component,
+        ..COMMAND_ACK_DATA::default()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autopilot::Parser;
+    use autopilot::dialect::{
+        COMMAND_LONG_DATA, HEARTBEAT_DATA, LANDING_TARGET_DATA, MavAutopilot,
+        PARAM_REQUEST_LIST_DATA,
+    };
+    use autopilot::frame::encode;
+
+    const ME: Sender = Sender { system: 7, component: 191 };
+    const AUTOPILOT: Sender = Sender { system: 7, component: 1 };
+    const GROUND: Sender = Sender { system: 255, component: 190 };
+
+    fn frame(sender: Sender, message: &MavMessage) -> Frame {
+        Parser::new().push(&encode(sender, 0, message)).remove(0)
+    }
+
+    fn heartbeat() -> MavMessage {
+        let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA { autopilot, ..HEARTBEAT_DATA::default() })
+    }
+
+    fn command(target: Sender) -> MavMessage {
+        MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+            command: MavCmd::MAV_CMD_REQUEST_MESSAGE,
+            target_system: target.system,
+            target_component: target.component,
+            ..COMMAND_LONG_DATA::default()
+        })
+    }
+
+    fn vehicle() -> Vehicle {
+        let mut vehicle = Vehicle::new(0, 0);
+        vehicle.hear(0, &frame(AUTOPILOT, &heartbeat()));
+        vehicle
+    }
+
+    fn up(sender: Sender, message: &MavMessage) -> Route {
+        from_ground(&frame(sender, message), Some(ME), &vehicle())
+    }
+
+    #[test]
+    fn the_grounds_own_packets_go_up() {
+        assert_eq!(up(GROUND, &heartbeat()), Route::Pass);
+        assert_eq!(up(GROUND, &command(AUTOPILOT)), Route::Pass);
+        // To all components of the vehicle: the autopilot answers.
+        assert_eq!(up(GROUND, &command(Sender { system: 7, component: 0 })), Route::Pass);
+    }
+
+    #[test]
+    fn nothing_of_the_vehicle_goes_up_again() {
+        let target = MavMessage::LANDING_TARGET(LANDING_TARGET_DATA::default());
+        for message in [heartbeat(), target] {
+            assert!(matches!(up(ME, &message), Route::Drop(_)));
+            assert!(matches!(up(AUTOPILOT, &message), Route::Drop(_)));
+        }
+    }
+
+    #[test]
+    fn what_is_for_the_companion_is_answered_here() {
+        let Route::Answer(answer) = up(GROUND, &command(ME)) else { panic!("no answer") };
+        let MavMessage::COMMAND_ACK(ack) = *answer else { panic!("{answer:?}") };
+        assert_eq!(ack.command, MavCmd::MAV_CMD_REQUEST_MESSAGE);
+        assert_eq!(ack.result, MavResult::MAV_RESULT_UNSUPPORTED);
+        assert_eq!((ack.target_system, ack.target_component), (255, 190));
+
+        let (target_system, target_component) = (ME.system, ME.component);
+        let list = PARAM_REQUEST_LIST_DATA { target_system, target_component };
+        assert!(matches!(up(GROUND, &MavMessage::PARAM_REQUEST_LIST(list)), Route::Drop(_)));
+    }
+
+    #[test]
+    fn the_ground_hears_the_vehicle_but_not_its_talk_with_the_companion() {
+        let down = |sender, message: &MavMessage| from_autopilot(&frame(sender, message), Some(ME));
+        assert_eq!(down(AUTOPILOT, &heartbeat()), Route::Pass);
+        assert_eq!(down(GROUND, &heartbeat()), Route::Pass);
+        let to = |to| unsupported(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL, to);
+        assert_eq!(down(AUTOPILOT, &to(GROUND)), Route::Pass);
+        assert!(matches!(down(AUTOPILOT, &to(ME)), Route::Drop(_)));
+        assert!(matches!(down(ME, &heartbeat()), Route::Drop(_)));
+    }
+
+    #[test]
+    fn everything_passes_while_the_bridge_has_no_number() {
+        let vehicle = Vehicle::new(0, i64::MAX);
+        assert_eq!(from_ground(&frame(GROUND, &command(ME)), None, &vehicle), Route::Pass);
+        assert_eq!(from_autopilot(&frame(ME, &heartbeat()), None), Route::Pass);
+    }
+}

@@ -1,0 +1,472 @@
+//! The bridge between a vehicle that is made up here and a ground station on a plain UDP socket.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail, ensure};
+use autopilot::dialect::{
+    COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavBool, MavCmd, MavFrame, MavMessage,
+    MavResult, MavState, MavType, PARAM_REQUEST_READ_DATA, PARAM_VALUE_DATA,
+};
+use autopilot::frame::encode;
+use autopilot::{Frame, Parser, Sender};
+use gcs_bridge::Config;
+use messages::{ControllerStatus, MavlinkBytes, TargetEstimate, topic};
+use node::{Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
+use tokio::net::UdpSocket;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio::time::{interval, sleep, timeout};
+
+const PATIENCE: Duration = Duration::from_secs(30);
+const AUTOPILOT: Sender = Sender { system: 7, component: 1 };
+const COMPANION: Sender = Sender { system: 7, component: 191 };
+const GROUND: Sender = Sender { system: 255, component: 190 };
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_ground_hears_the_companion_and_the_vehicle_as_it_spoke() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let mut ground = Ground::open().await?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let bridge = start_bridge(port, &ground, &[]).await?;
+
+    let companion = ground.expect(|f| f.sender == COMPANION && is_heartbeat(f)).await?;
+    let Some(MavMessage::HEARTBEAT(heartbeat)) = companion.message else { bail!("no heartbeat") };
+    assert_eq!(heartbeat.mavtype, MavType::MAV_TYPE_ONBOARD_CONTROLLER);
+    assert_eq!(heartbeat.autopilot, MavAutopilot::MAV_AUTOPILOT_INVALID);
+
+    let packet = ground.expect(|f| f.sender == AUTOPILOT && is_heartbeat(f)).await?;
+    assert_eq!(packet.raw, autopilot_heartbeat());
+    let packet = ground.expect(|f| f.message_id == UNKNOWN_ID).await?;
+    assert_eq!(packet.raw, unknown_packet(AUTOPILOT));
+
+    ground.expect_text("Alight: search: looking for the marker").await?;
+    let why = "1.93 m beside the marker, which is more than the 0.35 m of the funnel";
+    vehicle.status.send_replace(status("approach", why));
+    ground.expect_text(&format!("Alight: approach: {why}")).await?;
+    ground.expect_text("Alight: detector spare").await?;
+
+    let active = |f: &Frame| match &f.message {
+        Some(MavMessage::HEARTBEAT(h)) => h.system_status == MavState::MAV_STATE_ACTIVE,
+        _ => false,
+    };
+    ground.expect(|f| f.sender == COMPANION && active(f)).await?;
+
+    let shown = ground.expect(|f| matches!(f.message, Some(MavMessage::LANDING_TARGET(_)))).await?;
+    let Some(MavMessage::LANDING_TARGET(target)) = shown.message else { bail!("no target") };
+    assert_eq!(shown.sender, COMPANION);
+    assert_eq!(target.frame, MavFrame::MAV_FRAME_LOCAL_NED);
+    assert_eq!(target.position_valid, MavBool::MAV_BOOL_TRUE);
+    assert_eq!([target.x, target.y, target.z], [1.5, -1.5, 0.0]);
+
+    vehicle.stop().await;
+    ground.expect_text("Alight: the controller is gone").await?;
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn only_the_grounds_own_packets_go_up_and_as_they_were_sent() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let mut ground = Ground::open().await?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let bridge = start_bridge(port, &ground, &[]).await?;
+    ground.expect(|f| f.sender == COMPANION).await?;
+
+    let first = encode(GROUND, 1, &param_request(1));
+    let arriving = timeout(PATIENCE, vehicle.next_packet());
+    let calling = async {
+        // Until the two sessions know each other, what is sent is lost.
+        loop {
+            ground.send(&first).await?;
+            sleep(Duration::from_millis(20)).await;
+        }
+    };
+    let arrived: anyhow::Result<Vec<u8>> = tokio::select! {
+        problem = calling => problem,
+        arrived = arriving => arrived?,
+    };
+    assert_eq!(arrived?, first);
+
+    let mut damaged = encode(GROUND, 2, &param_request(2));
+    damaged[12] ^= 0x40;
+    let last = encode(GROUND, 3, &param_request(3));
+    for bytes in [
+        b"PX4 boot text \xfd\xfe\x03 and more of it, which is no MAVLink at all".to_vec(),
+        damaged,
+        last[..last.len() / 2].to_vec(),
+        encode(COMPANION, 4, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default())),
+        autopilot_heartbeat(),
+        encode(GROUND, 5, &command_to(COMPANION)),
+        unknown_packet(GROUND),
+        last.clone(),
+    ] {
+        ground.send(&bytes).await?;
+    }
+    let mut others = Vec::new();
+    loop {
+        let packet = timeout(PATIENCE, vehicle.next_packet()).await??;
+        if packet == last {
+            break;
+        }
+        if packet != first {
+            others.push(packet);
+        }
+    }
+    assert_eq!(others, [unknown_packet(GROUND)]);
+
+    let ack = ground.expect(|f| matches!(f.message, Some(MavMessage::COMMAND_ACK(_)))).await?;
+    let Some(MavMessage::COMMAND_ACK(answer)) = ack.message else { bail!("no answer") };
+    assert_eq!((ack.sender, answer.result), (COMPANION, MavResult::MAV_RESULT_UNSUPPORTED));
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_is_sent_under_a_number_that_is_a_guess() -> anyhow::Result<()> {
+    let mut ground = Ground::open().await?;
+    let began = Instant::now();
+    let bridge = start_bridge(free_port()?, &ground, &["assume_system_after_s=1.5"]).await?;
+    let first = ground.expect(|_| true).await?;
+    assert!(began.elapsed() >= Duration::from_millis(1500), "{:?}", began.elapsed());
+    assert_eq!((first.sender.system, first.sender.component), (1, 191));
+    let Some(MavMessage::HEARTBEAT(heartbeat)) = first.message else { bail!("no heartbeat") };
+    assert_eq!(heartbeat.system_status, MavState::MAV_STATE_STANDBY);
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_bridge_outlives_the_ground_station() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let ground = Ground::open().await?;
+    let address = ground.socket.local_addr()?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let bridge = start_bridge(port, &ground, &[]).await?;
+    // Its packets now find nobody, which the system reports to the bridge as refused connections.
+    drop(ground);
+    let health = vehicle.node.subscriber(topic::HEALTH, &["gcs-bridge", "main"]).await?;
+    let sent = || async {
+        let report = health.next().await.context("health")?;
+        let rate = report.rates.into_iter().find(|rate| rate.name == "to ground");
+        anyhow::Ok(rate.map_or(0, |rate| rate.count))
+    };
+    let before = timeout(PATIENCE, sent()).await??;
+    while timeout(PATIENCE, sent()).await?? <= before {}
+    let mut ground = Ground { socket: UdpSocket::bind(address).await?, ..Ground::open().await? };
+    ground.expect(|f| f.sender == COMPANION && is_heartbeat(f)).await?;
+    ground.send(&encode(GROUND, 0, &param_request(1))).await?;
+    // A ground station that comes late is told where the landing stands.
+    ground.expect_text("Alight: search: looking for the marker").await?;
+    assert!(!bridge.is_finished());
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_port_in_use_is_an_error_that_says_so() -> anyhow::Result<()> {
+    let taken = Ground::open().await?;
+    let setting = format!("ground=udpin:{}", taken.socket.local_addr()?);
+    let bridge = start_bridge(free_port()?, &taken, &[&setting]).await?;
+    let problem = timeout(PATIENCE, bridge).await??.err().context("a port was taken twice")?;
+    assert!(format!("{problem:#}").contains("already in use"), "{problem:#}");
+    Ok(())
+}
+
+/// The same with an independent implementation of MAVLink as the ground station.
+#[tokio::test(flavor = "multi_thread")]
+async fn pymavlink_agrees() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let free = Ground::open().await?;
+    let address = free.socket.local_addr()?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let bridge = start_bridge(port, &free, &[]).await?;
+    drop(free);
+    let python = std::env::var("ALIGHT_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/gcs/ground_station.py");
+    let run = tokio::process::Command::new(&python)
+        .args([script, "--connect", &format!("udpin:{address}"), "--timeout", "30"])
+        .kill_on_drop(true)
+        .output();
+    // The phases of a landing, again and again, until the script has seen enough.
+    let phases = async {
+        let mut tick = interval(Duration::from_millis(700));
+        for phase in ["search", "approach", "descend"].into_iter().cycle() {
+            tick.tick().await;
+            vehicle.status.send_replace(status(phase, "so that pymavlink sees it"));
+        }
+    };
+    let output = tokio::select! {
+        output = run => output,
+        () = phases => bail!("the phases ended"),
+    };
+    bridge.abort();
+    let Ok(output) = output else {
+        println!("skipped: {python} is missing (ALIGHT_PYTHON names another one)");
+        return Ok(());
+    };
+    let said = String::from_utf8_lossy(&output.stdout);
+    match output.status.code() {
+        Some(0) => println!("{said}"),
+        Some(77) => println!("skipped: {said}"),
+        _ => bail!("{said}{}", String::from_utf8_lossy(&output.stderr)),
+    }
+    Ok(())
+}
+
+fn free_port() -> anyhow::Result<u16> {
+    Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+}
+
+async fn open(service: &'static str, instance: &str, port: u16) -> anyhow::Result<Node> {
+    let text = include_str!("../../zenoh-config/local.json5");
+    ensure!(text.contains(":7447"), "the meeting point has moved");
+    let source = ZenohSource::Text(text.replace(":7447", &format!(":{port}")));
+    Node::open(Identity { service, instance: instance.into() }, &source).await
+}
+
+async fn start_bridge(
+    port: u16,
+    ground: &Ground,
+    set: &[&str],
+) -> anyhow::Result<JoinHandle<anyhow::Result<()>>> {
+    let ground = format!("ground=udpout:{}", ground.socket.local_addr()?);
+    let set = [ground.as_str()].iter().chain(set).map(|text| (*text).to_owned()).collect();
+    let config = Layers { file: None, set }.load::<Config>()?.settings;
+    let node = open("gcs-bridge", "main", port).await?;
+    let shutdown = Shutdown::on_signals()?;
+    Ok(tokio::spawn(async move {
+        tokio::select! {
+            result = gcs_bridge::run(node.clone(), config, shutdown) => result,
+            result = node.publish_health() => result,
+        }
+    }))
+}
+
+/// A ground station on a UDP socket.
+struct Ground {
+    socket: UdpSocket,
+    parser: Parser,
+    waiting: Vec<Frame>,
+    /// The companion's texts so far.
+    texts: Vec<String>,
+    bridge: Option<SocketAddr>,
+}
+
+impl Ground {
+    async fn open() -> anyhow::Result<Self> {
+        let socket = UdpSocket::bind("127.0.0.1:0").await?;
+        let (waiting, texts) = (Vec::new(), Vec::new());
+        Ok(Self { socket, parser: Parser::new(), waiting, texts, bridge: None })
+    }
+
+    async fn next(&mut self) -> anyhow::Result<Frame> {
+        let mut bytes = [0; 2048];
+        while self.waiting.is_empty() {
+            let (count, from) = timeout(PATIENCE, self.socket.recv_from(&mut bytes)).await??;
+            self.bridge = Some(from);
+            self.waiting = self.parser.push(&bytes[..count]);
+        }
+        let frame = self.waiting.remove(0);
+        self.keep_text(&frame)?;
+        Ok(frame)
+    }
+
+    async fn expect(&mut self, wanted: impl Fn(&Frame) -> bool) -> anyhow::Result<Frame> {
+        let seen = async {
+            loop {
+                let frame = self.next().await?;
+                if wanted(&frame) {
+                    return Ok(frame);
+                }
+            }
+        };
+        timeout(PATIENCE, seen).await.context("what was expected did not come")?
+    }
+
+    /// Waits for a text of the companion, unless it came already.
+    async fn expect_text(&mut self, wanted: &str) -> anyhow::Result<()> {
+        let seen = async {
+            while !self.texts.iter().any(|text| text == wanted) {
+                self.next().await?;
+            }
+            anyhow::Ok(())
+        };
+        let outcome = timeout(PATIENCE, seen).await;
+        outcome.with_context(|| format!("`{wanted}` is not in {:?}", self.texts))?
+    }
+
+    /// Keeps a text, and joins its parts.
+    fn keep_text(&mut self, frame: &Frame) -> anyhow::Result<()> {
+        let Some(MavMessage::STATUSTEXT(part)) = &frame.message else { return Ok(()) };
+        ensure!(frame.sender == COMPANION, "a text of {:?}", frame.sender);
+        let text = part.text.to_str()?;
+        match self.texts.last_mut() {
+            Some(last) if part.chunk_seq > 0 => last.push_str(text),
+            _ => self.texts.push(text.to_owned()),
+        }
+        Ok(())
+    }
+
+    async fn send(&self, bytes: &[u8]) -> anyhow::Result<()> {
+        let to = self.bridge.context("the bridge was not heard yet")?;
+        self.socket.send_to(bytes, to).await?;
+        Ok(())
+    }
+}
+
+/// What the controller publishes, of a vehicle that hovers over its marker.
+struct FakeVehicle {
+    node: Node,
+    status: Arc<watch::Sender<ControllerStatus>>,
+    to_autopilot: Subscriber<MavlinkBytes>,
+    tasks: [JoinHandle<anyhow::Result<()>>; 2],
+}
+
+impl FakeVehicle {
+    async fn start(port: u16) -> anyhow::Result<Self> {
+        let node = open("controller", "main", port).await?;
+        let first = ControllerStatus {
+            active_detector: None,
+            ..status("search", "looking for the marker")
+        };
+        let status = Arc::new(watch::Sender::new(first));
+        let to_autopilot = node.subscriber(topic::TO_AUTOPILOT, &[]).await?;
+        let tasks = [
+            tokio::spawn(speak(node.clone(), Arc::clone(&status))),
+            tokio::spawn(answer_parameters(node.clone())),
+        ];
+        node.announce().await?;
+        Ok(Self { node, status, to_autopilot, tasks })
+    }
+
+    async fn next_packet(&self) -> anyhow::Result<Vec<u8>> {
+        Ok(self.to_autopilot.next().await.context("the session was closed")?.packet)
+    }
+
+    async fn stop(self) {
+        self.tasks.iter().for_each(JoinHandle::abort);
+        drop(self.to_autopilot);
+        self.node.close().await;
+    }
+}
+
+async fn speak(node: Node, status: Arc<watch::Sender<ControllerStatus>>) -> anyhow::Result<()> {
+    let from_autopilot = node.publisher(topic::FROM_AUTOPILOT, &[]).await?;
+    let statuses = node.publisher(topic::STATUS, &[]).await?;
+    let targets = node.publisher(topic::TARGET, &[]).await?;
+    let mut tick = interval(Duration::from_millis(50));
+    loop {
+        tick.tick().await;
+        for packet in [autopilot_heartbeat(), unknown_packet(AUTOPILOT)] {
+            from_autopilot.publish(&MavlinkBytes { packet }).await;
+        }
+        let now = status.borrow().clone();
+        statuses.publish(&now).await;
+        targets.publish(&target()).await;
+    }
+}
+
+async fn answer_parameters(node: Node) -> anyhow::Result<()> {
+    let requests = node.subscriber(topic::TO_AUTOPILOT, &[]).await?;
+    let answers = node.publisher(topic::FROM_AUTOPILOT, &[]).await?;
+    while let Some(MavlinkBytes { packet }) = requests.next().await {
+        for frame in Parser::new().push(&packet) {
+            let Some(MavMessage::PARAM_REQUEST_READ(request)) = frame.message else { continue };
+            let value = MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
+                param_id: request.param_id,
+                param_value: 50.0,
+                param_count: 1,
+                ..PARAM_VALUE_DATA::default()
+            });
+            answers.publish(&MavlinkBytes { packet: encode(AUTOPILOT, 1, &value) }).await;
+        }
+    }
+    Ok(())
+}
+
+fn status(phase: &str, why: &str) -> ControllerStatus {
+    ControllerStatus {
+        stamp_ns: now_ns(),
+        phase: phase.into(),
+        why: why.into(),
+        guidance: "metric".into(),
+        autopilot: "connected".into(),
+        active_detector: Some("spare".into()),
+        candidates: Vec::new(),
+        detection_age_ms: Some(60.0),
+        height_m: Some(10.0),
+        lateral_error_m: Some(1.93),
+        setpoint: None,
+        started_ns: Some(0),
+        disarmed_ns: None,
+        finished: false,
+        detections_used: 1,
+        latency_ms: None,
+    }
+}
+
+fn target() -> TargetEstimate {
+    TargetEstimate {
+        stamp_ns: now_ns(),
+        position_ned_m: Some([1.5, -1.5, 0.0]),
+        lateral_error_m: Some(1.93),
+        height_m: Some(10.0),
+        age_ms: Some(60.0),
+        rejected: None,
+    }
+}
+
+fn is_heartbeat(frame: &Frame) -> bool {
+    matches!(frame.message, Some(MavMessage::HEARTBEAT(_)))
+}
+
+fn autopilot_heartbeat() -> Vec<u8> {
+    let heartbeat = HEARTBEAT_DATA {
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
+        ..HEARTBEAT_DATA::default()
+    };
+    encode(AUTOPILOT, 0, &MavMessage::HEARTBEAT(heartbeat))
+}
+
+fn param_request(index: i16) -> MavMessage {
+    MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
+        param_index: index,
+        target_system: AUTOPILOT.system,
+        target_component: AUTOPILOT.component,
+        ..PARAM_REQUEST_READ_DATA::default()
+    })
+}
+
+fn command_to(target: Sender) -> MavMessage {
+    MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_REQUEST_MESSAGE,
+        target_system: target.system,
+        target_component: target.component,
+        ..COMMAND_LONG_DATA::default()
+    })
+}
+
+/// A number that no dialect gives to a message.
+const UNKNOWN_ID: u32 = 16_000_000;
+
+fn unknown_packet(sender: Sender) -> Vec<u8> {
+    let [id0, id1, id2, _] = UNKNOWN_ID.to_le_bytes();
+    let mut packet = vec![0xFD, 4, 0, 0, 9, sender.system, sender.component, id0, id1, id2];
+    packet.extend([1, 2, 3, 4]);
+    let crc = packet.iter().skip(1).fold(0xFFFF, |crc, byte| crc_step(crc, *byte));
+    packet.extend(crc_step(crc, 42).to_le_bytes());
+    packet
+}
+
+/// One byte of the X.25 checksum, bit by bit.
+fn crc_step(crc: u16, byte: u8) -> u16 {
+    (0..8).fold(
+        crc ^ u16::from(byte),
+        |crc, _| {
+            if crc & 1 == 1 { (crc >> 1) ^ 0x8408 } else { crc >> 1 }
+        },
+    )
+}
