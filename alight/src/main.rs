@@ -1,2 +1,21 @@
-//! Lands a UAV on a printed marker.
-fn main() {}
+//! Lands a UAV on a printed marker: every service and tool as a subcommand of one program.
+//!
+//! Modules in reading order: [`cli`] is what can be asked, [`services`] runs one service in this process, [`land`]
+//! runs them all as processes and watches the landing, with [`children`] for the processes, [`progress`] for what is
+//! shown meanwhile and [`outcome`] for the result; [`detect`] and [`marker`] are tools.
+
+mod children;
+mod cli;
+mod detect;
+mod land;
+mod marker;
+mod outcome;
+mod progress;
+mod services;
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    node::relaunch_with_zenoh_threads();
+    cli::run()
+}

@@ -425,6 +425,11 @@ impl Flight {
                     "Another vehicle is on the link and is ignored; pin ours with autopilot.system_id"
                 );
             }
+            Event::SameAddress { .. } => {
+                tracing::warn!(
+                    "Another companion speaks in our name; give one of the two another autopilot.component_id"
+                );
+            }
             Event::Lost { silence } => tracing::error!(?silence, "The autopilot is silent"),
             Event::Returned => tracing::info!("The autopilot is heard again"),
             Event::ModeChanged { from, to } => tracing::info!(?from, %to, "Flight mode"),
@@ -498,6 +503,8 @@ impl Flight {
                     yaw_rate_rad_s: yaw_rate,
                 });
             }
+            // LAND was asked for and has just begun.
+            Err(_) if self.lander.phase() == Phase::Final => {}
             Err(problem) => {
                 if self.health.failed("setpoints") {
                     tracing::warn!(%problem, "A setpoint was not sent; further ones are counted only");

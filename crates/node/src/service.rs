@@ -85,11 +85,11 @@ where
 /// Starts logging to standard error: at `default_level` and above, unless `ALIGHT_LOG` says otherwise.
 pub fn start_logging(default_level: &str) {
     let ours = std::env::var("ALIGHT_LOG").unwrap_or_else(|_| default_level.to_owned());
-    // Zenoh warns about every attempt at the meeting point, which is how it is meant to work.
+    // Zenoh complains about every attempt at the meeting point, by whoever keeps it too; that is how it is meant to work.
     let filter = EnvFilter::try_new(format!(
-        "zenoh=error,zenoh_transport=error,zenoh_shm=error,zenoh_link=error,{ours}"
+        "zenoh=error,zenoh_transport=off,zenoh_link=error,zenoh_shm=error,{ours}"
     ))
-    .unwrap_or_else(|_| EnvFilter::new("zenoh=error,info"));
+    .unwrap_or_else(|_| EnvFilter::new("info,zenoh=error,zenoh_transport=off"));
     let log = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)

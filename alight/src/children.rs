@@ -1,0 +1,126 @@
+//! The services as child processes: start them, hear what they say, notice their end, stop them.
+
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
+
+use anyhow::Context;
+use rustix::process::{Pid, Signal, kill_process};
+use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::process::{Child, Command};
+use tokio::sync::mpsc;
+
+use crate::services::Service;
+
+/// How long a service may take to stop by itself.
+const STOP_PATIENCE: Duration = Duration::from_secs(2);
+/// Lines that wait to be shown; a service that says more meanwhile waits until some are.
+const LINES_WAITING: usize = 256;
+
+/// What a child did.
+pub(crate) enum News {
+    /// It wrote a line.
+    Said(Service, String),
+    /// It ended.
+    Ended(Service, String),
+}
+
+/// The running children.
+pub(crate) struct Children {
+    pids: Vec<(Service, Pid)>,
+    sender: mpsc::Sender<News>,
+    news: mpsc::Receiver<News>,
+}
+
+impl Children {
+    pub(crate) fn new() -> Self {
+        let (sender, news) = mpsc::channel(LINES_WAITING);
+        Self { pids: Vec::new(), sender, news }
+    }
+
+    /// Starts a service as a process of this same program.
+    pub(crate) fn start(
+        &mut self,
+        service: Service,
+        zenoh: &Path,
+        settings: &[String],
+    ) -> anyhow::Result<()> {
+        let program = std::env::current_exe().context("finding this program's own file")?;
+        let mut command = Command::new(program);
+        command.arg(service.name()).arg("--stop-with-parent").arg("--zenoh").arg(zenoh);
+        for setting in settings {
+            command.arg("--set").arg(setting);
+        }
+        if std::env::var_os("ALIGHT_LOG").is_none() {
+            command.env("ALIGHT_LOG", "warn");
+        }
+        let child = command
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .kill_on_drop(true)
+            .spawn()
+            .with_context(|| format!("starting {}", service.name()))?;
+        if let Some(pid) = child.id().and_then(|id| i32::try_from(id).ok()).and_then(Pid::from_raw)
+        {
+            self.pids.push((service, pid));
+        }
+        tokio::spawn(follow(service, child, self.sender.clone()));
+        Ok(())
+    }
+
+    /// The next news.
+    pub(crate) async fn next(&mut self) -> Option<News> {
+        self.news.recv().await
+    }
+
+    /// The process ids, by service.
+    pub(crate) fn pids(&self) -> impl Iterator<Item = (Service, i32)> {
+        self.pids.iter().map(|(service, pid)| (*service, pid.as_raw_nonzero().get()))
+    }
+
+    /// Forgets a child that has ended.
+    pub(crate) fn forget(&mut self, service: Service) {
+        self.pids.retain(|(running, _)| *running != service);
+    }
+
+    /// Asks all to stop, waits, and stops those that do not.
+    pub(crate) async fn stop(mut self) {
+        for signal in [Signal::TERM, Signal::KILL] {
+            for (_, pid) in &self.pids {
+                // One that has ended meanwhile needs no signal.
+                let _ = kill_process(*pid, signal);
+            }
+            let all_ended = async {
+                while !self.pids.is_empty() {
+                    match self.news.recv().await {
+                        Some(News::Ended(service, _)) => {
+                            self.pids.retain(|(running, _)| *running != service);
+                        }
+                        Some(News::Said(..)) => {}
+                        None => return,
+                    }
+                }
+            };
+            if tokio::time::timeout(STOP_PATIENCE, all_ended).await.is_ok() {
+                return;
+            }
+        }
+    }
+}
+
+/// Tells what a child says, and then its end.
+async fn follow(service: Service, mut child: Child, news: mpsc::Sender<News>) {
+    if let Some(stderr) = child.stderr.take() {
+        let mut lines = BufReader::new(stderr).lines();
+        while let Ok(Some(line)) = lines.next_line().await {
+            // Nobody listens any more once everything is being stopped.
+            drop(news.send(News::Said(service, line)).await);
+        }
+    }
+    let end = match child.wait().await {
+        Ok(status) => status.to_string(),
+        Err(cause) => cause.to_string(),
+    };
+    drop(news.send(News::Ended(service, end)).await);
+}

@@ -1,0 +1,175 @@
+//! The command line.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use messages::ControllerCommand;
+use node::{ConfigError, Identity, Layers, Node, ZenohSource};
+
+use crate::services::{self, Service};
+use crate::{detect, land, marker};
+
+/// Exit status for a command line or a configuration that asks for something impossible.
+const WRONG_USE: u8 = 2;
+
+/// Lands a UAV on a printed marker. Without a subcommand: `alight land`.
+#[derive(Parser)]
+#[command(version, args_conflicts_with_subcommands = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Option<Command>,
+    #[command(flatten)]
+    land: land::LandArgs,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Land: start all services as processes, show the landing, print the result.
+    Land(land::LandArgs),
+    /// Publish frames from image files.
+    CameraPub(ServiceArgs),
+    /// Find markers in frames.
+    Detector(ServiceArgs),
+    /// Land the vehicle by what a detector finds.
+    Controller(ServiceArgs),
+    /// Talk to the ground station.
+    GcsBridge(ServiceArgs),
+    /// Simulate a world with wind, a pad, a vehicle, an autopilot and a camera.
+    Simulator(ServiceArgs),
+    /// Find markers in image files.
+    Detect(detect::DetectArgs),
+    /// Make a marker to print.
+    Marker(marker::MarkerArgs),
+    /// Print the effective configuration of a service, or of all.
+    Config(ConfigArgs),
+    /// Tell a running controller what to do.
+    Command(CommandArgs),
+}
+
+/// What every service takes.
+#[derive(Args, Clone, Default)]
+pub(crate) struct ServiceArgs {
+    /// Settings to lay over the defaults (TOML).
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Zenoh configuration (JSON5); the built-in `local.json5` otherwise.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) zenoh: Option<PathBuf>,
+    /// One setting to lay over the file: dotted key, TOML value. May be repeated.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// Stop when the program that started this one ends.
+    #[arg(long, hide = true)]
+    pub(crate) stop_with_parent: bool,
+}
+
+#[derive(Args)]
+struct ConfigArgs {
+    /// The service; all of them otherwise.
+    #[arg(value_enum)]
+    service: Option<Service>,
+    /// Settings to lay over the defaults (TOML).
+    #[arg(long, value_name = "FILE", requires = "service")]
+    config: Option<PathBuf>,
+    /// One setting to lay over the file. May be repeated.
+    #[arg(long, value_name = "KEY=VALUE", requires = "service")]
+    set: Vec<String>,
+}
+
+#[derive(Args)]
+struct CommandArgs {
+    /// What to do.
+    #[arg(value_enum)]
+    command: OperatorCommand,
+    /// The detector, for `use-detector`.
+    #[arg(required_if_eq("command", "use-detector"))]
+    detector: Option<String>,
+    /// Zenoh configuration (JSON5); the built-in `local.json5` otherwise.
+    #[arg(long, value_name = "FILE")]
+    zenoh: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum OperatorCommand {
+    /// Begin to land.
+    Start,
+    /// Stop where it is, and wait.
+    Hold,
+    /// Go on after a hold.
+    Resume,
+    /// Give the landing up.
+    Abort,
+    /// Use a certain detector from now on.
+    UseDetector,
+}
+
+/// Does what the command line asks for; errors go to standard error.
+pub(crate) fn run() -> ExitCode {
+    let cli = Cli::parse();
+    let result = match cli.command.unwrap_or(Command::Land(cli.land)) {
+        Command::Land(args) => land::run(&args),
+        Command::CameraPub(args) => services::run(Service::CameraPub, &args),
+        Command::Detector(args) => services::run(Service::Detector, &args),
+        Command::Controller(args) => services::run(Service::Controller, &args),
+        Command::GcsBridge(args) => services::run(Service::GcsBridge, &args),
+        Command::Simulator(args) => services::run(Service::Simulator, &args),
+        Command::Detect(args) => detect::run(&args),
+        Command::Marker(args) => marker::run(&args),
+        Command::Config(args) => print_config(args),
+        Command::Command(args) => send_command(args),
+    };
+    result.unwrap_or_else(|problem| {
+        let wrong_use = problem.downcast_ref::<ConfigError>().is_some();
+        write_error(&format!("alight: {problem:#}"));
+        ExitCode::from(if wrong_use { WRONG_USE } else { 1 })
+    })
+}
+
+fn print_config(args: ConfigArgs) -> anyhow::Result<ExitCode> {
+    use std::io::Write;
+    let layers = Layers { file: args.config, set: args.set };
+    let wanted = |s: &Service| args.service.is_none_or(|service| service == *s);
+    let mut out = std::io::stdout().lock();
+    for service in Service::value_variants().iter().copied().filter(wanted) {
+        let table = service.effective_config(&layers)?;
+        writeln!(out, "# {}\n{table}", service.name())?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn send_command(args: CommandArgs) -> anyhow::Result<ExitCode> {
+    use std::io::Write;
+    let command = match args.command {
+        OperatorCommand::Start => ControllerCommand::Start,
+        OperatorCommand::Hold => ControllerCommand::Hold,
+        OperatorCommand::Resume => ControllerCommand::Resume,
+        OperatorCommand::Abort => ControllerCommand::Abort,
+        OperatorCommand::UseDetector => {
+            ControllerCommand::UseDetector(args.detector.unwrap_or_default())
+        }
+    };
+    node::start_logging("warn");
+    let reply = services::runtime()?.block_on(async {
+        let instance = format!("command-{}", std::process::id());
+        let identity = Identity { service: "alight", instance };
+        let node = Node::open(identity, &zenoh_source(args.zenoh)).await?;
+        let reply = node.command(&command).await;
+        node.close().await;
+        reply
+    })?;
+    let verdict = if reply.accepted { "accepted" } else { "refused" };
+    writeln!(std::io::stdout(), "{verdict}: {}", reply.reason)?;
+    Ok(ExitCode::from(u8::from(!reply.accepted)))
+}
+
+/// The session's configuration that a command line names.
+pub(crate) fn zenoh_source(file: Option<PathBuf>) -> ZenohSource {
+    file.map_or(ZenohSource::Local, ZenohSource::File)
+}
+
+/// Writes a line to standard error; when that is closed there is nobody left to tell.
+pub(crate) fn write_error(line: &str) {
+    use std::io::Write;
+    drop(writeln!(std::io::stderr(), "{line}"));
+}

@@ -1,0 +1,283 @@
+//! What came of a landing: the flight as it was watched, and its result.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use messages::{ControllerStatus, Health, Truth};
+use serde::Serialize;
+
+/// The thesis' one simulated flight (section 4.4.3).
+const THESIS_TIME_S: f64 = 55.0;
+const THESIS_ERROR_M: f64 = 0.0682;
+
+/// A flight, as it is being watched.
+#[derive(Default)]
+pub(crate) struct Flight {
+    pub(crate) last_status: Option<ControllerStatus>,
+    pub(crate) last_truth: Option<Truth>,
+    /// First and last health by service and process.
+    healths: BTreeMap<(String, u32), (Health, Health)>,
+    /// The first start that was told: a controller that was started again counts from its own.
+    started_ns: Option<i64>,
+    disarmed_ns: Option<i64>,
+    interrupted: Option<String>,
+    /// Detections used by controllers that are gone.
+    detections_before: u64,
+}
+
+/// The result of a landing.
+#[derive(Serialize)]
+pub(crate) struct Outcome {
+    pub(crate) landed: bool,
+    outcome: String,
+    time_to_disarm_s: Option<f64>,
+    time_to_touchdown_s: Option<f64>,
+    touchdown_error_m: Option<f64>,
+    touchdown_speed_m_s: Option<f64>,
+    touchdown_lateral_speed_m_s: Option<f64>,
+    max_tilt_deg: Option<f64>,
+    detections: u64,
+    frames: u64,
+    latency_ms: Option<Percentiles>,
+    guidance: String,
+    processes: Vec<Process>,
+}
+
+/// Median and 99th percentile.
+#[derive(Serialize)]
+struct Percentiles {
+    p50: f64,
+    p99: f64,
+}
+
+/// The cost of a process.
+#[derive(Serialize)]
+struct Process {
+    service: String,
+    pid: u32,
+    /// Share of one core, in percent, from its first to its last report.
+    cpu_percent: f64,
+}
+
+impl Flight {
+    /// Takes a status in; true when the controller says that nothing more will happen.
+    pub(crate) fn status(&mut self, status: ControllerStatus) -> bool {
+        self.started_ns = self.started_ns.or(status.started_ns);
+        self.disarmed_ns = self.disarmed_ns.or(status.disarmed_ns);
+        if let Some(last) = &self.last_status
+            && last.detections_used > status.detections_used
+        {
+            self.detections_before += last.detections_used;
+        }
+        let finished = status.finished;
+        self.last_status = Some(status);
+        finished
+    }
+
+    pub(crate) fn truth(&mut self, truth: Truth) {
+        self.last_truth = Some(truth);
+    }
+
+    pub(crate) fn health(&mut self, health: Health) {
+        let key = (health.service.clone(), health.pid);
+        let span = self.healths.entry(key).or_insert_with(|| (health.clone(), health.clone()));
+        span.1 = health;
+    }
+
+    /// Ends the watch before the landing.
+    pub(crate) fn interrupted(&mut self, why: &str) {
+        self.interrupted = Some(why.to_owned());
+    }
+
+    /// True while no landing has begun.
+    pub(crate) fn never_flew(&self) -> bool {
+        self.started_ns.is_none()
+    }
+
+    /// Frames a second, as the detectors count them.
+    pub(crate) fn frame_rate_hz(&self) -> Option<f64> {
+        let camera = self
+            .healths
+            .iter()
+            .find(|((service, _), _)| service == "simulator" || service == "camera-pub")?;
+        let rates = &camera.1.1.rates;
+        rates.iter().find(|rate| rate.name == "frames").map(|rate| rate.hz)
+    }
+
+    /// The result.
+    pub(crate) fn outcome(&self) -> Outcome {
+        let status = self.last_status.as_ref();
+        let touchdown = self.last_truth.as_ref().and_then(|t| t.touchdown);
+        let since_start = |ns: i64| self.started_ns.map(|start| (ns - start) as f64 * 1e-9);
+        let landed = self.disarmed_ns.is_some() && touchdown.is_some();
+        let outcome = match (&self.interrupted, status) {
+            (Some(why), Some(status)) => {
+                format!("{why}; it was in `{}`: {}", status.phase, status.why)
+            }
+            (Some(why), None) => format!("{why}; no controller was heard"),
+            (None, _) if landed => "landed".to_owned(),
+            (None, Some(status)) => format!("{}: {}", status.phase, status.why),
+            (None, None) => "no controller was heard".to_owned(),
+        };
+        Outcome {
+            landed,
+            outcome,
+            time_to_disarm_s: self.disarmed_ns.and_then(since_start),
+            time_to_touchdown_s: touchdown.and_then(|t| since_start(t.stamp_ns)),
+            touchdown_error_m: touchdown.map(|t| t.error_m),
+            touchdown_speed_m_s: touchdown.map(|t| t.vertical_speed_m_s),
+            touchdown_lateral_speed_m_s: touchdown.map(|t| t.lateral_speed_m_s),
+            max_tilt_deg: self.last_truth.as_ref().map(|t| t.max_tilt_rad.to_degrees()),
+            detections: self.detections_before + status.map_or(0, |s| s.detections_used),
+            frames: self.last_truth.as_ref().map_or(0, |t| t.frames),
+            latency_ms: status
+                .and_then(|s| s.latency_ms)
+                .map(|[p50, p99]| Percentiles { p50, p99 }),
+            guidance: status.map_or_else(String::new, |s| s.guidance.clone()),
+            processes: self.processes(),
+        }
+    }
+
+    fn processes(&self) -> Vec<Process> {
+        let cost = |((service, pid), (first, last)): (&(String, u32), &(Health, Health))| {
+            let wall_s = last.uptime_s - first.uptime_s;
+            let cpu_percent =
+                if wall_s > 0.0 { 100.0 * (last.cpu_s - first.cpu_s) / wall_s } else { 0.0 };
+            Process { service: service.clone(), pid: *pid, cpu_percent }
+        };
+        self.healths.iter().map(cost).collect()
+    }
+}
+
+impl Outcome {
+    /// The result beside the thesis' flight, for people.
+    pub(crate) fn table(&self) -> String {
+        let mut text = String::new();
+        let verdict = if self.landed { "Landed." } else { "Not landed:" };
+        let detail = if self.landed { "" } else { &self.outcome };
+        // Writing to a string cannot fail.
+        let mut line = |args: std::fmt::Arguments<'_>| {
+            let _ = writeln!(text, "{args}");
+        };
+        line(format_args!("{verdict} {detail}"));
+        line(format_args!("{:34} {:>14} {:>14}", "", "this flight", "thesis"));
+        let mut row = |name: &str, value: Option<f64>, unit: &str, digits: usize, thesis: &str| {
+            let value = value.map_or("-".to_owned(), |v| format!("{v:.digits$} {unit}"));
+            line(format_args!("{name:34} {value:>14} {thesis:>14}"));
+        };
+        row("time to disarm", self.time_to_disarm_s, "s", 1, &format!("{THESIS_TIME_S:.0} s"));
+        row("time to touchdown", self.time_to_touchdown_s, "s", 1, "-");
+        row("touchdown error", self.touchdown_error_m, "m", 3, &format!("{THESIS_ERROR_M:.3} m"));
+        row("vertical speed at touchdown", self.touchdown_speed_m_s, "m/s", 2, "-");
+        row("lateral speed at touchdown", self.touchdown_lateral_speed_m_s, "m/s", 2, "-");
+        row("largest tilt", self.max_tilt_deg, "deg", 1, "-");
+        let latency = self.latency_ms.as_ref();
+        row("stamp to setpoint, median", latency.map(|l| l.p50), "ms", 1, "-");
+        row("stamp to setpoint, 99 %", latency.map(|l| l.p99), "ms", 1, "-");
+        line(format_args!(
+            "{:34} {:>14}",
+            "detections used of frames",
+            format!("{} of {}", self.detections, self.frames)
+        ));
+        for process in &self.processes {
+            let name = format!("processor, {}", process.service);
+            line(format_args!(
+                "{name:34} {:>14}",
+                format!("{:.0} % of a core", process.cpu_percent)
+            ));
+        }
+        text.truncate(text.trim_end().len());
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use messages::Touchdown;
+
+    fn status(phase: &str) -> ControllerStatus {
+        ControllerStatus {
+            stamp_ns: 0,
+            phase: phase.into(),
+            why: "because".into(),
+            guidance: "metric".into(),
+            autopilot: String::new(),
+            active_detector: None,
+            candidates: Vec::new(),
+            detection_age_ms: None,
+            height_m: None,
+            lateral_error_m: None,
+            setpoint: None,
+            started_ns: None,
+            disarmed_ns: None,
+            finished: false,
+            detections_used: 0,
+            latency_ms: None,
+        }
+    }
+
+    fn truth(touchdown: Option<Touchdown>) -> Truth {
+        Truth {
+            stamp_ns: 0,
+            ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+            position_ned_m: [0.0; 3],
+            velocity_ned_m_s: [0.0; 3],
+            pad_ned_m: [0.0; 3],
+            on_ground: touchdown.is_some(),
+            touchdown,
+            max_tilt_rad: 0.1,
+            frames: 300,
+        }
+    }
+
+    #[test]
+    fn a_landing_counts_from_the_first_start_whatever_controller_ends_it() {
+        let mut flight = Flight::default();
+        let second = 1_000_000_000;
+        flight.status(ControllerStatus {
+            started_ns: Some(second),
+            detections_used: 40,
+            ..status("descend")
+        });
+        // A controller that was started again.
+        flight.status(ControllerStatus {
+            started_ns: Some(9 * second),
+            detections_used: 2,
+            ..status("descend")
+        });
+        let touchdown = Touchdown {
+            stamp_ns: 14 * second,
+            error_m: 0.02,
+            vertical_speed_m_s: 0.5,
+            lateral_speed_m_s: 0.0,
+        };
+        flight.truth(truth(Some(touchdown)));
+        let done = ControllerStatus {
+            started_ns: Some(9 * second),
+            disarmed_ns: Some(16 * second),
+            finished: true,
+            detections_used: 60,
+            ..status("landed")
+        };
+        assert!(flight.status(done));
+        let outcome = flight.outcome();
+        assert!(outcome.landed && outcome.outcome == "landed");
+        assert_eq!(
+            (outcome.time_to_disarm_s, outcome.time_to_touchdown_s),
+            (Some(15.0), Some(13.0))
+        );
+        assert_eq!(outcome.detections, 100);
+        assert!(outcome.table().contains("0.020 m        0.068 m"), "{}", outcome.table());
+    }
+
+    #[test]
+    fn a_flight_that_is_broken_off_says_where_it_was() {
+        let mut flight = Flight::default();
+        flight.status(status("search"));
+        flight.interrupted("interrupted");
+        let outcome = flight.outcome();
+        assert!(!outcome.landed);
+        assert_eq!(outcome.outcome, "interrupted; it was in `search`: because");
+    }
+}

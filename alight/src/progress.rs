@@ -1,0 +1,148 @@
+//! What is shown during a landing: a few lines that are redrawn on a terminal, else a line for each change.
+
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use messages::ControllerStatus;
+
+use crate::cli::write_error;
+use crate::land::Format;
+use crate::outcome::Flight;
+
+/// The view of a landing.
+pub(crate) struct Progress {
+    /// Nothing where standard error is no terminal.
+    live: Option<ProgressBar>,
+    phase: String,
+    active_detector: Option<String>,
+}
+
+impl Progress {
+    pub(crate) fn new(format: Format) -> Self {
+        use std::io::IsTerminal;
+        let is_live = format == Format::Text && std::io::stderr().is_terminal();
+        let live = is_live.then(|| {
+            let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+            if let Ok(style) =
+                ProgressStyle::with_template("{spinner:.cyan} {elapsed_precise} {msg}")
+            {
+                bar.set_style(style);
+            }
+            bar.enable_steady_tick(Duration::from_millis(200));
+            bar
+        });
+        Self { live, phase: String::new(), active_detector: None }
+    }
+
+    /// Shows a line that stays.
+    pub(crate) fn say(&self, line: &str) {
+        match &self.live {
+            Some(bar) => bar.println(line),
+            None => write_error(line),
+        }
+    }
+
+    /// Shows a line that only programs and the curious want.
+    pub(crate) fn debug(&self, line: &str) {
+        if self.live.is_none() {
+            write_error(line);
+        }
+    }
+
+    /// Tells a change of phase or of detector.
+    pub(crate) fn status(&mut self, status: &ControllerStatus) {
+        if status.phase != self.phase {
+            self.phase.clone_from(&status.phase);
+            self.say(&format!("{}: {}", status.phase, status.why));
+        }
+        if status.active_detector != self.active_detector {
+            self.active_detector.clone_from(&status.active_detector);
+            let name = status.active_detector.as_deref().unwrap_or("none");
+            self.say(&format!("active detector: {name}"));
+        }
+    }
+
+    /// Redraws the live view.
+    pub(crate) fn draw(&self, flight: &Flight) {
+        if let (Some(bar), Some(status)) = (&self.live, &flight.last_status) {
+            bar.set_message(live_lines(status, flight.frame_rate_hz()));
+        }
+    }
+
+    /// Clears the live view.
+    pub(crate) fn finish(&self) {
+        if let Some(bar) = &self.live {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+fn live_lines(status: &ControllerStatus, frame_rate_hz: Option<f64>) -> String {
+    let number = |value: Option<f64>, digits: usize, unit: &str| match value {
+        Some(value) => format!("{value:.digits$} {unit}"),
+        None => format!("- {unit}"),
+    };
+    let others: Vec<&str> = status
+        .candidates
+        .iter()
+        .map(|c| c.detector.as_str())
+        .filter(|name| Some(*name) != status.active_detector.as_deref())
+        .collect();
+    let standby = if others.is_empty() {
+        String::new()
+    } else {
+        format!(" (standing by: {})", others.join(", "))
+    };
+    format!(
+        "{}: {}\n  height {:>8}   lateral error {:>8}\n  frames {:>8}   detection age {:>7}   detector {}{standby}",
+        status.phase,
+        status.why,
+        number(status.height_m, 2, "m"),
+        number(status.lateral_error_m, 3, "m"),
+        number(frame_rate_hz, 1, "Hz"),
+        number(status.detection_age_ms, 0, "ms"),
+        status.active_detector.as_deref().unwrap_or("none"),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use messages::Candidate;
+
+    #[test]
+    fn the_live_view_names_what_a_pilot_asks_for() {
+        let candidate = |name: &str| Candidate {
+            detector: name.into(),
+            age_ms: 60.0,
+            rate_hz: 15.0,
+            alive: true,
+            disagreement_m: None,
+        };
+        let status = ControllerStatus {
+            stamp_ns: 0,
+            phase: "descend".into(),
+            why: "descending over the marker".into(),
+            guidance: "metric".into(),
+            autopilot: String::new(),
+            active_detector: Some("main".into()),
+            candidates: vec![candidate("main"), candidate("spare")],
+            detection_age_ms: Some(63.4),
+            height_m: Some(4.321),
+            lateral_error_m: Some(0.0123),
+            setpoint: None,
+            started_ns: None,
+            disarmed_ns: None,
+            finished: false,
+            detections_used: 0,
+            latency_ms: None,
+        };
+        let text = live_lines(&status, Some(15.02));
+        for part in
+            ["descend", "4.32 m", "0.012 m", "15.0 Hz", "63 ms", "main", "standing by: spare"]
+        {
+            assert!(text.contains(part), "`{part}` is not in: {text}");
+        }
+        assert!(live_lines(&ControllerStatus { height_m: None, ..status }, None).contains("- m"));
+    }
+}
