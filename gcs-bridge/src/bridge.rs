@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Context;
 use autopilot::compose::heartbeat;
 use autopilot::dialect::{MavMessage, MavSeverity, MavState};
-use autopilot::frame::encode;
+use autopilot::frame::{Counters, encode};
 use autopilot::link::SendError;
 use autopilot::{Address, Frame, Link, LinkEvent, LinkSender, Parser, Sender};
 use messages::{ControllerStatus, MavlinkBytes, TargetEstimate, topic};
@@ -61,7 +61,10 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                 let (controller, is_there) = change.context(CLOSED)?;
                 bridge.controller(now_ns(), controller, is_there);
             }
-            _ = second.tick() => bridge.second(now_ns(), ground.dropped()),
+            _ = second.tick() => {
+                bridge.count_losses(ground.counters(), ground.dropped());
+                bridge.second(now_ns());
+            }
         }
     }
 }
@@ -84,7 +87,8 @@ struct Bridge {
     /// Whether a controller was there and left.
     deserted: bool,
     ground_heard_ns: Option<i64>,
-    /// Packets from the ground that were not read in time, as far as they are counted.
+    /// Bytes and packets of the ground that were lost, as far as they are counted.
+    noise: u64,
     unread: u64,
     /// Number of our next packet.
     sequence: u8,
@@ -108,6 +112,7 @@ impl Bridge {
             controllers: BTreeSet::new(),
             deserted: false,
             ground_heard_ns: None,
+            noise: 0,
             unread: 0,
             sequence: 0,
         }
@@ -243,12 +248,20 @@ impl Bridge {
         }
     }
 
-    /// What is done every second: the heartbeat, and what could not be told earlier.
-    fn second(&mut self, now_ns: i64, unread: u64) {
+    /// Counts what was lost on the ground's side since the last second.
+    fn count_losses(&mut self, heard: Counters, unread: u64) {
+        if heard.bad_bytes > self.noise {
+            self.health.dropped("from ground: seconds with bytes that are no packet");
+        }
         for _ in self.unread..unread {
             self.health.dropped("from ground: not read in time");
         }
+        self.noise = heard.bad_bytes;
         self.unread = unread;
+    }
+
+    /// What is done every second: the heartbeat, and what could not be told earlier.
+    fn second(&mut self, now_ns: i64) {
         self.speak(now_ns, &self.heartbeat());
         self.tell(now_ns);
     }

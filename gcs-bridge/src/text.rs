@@ -13,8 +13,8 @@ const REFILL_NS: i64 = 500_000_000;
 /// Tells changes, each once; a controller that flutters cannot flood the ground.
 #[derive(Debug)]
 pub(crate) struct Teller {
-    /// What the ground was told last; none when it was told nothing.
-    phase: Option<String>,
+    /// The phase and reason that the ground was told last, without numbers; none when it was told nothing.
+    told: Option<String>,
     /// The same for the active detector; none while there was none.
     detector: Option<String>,
     tokens: u32,
@@ -25,21 +25,23 @@ pub(crate) struct Teller {
 impl Teller {
     /// A teller that has told nothing.
     pub(crate) fn new(now_ns: i64) -> Self {
-        Self { phase: None, detector: None, tokens: BURST, refilled_ns: now_ns, next_id: 1 }
+        Self { told: None, detector: None, tokens: BURST, refilled_ns: now_ns, next_id: 1 }
     }
 
     /// The texts for what is new in a status. What does not fit now is told with a later status, if it still holds.
     pub(crate) fn status(&mut self, now_ns: i64, status: &ControllerStatus) -> Vec<MavMessage> {
         let mut packets = Vec::new();
-        if self.phase.as_ref() != Some(&status.phase) {
-            let text = match status.why.is_empty() {
-                true => format!("Alight: {}", status.phase),
-                false => format!("Alight: {}: {}", status.phase, status.why),
-            };
-            if let Some(text) = self.say(now_ns, severity(&status.phase), &text) {
-                packets.extend(text);
-                self.phase = Some(status.phase.clone());
-            }
+        let text = match status.why.is_empty() {
+            true => format!("Alight: {}", status.phase),
+            false => format!("Alight: {}: {}", status.phase, status.why),
+        };
+        // A height that changes while everything else stays is no news.
+        let news: String = text.chars().filter(|c| !c.is_ascii_digit()).collect();
+        if self.told.as_ref() != Some(&news)
+            && let Some(text) = self.say(now_ns, severity(&status.phase), &text)
+        {
+            packets.extend(text);
+            self.told = Some(news);
         }
         if self.detector != status.active_detector {
             let (severity, text) = match &status.active_detector {
@@ -74,7 +76,7 @@ impl Teller {
 
     /// Tells everything anew, to a ground station or of a controller that was not there before.
     pub(crate) fn forget(&mut self) {
-        self.phase = None;
+        self.told = None;
         self.detector = None;
     }
 }
@@ -82,7 +84,7 @@ impl Teller {
 /// How loud a phase is told; a ground station reads warnings and worse aloud.
 fn severity(phase: &str) -> MavSeverity {
     match phase {
-        "aborted" => MavSeverity::MAV_SEVERITY_CRITICAL,
+        "aborted" | "failed" => MavSeverity::MAV_SEVERITY_CRITICAL,
         "hold" => MavSeverity::MAV_SEVERITY_WARNING,
         "landed" | "pilot-in-command" => MavSeverity::MAV_SEVERITY_NOTICE,
         _ => MavSeverity::MAV_SEVERITY_INFO,
@@ -150,14 +152,16 @@ mod tests {
     }
 
     #[test]
-    fn a_phase_is_told_once_with_its_reason() {
+    fn a_phase_and_its_reason_are_told_once() {
         let mut teller = Teller::new(0);
         let search = status("search", "looking for the marker", None);
         let told = join(&teller.status(0, &search));
         assert_eq!(told.len(), 1);
         assert_eq!(told[0].1, "Alight: search: looking for the marker");
         assert!(teller.status(0, &search).is_empty());
-        assert!(teller.status(0, &status("search", "another reason", None)).is_empty());
+        let told = join(&teller.status(0, &status("search", "waiting 1 s", None)));
+        assert_eq!(told[0].1, "Alight: search: waiting 1 s");
+        assert!(teller.status(0, &status("search", "waiting 2 s", None)).is_empty());
         let told = join(&teller.status(0, &status("aborted", "", None)));
         assert_eq!(told, [(MavSeverity::MAV_SEVERITY_CRITICAL, "Alight: aborted".to_owned())]);
         teller.forget();
