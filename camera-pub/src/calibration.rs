@@ -156,7 +156,7 @@ fn matrix_form(root: &Value) -> Result<CameraModel, Problem> {
     };
     let rest = [skew, zero, zero_x, zero_y, one - 1.0];
     // A skew of less than a millionth of the focal length moves no pixel of any image.
-    if rest.iter().any(|r| !(r.abs() <= 1e-6 * fx.abs().max(1.0))) {
+    if rest.iter().any(|r| r.abs() > 1e-6 * fx.abs().max(1.0)) {
         return Err(wrong(key, value, expected));
     }
     let size = size(root)?;

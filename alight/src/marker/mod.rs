@@ -1,0 +1,157 @@
+//! `alight marker`: a marker to print, true to scale.
+
+mod glyphs;
+mod pdf;
+mod png;
+mod sheet;
+mod svg;
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::Args;
+use fiducial::Marker;
+
+pub(crate) use sheet::SheetError;
+use sheet::{Paper, Sheet};
+
+/// What `alight marker` is told.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct MarkerArgs {
+    /// The marker: FAMILY:ID, or FAMILY for a family without ids (rings).
+    marker: Marker,
+    /// Its size in metres: the outer diameter of rings, the edge of the outer black square of others.
+    #[arg(long, value_name = "M", value_parser = size_m)]
+    size: Option<f64>,
+    /// The paper it is printed on.
+    #[arg(long, value_enum, ignore_case = true, default_value_t = Paper::A4)]
+    paper: Paper,
+    /// The file to write; its name ends in .pdf, .svg or .png.
+    #[arg(short, long, value_name = "FILE")]
+    output: Output,
+    /// Pixels per inch of a PNG.
+    #[arg(long, value_name = "N", default_value_t = 300, value_parser = clap::value_parser!(u16).range(30..=2400))]
+    dpi: u16,
+}
+
+/// A file whose name says its form.
+#[derive(Clone, Debug)]
+struct Output {
+    path: PathBuf,
+    form: Form,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Form {
+    Pdf,
+    Svg,
+    Png,
+}
+
+impl std::str::FromStr for Output {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let path = PathBuf::from(text);
+        let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
+        let form = match ending.to_ascii_lowercase().as_str() {
+            "pdf" => Form::Pdf,
+            "svg" => Form::Svg,
+            "png" => Form::Png,
+            _ => return Err("the name must end in .pdf, .svg or .png".to_owned()),
+        };
+        Ok(Self { path, form })
+    }
+}
+
+fn size_m(text: &str) -> Result<f64, String> {
+    let (min, max) = Marker::SIZE_LIMITS_M;
+    let number: Option<f64> = text.parse().ok();
+    number
+        .filter(|m| (min..=max).contains(m))
+        .ok_or_else(|| format!("a size is a number of metres from {min} to {max}"))
+}
+
+/// Writes the marker's file.
+///
+/// # Errors
+/// [`SheetError`] when there is no such sheet; otherwise the file could not be written.
+pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
+    let size_m = stated_size(args)?;
+    let sheet = Sheet::new(&args.marker, size_m, args.paper)?;
+    let bytes = match args.output.form {
+        Form::Pdf => pdf::document(&sheet),
+        Form::Svg => svg::document(&sheet).into_bytes(),
+        Form::Png => png::image(&sheet, args.dpi)?,
+    };
+    let path: &Path = &args.output.path;
+    std::fs::write(path, bytes).with_context(|| format!("writing {path:?}"))?;
+    let name = args.marker.name();
+    writeln!(
+        std::io::stdout(),
+        "{}: {name}, {size_m} m, on {}. Print it at 100 %, then measure the ruler below it: 100 mm.",
+        path.display(),
+        args.paper.name()
+    )
+    .context("writing the result")?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn stated_size(args: &MarkerArgs) -> Result<f64, SheetError> {
+    match (args.size, args.marker.size_m) {
+        (Some(size), Some(other)) if size != other => Err(SheetError::TwoSizes { size, other }),
+        (Some(size), _) | (None, Some(size)) => Ok(size),
+        (None, None) => Err(SheetError::NoSize),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Program {
+        #[command(flatten)]
+        args: MarkerArgs,
+    }
+
+    fn write(text: &[&str]) -> Result<(), String> {
+        let text = std::iter::once(&"marker").chain(text);
+        let args = Program::try_parse_from(text).map_err(|e| e.to_string())?.args;
+        run(&args).map(drop).map_err(|e| format!("{e:#}"))
+    }
+
+    #[test]
+    fn the_file_has_the_form_that_its_name_says() {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, start) in [("a.pdf", &b"%PDF-1"[..]), ("b.SVG", b"<svg"), ("c.png", b"\x89PNG")]
+        {
+            let path = folder.path().join(name);
+            let text = path.to_str().unwrap();
+            write(&["rings", "--size", "0.15341", "--dpi", "72", "-o", text]).unwrap();
+            assert!(std::fs::read(&path).unwrap().starts_with(start), "{name}");
+        }
+    }
+
+    #[test]
+    fn wrong_use_is_explained() {
+        let check = |text: &[&str], part: &str| {
+            let problem = write(text).unwrap_err();
+            assert!(problem.contains(part), "`{part}` is not in: {problem}");
+        };
+        check(&["rings", "--size", "0.1", "-o", "a.gif"], ".pdf, .svg or .png");
+        check(&["rings", "--size", "0.1"], "--output");
+        check(&["rings", "-o", "a.pdf"], "--size");
+        check(&["rings:0.2", "--size", "0.1", "-o", "a.pdf"], "two sizes");
+        check(&["rings", "--size", "0", "-o", "a.pdf"], "from 0.001 to 100");
+        check(&["ring", "--size", "0.1", "-o", "a.pdf"], "known are");
+        check(&["rings", "--size", "0.1", "--paper", "b5", "-o", "a.pdf"], "a4");
+        check(&["rings", "--size", "0.1", "--dpi", "5", "-o", "a.png"], "30..=2400");
+        check(&["rings", "--size", "0.1", "-o", "no/such/folder/a.pdf"], "no/such/folder/a.pdf");
+        let large = ["rings", "--size", "0.6", "--paper", "a0", "--dpi", "1200", "-o", "a.png"];
+        check(&large, "pixels");
+    }
+}

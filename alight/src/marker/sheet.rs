@@ -1,0 +1,318 @@
+//! What is on the paper, and where: the marker, lines to cut along, a ruler, and words.
+
+use clap::ValueEnum;
+use fiducial::{Drawing, Ink, Marker, Shape};
+
+/// The edge of the paper on which printers print nothing, in millimetres.
+const EDGE_MM: f64 = 5.0;
+/// What lies below the marker: cut marks, the ruler and two lines of text.
+const BELOW_MM: f64 = 33.0;
+/// Far below what a printer can do, far above what arithmetic loses.
+const ROUNDING_MM: f64 = 1e-6;
+/// Length of the ruler.
+const RULER_MM: f64 = 100.0;
+/// Width of the lines.
+const LINE_MM: f64 = 0.2;
+/// Cut marks begin this far from the quiet zone, and are this long.
+const CUT_MM: (f64, f64) = (1.0, 3.5);
+/// Height of the letters' bodies.
+pub(super) const TEXT_MM: f64 = 3.2;
+
+/// Paper sizes, upright.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Paper {
+    /// 148 x 210 mm.
+    A5,
+    /// 210 x 297 mm.
+    A4,
+    /// 297 x 420 mm.
+    A3,
+    /// 420 x 594 mm.
+    A2,
+    /// 594 x 841 mm.
+    A1,
+    /// 841 x 1189 mm.
+    A0,
+    /// 8.5 x 11 in.
+    Letter,
+    /// 8.5 x 14 in.
+    Legal,
+    /// 11 x 17 in.
+    Tabloid,
+}
+
+impl Paper {
+    /// Width and height in millimetres.
+    pub(crate) fn size_mm(self) -> [f64; 2] {
+        match self {
+            Self::A5 => [148.0, 210.0],
+            Self::A4 => [210.0, 297.0],
+            Self::A3 => [297.0, 420.0],
+            Self::A2 => [420.0, 594.0],
+            Self::A1 => [594.0, 841.0],
+            Self::A0 => [841.0, 1189.0],
+            Self::Letter => [215.9, 279.4],
+            Self::Legal => [215.9, 355.6],
+            Self::Tabloid => [279.4, 431.8],
+        }
+    }
+
+    /// Its name on the command line.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::A5 => "a5",
+            Self::A4 => "a4",
+            Self::A3 => "a3",
+            Self::A2 => "a2",
+            Self::A1 => "a1",
+            Self::A0 => "a0",
+            Self::Letter => "letter",
+            Self::Legal => "legal",
+            Self::Tabloid => "tabloid",
+        }
+    }
+
+    /// The largest marker with its quiet zone that fits between the edges and above the ruler, in millimetres.
+    fn room_mm(self) -> f64 {
+        let [width, height] = self.size_mm();
+        (width - 2.0 * EDGE_MM).min(height - 2.0 * BELOW_MM)
+    }
+}
+
+/// Why there is no sheet.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum SheetError {
+    /// A marker that is larger than the paper.
+    TooLarge {
+        /// What is too large, and what would fit.
+        problem: String,
+    },
+    /// A marker without a size.
+    NoSize,
+    /// A size with the marker, and another one beside it.
+    TwoSizes {
+        /// The one beside it, in metres.
+        size: f64,
+        /// The one with it, in metres.
+        other: f64,
+    },
+    /// An image larger than what printers take.
+    TooManyPixels {
+        /// Width and height in pixels.
+        pixels: [u32; 2],
+        /// The most pixels per inch for this paper.
+        most_dpi: u32,
+    },
+}
+
+impl std::fmt::Display for SheetError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::TooLarge { problem } => f.write_str(problem),
+            Self::NoSize => f.write_str("how large is the marker? Say it with `--size`, in metres"),
+            Self::TwoSizes { size, other } => {
+                write!(
+                    f,
+                    "two sizes are stated: {size} m by `--size`, and {other} m with the marker"
+                )
+            }
+            Self::TooManyPixels { pixels: [width, height], most_dpi } => write!(
+                f,
+                "an image of {width} x {height} pixels is too large; take `--dpi {most_dpi}` or less, or a PDF"
+            ),
+        }
+    }
+}
+
+impl std::error::Error for SheetError {}
+
+/// Something on the paper. Millimetres from its top left corner, x right, y down; later marks hide earlier ones.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Mark {
+    /// A filled circle.
+    Disc { centre_mm: [f64; 2], radius_mm: f64, ink: Ink },
+    /// A filled, upright rectangle: its top left and its bottom right corner.
+    Rectangle { min_mm: [f64; 2], max_mm: [f64; 2], ink: Ink },
+    /// A line of text, from the left end of its base line.
+    Text { at_mm: [f64; 2], text: String },
+}
+
+/// A sheet of paper with a marker in its middle.
+#[derive(Clone, Debug)]
+pub(super) struct Sheet {
+    pub(super) size_mm: [f64; 2],
+    pub(super) marks: Vec<Mark>,
+}
+
+impl Sheet {
+    pub(super) fn new(marker: &Marker, size_m: f64, paper: Paper) -> Result<Self, SheetError> {
+        let drawing = Drawing::new(marker, size_m);
+        let half_mm = drawing.half_extent_m * 1e3;
+        if 2.0 * half_mm > paper.room_mm() + ROUNDING_MM {
+            return Err(too_large(marker, size_m, half_mm, paper));
+        }
+        let mut sheet = Self { size_mm: paper.size_mm(), marks: Vec::new() };
+        sheet.draw_marker(&drawing);
+        sheet.draw_cut_marks(half_mm);
+        sheet.draw_ruler();
+        let [width, height] = sheet.size_mm;
+        let left = (width - RULER_MM) / 2.0;
+        sheet.write([left, height - 11.0], format!("{}, size {size_m} m", marker.name()));
+        let advice = "Print at 100 %: the ruler must measure 100 mm.";
+        sheet.write([left, height - EDGE_MM - 1.0], advice.to_owned());
+        Ok(sheet)
+    }
+
+    fn middle(&self) -> [f64; 2] {
+        self.size_mm.map(|edge| edge / 2.0)
+    }
+
+    fn draw_marker(&mut self, drawing: &Drawing) {
+        let [x, y] = self.middle();
+        // The marker's y axis points up, the paper's down.
+        let place = |[right, up]: [f64; 2]| [x + right * 1e3, y - up * 1e3];
+        self.marks.extend(drawing.layers.iter().map(|layer| match layer.shape {
+            Shape::Disc { radius_m } => {
+                Mark::Disc { centre_mm: [x, y], radius_mm: radius_m * 1e3, ink: layer.ink }
+            }
+            Shape::Rectangle { min_m, max_m } => {
+                let ([left, bottom], [right, top]) = (place(min_m), place(max_m));
+                Mark::Rectangle { min_mm: [left, top], max_mm: [right, bottom], ink: layer.ink }
+            }
+        }));
+    }
+
+    /// Lines outside the quiet zone's corners: cut along them, and the marker is in the middle of what is left.
+    fn draw_cut_marks(&mut self, half_mm: f64) {
+        let [x, y] = self.middle();
+        let (from, len) = CUT_MM;
+        let (near, far) = (half_mm + from, half_mm + from + len);
+        for (right, down) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
+            self.line(
+                [x + right * near, y + down * half_mm],
+                [x + right * far, y + down * half_mm],
+            );
+            self.line(
+                [x + right * half_mm, y + down * near],
+                [x + right * half_mm, y + down * far],
+            );
+        }
+    }
+
+    fn draw_ruler(&mut self) {
+        let [width, height] = self.size_mm;
+        let (left, top) = ((width - RULER_MM) / 2.0, height - 25.0);
+        self.line([left, top], [left + RULER_MM, top]);
+        for mm in 0..=RULER_MM as u32 {
+            let len = match mm {
+                _ if mm % 10 == 0 => 5.0,
+                _ if mm % 5 == 0 => 3.5,
+                _ => 2.0,
+            };
+            let x = left + f64::from(mm);
+            self.line([x, top], [x, top + len]);
+        }
+        for (mm, label) in [(0.0, "0"), (50.0, "50"), (RULER_MM, "100 mm")] {
+            self.write([left + mm - 1.0, height - 16.5], label.to_owned());
+        }
+    }
+
+    /// An upright or level line, whose middle lies on the points.
+    fn line(&mut self, from_mm: [f64; 2], to_mm: [f64; 2]) {
+        let half = LINE_MM / 2.0;
+        let level = from_mm[1] == to_mm[1];
+        let (dx, dy) = if level { (0.0, half) } else { (half, 0.0) };
+        let min_mm = [from_mm[0].min(to_mm[0]) - dx, from_mm[1].min(to_mm[1]) - dy];
+        let max_mm = [from_mm[0].max(to_mm[0]) + dx, from_mm[1].max(to_mm[1]) + dy];
+        self.marks.push(Mark::Rectangle { min_mm, max_mm, ink: Ink::Black });
+    }
+
+    fn write(&mut self, at_mm: [f64; 2], text: String) {
+        self.marks.push(Mark::Text { at_mm, text });
+    }
+}
+
+fn too_large(marker: &Marker, size_m: f64, half_mm: f64, paper: Paper) -> SheetError {
+    let per_metre = 2.0 * half_mm / size_m;
+    // Tenths of millimetres, rounded down, so that the size stated does fit.
+    let largest_m = (paper.room_mm() / per_metre * 1e4).floor() / 1e4;
+    let mut larger =
+        Paper::value_variants().iter().filter(|p| p.room_mm() + ROUNDING_MM >= 2.0 * half_mm);
+    let instead = match larger.next() {
+        Some(paper) => format!("; {size_m} m fit on {}", paper.name()),
+        None => String::new(),
+    };
+    SheetError::TooLarge {
+        problem: format!(
+            "{} of {size_m} m needs {:.1} mm with its white border; at most {largest_m} m fit on {}{instead}",
+            marker.name(),
+            2.0 * half_mm,
+            paper.name()
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sheet(size_m: f64, paper: Paper) -> Result<Sheet, SheetError> {
+        Sheet::new(&"rings".parse().unwrap(), size_m, paper)
+    }
+
+    #[test]
+    fn a_marker_that_does_not_fit_names_the_largest_that_does() {
+        let problem = sheet(0.2, Paper::A4).unwrap_err().to_string();
+        assert!(problem.contains("needs 240.0 mm"), "{problem}");
+        assert!(problem.contains("at most 0.1666 m fit on a4; 0.2 m fit on a3"), "{problem}");
+        assert!(sheet(0.1666, Paper::A4).is_ok() && sheet(0.2, Paper::A3).is_ok());
+        let problem = sheet(5.0, Paper::A0).unwrap_err().to_string();
+        assert!(problem.ends_with("at most 0.6925 m fit on a0"), "{problem}");
+    }
+
+    #[test]
+    fn everything_lies_on_the_paper_and_nothing_in_the_quiet_zone() {
+        for paper in Paper::value_variants() {
+            let size_m = paper.room_mm() / 1200.0;
+            let sheet = sheet(size_m, *paper).unwrap();
+            let [width, height] = paper.size_mm();
+            let reach = size_m * 1e3 * 0.6;
+            let is_clear = |[x, y]: [f64; 2]| {
+                (x - width / 2.0).abs().max((y - height / 2.0).abs()) >= reach - LINE_MM
+            };
+            for mark in &sheet.marks {
+                match mark {
+                    Mark::Disc { centre_mm, .. } => {
+                        assert_eq!(*centre_mm, [width / 2.0, height / 2.0])
+                    }
+                    Mark::Rectangle { min_mm, max_mm, .. } => {
+                        assert!(min_mm[0] >= 0.0 && min_mm[1] >= 0.0, "{mark:?}");
+                        assert!(max_mm[0] <= width && max_mm[1] <= height, "{mark:?}");
+                        assert!(is_clear(*min_mm) && is_clear(*max_mm), "{mark:?} on {paper:?}");
+                    }
+                    Mark::Text { at_mm: [x, y], text } => {
+                        // No letter is wider than its body is high.
+                        assert!(x + 0.75 * TEXT_MM * text.len() as f64 <= width, "{text}");
+                        assert!(*y <= height - EDGE_MM && is_clear([*x, y - TEXT_MM]));
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_ruler_is_a_hundred_millimetres_long() {
+        let sheet = sheet(0.1, Paper::A5).unwrap();
+        let edges = sheet.marks.iter().filter_map(|mark| match mark {
+            Mark::Rectangle { min_mm, max_mm, .. }
+                if (max_mm[1] - min_mm[1] - 5.0).abs() < 1e-9 =>
+            {
+                Some((min_mm[0] + max_mm[0]) / 2.0)
+            }
+            _ => None,
+        });
+        let edges: Vec<f64> = edges.collect();
+        assert_eq!(edges.len(), 11);
+        assert!((edges[10] - edges[0] - 100.0).abs() < 1e-9);
+    }
+}
