@@ -492,8 +492,8 @@ distortion_coefficients: !!opencv-matrix
         let folder =
             Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/photos/groundtruth");
         let rows = [
-            ("wykrichard__opencv/left_intrinsics.yml", 535.91573396163199),
-            ("opencv__opencv_contrib/tutorial_camera_charuco.yml", 452.51072219637672),
+            ("wykrichard__opencv/left_intrinsics.yml", 535.915_733_961_632),
+            ("opencv__opencv_contrib/tutorial_camera_charuco.yml", 452.510_722_196_376_7),
         ];
         for (name, fx) in rows {
             let file = folder.join(name);

@@ -283,7 +283,7 @@ mod tests {
             for mark in &sheet.marks {
                 match mark {
                     Mark::Disc { centre_mm, .. } => {
-                        assert_eq!(*centre_mm, [width / 2.0, height / 2.0])
+                        assert_eq!(*centre_mm, [width / 2.0, height / 2.0]);
                     }
                     Mark::Rectangle { min_mm, max_mm, .. } => {
                         assert!(min_mm[0] >= 0.0 && min_mm[1] >= 0.0, "{mark:?}");
