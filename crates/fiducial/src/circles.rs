@@ -41,7 +41,7 @@ impl Circles {
     ) -> Option<[Self; 2]> {
         let eigen = cone(ellipse, camera)?.symmetric_eigen();
         let mut order = [0, 1, 2];
-        order.sort_by(|i, j| eigen.eigenvalues[*j].total_cmp(&eigen.eigenvalues[*i]));
+        order.sort_unstable_by(|i, j| eigen.eigenvalues[*j].total_cmp(&eigen.eigenvalues[*i]));
         let [l1, l2, l3] = order.map(|i| eigen.eigenvalues[i]);
         let (e1, e3) = (eigen.eigenvectors.column(order[0]), eigen.eigenvectors.column(order[2]));
         if !(l2 > 0.0 && l3 < 0.0) {
@@ -117,9 +117,7 @@ impl Circles {
                 }
             }
         }
-        let squares: Option<f64> =
-            points.iter().map(|point| best.residual(point, camera).map(|(r, _)| r * r)).sum();
-        Some((best, (squares? / points.len() as f64).sqrt()))
+        Some((best, best.rms_px(points, camera)?))
     }
 
     /// The pose in the project's conventions. Rings do not tell a turn about their normal: the marker's y axis
@@ -143,11 +141,15 @@ impl Circles {
         finite && self.centre.z > 0.0 && self.normal.dot(&self.centre) < 0.0
     }
 
-    /// Distance in pixels from an edge point to its circle, positive outside, and how it changes with the centre
-    /// (three numbers) and with the normal along the two vectors of [`Circles::basis`].
-    fn residual(&self, point: &EdgePoint, camera: &CameraModel) -> Option<(f64, SVector<f64, 5>)> {
-        let ray = point.ray;
-        let (nd, nc) = (self.normal.dot(&ray), self.normal.dot(&self.centre));
+    /// Where a ray meets the plane: distance from the centre in metres, metres per pixel along that distance,
+    /// and how the distance in pixels changes with the centre (three numbers) and with the normal along the two
+    /// vectors of [`Circles::basis`].
+    pub(crate) fn radius_at(
+        &self,
+        ray: &Vector3<f64>,
+        camera: &CameraModel,
+    ) -> Option<(f64, f64, SVector<f64, 5>)> {
+        let (nd, nc) = (self.normal.dot(ray), self.normal.dot(&self.centre));
         if nd > -1e-9 {
             return None;
         }
@@ -158,7 +160,7 @@ impl Circles {
             return None;
         }
         let out = arm / rho;
-        let od = out.dot(&ray);
+        let od = out.dot(ray);
         // How the distance in the plane changes from pixel to pixel.
         let per_pixel = |axis: usize, focal: f64| {
             (out[axis] * along - od * along * self.normal[axis] / nd) / focal
@@ -175,8 +177,21 @@ impl Circles {
             by_normal.dot(&u),
             by_normal.dot(&v),
         );
-        let residual = (rho - point.radius) * scale;
-        (residual.is_finite() && slope.iter().all(|s| s.is_finite())).then_some((residual, slope))
+        let finite = scale.is_finite() && slope.iter().all(|s| s.is_finite());
+        finite.then_some((rho, metres_per_px, slope))
+    }
+
+    /// Distance in pixels from an edge point to its circle, positive outside, and how it changes with the pose.
+    fn residual(&self, point: &EdgePoint, camera: &CameraModel) -> Option<(f64, SVector<f64, 5>)> {
+        let (rho, metres_per_px, slope) = self.radius_at(&point.ray, camera)?;
+        Some(((rho - point.radius) / metres_per_px, slope))
+    }
+
+    /// Root mean square distance in pixels between edge points and their circles.
+    pub(crate) fn rms_px(&self, points: &[EdgePoint], camera: &CameraModel) -> Option<f64> {
+        let squares: Option<f64> =
+            points.iter().map(|point| self.residual(point, camera).map(|(r, _)| r * r)).sum();
+        Some((squares? / points.len().max(1) as f64).sqrt())
     }
 
     /// The normal equations of one step, and the cost here.
@@ -200,7 +215,11 @@ impl Circles {
         for i in 0..5 {
             matrix[(i, i)] += damping * system.matrix[(i, i)] + 1e-12;
         }
-        let step = matrix.cholesky()?.solve(&system.right);
+        self.moved(&matrix.cholesky()?.solve(&system.right))
+    }
+
+    /// The pose after a step of the centre (three numbers, metres) and of the normal along [`Circles::basis`].
+    pub(crate) fn moved(&self, step: &SVector<f64, 5>) -> Option<Self> {
         let (u, v) = self.basis();
         // The normal is a direction: more than a third of a radian at once is no small step.
         let turn = (step[3].hypot(step[4]) / 0.3).max(1.0);

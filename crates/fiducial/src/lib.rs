@@ -5,7 +5,8 @@
 //!
 //! Modules in reading order: [`marker`] names what is looked for, [`drawing`] says what it looks like,
 //! [`observation`] is what was found, [`detector`] finds it; [`ring`] and [`rings_thesis`] are the thesis' way
-//! (Algorithms 1-15), [`rings`] the mended one, with `circles` for the pose; [`trace`] is what they saw on the way,
+//! (Algorithms 1-15), [`rings`] the mended one, with `circles` and, for
+//! small markers, `photometry` for the pose; [`trace`] is what they saw on the way,
 //! [`debug`] draws that.
 
 mod circles;
@@ -14,6 +15,7 @@ pub mod detector;
 pub mod drawing;
 pub mod marker;
 pub mod observation;
+mod photometry;
 pub mod ring;
 pub mod rings;
 pub mod rings_thesis;

@@ -20,6 +20,7 @@ use crate::circles::{Circles, EdgePoint, project};
 use crate::drawing::RING_RADII;
 use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, Stages};
+use crate::photometry::{self, Spot};
 use crate::ring::{Ring, RingKind};
 use crate::trace::{Reason, Trace, TracedMarker};
 
@@ -51,6 +52,7 @@ pub struct Rings {
     outlines: Vec<Outline>,
     candidates: Vec<Candidate>,
     edges: Vec<EdgePoint>,
+    spots: Vec<Spot>,
 }
 
 /// A ring to be looked into, and the difference in grey levels between it and what is around.
@@ -93,7 +95,7 @@ impl Rings {
                 break;
             }
         }
-        found[first..].sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
+        found[first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
         stages.ended("matching");
     }
 
@@ -120,7 +122,7 @@ impl Rings {
     /// The rings among the pairs of ellipses, largest first.
     fn find_rings(&mut self, view: GrayView<'_>, trace: &mut Trace) {
         self.candidates.clear();
-        self.outlines.sort_by(|a, b| a.ellipse.centre[0].total_cmp(&b.ellipse.centre[0]));
+        self.outlines.sort_unstable_by(|a, b| a.ellipse.centre[0].total_cmp(&b.ellipse.centre[0]));
         let mut pairs = 0;
         for (i, outer) in self.outlines.iter().enumerate().filter(|(_, o)| o.black_within) {
             let reach = concentric_tolerance(&outer.ellipse);
@@ -143,7 +145,7 @@ impl Rings {
                 break;
             }
         }
-        self.candidates.sort_by(|a, b| b.ring.outer.major.total_cmp(&a.ring.outer.major));
+        self.candidates.sort_unstable_by(|a, b| b.ring.outer.major.total_cmp(&a.ring.outer.major));
         self.candidates.truncate(MOST_CANDIDATES);
         trace.rings.extend(self.candidates.iter().map(|c| c.ring));
     }
@@ -166,22 +168,75 @@ impl Rings {
         if !believable(&support, candidate.ring.kind) {
             return Err(Reason::Edges);
         }
-        let centre = project(circles.centre, lens).ok_or(Reason::Pose)?;
-        let outline = circles.outline(size_m / 2.0, lens).ok_or(Reason::Pose)?;
+        let guessed = match camera {
+            Some(_) => None,
+            None => guess_lens(&circles, lens, &mut self.edges),
+        };
+        if let Some((circles, lens)) = guessed {
+            return observe(&circles, &lens, size_m, &support, None);
+        }
+        let (circles, rms_px) = match search.refine_small(&circles, &mut self.spots) {
+            Some(better) => (better, better.rms_px(&self.edges, lens).ok_or(Reason::Pose)?),
+            None => (circles, rms_px),
+        };
         let pose = marker.size_m.and(camera).map(|_| MarkerPose {
             camera_from_marker: circles.camera_from_marker(),
             reprojection_rms_px: rms_px,
         });
-        Ok(Observation {
-            family: Family::Rings,
-            id: None,
-            centre,
-            corners: None,
-            size_px: outline.major,
-            confidence: confidence(&support),
-            pose,
-        })
+        observe(&circles, lens, size_m, &support, pose)
     }
+}
+
+fn observe(
+    circles: &Circles,
+    lens: &CameraModel,
+    size_m: f64,
+    support: &[Support; 6],
+    pose: Option<MarkerPose>,
+) -> Result<Observation, Reason> {
+    let centre = project(circles.centre, lens).ok_or(Reason::Pose)?;
+    let outline = circles.outline(size_m / 2.0, lens).ok_or(Reason::Pose)?;
+    Ok(Observation {
+        family: Family::Rings,
+        id: None,
+        centre,
+        corners: None,
+        size_px: outline.major,
+        confidence: confidence(support),
+        pose,
+    })
+}
+
+/// The focal length at which the circles fit a tilted marker's edges best: without it the true centre of a large one
+/// would be a pixel off. `None` when none fits better than the `nominal` one.
+fn guess_lens(
+    circles: &Circles,
+    nominal: &CameraModel,
+    edges: &mut [EdgePoint],
+) -> Option<(Circles, CameraModel)> {
+    const STEPS: i32 = 9;
+    const RATIO: f64 = 1.18;
+    let mut best = None;
+    let mut least = circles.rms_px(edges, nominal)?;
+    let mut previous = 1.0;
+    for step in -STEPS..=STEPS {
+        let factor = RATIO.powi(step);
+        let mut lens = *nominal;
+        (lens.fx, lens.fy) = (nominal.fx * factor, nominal.fy * factor);
+        for edge in edges.iter_mut() {
+            edge.ray.x *= previous / factor;
+            edge.ray.y *= previous / factor;
+        }
+        previous = factor;
+        let mut start = *circles;
+        start.centre.z *= factor;
+        if let Some((found, rms)) = start.refined(edges, &lens)
+            && rms < least
+        {
+            (best, least) = (Some((found, lens)), rms);
+        }
+    }
+    best
 }
 
 /// A camera for images whose own is not known; the marker's centre hardly depends on it.
@@ -282,7 +337,7 @@ fn ring_contrast(view: GrayView<'_>, inner: &Ellipse, outer: &Ellipse) -> Option
         }
     }
     let steps = steps.get_mut(..count).filter(|steps| steps.len() >= DIRECTIONS as usize)?;
-    steps.sort_by(f64::total_cmp);
+    steps.sort_unstable_by(f64::total_cmp);
     let median = steps.get(count / 2).copied()?;
     let low = steps.get(count / 5).copied()?;
     (median >= f64::from(LEAST_CONTRAST.levels) / 2.0 && low > 0.25 * median).then_some(median)
@@ -372,6 +427,20 @@ impl Search<'_> {
             (circles, rms) = (other, other_rms);
         }
         Ok((circles, rms))
+    }
+
+    /// A small marker's pose from its grey values; `None` for a large one, and when they disagree with its edges.
+    fn refine_small(&self, circles: &Circles, spots: &mut Vec<Spot>) -> Option<Circles> {
+        let refined = |start: &Circles, spots: &mut Vec<Spot>| {
+            photometry::refined(self.view, self.camera, start, self.size_m, spots)
+        };
+        let first = refined(circles, spots);
+        let second = first.and_then(|(found, _)| refined(&found.mirrored(), spots));
+        let (best, _) = first.into_iter().chain(second).min_by(|a, b| a.1.total_cmp(&b.1))?;
+        let moved =
+            project(best.centre, self.camera)?.distance(&project(circles.centre, self.camera)?);
+        let scaled = best.centre.z / circles.centre.z;
+        (moved < 0.5 && (0.9..1.1).contains(&scaled)).then_some(best)
     }
 
     /// Looks for all six edges.

@@ -118,7 +118,7 @@ impl RingsThesis {
         self.by_x.clear();
         self.by_x.extend(0..self.ellipses.len());
         let x = |index: &usize| self.ellipses[*index].ellipse.centre[0];
-        self.by_x.sort_by(|i, j| x(i).total_cmp(&x(j)));
+        self.by_x.sort_unstable_by(|i, j| x(i).total_cmp(&x(j)));
         for (place, i) in self.by_x.iter().enumerate() {
             let near = self.by_x[place + 1..].iter().take_while(|j| x(j) - x(i) <= T_CONCENTRIC_PX);
             for j in near {

@@ -1,4 +1,6 @@
 //! How well the marker is found in renderings of the thesis' camera, at both its binnings.
+#![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
+#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
 mod render;
 
@@ -79,7 +81,7 @@ fn the_true_centre_and_range_at_two_by_two_binning() {
     {
         assert_eq!(row.centre_px.len(), row.frames, "at {range_m} m");
         assert!(Row::worst(&row.centre_px) < 0.05, "at {range_m} m");
-        assert!(Row::worst(&row.range_percent) < 0.35, "at {range_m} m");
+        assert!(Row::worst(&row.range_percent) < 0.1, "at {range_m} m");
     }
 }
 
@@ -91,8 +93,8 @@ fn the_true_centre_and_range_at_four_by_four_binning() {
             continue;
         }
         assert_eq!(row.centre_px.len(), row.frames, "at {range_m} m");
-        assert!(Row::worst(&row.centre_px) < 0.06, "at {range_m} m");
-        assert!(Row::worst(&row.range_percent) < 1.0, "at {range_m} m");
+        assert!(Row::worst(&row.centre_px) < 0.05, "at {range_m} m");
+        assert!(Row::worst(&row.range_percent) < 0.3, "at {range_m} m");
     }
 }
 

@@ -1,0 +1,147 @@
+//! Images that are hard: close up, in odd light, tilted, bent by the lens.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
+#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+
+mod render;
+
+use fiducial::{Detector, Observation, Settings};
+use geometry::{CameraModel, Distortion};
+use imaging::GrayImage;
+use render::{SIZE_M, Scene};
+
+fn camera() -> CameraModel {
+    CameraModel::pinhole(1296, 972, 1818.0)
+}
+
+fn find(image: &GrayImage, camera: &CameraModel) -> Option<Observation> {
+    let marker = format!("rings:{SIZE_M}").parse().unwrap();
+    let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+    let found = detector.detect(image.view().unwrap(), Some(camera), &mut ());
+    assert!(found.len() < 2, "{found:?}");
+    found.first().cloned()
+}
+
+/// Asserts that the marker is found within these bounds; returns what was found.
+fn expect(
+    name: &str,
+    scene: &Scene,
+    image: &GrayImage,
+    centre_px: f64,
+    range_percent: f64,
+) -> Observation {
+    let Some(marker) = find(image, &scene.camera) else { panic!("{name}: not found") };
+    let range_m = marker.pose.unwrap().camera_from_marker.origin().coords.coords.norm();
+    let range = (range_m / scene.range_m() - 1.0) * 100.0;
+    let centre = marker.centre.distance(&scene.centre());
+    println!(
+        "{name}: centre {centre:.3} px, range {range:+.3} %, confidence {:.2}",
+        marker.confidence
+    );
+    assert!(centre < centre_px && range.abs() < range_percent, "{name}");
+    marker
+}
+
+#[test]
+fn from_twenty_centimetres_to_three_the_rings_that_still_fit_are_enough() {
+    for (range_m, sides) in [(0.03, [0.0, 0.2]), (0.1, [0.05, 0.25]), (0.2, [0.0, 0.25])] {
+        for side in sides {
+            let place = [side * range_m, side * 0.7 * range_m, range_m];
+            let scene = Scene::new(camera(), place, 0.05, 1.0);
+            expect(&format!("{range_m} m, {side} aside"), &scene, &scene.render(), 0.05, 0.05);
+        }
+    }
+}
+
+#[test]
+fn dim_bright_blurred_and_noisy() {
+    for range_m in [0.6, 2.0, 7.0] {
+        let plain = Scene::new(camera(), [0.05 * range_m, 0.03 * range_m, range_m], 0.2, 1.0);
+        let scenes = [
+            ("dim", Scene { black: 8.0, white: 40.0, ground: 20.0, texture: 10.0, ..plain }),
+            ("bright", Scene { black: 90.0, white: 255.0, ground: 250.0, texture: 60.0, ..plain }),
+            ("blurred", Scene { blur_px: 1.5, ..plain }),
+            ("noisy", Scene { noise: 10.0, ..plain }),
+            ("little paper", Scene { paper: 0.55, ..plain }),
+        ];
+        for (name, scene) in scenes {
+            expect(&format!("{name} at {range_m} m"), &scene, &scene.render(), 0.06, 0.3);
+        }
+    }
+}
+
+#[test]
+fn a_saturated_sky_and_light_that_falls_off() {
+    for range_m in [0.6, 2.0, 7.0] {
+        let scene = Scene::new(camera(), [0.05 * range_m, 0.03 * range_m, range_m], 0.2, 1.0);
+        let mut image = scene.render();
+        for y in 0..image.height() {
+            for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                let light = 0.2 + 1.2 * x as f64 / 1296.0;
+                *pixel = if y < 300 { 255 } else { (f64::from(*pixel) * light) as u8 };
+            }
+        }
+        expect(&format!("sky at {range_m} m"), &scene, &image, 0.06, 0.2);
+    }
+}
+
+#[test]
+fn steeply_tilted() {
+    for tilt in [0.8, 1.0] {
+        for range_m in [0.6, 2.0, 5.0] {
+            let scene = Scene::new(camera(), [0.05 * range_m, 0.03 * range_m, range_m], tilt, 2.0);
+            let name = format!("{tilt} rad at {range_m} m");
+            let marker = expect(&name, &scene, &scene.render(), 0.05, 0.5);
+            let z = nalgebra::Vector3::z();
+            let found = marker.pose.unwrap().camera_from_marker.rotation().quaternion * z;
+            let truth = scene.camera_from_marker.rotation().quaternion * z;
+            assert!(found.angle(&truth) < 0.03, "{name}: {:.3} rad off", found.angle(&truth));
+        }
+    }
+}
+
+#[test]
+fn through_a_lens_that_bends() {
+    let k = [-0.25, 0.08, 0.001, -0.0005, 0.0, 0.0, 0.0, 0.0];
+    let bent = CameraModel { distortion: Distortion::BrownConrady(k), ..camera() };
+    for range_m in [0.6, 3.0] {
+        let place = [0.22 * range_m, -0.12 * range_m, range_m];
+        let scene = Scene::new(bent, place, 0.3, 4.0);
+        expect(&format!("bent at {range_m} m"), &scene, &scene.render(), 0.05, 0.1);
+    }
+}
+
+#[test]
+fn without_a_camera_there_is_a_centre_and_no_pose() {
+    let marker = format!("rings:{SIZE_M}").parse().unwrap();
+    let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+    for range_m in [0.5, 3.0] {
+        let scene = Scene::new(camera(), [0.1 * range_m, 0.05 * range_m, range_m], 0.5, 1.0);
+        let image = scene.render();
+        let found = detector.detect(image.view().unwrap(), None, &mut ());
+        assert_eq!(found.len(), 1);
+        assert!(found[0].pose.is_none());
+        let error = found[0].centre.distance(&scene.centre());
+        assert!(error < 0.5, "{error}");
+    }
+}
+
+#[test]
+fn a_lone_ring_is_no_marker_when_the_others_would_be_seen() {
+    // Grey values of a disc with a hole, of these radii, on white.
+    let draw = |outer: f64, inner: f64| {
+        let mut image = GrayImage::filled(1000, 800, 210);
+        for y in 0..800 {
+            for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                let radius = (x as f64 - 500.3).hypot(y as f64 - 400.6);
+                let cover = |edge: f64| (edge - radius + 0.5).clamp(0.0, 1.0);
+                *pixel = (210.0 - 180.0 * (cover(outer) - cover(inner))).round() as u8;
+            }
+        }
+        image
+    };
+    let camera = CameraModel::pinhole(1000, 800, 909.0);
+    // A wheel, a traffic sign, a washer: the other rings would be seen.
+    assert_eq!(find(&draw(60.0, 48.0), &camera), None);
+    assert_eq!(find(&draw(60.0, 36.0), &camera), None);
+    assert_eq!(find(&draw(60.0, 20.0), &camera), None);
+}
