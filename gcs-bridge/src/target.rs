@@ -10,22 +10,23 @@ use messages::TargetEstimate;
 pub(crate) struct Display {
     period_ns: i64,
     max_age_ms: f64,
-    shown_ns: Option<i64>,
+    due_ns: i64,
 }
 
 impl Display {
     /// A display with this rate, for estimates up to this age.
     pub(crate) fn new(rate_hz: f64, max_age_ms: f64) -> Self {
-        Self { period_ns: (1e9 / rate_hz) as i64, max_age_ms, shown_ns: None }
+        Self { period_ns: (1e9 / rate_hz) as i64, max_age_ms, due_ns: i64::MIN }
     }
 
     /// The message for an estimate, if one is due and the estimate tells where the landing point is now.
     pub(crate) fn show(&mut self, now_ns: i64, estimate: &TargetEstimate) -> Option<MavMessage> {
-        let due = self.shown_ns.is_none_or(|shown| now_ns.saturating_sub(shown) >= self.period_ns);
+        let due = now_ns >= self.due_ns;
         let fresh = estimate.age_ms.is_some_and(|age_ms| age_ms <= self.max_age_ms);
         let position = estimate.position_ned_m.filter(|p| p.iter().all(|c| c.is_finite()));
         let message = position.filter(|_| due && fresh).map(|at| message(estimate, at))?;
-        self.shown_ns = Some(now_ns);
+        // Counted from when it was due, so that the rate is right whenever estimates come; but nothing is made up for.
+        self.due_ns = self.due_ns.max(now_ns.saturating_sub(self.period_ns)) + self.period_ns;
         Some(message)
     }
 }
@@ -84,8 +85,12 @@ mod tests {
     #[test]
     fn the_rate_is_bounded() {
         let mut display = Display::new(5.0, 1000.0);
-        let shown = (0..100).filter(|i| display.show(i * SECOND_NS / 50, &estimate()).is_some());
-        assert_eq!(shown.count(), 10);
+        // Two seconds of estimates, then two more after a pause, at a rate that is no multiple of the display's.
+        for start_s in [0, 60] {
+            let times = (0..34).map(|i| start_s * SECOND_NS + i * SECOND_NS / 17);
+            let shown = times.filter(|now_ns| display.show(*now_ns, &estimate()).is_some()).count();
+            assert!((10..=11).contains(&shown), "{shown}");
+        }
     }
 
     #[test]
