@@ -27,8 +27,15 @@ use crate::trace::{Reason, Trace, TracedMarker};
 /// Smaller differences are not edges. Black ink seldom has more than a quarter of white paper's brightness; a thin ring
 /// far away keeps half of that difference.
 const LEAST_CONTRAST: LeastContrast = LeastContrast { levels: 14, percent: 20 };
+/// Fewer grey levels are noise.
+const LEAST_STEP: f64 = 7.0;
+/// The least share of paper's light that ink lacks.
+const LEAST_RING_CONTRAST: f64 = 0.15;
 /// Outlines that enclose fewer square pixels say nothing about their shape.
 const LEAST_AREA_PX2: f64 = 18.0;
+/// Where grey values differ more from a fitted marker's, as a share of its contrast, something else is in the picture,
+/// such as a shadow's edge.
+const MOST_DIFFERENCE: f64 = 0.15;
 /// Bounds, far above what a frame with a marker needs, so that no image takes long.
 const MOST_CONTOUR_POINTS: usize = 2_000_000;
 const MOST_ELLIPSES: usize = 20_000;
@@ -55,7 +62,7 @@ pub struct Rings {
     spots: Vec<Spot>,
 }
 
-/// A ring to be looked into, and the difference in grey levels between it and what is around.
+/// A ring to be looked into, and how much of the light of what is around it lacks, as a share.
 #[derive(Copy, Clone, Debug)]
 struct Candidate {
     ring: Ring,
@@ -162,7 +169,7 @@ impl Rings {
         let size_m = marker.size_m.unwrap_or(1.0);
         let lens = camera.unwrap_or(nominal);
         let mut search =
-            Search { view, camera: lens, size_m, least_step: 0.35 * candidate.contrast };
+            Search { view, camera: lens, size_m, least_contrast: 0.35 * candidate.contrast };
         let (circles, rms_px) = search.locate(&candidate.ring, &mut self.edges)?;
         let support = search.measure(&circles, &mut self.edges);
         if !believable(&support, candidate.ring.kind) {
@@ -310,11 +317,11 @@ fn ring_of(
     Ok(Candidate { ring: Ring::new(kind, *inner, *outer), contrast })
 }
 
-/// How much darker a ring is than what is within and around it (the middle of the differences), if it is so nearly
-/// all round (Algorithm 6, in its own light).
+/// What share of the light of what is within and around it a ring lacks (the middle of the shares), if it does so
+/// nearly all round (Algorithm 6, in its own light, which may differ from side to side).
 fn ring_contrast(view: GrayView<'_>, inner: &Ellipse, outer: &Ellipse) -> Option<f64> {
     const DIRECTIONS: u32 = 24;
-    let mut steps = [0.0; 2 * DIRECTIONS as usize];
+    let mut shares = [0.0; 2 * DIRECTIONS as usize];
     let mut count = 0;
     for i in 0..DIRECTIONS {
         let t = f64::from(i) * TAU / f64::from(DIRECTIONS);
@@ -330,17 +337,17 @@ fn ring_contrast(view: GrayView<'_>, inner: &Ellipse, outer: &Ellipse) -> Option
         let inwards = 0.5_f64.min(0.9 * inner.minor / (outer.minor - inner.minor).max(1e-9));
         let Some(black) = at(0.5) else { continue };
         for white in [at(-inwards), at(1.5)].into_iter().flatten() {
-            if let Some(slot) = steps.get_mut(count) {
-                *slot = white - black;
+            if let Some(slot) = shares.get_mut(count) {
+                *slot = if white - black < LEAST_STEP { 0.0 } else { (white - black) / white };
                 count += 1;
             }
         }
     }
-    let steps = steps.get_mut(..count).filter(|steps| steps.len() >= DIRECTIONS as usize)?;
-    steps.sort_unstable_by(f64::total_cmp);
-    let median = steps.get(count / 2).copied()?;
-    let low = steps.get(count / 5).copied()?;
-    (median >= f64::from(LEAST_CONTRAST.levels) / 2.0 && low > 0.25 * median).then_some(median)
+    let shares = shares.get_mut(..count).filter(|shares| shares.len() >= DIRECTIONS as usize)?;
+    shares.sort_unstable_by(f64::total_cmp);
+    let median = shares.get(count / 2).copied()?;
+    let low = shares.get(count / 5).copied()?;
+    (median > LEAST_RING_CONTRAST && low > 0.3 * median).then_some(median)
 }
 
 /// How many of the places at which an edge of the marker should be were looked at, and how many had it.
@@ -389,8 +396,8 @@ struct Search<'a> {
     view: GrayView<'a>,
     camera: &'a CameraModel,
     size_m: f64,
-    /// An edge is a change of at least this many grey levels.
-    least_step: f64,
+    /// At an edge the dark side lacks at least this share of the bright side's light.
+    least_contrast: f64,
 }
 
 impl Search<'_> {
@@ -436,7 +443,8 @@ impl Search<'_> {
         };
         let first = refined(circles, spots);
         let second = first.and_then(|(found, _)| refined(&found.mirrored(), spots));
-        let (best, _) = first.into_iter().chain(second).min_by(|a, b| a.1.total_cmp(&b.1))?;
+        let all = first.into_iter().chain(second).filter(|(_, rms)| *rms < MOST_DIFFERENCE);
+        let (best, _) = all.min_by(|a, b| a.1.total_cmp(&b.1))?;
         let moved =
             project(best.centre, self.camera)?.distance(&project(circles.centre, self.camera)?);
         let scaled = best.centre.z / circles.centre.z;
@@ -506,7 +514,8 @@ impl Search<'_> {
             *value = if black_within { sample } else { -sample };
         }
         let ends = (values[0].min(values[1]), values[2 * half].max(values[2 * half - 1]));
-        if ends.1 - ends.0 < self.least_step {
+        let bright = if black_within { ends.1 } else { -ends.0 };
+        if ends.1 - ends.0 < (self.least_contrast * bright).max(LEAST_STEP) {
             return Sight::Nothing;
         }
         let middle = (ends.0 + ends.1) / 2.0;

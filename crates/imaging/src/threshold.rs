@@ -19,8 +19,9 @@ const TILE: usize = 4;
 
 /// Binarises with a threshold that follows the light.
 ///
-/// Each tile's threshold is the middle between the darkest and the brightest pixel of the tile and its eight
-/// neighbours; where these differ by less than a least contrast, the tile takes the threshold of the tile of
+/// Each tile's threshold lies between the darkest and the brightest pixel of the tile and its eight neighbours, in
+/// the middle by ratio and not by difference: so white paper in shade stays brighter than it while black ink in the
+/// sun, across the shadow's edge, stays darker. Where the two differ by less than a least contrast, the tile takes the threshold of the tile of
 /// twice the size that contains it. So an edge is found at its own brightness, in shade or sun, sharp or
 /// blurred, and a plain surface takes the side it has on the scale on which there is something to see.
 /// The dark side is the white one of the result: of contours, thin dark lines on bright ground then stay whole.
@@ -155,7 +156,7 @@ impl Level {
                         max = max.max(*high);
                     }
                 }
-                let middle = min + (max.saturating_sub(min)).div_ceil(2);
+                let middle = middle_by_ratio(min, max);
                 self.thresholds[y * self.width + x] = match coarse {
                     Some(coarse) if !least.is_met(min, max) => {
                         coarse.thresholds[y / 2 * coarse.width + x / 2]
@@ -165,6 +166,15 @@ impl Level {
             }
         }
     }
+}
+
+/// The grey value as many times brighter than `min` as it is darker than `max`, and above `min` unless both are the
+/// same. What the lens scatters into the dark is allowed for, or else the darkest pixels would decide alone.
+fn middle_by_ratio(min: u8, max: u8) -> u8 {
+    const SCATTERED: f32 = 8.0;
+    let product = (f32::from(min) + SCATTERED) * (f32::from(max) + SCATTERED);
+    let middle = (product.sqrt() - SCATTERED).ceil() as u8;
+    middle.clamp(min.saturating_add(1).min(max), max.max(min))
 }
 
 #[cfg(test)]
