@@ -10,7 +10,7 @@ use geometry::{CameraModel, Distortion};
 use serde_yaml_ng::Value;
 
 /// Largest calibration file that is read, in bytes.
-const LARGEST_FILE: u64 = 4 << 20;
+const LARGEST_FILE: u64 = 1 << 20;
 /// Largest edge of an image, in pixels.
 const LARGEST_EDGE_PX: f64 = 65_535.0;
 /// Largest focal length that is taken for one, in pixels.
