@@ -11,7 +11,6 @@ use jpeg_encoder::{ColorType, Encoder};
 use messages::{CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
-use tokio::time::{Interval, MissedTickBehavior};
 
 use crate::config::Config;
 use crate::image::{Decoded, image_size, images_in};
@@ -150,6 +149,19 @@ struct Stream {
     sequence: u64,
 }
 
+/// Keeps a rate exactly as long as the work keeps up with it; what is late is not caught up with.
+struct Pace {
+    due: Instant,
+    period: Duration,
+}
+
+impl Pace {
+    async fn wait(&mut self) {
+        tokio::time::sleep_until(self.due.into()).await;
+        self.due = (self.due + self.period).max(Instant::now());
+    }
+}
+
 /// A frame that waits for its time.
 struct Prepared {
     width: usize,
@@ -178,23 +190,22 @@ impl Stream {
             tokio::time::sleep(SUBSCRIBER_POLL).await;
         }
         let period = Duration::from_secs_f64(1.0 / self.config.source.rate_hz);
-        let mut clock = tokio::time::interval(period);
-        clock.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        self.pass(&mut clock, true).await?;
+        let mut pace = Pace { due: Instant::now(), period };
+        self.pass(&mut pace, true).await?;
         while self.config.source.repeat {
-            self.pass(&mut clock, false).await?;
+            self.pass(&mut pace, false).await?;
         }
         Ok(())
     }
 
     /// Publishes every image once.
-    async fn pass(&mut self, clock: &mut Interval, is_first: bool) -> anyhow::Result<()> {
+    async fn pass(&mut self, pace: &mut Pace, is_first: bool) -> anyhow::Result<()> {
         let before = self.sequence;
         for index in 0..self.images.len() {
             let Some(path) = self.images.get(index) else { break };
             match self.prepare(path).await {
                 Ok(frame) => {
-                    clock.tick().await;
+                    pace.wait().await;
                     self.publish(frame).await;
                 }
                 Err(problem) => {

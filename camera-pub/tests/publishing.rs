@@ -145,3 +145,18 @@ async fn a_start_without_images_says_why() -> anyhow::Result<()> {
     ensure!(too_large.contains("none of the 2 images"), "{too_large}");
     Ok(())
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_rate_is_kept() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    for i in 0..60 {
+        GrayImage::from_pixel(64, 48, Luma([i])).save(folder.path().join(format!("{i:02}.png")))?;
+    }
+    let camera = open("camera-pub", free_port()?).await?;
+    let config = config(folder.path(), &["source.rate_hz=40", "source.repeat=false"])?;
+    let began = now_ns();
+    camera_pub::run(camera.clone(), config, Shutdown::on_signals()?).await?;
+    // 59 periods of 25 ms; a busy machine may take longer, but none may be faster.
+    ensure!(now_ns() - began >= 59 * 25_000_000, "{} ns", now_ns() - began);
+    Ok(())
+}
