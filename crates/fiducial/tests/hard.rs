@@ -18,7 +18,11 @@ fn find(image: &GrayImage, camera: &CameraModel) -> Option<Observation> {
     let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
     let found = detector.detect(image.view().unwrap(), Some(camera), &mut ());
     assert!(found.len() < 2, "{found:?}");
-    found.first().cloned()
+    let found = found.first().cloned();
+    if found.is_none() {
+        println!("rings {:#?}, refused {:#?}", detector.trace().rings, detector.trace().refusals);
+    }
+    found
 }
 
 /// Asserts that the marker is found within these bounds; returns what was found.
@@ -81,6 +85,32 @@ fn a_saturated_sky_and_light_that_falls_off() {
             }
         }
         expect(&format!("sky at {range_m} m"), &scene, &image, 0.06, 0.2);
+    }
+}
+
+#[test]
+fn with_the_edge_of_a_shadow_across_it() {
+    for range_m in [0.6, 2.0, 7.0] {
+        for (light, aside) in [(0.3, 0.02), (0.25, -0.2), (0.4, 0.3)] {
+            let scene = Scene::new(camera(), [0.05 * range_m, 0.03 * range_m, range_m], 0.2, 1.0);
+            let mut image = scene.render();
+            let (middle, size_px) = (scene.centre(), SIZE_M * 1818.0 / range_m);
+            for y in 0..image.height() {
+                for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                    let beyond =
+                        (x as f64 - middle.x) + 0.4 * (y as f64 - middle.y) - aside * size_px;
+                    let share = (beyond / 2.0).clamp(0.0, 1.0);
+                    *pixel = (f64::from(*pixel) * (1.0 - share * (1.0 - light))).round() as u8;
+                }
+            }
+            expect(
+                &format!("shadow of {light}, {aside} aside, at {range_m} m"),
+                &scene,
+                &image,
+                0.1,
+                0.4,
+            );
+        }
     }
 }
 
