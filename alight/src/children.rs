@@ -38,18 +38,20 @@ impl Children {
         Self { pids: Vec::new(), sender, news }
     }
 
-    /// Starts a service as a process of this same program.
+    /// Starts a service as a process of this same program; the answer is how to start it again by hand.
     pub(crate) fn start(
         &mut self,
         service: Service,
         zenoh: &Path,
         settings: &[String],
-    ) -> anyhow::Result<()> {
+    ) -> anyhow::Result<String> {
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
         command.arg(service.name()).arg("--stop-with-parent").arg("--zenoh").arg(zenoh);
+        let mut by_hand = format!("alight {} --zenoh {}", service.name(), zenoh.display());
         for setting in settings {
             command.arg("--set").arg(setting);
+            by_hand.push_str(&format!(" --set '{setting}'"));
         }
         if std::env::var_os("ALIGHT_LOG").is_none() {
             command.env("ALIGHT_LOG", "warn");
@@ -61,22 +63,16 @@ impl Children {
             .kill_on_drop(true)
             .spawn()
             .with_context(|| format!("starting {}", service.name()))?;
-        if let Some(pid) = child.id().and_then(|id| i32::try_from(id).ok()).and_then(Pid::from_raw)
-        {
-            self.pids.push((service, pid));
-        }
+        let pid = child.id().and_then(|id| i32::try_from(id).ok()).and_then(Pid::from_raw);
+        self.pids.extend(pid.map(|pid| (service, pid)));
         tokio::spawn(follow(service, child, self.sender.clone()));
-        Ok(())
+        let number = pid.map_or(0, |pid| pid.as_raw_nonzero().get());
+        Ok(format!("{} is process {number}; by hand: {by_hand}", service.name()))
     }
 
     /// The next news.
     pub(crate) async fn next(&mut self) -> Option<News> {
         self.news.recv().await
-    }
-
-    /// The process ids, by service.
-    pub(crate) fn pids(&self) -> impl Iterator<Item = (Service, i32)> {
-        self.pids.iter().map(|(service, pid)| (*service, pid.as_raw_nonzero().get()))
     }
 
     /// Forgets a child that has ended.

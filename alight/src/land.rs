@@ -12,7 +12,7 @@ use tempfile::TempDir;
 use tokio::time::Instant;
 
 use crate::children::{Children, News};
-use crate::cli::zenoh_source;
+use crate::cli::{write_error, zenoh_source};
 use crate::outcome::Flight;
 use crate::progress::Progress;
 use crate::services::{self, Service};
@@ -57,6 +57,9 @@ pub(crate) enum Format {
 /// The services of a landing, in the order in which they are started.
 const SERVICES: [Service; 4] =
     [Service::Simulator, Service::Detector, Service::Controller, Service::GcsBridge];
+
+/// Where ground stations such as QGroundControl listen.
+const GROUND_PORT: u16 = 14_550;
 
 /// Time for the services to settle and tell their last words after the landing.
 const AFTERMATH: Duration = Duration::from_millis(1200);
@@ -108,7 +111,7 @@ impl Settings {
             (Service::Simulator, simulator),
             (Service::Detector, Vec::new()),
             (Service::Controller, controller),
-            (Service::GcsBridge, Vec::new()),
+            (Service::GcsBridge, ground_station(args.autopilot.as_deref())),
         ];
         for setting in &args.set {
             let named = by_service.iter_mut().find_map(|(service, settings)| {
@@ -136,6 +139,21 @@ impl Settings {
     }
 }
 
+/// Where the ground station is listened for, when its usual port is where the autopilot already talks to.
+fn ground_station(autopilot: Option<&str>) -> Vec<String> {
+    let taken = autopilot.is_some_and(|address| {
+        address.starts_with("udpin:") && address.ends_with(&format!(":{GROUND_PORT}"))
+    });
+    if !taken {
+        return Vec::new();
+    }
+    let port = GROUND_PORT + 1;
+    write_error(&format!(
+        "The autopilot talks to port {GROUND_PORT}; the ground station is served at UDP port {port} instead"
+    ));
+    vec![format!("ground=\"udpout:127.0.0.1:{port}\"")]
+}
+
 async fn fly(args: &LandArgs, settings: &Settings) -> anyhow::Result<Flight> {
     let shutdown = Shutdown::on_signals()?;
     let meeting = MeetingPoint::new(args.zenoh.as_deref())?;
@@ -149,10 +167,8 @@ async fn fly(args: &LandArgs, settings: &Settings) -> anyhow::Result<Flight> {
     ));
     let mut children = Children::new();
     for service in SERVICES {
-        children.start(service, &meeting.file, settings.of(service))?;
-    }
-    for (service, pid) in children.pids() {
-        progress.debug(&format!("{} runs as process {pid}", service.name()));
+        let started = children.start(service, &meeting.file, settings.of(service))?;
+        progress.debug(&started);
     }
     let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s.clamp(1.0, 86_400.0));
     let watched = watch(&node, &mut children, &mut progress, shutdown, deadline).await;

@@ -151,7 +151,7 @@ pub struct PhaseConfig {
 impl Default for PhaseConfig {
     fn default() -> Self {
         Self {
-            stale_target_s: 0.4,
+            stale_target_s: 0.25,
             low_height_m: 0.8,
             low_grace_s: 0.4,
             lost_target_s: 1.0,

@@ -165,13 +165,15 @@ fn setting_layer(text: &str, defaults: &Table) -> Result<Layer, ConfigError> {
     let (key, value) = (key.trim(), value.trim());
     // A bare word is a string where the default is one, so that the shell's quotes are enough.
     let quoted = || parse(&name, &format!("{key} = {}", Value::String(value.to_owned())));
-    let default_is_text = matches!(look_up(defaults, key), Some(Value::String(_)));
+    let default = look_up(defaults, key);
+    let default_is_text = matches!(default, Some(Value::String(_)));
     let table = match parse(&name, &format!("{key} = {value}")) {
         Ok(table) if default_is_text && !matches!(look_up(&table, key), Some(Value::String(_))) => {
             quoted()?
         }
         Ok(table) => table,
-        Err(_) if default_is_text => quoted()?,
+        // A key that does not exist is a worse mistake than its value, and is reported when the layers are joined.
+        Err(_) if default_is_text || default.is_none() => quoted()?,
         Err(problem) => return Err(problem),
     };
     Ok(Layer { name, table })
@@ -374,6 +376,7 @@ mod tests {
             &["`rate_hz` = true is true or false, where a number is needed"],
         );
         check(None, &["rate_hz"], &["not of the form key=value"]);
+        check(None, &["nam=a b"], &["no key `nam`", "did you mean `name`?"]);
         check(None, &["rate_hz=1 2"], &["--set rate_hz=1 2 is not valid TOML"]);
         check(Some("rate_hz = = 1"), &[], &["is not valid TOML", ".toml"]);
         check(None, &["name=a/b"], &["letters, digits"]);
