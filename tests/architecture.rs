@@ -1,0 +1,408 @@
+//! Keeps true what ARCHITECTURE.md says of the tree: its arrows, its names, its topics, and what each room leaves out.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context, ensure};
+use messages::{Delivery, TOPICS};
+
+/// The algorithm crates, and what each may know of this workspace. `autopilot` is told apart for its link.
+const ALGORITHMS: [(&str, &[&str]); 5] = [
+    ("geometry", &[]),
+    ("imaging", &[]),
+    ("messages", &[]),
+    ("fiducial", &["geometry", "imaging"]),
+    ("landing", &["geometry"]),
+];
+const AUTOPILOT: (&str, &[&str]) = ("autopilot", &["geometry"]);
+const NODE: (&str, &[&str]) = ("node", &["messages"]);
+const SERVICES: [&str; 4] = ["camera-pub", "controller", "detector", "gcs-bridge"];
+/// What a service or a tool may know.
+const ROOMS: [&str; 7] =
+    ["autopilot", "fiducial", "geometry", "imaging", "landing", "messages", "node"];
+/// What the program may know beside services and tools: markers to find in files and to print, and the network.
+const ALIGHT: [&str; 5] = ["fiducial", "geometry", "imaging", "messages", "node"];
+
+/// What an algorithm does without.
+const OUTSIDE: [&str; 17] = [
+    "std::env",
+    "std::fs",
+    "std::io",
+    "std::net",
+    "std::process",
+    "std::thread",
+    "std::{",
+    "Instant",
+    "SystemTime",
+    "tokio",
+    "tracing",
+    "log::",
+    "println!",
+    "eprintln!",
+    "print!",
+    "dbg!",
+    "rustix",
+];
+
+/// Keys that share the comment of the key above them.
+const SHARED_COMMENTS: [(&str, &str); 3] =
+    [("simulator.toml", "east_m"), ("simulator.toml", "height"), ("simulator.toml", "focal_px")];
+
+/// A package of the workspace.
+struct Package {
+    name: String,
+    folder: PathBuf,
+    /// Names of the libraries and, where there is none, of the programs it builds.
+    targets: Vec<String>,
+    /// What it depends on, for tests included.
+    dependencies: BTreeSet<String>,
+}
+
+impl Package {
+    fn is_tool(&self) -> bool {
+        self.folder.parent().is_some_and(|parent| parent.ends_with("tools"))
+    }
+
+    /// Its source files.
+    fn sources(&self) -> anyhow::Result<Vec<PathBuf>> {
+        let mut folders = vec![self.folder.join("src")];
+        let mut files = Vec::new();
+        while let Some(folder) = folders.pop() {
+            for entry in std::fs::read_dir(&folder).with_context(|| format!("{folder:?}"))? {
+                let path = entry?.path();
+                match path.extension() {
+                    _ if path.is_dir() => folders.push(path),
+                    Some(extension) if extension == "rs" => files.push(path),
+                    _ => {}
+                }
+            }
+        }
+        Ok(files)
+    }
+}
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+fn text(path: impl AsRef<Path>) -> anyhow::Result<String> {
+    let path = path.as_ref();
+    std::fs::read_to_string(path).with_context(|| format!("reading {path:?}"))
+}
+
+fn workspace() -> anyhow::Result<Vec<Package>> {
+    let output = Command::new(env!("CARGO"))
+        .args(["metadata", "--no-deps", "--format-version", "1", "--offline"])
+        .current_dir(root())
+        .output()?;
+    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let metadata: serde_json::Value = serde_json::from_slice(&output.stdout)?;
+    let packages = metadata["packages"].as_array().context("packages")?;
+    let strings = |list: &serde_json::Value, key: &str| -> Vec<String> {
+        let list = list.as_array().into_iter().flatten();
+        list.filter_map(|entry| entry[key].as_str().map(str::to_owned)).collect()
+    };
+    packages
+        .iter()
+        .map(|package| {
+            let manifest = Path::new(package["manifest_path"].as_str().context("manifest_path")?);
+            let targets = package["targets"].as_array().context("targets")?;
+            let main = |target: &&serde_json::Value| target["kind"][0] == "lib";
+            let library = targets.iter().filter(main).cloned().collect::<Vec<_>>();
+            let programs = targets.iter().filter(|target| target["kind"][0] == "bin").cloned();
+            let main = if library.is_empty() { programs.collect() } else { library };
+            Ok(Package {
+                name: package["name"].as_str().context("name")?.to_owned(),
+                folder: manifest.parent().context("folder")?.to_owned(),
+                targets: strings(&serde_json::Value::Array(main), "name"),
+                dependencies: strings(&package["dependencies"], "name").into_iter().collect(),
+            })
+        })
+        .collect()
+}
+
+fn package<'a>(workspace: &'a [Package], name: &str) -> anyhow::Result<&'a Package> {
+    workspace.iter().find(|p| p.name == name).with_context(|| format!("there is no package {name}"))
+}
+
+/// The code in a file: without comments, and without the tests at its end.
+fn code(path: &Path) -> anyhow::Result<String> {
+    let whole = text(path)?;
+    let (code, tests) = whole.split_once("\n#[cfg(test)]\nmod ").unwrap_or((&whole, ""));
+    // The module's end is the first brace at the beginning of a line.
+    let after = tests.split_once("\n}\n").map_or("", |(_, after)| after);
+    ensure!(after.trim().is_empty(), "{path:?}: code after the tests, which come last");
+    let without_comment = |line: &str| line.split("//").next().unwrap_or_default().to_owned();
+    Ok(code.lines().map(without_comment).collect::<Vec<_>>().join("\n"))
+}
+
+#[test]
+fn folders_packages_and_libraries_share_a_name() -> anyhow::Result<()> {
+    for package in workspace()? {
+        let Package { name, folder, targets, .. } = package;
+        ensure!(folder.ends_with(&name), "the package {name} is in {folder:?}");
+        ensure!(targets == [name.replace('-', "_")], "the package {name} builds {targets:?}");
+    }
+    Ok(())
+}
+
+#[test]
+fn dependencies_point_downwards_only() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    let names: BTreeSet<&str> = workspace.iter().map(|p| p.name.as_str()).collect();
+    let crates: BTreeMap<_, _> = ALGORITHMS.into_iter().chain([AUTOPILOT, NODE]).collect();
+    for package in &workspace {
+        let allowed: BTreeSet<&str> = match crates.get(package.name.as_str()) {
+            Some(allowed) => allowed.iter().copied().collect(),
+            None if package.name == "alight" => {
+                let tools = workspace.iter().filter(|p| p.is_tool()).map(|p| p.name.as_str());
+                ALIGHT.into_iter().chain(SERVICES).chain(tools).collect()
+            }
+            None => {
+                let is_known = package.is_tool() || SERVICES.contains(&package.name.as_str());
+                ensure!(is_known, "{}: name what it may depend on in this test", package.name);
+                ROOMS.into_iter().collect()
+            }
+        };
+        for dependency in package.dependencies.iter().filter(|d| names.contains(d.as_str())) {
+            let is_allowed = allowed.contains(dependency.as_str());
+            ensure!(is_allowed, "{} must not depend on {dependency}", package.name);
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn only_node_knows_zenoh_and_only_autopilot_knows_mavlink() -> anyhow::Result<()> {
+    for (protocol, room) in [("zenoh", "node"), ("mavlink", "autopilot")] {
+        for package in workspace()? {
+            let knows = package.dependencies.iter().any(|name| name.starts_with(protocol));
+            ensure!(knows == (package.name == room), "{} and {protocol}: {knows}", package.name);
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn algorithms_know_no_clock_file_network_thread_or_log() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    let mut files = Vec::new();
+    for (name, _) in ALGORITHMS {
+        let package = package(&workspace, name)?;
+        for outside in ["tokio", "tracing", "log", "rustix", "libc", "anyhow"] {
+            ensure!(!package.dependencies.contains(outside), "{name} depends on {outside}");
+        }
+        files.extend(package.sources()?);
+    }
+    let link = ["link.rs", "session.rs"];
+    let mut conversation = package(&workspace, "autopilot")?.sources()?;
+    conversation.retain(|path| !link.iter().any(|name| path.ends_with(name)));
+    files.extend(conversation);
+    ensure!(files.len() > 30, "only {} files are algorithms", files.len());
+    for path in files {
+        let code = code(&path)?;
+        for outside in OUTSIDE {
+            ensure!(!code.contains(outside), "{path:?} mentions `{outside}`");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn no_service_knows_of_a_simulation() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    for service in SERVICES {
+        for path in package(&workspace, service)?.sources()? {
+            let code = code(&path)?;
+            for truth in ["TRUTH", "WIND", "simulat"] {
+                ensure!(!code.contains(truth), "{path:?} mentions `{truth}`");
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn every_queue_has_a_bound() -> anyhow::Result<()> {
+    for package in workspace()? {
+        for path in package.sources()? {
+            let code = code(&path)?;
+            for unbounded in ["unbounded", "std::sync::mpsc"] {
+                ensure!(!code.contains(unbounded), "{path:?} mentions `{unbounded}`");
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    let table = code(&package(&workspace, "messages")?.folder.join("src/topic.rs"))?;
+    let mut constants = BTreeMap::new();
+    for part in table.split("pub const ").skip(1) {
+        let (name, rest) = part.split_once(": ").context("a constant")?;
+        if rest.starts_with("Topic<") {
+            let key = rest.split('"').nth(1).with_context(|| format!("the key of {name}"))?;
+            constants.insert(name.to_owned(), key.to_owned());
+        }
+    }
+    ensure!(constants.len() == TOPICS.len(), "{} constants of topics", constants.len());
+    let mut publishers: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    for package in workspace.iter().filter(|p| p.name != "node") {
+        for path in package.sources()? {
+            let code: String = code(&path)?.split_whitespace().collect();
+            for (name, key) in &constants {
+                if code.contains(&format!("publisher(topic::{name},")) {
+                    publishers.entry(key).or_default().insert(&package.name);
+                }
+            }
+        }
+    }
+    // All that have a configuration are services of the network, and `node` publishes the health of each.
+    let with_defaults = workspace.iter().filter(|p| defaults(p).is_file());
+    publishers
+        .insert("health/{service}/{instance}", with_defaults.map(|p| p.name.as_str()).collect());
+    for row in TOPICS.iter().filter(|row| row.delivery != Delivery::Query) {
+        let stated: BTreeSet<_> = row.publishers.iter().copied().collect();
+        let found = publishers.get(row.key).cloned().unwrap_or_default();
+        ensure!(stated == found, "{} is published by {found:?}, its row says {stated:?}", row.key);
+    }
+    Ok(())
+}
+
+fn defaults(package: &Package) -> PathBuf {
+    package.folder.join(format!("{}.toml", package.name))
+}
+
+#[test]
+fn every_key_of_a_default_configuration_is_explained() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    let mut shared = BTreeSet::new();
+    let mut services = 0;
+    for package in &workspace {
+        let mut configured = false;
+        for path in package.sources()? {
+            let code = code(&path)?;
+            configured |= package.name != "node" && code.contains("const DEFAULTS: &'static str");
+        }
+        if !configured {
+            continue;
+        }
+        services += 1;
+        let file = format!("{}.toml", package.name);
+        let defaults = text(defaults(package))?;
+        let mut above = "";
+        for line in defaults.lines() {
+            let is_key = line.starts_with(|first: char| first.is_ascii_alphabetic());
+            if is_key && !above.starts_with('#') {
+                let key = line.split_whitespace().next().unwrap_or_default();
+                let exception = SHARED_COMMENTS.iter().find(|it| **it == (file.as_str(), key));
+                shared.insert(exception.with_context(|| format!("{file}: no comment on {key}"))?);
+            }
+            above = line;
+        }
+    }
+    ensure!(services > SERVICES.len(), "only {services} packages have a configuration");
+    ensure!(shared.len() == SHARED_COMMENTS.len(), "exceptions that are none: only {shared:?} are");
+    Ok(())
+}
+
+/// What stands in backticks in a Markdown text, outside of its code blocks.
+fn quoted(markdown: &str) -> Vec<&str> {
+    let prose = markdown.split("```").step_by(2);
+    prose.flat_map(|part| part.split('`').skip(1).step_by(2)).collect()
+}
+
+fn is_topic(key: &str) -> bool {
+    key == "alive/{service}/{instance}" || TOPICS.iter().any(|row| row.key == key)
+}
+
+/// True when a file defines something of this name.
+fn defines(code: &str, name: &str) -> bool {
+    let ends = |rest: &str| !rest.starts_with(|c: char| c.is_alphanumeric() || c == '_');
+    ["fn", "struct", "enum", "trait", "const", "mod", "type"].iter().any(|kind| {
+        let definition = format!("{kind} {name}");
+        code.match_indices(&definition).any(|(at, found)| ends(&code[at + found.len()..]))
+    })
+}
+
+#[test]
+fn documents_name_only_what_exists() -> anyhow::Result<()> {
+    let extensions = [".rs", ".toml", ".md", ".json5", ".py"];
+    let mut names = 0;
+    for document in ["ARCHITECTURE.md", "CONTRIBUTING.md", "zenoh-config/README.md"] {
+        let markdown = text(root().join(document))?;
+        for quote in quoted(&markdown) {
+            let (path, name) = match quote.split_once(": ") {
+                Some((path, name)) => (path, Some(name)),
+                None => (quote, None),
+            };
+            let is_path = path.contains('/') || extensions.iter().any(|end| path.ends_with(end));
+            if !is_path || path.contains(|c: char| c.is_whitespace() || ":{<*$".contains(c)) {
+                let is_key = path.contains('/') && path.contains('{') && !path.contains(' ');
+                ensure!(!is_key || is_topic(path), "{document}: there is no topic `{path}`");
+                continue;
+            }
+            let file = root().join(path);
+            ensure!(file.exists() || is_topic(path), "{document}: there is no `{path}`");
+            if let Some(name) = name {
+                let last = name.rsplit("::").next().unwrap_or(name);
+                ensure!(defines(&text(&file)?, last), "{document}: no `{name}` in `{path}`");
+                names += 1;
+            }
+        }
+    }
+    ensure!(names > 30, "only {names} names of functions were found");
+    Ok(())
+}
+
+#[test]
+fn the_architecture_has_the_topic_table() -> anyhow::Result<()> {
+    let markdown = text(root().join("ARCHITECTURE.md"))?;
+    let is_row = |line: &&str| quoted(line).first().copied().is_some_and(is_topic);
+    let table: Vec<&str> =
+        markdown.lines().filter(|line| line.starts_with("| `")).filter(is_row).collect();
+    for row in TOPICS {
+        let delivery = match row.delivery {
+            Delivery::Newest => "newest",
+            Delivery::NewestFirst => "newest, first",
+            Delivery::LastValue => "last value",
+            Delivery::InOrder => "in order",
+            Delivery::Query => "query",
+        };
+        let publishers = row.publishers.join(", ");
+        let line = format!(
+            "| `{}` | {} v{} | {delivery} | {publishers} |",
+            row.key, row.message, row.version
+        );
+        ensure!(table.contains(&line.as_str()), "ARCHITECTURE.md lacks the row\n{line}");
+    }
+    ensure!(table.len() == TOPICS.len() + 1, "rows without a topic in {table:#?}");
+    Ok(())
+}
+
+#[test]
+fn nothing_names_a_folder_of_somebodys_machine() -> anyhow::Result<()> {
+    let listing = Command::new("git").arg("ls-files").current_dir(root()).output();
+    let Some(listing) = listing.ok().filter(|output| output.status.success()) else {
+        println!("skipped: this is no git repository, or git is missing");
+        return Ok(());
+    };
+    let folders = ["home", "root", "tmp", "Users", "work"].map(|name| format!("/{name}/"));
+    let files = String::from_utf8(listing.stdout)?;
+    ensure!(files.lines().count() > 100, "only {} files are tracked", files.lines().count());
+    for file in files.lines() {
+        // A file may have been removed and not yet committed.
+        let Ok(bytes) = std::fs::read(root().join(file)) else { continue };
+        let content = String::from_utf8_lossy(&bytes);
+        for folder in &folders {
+            let found = content.match_indices(folder.as_str()).find(|(at, _)| {
+                !content[..*at].ends_with(|c: char| c.is_alphanumeric() || "._-/~)}".contains(c))
+            });
+            ensure!(found.is_none(), "{file} names {folder}, a folder of some machine");
+        }
+    }
+    Ok(())
+}
