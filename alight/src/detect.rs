@@ -156,18 +156,25 @@ impl Examiner<'_> {
             }
             Lens::Calibrated(camera) => {
                 if !self.was_warned.swap(true, Ordering::Relaxed) {
-                    tracing::warn!(
-                        ?path,
-                        width,
-                        height,
-                        calibrated_width = camera.width,
-                        calibrated_height = camera.height,
-                        "The calibration is for another size of image: no poses; further ones are not named"
-                    );
+                    Self::warn_of_size(&camera, image, path);
                 }
                 None
             }
         }
+    }
+
+    fn warn_of_size(camera: &CameraModel, image: &GrayImage, path: &Path) {
+        // Nothing can be done about a standard error that is closed.
+        let _ = writeln!(
+            std::io::stderr(),
+            "warning: {} has {} x {} pixels, but the calibration is for {} x {}: no poses there, nor in other \
+             images of another size",
+            path.display(),
+            image.width(),
+            image.height(),
+            camera.width,
+            camera.height
+        );
     }
 }
 
@@ -403,7 +410,7 @@ impl<W: Write> Printer<W> {
         if self.format == Format::Text {
             let Totals { images, detections, unreadable } = self.totals;
             self.write(&format!(
-                "{images} images, {detections} markers found, {unreadable} images not readable\n"
+                "images: {images}, markers found: {detections}, not readable: {unreadable}\n"
             ));
         }
         match self.stopped_by {
@@ -528,7 +535,7 @@ mod tests {
         assert!(text.contains("0.png  320 x 240 px"), "{text}");
         assert!(text.contains("\n  rings  centre (159."), "{text}");
         assert!(text.contains("4.png  error: "), "{text}");
-        assert!(text.ends_with("9 images, 7 markers found, 1 images not readable\n"), "{text}");
+        assert!(text.ends_with("images: 9, markers found: 7, not readable: 1\n"), "{text}");
     }
 
     /// Takes a few lines, then is gone.
