@@ -5,10 +5,11 @@
 //! frames before it.
 //!
 //! Modules in reading order: `exposure` says where the camera is while the shutter is open, `lens` where a pixel
-//! looks, `painting` draws markers, `sensor` turns light into grey levels.
+//! looks, `painting` what a part of the image shows of a marker, `painter` draws its edges, `sensor` turns light into grey levels.
 
 mod exposure;
 mod lens;
+mod painter;
 mod painting;
 mod sensor;
 
@@ -21,7 +22,8 @@ use rand_chacha::ChaCha8Rng;
 use crate::ground::{Ground, Span, Surface};
 use exposure::{Exposure, MOST_INSTANTS};
 use lens::Lens;
-use painting::{Area, BARE, Channels, Coat, Paint, Painter, Painting, Shown, Sight, shown};
+use painter::{Channels, Glimpse, Painter};
+use painting::{Area, BARE, Coat, Paint, Painting, Shown, Sight, View, shown};
 use sensor::Sensor;
 
 /// What there is to see.
@@ -228,16 +230,6 @@ pub struct Renderer {
     band: Band,
 }
 
-/// A painting during the exposure of a frame.
-#[derive(Debug)]
-struct View {
-    /// From each instant; empty when it cannot be seen.
-    sights: Vec<Sight>,
-    /// First and last column and row of pixels that may show it.
-    columns: [usize; 2],
-    rows: [usize; 2],
-}
-
 /// A row of tiles.
 #[derive(Debug)]
 struct Band {
@@ -270,8 +262,12 @@ impl Renderer {
         let lens = Lens::new(settings.model);
         let painter = Painter::new(&lens, settings.blur_px);
         let tiles = (settings.model.width as usize).div_ceil(lens.tile);
-        let view =
-            || View { sights: Vec::with_capacity(MOST_INSTANTS), columns: [0; 2], rows: [0; 2] };
+        let view = || View {
+            looks: None,
+            sights: Vec::with_capacity(MOST_INSTANTS),
+            columns: [0; 2],
+            rows: [0; 2],
+        };
         let most_coats = paintings.iter().map(|painting| painting.coats.len()).max().unwrap_or(0);
         Ok(Self {
             ground: Ground::new(scene.surface, seed),
@@ -339,19 +335,20 @@ impl Renderer {
     /// Finds out from where and in which part of the image the paintings are seen.
     fn look_at_paintings(&mut self) {
         let reach = self.painter.reach_px();
+        let [opening, closing] = &self.exposure.ends;
         for (view, painting) in self.views.iter_mut().zip(&self.paintings) {
+            let look = |instant| Sight::new(painting, instant);
+            view.looks = None;
             view.sights.clear();
-            for instant in &self.exposure.instants {
-                let Some(sight) = Sight::new(painting, instant) else {
-                    view.sights.clear();
-                    break;
-                };
-                view.sights.push(sight);
-            }
-            let bounds = bounds_px(painting, &self.exposure, &self.settings.model, reach);
-            match bounds {
-                Some((columns, rows)) => (view.columns, view.rows) = (columns, rows),
-                None => view.sights.clear(),
+            view.sights.extend(self.exposure.instants.iter().map_while(look));
+            if let (Some(first), Some(middle), Some(last)) =
+                (look(opening), look(&self.exposure.middle), look(closing))
+                && view.sights.len() == self.exposure.instants.len()
+                && let Some((columns, rows)) =
+                    bounds_px(painting, &self.exposure, &self.settings.model, reach)
+            {
+                view.looks = Some([first, middle, last]);
+                (view.columns, view.rows) = (columns, rows);
             }
         }
     }
@@ -361,20 +358,28 @@ impl Renderer {
         let tile = self.lens.tile;
         self.band.tiles.fill(TileState::Bare);
         let rows = [band * tile, (band + 1) * tile - 1];
+        let marks = self.paintings.len() - self.pads;
         let half = 0.5 * (tile as f64 - 1.0) + self.painter.reach_px();
-        for (view, painting) in self.views.iter().zip(&self.paintings) {
-            if view.sights.is_empty() || rows[1] < view.rows[0] || rows[0] > view.rows[1] {
+        for (index, (view, painting)) in self.views.iter().zip(&self.paintings).enumerate() {
+            let Some(looks) = &view.looks else { continue };
+            if rows[1] < view.rows[0] || rows[0] > view.rows[1] {
                 continue;
             }
             let last = (view.columns[1] / tile).min(self.band.tiles.len().saturating_sub(1));
             for column in view.columns[0] / tile..=last {
                 let centre = |index: usize| index as f64 * tile as f64 + 0.5 * (tile as f64 - 1.0);
                 let lens = self.lens.about(centre(column), centre(band), 0.5 * tile as f64);
-                match shown(painting, &view.sights, &lens, half, &mut self.crossing) {
+                match shown(painting, looks, &lens, half, &mut self.crossing) {
                     Shown::Even(BARE) => {}
                     Shown::Even(paint) => self.band.lay_evenly(column, tile, paint),
                     Shown::Edges(beneath) => {
-                        self.painter.paint(&self.crossing, beneath, &view.sights, &lens);
+                        let glimpse = Glimpse {
+                            sights: &view.sights,
+                            lens: &lens,
+                            motion_px: view.motion_px(&lens),
+                            exact: index >= marks,
+                        };
+                        self.painter.paint(&self.crossing, beneath, &glimpse);
                         self.band.lay(column, tile, &self.painter.tile_paint);
                     }
                 }
@@ -386,33 +391,40 @@ impl Renderer {
     fn fill_row(&mut self, v: usize) {
         let tile = self.lens.tile;
         let gain = self.levels_per_reflectance;
-        let mut look = GroundLook::new(&self.ground, &self.exposure, &self.lens, v);
-        let spans = self.band.light.chunks_exact_mut(tile).zip(&self.band.tiles).enumerate();
-        for (column, (span, state)) in spans {
-            let start = (column * tile + v % tile) * tile;
-            if *state != TileState::Covered {
-                look.fill(column, span);
-            } else {
-                look.skip();
+        let look = GroundLook::new(&self.ground, &self.exposure, &self.lens, v);
+        let Band { tiles, paint, light } = &mut self.band;
+        let mut column = 0;
+        while let Some(state) = tiles.get(column) {
+            let bare = |state: &&TileState| **state != TileState::Covered;
+            let run = tiles.iter().skip(column).take(RUN).take_while(bare).count();
+            if *state != TileState::Covered
+                && let Some(span) = light.get_mut(column * tile..(column + run) * tile)
+            {
+                look.fill(column, run, span);
             }
-            if *state != TileState::Bare {
-                let paint = &self.band.paint;
-                let (cover, light) = (paint.cover.get(start..), paint.light.get(start..));
-                let (Some(cover), Some(light)) = (cover, light) else { continue };
-                if *state == TileState::Covered {
-                    for (value, light) in span.iter_mut().zip(light) {
-                        *value = *light;
-                    }
-                } else {
-                    for ((value, cover), light) in span.iter_mut().zip(cover).zip(light) {
-                        *value = *value * (1.0 - cover) + light;
+            column += run.max(1);
+        }
+        for (column, (span, state)) in light.chunks_exact_mut(tile).zip(&*tiles).enumerate() {
+            let start = (column * tile + v % tile) * tile;
+            let (cover, own) = (paint.cover.get(start..), paint.light.get(start..));
+            let (Some(cover), Some(own)) = (cover, own) else { continue };
+            match state {
+                TileState::Bare => span.iter_mut().for_each(|value| *value *= gain),
+                TileState::Mixed => {
+                    for ((value, cover), own) in span.iter_mut().zip(cover).zip(own) {
+                        *value = (*value * (1.0 - cover) + own) * gain;
                     }
                 }
+                TileState::Covered => {
+                    span.iter_mut().zip(own).for_each(|(value, own)| *value = own * gain);
+                }
             }
-            span.iter_mut().for_each(|value| *value *= gain);
         }
     }
 }
+
+/// Tiles over which the ground's perspective counts as linear.
+const RUN: usize = 8;
 
 impl Band {
     /// Lays one paint over a tile.
@@ -467,8 +479,6 @@ struct GroundLook<'a> {
     middle: Eye,
     ends: [Eye; 2],
     moves: bool,
-    /// Of the node at which the next span begins, when the span before has found it.
-    next: Option<([f64; 2], Hit, f32)>,
 }
 
 /// A camera's place and its rotation's rows.
@@ -527,7 +537,6 @@ impl<'a> GroundLook<'a> {
             middle: Eye::new(&exposure.middle),
             ends: [Eye::new(&exposure.ends[0]), Eye::new(&exposure.ends[1])],
             moves: exposure.motion_px > 0.5,
-            next: None,
         }
     }
 
@@ -538,33 +547,26 @@ impl<'a> GroundLook<'a> {
         (ideal, hit, patch)
     }
 
-    fn skip(&mut self) {
-        self.next = None;
-    }
-
-    fn fill(&mut self, column: usize, span: &mut [f32]) {
+    /// Fills the pixels of `run` tiles from `column` on.
+    fn fill(&self, column: usize, run: usize, span: &mut [f32]) {
         if self.middle.place[2] >= 0.0 {
             span.fill(UNDERGROUND);
             return;
         }
-        let (ideal, from, patch) = self.next.take().unwrap_or_else(|| self.node(column));
-        let (ideal_to, to, patch_to) = self.node(column + 1);
-        self.next = Some((ideal_to, to, patch_to));
+        let (ideal, from, patch) = self.node(column);
+        let (ideal_to, to, patch_to) = self.node(column + run);
         if !(from.is_ground() && to.is_ground()) {
             self.fill_horizon(ideal, ideal_to, span);
             return;
         }
-        let step = (patch_to - patch) / span.len().max(1) as f32;
+        let count = span.len().max(1) as f64;
+        let step = (patch_to - patch) / count as f32;
         for (index, value) in span.iter_mut().enumerate() {
             *value = patch + step * index as f32;
         }
-        let pixel =
-            (ideal_to[0] - ideal[0]).hypot(ideal_to[1] - ideal[1]) / span.len().max(1) as f64;
-        let smear_m = if self.moves {
-            self.smear([0, 1].map(|i| 0.5 * (ideal[i] + ideal_to[i])))
-        } else {
-            [0.0; 2]
-        };
+        let middle = [0, 1].map(|i| 0.5 * (ideal[i] + ideal_to[i]));
+        let smear_m = if self.moves { self.smear(middle) } else { [0.0; 2] };
+        let pixel = length([0, 1].map(|i| ideal_to[i] - ideal[i])) / count;
         let footprint_m = pixel * from.reach_m * from.slant.abs().sqrt();
         let span_m = Span { from_m: from.place_m, to_m: to.place_m, smear_m, footprint_m };
         self.ground.add_grain(&span_m, span);
@@ -583,7 +585,7 @@ impl<'a> GroundLook<'a> {
     /// Pixel by pixel, without grain.
     fn fill_horizon(&self, from: [f64; 2], to: [f64; 2], span: &mut [f32]) {
         let count = span.len().max(1) as f64;
-        let pixel = (to[0] - from[0]).hypot(to[1] - from[1]) / count;
+        let pixel = length([0, 1].map(|i| to[i] - from[i])) / count;
         for (index, value) in span.iter_mut().enumerate() {
             let part = index as f64 / count;
             let ray = self.middle.ray([0, 1].map(|i| from[i] + (to[i] - from[i]) * part));
@@ -591,6 +593,11 @@ impl<'a> GroundLook<'a> {
             *value = SKY + (self.ground.mean() - SKY) * ground;
         }
     }
+}
+
+/// Euclidean length, without the care of `hypot` for very large and very small ones.
+fn length([x, y]: [f64; 2]) -> f64 {
+    (x * x + y * y).sqrt()
 }
 
 /// Columns and rows of pixels, first and last.
@@ -610,7 +617,7 @@ fn bounds_px(
         return everything;
     }
     let (mut min, mut max) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-    for instant in &exposure.instants {
+    for instant in exposure.ends.iter().chain(&exposure.instants) {
         let camera_from_plane = instant.inverse() * painting.ned_from_plane;
         let half = painting.half_extent_m;
         for corner in 0..8 {

@@ -17,15 +17,20 @@ pub(super) struct Exposure {
     pub(super) motion_px: f64,
 }
 
-/// Two instants of an average lie at most this far apart, as long as there are fewer than [`MOST_INSTANTS`]: the
-/// blur of a pixel and a lens leaves no ripple from steps of this size.
-const STEP_PX: f64 = 1.0;
+/// Instants come in groups of so many, of which the middle one can stand for all.
+pub(super) const GROUP: usize = 5;
+
+/// A group spans at most this much motion as long as there are fewer than [`MOST_GROUPS`]: the blur of a pixel and a
+/// lens leaves no ripple from steps of a fifth of it.
+const GROUP_PX: f64 = 5.0;
+
+const MOST_GROUPS: usize = 4;
 
 /// Instants of an average at most.
-pub(super) const MOST_INSTANTS: usize = 16;
+pub(super) const MOST_INSTANTS: usize = GROUP * MOST_GROUPS;
 
-/// Below this the camera stands still.
-const STILL_PX: f64 = 0.02;
+/// For less motion one instant is enough.
+const SHORT_PX: f64 = 0.3;
 
 /// Places farther than this from the origin are refused: a picture of the ground makes no sense there.
 const FARTHEST_M: f64 = 1e5;
@@ -54,13 +59,11 @@ impl Exposure {
         self.middle = camera_at(0.5);
         self.ends = [*first * *body_from_camera, *last * *body_from_camera];
         self.motion_px = motion_px(poses, &self.middle, body_from_camera, model);
-        let count = (self.motion_px / STEP_PX).ceil().clamp(1.0, MOST_INSTANTS as f64);
+        let groups = (self.motion_px / GROUP_PX).ceil().clamp(1.0, MOST_GROUPS as f64) as usize;
+        let count = if self.motion_px < SHORT_PX { 1 } else { GROUP * groups };
         self.instants.clear();
-        let fractions = (0..count as usize).map(|k| (k as f64 + 0.5) / count);
+        let fractions = (0..count).map(|k| (k as f64 + 0.5) / count as f64);
         self.instants.extend(fractions.map(camera_at));
-        if self.motion_px < STILL_PX {
-            self.motion_px = 0.0;
-        }
         Ok(())
     }
 }

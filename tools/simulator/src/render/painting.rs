@@ -1,12 +1,11 @@
-//! Flat vector drawings in the scene, and how they appear: every shape's exact outline, averaged over the area of a
-//! pixel, the lens's blur and the exposure.
+//! Flat vector drawings in the scene, and how they appear.
 //!
-//! A square tile of pixels that lies wholly in one ink is one number. In any other, each shape covers subsamples by
-//! its distance from them along its own gradient, and the subsamples are weighted with the blur.
+//! This module tells what a tile of pixels shows of a painting: one ink all over, or edges.
 
 use geometry::{Camera, Marker, Ned, Transform};
 
-use super::lens::{Blur, Lens, Linear};
+use super::lens::Linear;
+use super::painter::slopes;
 
 /// A drawing on a plane in the scene.
 #[derive(Clone, Debug)]
@@ -51,7 +50,7 @@ pub(super) enum Area {
 }
 
 /// Three numbers that make a function linear in two coordinates: constant, per x, per y.
-type Affine = [f64; 3];
+pub(super) type Affine = [f64; 3];
 
 /// A painting from one instant's camera.
 #[derive(Clone, Debug)]
@@ -88,14 +87,14 @@ impl Sight {
     }
 
     /// The plane's homogeneous coordinates from pixels about a tile's centre.
-    fn about(&self, lens: &Linear) -> [Affine; 3] {
+    pub(super) fn about(&self, lens: &Linear) -> [Affine; 3] {
         self.plane_from_ideal.map(|[one, x, y]| {
             let along = |d: [f64; 2]| x * d[0] + y * d[1];
             [one + along(lens.centre), along(lens.per_column), along(lens.per_row)]
         })
     }
 
-    fn outline(&self) -> &[Affine] {
+    pub(super) fn outline(&self) -> &[Affine] {
         self.outline.get(..self.outline_len).unwrap_or(&[])
     }
 }
@@ -145,44 +144,62 @@ pub(super) enum Shown {
     Edges(Paint),
 }
 
-/// Sights looked at to tell what a tile shows; those between them lie between.
-const MOST_LOOKS: usize = 3;
+/// A painting during the exposure of a frame.
+#[derive(Debug)]
+pub(super) struct View {
+    /// When the shutter opens, half-way through, and when it closes; none when the painting cannot be seen.
+    pub(super) looks: Option<[Sight; 3]>,
+    /// At the instants of the exposure.
+    pub(super) sights: Vec<Sight>,
+    /// First and last column and row of pixels that may show it.
+    pub(super) columns: [usize; 2],
+    pub(super) rows: [usize; 2],
+}
+
+impl View {
+    /// How far what a tile's centre sees moves in the image during the exposure, in pixels.
+    pub(super) fn motion_px(&self, lens: &Linear) -> [f64; 2] {
+        let Some([first, middle, last]) = &self.looks else { return [0.0; 2] };
+        let place = |sight: &Sight| {
+            let [x, y, w] = sight.about(lens);
+            [x[0] / w[0], y[0] / w[0]]
+        };
+        let (from, to) = (place(first), place(last));
+        let [du, dv] = slopes(&middle.about(lens));
+        let (x, y) = (to[0] - from[0], to[1] - from[1]);
+        let area = du[0] * dv[1] - du[1] * dv[0];
+        let motion = [(x * dv[1] - y * dv[0]) / area, (y * du[0] - x * du[1]) / area];
+        if motion.iter().all(|m| m.abs() < 1e3) { motion } else { [0.0; 2] }
+    }
+}
 
 /// What a window of `half` its edge about the lens's centre shows of a painting; it must contain all that light may
 /// come from. The coats with edges in it are put into `crossing`, top first.
 pub(super) fn shown(
     painting: &Painting,
-    sights: &[Sight],
+    looks: &[Sight; 3],
     lens: &Linear,
     half: f64,
     crossing: &mut Vec<Coat>,
 ) -> Shown {
     crossing.clear();
-    let mut places = [[0.0; 2]; 4 * MOST_LOOKS];
-    let mut count = 0;
-    let looks = sights.len().min(MOST_LOOKS);
-    for look in 0..looks {
-        let Some(sight) = sights.get(look * (sights.len() - 1) / (looks - 1).max(1)) else {
-            continue;
-        };
+    let mut places = [[0.0; 2]; 12];
+    for (places, sight) in places.chunks_exact_mut(4).zip(looks) {
         let [x, y, w] = sight.about(lens);
-        for (du, dv) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
+        let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+        for (place, (du, dv)) in places.iter_mut().zip(corners) {
             let at = |f: Affine| f[0] + (f[1] * du + f[2] * dv) * half;
             if at(w) < 1e-6 {
                 crossing.extend(painting.coats.iter().rev());
                 return Shown::Edges(BARE);
             }
-            if let Some(place) = places.get_mut(count) {
-                *place = [at(x) / at(w), at(y) / at(w)];
-                count += 1;
-            }
+            *place = [at(x) / at(w), at(y) / at(w)];
         }
     }
-    let places = places.get(..count).unwrap_or(&[]);
-    let around = Around::new(places);
+    let around = Around::new(&places);
     let mut beneath = BARE;
     for coat in painting.coats.iter().rev() {
-        match around.part(coat.area, sights) {
+        match around.part(coat.area, looks) {
             Part::Outside => {}
             Part::Inside => {
                 beneath = coat.paint;
@@ -219,7 +236,7 @@ impl<'a> Around<'a> {
         }
     }
 
-    fn part(&self, area: Area, sights: &[Sight]) -> Part {
+    fn part(&self, area: Area, looks: &[Sight; 3]) -> Part {
         let (outside, inside) = match area {
             Area::Disc(radius) => {
                 let beyond = |i: usize| self.min[i].max(-self.max[i]).max(0.0);
@@ -234,9 +251,9 @@ impl<'a> Around<'a> {
             Area::Box => {
                 let side = |f: &Affine, p: &[f64; 2]| f[0] + f[1] * p[0] + f[2] * p[1];
                 let outside = (0..4).any(|k| {
-                    sights.iter().all(|s| self.places.iter().all(|p| side(&s.outline[k], p) < 0.0))
+                    looks.iter().all(|s| self.places.iter().all(|p| side(&s.outline[k], p) < 0.0))
                 });
-                let inside = sights.iter().all(|s| {
+                let inside = looks.iter().all(|s| {
                     s.outline().iter().all(|f| self.places.iter().all(|p| side(f, p) >= 0.0))
                 });
                 (outside, inside)
@@ -248,279 +265,6 @@ impl<'a> Around<'a> {
             Part::Inside
         } else {
             Part::Crossed
-        }
-    }
-}
-
-/// Paints tiles.
-#[derive(Debug)]
-pub(super) struct Painter {
-    tile: usize,
-    /// From coarse to fine subsamples.
-    blurs: [Blur; 3],
-    /// Of the row of subsamples being painted.
-    cover: Vec<f32>,
-    paint: Channels,
-    /// Sums over the instants, subsample by subsample.
-    sums: Channels,
-    /// Rows of pixels by columns of subsamples.
-    rows: Vec<f32>,
-    /// The painted tile, pixel by pixel.
-    pub(super) tile_paint: Channels,
-    offsets: Vec<f32>,
-}
-
-/// Cover and light, place by place.
-#[derive(Debug, Default)]
-pub(super) struct Channels {
-    pub(super) cover: Vec<f32>,
-    pub(super) light: Vec<f32>,
-}
-
-impl Channels {
-    pub(super) fn new(len: usize) -> Self {
-        Self { cover: vec![0.0; len], light: vec![0.0; len] }
-    }
-}
-
-/// The finest subsamples to a pixel.
-const FINEST: usize = 8;
-
-impl Painter {
-    pub(super) fn new(lens: &Lens, blur_px: f64) -> Self {
-        let blurs = [2, 4, FINEST].map(|per_pixel| Blur::new(blur_px, per_pixel));
-        let tile = lens.tile;
-        let edge = blurs.iter().map(|b| tile * b.per_pixel + 2 * b.margin).max().unwrap_or(0);
-        Self {
-            tile,
-            blurs,
-            cover: vec![0.0; edge],
-            paint: Channels::new(edge),
-            sums: Channels::new(edge * edge),
-            rows: vec![0.0; tile * edge],
-            tile_paint: Channels::new(tile * tile),
-            offsets: vec![0.0; edge],
-        }
-    }
-
-    /// How far outside a tile its light may come from, in pixels.
-    pub(super) fn reach_px(&self) -> f64 {
-        self.blurs.iter().map(Blur::reach_px).fold(0.0, f64::max)
-    }
-
-    /// Paints coats, top first, over what lies `beneath` into [`Painter::tile_paint`], a tile about the lens's centre.
-    pub(super) fn paint(
-        &mut self,
-        coats: &[Coat],
-        beneath: Paint,
-        sights: &[Sight],
-        lens: &Linear,
-    ) {
-        let Some(blur) = self.blurs.get(self.fineness(coats, sights, lens)) else { return };
-        let step = 1.0 / blur.per_pixel as f32;
-        let edge = self.tile * blur.per_pixel + 2 * blur.margin;
-        let first = -0.5 * (edge as f32 - 1.0) * step;
-        let Some(offsets) = self.offsets.get_mut(..edge) else { return };
-        for (index, offset) in offsets.iter_mut().enumerate() {
-            *offset = first + index as f32 * step;
-        }
-        let opaque = beneath.cover == 1.0 && coats.iter().all(|coat| coat.paint.cover == 1.0);
-        let (Some(cover), Some(paint_cover), Some(paint_light)) = (
-            self.cover.get_mut(..edge),
-            self.paint.cover.get_mut(..edge),
-            self.paint.light.get_mut(..edge),
-        ) else {
-            return;
-        };
-        let part = 1.0 / sights.len().max(1) as f32;
-        for (instant, sight) in sights.iter().enumerate() {
-            let plane = sight.about(lens);
-            let reach = f64::from(-first);
-            let behind = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
-                .iter()
-                .any(|(u, v)| plane[2][0] + (plane[2][1] * u + plane[2][2] * v) * reach < 1e-6);
-            let rows =
-                self.sums.cover.chunks_exact_mut(edge).zip(self.sums.light.chunks_exact_mut(edge));
-            for ((sum_cover, sum_light), v) in rows.zip(&*offsets) {
-                paint_cover.fill(beneath.cover);
-                paint_light.fill(beneath.light);
-                for coat in coats.iter().rev() {
-                    let outline = Outline { plane: &plane, sight, sharpness: 1.0 / step };
-                    outline.cover_row(coat.area, *v, offsets, cover);
-                    if behind {
-                        hide_behind(plane[2], *v, offsets, cover);
-                    }
-                    apply(coat, cover, paint_cover, paint_light, opaque);
-                }
-                accumulate(sum_light, paint_light, part, instant == 0);
-                if !opaque {
-                    accumulate(sum_cover, paint_cover, part, instant == 0);
-                }
-            }
-        }
-        let blurred = Blurred { tile: self.tile, edge, blur };
-        blurred.into_pixels(&self.sums.light, &mut self.rows, &mut self.tile_paint.light);
-        if opaque {
-            self.tile_paint.cover.fill(1.0);
-        } else {
-            blurred.into_pixels(&self.sums.cover, &mut self.rows, &mut self.tile_paint.cover);
-        }
-    }
-
-    /// Which of the blurs resolves the smallest of the shapes.
-    fn fineness(&self, coats: &[Coat], sights: &[Sight], lens: &Linear) -> usize {
-        let Some(sight) = sights.first() else { return 0 };
-        let [x, y, w] = sight.about(lens);
-        let speed = |f: Affine, axis: usize| (f[axis] * w[0] - f[0] * w[axis]) / (w[0] * w[0]);
-        let per_pixel = |axis: usize| speed(x, axis).hypot(speed(y, axis));
-        let metres_per_pixel = per_pixel(1).max(per_pixel(2));
-        let smallest_m = coats.iter().fold(f64::INFINITY, |smallest, coat| match coat.area {
-            Area::Disc(radius) => smallest.min(radius),
-            Area::Rectangle(min, max) => smallest.min((max[0] - min[0]).min(max[1] - min[1])),
-            Area::Box => smallest,
-        });
-        let smallest_px = smallest_m / metres_per_pixel;
-        let sharp = self.blurs.first().is_some_and(|blur| blur.margin == 0);
-        match smallest_px {
-            // Also when it is not a number, at the horizon.
-            px if px > 5.0 && !sharp => 0,
-            px if px > 1.0 => 1,
-            _ => 2,
-        }
-    }
-}
-
-/// Coverage of subsamples by shapes, from one instant.
-struct Outline<'a> {
-    plane: &'a [Affine; 3],
-    sight: &'a Sight,
-    /// Subsamples to a pixel.
-    sharpness: f32,
-}
-
-impl Outline<'_> {
-    fn cover_row(&self, area: Area, v: f32, offsets: &[f32], cover: &mut [f32]) {
-        match area {
-            Area::Disc(radius) => self.disc(radius, v, offsets, cover),
-            Area::Rectangle(min, max) => {
-                cover.fill(1.0);
-                for edge in [
-                    [max[0], -1.0, 0.0],
-                    [-min[0], 1.0, 0.0],
-                    [max[1], 0.0, -1.0],
-                    [-min[1], 0.0, 1.0],
-                ] {
-                    self.half_plane(edge, v, offsets, cover);
-                }
-            }
-            Area::Box => {
-                cover.fill(1.0);
-                for edge in self.sight.outline() {
-                    self.half_plane(*edge, v, offsets, cover);
-                }
-            }
-        }
-    }
-
-    /// Multiplies the cover with that of a half-plane, in which `edge` is positive.
-    fn half_plane(&self, edge: Affine, v: f32, offsets: &[f32], cover: &mut [f32]) {
-        let [x, y, w] = self.plane;
-        let line = [0, 1, 2].map(|i| edge[0] * w[i] + edge[1] * x[i] + edge[2] * y[i]);
-        let scale = f64::from(self.sharpness) / line[1].hypot(line[2]).max(1e-30);
-        let [constant, per_u, per_v] = line.map(|l| (l * scale).clamp(-1e30, 1e30) as f32);
-        let start = 0.5 + constant + per_v * v;
-        for (cover, u) in cover.iter_mut().zip(offsets) {
-            *cover *= (start + per_u * u).clamp(0.0, 1.0);
-        }
-    }
-
-    /// The cover by a disc: x^2 + y^2 - radius^2 w^2 is a quadratic in the image, and its distance from nought in
-    /// pixels is its value over its gradient.
-    fn disc(&self, radius: f64, v: f32, offsets: &[f32], cover: &mut [f32]) {
-        let [x, y, w] = self.plane;
-        let r2 = radius * radius;
-        let product = |i: usize, j: usize| x[i] * x[j] + y[i] * y[j] - r2 * w[i] * w[j];
-        let (u1, v1) = (2.0 * product(0, 1), 2.0 * product(0, 2));
-        let (uu, uv, vv) = (product(1, 1), 2.0 * product(1, 2), product(2, 2));
-        let scale =
-            1.0 / [u1, v1, 8.0 * uu, 8.0 * vv].iter().fold(1e-200, |m: f64, c| m.max(c.abs()));
-        let [c, u1, v1, uu, uv, vv] =
-            [product(0, 0), u1, v1, uu, uv, vv].map(|c| (c * scale) as f32);
-        let (start, slope) = (c + (v1 + vv * v) * v, u1 + uv * v);
-        let down = v1 + 2.0 * vv * v;
-        for (cover, u) in cover.iter_mut().zip(offsets) {
-            let value = start + (slope + uu * u) * u;
-            let across = slope + 2.0 * uu * u;
-            let along = down + uv * u;
-            let steepness = (across * across + along * along + 1e-12).sqrt();
-            *cover = (0.5 - value / steepness * self.sharpness).clamp(0.0, 1.0);
-        }
-    }
-}
-
-/// Takes away what lies behind the camera.
-fn hide_behind(w: Affine, v: f32, offsets: &[f32], cover: &mut [f32]) {
-    let [start, per_u, per_v] = w.map(|w| w as f32);
-    for (cover, u) in cover.iter_mut().zip(offsets) {
-        if start + per_v * v + per_u * u < 1e-6 {
-            *cover = 0.0;
-        }
-    }
-}
-
-fn apply(
-    coat: &Coat,
-    cover: &[f32],
-    paint_cover: &mut [f32],
-    paint_light: &mut [f32],
-    opaque: bool,
-) {
-    let Paint { cover: own_cover, light: own_light } = coat.paint;
-    if let Some(within) = coat.within {
-        for (light, c) in paint_light.iter_mut().zip(cover) {
-            *light += c * (own_light - within);
-        }
-        return;
-    }
-    for (light, c) in paint_light.iter_mut().zip(cover) {
-        *light += c * (own_light - *light);
-    }
-    if !opaque {
-        for (paint, c) in paint_cover.iter_mut().zip(cover) {
-            *paint += c * (own_cover - *paint);
-        }
-    }
-}
-
-fn accumulate(sums: &mut [f32], values: &[f32], part: f32, first: bool) {
-    for (sum, value) in sums.iter_mut().zip(values) {
-        *sum = if first { value * part } else { *sum + value * part };
-    }
-}
-
-/// Subsamples on their way into pixels.
-struct Blurred<'a> {
-    tile: usize,
-    edge: usize,
-    blur: &'a Blur,
-}
-
-impl Blurred<'_> {
-    fn into_pixels(&self, sums: &[f32], rows: &mut [f32], pixels: &mut [f32]) {
-        let weights = &self.blur.weights;
-        let rows = rows.chunks_exact_mut(self.edge).take(self.tile).enumerate();
-        for ((y, row), pixels) in rows.zip(pixels.chunks_exact_mut(self.tile)) {
-            row.fill(0.0);
-            let sources = sums.chunks_exact(self.edge).skip(y * self.blur.per_pixel);
-            for (source, weight) in sources.zip(weights) {
-                for (sum, value) in row.iter_mut().zip(source) {
-                    *sum += value * weight;
-                }
-            }
-            let windows = row.windows(weights.len()).step_by(self.blur.per_pixel);
-            for (pixel, window) in pixels.iter_mut().zip(windows) {
-                *pixel = window.iter().zip(weights).map(|(v, w)| v * w).sum();
-            }
         }
     }
 }

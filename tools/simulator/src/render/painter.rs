@@ -1,0 +1,497 @@
+//! Tiles of a painting in which edges are: subsamples, weighted with the blur.
+
+use super::exposure::GROUP;
+use super::lens::{Blur, Lens, Linear, PROFILE_WIDTH};
+use super::painting::{Affine, Area, Coat, Paint, Sight};
+
+/// Paints tiles.
+#[derive(Debug)]
+pub(super) struct Painter {
+    tile: usize,
+    /// From coarse to fine subsamples, and the coarsest that serves straight edges.
+    blurs: [Blur; 3],
+    coarsest: usize,
+    offsets: Vec<f32>,
+    outlines: Outlines,
+    /// Of the row of subsamples being painted.
+    cover: Vec<f32>,
+    paint: Channels,
+    /// Sums over the instants, subsample by subsample.
+    sums: Channels,
+    /// Rows of pixels by columns of subsamples.
+    rows: Vec<f32>,
+    /// The painted tile, pixel by pixel.
+    pub(super) tile_paint: Channels,
+}
+
+/// Cover and light, place by place.
+#[derive(Debug, Default)]
+pub(super) struct Channels {
+    pub(super) cover: Vec<f32>,
+    pub(super) light: Vec<f32>,
+}
+
+impl Channels {
+    pub(super) fn new(len: usize) -> Self {
+        Self { cover: vec![0.0; len], light: vec![0.0; len] }
+    }
+}
+
+/// A tile of a painting during the exposure.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct Glimpse<'a> {
+    /// At its instants.
+    pub(super) sights: &'a [Sight],
+    /// About the tile's centre.
+    pub(super) lens: &'a Linear,
+    /// How far what the tile shows moves during the exposure, in pixels.
+    pub(super) motion_px: [f64; 2],
+    /// Whether accuracy matters.
+    pub(super) exact: bool,
+}
+
+/// How finely a tile is resolved.
+#[derive(Copy, Clone, Debug)]
+struct Resolution {
+    /// Which of the blurs.
+    blur: usize,
+    /// Every how many of the instants is painted.
+    group: usize,
+    /// Motion in pixels from one painted instant to the next, over which edges are averaged.
+    motion: [f64; 2],
+    /// Whether edges of polygons, too, are averaged; corners are not made of averaged edges.
+    polygons_move: bool,
+    /// Discs smaller than this are not averaged, in metres: their edges are too bent.
+    smallest_moving_m: f64,
+}
+
+/// Blurs of lenses, in pixels, too sharp for the coarsest and for the next coarsest subsamples.
+const SHARP_PX: [f64; 2] = [0.5, 0.2];
+
+/// From this size in pixels on, a shape's edge is nearly straight within a subsample.
+const LARGE_PX: f64 = 4.0;
+
+/// A shape of so many times the motion during a group of instants is nearly straight along it.
+const STRAIGHT: f64 = 4.0;
+
+/// A disc of a radius below so many times the motion during an instant is too bent to be averaged over it.
+const BENT: f64 = 2.0;
+
+/// Below this size in pixels a shape needs the finest subsamples.
+const SMALL_PX: f64 = 0.7;
+
+impl Painter {
+    pub(super) fn new(lens: &Lens, blur_px: f64) -> Self {
+        let blurs = [2, 4, 8].map(|per_pixel| Blur::new(blur_px, per_pixel));
+        let tile = lens.tile;
+        let edge = blurs.iter().map(|b| tile * b.per_pixel + 2 * b.margin).max().unwrap_or(0);
+        Self {
+            tile,
+            blurs,
+            coarsest: SHARP_PX.iter().filter(|sharp| blur_px < **sharp).count(),
+            offsets: vec![0.0; edge],
+            outlines: Outlines::default(),
+            cover: vec![0.0; edge],
+            paint: Channels::new(edge),
+            sums: Channels::new(edge * edge),
+            rows: vec![0.0; tile * edge],
+            tile_paint: Channels::new(tile * tile),
+        }
+    }
+
+    /// How far outside a tile its light may come from, in pixels.
+    pub(super) fn reach_px(&self) -> f64 {
+        self.blurs.iter().map(Blur::reach_px).fold(0.0, f64::max)
+    }
+
+    /// Paints coats, top first, over what lies `beneath`, into [`Painter::tile_paint`].
+    pub(super) fn paint(&mut self, coats: &[Coat], beneath: Paint, glimpse: &Glimpse<'_>) {
+        let resolution = self.resolution(coats, glimpse);
+        let Some(blur) = self.blurs.get(resolution.blur) else { return };
+        let step = 1.0 / blur.per_pixel as f32;
+        let edge = self.tile * blur.per_pixel + 2 * blur.margin;
+        let first = -0.5 * (edge as f32 - 1.0) * step;
+        let opaque = beneath.cover == 1.0 && coats.iter().all(|coat| coat.paint.cover == 1.0);
+        let (Some(offsets), Some(cover), Some(paint_cover), Some(paint_light)) = (
+            self.offsets.get_mut(..edge),
+            self.cover.get_mut(..edge),
+            self.paint.cover.get_mut(..edge),
+            self.paint.light.get_mut(..edge),
+        ) else {
+            return;
+        };
+        for (index, offset) in offsets.iter_mut().enumerate() {
+            *offset = first + index as f32 * step;
+        }
+        let count = glimpse.sights.len() / resolution.group;
+        let part = 1.0 / count.max(1) as f32;
+        // The middle one of each group stands for it.
+        let chosen = glimpse.sights.iter().skip(resolution.group / 2).step_by(resolution.group);
+        for (instant, sight) in chosen.enumerate() {
+            let plane = sight.about(glimpse.lens);
+            let size = (f64::from(step), f64::from(-first));
+            self.outlines.draw(coats, (sight, &plane), &resolution, size);
+            let rows =
+                self.sums.cover.chunks_exact_mut(edge).zip(self.sums.light.chunks_exact_mut(edge));
+            for ((sum_cover, sum_light), v) in rows.zip(&*offsets) {
+                paint_cover.fill(beneath.cover);
+                paint_light.fill(beneath.light);
+                for (coat, outline) in &self.outlines.of_coats {
+                    self.outlines.cover_row(outline, *v, offsets, cover);
+                    apply(coat, cover, paint_cover, paint_light, opaque);
+                }
+                accumulate(sum_light, paint_light, part, instant == 0);
+                if !opaque {
+                    accumulate(sum_cover, paint_cover, part, instant == 0);
+                }
+            }
+        }
+        let blurred = Blurred { tile: self.tile, edge, blur };
+        blurred.into_pixels(&self.sums.light, &mut self.rows, &mut self.tile_paint.light);
+        if opaque {
+            self.tile_paint.cover.fill(1.0);
+        } else {
+            blurred.into_pixels(&self.sums.cover, &mut self.rows, &mut self.tile_paint.cover);
+        }
+    }
+
+    /// What resolves the smallest of the shapes.
+    fn resolution(&self, coats: &[Coat], glimpse: &Glimpse<'_>) -> Resolution {
+        let count = glimpse.sights.len();
+        let coarse = Resolution {
+            blur: self.coarsest,
+            group: GROUP.min(count.max(1)),
+            motion: glimpse.motion_px.map(|m| m * GROUP as f64 / count.max(GROUP) as f64),
+            polygons_move: true,
+            smallest_moving_m: 0.0,
+        };
+        let Some(middle) = glimpse.sights.get(count / 2) else { return coarse };
+        if !glimpse.exact {
+            return coarse;
+        }
+        let plane = middle.about(glimpse.lens);
+        let [du, dv] = slopes(&plane);
+        let metres_per_pixel =
+            (du[0] * du[0] + du[1] * du[1]).max(dv[0] * dv[0] + dv[1] * dv[1]).sqrt();
+        let smallest_m = coats.iter().fold(f64::INFINITY, |smallest, coat| match coat.area {
+            Area::Disc(radius) => smallest.min(radius),
+            Area::Rectangle(min, max) => smallest.min((max[0] - min[0]).min(max[1] - min[1])),
+            Area::Box => smallest,
+        });
+        let smallest_px = smallest_m / metres_per_pixel;
+        let cornered = self.has_corner(coats, middle, &plane);
+        let step_px = |motion: [f64; 2]| (motion[0] * motion[0] + motion[1] * motion[1]).sqrt();
+        let straight = smallest_px > STRAIGHT * step_px(coarse.motion);
+        if smallest_px > LARGE_PX && (count == 1 || (straight && !cornered)) {
+            return coarse;
+        }
+        let motion = glimpse.motion_px.map(|m| m / count as f64);
+        let blur = match smallest_px {
+            px if px > LARGE_PX => self.coarsest,
+            px if px > SMALL_PX || count > 1 => self.coarsest.max(1),
+            // Also when it is not a number, at the horizon.
+            _ => 2,
+        };
+        let smallest_moving_m = BENT * step_px(motion) * metres_per_pixel;
+        Resolution { blur, group: 1, motion, polygons_move: !cornered, smallest_moving_m }
+    }
+
+    /// Whether two edges of one shape come near the tile.
+    fn has_corner(&self, coats: &[Coat], sight: &Sight, plane: &[Affine; 3]) -> bool {
+        let near = (self.tile as f64 / 2.0 + self.reach_px()) * std::f64::consts::SQRT_2;
+        let edges_near = |edges: &[Affine]| {
+            edges.iter().filter(|edge| depth_px(plane, edge)[0].abs() < near).count()
+        };
+        coats.iter().any(|coat| match coat.area {
+            Area::Disc(_) => false,
+            Area::Rectangle(min, max) => edges_near(&rectangle(min, max)) > 1,
+            Area::Box => edges_near(sight.outline()) > 1,
+        })
+    }
+}
+
+/// How the place on the plane changes per column and per row of pixels at a tile's centre.
+pub(super) fn slopes([x, y, w]: &[Affine; 3]) -> [[f64; 2]; 2] {
+    let slope = |f: &Affine, axis: usize| (f[axis] * w[0] - f[0] * w[axis]) / (w[0] * w[0]);
+    [1, 2].map(|axis| [slope(x, axis), slope(y, axis)])
+}
+
+/// The coats' outlines in a tile at one instant.
+#[derive(Debug, Default)]
+struct Outlines {
+    of_coats: Vec<(Coat, Outline)>,
+    half_planes: Vec<HalfPlane>,
+    /// The plane's w when some of the tile is behind the camera.
+    behind: Option<[f32; 3]>,
+    profile: Profile,
+}
+
+#[derive(Copy, Clone, Debug)]
+enum Outline {
+    Disc {
+        /// Coefficients 1, u, v, uu, uv, vv of a quadratic that is negative inside.
+        quadratic: [f32; 6],
+        /// How far it moves.
+        motion: [f32; 2],
+    },
+    /// Which of the half-planes.
+    Polygon { first: usize, len: usize },
+}
+
+/// Depth within its edge, in pixels: constant, per column, per row; and how far the edge moves.
+#[derive(Copy, Clone, Debug)]
+struct HalfPlane {
+    depth: [f32; 3],
+    motion: f32,
+}
+
+/// How cover rises across an edge: the integral of a biweight kernel.
+#[derive(Copy, Clone, Debug, Default)]
+struct Profile {
+    /// Width of the kernel, and its inverse, in pixels.
+    width: f32,
+    inverse: f32,
+}
+
+/// Below this an edge stands still, in pixels.
+const STILL_PX: f32 = 0.05;
+
+impl Profile {
+    fn new(width: f64) -> Self {
+        Self { width: width as f32, inverse: (1.0 / width) as f32 }
+    }
+
+    /// Cover at a depth within an edge that stands still.
+    fn cover(self, depth: f32) -> f32 {
+        let t = (0.5 + depth * self.inverse).clamp(0.0, 1.0);
+        t * t * t * (10.0 + t * (6.0 * t - 15.0))
+    }
+
+    /// Mean cover at a depth within an edge that moves along its normal by `motion`, at least [`STILL_PX`].
+    fn mean_cover(self, depth: f32, motion: f32) -> f32 {
+        (self.integral(depth + 0.5 * motion) - self.integral(depth - 0.5 * motion)) / motion
+    }
+
+    /// Integral of the cover up to a depth.
+    fn integral(self, depth: f32) -> f32 {
+        let t = (0.5 + depth * self.inverse).clamp(0.0, 1.0);
+        let t2 = t * t;
+        t2 * t2 * (2.5 + t * (t - 3.0)) * self.width + (depth - 0.5 * self.width).max(0.0)
+    }
+}
+
+impl Outlines {
+    /// Draws coats, top first, as seen in `sight`, for subsamples of size `step` at most `reach` columns and rows from
+    /// the tile's centre.
+    fn draw(
+        &mut self,
+        coats: &[Coat],
+        (sight, plane): (&Sight, &[Affine; 3]),
+        resolution: &Resolution,
+        (step, reach): (f64, f64),
+    ) {
+        let least = |f: &Affine| f[0] - (f[1].abs() + f[2].abs()) * reach;
+        self.behind = (least(&plane[2]) < 1e-6).then(|| plane[2].map(|w| w as f32));
+        self.profile = Profile::new(PROFILE_WIDTH * step);
+        let spread = (PROFILE_WIDTH * step).powi(2) / 28.0;
+        let motion_of_polygons =
+            if resolution.polygons_move { resolution.motion } else { [0.0; 2] };
+        self.of_coats.clear();
+        self.half_planes.clear();
+        for coat in coats.iter().rev() {
+            let outline = match coat.area {
+                Area::Disc(radius) => {
+                    let moves = radius > resolution.smallest_moving_m;
+                    let motion = if moves { resolution.motion } else { [0.0; 2] };
+                    let quadratic = disc(plane, radius, motion, spread);
+                    Outline::Disc { quadratic, motion: motion.map(|m| m as f32) }
+                }
+                Area::Rectangle(min, max) => {
+                    self.polygon(plane, &rectangle(min, max), motion_of_polygons, reach)
+                }
+                Area::Box => self.polygon(plane, sight.outline(), motion_of_polygons, reach),
+            };
+            self.of_coats.push((*coat, outline));
+        }
+    }
+
+    /// The half-planes of a polygon that have an edge in the tile.
+    fn polygon(
+        &mut self,
+        plane: &[Affine; 3],
+        edges: &[Affine],
+        motion: [f64; 2],
+        reach: f64,
+    ) -> Outline {
+        let first = self.half_planes.len();
+        for edge in edges {
+            let depth = depth_px(plane, edge);
+            let moved = (depth[1] * motion[0] + depth[2] * motion[1]).abs();
+            let least = depth[0] - (depth[1].abs() + depth[2].abs()) * reach;
+            if least < f64::from(self.profile.width) + moved {
+                let depth = depth.map(|d| d as f32);
+                self.half_planes.push(HalfPlane { depth, motion: moved as f32 });
+            }
+        }
+        Outline::Polygon { first, len: self.half_planes.len() - first }
+    }
+
+    /// How much of each subsample in row `v` an outline covers.
+    fn cover_row(&self, outline: &Outline, v: f32, offsets: &[f32], cover: &mut [f32]) {
+        match *outline {
+            Outline::Disc { quadratic, motion: [0.0, 0.0] } => {
+                self.disc_row(quadratic, v, offsets, cover);
+            }
+            Outline::Disc { quadratic, motion } => {
+                self.moving_disc_row(quadratic, motion, v, offsets, cover);
+            }
+            Outline::Polygon { first, len } => {
+                let planes = self.half_planes.get(first..first + len).unwrap_or(&[]);
+                cover.fill(1.0);
+                for plane in planes {
+                    self.half_plane_row(plane, v, offsets, cover);
+                }
+            }
+        }
+        if let Some([start, per_u, per_v]) = self.behind {
+            for (cover, u) in cover.iter_mut().zip(offsets) {
+                if start + per_v * v + per_u * u < 1e-6 {
+                    *cover = 0.0;
+                }
+            }
+        }
+    }
+
+    /// Multiplies the cover with a half-plane's.
+    fn half_plane_row(&self, plane: &HalfPlane, v: f32, offsets: &[f32], cover: &mut [f32]) {
+        let [start, per_u, per_v] = plane.depth;
+        let start = start + per_v * v;
+        if plane.motion < STILL_PX {
+            for (cover, u) in cover.iter_mut().zip(offsets) {
+                *cover *= self.profile.cover(start + per_u * u);
+            }
+        } else {
+            for (cover, u) in cover.iter_mut().zip(offsets) {
+                *cover *= self.profile.mean_cover(start + per_u * u, plane.motion);
+            }
+        }
+    }
+
+    /// The distance of a quadratic's nought in pixels is its value over its gradient.
+    fn disc_row(
+        &self,
+        [c, u1, v1, uu, uv, vv]: [f32; 6],
+        v: f32,
+        offsets: &[f32],
+        cover: &mut [f32],
+    ) {
+        let (start, slope) = (c + (v1 + vv * v) * v, u1 + uv * v);
+        let down = v1 + 2.0 * vv * v;
+        for (cover, u) in cover.iter_mut().zip(offsets) {
+            let value = start + (slope + uu * u) * u;
+            let (across, along) = (slope + 2.0 * uu * u, down + uv * u);
+            let steepness = (across * across + along * along + 1e-14).sqrt();
+            *cover = self.profile.cover(-value / steepness);
+        }
+    }
+
+    fn moving_disc_row(
+        &self,
+        [c, u1, v1, uu, uv, vv]: [f32; 6],
+        [mu, mv]: [f32; 2],
+        v: f32,
+        offsets: &[f32],
+        cover: &mut [f32],
+    ) {
+        let (start, slope) = (c + (v1 + vv * v) * v, u1 + uv * v);
+        let down = v1 + 2.0 * vv * v;
+        for (cover, u) in cover.iter_mut().zip(offsets) {
+            let value = start + (slope + uu * u) * u;
+            let (across, along) = (slope + 2.0 * uu * u, down + uv * u);
+            let flatness = 1.0 / (across * across + along * along + 1e-14).sqrt();
+            let motion = ((across * mu + along * mv) * flatness).abs().max(STILL_PX);
+            *cover = self.profile.mean_cover(-value * flatness, motion);
+        }
+    }
+}
+
+/// The half-planes of an upright rectangle.
+fn rectangle(min: [f64; 2], max: [f64; 2]) -> [Affine; 4] {
+    [[max[0], -1.0, 0.0], [-min[0], 1.0, 0.0], [max[1], 0.0, -1.0], [-min[1], 0.0, 1.0]]
+}
+
+/// Depth in pixels within the edge of a half-plane.
+fn depth_px([x, y, w]: &[Affine; 3], edge: &Affine) -> Affine {
+    let line = [0, 1, 2].map(|i| edge[0] * w[i] + edge[1] * x[i] + edge[2] * y[i]);
+    let steepness = (line[1] * line[1] + line[2] * line[2]).sqrt().max(1e-30);
+    line.map(|l| (l / steepness).clamp(-1e9, 1e9))
+}
+
+/// A disc about the origin: x^2 + y^2 - radius^2 w^2, a quadratic in the image. Its bend is accounted for: along the
+/// motion by the mean over it, within the profile, whose variance is `spread`, by that of a round one.
+fn disc([x, y, w]: &[Affine; 3], radius: f64, [mu, mv]: [f64; 2], spread: f64) -> [f32; 6] {
+    let r2 = radius * radius;
+    let product = |i: usize, j: usize| x[i] * x[j] + y[i] * y[j] - r2 * w[i] * w[j];
+    let (u1, v1) = (2.0 * product(0, 1), 2.0 * product(0, 2));
+    let (uu, uv, vv) = (product(1, 1), 2.0 * product(1, 2), product(2, 2));
+    let bend = (uu * mu * mu + uv * mu * mv + vv * mv * mv) / 12.0 + (uu + vv) * spread;
+    let largest = [u1, v1, 8.0 * uu, 8.0 * vv].iter().fold(1e-200, |m: f64, c| m.max(c.abs()));
+    [product(0, 0) + bend, u1, v1, uu, uv, vv].map(|c| (c / largest) as f32)
+}
+
+fn apply(
+    coat: &Coat,
+    cover: &[f32],
+    paint_cover: &mut [f32],
+    paint_light: &mut [f32],
+    opaque: bool,
+) {
+    let Paint { cover: own_cover, light: own_light } = coat.paint;
+    if let Some(within) = coat.within {
+        for (light, c) in paint_light.iter_mut().zip(cover) {
+            *light += c * (own_light - within);
+        }
+        return;
+    }
+    for (light, c) in paint_light.iter_mut().zip(cover) {
+        *light += c * (own_light - *light);
+    }
+    if !opaque {
+        for (paint, c) in paint_cover.iter_mut().zip(cover) {
+            *paint += c * (own_cover - *paint);
+        }
+    }
+}
+
+fn accumulate(sums: &mut [f32], values: &[f32], part: f32, first: bool) {
+    for (sum, value) in sums.iter_mut().zip(values) {
+        *sum = if first { value * part } else { *sum + value * part };
+    }
+}
+
+/// Subsamples on their way into pixels.
+struct Blurred<'a> {
+    tile: usize,
+    edge: usize,
+    blur: &'a Blur,
+}
+
+impl Blurred<'_> {
+    fn into_pixels(&self, sums: &[f32], rows: &mut [f32], pixels: &mut [f32]) {
+        let weights = &self.blur.weights;
+        let rows = rows.chunks_exact_mut(self.edge).take(self.tile).enumerate();
+        for ((y, row), pixels) in rows.zip(pixels.chunks_exact_mut(self.tile)) {
+            row.fill(0.0);
+            let sources = sums.chunks_exact(self.edge).skip(y * self.blur.per_pixel);
+            for (source, weight) in sources.zip(weights) {
+                for (sum, value) in row.iter_mut().zip(source) {
+                    *sum += value * weight;
+                }
+            }
+            let windows = row.windows(weights.len()).step_by(self.blur.per_pixel);
+            for (pixel, window) in pixels.iter_mut().zip(windows) {
+                *pixel = window.iter().zip(weights).map(|(v, w)| v * w).sum();
+            }
+        }
+    }
+}
