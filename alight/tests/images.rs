@@ -1,0 +1,59 @@
+//! The program from a marker's file to what is found in it.
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use anyhow::{Context, ensure};
+use serde_json::Value;
+
+fn alight(args: &[&str], folder: &Path) -> anyhow::Result<Output> {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_alight"));
+    command.args(args).current_dir(folder).output().context("running alight")
+}
+
+#[test]
+fn a_marker_that_was_made_is_found_where_it_was_drawn() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let made = alight(
+        &["marker", "rings", "--size", "0.1", "--dpi", "100", "-o", "a.png"],
+        folder.path(),
+    )?;
+    ensure!(made.status.success(), "{made:?}");
+    std::fs::write(folder.path().join("b.png"), "not an image")?;
+    let args = ["detect", "--marker", "rings:0.1", "--focal-px", "1000", "--format", "jsonl", "."];
+    let found = alight(&args, folder.path())?;
+    ensure!(found.status.code() == Some(1), "{found:?}");
+    let lines: Vec<Value> =
+        found.stdout.lines().map(|line| Ok(line?.parse()?)).collect::<anyhow::Result<_>>()?;
+    let [image, damaged] = lines.as_slice() else { anyhow::bail!("{lines:?}") };
+    ensure!(damaged["error"].is_string() && damaged["image"] == "./b.png", "{damaged}");
+    let marker = &image["detections"][0];
+    let number = |value: &Value| value.as_f64().context("a number");
+    // The middle of an A4 sheet of 827 x 1169 pixels, and 0.1 m at 100 pixels an inch.
+    ensure!((number(&marker["centre_px"][0])? - 412.9).abs() < 0.5, "{marker}");
+    ensure!((number(&marker["centre_px"][1])? - 584.1).abs() < 0.5, "{marker}");
+    ensure!((number(&marker["size_px"])? - 393.7).abs() < 1.0, "{marker}");
+    ensure!((number(&marker["pose"]["translation_m"][2])? - 0.254).abs() < 0.002, "{marker}");
+    Ok(())
+}
+
+#[test]
+fn a_reader_that_goes_away_is_no_error() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    for i in 0..300 {
+        std::fs::write(folder.path().join(format!("{i:03}.png")), "not an image")?;
+    }
+    let mut child = Command::new(env!("CARGO_BIN_EXE_alight"))
+        .args(["detect", "--marker", "rings"])
+        .arg(folder.path())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()?;
+    let mut first = String::new();
+    BufReader::with_capacity(64, child.stdout.take().context("output")?).read_line(&mut first)?;
+    ensure!(first.contains("000.png  error: "), "{first}");
+    let ended = child.wait_with_output()?;
+    ensure!(ended.stderr.is_empty(), "{}", String::from_utf8_lossy(&ended.stderr));
+    Ok(())
+}
