@@ -45,6 +45,10 @@ const OUTSIDE: [&str; 17] = [
     "rustix",
 ];
 
+/// The documents whose paths and names must exist.
+const DOCUMENTS: [&str; 4] =
+    ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "zenoh-config/README.md"];
+
 /// Keys that share the comment of the key above them.
 const SHARED_COMMENTS: [(&str, &str); 3] =
     [("simulator.toml", "east_m"), ("simulator.toml", "height"), ("simulator.toml", "focal_px")];
@@ -332,7 +336,7 @@ fn defines(code: &str, name: &str) -> bool {
 fn documents_name_only_what_exists() -> anyhow::Result<()> {
     let extensions = [".rs", ".toml", ".md", ".json5", ".py"];
     let mut names = 0;
-    for document in ["ARCHITECTURE.md", "CONTRIBUTING.md", "zenoh-config/README.md"] {
+    for document in DOCUMENTS {
         let markdown = text(root().join(document))?;
         for quote in quoted(&markdown) {
             let (path, name) = match quote.split_once(": ") {
@@ -340,7 +344,10 @@ fn documents_name_only_what_exists() -> anyhow::Result<()> {
                 None => (quote, None),
             };
             let is_path = path.contains('/') || extensions.iter().any(|end| path.ends_with(end));
-            if !is_path || path.contains(|c: char| c.is_whitespace() || ":{<*$".contains(c)) {
+            if !is_path
+                || path.starts_with('/')
+                || path.contains(|c: char| c.is_whitespace() || ":{<*$".contains(c))
+            {
                 let is_key = path.contains('/') && path.contains('{') && !path.contains(' ');
                 ensure!(!is_key || is_topic(path), "{document}: there is no topic `{path}`");
                 continue;
