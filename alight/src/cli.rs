@@ -120,10 +120,17 @@ pub(crate) fn run() -> ExitCode {
         Command::Command(args) => send_command(args),
     };
     result.unwrap_or_else(|problem| {
-        let wrong_use = problem.downcast_ref::<ConfigError>().is_some();
         write_error(&format!("alight: {problem:#}"));
-        ExitCode::from(if wrong_use { WRONG_USE } else { 1 })
+        ExitCode::from(if is_wrong_use(&problem) { WRONG_USE } else { 1 })
     })
+}
+
+/// True for errors that another command line or configuration would avoid.
+fn is_wrong_use(problem: &anyhow::Error) -> bool {
+    problem.is::<ConfigError>()
+        || problem.is::<fiducial::DetectorError>()
+        || problem.is::<camera_pub::CalibrationError>()
+        || problem.is::<marker::SheetError>()
 }
 
 fn print_config(args: ConfigArgs) -> anyhow::Result<ExitCode> {
@@ -133,7 +140,11 @@ fn print_config(args: ConfigArgs) -> anyhow::Result<ExitCode> {
     let mut out = std::io::stdout().lock();
     for service in Service::value_variants().iter().copied().filter(wanted) {
         let table = service.effective_config(&layers)?;
-        writeln!(out, "# {}\n{table}", service.name())?;
+        match writeln!(out, "# {}\n{table}", service.name()) {
+            // The reader has seen enough, as `head` does.
+            Err(problem) if problem.kind() == std::io::ErrorKind::BrokenPipe => break,
+            result => result?,
+        }
     }
     Ok(ExitCode::SUCCESS)
 }

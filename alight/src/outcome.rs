@@ -153,13 +153,15 @@ impl Outcome {
     /// The result beside the thesis' flight, for people.
     pub(crate) fn table(&self) -> String {
         let mut text = String::new();
-        let verdict = if self.landed { "Landed." } else { "Not landed:" };
-        let detail = if self.landed { "" } else { &self.outcome };
+        let verdict = match self.landed {
+            true => "Landed.".to_owned(),
+            false => format!("Not landed: {}.", self.outcome),
+        };
         // Writing to a string cannot fail.
         let mut line = |args: std::fmt::Arguments<'_>| {
             let _ = writeln!(text, "{args}");
         };
-        line(format_args!("{verdict} {detail}"));
+        line(format_args!("{verdict}"));
         line(format_args!("{:34} {:>14} {:>14}", "", "this flight", "thesis"));
         let mut row = |name: &str, value: Option<f64>, unit: &str, digits: usize, thesis: &str| {
             let value = value.map_or("-".to_owned(), |v| format!("{v:.digits$} {unit}"));

@@ -71,7 +71,7 @@ impl Flight {
             Start::Airborne => Mission::AwaitsAir,
             Start::Takeoff => Mission::TakesOff {
                 takeoff: Takeoff::new(config.takeoff_height_m),
-                why: "waiting for the autopilot".to_owned(),
+                why: "waiting for the autopilot's heartbeat".to_owned(),
             },
         };
         let settings = &config.autopilot;
@@ -375,12 +375,8 @@ impl Flight {
                         tracing::error!(%problem, "No take-off");
                         self.mission = Mission::Failed { why: problem.to_string() };
                     }
-                    progress => {
-                        let now_why = progress.to_string();
-                        if *why != now_why {
-                            *why = now_why;
-                        }
-                    }
+                    TakeoffProgress::Waiting(reasons) => *why = reasons.join("; "),
+                    progress => *why = progress.to_string(),
                 }
             }
             Mission::AwaitsCommand | Mission::Lands | Mission::Failed { .. } => {}

@@ -133,7 +133,10 @@ impl FramePublisher {
             Loan::Private(buffer) => buffer.into(),
         };
         match self.publisher.put(payload).attachment(encode(header)).await {
-            Ok(()) => self.health.count("frames"),
+            Ok(()) => self.health.count(match header.format {
+                PixelFormat::Mono8 => "frames",
+                PixelFormat::Jpeg => "JPEG images",
+            }),
             Err(cause) => {
                 if self.health.failed("publish frame") {
                     tracing::warn!(%cause, "A frame could not be published");
