@@ -9,6 +9,7 @@ use std::time::Instant;
 use fiducial::debug::{ALIGNMENT_RADIUS_PX, RgbImageBuf, draw_ellipses, draw_rings, draw_target};
 use fiducial::rings_thesis::{ContourEllipse, ellipse_filter};
 use fiducial::{Detector, Settings, Stages};
+use geometry::CameraModel;
 use imaging::{
     BilateralRows, Contours, GrayImage, GrayView, Limits, bilateral_5x5, contour_area, fit_ellipse,
     threshold,
@@ -94,13 +95,15 @@ fn thesis_stages(view: GrayView<'_>, folder: &Path) -> Outcome<()> {
 /// Detections, debug images and timings of one family.
 fn detect(view: GrayView<'_>, family: &str, folder: &Path) -> Outcome<()> {
     const REPEATS: u32 = 20;
-    let mut detector = Detector::new(&[family.parse()?], Settings::default())?;
-    detector.detect(view, None, &mut ());
+    let marker = format!("{family}:0.15341").parse()?;
+    let mut detector = Detector::new(&[marker], Settings::default())?;
+    let camera = CameraModel::pinhole(view.width() as u32, view.height() as u32, 1818.0);
+    detector.detect(view, Some(&camera), &mut ());
     let mut clock = Clock::default();
     let mut found = Vec::new();
     for _ in 0..REPEATS {
         clock.last = Some(Instant::now());
-        found = detector.detect(view, None, &mut clock).to_vec();
+        found = detector.detect(view, Some(&camera), &mut clock).to_vec();
     }
     println!("{family}: {} found", found.len());
     for marker in &found {

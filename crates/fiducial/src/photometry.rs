@@ -126,10 +126,11 @@ impl Picture {
     fn whiteness(
         &self,
         spot: &Spot,
+        basis: &(Vector3<f64>, Vector3<f64>),
         size_m: f64,
         camera: &CameraModel,
     ) -> Option<(f64, SVector<f64, 5>, f64)> {
-        let (rho, per_px, by_pose) = self.circles.radius_at(&spot.ray, camera)?;
+        let (rho, per_px, by_pose) = self.circles.radius_at(basis, &spot.ray, camera)?;
         let (mut white, mut by_distance, mut by_blur) = (1.0, 0.0, 0.0);
         for kind in [RingKind::Outer, RingKind::Middle] {
             let (inner, outer) = kind.radii();
@@ -156,8 +157,9 @@ impl Picture {
     /// Black and white that fit the image best with everything else as it is.
     fn expose(&mut self, spots: &[Spot], size_m: f64, camera: &CameraModel) -> Option<()> {
         let (mut n, mut sw, mut sww, mut sg, mut swg) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let basis = self.circles.basis();
         for spot in spots {
-            let (white, _, _) = self.whiteness(spot, size_m, camera)?;
+            let (white, _, _) = self.whiteness(spot, &basis, size_m, camera)?;
             n += 1.0;
             sw += white;
             sww += white * white;
@@ -180,8 +182,9 @@ impl Picture {
     ) -> Option<(System, f64)> {
         let mut system = System { matrix: SMatrix::zeros(), right: SVector::zeros() };
         let mut cost = 0.0;
+        let basis = self.circles.basis();
         for spot in spots {
-            let (white, by_pose, by_blur) = self.whiteness(spot, size_m, camera)?;
+            let (white, by_pose, by_blur) = self.whiteness(spot, &basis, size_m, camera)?;
             let [x, y] = spot.offset;
             let contrast = self.white + self.slope[0] * x + self.slope[1] * y - self.black;
             let difference = self.black + contrast * white - spot.grey;
@@ -269,8 +272,9 @@ mod tests {
                 let (x, y) = (f64::from(i % 100), f64::from(i / 100));
                 let ray = camera.unproject(Pixel::new(x, y)).coords;
                 let offset = [x - middle.x, y - middle.y];
-                let (white, _, _) =
-                    picture.whiteness(&Spot { ray, offset, grey: 0.0 }, size_m, &camera).unwrap();
+                let (white, _, _) = picture
+                    .whiteness(&Spot { ray, offset, grey: 0.0 }, &truth.basis(), size_m, &camera)
+                    .unwrap();
                 let paper = 200.0 + 0.5 * offset[0] - 0.3 * offset[1];
                 (30.0 + (paper - 30.0) * white).round() as u8
             })

@@ -116,8 +116,11 @@ impl Rings {
         stages.ended("contours");
         self.outlines.clear();
         for contour in self.contours.iter() {
-            if let Some(ellipse) = ellipse_of(contour.points, contour.hole) {
-                self.outlines.push(Outline { ellipse, black_within: !contour.hole });
+            match ellipse_of(contour.points, contour.hole) {
+                Some(ellipse) => {
+                    self.outlines.push(Outline { ellipse, black_within: !contour.hole });
+                }
+                None => arcs_of(contour.points, &view, &mut self.outlines),
             }
             if self.outlines.len() >= MOST_ELLIPSES {
                 break;
@@ -168,50 +171,55 @@ impl Rings {
     ) -> Result<Observation, Reason> {
         let size_m = marker.size_m.unwrap_or(1.0);
         let lens = camera.unwrap_or(nominal);
-        let mut search =
+        let search =
             Search { view, camera: lens, size_m, least_contrast: 0.35 * candidate.contrast };
-        let (circles, rms_px) = search.locate(&candidate.ring, &mut self.edges)?;
-        let support = search.measure(&circles, &mut self.edges);
-        if !believable(&support, candidate.ring.kind) {
-            return Err(Reason::Edges);
-        }
+        let kind = candidate.ring.kind;
+        let seen = match search.whole(&candidate.ring, &mut self.edges, &mut self.spots) {
+            Ok(seen) => seen,
+            Err(reason) => search
+                .alone(&candidate.ring, &mut self.edges)
+                .filter(|_| kind != RingKind::Inner)
+                .ok_or(reason)?,
+        };
         let guessed = match camera {
             Some(_) => None,
-            None => guess_lens(&circles, lens, &mut self.edges),
+            None => guess_lens(&seen.circles, lens, &mut self.edges),
         };
-        if let Some((circles, lens)) = guessed {
-            return observe(&circles, &lens, size_m, &support, None);
-        }
-        let (circles, rms_px) = match search.refine_small(&circles, &mut self.spots) {
-            Some(better) => (better, better.rms_px(&self.edges, lens).ok_or(Reason::Pose)?),
-            None => (circles, rms_px),
-        };
+        let (circles, lens) = guessed.unwrap_or((seen.circles, *lens));
         let pose = marker.size_m.and(camera).map(|_| MarkerPose {
             camera_from_marker: circles.camera_from_marker(),
-            reprojection_rms_px: rms_px,
+            reprojection_rms_px: seen.rms_px,
         });
-        observe(&circles, lens, size_m, &support, pose)
+        let centre = project(circles.centre, &lens).ok_or(Reason::Pose)?;
+        let outline = circles.outline(size_m / 2.0, &lens).ok_or(Reason::Pose)?;
+        Ok(Observation {
+            family: Family::Rings,
+            id: None,
+            centre,
+            corners: None,
+            size_px: outline.major,
+            confidence: seen.confidence,
+            pose,
+        })
     }
 }
 
-fn observe(
-    circles: &Circles,
-    lens: &CameraModel,
-    size_m: f64,
-    support: &[Support; 6],
-    pose: Option<MarkerPose>,
-) -> Result<Observation, Reason> {
-    let centre = project(circles.centre, lens).ok_or(Reason::Pose)?;
-    let outline = circles.outline(size_m / 2.0, lens).ok_or(Reason::Pose)?;
-    Ok(Observation {
-        family: Family::Rings,
-        id: None,
-        centre,
-        corners: None,
-        size_px: outline.major,
-        confidence: confidence(support),
-        pose,
-    })
+/// A marker that was looked for and seen.
+#[derive(Copy, Clone, Debug)]
+struct Seen {
+    circles: Circles,
+    rms_px: f64,
+    confidence: f64,
+}
+
+/// Whether the edges lie where the pose puts them, or a small marker's grey values are what they should be: blur moves
+/// the edges of thin rings, but leaves them round.
+fn fits(diameter_px: f64, rms_px: f64, difference: Option<f64>) -> bool {
+    if diameter_px > photometry::MOST_DIAMETER_PX {
+        // Paper is not quite flat, and lenses bend.
+        return rms_px < 0.3 + 0.01 * diameter_px;
+    }
+    rms_px < 0.3 || difference.is_some_and(|d| d < 0.04)
 }
 
 /// The focal length at which the circles fit a tilted marker's edges best: without it the true centre of a large one
@@ -270,6 +278,60 @@ fn ellipse_of(points: &[[i32; 2]], hole: bool) -> Option<Ellipse> {
     (fits && on_edge.minor > 1.0 && ellipse.minor > 0.2 * ellipse.major).then_some(on_edge)
 }
 
+/// The ellipses of which a contour shows arcs between places where the image ends. A ring that the image's border
+/// cuts is one region whose contour is both its edges, the outer and, turning the other way, the inner one.
+fn arcs_of(points: &[[i32; 2]], view: &GrayView<'_>, outlines: &mut Vec<Outline>) {
+    const LEAST_POINTS: usize = 16;
+    let (right, bottom) = (view.width() as i32 - 1, view.height() as i32 - 1);
+    let ends = |[x, y]: &[i32; 2]| *x <= 0 || *y <= 0 || *x >= right || *y >= bottom;
+    if points.len() < LEAST_POINTS {
+        return;
+    }
+    // Few contours reach the image's border; all corners at once is the fastest way to see that.
+    let far = points.iter().fold([i32::MAX, i32::MAX, 0, 0], |[a, b, c, d], [x, y]| {
+        [a.min(*x), b.min(*y), c.max(*x), d.max(*y)]
+    });
+    if !ends(&[far[0], far[1]]) && !ends(&[far[2], far[3]]) {
+        return;
+    }
+    let Some(first) = points.iter().position(ends) else { return };
+    let mut start = first;
+    // Once round, from an end to the next.
+    while start < first + points.len() {
+        let onwards = points.iter().cycle().skip(start + 1);
+        let length = onwards.take(points.len()).take_while(|p| !ends(p)).count();
+        if length >= LEAST_POINTS {
+            let arc = points.iter().cycle().skip(start + 1).take(length);
+            outlines.extend(outline_of_arc(arc.map(|p| p.map(f64::from))));
+        }
+        start += length + 1;
+    }
+}
+
+/// The ellipse of an arc, if it is one and goes far enough round.
+fn outline_of_arc<I>(arc: I) -> Option<Outline>
+where
+    I: Iterator<Item = [f64; 2]> + Clone,
+{
+    const LEAST_TURN: f64 = 1.7;
+    const MOST_RMS_PX: f64 = 0.8;
+    let ellipse = fit_ellipse(arc.clone())?;
+    let [cx, cy] = ellipse.centre;
+    let (mut turn, mut squares, mut count) = (0.0, 0.0, 0.0);
+    for ([x, y], [next_x, next_y]) in arc.clone().zip(arc.skip(1)) {
+        let (a, b) = ([x - cx, y - cy], [next_x - cx, next_y - cy]);
+        turn += (a[0] * b[1] - a[1] * b[0]).atan2(a[0] * b[0] + a[1] * b[1]);
+        squares += ((ellipse.radius_of([x, y]) - 1.0) * ellipse.minor / 2.0).powi(2);
+        count += 1.0;
+    }
+    let fits = squares <= MOST_RMS_PX * MOST_RMS_PX * count && ellipse.minor > 0.3 * ellipse.major;
+    // Dark regions lie to the left of their contours, which on screen is within when these turn from y to x.
+    let black_within = turn < 0.0;
+    let on_edge = ellipse.grown(if black_within { 1.0 } else { -1.0 });
+    (turn.abs() >= LEAST_TURN && fits && ellipse.minor > 12.0)
+        .then_some(Outline { ellipse: on_edge, black_within })
+}
+
 /// How far apart the centres of one ring's ellipses may be, in pixels (Algorithm 2): perspective moves them apart
 /// in proportion to their size.
 fn concentric_tolerance(outer: &Ellipse) -> f64 {
@@ -321,6 +383,8 @@ fn ring_of(
 /// nearly all round (Algorithm 6, in its own light, which may differ from side to side).
 fn ring_contrast(view: GrayView<'_>, inner: &Ellipse, outer: &Ellipse) -> Option<f64> {
     const DIRECTIONS: u32 = 24;
+    // Within and around, a fifth of the way round.
+    const LEAST_PLACES: usize = 10;
     let mut shares = [0.0; 2 * DIRECTIONS as usize];
     let mut count = 0;
     for i in 0..DIRECTIONS {
@@ -343,7 +407,7 @@ fn ring_contrast(view: GrayView<'_>, inner: &Ellipse, outer: &Ellipse) -> Option
             }
         }
     }
-    let shares = shares.get_mut(..count).filter(|shares| shares.len() >= DIRECTIONS as usize)?;
+    let shares = shares.get_mut(..count).filter(|shares| shares.len() >= LEAST_PLACES)?;
     shares.sort_unstable_by(f64::total_cmp);
     let median = shares.get(count / 2).copied()?;
     let low = shares.get(count / 5).copied()?;
@@ -401,12 +465,58 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// The pose that a ring's own edges, then all edges, speak for.
-    fn locate(
-        &mut self,
+    /// The marker of which all edges speak that can be seen, starting from one ring.
+    fn whole(
+        &self,
         ring: &Ring,
         edges: &mut Vec<EdgePoint>,
-    ) -> Result<(Circles, f64), Reason> {
+        spots: &mut Vec<Spot>,
+    ) -> Result<Seen, Reason> {
+        let (mut circles, mut rms_px) = self.own(ring, edges)?;
+        for _ in 0..2 {
+            self.measure(&circles, edges);
+            (circles, rms_px) = circles.refined(edges, self.camera).ok_or(Reason::Edges)?;
+        }
+        // The same outlines come nearly as well from the marker tilted the other way.
+        if let Some((other, other_rms)) = circles.mirrored().refined(edges, self.camera)
+            && other_rms < rms_px
+        {
+            (circles, rms_px) = (other, other_rms);
+        }
+        let support = self.measure(&circles, edges);
+        let diameter_px =
+            circles.outline(self.size_m / 2.0, self.camera).ok_or(Reason::Pose)?.major;
+        let small = self.refine_small(&circles, spots);
+        let difference = small.map(|(_, difference)| difference);
+        if !believable(&support, ring.kind) || !fits(diameter_px, rms_px, difference) {
+            return Err(Reason::Edges);
+        }
+        if let Some((better, _)) = small.filter(|(_, difference)| *difference < MOST_DIFFERENCE) {
+            circles = better;
+            rms_px = circles.rms_px(edges, self.camera).ok_or(Reason::Pose)?;
+        }
+        Ok(Seen { circles, rms_px, confidence: confidence(&support) })
+    }
+
+    /// The marker of which only one ring can be seen, because its neighbour's place is covered by something.
+    fn alone(&self, ring: &Ring, edges: &mut Vec<EdgePoint>) -> Option<Seen> {
+        let (start, _) = self.own(ring, edges).ok()?;
+        edges.clear();
+        let own = ring.kind as usize * 2;
+        let mut support = [Support::default(); 6];
+        for (index, support) in support.iter_mut().enumerate().skip(own).take(2) {
+            *support = self.measure_edge(&start, index, edges);
+        }
+        let whole = support.iter().skip(own).take(2).all(|s| s.share().is_some_and(|s| s >= 0.95));
+        let (circles, rms_px) = start.refined(edges, self.camera)?;
+        let diameter_px = circles.outline(self.size_m / 2.0, self.camera)?.major;
+        let good =
+            whole && fits(diameter_px, rms_px, None) && self.is_covered(&circles, ring.kind)?;
+        good.then(|| Seen { circles, rms_px, confidence: 0.5 * confidence(&support) })
+    }
+
+    /// The pose that a ring's own two edges speak for.
+    fn own(&self, ring: &Ring, edges: &mut Vec<EdgePoint>) -> Result<(Circles, f64), Reason> {
         let (_, outer) = ring.kind.radii();
         let both = Circles::from_ellipse(&ring.outer, outer * self.size_m, self.camera)
             .ok_or(Reason::Pose)?;
@@ -422,33 +532,55 @@ impl Search<'_> {
                 best = Some((circles, rms));
             }
         }
-        let (mut circles, mut rms) = best.ok_or(Reason::Pose)?;
-        for _ in 0..2 {
-            self.measure(&circles, edges);
-            (circles, rms) = circles.refined(edges, self.camera).ok_or(Reason::Edges)?;
-        }
-        // The same outlines come nearly as well from the marker tilted the other way.
-        if let Some((other, other_rms)) = circles.mirrored().refined(edges, self.camera)
-            && other_rms < rms
-        {
-            (circles, rms) = (other, other_rms);
-        }
-        Ok((circles, rms))
+        best.ok_or(Reason::Pose)
     }
 
-    /// A small marker's pose from its grey values; `None` for a large one, and when they disagree with its edges.
-    fn refine_small(&self, circles: &Circles, spots: &mut Vec<Spot>) -> Option<Circles> {
+    /// A small marker's pose from its grey values, and the difference left; `None` for a large one, and when they
+    /// disagree with its edges.
+    fn refine_small(&self, circles: &Circles, spots: &mut Vec<Spot>) -> Option<(Circles, f64)> {
         let refined = |start: &Circles, spots: &mut Vec<Spot>| {
             photometry::refined(self.view, self.camera, start, self.size_m, spots)
         };
         let first = refined(circles, spots);
         let second = first.and_then(|(found, _)| refined(&found.mirrored(), spots));
-        let all = first.into_iter().chain(second).filter(|(_, rms)| *rms < MOST_DIFFERENCE);
-        let (best, _) = all.min_by(|a, b| a.1.total_cmp(&b.1))?;
+        let all = first.into_iter().chain(second);
+        let (best, difference) = all.min_by(|a, b| a.1.total_cmp(&b.1))?;
         let moved =
             project(best.centre, self.camera)?.distance(&project(circles.centre, self.camera)?);
         let scaled = best.centre.z / circles.centre.z;
-        (moved < 0.5 && (0.9..1.1).contains(&scaled)).then_some(best)
+        (moved < 0.5 && (0.9..1.1).contains(&scaled)).then_some((best, difference))
+    }
+
+    /// Whether the place of a ring's neighbour is not plain white, as beside other rings, but covered.
+    fn is_covered(&self, circles: &Circles, kind: RingKind) -> Option<bool> {
+        let neighbour = if kind == RingKind::Middle { RingKind::Outer } else { RingKind::Middle };
+        let middle = |(inner, outer): (f64, f64)| self.median_at(circles, (inner + outer) / 2.0);
+        let (inner, outer) = kind.radii();
+        let aside = 0.4 * (outer - inner);
+        let (within, around) =
+            (self.median_at(circles, inner - aside)?, self.median_at(circles, outer + aside)?);
+        let black = middle(kind.radii())?;
+        Some(middle(neighbour.radii())? < (black * within.min(around)).sqrt())
+    }
+
+    /// The middle grey value on a circle of this radius (in marker sizes).
+    fn median_at(&self, circles: &Circles, radius: f64) -> Option<f64> {
+        const PLACES: usize = 24;
+        let (u, v) = circles.basis();
+        let mut values = [0.0; PLACES];
+        let mut count = 0;
+        for i in 0..PLACES {
+            let (sin, cos) = (i as f64 * TAU / PLACES as f64).sin_cos();
+            let place = circles.centre + (u * cos + v * sin) * (radius * self.size_m);
+            let value = project(place, self.camera).and_then(|p| bilinear(self.view, p.x, p.y));
+            if let Some((slot, value)) = values.get_mut(count).zip(value) {
+                *slot = value;
+                count += 1;
+            }
+        }
+        let values = values.get_mut(..count).filter(|values| 2 * values.len() > PLACES)?;
+        values.sort_unstable_by(f64::total_cmp);
+        values.get(count / 2).copied()
     }
 
     /// Looks for all six edges.

@@ -57,6 +57,18 @@ fn from_twenty_centimetres_to_three_the_rings_that_still_fit_are_enough() {
 }
 
 #[test]
+fn cut_by_the_edge_of_the_image() {
+    // Range, and how far to the right of the axis per metre of range; the image ends at 0.356.
+    for (range_m, side) in
+        [(0.05, 0.34), (0.1, 0.34), (0.2, 0.37), (0.5, 0.37), (1.0, 0.37), (3.0, 0.35)]
+    {
+        let scene =
+            Scene::new(camera(), [side * range_m, side * 0.3 * range_m, range_m], 0.05, 1.0);
+        expect(&format!("{range_m} m, cut at {side}"), &scene, &scene.render(), 0.06, 0.1);
+    }
+}
+
+#[test]
 fn dim_bright_blurred_and_noisy() {
     for range_m in [0.6, 2.0, 7.0] {
         let plain = Scene::new(camera(), [0.05 * range_m, 0.03 * range_m, range_m], 0.2, 1.0);
@@ -152,6 +164,33 @@ fn without_a_camera_there_is_a_centre_and_no_pose() {
         assert!(found[0].pose.is_none());
         let error = found[0].centre.distance(&scene.centre());
         assert!(error < 0.5, "{error}");
+    }
+}
+
+#[test]
+fn with_its_middle_or_its_rim_covered() {
+    for range_m in [0.8, 2.5] {
+        for rim in [false, true] {
+            let scene = Scene::new(camera(), [0.03, 0.02, range_m], 0.15, 1.0);
+            let mut image = scene.render();
+            let (middle, size_px) = (scene.centre(), SIZE_M * 1818.0 / range_m);
+            for y in 0..image.height() {
+                for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                    let (dx, dy) = ((x as f64 - middle.x).abs(), (y as f64 - middle.y).abs());
+                    // A leaf on the middle, or grass grown over all but a square.
+                    let covered = if rim {
+                        dx.max(dy) > 0.29 * size_px
+                    } else {
+                        dx + 1.3 * dy < 0.33 * size_px
+                    };
+                    if covered {
+                        *pixel = 40 + ((x / 3 + y / 5) % 4 * 6) as u8;
+                    }
+                }
+            }
+            let name = format!("{} covered at {range_m} m", if rim { "rim" } else { "middle" });
+            expect(&name, &scene, &image, 0.1, 0.3);
+        }
     }
 }
 
