@@ -272,15 +272,14 @@ impl Level {
     fn add_smeared(&self, gain: f32, walk: &Walk, row: &mut [f32]) {
         let (mask, stride) = ((1u32 << self.log2) - 1, (1u32 << self.log2) + 1);
         let gain = gain / TAPS as f32;
-        let taps = [0, 1].map(|i| {
-            let smear = walk.smear[i] as i32;
-            [-3, -1, 1, 3].map(|eighths: i32| (smear / 8).wrapping_mul(eighths) as u32)
-        });
+        let eighth = walk.smear.map(|smear| smear as i32 / 8);
+        let taps: [[u32; 2]; TAPS] =
+            [-3, -1, 1, 3].map(|n: i32| eighth.map(|eighth| eighth.wrapping_mul(n) as u32));
         let [mut x, mut y] = walk.start;
         for value in row {
             let mut sum = 0;
-            for tap in 0..TAPS {
-                let (tx, ty) = (x.wrapping_add(taps[0][tap]), y.wrapping_add(taps[1][tap]));
+            for tap in &taps {
+                let (tx, ty) = (x.wrapping_add(tap[0]), y.wrapping_add(tap[1]));
                 let index = ((ty >> 16) & mask) * stride + ((tx >> 16) & mask);
                 sum += self.pairs.get(index as usize).map_or(128, |pair| i32::from(*pair & 255));
             }
@@ -357,8 +356,8 @@ impl Patches {
 }
 
 fn asphalt(rng: &mut ChaCha8Rng) -> Ground {
-    let mut coarse = noise(rng, 11, &[(6, 0.5), (5, 0.5), (4, 0.5), (3, 0.5), (2, 0.4)]);
-    normalise(&mut coarse, 0.014);
+    let mut coarse = noise(rng, 11, &[(7, 0.5), (6, 0.5), (5, 0.5), (4, 0.6), (3, 0.6), (2, 0.4)]);
+    normalise(&mut coarse, 0.022);
     scatter(&mut coarse, 11, 700_000, rng, |rng, canvas| {
         let grey = rng.random_range(-0.06..0.06f32) + 0.1 * rng.random::<f32>().powi(6);
         canvas.stone(rng.random_range(0.6..1.9), grey);
@@ -378,8 +377,8 @@ fn asphalt(rng: &mut ChaCha8Rng) -> Ground {
 }
 
 fn grass(rng: &mut ChaCha8Rng) -> Ground {
-    let mut coarse = noise(rng, 11, &[(6, 0.8), (5, 1.0), (4, 0.8), (3, 0.5)]);
-    normalise(&mut coarse, 0.03);
+    let mut coarse = noise(rng, 11, &[(7, 0.6), (6, 0.9), (5, 1.0), (4, 1.0), (3, 0.7)]);
+    normalise(&mut coarse, 0.05);
     scatter(&mut coarse, 11, 420_000, rng, |rng, canvas| {
         let (angle, length) = (rng.random_range(0.0..TAU), rng.random_range(8.0..22.0));
         canvas.blade(angle, length, 0.8, rng.random_range(-0.11..0.13));

@@ -679,7 +679,7 @@ fn painting_of(pad: &PadInScene) -> Result<Painting, RenderError> {
 /// Lines, discs and rings on the ground, clear of the pads.
 fn painted_marks(scene: &Scene, seed: u64) -> Vec<Painting> {
     const SPREAD_M: f64 = 5.0;
-    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x6d61_726b_73);
+    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x6d_6172_6b73);
     let about = scene.pads.first().map_or(Point::origin(), |pad| pad.ned_from_marker.origin());
     let mut marks = Vec::new();
     for _ in 0..scene.painted_marks {

@@ -55,15 +55,15 @@ impl Exposure {
         if let Some(index) = poses.iter().position(|pose| !is_sound(pose)) {
             return Err(RenderError::Pose { index });
         }
-        let camera_at = |fraction: f64| between(poses, fraction) * *body_from_camera;
-        self.middle = camera_at(0.5);
+        let camera_at = |fraction: &f64| between(poses, *fraction) * *body_from_camera;
+        self.middle = camera_at(&0.5);
         self.ends = [*first * *body_from_camera, *last * *body_from_camera];
         self.motion_px = motion_px(poses, &self.middle, body_from_camera, model);
         let groups = (self.motion_px / GROUP_PX).ceil().clamp(1.0, MOST_GROUPS as f64) as usize;
         let count = if self.motion_px < SHORT_PX { 1 } else { GROUP * groups };
         self.instants.clear();
-        let fractions = (0..count).map(|k| (k as f64 + 0.5) / count as f64);
-        self.instants.extend(fractions.map(camera_at));
+        let fraction = |k| (k as f64 + 0.5) / count as f64;
+        self.instants.extend((0..count).map(|k| camera_at(&fraction(k))));
         Ok(())
     }
 }

@@ -147,11 +147,11 @@ impl Painter {
             }
         }
         let blurred = Blurred { tile: self.tile, edge, blur };
-        blurred.into_pixels(&self.sums.light, &mut self.rows, &mut self.tile_paint.light);
+        blurred.fill_pixels(&self.sums.light, &mut self.rows, &mut self.tile_paint.light);
         if opaque {
             self.tile_paint.cover.fill(1.0);
         } else {
-            blurred.into_pixels(&self.sums.cover, &mut self.rows, &mut self.tile_paint.cover);
+            blurred.fill_pixels(&self.sums.cover, &mut self.rows, &mut self.tile_paint.cover);
         }
     }
 
@@ -477,7 +477,7 @@ struct Blurred<'a> {
 }
 
 impl Blurred<'_> {
-    fn into_pixels(&self, sums: &[f32], rows: &mut [f32], pixels: &mut [f32]) {
+    fn fill_pixels(&self, sums: &[f32], rows: &mut [f32], pixels: &mut [f32]) {
         let weights = &self.blur.weights;
         let rows = rows.chunks_exact_mut(self.edge).take(self.tile).enumerate();
         for ((y, row), pixels) in rows.zip(pixels.chunks_exact_mut(self.tile)) {
