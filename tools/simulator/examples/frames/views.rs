@@ -1,0 +1,217 @@
+//! The thesis' marker from above, at the reference positions of the thesis' experiment (Table 4.1): which frames there
+//! are, their pixels and their truth.
+
+use std::f64::consts::TAU;
+use std::fmt::Write as _;
+
+use geometry::{Body, Camera, CameraModel, Marker, Ned, Pixel, Rotation, Transform, Vector};
+use simulator::ground::Surface;
+use simulator::render::{CameraSettings, PadInScene, RenderError, Renderer, Scene};
+
+/// Outer diameter of the thesis' marker, in metres.
+pub(crate) const SIZE_M: f64 = 0.15341;
+
+/// The highest camera, in metres above the marker; the lowest is at 1 m.
+pub(crate) const HIGHEST_M: u32 = 13;
+
+/// Neighbouring photosites of the thesis' sensor that make one pixel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Binning {
+    /// 1296 x 972 pixels of 4.4 um behind 8 mm.
+    TwoByTwo,
+    /// 648 x 486 pixels of 8.8 um behind the same lens.
+    FourByFour,
+}
+
+impl Binning {
+    /// The name of files and tables.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::TwoByTwo => "2x2",
+            Self::FourByFour => "4x4",
+        }
+    }
+
+    /// The camera's intrinsics.
+    pub(crate) fn camera(self) -> CameraModel {
+        self.settings().model
+    }
+
+    /// At 4 x 4 a pixel is the sum of four of those at 2 x 2: the lens' blur is half as many pixels, light and well
+    /// are four times as much, and four readings have twice the noise of one.
+    fn settings(self) -> CameraSettings {
+        let fine = CameraSettings::thesis();
+        match self {
+            Self::TwoByTwo => fine,
+            Self::FourByFour => CameraSettings {
+                model: CameraModel::pinhole(648, 486, fine.model.fx / 2.0),
+                electrons_per_s: 4.0 * fine.electrons_per_s,
+                full_well_e: 4.0 * fine.full_well_e,
+                read_noise_e: 2.0 * fine.read_noise_e,
+                blur_px: fine.blur_px / 2.0,
+                ..fine
+            },
+        }
+    }
+
+    /// The intrinsics in the form of ROS `camera_info`.
+    pub(crate) fn calibration(self) -> String {
+        let CameraModel { width, height, fx, fy, cx, cy, .. } = self.camera();
+        let mut text = format!("image_width: {width}\nimage_height: {height}\n");
+        // Writing to a text cannot fail.
+        let _ = writeln!(
+            text,
+            "camera_matrix: {{rows: 3, cols: 3, data: [{fx}, 0, {cx}, 0, {fy}, {cy}, 0, 0, 1]}}"
+        );
+        text.push_str("distortion_model: plumb_bob\n");
+        text.push_str(
+            "distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}\n",
+        );
+        text
+    }
+}
+
+/// One frame to take.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct View {
+    pub(crate) binning: Binning,
+    /// Height of the camera above the marker's face.
+    pub(crate) height_m: u32,
+    /// How far the marker is to the right of the camera's axis, where the camera does not tilt.
+    pub(crate) lateral_m: f64,
+    /// The axis' angle from straight down, in degrees.
+    pub(crate) tilt_deg: f64,
+    /// Counts the frames of a position.
+    pub(crate) repeat: u32,
+}
+
+/// Where the thesis' marker lies across the axis, in metres, at a distance (Table 4.1).
+pub(crate) fn laterals_m(height_m: u32) -> &'static [f64] {
+    match height_m {
+        ..=1 => &[0.0],
+        2..=3 => &[-0.5, 0.0, 0.5],
+        4..=6 => &[-1.0, 0.0, 1.0],
+        7.. => &[-2.0, 0.0, 2.0],
+    }
+}
+
+/// So many frames at each position of one camera that tilts by so much.
+pub(crate) fn views(binning: Binning, tilt_deg: f64, repeats: u32) -> Vec<View> {
+    let mut views = Vec::new();
+    for height_m in 1..=HIGHEST_M {
+        for lateral_m in laterals_m(height_m).iter().copied() {
+            let view = |repeat| View { binning, height_m, lateral_m, tilt_deg, repeat };
+            views.extend((0..repeats).map(view));
+        }
+    }
+    views
+}
+
+impl View {
+    /// A name that says it all: `2x2-tilt0-07m-left2.0m-3`.
+    pub(crate) fn name(&self) -> String {
+        let side = match self.lateral_m {
+            ..0.0 => "left",
+            0.0 => "mid",
+            _ => "right",
+        };
+        format!(
+            "{}-tilt{}-{:02}m-{side}{:.1}m-{}",
+            self.binning.name(),
+            self.tilt_deg,
+            self.height_m,
+            self.lateral_m.abs(),
+            self.repeat
+        )
+    }
+
+    /// A number that no other frame of the same binning has.
+    fn index(&self) -> u32 {
+        let position = self.height_m * 10 + (self.lateral_m * 2.0 + 4.0) as u32;
+        (position * 100 + self.repeat % 100) * 100 + self.tilt_deg as u32
+    }
+
+    /// `ned_from_body` for a camera that sees the marker's centre within a few pixels of where the position says.
+    /// Heading, direction of the tilt and the pixel are spread evenly over the frames.
+    fn ned_from_body(
+        &self,
+        settings: &CameraSettings,
+        ned_from_marker: &Transform<Ned, Marker>,
+    ) -> Transform<Ned, Body> {
+        const FEW_PX: f64 = 4.0;
+        let spread = Spread { index: self.index() };
+        let (heading, towards) = (spread.fraction(1) * TAU, spread.fraction(2) * TAU);
+        let tilt = self.tilt_deg.to_radians();
+        let axis = Vector::new(tilt * towards.cos(), tilt * towards.sin(), 0.0);
+        let ned_from_level = Rotation::<Ned, Body>::from_euler(0.0, 0.0, heading);
+        let ned_from_body = Rotation::from_quaternion(
+            ned_from_level.quaternion
+                * Rotation::<Ned, Body>::from_rotation_vector(axis).quaternion,
+        );
+        let ned_from_camera = ned_from_body * settings.body_from_camera.rotation();
+        let camera = &settings.model;
+        let lateral_px = camera.fx * self.lateral_m / f64::from(self.height_m);
+        let jitter_px = |i| FEW_PX * (2.0 * spread.fraction(i) - 1.0);
+        let seen_at = Pixel::new(camera.cx + lateral_px + jitter_px(3), camera.cy + jitter_px(4));
+        let sight = ned_from_camera * camera.unproject(seen_at);
+        let place = ned_from_marker.origin() - sight * (f64::from(self.height_m) / sight.z());
+        let ned_from_camera: Transform<Ned, Camera> = Transform::new(ned_from_camera, place);
+        ned_from_camera * settings.body_from_camera.inverse()
+    }
+}
+
+/// Evenly spread numbers: the additive sequence in four dimensions of the generalised golden ratio (Roberts, "The
+/// unreasonable effectiveness of quasirandom sequences", 2018).
+struct Spread {
+    index: u32,
+}
+
+impl Spread {
+    /// From 0 to 1, in dimension 1 to 4.
+    fn fraction(&self, dimension: i32) -> f64 {
+        // The root of x^5 = x + 1.
+        const RATIO: f64 = 1.167_303_978_261_418_7;
+        (0.5 + f64::from(self.index) * RATIO.powi(-dimension)).fract()
+    }
+}
+
+/// What a frame shows.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Truth {
+    /// Where the marker's centre appears.
+    pub(crate) centre: Pixel,
+    /// The marker as seen by the camera.
+    pub(crate) camera_from_marker: Transform<Camera, Marker>,
+}
+
+/// A camera over the marker on painted asphalt in full sun.
+#[derive(Debug)]
+pub(crate) struct Studio {
+    renderer: Renderer,
+    ned_from_marker: Transform<Ned, Marker>,
+}
+
+impl Studio {
+    pub(crate) fn new(binning: Binning) -> Result<Self, RenderError> {
+        let marker =
+            fiducial::Marker { family: fiducial::Family::Rings, id: None, size_m: Some(SIZE_M) };
+        let pad = PadInScene::flat(marker, 0.0, 0.0, 0.0);
+        let ned_from_marker = pad.ned_from_marker;
+        let scene =
+            Scene { surface: Surface::Asphalt, pads: vec![pad], painted_marks: 20, light: 1.0 };
+        Ok(Self { renderer: Renderer::new(&scene, binning.settings(), 1)?, ned_from_marker })
+    }
+
+    /// The pixels, row by row, and what they show.
+    pub(crate) fn take(&mut self, view: &View) -> Result<(Vec<u8>, Truth), RenderError> {
+        let settings = self.renderer.settings().clone();
+        let ned_from_body = view.ned_from_body(&settings, &self.ned_from_marker);
+        let mut pixels = vec![0; settings.model.width as usize * settings.model.height as usize];
+        self.renderer.render(&[ned_from_body], u64::from(view.index()), &mut pixels)?;
+        let ned_from_camera = ned_from_body * settings.body_from_camera;
+        let camera_from_marker = ned_from_camera.inverse() * self.ned_from_marker;
+        let centre = settings.model.project(camera_from_marker.origin());
+        let centre = centre.ok_or(RenderError::Setting("the marker is behind the camera"))?;
+        Ok((pixels, Truth { centre, camera_from_marker }))
+    }
+}
