@@ -4,21 +4,24 @@
 //! clock and no thread; a stage of a detection that wants to be timed tells a [`Stages`] observer.
 //!
 //! Modules in reading order: [`marker`] names what is looked for, [`drawing`] says what it looks like,
-//! [`observation`] is what was found, [`detector`] finds it; [`ring`] and [`rings_thesis`] are the thesis' way
-//! (Algorithms 1-15), [`rings`] the mended one, with `circles` and, for
-//! small markers, `photometry` for the pose; [`trace`] is what they saw on the way,
-//! [`debug`] draws that.
+//! [`observation`] is what was found, [`detector`] finds it. [`ring`] and [`rings_thesis`] are the thesis' way
+//! (Algorithms 1-15). [`rings`] is the mended one: `outline` takes ellipses from contours, `search` goes from a ring
+//! to the marker, `circles` and, for small markers, `photometry` give its pose, `lens` serves images of unknown
+//! cameras. [`trace`] is what they saw on the way, [`debug`] draws that.
 
 mod circles;
 pub mod debug;
 pub mod detector;
 pub mod drawing;
+mod lens;
 pub mod marker;
 pub mod observation;
+mod outline;
 mod photometry;
 pub mod ring;
 pub mod rings;
 pub mod rings_thesis;
+mod search;
 pub mod trace;
 
 pub use detector::{Detector, DetectorError, Settings};

@@ -3,6 +3,7 @@
 use geometry::Pixel;
 use imaging::Ellipse;
 
+use crate::observation::Observation;
 use crate::ring::Ring;
 
 /// What the last detection saw.
@@ -71,5 +72,11 @@ impl Trace {
         if self.refusals.len() < Self::MOST_REFUSALS {
             self.refusals.push(Refusal { ellipses: [first, second], reason });
         }
+    }
+}
+
+impl From<&Observation> for TracedMarker {
+    fn from(observation: &Observation) -> Self {
+        Self { centre: observation.centre, size_px: observation.size_px }
     }
 }
