@@ -251,6 +251,10 @@ impl Flight {
             Mission::AwaitsAir => ("idle", "waiting for the vehicle to fly in GUIDED".to_owned()),
             Mission::TakesOff { why, .. } => ("takeoff", why.clone()),
             Mission::Failed { why } => ("failed", why.clone()),
+            Mission::Lands if self.is_landing() && self.selection.is_blind() => {
+                let why = "no detector is alive, nothing descends".to_owned();
+                (self.lander.phase().name(), why)
+            }
             Mission::Lands => {
                 let why = self.decision.map_or_else(String::new, |d| d.why.to_string());
                 (self.lander.phase().name(), why)
@@ -480,6 +484,7 @@ impl Flight {
                 self.autopilot.tick(now_ns);
             }
             Action::Velocity { velocity, yaw_rate } => {
+                let velocity = if self.selection.is_blind() { level(velocity) } else { velocity };
                 let period_ns = (1e9 / self.config.autopilot.setpoint_rate_hz) as i64;
                 let is_frame = matches!(event, LanderEvent::Frame(_));
                 if is_frame || now_ns.saturating_sub(self.setpoint_ns) >= period_ns {
@@ -508,4 +513,10 @@ impl Flight {
             }
         }
     }
+}
+
+/// The same velocity without its downward part: a crash of the last detector is told at once, and need not wait until
+/// the target has aged.
+fn level(velocity: Vector<geometry::Ned>) -> Vector<geometry::Ned> {
+    Vector::new(velocity.x(), velocity.y(), velocity.z().min(0.0))
 }

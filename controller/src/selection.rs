@@ -101,6 +101,11 @@ impl Selection {
         self.active.as_deref()
     }
 
+    /// True when every detector that was heard has gone: there will be no more detections until one comes.
+    pub fn is_blind(&self) -> bool {
+        !self.known.iter().any(|known| known.alive)
+    }
+
     /// All detectors there are.
     pub fn candidates(&self, now_ns: i64) -> Vec<Candidate> {
         let candidate = |known: &Known| Candidate {
@@ -211,7 +216,9 @@ mod tests {
     fn those_that_left_are_forgotten_and_a_flood_of_names_is_bounded() {
         let mut selection = selection();
         selection.heard(0, "main", 0, None);
+        assert!(!selection.is_blind());
         selection.presence(1, "main", false);
+        assert!(selection.is_blind());
         selection.tick(11_000 * MS);
         assert!(selection.active().is_none() && selection.candidates(0).is_empty());
         for i in 0..1000 {

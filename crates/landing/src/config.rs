@@ -118,6 +118,14 @@ pub struct PhaseConfig {
     pub stale_vehicle_s: f64,
     /// Longest search before a hold, in s (1 to 600).
     pub search_timeout_s: f64,
+    /// Hovering before the search begins to move, in s (0 to 60).
+    pub search_delay_s: f64,
+    /// Speed of the search, in m/s; 0 hovers (0 to 3).
+    pub search_speed_m_s: f64,
+    /// Distance between the legs of the expanding square, in m (0.5 to 20).
+    pub search_spacing_m: f64,
+    /// How far the search goes along either axis, in m (0 to 50).
+    pub search_radius_m: f64,
     /// Longest approach before a hold, in s (1 to 600).
     pub approach_timeout_s: f64,
     /// Longest descent before a hold, in s (1 to 600).
@@ -151,12 +159,16 @@ pub struct PhaseConfig {
 impl Default for PhaseConfig {
     fn default() -> Self {
         Self {
-            stale_target_s: 0.25,
+            stale_target_s: 0.4,
             low_height_m: 0.8,
             low_grace_s: 0.4,
             lost_target_s: 1.0,
             stale_vehicle_s: 0.5,
-            search_timeout_s: 20.0,
+            search_timeout_s: 60.0,
+            search_delay_s: 1.0,
+            search_speed_m_s: 1.0,
+            search_spacing_m: 2.0,
+            search_radius_m: 5.0,
             approach_timeout_s: 60.0,
             descend_timeout_s: 120.0,
             hold_timeout_s: 60.0,
@@ -252,6 +264,10 @@ impl PhaseConfig {
         check("phases.lost_target_s", self.lost_target_s, 0.1, 10.0)?;
         check("phases.stale_vehicle_s", self.stale_vehicle_s, 0.1, 5.0)?;
         check("phases.search_timeout_s", self.search_timeout_s, 1.0, 600.0)?;
+        check("phases.search_delay_s", self.search_delay_s, 0.0, 60.0)?;
+        check("phases.search_speed_m_s", self.search_speed_m_s, 0.0, 3.0)?;
+        check("phases.search_spacing_m", self.search_spacing_m, 0.5, 20.0)?;
+        check("phases.search_radius_m", self.search_radius_m, 0.0, 50.0)?;
         check("phases.approach_timeout_s", self.approach_timeout_s, 1.0, 600.0)?;
         check("phases.descend_timeout_s", self.descend_timeout_s, 1.0, 600.0)?;
         check("phases.hold_timeout_s", self.hold_timeout_s, 1.0, 600.0)?;

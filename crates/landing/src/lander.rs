@@ -9,6 +9,7 @@ use crate::event::{Event, Frame, MarkerInFrame, Mode, VehicleState};
 use crate::guidance::{Guide, Progress, Situation};
 use crate::history::History;
 use crate::phase::{Facts, Machine, Phase, VehicleFacts};
+use crate::search;
 use crate::target::Target;
 use crate::time::Timestamp;
 
@@ -27,6 +28,8 @@ pub struct Lander {
     guide: Guide,
     machine: Machine,
     land_asked: Option<Timestamp>,
+    /// Direction of the first leg of the search under way, in radians.
+    first_leg_rad: Option<f64>,
 }
 
 /// The markers used, as moments.
@@ -51,6 +54,7 @@ impl Lander {
             guide: Guide::new(config.guidance),
             machine: Machine::new(config.phases),
             land_asked: None,
+            first_leg_rad: None,
         })
     }
 
@@ -179,10 +183,13 @@ impl Lander {
         if !guided {
             self.guide.rest();
         }
+        if self.machine.phase() != Phase::Search {
+            self.first_leg_rad = None;
+        }
         match self.machine.phase() {
             Phase::Idle | Phase::Landed | Phase::PilotInCommand => (Action::None, why),
             Phase::Search if why == Reason::TakingOff => (Action::None, why),
-            Phase::Search => (Action::hover(), why),
+            Phase::Search => (self.search(now), why),
             Phase::Approach | Phase::Descend => self.guided(now),
             Phase::Hold => (self.hold(now), why),
             Phase::Final if self.machine.is_landing() => (Action::None, why),
@@ -200,6 +207,17 @@ impl Lander {
         let (wanted, why) = self.guide.velocity(&situation);
         let velocity = envelope::admit(&self.config.envelope, wanted, situation.may_descend());
         (Action::Velocity { velocity, yaw_rate: 0.0 }, why)
+    }
+
+    /// Flies the expanding square.
+    fn search(&mut self, now: Timestamp) -> Action {
+        let Some(vehicle) = self.history.newest() else { return Action::hover() };
+        let first_leg_rad =
+            *self.first_leg_rad.get_or_insert_with(|| search::first_leg_rad(vehicle.ned_from_body));
+        let phases = &self.config.phases;
+        let wanted = search::velocity(phases, self.machine.elapsed_s(now), first_leg_rad);
+        let velocity = envelope::admit(&self.config.envelope, wanted, false);
+        Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
     /// Hovers; where the marker was lost so low that it may just have left the view, climbs a little.

@@ -9,7 +9,7 @@
 //!
 //! Modules in reading order: [`event`] is what the lander is told and [`decision`] what it answers, [`config`] has
 //! every number; [`lander`] joins [`history`] (the vehicle a moment ago), [`target`] (where the landing point is),
-//! [`guidance`] (target to velocity), [`phase`] (what comes next) and [`envelope`] (the last look at a setpoint);
+//! [`guidance`] (target to velocity), [`phase`] (what comes next), [`search`] (where to look) and [`envelope`] (the last look at a setpoint);
 //! [`time`] has the stamps.
 
 pub mod config;
@@ -20,6 +20,7 @@ pub mod guidance;
 pub mod history;
 pub mod lander;
 pub mod phase;
+pub mod search;
 pub mod target;
 pub mod time;
 

@@ -29,7 +29,7 @@ use crate::time::Timestamp;
 pub enum Phase {
     /// Nothing asked for.
     Idle,
-    /// Hovering until the marker is seen.
+    /// Flying an expanding square until the marker is seen.
     Search,
     /// Moving over the marker.
     Approach,
@@ -464,8 +464,8 @@ mod tests {
     #[test]
     fn nothing_is_waited_for_without_end() {
         let approach = [start(), seen(1.0, Progress::Unchanged)];
-        check(&[start(), at(20.1)], Phase::Hold, Reason::TargetNotFound);
-        check(&[start(), at(20.1), at(80.3)], Phase::Aborted, Reason::HeldTooLong);
+        check(&[start(), at(60.1)], Phase::Hold, Reason::TargetNotFound);
+        check(&[start(), at(60.1), at(120.3)], Phase::Aborted, Reason::HeldTooLong);
         check(
             &[approach[0], approach[1], seen(61.2, Progress::Aligning)],
             Phase::Hold,

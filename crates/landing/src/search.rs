@@ -1,0 +1,74 @@
+//! Looking for the marker: an expanding square about the place where the search began.
+//!
+//! A camera that is fixed to the vehicle looks downwind, because the vehicle leans into the wind: what lies straight
+//! below it may be out of view, and what is out of view lies upwind. So the first leg goes upwind.
+
+use geometry::{Body, Ned, Rotation, Vector};
+
+use crate::config::PhaseConfig;
+
+/// Leans below this show no wind worth a direction, in radians.
+const CALM_RAD: f64 = 0.02;
+
+/// The direction of the first leg, in radians from north to east: that into which the vehicle leans.
+pub fn first_leg_rad(ned_from_body: Rotation<Ned, Body>) -> f64 {
+    let up = ned_from_body * Vector::<Body>::new(0.0, 0.0, -1.0);
+    if up.horizontal_norm() < CALM_RAD.sin() { 0.0 } else { up.y().atan2(up.x()) }
+}
+
+/// The velocity at a time after the search began, in m/s: legs of 1, 1, 2, 2, 3, 3, ... spacings, each to the right of the
+/// one before, after a moment of hovering; nought once the radius is reached.
+pub fn velocity(config: &PhaseConfig, elapsed_s: f64, first_leg_rad: f64) -> Vector<Ned> {
+    let mut way_m = (elapsed_s - config.search_delay_s) * config.search_speed_m_s;
+    if way_m.is_nan() || way_m < 0.0 {
+        return Vector::zero();
+    }
+    // The corner after leg n lies at most (n + 1) / 2 spacings from the start along either axis.
+    let legs = (2.0 * config.search_radius_m / config.search_spacing_m).floor() as u32;
+    for leg in 1..=legs {
+        let length_m = config.search_spacing_m * f64::from(leg.div_ceil(2));
+        if way_m < length_m {
+            let direction = first_leg_rad + f64::from(leg - 1) * std::f64::consts::FRAC_PI_2;
+            let (east, north) = direction.sin_cos();
+            return Vector::new(north, east, 0.0) * config.search_speed_m_s;
+        }
+        way_m -= length_m;
+    }
+    Vector::zero()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use geometry::Point;
+
+    #[test]
+    fn the_square_covers_its_radius_and_does_not_leave_it() {
+        let config = PhaseConfig::default();
+        let (mut place, mut path) = (Point::<Ned>::origin(), Vec::new());
+        let dt_s = 0.02;
+        for i in 0..(config.search_timeout_s / dt_s) as u32 {
+            place = place + velocity(&config, f64::from(i) * dt_s, 0.7) * dt_s;
+            path.push(place);
+        }
+        let farthest = path.iter().map(|p| p.x().hypot(p.y())).fold(0.0, f64::max);
+        assert!(farthest <= config.search_radius_m * std::f64::consts::SQRT_2 + 0.1, "{farthest}");
+        // Whatever lies within the square that is flown comes within the spacing of the path.
+        let reach = config.search_radius_m - config.search_spacing_m;
+        for (x, y) in [(0.0, 0.0), (reach, 0.0), (0.0, reach), (-reach, 0.0), (0.0, -reach)] {
+            let nearest =
+                path.iter().map(|p| (p.x() - x).hypot(p.y() - y)).fold(f64::MAX, f64::min);
+            assert!(nearest < config.search_spacing_m, "({x}, {y}) is {nearest} m from the path");
+        }
+        assert!(velocity(&config, 1e9, 0.0).norm() < 1e-12, "it ends");
+        assert!(velocity(&config, f64::NAN, 0.0).norm() < 1e-12);
+    }
+
+    #[test]
+    fn the_first_leg_goes_into_the_wind() {
+        // Nose down at heading east: it leans eastwards.
+        let leans_east = Rotation::<Ned, Body>::from_euler(0.0, -0.2, std::f64::consts::FRAC_PI_2);
+        assert!((first_leg_rad(leans_east) - std::f64::consts::FRAC_PI_2).abs() < 1e-9);
+        assert!(first_leg_rad(Rotation::identity()).abs() < 1e-12);
+    }
+}
