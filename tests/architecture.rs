@@ -339,6 +339,7 @@ fn documents_name_only_what_exists() -> anyhow::Result<()> {
     for document in DOCUMENTS {
         let markdown = text(root().join(document))?;
         for quote in quoted(&markdown) {
+            ensure!(!quote.contains('\n'), "{document}: `{quote}` goes over two lines");
             let (path, name) = match quote.split_once(": ") {
                 Some((path, name)) => (path, Some(name)),
                 None => (quote, None),
