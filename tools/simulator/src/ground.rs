@@ -229,13 +229,18 @@ impl Level {
         }
         let mut fours = [0; BATCH];
         for values in row.chunks_mut(BATCH) {
-            // Looking up and mixing in turn lets the latter work on several pixels at once.
-            let start = [x, y];
-            for four in fours.iter_mut().take(values.len()) {
-                *four = self.four(x, y);
-                (x, y) = (x.wrapping_add(dx), y.wrapping_add(dy));
+            // Where to look, looking, and mixing in turn lets the first and the last work on several pixels at once.
+            for (index, four) in fours.iter_mut().enumerate() {
+                let ahead = index as u32;
+                let (x, y) = (
+                    x.wrapping_add(dx.wrapping_mul(ahead)),
+                    y.wrapping_add(dy.wrapping_mul(ahead)),
+                );
+                *four = self.index(x, y);
             }
-            let [mut x, mut y] = start;
+            for four in fours.iter_mut().take(values.len()) {
+                *four = self.four(*four);
+            }
             for (value, four) in values.iter_mut().zip(&fours) {
                 *value += mixed(*four, x, y) * gain;
                 (x, y) = (x.wrapping_add(dx), y.wrapping_add(dy));
@@ -246,11 +251,11 @@ impl Level {
     /// Looks up only some of the pixels within a texel, and interpolates those between.
     fn add_sparsely(&self, gain: f32, start: [u32; 2], step: [u32; 2], row: &mut [f32]) {
         let [mut x, mut y] = start;
-        let mut from = mixed(self.four(x, y), x, y) * gain;
+        let mut from = mixed(self.four(self.index(x, y)), x, y) * gain;
         for values in row.chunks_mut(STRIDE) {
             x = x.wrapping_add(step[0].wrapping_mul(STRIDE as u32));
             y = y.wrapping_add(step[1].wrapping_mul(STRIDE as u32));
-            let to = mixed(self.four(x, y), x, y) * gain;
+            let to = mixed(self.four(self.index(x, y)), x, y) * gain;
             let slope = (to - from) / STRIDE as f32;
             for (index, value) in values.iter_mut().enumerate() {
                 *value += from + slope * index as f32;
@@ -259,33 +264,50 @@ impl Level {
         }
     }
 
+    /// Where the texel at a place is.
+    fn index(&self, x: u32, y: u32) -> u32 {
+        let mask = (1u32 << self.log2) - 1;
+        let (column, row) = ((x >> 16) & mask, (y >> 16) & mask);
+        (row << self.log2) + row + column
+    }
+
     /// A texel and, in the higher bytes, those below, to the right, and below that.
-    fn four(&self, x: u32, y: u32) -> u32 {
-        let (mask, stride) = ((1u32 << self.log2) - 1, (1u32 << self.log2) + 1);
-        let index = (((y >> 16) & mask) * stride + ((x >> 16) & mask)) as usize;
-        match self.pairs.get(index..index + 2) {
+    fn four(&self, index: u32) -> u32 {
+        match self.pairs.get(index as usize..index as usize + 2) {
             Some(&[left, right]) => u32::from(left) | (u32::from(right) << 16),
             _ => 0x8080_8080,
         }
     }
 
     fn add_smeared(&self, gain: f32, walk: &Walk, row: &mut [f32]) {
-        let (mask, stride) = ((1u32 << self.log2) - 1, (1u32 << self.log2) + 1);
         let gain = gain / TAPS as f32;
         let eighth = walk.smear.map(|smear| smear as i32 / 8);
-        let taps: [[u32; 2]; TAPS] =
-            [-3, -1, 1, 3].map(|n: i32| eighth.map(|eighth| eighth.wrapping_mul(n) as u32));
+        let [dx, dy] = walk.step;
+        let (mut indices, mut sums) = ([0; BATCH], [0; BATCH]);
         let [mut x, mut y] = walk.start;
-        for value in row {
-            let mut sum = 0;
-            for tap in &taps {
-                let (tx, ty) = (x.wrapping_add(tap[0]), y.wrapping_add(tap[1]));
-                let index = ((ty >> 16) & mask) * stride + ((tx >> 16) & mask);
-                sum += self.pairs.get(index as usize).map_or(128, |pair| i32::from(*pair & 255));
+        for values in row.chunks_mut(BATCH) {
+            sums.fill(-128 * TAPS as i32);
+            for eighths in [-3, -1, 1, 3] {
+                let [ahead_x, ahead_y] = eighth.map(|eighth| eighth.wrapping_mul(eighths) as u32);
+                let (x, y) = (x.wrapping_add(ahead_x), y.wrapping_add(ahead_y));
+                for (count, index) in indices.iter_mut().enumerate() {
+                    let count = count as u32;
+                    *index = self.index(
+                        x.wrapping_add(dx.wrapping_mul(count)),
+                        y.wrapping_add(dy.wrapping_mul(count)),
+                    );
+                }
+                for (sum, index) in sums.iter_mut().zip(&indices).take(values.len()) {
+                    let pair = self.pairs.get(*index as usize).copied();
+                    *sum += i32::from(pair.unwrap_or(0x8080) & 255);
+                }
             }
-            *value += (sum - 128 * TAPS as i32) as f32 * gain;
-            x = x.wrapping_add(walk.step[0]);
-            y = y.wrapping_add(walk.step[1]);
+            for (value, sum) in values.iter_mut().zip(&sums) {
+                *value += *sum as f32 * gain;
+            }
+            let count = values.len() as u32;
+            x = x.wrapping_add(dx.wrapping_mul(count));
+            y = y.wrapping_add(dy.wrapping_mul(count));
         }
     }
 }

@@ -14,7 +14,9 @@ mod painting;
 mod sensor;
 
 use fiducial::{Drawing, Ink, Marker, Shape};
-use geometry::{Body, Camera, CameraModel, Marker as MarkerFrame, Ned, Point, Rotation, Transform};
+use geometry::{
+    Body, Camera, CameraModel, Distortion, Marker as MarkerFrame, Ned, Point, Rotation, Transform,
+};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -345,7 +347,7 @@ impl Renderer {
                 (look(opening), look(&self.exposure.middle), look(closing))
                 && view.sights.len() == self.exposure.instants.len()
                 && let Some((columns, rows)) =
-                    bounds_px(painting, &self.exposure, &self.settings.model, reach)
+                    bounds_px(painting, &self.exposure, &self.lens, &self.settings.model, reach)
             {
                 view.looks = Some([first, middle, last]);
                 (view.columns, view.rows) = (columns, rows);
@@ -607,16 +609,16 @@ type Bounds = ([usize; 2], [usize; 2]);
 fn bounds_px(
     painting: &Painting,
     exposure: &Exposure,
+    lens: &Lens,
     model: &CameraModel,
     reach: f64,
 ) -> Option<Bounds> {
     let last = [model.width, model.height].map(|edge| edge as usize - 1);
-    let everything = Some(([0, last[0]], [0, last[1]]));
-    // The corners of a lens that distorts do not bound what lies between them.
-    if model.distortion != geometry::Distortion::None {
-        return everything;
-    }
+    let (ideal_min, ideal_max) = lens.field(reach + BEND_PX);
     let (mut min, mut max) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+    let mut in_front = true;
+    // How many of all corners lie beyond the left, top, right and bottom of the view.
+    let (mut beyond, mut corners) = ([0; 4], 0);
     for instant in exposure.ends.iter().chain(&exposure.instants) {
         let camera_from_plane = instant.inverse() * painting.ned_from_plane;
         let half = painting.half_extent_m;
@@ -624,24 +626,35 @@ fn bounds_px(
             let side = |bit: u32| if corner >> bit & 1 == 0 { -half } else { half };
             let depth = if corner >> 2 & 1 == 0 { 0.0 } else { -painting.thickness_m };
             let point = camera_from_plane * Point::new(side(0), side(1), depth);
-            if point.z() < 1e-3 {
-                return everything;
-            }
-            let pixel = model.project(point)?;
-            for (i, p) in [pixel.x, pixel.y].into_iter().enumerate() {
-                min[i] = min[i].min(p);
-                max[i] = max[i].max(p);
+            let (place, z) = ([point.x(), point.y()], point.z());
+            corners += 1;
+            in_front &= z > 1e-3;
+            for i in 0..2 {
+                beyond[i] += usize::from(place[i] < ideal_min[i] * z);
+                beyond[i + 2] += usize::from(place[i] > ideal_max[i] * z);
+                min[i] = min[i].min(place[i] / z);
+                max[i] = max[i].max(place[i] / z);
             }
         }
     }
-    // Sights between the instants lie between, but for a bend.
-    let margin = reach + 1.0;
+    if beyond.contains(&corners) {
+        return None;
+    }
+    // The corners in a picture that a lens distorts do not bound what lies between them.
+    if !in_front || model.distortion != Distortion::None {
+        return Some(([0, last[0]], [0, last[1]]));
+    }
+    let (focal, centre) = ([model.fx, model.fy], [model.cx, model.cy]);
     let bound = |i: usize| {
-        let (from, to) = ((min[i] - margin).max(0.0), (max[i] + margin).min(last[i] as f64));
+        let from = (min[i] * focal[i] + centre[i] - reach - BEND_PX).max(0.0);
+        let to = (max[i] * focal[i] + centre[i] + reach + BEND_PX).min(last[i] as f64);
         (from <= to).then_some([from.floor() as usize, to.ceil() as usize])
     };
     Some((bound(0)?, bound(1)?))
 }
+
+/// Between the instants of an exposure the way of a corner may bend by so many pixels.
+const BEND_PX: f64 = 1.0;
 
 fn painting_of(pad: &PadInScene) -> Result<Painting, RenderError> {
     let finite = |value: f64| value.is_finite() && value >= 0.0;

@@ -68,6 +68,26 @@ impl Lens {
         }
     }
 
+    /// Least and greatest ideal coordinates of the image and of `margin` pixels about it.
+    pub(super) fn field(&self, margin: f64) -> ([f64; 2], [f64; 2]) {
+        let (mut min, mut max) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+        let mut include = |place: [f64; 2]| {
+            for i in 0..2 {
+                min[i] = min[i].min(place[i]);
+                max[i] = max[i].max(place[i]);
+            }
+        };
+        let last = [self.model.width, self.model.height].map(|edge| f64::from(edge) - 1.0);
+        include(self.pinhole(-margin, -margin));
+        include(self.pinhole(last[0] + margin, last[1] + margin));
+        let extra = [margin / self.model.fx, margin / self.model.fy];
+        for node in &self.nodes {
+            include([0, 1].map(|i| node[i] - extra[i]));
+            include([0, 1].map(|i| node[i] + extra[i]));
+        }
+        (min, max)
+    }
+
     /// The lens about the pixel place (u, v), over `reach` pixels to each side.
     pub(super) fn about(&self, u: f64, v: f64, reach: f64) -> Linear {
         if self.nodes.is_empty() {

@@ -37,6 +37,18 @@ impl Channels {
     }
 }
 
+/// The subsamples of a row that lie in a range of pixels.
+fn columns(
+    [from, to]: [f32; 2],
+    first: f32,
+    per_pixel: f32,
+    edge: usize,
+) -> std::ops::Range<usize> {
+    let index = |place: f32| ((place - first) * per_pixel).max(0.0) as usize;
+    let end = (index(to) + 2).min(edge);
+    index(from).min(end)..end
+}
+
 /// A tile of a painting during the exposure.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Glimpse<'a> {
@@ -137,6 +149,18 @@ impl Painter {
                 paint_cover.fill(beneath.cover);
                 paint_light.fill(beneath.light);
                 for (coat, outline) in &self.outlines.of_coats {
+                    let Some(reach) = self.outlines.reach(outline, *v, [first, -first]) else {
+                        continue;
+                    };
+                    let columns = columns(reach, first, 1.0 / step, edge);
+                    let (Some(offsets), Some(cover), Some(paint_cover), Some(paint_light)) = (
+                        offsets.get(columns.clone()),
+                        cover.get_mut(columns.clone()),
+                        paint_cover.get_mut(columns.clone()),
+                        paint_light.get_mut(columns),
+                    ) else {
+                        continue;
+                    };
                     self.outlines.cover_row(outline, *v, offsets, cover);
                     apply(coat, cover, paint_cover, paint_light, opaque);
                 }
@@ -233,6 +257,8 @@ enum Outline {
         quadratic: [f32; 6],
         /// How far it moves.
         motion: [f32; 2],
+        /// From which column and row to which it may be seen.
+        bounds: [[f32; 2]; 2],
     },
     /// Which of the half-planes.
     Polygon { first: usize, len: usize },
@@ -259,6 +285,12 @@ const STILL_PX: f32 = 0.05;
 impl Profile {
     fn new(width: f64) -> Self {
         Self { width: width as f32, inverse: (1.0 / width) as f32 }
+    }
+
+    /// How far from an edge that moves there is neither full cover nor none.
+    fn margin(self, motion: [f32; 2]) -> f32 {
+        let moved = (motion[0] * motion[0] + motion[1] * motion[1]).sqrt();
+        0.5 * (self.width + moved.max(STILL_PX))
     }
 
     /// Cover at a depth within an edge that stands still.
@@ -304,7 +336,9 @@ impl Outlines {
                     let moves = radius > resolution.smallest_moving_m;
                     let motion = if moves { resolution.motion } else { [0.0; 2] };
                     let quadratic = disc(plane, radius, motion, spread);
-                    Outline::Disc { quadratic, motion: motion.map(|m| m as f32) }
+                    let motion = motion.map(|m| m as f32);
+                    let bounds = bounds(&quadratic, self.profile.margin(motion));
+                    Outline::Disc { quadratic, motion, bounds }
                 }
                 Area::Rectangle(min, max) => {
                     self.polygon(plane, &rectangle(min, max), motion_of_polygons, reach)
@@ -336,20 +370,73 @@ impl Outlines {
         Outline::Polygon { first, len: self.half_planes.len() - first }
     }
 
-    /// How much of each subsample in row `v` an outline covers.
-    fn cover_row(&self, outline: &Outline, v: f32, offsets: &[f32], cover: &mut [f32]) {
-        match *outline {
-            Outline::Disc { quadratic, motion: [0.0, 0.0] } => {
-                self.disc_row(quadratic, v, offsets, cover);
-            }
-            Outline::Disc { quadratic, motion } => {
-                self.moving_disc_row(quadratic, motion, v, offsets, cover);
+    /// From where to where row `v` of a tile, itself from `from` to `to`, may be covered by an outline.
+    fn reach(&self, outline: &Outline, v: f32, [from, to]: [f32; 2]) -> Option<[f32; 2]> {
+        match outline {
+            Outline::Disc { quadratic, motion, bounds: [columns, rows] } => {
+                if v < rows[0] || v > rows[1] {
+                    return None;
+                }
+                let [from, to] = [from.max(columns[0]), to.min(columns[1])];
+                if from > to {
+                    return None;
+                }
+                // Where the quadratic is below the most that it can be at the margin.
+                let row = Row::new(quadratic, v);
+                let most =
+                    row.steepness(from).max(row.steepness(to)) * self.profile.margin(*motion);
+                let half = 0.5 * row.slope / row.bend;
+                let square = half * half - (row.start - most) / row.bend;
+                if row.bend.is_nan() || row.bend < 1e-6 {
+                    return Some([from, to]);
+                }
+                let width = square.max(0.0).sqrt();
+                let reach = [from.max(-half - width), to.min(-half + width)];
+                (square > 0.0 && reach[0] <= reach[1]).then_some(reach)
             }
             Outline::Polygon { first, len } => {
-                let planes = self.half_planes.get(first..first + len).unwrap_or(&[]);
+                let planes = self.half_planes.get(*first..first + len).unwrap_or(&[]);
+                let mut reach = [from, to];
+                for plane in planes {
+                    let [start, per_u, per_v] = plane.depth;
+                    let start = start + per_v * v + self.profile.margin([plane.motion, 0.0]);
+                    if per_u > 1e-6 {
+                        reach[0] = reach[0].max(-start / per_u);
+                    } else if per_u < -1e-6 {
+                        reach[1] = reach[1].min(-start / per_u);
+                    }
+                }
+                (reach[0] <= reach[1]).then_some(reach)
+            }
+        }
+    }
+
+    /// How much of each subsample in row `v` an outline covers.
+    fn cover_row(&self, outline: &Outline, v: f32, offsets: &[f32], cover: &mut [f32]) {
+        let ends = [offsets.first(), offsets.last()].map(|end| end.copied().unwrap_or(0.0));
+        match outline {
+            Outline::Disc { quadratic, motion, .. } => {
+                let row = Row::new(quadratic, v);
+                let margin = self.profile.margin(*motion);
+                let deep = |u: f32| -row.value(u) > row.steepness(u) * margin;
+                // What lies between two places within lies within.
+                if row.bend > 0.0 && ends.iter().all(|u| deep(*u)) {
+                    cover.fill(1.0);
+                } else if *motion == [0.0; 2] {
+                    self.disc_row(&row, offsets, cover);
+                } else {
+                    self.moving_disc_row(&row, *motion, offsets, cover);
+                }
+            }
+            Outline::Polygon { first, len } => {
+                let planes = self.half_planes.get(*first..first + len).unwrap_or(&[]);
                 cover.fill(1.0);
                 for plane in planes {
-                    self.half_plane_row(plane, v, offsets, cover);
+                    let [start, per_u, per_v] = plane.depth;
+                    let margin = self.profile.margin([plane.motion, 0.0]);
+                    if ends.iter().any(|u| start + per_v * v + per_u * u < margin) {
+                        self.half_plane_row(plane, v, offsets, cover);
+                    }
                 }
             }
         }
@@ -378,41 +465,73 @@ impl Outlines {
     }
 
     /// The distance of a quadratic's nought in pixels is its value over its gradient.
-    fn disc_row(
-        &self,
-        [c, u1, v1, uu, uv, vv]: [f32; 6],
-        v: f32,
-        offsets: &[f32],
-        cover: &mut [f32],
-    ) {
-        let (start, slope) = (c + (v1 + vv * v) * v, u1 + uv * v);
-        let down = v1 + 2.0 * vv * v;
+    fn disc_row(&self, row: &Row, offsets: &[f32], cover: &mut [f32]) {
         for (cover, u) in cover.iter_mut().zip(offsets) {
-            let value = start + (slope + uu * u) * u;
-            let (across, along) = (slope + 2.0 * uu * u, down + uv * u);
-            let steepness = (across * across + along * along + 1e-14).sqrt();
-            *cover = self.profile.cover(-value / steepness);
+            *cover = self.profile.cover(-row.value(*u) / row.steepness(*u));
         }
     }
 
-    fn moving_disc_row(
-        &self,
-        [c, u1, v1, uu, uv, vv]: [f32; 6],
-        [mu, mv]: [f32; 2],
-        v: f32,
-        offsets: &[f32],
-        cover: &mut [f32],
-    ) {
-        let (start, slope) = (c + (v1 + vv * v) * v, u1 + uv * v);
-        let down = v1 + 2.0 * vv * v;
+    fn moving_disc_row(&self, row: &Row, motion: [f32; 2], offsets: &[f32], cover: &mut [f32]) {
         for (cover, u) in cover.iter_mut().zip(offsets) {
-            let value = start + (slope + uu * u) * u;
-            let (across, along) = (slope + 2.0 * uu * u, down + uv * u);
-            let flatness = 1.0 / (across * across + along * along + 1e-14).sqrt();
-            let motion = ((across * mu + along * mv) * flatness).abs().max(STILL_PX);
-            *cover = self.profile.mean_cover(-value * flatness, motion);
+            let flatness = 1.0 / row.steepness(*u);
+            let [across, along] = row.gradient(*u);
+            let moved = (across * motion[0] + along * motion[1]) * flatness;
+            let depth = -row.value(*u) * flatness;
+            *cover = self.profile.mean_cover(depth, moved.abs().max(STILL_PX));
         }
     }
+}
+
+/// A quadratic along one row: its value `start + slope u + bend u^2`, and its slope across rows.
+#[derive(Copy, Clone, Debug)]
+struct Row {
+    start: f32,
+    slope: f32,
+    bend: f32,
+    down: f32,
+    down_per_u: f32,
+}
+
+impl Row {
+    fn new([c, u1, v1, uu, uv, vv]: &[f32; 6], v: f32) -> Self {
+        Self {
+            start: c + (v1 + vv * v) * v,
+            slope: u1 + uv * v,
+            bend: *uu,
+            down: v1 + 2.0 * vv * v,
+            down_per_u: *uv,
+        }
+    }
+
+    fn value(&self, u: f32) -> f32 {
+        self.start + (self.slope + self.bend * u) * u
+    }
+
+    fn gradient(&self, u: f32) -> [f32; 2] {
+        [self.slope + 2.0 * self.bend * u, self.down + self.down_per_u * u]
+    }
+
+    fn steepness(&self, u: f32) -> f32 {
+        let [across, along] = self.gradient(u);
+        (across * across + along * along + 1e-14).sqrt()
+    }
+}
+
+/// The columns and the rows within which a quadratic is negative, and a margin about them; all where they have no
+/// bounds.
+fn bounds(&[c, u1, v1, uu, uv, vv]: &[f32; 6], margin: f32) -> [[f32; 2]; 2] {
+    let everywhere = [[f32::NEG_INFINITY, f32::INFINITY]; 2];
+    let [c, u1, v1, uu, uv, vv] = [c, u1, v1, uu, uv, vv].map(f64::from);
+    let round = 4.0 * uu * vv - uv * uv;
+    if !(uu > 0.0 && round > 1e-3 * (uu + vv) * (uu + vv)) {
+        return everywhere;
+    }
+    let centre = [(uv * v1 - 2.0 * vv * u1) / round, (uv * u1 - 2.0 * uu * v1) / round];
+    let depth = -(c + 0.5 * (u1 * centre[0] + v1 * centre[1]));
+    // Far from a small disc, twice the distance goes by value over gradient.
+    let margin = 2.0 * f64::from(margin) + 0.1;
+    let half = [vv, uu].map(|q| (depth.max(0.0) * 4.0 * q / round).sqrt() + margin);
+    [0, 1].map(|i| [(centre[i] - half[i]) as f32, (centre[i] + half[i]) as f32])
 }
 
 /// The half-planes of an upright rectangle.
