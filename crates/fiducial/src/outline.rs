@@ -82,18 +82,22 @@ where
     const LEAST_TURN: f64 = 1.7;
     const MOST_RMS_PX: f64 = 0.8;
     let ellipse = fit_ellipse(arc.clone())?;
+    let off_px = |point: [f64; 2]| (ellipse.radius_of(point) - 1.0) * ellipse.minor / 2.0;
+    // A few points of a long border are enough to see that it is none.
+    let few = arc.clone().step_by(1 + arc.clone().count() / 24);
+    let (squares, count) = few.fold((0.0, 0.0), |(s, n), p| (s + off_px(p).powi(2), n + 1.0));
+    if squares > MOST_RMS_PX * MOST_RMS_PX * count || ellipse.minor < 0.3 * ellipse.major {
+        return None;
+    }
     let [cx, cy] = ellipse.centre;
-    let (mut turn, mut squares, mut count) = (0.0, 0.0, 0.0);
+    let mut turn = 0.0;
     for ([x, y], [next_x, next_y]) in arc.clone().zip(arc.skip(1)) {
         let (a, b) = ([x - cx, y - cy], [next_x - cx, next_y - cy]);
         turn += (a[0] * b[1] - a[1] * b[0]).atan2(a[0] * b[0] + a[1] * b[1]);
-        squares += ((ellipse.radius_of([x, y]) - 1.0) * ellipse.minor / 2.0).powi(2);
-        count += 1.0;
     }
-    let fits = squares <= MOST_RMS_PX * MOST_RMS_PX * count && ellipse.minor > 0.3 * ellipse.major;
     // An outer border runs counter-clockwise on screen, which is a negative turn as y points down; a hole's does not.
     let black_within = turn < 0.0;
     let on_edge = ellipse.grown(if black_within { 1.0 } else { -1.0 });
-    (turn.abs() >= LEAST_TURN && fits && ellipse.minor > 12.0)
+    (turn.abs() >= LEAST_TURN && ellipse.minor > 12.0)
         .then_some(Outline { ellipse: on_edge, black_within })
 }

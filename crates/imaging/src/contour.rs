@@ -200,19 +200,20 @@ pub fn contour_area(points: &[[i32; 2]]) -> f64 {
     twice.abs() as f64 / 2.0
 }
 
-/// Length of a closed polygon, in pixels.
+/// Length of a border, in pixels. Its runs are level, upright or diagonal.
 pub fn contour_length(points: &[[i32; 2]]) -> f64 {
     let Some(last) = points.last() else {
         return 0.0;
     };
     let mut previous = *last;
-    let mut length = 0.0;
+    let (mut long, mut short) = (0_i64, 0_i64);
     for point in points {
-        let (dx, dy) = (point[0] - previous[0], point[1] - previous[1]);
-        length += f64::from(dx * dx + dy * dy).sqrt();
+        let (dx, dy) = ((point[0] - previous[0]).abs(), (point[1] - previous[1]).abs());
+        long += i64::from(dx.max(dy));
+        short += i64::from(dx.min(dy));
         previous = *point;
     }
-    length
+    long as f64 + short as f64 * (std::f64::consts::SQRT_2 - 1.0)
 }
 
 #[cfg(test)]
@@ -273,6 +274,8 @@ mod tests {
     fn areas_and_lengths_of_polygons() {
         let square = [[0, 0], [0, 3], [4, 3], [4, 0]];
         assert_eq!((contour_area(&square), contour_length(&square)), (12.0, 14.0));
+        let diamond = [[0, 3], [3, 0], [6, 3], [3, 6]];
+        assert!((contour_length(&diamond) - 12.0 * 2.0_f64.sqrt()).abs() < 1e-9);
         assert_eq!((contour_area(&[]), contour_area(&[[3, 4]])), (0.0, 0.0));
     }
 

@@ -29,6 +29,8 @@ const TILE: usize = 4;
 pub struct LocalThreshold {
     levels: Vec<Level>,
     row: Vec<u8>,
+    columns: [Vec<u8>; 2],
+    spread: Vec<[u8; 2]>,
 }
 
 /// What differences in brightness count as edges.
@@ -65,7 +67,7 @@ impl LocalThreshold {
         for index in (0..count).rev() {
             let (fine, coarse) = self.levels.split_at_mut(index + 1);
             if let Some(level) = fine.last_mut() {
-                level.decide(coarse.first().filter(|_| index + 1 < count), least);
+                level.decide(coarse.first().filter(|_| index + 1 < count), least, &mut self.spread);
             }
         }
         self.binarise(view, out);
@@ -76,7 +78,7 @@ impl LocalThreshold {
         if self.levels.is_empty() {
             self.levels.push(Level::default());
         }
-        self.levels[0].measure_pixels(view);
+        self.levels[0].measure_pixels(view, &mut self.columns);
         let mut count = 1;
         while self.levels[count - 1].width > 1 || self.levels[count - 1].height > 1 {
             if self.levels.len() == count {
@@ -118,15 +120,28 @@ impl Level {
         self.thresholds.resize(width * height, 0);
     }
 
-    fn measure_pixels(&mut self, view: GrayView<'_>) {
+    fn measure_pixels(&mut self, view: GrayView<'_>, columns: &mut [Vec<u8>; 2]) {
         self.resize(view.width().div_ceil(TILE), view.height().div_ceil(TILE));
-        for y in 0..view.height() {
-            let tiles = &mut self.extremes[y / TILE * self.width..];
-            for (tile, pixels) in tiles.iter_mut().zip(view.row(y).chunks(TILE)) {
-                for pixel in pixels {
-                    tile[0] = tile[0].min(*pixel);
-                    tile[1] = tile[1].max(*pixel);
+        let [lows, highs] = columns;
+        for (index, tiles) in self.extremes.chunks_mut(self.width).enumerate() {
+            let rows = index * TILE..((index + 1) * TILE).min(view.height());
+            lows.clear();
+            lows.resize(view.width(), 255);
+            highs.clear();
+            highs.resize(view.width(), 0);
+            // Down the columns first: many at a time.
+            for y in rows {
+                for ((low, high), pixel) in lows.iter_mut().zip(highs.iter_mut()).zip(view.row(y)) {
+                    *low = (*low).min(*pixel);
+                    *high = (*high).max(*pixel);
                 }
+            }
+            for ((tile, lows), highs) in
+                tiles.iter_mut().zip(lows.chunks(TILE)).zip(highs.chunks(TILE))
+            {
+                let low = lows.iter().copied().fold(255, u8::min);
+                let high = highs.iter().copied().fold(0, u8::max);
+                *tile = [low, high];
             }
         }
     }
@@ -144,36 +159,43 @@ impl Level {
         }
     }
 
-    fn decide(&mut self, coarse: Option<&Self>, least: LeastContrast) {
+    fn decide(&mut self, coarse: Option<&Self>, least: LeastContrast, spread: &mut Vec<[u8; 2]>) {
         for y in 0..self.height {
-            let rows = y.saturating_sub(1)..(y + 2).min(self.height);
-            for x in 0..self.width {
-                let (mut min, mut max) = (255, 0);
-                let columns = x.saturating_sub(1)..(x + 2).min(self.width);
-                for row in rows.clone() {
-                    for [low, high] in &self.extremes[row * self.width..][columns.clone()] {
-                        min = min.min(*low);
-                        max = max.max(*high);
-                    }
+            // Over the three rows, then over three columns.
+            let row = |y: usize| &self.extremes[y * self.width..][..self.width];
+            spread.clear();
+            spread.extend_from_slice(row(y));
+            for near in [y.saturating_sub(1), (y + 1).min(self.height - 1)] {
+                for (tile, other) in spread.iter_mut().zip(row(near)) {
+                    *tile = wider(*tile, *other);
                 }
-                let middle = middle_by_ratio(min, max);
+            }
+            for x in 0..self.width {
+                let right = (x + 1).min(self.width - 1);
+                let [min, max] =
+                    wider(wider(spread[x.saturating_sub(1)], spread[x]), spread[right]);
                 self.thresholds[y * self.width + x] = match coarse {
                     Some(coarse) if !least.is_met(min, max) => {
                         coarse.thresholds[y / 2 * coarse.width + x / 2]
                     }
-                    _ => middle,
+                    _ => middle_by_ratio(min, max),
                 };
             }
         }
     }
 }
 
+/// The extremes of two tiles together.
+fn wider(a: [u8; 2], b: [u8; 2]) -> [u8; 2] {
+    [a[0].min(b[0]), a[1].max(b[1])]
+}
+
 /// The grey value as many times brighter than `min` as it is darker than `max`, and above `min` unless both are the
 /// same. What the lens scatters into the dark is allowed for, or else the darkest pixels would decide alone.
 fn middle_by_ratio(min: u8, max: u8) -> u8 {
-    const SCATTERED: f32 = 8.0;
+    const SCATTERED: f32 = 10.0;
     let product = (f32::from(min) + SCATTERED) * (f32::from(max) + SCATTERED);
-    let middle = (product.sqrt() - SCATTERED).ceil() as u8;
+    let middle = (product.sqrt() - SCATTERED) as u8;
     middle.clamp(min.saturating_add(1).min(max), max.max(min))
 }
 
