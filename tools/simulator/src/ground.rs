@@ -82,7 +82,7 @@ const NEAREST_TEXEL_PER_FOOTPRINT: f64 = 0.8;
 const LONG_SMEAR: f64 = 1.5;
 
 /// Places at which a pixel with a long smear looks at the ground.
-const TAPS: usize = 4;
+const TAPS: usize = 3;
 
 /// Pixels looked up at a time.
 const BATCH: usize = 64;
@@ -91,7 +91,7 @@ const BATCH: usize = 64;
 const STRIDE: usize = 4;
 
 /// Variations below this reflectance are left out: they are a fraction of a grey level.
-const LEAST_CONTRAST: f32 = 0.0012;
+const LEAST_CONTRAST: f32 = 0.0025;
 
 impl Ground {
     /// The ground of this kind that `seed` grows.
@@ -202,7 +202,7 @@ impl Walk {
 impl Level {
     fn new(log2: u32, values: &[f32], gain: f32) -> Self {
         let edge = 1usize << log2;
-        let quantise = |v: &f32| (v / gain + 128.0).round().clamp(0.0, 255.0) as u8;
+        let quantise = |v: &f32| (v / gain + 128.5).clamp(0.0, 255.0) as u8;
         let rows = values.chunks_exact(edge);
         let below = rows.clone().cycle().skip(1);
         let pair =
@@ -281,14 +281,14 @@ impl Level {
 
     fn add_smeared(&self, gain: f32, walk: &Walk, row: &mut [f32]) {
         let gain = gain / TAPS as f32;
-        let eighth = walk.smear.map(|smear| smear as i32 / 8);
+        let third = walk.smear.map(|smear| smear as i32 / TAPS as i32);
         let [dx, dy] = walk.step;
         let (mut indices, mut sums) = ([0; BATCH], [0; BATCH]);
         let [mut x, mut y] = walk.start;
         for values in row.chunks_mut(BATCH) {
             sums.fill(-128 * TAPS as i32);
-            for eighths in [-3, -1, 1, 3] {
-                let [ahead_x, ahead_y] = eighth.map(|eighth| eighth.wrapping_mul(eighths) as u32);
+            for thirds in [-1, 0, 1] {
+                let [ahead_x, ahead_y] = third.map(|third| third.wrapping_mul(thirds) as u32);
                 let (x, y) = (x.wrapping_add(ahead_x), y.wrapping_add(ahead_y));
                 for (count, index) in indices.iter_mut().enumerate() {
                     let count = count as u32;
@@ -451,23 +451,26 @@ fn noise(rng: &mut impl Rng, log2: u32, octaves: &[(u32, f32)]) -> Vec<f32> {
     let edge = 1usize << log2;
     let mut sum = vec![0.0f32; edge * edge];
     for &(wave, amplitude) in octaves {
-        let cells = edge >> wave;
+        let (cells, length) = (edge >> wave, 1usize << wave);
         let lattice: Vec<f32> =
             (0..cells * cells).map(|_| rng.random_range(-amplitude..amplitude)).collect();
-        let at = |x: usize, y: usize| {
-            lattice.get((y % cells) * cells + x % cells).copied().unwrap_or(0.0)
-        };
-        let weight = |texel: usize| {
-            let t = (texel & ((1 << wave) - 1)) as f32 / (1 << wave) as f32;
-            t * t * (3.0 - 2.0 * t)
-        };
+        let weights: Vec<f32> = (0..length)
+            .map(|texel| {
+                let t = texel as f32 / length as f32;
+                t * t * (3.0 - 2.0 * t)
+            })
+            .collect();
         for (y, row) in sum.chunks_exact_mut(edge).enumerate() {
-            let (cy, fy) = (y >> wave, weight(y));
-            for (x, value) in row.iter_mut().enumerate() {
-                let (cx, fx) = (x >> wave, weight(x));
-                let upper = at(cx, cy) + (at(cx + 1, cy) - at(cx, cy)) * fx;
-                let lower = at(cx, cy + 1) + (at(cx + 1, cy + 1) - at(cx, cy + 1)) * fx;
-                *value += upper + (lower - upper) * fy;
+            let weight = weights.get(y % length).copied().unwrap_or(0.0);
+            let knots = |cell: usize| lattice.iter().skip(cell % cells * cells).take(cells);
+            let mixed =
+                knots(y / length).zip(knots(y / length + 1)).map(|(u, l)| u + (l - u) * weight);
+            let mixed: Vec<f32> = mixed.collect();
+            let next = mixed.iter().cycle().skip(1);
+            for ((values, from), to) in row.chunks_exact_mut(length).zip(&mixed).zip(next) {
+                for (value, weight) in values.iter_mut().zip(&weights) {
+                    *value += from + (to - from) * weight;
+                }
             }
         }
     }
@@ -500,6 +503,12 @@ struct Canvas<'a> {
     y: f32,
 }
 
+/// The texel that holds a place not far outside a tile.
+fn texel(place: f32) -> i32 {
+    const FAR: f32 = 4096.0;
+    (place + FAR) as i32 - FAR as i32
+}
+
 /// Draws `count` things at random places.
 fn scatter(
     values: &mut [f32],
@@ -527,7 +536,7 @@ impl Canvas<'_> {
     /// A round spot with a soft edge.
     fn stone(&mut self, radius: f32, grey: f32) {
         let reach = radius.ceil() as i32 + 1;
-        let (cx, cy) = (self.x.floor() as i32, self.y.floor() as i32);
+        let (cx, cy) = (texel(self.x), texel(self.y));
         for y in cy - reach..=cy + reach {
             for x in cx - reach..=cx + reach {
                 let (dx, dy) = (x as f32 + 0.5 - self.x, y as f32 + 0.5 - self.y);
@@ -550,7 +559,7 @@ impl Canvas<'_> {
                 let cover = (width - across.abs() as f32 + 0.5).clamp(0.0, 1.0);
                 let (a, b) = (along as f32, across as f32);
                 let (x, y) = (self.x + a * cos - b * sin, self.y + a * sin + b * cos);
-                self.mix(x.floor() as i32, y.floor() as i32, grey * (0.6 + 0.4 * t), cover);
+                self.mix(texel(x), texel(y), grey * (0.6 + 0.4 * t), cover);
             }
         }
     }
