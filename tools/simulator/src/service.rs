@@ -40,6 +40,9 @@ const SIM_STATE_INTERVAL_US: f32 = 10_000.0;
 /// Height at which the vehicle counts as having been in the air, in metres.
 const IN_AIR_M: f64 = 0.3;
 
+/// Height from which the vehicle is clear of the ground, in metres.
+const CLEAR_M: f64 = 0.04;
+
 /// Runs the service until it is asked to stop.
 ///
 /// # Errors
@@ -117,7 +120,8 @@ impl Stage {
 struct Witness {
     pad: [f64; 2],
     was_in_air: bool,
-    last: Option<VehicleTruth>,
+    /// The last motion clear of the ground: once the legs touch, the ground takes the speed in steps too short to see.
+    clear: Option<VehicleTruth>,
     touchdown: Option<Touchdown>,
     max_tilt_rad: f64,
     frames: u64,
@@ -135,16 +139,18 @@ impl Witness {
         }
         if self.was_in_air && truth.on_ground {
             self.was_in_air = false;
-            let before = self.last.unwrap_or(*truth);
+            let before = self.clear.unwrap_or(*truth);
             let [north, east] = self.pad;
             self.touchdown = Some(Touchdown {
                 stamp_ns,
                 error_m: (truth.position.x() - north).hypot(truth.position.y() - east),
-                vertical_speed_m_s: truth.impact_m_s.unwrap_or(before.velocity.z()),
+                vertical_speed_m_s: before.velocity.z(),
                 lateral_speed_m_s: before.velocity.horizontal_norm(),
             });
         }
-        self.last = Some(*truth);
+        if truth.height_m > CLEAR_M {
+            self.clear = Some(*truth);
+        }
     }
 
     fn message(&self, truth: &VehicleTruth, stamp_ns: i64, pad_z_m: f64) -> Truth {
@@ -435,5 +441,36 @@ impl Camera {
             }
             Err(_) => self.node.health().dropped("JPEG frames that could not be encoded"),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::vehicle::{Vehicle, VehicleConfig};
+    use geometry::{Point, Vector};
+
+    #[test]
+    fn a_touchdown_is_told_by_the_motion_before_the_legs_touch() {
+        let mut witness = Witness { pad: [1.5, -1.5], ..Witness::default() };
+        let still = Vehicle::new(VehicleConfig::default(), 1).truth();
+        let at = |height_m: f64, fall: f64, on_ground| VehicleTruth {
+            position: Point::new(1.4, -1.5, -height_m),
+            velocity: Vector::new(0.1, 0.0, fall),
+            height_m,
+            on_ground,
+            ..still
+        };
+        witness.see(&at(0.0, 0.0, true), 0);
+        assert!(witness.touchdown.is_none(), "it has not flown yet");
+        witness.see(&at(5.0, 1.0, false), 1);
+        witness.see(&at(0.1, 0.5, false), 2);
+        // A hop too short to see ends in a touch without speed.
+        witness.see(&at(0.001, 0.0, false), 3);
+        witness.see(&at(0.0, 0.0, true), 4);
+        let touchdown = witness.touchdown.unwrap();
+        assert!((touchdown.error_m - 0.1).abs() < 1e-9 && touchdown.stamp_ns == 4);
+        assert!((touchdown.vertical_speed_m_s - 0.5).abs() < 1e-9);
+        assert!((touchdown.lateral_speed_m_s - 0.1).abs() < 1e-9);
     }
 }
