@@ -71,7 +71,10 @@ impl Work {
         let detector = Detector::new(&markers, settings).context("setting the markers up")?;
         let mut debug = Vec::new();
         for image in DEBUG_IMAGES {
-            debug.push((image, node.frame_publisher(topic::DEBUG_IMAGE, &[&config.id, image], 0).await?));
+            debug.push((
+                image,
+                node.frame_publisher(topic::DEBUG_IMAGE, &[&config.id, image], 0).await?,
+            ));
         }
         Ok(Self {
             node: node.clone(),
