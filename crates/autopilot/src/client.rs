@@ -341,6 +341,12 @@ impl Autopilot {
         id
     }
 
+    /// Gives up all that was asked for and is not done: nothing of it is sent again. Whoever ends a flight, or sees
+    /// another take it over, must call this, or a command that was lost on the way is repeated against the pilot.
+    pub fn withdraw(&mut self) {
+        self.fail_requests(|command| CommandError::Withdrawn { command });
+    }
+
     /// How a request stands.
     pub fn status(&self, id: CommandId) -> CommandStatus {
         if self.requests.iter().any(|request| request.id == id) {

@@ -109,6 +109,12 @@ pub enum CommandError {
         /// What was asked later.
         by: Command,
     },
+    /// Nobody wants it any more.
+    #[error("{command}: withdrawn before it was done, because somebody else decides now")]
+    Withdrawn {
+        /// What was asked.
+        command: Command,
+    },
     /// The autopilot restarted in between.
     #[error("{command}: the autopilot restarted")]
     Restarted {

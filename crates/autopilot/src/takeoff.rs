@@ -47,6 +47,8 @@ pub struct Takeoff {
     /// The vertical position before the climb, in m downwards from the origin.
     ground_z: Option<f64>,
     guided: bool,
+    /// It stood with armed motors before anything was asked for.
+    found_armed: bool,
 }
 
 /// Where a takeoff stands.
@@ -135,14 +137,24 @@ impl Takeoff {
 
     /// The same with other time limits.
     pub fn with_limits(height_m: f64, limits: Limits) -> Self {
-        Self { height_m, limits, part: Part::Ready, until_ns: None, ground_z: None, guided: false }
+        Self {
+            height_m,
+            limits,
+            part: Part::Ready,
+            until_ns: None,
+            ground_z: None,
+            guided: false,
+            found_armed: false,
+        }
     }
 
     /// Does what is due and says where the takeoff stands.
     ///
-    /// A vehicle that already flies in GUIDED is done at once; one that flies in another mode is left alone.
+    /// A vehicle that already flies in GUIDED is done at once; one that flies in another mode is left alone. One that
+    /// stands with armed motors is watched, never lifted: it may have landed a moment ago.
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> TakeoffProgress {
         if let Err(error) = self.advance(now_ns, autopilot) {
+            autopilot.withdraw();
             self.part = Part::Failed(error);
         }
         self.progress(autopilot)
@@ -206,11 +218,14 @@ impl Takeoff {
             Some(state) if state.armed && state.landed == LandedState::TakingOff => {
                 self.begin(now_ns, Part::Climb, self.climb_limit());
             }
-            Some(state) if state.ready && state.landed == LandedState::OnGround => {
+            Some(state) if self.found_armed && !state.armed => return Err(TakeoffError::Disarmed),
+            Some(state) if state.ready && !state.armed && state.landed == LandedState::OnGround => {
                 let request = autopilot.request(now_ns, Command::SetMode(FlightMode::Guided));
                 self.begin(now_ns, Part::Mode(request), self.limits.ready);
             }
             _ => {
+                self.found_armed |= connected
+                    .is_some_and(|state| state.armed && state.landed == LandedState::OnGround);
                 let until_ns =
                     *self.until_ns.get_or_insert(now_ns.saturating_add(ns(self.limits.ready)));
                 if now_ns >= until_ns {
@@ -284,10 +299,9 @@ impl Takeoff {
         let Some(state) = state else { return Ok(()) };
         let height_m = self.height(state);
         let level = state.position.is_some_and(|p| p.velocity.z().abs() < CLIMB_M_S);
-        if state.landed == LandedState::InAir
-            && level
-            && (height_m - self.height_m).abs() < HEIGHT_M
-        {
+        // A climb that an earlier controller began ends where that one wanted it: the ground was not seen from here.
+        let arrived = self.ground_z.is_none() || (height_m - self.height_m).abs() < HEIGHT_M;
+        if state.landed == LandedState::InAir && level && arrived {
             self.part = Part::Done;
         } else if self.until_ns.is_some_and(|until_ns| now_ns >= until_ns) {
             let (after, landed, wanted_m) = (self.climb_limit(), state.landed, self.height_m);
@@ -363,6 +377,12 @@ fn reasons(autopilot: &Autopilot) -> Vec<String> {
         }
         Some(state) if state.landed == LandedState::Landing => {
             reasons.push("waiting for the end of a landing".to_owned());
+        }
+        Some(state) if state.landed == LandedState::OnGround && state.armed => {
+            reasons.push(
+                "it stands with motors that somebody else armed, or has just landed; disarm it first"
+                    .to_owned(),
+            );
         }
         Some(state) if state.landed != LandedState::OnGround && !state.armed => {
             reasons.push(format!("the motors are off, and yet it is {}", state.landed));

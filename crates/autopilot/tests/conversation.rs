@@ -713,6 +713,70 @@ fn the_pilots_mode_switch_ends_a_takeoff() {
 }
 
 #[test]
+fn what_was_lost_on_the_way_is_not_repeated_against_the_pilot() {
+    let mut world = World::flying();
+    world.fake.lose_commands = 1;
+    let id = world.client.request(world.now, Command::SetMode(FlightMode::Land));
+    world.step();
+    world.fake.mode = 5;
+    world.client.withdraw();
+    world.run(5);
+    let withdrawn = CommandError::Withdrawn { command: Command::SetMode(FlightMode::Land) };
+    assert_eq!(world.client.status(id), CommandStatus::Failed(withdrawn));
+    assert_eq!((world.heard(MavCmd::MAV_CMD_DO_SET_MODE), world.fake.mode), (0, 5));
+
+    // The pilot switches while we arm, and the motors stay off.
+    let mut world = World::standing();
+    let mut takeoff = Takeoff::new(10.0);
+    while world.client.state().unwrap().mode != FlightMode::Guided {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+    }
+    world.fake.lose_commands = 1;
+    while world.fake.lose_commands > 0 {
+        takeoff.step(world.now, &mut world.client);
+        world.step();
+    }
+    world.fake.mode = 0;
+    let (end, _) = world.take_off(&mut takeoff, 3);
+    assert!(matches!(end, TakeoffProgress::Failed(TakeoffError::PilotInCommand { .. })), "{end}");
+    world.run(5);
+    assert!(!world.fake.armed && world.heard(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM) == 0);
+}
+
+#[test]
+fn a_vehicle_found_standing_with_armed_motors_is_not_lifted() {
+    let found = |landed| {
+        let mut world =
+            World::with(Fake { mode: 4, armed: true, landed, ..Fake::new() }, Config::default());
+        world.run(5);
+        world
+    };
+    // It has just touched down; a controller that is started now must not fly again.
+    let mut world = found(MavLandedState::MAV_LANDED_STATE_ON_GROUND);
+    let mut takeoff = Takeoff::new(10.0);
+    for _ in 0..100 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+    }
+    let waiting = takeoff.step(world.now, &mut world.client).to_string();
+    assert!(waiting.contains("disarm it first"), "{waiting}");
+    world.fake.armed = false;
+    let (end, _) = world.take_off(&mut takeoff, 5);
+    assert_eq!(end, TakeoffProgress::Failed(TakeoffError::Disarmed));
+    assert!(world.fake.heard.iter().all(|c| *c == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL));
+
+    // Its motors were being started for a take-off that an earlier controller asked for.
+    let mut world = found(MavLandedState::MAV_LANDED_STATE_ON_GROUND);
+    let mut takeoff = Takeoff::new(10.0);
+    takeoff.step(world.now, &mut world.client);
+    world.fake.climbs_to = Some(10.0);
+    world.fake.landed = MavLandedState::MAV_LANDED_STATE_TAKEOFF;
+    let (end, _) = world.take_off(&mut takeoff, 60);
+    assert_eq!(end, TakeoffProgress::Done);
+}
+
+#[test]
 fn a_takeoff_gives_up_with_the_reasons() {
     let mut world = World::with(Fake { ready: false, ..Fake::new() }, Config::default());
     let (end, _) = world.take_off(&mut Takeoff::new(10.0), 125);
