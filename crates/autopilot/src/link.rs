@@ -26,6 +26,10 @@ use crate::frame::{Counters, Frame, Parser};
 const INCOMING: usize = 1024;
 /// Packets to be sent and not yet taken by the line.
 const OUTGOING: usize = 256;
+/// Packets that may wait when one is sent that is of less account.
+const SPARE: usize = 8;
+/// The longest packet of MAVLink 2, signed, in bytes.
+const LONGEST: usize = 280;
 const FIRST_RETRY: Duration = Duration::from_millis(200);
 const LAST_RETRY: Duration = Duration::from_secs(2);
 /// How long opening a connection may take.
@@ -121,8 +125,11 @@ pub enum SendError {
     #[error("not sent: the link to the autopilot is not connected")]
     NotConnected,
     /// The line does not keep up.
-    #[error("not sent: {OUTGOING} packets already wait, the line to the autopilot is too slow")]
+    #[error("not sent: too many packets already wait, the line to the autopilot is too slow")]
     Full,
+    /// It is no single packet.
+    #[error("not sent: a packet has 1 to {LONGEST} bytes")]
+    Length,
 }
 
 impl Link {
@@ -160,6 +167,11 @@ impl Link {
     /// Sends a packet without waiting; see [`LinkSender::send`].
     pub fn send(&self, packet: &[u8]) -> Result<(), SendError> {
         self.sender.send(packet)
+    }
+
+    /// Sends a packet of somebody else's without waiting; see [`LinkSender::send_spare`].
+    pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
+        self.sender.send_spare(packet)
     }
 
     /// A handle that sends over this link from elsewhere.
@@ -200,6 +212,18 @@ impl LinkSender {
             mpsc::error::TrySendError::Full(_) => SendError::Full,
             mpsc::error::TrySendError::Closed(_) => SendError::NotConnected,
         })
+    }
+
+    /// Sends a packet only while hardly any wait, so that whoever talks much (a ground station that reads all
+    /// parameters over a slow line) never delays the setpoints.
+    pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
+        if packet.is_empty() || packet.len() > LONGEST {
+            return Err(SendError::Length);
+        }
+        if self.queue.capacity() + SPARE < OUTGOING {
+            return Err(SendError::Full);
+        }
+        self.send(packet)
     }
 }
 
@@ -628,5 +652,26 @@ fn is_autopilot_heartbeat(frame: &Frame) -> bool {
                 && frame.sender.component == 1
         }
         _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn talk_of_others_never_fills_the_line() {
+        let (queue, mut line) = mpsc::channel(OUTGOING);
+        let sender = LinkSender { shared: Arc::new(Shared::new()), queue };
+        assert_eq!(sender.send_spare(b"packet"), Err(SendError::NotConnected));
+        sender.shared.connected.store(true, Ordering::Release);
+        let sent = (0..100).take_while(|_| sender.send_spare(b"packet").is_ok()).count();
+        assert_eq!(sent, SPARE + 1);
+        assert_eq!(sender.send_spare(b"packet"), Err(SendError::Full));
+        assert_eq!(sender.send(b"setpoint"), Ok(()), "our own still goes");
+        while line.try_recv().is_ok() {}
+        assert_eq!(sender.send_spare(&[0; LONGEST]), Ok(()));
+        assert_eq!(sender.send_spare(&[0; LONGEST + 1]), Err(SendError::Length));
+        assert_eq!(sender.send_spare(&[]), Err(SendError::Length));
     }
 }
