@@ -28,8 +28,6 @@ const INCOMING: usize = 1024;
 const OUTGOING: usize = 256;
 /// Packets that may wait when one is sent that is of less account.
 const SPARE: usize = 8;
-/// The longest packet of MAVLink 2, signed, in bytes.
-const LONGEST: usize = 280;
 const FIRST_RETRY: Duration = Duration::from_millis(200);
 const LAST_RETRY: Duration = Duration::from_secs(2);
 /// How long opening a connection may take.
@@ -127,9 +125,6 @@ pub enum SendError {
     /// The line does not keep up.
     #[error("not sent: too many packets already wait, the line to the autopilot is too slow")]
     Full,
-    /// It is no single packet.
-    #[error("not sent: a packet has 1 to {LONGEST} bytes")]
-    Length,
 }
 
 impl Link {
@@ -217,9 +212,6 @@ impl LinkSender {
     /// Sends a packet only while hardly any wait, so that whoever talks much (a ground station that reads all
     /// parameters over a slow line) never delays the setpoints.
     pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
-        if packet.is_empty() || packet.len() > LONGEST {
-            return Err(SendError::Length);
-        }
         if self.queue.capacity() + SPARE < OUTGOING {
             return Err(SendError::Full);
         }
@@ -670,8 +662,6 @@ mod tests {
         assert_eq!(sender.send_spare(b"packet"), Err(SendError::Full));
         assert_eq!(sender.send(b"setpoint"), Ok(()), "our own still goes");
         while line.try_recv().is_ok() {}
-        assert_eq!(sender.send_spare(&[0; LONGEST]), Ok(()));
-        assert_eq!(sender.send_spare(&[0; LONGEST + 1]), Err(SendError::Length));
-        assert_eq!(sender.send_spare(&[]), Err(SendError::Length));
+        assert_eq!(sender.send_spare(b"packet"), Ok(()));
     }
 }
