@@ -89,6 +89,7 @@ impl Settings for Config {
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.range("takeoff_height_m", self.takeoff_height_m, 1.0..=100.0);
+        check.parses("marker", crate::wire::marker_name(&self.marker));
         check.parses("autopilot.address", self.autopilot.address.parse::<Address>());
         check.range("autopilot.component_id", self.autopilot.component_id, 1..=255);
         check.range("autopilot.state_rate_hz", self.autopilot.state_rate_hz, 10.0..=200.0);
@@ -165,6 +166,7 @@ mod tests {
         check("phases.hold_timeout_s=0", &["phases.hold_timeout_s", "from 1 to 600"]);
         check("thesis.kp=5", &["`thesis.kp` = 5", "from 0 to 0.1"]);
         check("autopilot.address=usb", &["autopilot.address", "usb"]);
+        check("marker=aruco-4x4-50:x7", &["`marker`", "FAMILY:ID"]);
         check("guidance=magic", &["magic", "metric"]);
         check("metric.gain=1", &["no key `metric.gain`"]);
     }

@@ -124,6 +124,13 @@ impl Flight {
             self.reject("another-clock");
             return;
         }
+        // Refused here, because the newest stamp is what later ones are compared with: one from the future would shut
+        // all of them out.
+        let ahead_ns = header.stamp_ns.saturating_sub(now_ns);
+        if ahead_ns as f64 * 1e-9 > self.config.target.max_future_s {
+            self.reject("from-the-future");
+            return;
+        }
         let mount = self.cameras.get(&header.camera).and_then(wire::body_from_camera);
         let marker = wire::wanted(message, &self.config.marker)
             .map(|detection| wire::marker_in_frame(detection, mount));
@@ -309,14 +316,18 @@ impl Flight {
         if self.is_landing() {
             return Err(format!("a landing is under way, in phase `{}`", self.lander.phase()));
         }
+        if let Mission::TakesOff { .. } = self.mission {
+            return Err("the vehicle is taking off; the landing begins by itself".to_owned());
+        }
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
             return Err("attitude and position of the vehicle are not known".to_owned());
         }
+        let awaits_air = matches!(self.mission, Mission::AwaitsAir);
         self.begin(now_ns);
         let why = self.decision.map_or_else(String::new, |d| d.why.to_string());
         match self.lander.phase() {
-            Phase::Idle | Phase::PilotInCommand | Phase::Aborted => {
-                self.mission = Mission::AwaitsCommand;
+            Phase::Idle | Phase::Landed | Phase::PilotInCommand | Phase::Aborted => {
+                self.mission = if awaits_air { Mission::AwaitsAir } else { Mission::AwaitsCommand };
                 self.started_ns = None;
                 Err(format!("no landing was started: {why}"))
             }
@@ -331,7 +342,7 @@ impl Flight {
             }
             let why =
                 "broken off by the operator; the autopilot ends the take-off by itself".to_owned();
-            self.mission = Mission::Failed { why: why.clone() };
+            self.fail(why.clone());
             return Ok(why);
         }
         let before = self.lander.phase();
@@ -347,6 +358,12 @@ impl Flight {
         Ok(format!("in phase `{after}`: {why}"))
     }
 
+    /// Nothing is said any more, and nothing that was asked for is repeated.
+    fn fail(&mut self, why: String) {
+        self.autopilot.withdraw();
+        self.mission = Mission::Failed { why };
+    }
+
     fn begin(&mut self, now_ns: i64) {
         self.mission = Mission::Lands;
         self.started_ns = Some(now_ns);
@@ -355,7 +372,14 @@ impl Flight {
     }
 
     fn advance_mission(&mut self, now_ns: i64) {
+        // The lander refuses a start without them, and would not be asked again.
+        let state = self.autopilot.state().and_then(wire::vehicle);
+        let stale_s = self.config.phases.stale_vehicle_s;
+        let is_known = state.is_some_and(|state| {
+            Timestamp::from_nanos(now_ns).seconds_since(state.stamp) <= stale_s
+        });
         match &mut self.mission {
+            Mission::AwaitsAir if !is_known => {}
             Mission::AwaitsAir => {
                 let flies = self.autopilot.state().is_some_and(|state| {
                     state.armed && state.mode == FlightMode::Guided && state.landed.is_flying()
@@ -369,15 +393,21 @@ impl Flight {
             }
             Mission::TakesOff { takeoff, why } => {
                 match takeoff.step(now_ns, &mut self.autopilot) {
-                    TakeoffProgress::Done => self.begin(now_ns),
                     // LAND may be the end of the landing that an earlier controller began.
-                    TakeoffProgress::Failed(TakeoffError::PilotInCommand {
+                    TakeoffProgress::Done
+                    | TakeoffProgress::Failed(TakeoffError::PilotInCommand {
                         mode: FlightMode::Land,
                         ..
-                    }) => self.begin(now_ns),
+                    }) => {
+                        if is_known {
+                            self.begin(now_ns);
+                        } else {
+                            "waiting for attitude and position".clone_into(why);
+                        }
+                    }
                     TakeoffProgress::Failed(problem) => {
                         tracing::error!(%problem, "No take-off");
-                        self.mission = Mission::Failed { why: problem.to_string() };
+                        self.fail(problem.to_string());
                     }
                     TakeoffProgress::Waiting(reasons) => *why = reasons.join("; "),
                     progress => *why = progress.to_string(),
@@ -405,7 +435,7 @@ impl Flight {
                     let why = "the autopilot restarted in flight".to_owned();
                     tracing::error!("The autopilot restarted");
                     if self.started_ns.is_some() {
-                        self.mission = Mission::Failed { why };
+                        self.fail(why);
                     }
                 }
                 Event::Attitude(_) | Event::Position(_) | Event::Range(_) => {}
@@ -434,7 +464,7 @@ impl Flight {
             Event::Returned => tracing::info!("The autopilot is heard again"),
             Event::ModeChanged { from, to } => tracing::info!(?from, %to, "Flight mode"),
             Event::LandedChanged { from, to } => {
-                tracing::info!(%from, %to, "Contact with the ground")
+                tracing::info!(%from, %to, "Contact with the ground");
             }
             Event::ReadyChanged { ready, reasons } => tracing::info!(ready, ?reasons, "Readiness"),
             Event::Text { severity, text } => tracing::info!(?severity, text, "Autopilot"),
@@ -471,6 +501,8 @@ impl Flight {
         let decision = self.lander.step(Timestamp::from_nanos(now_ns), event);
         if decision.phase != before {
             tracing::info!(from = %before, to = %decision.phase, why = %decision.why, "Phase");
+            // A LAND that was lost on the way must not be asked for again after the pilot took over.
+            self.autopilot.withdraw();
         }
         self.decision = Some(decision);
         if !matches!(self.mission, Mission::Lands) {
@@ -519,4 +551,171 @@ impl Flight {
 /// the target has aged.
 fn level(velocity: Vector<geometry::Ned>) -> Vector<geometry::Ned> {
     Vector::new(velocity.x(), velocity.y(), velocity.z().min(0.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autopilot::dialect::{
+        ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA,
+        MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag, MavType,
+    };
+    use autopilot::{Parser, Sender};
+    use messages::{Detection, FrameHeader, PixelFormat};
+    use node::Layers;
+
+    const MS: i64 = 1_000_000;
+
+    fn flight(start: &str) -> Flight {
+        let layers = Layers { file: None, set: vec![format!("start={start}")] };
+        Flight::new(layers.load::<Config>().unwrap().settings, Arc::default()).unwrap()
+    }
+
+    fn hear(flight: &mut Flight, now_ns: i64, message: &MavMessage) {
+        let sender = Sender { system: 1, component: 1 };
+        for frame in Parser::new().push(&autopilot::frame::encode(sender, 0, message)) {
+            flight.packet(now_ns, &frame);
+        }
+    }
+
+    fn heartbeat(mode: u32, armed: bool) -> MavMessage {
+        let armed =
+            if armed { MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED } else { MavModeFlag::empty() };
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            custom_mode: mode,
+            mavtype: MavType::MAV_TYPE_QUADROTOR,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            base_mode: armed,
+            ..Default::default()
+        })
+    }
+
+    fn contact(landed_state: MavLandedState) -> MavMessage {
+        MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA {
+            landed_state,
+            ..Default::default()
+        })
+    }
+
+    /// Attitude and position 5 m over the origin.
+    fn pose(flight: &mut Flight, now_ns: i64) {
+        let time_boot_ms = (now_ns / MS) as u32;
+        let attitude = ATTITUDE_DATA { time_boot_ms, ..Default::default() };
+        hear(flight, now_ns, &MavMessage::ATTITUDE(attitude));
+        let position = LOCAL_POSITION_NED_DATA { time_boot_ms, z: -5.0, ..Default::default() };
+        hear(flight, now_ns + 1, &MavMessage::LOCAL_POSITION_NED(position));
+    }
+
+    /// What was sent since the last call: setpoints, and commands other than for messages.
+    fn sent(flight: &mut Flight) -> (usize, Vec<MavCmd>) {
+        let (mut setpoints, mut commands) = (0, Vec::new());
+        while let Some(packet) = flight.poll_outgoing() {
+            for frame in Parser::new().push(&packet) {
+                match frame.message {
+                    Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => setpoints += 1,
+                    Some(MavMessage::COMMAND_LONG(c))
+                        if c.command != MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL =>
+                    {
+                        commands.push(c.command);
+                    }
+                    _ => {}
+                }
+            }
+        }
+        (setpoints, commands)
+    }
+
+    fn in_flight(start: &str) -> Flight {
+        let mut flight = flight(start);
+        hear(&mut flight, 0, &heartbeat(4, true));
+        hear(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        flight
+    }
+
+    #[test]
+    fn a_landing_is_taken_up_only_once_attitude_and_position_are_known() {
+        for start in ["takeoff", "airborne"] {
+            let mut flight = in_flight(start);
+            flight.tick(2 * MS);
+            let status = flight.status(2 * MS);
+            assert!(!status.finished && status.phase != "search", "{status:?}");
+            pose(&mut flight, 30 * MS);
+            flight.tick(31 * MS);
+            assert_eq!(flight.status(31 * MS).phase, "search");
+            assert_eq!(sent(&mut flight).0, 1);
+        }
+    }
+
+    #[test]
+    fn the_pilots_switch_silences_at_once_and_for_good() {
+        let mut flight = in_flight("airborne");
+        pose(&mut flight, 30 * MS);
+        flight.tick(31 * MS);
+        assert_eq!(sent(&mut flight), (1, vec![]));
+        hear(&mut flight, 100 * MS, &heartbeat(5, true));
+        for i in 0..100 {
+            let now_ns = (101 + i * 25) * MS;
+            pose(&mut flight, now_ns);
+            flight.tick(now_ns + 2);
+        }
+        assert_eq!(flight.status(3000 * MS).phase, "pilot-in-command");
+        assert_eq!(sent(&mut flight), (0, vec![]));
+    }
+
+    #[test]
+    fn a_start_is_refused_on_the_ground_and_while_taking_off() {
+        let mut rising = flight("takeoff");
+        let reply = rising.command(0, &ControllerCommand::Start);
+        assert!(!reply.accepted && reply.reason.contains("taking off"), "{reply:?}");
+        let mut flight = flight("airborne");
+        hear(&mut flight, 0, &heartbeat(4, false));
+        hear(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+        pose(&mut flight, 2 * MS);
+        let reply = flight.command(3 * MS, &ControllerCommand::Start);
+        assert!(!reply.accepted && reply.reason.contains("not armed"), "{reply:?}");
+        // It still begins by itself, as it was told to.
+        hear(&mut flight, 10 * MS, &heartbeat(4, true));
+        hear(&mut flight, 11 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        pose(&mut flight, 12 * MS);
+        flight.tick(13 * MS);
+        assert_eq!(flight.status(13 * MS).phase, "search");
+    }
+
+    #[test]
+    fn a_frame_from_the_future_does_not_shut_out_those_of_now() {
+        let mut flight = in_flight("airborne");
+        let now_ns = 1000 * MS;
+        let seen = |stamp_ns: i64| Detections {
+            detector: "main".into(),
+            header: FrameHeader {
+                camera: "down".into(),
+                sequence: 0,
+                stamp_ns,
+                clock: clock_name().into(),
+                exposure_ns: 0,
+                width: 64,
+                height: 48,
+                format: PixelFormat::Mono8,
+            },
+            detections: vec![Detection {
+                family: "rings".into(),
+                id: None,
+                centre_px: [1.0, 2.0],
+                corners_px: None,
+                size_px: 3.0,
+                confidence: 1.0,
+                pose: None,
+            }],
+            stages: Vec::new(),
+        };
+        for stamp_ns in [i64::MAX, now_ns + 10_000 * MS, now_ns + 60 * MS] {
+            flight.detections(now_ns, &seen(stamp_ns));
+            assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("from-the-future"));
+        }
+        for stamp_ns in [i64::MIN, now_ns - 1] {
+            flight.detections(now_ns, &seen(stamp_ns));
+        }
+        assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("no-pose"), "it was looked at");
+        assert_eq!(flight.status(now_ns).active_detector.as_deref(), Some("main"));
+    }
 }

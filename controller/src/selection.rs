@@ -180,7 +180,7 @@ mod tests {
     fn a_crash_hands_over_at_the_next_frame_that_is_newer() {
         let mut selection = selection();
         selection.heard(0, "main", 0, None);
-        selection.heard(1 * MS, "spare", 0, None);
+        selection.heard(MS, "spare", 0, None);
         selection.presence(10 * MS, "main", false);
         assert_eq!(selection.active(), Some("spare"));
         assert!(!selection.heard(20 * MS, "spare", 0, None), "the same frame again");

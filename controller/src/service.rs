@@ -20,6 +20,8 @@ const STATUS_PERIOD_NS: i64 = 200_000_000;
 const VEHICLE_PERIOD_NS: i64 = 18_000_000;
 /// Packets of the autopilot that wait to be passed on; more are dropped, as the flight never waits for the network.
 const PACKETS_WAITING: usize = 512;
+/// The longest packet of MAVLink 2, signed, in bytes.
+const LONGEST_PACKET: usize = 280;
 
 /// Runs the service until it is asked to stop.
 ///
@@ -44,8 +46,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         tokio::select! {
-            // What steers the vehicle comes before what reports on it.
-            biased;
+            // Whichever is ready, in no order: one that talks without end must not silence the others.
             () = shutdown.requested() => break,
             event = link.recv() => match event {
                 LinkEvent::Frame { frame, .. } => {
@@ -67,11 +68,13 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             Some((detector, alive)) = presence.next() => flight.presence(now_ns(), &detector, alive),
             Some(request) = commands.next() => {
                 let reply = flight.command(now_ns(), &request.message);
-                request.answer(&reply).await;
+                // Whoever asked may not listen, and the setpoints do not wait for that.
+                tokio::spawn(async move { request.answer(&reply).await });
             }
             Some(info) = cameras.next() => flight.camera(info),
             Some(message) = to_autopilot.next() => {
-                if link.send(&message.packet).is_err() {
+                let is_packet = (1..=LONGEST_PACKET).contains(&message.packet.len());
+                if !is_packet || link.send_spare(&message.packet).is_err() {
                     node.health().dropped("packets of the ground station");
                 }
             }

@@ -5,6 +5,9 @@ use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp};
 use messages::{CameraInfo, Detection, Detections, Transform3};
 
+/// Attitude and position further apart than this are not of one moment: one of the two has stopped.
+const MOST_APART_NS: i64 = 300_000_000;
+
 /// A transform as a message tells it; `None` when its numbers make none.
 pub fn transform<To: geometry::Frame, From: geometry::Frame>(
     wire: &Transform3,
@@ -20,12 +23,25 @@ pub fn body_from_camera(info: &CameraInfo) -> Option<Transform<Body, Camera>> {
     transform(&info.body_from_camera)
 }
 
-/// The best detection of a marker, named `family` or `family:id`, among those in a frame.
-pub fn wanted<'a>(message: &'a Detections, marker: &str) -> Option<&'a Detection> {
-    let (family, id) = match marker.split_once(':') {
-        Some((family, id)) => (family, id.parse().ok()),
-        None => (marker, None),
+/// A marker's name, `family` or `family:id`, in its parts.
+///
+/// # Errors
+/// Says what a name looks like.
+pub fn marker_name(name: &str) -> Result<(&str, Option<u32>), String> {
+    let (family, id) = match name.split_once(':') {
+        Some((family, id)) => (family, Some(id)),
+        None => (name, None),
     };
+    let id = id.map(str::parse).transpose();
+    id.ok()
+        .filter(|_| !family.is_empty())
+        .map(|id| (family, id))
+        .ok_or_else(|| "it must be FAMILY or FAMILY:ID, with a whole number as ID".to_owned())
+}
+
+/// The first detection of a marker, named `family` or `family:id`, among those in a frame; none for what is no name.
+pub fn wanted<'a>(message: &'a Detections, marker: &str) -> Option<&'a Detection> {
+    let (family, id) = marker_name(marker).ok()?;
     message.detections.iter().find(|d| d.family == family && (id.is_none() || d.id == id))
 }
 
@@ -41,9 +57,14 @@ pub fn marker_in_frame(
     MarkerInFrame { centre: Pixel::new(x, y), body_from_marker, confidence: detection.confidence }
 }
 
-/// The vehicle as the lander sees it: attitude and position at one moment, that of the newer of the two.
+/// The vehicle as the lander sees it: attitude and position at one moment, that of the newer of the two; `None` when
+/// one of the two has stopped (an autopilot without a position estimate goes on telling its attitude), as what is
+/// extrapolated further would be made up.
 pub fn vehicle(state: &VehicleState) -> Option<landing::VehicleState> {
     let (attitude, position) = (state.attitude?, state.position?);
+    if attitude.stamp_ns.abs_diff(position.stamp_ns) > MOST_APART_NS.unsigned_abs() {
+        return None;
+    }
     let stamp_ns = attitude.stamp_ns.max(position.stamp_ns);
     let since = |ns: i64| (stamp_ns - ns) as f64 * 1e-9;
     let turned = Rotation::from_rotation_vector(attitude.rate_in_body * since(attitude.stamp_ns));
@@ -131,6 +152,40 @@ mod tests {
         assert_eq!(id("aruco-4x4-50:7"), Some(Some(7)));
         assert_eq!(id("aruco-4x4-50"), Some(Some(3)));
         assert_eq!(id("stag-hd23:0"), None);
+        assert_eq!(id("aruco-4x4-50:x7"), None, "what is no number is not any number");
+    }
+
+    #[test]
+    fn a_position_that_has_stopped_is_not_flown_on() {
+        use autopilot::{Attitude, Battery, Position};
+        let ms = 1_000_000;
+        let at = |attitude_ms: i64, position_ms: i64| VehicleState {
+            stamp_ns: attitude_ms.max(position_ms) * ms,
+            attitude: Some(Attitude {
+                stamp_ns: attitude_ms * ms,
+                boot_ms: 0,
+                ned_from_body: Rotation::identity(),
+                rate_in_body: geometry::Vector::zero(),
+            }),
+            position: Some(Position {
+                stamp_ns: position_ms * ms,
+                boot_ms: 0,
+                position: Point::origin(),
+                velocity: geometry::Vector::new(1.0, 0.0, 0.0),
+            }),
+            range: None,
+            mode: FlightMode::Guided,
+            armed: true,
+            landed: autopilot::LandedState::InAir,
+            ready: true,
+            battery: Battery::default(),
+            connected: true,
+        };
+        let seen = vehicle(&at(1100, 1000)).unwrap();
+        assert_eq!(seen.stamp.nanos(), 1100 * ms);
+        assert!((seen.position.x() - 0.1).abs() < 1e-9);
+        assert!(vehicle(&at(1301, 1000)).is_none());
+        assert!(vehicle(&at(1000, 1301)).is_none());
     }
 
     #[test]
