@@ -99,12 +99,13 @@ impl Node {
     async fn last_value(&self, key: &str) -> anyhow::Result<LastValue> {
         let bytes = Arc::new(Mutex::new(Vec::new()));
         let kept = Arc::clone(&bytes);
+        // Our own key, whatever was asked for: of several answers on one key only one arrives.
+        let own_key = key.to_owned();
         let answer = move |query: Query| {
             let bytes: Vec<u8> = kept.lock().unwrap_or_else(PoisonError::into_inner).clone();
             if !bytes.is_empty() {
-                let key = query.key_expr().clone();
                 // Whoever asked may be gone; there is nobody to tell.
-                drop(zenoh::Wait::wait(query.reply(key, bytes)));
+                drop(zenoh::Wait::wait(query.reply(own_key.as_str(), bytes)));
             }
         };
         let answers = self
