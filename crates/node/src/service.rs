@@ -72,7 +72,11 @@ where
     Fut: Future<Output = anyhow::Result<()>>,
 {
     let shutdown = Shutdown::on_signals()?;
-    let node = Node::open(identity, zenoh).await?;
+    let node = tokio::select! {
+        node = Node::open(identity, zenoh) => node?,
+        // A network that cannot be joined must not keep the process from being stopped.
+        () = shutdown.requested() => return Ok(()),
+    };
     let result = tokio::select! {
         result = service(node.clone(), shutdown.clone()) => result,
         result = node.publish_health() => result,
@@ -94,7 +98,9 @@ pub fn start_logging(default_level: &str) {
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
-        .with_target(false);
+        .with_target(false)
+        // A log that nobody reads any more (a broken pipe) is lost; complaining about it there would end the process.
+        .log_internal_errors(false);
     // Logging that was started already (by a test, say) stays as it is.
     drop(log.try_init());
 }
