@@ -216,6 +216,7 @@ async fn advance(node: &Node, config: &Config, stage: &Stage) -> anyhow::Result<
 }
 
 /// The autopilot's side: our own on a link, or a real one through the controller.
+#[expect(clippy::large_enum_variant, reason = "there is one")]
 enum Outside {
     Link(Link),
     Topics {
