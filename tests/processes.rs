@@ -2,6 +2,11 @@
 //!
 //! Each test flies `alight land` in real time, one after the other, and joins its network as one more process.
 
+#![expect(
+    clippy::print_stdout,
+    reason = "what a test measured, or why it is skipped, is for people to read"
+)]
+
 use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
