@@ -516,7 +516,12 @@ impl Flight {
                 self.autopilot.tick(now_ns);
             }
             Action::Velocity { velocity, yaw_rate } => {
-                let velocity = if self.selection.is_blind() { level(velocity) } else { velocity };
+                let velocity = match self.selection.is_blind() {
+                    // A search without a detector finds nothing.
+                    true if decision.phase == Phase::Search => Vector::zero(),
+                    true => level(velocity),
+                    false => velocity,
+                };
                 let period_ns = (1e9 / self.config.autopilot.setpoint_rate_hz) as i64;
                 let is_frame = matches!(event, LanderEvent::Frame(_));
                 if is_frame || now_ns.saturating_sub(self.setpoint_ns) >= period_ns {
@@ -599,10 +604,14 @@ mod tests {
 
     /// Attitude and position 5 m over the origin.
     fn pose(flight: &mut Flight, now_ns: i64) {
+        pose_at(flight, now_ns, 5.0);
+    }
+
+    fn pose_at(flight: &mut Flight, now_ns: i64, height_m: f32) {
         let time_boot_ms = (now_ns / MS) as u32;
         let attitude = ATTITUDE_DATA { time_boot_ms, ..Default::default() };
         hear(flight, now_ns, &MavMessage::ATTITUDE(attitude));
-        let position = LOCAL_POSITION_NED_DATA { time_boot_ms, z: -5.0, ..Default::default() };
+        let position = LOCAL_POSITION_NED_DATA { time_boot_ms, z: -height_m, ..Default::default() };
         hear(flight, now_ns + 1, &MavMessage::LOCAL_POSITION_NED(position));
     }
 
@@ -660,6 +669,29 @@ mod tests {
         }
         assert_eq!(flight.status(3000 * MS).phase, "pilot-in-command");
         assert_eq!(sent(&mut flight), (0, vec![]));
+    }
+
+    #[test]
+    fn the_search_waits_for_a_detector_and_climbs_before_it_goes_sideways() {
+        let searched = |height_m: f32, has_detector: bool| {
+            let mut flight = in_flight("airborne");
+            if has_detector {
+                flight.presence(0, "main", true);
+            }
+            for i in 0..80 {
+                let now_ns = (30 + i * 25) * MS;
+                pose_at(&mut flight, now_ns, height_m);
+                flight.tick(now_ns + 2);
+            }
+            let status = flight.status(2030 * MS);
+            assert_eq!(status.phase, "search");
+            status.setpoint.unwrap().velocity_ned_m_s
+        };
+        assert_eq!(searched(5.0, false), [0.0; 3]);
+        let [north, east, down] = searched(5.0, true);
+        assert!(north.hypot(east) > 0.5 && down == 0.0);
+        let [north, east, down] = searched(0.6, true);
+        assert!(north.hypot(east) == 0.0 && down < 0.0);
     }
 
     #[test]

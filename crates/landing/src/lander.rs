@@ -209,13 +209,16 @@ impl Lander {
         (Action::Velocity { velocity, yaw_rate: 0.0 }, why)
     }
 
-    /// Flies the expanding square.
+    /// Flies the expanding square; low over the ground, where little is seen and much is in the way, climbs instead.
     fn search(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
         let first_leg_rad =
             *self.first_leg_rad.get_or_insert_with(|| search::first_leg_rad(vehicle.ned_from_body));
         let phases = &self.config.phases;
-        let wanted = search::velocity(phases, self.machine.elapsed_s(now), first_leg_rad);
+        let mut wanted = search::velocity(phases, self.machine.elapsed_s(now), first_leg_rad);
+        if wanted.norm() > 0.0 && -vehicle.position.z() < phases.regain_height_m {
+            wanted = Vector::new(0.0, 0.0, -phases.regain_climb_m_s);
+        }
         let velocity = envelope::admit(&self.config.envelope, wanted, false);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
