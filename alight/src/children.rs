@@ -14,7 +14,7 @@ use crate::services::Service;
 
 /// How long a service may take to stop by itself.
 const STOP_PATIENCE: Duration = Duration::from_secs(2);
-/// Lines that wait to be shown; a service that says more meanwhile waits until some are.
+/// Lines that wait to be shown; more are left out, as no service may ever wait for a terminal.
 const LINES_WAITING: usize = 256;
 
 /// What a child did.
@@ -47,11 +47,16 @@ impl Children {
     ) -> anyhow::Result<String> {
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
-        command.arg(service.name()).arg("--stop-with-parent").arg("--zenoh").arg(zenoh);
+        command.arg(service.name()).arg("--zenoh").arg(zenoh);
+        command.arg("--stop-with-parent").arg(std::process::id().to_string());
         let mut by_hand = format!("alight {} --zenoh {}", service.name(), zenoh.display());
         for setting in settings {
             command.arg("--set").arg(setting);
             by_hand.push_str(&format!(" --set '{setting}'"));
+        }
+        if service == Service::Controller {
+            // One that is started again takes the landing up, and never takes off a second time.
+            by_hand.push_str(" --set 'start=\"airborne\"'");
         }
         if std::env::var_os("ALIGHT_LOG").is_none() {
             command.env("ALIGHT_LOG", "warn");
@@ -109,9 +114,15 @@ impl Children {
 async fn follow(service: Service, mut child: Child, news: mpsc::Sender<News>) {
     if let Some(stderr) = child.stderr.take() {
         let mut lines = BufReader::new(stderr).lines();
+        let mut left_out = 0_u64;
         while let Ok(Some(line)) = lines.next_line().await {
+            let line = match left_out {
+                0 => line,
+                _ => format!("({left_out} lines are left out) {line}"),
+            };
             // Nobody listens any more once everything is being stopped.
-            drop(news.send(News::Said(service, line)).await);
+            left_out =
+                if news.try_send(News::Said(service, line)).is_ok() { 0 } else { left_out + 1 };
         }
     }
     let end = match child.wait().await {

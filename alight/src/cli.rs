@@ -24,6 +24,7 @@ struct Cli {
 }
 
 #[derive(Subcommand)]
+#[expect(clippy::enum_variant_names, reason = "`command` is what a person types")]
 enum Command {
     /// Land: start all services as processes, show the landing, print the result.
     Land(land::LandArgs),
@@ -59,9 +60,9 @@ pub(crate) struct ServiceArgs {
     /// One setting to lay over the file: dotted key, TOML value. May be repeated.
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
-    /// Stop when the program that started this one ends.
-    #[arg(long, hide = true)]
-    pub(crate) stop_with_parent: bool,
+    /// Stop when the process of this number, which started this one, ends.
+    #[arg(long, hide = true, value_name = "PID")]
+    pub(crate) stop_with_parent: Option<u32>,
 }
 
 #[derive(Args)]

@@ -36,12 +36,22 @@ pub(crate) struct LandArgs {
     /// Zenoh configuration (JSON5); the built-in `local.json5` otherwise.
     #[arg(long, value_name = "FILE")]
     zenoh: Option<PathBuf>,
-    /// Give up after this many seconds.
-    #[arg(long, default_value_t = 300.0, value_name = "SECONDS")]
+    /// Give up after this many seconds, from 1 to 86400.
+    #[arg(long, default_value_t = 300.0, value_name = "SECONDS", value_parser = patience_s)]
     timeout_s: f64,
     /// What is printed at the end: a table, or one JSON object on the last line.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
+}
+
+/// A number of seconds that can be waited for.
+fn patience_s(text: &str) -> Result<f64, String> {
+    let seconds = text.parse().map_err(|_| "it is not a number".to_owned())?;
+    if (1.0..=86_400.0).contains(&seconds) {
+        Ok(seconds)
+    } else {
+        Err("it must be from 1 to 86400".to_owned())
+    }
 }
 
 /// Form of the result.
@@ -170,7 +180,7 @@ async fn fly(args: &LandArgs, settings: &Settings) -> anyhow::Result<Flight> {
         let started = children.start(service, &meeting.file, settings.of(service))?;
         progress.debug(&started);
     }
-    let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s.clamp(1.0, 86_400.0));
+    let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s);
     let watched = watch(&node, &mut children, &mut progress, shutdown, deadline).await;
     progress.finish();
     children.stop().await;

@@ -108,7 +108,8 @@ impl Flight {
     pub(crate) fn outcome(&self) -> Outcome {
         let status = self.last_status.as_ref();
         let touchdown = self.last_truth.as_ref().and_then(|t| t.touchdown);
-        let since_start = |ns: i64| self.started_ns.map(|start| (ns - start) as f64 * 1e-9);
+        let since_start =
+            |ns: i64| self.started_ns.map(|start| ns.saturating_sub(start) as f64 / 1e9);
         let landed = self.disarmed_ns.is_some() && touchdown.is_some();
         let outcome = match (&self.interrupted, status) {
             (Some(why), Some(status)) => {

@@ -50,8 +50,10 @@ impl Service {
 
 /// Runs a service until it ends or is asked to stop.
 pub(crate) fn run(service: Service, args: &ServiceArgs) -> anyhow::Result<ExitCode> {
-    if args.stop_with_parent {
-        stop_with_parent();
+    if let Some(parent) = args.stop_with_parent
+        && !stop_with_parent(parent)
+    {
+        return Ok(ExitCode::FAILURE);
     }
     node::start_logging("info");
     let layers = Layers { file: args.config.clone(), set: args.set.clone() };
@@ -106,12 +108,16 @@ pub(crate) fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
         .context("starting the asynchronous runtime")
 }
 
+/// Ends with the parent from now on; false when the parent has ended already.
 #[cfg(target_os = "linux")]
-fn stop_with_parent() {
+fn stop_with_parent(parent: u32) -> bool {
     let signal = Some(rustix::process::Signal::TERM);
     // Without it the process would merely outlive a parent that was killed.
     let _ = rustix::process::set_parent_process_death_signal(signal);
+    std::os::unix::process::parent_id() == parent
 }
 
 #[cfg(not(target_os = "linux"))]
-fn stop_with_parent() {}
+fn stop_with_parent(_parent: u32) -> bool {
+    true
+}
