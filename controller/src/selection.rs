@@ -5,8 +5,12 @@
 
 use messages::Candidate;
 
-/// A detector that has not been heard for so long is forgotten, in nanoseconds.
+/// A detector that has gone and was not heard for so long is forgotten, in nanoseconds.
 const FORGOTTEN_NS: i64 = 10_000_000_000;
+/// One that is said to be there is forgotten after so long a silence, and known again at its next word.
+const SILENT_NS: i64 = 60_000_000_000;
+/// The longest name of a service, in bytes.
+const LONGEST_NAME: usize = 64;
 /// Detectors that are followed at most; more are a mistake in the network.
 const MOST: usize = 16;
 
@@ -92,7 +96,10 @@ impl Selection {
 
     /// Lets time pass.
     pub fn tick(&mut self, now_ns: i64) {
-        self.known.retain(|known| known.alive || now_ns - known.heard_ns < FORGOTTEN_NS);
+        self.known.retain(|known| {
+            let patience_ns = if known.alive { SILENT_NS } else { FORGOTTEN_NS };
+            now_ns.saturating_sub(known.heard_ns) < patience_ns
+        });
         self.choose(now_ns);
     }
 
@@ -122,7 +129,7 @@ impl Selection {
         if let Some(index) = self.known.iter().position(|known| known.name == name) {
             return self.known.get_mut(index);
         }
-        if self.known.len() >= MOST {
+        if self.known.len() >= MOST || name.len() > LONGEST_NAME {
             return None;
         }
         self.known.push(Known {
@@ -225,5 +232,10 @@ mod tests {
             selection.heard(i, &format!("d{i}"), i, None);
         }
         assert_eq!(selection.candidates(0).len(), MOST);
+        assert!(!selection.heard(1000, "main", 1000, None), "there is no room");
+        let later = 61_000 * MS;
+        selection.tick(later);
+        assert!(!selection.heard(later, &"d".repeat(65), later, None), "no name of a service");
+        assert!(selection.heard(later, "main", later, None));
     }
 }
