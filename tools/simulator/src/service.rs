@@ -186,9 +186,10 @@ async fn advance(node: &Node, config: &Config, stage: &Stage) -> anyhow::Result<
     let mut tick: u64 = 0;
     loop {
         tokio::select! {
+            // Time goes on whoever talks without end.
             biased;
-            () = outside.listen(stage) => continue,
             _ = ticks.tick() => {}
+            () = outside.listen(stage) => continue,
         }
         tick += 1;
         outside.speak(node, stage).await;
