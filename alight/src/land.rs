@@ -71,6 +71,9 @@ const SERVICES: [Service; 4] =
 /// Where ground stations such as QGroundControl listen.
 const GROUND_PORT: u16 = 14_550;
 
+/// How much later than its services this process may hear of Ctrl-C.
+const SIGNAL_GRACE: Duration = Duration::from_millis(200);
+
 /// Time for the services to settle and tell their last words after the landing.
 const AFTERMATH: Duration = Duration::from_millis(1200);
 
@@ -217,6 +220,11 @@ async fn watch(
                 News::Said(service, line) => progress.say(&format!("{}: {line}", service.name())),
                 News::Ended(service, end) => {
                     children.forget(service);
+                    // Ctrl-C in a terminal reaches the services as well, and they may be the quicker ones.
+                    if tokio::time::timeout(SIGNAL_GRACE, shutdown.requested()).await.is_ok() {
+                        flight.interrupted("interrupted");
+                        return Ok(flight);
+                    }
                     progress.say(&format!("{} ended: {end}{}", service.name(), remedy(service)));
                     // Nobody flies by the ground station, so its end is no reason to leave a vehicle that takes off.
                     let is_needed = service != Service::GcsBridge;
