@@ -16,6 +16,8 @@ use crate::flight::Flight;
 const TICK: Duration = Duration::from_millis(25);
 /// How often the status is published when nothing changes.
 const STATUS_PERIOD_NS: i64 = 200_000_000;
+/// How often it is looked at whether something has changed.
+const LOOK_PERIOD_NS: i64 = 20_000_000;
 /// How often the vehicle's state is published at most.
 const VEHICLE_PERIOD_NS: i64 = 18_000_000;
 /// Packets of the autopilot that wait to be passed on; more are dropped, as the flight never waits for the network.
@@ -105,6 +107,7 @@ struct Reports {
     packets: mpsc::Sender<Vec<u8>>,
     last: Option<ControllerStatus>,
     vehicle_ns: i64,
+    looked_ns: i64,
 }
 
 impl Reports {
@@ -122,6 +125,7 @@ impl Reports {
             packets,
             last: None,
             vehicle_ns: i64::MIN,
+            looked_ns: i64::MIN,
         })
     }
 
@@ -140,6 +144,10 @@ impl Reports {
             self.vehicle_ns = now;
             self.vehicle.publish(&vehicle).await;
         }
+        if now.saturating_sub(self.looked_ns) < LOOK_PERIOD_NS {
+            return;
+        }
+        self.looked_ns = now;
         let status = flight.status(now);
         let is_due = self.last.as_ref().is_none_or(|last| {
             now - last.stamp_ns >= STATUS_PERIOD_NS
