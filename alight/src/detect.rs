@@ -23,7 +23,7 @@ const AHEAD: usize = 4;
 /// What `alight detect` is told.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct DetectArgs {
-    /// Marker to look for: FAMILY:ID[:SIZE_M], or FAMILY[:SIZE_M] for a family without ids (rings). May be repeated.
+    /// Marker to look for: `FAMILY:ID[:SIZE_M]`, or `FAMILY[:SIZE_M]` for a family without ids (rings). May be repeated.
     #[arg(long = "marker", required = true, value_name = "MARKER")]
     markers: Vec<Marker>,
     /// Calibration of the camera (ROS camera_info, Kalibr camchain or OpenCV FileStorage, as YAML); with it, markers

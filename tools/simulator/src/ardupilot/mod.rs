@@ -2,7 +2,7 @@
 //!
 //! It knows no socket: packets go in and come out, and time is an argument.
 //!
-//! Modules in reading order: [`estimate`] is what it believes of its motion, `flight` decides, `steering` flies by
+//! Modules in reading order: `estimate` is what it believes of its motion, `flight` decides, `steering` flies by
 //! the smooth paths of `shaping`, `conversation` answers the link, `telemetry` tells, `parameters` and `packet` serve
 //! both.
 
