@@ -9,7 +9,7 @@
 
 use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail, ensure};
@@ -25,6 +25,21 @@ const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
 
 /// Two landings at once would share the processor.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::const_new(());
+
+/// What a command that should end by itself says; one that goes on is ended.
+fn output_of(command: &mut Command) -> anyhow::Result<Output> {
+    let mut child =
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+    let began = std::time::Instant::now();
+    while child.try_wait()?.is_none() {
+        if began.elapsed() > PATIENCE / 4 {
+            child.kill()?;
+            bail!("{command:?} does not end: {:?}", child.wait_with_output()?);
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Ok(child.wait_with_output()?)
+}
 
 /// A landing under way.
 struct Landing {
@@ -334,10 +349,11 @@ async fn the_operators_choice_of_detector_is_followed_and_a_wrong_one_refused() 
     landing.status("both are named", |s| s.candidates.len() == 2).await?;
     let refused = landing.node.command(&ControllerCommand::UseDetector("nobody".into())).await?;
     ensure!(!refused.accepted && refused.reason.contains("main"), "{refused:?}");
-    let output = Command::new(ALIGHT)
-        .args(["command", "use-detector", "spare", "--zenoh"])
-        .arg(&landing.zenoh)
-        .output()?;
+    let output = output_of(
+        Command::new(ALIGHT)
+            .args(["command", "use-detector", "spare", "--zenoh"])
+            .arg(&landing.zenoh),
+    )?;
     ensure!(output.status.success(), "{output:?}");
     landing
         .status("the spare one is active", |s| s.active_detector.as_deref() == Some("spare"))
@@ -358,14 +374,17 @@ async fn a_second_controller_and_a_port_in_use_are_refused_in_words() -> anyhow:
     let _alone = ONE_AT_A_TIME.lock().await;
     let mut landing = Landing::start(&["--seed", "7"]).await?;
     landing.status("the controller is there", |_| true).await?;
-    let second = Command::new(ALIGHT)
-        .args(&landing.service("controller")?.by_hand)
-        .args(["--set", "id=second", "--set", "autopilot.address=udpin:127.0.0.1:0"])
-        .output()?;
+    let second =
+        output_of(Command::new(ALIGHT).args(&landing.service("controller")?.by_hand).args([
+            "--set",
+            "id=second",
+            "--set",
+            "autopilot.address=udpin:127.0.0.1:0",
+        ]))?;
     let said = String::from_utf8_lossy(&second.stderr);
     ensure!(second.status.code() == Some(1), "{second:?}");
     ensure!(said.contains("another controller (`main`) is at work for this vehicle"), "{said}");
-    let twin = Command::new(ALIGHT).args(&landing.service("detector")?.by_hand).output()?;
+    let twin = output_of(Command::new(ALIGHT).args(&landing.service("detector")?.by_hand))?;
     let said = String::from_utf8_lossy(&twin.stderr);
     ensure!(twin.status.code() == Some(1) && said.contains("called `main` already"), "{said}");
     // The first still flies; it is asked to stop, and stops all of its services.
@@ -388,15 +407,16 @@ async fn a_link_whose_port_is_taken_says_so() -> anyhow::Result<()> {
     let zenoh = directory.path().join("zenoh.json5");
     let free = std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
     std::fs::write(&zenoh, node::session::local_config(free))?;
-    let output = Command::new(ALIGHT)
-        .args([
-            "controller",
-            "--set",
-            &format!("autopilot.address=udpin:127.0.0.1:{port}"),
-            "--zenoh",
-        ])
-        .arg(&zenoh)
-        .output()?;
+    let output = output_of(
+        Command::new(ALIGHT)
+            .args([
+                "controller",
+                "--set",
+                &format!("autopilot.address=udpin:127.0.0.1:{port}"),
+                "--zenoh",
+            ])
+            .arg(&zenoh),
+    )?;
     let said = String::from_utf8_lossy(&output.stderr);
     ensure!(output.status.code() == Some(1), "{output:?}");
     ensure!(said.contains(&format!("port {port} is already in use")), "{said}");
@@ -406,7 +426,7 @@ async fn a_link_whose_port_is_taken_says_so() -> anyhow::Result<()> {
 #[test]
 fn wrong_settings_stop_the_start_with_file_key_value_and_limit() -> anyhow::Result<()> {
     let check = |args: &[&str], parts: &[&str]| {
-        let output = Command::new(ALIGHT).args(args).stdin(Stdio::null()).output()?;
+        let output = output_of(Command::new(ALIGHT).args(args).stdin(Stdio::null()))?;
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         ensure!(output.status.code() == Some(2), "{args:?} ended with {}: {said}", output.status);
         for part in parts {

@@ -27,6 +27,11 @@ pub fn local_config(port: u16) -> String {
 /// How long a question about presence may take.
 const PRESENCE_TIMEOUT: Duration = Duration::from_millis(500);
 
+/// Pauses before each look for others of the same kind. A session that is new meets the others one by one, through the
+/// meeting point, and knows of nobody whom it has not met.
+const GREETING: [Duration; 3] =
+    [Duration::ZERO, Duration::from_millis(200), Duration::from_millis(500)];
+
 /// How long leaving the network may take.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(300);
 
@@ -112,15 +117,19 @@ impl Node {
     /// Names the other instance.
     pub async fn ensure_alone(&self, matches: &str) -> anyhow::Result<()> {
         let service = self.identity.service;
-        match self.alive(service, matches).await?.first() {
-            None => Ok(()),
-            Some(other) if matches == "*" => bail!(
-                "another {service} (`{other}`) is at work for this vehicle; stop it first, or give this one another vehicle (`namespace` in the Zenoh configuration)"
-            ),
-            Some(other) => bail!(
-                "another {service} is called `{other}` already; give this one another name with `--set id=...`"
-            ),
+        for pause in GREETING {
+            tokio::time::sleep(pause).await;
+            match self.alive(service, matches).await?.first() {
+                None => {}
+                Some(other) if matches == "*" => bail!(
+                    "another {service} (`{other}`) is at work for this vehicle; stop it first, or give this one another vehicle (`namespace` in the Zenoh configuration)"
+                ),
+                Some(other) => bail!(
+                    "another {service} is called `{other}` already; give this one another name with `--set id=...`"
+                ),
+            }
         }
+        Ok(())
     }
 
     /// The instances of a service that are ready, by liveliness.

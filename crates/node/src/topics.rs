@@ -13,11 +13,14 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::Sample;
 
+use crate::clock::now_ns;
 use crate::health::HealthCounters;
 use crate::session::Node;
 
 /// How long a command waits for its answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
+/// Pause before a command that reached nobody is sent again.
+const ASK_AGAIN: Duration = Duration::from_millis(100);
 
 /// Publishes messages of one type on one key.
 pub struct Publisher<M> {
@@ -172,7 +175,8 @@ impl Node {
         Ok(Commands { queryable, health: self.shared_health() })
     }
 
-    /// Sends a command to the controller and waits for its answer.
+    /// Sends a command to the controller and waits for its answer. A session that is new may not have met the
+    /// controller yet, so a command that reached nobody is sent again; one that reached somebody never is.
     ///
     /// # Errors
     /// When no controller answers in time.
@@ -180,6 +184,22 @@ impl Node {
         &self,
         command: &messages::ControllerCommand,
     ) -> anyhow::Result<messages::CommandReply> {
+        let until_ns = now_ns() + ANSWER_TIMEOUT.as_nanos() as i64;
+        while now_ns() < until_ns {
+            if let Some(reply) = self.ask(command).await? {
+                return Ok(reply);
+            }
+            tokio::time::sleep(ASK_AGAIN).await;
+        }
+        Err(anyhow!(
+            "no controller answered within {ANSWER_TIMEOUT:?}; is one running for this vehicle?"
+        ))
+    }
+
+    async fn ask(
+        &self,
+        command: &messages::ControllerCommand,
+    ) -> anyhow::Result<Option<messages::CommandReply>> {
         let key = topic::COMMAND.key(&[]);
         let replies = self
             .session
@@ -190,12 +210,10 @@ impl Node {
             .map_err(|cause| anyhow!("sending a command on {key}: {cause}"))?;
         while let Ok(reply) = replies.recv_async().await {
             if let Ok(sample) = reply.result() {
-                return Ok(decode(&sample.payload().to_bytes())?);
+                return Ok(Some(decode(&sample.payload().to_bytes())?));
             }
         }
-        Err(anyhow!(
-            "no controller answered within {ANSWER_TIMEOUT:?}; is one running for this vehicle?"
-        ))
+        Ok(None)
     }
 }
 
