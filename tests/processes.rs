@@ -487,7 +487,7 @@ async fn programs_of_others_see_the_services_the_frames_and_the_vehicle() -> any
     let landing = Landing::start(&["--seed", "8", "--set", &address]).await?;
     landing.status("a detector is active", |s| s.active_detector.is_some()).await?;
     let port = std::fs::read_to_string(&landing.zenoh)?
-        .split("connect")
+        .split("connect: {")
         .nth(1)
         .and_then(|rest| rest.split("127.0.0.1:").nth(1)?.split('"').next().map(str::to_owned))
         .context("the meeting point's port")?;
