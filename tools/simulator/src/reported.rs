@@ -237,10 +237,15 @@ mod tests {
         reported.handle(0.1, &sim_state(0, 586.09, [0.0, 0.0, 0.5]));
         let flying = reported.truth().unwrap();
         assert!(!flying.on_ground && (flying.height_m - 2.0).abs() < 1e-3);
-        reported.handle(10.0, &sim_state(0, 584.2, [0.0, 0.0, 0.48]));
-        reported.handle(10.02, &sim_state(0, 584.09, [0.0, 0.0, 0.0]));
-        for i in 0..10 {
-            reported.handle(10.04 + f64::from(i) * 0.02, &sim_state(0, 584.09, [0.0; 3]));
+        for i in 0..60 {
+            let fallen_s = f64::from(i) * 0.02;
+            let height_m = (0.24 - 0.48 * fallen_s).max(0.0);
+            let fall = if height_m > 0.0 { 0.48 } else { 0.0 };
+            reported
+                .handle(10.0 + fallen_s, &sim_state(0, 584.09 + height_m as f32, [0.0, 0.0, fall]));
+            if reported.truth().unwrap().on_ground {
+                break;
+            }
         }
         let landed = reported.truth().unwrap();
         assert!(landed.on_ground && (landed.impact_m_s.unwrap() - 0.48).abs() < 1e-6);
