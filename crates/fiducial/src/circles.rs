@@ -1,10 +1,11 @@
 //! Where concentric circles are in space: from one ellipse to a first pose, from edge points to the best one.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
+use std::ops::AddAssign;
 
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Rotation, Transform};
 use imaging::{Ellipse, fit_ellipse};
-use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector3};
+use nalgebra::{Matrix2, Matrix3, Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
 
 /// Concentric circles in the camera frame: their centre, and the direction in which their face looks.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -30,6 +31,9 @@ const ELLIPSE_POINTS: u32 = 24;
 const MOST_STEPS: usize = 25;
 /// Edge points further off than this, in pixels, pull no harder than those at this distance.
 const HUBER_PX: f64 = 0.3;
+/// Edge points are not known better than this, in pixels, however well they agree: what is wrong with them all, such
+/// as the blur of thin rings, does not show in their differences.
+const LEAST_EDGE_ERROR_PX: f64 = 0.05;
 
 impl Circles {
     /// The two poses of a circle of this radius (metres) that an ellipse in the image may be (Chen, Wu and Wada,
@@ -202,6 +206,28 @@ impl Circles {
         Some((squares? / points.len().max(1) as f64).sqrt())
     }
 
+    /// Covariance of the pose that was fitted to these edge points: centre (m), then rotation vector (rad), in the
+    /// camera frame. The turn about the normal does not show, and has the variance of any angle.
+    pub(crate) fn covariance(
+        &self,
+        points: &[EdgePoint],
+        camera: &CameraModel,
+    ) -> Option<Matrix6<f64>> {
+        let (system, _) = self.system(points, camera)?;
+        let error_px = self.rms_px(points, camera)?.max(LEAST_EDGE_ERROR_PX);
+        let of_step = system.matrix.try_inverse()? * (error_px * error_px);
+        let (u, v) = self.basis();
+        // The rotation vector v moves the normal along u, and -u along v.
+        let mut full_from_step = SMatrix::<f64, 6, 5>::zeros();
+        full_from_step.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
+        full_from_step.fixed_view_mut::<3, 1>(3, 3).copy_from(&v);
+        full_from_step.fixed_view_mut::<3, 1>(3, 4).copy_from(&-u);
+        let mut covariance = full_from_step * of_step * full_from_step.transpose();
+        let turn = self.normal * self.normal.transpose() * ANY_ANGLE_VARIANCE;
+        covariance.fixed_view_mut::<3, 3>(3, 3).add_assign(turn);
+        covariance.iter().all(|c| c.is_finite()).then_some(covariance)
+    }
+
     /// The normal equations of one step, and the cost here.
     fn system(&self, points: &[EdgePoint], camera: &CameraModel) -> Option<(System, f64)> {
         let mut system = System { matrix: SMatrix::zeros(), right: SVector::zeros() };
@@ -237,6 +263,19 @@ impl Circles {
             Self { centre: self.centre + step.fixed_rows::<3>(0), normal: normal.normalize() };
         stepped.is_sound().then_some(stepped)
     }
+}
+
+/// Variance of an angle of which nothing is known, in square radians.
+pub(crate) const ANY_ANGLE_VARIANCE: f64 = PI * PI / 3.0;
+
+/// Covariance, in square pixels, of the image of a point whose place in the camera frame has this covariance.
+pub(crate) fn pixel_covariance(
+    point: Vector3<f64>,
+    covariance: &Matrix3<f64>,
+    camera: &CameraModel,
+) -> Option<Matrix2<f64>> {
+    let (_, jacobian) = camera.project_with_jacobian(Point::from_coords(point.into()))?;
+    Some(jacobian * covariance * jacobian.transpose())
 }
 
 struct System {

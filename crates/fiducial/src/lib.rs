@@ -27,6 +27,6 @@ pub mod trace;
 pub use detector::{Detector, DetectorError, Settings};
 pub use drawing::{Drawing, Ink, Layer, Shape};
 pub use marker::{Family, Marker, MarkerError};
-pub use observation::{MarkerPose, Observation, Stages};
+pub use observation::{MarkerPose, Observation, PoseSolution, Stages};
 pub use ring::{Ring, RingKind};
 pub use trace::{Reason, Refusal, Trace, TracedMarker};

@@ -15,10 +15,10 @@ use imaging::{
     Contours, Ellipse, GrayImage, GrayView, LeastContrast, Limits, LocalThreshold, bilinear,
 };
 
-use crate::circles::{EdgePoint, project};
+use crate::circles::{EdgePoint, pixel_covariance, project};
 use crate::lens::{guess_lens, nominal_camera};
 use crate::marker::{Family, Marker};
-use crate::observation::{MarkerPose, Observation, Stages};
+use crate::observation::{MarkerPose, Observation, PoseSolution, Stages};
 use crate::outline::{Outline, add_outlines};
 use crate::photometry::Spot;
 use crate::ring::{Ring, RingKind};
@@ -176,14 +176,24 @@ impl Rings {
         let pose = marker.size_m.and(camera).map(|_| MarkerPose {
             camera_from_marker: circles.camera_from_marker(),
             reprojection_rms_px: seen.rms_px,
+            covariance: seen.covariance,
+            alternative: seen.other.map(|(other, reprojection_rms_px)| PoseSolution {
+                camera_from_marker: other.camera_from_marker(),
+                reprojection_rms_px,
+            }),
         });
+        let of_centre = seen.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        let centre_covariance_px2 =
+            pixel_covariance(seen.circles.centre, &of_centre, search.camera).ok_or(Reason::Pose)?;
         let centre = project(circles.centre, &lens).ok_or(Reason::Pose)?;
         let outline = circles.outline(size_m / 2.0, &lens).ok_or(Reason::Pose)?;
         Ok(Observation {
             family: Family::Rings,
             id: None,
             centre,
+            centre_covariance_px2,
             corners: None,
+            wrong_bits: 0,
             size_px: outline.major,
             confidence: seen.confidence,
             pose,

@@ -10,7 +10,9 @@ use imaging::{
     BilateralRows, Contours, Ellipse, GrayImage, GrayView, Limits, bilateral_5x5, contour_area,
     fit_ellipse, threshold,
 };
+use nalgebra::{Matrix2, Matrix3, Matrix6};
 
+use crate::circles::ANY_ANGLE_VARIANCE;
 use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, Stages};
 use crate::ring::{Ring, RingKind};
@@ -378,17 +380,53 @@ fn observe(rings: &[Ring], marker: &Marker, camera: Option<&CameraModel>) -> Obs
     let pose = marker.size_m.zip(camera).map(|(size_m, camera)| MarkerPose {
         camera_from_marker: facing(centre, size_m / size_px, camera),
         reprojection_rms_px: rms_px(rings, size_px),
+        covariance: facing_covariance(centre, size_m, size_px, camera),
+        alternative: None,
     });
+    let centre_error_px = CENTRE_ERROR_PX + CENTRE_ERROR_OF_SIZE * size_px;
     let confidence = count / RingKind::ALL.len() as f64;
     Observation {
         family: Family::RingsThesis,
         id: None,
         centre,
+        centre_covariance_px2: Matrix2::identity() * (centre_error_px * centre_error_px),
         corners: None,
+        wrong_bits: 0,
         size_px,
         confidence,
         pose,
     }
+}
+
+/// Standard deviation of the centre in pixels, and what the perspective of tilted rings adds, as a share of their size:
+/// the thesis' method has no estimate of its own, and these are no less than the errors measured in renderings.
+const CENTRE_ERROR_PX: f64 = 0.1;
+const CENTRE_ERROR_OF_SIZE: f64 = 0.02;
+/// Standard deviation of the range, as a share of it.
+const RANGE_ERROR: f64 = 0.03;
+/// Standard deviation of the tilt, in radians, when all markers are said to face the camera.
+const TILT_ERROR: f64 = 0.35;
+
+/// Covariance of [`facing`]: translation (m), then rotation vector (rad), in the camera frame.
+fn facing_covariance(
+    centre: Pixel,
+    size_m: f64,
+    size_px: f64,
+    camera: &CameraModel,
+) -> Matrix6<f64> {
+    let metres_per_px = size_m / size_px;
+    let range_m = (camera.fx + camera.fy) / 2.0 * metres_per_px;
+    let ray = camera.unproject(centre).coords;
+    let aside_m = CENTRE_ERROR_PX * metres_per_px + CENTRE_ERROR_OF_SIZE * size_m;
+    let along = ray * ray.transpose() * (range_m * RANGE_ERROR).powi(2);
+    let sight = ray.normalize();
+    let turn = sight * sight.transpose() * (ANY_ANGLE_VARIANCE - TILT_ERROR * TILT_ERROR);
+    let mut covariance = Matrix6::zeros();
+    let place = along + Matrix3::identity() * (aside_m * aside_m);
+    covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&place);
+    let turned = turn + Matrix3::identity() * (TILT_ERROR * TILT_ERROR);
+    covariance.fixed_view_mut::<3, 3>(3, 3).copy_from(&turned);
+    covariance
 }
 
 /// A marker that faces the camera squarely, at the range at which a pixel covers `metres_per_px`.

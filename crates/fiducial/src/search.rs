@@ -6,6 +6,7 @@ use std::f64::consts::{PI, TAU};
 
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, bilinear};
+use nalgebra::Matrix6;
 
 use crate::circles::{Circles, EdgePoint, project};
 use crate::drawing::RING_RADII;
@@ -18,6 +19,8 @@ pub(crate) const LEAST_STEP: f64 = 7.0;
 /// Where grey values differ more from a fitted marker's, as a share of its contrast, something else is in the picture,
 /// such as a shadow's edge.
 const MOST_DIFFERENCE: f64 = 0.15;
+/// Poses whose normals differ by less, in radians, are one.
+const DISTINCT_TILT: f64 = 0.01;
 
 /// What stays the same while one candidate is looked into.
 pub(crate) struct Search<'a> {
@@ -35,6 +38,10 @@ pub(crate) struct Seen {
     pub(crate) circles: Circles,
     /// Between the edges in the image and the pose's, in pixels.
     pub(crate) rms_px: f64,
+    /// Of centre (m) and rotation vector (rad), in the camera frame.
+    pub(crate) covariance: Matrix6<f64>,
+    /// The same tilted the other way, and its difference from the edges in pixels, where it is a pose of its own.
+    pub(crate) other: Option<(Circles, f64)>,
     /// From 0 to 1.
     pub(crate) confidence: f64,
 }
@@ -70,7 +77,7 @@ impl Search<'_> {
             circles = better;
             rms_px = circles.rms_px(edges, self.camera).ok_or(Reason::Pose)?;
         }
-        Ok(Seen { circles, rms_px, confidence: confidence(&support) })
+        self.seen(circles, rms_px, edges, confidence(&support)).ok_or(Reason::Pose)
     }
 
     /// The marker of which only one ring can be seen, because its neighbour's place is covered by something.
@@ -87,7 +94,23 @@ impl Search<'_> {
         let diameter_px = circles.outline(self.size_m / 2.0, self.camera)?.major;
         let good =
             whole && fits(diameter_px, rms_px, None) && self.is_covered(&circles, ring.kind)?;
-        good.then(|| Seen { circles, rms_px, confidence: 0.5 * confidence(&support) })
+        good.then(|| self.seen(circles, rms_px, edges, 0.5 * confidence(&support))).flatten()
+    }
+
+    /// The marker with how well it is known and what else it could be.
+    fn seen(
+        &self,
+        circles: Circles,
+        rms_px: f64,
+        edges: &[EdgePoint],
+        confidence: f64,
+    ) -> Option<Seen> {
+        let covariance = circles.covariance(edges, self.camera)?;
+        let other = circles
+            .mirrored()
+            .refined(edges, self.camera)
+            .filter(|(other, _)| other.normal.angle(&circles.normal) > DISTINCT_TILT);
+        Some(Seen { circles, rms_px, covariance, other, confidence })
     }
 
     /// The pose that a ring's own two edges speak for.

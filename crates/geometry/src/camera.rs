@@ -2,6 +2,8 @@
 //!
 //! Pixel coordinates: the centre of the top-left pixel is (0, 0), x right, y down.
 
+use nalgebra::{Matrix2, Matrix2x3};
+
 use crate::frame::Camera;
 use crate::transform::{Point, Vector};
 
@@ -86,6 +88,16 @@ impl CameraModel {
         Some(Pixel::new(self.fx * u + self.cx, self.fy * v + self.cy))
     }
 
+    /// As [`CameraModel::project`], with the derivative of the pixel by the point, in pixels per metre.
+    pub fn project_with_jacobian(&self, point: Point<Camera>) -> Option<(Pixel, Matrix2x3<f64>)> {
+        let pixel = self.project(point)?;
+        let (x, y) = (point.x() / point.z(), point.y() / point.z());
+        let ideal = Matrix2x3::new(1.0, 0.0, -x, 0.0, 1.0, -y) / point.z();
+        let focal = Matrix2::new(self.fx, 0.0, 0.0, self.fy);
+        let jacobian = focal * self.distortion_jacobian(x, y) * ideal;
+        jacobian.iter().all(|j| j.is_finite()).then_some((pixel, jacobian))
+    }
+
     /// The direction in which a pixel looks, with z = 1. A fisheye's pixels beyond 90 degrees off axis, which no
     /// such direction reaches, give the widest one.
     pub fn unproject(&self, pixel: Pixel) -> Vector<Camera> {
@@ -116,6 +128,47 @@ impl CameraModel {
                 }
                 let scale = fisheye_angle(&k, r.atan()) / r;
                 (x * scale, y * scale)
+            }
+        }
+    }
+
+    /// Derivative of the distorted by the ideal normalised coordinates.
+    fn distortion_jacobian(&self, x: f64, y: f64) -> Matrix2<f64> {
+        match self.distortion {
+            Distortion::None => Matrix2::identity(),
+            Distortion::BrownConrady(k) => {
+                let [k1, k2, p1, p2, k3, k4, k5, k6] = k;
+                let r2 = x * x + y * y;
+                let above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+                let below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6));
+                let above_slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3);
+                let below_slope = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6);
+                let radial = above / below;
+                // By r squared, whose own derivatives are 2 x and 2 y.
+                let slope = 2.0 * (above_slope - radial * below_slope) / below;
+                let across = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y;
+                Matrix2::new(
+                    radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
+                    across,
+                    across,
+                    radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
+                )
+            }
+            Distortion::KannalaBrandt(k) => {
+                let r = x.hypot(y);
+                if r < 1e-9 {
+                    return Matrix2::identity();
+                }
+                let (c, s, theta) = (x / r, y / r, r.atan());
+                let along = fisheye_slope(&k, theta) / (1.0 + r * r);
+                let around = fisheye_angle(&k, theta) / r;
+                let mixed = (along - around) * c * s;
+                Matrix2::new(
+                    along * c * c + around * s * s,
+                    mixed,
+                    mixed,
+                    along * s * s + around * c * c,
+                )
             }
         }
     }
@@ -199,6 +252,33 @@ mod tests {
                 let ray = model.unproject(Pixel::new(x, y));
                 let pixel = model.project(Point::new(ray.x() * 3.0, ray.y() * 3.0, 3.0)).unwrap();
                 prop_assert!(pixel.distance(&Pixel::new(x, y)) < 1e-6, "{model:?} {pixel:?}");
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn the_jacobian_is_the_slope_of_the_projection(
+            x in -0.35..0.35f64, y in -0.25..0.25f64, z in 0.3..20.0f64,
+        ) {
+            let rational = Distortion::BrownConrady([0.3, -0.1, 1e-3, -2e-3, 0.02, 0.4, 0.05, 0.01]);
+            let rational = CameraModel { distortion: rational, ..models()[0] };
+            for model in models().into_iter().chain([rational]) {
+                let at = |d: [f64; 3]| {
+                    model.project(Point::new(x * z + d[0], y * z + d[1], z + d[2])).unwrap()
+                };
+                let (_, jacobian) = model.project_with_jacobian(Point::new(x * z, y * z, z)).unwrap();
+                for axis in 0..3 {
+                    let step = 1e-5 * z;
+                    let (mut ahead, mut behind) = ([0.0; 3], [0.0; 3]);
+                    (ahead[axis], behind[axis]) = (step, -step);
+                    let (ahead, behind) = (at(ahead), at(behind));
+                    let slope = [ahead.x - behind.x, ahead.y - behind.y].map(|d| d / (2.0 * step));
+                    for row in 0..2 {
+                        let error = (jacobian[(row, axis)] - slope[row]).abs();
+                        prop_assert!(error < 1e-4 * model.fx / z, "{model:?} {jacobian} {slope:?}");
+                    }
+                }
             }
         }
     }
