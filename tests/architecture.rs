@@ -8,12 +8,13 @@ use anyhow::{Context, ensure};
 use messages::{Delivery, TOPICS};
 
 /// The algorithm crates, and what each may know of this workspace. `autopilot` is told apart for its link.
-const ALGORITHMS: [(&str, &[&str]); 5] = [
+const ALGORITHMS: [(&str, &[&str]); 6] = [
     ("geometry", &[]),
     ("imaging", &[]),
     ("messages", &[]),
     ("fiducial", &["geometry", "imaging"]),
     ("landing", &["geometry"]),
+    ("rendering", &["fiducial", "geometry"]),
 ];
 const AUTOPILOT: (&str, &[&str]) = ("autopilot", &["geometry"]);
 const NODE: (&str, &[&str]) = ("node", &["messages"]);
@@ -21,6 +22,8 @@ const SERVICES: [&str; 4] = ["camera-pub", "controller", "detector", "gcs-bridge
 /// What a service or a tool may know.
 const ROOMS: [&str; 7] =
     ["autopilot", "fiducial", "geometry", "imaging", "landing", "messages", "node"];
+/// What a tool may know beside: pictures with truth, which also the tests of any room may use.
+const PICTURES: &str = "rendering";
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
 const ALIGHT: [&str; 5] = ["fiducial", "geometry", "imaging", "messages", "node"];
 
@@ -59,7 +62,7 @@ struct Package {
     folder: PathBuf,
     /// Names of the libraries and, where there is none, of the programs it builds.
     targets: Vec<String>,
-    /// What it depends on, for tests included.
+    /// What it depends on, for tests included, but for the pictures that tests look at.
     dependencies: BTreeSet<String>,
 }
 
@@ -107,11 +110,16 @@ fn workspace() -> anyhow::Result<Vec<Package>> {
         let list = list.as_array().into_iter().flatten();
         list.filter_map(|entry| entry[key].as_str().map(str::to_owned)).collect()
     };
+    let counts = |dependency: &&serde_json::Value| {
+        dependency["kind"] != "dev" || dependency["name"] != PICTURES
+    };
     packages
         .iter()
         .map(|package| {
             let manifest = Path::new(package["manifest_path"].as_str().context("manifest_path")?);
             let targets = package["targets"].as_array().context("targets")?;
+            let dependencies = package["dependencies"].as_array().context("dependencies")?;
+            let dependencies = dependencies.iter().filter(counts).cloned().collect();
             let main = |target: &&serde_json::Value| target["kind"][0] == "lib";
             let library = targets.iter().filter(main).cloned().collect::<Vec<_>>();
             let programs = targets.iter().filter(|target| target["kind"][0] == "bin").cloned();
@@ -120,7 +128,9 @@ fn workspace() -> anyhow::Result<Vec<Package>> {
                 name: package["name"].as_str().context("name")?.to_owned(),
                 folder: manifest.parent().context("folder")?.to_owned(),
                 targets: strings(&serde_json::Value::Array(main), "name"),
-                dependencies: strings(&package["dependencies"], "name").into_iter().collect(),
+                dependencies: strings(&serde_json::Value::Array(dependencies), "name")
+                    .into_iter()
+                    .collect(),
             })
         })
         .collect()
@@ -166,7 +176,7 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
             None => {
                 let is_known = package.is_tool() || SERVICES.contains(&package.name.as_str());
                 ensure!(is_known, "{}: name what it may depend on in this test", package.name);
-                ROOMS.into_iter().collect()
+                ROOMS.into_iter().chain(package.is_tool().then_some(PICTURES)).collect()
             }
         };
         for dependency in package.dependencies.iter().filter(|d| names.contains(d.as_str())) {

@@ -3,16 +3,13 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
-#[path = "../tools/simulator/examples/frames/views.rs"]
-mod views;
-
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::process::{Command, Output};
 
 use geometry::Pixel;
+use rendering::views::{Binning, HIGHEST_M, SIZE_M, Studio, Truth, View, laterals_m, views};
 use serde_json::Value;
-use views::{Binning, HIGHEST_M, SIZE_M, Studio, Truth, View, laterals_m};
 
 const FAMILIES: [&str; 2] = ["rings", "rings-thesis"];
 
@@ -122,8 +119,7 @@ fn take_frames(binning: Binning, repeats: u32, folder: &Path) -> HashMap<String,
     let camera = binning.camera();
     let mut studio = Studio::new(binning).unwrap();
     let mut shown = HashMap::new();
-    for view in [0.0, 5.0].into_iter().flat_map(|tilt_deg| views::views(binning, tilt_deg, repeats))
-    {
+    for view in [0.0, 5.0].into_iter().flat_map(|tilt_deg| views(binning, tilt_deg, repeats)) {
         let (pixels, truth) = studio.take(&view).unwrap();
         let path = folder.join(format!("{}.png", view.name()));
         let grey = image::ColorType::L8;

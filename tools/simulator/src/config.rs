@@ -4,11 +4,10 @@ use autopilot::Address;
 use fiducial::Marker;
 use geometry::{CameraModel, Point, Transform};
 use node::{Check, Settings};
+use rendering::{CameraSettings, PadInScene, Scene, Surface};
 use serde::Deserialize;
 
 use crate::ardupilot::AutopilotConfig;
-use crate::ground::Surface;
-use crate::render::{CameraSettings, PadInScene, Scene};
 use crate::wind::{WindConfig, WindNoise};
 use crate::world::WorldConfig;
 

@@ -4,15 +4,13 @@
 //! The world is pure: a seed and the packets it receives decide everything.
 //!
 //! Modules in reading order: [`world`] joins [`vehicle`], [`wind`] and [`ardupilot`], with [`drift`] for their slow
-//! errors; [`ground`] and [`render`] are what the camera sees; [`reported`] is a vehicle that a real autopilot flies;
+//! errors; what the camera sees is the crate `rendering`'s; [`reported`] is a vehicle that a real autopilot flies;
 //! [`config`] and [`service`] run it all in real time.
 
 pub mod ardupilot;
 pub mod config;
 pub mod drift;
-pub mod ground;
 mod laws;
-pub mod render;
 pub mod reported;
 pub mod service;
 pub mod vehicle;

@@ -15,12 +15,12 @@ use messages::{
     Wind, topic,
 };
 use node::{FramePublisher, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
+use rendering::Renderer;
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::config::{Config, Flown};
-use crate::render::Renderer;
 use crate::reported::Reported;
 use crate::vehicle::VehicleTruth;
 use crate::world::World;

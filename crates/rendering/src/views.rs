@@ -4,19 +4,19 @@
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 
+use crate::ground::Surface;
+use crate::render::{CameraSettings, PadInScene, RenderError, Renderer, Scene};
 use geometry::{Body, Camera, CameraModel, Marker, Ned, Pixel, Rotation, Transform, Vector};
-use simulator::ground::Surface;
-use simulator::render::{CameraSettings, PadInScene, RenderError, Renderer, Scene};
 
 /// Outer diameter of the thesis' marker, in metres.
-pub(crate) const SIZE_M: f64 = 0.15341;
+pub const SIZE_M: f64 = 0.15341;
 
 /// The highest camera, in metres above the marker; the lowest is at 1 m.
-pub(crate) const HIGHEST_M: u32 = 13;
+pub const HIGHEST_M: u32 = 13;
 
 /// Neighbouring photosites of the thesis' sensor that make one pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Binning {
+pub enum Binning {
     /// 1296 x 972 pixels of 4.4 um behind 8 mm.
     TwoByTwo,
     /// 648 x 486 pixels of 8.8 um behind the same lens.
@@ -25,7 +25,7 @@ pub(crate) enum Binning {
 
 impl Binning {
     /// The name of files and tables.
-    pub(crate) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::TwoByTwo => "2x2",
             Self::FourByFour => "4x4",
@@ -33,7 +33,7 @@ impl Binning {
     }
 
     /// The camera's intrinsics.
-    pub(crate) fn camera(self) -> CameraModel {
+    pub fn camera(self) -> CameraModel {
         self.settings().model
     }
 
@@ -55,7 +55,7 @@ impl Binning {
     }
 
     /// The intrinsics in the form of ROS `camera_info`.
-    pub(crate) fn calibration(self) -> String {
+    pub fn calibration(self) -> String {
         let CameraModel { width, height, fx, fy, cx, cy, .. } = self.camera();
         let mut text = format!("image_width: {width}\nimage_height: {height}\n");
         // Writing to a text cannot fail.
@@ -73,20 +73,21 @@ impl Binning {
 
 /// One frame to take.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct View {
-    pub(crate) binning: Binning,
+pub struct View {
+    /// The camera's binning.
+    pub binning: Binning,
     /// Height of the camera above the marker's face.
-    pub(crate) height_m: u32,
+    pub height_m: u32,
     /// How far the marker is to the right of the camera's axis, where the camera does not tilt.
-    pub(crate) lateral_m: f64,
+    pub lateral_m: f64,
     /// The axis' angle from straight down, in degrees.
-    pub(crate) tilt_deg: f64,
+    pub tilt_deg: f64,
     /// Counts the frames of a position.
-    pub(crate) repeat: u32,
+    pub repeat: u32,
 }
 
 /// Where the thesis' marker lies across the axis, in metres, at a distance (Table 4.1).
-pub(crate) fn laterals_m(height_m: u32) -> &'static [f64] {
+pub fn laterals_m(height_m: u32) -> &'static [f64] {
     match height_m {
         ..=1 => &[0.0],
         2..=3 => &[-0.5, 0.0, 0.5],
@@ -96,7 +97,7 @@ pub(crate) fn laterals_m(height_m: u32) -> &'static [f64] {
 }
 
 /// So many frames at each position of one camera that tilts by so much.
-pub(crate) fn views(binning: Binning, tilt_deg: f64, repeats: u32) -> Vec<View> {
+pub fn views(binning: Binning, tilt_deg: f64, repeats: u32) -> Vec<View> {
     let mut views = Vec::new();
     for height_m in 1..=HIGHEST_M {
         for lateral_m in laterals_m(height_m).iter().copied() {
@@ -109,7 +110,7 @@ pub(crate) fn views(binning: Binning, tilt_deg: f64, repeats: u32) -> Vec<View> 
 
 impl View {
     /// A name that says it all: `2x2-tilt0-07m-left2.0m-3`.
-    pub(crate) fn name(&self) -> String {
+    pub fn name(&self) -> String {
         let side = match self.lateral_m {
             ..0.0 => "left",
             0.0 => "mid",
@@ -177,22 +178,26 @@ impl Spread {
 
 /// What a frame shows.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Truth {
+pub struct Truth {
     /// Where the marker's centre appears.
-    pub(crate) centre: Pixel,
+    pub centre: Pixel,
     /// The marker as seen by the camera.
-    pub(crate) camera_from_marker: Transform<Camera, Marker>,
+    pub camera_from_marker: Transform<Camera, Marker>,
 }
 
 /// A camera over the marker on painted asphalt in full sun.
 #[derive(Debug)]
-pub(crate) struct Studio {
+pub struct Studio {
     renderer: Renderer,
     ned_from_marker: Transform<Ned, Marker>,
 }
 
 impl Studio {
-    pub(crate) fn new(binning: Binning) -> Result<Self, RenderError> {
+    /// The marker of the thesis under a camera of this binning.
+    ///
+    /// # Errors
+    /// [`RenderError`] when the scene makes no sense.
+    pub fn new(binning: Binning) -> Result<Self, RenderError> {
         let marker =
             fiducial::Marker { family: fiducial::Family::Rings, id: None, size_m: Some(SIZE_M) };
         let pad = PadInScene::flat(marker, 0.0, 0.0, 0.0);
@@ -203,7 +208,10 @@ impl Studio {
     }
 
     /// The pixels, row by row, and what they show.
-    pub(crate) fn take(&mut self, view: &View) -> Result<(Vec<u8>, Truth), RenderError> {
+    ///
+    /// # Errors
+    /// [`RenderError`] when the marker cannot be seen.
+    pub fn take(&mut self, view: &View) -> Result<(Vec<u8>, Truth), RenderError> {
         let settings = self.renderer.settings().clone();
         let ned_from_body = view.ned_from_body(&settings, &self.ned_from_marker);
         let mut pixels = vec![0; settings.model.width as usize * settings.model.height as usize];

@@ -1,19 +1,17 @@
 //! Writes frames of the thesis' marker with their truth, at both binnings, for `alight detect` and other detectors:
-//! `cargo run --release -p simulator --example frames -- FOLDER`.
+//! `cargo run --release -p rendering --example frames -- FOLDER`.
 //!
 //! Five frames at each of the thesis' positions, straight down and tilted by 5 degrees: PNG files in a folder for each
 //! camera and tilt, its calibration beside it, and a line for each in `truth.jsonl`.
 #![allow(clippy::print_stdout, reason = "a program for people at a terminal")]
-
-mod views;
 
 use std::error::Error;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
+use rendering::views::{Binning, Studio, views};
 use serde_json::json;
-use views::{Binning, Studio, views};
 
 const BINNINGS: [Binning; 2] = [Binning::TwoByTwo, Binning::FourByFour];
 const REPEATS: u32 = 5;

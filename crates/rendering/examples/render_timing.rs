@@ -7,8 +7,7 @@ use std::sync::OnceLock;
 use std::time::Instant;
 
 use geometry::{Body, Ned, Point, Rotation, Transform};
-use simulator::ground::Surface;
-use simulator::render::{CameraSettings, PadInScene, Renderer, Scene};
+use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
 
 /// Frames to a mean.
 const FRAMES: u64 = 20;

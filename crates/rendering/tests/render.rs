@@ -10,8 +10,7 @@ use geometry::{
     Body, Camera, CameraModel, Distortion, Marker as MarkerFrame, Ned, Pixel, Point, Rotation,
     Transform, Vector,
 };
-use simulator::ground::Surface;
-use simulator::render::{CameraSettings, PadInScene, RenderError, Renderer, Scene};
+use rendering::{CameraSettings, PadInScene, RenderError, Renderer, Scene, Surface};
 
 const WIDTH: usize = 1296;
 const HEIGHT: usize = 972;
