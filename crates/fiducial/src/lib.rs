@@ -4,7 +4,7 @@
 //! clock and no thread; a stage of a detection that wants to be timed tells a [`Stages`] observer.
 //!
 //! Modules in reading order: [`marker`] names what is looked for, [`drawing`] says what it looks like,
-//! [`observation`] is what was found, [`detector`] finds it. [`ring`] and [`rings_thesis`] are the thesis' way
+//! [`observation`] is what was found, [`pose`] where it is in space, [`detector`] finds it. [`ring`] and [`rings_thesis`] are the thesis' way
 //! (Algorithms 1-15). [`rings`] is the mended one: `outline` takes ellipses from contours, `search` goes from a ring
 //! to the marker, `circles` and, for small markers, `photometry` give its pose, `lens` serves images of unknown
 //! cameras. [`trace`] is what they saw on the way, [`debug`] draws that.
@@ -18,6 +18,7 @@ pub mod marker;
 pub mod observation;
 mod outline;
 mod photometry;
+pub mod pose;
 pub mod ring;
 pub mod rings;
 pub mod rings_thesis;
@@ -28,5 +29,6 @@ pub use detector::{Detector, DetectorError, Settings};
 pub use drawing::{Drawing, Ink, Layer, Shape};
 pub use marker::{Family, Marker, MarkerError};
 pub use observation::{MarkerPose, Observation, PoseSolution, Stages};
+pub use pose::{PlanePoint, planar_pose, square_pose};
 pub use ring::{Ring, RingKind};
 pub use trace::{Reason, Refusal, Trace, TracedMarker};
