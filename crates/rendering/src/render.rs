@@ -41,11 +41,11 @@ pub struct Scene {
     pub light: f64,
 }
 
-/// A printed marker on top of a flat square box.
+/// Something printed on top of a flat square box.
 #[derive(Clone, Debug)]
 pub struct PadInScene {
-    /// The marker, with its size.
-    pub marker: Marker,
+    /// What is printed.
+    pub drawing: Drawing,
     /// The printed face in the world.
     pub ned_from_marker: Transform<Ned, MarkerFrame>,
     /// Edge of the box's white lid, in metres.
@@ -139,15 +139,15 @@ impl PadInScene {
         let up = Matrix3::from_columns(&[Vector3::y(), Vector3::x(), -Vector3::z()]);
         let flat = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(up));
         let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading) * flat;
-        let size_m = marker.size_m.unwrap_or(f64::NAN);
+        let drawing = Drawing::new(&marker, marker.size_m.unwrap_or(f64::NAN));
         Self {
-            marker,
             ned_from_marker: Transform::new(
                 Rotation::from_quaternion(turned),
                 Point::new(north_m, east_m, -THICKNESS_M),
             ),
-            paper_m: 2.0 * Drawing::new(&marker, size_m).half_extent_m,
+            paper_m: 2.0 * drawing.half_extent_m,
             thickness_m: THICKNESS_M,
+            drawing,
         }
     }
 }
@@ -251,7 +251,7 @@ impl Renderer {
     /// A renderer whose ground, painted marks and noise grow from `seed`.
     ///
     /// # Errors
-    /// [`RenderError::Setting`] when a setting makes no sense or a pad's marker has no size.
+    /// [`RenderError::Setting`] when a setting or a pad's size makes no sense.
     pub fn new(scene: &Scene, settings: CameraSettings, seed: u64) -> Result<Self, RenderError> {
         settings.check()?;
         if !(scene.light.is_finite() && scene.light >= 0.0) {
@@ -315,6 +315,21 @@ impl Renderer {
         frame_index: u64,
         out: &mut [u8],
     ) -> Result<(), RenderError> {
+        self.render_through(&mut |_, _| {}, poses, frame_index, out)
+    }
+
+    /// As [`Renderer::render`], through a `veil` between scene and sensor: it is given each row's number and its
+    /// light, in grey levels before vignetting and noise, and may change it as shadows, glare and hands do.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`].
+    pub fn render_through(
+        &mut self,
+        veil: &mut dyn FnMut(usize, &mut [f32]),
+        poses: &[Transform<Ned, Body>],
+        frame_index: u64,
+        out: &mut [u8],
+    ) -> Result<(), RenderError> {
         let model = self.settings.model;
         let (width, height) = (model.width as usize, model.height as usize);
         if out.len() != width * height {
@@ -328,6 +343,7 @@ impl Renderer {
             for (y, row) in rows.chunks_mut(width).enumerate() {
                 let v = index * tile + y;
                 self.fill_row(v);
+                veil(v, self.band.light.get_mut(..width).unwrap_or(&mut []));
                 self.sensor.expose(frame_index, v, &self.band.light, row);
             }
         }
@@ -658,9 +674,6 @@ const BEND_PX: f64 = 1.0;
 
 fn painting_of(pad: &PadInScene) -> Result<Painting, RenderError> {
     let finite = |value: f64| value.is_finite() && value >= 0.0;
-    let Some(size_m) = pad.marker.size_m else {
-        return Err(RenderError::Setting("a pad's marker has no size"));
-    };
     if !(finite(pad.paper_m) && finite(pad.thickness_m) && pad.ned_from_marker.origin().is_finite())
     {
         return Err(RenderError::Setting("a pad's size or place is not finite"));
@@ -670,23 +683,42 @@ fn painting_of(pad: &PadInScene) -> Result<Painting, RenderError> {
     let lid = Area::Rectangle([-half_m; 2], [half_m; 2]);
     let mut coats =
         vec![opaque(Area::Box, SIDES), Coat { within: Some(SIDES), ..opaque(lid, WHITE) }];
-    coats.extend(Drawing::new(&pad.marker, size_m).layers.iter().map(|layer| {
+    for layer in &pad.drawing.layers {
         let area = match layer.shape {
-            Shape::Disc { radius_m } => Area::Disc(radius_m),
+            Shape::Disc { radius_m } => Area::Disc { centre: [0.0; 2], radius: radius_m },
             Shape::Rectangle { min_m, max_m } => Area::Rectangle(min_m, max_m),
         };
         let light = match layer.ink {
             Ink::Black => BLACK,
             Ink::White => WHITE,
         };
-        opaque(area, light)
-    }));
+        coats.push(Coat { within: ground_of(&area, &coats), ..opaque(area, light) });
+    }
     Ok(Painting {
         ned_from_plane: pad.ned_from_marker,
         half_extent_m: half_m,
         thickness_m: pad.thickness_m,
         coats,
     })
+}
+
+/// The light of the one coat that a rectangle lies upon: rectangles side by side add up to one without a seam.
+fn ground_of(area: &Area, below: &[Coat]) -> Option<f32> {
+    let Area::Rectangle(min, max) = area else { return None };
+    // Edges that coincide differ by rounding.
+    let slack = 1e-6 * (max[0] - min[0]).min(max[1] - min[1]);
+    for coat in below.iter().rev() {
+        let Area::Rectangle(low, high) = &coat.area else { return None };
+        let apart = |i: usize| min[i] > high[i] - slack || max[i] < low[i] + slack;
+        let inside = |i: usize| min[i] >= low[i] - slack && max[i] <= high[i] + slack;
+        if inside(0) && inside(1) {
+            return Some(coat.paint.light);
+        }
+        if !(apart(0) || apart(1)) {
+            return None;
+        }
+    }
+    None
 }
 
 /// Lines, discs and rings on the ground, clear of the pads.
@@ -700,15 +732,16 @@ fn painted_marks(scene: &Scene, seed: u64) -> Vec<Painting> {
         let light = if rng.random::<f64>() < 0.25 { Paint { light: 0.06, ..paint } } else { paint };
         let (kind, size_m): (u32, f64) = (rng.random_range(0..3), rng.random_range(0.05..0.5));
         let coat = |area, paint| Coat { area, paint, within: None };
+        let disc = |radius| Area::Disc { centre: [0.0; 2], radius };
         let (half_extent_m, coats) = match kind {
             0 => {
                 let half = [rng.random_range(0.02..0.08), 3.0 * size_m];
                 (half[1], vec![coat(Area::Rectangle(half.map(|h| -h), half), light)])
             }
-            1 => (size_m, vec![coat(Area::Disc(size_m), light)]),
+            1 => (size_m, vec![coat(disc(size_m), light)]),
             _ => {
                 let inner = size_m * rng.random_range(0.4..0.9);
-                (size_m, vec![coat(Area::Disc(size_m), light), coat(Area::Disc(inner), BARE)])
+                (size_m, vec![coat(disc(size_m), light), coat(disc(inner), BARE)])
             }
         };
         let mut offset = || rng.random_range(-SPREAD_M..SPREAD_M);

@@ -5,7 +5,7 @@
     reason = "helpers of tests fail like tests, and print what they measure"
 )]
 
-use fiducial::{Drawing, Ink, Marker};
+use fiducial::{Drawing, Ink, Layer, Marker, Shape};
 use geometry::{
     Body, Camera, CameraModel, Distortion, Marker as MarkerFrame, Ned, Pixel, Point, Rotation,
     Transform, Vector,
@@ -25,6 +25,23 @@ fn marker() -> Marker {
 fn plain_scene() -> Scene {
     let pad = PadInScene::flat(marker(), 0.4, -0.3, 0.3);
     Scene { surface: Surface::Plain, pads: vec![pad], painted_marks: 0, light: 1.0 }
+}
+
+/// Cells side by side on a black square, as a square marker has them, seven of them white.
+fn scene_of_cells() -> Scene {
+    const WHITE_CELLS: [(i32, i32); 7] = [(1, 1), (2, 1), (3, 1), (2, 2), (3, 2), (4, 3), (1, 4)];
+    let cell_m = 0.15341 / 6.0;
+    let rectangle = |min: [i32; 2], max: [i32; 2], ink| {
+        let place = |cells: [i32; 2]| cells.map(|cell| f64::from(cell - 3) * cell_m);
+        Layer { shape: Shape::Rectangle { min_m: place(min), max_m: place(max) }, ink }
+    };
+    let white = |(x, y): (i32, i32)| rectangle([x, y], [x + 1, y + 1], Ink::White);
+    let layers = std::iter::once(rectangle([0, 0], [6, 6], Ink::Black))
+        .chain(WHITE_CELLS.into_iter().map(white))
+        .collect();
+    let mut scene = plain_scene();
+    scene.pads[0].drawing = Drawing { half_extent_m: 4.0 * cell_m, layers };
+    scene
 }
 
 fn exact_settings() -> CameraSettings {
@@ -114,7 +131,7 @@ fn brute_force(
 ) -> Vec<f64> {
     const RAYS: usize = 32;
     let pad = &scene.pads[0];
-    let drawing = Drawing::new(&pad.marker, pad.marker.size_m.unwrap());
+    let drawing = &pad.drawing;
     let margin = (4.0 * settings.blur_px).ceil() as usize;
     let edge = (2 * half + 1 + 2 * margin) * RAYS;
     let mut fine = vec![0.0; edge * edge];
@@ -131,7 +148,7 @@ fn brute_force(
             let (x, y) = (index % edge, index / edge);
             let pixel = Pixel::new(place(centre[0], x, y), place(centre[1], y, x));
             let ray = settings.model.unproject(pixel);
-            *value += reflectance(pad, &drawing, &marker_from_camera, ray) / instants.len() as f64;
+            *value += reflectance(pad, drawing, &marker_from_camera, ray) / instants.len() as f64;
         }
     }
     let weights = blur_weights(settings.blur_px * RAYS as f64, RAYS, margin * RAYS);
@@ -172,14 +189,13 @@ fn blur_weights(sigma: f64, pixel: usize, margin: usize) -> Vec<f64> {
 /// Renders, and compares a square of the picture about `centre` with brute force.
 fn check(
     name: &str,
-    settings: &CameraSettings,
+    (scene, settings): (&Scene, &CameraSettings),
     poses: &[Transform<Ned, Body>],
     centre: [usize; 2],
     half: usize,
 ) -> f64 {
-    let scene = plain_scene();
-    let out = rendered(&scene, settings, poses, 0);
-    let expected = brute_force(&scene, settings, poses, centre, half);
+    let out = rendered(scene, settings, poses, 0);
+    let expected = brute_force(scene, settings, poses, centre, half);
     let size = 2 * half + 1;
     let (mut worst, mut squares) = (0.0f64, 0.0);
     let mut at = [0, 0];
@@ -228,12 +244,51 @@ fn pixels_agree_with_brute_force() {
     ];
     let mut failures = Vec::new();
     for (name, poses, centre, half) in &cases {
-        let worst = check(name, &settings, poses, *centre, *half);
+        let worst = check(name, (&plain_scene(), &settings), poses, *centre, *half);
         if worst > WORST_LEVELS {
             failures.push((*name, worst));
         }
     }
     assert!(failures.is_empty(), "{failures:?}");
+}
+
+#[test]
+fn cells_side_by_side_have_no_seams() {
+    let settings = exact_settings();
+    for (height_m, roll, half, centre) in [
+        (0.5, 0.1, 16, [640, 480]),
+        (2.0, 0.3, 20, [640, 480]),
+        (10.0, 0.0, 20, [648, 486]),
+        (36.0, 0.1, 9, [648, 486]),
+    ] {
+        let pose = pose(height_m, roll, 0.05, 0.7, [0.3, 0.4]);
+        let scene = scene_of_cells();
+        let worst =
+            check(&format!("cells, {height_m} m"), (&scene, &settings), &[pose], centre, half);
+        assert!(worst <= WORST_LEVELS, "{worst} at {height_m} m");
+    }
+}
+
+#[test]
+fn a_veil_changes_the_light_before_the_sensor() {
+    let settings = exact_settings();
+    let pose = pose(2.0, 0.0, 0.0, 0.0, [0.0; 2]);
+    let mut renderer = Renderer::new(&plain_scene(), settings.clone(), 5).unwrap();
+    let mut out = vec![0; WIDTH * HEIGHT];
+    let mut half = |v: usize, light: &mut [f32]| {
+        assert_eq!(light.len(), WIDTH);
+        if v < HEIGHT / 2 {
+            light.iter_mut().for_each(|level| *level *= 0.5);
+        }
+    };
+    renderer.render_through(&mut half, &[pose], 0, &mut out).unwrap();
+    let bare = rendered(&plain_scene(), &settings, &[pose], 0);
+    let (dark, bright) = out.split_at(WIDTH * HEIGHT / 2);
+    let (whole, same) = bare.split_at(WIDTH * HEIGHT / 2);
+    assert_eq!(bright, same);
+    assert!(
+        dark.iter().zip(whole).all(|(d, w)| (f64::from(*d) - f64::from(*w) / 2.0).abs() <= 1.0)
+    );
 }
 
 #[test]
@@ -264,7 +319,8 @@ fn other_lenses_agree_with_brute_force() {
         let ned_from_camera = poses[0] * settings.body_from_camera;
         let face = plain_scene().pads[0].ned_from_marker.origin();
         let centre = settings.model.project(ned_from_camera.inverse() * face).unwrap();
-        let worst = check(name, &settings, &poses, [centre.x as usize, centre.y as usize], 25);
+        let centre = [centre.x as usize, centre.y as usize];
+        let worst = check(name, (&plain_scene(), &settings), &poses, centre, 25);
         assert!(worst <= WORST_LEVELS, "{name}: {worst}");
     }
 }

@@ -198,7 +198,7 @@ impl Painter {
         let metres_per_pixel =
             (du[0] * du[0] + du[1] * du[1]).max(dv[0] * dv[0] + dv[1] * dv[1]).sqrt();
         let smallest_m = coats.iter().fold(f64::INFINITY, |smallest, coat| match coat.area {
-            Area::Disc(radius) => smallest.min(radius),
+            Area::Disc { radius, .. } => smallest.min(radius),
             Area::Rectangle(min, max) => smallest.min((max[0] - min[0]).min(max[1] - min[1])),
             Area::Box => smallest,
         });
@@ -227,7 +227,7 @@ impl Painter {
             edges.iter().filter(|edge| depth_px(plane, edge)[0].abs() < near).count()
         };
         coats.iter().any(|coat| match coat.area {
-            Area::Disc(_) => false,
+            Area::Disc { .. } => false,
             Area::Rectangle(min, max) => edges_near(&rectangle(min, max)) > 1,
             Area::Box => edges_near(sight.outline()) > 1,
         })
@@ -332,10 +332,11 @@ impl Outlines {
         self.half_planes.clear();
         for coat in coats.iter().rev() {
             let outline = match coat.area {
-                Area::Disc(radius) => {
+                Area::Disc { centre, radius } => {
                     let moves = radius > resolution.smallest_moving_m;
                     let motion = if moves { resolution.motion } else { [0.0; 2] };
-                    let quadratic = disc(plane, radius, motion, spread);
+                    let about = about(plane, centre);
+                    let quadratic = disc(&about, radius, motion, spread);
                     let motion = motion.map(|m| m as f32);
                     let bounds = bounds(&quadratic, self.profile.margin(motion));
                     Outline::Disc { quadratic, motion, bounds }
@@ -544,6 +545,11 @@ fn depth_px([x, y, w]: &[Affine; 3], edge: &Affine) -> Affine {
     let line = [0, 1, 2].map(|i| edge[0] * w[i] + edge[1] * x[i] + edge[2] * y[i]);
     let steepness = (line[1] * line[1] + line[2] * line[2]).sqrt().max(1e-30);
     line.map(|l| (l / steepness).clamp(-1e9, 1e9))
+}
+
+/// The plane's homogeneous coordinates about a place.
+fn about([x, y, w]: &[Affine; 3], centre: [f64; 2]) -> [Affine; 3] {
+    [[0, 1, 2].map(|i| x[i] - centre[0] * w[i]), [0, 1, 2].map(|i| y[i] - centre[1] * w[i]), *w]
 }
 
 /// A disc about the origin: x^2 + y^2 - radius^2 w^2, a quadratic in the image. Its bend is accounted for: along the

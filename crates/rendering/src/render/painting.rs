@@ -43,8 +43,13 @@ pub(super) const BARE: Paint = Paint { cover: 0.0, light: 0.0 };
 pub(super) enum Area {
     /// All of the box that can be seen: lid and sides.
     Box,
-    /// A disc about the origin.
-    Disc(f64),
+    /// A disc.
+    Disc {
+        /// Its centre.
+        centre: [f64; 2],
+        /// Its radius.
+        radius: f64,
+    },
     /// An upright rectangle between two corners.
     Rectangle([f64; 2], [f64; 2]),
 }
@@ -238,9 +243,13 @@ impl<'a> Around<'a> {
 
     fn part(&self, area: Area, looks: &[Sight; 3]) -> Part {
         let (outside, inside) = match area {
-            Area::Disc(radius) => {
-                let beyond = |i: usize| self.min[i].max(-self.max[i]).max(0.0);
-                let far = self.places.iter().all(|p| p[0].hypot(p[1]) <= radius);
+            Area::Disc { centre, radius } => {
+                let beyond =
+                    |i: usize| (self.min[i] - centre[i]).max(centre[i] - self.max[i]).max(0.0);
+                let far = self
+                    .places
+                    .iter()
+                    .all(|p| (p[0] - centre[0]).hypot(p[1] - centre[1]) <= radius);
                 (beyond(0).hypot(beyond(1)) > radius, far)
             }
             Area::Rectangle(min, max) => {
