@@ -347,7 +347,10 @@ async fn the_operators_choice_of_detector_is_followed_and_a_wrong_one_refused() 
     landing.status("a detector is active", |s| s.active_detector.is_some()).await?;
     landing.start_by_hand("detector", &["id=spare"])?;
     landing.status("both are named", |s| s.candidates.len() == 2).await?;
-    let refused = landing.node.command(&ControllerCommand::UseDetector("nobody".into())).await?;
+    let refused = landing
+        .node
+        .command(topic::COMMAND, &[], &ControllerCommand::UseDetector("nobody".into()))
+        .await?;
     ensure!(!refused.accepted && refused.reason.contains("main"), "{refused:?}");
     let output = output_of(
         Command::new(ALIGHT)
@@ -360,10 +363,10 @@ async fn the_operators_choice_of_detector_is_followed_and_a_wrong_one_refused() 
         .await?;
     // Hold and resume on the way down.
     landing.descends_below(9.0).await?;
-    let hold = landing.node.command(&ControllerCommand::Hold).await?;
+    let hold = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Hold).await?;
     ensure!(hold.accepted, "{hold:?}");
     landing.status("it holds", |s| s.phase == "hold").await?;
-    let resume = landing.node.command(&ControllerCommand::Resume).await?;
+    let resume = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Resume).await?;
     ensure!(resume.accepted, "{resume:?}");
     landing.lands().await?;
     Ok(())

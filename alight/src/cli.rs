@@ -166,7 +166,7 @@ fn send_command(args: CommandArgs) -> anyhow::Result<ExitCode> {
         let instance = format!("command-{}", std::process::id());
         let identity = Identity { service: "alight", instance };
         let node = Node::open(identity, &zenoh_source(args.zenoh)).await?;
-        let reply = node.command(&command).await;
+        let reply = node.command(topic::COMMAND, &[], &command).await;
         node.close().await;
         reply
     })?;

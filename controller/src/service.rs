@@ -38,7 +38,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
     let cameras = node.subscriber(topic::CAMERA_INFO, &[]).await?;
     let presence = node.presence("detector").await?;
-    let commands = node.commands().await?;
+    let commands = node.commands(topic::COMMAND, &[]).await?;
     let to_autopilot = node.subscriber(topic::TO_AUTOPILOT, &[]).await?;
     let targets = node.publisher(topic::TARGET, &[]).await?;
     let mut reports = Reports::new(&node).await?;

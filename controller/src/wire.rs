@@ -121,8 +121,10 @@ mod tests {
             family: family.into(),
             id,
             centre_px: [1.0, 2.0],
+            centre_covariance_px2: [1.0, 0.0, 1.0],
             corners_px: None,
             size_px: 3.0,
+            wrong_bits: 0,
             confidence: 1.0,
             pose: None,
         }

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::codec::wire;
 
 wire! {
-    FrameHeader = 1 v 1;
+    FrameHeader = 1 v 2;
     CameraInfo = 2 v 1;
 }
 
@@ -16,6 +16,49 @@ pub enum PixelFormat {
     Mono8,
     /// A JPEG file.
     Jpeg,
+    /// Two bytes a pixel, the low one first, of which 10 bits count; grey.
+    Mono10,
+    /// As `Mono10`, with 12 bits.
+    Mono12,
+    /// As `Mono10`, with 16 bits.
+    Mono16,
+    /// One byte a pixel, each behind one colour of a mosaic.
+    Bayer8(BayerPattern),
+    /// Two bytes a pixel, the low one first, of which 10 bits count; each behind one colour of a mosaic.
+    Bayer10(BayerPattern),
+    /// As `Bayer10`, with 12 bits.
+    Bayer12(BayerPattern),
+    /// As `Bayer10`, with 16 bits.
+    Bayer16(BayerPattern),
+}
+
+/// The colours of a mosaic's first two rows: of two pixels each, red, green or blue.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum BayerPattern {
+    /// Red, green; green, blue.
+    Rggb,
+    /// Green, red; blue, green.
+    Grbg,
+    /// Green, blue; red, green.
+    Gbrg,
+    /// Blue, green; green, red.
+    Bggr,
+}
+
+impl PixelFormat {
+    /// Bytes of one pixel; `None` where their number differs from image to image.
+    pub fn bytes_per_pixel(self) -> Option<usize> {
+        match self {
+            Self::Jpeg => None,
+            Self::Mono8 | Self::Bayer8(_) => Some(1),
+            Self::Mono10
+            | Self::Mono12
+            | Self::Mono16
+            | Self::Bayer10(_)
+            | Self::Bayer12(_)
+            | Self::Bayer16(_) => Some(2),
+        }
+    }
 }
 
 /// What travels with a frame, and unchanged with everything that is derived from it.

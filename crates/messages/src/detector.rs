@@ -1,4 +1,4 @@
-//! What a detector publishes.
+//! What a detector publishes, and what it can be told.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,7 +7,8 @@ pub use crate::camera::Transform3;
 use crate::codec::wire;
 
 wire! {
-    Detections = 3 v 1;
+    Detections = 3 v 2;
+    DetectorCommand = 13 v 1;
 }
 
 /// What a detector found in one frame; also sent when it found nothing.
@@ -32,10 +33,14 @@ pub struct Detection {
     pub id: Option<u32>,
     /// The projection of its centre, in pixels.
     pub centre_px: [f64; 2],
+    /// Covariance of the centre in square pixels: xx, xy, yy.
+    pub centre_covariance_px2: [f32; 3],
     /// Its corners in pixels, its own top-left first, then clockwise as seen in the image.
     pub corners_px: Option<[[f64; 2]; 4]>,
     /// Its largest extent in the image, in pixels.
     pub size_px: f64,
+    /// Bits of its code that were read wrongly and corrected; 0 for families without a code.
+    pub wrong_bits: u8,
     /// From 0 (a guess) to 1 (certain).
     pub confidence: f64,
     /// Where it is, when its size and the camera are known.
@@ -49,6 +54,20 @@ pub struct MarkerPose {
     pub camera_from_marker: Transform3,
     /// Root mean square distance, in pixels, between the image's edges and the pose's.
     pub reprojection_rms_px: f64,
+    /// Covariance of translation (x, y, z in metres) and rotation (a rotation vector in radians, applied after the
+    /// pose), both in the camera frame: the upper triangle of the 6 x 6 matrix, row by row.
+    pub covariance: [f32; 21],
+    /// The other place from which a flat marker looks much the same, if there is one.
+    pub alternative: Option<AlternativePose>,
+}
+
+/// The second of the two poses that a flat marker's image allows.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AlternativePose {
+    /// The marker frame in the camera frame.
+    pub camera_from_marker: Transform3,
+    /// Root mean square distance, in pixels, between the image's edges and this pose's.
+    pub reprojection_rms_px: f64,
 }
 
 /// How long a stage took.
@@ -58,4 +77,16 @@ pub struct StageTime {
     pub stage: String,
     /// Its duration in microseconds.
     pub micros: u32,
+}
+
+/// What a detector can be told; answered with a [`crate::CommandReply`].
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum DetectorCommand {
+    /// Change a parameter from the next frame on.
+    SetParameter {
+        /// Its key in the detector's configuration.
+        key: String,
+        /// Its new value, in TOML.
+        value: String,
+    },
 }

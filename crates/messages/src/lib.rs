@@ -16,12 +16,14 @@ pub mod simulation;
 pub mod topic;
 pub mod vehicle;
 
-pub use camera::{CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3};
+pub use camera::{BayerPattern, CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3};
 pub use codec::{DecodeError, Message, decode, encode};
 pub use controller::{
     Candidate, CommandReply, ControllerCommand, ControllerStatus, Setpoint, TargetEstimate,
 };
-pub use detector::{Detection, Detections, MarkerPose, StageTime};
+pub use detector::{
+    AlternativePose, Detection, Detections, DetectorCommand, MarkerPose, StageTime,
+};
 pub use health::{Count, Health, Latency, Rate};
 pub use simulation::{Touchdown, Truth, Wind};
 pub use topic::{Delivery, Row, TOPICS, Topic};

@@ -7,7 +7,7 @@ use std::marker::PhantomData;
 use crate::camera::{CameraInfo, FrameHeader};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
-use crate::detector::Detections;
+use crate::detector::{Detections, DetectorCommand};
 use crate::health::Health;
 use crate::simulation::{Truth, Wind};
 use crate::vehicle::{MavlinkBytes, VehicleState};
@@ -101,6 +101,12 @@ pub const DETECTIONS: Topic<Detections> =
 /// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
 pub const DEBUG_IMAGE: Topic<FrameHeader> =
     Topic::new("detector/{detector}/debug/{image}", Delivery::Newest, DETECTOR);
+/// What a detector is told; answered with a [`CommandReply`].
+pub const DETECTOR_COMMAND: Topic<DetectorCommand> =
+    Topic::new("detector/{detector}/command", Delivery::Query, &["alight"]);
+/// The answer to a detector's command; travels as the reply, on the command's key.
+pub const DETECTOR_COMMAND_REPLY: Topic<CommandReply> =
+    Topic::new("detector/{detector}/command", Delivery::Query, DETECTOR);
 /// Attitude, position, velocity, mode.
 pub const VEHICLE_STATE: Topic<VehicleState> =
     Topic::new("vehicle/state", Delivery::NewestFirst, CONTROLLER);
@@ -145,6 +151,8 @@ pub const TOPICS: &[Row] = &[
     CAMERA_INFO.row,
     DETECTIONS.row,
     DEBUG_IMAGE.row,
+    DETECTOR_COMMAND.row,
+    DETECTOR_COMMAND_REPLY.row,
     VEHICLE_STATE.row,
     TARGET.row,
     STATUS.row,
@@ -169,10 +177,10 @@ mod tests {
     }
 
     #[test]
-    fn keys_are_unique_but_for_a_query_and_its_reply() {
+    fn keys_are_unique_but_for_queries_and_their_replies() {
         let mut keys: Vec<_> = TOPICS.iter().map(|row| row.key).collect();
         keys.sort_unstable();
         keys.dedup();
-        assert_eq!(keys.len(), TOPICS.len() - 1);
+        assert_eq!(keys.len(), TOPICS.len() - 2);
     }
 }

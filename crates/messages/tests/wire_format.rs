@@ -1,10 +1,11 @@
 //! The bytes on the wire: they change only with a version.
 
 use messages::{
-    CameraInfo, Candidate, CommandReply, ControllerCommand, ControllerStatus, Count, DecodeError,
-    Detection, Detections, FrameHeader, Health, LandedState, Latency, LensModel, MarkerPose,
-    MavlinkBytes, Message, PixelFormat, Rate, Setpoint, StageTime, TargetEstimate, Touchdown,
-    Transform3, Truth, VehicleState, Wind, decode, encode,
+    AlternativePose, BayerPattern, CameraInfo, Candidate, CommandReply, ControllerCommand,
+    ControllerStatus, Count, DecodeError, Detection, Detections, DetectorCommand, FrameHeader,
+    Health, LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, PixelFormat, Rate,
+    Setpoint, StageTime, TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind, decode,
+    encode,
 };
 use proptest::prelude::*;
 
@@ -48,7 +49,7 @@ fn check<M: Message + PartialEq + std::fmt::Debug>(message: &M, golden: &str) {
 #[test]
 fn frame_header() {
     let message = header();
-    check(&message, "41010104646f776eac0201016302900acc0700");
+    check(&message, "41010204646f776eac0201016302900acc0700");
 }
 
 #[test]
@@ -77,17 +78,49 @@ fn detections() {
             family: "rings".into(),
             id: None,
             centre_px: [1.0, 2.0],
+            centre_covariance_px2: [1.0, 0.0, 2.0],
             corners_px: None,
             size_px: 3.0,
+            wrong_bits: 1,
             confidence: 1.0,
-            pose: Some(MarkerPose { camera_from_marker: transform(), reprojection_rms_px: 0.5 }),
+            pose: Some(MarkerPose {
+                camera_from_marker: transform(),
+                reprojection_rms_px: 0.5,
+                covariance: std::array::from_fn(|i| i as f32),
+                alternative: Some(AlternativePose {
+                    camera_from_marker: transform(),
+                    reprojection_rms_px: 1.0,
+                }),
+            }),
         }],
         stages: vec![StageTime { stage: "threshold".into(), micros: 7 }],
     };
     check(
         &message,
-        "410301046d61696e04646f776eac0201016302900acc0700010572696e677300000000000000f03f0000000000000040000000000000000840000000000000f03f0100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000e03f01097468726573686f6c6407",
+        "410302046d61696e04646f776eac0201016302900acc0700010572696e677300000000000000f03f00000000000000400000803f000000000000004000000000000000084001000000000000f03f0100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000e03f000000000000803f0000004000004040000080400000a0400000c0400000e0400000004100001041000020410000304100004041000050410000604100007041000080410000884100009041000098410000a0410100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000f03f01097468726573686f6c6407",
     );
+}
+
+#[test]
+fn detector_command() {
+    let message =
+        DetectorCommand::SetParameter { key: "thesis_threshold".into(), value: "80".into() };
+    check(&message, "410d0100107468657369735f7468726573686f6c64023830");
+}
+
+#[test]
+fn pixel_formats() {
+    let bytes = |format| encode(&FrameHeader { format, ..header() })[18..].to_vec();
+    let formats = [PixelFormat::Mono8, PixelFormat::Jpeg, PixelFormat::Mono10, PixelFormat::Mono12];
+    for (number, format) in (0..).zip(formats) {
+        assert_eq!(bytes(format), [number], "{format:?}");
+    }
+    let patterns = [BayerPattern::Rggb, BayerPattern::Grbg, BayerPattern::Gbrg, BayerPattern::Bggr];
+    for (number, pattern) in (0..).zip(patterns) {
+        assert_eq!(bytes(PixelFormat::Bayer8(pattern)), [5, number]);
+        assert_eq!(bytes(PixelFormat::Bayer16(pattern)), [8, number]);
+    }
+    assert_eq!(bytes(PixelFormat::Mono16), [4]);
 }
 
 #[test]
@@ -226,14 +259,15 @@ fn health() {
 
 proptest! {
     #[test]
-    fn no_bytes_make_decoding_panic(mut bytes in prop::collection::vec(any::<u8>(), 0..200), kind in 0u8..16) {
+    fn no_bytes_make_decoding_panic(mut bytes in prop::collection::vec(any::<u8>(), 0..200), kind in 0u8..16, version in 1u8..3) {
         if bytes.len() > 2 {
-            (bytes[0], bytes[1], bytes[2]) = (b'A', kind, 1);
+            (bytes[0], bytes[1], bytes[2]) = (b'A', kind, version);
         }
         let refused = [
             decode::<FrameHeader>(&bytes).is_err(),
             decode::<CameraInfo>(&bytes).is_err(),
             decode::<Detections>(&bytes).is_err(),
+            decode::<DetectorCommand>(&bytes).is_err(),
             decode::<VehicleState>(&bytes).is_err(),
             decode::<ControllerStatus>(&bytes).is_err(),
             decode::<Health>(&bytes).is_err(),

@@ -134,8 +134,8 @@ impl FramePublisher {
         };
         match self.publisher.put(payload).attachment(encode(header)).await {
             Ok(()) => self.health.count(match header.format {
-                PixelFormat::Mono8 => "frames",
                 PixelFormat::Jpeg => "JPEG images",
+                _ => "frames",
             }),
             Err(cause) => {
                 if self.health.failed("publish frame") {
@@ -204,12 +204,9 @@ impl FrameSubscriber {
 }
 
 fn fits(header: &FrameHeader, len: usize) -> bool {
-    match header.format {
-        PixelFormat::Mono8 => {
-            header.width > 0
-                && header.height > 0
-                && u64::from(header.width) * u64::from(header.height) == len as u64
-        }
-        PixelFormat::Jpeg => len > 0,
+    let pixels = u64::from(header.width) * u64::from(header.height);
+    match header.format.bytes_per_pixel() {
+        Some(bytes) => pixels > 0 && pixels.checked_mul(bytes as u64) == Some(len as u64),
+        None => len > 0,
     }
 }

@@ -20,4 +20,4 @@ pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
 pub use service::{Options, Shutdown, relaunch_with_zenoh_threads, run, start_logging};
 pub use session::{Identity, Node, Presence, ZenohSource};
-pub use topics::{Publisher, Request, Subscriber};
+pub use topics::{Commands, Publisher, Request, Subscriber};

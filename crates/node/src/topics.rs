@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::anyhow;
-use messages::{Delivery, Message, Topic, decode, encode, topic};
+use messages::{Delivery, Message, Topic, decode, encode};
 use zenoh::handlers::{RingChannel, RingChannelHandler};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{Query, Queryable};
@@ -160,50 +160,57 @@ impl Node {
         }
     }
 
-    /// The commands that are sent to the controller.
+    /// The commands that are sent on a topic's key to this service.
     ///
     /// # Errors
-    /// When the session is closed.
-    pub async fn commands(&self) -> anyhow::Result<Commands> {
-        let key = topic::COMMAND.key(&[]);
+    /// When the session is closed or a name makes no key.
+    pub async fn commands<M: Message>(
+        &self,
+        topic: Topic<M>,
+        names: &[&str],
+    ) -> anyhow::Result<Commands<M>> {
+        let key = topic.key(names);
         let queryable = self
             .session
             .declare_queryable(key.clone())
-            .with(RingChannel::new(qos(topic::COMMAND.delivery()).depth))
+            .with(RingChannel::new(qos(topic.delivery()).depth))
             .await
             .map_err(|cause| anyhow!("answering on {key}: {cause}"))?;
-        Ok(Commands { queryable, health: self.shared_health() })
+        Ok(Commands { queryable, health: self.shared_health(), message: PhantomData })
     }
 
-    /// Sends a command to the controller and waits for its answer. A session that is new may not have met the
-    /// controller yet, so a command that reached nobody is sent again; one that reached somebody never is.
+    /// Sends a command on a topic's key and waits for its answer. A session that is new may not have met the other
+    /// side yet, so a command that reached nobody is sent again; one that reached somebody never is.
     ///
     /// # Errors
-    /// When no controller answers in time.
-    pub async fn command(
+    /// When nobody answers in time.
+    pub async fn command<M: Message>(
         &self,
-        command: &messages::ControllerCommand,
+        topic: Topic<M>,
+        names: &[&str],
+        command: &M,
     ) -> anyhow::Result<messages::CommandReply> {
+        let key = topic.key(names);
         let until_ns = now_ns() + ANSWER_TIMEOUT.as_nanos() as i64;
         while now_ns() < until_ns {
-            if let Some(reply) = self.ask(command).await? {
+            if let Some(reply) = self.ask(&key, command).await? {
                 return Ok(reply);
             }
             tokio::time::sleep(ASK_AGAIN).await;
         }
         Err(anyhow!(
-            "no controller answered within {ANSWER_TIMEOUT:?}; is one running for this vehicle?"
+            "nobody answered on {key} within {ANSWER_TIMEOUT:?}; is the service running for this vehicle?"
         ))
     }
 
-    async fn ask(
+    async fn ask<M: Message>(
         &self,
-        command: &messages::ControllerCommand,
+        key: &str,
+        command: &M,
     ) -> anyhow::Result<Option<messages::CommandReply>> {
-        let key = topic::COMMAND.key(&[]);
         let replies = self
             .session
-            .get(&key)
+            .get(key)
             .payload(encode(command))
             .timeout(ANSWER_TIMEOUT)
             .await
@@ -217,15 +224,16 @@ impl Node {
     }
 }
 
-/// The controller's side of its commands.
-pub struct Commands {
+/// A service's side of its commands.
+pub struct Commands<M> {
     queryable: Queryable<RingChannelHandler<Query>>,
     health: Arc<HealthCounters>,
+    message: PhantomData<fn() -> M>,
 }
 
-impl Commands {
+impl<M: Message> Commands<M> {
     /// The next command; `None` once the session is closed. A payload that is no command is answered as such.
-    pub async fn next(&self) -> Option<Request<messages::ControllerCommand>> {
+    pub async fn next(&self) -> Option<Request<M>> {
         loop {
             let query = self.queryable.recv_async().await.ok()?;
             let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();

@@ -159,10 +159,14 @@ async fn foreign_payloads_are_counted_and_skipped() -> anyhow::Result<()> {
 async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> anyhow::Result<()> {
     let port = free_port()?;
     let operator = open("alight", "main", port).await?;
-    let nobody = operator.command(&ControllerCommand::Hold).await.err().context("nobody")?;
+    let nobody = operator
+        .command(topic::COMMAND, &[], &ControllerCommand::Hold)
+        .await
+        .err()
+        .context("nobody")?;
     assert!(nobody.to_string().contains("no controller answered"), "{nobody}");
     let controller = open("controller", "main", port).await?;
-    let commands = controller.commands().await?;
+    let commands = controller.commands(topic::COMMAND, &[]).await?;
     let answering = tokio::spawn(async move {
         while let Some(request) = commands.next().await {
             let reason = format!("{:?}", request.message);
@@ -172,7 +176,9 @@ async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> a
     // Until the two sessions know each other, the answer is that nobody is there.
     let answered = async {
         loop {
-            if let Ok(reply) = operator.command(&ControllerCommand::Abort).await {
+            if let Ok(reply) =
+                operator.command(topic::COMMAND, &[], &ControllerCommand::Abort).await
+            {
                 return reply;
             }
             tokio::time::sleep(Duration::from_millis(10)).await;
