@@ -2,11 +2,13 @@
 //!
 //! This crate knows no marker, no camera, no file and no thread.
 //!
-//! Modules in reading order: [`view`] is an image, [`mod@filter`] smooths it, [`mod@threshold`] makes it black and
+//! Modules in reading order: [`view`] is an image, [`convert`] makes one
+//! of what other sensors give, [`mod@filter`] smooths it, [`mod@threshold`] makes it black and
 //! white, [`contour`] follows the borders between the two, [`ellipse`] fits ellipses to borders, [`sample`] reads
 //! grey values between the pixels.
 
 pub mod contour;
+pub mod convert;
 pub mod ellipse;
 pub mod filter;
 pub mod sample;
@@ -14,6 +16,7 @@ pub mod threshold;
 pub mod view;
 
 pub use contour::{Contour, Contours, Limits, contour_area, contour_length};
+pub use convert::{Converter, Mosaic, SampleFormat};
 pub use ellipse::{Ellipse, fit_ellipse};
 pub use filter::{BilateralRows, bilateral_5x5};
 pub use sample::bilinear;
