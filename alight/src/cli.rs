@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use messages::ControllerCommand;
+use messages::{ControllerCommand, topic};
 use node::{ConfigError, Identity, Layers, Node, ZenohSource};
 
 use crate::services::{self, Service};

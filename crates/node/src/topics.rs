@@ -198,8 +198,9 @@ impl Node {
             }
             tokio::time::sleep(ASK_AGAIN).await;
         }
+        let who = key.rsplit_once('/').map_or(key.as_str(), |(who, _command)| who);
         Err(anyhow!(
-            "nobody answered on {key} within {ANSWER_TIMEOUT:?}; is the service running for this vehicle?"
+            "no {who} answered within {ANSWER_TIMEOUT:?}; is one running for this vehicle?"
         ))
     }
 
