@@ -441,7 +441,7 @@ mod tests {
 
     /// The thesis' marker, seen head-on, `size_px` large, in the middle of a grey image.
     fn picture_of_rings(size_px: f64) -> image::GrayImage {
-        let drawing = fiducial::Drawing::new(&"rings".parse().unwrap(), size_px);
+        let drawing = fiducial::Drawing::new(&"rings".parse().unwrap(), size_px).unwrap();
         image::GrayImage::from_fn(320, 240, |x, y| {
             let sample = |i: u32| {
                 let (dx, dy) = (f64::from(i % 4), f64::from(i / 4));

@@ -118,7 +118,7 @@ mod tests {
         let sheet = Sheet::new(&marker, size_m, Paper::A4).unwrap();
         let image = raster(&sheet, dpi).unwrap();
         assert_eq!(image.dimensions(), (2480, 3508));
-        let drawing = Drawing::new(&marker, size_m);
+        let drawing = Drawing::new(&marker, size_m).unwrap();
         let per_m = f64::from(dpi) / 0.0254;
         let reach = drawing.half_extent_m;
         let mut compared = 0;

@@ -87,6 +87,8 @@ pub(crate) enum SheetError {
         /// What is too large, and what would fit.
         problem: String,
     },
+    /// A marker that may have any id.
+    NoId,
     /// A marker without a size.
     NoSize,
     /// A size with the marker, and another one beside it.
@@ -109,6 +111,7 @@ impl std::fmt::Display for SheetError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::TooLarge { problem } => f.write_str(problem),
+            Self::NoId => f.write_str("which id? Name the marker as FAMILY:ID"),
             Self::NoSize => f.write_str("how large is the marker? Say it with `--size`, in metres"),
             Self::TwoSizes { size, other } => {
                 write!(
@@ -146,7 +149,7 @@ pub(super) struct Sheet {
 
 impl Sheet {
     pub(super) fn new(marker: &Marker, size_m: f64, paper: Paper) -> Result<Self, SheetError> {
-        let drawing = Drawing::new(marker, size_m);
+        let drawing = Drawing::new(marker, size_m).ok_or(SheetError::NoId)?;
         let half_mm = drawing.half_extent_m * 1e3;
         if 2.0 * half_mm > paper.room_mm() + ROUNDING_MM {
             return Err(too_large(marker, size_m, half_mm, paper));
@@ -172,8 +175,8 @@ impl Sheet {
         // The marker's y axis points up, the paper's down.
         let place = |[right, up]: [f64; 2]| [x + right * 1e3, y - up * 1e3];
         self.marks.extend(drawing.layers.iter().map(|layer| match layer.shape {
-            Shape::Disc { radius_m } => {
-                Mark::Disc { centre_mm: [x, y], radius_mm: radius_m * 1e3, ink: layer.ink }
+            Shape::Disc { centre_m, radius_m } => {
+                Mark::Disc { centre_mm: place(centre_m), radius_mm: radius_m * 1e3, ink: layer.ink }
             }
             Shape::Rectangle { min_m, max_m } => {
                 let ([left, bottom], [right, top]) = (place(min_m), place(max_m));

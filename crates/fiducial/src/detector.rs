@@ -90,6 +90,7 @@ impl Detector {
                     let threshold = self.settings.thesis_threshold;
                     self.found.extend(self.thesis.detect(view, marker, threshold, camera, watch));
                 }
+                _ => {}
             }
         }
         self.trace.markers.extend(self.found.iter().map(TracedMarker::from));

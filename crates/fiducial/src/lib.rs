@@ -3,8 +3,9 @@
 //! This crate knows images as borrowed grey views and cameras as models. It knows no network, no file, no
 //! clock and no thread; a stage of a detection that wants to be timed tells a [`Stages`] observer.
 //!
-//! Modules in reading order: [`marker`] names what is looked for, [`drawing`] says what it looks like,
-//! [`observation`] is what was found, [`pose`] where it is in space, [`detector`] finds it. [`ring`] and [`rings_thesis`] are the thesis' way
+//! Modules in reading order: [`marker`] names what is looked for, [`square`] has the codes of square markers, [`drawing`]
+//! says what a marker looks like, [`observation`] is what was found, [`pose`] where it is in space, [`detector`] finds
+//! it. [`ring`] and [`rings_thesis`] are the thesis' way
 //! (Algorithms 1-15). [`rings`] is the mended one: `outline` takes ellipses from contours, `search` goes from a ring
 //! to the marker, `circles` and, for small markers, `photometry` give its pose, `lens` serves images of unknown
 //! cameras. [`trace`] is what they saw on the way, [`debug`] draws that.
@@ -23,6 +24,8 @@ pub mod ring;
 pub mod rings;
 pub mod rings_thesis;
 mod search;
+pub mod square;
+mod stag;
 pub mod trace;
 
 pub use detector::{Detector, DetectorError, Settings};

@@ -139,7 +139,11 @@ impl PadInScene {
         let up = Matrix3::from_columns(&[Vector3::y(), Vector3::x(), -Vector3::z()]);
         let flat = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(up));
         let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading) * flat;
-        let drawing = Drawing::new(&marker, marker.size_m.unwrap_or(f64::NAN));
+        // What cannot be drawn is refused when it is rendered.
+        let drawing = marker
+            .size_m
+            .and_then(|size_m| Drawing::new(&marker, size_m))
+            .unwrap_or(Drawing { half_extent_m: f64::NAN, layers: Vec::new() });
         Self {
             ned_from_marker: Transform::new(
                 Rotation::from_quaternion(turned),
@@ -676,7 +680,9 @@ fn painting_of(pad: &PadInScene) -> Result<Painting, RenderError> {
     let finite = |value: f64| value.is_finite() && value >= 0.0;
     if !(finite(pad.paper_m) && finite(pad.thickness_m) && pad.ned_from_marker.origin().is_finite())
     {
-        return Err(RenderError::Setting("a pad's size or place is not finite"));
+        return Err(RenderError::Setting(
+            "a pad's marker has no size or no id, or its place is not finite",
+        ));
     }
     let half_m = pad.paper_m / 2.0;
     let opaque = |area, light| Coat { area, paint: Paint { cover: 1.0, light }, within: None };
@@ -685,7 +691,7 @@ fn painting_of(pad: &PadInScene) -> Result<Painting, RenderError> {
         vec![opaque(Area::Box, SIDES), Coat { within: Some(SIDES), ..opaque(lid, WHITE) }];
     for layer in &pad.drawing.layers {
         let area = match layer.shape {
-            Shape::Disc { radius_m } => Area::Disc { centre: [0.0; 2], radius: radius_m },
+            Shape::Disc { centre_m, radius_m } => Area::Disc { centre: centre_m, radius: radius_m },
             Shape::Rectangle { min_m, max_m } => Area::Rectangle(min_m, max_m),
         };
         let light = match layer.ink {

@@ -177,9 +177,9 @@ impl Scene {
 
 /// The drawing's discs, smallest first: radius in metres and ink.
 fn discs() -> Vec<(f64, Ink)> {
-    let drawing = Drawing::new(&"rings".parse::<Marker>().unwrap(), SIZE_M);
+    let drawing = Drawing::new(&"rings".parse::<Marker>().unwrap(), SIZE_M).unwrap();
     let disc = |layer: &fiducial::Layer| match layer.shape {
-        Shape::Disc { radius_m } => (radius_m, layer.ink),
+        Shape::Disc { radius_m, .. } => (radius_m, layer.ink),
         Shape::Rectangle { .. } => panic!("rings are discs"),
     };
     drawing.layers.iter().rev().map(disc).collect()
