@@ -93,6 +93,19 @@ impl<'a> GrayView<'a> {
         Self::new(data, width, height, width)
     }
 
+    /// The part of `width` x `height` pixels whose top left pixel is (x, y); `None` when it is empty or reaches beyond the
+    /// image.
+    pub fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Option<Self> {
+        let fits = |from: usize, edge: usize, whole: usize| {
+            edge > 0 && from.checked_add(edge).is_some_and(|end| end <= whole)
+        };
+        if !fits(x, width, self.width) || !fits(y, height, self.height) {
+            return None;
+        }
+        let data = self.data.get(y * self.stride + x..)?;
+        Some(Self { data, width, height, stride: self.stride })
+    }
+
     /// Width in pixels.
     pub fn width(&self) -> usize {
         self.width
@@ -198,6 +211,19 @@ mod tests {
             usize::MAX,
             Err(ViewError::Length { len: 9, needed: usize::MAX }),
         );
+    }
+
+    #[test]
+    fn a_part_has_the_pixels_of_its_place() {
+        let data: Vec<u8> = (0..20).collect();
+        let view = GrayView::packed(&data, 5, 4).unwrap();
+        let part = view.crop(1, 2, 3, 2).unwrap();
+        assert_eq!((part.row(0), part.row(1)), (&[11, 12, 13][..], &[16, 17, 18][..]));
+        for (x, y, width, height) in
+            [(0, 0, 6, 1), (5, 0, 1, 1), (0, 0, 0, 1), (usize::MAX, 0, 2, 1), (0, 3, 1, 2)]
+        {
+            assert!(view.crop(x, y, width, height).is_none());
+        }
     }
 
     #[test]

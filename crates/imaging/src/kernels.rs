@@ -1,0 +1,227 @@
+//! The loops over all pixels, eight to sixty-four at a time where the processor can.
+//!
+//! Each kernel exists twice, for AVX2 and in plain Rust, with the same result to the bit. The plain one also serves the
+//! ends of rows, and processors without AVX2.
+#![allow(unsafe_code, reason = "vector instructions; each is tested against its plain twin")]
+
+/// Edge of a tile, in pixels.
+pub(crate) const TILE: usize = 4;
+
+/// Darkest and brightest pixel of each tile of up to four rows of the same length; the last tile may be narrower.
+pub(crate) fn tile_extremes(rows: &[&[u8]; TILE], low: &mut [u8], high: &mut [u8]) {
+    let tiles = rows[0].len().div_ceil(TILE).min(low.len()).min(high.len());
+    let mut done = 0;
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        done = unsafe { avx2::tile_extremes(rows, &mut low[..tiles], &mut high[..tiles]) };
+    }
+    plain::tile_extremes(rows, &mut low[..tiles], &mut high[..tiles], done);
+}
+
+/// Rounded means of 2 x 2 pixels; a last odd column is left out.
+pub(crate) fn halve_rows(above: &[u8], below: &[u8], out: &mut [u8]) {
+    let mut done = 0;
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        done = unsafe { avx2::halve_rows(above, below, out) };
+    }
+    plain::halve_rows(above, below, out, done);
+}
+
+/// Bit i of the words says whether pixel i is below its threshold. Bits beyond the row are 0.
+pub(crate) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
+    let mut done = 0;
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        done = unsafe { avx2::below(pixels, thresholds, words) };
+    }
+    plain::below(pixels, thresholds, words, done);
+}
+
+/// Bit i of the words says whether pixel i is above its threshold. Bits beyond the row are 0.
+pub(crate) fn above(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
+    // Pixel above threshold is threshold below pixel.
+    below(thresholds, pixels, words);
+}
+
+/// In plain Rust, from tile, pixel or word `from` on.
+mod plain {
+    use super::TILE;
+
+    pub(super) fn tile_extremes(
+        rows: &[&[u8]; TILE],
+        low: &mut [u8],
+        high: &mut [u8],
+        from: usize,
+    ) {
+        for (tile, (low, high)) in low.iter_mut().zip(high).enumerate().skip(from) {
+            (*low, *high) = (255, 0);
+            for row in rows {
+                let end = (tile * TILE + TILE).min(row.len());
+                for pixel in &row[(tile * TILE).min(end)..end] {
+                    *low = (*low).min(*pixel);
+                    *high = (*high).max(*pixel);
+                }
+            }
+        }
+    }
+
+    pub(super) fn halve_rows(above: &[u8], below: &[u8], out: &mut [u8], from: usize) {
+        let pairs = above.chunks_exact(2).zip(below.chunks_exact(2));
+        for (out, (a, b)) in out.iter_mut().zip(pairs).skip(from) {
+            let sum = u16::from(a[0]) + u16::from(a[1]) + u16::from(b[0]) + u16::from(b[1]);
+            *out = ((sum + 2) / 4) as u8;
+        }
+    }
+
+    pub(super) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64], from: usize) {
+        let chunks = pixels.chunks(64).zip(thresholds.chunks(64));
+        for (word, (pixels, thresholds)) in words.iter_mut().zip(chunks).skip(from) {
+            *word = 0;
+            for (bit, (pixel, threshold)) in pixels.iter().zip(thresholds).enumerate() {
+                *word |= u64::from(pixel < threshold) << bit;
+            }
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod avx2 {
+    use std::arch::x86_64::{
+        __m256i, _mm256_add_epi16, _mm256_and_si256, _mm256_cmpeq_epi8, _mm256_loadu_si256,
+        _mm256_maddubs_epi16, _mm256_max_epu8, _mm256_min_epu8, _mm256_movemask_epi8,
+        _mm256_packus_epi16, _mm256_packus_epi32, _mm256_permute4x64_epi64,
+        _mm256_permutevar8x32_epi32, _mm256_set_epi32, _mm256_set1_epi8, _mm256_set1_epi16,
+        _mm256_set1_epi32, _mm256_srli_epi16, _mm256_srli_epi32, _mm256_storeu_si256,
+    };
+
+    use super::TILE;
+
+    /// 32 bytes of `row` from `at` on.
+    #[target_feature(enable = "avx2")]
+    fn load(row: &[u8], at: usize) -> __m256i {
+        let bytes = &row[at..at + 32];
+        // SAFETY: `bytes` has 32 bytes, and the load needs no alignment.
+        unsafe { _mm256_loadu_si256(bytes.as_ptr().cast()) }
+    }
+
+    /// Writes 32 bytes to `row` from `at` on.
+    #[target_feature(enable = "avx2")]
+    fn store(row: &mut [u8], at: usize, value: __m256i) {
+        let bytes = &mut row[at..at + 32];
+        // SAFETY: `bytes` has 32 bytes, and the store needs no alignment.
+        unsafe { _mm256_storeu_si256(bytes.as_mut_ptr().cast(), value) }
+    }
+
+    /// The lowest bytes of the 32 four-byte groups of four vectors, in order.
+    #[target_feature(enable = "avx2")]
+    fn lowest_bytes(groups: [__m256i; 4]) -> __m256i {
+        let byte = _mm256_set1_epi32(0xff);
+        let [a, b, c, d] = groups;
+        let ab = _mm256_packus_epi32(_mm256_and_si256(a, byte), _mm256_and_si256(b, byte));
+        let cd = _mm256_packus_epi32(_mm256_and_si256(c, byte), _mm256_and_si256(d, byte));
+        // Packing works within halves of the vector, so groups of four bytes come out as a b c d a b c d.
+        let mixed = _mm256_packus_epi16(ab, cd);
+        _mm256_permutevar8x32_epi32(mixed, _mm256_set_epi32(7, 3, 6, 2, 5, 1, 4, 0))
+    }
+
+    /// Returns how many tiles it did.
+    #[target_feature(enable = "avx2")]
+    pub(super) fn tile_extremes(rows: &[&[u8]; TILE], low: &mut [u8], high: &mut [u8]) -> usize {
+        const TILES: usize = 32;
+        let count = rows[0].len() / (TILES * TILE);
+        for step in 0..count {
+            let mut lows = [_mm256_set1_epi8(0); 4];
+            let mut highs = lows;
+            for (part, (low, high)) in lows.iter_mut().zip(&mut highs).enumerate() {
+                let [a, b, c, d] = rows.map(|row| load(row, step * TILES * TILE + part * 32));
+                let least = _mm256_min_epu8(_mm256_min_epu8(a, b), _mm256_min_epu8(c, d));
+                let most = _mm256_max_epu8(_mm256_max_epu8(a, b), _mm256_max_epu8(c, d));
+                let least = _mm256_min_epu8(least, _mm256_srli_epi16::<8>(least));
+                let most = _mm256_max_epu8(most, _mm256_srli_epi16::<8>(most));
+                *low = _mm256_min_epu8(least, _mm256_srli_epi32::<16>(least));
+                *high = _mm256_max_epu8(most, _mm256_srli_epi32::<16>(most));
+            }
+            store(low, step * TILES, lowest_bytes(lows));
+            store(high, step * TILES, lowest_bytes(highs));
+        }
+        count * TILES
+    }
+
+    /// Returns how many means it did.
+    #[target_feature(enable = "avx2")]
+    pub(super) fn halve_rows(above: &[u8], below: &[u8], out: &mut [u8]) -> usize {
+        let ones = _mm256_set1_epi8(1);
+        let two = _mm256_set1_epi16(2);
+        let count = (above.len().min(below.len()) / 64).min(out.len() / 32);
+        for step in 0..count {
+            let half = |part: usize| {
+                let at = step * 64 + part * 32;
+                let pairs = |row: &[u8]| _mm256_maddubs_epi16(load(row, at), ones);
+                let sum = _mm256_add_epi16(_mm256_add_epi16(pairs(above), pairs(below)), two);
+                _mm256_srli_epi16::<2>(sum)
+            };
+            let mixed = _mm256_packus_epi16(half(0), half(1));
+            store(out, step * 32, _mm256_permute4x64_epi64::<0b11_01_10_00>(mixed));
+        }
+        count * 32
+    }
+
+    /// Returns how many words it did.
+    #[target_feature(enable = "avx2")]
+    pub(super) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) -> usize {
+        let count = (pixels.len().min(thresholds.len()) / 64).min(words.len());
+        for (step, word) in words.iter_mut().enumerate().take(count) {
+            let half = |part: usize| {
+                let at = step * 64 + part * 32;
+                let (pixel, threshold) = (load(pixels, at), load(thresholds, at));
+                let reached = _mm256_cmpeq_epi8(_mm256_max_epu8(pixel, threshold), pixel);
+                u64::from(!(_mm256_movemask_epi8(reached) as u32))
+            };
+            *word = half(0) | half(1) << 32;
+        }
+        count
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn vectors_give_what_plain_rust_gives(
+            (width, bytes) in (1_usize..700).prop_flat_map(|w| (Just(w), prop::collection::vec(any::<u8>(), w * 4))),
+        ) {
+            let rows: [&[u8]; 4] = [0, 1, 2, 3].map(|i| &bytes[i * width..][..width]);
+            let tiles = width.div_ceil(TILE);
+            let (mut low, mut high) = (vec![0; tiles], vec![0; tiles]);
+            tile_extremes(&rows, &mut low, &mut high);
+            let (mut plain_low, mut plain_high) = (vec![0; tiles], vec![0; tiles]);
+            plain::tile_extremes(&rows, &mut plain_low, &mut plain_high, 0);
+            prop_assert_eq!((low, high), (plain_low, plain_high));
+
+            let (mut half, mut plain_half) = (vec![0; width / 2], vec![0; width / 2]);
+            halve_rows(rows[0], rows[1], &mut half);
+            plain::halve_rows(rows[0], rows[1], &mut plain_half, 0);
+            prop_assert_eq!(half, plain_half);
+
+            let words = width.div_ceil(64);
+            let (mut bits, mut plain_bits) = (vec![9; words], vec![9; words]);
+            below(rows[0], rows[1], &mut bits);
+            plain::below(rows[0], rows[1], &mut plain_bits, 0);
+            prop_assert_eq!(&bits, &plain_bits);
+            for (x, (a, b)) in rows[0].iter().zip(rows[1]).enumerate() {
+                prop_assert_eq!(bits[x / 64] >> (x % 64) & 1 == 1, a < b);
+            }
+            above(rows[0], rows[1], &mut bits);
+            for (x, (a, b)) in rows[0].iter().zip(rows[1]).enumerate() {
+                prop_assert_eq!(bits[x / 64] >> (x % 64) & 1 == 1, a > b);
+            }
+        }
+    }
+}

@@ -1,0 +1,655 @@
+//! Outlines of dark and of bright regions, on an image and its halvings.
+
+use crate::binary::{Binarizer, BitImage, Contrast, Middle};
+use crate::pyramid::Pyramid;
+use crate::view::GrayView;
+
+/// What is looked for. Sizes are in pixels of the level that is looked at, so that each level sees other regions.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// The finest level on which outlines of dark regions are looked for: 0 is the image itself, 1 is half its size.
+    pub dark_from: Option<usize>,
+    /// The finest level on which outlines of bright regions are looked for.
+    pub bright_from: Option<usize>,
+    /// From this level on, regions may be as large as the image; on finer ones up to `largest_px`.
+    pub whole_level: usize,
+    /// The longer edge of a region's bounds is at least this.
+    pub smallest_px: u16,
+    /// The longer edge of a region's bounds is at most this, on levels below `whole_level`.
+    pub largest_px: u16,
+    /// Where pixels differ by fewer grey levels within 12 x 12 pixels, nothing is seen. Halved with each level from 2 on,
+    /// as noise is, down to a third.
+    pub least_contrast: u8,
+    /// The same as a share of the brightest pixel, in percent, on all levels.
+    pub least_contrast_percent: u8,
+    /// Outlines on levels 0 and 1 are followed only where, at their top, the grey values step by half of their range
+    /// within 12 x 12 pixels (level 1: of its logarithm). It spares following most of the ups and downs of textures.
+    pub steep: bool,
+    /// Least share of its bounds that a region fills; a disc 0.79, a square 0.5 to 1.
+    pub least_fill: f32,
+    /// Most pixel edges that an outline has, relative to its bounds': 1 for all convex outlines, more for ragged ones.
+    pub most_ragged: f32,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            dark_from: Some(0),
+            bright_from: None,
+            whole_level: 2,
+            smallest_px: 5,
+            largest_px: 36,
+            least_contrast: 18,
+            least_contrast_percent: 15,
+            steep: true,
+            least_fill: 0.3,
+            most_ragged: 1.3,
+        }
+    }
+}
+
+/// The closed outline of a connected region, between its pixels and those around it.
+#[derive(Copy, Clone, Debug)]
+pub struct Outline<'a> {
+    /// The level it was seen on; places are in pixels of that level, see [`crate::pyramid::to_level_0`].
+    pub level: usize,
+    /// Whether the region is darker than what is around it.
+    pub dark: bool,
+    /// One point for each pixel edge of the outline, clockwise as seen in the image, where the grey values pass the
+    /// threshold between the centres of the pixel within and the pixel without, interpolated linearly.
+    pub points: &'a [[f32; 2]],
+    /// Columns and rows of the region: left, top, and right and bottom, which are the first ones beyond it.
+    pub bounds: [u16; 4],
+    /// Pixels within, holes included.
+    pub area: u32,
+    /// Mean difference of the grey values across the outline.
+    pub contrast: f32,
+    /// Whether the region reaches the image's edge; the outline then runs along it.
+    pub cut: bool,
+}
+
+/// Finds the outlines of regions, level by level of a pyramid. Regions are connected across corners.
+///
+/// An outline is followed from the right end of a run of pixels that has none of its kind above it, and given up as
+/// soon as it rises above that row or outgrows its level's size. So each outline is followed once, without marks, and
+/// of texture little is followed. Borders of holes are not outlines; they are those of the other kind's regions.
+#[derive(Clone, Debug, Default)]
+pub struct Outlines {
+    pyramid: Pyramid,
+    binarizer: Binarizer,
+    dark: BitImage,
+    bright: BitImage,
+    path: Vec<u8>,
+    points: Vec<[f32; 2]>,
+    spans: Vec<Span>,
+}
+
+/// Most levels; the coarsest is then 256 times smaller.
+const MOST_LEVELS: usize = 9;
+/// No level has an edge shorter than this, in pixels.
+const SHORTEST_EDGE_PX: usize = 24;
+/// Bounds on the work and memory of one level: pixel edges followed per pixel, and points kept per pixel.
+const MOST_STEPS_PER_PIXEL: f32 = 3.0;
+const MOST_POINTS_PER_PIXEL: f32 = 0.3;
+/// Tiny images may have this many anyway.
+const LEAST_BUDGET: usize = 4096;
+
+#[derive(Copy, Clone, Debug)]
+struct Span {
+    level: u8,
+    dark: bool,
+    cut: bool,
+    start: usize,
+    end: usize,
+    bounds: [u16; 4],
+    area: u32,
+    contrast: f32,
+}
+
+impl Outlines {
+    /// Finds the outlines in an image; those found before are forgotten.
+    pub fn find(&mut self, view: GrayView<'_>, settings: &Settings) {
+        self.points.clear();
+        self.spans.clear();
+        self.pyramid.build(view, MOST_LEVELS, SHORTEST_EDGE_PX);
+        let finest = settings.dark_from.into_iter().chain(settings.bright_from).min();
+        for level in finest.unwrap_or(MOST_LEVELS)..self.pyramid.levels() {
+            self.find_on(view, level, settings);
+        }
+    }
+
+    /// Number of outlines.
+    pub fn len(&self) -> usize {
+        self.spans.len()
+    }
+
+    /// True when there are none.
+    pub fn is_empty(&self) -> bool {
+        self.spans.is_empty()
+    }
+
+    /// The outlines, finest level first, on each level the dark ones first, from top to bottom.
+    pub fn iter(&self) -> impl Iterator<Item = Outline<'_>> {
+        self.spans.iter().map(|span| self.outline(span))
+    }
+
+    /// The outline of an index below [`Outlines::len`], in the same order.
+    pub fn get(&self, index: usize) -> Option<Outline<'_>> {
+        self.spans.get(index).map(|span| self.outline(span))
+    }
+
+    /// The levels of the last image.
+    pub fn pyramid(&self) -> &Pyramid {
+        &self.pyramid
+    }
+
+    fn outline(&self, span: &Span) -> Outline<'_> {
+        Outline {
+            level: usize::from(span.level),
+            dark: span.dark,
+            points: self.points.get(span.start..span.end).unwrap_or_default(),
+            bounds: span.bounds,
+            area: span.area,
+            contrast: span.contrast,
+            cut: span.cut,
+        }
+    }
+
+    fn find_on(&mut self, view: GrayView<'_>, level: usize, settings: &Settings) {
+        let Some(view) = self.pyramid.level(view, level) else {
+            return;
+        };
+        let wanted = |from: Option<usize>| from.is_some_and(|from| from <= level);
+        let bright = wanted(settings.bright_from).then_some(&mut self.bright);
+        self.binarizer.apply(view, contrast(settings, level), &mut self.dark, bright);
+        let limits = Limits::new(settings, level, view);
+        for (from, bits, dark) in
+            [(settings.dark_from, &self.dark, true), (settings.bright_from, &self.bright, false)]
+        {
+            if wanted(from) {
+                let found = Found {
+                    view,
+                    bits,
+                    binarizer: &self.binarizer,
+                    dark,
+                    level: level as u8,
+                    path: &mut self.path,
+                    points: &mut self.points,
+                    spans: &mut self.spans,
+                };
+                found.scan(&limits);
+            }
+        }
+    }
+}
+
+/// Full resolution serves regions a few pixels wide, so its threshold lies where lines of a pixel's width stay whole.
+fn contrast(settings: &Settings, level: usize) -> Contrast {
+    let least = settings.least_contrast;
+    Contrast {
+        middle: if level == 0 { Middle::Share(136) } else { Middle::Ratio },
+        least_levels: (least >> level.saturating_sub(1).min(7)).max(least / 3),
+        least_percent: settings.least_contrast_percent,
+    }
+}
+
+/// What is kept on one level.
+#[derive(Copy, Clone, Debug)]
+struct Limits {
+    smallest: i32,
+    largest: i32,
+    most_path: usize,
+    most_steps: usize,
+    most_points: usize,
+    detour_256ths: i32,
+    steep: bool,
+    least_fill: f32,
+    most_ragged: f32,
+}
+
+impl Limits {
+    fn new(settings: &Settings, level: usize, view: GrayView<'_>) -> Self {
+        let longest = view.width().max(view.height()) as i32;
+        let largest = if level >= settings.whole_level {
+            longest
+        } else {
+            longest.min(i32::from(settings.largest_px))
+        };
+        let pixels = view.width() as f32 * view.height() as f32;
+        Self {
+            smallest: i32::from(settings.smallest_px).max(2),
+            largest,
+            // An image has no more pixel edges than this.
+            most_path: ((4.0 * largest as f32 * settings.most_ragged) as usize)
+                .min(4 * view.width() * view.height()),
+            most_steps: (pixels * MOST_STEPS_PER_PIXEL) as usize + LEAST_BUDGET,
+            most_points: (pixels * MOST_POINTS_PER_PIXEL) as usize + LEAST_BUDGET,
+            steep: settings.steep && level < 2,
+            detour_256ths: ((settings.most_ragged - 1.0).clamp(0.0, 1e4) * 256.0) as i32,
+            least_fill: settings.least_fill,
+            most_ragged: settings.most_ragged,
+        }
+    }
+}
+
+/// The outlines of one kind of region on one level.
+struct Found<'a> {
+    view: GrayView<'a>,
+    bits: &'a BitImage,
+    binarizer: &'a Binarizer,
+    dark: bool,
+    level: u8,
+    path: &'a mut Vec<u8>,
+    points: &'a mut Vec<[f32; 2]>,
+    spans: &'a mut Vec<Span>,
+}
+
+/// Directions along pixel edges; the fourth is up.
+const RIGHT: u8 = 0;
+const DOWN: u8 = 1;
+const LEFT: u8 = 2;
+
+/// The outline of a region, whose pixels lie to the right of the way.
+struct Trace {
+    bounds: [i32; 4],
+    area: i64,
+    length: usize,
+}
+
+impl Found<'_> {
+    fn scan(mut self, limits: &Limits) {
+        let mut steps_left = limits.most_steps;
+        let points_end = self.points.len() + limits.most_points;
+        self.path.resize(limits.most_path, 0);
+        let bits = self.bits;
+        for y in 0..bits.height() {
+            let mut tops = Tops::new(bits.row(y), bits.row_above(y));
+            while let Some(x) = tops.next() {
+                if limits.steep && !self.is_steep(x, y) {
+                    continue;
+                }
+                let (trace, steps) = self.follow(x, y, limits);
+                if let Some(trace) = trace
+                    && limits.admit(&trace)
+                {
+                    self.keep(x, y, &trace);
+                }
+                // A start costs about as much as some steps.
+                steps_left = steps_left.saturating_sub(steps + 4);
+                if steps_left == 0 || self.points.len() >= points_end {
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Whether the grey values step at a top by half of their range. Looks two pixels up and down, as blur spreads a step
+    /// over two or three.
+    fn is_steep(&self, x: usize, y: usize) -> bool {
+        let row = |y: usize| self.view.row(y.min(self.view.height() - 1));
+        let (near, far) = (row(y.saturating_sub(1)), row(y.saturating_sub(2)));
+        let (here, next, last) = (row(y), row(y + 1), row(y + 2));
+        let (before, after) = (x.saturating_sub(1), (x + 1).min(self.view.width() - 1));
+        let (bright, dark) = if self.dark {
+            let above = near[x].max(far[x]).max(near[after]);
+            (above, here[x].min(next[x]).min(next[before]).min(last[before]))
+        } else {
+            let within = here[x].max(next[x]).max(next[before]).max(last[before]);
+            (within, near[x].min(far[x]).min(near[after]))
+        };
+        let [low, high] = self.binarizer.extremes(x, y);
+        let [bright, dark, low, high] = [bright, dark, low, high].map(i64::from);
+        if self.level == 0 {
+            2 * (bright - dark) >= high - low
+        } else {
+            // The same in logarithms; a little is added so that nothing is infinitely darker.
+            let [bright, dark, low, high] = [bright, dark, low, high].map(|grey| grey + 4);
+            bright * bright * low >= dark * dark * high
+        }
+    }
+
+    /// Follows an outline from the upper edge of pixel (x, y), the right end of a run, once round. `None` when it is
+    /// another run's, too large or too ragged; and how many steps it took.
+    fn follow(&mut self, x: usize, y: usize, limits: &Limits) -> (Option<Trace>, usize) {
+        let (bits, row) = (self.bits.bits(), self.bits.row_bits());
+        // Whether the pixel is part of the region; no for those beyond the image.
+        let part = |place: usize| bits.get(place >> 6).is_some_and(|w| w >> (place & 63) & 1 == 1);
+        // `place` is the pixel to the lower right of the point that was reached.
+        let mut place = self.bits.place(x + 1, y);
+        let (start_x, start_y) = (x as i32 + 1, y as i32);
+        let (mut x, mut y, mut direction) = (start_x, start_y, RIGHT);
+        let [mut left, mut right, mut bottom] = [start_x - 1, start_x, start_y];
+        let (mut area, mut down, mut leftwards) = (0, 0, 0);
+        for (length, step) in self.path.iter_mut().enumerate() {
+            // Regions are connected across corners, so a pixel ahead to the left is part of it whatever is to its right.
+            let (ahead_left, ahead_right) = match direction {
+                RIGHT => (place - row, place),
+                DOWN => (place, place - 1),
+                LEFT => (place - 1, place - row - 1),
+                _ => (place - row - 1, place - row),
+            };
+            if part(ahead_left) {
+                direction = (direction + 3) & 3;
+            } else if !part(ahead_right) {
+                direction = (direction + 1) & 3;
+            }
+            *step = direction;
+            // The area is the sum over the upright edges of where they are, down less up. A convex outline goes as far
+            // down as it is high, and as far left as it is wide.
+            match direction {
+                RIGHT => {
+                    place += 1;
+                    x += 1;
+                    if y == start_y && x >= start_x {
+                        let bounds = [left, start_y, right, bottom];
+                        let closed = x == start_x;
+                        let trace = Trace { bounds, area, length: length + 1 };
+                        return (closed.then_some(trace), length);
+                    }
+                    right = right.max(x);
+                    if right - left > limits.largest {
+                        return (None, length);
+                    }
+                }
+                DOWN => {
+                    place += row;
+                    y += 1;
+                    area += i64::from(x);
+                    down += 1;
+                    bottom = bottom.max(y);
+                    if bottom - start_y > limits.largest
+                        || limits.is_ragged([left, start_y, right, bottom], down + leftwards)
+                    {
+                        return (None, length);
+                    }
+                }
+                LEFT => {
+                    place -= 1;
+                    x -= 1;
+                    leftwards += 1;
+                    left = left.min(x);
+                    if right - left > limits.largest
+                        || limits.is_ragged([left, start_y, right, bottom], down + leftwards)
+                    {
+                        return (None, length);
+                    }
+                }
+                _ => {
+                    place -= row;
+                    y -= 1;
+                    area -= i64::from(x);
+                    if y < start_y {
+                        return (None, length);
+                    }
+                }
+            }
+        }
+        (None, self.path.len())
+    }
+
+    /// Keeps an outline that was just followed from pixel (x, y).
+    fn keep(&mut self, x: usize, y: usize, trace: &Trace) {
+        let start = self.points.len();
+        let (mut x, mut y) = (x as i32 + 1, y as i32);
+        let (mut cut, mut contrast) = (false, 0_i64);
+        for step in self.path.iter().take(trace.length) {
+            // The pixels on both sides of the edge.
+            let ([ax, ay], [bx, by], [nx, ny]) = match *step {
+                RIGHT => ([x, y], [x, y - 1], [x + 1, y]),
+                DOWN => ([x - 1, y], [x, y], [x, y + 1]),
+                LEFT => ([x - 1, y - 1], [x - 1, y], [x - 1, y]),
+                _ => ([x, y - 1], [x - 1, y - 1], [x, y - 1]),
+            };
+            let within = self.grey(ax, ay).unwrap_or(0);
+            let share = if let Some(without) = self.grey(bx, by) {
+                contrast += i64::from(without) - i64::from(within);
+                let threshold = self.binarizer.threshold(ax as usize, ay as usize);
+                crossing(within, without, threshold)
+            } else {
+                cut = true;
+                0.5
+            };
+            self.points
+                .push([ax as f32 + share * (bx - ax) as f32, ay as f32 + share * (by - ay) as f32]);
+            (x, y) = (nx, ny);
+        }
+        let contrast = contrast as f32 / trace.length.max(1) as f32;
+        self.spans.push(Span {
+            level: self.level,
+            dark: self.dark,
+            cut,
+            start,
+            end: self.points.len(),
+            bounds: trace.bounds.map(|b| b as u16),
+            area: trace.area as u32,
+            contrast: if self.dark { contrast } else { -contrast },
+        });
+    }
+
+    #[inline]
+    fn grey(&self, x: i32, y: i32) -> Option<u8> {
+        let inside = x >= 0
+            && y >= 0
+            && (x as usize) < self.view.width()
+            && (y as usize) < self.view.height();
+        inside.then(|| self.view.at(x as usize, y as usize))
+    }
+}
+
+/// How far from the pixel within to that without the grey values pass the threshold.
+fn crossing(within: u8, without: u8, threshold: u8) -> f32 {
+    // Dark pixels are below the threshold and bright ones may be on it, so the line lies half a level lower.
+    let (a, b) = (f32::from(within), f32::from(without));
+    let share = (f32::from(threshold) - 0.5 - a) / (b - a);
+    // Where the neighbour has another threshold, or none, the line may lie elsewhere.
+    if share > 0.0 && share < 1.0 { share } else { 0.5 }
+}
+
+impl Limits {
+    /// Whether an outline with these bounds so far went too far down and to the left for one that is nearly convex.
+    #[inline]
+    fn is_ragged(&self, [left, top, right, bottom]: [i32; 4], back: i32) -> bool {
+        const SLACK: i32 = 2;
+        let convex = right - left + bottom - top;
+        back - convex > SLACK + ((convex * self.detour_256ths) >> 8)
+    }
+
+    fn admit(&self, trace: &Trace) -> bool {
+        let [left, top, right, bottom] = trace.bounds;
+        let (width, height) = (right - left, bottom - top);
+        let around = 2 * (width + height);
+        width.max(height) >= self.smallest
+            && trace.length as f32 <= self.most_ragged * around as f32
+            && trace.area as f32 >= self.least_fill * width as f32 * height as f32
+    }
+}
+
+/// The right ends of those runs of a row that touch none of the row above, not even across a corner.
+struct Tops<'a> {
+    row: &'a [u64],
+    above: &'a [u64],
+    index: usize,
+    /// Runs of the current word that are still to be told.
+    ends: u64,
+    /// Whether a run that touches goes on from the word before into the current one.
+    carry: bool,
+}
+
+impl<'a> Tops<'a> {
+    fn new(row: &'a [u64], above: &'a [u64]) -> Self {
+        Self { row, above, index: 0, ends: 0, carry: false }
+    }
+
+    fn next(&mut self) -> Option<usize> {
+        while self.ends == 0 {
+            let run = *self.row.get(self.index)?;
+            if run == 0 && !self.carry {
+                self.index += 1;
+                continue;
+            }
+            self.read(run);
+            self.index += 1;
+        }
+        let bit = self.ends.trailing_zeros() as usize;
+        self.ends &= self.ends - 1;
+        Some((self.index - 1) * 64 + bit)
+    }
+
+    fn read(&mut self, run: u64) {
+        let at = |index: usize| self.above.get(index).copied().unwrap_or(0);
+        let above = at(self.index);
+        let before = if self.index > 0 { at(self.index - 1) } else { 0 };
+        let touched = above | above << 1 | before >> 63 | above >> 1 | at(self.index + 1) << 63;
+        // Adding a run's touched pixels to it carries a one from each of them to the run's end and changes the bits on the
+        // way: the last bit of a run stays as it is only where nothing touches.
+        let seeds = run & touched;
+        let (sum, over) = run.overflowing_add(seeds);
+        let (sum, over_too) = sum.overflowing_add(u64::from(self.carry));
+        let flooded = (run ^ sum) & run | seeds;
+        let next = self.row.get(self.index + 1).copied().unwrap_or(0);
+        let ends = run & !(run >> 1 | next << 63);
+        self.ends = ends & !flooded;
+        self.carry = (over || over_too) && next & 1 == 1;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const ALL: Settings = Settings {
+        dark_from: Some(0),
+        bright_from: Some(0),
+        whole_level: 0,
+        smallest_px: 1,
+        largest_px: 0,
+        least_contrast: 10,
+        least_contrast_percent: 0,
+        steep: false,
+        least_fill: 0.0,
+        most_ragged: 1e6,
+    };
+
+    fn image(rows: &[&str]) -> (Vec<u8>, usize) {
+        let grey = |b| if b == b'#' { 20 } else { 200 };
+        (rows.iter().flat_map(|row| row.bytes().map(grey)).collect(), rows[0].len())
+    }
+
+    fn find(rows: &[&str], settings: &Settings) -> Outlines {
+        let (data, width) = image(rows);
+        let mut outlines = Outlines::default();
+        outlines.find(GrayView::packed(&data, width, rows.len()).unwrap(), settings);
+        outlines
+    }
+
+    #[test]
+    fn a_square_has_its_four_sides_in_the_middle_between_pixels() {
+        let rows = [
+            "........", "........", "..####..", "..#..#..", "..#..#..", "..####..", "........",
+            "........",
+        ];
+        let outlines = find(&rows, &Settings { smallest_px: 2, ..ALL });
+        let dark: Vec<_> = outlines.iter().filter(|o| o.dark).collect();
+        assert_eq!(dark.len(), 1);
+        assert_eq!((dark[0].bounds, dark[0].area, dark[0].cut), ([2, 2, 6, 6], 16, false));
+        assert_eq!(dark[0].points.len(), 16);
+        assert!((dark[0].contrast - 180.0).abs() < 1e-3);
+        for [x, y] in dark[0].points {
+            let off = (x - 3.5).abs().max((y - 3.5).abs());
+            assert!((1.95..2.08).contains(&off), "{x} {y}");
+        }
+        let hole = outlines.iter().find(|o| !o.dark && !o.cut).unwrap();
+        assert_eq!((hole.bounds, hole.area, hole.level), ([3, 3, 5, 5], 4, 0));
+    }
+
+    #[test]
+    fn regions_of_the_wrong_size_or_shape_are_left_out() {
+        let rows =
+            ["#.......", "..#..#..", "..#..#..", "..####..", "........", "...###..", "........"];
+        let bounds = |settings: &Settings| -> Vec<_> {
+            find(&rows, settings).iter().filter(|o| o.dark).map(|o| o.bounds).collect()
+        };
+        // A lone pixel is noise at any setting.
+        assert_eq!(bounds(&ALL), [[2, 1, 6, 4], [3, 5, 6, 6]]);
+        assert_eq!(bounds(&Settings { smallest_px: 4, ..ALL }), [[2, 1, 6, 4]]);
+        assert_eq!(bounds(&Settings { most_ragged: 1.2, smallest_px: 3, ..ALL }), [[3, 5, 6, 6]]);
+        let finite = Settings { whole_level: 9, largest_px: 3, smallest_px: 2, ..ALL };
+        assert_eq!(bounds(&finite), [[3, 5, 6, 6]]);
+    }
+
+    #[test]
+    fn coarser_levels_see_the_same_square_smaller() {
+        let data: Vec<u8> = (0..200 * 200)
+            .map(|i| (i % 200, i / 200))
+            .map(|(x, y)| if (40..120).contains(&x) && (60..140).contains(&y) { 10 } else { 220 })
+            .collect();
+        let mut outlines = Outlines::default();
+        outlines.find(GrayView::packed(&data, 200, 200).unwrap(), &Settings::default());
+        let seen: Vec<_> = outlines.iter().map(|o| (o.level, o.bounds)).collect();
+        assert_eq!(seen, [(2, [10, 15, 30, 35]), (3, [5, 8, 15, 17])]);
+        for [x, y] in outlines.get(0).unwrap().points {
+            let place = |p: f32| crate::pyramid::to_level_0(f64::from(p), 2);
+            let off = (place(*x) - 79.5).abs().max((place(*y) - 99.5).abs());
+            // The threshold is in the middle by ratio, which lies on the dark side of the edge.
+            assert!((38.5..40.0).contains(&off), "{off}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn each_region_has_one_outline_whatever_its_shape(
+            (width, bits) in (1_usize..150).prop_flat_map(|w| {
+                (Just(w), (1_usize..12).prop_flat_map(move |h| prop::collection::vec(prop::bool::ANY, w * h)))
+            })
+        ) {
+            let data: Vec<u8> = bits.iter().map(|dark| if *dark { 20 } else { 200 }).collect();
+            let view = GrayView::packed(&data, width, bits.len() / width).unwrap();
+            let mut outlines = Outlines::default();
+            outlines.find(view, &ALL);
+            // Where all is the same in a neighbourhood nothing is dark, so the bits themselves are the truth.
+            let dark = |x: usize, y: usize| outlines.dark.at(x as i32, y as i32);
+            let seen: Vec<bool> = (0..bits.len()).map(|i| dark(i % width, i / width)).collect();
+            let mut expected = regions(&seen, width);
+            let mut found: Vec<_> = outlines
+                .iter()
+                .filter(|o| o.dark && o.level == 0)
+                .map(|o| o.bounds.map(usize::from))
+                .filter(|b| (b[2] - b[0]).max(b[3] - b[1]) >= 2)
+                .collect();
+            expected.retain(|b| (b[2] - b[0]).max(b[3] - b[1]) >= 2);
+            expected.sort_unstable();
+            found.sort_unstable();
+            prop_assert_eq!(found, expected);
+        }
+    }
+
+    /// Bounds of the regions, connected across corners, by flooding.
+    fn regions(bits: &[bool], width: usize) -> Vec<[usize; 4]> {
+        let mut left = bits.to_vec();
+        let mut found = Vec::new();
+        while let Some(seed) = left.iter().position(|w| *w) {
+            let mut bounds = [usize::MAX, usize::MAX, 0, 0];
+            let mut stack = vec![seed];
+            while let Some(at) = stack.pop() {
+                if !std::mem::replace(&mut left[at], false) {
+                    continue;
+                }
+                let (x, y) = (at % width, at / width);
+                bounds = [
+                    bounds[0].min(x),
+                    bounds[1].min(y),
+                    bounds[2].max(x + 1),
+                    bounds[3].max(y + 1),
+                ];
+                for ny in y.saturating_sub(1)..(y + 2).min(bits.len() / width) {
+                    for nx in x.saturating_sub(1)..(x + 2).min(width) {
+                        stack.push(ny * width + nx);
+                    }
+                }
+            }
+            found.push(bounds);
+        }
+        found
+    }
+}
