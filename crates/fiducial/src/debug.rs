@@ -1,32 +1,21 @@
-//! The thesis' three debug images: valid ellipses, rings, and the marker with the alignment circle.
-
-use std::f64::consts::PI;
+//! Debug images: the thesis' three (valid ellipses, rings, and the marker with the alignment circle), and the squares.
 
 use geometry::Pixel;
-use imaging::{Ellipse, GrayView};
+use imaging::GrayView;
 
+pub use crate::canvas::{Colour, RgbImageBuf};
 use crate::ring::RingKind;
-use crate::trace::Trace;
-
-/// A colour image, three bytes (red, green, blue) a pixel, row by row.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct RgbImageBuf {
-    /// The pixels.
-    pub data: Vec<u8>,
-    /// Width in pixels.
-    pub width: usize,
-    /// Height in pixels.
-    pub height: usize,
-}
+use crate::trace::{Candidate, Trace};
 
 /// Radius of the thesis' alignment circle, in pixels.
 pub const ALIGNMENT_RADIUS_PX: f64 = 300.0;
 
-type Colour = [u8; 3];
 const GREEN: Colour = [0, 220, 60];
 const RED: Colour = [235, 40, 40];
 const ORANGE: Colour = [255, 150, 0];
 const BLUE: Colour = [40, 120, 255];
+const YELLOW: Colour = [255, 230, 60];
+const MAGENTA: Colour = [230, 80, 230];
 
 /// The image with the ellipses that passed the ellipse filter.
 pub fn draw_ellipses(view: GrayView<'_>, trace: &Trace, out: &mut RgbImageBuf) {
@@ -36,7 +25,8 @@ pub fn draw_ellipses(view: GrayView<'_>, trace: &Trace, out: &mut RgbImageBuf) {
     }
 }
 
-/// The image with the rings by kind (outer red, middle orange, inner blue), inner and outer edge each.
+/// The image with the rings by kind (outer red, middle orange, inner blue), inner and outer edge each, and those that
+/// were refused (magenta) with the reason.
 pub fn draw_rings(view: GrayView<'_>, trace: &Trace, out: &mut RgbImageBuf) {
     out.copy(view);
     for ring in &trace.rings {
@@ -47,6 +37,30 @@ pub fn draw_rings(view: GrayView<'_>, trace: &Trace, out: &mut RgbImageBuf) {
         };
         out.ellipse(&ring.inner, colour);
         out.ellipse(&ring.outer, colour);
+    }
+    for refusal in &trace.refusals {
+        if let Candidate::Ring(edges) = refusal.candidate {
+            for edge in &edges {
+                out.ellipse(edge, MAGENTA);
+            }
+            let [x, y] = edges[0].centre;
+            let below = edges.iter().map(|edge| edge.major / 2.0).fold(0.0, f64::max);
+            label(out, [x, y + below], refusal.reason.name(), YELLOW);
+        }
+    }
+}
+
+/// The image with the quads: those whose code was read (green), and those that were refused (magenta) with the reason.
+pub fn draw_squares(view: GrayView<'_>, trace: &Trace, out: &mut RgbImageBuf) {
+    out.copy(view);
+    for refusal in &trace.refusals {
+        if let Candidate::Quad(corners) = refusal.candidate {
+            out.polygon(&corners.map(place), 1.0, MAGENTA);
+            label(out, below(&corners), refusal.reason.name(), YELLOW);
+        }
+    }
+    for corners in &trace.quads {
+        out.polygon(&corners.map(place), 1.0, GREEN);
     }
 }
 
@@ -63,53 +77,36 @@ pub fn draw_target(
     out.circle(middle, alignment_radius_px, BLUE);
     for marker in &trace.markers {
         let Pixel { x, y } = marker.centre;
-        out.circle([x, y], marker.size_px / 2.0, GREEN);
-        for offset in -10..=10 {
-            out.dot(x + f64::from(offset), y, RED);
-            out.dot(x, y + f64::from(offset), RED);
+        match marker.corners {
+            Some(corners) => out.polygon(&corners.map(place), 1.0, GREEN),
+            None => out.circle([x, y], marker.size_px / 2.0, GREEN),
         }
+        out.line([x - 10.0, y], [x + 10.0, y], 1.0, RED);
+        out.line([x, y - 10.0], [x, y + 10.0], 1.0, RED);
     }
 }
 
-impl RgbImageBuf {
-    fn copy(&mut self, view: GrayView<'_>) {
-        (self.width, self.height) = (view.width(), view.height());
-        self.data.clear();
-        for y in 0..view.height() {
-            self.data.extend(view.row(y).iter().flat_map(|grey| [*grey; 3]));
-        }
-    }
+fn place(pixel: Pixel) -> [f64; 2] {
+    [pixel.x, pixel.y]
+}
 
-    fn circle(&mut self, centre: [f64; 2], radius: f64, colour: Colour) {
-        let size = 2.0 * radius;
-        self.ellipse(&Ellipse { centre, minor: size, major: size, angle: 0.0 }, colour);
-    }
+/// A place under a quad.
+fn below(corners: &[Pixel; 4]) -> [f64; 2] {
+    let x = corners.iter().map(|c| c.x).sum::<f64>() / 4.0;
+    [x, corners.iter().map(|c| c.y).fold(f64::NEG_INFINITY, f64::max)]
+}
 
-    fn ellipse(&mut self, ellipse: &Ellipse, colour: Colour) {
-        // Two dots a pixel leave no gap; an ellipse far larger than the image needs no more than this many.
-        let dots = (2.0 * PI * ellipse.major).clamp(8.0, 20_000.0) as u32;
-        for i in 0..dots {
-            let [x, y] = ellipse.at(f64::from(i) * 2.0 * PI / f64::from(dots));
-            self.dot(x, y, colour);
-        }
-    }
-
-    fn dot(&mut self, x: f64, y: f64, colour: Colour) {
-        let (x, y) = (x.round(), y.round());
-        if !(x >= 0.0 && y >= 0.0 && x < self.width as f64 && y < self.height as f64) {
-            return;
-        }
-        let start = (y as usize * self.width + x as usize) * 3;
-        if let Some(pixel) = self.data.get_mut(start..start + 3) {
-            pixel.copy_from_slice(&colour);
-        }
-    }
+/// A word centred under a place.
+fn label(out: &mut RgbImageBuf, [x, y]: [f64; 2], word: &str, colour: Colour) {
+    out.text([x - 3.0 * word.len() as f64, y + 2.0], word, 1, colour);
 }
 
 #[cfg(test)]
 mod tests {
+    use imaging::Ellipse;
+
     use super::*;
-    use crate::trace::TracedMarker;
+    use crate::trace::{Reason, TracedMarker};
 
     #[test]
     fn marks_are_drawn_where_they_are_and_nowhere_else() {
@@ -127,11 +124,33 @@ mod tests {
     }
 
     #[test]
+    fn refused_squares_are_marked_with_their_reason() {
+        let data = vec![200; 100 * 80];
+        let view = GrayView::packed(&data, 100, 80).unwrap();
+        let square = |x: f64| {
+            [(x, 10.0), (x + 20.0, 10.0), (x + 20.0, 30.0), (x, 30.0)]
+                .map(|(x, y)| Pixel::new(x, y))
+        };
+        let mut part = Trace::default();
+        part.refuse_quad(square(10.0), Reason::Border);
+        part.accept_quad(square(60.0));
+        let mut trace = Trace::default();
+        trace.add_part(&part, [5.0, 2.0]);
+        let mut out = RgbImageBuf::default();
+        draw_squares(view, &trace, &mut out);
+        let at = |x: usize, y: usize| &out.data[(y * 100 + x) * 3..][..3];
+        assert_eq!((at(15, 20), at(65, 20), at(50, 20)), (&MAGENTA[..], &GREEN[..], &[200; 3][..]));
+        let letters = (0..100 * 80).filter(|i| out.data[i * 3..][..3] == YELLOW).count();
+        assert!(letters > 50, "{letters}");
+    }
+
+    #[test]
     fn marks_beyond_the_image_are_left_out() {
         let view = GrayView::packed(&[1], 1, 1).unwrap();
         let mut trace = Trace::default();
         for size_px in [1.0, 1e9, f64::NAN, f64::INFINITY] {
-            trace.markers.push(TracedMarker { centre: Pixel::new(-1e12, f64::NAN), size_px });
+            let centre = Pixel::new(-1e12, f64::NAN);
+            trace.markers.push(TracedMarker { centre, size_px, corners: Some([centre; 4]) });
         }
         let mut out = RgbImageBuf::default();
         draw_target(view, &trace, ALIGNMENT_RADIUS_PX, &mut out);

@@ -8,13 +8,16 @@
 //! it. [`ring`] and [`rings_thesis`] are the thesis' way
 //! (Algorithms 1-15). [`rings`] is the mended one: `outline` takes ellipses from contours, `search` goes from a ring
 //! to the marker, `circles` and, for small markers, `photometry` give its pose, `lens` serves images of unknown
-//! cameras. [`trace`] is what they saw on the way, [`debug`] draws that.
+//! cameras. [`trace`] is what they saw on the way, [`debug`] draws that
+//! on a [`canvas`] with its [`letters`].
 
+pub mod canvas;
 mod circles;
 pub mod debug;
 pub mod detector;
 pub mod drawing;
 mod lens;
+pub mod letters;
 pub mod marker;
 pub mod observation;
 mod outline;
@@ -34,4 +37,4 @@ pub use marker::{Family, Marker, MarkerError};
 pub use observation::{MarkerPose, Observation, PoseSolution, Stages};
 pub use pose::{PlanePoint, planar_pose, square_pose};
 pub use ring::{Ring, RingKind};
-pub use trace::{Reason, Refusal, Trace, TracedMarker};
+pub use trace::{Candidate, Reason, Refusal, Trace, TracedMarker};
