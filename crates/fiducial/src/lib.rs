@@ -29,6 +29,7 @@ pub mod rings_thesis;
 mod search;
 pub mod square;
 mod stag;
+mod step;
 pub mod trace;
 
 pub use detector::{Detector, DetectorError, Settings};

@@ -1,0 +1,152 @@
+//! Which cells of a square marker are black and which are white, as far as it is known.
+
+use crate::square::code::Code;
+
+/// Most cells across a pattern, its surroundings included.
+pub const MOST_CELLS: usize = 32;
+
+/// The cells of a square marker and what is around it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pattern {
+    across: usize,
+    margin: usize,
+    /// Bit `x` of row `y`, surroundings included.
+    white: [u32; MOST_CELLS],
+    known: [u32; MOST_CELLS],
+}
+
+impl Pattern {
+    /// A square of `cells` cells across with `margin` cells around it on each side. `is_white` tells of the cell in
+    /// column x and row y, the square's own top left being (0, 0) and what is left of or above it negative; `None`
+    /// for what is not known. `None` when the square has no cells, or all together are too many.
+    pub fn new(
+        cells: usize,
+        margin: usize,
+        is_white: impl Fn(i32, i32) -> Option<bool>,
+    ) -> Option<Self> {
+        let across = margin.checked_mul(2)?.checked_add(cells)?;
+        if cells == 0 || across > MOST_CELLS {
+            return None;
+        }
+        let mut pattern = Self { across, margin, white: [0; MOST_CELLS], known: [0; MOST_CELLS] };
+        for y in 0..across {
+            for x in 0..across {
+                let at = |value: usize| value as i32 - margin as i32;
+                if let Some(white) = is_white(at(x), at(y)) {
+                    pattern.known[y] |= 1 << x;
+                    pattern.white[y] |= u32::from(white) << x;
+                }
+            }
+        }
+        Some(pattern)
+    }
+
+    /// The marker of a family that carries this word. Around a square the paper is white for a cell; what lies beside the
+    /// bits outside of a square is known only where the bits leave no gaps.
+    pub fn of(code: &Code, word: u64) -> Option<Self> {
+        let cells = i32::from(code.cells);
+        let depth = |x: i32, y: i32| x.min(y).min(cells - 1 - x).min(cells - 1 - y);
+        let outside = if code.reversed_border { i32::from(code.margin()) } else { 0 };
+        let ring = 4 * (cells + 2 * outside - 1);
+        let bits = || code.bits.iter().map(|[x, y]| (i32::from(*x), i32::from(*y)));
+        let outermost = bits().filter(|(x, y)| depth(*x, *y) == -outside).count();
+        let is_closed = !code.reversed_border || outermost == ring as usize;
+        let mut pattern =
+            Self::new(code.cells.into(), outside as usize + 1, |x, y| match depth(x, y) {
+                0.. => Some(code.reversed_border),
+                -1 if code.reversed_border => Some(false),
+                deep if deep < -outside && is_closed => Some(true),
+                _ => None,
+            })?;
+        for (k, (x, y)) in bits().enumerate() {
+            let column = usize::try_from(x + outside + 1).ok()?;
+            let row = pattern.white.get_mut(usize::try_from(y + outside + 1).ok()?)?;
+            let white = word >> (code.bits.len() - 1 - k) & 1 == 1;
+            *row = *row & !(1 << column) | u32::from(white) << column;
+            *pattern.known.get_mut(usize::try_from(y + outside + 1).ok()?)? |= 1 << column;
+        }
+        Some(pattern)
+    }
+
+    /// A square of which only the border is known, one of `cells` cells wide: black on white, or white on black.
+    pub fn border(cells: usize, white_on_black: bool) -> Option<Self> {
+        let last = i32::try_from(cells).ok()? - 1;
+        Self::new(cells, 1, |x, y| {
+            let outside = x.min(y) < 0 || x.max(y) > last;
+            let on_border = x.min(y) == 0 || x.max(y) == last;
+            (outside || on_border).then_some(outside != white_on_black)
+        })
+    }
+
+    /// Cells across the square itself.
+    pub fn cells(&self) -> usize {
+        self.across - 2 * self.margin
+    }
+
+    /// Cells around the square on each side.
+    pub fn margin(&self) -> usize {
+        self.margin
+    }
+
+    /// Cells across, surroundings included.
+    pub(crate) fn across(&self) -> usize {
+        self.across
+    }
+
+    /// Whether the cell in column x and row y, counted from the surroundings' top left, is white; `None` when it is
+    /// not known.
+    pub(crate) fn is_white(&self, x: usize, y: usize) -> Option<bool> {
+        let bit = |rows: &[u32; MOST_CELLS]| rows.get(y).is_some_and(|row| row >> x & 1 == 1);
+        (x < self.across && bit(&self.known)).then(|| bit(&self.white))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::drawing::{Drawing, Ink};
+    use crate::marker::{Family, Marker};
+
+    #[test]
+    fn a_border_is_black_in_white_or_white_in_black() {
+        for inverted in [false, true] {
+            let border = Pattern::border(6, inverted).unwrap();
+            assert_eq!((border.cells(), border.margin(), border.across()), (6, 1, 8));
+            let at = |x, y| border.is_white(x, y).map(|white| white != inverted);
+            assert_eq!(at(0, 3), Some(true));
+            assert_eq!(at(7, 7), Some(true));
+            assert_eq!(at(1, 1), Some(false));
+            assert_eq!(at(6, 3), Some(false));
+            assert_eq!((at(2, 2), at(8, 0), at(0, 9)), (None, None, None));
+        }
+    }
+
+    /// Cell by cell as the marker is drawn, wherever something is known.
+    #[test]
+    fn every_family_is_as_it_is_drawn() {
+        for family in Family::ALL {
+            let Some(code) = Code::of(family) else { continue };
+            let marker = Marker { family, id: Some(3), size_m: None };
+            let drawing = Drawing::new(&marker, f64::from(code.cells)).unwrap();
+            let pattern = Pattern::of(code, code.words[3]).unwrap();
+            let half = pattern.across() as f64 / 2.0 - 0.5;
+            let mut known = 0;
+            for y in 0..pattern.across() {
+                for x in 0..pattern.across() {
+                    let Some(white) = pattern.is_white(x, y) else { continue };
+                    let ink = drawing.ink_at(x as f64 - half, half - y as f64);
+                    assert_eq!(white, ink == Ink::White, "{family} {x} {y}");
+                    known += 1;
+                }
+            }
+            assert!(known >= code.bits.len() + 16, "{family}");
+        }
+    }
+
+    #[test]
+    fn impossible_sizes_are_refused() {
+        for (cells, margin) in [(0, 1), (31, 1), (5, usize::MAX)] {
+            assert_eq!(Pattern::new(cells, margin, |_, _| Some(true)), None);
+        }
+    }
+}

@@ -1,0 +1,501 @@
+//! The whole picture of a small square marker, compared with the image grey value by grey value.
+//!
+//! Every cell's edges are predicted together: through the blur of lens and pixels a cell of two pixels never shows its
+//! own black or white. In the square's own coordinates the blur is a Gaussian whose axes the perspective has made
+//! oblique; a cell's share of it is the product of two steps' differences, with the terms of Mehler's series for what
+//! the obliqueness adds where edges cross.
+
+use geometry::Pixel;
+use imaging::GrayView;
+use nalgebra::{SMatrix, SVector};
+
+use crate::square::pattern::{MOST_CELLS, Pattern};
+use crate::square::refine::{Fit, Homography, Lens, Scratch};
+use crate::step::{END, PIXEL_VARIANCE, Step, boxiness};
+
+/// Light and blur of a marker's picture.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) struct Picture {
+    /// Grey value of black, and how much brighter white is, in the marker's middle.
+    pub(crate) black: f64,
+    pub(crate) contrast: f64,
+    /// Change of the light to the right and down, as a share of it, per half a marker.
+    pub(crate) shade: [f64; 2],
+    /// Standard deviation of the blur of lens and pixel together, in pixels.
+    pub(crate) spread_px: f64,
+}
+
+/// A pixel that takes part.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Spot {
+    /// Its place in the ideal image, relative to the homography's.
+    ideal: [f64; 2],
+    grey: f64,
+}
+
+/// Homography (8), spread, black, contrast, shade (2).
+const UNKNOWNS: usize = 13;
+/// Steps of the first, rough round and of the second.
+const MOST_STEPS: [usize; 2] = [8, 12];
+/// Pixels that take part in each round at most.
+const MOST_SPOTS: [usize; 2] = [600, 1600];
+/// The spread may become this, in pixels.
+const SPREAD_LIMITS_PX: (f64, f64) = (0.25, 4.0);
+/// Less contrast, in grey levels, is none.
+const LEAST_CONTRAST: f64 = 4.0;
+/// A pixel takes no part when more of its light than this comes from cells of which nothing is known.
+const MOST_UNKNOWN: f64 = 0.03;
+
+impl Picture {
+    /// Standard deviation of the lens' blur alone.
+    pub(crate) fn blur_px(&self) -> f64 {
+        (self.spread_px * self.spread_px - PIXEL_VARIANCE).max(0.0).sqrt()
+    }
+}
+
+/// The homography at which the marker's picture agrees with the image best.
+pub(crate) fn fit(
+    view: GrayView<'_>,
+    lens: &Lens<'_>,
+    start: &Homography,
+    pattern: &Pattern,
+    scratch: &mut Scratch,
+) -> Option<Fit> {
+    let grid = Grid::new(pattern, lens);
+    let side_px = start.shortest_side_px();
+    let cell_px = side_px / pattern.cells() as f64;
+    // A wide blur at first: what is half a cell off is still drawn to its place.
+    let spread_px = (0.4 * cell_px).clamp(0.7, 1.2);
+    let light = Picture { black: 0.0, contrast: 1.0, shade: [0.0; 2], spread_px };
+    let mut state = State { homography: *start, light, half_px: side_px / 2.0 };
+    let mut solved = None;
+    for (most_spots, most_steps) in MOST_SPOTS.into_iter().zip(MOST_STEPS) {
+        grid.gather(view, lens, &state, most_spots, &mut scratch.spots)?;
+        if solved.is_none() {
+            state.expose(&grid, &scratch.spots)?;
+        }
+        let (next, system) = state.solved(&grid, &scratch.spots, most_steps)?;
+        state = next;
+        solved = Some(system);
+    }
+    let system = solved?;
+    let contrast = state.light.contrast.abs();
+    let freedom = system.weight - UNKNOWNS as f64;
+    if contrast < LEAST_CONTRAST || freedom < 1.0 {
+        return None;
+    }
+    let variance = system.squares / freedom;
+    let covariance = system.full().cholesky()?.inverse().fixed_view::<8, 8>(0, 0) * variance;
+    Some(Fit {
+        homography: state.homography,
+        covariance,
+        picture: state.light,
+        residual: variance.sqrt() / contrast,
+    })
+}
+
+/// Everything that is fitted.
+#[derive(Copy, Clone, Debug)]
+struct State {
+    homography: Homography,
+    light: Picture,
+    /// Half the marker, the unit of `shade`.
+    half_px: f64,
+}
+
+/// The cells, ready to be looked up.
+struct Grid {
+    across: usize,
+    /// Cells from the middle to the square's side, and from the pattern's to its end.
+    half: f64,
+    middle: f64,
+    white: [[f64; MOST_CELLS]; MOST_CELLS],
+    unknown: [[f64; MOST_CELLS]; MOST_CELLS],
+    bend: [[f64; 2]; 2],
+    step: Step,
+}
+
+/// The shares that the columns (or rows) of cells have of a blurred place's light, times what they are multiplied by
+/// in its first and second derivative, in units of the blur.
+#[derive(Copy, Clone, Debug)]
+struct Bands {
+    first: usize,
+    count: usize,
+    share: [[f64; 3]; MOST_CELLS],
+}
+
+/// A place's whiteness and how it changes.
+#[derive(Copy, Clone, Debug, Default)]
+struct Look {
+    /// The square's coordinates.
+    square: [f64; 2],
+    white: f64,
+    /// By the place in the ideal image, per pixel.
+    by_place: [f64; 2],
+    by_spread: f64,
+}
+
+/// Where a place of the image is in the pattern, and how far the blur reaches there.
+struct Spread {
+    square: [f64; 2],
+    /// In cells from the pattern's left and top end.
+    cells: [f64; 2],
+    /// Change of `cells` with the place in the ideal image.
+    slopes: [[f64; 2]; 2],
+    sigma: [f64; 2],
+    boxiness: [f64; 2],
+    correlation: f64,
+}
+
+impl Grid {
+    fn new(pattern: &Pattern, lens: &Lens<'_>) -> Self {
+        let across = pattern.across();
+        let mut white = [[0.0; MOST_CELLS]; MOST_CELLS];
+        let mut unknown = [[0.0; MOST_CELLS]; MOST_CELLS];
+        for y in 0..across {
+            for x in 0..across {
+                match pattern.is_white(x, y) {
+                    Some(is_white) => white[y][x] = f64::from(u8::from(is_white)),
+                    None => unknown[y][x] = 1.0,
+                }
+            }
+        }
+        let bend = lens.slope();
+        Self {
+            across,
+            half: pattern.cells() as f64 / 2.0,
+            middle: across as f64 / 2.0,
+            white,
+            unknown,
+            bend: [[bend[(0, 0)], bend[(0, 1)]], [bend[(1, 0)], bend[(1, 1)]]],
+            step: Step::new(),
+        }
+    }
+
+    /// The pixels near the marker's known edges.
+    fn gather(
+        &self,
+        view: GrayView<'_>,
+        lens: &Lens<'_>,
+        state: &State,
+        most: usize,
+        spots: &mut Vec<Spot>,
+    ) -> Option<()> {
+        spots.clear();
+        let [left, top, right, bottom] = self.bounds(view, lens, state)?;
+        let inverse = state.homography.inverse();
+        let about = state.homography.about;
+        let spread_px = state.light.spread_px;
+        let area = ((right - left) * (bottom - top)) as f64;
+        // Of large markers every so many-th pixel, in an order without a pattern of its own.
+        let every = (0.5 * area / most as f64).max(1.0) as usize;
+        let mut turn = 0;
+        for y in top..bottom {
+            let row = view.row(y);
+            for (x, grey) in row.iter().enumerate().take(right).skip(left) {
+                let ideal = lens.ideal(Pixel::new(x as f64, y as f64))?;
+                let ideal = [ideal[0] - about[0], ideal[1] - about[1]];
+                let Some(spread) = self.spread(&inverse, ideal, spread_px) else { continue };
+                if self.unknown_at(&spread) > MOST_UNKNOWN {
+                    continue;
+                }
+                if every > 1 {
+                    turn += 1;
+                    let look = self.look_at(&spread, spread_px);
+                    let change = look.by_place[0].hypot(look.by_place[1]);
+                    let chosen =
+                        if change > 0.03 { turn % every == 0 } else { turn % (4 * every) == 1 };
+                    if !chosen {
+                        continue;
+                    }
+                }
+                spots.push(Spot { ideal, grey: f64::from(*grey) });
+            }
+        }
+        (spots.len() > 2 * UNKNOWNS).then_some(())
+    }
+
+    /// First column and row around the pattern within the image, and those after the last.
+    fn bounds(&self, view: GrayView<'_>, lens: &Lens<'_>, state: &State) -> Option<[usize; 4]> {
+        let mut bounds = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
+        let reach = self.middle / self.half;
+        for [a, b] in crate::square::refine::CORNERS {
+            let (seen, _) = lens.seen(state.homography.at([a * reach, b * reach]).ideal)?;
+            bounds = [
+                bounds[0].min(seen.x),
+                bounds[1].min(seen.y),
+                bounds[2].max(seen.x),
+                bounds[3].max(seen.y),
+            ];
+        }
+        let limit = |value: f64, end: usize| value.clamp(0.0, end as f64) as usize;
+        let (width, height) = (view.width(), view.height());
+        Some([
+            limit(bounds[0].floor(), width),
+            limit(bounds[1].floor(), height),
+            limit(bounds[2].ceil() + 1.0, width),
+            limit(bounds[3].ceil() + 1.0, height),
+        ])
+    }
+
+    #[inline]
+    fn spread(&self, inverse: &[f64; 9], [x, y]: [f64; 2], spread_px: f64) -> Option<Spread> {
+        let i = inverse;
+        let depth = 1.0 / (i[6] * x + i[7] * y + i[8]);
+        let square = [(i[0] * x + i[1] * y + i[2]) * depth, (i[3] * x + i[4] * y + i[5]) * depth];
+        let mut spread = Spread {
+            square,
+            cells: square.map(|s| s * self.half + self.middle),
+            slopes: [[0.0; 2]; 2],
+            sigma: [0.0; 2],
+            boxiness: [0.0; 2],
+            correlation: 0.0,
+        };
+        let size = self.across as f64;
+        let outside = |c: f64| !(c > -0.5 && c < size + 0.5);
+        if spread.cells.iter().any(|c| outside(*c)) {
+            return None;
+        }
+        let variance = spread_px * spread_px;
+        let mut directions = [[0.0; 2]; 2];
+        for axis in 0..2 {
+            let row = |column: usize| {
+                (i[3 * axis + column] - square[axis] * i[6 + column]) * depth * self.half
+            };
+            let slope = [row(0), row(1)];
+            let bent = [
+                slope[0] * self.bend[0][0] + slope[1] * self.bend[1][0],
+                slope[0] * self.bend[0][1] + slope[1] * self.bend[1][1],
+            ];
+            let length = (bent[0] * bent[0] + bent[1] * bent[1]).sqrt();
+            directions[axis] = bent.map(|b| b / length);
+            spread.slopes[axis] = slope;
+            spread.sigma[axis] = length * spread_px;
+            spread.boxiness[axis] = boxiness(directions[axis], variance);
+        }
+        let [p, q] = directions;
+        spread.correlation = p[0] * q[0] + p[1] * q[1];
+        Some(spread)
+    }
+
+    fn bands(&self, at: f64, sigma: f64, boxiness: f64) -> Bands {
+        let end = self.across as f64;
+        let reach = END * sigma;
+        let first = (at - reach).ceil().clamp(1.0, end) as usize;
+        let beyond = ((at + reach).floor() + 1.0).clamp(first as f64, end) as usize;
+        let mut bands =
+            Bands { first: first - 1, count: beyond - first + 1, share: [[0.0; 3]; MOST_CELLS] };
+        // Of each line between two columns: the light from before it, and that number's derivatives.
+        let mut before = [0.0; 3];
+        let scale = 1.0 / sigma;
+        for (share, line) in bands.share.iter_mut().zip(first..beyond) {
+            let z = (line as f64 - at) * scale;
+            let (height, slope) = self.step.at(z, boxiness);
+            let here = [height, -slope, -z * slope];
+            *share = [here[0] - before[0], here[1] - before[1], here[2] - before[2]];
+            before = here;
+        }
+        if let Some(last) = bands.share.get_mut(bands.count - 1) {
+            *last = [1.0 - before[0], -before[1], -before[2]];
+        }
+        bands
+    }
+
+    /// The share of a place's light that comes from cells of which nothing is known.
+    fn unknown_at(&self, spread: &Spread) -> f64 {
+        let [columns, rows] =
+            [0, 1].map(|axis| self.bands(spread.cells[axis], spread.sigma[axis], 0.0));
+        let mut sum = 0.0;
+        for (row, [share, ..]) in
+            self.unknown.iter().skip(rows.first).zip(&rows.share).take(rows.count)
+        {
+            let cells = row.iter().skip(columns.first).zip(&columns.share).take(columns.count);
+            sum += share * cells.map(|(unknown, [share, ..])| unknown * share).sum::<f64>();
+        }
+        let size = self.across as f64;
+        for axis in 0..2 {
+            let (at, sigma) = (spread.cells[axis], spread.sigma[axis]);
+            sum += self.step.at(-at / sigma, 0.0).0 + self.step.at((at - size) / sigma, 0.0).0;
+        }
+        sum
+    }
+
+    #[inline]
+    fn look_at(&self, spread: &Spread, spread_px: f64) -> Look {
+        let columns = self.bands(spread.cells[0], spread.sigma[0], spread.boxiness[0]);
+        let rows = self.bands(spread.cells[1], spread.sigma[1], spread.boxiness[1]);
+        // Sums over the cells with the derivatives by column and by row.
+        let (mut w, mut wx, mut wy, mut wxy, mut wxx, mut wyy, mut wxxyy) =
+            (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+        for (row, [share, slope, curve]) in
+            self.white.iter().skip(rows.first).zip(&rows.share).take(rows.count)
+        {
+            let (mut r, mut rx, mut rxx) = (0.0, 0.0, 0.0);
+            for (white, [share, slope, curve]) in
+                row.iter().skip(columns.first).zip(&columns.share).take(columns.count)
+            {
+                r += white * share;
+                rx += white * slope;
+                rxx += white * curve;
+            }
+            w += share * r;
+            wx += share * rx;
+            wxx += share * rxx;
+            wy += slope * r;
+            wxy += slope * rx;
+            wyy += curve * r;
+            wxxyy += curve * rxx;
+        }
+        let c = spread.correlation;
+        let [by_u, by_v] = [wx / spread.sigma[0], wy / spread.sigma[1]];
+        Look {
+            square: spread.square,
+            white: w + c * (wxy + 0.5 * c * wxxyy),
+            by_place: [
+                by_u * spread.slopes[0][0] + by_v * spread.slopes[1][0],
+                by_u * spread.slopes[0][1] + by_v * spread.slopes[1][1],
+            ],
+            by_spread: (wxx + wyy + 2.0 * c * wxy) / spread_px,
+        }
+    }
+}
+
+/// The normal equations, upper half, and the cost.
+#[derive(Clone, Debug)]
+struct System {
+    matrix: [[f64; UNKNOWNS]; UNKNOWNS],
+    right: [f64; UNKNOWNS],
+    cost: f64,
+    /// Weighted squares of the differences, and the sum of their weights.
+    squares: f64,
+    weight: f64,
+}
+
+impl System {
+    fn full(&self) -> SMatrix<f64, UNKNOWNS, UNKNOWNS> {
+        SMatrix::from_fn(|i, j| self.matrix[i.min(j)][i.max(j)])
+    }
+}
+
+impl State {
+    /// Black and contrast that fit best with everything else as it is.
+    fn expose(&mut self, grid: &Grid, spots: &[Spot]) -> Option<()> {
+        let inverse = self.homography.inverse();
+        let (mut n, mut sw, mut sww, mut sg, mut swg) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        for spot in spots {
+            let spread = grid.spread(&inverse, spot.ideal, self.light.spread_px)?;
+            let white = grid.look_at(&spread, self.light.spread_px).white;
+            n += 1.0;
+            sw += white;
+            sww += white * white;
+            sg += spot.grey;
+            swg += white * spot.grey;
+        }
+        let contrast = (n * swg - sw * sg) / (n * sww - sw * sw);
+        self.light.contrast = contrast;
+        self.light.black = (sg - contrast * sw) / n;
+        (contrast.is_finite() && contrast.abs() > LEAST_CONTRAST).then_some(())
+    }
+
+    /// The best state near this one and its equations.
+    fn solved(&self, grid: &Grid, spots: &[Spot], most_steps: usize) -> Option<(Self, System)> {
+        let mut best = *self;
+        // Differences beyond this pull no harder; about thrice what they are once the fit is good.
+        let mut limit = 0.25 * best.light.contrast.abs();
+        let mut system = best.system(grid, spots, limit)?;
+        let mut damping = 1e-3;
+        for step in 0..most_steps {
+            let moved = best.stepped(&system, damping);
+            match moved.and_then(|next| Some((next, next.system(grid, spots, limit)?))) {
+                Some((next, next_system)) if next_system.cost <= system.cost => {
+                    let settled = system.cost - next_system.cost < 1e-4 * system.cost;
+                    (best, system) = (next, next_system);
+                    damping = (damping * 0.1).max(1e-7);
+                    let rms = (system.cost / spots.len() as f64).sqrt();
+                    if step >= 1 && 3.0 * rms + 1.0 < 0.8 * limit {
+                        limit = 3.0 * rms + 1.0;
+                        system = best.system(grid, spots, limit)?;
+                    } else if settled && step > 1 {
+                        break;
+                    }
+                }
+                _ => {
+                    damping *= 20.0;
+                    if damping > 1e4 {
+                        break;
+                    }
+                }
+            }
+        }
+        Some((best, system))
+    }
+
+    fn system(&self, grid: &Grid, spots: &[Spot], limit: f64) -> Option<System> {
+        let mut system = System {
+            matrix: [[0.0; UNKNOWNS]; UNKNOWNS],
+            right: [0.0; UNKNOWNS],
+            cost: 0.0,
+            squares: 0.0,
+            weight: 0.0,
+        };
+        let inverse = self.homography.inverse();
+        let light = &self.light;
+        for spot in spots {
+            let spread = grid.spread(&inverse, spot.ideal, light.spread_px)?;
+            let look = grid.look_at(&spread, light.spread_px);
+            let [x, y] = spot.ideal.map(|p| p / self.half_px);
+            let shade = 1.0 + light.shade[0] * x + light.shade[1] * y;
+            let flat = light.black + light.contrast * look.white;
+            let predicted = flat * shade;
+            // Where the sensor has reached its end, nothing more can be asked of it.
+            if spot.grey >= 255.0 && predicted > 254.5 || spot.grey <= 0.0 && predicted < 0.5 {
+                continue;
+            }
+            let difference = spot.grey - predicted;
+            let size = difference.abs();
+            let weight = if size > limit { limit / size } else { 1.0 };
+            system.cost += if size > limit { limit * (2.0 * size - limit) } else { size * size };
+            system.squares += weight * size * size;
+            system.weight += weight;
+            let place = self.homography.at(look.square);
+            let tilt = look.by_place.map(|by| -shade * light.contrast * by);
+            let moved = place.along(tilt);
+            let mut slope = [0.0; UNKNOWNS];
+            slope[..8].copy_from_slice(&moved);
+            slope[8] = shade * light.contrast * look.by_spread;
+            slope[9] = shade;
+            slope[10] = shade * look.white;
+            slope[11] = flat * x;
+            slope[12] = flat * y;
+            for (i, row) in system.matrix.iter_mut().enumerate() {
+                let scaled = weight * slope[i];
+                system.right[i] += scaled * difference;
+                for (entry, other) in row[i..].iter_mut().zip(&slope[i..]) {
+                    *entry += scaled * other;
+                }
+            }
+        }
+        (system.cost.is_finite() && system.weight > UNKNOWNS as f64).then_some(system)
+    }
+
+    fn stepped(&self, system: &System, damping: f64) -> Option<Self> {
+        let mut matrix = system.full();
+        for i in 0..UNKNOWNS {
+            matrix[(i, i)] += damping * matrix[(i, i)] + 1e-9;
+        }
+        let step = matrix.cholesky()?.solve(&SVector::from(system.right));
+        let light = &self.light;
+        let spread_px = light.spread_px + step[8].clamp(-0.3, 0.3);
+        Some(Self {
+            homography: self.homography.moved(|i| step[i])?,
+            light: Picture {
+                black: light.black + step[9],
+                contrast: light.contrast + step[10],
+                shade: [light.shade[0] + step[11], light.shade[1] + step[12]]
+                    .map(|s| s.clamp(-0.9, 0.9)),
+                spread_px: spread_px.clamp(SPREAD_LIMITS_PX.0, SPREAD_LIMITS_PX.1),
+            },
+            half_px: self.half_px,
+        })
+    }
+}
