@@ -9,7 +9,7 @@
 //! (Algorithms 1-15). [`rings`] is the mended one: `outline` takes ellipses from contours, `search` goes from a ring
 //! to the marker, `circles` and, for small markers, `photometry` give its pose, `lens` serves images of unknown
 //! cameras. [`trace`] is what they saw on the way, [`debug`] draws that
-//! on a [`canvas`] with its [`letters`].
+//! on a [`canvas`] with its [`letters`]. [`tracking`] searches first where the markers of the last images should be.
 
 pub mod canvas;
 mod circles;
@@ -31,6 +31,7 @@ pub mod square;
 mod stag;
 mod step;
 pub mod trace;
+pub mod tracking;
 
 pub use detector::{Detector, DetectorError, Settings};
 pub use drawing::{Drawing, Ink, Layer, Shape};
@@ -39,3 +40,4 @@ pub use observation::{MarkerPose, Observation, PoseSolution, Stages};
 pub use pose::{PlanePoint, planar_pose, square_pose};
 pub use ring::{Ring, RingKind};
 pub use trace::{Candidate, Reason, Refusal, Trace, TracedMarker};
+pub use tracking::{Tracker, TrackingSettings};

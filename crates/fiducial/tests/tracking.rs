@@ -1,0 +1,72 @@
+//! Following a marker through rendered frames finds what searching whole frames finds.
+#![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
+
+mod render;
+
+use fiducial::{Detector, Settings, Tracker, TrackingSettings};
+use geometry::CameraModel;
+use imaging::GrayImage;
+use render::{SIZE_M, Scene};
+
+/// A marker that crosses the image, with a jump in the middle, and is out of sight in two frames.
+fn frames(camera: CameraModel) -> Vec<(Option<Scene>, GrayImage)> {
+    let frame = |i: u32| {
+        let along = f64::from(i) * 0.03 + if i < 10 { 0.0 } else { 0.6 };
+        let mut scene = Scene::new(camera, [along - 0.9, 0.3 - 0.4 * along, 4.0], 0.1, 0.3);
+        scene.seed = u64::from(i) + 1;
+        match i {
+            14 | 15 => {
+                (None, GrayImage::filled(camera.width as usize, camera.height as usize, 110))
+            }
+            _ => (Some(scene), scene.render()),
+        }
+    };
+    (0..24).map(frame).collect()
+}
+
+/// Counts the searches, by what a search always tells first.
+#[derive(Default)]
+struct Stages {
+    first: Option<&'static str>,
+    searches: usize,
+}
+
+impl fiducial::Stages for Stages {
+    fn ended(&mut self, stage: &'static str) {
+        let first = *self.first.get_or_insert(stage);
+        self.searches += usize::from(stage == first);
+    }
+}
+
+#[test]
+fn a_marker_that_moves_jumps_and_vanishes_is_followed() {
+    let camera = CameraModel::pinhole(648, 486, 909.0);
+    let marker = format!("rings:{SIZE_M}").parse().unwrap();
+    let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+    let mut whole = Detector::new(&[marker], Settings::default()).unwrap();
+    let mut tracker = Tracker::new(TrackingSettings { full_search_period: 8 });
+    for (i, (scene, image)) in frames(camera).iter().enumerate() {
+        let view = image.view().unwrap();
+        let mut stages = Stages::default();
+        let time_s = i as f64 * 0.05;
+        let found =
+            tracker.detect(&mut detector, view, Some(&camera), time_s, &mut stages).to_vec();
+        let expected = whole.detect(view, Some(&camera), &mut ());
+        assert_eq!(
+            (found.len(), expected.len()),
+            (scene.iter().count(), scene.iter().count()),
+            "{i}"
+        );
+        if let (Some(scene), Some(found)) = (scene, found.first()) {
+            assert!(found.centre.distance(&expected[0].centre) < 0.02, "{i}");
+            let at = found.pose.unwrap().camera_from_marker.origin();
+            let truth = scene.camera_from_marker.origin();
+            assert!((at.coords - truth.coords).norm() < 0.02, "{i}: {at:?}");
+            assert_eq!(tracker.trace().markers.len(), 1);
+            assert!(tracker.trace().markers[0].centre.distance(&scene.centre()) < 0.5);
+        }
+        // The marker was not where it was expected after the jump and when it vanished.
+        let searches = if matches!(i, 10 | 14) { 2 } else { 1 };
+        assert_eq!(stages.searches, searches, "{i}");
+    }
+}
