@@ -13,6 +13,8 @@ mod painter;
 mod painting;
 mod sensor;
 
+use std::sync::Arc;
+
 use fiducial::{Drawing, Ink, Marker, Shape};
 use geometry::{
     Body, Camera, CameraModel, Distortion, Marker as MarkerFrame, Ned, Point, Rotation, Transform,
@@ -222,7 +224,7 @@ impl CameraSettings {
 pub struct Renderer {
     settings: CameraSettings,
     lens: Lens,
-    ground: Ground,
+    ground: Arc<Ground>,
     sensor: Sensor,
     levels_per_reflectance: f32,
     paintings: Vec<Painting>,
@@ -258,6 +260,20 @@ impl Renderer {
     /// [`RenderError::Setting`] when a setting or a pad's size makes no sense.
     pub fn new(scene: &Scene, settings: CameraSettings, seed: u64) -> Result<Self, RenderError> {
         settings.check()?;
+        Self::on(Arc::new(Ground::new(scene.surface, seed)), scene, settings, seed)
+    }
+
+    /// As [`Renderer::new`], on a ground that has grown already and may serve several renderers.
+    ///
+    /// # Errors
+    /// As [`Renderer::new`].
+    pub fn on(
+        ground: Arc<Ground>,
+        scene: &Scene,
+        settings: CameraSettings,
+        seed: u64,
+    ) -> Result<Self, RenderError> {
+        settings.check()?;
         if !(scene.light.is_finite() && scene.light >= 0.0) {
             return Err(RenderError::Setting("the light is below 0"));
         }
@@ -276,7 +292,7 @@ impl Renderer {
         };
         let most_coats = paintings.iter().map(|painting| painting.coats.len()).max().unwrap_or(0);
         Ok(Self {
-            ground: Ground::new(scene.surface, seed),
+            ground,
             sensor: Sensor::new(&settings, seed),
             levels_per_reflectance: settings.levels_per_reflectance(scene.light) as f32,
             views: paintings.iter().map(|_| view()).collect(),

@@ -39,7 +39,7 @@ impl Binning {
 
     /// At 4 x 4 a pixel is the sum of four of those at 2 x 2: the lens' blur is half as many pixels, light and well
     /// are four times as much, and four readings have twice the noise of one.
-    fn settings(self) -> CameraSettings {
+    pub fn settings(self) -> CameraSettings {
         let fine = CameraSettings::thesis();
         match self {
             Self::TwoByTwo => fine,

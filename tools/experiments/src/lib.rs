@@ -1,0 +1,12 @@
+//! The thesis' experiment with markers (section 4.3), wider: sets of rendered frames with truth, detectors run over
+//! them, scores, tables and figures.
+//!
+//! This crate knows cameras, markers and detectors as functions; it knows no vehicle and no network.
+//!
+//! Modules in reading order: [`shot`] takes one frame, through a [`veil`]; [`sets`] says which frames there are;
+//! [`store`] keeps them on disk.
+
+pub mod sets;
+pub mod shot;
+pub mod store;
+pub mod veil;

@@ -1,0 +1,158 @@
+//! What makes a marker hard to find that people see at once.
+
+use std::f64::consts::{FRAC_PI_4, TAU};
+
+use fiducial::Marker;
+use geometry::{Pixel, Point};
+use rand::RngExt;
+use rendering::CameraSettings;
+
+use super::{SIZE_M, Set, chance, view, with_id};
+use crate::shot::{Shot, pose};
+use crate::veil::{Line, Veil};
+
+const FRAMES: usize = 8;
+
+pub(super) fn shots(marker: Marker) -> Vec<Shot> {
+    let kinds = [shadow, glare, occlusion, contrast, noise, defocus, inverted, cut, cut_border];
+    let numbered = kinds.iter().enumerate();
+    numbered
+        .flat_map(|(kind, shot)| (0..FRAMES).map(move |frame| shot(marker, 100 * kind + frame)))
+        .collect()
+}
+
+/// A hard shadow's edge across the marker.
+fn shadow(marker: Marker, frame: usize) -> Shot {
+    let (shot, mut rng) = large(marker, frame);
+    let edge = Line {
+        through: beside(&shot, rng.random_range(-0.25..0.25), rng.random_range(-0.25..0.25)),
+        normal: rng.random_range(0.0..TAU),
+    };
+    let veil = Veil::Shadow {
+        edge,
+        soft_px: rng.random_range(1.5..4.0),
+        left: rng.random_range(0.12..0.35),
+    };
+    shot.with("shadow", veil)
+}
+
+/// A reflection that saturates a part of the marker.
+fn glare(marker: Marker, frame: usize) -> Shot {
+    let (shot, mut rng) = large(marker, frame);
+    let size_px = shot.size_px();
+    let centre = beside(&shot, rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
+    let veil = Veil::Glare {
+        centre,
+        radius_px: (size_px * rng.random_range(0.15..0.3)) as f32,
+        levels: rng.random_range(220.0..500.0),
+    };
+    shot.with("glare", veil)
+}
+
+/// A corner of a square, or a third of the outer ring, behind something.
+fn occlusion(marker: Marker, frame: usize) -> Shot {
+    let (shot, mut rng) = large(marker, frame);
+    // From the centre in marker sizes: the chord that hides a third of a circle, or a corner with legs of this part.
+    let (towards, away) = if marker.family.id_count().is_none() {
+        (rng.random_range(0.0..TAU), 0.25)
+    } else {
+        let corner = f64::from(rng.random_range(0..4));
+        let legs = rng.random_range(0.18..0.32);
+        (FRAC_PI_4 + corner * TAU / 4.0, (1.0 - legs) * std::f64::consts::FRAC_1_SQRT_2)
+    };
+    let (sin, cos) = towards.sin_cos();
+    let level = [20.0, 90.0, 230.0][frame % 3];
+    let (through, centre) = (beside(&shot, away * cos, away * sin), beside(&shot, 0.0, 0.0));
+    let normal = (through.y - centre.y).atan2(through.x - centre.x);
+    shot.with("occlusion", Veil::Cover { edge: Line { through, normal }, level })
+}
+
+/// Haze that leaves little of the contrast.
+fn contrast(marker: Marker, frame: usize) -> Shot {
+    let (shot, mut rng) = large(marker, frame);
+    let veil =
+        Veil::Haze { left: rng.random_range(0.07..0.16), levels: rng.random_range(40.0..150.0) };
+    shot.with("contrast", veil)
+}
+
+/// The amplified picture of a dark place.
+fn noise(marker: Marker, frame: usize) -> Shot {
+    let light = 0.002 * (1.0 + (frame % 4) as f64);
+    let settings = CameraSettings::thesis().exposed_for(light, 200.0, 0.004);
+    let (mut shot, _) = view(marker, settings, (Set::Adverse, frame), 60.0..140.0, 0.4);
+    shot.light = light;
+    shot.with("noise", Veil::Nothing)
+}
+
+/// Out of focus.
+fn defocus(marker: Marker, frame: usize) -> Shot {
+    let blur_px = 2.0 + 0.14 * (frame % FRAMES) as f64;
+    let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
+    let (shot, _) = view(marker, settings, (Set::Adverse, frame), 45.0..90.0, 0.4);
+    shot.with("defocus", Veil::Nothing)
+}
+
+/// White on black.
+fn inverted(marker: Marker, frame: usize) -> Shot {
+    let (mut shot, _) = large(marker, frame);
+    shot.inverted = true;
+    shot.with("inverted", Veil::Nothing)
+}
+
+/// A corner beyond the border of the frame.
+fn cut(marker: Marker, frame: usize) -> Shot {
+    // A corner with legs of this part of the edge is missing.
+    cut_by(marker, frame, |rng| {
+        let legs = rng.random_range(0.15..0.32);
+        (FRAC_PI_4 + rng.random_range(-0.25..0.25), (1.0 - legs) * 0.68)
+    })
+    .with("cut", Veil::Nothing)
+}
+
+/// Half of one edge's border beyond the border of the frame; of rings almost half the marker.
+fn cut_border(marker: Marker, frame: usize) -> Shot {
+    let without_ids = marker.family.id_count().is_none();
+    cut_by(marker, frame, |rng| {
+        let away = if without_ids { 0.1 } else { 0.47 };
+        (rng.random_range(-0.02..0.02), away)
+    })
+    .with("cut-border", Veil::Nothing)
+}
+
+/// A marker whose centre is so many of its sizes from a side of the frame, turned by so much against it.
+fn cut_by(
+    marker: Marker,
+    frame: usize,
+    how: impl Fn(&mut rand_chacha::ChaCha8Rng) -> (f64, f64),
+) -> Shot {
+    let (mut rng, seed) = chance(Set::Adverse, frame);
+    let settings = CameraSettings::thesis();
+    let model = settings.model;
+    let size_px = rng.random_range(80.0..300.0);
+    let (turned, away) = how(&mut rng);
+    let away_px = away * size_px;
+    let [right, bottom] = [model.width, model.height].map(|edge| f64::from(edge) - 0.5);
+    let along = rng.random_range(0.3..0.7);
+    let at = match frame % 4 {
+        0 => Pixel::new(away_px - 0.5, bottom * along),
+        1 => Pixel::new(right - away_px, bottom * along),
+        2 => Pixel::new(right * along, away_px - 0.5),
+        _ => Pixel::new(right * along, bottom - away_px),
+    };
+    let heading = turned + f64::from(rng.random_range(0..4)) * TAU / 4.0;
+    let pose = pose(&model, at, model.fx * SIZE_M / size_px, (0.0, 0.0), heading);
+    Shot::of(with_id(marker, frame), settings, pose, seed)
+}
+
+fn large(marker: Marker, frame: usize) -> (Shot, rand_chacha::ChaCha8Rng) {
+    view(marker, CameraSettings::thesis(), (Set::Adverse, frame), 60.0..160.0, 0.4)
+}
+
+/// Where a place on the marker appears, given in marker sizes from its centre.
+fn beside(shot: &Shot, x: f64, y: f64) -> Pixel {
+    let seen = shot.path.first().and_then(|camera_from_marker| {
+        let place = *camera_from_marker * Point::new(x * SIZE_M, y * SIZE_M, 0.0);
+        shot.settings.model.project(place)
+    });
+    seen.unwrap_or(Pixel::new(0.0, 0.0))
+}

@@ -1,0 +1,182 @@
+//! Sets on disk: `FOLDER/SET/FAMILY/`, a PNG file for each frame and a line of JSON for each in `truth.jsonl`.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use fiducial::Marker;
+use geometry::{CameraModel, Distortion, Pixel, Point, Rotation, Transform};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+use serde::{Deserialize, Serialize};
+
+use crate::sets::Set;
+use crate::shot::{Shot, Studio};
+
+/// The file that says what the frames beside it show.
+pub const TRUTH: &str = "truth.jsonl";
+
+/// A frame and what it shows.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Frame {
+    /// Its file, in the folder of its truth.
+    pub image: String,
+    /// The set.
+    pub set: String,
+    /// The group of the set.
+    pub group: String,
+    /// The camera.
+    pub camera: CameraLine,
+    /// The marker; none in a negative.
+    pub marker: Option<MarkerLine>,
+}
+
+/// A camera, as OpenCV states one.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CameraLine {
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Focal lengths in pixels.
+    pub fx: f64,
+    /// Focal lengths in pixels.
+    pub fy: f64,
+    /// Principal point in pixels.
+    pub cx: f64,
+    /// Principal point in pixels.
+    pub cy: f64,
+    /// k1, k2, p1, p2, k3, k4, k5, k6 of Brown and Conrady; empty for a pinhole.
+    pub distortion: Vec<f64>,
+}
+
+/// A marker and where it is.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MarkerLine {
+    /// Its family.
+    pub family: String,
+    /// Its id.
+    pub id: Option<u32>,
+    /// Its size in metres.
+    pub size_m: f64,
+    /// Where its centre appears.
+    pub centre_px: [f64; 2],
+    /// Its corners, its own top left first, then clockwise; of rings those of the square about the outer circle.
+    pub corners_px: [[f64; 2]; 4],
+    /// Its largest edge in the image.
+    pub size_px: f64,
+    /// Whether the square is all in the frame.
+    pub is_whole: bool,
+    /// Its place in the camera frame.
+    pub translation_m: [f64; 3],
+    /// Its orientation in the camera frame.
+    pub rotation_wxyz: [f64; 4],
+}
+
+impl CameraLine {
+    fn of(model: &CameraModel) -> Self {
+        let CameraModel { width, height, fx, fy, cx, cy, distortion } = *model;
+        let distortion = match distortion {
+            Distortion::BrownConrady(k) => k.to_vec(),
+            _ => Vec::new(),
+        };
+        Self { width, height, fx, fy, cx, cy, distortion }
+    }
+
+    /// The camera's model.
+    pub fn model(&self) -> CameraModel {
+        let Self { width, height, fx, fy, cx, cy, .. } = *self;
+        let distortion = match <[f64; 8]>::try_from(self.distortion.as_slice()) {
+            Ok(k) => Distortion::BrownConrady(k),
+            Err(_) => Distortion::None,
+        };
+        CameraModel { width, height, fx, fy, cx, cy, distortion }
+    }
+}
+
+impl MarkerLine {
+    fn of(shot: &Shot) -> Option<Self> {
+        let (marker, shown) = (shot.marker?, shot.shown()?);
+        let pixel = |p: Pixel| [p.x, p.y];
+        let origin = shown.camera_from_marker.origin();
+        Some(Self {
+            family: marker.family.name().to_owned(),
+            id: marker.id,
+            size_m: marker.size_m?,
+            centre_px: pixel(shown.centre),
+            corners_px: shown.corners.map(pixel),
+            size_px: shot.size_px(),
+            is_whole: shot.is_whole(),
+            translation_m: [origin.x(), origin.y(), origin.z()],
+            rotation_wxyz: shown.camera_from_marker.rotation().wxyz(),
+        })
+    }
+
+    /// The marker in the camera frame; `None` when the rotation is none.
+    pub fn camera_from_marker(&self) -> Option<Transform<geometry::Camera, geometry::Marker>> {
+        let [x, y, z] = self.translation_m;
+        Some(Transform::new(Rotation::from_wxyz(self.rotation_wxyz)?, Point::new(x, y, z)))
+    }
+}
+
+/// The folder of a set with one marker.
+pub fn folder(root: &Path, set: Set, marker: Marker) -> PathBuf {
+    let root = root.join(set.name());
+    if set.has_marker() { root.join(marker.family.name()) } else { root }
+}
+
+/// Renders a set with one marker, unless it is there; says how many frames it has.
+///
+/// # Errors
+/// When a file cannot be written.
+pub fn make(root: &Path, set: Set, marker: Marker, studio: &mut Studio) -> anyhow::Result<usize> {
+    let folder = folder(root, set, marker);
+    let truth = folder.join(TRUTH);
+    if let Ok(text) = std::fs::read_to_string(&truth) {
+        return Ok(text.lines().count());
+    }
+    std::fs::create_dir_all(&folder).with_context(|| format!("making {}", folder.display()))?;
+    // The truth is complete when it has its name.
+    let unfinished = folder.join("truth.unfinished");
+    let mut lines = BufWriter::new(File::create(&unfinished)?);
+    let shots = set.shots(marker);
+    for (index, shot) in shots.iter().enumerate() {
+        let image = format!("{index:04}-{}.png", shot.group);
+        let pixels = studio.take(shot)?;
+        let camera = CameraLine::of(&shot.settings.model);
+        write_png(&folder.join(&image), &pixels, &camera)?;
+        let frame = Frame {
+            image,
+            set: set.name().to_owned(),
+            group: shot.group.clone(),
+            camera,
+            marker: MarkerLine::of(shot),
+        };
+        serde_json::to_writer(&mut lines, &frame)?;
+        lines.write_all(b"\n")?;
+    }
+    lines.flush()?;
+    std::fs::rename(&unfinished, &truth)?;
+    Ok(shots.len())
+}
+
+fn write_png(path: &Path, pixels: &[u8], camera: &CameraLine) -> anyhow::Result<()> {
+    let file = BufWriter::new(File::create(path)?);
+    PngEncoder::new_with_quality(file, CompressionType::Fast, FilterType::Up)
+        .write_image(pixels, camera.width, camera.height, ExtendedColorType::L8)
+        .with_context(|| format!("writing {}", path.display()))
+}
+
+/// The frames of a folder.
+///
+/// # Errors
+/// When the truth is missing or damaged.
+pub fn frames(folder: &Path) -> anyhow::Result<Vec<Frame>> {
+    let path = folder.join(TRUTH);
+    let text =
+        std::fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?;
+    text.lines()
+        .map(|line| serde_json::from_str(line).with_context(|| path.display().to_string()))
+        .collect()
+}
