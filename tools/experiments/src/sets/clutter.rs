@@ -104,7 +104,7 @@ fn square(half_m: f64, ink: Ink) -> Layer {
 }
 
 fn disc(radius_m: f64, ink: Ink) -> Layer {
-    Layer { shape: Shape::Disc { radius_m }, ink }
+    Layer { shape: Shape::Disc { centre_m: [0.0; 2], radius_m }, ink }
 }
 
 fn drawing(half_extent_m: f64, layers: Vec<Layer>) -> Drawing {
