@@ -41,7 +41,8 @@ const KINDS: [(&str, fn(&mut ChaCha8Rng) -> Drawing); 10] = [
 fn shot(frame: usize) -> Shot {
     let (mut rng, seed) = chance(Set::Negatives, frame);
     // A few large pictures cost as much time as many small ones.
-    let binning = if frame % 4 == 0 { Binning::TwoByTwo } else { Binning::FourByFour };
+    let binning =
+        if frame / KINDS.len() % 4 == 0 { Binning::TwoByTwo } else { Binning::FourByFour };
     let light = 10f64.powf(rng.random_range(-1.5..0.2));
     let settings = binning.settings().exposed_for(light, rng.random_range(120.0..260.0), 0.004);
     let model = settings.model;
@@ -57,7 +58,7 @@ fn shot(frame: usize) -> Shot {
         inverted: false,
         settings,
         path: vec![pose],
-        surface: Surface::ALL[frame % 4],
+        surface: Surface::ALL[frame / KINDS.len() % 4],
         painted_marks: rng.random_range(0..60),
         light,
         veil: Veil::Nothing,
