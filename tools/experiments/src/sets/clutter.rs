@@ -24,8 +24,11 @@ pub(super) fn shots() -> Vec<Shot> {
     (0..SCENES).map(shot).collect()
 }
 
+/// A name, and a drawing of chance.
+type Kind = (&'static str, fn(&mut ChaCha8Rng) -> Drawing);
+
 /// What a scene is full of.
-const KINDS: [(&str, fn(&mut ChaCha8Rng) -> Drawing); 10] = [
+const KINDS: [Kind; 10] = [
     ("squares", squares),
     ("circles", circles),
     ("text", text),
@@ -41,8 +44,11 @@ const KINDS: [(&str, fn(&mut ChaCha8Rng) -> Drawing); 10] = [
 fn shot(frame: usize) -> Shot {
     let (mut rng, seed) = chance(Set::Negatives, frame);
     // A few large pictures cost as much time as many small ones.
-    let binning =
-        if frame / KINDS.len() % 4 == 0 { Binning::TwoByTwo } else { Binning::FourByFour };
+    let binning = if (frame / KINDS.len()).is_multiple_of(4) {
+        Binning::TwoByTwo
+    } else {
+        Binning::FourByFour
+    };
     let light = 10f64.powf(rng.random_range(-1.5..0.2));
     let settings = binning.settings().exposed_for(light, rng.random_range(120.0..260.0), 0.004);
     let model = settings.model;
