@@ -137,6 +137,21 @@ mod tests {
     }
 
     #[test]
+    fn every_family_is_written() {
+        let folder = tempfile::tempdir().unwrap();
+        for family in fiducial::Family::ALL {
+            let marker = match family.id_count() {
+                Some(count) => format!("{family}:{}:0.1", count - 1),
+                None => format!("{family}:0.1"),
+            };
+            for name in ["a.pdf", "a.svg", "a.png"] {
+                let path = folder.path().join(name);
+                write(&[&marker, "--dpi", "72", "-o", path.to_str().unwrap()]).unwrap();
+            }
+        }
+    }
+
+    #[test]
     fn wrong_use_is_explained() {
         let check = |text: &[&str], part: &str| {
             let problem = write(text).unwrap_err();

@@ -42,26 +42,28 @@ fn drawn(sheet: &Sheet) -> Vec<u8> {
     let mut content = Content::new();
     // The origin of a PDF page is its bottom left corner.
     let flip = |[x, y]: [f64; 2]| [x, sheet.size_mm[1] - y];
-    for mark in &sheet.marks {
-        match mark {
-            Mark::Disc { centre_mm, radius_mm, ink } => {
-                set_ink(&mut content, *ink);
-                circle(&mut content, flip(*centre_mm), *radius_mm);
-                content.fill_nonzero();
+    // Shapes of one ink that follow each other are filled at once: viewers leave hairlines between two that touch.
+    for marks in sheet.marks.chunk_by(|a, b| a.ink() == b.ink() && a.ink().is_some()) {
+        set_ink(&mut content, marks[0].ink().unwrap_or(Ink::Black));
+        for mark in marks {
+            match mark {
+                Mark::Disc { centre_mm, radius_mm, .. } => {
+                    circle(&mut content, flip(*centre_mm), *radius_mm);
+                }
+                Mark::Rectangle { min_mm, max_mm, .. } => {
+                    let [left, bottom] = flip([min_mm[0], max_mm[1]]);
+                    let size = [max_mm[0] - min_mm[0], max_mm[1] - min_mm[1]].map(units);
+                    content.rect(units(left), units(bottom), size[0], size[1]);
+                }
+                Mark::Text { at_mm, text } => {
+                    let [x, y] = flip(*at_mm).map(units);
+                    content.begin_text().set_font(FONT, units(TEXT_MM)).next_line(x, y);
+                    content.show(Str(text.as_bytes())).end_text();
+                }
             }
-            Mark::Rectangle { min_mm, max_mm, ink } => {
-                set_ink(&mut content, *ink);
-                let [left, bottom] = flip([min_mm[0], max_mm[1]]);
-                let size = [max_mm[0] - min_mm[0], max_mm[1] - min_mm[1]].map(units);
-                content.rect(units(left), units(bottom), size[0], size[1]);
-                content.fill_nonzero();
-            }
-            Mark::Text { at_mm, text } => {
-                set_ink(&mut content, Ink::Black);
-                let [x, y] = flip(*at_mm).map(units);
-                content.begin_text().set_font(FONT, units(TEXT_MM)).next_line(x, y);
-                content.show(Str(text.as_bytes())).end_text();
-            }
+        }
+        if marks[0].ink().is_some() {
+            content.fill_nonzero();
         }
     }
     content.finish().into_vec()

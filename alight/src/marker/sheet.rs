@@ -140,6 +140,16 @@ pub(super) enum Mark {
     Text { at_mm: [f64; 2], text: String },
 }
 
+impl Mark {
+    /// What a shape is filled with; text is written, not filled.
+    pub(super) fn ink(&self) -> Option<Ink> {
+        match self {
+            Self::Disc { ink, .. } | Self::Rectangle { ink, .. } => Some(*ink),
+            Self::Text { .. } => None,
+        }
+    }
+}
+
 /// A sheet of paper with a marker in its middle.
 #[derive(Clone, Debug)]
 pub(super) struct Sheet {

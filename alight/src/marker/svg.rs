@@ -2,7 +2,8 @@
 
 use fiducial::Ink;
 use svg::Document;
-use svg::node::element::{Circle, Rectangle, Text};
+use svg::node::element::path::Data;
+use svg::node::element::{Circle, Path, Rectangle, Text};
 
 use super::sheet::{Mark, Sheet, TEXT_MM};
 
@@ -15,34 +16,46 @@ pub(super) fn document(sheet: &Sheet) -> String {
         .set("height", format!("{height}mm"))
         .set("viewBox", (0, 0, width, height))
         .add(paper);
-    sheet
-        .marks
-        .iter()
-        .fold(document, |document, mark| match mark {
-            Mark::Disc { centre_mm: [x, y], radius_mm, ink } => document.add(
-                Circle::new()
-                    .set("cx", rounded(*x))
-                    .set("cy", rounded(*y))
-                    .set("r", rounded(*radius_mm))
-                    .set("fill", colour(*ink)),
-            ),
-            Mark::Rectangle { min_mm: [left, top], max_mm: [right, bottom], ink } => document.add(
-                Rectangle::new()
-                    .set("x", rounded(*left))
-                    .set("y", rounded(*top))
-                    .set("width", rounded(right - left))
-                    .set("height", rounded(bottom - top))
-                    .set("fill", colour(*ink)),
-            ),
-            Mark::Text { at_mm: [x, y], text } => document.add(
-                Text::new(text.as_str())
-                    .set("x", rounded(*x))
-                    .set("y", rounded(*y))
-                    .set("font-family", "Helvetica, Arial, sans-serif")
-                    .set("font-size", TEXT_MM),
-            ),
-        })
-        .to_string()
+    // Shapes of one ink that follow each other are filled at once: viewers leave hairlines between two that touch.
+    let runs = sheet.marks.chunk_by(|a, b| match (a, b) {
+        (Mark::Rectangle { ink: a, .. }, Mark::Rectangle { ink: b, .. }) => a == b,
+        _ => false,
+    });
+    runs.fold(document, |document, marks| match &marks[0] {
+        Mark::Disc { centre_mm: [x, y], radius_mm, ink } => document.add(
+            Circle::new()
+                .set("cx", rounded(*x))
+                .set("cy", rounded(*y))
+                .set("r", rounded(*radius_mm))
+                .set("fill", colour(*ink)),
+        ),
+        Mark::Rectangle { ink, .. } => {
+            document.add(Path::new().set("d", outline(marks)).set("fill", colour(*ink)))
+        }
+        Mark::Text { at_mm: [x, y], text } => document.add(
+            Text::new(text.as_str())
+                .set("x", rounded(*x))
+                .set("y", rounded(*y))
+                .set("font-family", "Helvetica, Arial, sans-serif")
+                .set("font-size", TEXT_MM),
+        ),
+    })
+    .to_string()
+}
+
+/// The rectangles' outlines.
+fn outline(marks: &[Mark]) -> Data {
+    marks.iter().fold(Data::new(), |data, mark| match mark {
+        Mark::Rectangle { min_mm, max_mm, .. } => {
+            let ([left, top], [right, bottom]) = (min_mm.map(rounded), max_mm.map(rounded));
+            data.move_to((left, top))
+                .horizontal_line_to(right)
+                .vertical_line_to(bottom)
+                .horizontal_line_to(left)
+                .close()
+        }
+        Mark::Disc { .. } | Mark::Text { .. } => data,
+    })
 }
 
 /// To a tenth of a micrometre, which no printer can tell apart.
@@ -62,6 +75,25 @@ mod tests {
     use super::*;
     use crate::marker::sheet::Paper;
     use svg::parser::Event;
+
+    #[test]
+    fn cells_of_one_ink_are_one_outline() {
+        let sheet = Sheet::new(&"apriltag-16h5:0".parse().unwrap(), 0.12, Paper::A4).unwrap();
+        let text = document(&sheet);
+        let paths: Vec<_> = svg::read(&text)
+            .unwrap()
+            .filter_map(|event| match event {
+                Event::Tag("path", _, attributes) => {
+                    Some((attributes["d"].to_string(), attributes["fill"].to_string()))
+                }
+                _ => None,
+            })
+            .collect();
+        // The black square, the white cells on it, and the lines beside it.
+        assert_eq!(paths.len(), 3);
+        assert_eq!(paths[0], ("M45,88.5 H165 V208.5 H45 z".to_owned(), "black".to_owned()));
+        assert_eq!(paths[1].1, "white");
+    }
 
     #[test]
     fn the_rings_are_read_back_where_table_3_1_puts_them() {
