@@ -141,8 +141,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         for family in fiducial::Family::ALL {
             let marker = match family.id_count() {
-                Some(count) => format!("{family}:{}:0.1", count - 1),
-                None => format!("{family}:0.1"),
+                Some(count) => format!("{family}:{}:0.07", count - 1),
+                None => format!("{family}:0.07"),
             };
             for name in ["a.pdf", "a.svg", "a.png"] {
                 let path = folder.path().join(name);
