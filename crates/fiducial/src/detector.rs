@@ -1,12 +1,13 @@
 //! The detector: markers in, observations out.
 
 use geometry::CameraModel;
-use imaging::GrayView;
+use imaging::{GrayView, Outlines, outline};
 
 use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
 use crate::rings::Rings;
 use crate::rings_thesis::RingsThesis;
+use crate::square::Squares;
 use crate::trace::{Trace, TracedMarker};
 
 /// What can be chosen about a detection.
@@ -42,6 +43,8 @@ pub enum DetectorError {
 pub struct Detector {
     markers: Vec<Marker>,
     settings: Settings,
+    outlines: Outlines,
+    squares: Squares,
     rings: Rings,
     thesis: RingsThesis,
     found: Vec<Observation>,
@@ -65,6 +68,8 @@ impl Detector {
         Ok(Self {
             markers: markers.to_vec(),
             settings,
+            outlines: Outlines::default(),
+            squares: Squares::new(markers),
             rings: Rings::default(),
             thesis: RingsThesis::default(),
             found: Vec::new(),
@@ -82,6 +87,14 @@ impl Detector {
     ) -> &[Observation] {
         self.found.clear();
         self.trace.clear();
+        if !self.squares.is_empty() {
+            let bright_from = self.squares.has_bright().then_some(0);
+            let settings = outline::Settings { bright_from, ..outline::Settings::default() };
+            self.outlines.find(view, &settings);
+            stages.ended("outlines");
+            let watch = (&mut self.trace, &mut *stages);
+            self.squares.detect(view, &self.outlines, camera, watch, &mut self.found);
+        }
         for marker in &self.markers {
             let watch = (&mut self.trace, &mut *stages);
             match marker.family {

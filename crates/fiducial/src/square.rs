@@ -1,10 +1,381 @@
-//! Square markers: [`code`] says which cells of which family carry which words, [`pattern`] which cells of a marker are
-//! black and white, [`refine`] where its corners are.
+//! Square markers: [`code`] says which cells of which family carry which words, [`quad`] finds four-sided outlines,
+//! `decode` reads their cells. [`pattern`] says which cells of a marker are black and white, [`refine`] where its corners
+//! are. [`Squares`] does it all, for any number of families at once.
 
 pub mod code;
 pub(crate) mod codebook;
+pub(crate) mod decode;
 pub mod pattern;
 mod picture;
 mod profiles;
+pub mod quad;
 pub mod refine;
 mod tables;
+
+use geometry::{CameraModel, Pixel};
+use imaging::{GrayView, Outline, Outlines, bilinear};
+use nalgebra::{Matrix2, SMatrix};
+
+use crate::marker::Marker;
+use crate::observation::{Observation, Stages};
+use crate::pose::square_pose;
+use crate::square::code::Code;
+use crate::square::decode::{Cells, Layout, Look};
+use crate::square::pattern::Pattern;
+use crate::square::quad::Quad;
+use crate::square::refine::{Refined, Scratch, refine};
+use crate::trace::{Reason, Trace};
+
+/// Bounds on the work in one image, far above what frames with markers need.
+const MOST_QUADS: usize = 4000;
+const MOST_SOLVED: usize = 600;
+const MOST_FOUND: usize = 256;
+
+/// How alike the steps from border to paper are all round a marker: the standard deviation as a share of the mean.
+const MOST_UNEVEN: f64 = 0.6;
+/// Share of the variance of its pixels that a marker explains; textures that happen to spell a word explain less.
+const LEAST_EXPLAINED: f64 = 0.8;
+
+/// One family that is looked for, and which of its ids.
+#[derive(Debug)]
+struct Wanted {
+    code: &'static Code,
+    /// Index of the cells it shares with other families.
+    layout: usize,
+    markers: Vec<Marker>,
+}
+
+/// Finds the square markers of any number of families. It keeps its memory from image to image.
+#[derive(Debug, Default)]
+pub struct Squares {
+    wanted: Vec<Wanted>,
+    layouts: Vec<Layout>,
+    quads: Vec<Candidate>,
+    cells: Cells,
+    found: Vec<Found>,
+    scratch: Scratch,
+}
+
+#[derive(Copy, Clone, Debug)]
+struct Candidate {
+    quad: Quad,
+    unevenness: f64,
+}
+
+#[derive(Copy, Clone, Debug)]
+struct Found {
+    wanted: usize,
+    id: u32,
+    corners: [Pixel; 4],
+    wrong_bits: u8,
+    explained: f64,
+    margin: f64,
+}
+
+impl Squares {
+    /// Looks for these markers; those of families without square cells are left out.
+    pub fn new(markers: &[Marker]) -> Self {
+        let mut squares = Self::default();
+        for marker in markers {
+            let Some(code) = Code::of(marker.family) else {
+                continue;
+            };
+            if let Some(known) = squares.wanted.iter_mut().find(|w| w.code.family == marker.family)
+            {
+                known.markers.push(*marker);
+                continue;
+            }
+            let known = squares.layouts.iter().position(|layout| layout.fits(code));
+            let layout = match (known, Layout::of(code)) {
+                (Some(layout), _) => layout,
+                (None, Some(layout)) => {
+                    squares.layouts.push(layout);
+                    squares.layouts.len() - 1
+                }
+                (None, None) => continue,
+            };
+            squares.wanted.push(Wanted { code, layout, markers: vec![*marker] });
+        }
+        squares
+    }
+
+    /// True when there is nothing to look for.
+    pub fn is_empty(&self) -> bool {
+        self.wanted.is_empty()
+    }
+
+    /// Whether markers with a white border are among those looked for; their outlines are bright.
+    pub fn has_bright(&self) -> bool {
+        self.layouts.iter().any(|layout| layout.reversed)
+    }
+
+    /// Finds the markers among the outlines of an image.
+    pub fn detect(
+        &mut self,
+        view: GrayView<'_>,
+        outlines: &Outlines,
+        camera: Option<&CameraModel>,
+        (trace, stages): (&mut Trace, &mut impl Stages),
+        found: &mut Vec<Observation>,
+    ) {
+        self.quads.clear();
+        for outline in outlines.iter() {
+            self.consider(view, outlines, &outline, trace);
+            if self.quads.len() >= MOST_QUADS {
+                break;
+            }
+        }
+        stages.ended("quads");
+        self.found.clear();
+        self.read(view, outlines, trace);
+        stages.ended("codes");
+        let first = found.len();
+        for marker in &self.found {
+            if let Some(wanted) = self.wanted.get(marker.wanted) {
+                found.push(observe(view, marker, wanted, camera, &mut self.scratch));
+            }
+        }
+        found[first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
+        stages.ended("poses");
+    }
+
+    /// Keeps an outline that is a quad with an even border.
+    fn consider(
+        &mut self,
+        view: GrayView<'_>,
+        outlines: &Outlines,
+        outline: &Outline<'_>,
+        trace: &mut Trace,
+    ) {
+        let Some(quad) = Quad::of(outline) else {
+            return;
+        };
+        let Some(level) = outlines.pyramid().level(view, outline.level) else {
+            return;
+        };
+        let uneven = unevenness(&quad, level, outline.level);
+        if uneven <= MOST_UNEVEN {
+            self.quads.push(Candidate { quad, unevenness: uneven });
+        } else {
+            trace.refuse_quad(quad.corners, Reason::Border);
+        }
+    }
+
+    fn read(&mut self, view: GrayView<'_>, outlines: &Outlines, trace: &mut Trace) {
+        // The evenest first, so that a bound on the work costs the least likely ones.
+        self.quads.sort_unstable_by(|a, b| a.unevenness.total_cmp(&b.unevenness));
+        let mut solved = 0;
+        for index in 0..self.quads.len() {
+            let quad = self.quads[index].quad;
+            for layout in 0..self.layouts.len() {
+                if self.layouts[layout].reversed != quad.inverted || self.is_known(&quad, layout) {
+                    continue;
+                }
+                let cells = self.layouts[layout].cells;
+                let Some(look) = Look::at(&quad.corners, cells, view, outlines.pyramid()) else {
+                    continue;
+                };
+                solved += 1;
+                let read = self.cells.solve(&look, &self.layouts[layout]);
+                match if read { self.match_words(&quad, layout) } else { Err(Reason::Small) } {
+                    Ok(found) => {
+                        trace.accept_quad(quad.corners);
+                        self.found.push(found);
+                    }
+                    Err(reason) => trace.refuse_quad(quad.corners, reason),
+                }
+            }
+            if solved >= MOST_SOLVED || self.found.len() >= MOST_FOUND {
+                break;
+            }
+        }
+    }
+
+    /// Whether a marker with these cells was found where the quad is.
+    fn is_known(&self, quad: &Quad, layout: usize) -> bool {
+        let of_layout = |found: &&Found| self.wanted[found.wanted].layout == layout;
+        self.found.iter().filter(of_layout).any(|found| is_same(&found.corners, &quad.corners))
+    }
+
+    /// The family and id whose word the cells of a quad carry, or how near to one they are.
+    fn match_words(&self, quad: &Quad, layout: usize) -> Result<Found, Reason> {
+        let word = self.cells.word();
+        let mut best = Err(Reason::Code);
+        for (index, wanted) in self.wanted.iter().enumerate().filter(|(_, w)| w.layout == layout) {
+            let most = most_wrong(wanted.code);
+            let Some((id, turns, wrong_bits)) = wanted.code.match_word(word, most) else {
+                continue;
+            };
+            let is_better = match &best {
+                Ok(Found { wrong_bits: least, .. }) => wrong_bits < *least,
+                Err(_) => true,
+            };
+            if is_better {
+                best = self.admit(quad, index, (id, turns, wrong_bits));
+            }
+        }
+        best
+    }
+
+    /// A word that was read as a marker, if that is wanted and explains what is seen.
+    fn admit(
+        &self,
+        quad: &Quad,
+        index: usize,
+        (id, turns, wrong_bits): (u32, u8, u8),
+    ) -> Result<Found, Reason> {
+        let wanted = self.wanted.get(index).ok_or(Reason::Unwanted)?;
+        if !wanted.markers.iter().any(|m| m.id.is_none_or(|wanted| wanted == id)) {
+            return Err(Reason::Unwanted);
+        }
+        let word = wanted.code.words.get(id as usize).ok_or(Reason::Unwanted)?;
+        // The word as it stands in the picture.
+        let seen = (0..(4 - turns) % 4).fold(*word, |word, _| wanted.code.turned(word));
+        let explanation = self.cells.explain(seen);
+        let [dark, bright] = explanation.levels;
+        if bright <= dark {
+            return Err(Reason::Contrast);
+        }
+        let explained = explanation.explained;
+        if explained < LEAST_EXPLAINED {
+            return Err(Reason::Confidence);
+        }
+        let margin = (0..wanted.code.bits.len())
+            .map(|bit| (2.0 * self.cells.value(bit) - 1.0).abs())
+            .fold(f64::MAX, f64::min);
+        let mut corners = quad.corners;
+        corners.rotate_left(usize::from(turns) % 4);
+        Ok(Found { wanted: index, id, corners, wrong_bits, explained, margin })
+    }
+}
+
+/// How many wrong bits are mended. Families of few bits have words near most words; theirs must be read as they are.
+fn most_wrong(code: &Code) -> u8 {
+    match code.min_hamming {
+        0..=6 => 0,
+        7..=9 => 1,
+        10..=12 => 2,
+        _ => 3,
+    }
+}
+
+/// Whether two quads are of the same square, up to a turn.
+fn is_same(a: &[Pixel; 4], b: &[Pixel; 4]) -> bool {
+    let middle = |q: &[Pixel; 4]| {
+        Pixel::new(
+            q.iter().map(|c| c.x).sum::<f64>() / 4.0,
+            q.iter().map(|c| c.y).sum::<f64>() / 4.0,
+        )
+    };
+    let size = a[0].distance(&a[2]).max(a[1].distance(&a[3]));
+    let other = b[0].distance(&b[2]).max(b[1].distance(&b[3]));
+    middle(a).distance(&middle(b)) < 0.2 * size && other < 1.5 * size && size < 1.5 * other
+}
+
+/// Standard deviation of the steps from just within a quad to just outside, all round, as a share of their mean: in grey
+/// levels or, across the edge of a shadow, in their logarithms, whichever is less. Large where the mean is not positive.
+fn unevenness(quad: &Quad, view: GrayView<'_>, level: usize) -> f64 {
+    use imaging::pyramid::from_level_0;
+    const POINTS: usize = 6;
+    let corners = quad.corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
+    let (mut plain, mut logarithms) = (Spread::default(), Spread::default());
+    for side in 0..4 {
+        let ([ax, ay], [bx, by]) = (corners[side], corners[(side + 1) % 4]);
+        let (dx, dy) = (bx - ax, by - ay);
+        let length = dx.hypot(dy);
+        // To the left of a clockwise way is outside.
+        let off = (0.07 * length).max(0.7) / length;
+        let (nx, ny) = (dy * off, -dx * off);
+        for k in 0..POINTS {
+            let t = (k as f64 + 0.75) / (POINTS as f64 + 0.5);
+            let (x, y) = (ax + dx * t, ay + dy * t);
+            if let (Some(outer), Some(inner)) =
+                (bilinear(view, x + nx, y + ny), bilinear(view, x - nx, y - ny))
+            {
+                let (dark, bright) = if quad.inverted { (outer, inner) } else { (inner, outer) };
+                plain.add(bright - dark);
+                logarithms.add(((bright + 4.0) / (dark + 4.0)).ln());
+            }
+        }
+    }
+    plain.relative().min(logarithms.relative())
+}
+
+#[derive(Default)]
+struct Spread {
+    count: f64,
+    sum: f64,
+    squares: f64,
+}
+
+impl Spread {
+    fn add(&mut self, value: f64) {
+        self.count += 1.0;
+        self.sum += value;
+        self.squares += value * value;
+    }
+
+    /// Standard deviation as a share of the mean.
+    fn relative(&self) -> f64 {
+        let mean = self.sum / self.count;
+        let variance = self.squares / self.count - mean * mean;
+        if mean > 0.0 { variance.max(0.0).sqrt() / mean } else { f64::MAX }
+    }
+}
+
+/// The marker with its corners between the pixels and its pose.
+fn observe(
+    view: GrayView<'_>,
+    found: &Found,
+    wanted: &Wanted,
+    camera: Option<&CameraModel>,
+    scratch: &mut Scratch,
+) -> Observation {
+    let pattern =
+        wanted.code.words.get(found.id as usize).and_then(|w| Pattern::of(wanted.code, *w));
+    let refined = pattern
+        .and_then(|pattern| refine(view, &found.corners, &pattern, camera, scratch))
+        .unwrap_or_else(|| coarse(&found.corners));
+    let corners = refined.corners;
+    let named = wanted.markers.iter().find(|m| m.id == Some(found.id));
+    let marker = named.or_else(|| wanted.markers.iter().find(|m| m.id.is_none()));
+    let size_m = marker.and_then(|marker| marker.size_m);
+    let pose = camera.zip(size_m).and_then(|(camera, size_m)| {
+        square_pose(&corners, &refined.covariance_px2, size_m, camera)
+    });
+    Observation {
+        family: wanted.code.family,
+        id: Some(found.id),
+        centre: refined.centre,
+        centre_covariance_px2: refined.centre_covariance_px2,
+        corners: Some(corners),
+        wrong_bits: found.wrong_bits,
+        size_px: corners[0].distance(&corners[2]).max(corners[1].distance(&corners[3])),
+        confidence: found.explained * (0.5 + 0.5 * found.margin.min(1.0)),
+        pose,
+    }
+}
+
+/// Corners that could not be refined: of an outline they are good to some tenths of a pixel.
+fn coarse(corners: &[Pixel; 4]) -> Refined {
+    const CORNER_PX2: f64 = 0.2 * 0.2;
+    Refined {
+        corners: *corners,
+        covariance_px2: SMatrix::identity() * CORNER_PX2,
+        centre: crossing(corners),
+        centre_covariance_px2: Matrix2::identity() * (CORNER_PX2 / 4.0),
+        blur_px: 0.0,
+        black: 0.0,
+        white: 0.0,
+        residual: 1.0,
+    }
+}
+
+/// Where the diagonals of a quad cross: the image of the square's centre.
+fn crossing(corners: &[Pixel; 4]) -> Pixel {
+    let [a, b, c, d] = corners;
+    let (ux, uy) = (c.x - a.x, c.y - a.y);
+    let (vx, vy) = (d.x - b.x, d.y - b.y);
+    let t = ((b.x - a.x) * vy - (b.y - a.y) * vx) / (ux * vy - uy * vx);
+    Pixel::new(a.x + t * ux, a.y + t * uy)
+}

@@ -1,0 +1,280 @@
+//! A four-sided candidate, and which outlines are one.
+
+use geometry::Pixel;
+use imaging::Outline;
+use imaging::pyramid::to_level_0;
+
+/// A four-sided outline that may be a square marker's.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Quad {
+    /// Its corners, clockwise as seen in the image.
+    pub corners: [Pixel; 4],
+    /// Bright within, dark around.
+    pub inverted: bool,
+}
+
+impl Quad {
+    /// The quad that an outline is, its sides fitted to the outline's points; `None` when it is none.
+    pub(crate) fn of(outline: &Outline<'_>) -> Option<Self> {
+        let points = outline.points;
+        let indices = Self::corner_points(points)?;
+        let [width, height] = [0, 1].map(|i| f32::from(outline.bounds[i + 2] - outline.bounds[i]));
+        let size = width.max(height);
+        let mut lines = [Line::default(); 4];
+        for side in 0..4 {
+            let line = side_line(points, indices[side], indices[(side + 1) % 4])?;
+            if line.rms > LEAST_RMS_PX + RMS_PER_PX * size {
+                return None;
+            }
+            lines[side] = line;
+        }
+        let mut corners = [[0.0; 2]; 4];
+        for i in 0..4 {
+            corners[i] = lines[(i + 3) % 4].meets(&lines[i])?;
+            let seen = points[indices[i]];
+            let off = (corners[i][0] - seen[0]).hypot(corners[i][1] - seen[1]);
+            if off > MOST_CORNER_PX + MOST_CORNER_PER_PX * size {
+                return None;
+            }
+        }
+        let is_sound = is_sound(&corners, outline.area as f32);
+        is_sound.then(|| Self {
+            corners: corners.map(|[x, y]| {
+                let place = |at: f32| to_level_0(f64::from(at), outline.level);
+                Pixel::new(place(x), place(y))
+            }),
+            inverted: !outline.dark,
+        })
+    }
+
+    /// Indices of the points that are likeliest corners, in order: the farthest from the middle, the farthest from that
+    /// one, and the two farthest from the line between these.
+    fn corner_points(points: &[[f32; 2]]) -> Option<[usize; 4]> {
+        if points.len() < LEAST_POINTS {
+            return None;
+        }
+        let n = points.len() as f32;
+        let sum = points.iter().fold([0.0; 2], |[x, y], p| [x + p[0], y + p[1]]);
+        let first = farthest(points, [sum[0] / n, sum[1] / n]);
+        let third = farthest(points, points[first]);
+        let ([ax, ay], [bx, by]) = (points[first], points[third]);
+        let (mut second, mut fourth) = ((first, 0.0), (first, 0.0));
+        for (index, [x, y]) in points.iter().enumerate() {
+            // Positive to the right of the way from the first to the third, which clockwise is where the fourth lies.
+            let across = (bx - ax) * (y - ay) - (by - ay) * (x - ax);
+            if across > fourth.1 {
+                fourth = (index, across);
+            }
+            if across < second.1 {
+                second = (index, across);
+            }
+        }
+        let mut indices = [first, second.0, third, fourth.0];
+        if second.1 == 0.0 || fourth.1 == 0.0 {
+            return None;
+        }
+        // Two corners at the ends of a short side may not be the farthest; each corner is the point farthest from the line
+        // between its neighbours.
+        for i in [0, 2, 1, 3] {
+            let (before, after) = (indices[(i + 3) % 4], indices[(i + 1) % 4]);
+            indices[i] = farthest_from_line(points, before, after)?;
+        }
+        let turns = (0..4).filter(|i| indices[(i + 1) % 4] < indices[*i]).count();
+        (turns == 1).then_some(indices)
+    }
+}
+
+/// Fewer points are no outline of four sides.
+const LEAST_POINTS: usize = 12;
+/// Root mean square distance of a side's points from its line: so much, and more for each pixel of the outline's size.
+const LEAST_RMS_PX: f32 = 0.3;
+const RMS_PER_PX: f32 = 0.012;
+/// How far from the outline's extreme points its corners may be; blur rounds corners.
+const MOST_CORNER_PX: f32 = 1.6;
+const MOST_CORNER_PER_PX: f32 = 0.12;
+/// Share of a side, and pixels, at either end that do not count, as corners are rounded.
+const END_SHARE: f32 = 0.1;
+const END_PX: f32 = 1.0;
+
+fn farthest(points: &[[f32; 2]], from: [f32; 2]) -> usize {
+    let mut best = (0, -1.0);
+    for (index, [x, y]) in points.iter().enumerate() {
+        let distance = (x - from[0]).powi(2) + (y - from[1]).powi(2);
+        if distance > best.1 {
+            best = (index, distance);
+        }
+    }
+    best.0
+}
+
+/// Of the points from `before` to `after`, the one farthest to the left of the line between them.
+fn farthest_from_line(points: &[[f32; 2]], before: usize, after: usize) -> Option<usize> {
+    let ([ax, ay], [bx, by]) = (points[before], points[after]);
+    let mut best = (None, 0.0);
+    for (index, [x, y]) in between(points, before, after) {
+        let across = (by - ay) * (x - ax) - (bx - ax) * (y - ay);
+        if across > best.1 {
+            best = (Some(index), across);
+        }
+    }
+    best.0
+}
+
+/// The points from one index to another, round the end of the list where need be.
+fn between(
+    points: &[[f32; 2]],
+    from: usize,
+    to: usize,
+) -> impl Iterator<Item = (usize, &[f32; 2])> {
+    let all = points.iter().enumerate();
+    let (head, tail) = if from <= to { (0, to) } else { (to, points.len()) };
+    let wrapped = all.clone().take(head);
+    all.take(tail).skip(from).chain(wrapped)
+}
+
+/// A straight line through points: `normal` . p = `offset`.
+#[derive(Copy, Clone, Debug, Default)]
+struct Line {
+    normal: [f32; 2],
+    offset: f32,
+    rms: f32,
+}
+
+impl Line {
+    /// The line nearest to points, given their number and sums of x, y, xx, xy, yy about an origin.
+    fn through(sums: &[f32; 6], origin: [f32; 2]) -> Option<Self> {
+        let [n, x, y, xx, xy, yy] = *sums;
+        if n < 2.0 {
+            return None;
+        }
+        let (mx, my) = (x / n, y / n);
+        let (cxx, cxy, cyy) = (xx / n - mx * mx, xy / n - mx * my, yy / n - my * my);
+        let mean = (cxx + cyy) / 2.0;
+        let root = (((cxx - cyy) / 2.0).powi(2) + cxy * cxy).sqrt();
+        // The normal belongs to the smaller eigenvalue; the longer one of two ways to write it is the exact one.
+        let smaller = mean - root;
+        let normal = if cxx > cyy { [-cxy, cxx - smaller] } else { [cyy - smaller, -cxy] };
+        let length = normal[0].hypot(normal[1]);
+        if length < 1e-6 {
+            return None;
+        }
+        let normal = [normal[0] / length, normal[1] / length];
+        let offset = normal[0] * (mx + origin[0]) + normal[1] * (my + origin[1]);
+        Some(Self { normal, offset, rms: smaller.max(0.0).sqrt() })
+    }
+
+    fn meets(&self, other: &Self) -> Option<[f32; 2]> {
+        let ([a, b], [c, d]) = (self.normal, other.normal);
+        let determinant = a * d - b * c;
+        // Sides at less than about 15 degrees are no corner.
+        if determinant.abs() < 0.25 {
+            return None;
+        }
+        let (e, f) = (self.offset, other.offset);
+        Some([(e * d - b * f) / determinant, (a * f - e * c) / determinant])
+    }
+}
+
+/// The line through the points of a side without its ends; of these again without those that lie off.
+fn side_line(points: &[[f32; 2]], from: usize, to: usize) -> Option<Line> {
+    let ([ax, ay], [bx, by]) = (points[from], points[to]);
+    let length = (bx - ax).hypot(by - ay);
+    let end = (END_PX + END_SHARE * length).min(0.3 * length) * length;
+    let along = |[x, y]: &[f32; 2]| (x - ax) * (bx - ax) + (y - ay) * (by - ay);
+    let inner = || {
+        between(points, from, to)
+            .map(|(_, point)| point)
+            .filter(|point| (end..=length * length - end).contains(&along(point)))
+    };
+    let origin = [ax, ay];
+    let line = Line::through(&sums(inner(), origin), origin)?;
+    let most = (2.0 * line.rms).max(0.25);
+    let near =
+        |[x, y]: &&[f32; 2]| (line.normal[0] * x + line.normal[1] * y - line.offset).abs() <= most;
+    let again = Line::through(&sums(inner().filter(near), origin), origin)?;
+    // What was left out counts still when it comes to how straight the side is.
+    Some(Line { rms: line.rms, ..again })
+}
+
+fn sums<'a>(points: impl Iterator<Item = &'a [f32; 2]>, origin: [f32; 2]) -> [f32; 6] {
+    points.fold([0.0; 6], |sums, point| {
+        let (x, y) = (point[0] - origin[0], point[1] - origin[1]);
+        let [n, a, b, c, d, e] = sums;
+        [n + 1.0, a + x, b + y, c + x * x, d + x * y, e + y * y]
+    })
+}
+
+/// Whether corners are those of a convex quad of about that area that a square may look like.
+fn is_sound(corners: &[[f32; 2]; 4], area: f32) -> bool {
+    let (mut twice, mut shortest, mut longest) = (0.0, f32::MAX, 0.0_f32);
+    for i in 0..4 {
+        let [before, at, after] = [(i + 3) % 4, i, (i + 1) % 4].map(|k| corners[k]);
+        let (ux, uy) = (at[0] - before[0], at[1] - before[1]);
+        let (vx, vy) = (after[0] - at[0], after[1] - at[1]);
+        if ux * vy - uy * vx <= 0.0 {
+            return false;
+        }
+        let length = vx.hypot(vy);
+        shortest = shortest.min(length);
+        longest = longest.max(length);
+        twice += at[0] * after[1] - at[1] * after[0];
+    }
+    let quad_area = twice / 2.0;
+    let tolerance = 0.12 * quad_area + 1.2 * longest;
+    shortest >= 3.5 && shortest * 5.0 >= longest && (quad_area - area).abs() <= tolerance
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use imaging::{GrayView, Outlines, outline};
+
+    /// A dark shape on white, each pixel's value the mean of 8 x 8 points in it.
+    fn picture(within: impl Fn(f64, f64) -> bool) -> Vec<u8> {
+        let grey = |x: usize, y: usize| {
+            let inside = (0..64).filter(|i| {
+                let part = |p: usize, k: usize| p as f64 + (k as f64 + 0.5) / 8.0 - 0.5;
+                within(part(x, i % 8), part(y, i / 8))
+            });
+            (220 - 200 * inside.count() / 64) as u8
+        };
+        (0..96 * 96).map(|i| grey(i % 96, i / 96)).collect()
+    }
+
+    fn quads(data: &[u8]) -> Vec<Quad> {
+        let mut outlines = Outlines::default();
+        outlines.find(GrayView::packed(data, 96, 96).unwrap(), &outline::Settings::default());
+        outlines.iter().filter_map(|o| Quad::of(&o)).collect()
+    }
+
+    #[test]
+    fn a_turned_square_has_its_corners_to_a_fraction_of_a_pixel() {
+        for (half, turn) in [(4.0, 0.3), (6.0, 0.7), (10.0, 0.0), (14.0, 0.4), (30.0, 1.1)] {
+            let (sin, cos) = f64::sin_cos(turn);
+            let within = |x: f64, y: f64| {
+                let (x, y) = (x - 47.3, y - 48.1);
+                (x * cos + y * sin).abs() < half && (y * cos - x * sin).abs() < half
+            };
+            let found = quads(&picture(within));
+            assert!(!found.is_empty(), "{half} {turn}");
+            for quad in found {
+                for corner in quad.corners {
+                    let (x, y) = (corner.x - 47.3, corner.y - 48.1);
+                    let off = [x * cos + y * sin, y * cos - x * sin].map(|a| a.abs() - half);
+                    assert!(
+                        off.iter().all(|o| o.abs() < 0.35 + 0.02 * half),
+                        "{half} {turn} {off:?}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn discs_and_triangles_are_no_quads() {
+        let disc = |x: f64, y: f64| (x - 48.0).hypot(y - 48.0) < 24.0;
+        assert_eq!(quads(&picture(disc)), []);
+        let triangle = |x: f64, y: f64| y > 20.0 && y < 80.0 && (x - 48.0).abs() < (y - 20.0) / 2.0;
+        assert_eq!(quads(&picture(triangle)), []);
+    }
+}
