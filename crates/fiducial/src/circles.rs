@@ -70,6 +70,17 @@ impl Circles {
         Self { normal: sight * (2.0 * self.normal.dot(&sight)) - self.normal, ..*self }
     }
 
+    /// The same place, its normal no closer to the line of sight than this angle (radians).
+    pub(crate) fn tilted_at_least(&self, angle: f64) -> Self {
+        let sight = self.centre.normalize();
+        let aside = self.normal - sight * self.normal.dot(&sight);
+        if aside.norm() >= angle.sin() {
+            return *self;
+        }
+        let towards = aside.try_normalize(1e-9).unwrap_or_else(|| self.basis().0);
+        Self { normal: towards * angle.sin() - sight * angle.cos(), ..*self }
+    }
+
     /// Two unit vectors that span the plane.
     pub(crate) fn basis(&self) -> (Vector3<f64>, Vector3<f64>) {
         let aside = if self.normal.x.abs() < 0.8 { Vector3::x() } else { Vector3::y() };
@@ -106,7 +117,7 @@ impl Circles {
             let candidate = best.stepped(&system, damping)?;
             match candidate.system(points, camera) {
                 Some((next, next_cost)) if next_cost <= cost => {
-                    let settled = cost - next_cost < 1e-9 * cost;
+                    let settled = cost - next_cost < 1e-6 * cost;
                     (best, system, cost) = (candidate, next, next_cost);
                     damping = (damping * 0.1).max(1e-9);
                     if settled {
@@ -216,6 +227,13 @@ impl Circles {
         let (system, _) = self.system(points, camera)?;
         let error_px = self.rms_px(points, camera)?.max(LEAST_EDGE_ERROR_PX);
         let of_step = system.matrix.try_inverse()? * (error_px * error_px);
+        let covariance = self.spread(&of_step);
+        covariance.iter().all(|c| c.is_finite()).then_some(covariance)
+    }
+
+    /// Covariance of centre (m) and rotation vector (rad) from that of the centre and of the normal along
+    /// [`Circles::basis`].
+    pub(crate) fn spread(&self, of_step: &SMatrix<f64, 5, 5>) -> Matrix6<f64> {
         let (u, v) = self.basis();
         // The rotation vector v moves the normal along u, and -u along v.
         let mut full_from_step = SMatrix::<f64, 6, 5>::zeros();
@@ -225,7 +243,25 @@ impl Circles {
         let mut covariance = full_from_step * of_step * full_from_step.transpose();
         let turn = self.normal * self.normal.transpose() * ANY_ANGLE_VARIANCE;
         covariance.fixed_view_mut::<3, 3>(3, 3).add_assign(turn);
-        covariance.iter().all(|c| c.is_finite()).then_some(covariance)
+        covariance
+    }
+
+    /// Leaves out the edge points that lie much further off than most.
+    pub(crate) fn leave_outliers(&self, points: &mut Vec<EdgePoint>, camera: &CameraModel) {
+        const MOST: usize = 640;
+        let basis = self.basis();
+        let off = |point: &EdgePoint| {
+            self.residual(&basis, point, camera).map_or(f64::MAX, |(r, _)| r.abs())
+        };
+        let mut offs = [0.0; MOST];
+        let count = points.len().min(MOST);
+        for (slot, point) in offs.iter_mut().zip(points.iter()) {
+            *slot = off(point);
+        }
+        let Some(offs) = offs.get_mut(..count).filter(|offs| !offs.is_empty()) else { return };
+        let (_, median, _) = offs.select_nth_unstable_by(count / 2, f64::total_cmp);
+        let limit = (4.0 * *median).max(0.1);
+        points.retain(|point| off(point) <= limit);
     }
 
     /// The normal equations of one step, and the cost here.

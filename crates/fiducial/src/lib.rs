@@ -6,10 +6,11 @@
 //! Modules in reading order: [`marker`] names what is looked for, [`square`] has the codes of square markers, [`drawing`]
 //! says what a marker looks like, [`observation`] is what was found, [`pose`] where it is in space, [`detector`] finds
 //! it. [`ring`] and [`rings_thesis`] are the thesis' way
-//! (Algorithms 1-15). [`rings`] is the mended one: `outline` takes ellipses from contours, `search` goes from a ring
-//! to the marker, `circles` and, for small markers, `photometry` give its pose, `lens` serves images of unknown
-//! cameras. [`trace`] is what they saw on the way, [`debug`] draws that
-//! on a [`canvas`] with its [`letters`]. [`tracking`] searches first where the markers of the last images should be.
+//! (Algorithms 1-15). [`rings`] is the second generation: `outline` takes ellipses from outlines, `profile` compares the
+//! bands about them with the marker's, `search` goes from one circle to all edges, `circles` and, for small markers,
+//! `photometry` give the pose, `lens` serves images of unknown cameras. [`trace`] is what they saw on the way, [`debug`]
+//! draws that on a [`canvas`] with its [`letters`]. [`tracking`] searches first where the markers of the last images
+//! should be.
 
 pub mod canvas;
 mod circles;
@@ -23,6 +24,7 @@ pub mod observation;
 mod outline;
 mod photometry;
 pub mod pose;
+mod profile;
 pub mod ring;
 pub mod rings;
 pub mod rings_thesis;

@@ -1,8 +1,10 @@
-//! The pose of a small marker from the grey values themselves.
+//! The pose of a marker from the grey values themselves.
 //!
 //! Where rings are a few pixels wide, the blur of one edge reaches the next, and edges located one by one lie too far
 //! apart. Here the pose, the blur and the light are fitted together, so that the picture they predict comes
 //! closest to the picture there is; nothing in the image says more about the pose than that.
+
+use std::f64::consts::TAU;
 
 use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
@@ -12,10 +14,20 @@ use crate::circles::{Circles, project};
 use crate::ring::RingKind;
 
 /// Markers of more pixels across have edges far enough apart.
-pub(crate) const MOST_DIAMETER_PX: f64 = 64.0;
-const MOST_STEPS: usize = 12;
+pub(crate) const MOST_DIAMETER_PX: f64 = 180.0;
+/// Of fewer pixels no ring can be told from a disc.
+const LEAST_DIAMETER_PX: f64 = 5.0;
+/// Up to this diameter all pixels take part, of larger markers those about the edges.
+const ALL_PIXELS_PX: f64 = 22.0;
+/// About as many pixels take part of a larger marker.
+const SPOTS: f64 = 360.0;
+const MOST_STEPS: usize = 14;
 /// Pose (5), blur, black, white, and white's change across and down.
 const UNKNOWNS: usize = 10;
+/// A tilt, in radians, that is no longer a saddle of the fit: seen squarely, every tilt looks the same at first.
+const LEAST_START_TILT: f64 = 0.2;
+/// What is known of a normal before it is measured, as a standard deviation in radians.
+const PRIOR_NORMAL: f64 = 0.6;
 
 /// Everything that is fitted.
 #[derive(Copy, Clone, Debug)]
@@ -36,52 +48,58 @@ pub(crate) struct Spot {
     /// Offset from the marker's centre, in pixels.
     offset: [f64; 2],
     grey: f64,
+    /// Whether it lies well within the marker's rim.
+    within: bool,
 }
 
-/// The pose at which a marker of this size looks most like the image, from a pose that is nearly right, and the
-/// root mean square of the differences left, in units of the marker's contrast. `spots` is working memory.
+/// What a marker of a known look fitted to an image says.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Fit {
+    pub(crate) circles: Circles,
+    /// Covariance of the centre (m) and of the normal along [`Circles::basis`] (rad).
+    pub(crate) covariance: SMatrix<f64, 5, 5>,
+    /// Root mean square of the differences left, in units of the marker's contrast.
+    pub(crate) difference: f64,
+    /// The share of the variance within the marker that its rings explain.
+    pub(crate) explained: f64,
+    /// What is left of the differences from a plain disc, as a share of their squares.
+    pub(crate) beside_disc: f64,
+    /// How dark the middle ring is in units of the outer one, each left to itself.
+    pub(crate) balance: f64,
+    /// White less black, in grey levels.
+    pub(crate) contrast: f64,
+    /// Standard deviation of the blur, in pixels.
+    pub(crate) blur_px: f64,
+    /// Sum of the squared differences, large ones counting less.
+    cost: f64,
+}
+
+/// The marker of this size that looks most like the image, from a pose that is nearly right, and the one tilted the
+/// other way where that is another. `spots` is working memory.
 pub(crate) fn refined(
     view: GrayView<'_>,
     camera: &CameraModel,
     start: &Circles,
     size_m: f64,
+    inverted: bool,
     spots: &mut Vec<Spot>,
-) -> Option<(Circles, f64)> {
+) -> Option<(Fit, Option<Fit>)> {
     gather(view, camera, start, size_m, spots)?;
-    let mut best =
-        Picture { circles: *start, blur_px: 0.7, black: 0.0, white: 255.0, slope: [0.0; 2] };
-    best.expose(spots, size_m, camera)?;
-    // Differences beyond this pull no harder; about thrice what they are once the fit is good.
-    let mut limit = 0.25 * (best.white - best.black);
-    let (mut system, mut cost) = best.system(spots, size_m, camera, limit)?;
-    let mut damping = 1e-3;
-    for step in 0..MOST_STEPS {
-        let candidate = best.stepped(&system, damping);
-        match candidate.and_then(|c| Some((c, c.system(spots, size_m, camera, limit)?))) {
-            Some((next, (next_system, next_cost))) if next_cost <= cost => {
-                let settled = cost - next_cost < 1e-5 * cost;
-                (best, system, cost) = (next, next_system, next_cost);
-                damping = (damping * 0.1).max(1e-7);
-                if step == 2 {
-                    limit = limit.min(3.0 * (cost / spots.len() as f64).sqrt() + 1.0);
-                    (system, cost) = best.system(spots, size_m, camera, limit)?;
-                } else if settled && step > 2 {
-                    break;
-                }
-            }
-            _ => {
-                damping *= 20.0;
-                if damping > 1e4 {
-                    break;
-                }
-            }
+    if inverted {
+        for spot in spots.iter_mut() {
+            spot.grey = 255.0 - spot.grey;
         }
     }
-    let contrast = best.white - best.black;
-    (contrast > 0.0).then(|| (best.circles, (cost / spots.len() as f64).sqrt() / contrast))
+    let scene = Scene { spots, size_m, camera };
+    let first = scene.fitted(&start.tilted_at_least(LEAST_START_TILT))?;
+    let mirrored = first.circles.tilted_at_least(LEAST_START_TILT).mirrored();
+    let Some(second) = scene.fitted(&mirrored) else { return Some((first, None)) };
+    let (best, other) = if second.cost < first.cost { (second, first) } else { (first, second) };
+    let same = best.circles.normal.angle(&other.circles.normal) < 0.02;
+    Some((best, (!same).then_some(other)))
 }
 
-/// The pixels in and just around the marker, except about its innermost ring, which is a dot at this size.
+/// The pixels in and just around the marker; of a large one those about its edges.
 fn gather(
     view: GrayView<'_>,
     camera: &CameraModel,
@@ -93,73 +111,314 @@ fn gather(
     let outline = circles.outline(size_m / 2.0, camera)?;
     let middle = project(circles.centre, camera)?;
     let diameter_px = outline.major;
-    if !(4.0..=MOST_DIAMETER_PX).contains(&diameter_px) {
+    if !(LEAST_DIAMETER_PX..=MOST_DIAMETER_PX).contains(&diameter_px) {
         return None;
     }
-    // The paper is white for a ring's width around the marker; what the blur brings in from beyond is kept out.
-    let reach = (0.6 - 1.3 / diameter_px).clamp(0.51, 0.55);
-    let around = outline.grown(diameter_px * (2.0 * reach - 1.0));
-    let dot = 0.09;
-    let bound = |low: f64, high: f64, len: usize| {
-        let from = low.floor().max(0.0) as usize;
-        let to = (high.ceil() + 1.0).clamp(0.0, len as f64) as usize;
-        from..to
+    let spot = |x: usize, y: usize, within: bool| {
+        let place = [x as f64, y as f64];
+        Spot {
+            ray: camera.unproject(Pixel::new(place[0], place[1])).coords,
+            offset: [place[0] - middle.x, place[1] - middle.y],
+            grey: f64::from(view.at(x, y)),
+            within,
+        }
     };
-    let half = around.major / 2.0;
-    for y in bound(outline.centre[1] - half, outline.centre[1] + half, view.height()) {
-        let row = view.row(y);
-        for x in bound(outline.centre[0] - half, outline.centre[0] + half, view.width()) {
-            let place = [x as f64, y as f64];
-            let offset = [place[0] - middle.x, place[1] - middle.y];
-            if around.radius_of(place) > 1.0 || offset[0].hypot(offset[1]) < dot * diameter_px {
-                continue;
+    if diameter_px > ALL_PIXELS_PX {
+        let around = |place: [f64; 2]| {
+            let (x, y) = (place[0].round(), place[1].round());
+            let inside =
+                x >= 0.0 && y >= 0.0 && x < view.width() as f64 && y < view.height() as f64;
+            inside.then_some((x as usize, y as usize))
+        };
+        about_edges(circles, size_m, camera, |place, within| {
+            if let Some((x, y)) = around(place) {
+                spots.push(spot(x, y, within));
             }
-            let ray = camera.unproject(Pixel::new(place[0], place[1])).coords;
-            spots.push(Spot { ray, offset, grey: f64::from(row[x]) });
+        });
+    } else {
+        // The paper is white for a ring's width around the marker; what the blur brings in from beyond is kept out.
+        let reach = (0.6 - 1.3 / diameter_px).clamp(0.51, 0.55);
+        let around = outline.grown(diameter_px * (2.0 * reach - 1.0));
+        let bound = |low: f64, high: f64, len: usize| {
+            let from = low.floor().max(0.0) as usize;
+            let to = (high.ceil() + 1.0).clamp(0.0, len as f64) as usize;
+            from..to
+        };
+        let half = around.major / 2.0;
+        for y in bound(outline.centre[1] - half, outline.centre[1] + half, view.height()) {
+            for x in bound(outline.centre[0] - half, outline.centre[0] + half, view.width()) {
+                let place = [x as f64, y as f64];
+                if around.radius_of(place) <= 1.0 {
+                    spots.push(spot(x, y, outline.radius_of(place) < 0.95));
+                }
+            }
         }
     }
     (spots.len() > 3 * UNKNOWNS).then_some(())
 }
 
+/// Tells places across each edge of the marker, all round, and whether they lie within its rim.
+fn about_edges(
+    circles: &Circles,
+    size_m: f64,
+    camera: &CameraModel,
+    mut tell: impl FnMut([f64; 2], bool),
+) {
+    const ACROSS: i32 = 2;
+    let px_per_m = camera.fx / circles.centre.z;
+    let (u, v) = circles.basis();
+    let edges = RingKind::ALL.map(RingKind::radii);
+    let total: f64 = edges.iter().map(|(inner, outer)| inner + outer).sum();
+    for (index, radius) in edges.iter().flat_map(|(inner, outer)| [outer, inner]).enumerate() {
+        let radius = radius * size_m;
+        if radius * px_per_m < 2.5 {
+            continue;
+        }
+        let share = radius / (total * size_m);
+        let count = (SPOTS * share / f64::from(2 * ACROSS + 1)).ceil() as u32;
+        for i in 0..count {
+            let turn = (f64::from(i) + 0.37 * index as f64) * TAU / f64::from(count);
+            let (sin, cos) = turn.sin_cos();
+            let out = u * cos + v * sin;
+            let (Some(on), Some(beyond)) = (
+                project(circles.centre + out * radius, camera),
+                project(circles.centre + out * (radius * 1.001), camera),
+            ) else {
+                continue;
+            };
+            let length = on.distance(&beyond);
+            for step in -ACROSS..=ACROSS {
+                let along = f64::from(step) / length;
+                let place = [on.x + (beyond.x - on.x) * along, on.y + (beyond.y - on.y) * along];
+                tell(place, index > 0 || step < 0);
+            }
+        }
+    }
+}
+
+/// What a picture is fitted to.
+struct Scene<'a> {
+    spots: &'a [Spot],
+    size_m: f64,
+    camera: &'a CameraModel,
+}
+
+impl Scene<'_> {
+    fn fitted(&self, start: &Circles) -> Option<Fit> {
+        let mut best =
+            Picture { circles: *start, blur_px: 0.7, black: 0.0, white: 255.0, slope: [0.0; 2] };
+        best.expose(self)?;
+        // Differences beyond this pull no harder; about thrice what they are once the fit is good.
+        let mut limit = 0.25 * (best.white - best.black);
+        let (mut system, mut cost) = best.system(self, limit)?;
+        let mut damping = 1e-3;
+        for step in 0..MOST_STEPS {
+            let candidate = best.stepped(&system, damping);
+            match candidate.and_then(|c| Some((c, c.system(self, limit)?))) {
+                Some((next, (next_system, next_cost))) if next_cost <= cost => {
+                    let settled = cost - next_cost < 1e-4 * cost;
+                    (best, system, cost) = (next, next_system, next_cost);
+                    damping = (damping * 0.1).max(1e-7);
+                    if step == 2 {
+                        limit = limit.min(3.0 * (cost / self.count()).sqrt() + 1.0);
+                        (system, cost) = best.system(self, limit)?;
+                    } else if settled && step > 2 {
+                        break;
+                    }
+                }
+                _ => {
+                    damping *= 20.0;
+                    if damping > 1e4 {
+                        break;
+                    }
+                }
+            }
+        }
+        let contrast = best.white - best.black;
+        if contrast <= 0.0 {
+            return None;
+        }
+        let (beside_disc, balance) = best.alternatives(self)?;
+        Some(Fit {
+            circles: best.circles,
+            covariance: self.covariance(&system, cost)?,
+            difference: (cost / self.count()).sqrt() / contrast,
+            explained: best.explained(self)?,
+            beside_disc,
+            balance,
+            contrast,
+            blur_px: best.blur_px,
+            cost,
+        })
+    }
+
+    fn count(&self) -> f64 {
+        self.spots.len() as f64
+    }
+
+    /// Of the pose, from the differences that are left: noise, and what the model does not know.
+    fn covariance(&self, system: &System, cost: f64) -> Option<SMatrix<f64, 5, 5>> {
+        let variance = cost / (self.count() - UNKNOWNS as f64).max(1.0) + 1.0 / 12.0;
+        let mut information = system.matrix / variance;
+        for i in 0..UNKNOWNS {
+            information[(i, i)] += 1e-9;
+        }
+        for i in 3..5 {
+            information[(i, i)] += 1.0 / (PRIOR_NORMAL * PRIOR_NORMAL);
+        }
+        let all = information.cholesky()?.inverse();
+        Some(all.fixed_view::<5, 5>(0, 0).into_owned())
+    }
+}
+
+/// How a circle looks in the neighbourhood of one pixel.
+struct Near {
+    /// Distance from the centre in metres.
+    rho: f64,
+    metres_per_px: f64,
+    /// How the distance in pixels changes with the pose.
+    by_pose: SVector<f64, 5>,
+    /// Cumulants of the squared distance of a place drawn from the blur.
+    cumulants: [f64; 3],
+    /// Excess of the fourth cumulant of the blur across the edge, which the pixel's square makes negative.
+    excess: f64,
+}
+
+/// What a pixel sees of the marker.
+struct Looks {
+    /// The shares of the pixel's light from within each circle, the outermost first.
+    within: [f64; 6],
+    /// How the distance from the centre, in pixels, changes with the pose.
+    by_pose: SVector<f64, 5>,
+    /// How the whiteness changes with that distance, and with the blur.
+    by_distance: f64,
+    by_blur: f64,
+}
+
+impl Looks {
+    /// How white the pixel is, from 0 (black) to 1.
+    fn white(&self) -> f64 {
+        let [a, b, c, d, e, f] = self.within;
+        1.0 - a + b - c + d - e + f
+    }
+}
+
 impl Picture {
-    /// How white a pixel is, from 0 (black) to 1, and how that changes with the pose and with the blur.
-    fn whiteness(
+    /// What the blur about a pixel sees of the marker's plane.
+    fn near(
         &self,
         spot: &Spot,
         basis: &(Vector3<f64>, Vector3<f64>),
-        size_m: f64,
         camera: &CameraModel,
-    ) -> Option<(f64, SVector<f64, 5>, f64)> {
-        let (rho, per_px, by_pose) = self.circles.radius_at(basis, &spot.ray, camera)?;
-        let (mut white, mut by_distance, mut by_blur) = (1.0, 0.0, 0.0);
-        for kind in [RingKind::Outer, RingKind::Middle] {
-            let (inner, outer) = kind.radii();
-            for (radius, sign) in [(inner, -1.0), (outer, 1.0)] {
-                let radius = radius * size_m;
-                // A blurred circle's edge appears further in, by the blur squared over the diameter.
-                let bend_px = self.blur_px * self.blur_px * per_px / (2.0 * radius);
-                let z = ((rho - radius) / per_px + bend_px) / self.blur_px;
-                let (step, density) = blurred_step(z);
-                white += sign * step;
-                by_distance += sign * density / self.blur_px;
-                by_blur -= sign * density * z / self.blur_px;
+    ) -> Option<Near> {
+        let (rho, metres_per_px, by_pose) = self.circles.radius_at(basis, &spot.ray, camera)?;
+        let normal = self.circles.normal;
+        let along = normal.dot(&self.circles.centre) / normal.dot(&spot.ray);
+        let out = (spot.ray * along - self.circles.centre) / rho;
+        let aside = normal.cross(&out);
+        let nd = normal.dot(&spot.ray);
+        // Rows of the map from pixels to the plane: outwards and around.
+        let row = |axis: &Vector3<f64>| {
+            let od = axis.dot(&spot.ray);
+            [
+                along * (axis.x - od * normal.x / nd) / camera.fx,
+                along * (axis.y - od * normal.y / nd) / camera.fy,
+            ]
+        };
+        let (a, b) = (row(&out), row(&aside));
+        let variance = self.blur_px * self.blur_px;
+        let rr = variance * (a[0] * a[0] + a[1] * a[1]);
+        let tt = variance * (b[0] * b[0] + b[1] * b[1]);
+        let rt = variance * (a[0] * b[0] + a[1] * b[1]);
+        let (trace, det) = (rr + tt, rr * tt - rt * rt);
+        let square = rho * rho;
+        let cumulants = [
+            square + trace,
+            2.0 * (trace * trace - 2.0 * det) + 4.0 * square * rr,
+            8.0 * (trace * trace - 3.0 * det) * trace + 24.0 * square * (rr * rr + rt * rt),
+        ];
+        let [c, s] = a.map(|part| (part / metres_per_px).powi(2));
+        let excess = -(c * c + s * s) / (120.0 * variance * variance);
+        Some(Near { rho, metres_per_px, by_pose, cumulants, excess })
+    }
+
+    /// How much of what a pixel sees lies within each of the marker's circles, and how that changes.
+    ///
+    /// Of a place drawn from the blur about the pixel the squared distance from the centre is a quadratic form in
+    /// normal variables; how often it falls within a circle is known closely (Jensen and Solomon, "A Gaussian
+    /// approximation to the distribution of a definite quadratic form", JASA 1972), also for circles no larger than the blur.
+    fn looks(
+        &self,
+        spot: &Spot,
+        basis: &(Vector3<f64>, Vector3<f64>),
+        scene: &Scene<'_>,
+    ) -> Option<Looks> {
+        let near = self.near(spot, basis, scene.camera)?;
+        let [k1, k2, k3] = near.cumulants;
+        let power = 1.0 - k1 * k3 / (3.0 * k2 * k2);
+        let spread = k2.sqrt();
+        let mean = 1.0 + power * (power - 1.0) * k2 / (2.0 * k1 * k1);
+        let log_k1 = k1.ln();
+        let mut looks =
+            Looks { within: [0.0; 6], by_distance: 0.0, by_blur: 0.0, by_pose: near.by_pose };
+        let radii = RingKind::ALL.map(RingKind::radii);
+        for (index, within) in looks.within.iter_mut().enumerate() {
+            let (inner, outer) = radii[index / 2];
+            // Outer edges end the black, inner ones begin the white.
+            let (radius, sign) = if index % 2 == 0 { (outer, -1.0) } else { (inner, 1.0) };
+            let radius = radius * scene.size_m;
+            let rough = (radius - near.rho) / (near.metres_per_px * self.blur_px);
+            if rough.abs() > 6.0 {
+                *within = if rough > 0.0 { 1.0 } else { 0.0 };
+                continue;
             }
+            let ratio = (power * (2.0 * radius.ln() - log_k1)).exp();
+            let z = (ratio - mean) * k1 / (power * spread);
+            let (step, density) = blurred_step(z);
+            *within = step - near.excess / 24.0 * (z * z - 3.0) * z * density;
+            // Outwards, per pixel.
+            let slope = -2.0 * near.rho * ratio / spread * near.metres_per_px;
+            looks.by_distance += sign * density * slope;
+            looks.by_blur -= sign * density * z / self.blur_px;
         }
-        let (hole, dot) = RingKind::Inner.radii();
-        let dot_px2 = std::f64::consts::PI * (dot * dot - hole * hole) * (size_m / per_px).powi(2);
-        let spread_px2 = self.blur_px * self.blur_px + (dot * size_m / per_px).powi(2) / 4.0;
-        let distance_px2 = (rho / per_px).powi(2);
-        white -= dot_px2 / (std::f64::consts::TAU * spread_px2)
-            * (-distance_px2 / (2.0 * spread_px2)).exp();
-        Some((white, by_pose * by_distance, by_blur))
+        Some(looks)
+    }
+
+    /// How many times less a marker differs from the image than a plain disc in its place does, and how dark its
+    /// middle ring is in units of the outer one, when each has a grey value of its own.
+    fn alternatives(&self, scene: &Scene<'_>) -> Option<(f64, f64)> {
+        let basis = self.circles.basis();
+        let mut disc = SMatrix::<f64, 3, 3>::zeros();
+        let mut rings = SMatrix::<f64, 4, 4>::zeros();
+        for spot in scene.spots {
+            let looks = self.looks(spot, &basis, scene)?;
+            let [a, b, c, d, e, f] = looks.within;
+            let (grey, _) = self.grey(spot, looks.white());
+            // The light's slope is taken as found.
+            let lit = spot.grey - grey + self.black + (self.white - self.black) * looks.white();
+            let plain = SVector::<f64, 3>::new(1.0, a, lit);
+            disc.syger(1.0, &plain, &plain, 1.0);
+            let apart = SVector::<f64, 4>::new(1.0, a - b, c - d + e - f, lit);
+            rings.syger(1.0, &apart, &apart, 1.0);
+        }
+        disc.fill_upper_triangle_with_lower_triangle();
+        rings.fill_upper_triangle_with_lower_triangle();
+        let of_disc = disc.fixed_view::<2, 2>(0, 0).into_owned();
+        let to_disc = disc.fixed_view::<2, 1>(0, 2).into_owned();
+        let left = disc[(2, 2)] - to_disc.dot(&(of_disc.try_inverse()? * to_disc));
+        let of_rings = rings.fixed_view::<3, 3>(0, 0).into_owned();
+        let to_rings = rings.fixed_view::<3, 1>(0, 3).into_owned();
+        let levels = of_rings.try_inverse()? * to_rings;
+        let own = rings[(3, 3)] - to_rings.dot(&levels);
+        Some((own.max(0.0) / left.max(1e-9), levels[2] / levels[1]))
     }
 
     /// Black and white that fit the image best with everything else as it is.
-    fn expose(&mut self, spots: &[Spot], size_m: f64, camera: &CameraModel) -> Option<()> {
+    fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
         let (mut n, mut sw, mut sww, mut sg, mut swg) = (0.0, 0.0, 0.0, 0.0, 0.0);
         let basis = self.circles.basis();
-        for spot in spots {
-            let (white, _, _) = self.whiteness(spot, &basis, size_m, camera)?;
+        for spot in scene.spots {
+            let white = self.looks(spot, &basis, scene)?.white();
             n += 1.0;
             sw += white;
             sww += white * white;
@@ -172,28 +431,48 @@ impl Picture {
         (contrast > 1.0).then_some(())
     }
 
+    /// The grey value predicted for a pixel of this whiteness.
+    fn grey(&self, spot: &Spot, white: f64) -> (f64, f64) {
+        let [x, y] = spot.offset;
+        let contrast = self.white + self.slope[0] * x + self.slope[1] * y - self.black;
+        (self.black + contrast * white, contrast)
+    }
+
+    /// The share of the variance of the pixels within the rim that the picture explains.
+    fn explained(&self, scene: &Scene<'_>) -> Option<f64> {
+        let basis = self.circles.basis();
+        let (mut n, mut sum, mut squares, mut left) = (0.0, 0.0, 0.0, 0.0);
+        for spot in scene.spots.iter().filter(|s| s.within) {
+            let white = self.looks(spot, &basis, scene)?.white();
+            let (grey, _) = self.grey(spot, white);
+            n += 1.0;
+            sum += spot.grey;
+            squares += spot.grey * spot.grey;
+            left += (grey - spot.grey).powi(2);
+        }
+        let variance = squares - sum * sum / n;
+        (variance > 0.0).then(|| 1.0 - left / variance)
+    }
+
     /// The normal equations of one step, and the cost here.
-    fn system(
-        &self,
-        spots: &[Spot],
-        size_m: f64,
-        camera: &CameraModel,
-        limit: f64,
-    ) -> Option<(System, f64)> {
+    fn system(&self, scene: &Scene<'_>, limit: f64) -> Option<(System, f64)> {
         let mut system = System { matrix: SMatrix::zeros(), right: SVector::zeros() };
         let mut cost = 0.0;
         let basis = self.circles.basis();
-        for spot in spots {
-            let (white, by_pose, by_blur) = self.whiteness(spot, &basis, size_m, camera)?;
+        for spot in scene.spots {
+            let looks = self.looks(spot, &basis, scene)?;
+            let white = looks.white();
             let [x, y] = spot.offset;
-            let contrast = self.white + self.slope[0] * x + self.slope[1] * y - self.black;
-            let difference = self.black + contrast * white - spot.grey;
+            let (grey, contrast) = self.grey(spot, white);
+            let difference = grey - spot.grey;
             let size = difference.abs();
             let weight = if size > limit { limit / size } else { 1.0 };
             cost += if size > limit { limit * (2.0 * size - limit) } else { size * size };
             let mut slope = SVector::<f64, UNKNOWNS>::zeros();
-            slope.fixed_rows_mut::<5>(0).copy_from(&(by_pose * contrast));
-            slope[5] = contrast * by_blur;
+            slope
+                .fixed_rows_mut::<5>(0)
+                .copy_from(&(looks.by_pose * (looks.by_distance * contrast)));
+            slope[5] = contrast * looks.by_blur;
             slope[6] = 1.0 - white;
             slope[7] = white;
             slope[8] = white * x;
@@ -213,7 +492,7 @@ impl Picture {
         let step = matrix.cholesky()?.solve(&system.right);
         Some(Self {
             circles: self.circles.moved(&step.fixed_rows::<5>(0).into_owned())?,
-            blur_px: (self.blur_px + step[5].clamp(-0.3, 0.3)).clamp(0.25, 6.0),
+            blur_px: (self.blur_px + step[5].clamp(-0.3, 0.3)).clamp(0.3, 6.0),
             black: self.black + step[6],
             white: self.white + step[7],
             slope: [self.slope[0] + step[8], self.slope[1] + step[9]],
@@ -228,10 +507,10 @@ struct System {
 
 /// The normal distribution and its density at `z`: a step seen through a Gaussian blur.
 fn blurred_step(z: f64) -> (f64, f64) {
-    if z.abs() > 5.0 {
+    if z.abs() > 6.0 {
         return (if z > 0.0 { 1.0 } else { 0.0 }, 0.0);
     }
-    let density = (-0.5 * z * z).exp() / std::f64::consts::TAU.sqrt();
+    let density = (-0.5 * z * z).exp() / TAU.sqrt();
     // Abramowitz and Stegun 26.2.17, good to 7.5e-8.
     let t = 1.0 / (1.0 + 0.231_641_9 * z.abs());
     let poly = t
@@ -272,9 +551,9 @@ mod tests {
                 let (x, y) = (f64::from(i % 100), f64::from(i / 100));
                 let ray = camera.unproject(Pixel::new(x, y)).coords;
                 let offset = [x - middle.x, y - middle.y];
-                let (white, _, _) = picture
-                    .whiteness(&Spot { ray, offset, grey: 0.0 }, &truth.basis(), size_m, &camera)
-                    .unwrap();
+                let spot = Spot { ray, offset, grey: 0.0, within: true };
+                let scene = Scene { spots: &[], size_m, camera: &camera };
+                let white = picture.looks(&spot, &truth.basis(), &scene).unwrap().white();
                 let paper = 200.0 + 0.5 * offset[0] - 0.3 * offset[1];
                 (30.0 + (paper - 30.0) * white).round() as u8
             })
@@ -284,8 +563,9 @@ mod tests {
             centre: truth.centre * 1.01,
             normal: Vector3::new(0.1, 0.1, -0.9).normalize(),
         };
-        let (found, rms) = refined(view, &camera, &start, size_m, &mut Vec::new()).unwrap();
-        assert!(rms < 0.005, "{rms}");
+        let (fit, _) = refined(view, &camera, &start, size_m, false, &mut Vec::new()).unwrap();
+        let found = fit.circles;
+        assert!(fit.difference < 0.005 && fit.explained > 0.999, "{fit:?}");
         assert!((found.centre - truth.centre).norm() < 2e-4 * 6.0, "{found:?}");
         assert!(found.normal.angle(&truth.normal) < 0.02, "{found:?}");
     }

@@ -1,4 +1,4 @@
-//! From one ring to the marker: its six edges, looked for where the ring says that they are.
+//! From one circle to the marker: all six of its edges, looked for where the circle says that they are.
 //!
 //! What is found refines the pose and decides whether there is a marker at all.
 
@@ -10,15 +10,23 @@ use nalgebra::Matrix6;
 
 use crate::circles::{Circles, EdgePoint, project};
 use crate::drawing::RING_RADII;
-use crate::photometry::{self, Spot};
-use crate::ring::{Ring, RingKind};
+use crate::photometry::{self, Fit, Spot};
+use crate::profile::{Candidate, LEAST_SCORE, LEAST_STEP, SMALL_PX};
+use crate::ring::RingKind;
 use crate::trace::Reason;
 
-/// Fewer grey levels are noise.
-pub(crate) const LEAST_STEP: f64 = 7.0;
 /// Where grey values differ more from a fitted marker's, as a share of its contrast, something else is in the picture,
 /// such as a shadow's edge.
-const MOST_DIFFERENCE: f64 = 0.15;
+const MOST_DIFFERENCE: f64 = 0.08;
+/// Of a blurred marker the rings must explain this share of the variance within its rim.
+const LEAST_EXPLAINED: f64 = 0.85;
+/// It must differ from the image much less than a plain disc does, in squares.
+const MOST_BESIDE_DISC: f64 = 0.35;
+/// An edge is there when this share of its visible places has it: a third may be hidden.
+const LEAST_EDGE_SHARE: f64 = 0.5;
+/// An edge appears nearer to the centre of its circle by this over the radius, all in pixels: half the square of what a
+/// lens in focus and the pixels blur.
+const BEND_PX2: f64 = 0.2;
 /// Poses whose normals differ by less, in radians, are one.
 const DISTINCT_TILT: f64 = 0.01;
 
@@ -30,6 +38,8 @@ pub(crate) struct Search<'a> {
     pub(crate) size_m: f64,
     /// At an edge the dark side lacks at least this share of the bright side's light.
     pub(crate) least_contrast: f64,
+    /// White rings on black.
+    pub(crate) inverted: bool,
 }
 
 /// A marker that was looked for and seen.
@@ -47,53 +57,138 @@ pub(crate) struct Seen {
 }
 
 impl Search<'_> {
-    /// The marker of which all edges speak that can be seen, starting from one ring.
-    pub(crate) fn whole(
+    /// The marker of which a candidate is one circle.
+    pub(crate) fn marker(
         &self,
-        ring: &Ring,
+        candidate: &Candidate,
         edges: &mut Vec<EdgePoint>,
         spots: &mut Vec<Spot>,
     ) -> Result<Seen, Reason> {
-        let (mut circles, mut rms_px) = self.own(ring, edges)?;
-        for _ in 0..2 {
-            self.measure(&circles, edges);
-            (circles, rms_px) = circles.refined(edges, self.camera).ok_or(Reason::Edges)?;
+        edges.clear();
+        let radius_m = candidate.radius * self.size_m;
+        let both = Circles::from_ellipse(&candidate.border.ellipse, radius_m, self.camera)
+            .ok_or(Reason::Pose)?;
+        if candidate.diameter_px() < SMALL_PX {
+            return self.small(&both[0], spots);
         }
+        let kind = ring_of(candidate.radius);
+        if candidate.score < LEAST_SCORE {
+            return self.alone(&both[0], kind, edges).ok_or(Reason::Edges);
+        }
+        let (circles, rms_px, support) = self.whole(both, edges)?;
+        let diameter_px =
+            circles.outline(self.size_m / 2.0, self.camera).ok_or(Reason::Pose)?.major;
+        // Paper is not quite flat, and lenses bend; but edges of texture lie anywhere.
+        let fits = rms_px < (0.3 + 0.003 * diameter_px).min(1.5);
+        if !fits || !believable(&support, edges.len()) {
+            return self.alone(&circles, kind, edges).ok_or(Reason::Edges);
+        }
+        let confidence = confidence(&support);
+        if let Some((fit, other)) = self.by_grey_values(&circles, diameter_px, spots)
+            && fit.difference < MOST_DIFFERENCE
+        {
+            return self.seen_by_grey_values(&fit, other, confidence).ok_or(Reason::Pose);
+        }
+        self.seen(circles, rms_px, edges, confidence).ok_or(Reason::Pose)
+    }
+
+    /// A marker too small for edges: its grey values decide.
+    fn small(&self, start: &Circles, spots: &mut Vec<Spot>) -> Result<Seen, Reason> {
+        let (fit, other) =
+            photometry::refined(self.view, self.camera, start, self.size_m, self.inverted, spots)
+                .ok_or(Reason::Pose)?;
+        let sound = fit.explained > LEAST_EXPLAINED
+            && fit.difference < 1.5 * MOST_DIFFERENCE
+            && fit.contrast > 2.0 * LEAST_STEP
+            && fit.beside_disc < MOST_BESIDE_DISC
+            && (0.6..1.6).contains(&fit.balance)
+            && self.is_near(start, &fit.circles, 1.5, 0.3);
+        if !sound {
+            return Err(Reason::Edges);
+        }
+        self.seen_by_grey_values(&fit, other, fit.explained).ok_or(Reason::Pose)
+    }
+
+    /// Whether a pose has its centre within so many pixels of another's, at nearly its distance.
+    fn is_near(&self, start: &Circles, found: &Circles, px: f64, share: f64) -> bool {
+        let ends = project(start.centre, self.camera).zip(project(found.centre, self.camera));
+        ends.is_some_and(|(a, b)| a.distance(&b) < px)
+            && (found.centre.z / start.centre.z - 1.0).abs() < share
+    }
+
+    /// The pose that all edges speak for, the distances left, and how much of each edge there is.
+    fn whole(
+        &self,
+        both: [Circles; 2],
+        edges: &mut Vec<EdgePoint>,
+    ) -> Result<(Circles, f64, [Support; 6]), Reason> {
+        let mut best: Option<(Circles, f64)> = None;
+        for start in both {
+            let support = self.measure(&start, Reach::Far, edges);
+            let there = |s: &&Support| s.share().is_some_and(|share| share > 0.4);
+            let beyond_view = support[..4].iter().all(|s| s.share().is_none());
+            if support.iter().filter(there).count() < if beyond_view { 2 } else { 3 } {
+                continue;
+            }
+            let Some((rough, _)) = start.refined(edges, self.camera) else { continue };
+            self.measure(&rough, Reach::Near, edges);
+            let Some((circles, rms)) = rough.refined(edges, self.camera) else { continue };
+            // Per edge found: a wrong pose finds few.
+            let cost = (rms + 0.1) / edges.len() as f64;
+            if best.is_none_or(|(_, least)| cost < least) {
+                best = Some((circles, cost));
+            }
+        }
+        let (mut circles, _) = best.ok_or(Reason::Edges)?;
+        let support = self.measure(&circles, Reach::Near, edges);
+        circles.leave_outliers(edges, self.camera);
+        let mut rms_px;
+        (circles, rms_px) = circles.refined(edges, self.camera).ok_or(Reason::Edges)?;
         // The same outlines come nearly as well from the marker tilted the other way.
         if let Some((other, other_rms)) = circles.mirrored().refined(edges, self.camera)
             && other_rms < rms_px
         {
             (circles, rms_px) = (other, other_rms);
         }
-        let support = self.measure(&circles, edges);
-        let diameter_px =
-            circles.outline(self.size_m / 2.0, self.camera).ok_or(Reason::Pose)?.major;
-        let small = self.refine_small(&circles, spots);
-        let difference = small.map(|(_, difference)| difference);
-        if !believable(&support, ring.kind) || !fits(diameter_px, rms_px, difference) {
-            return Err(Reason::Edges);
-        }
-        if let Some((better, _)) = small.filter(|(_, difference)| *difference < MOST_DIFFERENCE) {
-            circles = better;
-            rms_px = circles.rms_px(edges, self.camera).ok_or(Reason::Pose)?;
-        }
-        self.seen(circles, rms_px, edges, confidence(&support)).ok_or(Reason::Pose)
+        Ok((circles, rms_px, support))
+    }
+
+    /// The pose from the grey values, and the one tilted the other way; `None` for a large marker, and when they
+    /// disagree with its edges.
+    fn by_grey_values(
+        &self,
+        circles: &Circles,
+        diameter_px: f64,
+        spots: &mut Vec<Spot>,
+    ) -> Option<(Fit, Option<Fit>)> {
+        let (fit, other) = photometry::refined(
+            self.view,
+            self.camera,
+            circles,
+            self.size_m,
+            self.inverted,
+            spots,
+        )?;
+        let near = self.is_near(circles, &fit.circles, 0.3 + 0.01 * diameter_px, 0.1);
+        near.then_some((fit, other))
     }
 
     /// The marker of which only one ring can be seen, because its neighbour's place is covered by something.
-    pub(crate) fn alone(&self, ring: &Ring, edges: &mut Vec<EdgePoint>) -> Option<Seen> {
-        let (start, _) = self.own(ring, edges).ok()?;
+    fn alone(&self, start: &Circles, kind: RingKind, edges: &mut Vec<EdgePoint>) -> Option<Seen> {
+        if kind == RingKind::Inner || self.inverted || !self.is_covered(start, kind)? {
+            return None;
+        }
         edges.clear();
-        let own = ring.kind as usize * 2;
+        let own = kind as usize * 2;
         let mut support = [Support::default(); 6];
         for (index, support) in support.iter_mut().enumerate().skip(own).take(2) {
-            *support = self.measure_edge(&start, index, edges);
+            *support = self.measure_edge(start, index, Reach::Near, edges);
         }
         let whole = support.iter().skip(own).take(2).all(|s| s.share().is_some_and(|s| s >= 0.95));
         let (circles, rms_px) = start.refined(edges, self.camera)?;
         let diameter_px = circles.outline(self.size_m / 2.0, self.camera)?.major;
-        let good =
-            whole && fits(diameter_px, rms_px, None) && self.is_covered(&circles, ring.kind)?;
+        let fits = rms_px < 0.3 + 0.002 * diameter_px;
+        let good = whole && fits && self.is_covered(&circles, kind)?;
         good.then(|| self.seen(circles, rms_px, edges, 0.5 * confidence(&support))).flatten()
     }
 
@@ -113,41 +208,17 @@ impl Search<'_> {
         Some(Seen { circles, rms_px, covariance, other, confidence })
     }
 
-    /// The pose that a ring's own two edges speak for.
-    fn own(&self, ring: &Ring, edges: &mut Vec<EdgePoint>) -> Result<(Circles, f64), Reason> {
-        let (_, outer) = ring.kind.radii();
-        let both = Circles::from_ellipse(&ring.outer, outer * self.size_m, self.camera)
-            .ok_or(Reason::Pose)?;
-        let own = ring.kind as usize * 2;
-        let mut best: Option<(Circles, f64)> = None;
-        for start in both {
-            edges.clear();
-            let support = [own, own + 1].map(|index| self.measure_edge(&start, index, edges));
-            if !support.iter().all(|s| s.share().is_some_and(|share| share >= 0.6)) {
-                continue;
-            }
-            let Some((circles, rms)) = start.refined(edges, self.camera) else { continue };
-            if best.is_none_or(|(_, least)| rms < least) {
-                best = Some((circles, rms));
-            }
-        }
-        best.ok_or(Reason::Edges)
-    }
-
-    /// A small marker's pose from its grey values, and the difference left; `None` for a large one, and when they
-    /// disagree with its edges.
-    fn refine_small(&self, circles: &Circles, spots: &mut Vec<Spot>) -> Option<(Circles, f64)> {
-        let refined = |start: &Circles, spots: &mut Vec<Spot>| {
-            photometry::refined(self.view, self.camera, start, self.size_m, spots)
-        };
-        let first = refined(circles, spots);
-        let second = first.and_then(|(found, _)| refined(&found.mirrored(), spots));
-        let all = first.into_iter().chain(second);
-        let (best, difference) = all.min_by(|a, b| a.1.total_cmp(&b.1))?;
-        let moved =
-            project(best.centre, self.camera)?.distance(&project(circles.centre, self.camera)?);
-        let scaled = best.centre.z / circles.centre.z;
-        (moved < 0.5 && (0.9..1.1).contains(&scaled)).then_some((best, difference))
+    fn seen_by_grey_values(&self, fit: &Fit, other: Option<Fit>, confidence: f64) -> Option<Seen> {
+        // A step as high as the contrast rises within two and a half times the blur.
+        let rms_px = |fit: &Fit| 2.5 * fit.blur_px * fit.difference;
+        let covariance = fit.circles.spread(&fit.covariance);
+        Some(Seen {
+            circles: fit.circles,
+            rms_px: rms_px(fit),
+            covariance: covariance.iter().all(|c| c.is_finite()).then_some(covariance)?,
+            other: other.map(|o| (o.circles, rms_px(&o))),
+            confidence,
+        })
     }
 
     /// Whether the place of a ring's neighbour is not plain white, as beside other rings, but covered.
@@ -183,26 +254,35 @@ impl Search<'_> {
     }
 
     /// Looks for all six edges.
-    fn measure(&self, circles: &Circles, edges: &mut Vec<EdgePoint>) -> [Support; 6] {
+    fn measure(&self, circles: &Circles, reach: Reach, edges: &mut Vec<EdgePoint>) -> [Support; 6] {
         edges.clear();
         let mut support = [Support::default(); 6];
         for (index, support) in support.iter_mut().enumerate() {
-            *support = self.measure_edge(circles, index, edges);
+            *support = self.measure_edge(circles, index, reach, edges);
         }
         support
     }
 
     /// Looks for one edge all round; nowhere when its bands are too narrow to be seen.
-    fn measure_edge(&self, circles: &Circles, index: usize, edges: &mut Vec<EdgePoint>) -> Support {
+    fn measure_edge(
+        &self,
+        circles: &Circles,
+        index: usize,
+        reach: Reach,
+        edges: &mut Vec<EdgePoint>,
+    ) -> Support {
         let (radius, width, black_within) = EDGES[index];
+        let black_within = black_within != self.inverted;
         let radius = radius * self.size_m;
         let px_per_m = self.camera.fx / circles.centre.z;
         let width_px = width * self.size_m * px_per_m;
         let mut support = Support::default();
-        if width_px < 1.0 || radius * px_per_m < 1.5 {
+        if width_px < 1.0 || radius * px_per_m < 3.0 {
             return support;
         }
-        let reach = (0.5 * width_px).clamp(1.25, 5.0);
+        let furthest = if reach == Reach::Far { 0.45 * width_px } else { 5.0 };
+        let reach = (0.5 * width_px).min(furthest).max(1.25);
+        let bend_px = BEND_PX2 / (radius * px_per_m);
         let count = (PI * radius * px_per_m).clamp(16.0, 96.0) as u32;
         let (u, v) = circles.basis();
         for i in 0..count {
@@ -223,6 +303,8 @@ impl Search<'_> {
                 Sight::Edge(at) => {
                     support.visible += 1;
                     support.found += 1;
+                    let at =
+                        Pixel::new(at.x + direction[0] * bend_px, at.y + direction[1] * bend_px);
                     let ray = self.camera.unproject(at);
                     edges.push(EdgePoint { ray: ray.coords, radius });
                 }
@@ -266,6 +348,13 @@ impl Search<'_> {
             None => Sight::Nothing,
         }
     }
+}
+
+/// How far from where it should be an edge is looked for: at first as far as its neighbours allow.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Reach {
+    Far,
+    Near,
 }
 
 /// What was seen at a place where an edge should be.
@@ -316,15 +405,32 @@ const fn edges() -> [(f64, f64, bool); 6] {
     edges
 }
 
-/// Whether the edges found are those of a marker: the ring's own two, and of the others either all that could be
-/// seen, or a second ring.
-fn believable(support: &[Support; 6], kind: RingKind) -> bool {
-    let own = kind as usize * 2;
+/// The ring to which a circle of this radius (in marker sizes) belongs.
+fn ring_of(radius: f64) -> RingKind {
+    let belongs = |kind: &RingKind| {
+        let (inner, outer) = kind.radii();
+        (inner - 1e-6..=outer + 1e-6).contains(&radius)
+    };
+    RingKind::ALL.into_iter().find(belongs).unwrap_or(RingKind::Inner)
+}
+
+/// Whether the edges found are those of a marker: most of those that could be seen, of two rings at least; or the
+/// innermost ring alone where the camera is too near to see any other.
+///
+/// `kept` of the edge points agree.
+fn believable(support: &[Support; 6], kept: usize) -> bool {
     let shares = support.map(|s| s.share());
-    let own_found = shares[own..own + 2].iter().all(|s| s.is_some_and(|s| s >= 0.8));
-    let seen = shares.iter().flatten().filter(|s| **s >= 0.7).count();
-    let missed = shares.iter().flatten().filter(|s| **s < 0.7).count();
-    own_found && (missed == 0 || seen >= 4)
+    let seen = shares.iter().flatten().filter(|s| **s >= LEAST_EDGE_SHARE).count();
+    let clear = shares.iter().flatten().filter(|s| **s >= 0.8).count();
+    let missed = shares.iter().flatten().filter(|s| **s < LEAST_EDGE_SHARE).count();
+    let alone = shares[..4].iter().all(Option::is_none);
+    let visible: u32 = support.iter().map(|s| s.visible).sum();
+    let enough = 2 * kept >= visible as usize;
+    match missed {
+        0 => enough && (seen >= 4 || clear >= 3 || clear >= 2 && alone),
+        1 | 2 => enough && seen >= 4 || clear >= 4,
+        _ => false,
+    }
 }
 
 /// How sure a believable marker is: the share of its visible edges that were found, less when few can be seen.
@@ -332,14 +438,4 @@ fn confidence(support: &[Support; 6]) -> f64 {
     let shares = support.iter().filter_map(Support::share);
     let (count, sum) = shares.fold((0.0, 0.0), |(count, sum), share| (count + 1.0, sum + share));
     if count == 0.0 { 0.0 } else { sum / count * (0.5 + count / 12.0) }
-}
-
-/// Whether the edges lie where the pose puts them, or a small marker's grey values are what they should be: blur moves
-/// the edges of thin rings, but leaves them round.
-fn fits(diameter_px: f64, rms_px: f64, difference: Option<f64>) -> bool {
-    if diameter_px > photometry::MOST_DIAMETER_PX {
-        // Paper is not quite flat, and lenses bend.
-        return rms_px < 0.3 + 0.01 * diameter_px;
-    }
-    rms_px < 0.3 || difference.is_some_and(|d| d < 0.04)
 }

@@ -1,0 +1,141 @@
+//! Whether an ellipse, taken for one of the marker's circles, has the marker's bands about it.
+
+use std::f64::consts::TAU;
+
+use imaging::{Ellipse, GrayView, bilinear};
+
+use crate::outline::Border;
+
+/// Fewer grey levels are noise.
+pub(crate) const LEAST_STEP: f64 = 6.0;
+/// From band to band the dark one lacks at least this share of the bright one's light.
+const LEAST_SHARE: f64 = 0.12;
+/// Radii at which the bands are looked at, in marker sizes, and their widths; white and black in turn.
+const BANDS: [(f64, f64); 7] =
+    [(0.55, 0.1), (0.45, 0.1), (0.325, 0.15), (0.2, 0.1), (0.09, 0.12), (0.02, 0.02), (0.0, 0.02)];
+/// A place in the white about the innermost ring that is close to it.
+const NEAR_DOT: f64 = 0.055;
+const RAYS: u32 = 32;
+/// Of so many neighbouring bands that can be seen, this share must differ as they should.
+pub(crate) const LEAST_SCORE: f64 = 0.55;
+/// A marker of this diameter or less is so blurred that only its mean over all directions is looked at.
+pub(crate) const SMALL_PX: f64 = 24.0;
+
+/// A border taken for a circle of the marker.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Candidate {
+    pub(crate) border: Border,
+    /// The circle's radius in marker sizes.
+    pub(crate) radius: f64,
+    /// White rings on black.
+    pub(crate) inverted: bool,
+    /// How much of it looks as it should, from 0 to 1.
+    pub(crate) score: f64,
+    /// The share of the bright bands' light that the dark ones lack.
+    pub(crate) contrast: f64,
+}
+
+impl Candidate {
+    /// The marker's diameter in pixels along the minor axis.
+    pub(crate) fn diameter_px(&self) -> f64 {
+        self.border.ellipse.minor / (2.0 * self.radius)
+    }
+}
+
+/// The circles that a border may be, with what lies about it looking like the marker.
+pub(crate) fn candidates(view: GrayView<'_>, border: &Border, found: &mut Vec<Candidate>) {
+    for (radius, dark_within) in
+        [(0.5, true), (0.4, false), (0.25, true), (0.15, false), (0.03, true), (0.01, false)]
+    {
+        let inverted = dark_within != border.dark_within;
+        let diameter_px = border.ellipse.minor / (2.0 * radius);
+        // The inner rings of a small marker have no outlines.
+        let blurred = diameter_px < SMALL_PX && (radius < 0.2 || !border.whole);
+        if blurred || inverted && radius < 0.02 {
+            continue;
+        }
+        let looks = if diameter_px < SMALL_PX { looks_small } else { looks };
+        if let Some((score, contrast)) = looks(view, &border.ellipse, radius, inverted) {
+            found.push(Candidate { border: *border, radius, inverted, score, contrast });
+        }
+    }
+}
+
+/// Compares the bands along rays; the order of the rays makes the first few a fair sample.
+fn looks(view: GrayView<'_>, ellipse: &Ellipse, radius: f64, inverted: bool) -> Option<(f64, f64)> {
+    const FIRST: u32 = 8;
+    let px_per_size = ellipse.minor / (2.0 * radius);
+    let bands = BANDS.iter().take_while(|(_, width)| width * px_per_size > 1.6).count();
+    let (mut seen, mut agree, mut share) = (0.0, 0.0, 0.0);
+    let mut by_edge = [[0_u32; 2]; 6];
+    for i in 0..RAYS {
+        if i == FIRST && agree < 0.35 * seen {
+            return None;
+        }
+        let turn = f64::from(i * 13 % RAYS) * TAU / f64::from(RAYS);
+        let on = ellipse.at(turn);
+        let at = |band: f64| {
+            let along = |axis: usize| {
+                ellipse.centre[axis] + (on[axis] - ellipse.centre[axis]) * (band / radius)
+            };
+            bilinear(view, along(0), along(1))
+        };
+        let mut before = None;
+        for (index, (band, _)) in BANDS.iter().take(bands).enumerate() {
+            // So near that the dot can be told, the white about it is looked at near it.
+            let here = at(if index == 4 && bands > 5 { NEAR_DOT } else { *band });
+            if let (Some(a), Some(b)) = (before, here) {
+                let (dark, bright): (f64, f64) =
+                    if (index % 2 == 1) != inverted { (b, a) } else { (a, b) };
+                seen += 1.0;
+                let tally = &mut by_edge[index - 1];
+                tally[0] += 1;
+                if bright - dark > LEAST_STEP.max(LEAST_SHARE * bright) {
+                    agree += 1.0;
+                    share += (bright - dark) / bright;
+                    tally[1] += 1;
+                }
+            }
+            before = here;
+        }
+    }
+    let edges = by_edge.iter().filter(|[seen, agree]| *seen >= 6 && 2 * agree >= *seen).count();
+    // A ring of which the rest is covered has two good edges.
+    let clear = by_edge.iter().filter(|[seen, agree]| *seen >= 28 && agree + 2 >= *seen).count();
+    let score = agree / seen;
+    (edges >= 2 && (score >= LEAST_SCORE || clear >= 2)).then_some((score, share / agree))
+}
+
+/// Compares the bands' means of a blurred marker.
+fn looks_small(
+    view: GrayView<'_>,
+    ellipse: &Ellipse,
+    radius: f64,
+    inverted: bool,
+) -> Option<(f64, f64)> {
+    const RAYS: u32 = 12;
+    let mut means = [0.0; 5];
+    let mut rim = 0;
+    for i in 0..RAYS {
+        let on = ellipse.at(f64::from(i) * TAU / f64::from(RAYS));
+        let mut values = [0.0; 5];
+        for (value, band) in values.iter_mut().zip([0.57, 0.45, 0.325, 0.2, 0.06]) {
+            let along = |axis: usize| {
+                ellipse.centre[axis] + (on[axis] - ellipse.centre[axis]) * (band / radius)
+            };
+            let sample = bilinear(view, along(0), along(1))?;
+            *value = if inverted { 255.0 - sample } else { sample };
+        }
+        rim += u32::from(values[0] > values[1] + 2.0);
+        for (mean, value) in means.iter_mut().zip(values) {
+            *mean += value / f64::from(RAYS);
+        }
+    }
+    let [paper, outer, gap, middle, _] = means;
+    let step = paper - outer;
+    let ripple = gap - (outer + middle) / 2.0;
+    if rim < 10 || step < LEAST_STEP || ripple < 0.02 * step {
+        return None;
+    }
+    Some(((0.6 + ripple / step).min(1.0), (step / paper.max(1.0)).min(1.0)))
+}
