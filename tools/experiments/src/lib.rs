@@ -4,8 +4,14 @@
 //! This crate knows cameras, markers and detectors as functions; it knows no vehicle and no network.
 //!
 //! Modules in reading order: [`shot`] takes one frame, through a [`veil`]; [`sets`] says which frames there are;
-//! [`store`] keeps them on disk.
+//! [`store`] keeps them on disk; [`record`] is what a detector answers; [`score`] how good that is; [`photographs`] asks
+//! real pictures; [`report`] writes it down; [`markers`] does all of it.
 
+pub mod markers;
+pub mod photographs;
+pub mod record;
+pub mod report;
+pub mod score;
 pub mod sets;
 pub mod shot;
 pub mod store;

@@ -1,0 +1,38 @@
+//! The experiment with markers without the rest of the program:
+//! `cargo run --release -p experiments --example markers -- SETS RESULTS [set=NAME] [family=NAME] [photographs=FOLDER]...`.
+#![allow(clippy::print_stdout, clippy::print_stderr, reason = "a program for people at a terminal")]
+
+use std::path::PathBuf;
+
+use experiments::markers::{Request, run};
+use experiments::sets::Set;
+
+fn main() -> anyhow::Result<()> {
+    let mut arguments = std::env::args().skip(1);
+    let mut folder = || arguments.next().map(PathBuf::from).ok_or_else(usage);
+    let mut request = Request {
+        sets_in: folder()?,
+        results_in: folder()?,
+        sets: Vec::new(),
+        families: Vec::new(),
+        photographs: None,
+    };
+    for argument in arguments {
+        match argument.split_once('=') {
+            Some(("set", name)) => request.sets.push(name.parse().map_err(anyhow::Error::msg)?),
+            Some(("family", name)) => request.families.push(name.to_owned()),
+            Some(("photographs", folder)) => request.photographs = Some(folder.into()),
+            _ => return Err(usage()),
+        }
+    }
+    if request.sets.is_empty() {
+        request.sets = Set::ALL.to_vec();
+    }
+    let report = run(&request, &mut |doing| eprintln!("{doing}"))?;
+    println!("{report}");
+    Ok(())
+}
+
+fn usage() -> anyhow::Error {
+    anyhow::anyhow!("usage: markers SETS RESULTS [set=NAME] [family=NAME] [photographs=FOLDER]...")
+}

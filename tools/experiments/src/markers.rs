@@ -1,0 +1,145 @@
+//! The experiment with markers: renders what is missing, runs our detector, scores all answers, writes the report.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use fiducial::{Family, Marker};
+
+use crate::photographs;
+use crate::record::{self, OURS, Record};
+use crate::report;
+use crate::sets::{MARKERS, SIZE_M, Set};
+use crate::shot::Studio;
+use crate::store;
+
+/// What to do.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// Folder of the sets, rendered where they are missing.
+    pub sets_in: PathBuf,
+    /// Folder of answers, scores and figures.
+    pub results_in: PathBuf,
+    /// Which sets.
+    pub sets: Vec<Set>,
+    /// Which families of the experiment's; all when empty.
+    pub families: Vec<String>,
+    /// Folder of labelled photographs.
+    pub photographs: Option<PathBuf>,
+}
+
+/// Runs in which the shortest time is taken, where time matters.
+const TIMED_RUNS: usize = 5;
+
+/// Does it, telling `progress` what is being done; returns the report.
+///
+/// # Errors
+/// When a file cannot be read or written.
+pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<String> {
+    let Request { sets_in, results_in, .. } = request;
+    let mut studio = Studio::default();
+    let mut extra = String::new();
+    for set in &request.sets {
+        for marker in markers(request, *set)? {
+            let name = marker.family.name();
+            progress(&format!("{} {name}", set.name()));
+            store::make(sets_in, *set, marker, &mut studio)?;
+            let folder = store::folder(sets_in, *set, marker);
+            if set.has_marker() {
+                let any = Marker { id: None, ..marker };
+                answer(results_in, *set, name, (&folder, &[any]))?;
+            } else {
+                for (name, families) in photographs::families_for_negatives() {
+                    let markers = sized(&families);
+                    answer(results_in, *set, name, (&folder, &markers))?;
+                }
+            }
+        }
+    }
+    if let Some(folder) = &request.photographs {
+        progress("photographs");
+        extra = ask_photographs(folder, results_in)?;
+    }
+    let runs = report::runs(sets_in, results_in)?;
+    let text = report::text(&runs) + &extra;
+    std::fs::write(results_in.join("report.md"), &text)?;
+    std::fs::write(results_in.join("scores.jsonl"), report::json_lines(&runs)?)?;
+    Ok(text)
+}
+
+fn sized(families: &[Family]) -> Vec<Marker> {
+    let sized = |family: &Family| Marker { family: *family, id: None, size_m: Some(SIZE_M) };
+    families.iter().map(sized).collect()
+}
+
+/// The markers with which a set is rendered.
+fn markers(request: &Request, set: Set) -> anyhow::Result<Vec<Marker>> {
+    let wanted = |name: &&&str| {
+        let family = name.split(':').next().unwrap_or_default();
+        request.families.is_empty() || request.families.iter().any(|wanted| wanted == family)
+    };
+    let count = if set.has_marker() { MARKERS.len() } else { 1 };
+    MARKERS
+        .iter()
+        .take(count)
+        .filter(|name| !set.has_marker() || wanted(name))
+        .map(|name| format!("{name}:{SIZE_M}").parse().with_context(|| (*name).to_owned()))
+        .collect()
+}
+
+fn answer(
+    results: &Path,
+    set: Set,
+    name: &str,
+    (folder, markers): (&Path, &[Marker]),
+) -> anyhow::Result<()> {
+    let is_timed = matches!(set, Set::Textured | Set::Tracking);
+    let runs = if is_timed { TIMED_RUNS } else { 1 };
+    let answers = record::run(folder, markers, runs)?;
+    let file = record::file(results, OURS, set, name);
+    record::write(&file, answers.iter().map(|(_, record)| record))
+}
+
+/// The folder in which a detector's answers to photographs are.
+const PHOTOGRAPHS: &str = "photographs";
+
+fn ask_photographs(folder: &Path, results: &Path) -> anyhow::Result<String> {
+    for (_, name) in photographs::FAMILIES {
+        if let Some(family) = Family::ALL.into_iter().find(|family| family.name() == name) {
+            let records = photographs::run(folder, family)?;
+            record::write(&photographs_file(results, OURS, name), &records)?;
+        }
+    }
+    let mut recalls = BTreeMap::new();
+    for entry in std::fs::read_dir(results)? {
+        let detector = entry?.file_name().to_string_lossy().into_owned();
+        for (_, name) in photographs::FAMILIES {
+            let file = photographs_file(results, &detector, name);
+            let Ok(text) = std::fs::read_to_string(file) else { continue };
+            let records: Vec<Record> =
+                text.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;
+            let recall = photographs::recall(folder, name, &records)?;
+            recalls.insert((name.to_owned(), detector.clone()), recall);
+        }
+    }
+    let mut text = photographs::text(&recalls);
+    for (name, families) in photographs::families_for_negatives() {
+        let (images, wrong) = photographs::negatives(folder, &families)?;
+        text.push_str(&format!(
+            "\nPhotographs without a marker and their parts, families `{name}`: {images}, with false detections: {}\n",
+            wrong.len()
+        ));
+        for (image, found) in wrong {
+            let names: Vec<String> = found
+                .iter()
+                .map(|f| format!("{}:{:?} confidence {:.2}", f.family, f.id, f.confidence))
+                .collect();
+            text.push_str(&format!("- {image}: {}\n", names.join(", ")));
+        }
+    }
+    Ok(text)
+}
+
+fn photographs_file(results: &Path, detector: &str, family: &str) -> PathBuf {
+    results.join(detector).join(PHOTOGRAPHS).join(format!("{family}.jsonl"))
+}

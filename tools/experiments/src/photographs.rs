@@ -1,0 +1,228 @@
+//! Real photographs: recall on those that are labelled, false detections on those that show no marker.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+
+use anyhow::Context;
+use fiducial::{Detector, Family, Marker, Settings};
+use image::GrayImage;
+use serde::Deserialize;
+
+use crate::record::{self, Found, Record};
+
+/// The labels' families and ours.
+pub const FAMILIES: [(&str, &str); 5] = [
+    ("tag36h11", "apriltag-36h11"),
+    ("aruco_4x4_1000", "aruco-4x4-1000"),
+    ("aruco_5x5_1000", "aruco-5x5-1000"),
+    ("aruco_6x6_1000", "aruco-6x6-1000"),
+    ("stag_hd21", "stag-hd21"),
+];
+
+/// A line of `labels.jsonl`.
+#[derive(Debug, Deserialize)]
+struct Photograph {
+    image: String,
+    markers: Vec<Label>,
+    uncertain: Vec<Label>,
+    #[serde(default)]
+    negative: bool,
+    /// Whether the markers are all that there are.
+    #[serde(default)]
+    complete: Option<bool>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Label {
+    family: String,
+    id: u32,
+    corners: [[f64; 2]; 4],
+}
+
+impl Label {
+    fn centre(&self) -> [f64; 2] {
+        [0, 1].map(|i| self.corners.iter().map(|corner| corner[i]).sum::<f64>() / 4.0)
+    }
+
+    /// Half of a diagonal.
+    fn reach_px(&self) -> f64 {
+        let centre = self.centre();
+        self.corners.iter().map(|c| away(*c, centre)).fold(0.0, f64::max)
+    }
+
+    /// Whether a detection lies on it.
+    fn is_at(&self, found: &Found) -> bool {
+        away(found.centre_px, self.centre()) < 0.35 * self.reach_px()
+    }
+}
+
+fn away(a: [f64; 2], b: [f64; 2]) -> f64 {
+    (a[0] - b[0]).hypot(a[1] - b[1])
+}
+
+/// What a detector made of the labelled photographs, for one family.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Recall {
+    /// Labelled markers.
+    pub markers: usize,
+    /// Of those, found.
+    pub found: usize,
+    /// Found with another id.
+    pub wrong_ids: usize,
+    /// Found where no label is, though the labels are complete.
+    pub elsewhere: usize,
+    /// Found where no label is, and nobody knows.
+    pub unlabelled: usize,
+    /// Photographs and how many markers were missed in them.
+    pub missed: Vec<(String, usize)>,
+}
+
+fn photographs(folder: &Path) -> anyhow::Result<Vec<Photograph>> {
+    let path = folder.join("labels.jsonl");
+    let text =
+        std::fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?;
+    text.lines()
+        .map(|line| serde_json::from_str(line).with_context(|| path.display().to_string()))
+        .collect()
+}
+
+/// A marker of a family, any id, without a size.
+fn any_of(family: Family) -> Marker {
+    Marker { family, id: None, size_m: None }
+}
+
+/// Runs our detector for one family over the labelled photographs that show it.
+///
+/// # Errors
+/// When a photograph or the labels cannot be read.
+pub fn run(folder: &Path, family: Family) -> anyhow::Result<Vec<Record>> {
+    let mut detector = Detector::new(&[any_of(family)], Settings::default())?;
+    let label = label_of(family.name());
+    let mut records = Vec::new();
+    for photograph in photographs(folder)? {
+        if photograph.markers.iter().any(|marker| Some(marker.family.as_str()) == label) {
+            let image = record::read(&folder.join(&photograph.image))?;
+            let (ms, found) = record::answer(&mut detector, &image, None, 1)?;
+            records.push(Record { image: photograph.image, ms, found });
+        }
+    }
+    Ok(records)
+}
+
+fn label_of(family: &str) -> Option<&'static str> {
+    FAMILIES.iter().find(|(_, ours)| *ours == family).map(|(label, _)| *label)
+}
+
+/// How many of the labelled markers of a family are among the answers.
+///
+/// # Errors
+/// When the labels cannot be read, or an answer is missing.
+pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result<Recall> {
+    let label = label_of(family);
+    let mut recall = Recall::default();
+    for photograph in photographs(folder)? {
+        let is_ours = |marker: &&Label| Some(marker.family.as_str()) == label;
+        let markers: Vec<&Label> = photograph.markers.iter().filter(is_ours).collect();
+        if markers.is_empty() {
+            continue;
+        }
+        let record = records.iter().find(|record| record.image == photograph.image);
+        let record = record.with_context(|| format!("no answer to {}", photograph.image))?;
+        let has = |label: &&&Label| {
+            record.found.iter().any(|found| label.is_at(found) && found.id == Some(label.id))
+        };
+        let found = markers.iter().filter(has).count();
+        recall.markers += markers.len();
+        recall.found += found;
+        if found < markers.len() {
+            recall.missed.push((photograph.image.clone(), markers.len() - found));
+        }
+        for found in &record.found {
+            let at = |label: &&Label| label.is_at(found);
+            match photograph.markers.iter().find(at) {
+                Some(label) if is_ours(&label) && found.id != Some(label.id) => {
+                    recall.wrong_ids += 1;
+                }
+                Some(_) => {}
+                None if photograph.uncertain.iter().any(|label| at(&label)) => {}
+                None if photograph.complete == Some(true) => recall.elsewhere += 1,
+                None => recall.unlabelled += 1,
+            }
+        }
+    }
+    Ok(recall)
+}
+
+/// Which families are looked for in negatives: those of the experiment, and all there are.
+pub fn families_for_negatives() -> [(&'static str, Vec<Family>); 2] {
+    let thesis = crate::sets::MARKERS.iter().filter_map(|name| {
+        let name = name.split(':').next()?;
+        Family::ALL.into_iter().find(|family| family.name() == name)
+    });
+    let all = Family::ALL.into_iter().filter(|family| *family != Family::RingsThesis);
+    [("experiment", thesis.collect()), ("all", all.collect())]
+}
+
+/// False detections in the photographs without a marker: whole, in quarters and in ninths, each at full resolution.
+/// Returns how many images there were, and the false detections by image.
+///
+/// # Errors
+/// When a photograph or the labels cannot be read.
+pub fn negatives(
+    folder: &Path,
+    families: &[Family],
+) -> anyhow::Result<(usize, Vec<(String, Vec<Found>)>)> {
+    let markers: Vec<Marker> = families.iter().map(|family| any_of(*family)).collect();
+    let mut detector = Detector::new(&markers, Settings::default())?;
+    let (mut images, mut wrong) = (0, Vec::new());
+    for photograph in photographs(folder)?.iter().filter(|photograph| photograph.negative) {
+        let whole = record::read(&folder.join(&photograph.image))?;
+        for (name, part) in parts(&whole) {
+            let (_, found) = record::answer(&mut detector, &part, None, 1)?;
+            images += 1;
+            if !found.is_empty() {
+                wrong.push((format!("{}{name}", photograph.image), found));
+            }
+        }
+    }
+    Ok((images, wrong))
+}
+
+/// The whole image, its quarters and its ninths, and what to add to its name.
+fn parts(whole: &GrayImage) -> Vec<(String, GrayImage)> {
+    let mut parts = vec![(String::new(), whole.clone())];
+    for count in [2, 3] {
+        let (width, height) = (whole.width() / count, whole.height() / count);
+        for (x, y) in (0..count).flat_map(|x| (0..count).map(move |y| (x, y))) {
+            let part = image::imageops::crop_imm(whole, x * width, y * height, width, height);
+            parts
+                .push((format!(" {width}x{height}+{}+{}", x * width, y * height), part.to_image()));
+        }
+    }
+    parts
+}
+
+/// The table of recall on photographs.
+pub fn text(recalls: &BTreeMap<(String, String), Recall>) -> String {
+    let mut text = String::from(
+        "\n## Labelled photographs\n\n| marker | detector | found | wrong ids | elsewhere | unlabelled |\n|---|---|---|---|---|---|\n",
+    );
+    // Writing to a text cannot fail.
+    for ((family, detector), r) in recalls {
+        let _ = writeln!(
+            text,
+            "| {family} | {detector} | {}/{} | {} | {} | {} |",
+            r.found, r.markers, r.wrong_ids, r.elsewhere, r.unlabelled
+        );
+    }
+    for ((family, detector), r) in recalls {
+        if detector == record::OURS {
+            let _ = writeln!(text, "\nMissed by us, {family}:");
+            for (image, count) in &r.missed {
+                let _ = writeln!(text, "- {image}: {count}");
+            }
+        }
+    }
+    text
+}

@@ -1,0 +1,174 @@
+//! What a detector found in a frame, as a line of JSON: the same for ours and for others'.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use fiducial::{Detector, Marker, Observation, Settings};
+use image::GrayImage;
+use imaging::GrayView;
+use rustix::time::{ClockId, clock_gettime};
+use serde::{Deserialize, Serialize};
+
+use crate::sets::Set;
+use crate::store::{self, Frame};
+
+/// The name under which our own results are kept.
+pub const OURS: &str = "alight";
+
+/// A detector's answer to one frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// The frame's file.
+    pub image: String,
+    /// Processor time in milliseconds.
+    pub ms: f64,
+    /// What was found.
+    pub found: Vec<Found>,
+}
+
+/// A marker that was found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Found {
+    /// Its family.
+    pub family: String,
+    /// Its id.
+    pub id: Option<u32>,
+    /// Where its centre appears.
+    pub centre_px: [f64; 2],
+    /// Covariance of the centre: xx, xy, yy.
+    #[serde(default)]
+    pub covariance_px2: Option<[f64; 3]>,
+    /// Its corners: its own top left first, then clockwise.
+    #[serde(default)]
+    pub corners_px: Option<[[f64; 2]; 4]>,
+    /// Its place in the camera frame.
+    #[serde(default)]
+    pub translation_m: Option<[f64; 3]>,
+    /// Variance of the distance along the optical axis, in square metres.
+    #[serde(default)]
+    pub range_variance_m2: Option<f64>,
+    /// How sure the detector is, on a scale of its own.
+    #[serde(default)]
+    pub confidence: f64,
+}
+
+impl From<&Observation> for Found {
+    fn from(seen: &Observation) -> Self {
+        let covariance = &seen.centre_covariance_px2;
+        Self {
+            family: seen.family.name().to_owned(),
+            id: seen.id,
+            centre_px: [seen.centre.x, seen.centre.y],
+            covariance_px2: Some([covariance[(0, 0)], covariance[(0, 1)], covariance[(1, 1)]]),
+            corners_px: seen.corners.map(|corners| corners.map(|c| [c.x, c.y])),
+            translation_m: seen.pose.map(|pose| {
+                let origin = pose.camera_from_marker.origin();
+                [origin.x(), origin.y(), origin.z()]
+            }),
+            range_variance_m2: seen.pose.map(|pose| pose.covariance[(2, 2)]),
+            confidence: seen.confidence,
+        }
+    }
+}
+
+/// The file of a detector's answers to a set with one family.
+pub fn file(results: &Path, detector: &str, set: Set, family: &str) -> PathBuf {
+    results.join(detector).join(set.name()).join(format!("{family}.jsonl"))
+}
+
+/// Processor time of this thread, in milliseconds.
+pub fn processor_ms() -> f64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    time.tv_sec as f64 * 1e3 + time.tv_nsec as f64 * 1e-6
+}
+
+/// An image on disk, as grey.
+///
+/// # Errors
+/// When the file cannot be read or is no image.
+pub fn read(path: &Path) -> anyhow::Result<GrayImage> {
+    let image = image::ImageReader::open(path)
+        .with_context(|| format!("reading {}", path.display()))?
+        .with_guessed_format()?
+        .decode()
+        .with_context(|| format!("reading {}", path.display()))?;
+    Ok(image.into_luma8())
+}
+
+/// Our detector's answer to an image: the shortest time of some `runs`.
+///
+/// # Errors
+/// When the image is larger than any detector takes.
+pub fn answer(
+    detector: &mut Detector,
+    image: &GrayImage,
+    camera: Option<&geometry::CameraModel>,
+    runs: usize,
+) -> anyhow::Result<(f64, Vec<Found>)> {
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    let view = GrayView::packed(image.as_raw(), width, height).context("an image")?;
+    let mut shortest = f64::INFINITY;
+    let mut found = Vec::new();
+    for _ in 0..runs.max(1) {
+        let start = processor_ms();
+        let seen = detector.detect(view, camera, &mut ());
+        shortest = shortest.min(processor_ms() - start);
+        found = seen.iter().map(Found::from).collect();
+    }
+    Ok((shortest, found))
+}
+
+/// Runs our detector for `markers` over the frames of a folder.
+///
+/// # Errors
+/// When a frame cannot be read, or there is no such detector.
+pub fn run(folder: &Path, markers: &[Marker], runs: usize) -> anyhow::Result<Vec<(Frame, Record)>> {
+    let mut detector = Detector::new(markers, Settings::default())?;
+    store::frames(folder)?
+        .into_iter()
+        .map(|frame| {
+            let image = read(&folder.join(&frame.image))?;
+            let (ms, found) = answer(&mut detector, &image, Some(&frame.camera.model()), runs)?;
+            let record = Record { image: frame.image.clone(), ms, found };
+            Ok((frame, record))
+        })
+        .collect()
+}
+
+/// Writes a detector's answers.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write<'a>(path: &Path, records: impl IntoIterator<Item = &'a Record>) -> anyhow::Result<()> {
+    let mut text = String::new();
+    for record in records {
+        text.push_str(&serde_json::to_string(record)?);
+        text.push('\n');
+    }
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder)?;
+    }
+    std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))
+}
+
+/// A detector's answers, joined with the frames of a folder; `None` when it has not been run.
+///
+/// # Errors
+/// When the answers are damaged, or not those to these frames.
+pub fn join(path: &Path, folder: &Path) -> anyhow::Result<Option<Vec<(Frame, Record)>>> {
+    let Ok(text) = std::fs::read_to_string(path) else { return Ok(None) };
+    let mut records = std::collections::HashMap::new();
+    for line in text.lines() {
+        let record: Record =
+            serde_json::from_str(line).with_context(|| path.display().to_string())?;
+        records.insert(record.image.clone(), record);
+    }
+    let joined: Option<Vec<_>> = store::frames(folder)?
+        .into_iter()
+        .map(|frame| {
+            let record = records.remove(&frame.image)?;
+            Some((frame, record))
+        })
+        .collect();
+    Ok(Some(joined.with_context(|| format!("{} is of other frames", path.display()))?))
+}

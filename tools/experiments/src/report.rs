@@ -1,0 +1,296 @@
+//! The scores as text: one table of all sets, one of their groups, and which frames were missed.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+
+use anyhow::Context;
+use serde::Serialize;
+
+use crate::record::{self, OURS, Record};
+use crate::score::{Score, Summary, quantile};
+use crate::sets::Set;
+use crate::store::Frame;
+
+/// What one detector made of one family's frames of one set.
+#[derive(Debug)]
+pub struct Run {
+    /// The set.
+    pub set: Set,
+    /// The family; of negatives all that were looked for.
+    pub family: String,
+    /// The detector.
+    pub detector: String,
+    /// Its answers.
+    pub answers: Vec<(Frame, Record)>,
+}
+
+/// A line of `summary.jsonl`.
+#[derive(Serialize)]
+struct Line<'a> {
+    detector: &'a str,
+    set: &'static str,
+    family: &'a str,
+    group: Option<&'a str>,
+    #[serde(flatten)]
+    summary: Summary,
+}
+
+/// All runs whose answers are kept below `results`, ours first.
+///
+/// # Errors
+/// When answers are damaged or of other frames.
+pub fn runs(root: &Path, results: &Path) -> anyhow::Result<Vec<Run>> {
+    let mut detectors = Vec::new();
+    for entry in std::fs::read_dir(results).with_context(|| format!("{}", results.display()))? {
+        let entry = entry?;
+        if entry.path().is_dir() {
+            detectors.push(entry.file_name().to_string_lossy().into_owned());
+        }
+    }
+    detectors.sort_by_key(|name| (name != OURS, name.clone()));
+    let mut runs = Vec::new();
+    for set in Set::ALL {
+        for detector in &detectors {
+            let Ok(entries) = std::fs::read_dir(results.join(detector).join(set.name())) else {
+                continue;
+            };
+            let mut families: Vec<String> = entries
+                .filter_map(|entry| {
+                    let path = entry.ok()?.path();
+                    Some(path.file_stem()?.to_string_lossy().into_owned())
+                })
+                .collect();
+            families.sort();
+            for family in families {
+                let below = root.join(set.name());
+                let folder = if set.has_marker() { below.join(&family) } else { below };
+                let file = record::file(results, detector, set, &family);
+                if let Some(answers) = record::join(&file, &folder)? {
+                    runs.push(Run { set, family, detector: detector.clone(), answers });
+                }
+            }
+        }
+    }
+    runs.sort_by_key(|run| (place(run.set), run.family.clone()));
+    Ok(runs)
+}
+
+fn place(set: Set) -> usize {
+    Set::ALL.iter().position(|other| *other == set).unwrap_or(0)
+}
+
+/// The whole report, as Markdown.
+pub fn text(runs: &[Run]) -> String {
+    let mut text = String::new();
+    append_summary(&mut text, runs);
+    append_positions(&mut text, runs);
+    append_farthest(&mut text, runs);
+    append_groups(&mut text, runs);
+    append_misses(&mut text, runs);
+    text
+}
+
+/// The scores as lines of JSON, of sets and of their groups.
+///
+/// # Errors
+/// When a score cannot be written as JSON.
+pub fn json_lines(runs: &[Run]) -> anyhow::Result<String> {
+    let mut text = String::new();
+    let mut append = |run: &Run, group: Option<&str>, score: &Score| -> anyhow::Result<()> {
+        let line = Line {
+            detector: &run.detector,
+            set: run.set.name(),
+            family: &run.family,
+            group,
+            summary: score.summary(),
+        };
+        text.push_str(&serde_json::to_string(&line)?);
+        text.push('\n');
+        Ok(())
+    };
+    for run in runs {
+        append(run, None, &Score::of(&run.answers))?;
+        for (group, score) in groups(run) {
+            append(run, Some(&group), &score)?;
+        }
+    }
+    Ok(text)
+}
+
+/// Scores by group.
+pub fn groups(run: &Run) -> BTreeMap<String, Score> {
+    let mut groups: BTreeMap<&str, Vec<&(Frame, Record)>> = BTreeMap::new();
+    for answer in &run.answers {
+        groups.entry(&answer.0.group).or_default().push(answer);
+    }
+    groups.into_iter().map(|(group, list)| (group.to_owned(), Score::of(list))).collect()
+}
+
+/// A number, or a dash where there is none.
+pub fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+// Writing to a text cannot fail, so that the results of `writeln!` are of no use here.
+
+fn append_summary(text: &mut String, runs: &[Run]) {
+    let _ = writeln!(
+        text,
+        "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) when the covariance is true. Times are processor time.\n"
+    );
+    let _ = writeln!(
+        text,
+        "| set | marker | detector | found | wrong ids | elsewhere | centre px median | p95 | worst | corner px | range % median | p95 | bias % | centre chi2 | range chi2 | ms | p95 |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    );
+    for run in runs {
+        let s = Score::of(&run.answers).summary();
+        let found = if run.set.has_marker() {
+            format!("{}/{}", s.found, s.frames)
+        } else {
+            s.frames.to_string()
+        };
+        let _ = writeln!(
+            text,
+            "| {} | {} | {} | {found} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+            run.set.name(),
+            run.family,
+            run.detector,
+            s.wrong_ids,
+            s.elsewhere,
+            number(s.centre_median_px, 4),
+            number(s.centre_p95_px, 4),
+            number(s.centre_worst_px, 3),
+            number(s.corner_median_px, 4),
+            number(s.range_median_percent, 4),
+            number(s.range_p95_percent, 4),
+            number(s.range_bias_percent, 4),
+            number(s.centre_chi2, 2),
+            number(s.range_chi2, 2),
+            number(s.ms, 2),
+            number(s.ms_p95, 2),
+        );
+    }
+}
+
+/// Height in metres of a group of positions, `2x2-07m-2m`.
+pub fn height_m(group: &str) -> Option<u32> {
+    group.split('-').nth(1)?.get(..2)?.parse().ok()
+}
+
+fn append_positions(text: &mut String, runs: &[Run]) {
+    let _ = writeln!(
+        text,
+        "\n## The thesis' positions\n\n| marker | detector | binning | frames found | every frame found to m | centre px median | p95 | range % median to 10 m | p95 | bias % | range % median at 13 m | bias mm |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+    );
+    for run in runs.iter().filter(|run| run.set == Set::Positions) {
+        for binning in ["2x2", "4x4"] {
+            let of = |from: u32, to: u32| {
+                Score::of(run.answers.iter().filter(|(frame, _)| {
+                    frame.group.starts_with(binning)
+                        && height_m(&frame.group)
+                            .is_some_and(|height| (from..=to).contains(&height))
+                }))
+            };
+            let (all, near, last) = (of(1, 13), of(1, 10), of(13, 13));
+            let complete = (1..=13)
+                .take_while(|height| {
+                    let row = of(*height, *height);
+                    row.found == row.frames
+                })
+                .count();
+            let (all, near, last) = (all.summary(), near.summary(), last.summary());
+            let _ = writeln!(
+                text,
+                "| {} | {} | {binning} | {}/{} | {complete} | {} | {} | {} | {} | {} | {} | {} |",
+                run.family,
+                run.detector,
+                all.found,
+                all.frames,
+                number(all.centre_median_px, 4),
+                number(all.centre_p95_px, 4),
+                number(near.range_median_percent, 4),
+                number(near.range_p95_percent, 4),
+                number(near.range_bias_percent, 4),
+                number(last.range_median_percent, 4),
+                number(last.range_bias_mm, 1),
+            );
+        }
+    }
+}
+
+fn append_farthest(text: &mut String, runs: &[Run]) {
+    let _ = writeln!(
+        text,
+        "\n## Farthest, 2x2\n\n| marker | detector | every frame found to m | found at 20 | 24 | 28 | 30 | 32 | 34 | 36 | 38 | 40 m |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+    );
+    for run in runs.iter().filter(|run| run.set == Set::Far) {
+        let groups = groups(run);
+        let at = |height: u32| groups.get(&format!("{height}m"));
+        let is_complete =
+            |height: &u32| at(*height).is_some_and(|score| score.found == score.frames);
+        let farthest = (10..=40).step_by(2).take_while(is_complete).last().unwrap_or(0);
+        let _ = write!(text, "| {} | {} | {farthest} |", run.family, run.detector);
+        for height in [20, 24, 28, 30, 32, 34, 36, 38, 40] {
+            let found = at(height).map_or(0, |score| score.found);
+            let _ = write!(text, " {found} |");
+        }
+        text.push('\n');
+    }
+}
+
+fn append_groups(text: &mut String, runs: &[Run]) {
+    let _ = writeln!(text, "\n## Groups: found of all, median centre px");
+    let with_groups = [Set::Adverse, Set::Landing, Set::Tilt, Set::Blur, Set::Noise, Set::Light];
+    for set in with_groups {
+        let of_set: Vec<_> = runs.iter().filter(|run| run.set == set).collect();
+        let Some(first) = of_set.first() else { continue };
+        let mut names: Vec<&str> = Vec::new();
+        for (frame, _) in &first.answers {
+            if !names.contains(&frame.group.as_str()) {
+                names.push(&frame.group);
+            }
+        }
+        let _ = writeln!(text, "\n| {} | detector | {} |", set.name(), names.join(" | "));
+        let _ = writeln!(text, "|---|---|{}", "---|".repeat(names.len()));
+        for run in of_set {
+            let groups = groups(run);
+            let _ = write!(text, "| {} | {} |", run.family, run.detector);
+            for name in &names {
+                let cell = groups.get(*name).map_or_else(String::new, |score| {
+                    let centre = quantile(&score.centre_px, 0.5);
+                    format!("{}/{} ({})", score.found, score.frames, number(centre, 3))
+                });
+                let _ = write!(text, " {cell} |");
+            }
+            text.push('\n');
+        }
+    }
+}
+
+fn append_misses(text: &mut String, runs: &[Run]) {
+    let _ = writeln!(text, "\n## Our misses and false detections\n");
+    for run in runs.iter().filter(|run| run.detector == OURS) {
+        let score = Score::of(&run.answers);
+        if run.set.has_marker() && !score.missed.is_empty() {
+            let _ = writeln!(
+                text,
+                "- {}/{} missed {}: {}",
+                run.set.name(),
+                run.family,
+                score.missed.len(),
+                score.missed.join(" ")
+            );
+        }
+        if !score.false_in.is_empty() {
+            let _ = writeln!(
+                text,
+                "- {}/{} FALSE or wrong id in {}: {}",
+                run.set.name(),
+                run.family,
+                score.false_in.len(),
+                score.false_in.join(" ")
+            );
+        }
+    }
+}
