@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use messages::{ControllerCommand, topic};
+use messages::{ControllerCommand, DetectorCommand, topic};
 use node::{ConfigError, Identity, Layers, Node, ZenohSource};
 
 use crate::services::{self, Service};
@@ -44,7 +44,7 @@ enum Command {
     Marker(marker::MarkerArgs),
     /// Print the effective configuration of a service, or of all.
     Config(ConfigArgs),
-    /// Tell a running controller what to do.
+    /// Tell a running controller what to do, or change a parameter of a running detector.
     Command(CommandArgs),
 }
 
@@ -83,8 +83,11 @@ struct CommandArgs {
     /// What to do.
     #[arg(value_enum)]
     command: OperatorCommand,
-    /// The detector, for `use-detector`.
-    #[arg(required_if_eq("command", "use-detector"))]
+    /// The detector, for `use-detector`; the parameter and its value, for `set`: KEY=VALUE.
+    #[arg(required_if_eq_any([("command", "use-detector"), ("command", "set")]))]
+    argument: Option<String>,
+    /// The detector that is told, for `set`; the controller otherwise.
+    #[arg(long, value_name = "ID")]
     detector: Option<String>,
     /// Zenoh configuration (JSON5); the built-in `local.json5` otherwise.
     #[arg(long, value_name = "FILE")]
@@ -103,6 +106,53 @@ enum OperatorCommand {
     Abort,
     /// Use a certain detector from now on.
     UseDetector,
+    /// Change a parameter while the service runs.
+    Set,
+}
+
+/// What is sent, and to whom.
+enum Order {
+    Controller(ControllerCommand),
+    Detector { id: String, command: DetectorCommand },
+}
+
+impl Order {
+    fn new(args: &CommandArgs) -> anyhow::Result<Self> {
+        let argument = args.argument.clone().unwrap_or_default();
+        let command = match (args.command, &args.detector) {
+            (OperatorCommand::Set, Some(id)) => {
+                let (key, value) = key_and_value(&argument)?;
+                let command = DetectorCommand::SetParameter { key, value };
+                return Ok(Self::Detector { id: id.clone(), command });
+            }
+            (OperatorCommand::Set, None) => {
+                let (key, value) = key_and_value(&argument)?;
+                ControllerCommand::SetParameter { key, value }
+            }
+            (_, Some(_)) => {
+                return Err(wrong_command("a detector is only told to `set` a parameter"));
+            }
+            (OperatorCommand::UseDetector, None) => ControllerCommand::UseDetector(argument),
+            (_, None) if !argument.is_empty() => {
+                return Err(wrong_command("only `use-detector` and `set` take an argument"));
+            }
+            (OperatorCommand::Start, None) => ControllerCommand::Start,
+            (OperatorCommand::Hold, None) => ControllerCommand::Hold,
+            (OperatorCommand::Resume, None) => ControllerCommand::Resume,
+            (OperatorCommand::Abort, None) => ControllerCommand::Abort,
+        };
+        Ok(Self::Controller(command))
+    }
+}
+
+fn key_and_value(setting: &str) -> anyhow::Result<(String, String)> {
+    let (key, value) =
+        setting.split_once('=').ok_or_else(|| ConfigError::Form { text: setting.to_owned() })?;
+    Ok((key.trim().to_owned(), value.trim().to_owned()))
+}
+
+fn wrong_command(problem: &str) -> anyhow::Error {
+    clap::Error::raw(clap::error::ErrorKind::ArgumentConflict, problem).into()
 }
 
 /// Does what the command line asks for; errors go to standard error.
@@ -129,6 +179,7 @@ pub(crate) fn run() -> ExitCode {
 /// True for errors that another command line or configuration would avoid.
 fn is_wrong_use(problem: &anyhow::Error) -> bool {
     problem.is::<ConfigError>()
+        || problem.is::<clap::Error>()
         || problem.is::<fiducial::DetectorError>()
         || problem.is::<camera_pub::CalibrationError>()
         || problem.is::<marker::SheetError>()
@@ -152,21 +203,18 @@ fn print_config(args: ConfigArgs) -> anyhow::Result<ExitCode> {
 
 fn send_command(args: CommandArgs) -> anyhow::Result<ExitCode> {
     use std::io::Write;
-    let command = match args.command {
-        OperatorCommand::Start => ControllerCommand::Start,
-        OperatorCommand::Hold => ControllerCommand::Hold,
-        OperatorCommand::Resume => ControllerCommand::Resume,
-        OperatorCommand::Abort => ControllerCommand::Abort,
-        OperatorCommand::UseDetector => {
-            ControllerCommand::UseDetector(args.detector.unwrap_or_default())
-        }
-    };
+    let order = Order::new(&args)?;
     node::start_logging("warn");
     let reply = services::runtime()?.block_on(async {
         let instance = format!("command-{}", std::process::id());
         let identity = Identity { service: "alight", instance };
         let node = Node::open(identity, &zenoh_source(args.zenoh)).await?;
-        let reply = node.command(topic::COMMAND, &[], &command).await;
+        let reply = match &order {
+            Order::Controller(command) => node.command(topic::COMMAND, &[], command).await,
+            Order::Detector { id, command } => {
+                node.command(topic::DETECTOR_COMMAND, &[id], command).await
+            }
+        };
         node.close().await;
         reply
     })?;

@@ -1,11 +1,11 @@
-//! The detector's configuration.
+//! The detector's configuration, at the start and while it runs.
 
-use fiducial::Marker;
+use fiducial::{Detector, Marker, TrackingSettings};
 use node::{Check, Settings};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 /// The keys of `detector.toml`; meanings, units and ranges are told there.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Name of this detector.
@@ -14,10 +14,24 @@ pub struct Config {
     pub camera: String,
     /// Markers to look for.
     pub markers: Vec<String>,
+    /// Detections less sure than this are not published.
+    pub least_confidence: f64,
     /// Threshold of `rings-thesis`, in grey levels.
     pub thesis_threshold: u8,
     /// Quality of the debug images.
     pub debug_jpeg_quality: u8,
+    /// Whether and how markers are followed.
+    pub tracking: TrackingConfig,
+}
+
+/// Whether and how markers are followed from frame to frame.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrackingConfig {
+    /// Whether they are.
+    pub enabled: bool,
+    /// The whole frame is searched in every frame of this number.
+    pub full_search_period: u32,
 }
 
 impl Settings for Config {
@@ -26,18 +40,52 @@ impl Settings for Config {
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.name("camera", &self.camera);
-        check.parses("markers", self.parsed_markers());
+        check.parses("markers", self.detector());
+        check.range("least_confidence", self.least_confidence, 0.0..=1.0);
         check.range("thesis_threshold", self.thesis_threshold, 1..=255);
         check.range("debug_jpeg_quality", self.debug_jpeg_quality, 1..=100);
+        check.range("tracking.full_search_period", self.tracking.full_search_period, 1..=1000);
     }
 }
 
 impl Config {
-    /// The markers to look for.
+    /// A detector as configured.
     ///
     /// # Errors
     /// Says which marker is wrong and why.
-    pub fn parsed_markers(&self) -> Result<Vec<Marker>, String> {
+    pub fn detector(&self) -> Result<Detector, String> {
+        let markers = self.parsed_markers()?;
+        let settings = fiducial::Settings { thesis_threshold: self.thesis_threshold };
+        Detector::new(&markers, settings).map_err(|problem| problem.to_string())
+    }
+
+    /// How markers are followed; `None` when they are not.
+    pub fn tracking(&self) -> Option<TrackingSettings> {
+        let TrackingConfig { enabled, full_search_period } = self.tracking;
+        enabled.then_some(TrackingSettings { full_search_period })
+    }
+
+    /// This configuration with one setting changed while the service runs.
+    ///
+    /// # Errors
+    /// Says why the setting is refused.
+    pub fn with(&self, key: &str, value: &str) -> Result<Self, String> {
+        let changed = node::changed(self, &format!("{key}={value}"));
+        let changed = changed.map_err(|problem| problem.to_string())?;
+        // The keys by which others know this detector, and its frames.
+        for (name, before, after) in
+            [("id", &self.id, &changed.id), ("camera", &self.camera, &changed.camera)]
+        {
+            if before != after {
+                return Err(format!(
+                    "`{name}` holds from start to end; start the detector again with `--set {name}={after}`"
+                ));
+            }
+        }
+        Ok(changed)
+    }
+
+    fn parsed_markers(&self) -> Result<Vec<Marker>, String> {
         if self.markers.is_empty() {
             return Err("at least one marker is needed, for example \"rings:0.15341\"".to_owned());
         }
@@ -50,17 +98,42 @@ mod tests {
     use super::*;
     use node::Layers;
 
+    fn load(set: &str) -> Result<Config, String> {
+        let set = if set.is_empty() { Vec::new() } else { vec![set.to_owned()] };
+        Layers { file: None, set }.load().map(|c| c.settings).map_err(|e| e.to_string())
+    }
+
     #[test]
     fn the_defaults_are_complete_and_wrong_markers_are_refused() {
-        let load = |set: &str| {
-            let set = if set.is_empty() { Vec::new() } else { vec![set.to_owned()] };
-            Layers { file: None, set }.load::<Config>().map_err(|e| e.to_string())
-        };
-        assert_eq!(load("").unwrap().settings.markers, ["rings:0.15341"]);
+        assert_eq!(load("").unwrap().markers, ["rings:0.15341"]);
         assert!(load("markers=[\"hexagons:1\"]").unwrap_err().contains("no family `hexagons`"));
         assert!(load("markers=[]").unwrap_err().contains("at least one marker"));
+        let twice = "markers=[\"rings:0.1\", \"rings:0.2\"]";
+        assert!(load(twice).unwrap_err().contains("listed twice"));
         assert!(load("thesis_threshold=0").unwrap_err().contains("from 1 to 255"));
         // A number that does not fit its type is refused too, whatever its range says.
         assert!(load("thesis_threshold=300").is_err());
+    }
+
+    #[test]
+    fn several_families_are_looked_for_at_once() {
+        let all = "markers=[\"rings:0.15341\", \"apriltag-36h11:*:0.1\", \"aruco-4x4-50:7:0.2\"]";
+        let markers = load(all).unwrap().parsed_markers().unwrap();
+        assert_eq!(markers.iter().map(|m| m.id).collect::<Vec<_>>(), [None, None, Some(7)]);
+    }
+
+    #[test]
+    fn settings_change_while_it_runs_but_for_names() {
+        let config = load("").unwrap();
+        let changed = config.with("markers", "[\"aruco-4x4-50:7:0.2\"]").unwrap();
+        assert_eq!(changed.markers, ["aruco-4x4-50:7:0.2"]);
+        let changed = changed.with("tracking.enabled", "true").unwrap();
+        assert!(changed.tracking().is_some() && changed.markers.len() == 1);
+        let refused = |key, value| config.with(key, value).unwrap_err();
+        assert!(refused("id", "other").contains("start the detector again"));
+        assert!(refused("least_confidence", "2").contains("from 0 to 1"));
+        assert!(refused("markers", "[]").contains("at least one marker"));
+        assert!(refused("tracking", "7").contains("a table is needed"));
+        assert!(refused("x=1\ny", "2").contains("x"));
     }
 }

@@ -1,17 +1,20 @@
-//! The service: newest frame in, detections out.
+//! The service: newest frame in, detections out; parameters are changed between two frames.
 //!
 //! The image work runs on one thread of its own, named `detect`, so that no message ever waits for it. The thread
 //! takes a frame only when it is free, and its mailbox keeps only the newest.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use fiducial::debug::{self, RgbImageBuf};
-use fiducial::{Detector, Settings, Stages};
+use fiducial::{Detector, Stages, Tracker};
 use geometry::CameraModel;
-use imaging::GrayView;
-use messages::{CameraInfo, Detections, FrameHeader, PixelFormat, StageTime, topic};
+use imaging::{Converter, GrayView};
+use messages::{
+    CameraInfo, CommandReply, Detection, Detections, DetectorCommand, FrameHeader, PixelFormat,
+    StageTime, topic,
+};
 use node::{Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
@@ -19,8 +22,8 @@ use tokio::sync::oneshot;
 use crate::config::Config;
 use crate::wire;
 
-/// The thesis' three debug images, as the topics name them.
-const DEBUG_IMAGES: [&str; 3] = ["ellipses", "rings", "target"];
+/// The debug images, as the topics name them: the thesis' three, and the squares.
+const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
 
 /// Runs the service until it is asked to stop.
 ///
@@ -30,21 +33,70 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     node.ensure_alone(&config.id).await?;
     let camera = Arc::new(Mutex::new(None));
     let infos = node.subscriber(topic::CAMERA_INFO, &[&config.camera]).await?;
-    let work = Work::new(&node, &config, Arc::clone(&camera)).await?;
+    let commands = node.commands(topic::DETECTOR_COMMAND, &[&config.id]).await?;
+    let change = Arc::default();
+    let work = Work::new(&node, &config, Arc::clone(&camera), Arc::clone(&change)).await?;
+    let mut live = Live { config, change };
     let (stopped, thread) = work.start()?;
     node.announce().await?;
     let follow_camera = async {
         while let Some(info) = infos.next().await {
-            *camera.lock().unwrap_or_else(PoisonError::into_inner) = Some(info);
+            *lock(&camera) = Some(info);
+        }
+    };
+    let obey = async {
+        while let Some(request) = commands.next().await {
+            let reply = live.command(&request.message);
+            request.answer(&reply).await;
         }
     };
     tokio::select! {
         () = shutdown.requested() => {}
         () = follow_camera => {}
+        () = obey => {}
         _ = stopped => anyhow::bail!("the detection thread ended"),
     }
     drop(thread);
     Ok(())
+}
+
+// What a thread that panicked has left is still one whole value.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// What the image thread changes to before its next frame.
+struct Change {
+    config: Config,
+    detector: Detector,
+}
+
+/// The parameters, as they are changed.
+struct Live {
+    config: Config,
+    change: Arc<Mutex<Option<Change>>>,
+}
+
+impl Live {
+    fn command(&mut self, command: &DetectorCommand) -> CommandReply {
+        let DetectorCommand::SetParameter { key, value } = command;
+        match self.set(key, value) {
+            Ok(()) => {
+                tracing::info!(key, value, "Parameter changed");
+                let reason = format!("`{key}` is {value} from the next frame on");
+                CommandReply { accepted: true, reason }
+            }
+            Err(reason) => CommandReply { accepted: false, reason },
+        }
+    }
+
+    fn set(&mut self, key: &str, value: &str) -> Result<(), String> {
+        let config = self.config.with(key, value)?;
+        let detector = config.detector()?;
+        *lock(&self.change) = Some(Change { config: config.clone(), detector });
+        self.config = config;
+        Ok(())
+    }
 }
 
 /// Everything the image thread needs.
@@ -54,9 +106,11 @@ struct Work {
     detections: Publisher<Detections>,
     debug: Vec<(&'static str, FramePublisher)>,
     camera: Arc<Mutex<Option<CameraInfo>>>,
+    change: Arc<Mutex<Option<Change>>>,
+    config: Config,
+    converter: Converter,
     detector: Detector,
-    id: String,
-    debug_jpeg_quality: u8,
+    tracker: Tracker,
     overlay: RgbImageBuf,
 }
 
@@ -65,10 +119,9 @@ impl Work {
         node: &Node,
         config: &Config,
         camera: Arc<Mutex<Option<CameraInfo>>>,
+        change: Arc<Mutex<Option<Change>>>,
     ) -> anyhow::Result<Self> {
-        let markers = config.parsed_markers().map_err(anyhow::Error::msg)?;
-        let settings = Settings { thesis_threshold: config.thesis_threshold };
-        let detector = Detector::new(&markers, settings).context("setting the markers up")?;
+        let detector = config.detector().map_err(anyhow::Error::msg)?;
         let mut debug = Vec::new();
         for image in DEBUG_IMAGES {
             debug.push((
@@ -82,9 +135,11 @@ impl Work {
             detections: node.publisher(topic::DETECTIONS, &[&config.id]).await?,
             debug,
             camera,
+            change,
+            config: config.clone(),
+            converter: Converter::default(),
             detector,
-            id: config.id.clone(),
-            debug_jpeg_quality: config.debug_jpeg_quality,
+            tracker: Tracker::new(config.tracking().unwrap_or_default()),
             overlay: RgbImageBuf::default(),
         })
     }
@@ -106,40 +161,78 @@ impl Work {
     }
 
     async fn search(&mut self, frame: &Frame) {
+        self.take_change();
         let health = self.node.shared_health();
         health.count("frames");
         let bytes = frame.bytes();
         let FrameHeader { width, height, format, .. } = frame.header;
-        if format != PixelFormat::Mono8 {
+        let Some(format) = wire::sample_format(format) else {
             health.dropped("frames in a pixel format that is not searched");
             return;
-        }
-        let Ok(view) = GrayView::packed(&bytes, width as usize, height as usize) else {
-            health.dropped("frames of an impossible size");
-            return;
         };
-        let camera = self.camera_model(&frame.header);
         let mut clock = StageClock::start();
-        let found = self.detector.detect(view, camera.as_ref(), &mut clock);
-        let message = Detections {
-            detector: self.id.clone(),
-            header: frame.header.clone(),
-            detections: found.iter().map(wire::detection).collect(),
-            stages: clock.stages,
+        // Taken out while the image it holds is looked at.
+        let mut converter = std::mem::take(&mut self.converter);
+        match converter.convert(&bytes, width as usize, height as usize, format) {
+            Ok(view) => {
+                if !std::ptr::eq(view.row(0).as_ptr(), bytes.as_ptr()) {
+                    clock.ended("convert");
+                }
+                let detections = self.detect(view, &frame.header, &mut clock);
+                self.publish(&frame.header, detections, clock).await;
+                self.publish_debug_images(view, &frame.header).await;
+            }
+            Err(_) => health.dropped("frames of an impossible size"),
+        }
+        self.converter = converter;
+    }
+
+    fn take_change(&mut self) {
+        if let Some(Change { config, detector }) = lock(&self.change).take() {
+            self.detector = detector;
+            self.tracker = Tracker::new(config.tracking().unwrap_or_default());
+            self.config = config;
+        }
+    }
+
+    fn detect(
+        &mut self,
+        view: GrayView<'_>,
+        header: &FrameHeader,
+        clock: &mut StageClock,
+    ) -> Vec<Detection> {
+        let camera = self.camera_model(header);
+        let found = match self.config.tracking.enabled {
+            true => {
+                let time_s = header.stamp_ns as f64 * 1e-9;
+                self.tracker.detect(&mut self.detector, view, camera.as_ref(), time_s, clock)
+            }
+            false => self.detector.detect(view, camera.as_ref(), clock),
         };
+        let sure = found.iter().filter(|seen| seen.confidence >= self.config.least_confidence);
+        sure.map(wire::detection).collect()
+    }
+
+    async fn publish(&self, header: &FrameHeader, found: Vec<Detection>, clock: StageClock) {
+        let health = self.node.health();
         health.latency("detect", clock.started.elapsed());
-        if !message.detections.is_empty() {
+        if !found.is_empty() {
             health.count("frames with a marker");
         }
+        let message = Detections {
+            detector: self.config.id.clone(),
+            header: header.clone(),
+            detections: found,
+            stages: clock.stages,
+        };
         self.detections.publish(&message).await;
-        let age_ns = now_ns().saturating_sub(frame.header.stamp_ns);
+        let age_ns = now_ns().saturating_sub(header.stamp_ns);
         health.latency("stamp to detections", Duration::from_nanos(age_ns.max(0).unsigned_abs()));
-        self.publish_debug_images(view, &frame.header).await;
     }
 
     /// The camera's model, when it is calibrated for frames of this size.
     fn camera_model(&self, header: &FrameHeader) -> Option<CameraModel> {
-        let info = self.camera.lock().unwrap_or_else(PoisonError::into_inner);
+        let info = lock(&self.camera);
         let model = wire::camera_model(info.as_ref()?)?;
         if (model.width, model.height) == (header.width, header.height) {
             return Some(model);
@@ -159,13 +252,17 @@ impl Work {
             if !publisher.has_subscribers().await {
                 continue;
             }
-            let trace = self.detector.trace();
+            let trace = match self.config.tracking.enabled {
+                true => self.tracker.trace(),
+                false => self.detector.trace(),
+            };
             match *image {
                 "ellipses" => debug::draw_ellipses(view, trace, &mut self.overlay),
                 "rings" => debug::draw_rings(view, trace, &mut self.overlay),
+                "squares" => debug::draw_squares(view, trace, &mut self.overlay),
                 _ => debug::draw_target(view, trace, debug::ALIGNMENT_RADIUS_PX, &mut self.overlay),
             }
-            match jpeg(&self.overlay, self.debug_jpeg_quality) {
+            match jpeg(&self.overlay, self.config.debug_jpeg_quality) {
                 Ok(bytes) => {
                     let header = FrameHeader { format: PixelFormat::Jpeg, ..header.clone() };
                     publisher.publish(&header, Loan::Private(bytes)).await;
@@ -202,7 +299,11 @@ impl Stages for StageClock {
     fn ended(&mut self, stage: &'static str) {
         let now = Instant::now();
         let micros = u32::try_from(now.duration_since(self.last).as_micros()).unwrap_or(u32::MAX);
-        self.stages.push(StageTime { stage: stage.to_owned(), micros });
+        // Several parts of a frame may be searched one after the other.
+        match self.stages.iter_mut().find(|it| it.stage == stage) {
+            Some(again) => again.micros = again.micros.saturating_add(micros),
+            None => self.stages.push(StageTime { stage: stage.to_owned(), micros }),
+        }
         self.last = now;
     }
 }

@@ -2,7 +2,10 @@
 
 use fiducial::{MarkerPose, Observation};
 use geometry::{Camera, CameraModel, Distortion, Marker, Transform};
-use messages::{AlternativePose, CameraInfo, Detection, LensModel, Transform3};
+use imaging::{Mosaic, SampleFormat};
+use messages::{
+    AlternativePose, BayerPattern, CameraInfo, Detection, LensModel, PixelFormat, Transform3,
+};
 use nalgebra::Matrix6;
 
 /// The camera model of a calibrated camera; `None` for one that is not calibrated or not sound.
@@ -24,6 +27,28 @@ pub fn camera_model(info: &CameraInfo) -> Option<CameraModel> {
         cy,
         distortion,
     })
+}
+
+/// How a frame's samples lie; `None` for files, which are not searched.
+pub fn sample_format(format: PixelFormat) -> Option<SampleFormat> {
+    let (bits, pattern) = match format {
+        PixelFormat::Jpeg => return None,
+        PixelFormat::Mono8 => (8, None),
+        PixelFormat::Mono10 => (10, None),
+        PixelFormat::Mono12 => (12, None),
+        PixelFormat::Mono16 => (16, None),
+        PixelFormat::Bayer8(pattern) => (8, Some(pattern)),
+        PixelFormat::Bayer10(pattern) => (10, Some(pattern)),
+        PixelFormat::Bayer12(pattern) => (12, Some(pattern)),
+        PixelFormat::Bayer16(pattern) => (16, Some(pattern)),
+    };
+    let mosaic = pattern.map(|pattern| match pattern {
+        BayerPattern::Rggb => Mosaic::Rggb,
+        BayerPattern::Grbg => Mosaic::Grbg,
+        BayerPattern::Gbrg => Mosaic::Gbrg,
+        BayerPattern::Bggr => Mosaic::Bggr,
+    });
+    Some(SampleFormat { bits, mosaic })
 }
 
 /// An observation as it is sent.

@@ -8,6 +8,7 @@ use std::fmt::Display;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
@@ -116,7 +117,7 @@ impl Layers {
     /// [`ConfigError`] names the layer, the key, the value and the limit.
     pub fn load<T: Settings>(&self) -> Result<Effective<T>, ConfigError> {
         let defaults = parse("the defaults", T::DEFAULTS)?;
-        let mut table = defaults.clone();
+        let table = defaults.clone();
         let mut layers = Vec::new();
         if let Some(path) = &self.file {
             layers.push(file_layer(path)?);
@@ -124,22 +125,39 @@ impl Layers {
         for text in &self.set {
             layers.push(setting_layer(text, &defaults)?);
         }
-        for layer in &layers {
-            lay_over(&mut table, &layer.table, &layer.name, &mut String::new())?;
-        }
-        let settings: T =
-            Value::Table(table.clone()).try_into().map_err(|cause: toml::de::Error| {
-                let message = cause.message().to_owned();
-                let source_name =
-                    layers.last().map_or("the defaults".to_owned(), |l| l.name.clone());
-                ConfigError::Syntax { source_name, cause: message }
-            })?;
-        let mut check = Check { table: &table, layers: &layers, problem: None };
-        settings.check(&mut check);
-        match check.problem {
-            Some(problem) => Err(problem),
-            None => Ok(Effective { settings, table }),
-        }
+        effective(table, &layers)
+    }
+}
+
+/// A configuration with one more setting `key=value` laid over it.
+///
+/// # Errors
+/// As [`Layers::load`].
+pub fn changed<T: Settings + Serialize>(current: &T, setting: &str) -> Result<T, ConfigError> {
+    let table = Table::try_from(current).map_err(|cause| ConfigError::Syntax {
+        source_name: "the configuration in use".to_owned(),
+        cause: cause.to_string(),
+    })?;
+    let layer = setting_layer(setting, &table)?;
+    Ok(effective(table, &[layer])?.settings)
+}
+
+/// The configuration that layers over a table make.
+fn effective<T: Settings>(mut table: Table, layers: &[Layer]) -> Result<Effective<T>, ConfigError> {
+    for layer in layers {
+        lay_over(&mut table, &layer.table, &layer.name, &mut String::new())?;
+    }
+    let settings: T =
+        Value::Table(table.clone()).try_into().map_err(|cause: toml::de::Error| {
+            let message = cause.message().to_owned();
+            let source_name = layers.last().map_or("the defaults".to_owned(), |l| l.name.clone());
+            ConfigError::Syntax { source_name, cause: message }
+        })?;
+    let mut check = Check { table: &table, layers, problem: None };
+    settings.check(&mut check);
+    match check.problem {
+        Some(problem) => Err(problem),
+        None => Ok(Effective { settings, table }),
     }
 }
 
@@ -303,9 +321,9 @@ impl Check<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use serde::Deserialize;
+    use serde::{Deserialize, Serialize};
 
-    #[derive(Debug, Deserialize, PartialEq)]
+    #[derive(Debug, Deserialize, PartialEq, Serialize)]
     #[serde(deny_unknown_fields)]
     struct Camera {
         name: String,
@@ -313,7 +331,7 @@ mod tests {
         lens: Lens,
     }
 
-    #[derive(Debug, Deserialize, PartialEq)]
+    #[derive(Debug, Deserialize, PartialEq, Serialize)]
     #[serde(deny_unknown_fields)]
     struct Lens {
         focal_px: f64,
@@ -380,6 +398,24 @@ mod tests {
         check(None, &["rate_hz=1 2"], &["--set rate_hz=1 2 is not valid TOML"]);
         check(Some("rate_hz = = 1"), &[], &["is not valid TOML", ".toml"]);
         check(None, &["name=a/b"], &["letters, digits"]);
+    }
+
+    #[test]
+    fn a_setting_is_laid_over_the_configuration_in_use() {
+        let camera = load(None, &["rate_hz=30"]).unwrap();
+        let changed = |setting| changed(&camera, setting).map_err(|e| e.to_string());
+        let left = changed("name=left").unwrap();
+        assert_eq!((left.name.as_str(), left.rate_hz), ("left", 30.0));
+        assert_eq!(changed("lens.focal_px=900").unwrap().lens.focal_px, 900.0);
+        for (setting, part) in [
+            ("rate_hz=0", "from 0.1 to 1000"),
+            ("rate_hx=1", "did you mean `rate_hz`"),
+            ("rate_hz=[]", "a list"),
+            ("rate_hz", "key=value"),
+        ] {
+            let problem = changed(setting).unwrap_err();
+            assert!(problem.contains(part), "`{part}` is not in: {problem}");
+        }
     }
 
     #[test]

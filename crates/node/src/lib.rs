@@ -15,7 +15,7 @@ pub mod session;
 pub mod topics;
 
 pub use clock::{Clock, clock_name, now_ns};
-pub use config::{Check, ConfigError, Effective, Layers, Settings};
+pub use config::{Check, ConfigError, Effective, Layers, Settings, changed};
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
 pub use service::{Options, Shutdown, relaunch_with_zenoh_threads, run, start_logging};
