@@ -35,10 +35,13 @@ pub(crate) struct Spot {
 
 /// Homography (8), spread, black, contrast, shade (2).
 const UNKNOWNS: usize = 13;
-/// Steps of the first, rough round and of the second.
-const MOST_STEPS: [usize; 2] = [8, 12];
-/// Pixels that take part in each round at most.
-const MOST_SPOTS: [usize; 2] = [600, 1600];
+/// Pixels that take part at most in the first, rough round, and in the second.
+const MOST_SPOTS: [usize; 2] = [500, 1600];
+/// Steps of a round, and the move in pixels at which it ends.
+const MOST_STEPS: usize = 12;
+const SETTLED_PX: [f64; 2] = [0.03, 0.003];
+/// Columns or rows of cells that the blur reaches across at most.
+const MOST_BANDS: usize = 12;
 /// The spread may become this, in pixels.
 const SPREAD_LIMITS_PX: (f64, f64) = (0.25, 4.0);
 /// Less contrast, in grey levels, is none.
@@ -69,12 +72,12 @@ pub(crate) fn fit(
     let light = Picture { black: 0.0, contrast: 1.0, shade: [0.0; 2], spread_px };
     let mut state = State { homography: *start, light, half_px: side_px / 2.0 };
     let mut solved = None;
-    for (most_spots, most_steps) in MOST_SPOTS.into_iter().zip(MOST_STEPS) {
+    for (most_spots, settled_px) in MOST_SPOTS.into_iter().zip(SETTLED_PX) {
         grid.gather(view, lens, &state, most_spots, &mut scratch.spots)?;
         if solved.is_none() {
             state.expose(&grid, &scratch.spots)?;
         }
-        let (next, system) = state.solved(&grid, &scratch.spots, most_steps)?;
+        let (next, system) = state.solved(&grid, &scratch.spots, settled_px)?;
         state = next;
         solved = Some(system);
     }
@@ -121,7 +124,7 @@ struct Grid {
 struct Bands {
     first: usize,
     count: usize,
-    share: [[f64; 3]; MOST_CELLS],
+    share: [[f64; 3]; MOST_BANDS],
 }
 
 /// A place's whiteness and how it changes.
@@ -280,11 +283,11 @@ impl Grid {
 
     fn bands(&self, at: f64, sigma: f64, boxiness: f64) -> Bands {
         let end = self.across as f64;
-        let reach = END * sigma;
+        let reach = (END * sigma).min(0.5 * MOST_BANDS as f64 - 1.0);
         let first = (at - reach).ceil().clamp(1.0, end) as usize;
         let beyond = ((at + reach).floor() + 1.0).clamp(first as f64, end) as usize;
         let mut bands =
-            Bands { first: first - 1, count: beyond - first + 1, share: [[0.0; 3]; MOST_CELLS] };
+            Bands { first: first - 1, count: beyond - first + 1, share: [[0.0; 3]; MOST_BANDS] };
         // Of each line between two columns: the light from before it, and that number's derivatives.
         let mut before = [0.0; 3];
         let scale = 1.0 / sigma;
@@ -397,33 +400,33 @@ impl State {
         (contrast.is_finite() && contrast.abs() > LEAST_CONTRAST).then_some(())
     }
 
-    /// The best state near this one and its equations.
-    fn solved(&self, grid: &Grid, spots: &[Spot], most_steps: usize) -> Option<(Self, System)> {
+    /// The best state near this one, and the equations of its last but one step.
+    fn solved(&self, grid: &Grid, spots: &[Spot], settled_px: f64) -> Option<(Self, System)> {
         let mut best = *self;
         // Differences beyond this pull no harder; about thrice what they are once the fit is good.
         let mut limit = 0.25 * best.light.contrast.abs();
         let mut system = best.system(grid, spots, limit)?;
-        let mut damping = 1e-3;
-        for step in 0..most_steps {
-            let moved = best.stepped(&system, damping);
-            match moved.and_then(|next| Some((next, next.system(grid, spots, limit)?))) {
-                Some((next, next_system)) if next_system.cost <= system.cost => {
-                    let settled = system.cost - next_system.cost < 1e-4 * system.cost;
-                    (best, system) = (next, next_system);
-                    damping = (damping * 0.1).max(1e-7);
-                    let rms = (system.cost / spots.len() as f64).sqrt();
-                    if step >= 1 && 3.0 * rms + 1.0 < 0.8 * limit {
-                        limit = 3.0 * rms + 1.0;
-                        system = best.system(grid, spots, limit)?;
-                    } else if settled && step > 1 {
-                        break;
-                    }
-                }
-                _ => {
-                    damping *= 20.0;
-                    if damping > 1e4 {
-                        break;
-                    }
+        let mut damping = 1e-4;
+        for _ in 0..MOST_STEPS {
+            let Some(next) = best.stepped(&system, damping) else {
+                damping = (damping * 30.0).max(1e-2);
+                continue;
+            };
+            let moved_px = best.homography.distance_px(&next.homography);
+            let rms = (system.cost / system.weight).sqrt();
+            let rough = limit > 1.5 * (3.0 * rms + 1.0);
+            if moved_px < settled_px && !rough {
+                return Some((next, system));
+            }
+            let next_limit = if rough && moved_px < 0.3 { 3.0 * rms + 1.0 } else { limit };
+            let next_system = next.system(grid, spots, next_limit)?;
+            if next_limit < limit || next_system.cost <= system.cost {
+                (best, system, limit) = (next, next_system, next_limit);
+                damping = (damping * 0.1).max(1e-7);
+            } else {
+                damping = (damping * 30.0).max(1e-2);
+                if damping > 1e4 {
+                    break;
                 }
             }
         }

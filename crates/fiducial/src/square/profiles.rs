@@ -404,11 +404,7 @@ impl Search<'_> {
         let before = self.homography;
         self.homography = before.moved(|i| step[i])?;
         self.spread_px = (self.spread_px + step[8].clamp(-0.4, 0.6)).clamp(0.29, 4.0);
-        let corners = crate::square::refine::CORNERS.map(|corner| {
-            let [a, b] = [before.at(corner).ideal, self.homography.at(corner).ideal];
-            (a[0] - b[0]).hypot(a[1] - b[1])
-        });
-        Some(corners.into_iter().fold(0.0, f64::max))
+        Some(before.distance_px(&self.homography))
     }
 
     fn result(&self, system: System, runs: &[Run]) -> Option<Fit> {

@@ -287,6 +287,15 @@ impl Homography {
         moved.is_sound().then_some(moved)
     }
 
+    /// How far the corners are from another's, at most, in pixels.
+    pub(crate) fn distance_px(&self, other: &Self) -> f64 {
+        let moved = CORNERS.map(|corner| {
+            let [a, b] = [self.at(corner).relative, other.at(corner).relative];
+            (a[0] - b[0]).hypot(a[1] - b[1])
+        });
+        moved.into_iter().fold(0.0, f64::max)
+    }
+
     fn sides_px(&self) -> [f64; 4] {
         let corners = CORNERS.map(|corner| self.at(corner).relative);
         [0, 1, 2, 3].map(|i| {
