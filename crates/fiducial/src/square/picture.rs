@@ -36,10 +36,10 @@ pub(crate) struct Spot {
 /// Homography (8), spread, black, contrast, shade (2).
 const UNKNOWNS: usize = 13;
 /// Pixels that take part at most in the first, rough round, and in the second.
-const MOST_SPOTS: [usize; 2] = [500, 1600];
+const MOST_SPOTS: [usize; 2] = [300, 800];
 /// Steps of a round, and the move in pixels at which it ends.
 const MOST_STEPS: usize = 12;
-const SETTLED_PX: [f64; 2] = [0.03, 0.003];
+const SETTLED_PX: [f64; 2] = [0.15, 0.02];
 /// Columns or rows of cells that the blur reaches across at most.
 const MOST_BANDS: usize = 12;
 /// The spread may become this, in pixels.
@@ -71,13 +71,17 @@ pub(crate) fn fit(
     let spread_px = (0.4 * cell_px).clamp(0.7, 1.2);
     let light = Picture { black: 0.0, contrast: 1.0, shade: [0.0; 2], spread_px };
     let mut state = State { homography: *start, light, half_px: side_px / 2.0 };
-    let mut solved = None;
+    let mut solved: Option<System> = None;
     for (most_spots, settled_px) in MOST_SPOTS.into_iter().zip(SETTLED_PX) {
         grid.gather(view, lens, &state, most_spots, &mut scratch.spots)?;
         if solved.is_none() {
             state.expose(&grid, &scratch.spots)?;
         }
-        let (next, system) = state.solved(&grid, &scratch.spots, settled_px)?;
+        let limit = match &solved {
+            Some(system) => system.usual_limit(),
+            None => 0.25 * state.light.contrast.abs(),
+        };
+        let (next, system) = state.solved(&grid, &scratch.spots, limit, settled_px)?;
         state = next;
         solved = Some(system);
     }
@@ -114,6 +118,7 @@ struct Grid {
     middle: f64,
     white: [[f64; MOST_CELLS]; MOST_CELLS],
     unknown: [[f64; MOST_CELLS]; MOST_CELLS],
+    has_unknown: bool,
     bend: [[f64; 2]; 2],
     step: Step,
 }
@@ -170,6 +175,7 @@ impl Grid {
             middle: across as f64 / 2.0,
             white,
             unknown,
+            has_unknown: unknown.iter().flatten().any(|u| *u > 0.0),
             bend: [[bend[(0, 0)], bend[(0, 1)]], [bend[(1, 0)], bend[(1, 1)]]],
             step: Step::new(),
         }
@@ -306,14 +312,16 @@ impl Grid {
 
     /// The share of a place's light that comes from cells of which nothing is known.
     fn unknown_at(&self, spread: &Spread) -> f64 {
-        let [columns, rows] =
-            [0, 1].map(|axis| self.bands(spread.cells[axis], spread.sigma[axis], 0.0));
         let mut sum = 0.0;
-        for (row, [share, ..]) in
-            self.unknown.iter().skip(rows.first).zip(&rows.share).take(rows.count)
-        {
-            let cells = row.iter().skip(columns.first).zip(&columns.share).take(columns.count);
-            sum += share * cells.map(|(unknown, [share, ..])| unknown * share).sum::<f64>();
+        if self.has_unknown {
+            let [columns, rows] =
+                [0, 1].map(|axis| self.bands(spread.cells[axis], spread.sigma[axis], 0.0));
+            for (row, [share, ..]) in
+                self.unknown.iter().skip(rows.first).zip(&rows.share).take(rows.count)
+            {
+                let cells = row.iter().skip(columns.first).zip(&columns.share).take(columns.count);
+                sum += share * cells.map(|(unknown, [share, ..])| unknown * share).sum::<f64>();
+            }
         }
         let size = self.across as f64;
         for axis in 0..2 {
@@ -375,6 +383,11 @@ struct System {
 }
 
 impl System {
+    /// Differences beyond this, about thrice what they are once the fit is good, pull no harder.
+    fn usual_limit(&self) -> f64 {
+        3.0 * (self.cost / self.weight).sqrt() + 1.0
+    }
+
     fn full(&self) -> SMatrix<f64, UNKNOWNS, UNKNOWNS> {
         SMatrix::from_fn(|i, j| self.matrix[i.min(j)][i.max(j)])
     }
@@ -401,10 +414,14 @@ impl State {
     }
 
     /// The best state near this one, and the equations of its last but one step.
-    fn solved(&self, grid: &Grid, spots: &[Spot], settled_px: f64) -> Option<(Self, System)> {
+    fn solved(
+        &self,
+        grid: &Grid,
+        spots: &[Spot],
+        mut limit: f64,
+        settled_px: f64,
+    ) -> Option<(Self, System)> {
         let mut best = *self;
-        // Differences beyond this pull no harder; about thrice what they are once the fit is good.
-        let mut limit = 0.25 * best.light.contrast.abs();
         let mut system = best.system(grid, spots, limit)?;
         let mut damping = 1e-4;
         for _ in 0..MOST_STEPS {
@@ -413,12 +430,11 @@ impl State {
                 continue;
             };
             let moved_px = best.homography.distance_px(&next.homography);
-            let rms = (system.cost / system.weight).sqrt();
-            let rough = limit > 1.5 * (3.0 * rms + 1.0);
+            let rough = limit > 1.5 * system.usual_limit();
             if moved_px < settled_px && !rough {
                 return Some((next, system));
             }
-            let next_limit = if rough && moved_px < 0.3 { 3.0 * rms + 1.0 } else { limit };
+            let next_limit = if rough && moved_px < 0.3 { system.usual_limit() } else { limit };
             let next_system = next.system(grid, spots, next_limit)?;
             if next_limit < limit || next_system.cost <= system.cost {
                 (best, system, limit) = (next, next_system, next_limit);
