@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 use std::sync::LazyLock;
 
 /// The edge's profile has ended at this many standard deviations.
-pub(crate) const END: f64 = 4.25;
+pub(crate) const END: f64 = 3.75;
 const PER_UNIT: f64 = 32.0;
 const NODES: usize = 2 * (END as usize + 1) * PER_UNIT as usize + 1;
 const FIRST: f64 = -(END as usize as f64 + 1.0);
@@ -22,6 +22,7 @@ pub(crate) struct Step {
 pub(crate) const PIXEL_VARIANCE: f64 = 1.0 / 12.0;
 
 /// Fourth cumulant of a pixel's extent along the unit vector `normal`, over 24 times the square of the whole variance.
+#[inline]
 pub(crate) fn boxiness(normal: [f64; 2], variance: f64) -> f64 {
     let [x, y] = normal.map(|n| n * n);
     -(x * x + y * y) / (120.0 * 24.0 * variance * variance)
@@ -89,9 +90,13 @@ mod tests {
             (-9.0, 0.0),
             (f64::NAN, 0.0),
         ] {
-            assert!((step.at(z, 0.0).0 - expected).abs() < 1e-8, "{z}");
+            assert!(
+                (step.at(z, 0.0).0 - expected).abs() < 1e-8
+                    || z.abs() > END && expected == f64::from(u8::from(z > 0.0)),
+                "{z}"
+            );
         }
-        for i in -400..400 {
+        for i in -370..370 {
             let z = f64::from(i) * 0.01 + 0.003;
             let slope = (step.at(z + 1e-4, -0.01).0 - step.at(z - 1e-4, -0.01).0) / 2e-4;
             assert!((step.at(z, -0.01).1 - slope).abs() < 2e-5, "{z}");

@@ -132,6 +132,10 @@ struct Bands {
     share: [[f64; 3]; MOST_BANDS],
 }
 
+impl Bands {
+    const NONE: Self = Self { first: 0, count: 0, share: [[0.0; 3]; MOST_BANDS] };
+}
+
 /// A place's whiteness and how it changes.
 #[derive(Copy, Clone, Debug, Default)]
 struct Look {
@@ -199,18 +203,19 @@ impl Grid {
         // Of large markers every so many-th pixel, in an order without a pattern of its own.
         let every = (0.5 * area / most as f64).max(1.0) as usize;
         let mut turn = 0;
+        let mut work = [Bands::NONE; 2];
         for y in top..bottom {
             let row = view.row(y);
             for (x, grey) in row.iter().enumerate().take(right).skip(left) {
                 let ideal = lens.ideal(Pixel::new(x as f64, y as f64))?;
                 let ideal = [ideal[0] - about[0], ideal[1] - about[1]];
                 let Some(spread) = self.spread(&inverse, ideal, spread_px) else { continue };
-                if self.unknown_at(&spread) > MOST_UNKNOWN {
+                if self.unknown_at(&spread, &mut work) > MOST_UNKNOWN {
                     continue;
                 }
                 if every > 1 {
                     turn += 1;
-                    let look = self.look_at(&spread, spread_px);
+                    let look = self.look_at(&spread, spread_px, &mut work);
                     let change = look.by_place[0].hypot(look.by_place[1]);
                     let chosen =
                         if change > 0.03 { turn % every == 0 } else { turn % (4 * every) == 1 };
@@ -277,7 +282,8 @@ impl Grid {
                 slope[0] * self.bend[0][1] + slope[1] * self.bend[1][1],
             ];
             let length = (bent[0] * bent[0] + bent[1] * bent[1]).sqrt();
-            directions[axis] = bent.map(|b| b / length);
+            let scale = 1.0 / length;
+            directions[axis] = bent.map(|b| b * scale);
             spread.slopes[axis] = slope;
             spread.sigma[axis] = length * spread_px;
             spread.boxiness[axis] = boxiness(directions[axis], variance);
@@ -287,35 +293,46 @@ impl Grid {
         Some(spread)
     }
 
-    fn bands(&self, at: f64, sigma: f64, boxiness: f64) -> Bands {
-        let end = self.across as f64;
+    #[inline]
+    fn bands(&self, at: f64, sigma: f64, boxiness: f64, bands: &mut Bands) {
+        let last = self.across as f64;
         let reach = (END * sigma).min(0.5 * MOST_BANDS as f64 - 1.0);
-        let first = (at - reach).ceil().clamp(1.0, end) as usize;
-        let beyond = ((at + reach).floor() + 1.0).clamp(first as f64, end) as usize;
-        let mut bands =
-            Bands { first: first - 1, count: beyond - first + 1, share: [[0.0; 3]; MOST_BANDS] };
+        // The lines between columns from `first` until before `beyond`: casts round down.
+        let first = (at - reach).clamp(0.0, last - 1.0) as usize + 1;
+        let beyond = ((at + reach).clamp(0.0, last - 1.0) as usize + 1).max(first);
+        (bands.first, bands.count) = (first - 1, beyond - first + 1);
         // Of each line between two columns: the light from before it, and that number's derivatives.
         let mut before = [0.0; 3];
         let scale = 1.0 / sigma;
-        for (share, line) in bands.share.iter_mut().zip(first..beyond) {
-            let z = (line as f64 - at) * scale;
+        let mut z = (first as f64 - at) * scale;
+        let Some((end, shares)) =
+            bands.share.get_mut(..bands.count).and_then(<[_]>::split_last_mut)
+        else {
+            return;
+        };
+        for share in shares {
             let (height, slope) = self.step.at(z, boxiness);
             let here = [height, -slope, -z * slope];
             *share = [here[0] - before[0], here[1] - before[1], here[2] - before[2]];
             before = here;
+            z += scale;
         }
-        if let Some(last) = bands.share.get_mut(bands.count - 1) {
-            *last = [1.0 - before[0], -before[1], -before[2]];
+        *end = [1.0 - before[0], -before[1], -before[2]];
+    }
+
+    #[inline]
+    fn both_bands<'a>(&self, spread: &Spread, work: &'a mut [Bands; 2]) -> &'a [Bands; 2] {
+        for (axis, bands) in work.iter_mut().enumerate() {
+            self.bands(spread.cells[axis], spread.sigma[axis], spread.boxiness[axis], bands);
         }
-        bands
+        work
     }
 
     /// The share of a place's light that comes from cells of which nothing is known.
-    fn unknown_at(&self, spread: &Spread) -> f64 {
+    fn unknown_at(&self, spread: &Spread, work: &mut [Bands; 2]) -> f64 {
         let mut sum = 0.0;
         if self.has_unknown {
-            let [columns, rows] =
-                [0, 1].map(|axis| self.bands(spread.cells[axis], spread.sigma[axis], 0.0));
+            let [columns, rows] = self.both_bands(spread, work);
             for (row, [share, ..]) in
                 self.unknown.iter().skip(rows.first).zip(&rows.share).take(rows.count)
             {
@@ -332,9 +349,8 @@ impl Grid {
     }
 
     #[inline]
-    fn look_at(&self, spread: &Spread, spread_px: f64) -> Look {
-        let columns = self.bands(spread.cells[0], spread.sigma[0], spread.boxiness[0]);
-        let rows = self.bands(spread.cells[1], spread.sigma[1], spread.boxiness[1]);
+    fn look_at(&self, spread: &Spread, spread_px: f64, work: &mut [Bands; 2]) -> Look {
+        let [columns, rows] = self.both_bands(spread, work);
         // Sums over the cells with the derivatives by column and by row.
         let (mut w, mut wx, mut wy, mut wxy, mut wxx, mut wyy, mut wxxyy) =
             (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
@@ -397,10 +413,11 @@ impl State {
     /// Black and contrast that fit best with everything else as it is.
     fn expose(&mut self, grid: &Grid, spots: &[Spot]) -> Option<()> {
         let inverse = self.homography.inverse();
+        let mut work = [Bands::NONE; 2];
         let (mut n, mut sw, mut sww, mut sg, mut swg) = (0.0, 0.0, 0.0, 0.0, 0.0);
         for spot in spots {
             let spread = grid.spread(&inverse, spot.ideal, self.light.spread_px)?;
-            let white = grid.look_at(&spread, self.light.spread_px).white;
+            let white = grid.look_at(&spread, self.light.spread_px, &mut work).white;
             n += 1.0;
             sw += white;
             sww += white * white;
@@ -457,11 +474,12 @@ impl State {
             squares: 0.0,
             weight: 0.0,
         };
+        let mut work = [Bands::NONE; 2];
         let inverse = self.homography.inverse();
         let light = &self.light;
         for spot in spots {
             let spread = grid.spread(&inverse, spot.ideal, light.spread_px)?;
-            let look = grid.look_at(&spread, light.spread_px);
+            let look = grid.look_at(&spread, light.spread_px, &mut work);
             let [x, y] = spot.ideal.map(|p| p / self.half_px);
             let shade = 1.0 + light.shade[0] * x + light.shade[1] * y;
             let flat = light.black + light.contrast * look.white;
