@@ -7,7 +7,7 @@ mod scene;
 use std::time::Instant;
 
 use fiducial::square::refine::{Refined, Scratch, refine};
-use geometry::CameraModel;
+use geometry::{CameraModel, Distortion};
 use nalgebra::SVector;
 use scene::Scene;
 
@@ -35,7 +35,8 @@ impl Errors {
             (error[2 * i], error[2 * i + 1]) = (a.x - b.x, a.y - b.y);
             self.corner_px.push(a.distance(b));
         }
-        let inverse = refined.covariance_px2.cholesky().unwrap().inverse();
+        let Some(cholesky) = refined.covariance_px2.cholesky() else { return };
+        let inverse = cholesky.inverse();
         self.normalised.push(error.dot(&(inverse * error)));
         self.centre_px.push(refined.centre.distance(&scene.centre()));
         self.size.push((area(&refined.corners) / area(&truth)).sqrt() - 1.0);
@@ -127,6 +128,78 @@ fn figures() {
     }
 }
 
+/// Light, blur, lens and what is in the way, near and far; takes minutes.
+#[test]
+#[ignore = "takes minutes; for who wants to see the figures"]
+fn conditions() {
+    type Change = fn(&mut Scene);
+    let all: [(&str, Change); 13] = [
+        ("plain", |_| {}),
+        ("blur 0.3", |s| s.blur_px = 0.3),
+        ("blur 1.0", |s| s.blur_px = 1.0),
+        ("blur 1.5", |s| s.blur_px = 1.5),
+        ("white 300", |s| s.white = 300.0),
+        ("white 250", |s| s.white = 250.0),
+        ("black -10", |s| s.black = -10.0),
+        ("dim", |s| (s.white, s.black, s.ground) = (60.0, 20.0, 40.0)),
+        ("shadow", |s| s.shadow = 0.6),
+        ("covered", |s| s.covered = true),
+        ("inverted", |s| s.inverted = true),
+        ("barrel", |s| {
+            s.camera.distortion = BARREL;
+        }),
+        ("fisheye", |s| {
+            s.camera.distortion = Distortion::KannalaBrandt([-0.01, 0.03, -0.02, 0.004]);
+        }),
+    ];
+    for (focal_px, range_m) in [(1818.0, 3.0), (1818.0, 7.0), (1818.0, 11.0), (909.0, 13.0)] {
+        for (name, change) in all {
+            let found = errors(10, 5, |seed| {
+                let mut scene = scene(focal_px, range_m, 0.3, seed);
+                change(&mut scene);
+                scene
+            });
+            found.tell(&format!("{name}, f {focal_px}, {range_m} m"));
+        }
+    }
+}
+
+/// The same from afar and from near in any light, in focus and out of it, through a lens, and half hidden. Centre (px)
+/// and size (%), 95 %.
+#[test]
+fn corners_are_found_in_bad_light_and_behind_bent_lenses() {
+    type Change = fn(&mut Scene);
+    let all: [(&str, Change, [f64; 2]); 8] = [
+        ("sharp", |s| s.blur_px = 0.3, [0.03, 0.1]),
+        ("blurred", |s| s.blur_px = 1.5, [0.06, 0.2]),
+        ("too bright", |s| s.white = 300.0, [0.03, 0.1]),
+        ("too dark", |s| s.black = -10.0, [0.03, 0.1]),
+        ("dim", |s| (s.white, s.black, s.ground) = (60.0, 20.0, 40.0), [0.1, 0.3]),
+        ("covered", |s| s.covered = true, [0.06, 0.3]),
+        ("inverted", |s| s.inverted = true, [0.03, 0.1]),
+        ("barrel", |s| s.camera.distortion = BARREL, [0.03, 0.1]),
+    ];
+    for range_m in [5.0, 11.0] {
+        for (name, change, allowed) in all {
+            let found = errors(4, 5, |seed| {
+                let mut scene = scene(1818.0, range_m, 0.3, seed);
+                change(&mut scene);
+                scene
+            });
+            found.tell(&format!("{name}, {range_m} m"));
+            assert_eq!(found.normalised.len(), found.frames, "{name}");
+            let of_size: Vec<_> = found.size.iter().map(|s| 100.0 * s.abs()).collect();
+            let measured = [share(&found.centre_px, 0.95), share(&of_size, 0.95)];
+            assert!(measured[0] <= allowed[0] && measured[1] <= allowed[1], "{name} {measured:?}");
+        }
+    }
+    let found = errors(4, 5, |seed| Scene { shadow: 0.6, ..scene(1818.0, 4.0, 0.3, seed) });
+    found.tell("shadow");
+    assert!(share(&found.centre_px, 0.95) < 0.04);
+}
+
+const BARREL: Distortion = Distortion::BrownConrady([-0.28, 0.07, 2e-4, 2e-5, 0.0, 0.0, 0.0, 0.0]);
+
 /// Range (m), then the most that is allowed: centre (px, median and 95 %), size (%, mean and 95 %).
 #[test]
 fn corners_are_found_to_a_hundredth_of_a_pixel() {
@@ -138,8 +211,7 @@ fn corners_are_found_to_a_hundredth_of_a_pixel() {
         (909.0, 13.0, [0.010, 0.04, 0.04, 0.2]),
     ] {
         for cells in [6, 8] {
-            let found =
-                errors(10, 10, |seed| Scene { cells, ..scene(focal_px, range_m, 0.2, seed) });
+            let found = errors(8, 8, |seed| Scene { cells, ..scene(focal_px, range_m, 0.2, seed) });
             found.tell(&format!("{cells} cells, f {focal_px}, {range_m} m"));
             assert_eq!(found.normalised.len(), found.frames);
             let of_size: Vec<_> = found.size.iter().map(|s| 100.0 * s.abs()).collect();
@@ -161,7 +233,7 @@ fn corners_are_found_to_a_hundredth_of_a_pixel() {
 /// in one of twenty cases above 15.5.
 #[test]
 fn the_covariance_is_that_of_the_errors() {
-    for range_m in [3.0, 7.0, 10.0, 16.0] {
+    for range_m in [5.0, 10.0, 16.0] {
         let found = errors(25, 20, |seed| scene(1818.0, range_m, 0.02 * seed as f64, seed));
         found.tell(&format!("{range_m} m"));
         assert!(found.normalised.len() >= 499);

@@ -31,6 +31,8 @@ pub(crate) struct Spot {
     /// Its place in the ideal image, relative to the homography's.
     ideal: [f64; 2],
     grey: f64,
+    /// How much brighter it is than was predicted last; not a number where the sensor cannot tell.
+    difference: f64,
 }
 
 /// Homography (8), spread, black, contrast, shade (2).
@@ -70,18 +72,16 @@ pub(crate) fn fit(
     // A wide blur at first: what is half a cell off is still drawn to its place.
     let spread_px = (0.4 * cell_px).clamp(0.7, 1.2);
     let light = Picture { black: 0.0, contrast: 1.0, shade: [0.0; 2], spread_px };
-    let mut state = State { homography: *start, light, half_px: side_px / 2.0 };
+    let pull = Pull { limit: f64::INFINITY, is_rough: true };
+    let mut state = State { homography: *start, light, half_px: side_px / 2.0, pull };
     let mut solved: Option<System> = None;
     for (most_spots, settled_px) in MOST_SPOTS.into_iter().zip(SETTLED_PX) {
         grid.gather(view, lens, &state, most_spots, &mut scratch.spots)?;
         if solved.is_none() {
             state.expose(&grid, &scratch.spots)?;
+            state.pull = Pull { limit: 0.25 * state.light.contrast.abs(), is_rough: true };
         }
-        let limit = match &solved {
-            Some(system) => system.usual_limit(),
-            None => 0.25 * state.light.contrast.abs(),
-        };
-        let (next, system) = state.solved(&grid, &scratch.spots, limit, settled_px)?;
+        let (next, system) = state.solved(&grid, scratch, settled_px)?;
         state = next;
         solved = Some(system);
     }
@@ -108,6 +108,44 @@ struct State {
     light: Picture,
     /// Half the marker, the unit of `shade`.
     half_px: f64,
+    pull: Pull,
+}
+
+/// How hard a pixel pulls that differs from its prediction.
+#[derive(Copy, Clone, Debug)]
+struct Pull {
+    /// From this difference on, in grey levels, it pulls no harder (Huber), ...
+    limit: f64,
+    /// ... or, once the marker is nearly in its place, ever less (Cauchy): something else is in the picture.
+    is_rough: bool,
+}
+
+impl Pull {
+    /// The pixel's weight and its part of the cost.
+    #[inline]
+    fn of(&self, difference: f64) -> (f64, f64) {
+        let size = difference.abs();
+        let share = self.limit / size;
+        if share >= 1.0 {
+            (1.0, size * size)
+        } else if self.is_rough {
+            (share, self.limit * (2.0 * size - self.limit))
+        } else {
+            (share * share, self.limit * self.limit * (1.0 - 2.0 * share.ln()))
+        }
+    }
+
+    /// What suits pixels that agree with the picture as well as these.
+    fn usual(spots: &[Spot], differences: &mut Vec<f64>) -> Self {
+        differences.clear();
+        differences.extend(spots.iter().map(|s| s.difference.abs()).filter(|d| d.is_finite()));
+        let middle = differences.len() / 2;
+        let median = match differences.get(middle) {
+            Some(_) => *differences.select_nth_unstable_by(middle, f64::total_cmp).1,
+            None => 0.0,
+        };
+        Self { limit: 3.0 * 1.4826 * median + 0.7, is_rough: false }
+    }
 }
 
 /// The cells, ready to be looked up.
@@ -202,28 +240,32 @@ impl Grid {
         let area = ((right - left) * (bottom - top)) as f64;
         // Of large markers every so many-th pixel, in an order without a pattern of its own.
         let every = (0.5 * area / most as f64).max(1.0) as usize;
+        // Of very large ones most are not even looked at.
+        let skipped = (every / 8).max(1);
+        let thinned = every / skipped;
         let mut turn = 0;
         let mut work = [Bands::NONE; 2];
         for y in top..bottom {
             let row = view.row(y);
-            for (x, grey) in row.iter().enumerate().take(right).skip(left) {
+            let columns = row.iter().enumerate().take(right).skip(left + y * 5 % skipped);
+            for (x, grey) in columns.step_by(skipped) {
                 let ideal = lens.ideal(Pixel::new(x as f64, y as f64))?;
                 let ideal = [ideal[0] - about[0], ideal[1] - about[1]];
                 let Some(spread) = self.spread(&inverse, ideal, spread_px) else { continue };
                 if self.unknown_at(&spread, &mut work) > MOST_UNKNOWN {
                     continue;
                 }
-                if every > 1 {
+                if thinned > 1 {
                     turn += 1;
                     let look = self.look_at(&spread, spread_px, &mut work);
                     let change = look.by_place[0].hypot(look.by_place[1]);
                     let chosen =
-                        if change > 0.03 { turn % every == 0 } else { turn % (4 * every) == 1 };
+                        if change > 0.03 { turn % thinned == 0 } else { turn % (4 * thinned) == 1 };
                     if !chosen {
                         continue;
                     }
                 }
-                spots.push(Spot { ideal, grey: f64::from(*grey) });
+                spots.push(Spot { ideal, grey: f64::from(*grey), difference: 0.0 });
             }
         }
         (spots.len() > 2 * UNKNOWNS).then_some(())
@@ -399,11 +441,6 @@ struct System {
 }
 
 impl System {
-    /// Differences beyond this, about thrice what they are once the fit is good, pull no harder.
-    fn usual_limit(&self) -> f64 {
-        3.0 * (self.cost / self.weight).sqrt() + 1.0
-    }
-
     fn full(&self) -> SMatrix<f64, UNKNOWNS, UNKNOWNS> {
         SMatrix::from_fn(|i, j| self.matrix[i.min(j)][i.max(j)])
     }
@@ -434,27 +471,31 @@ impl State {
     fn solved(
         &self,
         grid: &Grid,
-        spots: &[Spot],
-        mut limit: f64,
+        scratch: &mut Scratch,
         settled_px: f64,
     ) -> Option<(Self, System)> {
+        let Scratch { spots, shifts, .. } = scratch;
         let mut best = *self;
-        let mut system = best.system(grid, spots, limit)?;
+        let mut system = best.system(grid, spots)?;
         let mut damping = 1e-4;
         for _ in 0..MOST_STEPS {
-            let Some(next) = best.stepped(&system, damping) else {
+            let Some(mut next) = best.stepped(&system, damping) else {
                 damping = (damping * 30.0).max(1e-2);
                 continue;
             };
             let moved_px = best.homography.distance_px(&next.homography);
-            let rough = limit > 1.5 * system.usual_limit();
-            if moved_px < settled_px && !rough {
+            // The light's compromise with what is not the marker is undone in stages.
+            let usual = Pull::usual(spots, shifts);
+            let tightens = moved_px < 0.3 && best.pull.limit > 1.3 * usual.limit;
+            if moved_px < settled_px && !tightens {
                 return Some((next, system));
             }
-            let next_limit = if rough && moved_px < 0.3 { system.usual_limit() } else { limit };
-            let next_system = next.system(grid, spots, next_limit)?;
-            if next_limit < limit || next_system.cost <= system.cost {
-                (best, system, limit) = (next, next_system, next_limit);
+            if tightens {
+                next.pull = usual;
+            }
+            let next_system = next.system(grid, spots)?;
+            if tightens || next_system.cost <= system.cost {
+                (best, system) = (next, next_system);
                 damping = (damping * 0.1).max(1e-7);
             } else {
                 damping = (damping * 30.0).max(1e-2);
@@ -466,7 +507,7 @@ impl State {
         Some((best, system))
     }
 
-    fn system(&self, grid: &Grid, spots: &[Spot], limit: f64) -> Option<System> {
+    fn system(&self, grid: &Grid, spots: &mut [Spot]) -> Option<System> {
         let mut system = System {
             matrix: [[0.0; UNKNOWNS]; UNKNOWNS],
             right: [0.0; UNKNOWNS],
@@ -486,13 +527,14 @@ impl State {
             let predicted = flat * shade;
             // Where the sensor has reached its end, nothing more can be asked of it.
             if spot.grey >= 255.0 && predicted > 254.5 || spot.grey <= 0.0 && predicted < 0.5 {
+                spot.difference = f64::NAN;
                 continue;
             }
             let difference = spot.grey - predicted;
-            let size = difference.abs();
-            let weight = if size > limit { limit / size } else { 1.0 };
-            system.cost += if size > limit { limit * (2.0 * size - limit) } else { size * size };
-            system.squares += weight * size * size;
+            spot.difference = difference;
+            let (weight, cost) = self.pull.of(difference);
+            system.cost += cost;
+            system.squares += weight * difference * difference;
             system.weight += weight;
             let place = self.homography.at(look.square);
             let tilt = look.by_place.map(|by| -shade * light.contrast * by);
@@ -532,7 +574,7 @@ impl State {
                     .map(|s| s.clamp(-0.9, 0.9)),
                 spread_px: spread_px.clamp(SPREAD_LIMITS_PX.0, SPREAD_LIMITS_PX.1),
             },
-            half_px: self.half_px,
+            ..*self
         })
     }
 }

@@ -66,7 +66,7 @@ const LEAST_CONTRAST: f64 = 5.0;
 /// Runs whose shift is more times its usual size pull no harder.
 const USUAL_SHIFTS: f64 = 2.5;
 /// Where more of the pixels are at the sensor's end, black and white must be common to the whole marker.
-const MOST_CLIPPED: f64 = 0.1;
+const MOST_CLIPPED: f64 = 0.03;
 
 /// The homography on which the runs agree. `None` when too few of the marker's edges are seen, or they are too
 /// close to each other for their blur.
@@ -93,6 +93,9 @@ pub(crate) fn fit(
     let mut system = None;
     for pass in 0..FINE_PASSES {
         search.compare_all(&mut scratch.runs)?;
+        if search.clipped as f64 > MOST_CLIPPED * search.pixels as f64 {
+            return None;
+        }
         search.weigh(scratch)?;
         let next = System::new(&scratch.runs);
         let moved_px = search.step(&next)?;
@@ -100,9 +103,6 @@ pub(crate) fn fit(
         if pass > 0 && moved_px < 1e-3 {
             break;
         }
-    }
-    if search.clipped as f64 > MOST_CLIPPED * search.pixels as f64 {
-        return None;
     }
     search.result(system?, &scratch.runs)
 }
@@ -308,7 +308,8 @@ impl Search<'_> {
             let count = self.pixels(&edge, reach, &mut pixels);
             let Some(pixels) = pixels.get(..count).filter(|p| p.len() >= 5) else { continue };
             self.pixels += count;
-            self.clipped += pixels.iter().filter(|[_, grey]| *grey >= 255.0).count();
+            self.clipped +=
+                pixels.iter().filter(|[_, grey]| *grey <= 0.0 || *grey >= 255.0).count();
             run.sight = self.compare(&edge, pixels);
         }
         Some(())

@@ -30,6 +30,10 @@ pub(crate) struct Scene {
     pub(crate) read_noise: f64,
     pub(crate) shot_noise: f64,
     pub(crate) seed: u64,
+    /// A straight shadow through the marker's middle takes this share of the light, over an edge two pixels wide.
+    pub(crate) shadow: f64,
+    /// A grey patch hides the marker's first corner and a quarter of two of its sides.
+    pub(crate) covered: bool,
 }
 
 impl Scene {
@@ -57,6 +61,8 @@ impl Scene {
             read_noise: 1.2,
             shot_noise: 0.015,
             seed,
+            shadow: 0.0,
+            covered: false,
         }
     }
 
@@ -111,6 +117,9 @@ impl Scene {
         let column = (from.x() + along * ray.x()) / cell + self.cells as f64 / 2.0;
         let row = self.cells as f64 / 2.0 - (from.y() + along * ray.y()) / cell;
         let size = self.cells as f64;
+        if self.covered && column.max(row) < 0.25 * size {
+            return 0.5 * (self.black + self.white);
+        }
         if column.min(row) < -self.paper || column.max(row) > size + self.paper {
             return self.ground;
         }
@@ -199,7 +208,11 @@ impl Scene {
         let (width, height) = (self.camera.width as usize, self.camera.height as usize);
         let mut random = Random::new(seed);
         let mut image = GrayImage::filled(width, height, 0);
-        for (pixel, light) in image.pixels_mut().iter_mut().zip(light) {
+        let (sin, cos) = (self.seed as f64).sin_cos();
+        let centre = self.centre();
+        for (i, (pixel, light)) in image.pixels_mut().iter_mut().zip(light).enumerate() {
+            let (x, y) = ((i % width) as f64 - centre.x, (i / width) as f64 - centre.y);
+            let light = light * (1.0 - self.shadow * normal(x * cos + y * sin));
             let noise = (self.read_noise.powi(2) + self.shot_noise * light).sqrt();
             *pixel = (light + noise * random.gaussian()).round().clamp(0.0, 255.0) as u8;
         }
