@@ -30,6 +30,19 @@ pub(crate) fn halve_rows(above: &[u8], below: &[u8], out: &mut [u8]) {
     plain::halve_rows(above, below, out, done);
 }
 
+/// A row sharpened: each pixel moves away from the mean of its 3 x 3 neighbours (weights 1 2 1, both ways) by as much as
+/// it differs from it. Beyond the ends of the row its last pixels count again.
+pub(crate) fn sharpen_row(above: &[u8], here: &[u8], below: &[u8], out: &mut [u8]) {
+    let mut done = 0;
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        done = unsafe { avx2::sharpen_row(above, here, below, out) };
+    }
+    plain::sharpen_row(above, here, below, out, 0..done.min(1));
+    plain::sharpen_row(above, here, below, out, done..here.len());
+}
+
 /// Bit i of the words says whether pixel i is below its threshold. Bits beyond the row are 0.
 pub(crate) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
     let mut done = 0;
@@ -49,6 +62,8 @@ pub(crate) fn above(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
 
 /// In plain Rust, from tile, pixel or word `from` on.
 mod plain {
+    use std::ops::Range;
+
     use super::TILE;
 
     pub(super) fn tile_extremes(
@@ -77,6 +92,23 @@ mod plain {
         }
     }
 
+    pub(super) fn sharpen_row(
+        above: &[u8],
+        here: &[u8],
+        below: &[u8],
+        out: &mut [u8],
+        columns: Range<usize>,
+    ) {
+        let mean = |a: u8, b: u8| (u16::from(a) + u16::from(b)).div_ceil(2) as u8;
+        let down = |x: usize| mean(mean(above[x], below[x]), here[x]);
+        for x in columns {
+            let sides = mean(down(x.saturating_sub(1)), down((x + 1).min(here.len() - 1)));
+            let smooth = mean(sides, down(x));
+            let up = here[x].saturating_sub(smooth);
+            out[x] = here[x].saturating_add(up).saturating_sub(smooth.saturating_sub(here[x]));
+        }
+    }
+
     pub(super) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64], from: usize) {
         let chunks = pixels.chunks(64).zip(thresholds.chunks(64));
         for (word, (pixels, thresholds)) in words.iter_mut().zip(chunks).skip(from) {
@@ -91,11 +123,12 @@ mod plain {
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
     use std::arch::x86_64::{
-        __m256i, _mm256_add_epi16, _mm256_and_si256, _mm256_cmpeq_epi8, _mm256_loadu_si256,
-        _mm256_maddubs_epi16, _mm256_max_epu8, _mm256_min_epu8, _mm256_movemask_epi8,
-        _mm256_packus_epi16, _mm256_packus_epi32, _mm256_permute4x64_epi64,
-        _mm256_permutevar8x32_epi32, _mm256_set_epi32, _mm256_set1_epi8, _mm256_set1_epi16,
-        _mm256_set1_epi32, _mm256_srli_epi16, _mm256_srli_epi32, _mm256_storeu_si256,
+        __m256i, _mm256_add_epi16, _mm256_adds_epu8, _mm256_and_si256, _mm256_avg_epu8,
+        _mm256_cmpeq_epi8, _mm256_loadu_si256, _mm256_maddubs_epi16, _mm256_max_epu8,
+        _mm256_min_epu8, _mm256_movemask_epi8, _mm256_packus_epi16, _mm256_packus_epi32,
+        _mm256_permute4x64_epi64, _mm256_permutevar8x32_epi32, _mm256_set_epi32, _mm256_set1_epi8,
+        _mm256_set1_epi16, _mm256_set1_epi32, _mm256_srli_epi16, _mm256_srli_epi32,
+        _mm256_storeu_si256, _mm256_subs_epu8,
     };
 
     use super::TILE;
@@ -170,6 +203,24 @@ mod avx2 {
         count * 32
     }
 
+    /// Returns the column up to which it did all but the first.
+    #[target_feature(enable = "avx2")]
+    pub(super) fn sharpen_row(above: &[u8], here: &[u8], below: &[u8], out: &mut [u8]) -> usize {
+        let length = here.len().min(above.len()).min(below.len()).min(out.len());
+        let mut at = 1;
+        while at + 33 <= length {
+            let down = |at: usize| {
+                _mm256_avg_epu8(_mm256_avg_epu8(load(above, at), load(below, at)), load(here, at))
+            };
+            let smooth = _mm256_avg_epu8(_mm256_avg_epu8(down(at - 1), down(at + 1)), down(at));
+            let pixel = load(here, at);
+            let brighter = _mm256_adds_epu8(pixel, _mm256_subs_epu8(pixel, smooth));
+            store(out, at, _mm256_subs_epu8(brighter, _mm256_subs_epu8(smooth, pixel)));
+            at += 32;
+        }
+        if at == 1 { 0 } else { at }
+    }
+
     /// Returns how many words it did.
     #[target_feature(enable = "avx2")]
     pub(super) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) -> usize {
@@ -209,6 +260,11 @@ mod tests {
             halve_rows(rows[0], rows[1], &mut half);
             plain::halve_rows(rows[0], rows[1], &mut plain_half, 0);
             prop_assert_eq!(half, plain_half);
+
+            let (mut sharp, mut plain_sharp) = (vec![0; width], vec![0; width]);
+            sharpen_row(rows[0], rows[1], rows[2], &mut sharp);
+            plain::sharpen_row(rows[0], rows[1], rows[2], &mut plain_sharp, 0..width);
+            prop_assert_eq!(sharp, plain_sharp);
 
             let words = width.div_ceil(64);
             let (mut bits, mut plain_bits) = (vec![9; words], vec![9; words]);

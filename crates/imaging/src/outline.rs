@@ -1,8 +1,9 @@
 //! Outlines of dark and of bright regions, on an image and its halvings.
 
 use crate::binary::{Binarizer, BitImage, Contrast, Middle};
+use crate::kernels::sharpen_row;
 use crate::pyramid::Pyramid;
-use crate::view::GrayView;
+use crate::view::{GrayImage, GrayView};
 
 /// What is looked for. Sizes are in pixels of the level that is looked at, so that each level sees other regions.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -76,6 +77,7 @@ pub struct Outline<'a> {
 #[derive(Clone, Debug, Default)]
 pub struct Outlines {
     pyramid: Pyramid,
+    sharp: GrayImage,
     binarizer: Binarizer,
     dark: BitImage,
     bright: BitImage,
@@ -161,7 +163,14 @@ impl Outlines {
         };
         let wanted = |from: Option<usize>| from.is_some_and(|from| from <= level);
         let bright = wanted(settings.bright_from).then_some(&mut self.bright);
-        self.binarizer.apply(view, contrast(settings, level), &mut self.dark, bright);
+        // Full resolution serves regions a few pixels wide, whose lines are hardly wider than a pixel and blurred.
+        let sharp = if level == 0 {
+            sharpen(view, &mut self.sharp);
+            self.sharp.view().unwrap_or(view)
+        } else {
+            view
+        };
+        self.binarizer.apply(sharp, contrast(settings, level), &mut self.dark, bright);
         let limits = Limits::new(settings, level, view);
         for (from, bits, dark) in
             [(settings.dark_from, &self.dark, true), (settings.bright_from, &self.bright, false)]
@@ -169,6 +178,7 @@ impl Outlines {
             if wanted(from) {
                 let found = Found {
                     view,
+                    sharp,
                     bits,
                     binarizer: &self.binarizer,
                     dark,
@@ -183,11 +193,19 @@ impl Outlines {
     }
 }
 
-/// Full resolution serves regions a few pixels wide, so its threshold lies where lines of a pixel's width stay whole.
+fn sharpen(view: GrayView<'_>, out: &mut GrayImage) {
+    out.resize(view.width(), view.height());
+    for y in 0..view.height() {
+        let (above, below) = (y.saturating_sub(1), (y + 1).min(view.height() - 1));
+        sharpen_row(view.row(above), view.row(y), view.row(below), out.row_mut(y));
+    }
+}
+
+/// In the middle, lines of a pixel's width stay whole, dark and bright ones alike; on coarser levels shadows matter more.
 fn contrast(settings: &Settings, level: usize) -> Contrast {
     let least = settings.least_contrast;
     Contrast {
-        middle: if level == 0 { Middle::Share(136) } else { Middle::Ratio },
+        middle: if level == 0 { Middle::Share(128) } else { Middle::Ratio },
         least_levels: (least >> level.saturating_sub(1).min(7)).max(least / 3),
         least_percent: settings.least_contrast_percent,
     }
@@ -235,6 +253,8 @@ impl Limits {
 /// The outlines of one kind of region on one level.
 struct Found<'a> {
     view: GrayView<'a>,
+    /// What the bits were made of.
+    sharp: GrayView<'a>,
     bits: &'a BitImage,
     binarizer: &'a Binarizer,
     dark: bool,
@@ -286,10 +306,10 @@ impl Found<'_> {
     /// Whether the grey values step at a top by half of their range. Looks two pixels up and down, as blur spreads a step
     /// over two or three.
     fn is_steep(&self, x: usize, y: usize) -> bool {
-        let row = |y: usize| self.view.row(y.min(self.view.height() - 1));
+        let row = |y: usize| self.sharp.row(y.min(self.sharp.height() - 1));
         let (near, far) = (row(y.saturating_sub(1)), row(y.saturating_sub(2)));
         let (here, next, last) = (row(y), row(y + 1), row(y + 2));
-        let (before, after) = (x.saturating_sub(1), (x + 1).min(self.view.width() - 1));
+        let (before, after) = (x.saturating_sub(1), (x + 1).min(self.sharp.width() - 1));
         let (bright, dark) = if self.dark {
             let above = near[x].max(far[x]).max(near[after]);
             (above, here[x].min(next[x]).min(next[before]).min(last[before]))

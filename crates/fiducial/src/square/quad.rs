@@ -20,13 +20,19 @@ impl Quad {
         let indices = Self::corner_points(points)?;
         let [width, height] = [0, 1].map(|i| f32::from(outline.bounds[i + 2] - outline.bounds[i]));
         let size = width.max(height);
+        let mut sides = [Side::default(); 4];
+        for (i, side) in sides.iter_mut().enumerate() {
+            *side = Side::of(points, indices[i], indices[(i + 1) % 4])?;
+        }
         let mut lines = [Line::default(); 4];
-        for side in 0..4 {
-            let line = side_line(points, indices[side], indices[(side + 1) % 4])?;
+        for (i, line) in lines.iter_mut().enumerate() {
+            // From so far away opposite sides are parallel, and together tell their direction better.
+            let parallel = outline.level == 0 && size <= PARALLEL_PX;
+            let opposite = parallel.then_some(&sides[(i + 2) % 4]);
+            *line = sides[i].line(opposite)?;
             if line.rms > LEAST_RMS_PX + RMS_PER_PX * size {
                 return None;
             }
-            lines[side] = line;
         }
         let mut corners = [[0.0; 2]; 4];
         for i in 0..4 {
@@ -89,6 +95,8 @@ const LEAST_POINTS: usize = 12;
 /// Root mean square distance of a side's points from its line: so much, and more for each pixel of the outline's size.
 const LEAST_RMS_PX: f32 = 0.3;
 const RMS_PER_PX: f32 = 0.012;
+/// Quads up to this size are parallelograms, in pixels.
+const PARALLEL_PX: f32 = 20.0;
 /// How far from the outline's extreme points its corners may be; blur rounds corners.
 const MOST_CORNER_PX: f32 = 1.6;
 const MOST_CORNER_PER_PX: f32 = 0.12;
@@ -141,26 +149,8 @@ struct Line {
 }
 
 impl Line {
-    /// The line nearest to points, given their number and sums of x, y, xx, xy, yy about an origin.
-    fn through(sums: &[f32; 6], origin: [f32; 2]) -> Option<Self> {
-        let [n, x, y, xx, xy, yy] = *sums;
-        if n < 2.0 {
-            return None;
-        }
-        let (mx, my) = (x / n, y / n);
-        let (cxx, cxy, cyy) = (xx / n - mx * mx, xy / n - mx * my, yy / n - my * my);
-        let mean = (cxx + cyy) / 2.0;
-        let root = (((cxx - cyy) / 2.0).powi(2) + cxy * cxy).sqrt();
-        // The normal belongs to the smaller eigenvalue; the longer one of two ways to write it is the exact one.
-        let smaller = mean - root;
-        let normal = if cxx > cyy { [-cxy, cxx - smaller] } else { [cyy - smaller, -cxy] };
-        let length = normal[0].hypot(normal[1]);
-        if length < 1e-6 {
-            return None;
-        }
-        let normal = [normal[0] / length, normal[1] / length];
-        let offset = normal[0] * (mx + origin[0]) + normal[1] * (my + origin[1]);
-        Some(Self { normal, offset, rms: smaller.max(0.0).sqrt() })
+    fn distance(&self, [x, y]: [f32; 2]) -> f32 {
+        (self.normal[0] * x + self.normal[1] * y - self.offset).abs()
     }
 
     fn meets(&self, other: &Self) -> Option<[f32; 2]> {
@@ -175,33 +165,75 @@ impl Line {
     }
 }
 
-/// The line through the points of a side without its ends; of these again without those that lie off.
-fn side_line(points: &[[f32; 2]], from: usize, to: usize) -> Option<Line> {
-    let ([ax, ay], [bx, by]) = (points[from], points[to]);
-    let length = (bx - ax).hypot(by - ay);
-    let end = (END_PX + END_SHARE * length).min(0.3 * length) * length;
-    let along = |[x, y]: &[f32; 2]| (x - ax) * (bx - ax) + (y - ay) * (by - ay);
-    let inner = || {
-        between(points, from, to)
-            .map(|(_, point)| point)
-            .filter(|point| (end..=length * length - end).contains(&along(point)))
-    };
-    let origin = [ax, ay];
-    let line = Line::through(&sums(inner(), origin), origin)?;
-    let most = (2.0 * line.rms).max(0.25);
-    let near =
-        |[x, y]: &&[f32; 2]| (line.normal[0] * x + line.normal[1] * y - line.offset).abs() <= most;
-    let again = Line::through(&sums(inner().filter(near), origin), origin)?;
-    // What was left out counts still when it comes to how straight the side is.
-    Some(Line { rms: line.rms, ..again })
+/// The points of a side: their mean, and the sums of the squares and products of their distances from it.
+#[derive(Copy, Clone, Debug, Default)]
+struct Side {
+    count: f32,
+    mean: [f32; 2],
+    xx: f32,
+    xy: f32,
+    yy: f32,
+    /// Root mean square distance of all points of the side from their line, those left out as well.
+    rms: f32,
 }
 
-fn sums<'a>(points: impl Iterator<Item = &'a [f32; 2]>, origin: [f32; 2]) -> [f32; 6] {
-    points.fold([0.0; 6], |sums, point| {
-        let (x, y) = (point[0] - origin[0], point[1] - origin[1]);
-        let [n, a, b, c, d, e] = sums;
-        [n + 1.0, a + x, b + y, c + x * x, d + x * y, e + y * y]
-    })
+impl Side {
+    /// The points from one index to another without the ends, and without those that lie off the line of the others.
+    fn of(points: &[[f32; 2]], from: usize, to: usize) -> Option<Self> {
+        let ([ax, ay], [bx, by]) = (points[from], points[to]);
+        let length = (bx - ax).hypot(by - ay);
+        let end = (END_PX + END_SHARE * length).min(0.3 * length) * length;
+        let along = |[x, y]: &[f32; 2]| (x - ax) * (bx - ax) + (y - ay) * (by - ay);
+        let inner = || {
+            between(points, from, to)
+                .map(|(_, point)| *point)
+                .filter(|point| (end..=length * length - end).contains(&along(point)))
+        };
+        let all = Self::sums(inner(), points[from]);
+        let line = all.line(None)?;
+        let most = (2.0 * line.rms).max(0.25);
+        let near = Self::sums(inner().filter(|point| line.distance(*point) <= most), points[from]);
+        Some(Self { rms: line.rms, ..near })
+    }
+
+    fn sums(points: impl Iterator<Item = [f32; 2]>, origin: [f32; 2]) -> Self {
+        let [n, x, y, xx, xy, yy] = points.fold([0.0; 6], |[n, a, b, c, d, e], point| {
+            let (x, y) = (point[0] - origin[0], point[1] - origin[1]);
+            [n + 1.0, a + x, b + y, c + x * x, d + x * y, e + y * y]
+        });
+        let (mx, my) = (x / n, y / n);
+        Self {
+            count: n,
+            mean: [mx + origin[0], my + origin[1]],
+            xx: xx - n * mx * mx,
+            xy: xy - n * mx * my,
+            yy: yy - n * my * my,
+            rms: 0.0,
+        }
+    }
+
+    /// The line nearest to the points, or the one of those parallel to the line of a second side.
+    fn line(&self, parallel_to: Option<&Self>) -> Option<Line> {
+        if self.count < 2.0 {
+            return None;
+        }
+        let (mut xx, mut xy, mut yy) = (self.xx, self.xy, self.yy);
+        if let Some(other) = parallel_to {
+            (xx, xy, yy) = (xx + other.xx, xy + other.xy, yy + other.yy);
+        }
+        let root = (((xx - yy) / 2.0).powi(2) + xy * xy).sqrt();
+        // The normal belongs to the smaller eigenvalue; the longer one of two ways to write it is the exact one.
+        let smaller = (xx + yy) / 2.0 - root;
+        let [a, b] = if xx > yy { [-xy, xx - smaller] } else { [yy - smaller, -xy] };
+        let length = a.hypot(b);
+        if length < 1e-6 {
+            return None;
+        }
+        let normal = [a / length, b / length];
+        let offset = normal[0] * self.mean[0] + normal[1] * self.mean[1];
+        let own = (smaller.max(0.0) / self.count).sqrt();
+        Some(Line { normal, offset, rms: self.rms.max(own) })
+    }
 }
 
 /// Whether corners are those of a convex quad of about that area that a square may look like.
