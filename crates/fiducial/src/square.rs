@@ -1,15 +1,19 @@
 //! Square markers: [`code`] says which cells of which family carry which words, [`quad`] finds four-sided outlines,
 //! `decode` reads their cells. [`pattern`] says which cells of a marker are black and white, [`refine`] where its corners
-//! are. [`Squares`] does it all, for any number of families at once.
+//! are. [`Squares`] does it all, for any number of families at once. Where outlines are broken, [`segments`] makes quads
+//! of straight pieces of edges, [`erasures`] reads what is left of a marker, and [`damaged`] does both.
 
 pub mod code;
 pub(crate) mod codebook;
+pub mod damaged;
 pub(crate) mod decode;
+pub mod erasures;
 pub mod pattern;
 mod picture;
 mod profiles;
 pub mod quad;
 pub mod refine;
+pub mod segments;
 mod tables;
 
 use geometry::{CameraModel, Pixel};
@@ -20,6 +24,7 @@ use crate::marker::Marker;
 use crate::observation::{Observation, Stages};
 use crate::pose::square_pose;
 use crate::square::code::Code;
+use crate::square::damaged::{Damaged, Sought};
 use crate::square::decode::{Cells, Layout, Look};
 use crate::square::pattern::Pattern;
 use crate::square::quad::Quad;
@@ -43,6 +48,9 @@ struct Wanted {
     /// Index of the cells it shares with other families.
     layout: usize,
     markers: Vec<Marker>,
+    /// The ids that were not yet found in this image.
+    missing: Vec<u32>,
+    is_missing: bool,
 }
 
 /// Finds the square markers of any number of families. It keeps its memory from image to image.
@@ -54,6 +62,7 @@ pub struct Squares {
     cells: Cells,
     found: Vec<Found>,
     scratch: Scratch,
+    damaged: Damaged,
 }
 
 #[derive(Copy, Clone, Debug)]
@@ -94,7 +103,14 @@ impl Squares {
                 }
                 (None, None) => continue,
             };
-            squares.wanted.push(Wanted { code, layout, markers: vec![*marker] });
+            let markers = vec![*marker];
+            squares.wanted.push(Wanted {
+                code,
+                layout,
+                markers,
+                missing: Vec::new(),
+                is_missing: false,
+            });
         }
         squares
     }
@@ -129,6 +145,8 @@ impl Squares {
         self.found.clear();
         self.read(view, outlines, trace);
         stages.ended("codes");
+        self.read_damaged(view, outlines, trace);
+        stages.ended("damaged");
         let first = found.len();
         for marker in &self.found {
             if let Some(wanted) = self.wanted.get(marker.wanted) {
@@ -188,6 +206,49 @@ impl Squares {
             if solved >= MOST_SOLVED || self.found.len() >= MOST_FOUND {
                 break;
             }
+        }
+    }
+
+    /// Looks for the markers that outlines do not show. A family of which any id is wanted is missing when none of it was
+    /// found.
+    fn read_damaged(&mut self, view: GrayView<'_>, outlines: &Outlines, trace: &mut Trace) {
+        let mut all_found = true;
+        for (index, wanted) in self.wanted.iter_mut().enumerate() {
+            wanted.missing.clear();
+            let known = || self.found.iter().filter(|found| found.wanted == index);
+            let any = wanted.markers.iter().any(|marker| marker.id.is_none());
+            let ids = wanted.markers.iter().filter_map(|marker| marker.id);
+            wanted.missing.extend(ids.filter(|id| known().all(|found| found.id != *id)));
+            wanted.is_missing =
+                if any { known().next().is_none() } else { !wanted.missing.is_empty() };
+            all_found &= !wanted.is_missing;
+        }
+        if all_found {
+            return;
+        }
+        let missing = self.wanted.iter().enumerate().filter(|(_, wanted)| wanted.is_missing);
+        let sought = missing.map(|(index, wanted)| {
+            let any = wanted.markers.iter().any(|marker| marker.id.is_none());
+            Sought { index, code: wanted.code, ids: (!any).then_some(wanted.missing.as_slice()) }
+        });
+        let whole = self.found.len();
+        for marker in self.damaged.find(view, outlines.pyramid(), sought) {
+            let corners = marker.quad.corners;
+            if self.found[..whole].iter().any(|found| is_same(&found.corners, &corners)) {
+                continue;
+            }
+            trace.accept_quad(corners);
+            let reading = marker.reading;
+            // As many bits again as make the reading certain make it as sure as a whole marker's.
+            let margin = f64::from(reading.intact * (reading.evidence / 20.0).min(1.0));
+            self.found.push(Found {
+                wanted: marker.index,
+                id: reading.id,
+                corners,
+                wrong_bits: reading.wrong_bits,
+                explained: f64::from(reading.explained),
+                margin,
+            });
         }
     }
 

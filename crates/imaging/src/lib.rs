@@ -7,6 +7,7 @@
 //! white, [`contour`] follows the borders between the two, [`ellipse`] fits ellipses to borders, [`sample`] reads
 //! grey values between the pixels. The fast way to regions of any size: [`pyramid`] halves an image again and again,
 //! [`binary`] decides which pixels are dark or bright, [`outline`] follows the outlines of the regions they make.
+//! [`segment`] takes straight pieces of edges where regions are broken.
 
 pub mod binary;
 pub mod contour;
@@ -17,6 +18,7 @@ mod kernels;
 pub mod outline;
 pub mod pyramid;
 pub mod sample;
+pub mod segment;
 pub mod threshold;
 pub mod view;
 
@@ -28,5 +30,6 @@ pub use filter::{BilateralRows, bilateral_5x5};
 pub use outline::{Outline, Outlines};
 pub use pyramid::Pyramid;
 pub use sample::bilinear;
+pub use segment::{LeastEdge, Segment, Segments};
 pub use threshold::{LeastContrast, LocalThreshold, threshold};
 pub use view::{GrayImage, GrayView, ViewError};

@@ -1,0 +1,694 @@
+//! Reads markers of which a part is in shadow, washed out, covered or outside of the image.
+//!
+//! Border and paper say what black and white are where they lie. From there the light over the whole marker is
+//! modelled: as the same everywhere, as two lights on the sides of a straight edge of a shadow, or with a reflection
+//! that adds light in a round blob. Cells that are neither black nor white by this, or beside border cells that are not
+//! what they should be, are unknown, and a word is matched by the others. It counts only when so many cells agree that
+//! chance is out of the question.
+
+use geometry::Pixel;
+use imaging::GrayView;
+
+use super::code::Code;
+use super::quad::Quad;
+
+/// What a damaged marker says.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Reading {
+    /// The id.
+    pub id: u32,
+    /// The marker's own top left corner is this one of the quad's.
+    pub quarter_turns: u8,
+    /// Known bits that differ from the word's.
+    pub wrong_bits: u8,
+    /// Bits that could be read.
+    pub known_bits: u8,
+    /// The share of the border and the paper around it that looks as it should.
+    pub intact: f32,
+    /// The share of the variance of the known cells' pixels that black and white explain.
+    pub explained: f32,
+    /// By how many bits the agreement exceeds what chance would give among the words looked for.
+    pub evidence: f32,
+}
+
+/// Least evidence, in bits.
+const LEAST_EVIDENCE: f32 = 7.0;
+/// Least share of the border's cells, and of those around it, that look as they should.
+const LEAST_INTACT: f32 = 0.6;
+/// Least share of the variance of the known cells' pixels that black and white must explain.
+const LEAST_EXPLAINED: f32 = 0.7;
+/// Least share of them that must be seen.
+const LEAST_SEEN: f32 = 0.35;
+/// Least logarithm of the ratio of white to black.
+const LEAST_RATIO: f32 = 0.08;
+/// Least difference of white and black, in grey levels.
+const LEAST_CONTRAST: f32 = 8.0;
+
+/// The most cells across, those around the square included.
+const MOST_ACROSS: usize = 15;
+const MOST_CELLS: usize = MOST_ACROSS * MOST_ACROSS;
+/// Places across a cell at which it is sampled.
+const SAMPLES: usize = 3;
+
+/// Reads the marker of one family in `quad`. `wanted` are the ids that are looked for; `None` stands for all.
+pub fn read(
+    view: GrayView<'_>,
+    quad: &Quad,
+    code: &Code,
+    wanted: Option<&[u32]>,
+) -> Option<Reading> {
+    let place = Projection::of(&quad.corners)?;
+    let grid = Grid::sample(view, quad, &place, code)?;
+    let light = grid.light()?;
+    let mut read = [Cell::Unknown; MOST_CELLS];
+    grid.judge(&light, &mut read);
+    let intact = grid.intact(&read)?;
+    grid.distrust(&mut read);
+    let (word, known) = grid.word(&read, code);
+    let mut reading = best_word(word, known, code, wanted)?;
+    reading.intact = intact;
+    reading.explained = grid.explained(&light, &read);
+    (reading.explained >= LEAST_EXPLAINED).then_some(reading)
+}
+
+/// Whether the border is darker than what lies beside it, by nearly the same ratio for most of its cells: a shadow keeps
+/// the ratio of ink and paper.
+pub(crate) fn has_border(view: GrayView<'_>, quad: &Quad, code: &Code) -> bool {
+    let Some(place) = Projection::of(&quad.corners) else { return false };
+    let cells = f64::from(code.cells);
+    let mut ratios = [0.0_f32; 4 * MOST_ACROSS];
+    let mut seen = 0;
+    for index in 0..4 * usize::from(code.cells).min(MOST_ACROSS) {
+        let along = ((index / 4) as f64 + 0.5) / cells;
+        let value = |depth: f64| {
+            let at = match index % 4 {
+                0 => [along, depth],
+                1 => [1.0 - depth, along],
+                2 => [along, 1.0 - depth],
+                _ => [depth, along],
+            };
+            let value = place.at(at).and_then(|p| bilinear(view, p))?;
+            Some(log(if quad.inverted { 255.0 - value } else { value }))
+        };
+        if let (Some(border), Some(paper)) = (value(0.5 / cells), value(-0.35 / cells)) {
+            ratios[seen] = paper - border;
+            seen += 1;
+        }
+    }
+    if seen < 2 * usize::from(code.cells) {
+        return false;
+    }
+    let ratios = &mut ratios[..seen];
+    ratios.sort_unstable_by(f32::total_cmp);
+    // The ratio which most cells reach, and the one most stay below.
+    let (low, high) = (ratios[2 * seen / 5], ratios[4 * seen / 5]);
+    low > LEAST_RATIO && high < 4.0 * low
+}
+
+/// What a cell of a marker is.
+#[derive(Copy, Clone, Debug, PartialEq)]
+enum Kind {
+    /// Always black (for a reversed border: white).
+    Border,
+    /// Always white (for a reversed border: black).
+    Paper,
+    Bit,
+    Nothing,
+}
+
+/// What a cell looks like.
+#[derive(Copy, Clone, Debug, PartialEq)]
+enum Cell {
+    Black,
+    White,
+    /// Outside of the image, or where black and white look the same.
+    Unknown,
+    /// Neither black nor white.
+    Grey,
+    /// Brighter than paper is here.
+    Glare,
+}
+
+/// The cells of a quad, sampled.
+struct Grid {
+    across: usize,
+    margin: i8,
+    kinds: [Kind; MOST_CELLS],
+    samples: [[f32; SAMPLES * SAMPLES]; MOST_CELLS],
+}
+
+/// The light over a marker. Places are in cells, the middle of the square's top left one at (0, 0).
+#[derive(Copy, Clone, Debug)]
+struct Light {
+    /// The edge of a shadow; infinitely far away when there is none.
+    normal: [f32; 2],
+    offset: f32,
+    /// Black and white before and beyond the edge.
+    levels: [[f32; 2]; 2],
+    /// The logarithm of the light that a reflection adds: constant, by x, by y and by both squares.
+    reflection: Option<[f32; 4]>,
+}
+
+impl Grid {
+    fn sample(view: GrayView<'_>, quad: &Quad, place: &Projection, code: &Code) -> Option<Self> {
+        let margin = code.margin();
+        let across = usize::from(code.cells + 2 * margin);
+        if across > MOST_ACROSS {
+            return None;
+        }
+        let mut grid = Self {
+            across,
+            margin: margin as i8,
+            kinds: [Kind::Nothing; MOST_CELLS],
+            samples: [[f32::NAN; SAMPLES * SAMPLES]; MOST_CELLS],
+        };
+        grid.name(code);
+        // A marker printed the other way round is read as its negative.
+        let negative = quad.inverted;
+        for index in 0..across * across {
+            let kind = grid.kinds[index];
+            if kind == Kind::Nothing {
+                continue;
+            }
+            let [column, row] = grid.cell(index);
+            let last = f64::from(code.cells) - 1.0;
+            for sample in 0..SAMPLES * SAMPLES {
+                let within = [sample % SAMPLES, sample / SAMPLES].map(|i| 0.22 + 0.28 * i as f64);
+                // Little paper may be around the border, so it is taken near the border.
+                let near = |cell: i8, within: f64| {
+                    let cell = f64::from(cell);
+                    match kind {
+                        Kind::Paper if cell < 0.0 => 0.3 * within - 0.42,
+                        Kind::Paper if cell > last => last + 1.12 + 0.3 * within,
+                        _ => cell + within,
+                    }
+                };
+                let at = [near(column, within[0]), near(row, within[1])]
+                    .map(|v| v / f64::from(code.cells));
+                let value = place.at(at).and_then(|p| bilinear(view, p));
+                grid.samples[index][sample] = match value {
+                    Some(value) if negative => 255.0 - value,
+                    Some(value) => value,
+                    None => f32::NAN,
+                };
+            }
+        }
+        Some(grid)
+    }
+
+    /// Says what each cell is.
+    fn name(&mut self, code: &Code) {
+        let last = code.cells as i8 - 1;
+        for index in 0..self.across * self.across {
+            let [column, row] = self.cell(index);
+            let outside = |v: i8| (-v).max(v - last);
+            self.kinds[index] = match outside(column).max(outside(row)) {
+                0 => Kind::Border,
+                1 => Kind::Paper,
+                _ => Kind::Nothing,
+            };
+        }
+        for &[column, row] in code.bits {
+            if let Some(index) = self.index([column, row]) {
+                self.kinds[index] = Kind::Bit;
+            }
+        }
+    }
+
+    fn cell(&self, index: usize) -> [i8; 2] {
+        [(index % self.across) as i8 - self.margin, (index / self.across) as i8 - self.margin]
+    }
+
+    fn index(&self, cell: [i8; 2]) -> Option<usize> {
+        let [column, row] = cell.map(|v| usize::try_from(v + self.margin).unwrap_or(usize::MAX));
+        (column < self.across && row < self.across).then_some(row * self.across + column)
+    }
+
+    /// The light by which border and paper look as they do.
+    fn light(&self) -> Option<Light> {
+        let mut known = Known::default();
+        for index in 0..self.across * self.across {
+            let white = match self.kinds[index] {
+                Kind::Border => false,
+                Kind::Paper => true,
+                _ => continue,
+            };
+            let values = self.samples[index];
+            let value = values.iter().sum::<f32>() / values.len() as f32;
+            if value.is_finite() {
+                known.push(self.cell(index).map(f32::from), value, white);
+            }
+        }
+        known.light(f32::from(self.across as u8) * 0.5 - f32::from(self.margin) - 0.5)
+    }
+
+    /// Says what each cell looks like.
+    fn judge(&self, light: &Light, read: &mut [Cell; MOST_CELLS]) {
+        for (index, cell) in read.iter_mut().enumerate().take(self.across * self.across) {
+            if self.kinds[index] == Kind::Nothing {
+                continue;
+            }
+            let [column, row] = self.cell(index).map(f32::from);
+            let (mut sum, mut weights, mut bright) = (0.0, 0.0_f32, 0);
+            for (sample, value) in self.samples[index].iter().enumerate() {
+                let [dx, dy] = within(sample);
+                let Some(share) = light.white_share([column + dx, row + dy], *value) else {
+                    continue;
+                };
+                let weight = if sample == SAMPLES * SAMPLES / 2 { 2.0 } else { 1.0 };
+                bright += usize::from(share > 1.5);
+                sum += weight * share.clamp(-0.2, 1.2);
+                weights += weight;
+            }
+            let share = sum / weights.max(1.0);
+            *cell = if weights < 4.0 {
+                Cell::Unknown
+            } else if bright > 2 {
+                Cell::Glare
+            } else if share < 0.4 {
+                Cell::Black
+            } else if share > 0.6 {
+                Cell::White
+            } else {
+                Cell::Grey
+            };
+        }
+    }
+
+    /// The share of the known border and of the paper around it that looks as it should; `None` when that or what is
+    /// known is too little.
+    fn intact(&self, read: &[Cell; MOST_CELLS]) -> Option<f32> {
+        let mut counts = [[0.0_f32; 3]; 2];
+        for (kind, cell) in self.kinds.iter().zip(read).take(self.across * self.across) {
+            let (which, expected) = match kind {
+                Kind::Border => (0, Cell::Black),
+                Kind::Paper => (1, Cell::White),
+                _ => continue,
+            };
+            counts[which][0] += 1.0;
+            counts[which][1] += f32::from(u8::from(*cell == expected));
+            counts[which][2] += f32::from(u8::from(matches!(cell, Cell::Unknown | Cell::Glare)));
+        }
+        let shares =
+            counts.map(
+                |[all, good, unknown]| {
+                    if good >= LEAST_SEEN * all { good / (all - unknown) } else { 0.0 }
+                },
+            );
+        let all_good = shares.iter().all(|share| *share >= LEAST_INTACT);
+        all_good.then_some(0.5 * (shares[0] + shares[1]))
+    }
+
+    /// Makes cells unknown that are probably damaged as their neighbours are.
+    fn distrust(&self, read: &mut [Cell; MOST_CELLS]) {
+        let seen = *read;
+        for (index, cell) in seen.iter().enumerate().take(self.across * self.across) {
+            let covered =
+                self.kinds[index] == Kind::Border && matches!(cell, Cell::White | Cell::Grey);
+            let glare = *cell == Cell::Glare;
+            if !covered && !glare {
+                continue;
+            }
+            let [column, row] = self.cell(index);
+            for dy in -1..=1 {
+                for dx in -1..=1 {
+                    let Some(near) = self.index([column + dx, row + dy]) else { continue };
+                    // Light is only added, so what is dark beside glare is black.
+                    if covered || read[near] == Cell::White {
+                        read[near] = Cell::Unknown;
+                    }
+                }
+            }
+        }
+    }
+
+    /// How well the known bits' cells are one black or one white: texture and writing are not.
+    fn explained(&self, light: &Light, read: &[Cell; MOST_CELLS]) -> f32 {
+        let (mut off, mut count, mut whites) = (0.0, 0.0_f32, 0.0);
+        for (index, cell) in read.iter().enumerate().take(self.across * self.across) {
+            let white = match cell {
+                Cell::Black => 0.0,
+                Cell::White => 1.0,
+                _ => continue,
+            };
+            if self.kinds[index] != Kind::Bit {
+                continue;
+            }
+            let [column, row] = self.cell(index).map(f32::from);
+            for (sample, value) in self.samples[index].iter().enumerate() {
+                let [dx, dy] = within(sample);
+                if let Some(share) = light.white_share([column + dx, row + dy], *value) {
+                    off += (share.clamp(-0.5, 1.5) - white).powi(2);
+                    count += 1.0;
+                    whites += white;
+                }
+            }
+        }
+        let share = whites / count;
+        // Words are about half white; one that is not must not be held to less.
+        let variance = (share * (1.0 - share)).max(0.15);
+        if count > 0.0 { (1.0 - off / count / variance).clamp(0.0, 1.0) } else { 0.0 }
+    }
+
+    /// The bits, and which of them are known.
+    fn word(&self, read: &[Cell; MOST_CELLS], code: &Code) -> (u64, u64) {
+        let (mut word, mut known) = (0, 0);
+        for cell in code.bits {
+            let cell = self.index(*cell).map_or(Cell::Unknown, |index| read[index]);
+            let white = (cell == Cell::White) != code.reversed_border;
+            let is_known = matches!(cell, Cell::Black | Cell::White);
+            word = word << 1 | u64::from(is_known && white);
+            known = known << 1 | u64::from(is_known);
+        }
+        (word, known)
+    }
+}
+
+/// Where a sample lies from the middle of its cell, in cells.
+fn within(sample: usize) -> [f32; 2] {
+    [sample % SAMPLES, sample / SAMPLES].map(|i| 0.28 * (i as f32 - 1.0))
+}
+
+/// The word that agrees best with the known bits.
+fn best_word(word: u64, known: u64, code: &Code, wanted: Option<&[u32]>) -> Option<Reading> {
+    let bits = known.count_ones();
+    let count = wanted.map_or(code.words.len(), <[u32]>::len);
+    let chances = (4.0 * count as f32).log2();
+    if (bits as f32) < LEAST_EVIDENCE + chances {
+        return None;
+    }
+    let (mut best, mut second) = ((u32::MAX, 0, 0), u32::MAX);
+    let mut look = |id: u32, turns: u8, wrong: u32| {
+        if wrong < best.0 {
+            // The same id at another turn is a rival as well.
+            second = best.0;
+            best = (wrong, id, turns);
+        } else {
+            second = second.min(wrong);
+        }
+    };
+    let (mut word, mut known) = (word, known);
+    for turns in 0..4 {
+        match wanted {
+            Some(ids) => {
+                for id in ids {
+                    if let Some(expected) = code.words.get(*id as usize) {
+                        look(*id, turns, ((expected ^ word) & known).count_ones());
+                    }
+                }
+            }
+            None => {
+                for (expected, id) in code.words.iter().zip(0..) {
+                    look(id, turns, ((expected ^ word) & known).count_ones());
+                }
+            }
+        }
+        word = code.turned(word);
+        known = code.turned(known);
+    }
+    let (wrong, id, quarter_turns) = best;
+    let erased = code.bits.len() as u32 - bits;
+    // As many as the words' distance allows for when so many bits are missing.
+    let correctable = u32::from(code.min_hamming).saturating_sub(erased + 1) / 2;
+    let evidence = bits as f32 - chances - ways(bits, wrong).log2();
+    (wrong <= correctable.max(u32::from(erased == 0))
+        && second > wrong
+        && evidence >= LEAST_EVIDENCE)
+        .then_some(Reading {
+            id,
+            quarter_turns,
+            wrong_bits: wrong as u8,
+            known_bits: bits as u8,
+            intact: 0.0,
+            explained: 0.0,
+            evidence,
+        })
+}
+
+/// The number of words within `wrong` bits of one.
+fn ways(bits: u32, wrong: u32) -> f32 {
+    let mut term = 1.0;
+    let mut sum = 1.0;
+    for k in 1..=wrong.min(bits) {
+        term *= (bits - k + 1) as f32 / k as f32;
+        sum += term;
+    }
+    sum
+}
+
+/// The cells whose ink is known, by their places and grey values.
+struct Known {
+    count: usize,
+    places: [[f32; 2]; MOST_CELLS],
+    values: [f32; MOST_CELLS],
+    /// Logarithms: of a shadow, black and white keep their ratio.
+    logs: [f32; MOST_CELLS],
+    white: [bool; MOST_CELLS],
+}
+
+impl Default for Known {
+    fn default() -> Self {
+        Self {
+            count: 0,
+            places: [[0.0; 2]; MOST_CELLS],
+            values: [0.0; MOST_CELLS],
+            logs: [0.0; MOST_CELLS],
+            white: [false; MOST_CELLS],
+        }
+    }
+}
+
+impl Known {
+    fn push(&mut self, place: [f32; 2], value: f32, white: bool) {
+        if self.count < MOST_CELLS {
+            self.places[self.count] = place;
+            self.values[self.count] = value;
+            self.logs[self.count] = log(value);
+            self.white[self.count] = white;
+            self.count += 1;
+        }
+    }
+
+    /// The light about a grid whose middle is at `middle` both ways.
+    fn light(&self, middle: f32) -> Option<Light> {
+        let (mut best, mut misfit) = self.split([1.0, 0.0], f32::INFINITY)?;
+        // Little is left to explain: one light.
+        if misfit > 0.01 * self.count as f32 {
+            let most = 0.6 * misfit;
+            let others = [self.reflected(), self.shaded(middle)];
+            for (light, here) in others.into_iter().flatten() {
+                if here < most && here < misfit {
+                    (best, misfit) = (light, here);
+                }
+            }
+        }
+        let enough = |[black, white]: [f32; 2]| white - black >= LEAST_CONTRAST;
+        best.levels.into_iter().all(enough).then_some(best)
+    }
+
+    /// Two lights, and what they leave to explain: the best of lines all over the grid, then of lines near it.
+    fn shaded(&self, middle: f32) -> Option<(Light, f32)> {
+        const DIRECTIONS: i32 = 16;
+        let (mut turn, mut step) = (std::f32::consts::PI / DIRECTIONS as f32, (middle + 1.0) / 8.0);
+        let line = |angle: f32, aside: f32| {
+            let normal = [angle.cos(), angle.sin()];
+            self.split(normal, middle * (normal[0] + normal[1]) + aside)
+        };
+        let mut best: Option<(Light, f32)> = None;
+        let mut at = (0.0, 0.0);
+        let mut look = |angle: f32, aside: f32, at: &mut (f32, f32)| {
+            let Some(found) = line(angle, aside) else { return };
+            if best.is_none_or(|best| found.1 < best.1) {
+                best = Some(found);
+                *at = (angle, aside);
+            }
+        };
+        for direction in 0..DIRECTIONS {
+            for aside in -8..=8 {
+                look(turn * direction as f32, step * aside as f32, &mut at);
+            }
+        }
+        for _ in 0..3 {
+            turn *= 0.5;
+            step *= 0.5;
+            let (angle, aside) = at;
+            for (dt, ds) in [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)] {
+                look(angle + dt * turn, aside + ds * step, &mut at);
+            }
+        }
+        best
+    }
+
+    /// The light when a line separates two, and the squares that remain, each bounded.
+    fn split(&self, normal: [f32; 2], offset: f32) -> Option<(Light, f32)> {
+        let mut sums = [[[0.0_f32; 2]; 2]; 2];
+        let side = |i: usize| {
+            let [x, y] = self.places[i];
+            usize::from(x * normal[0] + y * normal[1] > offset)
+        };
+        for i in 0..self.count {
+            let sum = &mut sums[side(i)][usize::from(self.white[i])];
+            sum[0] += 1.0;
+            sum[1] += self.logs[i];
+        }
+        let mut means = sums.map(|side| side.map(|[n, sum]| (n >= 2.0).then_some(sum / n)));
+        if offset.is_infinite() {
+            means[1] = means[0];
+        }
+        // What one side lacks follows from the ratio on the other one.
+        let ratios = means.map(|[black, white]| Some(white? - black?));
+        if let [Some(here), Some(there)] = ratios {
+            // What covers the marker has no black and white in it.
+            if here.max(there) > 2.5 * here.min(there) {
+                return None;
+            }
+        }
+        let mut logs = [[0.0; 2]; 2];
+        for (s, log) in logs.iter_mut().enumerate() {
+            let other = ratios[1 - s];
+            *log = match means[s] {
+                [Some(black), Some(white)] => [black, white],
+                [Some(black), None] => [black, black + other?],
+                [None, Some(white)] => [white - other?, white],
+                [None, None] => return None,
+            };
+        }
+        let misfit = (0..self.count)
+            .map(|i| bounded(self.logs[i] - logs[side(i)][usize::from(self.white[i])]))
+            .sum();
+        let levels = logs.map(|side| side.map(|log| log.exp() - SCATTERED));
+        Some((Light { normal, offset, levels, reflection: None }, misfit))
+    }
+
+    /// One light and a reflection, and what they leave to explain.
+    fn reflected(&self) -> Option<(Light, f32)> {
+        // The darker ones of each ink are those outside of the reflection.
+        let plain = [false, true].map(|white| self.quarter(white));
+        let [black, white] = plain;
+        let levels = [[black?, white?]; 2];
+        let mut sums = nalgebra::Matrix4::<f32>::zeros();
+        let mut sides = nalgebra::Vector4::<f32>::zeros();
+        for i in 0..self.count {
+            let added = self.values[i] - levels[0][usize::from(self.white[i])];
+            if added < 5.0 || self.values[i] > SATURATED {
+                continue;
+            }
+            let [x, y] = self.places[i];
+            let row = nalgebra::Vector4::new(1.0, x, y, x * x + y * y);
+            // The error of a logarithm is that of the level by the level.
+            let weight = (added / 20.0).powi(2).min(25.0);
+            sums += weight * row * row.transpose();
+            sides += weight * added.ln() * row;
+        }
+        let shape = sums.cholesky()?.solve(&sides);
+        if shape[3] >= 0.0 {
+            return None;
+        }
+        let reflection = Some([shape[0], shape[1], shape[2], shape[3]]);
+        let light = Light { normal: [1.0, 0.0], offset: f32::INFINITY, levels, reflection };
+        let misfit = (0..self.count)
+            .map(|i| {
+                let [black, white] = light.at(self.places[i], 0);
+                let expected = if self.white[i] { white } else { black };
+                bounded(self.logs[i] - log(expected))
+            })
+            .sum();
+        Some((light, misfit))
+    }
+
+    /// A grey value that a quarter of the cells of one ink stay below.
+    fn quarter(&self, white: bool) -> Option<f32> {
+        let mut values = [0.0; MOST_CELLS];
+        let mut count = 0;
+        for i in 0..self.count {
+            if self.white[i] == white {
+                values[count] = self.values[i];
+                count += 1;
+            }
+        }
+        let values = &mut values[..count];
+        values.sort_unstable_by(f32::total_cmp);
+        values.get(count / 4).copied()
+    }
+}
+
+/// What the lens scatters into the dark, in grey levels: it keeps the logarithm of the darkest from deciding alone.
+const SCATTERED: f32 = 8.0;
+
+/// From here on a pixel may be at its end.
+const SATURATED: f32 = 245.0;
+
+fn log(value: f32) -> f32 {
+    (value.min(255.0) + SCATTERED).ln()
+}
+
+/// The square of a difference of logarithms; what is covered counts no more than so much.
+fn bounded(difference: f32) -> f32 {
+    const MOST: f32 = 0.5;
+    difference.abs().min(MOST).powi(2)
+}
+
+impl Light {
+    /// Black and white at a place, by the light of one side of the edge.
+    fn at(&self, [x, y]: [f32; 2], side: usize) -> [f32; 2] {
+        let added = self.reflection.map_or(0.0, |[constant, by_x, by_y, by_squares]| {
+            (constant + by_x * x + by_y * y + by_squares * (x * x + y * y)).min(6.0).exp()
+        });
+        self.levels[side].map(|level| (level + added).min(255.0))
+    }
+
+    /// Where a grey value lies between black (0) and white (1); `None` outside of the image, where the two lights
+    /// disagree about it, and where a reflection leaves no difference.
+    fn white_share(&self, place: [f32; 2], value: f32) -> Option<f32> {
+        if !value.is_finite() {
+            return None;
+        }
+        let [x, y] = place;
+        let beyond = x * self.normal[0] + y * self.normal[1] - self.offset;
+        let share = |side: usize| {
+            let [black, white] = self.at(place, side);
+            let left = (white - black) / (self.levels[side][1] - self.levels[side][0]);
+            (left > 0.2).then(|| (value - black) / (white - black))
+        };
+        let here = share(usize::from(beyond > 0.0))?;
+        const NEAR: f32 = 0.4;
+        if beyond.abs() < NEAR {
+            let there = share(usize::from(beyond <= 0.0))?;
+            if (here > 0.5) != (there > 0.5) {
+                return None;
+            }
+        }
+        Some(here)
+    }
+}
+
+/// From the marker's unit square to the image (projective, the corners clockwise from the top left one).
+struct Projection([f64; 8]);
+
+impl Projection {
+    fn of(corners: &[Pixel; 4]) -> Option<Self> {
+        let [a, b, c, d] = corners.map(|p| [p.x, p.y]);
+        let sub = |p: [f64; 2], q: [f64; 2]| [p[0] - q[0], p[1] - q[1]];
+        let (bc, dc) = (sub(b, c), sub(d, c));
+        let sum = [a[0] - b[0] + c[0] - d[0], a[1] - b[1] + c[1] - d[1]];
+        let det = bc[0] * dc[1] - dc[0] * bc[1];
+        if det.is_nan() || det.abs() <= 1e-6 {
+            return None;
+        }
+        let g = (sum[0] * dc[1] - dc[0] * sum[1]) / det;
+        let h = (bc[0] * sum[1] - sum[0] * bc[1]) / det;
+        let row = |i: usize| [b[i] - a[i] + g * b[i], d[i] - a[i] + h * d[i], a[i]];
+        let ([p, q, r], [s, t, u]) = (row(0), row(1));
+        Some(Self([p, q, r, s, t, u, g, h]))
+    }
+
+    fn at(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
+        let [a, b, c, d, e, f, g, h] = self.0;
+        let w = g * x + h * y + 1.0;
+        (w > 1e-3).then(|| [(a * x + b * y + c) / w, (d * x + e * y + f) / w])
+    }
+}
+
+fn bilinear(view: GrayView<'_>, [x, y]: [f64; 2]) -> Option<f32> {
+    imaging::bilinear(view, x, y).map(|value| value as f32)
+}

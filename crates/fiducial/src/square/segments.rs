@@ -1,0 +1,486 @@
+//! Quads from segments of edges: for markers whose outline is not closed.
+//!
+//! The edge of a shadow, glare or something in front break the outline of a marker, and the frame cuts it; its sides
+//! are still straight, have their dark side within, and meet at corners. So sides are joined across gaps, corners
+//! are where one side ends and another one begins with a turn to the right, and a quad is a way round over two, three
+//! or four sides. A corner that is not seen lies where its sides would meet; a side that is not seen joins the ends of
+//! its neighbours.
+
+use geometry::Pixel;
+use imaging::Segment;
+
+use super::quad::Quad;
+
+/// A quad, and how much of it was seen.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct SegmentQuad {
+    /// The outline.
+    pub quad: Quad,
+    /// The share of its perimeter on which there are edges.
+    pub seen: f32,
+}
+
+/// Where a picture of the image lies in the image: a pixel's place is `scale` times that in the picture, plus
+/// `offset`.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Placement {
+    /// Image pixels per pixel of the picture.
+    pub scale: f32,
+    /// The place of the picture's first pixel in the image.
+    pub offset: f32,
+}
+
+/// The most sides, corners and quads that are looked at.
+const MOST_SIDES: usize = 6000;
+const MOST_CORNERS: usize = 16_000;
+const MOST_CORNERS_OF_A_SIDE: usize = 6;
+const MOST_GUESSES: usize = 4000;
+/// The most quads that are returned.
+const MOST_QUADS: usize = 150;
+
+/// Edge of a cell of the grid in which sides are looked up, in pixels.
+const CELL_PX: f32 = 16.0;
+
+/// Joins segments to quads. It keeps its memory from image to image.
+#[derive(Clone, Debug, Default)]
+pub struct SegmentQuads {
+    sides: Vec<Side>,
+    starts: Grid,
+    corners: Vec<Corner>,
+    /// Where the corners at the end of each side begin in `corners`.
+    corners_from: Vec<u32>,
+    guesses: Vec<Guess>,
+    found: Vec<SegmentQuad>,
+}
+
+/// A straight side: a segment, or several in one line.
+#[derive(Copy, Clone, Debug)]
+struct Side {
+    start: [f32; 2],
+    end: [f32; 2],
+    way: [f32; 2],
+    length: f32,
+    /// The length over which there is an edge.
+    seen: f32,
+}
+
+/// Where a side ends and the next one begins.
+#[derive(Copy, Clone, Debug)]
+struct Corner {
+    next: u32,
+    place: [f32; 2],
+    gap: f32,
+}
+
+#[derive(Copy, Clone, Debug)]
+struct Guess {
+    corners: [[f32; 2]; 4],
+    seen: f32,
+    score: f32,
+}
+
+impl SegmentQuads {
+    /// The quads that these segments of a picture of `size` pixels may belong to, in the image's pixels, best first:
+    /// dark ones, or bright ones when `inverted`.
+    pub fn find(
+        &mut self,
+        segments: &[Segment],
+        size: [usize; 2],
+        placement: Placement,
+        inverted: bool,
+    ) -> &[SegmentQuad] {
+        self.found.clear();
+        self.sides.clear();
+        let sides = segments.iter().filter_map(|segment| Side::of(segment, inverted));
+        self.sides.extend(sides.take(MOST_SIDES / 2));
+        self.starts.fill(&self.sides, size);
+        self.join();
+        self.starts.fill(&self.sides, size);
+        self.turn();
+        self.guess();
+        self.choose(placement, inverted);
+        &self.found
+    }
+
+    /// Adds sides that are several segments in one line.
+    fn join(&mut self) {
+        let count = self.sides.len();
+        for index in 0..count {
+            let mut whole = self.sides[index];
+            for _ in 0..3 {
+                let Some(next) = self.continuation(&whole) else { break };
+                if self.sides.len() >= MOST_SIDES {
+                    return;
+                }
+                whole = whole.joined(&self.sides[next]);
+                self.sides.push(whole);
+            }
+        }
+    }
+
+    /// The nearest segment ahead in the same line.
+    fn continuation(&self, side: &Side) -> Option<usize> {
+        if side.length < 8.0 {
+            return None;
+        }
+        let reach = (1.5 * side.length).clamp(8.0, 160.0);
+        let mut best = None;
+        let mut nearest = reach;
+        let mut last_cell = usize::MAX;
+        let mut along = 0.0;
+        while along <= nearest {
+            for aside in [-2.0, 2.0] {
+                let x = side.end[0] + along * side.way[0] - aside * side.way[1];
+                let y = side.end[1] + along * side.way[1] + aside * side.way[0];
+                let Some(cell) = self.starts.cell([x, y]) else { continue };
+                if cell == last_cell {
+                    continue;
+                }
+                last_cell = cell;
+                for other in self.starts.within(cell) {
+                    let gap = side.gap_to(&self.sides[*other as usize]);
+                    if let Some(gap) = gap.filter(|gap| *gap < nearest) {
+                        nearest = gap;
+                        best = Some(*other as usize);
+                    }
+                }
+            }
+            along += 0.5 * CELL_PX;
+        }
+        best
+    }
+
+    /// Finds the corners: where one side ends and another begins with a turn to the right.
+    fn turn(&mut self) {
+        self.corners.clear();
+        self.corners_from.clear();
+        for index in 0..self.sides.len() {
+            let from = self.corners.len();
+            self.corners_from.push(from as u32);
+            if from >= MOST_CORNERS {
+                continue;
+            }
+            let side = self.sides[index];
+            let reach = 3.0 + 0.08 * side.length.min(80.0);
+            for cell in self.starts.around(side.end, reach) {
+                for other in self.starts.within(cell) {
+                    let next = &self.sides[*other as usize];
+                    if let Some((place, gap)) = side.corner_with(next, reach) {
+                        self.corners.push(Corner { next: *other, place, gap });
+                    }
+                }
+            }
+            let these = &mut self.corners[from..];
+            if these.len() > MOST_CORNERS_OF_A_SIDE {
+                these.sort_unstable_by(|a, b| a.gap.total_cmp(&b.gap));
+                self.corners.truncate(from + MOST_CORNERS_OF_A_SIDE);
+            }
+        }
+        self.corners_from.push(self.corners.len() as u32);
+    }
+
+    fn corners_of(&self, side: usize) -> &[Corner] {
+        &self.corners[self.corners_from[side] as usize..self.corners_from[side + 1] as usize]
+    }
+
+    /// Ways round over four, three and two sides.
+    fn guess(&mut self) {
+        let mut guesses = std::mem::take(&mut self.guesses);
+        guesses.clear();
+        for (index, a) in self.sides.iter().enumerate() {
+            for first in self.corners_of(index) {
+                let b = &self.sides[first.next as usize];
+                if guesses.len() >= MOST_GUESSES {
+                    break;
+                }
+                two_sides([a, b], first.place, &mut guesses);
+                for second in self.corners_of(first.next as usize) {
+                    let c = &self.sides[second.next as usize];
+                    if dot(a.way, c.way) > -0.4 {
+                        continue;
+                    }
+                    let places = [first.place, second.place];
+                    three_sides([a, b, c], places, &mut guesses);
+                    for third in self.corners_of(second.next as usize) {
+                        let d = &self.sides[third.next as usize];
+                        let places = [first.place, second.place, third.place];
+                        four_sides([a, b, c, d], places, &mut guesses);
+                    }
+                }
+            }
+        }
+        self.guesses = guesses;
+    }
+
+    /// The best guesses, each place once.
+    fn choose(&mut self, placement: Placement, inverted: bool) {
+        self.guesses.sort_unstable_by(|a, b| b.score.total_cmp(&a.score));
+        let place = |p: [f32; 2]| {
+            let [x, y] = p.map(|v| f64::from(v * placement.scale + placement.offset));
+            Pixel::new(x, y)
+        };
+        let mut kept = 0;
+        for index in 0..self.guesses.len() {
+            let guess = self.guesses[index];
+            if self.guesses[..kept].iter().any(|other| other.is_like(&guess)) {
+                continue;
+            }
+            self.guesses[kept] = guess;
+            kept += 1;
+            let quad = Quad { corners: guess.corners.map(place), inverted };
+            self.found.push(SegmentQuad { quad, seen: guess.seen });
+            if kept == MOST_QUADS {
+                return;
+            }
+        }
+    }
+}
+
+/// Four sides, of which the last corner may be out of sight.
+fn four_sides([a, b, c, d]: [&Side; 4], [ab, bc, cd]: [[f32; 2]; 3], out: &mut Vec<Guess>) {
+    let Some(da) = intersection(d, a) else { return };
+    // How far the two sides are continued beyond what is seen.
+    let beyond_d = dot(minus(da, d.end), d.way);
+    let beyond_a = dot(minus(a.start, da), a.way);
+    let lies_near = |beyond: f32, side: &Side| {
+        beyond > -0.15 * side.length - 3.0 && beyond < 0.8 * side.length + 3.0
+    };
+    if lies_near(beyond_d, d) && lies_near(beyond_a, a) {
+        Guess::add([da, ab, bc, cd], [a, b, c, d], out);
+    }
+}
+
+/// Three sides; the fourth joins their ends, or is parallel to the second.
+fn three_sides(sides: [&Side; 3], [ab, bc]: [[f32; 2]; 2], out: &mut Vec<Guess>) {
+    let [a, b, c] = sides;
+    Guess::add([a.start, ab, bc, c.end], sides, out);
+    let (first, last) = (distance(a.start, ab), distance(bc, c.end));
+    if (first - last).abs() > 0.06 * first.max(last) {
+        let (start, end) = if first > last {
+            (a.start, plus(bc, minus(a.start, ab)))
+        } else {
+            (plus(ab, minus(c.end, bc)), c.end)
+        };
+        Guess::add([start, ab, bc, end], [a, b, c], out);
+    }
+}
+
+/// Two sides, and the other two parallel to them.
+fn two_sides([a, b]: [&Side; 2], ab: [f32; 2], out: &mut Vec<Guess>) {
+    if a.length.min(b.length) < 16.0 {
+        return;
+    }
+    let last = plus(a.start, minus(b.end, ab));
+    Guess::add([a.start, ab, b.end, last], [a, b], out);
+}
+
+impl Guess {
+    /// Adds the quad with these corners if it has a shape a square may have in an image.
+    fn add<const N: usize>(corners: [[f32; 2]; 4], sides: [&Side; N], out: &mut Vec<Self>) {
+        let mut perimeter = 0.0;
+        let (mut shortest, mut longest) = (f32::INFINITY, 0.0_f32);
+        for i in 0..4 {
+            let [p, q, r] = [corners[i], corners[(i + 1) % 4], corners[(i + 2) % 4]];
+            let (way, next) = (minus(q, p), minus(r, q));
+            let length = distance(p, q);
+            // At least 25 degrees of turn at each corner, and to the right.
+            if cross(way, next) < 0.42 * length * distance(q, r) {
+                return;
+            }
+            perimeter += length;
+            shortest = shortest.min(length);
+            longest = longest.max(length);
+        }
+        if shortest < 5.0 || longest > 4.0 * shortest || out.len() >= MOST_GUESSES {
+            return;
+        }
+        let seen: f32 = sides.iter().map(|side| side.seen).sum();
+        let seen = (seen / perimeter).min(1.0);
+        let score = seen * seen * (1.0 + perimeter / 200.0).min(2.0);
+        out.push(Self { corners, seen, score });
+    }
+
+    fn is_like(&self, other: &Self) -> bool {
+        let edge = distance(self.corners[0], self.corners[1]);
+        let near = 0.03 * edge + 0.5;
+        (0..4).any(|turn| {
+            (0..4).all(|i| {
+                let [dx, dy] = minus(self.corners[i], other.corners[(i + turn) % 4]);
+                dx.abs() < near && dy.abs() < near
+            })
+        })
+    }
+}
+
+impl Side {
+    /// A segment walked with the dark side on the right, or the bright one when `inverted`.
+    fn of(segment: &Segment, inverted: bool) -> Option<Self> {
+        let length = segment.length();
+        let (start, end) = (segment.start, segment.end);
+        let (start, end) = if inverted { (end, start) } else { (start, end) };
+        (length > 1.0).then(|| Self::between(start, end, length))
+    }
+
+    fn between(start: [f32; 2], end: [f32; 2], seen: f32) -> Self {
+        let way = minus(end, start);
+        let length = way[0].hypot(way[1]).max(1e-3);
+        Self { start, end, way: way.map(|v| v / length), length, seen }
+    }
+
+    /// The gap between this side's end and the start of one that continues its line.
+    fn gap_to(&self, other: &Self) -> Option<f32> {
+        let to_start = minus(other.start, self.end);
+        let along = dot(to_start, self.way);
+        let to_end = minus(other.end, self.end);
+        let far = dot(to_end, self.way);
+        let aside =
+            |to: [f32; 2], along: f32| cross(self.way, to).abs() <= 0.8 + 0.03 * along.max(0.0);
+        let in_line = along > -2.0
+            && far > along
+            && dot(self.way, other.way) > 0.98
+            && along < 1.5 * (self.length + other.length)
+            && aside(to_start, along)
+            && aside(to_end, far);
+        in_line.then_some(along.max(0.0))
+    }
+
+    /// This side and one that continues it as one: the line through both, by their lengths.
+    fn joined(&self, other: &Self) -> Self {
+        let middle = |side: &Self| mix(side.start, side.end, 0.5);
+        let (a, b) = (middle(self), middle(other));
+        let weight = other.seen / (self.seen + other.seen);
+        let centre = mix(a, b, weight);
+        // Sums of squares along and across, of two rods.
+        let mut xx = 0.0;
+        let mut xy = 0.0;
+        let mut yy = 0.0;
+        for (side, middle) in [(self, a), (other, b)] {
+            let [dx, dy] = minus(middle, centre);
+            let spread = side.seen * side.length * side.length / 12.0;
+            xx += side.seen * dx * dx + spread * side.way[0] * side.way[0];
+            xy += side.seen * dx * dy + spread * side.way[0] * side.way[1];
+            yy += side.seen * dy * dy + spread * side.way[1] * side.way[1];
+        }
+        let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
+        let (dy, dx) = angle.sin_cos();
+        let beside = |p: [f32; 2]| {
+            let along = dot(minus(p, centre), [dx, dy]);
+            [centre[0] + along * dx, centre[1] + along * dy]
+        };
+        Self::between(beside(self.start), beside(other.end), self.seen + other.seen)
+    }
+
+    /// Where this side meets the next one, and how much of the two is missing there.
+    fn corner_with(&self, next: &Self, reach: f32) -> Option<([f32; 2], f32)> {
+        let between = minus(next.start, self.end);
+        if between[0].abs() > 2.0 * reach || between[1].abs() > 2.0 * reach {
+            return None;
+        }
+        if cross(self.way, next.way) < 0.42
+            || self.length > 8.0 * next.length
+            || next.length > 8.0 * self.length
+        {
+            return None;
+        }
+        let place = intersection(self, next)?;
+        let (first, second) = (distance(place, self.end), distance(place, next.start));
+        (first <= reach && second <= reach).then_some((place, first + second))
+    }
+}
+
+/// Sides by the place where they start.
+#[derive(Clone, Debug, Default)]
+struct Grid {
+    columns: usize,
+    rows: usize,
+    from: Vec<u32>,
+    sides: Vec<u32>,
+}
+
+impl Grid {
+    fn fill(&mut self, sides: &[Side], [width, height]: [usize; 2]) {
+        self.columns = width / CELL_PX as usize + 1;
+        self.rows = height / CELL_PX as usize + 1;
+        self.from.clear();
+        self.from.resize(self.columns * self.rows + 1, 0);
+        for side in sides {
+            if let Some(cell) = self.cell(side.start) {
+                self.from[cell] += 1;
+            }
+        }
+        let mut sum = 0;
+        for from in &mut self.from {
+            sum += *from;
+            *from = sum;
+        }
+        self.sides.clear();
+        self.sides.resize(sum as usize, 0);
+        for (index, side) in sides.iter().enumerate() {
+            if let Some(cell) = self.cell(side.start) {
+                self.from[cell] -= 1;
+                self.sides[self.from[cell] as usize] = index as u32;
+            }
+        }
+    }
+
+    fn cell(&self, [x, y]: [f32; 2]) -> Option<usize> {
+        // Written so that a place that is not a number is outside.
+        if !(x >= 0.0 && y >= 0.0) {
+            return None;
+        }
+        let (column, row) = ((x / CELL_PX) as usize, (y / CELL_PX) as usize);
+        (column < self.columns && row < self.rows).then_some(row * self.columns + column)
+    }
+
+    fn within(&self, cell: usize) -> &[u32] {
+        &self.sides[self.from[cell] as usize..self.from[cell + 1] as usize]
+    }
+
+    /// The cells that a square about a place touches.
+    fn around(&self, [x, y]: [f32; 2], reach: f32) -> impl Iterator<Item = usize> + use<> {
+        let range = |v: f32, count: usize| {
+            let last = count.saturating_sub(1);
+            let from = ((v - reach).max(0.0) / CELL_PX) as usize;
+            let to = ((v + reach).max(0.0) / CELL_PX) as usize;
+            from.min(last)..to.min(last) + 1
+        };
+        let (columns, rows) = (range(x, self.columns), range(y, self.rows));
+        let width = self.columns;
+        rows.flat_map(move |row| columns.clone().map(move |column| row * width + column))
+    }
+}
+
+/// Where the lines of two sides meet; `None` when they are parallel.
+fn intersection(a: &Side, b: &Side) -> Option<[f32; 2]> {
+    let sine = cross(a.way, b.way);
+    if sine.abs() < 0.1 {
+        return None;
+    }
+    let along = cross(minus(b.start, a.end), b.way) / sine;
+    Some([a.end[0] + along * a.way[0], a.end[1] + along * a.way[1]])
+}
+
+fn dot(a: [f32; 2], b: [f32; 2]) -> f32 {
+    a[0] * b[0] + a[1] * b[1]
+}
+
+fn cross(a: [f32; 2], b: [f32; 2]) -> f32 {
+    a[0] * b[1] - a[1] * b[0]
+}
+
+fn minus(a: [f32; 2], b: [f32; 2]) -> [f32; 2] {
+    [a[0] - b[0], a[1] - b[1]]
+}
+
+fn plus(a: [f32; 2], b: [f32; 2]) -> [f32; 2] {
+    [a[0] + b[0], a[1] + b[1]]
+}
+
+fn mix(a: [f32; 2], b: [f32; 2], share: f32) -> [f32; 2] {
+    [a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])]
+}
+
+fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {
+    let [dx, dy] = minus(a, b);
+    dx.hypot(dy)
+}

@@ -1,0 +1,450 @@
+//! Straight pieces of edges, from the gradient.
+//!
+//! Where a threshold fails (the edge of a shadow, glare, something in front), edges are still edges, in pieces.
+//! Edge pixels are those of the strongest gradient across the edge; a chain follows them while the gradient keeps
+//! its direction, is cut where it bends, and each part is fitted with a line, to a fraction of a pixel. This is the
+//! way of edge drawing (Topal and Akinlar, 2012), with the direction of the gradient in place of its routing.
+
+use crate::view::GrayView;
+
+/// A straight piece of an edge. Its dark side is on the right of the way from start to end, so the outline of
+/// a dark shape is walked clockwise as seen in the image.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Segment {
+    /// Where it starts, in pixels.
+    pub start: [f32; 2],
+    /// Where it ends, in pixels.
+    pub end: [f32; 2],
+    /// Mean gradient, in grey levels per pixel.
+    pub gradient: f32,
+}
+
+impl Segment {
+    /// Its length in pixels.
+    pub fn length(&self) -> f32 {
+        (self.end[0] - self.start[0]).hypot(self.end[1] - self.start[1])
+    }
+}
+
+/// Which edges are taken.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct LeastEdge {
+    /// At least this gradient, in grey levels per pixel.
+    pub gradient: u8,
+    /// At least this length, in pixels.
+    pub length_px: f32,
+}
+
+/// No chain is longer than this many pixels; what goes on is the next chain.
+const LONGEST_CHAIN: usize = 1024;
+
+/// A chain is cut where it leaves the straight line by more than this many pixels.
+const STRAIGHT_PX: f32 = 0.8;
+
+/// Finds segments. It keeps its memory from image to image.
+#[derive(Clone, Debug, Default)]
+pub struct Segments {
+    width: usize,
+    height: usize,
+    /// Twice the gradient in the middle of four pixels, whose top left one is at the same index.
+    across: Vec<i16>,
+    down: Vec<i16>,
+    /// Sum of the two gradients' sizes, of three rows.
+    strengths: [Vec<i16>; 3],
+    /// Not nought where the gradient is the strongest across the edge, and no chain was yet; then as
+    /// [`strongest`] writes it.
+    edges: Vec<u8>,
+    /// Not nought where an edge goes on to both sides.
+    seeds: Vec<u8>,
+    /// Indices of the pixels of a chain, then their places and strengths.
+    chain: Vec<u32>,
+    places: Vec<[f32; 3]>,
+    parts: Vec<[usize; 2]>,
+    found: Vec<Segment>,
+}
+
+impl Segments {
+    /// The segments in an image, in no order.
+    pub fn find(&mut self, view: GrayView<'_>, least: LeastEdge) -> &[Segment] {
+        self.found.clear();
+        if view.width() < 4 || view.height() < 4 {
+            return &self.found;
+        }
+        (self.width, self.height) = (view.width(), view.height());
+        self.measure(view);
+        self.thin(least);
+        self.sow();
+        for start in 0..self.seeds.len() / 8 {
+            let eight = &self.seeds[8 * start..][..8];
+            if eight == [0; 8] {
+                continue;
+            }
+            for seed in 8 * start..8 * start + 8 {
+                if self.seeds[seed] != 0 && self.edges[seed] != 0 {
+                    self.follow(seed);
+                    self.cut(least);
+                }
+            }
+        }
+        &self.found
+    }
+
+    fn measure(&mut self, view: GrayView<'_>) {
+        let (width, height) = (self.width, self.height);
+        self.across.resize(width * height, 0);
+        self.down.resize(width * height, 0);
+        for y in 0..height - 1 {
+            let (above, below) = (view.row(y), view.row(y + 1));
+            let across = &mut self.across[y * width..][..width - 1];
+            let down = &mut self.down[y * width..][..width - 1];
+            gradients(above, below, across, down);
+        }
+    }
+
+    fn thin(&mut self, least: LeastEdge) {
+        let (width, height) = (self.width, self.height);
+        self.edges.clear();
+        self.edges.resize(width * height, 0);
+        for row in &mut self.strengths {
+            row.resize(width, 0);
+        }
+        let least = 2 * i16::from(least.gradient);
+        for y in 0..height - 1 {
+            self.strengths.rotate_left(1);
+            let (across, down) =
+                (&self.across[y * width..][..width], &self.down[y * width..][..width]);
+            let [above, here, below] = &mut self.strengths;
+            strengths(across, down, below);
+            if y < 2 {
+                continue;
+            }
+            let start = (y - 1) * width;
+            strongest(
+                [&self.across[start..][..width], &self.down[start..][..width]],
+                [above, here, below],
+                least,
+                &mut self.edges[start..][..width],
+            );
+        }
+    }
+
+    /// Marks where chains may begin: texture has many edge pixels, but few that go on to both sides.
+    fn sow(&mut self) {
+        let (width, height) = (self.width, self.height);
+        // The last pixels up to a multiple of eight are never seeds.
+        self.seeds.clear();
+        self.seeds.resize((width * height).next_multiple_of(8), 0);
+        for y in 1..height - 1 {
+            let row = |y: usize| &self.edges[y * width..][..width];
+            let out = &mut self.seeds[y * width..][..width];
+            continued([row(y - 1), row(y), row(y + 1)], out);
+        }
+    }
+
+    /// Puts the chain through `seed` into `self.chain`, the dark side on its right.
+    fn follow(&mut self, seed: usize) {
+        self.chain.clear();
+        self.walk(seed, false);
+        self.chain.reverse();
+        self.chain.push(seed as u32);
+        self.walk(seed, true);
+        self.edges[seed] = 0;
+    }
+
+    /// Goes on from `seed` over edge pixels whose gradients have the seed's direction.
+    fn walk(&mut self, seed: usize, forward: bool) {
+        let turn = if forward { 0 } else { 4 };
+        let ahead = AHEAD[usize::from(self.edges[seed] >> 4)].map(|octant| {
+            let [dx, dy] = NEIGHBOURS[(octant + turn) % 8];
+            dy * self.width as isize + dx
+        });
+        let direction = self.edges[seed];
+        let mut at = seed;
+        while self.chain.len() < LONGEST_CHAIN {
+            let next = ahead.iter().find_map(|step| {
+                // An edge pixel is never in the outermost rows or columns.
+                let next = at.wrapping_add_signed(*step);
+                let edge = self.edges[next];
+                is_like(direction, edge).then_some(next)
+            });
+            let Some(next) = next else { return };
+            self.edges[next] = 0;
+            self.chain.push(next as u32);
+            at = next;
+        }
+    }
+
+    /// Where the gradient along its own axis is strongest about an edge pixel, and how strong it is there.
+    fn place(&self, at: usize) -> [f32; 3] {
+        let (y, x) = (at / self.width, at % self.width);
+        let strength = |at: usize| {
+            f32::from(self.across[at].saturating_abs()) + f32::from(self.down[at].saturating_abs())
+        };
+        let sideways = self.across[at].saturating_abs() > self.down[at].saturating_abs();
+        let step = if sideways { 1 } else { self.width };
+        let (before, here, after) = (strength(at - step), strength(at), strength(at + step));
+        let bend = before - 2.0 * here + after;
+        let shift = if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-0.5, 0.5) } else { 0.0 };
+        let (x, y) = (x as f32 + 0.5, y as f32 + 0.5);
+        if sideways { [x + shift, y, here] } else { [x, y + shift, here] }
+    }
+
+    /// Cuts the chain into straight parts and keeps those that are long enough.
+    fn cut(&mut self, least: LeastEdge) {
+        // Diagonally a chain is longer than its pixels are many.
+        if (self.chain.len() as f32) * std::f32::consts::SQRT_2 < least.length_px {
+            return;
+        }
+        self.places.clear();
+        for index in 0..self.chain.len() {
+            let place = self.place(self.chain[index] as usize);
+            self.places.push(place);
+        }
+        self.parts.clear();
+        self.parts.push([0, self.places.len()]);
+        while let Some([from, to]) = self.parts.pop() {
+            let chain = &self.places[from..to];
+            let (Some(first), Some(last)) = (chain.first(), chain.last()) else { continue };
+            let length = (last[0] - first[0]).hypot(last[1] - first[1]);
+            if length + 1.0 < least.length_px {
+                continue;
+            }
+            let [dx, dy] = [(last[0] - first[0]) / length, (last[1] - first[1]) / length];
+            let (farthest, distance) = chain
+                .iter()
+                .map(|p| ((p[0] - first[0]) * dy - (p[1] - first[1]) * dx).abs())
+                .enumerate()
+                .fold((0, 0.0), |most, here| if here.1 > most.1 { here } else { most });
+            if distance > STRAIGHT_PX {
+                self.parts.push([from, from + farthest]);
+                self.parts.push([from + farthest, to]);
+            } else {
+                self.found.extend(fit(chain).filter(|s| s.length() >= least.length_px));
+            }
+        }
+    }
+}
+
+/// The eight neighbours, clockwise as seen in the image from the right one.
+const NEIGHBOURS: [[isize; 2]; 8] =
+    [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]];
+
+/// An edge pixel. Its upper four bits are the direction of its gradient, in sixteenths of a turn, clockwise as seen in
+/// the image from the right; so differences of directions go round as bytes do.
+const EDGE: u8 = 1;
+
+/// Whether a pixel is an edge whose direction differs by no more than a sixteenth of a turn.
+fn is_like(direction: u8, other: u8) -> bool {
+    (other.wrapping_sub(direction).wrapping_add(16) <= 32) & (other != 0)
+}
+
+/// For each direction of a gradient the neighbours its edge goes on to, likeliest first, so that the dark side is on
+/// the right.
+static AHEAD: [[usize; 3]; 16] = ahead();
+
+const fn ahead() -> [[usize; 3]; 16] {
+    let mut ahead = [[0; 3]; 16];
+    let mut direction = 0;
+    while direction < 16 {
+        let edge: usize = (direction + 4) % 16;
+        let nearest = edge.div_ceil(2);
+        let (second, third) = if edge.is_multiple_of(2) { (1, 7) } else { (7, 1) };
+        ahead[direction] = [nearest % 8, (nearest + second) % 8, (nearest + third) % 8];
+        direction += 1;
+    }
+    ahead
+}
+
+/// Twice the gradients in the middle of each two by two pixels.
+fn gradients(above: &[u8], below: &[u8], across: &mut [i16], down: &mut [i16]) {
+    let above = above.iter().zip(&above[1..]);
+    let below = below.iter().zip(&below[1..]);
+    for (((a, b), (c, d)), (across, down)) in
+        above.zip(below).zip(across.iter_mut().zip(down.iter_mut()))
+    {
+        let [a, b, c, d] = [*a, *b, *c, *d].map(i16::from);
+        let (falling, rising) = (d - a, b - c);
+        *across = falling + rising;
+        *down = falling - rising;
+    }
+}
+
+fn strengths(across: &[i16], down: &[i16], out: &mut [i16]) {
+    for ((out, across), down) in out.iter_mut().zip(across).zip(down) {
+        *out = across.wrapping_abs() + down.wrapping_abs();
+    }
+}
+
+/// Marks where the strength is at least `least` and the largest along the axis the gradient is nearest to, and
+/// writes the gradient's direction, as [`EDGE`] says.
+fn strongest(
+    [across, down]: [&[i16]; 2],
+    [above, here, below]: [&[i16]; 3],
+    least: i16,
+    out: &mut [u8],
+) {
+    let inner = out.len().saturating_sub(2);
+    // Slices of one length, so that no bound is checked within the loop.
+    let (left, right) = (&here[..inner], &here[2..][..inner]);
+    let (above, here, below) = (&above[1..][..inner], &here[1..][..inner], &below[1..][..inner]);
+    let (across, down) = (&across[1..][..inner], &down[1..][..inner]);
+    let out = &mut out[1..][..inner];
+    for x in 0..inner {
+        let (ax, ay) = (across[x].wrapping_abs(), down[x].wrapping_abs());
+        let sideways = ax > ay;
+        let along_row = (here[x] > left[x]) & (here[x] >= right[x]);
+        let along_column = (here[x] > above[x]) & (here[x] >= below[x]);
+        let most = (here[x] >= least) & ((sideways & along_row) | (!sideways & along_column));
+        // More than 22.5 degrees from the nearer axis: its tangent is nearly 5 / 12.
+        let oblique = 12 * ax.min(ay) > 5 * ax.max(ay);
+        // The sixteenth within the quarter of both signs positive, then mirrored into the others.
+        let direction = i16::from(oblique)
+            ^ (3 & -i16::from(!sideways))
+            ^ (7 & -i16::from(across[x] < 0))
+            ^ (15 & -i16::from(down[x] < 0));
+        out[x] = ((direction << 4 | i16::from(EDGE)) & -i16::from(most)) as u8;
+    }
+}
+
+/// Marks the edge pixels of the middle row that have two neighbours of like direction or more.
+fn continued([above, here, below]: [&[u8]; 3], out: &mut [u8]) {
+    let inner = out.len().saturating_sub(2);
+    let around = [
+        &above[..inner],
+        &above[1..][..inner],
+        &above[2..][..inner],
+        &here[..inner],
+        &here[2..][..inner],
+        &below[..inner],
+        &below[1..][..inner],
+        &below[2..][..inner],
+    ];
+    let here = &here[1..][..inner];
+    let out = &mut out[1..][..inner];
+    for x in 0..inner {
+        let mut like = 0;
+        for row in around {
+            like += u8::from(is_like(here[x], row[x]));
+        }
+        out[x] = u8::from((like >= 2) & (here[x] != 0));
+    }
+}
+
+/// The line of least squares through a chain, from beside its first to beside its last point.
+fn fit(chain: &[[f32; 3]]) -> Option<Segment> {
+    let (first, last) = (chain.first()?, chain.last()?);
+    let count = chain.len() as f32;
+    let mut sums = [0.0_f32; 6];
+    for [x, y, strength] in chain {
+        let (x, y) = (x - first[0], y - first[1]);
+        for (sum, term) in sums.iter_mut().zip([x, y, x * x, x * y, y * y, *strength]) {
+            *sum += term;
+        }
+    }
+    let [x, y, xx, xy, yy, strength] = sums.map(|sum| sum / count);
+    let (xx, xy, yy) = (xx - x * x, xy - x * y, yy - y * y);
+    let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
+    let (dy, dx) = angle.sin_cos();
+    let middle = [first[0] + x, first[1] + y];
+    let beside = |p: &[f32; 3]| {
+        let along = (p[0] - middle[0]) * dx + (p[1] - middle[1]) * dy;
+        [middle[0] + along * dx, middle[1] + along * dy]
+    };
+    Some(Segment { start: beside(first), end: beside(last), gradient: 0.5 * strength })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::view::GrayImage;
+
+    const LEAST: LeastEdge = LeastEdge { gradient: 6, length_px: 5.0 };
+
+    /// A dark square, turned by `angle`, on bright ground; each pixel has the mean of 16 places.
+    fn square(angle: f32, centre: [f32; 2], half: f32) -> GrayImage {
+        let mut image = GrayImage::filled(120, 100, 0);
+        let (sin, cos) = angle.sin_cos();
+        for y in 0..100 {
+            for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                let dark = (0..16).filter(|i| {
+                    let dx = x as f32 - 0.375 + 0.25 * (i % 4) as f32 - centre[0];
+                    let dy = y as f32 - 0.375 + 0.25 * (i / 4) as f32 - centre[1];
+                    (dx * cos + dy * sin).abs().max((dy * cos - dx * sin).abs()) < half
+                });
+                *pixel = 200 - 10 * dark.count() as u8;
+            }
+        }
+        image
+    }
+
+    #[test]
+    fn the_sides_of_a_square_are_walked_clockwise_and_lie_where_they_are() {
+        let centre = [60.3, 49.8];
+        for step in 0..40 {
+            let angle = 0.04 * step as f32;
+            let image = square(angle, centre, 30.0);
+            let mut segments = Segments::default();
+            let found = segments.find(image.view().unwrap(), LEAST);
+            let mut seen = [0.0; 4];
+            for segment in found {
+                // From the centre to the segment is the side's outward normal.
+                let mut sides = [0.0; 2];
+                for (side, [x, y]) in sides.iter_mut().zip([segment.start, segment.end]) {
+                    let (dx, dy) = (x - centre[0], y - centre[1]);
+                    let way = segment.length();
+                    let across =
+                        [segment.end[1] - segment.start[1], segment.start[0] - segment.end[0]];
+                    *side = (dx * across[0] + dy * across[1]) / way;
+                }
+                for side in sides {
+                    assert!((side - 30.0).abs() < 0.5, "{angle}: {side} in {segment:?}");
+                }
+                let way =
+                    (segment.end[1] - segment.start[1]).atan2(segment.end[0] - segment.start[0]);
+                let quarter = (way - angle) / std::f32::consts::FRAC_PI_2;
+                seen[(quarter.round() as i32).rem_euclid(4) as usize] += segment.length();
+            }
+            for length in seen {
+                assert!((48.0..=60.5).contains(&length), "{angle}: {seen:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn images_without_edges_or_with_nothing_else_are_survived() {
+        let mut segments = Segments::default();
+        let mut random = 1_u32;
+        for (width, height) in [(1, 1), (3, 9), (4, 4), (5, 64), (64, 5), (97, 61), (33, 2)] {
+            let mut image = GrayImage::filled(width, height, 128);
+            assert!(segments.find(image.view().unwrap(), LEAST).is_empty());
+            for pattern in 0..4 {
+                for (i, pixel) in image.pixels_mut().iter_mut().enumerate() {
+                    random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                    *pixel = match pattern {
+                        0 => (random >> 24) as u8,
+                        1 => 255 * ((i % width + i / width) % 2) as u8,
+                        2 => 255 * (i % width / 2 % 2) as u8,
+                        _ => 255 * (i / width / 3 % 2) as u8,
+                    };
+                }
+                for segment in segments.find(image.view().unwrap(), LEAST) {
+                    assert!(segment.start.iter().chain(&segment.end).all(|v| v.is_finite()));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_circle_has_no_long_segment() {
+        let mut image = GrayImage::filled(200, 200, 0);
+        for y in 0..200 {
+            for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                let beyond = (x as f32 - 99.5).hypot(y as f32 - 99.5) - 80.0;
+                *pixel = (20.0 + 180.0 * (beyond + 0.5).clamp(0.0, 1.0)) as u8;
+            }
+        }
+        let mut segments = Segments::default();
+        let found = segments.find(image.view().unwrap(), LEAST);
+        assert!(found.iter().all(|segment| segment.length() < 35.0));
+    }
+}
