@@ -8,7 +8,7 @@ use messages::{ControllerCommand, DetectorCommand, topic};
 use node::{ConfigError, Identity, Layers, Node, ZenohSource};
 
 use crate::services::{self, Service};
-use crate::{detect, land, marker};
+use crate::{detect, experiment, land, marker};
 
 /// Exit status for a command line or a configuration that asks for something impossible.
 const WRONG_USE: u8 = 2;
@@ -42,6 +42,8 @@ enum Command {
     Detect(detect::DetectArgs),
     /// Make a marker to print.
     Marker(marker::MarkerArgs),
+    /// Run the thesis' experiments again.
+    Experiment(experiment::ExperimentArgs),
     /// Print the effective configuration of a service, or of all.
     Config(ConfigArgs),
     /// Tell a running controller what to do, or change a parameter of a running detector.
@@ -167,6 +169,7 @@ pub(crate) fn run() -> ExitCode {
         Command::Simulator(args) => services::run(Service::Simulator, &args),
         Command::Detect(args) => detect::run(&args),
         Command::Marker(args) => marker::run(&args),
+        Command::Experiment(args) => experiment::run(args),
         Command::Config(args) => print_config(args),
         Command::Command(args) => send_command(args),
     };

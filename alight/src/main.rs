@@ -2,11 +2,12 @@
 //!
 //! Modules in reading order: [`cli`] is what can be asked, [`services`] runs one service in this process, [`land`]
 //! runs them all as processes and watches the landing, with [`children`] for the processes, [`progress`] for what is
-//! shown meanwhile and [`outcome`] for the result; [`detect`] and [`marker`] are tools.
+//! shown meanwhile and [`outcome`] for the result; [`detect`], [`marker`] and [`experiment`] are tools.
 
 mod children;
 mod cli;
 mod detect;
+mod experiment;
 mod land;
 mod marker;
 mod outcome;

@@ -5,8 +5,9 @@
 //!
 //! Modules in reading order: [`shot`] takes one frame, through a [`veil`]; [`sets`] says which frames there are;
 //! [`store`] keeps them on disk; [`record`] is what a detector answers; [`score`] how good that is; [`photographs`] asks
-//! real pictures; [`report`] writes it down; [`markers`] does all of it.
+//! real pictures; [`report`] writes it down, [`tables`] and [`figures`] as the [`thesis`] did; [`markers`] does all of it.
 
+pub mod figures;
 pub mod markers;
 pub mod photographs;
 pub mod record;
@@ -15,4 +16,6 @@ pub mod score;
 pub mod sets;
 pub mod shot;
 pub mod store;
+pub mod tables;
+pub mod thesis;
 pub mod veil;

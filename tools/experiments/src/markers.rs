@@ -6,12 +6,14 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use fiducial::{Family, Marker};
 
+use crate::figures::{self, FIGURES};
 use crate::photographs;
 use crate::record::{self, OURS, Record};
 use crate::report;
 use crate::sets::{MARKERS, SIZE_M, Set};
 use crate::shot::Studio;
 use crate::store;
+use crate::tables;
 
 /// What to do.
 #[derive(Clone, Debug)]
@@ -37,6 +39,8 @@ const TIMED_RUNS: usize = 5;
 /// When a file cannot be read or written.
 pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<String> {
     let Request { sets_in, results_in, .. } = request;
+    std::fs::create_dir_all(results_in)
+        .with_context(|| format!("making {}", results_in.display()))?;
     let mut studio = Studio::default();
     let mut extra = String::new();
     for set in &request.sets {
@@ -61,7 +65,16 @@ pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<
         extra = ask_photographs(folder, results_in)?;
     }
     let runs = report::runs(sets_in, results_in)?;
-    let text = report::text(&runs) + &extra;
+    let mut text = report::text(&runs) + &extra;
+    for table in tables::all(&runs) {
+        text.push_str(&format!("\n{}", table.markdown));
+        std::fs::write(results_in.join(format!("{}.csv", table.name)), table.csv)?;
+    }
+    for (name, binning) in FIGURES {
+        if let Some(svg) = figures::svg(&runs, binning)? {
+            std::fs::write(results_in.join(format!("{name}.svg")), svg)?;
+        }
+    }
     std::fs::write(results_in.join("report.md"), &text)?;
     std::fs::write(results_in.join("scores.jsonl"), report::json_lines(&runs)?)?;
     Ok(text)

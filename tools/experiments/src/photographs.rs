@@ -164,15 +164,15 @@ pub fn families_for_negatives() -> [(&'static str, Vec<Family>); 2] {
     [("experiment", thesis.collect()), ("all", all.collect())]
 }
 
+/// Images, and what was found in those where something was.
+pub type Negatives = (usize, Vec<(String, Vec<Found>)>);
+
 /// False detections in the photographs without a marker: whole, in quarters and in ninths, each at full resolution.
 /// Returns how many images there were, and the false detections by image.
 ///
 /// # Errors
 /// When a photograph or the labels cannot be read.
-pub fn negatives(
-    folder: &Path,
-    families: &[Family],
-) -> anyhow::Result<(usize, Vec<(String, Vec<Found>)>)> {
+pub fn negatives(folder: &Path, families: &[Family]) -> anyhow::Result<Negatives> {
     let markers: Vec<Marker> = families.iter().map(|family| any_of(*family)).collect();
     let mut detector = Detector::new(&markers, Settings::default())?;
     let (mut images, mut wrong) = (0, Vec::new());

@@ -1,0 +1,145 @@
+//! Figures 4.7 and 4.8 of the thesis again: the mean estimated distance at each position for every marker.
+
+use anyhow::anyhow;
+use plotters::coord::Shift;
+use plotters::prelude::*;
+
+use crate::record::OURS;
+use crate::report::Run;
+use crate::score::mean;
+use crate::sets::Set;
+use crate::tables::positions;
+use crate::thesis::TABLES;
+
+/// The figures and their binnings.
+pub const FIGURES: [(&str, &str); 2] = [("figure-4-7", "2x2"), ("figure-4-8", "4x4")];
+
+const COLOURS: [RGBColor; 6] = [
+    RGBColor(31, 119, 180),
+    RGBColor(214, 39, 40),
+    RGBColor(44, 160, 44),
+    RGBColor(148, 103, 189),
+    RGBColor(255, 127, 14),
+    RGBColor(23, 190, 207),
+];
+
+/// One curve: name, and the mean error at each position in metres.
+type Curve = (String, Vec<Option<f64>>);
+
+/// The figure of a binning as SVG; `None` when no marker was looked for at the positions.
+///
+/// Above the estimated distances, below their errors on a scale that shows them, with the thesis' beside.
+///
+/// # Errors
+/// When it cannot be drawn.
+pub fn svg(runs: &[Run], binning: &str) -> anyhow::Result<Option<String>> {
+    let of_set = |run: &&Run| run.set == Set::Positions && run.detector == OURS;
+    let ours: Vec<&Run> = runs.iter().filter(of_set).collect();
+    let Some(first) = ours.first() else { return Ok(None) };
+    let truth: Vec<(u32, f64)> =
+        positions(first, binning).iter().map(|position| (position.x_m, position.y_m)).collect();
+    let curves: Vec<Curve> = ours
+        .iter()
+        .map(|run| {
+            let errors = positions(run, binning).into_iter().map(|position| {
+                let along: Vec<f64> = position.errors_m.iter().map(|error| error[0]).collect();
+                position.is_complete().then(|| mean(&along)).flatten()
+            });
+            (run.family.clone(), errors.collect())
+        })
+        .collect();
+    let thesis: Vec<Curve> = TABLES
+        .iter()
+        .filter(|table| table.binning == binning)
+        .map(|table| {
+            let errors = truth.iter().map(|(x, y)| {
+                let is_there = |row: &&crate::thesis::Row| {
+                    row.0 == *x && f64::from(row.1).total_cmp(&0.0) == y.total_cmp(&0.0)
+                };
+                table.rows.iter().find(is_there).map(|row| row.2[0])
+            });
+            (format!("{} (thesis)", table.family), errors.collect())
+        })
+        .collect();
+    let mut svg = String::new();
+    {
+        let area = SVGBackend::with_string(&mut svg, (1000, 900)).into_drawing_area();
+        draw(&area, binning, &truth, (&curves, &thesis)).map_err(|problem| anyhow!("{problem}"))?;
+    }
+    Ok(Some(svg))
+}
+
+fn draw(
+    area: &DrawingArea<SVGBackend<'_>, Shift>,
+    binning: &str,
+    truth: &[(u32, f64)],
+    (ours, thesis): (&[Curve], &[Curve]),
+) -> Result<(), Box<dyn std::error::Error>> {
+    area.fill(&WHITE)?;
+    let (upper, lower) = area.split_vertically(500);
+    let last = truth.len() as f64;
+    let title = format!("Mean estimated distance at each position, {binning} binning");
+    let mut chart = ChartBuilder::on(&upper)
+        .caption(title, ("sans-serif", 20))
+        .margin(10)
+        .x_label_area_size(40)
+        .y_label_area_size(60)
+        .build_cartesian_2d(0.0..last + 1.0, 0.0..15.0)?;
+    chart.configure_mesh().x_desc("position (Table 4.1)").y_desc("distance, m").draw()?;
+    let line = truth.iter().enumerate().map(|(i, (x, _))| (i as f64 + 1.0, f64::from(*x)));
+    chart
+        .draw_series(LineSeries::new(line, BLACK.stroke_width(1)))?
+        .label("truth")
+        .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], BLACK));
+    for (index, (name, errors)) in ours.iter().chain(thesis).enumerate() {
+        let colour = COLOURS[index % COLOURS.len()];
+        let is_thesis = index >= ours.len();
+        let points =
+            truth.iter().zip(errors).enumerate().filter_map(|(i, ((x, _), error))| {
+                Some((i as f64 + 1.0, f64::from(*x) + (*error)?))
+            });
+        if is_thesis {
+            chart
+                .draw_series(points.map(|place| Cross::new(place, 3, colour.mix(0.7))))?
+                .label(name)
+                .legend(move |(x, y)| Cross::new((x + 8, y), 3, colour.mix(0.7)));
+        } else {
+            chart
+                .draw_series(points.map(|place| Circle::new(place, 3, colour)))?
+                .label(name)
+                .legend(move |(x, y)| Circle::new((x + 8, y), 3, colour));
+        }
+    }
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::UpperLeft)
+        .background_style(WHITE.mix(0.8))
+        .border_style(BLACK)
+        .draw()?;
+    draw_errors(&lower, truth.len(), ours)
+}
+
+fn draw_errors(
+    area: &DrawingArea<SVGBackend<'_>, Shift>,
+    count: usize,
+    ours: &[Curve],
+) -> Result<(), Box<dyn std::error::Error>> {
+    let errors_mm = || ours.iter().flat_map(|(_, errors)| errors.iter().flatten().map(|e| 1e3 * e));
+    let most = errors_mm().fold(1.0, |most: f64, error| most.max(error.abs())) * 1.1;
+    let mut chart = ChartBuilder::on(area)
+        .caption("Errors of this detector", ("sans-serif", 16))
+        .margin(10)
+        .x_label_area_size(40)
+        .y_label_area_size(60)
+        .build_cartesian_2d(0.0..count as f64 + 1.0, -most..most)?;
+    chart.configure_mesh().x_desc("position (Table 4.1)").y_desc("mean error, mm").draw()?;
+    for (index, (_, errors)) in ours.iter().enumerate() {
+        let colour = COLOURS[index % COLOURS.len()];
+        let points = errors
+            .iter()
+            .enumerate()
+            .filter_map(|(i, error)| Some((i as f64 + 1.0, 1e3 * (*error)?)));
+        chart.draw_series(points.map(|place| Circle::new(place, 3, colour)))?;
+    }
+    Ok(())
+}
