@@ -221,7 +221,7 @@ impl Grid {
 
     fn index(&self, cell: [i8; 2]) -> Option<usize> {
         let [column, row] = cell.map(|v| usize::try_from(v + self.margin).unwrap_or(usize::MAX));
-        (column < self.across && row < self.across).then_some(row * self.across + column)
+        (column < self.across && row < self.across).then(|| row * self.across + column)
     }
 
     /// The light by which border and paper look as they do.

@@ -429,7 +429,7 @@ impl Grid {
             return None;
         }
         let (column, row) = ((x / CELL_PX) as usize, (y / CELL_PX) as usize);
-        (column < self.columns && row < self.rows).then_some(row * self.columns + column)
+        (column < self.columns && row < self.rows).then(|| row * self.columns + column)
     }
 
     fn within(&self, cell: usize) -> &[u32] {
