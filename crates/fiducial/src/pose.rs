@@ -217,9 +217,9 @@ impl Plane<'_> {
         });
         let mut matrix = SMatrix::<f64, 8, 8>::zeros();
         let mut right = SVector::<f64, 8>::zeros();
-        let first = self.camera.unproject(self.points.first()?.seen);
+        let first = self.camera.sight(self.points.first()?.seen)?;
         for point in self.points {
-            let ray = self.camera.unproject(point.seen);
+            let ray = self.camera.sight(point.seen)?;
             // About a point nearby: small numbers keep the equations well conditioned.
             let (u, v) = (ray.x() - first.x(), ray.y() - first.y());
             let (x, y) =
@@ -246,7 +246,7 @@ impl Plane<'_> {
         let mut matrix = Matrix3::zeros();
         let mut right = Vector3::zeros();
         for point in self.points {
-            let ray = self.camera.unproject(point.seen).coords;
+            let ray = self.camera.sight(point.seen)?.coords;
             let arm = rotation * Vector3::new(point.place_m[0], point.place_m[1], 0.0);
             for (axis, along) in [(0, ray.x), (1, ray.y)] {
                 let mut row = Vector3::zeros();

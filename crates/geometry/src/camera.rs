@@ -58,9 +58,10 @@ pub struct CameraModel {
     pub distortion: Distortion,
 }
 
-/// Iterations of the fixed-point inversion of a distortion; each gains about a digit for usual lenses.
-const UNDISTORT_ITERATIONS: usize = 30;
-
+/// Steps of Newton's method by which a distortion is undone; usual lenses take four.
+const UNDISTORT_STEPS: usize = 20;
+/// Error that is left, in focal lengths: less than a hundred thousandth of a pixel.
+const UNDISTORT_ERROR: f64 = 1e-10;
 /// Angle off axis, in radians, at which directions with z = 1 end (just under 90 degrees).
 const WIDEST_ANGLE: f64 = 1.57;
 
@@ -79,12 +80,17 @@ impl CameraModel {
     }
 
     /// The pixel at which a point appears; `None` for a point behind the camera or beyond what the lens model
-    /// describes. The pixel may lie outside the image.
+    /// describes: further off axis than where its pixels turn back towards the middle. The pixel may lie outside the
+    /// image.
     pub fn project(&self, point: Point<Camera>) -> Option<Pixel> {
         if !point.is_finite() || point.z() <= 1e-9 {
             return None;
         }
-        let (u, v) = self.distort(point.x() / point.z(), point.y() / point.z());
+        let (x, y) = (point.x() / point.z(), point.y() / point.z());
+        if !self.distortion.describes(x, y) {
+            return None;
+        }
+        let (u, v) = self.distortion.distort(x, y);
         Some(Pixel::new(self.fx * u + self.cx, self.fy * v + self.cy))
     }
 
@@ -94,15 +100,34 @@ impl CameraModel {
         let (x, y) = (point.x() / point.z(), point.y() / point.z());
         let ideal = Matrix2x3::new(1.0, 0.0, -x, 0.0, 1.0, -y) / point.z();
         let focal = Matrix2::new(self.fx, 0.0, 0.0, self.fy);
-        let jacobian = focal * self.distortion_jacobian(x, y) * ideal;
+        let jacobian = focal * self.distortion.jacobian(x, y) * ideal;
         jacobian.iter().all(|j| j.is_finite()).then_some((pixel, jacobian))
     }
 
-    /// The direction in which a pixel looks, with z = 1. A fisheye's pixels beyond 90 degrees off axis, which no
-    /// such direction reaches, give the widest one.
+    /// The direction in which a pixel looks, with z = 1; `None` where no direction in front of the camera that the
+    /// lens model describes gives this pixel, and for a fisheye's pixels from 90 degrees off axis on.
+    pub fn sight(&self, pixel: Pixel) -> Option<Vector<Camera>> {
+        let (u, v) = ((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
+        let (x, y) = self.distortion.undistort(u, v)?;
+        Some(Vector::new(x, y, 1.0))
+    }
+
+    /// As [`CameraModel::sight`]; where there is none, the outermost direction on the way to the pixel.
     pub fn unproject(&self, pixel: Pixel) -> Vector<Camera> {
-        let (x, y) = self.undistort((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
-        Vector::new(x, y, 1.0)
+        if let Some(sight) = self.sight(pixel) {
+            return sight;
+        }
+        let mut outermost = Vector::new(0.0, 0.0, 1.0);
+        let (mut within, mut beyond) = (0.0, 1.0);
+        for _ in 0..24 {
+            let share = (within + beyond) / 2.0;
+            let between = |middle: f64, end: f64| middle + (end - middle) * share;
+            match self.sight(Pixel::new(between(self.cx, pixel.x), between(self.cy, pixel.y))) {
+                Some(sight) => (within, outermost) = (share, sight),
+                None => beyond = share,
+            }
+        }
+        outermost
     }
 
     /// True when a pixel lies within the image's outer pixel borders.
@@ -112,16 +137,18 @@ impl CameraModel {
             && pixel.x <= f64::from(self.width) - 0.5
             && pixel.y <= f64::from(self.height) - 0.5
     }
+}
 
+impl Distortion {
     /// From ideal to distorted normalised coordinates.
     fn distort(&self, x: f64, y: f64) -> (f64, f64) {
-        match self.distortion {
-            Distortion::None => (x, y),
-            Distortion::BrownConrady(k) => {
+        match *self {
+            Self::None => (x, y),
+            Self::BrownConrady(k) => {
                 let (radial, dx, dy) = brown_conrady(&k, x, y);
                 (x * radial + dx, y * radial + dy)
             }
-            Distortion::KannalaBrandt(k) => {
+            Self::KannalaBrandt(k) => {
                 let r = x.hypot(y);
                 if r < 1e-12 {
                     return (x, y);
@@ -133,10 +160,10 @@ impl CameraModel {
     }
 
     /// Derivative of the distorted by the ideal normalised coordinates.
-    fn distortion_jacobian(&self, x: f64, y: f64) -> Matrix2<f64> {
-        match self.distortion {
-            Distortion::None => Matrix2::identity(),
-            Distortion::BrownConrady(k) => {
+    fn jacobian(&self, x: f64, y: f64) -> Matrix2<f64> {
+        match *self {
+            Self::None => Matrix2::identity(),
+            Self::BrownConrady(k) => {
                 let [k1, k2, p1, p2, k3, k4, k5, k6] = k;
                 let r2 = x * x + y * y;
                 let above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
@@ -154,7 +181,7 @@ impl CameraModel {
                     radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
                 )
             }
-            Distortion::KannalaBrandt(k) => {
+            Self::KannalaBrandt(k) => {
                 let r = x.hypot(y);
                 if r < 1e-9 {
                     return Matrix2::identity();
@@ -173,29 +200,66 @@ impl CameraModel {
         }
     }
 
-    /// From distorted to ideal normalised coordinates.
-    fn undistort(&self, u: f64, v: f64) -> (f64, f64) {
-        match self.distortion {
-            Distortion::None => (u, v),
-            Distortion::BrownConrady(k) => {
-                let (mut x, mut y) = (u, v);
-                for _ in 0..UNDISTORT_ITERATIONS {
-                    let (radial, dx, dy) = brown_conrady(&k, x, y);
-                    (x, y) = ((u - dx) / radial, (v - dy) / radial);
-                }
-                (x, y)
-            }
-            Distortion::KannalaBrandt(k) => {
+    /// From distorted to ideal normalised coordinates; `None` for what nothing within the model's reach gives.
+    fn undistort(&self, u: f64, v: f64) -> Option<(f64, f64)> {
+        let (x, y) = match *self {
+            Self::None => (u, v),
+            Self::BrownConrady(_) => self.undistort_by_newton(u, v)?,
+            Self::KannalaBrandt(k) => {
                 let distorted = u.hypot(v);
                 if distorted < 1e-12 {
-                    return (u, v);
+                    return Some((u, v));
                 }
-                let mut theta = distorted;
-                for _ in 0..UNDISTORT_ITERATIONS {
-                    theta -= (fisheye_angle(&k, theta) - distorted) / fisheye_slope(&k, theta);
+                let mut theta = distorted.min(WIDEST_ANGLE);
+                for _ in 0..UNDISTORT_STEPS {
+                    let error = fisheye_angle(&k, theta) - distorted;
+                    theta = (theta - error / fisheye_slope(&k, theta)).clamp(0.0, WIDEST_ANGLE);
+                    if error.abs() < UNDISTORT_ERROR {
+                        break;
+                    }
                 }
-                let scale = theta.clamp(0.0, WIDEST_ANGLE).tan() / distorted;
+                if (fisheye_angle(&k, theta) - distorted).abs() > 10.0 * UNDISTORT_ERROR {
+                    return None;
+                }
+                let scale = theta.tan() / distorted;
                 (u * scale, v * scale)
+            }
+        };
+        (x.is_finite() && y.is_finite() && self.describes(x, y)).then_some((x, y))
+    }
+
+    fn undistort_by_newton(&self, u: f64, v: f64) -> Option<(f64, f64)> {
+        let (mut x, mut y) = (u, v);
+        for _ in 0..UNDISTORT_STEPS {
+            let (du, dv) = self.distort(x, y);
+            let (eu, ev) = (u - du, v - dv);
+            if eu.abs().max(ev.abs()) < UNDISTORT_ERROR {
+                return Some((x, y));
+            }
+            let j = self.jacobian(x, y);
+            let determinant = j[(0, 0)] * j[(1, 1)] - j[(0, 1)] * j[(1, 0)];
+            let dx = (j[(1, 1)] * eu - j[(0, 1)] * ev) / determinant;
+            let dy = (j[(0, 0)] * ev - j[(1, 0)] * eu) / determinant;
+            // Near the end of the model's reach steps become too long.
+            let limit = (0.5 + 0.5 * x.hypot(y)) / dx.hypot(dy).max(1e-12);
+            let share = limit.min(1.0);
+            (x, y) = (x + dx * share, y + dy * share);
+        }
+        None
+    }
+
+    /// Whether the distance from the middle grows with the angle off axis all the way to this place.
+    fn describes(&self, x: f64, y: f64) -> bool {
+        const SHARES: [f64; 4] = [0.25, 0.5, 0.75, 1.0];
+        match *self {
+            Self::None => true,
+            Self::BrownConrady(k) => {
+                let r2 = x * x + y * y;
+                SHARES.iter().all(|share| brown_conrady_slope(&k, share * r2) > 0.0)
+            }
+            Self::KannalaBrandt(k) => {
+                let theta = x.hypot(y).atan();
+                SHARES.iter().all(|share| fisheye_slope(&k, share * theta) > 0.0)
             }
         }
     }
@@ -209,6 +273,17 @@ fn brown_conrady(k: &[f64; 8], x: f64, y: f64) -> (f64, f64, f64) {
     let dx = 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x);
     let dy = p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y;
     (radial, dx, dy)
+}
+
+/// How the distorted distance from the middle changes with the ideal one, tangential parts left out, at the square of
+/// the latter.
+fn brown_conrady_slope(k: &[f64; 8], r2: f64) -> f64 {
+    let [k1, k2, _, _, k3, k4, k5, k6] = *k;
+    let above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+    let below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6));
+    let above_slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3);
+    let below_slope = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6);
+    (above * below + 2.0 * r2 * (above_slope * below - above * below_slope)) / (below * below)
 }
 
 fn fisheye_angle(k: &[f64; 4], theta: f64) -> f64 {
@@ -287,6 +362,97 @@ mod tests {
     fn the_thesis_camera_sees_a_metre_to_the_right_at_ten_metres() {
         let pixel = models()[0].project(Point::new(1.0, 0.0, 10.0)).unwrap();
         assert!(pixel.distance(&Pixel::new(647.5 + 181.8, 485.5)) < 1e-9);
+    }
+
+    /// Values of OpenCV 5.0 (`projectPoints` and `fisheye::projectPoints`) for the same points.
+    #[test]
+    fn lenses_are_those_of_opencv() {
+        let points = [
+            [0.1, 0.2, 1.0],
+            [-0.5, 0.3, 1.2],
+            [0.6, -0.45, 0.9],
+            [-1.0, -0.8, 1.5],
+            [0.0, 0.0, 2.0],
+        ];
+        let five = Distortion::BrownConrady([-0.28, 0.07, 2e-4, -3e-5, 0.01, 0.0, 0.0, 0.0]);
+        let eight = Distortion::BrownConrady([0.3, -0.1, 1e-3, -2e-3, 0.02, 0.4, 0.05, 0.01]);
+        let fisheye = Distortion::KannalaBrandt([-0.01, 0.03, -0.02, 0.004]);
+        let expected = [
+            (
+                five,
+                [
+                    [383.305_291_25, 370.905_332_75],
+                    [65.140_753_768, 395.336_275_681],
+                    [684.236_100_594, -34.102_315_102],
+                    [-43.427_435_011, -50.526_558_877],
+                    [319.2, 241.7],
+                ],
+            ),
+            (
+                eight,
+                [
+                    [383.792_597_528, 372.042_677_325],
+                    [55.331_577_617, 401.207_977_131],
+                    [704.082_421_107, -49.409_721_892],
+                    [-67.029_396_747, -68.419_015_907],
+                    [319.2, 241.7],
+                ],
+            ),
+            (
+                fisheye,
+                [
+                    [383.121_451_371, 370.526_309_685],
+                    [67.333_989_177, 393.982_065_006],
+                    [680.511_046_975, -31.367_772_041],
+                    [-39.567_376_948, -47.521_700_801],
+                    [319.2, 241.7],
+                ],
+            ),
+        ];
+        for (distortion, pixels) in expected {
+            let camera = CameraModel {
+                width: 640,
+                height: 480,
+                fx: 650.0,
+                fy: 655.0,
+                cx: 319.2,
+                cy: 241.7,
+                distortion,
+            };
+            for ([x, y, z], [u, v]) in points.into_iter().zip(pixels) {
+                let expected = Pixel::new(u, v);
+                let found = camera.project(Point::new(x, y, z)).unwrap();
+                assert!(found.distance(&expected) < 1e-7, "{found:?} {expected:?}");
+                let sight = camera.sight(expected).unwrap();
+                assert!((sight.x() - x / z).hypot(sight.y() - y / z) < 1e-8, "{sight:?}");
+            }
+        }
+    }
+
+    /// A calibration that was fitted too closely: its pixels turn back within the image.
+    #[test]
+    fn beyond_its_reach_a_lens_model_says_nothing() {
+        let distortion = Distortion::BrownConrady([
+            -0.040062, 2.499804, 0.005404, -0.000658, -13.76708, 0.0, 0.0, 0.0,
+        ]);
+        let camera = CameraModel {
+            fx: 770.502,
+            fy: 769.174,
+            distortion,
+            ..CameraModel::pinhole(816, 612, 770.0)
+        };
+        assert!(camera.sight(Pixel::new(700.0, 305.0)).is_some());
+        assert_eq!(camera.sight(Pixel::new(1500.0, 305.0)), None);
+        assert_eq!(camera.project(Point::new(0.7, 0.0, 1.0)), None);
+        let outermost = camera.unproject(Pixel::new(1500.0, 305.0));
+        assert!((0.4..0.7).contains(&outermost.x()), "{outermost:?}");
+        assert!(outermost.y().abs() < 0.1);
+        let fisheye = CameraModel { distortion: Distortion::KannalaBrandt([0.0; 4]), ..camera };
+        assert_eq!(fisheye.sight(Pixel::new(408.0 + 770.5 * 1.6, 305.0)), None);
+        for model in [camera, fisheye] {
+            assert_eq!(model.sight(Pixel::new(f64::NAN, 3.0)), None);
+            assert!(model.unproject(Pixel::new(f64::INFINITY, 3.0)).is_finite());
+        }
     }
 
     #[test]

@@ -140,10 +140,14 @@ impl<'a> Lens<'a> {
         }
         let mean = |of: fn(&Pixel) -> f64| corners.iter().map(of).sum::<f64>() / 4.0;
         let middle = Pixel::new(mean(|c| c.x), mean(|c| c.y));
-        let camera = camera.filter(|camera| camera.distortion != Distortion::None);
+        // A lens model that says nothing of this place helps nobody: lines are then taken to be straight.
+        let camera = camera.filter(|camera| {
+            camera.distortion != Distortion::None
+                && corners.iter().all(|corner| camera.sight(*corner).is_some())
+        });
         let mut lens = Self { camera, near: (middle, [middle.x, middle.y], Matrix2::identity()) };
         if let Some(camera) = camera {
-            let ray = camera.unproject(middle);
+            let ray = camera.sight(middle)?;
             lens.near.1 = [camera.fx * ray.x() + camera.cx, camera.fy * ray.y() + camera.cy];
             let (_, bend) = lens.seen(lens.near.1)?;
             lens.near.2 = bend.try_inverse()?;
