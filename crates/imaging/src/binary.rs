@@ -6,7 +6,8 @@ use crate::view::GrayView;
 /// A yes or no for each pixel of an image, 64 in a word, with no all round.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct BitImage {
-    /// A row of noes, the rows, and another row of noes. Each row begins with a word of noes and ends with at least one no.
+    /// A row of noes, the rows, another row of noes and a word of them. Each row begins with a word of noes and ends with at
+    /// least one no.
     words: Vec<u64>,
     width: usize,
     height: usize,
@@ -22,7 +23,7 @@ impl BitImage {
         }
         (self.width, self.height, self.stride) = (width, height, stride);
         self.words.clear();
-        self.words.resize(stride * (height + 2), 0);
+        self.words.resize(stride * (height + 2) + 1, 0);
     }
 
     /// Width in pixels.
@@ -62,14 +63,14 @@ impl BitImage {
         self.words.get(place >> 6).is_some_and(|word| word >> (place & 63) & 1 == 1)
     }
 
-    /// The words of row `y`; bit 0 of the first is pixel 0.
+    /// The words of row `y` and one of noes; bit 0 of the first is pixel 0.
     pub(crate) fn row(&self, y: usize) -> &[u64] {
-        &self.words[(y + 1) * self.stride + 1..][..self.stride - 1]
+        &self.words[(y + 1) * self.stride + 1..][..self.stride]
     }
 
-    /// The words of the row above row `y`; all no for row 0.
+    /// The words of the row above row `y`, all no for row 0, and one of noes.
     pub(crate) fn row_above(&self, y: usize) -> &[u64] {
-        &self.words[y * self.stride + 1..][..self.stride - 1]
+        &self.words[y * self.stride + 1..][..self.stride]
     }
 
     fn row_mut(&mut self, y: usize) -> &mut [u64] {

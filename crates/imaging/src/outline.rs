@@ -82,6 +82,7 @@ pub struct Outlines {
     dark: BitImage,
     bright: BitImage,
     path: Vec<u8>,
+    tops: Vec<u64>,
     points: Vec<[f32; 2]>,
     spans: Vec<Span>,
 }
@@ -184,6 +185,7 @@ impl Outlines {
                     dark,
                     level: level as u8,
                     path: &mut self.path,
+                    tops: &mut self.tops,
                     points: &mut self.points,
                     spans: &mut self.spans,
                 };
@@ -260,20 +262,106 @@ struct Found<'a> {
     dark: bool,
     level: u8,
     path: &'a mut Vec<u8>,
+    tops: &'a mut Vec<u64>,
     points: &'a mut Vec<[f32; 2]>,
     spans: &'a mut Vec<Span>,
 }
 
-/// Directions along pixel edges; the fourth is up.
+/// Directions along pixel edges.
 const RIGHT: u8 = 0;
 const DOWN: u8 = 1;
 const LEFT: u8 = 2;
+const UP: u8 = 3;
 
 /// The outline of a region, whose pixels lie to the right of the way.
 struct Trace {
     bounds: [i32; 4],
     area: i64,
     length: usize,
+}
+
+/// The way along an outline.
+struct Walk {
+    start: [i32; 2],
+    x: i32,
+    y: i32,
+    /// The pixel to the lower right of the point that was reached.
+    place: usize,
+    row: usize,
+    direction: u8,
+    left: i32,
+    right: i32,
+    bottom: i32,
+    /// The sum over the upright edges of where they are, down less up.
+    area: i64,
+    /// Steps down and to the left; a convex outline takes as many as it is high and wide.
+    back: i32,
+}
+
+impl Walk {
+    /// Has taken the upper edge of pixel (x, y); `place` is the next pixel's.
+    #[inline]
+    fn new(x: usize, y: usize, place: usize, row: usize) -> Self {
+        let (x, y) = (x as i32 + 1, y as i32);
+        let (start, left, right, bottom) = ([x, y], x - 1, x, y);
+        Self { start, x, y, place, row, direction: RIGHT, left, right, bottom, area: 0, back: 0 }
+    }
+
+    /// The outline, if this is its end.
+    fn closed(&self, length: usize) -> Option<Trace> {
+        let bounds = [self.left, self.start[1], self.right, self.bottom];
+        let closed = self.direction == RIGHT && [self.x, self.y] == self.start;
+        closed.then_some(Trace { bounds, area: self.area, length })
+    }
+
+    /// A step; false when the way ends.
+    #[inline]
+    fn right(&mut self, limits: &Limits) -> bool {
+        self.direction = RIGHT;
+        self.place += 1;
+        self.x += 1;
+        self.right = self.right.max(self.x);
+        let is_top = self.y == self.start[1] && self.x >= self.start[0];
+        !is_top && self.right - self.left <= limits.largest
+    }
+
+    #[inline]
+    fn down(&mut self, limits: &Limits) -> bool {
+        self.direction = DOWN;
+        self.place += self.row;
+        self.y += 1;
+        self.area += i64::from(self.x);
+        self.back += 1;
+        self.bottom = self.bottom.max(self.y);
+        self.bottom - self.start[1] <= limits.largest && !self.is_ragged(limits)
+    }
+
+    #[inline]
+    fn left(&mut self, limits: &Limits) -> bool {
+        self.direction = LEFT;
+        self.place -= 1;
+        self.x -= 1;
+        self.back += 1;
+        self.left = self.left.min(self.x);
+        self.right - self.left <= limits.largest && !self.is_ragged(limits)
+    }
+
+    #[inline]
+    fn up(&mut self) -> bool {
+        self.direction = UP;
+        self.place -= self.row;
+        self.y -= 1;
+        self.area -= i64::from(self.x);
+        self.y >= self.start[1]
+    }
+
+    /// Whether an outline with these bounds so far went too far down and to the left for one that is nearly convex.
+    #[inline]
+    fn is_ragged(&self, limits: &Limits) -> bool {
+        const SLACK: i32 = 2;
+        let convex = self.right - self.left + self.bottom - self.start[1];
+        self.back - convex > SLACK + ((convex * limits.detour_256ths) >> 8)
+    }
 }
 
 impl Found<'_> {
@@ -283,8 +371,30 @@ impl Found<'_> {
         self.path.resize(limits.most_path, 0);
         let bits = self.bits;
         for y in 0..bits.height() {
-            let mut tops = Tops::new(bits.row(y), bits.row_above(y));
-            while let Some(x) = tops.next() {
+            let mut tops = std::mem::take(self.tops);
+            tops.resize(bits.row(y).len() - 1, 0);
+            mark_tops(bits.row(y), bits.row_above(y), &mut tops);
+            let goes_on = self.scan_row(y, &tops, limits, &mut steps_left);
+            *self.tops = tops;
+            if !goes_on || self.points.len() >= points_end {
+                return;
+            }
+        }
+    }
+
+    /// Follows the outlines that begin in a row; false when there are no steps left.
+    fn scan_row(
+        &mut self,
+        y: usize,
+        tops: &[u64],
+        limits: &Limits,
+        steps_left: &mut usize,
+    ) -> bool {
+        for (index, word) in tops.iter().enumerate() {
+            let mut word = *word;
+            while word != 0 {
+                let x = index * 64 + word.trailing_zeros() as usize;
+                word &= word - 1;
                 if limits.steep && !self.is_steep(x, y) {
                     continue;
                 }
@@ -295,12 +405,13 @@ impl Found<'_> {
                     self.keep(x, y, &trace);
                 }
                 // A start costs about as much as some steps.
-                steps_left = steps_left.saturating_sub(steps + 4);
-                if steps_left == 0 || self.points.len() >= points_end {
-                    return;
+                *steps_left = steps_left.saturating_sub(steps + 4);
+                if *steps_left == 0 {
+                    return false;
                 }
             }
         }
+        true
     }
 
     /// Whether the grey values step at a top by half of their range. Looks two pixels up and down, as blur spreads a step
@@ -334,74 +445,28 @@ impl Found<'_> {
         let (bits, row) = (self.bits.bits(), self.bits.row_bits());
         // Whether the pixel is part of the region; no for those beyond the image.
         let part = |place: usize| bits.get(place >> 6).is_some_and(|w| w >> (place & 63) & 1 == 1);
-        // `place` is the pixel to the lower right of the point that was reached.
-        let mut place = self.bits.place(x + 1, y);
-        let (start_x, start_y) = (x as i32 + 1, y as i32);
-        let (mut x, mut y, mut direction) = (start_x, start_y, RIGHT);
-        let [mut left, mut right, mut bottom] = [start_x - 1, start_x, start_y];
-        let (mut area, mut down, mut leftwards) = (0, 0, 0);
+        let mut walk = Walk::new(x, y, self.bits.place(x + 1, y), row);
         for (length, step) in self.path.iter_mut().enumerate() {
-            // Regions are connected across corners, so a pixel ahead to the left is part of it whatever is to its right.
-            let (ahead_left, ahead_right) = match direction {
-                RIGHT => (place - row, place),
-                DOWN => (place, place - 1),
-                LEFT => (place - 1, place - row - 1),
-                _ => (place - row - 1, place - row),
+            // Regions are connected across corners, so a pixel ahead to the left is part of it whatever is to its right;
+            // else the way is straight on along a pixel ahead to the right, or turns right.
+            let place = walk.place;
+            let goes_on = match walk.direction {
+                RIGHT if part(place - row) => walk.up(),
+                RIGHT if part(place) => walk.right(limits),
+                RIGHT => walk.down(limits),
+                DOWN if part(place) => walk.right(limits),
+                DOWN if part(place - 1) => walk.down(limits),
+                DOWN => walk.left(limits),
+                LEFT if part(place - 1) => walk.down(limits),
+                LEFT if part(place - row - 1) => walk.left(limits),
+                LEFT => walk.up(),
+                _ if part(place - row - 1) => walk.left(limits),
+                _ if part(place - row) => walk.up(),
+                _ => walk.right(limits),
             };
-            if part(ahead_left) {
-                direction = (direction + 3) & 3;
-            } else if !part(ahead_right) {
-                direction = (direction + 1) & 3;
-            }
-            *step = direction;
-            // The area is the sum over the upright edges of where they are, down less up. A convex outline goes as far
-            // down as it is high, and as far left as it is wide.
-            match direction {
-                RIGHT => {
-                    place += 1;
-                    x += 1;
-                    if y == start_y && x >= start_x {
-                        let bounds = [left, start_y, right, bottom];
-                        let closed = x == start_x;
-                        let trace = Trace { bounds, area, length: length + 1 };
-                        return (closed.then_some(trace), length);
-                    }
-                    right = right.max(x);
-                    if right - left > limits.largest {
-                        return (None, length);
-                    }
-                }
-                DOWN => {
-                    place += row;
-                    y += 1;
-                    area += i64::from(x);
-                    down += 1;
-                    bottom = bottom.max(y);
-                    if bottom - start_y > limits.largest
-                        || limits.is_ragged([left, start_y, right, bottom], down + leftwards)
-                    {
-                        return (None, length);
-                    }
-                }
-                LEFT => {
-                    place -= 1;
-                    x -= 1;
-                    leftwards += 1;
-                    left = left.min(x);
-                    if right - left > limits.largest
-                        || limits.is_ragged([left, start_y, right, bottom], down + leftwards)
-                    {
-                        return (None, length);
-                    }
-                }
-                _ => {
-                    place -= row;
-                    y -= 1;
-                    area -= i64::from(x);
-                    if y < start_y {
-                        return (None, length);
-                    }
-                }
+            *step = walk.direction;
+            if !goes_on {
+                return (walk.closed(length + 1), length + 1);
             }
         }
         (None, self.path.len())
@@ -476,14 +541,6 @@ fn crossing(greys: [u8; 4], dark: bool) -> f32 {
 }
 
 impl Limits {
-    /// Whether an outline with these bounds so far went too far down and to the left for one that is nearly convex.
-    #[inline]
-    fn is_ragged(&self, [left, top, right, bottom]: [i32; 4], back: i32) -> bool {
-        const SLACK: i32 = 2;
-        let convex = right - left + bottom - top;
-        back - convex > SLACK + ((convex * self.detour_256ths) >> 8)
-    }
-
     fn admit(&self, trace: &Trace) -> bool {
         let [left, top, right, bottom] = trace.bounds;
         let (width, height) = (right - left, bottom - top);
@@ -494,52 +551,23 @@ impl Limits {
     }
 }
 
-/// The right ends of those runs of a row that touch none of the row above, not even across a corner.
-struct Tops<'a> {
-    row: &'a [u64],
-    above: &'a [u64],
-    index: usize,
-    /// Runs of the current word that are still to be told.
-    ends: u64,
-    /// Whether a run that touches goes on from the word before into the current one.
-    carry: bool,
-}
-
-impl<'a> Tops<'a> {
-    fn new(row: &'a [u64], above: &'a [u64]) -> Self {
-        Self { row, above, index: 0, ends: 0, carry: false }
-    }
-
-    fn next(&mut self) -> Option<usize> {
-        while self.ends == 0 {
-            let run = *self.row.get(self.index)?;
-            if run == 0 && !self.carry {
-                self.index += 1;
-                continue;
-            }
-            self.read(run);
-            self.index += 1;
-        }
-        let bit = self.ends.trailing_zeros() as usize;
-        self.ends &= self.ends - 1;
-        Some((self.index - 1) * 64 + bit)
-    }
-
-    fn read(&mut self, run: u64) {
-        let at = |index: usize| self.above.get(index).copied().unwrap_or(0);
-        let above = at(self.index);
-        let before = if self.index > 0 { at(self.index - 1) } else { 0 };
-        let touched = above | above << 1 | before >> 63 | above >> 1 | at(self.index + 1) << 63;
+/// Writes the right ends of those runs of a row that touch none of the row above, not even across a corner. Both rows
+/// have a word of noes at their end for which there is none in `ends`.
+fn mark_tops(row: &[u64], above: &[u64], ends: &mut [u64]) {
+    let (mut above_before, mut carry) = (0, false);
+    for (end, (run, above)) in ends.iter_mut().zip(row.windows(2).zip(above.windows(2))) {
+        let ([run, run_after], [above, above_after]) = ([run[0], run[1]], [above[0], above[1]]);
+        let touched = above | above << 1 | above_before >> 63 | above >> 1 | above_after << 63;
+        above_before = above;
         // Adding a run's touched pixels to it carries a one from each of them to the run's end and changes the bits on the
         // way: the last bit of a run stays as it is only where nothing touches.
         let seeds = run & touched;
         let (sum, over) = run.overflowing_add(seeds);
-        let (sum, over_too) = sum.overflowing_add(u64::from(self.carry));
+        let (sum, over_too) = sum.overflowing_add(u64::from(carry));
         let flooded = (run ^ sum) & run | seeds;
-        let next = self.row.get(self.index + 1).copied().unwrap_or(0);
-        let ends = run & !(run >> 1 | next << 63);
-        self.ends = ends & !flooded;
-        self.carry = (over || over_too) && next & 1 == 1;
+        *end = run & !(run >> 1 | run_after << 63) & !flooded;
+        // A run that touches may go on in the next word.
+        carry = (over | over_too) && run_after & 1 == 1;
     }
 }
 
