@@ -6,10 +6,12 @@ mod scene;
 
 use std::time::Instant;
 
+use fiducial::square::pattern::Pattern;
 use fiducial::square::refine::{Refined, Scratch, refine};
-use geometry::{CameraModel, Distortion};
+use geometry::{CameraModel, Distortion, Pixel};
+use imaging::GrayView;
 use nalgebra::SVector;
-use scene::Scene;
+use scene::{Random, Scene};
 
 /// Errors of many frames.
 #[derive(Default)]
@@ -64,7 +66,7 @@ impl Errors {
     }
 }
 
-fn area(corners: &[geometry::Pixel; 4]) -> f64 {
+fn area(corners: &[Pixel; 4]) -> f64 {
     let [a, b, c, d] = corners;
     ((c.x - a.x) * (d.y - b.y) - (d.x - b.x) * (c.y - a.y)) / 2.0
 }
@@ -237,5 +239,42 @@ fn the_covariance_is_that_of_the_errors() {
         assert!((5.5..10.0).contains(&mean), "{mean}");
         let beyond = found.normalised.iter().filter(|n| **n > 15.5).count();
         assert!(beyond * 100 <= 12 * found.normalised.len(), "{beyond}");
+    }
+}
+
+/// Corners of anything, in images of anything, give an answer or none.
+#[test]
+fn nonsense_is_survived() {
+    let mut random = Random::new(5);
+    let mut scratch = Scratch::default();
+    let odd = [f64::NAN, f64::INFINITY, -1e300, 1e300, 0.0, -0.5, 1e6, 65_535.0];
+    let patterns =
+        [Pattern::border(6, false), Pattern::border(8, true), Pattern::new(1, 0, |_, _| None)];
+    for round in 0..3000 {
+        let (width, height) = (1 + random.next() as usize % 60, 1 + random.next() as usize % 60);
+        let kind = round % 3;
+        let data: Vec<u8> = (0..width * height)
+            .map(|i| match kind {
+                0 => random.next() as u8,
+                1 => 255 * ((i % width + i / width) % 2) as u8,
+                _ => 128,
+            })
+            .collect();
+        let view = GrayView::packed(&data, width, height).unwrap();
+        let corners = [(); 4].map(|()| {
+            let mut number = || match random.next() % 12 {
+                0 if round % 2 == 0 => odd[random.next() as usize % odd.len()],
+                _ => random.between(-20.0, 80.0),
+            };
+            Pixel::new(number(), number())
+        });
+        let mut camera = CameraModel::pinhole(width as u32, height as u32, 50.0);
+        camera.distortion = [Distortion::None, BARREL, Distortion::KannalaBrandt([9.0; 4])][kind];
+        for pattern in patterns.iter().flatten() {
+            if let Some(found) = refine(view, &corners, pattern, Some(&camera), &mut scratch) {
+                assert!(found.corners.iter().all(|c| c.x.is_finite() && c.y.is_finite()));
+                assert!(found.covariance_px2.iter().all(|c| c.is_finite()));
+            }
+        }
     }
 }

@@ -41,7 +41,9 @@ const UNKNOWNS: usize = 13;
 const MOST_SPOTS: [usize; 2] = [300, 800];
 /// Steps of a round, and the move in pixels at which it ends.
 const MOST_STEPS: usize = 12;
-const SETTLED_PX: [f64; 2] = [0.15, 0.02];
+const SETTLED_PX: [f64; 2] = [0.15, 0.015];
+/// A marker that moves less than this keeps its pixels.
+const SAME_PIXELS_PX: f64 = 0.4;
 /// Columns or rows of cells that the blur reaches across at most.
 const MOST_BANDS: usize = 12;
 /// The spread may become this, in pixels.
@@ -76,14 +78,20 @@ pub(crate) fn fit(
     let mut state = State { homography: *start, light, half_px: side_px / 2.0, pull };
     let mut solved: Option<System> = None;
     for (most_spots, settled_px) in MOST_SPOTS.into_iter().zip(SETTLED_PX) {
-        grid.gather(view, lens, &state, most_spots, &mut scratch.spots)?;
+        let is_complete = grid.gather(view, lens, &state, most_spots, &mut scratch.spots)?;
         if solved.is_none() {
             state.expose(&grid, &scratch.spots)?;
             state.pull = Pull { limit: 0.25 * state.light.contrast.abs(), is_rough: true };
         }
+        let settled_px = if is_complete { SETTLED_PX[1] } else { settled_px };
         let (next, system) = state.solved(&grid, scratch, settled_px)?;
+        // Where all pixels take part at once, others would only after a move.
+        let is_last = is_complete && next.homography.distance_px(start) < SAME_PIXELS_PX;
         state = next;
         solved = Some(system);
+        if is_last {
+            break;
+        }
     }
     let system = solved?;
     let contrast = state.light.contrast.abs();
@@ -223,7 +231,7 @@ impl Grid {
         }
     }
 
-    /// The pixels near the marker's known edges.
+    /// The pixels near the marker's known edges, and some others; true when none were left out for their number.
     fn gather(
         &self,
         view: GrayView<'_>,
@@ -231,7 +239,7 @@ impl Grid {
         state: &State,
         most: usize,
         spots: &mut Vec<Spot>,
-    ) -> Option<()> {
+    ) -> Option<bool> {
         spots.clear();
         let [left, top, right, bottom] = self.bounds(view, lens, state)?;
         let inverse = state.homography.inverse();
@@ -252,23 +260,33 @@ impl Grid {
                 let ideal = lens.ideal(Pixel::new(x as f64, y as f64))?;
                 let ideal = [ideal[0] - about[0], ideal[1] - about[1]];
                 let Some(spread) = self.spread(&inverse, ideal, spread_px) else { continue };
-                if self.unknown_at(&spread, &mut work) > MOST_UNKNOWN {
+                turn += 1;
+                let interval = if self.is_near_edge(&spread) { thinned } else { 4 * thinned };
+                if thinned > 1 && turn % interval != 0
+                    || self.unknown_at(&spread, &mut work) > MOST_UNKNOWN
+                {
                     continue;
-                }
-                if thinned > 1 {
-                    turn += 1;
-                    let look = self.look_at(&spread, spread_px, &mut work);
-                    let change = look.by_place[0].hypot(look.by_place[1]);
-                    let chosen =
-                        if change > 0.03 { turn % thinned == 0 } else { turn % (4 * thinned) == 1 };
-                    if !chosen {
-                        continue;
-                    }
                 }
                 spots.push(Spot { ideal, grey: f64::from(*grey), difference: 0.0 });
             }
         }
-        (spots.len() > 2 * UNKNOWNS).then_some(())
+        (spots.len() > 2 * UNKNOWNS).then_some(every == 1)
+    }
+
+    /// Whether the nearest line between columns, or between rows, has black on one side and white on the other.
+    fn is_near_edge(&self, spread: &Spread) -> bool {
+        const REACH: f64 = 1.8;
+        let last = self.across - 1;
+        let cell = spread.cells.map(|at| (at.max(0.0) as usize).min(last));
+        let line = |axis: usize| {
+            let nearest = (spread.cells[axis] + 0.5).max(0.0) as usize;
+            let distance = (spread.cells[axis] - nearest as f64).abs();
+            (distance < REACH * spread.sigma[axis] && (1..=last).contains(&nearest))
+                .then_some(nearest)
+        };
+        let [column, row] = cell;
+        line(0).is_some_and(|line| self.white[row][line - 1] != self.white[row][line])
+            || line(1).is_some_and(|line| self.white[line - 1][column] != self.white[line][column])
     }
 
     /// First column and row around the pattern within the image, and those after the last.
