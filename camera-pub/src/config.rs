@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{bail, ensure};
 use geometry::{Body, Camera, CameraModel, Distortion, Point, Rotation, Transform};
+use imaging::Mosaic;
 use node::{Check, Settings};
 use serde::Deserialize;
 
@@ -27,6 +28,7 @@ pub(crate) struct SourceConfig {
     pub(crate) rate_hz: f64,
     pub(crate) repeat: bool,
     pub(crate) wait_for_subscriber: bool,
+    bayer: String,
     largest_megapixels: f64,
 }
 
@@ -61,6 +63,7 @@ impl Settings for Config {
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.range("source.rate_hz", self.source.rate_hz, 0.01..=1000.0);
+        check.parses("source.bayer", self.source.mosaic());
         check.range("source.largest_megapixels", self.source.largest_megapixels, 0.001..=4294.0);
         check.range("jpeg.quality", self.jpeg.quality, 1..=100);
         self.calibration.check(check);
@@ -121,6 +124,16 @@ impl Config {
         // A quaternion of no length does not pass the check.
         let rotation = self.mount.rotation().unwrap_or_else(Rotation::identity);
         Transform::new(rotation, Point::new(x, y, z))
+    }
+}
+
+impl SourceConfig {
+    /// The colours in front of the sensor's pixels.
+    pub(crate) fn mosaic(&self) -> anyhow::Result<Option<Mosaic>> {
+        Ok(match self.bayer.as_str() {
+            "" => None,
+            name => Some(name.parse()?),
+        })
     }
 }
 

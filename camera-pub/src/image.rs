@@ -3,8 +3,8 @@
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use ::image::{DynamicImage, ImageDecoder, ImageReader, Limits};
-use imaging::{GrayImage, GrayView};
+use ::image::{ColorType, DynamicImage, ImageDecoder, ImageReader, Limits};
+use imaging::{Converter, GrayImage, GrayView, Mosaic, SampleFormat};
 
 /// Pixels an image may have unless another limit is chosen.
 pub const MOST_PIXELS: u64 = 100_000_000;
@@ -33,10 +33,12 @@ pub enum ImageError {
         path: PathBuf,
     },
     /// A folder without images.
-    #[error("the folder {path:?} holds no images; names of images end in .png, .jpg or .jpeg")]
+    #[error("the folder {path:?} holds no images; their names end in {extensions}")]
     EmptyFolder {
         /// The folder.
         path: PathBuf,
+        /// The ends of names that were looked for.
+        extensions: String,
     },
     /// Bytes that are neither PNG nor JPEG.
     #[error("{path:?} is neither a PNG nor a JPEG image; convert it to one of them")]
@@ -74,6 +76,12 @@ pub enum ImageError {
         /// The file.
         path: PathBuf,
     },
+    /// A colour image where the raw samples of a mosaic were expected.
+    #[error("{path:?} has colours already, so that it is no mosaic; leave the mosaic out")]
+    NoMosaic {
+        /// The file.
+        path: PathBuf,
+    },
     /// Bytes that cannot be decoded.
     #[error("{path:?} is damaged or cut short: {cause}; copy or record it again")]
     Damaged {
@@ -84,25 +92,44 @@ pub enum ImageError {
     },
 }
 
+/// Ends of the names of images.
+pub const IMAGE_EXTENSIONS: &[&str] = &["png", "jpg", "jpeg"];
+
 /// The images that a path names: the file itself, or those in a folder and in the folders in it, in the order of
 /// their names. Whether a file can be read turns out when it is read.
 ///
 /// # Errors
 /// [`ImageError`] for a folder that cannot be listed or holds no images.
 pub fn images_in(path: &Path) -> Result<Vec<PathBuf>, ImageError> {
+    files_in(path, &[IMAGE_EXTENSIONS])
+}
+
+/// As [`images_in`], for files whose names have one of these extensions.
+///
+/// # Errors
+/// As [`images_in`].
+pub fn files_in(path: &Path, extensions: &[&[&str]]) -> Result<Vec<PathBuf>, ImageError> {
     if !path.is_dir() {
         return Ok(vec![path.to_owned()]);
     }
-    let mut images = Vec::new();
-    collect(path, DEEPEST_FOLDER, &mut images)?;
-    if images.is_empty() {
-        return Err(ImageError::EmptyFolder { path: path.to_owned() });
+    let extensions = extensions.concat();
+    let mut files = Vec::new();
+    collect(path, DEEPEST_FOLDER, &extensions, &mut files)?;
+    if files.is_empty() {
+        let extensions =
+            extensions.iter().map(|end| format!(".{end}")).collect::<Vec<_>>().join(", ");
+        return Err(ImageError::EmptyFolder { path: path.to_owned(), extensions });
     }
-    images.sort_unstable();
-    Ok(images)
+    files.sort_unstable();
+    Ok(files)
 }
 
-fn collect(folder: &Path, depth: usize, images: &mut Vec<PathBuf>) -> Result<(), ImageError> {
+fn collect(
+    folder: &Path,
+    depth: usize,
+    extensions: &[&str],
+    files: &mut Vec<PathBuf>,
+) -> Result<(), ImageError> {
     let unreadable = |cause| ImageError::Unreadable { path: folder.to_owned(), cause };
     for entry in std::fs::read_dir(folder).map_err(unreadable)? {
         let entry = entry.map_err(unreadable)?;
@@ -113,45 +140,54 @@ fn collect(folder: &Path, depth: usize, images: &mut Vec<PathBuf>) -> Result<(),
         // A link to a folder is not followed, as it may lead back here.
         if entry.file_type().map_err(unreadable)?.is_dir() {
             if depth > 0 {
-                collect(&path, depth - 1, images)?;
+                collect(&path, depth - 1, extensions, files)?;
             }
-        } else if is_named_as_image(&path) {
-            images.push(path);
+        } else if has_extension(&path, extensions) {
+            files.push(path);
         }
     }
     Ok(())
 }
 
-fn is_named_as_image(path: &Path) -> bool {
+/// True when a file's name ends in one of these, in capitals or not.
+pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    ["png", "jpg", "jpeg"].iter().any(|known| extension.eq_ignore_ascii_case(known))
+    extensions.iter().any(|known| extension.eq_ignore_ascii_case(known))
 }
 
 /// An image file (PNG or JPEG) in grey, the way up that its Exif data says. Colours are weighted by Rec. 601, 16-bit
-/// values scaled to 8 bits, transparent pixels laid over white.
+/// grey is scaled to the range it uses, transparent pixels are laid over white. With a `mosaic`, an image of one
+/// channel is what a sensor gave behind it.
 ///
 /// # Errors
 /// [`ImageError`] when the file cannot be read, is no complete image, or has more than `most_pixels`.
-pub fn read_image(path: &Path, most_pixels: u64) -> Result<GrayImage, ImageError> {
+pub fn read_image(
+    path: &Path,
+    most_pixels: u64,
+    mosaic: Option<Mosaic>,
+) -> Result<GrayImage, ImageError> {
     let decoded = Decoded::read(path, most_pixels)?;
-    let mut image = GrayImage::filled(decoded.width(), decoded.height(), 0);
-    decoded.write_grey(image.pixels_mut());
-    Ok(image)
+    if mosaic.is_some() && decoded.raw_bits().is_none() {
+        return Err(ImageError::NoMosaic { path: path.to_owned() });
+    }
+    Ok(decoded.grey(mosaic))
 }
 
-/// Width and height of an image file in pixels, from its first bytes alone.
-pub(crate) fn image_size(path: &Path, most_pixels: u64) -> Result<(usize, usize), ImageError> {
+/// As [`read_image`], from the bytes of a file; `path` is what errors name.
+///
+/// # Errors
+/// As [`read_image`].
+pub fn decode_image(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<GrayImage, ImageError> {
+    Ok(Decoded::decode(path, bytes, most_pixels)?.grey(None))
+}
+
+/// Bytes of the frame that an image file makes, from its first bytes alone.
+pub(crate) fn frame_bytes(path: &Path, most_pixels: u64) -> Result<usize, ImageError> {
     let bytes = file_bytes(path, most_pixels)?;
-    let mut decoder = decoder(path, &bytes, most_pixels)?;
+    let decoder = decoder(path, &bytes, most_pixels)?;
     let (width, height) = decoder.dimensions();
-    let turned = decoder.orientation().is_ok_and(turns_sideways);
-    let size = (width as usize, height as usize);
-    Ok(if turned { (size.1, size.0) } else { size })
-}
-
-fn turns_sideways(orientation: ::image::metadata::Orientation) -> bool {
-    use ::image::metadata::Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
-    matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
+    let per_pixel = if decoder.color_type() == ColorType::L16 { 2 } else { 1 };
+    Ok((width as usize).saturating_mul(height as usize).saturating_mul(per_pixel))
 }
 
 /// An image in the form its file has.
@@ -162,10 +198,14 @@ pub(crate) struct Decoded {
 impl Decoded {
     /// Reads and decodes a file.
     pub(crate) fn read(path: &Path, most_pixels: u64) -> Result<Self, ImageError> {
-        let bytes = file_bytes(path, most_pixels)?;
-        let mut decoder = decoder(path, &bytes, most_pixels)?;
+        Self::decode(path, &file_bytes(path, most_pixels)?, most_pixels)
+    }
+
+    /// Decodes the bytes of a file.
+    fn decode(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<Self, ImageError> {
+        let mut decoder = decoder(path, bytes, most_pixels)?;
         // The decoder fills up what is missing of a JPEG with grey, which is no picture of anything.
-        if bytes.starts_with(JPEG_START) && !jpeg_is_complete(&bytes) {
+        if bytes.starts_with(JPEG_START) && !jpeg_is_complete(bytes) {
             return Err(ImageError::Cut { path: path.to_owned() });
         }
         let damaged = |cause: ::image::ImageError| ImageError::Damaged {
@@ -188,8 +228,52 @@ impl Decoded {
         self.image.height() as usize
     }
 
+    /// Bits of a sample, of an image that can be what a sensor gave: grey without more.
+    pub(crate) fn raw_bits(&self) -> Option<u32> {
+        match &self.image {
+            DynamicImage::ImageLuma8(_) => Some(8),
+            DynamicImage::ImageLuma16(_) => Some(16),
+            _ => None,
+        }
+    }
+
+    /// The image in 8-bit grey.
+    pub(crate) fn grey(&self, mosaic: Option<Mosaic>) -> GrayImage {
+        let (width, height) = (self.width(), self.height());
+        let mut image = GrayImage::filled(width, height, 0);
+        match self.raw_bits() {
+            Some(bits) if bits > 8 || mosaic.is_some() => {
+                let mut samples = vec![0; width * height * bits.div_ceil(8) as usize];
+                self.write_samples(&mut samples);
+                let format = SampleFormat { bits, mosaic };
+                // An image that was decoded has a size that can be.
+                if let Ok(view) = Converter::default().convert(&samples, width, height, format) {
+                    for y in 0..height {
+                        image.row_mut(y).copy_from_slice(view.row(y));
+                    }
+                }
+            }
+            _ => self.write_grey(image.pixels_mut()),
+        }
+        image
+    }
+
+    /// Writes the samples as they are, row by row, into a buffer of width times height times their bytes; those of two
+    /// bytes with the low one first. Images that are not raw are written in grey.
+    pub(crate) fn write_samples(&self, out: &mut [u8]) {
+        match &self.image {
+            DynamicImage::ImageLuma16(image) => {
+                let (pairs, _) = out.as_chunks_mut::<2>();
+                for (pair, sample) in pairs.iter_mut().zip(image.iter()) {
+                    *pair = sample.to_le_bytes();
+                }
+            }
+            _ => self.write_grey(out),
+        }
+    }
+
     /// Writes the pixels, row by row, into a buffer of width times height bytes.
-    pub(crate) fn write_grey(&self, out: &mut [u8]) {
+    fn write_grey(&self, out: &mut [u8]) {
         match &self.image {
             DynamicImage::ImageLuma8(image) => fill(out, image, |[v]| v),
             DynamicImage::ImageLumaA8(image) => fill(out, image, |[v, a]| over_white(v, a)),
@@ -329,7 +413,7 @@ mod tests {
     fn read_bytes(bytes: &[u8], most_pixels: u64) -> Result<GrayImage, String> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), bytes).unwrap();
-        read_image(file.path(), most_pixels).map_err(|e| e.to_string())
+        read_image(file.path(), most_pixels, None).map_err(|e| e.to_string())
     }
 
     fn photo() -> DynamicImage {
@@ -349,13 +433,36 @@ mod tests {
         // 0.299 * 200 + 0.587 * 100 + 0.114 * 50 = 124.2
         check(ImageBuffer::from_pixel(1, 1, Rgb([200_u8, 100, 50])).into(), 124);
         check(ImageBuffer::from_pixel(1, 1, Rgba([200_u8, 100, 50, 255])).into(), 124);
-        check(ImageBuffer::from_pixel(1, 1, Luma([77_u16 * 257])).into(), 77);
         check(ImageBuffer::from_pixel(1, 1, LumaA([77_u16 * 257, 65_535])).into(), 77);
         check(ImageBuffer::from_pixel(1, 1, Rgb([65_535_u16, 65_535, 65_535])).into(), 255);
         check(
             ImageBuffer::from_pixel(1, 1, Rgba([51_400_u16, 25_700, 12_850, 65_535])).into(),
             124,
         );
+    }
+
+    #[test]
+    fn sixteen_bits_are_scaled_to_the_range_they_use() {
+        // 12 bits in 16, as many cameras store them.
+        let image: DynamicImage =
+            ImageBuffer::from_fn(3, 1, |x, _| Luma([[100_u16, 2100, 4000][x as usize]])).into();
+        let read = read_bytes(&bytes_of(&image, ImageFormat::Png), 100).unwrap();
+        let far = read.pixels().iter().zip([0_u8, 131, 255]).map(|(a, b)| a.abs_diff(b)).max();
+        assert!(far <= Some(2), "{:?}", read.pixels());
+    }
+
+    #[test]
+    fn a_mosaic_becomes_grey_and_an_image_with_colours_is_none() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let read = |image: DynamicImage| {
+            std::fs::write(file.path(), bytes_of(&image, ImageFormat::Png)).unwrap();
+            read_image(file.path(), 1000, Some(Mosaic::Rggb)).map_err(|e| e.to_string())
+        };
+        let mosaic = |x: u32, y: u32| [[60_u8, 120], [120, 40]][y as usize % 2][x as usize % 2];
+        let grey = read(ImageBuffer::from_fn(8, 6, |x, y| Luma([mosaic(x, y)])).into()).unwrap();
+        assert!(grey.pixels().iter().all(|pixel| *pixel == 120));
+        let problem = read(ImageBuffer::from_pixel(8, 6, Rgb([1_u8, 2, 3])).into()).unwrap_err();
+        assert!(problem.contains("has colours already"), "{problem}");
     }
 
     #[test]
@@ -435,7 +542,7 @@ mod tests {
 
     #[test]
     fn what_is_no_image_is_named() {
-        let problem = |path: &Path| read_image(path, MOST_PIXELS).unwrap_err().to_string();
+        let problem = |path: &Path| read_image(path, MOST_PIXELS, None).unwrap_err().to_string();
         let folder = tempfile::tempdir().unwrap();
         assert!(problem(Path::new("no/such.png")).contains("no/such.png"));
         assert!(problem(folder.path()).contains("is not a file"));
@@ -450,7 +557,7 @@ mod tests {
     fn a_folder_is_listed_by_name_and_to_the_bottom() {
         let folder = tempfile::tempdir().unwrap();
         let empty = images_in(folder.path()).unwrap_err().to_string();
-        assert!(empty.contains("holds no images"), "{empty}");
+        assert!(empty.contains("holds no images; their names end in .png, .jpg"), "{empty}");
         std::fs::create_dir(folder.path().join("b")).unwrap();
         for name in ["c.PNG", "a.jpeg", "b/2.jpg", "b/1.png", ".hidden.png", "notes.txt"] {
             std::fs::write(folder.path().join(name), []).unwrap();

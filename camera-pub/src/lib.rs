@@ -1,17 +1,21 @@
 //! Light to frames: images are published with their stamp, and with the camera's calibration and mount.
 //!
-//! Frames come from image files. The crate also reads images and calibrations for programs that publish nothing.
+//! Frames come from image files. The crate also reads images, videos and calibrations for programs that publish nothing.
 //! It knows no marker, no vehicle and no detector.
 //!
 //! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, [`image`] reads image files,
-//! [`calibration`] reads calibration files.
+//! [`video`] reads videos, [`calibration`] reads calibration files.
 
 pub mod calibration;
 pub mod config;
 pub mod image;
 pub mod service;
+pub mod video;
 
 pub use calibration::{CalibrationError, read_calibration};
 pub use config::Config;
-pub use image::{ImageError, MOST_PIXELS, images_in, read_image};
+pub use image::{
+    IMAGE_EXTENSIONS, ImageError, MOST_PIXELS, decode_image, files_in, images_in, read_image,
+};
 pub use service::run;
+pub use video::{Picture, VIDEO_EXTENSIONS, Video, VideoError, VideoFrame, is_video};

@@ -7,13 +7,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use geometry::{CameraModel, Distortion};
+use imaging::Mosaic;
 use jpeg_encoder::{ColorType, Encoder};
-use messages::{CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
+use messages::{BayerPattern, CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
 use crate::config::Config;
-use crate::image::{Decoded, image_size, images_in};
+use crate::image::{Decoded, frame_bytes, images_in};
 
 /// Images whose size is looked up at the start, to make room for the largest in shared memory. Frames that are larger
 /// than these are published all the same, by a copy.
@@ -79,7 +80,7 @@ struct Found {
     images: Vec<PathBuf>,
     /// Width and height of the first image that can be read, in pixels.
     first_size: (usize, usize),
-    /// Pixels of the largest image that was measured.
+    /// Bytes of the largest frame that was measured.
     largest: usize,
 }
 
@@ -108,8 +109,8 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
         bail!("none of the {} images can be read; the first one: {problem}", images.len());
     };
     let sizes =
-        images.iter().take(IMAGES_MEASURED).filter_map(|path| image_size(path, most_pixels).ok());
-    let largest = sizes.map(|(width, height)| width.saturating_mul(height)).max();
+        images.iter().take(IMAGES_MEASURED).filter_map(|path| frame_bytes(path, most_pixels).ok());
+    let largest = sizes.max();
     Ok(Found { images, first_size, largest: largest.unwrap_or(first_size.0 * first_size.1) })
 }
 
@@ -166,6 +167,7 @@ impl Pace {
 struct Prepared {
     width: usize,
     height: usize,
+    format: PixelFormat,
     pixels: Loan,
     jpeg: Option<Vec<u8>>,
 }
@@ -238,15 +240,18 @@ impl Stream {
                 "An image is not of the size that the camera info states"
             );
         }
-        let mut pixels = self.frames.loan(width * height);
-        image.write_grey(&mut pixels);
+        let mosaic = self.config.source.mosaic()?;
+        let format = pixel_format(image.raw_bits(), mosaic);
+        let bytes = format.bytes_per_pixel().unwrap_or(1);
+        let mut pixels = self.frames.loan(width * height * bytes);
+        image.write_samples(&mut pixels);
         self.health.latency("read", began.elapsed());
-        let jpeg = if self.jpegs.has_subscribers().await {
-            self.encode(&pixels, width, height)
-        } else {
-            None
+        let jpeg = match self.jpegs.has_subscribers().await {
+            true if format == PixelFormat::Mono8 => self.encode(&pixels, width, height),
+            true => self.encode(image.grey(mosaic).pixels(), width, height),
+            false => None,
         };
-        Ok(Prepared { width, height, pixels, jpeg })
+        Ok(Prepared { width, height, format, pixels, jpeg })
     }
 
     fn encode(&self, pixels: &[u8], width: usize, height: usize) -> Option<Vec<u8>> {
@@ -277,7 +282,7 @@ impl Stream {
             exposure_ns: 0,
             width: frame.width as u32,
             height: frame.height as u32,
-            format: PixelFormat::Mono8,
+            format: frame.format,
         };
         self.frames.publish(&header, frame.pixels).await;
         if let Some(jpeg) = frame.jpeg {
@@ -287,5 +292,21 @@ impl Stream {
             self.jpegs.publish(&header, bytes).await;
         }
         self.sequence += 1;
+    }
+}
+
+/// The format of a frame whose samples have so many bits; an image that is not raw is published in grey.
+fn pixel_format(raw_bits: Option<u32>, mosaic: Option<Mosaic>) -> PixelFormat {
+    let pattern = mosaic.map(|mosaic| match mosaic {
+        Mosaic::Rggb => BayerPattern::Rggb,
+        Mosaic::Grbg => BayerPattern::Grbg,
+        Mosaic::Gbrg => BayerPattern::Gbrg,
+        Mosaic::Bggr => BayerPattern::Bggr,
+    });
+    match (raw_bits, pattern) {
+        (Some(9..), Some(pattern)) => PixelFormat::Bayer16(pattern),
+        (Some(9..), None) => PixelFormat::Mono16,
+        (Some(_), Some(pattern)) => PixelFormat::Bayer8(pattern),
+        _ => PixelFormat::Mono8,
     }
 }

@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use camera_pub::Config;
 use image::{GrayImage, Luma, RgbImage};
-use messages::{PixelFormat, topic};
+use messages::{BayerPattern, PixelFormat, topic};
 use node::{Identity, Layers, Node, Shutdown, ZenohSource, now_ns};
 use tokio::time::timeout;
 
@@ -89,6 +89,24 @@ async fn images_become_frames_in_order_and_the_unreadable_are_counted() -> anyho
     ensure!(failed("image that cannot be read").is_some_and(|count| count >= 2), "{health:?}");
     ensure!(failed("image of another size").is_some(), "{health:?}");
     ensure!(health.drops.is_empty(), "{health:?}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn sixteen_bits_behind_a_mosaic_are_published_as_they_are() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let image = image::ImageBuffer::from_fn(6, 4, |x, y| Luma([(1000 * x + y) as u16]));
+    image.save(folder.path().join("1.png"))?;
+    let port = free_port()?;
+    let (camera, viewer) = (open("camera-pub", port).await?, open("gcs-bridge", port).await?);
+    let config = config(folder.path(), &["source.rate_hz=50", "source.bayer=GBRG"])?;
+    let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
+    let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+    ensure!(frame.header.format == PixelFormat::Bayer16(BayerPattern::Gbrg));
+    ensure!(frame.bytes().len() == 6 * 4 * 2 && frame.bytes()[2..4] == 1000_u16.to_le_bytes());
+    ensure!(camera.health().report(camera.identity(), now_ns()).drops.is_empty());
+    service.abort();
     Ok(())
 }
 

@@ -24,6 +24,33 @@ pub enum Mosaic {
     Bggr,
 }
 
+/// A text that names no mosaic.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NoMosaic(String);
+
+impl std::fmt::Display for NoMosaic {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "`{}` is no mosaic; there are RGGB, GRBG, GBRG and BGGR", self.0)
+    }
+}
+
+impl std::error::Error for NoMosaic {}
+
+impl std::str::FromStr for Mosaic {
+    type Err = NoMosaic;
+
+    /// Reads the colours of the first two rows of two pixels, as in `RGGB`.
+    fn from_str(text: &str) -> Result<Self, NoMosaic> {
+        match text.to_ascii_uppercase().as_str() {
+            "RGGB" => Ok(Self::Rggb),
+            "GRBG" => Ok(Self::Grbg),
+            "GBRG" => Ok(Self::Gbrg),
+            "BGGR" => Ok(Self::Bggr),
+            _ => Err(NoMosaic(text.to_owned())),
+        }
+    }
+}
+
 /// Makes raw images 8-bit grey; keeps its memory from image to image.
 #[derive(Clone, Debug, Default)]
 pub struct Converter {
@@ -275,6 +302,12 @@ mod tests {
         let data = wide(&levels);
         let view = converter.convert(&data, 1000, 100, format).unwrap();
         assert_eq!((view.at(0, 0), view.at(7, 0), view.at(500, 99)), (0, 255, 255));
+    }
+
+    #[test]
+    fn mosaics_are_read_by_their_colours() {
+        assert_eq!("rggb".parse(), Ok(Mosaic::Rggb));
+        assert!("RGB".parse::<Mosaic>().unwrap_err().to_string().contains("BGGR"));
     }
 
     #[test]

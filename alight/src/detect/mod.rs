@@ -1,21 +1,27 @@
-//! `alight detect`: markers in image files, one line an image.
+//! `alight detect`: markers in image files and videos, one line an image.
+
+mod picture;
+mod source;
 
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 use std::io::{ErrorKind, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
-use camera_pub::{MOST_PIXELS, images_in, read_calibration, read_image};
+use camera_pub::read_calibration;
 use clap::{Args, ValueEnum};
-use fiducial::{Detector, Marker, Observation, Settings};
+use fiducial::{Detector, Marker, MarkerPose, Observation, PoseSolution, Settings, Tracker};
 use geometry::{CameraModel, Pixel};
-use imaging::GrayImage;
+use imaging::{GrayImage, Mosaic};
 use serde::Serialize;
+
+use picture::Gallery;
+use source::{Item, Source};
 
 /// Images that may be done before the one whose turn it is to be printed, for each thread.
 const AHEAD: usize = 4;
@@ -39,7 +45,17 @@ pub(crate) struct DetectArgs {
     /// What is printed: text for people, or one JSON object a line.
     #[arg(long, value_enum, default_value_t = Format::Text)]
     format: Format,
-    /// Image files (PNG, JPEG), and folders of them.
+    /// The colours in front of the pixels of grey images that are a sensor's raw samples: RGGB, GRBG, GBRG or BGGR.
+    #[arg(long, value_name = "PATTERN")]
+    bayer: Option<Mosaic>,
+    /// Look first where the markers of the last images should be by now; one image after the other.
+    #[arg(long, conflicts_with = "threads")]
+    track: bool,
+    /// Folder for annotated pictures: outlines, ids, confidence, and the axes of poses.
+    #[arg(long, value_name = "DIR")]
+    draw: Option<PathBuf>,
+    /// Image files (PNG of 8 or 16 bits, JPEG), videos (Motion JPEG as AVI or stream, H.264 as MP4 or stream), and folders
+    /// of them.
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
 }
@@ -67,26 +83,12 @@ pub(crate) fn run(args: &DetectArgs) -> anyhow::Result<ExitCode> {
         (None, Some(focal_px)) => Lens::Ideal { focal_px },
         (None, None) => Lens::Unknown,
     };
-    let images = list(&args.images);
     let processors = || std::thread::available_parallelism().map_or(1, usize::from);
-    let threads = args.threads.map_or_else(processors, usize::from).min(images.len()).max(1);
-    let examiner = Examiner { markers: &args.markers, lens, was_warned: AtomicBool::new(false) };
-    let printed = examine_all(&images, &examiner, threads, args.format, std::io::stdout())?;
+    let threads = if args.track { 1 } else { args.threads.map_or_else(processors, usize::from) };
+    let examiner = Examiner::new(args, lens)?;
+    let source = Source::new(&args.images);
+    let printed = examine_all(source, &examiner, threads, args.format, std::io::stdout())?;
     Ok(if printed.unreadable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
-}
-
-/// An image, or a folder with the reason why there are none in it.
-type Listed = Result<PathBuf, (PathBuf, String)>;
-
-fn list(paths: &[PathBuf]) -> Vec<Listed> {
-    let mut listed = Vec::new();
-    for path in paths {
-        match images_in(path) {
-            Ok(images) => listed.extend(images.into_iter().map(Ok)),
-            Err(problem) => listed.push(Err((path.clone(), problem.to_string()))),
-        }
-    }
-    listed
 }
 
 /// How poses are found.
@@ -102,51 +104,85 @@ enum Lens {
 /// Looks for markers in one image after the other.
 struct Examiner<'a> {
     markers: &'a [Marker],
+    mosaic: Option<Mosaic>,
     lens: Lens,
+    tracks: bool,
+    gallery: Option<Gallery>,
     was_warned: AtomicBool,
 }
 
-impl Examiner<'_> {
-    fn detector(&self) -> anyhow::Result<Detector> {
-        Ok(Detector::new(self.markers, Settings::default())?)
+/// What a thread needs to look for markers.
+struct Worker {
+    detector: Detector,
+    tracker: Option<Tracker>,
+}
+
+impl<'a> Examiner<'a> {
+    fn new(args: &'a DetectArgs, lens: Lens) -> anyhow::Result<Self> {
+        Ok(Self {
+            markers: &args.markers,
+            mosaic: args.bayer,
+            lens,
+            tracks: args.track,
+            gallery: args.draw.as_deref().map(Gallery::new).transpose()?,
+            was_warned: AtomicBool::new(false),
+        })
     }
 
-    fn examine(&self, listed: &Listed, detector: &mut Detector) -> Line {
-        let path = match listed {
-            Ok(path) => path,
-            Err((path, error)) => return Line::error(path, error.clone()),
-        };
-        let image = match read_image(path, MOST_PIXELS) {
-            Ok(image) => image,
-            Err(problem) => return Line::error(path, problem.to_string()),
-        };
+    fn worker(&self) -> anyhow::Result<Worker> {
+        let detector = Detector::new(self.markers, Settings::default())?;
+        Ok(Worker { detector, tracker: self.tracks.then(Tracker::default) })
+    }
+
+    fn examine(&self, item: Item, worker: &mut Worker) -> Line {
+        let (name, time_s, is_frame) = (item.name.clone(), item.time_s, item.is_frame);
+        let error = |error: String| Line::Error { image: name.clone(), error };
         // A fault in one image must neither cost the others nor leave them waiting for its line.
-        match catch_unwind(AssertUnwindSafe(|| self.detect(&image, path, detector))) {
-            Ok(line) => line,
+        let examined = catch_unwind(AssertUnwindSafe(|| {
+            let image = item.into_image(self.mosaic)?;
+            let found = self.detect(&image, &name, time_s, worker)?;
+            Ok(Line::Image { image: name.clone(), time_s: is_frame.then_some(time_s), found })
+        }));
+        match examined {
+            Ok(Ok(line)) => line,
+            Ok(Err(problem)) => error(problem),
             Err(_) => {
-                if let Ok(fresh) = self.detector() {
-                    *detector = fresh;
+                if let Ok(fresh) = self.worker() {
+                    *worker = fresh;
                 }
-                Line::error(path, "the detector failed on this image; please report it".to_owned())
+                error("the detector failed on this image; please report it".to_owned())
             }
         }
     }
 
-    fn detect(&self, image: &GrayImage, path: &Path, detector: &mut Detector) -> Line {
+    fn detect(
+        &self,
+        image: &GrayImage,
+        name: &str,
+        time_s: f64,
+        worker: &mut Worker,
+    ) -> Result<Found, String> {
         let Some(view) = image.view() else {
-            return Line::error(path, "an image without pixels".to_owned());
+            return Err("an image without pixels".to_owned());
         };
-        let camera = self.camera(image, path);
+        let camera = self.camera(image, name);
+        let Worker { detector, tracker } = worker;
         let began = Instant::now();
-        let detections =
-            detector.detect(view, camera.as_ref(), &mut ()).iter().map(Detection::from).collect();
+        let found = match tracker {
+            Some(tracker) => tracker.detect(detector, view, camera.as_ref(), time_s, &mut ()),
+            None => detector.detect(view, camera.as_ref(), &mut ()),
+        };
         let detect_ms = began.elapsed().as_secs_f64() * 1e3;
-        let image_name = path.display().to_string();
-        let (width, height) = (image.width(), image.height());
-        Line::Image { image: image_name, width, height, detect_ms, detections }
+        if let Some(gallery) = &self.gallery {
+            gallery
+                .add(name, image, found, camera.as_ref())
+                .map_err(|problem| format!("{problem:#}"))?;
+        }
+        let detections = found.iter().map(Detection::from).collect();
+        Ok(Found { width: image.width(), height: image.height(), detect_ms, detections })
     }
 
-    fn camera(&self, image: &GrayImage, path: &Path) -> Option<CameraModel> {
+    fn camera(&self, image: &GrayImage, name: &str) -> Option<CameraModel> {
         let (width, height) = (image.width() as u32, image.height() as u32);
         match self.lens {
             Lens::Unknown => None,
@@ -156,20 +192,19 @@ impl Examiner<'_> {
             }
             Lens::Calibrated(camera) => {
                 if !self.was_warned.swap(true, Ordering::Relaxed) {
-                    Self::warn_of_size(&camera, image, path);
+                    Self::warn_of_size(&camera, image, name);
                 }
                 None
             }
         }
     }
 
-    fn warn_of_size(camera: &CameraModel, image: &GrayImage, path: &Path) {
+    fn warn_of_size(camera: &CameraModel, image: &GrayImage, name: &str) {
         // Nothing can be done about a standard error that is closed.
         let _ = writeln!(
             std::io::stderr(),
-            "warning: {} has {} x {} pixels, but the calibration is for {} x {}: no poses there, nor in other \
+            "warning: {name} has {} x {} pixels, but the calibration is for {} x {}: no poses there, nor in other \
              images of another size",
-            path.display(),
             image.width(),
             image.height(),
             camera.width,
@@ -182,8 +217,25 @@ impl Examiner<'_> {
 #[derive(Debug, Serialize)]
 #[serde(untagged)]
 enum Line {
-    Image { image: String, width: usize, height: usize, detect_ms: f64, detections: Vec<Detection> },
-    Error { image: String, error: String },
+    Image {
+        image: String,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        time_s: Option<f64>,
+        #[serde(flatten)]
+        found: Found,
+    },
+    Error {
+        image: String,
+        error: String,
+    },
+}
+
+#[derive(Debug, Serialize)]
+struct Found {
+    width: usize,
+    height: usize,
+    detect_ms: f64,
+    detections: Vec<Detection>,
 }
 
 #[derive(Debug, Serialize)]
@@ -191,8 +243,11 @@ struct Detection {
     family: &'static str,
     id: Option<u32>,
     centre_px: [f64; 2],
+    /// xx, xy, yy.
+    centre_covariance_px2: [f64; 3],
     corners_px: Option<[[f64; 2]; 4]>,
     size_px: f64,
+    wrong_bits: u8,
     confidence: f64,
     pose: Option<Pose>,
 }
@@ -202,40 +257,65 @@ struct Pose {
     translation_m: [f64; 3],
     rotation_wxyz: [f64; 4],
     reprojection_rms_px: f64,
+    /// The upper triangle row by row: translation, then rotation vector, in the camera frame.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    covariance: Vec<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    alternative: Option<Box<Pose>>,
+}
+
+impl From<&PoseSolution> for Pose {
+    fn from(solution: &PoseSolution) -> Self {
+        let origin = solution.camera_from_marker.origin();
+        Self {
+            translation_m: [origin.x(), origin.y(), origin.z()],
+            rotation_wxyz: solution.camera_from_marker.rotation().wxyz(),
+            reprojection_rms_px: solution.reprojection_rms_px,
+            covariance: Vec::new(),
+            alternative: None,
+        }
+    }
+}
+
+impl From<&MarkerPose> for Pose {
+    fn from(pose: &MarkerPose) -> Self {
+        let best = PoseSolution {
+            camera_from_marker: pose.camera_from_marker,
+            reprojection_rms_px: pose.reprojection_rms_px,
+        };
+        let cells = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
+        Self {
+            covariance: cells.map(|at| pose.covariance[at]).collect(),
+            alternative: pose.alternative.as_ref().map(|other| Box::new(Self::from(other))),
+            ..Self::from(&best)
+        }
+    }
 }
 
 impl From<&Observation> for Detection {
     fn from(found: &Observation) -> Self {
         let pixel = |p: Pixel| [p.x, p.y];
-        let pose = found.pose.map(|pose| {
-            let origin = pose.camera_from_marker.origin();
-            Pose {
-                translation_m: [origin.x(), origin.y(), origin.z()],
-                rotation_wxyz: pose.camera_from_marker.rotation().wxyz(),
-                reprojection_rms_px: pose.reprojection_rms_px,
-            }
-        });
+        let spread = &found.centre_covariance_px2;
         Self {
             family: found.family.name(),
             id: found.id,
             centre_px: pixel(found.centre),
+            centre_covariance_px2: [spread.m11, spread.m12, spread.m22],
             corners_px: found.corners.map(|corners| corners.map(pixel)),
             size_px: found.size_px,
+            wrong_bits: found.wrong_bits,
             confidence: found.confidence,
-            pose,
+            pose: found.pose.as_ref().map(Pose::from),
         }
     }
 }
 
 impl Line {
-    fn error(path: &Path, error: String) -> Self {
-        Self::Error { image: path.display().to_string(), error }
-    }
-
     fn as_text(&self) -> String {
         match self {
             Self::Error { image, error } => format!("{image}  error: {error}\n"),
-            Self::Image { image, width, height, detect_ms, detections } => {
+            Self::Image { image, found, .. } => {
+                let Found { width, height, detect_ms, detections } = found;
                 let count = detections.len();
                 let markers = if count == 1 { "marker" } else { "markers" };
                 let mut text = format!(
@@ -290,21 +370,20 @@ struct Totals {
 /// Looks at all images with several threads, and prints their lines in the order of the images. Whoever reads the
 /// output may stop reading, which ends the work.
 fn examine_all<W: Write + Send>(
-    images: &[Listed],
+    source: Source,
     examiner: &Examiner<'_>,
     threads: usize,
     format: Format,
     out: W,
 ) -> anyhow::Result<Totals> {
-    let detectors = (0..threads).map(|_| examiner.detector()).collect::<Result<Vec<_>, _>>()?;
-    let queue = Queue::new(images.len(), threads * AHEAD, format, out);
+    let workers = (0..threads).map(|_| examiner.worker()).collect::<Result<Vec<_>, _>>()?;
+    let queue = Queue::new(source, threads * AHEAD, format, out);
     std::thread::scope(|scope| {
-        for mut detector in detectors {
+        for mut worker in workers {
             let queue = &queue;
             scope.spawn(move || {
-                while let Some(index) = queue.take() {
-                    let Some(listed) = images.get(index) else { break };
-                    queue.finish(index, examiner.examine(listed, &mut detector));
+                while let Some((index, item)) = queue.take() {
+                    queue.finish(index, examiner.examine(item, &mut worker));
                 }
             });
         }
@@ -313,9 +392,10 @@ fn examine_all<W: Write + Send>(
     printer.end()
 }
 
-/// Hands out the images' numbers and takes their lines, so that only few lines ever wait for an earlier one.
+/// Hands out the images with their numbers and takes their lines, so that only few lines ever wait for an earlier one.
 struct Queue<W> {
-    images: usize,
+    /// Locked before the printer, never after it.
+    source: Mutex<Source>,
     window: usize,
     printer: Mutex<Printer<W>>,
     room: Condvar,
@@ -333,7 +413,7 @@ struct Printer<W> {
 }
 
 impl<W: Write> Queue<W> {
-    fn new(images: usize, window: usize, format: Format, out: W) -> Self {
+    fn new(source: Source, window: usize, format: Format, out: W) -> Self {
         let printer = Printer {
             out,
             format,
@@ -342,24 +422,28 @@ impl<W: Write> Queue<W> {
             totals: Totals::default(),
             stopped_by: None,
         };
-        Self { images, window, printer: Mutex::new(printer), room: Condvar::new() }
+        let source = Mutex::new(source);
+        Self { source, window, printer: Mutex::new(printer), room: Condvar::new() }
     }
 
-    /// The number of the next image; `None` when there is no more to do.
-    fn take(&self) -> Option<usize> {
+    /// The next image and its number; `None` when there is no more to do.
+    fn take(&self) -> Option<(usize, Item)> {
+        let mut source = self.source.lock().unwrap_or_else(PoisonError::into_inner);
         let has_to_wait = |printer: &mut Printer<W>| {
-            printer.stopped_by.is_none()
-                && printer.next < self.images
-                && printer.waiting.len() >= self.window
+            printer.stopped_by.is_none() && printer.waiting.len() >= self.window
         };
-        let mut printer =
+        let printer =
             self.room.wait_while(self.lock(), has_to_wait).unwrap_or_else(PoisonError::into_inner);
-        if printer.stopped_by.is_some() || printer.next >= self.images {
+        if printer.stopped_by.is_some() {
             return None;
         }
+        drop(printer);
+        // Decoding a video takes time, in which lines can be printed.
+        let item = source.next()?;
+        let mut printer = self.lock();
         printer.waiting.push_back(None);
         printer.next += 1;
-        Some(printer.next - 1)
+        Some((printer.next - 1, item))
     }
 
     /// Takes the line of image `index`, and prints all whose turn has come.
@@ -387,7 +471,7 @@ impl<W: Write> Printer<W> {
     fn print(&mut self, line: &Line) {
         self.totals.images += 1;
         match line {
-            Line::Image { detections, .. } => self.totals.detections += detections.len(),
+            Line::Image { found, .. } => self.totals.detections += found.detections.len(),
             Line::Error { .. } => self.totals.unreadable += 1,
         }
         let text = match self.format {
@@ -473,10 +557,9 @@ mod tests {
             Some(focal_px) => Lens::Ideal { focal_px },
             None => Lens::Unknown,
         };
-        let examiner =
-            Examiner { markers: &args.markers, lens, was_warned: AtomicBool::new(false) };
+        let examiner = Examiner::new(&args, lens)?;
         let threads = usize::from(args.threads.unwrap_or(1));
-        examine_all(&list(&args.images), &examiner, threads, args.format, out)
+        examine_all(Source::new(&args.images), &examiner, threads, args.format, out)
     }
 
     #[test]
@@ -527,6 +610,35 @@ mod tests {
     }
 
     #[test]
+    fn a_video_is_followed_frame_by_frame_and_drawn() {
+        let folder = tempfile::tempdir().unwrap();
+        let video = folder.path().join("flight.mjpeg");
+        let mut frame = std::io::Cursor::new(Vec::new());
+        picture_of_rings(150.0).write_to(&mut frame, image::ImageFormat::Jpeg).unwrap();
+        std::fs::write(&video, frame.into_inner().repeat(4)).unwrap();
+        let drawn = folder.path().join("drawn");
+        let mut out = Vec::new();
+        let text = ["--marker", "rings:0.2", "--focal-px", "300", "--format", "jsonl", "--track"];
+        let (video, drawn_text) = (video.to_str().unwrap(), drawn.to_str().unwrap());
+        let totals = examine(&[&text[..], &["--draw", drawn_text, video]].concat(), &mut out);
+        assert_eq!(totals.unwrap(), Totals { images: 4, detections: 4, unreadable: 0 });
+        let lines: Vec<Value> =
+            String::from_utf8(out).unwrap().lines().map(|l| l.parse().unwrap()).collect();
+        assert_eq!(lines[3]["image"], format!("{video}#3"));
+        assert!((lines[3]["time_s"].as_f64().unwrap() - 0.12).abs() < 1e-9);
+        let found = &lines[3]["detections"][0];
+        assert_eq!(found["pose"]["covariance"].as_array().unwrap().len(), 21);
+        assert_eq!(found["centre_covariance_px2"].as_array().unwrap().len(), 3);
+        assert_eq!(found["wrong_bits"], 0);
+        let pictures: Vec<_> =
+            std::fs::read_dir(&drawn).unwrap().map(|e| e.unwrap().path()).collect();
+        assert_eq!(pictures.len(), 4);
+        let picture = image::open(&pictures[0]).unwrap().to_rgb8();
+        assert_eq!(picture.dimensions(), (960, 720));
+        assert!(picture.pixels().filter(|p| p.0[1] > 200 && p.0[0] < 60).count() > 100);
+    }
+
+    #[test]
     fn text_ends_with_the_totals() {
         let folder = folder();
         let mut out = Vec::new();
@@ -572,15 +684,17 @@ mod tests {
 
     #[test]
     fn a_slow_image_holds_back_only_a_window_of_lines() {
-        let queue = Queue::new(100, 3, Format::Jsonl, Vec::new());
-        let line = |i: usize| Line::error(Path::new(&i.to_string()), String::new());
-        assert_eq!([queue.take(), queue.take(), queue.take()], [Some(0), Some(1), Some(2)]);
+        let source = Source::new(&vec![PathBuf::from("a.png"); 100]);
+        let queue = Queue::new(source, 3, Format::Jsonl, Vec::new());
+        let line = |i: usize| Line::Error { image: i.to_string(), error: String::new() };
+        let take = || queue.take().map(|(index, _)| index);
+        assert_eq!([take(), take(), take()], [Some(0), Some(1), Some(2)]);
         queue.finish(2, line(2));
         queue.finish(1, line(1));
         assert_eq!(queue.lock().waiting.len(), 3);
         queue.finish(0, line(0));
         assert_eq!(queue.lock().waiting.len(), 0);
-        assert_eq!(queue.take(), Some(3));
+        assert_eq!(take(), Some(3));
     }
 
     #[test]
@@ -596,6 +710,8 @@ mod tests {
         check(&["--marker", "rings", "--focal-px=-3", "a.png"], "above 0");
         check(&["--marker", "rings", "--focal-px=nan", "a.png"], "above 0");
         check(&["--marker", "rings", "--format", "xml", "a.png"], "jsonl");
+        check(&["--marker", "rings", "--bayer", "RGB", "a.png"], "there are RGGB");
+        check(&["--marker", "rings", "--track", "--threads", "2", "a.png"], "cannot be used with");
         let twice = examine(&["--marker", "rings", "--marker", "rings:1", "a.png"], Vec::new());
         assert!(twice.unwrap_err().to_string().contains("listed twice"));
     }

@@ -1,0 +1,270 @@
+//! Annotated pictures: what was found, drawn where it was found.
+
+use std::f64::consts::TAU;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use fiducial::Observation;
+use fiducial::canvas::{Colour, RgbImageBuf};
+use geometry::{CameraModel, Pixel, Point, Transform};
+use imaging::{GrayImage, GrayView};
+
+const GREEN: Colour = [40, 230, 80];
+const RED: Colour = [255, 60, 60];
+const BLUE: Colour = [70, 140, 255];
+const YELLOW: Colour = [255, 235, 80];
+const WHITE: Colour = [255, 255, 255];
+
+/// Pictures narrower than this are enlarged, so that labels have room.
+const LEAST_WIDTH: usize = 900;
+/// Markers smaller than this get a circle about them, in pixels of the drawing.
+const EASILY_SEEN_PX: f64 = 40.0;
+
+/// Draws pictures into a folder.
+#[derive(Debug)]
+pub(super) struct Gallery {
+    folder: PathBuf,
+}
+
+impl Gallery {
+    /// Makes the folder if it is not there.
+    ///
+    /// # Errors
+    /// When it cannot be made.
+    pub(super) fn new(folder: &Path) -> anyhow::Result<Self> {
+        std::fs::create_dir_all(folder)
+            .with_context(|| format!("making the folder {folder:?} for annotated pictures"))?;
+        Ok(Self { folder: folder.to_owned() })
+    }
+
+    /// Writes the picture of an image.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub(super) fn add(
+        &self,
+        name: &str,
+        image: &GrayImage,
+        found: &[Observation],
+        camera: Option<&CameraModel>,
+    ) -> anyhow::Result<()> {
+        let path = self.folder.join(file_name(name));
+        let Some(view) = image.view() else { return Ok(()) };
+        let drawn = draw(view, found, camera);
+        let (width, height) = (drawn.width as u32, drawn.height as u32);
+        image::save_buffer(&path, &drawn.data, width, height, image::ColorType::Rgb8)
+            .with_context(|| format!("writing the annotated picture {path:?}"))
+    }
+}
+
+/// The name of an image as that of one file: folders become parts of the name, so that no two share one.
+fn file_name(name: &str) -> String {
+    let parts = name.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));
+    format!("{}.png", parts.collect::<Vec<_>>().join("_").replace(['#', ':'], "-"))
+}
+
+fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>) -> RgbImageBuf {
+    let enlarged = LEAST_WIDTH.div_ceil(view.width()).clamp(1, 4);
+    let mut brush = Brush {
+        canvas: RgbImageBuf::default(),
+        scale: enlarged as f64,
+        dot_px: (view.width() * enlarged / 1000).clamp(1, 6),
+    };
+    brush.lay_ground(view, enlarged);
+    for seen in found {
+        brush.outline(seen, camera);
+    }
+    for seen in found {
+        brush.axes(seen, camera);
+        brush.label(seen);
+    }
+    if found.is_empty() {
+        brush.canvas.text([0.0, 0.0], "no marker", brush.dot_px, YELLOW);
+    }
+    brush.canvas
+}
+
+struct Brush {
+    canvas: RgbImageBuf,
+    scale: f64,
+    /// Width of a dot of a letter, in pixels of the drawing.
+    dot_px: usize,
+}
+
+impl Brush {
+    fn lay_ground(&mut self, view: GrayView<'_>, enlarged: usize) {
+        if enlarged == 1 {
+            self.canvas.copy(view);
+            return;
+        }
+        let mut ground = GrayImage::filled(view.width() * enlarged, view.height() * enlarged, 0);
+        for y in 0..ground.height() {
+            let row = view.row(y / enlarged);
+            for (x, pixel) in ground.row_mut(y).iter_mut().enumerate() {
+                *pixel = row.get(x / enlarged).copied().unwrap_or_default();
+            }
+        }
+        if let Some(ground) = ground.view() {
+            self.canvas.copy(ground);
+        }
+    }
+
+    /// A place of the image in the drawing.
+    fn place(&self, pixel: Pixel) -> [f64; 2] {
+        [pixel.x, pixel.y].map(|at| (at + 0.5) * self.scale - 0.5)
+    }
+
+    fn line_px(&self) -> f64 {
+        self.dot_px as f64
+    }
+
+    /// The marker's outline; at its own top-left corner a red mark.
+    fn outline(&mut self, seen: &Observation, camera: Option<&CameraModel>) {
+        let (line, centre) = (self.line_px(), self.place(seen.centre));
+        match seen.corners {
+            Some(corners) => {
+                let corners = corners.map(|corner| self.place(corner));
+                self.canvas.polygon(&corners, line, GREEN);
+                self.canvas.circle(corners[0], 2.0 * line, RED);
+                self.canvas.circle(corners[0], 2.0 * line + 1.0, RED);
+            }
+            None => {
+                let rim = self.rim(seen, camera);
+                self.canvas.polygon(&rim, line, GREEN);
+            }
+        }
+        if seen.size_px * self.scale < EASILY_SEEN_PX {
+            self.canvas.circle(centre, EASILY_SEEN_PX, YELLOW);
+        }
+    }
+
+    /// The rim of a round marker: of its pose, or else a circle.
+    fn rim(&self, seen: &Observation, camera: Option<&CameraModel>) -> Vec<[f64; 2]> {
+        const POINTS: u32 = 90;
+        let turns = (0..POINTS).map(|i| f64::from(i) * TAU / f64::from(POINTS));
+        let of_pose = seen.pose.zip(camera).map(|(pose, camera)| {
+            let radius_m = size_m(seen, camera) / 2.0;
+            let at = |turn: f64| Point::new(radius_m * turn.cos(), radius_m * turn.sin(), 0.0);
+            let seen_at = |turn| camera.project(pose.camera_from_marker * at(turn));
+            turns.clone().filter_map(seen_at).map(|pixel| self.place(pixel)).collect::<Vec<_>>()
+        });
+        of_pose.unwrap_or_else(|| {
+            let radius = seen.size_px / 2.0;
+            let at = |turn: f64| {
+                Pixel::new(seen.centre.x + radius * turn.cos(), seen.centre.y + radius * turn.sin())
+            };
+            turns.map(|turn| self.place(at(turn))).collect()
+        })
+    }
+
+    /// The axes of the pose: x red, y green, z (towards the viewer) blue; without a pose a cross.
+    fn axes(&mut self, seen: &Observation, camera: Option<&CameraModel>) {
+        let (centre, line) = (self.place(seen.centre), self.line_px());
+        let Some((pose, camera)) = seen.pose.zip(camera) else {
+            let arm = (0.15 * seen.size_px * self.scale).clamp(3.0, 20.0);
+            let [x, y] = centre;
+            self.canvas.line([x - arm, y], [x + arm, y], line, RED);
+            self.canvas.line([x, y - arm], [x, y + arm], line, RED);
+            return;
+        };
+        let length_m = 0.5 * size_m(seen, camera);
+        let tips = [
+            (Point::new(length_m, 0.0, 0.0), RED),
+            (Point::new(0.0, length_m, 0.0), GREEN),
+            (Point::new(0.0, 0.0, length_m), BLUE),
+        ];
+        for (tip, colour) in tips {
+            if let Some(tip) = tip_of(camera, &pose.camera_from_marker, tip) {
+                self.canvas.line(centre, self.place(tip), 2.0 * line, colour);
+            }
+        }
+    }
+
+    /// Name, confidence, and where it is.
+    fn label(&mut self, seen: &Observation) {
+        let id = seen.id.map_or_else(String::new, |id| format!(":{id}"));
+        let wrong = match seen.wrong_bits {
+            0 => String::new(),
+            bits => format!("  {bits} wrong"),
+        };
+        let mut lines = vec![format!("{}{id}  {:.2}{wrong}", seen.family, seen.confidence)];
+        if let Some(pose) = &seen.pose {
+            let at = pose.camera_from_marker.origin();
+            lines.push(format!("{:.3}, {:.3}, {:.3} m", at.x(), at.y(), at.z()));
+        }
+        let [x, y] = self.place(seen.centre);
+        let reach = match seen.corners {
+            Some(corners) => corners.map(|c| self.place(c)[1] - y).into_iter().fold(0.0, f64::max),
+            None => seen.size_px * self.scale / 2.0,
+        };
+        let reach = if seen.size_px * self.scale < EASILY_SEEN_PX { EASILY_SEEN_PX } else { reach };
+        let dot = self.dot_px as f64;
+        for (index, text) in (0..).zip(&lines) {
+            let left = x - 3.0 * dot * text.len() as f64;
+            let top = y + reach + (4.0 + 9.0 * f64::from(index)) * dot;
+            let colour = if index == 0 { YELLOW } else { WHITE };
+            self.canvas.text([left, top], text, self.dot_px, colour);
+        }
+    }
+}
+
+/// About how large a marker of this pose is, in metres: the drawing need not know what was configured.
+fn size_m(seen: &Observation, camera: &CameraModel) -> f64 {
+    let Some(pose) = &seen.pose else { return 0.0 };
+    match seen.corners {
+        Some(corners) => {
+            // The corner and the centre on the marker's plane.
+            let at = |pixel: Pixel| on_plane(&pose.camera_from_marker, camera, pixel);
+            let away = |corner: Pixel| {
+                let (corner, centre) = (at(corner)?, at(seen.centre)?);
+                Some((corner.0 - centre.0).hypot(corner.1 - centre.1))
+            };
+            let known: Vec<f64> = corners.into_iter().filter_map(away).collect();
+            known.iter().sum::<f64>() / known.len().max(1) as f64 * std::f64::consts::SQRT_2
+        }
+        None => seen.size_px / camera.fx * pose.camera_from_marker.origin().z(),
+    }
+}
+
+/// Where the ray of a pixel meets the marker's plane, in the marker frame.
+fn on_plane(
+    camera_from_marker: &Transform<geometry::Camera, geometry::Marker>,
+    camera: &CameraModel,
+    pixel: Pixel,
+) -> Option<(f64, f64)> {
+    let ray = camera.unproject(pixel);
+    let marker_from_camera = camera_from_marker.inverse();
+    let origin = marker_from_camera.origin();
+    let direction = marker_from_camera.rotation() * ray;
+    let along = -origin.z() / direction.z();
+    let (x, y) = (origin.x() + along * direction.x(), origin.y() + along * direction.y());
+    (x.is_finite() && y.is_finite()).then_some((x, y))
+}
+
+fn tip_of(
+    camera: &CameraModel,
+    camera_from_marker: &Transform<geometry::Camera, geometry::Marker>,
+    tip: Point<geometry::Marker>,
+) -> Option<Pixel> {
+    camera.project(*camera_from_marker * tip)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_pictures_keep_their_folders_apart() {
+        assert_eq!(file_name("../a/b.c/1.jpg"), "a_b.c_1.jpg.png");
+        assert_eq!(file_name("/d/flight.avi#12"), "d_flight.avi-12.png");
+        assert_ne!(file_name("a/1.png"), file_name("b/1.png"));
+    }
+
+    #[test]
+    fn small_images_are_enlarged_and_say_when_there_is_nothing() {
+        let image = GrayImage::filled(300, 100, 80);
+        let drawn = draw(image.view().unwrap(), &[], None);
+        assert_eq!((drawn.width, drawn.height, drawn.data.len()), (900, 300, 900 * 300 * 3));
+        assert!(drawn.data.chunks(3).any(|pixel| pixel == YELLOW));
+    }
+}
