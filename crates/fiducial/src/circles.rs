@@ -172,10 +172,8 @@ impl Circles {
         let along = nc / nd;
         let arm = ray * along - self.centre;
         let rho = arm.norm();
-        if rho < 1e-12 {
-            return None;
-        }
-        let out = arm / rho;
+        // From the centre itself any way is outwards.
+        let out = if rho < 1e-12 { *u } else { arm / rho };
         let od = out.dot(ray);
         // How the distance in the plane changes from pixel to pixel.
         let per_pixel = |axis: usize, focal: f64| {
@@ -244,6 +242,21 @@ impl Circles {
         let turn = self.normal * self.normal.transpose() * ANY_ANGLE_VARIANCE;
         covariance.fixed_view_mut::<3, 3>(3, 3).add_assign(turn);
         covariance
+    }
+
+    /// The largest mean distance, in pixels, of one circle's edge points from it: circles of other radii have some.
+    pub(crate) fn bias_px(&self, points: &[EdgePoint], camera: &CameraModel) -> f64 {
+        let basis = self.basis();
+        let mut worst = 0.0_f64;
+        for circle in points.chunk_by(|a, b| a.radius == b.radius) {
+            let sum: f64 = circle
+                .iter()
+                .filter_map(|point| self.residual(&basis, point, camera))
+                .map(|(off, _)| off)
+                .sum();
+            worst = worst.max((sum / circle.len() as f64).abs());
+        }
+        worst
     }
 
     /// Leaves out the edge points that lie much further off than most.

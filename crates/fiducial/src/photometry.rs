@@ -20,12 +20,18 @@ const LEAST_DIAMETER_PX: f64 = 5.0;
 /// Up to this diameter all pixels take part, of larger markers those about the edges.
 const ALL_PIXELS_PX: f64 = 22.0;
 /// About as many pixels take part of a larger marker.
-const SPOTS: f64 = 360.0;
+const SPOTS: f64 = 300.0;
+/// Standard deviation, in pixels, of the blur of a lens in focus and of the pixel's own extent.
+const FOCUSED_PX: f64 = 0.6;
+/// Brighter pixels may be of any brightness.
+const WHITEST: f64 = 254.5;
 const MOST_STEPS: usize = 14;
 /// Pose (5), blur, black, white, and white's change across and down.
 const UNKNOWNS: usize = 10;
 /// A tilt, in radians, that is no longer a saddle of the fit: seen squarely, every tilt looks the same at first.
 const LEAST_START_TILT: f64 = 0.2;
+/// The pose tilted the other way is no alternative when it costs so many times more.
+const MOST_COST_OF_OTHER: f64 = 4.0;
 /// What is known of a normal before it is measured, as a standard deviation in radians.
 const PRIOR_NORMAL: f64 = 0.6;
 
@@ -74,6 +80,15 @@ pub(crate) struct Fit {
     cost: f64,
 }
 
+impl Fit {
+    /// Whether it is the marker and not something else of about its size: much closer to the image than a plain disc, with
+    /// two rings as black as one another.
+    pub(crate) fn is_marker(&self) -> bool {
+        const MOST_BESIDE_DISC: f64 = 0.12;
+        self.beside_disc < MOST_BESIDE_DISC && (0.8..1.25).contains(&self.balance)
+    }
+}
+
 /// The marker of this size that looks most like the image, from a pose that is nearly right, and the one tilted the
 /// other way where that is another. `spots` is working memory.
 pub(crate) fn refined(
@@ -84,77 +99,88 @@ pub(crate) fn refined(
     inverted: bool,
     spots: &mut Vec<Spot>,
 ) -> Option<(Fit, Option<Fit>)> {
-    gather(view, camera, start, size_m, spots)?;
-    if inverted {
-        for spot in spots.iter_mut() {
-            spot.grey = 255.0 - spot.grey;
-        }
+    spots.clear();
+    let around = Around { view, camera, size_m, inverted };
+    around.gather(start, FOCUSED_PX, spots)?;
+    let start = start.tilted_at_least(LEAST_START_TILT);
+    let mut first = Scene { spots, size_m, camera }.fitted(&start, f64::INFINITY)?;
+    // What lies beyond the paper is kept out once the blur is known.
+    if around.gather(&first.circles, first.blur_px, spots)? {
+        let start = first.circles.tilted_at_least(LEAST_START_TILT);
+        first = Scene { spots, size_m, camera }.fitted(&start, f64::INFINITY)?;
     }
     let scene = Scene { spots, size_m, camera };
-    let first = scene.fitted(&start.tilted_at_least(LEAST_START_TILT))?;
     let mirrored = first.circles.tilted_at_least(LEAST_START_TILT).mirrored();
-    let Some(second) = scene.fitted(&mirrored) else { return Some((first, None)) };
+    let hopeless = MOST_COST_OF_OTHER * first.cost;
+    let Some(second) = scene.fitted(&mirrored, hopeless) else { return Some((first, None)) };
     let (best, other) = if second.cost < first.cost { (second, first) } else { (first, second) };
     let same = best.circles.normal.angle(&other.circles.normal) < 0.02;
     Some((best, (!same).then_some(other)))
 }
 
-/// The pixels in and just around the marker; of a large one those about its edges.
-fn gather(
-    view: GrayView<'_>,
-    camera: &CameraModel,
-    circles: &Circles,
+/// Where spots are gathered.
+struct Around<'a> {
+    view: GrayView<'a>,
+    camera: &'a CameraModel,
     size_m: f64,
-    spots: &mut Vec<Spot>,
-) -> Option<()> {
-    spots.clear();
-    let outline = circles.outline(size_m / 2.0, camera)?;
-    let middle = project(circles.centre, camera)?;
-    let diameter_px = outline.major;
-    if !(LEAST_DIAMETER_PX..=MOST_DIAMETER_PX).contains(&diameter_px) {
-        return None;
-    }
-    let spot = |x: usize, y: usize, within: bool| {
-        let place = [x as f64, y as f64];
-        Spot {
-            ray: camera.unproject(Pixel::new(place[0], place[1])).coords,
-            offset: [place[0] - middle.x, place[1] - middle.y],
-            grey: f64::from(view.at(x, y)),
-            within,
+    inverted: bool,
+}
+
+impl Around<'_> {
+    /// The pixels in and just around the marker; of a large one those about its edges. False when they would be the same
+    /// as those of a lens in focus that are there already.
+    fn gather(&self, circles: &Circles, blur_px: f64, spots: &mut Vec<Spot>) -> Option<bool> {
+        let outline = circles.outline(self.size_m / 2.0, self.camera)?;
+        let middle = project(circles.centre, self.camera)?;
+        let diameter_px = outline.major;
+        if !(LEAST_DIAMETER_PX..=MOST_DIAMETER_PX).contains(&diameter_px) {
+            return None;
         }
-    };
-    if diameter_px > ALL_PIXELS_PX {
-        let around = |place: [f64; 2]| {
-            let (x, y) = (place[0].round(), place[1].round());
-            let inside =
-                x >= 0.0 && y >= 0.0 && x < view.width() as f64 && y < view.height() as f64;
-            inside.then_some((x as usize, y as usize))
+        // The paper is white for a ring's width around the marker.
+        let reach = |blur_px: f64| (0.6 - 1.5 * blur_px / diameter_px).clamp(0.45, 0.55);
+        let focused = reach(FOCUSED_PX).max(0.51);
+        let reach = reach(blur_px).min(focused);
+        if !spots.is_empty() && (diameter_px > ALL_PIXELS_PX || reach > focused - 0.015) {
+            return Some(false);
+        }
+        spots.clear();
+        let mut add = |x: usize, y: usize, within: bool| {
+            let place = [x as f64, y as f64];
+            let grey = f64::from(self.view.at(x, y));
+            spots.push(Spot {
+                ray: self.camera.unproject(Pixel::new(place[0], place[1])).coords,
+                offset: [place[0] - middle.x, place[1] - middle.y],
+                grey: if self.inverted { 255.0 - grey } else { grey },
+                within,
+            });
         };
-        about_edges(circles, size_m, camera, |place, within| {
-            if let Some((x, y)) = around(place) {
-                spots.push(spot(x, y, within));
-            }
-        });
-    } else {
-        // The paper is white for a ring's width around the marker; what the blur brings in from beyond is kept out.
-        let reach = (0.6 - 1.3 / diameter_px).clamp(0.51, 0.55);
-        let around = outline.grown(diameter_px * (2.0 * reach - 1.0));
-        let bound = |low: f64, high: f64, len: usize| {
-            let from = low.floor().max(0.0) as usize;
-            let to = (high.ceil() + 1.0).clamp(0.0, len as f64) as usize;
-            from..to
-        };
-        let half = around.major / 2.0;
-        for y in bound(outline.centre[1] - half, outline.centre[1] + half, view.height()) {
-            for x in bound(outline.centre[0] - half, outline.centre[0] + half, view.width()) {
-                let place = [x as f64, y as f64];
-                if around.radius_of(place) <= 1.0 {
-                    spots.push(spot(x, y, outline.radius_of(place) < 0.95));
+        let size = [self.view.width(), self.view.height()];
+        if diameter_px > ALL_PIXELS_PX {
+            about_edges(circles, self.size_m, self.camera, |place, within| {
+                let [x, y] = place.map(f64::round);
+                if x >= 0.0 && y >= 0.0 && x < size[0] as f64 && y < size[1] as f64 {
+                    add(x as usize, y as usize, within);
+                }
+            });
+        } else {
+            let around = outline.grown(diameter_px * (2.0 * reach - 1.0));
+            let half = around.major / 2.0;
+            let bound = |axis: usize| {
+                let from = (outline.centre[axis] - half).floor().max(0.0) as usize;
+                let to = (outline.centre[axis] + half).ceil() + 1.0;
+                from..to.clamp(0.0, size[axis] as f64) as usize
+            };
+            for y in bound(1) {
+                for x in bound(0) {
+                    let place = [x as f64, y as f64];
+                    if around.radius_of(place) <= 1.0 {
+                        add(x, y, outline.radius_of(place) < 0.95);
+                    }
                 }
             }
         }
+        (spots.len() > 3 * UNKNOWNS).then_some(true)
     }
-    (spots.len() > 3 * UNKNOWNS).then_some(())
 }
 
 /// Tells places across each edge of the marker, all round, and whether they lie within its rim.
@@ -204,15 +230,24 @@ struct Scene<'a> {
 }
 
 impl Scene<'_> {
-    fn fitted(&self, start: &Circles) -> Option<Fit> {
-        let mut best =
-            Picture { circles: *start, blur_px: 0.7, black: 0.0, white: 255.0, slope: [0.0; 2] };
+    /// The best fit from here; `None` when its cost stays above what is `hopeless`.
+    fn fitted(&self, start: &Circles, hopeless: f64) -> Option<Fit> {
+        let mut best = Picture {
+            circles: *start,
+            blur_px: FOCUSED_PX,
+            black: 0.0,
+            white: 255.0,
+            slope: [0.0; 2],
+        };
         best.expose(self)?;
         // Differences beyond this pull no harder; about thrice what they are once the fit is good.
         let mut limit = 0.25 * (best.white - best.black);
         let (mut system, mut cost) = best.system(self, limit)?;
         let mut damping = 1e-3;
         for step in 0..MOST_STEPS {
+            if step == 4 && cost > hopeless {
+                return None;
+            }
             let candidate = best.stepped(&system, damping);
             match candidate.and_then(|c| Some((c, c.system(self, limit)?))) {
                 Some((next, (next_system, next_cost))) if next_cost <= cost => {
@@ -314,7 +349,8 @@ impl Picture {
         let (rho, metres_per_px, by_pose) = self.circles.radius_at(basis, &spot.ray, camera)?;
         let normal = self.circles.normal;
         let along = normal.dot(&self.circles.centre) / normal.dot(&spot.ray);
-        let out = (spot.ray * along - self.circles.centre) / rho;
+        let out =
+            if rho < 1e-12 { basis.0 } else { (spot.ray * along - self.circles.centre) / rho };
         let aside = normal.cross(&out);
         let nd = normal.dot(&spot.ray);
         // Rows of the map from pixels to the plane: outwards and around.
@@ -395,7 +431,8 @@ impl Picture {
             let [a, b, c, d, e, f] = looks.within;
             let (grey, _) = self.grey(spot, looks.white());
             // The light's slope is taken as found.
-            let lit = spot.grey - grey + self.black + (self.white - self.black) * looks.white();
+            let seen = if spot.grey > WHITEST { spot.grey.max(grey) } else { spot.grey };
+            let lit = seen - grey + self.black + (self.white - self.black) * looks.white();
             let plain = SVector::<f64, 3>::new(1.0, a, lit);
             disc.syger(1.0, &plain, &plain, 1.0);
             let apart = SVector::<f64, 4>::new(1.0, a - b, c - d + e - f, lit);
@@ -445,10 +482,11 @@ impl Picture {
         for spot in scene.spots.iter().filter(|s| s.within) {
             let white = self.looks(spot, &basis, scene)?.white();
             let (grey, _) = self.grey(spot, white);
+            let seen = if spot.grey > WHITEST { spot.grey.max(grey) } else { spot.grey };
             n += 1.0;
-            sum += spot.grey;
-            squares += spot.grey * spot.grey;
-            left += (grey - spot.grey).powi(2);
+            sum += seen;
+            squares += seen * seen;
+            left += (grey - seen).powi(2);
         }
         let variance = squares - sum * sum / n;
         (variance > 0.0).then(|| 1.0 - left / variance)
@@ -464,6 +502,10 @@ impl Picture {
             let white = looks.white();
             let [x, y] = spot.offset;
             let (grey, contrast) = self.grey(spot, white);
+            // Where both are beyond what a pixel tells, nothing is known.
+            if grey > WHITEST && spot.grey > WHITEST {
+                continue;
+            }
             let difference = grey - spot.grey;
             let size = difference.abs();
             let weight = if size > limit { limit / size } else { 1.0 };

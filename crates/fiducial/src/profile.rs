@@ -2,6 +2,7 @@
 
 use std::f64::consts::TAU;
 
+use imaging::pyramid::to_level_0;
 use imaging::{Ellipse, GrayView, bilinear};
 
 use crate::outline::Border;
@@ -106,6 +107,62 @@ fn looks(view: GrayView<'_>, ellipse: &Ellipse, radius: f64, inverted: bool) -> 
     (edges >= 2 && (score >= LEAST_SCORE || clear >= 2)).then_some((score, share / agree))
 }
 
+/// A marker so far away that only its paper is a region: looked for about the middle of a bright outline.
+pub(crate) fn speck(view: GrayView<'_>, outline: &imaging::Outline<'_>) -> Option<Candidate> {
+    // The paper's edge in marker sizes, as the marker is drawn.
+    const PAPER: f64 = 1.2;
+    // Both in steps that the pattern's rings tolerate.
+    const STEP_PX: f64 = 0.5;
+    const STEP: f64 = 1.07;
+    const MOST_STEPS: usize = 5;
+    let [left, top, right, bottom] = outline.bounds.map(f64::from);
+    let (width, height) = (right - left, bottom - top);
+    if outline.dark || outline.cut || width.max(height) > 2.0 * width.min(height) {
+        return None;
+    }
+    let middle = |from: f64, to: f64| to_level_0((from + to) / 2.0 - 0.5, outline.level);
+    let scale = to_level_0(1.0, outline.level) - to_level_0(0.0, outline.level);
+    let mut place = [middle(left, right), middle(top, bottom)];
+    let mut diameter_px = f64::from(outline.area).sqrt() * scale / PAPER;
+    if !(5.0..SMALL_PX).contains(&diameter_px) {
+        return None;
+    }
+    let pattern = |place: [f64; 2], diameter_px: f64| {
+        let disc = Ellipse { centre: place, minor: diameter_px, major: diameter_px, angle: 0.0 };
+        means(view, &disc, 0.5, false)
+    };
+    let worth = |m: &Means| m.ripple() + 0.5 * m.step().min(m.ripple().max(0.0));
+    let first = pattern(place, diameter_px)?;
+    // Most bright specks just grow darker outwards.
+    if first.step() < 0.0 && first.gap < first.middle {
+        return None;
+    }
+    let mut best = worth(&first);
+    for _ in 0..MOST_STEPS {
+        let from = (place, diameter_px);
+        for (dx, dy, grow) in [-1.0, 0.0, 1.0].into_iter().flat_map(|dx| {
+            [-1.0, 0.0, 1.0]
+                .into_iter()
+                .flat_map(move |dy| [-1, 0, 1].map(move |grow| (dx, dy, grow)))
+        }) {
+            let next = [from.0[0] + dx * STEP_PX, from.0[1] + dy * STEP_PX];
+            let grown = from.1 * f64::powi(STEP, grow);
+            if let Some(value) = pattern(next, grown).as_ref().map(worth)
+                && value > best
+            {
+                (place, diameter_px, best) = (next, grown, value);
+            }
+        }
+        if from == (place, diameter_px) {
+            break;
+        }
+    }
+    let ellipse = Ellipse { centre: place, minor: diameter_px, major: diameter_px, angle: 0.0 };
+    let (score, contrast) = looks_small(view, &ellipse, 0.5, false)?;
+    let border = Border { ellipse, dark_within: true, whole: true };
+    Some(Candidate { border, radius: 0.5, inverted: false, score, contrast })
+}
+
 /// Compares the bands' means of a blurred marker.
 fn looks_small(
     view: GrayView<'_>,
@@ -113,13 +170,45 @@ fn looks_small(
     radius: f64,
     inverted: bool,
 ) -> Option<(f64, f64)> {
+    let means = means(view, ellipse, radius, inverted)?;
+    let (step, ripple) = (means.step(), means.ripple());
+    if means.rim < LEAST_RIM || step < LEAST_STEP / 2.0 || ripple < 0.02 * step {
+        return None;
+    }
+    Some(((0.6 + ripple / step).min(1.0), (step / means.paper.max(1.0)).min(1.0)))
+}
+
+/// Of so many directions the paper must be brighter than the outer ring.
+const LEAST_RIM: u32 = 9;
+
+/// Mean grey values of bands over all directions.
+struct Means {
+    paper: f64,
+    outer: f64,
+    gap: f64,
+    middle: f64,
+    /// Of 12 directions, in how many the paper is brighter than the outer ring.
+    rim: u32,
+}
+
+impl Means {
+    fn step(&self) -> f64 {
+        self.paper - self.outer
+    }
+
+    fn ripple(&self) -> f64 {
+        self.gap - (self.outer + self.middle) / 2.0
+    }
+}
+
+fn means(view: GrayView<'_>, ellipse: &Ellipse, radius: f64, inverted: bool) -> Option<Means> {
     const RAYS: u32 = 12;
-    let mut means = [0.0; 5];
+    let mut sums = [0.0; 4];
     let mut rim = 0;
     for i in 0..RAYS {
         let on = ellipse.at(f64::from(i) * TAU / f64::from(RAYS));
-        let mut values = [0.0; 5];
-        for (value, band) in values.iter_mut().zip([0.57, 0.45, 0.325, 0.2, 0.06]) {
+        let mut values = [0.0; 4];
+        for (value, band) in values.iter_mut().zip([0.57, 0.45, 0.325, 0.2]) {
             let along = |axis: usize| {
                 ellipse.centre[axis] + (on[axis] - ellipse.centre[axis]) * (band / radius)
             };
@@ -127,15 +216,10 @@ fn looks_small(
             *value = if inverted { 255.0 - sample } else { sample };
         }
         rim += u32::from(values[0] > values[1] + 2.0);
-        for (mean, value) in means.iter_mut().zip(values) {
-            *mean += value / f64::from(RAYS);
+        for (sum, value) in sums.iter_mut().zip(values) {
+            *sum += value / f64::from(RAYS);
         }
     }
-    let [paper, outer, gap, middle, _] = means;
-    let step = paper - outer;
-    let ripple = gap - (outer + middle) / 2.0;
-    if rim < 10 || step < LEAST_STEP || ripple < 0.02 * step {
-        return None;
-    }
-    Some(((0.6 + ripple / step).min(1.0), (step / paper.max(1.0)).min(1.0)))
+    let [paper, outer, gap, middle] = sums;
+    Some(Means { paper, outer, gap, middle, rim })
 }

@@ -17,12 +17,23 @@ use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, PoseSolution, Stages};
 use crate::outline::{Border, add_arcs, whole_border};
 use crate::photometry::Spot;
-use crate::profile::{Candidate, candidates};
+use crate::profile::{Candidate, candidates, speck};
 use crate::ring::{Ring, RingKind};
 use crate::search::Search;
 use crate::trace::{Reason, Trace};
 
-/// What is looked for whole: regions of any size that fill their bounds as ellipses do.
+/// Where the marker is looked for; what comes later only when it was not found before.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Stage {
+    /// Outlines that are ellipses.
+    Whole,
+    /// Outlines that show arcs of ellipses.
+    Parts,
+    /// Bright specks, which may be the paper of a marker far away.
+    Specks,
+}
+
+/// Regions of any size that fill their bounds as ellipses do.
 const WHOLE: imaging::outline::Settings = imaging::outline::Settings {
     dark_from: Some(0),
     bright_from: None,
@@ -35,14 +46,41 @@ const WHOLE: imaging::outline::Settings = imaging::outline::Settings {
     least_fill: 0.4,
     most_ragged: 1.3,
 };
-/// What is looked for in parts: regions of any shape that are large enough to show arcs.
-const PARTS: imaging::outline::Settings = imaging::outline::Settings {
-    dark_from: Some(2),
-    smallest_px: 16,
-    least_fill: 0.02,
-    most_ragged: 5.0,
-    ..WHOLE
-};
+
+impl Stage {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Whole => "ellipses",
+            Self::Parts => "arcs",
+            Self::Specks => "specks",
+        }
+    }
+
+    fn settings(self) -> imaging::outline::Settings {
+        match self {
+            Self::Whole => WHOLE,
+            // Regions of any shape that are large enough to show arcs.
+            Self::Parts => imaging::outline::Settings {
+                dark_from: Some(2),
+                smallest_px: 16,
+                least_fill: 0.02,
+                most_ragged: 5.0,
+                ..WHOLE
+            },
+            Self::Specks => imaging::outline::Settings {
+                dark_from: None,
+                bright_from: Some(1),
+                whole_level: usize::MAX,
+                smallest_px: 4,
+                largest_px: 16,
+                steep: false,
+                least_fill: 0.5,
+                ..WHOLE
+            },
+        }
+    }
+}
+
 /// Bounds, far above what a frame with a marker needs, so that no image takes long.
 const MOST_BORDERS: usize = 4000;
 const MOST_ARC_FITS: usize = 3000;
@@ -70,64 +108,39 @@ impl Rings {
         (trace, stages): (&mut Trace, &mut impl Stages),
         found: &mut Vec<Observation>,
     ) {
-        self.find_borders(view, stages);
-        trace.ellipses.extend(self.borders.iter().map(|b| b.ellipse));
-        self.find_candidates(view);
-        trace.rings.extend(self.candidates.iter().map(ring));
-        stages.ended("rings");
         let nominal = nominal_camera(view);
         let first = found.len();
-        for index in 0..self.candidates.len().min(MOST_LOOKED_INTO) {
-            let candidate = self.candidates[index];
-            let [x, y] = candidate.border.ellipse.centre;
-            let taken = |o: &Observation| (o.centre.x - x).hypot(o.centre.y - y) < o.size_px / 2.0;
-            let outcome = if found[first..].iter().any(taken) {
-                Err(Reason::Repeated)
-            } else {
-                self.look_into(view, &candidate, marker, camera, &nominal)
-            };
-            match outcome {
-                Ok(observation) => found.push(observation),
-                Err(reason) => {
-                    let Ring { inner, outer, .. } = ring(&candidate);
-                    trace.refuse(inner, outer, reason);
-                }
-            }
-            if found.len() - first >= MOST_MARKERS {
+        for stage in [Stage::Whole, Stage::Parts, Stage::Specks] {
+            self.find_candidates(view, stage);
+            trace.ellipses.extend(self.borders.iter().map(|b| b.ellipse));
+            trace.rings.extend(self.candidates.iter().map(ring));
+            stages.ended(stage.name());
+            self.look_into_all(view, marker, (camera, &nominal), trace, (found, first));
+            stages.ended("matching");
+            if found.len() > first {
                 break;
             }
         }
         found[first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
-        stages.ended("matching");
-    }
-
-    fn find_borders(&mut self, view: GrayView<'_>, stages: &mut impl Stages) {
-        self.borders.clear();
-        self.outlines.find(view, &WHOLE);
-        stages.ended("outlines");
-        let whole = self.outlines.iter().filter_map(|o| whole_border(&o));
-        self.borders.extend(whole.take(MOST_BORDERS));
-        stages.ended("ellipses");
-        self.outlines.find(view, &PARTS);
-        stages.ended("parts");
-        let mut budget = MOST_ARC_FITS;
-        for outline in self.outlines.iter() {
-            if whole_border(&outline).is_some() {
-                continue;
-            }
-            let level = self.outlines.pyramid().level(view, outline.level);
-            let Some(size) = level.map(|v| [v.width(), v.height()]) else { continue };
-            add_arcs(&outline, size, &mut budget, &mut self.borders);
-            if budget == 0 || self.borders.len() >= 2 * MOST_BORDERS {
-                break;
-            }
-        }
-        stages.ended("arcs");
     }
 
     /// The circles that may be the marker's, those that look most like it first.
-    fn find_candidates(&mut self, view: GrayView<'_>) {
+    fn find_candidates(&mut self, view: GrayView<'_>, stage: Stage) {
+        self.borders.clear();
         self.candidates.clear();
+        self.outlines.find(view, &stage.settings());
+        match stage {
+            Stage::Whole => {
+                let whole = self.outlines.iter().filter_map(|o| whole_border(&o));
+                self.borders.extend(whole.take(MOST_BORDERS));
+            }
+            Stage::Parts => self.find_arcs(view),
+            Stage::Specks => {
+                let specks =
+                    self.outlines.iter().take(MOST_BORDERS).filter_map(|o| speck(view, &o));
+                self.candidates.extend(specks.take(MOST_CANDIDATES));
+            }
+        }
         for border in &self.borders {
             candidates(view, border, &mut self.candidates);
             if self.candidates.len() >= MOST_CANDIDATES {
@@ -146,6 +159,52 @@ impl Rings {
             }
         }
         self.candidates.truncate(kept);
+    }
+
+    fn find_arcs(&mut self, view: GrayView<'_>) {
+        let mut budget = MOST_ARC_FITS;
+        for outline in self.outlines.iter() {
+            if whole_border(&outline).is_some() {
+                continue;
+            }
+            let level = self.outlines.pyramid().level(view, outline.level);
+            let Some(size) = level.map(|v| [v.width(), v.height()]) else { continue };
+            add_arcs(&outline, size, &mut budget, &mut self.borders);
+            if budget == 0 || self.borders.len() >= MOST_BORDERS {
+                return;
+            }
+        }
+    }
+
+    /// Adds the markers among the candidates to those found from the index `first` on.
+    fn look_into_all(
+        &mut self,
+        view: GrayView<'_>,
+        marker: &Marker,
+        (camera, nominal): (Option<&CameraModel>, &CameraModel),
+        trace: &mut Trace,
+        (found, first): (&mut Vec<Observation>, usize),
+    ) {
+        for index in 0..self.candidates.len().min(MOST_LOOKED_INTO) {
+            let candidate = self.candidates[index];
+            let [x, y] = candidate.border.ellipse.centre;
+            let taken = |o: &Observation| (o.centre.x - x).hypot(o.centre.y - y) < o.size_px / 2.0;
+            let outcome = if found[first..].iter().any(taken) {
+                Err(Reason::Repeated)
+            } else {
+                self.look_into(view, &candidate, marker, camera, nominal)
+            };
+            match outcome {
+                Ok(observation) => found.push(observation),
+                Err(reason) => {
+                    let Ring { inner, outer, .. } = ring(&candidate);
+                    trace.refuse(inner, outer, reason);
+                }
+            }
+            if found.len() - first >= MOST_MARKERS {
+                break;
+            }
+        }
     }
 
     /// Whether a candidate is part of a marker, and where that marker is.

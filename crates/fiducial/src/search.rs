@@ -18,12 +18,21 @@ use crate::trace::Reason;
 /// Where grey values differ more from a fitted marker's, as a share of its contrast, something else is in the picture,
 /// such as a shadow's edge.
 const MOST_DIFFERENCE: f64 = 0.08;
-/// Of a blurred marker the rings must explain this share of the variance within its rim.
-const LEAST_EXPLAINED: f64 = 0.85;
-/// It must differ from the image much less than a plain disc does, in squares.
-const MOST_BESIDE_DISC: f64 = 0.35;
+/// The rings must explain this share of the variance of the grey values about them, of a small marker within its rim
+/// more, of a faint one, whose differences are no more than so many grey levels, less.
+const LEAST_EXPLAINED: f64 = 0.95;
+const LEAST_EXPLAINED_OF_SMALL: f64 = 0.99;
+/// Below this diameter in pixels, where what lies beyond the paper shines in, it is this share.
+const TINY_PX: f64 = 11.8;
+const LEAST_EXPLAINED_OF_TINY: f64 = 0.975;
+const LEAST_EXPLAINED_OF_FAINT: f64 = 0.85;
+const MOST_NOISE: f64 = 4.0;
+/// One ring of a marker of fewer pixels across says too little.
+const LEAST_ALONE_PX: f64 = 90.0;
 /// An edge is there when this share of its visible places has it: a third may be hidden.
 const LEAST_EDGE_SHARE: f64 = 0.5;
+/// Pixels as bright as this tell no difference.
+const SATURATED: f64 = 252.0;
 /// An edge appears nearer to the centre of its circle by this over the radius, all in pixels: half the square of what a
 /// lens in focus and the pixels blur.
 const BEND_PX2: f64 = 0.2;
@@ -69,7 +78,7 @@ impl Search<'_> {
         let both = Circles::from_ellipse(&candidate.border.ellipse, radius_m, self.camera)
             .ok_or(Reason::Pose)?;
         if candidate.diameter_px() < SMALL_PX {
-            return self.small(&both[0], spots);
+            return self.small(&both[0], candidate.diameter_px(), spots);
         }
         let kind = ring_of(candidate.radius);
         if candidate.score < LEAST_SCORE {
@@ -78,30 +87,53 @@ impl Search<'_> {
         let (circles, rms_px, support) = self.whole(both, edges)?;
         let diameter_px =
             circles.outline(self.size_m / 2.0, self.camera).ok_or(Reason::Pose)?.major;
-        // Paper is not quite flat, and lenses bend; but edges of texture lie anywhere.
-        let fits = rms_px < (0.3 + 0.003 * diameter_px).min(1.5);
-        if !fits || !believable(&support, edges.len()) {
+        let judged = believable(&support);
+        if judged != Belief::None
+            && let Some((fit, other)) = self.by_grey_values(&circles, diameter_px, spots)
+            && fit.difference < MOST_DIFFERENCE
+            && fit.is_marker()
+            && fit.explained > LEAST_EXPLAINED
+        {
+            return self.seen_by_grey_values(&fit, other, confidence(&support)).ok_or(Reason::Pose);
+        }
+        // Paper is not quite flat, and lenses bend; but each circle has its radius.
+        let lies = |rms: f64, bias: f64| {
+            rms_px < (rms + 3e-3 * diameter_px).min(0.9)
+                && circles.bias_px(edges, self.camera) < bias + 6e-4 * diameter_px
+        };
+        let fits = match judged {
+            Belief::None => false,
+            Belief::Some => lies(0.1, 0.05),
+            Belief::All => lies(0.3, 0.12),
+        };
+        if !fits {
             return self.alone(&circles, kind, edges).ok_or(Reason::Edges);
         }
-        let confidence = confidence(&support);
-        if let Some((fit, other)) = self.by_grey_values(&circles, diameter_px, spots)
-            && fit.difference < MOST_DIFFERENCE
-        {
-            return self.seen_by_grey_values(&fit, other, confidence).ok_or(Reason::Pose);
-        }
-        self.seen(circles, rms_px, edges, confidence).ok_or(Reason::Pose)
+        self.seen(circles, rms_px, edges, confidence(&support)).ok_or(Reason::Pose)
     }
 
     /// A marker too small for edges: its grey values decide.
-    fn small(&self, start: &Circles, spots: &mut Vec<Spot>) -> Result<Seen, Reason> {
+    fn small(
+        &self,
+        start: &Circles,
+        candidate_px: f64,
+        spots: &mut Vec<Spot>,
+    ) -> Result<Seen, Reason> {
         let (fit, other) =
             photometry::refined(self.view, self.camera, start, self.size_m, self.inverted, spots)
                 .ok_or(Reason::Pose)?;
-        let sound = fit.explained > LEAST_EXPLAINED
-            && fit.difference < 1.5 * MOST_DIFFERENCE
+        // Noise may be a large part of a faint marker.
+        let faint = fit.explained > LEAST_EXPLAINED_OF_FAINT
+            && fit.difference * fit.contrast < MOST_NOISE
+            && fit.difference < 1.5 * MOST_DIFFERENCE;
+        let tiny = candidate_px < TINY_PX;
+        let least = if tiny { LEAST_EXPLAINED_OF_TINY } else { LEAST_EXPLAINED_OF_SMALL };
+        let clear = fit.explained > least && fit.difference < MOST_DIFFERENCE;
+        let sound = (clear || faint)
             && fit.contrast > 2.0 * LEAST_STEP
-            && fit.beside_disc < MOST_BESIDE_DISC
-            && (0.6..1.6).contains(&fit.balance)
+            // Blur that hides the rings of something else makes them blacker than black.
+            && (!tiny || fit.contrast < 260.0)
+            && fit.is_marker()
             && self.is_near(start, &fit.circles, 1.5, 0.3);
         if !sound {
             return Err(Reason::Edges);
@@ -140,8 +172,13 @@ impl Search<'_> {
             }
         }
         let (mut circles, _) = best.ok_or(Reason::Edges)?;
-        let support = self.measure(&circles, Reach::Near, edges);
+        let mut support = self.measure(&circles, Reach::Near, edges);
         circles.leave_outliers(edges, self.camera);
+        // A circle of another radius is found all round, but none of it agrees.
+        for (support, (radius, ..)) in support.iter_mut().zip(EDGES) {
+            let radius = radius * self.size_m;
+            support.found = edges.iter().filter(|e| e.radius == radius).count() as u32;
+        }
         let mut rms_px;
         (circles, rms_px) = circles.refined(edges, self.camera).ok_or(Reason::Edges)?;
         // The same outlines come nearly as well from the marker tilted the other way.
@@ -178,6 +215,12 @@ impl Search<'_> {
         if kind == RingKind::Inner || self.inverted || !self.is_covered(start, kind)? {
             return None;
         }
+        // A middle ring alone has the dot in it.
+        edges.clear();
+        let dot = self.measure_edge(start, 4, Reach::Near, edges).share();
+        if kind == RingKind::Middle && dot.is_none_or(|share| share < 0.9) {
+            return None;
+        }
         edges.clear();
         let own = kind as usize * 2;
         let mut support = [Support::default(); 6];
@@ -187,7 +230,11 @@ impl Search<'_> {
         let whole = support.iter().skip(own).take(2).all(|s| s.share().is_some_and(|s| s >= 0.95));
         let (circles, rms_px) = start.refined(edges, self.camera)?;
         let diameter_px = circles.outline(self.size_m / 2.0, self.camera)?.major;
-        let fits = rms_px < 0.3 + 0.002 * diameter_px;
+        // Of two circles alone the radii must be right.
+        let limit_px = 0.06 + 4e-4 * diameter_px;
+        let fits = diameter_px > LEAST_ALONE_PX
+            && rms_px < 2.0 * limit_px
+            && circles.bias_px(edges, self.camera) < limit_px;
         let good = whole && fits && self.is_covered(&circles, kind)?;
         good.then(|| self.seen(circles, rms_px, edges, 0.5 * confidence(&support))).flatten()
     }
@@ -326,6 +373,10 @@ impl Search<'_> {
             let Some(sample) = bilinear(self.view, x, y) else { return Sight::Outside };
             *value = if black_within { sample } else { -sample };
         }
+        // In glare nothing is seen.
+        if values.iter().all(|value| value.abs() >= SATURATED) {
+            return Sight::Outside;
+        }
         let ends = (values[0].min(values[1]), values[2 * half].max(values[2 * half - 1]));
         let bright = if black_within { ends.1 } else { -ends.0 };
         if ends.1 - ends.0 < (self.least_contrast * bright).max(LEAST_STEP) {
@@ -416,21 +467,30 @@ fn ring_of(radius: f64) -> RingKind {
 
 /// Whether the edges found are those of a marker: most of those that could be seen, of two rings at least; or the
 /// innermost ring alone where the camera is too near to see any other.
-///
-/// `kept` of the edge points agree.
-fn believable(support: &[Support; 6], kept: usize) -> bool {
+fn believable(support: &[Support; 6]) -> Belief {
     let shares = support.map(|s| s.share());
     let seen = shares.iter().flatten().filter(|s| **s >= LEAST_EDGE_SHARE).count();
     let clear = shares.iter().flatten().filter(|s| **s >= 0.8).count();
     let missed = shares.iter().flatten().filter(|s| **s < LEAST_EDGE_SHARE).count();
     let alone = shares[..4].iter().all(Option::is_none);
-    let visible: u32 = support.iter().map(|s| s.visible).sum();
-    let enough = 2 * kept >= visible as usize;
-    match missed {
-        0 => enough && (seen >= 4 || clear >= 3 || clear >= 2 && alone),
-        1 | 2 => enough && seen >= 4 || clear >= 4,
-        _ => false,
+    let (found, visible) = support.iter().fold((0, 0), |(f, v), s| (f + s.found, v + s.visible));
+    if 2 * found < visible {
+        return Belief::None;
     }
+    match missed {
+        0 if seen >= 4 || clear >= 3 || clear >= 2 && alone => Belief::All,
+        1 | 2 if seen >= 4 => Belief::Some,
+        _ => Belief::None,
+    }
+}
+
+/// Whether edges are where a marker has them.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Belief {
+    None,
+    /// Some are missing.
+    Some,
+    All,
 }
 
 /// How sure a believable marker is: the share of its visible edges that were found, less when few can be seen.
