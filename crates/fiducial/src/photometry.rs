@@ -20,11 +20,15 @@ const LEAST_DIAMETER_PX: f64 = 5.0;
 /// Up to this diameter all pixels take part, of larger markers those about the edges.
 const ALL_PIXELS_PX: f64 = 22.0;
 /// About as many pixels take part of a larger marker.
-const SPOTS: f64 = 300.0;
+const SPOTS: f64 = 260.0;
 /// Standard deviation, in pixels, of the blur of a lens in focus and of the pixel's own extent.
 const FOCUSED_PX: f64 = 0.6;
 /// Brighter pixels may be of any brightness.
 const WHITEST: f64 = 254.5;
+/// So many standard deviations of the blur from an edge nothing is seen of it.
+const FURTHEST_BLUR: f64 = 4.7;
+/// Root mean square differences above this, in units of the contrast, are not of a marker.
+const MOST_DIFFERENCE: f64 = 0.2;
 const MOST_STEPS: usize = 14;
 /// Pose (5), blur, black, white, and white's change across and down.
 const UNKNOWNS: usize = 10;
@@ -76,8 +80,6 @@ pub(crate) struct Fit {
     pub(crate) contrast: f64,
     /// Standard deviation of the blur, in pixels.
     pub(crate) blur_px: f64,
-    /// Sum of the squared differences, large ones counting less.
-    cost: f64,
 }
 
 impl Fit {
@@ -98,24 +100,41 @@ pub(crate) fn refined(
     size_m: f64,
     inverted: bool,
     spots: &mut Vec<Spot>,
-) -> Option<(Fit, Option<Fit>)> {
+) -> Option<(Fit, Option<Alternative>)> {
     spots.clear();
     let around = Around { view, camera, size_m, inverted };
     around.gather(start, FOCUSED_PX, spots)?;
-    let start = start.tilted_at_least(LEAST_START_TILT);
-    let mut first = Scene { spots, size_m, camera }.fitted(&start, f64::INFINITY)?;
+    let tilted = |circles: &Circles| circles.tilted_at_least(LEAST_START_TILT);
+    let mut first = Scene::new(spots, size_m, camera).fitted(&tilted(start), None)?;
     // What lies beyond the paper is kept out once the blur is known.
-    if around.gather(&first.circles, first.blur_px, spots)? {
-        let start = first.circles.tilted_at_least(LEAST_START_TILT);
-        first = Scene { spots, size_m, camera }.fitted(&start, f64::INFINITY)?;
+    let circles = first.picture.circles;
+    if first.difference(spots) < MOST_DIFFERENCE
+        && around.gather(&circles, first.picture.blur_px, spots)?
+    {
+        first = Scene::new(spots, size_m, camera).fitted(&tilted(&circles), None)?;
     }
-    let scene = Scene { spots, size_m, camera };
-    let mirrored = first.circles.tilted_at_least(LEAST_START_TILT).mirrored();
-    let hopeless = MOST_COST_OF_OTHER * first.cost;
-    let Some(second) = scene.fitted(&mirrored, hopeless) else { return Some((first, None)) };
+    let scene = Scene::new(spots, size_m, camera);
+    if first.difference(spots) > MOST_DIFFERENCE {
+        return Some((scene.fit(&first)?, None));
+    }
+    let mirrored = tilted(&first.picture.circles).mirrored();
+    let Some(second) = scene.fitted(&mirrored, Some(MOST_COST_OF_OTHER * first.cost)) else {
+        return Some((scene.fit(&first)?, None));
+    };
     let (best, other) = if second.cost < first.cost { (second, first) } else { (first, second) };
-    let same = best.circles.normal.angle(&other.circles.normal) < 0.02;
-    Some((best, (!same).then_some(other)))
+    let other = other.alternative(spots);
+    let fit = scene.fit(&best)?;
+    let same = fit.circles.normal.angle(&other.circles.normal) < 0.02;
+    Some((fit, (!same).then_some(other)))
+}
+
+/// The marker tilted the other way.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Alternative {
+    pub(crate) circles: Circles,
+    /// As of [`Fit`].
+    pub(crate) difference: f64,
+    pub(crate) blur_px: f64,
 }
 
 /// Where spots are gathered.
@@ -225,13 +244,48 @@ fn about_edges(
 /// What a picture is fitted to.
 struct Scene<'a> {
     spots: &'a [Spot],
-    size_m: f64,
     camera: &'a CameraModel,
+    /// Radii of the circles in metres, the outermost first, and their logarithms.
+    radii: [(f64, f64); 6],
 }
 
-impl Scene<'_> {
+/// A picture that fits as well as any near it.
+struct Fitted {
+    picture: Picture,
+    system: System,
+    /// Sum of the squared differences, large ones counting less.
+    cost: f64,
+}
+
+impl Fitted {
+    /// Root mean square of the differences, in units of the contrast.
+    fn difference(&self, spots: &[Spot]) -> f64 {
+        (self.cost / spots.len() as f64).sqrt() / (self.picture.white - self.picture.black)
+    }
+
+    fn alternative(&self, spots: &[Spot]) -> Alternative {
+        Alternative {
+            circles: self.picture.circles,
+            difference: self.difference(spots),
+            blur_px: self.picture.blur_px,
+        }
+    }
+}
+
+impl<'a> Scene<'a> {
+    fn new(spots: &'a [Spot], size_m: f64, camera: &'a CameraModel) -> Self {
+        let mut radii = [(0.0, 0.0); 6];
+        for (pair, kind) in radii.chunks_mut(2).zip(RingKind::ALL) {
+            let (inner, outer) = kind.radii();
+            for (slot, radius) in pair.iter_mut().zip([outer, inner]) {
+                *slot = (radius * size_m, (radius * size_m).ln());
+            }
+        }
+        Self { spots, camera, radii }
+    }
+
     /// The best fit from here; `None` when its cost stays above what is `hopeless`.
-    fn fitted(&self, start: &Circles, hopeless: f64) -> Option<Fit> {
+    fn fitted(&self, start: &Circles, hopeless: Option<f64>) -> Option<Fitted> {
         let mut best = Picture {
             circles: *start,
             blur_px: FOCUSED_PX,
@@ -245,13 +299,15 @@ impl Scene<'_> {
         let (mut system, mut cost) = best.system(self, limit)?;
         let mut damping = 1e-3;
         for step in 0..MOST_STEPS {
-            if step == 4 && cost > hopeless {
-                return None;
+            let bad = hopeless.is_some_and(|most| cost > most)
+                || cost > self.count() * (MOST_DIFFERENCE * (best.white - best.black)).powi(2);
+            if step == 4 && bad {
+                break;
             }
             let candidate = best.stepped(&system, damping);
             match candidate.and_then(|c| Some((c, c.system(self, limit)?))) {
                 Some((next, (next_system, next_cost))) if next_cost <= cost => {
-                    let settled = cost - next_cost < 1e-4 * cost;
+                    let settled = cost - next_cost < 3e-4 * cost;
                     (best, system, cost) = (next, next_system, next_cost);
                     damping = (damping * 0.1).max(1e-7);
                     if step == 2 {
@@ -269,21 +325,22 @@ impl Scene<'_> {
                 }
             }
         }
-        let contrast = best.white - best.black;
-        if contrast <= 0.0 {
-            return None;
-        }
-        let (beside_disc, balance) = best.alternatives(self)?;
+        let fits = best.white > best.black && hopeless.is_none_or(|most| cost <= most);
+        fits.then_some(Fitted { picture: best, system, cost })
+    }
+
+    fn fit(&self, fitted: &Fitted) -> Option<Fit> {
+        let picture = &fitted.picture;
+        let (beside_disc, balance) = picture.alternatives(self)?;
         Some(Fit {
-            circles: best.circles,
-            covariance: self.covariance(&system, cost)?,
-            difference: (cost / self.count()).sqrt() / contrast,
-            explained: best.explained(self)?,
+            circles: picture.circles,
+            covariance: self.covariance(&fitted.system, fitted.cost)?,
+            difference: fitted.difference(self.spots),
+            explained: picture.explained(self)?,
             beside_disc,
             balance,
-            contrast,
-            blur_px: best.blur_px,
-            cost,
+            contrast: picture.white - picture.black,
+            blur_px: picture.blur_px,
         })
     }
 
@@ -397,18 +454,18 @@ impl Picture {
         let log_k1 = k1.ln();
         let mut looks =
             Looks { within: [0.0; 6], by_distance: 0.0, by_blur: 0.0, by_pose: near.by_pose };
-        let radii = RingKind::ALL.map(RingKind::radii);
-        for (index, within) in looks.within.iter_mut().enumerate() {
-            let (inner, outer) = radii[index / 2];
+        let per_blur = 1.0 / (near.metres_per_px * self.blur_px);
+        for (index, (within, (radius, log_radius))) in
+            looks.within.iter_mut().zip(scene.radii).enumerate()
+        {
             // Outer edges end the black, inner ones begin the white.
-            let (radius, sign) = if index % 2 == 0 { (outer, -1.0) } else { (inner, 1.0) };
-            let radius = radius * scene.size_m;
-            let rough = (radius - near.rho) / (near.metres_per_px * self.blur_px);
-            if rough.abs() > 6.0 {
+            let sign = if index % 2 == 0 { -1.0 } else { 1.0 };
+            let rough = (radius - near.rho) * per_blur;
+            if rough.abs() > FURTHEST_BLUR {
                 *within = if rough > 0.0 { 1.0 } else { 0.0 };
                 continue;
             }
-            let ratio = (power * (2.0 * radius.ln() - log_k1)).exp();
+            let ratio = (power * (2.0 * log_radius - log_k1)).exp();
             let z = (ratio - mean) * k1 / (power * spread);
             let (step, density) = blurred_step(z);
             *within = step - near.excess / 24.0 * (z * z - 3.0) * z * density;
@@ -594,7 +651,7 @@ mod tests {
                 let ray = camera.unproject(Pixel::new(x, y)).coords;
                 let offset = [x - middle.x, y - middle.y];
                 let spot = Spot { ray, offset, grey: 0.0, within: true };
-                let scene = Scene { spots: &[], size_m, camera: &camera };
+                let scene = Scene::new(&[], size_m, &camera);
                 let white = picture.looks(&spot, &truth.basis(), &scene).unwrap().white();
                 let paper = 200.0 + 0.5 * offset[0] - 0.3 * offset[1];
                 (30.0 + (paper - 30.0) * white).round() as u8

@@ -114,7 +114,7 @@ pub(crate) fn speck(view: GrayView<'_>, outline: &imaging::Outline<'_>) -> Optio
     // Both in steps that the pattern's rings tolerate.
     const STEP_PX: f64 = 0.5;
     const STEP: f64 = 1.07;
-    const MOST_STEPS: usize = 5;
+    const MOST_STEPS: usize = 6;
     let [left, top, right, bottom] = outline.bounds.map(f64::from);
     let (width, height) = (right - left, bottom - top);
     if outline.dark || outline.cut || width.max(height) > 2.0 * width.min(height) {
@@ -134,19 +134,19 @@ pub(crate) fn speck(view: GrayView<'_>, outline: &imaging::Outline<'_>) -> Optio
     let worth = |m: &Means| m.ripple() + 0.5 * m.step().min(m.ripple().max(0.0));
     let first = pattern(place, diameter_px)?;
     // Most bright specks just grow darker outwards.
-    if first.step() < 0.0 && first.gap < first.middle {
+    if first.step() < 0.0 && first.gap < first.middle
+        || first.paper.max(first.gap) - first.outer.min(first.middle) < LEAST_STEP
+    {
         return None;
     }
     let mut best = worth(&first);
-    for _ in 0..MOST_STEPS {
+    for step in 0..MOST_STEPS {
         let from = (place, diameter_px);
-        for (dx, dy, grow) in [-1.0, 0.0, 1.0].into_iter().flat_map(|dx| {
-            [-1.0, 0.0, 1.0]
-                .into_iter()
-                .flat_map(move |dy| [-1, 0, 1].map(move |grow| (dx, dy, grow)))
-        }) {
-            let next = [from.0[0] + dx * STEP_PX, from.0[1] + dy * STEP_PX];
-            let grown = from.1 * f64::powi(STEP, grow);
+        // All neighbours at first, then those along one axis.
+        let near = NEIGHBOURS.iter().take(if step == 0 { 26 } else { 6 });
+        for [dx, dy, grow] in near {
+            let next = [from.0[0] + f64::from(*dx) * STEP_PX, from.0[1] + f64::from(*dy) * STEP_PX];
+            let grown = from.1 * f64::powi(STEP, *grow);
             if let Some(value) = pattern(next, grown).as_ref().map(worth)
                 && value > best
             {
@@ -161,6 +161,28 @@ pub(crate) fn speck(view: GrayView<'_>, outline: &imaging::Outline<'_>) -> Optio
     let (score, contrast) = looks_small(view, &ellipse, 0.5, false)?;
     let border = Border { ellipse, dark_within: true, whole: true };
     Some(Candidate { border, radius: 0.5, inverted: false, score, contrast })
+}
+
+/// Steps to the neighbours of a place and a size, those along one axis first.
+const NEIGHBOURS: [[i32; 3]; 26] = neighbours();
+
+const fn neighbours() -> [[i32; 3]; 26] {
+    let mut all = [[0; 3]; 26];
+    let mut count = 0;
+    let mut axes = 1;
+    while axes <= 3 {
+        let mut i = 0;
+        while i < 27 {
+            let step = [i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1];
+            if step[0] * step[0] + step[1] * step[1] + step[2] * step[2] == axes {
+                all[count] = step;
+                count += 1;
+            }
+            i += 1;
+        }
+        axes += 1;
+    }
+    all
 }
 
 /// Compares the bands' means of a blurred marker.

@@ -85,7 +85,7 @@ impl Stage {
 const MOST_BORDERS: usize = 4000;
 const MOST_ARC_FITS: usize = 3000;
 const MOST_CANDIDATES: usize = 400;
-const MOST_LOOKED_INTO: usize = 40;
+const MOST_LOOKED_INTO: usize = 20;
 const MOST_MARKERS: usize = 8;
 
 /// The detector's working memory.

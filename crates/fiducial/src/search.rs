@@ -10,7 +10,7 @@ use nalgebra::Matrix6;
 
 use crate::circles::{Circles, EdgePoint, project};
 use crate::drawing::RING_RADII;
-use crate::photometry::{self, Fit, Spot};
+use crate::photometry::{self, Alternative, Fit, Spot};
 use crate::profile::{Candidate, LEAST_SCORE, LEAST_STEP, SMALL_PX};
 use crate::ring::RingKind;
 use crate::trace::Reason;
@@ -31,6 +31,8 @@ const MOST_NOISE: f64 = 4.0;
 const LEAST_ALONE_PX: f64 = 90.0;
 /// An edge is there when this share of its visible places has it: a third may be hidden.
 const LEAST_EDGE_SHARE: f64 = 0.5;
+/// How many times more the covariance is when something disturbs the marker's look.
+const DISTURBED: f64 = 16.0;
 /// Pixels as bright as this tell no difference.
 const SATURATED: f64 = 252.0;
 /// An edge appears nearer to the centre of its circle by this over the radius, all in pixels: half the square of what a
@@ -97,9 +99,12 @@ impl Search<'_> {
             return self.seen_by_grey_values(&fit, other, confidence(&support)).ok_or(Reason::Pose);
         }
         // Paper is not quite flat, and lenses bend; but each circle has its radius.
+        self.measure(&circles, Reach::Near, edges);
+        let bias_px = circles.bias_px(edges, self.camera);
+        circles.leave_outliers(edges, self.camera);
         let lies = |rms: f64, bias: f64| {
             rms_px < (rms + 3e-3 * diameter_px).min(0.9)
-                && circles.bias_px(edges, self.camera) < bias + 6e-4 * diameter_px
+                && bias_px < bias * (diameter_px / 60.0).min(1.0) + 6e-4 * diameter_px
         };
         let fits = match judged {
             Belief::None => false,
@@ -109,7 +114,13 @@ impl Search<'_> {
         if !fits {
             return self.alone(&circles, kind, edges).ok_or(Reason::Edges);
         }
-        self.seen(circles, rms_px, edges, confidence(&support)).ok_or(Reason::Pose)
+        let mut seen =
+            self.seen(circles, rms_px, edges, confidence(&support)).ok_or(Reason::Pose)?;
+        if diameter_px <= photometry::MOST_DIAMETER_PX {
+            // Its grey values are not a marker's: light or something on it moves edges, all of one side together.
+            seen.covariance *= DISTURBED;
+        }
+        Ok(seen)
     }
 
     /// A marker too small for edges: its grey values decide.
@@ -163,22 +174,21 @@ impl Search<'_> {
                 continue;
             }
             let Some((rough, _)) = start.refined(edges, self.camera) else { continue };
-            self.measure(&rough, Reach::Near, edges);
+            let near = self.measure(&rough, Reach::Near, edges);
             let Some((circles, rms)) = rough.refined(edges, self.camera) else { continue };
             // Per edge found: a wrong pose finds few.
             let cost = (rms + 0.1) / edges.len() as f64;
             if best.is_none_or(|(_, least)| cost < least) {
                 best = Some((circles, cost));
             }
+            let visible: u32 = near.iter().map(|s| s.visible).sum();
+            if rms < 0.3 && 10 * edges.len() > 9 * visible as usize {
+                break;
+            }
         }
         let (mut circles, _) = best.ok_or(Reason::Edges)?;
-        let mut support = self.measure(&circles, Reach::Near, edges);
+        let support = self.measure(&circles, Reach::Near, edges);
         circles.leave_outliers(edges, self.camera);
-        // A circle of another radius is found all round, but none of it agrees.
-        for (support, (radius, ..)) in support.iter_mut().zip(EDGES) {
-            let radius = radius * self.size_m;
-            support.found = edges.iter().filter(|e| e.radius == radius).count() as u32;
-        }
         let mut rms_px;
         (circles, rms_px) = circles.refined(edges, self.camera).ok_or(Reason::Edges)?;
         // The same outlines come nearly as well from the marker tilted the other way.
@@ -197,7 +207,7 @@ impl Search<'_> {
         circles: &Circles,
         diameter_px: f64,
         spots: &mut Vec<Spot>,
-    ) -> Option<(Fit, Option<Fit>)> {
+    ) -> Option<(Fit, Option<Alternative>)> {
         let (fit, other) = photometry::refined(
             self.view,
             self.camera,
@@ -255,15 +265,20 @@ impl Search<'_> {
         Some(Seen { circles, rms_px, covariance, other, confidence })
     }
 
-    fn seen_by_grey_values(&self, fit: &Fit, other: Option<Fit>, confidence: f64) -> Option<Seen> {
+    fn seen_by_grey_values(
+        &self,
+        fit: &Fit,
+        other: Option<Alternative>,
+        confidence: f64,
+    ) -> Option<Seen> {
         // A step as high as the contrast rises within two and a half times the blur.
-        let rms_px = |fit: &Fit| 2.5 * fit.blur_px * fit.difference;
+        let rms_px = |blur_px: f64, difference: f64| 2.5 * blur_px * difference;
         let covariance = fit.circles.spread(&fit.covariance);
         Some(Seen {
             circles: fit.circles,
-            rms_px: rms_px(fit),
+            rms_px: rms_px(fit.blur_px, fit.difference),
             covariance: covariance.iter().all(|c| c.is_finite()).then_some(covariance)?,
-            other: other.map(|o| (o.circles, rms_px(&o))),
+            other: other.map(|o| (o.circles, rms_px(o.blur_px, o.difference))),
             confidence,
         })
     }
@@ -327,10 +342,11 @@ impl Search<'_> {
         if width_px < 1.0 || radius * px_per_m < 3.0 {
             return support;
         }
+        let most = if reach == Reach::Far { 40.0 } else { 96.0 };
+        let count = (PI * radius * px_per_m).clamp(16.0, most) as u32;
         let furthest = if reach == Reach::Far { 0.45 * width_px } else { 5.0 };
         let reach = (0.5 * width_px).min(furthest).max(1.25);
         let bend_px = BEND_PX2 / (radius * px_per_m);
-        let count = (PI * radius * px_per_m).clamp(16.0, 96.0) as u32;
         let (u, v) = circles.basis();
         for i in 0..count {
             support.sought += 1;
