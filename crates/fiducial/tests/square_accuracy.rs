@@ -8,6 +8,7 @@ use std::time::Instant;
 
 use fiducial::square::pattern::Pattern;
 use fiducial::square::refine::{Refined, Scratch, refine};
+use fiducial::square_pose;
 use geometry::{CameraModel, Distortion, Pixel};
 use imaging::GrayView;
 use nalgebra::SVector;
@@ -22,6 +23,8 @@ struct Errors {
     size: Vec<f64>,
     /// Squared errors of the corners in units of their covariance; 8 on average.
     normalised: Vec<f64>,
+    /// Of the pose's range, as a share.
+    range: Vec<f64>,
     corner_px: Vec<f64>,
     blur_px: Vec<f64>,
     micros: Vec<f64>,
@@ -43,12 +46,22 @@ impl Errors {
         self.centre_px.push(refined.centre.distance(&scene.centre()));
         self.size.push((area(&refined.corners) / area(&truth)).sqrt() - 1.0);
         self.blur_px.push(refined.blur_px);
+        let pose =
+            square_pose(&refined.corners, &refined.covariance_px2, scene.size_m, &scene.camera);
+        let range = |pose: &geometry::Transform<_, geometry::Marker>| {
+            let origin: geometry::Point<geometry::Camera> = pose.origin();
+            origin.coords.coords.norm()
+        };
+        if let Some(pose) = pose {
+            let found = range(&pose.camera_from_marker);
+            self.range.push(found / range(&scene.camera_from_marker) - 1.0);
+        }
     }
 
     fn tell(&self, name: &str) {
         let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len().max(1) as f64;
         println!(
-            "{name:34} {:3}/{:3} centre {:.4}/{:.4} px  corner {:.4}/{:.4}  size {:+.4} %/{:.4} %  chi2 {:5.2}/{:5.1} blur {:.3} {:6.1} us",
+            "{name:34} {:3}/{:3} centre {:.4}/{:.4} px  corner {:.4}/{:.4}  size {:+.4} %/{:.4} %  range {:+.4} %/{:.4} % chi2 {:5.2}/{:5.1} blur {:.3} {:6.1} us",
             self.normalised.len(),
             self.frames,
             share(&self.centre_px, 0.5),
@@ -57,6 +70,8 @@ impl Errors {
             share(&self.corner_px, 0.95),
             100.0 * mean(&self.size),
             100.0 * share(&self.size.iter().map(|s| s.abs()).collect::<Vec<_>>(), 0.95),
+            100.0 * mean(&self.range),
+            100.0 * mean(&self.range.iter().map(|s| s.abs()).collect::<Vec<_>>()),
             mean(&self.normalised),
             share(&self.normalised, 0.95),
             mean(&self.blur_px),
@@ -122,6 +137,20 @@ fn figures() {
                     errors(6, 10, |seed| Scene { cells, ..scene(focal_px, range_m, tilt, seed) });
                 found.tell(&format!("{cells} cells, tilt {tilt}, f {focal_px}, {range_m} m"));
             }
+        }
+    }
+}
+
+/// What tilt does to the range; takes minutes.
+#[test]
+#[ignore = "takes minutes; for who wants to see the figures"]
+fn ranges() {
+    for (focal_px, range_m) in
+        [(1818.0, 5.0), (1818.0, 10.0), (1818.0, 13.0), (909.0, 7.0), (909.0, 13.0)]
+    {
+        for tilt in [0.0, 0.05, 0.1, 0.2, 0.4, 0.8] {
+            let found = errors(15, 8, |seed| scene(focal_px, range_m, tilt, seed));
+            found.tell(&format!("f {focal_px}, {range_m} m, tilt {tilt}"));
         }
     }
 }
