@@ -200,9 +200,25 @@ struct Spread {
     cells: [f64; 2],
     /// Change of `cells` with the place in the ideal image.
     slopes: [[f64; 2]; 2],
+    blur: Blur,
+}
+
+/// The blur in the pattern's coordinates.
+#[derive(Copy, Clone, Debug)]
+struct Blur {
+    /// Standard deviations across columns and rows, in cells, and one over them.
     sigma: [f64; 2],
+    scale: [f64; 2],
     boxiness: [f64; 2],
     correlation: f64,
+}
+
+/// From the ideal image to the pattern.
+struct Map {
+    inverse: [f64; 9],
+    spread_px: f64,
+    /// The blur all over the pattern, where its perspective is so weak that it is the same.
+    blur: Option<Blur>,
 }
 
 impl Grid {
@@ -242,9 +258,8 @@ impl Grid {
     ) -> Option<bool> {
         spots.clear();
         let [left, top, right, bottom] = self.bounds(view, lens, state)?;
-        let inverse = state.homography.inverse();
+        let map = self.map(&state.homography, state.light.spread_px);
         let about = state.homography.about;
-        let spread_px = state.light.spread_px;
         let area = ((right - left) * (bottom - top)) as f64;
         // Of large markers every so many-th pixel, in an order without a pattern of its own.
         let every = (0.5 * area / most as f64).max(1.0) as usize;
@@ -259,7 +274,7 @@ impl Grid {
             for (x, grey) in columns.step_by(skipped) {
                 let ideal = lens.ideal(Pixel::new(x as f64, y as f64))?;
                 let ideal = [ideal[0] - about[0], ideal[1] - about[1]];
-                let Some(spread) = self.spread(&inverse, ideal, spread_px) else { continue };
+                let Some(spread) = self.spread(&map, ideal) else { continue };
                 turn += 1;
                 let interval = if self.is_near_edge(&spread) { thinned } else { 4 * thinned };
                 if thinned > 1 && turn % interval != 0
@@ -281,7 +296,7 @@ impl Grid {
         let line = |axis: usize| {
             let nearest = (spread.cells[axis] + 0.5).max(0.0) as usize;
             let distance = (spread.cells[axis] - nearest as f64).abs();
-            (distance < REACH * spread.sigma[axis] && (1..=last).contains(&nearest))
+            (distance < REACH * spread.blur.sigma[axis] && (1..=last).contains(&nearest))
                 .then_some(nearest)
         };
         let [column, row] = cell;
@@ -312,58 +327,67 @@ impl Grid {
         ])
     }
 
+    /// Above this change of scale across half a marker, the blur in cells differs from place to place.
+    const LEAST_PERSPECTIVE: f64 = 0.04;
+
+    fn map(&self, homography: &Homography, spread_px: f64) -> Map {
+        let mut map = Map { inverse: homography.inverse(), spread_px, blur: None };
+        let perspective = homography.h[6].abs() + homography.h[7].abs();
+        if perspective < Self::LEAST_PERSPECTIVE {
+            map.blur = self.spread(&map, [homography.h[2], homography.h[5]]).map(|s| s.blur);
+        }
+        map
+    }
+
+    /// The place in the pattern; `None` outside of it.
     #[inline]
-    fn spread(&self, inverse: &[f64; 9], [x, y]: [f64; 2], spread_px: f64) -> Option<Spread> {
-        let i = inverse;
+    fn spread(&self, map: &Map, [x, y]: [f64; 2]) -> Option<Spread> {
+        let i = &map.inverse;
         let depth = 1.0 / (i[6] * x + i[7] * y + i[8]);
         let square = [(i[0] * x + i[1] * y + i[2]) * depth, (i[3] * x + i[4] * y + i[5]) * depth];
-        let mut spread = Spread {
-            square,
-            cells: square.map(|s| s * self.half + self.middle),
-            slopes: [[0.0; 2]; 2],
-            sigma: [0.0; 2],
-            boxiness: [0.0; 2],
-            correlation: 0.0,
-        };
+        let cells = square.map(|s| s * self.half + self.middle);
         let size = self.across as f64;
-        let outside = |c: f64| !(c > -0.5 && c < size + 0.5);
-        if spread.cells.iter().any(|c| outside(*c)) {
+        if !cells.iter().all(|c| *c > -0.5 && *c < size + 0.5) {
             return None;
         }
-        let variance = spread_px * spread_px;
-        let mut directions = [[0.0; 2]; 2];
-        for axis in 0..2 {
-            let row = |column: usize| {
-                (i[3 * axis + column] - square[axis] * i[6 + column]) * depth * self.half
-            };
-            let slope = [row(0), row(1)];
-            let bent = [
-                slope[0] * self.bend[0][0] + slope[1] * self.bend[1][0],
-                slope[0] * self.bend[0][1] + slope[1] * self.bend[1][1],
-            ];
-            let length = (bent[0] * bent[0] + bent[1] * bent[1]).sqrt();
-            let scale = 1.0 / length;
-            directions[axis] = bent.map(|b| b * scale);
-            spread.slopes[axis] = slope;
-            spread.sigma[axis] = length * spread_px;
-            spread.boxiness[axis] = boxiness(directions[axis], variance);
+        let scale = depth * self.half;
+        let slopes = [0, 1].map(|axis| {
+            [0, 1].map(|column| (i[3 * axis + column] - square[axis] * i[6 + column]) * scale)
+        });
+        let blur = match map.blur {
+            Some(blur) => blur,
+            None => self.blur(&slopes, map.spread_px),
+        };
+        Some(Spread { square, cells, slopes, blur })
+    }
+
+    fn blur(&self, slopes: &[[f64; 2]; 2], spread_px: f64) -> Blur {
+        let bent = slopes.map(|slope| {
+            [0, 1].map(|axis| slope[0] * self.bend[0][axis] + slope[1] * self.bend[1][axis])
+        });
+        let lengths = bent.map(|[x, y]| (x * x + y * y).sqrt());
+        let normals = [0, 1].map(|axis| bent[axis].map(|b| b / lengths[axis]));
+        let sigma = lengths.map(|length| length * spread_px);
+        let [p, q] = normals;
+        Blur {
+            sigma,
+            scale: sigma.map(|s| 1.0 / s),
+            boxiness: normals.map(|normal| boxiness(normal, spread_px * spread_px)),
+            correlation: p[0] * q[0] + p[1] * q[1],
         }
-        let [p, q] = directions;
-        spread.correlation = p[0] * q[0] + p[1] * q[1];
-        Some(spread)
     }
 
     #[inline]
-    fn bands(&self, at: f64, sigma: f64, boxiness: f64, bands: &mut Bands) {
+    fn bands(&self, at: f64, blur: &Blur, axis: usize, bands: &mut Bands) {
         let last = self.across as f64;
-        let reach = (END * sigma).min(0.5 * MOST_BANDS as f64 - 1.0);
+        let reach = (END * blur.sigma[axis]).min(0.5 * MOST_BANDS as f64 - 1.0);
         // The lines between columns from `first` until before `beyond`: casts round down.
         let first = (at - reach).clamp(0.0, last - 1.0) as usize + 1;
         let beyond = ((at + reach).clamp(0.0, last - 1.0) as usize + 1).max(first);
         (bands.first, bands.count) = (first - 1, beyond - first + 1);
         // Of each line between two columns: the light from before it, and that number's derivatives.
         let mut before = [0.0; 3];
-        let scale = 1.0 / sigma;
+        let (scale, boxiness) = (blur.scale[axis], blur.boxiness[axis]);
         let mut z = (first as f64 - at) * scale;
         let Some((end, shares)) =
             bands.share.get_mut(..bands.count).and_then(<[_]>::split_last_mut)
@@ -383,7 +407,7 @@ impl Grid {
     #[inline]
     fn both_bands<'a>(&self, spread: &Spread, work: &'a mut [Bands; 2]) -> &'a [Bands; 2] {
         for (axis, bands) in work.iter_mut().enumerate() {
-            self.bands(spread.cells[axis], spread.sigma[axis], spread.boxiness[axis], bands);
+            self.bands(spread.cells[axis], &spread.blur, axis, bands);
         }
         work
     }
@@ -402,8 +426,8 @@ impl Grid {
         }
         let size = self.across as f64;
         for axis in 0..2 {
-            let (at, sigma) = (spread.cells[axis], spread.sigma[axis]);
-            sum += self.step.at(-at / sigma, 0.0).0 + self.step.at((at - size) / sigma, 0.0).0;
+            let (at, scale) = (spread.cells[axis], spread.blur.scale[axis]);
+            sum += self.step.at(-at * scale, 0.0).0 + self.step.at((at - size) * scale, 0.0).0;
         }
         sum
     }
@@ -433,8 +457,8 @@ impl Grid {
             wyy += curve * r;
             wxxyy += curve * rxx;
         }
-        let c = spread.correlation;
-        let [by_u, by_v] = [wx / spread.sigma[0], wy / spread.sigma[1]];
+        let c = spread.blur.correlation;
+        let [by_u, by_v] = [wx * spread.blur.scale[0], wy * spread.blur.scale[1]];
         Look {
             square: spread.square,
             white: w + c * (wxy + 0.5 * c * wxxyy),
@@ -467,11 +491,11 @@ impl System {
 impl State {
     /// Black and contrast that fit best with everything else as it is.
     fn expose(&mut self, grid: &Grid, spots: &[Spot]) -> Option<()> {
-        let inverse = self.homography.inverse();
+        let map = grid.map(&self.homography, self.light.spread_px);
         let mut work = [Bands::NONE; 2];
         let (mut n, mut sw, mut sww, mut sg, mut swg) = (0.0, 0.0, 0.0, 0.0, 0.0);
         for spot in spots {
-            let spread = grid.spread(&inverse, spot.ideal, self.light.spread_px)?;
+            let spread = grid.spread(&map, spot.ideal)?;
             let white = grid.look_at(&spread, self.light.spread_px, &mut work).white;
             n += 1.0;
             sw += white;
@@ -534,10 +558,10 @@ impl State {
             weight: 0.0,
         };
         let mut work = [Bands::NONE; 2];
-        let inverse = self.homography.inverse();
+        let map = grid.map(&self.homography, self.light.spread_px);
         let light = &self.light;
         for spot in spots {
-            let spread = grid.spread(&inverse, spot.ideal, light.spread_px)?;
+            let spread = grid.spread(&map, spot.ideal)?;
             let look = grid.look_at(&spread, light.spread_px, &mut work);
             let [x, y] = spot.ideal.map(|p| p / self.half_px);
             let shade = 1.0 + light.shade[0] * x + light.shade[1] * y;
