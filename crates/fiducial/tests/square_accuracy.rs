@@ -307,3 +307,19 @@ fn nonsense_is_survived() {
         }
     }
 }
+
+/// For a profiler: one marker, over and over.
+#[test]
+#[ignore = "for a profiler"]
+fn speed() {
+    let scene = scene(1818.0, 10.0, 0.2, 3);
+    let image = scene.developed(&scene.expose(), 1);
+    let (coarse, pattern) = (scene.coarse(0.7), scene.pattern());
+    let mut scratch = Scratch::default();
+    let view = image.view().unwrap();
+    let start = Instant::now();
+    let found = (0..3000)
+        .filter(|_| refine(view, &coarse, &pattern, Some(&scene.camera), &mut scratch).is_some())
+        .count();
+    println!("{found}: {:.1} us each", start.elapsed().as_secs_f64() * 1e6 / 3000.0);
+}

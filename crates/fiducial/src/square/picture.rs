@@ -292,16 +292,15 @@ impl Grid {
     fn is_near_edge(&self, spread: &Spread) -> bool {
         const REACH: f64 = 1.8;
         let last = self.across - 1;
-        let cell = spread.cells.map(|at| (at.max(0.0) as usize).min(last));
-        let line = |axis: usize| {
-            let nearest = (spread.cells[axis] + 0.5).max(0.0) as usize;
-            let distance = (spread.cells[axis] - nearest as f64).abs();
-            (distance < REACH * spread.blur.sigma[axis] && (1..=last).contains(&nearest))
-                .then_some(nearest)
+        let place = |axis: usize| {
+            let at = spread.cells[axis].max(0.0);
+            let nearest = (at + 0.5) as usize;
+            let is_near = (at - nearest as f64).abs() < REACH * spread.blur.sigma[axis];
+            ((at as usize).min(last), nearest, is_near && nearest > 0 && nearest <= last)
         };
-        let [column, row] = cell;
-        line(0).is_some_and(|line| self.white[row][line - 1] != self.white[row][line])
-            || line(1).is_some_and(|line| self.white[line - 1][column] != self.white[line][column])
+        let ((column, x, upright), (row, y, level)) = (place(0), place(1));
+        upright && self.white[row][x - 1] != self.white[row][x]
+            || level && self.white[y - 1][column] != self.white[y][column]
     }
 
     /// First column and row around the pattern within the image, and those after the last.
@@ -345,20 +344,22 @@ impl Grid {
         let i = &map.inverse;
         let depth = 1.0 / (i[6] * x + i[7] * y + i[8]);
         let square = [(i[0] * x + i[1] * y + i[2]) * depth, (i[3] * x + i[4] * y + i[5]) * depth];
-        let cells = square.map(|s| s * self.half + self.middle);
-        let size = self.across as f64;
-        if !cells.iter().all(|c| *c > -0.5 && *c < size + 0.5) {
+        let [a, b] = square;
+        let (column, row) = (a * self.half + self.middle, b * self.half + self.middle);
+        let end = self.across as f64 + 0.5;
+        if !(column > -0.5 && column < end && row > -0.5 && row < end) {
             return None;
         }
         let scale = depth * self.half;
-        let slopes = [0, 1].map(|axis| {
-            [0, 1].map(|column| (i[3 * axis + column] - square[axis] * i[6 + column]) * scale)
-        });
+        let slopes = [
+            [(i[0] - a * i[6]) * scale, (i[1] - a * i[7]) * scale],
+            [(i[3] - b * i[6]) * scale, (i[4] - b * i[7]) * scale],
+        ];
         let blur = match map.blur {
             Some(blur) => blur,
             None => self.blur(&slopes, map.spread_px),
         };
-        Some(Spread { square, cells, slopes, blur })
+        Some(Spread { square, cells: [column, row], slopes, blur })
     }
 
     fn blur(&self, slopes: &[[f64; 2]; 2], spread_px: f64) -> Blur {
@@ -560,10 +561,11 @@ impl State {
         let mut work = [Bands::NONE; 2];
         let map = grid.map(&self.homography, self.light.spread_px);
         let light = &self.light;
+        let unit = 1.0 / self.half_px;
         for spot in spots {
             let spread = grid.spread(&map, spot.ideal)?;
             let look = grid.look_at(&spread, light.spread_px, &mut work);
-            let [x, y] = spot.ideal.map(|p| p / self.half_px);
+            let (x, y) = (spot.ideal[0] * unit, spot.ideal[1] * unit);
             let shade = 1.0 + light.shade[0] * x + light.shade[1] * y;
             let flat = light.black + light.contrast * look.white;
             let predicted = flat * shade;
@@ -579,7 +581,8 @@ impl State {
             system.squares += weight * difference * difference;
             system.weight += weight;
             let place = self.homography.at(look.square);
-            let tilt = look.by_place.map(|by| -shade * light.contrast * by);
+            let steepness = -shade * light.contrast;
+            let tilt = [steepness * look.by_place[0], steepness * look.by_place[1]];
             let moved = place.along(tilt);
             let mut slope = [0.0; UNKNOWNS];
             slope[..8].copy_from_slice(&moved);

@@ -172,6 +172,7 @@ impl<'a> Lens<'a> {
     }
 
     /// The place in the ideal image of a pixel near the marker.
+    #[inline]
     pub(crate) fn ideal(&self, pixel: Pixel) -> Option<[f64; 2]> {
         let (near, ideal, slope) = &self.near;
         let from = |to: [f64; 2], pixel: Pixel, other: Pixel| {
@@ -346,9 +347,9 @@ impl Place {
     /// How the place, along a direction, changes with the homography's numbers.
     #[inline]
     pub(crate) fn along(&self, [dx, dy]: [f64; 2]) -> [f64; 8] {
-        let [a, b] = self.square.map(|s| s * self.depth);
-        let far = -(dx * self.relative[0] + dy * self.relative[1]);
         let d = self.depth;
+        let (a, b) = (self.square[0] * d, self.square[1] * d);
+        let far = -(dx * self.relative[0] + dy * self.relative[1]);
         [dx * a, dx * b, dx * d, dy * a, dy * b, dy * d, far * a, far * b]
     }
 }
