@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
+use fiducial::Marker;
 use messages::topic;
 use node::{Identity, Layers, Node, Shutdown};
 use tempfile::TempDir;
@@ -26,6 +27,9 @@ pub(crate) struct LandArgs {
     /// One setting of a service: SERVICE.KEY=VALUE, for example simulator.wind.mean_m_s=5. May be repeated.
     #[arg(long, value_name = "SERVICE.KEY=VALUE")]
     set: Vec<String>,
+    /// Marker to land on, on the simulated pad as well: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids.
+    #[arg(long, value_name = "MARKER")]
+    marker: Option<Marker>,
     /// What turns detections into velocity: `metric` (our own) or `thesis` (Algorithm 18).
     #[arg(long, value_name = "GUIDANCE")]
     guidance: Option<String>,
@@ -120,9 +124,15 @@ impl Settings {
         if let Some(guidance) = &args.guidance {
             controller.push(format!("guidance=\"{guidance}\""));
         }
+        let mut detector = Vec::new();
+        if let Some(marker) = &args.marker {
+            simulator.push(format!("pad.marker=\"{marker}\""));
+            detector.push(format!("markers=[\"{marker}\"]"));
+            controller.push(format!("marker=\"{}\"", marker.name()));
+        }
         let mut by_service = vec![
             (Service::Simulator, simulator),
-            (Service::Detector, Vec::new()),
+            (Service::Detector, detector),
             (Service::Controller, controller),
             (Service::GcsBridge, ground_station(args.autopilot.as_deref())),
         ];

@@ -68,7 +68,7 @@ fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>)
     let mut brush = Brush {
         canvas: RgbImageBuf::default(),
         scale: enlarged as f64,
-        dot_px: (view.width() * enlarged / 1000).clamp(1, 6),
+        dot_px: (view.width() * enlarged / 640).clamp(1, 6),
     };
     brush.lay_ground(view, enlarged);
     for seen in found {
@@ -76,7 +76,7 @@ fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>)
     }
     for seen in found {
         brush.axes(seen, camera);
-        brush.label(seen);
+        brush.label(seen, found);
     }
     if found.is_empty() {
         brush.canvas.text([0.0, 0.0], "no marker", brush.dot_px, YELLOW);
@@ -180,8 +180,8 @@ impl Brush {
         }
     }
 
-    /// Name, confidence, and where it is.
-    fn label(&mut self, seen: &Observation) {
+    /// Name, confidence, and where it is; among neighbours only as much as there is room for.
+    fn label(&mut self, seen: &Observation, all: &[Observation]) {
         let id = seen.id.map_or_else(String::new, |id| format!(":{id}"));
         let wrong = match seen.wrong_bits {
             0 => String::new(),
@@ -191,6 +191,15 @@ impl Brush {
         if let Some(pose) = &seen.pose {
             let at = pose.camera_from_marker.origin();
             lines.push(format!("{:.3}, {:.3}, {:.3} m", at.x(), at.y(), at.z()));
+        }
+        let others = all.iter().filter(|other| other.centre != seen.centre);
+        let room = others.map(|other| other.centre.distance(&seen.centre) * self.scale);
+        let letters = room.fold(f64::INFINITY, f64::min) / (6.0 * self.dot_px as f64);
+        if lines.iter().any(|line| line.len() as f64 > letters) {
+            lines = vec![format!("{id} {:.2}", seen.confidence)];
+            if lines.iter().any(|line| line.len() as f64 > letters) {
+                lines = vec![id.trim_start_matches(':').to_owned()];
+            }
         }
         let [x, y] = self.place(seen.centre);
         let reach = match seen.corners {

@@ -1,0 +1,211 @@
+//! A detector service between a camera and an operator, on a port of the test's own.
+
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use detector::Config;
+use fiducial::{Drawing, Ink};
+use imaging::GrayImage;
+use messages::{
+    BayerPattern, CommandReply, Detections, DetectorCommand, FrameHeader, PixelFormat, topic,
+};
+use node::{
+    FramePublisher, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, clock_name, now_ns,
+};
+use tokio::time::timeout;
+
+const PATIENCE: Duration = Duration::from_secs(30);
+const MARKERS: [(&str, [f64; 2], f64); 3] = [
+    ("rings", [170.0, 240.0], 180.0),
+    ("apriltag-36h11:7", [430.0, 120.0], 100.0),
+    ("aruco-4x4-50:3", [480.0, 350.0], 90.0),
+];
+
+/// The local configuration with another meeting point.
+fn local(port: u16) -> ZenohSource {
+    let text = include_str!("../../zenoh-config/local.json5");
+    ZenohSource::Text(text.replace(":7447", &format!(":{port}")))
+}
+
+async fn open(service: &'static str, instance: &str, port: u16) -> anyhow::Result<Node> {
+    Node::open(Identity { service, instance: instance.into() }, &local(port)).await
+}
+
+/// Markers of three families, seen head-on on a grey ground.
+fn picture() -> anyhow::Result<GrayImage> {
+    let mut image = GrayImage::filled(640, 480, 120);
+    for (name, [x0, y0], size_px) in MARKERS {
+        let drawing = Drawing::new(&name.parse()?, size_px).context("a drawing")?;
+        for y in 0..480 {
+            for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                let samples = (0..16).map(|i| {
+                    let [dx, dy] = [i % 4, i / 4].map(|d| (f64::from(d) - 1.5) / 4.0);
+                    let (right, up) = (x as f64 + dx - x0, y0 - y as f64 - dy);
+                    match drawing.ink_at(right, up) {
+                        _ if right.abs().max(up.abs()) > drawing.half_extent_m => None,
+                        Ink::Black => Some(20),
+                        Ink::White => Some(220),
+                    }
+                });
+                let inked: Vec<u32> = samples.flatten().collect();
+                if inked.len() == 16 {
+                    *pixel = (inked.iter().sum::<u32>() / 16) as u8;
+                }
+            }
+        }
+    }
+    Ok(image)
+}
+
+/// The same through a sensor of 12 bits behind a mosaic, whose red and blue are darker.
+fn behind_a_mosaic(image: &GrayImage) -> Vec<u8> {
+    let sample = |(i, grey): (usize, &u8)| {
+        let (x, y) = (i % image.width(), i / image.width());
+        let level = u16::from(*grey) * if x % 2 == y % 2 { 6 } else { 12 };
+        level.to_le_bytes()
+    };
+    image.pixels().iter().enumerate().flat_map(sample).collect()
+}
+
+/// Publishes a picture again and again.
+async fn film(frames: FramePublisher, format: PixelFormat, bytes: Vec<u8>) {
+    for sequence in 0.. {
+        let mut loan = frames.loan(bytes.len());
+        loan.copy_from_slice(&bytes);
+        let header = FrameHeader {
+            camera: "down".into(),
+            sequence,
+            stamp_ns: now_ns(),
+            clock: clock_name().into(),
+            exposure_ns: 0,
+            width: 640,
+            height: 480,
+            format,
+        };
+        frames.publish(&header, loan).await;
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+/// Waits for detections of which something holds.
+async fn until(
+    detections: &Subscriber<Detections>,
+    what: &str,
+    holds: impl Fn(&Detections) -> bool,
+) -> anyhow::Result<Detections> {
+    let wait = async {
+        let mut last = None;
+        while let Some(message) = detections.next().await {
+            if holds(&message) {
+                return Ok(message);
+            }
+            last = Some(message);
+        }
+        Err(last)
+    };
+    match timeout(PATIENCE, wait).await {
+        Ok(Ok(message)) => Ok(message),
+        Ok(Err(last)) => Err(anyhow::anyhow!("{what}; last: {last:?}")),
+        Err(_) => Err(anyhow::anyhow!("waiting until {what}")),
+    }
+}
+
+fn names(message: &Detections) -> Vec<String> {
+    let name = |family: &str, id: Option<u32>| match id {
+        Some(id) => format!("{family}:{id}"),
+        None => family.to_owned(),
+    };
+    let mut names: Vec<_> =
+        message.detections.iter().map(|seen| name(&seen.family, seen.id)).collect();
+    names.sort_unstable();
+    names
+}
+
+fn sorted(names: &[&str]) -> Vec<String> {
+    let mut names: Vec<_> = names.iter().map(|name| (*name).to_owned()).collect();
+    names.sort_unstable();
+    names
+}
+
+async fn set(operator: &Node, key: &str, value: &str) -> anyhow::Result<CommandReply> {
+    let command = DetectorCommand::SetParameter { key: key.into(), value: value.into() };
+    operator.command(topic::DETECTOR_COMMAND, &["main"], &command).await
+}
+
+async fn accept(operator: &Node, key: &str, value: &str) -> anyhow::Result<()> {
+    let reply = set(operator, key, value).await?;
+    ensure!(reply.accepted, "{reply:?}");
+    Ok(())
+}
+
+const ALL: &str = r#"["rings:0.2", "apriltag-36h11:*:0.1", "aruco-4x4-50:3:0.1"]"#;
+
+async fn check_live_changes(
+    operator: &Node,
+    detections: &Subscriber<Detections>,
+) -> anyhow::Result<()> {
+    let all = sorted(&MARKERS.map(|(name, _, _)| name));
+    let seen = until(detections, "all families are found", |m| names(m) == all).await?;
+    for detection in &seen.detections {
+        let (_, [x, y], size_px) = MARKERS
+            .into_iter()
+            .find(|(name, _, _)| name.split(':').next() == Some(&detection.family))
+            .context("a marker that was drawn")?;
+        let [found_x, found_y] = detection.centre_px;
+        ensure!((found_x - x).hypot(found_y - y) < 0.2, "{detection:?}");
+        ensure!((detection.size_px / size_px - 1.0).abs() < 0.5, "{detection:?}");
+        ensure!(detection.centre_covariance_px2.iter().all(|c| c.is_finite()), "{detection:?}");
+    }
+    ensure!(!seen.stages.is_empty());
+
+    accept(operator, "tracking.enabled", "true").await?;
+    for _ in 0..5 {
+        until(detections, "all are followed", |m| names(m) == all).await?;
+    }
+    accept(operator, "markers", "[\"aruco-4x4-50:*\"]").await?;
+    let only = sorted(&["aruco-4x4-50:3"]);
+    until(detections, "only ArUco is found", |m| names(m) == only).await?;
+
+    for (key, value, part) in [
+        ("markers", "[\"hexagons:1\"]", "no family `hexagons`"),
+        ("least_confidence", "1.5", "from 0 to 1"),
+        ("leest_confidence", "0.5", "did you mean `least_confidence`"),
+        ("camera", "other", "start the detector again"),
+    ] {
+        let reply = set(operator, key, value).await?;
+        ensure!(!reply.accepted && reply.reason.contains(part), "{reply:?}");
+    }
+    until(detections, "only ArUco is still found", |m| names(m) == only).await?;
+    accept(operator, "least_confidence", "1").await?;
+    until(detections, "nothing is sure enough", |m| m.detections.is_empty()).await?;
+    accept(operator, "least_confidence", "0").await?;
+    accept(operator, "markers", ALL).await?;
+    until(detections, "all families are found again", |m| names(m) == all).await?;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn several_families_are_found_and_parameters_change_while_it_runs() -> anyhow::Result<()> {
+    let port = std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
+    let (camera, node) =
+        (open("camera-pub", "down", port).await?, open("detector", "main", port).await?);
+    let operator = open("alight", "test", port).await?;
+    let layers = Layers { file: None, set: vec![format!("markers={ALL}")] };
+    let config = layers.load::<Config>()?.settings;
+    let service = tokio::spawn(detector::run(node, config, Shutdown::on_signals()?));
+    let detections = operator.subscriber(topic::DETECTIONS, &["main"]).await?;
+    let image = picture()?;
+    let grey = image.pixels().to_vec();
+    let mosaic = behind_a_mosaic(&image);
+    let formats = [(PixelFormat::Mono8, grey), (PixelFormat::Bayer12(BayerPattern::Rggb), mosaic)];
+    for (format, bytes) in formats {
+        let frames = camera.frame_publisher(topic::FRAME, &["down"], bytes.len()).await?;
+        let filming = tokio::spawn(film(frames, format, bytes));
+        until(&detections, "its frames are searched", |m| m.header.format == format).await?;
+        check_live_changes(&operator, &detections).await.with_context(|| format!("{format:?}"))?;
+        accept(&operator, "tracking.enabled", "false").await?;
+        filming.abort();
+    }
+    service.abort();
+    Ok(())
+}
