@@ -375,7 +375,7 @@ struct H264 {
 }
 
 enum Source {
-    Mp4 { reader: mp4::Mp4Reader<BufReader<File>>, track: u32, next: u32, length_bytes: usize },
+    Mp4 { reader: Box<mp4::Mp4Reader<BufReader<File>>>, track: u32, next: u32, length_bytes: usize },
     Stream { bytes: Vec<u8>, at: usize },
 }
 
@@ -410,7 +410,7 @@ impl H264 {
         let period_s = if seconds > 0.0 { seconds } else { 1.0 / USUAL_RATE_HZ };
         let length_bytes = usize::from(avc1.avcc.length_size_minus_one & 3) + 1;
         let track = track.track_id();
-        let source = Source::Mp4 { reader, track, next: 1, length_bytes };
+        let source = Source::Mp4 { reader: Box::new(reader), track, next: 1, length_bytes };
         Ok((Self { decoder, source, ready: VecDeque::new(), is_over: false }, period_s))
     }
 
