@@ -8,6 +8,7 @@ use crate::observation::{Observation, Stages};
 use crate::rings::Rings;
 use crate::rings_thesis::RingsThesis;
 use crate::square::Squares;
+use crate::stag::Stags;
 use crate::trace::{Trace, TracedMarker};
 
 /// What can be chosen about a detection.
@@ -45,6 +46,7 @@ pub struct Detector {
     settings: Settings,
     outlines: Outlines,
     squares: Squares,
+    stags: Stags,
     rings: Rings,
     thesis: RingsThesis,
     found: Vec<Observation>,
@@ -70,6 +72,7 @@ impl Detector {
             settings,
             outlines: Outlines::default(),
             squares: Squares::new(markers),
+            stags: Stags::new(markers),
             rings: Rings::default(),
             thesis: RingsThesis::default(),
             found: Vec::new(),
@@ -87,13 +90,19 @@ impl Detector {
     ) -> &[Observation] {
         self.found.clear();
         self.trace.clear();
-        if !self.squares.is_empty() {
+        if !self.squares.is_empty() || !self.stags.is_empty() {
             let bright_from = self.squares.has_bright().then_some(0);
             let settings = outline::Settings { bright_from, ..outline::Settings::default() };
             self.outlines.find(view, &settings);
             stages.ended("outlines");
             let watch = (&mut self.trace, &mut *stages);
             self.squares.detect(view, &self.outlines, camera, watch, &mut self.found);
+            if !self.stags.is_empty() {
+                let watch = (&mut self.trace, &mut *stages);
+                let quads = self.squares.quads();
+                let pyramid = self.outlines.pyramid();
+                self.stags.detect(view, pyramid, quads, camera, watch, &mut self.found);
+            }
         }
         for marker in &self.markers {
             let watch = (&mut self.trace, &mut *stages);

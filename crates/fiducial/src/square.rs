@@ -120,6 +120,11 @@ impl Squares {
         self.wanted.is_empty()
     }
 
+    /// The quads of the last image that have an even border, the evenest first.
+    pub(crate) fn quads(&self) -> impl Iterator<Item = &Quad> {
+        self.quads.iter().map(|candidate| &candidate.quad)
+    }
+
     /// Whether markers with a white border are among those looked for; their outlines are bright.
     pub fn has_bright(&self) -> bool {
         self.layouts.iter().any(|layout| layout.reversed)

@@ -1,4 +1,314 @@
 //! STag: a black square with a white disc in it, and 48 dots in the disc (Benligiray, Topal, Akinlar: "STag: A stable
 //! fiducial marker system", Image and Vision Computing 89, 2019).
+//!
+//! A quad's dots are solved for from its pixels, and the word that explains them best is what the marker says. Then the
+//! whole marker is compared with the image: its outline and the disc's edge where they are wide enough apart, the picture
+//! as a whole where they are not.
 
 pub(crate) mod code;
+mod dots;
+mod picture;
+
+use geometry::{CameraModel, Pixel};
+use imaging::pyramid::from_level_0;
+use imaging::{GrayView, Pyramid};
+
+use crate::marker::Marker;
+use crate::observation::{Observation, Stages};
+use crate::pose::square_pose;
+use crate::square::codebook::Codebook;
+use crate::square::quad::Quad;
+use crate::square::refine::{Refined, Scratch, refine_design};
+use crate::trace::{Reason, Trace};
+
+use dots::Dots;
+use picture::Picture;
+
+/// A quad is looked at on the level of the pyramid on which its sides are from this long to twice that, in pixels.
+const SIDE_PX: f64 = 20.0;
+/// Shorter sides tell nothing.
+const LEAST_SIDE_PX: f64 = 7.0;
+/// Of families with more words than this, or of so many ids, not every word is tried.
+const MOST_TRIED: usize = 40;
+/// Bounds on the work in one image.
+const MOST_LOOKS: usize = 400;
+const MOST_FOUND: usize = 64;
+/// Pictures that are kept.
+const MOST_PICTURES: usize = 32;
+
+/// Share of the variance of its pixels that a marker explains.
+const LEAST_EXPLAINED: f64 = 0.8;
+/// The second best word leaves so many times as much unexplained.
+const LEAST_RATIO: f64 = 1.5;
+/// With corners that are some tenths of a pixel off, these are less; with less than this there is no need to find better
+/// corners.
+const ROUGHLY_EXPLAINED: f64 = 0.6;
+const ROUGH_RATIO: f64 = 1.25;
+
+/// Finds STags among quads. It keeps its memory from image to image.
+#[derive(Debug, Default)]
+pub(crate) struct Stags {
+    wanted: Vec<Wanted>,
+    dots: Dots,
+    pictures: Vec<Picture>,
+    scratch: Scratch,
+    places: Vec<[Pixel; 4]>,
+}
+
+/// One family that is looked for, and which of its ids.
+#[derive(Debug)]
+struct Wanted {
+    book: &'static Codebook,
+    markers: Vec<Marker>,
+    /// The ids that are each compared with the image; none where there are too many.
+    tried: Vec<u32>,
+}
+
+/// What a quad says.
+#[derive(Copy, Clone, Debug)]
+struct Reading {
+    wanted: usize,
+    id: u32,
+    turns: u8,
+    wrong_bits: u8,
+    explained: f64,
+    /// What the second best leaves unexplained, over what this one does.
+    ratio: f64,
+}
+
+impl Stags {
+    /// Looks for these markers; those of other families are left out.
+    pub(crate) fn new(markers: &[Marker]) -> Self {
+        let mut stags = Self::default();
+        for marker in markers {
+            let Some(book) = code::book(marker.family) else { continue };
+            match stags.wanted.iter_mut().find(|w| w.markers[0].family == marker.family) {
+                Some(known) => known.markers.push(*marker),
+                None => {
+                    let tried = Vec::new();
+                    stags.wanted.push(Wanted { book, markers: vec![*marker], tried });
+                }
+            }
+        }
+        for wanted in &mut stags.wanted {
+            wanted.tried = if wanted.markers.iter().any(|m| m.id.is_none()) {
+                (0..wanted.book.words().len() as u32).collect()
+            } else {
+                wanted.markers.iter().filter_map(|m| m.id).collect()
+            };
+            if wanted.tried.len() > MOST_TRIED {
+                wanted.tried.clear();
+            }
+        }
+        stags
+    }
+
+    /// True when there is nothing to look for.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.wanted.is_empty()
+    }
+
+    /// Finds the markers among the quads of an image.
+    pub(crate) fn detect<'a>(
+        &mut self,
+        view: GrayView<'_>,
+        pyramid: &Pyramid,
+        quads: impl Iterator<Item = &'a Quad>,
+        camera: Option<&CameraModel>,
+        (trace, stages): (&mut Trace, &mut impl Stages),
+        found: &mut Vec<Observation>,
+    ) {
+        self.places.clear();
+        for quad in quads.filter(|quad| !quad.inverted).take(MOST_LOOKS) {
+            if self.places.len() >= MOST_FOUND {
+                break;
+            }
+            if self.places.iter().any(|place| is_same(place, &quad.corners)) {
+                continue;
+            }
+            match self.read(view, pyramid, quad, camera) {
+                Ok((reading, refined)) => {
+                    trace.accept_quad(refined.corners);
+                    self.places.push(refined.corners);
+                    found.push(self.observe(&reading, &refined, camera));
+                }
+                Err(reason) => trace.refuse_quad(quad.corners, reason),
+            }
+        }
+        stages.ended("stags");
+    }
+
+    /// The marker that a quad is, with its corners between the pixels.
+    fn read(
+        &mut self,
+        view: GrayView<'_>,
+        pyramid: &Pyramid,
+        quad: &Quad,
+        camera: Option<&CameraModel>,
+    ) -> Result<(Reading, Refined), Reason> {
+        let side_px = shortest_side_px(&quad.corners);
+        if side_px < LEAST_SIDE_PX {
+            return Err(Reason::Small);
+        }
+        let first = self.look(view, pyramid, &quad.corners)?;
+        if first.explained < ROUGHLY_EXPLAINED || first.ratio < ROUGH_RATIO {
+            return Err(Reason::Code);
+        }
+        // A wrong word has an outline too: with better corners, the right one explains more.
+        let refined = self.refined(view, (&quad.corners, &first), camera).ok_or(Reason::Edges)?;
+        let mut corners = refined.corners;
+        corners.rotate_right(usize::from(first.turns) % 4);
+        let second = self.look(view, pyramid, &corners)?;
+        if second.explained < LEAST_EXPLAINED || second.ratio < LEAST_RATIO {
+            return Err(Reason::Confidence);
+        }
+        if (second.wanted, second.id, second.turns) == (first.wanted, first.id, first.turns) {
+            return Ok((second, refined));
+        }
+        let refined = self.refined(view, (&corners, &second), camera).ok_or(Reason::Edges)?;
+        Ok((second, refined))
+    }
+
+    fn refined(
+        &mut self,
+        view: GrayView<'_>,
+        (corners, reading): (&[Pixel; 4], &Reading),
+        camera: Option<&CameraModel>,
+    ) -> Option<Refined> {
+        let mut corners = *corners;
+        corners.rotate_left(usize::from(reading.turns) % 4);
+        let family = self.wanted.get(reading.wanted)?.markers[0].family;
+        let is_it = |picture: &Picture| (picture.family, picture.id) == (family, reading.id);
+        if !self.pictures.iter().any(is_it) {
+            if self.pictures.len() >= MOST_PICTURES {
+                self.pictures.remove(0);
+            }
+            self.pictures.push(Picture::new(family, reading.id)?);
+        }
+        let picture = self.pictures.iter().find(|picture| is_it(picture))?;
+        let design = picture.design(shortest_side_px(&corners));
+        refine_design(view, &corners, &design, camera, &mut self.scratch)
+    }
+
+    /// The word that explains a square best.
+    fn look(
+        &mut self,
+        view: GrayView<'_>,
+        pyramid: &Pyramid,
+        corners: &[Pixel; 4],
+    ) -> Result<Reading, Reason> {
+        let level = ((shortest_side_px(corners) / SIDE_PX).log2().floor().max(0.0) as usize)
+            .min(pyramid.levels().saturating_sub(1));
+        let image = pyramid.level(view, level).ok_or(Reason::Small)?;
+        let places = corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
+        if !self.dots.look(image, &places) {
+            return Err(Reason::Small);
+        }
+        let word = if self.dots.solve() { self.dots.word() } else { return Err(Reason::Code) };
+        let mut best: Option<Reading> = None;
+        for (index, wanted) in self.wanted.iter().enumerate() {
+            if let Some(reading) = wanted.best(index, word, &self.dots) {
+                if best.is_none_or(|best| best.explained < reading.explained) {
+                    best = Some(reading);
+                }
+            }
+        }
+        best.ok_or(Reason::Code)
+    }
+
+    fn observe(
+        &self,
+        reading: &Reading,
+        refined: &Refined,
+        camera: Option<&CameraModel>,
+    ) -> Observation {
+        let markers = &self.wanted[reading.wanted].markers;
+        let named = markers.iter().find(|m| m.id == Some(reading.id));
+        let marker = named.or_else(|| markers.iter().find(|m| m.id.is_none()));
+        let corners = refined.corners;
+        let size_m = marker.and_then(|marker| marker.size_m);
+        let pose = camera.zip(size_m).and_then(|(camera, size_m)| {
+            square_pose(&corners, &refined.covariance_px2, size_m, camera)
+        });
+        Observation {
+            family: markers[0].family,
+            id: Some(reading.id),
+            centre: refined.centre,
+            centre_covariance_px2: refined.centre_covariance_px2,
+            corners: Some(corners),
+            wrong_bits: reading.wrong_bits,
+            size_px: corners[0].distance(&corners[2]).max(corners[1].distance(&corners[3])),
+            confidence: reading.explained * (1.0 - 0.5 / reading.ratio),
+            pose,
+        }
+    }
+}
+
+impl Wanted {
+    /// The wanted word that explains a picture best, given the word that its dots are nearest to.
+    fn best(&self, index: usize, word: u64, dots: &Dots) -> Option<Reading> {
+        let reading = |id: u32, turns: u8| {
+            // The word as it stands in the picture.
+            let seen = (0..(4 - turns) % 4)
+                .fold(*self.book.words().get(id as usize)?, |word, _| self.book.turned(word));
+            let explanation = dots.explain(seen);
+            let [black, white] = explanation.levels;
+            (white > black).then(|| Reading {
+                wanted: index,
+                id,
+                turns,
+                wrong_bits: (seen ^ word).count_ones() as u8,
+                explained: explanation.explained,
+                ratio: 1.0,
+            })
+        };
+        if self.tried.is_empty() {
+            let found = self.book.nearest(word, self.most_wrong())?;
+            let is_wanted = self.markers.iter().any(|m| m.id.is_none_or(|id| id == found.id));
+            let reading = reading(found.id, found.quarter_turns).filter(|_| is_wanted)?;
+            return Some(Reading { ratio: 2.0 * LEAST_RATIO, ..reading });
+        }
+        let mut best: Option<Reading> = None;
+        let mut second = 0.0_f64;
+        for found in self.tried.iter().flat_map(|id| (0..4).filter_map(|turns| reading(*id, turns)))
+        {
+            match best {
+                Some(best) if best.explained >= found.explained => {
+                    second = second.max(found.explained);
+                }
+                _ => {
+                    second = best.map_or(0.0, |best| best.explained);
+                    best = Some(found);
+                }
+            }
+        }
+        best.map(|best| Reading {
+            ratio: (1.0 - second) / (1.0 - best.explained).max(1e-6),
+            ..best
+        })
+    }
+
+    /// How many wrong bits are mended, so that a random word hardly ever becomes one of the family's.
+    fn most_wrong(&self) -> u8 {
+        use crate::marker::Family;
+        match self.markers[0].family {
+            Family::StagHd11 => 4,
+            Family::StagHd13 => 5,
+            Family::StagHd15 => 6,
+            _ => 7,
+        }
+    }
+}
+
+fn shortest_side_px(corners: &[Pixel; 4]) -> f64 {
+    (0..4).map(|i| corners[i].distance(&corners[(i + 1) % 4])).fold(f64::INFINITY, f64::min)
+}
+
+/// Whether two quads are of the same square.
+fn is_same(a: &[Pixel; 4], b: &[Pixel; 4]) -> bool {
+    let middle = |q: &[Pixel; 4]| {
+        let mean = |of: fn(&Pixel) -> f64| q.iter().map(of).sum::<f64>() / 4.0;
+        Pixel::new(mean(|c| c.x), mean(|c| c.y))
+    };
+    middle(a).distance(&middle(b)) < 0.25 * a[0].distance(&a[2])
+}

@@ -63,7 +63,6 @@ impl Codebook {
     }
 
     /// The words.
-    #[allow(dead_code, reason = "only tests list the words so far")]
     pub(crate) fn words(&self) -> &'static [u64] {
         self.words
     }

@@ -10,7 +10,7 @@ use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
 use crate::square::pattern::{MOST_CELLS, Pattern};
-use crate::square::refine::{Fit, Homography, Lens, Scratch};
+use crate::square::refine::{Design, Fit, Homography, Lens, Scratch};
 use crate::step::{END, PIXEL_VARIANCE, Step, boxiness};
 
 /// Light and blur of a marker's picture.
@@ -68,11 +68,31 @@ pub(crate) fn fit(
     pattern: &Pattern,
     scratch: &mut Scratch,
 ) -> Option<Fit> {
-    let grid = Grid::new(pattern, lens);
-    let side_px = start.shortest_side_px();
-    let cell_px = side_px / pattern.cells() as f64;
+    let cell_px = start.shortest_side_px() / pattern.cells() as f64;
     // A wide blur at first: what is half a cell off is still drawn to its place.
     let spread_px = (0.4 * cell_px).clamp(0.7, 1.2);
+    fit_grid(view, lens, start, (&Grid::new(pattern, lens), spread_px), scratch)
+}
+
+/// The same for a picture that is not made of square cells.
+pub(crate) fn fit_design(
+    view: GrayView<'_>,
+    lens: &Lens<'_>,
+    start: &Homography,
+    design: &Design<'_>,
+    scratch: &mut Scratch,
+) -> Option<Fit> {
+    fit_grid(view, lens, start, (&Grid::of(design, lens), 0.7), scratch)
+}
+
+fn fit_grid(
+    view: GrayView<'_>,
+    lens: &Lens<'_>,
+    start: &Homography,
+    (grid, spread_px): (&Grid, f64),
+    scratch: &mut Scratch,
+) -> Option<Fit> {
+    let side_px = start.shortest_side_px();
     let light = Picture { black: 0.0, contrast: 1.0, shade: [0.0; 2], spread_px };
     let pull = Pull { limit: f64::INFINITY, is_rough: true };
     let mut state = State { homography: *start, light, half_px: side_px / 2.0, pull };
@@ -80,11 +100,11 @@ pub(crate) fn fit(
     for (most_spots, settled_px) in MOST_SPOTS.into_iter().zip(SETTLED_PX) {
         let is_complete = grid.gather(view, lens, &state, most_spots, &mut scratch.spots)?;
         if solved.is_none() {
-            state.expose(&grid, &scratch.spots)?;
+            state.expose(grid, &scratch.spots)?;
             state.pull = Pull { limit: 0.25 * state.light.contrast.abs(), is_rough: true };
         }
         let settled_px = if is_complete { SETTLED_PX[1] } else { settled_px };
-        let (next, system) = state.solved(&grid, scratch, settled_px)?;
+        let (next, system) = state.solved(grid, scratch, settled_px)?;
         // Where all pixels take part at once, others would only after a move.
         let is_last = is_complete && next.homography.distance_px(start) < SAME_PIXELS_PX;
         state = next;
@@ -234,10 +254,25 @@ impl Grid {
                 }
             }
         }
+        Self::with(lens, (pattern.cells(), across), white, unknown)
+    }
+
+    fn of(design: &Design<'_>, lens: &Lens<'_>) -> Self {
+        let across = (design.cells + 2 * design.margin).min(MOST_CELLS);
+        let known = [[0.0; MOST_CELLS]; MOST_CELLS];
+        Self::with(lens, (design.cells, across), *design.white, known)
+    }
+
+    fn with(
+        lens: &Lens<'_>,
+        (cells, across): (usize, usize),
+        white: [[f64; MOST_CELLS]; MOST_CELLS],
+        unknown: [[f64; MOST_CELLS]; MOST_CELLS],
+    ) -> Self {
         let bend = lens.slope();
         Self {
             across,
-            half: pattern.cells() as f64 / 2.0,
+            half: cells as f64 / 2.0,
             middle: across as f64 / 2.0,
             white,
             unknown,

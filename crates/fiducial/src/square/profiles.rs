@@ -82,6 +82,29 @@ pub(crate) fn fit(
     scratch: &mut Scratch,
 ) -> Option<Fit> {
     place_runs(start, pattern, &mut scratch.runs);
+    fit_runs(view, lens, start, scratch)
+}
+
+/// The same for edges that are given.
+pub(crate) fn fit_edges(
+    view: GrayView<'_>,
+    lens: &Lens<'_>,
+    start: &Homography,
+    edges: &[[[f64; 2]; 2]],
+    scratch: &mut Scratch,
+) -> Option<Fit> {
+    scratch.runs.clear();
+    let run = |[place, across]: &[[f64; 2]; 2]| Run { place: *place, across: *across, sight: None };
+    scratch.runs.extend(edges.iter().take(2 * MOST_RUNS).map(run));
+    fit_runs(view, lens, start, scratch)
+}
+
+fn fit_runs(
+    view: GrayView<'_>,
+    lens: &Lens<'_>,
+    start: &Homography,
+    scratch: &mut Scratch,
+) -> Option<Fit> {
     let mut search = Search {
         view,
         lens,

@@ -12,7 +12,7 @@ use geometry::{CameraModel, Distortion, Pixel, Point};
 use imaging::GrayView;
 use nalgebra::{Matrix2, SMatrix, SVector};
 
-use crate::square::pattern::Pattern;
+use crate::square::pattern::{MOST_CELLS, Pattern};
 use crate::square::picture::{self, Picture};
 use crate::square::profiles::{self, Run};
 
@@ -47,6 +47,8 @@ pub struct Scratch {
 
 /// Cells narrower than this, in pixels, have edges that blur into each other.
 const LEAST_CELL_PX: f64 = 5.5;
+/// The same for a single border, beside which there is nothing as fine.
+const LEAST_BORDER_PX: f64 = 4.0;
 /// Squares smaller than this, in pixels, tell nothing.
 const LEAST_SIDE_PX: f64 = 4.0;
 /// A corner moves no further than this: pixels, and a share of the shortest side.
@@ -73,6 +75,41 @@ pub fn refine(
         None => picture::fit(view, &lens, &start, pattern, scratch)?,
     };
     fit.refined(&lens, corners, start.shortest_side_px())
+}
+
+/// A square picture that is not made of square cells of one colour.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Design<'a> {
+    /// Small cells across the square, and around it on each side.
+    pub(crate) cells: usize,
+    pub(crate) margin: usize,
+    /// The share of white in each of them, row by row.
+    pub(crate) white: &'a [[f64; MOST_CELLS]; MOST_CELLS],
+    /// Places on edges, in the square's coordinates, and from there towards white as far as no other edge is.
+    pub(crate) edges: &'a [[[f64; 2]; 2]],
+    /// How far the square's outline is from the next edge, in sides of the square.
+    pub(crate) border: f64,
+}
+
+/// The same as [`refine`] for other pictures.
+pub(crate) fn refine_design(
+    view: GrayView<'_>,
+    corners: &[Pixel; 4],
+    design: &Design<'_>,
+    camera: Option<&CameraModel>,
+    scratch: &mut Scratch,
+) -> Option<Refined> {
+    let lens = Lens::new(camera, corners)?;
+    let start = Homography::from_corners(&lens, corners)?;
+    let side_px = start.shortest_side_px();
+    let by_profiles = (design.border * side_px >= LEAST_BORDER_PX)
+        .then(|| profiles::fit_edges(view, &lens, &start, design.edges, scratch))
+        .flatten();
+    let fit = match by_profiles {
+        Some(fit) => fit,
+        None => picture::fit_design(view, &lens, &start, design, scratch)?,
+    };
+    fit.refined(&lens, corners, side_px)
 }
 
 /// What both ways end with.

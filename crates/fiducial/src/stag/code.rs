@@ -54,7 +54,6 @@ pub(crate) fn is_black(word: u64, k: usize) -> bool {
     word >> (DOTS - 1 - k) & 1 == 1
 }
 
-#[allow(dead_code, reason = "only tests search among the words so far")]
 /// The words of a family of STags and the search among them; `None` for other families. Prepared at the first call.
 pub(crate) fn book(family: Family) -> Option<&'static Codebook> {
     static BOOKS: [OnceLock<Codebook>; 7] = [const { OnceLock::new() }; 7];

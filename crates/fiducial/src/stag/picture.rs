@@ -1,0 +1,130 @@
+//! What an STag looks like, for the comparison with an image: small cells with their share of white, and edges.
+
+use crate::drawing::{Drawing, Ink, Shape};
+use crate::marker::{Family, Marker};
+use crate::square::pattern::MOST_CELLS;
+use crate::square::refine::Design;
+use crate::stag::code::DISC_RADIUS;
+use crate::stag::dots::{ACROSS, CELLS, MARGIN};
+
+/// Samples of a small cell in each direction.
+const SAMPLES: usize = 16;
+const FINE: usize = ACROSS * SAMPLES;
+/// Places on each side, and on the disc's edge.
+const ON_SIDE: usize = 36;
+const ON_DISC: usize = 96;
+/// How far the next edge is, in the square's coordinates, from -1 to 1: from the outline to the disc, and from the disc to
+/// the dots.
+const BORDER: f64 = 0.2;
+const RIM: f64 = 0.1;
+
+/// The picture of one marker.
+#[derive(Debug)]
+pub(crate) struct Picture {
+    pub(crate) family: Family,
+    pub(crate) id: u32,
+    white: Box<[[f64; MOST_CELLS]; MOST_CELLS]>,
+    edges: Vec<[[f64; 2]; 2]>,
+}
+
+/// Where the rim between disc and dots is narrower than this, in pixels, the disc's edge is not looked at by itself.
+const LEAST_RIM_PX: f64 = 4.0;
+
+impl Picture {
+    /// `None` for an id that the family does not have.
+    pub(crate) fn new(family: Family, id: u32) -> Option<Self> {
+        let drawing = Drawing::new(&Marker { family, id: Some(id), size_m: None }, 1.0)?;
+        Some(Self { family, id, white: white(&drawing), edges: edges() })
+    }
+
+    /// For a square with sides of this length.
+    pub(crate) fn design(&self, side_px: f64) -> Design<'_> {
+        let is_wide = side_px * RIM / 2.0 >= LEAST_RIM_PX;
+        let edges = if is_wide { &self.edges[..] } else { &self.edges[..4 * ON_SIDE] };
+        Design { cells: CELLS, margin: MARGIN, white: &self.white, edges, border: BORDER / 2.0 }
+    }
+}
+
+/// The share of white in each small cell.
+fn white(drawing: &Drawing) -> Box<[[f64; MOST_CELLS]; MOST_CELLS]> {
+    let mut fine = vec![true; FINE * FINE];
+    let per_unit = (CELLS * SAMPLES) as f64;
+    let middle = FINE as f64 / 2.0;
+    // Of the samples whose middles lie between two places.
+    let range = |low: f64, high: f64| {
+        let index = |place: f64| (place * per_unit + middle - 0.5).ceil().clamp(0.0, FINE as f64);
+        index(low) as usize..index(high) as usize
+    };
+    for layer in &drawing.layers {
+        let ink = layer.ink == Ink::White;
+        match layer.shape {
+            Shape::Rectangle { min_m, max_m } => {
+                for y in range(-max_m[1], -min_m[1]) {
+                    let row = &mut fine[y * FINE..(y + 1) * FINE];
+                    row[range(min_m[0], max_m[0])].fill(ink);
+                }
+            }
+            Shape::Disc { centre_m: [x, y], radius_m } => {
+                for row in range(-y - radius_m, -y + radius_m) {
+                    let off = (row as f64 + 0.5 - middle) / per_unit + y;
+                    let half = (radius_m * radius_m - off * off).max(0.0).sqrt();
+                    let columns = range(x - half, x + half);
+                    fine[row * FINE..(row + 1) * FINE][columns].fill(ink);
+                }
+            }
+        }
+    }
+    let mut white = Box::new([[0.0; MOST_CELLS]; MOST_CELLS]);
+    for (index, is_white) in fine.iter().enumerate() {
+        let (x, y) = (index % FINE / SAMPLES, index / FINE / SAMPLES);
+        white[y][x] += f64::from(u8::from(*is_white)) / (SAMPLES * SAMPLES) as f64;
+    }
+    white
+}
+
+/// Places on the outline and on the disc's edge, in the square's coordinates (x right, y down, -1 to 1), and for each the
+/// way to the next edge on its white side, or as far on it as to the next one on its black side.
+fn edges() -> Vec<[[f64; 2]; 2]> {
+    let mut edges = Vec::with_capacity(4 * ON_SIDE + ON_DISC);
+    for k in 0..ON_SIDE {
+        let along = (k as f64 + 0.5) / ON_SIDE as f64 * 1.9 - 0.95;
+        edges.extend([
+            [[along, -1.0], [0.0, -BORDER]],
+            [[along, 1.0], [0.0, BORDER]],
+            [[-1.0, along], [-BORDER, 0.0]],
+            [[1.0, along], [BORDER, 0.0]],
+        ]);
+    }
+    let radius = 2.0 * DISC_RADIUS;
+    edges.extend((0..ON_DISC).map(|k| {
+        let (sin, cos) = ((k as f64 + 0.5) / ON_DISC as f64 * std::f64::consts::TAU).sin_cos();
+        [[radius * cos, radius * sin], [-RIM * cos, -RIM * sin]]
+    }));
+    edges
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_cells_have_the_share_of_white_that_is_drawn() {
+        let marker = "stag-hd21:3".parse().unwrap();
+        let drawing = Drawing::new(&marker, 1.0).unwrap();
+        let picture = Picture::new(Family::StagHd21, 3).unwrap();
+        let samples = 20;
+        for cell in 0..ACROSS * ACROSS {
+            let (x, y) = (cell % ACROSS, cell / ACROSS);
+            let place = |cell: usize, k: usize| {
+                let offset = (k as f64 + 0.5) / f64::from(samples);
+                (cell as f64 + offset - ACROSS as f64 / 2.0) / CELLS as f64
+            };
+            let all =
+                (0..samples as usize).flat_map(|i| (0..samples as usize).map(move |j| (i, j)));
+            let white =
+                all.filter(|(i, j)| drawing.ink_at(place(x, *i), -place(y, *j)) == Ink::White);
+            let share = white.count() as f64 / f64::from(samples * samples);
+            assert!((share - picture.white[y][x]).abs() < 0.12, "{x} {y}");
+        }
+    }
+}
