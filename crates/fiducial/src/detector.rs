@@ -101,7 +101,7 @@ impl Detector {
                 let watch = (&mut self.trace, &mut *stages);
                 let quads = self.squares.quads();
                 let pyramid = self.outlines.pyramid();
-                self.stags.detect(view, pyramid, quads, camera, watch, &mut self.found);
+                self.stags.detect((view, pyramid), quads, camera, watch, &mut self.found);
             }
         }
         for marker in &self.markers {

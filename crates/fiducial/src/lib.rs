@@ -3,8 +3,8 @@
 //! This crate knows images as borrowed grey views and cameras as models. It knows no network, no file, no
 //! clock and no thread; a stage of a detection that wants to be timed tells a [`Stages`] observer.
 //!
-//! Modules in reading order: [`marker`] names what is looked for, [`square`] has the codes of square markers, [`drawing`]
-//! says what a marker looks like, [`observation`] is what was found, [`pose`] where it is in space, [`detector`] finds
+//! Modules in reading order: [`marker`] names what is looked for, [`square`] has the codes of square markers and finds
+//! them, `stag` finds STags among the same quads, [`drawing`] says what a marker looks like, [`observation`] is what was found, [`pose`] where it is in space, [`detector`] finds
 //! it. [`ring`] and [`rings_thesis`] are the thesis' way
 //! (Algorithms 1-15). [`rings`] is the second generation: `outline` takes ellipses from outlines, `profile` compares the
 //! bands about them with the marker's, `search` goes from one circle to all edges, `circles` and, for small markers,

@@ -111,8 +111,7 @@ impl Stags {
     /// Finds the markers among the quads of an image.
     pub(crate) fn detect<'a>(
         &mut self,
-        view: GrayView<'_>,
-        pyramid: &Pyramid,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
         quads: impl Iterator<Item = &'a Quad>,
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
@@ -207,11 +206,10 @@ impl Stags {
         let word = if self.dots.solve() { self.dots.word() } else { return Err(Reason::Code) };
         let mut best: Option<Reading> = None;
         for (index, wanted) in self.wanted.iter().enumerate() {
-            if let Some(reading) = wanted.best(index, word, &self.dots) {
-                if best.is_none_or(|best| best.explained < reading.explained) {
-                    best = Some(reading);
-                }
-            }
+            let reading = wanted.best(index, word, &self.dots);
+            let is_better =
+                |reading: &Reading| best.is_none_or(|best| best.explained < reading.explained);
+            best = reading.filter(is_better).or(best);
         }
         best.ok_or(Reason::Code)
     }

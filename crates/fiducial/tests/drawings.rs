@@ -1,6 +1,7 @@
 //! The drawings agree with the pictures of the reference libraries, cell by cell, for every id.
 //!
 //! `reference_drawings.txt` has a checksum for each family, written by `reference_drawings.py` from the libraries.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
 
 use fiducial::square::code::Code;
 use fiducial::{Drawing, Family, Ink, Marker, Shape};

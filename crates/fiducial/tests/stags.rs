@@ -1,4 +1,5 @@
 //! STags as a camera sees them: from close up to where a dot is hardly wider than a pixel.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
 
 use fiducial::{Detector, Drawing, Family, Ink, Marker, Observation, Settings};
 use geometry::{CameraModel, Pixel};
