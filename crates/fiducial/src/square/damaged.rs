@@ -44,8 +44,10 @@ pub struct Damaged {
 const MOST_PIXELS: usize = 400_000;
 const LEVELS: usize = 2;
 const LEAST_EDGE: LeastEdge = LeastEdge { gradient: 6, length_px: 5.0 };
+/// Cells that are narrower, in pixels, cannot be told apart one by one.
+const LEAST_CELL_PX: f64 = 2.5;
 /// The most quads that are read in an image, and the most markers that are found.
-const MOST_READ: usize = 200;
+const MOST_READ: usize = 100;
 const MOST_FOUND: usize = 64;
 
 impl Damaged {
@@ -79,7 +81,10 @@ impl Damaged {
 
     /// Of what was found in one place more than once, keeps the surest.
     fn choose(&mut self) {
-        let sureness = |marker: &DamagedMarker| marker.reading.intact * marker.reading.evidence;
+        let sureness = |marker: &DamagedMarker| {
+            let Reading { intact, explained, evidence, .. } = marker.reading;
+            intact * explained * evidence
+        };
         self.found.sort_unstable_by(|a, b| sureness(b).total_cmp(&sureness(a)));
         let mut kept = 0;
         for index in 0..self.found.len() {
@@ -106,7 +111,12 @@ fn read<'a>(
     if is_known {
         return;
     }
+    let shortest = (0..4).map(|i| quad.corners[i].distance(&quad.corners[(i + 1) % 4]));
+    let shortest = shortest.fold(f64::MAX, f64::min);
     for family in sought {
+        if shortest < LEAST_CELL_PX * f64::from(family.code.cells) {
+            continue;
+        }
         if *left == 0 || found.len() >= MOST_FOUND || !erasures::has_border(view, quad, family.code)
         {
             continue;

@@ -488,8 +488,8 @@ impl Known {
 
     /// Two lights, and what they leave to explain: the best of lines all over the grid, then of lines near it.
     fn shaded(&self, middle: f32) -> Option<(Light, f32)> {
-        const DIRECTIONS: i32 = 16;
-        let (mut turn, mut step) = (std::f32::consts::PI / DIRECTIONS as f32, (middle + 1.0) / 8.0);
+        const DIRECTIONS: i32 = 12;
+        let (mut turn, mut step) = (std::f32::consts::PI / DIRECTIONS as f32, (middle + 1.0) / 5.0);
         let line = |angle: f32, aside: f32| {
             let normal = [angle.cos(), angle.sin()];
             self.split(normal, middle * (normal[0] + normal[1]) + aside)
@@ -504,11 +504,11 @@ impl Known {
             }
         };
         for direction in 0..DIRECTIONS {
-            for aside in -8..=8 {
+            for aside in -5..=5 {
                 look(turn * direction as f32, step * aside as f32, &mut at);
             }
         }
-        for _ in 0..3 {
+        for _ in 0..4 {
             turn *= 0.5;
             step *= 0.5;
             let (angle, aside) = at;

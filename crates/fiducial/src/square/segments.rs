@@ -97,7 +97,7 @@ impl SegmentQuads {
         self.join();
         self.starts.fill(&self.sides, size);
         self.turn();
-        self.guess();
+        self.guess(size);
         self.choose(placement, inverted);
         &self.found
     }
@@ -184,7 +184,7 @@ impl SegmentQuads {
     }
 
     /// Ways round over four, three and two sides.
-    fn guess(&mut self) {
+    fn guess(&mut self, size: [usize; 2]) {
         let mut guesses = std::mem::take(&mut self.guesses);
         guesses.clear();
         for (index, a) in self.sides.iter().enumerate() {
@@ -200,7 +200,7 @@ impl SegmentQuads {
                         continue;
                     }
                     let places = [first.place, second.place];
-                    three_sides([a, b, c], places, &mut guesses);
+                    three_sides([a, b, c], places, size, &mut guesses);
                     for third in self.corners_of(second.next as usize) {
                         let d = &self.sides[third.next as usize];
                         let places = [first.place, second.place, third.place];
@@ -251,10 +251,22 @@ fn four_sides([a, b, c, d]: [&Side; 4], [ab, bc, cd]: [[f32; 2]; 3], out: &mut V
 }
 
 /// Three sides; the fourth joins their ends, or is parallel to the second.
-fn three_sides(sides: [&Side; 3], [ab, bc]: [[f32; 2]; 2], out: &mut Vec<Guess>) {
+fn three_sides(sides: [&Side; 3], [ab, bc]: [[f32; 2]; 2], size: [usize; 2], out: &mut Vec<Guess>) {
     let [a, b, c] = sides;
-    Guess::add([a.start, ab, bc, c.end], sides, out);
     let (first, last) = (distance(a.start, ab), distance(bc, c.end));
+    if is_at_frame(a.start, size) || is_at_frame(c.end, size) {
+        // How far the marker goes on beyond the frame is not seen; it is a square.
+        let middle = distance(ab, bc);
+        for share in [0.84, 0.92, 1.0, 1.09, 1.18] {
+            let length = share * middle;
+            if length > 0.97 * first.max(last) {
+                let start = [ab[0] - length * a.way[0], ab[1] - length * a.way[1]];
+                let end = [bc[0] + length * c.way[0], bc[1] + length * c.way[1]];
+                Guess::add([start, ab, bc, end], [a, b, c], out);
+            }
+        }
+    }
+    Guess::add([a.start, ab, bc, c.end], sides, out);
     if (first - last).abs() > 0.06 * first.max(last) {
         let (start, end) = if first > last {
             (a.start, plus(bc, minus(a.start, ab)))
@@ -263,6 +275,13 @@ fn three_sides(sides: [&Side; 3], [ab, bc]: [[f32; 2]; 2], out: &mut Vec<Guess>)
         };
         Guess::add([start, ab, bc, end], [a, b, c], out);
     }
+}
+
+/// Whether a place is as good as on the edge of the picture.
+fn is_at_frame([x, y]: [f32; 2], [width, height]: [usize; 2]) -> bool {
+    const NEAR_PX: f32 = 4.0;
+    let beyond = |at: f32, edge: usize| at < NEAR_PX || at > edge as f32 - 1.0 - NEAR_PX;
+    beyond(x, width) || beyond(y, height)
 }
 
 /// Two sides, and the other two parallel to them.
