@@ -63,8 +63,14 @@ pub fn read(
     let mut read = [Cell::Unknown; MOST_CELLS];
     grid.judge(&light, &mut read);
     let intact = grid.intact(&read)?;
-    grid.distrust(&mut read);
-    let (word, known) = grid.word(&read, code);
+    let glares = grid.distrust(&mut read);
+    let mut whole = read;
+    if glares || light.reflection.is_some() {
+        let look =
+            Look { view, place: &place, cells: f64::from(code.cells), inverted: quad.inverted };
+        grid.step(&look, &light, &mut whole);
+    }
+    let (word, known) = grid.word(&whole, code);
     let mut reading = best_word(word, known, code, wanted)?;
     reading.intact = intact;
     reading.explained = grid.explained(&light, &read);
@@ -256,7 +262,8 @@ impl Grid {
                     continue;
                 };
                 let weight = if sample == SAMPLES * SAMPLES / 2 { 2.0 } else { 1.0 };
-                bright += usize::from(share > 1.5);
+                bright +=
+                    usize::from(share > 1.2 && light.is_brighter([column + dx, row + dy], *value));
                 sum += weight * share.clamp(-0.2, 1.2);
                 weights += weight;
             }
@@ -299,8 +306,8 @@ impl Grid {
         all_good.then_some(0.5 * (shares[0] + shares[1]))
     }
 
-    /// Makes cells unknown that are probably damaged as their neighbours are.
-    fn distrust(&self, read: &mut [Cell; MOST_CELLS]) {
+    /// Makes cells unknown that are probably damaged as their neighbours are; says whether any is washed out.
+    fn distrust(&self, read: &mut [Cell; MOST_CELLS]) -> bool {
         let seen = *read;
         for (index, cell) in seen.iter().enumerate().take(self.across * self.across) {
             let covered =
@@ -320,6 +327,69 @@ impl Grid {
                 }
             }
         }
+        seen.iter().take(self.across * self.across).any(|cell| *cell == Cell::Glare)
+    }
+
+    /// Reads bits that are unknown by the steps from their neighbours to them: added light hardly changes across the edge
+    /// between two cells, and black and white still differ there until both are at the sensor's end.
+    fn step(&self, look: &Look<'_>, light: &Light, read: &mut [Cell; MOST_CELLS]) {
+        const SWEEPS: usize = 4;
+        for _ in 0..SWEEPS {
+            let mut changed = false;
+            for index in 0..self.across * self.across {
+                if self.kinds[index] != Kind::Bit
+                    || matches!(read[index], Cell::Black | Cell::White)
+                {
+                    continue;
+                }
+                let [black, white] = self.votes(index, look, light, read);
+                let cell = match (black > 0, white > 0) {
+                    (true, false) => Cell::Black,
+                    (false, true) => Cell::White,
+                    _ => continue,
+                };
+                read[index] = cell;
+                changed = true;
+            }
+            if !changed {
+                return;
+            }
+        }
+    }
+
+    /// How many neighbours say by their steps that a cell is black, and how many that it is white.
+    fn votes(
+        &self,
+        index: usize,
+        look: &Look<'_>,
+        light: &Light,
+        read: &[Cell; MOST_CELLS],
+    ) -> [u32; 2] {
+        let [column, row] = self.cell(index);
+        let mut votes = [0; 2];
+        for way in [[1, 0], [0, 1], [-1, 0], [0, -1]] {
+            let Some(near) = self.index([column + way[0], row + way[1]]) else { continue };
+            let neighbour = match (self.kinds[near], read[near]) {
+                (Kind::Border, _) | (_, Cell::Black) => Cell::Black,
+                (_, Cell::White) => Cell::White,
+                _ => continue,
+            };
+            let Some([here, there]) = look.beside([column, row], way) else { continue };
+            let [black, white] = light.plain([f32::from(column), f32::from(row)]);
+            let step = (here - there) / (white - black);
+            let ends = here.max(there) > SATURATED;
+            let vote = match neighbour {
+                Cell::Black if step > 0.5 => Some(1),
+                Cell::White if step < -0.5 => Some(0),
+                Cell::Black if step.abs() < 0.25 && !ends => Some(0),
+                Cell::White if step.abs() < 0.25 && !ends => Some(1),
+                _ => None,
+            };
+            if let Some(vote) = vote {
+                votes[vote] += 1;
+            }
+        }
+        votes
     }
 
     /// How well the known bits' cells are one black or one white: texture and writing are not.
@@ -361,6 +431,36 @@ impl Grid {
             known = known << 1 | u64::from(is_known);
         }
         (word, known)
+    }
+}
+
+/// A marker in an image, to look at more closely.
+struct Look<'a> {
+    view: GrayView<'a>,
+    place: &'a Projection,
+    cells: f64,
+    inverted: bool,
+}
+
+impl Look<'_> {
+    /// The mean grey values just on this side and just beyond of the edge between a cell and its neighbour.
+    fn beside(&self, cell: [i8; 2], way: [i8; 2]) -> Option<[f32; 2]> {
+        const OFF: f64 = 0.2;
+        let middle = cell.map(|v| f64::from(v) + 0.5);
+        let way = way.map(f64::from);
+        let mut sums = [0.0; 2];
+        for along in [-0.25, 0.0, 0.25] {
+            for (sum, across) in sums.iter_mut().zip([0.5 - OFF, 0.5 + OFF]) {
+                let at = [
+                    middle[0] + across * way[0] - along * way[1],
+                    middle[1] + across * way[1] + along * way[0],
+                ];
+                let value = bilinear(self.view, self.place.at(at.map(|v| v / self.cells))?)?;
+                let value = if self.inverted { 255.0 - value } else { value };
+                *sum += value / 3.0;
+            }
+        }
+        Some(sums)
     }
 }
 
@@ -635,6 +735,18 @@ impl Light {
             (constant + by_x * x + by_y * y + by_squares * (x * x + y * y)).min(6.0).exp()
         });
         self.levels[side].map(|level| (level + added).min(255.0))
+    }
+
+    /// Black and white at a place without the reflection.
+    fn plain(&self, [x, y]: [f32; 2]) -> [f32; 2] {
+        let beyond = x * self.normal[0] + y * self.normal[1] - self.offset;
+        self.levels[usize::from(beyond > 0.0)]
+    }
+
+    /// Whether a grey value is at the sensor's end where white is not.
+    fn is_brighter(&self, place: [f32; 2], value: f32) -> bool {
+        let [_, white] = self.plain(place);
+        white < SATURATED - 10.0 && value > SATURATED
     }
 
     /// Where a grey value lies between black (0) and white (1); `None` outside of the image, where the two lights
