@@ -41,6 +41,12 @@ const MOST_UNEVEN: f64 = 0.6;
 /// Share of the variance of its pixels that a marker explains; textures that happen to spell a word explain less.
 const LEAST_EXPLAINED: f64 = 0.8;
 
+/// How good corners are before they are refined: of an outline; of joined segments, at least, and as a share of the
+/// diagonal.
+const OUTLINED_PX: f64 = 0.2;
+const JOINED_PX: f64 = 0.5;
+const JOINED_SHARE: f64 = 0.015;
+
 /// One family that is looked for, and which of its ids.
 #[derive(Debug)]
 struct Wanted {
@@ -79,6 +85,8 @@ struct Found {
     wrong_bits: u8,
     explained: f64,
     margin: f64,
+    /// How good the corners are as they were found, in pixels.
+    corner_px: f64,
 }
 
 impl Squares {
@@ -253,6 +261,7 @@ impl Squares {
                 wrong_bits: reading.wrong_bits,
                 explained: f64::from(reading.explained),
                 margin,
+                corner_px: (JOINED_SHARE * corners[0].distance(&corners[2])).max(JOINED_PX),
             });
         }
     }
@@ -311,7 +320,15 @@ impl Squares {
             .fold(f64::MAX, f64::min);
         let mut corners = quad.corners;
         corners.rotate_left(usize::from(turns) % 4);
-        Ok(Found { wanted: index, id, corners, wrong_bits, explained, margin })
+        Ok(Found {
+            wanted: index,
+            id,
+            corners,
+            wrong_bits,
+            explained,
+            margin,
+            corner_px: OUTLINED_PX,
+        })
     }
 }
 
@@ -401,7 +418,7 @@ fn observe(
         wanted.code.words.get(found.id as usize).and_then(|w| Pattern::of(wanted.code, *w));
     let refined = pattern
         .and_then(|pattern| refine(view, &found.corners, &pattern, camera, scratch))
-        .unwrap_or_else(|| coarse(&found.corners));
+        .unwrap_or_else(|| coarse(&found.corners, found.corner_px));
     let corners = refined.corners;
     let named = wanted.markers.iter().find(|m| m.id == Some(found.id));
     let marker = named.or_else(|| wanted.markers.iter().find(|m| m.id.is_none()));
@@ -422,14 +439,14 @@ fn observe(
     }
 }
 
-/// Corners that could not be refined: of an outline they are good to some tenths of a pixel.
-fn coarse(corners: &[Pixel; 4]) -> Refined {
-    const CORNER_PX2: f64 = 0.2 * 0.2;
+/// Corners that could not be refined, and how good they are in pixels.
+fn coarse(corners: &[Pixel; 4], corner_px: f64) -> Refined {
+    let corner_px2 = corner_px * corner_px;
     Refined {
         corners: *corners,
-        covariance_px2: SMatrix::identity() * CORNER_PX2,
+        covariance_px2: SMatrix::identity() * corner_px2,
         centre: crossing(corners),
-        centre_covariance_px2: Matrix2::identity() * (CORNER_PX2 / 4.0),
+        centre_covariance_px2: Matrix2::identity() * (corner_px2 / 4.0),
         blur_px: 0.0,
         black: 0.0,
         white: 0.0,
