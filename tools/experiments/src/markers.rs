@@ -8,7 +8,7 @@ use fiducial::{Family, Marker};
 
 use crate::figures::{self, FIGURES};
 use crate::photographs;
-use crate::record::{self, OURS, Record};
+use crate::record::{self, ALL_AT_ONCE, FOLLOWING, OURS, Record};
 use crate::report;
 use crate::sets::{MARKERS, SIZE_M, Set};
 use crate::shot::Studio;
@@ -52,6 +52,7 @@ pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<
             if set.has_marker() {
                 let any = Marker { id: None, ..marker };
                 answer(results_in, *set, name, (&folder, &[any]))?;
+                time(results_in, *set, any, &folder)?;
             } else {
                 for (name, families) in photographs::families_for_negatives() {
                     let markers = sized(&families);
@@ -111,6 +112,23 @@ fn answer(
     let answers = record::run(folder, markers, runs)?;
     let file = record::file(results, OURS, set, name);
     record::write(&file, answers.iter().map(|(_, record)| record))
+}
+
+/// Sets that are there to measure time, with all families at once and with the marker followed.
+fn time(results: &Path, set: Set, marker: Marker, folder: &Path) -> anyhow::Result<()> {
+    const RATE_HZ: f64 = 30.0;
+    let name = marker.family.name();
+    if set == Set::Textured {
+        let [(_, families), _] = photographs::families_for_negatives();
+        let answers = record::run(folder, &sized(&families), TIMED_RUNS)?;
+        let file = record::file(results, ALL_AT_ONCE, set, name);
+        record::write(&file, answers.iter().map(|(_, record)| record))?;
+    }
+    if set == Set::Tracking {
+        let records = record::follow(folder, &[marker], RATE_HZ, TIMED_RUNS)?;
+        record::write(&record::file(results, FOLLOWING, set, name), &records)?;
+    }
+    Ok(())
 }
 
 /// The folder in which a detector's answers to photographs are.

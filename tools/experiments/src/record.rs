@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use fiducial::tracking::{Tracker, TrackingSettings};
 use fiducial::{Detector, Marker, Observation, Settings};
 use image::GrayImage;
 use imaging::GrayView;
@@ -14,6 +15,12 @@ use crate::store::{self, Frame};
 
 /// The name under which our own results are kept.
 pub const OURS: &str = "alight";
+
+/// The same looking for all of the experiment's families at once.
+pub const ALL_AT_ONCE: &str = "alight-all";
+
+/// The same following the marker from frame to frame.
+pub const FOLLOWING: &str = "alight-following";
 
 /// A detector's answer to one frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -133,6 +140,44 @@ pub fn run(folder: &Path, markers: &[Marker], runs: usize) -> anyhow::Result<Vec
             Ok((frame, record))
         })
         .collect()
+}
+
+/// Follows markers through the frames of a folder, taken at so many a second, some times over; the shortest time of
+/// each frame counts, but for the first of all, in which there is nothing to follow.
+///
+/// # Errors
+/// When a frame cannot be read, or there is no such detector.
+pub fn follow(
+    folder: &Path,
+    markers: &[Marker],
+    rate_hz: f64,
+    runs: usize,
+) -> anyhow::Result<Vec<Record>> {
+    let frames = store::frames(folder)?;
+    let images: Vec<GrayImage> =
+        frames.iter().map(|frame| read(&folder.join(&frame.image))).collect::<Result<_, _>>()?;
+    let mut records: Vec<Record> = Vec::new();
+    for _ in 0..runs.max(1) {
+        let mut detector = Detector::new(markers, Settings::default())?;
+        // Nothing but following, so that the times are of that.
+        let mut tracker = Tracker::new(TrackingSettings { full_search_period: u32::MAX });
+        for (index, (frame, image)) in frames.iter().zip(&images).enumerate() {
+            let (width, height) = (image.width() as usize, image.height() as usize);
+            let view = GrayView::packed(image.as_raw(), width, height).context("an image")?;
+            let (camera, time_s) = (frame.camera.model(), index as f64 / rate_hz);
+            let start = processor_ms();
+            let seen = tracker.detect(&mut detector, view, Some(&camera), time_s, &mut ());
+            let ms = processor_ms() - start;
+            match records.get_mut(index) {
+                Some(record) => record.ms = record.ms.min(ms),
+                None => {
+                    let found = seen.iter().map(Found::from).collect();
+                    records.push(Record { image: frame.image.clone(), ms, found });
+                }
+            }
+        }
+    }
+    Ok(records)
 }
 
 /// Writes a detector's answers.
