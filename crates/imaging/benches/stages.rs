@@ -28,8 +28,9 @@ fn stages(criterion: &mut Criterion) {
         bencher.iter(|| bilateral_5x5(black_box(view), &mut rows, &mut filtered));
     });
     let (mut threshold, mut binary) = (LocalThreshold::default(), GrayImage::default());
+    let least = LeastContrast { levels: 8, percent: 10 };
     group.bench_function("local threshold", |bencher| {
-        bencher.iter(|| threshold.apply(black_box(view), LeastContrast { levels: 8, percent: 10 }, &mut binary));
+        bencher.iter(|| threshold.apply(black_box(view), least, &mut binary));
     });
     let mut contours = Contours::default();
     group.bench_function("contours", |bencher| {
