@@ -21,6 +21,8 @@ pub(crate) struct Picture {
     pub(crate) contrast: f64,
     /// Change of the light to the right and down, as a share of it, per half a marker.
     pub(crate) shade: [f64; 2],
+    /// How much brighter than white it is beyond the pattern, in grey levels: as a rule, less bright.
+    pub(crate) beyond: f64,
     /// Standard deviation of the blur of lens and pixel together, in pixels.
     pub(crate) spread_px: f64,
 }
@@ -35,8 +37,11 @@ pub(crate) struct Spot {
     difference: f64,
 }
 
-/// Homography (8), spread, black, contrast, shade (2).
-const UNKNOWNS: usize = 13;
+/// Homography (8), spread, black, contrast, shade (2), what is beyond.
+const UNKNOWNS: usize = 14;
+/// What is known of what is beyond the pattern before the image is seen, in units of a pixel's difference: it is about
+/// as bright as white, give or take the contrast.
+const PRIOR_OF_BEYOND: f64 = 1e-4;
 /// Pixels that take part at most in the first, rough round, and in the second.
 const MOST_SPOTS: [usize; 2] = [300, 800];
 /// Steps of a round, and the move in pixels at which it ends.
@@ -52,6 +57,8 @@ const SPREAD_LIMITS_PX: (f64, f64) = (0.25, 4.0);
 const LEAST_CONTRAST: f64 = 4.0;
 /// A pixel takes no part when more of its light than this comes from cells of which nothing is known.
 const MOST_UNKNOWN: f64 = 0.03;
+/// The same of light from beyond the pattern.
+const MOST_BEYOND: f64 = 0.1;
 
 impl Picture {
     /// Standard deviation of the lens' blur alone.
@@ -93,7 +100,7 @@ fn fit_grid(
     scratch: &mut Scratch,
 ) -> Option<Fit> {
     let side_px = start.shortest_side_px();
-    let light = Picture { black: 0.0, contrast: 1.0, shade: [0.0; 2], spread_px };
+    let light = Picture { black: 0.0, contrast: 1.0, shade: [0.0; 2], beyond: 0.0, spread_px };
     let pull = Pull { limit: f64::INFINITY, is_rough: true };
     let mut state = State { homography: *start, light, half_px: side_px / 2.0, pull };
     let mut solved: Option<System> = None;
@@ -211,6 +218,8 @@ struct Look {
     /// By the place in the ideal image, per pixel.
     by_place: [f64; 2],
     by_spread: f64,
+    /// The share of light from beyond the pattern.
+    beyond: f64,
 }
 
 /// Where a place of the image is in the pattern, and how far the blur reaches there.
@@ -313,6 +322,7 @@ impl Grid {
                 turn += 1;
                 let interval = if self.is_near_edge(&spread) { thinned } else { 4 * thinned };
                 if thinned > 1 && turn % interval != 0
+                    || self.beyond(&spread) > MOST_BEYOND
                     || self.unknown_at(&spread, &mut work) > MOST_UNKNOWN
                 {
                     continue;
@@ -450,22 +460,33 @@ impl Grid {
 
     /// The share of a place's light that comes from cells of which nothing is known.
     fn unknown_at(&self, spread: &Spread, work: &mut [Bands; 2]) -> f64 {
-        let mut sum = 0.0;
-        if self.has_unknown {
-            let [columns, rows] = self.both_bands(spread, work);
-            for (row, [share, ..]) in
-                self.unknown.iter().skip(rows.first).zip(&rows.share).take(rows.count)
-            {
-                let cells = row.iter().skip(columns.first).zip(&columns.share).take(columns.count);
-                sum += share * cells.map(|(unknown, [share, ..])| unknown * share).sum::<f64>();
-            }
+        if !self.has_unknown {
+            return 0.0;
         }
-        let size = self.across as f64;
-        for axis in 0..2 {
-            let (at, scale) = (spread.cells[axis], spread.blur.scale[axis]);
-            sum += self.step.at(-at * scale, 0.0).0 + self.step.at((at - size) * scale, 0.0).0;
+        let mut sum = 0.0;
+        let [columns, rows] = self.both_bands(spread, work);
+        for (row, [share, ..]) in
+            self.unknown.iter().skip(rows.first).zip(&rows.share).take(rows.count)
+        {
+            let cells = row.iter().skip(columns.first).zip(&columns.share).take(columns.count);
+            sum += share * cells.map(|(unknown, [share, ..])| unknown * share).sum::<f64>();
         }
         sum
+    }
+
+    /// The share of a place's light that comes from beyond the pattern.
+    #[inline]
+    fn beyond(&self, spread: &Spread) -> f64 {
+        let size = self.across as f64;
+        let within = |axis: usize| {
+            let (at, scale) = (spread.cells[axis], spread.blur.scale[axis]);
+            if at.min(size - at) * scale > END {
+                return 1.0;
+            }
+            let before = self.step.at(-at * scale, spread.blur.boxiness[axis]).0;
+            self.step.at((size - at) * scale, spread.blur.boxiness[axis]).0 - before
+        };
+        1.0 - within(0) * within(1)
     }
 
     #[inline]
@@ -503,6 +524,7 @@ impl Grid {
                 by_u * spread.slopes[0][1] + by_v * spread.slopes[1][1],
             ],
             by_spread: (wxx + wyy + 2.0 * c * wxy) / spread_px,
+            beyond: self.beyond(spread),
         }
     }
 }
@@ -602,7 +624,7 @@ impl State {
             let look = grid.look_at(&spread, light.spread_px, &mut work);
             let (x, y) = (spot.ideal[0] * unit, spot.ideal[1] * unit);
             let shade = 1.0 + light.shade[0] * x + light.shade[1] * y;
-            let flat = light.black + light.contrast * look.white;
+            let flat = light.black + light.contrast * look.white + light.beyond * look.beyond;
             let predicted = flat * shade;
             // Where the sensor has reached its end, nothing more can be asked of it.
             if spot.grey >= 255.0 && predicted > 254.5 || spot.grey <= 0.0 && predicted < 0.5 {
@@ -626,6 +648,7 @@ impl State {
             slope[10] = shade * look.white;
             slope[11] = flat * x;
             slope[12] = flat * y;
+            slope[13] = shade * look.beyond;
             for (i, row) in system.matrix.iter_mut().enumerate() {
                 let scaled = weight * slope[i];
                 system.right[i] += scaled * difference;
@@ -634,6 +657,8 @@ impl State {
                 }
             }
         }
+        system.matrix[13][13] += PRIOR_OF_BEYOND;
+        system.right[13] -= PRIOR_OF_BEYOND * light.beyond;
         (system.cost.is_finite() && system.weight > UNKNOWNS as f64).then_some(system)
     }
 
@@ -652,6 +677,7 @@ impl State {
                 contrast: light.contrast + step[10],
                 shade: [light.shade[0] + step[11], light.shade[1] + step[12]]
                     .map(|s| s.clamp(-0.9, 0.9)),
+                beyond: light.beyond + step[13],
                 spread_px: spread_px.clamp(SPREAD_LIMITS_PX.0, SPREAD_LIMITS_PX.1),
             },
             ..*self

@@ -463,6 +463,7 @@ impl Search<'_> {
             black: black / weight,
             contrast: contrast / weight,
             shade: [0.0; 2],
+            beyond: 0.0,
             spread_px: self.spread_px,
         };
         let residual = noise.sqrt() / picture.contrast;
