@@ -87,6 +87,8 @@ struct Found {
     margin: f64,
     /// How good the corners are as they were found, in pixels.
     corner_px: f64,
+    /// Whether a reflection moves its edges, so that the refined corners are hardly better.
+    washed_out: bool,
 }
 
 impl Squares {
@@ -262,6 +264,7 @@ impl Squares {
                 explained: f64::from(reading.explained),
                 margin,
                 corner_px: (JOINED_SHARE * corners[0].distance(&corners[2])).max(JOINED_PX),
+                washed_out: reading.washed_out,
             });
         }
     }
@@ -328,6 +331,7 @@ impl Squares {
             explained,
             margin,
             corner_px: OUTLINED_PX,
+            washed_out: false,
         })
     }
 }
@@ -416,9 +420,14 @@ fn observe(
 ) -> Observation {
     let pattern =
         wanted.code.words.get(found.id as usize).and_then(|w| Pattern::of(wanted.code, *w));
-    let refined = pattern
+    let mut refined = pattern
         .and_then(|pattern| refine(view, &found.corners, &pattern, camera, scratch))
         .unwrap_or_else(|| coarse(&found.corners, found.corner_px));
+    if found.washed_out {
+        let coarse = coarse(&found.corners, found.corner_px);
+        refined.covariance_px2 += coarse.covariance_px2;
+        refined.centre_covariance_px2 += coarse.centre_covariance_px2;
+    }
     let corners = refined.corners;
     let named = wanted.markers.iter().find(|m| m.id == Some(found.id));
     let marker = named.or_else(|| wanted.markers.iter().find(|m| m.id.is_none()));

@@ -27,6 +27,8 @@ pub struct Reading {
     pub intact: f32,
     /// The share of the variance of the known cells' pixels that black and white explain.
     pub explained: f32,
+    /// Whether a reflection adds light to it: its edges are then not where they seem.
+    pub washed_out: bool,
     /// By how many bits the agreement exceeds what chance would give among the words looked for.
     pub evidence: f32,
 }
@@ -65,7 +67,8 @@ pub fn read(
     let intact = grid.intact(&read)?;
     let glares = grid.distrust(&mut read);
     let mut whole = read;
-    if glares || light.reflection.is_some() {
+    let washed_out = glares || light.reflection.is_some();
+    if washed_out {
         let look =
             Look { view, place: &place, cells: f64::from(code.cells), inverted: quad.inverted };
         grid.step(&look, &light, &mut whole);
@@ -73,6 +76,7 @@ pub fn read(
     let (word, known) = grid.word(&whole, code);
     let mut reading = best_word(word, known, code, wanted)?;
     reading.intact = intact;
+    reading.washed_out = washed_out;
     reading.explained = grid.explained(&light, &read);
     (reading.explained >= LEAST_EXPLAINED).then_some(reading)
 }
@@ -521,6 +525,7 @@ fn best_word(word: u64, known: u64, code: &Code, wanted: Option<&[u32]>) -> Opti
             known_bits: bits as u8,
             intact: 0.0,
             explained: 0.0,
+            washed_out: false,
             evidence,
         })
 }
