@@ -313,3 +313,52 @@ fn view(
     shot.surface = Surface::ALL[frame % 3];
     (shot, rng)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sets_have_the_frames_they_are_said_to_have() {
+        let marker = "apriltag-16h5:0:0.15341".parse().unwrap();
+        let counts = Set::ALL.map(|set| (set.name(), set.shots(marker).len()));
+        let expected = [
+            ("textured", 15),
+            ("adverse", 72),
+            ("landing", 51),
+            ("far", 80),
+            ("tilt", 84),
+            ("blur", 84),
+            ("noise", 42),
+            ("light", 54),
+            ("tracking", 30),
+            ("negatives", 520),
+            ("positions", 37 * 2 * 5),
+        ];
+        assert_eq!(counts, expected);
+    }
+
+    #[test]
+    fn every_marker_has_the_same_views_and_is_in_front_of_the_camera() {
+        let shots = MARKERS.map(|name| {
+            let marker = format!("{name}:{SIZE_M}").parse().unwrap();
+            Set::Landing.shots(marker)
+        });
+        for of_marker in &shots {
+            for (shot, first) in of_marker.iter().zip(&shots[0]) {
+                assert_eq!(shot.path, first.path);
+                assert_eq!(shot.shown().unwrap().centre, first.shown().unwrap().centre);
+            }
+        }
+    }
+
+    #[test]
+    fn no_clutter_has_a_marker() {
+        assert!(
+            Set::Negatives
+                .shots("rings:0.1".parse().unwrap())
+                .iter()
+                .all(|shot| { shot.marker.is_none() && !shot.clutter.is_empty() })
+        );
+    }
+}

@@ -262,3 +262,50 @@ fn interpolated(mosaic: &[u8], width: usize) -> Vec<u8> {
     }
     grey
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shot() -> Shot {
+        let settings = rendering::views::Binning::FourByFour.settings();
+        let at = Pixel::new(200.0, 300.0);
+        let pose = pose(&settings.model, at, 2.0, (0.3, 1.0), 0.5);
+        Shot::of("apriltag-36h11:3:0.2".parse().unwrap(), settings, pose, 7)
+    }
+
+    #[test]
+    fn a_marker_is_seen_where_it_is_put_and_faces_the_camera() {
+        let shown = shot().shown().unwrap();
+        assert!(shown.centre.distance(&Pixel::new(200.0, 300.0)) < 1e-9);
+        assert!((shown.camera_from_marker.origin().z() - 2.0).abs() < 1e-12);
+        // Clockwise in the image, whose y axis points down: the area is positive.
+        let corners = shown.corners;
+        let area: f64 = (0..4)
+            .map(|k| (corners[k], corners[(k + 1) % 4]))
+            .map(|(a, b)| (a.x * b.y - b.x * a.y) / 2.0)
+            .sum();
+        assert!(area > 0.0, "{area}");
+    }
+
+    #[test]
+    fn a_shot_is_the_same_each_time_and_an_inverted_one_is_not() {
+        let take = |shot: &Shot| Studio::default().take(shot).unwrap();
+        assert_eq!(take(&shot()), take(&shot()));
+        let swapped = Shot { inverted: true, ..shot() };
+        assert_ne!(take(&shot()), take(&swapped));
+    }
+
+    #[test]
+    fn grey_from_a_mosaic_is_the_grey_there_was() {
+        let mut levels = [120.0f32; 8];
+        let mosaic: Vec<u8> = (0..6)
+            .flat_map(|v| {
+                levels.fill(120.0);
+                filter_colours(v, &mut levels);
+                levels.map(|level| level as u8)
+            })
+            .collect();
+        assert!(interpolated(&mosaic, 8).iter().all(|grey| grey.abs_diff(120) <= 1));
+    }
+}
