@@ -25,6 +25,9 @@ impl Default for Settings {
     }
 }
 
+/// The level of the image's pyramid from which on bright outlines are followed for markers printed white on black.
+const INVERTED_FROM: usize = 2;
+
 /// Why there is no detector for these markers.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum DetectorError {
@@ -90,11 +93,18 @@ impl Detector {
     ) -> &[Observation] {
         self.found.clear();
         self.trace.clear();
-        if !self.squares.is_empty() || !self.stags.is_empty() {
-            let bright_from = self.squares.has_bright().then_some(0);
+        let needs_outlines = |marker: &Marker| marker.family != Family::RingsThesis;
+        if self.markers.iter().any(needs_outlines) {
+            // Markers with a white border may be as small as others; others printed white on black are only looked for where
+            // they are large.
+            let bright_from = if self.squares.has_bright() { 0 } else { INVERTED_FROM };
+            let has_quads = !self.squares.is_empty() || !self.stags.is_empty();
+            let bright_from = has_quads.then_some(bright_from);
             let settings = outline::Settings { bright_from, ..outline::Settings::default() };
             self.outlines.find(view, &settings);
             stages.ended("outlines");
+        }
+        if !self.squares.is_empty() || !self.stags.is_empty() {
             let watch = (&mut self.trace, &mut *stages);
             self.squares.detect(view, &self.outlines, camera, watch, &mut self.found);
             if !self.stags.is_empty() {
@@ -105,15 +115,21 @@ impl Detector {
             }
         }
         for marker in &self.markers {
-            let watch = (&mut self.trace, &mut *stages);
+            let (watch, seen) = ((&mut self.trace, &mut *stages), (view, &self.outlines));
+            let found = &mut self.found;
             match marker.family {
-                Family::Rings => self.rings.detect(view, marker, camera, watch, &mut self.found),
+                Family::Rings => self.rings.detect(seen, marker, camera, watch, found),
                 Family::RingsThesis => {
                     let threshold = self.settings.thesis_threshold;
-                    self.found.extend(self.thesis.detect(view, marker, threshold, camera, watch));
+                    found.extend(self.thesis.detect(view, marker, threshold, camera, watch));
                 }
                 _ => {}
             }
+        }
+        // Who finds nothing has time to look harder.
+        if self.found.is_empty() && !self.squares.is_empty() {
+            let watch = (&mut self.trace, &mut *stages);
+            self.squares.detect_damaged(view, &self.outlines, camera, watch, &mut self.found);
         }
         self.trace.markers.extend(self.found.iter().map(TracedMarker::from));
         &self.found

@@ -33,18 +33,18 @@ enum Stage {
     Specks,
 }
 
-/// Regions of any size that fill their bounds as ellipses do.
-const WHOLE: imaging::outline::Settings = imaging::outline::Settings {
-    dark_from: Some(0),
+/// Regions of any shape that are large enough to show arcs.
+const PARTS: imaging::outline::Settings = imaging::outline::Settings {
+    dark_from: Some(2),
     bright_from: None,
     whole_level: 2,
-    smallest_px: 5,
+    smallest_px: 16,
     largest_px: 36,
     least_contrast: 14,
     least_contrast_percent: 12,
     steep: true,
-    least_fill: 0.4,
-    most_ragged: 1.3,
+    least_fill: 0.02,
+    most_ragged: 5.0,
 };
 
 impl Stage {
@@ -56,18 +56,12 @@ impl Stage {
         }
     }
 
-    fn settings(self) -> imaging::outline::Settings {
+    /// Of outlines other than those that all families share.
+    fn settings(self) -> Option<imaging::outline::Settings> {
         match self {
-            Self::Whole => WHOLE,
-            // Regions of any shape that are large enough to show arcs.
-            Self::Parts => imaging::outline::Settings {
-                dark_from: Some(2),
-                smallest_px: 16,
-                least_fill: 0.02,
-                most_ragged: 5.0,
-                ..WHOLE
-            },
-            Self::Specks => imaging::outline::Settings {
+            Self::Whole => None,
+            Self::Parts => Some(PARTS),
+            Self::Specks => Some(imaging::outline::Settings {
                 dark_from: None,
                 bright_from: Some(1),
                 whole_level: usize::MAX,
@@ -75,8 +69,9 @@ impl Stage {
                 largest_px: 16,
                 steep: false,
                 least_fill: 0.5,
-                ..WHOLE
-            },
+                most_ragged: 1.3,
+                ..PARTS
+            }),
         }
     }
 }
@@ -99,10 +94,10 @@ pub struct Rings {
 }
 
 impl Rings {
-    /// Finds the markers; the surest comes first.
+    /// Finds the markers in an image with these outlines; the surest comes first.
     pub fn detect(
         &mut self,
-        view: GrayView<'_>,
+        (view, outlines): (GrayView<'_>, &Outlines),
         marker: &Marker,
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
@@ -111,7 +106,7 @@ impl Rings {
         let nominal = nominal_camera(view);
         let first = found.len();
         for stage in [Stage::Whole, Stage::Parts, Stage::Specks] {
-            self.find_candidates(view, stage);
+            self.find_candidates((view, outlines), stage);
             trace.ellipses.extend(self.borders.iter().map(|b| b.ellipse));
             trace.rings.extend(self.candidates.iter().map(ring));
             stages.ended(stage.name());
@@ -125,13 +120,16 @@ impl Rings {
     }
 
     /// The circles that may be the marker's, those that look most like it first.
-    fn find_candidates(&mut self, view: GrayView<'_>, stage: Stage) {
+    fn find_candidates(&mut self, (view, outlines): (GrayView<'_>, &Outlines), stage: Stage) {
         self.borders.clear();
         self.candidates.clear();
-        self.outlines.find(view, &stage.settings());
+        if let Some(settings) = stage.settings() {
+            self.outlines.find(view, &settings);
+        }
         match stage {
             Stage::Whole => {
-                let whole = self.outlines.iter().filter_map(|o| whole_border(&o));
+                let dark = outlines.iter().filter(|o| o.dark);
+                let whole = dark.filter_map(|o| whole_border(&o));
                 self.borders.extend(whole.take(MOST_BORDERS));
             }
             Stage::Parts => self.find_arcs(view),

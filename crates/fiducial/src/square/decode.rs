@@ -10,6 +10,7 @@ use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Pyramid};
 
 use crate::square::code::Code;
+use crate::square::mean_side;
 
 /// Most bits of a code, and with them the two values of known cells.
 const MOST_BITS: usize = 64;
@@ -198,9 +199,7 @@ impl<'a> Look<'a> {
         view: GrayView<'a>,
         pyramid: &'a Pyramid,
     ) -> Option<Self> {
-        let mean_side =
-            (0..4).map(|i| corners[i].distance(&corners[(i + 1) % 4])).sum::<f64>() / 4.0;
-        let cell_px = mean_side / cells as f64;
+        let cell_px = mean_side(corners) / cells as f64;
         let level = ((cell_px / CELL_PX).log2().floor().max(0.0) as usize)
             .min(pyramid.levels().saturating_sub(1));
         let corners = corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
