@@ -175,7 +175,8 @@ class Rings:
 
     def detect(self, grey):
         filtered = cv2.bilateralFilter(grey, 5, 175, 175)
-        _, binary = cv2.threshold(filtered, self.threshold, 255, cv2.THRESH_BINARY_INV)
+        # The thesis' T is the least that is white, OpenCV's the most that is black.
+        _, binary = cv2.threshold(filtered, self.threshold - 1, 255, cv2.THRESH_BINARY)
         contours, _ = cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
         ellipses = []
         for contour in contours:
