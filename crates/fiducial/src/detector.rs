@@ -28,6 +28,9 @@ impl Default for Settings {
 /// The level of the image's pyramid from which on bright outlines are followed for markers printed white on black.
 const INVERTED_FROM: usize = 2;
 
+/// Of so many quads at most the dots of a STag are read; of frames with markers, more than there are.
+const MOST_STAG_QUADS: usize = 128;
+
 /// Why there is no detector for these markers.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum DetectorError {
@@ -109,7 +112,7 @@ impl Detector {
             self.squares.detect(view, &self.outlines, camera, watch, &mut self.found);
             if !self.stags.is_empty() {
                 let watch = (&mut self.trace, &mut *stages);
-                let quads = self.squares.quads();
+                let quads = self.squares.quads().take(MOST_STAG_QUADS);
                 let pyramid = self.outlines.pyramid();
                 self.stags.detect((view, pyramid), quads, camera, watch, &mut self.found);
             }

@@ -33,7 +33,7 @@ use crate::trace::{Reason, Trace};
 
 /// Bounds on the work in one image, far above what frames with markers need.
 const MOST_QUADS: usize = 4000;
-const MOST_SOLVED: usize = 600;
+const MOST_SOLVED: usize = 400;
 const MOST_FOUND: usize = 256;
 
 /// How alike the steps from border to paper are all round a marker: the standard deviation as a share of the mean.
