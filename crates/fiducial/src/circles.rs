@@ -81,6 +81,18 @@ impl Circles {
         Self { normal: towards * angle.sin() - sight * angle.cos(), ..*self }
     }
 
+    /// The angle of the normal from the line of sight, in radians.
+    pub(crate) fn tilt(&self) -> f64 {
+        self.normal.angle(&-self.centre)
+    }
+
+    /// The same place, tilted as much towards a quarter turn from where it is tilted to.
+    pub(crate) fn turned(&self) -> Self {
+        let sight = self.centre.normalize();
+        let along = sight * self.normal.dot(&sight);
+        Self { normal: along + sight.cross(&self.normal), ..*self }
+    }
+
     /// Two unit vectors that span the plane.
     pub(crate) fn basis(&self) -> (Vector3<f64>, Vector3<f64>) {
         let aside = if self.normal.x.abs() < 0.8 { Vector3::x() } else { Vector3::y() };

@@ -117,6 +117,14 @@ pub(crate) fn refined(
     if first.difference(spots) > MOST_DIFFERENCE {
         return Some((scene.fit(&first)?, None));
     }
+    // Tilted to a wrong side at first, it may have stopped where it faces the camera.
+    if first.picture.circles.tilt() < LEAST_START_TILT / 2.0
+        && let Some(other) =
+            scene.fitted(&tilted(&first.picture.circles).turned(), Some(2.0 * first.cost))
+        && other.cost < first.cost
+    {
+        first = other;
+    }
     let mirrored = tilted(&first.picture.circles).mirrored();
     let Some(second) = scene.fitted(&mirrored, Some(MOST_COST_OF_OTHER * first.cost)) else {
         return Some((scene.fit(&first)?, None));

@@ -134,9 +134,7 @@ pub(crate) fn speck(view: GrayView<'_>, outline: &imaging::Outline<'_>) -> Optio
     let worth = |m: &Means| m.ripple() + 0.5 * m.step().min(m.ripple().max(0.0));
     let first = pattern(place, diameter_px)?;
     // Most bright specks just grow darker outwards.
-    if first.step() < 0.0 && first.gap < first.middle
-        || first.paper.max(first.gap) - first.outer.min(first.middle) < LEAST_STEP
-    {
+    if first.step() < 0.0 && first.gap < first.middle {
         return None;
     }
     let mut best = worth(&first);

@@ -102,9 +102,11 @@ impl Search<'_> {
         self.measure(&circles, Reach::Near, edges);
         let bias_px = circles.bias_px(edges, self.camera);
         circles.leave_outliers(edges, self.camera);
+        let large = diameter_px > photometry::MOST_DIAMETER_PX;
+        let share = if large { 2e-3 } else { 6e-4 };
         let lies = |rms: f64, bias: f64| {
             rms_px < (rms + 3e-3 * diameter_px).min(0.9)
-                && bias_px < bias * (diameter_px / 60.0).min(1.0) + 6e-4 * diameter_px
+                && bias_px < bias * (diameter_px / 60.0).min(1.0) + share * diameter_px
         };
         let fits = match judged {
             Belief::None => false,
@@ -116,7 +118,7 @@ impl Search<'_> {
         }
         let mut seen =
             self.seen(circles, rms_px, edges, confidence(&support)).ok_or(Reason::Pose)?;
-        if diameter_px <= photometry::MOST_DIAMETER_PX {
+        if !large {
             // Its grey values are not a marker's: light or something on it moves edges, all of one side together.
             seen.covariance *= DISTURBED;
         }

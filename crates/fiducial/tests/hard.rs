@@ -195,6 +195,75 @@ fn with_its_middle_or_its_rim_covered() {
 }
 
 #[test]
+fn thirty_metres_away() {
+    for (range_m, side) in [(16.0, 0.1), (22.0, -0.05), (26.0, 0.12), (30.0, 0.03)] {
+        let place = [side * range_m, 0.5 * side * range_m, range_m];
+        let plain = Scene::new(camera(), place, 0.1, 1.0);
+        // The ground begins where the quiet zone ends.
+        let scene = Scene { paper: 0.6, ground: 60.0, texture: 20.0, ..plain };
+        expect(&format!("{range_m} m"), &scene, &scene.render(), 0.05, 1.5);
+    }
+}
+
+#[test]
+fn white_on_black_overexposed_and_partly_hidden() {
+    for range_m in [0.6, 2.0, 5.0] {
+        let place = [0.05 * range_m, 0.03 * range_m, range_m];
+        let plain = Scene::new(camera(), place, 0.2, 1.0);
+        let mut inverted = plain.render();
+        inverted.pixels_mut().iter_mut().for_each(|pixel| *pixel = 255 - *pixel);
+        expect(&format!("white on black at {range_m} m"), &plain, &inverted, 0.03, 0.05);
+        let bright = Scene { black: 45.0, white: 700.0, ground: 350.0, ..plain };
+        let name = format!("overexposed at {range_m} m");
+        expect(&name, &bright, &bright.render(), 0.1, 0.3);
+        // Something white lies on a quarter of it, over all rings but the innermost.
+        let mut hidden = plain.render();
+        let (middle, size_px) = (plain.centre(), SIZE_M * 1818.0 / range_m);
+        for y in 0..hidden.height() {
+            for (x, pixel) in hidden.row_mut(y).iter_mut().enumerate() {
+                let (dx, dy) = (x as f64 - middle.x, y as f64 - middle.y);
+                if dx > 0.04 * size_px && dy > 0.04 * size_px {
+                    *pixel = 190;
+                }
+            }
+        }
+        expect(&format!("a quarter hidden at {range_m} m"), &plain, &hidden, 0.2, 0.3);
+    }
+}
+
+#[test]
+fn rings_of_other_radii_are_no_marker() {
+    let camera = CameraModel::pinhole(1000, 800, 909.0);
+    // Radii of the edges, the outermost first, in units of the outermost; the marker's are 1, 0.8, 0.5, 0.3.
+    let others: [&[f64]; 5] = [
+        &[1.0, 0.85, 0.5, 0.3],
+        &[1.0, 0.75, 0.5, 0.35],
+        &[1.0, 0.8, 0.6, 0.4, 0.2],
+        &[1.0, 0.82, 0.45, 0.25],
+        &[1.0, 0.66, 0.33],
+    ];
+    for radii in others {
+        for radius_px in [14.0, 25.0, 60.0, 150.0] {
+            let mut image = GrayImage::filled(1000, 800, 210);
+            for y in 0..800 {
+                for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                    let from_centre = (x as f64 - 500.3).hypot(y as f64 - 400.6);
+                    let within =
+                        |radius: &f64| (radius * radius_px - from_centre + 0.5).clamp(0.0, 1.0);
+                    let black: f64 = radii
+                        .iter()
+                        .enumerate()
+                        .map(|(i, r)| if i % 2 == 0 { within(r) } else { -within(r) })
+                        .sum();
+                    *pixel = (210.0 - 180.0 * black).round() as u8;
+                }
+            }
+            assert_eq!(find(&image, &camera), None, "{radii:?} of {radius_px} px");
+        }
+    }
+}
+
+#[test]
 fn a_lone_ring_is_no_marker_when_the_others_would_be_seen() {
     // Grey values of a disc with a hole, of these radii, on white.
     let draw = |outer: f64, inner: f64| {
