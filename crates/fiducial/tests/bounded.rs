@@ -42,6 +42,9 @@ fn time_ms(detector: &mut Detector, pixels: &[u8], width: usize, height: usize) 
     shortest
 }
 
+/// The grey level at a place.
+type Grey<'a> = &'a dyn Fn(usize, usize) -> u8;
+
 /// A bijection that scatters (splitmix64's finaliser).
 fn scattered(index: usize) -> u8 {
     let key = (index as u64).wrapping_add(0x9e37_79b9_7f4a_7c15);
@@ -57,7 +60,7 @@ fn any_image_is_looked_at_in_bounded_time() {
     let view = View { binning, height_m: 3, lateral_m: 0.0, tilt_deg: 5.0, repeat: 0 };
     let (normal, _) = Studio::new(binning).unwrap().take(&view).unwrap();
     let black_or_white = |white: bool| if white { 255 } else { 0 };
-    let images: [(&str, &dyn Fn(usize, usize) -> u8); 10] = [
+    let images: [(&str, Grey<'_>); 10] = [
         ("constant", &|_, _| 128),
         ("single pixels", &|x, y| black_or_white((x + y) % 2 == 0)),
         ("pairs of pixels", &|x, y| black_or_white((x / 2 + y / 2) % 2 == 0)),
