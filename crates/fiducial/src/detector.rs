@@ -103,7 +103,10 @@ impl Detector {
             let bright_from = if self.squares.has_bright() { 0 } else { INVERTED_FROM };
             let has_quads = !self.squares.is_empty() || !self.stags.is_empty();
             let bright_from = has_quads.then_some(bright_from);
-            let settings = outline::Settings { bright_from, ..outline::Settings::default() };
+            let mut settings = outline::Settings { bright_from, ..outline::Settings::default() };
+            if !self.stags.is_empty() {
+                settings.largest_px = settings.largest_px.max(Stags::LARGEST_PX);
+            }
             self.outlines.find(view, &settings);
             stages.ended("outlines");
         }

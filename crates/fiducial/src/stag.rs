@@ -24,8 +24,9 @@ use crate::trace::{Reason, Trace};
 use dots::Dots;
 use picture::Picture;
 
-/// A quad is looked at on the level of the pyramid on which its sides are from this long to twice that, in pixels.
-const SIDE_PX: f64 = 20.0;
+/// A quad is looked at on the level of the pyramid on which its sides are from this long to twice that, in pixels: at first
+/// and, when it may be a marker, again.
+const SIDE_PX: [f64; 2] = [12.0, 20.0];
 /// Shorter sides tell nothing.
 const LEAST_SIDE_PX: f64 = 7.0;
 /// Of families with more words than this, or of so many ids, not every word is tried.
@@ -77,6 +78,10 @@ struct Reading {
 }
 
 impl Stags {
+    /// Outlines up to this size are looked for in the image itself: the border of a marker, a tenth of its side, is too
+    /// thin on the next level.
+    pub(crate) const LARGEST_PX: u16 = 56;
+
     /// Looks for these markers; those of other families are left out.
     pub(crate) fn new(markers: &[Marker]) -> Self {
         let mut stags = Self::default();
@@ -149,7 +154,7 @@ impl Stags {
         if side_px < LEAST_SIDE_PX {
             return Err(Reason::Small);
         }
-        let first = self.look(view, pyramid, &quad.corners)?;
+        let first = self.look((view, pyramid), &quad.corners, SIDE_PX[0])?;
         if first.explained < ROUGHLY_EXPLAINED || first.ratio < ROUGH_RATIO {
             return Err(Reason::Code);
         }
@@ -157,7 +162,7 @@ impl Stags {
         let refined = self.refined(view, (&quad.corners, &first), camera).ok_or(Reason::Edges)?;
         let mut corners = refined.corners;
         corners.rotate_right(usize::from(first.turns) % 4);
-        let second = self.look(view, pyramid, &corners)?;
+        let second = self.look((view, pyramid), &corners, SIDE_PX[1])?;
         if second.explained < LEAST_EXPLAINED || second.ratio < LEAST_RATIO {
             return Err(Reason::Confidence);
         }
@@ -192,11 +197,11 @@ impl Stags {
     /// The word that explains a square best.
     fn look(
         &mut self,
-        view: GrayView<'_>,
-        pyramid: &Pyramid,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
         corners: &[Pixel; 4],
+        side_px: f64,
     ) -> Result<Reading, Reason> {
-        let level = ((shortest_side_px(corners) / SIDE_PX).log2().floor().max(0.0) as usize)
+        let level = ((shortest_side_px(corners) / side_px).log2().floor().max(0.0) as usize)
             .min(pyramid.levels().saturating_sub(1));
         let image = pyramid.level(view, level).ok_or(Reason::Small)?;
         let places = corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
