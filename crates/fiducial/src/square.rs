@@ -45,6 +45,10 @@ const LEAST_EXPLAINED: f64 = 0.78;
 /// doubtful as those of others, but chance spells no words there.
 const LEAST_CONFIDENCE: f64 = 0.5;
 const SMALL_CELL_PX: f64 = 1.5;
+/// Of random bits, one word in so many may be a marker that is looked for, before its cells must be clearly black and
+/// white: a pattern that is no marker spells one of the thousand words of 4 x 4 bits once in sixteen times.
+const OFTEN: f64 = 0.01;
+const LEAST_CONFIDENCE_OFTEN: f64 = 0.6;
 
 /// How good corners are before they are refined: of an outline; of joined segments, at least, and as a share of the
 /// diagonal.
@@ -62,6 +66,15 @@ struct Wanted {
     /// The ids that were not yet found in this image.
     missing: Vec<u32>,
     is_missing: bool,
+}
+
+impl Wanted {
+    /// How many of all words of as many bits are a marker that is looked for, in any of its four turns.
+    fn spelt_by_chance(&self) -> f64 {
+        let any_id = self.markers.iter().any(|m| m.id.is_none());
+        let words = if any_id { self.code.words.len() } else { self.markers.len() };
+        4.0 * words as f64 / (self.code.bits.len() as f64).exp2()
+    }
 }
 
 /// Finds the square markers of any number of families. It keeps its memory from image to image.
@@ -351,7 +364,14 @@ impl Squares {
             .map(|bit| (2.0 * self.cells.value(bit) - 1.0).abs())
             .fold(1.0, f64::min);
         let cell_px = mean_side(&quad.corners) / f64::from(wanted.code.cells);
-        if cell_px >= SMALL_CELL_PX && confidence(explained, margin) < LEAST_CONFIDENCE {
+        let least = if wanted.spelt_by_chance() > OFTEN {
+            LEAST_CONFIDENCE_OFTEN
+        } else if cell_px >= SMALL_CELL_PX {
+            LEAST_CONFIDENCE
+        } else {
+            0.0
+        };
+        if confidence(explained, margin) < least {
             return Err(Reason::Confidence);
         }
         let mut corners = quad.corners;
