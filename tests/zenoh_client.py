@@ -2,7 +2,7 @@
 """A Zenoh program that is none of ours: who is there, and what do the frames' headers say?
 
 It lists the live services by their liveliness tokens and reads the headers of some frames from their attachments
-(codec: `A`, type 1, version 1, then postcard), and prints what it saw as one JSON object on the last line.
+(codec: `A`, type 1, version 2, then postcard), and prints what it saw as one JSON object on the last line.
 
     python3 tests/zenoh_client.py tcp/127.0.0.1:7447
 
@@ -28,8 +28,8 @@ class Header:
     """Reads postcard: variable-length integers (zigzag when signed), strings with their length in front."""
 
     def __init__(self, data):
-        if data[:3] != b"A\x01\x01":
-            raise ValueError(f"not a frame header of version 1: {data[:3]!r}")
+        if data[:3] != b"A\x01\x02":
+            raise ValueError(f"not a frame header of version 2: {data[:3]!r}")
         self.data, self.at = data, 3
 
     def unsigned(self):
