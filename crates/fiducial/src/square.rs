@@ -1,7 +1,7 @@
 //! Square markers: [`code`] says which cells of which family carry which words, [`quad`] finds four-sided outlines,
-//! `decode` reads their cells. [`pattern`] says which cells of a marker are black and white, [`refine`] where its corners
-//! are. [`Squares`] does it all, for any number of families at once. Where outlines are broken, [`segments`] makes quads
-//! of straight pieces of edges, [`erasures`] reads what is left of a marker, and [`damaged`] does both.
+//! `decode` reads their cells. [`pattern`] says which cells of a marker are black and white, [`mod@refine`] where its
+//! corners are. [`Squares`] does it all, for any number of families at once. Where outlines are broken, [`segments`]
+//! makes quads of straight pieces of edges, [`erasures`] reads what is left of a marker, and [`damaged`] does both.
 
 pub mod code;
 pub(crate) mod codebook;
