@@ -96,12 +96,12 @@ impl Detector {
     ) -> &[Observation] {
         self.found.clear();
         self.trace.clear();
+        let has_quads = !self.squares.is_empty() || !self.stags.is_empty();
         let needs_outlines = |marker: &Marker| marker.family != Family::RingsThesis;
         if self.markers.iter().any(needs_outlines) {
             // Markers with a white border may be as small as others; others printed white on black are only looked for where
             // they are large.
             let bright_from = if self.squares.has_bright() { 0 } else { INVERTED_FROM };
-            let has_quads = !self.squares.is_empty() || !self.stags.is_empty();
             let bright_from = has_quads.then_some(bright_from);
             let mut settings = outline::Settings { bright_from, ..outline::Settings::default() };
             if !self.stags.is_empty() {
@@ -110,7 +110,7 @@ impl Detector {
             self.outlines.find(view, &settings);
             stages.ended("outlines");
         }
-        if !self.squares.is_empty() || !self.stags.is_empty() {
+        if has_quads {
             let watch = (&mut self.trace, &mut *stages);
             self.squares.detect(view, &self.outlines, camera, watch, &mut self.found);
             if !self.stags.is_empty() {

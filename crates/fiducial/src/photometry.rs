@@ -11,6 +11,7 @@ use imaging::GrayView;
 use nalgebra::{SMatrix, SVector, Vector3};
 
 use crate::circles::{Circles, project};
+use crate::exposure::Exposure;
 use crate::ring::RingKind;
 
 /// Markers of more pixels across have edges far enough apart.
@@ -517,19 +518,14 @@ impl Picture {
 
     /// Black and white that fit the image best with everything else as it is.
     fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
-        let (mut n, mut sw, mut sww, mut sg, mut swg) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let mut exposure = Exposure::default();
         let basis = self.circles.basis();
         for spot in scene.spots {
             let white = self.looks(spot, &basis, scene)?.white();
-            n += 1.0;
-            sw += white;
-            sww += white * white;
-            sg += spot.grey;
-            swg += white * spot.grey;
+            exposure.add(white, spot.grey);
         }
-        let contrast = (n * swg - sw * sg) / (n * sww - sw * sw);
-        self.black = (sg - contrast * sw) / n;
-        self.white = self.black + contrast;
+        let [black, contrast] = exposure.black_and_contrast();
+        (self.black, self.white) = (black, black + contrast);
         (contrast > 1.0).then_some(())
     }
 

@@ -27,7 +27,7 @@ use crate::square::code::Code;
 use crate::square::damaged::{Damaged, Sought};
 use crate::square::decode::{Cells, Layout, Look};
 use crate::square::pattern::Pattern;
-use crate::square::quad::Quad;
+use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine};
 use crate::trace::{Reason, Trace};
 
@@ -395,7 +395,7 @@ fn confidence(explained: f64, margin: f64) -> f64 {
 }
 
 fn mean_side(corners: &[Pixel; 4]) -> f64 {
-    (0..4).map(|i| corners[i].distance(&corners[(i + 1) % 4])).sum::<f64>() / 4.0
+    sides_px(corners).iter().sum::<f64>() / 4.0
 }
 
 /// How many wrong bits are mended. Families of few bits have words near most words; theirs must be read as they are.
@@ -410,14 +410,7 @@ fn most_wrong(code: &Code) -> u8 {
 
 /// Whether two quads are of the same square, up to a turn.
 fn is_same(a: &[Pixel; 4], b: &[Pixel; 4]) -> bool {
-    let middle = |q: &[Pixel; 4]| {
-        Pixel::new(
-            q.iter().map(|c| c.x).sum::<f64>() / 4.0,
-            q.iter().map(|c| c.y).sum::<f64>() / 4.0,
-        )
-    };
-    let size = a[0].distance(&a[2]).max(a[1].distance(&a[3]));
-    let other = b[0].distance(&b[2]).max(b[1].distance(&b[3]));
+    let (size, other) = (diagonal_px(a), diagonal_px(b));
     middle(a).distance(&middle(b)) < 0.2 * size && other < 1.5 * size && size < 1.5 * other
 }
 
@@ -504,7 +497,7 @@ fn observe(
         centre_covariance_px2: refined.centre_covariance_px2,
         corners: Some(corners),
         wrong_bits: found.wrong_bits,
-        size_px: corners[0].distance(&corners[2]).max(corners[1].distance(&corners[3])),
+        size_px: diagonal_px(&corners),
         confidence: confidence(found.explained, found.margin),
         pose,
     }

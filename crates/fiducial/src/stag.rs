@@ -17,7 +17,7 @@ use crate::marker::Marker;
 use crate::observation::{Observation, Stages};
 use crate::pose::square_pose;
 use crate::square::codebook::Codebook;
-use crate::square::quad::Quad;
+use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
 use crate::trace::{Reason, Trace};
 
@@ -240,7 +240,7 @@ impl Stags {
             centre_covariance_px2: refined.centre_covariance_px2,
             corners: Some(corners),
             wrong_bits: reading.wrong_bits,
-            size_px: corners[0].distance(&corners[2]).max(corners[1].distance(&corners[3])),
+            size_px: diagonal_px(&corners),
             confidence: reading.explained * (1.0 - 0.5 / reading.ratio),
             pose,
         }
@@ -304,14 +304,10 @@ impl Wanted {
 }
 
 fn shortest_side_px(corners: &[Pixel; 4]) -> f64 {
-    (0..4).map(|i| corners[i].distance(&corners[(i + 1) % 4])).fold(f64::INFINITY, f64::min)
+    sides_px(corners).into_iter().fold(f64::INFINITY, f64::min)
 }
 
 /// Whether two quads are of the same square.
 fn is_same(a: &[Pixel; 4], b: &[Pixel; 4]) -> bool {
-    let middle = |q: &[Pixel; 4]| {
-        let mean = |of: fn(&Pixel) -> f64| q.iter().map(of).sum::<f64>() / 4.0;
-        Pixel::new(mean(|c| c.x), mean(|c| c.y))
-    };
     middle(a).distance(&middle(b)) < 0.25 * a[0].distance(&a[2])
 }

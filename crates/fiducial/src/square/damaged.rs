@@ -1,13 +1,12 @@
 //! Finds square markers that are in part in shadow, washed out, covered or beyond the frame: the slow way, for when
 //! closed outlines do not show them.
 
-use geometry::Pixel;
 use imaging::pyramid::to_level_0;
 use imaging::{GrayView, LeastEdge, Pyramid, Segments};
 
 use super::code::Code;
 use super::erasures::{self, Reading};
-use super::quad::Quad;
+use super::quad::{Quad, diagonal_px, middle, sides_px};
 use super::segments::{Placement, SegmentQuads};
 
 /// The markers of one family that are looked for.
@@ -111,8 +110,7 @@ fn read<'a>(
     if is_known {
         return;
     }
-    let shortest = (0..4).map(|i| quad.corners[i].distance(&quad.corners[(i + 1) % 4]));
-    let shortest = shortest.fold(f64::MAX, f64::min);
+    let shortest = sides_px(&quad.corners).into_iter().fold(f64::MAX, f64::min);
     for family in sought {
         if shortest < LEAST_CELL_PX * f64::from(family.code.cells) {
             continue;
@@ -132,21 +130,15 @@ fn read<'a>(
 
 /// Whether two quads overlap so much that only one of them can be a marker.
 fn is_same_place(a: &Quad, b: &Quad) -> bool {
-    let middle = |quad: &Quad| {
-        let [a, b, c, d] = quad.corners;
-        Pixel::new((a.x + b.x + c.x + d.x) / 4.0, (a.y + b.y + c.y + d.y) / 4.0)
-    };
-    let size = |quad: &Quad| {
-        let [a, b, c, d] = quad.corners;
-        a.distance(&c).max(b.distance(&d))
-    };
-    middle(a).distance(&middle(b)) < 0.4 * size(a).max(size(b))
+    let size = diagonal_px(&a.corners).max(diagonal_px(&b.corners));
+    middle(&a.corners).distance(&middle(&b.corners)) < 0.4 * size
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::marker::Family;
+    use geometry::Pixel;
     use imaging::GrayImage;
 
     const SIDE: f64 = 80.0;

@@ -9,6 +9,7 @@ use geometry::Pixel;
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
+use crate::exposure::Exposure;
 use crate::square::pattern::{MOST_CELLS, Pattern};
 use crate::square::refine::{Design, Fit, Homography, Lens, Scratch};
 use crate::step::{END, PIXEL_VARIANCE, Step, boxiness};
@@ -551,19 +552,14 @@ impl State {
     fn expose(&mut self, grid: &Grid, spots: &[Spot]) -> Option<()> {
         let map = grid.map(&self.homography, self.light.spread_px);
         let mut work = [Bands::NONE; 2];
-        let (mut n, mut sw, mut sww, mut sg, mut swg) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let mut exposure = Exposure::default();
         for spot in spots {
             let spread = grid.spread(&map, spot.ideal)?;
             let white = grid.look_at(&spread, self.light.spread_px, &mut work).white;
-            n += 1.0;
-            sw += white;
-            sww += white * white;
-            sg += spot.grey;
-            swg += white * spot.grey;
+            exposure.add(white, spot.grey);
         }
-        let contrast = (n * swg - sw * sg) / (n * sww - sw * sw);
-        self.light.contrast = contrast;
-        self.light.black = (sg - contrast * sw) / n;
+        let [black, contrast] = exposure.black_and_contrast();
+        (self.light.black, self.light.contrast) = (black, contrast);
         (contrast.is_finite() && contrast.abs() > LEAST_CONTRAST).then_some(())
     }
 

@@ -13,6 +13,22 @@ pub struct Quad {
     pub inverted: bool,
 }
 
+/// The mean of four corners, in pixels.
+pub(crate) fn middle(corners: &[Pixel; 4]) -> Pixel {
+    let mean = |of: fn(&Pixel) -> f64| corners.iter().map(of).sum::<f64>() / 4.0;
+    Pixel::new(mean(|c| c.x), mean(|c| c.y))
+}
+
+/// The sides between four corners, in pixels, the one after the first corner first.
+pub(crate) fn sides_px(corners: &[Pixel; 4]) -> [f64; 4] {
+    [0, 1, 2, 3].map(|i| corners[i].distance(&corners[(i + 1) % 4]))
+}
+
+/// The longer diagonal between four corners, in pixels.
+pub(crate) fn diagonal_px(corners: &[Pixel; 4]) -> f64 {
+    corners[0].distance(&corners[2]).max(corners[1].distance(&corners[3]))
+}
+
 impl Quad {
     /// The quad that an outline is, its sides fitted to the outline's points; `None` when it is none.
     pub(crate) fn of(outline: &Outline<'_>) -> Option<Self> {

@@ -15,6 +15,7 @@ use nalgebra::{Matrix2, SMatrix, SVector};
 use crate::square::pattern::{MOST_CELLS, Pattern};
 use crate::square::picture::{self, Picture};
 use crate::square::profiles::{self, Run};
+use crate::square::quad::middle;
 
 /// A square marker's corners and what else its picture tells.
 #[derive(Clone, Debug, PartialEq)]
@@ -175,8 +176,7 @@ impl<'a> Lens<'a> {
         if !corners.iter().all(|c| c.x.abs() < 1e6 && c.y.abs() < 1e6) {
             return None;
         }
-        let mean = |of: fn(&Pixel) -> f64| corners.iter().map(of).sum::<f64>() / 4.0;
-        let middle = Pixel::new(mean(|c| c.x), mean(|c| c.y));
+        let middle = middle(corners);
         // A lens model that says nothing of this place helps nobody: lines are then taken to be straight.
         let camera = camera.filter(|camera| {
             camera.distortion != Distortion::None

@@ -1,0 +1,48 @@
+//! Black and contrast of a picture whose shares of white are known.
+
+/// The line of least squares from the share of white that a pixel should see to the grey value it has.
+#[derive(Copy, Clone, Debug, Default)]
+pub(crate) struct Exposure {
+    n: f64,
+    white: f64,
+    white_white: f64,
+    grey: f64,
+    white_grey: f64,
+}
+
+impl Exposure {
+    /// Takes a pixel into account: its share of white, from 0 to 1, and its grey value.
+    pub(crate) fn add(&mut self, white: f64, grey: f64) {
+        self.n += 1.0;
+        self.white += white;
+        self.white_white += white * white;
+        self.grey += grey;
+        self.white_grey += white * grey;
+    }
+
+    /// Black and the contrast from black to white, in grey levels; not finite where all pixels have the same share.
+    pub(crate) fn black_and_contrast(&self) -> [f64; 2] {
+        let Self { n, white, white_white, grey, white_grey } = *self;
+        let contrast = (n * white_grey - white * grey) / (n * white_white - white * white);
+        [(grey - contrast * white) / n, contrast]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn black_and_contrast_are_those_of_the_pixels() {
+        let mut exposure = Exposure::default();
+        for (white, grey) in [(0.0, 20.0), (0.25, 60.0), (1.0, 180.0)] {
+            exposure.add(white, grey);
+        }
+        let [black, contrast] = exposure.black_and_contrast();
+        assert!((black - 20.0).abs() < 1e-9 && (contrast - 160.0).abs() < 1e-9);
+        let mut alike = Exposure::default();
+        alike.add(0.5, 90.0);
+        alike.add(0.5, 91.0);
+        assert!(!alike.black_and_contrast()[1].is_finite());
+    }
+}
