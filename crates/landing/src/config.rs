@@ -12,8 +12,10 @@ pub use crate::guidance::thesis::ThesisConfig;
 pub struct Config {
     /// What turns the target into a velocity.
     pub guidance: Guidance,
-    /// How detections become a target.
+    /// Which detections are used at all, and the mean that the thesis' guidance takes its height from.
     pub target: TargetConfig,
+    /// How detections become a target for our own guidance.
+    pub estimator: EstimatorConfig,
     /// What no setpoint exceeds.
     pub envelope: EnvelopeConfig,
     /// When the phases end.
@@ -80,6 +82,91 @@ impl Default for TargetConfig {
             forget_after_s: 5.0,
             restart_after: 6,
             confirm_after: 3,
+        }
+    }
+}
+
+/// How detections become a target: what is noise, what may change, and what is believed.
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EstimatorConfig {
+    /// A detection further than this is not used, in m (1 to 200).
+    pub max_range_m: f64,
+    /// Noise of a marker's place in the image where the detector does not tell it, in px (0.01 to 10).
+    pub pixel_noise_px: f64,
+    /// The same as an angle, where the focal length is not known either, in rad (0.00001 to 0.1).
+    pub direction_noise_rad: f64,
+    /// Noise of the range as a part of it, where the marker's size in the image is not told (0.0001 to 0.5).
+    pub range_noise_part: f64,
+    /// Fast noise of the attitude at an exposure, in rad (0.00001 to 0.1).
+    pub attitude_noise_rad: f64,
+    /// Fast noise of the autopilot's position, in m (0.0001 to 1).
+    pub position_noise_m: f64,
+    /// Slow error of the autopilot's position, in m per square root of a second (0 to 1).
+    pub way_noise_m: f64,
+    /// Drift of the autopilot's horizontal position at first, in m/s (0 to 1), and what it changes by, in m/s per square
+    /// root of a second (0 to 1).
+    pub drift_m_s: f64,
+    /// See `drift_m_s`.
+    pub drift_change: f64,
+    /// The same for the height, in m/s (0 to 1).
+    pub height_drift_m_s: f64,
+    /// The same for the height, in m/s per square root of a second (0 to 1).
+    pub height_drift_change: f64,
+    /// Fastest pad, in m/s; 0 for one that lies still (0 to 10).
+    pub pad_speed_m_s: f64,
+    /// Fastest heave of the pad, in m/s (0 to 5).
+    pub pad_heave_m_s: f64,
+    /// What the pad's velocity changes by, in m/s per square root of a second (0 to 5).
+    pub pad_acceleration: f64,
+    /// Error of mount and attitude, in rad (0.00001 to 0.2), and what it changes by, in rad per square root of a second
+    /// (0 to 0.1).
+    pub mount_error_rad: f64,
+    /// See `mount_error_rad`.
+    pub tilt_change: f64,
+    /// Error of the heading, in rad (0.00001 to 0.5).
+    pub heading_error_rad: f64,
+    /// Error of the frames' stamps, in s; 0 trusts them (0 to 0.2).
+    pub time_offset_s: f64,
+    /// Squared innovation over its covariance beyond which a detection is an outlier; chi-square with 3 degrees of
+    /// freedom exceeds 16.3 once in a thousand times (7 to 100).
+    pub gate: f64,
+    /// Outliers that agree with each other and so begin a new estimate (2 to 100),
+    pub restart_after: u32,
+    /// over at least this time, in s (0 to 10).
+    pub restart_s: f64,
+    /// After so long without a detection the estimate is forgotten, in s (0.5 to 600).
+    pub forget_after_s: f64,
+    /// Weight of a new detection in the pad's heading (0.01 to 1).
+    pub heading_share: f64,
+}
+
+impl Default for EstimatorConfig {
+    fn default() -> Self {
+        Self {
+            max_range_m: 40.0,
+            pixel_noise_px: 0.3,
+            direction_noise_rad: 0.0003,
+            range_noise_part: 0.015,
+            attitude_noise_rad: 0.0008,
+            position_noise_m: 0.005,
+            way_noise_m: 0.01,
+            drift_m_s: 0.05,
+            drift_change: 0.01,
+            height_drift_m_s: 0.1,
+            height_drift_change: 0.05,
+            pad_speed_m_s: 0.0,
+            pad_heave_m_s: 0.0,
+            pad_acceleration: 0.0,
+            mount_error_rad: 0.005,
+            tilt_change: 0.0005,
+            heading_error_rad: 0.015,
+            time_offset_s: 0.02,
+            gate: 16.3,
+            restart_after: 8,
+            restart_s: 1.5,
+            forget_after_s: 10.0,
+            heading_share: 0.1,
         }
     }
 }
@@ -226,6 +313,7 @@ impl Config {
             Guidance::Metric(metric) => metric.validate()?,
         }
         self.target.validate()?;
+        self.estimator.validate()?;
         self.envelope.validate()?;
         self.phases.validate()
     }
@@ -245,6 +333,34 @@ impl TargetConfig {
         check("target.forget_after_s", self.forget_after_s, 0.5, 600.0)?;
         check("target.restart_after", f64::from(self.restart_after), 2.0, 100.0)?;
         check("target.confirm_after", f64::from(self.confirm_after), 1.0, 100.0)
+    }
+}
+
+impl EstimatorConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        check("estimator.max_range_m", self.max_range_m, 1.0, 200.0)?;
+        check("estimator.pixel_noise_px", self.pixel_noise_px, 0.01, 10.0)?;
+        check("estimator.direction_noise_rad", self.direction_noise_rad, 1e-5, 0.1)?;
+        check("estimator.range_noise_part", self.range_noise_part, 1e-4, 0.5)?;
+        check("estimator.attitude_noise_rad", self.attitude_noise_rad, 1e-5, 0.1)?;
+        check("estimator.position_noise_m", self.position_noise_m, 1e-4, 1.0)?;
+        check("estimator.way_noise_m", self.way_noise_m, 0.0, 1.0)?;
+        check("estimator.drift_m_s", self.drift_m_s, 0.0, 1.0)?;
+        check("estimator.drift_change", self.drift_change, 0.0, 1.0)?;
+        check("estimator.height_drift_m_s", self.height_drift_m_s, 0.0, 1.0)?;
+        check("estimator.height_drift_change", self.height_drift_change, 0.0, 1.0)?;
+        check("estimator.pad_speed_m_s", self.pad_speed_m_s, 0.0, 10.0)?;
+        check("estimator.pad_heave_m_s", self.pad_heave_m_s, 0.0, 5.0)?;
+        check("estimator.pad_acceleration", self.pad_acceleration, 0.0, 5.0)?;
+        check("estimator.mount_error_rad", self.mount_error_rad, 1e-5, 0.2)?;
+        check("estimator.tilt_change", self.tilt_change, 0.0, 0.1)?;
+        check("estimator.heading_error_rad", self.heading_error_rad, 1e-5, 0.5)?;
+        check("estimator.time_offset_s", self.time_offset_s, 0.0, 0.2)?;
+        check("estimator.gate", self.gate, 7.0, 100.0)?;
+        check("estimator.restart_after", f64::from(self.restart_after), 2.0, 100.0)?;
+        check("estimator.restart_s", self.restart_s, 0.0, 10.0)?;
+        check("estimator.forget_after_s", self.forget_after_s, 0.5, 600.0)?;
+        check("estimator.heading_share", self.heading_share, 0.01, 1.0)
     }
 }
 

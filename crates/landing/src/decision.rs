@@ -49,16 +49,24 @@ impl Action {
 pub struct TargetEstimate {
     /// Where it is.
     pub position: Point<Ned>,
+    /// How it moves in the autopilot's frame, in m/s: its own motion and the frame's drift.
+    pub velocity: Vector<Ned>,
     /// Horizontal distance between the vehicle and the target, in metres.
     pub lateral_error_m: f64,
     /// Height of the vehicle's body origin above the target, in metres.
     pub height_m: f64,
     /// Time since the exposure of the newest detection used, in seconds.
     pub age_s: f64,
-    /// Root mean square horizontal distance of recent detections from the estimate, in metres.
-    pub spread_m: f64,
+    /// Standard deviation of the horizontal position, in metres.
+    pub deviation_m: f64,
     /// Detections used since the estimate was begun.
     pub detections: u32,
+    /// Heading of the marker's upper edge in radians from north to east, when poses tell it.
+    pub heading_rad: Option<f64>,
+    /// By how much exposures are later than their stamps, in seconds.
+    pub time_offset_s: f64,
+    /// The newest detection's squared innovation over its covariance: about 3 when all is as expected.
+    pub nis: Option<f64>,
 }
 
 macro_rules! named {
@@ -163,6 +171,8 @@ named! {
         Implausible = "implausible", "its pose is not below the vehicle";
         /// The detector was not sure enough.
         LowConfidence = "low-confidence", "its confidence is too low";
+        /// A frame of this stamp was used already.
+        Duplicate = "duplicate", "a frame of the same stamp was used already";
         /// Too far from the estimate.
         Outlier = "outlier", "too far from the estimate";
     }

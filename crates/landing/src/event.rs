@@ -1,6 +1,7 @@
 //! What the lander is told.
 
 use geometry::{Body, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
+use nalgebra::Matrix3;
 
 use crate::time::Timestamp;
 
@@ -84,6 +85,8 @@ pub struct Frame {
     pub detector: u32,
     /// Width and height of the image in pixels.
     pub image_size: (u32, u32),
+    /// Focal length in pixels, when the camera is calibrated.
+    pub focal_px: Option<f64>,
     /// The marker, when it was found.
     pub marker: Option<MarkerInFrame>,
 }
@@ -95,6 +98,12 @@ pub struct MarkerInFrame {
     pub centre: Pixel,
     /// Where it is, seen from the vehicle; `None` when its size or the camera is unknown.
     pub body_from_marker: Option<Transform<Body, Marker>>,
+    /// The other solution of a flat marker's pose, when there is one.
+    pub alternative: Option<Transform<Body, Marker>>,
+    /// Covariance of the pose's origin, in body axes and m^2; `None` when the detector does not tell.
+    pub covariance_m2: Option<Matrix3<f64>>,
+    /// Edge or diameter of the marker in the image, in pixels.
+    pub size_px: Option<f64>,
     /// From 0 (a guess) to 1 (certain).
     pub confidence: f64,
 }
@@ -119,8 +128,13 @@ impl MarkerInFrame {
         self.centre.x.is_finite()
             && self.centre.y.is_finite()
             && self.confidence.is_finite()
-            && self.body_from_marker.is_none_or(|t| {
-                t.origin().is_finite() && t.rotation().wxyz().iter().all(|c| c.is_finite())
-            })
+            && self.body_from_marker.is_none_or(|pose| is_finite(&pose))
+            && self.alternative.is_none_or(|pose| is_finite(&pose))
+            && self.covariance_m2.is_none_or(|m| m.iter().all(|c| c.is_finite()))
+            && self.size_px.is_none_or(f64::is_finite)
     }
+}
+
+fn is_finite(pose: &Transform<Body, Marker>) -> bool {
+    pose.origin().is_finite() && pose.rotation().wxyz().iter().all(|c| c.is_finite())
 }

@@ -13,10 +13,17 @@ const CAPACITY: usize = 256;
 /// Two neighbouring states further apart than this are not interpolated between, in seconds.
 const WIDEST_GAP_S: f64 = 0.5;
 
+/// A position this far from where the velocity leads is a jump of the autopilot's estimate, in metres, and what is added
+/// for each second between the two states.
+const JUMP_M: f64 = 0.1;
+const JUMP_M_S: f64 = 0.5;
+
 /// The vehicle's latest states, in the order of their stamps.
 #[derive(Clone, Debug)]
 pub struct History {
     states: VecDeque<VehicleState>,
+    /// For each state: by how much the autopilot's position had jumped altogether.
+    jumps: VecDeque<Vector<Ned>>,
     max_extrapolation_s: f64,
 }
 
@@ -29,12 +36,20 @@ pub struct Motion {
     pub position: Point<Ned>,
     /// Velocity in m/s.
     pub velocity: Vector<Ned>,
+    /// The position without the jumps of the autopilot's estimate.
+    pub way: Point<Ned>,
+    /// Turning rate in rad/s, as the neighbouring attitudes tell.
+    pub rate: Vector<Body>,
 }
 
 impl History {
     /// An empty history that reaches at most so many seconds beyond its newest state.
     pub fn new(max_extrapolation_s: f64) -> Self {
-        Self { states: VecDeque::with_capacity(CAPACITY), max_extrapolation_s }
+        Self {
+            states: VecDeque::with_capacity(CAPACITY),
+            jumps: VecDeque::with_capacity(CAPACITY),
+            max_extrapolation_s,
+        }
     }
 
     /// Adds a state; false when it is not newer than the newest.
@@ -42,10 +57,15 @@ impl History {
         if self.newest().is_some_and(|newest| state.stamp <= newest.stamp) {
             return false;
         }
+        let jumps = self.newest().map_or(Vector::zero(), |newest| {
+            self.way_origin() + jump(newest, &state).unwrap_or(Vector::zero())
+        });
         if self.states.len() == CAPACITY {
             self.states.pop_front();
+            self.jumps.pop_front();
         }
         self.states.push_back(state);
+        self.jumps.push_back(jumps);
         true
     }
 
@@ -54,13 +74,18 @@ impl History {
         self.states.back()
     }
 
+    /// By how much the autopilot's position has jumped altogether: where the way's origin now lies.
+    pub fn way_origin(&self) -> Vector<Ned> {
+        self.jumps.back().copied().unwrap_or(Vector::zero())
+    }
+
     /// The motion at `stamp`, interpolated between its neighbours; `None` before the oldest state, inside a gap,
     /// and too far beyond the newest state.
     pub fn at(&self, stamp: Timestamp) -> Option<Motion> {
         let after = self.states.partition_point(|state| state.stamp < stamp);
         let Some(later) = self.states.get(after) else { return self.extrapolate(stamp) };
         if later.stamp == stamp {
-            return Some(motion(later));
+            return self.known(after);
         }
         let earlier = self.states.get(after.checked_sub(1)?)?;
         let gap_s = later.stamp.seconds_since(earlier.stamp);
@@ -69,7 +94,13 @@ impl History {
         }
         let fraction = stamp.seconds_since(earlier.stamp) / gap_s;
         let between = |a: Vector<Ned>, b: Vector<Ned>| a + (b - a) * fraction;
+        let way = |index: usize, state: &VehicleState| {
+            self.jumps.get(index).map(|jumps| state.position - *jumps)
+        };
+        let (from, to) = (way(after - 1, earlier)?, way(after, later)?);
         Some(Motion {
+            way: from + (to - from) * fraction,
+            rate: turning(earlier, later),
             ned_from_body: earlier.ned_from_body.interpolate(&later.ned_from_body, fraction),
             position: earlier.position + (later.position - earlier.position) * fraction,
             velocity: between(earlier.velocity, later.velocity),
@@ -80,19 +111,45 @@ impl History {
     fn extrapolate(&self, stamp: Timestamp) -> Option<Motion> {
         let newest = self.newest()?;
         let ahead_s = stamp.seconds_since(newest.stamp);
-        (ahead_s <= self.max_extrapolation_s).then(|| Motion {
-            position: newest.position + newest.velocity * ahead_s,
-            ..motion(newest)
+        if ahead_s > self.max_extrapolation_s {
+            return None;
+        }
+        let known = self.known(self.states.len() - 1)?;
+        let further = newest.velocity * ahead_s;
+        Some(Motion { position: newest.position + further, way: known.way + further, ..known })
+    }
+
+    /// The motion at a state that is known.
+    fn known(&self, index: usize) -> Option<Motion> {
+        let state = self.states.get(index)?;
+        let before = index.checked_sub(1).and_then(|before| self.states.get(before));
+        Some(Motion {
+            ned_from_body: state.ned_from_body,
+            position: state.position,
+            velocity: state.velocity,
+            way: state.position - *self.jumps.get(index)?,
+            rate: before.map_or(Vector::zero(), |before| turning(before, state)),
         })
     }
 }
 
-fn motion(state: &VehicleState) -> Motion {
-    Motion {
-        ned_from_body: state.ned_from_body,
-        position: state.position,
-        velocity: state.velocity,
+/// Turning rate between two states, in rad/s; nought over a gap.
+fn turning(earlier: &VehicleState, later: &VehicleState) -> Vector<Body> {
+    let gap_s = later.stamp.seconds_since(earlier.stamp);
+    if !(1e-4..=WIDEST_GAP_S).contains(&gap_s) {
+        return Vector::zero();
     }
+    let [w, x, y, z] = (earlier.ned_from_body.inverse() * later.ned_from_body).wxyz();
+    // Half the angle's sine and the half angle are one for what a vehicle turns between two states.
+    Vector::new(x, y, z) * (2.0 * w.signum() / gap_s)
+}
+
+/// The jump of the autopilot's position between two states: what its velocity does not lead to.
+fn jump(earlier: &VehicleState, later: &VehicleState) -> Option<Vector<Ned>> {
+    let gap_s = later.stamp.seconds_since(earlier.stamp);
+    let led = (earlier.velocity + later.velocity) * (0.5 * gap_s);
+    let beside = later.position - earlier.position - led;
+    (beside.norm() > JUMP_M + JUMP_M_S * gap_s).then_some(beside)
 }
 
 #[cfg(test)]

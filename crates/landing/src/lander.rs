@@ -2,9 +2,10 @@
 
 use geometry::Vector;
 
-use crate::config::{Config, ConfigError, OnAbort};
+use crate::config::{Config, ConfigError, Guidance, OnAbort};
 use crate::decision::{Action, Decision, Reason, Rejection, TargetEstimate};
 use crate::envelope;
+use crate::estimator::Estimator;
 use crate::event::{Event, Frame, MarkerInFrame, Mode, VehicleState};
 use crate::guidance::{Guide, Progress, Situation};
 use crate::history::History;
@@ -22,7 +23,7 @@ pub struct Lander {
     config: Config,
     now: Option<Timestamp>,
     history: History,
-    target: Target,
+    tracker: Tracker,
     sightings: Sightings,
     newest_frame: Option<Timestamp>,
     guide: Guide,
@@ -30,6 +31,17 @@ pub struct Lander {
     land_asked: Option<Timestamp>,
     /// Direction of the first leg of the search under way, in radians.
     first_leg_rad: Option<f64>,
+}
+
+/// Where the landing point is, by the filter that the guidance takes.
+#[derive(Clone, Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there is one, and nothing may be allocated in flight"
+)]
+enum Tracker {
+    Mean(Target),
+    Filter(Estimator),
 }
 
 /// The markers used, as moments.
@@ -48,7 +60,7 @@ impl Lander {
             config,
             now: None,
             history: History::new(config.target.max_extrapolation_s),
-            target: Target::new(config.target),
+            tracker: Tracker::new(&config),
             sightings: Sightings::default(),
             newest_frame: None,
             guide: Guide::new(config.guidance),
@@ -84,10 +96,7 @@ impl Lander {
             phase: self.machine.phase(),
             action,
             why,
-            target: self
-                .history
-                .newest()
-                .and_then(|state| self.target.seen_from(state.position, now)),
+            target: self.target(now),
             rejected: refused.err(),
         }
     }
@@ -118,8 +127,12 @@ impl Lander {
             return Err(Rejection::NotFinite);
         }
         self.timely(now, frame.stamp, self.config.target.max_latency_s)?;
-        if self.newest_frame.is_some_and(|newest| frame.stamp <= newest) {
+        let late = self.newest_frame.is_some_and(|newest| frame.stamp <= newest);
+        if late && !self.tracker.takes_late_frames() {
             return Err(Rejection::OutOfOrder);
+        }
+        if late {
+            return frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
         }
         self.newest_frame = Some(frame.stamp);
         let seen = frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
@@ -132,7 +145,7 @@ impl Lander {
         if marker.confidence < self.config.target.min_confidence {
             return Err(Rejection::LowConfidence);
         }
-        match self.target.observe(frame, marker, &self.history) {
+        match self.tracker.observe(frame, marker, &self.history) {
             Err(Rejection::NoPose) if !self.guide.needs_pose() => {}
             Err(rejection) => return Err(rejection),
             Ok(()) => {}
@@ -150,7 +163,7 @@ impl Lander {
         let motion = self.history.at(frame.stamp);
         let heading_rad =
             motion.map_or(state.heading_rad(), |motion| motion.ned_from_body.euler().2);
-        let altitude_m = self.target.seen_from(state.position, frame.stamp);
+        let altitude_m = self.target(frame.stamp);
         let altitude_m = altitude_m.map_or(-state.position.z(), |target| target.height_m);
         let marker = frame.marker.filter(|_| used);
         self.guide.frame(&Frame { marker, ..*frame }, heading_rad, altitude_m);
@@ -167,12 +180,23 @@ impl Lander {
         }
     }
 
+    /// The landing point as seen from the vehicle's newest state.
+    fn target(&self, now: Timestamp) -> Option<TargetEstimate> {
+        let vehicle = self.history.newest()?.position;
+        match &self.tracker {
+            Tracker::Mean(target) => target.seen_from(vehicle, now),
+            Tracker::Filter(estimator) => {
+                estimator.seen_from(vehicle, self.history.way_origin(), now)
+            }
+        }
+    }
+
     fn progress(&mut self, now: Timestamp) -> Progress {
         if !matches!(self.machine.phase(), Phase::Approach | Phase::Descend) {
             return Progress::Unchanged;
         }
         let Some(vehicle) = self.history.newest().copied() else { return Progress::Unchanged };
-        let target = self.target.seen_from(vehicle.position, now);
+        let target = self.target(now);
         self.guide.progress(&situation(&self.config, now, &vehicle, target, self.sightings))
     }
 
@@ -202,7 +226,7 @@ impl Lander {
         let Some(vehicle) = self.history.newest().copied() else {
             return (Action::hover(), Reason::VehicleStale);
         };
-        let target = self.target.seen_from(vehicle.position, now);
+        let target = self.target(now);
         let situation = situation(&self.config, now, &vehicle, target, self.sightings);
         let (wanted, why) = self.guide.velocity(&situation);
         let velocity = envelope::admit(&self.config.envelope, wanted, situation.may_descend());
@@ -230,7 +254,7 @@ impl Lander {
             && self.machine.elapsed_s(now) > phases.regain_after_s;
         let low = self.history.newest().is_some_and(|vehicle| {
             let age_s = now.seconds_since(vehicle.stamp);
-            let target = self.target.seen_from(vehicle.position, now);
+            let target = self.target(now);
             age_s <= phases.stale_vehicle_s
                 && target.is_some_and(|target| target.height_m < phases.regain_height_m)
         });
@@ -273,9 +297,37 @@ impl Lander {
     }
 }
 
+impl Tracker {
+    fn new(config: &Config) -> Self {
+        match config.guidance {
+            Guidance::Thesis(_) => Self::Mean(Target::new(config.target)),
+            Guidance::Metric(_) => Self::Filter(Estimator::new(config.estimator)),
+        }
+    }
+
+    fn takes_late_frames(&self) -> bool {
+        matches!(self, Self::Filter(_))
+    }
+
+    fn observe(
+        &mut self,
+        frame: &Frame,
+        marker: &MarkerInFrame,
+        history: &History,
+    ) -> Result<(), Rejection> {
+        match self {
+            Self::Mean(target) => target.observe(frame, marker, history),
+            Self::Filter(estimator) => estimator.observe(frame, marker, history),
+        }
+    }
+}
+
 impl Sightings {
     fn add(&mut self, stamp: Timestamp, longest_gap_s: f64) {
         let gap_s = self.age_s(stamp);
+        if gap_s < 0.0 {
+            return;
+        }
         self.in_a_row = if gap_s > longest_gap_s { 1 } else { self.in_a_row.saturating_add(1) };
         self.newest = Some(stamp);
     }

@@ -15,6 +15,7 @@
 pub mod config;
 pub mod decision;
 pub mod envelope;
+pub mod estimator;
 pub mod event;
 pub mod guidance;
 pub mod history;
@@ -25,7 +26,7 @@ pub mod target;
 pub mod time;
 
 pub use config::{
-    Config, ConfigError, EnvelopeConfig, Guidance, MetricConfig, OnAbort, PhaseConfig,
+    Config, ConfigError, EnvelopeConfig, EstimatorConfig, Guidance, MetricConfig, OnAbort, PhaseConfig,
     TargetConfig, ThesisConfig,
 };
 pub use decision::{Action, Decision, Reason, Rejection, TargetEstimate};

@@ -67,11 +67,15 @@ impl Target {
             let offset = mean.position - vehicle;
             TargetEstimate {
                 position: mean.position,
+                velocity: Vector::zero(),
                 lateral_error_m: offset.horizontal_norm(),
                 height_m: offset.z(),
                 age_s: now.seconds_since(mean.stamp),
-                spread_m: mean.spread_m2.sqrt(),
+                deviation_m: mean.spread_m2.sqrt(),
                 detections: mean.detections,
+                heading_rad: None,
+                time_offset_s: 0.0,
+                nis: None,
             }
         })
     }
@@ -195,9 +199,18 @@ mod tests {
                     Rotation::identity(),
                     Point::new(in_body.x(), in_body.y(), in_body.z()),
                 )),
+                alternative: None,
+                covariance_m2: None,
+                size_px: None,
                 confidence: 1.0,
             };
-            let frame = Frame { stamp, detector: 0, image_size: (1296, 972), marker: Some(marker) };
+            let frame = Frame {
+                stamp,
+                detector: 0,
+                image_size: (1296, 972),
+                focal_px: None,
+                marker: Some(marker),
+            };
             self.target.observe(&frame, &marker, &self.history)
         }
 

@@ -141,10 +141,14 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
             stamp: now.plus_seconds(-age_s),
             detector: 3,
             image_size: (width, 972),
+            focal_px: Some(1818.0),
             marker: centre.map(|c| MarkerInFrame {
                 centre: Pixel::new(c[0], c[1]),
                 body_from_marker: origin
                     .map(|o| Transform::new(Rotation::identity(), Point::new(o[0], o[1], o[2]))),
+                alternative: None,
+                covariance_m2: None,
+                size_px: None,
                 confidence: 0.8,
             }),
         }),

@@ -238,9 +238,12 @@ mod tests {
         let marker = centre.map(|(x, y)| MarkerInFrame {
             centre: Pixel::new(x, y),
             body_from_marker: None,
+            alternative: None,
+            covariance_m2: None,
+            size_px: None,
             confidence: 1.0,
         });
-        Frame { stamp: Timestamp::default(), detector: 0, image_size: (1296, 972), marker }
+        Frame { stamp: Timestamp::default(), detector: 0, image_size: (1296, 972), focal_px: None, marker }
     }
 
     fn calm() -> ThesisConfig {

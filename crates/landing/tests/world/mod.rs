@@ -1,31 +1,45 @@
-//! A small world for closed-loop tests: a vehicle that answers velocity setpoints as the measured autopilot does,
-//! a camera below it, and a pad.
+//! A small world for closed-loop tests, in steps of the autopilot's loop: [`air`], a [`multirotor`] in it, an
+//! [`autopilot`] that flies it as the measured one does, a pad that may move, and [`eyes`] that see it, with all their
+//! errors drawn from one seed.
+
+#![allow(dead_code, reason = "each test uses a part of it")]
+
+pub(crate) mod air;
+pub(crate) mod autopilot;
+pub(crate) mod chance;
+pub(crate) mod eyes;
+pub(crate) mod multirotor;
+pub(crate) mod report;
 
 use std::collections::VecDeque;
 
-use geometry::{Body, CameraModel, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
+use geometry::{Ned, Point, Vector};
 use landing::{
-    Action, Config, Decision, Event, Frame, Landed, Lander, MarkerInFrame, Mode, OperatorCommand,
-    Phase, Timestamp, VehicleState,
+    Action, Config, Decision, Event, Lander, OperatorCommand, Phase, Timestamp,
 };
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
-use rand_distr::{Distribution, StandardNormal, StandardUniform};
 
-/// Seconds per step of the physics.
-const STEP_S: f64 = 0.005;
-/// Seconds between a setpoint and the first motion.
-const DEAD_TIME_S: f64 = 0.25;
-/// First-order time constants, horizontal and vertical, in seconds.
-const LAG_S: [f64; 3] = [0.43, 0.43, 0.21];
-/// Largest horizontal acceleration of the autopilot, in m/s^2.
-const ACCELERATION: f64 = 2.5;
-/// Height of the body's origin when the vehicle stands, in metres.
-const STANDING_M: f64 = 0.1;
-/// Speed of the autopilot's LAND mode, in m/s.
-const LAND_SPEED: f64 = 0.48;
-/// Edge of the marker, in metres.
-const MARKER_M: f64 = 0.153_41;
+use air::{Air, Wind};
+use autopilot::{Autopilot, Estimator, Packet};
+use eyes::{Eyes, Faults};
+use multirotor::{Demand, Multirotor};
+
+/// Seconds per step.
+const STEP_S: f64 = 1.0 / 400.0;
+/// The vehicle hovers so long before the landing begins, in seconds.
+const WARM_UP_S: f64 = 6.0;
+/// Setpoints are sent at most this often, and with each frame, in seconds.
+const SETPOINT_PERIOD_S: f64 = 0.04;
+
+/// How the pad moves.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct PadMotion {
+    /// In m/s.
+    pub(crate) velocity: Vector<Ned>,
+    /// Amplitude in metres and period in seconds.
+    pub(crate) heave: (f64, f64),
+    /// In radians, and rad/s.
+    pub(crate) yaw: (f64, f64),
+}
 
 /// One flight's circumstances.
 #[derive(Clone, Debug)]
@@ -36,17 +50,21 @@ pub(crate) struct Scene {
     pub(crate) start: Point<Ned>,
     pub(crate) heading_rad: f64,
     pub(crate) pad: Point<Ned>,
-    /// Standard deviation of the gusts' effect on the velocity, in m/s.
-    pub(crate) gust_m_s: f64,
-    /// Size of the autopilot's velocity bias and of its slow error of position, in m/s and m.
-    pub(crate) estimator_error: f64,
+    pub(crate) pad_motion: PadMotion,
+    pub(crate) wind: Wind,
+    pub(crate) estimator: Estimator,
+    pub(crate) faults: Faults,
+    pub(crate) frames_hz: f64,
     pub(crate) latency_s: f64,
-    /// By how much the vehicle's stamps are later than the truth, in seconds.
+    pub(crate) latency_jitter_s: f64,
+    /// By how much the frames' stamps are earlier than the truth, in seconds.
     pub(crate) stamp_error_s: f64,
-    /// Part of the frames in which the marker is missed.
-    pub(crate) miss: f64,
-    /// The detector is silent between these seconds.
-    pub(crate) outage_s: Option<(f64, f64)>,
+    /// The detector says how good its poses are.
+    pub(crate) tells_covariance: bool,
+    /// Size of the marker relative to the thesis'.
+    pub(crate) marker_scale: f64,
+    /// The autopilot is neither heard nor reached between these seconds.
+    pub(crate) link_lost_s: Option<(f64, f64)>,
     /// What the operator does when.
     pub(crate) commands: Vec<(f64, OperatorCommand)>,
     /// The autopilot ignores the request to land.
@@ -62,10 +80,23 @@ pub(crate) struct Scene {
 pub(crate) struct Sample {
     pub(crate) seconds: f64,
     pub(crate) position: Point<Ned>,
+    pub(crate) velocity: Vector<Ned>,
+    pub(crate) pad: Point<Ned>,
     pub(crate) decision: Decision,
 }
 
-/// One flight.
+/// The moment of the touch.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Touch {
+    /// Horizontal distance from the pad, in metres.
+    pub(crate) error_m: f64,
+    /// Relative to the pad, in m/s.
+    pub(crate) sink_m_s: f64,
+    pub(crate) slide_m_s: f64,
+    pub(crate) tilt_rad: f64,
+}
+
+/// One flight. Times are seconds from the start of the landing.
 #[derive(Debug)]
 pub(crate) struct Flight {
     pub(crate) samples: Vec<Sample>,
@@ -74,15 +105,18 @@ pub(crate) struct Flight {
     pub(crate) land_s: Option<f64>,
     pub(crate) touchdown_s: Option<f64>,
     pub(crate) disarm_s: Option<f64>,
-    /// Horizontal distance from the pad at touchdown, in metres.
+    pub(crate) touch: Option<Touch>,
+    /// As in `touch`; infinite without one.
     pub(crate) error_m: f64,
     /// Largest distance beyond the pad, along the way to it, in metres.
     pub(crate) overshoot_m: f64,
     pub(crate) max_tilt_rad: f64,
+    /// The landing was given up before the touch.
+    pub(crate) aborted: bool,
 }
 
 impl Scene {
-    /// The thesis' field: 10 m over the origin, the pad at (1.5, -1.5), its own errors drawn from the seed.
+    /// The thesis' field in calm air: 10 m over the origin, the pad at (1.5, -1.5).
     pub(crate) fn new(seed: u64) -> Self {
         Self {
             seed,
@@ -90,12 +124,21 @@ impl Scene {
             start: Point::new(0.0, 0.0, -10.0),
             heading_rad: 0.0,
             pad: Point::new(1.5, -1.5, 0.0),
-            gust_m_s: 0.03,
-            estimator_error: 0.03,
+            pad_motion: PadMotion {
+                velocity: Vector::zero(),
+                heave: (0.0, 5.0),
+                yaw: (0.0, 0.0),
+            },
+            wind: Wind::CALM,
+            estimator: Estimator::USUAL,
+            faults: Faults::USUAL,
+            frames_hz: 15.0,
             latency_s: 0.08,
+            latency_jitter_s: 0.02,
             stamp_error_s: 0.0,
-            miss: 0.03,
-            outage_s: None,
+            tells_covariance: true,
+            marker_scale: 1.0,
+            link_lost_s: None,
             commands: vec![(0.0, OperatorCommand::Start)],
             refuses_land: false,
             pilot_s: None,
@@ -103,36 +146,50 @@ impl Scene {
         }
     }
 
+    /// The same in wind from a direction that the seed draws.
+    pub(crate) fn windy(seed: u64, mean_m_s: f64, turbulence: f64) -> Self {
+        let from_rad = seed as f64 * 2.399;
+        Self { wind: Wind::new(mean_m_s, turbulence, from_rad), ..Self::new(seed) }
+    }
+
     /// Flies until the landing ends or patience does.
     pub(crate) fn fly(self) -> Flight {
-        let lander = Lander::new(self.config);
         let mut flight = Flight::new();
-        let Ok(mut lander) = lander else { return flight };
+        let Ok(mut lander) = Lander::new(self.config) else { return flight };
         let mut world = World::new(&self);
+        world.warm_up(&self);
         let mut commands: VecDeque<_> = self.commands.iter().copied().collect();
         let mut step = 0u32;
         while world.seconds < self.limit_s {
             world.advance(&self);
-            let mut events = world.events(&self, step);
-            if commands.front().is_some_and(|(at, _)| *at + 0.5 <= world.seconds) {
-                events.extend(commands.pop_front().map(|(_, command)| Event::Operator(command)));
-            }
-            for event in events {
+            for event in world.events(&self, step, &mut commands) {
                 let decision = lander.step(Timestamp::from_seconds(world.seconds), event);
-                world.obey(&self, decision.action);
+                world.obey(&self, decision, matches!(event, Event::Frame(_)));
                 flight.note(&world, &self, decision);
             }
+            flight.watch(&world, &self);
             step += 1;
-            let over = world.disarm_s.is_some_and(|at| world.seconds > at + 1.0);
+            let over = world.autopilot.disarm_s.is_some_and(|at| world.seconds > at + 1.0);
             if over || lander.phase() == Phase::Landed {
                 break;
             }
         }
         flight.phase = lander.phase();
-        flight.disarm_s = world.disarm_s.map(|at| at - 0.5);
-        flight.touchdown_s = world.touchdown_s.map(|at| at - 0.5);
-        flight.land_s = world.land_s.map(|at| at - 0.5);
+        flight.disarm_s = world.autopilot.disarm_s;
+        flight.touchdown_s = world.autopilot.touchdown_s;
+        flight.land_s = world.autopilot.land_s;
         flight
+    }
+
+    /// Place and heading of the pad, and its velocity.
+    fn pad_at(&self, seconds: f64) -> (Point<Ned>, f64, Vector<Ned>) {
+        let PadMotion { velocity, heave: (height_m, period_s), yaw: (yaw, yaw_rate) } =
+            self.pad_motion;
+        let pace = std::f64::consts::TAU / period_s;
+        let (sin, cos) = (pace * seconds).sin_cos();
+        let heave = Vector::new(0.0, 0.0, height_m * sin);
+        let rate = velocity + Vector::new(0.0, 0.0, height_m * pace * cos);
+        (self.pad + velocity * seconds + heave, yaw + yaw_rate * seconds, rate)
     }
 }
 
@@ -144,249 +201,159 @@ impl Flight {
             land_s: None,
             touchdown_s: None,
             disarm_s: None,
+            touch: None,
             error_m: f64::INFINITY,
             overshoot_m: 0.0,
             max_tilt_rad: 0.0,
+            aborted: false,
         }
     }
 
     fn note(&mut self, world: &World, scene: &Scene, decision: Decision) {
+        let vehicle = &world.vehicle;
+        self.aborted |= decision.phase == Phase::Aborted && self.touch.is_none();
+        self.samples.push(Sample {
+            seconds: world.seconds,
+            position: vehicle.position,
+            velocity: vehicle.velocity,
+            pad: scene.pad_at(world.seconds).0,
+            decision,
+        });
+    }
+
+    fn watch(&mut self, world: &World, scene: &Scene) {
+        let vehicle = &world.vehicle;
+        let (pad, _, pad_velocity) = scene.pad_at(world.seconds);
         let way = scene.pad - scene.start;
-        let gone = world.position - scene.pad;
+        let gone = vehicle.position - pad;
         if way.horizontal_norm() > 0.1 {
             let beyond = (gone.x() * way.x() + gone.y() * way.y()) / way.horizontal_norm();
             self.overshoot_m = self.overshoot_m.max(beyond);
         }
-        if world.touchdown_s.is_some() {
-            self.error_m = gone.horizontal_norm();
+        self.max_tilt_rad = self.max_tilt_rad.max(vehicle.tilt_rad());
+        if vehicle.on_ground && self.touch.is_none() {
+            let hit = world.before_touch - pad_velocity;
+            let error_m = gone.horizontal_norm();
+            self.error_m = error_m;
+            self.touch = Some(Touch {
+                error_m,
+                sink_m_s: hit.z(),
+                slide_m_s: hit.horizontal_norm(),
+                tilt_rad: vehicle.tilt_rad(),
+            });
         }
-        self.max_tilt_rad = self.max_tilt_rad.max(world.tilt[0].hypot(world.tilt[1]));
-        self.samples.push(Sample {
-            seconds: world.seconds - 0.5,
-            position: world.position,
-
-            decision,
-        });
     }
 
     /// The sample nearest after `seconds`.
     pub(crate) fn at(&self, seconds: f64) -> Option<&Sample> {
         self.samples.iter().find(|sample| sample.seconds >= seconds)
     }
+
+    /// True when the vehicle touched the ground far from the pad or hard, and the landing had not been given up.
+    pub(crate) fn is_unsafe(&self) -> bool {
+        self.touch.is_some_and(|touch| {
+            !self.aborted && (touch.error_m > 0.3 || touch.sink_m_s > 0.8 || touch.tilt_rad > 0.35)
+        })
+    }
 }
 
 struct World {
-    random: ChaCha8Rng,
     seconds: f64,
-    position: Point<Ned>,
-    velocity: Vector<Ned>,
-    /// Roll and pitch that the acceleration needs, in radians.
-    tilt: [f64; 2],
-    gust: Vector<Ned>,
-    velocity_bias: Vector<Ned>,
-    position_error: Vector<Ned>,
-    mount_error: [f64; 2],
-    setpoints: VecDeque<Vector<Ned>>,
-    wanted: Vector<Ned>,
-    mode: Mode,
-    /// A mode change on its way.
-    pending_land_s: Option<f64>,
-    hold: Point<Ned>,
-    land_s: Option<f64>,
-    touchdown_s: Option<f64>,
-    disarm_s: Option<f64>,
-    frames: VecDeque<(f64, Frame)>,
+    vehicle: Multirotor,
+    air: Air,
+    autopilot: Autopilot,
+    eyes: Eyes,
+    demand: Demand,
+    sent_s: f64,
+    before_touch: Vector<Ned>,
 }
 
 impl World {
     fn new(scene: &Scene) -> Self {
-        let mut random = ChaCha8Rng::seed_from_u64(scene.seed);
-        let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
-        let bias = Vector::new(normal(), normal(), 0.3 * normal()) * scene.estimator_error;
-        let mount_error = [0.002 * normal(), 0.002 * normal()];
+        let vehicle = Multirotor::new(scene.start, scene.heading_rad, scene.seed);
         Self {
             seconds: 0.0,
-            position: scene.start,
-            velocity: Vector::zero(),
-            tilt: [0.0; 2],
-            gust: Vector::zero(),
-            velocity_bias: bias,
-            position_error: Vector::zero(),
-            mount_error,
-            setpoints: VecDeque::new(),
-            wanted: Vector::zero(),
-            mode: Mode::Guided,
-            pending_land_s: None,
-            hold: scene.start,
-            land_s: None,
-            touchdown_s: None,
-            disarm_s: None,
-            frames: VecDeque::new(),
-            random,
+            air: Air::new(scene.wind, scene.seed),
+            autopilot: Autopilot::new(scene.estimator, &vehicle, scene.refuses_land, scene.seed),
+            eyes: Eyes::new(scene),
+            vehicle,
+            demand: Demand { thrust: multirotor::GRAVITY, ..Demand::default() },
+            sent_s: f64::NEG_INFINITY,
+            before_touch: Vector::zero(),
         }
     }
 
-    fn normal(&mut self) -> f64 {
-        StandardNormal.sample(&mut self.random)
+    /// Lets the autopilot learn the wind, and puts the vehicle back to its start.
+    fn warm_up(&mut self, scene: &Scene) {
+        self.seconds = -WARM_UP_S;
+        while self.seconds < -1e-9 {
+            self.seconds += STEP_S;
+            self.fly(scene);
+        }
+        self.seconds = 0.0;
+        self.autopilot.shift(scene.start - self.vehicle.position);
+        self.vehicle.position = scene.start;
     }
 
-    fn noise(&mut self) -> Vector<Ned> {
-        Vector::new(self.normal(), self.normal(), 0.3 * self.normal())
+    fn fly(&mut self, scene: &Scene) {
+        let (pad, _, pad_velocity) = scene.pad_at(self.seconds);
+        let height_m = pad.z() - self.vehicle.position.z();
+        let wind = self.air.step(STEP_S, self.seconds, height_m);
+        if !self.vehicle.on_ground {
+            self.before_touch = self.vehicle.velocity;
+        }
+        self.vehicle.step(STEP_S, wind, &self.demand, pad.z(), pad_velocity);
+        self.demand = self.autopilot.step(STEP_S, self.seconds, &self.vehicle);
     }
 
-    /// One step of the physics.
     fn advance(&mut self, scene: &Scene) {
         self.seconds += STEP_S;
-        self.modes(scene);
-        // Gusts last a second, the estimator's errors twenty.
-        let (gust, wander) = (self.noise(), self.noise());
-        self.gust = self.gust * (1.0 - STEP_S) + gust * (scene.gust_m_s * (2.0 * STEP_S).sqrt());
-        self.position_error = self.position_error * (1.0 - STEP_S / 20.0)
-            + wander * (scene.estimator_error * (2.0 * STEP_S / 20.0).sqrt());
-        if self.touchdown_s.is_some() {
-            self.velocity = Vector::zero();
-            self.tilt = [0.0; 2];
-            return;
+        if scene.pilot_s.is_some_and(|at| self.seconds >= at) {
+            self.autopilot.mode = landing::Mode::Other;
         }
-        self.setpoints.push_back(self.wanted);
-        let delayed = if self.setpoints.len() as f64 * STEP_S > DEAD_TIME_S {
-            self.setpoints.pop_front().unwrap_or(Vector::zero())
-        } else {
-            Vector::zero()
-        };
-        let aim = if self.mode == Mode::Land { self.land_aim() } else { delayed };
-        // The autopilot follows its own, biased, idea of the velocity.
-        let lack = aim - self.velocity_bias + self.gust - self.velocity;
-        let push = |lack: f64, axis: usize| (lack / LAG_S[axis]).clamp(-ACCELERATION, ACCELERATION);
-        let acceleration = Vector::new(push(lack.x(), 0), push(lack.y(), 1), push(lack.z(), 2));
-        self.velocity = self.velocity + acceleration * STEP_S;
-        self.position = self.position + self.velocity * STEP_S;
-        self.lean(scene, acceleration);
-        if self.position.z() >= -STANDING_M {
-            self.touchdown_s = Some(self.seconds);
-        }
+        self.fly(scene);
+        let (pad, yaw, _) = scene.pad_at(self.seconds);
+        self.eyes.look(scene, self.seconds, &self.vehicle, (pad, yaw));
     }
 
-    fn modes(&mut self, scene: &Scene) {
-        if scene.pilot_s.is_some_and(|at| self.seconds >= at + 0.5) {
-            self.mode = Mode::Other;
-        }
-        if self.pending_land_s.is_some_and(|at| self.seconds >= at) && self.mode == Mode::Guided {
-            self.mode = Mode::Land;
-            self.land_s = Some(self.seconds);
-            self.hold =
-                self.position + Vector::new(self.velocity.x(), self.velocity.y(), 0.0) * 0.6;
-        }
-        if let Some(touched) = self.touchdown_s
-            && self.seconds > touched + 2.05
-            && self.mode == Mode::Land
-        {
-            self.disarm_s.get_or_insert(self.seconds);
-        }
-    }
-
-    fn land_aim(&self) -> Vector<Ned> {
-        let back = self.hold - self.position;
-        Vector::new(back.x(), back.y(), 0.0) * 0.8 + Vector::new(0.0, 0.0, LAND_SPEED)
-    }
-
-    /// The attitude that the acceleration needs, a tenth of a second behind.
-    fn lean(&mut self, scene: &Scene, acceleration: Vector<Ned>) {
-        let (sin, cos) = scene.heading_rad.sin_cos();
-        let forward = acceleration.x() * cos + acceleration.y() * sin;
-        let right = acceleration.y() * cos - acceleration.x() * sin;
-        let wanted = [(right / 9.81).atan(), -(forward / 9.81).atan()];
-        for (tilt, wanted) in self.tilt.iter_mut().zip(wanted) {
-            *tilt += (wanted - *tilt) * STEP_S / 0.1;
-        }
-    }
-
-    fn ned_from_body(&self, scene: &Scene) -> Rotation<Ned, Body> {
-        Rotation::from_euler(self.tilt[0], self.tilt[1], scene.heading_rad)
-    }
-
-    /// What the lander is told after this step: states at 50 Hz, frames at 15 Hz after their latency, ticks at 20 Hz.
-    fn events(&mut self, scene: &Scene, step: u32) -> Vec<Event> {
+    /// What the lander is told after this step: states at 50 Hz, frames as they arrive, ticks at 20 Hz.
+    fn events(
+        &mut self,
+        scene: &Scene,
+        step: u32,
+        commands: &mut VecDeque<(f64, OperatorCommand)>,
+    ) -> Vec<Event> {
         let mut events = Vec::new();
-        if step.is_multiple_of(4) {
-            events.push(Event::Vehicle(self.state(scene)));
+        if step.is_multiple_of(8) && !self.link_is_lost(scene) {
+            events.push(Event::Vehicle(self.autopilot.state(self.seconds - 0.005)));
         }
-        if step.is_multiple_of(13) {
-            let frame = self.frame(scene);
-            let jitter: f64 = StandardUniform.sample(&mut self.random);
-            self.frames.push_back((self.seconds + scene.latency_s + 0.02 * jitter, frame));
-        }
-        if self.frames.front().is_some_and(|(at, _)| *at <= self.seconds) {
-            events.extend(self.frames.pop_front().map(|(_, frame)| Event::Frame(frame)));
-        }
-        let silent =
-            scene.outage_s.is_some_and(|(from, to)| (from..to).contains(&(self.seconds - 0.5)));
-        events.retain(|event| !(silent && matches!(event, Event::Frame(_))));
-        if step.is_multiple_of(10) {
+        events.extend(self.eyes.arrived(self.seconds).map(Event::Frame));
+        if step.is_multiple_of(20) {
             events.push(Event::Tick);
+        }
+        if commands.front().is_some_and(|(at, _)| *at <= self.seconds) {
+            events.extend(commands.pop_front().map(|(_, command)| Event::Operator(command)));
         }
         events
     }
 
-    fn state(&mut self, scene: &Scene) -> VehicleState {
-        let landed = match self.touchdown_s {
-            Some(at) if self.seconds > at + 1.65 => Landed::OnGround,
-            _ if self.mode == Mode::Land => Landed::Landing,
-            _ => Landed::InAir,
-        };
-        VehicleState {
-            stamp: Timestamp::from_seconds(self.seconds - 0.01 + scene.stamp_error_s),
-            ned_from_body: self.ned_from_body(scene),
-            position: self.position + self.position_error,
-            velocity: self.velocity + self.velocity_bias + self.noise() * 0.01,
-            mode: self.mode,
-            armed: self.disarm_s.is_none(),
-            landed,
-        }
+    fn link_is_lost(&self, scene: &Scene) -> bool {
+        scene.link_lost_s.is_some_and(|(from, to)| (from..to).contains(&self.seconds))
     }
 
-    /// The camera looks down, image up is forward, with a small error of its mounting that nobody knows.
-    fn frame(&mut self, scene: &Scene) -> Frame {
-        let model = CameraModel::pinhole(1296, 972, 1818.0);
-        let in_body = self.ned_from_body(scene).inverse() * (scene.pad - self.position);
-        let [roll, pitch] = self.mount_error;
-        let in_body: Vector<Body> = Rotation::<Body, Body>::from_euler(roll, pitch, 0.0) * in_body;
-        let centre = model.project(Point::new(in_body.y(), -in_body.x(), in_body.z()));
-        let half_px = 0.6 * MARKER_M * 1818.0 / in_body.z().max(0.01);
-        let inside = |pixel: &Pixel| {
-            (half_px..1296.0 - half_px).contains(&pixel.x)
-                && (half_px..972.0 - half_px).contains(&pixel.y)
-        };
-        let luck: f64 = StandardUniform.sample(&mut self.random);
-        let pixel_noise = [self.normal() * 0.5, self.normal() * 0.5];
-        let range_noise = 1.0 + 0.01 * self.normal();
-        let marker = centre.filter(inside).filter(|_| luck >= scene.miss).map(|pixel| {
-            let pixel = Pixel::new(pixel.x + pixel_noise[0], pixel.y + pixel_noise[1]);
-            let ray = model.unproject(pixel);
-            let range = in_body.z() * range_noise;
-            let origin = Point::<Body>::new(-ray.y() * range, ray.x() * range, range);
-            let body_from_marker = Transform::<Body, Marker>::new(Rotation::identity(), origin);
-            MarkerInFrame {
-                centre: pixel,
-                body_from_marker: Some(body_from_marker),
-                confidence: 0.9,
-            }
-        });
-        Frame {
-            stamp: Timestamp::from_seconds(self.seconds),
-            detector: 1,
-            image_size: (1296, 972),
-            marker,
+    /// Sends what was decided, as the controller does.
+    fn obey(&mut self, scene: &Scene, decision: Decision, is_frame: bool) {
+        if self.link_is_lost(scene) {
+            return;
         }
-    }
-
-    fn obey(&mut self, scene: &Scene, action: Action) {
-        match action {
+        match decision.action {
             Action::None => {}
-            Action::Velocity { velocity, .. } => self.wanted = velocity,
-            Action::Land if scene.refuses_land => {}
-            Action::Land => {
-                self.pending_land_s.get_or_insert(self.seconds + 0.08);
+            Action::Land => self.autopilot.send(self.seconds, Packet::Land),
+            Action::Velocity { velocity, yaw_rate } => {
+                if is_frame || self.seconds - self.sent_s >= SETPOINT_PERIOD_S - 1e-6 {
+                    self.sent_s = self.seconds;
+                    self.autopilot.send(self.seconds, Packet::Velocity(velocity, yaw_rate));
+                }
             }
         }
     }

@@ -1,0 +1,477 @@
+//! The estimator: where the landing point is, how it moves, and how well that is known.
+//!
+//! A Kalman filter of the pad in the vehicle's own way, that is in the autopilot's local frame without its jumps
+//! ([`crate::history::Motion::way`]). There the autopilot's motion needs no integration between detections, and what the
+//! filter sees is what velocity setpoints act on: in 160 recorded flights of ArduPilot the reported position moved against the truth by
+//! 0.010 m over 2 s, the sum of the reported velocity by 0.032 m.
+//!
+//! | state | unit | why |
+//! |---|---|---|
+//! | `q` | m | the pad, in the vehicle's way |
+//! | `u` | m/s | its velocity there: the pad's own plus the autopilot's drift (GNSS, barometer), which no image can tell apart and which a setpoint must contain both |
+//! | `θ` | rad | error of mount and attitude together, about the body's axes; seen as the height changes |
+//! | `τ` | s | exposures are so much later than their stamps; seen as image motion that goes with the vehicle's turning |
+//!
+//! A detection of the pad at `r` (north, east, down from the vehicle) by a vehicle that moves with `v` and turns with `ω`
+//! measures `y = q + (R θ) × r + τ (u - v - ω × r)`, linearised as an extended Kalman filter does (Bar-Shalom, Li, Kirubarajan:
+//! Estimation with Applications to Tracking and Navigation, sections 5.2 and 10.3). Its covariance is the detector's, or one
+//! from pixel noise, size and range, plus what attitude and position are known to.
+//!
+//! A detection is fused at its own stamp: the last [`MEMORY`] detections are kept with the state after each, and one that comes late is put
+//! between them and those after it are fused again. A detection whose normalised innovation squared exceeds the gate is an
+//! outlier. Outliers that agree with each other for long enough are a new estimate: neither a false marker nor a jump is
+//! believed at once, and none is ignored for ever.
+
+use std::collections::VecDeque;
+
+use geometry::{Body, Marker, Ned, Point, Rotation, Transform, Vector};
+use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector3};
+
+use crate::config::EstimatorConfig;
+use crate::decision::{Rejection, TargetEstimate};
+use crate::event::{Frame, MarkerInFrame};
+use crate::history::{History, Motion};
+use crate::time::Timestamp;
+
+/// Size of the state: `q`, `u`, `θ`, `τ`.
+const STATES: usize = 10;
+const Q: usize = 0;
+const U: usize = 3;
+const TILT: usize = 6;
+const OFFSET: usize = 9;
+
+/// Detections kept for those that come late.
+pub const MEMORY: usize = 32;
+
+/// Deviation of a position never measured, in metres.
+const UNKNOWN_M: f64 = 100.0;
+
+/// Two solutions of a flat marker's pose whose normals are equally upright within this angle are not told apart, in radians.
+const UNDECIDED_RAD: f64 = 0.05;
+
+/// A rival detection's distance from the rival before it, as a multiple of what the gate allows a single detection.
+const RIVAL_GATE_M: f64 = 0.15;
+
+type State = SVector<f64, STATES>;
+type Covariance = SMatrix<f64, STATES, STATES>;
+
+/// The estimate of the landing point.
+#[derive(Clone, Debug)]
+pub struct Estimator {
+    config: EstimatorConfig,
+    /// Oldest first, never more than [`MEMORY`].
+    past: VecDeque<Fused>,
+    detections: u32,
+    heading: Option<[f64; 2]>,
+    rival: Option<Rival>,
+    nis: Option<f64>,
+}
+
+/// A detection and what is known after it.
+#[derive(Clone, Debug)]
+struct Fused {
+    sight: Sight,
+    belief: Belief,
+}
+
+/// What is known at one moment.
+#[derive(Clone, Debug)]
+struct Belief {
+    state: State,
+    covariance: Covariance,
+}
+
+/// A detection joined with the vehicle's motion at its stamp.
+#[derive(Copy, Clone, Debug)]
+struct Sight {
+    stamp: Timestamp,
+    /// The pad in the vehicle's way.
+    place: Vector3<f64>,
+    noise: Matrix3<f64>,
+    /// What a tilt about each of the body's axes adds, in metres per radian.
+    tilt: Matrix3<f64>,
+    /// What a later exposure adds, apart from the pad's own velocity, in m/s.
+    slip: Vector3<f64>,
+}
+
+/// Outliers that agree with each other.
+#[derive(Copy, Clone, Debug)]
+struct Rival {
+    newest: Sight,
+    since: Timestamp,
+    detections: u32,
+}
+
+impl Estimator {
+    /// A target never seen.
+    pub fn new(config: EstimatorConfig) -> Self {
+        Self {
+            config,
+            past: VecDeque::with_capacity(MEMORY + 1),
+            detections: 0,
+            heading: None,
+            rival: None,
+            nis: None,
+        }
+    }
+
+    /// Uses one marker of a frame, or says why not.
+    pub fn observe(
+        &mut self,
+        frame: &Frame,
+        marker: &MarkerInFrame,
+        history: &History,
+    ) -> Result<(), Rejection> {
+        let pose = marker.body_from_marker.ok_or(Rejection::NoPose)?;
+        let motion = history.at(frame.stamp).ok_or(Rejection::NoAttitude)?;
+        let (seen, spread) = resolved(&motion, pose, marker.alternative);
+        let from_vehicle = motion.ned_from_body * seen;
+        self.plausible(from_vehicle)?;
+        let in_body = self.noise_in_body(frame, marker, seen) + spread;
+        let sight = self.sight(frame.stamp, &motion, from_vehicle, in_body);
+        self.fuse(sight)?;
+        self.turn_towards(motion.ned_from_body * pose.rotation());
+        Ok(())
+    }
+
+    /// The estimate as seen from a vehicle at `vehicle` whose way has the origin `way_origin`, at `now`.
+    pub fn seen_from(
+        &self,
+        vehicle: Point<Ned>,
+        way_origin: Vector<Ned>,
+        now: Timestamp,
+    ) -> Option<TargetEstimate> {
+        let Fused { sight, belief } = self.past.back()?;
+        let ahead_s = now.seconds_since(sight.stamp).clamp(0.0, self.config.forget_after_s);
+        let velocity = belief.velocity();
+        let place = belief.place() + velocity * ahead_s;
+        let position = Point::new(place.x, place.y, place.z) + way_origin;
+        let offset = position - vehicle;
+        Some(TargetEstimate {
+            position,
+            velocity: Vector::from_coords(velocity),
+            lateral_error_m: offset.horizontal_norm(),
+            height_m: offset.z(),
+            age_s: now.seconds_since(sight.stamp),
+            deviation_m: self.deviation_m(belief, ahead_s),
+            detections: self.detections,
+            heading_rad: self.heading.map(|[north, east]| east.atan2(north)),
+            time_offset_s: belief.state[OFFSET],
+            nis: self.nis,
+        })
+    }
+
+    fn plausible(&self, from_vehicle: Vector<Ned>) -> Result<(), Rejection> {
+        let below = from_vehicle.z() > 0.0;
+        let steep = from_vehicle.horizontal_norm() < 3.0 * from_vehicle.z();
+        if below && steep && from_vehicle.norm() <= self.config.max_range_m {
+            Ok(())
+        } else {
+            Err(Rejection::Implausible)
+        }
+    }
+
+    /// Covariance of a pose's origin: as told, or from the noise of pixels.
+    fn noise_in_body(
+        &self,
+        frame: &Frame,
+        marker: &MarkerInFrame,
+        seen: Vector<Body>,
+    ) -> Matrix3<f64> {
+        if let Some(told) = marker.covariance_m2 {
+            return (told + told.transpose()) * 0.5;
+        }
+        let pixel_rad = frame
+            .focal_px
+            .filter(|focal_px| *focal_px > 1.0)
+            .map_or(self.config.direction_noise_rad, |focal_px| self.config.pixel_noise_px / focal_px);
+        let size_px = marker.size_px.filter(|size_px| *size_px > 1.0);
+        let range_part = size_px
+            .map_or(self.config.range_noise_part, |size_px| 2.0 * self.config.pixel_noise_px / size_px);
+        let range_m = seen.norm();
+        let along = seen.coords / range_m.max(1e-6);
+        let across = (range_m * pixel_rad).powi(2);
+        Matrix3::identity() * across
+            + along * along.transpose() * ((range_m * range_part).powi(2) - across)
+    }
+
+    fn sight(
+        &self,
+        stamp: Timestamp,
+        motion: &Motion,
+        from_vehicle: Vector<Ned>,
+        in_body: Matrix3<f64>,
+    ) -> Sight {
+        let r = from_vehicle.coords;
+        let axis = |x, y, z| (motion.ned_from_body * Vector::<Body>::new(x, y, z)).coords;
+        let axes = Matrix3::from_columns(&[
+            axis(1.0, 0.0, 0.0),
+            axis(0.0, 1.0, 0.0),
+            axis(0.0, 0.0, 1.0),
+        ]);
+        let tilt = Matrix3::from_columns(&[
+            axes.column(0).cross(&r),
+            axes.column(1).cross(&r),
+            axes.column(2).cross(&r),
+        ]);
+        let turning = (motion.ned_from_body * motion.rate).coords;
+        let attitude = self.config.attitude_noise_rad.powi(2);
+        let position = self.config.position_noise_m.powi(2);
+        let noise = axes * in_body * axes.transpose()
+            + tilt * tilt.transpose() * attitude
+            + Matrix3::identity() * position;
+        Sight {
+            stamp,
+            place: motion.way.coords.coords + r,
+            noise,
+            tilt,
+            slip: -motion.velocity.coords - turning.cross(&r),
+        }
+    }
+
+    /// Puts a detection where it belongs in time, and fuses those after it again.
+    fn fuse(&mut self, sight: Sight) -> Result<(), Rejection> {
+        let newest = self.past.back().map(|fused| fused.sight.stamp);
+        let forgotten = newest.is_some_and(|newest| {
+            sight.stamp.seconds_since(newest) > self.config.forget_after_s
+        });
+        if newest.is_none() || forgotten {
+            self.begin(sight);
+            return Ok(());
+        }
+        let place = self.past.partition_point(|fused| fused.sight.stamp < sight.stamp);
+        if self.past.get(place).is_some_and(|fused| fused.sight.stamp == sight.stamp) {
+            return Err(Rejection::Duplicate);
+        }
+        let Some(before) = place.checked_sub(1).and_then(|index| self.past.get(index)) else {
+            return Err(Rejection::Stale);
+        };
+        let mut belief = before.belief.clone();
+        belief.pass(&self.config, sight.stamp.seconds_since(before.sight.stamp));
+        let nis = belief.nis(&sight);
+        self.nis = Some(nis);
+        if nis > self.config.gate {
+            return self.rival(sight);
+        }
+        self.rival = None;
+        belief.update(&self.config, &sight);
+        self.detections = self.detections.saturating_add(1);
+        if self.past.len() == MEMORY {
+            self.past.pop_front();
+        }
+        let place = self.past.partition_point(|fused| fused.sight.stamp < sight.stamp);
+        self.past.insert(place, Fused { sight, belief });
+        self.fuse_again(place + 1);
+        Ok(())
+    }
+
+    fn fuse_again(&mut self, from: usize) {
+        for index in from..self.past.len() {
+            let Some(before) = index.checked_sub(1).and_then(|before| self.past.get(before)) else {
+                return;
+            };
+            let (mut belief, stamp) = (before.belief.clone(), before.sight.stamp);
+            if let Some(fused) = self.past.get_mut(index) {
+                belief.pass(&self.config, fused.sight.stamp.seconds_since(stamp));
+                belief.update(&self.config, &fused.sight);
+                fused.belief = belief;
+            }
+        }
+    }
+
+    fn begin(&mut self, sight: Sight) {
+        let mut belief = Belief::new(&self.config, sight.place);
+        belief.update(&self.config, &sight);
+        self.past.clear();
+        self.past.push_back(Fused { sight, belief });
+        self.detections = 1;
+        self.heading = None;
+        self.rival = None;
+    }
+
+    /// Outliers that agree become the estimate once there are enough of them over a long enough time; an estimate that
+    /// was itself hardly begun gives way at once.
+    fn rival(&mut self, sight: Sight) -> Result<(), Rejection> {
+        let agrees = |rival: &Rival| {
+            let gap_s = sight.stamp.seconds_since(rival.newest.stamp);
+            let reach_m = RIVAL_GATE_M
+                + 3.0 * (sight.noise.trace() + rival.newest.noise.trace()).sqrt()
+                + self.config.pad_speed_m_s * gap_s.max(0.0);
+            (0.0..1.0).contains(&gap_s) && (sight.place - rival.newest.place).norm() <= reach_m
+        };
+        let rival = match self.rival.filter(agrees) {
+            Some(rival) => {
+                Rival { newest: sight, detections: rival.detections.saturating_add(1), ..rival }
+            }
+            None => Rival { newest: sight, since: sight.stamp, detections: 1 },
+        };
+        self.rival = Some(rival);
+        let lasted_s = sight.stamp.seconds_since(rival.since);
+        let young = self.detections < self.config.restart_after;
+        let enough = rival.detections >= self.config.restart_after;
+        if enough && (young || lasted_s >= self.config.restart_s) {
+            self.begin(sight);
+            return Ok(());
+        }
+        Err(Rejection::Outlier)
+    }
+
+    /// Largest horizontal deviation so long after the newest detection, in metres.
+    fn deviation_m(&self, belief: &Belief, ahead_s: f64) -> f64 {
+        let p = &belief.covariance;
+        let block = |row: usize, column: usize| p.fixed_view::<2, 2>(row, column).into_owned();
+        let cross: Matrix2<f64> = block(Q, U);
+        let grown = block(Q, Q)
+            + (cross + cross.transpose()) * ahead_s
+            + block(U, U) * ahead_s.powi(2)
+            + Matrix2::identity() * (self.config.way_noise_m.powi(2) * ahead_s)
+            + Matrix2::identity() * (self.config.pad_acceleration.powi(2) * ahead_s.powi(3) / 3.0);
+        let (mean, half) = (0.5 * (grown.m11 + grown.m22), 0.5 * (grown.m11 - grown.m22));
+        (mean + half.hypot(grown.m12)).max(0.0).sqrt()
+    }
+
+    /// The pad's heading is that of the marker's upper edge, averaged.
+    fn turn_towards(&mut self, ned_from_marker: Rotation<Ned, Marker>) {
+        let up = ned_from_marker * Vector::<Marker>::new(0.0, 1.0, 0.0);
+        let length = up.horizontal_norm();
+        if length < 0.1 {
+            return;
+        }
+        let seen = [up.x() / length, up.y() / length];
+        let share = self.config.heading_share;
+        self.heading = Some(match self.heading {
+            Some([north, east]) => {
+                [north + (seen[0] - north) * share, east + (seen[1] - east) * share]
+            }
+            None => seen,
+        });
+    }
+}
+
+/// Of two solutions of a flat marker's pose the one whose face looks up; when both do, their mean with what they differ by.
+fn resolved(
+    motion: &Motion,
+    pose: Transform<Body, Marker>,
+    alternative: Option<Transform<Body, Marker>>,
+) -> (Vector<Body>, Matrix3<f64>) {
+    let first = pose.origin() - Point::origin();
+    let Some(other) = alternative else { return (first, Matrix3::zeros()) };
+    let leaning = |pose: Transform<Body, Marker>| {
+        let face = motion.ned_from_body * (pose.rotation() * Vector::<Marker>::new(0.0, 0.0, 1.0));
+        (-face.z()).clamp(-1.0, 1.0).acos()
+    };
+    let second = other.origin() - Point::origin();
+    let preference = leaning(other) - leaning(pose);
+    if preference > UNDECIDED_RAD {
+        (first, Matrix3::zeros())
+    } else if preference < -UNDECIDED_RAD {
+        (second, Matrix3::zeros())
+    } else {
+        let half = (second - first) * 0.5;
+        (first + half, half.coords * half.coords.transpose())
+    }
+}
+
+impl Belief {
+    fn new(config: &EstimatorConfig, place: Vector3<f64>) -> Self {
+        let mut state = State::zeros();
+        state.fixed_rows_mut::<3>(Q).copy_from(&place);
+        let level = config.drift_m_s.hypot(config.pad_speed_m_s);
+        let deviations = [
+            UNKNOWN_M,
+            UNKNOWN_M,
+            UNKNOWN_M,
+            level,
+            level,
+            config.height_drift_m_s.hypot(config.pad_heave_m_s),
+            config.mount_error_rad,
+            config.mount_error_rad,
+            config.heading_error_rad,
+            config.time_offset_s,
+        ];
+        let mut covariance = Covariance::zeros();
+        for (i, deviation) in deviations.into_iter().enumerate() {
+            covariance[(i, i)] = deviation * deviation;
+        }
+        Self { state, covariance }
+    }
+
+    fn place(&self) -> Vector3<f64> {
+        self.state.fixed_rows::<3>(Q).into_owned()
+    }
+
+    fn velocity(&self) -> Vector3<f64> {
+        self.state.fixed_rows::<3>(U).into_owned()
+    }
+
+    /// Lets time pass.
+    fn pass(&mut self, config: &EstimatorConfig, dt_s: f64) {
+        let velocity = self.velocity();
+        let p = &mut self.covariance;
+        for i in 0..3 {
+            self.state[Q + i] += velocity[i] * dt_s;
+            // P <- F P F^T, where F adds dt times row and column U to Q.
+            for j in 0..STATES {
+                p[(Q + i, j)] += dt_s * p[(U + i, j)];
+            }
+        }
+        for i in 0..3 {
+            for j in 0..STATES {
+                p[(j, Q + i)] += dt_s * p[(j, U + i)];
+            }
+        }
+        let level = config.drift_change.hypot(config.pad_acceleration);
+        let upright = config.height_drift_change.hypot(config.pad_acceleration);
+        for (i, u) in [level, level, upright].into_iter().enumerate() {
+            let (u, q) = (u * u, config.way_noise_m.powi(2));
+            p[(Q + i, Q + i)] += q * dt_s + u * dt_s.powi(3) / 3.0;
+            p[(Q + i, U + i)] += u * dt_s.powi(2) / 2.0;
+            p[(U + i, Q + i)] += u * dt_s.powi(2) / 2.0;
+            p[(U + i, U + i)] += u * dt_s;
+        }
+        for i in 0..3 {
+            p[(TILT + i, TILT + i)] += config.tilt_change.powi(2) * dt_s;
+        }
+        p[(OFFSET, OFFSET)] += (0.02 * config.time_offset_s).powi(2) * dt_s;
+    }
+
+    /// How the detection depends on the state.
+    fn sensitivity(&self, sight: &Sight) -> SMatrix<f64, 3, STATES> {
+        let mut h = SMatrix::<f64, 3, STATES>::zeros();
+        let offset_s = self.state[OFFSET];
+        for i in 0..3 {
+            h[(i, Q + i)] = 1.0;
+            h[(i, U + i)] = offset_s;
+        }
+        h.fixed_view_mut::<3, 3>(0, TILT).copy_from(&sight.tilt);
+        h.fixed_view_mut::<3, 1>(0, OFFSET).copy_from(&(sight.slip + self.velocity()));
+        h
+    }
+
+    fn innovation(&self, sight: &Sight) -> Vector3<f64> {
+        let tilt = self.state.fixed_rows::<3>(TILT).into_owned();
+        let slip = sight.slip + self.velocity();
+        sight.place - self.place() - sight.tilt * tilt - slip * self.state[OFFSET]
+    }
+
+    /// The innovation squared over its covariance: chi-square with 3 degrees of freedom.
+    fn nis(&self, sight: &Sight) -> f64 {
+        let h = self.sensitivity(sight);
+        let s = h * self.covariance * h.transpose() + sight.noise;
+        let innovation = self.innovation(sight);
+        s.try_inverse().map_or(f64::INFINITY, |inverse| innovation.dot(&(inverse * innovation)))
+    }
+
+    fn update(&mut self, config: &EstimatorConfig, sight: &Sight) {
+        let h = self.sensitivity(sight);
+        let ph = self.covariance * h.transpose();
+        let Some(inverse) = (h * ph + sight.noise).try_inverse() else { return };
+        let gain = ph * inverse;
+        self.state += gain * self.innovation(sight);
+        let less = gain * ph.transpose();
+        let p = self.covariance - (less + less.transpose()) * 0.5;
+        self.covariance = (p + p.transpose()) * 0.5;
+        let most_s = 3.0 * config.time_offset_s;
+        self.state[OFFSET] = self.state[OFFSET].clamp(-most_s, most_s);
+    }
+}
