@@ -111,6 +111,8 @@ named! {
         Aligning = "aligning", "moving over the marker before descending";
         /// All is well.
         Descending = "descending", "descending over the marker";
+        /// The marker left the view low over it, and the estimate is good.
+        DescendingUnseen = "descending-unseen", "descending on the estimate, the marker is out of view";
         /// No recent detection: the descent stops until there is one.
         TargetAging = "target-aging", "no recent detection, descent stopped";
         /// Low over the marker, waiting for a small error and a small speed.

@@ -17,6 +17,9 @@ use crate::time::Timestamp;
 /// Positions and velocities beyond this are no flight of ours, in m and m/s.
 const FARTHEST: f64 = 1e6;
 
+/// For so long the guidance flies on while LAND is awaited, in seconds.
+const HAND_OVER_S: f64 = 1.0;
+
 /// One landing after the other: told what happens, it answers what to do.
 #[derive(Clone, Debug)]
 pub struct Lander {
@@ -29,6 +32,8 @@ pub struct Lander {
     guide: Guide,
     machine: Machine,
     land_asked: Option<Timestamp>,
+    /// Smallest angle from the middle of the camera's image to its edge, in radians.
+    half_view_rad: Option<f64>,
     /// Direction of the first leg of the search under way, in radians.
     first_leg_rad: Option<f64>,
 }
@@ -66,6 +71,7 @@ impl Lander {
             guide: Guide::new(config.guidance),
             machine: Machine::new(config.phases),
             land_asked: None,
+            half_view_rad: None,
             first_leg_rad: None,
         })
     }
@@ -135,6 +141,9 @@ impl Lander {
             return frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
         }
         self.newest_frame = Some(frame.stamp);
+        let short_px = f64::from(frame.image_size.0.min(frame.image_size.1));
+        let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0);
+        self.half_view_rad = focal_px.map(|focal_px| (0.5 * short_px / focal_px).atan());
         let seen = frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
         self.tell_guide(frame, seen.is_ok());
         seen
@@ -191,20 +200,35 @@ impl Lander {
         }
     }
 
+    fn situation<'a>(&self, now: Timestamp, vehicle: &'a VehicleState) -> Situation<'a> {
+        Situation {
+            now,
+            vehicle,
+            target: self.target(now),
+            age_s: self.sightings.age_s(now),
+            half_view_rad: self.half_view_rad,
+            phases: self.config.phases,
+        }
+    }
+
     fn progress(&mut self, now: Timestamp) -> Progress {
         if !matches!(self.machine.phase(), Phase::Approach | Phase::Descend) {
             return Progress::Unchanged;
         }
         let Some(vehicle) = self.history.newest().copied() else { return Progress::Unchanged };
-        let target = self.target(now);
-        self.guide.progress(&situation(&self.config, now, &vehicle, target, self.sightings))
+        let situation = self.situation(now, &vehicle);
+        self.guide.progress(&situation)
     }
 
     /// What the present phase does.
     fn act(&mut self, now: Timestamp) -> (Action, Reason) {
         let why = self.machine.why();
         let guided = matches!(self.machine.phase(), Phase::Approach | Phase::Descend);
-        if !guided {
+        let handing_over = self.machine.phase() == Phase::Final
+            && !self.machine.is_landing()
+            && self.guide.flies_until_land()
+            && self.machine.elapsed_s(now) <= HAND_OVER_S;
+        if !guided && !handing_over {
             self.guide.rest();
         }
         if self.machine.phase() != Phase::Search {
@@ -217,6 +241,7 @@ impl Lander {
             Phase::Approach | Phase::Descend => self.guided(now),
             Phase::Hold => (self.hold(now), why),
             Phase::Final if self.machine.is_landing() => (Action::None, why),
+            Phase::Final if handing_over && !self.asks_for_land(now) => (self.guided(now).0, why),
             Phase::Final => (self.ask_for_land(now), why),
             Phase::Aborted => (self.aborted(now), why),
         }
@@ -226,10 +251,10 @@ impl Lander {
         let Some(vehicle) = self.history.newest().copied() else {
             return (Action::hover(), Reason::VehicleStale);
         };
-        let target = self.target(now);
-        let situation = situation(&self.config, now, &vehicle, target, self.sightings);
+        let situation = self.situation(now, &vehicle);
         let (wanted, why) = self.guide.velocity(&situation);
-        let velocity = envelope::admit(&self.config.envelope, wanted, situation.may_descend());
+        let may_descend = self.guide.may_descend(&situation);
+        let velocity = envelope::admit(&self.config.envelope, wanted, may_descend);
         (Action::Velocity { velocity, yaw_rate: 0.0 }, why)
     }
 
@@ -270,13 +295,17 @@ impl Lander {
 
     /// Asks for LAND at once and at intervals, and hovers in between.
     fn ask_for_land(&mut self, now: Timestamp) -> Action {
-        let first = self.machine.elapsed_s(now) <= 0.0;
-        let again = |asked: Timestamp| now.seconds_since(asked) >= self.config.phases.land_retry_s;
-        if first || self.land_asked.is_none_or(again) {
+        if self.asks_for_land(now) {
             self.land_asked = Some(now);
             return Action::Land;
         }
         Action::hover()
+    }
+
+    fn asks_for_land(&self, now: Timestamp) -> bool {
+        let first = self.machine.elapsed_s(now) <= 0.0;
+        let again = |asked: Timestamp| now.seconds_since(asked) >= self.config.phases.land_retry_s;
+        first || self.land_asked.is_none_or(again)
     }
 
     fn aborted(&mut self, now: Timestamp) -> Action {
@@ -345,14 +374,4 @@ fn facts_of(state: &VehicleState, now: Timestamp) -> VehicleFacts {
         landed: state.landed,
         altitude_m: -state.position.z(),
     }
-}
-
-fn situation<'a>(
-    config: &'a Config,
-    now: Timestamp,
-    vehicle: &'a VehicleState,
-    target: Option<TargetEstimate>,
-    sightings: Sightings,
-) -> Situation<'a> {
-    Situation { now, vehicle, target, age_s: sightings.age_s(now), phases: &config.phases }
 }

@@ -300,6 +300,7 @@ impl Machine {
     fn after_approach(&self, facts: &Facts) -> Option<(Phase, Reason)> {
         match facts.progress {
             Progress::Ready(why) => Some((Phase::Final, why)),
+            Progress::Blind => Some((Phase::Descend, Reason::DescendingUnseen)),
             _ if self.lost(facts) => Some((Phase::Hold, Reason::TargetLost)),
             Progress::Descending => Some((Phase::Descend, Reason::Descending)),
             Progress::Aligning | Progress::Unchanged => self
@@ -311,9 +312,11 @@ impl Machine {
     fn after_descend(&self, facts: &Facts) -> Option<(Phase, Reason)> {
         match facts.progress {
             Progress::Ready(why) => Some((Phase::Final, why)),
-            _ if self.lost(facts) => Some((Phase::Hold, Reason::TargetLost)),
+            Progress::Descending | Progress::Aligning | Progress::Unchanged if self.lost(facts) => {
+                Some((Phase::Hold, Reason::TargetLost))
+            }
             Progress::Aligning => Some((Phase::Approach, Reason::Aligning)),
-            Progress::Descending | Progress::Unchanged => self
+            Progress::Descending | Progress::Blind | Progress::Unchanged => self
                 .over(facts, self.config.descend_timeout_s)
                 .then_some((Phase::Hold, Reason::NoProgress)),
         }

@@ -1,17 +1,24 @@
 //! Our guidance: from the target's position in metres to a velocity.
 //!
-//! Laterally: a speed in proportion to the error that will be left when a setpoint shows (a velocity setpoint of
-//! 1 m/s takes 0.27 s until anything moves and 0.43 s more to two thirds of it), bounded by the speed from which
-//! the vehicle can still brake before the target, and by the acceleration that keeps the camera from tilting the
-//! marker out of view. A slow integral counters the autopilot's biased velocity, which is 2 to 3 cm/s.
+//! Laterally: a wanted closing speed in proportion to the error that will be left when a setpoint shows, bounded by the
+//! speed from which the vehicle can still brake before the target. What is sent is not that speed but the setpoint that makes the
+//! autopilot accelerate as needed to reach it. An autopilot smooths a velocity setpoint: ArduPilot's path goes towards it
+//! with a time constant of acceleration limit over jerk limit, 0.5 s, and the vehicle follows the path. So the path's
+//! velocity is computed here too (it depends on nothing but the setpoints sent), and the setpoint is that velocity plus
+//! the time constant times the wanted acceleration. Wind that pushes the vehicle off its path is so seen and countered at
+//! once, and what stays is summed up in the path's velocity: there is nothing else that could wind up.
 //!
-//! Vertically: a funnel. Inside it the vehicle descends, fastest on the axis and not at all at the edge, more slowly near the
-//! ground, and more slowly the older the newest detection is.
+//! The reported velocity is biased by 2 to 3 cm/s; the bias is what an observer finds left over between it and
+//! the way really covered.
 //!
-//! The end: low over the target, with a small error and a small speed, the autopilot's LAND mode takes over. LAND
-//! holds the place where the vehicle comes to rest, so the error that counts is the one after coasting.
+//! Vertically: a funnel. Inside it the vehicle descends, as fast as it can still brake, fastest on the axis and not at all
+//! at the edge. A vehicle that leans into the wind looks past the target; above `view_height_m` it stays so far upwind
+//! that the marker remains in view.
+//!
+//! The end: below `blind_height_m` the vehicle goes on down on the estimate when the marker leaves the view. LAND follows no target
+//! and in gusts drifts by a decimetre in a second, so it takes over only a hand's breadth above the ground.
 
-use geometry::{Ned, Vector};
+use geometry::{Body, Ned, Vector};
 use serde::Deserialize;
 
 use crate::config::{ConfigError, check};
@@ -23,71 +30,94 @@ use crate::time::Timestamp;
 #[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MetricConfig {
-    /// Lateral speed per metre of predicted error, in 1/s (0.1 to 3).
+    /// Closing speed per metre of predicted error, in 1/s (0.1 to 3).
     pub lateral_gain: f64,
-    /// Largest lateral speed, in m/s (0.1 to 5).
+    /// Acceleration per difference between wanted and real closing speed, in 1/s (0.2 to 6).
+    pub velocity_gain: f64,
+    /// Largest closing speed, in m/s (0.1 to 5).
     pub max_lateral_m_s: f64,
-    /// Largest change of the lateral setpoint, in m/s^2; tilts the camera (0.1 to 2.5).
+    /// Largest lateral acceleration, in m/s^2; tilts the camera (0.1 to 2.5).
     pub lateral_acceleration_m_s2: f64,
-    /// Time from a setpoint to the first motion, in s (0 to 1).
+    /// Time from a detection's arrival to the motion that answers it, in s (0 to 1).
     pub dead_time_s: f64,
-    /// Time constant with which the velocity then follows, in s (0 to 1).
-    pub lag_s: f64,
+    /// Time constant with which the autopilot's path goes towards a setpoint, in s (0.05 to 2): ArduPilot's WPNAV_ACCEL
+    /// over PSC_JERK_XY.
+    pub path_time_s: f64,
     /// Largest speed of descent, in m/s (0.1 to 3).
     pub max_descend_m_s: f64,
-    /// Speed of descent at the hand-over to LAND, in m/s (0.05 to 1).
-    pub final_descend_m_s: f64,
-    /// Speed of descent gained per metre above the hand-over, in 1/s (0.1 to 2).
-    pub descend_gain: f64,
-    /// Largest change of the descent's setpoint, in m/s^2 (0.1 to 2.5).
+    /// Speed of descent at the ground, in m/s (0.1 to 1).
+    pub touch_descend_m_s: f64,
+    /// Braking on the way down, in m/s^2 (0.1 to 2.5).
+    pub descend_braking_m_s2: f64,
+    /// Time from a setpoint of descent to its speed, in s (0 to 2).
+    pub descend_lag_s: f64,
+    /// Largest growth of the descent's setpoint, in m/s^2 (0.1 to 5).
     pub descend_acceleration_m_s2: f64,
-    /// Radius of the funnel at the hand-over to LAND, in m; at its edge the descent stops (0.02 to 5).
+    /// Radius of the funnel at the ground, in m; at its edge the descent stops (0.02 to 5).
     pub funnel_m: f64,
-    /// What the funnel's radius grows by per metre above the hand-over (0 to 2).
+    /// What the funnel's radius grows by per metre of height (0 to 2).
     pub funnel_per_height: f64,
     /// Age of the target up to which the descent is not slowed, in s (0 to 5).
     pub fresh_target_s: f64,
-    /// Height over the target at which LAND takes over, in m (0.1 to 5).
+    /// Height over the target at which LAND takes over, in m (0.02 to 5).
     pub land_height_m: f64,
-    /// Largest lateral error predicted for the touchdown at the hand-over, in m (0.01 to 1).
-    pub land_error_m: f64,
-    /// Largest lateral speed at the hand-over, in m/s (0.02 to 1).
-    pub land_speed_m_s: f64,
-    /// For how long lateral speed goes on in LAND, in s (0 to 2).
-    pub coast_s: f64,
-    /// Over this time of settling the hand-over's limits widen to `blind_error_m`, in s (0.1 to 60).
+    /// Height of the body's origin over the pad when the vehicle stands on it, in m (-1 to 2).
+    pub standing_height_m: f64,
+    /// Over this time of waiting near the ground the funnel widens to `blind_error_m`, in s (0.1 to 60).
     pub settle_s: f64,
-    /// Largest lateral error at which the vehicle lands on although the marker left the view, in m (0.01 to 1).
+    /// Largest lateral error with which the vehicle lands although it waited in vain or the marker left the view, in m
+    /// (0.01 to 1).
     pub blind_error_m: f64,
-    /// Time constant of the observer of the drift that the autopilot's velocity does not show, in s (0.2 to 60).
+    /// Height over the target below which the descent goes on without the marker, in m (0 to 10).
+    pub blind_height_m: f64,
+    /// For how long it does, in s (0 to 20).
+    pub blind_s: f64,
+    /// Largest deviation of the estimate with which it does, in m (0.005 to 1).
+    pub blind_deviation_m: f64,
+    /// Height down to which the marker is kept in view by staying upwind, in m (0.2 to 50).
+    pub view_height_m: f64,
+    /// Free rim that is left around the marker's centre in the image: in m for the marker's size (0 to 2),
+    pub view_margin_m: f64,
+    /// and in rad for what the vehicle sways (0 to 0.5).
+    pub view_margin_rad: f64,
+    /// Time constant of the observer of the bias of the autopilot's velocity, in s (0.2 to 60).
     pub drift_time_s: f64,
-    /// Largest drift countered, in m/s; 0 turns the observer off (0 to 1).
+    /// Largest bias believed, in m/s; 0 turns the observer off (0 to 1).
     pub max_drift_m_s: f64,
+    /// Fastest pad that is followed, in m/s (0 to 10).
+    pub max_pad_m_s: f64,
 }
 
 impl Default for MetricConfig {
     fn default() -> Self {
         Self {
-            lateral_gain: 1.1,
-            max_lateral_m_s: 1.5,
-            lateral_acceleration_m_s2: 1.0,
+            lateral_gain: 1.2,
+            velocity_gain: 2.0,
+            max_lateral_m_s: 2.0,
+            lateral_acceleration_m_s2: 1.5,
             dead_time_s: 0.25,
-            lag_s: 0.43,
-            max_descend_m_s: 1.8,
-            final_descend_m_s: 0.25,
-            descend_gain: 0.5,
-            descend_acceleration_m_s2: 1.5,
-            funnel_m: 0.06,
+            path_time_s: 0.5,
+            max_descend_m_s: 2.0,
+            touch_descend_m_s: 0.4,
+            descend_braking_m_s2: 0.7,
+            descend_lag_s: 0.45,
+            descend_acceleration_m_s2: 2.0,
+            funnel_m: 0.08,
             funnel_per_height: 0.25,
             fresh_target_s: 0.3,
-            land_height_m: 0.4,
-            land_error_m: 0.05,
-            land_speed_m_s: 0.1,
-            coast_s: 0.6,
+            land_height_m: 0.12,
+            standing_height_m: 0.0,
             settle_s: 5.0,
             blind_error_m: 0.15,
-            drift_time_s: 1.0,
+            blind_height_m: 2.2,
+            blind_s: 6.0,
+            blind_deviation_m: 0.06,
+            view_height_m: 1.0,
+            view_margin_m: 0.11,
+            view_margin_rad: 0.03,
+            drift_time_s: 1.5,
             max_drift_m_s: 0.1,
+            max_pad_m_s: 5.0,
         }
     }
 }
@@ -95,30 +125,34 @@ impl Default for MetricConfig {
 impl MetricConfig {
     pub(crate) fn validate(&self) -> Result<(), ConfigError> {
         check("metric.lateral_gain", self.lateral_gain, 0.1, 3.0)?;
+        check("metric.velocity_gain", self.velocity_gain, 0.2, 6.0)?;
         check("metric.max_lateral_m_s", self.max_lateral_m_s, 0.1, 5.0)?;
         check("metric.lateral_acceleration_m_s2", self.lateral_acceleration_m_s2, 0.1, 2.5)?;
         check("metric.dead_time_s", self.dead_time_s, 0.0, 1.0)?;
-        check("metric.lag_s", self.lag_s, 0.0, 1.0)?;
+        check("metric.path_time_s", self.path_time_s, 0.05, 2.0)?;
         check("metric.max_descend_m_s", self.max_descend_m_s, 0.1, 3.0)?;
-        check("metric.final_descend_m_s", self.final_descend_m_s, 0.05, 1.0)?;
-        check("metric.descend_gain", self.descend_gain, 0.1, 2.0)?;
-        check("metric.descend_acceleration_m_s2", self.descend_acceleration_m_s2, 0.1, 2.5)?;
+        check("metric.touch_descend_m_s", self.touch_descend_m_s, 0.1, 1.0)?;
+        check("metric.descend_braking_m_s2", self.descend_braking_m_s2, 0.1, 2.5)?;
+        check("metric.descend_lag_s", self.descend_lag_s, 0.0, 2.0)?;
+        check("metric.descend_acceleration_m_s2", self.descend_acceleration_m_s2, 0.1, 5.0)?;
         check("metric.funnel_m", self.funnel_m, 0.02, 5.0)?;
         check("metric.funnel_per_height", self.funnel_per_height, 0.0, 2.0)?;
         check("metric.fresh_target_s", self.fresh_target_s, 0.0, 5.0)?;
-        check("metric.land_height_m", self.land_height_m, 0.1, 5.0)?;
-        check("metric.land_error_m", self.land_error_m, 0.01, 1.0)?;
-        check("metric.land_speed_m_s", self.land_speed_m_s, 0.02, 1.0)?;
-        check("metric.coast_s", self.coast_s, 0.0, 2.0)?;
+        check("metric.land_height_m", self.land_height_m, 0.02, 5.0)?;
+        check("metric.standing_height_m", self.standing_height_m, -1.0, 2.0)?;
         check("metric.settle_s", self.settle_s, 0.1, 60.0)?;
         check("metric.blind_error_m", self.blind_error_m, 0.01, 1.0)?;
+        check("metric.blind_height_m", self.blind_height_m, 0.0, 10.0)?;
+        check("metric.blind_s", self.blind_s, 0.0, 20.0)?;
+        check("metric.blind_deviation_m", self.blind_deviation_m, 0.005, 1.0)?;
+        check("metric.view_height_m", self.view_height_m, 0.2, 50.0)?;
+        check("metric.view_margin_m", self.view_margin_m, 0.0, 2.0)?;
+        check("metric.view_margin_rad", self.view_margin_rad, 0.0, 0.5)?;
         check("metric.drift_time_s", self.drift_time_s, 0.2, 60.0)?;
-        check("metric.max_drift_m_s", self.max_drift_m_s, 0.0, 1.0)
+        check("metric.max_drift_m_s", self.max_drift_m_s, 0.0, 1.0)?;
+        check("metric.max_pad_m_s", self.max_pad_m_s, 0.0, 10.0)
     }
 }
-
-/// The height band above the hand-over in which the vehicle counts as arrived, in metres.
-const ARRIVED_M: f64 = 0.03;
 
 /// Outside this multiple of the funnel's radius a descent becomes an approach again.
 const FUNNEL_HYSTERESIS: f64 = 1.2;
@@ -126,195 +160,316 @@ const FUNNEL_HYSTERESIS: f64 = 1.2;
 /// Part of the lateral acceleration that braking before the target counts on.
 const BRAKING: f64 = 0.7;
 
+/// Below this height the vehicle waits for a small error, in metres.
+const LOW_M: f64 = 0.5;
+
+/// A vehicle asked to descend this fast that stands still for so long is on the ground, in m/s and seconds.
+const PUSHING_M_S: f64 = 0.15;
+const STANDING_S: f64 = 0.4;
+
+/// Time constant of the lean that is taken for the wind's, in seconds.
+const LEAN_S: f64 = 1.0;
+
 /// Steps are taken as if no longer than this apart, in seconds.
 const LONGEST_STEP_S: f64 = 0.1;
 
 /// An observed error further than this from the expected one is a jump of the estimate, not drift, in metres.
 const JUMP_M: f64 = 0.3;
 
-/// Our guidance with its memory: the last setpoint, the drift, and since when the vehicle settles.
+/// Our guidance with its memory.
 #[derive(Clone, Debug)]
 pub struct Metric {
     config: MetricConfig,
-    last: Option<(Timestamp, Vector<Ned>)>,
-    drift: Option<Drift>,
-    settling_since: Option<Timestamp>,
+    memory: Option<Memory>,
+    waiting_since: Option<Timestamp>,
+    standing_since: Option<Timestamp>,
 }
 
-/// What moves the vehicle although the autopilot's velocity does not show it.
+/// What builds up while guiding.
 #[derive(Copy, Clone, Debug)]
-struct Drift {
-    /// The lateral error expected now.
+struct Memory {
+    stamp: Timestamp,
+    /// The newest setpoint, in m/s.
+    setpoint: Vector<Ned>,
+    /// The horizontal velocity of the autopilot's path, in m/s.
+    path: Vector<Ned>,
+    /// The lateral error expected now, in metres.
     expected: Vector<Ned>,
-    velocity: Vector<Ned>,
+    /// Real minus reported velocity, in m/s.
+    bias: Vector<Ned>,
+    /// How far ahead of the vehicle the body's down axis points, as a part of the height.
+    lean: Vector<Ned>,
 }
 
 impl Metric {
     /// A guidance without memory.
     pub fn new(config: MetricConfig) -> Self {
-        Self { config, last: None, drift: None, settling_since: None }
+        Self { config, memory: None, waiting_since: None, standing_since: None }
     }
 
     /// Forgets what builds up while guiding.
     pub fn rest(&mut self) {
-        self.last = None;
-        self.drift = None;
-        self.settling_since = None;
+        self.memory = None;
+        self.waiting_since = None;
+        self.standing_since = None;
+    }
+
+    /// True when the vehicle may go down: the target is recent, or low below and well known.
+    pub fn may_descend(&self, situation: &Situation<'_>) -> bool {
+        self.sees(situation) || self.is_blind_but_sure(situation)
+    }
+
+    fn sees(&self, situation: &Situation<'_>) -> bool {
+        situation.age_s <= situation.phases.stale_target_s
+    }
+
+    fn is_blind_but_sure(&self, situation: &Situation<'_>) -> bool {
+        situation.target.is_some_and(|target| {
+            self.height_m(&target) <= self.config.blind_height_m
+                && situation.age_s <= situation.phases.stale_target_s + self.config.blind_s
+                && target.deviation_m <= self.config.blind_deviation_m
+        })
     }
 
     /// Where the vehicle is in its funnel.
     pub fn progress(&mut self, situation: &Situation<'_>) -> Progress {
         let Some(target) = situation.target else { return Progress::Unchanged };
-        if !situation.may_descend() {
-            return self.unseen(situation, &target);
+        if !self.may_descend(situation) {
+            return Progress::Unchanged;
         }
-        if target.height_m <= self.config.land_height_m + ARRIVED_M {
-            let since = *self.settling_since.get_or_insert(situation.now);
-            let patience = situation.now.seconds_since(since) / self.config.settle_s;
-            return if self.settled(situation, &target, patience) {
-                Progress::Ready(Reason::LowAndAligned)
-            } else {
-                Progress::Descending
-            };
+        if self.stands(situation, &target) {
+            return Progress::Ready(Reason::TouchedEarly);
         }
-        self.settling_since = None;
-        let outside = self.error(situation, &target, 0.0).norm() / self.funnel_m(target.height_m);
-        if outside < 1.0 {
-            Progress::Descending
-        } else if outside > FUNNEL_HYSTERESIS {
-            Progress::Aligning
-        } else {
-            Progress::Unchanged
+        let seen = self.sees(situation);
+        let height_m = self.height_m(&target);
+        let outside = self.outside(situation, &target);
+        if height_m <= self.config.land_height_m && outside < 1.0 {
+            return Progress::Ready(if seen { Reason::LowAndAligned } else { Reason::LowAndUnseen });
+        }
+        match (seen, outside) {
+            (true, outside) if outside < 1.0 => Progress::Descending,
+            (true, outside) if outside > FUNNEL_HYSTERESIS && height_m > LOW_M => Progress::Aligning,
+            (true, _) => Progress::Unchanged,
+            (false, _) => Progress::Blind,
         }
     }
 
     /// The velocity wanted now, and what it does.
     pub fn velocity(&mut self, situation: &Situation<'_>) -> (Vector<Ned>, Reason) {
         let Some(target) = situation.target else { return (Vector::zero(), Reason::Searching) };
-        let (before, last) = self.last.unwrap_or((situation.now, situation.vehicle.velocity));
-        let step_s = situation.now.seconds_since(before).clamp(0.0, LONGEST_STEP_S);
-        self.observe_drift(situation, &target, step_s);
-        let lateral = self.lateral(situation, &target, last);
+        let before = self.memory.unwrap_or_else(|| self.begin(situation, &target));
+        let step_s = situation.now.seconds_since(before.stamp).clamp(0.0, LONGEST_STEP_S);
+        let mut memory = self.observed(before, situation, &target, step_s);
+        self.memory = Some(memory);
+        let lateral = self.lateral(&memory, situation, &target);
         let (descent_m_s, why) = self.descent(situation, &target);
-        let down =
-            approach_speed(last.z(), descent_m_s, self.config.descend_acceleration_m_s2 * step_s);
-        let change = lateral - Vector::new(last.x(), last.y(), 0.0);
-        let change = shortened(change, self.config.lateral_acceleration_m_s2 * step_s);
-        let velocity = Vector::new(last.x() + change.x(), last.y() + change.y(), down);
-        if velocity.is_finite() {
-            self.last = Some((situation.now, velocity));
-        } else {
+        let descent_m_s = descent_m_s + level_off(target.velocity.z());
+        let down = approach_speed(
+            before.setpoint.z(),
+            descent_m_s,
+            self.config.descend_acceleration_m_s2 * step_s,
+        );
+        let setpoint = Vector::new(lateral.x(), lateral.y(), down);
+        if !setpoint.is_finite() {
             self.rest();
+            return (setpoint, why);
         }
-        (velocity, why)
+        memory.setpoint = setpoint;
+        self.memory = Some(memory);
+        self.wait(situation, &target);
+        (setpoint, why)
     }
 
-    /// The marker is out of view for too long: near the ground and above the target, landing blindly is
-    /// better than hovering in ground effect until a timeout.
-    fn unseen(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Progress {
-        let low = target.height_m <= situation.phases.low_height_m;
-        let near =
-            self.error(situation, target, self.config.coast_s).norm() <= self.config.blind_error_m;
-        if low && near { Progress::Ready(Reason::LowAndUnseen) } else { Progress::Unchanged }
+    fn begin(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Memory {
+        let velocity = situation.vehicle.velocity;
+        let level = Vector::new(velocity.x(), velocity.y(), 0.0);
+        Memory {
+            stamp: situation.now,
+            setpoint: velocity,
+            path: level,
+            expected: self.way(situation, target),
+            bias: Vector::zero(),
+            lean: lean(situation),
+        }
     }
 
-    /// True when LAND would end close enough; `patience` runs from 0 to 1 and allows up to the blind error.
-    fn settled(&self, situation: &Situation<'_>, target: &TargetEstimate, patience: f64) -> bool {
-        let patience = patience.clamp(0.0, 1.0);
-        let limit_m = self.config.land_error_m
-            + (self.config.blind_error_m - self.config.land_error_m).max(0.0) * patience;
-        self.error(situation, target, self.config.coast_s).norm() <= limit_m
-            && situation.vehicle.velocity.horizontal_norm()
-                <= self.config.land_speed_m_s * (1.0 + patience)
-    }
-
-    /// Horizontal way to the target that will be left in `ahead_s` seconds, at the present velocity.
-    fn error(
+    /// The memory after the time that has passed: the path follows the setpoint, the observers what they see.
+    fn observed(
         &self,
+        mut memory: Memory,
         situation: &Situation<'_>,
         target: &TargetEstimate,
-        ahead_s: f64,
-    ) -> Vector<Ned> {
-        let age_s = situation.now.seconds_since(situation.vehicle.stamp).clamp(0.0, LONGEST_STEP_S);
-        let drift = self.drift.map_or(Vector::zero(), |drift| drift.velocity);
-        let vehicle = situation.vehicle.position + situation.vehicle.velocity * age_s;
-        let way = target.position - vehicle - (situation.vehicle.velocity + drift) * ahead_s;
-        Vector::new(way.x(), way.y(), 0.0)
-    }
-
-    /// A critically damped observer: the error should shrink by the velocity reported; what is left over is drift.
-    fn observe_drift(&mut self, situation: &Situation<'_>, target: &TargetEstimate, step_s: f64) {
-        let error = self.error(situation, target, 0.0);
-        let moved = situation.vehicle.velocity * step_s;
-        let fresh = Drift { expected: error, velocity: Vector::zero() };
-        let mut drift = self.drift.unwrap_or(fresh);
-        let expected =
-            drift.expected - (Vector::new(moved.x(), moved.y(), 0.0) + drift.velocity * step_s);
-        let surprise = error - expected;
+        step_s: f64,
+    ) -> Memory {
+        memory.stamp = situation.now;
+        let ahead = flat(memory.setpoint) - memory.path;
+        let acceleration = shortened(ahead * (1.0 / self.config.path_time_s), 2.5);
+        memory.path = memory.path + acceleration * step_s;
+        memory.lean =
+            memory.lean + (lean(situation) - memory.lean) * (step_s / LEAN_S).min(1.0);
+        let way = self.way(situation, target);
+        let closing = flat(situation.vehicle.velocity) + memory.bias - flat(target.velocity);
+        let expected = memory.expected - closing * step_s;
+        let surprise = way - expected;
         if surprise.norm() > JUMP_M {
-            self.drift = Some(fresh);
-            return;
+            memory.expected = way;
+            return memory;
         }
+        // A critically damped observer.
         let time_s = self.config.drift_time_s;
-        drift.expected = expected + surprise * (2.0 * step_s / time_s).min(1.0);
-        let grown = drift.velocity - surprise * (step_s / time_s.powi(2));
-        drift.velocity = shortened(grown, self.config.max_drift_m_s);
-        self.drift = Some(drift);
+        memory.expected = expected + surprise * (2.0 * step_s / time_s).min(1.0);
+        let bias = memory.bias - surprise * (step_s / time_s.powi(2));
+        memory.bias = shortened(bias, self.config.max_drift_m_s);
+        memory
     }
 
-    fn funnel_m(&self, height_m: f64) -> f64 {
-        let above_m = height_m - self.config.land_height_m;
-        self.config.funnel_m + self.config.funnel_per_height * above_m.max(0.0)
+    /// Horizontal way from the vehicle to the target, in metres.
+    fn way(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Vector<Ned> {
+        let age_s = situation.now.seconds_since(situation.vehicle.stamp).clamp(0.0, LONGEST_STEP_S);
+        let bias = self.memory.map_or(Vector::zero(), |memory| memory.bias);
+        let vehicle =
+            situation.vehicle.position + (flat(situation.vehicle.velocity) + bias) * age_s;
+        flat(target.position - vehicle)
+    }
+
+    /// Horizontal way to the place that is aimed at, in metres: high up, where the wind makes the vehicle lean, that is
+    /// not the target but the nearest place from which the marker is in view.
+    fn error(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Vector<Ned> {
+        self.way(situation, target) - self.upwind(situation, target)
+    }
+
+    fn upwind(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Vector<Ned> {
+        let config = &self.config;
+        let (Some(view_rad), Some(memory)) = (situation.half_view_rad, self.memory) else {
+            return Vector::zero();
+        };
+        let height_m = self.height_m(target);
+        let share = (height_m / config.view_height_m - 1.0).clamp(0.0, 1.0);
+        let seen_m = height_m * (view_rad - config.view_margin_rad).tan() - config.view_margin_m;
+        let axis = memory.lean * height_m;
+        let excess_m = axis.norm() - seen_m.max(0.0);
+        if excess_m <= 0.0 { Vector::zero() } else { axis * (share * excess_m / axis.norm()) }
+    }
+
+    fn height_m(&self, target: &TargetEstimate) -> f64 {
+        target.height_m - self.config.standing_height_m
+    }
+
+    /// The error as a part of the funnel's radius, which near the ground grows with the time spent waiting.
+    fn outside(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
+        let config = &self.config;
+        let height_m = self.height_m(target).max(0.0);
+        let waited_s = self.waiting_since.map_or(0.0, |since| situation.now.seconds_since(since));
+        let patience = (waited_s / config.settle_s).clamp(0.0, 1.0);
+        let widest_m = config.funnel_m.max(config.blind_error_m);
+        let radius_m = config.funnel_m
+            + (widest_m - config.funnel_m) * patience
+            + config.funnel_per_height * height_m;
+        self.error(situation, target).norm() / radius_m
+    }
+
+    /// Notes since when the vehicle is low, and since when it stands although it is to go down.
+    fn wait(&mut self, situation: &Situation<'_>, target: &TargetEstimate) {
+        let height_m = self.height_m(target);
+        if height_m > LOW_M {
+            self.waiting_since = None;
+        } else {
+            self.waiting_since.get_or_insert(situation.now);
+        }
+        let pushed = self.memory.is_some_and(|memory| {
+            memory.setpoint.z() - level_off(target.velocity.z()) >= PUSHING_M_S
+        });
+        let still = situation.vehicle.velocity.z() - target.velocity.z() < 0.3 * PUSHING_M_S;
+        if pushed && still && height_m <= LOW_M {
+            self.standing_since.get_or_insert(situation.now);
+        } else {
+            self.standing_since = None;
+        }
+    }
+
+    fn stands(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
+        self.height_m(target) <= LOW_M
+            && self
+                .standing_since
+                .is_some_and(|since| situation.now.seconds_since(since) >= STANDING_S)
     }
 
     fn lateral(
         &self,
+        memory: &Memory,
         situation: &Situation<'_>,
         target: &TargetEstimate,
-        last: Vector<Ned>,
     ) -> Vector<Ned> {
         let config = &self.config;
-        // What the setpoints already sent will still move the vehicle by.
-        let under_way = Vector::new(last.x(), last.y(), 0.0) * config.dead_time_s;
-        let error = self.error(situation, target, config.lag_s) - under_way;
-        let distance_m = error.norm();
-        let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * distance_m).sqrt();
+        let pad = shortened(flat(target.velocity), config.max_pad_m_s);
+        let closing = flat(situation.vehicle.velocity) + memory.bias - pad;
+        let left = self.error(situation, target) - closing * config.dead_time_s;
+        let left_m = left.norm();
+        let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
         let speed_m_s =
-            (config.lateral_gain * distance_m).min(braking_m_s).min(config.max_lateral_m_s);
-        let towards =
-            if distance_m > 1e-9 { error * (speed_m_s / distance_m) } else { Vector::zero() };
-        towards - self.drift.map_or(Vector::zero(), |drift| drift.velocity)
+            (config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
+        let wanted = if left_m > 1e-9 { left * (speed_m_s / left_m) } else { Vector::zero() };
+        let acceleration = shortened(
+            (wanted - closing) * config.velocity_gain,
+            config.lateral_acceleration_m_s2,
+        );
+        shortened(
+            memory.path + acceleration * config.path_time_s,
+            config.max_lateral_m_s + config.max_pad_m_s,
+        )
     }
 
+    /// Speed towards the pad, and what it does.
     fn descent(&self, situation: &Situation<'_>, target: &TargetEstimate) -> (f64, Reason) {
         let config = &self.config;
-        if !situation.may_descend() {
+        if !self.may_descend(situation) {
             return (0.0, Reason::TargetAging);
         }
-        let above_m = target.height_m - config.land_height_m;
-        if above_m <= 0.0 {
-            return (0.0, Reason::Settling);
-        }
-        let outside = self.error(situation, target, 0.0).norm() / self.funnel_m(target.height_m);
+        let outside = self.outside(situation, target);
         let centred = (1.0 - outside * outside).max(0.0);
-        let stale_s = situation.phases.stale_target_s;
-        let low = target.height_m <= situation.phases.low_height_m;
-        let fresh = if low || config.fresh_target_s >= stale_s {
-            1.0
-        } else {
-            ((stale_s - situation.age_s) / (stale_s - config.fresh_target_s)).clamp(0.0, 1.0)
-        };
-        let deepest_m_s =
-            (config.final_descend_m_s + config.descend_gain * above_m).min(config.max_descend_m_s);
-        let why = if centred == 0.0 {
+        let fresh = self.freshness(situation);
+        let why = if centred == 0.0 && self.height_m(target) <= LOW_M {
+            Reason::Settling
+        } else if centred == 0.0 {
             Reason::Aligning
         } else if fresh == 0.0 {
             Reason::TargetAging
-        } else {
+        } else if self.sees(situation) {
             Reason::Descending
+        } else {
+            Reason::DescendingUnseen
         };
-        (deepest_m_s * centred * fresh, why)
+        let sinking_m_s = (situation.vehicle.velocity.z() - target.velocity.z()).max(0.0);
+        let ahead_m = self.height_m(target) - config.land_height_m
+            - (sinking_m_s - config.touch_descend_m_s).max(0.0) * config.descend_lag_s;
+        let slowest = config.touch_descend_m_s;
+        let brakes = slowest.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);
+        (brakes.sqrt().min(config.max_descend_m_s) * centred * fresh, why)
     }
+
+    /// From 1 for a fresh target to 0 for a stale one; low above a well-known target it makes no difference.
+    fn freshness(&self, situation: &Situation<'_>) -> f64 {
+        let (fresh_s, stale_s) = (self.config.fresh_target_s, situation.phases.stale_target_s);
+        if self.is_blind_but_sure(situation) || fresh_s >= stale_s {
+            return 1.0;
+        }
+        ((stale_s - situation.age_s) / (stale_s - fresh_s)).clamp(0.0, 1.0)
+    }
+}
+
+/// Where the body's down axis points, as a part of the height.
+fn lean(situation: &Situation<'_>) -> Vector<Ned> {
+    let down = situation.vehicle.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
+    flat(down) * (1.0 / down.z().max(0.5))
+}
+
+fn flat(vector: Vector<Ned>) -> Vector<Ned> {
+    Vector::new(vector.x(), vector.y(), 0.0)
+}
+
+/// The pad's vertical velocity as far as it is followed: a drift of the barometer is not.
+fn level_off(pad_m_s: f64) -> f64 {
+    pad_m_s
 }
 
 /// From `last` towards `wanted` by at most `step`; a descent ends at once, the autopilot smooths it.

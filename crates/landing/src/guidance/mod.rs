@@ -23,8 +23,10 @@ pub struct Situation<'a> {
     pub target: Option<TargetEstimate>,
     /// Time since the exposure of the newest marker used, in seconds; infinite when there was none.
     pub age_s: f64,
+    /// Smallest angle from the middle of the camera's image to its edge, in radians, when it is known.
+    pub half_view_rad: Option<f64>,
     /// When a target is stale.
-    pub phases: &'a PhaseConfig,
+    pub phases: PhaseConfig,
 }
 
 /// How far a guidance has brought the vehicle.
@@ -34,6 +36,8 @@ pub enum Progress {
     Aligning,
     /// Over the target.
     Descending,
+    /// Over the target, which is not seen; its estimate is good enough for the rest of the way.
+    Blind,
     /// As before.
     Unchanged,
     /// Low enough for the autopilot's LAND, for this reason.
@@ -70,6 +74,19 @@ impl Guide {
             Guidance::Thesis(config) => Self::Thesis(Thesis::new(config)),
             Guidance::Metric(config) => Self::Metric(Metric::new(config)),
         }
+    }
+
+    /// True when the vehicle may go down.
+    pub(crate) fn may_descend(&self, situation: &Situation<'_>) -> bool {
+        match self {
+            Self::Thesis(_) => situation.may_descend(),
+            Self::Metric(metric) => metric.may_descend(situation),
+        }
+    }
+
+    /// True when it also flies the vehicle while LAND is awaited.
+    pub(crate) fn flies_until_land(&self) -> bool {
+        matches!(self, Self::Metric(_))
     }
 
     /// True when a marker without a pose is of no use.
