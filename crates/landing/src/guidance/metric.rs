@@ -23,6 +23,7 @@ use serde::Deserialize;
 
 use crate::config::{ConfigError, check};
 use crate::decision::{Reason, TargetEstimate};
+use crate::guidance::path::{PATH_TIME_S, Path};
 use crate::guidance::{Progress, Situation};
 use crate::time::Timestamp;
 
@@ -40,9 +41,6 @@ pub struct MetricConfig {
     pub lateral_acceleration_m_s2: f64,
     /// Time from a detection's arrival to the motion that answers it, in s (0 to 1).
     pub dead_time_s: f64,
-    /// Time constant with which the autopilot's path goes towards a setpoint, in s (0.05 to 2): ArduPilot's WPNAV_ACCEL
-    /// over PSC_JERK_XY.
-    pub path_time_s: f64,
     /// Largest speed of descent, in m/s (0.1 to 3).
     pub max_descend_m_s: f64,
     /// Speed of descent at the ground, in m/s (0.1 to 1).
@@ -91,12 +89,11 @@ pub struct MetricConfig {
 impl Default for MetricConfig {
     fn default() -> Self {
         Self {
-            lateral_gain: 1.2,
-            velocity_gain: 2.0,
+            lateral_gain: 1.5,
+            velocity_gain: 3.0,
             max_lateral_m_s: 2.0,
             lateral_acceleration_m_s2: 1.5,
-            dead_time_s: 0.25,
-            path_time_s: 0.5,
+            dead_time_s: 0.3,
             max_descend_m_s: 2.0,
             touch_descend_m_s: 0.4,
             descend_braking_m_s2: 0.7,
@@ -105,7 +102,7 @@ impl Default for MetricConfig {
             funnel_m: 0.08,
             funnel_per_height: 0.25,
             fresh_target_s: 0.3,
-            land_height_m: 0.12,
+            land_height_m: 0.08,
             standing_height_m: 0.0,
             settle_s: 5.0,
             blind_error_m: 0.15,
@@ -129,7 +126,6 @@ impl MetricConfig {
         check("metric.max_lateral_m_s", self.max_lateral_m_s, 0.1, 5.0)?;
         check("metric.lateral_acceleration_m_s2", self.lateral_acceleration_m_s2, 0.1, 2.5)?;
         check("metric.dead_time_s", self.dead_time_s, 0.0, 1.0)?;
-        check("metric.path_time_s", self.path_time_s, 0.05, 2.0)?;
         check("metric.max_descend_m_s", self.max_descend_m_s, 0.1, 3.0)?;
         check("metric.touch_descend_m_s", self.touch_descend_m_s, 0.1, 1.0)?;
         check("metric.descend_braking_m_s2", self.descend_braking_m_s2, 0.1, 2.5)?;
@@ -191,8 +187,8 @@ struct Memory {
     stamp: Timestamp,
     /// The newest setpoint, in m/s.
     setpoint: Vector<Ned>,
-    /// The horizontal velocity of the autopilot's path, in m/s.
-    path: Vector<Ned>,
+    /// The path that the autopilot makes of the setpoints.
+    path: Path,
     /// The lateral error expected now, in metres.
     expected: Vector<Ned>,
     /// Real minus reported velocity, in m/s.
@@ -286,7 +282,7 @@ impl Metric {
         Memory {
             stamp: situation.now,
             setpoint: velocity,
-            path: level,
+            path: Path::new(level),
             expected: self.way(situation, target),
             bias: Vector::zero(),
             lean: lean(situation),
@@ -302,9 +298,7 @@ impl Metric {
         step_s: f64,
     ) -> Memory {
         memory.stamp = situation.now;
-        let ahead = flat(memory.setpoint) - memory.path;
-        let acceleration = shortened(ahead * (1.0 / self.config.path_time_s), 2.5);
-        memory.path = memory.path + acceleration * step_s;
+        memory.path.pass(step_s, memory.setpoint);
         memory.lean =
             memory.lean + (lean(situation) - memory.lean) * (step_s / LEAN_S).min(1.0);
         let way = self.way(situation, target);
@@ -401,8 +395,8 @@ impl Metric {
         target: &TargetEstimate,
     ) -> Vector<Ned> {
         let config = &self.config;
-        let pad = shortened(flat(target.velocity), config.max_pad_m_s);
-        let closing = flat(situation.vehicle.velocity) + memory.bias - pad;
+        let pad_m_s = shortened(flat(target.velocity), config.max_pad_m_s);
+        let closing = flat(situation.vehicle.velocity) + memory.bias - pad_m_s;
         let left = self.error(situation, target) - closing * config.dead_time_s;
         let left_m = left.norm();
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
@@ -414,7 +408,7 @@ impl Metric {
             config.lateral_acceleration_m_s2,
         );
         shortened(
-            memory.path + acceleration * config.path_time_s,
+            memory.path.velocity() + acceleration * PATH_TIME_S,
             config.max_lateral_m_s + config.max_pad_m_s,
         )
     }

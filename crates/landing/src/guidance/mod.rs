@@ -1,6 +1,7 @@
 //! From the target to a velocity: either [`thesis`] or [`metric`].
 
 pub mod metric;
+mod path;
 pub mod thesis;
 
 use geometry::{Ned, Vector};

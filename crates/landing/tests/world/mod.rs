@@ -249,10 +249,10 @@ impl Flight {
         self.samples.iter().find(|sample| sample.seconds >= seconds)
     }
 
-    /// True when the vehicle touched the ground far from the pad or hard, and the landing had not been given up.
+    /// True when the vehicle touched the ground far from the pad, hard or sliding, and the landing had not been given up.
     pub(crate) fn is_unsafe(&self) -> bool {
         self.touch.is_some_and(|touch| {
-            !self.aborted && (touch.error_m > 0.3 || touch.sink_m_s > 0.8 || touch.tilt_rad > 0.35)
+            !self.aborted && (touch.error_m > 0.3 || touch.sink_m_s > 0.8 || touch.slide_m_s > 0.5)
         })
     }
 }
