@@ -227,6 +227,14 @@ pub struct PhaseConfig {
     pub regain_height_m: f64,
     /// Speed of that climb, in m/s (0.1 to 2).
     pub regain_climb_m_s: f64,
+    /// How often a landing that lost the marker or its patience climbs and begins again (0 to 20).
+    pub retries: u32,
+    /// How far it climbs, in m (0 to 20), never above the height where the landing began.
+    pub retry_climb_m: f64,
+    /// Speed of that climb, in m/s (0.1 to 3).
+    pub retry_climb_m_s: f64,
+    /// Longest climb and look-out before a search, in s (1 to 60).
+    pub retry_timeout_s: f64,
     /// Interval at which LAND is asked for again, in s (0.1 to 5).
     pub land_retry_s: f64,
     /// Longest wait for the LAND mode before the landing is aborted, in s (0.5 to 60).
@@ -239,8 +247,16 @@ pub struct PhaseConfig {
     pub watch_height_m: f64,
     /// What an aborted landing does.
     pub on_abort: OnAbort,
+    /// Height over the local origin to which an aborted landing climbs when it is to climb, in m (0 to 100).
+    pub abort_height_m: f64,
     /// How long an aborted landing hovers before it falls silent, in s (0 to 60).
     pub release_after_s: f64,
+    /// What a low battery leads to.
+    pub on_battery_low: AlarmAction,
+    /// What a nearly empty battery leads to.
+    pub on_battery_critical: AlarmAction,
+    /// What follows when the operator is no longer heard.
+    pub on_operator_lost: AlarmAction,
 }
 
 impl Default for PhaseConfig {
@@ -263,13 +279,21 @@ impl Default for PhaseConfig {
             regain_after_s: 2.0,
             regain_height_m: 1.5,
             regain_climb_m_s: 0.3,
+            retries: 3,
+            retry_climb_m: 2.0,
+            retry_climb_m_s: 0.8,
+            retry_timeout_s: 8.0,
             land_retry_s: 0.5,
             land_timeout_s: 5.0,
             touchdown_timeout_s: 60.0,
             landing_timeout_s: 300.0,
             watch_height_m: 2.0,
             on_abort: OnAbort::Hover,
+            abort_height_m: 10.0,
             release_after_s: 5.0,
+            on_battery_low: AlarmAction::Ignore,
+            on_battery_critical: AlarmAction::Land,
+            on_operator_lost: AlarmAction::Ignore,
         }
     }
 }
@@ -281,6 +305,22 @@ pub enum OnAbort {
     /// Hover for `release_after_s`, then fall silent: the autopilot holds its position by itself.
     Hover,
     /// Land where it is, by the autopilot's LAND mode.
+    Land,
+    /// Climb to `abort_height_m`, then as `Hover`.
+    Climb,
+}
+
+/// What an alarm leads to.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AlarmAction {
+    /// The landing goes on.
+    Ignore,
+    /// As if the operator had asked to hold.
+    Hold,
+    /// The landing is given up, and `on_abort` follows.
+    Abort,
+    /// The autopilot's LAND mode, where the vehicle is.
     Land,
 }
 
@@ -391,6 +431,11 @@ impl PhaseConfig {
         check("phases.regain_after_s", self.regain_after_s, 0.0, 60.0)?;
         check("phases.regain_height_m", self.regain_height_m, 0.0, 10.0)?;
         check("phases.regain_climb_m_s", self.regain_climb_m_s, 0.1, 2.0)?;
+        check("phases.retries", f64::from(self.retries), 0.0, 20.0)?;
+        check("phases.retry_climb_m", self.retry_climb_m, 0.0, 20.0)?;
+        check("phases.retry_climb_m_s", self.retry_climb_m_s, 0.1, 3.0)?;
+        check("phases.retry_timeout_s", self.retry_timeout_s, 1.0, 60.0)?;
+        check("phases.abort_height_m", self.abort_height_m, 0.0, 100.0)?;
         check("phases.land_retry_s", self.land_retry_s, 0.1, 5.0)?;
         check("phases.land_timeout_s", self.land_timeout_s, 0.5, 60.0)?;
         check("phases.touchdown_timeout_s", self.touchdown_timeout_s, 5.0, 600.0)?;

@@ -133,6 +133,16 @@ named! {
         TargetLost = "target-lost", "marker lost, holding";
         /// The marker was never seen.
         TargetNotFound = "target-not-found", "marker not found, holding";
+        /// The marker was seen and is no longer; it is looked for from higher up.
+        Retrying = "retrying", "marker lost, climbing to see it again";
+        /// Low over the marker for long, never near enough to its centre.
+        NotSettling = "not-settling", "cannot settle over the marker, climbing to try again";
+        /// The battery is low.
+        BatteryLow = "battery-low", "the battery is low";
+        /// The battery is nearly empty.
+        BatteryCritical = "battery-critical", "the battery is nearly empty";
+        /// The operator is no longer heard.
+        OperatorLost = "operator-lost", "the operator is no longer heard";
         /// The autopilot's reports stopped.
         VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
         /// The vehicle came no nearer in the time allowed.

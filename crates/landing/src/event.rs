@@ -14,6 +14,8 @@ pub enum Event {
     Frame(Frame),
     /// A person decided something.
     Operator(OperatorCommand),
+    /// A limit was reached.
+    Alarm(Alarm),
     /// Time has passed.
     Tick,
 }
@@ -29,6 +31,17 @@ pub enum OperatorCommand {
     Resume,
     /// Give the landing up.
     Abort,
+}
+
+/// A limit that others watch; what follows is configured for each.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Alarm {
+    /// There is enough left for one landing.
+    BatteryLow,
+    /// There is enough left to go straight down.
+    BatteryCritical,
+    /// The operator can no longer be heard.
+    OperatorLost,
 }
 
 /// The vehicle as the autopilot estimates it at one moment.

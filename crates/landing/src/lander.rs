@@ -2,11 +2,11 @@
 
 use geometry::Vector;
 
-use crate::config::{Config, ConfigError, Guidance, OnAbort};
+use crate::config::{AlarmAction, Config, ConfigError, Guidance, OnAbort};
 use crate::decision::{Action, Decision, Reason, Rejection, TargetEstimate};
 use crate::envelope;
 use crate::estimator::Estimator;
-use crate::event::{Event, Frame, MarkerInFrame, Mode, VehicleState};
+use crate::event::{Alarm, Event, Frame, MarkerInFrame, Mode, VehicleState};
 use crate::guidance::{Guide, Progress, Situation};
 use crate::history::History;
 use crate::phase::{Facts, Machine, Phase, VehicleFacts};
@@ -20,6 +20,9 @@ const FARTHEST: f64 = 1e6;
 /// For so long the guidance flies on while LAND is awaited, in seconds.
 const HAND_OVER_S: f64 = 1.0;
 
+/// For so long an aborted landing climbs and stays before it falls silent, in seconds.
+const CLIMB_AWAY_S: f64 = 60.0;
+
 /// One landing after the other: told what happens, it answers what to do.
 #[derive(Clone, Debug)]
 pub struct Lander {
@@ -32,10 +35,14 @@ pub struct Lander {
     guide: Guide,
     machine: Machine,
     land_asked: Option<Timestamp>,
+    /// Height over the local origin at which the landing began, in metres.
+    ceiling_m: f64,
+    /// Height over the local origin to which a retry climbs, in metres.
+    retry_to_m: Option<f64>,
     /// Smallest angle from the middle of the camera's image to its edge, in radians.
     half_view_rad: Option<f64>,
-    /// Direction of the first leg of the search under way, in radians.
-    first_leg_rad: Option<f64>,
+    /// Direction of the first leg of the search under way, in radians, and how far it goes upwind, in metres.
+    upwind: Option<(f64, f64)>,
 }
 
 /// Where the landing point is, by the filter that the guidance takes.
@@ -71,8 +78,10 @@ impl Lander {
             guide: Guide::new(config.guidance),
             machine: Machine::new(config.phases),
             land_asked: None,
+            ceiling_m: 0.0,
+            retry_to_m: None,
             half_view_rad: None,
-            first_leg_rad: None,
+            upwind: None,
         })
     }
 
@@ -80,22 +89,26 @@ impl Lander {
     pub fn step(&mut self, now: Timestamp, event: Event) -> Decision {
         let now = self.now.map_or(now, |last| last.max(now));
         self.now = Some(now);
-        let (operator, refused) = match event {
-            Event::Vehicle(state) => (None, self.vehicle(now, state)),
-            Event::Frame(frame) => (None, self.frame(now, &frame)),
-            Event::Operator(command) => (Some(command), Ok(())),
-            Event::Tick => (None, Ok(())),
+        let refused = match event {
+            Event::Vehicle(state) => self.vehicle(now, state),
+            Event::Frame(frame) => self.frame(now, &frame),
+            Event::Operator(_) | Event::Alarm(_) | Event::Tick => Ok(()),
         };
+        let operator = if let Event::Operator(command) = event { Some(command) } else { None };
+        let alarm = if let Event::Alarm(alarm) = event { Some(self.answer(alarm)) } else { None };
         let facts = Facts {
             now,
             operator,
+            alarm,
             vehicle: self.history.newest().map(|state| facts_of(state, now)),
             target_age_s: self.sightings.age_s(now),
             target_confirmed: self.sightings.in_a_row >= self.config.target.confirm_after,
+            target_known: self.knows(now),
             progress: self.progress(now),
         };
         if self.machine.advance(&facts) {
             self.guide = Guide::new(self.config.guidance);
+            self.ceiling_m = self.history.newest().map_or(0.0, |state| -state.position.z());
         }
         let (action, why) = self.act(now);
         Decision {
@@ -178,6 +191,22 @@ impl Lander {
         self.guide.frame(&Frame { marker, ..*frame }, heading_rad, altitude_m);
     }
 
+    /// What is configured to follow an alarm.
+    fn answer(&self, alarm: Alarm) -> (AlarmAction, Reason) {
+        let phases = &self.config.phases;
+        match alarm {
+            Alarm::BatteryLow => (phases.on_battery_low, Reason::BatteryLow),
+            Alarm::BatteryCritical => (phases.on_battery_critical, Reason::BatteryCritical),
+            Alarm::OperatorLost => (phases.on_operator_lost, Reason::OperatorLost),
+        }
+    }
+
+    fn knows(&self, now: Timestamp) -> bool {
+        self.history
+            .newest()
+            .is_some_and(|vehicle| self.guide.knows(&self.situation(now, vehicle)))
+    }
+
     fn timely(&self, now: Timestamp, stamp: Timestamp, max_age_s: f64) -> Result<(), Rejection> {
         let age_s = now.seconds_since(stamp);
         if age_s < -self.config.target.max_future_s {
@@ -224,21 +253,31 @@ impl Lander {
     fn act(&mut self, now: Timestamp) -> (Action, Reason) {
         let why = self.machine.why();
         let guided = matches!(self.machine.phase(), Phase::Approach | Phase::Descend);
+        let low = matches!(
+            why,
+            Reason::LowAndAligned | Reason::LowAndUnseen | Reason::TouchedEarly
+        );
+        let retrying = self.machine.phase() == Phase::Retry;
         let handing_over = self.machine.phase() == Phase::Final
+            && low
             && !self.machine.is_landing()
             && self.guide.flies_until_land()
             && self.machine.elapsed_s(now) <= HAND_OVER_S;
-        if !guided && !handing_over {
+        if !retrying {
+            self.retry_to_m = None;
+        }
+        if !guided && !handing_over && !retrying {
             self.guide.rest();
         }
         if self.machine.phase() != Phase::Search {
-            self.first_leg_rad = None;
+            self.upwind = None;
         }
         match self.machine.phase() {
             Phase::Idle | Phase::Landed | Phase::PilotInCommand => (Action::None, why),
             Phase::Search if why == Reason::TakingOff => (Action::None, why),
             Phase::Search => (self.search(now), why),
             Phase::Approach | Phase::Descend => self.guided(now),
+            Phase::Retry => (self.retry(now), why),
             Phase::Hold => (self.hold(now), why),
             Phase::Final if self.machine.is_landing() => (Action::None, why),
             Phase::Final if handing_over && !self.asks_for_land(now) => (self.guided(now).0, why),
@@ -258,13 +297,33 @@ impl Lander {
         (Action::Velocity { velocity, yaw_rate: 0.0 }, why)
     }
 
+    /// Stays where the marker must be in view, and climbs, never above the height where the landing began.
+    fn retry(&mut self, now: Timestamp) -> Action {
+        let Some(vehicle) = self.history.newest().copied() else { return Action::hover() };
+        let phases = self.config.phases;
+        let altitude_m = -vehicle.position.z();
+        let to_m = *self
+            .retry_to_m
+            .get_or_insert((altitude_m + phases.retry_climb_m).min(self.ceiling_m));
+        let (wanted, _) = self.guide.velocity(&self.situation(now, &vehicle));
+        // The last half metre is flown ever more slowly.
+        let climb_m_s = (2.0 * (to_m - altitude_m)).clamp(0.0, phases.retry_climb_m_s);
+        let wanted = Vector::new(wanted.x(), wanted.y(), -climb_m_s);
+        let velocity = envelope::admit(&self.config.envelope, wanted, false);
+        Action::Velocity { velocity, yaw_rate: 0.0 }
+    }
+
     /// Flies the expanding square; low over the ground, where little is seen and much is in the way, climbs instead.
     fn search(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
-        let first_leg_rad =
-            *self.first_leg_rad.get_or_insert_with(|| search::first_leg_rad(vehicle.ned_from_body));
         let phases = &self.config.phases;
-        let mut wanted = search::velocity(phases, self.machine.elapsed_s(now), first_leg_rad);
+        let (first_leg_rad, upwind_m) = *self.upwind.get_or_insert_with(|| {
+            let attitude = vehicle.ned_from_body;
+            let height_m = -vehicle.position.z();
+            (search::first_leg_rad(attitude), search::upwind_m(phases, attitude, height_m))
+        });
+        let elapsed_s = self.machine.elapsed_s(now);
+        let mut wanted = search::velocity(phases, elapsed_s, first_leg_rad, upwind_m);
         if wanted.norm() > 0.0 && -vehicle.position.z() < phases.regain_height_m {
             wanted = Vector::new(0.0, 0.0, -phases.regain_climb_m_s);
         }
@@ -321,8 +380,20 @@ impl Lander {
         match phases.on_abort {
             OnAbort::Hover if elapsed_s <= phases.release_after_s => Action::hover(),
             OnAbort::Land if elapsed_s <= phases.land_timeout_s => self.ask_for_land(now),
-            OnAbort::Hover | OnAbort::Land => Action::None,
+            OnAbort::Climb if elapsed_s <= CLIMB_AWAY_S => self.climb_away(),
+            OnAbort::Hover | OnAbort::Land | OnAbort::Climb => Action::None,
         }
+    }
+
+    /// Climbs to the height of aborted landings and stays there.
+    fn climb_away(&self) -> Action {
+        let phases = &self.config.phases;
+        let altitude_m = self.history.newest().map_or(f64::MAX, |state| -state.position.z());
+        let climb_m_s =
+            (phases.abort_height_m - altitude_m).clamp(0.0, self.config.envelope.climb_m_s);
+        let wanted = Vector::new(0.0, 0.0, -climb_m_s);
+        let velocity = envelope::admit(&self.config.envelope, wanted, false);
+        Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 }
 

@@ -26,11 +26,11 @@ pub mod target;
 pub mod time;
 
 pub use config::{
-    Config, ConfigError, EnvelopeConfig, EstimatorConfig, Guidance, MetricConfig, OnAbort, PhaseConfig,
+    AlarmAction, Config, ConfigError, EnvelopeConfig, EstimatorConfig, Guidance, MetricConfig, OnAbort, PhaseConfig,
     TargetConfig, ThesisConfig,
 };
 pub use decision::{Action, Decision, Reason, Rejection, TargetEstimate};
-pub use event::{Event, Frame, Landed, MarkerInFrame, Mode, OperatorCommand, VehicleState};
+pub use event::{Alarm, Event, Frame, Landed, MarkerInFrame, Mode, OperatorCommand, VehicleState};
 pub use lander::Lander;
 pub use phase::Phase;
 pub use time::Timestamp;

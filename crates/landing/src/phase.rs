@@ -1,28 +1,52 @@
 //! The phases of a landing: an explicit machine over plain facts.
 //!
-//! ```text
-//!            start            seen             inside the funnel       low and settled        disarmed
-//!   Idle -----------> Search ------> Approach <-----------------> Descend ----------> Final ----------> Landed
-//!                       |                |        outside            |                  |
-//!                       | not found      | lost, no progress         | lost             | LAND refused, no touchdown
-//!                       v                v                           v                  v
-//!                      Hold <------------+---------------------------+               Aborted
-//!                       |  seen again: Approach · resumed, vehicle heard again: Search   ^
-//!                       +------------------------- held too long -----------------------+
+//! ```mermaid
+//! stateDiagram-v2
+//!     [*] --> Idle
+//!     Idle --> Search: start
+//!     Search --> Approach: seen
+//!     Search --> Hold: not found
+//!     Approach --> Descend: inside the funnel
+//!     Descend --> Approach: outside
+//!     Approach --> Retry: lost, its place known
+//!     Descend --> Retry: lost or not settling, its place known
+//!     Retry --> Approach: seen
+//!     Retry --> Search: not seen in time
+//!     Approach --> Hold: lost, no progress, no retry left
+//!     Descend --> Hold: lost, no progress, no retry left
+//!     Descend --> Final: a hand's breadth above the ground
+//!     Hold --> Search: seen, resumed, vehicle heard again
+//!     Hold --> Aborted: held too long
+//!     Final --> Landed: disarmed
+//!     Final --> Aborted: LAND refused, no touchdown
+//!     Landed --> [*]
+//!     Aborted --> [*]
 //! ```
 //!
 //! From every phase that is not terminal: the operator's abort and too long a landing lead to Aborted, the operator's hold to Hold
 //! (not once the autopilot lands), a stale vehicle state to Hold (Final just waits), a mode that is neither GUIDED nor the
-//! LAND we asked for to PilotInCommand, the ground to Final, disarmed motors to Landed or Aborted. Idle, Landed, Aborted and
-//! PilotInCommand are terminal: only a new start leaves them.
+//! LAND we asked for to PilotInCommand, the ground to Final, disarmed motors to Landed or Aborted, an alarm to what is
+//! configured for it. Idle, Landed, Aborted and PilotInCommand are terminal: only a new start leaves them.
+//!
+//! | phase | longest stay | then |
+//! |---|---|---|
+//! | Search | `search_timeout_s` | Hold |
+//! | Approach, Descend | `approach_timeout_s`, `descend_timeout_s` | Hold |
+//! | Retry | `retry_timeout_s`, and `retries` times | Search |
+//! | Hold | `hold_timeout_s`, by the operator `operator_hold_timeout_s` | Aborted |
+//! | Final | `land_timeout_s` until LAND, `touchdown_timeout_s` until the ground | Aborted, Landed |
+//! | all together until LAND | `landing_timeout_s` | Aborted |
 
 use std::fmt;
 
-use crate::config::PhaseConfig;
+use crate::config::{AlarmAction, PhaseConfig};
 use crate::decision::Reason;
 use crate::event::{Landed, Mode, OperatorCommand};
 use crate::guidance::Progress;
 use crate::time::Timestamp;
+
+/// A vehicle that could not settle climbs at least so long before it tries again, in seconds.
+const RETRY_REST_S: f64 = 2.0;
 
 /// Where the landing stands.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
@@ -35,6 +59,8 @@ pub enum Phase {
     Approach,
     /// Descending over the marker.
     Descend,
+    /// Climbing to where the lost marker must be in view.
+    Retry,
     /// The autopilot's LAND mode does the rest.
     Final,
     /// On the ground, disarmed.
@@ -54,12 +80,16 @@ pub struct Facts {
     pub now: Timestamp,
     /// What the operator has just asked for.
     pub operator: Option<OperatorCommand>,
+    /// What has just been reached, and what is to follow.
+    pub alarm: Option<(AlarmAction, Reason)>,
     /// The vehicle; `None` before its first state.
     pub vehicle: Option<VehicleFacts>,
     /// Time since the exposure of the newest marker used, in seconds; infinite when there was none.
     pub target_age_s: f64,
     /// True when the marker was seen often enough, without a long gap.
     pub target_confirmed: bool,
+    /// True when the marker's place is known although it is not seen.
+    pub target_known: bool,
     /// How far the guidance is.
     pub progress: Progress,
 }
@@ -91,6 +121,8 @@ pub struct Machine {
     landing: bool,
     /// Somebody has taken an aborted vehicle over, so it is never spoken to again.
     released: bool,
+    /// Retries of this landing so far.
+    retries: u32,
 }
 
 impl Phase {
@@ -106,6 +138,7 @@ impl Phase {
             Self::Search => "search",
             Self::Approach => "approach",
             Self::Descend => "descend",
+            Self::Retry => "retry",
             Self::Final => "final",
             Self::Landed => "landed",
             Self::Hold => "hold",
@@ -132,6 +165,7 @@ impl Machine {
             started: Timestamp::default(),
             landing: false,
             released: false,
+            retries: 0,
         }
     }
 
@@ -212,6 +246,7 @@ impl Machine {
         self.enter(phase, why, now);
         self.started = now;
         self.released = false;
+        self.retries = 0;
     }
 
     fn enter(&mut self, phase: Phase, why: Reason, now: Timestamp) {
@@ -246,6 +281,16 @@ impl Machine {
         if self.landing {
             return None;
         }
+        if let Some((action, why)) = facts.alarm
+            && self.phase != Phase::Final
+        {
+            match action {
+                AlarmAction::Ignore => {}
+                AlarmAction::Hold => return Some((Phase::Hold, Reason::OperatorHold)),
+                AlarmAction::Abort => return Some((Phase::Aborted, why)),
+                AlarmAction::Land => return Some((Phase::Final, why)),
+            }
+        }
         if facts.operator == Some(OperatorCommand::Hold) {
             return Some((Phase::Hold, Reason::OperatorHold));
         }
@@ -272,12 +317,13 @@ impl Machine {
         let deaf = facts.vehicle.is_none_or(|vehicle| vehicle.age_s > self.config.stale_vehicle_s);
         match self.phase {
             Phase::Idle | Phase::Landed | Phase::Aborted | Phase::PilotInCommand => None,
-            Phase::Search | Phase::Approach | Phase::Descend if deaf => {
+            Phase::Search | Phase::Approach | Phase::Descend | Phase::Retry if deaf => {
                 Some((Phase::Hold, Reason::VehicleStale))
             }
             Phase::Search => self.after_search(facts),
             Phase::Approach => self.after_approach(facts),
             Phase::Descend => self.after_descend(facts),
+            Phase::Retry => self.after_retry(facts),
             Phase::Hold => self.after_hold(facts, deaf),
             Phase::Final => self.after_final(facts),
         }
@@ -297,11 +343,12 @@ impl Machine {
             .then_some((Phase::Hold, Reason::TargetNotFound))
     }
 
-    fn after_approach(&self, facts: &Facts) -> Option<(Phase, Reason)> {
+    fn after_approach(&mut self, facts: &Facts) -> Option<(Phase, Reason)> {
         match facts.progress {
             Progress::Ready(why) => Some((Phase::Final, why)),
             Progress::Blind => Some((Phase::Descend, Reason::DescendingUnseen)),
-            _ if self.lost(facts) => Some((Phase::Hold, Reason::TargetLost)),
+            _ if self.lost(facts) => Some(self.again(facts, Reason::Retrying)),
+            Progress::Stuck => Some(self.again(facts, Reason::NotSettling)),
             Progress::Descending => Some((Phase::Descend, Reason::Descending)),
             Progress::Aligning | Progress::Unchanged => self
                 .over(facts, self.config.approach_timeout_s)
@@ -309,17 +356,36 @@ impl Machine {
         }
     }
 
-    fn after_descend(&self, facts: &Facts) -> Option<(Phase, Reason)> {
+    fn after_descend(&mut self, facts: &Facts) -> Option<(Phase, Reason)> {
         match facts.progress {
             Progress::Ready(why) => Some((Phase::Final, why)),
             Progress::Descending | Progress::Aligning | Progress::Unchanged if self.lost(facts) => {
-                Some((Phase::Hold, Reason::TargetLost))
+                Some(self.again(facts, Reason::Retrying))
             }
+            Progress::Stuck => Some(self.again(facts, Reason::NotSettling)),
             Progress::Aligning => Some((Phase::Approach, Reason::Aligning)),
             Progress::Descending | Progress::Blind | Progress::Unchanged => self
                 .over(facts, self.config.descend_timeout_s)
                 .then_some((Phase::Hold, Reason::NoProgress)),
         }
+    }
+
+    /// Another try, while there is one left and the marker's place is known; otherwise a hold.
+    fn again(&mut self, facts: &Facts, why: Reason) -> (Phase, Reason) {
+        if facts.target_known && self.retries < self.config.retries {
+            self.retries += 1;
+            (Phase::Retry, why)
+        } else {
+            (Phase::Hold, Reason::TargetLost)
+        }
+    }
+
+    fn after_retry(&self, facts: &Facts) -> Option<(Phase, Reason)> {
+        let rested = self.why == Reason::Retrying || self.elapsed_s(facts.now) > RETRY_REST_S;
+        if self.sees(facts) && rested {
+            return Some((Phase::Approach, Reason::Aligning));
+        }
+        self.over(facts, self.config.retry_timeout_s).then_some((Phase::Search, Reason::Searching))
     }
 
     fn after_hold(&self, facts: &Facts, deaf: bool) -> Option<(Phase, Reason)> {
@@ -390,9 +456,11 @@ mod tests {
         Facts {
             now: Timestamp::from_seconds(seconds),
             operator: None,
+            alarm: None,
             vehicle: Some(FLYING),
             target_age_s: f64::INFINITY,
             target_confirmed: false,
+            target_known: false,
             progress: Progress::Unchanged,
         }
     }

@@ -16,13 +16,31 @@ pub fn first_leg_rad(ned_from_body: Rotation<Ned, Body>) -> f64 {
     if up.horizontal_norm() < CALM_RAD.sin() { 0.0 } else { up.y().atan2(up.x()) }
 }
 
-/// The velocity at a time after the search began, in m/s: legs of 1, 1, 2, 2, 3, 3, ... spacings, each to the right of the
-/// one before, after a moment of hovering; nought once the radius is reached.
-pub fn velocity(config: &PhaseConfig, elapsed_s: f64, first_leg_rad: f64) -> Vector<Ned> {
+/// How far upwind the camera must go to look at what lies below the vehicle, in metres: the way from below the vehicle to
+/// the ground that the camera looks at, as far as the search goes at all.
+pub fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: f64) -> f64 {
+    let down = ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
+    let beside_m = height_m.max(0.0) * down.horizontal_norm() / down.z().max(0.5);
+    if beside_m < CALM_RAD * height_m { 0.0 } else { beside_m.min(config.search_radius_m) }
+}
+
+/// The velocity at a time after the search began, in m/s: after a moment of hovering `upwind_m` along the first leg, then
+/// legs of 1, 1, 2, 2, 3, 3, ... spacings, each to the right of the one before; nought once the radius is reached.
+pub fn velocity(
+    config: &PhaseConfig,
+    elapsed_s: f64,
+    first_leg_rad: f64,
+    upwind_m: f64,
+) -> Vector<Ned> {
     let mut way_m = (elapsed_s - config.search_delay_s) * config.search_speed_m_s;
     if way_m.is_nan() || way_m < 0.0 {
         return Vector::zero();
     }
+    let (east, north) = first_leg_rad.sin_cos();
+    if way_m < upwind_m {
+        return Vector::new(north, east, 0.0) * config.search_speed_m_s;
+    }
+    way_m -= upwind_m;
     // The corner after leg n lies at most (n + 1) / 2 spacings from the start along either axis.
     let legs = (2.0 * config.search_radius_m / config.search_spacing_m).floor() as u32;
     for leg in 1..=legs {
@@ -48,7 +66,7 @@ mod tests {
         let (mut place, mut path) = (Point::<Ned>::origin(), Vec::new());
         let dt_s = 0.02;
         for i in 0..(config.search_timeout_s / dt_s) as u32 {
-            place = place + velocity(&config, f64::from(i) * dt_s, 0.7) * dt_s;
+            place = place + velocity(&config, f64::from(i) * dt_s, 0.7, 0.0) * dt_s;
             path.push(place);
         }
         let farthest = path.iter().map(|p| p.x().hypot(p.y())).fold(0.0, f64::max);
@@ -60,8 +78,8 @@ mod tests {
                 path.iter().map(|p| (p.x() - x).hypot(p.y() - y)).fold(f64::MAX, f64::min);
             assert!(nearest < config.search_spacing_m, "({x}, {y}) is {nearest} m from the path");
         }
-        assert!(velocity(&config, 1e9, 0.0).norm() < 1e-12, "it ends");
-        assert!(velocity(&config, f64::NAN, 0.0).norm() < 1e-12);
+        assert!(velocity(&config, 1e9, 0.0, 3.0).norm() < 1e-12, "it ends");
+        assert!(velocity(&config, f64::NAN, 0.0, 0.0).norm() < 1e-12);
     }
 
     #[test]
@@ -70,5 +88,9 @@ mod tests {
         let leans_east = Rotation::<Ned, Body>::from_euler(0.0, -0.2, std::f64::consts::FRAC_PI_2);
         assert!((first_leg_rad(leans_east) - std::f64::consts::FRAC_PI_2).abs() < 1e-9);
         assert!(first_leg_rad(Rotation::identity()).abs() < 1e-12);
+        let config = PhaseConfig::default();
+        assert!((upwind_m(&config, leans_east, 10.0) - 10.0 * 0.2f64.tan()).abs() < 1e-9);
+        assert_eq!(upwind_m(&config, leans_east, 100.0), config.search_radius_m);
+        assert_eq!(upwind_m(&config, Rotation::identity(), 10.0), 0.0);
     }
 }

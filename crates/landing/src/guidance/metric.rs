@@ -92,11 +92,11 @@ impl Default for MetricConfig {
             lateral_gain: 1.5,
             velocity_gain: 3.0,
             max_lateral_m_s: 2.0,
-            lateral_acceleration_m_s2: 1.5,
+            lateral_acceleration_m_s2: 1.2,
             dead_time_s: 0.3,
             max_descend_m_s: 2.0,
             touch_descend_m_s: 0.4,
-            descend_braking_m_s2: 0.7,
+            descend_braking_m_s2: 0.5,
             descend_lag_s: 0.45,
             descend_acceleration_m_s2: 2.0,
             funnel_m: 0.08,
@@ -109,9 +109,9 @@ impl Default for MetricConfig {
             blind_height_m: 2.2,
             blind_s: 6.0,
             blind_deviation_m: 0.06,
-            view_height_m: 1.0,
+            view_height_m: 1.3,
             view_margin_m: 0.11,
-            view_margin_rad: 0.03,
+            view_margin_rad: 0.07,
             drift_time_s: 1.5,
             max_drift_m_s: 0.1,
             max_pad_m_s: 5.0,
@@ -156,12 +156,19 @@ const FUNNEL_HYSTERESIS: f64 = 1.2;
 /// Part of the lateral acceleration that braking before the target counts on.
 const BRAKING: f64 = 0.7;
 
+/// The target's place is known while it is better than this, for at most so long, in metres and seconds.
+const KNOWN_M: f64 = 0.5;
+const KNOWN_S: f64 = 20.0;
+
 /// Below this height the vehicle waits for a small error, in metres.
 const LOW_M: f64 = 0.5;
 
 /// A vehicle asked to descend this fast that stands still for so long is on the ground, in m/s and seconds.
 const PUSHING_M_S: f64 = 0.15;
 const STANDING_S: f64 = 0.4;
+
+/// Acceleration of gravity, in m/s^2.
+const GRAVITY: f64 = 9.81;
 
 /// Time constant of the lean that is taken for the wind's, in seconds.
 const LEAN_S: f64 = 1.0;
@@ -215,6 +222,13 @@ impl Metric {
         self.sees(situation) || self.is_blind_but_sure(situation)
     }
 
+    /// True when the target's place is good enough to fly to where it must be seen.
+    pub fn knows(&self, situation: &Situation<'_>) -> bool {
+        situation.target.is_some_and(|target| {
+            target.deviation_m <= KNOWN_M && target.age_s <= KNOWN_S
+        })
+    }
+
     fn sees(&self, situation: &Situation<'_>) -> bool {
         situation.age_s <= situation.phases.stale_target_s
     }
@@ -241,6 +255,10 @@ impl Metric {
         let outside = self.outside(situation, &target);
         if height_m <= self.config.land_height_m && outside < 1.0 {
             return Progress::Ready(if seen { Reason::LowAndAligned } else { Reason::LowAndUnseen });
+        }
+        let waited_s = self.waiting_since.map_or(0.0, |since| situation.now.seconds_since(since));
+        if waited_s > 2.0 * self.config.settle_s && outside >= 1.0 {
+            return Progress::Stuck;
         }
         match (seen, outside) {
             (true, outside) if outside < 1.0 => Progress::Descending,
@@ -299,8 +317,9 @@ impl Metric {
     ) -> Memory {
         memory.stamp = situation.now;
         memory.path.pass(step_s, memory.setpoint);
-        memory.lean =
-            memory.lean + (lean(situation) - memory.lean) * (step_s / LEAN_S).min(1.0);
+        // What the vehicle leans beside what its path accelerates by, it leans against the wind.
+        let against_wind = lean(situation) + memory.path.acceleration() * (1.0 / GRAVITY);
+        memory.lean = memory.lean + (against_wind - memory.lean) * (step_s / LEAN_S).min(1.0);
         let way = self.way(situation, target);
         let closing = flat(situation.vehicle.velocity) + memory.bias - flat(target.velocity);
         let expected = memory.expected - closing * step_s;

@@ -39,6 +39,8 @@ pub enum Progress {
     Descending,
     /// Over the target, which is not seen; its estimate is good enough for the rest of the way.
     Blind,
+    /// Low for long and never near enough.
+    Stuck,
     /// As before.
     Unchanged,
     /// Low enough for the autopilot's LAND, for this reason.
@@ -82,6 +84,14 @@ impl Guide {
         match self {
             Self::Thesis(_) => situation.may_descend(),
             Self::Metric(metric) => metric.may_descend(situation),
+        }
+    }
+
+    /// True when the target's place is good enough to fly to where it must be seen.
+    pub(crate) fn knows(&self, situation: &Situation<'_>) -> bool {
+        match self {
+            Self::Thesis(_) => false,
+            Self::Metric(metric) => metric.knows(situation),
         }
     }
 

@@ -41,6 +41,11 @@ impl Path {
         Vector::new(self.velocity.x, self.velocity.y, 0.0)
     }
 
+    /// Its acceleration now, in m/s^2.
+    pub(super) fn acceleration(&self) -> Vector<Ned> {
+        Vector::new(self.acceleration.x, self.acceleration.y, 0.0)
+    }
+
     /// Lets `dt_s` pass with this setpoint.
     pub(super) fn pass(&mut self, dt_s: f64, setpoint: Vector<Ned>) {
         let setpoint = Level::new(setpoint.x(), setpoint.y());
