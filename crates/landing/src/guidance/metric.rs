@@ -41,6 +41,8 @@ pub struct MetricConfig {
     pub lateral_acceleration_m_s2: f64,
     /// Time from a detection's arrival to the motion that answers it, in s (0 to 1).
     pub dead_time_s: f64,
+    /// Time over which the present acceleration is taken to go on, in s (0 to 1).
+    pub acceleration_lead_s: f64,
     /// Largest speed of descent, in m/s (0.1 to 3).
     pub max_descend_m_s: f64,
     /// Speed of descent at the ground, in m/s (0.1 to 1).
@@ -89,11 +91,12 @@ pub struct MetricConfig {
 impl Default for MetricConfig {
     fn default() -> Self {
         Self {
-            lateral_gain: 1.5,
-            velocity_gain: 3.0,
+            lateral_gain: 1.7,
+            velocity_gain: 4.0,
             max_lateral_m_s: 2.0,
             lateral_acceleration_m_s2: 1.2,
             dead_time_s: 0.3,
+            acceleration_lead_s: 0.1,
             max_descend_m_s: 2.0,
             touch_descend_m_s: 0.4,
             descend_braking_m_s2: 0.5,
@@ -126,6 +129,7 @@ impl MetricConfig {
         check("metric.max_lateral_m_s", self.max_lateral_m_s, 0.1, 5.0)?;
         check("metric.lateral_acceleration_m_s2", self.lateral_acceleration_m_s2, 0.1, 2.5)?;
         check("metric.dead_time_s", self.dead_time_s, 0.0, 1.0)?;
+        check("metric.acceleration_lead_s", self.acceleration_lead_s, 0.0, 1.0)?;
         check("metric.max_descend_m_s", self.max_descend_m_s, 0.1, 3.0)?;
         check("metric.touch_descend_m_s", self.touch_descend_m_s, 0.1, 1.0)?;
         check("metric.descend_braking_m_s2", self.descend_braking_m_s2, 0.1, 2.5)?;
@@ -167,6 +171,9 @@ const LOW_M: f64 = 0.5;
 const PUSHING_M_S: f64 = 0.15;
 const STANDING_S: f64 = 0.4;
 
+/// Time constant of the filter over the acceleration, in seconds.
+const SLOPE_S: f64 = 0.05;
+
 /// Acceleration of gravity, in m/s^2.
 const GRAVITY: f64 = 9.81;
 
@@ -196,6 +203,9 @@ struct Memory {
     setpoint: Vector<Ned>,
     /// The path that the autopilot makes of the setpoints.
     path: Path,
+    /// Stamp and velocity of the newest state, and the acceleration up to it.
+    moved: (Timestamp, Vector<Ned>),
+    acceleration: Vector<Ned>,
     /// The lateral error expected now, in metres.
     expected: Vector<Ned>,
     /// Real minus reported velocity, in m/s.
@@ -300,6 +310,8 @@ impl Metric {
         Memory {
             stamp: situation.now,
             setpoint: velocity,
+            moved: (situation.vehicle.stamp, velocity),
+            acceleration: Vector::zero(),
             path: Path::new(level),
             expected: self.way(situation, target),
             bias: Vector::zero(),
@@ -316,6 +328,14 @@ impl Metric {
         step_s: f64,
     ) -> Memory {
         memory.stamp = situation.now;
+        let (stamp, velocity) = memory.moved;
+        let gap_s = situation.vehicle.stamp.seconds_since(stamp);
+        if gap_s > 1e-3 {
+            let slope = flat(situation.vehicle.velocity - velocity) * (1.0 / gap_s);
+            memory.acceleration = memory.acceleration
+                + (slope - memory.acceleration) * (gap_s / (SLOPE_S + gap_s));
+            memory.moved = (situation.vehicle.stamp, situation.vehicle.velocity);
+        }
         memory.path.pass(step_s, memory.setpoint);
         // What the vehicle leans beside what its path accelerates by, it leans against the wind.
         let against_wind = lean(situation) + memory.path.acceleration() * (1.0 / GRAVITY);
@@ -416,7 +436,11 @@ impl Metric {
         let config = &self.config;
         let pad_m_s = shortened(flat(target.velocity), config.max_pad_m_s);
         let closing = flat(situation.vehicle.velocity) + memory.bias - pad_m_s;
-        let left = self.error(situation, target) - closing * config.dead_time_s;
+        let lead_s = config.acceleration_lead_s;
+        let left = self.error(situation, target)
+            - closing * config.dead_time_s
+            - memory.acceleration * (0.5 * lead_s.powi(2));
+        let closing = closing + memory.acceleration * lead_s;
         let left_m = left.norm();
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
         let speed_m_s =

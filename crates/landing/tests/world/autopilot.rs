@@ -17,8 +17,6 @@ const VERTICAL: [f64; 2] = [1.0, 5.0];
 const LAND_SPEED: f64 = 0.5;
 /// A setpoint is flown so long, in seconds.
 const SETPOINT_TIMEOUT_S: f64 = 3.0;
-/// From a packet's arrival to its effect, in seconds.
-const PACKET_S: f64 = 0.03;
 
 /// How wrong the estimator is; 1 is as seen in real logs.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -100,6 +98,8 @@ pub(crate) struct Autopilot {
     arriving: VecDeque<(f64, Packet)>,
     setpoint: (f64, Vector<Ned>, f64),
     refuses_land: bool,
+    /// From sending a packet to its effect, in seconds.
+    link_s: f64,
     pub(crate) land_s: Option<f64>,
     pub(crate) touchdown_s: Option<f64>,
     pub(crate) disarm_s: Option<f64>,
@@ -115,7 +115,7 @@ impl Autopilot {
     pub(crate) fn new(
         estimator: Estimator,
         vehicle: &Multirotor,
-        refuses_land: bool,
+        (refuses_land, link_s): (bool, f64),
         seed: u64,
     ) -> Self {
         let mut random = stream(seed, 3);
@@ -160,6 +160,7 @@ impl Autopilot {
             arriving: VecDeque::new(),
             setpoint: (0.0, Vector::zero(), 0.0),
             refuses_land,
+            link_s,
             land_s: None,
             touchdown_s: None,
             disarm_s: None,
@@ -169,7 +170,7 @@ impl Autopilot {
     /// A packet that is sent now.
     pub(crate) fn send(&mut self, now_s: f64, packet: Packet) {
         if self.arriving.len() < 100 {
-            self.arriving.push_back((now_s + PACKET_S, packet));
+            self.arriving.push_back((now_s + self.link_s, packet));
         }
     }
 

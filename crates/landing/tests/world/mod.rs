@@ -63,6 +63,8 @@ pub(crate) struct Scene {
     pub(crate) tells_covariance: bool,
     /// Size of the marker relative to the thesis'.
     pub(crate) marker_scale: f64,
+    /// From sending a packet to its effect in the autopilot, in seconds.
+    pub(crate) link_s: f64,
     /// The autopilot is neither heard nor reached between these seconds.
     pub(crate) link_lost_s: Option<(f64, f64)>,
     /// What the operator does when.
@@ -138,6 +140,7 @@ impl Scene {
             stamp_error_s: 0.0,
             tells_covariance: true,
             marker_scale: 1.0,
+            link_s: 0.03,
             link_lost_s: None,
             commands: vec![(0.0, OperatorCommand::Start)],
             refuses_land: false,
@@ -274,7 +277,12 @@ impl World {
         Self {
             seconds: 0.0,
             air: Air::new(scene.wind, scene.seed),
-            autopilot: Autopilot::new(scene.estimator, &vehicle, scene.refuses_land, scene.seed),
+            autopilot: Autopilot::new(
+                scene.estimator,
+                &vehicle,
+                (scene.refuses_land, scene.link_s),
+                scene.seed,
+            ),
             eyes: Eyes::new(scene),
             vehicle,
             demand: Demand { thrust: multirotor::GRAVITY, ..Demand::default() },
