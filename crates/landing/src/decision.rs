@@ -153,6 +153,8 @@ named! {
         HeldTooLong = "held-too-long", "aborted: held too long";
         /// The whole landing lasted too long.
         LandingTooLong = "landing-too-long", "aborted: the landing took too long";
+        /// The marker was lost too often.
+        RetriesUsed = "retries-used", "aborted: the marker was lost too often";
         /// The autopilot did not enter its LAND mode.
         LandRefused = "land-refused", "aborted: the autopilot did not enter LAND";
         /// The autopilot did not reach the ground.

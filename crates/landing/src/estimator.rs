@@ -184,10 +184,13 @@ impl Estimator {
         let pixel_rad = frame
             .focal_px
             .filter(|focal_px| *focal_px > 1.0)
-            .map_or(self.config.direction_noise_rad, |focal_px| self.config.pixel_noise_px / focal_px);
+            .map_or(self.config.direction_noise_rad, |focal_px| {
+                self.config.pixel_noise_px / focal_px
+            });
         let size_px = marker.size_px.filter(|size_px| *size_px > 1.0);
-        let range_part = size_px
-            .map_or(self.config.range_noise_part, |size_px| 2.0 * self.config.pixel_noise_px / size_px);
+        let range_part = size_px.map_or(self.config.range_noise_part, |size_px| {
+            2.0 * self.config.pixel_noise_px / size_px
+        });
         let range_m = seen.norm();
         let along = seen.coords / range_m.max(1e-6);
         let across = (range_m * pixel_rad).powi(2);
@@ -204,11 +207,8 @@ impl Estimator {
     ) -> Sight {
         let r = from_vehicle.coords;
         let axis = |x, y, z| (motion.ned_from_body * Vector::<Body>::new(x, y, z)).coords;
-        let axes = Matrix3::from_columns(&[
-            axis(1.0, 0.0, 0.0),
-            axis(0.0, 1.0, 0.0),
-            axis(0.0, 0.0, 1.0),
-        ]);
+        let axes =
+            Matrix3::from_columns(&[axis(1.0, 0.0, 0.0), axis(0.0, 1.0, 0.0), axis(0.0, 0.0, 1.0)]);
         let tilt = Matrix3::from_columns(&[
             axes.column(0).cross(&r),
             axes.column(1).cross(&r),
@@ -232,9 +232,8 @@ impl Estimator {
     /// Puts a detection where it belongs in time, and fuses those after it again.
     fn fuse(&mut self, sight: Sight) -> Result<(), Rejection> {
         let newest = self.past.back().map(|fused| fused.sight.stamp);
-        let forgotten = newest.is_some_and(|newest| {
-            sight.stamp.seconds_since(newest) > self.config.forget_after_s
-        });
+        let forgotten = newest
+            .is_some_and(|newest| sight.stamp.seconds_since(newest) > self.config.forget_after_s);
         if newest.is_none() || forgotten {
             self.begin(sight);
             return Ok(());

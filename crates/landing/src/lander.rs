@@ -202,9 +202,7 @@ impl Lander {
     }
 
     fn knows(&self, now: Timestamp) -> bool {
-        self.history
-            .newest()
-            .is_some_and(|vehicle| self.guide.knows(&self.situation(now, vehicle)))
+        self.history.newest().is_some_and(|vehicle| self.guide.knows(&self.situation(now, vehicle)))
     }
 
     fn timely(&self, now: Timestamp, stamp: Timestamp, max_age_s: f64) -> Result<(), Rejection> {
@@ -253,10 +251,8 @@ impl Lander {
     fn act(&mut self, now: Timestamp) -> (Action, Reason) {
         let why = self.machine.why();
         let guided = matches!(self.machine.phase(), Phase::Approach | Phase::Descend);
-        let low = matches!(
-            why,
-            Reason::LowAndAligned | Reason::LowAndUnseen | Reason::TouchedEarly
-        );
+        let low =
+            matches!(why, Reason::LowAndAligned | Reason::LowAndUnseen | Reason::TouchedEarly);
         let retrying = self.machine.phase() == Phase::Retry;
         let handing_over = self.machine.phase() == Phase::Final
             && low
@@ -302,9 +298,8 @@ impl Lander {
         let Some(vehicle) = self.history.newest().copied() else { return Action::hover() };
         let phases = self.config.phases;
         let altitude_m = -vehicle.position.z();
-        let to_m = *self
-            .retry_to_m
-            .get_or_insert((altitude_m + phases.retry_climb_m).min(self.ceiling_m));
+        let to_m =
+            *self.retry_to_m.get_or_insert((altitude_m + phases.retry_climb_m).min(self.ceiling_m));
         let (wanted, _) = self.guide.velocity(&self.situation(now, &vehicle));
         // The last half metre is flown ever more slowly.
         let climb_m_s = (2.0 * (to_m - altitude_m)).clamp(0.0, phases.retry_climb_m_s);

@@ -26,8 +26,8 @@ pub mod target;
 pub mod time;
 
 pub use config::{
-    AlarmAction, Config, ConfigError, EnvelopeConfig, EstimatorConfig, Guidance, MetricConfig, OnAbort, PhaseConfig,
-    TargetConfig, ThesisConfig,
+    AlarmAction, Config, ConfigError, EnvelopeConfig, EstimatorConfig, Guidance, MetricConfig,
+    OnAbort, PhaseConfig, TargetConfig, ThesisConfig,
 };
 pub use decision::{Action, Decision, Reason, Rejection, TargetEstimate};
 pub use event::{Alarm, Event, Frame, Landed, MarkerInFrame, Mode, OperatorCommand, VehicleState};

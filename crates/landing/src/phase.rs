@@ -12,8 +12,10 @@
 //!     Descend --> Retry: lost or not settling, its place known
 //!     Retry --> Approach: seen
 //!     Retry --> Search: not seen in time
-//!     Approach --> Hold: lost, no progress, no retry left
-//!     Descend --> Hold: lost, no progress, no retry left
+//!     Approach --> Hold: lost with its place, no progress
+//!     Descend --> Hold: lost with its place, no progress
+//!     Approach --> Aborted: no retry left
+//!     Descend --> Aborted: no retry left
 //!     Descend --> Final: a hand's breadth above the ground
 //!     Hold --> Search: seen, resumed, vehicle heard again
 //!     Hold --> Aborted: held too long
@@ -370,14 +372,16 @@ impl Machine {
         }
     }
 
-    /// Another try, while there is one left and the marker's place is known; otherwise a hold.
+    /// Another try while there is one left; a hold where the marker's place is not known either.
     fn again(&mut self, facts: &Facts, why: Reason) -> (Phase, Reason) {
-        if facts.target_known && self.retries < self.config.retries {
-            self.retries += 1;
-            (Phase::Retry, why)
-        } else {
-            (Phase::Hold, Reason::TargetLost)
+        if !facts.target_known {
+            return (Phase::Hold, Reason::TargetLost);
         }
+        if self.retries >= self.config.retries {
+            return (Phase::Aborted, Reason::RetriesUsed);
+        }
+        self.retries += 1;
+        (Phase::Retry, why)
     }
 
     fn after_retry(&self, facts: &Facts) -> Option<(Phase, Reason)> {
@@ -607,5 +611,221 @@ mod tests {
         let starting = Facts { operator: start().operator, ..rising(0.0) };
         check(&[starting, rising(0.1)], Phase::Search, Reason::TakingOff);
         check(&[starting, rising(30.0), at(31.0)], Phase::Search, Reason::Searching);
+    }
+
+    mod every_way {
+        //! Everything the machine can do: it is driven through every event of an alphabet from every state that it can be
+        //! in, where two states count as the same when phase, reason, flags, retries and the timeouts already over agree.
+
+        use super::*;
+        use std::collections::{HashMap, VecDeque};
+
+        /// What tells two states apart.
+        type Key = (Phase, Reason, bool, bool, u32, [bool; 4], bool);
+
+        const LONG_S: f64 = 1e6;
+
+        fn config() -> PhaseConfig {
+            PhaseConfig { retries: 2, on_battery_low: AlarmAction::Hold, ..PhaseConfig::default() }
+        }
+
+        fn now() -> Timestamp {
+            Timestamp::from_seconds(LONG_S)
+        }
+
+        fn key(machine: &Machine) -> Key {
+            let (config, elapsed_s) = (&machine.config, machine.elapsed_s(now()));
+            let over = [
+                elapsed_s > RETRY_REST_S,
+                elapsed_s > config.retry_timeout_s,
+                elapsed_s > config.search_timeout_s.min(config.hold_timeout_s),
+                elapsed_s > config.descend_timeout_s.max(config.operator_hold_timeout_s),
+            ];
+            let late = now().seconds_since(machine.started) > config.landing_timeout_s;
+            let terminal = machine.phase.is_terminal();
+            // The time spent in a terminal phase does not matter.
+            let (over, late) = if terminal { ([false; 4], false) } else { (over, late) };
+            let released = machine.phase == Phase::Aborted && machine.released;
+            let retries = if terminal { 0 } else { machine.retries };
+            (machine.phase, machine.why, machine.landing, released, retries, over, late)
+        }
+
+        /// The same machine, so much later, with its moments moved so that it is always the same time.
+        fn aged(machine: &Machine, seconds: f64) -> Machine {
+            let earlier = |moment: Timestamp| {
+                let age_s = (now().seconds_since(moment) + seconds).min(2000.0);
+                now().plus_seconds(-age_s)
+            };
+            Machine {
+                entered: earlier(machine.entered),
+                started: earlier(machine.started),
+                ..machine.clone()
+            }
+        }
+
+        fn vehicles() -> Vec<Option<VehicleFacts>> {
+            let change = |change: fn(&mut VehicleFacts)| {
+                let mut vehicle = FLYING;
+                change(&mut vehicle);
+                Some(vehicle)
+            };
+            vec![
+                None,
+                Some(FLYING),
+                change(|v| v.age_s = 1.0),
+                change(|v| v.mode = Mode::Land),
+                change(|v| (v.mode, v.altitude_m) = (Mode::Land, 0.4)),
+                change(|v| v.mode = Mode::Other),
+                change(|v| v.armed = false),
+                change(|v| (v.armed, v.landed) = (false, Landed::OnGround)),
+                change(|v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround)),
+                change(|v| v.landed = Landed::OnGround),
+                change(|v| (v.mode, v.landed) = (Mode::Land, Landed::OnGround)),
+                change(|v| v.landed = Landed::TakingOff),
+            ]
+        }
+
+        fn alphabet() -> Vec<Facts> {
+            let operators = [
+                None,
+                Some(OperatorCommand::Start),
+                Some(OperatorCommand::Hold),
+                Some(OperatorCommand::Resume),
+                Some(OperatorCommand::Abort),
+            ];
+            let alarms = [
+                None,
+                Some((AlarmAction::Hold, Reason::BatteryLow)),
+                Some((AlarmAction::Abort, Reason::OperatorLost)),
+                Some((AlarmAction::Land, Reason::BatteryCritical)),
+            ];
+            let progresses = [
+                Progress::Aligning,
+                Progress::Descending,
+                Progress::Blind,
+                Progress::Stuck,
+                Progress::Unchanged,
+                Progress::Ready(Reason::LowAndAligned),
+            ];
+            let mut all = Vec::new();
+            for vehicle in vehicles() {
+                for operator in operators {
+                    for alarm in alarms {
+                        // A command and an alarm never come as one event.
+                        if operator.is_some() && alarm.is_some() {
+                            continue;
+                        }
+                        for progress in progresses {
+                            for (target_age_s, target_known) in
+                                [(0.1, true), (0.7, true), (5.0, true), (5.0, false)]
+                            {
+                                all.push(Facts {
+                                    now: now(),
+                                    operator,
+                                    alarm,
+                                    vehicle,
+                                    target_age_s,
+                                    target_confirmed: true,
+                                    target_known,
+                                    progress,
+                                });
+                            }
+                        }
+                    }
+                }
+            }
+            all
+        }
+
+        /// What holds for every single step.
+        fn check_step(before: &Machine, facts: &Facts, after: &Machine) {
+            let (from, to) = (before.phase, after.phase);
+            let told = format!("{from} to {to} after {facts:?}");
+            if from.is_terminal() {
+                let started = facts.operator == Some(OperatorCommand::Start);
+                assert!(from == to || started, "left by itself: {told}");
+                return;
+            }
+            let vehicle = facts.vehicle;
+            if vehicle.is_some_and(|v| v.mode == Mode::Other) {
+                assert_eq!(to, Phase::PilotInCommand, "the pilot is not obeyed: {told}");
+                return;
+            }
+            if to == Phase::Descend && from != Phase::Descend {
+                let seen = facts.target_age_s <= before.config.lost_target_s;
+                assert!(seen || facts.progress == Progress::Blind, "descends blindly: {told}");
+                assert!(vehicle.is_some_and(|v| v.age_s < 0.5), "descends deaf: {told}");
+            }
+            if to == Phase::Landed {
+                assert!(
+                    vehicle.is_some_and(|v| !v.armed || v.landed == Landed::OnGround),
+                    "{told}"
+                );
+            }
+            if facts.operator == Some(OperatorCommand::Abort) {
+                assert!(to.is_terminal(), "an abort is not obeyed: {told}");
+            }
+            assert!(after.retries <= before.config.retries, "too many retries: {told}");
+        }
+
+        #[test]
+        fn no_way_through_the_machine_is_wrong_or_endless() {
+            let alphabet = alphabet();
+            let first = aged(&Machine::new(config()), 10.0);
+            let mut found = HashMap::from([(key(&first), first.clone())]);
+            let mut open = VecDeque::from([first]);
+            let mut steps = 0u64;
+            while let Some(machine) = open.pop_front() {
+                for wait_s in [0.0, 3.0, 10.0, 65.0, 200.0, 400.0] {
+                    let waited = aged(&machine, wait_s);
+                    for facts in &alphabet {
+                        let mut after = waited.clone();
+                        after.advance(facts);
+                        check_step(&waited, facts, &after);
+                        steps += 1;
+                        let key = key(&after);
+                        if !found.contains_key(&key) {
+                            found.insert(key, after.clone());
+                            open.push_back(after);
+                        }
+                    }
+                }
+            }
+            for phase in [
+                Phase::Idle,
+                Phase::Search,
+                Phase::Approach,
+                Phase::Descend,
+                Phase::Retry,
+                Phase::Final,
+                Phase::Landed,
+                Phase::Hold,
+                Phase::Aborted,
+                Phase::PilotInCommand,
+            ] {
+                assert!(found.values().any(|m| m.phase == phase), "{phase} is never reached");
+            }
+            println!("{} states, {steps} steps", found.len());
+            for machine in found.values() {
+                assert!(ends(machine), "does not end: {machine:?}");
+            }
+        }
+
+        /// Left alone with a vehicle that flies or lands as asked, whatever state it is in ends.
+        fn ends(machine: &Machine) -> bool {
+            let mut machine = machine.clone();
+            for _ in 0..200 {
+                if machine.phase.is_terminal() {
+                    return true;
+                }
+                let mut vehicle = FLYING;
+                if machine.landing {
+                    vehicle.mode = Mode::Land;
+                }
+                machine = aged(&machine, 5.0);
+                machine.advance(&Facts { vehicle: Some(vehicle), now: now(), ..at(0.0) });
+            }
+            false
+        }
     }
 }

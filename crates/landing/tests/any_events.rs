@@ -3,8 +3,8 @@
 
 use geometry::{Body, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
-    Action, Config, Event, Frame, Guidance, Landed, Lander, MarkerInFrame, Mode, OperatorCommand,
-    Phase, ThesisConfig, Timestamp, VehicleState,
+    Action, Alarm, Config, Event, Frame, Guidance, Landed, Lander, MarkerInFrame, Mode,
+    OperatorCommand, Phase, ThesisConfig, Timestamp, VehicleState,
 };
 use proptest::prelude::*;
 
@@ -33,6 +33,7 @@ enum Kind {
         width: u32,
     },
     Operator(OperatorCommand),
+    Alarm(Alarm),
     Tick,
     /// The vehicle is near the pad, and the camera sees it.
     Usual {
@@ -95,12 +96,17 @@ fn operator() -> impl Strategy<Value = Kind> {
     .prop_map(Kind::Operator)
 }
 
+fn alarm() -> impl Strategy<Value = Kind> {
+    prop_oneof![Just(Alarm::BatteryLow), Just(Alarm::BatteryCritical), Just(Alarm::OperatorLost)]
+        .prop_map(Kind::Alarm)
+}
+
 fn happening() -> impl Strategy<Value = Happening> {
     let after_s = prop_oneof![200 => 0.0..0.08f64, 3 => 0.0..2.0f64, 1 => -1.0..200.0f64];
     let usual =
         (-0.3..0.3f64, 0.3..6.0f64).prop_map(|(north, height_m)| Kind::Usual { north, height_m });
     let event = prop_oneof![
-        200 => usual, 15 => vehicle(), 10 => frame(), 1 => operator(), 20 => Just(Kind::Tick)
+        200 => usual, 15 => vehicle(), 10 => frame(), 1 => operator(), 1 => alarm(), 20 => Just(Kind::Tick)
     ];
     (after_s, event).prop_map(|(after_s, event)| Happening { after_s, event })
 }
@@ -126,6 +132,7 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
     match *kind {
         Kind::Tick | Kind::Usual { .. } => Event::Tick,
         Kind::Operator(command) => Event::Operator(command),
+        Kind::Alarm(alarm) => Event::Alarm(alarm),
         Kind::Vehicle { age_s, position: p, velocity: v, mode, armed, landed } => {
             Event::Vehicle(VehicleState {
                 stamp: now.plus_seconds(-age_s),
@@ -195,7 +202,11 @@ impl Watcher {
                 prop_assert!(velocity.z() >= -config.envelope.climb_m_s);
                 prop_assert!(velocity.z() <= config.envelope.descend_m_s);
                 if velocity.z() > 0.0 {
-                    prop_assert!(matches!(decision.phase, Phase::Approach | Phase::Descend));
+                    // Our own guidance flies on while LAND is awaited.
+                    prop_assert!(matches!(
+                        decision.phase,
+                        Phase::Approach | Phase::Descend | Phase::Final
+                    ));
                     self.may_descend(config, now, decision.target.map(|t| t.height_m))?;
                 }
             }
@@ -211,12 +222,12 @@ impl Watcher {
     ) -> Result<(), TestCaseError> {
         let age_s = self.newest_marker.map_or(f64::INFINITY, |stamp| now.seconds_since(stamp));
         let phases = &config.phases;
-        prop_assert!(
-            age_s <= phases.stale_target_s + phases.low_grace_s + 1e-6,
-            "descends at age {}",
-            age_s
-        );
-        if height_m.is_some_and(|height_m| height_m > phases.low_height_m) {
+        let (low_m, grace_s) = match config.guidance {
+            Guidance::Thesis(_) => (phases.low_height_m, phases.low_grace_s),
+            Guidance::Metric(metric) => (metric.blind_height_m, metric.blind_s),
+        };
+        prop_assert!(age_s <= phases.stale_target_s + grace_s + 1e-6, "descends at age {}", age_s);
+        if height_m.is_some_and(|height_m| height_m > low_m) {
             prop_assert!(age_s <= phases.stale_target_s + 1e-6, "descends at age {}", age_s);
         }
         Ok(())

@@ -22,9 +22,10 @@ fn mix(hash: u64, decision: &Decision) -> u64 {
     let words = numbers.into_iter().flat_map(u64::to_le_bytes);
     let names = decision.phase.name().bytes().chain(decision.why.name().bytes());
     let rejected = decision.rejected.map_or("", |rejection| rejection.name()).bytes();
-    words.chain(names).chain(rejected).fold(hash, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-    })
+    words
+        .chain(names)
+        .chain(rejected)
+        .fold(hash, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3))
 }
 
 /// A flight that happens whatever is decided: a swaying descent over the pad, with gaps and an outlier.
@@ -54,7 +55,8 @@ fn events(i: u32) -> (Timestamp, Vec<Event>) {
     }
     if i.is_multiple_of(3) {
         let beside = if i == 600 { 1.0 } else { 0.0 };
-        let in_body = ned_from_body.inverse() * Vector::new(0.4 + beside - position.x(), -0.3 - position.y(), height_m);
+        let in_body = ned_from_body.inverse()
+            * Vector::new(0.4 + beside - position.x(), -0.3 - position.y(), height_m);
         let seen = !i.is_multiple_of(30) && !(900..960).contains(&i);
         let marker = seen.then(|| MarkerInFrame {
             centre: Pixel::new(

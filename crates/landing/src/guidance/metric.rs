@@ -234,9 +234,9 @@ impl Metric {
 
     /// True when the target's place is good enough to fly to where it must be seen.
     pub fn knows(&self, situation: &Situation<'_>) -> bool {
-        situation.target.is_some_and(|target| {
-            target.deviation_m <= KNOWN_M && target.age_s <= KNOWN_S
-        })
+        situation
+            .target
+            .is_some_and(|target| target.deviation_m <= KNOWN_M && target.age_s <= KNOWN_S)
     }
 
     fn sees(&self, situation: &Situation<'_>) -> bool {
@@ -264,7 +264,11 @@ impl Metric {
         let height_m = self.height_m(&target);
         let outside = self.outside(situation, &target);
         if height_m <= self.config.land_height_m && outside < 1.0 {
-            return Progress::Ready(if seen { Reason::LowAndAligned } else { Reason::LowAndUnseen });
+            return Progress::Ready(if seen {
+                Reason::LowAndAligned
+            } else {
+                Reason::LowAndUnseen
+            });
         }
         let waited_s = self.waiting_since.map_or(0.0, |since| situation.now.seconds_since(since));
         if waited_s > 2.0 * self.config.settle_s && outside >= 1.0 {
@@ -272,7 +276,9 @@ impl Metric {
         }
         match (seen, outside) {
             (true, outside) if outside < 1.0 => Progress::Descending,
-            (true, outside) if outside > FUNNEL_HYSTERESIS && height_m > LOW_M => Progress::Aligning,
+            (true, outside) if outside > FUNNEL_HYSTERESIS && height_m > LOW_M => {
+                Progress::Aligning
+            }
             (true, _) => Progress::Unchanged,
             (false, _) => Progress::Blind,
         }
@@ -332,8 +338,8 @@ impl Metric {
         let gap_s = situation.vehicle.stamp.seconds_since(stamp);
         if gap_s > 1e-3 {
             let slope = flat(situation.vehicle.velocity - velocity) * (1.0 / gap_s);
-            memory.acceleration = memory.acceleration
-                + (slope - memory.acceleration) * (gap_s / (SLOPE_S + gap_s));
+            memory.acceleration =
+                memory.acceleration + (slope - memory.acceleration) * (gap_s / (SLOPE_S + gap_s));
             memory.moved = (situation.vehicle.stamp, situation.vehicle.velocity);
         }
         memory.path.pass(step_s, memory.setpoint);
@@ -443,13 +449,10 @@ impl Metric {
         let closing = closing + memory.acceleration * lead_s;
         let left_m = left.norm();
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
-        let speed_m_s =
-            (config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
+        let speed_m_s = (config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
         let wanted = if left_m > 1e-9 { left * (speed_m_s / left_m) } else { Vector::zero() };
-        let acceleration = shortened(
-            (wanted - closing) * config.velocity_gain,
-            config.lateral_acceleration_m_s2,
-        );
+        let acceleration =
+            shortened((wanted - closing) * config.velocity_gain, config.lateral_acceleration_m_s2);
         shortened(
             memory.path.velocity() + acceleration * PATH_TIME_S,
             config.max_lateral_m_s + config.max_pad_m_s,
@@ -477,7 +480,8 @@ impl Metric {
             Reason::DescendingUnseen
         };
         let sinking_m_s = (situation.vehicle.velocity.z() - target.velocity.z()).max(0.0);
-        let ahead_m = self.height_m(target) - config.land_height_m
+        let ahead_m = self.height_m(target)
+            - config.land_height_m
             - (sinking_m_s - config.touch_descend_m_s).max(0.0) * config.descend_lag_s;
         let slowest = config.touch_descend_m_s;
         let brakes = slowest.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);

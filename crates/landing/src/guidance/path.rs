@@ -96,7 +96,7 @@ mod tests {
         path.pass(5.0, steady);
         assert!((path.velocity() - steady).norm() < 1e-9);
         let mut before = path.velocity();
-        for _ in 0..500 {
+        for _ in 0..1200 {
             path.pass(STEP_S, Vector::new(-5.0, 5.0, 0.0));
             assert!((path.velocity() - before).norm() <= 1.01 * ACCELERATION * STEP_S);
             before = path.velocity();

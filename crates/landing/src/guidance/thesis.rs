@@ -243,7 +243,13 @@ mod tests {
             size_px: None,
             confidence: 1.0,
         });
-        Frame { stamp: Timestamp::default(), detector: 0, image_size: (1296, 972), focal_px: None, marker }
+        Frame {
+            stamp: Timestamp::default(),
+            detector: 0,
+            image_size: (1296, 972),
+            focal_px: None,
+            marker,
+        }
     }
 
     fn calm() -> ThesisConfig {

@@ -30,7 +30,8 @@ pub(crate) struct Gust {
 }
 
 impl Wind {
-    pub(crate) const CALM: Self = Self { mean_m_s: 0.0, from_rad: 0.0, turbulence: 0.0, gust: None };
+    pub(crate) const CALM: Self =
+        Self { mean_m_s: 0.0, from_rad: 0.0, turbulence: 0.0, gust: None };
 
     pub(crate) fn new(mean_m_s: f64, turbulence: f64, from_rad: f64) -> Self {
         Self { mean_m_s, from_rad, turbulence, gust: None }
@@ -66,7 +67,11 @@ impl Air {
         self.wind.gust.map_or(0.0, |gust| {
             let part = (now_s - gust.start_s) / gust.length_s;
             let inside = (0.0..1.0).contains(&part);
-            if inside { 0.5 * gust.peak_m_s * (1.0 - (part * std::f64::consts::TAU).cos()) } else { 0.0 }
+            if inside {
+                0.5 * gust.peak_m_s * (1.0 - (part * std::f64::consts::TAU).cos())
+            } else {
+                0.0
+            }
         })
     }
 
@@ -89,8 +94,8 @@ impl Air {
             let once = source.step(dt_s, paces[i], &mut self.random);
             self.lagged[i] += (once - self.lagged[i]) * lag(dt_s, paces[i]);
             let root3 = 3.0f64.sqrt();
-            filtered[i] = (root3 * once + (1.0 - root3) * self.lagged[i])
-                * std::f64::consts::FRAC_1_SQRT_2;
+            filtered[i] =
+                (root3 * once + (1.0 - root3) * self.lagged[i]) * std::f64::consts::FRAC_1_SQRT_2;
         }
         [level * along, level * filtered[0], vertical * filtered[1]]
     }

@@ -31,6 +31,7 @@ pub(crate) struct Estimator {
 
 impl Estimator {
     pub(crate) const USUAL: Self = Self { scale: 1.0, gnss_drift: [0.0; 2], gnss_jump: None };
+    pub(crate) const PERFECT: Self = Self { scale: 0.0, ..Self::USUAL };
 }
 
 /// What is believed of the motion.

@@ -38,6 +38,8 @@ pub(crate) struct Faults {
     pub(crate) outage_s: Option<(f64, f64)>,
     /// No frame arrives from the first time below this height on, for so long.
     pub(crate) outage_below_m: Option<(f64, f64)>,
+    /// The marker is not seen from below this height.
+    pub(crate) blind_below_m: f64,
     /// Between these seconds the marker is reported beside its place by this much, in metres northwards.
     pub(crate) lie: Option<(f64, f64, f64)>,
     /// Part of the frames in which another marker, so far to the east, is taken for ours.
@@ -55,6 +57,7 @@ impl Faults {
         duplicate: 0.0,
         outage_s: None,
         outage_below_m: None,
+        blind_below_m: 0.0,
         lie: None,
         wrong: None,
         stamp_jumps: None,
@@ -114,7 +117,13 @@ impl Eyes {
         self.on_the_way.insert(place, (arrives_s, frame));
     }
 
-    fn is_dark(&mut self, scene: &Scene, now_s: f64, vehicle: &Multirotor, pad: Point<Ned>) -> bool {
+    fn is_dark(
+        &mut self,
+        scene: &Scene,
+        now_s: f64,
+        vehicle: &Multirotor,
+        pad: Point<Ned>,
+    ) -> bool {
         let faults = &scene.faults;
         if let Some((below_m, for_s)) = faults.outage_below_m {
             if pad.z() - vehicle.position.z() < below_m {
@@ -181,12 +190,12 @@ impl Eyes {
         let project = |v: Vector<Body>| model.project(Point::new(v.y(), -v.x(), v.z()));
         let half = 0.5 * MARKER_M * scene.marker_scale;
         let inside = |pixel: Pixel| {
-            (0.0..f64::from(WIDTH)).contains(&pixel.x) && (0.0..f64::from(HEIGHT)).contains(&pixel.y)
+            (0.0..f64::from(WIDTH)).contains(&pixel.x)
+                && (0.0..f64::from(HEIGHT)).contains(&pixel.y)
         };
         let corners = [(-half, -half), (-half, half), (half, -half), (half, half)];
-        let whole = corners
-            .iter()
-            .all(|(n, e)| project(see(Vector::new(*n, *e, 0.0))).is_some_and(inside));
+        let whole =
+            corners.iter().all(|(n, e)| project(see(Vector::new(*n, *e, 0.0))).is_some_and(inside));
         let centre = see(Vector::zero());
         let pixel = project(centre)?;
         let random = &mut self.random;
@@ -194,7 +203,8 @@ impl Eyes {
         let noise = [(); 3].map(|()| normal(random));
         let size_px = 2.0 * half * FOCAL_PX / centre.z();
         let seen = (2.0 * size_px / SMALL_PX - 1.0).clamp(0.0, 1.0) * (1.0 - scene.faults.miss);
-        if !whole || luck >= seen {
+        let low = centre.z() < scene.faults.blind_below_m;
+        if !whole || low || luck >= seen {
             return None;
         }
         let pixel =
@@ -205,18 +215,22 @@ impl Eyes {
         let range = centre.z() * (1.0 + part * noise[2]) * (1.0 + scene.faults.size_error);
         let from_camera = ray * (range / ray.z());
         let place = from_camera + mount;
-        let heading = body_from_ned * Rotation::<Ned, Marker>::from_euler(
-            std::f64::consts::PI,
-            0.0,
-            pad_yaw + std::f64::consts::FRAC_PI_2,
-        );
+        let heading = body_from_ned
+            * Rotation::<Ned, Marker>::from_euler(
+                std::f64::consts::PI,
+                0.0,
+                pad_yaw + std::f64::consts::FRAC_PI_2,
+            );
         let sideways = (centre.z() * CENTRE_NOISE_PX / FOCAL_PX).powi(2);
         let along = from_camera.coords / from_camera.coords.z;
         let covariance = Matrix3::from_diagonal(&[sideways, sideways, 0.0].into())
             + along * along.transpose() * (centre.z() * part).powi(2);
         Some(MarkerInFrame {
             centre: pixel,
-            body_from_marker: Some(Transform::new(heading, Point::new(place.x(), place.y(), place.z()))),
+            body_from_marker: Some(Transform::new(
+                heading,
+                Point::new(place.x(), place.y(), place.z()),
+            )),
             alternative: None,
             covariance_m2: scene.tells_covariance.then_some(covariance),
             size_px: Some(size_px),
@@ -228,6 +242,7 @@ impl Eyes {
 /// The marker, reported so many metres north of its place.
 fn lying(marker: MarkerInFrame, vehicle: &Multirotor, metres: f64) -> MarkerInFrame {
     let moved = vehicle.ned_from_body().inverse() * Vector::new(metres, 0.0, 0.0);
-    let lie = |pose: Transform<Body, Marker>| Transform::new(pose.rotation(), pose.origin() + moved);
+    let lie =
+        |pose: Transform<Body, Marker>| Transform::new(pose.rotation(), pose.origin() + moved);
     MarkerInFrame { body_from_marker: marker.body_from_marker.map(lie), ..marker }
 }

@@ -14,9 +14,7 @@ pub(crate) mod report;
 use std::collections::VecDeque;
 
 use geometry::{Ned, Point, Vector};
-use landing::{
-    Action, Config, Decision, Event, Lander, OperatorCommand, Phase, Timestamp,
-};
+use landing::{Action, Config, Decision, Event, Lander, OperatorCommand, Phase, Timestamp};
 
 use air::{Air, Wind};
 use autopilot::{Autopilot, Estimator, Packet};
@@ -126,11 +124,7 @@ impl Scene {
             start: Point::new(0.0, 0.0, -10.0),
             heading_rad: 0.0,
             pad: Point::new(1.5, -1.5, 0.0),
-            pad_motion: PadMotion {
-                velocity: Vector::zero(),
-                heave: (0.0, 5.0),
-                yaw: (0.0, 0.0),
-            },
+            pad_motion: PadMotion { velocity: Vector::zero(), heave: (0.0, 5.0), yaw: (0.0, 0.0) },
             wind: Wind::CALM,
             estimator: Estimator::USUAL,
             faults: Faults::USUAL,

@@ -86,7 +86,8 @@ impl Multirotor {
             self.position = Point::new(moved.x(), moved.y(), ground_z);
             return;
         }
-        self.thrust += (demand.thrust.clamp(0.0, 2.0 * GRAVITY) - self.thrust) * lag(dt_s, THRUST_LAG_S);
+        self.thrust +=
+            (demand.thrust.clamp(0.0, 2.0 * GRAVITY) - self.thrust) * lag(dt_s, THRUST_LAG_S);
         for (i, wanted) in [demand.roll, demand.pitch].into_iter().enumerate() {
             let wanted = wanted + self.unsteadiness[i].step(dt_s, 0.5, &mut self.random);
             let [target, angle] = &mut self.lean[i];
