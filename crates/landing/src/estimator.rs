@@ -252,7 +252,7 @@ impl Estimator {
         if nis > self.config.gate {
             return self.rival(sight);
         }
-        self.rival = None;
+        self.doubt();
         belief.update(&self.config, &sight);
         self.detections = self.detections.saturating_add(1);
         if self.past.len() == MEMORY {
@@ -278,6 +278,14 @@ impl Estimator {
         }
     }
 
+    /// What agrees with the estimate speaks against its rival, as much as one detection speaks for it.
+    fn doubt(&mut self) {
+        self.rival = self.rival.and_then(|rival| {
+            let detections = rival.detections.saturating_sub(1);
+            (detections > 0).then_some(Rival { detections, ..rival })
+        });
+    }
+
     fn begin(&mut self, sight: Sight) {
         let mut belief = Belief::new(&self.config, sight.place);
         belief.update(&self.config, &sight);
@@ -288,8 +296,8 @@ impl Estimator {
         self.rival = None;
     }
 
-    /// Outliers that agree become the estimate once there are enough of them over a long enough time; an estimate that
-    /// was itself hardly begun gives way at once.
+    /// Outliers that agree become the estimate once there are enough more of them than of detections that confirm it, over a
+    /// long enough time; an estimate that was itself hardly begun gives way at once.
     fn rival(&mut self, sight: Sight) -> Result<(), Rejection> {
         let agrees = |rival: &Rival| {
             let gap_s = sight.stamp.seconds_since(rival.newest.stamp);

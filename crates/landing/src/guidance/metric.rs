@@ -23,7 +23,7 @@ use serde::Deserialize;
 
 use crate::config::{ConfigError, check};
 use crate::decision::{Reason, TargetEstimate};
-use crate::guidance::path::{PATH_TIME_S, Path};
+use crate::guidance::path::{JERK, PATH_TIME_S, Path};
 use crate::guidance::{Progress, Situation};
 use crate::time::Timestamp;
 
@@ -59,6 +59,11 @@ pub struct MetricConfig {
     pub funnel_per_height: f64,
     /// Age of the target up to which the descent is not slowed, in s (0 to 5).
     pub fresh_target_s: f64,
+    /// Age of the target beyond which nothing descends, in s (0.1 to 5).
+    pub stale_target_s: f64,
+    /// A vehicle that no longer gets any setpoint is not to reach the ground faster than at `touch_descend_m_s` within this
+    /// time, in s (0.1 to 10).
+    pub silence_s: f64,
     /// Height over the target at which LAND takes over, in m (0.02 to 5).
     pub land_height_m: f64,
     /// Height of the body's origin over the pad when the vehicle stands on it, in m (-1 to 2).
@@ -104,7 +109,9 @@ impl Default for MetricConfig {
             descend_acceleration_m_s2: 2.0,
             funnel_m: 0.08,
             funnel_per_height: 0.25,
-            fresh_target_s: 0.3,
+            fresh_target_s: 0.5,
+            stale_target_s: 0.7,
+            silence_s: 1.8,
             land_height_m: 0.08,
             standing_height_m: 0.0,
             settle_s: 5.0,
@@ -138,6 +145,8 @@ impl MetricConfig {
         check("metric.funnel_m", self.funnel_m, 0.02, 5.0)?;
         check("metric.funnel_per_height", self.funnel_per_height, 0.0, 2.0)?;
         check("metric.fresh_target_s", self.fresh_target_s, 0.0, 5.0)?;
+        check("metric.stale_target_s", self.stale_target_s, 0.1, 5.0)?;
+        check("metric.silence_s", self.silence_s, 0.1, 10.0)?;
         check("metric.land_height_m", self.land_height_m, 0.02, 5.0)?;
         check("metric.standing_height_m", self.standing_height_m, -1.0, 2.0)?;
         check("metric.settle_s", self.settle_s, 0.1, 60.0)?;
@@ -240,13 +249,13 @@ impl Metric {
     }
 
     fn sees(&self, situation: &Situation<'_>) -> bool {
-        situation.age_s <= situation.phases.stale_target_s
+        situation.age_s <= self.config.stale_target_s
     }
 
     fn is_blind_but_sure(&self, situation: &Situation<'_>) -> bool {
         situation.target.is_some_and(|target| {
             self.height_m(&target) <= self.config.blind_height_m
-                && situation.age_s <= situation.phases.stale_target_s + self.config.blind_s
+                && situation.age_s <= self.config.stale_target_s + self.config.blind_s
                 && target.deviation_m <= self.config.blind_deviation_m
         })
     }
@@ -446,7 +455,11 @@ impl Metric {
         let left = self.error(situation, target)
             - closing * config.dead_time_s
             - memory.acceleration * (0.5 * lead_s.powi(2));
-        let closing = closing + memory.acceleration * lead_s;
+        // While the autopilot takes its acceleration back, within its jerk, the speed goes on growing.
+        let fading = memory.path.acceleration();
+        let closing = closing
+            + memory.acceleration * lead_s
+            + fading * (fading.norm() / (2.0 * JERK));
         let left_m = left.norm();
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
         let speed_m_s = (config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
@@ -485,12 +498,13 @@ impl Metric {
             - (sinking_m_s - config.touch_descend_m_s).max(0.0) * config.descend_lag_s;
         let slowest = config.touch_descend_m_s;
         let brakes = slowest.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);
-        (brakes.sqrt().min(config.max_descend_m_s) * centred * fresh, why)
+        let silent_m_s = (self.height_m(target) / config.silence_s).max(slowest);
+        (brakes.sqrt().min(silent_m_s).min(config.max_descend_m_s) * centred * fresh, why)
     }
 
     /// From 1 for a fresh target to 0 for a stale one; low above a well-known target it makes no difference.
     fn freshness(&self, situation: &Situation<'_>) -> f64 {
-        let (fresh_s, stale_s) = (self.config.fresh_target_s, situation.phases.stale_target_s);
+        let (fresh_s, stale_s) = (self.config.fresh_target_s, self.config.stale_target_s);
         if self.is_blind_but_sure(situation) || fresh_s >= stale_s {
             return 1.0;
         }

@@ -13,7 +13,7 @@ const STEP_S: f64 = 0.005;
 const SETPOINT_LAG_S: f64 = 0.06;
 /// Limits of the path: WPNAV_ACCEL in m/s^2 and PSC_JERK_XY in m/s^3.
 const ACCELERATION: f64 = 2.5;
-const JERK: f64 = 5.0;
+pub(super) const JERK: f64 = 5.0;
 
 /// Time constant with which the path goes towards a setpoint, in seconds.
 pub(super) const PATH_TIME_S: f64 = ACCELERATION / JERK;

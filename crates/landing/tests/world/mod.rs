@@ -6,6 +6,7 @@
 
 pub(crate) mod air;
 pub(crate) mod autopilot;
+pub(crate) mod cases;
 pub(crate) mod chance;
 pub(crate) mod eyes;
 pub(crate) mod multirotor;
