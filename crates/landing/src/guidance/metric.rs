@@ -96,14 +96,14 @@ pub struct MetricConfig {
 impl Default for MetricConfig {
     fn default() -> Self {
         Self {
-            lateral_gain: 1.7,
-            velocity_gain: 4.0,
+            lateral_gain: 1.8,
+            velocity_gain: 4.5,
             max_lateral_m_s: 2.0,
             lateral_acceleration_m_s2: 1.2,
             dead_time_s: 0.3,
             acceleration_lead_s: 0.1,
             max_descend_m_s: 2.0,
-            touch_descend_m_s: 0.4,
+            touch_descend_m_s: 0.45,
             descend_braking_m_s2: 0.5,
             descend_lag_s: 0.45,
             descend_acceleration_m_s2: 2.0,
@@ -111,8 +111,8 @@ impl Default for MetricConfig {
             funnel_per_height: 0.25,
             fresh_target_s: 0.5,
             stale_target_s: 0.7,
-            silence_s: 1.8,
-            land_height_m: 0.08,
+            silence_s: 1.5,
+            land_height_m: 0.06,
             standing_height_m: 0.0,
             settle_s: 5.0,
             blind_error_m: 0.15,
