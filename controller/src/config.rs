@@ -1,7 +1,10 @@
 //! The controller's configuration.
 
 use autopilot::Address;
-use landing::{EnvelopeConfig, Guidance, MetricConfig, PhaseConfig, TargetConfig, ThesisConfig};
+use landing::{
+    EnvelopeConfig, EstimatorConfig, Guidance, MetricConfig, PhaseConfig, TargetConfig,
+    ThesisConfig,
+};
 use node::{Check, Settings};
 use serde::Deserialize;
 
@@ -23,8 +26,10 @@ pub struct Config {
     pub autopilot: AutopilotSettings,
     /// The choice of the detector.
     pub detectors: DetectorSettings,
-    /// How detections become a target.
+    /// Which detections are used at all.
     pub target: TargetConfig,
+    /// How detections become a target.
+    pub estimator: EstimatorConfig,
     /// What no setpoint exceeds.
     pub envelope: EnvelopeConfig,
     /// When the phases end.
@@ -121,6 +126,7 @@ impl Config {
         landing::Config {
             guidance,
             target: self.target,
+            estimator: self.estimator,
             envelope: self.envelope,
             phases: self.phases,
         }

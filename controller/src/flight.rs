@@ -142,6 +142,10 @@ impl Flight {
             stamp: Timestamp::from_nanos(header.stamp_ns),
             detector: 0,
             image_size: (header.width, header.height),
+            focal_px: self.cameras.get(&header.camera).and_then(|info| {
+                let scale = f64::from(header.width) / f64::from(info.width.max(1));
+                info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
+            }),
             marker,
         };
         let sent_before = self.setpoint_ns;

@@ -1,9 +1,10 @@
 //! Between messages, the autopilot's types and the lander's types.
 
 use autopilot::{FlightMode, VehicleState};
-use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform};
+use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform, Vector};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp};
-use messages::{CameraInfo, Detection, Detections, Transform3};
+use messages::{CameraInfo, Detection, Detections, MarkerPose, Transform3};
+use nalgebra::Matrix3;
 
 /// Attitude and position further apart than this are not of one moment: one of the two has stopped.
 const MOST_APART_NS: i64 = 300_000_000;
@@ -50,11 +51,31 @@ pub fn marker_in_frame(
     detection: &Detection,
     mount: Option<Transform<Body, Camera>>,
 ) -> MarkerInFrame {
-    let camera_from_marker: Option<Transform<Camera, Marker>> =
-        detection.pose.as_ref().and_then(|pose| transform(&pose.camera_from_marker));
-    let body_from_marker = mount.zip(camera_from_marker).map(|(mount, pose)| mount * pose);
+    let in_body = |pose: &Transform3| -> Option<Transform<Body, Marker>> {
+        mount.zip(transform(pose)).map(|(mount, pose): (_, Transform<Camera, Marker>)| mount * pose)
+    };
+    let pose = detection.pose.as_ref();
     let [x, y] = detection.centre_px;
-    MarkerInFrame { centre: Pixel::new(x, y), body_from_marker, confidence: detection.confidence }
+    MarkerInFrame {
+        centre: Pixel::new(x, y),
+        body_from_marker: pose.and_then(|pose| in_body(&pose.camera_from_marker)),
+        alternative: pose
+            .and_then(|pose| pose.alternative.as_ref())
+            .and_then(|other| in_body(&other.camera_from_marker)),
+        covariance_m2: mount.zip(pose).map(|(mount, pose)| covariance_in_body(&mount, pose)),
+        size_px: Some(detection.size_px),
+        confidence: detection.confidence,
+    }
+}
+
+/// Covariance of a marker's place, from the camera's axes to the body's.
+fn covariance_in_body(mount: &Transform<Body, Camera>, pose: &MarkerPose) -> Matrix3<f64> {
+    let [xx, xy, xz, _, _, _, yy, yz, _, _, _, zz, ..] = pose.covariance.map(f64::from);
+    let in_camera = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
+    let axis = |x, y, z| (mount.rotation() * Vector::<Camera>::new(x, y, z)).coords;
+    let turn =
+        Matrix3::from_columns(&[axis(1.0, 0.0, 0.0), axis(0.0, 1.0, 0.0), axis(0.0, 0.0, 1.0)]);
+    turn * in_camera * turn.transpose()
 }
 
 /// The vehicle as the lander sees it: attitude and position at one moment, that of the newer of the two; `None` when

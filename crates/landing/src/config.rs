@@ -98,6 +98,8 @@ pub struct EstimatorConfig {
     pub direction_noise_rad: f64,
     /// Noise of the range as a part of it, where the marker's size in the image is not told (0.0001 to 0.5).
     pub range_noise_part: f64,
+    /// What the range is wrong by as a part of it, beside what the detector tells (0 to 0.1).
+    pub range_floor_part: f64,
     /// Fast noise of the attitude at an exposure, in rad (0.00001 to 0.1).
     pub attitude_noise_rad: f64,
     /// Fast noise of the autopilot's position, in m (0.0001 to 1).
@@ -148,6 +150,7 @@ impl Default for EstimatorConfig {
             pixel_noise_px: 0.3,
             direction_noise_rad: 0.0003,
             range_noise_part: 0.015,
+            range_floor_part: 0.002,
             attitude_noise_rad: 0.0003,
             position_noise_m: 0.002,
             way_noise_m: 0.01,
@@ -382,6 +385,7 @@ impl EstimatorConfig {
         check("estimator.pixel_noise_px", self.pixel_noise_px, 0.01, 10.0)?;
         check("estimator.direction_noise_rad", self.direction_noise_rad, 1e-5, 0.1)?;
         check("estimator.range_noise_part", self.range_noise_part, 1e-4, 0.5)?;
+        check("estimator.range_floor_part", self.range_floor_part, 0.0, 0.1)?;
         check("estimator.attitude_noise_rad", self.attitude_noise_rad, 1e-5, 0.1)?;
         check("estimator.position_noise_m", self.position_noise_m, 1e-4, 1.0)?;
         check("estimator.way_noise_m", self.way_noise_m, 0.0, 1.0)?;

@@ -224,7 +224,9 @@ impl Watcher {
         let phases = &config.phases;
         let (low_m, grace_s, stale_s) = match config.guidance {
             Guidance::Thesis(_) => (phases.low_height_m, phases.low_grace_s, phases.stale_target_s),
-            Guidance::Metric(metric) => (metric.blind_height_m, metric.blind_s, metric.stale_target_s),
+            Guidance::Metric(metric) => {
+                (metric.blind_height_m, metric.blind_s, metric.stale_target_s)
+            }
         };
         prop_assert!(age_s <= stale_s + grace_s + 1e-6, "descends at age {}", age_s);
         if height_m.is_some_and(|height_m| height_m > low_m) {

@@ -457,9 +457,8 @@ impl Metric {
             - memory.acceleration * (0.5 * lead_s.powi(2));
         // While the autopilot takes its acceleration back, within its jerk, the speed goes on growing.
         let fading = memory.path.acceleration();
-        let closing = closing
-            + memory.acceleration * lead_s
-            + fading * (fading.norm() / (2.0 * JERK));
+        let closing =
+            closing + memory.acceleration * lead_s + fading * (fading.norm() / (2.0 * JERK));
         let left_m = left.norm();
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
         let speed_m_s = (config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
