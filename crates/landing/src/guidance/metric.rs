@@ -173,6 +173,9 @@ const BRAKING: f64 = 0.7;
 const KNOWN_M: f64 = 0.5;
 const KNOWN_S: f64 = 20.0;
 
+/// A pad slower than this lies still, whatever the autopilot's drift adds, in m/s.
+const STILL_M_S: f64 = 0.3;
+
 /// Below this height the vehicle waits for a small error, in metres.
 const LOW_M: f64 = 0.5;
 
@@ -272,7 +275,9 @@ impl Metric {
         let seen = self.sees(situation);
         let height_m = self.height_m(&target);
         let outside = self.outside(situation, &target);
-        if height_m <= self.config.land_height_m && outside < 1.0 {
+        // LAND stops the vehicle over the ground: on a pad that moves it must come after the touch.
+        let lies_still = target.velocity.norm() <= STILL_M_S;
+        if height_m <= self.config.land_height_m && outside < 1.0 && lies_still {
             return Progress::Ready(if seen {
                 Reason::LowAndAligned
             } else {
