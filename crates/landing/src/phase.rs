@@ -618,6 +618,7 @@ mod tests {
         //! in, where two states count as the same when phase, reason, flags, retries and the timeouts already over agree.
 
         use super::*;
+        use std::collections::hash_map::Entry;
         use std::collections::{HashMap, VecDeque};
 
         /// What tells two states apart.
@@ -784,8 +785,8 @@ mod tests {
                         check_step(&waited, facts, &after);
                         steps += 1;
                         let key = key(&after);
-                        if !found.contains_key(&key) {
-                            found.insert(key, after.clone());
+                        if let Entry::Vacant(place) = found.entry(key) {
+                            place.insert(after.clone());
                             open.push_back(after);
                         }
                     }

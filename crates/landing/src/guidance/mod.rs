@@ -49,10 +49,6 @@ pub enum Progress {
 
 /// The guidance that was chosen, with its memory.
 #[derive(Clone, Debug)]
-#[expect(
-    clippy::large_enum_variant,
-    reason = "there is one, and nothing may be allocated in flight"
-)]
 pub(crate) enum Guide {
     Thesis(Thesis),
     Metric(Metric),

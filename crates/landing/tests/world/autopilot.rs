@@ -64,10 +64,10 @@ impl<const N: usize> Path<N> {
         let share = if size > 0.0 { rate / size } else { 0.0 };
         let change: [f64; N] = std::array::from_fn(|i| error[i] * share - self.acceleration[i]);
         let limited = (jerk * dt_s / norm(&change).max(1e-12)).min(1.0);
-        for i in 0..N {
+        for (i, change) in change.into_iter().enumerate() {
             self.position[i] += (self.velocity[i] + 0.5 * self.acceleration[i] * dt_s) * dt_s;
             self.velocity[i] += self.acceleration[i] * dt_s;
-            self.acceleration[i] += change[i] * limited;
+            self.acceleration[i] += change * limited;
         }
     }
 }
