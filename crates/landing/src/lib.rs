@@ -2,13 +2,13 @@
 //!
 //! [`Lander::step`] is told the time and what happened (the vehicle's state, a frame looked at, an operator's
 //! command, or nothing) and answers with a phase, an action for the autopilot, and the reasons. It keeps the
-//! vehicle's recent motion, joins every detection with the motion at its exposure, filters the target's place,
+//! vehicle's recent motion, joins every detection with the motion at its exposure, estimates the target's place and motion,
 //! and steers by one of two guidances. Same events, same decisions, to the bit.
 //!
 //! This crate knows no clock, network, file, thread, log or message, and no autopilot protocol.
 //!
 //! Modules in reading order: [`event`] is what the lander is told and [`decision`] what it answers, [`config`] has
-//! every number; [`lander`] joins [`history`] (the vehicle a moment ago), [`target`] (where the landing point is),
+//! every number; [`lander`] joins [`history`] (the vehicle a moment ago), [`estimator`] (where the landing point is; [`target`] for the thesis' guidance),
 //! [`guidance`] (target to velocity), [`phase`] (what comes next), [`search`] (where to look) and [`envelope`] (the last look at a setpoint);
 //! [`time`] has the stamps.
 
