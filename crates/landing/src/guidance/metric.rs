@@ -103,7 +103,7 @@ impl Default for MetricConfig {
             dead_time_s: 0.3,
             acceleration_lead_s: 0.1,
             max_descend_m_s: 2.0,
-            touch_descend_m_s: 0.45,
+            touch_descend_m_s: 0.5,
             descend_braking_m_s2: 0.5,
             descend_lag_s: 0.45,
             descend_acceleration_m_s2: 2.0,
@@ -111,7 +111,7 @@ impl Default for MetricConfig {
             funnel_per_height: 0.25,
             fresh_target_s: 0.5,
             stale_target_s: 0.7,
-            silence_s: 1.5,
+            silence_s: 2.0,
             land_height_m: 0.06,
             standing_height_m: 0.0,
             settle_s: 5.0,
@@ -179,9 +179,11 @@ const STILL_M_S: f64 = 0.3;
 /// Below this height the vehicle waits for a small error, in metres.
 const LOW_M: f64 = 0.5;
 
-/// A vehicle asked to descend this fast that stands still for so long is on the ground, in m/s and seconds.
+/// A vehicle asked to descend this fast that stands still for so long is on the ground, in m/s and seconds: the first where it
+/// should be near the ground, the second where it may also just be turning from a climb.
 const PUSHING_M_S: f64 = 0.15;
-const STANDING_S: f64 = 0.4;
+const STANDING_S: [f64; 2] = [0.4, 0.9];
+const NEAR_M: f64 = 0.3;
 
 /// Time constant of the filter over the acceleration, in seconds.
 const SLOPE_S: f64 = 0.05;
@@ -441,10 +443,12 @@ impl Metric {
     }
 
     fn stands(&self, situation: &Situation<'_>, target: &TargetEstimate) -> bool {
-        self.height_m(target) <= LOW_M
+        let height_m = self.height_m(target);
+        let enough_s = STANDING_S[usize::from(height_m > NEAR_M)];
+        height_m <= LOW_M
             && self
                 .standing_since
-                .is_some_and(|since| situation.now.seconds_since(since) >= STANDING_S)
+                .is_some_and(|since| situation.now.seconds_since(since) >= enough_s)
     }
 
     fn lateral(

@@ -102,7 +102,8 @@ fn moving(seed: u64, speed_m_s: f64, heave_m: f64) -> Scene {
     let metric = MetricConfig {
         max_lateral_m_s: 2.5,
         lateral_acceleration_m_s2: 2.0,
-        blind_deviation_m: 0.15,
+        silence_s: 1.2,
+        blind_deviation_m: 0.2,
         ..MetricConfig::default()
     };
     scene.config.guidance = Guidance::Metric(metric);
