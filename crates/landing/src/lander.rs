@@ -290,7 +290,8 @@ impl Lander {
         let (wanted, why) = self.guide.velocity(&situation);
         let may_descend = self.guide.may_descend(&situation);
         let velocity = envelope::admit(&self.config.envelope, wanted, may_descend);
-        (Action::Velocity { velocity, yaw_rate: 0.0 }, why)
+        let yaw_rate = self.guide.yaw_rate(&situation);
+        (Action::Velocity { velocity, yaw_rate }, why)
     }
 
     /// Stays where the marker must be in view, and climbs, never above the height where the landing began.

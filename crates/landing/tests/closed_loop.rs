@@ -203,6 +203,22 @@ fn a_retry_climbs_a_little_and_is_not_repeated_for_ever() {
 }
 
 #[test]
+fn the_vehicle_turns_to_the_pad_when_asked_to() {
+    let turning = MetricConfig { turn_rad_s: 0.5, pad_heading_rad: 0.2, ..MetricConfig::default() };
+    for (seed, pad_rad) in [(1, 0.5), (2, -1.5), (3, 2.8)] {
+        let config = Config { guidance: Guidance::Metric(turning), ..Config::default() };
+        let mut scene = Scene { config, heading_rad: 0.3, ..Scene::windy(seed, 3.0, 1.0) };
+        scene.pad_motion.yaw = (pad_rad, 0.0);
+        let flight = scene.fly();
+        assert_eq!(flight.phase, Phase::Landed);
+        assert!(flight.error_m < 0.08, "{}", flight.error_m);
+        let touch = flight.touch.unwrap();
+        let beside = (touch.heading_rad - pad_rad - 0.2).sin().abs();
+        assert!(beside < 0.1 && (touch.heading_rad - pad_rad - 0.2).cos() > 0.0, "{beside} rad");
+    }
+}
+
+#[test]
 fn the_pilot_silences_us_at_once() {
     let flight = Scene { pilot_s: Some(3.0), limit_s: 20.0, ..Scene::new(1) }.fly();
     assert!(

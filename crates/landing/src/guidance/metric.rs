@@ -91,6 +91,10 @@ pub struct MetricConfig {
     pub max_drift_m_s: f64,
     /// Fastest pad that is followed, in m/s (0 to 10).
     pub max_pad_m_s: f64,
+    /// Fastest turn towards the pad's heading, in rad/s; 0 holds the heading (0 to 1).
+    pub turn_rad_s: f64,
+    /// Heading to land with, from the direction of the marker's upper edge, in rad, clockwise seen from above (-7 to 7).
+    pub pad_heading_rad: f64,
 }
 
 impl Default for MetricConfig {
@@ -125,6 +129,8 @@ impl Default for MetricConfig {
             drift_time_s: 1.5,
             max_drift_m_s: 0.1,
             max_pad_m_s: 5.0,
+            turn_rad_s: 0.0,
+            pad_heading_rad: 0.0,
         }
     }
 }
@@ -159,7 +165,9 @@ impl MetricConfig {
         check("metric.view_margin_rad", self.view_margin_rad, 0.0, 0.5)?;
         check("metric.drift_time_s", self.drift_time_s, 0.2, 60.0)?;
         check("metric.max_drift_m_s", self.max_drift_m_s, 0.0, 1.0)?;
-        check("metric.max_pad_m_s", self.max_pad_m_s, 0.0, 10.0)
+        check("metric.max_pad_m_s", self.max_pad_m_s, 0.0, 10.0)?;
+        check("metric.turn_rad_s", self.turn_rad_s, 0.0, 1.0)?;
+        check("metric.pad_heading_rad", self.pad_heading_rad, -7.0, 7.0)
     }
 }
 
@@ -175,6 +183,9 @@ const KNOWN_S: f64 = 20.0;
 
 /// A pad slower than this lies still, whatever the autopilot's drift adds, in m/s.
 const STILL_M_S: f64 = 0.3;
+
+/// Turning rate per heading error, in 1/s.
+const TURN_GAIN: f64 = 0.8;
 
 /// Below this height the vehicle waits for a small error, in metres.
 const LOW_M: f64 = 0.5;
@@ -324,6 +335,16 @@ impl Metric {
         self.memory = Some(memory);
         self.wait(situation, &target);
         (setpoint, why)
+    }
+
+    /// The turn towards the pad's heading, in rad/s clockwise seen from above; none near the ground, where it would only disturb.
+    pub fn yaw_rate(&self, situation: &Situation<'_>) -> f64 {
+        let heading = situation.target.filter(|target| self.height_m(target) > LOW_M);
+        let Some(pad_rad) = heading.and_then(|target| target.heading_rad) else { return 0.0 };
+        let error = pad_rad + self.config.pad_heading_rad - situation.vehicle.heading_rad();
+        let turn = std::f64::consts::TAU;
+        let error = error - turn * (error / turn).round();
+        (error * TURN_GAIN).clamp(-self.config.turn_rad_s, self.config.turn_rad_s)
     }
 
     fn begin(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Memory {

@@ -123,6 +123,14 @@ impl Guide {
         }
     }
 
+    /// The turn wanted now, in rad/s clockwise seen from above.
+    pub(crate) fn yaw_rate(&self, situation: &Situation<'_>) -> f64 {
+        match self {
+            Self::Thesis(_) => 0.0,
+            Self::Metric(metric) => metric.yaw_rate(situation),
+        }
+    }
+
     /// The vehicle is not guided now: forget what builds up while it is.
     pub(crate) fn rest(&mut self) {
         match self {

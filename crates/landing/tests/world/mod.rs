@@ -95,6 +95,7 @@ pub(crate) struct Touch {
     pub(crate) sink_m_s: f64,
     pub(crate) slide_m_s: f64,
     pub(crate) tilt_rad: f64,
+    pub(crate) heading_rad: f64,
 }
 
 /// One flight. Times are seconds from the start of the landing.
@@ -238,6 +239,7 @@ impl Flight {
                 sink_m_s: hit.z(),
                 slide_m_s: hit.horizontal_norm(),
                 tilt_rad: vehicle.tilt_rad(),
+                heading_rad: vehicle.ned_from_body().euler().2,
             });
         }
     }
