@@ -291,6 +291,7 @@ impl Lander {
         let may_descend = self.guide.may_descend(&situation);
         let velocity = envelope::admit(&self.config.envelope, wanted, may_descend);
         let yaw_rate = self.guide.yaw_rate(&situation);
+        self.guide.sent(velocity);
         (Action::Velocity { velocity, yaw_rate }, why)
     }
 
@@ -306,6 +307,7 @@ impl Lander {
         let climb_m_s = (2.0 * (to_m - altitude_m)).clamp(0.0, phases.retry_climb_m_s);
         let wanted = Vector::new(wanted.x(), wanted.y(), -climb_m_s);
         let velocity = envelope::admit(&self.config.envelope, wanted, false);
+        self.guide.sent(velocity);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 

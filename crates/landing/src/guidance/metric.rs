@@ -320,10 +320,9 @@ impl Metric {
         self.memory = Some(memory);
         let lateral = self.lateral(&memory, situation, &target);
         let (descent_m_s, why) = self.descent(situation, &target);
-        let descent_m_s = descent_m_s + level_off(target.velocity.z());
         let down = approach_speed(
             before.setpoint.z(),
-            descent_m_s,
+            descent_m_s + target.velocity.z(),
             self.config.descend_acceleration_m_s2 * step_s,
         );
         let setpoint = Vector::new(lateral.x(), lateral.y(), down);
@@ -335,6 +334,13 @@ impl Metric {
         self.memory = Some(memory);
         self.wait(situation, &target);
         (setpoint, why)
+    }
+
+    /// What was really sent of the velocity wanted, in m/s: the autopilot's path follows that.
+    pub fn sent(&mut self, velocity: Vector<Ned>) {
+        if let Some(memory) = &mut self.memory {
+            memory.setpoint = velocity;
+        }
     }
 
     /// The turn towards the pad's heading, in rad/s clockwise seen from above; none near the ground, where it would only disturb.
@@ -452,9 +458,9 @@ impl Metric {
         } else {
             self.waiting_since.get_or_insert(situation.now);
         }
-        let pushed = self.memory.is_some_and(|memory| {
-            memory.setpoint.z() - level_off(target.velocity.z()) >= PUSHING_M_S
-        });
+        let pushed = self
+            .memory
+            .is_some_and(|memory| memory.setpoint.z() - target.velocity.z() >= PUSHING_M_S);
         let still = situation.vehicle.velocity.z() - target.velocity.z() < 0.3 * PUSHING_M_S;
         if pushed && still && height_m <= LOW_M {
             self.standing_since.get_or_insert(situation.now);
@@ -549,11 +555,6 @@ fn lean(situation: &Situation<'_>) -> Vector<Ned> {
 
 fn flat(vector: Vector<Ned>) -> Vector<Ned> {
     Vector::new(vector.x(), vector.y(), 0.0)
-}
-
-/// The pad's vertical velocity as far as it is followed: a drift of the barometer is not.
-fn level_off(pad_m_s: f64) -> f64 {
-    pad_m_s
 }
 
 /// From `last` towards `wanted` by at most `step`; a descent ends at once, the autopilot smooths it.

@@ -123,6 +123,13 @@ impl Guide {
         }
     }
 
+    /// What was really sent of the velocity wanted.
+    pub(crate) fn sent(&mut self, velocity: Vector<Ned>) {
+        if let Self::Metric(metric) = self {
+            metric.sent(velocity);
+        }
+    }
+
     /// The turn wanted now, in rad/s clockwise seen from above.
     pub(crate) fn yaw_rate(&self, situation: &Situation<'_>) -> f64 {
         match self {
