@@ -15,6 +15,17 @@
 //! at the edge. A vehicle that leans into the wind looks past the target; above `view_height_m` it stays so far upwind
 //! that the marker remains in view.
 //!
+//! Where the error comes from, in 100 modelled flights in 5 m/s of wind with turbulence 3 (`examples/landings.rs`), median and worst:
+//!
+//! | change | error, m |
+//! |---|---|
+//! | as it is | 0.017, 0.075 |
+//! | LAND from 0.2 m | 0.026, 0.085 |
+//! | LAND from 0.4 m | 0.061, 0.148 |
+//! | LAND from 0.8 m | 0.116, 0.322 |
+//! | half of the gains, no look ahead | 0.040, 0.148 |
+//! | an autopilot that knows the truth | 0.014, 0.041 |
+//!
 //! The end: below `blind_height_m` the vehicle goes on down on the estimate when the marker leaves the view. LAND follows no target
 //! and in gusts drifts by a decimetre in a second, so it takes over only a hand's breadth above the ground.
 
@@ -116,7 +127,7 @@ impl Default for MetricConfig {
             fresh_target_s: 0.5,
             stale_target_s: 0.7,
             silence_s: 2.0,
-            land_height_m: 0.06,
+            land_height_m: 0.1,
             standing_height_m: 0.0,
             settle_s: 5.0,
             blind_error_m: 0.15,
