@@ -106,14 +106,13 @@ pub struct EstimatorConfig {
     pub position_noise_m: f64,
     /// Slow error of the autopilot's position, in m per square root of a second (0 to 1).
     pub way_noise_m: f64,
-    /// Drift of the autopilot's horizontal position at first, in m/s (0 to 1), and what it changes by, in m/s per square
-    /// root of a second (0 to 1).
+    /// Drift of the autopilot's horizontal position at first, in m/s (0 to 1).
     pub drift_m_s: f64,
-    /// See `drift_m_s`.
+    /// What that drift changes by, in m/s per square root of a second (0 to 1).
     pub drift_change: f64,
-    /// The same for the height, in m/s (0 to 1).
+    /// Drift of the autopilot's height at first, in m/s (0 to 1).
     pub height_drift_m_s: f64,
-    /// The same for the height, in m/s per square root of a second (0 to 1).
+    /// What that drift changes by, in m/s per square root of a second (0 to 1).
     pub height_drift_change: f64,
     /// Fastest pad, in m/s; 0 for one that lies still (0 to 10).
     pub pad_speed_m_s: f64,
@@ -121,10 +120,9 @@ pub struct EstimatorConfig {
     pub pad_heave_m_s: f64,
     /// What the pad's velocity changes by, in m/s per square root of a second (0 to 5).
     pub pad_acceleration: f64,
-    /// Error of mount and attitude, in rad (0.00001 to 0.2), and what it changes by, in rad per square root of a second
-    /// (0 to 0.1).
+    /// Error of mount and attitude, in rad (0.00001 to 0.2).
     pub mount_error_rad: f64,
-    /// See `mount_error_rad`.
+    /// What that error changes by, in rad per square root of a second (0 to 0.1).
     pub tilt_change: f64,
     /// Error of the heading, in rad (0.00001 to 0.5).
     pub heading_error_rad: f64,
@@ -133,9 +131,9 @@ pub struct EstimatorConfig {
     /// Squared innovation over its covariance beyond which a detection is an outlier; chi-square with 3 degrees of
     /// freedom exceeds 16.3 once in a thousand times (7 to 100).
     pub gate: f64,
-    /// Outliers that agree with each other and so begin a new estimate (2 to 100),
+    /// Outliers that agree with each other and so begin a new estimate (2 to 100).
     pub restart_after: u32,
-    /// over at least this time, in s (0 to 10).
+    /// Shortest time over which such outliers must come, in s (0 to 10).
     pub restart_s: f64,
     /// After so long without a detection the estimate is forgotten, in s (0.5 to 600).
     pub forget_after_s: f64,

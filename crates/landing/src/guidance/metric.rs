@@ -92,9 +92,9 @@ pub struct MetricConfig {
     pub blind_deviation_m: f64,
     /// Height down to which the marker is kept in view by staying upwind, in m (0.2 to 50).
     pub view_height_m: f64,
-    /// Free rim that is left around the marker's centre in the image: in m for the marker's size (0 to 2),
+    /// Free rim that is left around the marker's centre in the image for the marker's size, in m (0 to 2).
     pub view_margin_m: f64,
-    /// and in rad for what the vehicle sways (0 to 0.5).
+    /// Free rim that is left in the image for what the vehicle sways, in rad (0 to 0.5).
     pub view_margin_rad: f64,
     /// Time constant of the observer of the bias of the autopilot's velocity, in s (0.2 to 60).
     pub drift_time_s: f64,
