@@ -2,7 +2,7 @@
 """A Zenoh program that is none of ours: who is there, and what do the frames' headers say?
 
 It lists the live services by their liveliness tokens and reads the headers of some frames from their attachments
-(codec: `A`, type 1, version 2, then postcard), and prints what it saw as one JSON object on the last line.
+(codec: `A`, type 1, version 3, then postcard), and prints what it saw as one JSON object on the last line.
 
     python3 tests/zenoh_client.py tcp/127.0.0.1:7447
 
@@ -28,8 +28,8 @@ class Header:
     """Reads postcard: variable-length integers (zigzag when signed), strings with their length in front."""
 
     def __init__(self, data):
-        if data[:3] != b"A\x01\x02":
-            raise ValueError(f"not a frame header of version 2: {data[:3]!r}")
+        if data[:3] != b"A\x01\x03":
+            raise ValueError(f"not a frame header of version 3: {data[:3]!r}")
         self.data, self.at = data, 3
 
     def unsigned(self):
@@ -62,6 +62,9 @@ class Header:
             "height": self.unsigned(),
             "format": ("mono8", "jpeg")[self.unsigned()],
         }
+        names = ("x", "y", "width", "height", "scale", "bytes")
+        parts = self.unsigned()
+        header["parts"] = [{name: self.unsigned() for name in names} for _ in range(parts)]
         if self.at != len(self.data):
             raise ValueError("bytes after the end of the header")
         return header

@@ -283,6 +283,7 @@ impl Stream {
             width: frame.width as u32,
             height: frame.height as u32,
             format: frame.format,
+            parts: Vec::new(),
         };
         self.frames.publish(&header, frame.pixels).await;
         if let Some(jpeg) = frame.jpeg {

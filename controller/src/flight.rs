@@ -732,6 +732,7 @@ mod tests {
                 width: 64,
                 height: 48,
                 format: PixelFormat::Mono8,
+                parts: Vec::new(),
             },
             detections: vec![Detection {
                 family: "rings".into(),

@@ -162,6 +162,7 @@ mod tests {
             width: 1,
             height: 1,
             format: PixelFormat::Mono8,
+            parts: Vec::new(),
         };
         let detections = vec![
             detection("aruco-4x4-50", Some(3)),

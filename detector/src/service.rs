@@ -12,8 +12,8 @@ use fiducial::{Detector, Stages, Tracker};
 use geometry::CameraModel;
 use imaging::{Converter, GrayView};
 use messages::{
-    CameraInfo, CommandReply, Detection, Detections, DetectorCommand, FrameHeader, PixelFormat,
-    StageTime, topic,
+    CameraInfo, CommandReply, Detection, Detections, DetectorCommand, FrameHeader, FrameReceipt,
+    PixelFormat, StageTime, topic,
 };
 use node::{Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, now_ns};
 use tokio::runtime::Handle;
@@ -104,6 +104,7 @@ struct Work {
     node: Node,
     frames: FrameSubscriber,
     detections: Publisher<Detections>,
+    receipts: Publisher<FrameReceipt>,
     debug: Vec<(&'static str, FramePublisher)>,
     camera: Arc<Mutex<Option<CameraInfo>>>,
     change: Arc<Mutex<Option<Change>>>,
@@ -133,6 +134,7 @@ impl Work {
             node: node.clone(),
             frames: node.frame_subscriber(topic::FRAME, &[&config.camera]).await?,
             detections: node.publisher(topic::DETECTIONS, &[&config.id]).await?,
+            receipts: node.publisher(topic::RECEIVED, &[&config.id]).await?,
             debug,
             camera,
             change,
@@ -166,6 +168,9 @@ impl Work {
         health.count("frames");
         let bytes = frame.bytes();
         let FrameHeader { width, height, format, .. } = frame.header;
+        if format == PixelFormat::Jpeg {
+            self.receipts.publish(&receipt(frame)).await;
+        }
         let Some(format) = wire::sample_format(format) else {
             health.dropped("frames in a pixel format that is not searched");
             return;
@@ -270,6 +275,18 @@ impl Work {
                 Err(_) => self.node.health().dropped("debug images too large for a JPEG"),
             }
         }
+    }
+}
+
+/// What the camera is told of a frame that has arrived.
+fn receipt(frame: &Frame) -> FrameReceipt {
+    let FrameHeader { camera, sequence, stamp_ns, clock, .. } = &frame.header;
+    FrameReceipt {
+        camera: camera.clone(),
+        sequence: *sequence,
+        stamp_ns: *stamp_ns,
+        clock: clock.clone(),
+        bytes: u32::try_from(frame.bytes().len()).unwrap_or(u32::MAX),
     }
 }
 

@@ -81,6 +81,7 @@ async fn film(frames: FramePublisher, format: PixelFormat, bytes: Vec<u8>) {
             width: 640,
             height: 480,
             format,
+            parts: Vec::new(),
         };
         frames.publish(&header, loan).await;
         tokio::time::sleep(Duration::from_millis(50)).await;

@@ -5,8 +5,9 @@ use serde::{Deserialize, Serialize};
 use crate::codec::wire;
 
 wire! {
-    FrameHeader = 1 v 2;
+    FrameHeader = 1 v 3;
     CameraInfo = 2 v 1;
+    FrameReceipt = 16 v 1;
 }
 
 /// How a frame's pixels lie in its payload, row by row without gaps.
@@ -74,12 +75,53 @@ pub struct FrameHeader {
     pub clock: String,
     /// How long the shutter was open, in nanoseconds; 0 when unknown.
     pub exposure_ns: u32,
-    /// Width in pixels.
+    /// Width of the whole frame in pixels, whatever part of it the payload has.
     pub width: u32,
-    /// Height in pixels.
+    /// Height of the whole frame in pixels.
     pub height: u32,
     /// How the pixels lie in the payload.
     pub format: PixelFormat,
+    /// What of the frame the payload has, one file after the other, finest first; empty: the whole frame.
+    pub parts: Vec<FramePart>,
+}
+
+/// A rectangle of a frame as a file of its own, in the frame's pixels or coarser.
+///
+/// The part's pixel (u, v) is the mean of `scale` x `scale` pixels of the frame, the first of which is
+/// (`x` + `scale` u, `y` + `scale` v); so its centre is at `x` + `scale` u + (`scale` - 1) / 2 in the frame, and
+/// likewise downwards.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FramePart {
+    /// Its left edge in the frame, in pixels of the frame.
+    pub x: u32,
+    /// Its upper edge in the frame, in pixels of the frame.
+    pub y: u32,
+    /// Its width in its own pixels.
+    pub width: u32,
+    /// Its height in its own pixels.
+    pub height: u32,
+    /// Pixels of the frame along the edge of one of its own; from 1.
+    pub scale: u32,
+    /// Bytes of its file.
+    pub bytes: u32,
+}
+
+/// Tells the camera that a frame for the air link has arrived; sent before it is looked at.
+///
+/// The stamp comes back to the clock it was taken from, so the way there and back is one subtraction and needs no
+/// synchronised clocks.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameReceipt {
+    /// The frame's camera.
+    pub camera: String,
+    /// The frame's number.
+    pub sequence: u64,
+    /// The frame's stamp.
+    pub stamp_ns: i64,
+    /// The frame's clock.
+    pub clock: String,
+    /// Bytes of its payload.
+    pub bytes: u32,
 }
 
 /// A rigid transform on the wire, `to_from_from` as its field's name says.

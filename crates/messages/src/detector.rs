@@ -7,7 +7,7 @@ pub use crate::camera::Transform3;
 use crate::codec::wire;
 
 wire! {
-    Detections = 3 v 2;
+    Detections = 3 v 3;
     DetectorCommand = 13 v 1;
 }
 

@@ -16,7 +16,10 @@ pub mod simulation;
 pub mod topic;
 pub mod vehicle;
 
-pub use camera::{BayerPattern, CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3};
+pub use camera::{
+    BayerPattern, CameraInfo, FrameHeader, FramePart, FrameReceipt, LensModel, PixelFormat,
+    Transform3,
+};
 pub use codec::{DecodeError, Message, decode, encode};
 pub use controller::{
     Candidate, CommandReply, ControllerCommand, ControllerStatus, Setpoint, TargetEstimate,

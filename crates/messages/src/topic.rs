@@ -4,7 +4,7 @@
 
 use std::marker::PhantomData;
 
-use crate::camera::{CameraInfo, FrameHeader};
+use crate::camera::{CameraInfo, FrameHeader, FrameReceipt};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
 use crate::detector::{Detections, DetectorCommand};
@@ -90,7 +90,7 @@ const SIMULATOR: &[&str] = &["simulator"];
 /// Pixels as they are; the message is the attachment.
 pub const FRAME: Topic<FrameHeader> =
     Topic::new("camera/{camera}/frame", Delivery::Newest, CAMERAS);
-/// A JPEG file; the message is the attachment.
+/// JPEG files, of the whole frame or of parts of it; the message is the attachment.
 pub const JPEG: Topic<FrameHeader> = Topic::new("camera/{camera}/jpeg", Delivery::Newest, CAMERAS);
 /// A camera's calibration and mount.
 pub const CAMERA_INFO: Topic<CameraInfo> =
@@ -98,6 +98,9 @@ pub const CAMERA_INFO: Topic<CameraInfo> =
 /// What a detector found.
 pub const DETECTIONS: Topic<Detections> =
     Topic::new("detector/{detector}/detections", Delivery::NewestFirst, DETECTOR);
+/// That a frame of `camera/{camera}/jpeg` has arrived.
+pub const RECEIVED: Topic<FrameReceipt> =
+    Topic::new("detector/{detector}/received", Delivery::NewestFirst, DETECTOR);
 /// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
 pub const DEBUG_IMAGE: Topic<FrameHeader> =
     Topic::new("detector/{detector}/debug/{image}", Delivery::Newest, DETECTOR);
@@ -150,6 +153,7 @@ pub const TOPICS: &[Row] = &[
     JPEG.row,
     CAMERA_INFO.row,
     DETECTIONS.row,
+    RECEIVED.row,
     DEBUG_IMAGE.row,
     DETECTOR_COMMAND.row,
     DETECTOR_COMMAND_REPLY.row,

@@ -3,9 +3,9 @@
 use messages::{
     AlternativePose, BayerPattern, CameraInfo, Candidate, CommandReply, ControllerCommand,
     ControllerStatus, Count, DecodeError, Detection, Detections, DetectorCommand, FrameHeader,
-    Health, LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, PixelFormat, Rate,
-    Setpoint, StageTime, TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind, decode,
-    encode,
+    FramePart, FrameReceipt, Health, LandedState, Latency, LensModel, MarkerPose, MavlinkBytes,
+    Message, PixelFormat, Rate, Setpoint, StageTime, TargetEstimate, Touchdown, Transform3, Truth,
+    VehicleState, Wind, decode, encode,
 };
 use proptest::prelude::*;
 
@@ -19,6 +19,7 @@ fn header() -> FrameHeader {
         width: 1296,
         height: 972,
         format: PixelFormat::Mono8,
+        parts: Vec::new(),
     }
 }
 
@@ -49,7 +50,10 @@ fn check<M: Message + PartialEq + std::fmt::Debug>(message: &M, golden: &str) {
 #[test]
 fn frame_header() {
     let message = header();
-    check(&message, "41010204646f776eac0201016302900acc0700");
+    check(&message, "41010304646f776eac0201016302900acc070000");
+    let part = FramePart { x: 300, y: 1, width: 2, height: 3, scale: 4, bytes: 5 };
+    let message = FrameHeader { format: PixelFormat::Jpeg, parts: vec![part], ..message };
+    check(&message, "41010304646f776eac0201016302900acc070101ac020102030405");
 }
 
 #[test]
@@ -97,8 +101,20 @@ fn detections() {
     };
     check(
         &message,
-        "410302046d61696e04646f776eac0201016302900acc0700010572696e677300000000000000f03f00000000000000400000803f000000000000004000000000000000084001000000000000f03f0100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000e03f000000000000803f0000004000004040000080400000a0400000c0400000e0400000004100001041000020410000304100004041000050410000604100007041000080410000884100009041000098410000a0410100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000f03f01097468726573686f6c6407",
+        "410303046d61696e04646f776eac0201016302900acc070000010572696e677300000000000000f03f00000000000000400000803f000000000000004000000000000000084001000000000000f03f0100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000e03f000000000000803f0000004000004040000080400000a0400000c0400000e0400000004100001041000020410000304100004041000050410000604100007041000080410000884100009041000098410000a0410100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000f03f01097468726573686f6c6407",
     );
+}
+
+#[test]
+fn frame_receipt() {
+    let message = FrameReceipt {
+        camera: "down".into(),
+        sequence: 300,
+        stamp_ns: -1,
+        clock: "c".into(),
+        bytes: 300,
+    };
+    check(&message, "41100104646f776eac02010163ac02");
 }
 
 #[test]
@@ -110,7 +126,8 @@ fn detector_command() {
 
 #[test]
 fn pixel_formats() {
-    let bytes = |format| encode(&FrameHeader { format, ..header() })[18..].to_vec();
+    let bytes =
+        |format| encode(&FrameHeader { format, ..header() })[18..].split_last().unwrap().1.to_vec();
     let formats = [PixelFormat::Mono8, PixelFormat::Jpeg, PixelFormat::Mono10, PixelFormat::Mono12];
     for (number, format) in (0..).zip(formats) {
         assert_eq!(bytes(format), [number], "{format:?}");

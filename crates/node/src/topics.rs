@@ -12,6 +12,7 @@ use zenoh::handlers::{RingChannel, RingChannelHandler};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::Sample;
+use zenoh::session::SessionGetBuilder;
 
 use crate::clock::now_ns;
 use crate::health::HealthCounters;
@@ -61,14 +62,17 @@ struct Qos {
     depth: usize,
 }
 
+/// Nothing is published with `CongestionControl::Block`: a link that is cut would hold up the one who publishes, and
+/// with it the messages to everybody else, until Zenoh gives the link up. Dropping waits a millisecond at most, and only
+/// when the link's own queue for this priority is full.
 fn qos(delivery: Delivery) -> Qos {
     let (priority, congestion, depth) = match delivery {
         Delivery::Newest => (Priority::Data, CongestionControl::Drop, 4),
         // Deep enough for several detectors at once.
         Delivery::NewestFirst => (Priority::RealTime, CongestionControl::Drop, 16),
         Delivery::LastValue => (Priority::InteractiveHigh, CongestionControl::Drop, 16),
-        Delivery::InOrder => (Priority::InteractiveLow, CongestionControl::Block, 512),
-        Delivery::Query => (Priority::InteractiveHigh, CongestionControl::Block, 16),
+        Delivery::InOrder => (Priority::InteractiveLow, CongestionControl::Drop, 512),
+        Delivery::Query => (Priority::InteractiveHigh, CongestionControl::Drop, 16),
     };
     Qos { priority, congestion, depth }
 }
@@ -150,7 +154,8 @@ impl Node {
 
     async fn fetch_last_values<M: Message>(&self, key: &str, subscriber: &Subscriber<M>) {
         // No publisher yet is the usual case at the start of a system, not an error.
-        let Ok(replies) = self.session.get(key).timeout(ANSWER_TIMEOUT).await else { return };
+        let question = question(self.session.get(key));
+        let Ok(replies) = question.timeout(ANSWER_TIMEOUT).await else { return };
         while let Ok(reply) = replies.recv_async().await {
             if let Ok(sample) = reply.result()
                 && let Some(message) = subscriber.decode(sample)
@@ -209,9 +214,7 @@ impl Node {
         key: &str,
         command: &M,
     ) -> anyhow::Result<Option<messages::CommandReply>> {
-        let replies = self
-            .session
-            .get(key)
+        let replies = question(self.session.get(key))
             .payload(encode(command))
             .timeout(ANSWER_TIMEOUT)
             .await
@@ -223,6 +226,12 @@ impl Node {
         }
         Ok(None)
     }
+}
+
+/// A question that holds up nobody; its answers travel the same way.
+fn question<'a, 'b, H>(get: SessionGetBuilder<'a, 'b, H>) -> SessionGetBuilder<'a, 'b, H> {
+    let Qos { priority, congestion, .. } = qos(Delivery::Query);
+    get.priority(priority).congestion_control(congestion)
 }
 
 /// A service's side of its commands.

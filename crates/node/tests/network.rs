@@ -34,6 +34,7 @@ fn header(sequence: u64) -> FrameHeader {
         width: 64,
         height: 48,
         format: PixelFormat::Mono8,
+        parts: Vec::new(),
     }
 }
 

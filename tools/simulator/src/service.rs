@@ -415,6 +415,7 @@ impl Camera {
             width: self.info.width,
             height: self.info.height,
             format: PixelFormat::Mono8,
+            parts: Vec::new(),
         };
         if self.jpegs.has_subscribers().await {
             self.publish_jpeg(&header, &frame).await;
