@@ -5,10 +5,13 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use messages::{ControllerCommand, DetectorCommand, topic};
-use node::{ConfigError, Identity, Layers, Node, ZenohSource};
+use node::{ConfigError, Identity, Layers, Network, Node, ZenohSource};
 
 use crate::services::{self, Service};
-use crate::{detect, experiment, land, marker};
+use crate::{detect, experiment, land, marker, relay};
+
+/// The role whose key a person at the command line holds.
+pub(crate) const OPERATOR: &str = "operator";
 
 /// Exit status for a command line or a configuration that asks for something impossible.
 const WRONG_USE: u8 = 2;
@@ -38,6 +41,8 @@ enum Command {
     GcsBridge(ServiceArgs),
     /// Simulate a world with wind, a pad, a vehicle, an autopilot and a camera.
     Simulator(ServiceArgs),
+    /// Pass messages on between the drone's own processes and the ground.
+    Relay(relay::RelayArgs),
     /// Find markers in image files.
     Detect(detect::DetectArgs),
     /// Make a marker to print.
@@ -56,15 +61,52 @@ pub(crate) struct ServiceArgs {
     /// Settings to lay over the defaults (TOML).
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
-    /// Zenoh configuration (JSON5); the built-in `local.json5` otherwise.
-    #[arg(long, value_name = "FILE")]
-    pub(crate) zenoh: Option<PathBuf>,
     /// One setting to lay over the file: dotted key, TOML value. May be repeated.
     #[arg(long, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
+    #[command(flatten)]
+    pub(crate) network: NetworkArgs,
     /// Stop when the process of this number, which started this one, ends.
     #[arg(long, hide = true, value_name = "PID")]
     pub(crate) stop_with_parent: Option<u32>,
+}
+
+/// Which network is joined.
+#[derive(Args, Clone, Default)]
+#[command(next_help_heading = "Network")]
+pub(crate) struct NetworkArgs {
+    /// How the processes meet: `local` (one machine), `ground`, or for the relay `drone` or `relay`; or a JSON5 file.
+    /// `local` if it is left out.
+    #[arg(long, value_name = "ROLE|FILE", env = "ALIGHT_ZENOH")]
+    pub(crate) zenoh: Option<PathBuf>,
+    /// Where the drone, or the relay to it, is: HOST or HOST:PORT.
+    #[arg(long, value_name = "ADDRESS", env = "ALIGHT_CONNECT")]
+    pub(crate) connect: Option<String>,
+    /// Where the relay is found by others: HOST or HOST:PORT; port 7448 (and 7449 for frames) of all interfaces if it
+    /// is left out.
+    #[arg(long, value_name = "ADDRESS", env = "ALIGHT_LISTEN")]
+    pub(crate) listen: Option<String>,
+    /// Where the processes of this machine meet, by `local` and `drone`; 7447 if it is left out.
+    #[arg(long, value_name = "PORT", env = "ALIGHT_MEET")]
+    pub(crate) meet: Option<u16>,
+    /// The vehicle's name, the beginning of all keys; `drone` if it is left out.
+    #[arg(long, value_name = "NAME", env = "ALIGHT_VEHICLE")]
+    pub(crate) vehicle: Option<String>,
+    /// The directory with the keys (`alight keys`): connections are encrypted, and each may say what its role may.
+    #[arg(long, value_name = "DIRECTORY", env = "ALIGHT_KEYS")]
+    pub(crate) keys: Option<PathBuf>,
+}
+
+impl NetworkArgs {
+    /// The session's configuration for a process that shows the certificate of `role`.
+    pub(crate) fn source(&self, role: &str) -> anyhow::Result<ZenohSource> {
+        self.network().source(role)
+    }
+
+    fn network(&self) -> Network {
+        let Self { zenoh, connect, listen, meet, vehicle, keys } = self.clone();
+        Network { config: zenoh, vehicle, connect, listen, meet, keys }
+    }
 }
 
 #[derive(Args)]
@@ -91,9 +133,8 @@ struct CommandArgs {
     /// The detector that is told, for `set`; the controller otherwise.
     #[arg(long, value_name = "ID")]
     detector: Option<String>,
-    /// Zenoh configuration (JSON5); the built-in `local.json5` otherwise.
-    #[arg(long, value_name = "FILE")]
-    zenoh: Option<PathBuf>,
+    #[command(flatten)]
+    network: NetworkArgs,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -167,6 +208,7 @@ pub(crate) fn run() -> ExitCode {
         Command::Controller(args) => services::run(Service::Controller, &args),
         Command::GcsBridge(args) => services::run(Service::GcsBridge, &args),
         Command::Simulator(args) => services::run(Service::Simulator, &args),
+        Command::Relay(args) => relay::run(&args),
         Command::Detect(args) => detect::run(&args),
         Command::Marker(args) => marker::run(&args),
         Command::Experiment(args) => experiment::run(args),
@@ -208,10 +250,11 @@ fn send_command(args: CommandArgs) -> anyhow::Result<ExitCode> {
     use std::io::Write;
     let order = Order::new(&args)?;
     node::start_logging("warn");
+    let zenoh = args.network.source(OPERATOR)?;
     let reply = services::runtime()?.block_on(async {
         let instance = format!("command-{}", std::process::id());
         let identity = Identity { service: "alight", instance };
-        let node = Node::open(identity, &zenoh_source(args.zenoh)).await?;
+        let node = Node::open(identity, &zenoh).await?;
         let reply = match &order {
             Order::Controller(command) => node.command(topic::COMMAND, &[], command).await,
             Order::Detector { id, command } => {

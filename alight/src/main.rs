@@ -1,8 +1,9 @@
 //! Lands a UAV on a printed marker: every service and tool as a subcommand of one program.
 //!
-//! Modules in reading order: [`cli`] is what can be asked, [`services`] runs one service in this process, [`land`]
-//! runs them all as processes and watches the landing, with [`children`] for the processes, [`progress`] for what is
-//! shown meanwhile and [`outcome`] for the result; [`detect`], [`marker`] and [`experiment`] are tools.
+//! Modules in reading order: [`cli`] is what can be asked, [`services`] runs one service in this process, [`relay`]
+//! stands between the drone and the ground; [`land`] runs all services as processes and watches the landing, with
+//! [`children`] for the processes, [`progress`] for what is shown meanwhile and [`outcome`] for the result; [`detect`],
+//! [`marker`] and [`experiment`] are tools.
 
 mod children;
 mod cli;
@@ -12,6 +13,7 @@ mod land;
 mod marker;
 mod outcome;
 mod progress;
+mod relay;
 mod services;
 
 use std::process::ExitCode;

@@ -7,7 +7,7 @@ use anyhow::Context;
 use clap::ValueEnum;
 use node::{Identity, Layers, Node, Settings, Shutdown};
 
-use crate::cli::{ServiceArgs, zenoh_source};
+use crate::cli::ServiceArgs;
 
 /// The services.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -92,7 +92,7 @@ where
 {
     let config = layers.load::<C>()?.settings;
     let identity = Identity { service: service.name(), instance: instance(&config) };
-    let zenoh = zenoh_source(args.zenoh.clone());
+    let zenoh = args.network.source(service.name())?;
     runtime()?
         .block_on(node::run(identity, &zenoh, |node, shutdown| run(node, config, shutdown)))
         .with_context(|| format!("running {}", service.name()))?;
@@ -110,7 +110,7 @@ pub(crate) fn runtime() -> anyhow::Result<tokio::runtime::Runtime> {
 
 /// Ends with the parent from now on; false when the parent has ended already.
 #[cfg(target_os = "linux")]
-fn stop_with_parent(parent: u32) -> bool {
+pub(crate) fn stop_with_parent(parent: u32) -> bool {
     let signal = Some(rustix::process::Signal::TERM);
     // Without it the process would merely outlive a parent that was killed.
     let _ = rustix::process::set_parent_process_death_signal(signal);

@@ -139,7 +139,7 @@ pub const TO_AUTOPILOT: Topic<MavlinkBytes> =
 pub const HEALTH: Topic<Health> = Topic::new(
     "health/{service}/{instance}",
     Delivery::LastValue,
-    &["camera-pub", "controller", "detector", "gcs-bridge", "simulator"],
+    &["camera-pub", "controller", "detector", "gcs-bridge", "relay", "simulator"],
 );
 
 /// Key of the liveliness token a service declares when it is ready.

@@ -45,12 +45,28 @@ impl HealthCounters {
 
     /// Something was dropped.
     pub fn dropped(&self, reason: &str) {
-        raise(&mut self.lock().drops, reason);
+        let mut counters = self.lock();
+        match counters.drops.get_mut(reason) {
+            Some(count) => *count += 1,
+            None => drop(counters.drops.insert(reason.to_owned(), 1)),
+        }
     }
 
     /// Something failed; true when it is the first failure for this reason, which is the one to log.
     pub fn failed(&self, reason: &str) -> bool {
-        raise(&mut self.lock().errors, reason) == 1
+        self.failed_times(reason, 1)
+    }
+
+    /// Something failed so many times; true when these are the first for this reason.
+    pub fn failed_times(&self, reason: &str, times: u64) -> bool {
+        let mut counters = self.lock();
+        match counters.errors.get_mut(reason) {
+            Some(count) => {
+                *count += times;
+                false
+            }
+            None => counters.errors.insert(reason.to_owned(), times).is_none(),
+        }
     }
 
     /// Median and 99th percentile of a latency, in milliseconds.
@@ -98,19 +114,6 @@ impl HealthCounters {
     // A thread that panicked while counting leaves counts that are still counts.
     fn lock(&self) -> MutexGuard<'_, Counters> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-fn raise(counts: &mut BTreeMap<String, u64>, reason: &str) -> u64 {
-    match counts.get_mut(reason) {
-        Some(count) => {
-            *count += 1;
-            *count
-        }
-        None => {
-            counts.insert(reason.to_owned(), 1);
-            1
-        }
     }
 }
 

@@ -6,9 +6,12 @@ use std::io::IsTerminal;
 use anyhow::Context;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer};
 
 use crate::config::Layers;
+use crate::refusals::{OnlyRefusals, Refusals};
 use crate::session::{Identity, Node, ZenohSource};
 
 /// The number of threads a cut air link must not be able to stop (see `zenoh-config/README.md`).
@@ -91,18 +94,19 @@ pub fn start_logging(default_level: &str) {
     let ours = std::env::var("ALIGHT_LOG").unwrap_or_else(|_| default_level.to_owned());
     // Zenoh complains about every attempt at the meeting point, by whoever keeps it too; that is how it is meant to work.
     let filter = EnvFilter::try_new(format!(
-        "zenoh=error,zenoh_transport=off,zenoh_link=error,zenoh_shm=error,{ours}"
+        "zenoh=error,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error,{ours}"
     ))
     .unwrap_or_else(|_| EnvFilter::new("info,zenoh=error,zenoh_transport=off"));
-    let log = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let log = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
         // A log that nobody reads any more (a broken pipe) is lost; complaining about it there would end the process.
-        .log_internal_errors(false);
+        .log_internal_errors(false)
+        .with_filter(filter);
+    let refusals = Refusals.with_filter(OnlyRefusals);
     // Logging that was started already (by a test, say) stays as it is.
-    drop(log.try_init());
+    drop(tracing_subscriber::registry().with(log).with(refusals).try_init());
 }
 
 /// Gives Zenoh the threads it needs, by starting this program over with the setting in its environment; it is read

@@ -1,0 +1,133 @@
+//! Two hosts: the drone's own processes, its relay, and the ground.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::{Context, anyhow, ensure};
+use messages::{CommandReply, ControllerCommand, Wind, topic};
+use node::{Identity, Network, Node};
+use tokio::time::timeout;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Where the processes of one test meet.
+#[derive(Clone)]
+struct Site {
+    meet: u16,
+    air: String,
+}
+
+impl Site {
+    fn new() -> anyhow::Result<Self> {
+        let free = || -> anyhow::Result<u16> {
+            Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+        };
+        // The air link has two neighbouring ports.
+        let air = loop {
+            let port = free()?;
+            if port < u16::MAX && std::net::TcpListener::bind(("127.0.0.1", port + 1)).is_ok() {
+                break port;
+            }
+        };
+        Ok(Self { meet: free()?, air: format!("127.0.0.1:{air}") })
+    }
+
+    fn network(&self, role: &str) -> Network {
+        Network {
+            config: Some(PathBuf::from(role)),
+            connect: Some(self.air.clone()),
+            listen: Some(self.air.clone()),
+            meet: Some(self.meet),
+            ..Network::default()
+        }
+    }
+
+    async fn open(&self, role: &str, service: &'static str, name: &str) -> anyhow::Result<Node> {
+        let mut network = self.network(role);
+        if role == "drone" {
+            // What `drone` connects to is its own meeting point.
+            network.connect = None;
+        }
+        let identity = Identity { service, instance: name.into() };
+        Node::open(identity, &network.source(service)?).await
+    }
+}
+
+/// Publishes until it is heard.
+async fn is_heard(from: &Node, by: &Node) -> anyhow::Result<()> {
+    let subscriber = by.subscriber(topic::WIND, &[]).await?;
+    let publisher = from.publisher(topic::WIND, &[]).await?;
+    let wind = Wind { velocity_ned_m_s: [1.0, 2.0, 3.0], stamp_ns: 7 };
+    let heard = async {
+        loop {
+            publisher.publish(&wind).await;
+            if let Ok(Some(heard)) = timeout(Duration::from_millis(50), subscriber.next()).await {
+                return heard;
+            }
+        }
+    };
+    let heard = timeout(PATIENCE, heard).await.context("nothing is heard")?;
+    ensure!(heard == wind);
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_ground_takes_part_through_the_drones_relay() -> anyhow::Result<()> {
+    let site = Site::new()?;
+    let controller = site.open("local", "controller", "main").await?;
+    let camera = site.open("local", "camera-pub", "down").await?;
+    let commands = controller.commands(topic::COMMAND, &[]).await?;
+    controller.announce().await?;
+    // The ground is there before the relay is.
+    let detector = site.open("ground", "detector", "ground").await?;
+    detector.announce().await?;
+    let relay = site.open("drone", "relay", "drone").await?;
+    is_heard(&camera, &detector).await?;
+    is_heard(&detector, &controller).await?;
+    let answering = tokio::spawn(async move {
+        let request = commands.next().await.context("a command")?;
+        request.answer(&CommandReply { accepted: true, reason: "it is done".into() }).await;
+        anyhow::Ok(commands)
+    });
+    let reply = detector.command(topic::COMMAND, &[], &ControllerCommand::Hold).await?;
+    ensure!(reply.accepted, "{reply:?}");
+    let _commands = answering.await??;
+    ensure!(controller.alive("detector", "*").await? == ["ground"]);
+    ensure!(detector.alive("controller", "*").await? == ["main"]);
+    // Without the relay the drone is by itself; the next one has all together again.
+    let presence = controller.presence("detector").await?;
+    let change = || async { timeout(PATIENCE, presence.next()).await?.ok_or(anyhow!("closed")) };
+    ensure!(change().await? == ("ground".to_owned(), true));
+    relay.close().await;
+    ensure!(change().await? == ("ground".to_owned(), false));
+    is_heard(&camera, &controller).await?;
+    let _relay = site.open("drone", "relay", "drone").await?;
+    ensure!(change().await? == ("ground".to_owned(), true));
+    is_heard(&camera, &detector).await?;
+    is_heard(&detector, &controller).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn processes_on_the_ground_hear_each_other_without_the_drone() -> anyhow::Result<()> {
+    let site = Site::new()?;
+    let relay = site.open("drone", "relay", "drone").await?;
+    let first = site.open("ground", "detector", "ground").await?;
+    let second = site.open("ground", "gcs-bridge", "ground").await?;
+    is_heard(&first, &second).await?;
+    relay.close().await;
+    is_heard(&first, &second).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_relay_stands_between() -> anyhow::Result<()> {
+    let drone = Site::new()?;
+    let base = Site::new()?;
+    let camera = drone.open("local", "camera-pub", "down").await?;
+    let _drones = drone.open("drone", "relay", "drone").await?;
+    let between = Network { listen: Some(base.air.clone()), ..drone.network("relay") };
+    let identity = Identity { service: "relay", instance: "base".into() };
+    let _between = Node::open(identity, &between.source("relay")?).await?;
+    let detector = base.open("ground", "detector", "ground").await?;
+    is_heard(&camera, &detector).await?;
+    is_heard(&detector, &camera).await
+}
