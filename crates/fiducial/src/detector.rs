@@ -137,6 +137,11 @@ impl Detector {
             let watch = (&mut self.trace, &mut *stages);
             self.squares.detect_damaged(view, &self.outlines, camera, watch, &mut self.found);
         }
+        if self.found.is_empty() && !self.stags.is_empty() {
+            let watch = (&mut self.trace, &mut *stages);
+            let seen = (view, self.outlines.pyramid());
+            self.stags.detect_damaged(seen, camera, watch, &mut self.found);
+        }
         self.trace.markers.extend(self.found.iter().map(TracedMarker::from));
         &self.found
     }

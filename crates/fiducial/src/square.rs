@@ -53,8 +53,8 @@ const LEAST_CONFIDENCE_OFTEN: f64 = 0.6;
 /// How good corners are before they are refined: of an outline; of joined segments, at least, and as a share of the
 /// diagonal.
 const OUTLINED_PX: f64 = 0.2;
-const JOINED_PX: f64 = 0.5;
-const JOINED_SHARE: f64 = 0.015;
+pub(crate) const JOINED_PX: f64 = 0.5;
+pub(crate) const JOINED_SHARE: f64 = 0.015;
 
 /// One family that is looked for, and which of its ids.
 #[derive(Debug)]
@@ -504,7 +504,7 @@ fn observe(
 }
 
 /// Corners that could not be refined, and how good they are in pixels.
-fn coarse(corners: &[Pixel; 4], corner_px: f64) -> Refined {
+pub(crate) fn coarse(corners: &[Pixel; 4], corner_px: f64) -> Refined {
     let corner_px2 = corner_px * corner_px;
     Refined {
         corners: *corners,

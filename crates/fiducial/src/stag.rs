@@ -1,13 +1,16 @@
 //! STag: a black square with a white disc in it, and 48 dots in the disc (Benligiray, Topal, Akinlar: "STag: A stable
 //! fiducial marker system", Image and Vision Computing 89, 2019).
 //!
-//! A quad's dots are solved for from its pixels, and the word that explains them best is what the marker says. Then the
-//! whole marker is compared with the image: its outline and the disc's edge where they are wide enough apart, the picture
+//! Where a quad is large and plain to see, its dots are sampled one by one. Of others they are solved for together, and the
+//! word that explains the pixels best is what the marker says. When outlines show nothing, quads of segments are sampled,
+//! with dots left out that are hidden or washed out. Then the whole marker is compared with the image: its outline and the disc's edge where they are wide enough apart, the picture
 //! as a whole where they are not.
 
 pub(crate) mod code;
+mod damaged;
 mod dots;
 mod picture;
+mod samples;
 
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::from_level_0;
@@ -19,10 +22,13 @@ use crate::pose::square_pose;
 use crate::square::codebook::Codebook;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
+use crate::square::{JOINED_PX, JOINED_SHARE, coarse};
 use crate::trace::{Reason, Trace};
 
+use damaged::Damaged;
 use dots::Dots;
 use picture::Picture;
+use samples::{Agreement, Sampled, sample};
 
 /// A quad is looked at on the level of the pyramid on which its sides are from this long to twice that, in pixels: at first
 /// and, when it may be a marker, again.
@@ -46,6 +52,18 @@ const LEAST_RATIO: f64 = 1.5;
 const ROUGHLY_EXPLAINED: f64 = 0.6;
 const ROUGH_RATIO: f64 = 1.25;
 
+/// Markers from this size on, in pixels, are sampled dot by dot, on the level of the pyramid on which they are from this
+/// wide to twice that.
+const SAMPLED_PX: f64 = 28.0;
+/// What must be there of a marker, and how well it must be explained, to need no more than samples.
+const LEAST_INTACT_PLAIN: f32 = 0.95;
+const LEAST_EXPLAINED_PLAIN: f32 = 0.85;
+/// What a damaged one must explain of its dots' places.
+const LEAST_EXPLAINED_DAMAGED: f32 = 0.7;
+/// By how many bits a word must exceed chance: one by which a marker is known at once, and one of a damaged marker.
+const LEAST_EVIDENCE_PLAIN: f32 = 20.0;
+const LEAST_EVIDENCE: f32 = 14.0;
+
 /// Finds STags among quads. It keeps its memory from image to image.
 #[derive(Debug, Default)]
 pub(crate) struct Stags {
@@ -53,6 +71,7 @@ pub(crate) struct Stags {
     dots: Dots,
     pictures: Vec<Picture>,
     scratch: Scratch,
+    damaged: Damaged,
     places: Vec<[Pixel; 4]>,
 }
 
@@ -75,6 +94,8 @@ struct Reading {
     explained: f64,
     /// What the second best leaves unexplained, over what this one does.
     ratio: f64,
+    /// Whether a reflection moves its edges, so that the refined corners are hardly better.
+    washed_out: bool,
 }
 
 impl Stags {
@@ -123,7 +144,7 @@ impl Stags {
         found: &mut Vec<Observation>,
     ) {
         self.places.clear();
-        for quad in quads.filter(|quad| !quad.inverted).take(MOST_LOOKS) {
+        for quad in quads.take(MOST_LOOKS) {
             if self.places.len() >= MOST_FOUND {
                 break;
             }
@@ -142,6 +163,90 @@ impl Stags {
         stages.ended("stags");
     }
 
+    /// Finds the markers that closed outlines do not show, as something hides a part of them; it takes several times as long
+    /// as [`Stags::detect`].
+    pub(crate) fn detect_damaged(
+        &mut self,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
+        camera: Option<&CameraModel>,
+        (trace, stages): (&mut Trace, &mut impl Stages),
+        found: &mut Vec<Observation>,
+    ) {
+        let mut damaged = std::mem::take(&mut self.damaged);
+        let candidates = damaged.find((view, pyramid), |quad| {
+            let reading = self.sampled((view, pyramid), quad, false)?;
+            Some((reading, reading.explained * (1.0 - 1.0 / (1.0 + reading.ratio))))
+        });
+        for candidate in candidates {
+            let (quad, reading) = (&candidate.quad, &candidate.reading);
+            let refined = self.refined_damaged((view, pyramid), (quad, reading), camera);
+            trace.accept_quad(refined.corners);
+            found.push(self.observe(reading, &refined, camera));
+        }
+        self.damaged = damaged;
+        stages.ended("damaged");
+    }
+
+    /// The corners of a damaged marker: refined where enough of its edges is seen, and still read as the same marker.
+    fn refined_damaged(
+        &mut self,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
+        (quad, reading): (&Quad, &Reading),
+        camera: Option<&CameraModel>,
+    ) -> Refined {
+        let mut corners = quad.corners;
+        corners.rotate_left(usize::from(reading.turns) % 4);
+        let corner_px = (JOINED_SHARE * corners[0].distance(&corners[2])).max(JOINED_PX);
+        let coarse = coarse(&corners, corner_px);
+        let Some(mut refined) = self.refined(view, (quad, reading), camera) else { return coarse };
+        let better = Quad { corners: refined.corners, ..*quad };
+        let again = self.sampled((view, pyramid), &better, false);
+        if again.is_none_or(|again| (again.id, again.turns) != (reading.id, 0)) {
+            return coarse;
+        }
+        if reading.washed_out {
+            refined.covariance_px2 += coarse.covariance_px2;
+            refined.centre_covariance_px2 += coarse.centre_covariance_px2;
+        }
+        refined
+    }
+
+    /// What a quad says, dot by dot: all of it where it is `plain` to see, or what is left of it.
+    fn sampled(
+        &self,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
+        quad: &Quad,
+        plain: bool,
+    ) -> Option<Reading> {
+        let (level, places) = on_level(&quad.corners, SAMPLED_PX, pyramid);
+        let image = pyramid.level(view, level)?;
+        let seen = sample(image, &places, quad.inverted)?;
+        let is_whole = seen.known.count_ones() as usize == code::DOTS;
+        let is_plain = is_whole && seen.intact >= LEAST_INTACT_PLAIN && !seen.washed_out;
+        let (explained, evidence) = if plain {
+            (LEAST_EXPLAINED_PLAIN, LEAST_EVIDENCE_PLAIN)
+        } else {
+            (LEAST_EXPLAINED_DAMAGED, LEAST_EVIDENCE)
+        };
+        if seen.explained < explained || plain && !is_plain {
+            return None;
+        }
+        let read = |(index, wanted): (usize, &Wanted)| {
+            let agreement = wanted.agreement(&seen).filter(|a| a.evidence >= evidence)?;
+            Some(Reading {
+                wanted: index,
+                id: agreement.id,
+                turns: agreement.turns,
+                wrong_bits: agreement.wrong_bits,
+                explained: f64::from(seen.explained * seen.intact),
+                ratio: f64::from(agreement.evidence / 8.0).max(LEAST_RATIO),
+                washed_out: seen.washed_out,
+            })
+        };
+        let all = self.wanted.iter().enumerate().filter_map(read);
+        all.max_by(|a, b| a.ratio.total_cmp(&b.ratio))
+    }
+
     /// The marker that a quad is, with its corners between the pixels.
     fn read(
         &mut self,
@@ -154,32 +259,38 @@ impl Stags {
         if side_px < LEAST_SIDE_PX {
             return Err(Reason::Small);
         }
-        let first = self.look((view, pyramid), &quad.corners, SIDE_PX[0])?;
+        if side_px >= SAMPLED_PX
+            && let Some(reading) = self.sampled((view, pyramid), quad, true)
+            && let Some(refined) = self.refined(view, (quad, &reading), camera)
+        {
+            return Ok((reading, refined));
+        }
+        let first = self.look((view, pyramid), quad, SIDE_PX[0])?;
         if first.explained < ROUGHLY_EXPLAINED || first.ratio < ROUGH_RATIO {
             return Err(Reason::Code);
         }
         // A wrong word has an outline too: with better corners, the right one explains more.
-        let refined = self.refined(view, (&quad.corners, &first), camera).ok_or(Reason::Edges)?;
-        let mut corners = refined.corners;
-        corners.rotate_right(usize::from(first.turns) % 4);
-        let second = self.look((view, pyramid), &corners, SIDE_PX[1])?;
+        let refined = self.refined(view, (quad, &first), camera).ok_or(Reason::Edges)?;
+        let mut better = Quad { corners: refined.corners, ..*quad };
+        better.corners.rotate_right(usize::from(first.turns) % 4);
+        let second = self.look((view, pyramid), &better, SIDE_PX[1])?;
         if second.explained < LEAST_EXPLAINED || second.ratio < LEAST_RATIO {
             return Err(Reason::Confidence);
         }
         if (second.wanted, second.id, second.turns) == (first.wanted, first.id, first.turns) {
             return Ok((second, refined));
         }
-        let refined = self.refined(view, (&corners, &second), camera).ok_or(Reason::Edges)?;
+        let refined = self.refined(view, (&better, &second), camera).ok_or(Reason::Edges)?;
         Ok((second, refined))
     }
 
     fn refined(
         &mut self,
         view: GrayView<'_>,
-        (corners, reading): (&[Pixel; 4], &Reading),
+        (quad, reading): (&Quad, &Reading),
         camera: Option<&CameraModel>,
     ) -> Option<Refined> {
-        let mut corners = *corners;
+        let mut corners = quad.corners;
         corners.rotate_left(usize::from(reading.turns) % 4);
         let family = self.wanted.get(reading.wanted)?.markers[0].family;
         let is_it = |picture: &Picture| (picture.family, picture.id) == (family, reading.id);
@@ -190,7 +301,7 @@ impl Stags {
             self.pictures.push(Picture::new(family, reading.id)?);
         }
         let picture = self.pictures.iter().find(|picture| is_it(picture))?;
-        let design = picture.design(shortest_side_px(&corners));
+        let design = picture.design(shortest_side_px(&corners), quad.inverted);
         refine_design(view, &corners, &design, camera, &mut self.scratch)
     }
 
@@ -198,20 +309,18 @@ impl Stags {
     fn look(
         &mut self,
         (view, pyramid): (GrayView<'_>, &Pyramid),
-        corners: &[Pixel; 4],
+        quad: &Quad,
         side_px: f64,
     ) -> Result<Reading, Reason> {
-        let level = ((shortest_side_px(corners) / side_px).log2().floor().max(0.0) as usize)
-            .min(pyramid.levels().saturating_sub(1));
+        let (level, places) = on_level(&quad.corners, side_px, pyramid);
         let image = pyramid.level(view, level).ok_or(Reason::Small)?;
-        let places = corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
         if !self.dots.look(image, &places) {
             return Err(Reason::Small);
         }
         let word = if self.dots.solve() { self.dots.word() } else { return Err(Reason::Code) };
         let mut best: Option<Reading> = None;
         for (index, wanted) in self.wanted.iter().enumerate() {
-            let reading = wanted.best(index, word, &self.dots);
+            let reading = wanted.best(index, word, (&self.dots, quad.inverted));
             let is_better =
                 |reading: &Reading| best.is_none_or(|best| best.explained < reading.explained);
             best = reading.filter(is_better).or(best);
@@ -249,20 +358,21 @@ impl Stags {
 
 impl Wanted {
     /// The wanted word that explains a picture best, given the word that its dots are nearest to.
-    fn best(&self, index: usize, word: u64, dots: &Dots) -> Option<Reading> {
+    fn best(&self, index: usize, word: u64, (dots, inverted): (&Dots, bool)) -> Option<Reading> {
         let reading = |id: u32, turns: u8| {
             // The word as it stands in the picture.
             let seen = (0..(4 - turns) % 4)
                 .fold(*self.book.words().get(id as usize)?, |word, _| self.book.turned(word));
             let explanation = dots.explain(seen);
             let [black, white] = explanation.levels;
-            (white > black).then(|| Reading {
+            ((white > black) != inverted).then(|| Reading {
                 wanted: index,
                 id,
                 turns,
                 wrong_bits: (seen ^ word).count_ones() as u8,
                 explained: explanation.explained,
                 ratio: 1.0,
+                washed_out: false,
             })
         };
         if self.tried.is_empty() {
@@ -291,6 +401,29 @@ impl Wanted {
         })
     }
 
+    /// The wanted word that agrees best with dots that were sampled.
+    fn agreement(&self, seen: &Sampled) -> Option<Agreement> {
+        let distance = self.distance();
+        if self.markers.iter().any(|m| m.id.is_none()) {
+            return seen.agreement(self.book, 0..self.book.words().len() as u32, distance);
+        }
+        seen.agreement(self.book, self.markers.iter().filter_map(|m| m.id), distance)
+    }
+
+    /// How many dots the words of the family differ in at least, however they are turned.
+    fn distance(&self) -> u32 {
+        use crate::marker::Family;
+        match self.markers[0].family {
+            Family::StagHd11 => 11,
+            Family::StagHd13 => 13,
+            Family::StagHd15 => 15,
+            Family::StagHd17 => 17,
+            Family::StagHd19 => 19,
+            Family::StagHd21 => 21,
+            _ => 23,
+        }
+    }
+
     /// How many wrong bits are mended, so that a random word hardly ever becomes one of the family's.
     fn most_wrong(&self) -> u8 {
         use crate::marker::Family;
@@ -301,6 +434,13 @@ impl Wanted {
             _ => 7,
         }
     }
+}
+
+/// The level of the pyramid on which a square's shortest side is from so long to twice that, and its corners there.
+fn on_level(corners: &[Pixel; 4], side_px: f64, pyramid: &Pyramid) -> (usize, [[f64; 2]; 4]) {
+    let level = ((shortest_side_px(corners) / side_px).log2().floor().max(0.0) as usize)
+        .min(pyramid.levels().saturating_sub(1));
+    (level, corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]))
 }
 
 fn shortest_side_px(corners: &[Pixel; 4]) -> f64 {

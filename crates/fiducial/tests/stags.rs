@@ -1,4 +1,5 @@
-//! STags as a camera sees them: from close up to where a dot is hardly wider than a pixel.
+//! STags as a camera sees them: from close up to where a dot is hardly wider than a pixel, in shadow, in glare, covered, cut,
+//! and printed the other way round.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
 
 use fiducial::{Detector, Drawing, Family, Ink, Marker, Observation, Settings};
@@ -6,6 +7,8 @@ use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
 
 const SIDE: usize = 72;
+/// Width and height of the images of markers of which a part cannot be seen.
+const LARGE: usize = 192;
 
 /// A marker's drawing with its square `side_px` wide, turned about a point near the middle of the image: every pixel is the
 /// mean of what it and half of its neighbours cover, with noise of two grey levels.
@@ -32,6 +35,12 @@ impl Shot {
     }
 
     fn image(&self) -> Vec<u8> {
+        self.seen(SIDE, |_, light| light)
+    }
+
+    /// An image of `size` pixels both ways; `veil` says what becomes of the light of a place, which is given in sides of the
+    /// marker from its middle, right and down.
+    fn seen(&self, size: usize, veil: impl Fn([f64; 2], f64) -> f64) -> Vec<u8> {
         const SAMPLES: usize = 4;
         const WIDTH_PX: f64 = 2.0;
         let (sin, cos) = self.turn.sin_cos();
@@ -40,29 +49,31 @@ impl Shot {
         let light = |x: f64, y: f64| {
             let (dx, dy) = (x - self.centre[0], y - self.centre[1]);
             let [u, v] = [cos * dx + sin * dy, cos * dy - sin * dx].map(|p| p / self.side_px);
-            match self.drawing.ink_at(u, -v) {
+            let grey = match self.drawing.ink_at(u, -v) {
                 _ if u.abs().max(v.abs()) > reach => 110.0,
                 Ink::White => 210.0,
                 Ink::Black => 30.0,
-            }
+            };
+            veil([u, v], grey).clamp(0.0, 255.0)
         };
         let mut noise = 0x2545_f491_u32;
-        (0..SIDE * SIDE)
+        (0..size * size)
             .map(|i| {
-                let (x, y) = ((i % SIDE) as f64, (i / SIDE) as f64);
+                let (x, y) = ((i % size) as f64, (i / size) as f64);
                 let all = (0..SAMPLES * SAMPLES)
                     .map(|s| light(x + offset(s % SAMPLES), y + offset(s / SAMPLES)));
                 noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
                 let mean = all.sum::<f64>() / (SAMPLES * SAMPLES) as f64;
-                (mean + f64::from(noise >> 24) / 128.0 * 3.5 - 3.5).round() as u8
+                (mean + f64::from(noise >> 24) / 128.0 * 3.5 - 3.5).round().clamp(0.0, 255.0) as u8
             })
             .collect()
     }
 }
 
 fn detect(detector: &mut Detector, image: &[u8]) -> Vec<Observation> {
-    let view = GrayView::packed(image, SIDE, SIDE).unwrap();
-    let camera = CameraModel::pinhole(SIDE as u32, SIDE as u32, 900.0);
+    let size = image.len().isqrt();
+    let view = GrayView::packed(image, size, size).unwrap();
+    let camera = CameraModel::pinhole(size as u32, size as u32, 900.0);
     detector.detect(view, Some(&camera), &mut ()).to_vec()
 }
 
@@ -119,4 +130,112 @@ fn a_marker_that_is_not_looked_for_is_not_found() {
         assert_eq!(detect(&mut detector(text), &image), [], "{text}");
     }
     assert_eq!(detect(&mut detector("stag-hd23:2"), &image).len(), 1);
+}
+
+/// Asserts that markers of several families and turns are found with their corners to `most_px` in spite of the veil.
+fn expect(name: &str, centre: [f64; 2], most_px: f64, veil: impl Fn([f64; 2], f64) -> f64) {
+    for (family, id) in [(Family::StagHd23, 3), (Family::StagHd21, 7), (Family::StagHd11, 12_345)] {
+        let mut detector = detector(&format!("{family}:*:0.1"));
+        for turn in [0.1, 0.8, 2.2, 4.3] {
+            let shot = Shot { centre, ..Shot::new(family, id, 84.0, turn) };
+            let found = detect(&mut detector, &shot.seen(LARGE, &veil));
+            let name = format!("{family}:{id} turned by {turn} {name}");
+            assert_eq!(found.len(), 1, "{name}: {found:?}");
+            assert_eq!(found[0].id, Some(id), "{name}");
+            let corners = found[0].corners.unwrap();
+            for (corner, truth) in corners.iter().zip(shot.corners()) {
+                let off_px = corner.distance(&truth);
+                assert!(off_px < most_px, "{name}: {off_px} px");
+            }
+        }
+    }
+}
+
+const MIDDLE: [f64; 2] = [95.3, 96.6];
+
+#[test]
+fn white_on_black_is_found() {
+    expect("inverted", MIDDLE, 0.1, |_, light| 240.0 - light);
+}
+
+#[test]
+fn the_edge_of_a_shadow_does_not_hide_a_marker() {
+    expect(
+        "in shadow",
+        MIDDLE,
+        0.3,
+        |[u, v], light| {
+            if u + 0.4 * v > 0.07 { 0.25 * light } else { light }
+        },
+    );
+}
+
+#[test]
+fn a_reflection_does_not_hide_a_marker() {
+    expect("in glare", MIDDLE, 3.0, |[u, v], light| {
+        let away = (u - 0.3).hypot(v + 0.15) / 0.13;
+        light + 300.0 * (-0.5 * away * away).exp()
+    });
+}
+
+#[test]
+fn a_covered_corner_does_not_hide_a_marker() {
+    for level in [20.0, 90.0, 230.0] {
+        let cover = |[u, v]: [f64; 2], light: f64| if u + v > 0.7 { level } else { light };
+        expect("covered", MIDDLE, 0.5, cover);
+    }
+}
+
+#[test]
+fn a_marker_that_the_frame_cuts_is_found() {
+    // Its left end, and where it is turned the most its left corner, is beyond the frame.
+    expect("cut", [38.5, 96.6], 1.5, |_, light| light);
+}
+
+/// A lens' Gaussian blur instead of the shot's even one, from samples a quarter of a pixel apart, elsewhere in each pixel.
+fn blurred(shot: &Shot) -> Vec<u8> {
+    const SAMPLES: usize = 21;
+    let (sin, cos) = shot.turn.sin_cos();
+    let light = |x: f64, y: f64| {
+        let (dx, dy) = (x - shot.centre[0], y - shot.centre[1]);
+        let [u, v] = [cos * dx + sin * dy, cos * dy - sin * dx].map(|p| p / shot.side_px);
+        let is_white = u.abs().max(v.abs()) > 0.5 || shot.drawing.ink_at(u, -v) == Ink::White;
+        if is_white { 210.0 } else { 30.0 }
+    };
+    let grey = |i: usize| {
+        let (x, y, place) = ((i % SIDE) as f64, (i / SIDE) as f64, i as f64);
+        let offsets = [0.7549 * place, 0.5698 * place]
+            .map(|part| (0..SAMPLES).map(move |k| (k as f64 - 10.5 + part.fract()) / 4.0));
+        let (mut sum, mut weights) = (0.0, 0.0);
+        for dy in offsets[1].clone() {
+            for dx in offsets[0].clone() {
+                let weight = (-dx * dx - dy * dy).exp();
+                sum += weight * light(x + dx, y + dy);
+                weights += weight;
+            }
+        }
+        (sum / weights).round() as u8
+    };
+    (0..SIDE * SIDE).map(grey).collect()
+}
+
+#[test]
+fn small_markers_are_as_large_as_they_are() {
+    let mut detector = detector("stag-hd23:*:0.1");
+    for side_px in [18.0, 30.0] {
+        let errors: Vec<f64> = (0..12)
+            .map(|k| {
+                let k = f64::from(k);
+                let centre = [35.0 + (0.37 * k).fract(), 36.0 + (0.73 * k).fract()];
+                let shot =
+                    Shot { centre, ..Shot::new(Family::StagHd23, 4, side_px, 0.1 + 0.37 * k) };
+                let found = detect(&mut detector, &blurred(&shot));
+                let [a, b, c, d] = found[0].corners.unwrap();
+                let twice = (c.x - a.x) * (d.y - b.y) - (d.x - b.x) * (c.y - a.y);
+                (twice / 2.0).sqrt() - side_px
+            })
+            .collect();
+        let mean_px = errors.iter().sum::<f64>() / errors.len() as f64;
+        assert!(mean_px.abs() < 0.004, "{side_px}: {mean_px} px");
+    }
 }

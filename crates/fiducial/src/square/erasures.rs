@@ -149,7 +149,7 @@ struct Grid {
 
 /// The light over a marker. Places are in cells, the middle of the square's top left one at (0, 0).
 #[derive(Copy, Clone, Debug)]
-struct Light {
+pub(crate) struct Light {
     /// The edge of a shadow; infinitely far away when there is none.
     normal: [f32; 2],
     offset: f32,
@@ -531,7 +531,7 @@ fn best_word(word: u64, known: u64, code: &Code, wanted: Option<&[u32]>) -> Opti
 }
 
 /// The number of words within `wrong` bits of one.
-fn ways(bits: u32, wrong: u32) -> f32 {
+pub(crate) fn ways(bits: u32, wrong: u32) -> f32 {
     let mut term = 1.0;
     let mut sum = 1.0;
     for k in 1..=wrong.min(bits) {
@@ -542,7 +542,7 @@ fn ways(bits: u32, wrong: u32) -> f32 {
 }
 
 /// The cells whose ink is known, by their places and grey values.
-struct Known {
+pub(crate) struct Known {
     count: usize,
     places: [[f32; 2]; MOST_CELLS],
     values: [f32; MOST_CELLS],
@@ -564,7 +564,8 @@ impl Default for Known {
 }
 
 impl Known {
-    fn push(&mut self, place: [f32; 2], value: f32, white: bool) {
+    /// Adds a place, in cells from the middle of the square's upper left one.
+    pub(crate) fn push(&mut self, place: [f32; 2], value: f32, white: bool) {
         if self.count < MOST_CELLS {
             self.places[self.count] = place;
             self.values[self.count] = value;
@@ -575,7 +576,7 @@ impl Known {
     }
 
     /// The light about a grid whose middle is at `middle` both ways.
-    fn light(&self, middle: f32) -> Option<Light> {
+    pub(crate) fn light(&self, middle: f32) -> Option<Light> {
         let (mut best, mut misfit) = self.split([1.0, 0.0], f32::INFINITY)?;
         // Little is left to explain: one light.
         if misfit > 0.01 * self.count as f32 {
@@ -748,15 +749,20 @@ impl Light {
         self.levels[usize::from(beyond > 0.0)]
     }
 
+    /// Whether a reflection adds to it.
+    pub(crate) fn is_reflected(&self) -> bool {
+        self.reflection.is_some()
+    }
+
     /// Whether a grey value is at the sensor's end where white is not.
-    fn is_brighter(&self, place: [f32; 2], value: f32) -> bool {
+    pub(crate) fn is_brighter(&self, place: [f32; 2], value: f32) -> bool {
         let [_, white] = self.plain(place);
         white < SATURATED - 10.0 && value > SATURATED
     }
 
     /// Where a grey value lies between black (0) and white (1); `None` outside of the image, where the two lights
     /// disagree about it, and where a reflection leaves no difference.
-    fn white_share(&self, place: [f32; 2], value: f32) -> Option<f32> {
+    pub(crate) fn white_share(&self, place: [f32; 2], value: f32) -> Option<f32> {
         if !value.is_finite() {
             return None;
         }

@@ -10,8 +10,8 @@ use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
 use crate::exposure::Exposure;
-use crate::square::pattern::{MOST_CELLS, Pattern};
-use crate::square::refine::{Design, Fit, Homography, Lens, Scratch};
+use crate::square::pattern::Pattern;
+use crate::square::refine::{Design, Fit, Homography, Lens, MOST_ACROSS, Scratch};
 use crate::step::{END, PIXEL_VARIANCE, Step, boxiness};
 
 /// Light and blur of a marker's picture.
@@ -51,7 +51,7 @@ const SETTLED_PX: [f64; 2] = [0.15, 0.015];
 /// A marker that moves less than this keeps its pixels.
 const SAME_PIXELS_PX: f64 = 0.4;
 /// Columns or rows of cells that the blur reaches across at most.
-const MOST_BANDS: usize = 12;
+const MOST_BANDS: usize = 28;
 /// The spread may become this, in pixels.
 const SPREAD_LIMITS_PX: (f64, f64) = (0.25, 4.0);
 /// Less contrast, in grey levels, is none.
@@ -190,8 +190,8 @@ struct Grid {
     /// Cells from the middle to the square's side, and from the pattern's to its end.
     half: f64,
     middle: f64,
-    white: [[f64; MOST_CELLS]; MOST_CELLS],
-    unknown: [[f64; MOST_CELLS]; MOST_CELLS],
+    white: [[f64; MOST_ACROSS]; MOST_ACROSS],
+    unknown: [[f64; MOST_ACROSS]; MOST_ACROSS],
     has_unknown: bool,
     bend: [[f64; 2]; 2],
     step: Step,
@@ -254,8 +254,8 @@ struct Map {
 impl Grid {
     fn new(pattern: &Pattern, lens: &Lens<'_>) -> Self {
         let across = pattern.across();
-        let mut white = [[0.0; MOST_CELLS]; MOST_CELLS];
-        let mut unknown = [[0.0; MOST_CELLS]; MOST_CELLS];
+        let mut white = [[0.0; MOST_ACROSS]; MOST_ACROSS];
+        let mut unknown = [[0.0; MOST_ACROSS]; MOST_ACROSS];
         for y in 0..across {
             for x in 0..across {
                 match pattern.is_white(x, y) {
@@ -268,16 +268,16 @@ impl Grid {
     }
 
     fn of(design: &Design<'_>, lens: &Lens<'_>) -> Self {
-        let across = (design.cells + 2 * design.margin).min(MOST_CELLS);
-        let known = [[0.0; MOST_CELLS]; MOST_CELLS];
+        let across = (design.cells + 2 * design.margin).min(MOST_ACROSS);
+        let known = [[0.0; MOST_ACROSS]; MOST_ACROSS];
         Self::with(lens, (design.cells, across), *design.white, known)
     }
 
     fn with(
         lens: &Lens<'_>,
         (cells, across): (usize, usize),
-        white: [[f64; MOST_CELLS]; MOST_CELLS],
-        unknown: [[f64; MOST_CELLS]; MOST_CELLS],
+        white: [[f64; MOST_ACROSS]; MOST_ACROSS],
+        unknown: [[f64; MOST_ACROSS]; MOST_ACROSS],
     ) -> Self {
         let bend = lens.slope();
         Self {

@@ -12,7 +12,7 @@ use geometry::{CameraModel, Distortion, Pixel, Point};
 use imaging::GrayView;
 use nalgebra::{Matrix2, SMatrix, SVector};
 
-use crate::square::pattern::{MOST_CELLS, Pattern};
+use crate::square::pattern::Pattern;
 use crate::square::picture::{self, Picture};
 use crate::square::profiles::{self, Run};
 use crate::square::quad::middle;
@@ -78,6 +78,9 @@ pub fn refine(
     fit.refined(&lens, corners, start.shortest_side_px())
 }
 
+/// Most small cells across a [`Design`].
+pub(crate) const MOST_ACROSS: usize = 60;
+
 /// A square picture that is not made of square cells of one colour.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Design<'a> {
@@ -85,7 +88,7 @@ pub(crate) struct Design<'a> {
     pub(crate) cells: usize,
     pub(crate) margin: usize,
     /// The share of white in each of them, row by row.
-    pub(crate) white: &'a [[f64; MOST_CELLS]; MOST_CELLS],
+    pub(crate) white: &'a [[f64; MOST_ACROSS]; MOST_ACROSS],
     /// Places on edges, in the square's coordinates, and from there towards white as far as no other edge is.
     pub(crate) edges: &'a [[[f64; 2]; 2]],
     /// How far the square's outline is from the next edge, in sides of the square.

@@ -13,9 +13,9 @@ use crate::stag::code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET};
 use crate::step::Step;
 
 /// Small cells across the square and its paper; their borders are the square's outline.
-pub(crate) const CELLS: usize = 24;
-pub(crate) const MARGIN: usize = (CELLS as f64 * QUIET) as usize;
-pub(crate) const ACROSS: usize = CELLS + 2 * MARGIN;
+const CELLS: usize = 24;
+const MARGIN: usize = (CELLS as f64 * QUIET) as usize;
+const ACROSS: usize = CELLS + 2 * MARGIN;
 
 const UNKNOWNS: usize = DOTS + 2;
 /// Indices of the values of what is known to be black and of what is known to be white.
@@ -206,10 +206,12 @@ impl Dots {
         }
     }
 
-    /// The word that the dots' values are nearest to.
+    /// The word that the dots' values are nearest to; what is black in print is bright where the print is inverted.
     pub(crate) fn word(&self) -> u64 {
-        let middle = (self.solution[DARK] + self.solution[BRIGHT]) / 2.0;
-        self.solution.iter().skip(2).fold(0, |word, value| word << 1 | u64::from(*value < middle))
+        let (dark, bright) = (self.solution[DARK], self.solution[BRIGHT]);
+        let (middle, inverted) = ((dark + bright) / 2.0, dark > bright);
+        let is_black = |value: f64| (value < middle) != inverted;
+        self.solution.iter().skip(2).fold(0, |word, value| word << 1 | u64::from(is_black(*value)))
     }
 
     /// How well a word explains the picture, with levels of its own for black and white.

@@ -2,13 +2,19 @@
 
 use crate::drawing::{Drawing, Ink, Shape};
 use crate::marker::{Family, Marker};
-use crate::square::pattern::MOST_CELLS;
-use crate::square::refine::Design;
-use crate::stag::code::DISC_RADIUS;
-use crate::stag::dots::{ACROSS, CELLS, MARGIN};
+use crate::square::refine::{Design, MOST_ACROSS};
+use crate::stag::code::{DISC_RADIUS, QUIET};
 
+/// Small cells across the square and its paper; their borders are the square's outline. What a disc's edge looks like in
+/// them is blurred by their width, which must be well below the blur's: of a small square in the image they are twice as
+/// wide.
+const CELLS: usize = 48;
+const MARGIN: usize = (CELLS as f64 * QUIET) as usize;
+const ACROSS: usize = CELLS + 2 * MARGIN;
+const _: () = assert!(ACROSS <= MOST_ACROSS);
+const SMALL_PX: f64 = 14.0;
 /// Samples of a small cell in each direction.
-const SAMPLES: usize = 16;
+const SAMPLES: usize = 8;
 const FINE: usize = ACROSS * SAMPLES;
 /// Places on each side, and on the disc's edge.
 const ON_SIDE: usize = 36;
@@ -23,8 +29,11 @@ const RIM: f64 = 0.1;
 pub(crate) struct Picture {
     pub(crate) family: Family,
     pub(crate) id: u32,
-    white: Box<[[f64; MOST_CELLS]; MOST_CELLS]>,
-    edges: Vec<[[f64; 2]; 2]>,
+    white: Box<[[f64; MOST_ACROSS]; MOST_ACROSS]>,
+    /// The same with cells twice as wide.
+    coarse: Box<[[f64; MOST_ACROSS]; MOST_ACROSS]>,
+    /// Of black on white, and of white on black.
+    edges: [Vec<[[f64; 2]; 2]>; 2],
 }
 
 /// Where the rim between disc and dots is narrower than this, in pixels, the disc's edge is not looked at by itself.
@@ -34,19 +43,30 @@ impl Picture {
     /// `None` for an id that the family does not have.
     pub(crate) fn new(family: Family, id: u32) -> Option<Self> {
         let drawing = Drawing::new(&Marker { family, id: Some(id), size_m: None }, 1.0)?;
-        Some(Self { family, id, white: white(&drawing), edges: edges() })
+        let white = white(&drawing);
+        let coarse = halved(&white);
+        let black = edges();
+        let bright = black.iter().map(|[place, [x, y]]| [*place, [-x, -y]]).collect();
+        Some(Self { family, id, white, coarse, edges: [black, bright] })
     }
 
-    /// For a square with sides of this length.
-    pub(crate) fn design(&self, side_px: f64) -> Design<'_> {
+    /// For a square with sides of this length, white on black when `inverted`.
+    pub(crate) fn design(&self, side_px: f64, inverted: bool) -> Design<'_> {
         let is_wide = side_px * RIM / 2.0 >= LEAST_RIM_PX;
-        let edges = if is_wide { &self.edges[..] } else { &self.edges[..4 * ON_SIDE] };
-        Design { cells: CELLS, margin: MARGIN, white: &self.white, edges, border: BORDER / 2.0 }
+        let edges = &self.edges[usize::from(inverted)];
+        let edges = if is_wide { &edges[..] } else { &edges[..4 * ON_SIDE] };
+        let border = BORDER / 2.0;
+        if side_px < SMALL_PX {
+            let (cells, margin) = (CELLS / 2, MARGIN / 2);
+            Design { cells, margin, white: &self.coarse, edges, border }
+        } else {
+            Design { cells: CELLS, margin: MARGIN, white: &self.white, edges, border }
+        }
     }
 }
 
 /// The share of white in each small cell.
-fn white(drawing: &Drawing) -> Box<[[f64; MOST_CELLS]; MOST_CELLS]> {
+fn white(drawing: &Drawing) -> Box<[[f64; MOST_ACROSS]; MOST_ACROSS]> {
     let mut fine = vec![true; FINE * FINE];
     let per_unit = (CELLS * SAMPLES) as f64;
     let middle = FINE as f64 / 2.0;
@@ -74,12 +94,23 @@ fn white(drawing: &Drawing) -> Box<[[f64; MOST_CELLS]; MOST_CELLS]> {
             }
         }
     }
-    let mut white = Box::new([[0.0; MOST_CELLS]; MOST_CELLS]);
+    let mut white = Box::new([[0.0; MOST_ACROSS]; MOST_ACROSS]);
     for (index, is_white) in fine.iter().enumerate() {
         let (x, y) = (index % FINE / SAMPLES, index / FINE / SAMPLES);
         white[y][x] += f64::from(u8::from(*is_white)) / (SAMPLES * SAMPLES) as f64;
     }
     white
+}
+
+/// The same with cells twice as wide.
+fn halved(white: &[[f64; MOST_ACROSS]; MOST_ACROSS]) -> Box<[[f64; MOST_ACROSS]; MOST_ACROSS]> {
+    let mut coarse = Box::new([[0.0; MOST_ACROSS]; MOST_ACROSS]);
+    for (y, row) in white.iter().enumerate() {
+        for (x, share) in row.iter().enumerate() {
+            coarse[y / 2][x / 2] += share / 4.0;
+        }
+    }
+    coarse
 }
 
 /// Places on the outline and on the disc's edge, in the square's coordinates (x right, y down, -1 to 1), and for each the
@@ -113,7 +144,8 @@ mod tests {
         let drawing = Drawing::new(&marker, 1.0).unwrap();
         let picture = Picture::new(Family::StagHd21, 3).unwrap();
         let samples = 20;
-        for cell in 0..ACROSS * ACROSS {
+        // Every so many-th cell, for the time it takes.
+        for cell in (0..ACROSS * ACROSS).step_by(7) {
             let (x, y) = (cell % ACROSS, cell / ACROSS);
             let place = |cell: usize, k: usize| {
                 let offset = (k as f64 + 0.5) / f64::from(samples);
@@ -126,5 +158,7 @@ mod tests {
             let share = white.count() as f64 / f64::from(samples * samples);
             assert!((share - picture.white[y][x]).abs() < 0.12, "{x} {y}");
         }
+        let sum = |white: &[[f64; MOST_ACROSS]; MOST_ACROSS]| white.iter().flatten().sum::<f64>();
+        assert!((sum(&picture.white) - 4.0 * sum(&picture.coarse)).abs() < 1e-6);
     }
 }
