@@ -136,7 +136,7 @@ fn a_marker_that_is_not_looked_for_is_not_found() {
 fn expect(name: &str, centre: [f64; 2], most_px: f64, veil: impl Fn([f64; 2], f64) -> f64) {
     for (family, id) in [(Family::StagHd23, 3), (Family::StagHd21, 7), (Family::StagHd11, 12_345)] {
         let mut detector = detector(&format!("{family}:*:0.1"));
-        for turn in [0.1, 0.8, 2.2, 4.3] {
+        for turn in [0.8, 4.3] {
             let shot = Shot { centre, ..Shot::new(family, id, 84.0, turn) };
             let found = detect(&mut detector, &shot.seen(LARGE, &veil));
             let name = format!("{family}:{id} turned by {turn} {name}");
