@@ -97,12 +97,14 @@ impl Detector {
         self.found.clear();
         self.trace.clear();
         let has_quads = !self.squares.is_empty() || !self.stags.is_empty();
-        let needs_outlines = |marker: &Marker| marker.family != Family::RingsThesis;
-        if self.markers.iter().any(needs_outlines) {
+        if !has_quads && self.markers.iter().any(|marker| marker.family == Family::Rings) {
+            self.outlines.begin(view);
+        }
+        if has_quads {
             // Markers with a white border may be as small as others; others printed white on black are only looked for where
             // they are large.
             let bright_from = if self.squares.has_bright() { 0 } else { INVERTED_FROM };
-            let bright_from = has_quads.then_some(bright_from);
+            let bright_from = Some(bright_from);
             let mut settings = outline::Settings { bright_from, ..outline::Settings::default() };
             if !self.stags.is_empty() {
                 settings.largest_px = settings.largest_px.max(Stags::LARGEST_PX);
@@ -121,7 +123,8 @@ impl Detector {
             }
         }
         for marker in &self.markers {
-            let (watch, seen) = ((&mut self.trace, &mut *stages), (view, &self.outlines));
+            let watch = (&mut self.trace, &mut *stages);
+            let seen = (view, &mut self.outlines, !has_quads);
             let found = &mut self.found;
             match marker.family {
                 Family::Rings => self.rings.detect(seen, marker, camera, watch, found),

@@ -9,7 +9,7 @@
 //! marker's, and decides whether it is believed.
 
 use geometry::CameraModel;
-use imaging::{Ellipse, GrayView, Outlines};
+use imaging::{Ellipse, GrayView, Outlines, outline};
 
 use crate::circles::{EdgePoint, pixel_covariance, project};
 use crate::lens::{guess_lens, nominal_camera};
@@ -25,16 +25,25 @@ use crate::trace::{Reason, Trace};
 /// Where the marker is looked for; what comes later only when it was not found before.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 enum Stage {
-    /// Outlines that are ellipses.
-    Whole,
+    /// Outlines that are ellipses, on levels of the image's pyramid from this one on up to the other.
+    Whole(usize, usize),
     /// Outlines that show arcs of ellipses.
     Parts,
     /// Bright specks, which may be the paper of a marker far away.
     Specks,
 }
 
+/// The largest markers first, which take the least time to find.
+const STAGES: [Stage; 5] = [
+    Stage::Whole(2, usize::MAX),
+    Stage::Whole(1, 2),
+    Stage::Whole(0, 1),
+    Stage::Parts,
+    Stage::Specks,
+];
+
 /// Regions of any shape that are large enough to show arcs.
-const PARTS: imaging::outline::Settings = imaging::outline::Settings {
+const PARTS: outline::Settings = outline::Settings {
     dark_from: Some(2),
     bright_from: None,
     whole_level: 2,
@@ -47,31 +56,25 @@ const PARTS: imaging::outline::Settings = imaging::outline::Settings {
     most_ragged: 5.0,
 };
 
+/// Regions as small as the paper of a marker far away.
+const SPECKS: outline::Settings = outline::Settings {
+    dark_from: None,
+    bright_from: Some(1),
+    whole_level: usize::MAX,
+    smallest_px: 4,
+    largest_px: 16,
+    steep: false,
+    least_fill: 0.5,
+    most_ragged: 1.3,
+    ..PARTS
+};
+
 impl Stage {
     fn name(self) -> &'static str {
         match self {
-            Self::Whole => "ellipses",
+            Self::Whole(..) => "ellipses",
             Self::Parts => "arcs",
             Self::Specks => "specks",
-        }
-    }
-
-    /// Of outlines other than those that all families share.
-    fn settings(self) -> Option<imaging::outline::Settings> {
-        match self {
-            Self::Whole => None,
-            Self::Parts => Some(PARTS),
-            Self::Specks => Some(imaging::outline::Settings {
-                dark_from: None,
-                bright_from: Some(1),
-                whole_level: usize::MAX,
-                smallest_px: 4,
-                largest_px: 16,
-                steep: false,
-                least_fill: 0.5,
-                most_ragged: 1.3,
-                ..PARTS
-            }),
         }
     }
 }
@@ -86,7 +89,6 @@ const MOST_MARKERS: usize = 8;
 /// The detector's working memory.
 #[derive(Debug, Default)]
 pub struct Rings {
-    outlines: Outlines,
     borders: Vec<Border>,
     candidates: Vec<Candidate>,
     edges: Vec<EdgePoint>,
@@ -94,10 +96,11 @@ pub struct Rings {
 }
 
 impl Rings {
-    /// Finds the markers in an image with these outlines; the surest comes first.
+    /// Finds the markers in an image; the surest comes first. `outlines` has the outlines of that image as other families
+    /// share them, or, when it is told to be empty, only its pyramid; what else is looked at is added to it.
     pub fn detect(
         &mut self,
-        (view, outlines): (GrayView<'_>, &Outlines),
+        (view, outlines, is_empty): (GrayView<'_>, &mut Outlines, bool),
         marker: &Marker,
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
@@ -105,8 +108,8 @@ impl Rings {
     ) {
         let nominal = nominal_camera(view);
         let first = found.len();
-        for stage in [Stage::Whole, Stage::Parts, Stage::Specks] {
-            self.find_candidates((view, outlines), stage);
+        for stage in STAGES {
+            self.find_candidates((view, outlines, is_empty), stage);
             trace.ellipses.extend(self.borders.iter().map(|b| b.ellipse));
             trace.rings.extend(self.candidates.iter().map(ring));
             stages.ended(stage.name());
@@ -120,22 +123,32 @@ impl Rings {
     }
 
     /// The circles that may be the marker's, those that look most like it first.
-    fn find_candidates(&mut self, (view, outlines): (GrayView<'_>, &Outlines), stage: Stage) {
+    fn find_candidates(
+        &mut self,
+        (view, outlines, is_empty): (GrayView<'_>, &mut Outlines, bool),
+        stage: Stage,
+    ) {
         self.borders.clear();
         self.candidates.clear();
-        if let Some(settings) = stage.settings() {
-            self.outlines.find(view, &settings);
-        }
         match stage {
-            Stage::Whole => {
-                let dark = outlines.iter().filter(|o| o.dark);
+            Stage::Whole(finest, end) => {
+                if is_empty {
+                    outlines.add(view, &outline::Settings::default(), finest..end);
+                }
+                let dark = outlines.iter().filter(|o| o.dark && (finest..end).contains(&o.level));
                 let whole = dark.filter_map(|o| whole_border(&o));
                 self.borders.extend(whole.take(MOST_BORDERS));
             }
-            Stage::Parts => self.find_arcs(view),
+            Stage::Parts => {
+                let first = outlines.len();
+                outlines.add(view, &PARTS, 0..usize::MAX);
+                self.find_arcs(view, outlines, first);
+            }
             Stage::Specks => {
-                let specks =
-                    self.outlines.iter().take(MOST_BORDERS).filter_map(|o| speck(view, &o));
+                let first = outlines.len();
+                outlines.add(view, &SPECKS, 0..usize::MAX);
+                let specks = outlines.iter().skip(first).take(MOST_BORDERS);
+                let specks = specks.filter_map(|o| speck(view, &o));
                 self.candidates.extend(specks.take(MOST_CANDIDATES));
             }
         }
@@ -159,13 +172,14 @@ impl Rings {
         self.candidates.truncate(kept);
     }
 
-    fn find_arcs(&mut self, view: GrayView<'_>) {
+    /// Takes the arcs of the outlines from the index `first` on.
+    fn find_arcs(&mut self, view: GrayView<'_>, outlines: &Outlines, first: usize) {
         let mut budget = MOST_ARC_FITS;
-        for outline in self.outlines.iter() {
+        for outline in outlines.iter().skip(first) {
             if whole_border(&outline).is_some() {
                 continue;
             }
-            let level = self.outlines.pyramid().level(view, outline.level);
+            let level = outlines.pyramid().level(view, outline.level);
             let Some(size) = level.map(|v| [v.width(), v.height()]) else { continue };
             add_arcs(&outline, size, &mut budget, &mut self.borders);
             if budget == 0 || self.borders.len() >= MOST_BORDERS {

@@ -123,12 +123,13 @@ mod plain {
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
     use std::arch::x86_64::{
-        __m256i, _mm256_add_epi16, _mm256_adds_epu8, _mm256_and_si256, _mm256_avg_epu8,
-        _mm256_cmpeq_epi8, _mm256_loadu_si256, _mm256_maddubs_epi16, _mm256_max_epu8,
-        _mm256_min_epu8, _mm256_movemask_epi8, _mm256_packus_epi16, _mm256_packus_epi32,
-        _mm256_permute4x64_epi64, _mm256_permutevar8x32_epi32, _mm256_set_epi32, _mm256_set1_epi8,
-        _mm256_set1_epi16, _mm256_set1_epi32, _mm256_srli_epi16, _mm256_srli_epi32,
-        _mm256_storeu_si256, _mm256_subs_epu8,
+        __m256i, _mm_cvtsi128_si64, _mm256_add_epi16, _mm256_adds_epu8, _mm256_and_si256,
+        _mm256_avg_epu8, _mm256_castsi256_si128, _mm256_cmpeq_epi8, _mm256_loadu_si256,
+        _mm256_maddubs_epi16, _mm256_max_epu8, _mm256_min_epu8, _mm256_movemask_epi8,
+        _mm256_packus_epi16, _mm256_packus_epi32, _mm256_permute4x64_epi64,
+        _mm256_permutevar8x32_epi32, _mm256_set_epi32, _mm256_set1_epi8, _mm256_set1_epi16,
+        _mm256_set1_epi32, _mm256_srli_epi16, _mm256_srli_epi32, _mm256_storeu_si256,
+        _mm256_subs_epu8,
     };
 
     use super::TILE;
@@ -170,18 +171,37 @@ mod avx2 {
             let mut lows = [_mm256_set1_epi8(0); 4];
             let mut highs = lows;
             for (part, (low, high)) in lows.iter_mut().zip(&mut highs).enumerate() {
-                let [a, b, c, d] = rows.map(|row| load(row, step * TILES * TILE + part * 32));
-                let least = _mm256_min_epu8(_mm256_min_epu8(a, b), _mm256_min_epu8(c, d));
-                let most = _mm256_max_epu8(_mm256_max_epu8(a, b), _mm256_max_epu8(c, d));
-                let least = _mm256_min_epu8(least, _mm256_srli_epi16::<8>(least));
-                let most = _mm256_max_epu8(most, _mm256_srli_epi16::<8>(most));
-                *low = _mm256_min_epu8(least, _mm256_srli_epi32::<16>(least));
-                *high = _mm256_max_epu8(most, _mm256_srli_epi32::<16>(most));
+                (*low, *high) = extremes_of_tiles(rows, step * TILES * TILE + part * 32);
             }
             store(low, step * TILES, lowest_bytes(lows));
             store(high, step * TILES, lowest_bytes(highs));
         }
-        count * TILES
+        let zero = _mm256_set1_epi8(0);
+        let mut done = count * TILES;
+        while (done + 8) * TILE <= rows[0].len() {
+            let (least, most) = extremes_of_tiles(rows, done * TILE);
+            for (row, groups) in [(&mut *low, least), (&mut *high, most)] {
+                let bytes = lowest_bytes([groups, zero, zero, zero]);
+                let eight = _mm_cvtsi128_si64(_mm256_castsi256_si128(bytes)).to_le_bytes();
+                row[done..done + 8].copy_from_slice(&eight);
+            }
+            done += 8;
+        }
+        done
+    }
+
+    /// Of 8 tiles from a column on, the least and the greatest pixel in the lowest byte of each group of four.
+    #[target_feature(enable = "avx2")]
+    fn extremes_of_tiles(rows: &[&[u8]; TILE], at: usize) -> (__m256i, __m256i) {
+        let [a, b, c, d] = rows.map(|row| load(row, at));
+        let least = _mm256_min_epu8(_mm256_min_epu8(a, b), _mm256_min_epu8(c, d));
+        let most = _mm256_max_epu8(_mm256_max_epu8(a, b), _mm256_max_epu8(c, d));
+        let least = _mm256_min_epu8(least, _mm256_srli_epi16::<8>(least));
+        let most = _mm256_max_epu8(most, _mm256_srli_epi16::<8>(most));
+        (
+            _mm256_min_epu8(least, _mm256_srli_epi32::<16>(least)),
+            _mm256_max_epu8(most, _mm256_srli_epi32::<16>(most)),
+        )
     }
 
     /// Returns how many means it did.
@@ -207,8 +227,7 @@ mod avx2 {
     #[target_feature(enable = "avx2")]
     pub(super) fn sharpen_row(above: &[u8], here: &[u8], below: &[u8], out: &mut [u8]) -> usize {
         let length = here.len().min(above.len()).min(below.len()).min(out.len());
-        let mut at = 1;
-        while at + 33 <= length {
+        let mut one = |at: usize| {
             let down = |at: usize| {
                 _mm256_avg_epu8(_mm256_avg_epu8(load(above, at), load(below, at)), load(here, at))
             };
@@ -216,25 +235,44 @@ mod avx2 {
             let pixel = load(here, at);
             let brighter = _mm256_adds_epu8(pixel, _mm256_subs_epu8(pixel, smooth));
             store(out, at, _mm256_subs_epu8(brighter, _mm256_subs_epu8(smooth, pixel)));
+        };
+        if length < 34 {
+            return 0;
+        }
+        let mut at = 1;
+        while at + 33 <= length {
+            one(at);
             at += 32;
         }
-        if at == 1 { 0 } else { at }
+        // Some at the end are done twice rather than one by one.
+        one(length - 33);
+        length - 1
     }
 
-    /// Returns how many words it did.
+    /// Returns how many words it did: all where there are 32 pixels at least.
     #[target_feature(enable = "avx2")]
     pub(super) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) -> usize {
-        let count = (pixels.len().min(thresholds.len()) / 64).min(words.len());
-        for (step, word) in words.iter_mut().enumerate().take(count) {
-            let half = |part: usize| {
-                let at = step * 64 + part * 32;
-                let (pixel, threshold) = (load(pixels, at), load(thresholds, at));
-                let reached = _mm256_cmpeq_epi8(_mm256_max_epu8(pixel, threshold), pixel);
-                u64::from(!(_mm256_movemask_epi8(reached) as u32))
-            };
-            *word = half(0) | half(1) << 32;
+        let length = pixels.len().min(thresholds.len());
+        if length < 32 || words.len() < length.div_ceil(64) {
+            return 0;
         }
-        count
+        let half = |at: usize| {
+            let (pixel, threshold) = (load(pixels, at), load(thresholds, at));
+            let reached = _mm256_cmpeq_epi8(_mm256_max_epu8(pixel, threshold), pixel);
+            u64::from(!(_mm256_movemask_epi8(reached) as u32))
+        };
+        for (step, word) in words.iter_mut().enumerate() {
+            let at = step * 64;
+            let left = length.saturating_sub(at);
+            *word = match left {
+                0 => 0,
+                64.. => half(at) | half(at + 32) << 32,
+                // Of the last 32 pixels of the row those that belong to this word.
+                1..=32 => half(length - 32) >> (32 - left),
+                _ => half(at) | half(length - 32) >> (64 - left) << 32,
+            };
+        }
+        words.len()
     }
 }
 

@@ -1,5 +1,7 @@
 //! Outlines of dark and of bright regions, on an image and its halvings.
 
+use std::ops::Range;
+
 use crate::binary::{Binarizer, BitImage, Contrast, Middle};
 use crate::kernels::sharpen_row;
 use crate::pyramid::Pyramid;
@@ -82,9 +84,18 @@ pub struct Outlines {
     dark: BitImage,
     bright: BitImage,
     path: Vec<u8>,
-    tops: Vec<u64>,
+    tops: Tops,
     points: Vec<[f32; 2]>,
     spans: Vec<Span>,
+}
+
+/// What one row says of where outlines begin. Each has a word of noes before and after.
+#[derive(Clone, Debug, Default)]
+struct Tops {
+    /// The right ends of runs of pixels that touch none of the row above.
+    ends: Vec<u64>,
+    /// The pixels of the other runs, from one that touches to the run's end.
+    flooded: Vec<u64>,
 }
 
 /// Most levels; the coarsest is then 256 times smaller.
@@ -112,11 +123,22 @@ struct Span {
 impl Outlines {
     /// Finds the outlines in an image; those found before are forgotten.
     pub fn find(&mut self, view: GrayView<'_>, settings: &Settings) {
+        self.begin(view);
+        self.add(view, settings, 0..MOST_LEVELS);
+    }
+
+    /// Turns to another image, in which nothing is found yet.
+    pub fn begin(&mut self, view: GrayView<'_>) {
         self.points.clear();
         self.spans.clear();
         self.pyramid.build(view, MOST_LEVELS, SHORTEST_EDGE_PX);
+    }
+
+    /// Adds the outlines on some levels of the image that was begun with; `view` is that image.
+    pub fn add(&mut self, view: GrayView<'_>, settings: &Settings, levels: Range<usize>) {
         let finest = settings.dark_from.into_iter().chain(settings.bright_from).min();
-        for level in finest.unwrap_or(MOST_LEVELS)..self.pyramid.levels() {
+        let first = levels.start.max(finest.unwrap_or(MOST_LEVELS));
+        for level in first..levels.end.min(self.pyramid.levels()) {
             self.find_on(view, level, settings);
         }
     }
@@ -131,7 +153,8 @@ impl Outlines {
         self.spans.is_empty()
     }
 
-    /// The outlines, finest level first, on each level the dark ones first, from top to bottom.
+    /// The outlines in the order in which they were found: finest level first, on each level the dark ones first, from top
+    /// to bottom.
     pub fn iter(&self) -> impl Iterator<Item = Outline<'_>> {
         self.spans.iter().map(|span| self.outline(span))
     }
@@ -262,7 +285,7 @@ struct Found<'a> {
     dark: bool,
     level: u8,
     path: &'a mut Vec<u8>,
-    tops: &'a mut Vec<u64>,
+    tops: &'a mut Tops,
     points: &'a mut Vec<[f32; 2]>,
     spans: &'a mut Vec<Span>,
 }
@@ -372,8 +395,7 @@ impl Found<'_> {
         let bits = self.bits;
         for y in 0..bits.height() {
             let mut tops = std::mem::take(self.tops);
-            tops.resize(bits.row(y).len() - 1, 0);
-            mark_tops(bits.row(y), bits.row_above(y), &mut tops);
+            tops.mark(bits.row(y), bits.row_above(y));
             let goes_on = self.scan_row(y, &tops, limits, &mut steps_left);
             *self.tops = tops;
             if !goes_on || self.points.len() >= points_end {
@@ -383,19 +405,13 @@ impl Found<'_> {
     }
 
     /// Follows the outlines that begin in a row; false when there are no steps left.
-    fn scan_row(
-        &mut self,
-        y: usize,
-        tops: &[u64],
-        limits: &Limits,
-        steps_left: &mut usize,
-    ) -> bool {
-        for (index, word) in tops.iter().enumerate() {
+    fn scan_row(&mut self, y: usize, tops: &Tops, limits: &Limits, steps_left: &mut usize) -> bool {
+        for (index, word) in tops.ends.iter().skip(1).enumerate() {
             let mut word = *word;
             while word != 0 {
                 let x = index * 64 + word.trailing_zeros() as usize;
                 word &= word - 1;
-                if limits.steep && !self.is_steep(x, y) {
+                if limits.steep && !self.is_steep(x, y) || self.rises(x, y, tops) {
                     continue;
                 }
                 let (trace, steps) = self.follow(x, y, limits);
@@ -412,6 +428,35 @@ impl Found<'_> {
             }
         }
         true
+    }
+
+    /// Whether the region that begins at a top rises above it elsewhere, or begins further right as well, by what the next
+    /// rows say within half a word to both sides. Its outline, followed from here, would be given up.
+    fn rises(&self, x: usize, y: usize, tops: &Tops) -> bool {
+        const ROWS: usize = 3;
+        let (words, place) = (self.bits.bits(), self.bits.place(x, y));
+        let mut rows = [0; ROWS];
+        for (down, row) in rows.iter_mut().enumerate() {
+            *row = window(words, place + down * self.bits.row_bits());
+        }
+        let flooded = window(&tops.flooded, 64 + x);
+        // The top's own run, from its end to the left.
+        let end = 1_u64 << HALF_WORD;
+        let own = flood(rows[0], end);
+        let mut parts = [0; ROWS];
+        parts[0] = own;
+        // Down and up again.
+        for (row, from) in
+            (1..ROWS).map(|row| (row, row - 1)).chain((1..ROWS).rev().map(|row| (row - 1, row)))
+        {
+            let part = parts[from];
+            let touched = (part | part << 1 | part >> 1) & rows[row];
+            if touched & !parts[row] != 0 {
+                parts[row] = flood(rows[row], touched | parts[row]);
+            }
+        }
+        let others = parts[0] & !own;
+        others & !(end - 1) != 0 || others & flooded != 0
     }
 
     /// Whether the grey values step at a top by half of their range. Looks two pixels up and down, as blur spreads a step
@@ -551,23 +596,53 @@ impl Limits {
     }
 }
 
-/// Writes the right ends of those runs of a row that touch none of the row above, not even across a corner. Both rows
-/// have a word of noes at their end for which there is none in `ends`.
-fn mark_tops(row: &[u64], above: &[u64], ends: &mut [u64]) {
-    let (mut above_before, mut carry) = (0, false);
-    for (end, (run, above)) in ends.iter_mut().zip(row.windows(2).zip(above.windows(2))) {
-        let ([run, run_after], [above, above_after]) = ([run[0], run[1]], [above[0], above[1]]);
-        let touched = above | above << 1 | above_before >> 63 | above >> 1 | above_after << 63;
-        above_before = above;
-        // Adding a run's touched pixels to it carries a one from each of them to the run's end and changes the bits on the
-        // way: the last bit of a run stays as it is only where nothing touches.
-        let seeds = run & touched;
-        let (sum, over) = run.overflowing_add(seeds);
-        let (sum, over_too) = sum.overflowing_add(u64::from(carry));
-        let flooded = (run ^ sum) & run | seeds;
-        *end = run & !(run >> 1 | run_after << 63) & !flooded;
-        // A run that touches may go on in the next word.
-        carry = (over | over_too) && run_after & 1 == 1;
+/// Bit in the middle of a [`window`].
+const HALF_WORD: usize = 31;
+
+/// 64 bits of which that of `place` is in the middle; noes where there are none.
+#[inline]
+fn window(words: &[u64], place: usize) -> u64 {
+    let first = place - HALF_WORD;
+    let word = |index: usize| words.get(index).copied().unwrap_or(0);
+    let (low, shift) = (word(first >> 6), first & 63);
+    // Shifted twice, as 64 is no shift.
+    low >> shift | word((first >> 6) + 1) << 1 << (63 - shift)
+}
+
+/// The runs of which some bits are `seeds`.
+#[inline]
+fn flood(bits: u64, seeds: u64) -> u64 {
+    // Adding them carries a one from each to its run's end and changes the bits on the way.
+    let upwards = |bits: u64, seeds: u64| (bits ^ bits.wrapping_add(seeds)) & bits | seeds;
+    let up = upwards(bits, seeds);
+    up | upwards(bits.reverse_bits(), seeds.reverse_bits()).reverse_bits()
+}
+
+impl Tops {
+    /// Marks the tops of a row. Both rows have a word of noes at their end.
+    fn mark(&mut self, row: &[u64], above: &[u64]) {
+        for words in [&mut self.ends, &mut self.flooded] {
+            words.resize(row.len() + 1, 0);
+            if let Some(last) = words.last_mut() {
+                *last = 0;
+            }
+        }
+        let (mut above_before, mut carry) = (0, false);
+        let out = self.ends.iter_mut().zip(&mut self.flooded).skip(1);
+        for ((end, flooded), (run, above)) in out.zip(row.windows(2).zip(above.windows(2))) {
+            let ([run, run_after], [above, above_after]) = ([run[0], run[1]], [above[0], above[1]]);
+            let touched = above | above << 1 | above_before >> 63 | above >> 1 | above_after << 63;
+            above_before = above;
+            // Adding a run's touched pixels to it carries a one from each of them to the run's end and changes the bits on
+            // the way: the last bit of a run stays as it is only where nothing touches.
+            let seeds = run & touched;
+            let (sum, over) = run.overflowing_add(seeds);
+            let (sum, over_too) = sum.overflowing_add(u64::from(carry));
+            *flooded = (run ^ sum) & run | seeds;
+            *end = run & !(run >> 1 | run_after << 63) & !*flooded;
+            // A run that touches may go on in the next word.
+            carry = (over | over_too) && run_after & 1 == 1;
+        }
     }
 }
 
