@@ -168,64 +168,24 @@ impl Circles {
         finite && self.centre.z > 0.0 && self.normal.dot(&self.centre) < 0.0
     }
 
-    /// Where a ray meets the plane: distance from the centre in metres, metres per pixel along that distance,
-    /// and how the distance in pixels changes with the centre (three numbers) and with the normal along the two
-    /// vectors of [`Circles::basis`], which come along because they are the same for all rays.
-    pub(crate) fn radius_at(
-        &self,
-        (u, v): &(Vector3<f64>, Vector3<f64>),
-        ray: &Vector3<f64>,
-        camera: &CameraModel,
-    ) -> Option<(f64, f64, SVector<f64, 5>)> {
-        let (nd, nc) = (self.normal.dot(ray), self.normal.dot(&self.centre));
-        if nd > -1e-9 {
-            return None;
+    /// The plane of the circles, ready for many rays.
+    pub(crate) fn plane(&self, camera: &CameraModel) -> Plane {
+        let (u, v) = self.basis();
+        Plane {
+            normal: self.normal,
+            distance: self.normal.dot(&self.centre),
+            centre: [u.dot(&self.centre), v.dot(&self.centre)],
+            u,
+            v,
+            per_px: [1.0 / camera.fx, 1.0 / camera.fy],
         }
-        let along = nc / nd;
-        let arm = ray * along - self.centre;
-        let rho = arm.norm();
-        // From the centre itself any way is outwards.
-        let out = if rho < 1e-12 { *u } else { arm / rho };
-        let od = out.dot(ray);
-        // How the distance in the plane changes from pixel to pixel.
-        let per_pixel = |axis: usize, focal: f64| {
-            (out[axis] * along - od * along * self.normal[axis] / nd) / focal
-        };
-        // Faster than `hypot`, whose care for the smallest numbers is not needed.
-        let metres_per_px =
-            (per_pixel(0, camera.fx).powi(2) + per_pixel(1, camera.fy).powi(2)).sqrt();
-        let scale = 1.0 / metres_per_px;
-        let by_centre = (self.normal * (od / nd) - out) * scale;
-        let by_normal = (self.centre - ray * along) * (od / nd * scale);
-        let slope = SVector::<f64, 5>::new(
-            by_centre.x,
-            by_centre.y,
-            by_centre.z,
-            by_normal.dot(u),
-            by_normal.dot(v),
-        );
-        let finite = scale.is_finite() && slope.iter().all(|s| s.is_finite());
-        finite.then_some((rho, metres_per_px, slope))
-    }
-
-    /// Distance in pixels from an edge point to its circle, positive outside, and how it changes with the pose.
-    fn residual(
-        &self,
-        basis: &(Vector3<f64>, Vector3<f64>),
-        point: &EdgePoint,
-        camera: &CameraModel,
-    ) -> Option<(f64, SVector<f64, 5>)> {
-        let (rho, metres_per_px, slope) = self.radius_at(basis, &point.ray, camera)?;
-        Some(((rho - point.radius) / metres_per_px, slope))
     }
 
     /// Root mean square distance in pixels between edge points and their circles.
     pub(crate) fn rms_px(&self, points: &[EdgePoint], camera: &CameraModel) -> Option<f64> {
-        let basis = self.basis();
-        let squares: Option<f64> = points
-            .iter()
-            .map(|point| self.residual(&basis, point, camera).map(|(r, _)| r * r))
-            .sum();
+        let plane = self.plane(camera);
+        let squares: Option<f64> =
+            points.iter().map(|point| plane.residual(point).map(|(r, _)| r * r)).sum();
         Some((squares? / points.len().max(1) as f64).sqrt())
     }
 
@@ -262,12 +222,12 @@ impl Circles {
     /// other radii have some.
     pub(crate) fn bias_px(&self, points: &[EdgePoint], camera: &CameraModel) -> f64 {
         const MOST: usize = 128;
-        let basis = self.basis();
+        let plane = self.plane(camera);
         let mut worst = 0.0_f64;
         for circle in points.chunk_by(|a, b| a.radius == b.radius) {
             let mut offs = [0.0; MOST];
             for (off, point) in offs.iter_mut().zip(circle) {
-                *off = self.residual(&basis, point, camera).map_or(f64::MAX, |(off, _)| off);
+                *off = plane.residual(point).map_or(f64::MAX, |(off, _)| off);
             }
             let count = circle.len().min(MOST);
             let Some(offs) = offs.get_mut(..count) else { continue };
@@ -280,10 +240,8 @@ impl Circles {
     /// Leaves out the edge points that lie much further off than most.
     pub(crate) fn leave_outliers(&self, points: &mut Vec<EdgePoint>, camera: &CameraModel) {
         const MOST: usize = 640;
-        let basis = self.basis();
-        let off = |point: &EdgePoint| {
-            self.residual(&basis, point, camera).map_or(f64::MAX, |(r, _)| r.abs())
-        };
+        let plane = self.plane(camera);
+        let off = |point: &EdgePoint| plane.residual(point).map_or(f64::MAX, |(r, _)| r.abs());
         let mut offs = [0.0; MOST];
         let count = points.len().min(MOST);
         for (slot, point) in offs.iter_mut().zip(points.iter()) {
@@ -299,9 +257,9 @@ impl Circles {
     fn system(&self, points: &[EdgePoint], camera: &CameraModel) -> Option<(System, f64)> {
         let mut system = System { matrix: SMatrix::zeros(), right: SVector::zeros() };
         let mut cost = 0.0;
-        let basis = self.basis();
+        let plane = self.plane(camera);
         for point in points {
-            let (residual, slope) = self.residual(&basis, point, camera)?;
+            let (residual, slope) = plane.residual(point)?;
             let size = residual.abs();
             let weight = if size > HUBER_PX { HUBER_PX / size } else { 1.0 };
             cost += if size > HUBER_PX { HUBER_PX * (2.0 * size - HUBER_PX) } else { size * size };
@@ -329,6 +287,75 @@ impl Circles {
         let stepped =
             Self { centre: self.centre + step.fixed_rows::<3>(0), normal: normal.normalize() };
         stepped.is_sound().then_some(stepped)
+    }
+}
+
+/// The plane of some circles, as a camera sees it.
+pub(crate) struct Plane {
+    normal: Vector3<f64>,
+    /// Its distance from the camera along the normal, and the centre along `u` and `v`, in metres.
+    distance: f64,
+    centre: [f64; 2],
+    /// As [`Circles::basis`].
+    u: Vector3<f64>,
+    v: Vector3<f64>,
+    /// Change of a ray from pixel to pixel.
+    per_px: [f64; 2],
+}
+
+/// Where a ray meets the plane.
+pub(crate) struct Meeting {
+    /// Distance from the centre, in metres.
+    pub(crate) rho: f64,
+    /// How the place changes with the pixel, to the right and down: outwards from the centre and around it, in metres.
+    pub(crate) outwards: [f64; 2],
+    pub(crate) around: [f64; 2],
+    /// The length of `outwards`.
+    pub(crate) metres_per_px: f64,
+    /// How the distance, in pixels, changes with the centre (three numbers) and with the normal along the two vectors of
+    /// [`Circles::basis`].
+    pub(crate) slope: SVector<f64, 5>,
+}
+
+impl Plane {
+    /// Where a ray meets it; `None` when it does not.
+    #[inline]
+    pub(crate) fn meets(&self, ray: &Vector3<f64>) -> Option<Meeting> {
+        let facing = self.normal.dot(ray);
+        if facing > -1e-9 {
+            return None;
+        }
+        let inverse = 1.0 / facing;
+        let along = self.distance * inverse;
+        let (ur, vr) = (self.u.dot(ray), self.v.dot(ray));
+        let (a, b) = (ur * along - self.centre[0], vr * along - self.centre[1]);
+        // Faster than `hypot`, whose care for the smallest numbers is not needed.
+        let rho = (a * a + b * b).sqrt();
+        // From the centre itself any way is outwards.
+        let [p, q] = if rho < 1e-12 { [1.0, 0.0] } else { [a / rho, b / rho] };
+        let [nx, ny] = [self.normal.x * inverse, self.normal.y * inverse];
+        let by_pixel = |axis: &Vector3<f64>, component: f64| {
+            let [x, y] = self.per_px;
+            [along * (axis.x - component * nx) * x, along * (axis.y - component * ny) * y]
+        };
+        let (of_u, of_v) = (by_pixel(&self.u, ur), by_pixel(&self.v, vr));
+        let outwards = [p * of_u[0] + q * of_v[0], p * of_u[1] + q * of_v[1]];
+        let around = [p * of_v[0] - q * of_u[0], p * of_v[1] - q * of_u[1]];
+        let metres_per_px = (outwards[0] * outwards[0] + outwards[1] * outwards[1]).sqrt();
+        let scale = 1.0 / metres_per_px;
+        let lean = (p * ur + q * vr) * inverse * scale;
+        let by_centre = self.normal * lean - (self.u * p + self.v * q) * scale;
+        let slope =
+            SVector::<f64, 5>::new(by_centre.x, by_centre.y, by_centre.z, -a * lean, -b * lean);
+        let finite = scale.is_finite() && slope.iter().all(|s| s.is_finite());
+        finite.then_some(Meeting { rho, outwards, around, metres_per_px, slope })
+    }
+
+    /// Distance in pixels from an edge point to its circle, positive outside, and how it changes with the pose.
+    #[inline]
+    fn residual(&self, point: &EdgePoint) -> Option<(f64, SVector<f64, 5>)> {
+        let meeting = self.meets(&point.ray)?;
+        Some(((meeting.rho - point.radius) / meeting.metres_per_px, meeting.slope))
     }
 }
 

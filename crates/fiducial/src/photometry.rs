@@ -10,7 +10,7 @@ use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector, Vector3};
 
-use crate::circles::{Circles, project};
+use crate::circles::{Circles, Meeting, Plane, project};
 use crate::exposure::Exposure;
 use crate::ring::RingKind;
 
@@ -106,28 +106,31 @@ pub(crate) fn refined(
     let around = Around { view, camera, size_m, inverted };
     around.gather(start, FOCUSED_PX, spots)?;
     let tilted = |circles: &Circles| circles.tilted_at_least(LEAST_START_TILT);
-    let mut first = Scene::new(spots, size_m, camera).fitted(&tilted(start), None)?;
+    let mut first = Scene::new(spots, size_m, camera).fitted(&tilted(start), None, None)?;
     // What lies beyond the paper is kept out once the blur is known.
     let circles = first.picture.circles;
     if first.difference(spots) < MOST_DIFFERENCE
         && around.gather(&circles, first.picture.blur_px, spots)?
     {
-        first = Scene::new(spots, size_m, camera).fitted(&tilted(&circles), None)?;
+        let scene = Scene::new(spots, size_m, camera);
+        first = scene.fitted(&tilted(&circles), None, None)?;
     }
     let scene = Scene::new(spots, size_m, camera);
     if first.difference(spots) > MOST_DIFFERENCE {
         return Some((scene.fit(&first)?, None));
     }
     // Tilted to a wrong side at first, it may have stopped where it faces the camera.
-    if first.picture.circles.tilt() < LEAST_START_TILT / 2.0
-        && let Some(other) =
-            scene.fitted(&tilted(&first.picture.circles).turned(), Some(2.0 * first.cost))
-        && other.cost < first.cost
-    {
-        first = other;
+    if first.picture.circles.tilt() < LEAST_START_TILT / 2.0 {
+        let turned = tilted(&first.picture.circles).turned();
+        if let Some(other) = scene.fitted(&turned, Some(&first), Some(2.0 * first.cost))
+            && other.cost < first.cost
+        {
+            first = other;
+        }
     }
     let mirrored = tilted(&first.picture.circles).mirrored();
-    let Some(second) = scene.fitted(&mirrored, Some(MOST_COST_OF_OTHER * first.cost)) else {
+    let most = MOST_COST_OF_OTHER * first.cost;
+    let Some(second) = scene.fitted(&mirrored, Some(&first), Some(most)) else {
         return Some((scene.fit(&first)?, None));
     };
     let (best, other) = if second.cost < first.cost { (second, first) } else { (first, second) };
@@ -262,8 +265,10 @@ struct Scene<'a> {
 struct Fitted {
     picture: Picture,
     system: System,
-    /// Sum of the squared differences, large ones counting less.
+    /// Sum of the squared differences, large ones counting less, ...
     cost: f64,
+    /// ... those beyond this.
+    limit: f64,
 }
 
 impl Fitted {
@@ -293,24 +298,40 @@ impl<'a> Scene<'a> {
         Self { spots, camera, radii }
     }
 
-    /// The best fit from here; `None` when its cost stays above what is `hopeless`.
-    fn fitted(&self, start: &Circles, hopeless: Option<f64>) -> Option<Fitted> {
-        let mut best = Picture {
-            circles: *start,
-            blur_px: FOCUSED_PX,
-            black: 0.0,
-            white: 255.0,
-            slope: [0.0; 2],
+    /// The best fit from here, in the light of another fit where there is one; `None` when its cost stays above what is
+    /// `hopeless`.
+    fn fitted(
+        &self,
+        start: &Circles,
+        like: Option<&Fitted>,
+        hopeless: Option<f64>,
+    ) -> Option<Fitted> {
+        let mut best = match like {
+            Some(like) => Picture { circles: *start, ..like.picture },
+            None => Picture {
+                circles: *start,
+                blur_px: FOCUSED_PX,
+                black: 0.0,
+                white: 255.0,
+                slope: [0.0; 2],
+            },
         };
-        best.expose(self)?;
+        if like.is_none() {
+            best.expose(self)?;
+        }
         // Differences beyond this pull no harder; about thrice what they are once the fit is good.
-        let mut limit = 0.25 * (best.white - best.black);
+        let mut limit = match like {
+            Some(like) => like.limit,
+            None => 0.25 * (best.white - best.black),
+        };
+        // So many steps at least, as the first may hardly improve anything.
+        let least_steps = if like.is_some() { 1 } else { 3 };
         let (mut system, mut cost) = best.system(self, limit)?;
-        let mut damping = 1e-3;
+        let mut damping = if like.is_some() { 1e-4 } else { 1e-3 };
         for step in 0..MOST_STEPS {
             let bad = hopeless.is_some_and(|most| cost > most)
                 || cost > self.count() * (MOST_DIFFERENCE * (best.white - best.black)).powi(2);
-            if step == 4 && bad {
+            if step == least_steps + 1 && bad {
                 break;
             }
             let candidate = best.stepped(&system, damping);
@@ -319,10 +340,10 @@ impl<'a> Scene<'a> {
                     let settled = cost - next_cost < 3e-4 * cost;
                     (best, system, cost) = (next, next_system, next_cost);
                     damping = (damping * 0.1).max(1e-7);
-                    if step == 2 {
+                    if like.is_none() && step == 2 {
                         limit = limit.min(3.0 * (cost / self.count()).sqrt() + 1.0);
                         (system, cost) = best.system(self, limit)?;
-                    } else if settled && step > 2 {
+                    } else if settled && step >= least_steps {
                         break;
                     }
                 }
@@ -335,17 +356,17 @@ impl<'a> Scene<'a> {
             }
         }
         let fits = best.white > best.black && hopeless.is_none_or(|most| cost <= most);
-        fits.then_some(Fitted { picture: best, system, cost })
+        fits.then_some(Fitted { picture: best, system, cost, limit })
     }
 
     fn fit(&self, fitted: &Fitted) -> Option<Fit> {
         let picture = &fitted.picture;
-        let (beside_disc, balance) = picture.alternatives(self)?;
+        let [beside_disc, balance, explained] = picture.worth(self)?;
         Some(Fit {
             circles: picture.circles,
             covariance: self.covariance(&fitted.system, fitted.cost)?,
             difference: fitted.difference(self.spots),
-            explained: picture.explained(self)?,
+            explained,
             beside_disc,
             balance,
             contrast: picture.white - picture.black,
@@ -374,11 +395,7 @@ impl<'a> Scene<'a> {
 
 /// How a circle looks in the neighbourhood of one pixel.
 struct Near {
-    /// Distance from the centre in metres.
-    rho: f64,
-    metres_per_px: f64,
-    /// How the distance in pixels changes with the pose.
-    by_pose: SVector<f64, 5>,
+    meeting: Meeting,
     /// Cumulants of the squared distance of a place drawn from the blur.
     cumulants: [f64; 3],
     /// Excess of the fourth cumulant of the blur across the edge, which the pixel's square makes negative.
@@ -406,42 +423,25 @@ impl Looks {
 
 impl Picture {
     /// What the blur about a pixel sees of the marker's plane.
-    fn near(
-        &self,
-        spot: &Spot,
-        basis: &(Vector3<f64>, Vector3<f64>),
-        camera: &CameraModel,
-    ) -> Option<Near> {
-        let (rho, metres_per_px, by_pose) = self.circles.radius_at(basis, &spot.ray, camera)?;
-        let normal = self.circles.normal;
-        let along = normal.dot(&self.circles.centre) / normal.dot(&spot.ray);
-        let out =
-            if rho < 1e-12 { basis.0 } else { (spot.ray * along - self.circles.centre) / rho };
-        let aside = normal.cross(&out);
-        let nd = normal.dot(&spot.ray);
-        // Rows of the map from pixels to the plane: outwards and around.
-        let row = |axis: &Vector3<f64>| {
-            let od = axis.dot(&spot.ray);
-            [
-                along * (axis.x - od * normal.x / nd) / camera.fx,
-                along * (axis.y - od * normal.y / nd) / camera.fy,
-            ]
-        };
-        let (a, b) = (row(&out), row(&aside));
+    #[inline]
+    fn near(&self, spot: &Spot, plane: &Plane) -> Option<Near> {
+        let meeting = plane.meets(&spot.ray)?;
+        let (a, b) = (meeting.outwards, meeting.around);
         let variance = self.blur_px * self.blur_px;
-        let rr = variance * (a[0] * a[0] + a[1] * a[1]);
+        let rr = variance * (meeting.metres_per_px * meeting.metres_per_px);
         let tt = variance * (b[0] * b[0] + b[1] * b[1]);
         let rt = variance * (a[0] * b[0] + a[1] * b[1]);
         let (trace, det) = (rr + tt, rr * tt - rt * rt);
-        let square = rho * rho;
+        let square = meeting.rho * meeting.rho;
         let cumulants = [
             square + trace,
             2.0 * (trace * trace - 2.0 * det) + 4.0 * square * rr,
             8.0 * (trace * trace - 3.0 * det) * trace + 24.0 * square * (rr * rr + rt * rt),
         ];
-        let [c, s] = a.map(|part| (part / metres_per_px).powi(2));
+        let per_px = 1.0 / meeting.metres_per_px;
+        let [c, s] = a.map(|part| (part * per_px) * (part * per_px));
         let excess = -(c * c + s * s) / (120.0 * variance * variance);
-        Some(Near { rho, metres_per_px, by_pose, cumulants, excess })
+        Some(Near { meeting, cumulants, excess })
     }
 
     /// How much of what a pixel sees lies within each of the marker's circles, and how that changes.
@@ -449,55 +449,60 @@ impl Picture {
     /// Of a place drawn from the blur about the pixel the squared distance from the centre is a quadratic form in
     /// normal variables; how often it falls within a circle is known closely (Jensen and Solomon, "A Gaussian
     /// approximation to the distribution of a definite quadratic form", JASA 1972), also for circles no larger than the blur.
-    fn looks(
-        &self,
-        spot: &Spot,
-        basis: &(Vector3<f64>, Vector3<f64>),
-        scene: &Scene<'_>,
-    ) -> Option<Looks> {
-        let near = self.near(spot, basis, scene.camera)?;
+    fn looks(&self, spot: &Spot, plane: &Plane, scene: &Scene<'_>) -> Option<Looks> {
+        let near = self.near(spot, plane)?;
+        let Meeting { rho, metres_per_px, slope: by_pose, .. } = near.meeting;
         let [k1, k2, k3] = near.cumulants;
         let power = 1.0 - k1 * k3 / (3.0 * k2 * k2);
         let spread = k2.sqrt();
         let mean = 1.0 + power * (power - 1.0) * k2 / (2.0 * k1 * k1);
         let log_k1 = k1.ln();
-        let mut looks =
-            Looks { within: [0.0; 6], by_distance: 0.0, by_blur: 0.0, by_pose: near.by_pose };
-        let per_blur = 1.0 / (near.metres_per_px * self.blur_px);
+        let mut looks = Looks { within: [0.0; 6], by_distance: 0.0, by_blur: 0.0, by_pose };
+        let per_blur = 1.0 / (metres_per_px * self.blur_px);
+        let (per_power, outwards) = (k1 / (power * spread), -2.0 * rho * metres_per_px / spread);
+        let (bend, per_px) = (near.excess / 24.0, 1.0 / self.blur_px);
         for (index, (within, (radius, log_radius))) in
             looks.within.iter_mut().zip(scene.radii).enumerate()
         {
             // Outer edges end the black, inner ones begin the white.
             let sign = if index % 2 == 0 { -1.0 } else { 1.0 };
-            let rough = (radius - near.rho) * per_blur;
+            let rough = (radius - rho) * per_blur;
             if rough.abs() > FURTHEST_BLUR {
                 *within = if rough > 0.0 { 1.0 } else { 0.0 };
                 continue;
             }
             let ratio = (power * (2.0 * log_radius - log_k1)).exp();
-            let z = (ratio - mean) * k1 / (power * spread);
+            let z = (ratio - mean) * per_power;
             let (step, density) = blurred_step(z);
-            *within = step - near.excess / 24.0 * (z * z - 3.0) * z * density;
+            *within = step - bend * (z * z - 3.0) * z * density;
             // Outwards, per pixel.
-            let slope = -2.0 * near.rho * ratio / spread * near.metres_per_px;
+            let slope = outwards * ratio;
             looks.by_distance += sign * density * slope;
-            looks.by_blur -= sign * density * z / self.blur_px;
+            looks.by_blur -= sign * density * z * per_px;
         }
         Some(looks)
     }
 
-    /// How many times less a marker differs from the image than a plain disc in its place does, and how dark its
-    /// middle ring is in units of the outer one, when each has a grey value of its own.
-    fn alternatives(&self, scene: &Scene<'_>) -> Option<(f64, f64)> {
-        let basis = self.circles.basis();
+    /// How many times less a marker differs from the image than a plain disc in its place does; how dark its middle ring
+    /// is in units of the outer one, when each has a grey value of its own; and the share of the variance of the pixels
+    /// within the rim that the picture explains.
+    fn worth(&self, scene: &Scene<'_>) -> Option<[f64; 3]> {
+        let plane = self.circles.plane(scene.camera);
         let mut disc = SMatrix::<f64, 3, 3>::zeros();
         let mut rings = SMatrix::<f64, 4, 4>::zeros();
+        let (mut n, mut sum, mut squares, mut unexplained) = (0.0, 0.0, 0.0, 0.0);
         for spot in scene.spots {
-            let looks = self.looks(spot, &basis, scene)?;
+            let looks = self.looks(spot, &plane, scene)?;
             let [a, b, c, d, e, f] = looks.within;
             let (grey, _) = self.grey(spot, looks.white());
             // The light's slope is taken as found.
             let seen = if spot.grey > WHITEST { spot.grey.max(grey) } else { spot.grey };
+            if spot.within {
+                n += 1.0;
+                sum += seen;
+                squares += seen * seen;
+                unexplained += (grey - seen).powi(2);
+            }
             let lit = seen - grey + self.black + (self.white - self.black) * looks.white();
             let plain = SVector::<f64, 3>::new(1.0, a, lit);
             disc.syger(1.0, &plain, &plain, 1.0);
@@ -513,15 +518,17 @@ impl Picture {
         let to_rings = rings.fixed_view::<3, 1>(0, 3).into_owned();
         let levels = of_rings.try_inverse()? * to_rings;
         let own = rings[(3, 3)] - to_rings.dot(&levels);
-        Some((own.max(0.0) / left.max(1e-9), levels[2] / levels[1]))
+        let variance = squares - sum * sum / n;
+        let explained = (variance > 0.0).then(|| 1.0 - unexplained / variance)?;
+        Some([own.max(0.0) / left.max(1e-9), levels[2] / levels[1], explained])
     }
 
     /// Black and white that fit the image best with everything else as it is.
     fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
         let mut exposure = Exposure::default();
-        let basis = self.circles.basis();
+        let plane = self.circles.plane(scene.camera);
         for spot in scene.spots {
-            let white = self.looks(spot, &basis, scene)?.white();
+            let white = self.looks(spot, &plane, scene)?.white();
             exposure.add(white, spot.grey);
         }
         let [black, contrast] = exposure.black_and_contrast();
@@ -536,30 +543,13 @@ impl Picture {
         (self.black + contrast * white, contrast)
     }
 
-    /// The share of the variance of the pixels within the rim that the picture explains.
-    fn explained(&self, scene: &Scene<'_>) -> Option<f64> {
-        let basis = self.circles.basis();
-        let (mut n, mut sum, mut squares, mut left) = (0.0, 0.0, 0.0, 0.0);
-        for spot in scene.spots.iter().filter(|s| s.within) {
-            let white = self.looks(spot, &basis, scene)?.white();
-            let (grey, _) = self.grey(spot, white);
-            let seen = if spot.grey > WHITEST { spot.grey.max(grey) } else { spot.grey };
-            n += 1.0;
-            sum += seen;
-            squares += seen * seen;
-            left += (grey - seen).powi(2);
-        }
-        let variance = squares - sum * sum / n;
-        (variance > 0.0).then(|| 1.0 - left / variance)
-    }
-
     /// The normal equations of one step, and the cost here.
     fn system(&self, scene: &Scene<'_>, limit: f64) -> Option<(System, f64)> {
         let mut system = System { matrix: SMatrix::zeros(), right: SVector::zeros() };
         let mut cost = 0.0;
-        let basis = self.circles.basis();
+        let plane = self.circles.plane(scene.camera);
         for spot in scene.spots {
-            let looks = self.looks(spot, &basis, scene)?;
+            let looks = self.looks(spot, &plane, scene)?;
             let white = looks.white();
             let [x, y] = spot.offset;
             let (grey, contrast) = self.grey(spot, white);
@@ -656,7 +646,7 @@ mod tests {
                 let offset = [x - middle.x, y - middle.y];
                 let spot = Spot { ray, offset, grey: 0.0, within: true };
                 let scene = Scene::new(&[], size_m, &camera);
-                let white = picture.looks(&spot, &truth.basis(), &scene).unwrap().white();
+                let white = picture.looks(&spot, &truth.plane(&camera), &scene).unwrap().white();
                 let paper = 200.0 + 0.5 * offset[0] - 0.3 * offset[1];
                 (30.0 + (paper - 30.0) * white).round() as u8
             })
