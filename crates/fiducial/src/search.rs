@@ -86,15 +86,18 @@ impl Search<'_> {
         if candidate.score < LEAST_SCORE {
             return self.alone(&both[0], kind, edges).ok_or(Reason::Edges);
         }
-        let (circles, rms_px, support) = self.whole(both, edges)?;
+        let rough = self.rough(&both[0], edges);
+        if let Some(rough) = &rough
+            && let Some(seen) = self.at_once(rough, edges, spots)
+        {
+            return Ok(seen);
+        }
+        let (circles, rms_px, support) = self.whole(rough, &both[1], edges)?;
         let diameter_px =
             circles.outline(self.size_m / 2.0, self.camera).ok_or(Reason::Pose)?.major;
         let judged = believable(&support);
         if judged != Belief::None
             && let Some((fit, other)) = self.by_grey_values(&circles, diameter_px, spots)
-            && fit.difference < MOST_DIFFERENCE
-            && fit.is_marker()
-            && fit.explained > LEAST_EXPLAINED
         {
             return self.seen_by_grey_values(&fit, other, confidence(&support)).ok_or(Reason::Pose);
         }
@@ -161,21 +164,43 @@ impl Search<'_> {
             && (found.centre.z / start.centre.z - 1.0).abs() < share
     }
 
-    /// The pose that all edges speak for, the distances left, and how much of each edge there is.
+    /// The pose that the edges speak for that are near enough to where this one has them; `None` when too few are.
+    fn rough(&self, start: &Circles, edges: &mut Vec<EdgePoint>) -> Option<Circles> {
+        let support = self.measure(start, Reach::Far, edges);
+        let there = |s: &&Support| s.share().is_some_and(|share| share > 0.4);
+        let beyond_view = support[..4].iter().all(|s| s.share().is_none());
+        if support.iter().filter(there).count() < if beyond_view { 2 } else { 3 } {
+            return None;
+        }
+        start.refined(edges, self.camera).map(|(rough, _)| rough)
+    }
+
+    /// The marker of which a pose is known roughly, when it is not too large and its grey values are a marker's.
+    fn at_once(
+        &self,
+        rough: &Circles,
+        edges: &mut Vec<EdgePoint>,
+        spots: &mut Vec<Spot>,
+    ) -> Option<Seen> {
+        let diameter_px = rough.outline(self.size_m / 2.0, self.camera)?.major;
+        let (fit, other) = self.by_grey_values(rough, diameter_px, spots)?;
+        let support = self.measure(&fit.circles, Reach::Near, edges);
+        let seen = self.seen_by_grey_values(&fit, other, confidence(&support))?;
+        (believable(&support) != Belief::None).then_some(seen)
+    }
+
+    /// The pose that all edges speak for, the distances left, and how much of each edge there is, from a pose that is known
+    /// roughly or from another start.
     fn whole(
         &self,
-        both: [Circles; 2],
+        rough: Option<Circles>,
+        start: &Circles,
         edges: &mut Vec<EdgePoint>,
     ) -> Result<(Circles, f64, [Support; 6]), Reason> {
         let mut best: Option<(Circles, f64)> = None;
-        for start in both {
-            let support = self.measure(&start, Reach::Far, edges);
-            let there = |s: &&Support| s.share().is_some_and(|share| share > 0.4);
-            let beyond_view = support[..4].iter().all(|s| s.share().is_none());
-            if support.iter().filter(there).count() < if beyond_view { 2 } else { 3 } {
-                continue;
-            }
-            let Some((rough, _)) = start.refined(edges, self.camera) else { continue };
+        for is_first in [true, false] {
+            let rough = if is_first { rough } else { self.rough(start, edges) };
+            let Some(rough) = rough else { continue };
             let near = self.measure(&rough, Reach::Near, edges);
             let Some((circles, rms)) = rough.refined(edges, self.camera) else { continue };
             // Per edge found: a wrong pose finds few.
@@ -203,7 +228,7 @@ impl Search<'_> {
     }
 
     /// The pose from the grey values, and the one tilted the other way; `None` for a large marker, and when they
-    /// disagree with its edges.
+    /// are not a marker's or disagree with its edges.
     fn by_grey_values(
         &self,
         circles: &Circles,
@@ -218,8 +243,11 @@ impl Search<'_> {
             self.inverted,
             spots,
         )?;
-        let near = self.is_near(circles, &fit.circles, 0.3 + 0.01 * diameter_px, 0.1);
-        near.then_some((fit, other))
+        let is_it = fit.difference < MOST_DIFFERENCE
+            && fit.is_marker()
+            && fit.explained > LEAST_EXPLAINED
+            && self.is_near(circles, &fit.circles, 0.3 + 0.01 * diameter_px, 0.1);
+        is_it.then_some((fit, other))
     }
 
     /// The marker of which only one ring can be seen, because its neighbour's place is covered by something.
