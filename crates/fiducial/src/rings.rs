@@ -85,6 +85,8 @@ const MOST_ARC_FITS: usize = 3000;
 const MOST_CANDIDATES: usize = 400;
 const MOST_LOOKED_INTO: usize = 20;
 const MOST_MARKERS: usize = 8;
+/// What looks like the marker less than this share of how much one does that was found is no other one.
+const LEAST_OF_BEST: f64 = 0.8;
 
 /// The detector's working memory.
 #[derive(Debug, Default)]
@@ -197,8 +199,12 @@ impl Rings {
         trace: &mut Trace,
         (found, first): (&mut Vec<Observation>, usize),
     ) {
+        let mut least_score = 0.0_f64;
         for index in 0..self.candidates.len().min(MOST_LOOKED_INTO) {
             let candidate = self.candidates[index];
+            if candidate.score < least_score {
+                continue;
+            }
             let [x, y] = candidate.border.ellipse.centre;
             let taken = |o: &Observation| (o.centre.x - x).hypot(o.centre.y - y) < o.size_px / 2.0;
             let outcome = if found[first..].iter().any(taken) {
@@ -207,7 +213,10 @@ impl Rings {
                 self.look_into(view, &candidate, marker, camera, nominal)
             };
             match outcome {
-                Ok(observation) => found.push(observation),
+                Ok(observation) => {
+                    found.push(observation);
+                    least_score = least_score.max(LEAST_OF_BEST * candidate.score);
+                }
                 Err(reason) => {
                     let Ring { inner, outer, .. } = ring(&candidate);
                     trace.refuse(inner, outer, reason);
