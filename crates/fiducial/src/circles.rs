@@ -310,8 +310,9 @@ pub(crate) struct Meeting {
     /// How the place changes with the pixel, to the right and down: outwards from the centre and around it, in metres.
     pub(crate) outwards: [f64; 2],
     pub(crate) around: [f64; 2],
-    /// The length of `outwards`.
+    /// The length of `outwards`, and one over it.
     pub(crate) metres_per_px: f64,
+    pub(crate) px_per_metre: f64,
     /// How the distance, in pixels, changes with the centre (three numbers) and with the normal along the two vectors of
     /// [`Circles::basis`].
     pub(crate) slope: SVector<f64, 5>,
@@ -332,7 +333,8 @@ impl Plane {
         // Faster than `hypot`, whose care for the smallest numbers is not needed.
         let rho = (a * a + b * b).sqrt();
         // From the centre itself any way is outwards.
-        let [p, q] = if rho < 1e-12 { [1.0, 0.0] } else { [a / rho, b / rho] };
+        let inward = 1.0 / rho;
+        let [p, q] = if rho < 1e-12 { [1.0, 0.0] } else { [a * inward, b * inward] };
         let [nx, ny] = [self.normal.x * inverse, self.normal.y * inverse];
         let by_pixel = |axis: &Vector3<f64>, component: f64| {
             let [x, y] = self.per_px;
@@ -348,14 +350,21 @@ impl Plane {
         let slope =
             SVector::<f64, 5>::new(by_centre.x, by_centre.y, by_centre.z, -a * lean, -b * lean);
         let finite = scale.is_finite() && slope.iter().all(|s| s.is_finite());
-        finite.then_some(Meeting { rho, outwards, around, metres_per_px, slope })
+        finite.then_some(Meeting {
+            rho,
+            outwards,
+            around,
+            metres_per_px,
+            px_per_metre: scale,
+            slope,
+        })
     }
 
     /// Distance in pixels from an edge point to its circle, positive outside, and how it changes with the pose.
     #[inline]
     fn residual(&self, point: &EdgePoint) -> Option<(f64, SVector<f64, 5>)> {
         let meeting = self.meets(&point.ray)?;
-        Some(((meeting.rho - point.radius) / meeting.metres_per_px, meeting.slope))
+        Some(((meeting.rho - point.radius) * meeting.px_per_metre, meeting.slope))
     }
 }
 

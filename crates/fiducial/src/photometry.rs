@@ -13,6 +13,7 @@ use nalgebra::{SMatrix, SVector, Vector3};
 use crate::circles::{Circles, Meeting, Plane, project};
 use crate::exposure::Exposure;
 use crate::ring::RingKind;
+use crate::step::{Step, boxiness};
 
 /// Markers of more pixels across have edges far enough apart.
 pub(crate) const MOST_DIAMETER_PX: f64 = 180.0;
@@ -31,6 +32,8 @@ const FURTHEST_BLUR: f64 = 4.7;
 /// Root mean square differences above this, in units of the contrast, are not of a marker.
 const MOST_DIFFERENCE: f64 = 0.2;
 const MOST_STEPS: usize = 14;
+/// Steps of a fit in the light of another.
+const MOST_STEPS_OF_OTHER: usize = 7;
 /// Pose (5), blur, black, white, and white's change across and down.
 const UNKNOWNS: usize = 10;
 /// A tilt, in radians, that is no longer a saddle of the fit: seen squarely, every tilt looks the same at first.
@@ -122,7 +125,7 @@ pub(crate) fn refined(
     // Tilted to a wrong side at first, it may have stopped where it faces the camera.
     if first.picture.circles.tilt() < LEAST_START_TILT / 2.0 {
         let turned = tilted(&first.picture.circles).turned();
-        if let Some(other) = scene.fitted(&turned, Some(&first), Some(2.0 * first.cost))
+        if let Some(other) = scene.fitted(&turned, Some(&first), Some(1.1 * first.cost))
             && other.cost < first.cost
         {
             first = other;
@@ -259,6 +262,7 @@ struct Scene<'a> {
     camera: &'a CameraModel,
     /// Radii of the circles in metres, the outermost first, and their logarithms.
     radii: [(f64, f64); 6],
+    step: Step,
 }
 
 /// A picture that fits as well as any near it.
@@ -295,7 +299,7 @@ impl<'a> Scene<'a> {
                 *slot = (radius * size_m, (radius * size_m).ln());
             }
         }
-        Self { spots, camera, radii }
+        Self { spots, camera, radii, step: Step::new() }
     }
 
     /// The best fit from here, in the light of another fit where there is one; `None` when its cost stays above what is
@@ -328,10 +332,11 @@ impl<'a> Scene<'a> {
         let least_steps = if like.is_some() { 1 } else { 3 };
         let (mut system, mut cost) = best.system(self, limit)?;
         let mut damping = if like.is_some() { 1e-4 } else { 1e-3 };
-        for step in 0..MOST_STEPS {
+        let most_steps = if like.is_some() { MOST_STEPS_OF_OTHER } else { MOST_STEPS };
+        for step in 0..most_steps {
             let bad = hopeless.is_some_and(|most| cost > most)
                 || cost > self.count() * (MOST_DIFFERENCE * (best.white - best.black)).powi(2);
-            if step == least_steps + 1 && bad {
+            if step > least_steps && bad {
                 break;
             }
             let candidate = best.stepped(&system, damping);
@@ -393,15 +398,6 @@ impl<'a> Scene<'a> {
     }
 }
 
-/// How a circle looks in the neighbourhood of one pixel.
-struct Near {
-    meeting: Meeting,
-    /// Cumulants of the squared distance of a place drawn from the blur.
-    cumulants: [f64; 3],
-    /// Excess of the fourth cumulant of the blur across the edge, which the pixel's square makes negative.
-    excess: f64,
-}
-
 /// What a pixel sees of the marker.
 struct Looks {
     /// The shares of the pixel's light from within each circle, the outermost first.
@@ -422,45 +418,36 @@ impl Looks {
 }
 
 impl Picture {
-    /// What the blur about a pixel sees of the marker's plane.
-    #[inline]
-    fn near(&self, spot: &Spot, plane: &Plane) -> Option<Near> {
-        let meeting = plane.meets(&spot.ray)?;
-        let (a, b) = (meeting.outwards, meeting.around);
-        let variance = self.blur_px * self.blur_px;
-        let rr = variance * (meeting.metres_per_px * meeting.metres_per_px);
-        let tt = variance * (b[0] * b[0] + b[1] * b[1]);
-        let rt = variance * (a[0] * b[0] + a[1] * b[1]);
-        let (trace, det) = (rr + tt, rr * tt - rt * rt);
-        let square = meeting.rho * meeting.rho;
-        let cumulants = [
-            square + trace,
-            2.0 * (trace * trace - 2.0 * det) + 4.0 * square * rr,
-            8.0 * (trace * trace - 3.0 * det) * trace + 24.0 * square * (rr * rr + rt * rt),
-        ];
-        let per_px = 1.0 / meeting.metres_per_px;
-        let [c, s] = a.map(|part| (part * per_px) * (part * per_px));
-        let excess = -(c * c + s * s) / (120.0 * variance * variance);
-        Some(Near { meeting, cumulants, excess })
-    }
-
     /// How much of what a pixel sees lies within each of the marker's circles, and how that changes.
     ///
     /// Of a place drawn from the blur about the pixel the squared distance from the centre is a quadratic form in
     /// normal variables; how often it falls within a circle is known closely (Jensen and Solomon, "A Gaussian
     /// approximation to the distribution of a definite quadratic form", JASA 1972), also for circles no larger than the blur.
+    #[inline]
     fn looks(&self, spot: &Spot, plane: &Plane, scene: &Scene<'_>) -> Option<Looks> {
-        let near = self.near(spot, plane)?;
-        let Meeting { rho, metres_per_px, slope: by_pose, .. } = near.meeting;
-        let [k1, k2, k3] = near.cumulants;
-        let power = 1.0 - k1 * k3 / (3.0 * k2 * k2);
-        let spread = k2.sqrt();
-        let mean = 1.0 + power * (power - 1.0) * k2 / (2.0 * k1 * k1);
+        let meeting = plane.meets(&spot.ray)?;
+        let Meeting { rho, outwards: a, around: b, metres_per_px, px_per_metre, slope } = meeting;
+        let variance = self.blur_px * self.blur_px;
+        // Variances outwards and around, and the two together.
+        let rr = variance * (metres_per_px * metres_per_px);
+        let tt = variance * (b[0] * b[0] + b[1] * b[1]);
+        let rt = variance * (a[0] * b[0] + a[1] * b[1]);
+        let (trace, det) = (rr + tt, rr * tt - rt * rt);
+        let square = rho * rho;
+        // Cumulants of the squared distance.
+        let k1 = square + trace;
+        let k2 = 2.0 * (trace * trace - 2.0 * det) + 4.0 * square * rr;
+        let k3 = 8.0 * (trace * trace - 3.0 * det) * trace + 24.0 * square * (rr * rr + rt * rt);
+        let (per_k1, per_k2) = (1.0 / k1, 1.0 / k2);
+        let power = 1.0 - k1 * k3 * (per_k2 * per_k2) / 3.0;
+        let mean = 1.0 + power * (power - 1.0) * k2 * (per_k1 * per_k1) / 2.0;
+        let per_spread = k2.sqrt() * per_k2;
+        let (per_power, outwards) =
+            (k1 * per_spread / power, -2.0 * rho * metres_per_px * per_spread);
         let log_k1 = k1.ln();
-        let mut looks = Looks { within: [0.0; 6], by_distance: 0.0, by_blur: 0.0, by_pose };
-        let per_blur = 1.0 / (metres_per_px * self.blur_px);
-        let (per_power, outwards) = (k1 / (power * spread), -2.0 * rho * metres_per_px / spread);
-        let (bend, per_px) = (near.excess / 24.0, 1.0 / self.blur_px);
+        let boxiness = boxiness(a.map(|part| part * px_per_metre), variance);
+        let (per_blur, per_px) = (px_per_metre / self.blur_px, 1.0 / self.blur_px);
+        let mut looks = Looks { within: [0.0; 6], by_distance: 0.0, by_blur: 0.0, by_pose: slope };
         for (index, (within, (radius, log_radius))) in
             looks.within.iter_mut().zip(scene.radii).enumerate()
         {
@@ -471,13 +458,12 @@ impl Picture {
                 *within = if rough > 0.0 { 1.0 } else { 0.0 };
                 continue;
             }
-            let ratio = (power * (2.0 * log_radius - log_k1)).exp();
+            let ratio = exp(power * (2.0 * log_radius - log_k1));
             let z = (ratio - mean) * per_power;
-            let (step, density) = blurred_step(z);
-            *within = step - bend * (z * z - 3.0) * z * density;
+            let (step, density) = scene.step.at(z, boxiness);
+            *within = step;
             // Outwards, per pixel.
-            let slope = outwards * ratio;
-            looks.by_distance += sign * density * slope;
+            looks.by_distance += sign * density * outwards * ratio;
             looks.by_blur -= sign * density * z * per_px;
         }
         Some(looks)
@@ -545,7 +531,7 @@ impl Picture {
 
     /// The normal equations of one step, and the cost here.
     fn system(&self, scene: &Scene<'_>, limit: f64) -> Option<(System, f64)> {
-        let mut system = System { matrix: SMatrix::zeros(), right: SVector::zeros() };
+        let (mut matrix, mut right) = ([[0.0; UNKNOWNS]; UNKNOWNS], [0.0; UNKNOWNS]);
         let mut cost = 0.0;
         let plane = self.circles.plane(scene.camera);
         for spot in scene.spots {
@@ -561,19 +547,31 @@ impl Picture {
             let size = difference.abs();
             let weight = if size > limit { limit / size } else { 1.0 };
             cost += if size > limit { limit * (2.0 * size - limit) } else { size * size };
-            let mut slope = SVector::<f64, UNKNOWNS>::zeros();
-            slope
-                .fixed_rows_mut::<5>(0)
-                .copy_from(&(looks.by_pose * (looks.by_distance * contrast)));
-            slope[5] = contrast * looks.by_blur;
-            slope[6] = 1.0 - white;
-            slope[7] = white;
-            slope[8] = white * x;
-            slope[9] = white * y;
-            system.matrix.syger(weight, &slope, &slope, 1.0);
-            system.right -= slope * (weight * difference);
+            let by_distance = looks.by_distance * contrast;
+            let [a, b, c, d, e] = looks.by_pose.into();
+            let slope: [f64; UNKNOWNS] = [
+                a * by_distance,
+                b * by_distance,
+                c * by_distance,
+                d * by_distance,
+                e * by_distance,
+                contrast * looks.by_blur,
+                1.0 - white,
+                white,
+                white * x,
+                white * y,
+            ];
+            let weighted = slope.map(|s| s * weight);
+            for (row, (scaled, sum)) in matrix.iter_mut().zip(weighted.iter().zip(&mut right)) {
+                *sum -= scaled * difference;
+                // All of the row, though half would do: it takes no longer.
+                for (entry, other) in row.iter_mut().zip(&slope) {
+                    *entry += scaled * other;
+                }
+            }
         }
-        system.matrix.fill_upper_triangle_with_lower_triangle();
+        let system =
+            System { matrix: SMatrix::from_fn(|i, j| matrix[i][j]), right: SVector::from(right) };
         cost.is_finite().then_some((system, cost))
     }
 
@@ -598,20 +596,16 @@ struct System {
     right: SVector<f64, UNKNOWNS>,
 }
 
-/// The normal distribution and its density at `z`: a step seen through a Gaussian blur.
-fn blurred_step(z: f64) -> (f64, f64) {
-    if z.abs() > 6.0 {
-        return (if z > 0.0 { 1.0 } else { 0.0 }, 0.0);
+/// The exponential function, in fewer steps where the argument is small.
+#[inline]
+fn exp(x: f64) -> f64 {
+    if x.abs() > 0.4 {
+        return x.exp();
     }
-    let density = (-0.5 * z * z).exp() / TAU.sqrt();
-    // Abramowitz and Stegun 26.2.17, good to 7.5e-8.
-    let t = 1.0 / (1.0 + 0.231_641_9 * z.abs());
-    let poly = t
-        * (0.319_381_530
-            + t * (-0.356_563_782
-                + t * (1.781_477_937 + t * (-1.821_255_978 + t * 1.330_274_429))));
-    let tail = density * poly;
-    (if z > 0.0 { 1.0 - tail } else { tail }, density)
+    // To the eighth power: wrong by less than a billionth.
+    let [a, b, c, d] = [1.0 / 6.0, 1.0 / 24.0, 1.0 / 120.0, 1.0 / 720.0];
+    let tail = d + x * (1.0 / 5040.0 + x * (1.0 / 40_320.0));
+    1.0 + x * (1.0 + x * (0.5 + x * (a + x * (b + x * (c + x * tail)))))
 }
 
 #[cfg(test)]
@@ -619,11 +613,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_normal_distribution() {
-        for (z, expected) in
-            [(0.0, 0.5), (1.0, 0.841_344_75), (-2.0, 0.022_750_13), (9.0, 1.0), (-9.0, 0.0)]
-        {
-            assert!((blurred_step(z).0 - expected).abs() < 1e-7, "{z}");
+    fn the_exponential_function() {
+        for i in -80..=80 {
+            let x = f64::from(i) * 0.01;
+            assert!((exp(x) / x.exp() - 1.0).abs() < 1e-9, "{x}");
         }
     }
 
