@@ -31,6 +31,10 @@ const WHITEST: f64 = 254.5;
 const FURTHEST_BLUR: f64 = 4.7;
 /// Root mean square differences above this, in units of the contrast, are not of a marker.
 const MOST_DIFFERENCE: f64 = 0.2;
+/// Where it is larger before each of the first steps, there is no marker: about a third above the largest that any marker of
+/// 800 had in a thousand pictures. Nine of ten other things that are looked at are given up at once, of larger ones half.
+const HOPELESS_OF_SMALL: [f64; 3] = [0.27, 0.22, 0.17];
+const HOPELESS: [f64; 3] = [0.45, 0.4, 0.35];
 const MOST_STEPS: usize = 14;
 /// Steps of a fit in the light of another.
 const MOST_STEPS_OF_OTHER: usize = 7;
@@ -107,18 +111,21 @@ pub(crate) fn refined(
 ) -> Option<(Fit, Option<Alternative>)> {
     spots.clear();
     let around = Around { view, camera, size_m, inverted };
+    let is_small = start.outline(size_m / 2.0, camera)?.major < ALL_PIXELS_PX;
+    let hopeless = if is_small { HOPELESS_OF_SMALL } else { HOPELESS };
     around.gather(start, FOCUSED_PX, spots)?;
     let tilted = |circles: &Circles| circles.tilted_at_least(LEAST_START_TILT);
-    let mut first = Scene::new(spots, size_m, camera).fitted(&tilted(start), None, None)?;
+    let mut first =
+        Scene::new(spots, size_m, camera, hopeless).fitted(&tilted(start), None, None)?;
     // What lies beyond the paper is kept out once the blur is known.
     let circles = first.picture.circles;
     if first.difference(spots) < MOST_DIFFERENCE
         && around.gather(&circles, first.picture.blur_px, spots)?
     {
-        let scene = Scene::new(spots, size_m, camera);
+        let scene = Scene::new(spots, size_m, camera, hopeless);
         first = scene.fitted(&tilted(&circles), None, None)?;
     }
-    let scene = Scene::new(spots, size_m, camera);
+    let scene = Scene::new(spots, size_m, camera, hopeless);
     if first.difference(spots) > MOST_DIFFERENCE {
         return Some((scene.fit(&first)?, None));
     }
@@ -263,6 +270,8 @@ struct Scene<'a> {
     /// Radii of the circles in metres, the outermost first, and their logarithms.
     radii: [(f64, f64); 6],
     step: Step,
+    /// The difference before each of the first steps above which there is no hope.
+    hopeless: [f64; 3],
 }
 
 /// A picture that fits as well as any near it.
@@ -291,7 +300,7 @@ impl Fitted {
 }
 
 impl<'a> Scene<'a> {
-    fn new(spots: &'a [Spot], size_m: f64, camera: &'a CameraModel) -> Self {
+    fn new(spots: &'a [Spot], size_m: f64, camera: &'a CameraModel, hopeless: [f64; 3]) -> Self {
         let mut radii = [(0.0, 0.0); 6];
         for (pair, kind) in radii.chunks_mut(2).zip(RingKind::ALL) {
             let (inner, outer) = kind.radii();
@@ -299,7 +308,7 @@ impl<'a> Scene<'a> {
                 *slot = (radius * size_m, (radius * size_m).ln());
             }
         }
-        Self { spots, camera, radii, step: Step::new() }
+        Self { spots, camera, radii, step: Step::new(), hopeless }
     }
 
     /// The best fit from here, in the light of another fit where there is one; `None` when its cost stays above what is
@@ -334,6 +343,12 @@ impl<'a> Scene<'a> {
         let mut damping = if like.is_some() { 1e-4 } else { 1e-3 };
         let most_steps = if like.is_some() { MOST_STEPS_OF_OTHER } else { MOST_STEPS };
         for step in 0..most_steps {
+            // Of what is no marker most is seen at once to be none.
+            let most = self.hopeless.get(step).filter(|_| like.is_none());
+            let most = most.map(|most| self.count() * (most * (best.white - best.black)).powi(2));
+            if most.is_some_and(|most| cost > most) {
+                return None;
+            }
             let bad = hopeless.is_some_and(|most| cost > most)
                 || cost > self.count() * (MOST_DIFFERENCE * (best.white - best.black)).powi(2);
             if step > least_steps && bad {
@@ -638,7 +653,7 @@ mod tests {
                 let ray = camera.unproject(Pixel::new(x, y)).coords;
                 let offset = [x - middle.x, y - middle.y];
                 let spot = Spot { ray, offset, grey: 0.0, within: true };
-                let scene = Scene::new(&[], size_m, &camera);
+                let scene = Scene::new(&[], size_m, &camera, HOPELESS);
                 let white = picture.looks(&spot, &truth.plane(&camera), &scene).unwrap().white();
                 let paper = 200.0 + 0.5 * offset[0] - 0.3 * offset[1];
                 (30.0 + (paper - 30.0) * white).round() as u8

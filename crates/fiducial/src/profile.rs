@@ -19,6 +19,8 @@ const NEAR_DOT: f64 = 0.055;
 const RAYS: u32 = 32;
 /// Of so many neighbouring bands that can be seen, this share must differ as they should.
 pub(crate) const LEAST_SCORE: f64 = 0.55;
+/// The same of white rings on black, for which any hole in something dark may be taken.
+const LEAST_SCORE_OF_INVERTED: f64 = 0.8;
 /// A marker of this diameter or less is so blurred that only its mean over all directions is looked at.
 pub(crate) const SMALL_PX: f64 = 24.0;
 
@@ -56,7 +58,9 @@ pub(crate) fn candidates(view: GrayView<'_>, border: &Border, found: &mut Vec<Ca
             continue;
         }
         let looks = if diameter_px < SMALL_PX { looks_small } else { looks };
-        if let Some((score, contrast)) = looks(view, &border.ellipse, radius, inverted) {
+        if let Some((score, contrast)) = looks(view, &border.ellipse, radius, inverted)
+            && (!inverted || score > LEAST_SCORE_OF_INVERTED)
+        {
             found.push(Candidate { border: *border, radius, inverted, score, contrast });
         }
     }

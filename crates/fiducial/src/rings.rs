@@ -70,6 +70,11 @@ const SPECKS: outline::Settings = outline::Settings {
 };
 
 impl Stage {
+    /// Whether it is for markers that are cut or hidden in part, or very far.
+    fn is_hard(self) -> bool {
+        matches!(self, Self::Parts | Self::Specks)
+    }
+
     fn name(self) -> &'static str {
         match self {
             Self::Whole(..) => "ellipses",
@@ -84,6 +89,9 @@ const MOST_BORDERS: usize = 4000;
 const MOST_ARC_FITS: usize = 3000;
 const MOST_CANDIDATES: usize = 400;
 const MOST_LOOKED_INTO: usize = 20;
+/// The same of candidates with a lower score than this, which hardly any marker has.
+const MOST_DOUBTFUL: usize = 6;
+const DOUBTFUL: f64 = 0.75;
 const MOST_MARKERS: usize = 8;
 /// What looks like the marker less than this share of how much one does that was found is no other one.
 const LEAST_OF_BEST: f64 = 0.8;
@@ -99,7 +107,8 @@ pub struct Rings {
 
 impl Rings {
     /// Finds the markers in an image; the surest comes first. `outlines` has the outlines of that image as other families
-    /// share them, or, when it is told to be empty, only its pyramid; what else is looked at is added to it.
+    /// share them, or, when it is told to be empty, only its pyramid; what else is looked at is added to it. When markers of
+    /// other families are among `found`, only those that are whole are looked for.
     pub fn detect(
         &mut self,
         (view, outlines, is_empty): (GrayView<'_>, &mut Outlines, bool),
@@ -111,6 +120,10 @@ impl Rings {
         let nominal = nominal_camera(view);
         let first = found.len();
         for stage in STAGES {
+            // Who has something to land on need not look harder.
+            if stage.is_hard() && first > 0 {
+                break;
+            }
             self.find_candidates((view, outlines, is_empty), stage);
             trace.ellipses.extend(self.borders.iter().map(|b| b.ellipse));
             trace.rings.extend(self.candidates.iter().map(ring));
@@ -199,11 +212,17 @@ impl Rings {
         trace: &mut Trace,
         (found, first): (&mut Vec<Observation>, usize),
     ) {
-        let mut least_score = 0.0_f64;
+        let (mut least_score, mut doubtful) = (0.0_f64, 0);
         for index in 0..self.candidates.len().min(MOST_LOOKED_INTO) {
             let candidate = self.candidates[index];
             if candidate.score < least_score {
                 continue;
+            }
+            if candidate.score < DOUBTFUL {
+                doubtful += 1;
+                if doubtful > MOST_DOUBTFUL {
+                    break;
+                }
             }
             let [x, y] = candidate.border.ellipse.centre;
             let taken = |o: &Observation| (o.centre.x - x).hypot(o.centre.y - y) < o.size_px / 2.0;
