@@ -98,7 +98,9 @@ impl Detector {
         self.trace.clear();
         let has_quads = !self.squares.is_empty() || !self.stags.is_empty();
         if !has_quads && self.markers.iter().any(|marker| marker.family == Family::Rings) {
+            // Rings look for their outlines themselves, where those of other families are not there anyway.
             self.outlines.begin(view);
+            stages.ended("outlines");
         }
         if has_quads {
             // Markers with a white border may be as small as others; others printed white on black are only looked for where
