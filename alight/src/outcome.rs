@@ -201,22 +201,10 @@ mod tests {
 
     fn status(phase: &str) -> ControllerStatus {
         ControllerStatus {
-            stamp_ns: 0,
             phase: phase.into(),
             why: "because".into(),
             guidance: "metric".into(),
-            autopilot: String::new(),
-            active_detector: None,
-            candidates: Vec::new(),
-            detection_age_ms: None,
-            height_m: None,
-            lateral_error_m: None,
-            setpoint: None,
-            started_ns: None,
-            disarmed_ns: None,
-            finished: false,
-            detections_used: 0,
-            latency_ms: None,
+            ..ControllerStatus::default()
         }
     }
 

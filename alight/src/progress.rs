@@ -58,7 +58,7 @@ impl Progress {
         if status.active_detector != self.active_detector {
             self.active_detector.clone_from(&status.active_detector);
             let name = status.active_detector.as_deref().unwrap_or("none");
-            self.say(&format!("active detector: {name}"));
+            self.say(&format!("active detector: {name}: {}", status.detector_why));
         }
     }
 
@@ -108,34 +108,32 @@ fn live_lines(status: &ControllerStatus, frame_rate_hz: Option<f64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::Candidate;
+    use messages::{Candidate, DetectorState};
 
     #[test]
     fn the_live_view_names_what_a_pilot_asks_for() {
         let candidate = |name: &str| Candidate {
             detector: name.into(),
+            state: DetectorState::Shadow,
+            place: None,
             age_ms: 60.0,
+            latency_ms: 40.0,
             rate_hz: 15.0,
             alive: true,
             disagreement_m: None,
+            compared: 0,
+            agreed: 0,
         };
         let status = ControllerStatus {
-            stamp_ns: 0,
             phase: "descend".into(),
             why: "descending over the marker".into(),
             guidance: "metric".into(),
-            autopilot: String::new(),
             active_detector: Some("main".into()),
             candidates: vec![candidate("main"), candidate("spare")],
             detection_age_ms: Some(63.4),
             height_m: Some(4.321),
             lateral_error_m: Some(0.0123),
-            setpoint: None,
-            started_ns: None,
-            disarmed_ns: None,
-            finished: false,
-            detections_used: 0,
-            latency_ms: None,
+            ..ControllerStatus::default()
         };
         let text = live_lines(&status, Some(15.02));
         for part in

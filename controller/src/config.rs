@@ -84,8 +84,30 @@ pub struct AutopilotSettings {
 pub struct DetectorSettings {
     /// The detector to use while it is healthy, or nothing.
     pub preferred: String,
-    /// The age of its last frame, in seconds, up to which a detector is healthy.
+    /// Where the detector to use should run.
+    pub place: PreferredPlace,
+    /// The usual age of its frames on arrival, in seconds, up to which a detector is healthy.
     pub max_age_s: f64,
+    /// Frames a second from which on a detector is healthy.
+    pub least_rate_hz: f64,
+    /// For how long a preferred detector must have been healthy before it is used, in seconds.
+    pub return_after_s: f64,
+    /// Distance up to which two detectors agree, in metres.
+    pub tolerance_m: f64,
+    /// What that distance grows by per metre of range.
+    pub tolerance_per_m: f64,
+}
+
+/// Where the detector to use should run.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PreferredPlace {
+    /// Anywhere.
+    Any,
+    /// On the vehicle.
+    Onboard,
+    /// On the ground.
+    Ground,
 }
 
 impl Settings for Config {
@@ -102,7 +124,7 @@ impl Settings for Config {
         if !self.detectors.preferred.is_empty() {
             check.name("detectors.preferred", &self.detectors.preferred);
         }
-        check.range("detectors.max_age_s", self.detectors.max_age_s, 0.05..=5.0);
+        self.detectors.check(check);
         // Both guidances are checked, used or not: a wrong number should not wait for the day it is used.
         for guidance in [Guidance::Metric(self.metric), Guidance::Thesis(self.thesis)] {
             if let Err(problem) = self.landing(guidance).validate() {
@@ -110,6 +132,16 @@ impl Settings for Config {
                 check.range(key, problem.value, min..=max);
             }
         }
+    }
+}
+
+impl DetectorSettings {
+    fn check(&self, check: &mut Check<'_>) {
+        check.range("detectors.max_age_s", self.max_age_s, 0.05..=5.0);
+        check.range("detectors.least_rate_hz", self.least_rate_hz, 0.1..=100.0);
+        check.range("detectors.return_after_s", self.return_after_s, 0.0..=60.0);
+        check.range("detectors.tolerance_m", self.tolerance_m, 0.001..=10.0);
+        check.range("detectors.tolerance_per_m", self.tolerance_per_m, 0.0..=1.0);
     }
 }
 

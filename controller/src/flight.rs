@@ -13,13 +13,13 @@ use autopilot::{
 use geometry::Vector;
 use landing::{Action, Decision, Event as LanderEvent, Lander, OperatorCommand, Phase, Timestamp};
 use messages::{
-    CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, Setpoint,
-    TargetEstimate,
+    CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo, Place,
+    Setpoint, TargetEstimate,
 };
 use node::{HealthCounters, clock_name};
 
-use crate::config::{Config, Start};
-use crate::selection::Selection;
+use crate::config::{Config, DetectorSettings, PreferredPlace, Start};
+use crate::selection::{Limits, MOST, Preference, Selection, Sight};
 use crate::wire;
 
 /// The latency that matters, as health and status name it.
@@ -34,11 +34,16 @@ pub struct Flight {
     lander: Lander,
     mission: Mission,
     selection: Selection,
+    /// The newest frame of each detector, to be used when it becomes the active one.
+    frames: BTreeMap<String, landing::Frame>,
+    changes_told: u64,
     cameras: BTreeMap<String, CameraInfo>,
     decision: Option<Decision>,
     setpoint: Option<Setpoint>,
     setpoint_ns: i64,
     used_stamp_ns: Option<i64>,
+    /// Stamp of the newest frame that was used, with a marker in it or without.
+    looked_stamp_ns: i64,
     detections_used: u64,
     started_ns: Option<i64>,
     disarmed_ns: Option<i64>,
@@ -81,17 +86,19 @@ impl Flight {
             streams: autopilot::client::default_streams(settings.state_rate_hz),
             ..autopilot::Config::default()
         });
-        let preferred = Some(config.detectors.preferred.clone()).filter(|name| !name.is_empty());
         Ok(Self {
             autopilot,
             lander: Lander::new(config.lander())?,
             mission,
-            selection: Selection::new(config.detectors.max_age_s, preferred),
+            selection: selection(&config.detectors),
+            frames: BTreeMap::new(),
+            changes_told: 0,
             cameras: BTreeMap::new(),
             decision: None,
             setpoint: None,
             setpoint_ns: i64::MIN,
             used_stamp_ns: None,
+            looked_stamp_ns: i64::MIN,
             detections_used: 0,
             started_ns: None,
             disarmed_ns: None,
@@ -112,58 +119,111 @@ impl Flight {
         self.autopilot.tick(now_ns);
         self.take_autopilot_events(now_ns);
         self.selection.tick(now_ns);
+        self.frames.retain(|name, _| self.selection.knows(name));
+        self.use_newest(now_ns);
+        self.count_ticks(now_ns);
         self.advance_mission(now_ns);
         self.decide(now_ns, LanderEvent::Tick);
     }
 
-    /// Takes what a detector found.
-    pub fn detections(&mut self, now_ns: i64, message: &Detections) {
+    /// Takes what the detector `publisher` found; that is whose key it was published on. True when it was used or
+    /// refused; false when another detector is the active one.
+    pub fn detections(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> bool {
         self.health.count("detections");
         let header = &message.header;
+        // Who may publish is decided by the key; what the message says of its sender is only a claim.
+        if message.detector != publisher {
+            self.reject("another-detectors-name");
+            return true;
+        }
         if header.clock != clock_name() {
             self.reject("another-clock");
-            return;
+            return true;
         }
         // Refused here, because the newest stamp is what later ones are compared with: one from the future would shut
         // all of them out.
         let ahead_ns = header.stamp_ns.saturating_sub(now_ns);
         if ahead_ns as f64 * 1e-9 > self.config.target.max_future_s {
             self.reject("from-the-future");
-            return;
+            return true;
         }
         let mount = self.cameras.get(&header.camera).and_then(wire::body_from_camera);
         let marker = wire::wanted(message, &self.config.marker)
             .map(|detection| wire::marker_in_frame(detection, mount));
-        let distance_m = marker.as_ref().and_then(|marker| self.disagreement_m(marker));
-        if !self.selection.heard(now_ns, &message.detector, header.stamp_ns, distance_m) {
-            return;
-        }
-        let frame = landing::Frame {
-            stamp: Timestamp::from_nanos(header.stamp_ns),
-            detector: 0,
-            image_size: (header.width, header.height),
-            focal_px: self.cameras.get(&header.camera).and_then(|info| {
-                let scale = f64::from(header.width) / f64::from(info.width.max(1));
-                info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
+        let sight = marker.as_ref().map(|marker| Sight {
+            place_m: marker.body_from_marker.map(|pose| {
+                let place = pose.origin();
+                [place.x(), place.y(), place.z()]
             }),
-            marker,
-        };
+        });
+        if self.selection.heard(now_ns, publisher, header.stamp_ns, sight) {
+            let frame = landing::Frame {
+                stamp: Timestamp::from_nanos(header.stamp_ns),
+                detector: 0,
+                image_size: (header.width, header.height),
+                focal_px: self.cameras.get(&header.camera).and_then(|info| {
+                    let scale = f64::from(header.width) / f64::from(info.width.max(1));
+                    info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
+                }),
+                marker,
+            };
+            self.frames.insert(publisher.to_owned(), frame);
+            debug_assert!(self.frames.len() <= MOST);
+        }
+        self.use_newest(now_ns)
+    }
+
+    /// Gives the lander the frame that is to be used next, if there is one, and tells of a change of the detector.
+    fn use_newest(&mut self, now_ns: i64) -> bool {
+        let next = self.selection.next_frame();
+        let next = next.and_then(|(name, _stamp)| self.frames.get(&name).copied());
+        if let Some(frame) = next {
+            self.frame(now_ns, frame);
+        }
+        if self.selection.changes() != self.changes_told {
+            self.changes_told = self.selection.changes();
+            self.health.count("changes of the detector");
+            let detector = self.selection.active().unwrap_or_default();
+            tracing::warn!(detector, why = self.selection.why(), "Another detector is used");
+        }
+        next.is_some()
+    }
+
+    fn frame(&mut self, now_ns: i64, frame: landing::Frame) {
+        let stamp_ns = frame.stamp.nanos();
+        self.looked_stamp_ns = stamp_ns;
         let sent_before = self.setpoint_ns;
         self.decide(now_ns, LanderEvent::Frame(frame));
         let rejection = self.decision.and_then(|decision| decision.rejected);
         self.rejected = None;
         match rejection {
             Some(rejection) => self.reject(rejection.name()),
-            None if marker.is_some() => {
+            None if frame.marker.is_some() => {
                 self.detections_used += u64::from(self.is_landing());
-                self.used_stamp_ns = Some(header.stamp_ns);
+                self.used_stamp_ns = Some(stamp_ns);
                 if self.setpoint_ns != sent_before {
-                    let age_ns = now_ns.saturating_sub(header.stamp_ns).max(0);
+                    let age_ns = now_ns.saturating_sub(stamp_ns).max(0);
                     self.health
                         .latency(STAMP_TO_SETPOINT, Duration::from_nanos(age_ns.unsigned_abs()));
                 }
             }
             None => {}
+        }
+    }
+
+    /// Counts the ticks of a landing, and those at which the newest frame that was used is no longer fresh: because no
+    /// detector has a newer one, or although one has.
+    fn count_ticks(&mut self, now_ns: i64) {
+        if !self.is_landing() {
+            return;
+        }
+        self.health.count("ticks");
+        let age_ns = now_ns.saturating_sub(self.looked_stamp_ns);
+        if age_ns as f64 * 1e-9 > self.config.detectors.max_age_s {
+            self.health.count("ticks without a fresh frame");
+            if self.selection.has_newer() {
+                self.health.count("ticks without a fresh frame although there was one");
+            }
         }
     }
 
@@ -177,6 +237,17 @@ impl Flight {
     /// A detector came or went.
     pub fn presence(&mut self, now_ns: i64, detector: &str, alive: bool) {
         self.selection.presence(now_ns, detector, alive);
+        self.use_newest(now_ns);
+    }
+
+    /// The detector `publisher` tells about itself.
+    pub fn introduced(&mut self, now_ns: i64, publisher: &str, info: &DetectorInfo) {
+        if info.detector != publisher {
+            self.reject("another-detectors-name");
+            return;
+        }
+        self.selection.introduced(now_ns, publisher, info.place);
+        self.use_newest(now_ns);
     }
 
     /// Does what the operator asks for, or says why not.
@@ -186,14 +257,15 @@ impl Flight {
             ControllerCommand::Hold => self.operator(now_ns, OperatorCommand::Hold),
             ControllerCommand::Resume => self.operator(now_ns, OperatorCommand::Resume),
             ControllerCommand::Abort => self.operator(now_ns, OperatorCommand::Abort),
-            ControllerCommand::UseDetector(name) => self
-                .selection
-                .prefer(now_ns, name)
-                .map(|()| format!("detector `{name}` is used while it is healthy")),
+            ControllerCommand::UseDetector(name) => self.selection.prefer(now_ns, name),
+            ControllerCommand::PreferDetectors(place) => {
+                Ok(self.selection.prefer_place(now_ns, *place))
+            }
             ControllerCommand::SetParameter { key, .. } => Err(format!(
                 "`{key}` cannot be changed while the controller runs; start it with --set {key}=VALUE"
             )),
         };
+        self.use_newest(now_ns);
         match result {
             Ok(reason) => CommandReply { accepted: true, reason },
             Err(reason) => CommandReply { accepted: false, reason },
@@ -243,6 +315,9 @@ impl Flight {
             guidance: self.config.guidance.name().to_owned(),
             autopilot: self.link_in_words(),
             active_detector: self.selection.active().map(str::to_owned),
+            detector_why: self.selection.why().to_owned(),
+            preference: self.selection.preference().to_owned(),
+            detector_changes: self.selection.changes(),
             candidates: self.selection.candidates(now_ns),
             detection_age_ms: self.detection_age_ms(now_ns),
             height_m: target.map(|t| t.height_m).or(above_origin_m),
@@ -305,15 +380,6 @@ impl Flight {
     fn reject(&mut self, reason: &str) {
         self.health.dropped(&format!("detection: {reason}"));
         self.rejected = Some(reason.to_owned());
-    }
-
-    /// How far a detection's marker is from the estimate, horizontally, taken at the vehicle's present place.
-    fn disagreement_m(&self, marker: &landing::MarkerInFrame) -> Option<f64> {
-        let target = self.decision.and_then(|decision| decision.target)?;
-        let vehicle = wire::vehicle(self.autopilot.state()?)?;
-        let offset = marker.body_from_marker?.origin() - geometry::Point::origin();
-        let seen = vehicle.position + vehicle.ned_from_body * offset;
-        Some((seen - target.position).horizontal_norm())
     }
 
     fn start(&mut self, now_ns: i64) -> Result<String, String> {
@@ -556,6 +622,24 @@ impl Flight {
     }
 }
 
+/// The choice of the detector, as configured.
+fn selection(settings: &DetectorSettings) -> Selection {
+    let limits = Limits {
+        max_age_s: settings.max_age_s,
+        least_rate_hz: settings.least_rate_hz,
+        return_after_s: settings.return_after_s,
+        tolerance_m: settings.tolerance_m,
+        tolerance_per_m: settings.tolerance_per_m,
+    };
+    let detector = Some(settings.preferred.clone()).filter(|name| !name.is_empty());
+    let place = match settings.place {
+        PreferredPlace::Any => None,
+        PreferredPlace::Onboard => Some(Place::Onboard),
+        PreferredPlace::Ground => Some(Place::Ground),
+    };
+    Selection::new(limits, Preference { detector, place })
+}
+
 /// The same velocity without its downward part: a crash of the last detector is told at once, and need not wait until
 /// the target has aged.
 fn level(velocity: Vector<geometry::Ned>) -> Vector<geometry::Ned> {
@@ -748,13 +832,17 @@ mod tests {
             stages: Vec::new(),
         };
         for stamp_ns in [i64::MAX, now_ns + 10_000 * MS, now_ns + 60 * MS] {
-            flight.detections(now_ns, &seen(stamp_ns));
+            flight.detections(now_ns, "main", &seen(stamp_ns));
             assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("from-the-future"));
         }
         for stamp_ns in [i64::MIN, now_ns - 1] {
-            flight.detections(now_ns, &seen(stamp_ns));
+            flight.detections(now_ns, "main", &seen(stamp_ns));
         }
         assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("no-pose"), "it was looked at");
         assert_eq!(flight.status(now_ns).active_detector.as_deref(), Some("main"));
+        // Another one's name is no way into the flight.
+        flight.detections(now_ns, "intruder", &seen(now_ns));
+        assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("another-detectors-name"));
+        assert_eq!(flight.status(now_ns).candidates.len(), 1);
     }
 }

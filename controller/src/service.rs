@@ -38,6 +38,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
     let cameras = node.subscriber(topic::CAMERA_INFO, &[]).await?;
     let presence = node.presence("detector").await?;
+    let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
     let commands = node.commands(topic::COMMAND, &[]).await?;
     let to_autopilot = node.subscriber(topic::TO_AUTOPILOT, &[]).await?;
     let targets = node.publisher(topic::TARGET, &[]).await?;
@@ -61,13 +62,19 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                     tracing::warn!(reason, "The link to the autopilot is down; it is tried again");
                 }
             },
-            Some(message) = detections.next() => {
-                flight.detections(now_ns(), &message);
-                send(&node, &link, &mut flight);
-                targets.publish(&flight.target(now_ns())).await;
+            Some((key, message)) = detections.next_with_key() => {
+                let publisher = topic::DETECTIONS.first_name(&key).unwrap_or_default();
+                if flight.detections(now_ns(), publisher, &message) {
+                    send(&node, &link, &mut flight);
+                    targets.publish(&flight.target(now_ns())).await;
+                }
             }
             _ = ticks.tick() => flight.tick(now_ns()),
             Some((detector, alive)) = presence.next() => flight.presence(now_ns(), &detector, alive),
+            Some((key, info)) = infos.next_with_key() => {
+                let publisher = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
+                flight.introduced(now_ns(), publisher, &info);
+            }
             Some(request) = commands.next() => {
                 let reply = flight.command(now_ns(), &request.message);
                 // Whoever asked may not listen, and the setpoints do not wait for that.

@@ -1,6 +1,7 @@
 //! The detector's configuration, at the start and while it runs.
 
 use fiducial::{Detector, Marker, TrackingSettings};
+use messages::Place;
 use node::{Check, Settings};
 use serde::{Deserialize, Serialize};
 
@@ -10,6 +11,8 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// Name of this detector.
     pub id: String,
+    /// Where it runs.
+    pub place: Place,
     /// Name of the camera.
     pub camera: String,
     /// Markers to look for.
@@ -73,9 +76,11 @@ impl Config {
         let changed = node::changed(self, &format!("{key}={value}"));
         let changed = changed.map_err(|problem| problem.to_string())?;
         // The keys by which others know this detector, and its frames.
-        for (name, before, after) in
-            [("id", &self.id, &changed.id), ("camera", &self.camera, &changed.camera)]
-        {
+        for (name, before, after) in [
+            ("id", self.id.as_str(), changed.id.as_str()),
+            ("place", self.place.name(), changed.place.name()),
+            ("camera", &self.camera, &changed.camera),
+        ] {
             if before != after {
                 return Err(format!(
                     "`{name}` holds from start to end; start the detector again with `--set {name}={after}`"
@@ -131,6 +136,7 @@ mod tests {
         assert!(changed.tracking().is_some() && changed.markers.len() == 1);
         let refused = |key, value| config.with(key, value).unwrap_err();
         assert!(refused("id", "other").contains("start the detector again"));
+        assert!(refused("place", "ground").contains("--set place=ground"));
         assert!(refused("least_confidence", "2").contains("from 0 to 1"));
         assert!(refused("markers", "[]").contains("at least one marker"));
         assert!(refused("tracking", "7").contains("a table is needed"));

@@ -12,8 +12,8 @@ use fiducial::{Detector, Stages, Tracker};
 use geometry::CameraModel;
 use imaging::{Converter, GrayView};
 use messages::{
-    CameraInfo, CommandReply, Detection, Detections, DetectorCommand, FrameHeader, FrameReceipt,
-    PixelFormat, StageTime, topic,
+    CameraInfo, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo, FrameHeader,
+    FrameReceipt, PixelFormat, StageTime, topic,
 };
 use node::{Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, now_ns};
 use tokio::runtime::Handle;
@@ -25,7 +25,12 @@ use crate::wire;
 /// The debug images, as the topics name them: the thesis' three, and the squares.
 const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
 
-/// Runs the service until it is asked to stop.
+/// How often a detector tells about itself, for those whose link was cut.
+const INFO_PERIOD: Duration = Duration::from_secs(1);
+/// Time for the answer to a last command to leave.
+const FAREWELL: Duration = Duration::from_millis(100);
+
+/// Runs the service until it is asked to stop, by the system or by a command.
 ///
 /// # Errors
 /// When another detector has the same name, or the network fails.
@@ -36,6 +41,8 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let commands = node.commands(topic::DETECTOR_COMMAND, &[&config.id]).await?;
     let change = Arc::default();
     let work = Work::new(&node, &config, Arc::clone(&camera), Arc::clone(&change)).await?;
+    let infos_of_ours = node.publisher(topic::DETECTOR_INFO, &[&config.id]).await?;
+    infos_of_ours.publish(&info(&config)).await;
     let mut live = Live { config, change };
     let (stopped, thread) = work.start()?;
     node.announce().await?;
@@ -45,9 +52,21 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         }
     };
     let obey = async {
-        while let Some(request) = commands.next().await {
-            let reply = live.command(&request.message);
-            request.answer(&reply).await;
+        let mut introduction = tokio::time::interval(INFO_PERIOD);
+        loop {
+            tokio::select! {
+                _ = introduction.tick() => infos_of_ours.publish(&info(&live.config)).await,
+                request = commands.next() => {
+                    let Some(request) = request else { return };
+                    let is_last = request.message == DetectorCommand::Stop;
+                    let reply = live.command(&request.message);
+                    request.answer(&reply).await;
+                    if is_last {
+                        tokio::time::sleep(FAREWELL).await;
+                        return;
+                    }
+                }
+            }
         }
     };
     tokio::select! {
@@ -65,6 +84,19 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// What this detector says about itself.
+fn info(config: &Config) -> DetectorInfo {
+    DetectorInfo {
+        detector: config.id.clone(),
+        host: node::host_name(),
+        place: config.place,
+        camera: config.camera.clone(),
+        markers: config.markers.clone(),
+        version: concat!("alight ", env!("CARGO_PKG_VERSION")).to_owned(),
+        pid: std::process::id(),
+    }
+}
+
 /// What the image thread changes to before its next frame.
 struct Change {
     config: Config,
@@ -79,7 +111,14 @@ struct Live {
 
 impl Live {
     fn command(&mut self, command: &DetectorCommand) -> CommandReply {
-        let DetectorCommand::SetParameter { key, value } = command;
+        let (key, value) = match command {
+            DetectorCommand::SetParameter { key, value } => (key, value),
+            DetectorCommand::Stop => {
+                tracing::info!("Asked to stop");
+                let reason = format!("detector `{}` stops", self.config.id);
+                return CommandReply { accepted: true, reason };
+            }
+        };
         match self.set(key, value) {
             Ok(()) => {
                 tracing::info!(key, value, "Parameter changed");

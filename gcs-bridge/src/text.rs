@@ -45,7 +45,13 @@ impl Teller {
         }
         if self.detector != status.active_detector {
             let (severity, text) = match &status.active_detector {
-                Some(name) => (MavSeverity::MAV_SEVERITY_INFO, format!("Alight: detector {name}")),
+                Some(name) if status.detector_why.is_empty() => {
+                    (MavSeverity::MAV_SEVERITY_INFO, format!("Alight: detector {name}"))
+                }
+                Some(name) => {
+                    let text = format!("Alight: detector {name}: {}", status.detector_why);
+                    (MavSeverity::MAV_SEVERITY_INFO, text)
+                }
                 None => (MavSeverity::MAV_SEVERITY_WARNING, "Alight: no detector".to_owned()),
             };
             if let Some(text) = self.say(now_ns, severity, &text) {
@@ -117,22 +123,10 @@ mod tests {
 
     fn status(phase: &str, why: &str, detector: Option<&str>) -> ControllerStatus {
         ControllerStatus {
-            stamp_ns: 0,
             phase: phase.into(),
             why: why.into(),
-            guidance: "metric".into(),
-            autopilot: "connected".into(),
             active_detector: detector.map(Into::into),
-            candidates: Vec::new(),
-            detection_age_ms: None,
-            height_m: None,
-            lateral_error_m: None,
-            setpoint: None,
-            started_ns: None,
-            disarmed_ns: None,
-            finished: false,
-            detections_used: 0,
-            latency_ms: None,
+            ..ControllerStatus::default()
         }
     }
 
@@ -175,6 +169,10 @@ mod tests {
         assert_eq!(told[1].1, "Alight: detector main");
         let told = join(&teller.status(0, &status("search", "", Some("spare"))));
         assert_eq!(told[0].1, "Alight: detector spare");
+        let mut changed = status("search", "", Some("main"));
+        changed.detector_why = "spare has gone".into();
+        let told = join(&teller.status(0, &changed));
+        assert_eq!(told[0].1, "Alight: detector main: spare has gone");
         let told = join(&teller.status(0, &status("search", "", None)));
         assert_eq!(told, [(MavSeverity::MAV_SEVERITY_WARNING, "Alight: no detector".to_owned())]);
     }

@@ -394,16 +394,12 @@ fn status(phase: &str, why: &str) -> ControllerStatus {
         guidance: "metric".into(),
         autopilot: "connected".into(),
         active_detector: Some("spare".into()),
-        candidates: Vec::new(),
         detection_age_ms: Some(60.0),
         height_m: Some(10.0),
         lateral_error_m: Some(1.93),
-        setpoint: None,
         started_ns: Some(0),
-        disarmed_ns: None,
-        finished: false,
         detections_used: 1,
-        latency_ms: None,
+        ..ControllerStatus::default()
     }
 }
 

@@ -3,11 +3,12 @@
 use serde::{Deserialize, Serialize};
 
 use crate::codec::wire;
+use crate::detector::Place;
 
 wire! {
     TargetEstimate = 6 v 1;
-    ControllerStatus = 7 v 1;
-    ControllerCommand = 8 v 1;
+    ControllerStatus = 7 v 2;
+    ControllerCommand = 8 v 2;
     CommandReply = 9 v 1;
 }
 
@@ -42,18 +43,40 @@ pub struct Setpoint {
 pub struct Candidate {
     /// Its name.
     pub detector: String,
+    /// Whether it is used, could be, or could not.
+    pub state: DetectorState,
+    /// Where it runs, if it has told.
+    pub place: Option<Place>,
     /// Since the capture of the frame of its latest detections, in milliseconds.
     pub age_ms: f64,
+    /// From the capture of a frame to the arrival of its detections, the median of the last ones, in milliseconds.
+    pub latency_ms: f64,
     /// Detections messages a second.
     pub rate_hz: f64,
     /// True while it tells of its presence.
     pub alive: bool,
-    /// Distance between its latest marker and the estimate, in metres.
+    /// Distance between its marker and the active detector's in the last frame in which both saw it, in metres.
     pub disagreement_m: Option<f64>,
+    /// Of the latest frames in which the active detector saw the marker, those that this one has searched too.
+    pub compared: u32,
+    /// Those of them in which it saw the marker at the same place.
+    pub agreed: u32,
+}
+
+/// Whether a detector is used.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DetectorState {
+    /// Its detections steer the vehicle.
+    Active,
+    /// It is healthy and stands by.
+    Shadow,
+    /// It is silent, late, slow or gone.
+    Stale,
 }
 
 /// What the controller is doing, and why.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ControllerStatus {
     /// When, in nanoseconds of the controller's clock.
     pub stamp_ns: i64,
@@ -67,6 +90,12 @@ pub struct ControllerStatus {
     pub autopilot: String,
     /// The detector in use.
     pub active_detector: Option<String>,
+    /// Why it is this one, in words.
+    pub detector_why: String,
+    /// What the operator prefers: a detector's name, `onboard`, `ground` or nothing.
+    pub preference: String,
+    /// How often another detector became the active one.
+    pub detector_changes: u64,
     /// All detectors there are, the active one included.
     pub candidates: Vec<Candidate>,
     /// Since the capture of the frame that was used last, in milliseconds.
@@ -109,6 +138,8 @@ pub enum ControllerCommand {
         /// Its new value, in TOML.
         value: String,
     },
+    /// Use detectors that run there rather than others.
+    PreferDetectors(Place),
 }
 
 /// The answer to a command.

@@ -8,7 +8,8 @@ use crate::codec::wire;
 
 wire! {
     Detections = 3 v 3;
-    DetectorCommand = 13 v 1;
+    DetectorCommand = 13 v 2;
+    DetectorInfo = 15 v 1;
 }
 
 /// What a detector found in one frame; also sent when it found nothing.
@@ -89,4 +90,45 @@ pub enum DetectorCommand {
         /// Its new value, in TOML.
         value: String,
     },
+    /// End, with exit status 0: another detector has taken over.
+    Stop,
+}
+
+/// What a detector says about itself.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DetectorInfo {
+    /// The detector's name.
+    pub detector: String,
+    /// The host it runs on.
+    pub host: String,
+    /// Where that host is.
+    pub place: Place,
+    /// The camera whose frames it searches.
+    pub camera: String,
+    /// The markers it looks for, as `FAMILY:ID:SIZE_M`.
+    pub markers: Vec<String>,
+    /// Its program and version.
+    pub version: String,
+    /// Process id on its host.
+    pub pid: u32,
+}
+
+/// Where a detector runs.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Place {
+    /// On the vehicle.
+    Onboard,
+    /// On the ground.
+    Ground,
+}
+
+impl Place {
+    /// Its name in configurations and commands.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Onboard => "onboard",
+            Self::Ground => "ground",
+        }
+    }
 }

@@ -22,10 +22,12 @@ pub use camera::{
 };
 pub use codec::{DecodeError, Message, decode, encode};
 pub use controller::{
-    Candidate, CommandReply, ControllerCommand, ControllerStatus, Setpoint, TargetEstimate,
+    Candidate, CommandReply, ControllerCommand, ControllerStatus, DetectorState, Setpoint,
+    TargetEstimate,
 };
 pub use detector::{
-    AlternativePose, Detection, Detections, DetectorCommand, MarkerPose, StageTime,
+    AlternativePose, Detection, Detections, DetectorCommand, DetectorInfo, MarkerPose, Place,
+    StageTime,
 };
 pub use health::{Count, Health, Latency, Rate};
 pub use simulation::{Touchdown, Truth, Wind};

@@ -7,7 +7,7 @@ use std::marker::PhantomData;
 use crate::camera::{CameraInfo, FrameHeader, FrameReceipt};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
-use crate::detector::{Detections, DetectorCommand};
+use crate::detector::{Detections, DetectorCommand, DetectorInfo};
 use crate::health::Health;
 use crate::simulation::{Truth, Wind};
 use crate::vehicle::{MavlinkBytes, VehicleState};
@@ -80,6 +80,23 @@ impl<M: Message> Topic<M> {
         });
         chunks.collect::<Vec<_>>().join("/")
     }
+
+    /// What stands for the first placeholder in a key of this topic, whatever the key begins with; `None` when it is
+    /// no key of this topic.
+    pub fn first_name<'a>(&self, key: &'a str) -> Option<&'a str> {
+        let pattern = self.row.key.rsplit('/');
+        let mut chunks = key.rsplit('/');
+        let mut first = None;
+        for wanted in pattern {
+            let chunk = chunks.next()?;
+            match wanted.starts_with('{') {
+                true => first = Some(chunk),
+                false if wanted == chunk => {}
+                false => return None,
+            }
+        }
+        first
+    }
 }
 
 const CAMERAS: &[&str] = &["camera-pub", "simulator"];
@@ -104,6 +121,9 @@ pub const RECEIVED: Topic<FrameReceipt> =
 /// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
 pub const DEBUG_IMAGE: Topic<FrameHeader> =
     Topic::new("detector/{detector}/debug/{image}", Delivery::Newest, DETECTOR);
+/// What a detector says about itself.
+pub const DETECTOR_INFO: Topic<DetectorInfo> =
+    Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR);
 /// What a detector is told; answered with a [`CommandReply`].
 pub const DETECTOR_COMMAND: Topic<DetectorCommand> =
     Topic::new("detector/{detector}/command", Delivery::Query, &["alight"]);
@@ -147,6 +167,11 @@ pub fn alive_key(service: &str, instance: &str) -> String {
     format!("alive/{service}/{instance}")
 }
 
+/// Key of the liveliness token by which a service says, before it looks for others, that it is about to start.
+pub fn claim_key(service: &str, instance: &str, session: &str) -> String {
+    format!("alive/{service}/{instance}/{session}")
+}
+
 /// Every topic there is.
 pub const TOPICS: &[Row] = &[
     FRAME.row,
@@ -155,6 +180,7 @@ pub const TOPICS: &[Row] = &[
     DETECTIONS.row,
     RECEIVED.row,
     DEBUG_IMAGE.row,
+    DETECTOR_INFO.row,
     DETECTOR_COMMAND.row,
     DETECTOR_COMMAND_REPLY.row,
     VEHICLE_STATE.row,
@@ -178,6 +204,16 @@ mod tests {
         assert_eq!(DEBUG_IMAGE.key(&["main", "rings"]), "detector/main/debug/rings");
         assert_eq!(DEBUG_IMAGE.key(&["main"]), "detector/main/debug/*");
         assert_eq!(WIND.key(&[]), "wind");
+    }
+
+    #[test]
+    fn the_first_name_is_read_from_a_key() {
+        assert_eq!(DETECTIONS.first_name("detector/main/detections"), Some("main"));
+        assert_eq!(DETECTIONS.first_name("drone/detector/main/detections"), Some("main"));
+        assert_eq!(DEBUG_IMAGE.first_name("detector/main/debug/rings"), Some("main"));
+        assert_eq!(DETECTIONS.first_name("detector/main/info"), None);
+        assert_eq!(DETECTIONS.first_name("detections"), None);
+        assert_eq!(WIND.first_name("wind"), None);
     }
 
     #[test]

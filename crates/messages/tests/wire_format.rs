@@ -2,10 +2,10 @@
 
 use messages::{
     AlternativePose, BayerPattern, CameraInfo, Candidate, CommandReply, ControllerCommand,
-    ControllerStatus, Count, DecodeError, Detection, Detections, DetectorCommand, FrameHeader,
-    FramePart, FrameReceipt, Health, LandedState, Latency, LensModel, MarkerPose, MavlinkBytes,
-    Message, PixelFormat, Rate, Setpoint, StageTime, TargetEstimate, Touchdown, Transform3, Truth,
-    VehicleState, Wind, decode, encode,
+    ControllerStatus, Count, DecodeError, Detection, Detections, DetectorCommand, DetectorInfo,
+    DetectorState, FrameHeader, FramePart, FrameReceipt, Health, LandedState, Latency, LensModel,
+    MarkerPose, MavlinkBytes, Message, PixelFormat, Place, Rate, Setpoint, StageTime,
+    TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind, decode, encode,
 };
 use proptest::prelude::*;
 
@@ -121,7 +121,25 @@ fn frame_receipt() {
 fn detector_command() {
     let message =
         DetectorCommand::SetParameter { key: "thesis_threshold".into(), value: "80".into() };
-    check(&message, "410d0100107468657369735f7468726573686f6c64023830");
+    check(&message, "410d0200107468657369735f7468726573686f6c64023830");
+    check(&DetectorCommand::Stop, "410d0201");
+}
+
+#[test]
+fn detector_info() {
+    let message = DetectorInfo {
+        detector: "main".into(),
+        host: "pi".into(),
+        place: Place::Ground,
+        camera: "down".into(),
+        markers: vec!["rings:0.15341".into()],
+        version: "alight 0.1.0".into(),
+        pid: 300,
+    };
+    check(
+        &message,
+        "410f01046d61696e0270690104646f776e010d72696e67733a302e31353334310c616c6967687420302e312e30ac02",
+    );
 }
 
 #[test]
@@ -189,12 +207,20 @@ fn controller_status() {
         guidance: "metric".into(),
         autopilot: "ok".into(),
         active_detector: Some("main".into()),
+        detector_why: "y".into(),
+        preference: "ground".into(),
+        detector_changes: 2,
         candidates: vec![Candidate {
             detector: "main".into(),
+            state: DetectorState::Active,
+            place: Some(Place::Onboard),
             age_ms: 1.0,
+            latency_ms: 2.0,
             rate_hz: 15.0,
             alive: true,
             disagreement_m: None,
+            compared: 15,
+            agreed: 14,
         }],
         detection_age_ms: None,
         height_m: None,
@@ -208,14 +234,15 @@ fn controller_status() {
     };
     check(
         &message,
-        "410701020764657363656e640177066d6574726963026f6b01046d61696e01046d61696e000000000000f03f0000000000002e4001000000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f0000000000000040",
+        "410702020764657363656e640177066d6574726963026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e0000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f0000000000000040",
     );
 }
 
 #[test]
 fn controller_command() {
     let message = ControllerCommand::UseDetector("spare".into());
-    check(&message, "41080104057370617265");
+    check(&message, "41080204057370617265");
+    check(&ControllerCommand::PreferDetectors(Place::Ground), "4108020601");
 }
 
 #[test]

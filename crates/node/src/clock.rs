@@ -18,9 +18,14 @@ pub fn clock_name() -> &'static str {
         let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
         match boot.trim().get(..8) {
             Some(boot) => format!("monotonic/{boot}"),
-            None => format!("monotonic/{}", rustix::system::uname().nodename().to_string_lossy()),
+            None => format!("monotonic/{}", host_name()),
         }
     })
+}
+
+/// Name of this host.
+pub fn host_name() -> String {
+    rustix::system::uname().nodename().to_string_lossy().into_owned()
 }
 
 #[cfg(test)]

@@ -16,7 +16,7 @@ pub mod service;
 pub mod session;
 pub mod topics;
 
-pub use clock::{Clock, clock_name, now_ns};
+pub use clock::{Clock, clock_name, host_name, now_ns};
 pub use config::{Check, ConfigError, Effective, Layers, Settings, changed};
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;

@@ -24,6 +24,9 @@ pub fn local_config(port: u16) -> String {
     LOCAL_CONFIG.replace(&format!(":{LOCAL_PORT}"), &format!(":{port}"))
 }
 
+/// Comings and goings a mailbox keeps.
+const PRESENCE_DEPTH: usize = 256;
+
 /// How long a question about presence may take.
 const PRESENCE_TIMEOUT: Duration = Duration::from_millis(500);
 
@@ -69,6 +72,8 @@ pub struct Node {
     identity: Arc<Identity>,
     health: Arc<HealthCounters>,
     token: Arc<Mutex<Option<LivelinessToken>>>,
+    /// Held from before the look for others until the service is announced.
+    claim: Arc<Mutex<Option<LivelinessToken>>>,
     started_ns: i64,
 }
 
@@ -92,6 +97,7 @@ impl Node {
             identity: Arc::new(identity),
             health: Arc::default(),
             token: Arc::default(),
+            claim: Arc::default(),
             started_ns: now_ns(),
         })
     }
@@ -111,12 +117,19 @@ impl Node {
         Arc::clone(&self.health)
     }
 
-    /// Stops with an error when a service of this kind is there already whose instance `matches` (`*` for any).
+    /// Stops with an error when a service of this kind is there already whose instance `matches` (`*` for any), or
+    /// starts in the same moment and goes first.
+    ///
+    /// The intention is told before the others are looked for, so that of two that start at once at least one sees
+    /// the other; the one whose name and session come first goes on.
     ///
     /// # Errors
     /// Names the other instance.
     pub async fn ensure_alone(&self, matches: &str) -> anyhow::Result<()> {
         let service = self.identity.service;
+        let ours = (self.identity.instance.clone(), self.session.zid().to_string());
+        let claim = self.declare(&topic::claim_key(service, &ours.0, &ours.1)).await?;
+        *self.claim.lock().unwrap_or_else(PoisonError::into_inner) = Some(claim);
         for pause in GREETING {
             tokio::time::sleep(pause).await;
             match self.alive(service, matches).await?.first() {
@@ -128,6 +141,12 @@ impl Node {
                     "another {service} is called `{other}` already; give this one another name with `--set id=...`"
                 ),
             }
+            let claims = self.tokens(&topic::claim_key(service, matches, "*")).await?;
+            if let Some((other, _)) =
+                claims.iter().filter_map(|key| claim_of(key)).find(|it| *it < ours)
+            {
+                bail!("another {service} (`{other}`) starts in the same moment and goes first");
+            }
         }
         Ok(())
     }
@@ -137,21 +156,24 @@ impl Node {
     /// # Errors
     /// When the question cannot be asked.
     pub async fn alive(&self, service: &str, instance: &str) -> anyhow::Result<Vec<String>> {
-        let key = topic::alive_key(service, instance);
+        let keys = self.tokens(&topic::alive_key(service, instance)).await?;
+        Ok(keys.iter().filter_map(|key| instance_of(key)).collect())
+    }
+
+    /// The keys of the liveliness tokens that match.
+    async fn tokens(&self, key: &str) -> anyhow::Result<Vec<String>> {
         let replies = self
             .session
             .liveliness()
-            .get(&key)
+            .get(key)
             .timeout(PRESENCE_TIMEOUT)
             .await
             .map_err(|cause| anyhow!("asking who is at {key}: {cause}"))?;
-        let mut instances = Vec::new();
+        let mut keys = Vec::new();
         while let Ok(reply) = replies.recv_async().await {
-            if let Ok(sample) = reply.result() {
-                instances.extend(instance_of(sample));
-            }
+            keys.extend(reply.result().map(|sample| sample.key_expr().as_str().to_owned()));
         }
-        Ok(instances)
+        Ok(keys)
     }
 
     /// Tells everybody that the service is ready.
@@ -160,15 +182,17 @@ impl Node {
     /// When the session is closed.
     pub async fn announce(&self) -> anyhow::Result<()> {
         let key = topic::alive_key(self.identity.service, &self.identity.instance);
-        let token = self
-            .session
-            .liveliness()
-            .declare_token(&key)
-            .await
-            .map_err(|cause| anyhow!("declaring {key}: {cause}"))?;
+        let token = self.declare(&key).await?;
         *self.token.lock().unwrap_or_else(PoisonError::into_inner) = Some(token);
+        // From here on the announcement says the same.
+        drop(self.claim.lock().unwrap_or_else(PoisonError::into_inner).take());
         tracing::info!(service = self.identity.service, instance = %self.identity.instance, "Ready");
         Ok(())
+    }
+
+    async fn declare(&self, key: &str) -> anyhow::Result<LivelinessToken> {
+        let token = self.session.liveliness().declare_token(key).await;
+        token.map_err(|cause| anyhow!("declaring {key}: {cause}"))
     }
 
     /// Follows the comings and goings of a service's instances, beginning with those that are there.
@@ -182,7 +206,7 @@ impl Node {
             .liveliness()
             .declare_subscriber(&key)
             .history(true)
-            .with(zenoh::handlers::RingChannel::new(64))
+            .with(zenoh::handlers::RingChannel::new(PRESENCE_DEPTH))
             .await
             .map_err(|cause| anyhow!("watching {key}: {cause}"))?;
         Ok(Presence { subscriber })
@@ -219,15 +243,22 @@ impl Presence {
     pub async fn next(&self) -> Option<(String, bool)> {
         loop {
             let sample = self.subscriber.recv_async().await.ok()?;
-            if let Some(instance) = instance_of(&sample) {
+            if let Some(instance) = instance_of(sample.key_expr().as_str()) {
                 return Some((instance, sample.kind() == SampleKind::Put));
             }
         }
     }
 }
 
-fn instance_of(sample: &Sample) -> Option<String> {
-    sample.key_expr().as_str().rsplit('/').next().map(str::to_owned)
+fn instance_of(key: &str) -> Option<String> {
+    key.rsplit('/').next().map(str::to_owned)
+}
+
+/// Instance and session of a claim.
+fn claim_of(key: &str) -> Option<(String, String)> {
+    let mut chunks = key.rsplit('/');
+    let session = chunks.next()?;
+    Some((chunks.next()?.to_owned(), session.to_owned()))
 }
 
 fn zenoh_config(source: &ZenohSource) -> anyhow::Result<zenoh::Config> {

@@ -42,7 +42,7 @@ struct LastValue {
 pub struct Subscriber<M> {
     subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
     /// States that were there before the subscription.
-    early: Mutex<Vec<M>>,
+    early: Mutex<Vec<(String, M)>>,
     health: Arc<HealthCounters>,
     message: PhantomData<fn() -> M>,
 }
@@ -68,9 +68,9 @@ struct Qos {
 fn qos(delivery: Delivery) -> Qos {
     let (priority, congestion, depth) = match delivery {
         Delivery::Newest => (Priority::Data, CongestionControl::Drop, 4),
-        // Deep enough for several detectors at once.
-        Delivery::NewestFirst => (Priority::RealTime, CongestionControl::Drop, 16),
-        Delivery::LastValue => (Priority::InteractiveHigh, CongestionControl::Drop, 16),
+        // Deep enough for all detectors at once.
+        Delivery::NewestFirst => (Priority::RealTime, CongestionControl::Drop, 64),
+        Delivery::LastValue => (Priority::InteractiveHigh, CongestionControl::Drop, 64),
         Delivery::InOrder => (Priority::InteractiveLow, CongestionControl::Drop, 512),
         Delivery::Query => (Priority::InteractiveHigh, CongestionControl::Drop, 16),
     };
@@ -160,7 +160,12 @@ impl Node {
             if let Ok(sample) = reply.result()
                 && let Some(message) = subscriber.decode(sample)
             {
-                subscriber.early.lock().unwrap_or_else(PoisonError::into_inner).push(message);
+                let key = sample.key_expr().as_str().to_owned();
+                subscriber
+                    .early
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .push((key, message));
             }
         }
     }
@@ -288,6 +293,11 @@ impl<M: Message> Publisher<M> {
 impl<M: Message> Subscriber<M> {
     /// The next message that can be read; `None` once the session is closed. Others are counted and logged once.
     pub async fn next(&self) -> Option<M> {
+        self.next_with_key().await.map(|(_key, message)| message)
+    }
+
+    /// As [`Subscriber::next`], with the key on which it was published.
+    pub async fn next_with_key(&self) -> Option<(String, M)> {
         let early = self.early.lock().unwrap_or_else(PoisonError::into_inner).pop();
         if early.is_some() {
             return early;
@@ -295,7 +305,7 @@ impl<M: Message> Subscriber<M> {
         loop {
             let sample = self.subscriber.recv_async().await.ok()?;
             if let Some(message) = self.decode(&sample) {
-                return Some(message);
+                return Some((sample.key_expr().as_str().to_owned(), message));
             }
         }
     }

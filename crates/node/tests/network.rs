@@ -105,6 +105,41 @@ async fn a_second_one_of_the_same_name_is_told_so() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn of_two_that_start_in_the_same_instant_one_goes_on() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let host = open("simulator", "main", port).await?;
+    let start = async |instance: &str| {
+        let node = open("controller", instance, port).await?;
+        let alone = node.ensure_alone("*").await;
+        if alone.is_ok() {
+            node.announce().await?;
+        }
+        anyhow::Ok((node, alone))
+    };
+    for instances in [["main", "main"], ["a", "b"], ["b", "a"], ["main", "main"]] {
+        let [first, second] = instances;
+        let (first, second) = tokio::try_join!(start(first), start(second))?;
+        let refusals: Vec<String> = [&first, &second]
+            .iter()
+            .filter_map(|it| it.1.as_ref().err())
+            .map(|e| e.to_string())
+            .collect();
+        assert_eq!(refusals.len(), 1, "{instances:?}: {refusals:?}");
+        let mut left = Vec::new();
+        while left.is_empty() {
+            left = host.alive("controller", "*").await?;
+        }
+        assert_eq!(left.len(), 1, "{left:?}");
+        first.0.close().await;
+        second.0.close().await;
+        while !host.alive("controller", "*").await?.is_empty() {
+            tokio::task::yield_now().await;
+        }
+    }
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_state_is_told_to_those_who_come_late() -> anyhow::Result<()> {
     let port = free_port()?;
     let controller = open("controller", "main", port).await?;
