@@ -111,7 +111,7 @@ impl Selection {
         Self {
             limits,
             preference,
-            is_asked: true,
+            is_asked: false,
             active: None,
             known: Vec::new(),
             newest_used_ns: i64::MIN,
@@ -600,7 +600,8 @@ mod tests {
                 self.used.push((stamp, self.now_ns, name));
             }
             let active = self.selection.active().unwrap_or("none").to_owned();
-            if self.changes.last().is_none_or(|(_, last)| *last != active) {
+            let last = self.changes.last().map_or("none", |(_, last)| last.as_str());
+            if last != active {
                 self.changes.push((self.now_ns, active));
             }
         }
@@ -624,7 +625,7 @@ mod tests {
                 self.now_ns = self.now_ns.max(at);
                 match event {
                     Some((name, sight)) => {
-                        drop(self.selection.heard(self.now_ns, name, stamp_ns, sight))
+                        self.selection.heard(self.now_ns, name, stamp_ns, sight);
                     }
                     None => self.selection.tick(self.now_ns),
                 }
@@ -664,7 +665,7 @@ mod tests {
         );
         assert_eq!(bench.used.len(), 30);
         let spare = &bench.selection.candidates(bench.now_ns)[1];
-        assert_eq!((spare.compared, spare.agreed), (29, 29));
+        assert_eq!((spare.compared, spare.agreed), (30, 30));
         assert!((spare.rate_hz - 15.0).abs() < 0.5 && (spare.latency_ms - 35.0).abs() < 0.1);
     }
 
@@ -699,12 +700,13 @@ mod tests {
                     }
                     events.extend((0..200).map(|i| (i * 25 * MS, None)));
                     events.sort_by_key(|(at, _)| *at);
-                    let mut bench = Bench::new(preferring(Some("main"), None));
+                    let mut bench = Bench::new(preferring(None, None));
+                    bench.selection.heard(0, "main", -period, None);
                     for (at, event) in events {
                         bench.now_ns = at;
                         match event {
                             Some((name, stamp)) => {
-                                drop(bench.selection.heard(at, name, stamp, None))
+                                bench.selection.heard(at, name, stamp, None);
                             }
                             None => bench.selection.tick(at),
                         }
@@ -834,7 +836,7 @@ mod tests {
                 .frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(0.8))]);
         }
         assert_eq!(bench.selection.active(), Some("main"));
-        let spare = bench.selection.candidates(bench.now_ns).pop().unwrap();
+        let spare = bench.selection.candidates(bench.now_ns).swap_remove(0);
         assert_eq!((spare.compared, spare.agreed), (COMPARED as u32, 0));
         assert!((spare.disagreement_m.unwrap() - 0.8).abs() < 1e-9);
         let answer = bench.selection.prefer(bench.now_ns, "spare").unwrap();
