@@ -49,8 +49,13 @@ const OUTSIDE: [&str; 17] = [
 ];
 
 /// The documents whose paths and names must exist.
-const DOCUMENTS: [&str; 4] =
-    ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "zenoh-config/README.md"];
+const DOCUMENTS: [&str; 5] = [
+    "README.md",
+    "ARCHITECTURE.md",
+    "CONTRIBUTING.md",
+    "docs/wire-format.md",
+    "zenoh-config/README.md",
+];
 
 /// Keys that share the comment of the key above them.
 const SHARED_COMMENTS: [(&str, &str); 3] =

@@ -8,7 +8,7 @@ use messages::{ControllerCommand, DetectorCommand, topic};
 use node::{ConfigError, Identity, Layers, Network, Node, ZenohSource};
 
 use crate::services::{self, Service};
-use crate::{detect, experiment, land, marker, relay};
+use crate::{detect, detectors, experiment, land, marker, relay, swap};
 
 /// The role whose key a person at the command line holds.
 pub(crate) const OPERATOR: &str = "operator";
@@ -53,6 +53,10 @@ enum Command {
     Config(ConfigArgs),
     /// Tell a running controller what to do, or change a parameter of a running detector.
     Command(CommandArgs),
+    /// List the detectors, or say which one to use.
+    Detectors(detectors::DetectorsArgs),
+    /// Replace the detector in use by another, in flight; on any trouble the old one stays.
+    Swap(swap::SwapArgs),
 }
 
 /// What every service takes.
@@ -101,6 +105,21 @@ impl NetworkArgs {
     /// The session's configuration for a process that shows the certificate of `role`.
     pub(crate) fn source(&self, role: &str) -> anyhow::Result<ZenohSource> {
         self.network().source(role)
+    }
+
+    /// The same as variables of the environment, for programs that are started.
+    pub(crate) fn environment(&self) -> Vec<(&'static str, std::ffi::OsString)> {
+        let path = |path: &Option<PathBuf>| path.as_ref().map(|path| path.clone().into_os_string());
+        let text = |text: &Option<String>| text.as_ref().map(Into::into);
+        let all = [
+            ("ALIGHT_ZENOH", path(&self.zenoh)),
+            ("ALIGHT_CONNECT", text(&self.connect)),
+            ("ALIGHT_LISTEN", text(&self.listen)),
+            ("ALIGHT_MEET", self.meet.map(|port| port.to_string().into())),
+            ("ALIGHT_VEHICLE", text(&self.vehicle)),
+            ("ALIGHT_KEYS", path(&self.keys)),
+        ];
+        all.into_iter().filter_map(|(name, value)| Some((name, value?))).collect()
     }
 
     fn network(&self) -> Network {
@@ -214,6 +233,8 @@ pub(crate) fn run() -> ExitCode {
         Command::Experiment(args) => experiment::run(args),
         Command::Config(args) => print_config(args),
         Command::Command(args) => send_command(args),
+        Command::Detectors(args) => detectors::run(args),
+        Command::Swap(args) => swap::run(&args),
     };
     result.unwrap_or_else(|problem| {
         write_error(&format!("alight: {problem:#}"));

@@ -2,12 +2,14 @@
 //!
 //! Modules in reading order: [`cli`] is what can be asked, [`services`] runs one service in this process, [`relay`]
 //! stands between the drone and the ground; [`land`] runs all services as processes and watches the landing, with
-//! [`children`] for the processes, [`progress`] for what is shown meanwhile and [`outcome`] for the result; [`detect`],
-//! [`marker`] and [`experiment`] are tools.
+//! [`children`] for the processes, [`progress`] for what is shown meanwhile and [`outcome`] for the result;
+//! [`detectors`] lists the detectors that run and [`swap`] replaces one; [`detect`], [`marker`] and [`experiment`] are
+//! tools.
 
 mod children;
 mod cli;
 mod detect;
+mod detectors;
 mod experiment;
 mod land;
 mod marker;
@@ -15,6 +17,7 @@ mod outcome;
 mod progress;
 mod relay;
 mod services;
+mod swap;
 
 use std::process::ExitCode;
 

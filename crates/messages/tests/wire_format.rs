@@ -319,3 +319,94 @@ proptest! {
         prop_assert!(refused.iter().filter(|r| !**r).count() <= 1, "two types took the same bytes");
     }
 }
+
+/// The messages whose bytes `docs/wire-format.md` shows.
+fn documented() -> Vec<(&'static str, Vec<u8>)> {
+    let clock = "monotonic/1a2b3c4d".to_owned();
+    let header = FrameHeader {
+        stamp_ns: 1_000_000_000,
+        clock: clock.clone(),
+        exposure_ns: 2_000_000,
+        ..header()
+    };
+    let turned = |translation_m| Transform3 { translation_m, rotation_wxyz: [0.0, 1.0, 0.0, 0.0] };
+    let camera = CameraInfo {
+        camera: "down".into(),
+        width: 1296,
+        height: 972,
+        focal_px: Some([1818.0, 1818.0]),
+        principal_px: [647.5, 485.5],
+        lens: LensModel::Pinhole,
+        body_from_camera: turned([0.0; 3]),
+    };
+    // The diagonal of the upper triangle of 6 x 6.
+    let diagonal = [0, 6, 11, 15, 18, 20];
+    let marker = Detection {
+        family: "aruco-4x4-50".into(),
+        id: Some(7),
+        centre_px: [100.0, 200.0],
+        centre_covariance_px2: [0.25, 0.0, 0.25],
+        corners_px: Some([[90.0, 190.0], [110.0, 190.0], [110.0, 210.0], [90.0, 210.0]]),
+        size_px: 28.0,
+        wrong_bits: 0,
+        confidence: 1.0,
+        pose: Some(MarkerPose {
+            camera_from_marker: turned([0.5, 0.25, 4.0]),
+            reprojection_rms_px: 0.125,
+            covariance: std::array::from_fn(|i| if diagonal.contains(&i) { 1.0 } else { 0.0 }),
+            alternative: None,
+        }),
+    };
+    let detections = Detections {
+        detector: "python".into(),
+        header: header.clone(),
+        detections: vec![marker],
+        stages: vec![StageTime { stage: "opencv".into(), micros: 5000 }],
+    };
+    let info = DetectorInfo {
+        detector: "python".into(),
+        host: "pi".into(),
+        place: Place::Ground,
+        camera: "down".into(),
+        markers: vec!["aruco-4x4-50:7:0.15".into()],
+        version: "python".into(),
+        pid: 300,
+    };
+    let set = DetectorCommand::SetParameter { key: "markers".into(), value: "[]".into() };
+    let reply = CommandReply { accepted: true, reason: "it stops".into() };
+    let receipt = FrameReceipt {
+        camera: "down".into(),
+        sequence: 300,
+        stamp_ns: 1_000_000_000,
+        clock,
+        bytes: 20_000,
+    };
+    vec![
+        ("FrameHeader", encode(&header)),
+        ("CameraInfo", encode(&camera)),
+        ("Detections", encode(&detections)),
+        ("DetectorInfo", encode(&info)),
+        ("DetectorCommand SetParameter", encode(&set)),
+        ("DetectorCommand Stop", encode(&DetectorCommand::Stop)),
+        ("CommandReply", encode(&reply)),
+        ("FrameReceipt", encode(&receipt)),
+    ]
+}
+
+#[test]
+fn the_documented_bytes_are_those_of_the_program() {
+    let page = include_str!("../../../docs/wire-format.md");
+    let blocks = page.split("```bytes ").skip(1).filter_map(|rest| rest.split_once('\n'));
+    let is_hex = |word: &&str| word.len() == 2 && word.chars().all(|c| c.is_ascii_hexdigit());
+    let shown: Vec<(&str, Vec<u8>)> = blocks
+        .map(|(name, rest)| {
+            let lines = rest.split("```").next().unwrap_or_default().lines();
+            // The bytes take the first 48 columns, what they are follows.
+            let bytes = lines.flat_map(|line| {
+                line.get(..line.len().min(48)).unwrap_or_default().split(' ').take_while(is_hex)
+            });
+            (name, bytes.map(|word| u8::from_str_radix(word, 16).unwrap()).collect())
+        })
+        .collect();
+    assert_eq!(shown, documented());
+}

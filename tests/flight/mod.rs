@@ -1,0 +1,248 @@
+//! A landing under way, for the tests that fly one: its processes, what they say, and their end.
+
+#![allow(dead_code, reason = "each test uses its part")]
+
+use std::io::{BufRead, BufReader};
+use std::path::PathBuf;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::Duration;
+
+use anyhow::{Context, anyhow, bail, ensure};
+use messages::{ControllerStatus, Truth, topic};
+use node::{Identity, Node, Subscriber, ZenohSource, now_ns};
+use rustix::process::{Pid, Signal, kill_process};
+use tokio::sync::{Mutex, mpsc};
+use tokio::time::timeout;
+
+/// Longest wait for anything; a landing takes a fifth of it.
+pub const PATIENCE: Duration = Duration::from_secs(120);
+pub const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
+
+/// Two landings at once would share the processor.
+pub static ONE_AT_A_TIME: Mutex<()> = Mutex::const_new(());
+
+/// What a command that should end by itself says; one that goes on is ended.
+pub fn output_of(command: &mut Command) -> anyhow::Result<Output> {
+    let mut child =
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+    let began = std::time::Instant::now();
+    while child.try_wait()?.is_none() {
+        if began.elapsed() > PATIENCE / 4 {
+            child.kill()?;
+            bail!("{command:?} does not end: {:?}", child.wait_with_output()?);
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Ok(child.wait_with_output()?)
+}
+
+/// A landing under way.
+pub struct Landing {
+    pub land: Child,
+    pub said: mpsc::UnboundedReceiver<String>,
+    pub zenoh: PathBuf,
+    pub services: Vec<Service>,
+    pub statuses: Subscriber<ControllerStatus>,
+    pub truths: Subscriber<Truth>,
+    pub node: Node,
+    pub by_hand: Vec<Child>,
+}
+
+/// A service that `alight land` started.
+pub struct Service {
+    pub name: String,
+    pub pid: Pid,
+    pub by_hand: Vec<String>,
+}
+
+impl Landing {
+    pub async fn start(args: &[&str]) -> anyhow::Result<Self> {
+        let mut land = Command::new(ALIGHT)
+            .args(["land", "--format", "json", "--timeout-s", "110"])
+            // A ground station of the machine's own must not join the flight.
+            .args(["--set", "gcs-bridge.ground=udpout:127.0.0.1:9"])
+            .args(args)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()?;
+        let mut lines = BufReader::new(land.stderr.take().context("standard error")?).lines();
+        let mut services = Vec::new();
+        let mut zenoh = None;
+        while services.len() < 4 {
+            let line = lines.next().context("alight land said nothing")??;
+            if let Some(rest) = line.split("--zenoh ").nth(1).filter(|_| zenoh.is_none()) {
+                zenoh = rest.split_whitespace().next().map(PathBuf::from);
+            }
+            services.extend(service_in(&line));
+        }
+        let (sender, said) = mpsc::unbounded_channel();
+        std::thread::Builder::new().name("said".into()).spawn(move || {
+            for line in lines.map_while(Result::ok) {
+                if sender.send(line).is_err() {
+                    return;
+                }
+            }
+        })?;
+        let zenoh = zenoh.context("the Zenoh configuration")?;
+        let identity = Identity { service: "alight", instance: "test".into() };
+        let node = Node::open(identity, &ZenohSource::File(zenoh.clone())).await?;
+        let statuses = node.subscriber(topic::STATUS, &[]).await?;
+        let truths = node.subscriber(topic::TRUTH, &[]).await?;
+        let by_hand = Vec::new();
+        Ok(Self { land, said, zenoh, services, statuses, truths, node, by_hand })
+    }
+
+    pub fn service(&self, name: &str) -> anyhow::Result<&Service> {
+        self.services.iter().find(|s| s.name == name).with_context(|| format!("no {name}"))
+    }
+
+    /// `kill -9`; the answer is when.
+    pub fn kill(&self, name: &str) -> anyhow::Result<i64> {
+        kill_process(self.service(name)?.pid, Signal::KILL)?;
+        Ok(now_ns())
+    }
+
+    /// Starts a service again as a person would, with more settings.
+    pub fn start_by_hand(&mut self, name: &str, settings: &[&str]) -> anyhow::Result<Pid> {
+        let mut command = Command::new(ALIGHT);
+        command.args(&self.service(name)?.by_hand);
+        for setting in settings {
+            command.args(["--set", setting]);
+        }
+        let child = command.stdin(Stdio::null()).stderr(Stdio::null()).spawn()?;
+        let pid = Pid::from_raw(i32::try_from(child.id())?).context("a process id")?;
+        self.by_hand.push(child);
+        Ok(pid)
+    }
+
+    pub async fn status(
+        &self,
+        what: &str,
+        mut holds: impl FnMut(&ControllerStatus) -> bool,
+    ) -> anyhow::Result<ControllerStatus> {
+        let mut last = None;
+        let found = timeout(PATIENCE, async {
+            while let Some(status) = self.statuses.next().await {
+                if holds(&status) {
+                    return Some(status);
+                }
+                last = Some(status);
+            }
+            None
+        });
+        found.await.ok().flatten().ok_or_else(|| anyhow!("waiting until {what}; last: {last:?}"))
+    }
+
+    /// Waits until the vehicle descends below a height.
+    pub async fn descends_below(&self, height_m: f64) -> anyhow::Result<ControllerStatus> {
+        self.status(&format!("it descends below {height_m} m"), |s| {
+            s.phase == "descend" && s.height_m.is_some_and(|h| h < height_m)
+        })
+        .await
+    }
+
+    pub async fn truth(
+        &self,
+        what: &str,
+        mut holds: impl FnMut(&Truth) -> bool,
+    ) -> anyhow::Result<Truth> {
+        let found = timeout(PATIENCE, async {
+            while let Some(truth) = self.truths.next().await {
+                if holds(&truth) {
+                    return Some(truth);
+                }
+            }
+            None
+        });
+        found.await.ok().flatten().with_context(|| format!("waiting until {what}"))
+    }
+
+    /// The vehicle's motion over a time, newest last.
+    pub async fn motion(&self, duration: Duration) -> Vec<Truth> {
+        let mut motion = Vec::new();
+        let _ = timeout(duration, async {
+            while let Some(truth) = self.truths.next().await {
+                motion.push(truth);
+            }
+        })
+        .await;
+        motion
+    }
+
+    /// Waits for the result, and checks that it landed on the pad.
+    pub async fn lands(mut self) -> anyhow::Result<serde_json::Value> {
+        let mut stdout = self.land.stdout.take().context("standard output")?;
+        let read = tokio::task::spawn_blocking(move || {
+            let mut text = String::new();
+            std::io::Read::read_to_string(&mut stdout, &mut text).map(|_| text)
+        });
+        let text = timeout(PATIENCE, read).await.context("waiting for the result")???;
+        let result: serde_json::Value =
+            serde_json::from_str(text.lines().last().context("no result")?)?;
+        ensure!(result["landed"] == true, "{result}");
+        ensure!(self.land.wait()?.success(), "exit status");
+        let error_m = result["touchdown_error_m"].as_f64().context("touchdown_error_m")?;
+        ensure!(error_m < 0.3, "landed {error_m} m from the pad");
+        Ok(result)
+    }
+}
+
+impl Drop for Landing {
+    fn drop(&mut self) {
+        let _ = self.land.kill();
+        let _ = self.land.wait();
+        for child in &mut self.by_hand {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+        // What was said helps when a test fails, and is not shown otherwise.
+        while let Ok(line) = self.said.try_recv() {
+            println!("{line}");
+        }
+    }
+}
+
+/// The service in a line such as `detector is process 12; by hand: alight detector --zenoh FILE --set 'a=b'`.
+pub fn service_in(line: &str) -> Option<Service> {
+    let (start, by_hand) = line.split_once("; by hand: alight ")?;
+    let (name, pid) = start.split_once(" is process ")?;
+    let by_hand = by_hand.split(' ').map(|word| word.trim_matches('\'').to_owned()).collect();
+    Some(Service { name: name.into(), pid: Pid::from_raw(pid.parse().ok()?)?, by_hand })
+}
+
+pub fn descent_m_s(truth: &Truth) -> f64 {
+    truth.velocity_ned_m_s[2]
+}
+
+pub fn speed_m_s(truth: &Truth) -> f64 {
+    truth.velocity_ned_m_s.iter().map(|v| v * v).sum::<f64>().sqrt()
+}
+
+pub fn seconds(ns: i64) -> f64 {
+    ns as f64 * 1e-9
+}
+
+/// Runs a Python script that status 77 lets skip; the interpreter is $ALIGHT_PYTHON, or python3.
+pub fn python(script: &str, args: &[&str]) -> anyhow::Result<Option<Child>> {
+    let interpreter = std::env::var("ALIGHT_PYTHON").unwrap_or_else(|_| "python3".into());
+    let script = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests").join(script);
+    let child = Command::new(&interpreter).arg(&script).args(args).stdout(Stdio::piped()).spawn();
+    match child {
+        Ok(child) => Ok(Some(child)),
+        Err(problem) => {
+            println!("skipped: {interpreter} does not start: {problem}");
+            Ok(None)
+        }
+    }
+}
+
+pub fn python_says_yes(child: Child) -> anyhow::Result<()> {
+    let output = child.wait_with_output()?;
+    let said = String::from_utf8_lossy(&output.stdout);
+    println!("{said}");
+    match output.status.code() {
+        Some(0 | 77) => Ok(()),
+        _ => bail!("the script ended with {}: {said}", output.status),
+    }
+}
