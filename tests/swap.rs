@@ -11,7 +11,7 @@
 mod flight;
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
@@ -207,6 +207,8 @@ async fn a_detector_in_python_lands_it() -> anyhow::Result<()> {
     }
     let landing = Landing::start(&["--seed", "23", "--marker", marker]).await?;
     let file = landing.zenoh.to_str().context("a path")?.to_owned();
+    // A landing whose detector ends before it began would be broken off.
+    landing.descends_below(9.5).await?;
     let python = python(script, &["--id", "python", "--marker", marker, "--zenoh", &file])?;
     let mut python = python.context("it started a moment ago")?;
     let flown = async {

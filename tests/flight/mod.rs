@@ -15,14 +15,14 @@ use tokio::sync::{Mutex, mpsc};
 use tokio::time::timeout;
 
 /// Longest wait for anything; a landing takes a fifth of it.
-pub const PATIENCE: Duration = Duration::from_secs(120);
-pub const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
+pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
+pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
 
 /// Two landings at once would share the processor.
-pub static ONE_AT_A_TIME: Mutex<()> = Mutex::const_new(());
+pub(crate) static ONE_AT_A_TIME: Mutex<()> = Mutex::const_new(());
 
 /// What a command that should end by itself says; one that goes on is ended.
-pub fn output_of(command: &mut Command) -> anyhow::Result<Output> {
+pub(crate) fn output_of(command: &mut Command) -> anyhow::Result<Output> {
     let mut child =
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
     let began = std::time::Instant::now();
@@ -37,28 +37,31 @@ pub fn output_of(command: &mut Command) -> anyhow::Result<Output> {
 }
 
 /// A landing under way.
-pub struct Landing {
-    pub land: Child,
-    pub said: mpsc::UnboundedReceiver<String>,
-    pub zenoh: PathBuf,
-    pub services: Vec<Service>,
-    pub statuses: Subscriber<ControllerStatus>,
-    pub truths: Subscriber<Truth>,
-    pub node: Node,
-    pub by_hand: Vec<Child>,
+pub(crate) struct Landing {
+    pub(crate) land: Child,
+    pub(crate) said: mpsc::UnboundedReceiver<String>,
+    pub(crate) zenoh: PathBuf,
+    pub(crate) services: Vec<Service>,
+    pub(crate) statuses: Subscriber<ControllerStatus>,
+    pub(crate) truths: Subscriber<Truth>,
+    pub(crate) node: Node,
+    pub(crate) by_hand: Vec<Child>,
 }
 
 /// A service that `alight land` started.
-pub struct Service {
-    pub name: String,
-    pub pid: Pid,
-    pub by_hand: Vec<String>,
+pub(crate) struct Service {
+    pub(crate) name: String,
+    pub(crate) pid: Pid,
+    pub(crate) by_hand: Vec<String>,
 }
 
 impl Landing {
-    pub async fn start(args: &[&str]) -> anyhow::Result<Self> {
+    pub(crate) async fn start(args: &[&str]) -> anyhow::Result<Self> {
+        let patience: &[&str] =
+            if args.contains(&"--timeout-s") { &[] } else { &["--timeout-s", "110"] };
         let mut land = Command::new(ALIGHT)
-            .args(["land", "--format", "json", "--timeout-s", "110"])
+            .args(["land", "--format", "json"])
+            .args(patience)
             // A ground station of the machine's own must not join the flight.
             .args(["--set", "gcs-bridge.ground=udpout:127.0.0.1:9"])
             .args(args)
@@ -93,18 +96,18 @@ impl Landing {
         Ok(Self { land, said, zenoh, services, statuses, truths, node, by_hand })
     }
 
-    pub fn service(&self, name: &str) -> anyhow::Result<&Service> {
+    pub(crate) fn service(&self, name: &str) -> anyhow::Result<&Service> {
         self.services.iter().find(|s| s.name == name).with_context(|| format!("no {name}"))
     }
 
     /// `kill -9`; the answer is when.
-    pub fn kill(&self, name: &str) -> anyhow::Result<i64> {
+    pub(crate) fn kill(&self, name: &str) -> anyhow::Result<i64> {
         kill_process(self.service(name)?.pid, Signal::KILL)?;
         Ok(now_ns())
     }
 
     /// Starts a service again as a person would, with more settings.
-    pub fn start_by_hand(&mut self, name: &str, settings: &[&str]) -> anyhow::Result<Pid> {
+    pub(crate) fn start_by_hand(&mut self, name: &str, settings: &[&str]) -> anyhow::Result<Pid> {
         let mut command = Command::new(ALIGHT);
         command.args(&self.service(name)?.by_hand);
         for setting in settings {
@@ -116,7 +119,7 @@ impl Landing {
         Ok(pid)
     }
 
-    pub async fn status(
+    pub(crate) async fn status(
         &self,
         what: &str,
         mut holds: impl FnMut(&ControllerStatus) -> bool,
@@ -135,14 +138,14 @@ impl Landing {
     }
 
     /// Waits until the vehicle descends below a height.
-    pub async fn descends_below(&self, height_m: f64) -> anyhow::Result<ControllerStatus> {
+    pub(crate) async fn descends_below(&self, height_m: f64) -> anyhow::Result<ControllerStatus> {
         self.status(&format!("it descends below {height_m} m"), |s| {
             s.phase == "descend" && s.height_m.is_some_and(|h| h < height_m)
         })
         .await
     }
 
-    pub async fn truth(
+    pub(crate) async fn truth(
         &self,
         what: &str,
         mut holds: impl FnMut(&Truth) -> bool,
@@ -159,7 +162,7 @@ impl Landing {
     }
 
     /// The vehicle's motion over a time, newest last.
-    pub async fn motion(&self, duration: Duration) -> Vec<Truth> {
+    pub(crate) async fn motion(&self, duration: Duration) -> Vec<Truth> {
         let mut motion = Vec::new();
         let _ = timeout(duration, async {
             while let Some(truth) = self.truths.next().await {
@@ -171,7 +174,7 @@ impl Landing {
     }
 
     /// Waits for the result, and checks that it landed on the pad.
-    pub async fn lands(mut self) -> anyhow::Result<serde_json::Value> {
+    pub(crate) async fn lands(mut self) -> anyhow::Result<serde_json::Value> {
         let mut stdout = self.land.stdout.take().context("standard output")?;
         let read = tokio::task::spawn_blocking(move || {
             let mut text = String::new();
@@ -204,27 +207,27 @@ impl Drop for Landing {
 }
 
 /// The service in a line such as `detector is process 12; by hand: alight detector --zenoh FILE --set 'a=b'`.
-pub fn service_in(line: &str) -> Option<Service> {
+pub(crate) fn service_in(line: &str) -> Option<Service> {
     let (start, by_hand) = line.split_once("; by hand: alight ")?;
     let (name, pid) = start.split_once(" is process ")?;
     let by_hand = by_hand.split(' ').map(|word| word.trim_matches('\'').to_owned()).collect();
     Some(Service { name: name.into(), pid: Pid::from_raw(pid.parse().ok()?)?, by_hand })
 }
 
-pub fn descent_m_s(truth: &Truth) -> f64 {
+pub(crate) fn descent_m_s(truth: &Truth) -> f64 {
     truth.velocity_ned_m_s[2]
 }
 
-pub fn speed_m_s(truth: &Truth) -> f64 {
+pub(crate) fn speed_m_s(truth: &Truth) -> f64 {
     truth.velocity_ned_m_s.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-pub fn seconds(ns: i64) -> f64 {
+pub(crate) fn seconds(ns: i64) -> f64 {
     ns as f64 * 1e-9
 }
 
 /// Runs a Python script that status 77 lets skip; the interpreter is $ALIGHT_PYTHON, or python3.
-pub fn python(script: &str, args: &[&str]) -> anyhow::Result<Option<Child>> {
+pub(crate) fn python(script: &str, args: &[&str]) -> anyhow::Result<Option<Child>> {
     let interpreter = std::env::var("ALIGHT_PYTHON").unwrap_or_else(|_| "python3".into());
     let script = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests").join(script);
     let child = Command::new(&interpreter).arg(&script).args(args).stdout(Stdio::piped()).spawn();
@@ -237,7 +240,7 @@ pub fn python(script: &str, args: &[&str]) -> anyhow::Result<Option<Child>> {
     }
 }
 
-pub fn python_says_yes(child: Child) -> anyhow::Result<()> {
+pub(crate) fn python_says_yes(child: Child) -> anyhow::Result<()> {
     let output = child.wait_with_output()?;
     let said = String::from_utf8_lossy(&output.stdout);
     println!("{said}");
