@@ -615,10 +615,9 @@ mod tests {
         }
 
         fn frame_seen(&mut self, stamp_ns: i64, answers: &[(&str, i64, Option<Sight>)]) {
-            let mut events: Vec<(i64, Option<(&str, Option<Sight>)>)> = answers
-                .iter()
-                .map(|(name, late, sight)| (stamp_ns + late, Some((*name, *sight))))
-                .collect();
+            let answered =
+                |(name, late, sight): &(_, i64, _)| (stamp_ns + late, Some((*name, *sight)));
+            let mut events: Vec<_> = answers.iter().map(answered).collect();
             events.extend((0..3).map(|i| (stamp_ns + i * 25 * MS, None)));
             events.sort_by_key(|(at, _)| *at);
             for (at, event) in events {
