@@ -122,7 +122,7 @@ async fn of_two_that_start_in_the_same_instant_one_goes_on() -> anyhow::Result<(
         let refusals: Vec<String> = [&first, &second]
             .iter()
             .filter_map(|it| it.1.as_ref().err())
-            .map(|e| e.to_string())
+            .map(ToString::to_string)
             .collect();
         assert_eq!(refusals.len(), 1, "{instances:?}: {refusals:?}");
         let mut left = Vec::new();
