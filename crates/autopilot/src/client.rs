@@ -7,18 +7,20 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use geometry::{Ned, Vector};
+use geometry::{Body, Ned, Point, Vector};
 
+use crate::clock::Clock;
 use crate::command::{
     Command, CommandError, CommandId, CommandStatus, Patience, Request, SetpointError, Step, ns,
 };
 use crate::compose;
 use crate::dialect::{
     COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
-    MavType,
+    MavType, TIMESYNC_DATA,
 };
 use crate::frame::{self, Frame, Sender};
 use crate::mode::{Firmware, FlightMode};
+use crate::parameter::{Parameter, Parameters};
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::{Notice, Stream, Streams};
 use crate::text::Joiner;
@@ -32,6 +34,15 @@ const MAX_OUTCOMES: usize = 32;
 const HEARTBEAT_NS: i64 = 1_000_000_000;
 /// The autopilot's clock going back by so much means that it restarted.
 const RESTART_MS: u32 = 1_000;
+/// PX4 enters OFFBOARD only after it has heard setpoints for a second, at 2 Hz or more
+/// (<https://docs.px4.io/main/en/flight_modes/offboard.html>): for so long, and so often, it is told to stand still before.
+const PROOF_NS: i64 = 1_300_000_000;
+const PROOF_PERIOD_NS: i64 = 50_000_000;
+/// Messages that PX4 has in the place of ArduPilot's (ESTIMATOR_STATUS for EKF_STATUS_REPORT), or beside them
+/// (GLOBAL_POSITION_INT, as its takeoff wants an altitude over the sea).
+const EKF_STATUS_REPORT: u32 = 193;
+const ESTIMATOR_STATUS: u32 = 230;
+const GLOBAL_POSITION_INT: u32 = 33;
 
 /// How to talk to the autopilot.
 #[derive(Clone, Debug, PartialEq)]
@@ -46,8 +57,12 @@ pub struct Config {
     pub heartbeat: bool,
     /// The silence after which the autopilot counts as lost.
     pub heartbeat_timeout: Duration,
-    /// The messages to ask for.
+    /// The messages to ask for; those that only ArduPilot has are asked of PX4 by their other names.
     pub streams: Vec<Stream>,
+    /// The parameters to read.
+    pub parameters: Vec<&'static str>,
+    /// Whether to ask for the autopilot's clock, so that what it measured carries the time of its measurement.
+    pub timesync: bool,
     /// How long commands are tried.
     pub patience: Patience,
 }
@@ -61,6 +76,8 @@ impl Default for Config {
             heartbeat: true,
             heartbeat_timeout: Duration::from_secs(3),
             streams: default_streams(50.0),
+            parameters: Vec::new(),
+            timesync: true,
             patience: Patience::default(),
         }
     }
@@ -180,6 +197,9 @@ pub enum Event {
 pub struct Autopilot {
     config: Config,
     vehicle: Option<Vehicle>,
+    clock: Clock,
+    parameters: Parameters,
+    proof_due_ns: i64,
     streams: Streams,
     requests: Vec<Request>,
     outcomes: VecDeque<(CommandId, CommandStatus)>,
@@ -201,6 +221,8 @@ struct Vehicle {
     readiness: Readiness,
     heartbeat_ns: i64,
     boot_ms: u32,
+    /// Altitude over the sea, in m.
+    amsl_m: Option<f64>,
     joiner: Joiner,
 }
 
@@ -209,6 +231,9 @@ impl Autopilot {
     pub fn new(config: Config) -> Self {
         Self {
             streams: Streams::new(&config.streams),
+            clock: Clock::default(),
+            parameters: Parameters::new(&config.parameters),
+            proof_due_ns: i64::MIN,
             config,
             vehicle: None,
             requests: Vec::new(),
@@ -240,7 +265,7 @@ impl Autopilot {
         if self.vehicle.as_ref().is_none_or(|vehicle| vehicle.system != frame.sender.system) {
             return;
         }
-        self.streams.received(frame.message_id);
+        self.streams.received(now_ns, frame.message_id);
         match message {
             MavMessage::COMMAND_ACK(ack) => self.take_acknowledgement(now_ns, ack),
             MavMessage::STATUSTEXT(text) => {
@@ -248,6 +273,10 @@ impl Autopilot {
                 for (severity, text) in texts.unwrap_or_default() {
                     self.take_text(severity, text);
                 }
+            }
+            MavMessage::TIMESYNC(sync) => self.take_time(now_ns, frame.sender, sync),
+            MavMessage::PARAM_VALUE(value) => {
+                self.parameters.take(self.firmware().unwrap_or(Firmware::Unknown), value);
             }
             _ => self.take_state(now_ns, message),
         }
@@ -276,6 +305,8 @@ impl Autopilot {
             if let Some(request) = request {
                 self.send_to_vehicle(request);
             }
+            self.ask(now_ns);
+            self.prove_life(now_ns);
         }
         self.step_requests(now_ns);
     }
@@ -310,6 +341,17 @@ impl Autopilot {
         self.vehicle.as_ref().is_some_and(|vehicle| vehicle.state.connected)
     }
 
+    /// What is known of a parameter that [`Config::parameters`] names.
+    pub fn parameter(&self, name: &str) -> Parameter {
+        self.parameters.get(name)
+    }
+
+    /// How long a packet to the autopilot and back takes at best; `None` while its clock is not known, so that what it
+    /// measured carries the time of its reception.
+    pub fn round_trip(&self, now_ns: i64) -> Option<Duration> {
+        self.clock.round_trip_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
+    }
+
     /// Why the vehicle cannot be armed and flown yet, for people; empty when it can.
     pub fn not_ready_because(&self) -> Vec<String> {
         match &self.vehicle {
@@ -334,9 +376,11 @@ impl Autopilot {
             let error = CommandError::Replaced { command: old.command, by: command };
             self.finish(old.id, old.command, Err(error));
         }
+        let proven = command != Command::SetMode(FlightMode::OFFBOARD);
+        let from_ns = if proven { now_ns } else { now_ns.saturating_add(PROOF_NS) };
         match self.refusal(command) {
             Some(error) => self.finish(id, command, Err(error)),
-            None => self.requests.push(Request::new(id, command, now_ns)),
+            None => self.requests.push(Request::new(id, command, from_ns)),
         }
         id
     }
@@ -373,10 +417,10 @@ impl Autopilot {
         if !state.connected {
             return Err(SetpointError::NoAutopilot);
         }
-        if vehicle.firmware != Firmware::Copter {
+        if vehicle.firmware.guided().is_none() {
             return Err(SetpointError::Unsupported(vehicle.firmware));
         }
-        if state.mode != FlightMode::Guided {
+        if !state.mode.is_guided() {
             return Err(SetpointError::NotGuided(state.mode));
         }
         // "Landing" lasts a moment after LAND was left. During the takeoff a setpoint would end it.
@@ -387,6 +431,26 @@ impl Autopilot {
         let target = (vehicle.system, AUTOPILOT);
         self.send(&compose::velocity(time_ms, velocity, yaw_rate, target));
         Ok(())
+    }
+
+    /// Tells the autopilot where the landing point is, for its own precision landing, in the frame that this firmware
+    /// takes: ArduPilot `in_body`, relative to the vehicle and by its present attitude; PX4 `in_local`. False when it
+    /// cannot be told: no autopilot of a kind that lands so, a number is not finite, or the point is not below.
+    ///
+    /// `stamp_ns` is when this was so, by our clock.
+    pub fn send_landing_target(
+        &mut self,
+        stamp_ns: i64,
+        in_body: Point<Body>,
+        in_local: Point<Ned>,
+    ) -> bool {
+        let time_usec = u64::try_from(stamp_ns / 1_000).unwrap_or(0);
+        let message = match self.firmware().filter(|_| self.is_connected()) {
+            Some(Firmware::Copter) => compose::landing_target_position(time_usec, in_body),
+            Some(Firmware::Px4) => compose::landing_target_local(time_usec, in_local),
+            _ => None,
+        };
+        message.inspect(|message| self.send(message)).is_some()
     }
 
     /// Sends any message in our name (LANDING_TARGET, STATUSTEXT, ...).
@@ -403,6 +467,47 @@ impl Autopilot {
     pub fn our_address(&self) -> Sender {
         let system = self.config.our_system.or(self.config.system_id).or(self.system());
         Sender { system: system.unwrap_or(1), component: self.config.our_component }
+    }
+
+    /// The altitude over the sea that PX4 takes off from, in m.
+    fn ground_amsl_m(&self) -> Option<f64> {
+        let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.firmware == Firmware::Px4)?;
+        vehicle.amsl_m
+    }
+
+    /// Asks for the time and for parameters, when it is time to.
+    fn ask(&mut self, now_ns: i64) {
+        let Some(system) = self.system() else { return };
+        if self.config.timesync
+            && let Some(ts1) = self.clock.ask(now_ns)
+        {
+            self.send(&timesync(0, ts1, Sender { system, component: AUTOPILOT }));
+        }
+        if let Some(question) = self.parameters.ask(now_ns, system, AUTOPILOT) {
+            self.send(&question);
+        }
+    }
+
+    /// While OFFBOARD is asked for, PX4 hears setpoints that stand still.
+    fn prove_life(&mut self, now_ns: i64) {
+        let offboard = Command::SetMode(FlightMode::OFFBOARD);
+        let asks = self.requests.iter().any(|request| request.command == offboard);
+        if !asks || now_ns < self.proof_due_ns {
+            return;
+        }
+        self.proof_due_ns = now_ns.saturating_add(PROOF_PERIOD_NS);
+        let Some(system) = self.system() else { return };
+        let time_ms = (now_ns / 1_000_000) as u32;
+        self.send(&compose::velocity(time_ms, Vector::zero(), 0.0, (system, AUTOPILOT)));
+    }
+
+    fn take_time(&mut self, now_ns: i64, from: Sender, message: &TIMESYNC_DATA) {
+        if message.tc1 == 0 {
+            // It asks for our clock, to understand our stamps.
+            self.send(&timesync(now_ns, message.ts1, from));
+        } else if self.config.timesync {
+            self.clock.answered(now_ns, message.tc1, message.ts1);
+        }
     }
 
     fn send_to_vehicle(&mut self, mut message: MavMessage) {
@@ -461,9 +566,10 @@ impl Autopilot {
             readiness: Readiness::default(),
             heartbeat_ns: now_ns,
             boot_ms: 0,
+            amsl_m: None,
             joiner: Joiner::default(),
         });
-        self.streams.restart();
+        self.streams = Streams::new(&streams_of(firmware, &self.config.streams));
         self.push(Event::Found { system, firmware });
         self.push(Event::ModeChanged { from: None, to: mode });
     }
@@ -579,16 +685,26 @@ impl Autopilot {
                 vehicle.readiness.take_ekf(message.flags);
                 self.check_readiness();
             }
+            MavMessage::ESTIMATOR_STATUS(message) => {
+                vehicle.readiness.take_estimator(message.flags);
+                self.check_readiness();
+            }
+            MavMessage::GLOBAL_POSITION_INT(message) => {
+                vehicle.amsl_m = Some(f64::from(message.alt) * 1e-3);
+            }
             _ => {}
         }
     }
 
     fn take_attitude(&mut self, now_ns: i64, attitude: Option<Attitude>) {
-        let Some(attitude) = attitude else {
+        let Some(mut attitude) = attitude else {
             self.refused_numbers += 1;
             return;
         };
         self.take_boot_time(attitude.boot_ms);
+        if let Some(stamp_ns) = self.clock.stamp_ns(now_ns, attitude.boot_ms) {
+            attitude.stamp_ns = stamp_ns;
+        }
         if let Some(vehicle) = &mut self.vehicle {
             vehicle.state.attitude = Some(attitude);
             vehicle.state.stamp_ns = now_ns;
@@ -599,11 +715,14 @@ impl Autopilot {
     }
 
     fn take_position(&mut self, now_ns: i64, position: Option<Position>) {
-        let Some(position) = position else {
+        let Some(mut position) = position else {
             self.refused_numbers += 1;
             return;
         };
         self.take_boot_time(position.boot_ms);
+        if let Some(stamp_ns) = self.clock.stamp_ns(now_ns, position.boot_ms) {
+            position.stamp_ns = stamp_ns;
+        }
         if let Some(vehicle) = &mut self.vehicle {
             vehicle.readiness.take_position();
             vehicle.state.position = Some(position);
@@ -627,6 +746,9 @@ impl Autopilot {
             vehicle.state.range = None;
             vehicle.state.ready = false;
             vehicle.state.landed = LandedState::Unknown;
+            vehicle.amsl_m = None;
+            self.clock.restart();
+            self.parameters.restart();
             self.streams.restart();
             self.push(Event::Restarted);
             self.fail_requests(|command| CommandError::Restarted { command });
@@ -646,8 +768,13 @@ impl Autopilot {
     fn refusal(&self, command: Command) -> Option<CommandError> {
         let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.state.connected);
         let Some(vehicle) = vehicle else { return Some(CommandError::NoAutopilot { command }) };
-        if vehicle.firmware != Firmware::Copter {
+        if vehicle.firmware.guided().is_none() {
             return Some(CommandError::Unsupported { command, firmware: vehicle.firmware });
+        }
+        let is_blind = vehicle.firmware == Firmware::Px4 && vehicle.amsl_m.is_none();
+        if matches!(command, Command::Takeoff { .. }) && is_blind {
+            let problem = "PX4 has not told its altitude over the sea (GLOBAL_POSITION_INT)";
+            return Some(CommandError::Invalid { command, problem });
         }
         let problem = command.problem(Some(&vehicle.state))?;
         Some(CommandError::Invalid { command, problem })
@@ -660,8 +787,9 @@ impl Autopilot {
         while let Some(request) = self.requests.get_mut(index) {
             match request.step(now_ns, &state, &patience) {
                 Step::Wait => index += 1,
-                Step::Send(message) => {
+                Step::Send(command, attempt) => {
                     index += 1;
+                    let message = command.message(attempt, self.ground_amsl_m());
                     self.send_to_vehicle(MavMessage::COMMAND_LONG(message));
                 }
                 Step::Finish(result) => {
@@ -689,6 +817,28 @@ impl Autopilot {
         self.outcomes.push_back((id, status));
         self.push(Event::Command { id, command, result });
     }
+}
+
+/// A question for the time (`tc1` nought), or the answer to one.
+fn timesync(tc1: i64, ts1: i64, to: Sender) -> MavMessage {
+    MavMessage::TIMESYNC(TIMESYNC_DATA {
+        tc1,
+        ts1,
+        target_system: to.system,
+        target_component: to.component,
+    })
+}
+
+/// The streams by the names that this firmware has for them.
+fn streams_of(firmware: Firmware, streams: &[Stream]) -> Vec<Stream> {
+    let mut streams = streams.to_vec();
+    if firmware == Firmware::Px4 {
+        for stream in streams.iter_mut().filter(|s| s.message_id == EKF_STATUS_REPORT) {
+            stream.message_id = ESTIMATOR_STATUS;
+        }
+        streams.push(Stream { message_id: GLOBAL_POSITION_INT, rate_hz: 2.0, required: true });
+    }
+    streams
 }
 
 impl From<Notice> for Event {

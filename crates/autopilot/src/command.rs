@@ -52,7 +52,7 @@ pub enum CommandError {
         command: Command,
     },
     /// This firmware is not flown.
-    #[error("{command}: the vehicle runs {firmware}; only ArduPilot Copter is supported for now")]
+    #[error("{command}: the vehicle runs {firmware}; only copters with ArduPilot or PX4 are flown")]
     Unsupported {
         /// What was asked.
         command: Command,
@@ -130,13 +130,17 @@ pub enum SetpointError {
     #[error("velocity not sent: no heartbeat of an autopilot")]
     NoAutopilot,
     /// This firmware is not flown.
-    #[error("velocity not sent: the vehicle runs {0}; only ArduPilot Copter is supported for now")]
+    #[error(
+        "velocity not sent: the vehicle runs {0}; only copters with ArduPilot or PX4 are flown"
+    )]
     Unsupported(Firmware),
     /// A number is infinite or not a number, which ArduPilot takes for a stop.
     #[error("velocity not sent: {0:?} m/s with {1} rad/s of yaw is not finite")]
     NotFinite([f64; 3], f64),
     /// Somebody else flies.
-    #[error("velocity not sent: the vehicle is in {0}, not in GUIDED; the pilot is in command")]
+    #[error(
+        "velocity not sent: the vehicle is in {0}, which follows no setpoints; the pilot is in command"
+    )]
     NotGuided(FlightMode),
     /// A setpoint now would end the takeoff or do nothing.
     #[error("velocity not sent: the vehicle is not armed and in the air ({0})")]
@@ -177,44 +181,64 @@ fn advice(command: &Command) -> &'static str {
         Command::SetMode(_) => "the mode may need a position first, or be disabled",
         Command::Arm => "remove the cause and arm again",
         Command::Disarm => "it must stand on the ground",
-        Command::Takeoff { .. } => "it must be armed, in GUIDED and on the ground",
+        Command::Takeoff { .. } => {
+            "it must be armed, on the ground, and in GUIDED if it is ArduPilot"
+        }
     }
 }
 
 impl Command {
-    /// The message that asks for it.
-    pub(crate) fn message(&self, attempt: u32) -> COMMAND_LONG_DATA {
+    /// The message that asks for it. `ground_amsl_m` is the altitude over the sea, in m, of where the vehicle stands:
+    /// PX4 takes off to an altitude.
+    pub(crate) fn message(&self, attempt: u32, ground_amsl_m: Option<f64>) -> COMMAND_LONG_DATA {
         let mut message = COMMAND_LONG_DATA {
+            command: self.number(),
             confirmation: attempt.saturating_sub(1).min(255) as u8,
             ..Default::default()
         };
         match *self {
             Self::SetMode(mode) => {
-                message.command = MavCmd::MAV_CMD_DO_SET_MODE;
-                // MAV_MODE_FLAG_CUSTOM_MODE_ENABLED: the second parameter is the firmware's own mode number.
+                // MAV_MODE_FLAG_CUSTOM_MODE_ENABLED: what follows is the firmware's own mode.
                 message.param1 = 1.0;
-                message.param2 = mode.custom_mode() as f32;
+                if let FlightMode::Px4(number) = mode {
+                    let [_, _, main, sub] = number.to_le_bytes();
+                    message.param2 = main.into();
+                    message.param3 = sub.into();
+                } else {
+                    message.param2 = mode.custom_mode() as f32;
+                }
             }
-            Self::Arm => {
-                message.command = MavCmd::MAV_CMD_COMPONENT_ARM_DISARM;
-                message.param1 = 1.0;
-            }
-            Self::Disarm => message.command = MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
-            Self::Takeoff { height_m } => {
-                message.command = MavCmd::MAV_CMD_NAV_TAKEOFF;
-                message.param7 = height_m as f32;
-            }
+            Self::Arm => message.param1 = 1.0,
+            Self::Disarm => {}
+            Self::Takeoff { height_m } => match ground_amsl_m {
+                // Not a number: the present heading, latitude and longitude.
+                Some(ground_m) => {
+                    message.param4 = f32::NAN;
+                    message.param5 = f32::NAN;
+                    message.param6 = f32::NAN;
+                    message.param7 = (ground_m + height_m) as f32;
+                }
+                None => message.param7 = height_m as f32,
+            },
         }
         message
     }
 
+    fn number(&self) -> MavCmd {
+        match self {
+            Self::SetMode(_) => MavCmd::MAV_CMD_DO_SET_MODE,
+            Self::Arm | Self::Disarm => MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+            Self::Takeoff { .. } => MavCmd::MAV_CMD_NAV_TAKEOFF,
+        }
+    }
+
     pub(crate) fn is_answered_by(&self, command: MavCmd) -> bool {
-        self.message(1).command == command
+        self.number() == command
     }
 
     /// Whether both are about the same thing, so that the later one takes the earlier one's place.
     pub(crate) fn concerns_same_as(&self, other: &Self) -> bool {
-        self.message(1).command == other.message(1).command
+        self.number() == other.number()
     }
 
     /// Whether the vehicle's own report shows that it happened.
@@ -271,7 +295,7 @@ enum Phase {
 /// What a request needs next.
 pub(crate) enum Step {
     Wait,
-    Send(COMMAND_LONG_DATA),
+    Send(Command, u32),
     Finish(Result<(), CommandError>),
 }
 
@@ -387,7 +411,7 @@ impl Request {
     fn send(&mut self, now_ns: i64, patience: &Patience) -> Step {
         self.attempts += 1;
         self.phase = Phase::Sent(now_ns.saturating_add(ns(patience.answer)));
-        Step::Send(self.command.message(self.attempts))
+        Step::Send(self.command, self.attempts)
     }
 }
 

@@ -91,6 +91,26 @@ pub fn landing_target_position(time_usec: u64, target: Point<Body>) -> Option<Ma
     }))
 }
 
+/// The landing target at a place in local NED (m from the autopilot's origin): the only frame that PX4 takes
+/// (<https://docs.px4.io/main/en/advanced_features/precland.html>).
+///
+/// `time_usec` is the capture time by one steady clock. `None` when a number is not finite.
+pub fn landing_target_local(time_usec: u64, target: Point<Ned>) -> Option<MavMessage> {
+    target.is_finite().then(|| {
+        MavMessage::LANDING_TARGET(LANDING_TARGET_DATA {
+            time_usec,
+            frame: MavFrame::MAV_FRAME_LOCAL_NED,
+            x: target.x() as f32,
+            y: target.y() as f32,
+            z: target.z() as f32,
+            q: [1.0, 0.0, 0.0, 0.0],
+            mavtype: LandingTargetType::LANDING_TARGET_TYPE_VISION_FIDUCIAL,
+            position_valid: MavBool::from_bits_retain(1),
+            ..Default::default()
+        })
+    })
+}
+
 /// The landing target in a direction in the body frame, of any length: without a distance (m along the line of sight)
 /// it needs a rangefinder.
 ///
@@ -153,6 +173,15 @@ mod tests {
         assert!((f64::from(target.distance) - 21_f64.sqrt()).abs() < 1e-6);
         assert_eq!(target.frame as u8, 12);
         assert_eq!(target.position_valid.bits(), 1);
+    }
+
+    #[test]
+    fn px4_is_told_a_place_and_nothing_else() {
+        let message = landing_target_local(7, Point::new(1.0, 2.0, -0.5)).unwrap();
+        let MavMessage::LANDING_TARGET(target) = message else { unreachable!() };
+        assert_eq!((target.frame as u8, target.position_valid.bits(), target.time_usec), (1, 1, 7));
+        assert_eq!([target.x, target.y, target.z, target.distance], [1.0, 2.0, -0.5, 0.0]);
+        assert!(landing_target_local(7, Point::new(f64::NAN, 0.0, 0.0)).is_none());
     }
 
     #[test]

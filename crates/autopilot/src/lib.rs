@@ -2,24 +2,26 @@
 //!
 //! It finds an autopilot on a serial line or a socket, asks it for the messages that landing needs, reports the
 //! vehicle's state in this project's types, and carries commands to it with acknowledgement, time limit and clear
-//! errors. ArduPilot Copter is flown; PX4 is recognised and refused by name.
+//! errors. ArduPilot Copter is flown; so is PX4 on a copter, as its documentation tells, though never tried on the real one.
 //!
 //! Everything but [`link`] and [`session`] is a pure state machine that takes the time as an argument (nanoseconds of any clock that
 //! does not jump) and does no input or output. The crate knows nothing of markers, of landing or of other processes.
 //!
 //! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it,
-//! [`frame`] finds MAVLink packets in them, [`mode`] and [`state`] are what the vehicle tells about itself,
-//! [`client`] keeps up the conversation, [`command`] is what can be asked and why it may fail, [`takeoff`] is the way
+//! [`frame`] finds MAVLink packets in them, [`mode`], [`state`] and [`parameter`] are what the vehicle tells about itself,
+//! [`clock`] is when that was so, [`client`] keeps up the conversation, [`command`] is what can be asked and why it may fail, [`takeoff`] is the way
 //! from the ground into the air, [`compose`] makes the messages a companion sends, [`session`] ties link and client
 //! together for a service.
 
 pub mod address;
 pub mod client;
+pub mod clock;
 pub mod command;
 pub mod compose;
 pub mod frame;
 pub mod link;
 pub mod mode;
+pub mod parameter;
 pub mod session;
 pub mod state;
 mod stream;
@@ -39,6 +41,7 @@ pub use command::{Command, CommandError, CommandId, CommandStatus};
 pub use frame::{Frame, Parser, Sender};
 pub use link::{Link, LinkEvent, LinkSender};
 pub use mode::{Firmware, FlightMode};
+pub use parameter::Parameter;
 pub use session::{Happening, Session};
 pub use state::{Attitude, Battery, LandedState, Position, Range, VehicleState};
 pub use takeoff::{Takeoff, TakeoffError, TakeoffProgress};

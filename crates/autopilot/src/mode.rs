@@ -11,8 +11,10 @@ pub enum Firmware {
     Copter,
     /// ArduPilot on a vehicle of another kind, whose modes have other numbers: not supported.
     OtherArduPilot,
-    /// PX4: recognised, not yet supported.
+    /// PX4 on a multicopter or helicopter: flown as its documentation tells, not tried on the real one.
     Px4,
+    /// PX4 on a vehicle of another kind: not supported.
+    OtherPx4,
     /// Anything else: not supported.
     Unknown,
 }
@@ -38,21 +40,47 @@ const LAND: u32 = 9;
 impl Firmware {
     /// What a heartbeat says.
     pub fn of(heartbeat: &HEARTBEAT_DATA) -> Self {
-        match heartbeat.autopilot {
-            MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA => match heartbeat.mavtype {
-                MavType::MAV_TYPE_QUADROTOR
+        let hovers = matches!(
+            heartbeat.mavtype,
+            MavType::MAV_TYPE_QUADROTOR
                 | MavType::MAV_TYPE_COAXIAL
                 | MavType::MAV_TYPE_HELICOPTER
                 | MavType::MAV_TYPE_HEXAROTOR
                 | MavType::MAV_TYPE_OCTOROTOR
                 | MavType::MAV_TYPE_TRICOPTER
                 | MavType::MAV_TYPE_DODECAROTOR
-                | MavType::MAV_TYPE_DECAROTOR => Self::Copter,
-                _ => Self::OtherArduPilot,
-            },
-            MavAutopilot::MAV_AUTOPILOT_PX4 => Self::Px4,
+                | MavType::MAV_TYPE_DECAROTOR
+        );
+        match (heartbeat.autopilot, hovers) {
+            (MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA, true) => Self::Copter,
+            (MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA, false) => Self::OtherArduPilot,
+            (MavAutopilot::MAV_AUTOPILOT_PX4, true) => Self::Px4,
+            (MavAutopilot::MAV_AUTOPILOT_PX4, false) => Self::OtherPx4,
             _ => Self::Unknown,
         }
+    }
+
+    /// The mode in which it follows a companion's setpoints; `None` for one that is not flown.
+    pub fn guided(self) -> Option<FlightMode> {
+        match self {
+            Self::Copter => Some(FlightMode::Guided),
+            Self::Px4 => Some(FlightMode::OFFBOARD),
+            Self::OtherArduPilot | Self::OtherPx4 | Self::Unknown => None,
+        }
+    }
+
+    /// The mode in which it lands by itself; `None` for one that is not flown.
+    pub fn land(self) -> Option<FlightMode> {
+        match self {
+            Self::Copter => Some(FlightMode::Land),
+            Self::Px4 => Some(FlightMode::AUTO_LAND),
+            Self::OtherArduPilot | Self::OtherPx4 | Self::Unknown => None,
+        }
+    }
+
+    /// The mode in which it lands by itself on a target that it is told: the same as [`Firmware::land`] but on PX4.
+    pub fn precision_land(self) -> Option<FlightMode> {
+        if self == Self::Px4 { Some(FlightMode::AUTO_PRECLAND) } else { self.land() }
     }
 }
 
@@ -62,19 +90,41 @@ impl fmt::Display for Firmware {
             Self::Copter => "ArduPilot Copter",
             Self::OtherArduPilot => "ArduPilot on a vehicle that is no copter",
             Self::Px4 => "PX4",
+            Self::OtherPx4 => "PX4 on a vehicle that is no copter",
             Self::Unknown => "an unknown firmware",
         })
     }
 }
 
 impl FlightMode {
+    /// PX4 follows the setpoints of a companion (main mode 6).
+    pub const OFFBOARD: Self = Self::Px4(6 << 16);
+    /// PX4 takes off (main mode 4, sub mode 2).
+    pub const AUTO_TAKEOFF: Self = Self::Px4(0x0204_0000);
+    /// PX4 stays where it is (main mode 4, sub mode 3).
+    pub const AUTO_HOLD: Self = Self::Px4(0x0304_0000);
+    /// PX4 lands where it is (main mode 4, sub mode 6).
+    pub const AUTO_LAND: Self = Self::Px4(0x0604_0000);
+    /// PX4 lands on a target that it is told (main mode 4, sub mode 9).
+    pub const AUTO_PRECLAND: Self = Self::Px4(0x0904_0000);
+
+    /// True when the autopilot follows setpoints.
+    pub fn is_guided(self) -> bool {
+        self == Self::Guided || self == Self::OFFBOARD
+    }
+
+    /// True when the autopilot lands by itself.
+    pub fn is_landing(self) -> bool {
+        [Self::Land, Self::AUTO_LAND, Self::AUTO_PRECLAND].contains(&self)
+    }
+
     /// The mode that `firmware` means by this number.
     pub fn of(firmware: Firmware, custom_mode: u32) -> Self {
         match (firmware, custom_mode) {
             (Firmware::Copter, GUIDED) => Self::Guided,
             (Firmware::Copter, LAND) => Self::Land,
             (Firmware::Copter, number) => Self::Other(number),
-            (Firmware::Px4, number) => Self::Px4(number),
+            (Firmware::Px4 | Firmware::OtherPx4, number) => Self::Px4(number),
             (_, number) => Self::Foreign(number),
         }
     }
@@ -177,5 +227,16 @@ mod tests {
             assert_eq!(mode.custom_mode(), number);
             assert_eq!(mode.to_string(), name);
         }
+    }
+
+    #[test]
+    fn what_is_flown_has_a_mode_for_setpoints_and_one_to_land() {
+        for firmware in [Firmware::Copter, Firmware::Px4] {
+            assert!(firmware.guided().is_some_and(FlightMode::is_guided));
+            assert!(firmware.land().is_some_and(FlightMode::is_landing));
+            assert!(firmware.precision_land().is_some_and(FlightMode::is_landing));
+        }
+        assert_eq!(Firmware::OtherPx4.guided(), None);
+        assert!(!FlightMode::Px4(4).is_guided() && !FlightMode::Foreign(4).is_guided());
     }
 }

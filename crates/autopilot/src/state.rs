@@ -1,6 +1,7 @@
 //! What the vehicle tells about itself.
 //!
-//! A stamp is the time of reception in nanoseconds of the caller's clock; `boot_ms` is the autopilot's own clock.
+//! A stamp is in nanoseconds of the caller's clock: the time of the measurement where the autopilot's clock is known
+//! ([`crate::clock`]), else that of its reception. `boot_ms` is the autopilot's own clock.
 
 use std::fmt;
 
@@ -8,15 +9,15 @@ use geometry::{Body, Ned, Point, Rotation, Vector};
 
 use crate::dialect::{
     ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, BATTERY_STATUS_DATA, DISTANCE_SENSOR_DATA,
-    EkfStatusFlags, LOCAL_POSITION_NED_DATA, MavLandedState, MavSensorOrientation,
-    MavSysStatusSensor, SYS_STATUS_DATA,
+    EkfStatusFlags, EstimatorStatusFlags, LOCAL_POSITION_NED_DATA, MavLandedState,
+    MavSensorOrientation, MavSysStatusSensor, SYS_STATUS_DATA,
 };
 use crate::mode::FlightMode;
 
 /// How the vehicle is turned, at one moment.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Attitude {
-    /// When it was received, in ns.
+    /// When it was measured, or else received, in ns.
     pub stamp_ns: i64,
     /// When it was measured, in ms since the autopilot started.
     pub boot_ms: u32,
@@ -29,7 +30,7 @@ pub struct Attitude {
 /// Where the vehicle is and how fast, at one moment.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Position {
-    /// When it was received, in ns.
+    /// When it was measured, or else received, in ns.
     pub stamp_ns: i64,
     /// When it was measured, in ms since the autopilot started.
     pub boot_ms: u32,
@@ -106,6 +107,8 @@ pub(crate) struct Readiness {
     /// Outcome of the pre-arm checks; none while unknown or not offered.
     prearm: Option<bool>,
     ekf: Option<EkfStatusFlags>,
+    /// What PX4 tells in the place of the former.
+    estimator: Option<EstimatorStatusFlags>,
     has_position: bool,
     /// What the autopilot said about its pre-arm checks last.
     complaint: Option<String>,
@@ -235,6 +238,10 @@ impl Readiness {
         self.ekf = Some(flags);
     }
 
+    pub(crate) fn take_estimator(&mut self, flags: EstimatorStatusFlags) {
+        self.estimator = Some(flags);
+    }
+
     pub(crate) fn take_position(&mut self) {
         self.has_position = true;
     }
@@ -246,7 +253,12 @@ impl Readiness {
     }
 
     pub(crate) fn is_ready(&self) -> bool {
-        self.prearm != Some(false) && self.ekf.is_some_and(ekf_is_ready) && self.has_position
+        let estimates = match (self.ekf, self.estimator) {
+            (Some(flags), _) => ekf_is_ready(flags),
+            (None, Some(flags)) => estimator_is_ready(flags),
+            (None, None) => false,
+        };
+        self.prearm != Some(false) && estimates && self.has_position
     }
 
     /// What is missing, for people; empty when it is ready.
@@ -255,12 +267,17 @@ impl Readiness {
         if !self.has_position {
             reasons.push("waiting for the EKF origin (no LOCAL_POSITION_NED yet)".to_owned());
         }
-        match self.ekf {
-            None => reasons.push("waiting for EKF_STATUS_REPORT".to_owned()),
-            Some(flags) if !ekf_is_ready(flags) => {
+        match (self.ekf, self.estimator) {
+            (None, None) => {
+                reasons.push("waiting for EKF_STATUS_REPORT or ESTIMATOR_STATUS".to_owned());
+            }
+            (Some(flags), _) if !ekf_is_ready(flags) => {
                 reasons.push(format!("the EKF has no position yet (flags {})", flags.bits()));
             }
-            Some(_) => {}
+            (None, Some(flags)) if !estimator_is_ready(flags) => {
+                reasons.push(format!("the estimator has no position yet (flags {})", flags.bits()));
+            }
+            _ => {}
         }
         if self.prearm == Some(false) {
             let complaint = self.complaint.as_deref().unwrap_or("checks not passed yet");
@@ -278,6 +295,18 @@ fn ekf_is_ready(flags: EkfStatusFlags) -> bool {
         | EkfStatusFlags::EKF_POS_VERT_ABS;
     let horizontal = EkfStatusFlags::EKF_POS_HORIZ_ABS | EkfStatusFlags::EKF_POS_HORIZ_REL;
     let wrong = EkfStatusFlags::EKF_CONST_POS_MODE | EkfStatusFlags::EKF_UNINITIALIZED;
+    flags.contains(needed) && flags.intersects(horizontal) && !flags.intersects(wrong)
+}
+
+/// The same of PX4's ESTIMATOR_STATUS.
+fn estimator_is_ready(flags: EstimatorStatusFlags) -> bool {
+    let needed = EstimatorStatusFlags::ESTIMATOR_ATTITUDE
+        | EstimatorStatusFlags::ESTIMATOR_VELOCITY_HORIZ
+        | EstimatorStatusFlags::ESTIMATOR_VELOCITY_VERT
+        | EstimatorStatusFlags::ESTIMATOR_POS_VERT_ABS;
+    let horizontal = EstimatorStatusFlags::ESTIMATOR_POS_HORIZ_ABS
+        | EstimatorStatusFlags::ESTIMATOR_POS_HORIZ_REL;
+    let wrong = EstimatorStatusFlags::ESTIMATOR_CONST_POS_MODE;
     flags.contains(needed) && flags.intersects(horizontal) && !flags.intersects(wrong)
 }
 

@@ -18,6 +18,9 @@ const COUNT_NS: i64 = 2 * SECOND_NS;
 const MAX_PAUSE_NS: i64 = 10 * SECOND_NS;
 /// A missing message is worth a word after this many requests.
 const VAIN: u32 = 2;
+/// One that has never come may still begin for so long: ArduPilot promises its position at once, and has one after 20
+/// to 40 s.
+const BEGINNING_NS: i64 = 60 * SECOND_NS;
 
 /// A message that the autopilot is asked to send.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -57,6 +60,9 @@ struct Watched {
     count: u32,
     since_ns: i64,
     missing: bool,
+    /// It has come since everything was asked for anew.
+    began: bool,
+    first_asked_ns: Option<i64>,
 }
 
 impl Streams {
@@ -72,6 +78,8 @@ impl Streams {
                     count: 0,
                     since_ns: 0,
                     missing: false,
+                    began: false,
+                    first_asked_ns: None,
                 }
             });
         Self { list: list.collect(), asking: None }
@@ -83,12 +91,18 @@ impl Streams {
         for watched in &mut self.list {
             watched.ask_at_ns = Some(i64::MIN);
             watched.asked = 0;
+            watched.began = false;
+            watched.first_asked_ns = None;
         }
     }
 
-    pub(crate) fn received(&mut self, message_id: u32) {
+    pub(crate) fn received(&mut self, now_ns: i64, message_id: u32) {
         for watched in &mut self.list {
             if watched.stream.message_id == message_id {
+                // It began in the middle of the counting.
+                if !std::mem::replace(&mut watched.began, true) && watched.ask_at_ns.is_none() {
+                    watched.count_anew(now_ns);
+                }
                 watched.count = watched.count.saturating_add(1);
             }
         }
@@ -127,6 +141,7 @@ impl Streams {
         };
         watched.asked = watched.asked.saturating_add(1);
         watched.asked_ns = now_ns;
+        watched.first_asked_ns.get_or_insert(now_ns);
         self.asking = Some((index, now_ns.saturating_add(ACK_NS)));
         (notices, Some(request(watched.stream)))
     }
@@ -162,7 +177,9 @@ impl Watched {
         if now_ns.saturating_sub(self.asked_ns) >= pause_ns {
             self.ask_at_ns = Some(now_ns);
         }
-        let news = self.asked >= VAIN && self.stream.required && !self.missing;
+        let waits = !self.began
+            && self.first_asked_ns.is_some_and(|at| now_ns.saturating_sub(at) < BEGINNING_NS);
+        let news = self.asked >= VAIN && self.stream.required && !self.missing && !waits;
         self.missing |= news;
         let wanted_hz = self.stream.rate_hz;
         news.then_some(Notice::Missing { message: self.name, wanted_hz, measured_hz })
@@ -210,7 +227,7 @@ mod tests {
                 }
             }
             if every > 0 && step % every == 0 {
-                streams.received(30);
+                streams.received(now_ns, 30);
             }
         }
         (said, asked)
@@ -235,6 +252,17 @@ mod tests {
         assert!(matches!(said[..], [Notice::Missing { message: "ATTITUDE", wanted_hz: 50.0, .. }]));
         let (said, _) = run(&mut streams, 50, 20, OK, 1);
         assert!(matches!(said[..], [Notice::Restored { message: "ATTITUDE", .. }]));
+    }
+
+    #[test]
+    fn what_begins_late_is_no_alarm_and_what_never_begins_is_one() {
+        let mut streams = Streams::new(&[ATTITUDE]);
+        let (said, _) = run(&mut streams, 0, 40, OK, 0);
+        assert!(said.is_empty(), "{said:?}");
+        assert!(run(&mut streams, 40, 20, OK, 1).0.is_empty());
+        let mut streams = Streams::new(&[ATTITUDE]);
+        let (said, _) = run(&mut streams, 0, 80, OK, 0);
+        assert!(matches!(said[..], [Notice::Missing { measured_hz: 0.0, .. }]), "{said:?}");
     }
 
     #[test]

@@ -1,11 +1,12 @@
-//! From the ground into the air: wait until ready, GUIDED, arm, climb.
+//! From the ground into the air. ArduPilot: wait until ready, GUIDED, arm, climb. PX4: wait until ready, arm, climb in its
+//! own takeoff mode, OFFBOARD.
 
 use std::fmt;
 use std::time::Duration;
 
 use crate::client::Autopilot;
 use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
-use crate::mode::FlightMode;
+use crate::mode::{Firmware, FlightMode};
 use crate::state::{LandedState, VehicleState};
 
 /// How close to its height the vehicle must be, in m.
@@ -47,6 +48,8 @@ pub struct Takeoff {
     /// The vertical position before the climb, in m downwards from the origin.
     ground_z: Option<f64>,
     guided: bool,
+    /// It has reached its height.
+    risen: bool,
     /// It stood with armed motors before anything was asked for.
     found_armed: bool,
 }
@@ -56,7 +59,7 @@ pub struct Takeoff {
 pub enum TakeoffProgress {
     /// The vehicle is not ready, for these reasons.
     Waiting(Vec<String>),
-    /// GUIDED is asked for.
+    /// GUIDED or OFFBOARD is asked for.
     ChangingMode,
     /// Arming; a number of attempts was refused, the last one for a reason.
     Arming {
@@ -79,7 +82,7 @@ pub enum TakeoffProgress {
 pub enum TakeoffError {
     /// Somebody else flies, or has taken over.
     #[error(
-        "no takeoff: the vehicle is {landed} in {mode}, so the pilot is in command; change to GUIDED to hand over"
+        "no takeoff: the vehicle is {landed} in {mode}, so the pilot is in command; change to GUIDED (OFFBOARD on PX4) to hand over"
     )]
     PilotInCommand {
         /// The mode the pilot chose.
@@ -144,6 +147,7 @@ impl Takeoff {
             until_ns: None,
             ground_z: None,
             guided: false,
+            risen: false,
             found_armed: false,
         }
     }
@@ -180,7 +184,7 @@ impl Takeoff {
                 self.arm(now_ns, autopilot, (request, again_ns, refused))
             }
             Part::Lift(request) => self.wait_for_lift(now_ns, autopilot, request),
-            Part::Climb => self.climb(now_ns, state.as_ref()),
+            Part::Climb => self.climb(now_ns, autopilot, state.as_ref()),
             Part::Done | Part::Failed(_) => Ok(()),
         }
     }
@@ -191,7 +195,10 @@ impl Takeoff {
         if !state.connected {
             return if waiting { Ok(()) } else { Err(TakeoffError::Lost) };
         }
-        let guided = state.mode == FlightMode::Guided;
+        // PX4 passes through modes of its own on the way up.
+        let rises =
+            !waiting && [FlightMode::AUTO_TAKEOFF, FlightMode::AUTO_HOLD].contains(&state.mode);
+        let guided = state.mode.is_guided() || rises;
         self.guided |= guided;
         let taken = if waiting { state.armed } else { self.guided };
         if taken && !guided {
@@ -220,8 +227,12 @@ impl Takeoff {
             }
             Some(state) if self.found_armed && !state.armed => return Err(TakeoffError::Disarmed),
             Some(state) if state.ready && !state.armed && state.landed == LandedState::OnGround => {
-                let request = autopilot.request(now_ns, Command::SetMode(FlightMode::Guided));
-                self.begin(now_ns, Part::Mode(request), self.limits.ready);
+                if autopilot.firmware() == Some(Firmware::Px4) {
+                    self.begin_arming(now_ns);
+                } else {
+                    let request = autopilot.request(now_ns, Command::SetMode(FlightMode::Guided));
+                    self.begin(now_ns, Part::Mode(request), self.limits.ready);
+                }
             }
             _ => {
                 self.found_armed |= connected
@@ -244,10 +255,18 @@ impl Takeoff {
         request: CommandId,
     ) -> Result<(), TakeoffError> {
         if finished(autopilot, request)? {
-            let part = Part::Arm { request: None, again_ns: now_ns, refused: None };
-            self.begin(now_ns, part, self.limits.arm);
+            if self.risen {
+                self.part = Part::Done;
+            } else {
+                self.begin_arming(now_ns);
+            }
         }
         Ok(())
+    }
+
+    fn begin_arming(&mut self, now_ns: i64) {
+        let part = Part::Arm { request: None, again_ns: now_ns, refused: None };
+        self.begin(now_ns, part, self.limits.arm);
     }
 
     fn arm(
@@ -295,14 +314,25 @@ impl Takeoff {
         Ok(())
     }
 
-    fn climb(&mut self, now_ns: i64, state: Option<&VehicleState>) -> Result<(), TakeoffError> {
+    fn climb(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        state: Option<&VehicleState>,
+    ) -> Result<(), TakeoffError> {
         let Some(state) = state else { return Ok(()) };
         let height_m = self.height(state);
         let level = state.position.is_some_and(|p| p.velocity.z().abs() < CLIMB_M_S);
         // A climb that an earlier controller began ends where that one wanted it: the ground was not seen from here.
         let arrived = self.ground_z.is_none() || (height_m - self.height_m).abs() < HEIGHT_M;
         if state.landed == LandedState::InAir && level && arrived {
-            self.part = Part::Done;
+            self.risen = true;
+            if state.mode.is_guided() {
+                self.part = Part::Done;
+            } else {
+                let request = autopilot.request(now_ns, Command::SetMode(FlightMode::OFFBOARD));
+                self.begin(now_ns, Part::Mode(request), self.limits.arm);
+            }
         } else if self.until_ns.is_some_and(|until_ns| now_ns >= until_ns) {
             let (after, landed, wanted_m) = (self.climb_limit(), state.landed, self.height_m);
             return Err(TakeoffError::TooSlow { after, height_m, wanted_m, landed });
@@ -345,7 +375,7 @@ impl fmt::Display for TakeoffProgress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Waiting(reasons) => write!(f, "waiting: {}", reasons.join("; ")),
-            Self::ChangingMode => f.write_str("changing to GUIDED"),
+            Self::ChangingMode => f.write_str("changing to the mode that follows setpoints"),
             Self::Arming { refused: None } => f.write_str("arming"),
             Self::Arming { refused: Some(reason) } => write!(f, "arming again: {reason}"),
             Self::Climbing { height_m } => write!(f, "climbing, {:.0} m", height_m.max(0.0)),

@@ -14,7 +14,7 @@ use autopilot::dialect::{
     ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, EKF_STATUS_REPORT_DATA,
     EXTENDED_SYS_STATE_DATA, EkfStatusFlags, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot,
     MavCmd, MavLandedState, MavMessage, MavModeFlag, MavResult, MavSeverity, MavSysStatusSensor,
-    MavType, STATUSTEXT_DATA, SYS_STATUS_DATA,
+    MavType, STATUSTEXT_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
 };
 use autopilot::frame::{self, Sender};
 use autopilot::{
@@ -28,6 +28,7 @@ const STEP: i64 = SECOND / 50;
 const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
 
 /// An autopilot that does what ArduPilot was measured to do, and what a test tells it.
+#[derive(Clone)]
 struct Fake {
     firmware: MavAutopilot,
     boot_ns: i64,
@@ -49,6 +50,10 @@ struct Fake {
     silent: bool,
     ignores_modes: bool,
     queue: Vec<MavMessage>,
+    /// Questions for the time, to be answered at the next step.
+    questions: Vec<i64>,
+    /// What it measures is sent so many steps later.
+    late_steps: i64,
     parser: Parser,
 }
 
@@ -72,6 +77,8 @@ impl Fake {
             silent: false,
             ignores_modes: false,
             queue: Vec::new(),
+            questions: Vec::new(),
+            late_steps: 0,
             parser: Parser::new(),
         }
     }
@@ -95,6 +102,9 @@ impl Fake {
                 MavMessage::HEARTBEAT(heartbeat) => {
                     assert_eq!(heartbeat.mavtype, MavType::MAV_TYPE_ONBOARD_CONTROLLER);
                     assert_eq!(frame.sender, Sender { system: 1, component: 191 });
+                }
+                MavMessage::TIMESYNC(question) if question.tc1 == 0 => {
+                    self.questions.push(question.ts1);
                 }
                 other => panic!("unexpected {other:?}"),
             }
@@ -180,6 +190,12 @@ impl Fake {
             }
         }
         let mut sent = std::mem::take(&mut self.queue);
+        let tc1 = now - self.boot_ns;
+        sent.extend(
+            self.questions
+                .drain(..)
+                .map(|ts1| MavMessage::TIMESYNC(TIMESYNC_DATA { tc1, ts1, ..Default::default() })),
+        );
         if now % SECOND == 0 {
             sent.push(self.heartbeat());
         }
@@ -192,7 +208,7 @@ impl Fake {
     }
 
     fn report(&self, id: u32, now: i64) -> Option<MavMessage> {
-        let time_boot_ms = ((now - self.boot_ns) / 1_000_000) as u32;
+        let time_boot_ms = ((now - self.late_steps * STEP - self.boot_ns) / 1_000_000) as u32;
         let prearm = MavSysStatusSensor::MAV_SYS_STATUS_PREARM_CHECK;
         let vz = if self.climbs_to.is_some() { -2.0 } else { 0.0 };
         Some(match id {
@@ -572,7 +588,7 @@ fn rates_that_another_station_overwrote_are_restored() {
 #[test]
 fn a_message_that_never_comes_is_named() {
     let mut world = World::with(Fake { ready: false, ..Fake::new() }, Config::default());
-    world.run(20);
+    world.run(70);
     assert_eq!(
         world.count(|event| matches!(
             event,
@@ -619,15 +635,45 @@ fn velocities_are_sent_only_where_they_mean_something() {
 }
 
 #[test]
-fn px4_is_recognised_and_refused_by_name() {
-    let fake = Fake { firmware: MavAutopilot::MAV_AUTOPILOT_PX4, mode: 6 << 16, ..Fake::new() };
+fn what_is_not_flown_is_recognised_and_refused_by_name() {
+    let fake = Fake { firmware: MavAutopilot::MAV_AUTOPILOT_GENERIC, mode: 4, ..Fake::new() };
     let mut world = World::with(fake, Config::default());
     world.run(3);
-    assert_eq!(world.client.state().unwrap().mode.to_string(), "PX4 OFFBOARD");
     let error = world.ask(Command::Arm).unwrap_err().to_string();
-    assert!(error.contains("PX4") && error.contains("only ArduPilot Copter"), "{error}");
+    assert!(error.contains("unknown firmware") && error.contains("ArduPilot or PX4"), "{error}");
     let error = world.client.set_velocity(world.now, Vector::zero(), 0.0).unwrap_err();
-    assert_eq!(error, SetpointError::Unsupported(Firmware::Px4));
+    assert_eq!(error, SetpointError::Unsupported(Firmware::Unknown));
+}
+
+#[test]
+fn what_was_measured_carries_its_own_time_once_the_clocks_are_known() {
+    let boot_ns = 63 * SECOND;
+    let fake = Fake { boot_ns, late_steps: 15, ..Fake::new() };
+    let age_ms = |world: &World| {
+        let attitude = world.client.state().unwrap().attitude.unwrap();
+        (world.now - attitude.stamp_ns) / 1_000_000
+    };
+    let mut world = World::with(fake.clone(), Config::default());
+    world.run(10);
+    // A round trip lasts a step of 20 ms here, so half of it is not known.
+    assert!(world.client.round_trip(world.now).is_some_and(|trip| trip.as_millis() <= 20));
+    assert!((280..=320).contains(&age_ms(&world)), "{} ms", age_ms(&world));
+    let mut without = World::with(fake, Config { timesync: false, ..Config::default() });
+    without.run(10);
+    assert!(without.client.round_trip(without.now).is_none());
+    assert!(age_ms(&without) <= 20, "that of its reception");
+    // It asks for our time as well, and is told.
+    let question = TIMESYNC_DATA { tc1: 0, ts1: 77, ..Default::default() };
+    world.hear(AUTOPILOT, &MavMessage::TIMESYNC(question));
+    let mut answers = Vec::new();
+    while let Some(packet) = world.client.poll_outgoing() {
+        answers.extend(Parser::new().push(&packet).into_iter().filter_map(|f| f.message));
+    }
+    let told = |message: &MavMessage| match message {
+        MavMessage::TIMESYNC(answer) => Some((answer.tc1, answer.ts1)),
+        _ => None,
+    };
+    assert_eq!(answers.iter().find_map(told), Some((world.now, 77)));
 }
 
 #[test]

@@ -1,0 +1,238 @@
+//! The autopilot's clock, seen by ours: TIMESYNC round trips (<https://mavlink.io/en/services/timesync.html>).
+//!
+//! A round trip bounds the difference of the two clocks to half its length, so the shortest one of the last seconds
+//! is believed, and loses some of its worth with age as the clocks drift. What the autopilot measured can then carry its
+//! own time instead of that of its reception, however long and however irregularly it was under way.
+
+use std::collections::VecDeque;
+
+const MS: i64 = 1_000_000;
+/// How often it is asked at first, and later.
+const FIRST_NS: i64 = 100 * MS;
+const LATER_NS: i64 = 1_000 * MS;
+/// So many round trips are made quickly.
+const FIRST: usize = 12;
+/// Round trips that are remembered, and for how long.
+const MOST: usize = 64;
+const WINDOW_NS: i64 = 30_000 * MS;
+/// Questions that wait for their answers.
+const MOST_ASKED: usize = 16;
+/// A longer round trip tells nothing.
+const LONGEST_NS: i64 = 200 * MS;
+/// What two clocks drift apart at most: 100 parts in a million.
+const DRIFT: f64 = 1e-4;
+/// What a clock may be read wrong by.
+const SLACK_NS: i64 = 2 * MS;
+/// So many contradictions in a row mean that a clock was set.
+const CONTRADICTIONS: u32 = 3;
+/// What was measured longer ago than this is not told by a live link.
+const OLDEST_NS: i64 = 1_000 * MS;
+
+/// The difference of the two clocks.
+#[derive(Clone, Debug, Default)]
+pub struct Clock {
+    asked: VecDeque<i64>,
+    due_ns: i64,
+    trips: VecDeque<Trip>,
+    contradictions: u32,
+}
+
+/// One question and its answer.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+struct Trip {
+    at_ns: i64,
+    /// Their clock minus ours.
+    offset_ns: i64,
+    length_ns: i64,
+}
+
+impl Clock {
+    /// The question to send now, if one is due: its `ts1`.
+    pub fn ask(&mut self, now_ns: i64) -> Option<i64> {
+        if now_ns < self.due_ns {
+            return None;
+        }
+        let pause_ns = if self.trips.len() < FIRST { FIRST_NS } else { LATER_NS };
+        self.due_ns = now_ns.saturating_add(pause_ns);
+        if self.asked.len() >= MOST_ASKED {
+            self.asked.pop_front();
+        }
+        self.asked.push_back(now_ns);
+        Some(now_ns)
+    }
+
+    /// Takes an answer that was received at `now_ns`: their time and the question's `ts1`. False when it is no answer
+    /// to a question of ours, or was under way too long.
+    pub fn answered(&mut self, now_ns: i64, theirs_ns: i64, ts1_ns: i64) -> bool {
+        let Some(index) = self.asked.iter().position(|asked| *asked == ts1_ns) else {
+            return false;
+        };
+        self.asked.remove(index);
+        let length_ns = now_ns.saturating_sub(ts1_ns);
+        if !(0..=LONGEST_NS).contains(&length_ns) || theirs_ns <= 0 {
+            return false;
+        }
+        let offset_ns = theirs_ns.saturating_sub(ts1_ns.saturating_add(length_ns / 2));
+        let trip = Trip { at_ns: now_ns, offset_ns, length_ns };
+        if self.best(now_ns).is_some_and(|best| best.contradicts(&trip)) {
+            self.contradictions += 1;
+            if self.contradictions < CONTRADICTIONS {
+                return false;
+            }
+            self.trips.clear();
+        }
+        self.contradictions = 0;
+        if self.trips.len() >= MOST {
+            self.trips.pop_front();
+        }
+        self.trips.push_back(trip);
+        true
+    }
+
+    /// The autopilot restarted: everything begins anew.
+    pub fn restart(&mut self) {
+        *self = Self::default();
+    }
+
+    /// The length of the round trip that is believed, in ns; `None` while there is none.
+    pub fn round_trip_ns(&self, now_ns: i64) -> Option<i64> {
+        self.best(now_ns).map(|trip| trip.length_ns)
+    }
+
+    /// By our clock, when the autopilot's showed `boot_ms` milliseconds, for what was received at `now_ns`; `None`
+    /// while the clocks are not known, and for a moment that no live link tells of.
+    pub fn stamp_ns(&self, now_ns: i64, boot_ms: u32) -> Option<i64> {
+        let offset_ns = self.best(now_ns)?.offset_ns;
+        let theirs_ns = now_ns.checked_add(offset_ns)?;
+        // The counter of milliseconds begins again after 49 days, so only the difference counts. It is cut off, half a
+        // millisecond too early in the mean.
+        let ahead_ms = boot_ms.wrapping_sub((theirs_ns / MS) as u32).cast_signed();
+        let measured_ns = (theirs_ns / MS + i64::from(ahead_ms)) * MS + MS / 2;
+        let stamp_ns = measured_ns.checked_sub(offset_ns)?;
+        let is_live = stamp_ns >= now_ns - OLDEST_NS && stamp_ns <= now_ns + SLACK_NS;
+        is_live.then_some(stamp_ns.min(now_ns))
+    }
+
+    fn best(&self, now_ns: i64) -> Option<Trip> {
+        let recent =
+            self.trips.iter().filter(|trip| now_ns.saturating_sub(trip.at_ns) <= WINDOW_NS);
+        recent.min_by_key(|trip| trip.worth_ns(now_ns)).copied()
+    }
+}
+
+impl Trip {
+    /// How wrong it may be, twice; smaller is better.
+    fn worth_ns(&self, now_ns: i64) -> i64 {
+        let age_ns = now_ns.saturating_sub(self.at_ns).max(0);
+        self.length_ns.saturating_add((2.0 * DRIFT * age_ns as f64) as i64)
+    }
+
+    /// True when both cannot be true of two clocks that run on.
+    fn contradicts(&self, later: &Self) -> bool {
+        let apart_ns = later.offset_ns.abs_diff(self.offset_ns);
+        let allowed_ns = self.worth_ns(later.at_ns) / 2 + later.length_ns / 2 + SLACK_NS;
+        apart_ns > allowed_ns.unsigned_abs()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Makes `count` round trips whose two ways last as told by turns, with their clock so far ahead.
+    fn synchronised(ways_ms: &[(i64, i64)], count: usize, ahead_ns: i64) -> (Clock, i64) {
+        let (mut clock, mut now_ns) = (Clock::default(), 1_000 * MS);
+        for i in 0..count {
+            let (there, back) = ways_ms[i % ways_ms.len()];
+            while clock.ask(now_ns).is_none() {
+                now_ns += 10 * MS;
+            }
+            let asked_ns = now_ns;
+            now_ns += (there + back) * MS;
+            clock.answered(now_ns, asked_ns + there * MS + ahead_ns, asked_ns);
+        }
+        (clock, now_ns)
+    }
+
+    proptest! {
+        #[test]
+        fn jitter_costs_no_more_than_half_the_shortest_round_trip(
+            ways in prop::collection::vec((0_i64..90, 0_i64..90), 1..40),
+            ahead_ms in 0_i64..10_000_000,
+            age_ms in 0_i64..900,
+        ) {
+            let ahead_ns = ahead_ms * MS;
+            let (clock, now_ns) = synchronised(&ways, ways.len(), ahead_ns);
+            let shortest_ms = ways.iter().map(|(a, b)| a + b).min().unwrap();
+            let measured_ns = now_ns - age_ms * MS;
+            let boot_ms = ((measured_ns + ahead_ns) / MS) as u32;
+            let Some(stamp_ns) = clock.stamp_ns(now_ns, boot_ms) else {
+                // Only what would lie in the future, or too long ago, is not told.
+                prop_assert!(age_ms * 2 <= shortest_ms || age_ms * 2 + shortest_ms > 1_990);
+                return Ok(());
+            };
+            let wrong_ns = (stamp_ns - measured_ns).abs();
+            prop_assert!(wrong_ns <= shortest_ms * MS / 2 + 4 * MS, "{} ms", wrong_ns / MS);
+            prop_assert!(stamp_ns <= now_ns);
+        }
+
+        #[test]
+        fn nothing_that_is_told_can_harm(
+            told in prop::collection::vec((any::<i64>(), any::<i64>(), any::<i64>()), 0..40),
+            boot_ms: u32,
+        ) {
+            let mut clock = Clock::default();
+            for (now_ns, theirs_ns, ts1_ns) in told {
+                clock.ask(now_ns);
+                clock.answered(now_ns, theirs_ns, ts1_ns);
+                clock.answered(now_ns, theirs_ns, now_ns);
+                if let Some(stamp_ns) = clock.stamp_ns(1_000 * MS, boot_ms) {
+                    prop_assert!((0..=1_000 * MS).contains(&stamp_ns));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_late_burst_keeps_its_own_times() {
+        let (clock, now_ns) = synchronised(&[(1, 1), (40, 5)], 20, 77 * MS);
+        for age_ms in [5, 50, 300] {
+            let boot_ms = ((now_ns - age_ms * MS + 77 * MS) / MS) as u32;
+            let stamp_ns = clock.stamp_ns(now_ns, boot_ms).unwrap();
+            assert!((now_ns - stamp_ns - age_ms * MS).abs() <= 2 * MS);
+        }
+    }
+
+    #[test]
+    fn the_counter_of_milliseconds_may_begin_again() {
+        let ahead_ns = (i64::from(u32::MAX) - 500) * MS;
+        let (clock, now_ns) = synchronised(&[(1, 1)], 20, ahead_ns);
+        let boot_ms = ((now_ns + ahead_ns) / MS) as u32;
+        assert!(boot_ms < 10_000, "it did");
+        assert!((clock.stamp_ns(now_ns, boot_ms).unwrap() - now_ns).abs() <= 2 * MS);
+    }
+
+    #[test]
+    fn a_clock_that_was_set_is_believed_after_a_while() {
+        let (mut clock, mut now_ns) = synchronised(&[(1, 1)], 20, 0);
+        let trip = |clock: &mut Clock, now_ns: &mut i64| {
+            while clock.ask(*now_ns).is_none() {
+                *now_ns += 10 * MS;
+            }
+            *now_ns += 2 * MS;
+            clock.answered(*now_ns, *now_ns + 5_000 * MS - MS, *now_ns - 2 * MS)
+        };
+        assert_eq!([0; 3].map(|_| trip(&mut clock, &mut now_ns)), [false, false, true]);
+        let boot_ms = ((now_ns + 5_000 * MS) / MS) as u32;
+        assert!(clock.stamp_ns(now_ns, boot_ms).is_some());
+    }
+
+    #[test]
+    fn a_clock_that_is_not_known_or_was_long_ago_tells_nothing() {
+        assert_eq!(Clock::default().stamp_ns(1_000 * MS, 1_000), None);
+        let (clock, now_ns) = synchronised(&[(1, 1)], 20, 0);
+        assert!(clock.stamp_ns(now_ns + WINDOW_NS + MS, 0).is_none());
+        assert!(!Clock::default().answered(2 * MS, MS, MS), "nobody asked");
+    }
+}

@@ -1,0 +1,313 @@
+//! The client against a PX4 that keeps the rules of its documentation
+//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>, <https://docs.px4.io/main/en/advanced_features/precland.html>):
+//! OFFBOARD needs a second of setpoints before and goes on only with them, a takeoff goes to an altitude over the sea,
+//! and the estimator tells of itself in ESTIMATOR_STATUS. It was never tried on the real PX4.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests may fail like tests")]
+
+use std::collections::BTreeMap;
+
+use autopilot::dialect::{
+    ATTITUDE_DATA, COMMAND_ACK_DATA, COMMAND_LONG_DATA, ESTIMATOR_STATUS_DATA,
+    EXTENDED_SYS_STATE_DATA, EstimatorStatusFlags, GLOBAL_POSITION_INT_DATA, HEARTBEAT_DATA,
+    LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
+    MavResult, MavType,
+};
+use autopilot::frame::{self, Sender};
+use autopilot::{
+    Autopilot, Command, CommandError, CommandStatus, Config, Firmware, FlightMode, Parser, Takeoff,
+    TakeoffProgress,
+};
+use geometry::{Point, Vector};
+
+const SECOND: i64 = 1_000_000_000;
+const STEP: i64 = SECOND / 50;
+const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
+const GROUND_AMSL_M: f64 = 488.0;
+/// COM_OF_LOSS_T.
+const OFFBOARD_LOSS_NS: i64 = SECOND;
+
+struct Px4 {
+    mode: FlightMode,
+    armed: bool,
+    height_m: f64,
+    climbs_to_m: Option<f64>,
+    intervals: BTreeMap<u32, i64>,
+    /// Since when setpoints have come at 2 Hz or more, and when the last one came.
+    streaming: Option<(i64, i64)>,
+    setpoints: Vec<[f32; 3]>,
+    landing_targets: Vec<(u8, [f32; 3])>,
+    queue: Vec<MavMessage>,
+}
+
+impl Px4 {
+    fn receive(&mut self, now: i64, packet: &[u8]) {
+        for frame in Parser::new().push(packet) {
+            match frame.message.unwrap() {
+                MavMessage::COMMAND_LONG(command) => {
+                    let result = self.carry_out(now, &command);
+                    self.queue.push(MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
+                        command: command.command,
+                        result,
+                        target_system: frame.sender.system,
+                        target_component: frame.sender.component,
+                        ..Default::default()
+                    }));
+                }
+                MavMessage::SET_POSITION_TARGET_LOCAL_NED(setpoint) => {
+                    let since = match self.streaming {
+                        Some((since, last)) if now - last <= SECOND / 2 => since,
+                        _ => now,
+                    };
+                    self.streaming = Some((since, now));
+                    self.setpoints.push([setpoint.vx, setpoint.vy, setpoint.vz]);
+                }
+                MavMessage::LANDING_TARGET(target) => {
+                    self.landing_targets.push((target.frame as u8, [target.x, target.y, target.z]));
+                }
+                MavMessage::HEARTBEAT(_) | MavMessage::TIMESYNC(_) => {}
+                other => panic!("unexpected {other:?}"),
+            }
+        }
+    }
+
+    fn carry_out(&mut self, now: i64, command: &COMMAND_LONG_DATA) -> MavResult {
+        match command.command {
+            MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => {
+                let interval = (f64::from(command.param2) * 1e3) as i64;
+                self.intervals.insert(command.param1 as u32, interval);
+            }
+            MavCmd::MAV_CMD_DO_SET_MODE => {
+                assert_eq!(command.param1, 1.0);
+                let number = [0, 0, command.param2 as u8, command.param3 as u8];
+                let mode = FlightMode::Px4(u32::from_le_bytes(number));
+                let proven = self
+                    .streaming
+                    .is_some_and(|(since, last)| now - since >= SECOND && now - last <= SECOND / 2);
+                if mode == FlightMode::OFFBOARD && !proven {
+                    return MavResult::MAV_RESULT_TEMPORARILY_REJECTED;
+                }
+                self.mode = mode;
+            }
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => self.armed = command.param1 == 1.0,
+            MavCmd::MAV_CMD_NAV_TAKEOFF => {
+                if !self.armed {
+                    return MavResult::MAV_RESULT_TEMPORARILY_REJECTED;
+                }
+                let here = [command.param4, command.param5, command.param6];
+                assert!(here.iter().all(|value| value.is_nan()), "at the present place");
+                self.climbs_to_m = Some(f64::from(command.param7) - GROUND_AMSL_M);
+                self.mode = FlightMode::AUTO_TAKEOFF;
+            }
+            other => panic!("unexpected {other:?}"),
+        }
+        MavResult::MAV_RESULT_ACCEPTED
+    }
+
+    fn step(&mut self, now: i64) -> Vec<MavMessage> {
+        if let Some(height_m) = self.climbs_to_m {
+            self.height_m += 0.04;
+            if self.height_m >= height_m {
+                self.climbs_to_m = None;
+                self.mode = FlightMode::AUTO_HOLD;
+            }
+        }
+        let silent = self.streaming.is_none_or(|(_, last)| now - last > OFFBOARD_LOSS_NS);
+        if self.mode == FlightMode::OFFBOARD && silent {
+            self.mode = FlightMode::AUTO_HOLD;
+        }
+        let mut sent = std::mem::take(&mut self.queue);
+        if now % SECOND == 0 {
+            sent.push(self.heartbeat());
+        }
+        for (&id, &interval) in &self.intervals {
+            if now % interval < STEP {
+                sent.extend(self.report(id, now));
+            }
+        }
+        sent
+    }
+
+    fn heartbeat(&self) -> MavMessage {
+        let armed = MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED;
+        MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+            custom_mode: self.mode.custom_mode(),
+            mavtype: MavType::MAV_TYPE_QUADROTOR,
+            autopilot: MavAutopilot::MAV_AUTOPILOT_PX4,
+            base_mode: if self.armed { armed } else { MavModeFlag::empty() },
+            ..Default::default()
+        })
+    }
+
+    fn report(&self, id: u32, now: i64) -> Option<MavMessage> {
+        let time_boot_ms = (now / 1_000_000) as u32;
+        Some(match id {
+            30 => MavMessage::ATTITUDE(ATTITUDE_DATA { time_boot_ms, ..Default::default() }),
+            32 => MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
+                time_boot_ms,
+                z: -self.height_m as f32,
+                vz: if self.climbs_to_m.is_some() { -2.0 } else { 0.0 },
+                ..Default::default()
+            }),
+            33 => MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
+                alt: ((GROUND_AMSL_M + self.height_m) * 1e3) as i32,
+                ..Default::default()
+            }),
+            230 => MavMessage::ESTIMATOR_STATUS(ESTIMATOR_STATUS_DATA {
+                // Attitude, velocities, relative and absolute positions: a PX4 with GNSS.
+                flags: EstimatorStatusFlags::from_bits_retain(831),
+                ..Default::default()
+            }),
+            245 => MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA {
+                landed_state: match (self.height_m > 0.1, self.mode) {
+                    (false, _) => MavLandedState::MAV_LANDED_STATE_ON_GROUND,
+                    (_, FlightMode::AUTO_TAKEOFF) => MavLandedState::MAV_LANDED_STATE_TAKEOFF,
+                    _ => MavLandedState::MAV_LANDED_STATE_IN_AIR,
+                },
+                ..Default::default()
+            }),
+            _ => return None,
+        })
+    }
+}
+
+struct World {
+    now: i64,
+    client: Autopilot,
+    px4: Px4,
+}
+
+impl World {
+    fn new() -> Self {
+        let px4 = Px4 {
+            mode: FlightMode::AUTO_HOLD,
+            armed: false,
+            height_m: 0.0,
+            climbs_to_m: None,
+            intervals: BTreeMap::new(),
+            streaming: None,
+            setpoints: Vec::new(),
+            landing_targets: Vec::new(),
+            queue: Vec::new(),
+        };
+        let mut world = Self { now: 100 * SECOND, client: Autopilot::new(Config::default()), px4 };
+        world.run(5);
+        world
+    }
+
+    fn step(&mut self) {
+        self.now += STEP;
+        for message in self.px4.step(self.now) {
+            let packet = frame::encode(AUTOPILOT, 0, &message);
+            for frame in Parser::new().push(&packet) {
+                self.client.handle(self.now, &frame);
+            }
+        }
+        self.client.tick(self.now);
+        while let Some(packet) = self.client.poll_outgoing() {
+            self.px4.receive(self.now, &packet);
+        }
+    }
+
+    fn run(&mut self, seconds: i64) {
+        for _ in 0..seconds * SECOND / STEP {
+            self.step();
+        }
+    }
+
+    fn ask(&mut self, command: Command) -> Result<(), CommandError> {
+        let id = self.client.request(self.now, command);
+        for _ in 0..1000 {
+            match self.client.status(id) {
+                CommandStatus::Pending => self.step(),
+                CommandStatus::Done => return Ok(()),
+                CommandStatus::Failed(error) => return Err(error),
+                CommandStatus::Unknown => panic!("forgotten"),
+            }
+        }
+        panic!("a command without an end");
+    }
+
+    fn flying(height_m: f64) -> Self {
+        let mut world = Self::new();
+        (world.px4.armed, world.px4.height_m) = (true, height_m);
+        world.run(2);
+        world
+    }
+}
+
+#[test]
+fn it_becomes_ready_by_px4s_own_messages() {
+    let world = World::new();
+    assert_eq!(world.client.firmware(), Some(Firmware::Px4));
+    assert!(world.client.state().unwrap().ready, "{:?}", world.client.not_ready_because());
+    assert!(!world.px4.intervals.contains_key(&193), "EKF_STATUS_REPORT is ArduPilot's");
+}
+
+#[test]
+fn a_takeoff_arms_rises_to_an_altitude_and_ends_in_offboard() {
+    let mut world = World::new();
+    let mut takeoff = Takeoff::new(10.0);
+    for _ in 0..60 * 50 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+        if takeoff.is_finished() {
+            break;
+        }
+    }
+    assert_eq!(takeoff.step(world.now, &mut world.client), TakeoffProgress::Done);
+    assert_eq!(world.px4.mode, FlightMode::OFFBOARD);
+    assert!((world.px4.height_m - 10.0).abs() < 0.2, "{} m", world.px4.height_m);
+    assert!(world.px4.setpoints.iter().all(|v| *v == [0.0; 3]), "the proof of life stands still");
+}
+
+#[test]
+fn offboard_is_entered_with_a_stream_and_lost_without_one() {
+    let mut world = World::flying(5.0);
+    world.ask(Command::SetMode(FlightMode::OFFBOARD)).unwrap();
+    for _ in 0..200 {
+        world.client.set_velocity(world.now, Vector::new(0.3, 0.0, 0.0), 0.0).unwrap();
+        world.step();
+    }
+    assert_eq!(world.px4.mode, FlightMode::OFFBOARD);
+    world.run(4);
+    assert_eq!(world.px4.mode, FlightMode::AUTO_HOLD, "its failsafe");
+    let refused = world.client.set_velocity(world.now, Vector::zero(), 0.0);
+    assert!(refused.unwrap_err().to_string().contains("PX4 HOLD"));
+}
+
+#[test]
+fn it_lands_in_its_own_mode_and_is_told_where_in_its_own_frame() {
+    let mut world = World::flying(5.0);
+    world.ask(Command::SetMode(Firmware::Px4.land().unwrap())).unwrap();
+    assert_eq!(world.px4.mode, FlightMode::AUTO_LAND);
+    let (in_body, in_local) = (Point::new(0.1, 0.2, 4.8), Point::new(3.0, 4.0, -0.2));
+    assert!(world.client.send_landing_target(world.now, in_body, in_local));
+    world.step();
+    assert_eq!(world.px4.landing_targets, [(1, [3.0, 4.0, -0.2])]);
+    world.ask(Command::SetMode(Firmware::Px4.precision_land().unwrap())).unwrap();
+    assert_eq!(world.px4.mode.to_string(), "PX4 PRECISION LAND");
+}
+
+#[test]
+fn a_pilots_switch_on_the_way_up_ends_the_takeoff() {
+    let mut world = World::new();
+    let mut takeoff = Takeoff::new(10.0);
+    let mut rises = false;
+    for _ in 0..60 * 50 {
+        world.step();
+        takeoff.step(world.now, &mut world.client);
+        rises |= world.px4.height_m > 3.0;
+        if rises {
+            // POSITION, by the sticks.
+            world.px4.mode = FlightMode::Px4(3 << 16);
+        }
+        if takeoff.is_finished() {
+            break;
+        }
+    }
+    let TakeoffProgress::Failed(problem) = takeoff.step(world.now, &mut world.client) else {
+        panic!("it went on");
+    };
+    assert!(problem.to_string().contains("PX4 POSITION"), "{problem}");
+}
