@@ -40,12 +40,12 @@ pub enum Verdict {
     /// The configured mount explains the detections.
     Agrees,
     /// Another one explains them, and the configured one does not.
-    Disagrees(Error),
+    Disagrees(Wrong),
 }
 
 /// What would explain the detections.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub enum Error {
+pub enum Wrong {
     /// The camera is turned about the vertical by so much more than is configured, in radians, clockwise seen from above.
     Turned(f64),
     /// The image is mirrored, and turned by so much.
@@ -137,7 +137,7 @@ impl Agreement {
         if best.squares > BETTER * configured + AGREES_BY {
             self.verdict = Verdict::Agrees;
         } else if configured > BETTER * best.squares + DISAGREES_BY && moves {
-            self.verdict = Verdict::Disagrees(Hypothesis::of(index).error());
+            self.verdict = Verdict::Disagrees(Hypothesis::of(index).wrong());
         }
     }
 }
@@ -170,15 +170,15 @@ impl Hypothesis {
         Self::Mount { turn, mirrored: index >= YAWS }
     }
 
-    fn error(&self) -> Error {
+    fn wrong(&self) -> Wrong {
         let wrapped = |turn: f64| {
             if turn > std::f64::consts::PI { turn - std::f64::consts::TAU } else { turn }
         };
         match *self {
-            Self::Mount { turn, mirrored: false } => Error::Turned(wrapped(turn)),
-            Self::Mount { turn, mirrored: true } => Error::Mirrored(wrapped(turn)),
-            Self::Roll => Error::RollSign,
-            Self::Pitch => Error::PitchSign,
+            Self::Mount { turn, mirrored: false } => Wrong::Turned(wrapped(turn)),
+            Self::Mount { turn, mirrored: true } => Wrong::Mirrored(wrapped(turn)),
+            Self::Roll => Wrong::RollSign,
+            Self::Pitch => Wrong::PitchSign,
         }
     }
 }
@@ -251,13 +251,13 @@ mod tests {
         let turned = |turn: f64| move |p: Vector<Body>, _| undone(p, -turn, false);
         for turn in [FRAC_PI_2, -FRAC_PI_2, PI] {
             let (verdict, _) = sway(turned(turn), 1.5, 0.03, 8.0);
-            let Verdict::Disagrees(Error::Turned(found)) = verdict else {
+            let Verdict::Disagrees(Wrong::Turned(found)) = verdict else {
                 unreachable!("{turn}: {verdict:?}")
             };
             assert!((found - turn).abs() < 1e-9, "{found} instead of {turn}");
         }
         let mirrored = |p: Vector<Body>, _| Vector::new(p.x(), -p.y(), p.z());
-        assert_eq!(sway(mirrored, 1.5, 0.03, 8.0).0, Verdict::Disagrees(Error::Mirrored(0.0)));
+        assert_eq!(sway(mirrored, 1.5, 0.03, 8.0).0, Verdict::Disagrees(Wrong::Mirrored(0.0)));
     }
 
     #[test]
@@ -268,7 +268,7 @@ mod tests {
             let other = Rotation::<Ned, Body>::from_euler(-roll, pitch, yaw);
             other.inverse() * (attitude * p)
         };
-        assert_eq!(sway(wrong, 1.5, 0.1, 8.0).0, Verdict::Disagrees(Error::RollSign));
+        assert_eq!(sway(wrong, 1.5, 0.1, 8.0).0, Verdict::Disagrees(Wrong::RollSign));
     }
 
     #[test]
@@ -288,7 +288,11 @@ mod tests {
             rate: Vector::zero(),
         };
         for i in 0..50 {
-            agreement.add(Timestamp::from_seconds(f64::from(i)), &motion, Point::new(1e200, 0.0, 1.0));
+            agreement.add(
+                Timestamp::from_seconds(f64::from(i)),
+                &motion,
+                Point::new(1e200, 0.0, 1.0),
+            );
         }
         assert_eq!(agreement.verdict(), Verdict::Open);
     }

@@ -214,6 +214,13 @@ pub struct PhaseConfig {
     pub search_spacing_m: f64,
     /// How far the search goes along either axis, in m (0 to 50).
     pub search_radius_m: f64,
+    /// Radius about the local origin that the search does not leave, in m; 0 sets none (0 to 10000).
+    pub fence_radius_m: f64,
+    /// Height over the local origin that neither search nor retry exceeds, in m; 0 sets none (0 to 1000).
+    pub fence_height_m: f64,
+    /// Longest wait before the descent for natural motion that shows whether camera and autopilot mean the same
+    /// directions, in s; 0 does not look (0 to 60).
+    pub self_test_s: f64,
     /// Longest approach before a hold, in s (1 to 600).
     pub approach_timeout_s: f64,
     /// Longest descent before a hold, in s (1 to 600).
@@ -242,6 +249,10 @@ pub struct PhaseConfig {
     pub land_timeout_s: f64,
     /// Longest time in LAND before the landing is aborted, in s (5 to 600).
     pub touchdown_timeout_s: f64,
+    /// Speed downwards without LAND, where the autopilot refuses it close to the ground, in m/s (0.1 to 1).
+    pub refused_descend_m_s: f64,
+    /// Height over the target below which the autopilot's LAND is not taken back any more, in m (0 to 20).
+    pub no_return_height_m: f64,
     /// Longest landing, from start to LAND, before it is aborted, in s (10 to 3600).
     pub landing_timeout_s: f64,
     /// Height over the local origin below which a start in LAND mode just watches the touchdown, in m (0 to 20).
@@ -273,6 +284,9 @@ impl Default for PhaseConfig {
             search_speed_m_s: 1.0,
             search_spacing_m: 2.0,
             search_radius_m: 5.0,
+            fence_radius_m: 0.0,
+            fence_height_m: 0.0,
+            self_test_s: 1.5,
             approach_timeout_s: 60.0,
             descend_timeout_s: 120.0,
             hold_timeout_s: 60.0,
@@ -287,6 +301,8 @@ impl Default for PhaseConfig {
             land_retry_s: 0.5,
             land_timeout_s: 5.0,
             touchdown_timeout_s: 60.0,
+            refused_descend_m_s: 0.3,
+            no_return_height_m: 1.0,
             landing_timeout_s: 300.0,
             watch_height_m: 2.0,
             on_abort: OnAbort::Hover,
@@ -426,6 +442,9 @@ impl PhaseConfig {
         check("phases.search_speed_m_s", self.search_speed_m_s, 0.0, 3.0)?;
         check("phases.search_spacing_m", self.search_spacing_m, 0.5, 20.0)?;
         check("phases.search_radius_m", self.search_radius_m, 0.0, 50.0)?;
+        check("phases.fence_radius_m", self.fence_radius_m, 0.0, 10_000.0)?;
+        check("phases.fence_height_m", self.fence_height_m, 0.0, 1_000.0)?;
+        check("phases.self_test_s", self.self_test_s, 0.0, 60.0)?;
         check("phases.approach_timeout_s", self.approach_timeout_s, 1.0, 600.0)?;
         check("phases.descend_timeout_s", self.descend_timeout_s, 1.0, 600.0)?;
         check("phases.hold_timeout_s", self.hold_timeout_s, 1.0, 600.0)?;
@@ -441,6 +460,8 @@ impl PhaseConfig {
         check("phases.land_retry_s", self.land_retry_s, 0.1, 5.0)?;
         check("phases.land_timeout_s", self.land_timeout_s, 0.5, 60.0)?;
         check("phases.touchdown_timeout_s", self.touchdown_timeout_s, 5.0, 600.0)?;
+        check("phases.refused_descend_m_s", self.refused_descend_m_s, 0.1, 1.0)?;
+        check("phases.no_return_height_m", self.no_return_height_m, 0.0, 20.0)?;
         check("phases.landing_timeout_s", self.landing_timeout_s, 10.0, 3600.0)?;
         check("phases.watch_height_m", self.watch_height_m, 0.0, 20.0)?;
         check("phases.release_after_s", self.release_after_s, 0.0, 60.0)

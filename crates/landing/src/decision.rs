@@ -33,6 +33,10 @@ pub enum Action {
         /// In rad/s, clockwise seen from above.
         yaw_rate: f64,
     },
+    /// Change back to the mode that follows setpoints. Given again, at the configured interval, until the mode changes.
+    Guided,
+    /// Stop the motors: the vehicle stands on the ground. Given again until they stand still.
+    Disarm,
     /// Change to the autopilot's own LAND mode. Given again, at the configured interval, until the mode changes.
     Land,
 }
@@ -155,6 +159,16 @@ named! {
         LandingTooLong = "landing-too-long", "aborted: the landing took too long";
         /// The marker was lost too often.
         RetriesUsed = "retries-used", "aborted: the marker was lost too often";
+        /// The autopilot does not enter LAND, so low that there is only one way.
+        LandingBySetpoints = "landing-by-setpoints", "the autopilot refuses LAND, going down without it: watch it and be ready to disarm";
+        /// Camera and autopilot do not mean the same directions.
+        CameraTurned = "camera-turned", "the camera's image moves as if it were mounted turned about the vertical, holding: check its mount";
+        /// The same.
+        ImageMirrored = "image-mirrored", "the camera's image moves as if it were mirrored, holding: check the camera's settings";
+        /// The same.
+        AttitudeSign = "attitude-sign", "the camera's image moves as if roll or pitch had the wrong sign, holding: check mount and autopilot";
+        /// The descent waits for motion that shows whether camera and autopilot mean the same directions.
+        SelfTest = "self-test", "looking whether camera and autopilot mean the same directions before descending";
         /// The autopilot did not enter its LAND mode.
         LandRefused = "land-refused", "aborted: the autopilot did not enter LAND";
         /// The autopilot did not reach the ground.

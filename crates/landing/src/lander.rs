@@ -1,12 +1,13 @@
 //! The landing decision as one function of time and events.
 
-use geometry::Vector;
+use geometry::{Ned, Point, Vector};
 
-use crate::config::{AlarmAction, Config, ConfigError, Guidance, OnAbort};
+use crate::agreement::{Agreement, Verdict, Wrong};
+use crate::config::{AlarmAction, Config, ConfigError, Guidance, OnAbort, PhaseConfig};
 use crate::decision::{Action, Decision, Reason, Rejection, TargetEstimate};
 use crate::envelope;
 use crate::estimator::Estimator;
-use crate::event::{Alarm, Event, Frame, MarkerInFrame, Mode, VehicleState};
+use crate::event::{Alarm, Event, Frame, Landed, MarkerInFrame, Mode, VehicleState};
 use crate::guidance::{Guide, Progress, Situation};
 use crate::history::History;
 use crate::phase::{Facts, Machine, Phase, VehicleFacts};
@@ -19,6 +20,9 @@ const FARTHEST: f64 = 1e6;
 
 /// For so long the guidance flies on while LAND is awaited, in seconds.
 const HAND_OVER_S: f64 = 1.0;
+
+/// The fence is looked ahead to over this time, in seconds.
+const FENCE_LEAD_S: f64 = 1.0;
 
 /// For so long an aborted landing climbs and stays before it falls silent, in seconds.
 const CLIMB_AWAY_S: f64 = 60.0;
@@ -33,6 +37,9 @@ pub struct Lander {
     sightings: Sightings,
     newest_frame: Option<Timestamp>,
     guide: Guide,
+    agreement: Agreement,
+    /// When the landing's first marker was seen.
+    first_seen: Option<Timestamp>,
     machine: Machine,
     land_asked: Option<Timestamp>,
     /// Height over the local origin at which the landing began, in metres.
@@ -76,6 +83,8 @@ impl Lander {
             sightings: Sightings::default(),
             newest_frame: None,
             guide: Guide::new(config.guidance),
+            agreement: Agreement::default(),
+            first_seen: None,
             machine: Machine::new(config.phases),
             land_asked: None,
             ceiling_m: 0.0,
@@ -100,14 +109,20 @@ impl Lander {
             now,
             operator,
             alarm,
-            vehicle: self.history.newest().map(|state| facts_of(state, now)),
+            vehicle: self.vehicle_facts(now),
             target_age_s: self.sightings.age_s(now),
             target_confirmed: self.sightings.in_a_row >= self.config.target.confirm_after,
             target_known: self.knows(now),
             progress: self.progress(now),
+            disagreement: self.disagreement(),
+            may_descend: self.is_tested(now),
         };
         if self.machine.advance(&facts) {
             self.guide = Guide::new(self.config.guidance);
+            self.first_seen = None;
+            if self.disagreement().is_some() {
+                self.agreement = Agreement::default();
+            }
             self.ceiling_m = self.history.newest().map_or(0.0, |state| -state.position.z());
         }
         let (action, why) = self.act(now);
@@ -129,7 +144,7 @@ impl Lander {
         if !state.is_finite() {
             return Err(Rejection::NotFinite);
         }
-        if (state.position - geometry::Point::origin()).norm() > FARTHEST
+        if (state.position - Point::origin()).norm() > FARTHEST
             || state.velocity.norm() > FARTHEST
         {
             return Err(Rejection::Implausible);
@@ -167,6 +182,11 @@ impl Lander {
         if marker.confidence < self.config.target.min_confidence {
             return Err(Rejection::LowConfidence);
         }
+        if let (Some(pose), Some(motion)) = (marker.body_from_marker, self.history.at(frame.stamp))
+        {
+            self.agreement.add(frame.stamp, &motion, pose.origin());
+        }
+        self.first_seen.get_or_insert(frame.stamp);
         match self.tracker.observe(frame, marker, &self.history) {
             Err(Rejection::NoPose) if !self.guide.needs_pose() => {}
             Err(rejection) => return Err(rejection),
@@ -199,6 +219,44 @@ impl Lander {
             Alarm::BatteryCritical => (phases.on_battery_critical, Reason::BatteryCritical),
             Alarm::OperatorLost => (phases.on_operator_lost, Reason::OperatorLost),
         }
+    }
+
+    fn vehicle_facts(&self, now: Timestamp) -> Option<VehicleFacts> {
+        let state = self.history.newest()?;
+        let altitude_m = -state.position.z();
+        Some(VehicleFacts {
+            age_s: now.seconds_since(state.stamp),
+            mode: state.mode,
+            armed: state.armed,
+            landed: state.landed,
+            altitude_m,
+            height_m: self.target(now).map_or(altitude_m, |target| target.height_m),
+        })
+    }
+
+    /// A pad that moves cannot show what the camera does, and the thesis' guidance stays as it was.
+    fn tests_itself(&self) -> bool {
+        let metric = matches!(self.config.guidance, Guidance::Metric(_));
+        metric && self.config.phases.self_test_s > 0.0 && self.config.estimator.pad_speed_m_s == 0.0
+    }
+
+    /// Why camera and autopilot do not mean the same directions.
+    fn disagreement(&self) -> Option<Reason> {
+        match self.agreement.verdict() {
+            Verdict::Disagrees(wrong) if self.tests_itself() => Some(match wrong {
+                Wrong::Turned(_) => Reason::CameraTurned,
+                Wrong::Mirrored(_) => Reason::ImageMirrored,
+                Wrong::RollSign | Wrong::PitchSign => Reason::AttitudeSign,
+            }),
+            _ => None,
+        }
+    }
+
+    /// True once camera and autopilot agree, or natural motion has not shown it in the time allowed.
+    fn is_tested(&self, now: Timestamp) -> bool {
+        let waited_s = self.first_seen.map_or(0.0, |seen| now.seconds_since(seen));
+        let over = waited_s > self.config.phases.self_test_s;
+        !self.tests_itself() || over || self.agreement.verdict() == Verdict::Agrees
     }
 
     fn knows(&self, now: Timestamp) -> bool {
@@ -276,6 +334,7 @@ impl Lander {
             Phase::Retry => (self.retry(now), why),
             Phase::Hold => (self.hold(now), why),
             Phase::Final if self.machine.is_landing() => (Action::None, why),
+            Phase::Final if why == Reason::LandingBySetpoints => (self.go_down(now), why),
             Phase::Final if handing_over && !self.asks_for_land(now) => (self.guided(now).0, why),
             Phase::Final => (self.ask_for_land(now), why),
             Phase::Aborted => (self.aborted(now), why),
@@ -287,8 +346,12 @@ impl Lander {
             return (Action::hover(), Reason::VehicleStale);
         };
         let situation = self.situation(now, &vehicle);
-        let (wanted, why) = self.guide.velocity(&situation);
-        let may_descend = self.guide.may_descend(&situation);
+        let (wanted, mut why) = self.guide.velocity(&situation);
+        let is_tested = self.is_tested(now) || self.machine.phase() != Phase::Approach;
+        let may_descend = self.guide.may_descend(&situation) && is_tested;
+        if !is_tested && wanted.z() > 0.0 {
+            why = Reason::SelfTest;
+        }
         let velocity = envelope::admit(&self.config.envelope, wanted, may_descend);
         let yaw_rate = self.guide.yaw_rate(&situation);
         self.guide.sent(velocity);
@@ -325,7 +388,20 @@ impl Lander {
         if wanted.norm() > 0.0 && -vehicle.position.z() < phases.regain_height_m {
             wanted = Vector::new(0.0, 0.0, -phases.regain_climb_m_s);
         }
+        let wanted = inside(phases, vehicle.position, wanted);
         let velocity = envelope::admit(&self.config.envelope, wanted, false);
+        Action::Velocity { velocity, yaw_rate: 0.0 }
+    }
+
+    /// Goes straight down where LAND is refused, and has the motors stopped on the ground.
+    fn go_down(&mut self, now: Timestamp) -> Action {
+        let down = self.history.newest().is_some_and(|state| state.landed == Landed::OnGround);
+        if down && self.asks_again(now) {
+            self.land_asked = Some(now);
+            return Action::Disarm;
+        }
+        let wanted = Vector::new(0.0, 0.0, self.config.phases.refused_descend_m_s);
+        let velocity = envelope::admit(&self.config.envelope, wanted, true);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
@@ -360,13 +436,20 @@ impl Lander {
     }
 
     fn asks_for_land(&self, now: Timestamp) -> bool {
-        let first = self.machine.elapsed_s(now) <= 0.0;
+        self.machine.elapsed_s(now) <= 0.0 || self.asks_again(now)
+    }
+
+    /// True at the interval at which modes and motors are asked for again.
+    fn asks_again(&self, now: Timestamp) -> bool {
         let again = |asked: Timestamp| now.seconds_since(asked) >= self.config.phases.land_retry_s;
-        first || self.land_asked.is_none_or(again)
+        self.land_asked.is_none_or(again)
     }
 
     fn aborted(&mut self, now: Timestamp) -> Action {
-        let phases = &self.config.phases;
+        let phases = self.config.phases;
+        if self.machine.recalls() {
+            return self.recall(now);
+        }
         let follows = self.history.newest().is_some_and(|state| {
             let fresh = now.seconds_since(state.stamp) <= phases.stale_vehicle_s;
             fresh && state.armed && state.mode == Mode::Guided
@@ -381,6 +464,15 @@ impl Lander {
             OnAbort::Climb if elapsed_s <= CLIMB_AWAY_S => self.climb_away(),
             OnAbort::Hover | OnAbort::Land | OnAbort::Climb => Action::None,
         }
+    }
+
+    /// Asks for the mode that follows setpoints, at once and at intervals.
+    fn recall(&mut self, now: Timestamp) -> Action {
+        if !self.asks_for_land(now) {
+            return Action::None;
+        }
+        self.land_asked = Some(now);
+        Action::Guided
     }
 
     /// Climbs to the height of aborted landings and stays there.
@@ -435,12 +527,13 @@ impl Sightings {
     }
 }
 
-fn facts_of(state: &VehicleState, now: Timestamp) -> VehicleFacts {
-    VehicleFacts {
-        age_s: now.seconds_since(state.stamp),
-        mode: state.mode,
-        armed: state.armed,
-        landed: state.landed,
-        altitude_m: -state.position.z(),
-    }
+/// The same velocity without what leads out of the fence; the way back stays open.
+fn inside(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
+    let ahead = place + wanted * FENCE_LEAD_S;
+    let far = |p: Point<Ned>| p.x().hypot(p.y());
+    let radius_m = phases.fence_radius_m;
+    let leaves = radius_m > 0.0 && far(ahead) > radius_m && far(ahead) > far(place);
+    let too_high = phases.fence_height_m > 0.0 && -ahead.z() > phases.fence_height_m;
+    let (x, y) = if leaves { (0.0, 0.0) } else { (wanted.x(), wanted.y()) };
+    Vector::new(x, y, if too_high { wanted.z().max(0.0) } else { wanted.z() })
 }

@@ -9,9 +9,10 @@
 //!
 //! Modules in reading order: [`event`] is what the lander is told and [`decision`] what it answers, [`config`] has
 //! every number; [`lander`] joins [`history`] (the vehicle a moment ago), [`estimator`] (where the landing point is; [`target`] for the thesis' guidance),
-//! [`guidance`] (target to velocity), [`phase`] (what comes next), [`search`] (where to look) and [`envelope`] (the last look at a setpoint);
+//! [`guidance`] (target to velocity), [`agreement`] (do camera and autopilot mean the same directions), [`phase`] (what comes next), [`search`] (where to look) and [`envelope`] (the last look at a setpoint);
 //! [`time`] has the stamps.
 
+pub mod agreement;
 pub mod config;
 pub mod decision;
 pub mod envelope;

@@ -20,13 +20,15 @@
 //!     Hold --> Search: seen, resumed, vehicle heard again
 //!     Hold --> Aborted: held too long
 //!     Final --> Landed: disarmed
-//!     Final --> Aborted: LAND refused, no touchdown
+//!     Final --> Final: LAND refused close to the ground, down by setpoints
+//!     Final --> Aborted: LAND refused, no touchdown, operator's abort while still high
 //!     Landed --> [*]
 //!     Aborted --> [*]
 //! ```
 //!
 //! From every phase that is not terminal: the operator's abort and too long a landing lead to Aborted, the operator's hold to Hold
-//! (not once the autopilot lands), a stale vehicle state to Hold (Final just waits), a mode that is neither GUIDED nor the
+//! (not once the autopilot lands: then an abort takes it back to GUIDED, but not below `no_return_height_m`), a camera and
+//! an autopilot that do not mean the same directions to Hold, a stale vehicle state to Hold (Final just waits), a mode that is neither GUIDED nor the
 //! LAND we asked for to PilotInCommand, the ground to Final, disarmed motors to Landed or Aborted, an alarm to what is
 //! configured for it. Idle, Landed, Aborted and PilotInCommand are terminal: only a new start leaves them.
 //!
@@ -36,12 +38,12 @@
 //! | Approach, Descend | `approach_timeout_s`, `descend_timeout_s` | Hold |
 //! | Retry | `retry_timeout_s`, and `retries` times | Search |
 //! | Hold | `hold_timeout_s`, by the operator `operator_hold_timeout_s` | Aborted |
-//! | Final | `land_timeout_s` until LAND, `touchdown_timeout_s` until the ground | Aborted, Landed |
+//! | Final | `land_timeout_s` until LAND, `touchdown_timeout_s` until the ground, both ways | Aborted, Landed |
 //! | all together until LAND | `landing_timeout_s` | Aborted |
 
 use std::fmt;
 
-use crate::config::{AlarmAction, PhaseConfig};
+use crate::config::{AlarmAction, OnAbort, PhaseConfig};
 use crate::decision::Reason;
 use crate::event::{Landed, Mode, OperatorCommand};
 use crate::guidance::Progress;
@@ -94,6 +96,10 @@ pub struct Facts {
     pub target_known: bool,
     /// How far the guidance is.
     pub progress: Progress,
+    /// Why camera and autopilot do not mean the same directions; `None` while nothing shows it.
+    pub disagreement: Option<Reason>,
+    /// False while it is still looked whether they do.
+    pub may_descend: bool,
 }
 
 /// The vehicle as far as phases care.
@@ -109,6 +115,8 @@ pub struct VehicleFacts {
     pub landed: Landed,
     /// Height over the autopilot's local origin, in metres.
     pub altitude_m: f64,
+    /// Height over the target, or over the local origin while no target is known, in metres.
+    pub height_m: f64,
 }
 
 /// The machine: a phase, since when, and why.
@@ -123,6 +131,8 @@ pub struct Machine {
     landing: bool,
     /// Somebody has taken an aborted vehicle over, so it is never spoken to again.
     released: bool,
+    /// The aborted vehicle is being taken back from LAND.
+    recalls: bool,
     /// Retries of this landing so far.
     retries: u32,
 }
@@ -167,6 +177,7 @@ impl Machine {
             started: Timestamp::default(),
             landing: false,
             released: false,
+            recalls: false,
             retries: 0,
         }
     }
@@ -194,6 +205,11 @@ impl Machine {
     /// True when somebody has taken an aborted vehicle over.
     pub fn is_released(&self) -> bool {
         self.released
+    }
+
+    /// True while an aborted vehicle is being taken back from LAND.
+    pub fn recalls(&self) -> bool {
+        self.recalls
     }
 
     /// Takes at most one step; true when a landing has just begun.
@@ -252,6 +268,7 @@ impl Machine {
     }
 
     fn enter(&mut self, phase: Phase, why: Reason, now: Timestamp) {
+        self.recalls = phase == Phase::Aborted && self.landing && why == Reason::OperatorAbort;
         self.phase = phase;
         self.why = why;
         self.entered = now;
@@ -260,9 +277,10 @@ impl Machine {
 
     /// After an abort, the first mode that is not ours ends our say.
     fn watch_release(&mut self, facts: &Facts) {
-        if let Some(vehicle) = facts.vehicle {
-            self.released |= vehicle.mode != Mode::Guided;
-        }
+        let Some(vehicle) = facts.vehicle else { return };
+        let in_time = !self.over(facts, self.config.land_timeout_s);
+        self.recalls &= vehicle.mode == Mode::Land && in_time;
+        self.released |= vehicle.mode != Mode::Guided && !self.recalls;
     }
 
     /// What ends or stops a landing in whatever phase it is.
@@ -277,7 +295,7 @@ impl Machine {
                 return Some(self.disarmed(vehicle));
             }
         }
-        if facts.operator == Some(OperatorCommand::Abort) {
+        if facts.operator == Some(OperatorCommand::Abort) && self.can_abort(facts) {
             return Some((Phase::Aborted, Reason::OperatorAbort));
         }
         if self.landing {
@@ -288,7 +306,7 @@ impl Machine {
         {
             match action {
                 AlarmAction::Ignore => {}
-                AlarmAction::Hold => return Some((Phase::Hold, Reason::OperatorHold)),
+                AlarmAction::Hold => return Some((Phase::Hold, why)),
                 AlarmAction::Abort => return Some((Phase::Aborted, why)),
                 AlarmAction::Land => return Some((Phase::Final, why)),
             }
@@ -299,11 +317,23 @@ impl Machine {
         if facts.now.seconds_since(self.started) > self.config.landing_timeout_s {
             return Some((Phase::Aborted, Reason::LandingTooLong));
         }
+        let moves =
+            matches!(self.phase, Phase::Search | Phase::Approach | Phase::Descend | Phase::Retry);
+        if let Some(why) = facts.disagreement.filter(|_| moves) {
+            return Some((Phase::Hold, why));
+        }
         let touched = facts.vehicle.is_some_and(|vehicle| vehicle.landed == Landed::OnGround);
         if touched && self.phase != Phase::Final {
             return Some((Phase::Final, Reason::TouchedEarly));
         }
         None
+    }
+
+    /// Once the autopilot lands, only a vehicle that is still high is taken back, and only to do something else.
+    fn can_abort(&self, facts: &Facts) -> bool {
+        let high =
+            facts.vehicle.is_some_and(|vehicle| vehicle.height_m > self.config.no_return_height_m);
+        !self.landing || high && self.config.on_abort != OnAbort::Land
     }
 
     fn disarmed(&self, vehicle: VehicleFacts) -> (Phase, Reason) {
@@ -351,8 +381,8 @@ impl Machine {
             Progress::Blind => Some((Phase::Descend, Reason::DescendingUnseen)),
             _ if self.lost(facts) => Some(self.again(facts, Reason::Retrying)),
             Progress::Stuck => Some(self.again(facts, Reason::NotSettling)),
-            Progress::Descending => Some((Phase::Descend, Reason::Descending)),
-            Progress::Aligning | Progress::Unchanged => self
+            Progress::Descending if facts.may_descend => Some((Phase::Descend, Reason::Descending)),
+            Progress::Descending | Progress::Aligning | Progress::Unchanged => self
                 .over(facts, self.config.approach_timeout_s)
                 .then_some((Phase::Hold, Reason::NoProgress)),
         }
@@ -396,7 +426,13 @@ impl Machine {
         if facts.operator == Some(OperatorCommand::Resume) {
             return Some((Phase::Search, Reason::Searching));
         }
-        let by_operator = self.why == Reason::OperatorHold;
+        let by_operator = matches!(
+            self.why,
+            Reason::OperatorHold
+                | Reason::BatteryLow
+                | Reason::BatteryCritical
+                | Reason::OperatorLost
+        );
         let timeout_s = if by_operator {
             self.config.operator_hold_timeout_s
         } else {
@@ -414,10 +450,22 @@ impl Machine {
     }
 
     fn after_final(&mut self, facts: &Facts) -> Option<(Phase, Reason)> {
-        if !self.landing {
+        if self.why == Reason::LandingBySetpoints {
             return self
-                .over(facts, self.config.land_timeout_s)
+                .over(facts, self.config.touchdown_timeout_s)
                 .then_some((Phase::Aborted, Reason::LandRefused));
+        }
+        if !self.landing {
+            // So close to the ground there is no other way: hovering there for good helps nobody.
+            let low = matches!(
+                self.why,
+                Reason::LowAndAligned | Reason::LowAndUnseen | Reason::TouchedEarly
+            );
+            return self.over(facts, self.config.land_timeout_s).then_some(if low {
+                (Phase::Final, Reason::LandingBySetpoints)
+            } else {
+                (Phase::Aborted, Reason::LandRefused)
+            });
         }
         if !self.over(facts, self.config.touchdown_timeout_s) {
             return None;
@@ -454,6 +502,7 @@ mod tests {
         armed: true,
         landed: Landed::InAir,
         altitude_m: 5.0,
+        height_m: 5.0,
     };
 
     fn at(seconds: f64) -> Facts {
@@ -466,6 +515,8 @@ mod tests {
             target_confirmed: false,
             target_known: false,
             progress: Progress::Unchanged,
+            disagreement: None,
+            may_descend: true,
         }
     }
 
@@ -557,13 +608,58 @@ mod tests {
             Reason::LandingTooLong,
         );
         let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
-        check(&[approach[0], approach[1], ready, at(14.1)], Phase::Aborted, Reason::LandRefused);
+        let refused = [approach[0], approach[1], ready, at(14.1), at(74.2)];
+        check(&refused[..4], Phase::Final, Reason::LandingBySetpoints);
+        check(&refused, Phase::Aborted, Reason::LandRefused);
+        let alarm = Facts { alarm: Some((AlarmAction::Land, Reason::BatteryCritical)), ..at(1.0) };
+        check(&[start(), alarm, at(6.1)], Phase::Aborted, Reason::LandRefused);
         let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
         check(
             &[approach[0], approach[1], ready, land(9.1), land(69.3)],
             Phase::Aborted,
             Reason::TouchdownOverdue,
         );
+    }
+
+    #[test]
+    fn land_is_taken_back_while_it_is_high_and_not_below() {
+        let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+        let land = |seconds, height_m| {
+            flown(seconds, move |v| (v.mode, v.height_m) = (Mode::Land, height_m))
+        };
+        let abort = |facts| Facts { operator: Some(OperatorCommand::Abort), ..facts };
+        let way = [start(), seen(1.0, Progress::Unchanged), ready, land(9.2, 3.0)];
+        let [a, b, c, d] = way;
+        check(&[a, b, c, d, abort(land(9.3, 0.5))], Phase::Final, Reason::AutopilotLands);
+        check(&[a, b, c, d, abort(land(9.3, 3.0))], Phase::Aborted, Reason::OperatorAbort);
+        let after = |facts: &[Facts]| {
+            let mut machine = Machine::new(PhaseConfig::default());
+            way.iter().chain([&abort(land(9.3, 3.0))]).chain(facts).for_each(|facts| {
+                machine.advance(facts);
+            });
+            (machine.recalls(), machine.is_released())
+        };
+        assert_eq!(after(&[]), (true, false));
+        assert_eq!(after(&[land(9.4, 3.0)]), (true, false));
+        assert_eq!(after(&[land(9.4, 3.0), at(9.6)]), (false, false), "it follows again");
+        assert_eq!(after(&[land(15.0, 1.0)]), (false, true), "it did not come back");
+        assert_eq!(after(&[flown(9.4, |v| v.mode = Mode::Other)]), (false, true));
+        let landing = PhaseConfig { on_abort: OnAbort::Land, ..PhaseConfig::default() };
+        let mut machine = Machine::new(landing);
+        for facts in way.iter().chain([&abort(land(9.3, 3.0))]) {
+            machine.advance(facts);
+        }
+        assert_eq!(machine.phase(), Phase::Final, "it lands already");
+    }
+
+    #[test]
+    fn a_camera_that_disagrees_is_held_for_and_an_open_question_keeps_it_up() {
+        let open = Facts { may_descend: false, ..seen(2.0, Progress::Descending) };
+        check(&[start(), seen(1.0, Progress::Unchanged), open], Phase::Approach, Reason::Aligning);
+        let turned = Facts { disagreement: Some(Reason::CameraTurned), ..open };
+        let way = [start(), seen(1.0, Progress::Unchanged), turned, turned];
+        check(&way, Phase::Hold, Reason::CameraTurned);
+        check(&[way[0], way[1], way[2], at(63.0)], Phase::Aborted, Reason::HeldTooLong);
     }
 
     #[test]
@@ -622,7 +718,7 @@ mod tests {
         use std::collections::{HashMap, VecDeque};
 
         /// What tells two states apart.
-        type Key = (Phase, Reason, bool, bool, u32, [bool; 4], bool);
+        type Key = (Phase, Reason, bool, bool, bool, u32, [bool; 4], bool);
 
         const LONG_S: f64 = 1e6;
 
@@ -648,7 +744,8 @@ mod tests {
             let (over, late) = if terminal { ([false; 4], false) } else { (over, late) };
             let released = machine.phase == Phase::Aborted && machine.released;
             let retries = if terminal { 0 } else { machine.retries };
-            (machine.phase, machine.why, machine.landing, released, retries, over, late)
+            let recalls = machine.recalls;
+            (machine.phase, machine.why, machine.landing, released, recalls, retries, over, late)
         }
 
         /// The same machine, so much later, with its moments moved so that it is always the same time.
@@ -675,7 +772,7 @@ mod tests {
                 Some(FLYING),
                 change(|v| v.age_s = 1.0),
                 change(|v| v.mode = Mode::Land),
-                change(|v| (v.mode, v.altitude_m) = (Mode::Land, 0.4)),
+                change(|v| (v.mode, v.altitude_m, v.height_m) = (Mode::Land, 0.4, 0.4)),
                 change(|v| v.mode = Mode::Other),
                 change(|v| v.armed = false),
                 change(|v| (v.armed, v.landed) = (false, Landed::OnGround)),
@@ -729,12 +826,16 @@ mod tests {
                                     target_confirmed: true,
                                     target_known,
                                     progress,
+                                    disagreement: None,
+                                    may_descend: true,
                                 });
                             }
                         }
                     }
                 }
             }
+            let turned = Some(Reason::CameraTurned);
+            all.push(Facts { disagreement: turned, may_descend: false, now: now(), ..at(0.0) });
             all
         }
 
@@ -764,7 +865,8 @@ mod tests {
                 );
             }
             if facts.operator == Some(OperatorCommand::Abort) {
-                assert!(to.is_terminal(), "an abort is not obeyed: {told}");
+                let too_late = before.landing && vehicle.is_none_or(|v| v.height_m < 1.0);
+                assert!(to.is_terminal() || too_late, "an abort is not obeyed: {told}");
             }
             assert!(after.retries <= before.config.retries, "too many retries: {told}");
         }

@@ -4,7 +4,7 @@
 use geometry::{Body, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
     Action, Alarm, Config, Event, Frame, Guidance, Landed, Lander, MarkerInFrame, Mode,
-    OperatorCommand, Phase, ThesisConfig, Timestamp, VehicleState,
+    OperatorCommand, Phase, Reason, ThesisConfig, Timestamp, VehicleState,
 };
 use proptest::prelude::*;
 
@@ -195,7 +195,8 @@ impl Watcher {
         prop_assert!(!self.pilot_flies || decision.action == Action::None);
         match decision.action {
             Action::None => {}
-            Action::Land => prop_assert_eq!(decision.phase, Phase::Final),
+            Action::Land | Action::Disarm => prop_assert_eq!(decision.phase, Phase::Final),
+            Action::Guided => prop_assert_eq!(decision.phase, Phase::Aborted),
             Action::Velocity { velocity, yaw_rate } => {
                 prop_assert!(velocity.is_finite() && yaw_rate == 0.0);
                 prop_assert!(velocity.horizontal_norm() <= config.envelope.horizontal_m_s + 1e-9);
@@ -207,6 +208,11 @@ impl Watcher {
                         decision.phase,
                         Phase::Approach | Phase::Descend | Phase::Final
                     ));
+                    // The autopilot refuses LAND, and the vehicle is too low to stay.
+                    if decision.why == Reason::LandingBySetpoints {
+                        prop_assert!(velocity.z() <= config.phases.refused_descend_m_s);
+                        return Ok(());
+                    }
                     self.may_descend(config, now, decision.target.map(|t| t.height_m))?;
                 }
             }

@@ -2,13 +2,14 @@
 
 mod world;
 
-use geometry::Point;
+use geometry::{Point, Rotation, Vector};
 use landing::{
-    Action, Config, Guidance, MetricConfig, OnAbort, OperatorCommand, Phase, Reason, ThesisConfig,
+    Action, Config, Event, Guidance, Landed, Lander, MetricConfig, Mode, OnAbort, OperatorCommand,
+    Phase, Reason, ThesisConfig, Timestamp, VehicleState,
 };
 use world::autopilot::Estimator;
 use world::eyes::Faults;
-use world::{Flight, Scene};
+use world::{Flight, Sample, Scene};
 
 /// The median and the largest of what `of` says about the flights.
 fn spread(flights: &[Flight], of: fn(&Flight) -> f64) -> (f64, f64) {
@@ -50,7 +51,7 @@ fn deepest(flight: &Flight, from_s: f64, to_s: f64) -> f64 {
     let within = flight.samples.iter().filter(|s| (from_s..to_s).contains(&s.seconds));
     within.fold(0.0, |deepest, sample| match sample.decision.action {
         Action::Velocity { velocity, .. } => velocity.z().max(deepest),
-        Action::None | Action::Land => deepest,
+        Action::None | Action::Land | Action::Guided | Action::Disarm => deepest,
     })
 }
 
@@ -247,12 +248,48 @@ fn the_operator_can_hold_resume_and_abort() {
 }
 
 #[test]
-fn land_is_asked_for_again_and_given_up_when_refused() {
+fn land_is_asked_for_again_and_done_without_when_refused() {
     let flight = Scene { refuses_land: true, limit_s: 40.0, ..Scene::new(1) }.fly();
     let asked = flight.samples.iter().filter(|s| s.decision.action == Action::Land).count();
     assert!((8..=12).contains(&asked), "{asked}");
-    let last = flight.samples.last().unwrap();
-    assert_eq!((last.decision.phase, last.decision.why), (Phase::Aborted, Reason::LandRefused));
+    let told = |s: &Sample| s.decision.why == Reason::LandingBySetpoints;
+    assert!(flight.samples.iter().any(told), "the pilot is told");
+    assert_eq!(flight.phase, Phase::Landed);
+    assert!(flight.error_m < 0.15 && flight.land_s.is_none(), "{} m", flight.error_m);
+    // It is stopped on the ground, and does not wait for the autopilot to find it idle.
+    let (touched_s, stopped_s) = (flight.touchdown_s.unwrap(), flight.disarm_s.unwrap());
+    assert!(stopped_s - touched_s < 6.0, "{} s", stopped_s - touched_s);
+}
+
+#[test]
+fn an_abort_takes_the_vehicle_back_from_land_while_it_is_high() {
+    let mut config = Config::default();
+    config.phases.on_battery_low = landing::AlarmAction::Land;
+    let mut lander = Lander::new(config).unwrap();
+    let mut tell = |seconds: f64, mode: Mode, event: Option<Event>| {
+        let now = Timestamp::from_seconds(seconds);
+        let state = VehicleState {
+            stamp: now,
+            ned_from_body: Rotation::identity(),
+            position: Point::new(0.0, 0.0, -6.0),
+            velocity: Vector::zero(),
+            mode,
+            armed: true,
+            landed: Landed::InAir,
+        };
+        lander.step(now, Event::Vehicle(state));
+        lander.step(now, event.unwrap_or(Event::Tick))
+    };
+    tell(1.0, Mode::Guided, Some(Event::Operator(OperatorCommand::Start)));
+    let alarmed = tell(1.1, Mode::Guided, Some(Event::Alarm(landing::Alarm::BatteryLow)));
+    assert_eq!((alarmed.action, alarmed.why), (Action::Land, Reason::BatteryLow));
+    assert_eq!(tell(1.3, Mode::Land, None).why, Reason::AutopilotLands);
+    let aborted = tell(2.0, Mode::Land, Some(Event::Operator(OperatorCommand::Abort)));
+    assert_eq!((aborted.phase, aborted.action), (Phase::Aborted, Action::Guided));
+    assert_eq!(tell(2.1, Mode::Land, None).action, Action::None, "not at every tick");
+    assert_eq!(tell(2.6, Mode::Land, None).action, Action::Guided, "but again");
+    assert_eq!(tell(2.8, Mode::Guided, None).action, Action::hover());
+    assert_eq!(tell(9.0, Mode::Guided, None).action, Action::None, "and then it is silent");
 }
 
 #[test]

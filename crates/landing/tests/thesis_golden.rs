@@ -11,6 +11,8 @@ fn mix(hash: u64, decision: &Decision) -> u64 {
     let numbers = match decision.action {
         Action::None => [1, 0, 0, 0, 0],
         Action::Land => [2, 0, 0, 0, 0],
+        Action::Guided => [4, 0, 0, 0, 0],
+        Action::Disarm => [5, 0, 0, 0, 0],
         Action::Velocity { velocity, yaw_rate } => [
             3,
             velocity.x().to_bits(),

@@ -110,6 +110,8 @@ pub(crate) struct Autopilot {
 pub(crate) enum Packet {
     Velocity(Vector<Ned>, f64),
     Land,
+    Guided,
+    Disarm,
 }
 
 impl Autopilot {
@@ -234,6 +236,14 @@ impl Autopilot {
                     self.mode = Mode::Land;
                     self.land_s = Some(now_s);
                     self.restart();
+                }
+                Some((_, Packet::Guided)) => {
+                    self.mode = Mode::Guided;
+                    self.setpoint = (now_s, Vector::zero(), 0.0);
+                    self.restart();
+                }
+                Some((_, Packet::Disarm)) if self.touchdown_s.is_some() => {
+                    self.disarm_s.get_or_insert(now_s);
                 }
                 _ => {}
             }

@@ -65,6 +65,13 @@ impl Faults {
     };
 }
 
+/// What a camera sees that is not mounted as the controller was told.
+fn misread(scene: &Scene, v: Vector<Body>) -> Vector<Body> {
+    let (sin, cos) = scene.camera_turned_rad.sin_cos();
+    let (x, y) = (cos * v.x() + sin * v.y(), cos * v.y() - sin * v.x());
+    Vector::new(x, if scene.mirrored { -y } else { y }, v.z())
+}
+
 /// The camera, its detector, and the frames on their way.
 pub(crate) struct Eyes {
     random: ChaCha8Rng,
@@ -214,7 +221,7 @@ impl Eyes {
         let part = EDGE_NOISE_PX / size_px;
         let range = centre.z() * (1.0 + part * noise[2]) * (1.0 + scene.faults.size_error);
         let from_camera = ray * (range / ray.z());
-        let place = from_camera + mount;
+        let place = misread(scene, from_camera) + mount;
         let heading = body_from_ned
             * Rotation::<Ned, Marker>::from_euler(
                 std::f64::consts::PI,

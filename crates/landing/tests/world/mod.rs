@@ -62,6 +62,10 @@ pub(crate) struct Scene {
     pub(crate) tells_covariance: bool,
     /// Size of the marker relative to the thesis'.
     pub(crate) marker_scale: f64,
+    /// The camera is turned about the vertical by so much more than the controller was told, clockwise seen from above.
+    pub(crate) camera_turned_rad: f64,
+    /// Its image is mirrored.
+    pub(crate) mirrored: bool,
     /// From sending a packet to its effect in the autopilot, in seconds.
     pub(crate) link_s: f64,
     /// The autopilot is neither heard nor reached between these seconds.
@@ -136,6 +140,8 @@ impl Scene {
             stamp_error_s: 0.0,
             tells_covariance: true,
             marker_scale: 1.0,
+            camera_turned_rad: 0.0,
+            mirrored: false,
             link_s: 0.03,
             link_lost_s: None,
             commands: vec![(0.0, OperatorCommand::Start)],
@@ -354,6 +360,8 @@ impl World {
         match decision.action {
             Action::None => {}
             Action::Land => self.autopilot.send(self.seconds, Packet::Land),
+            Action::Guided => self.autopilot.send(self.seconds, Packet::Guided),
+            Action::Disarm => self.autopilot.send(self.seconds, Packet::Disarm),
             Action::Velocity { velocity, yaw_rate } => {
                 if is_frame || self.seconds - self.sent_s >= SETPOINT_PERIOD_S - 1e-6 {
                     self.sent_s = self.seconds;
