@@ -18,12 +18,18 @@ pub struct Config {
     pub start: Start,
     /// Height of the take-off in metres.
     pub takeoff_height_m: f64,
+    /// Who steers.
+    pub mode: Mode,
     /// Which guidance is used.
     pub guidance: GuidanceName,
     /// The marker to land on.
     pub marker: String,
     /// The link to the autopilot.
     pub autopilot: AutopilotSettings,
+    /// What the autopilot's own precision landing is told.
+    pub landing_target: LandingTargetSettings,
+    /// What is watched beside the landing.
+    pub alarms: AlarmSettings,
     /// The choice of the detector.
     pub detectors: DetectorSettings,
     /// Which detections are used at all.
@@ -38,6 +44,54 @@ pub struct Config {
     pub metric: MetricConfig,
     /// The thesis' guidance.
     pub thesis: ThesisConfig,
+}
+
+/// Who steers.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Mode {
+    /// We do, by velocity setpoints.
+    Guided,
+    /// The autopilot's own precision landing, which is told where the landing point is.
+    LandingTarget,
+}
+
+/// What the autopilot's own precision landing is told.
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LandingTargetSettings {
+    /// What is sent.
+    pub source: LandingTargetSource,
+    /// For how long it is sent without a gap before LAND is asked for, in seconds.
+    pub steady_s: f64,
+}
+
+/// What is sent as the landing target.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LandingTargetSource {
+    /// The estimate, as seen from the vehicle's newest state.
+    Estimate,
+    /// Each detection as it is, with the stamp of its frame; PX4 is told the estimate all the same.
+    Detection,
+}
+
+/// What is watched beside the landing.
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AlarmSettings {
+    /// Charge below which the battery is low, from 0 to 1.
+    pub battery_low: f64,
+    /// Charge below which it is nearly empty, from 0 to 1.
+    pub battery_critical: f64,
+    /// Voltage below which it is low, in V.
+    pub battery_low_v: f64,
+    /// Voltage below which it is nearly empty, in V.
+    pub battery_critical_v: f64,
+    /// For how long it must be so, in seconds.
+    pub battery_s: f64,
+    /// Silence after which an operator who was heard is lost, in seconds; 0 does not watch.
+    pub operator_lost_s: f64,
 }
 
 /// When the landing begins.
@@ -76,6 +130,10 @@ pub struct AutopilotSettings {
     pub state_rate_hz: f64,
     /// How often setpoints are sent, in Hz.
     pub setpoint_rate_hz: f64,
+    /// Whether to ask for the autopilot's clock.
+    pub timesync: bool,
+    /// The vehicle's drag, from which the wind is told, in 1/s; 0 tells none.
+    pub drag_per_s: f64,
 }
 
 /// The choice of the detector.
@@ -124,6 +182,9 @@ impl Settings for Config {
         if !self.detectors.preferred.is_empty() {
             check.name("detectors.preferred", &self.detectors.preferred);
         }
+        check.range("autopilot.drag_per_s", self.autopilot.drag_per_s, 0.0..=5.0);
+        check.range("landing_target.steady_s", self.landing_target.steady_s, 0.0..=30.0);
+        self.alarms.check(check);
         self.detectors.check(check);
         // Both guidances are checked, used or not: a wrong number should not wait for the day it is used.
         for guidance in [Guidance::Metric(self.metric), Guidance::Thesis(self.thesis)] {
@@ -132,6 +193,17 @@ impl Settings for Config {
                 check.range(key, problem.value, min..=max);
             }
         }
+    }
+}
+
+impl AlarmSettings {
+    fn check(&self, check: &mut Check<'_>) {
+        check.range("alarms.battery_low", self.battery_low, 0.0..=1.0);
+        check.range("alarms.battery_critical", self.battery_critical, 0.0..=1.0);
+        check.range("alarms.battery_low_v", self.battery_low_v, 0.0..=100.0);
+        check.range("alarms.battery_critical_v", self.battery_critical_v, 0.0..=100.0);
+        check.range("alarms.battery_s", self.battery_s, 0.0..=60.0);
+        check.range("alarms.operator_lost_s", self.operator_lost_s, 0.0..=600.0);
     }
 }
 
@@ -161,6 +233,16 @@ impl Config {
             estimator: self.estimator,
             envelope: self.envelope,
             phases: self.phases,
+        }
+    }
+}
+
+impl Mode {
+    /// Its name in the configuration.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Guided => "guided",
+            Self::LandingTarget => "landing-target",
         }
     }
 }
@@ -206,6 +288,8 @@ mod tests {
         check("autopilot.address=usb", &["autopilot.address", "usb"]);
         check("marker=aruco-4x4-50:x7", &["`marker`", "FAMILY:ID"]);
         check("guidance=magic", &["magic", "metric"]);
+        check("mode=magic", &["magic", "landing-target"]);
+        check("alarms.battery_low=30", &["`alarms.battery_low` = 30", "from 0 to 1"]);
         check("metric.gain=1", &["no key `metric.gain`"]);
     }
 }

@@ -7,8 +7,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{
-    Autopilot, Command, Event, FlightMode, Frame, Takeoff, TakeoffError, TakeoffProgress,
+    Autopilot, Command, CommandId, CommandStatus, Event, Firmware, FlightMode, Frame, Takeoff,
+    TakeoffError, TakeoffProgress,
 };
 use geometry::Vector;
 use landing::{Action, Decision, Event as LanderEvent, Lander, OperatorCommand, Phase, Timestamp};
@@ -18,8 +20,11 @@ use messages::{
 };
 use node::{HealthCounters, clock_name};
 
-use crate::config::{Config, DetectorSettings, PreferredPlace, Start};
+use crate::alarms::Alarms;
+use crate::config::{Config, DetectorSettings, LandingTargetSource, Mode, PreferredPlace, Start};
+use crate::feed::{self, Feed};
 use crate::selection::{Limits, MOST, Preference, Selection, Sight};
+use crate::wind::WindEstimate;
 use crate::wire;
 
 /// The latency that matters, as health and status name it.
@@ -44,6 +49,14 @@ pub struct Flight {
     used_stamp_ns: Option<i64>,
     /// Stamp of the newest frame that was used, with a marker in it or without.
     looked_stamp_ns: i64,
+    /// Late frames of the active detector are used only if they are newer than the last one of its predecessor.
+    handover_stamp_ns: i64,
+    /// The autopilot's own precision landing, where that steers.
+    feed: Option<Feed>,
+    alarms: Alarms,
+    wind: WindEstimate,
+    /// The way back to the mode that follows setpoints, or the stop of the motors, as it was asked for last.
+    asked: Option<CommandId>,
     detections_used: u64,
     started_ns: Option<i64>,
     disarmed_ns: Option<i64>,
@@ -61,6 +74,8 @@ enum Mission {
     TakesOff { takeoff: Takeoff, why: String },
     /// The lander decides.
     Lands,
+    /// The autopilot's own precision landing decides.
+    Feeds,
     /// Nothing more happens without a command.
     Failed { why: String },
 }
@@ -84,6 +99,12 @@ impl Flight {
             system_id: Some(settings.system_id).filter(|id| *id != 0),
             our_component: settings.component_id,
             streams: autopilot::client::default_streams(settings.state_rate_hz),
+            parameters: if config.mode == Mode::LandingTarget {
+                feed::PARAMETERS.to_vec()
+            } else {
+                Vec::new()
+            },
+            timesync: settings.timesync,
             ..autopilot::Config::default()
         });
         Ok(Self {
@@ -99,6 +120,12 @@ impl Flight {
             setpoint_ns: i64::MIN,
             used_stamp_ns: None,
             looked_stamp_ns: i64::MIN,
+            handover_stamp_ns: i64::MIN,
+            feed: (config.mode == Mode::LandingTarget)
+                .then(|| Feed::new(config.landing_target, config.phases.search_timeout_s)),
+            alarms: Alarms::new(config.alarms),
+            wind: WindEstimate::default(),
+            asked: None,
             detections_used: 0,
             started_ns: None,
             disarmed_ns: None,
@@ -110,8 +137,22 @@ impl Flight {
 
     /// Takes a packet from the autopilot's link.
     pub fn packet(&mut self, now_ns: i64, frame: &Frame) {
+        self.listen_for_operator(now_ns, frame);
         self.autopilot.handle(now_ns, frame);
         self.take_autopilot_events(now_ns);
+    }
+
+    /// Takes note of what the ground station sends to the autopilot through us.
+    pub fn ground_packet(&mut self, now_ns: i64, frame: &Frame) {
+        self.listen_for_operator(now_ns, frame);
+    }
+
+    fn listen_for_operator(&mut self, now_ns: i64, frame: &Frame) {
+        if let Some(MavMessage::HEARTBEAT(heartbeat)) = &frame.message
+            && heartbeat.mavtype == MavType::MAV_TYPE_GCS
+        {
+            self.alarms.operator_heard(now_ns);
+        }
     }
 
     /// Lets time pass; to be called 20 times a second or more.
@@ -123,7 +164,21 @@ impl Flight {
         self.use_newest(now_ns);
         self.count_ticks(now_ns);
         self.advance_mission(now_ns);
+        self.watch(now_ns);
         self.decide(now_ns, LanderEvent::Tick);
+    }
+
+    /// Raises what the lander must know of while it lands.
+    fn watch(&mut self, now_ns: i64) {
+        if !self.is_landing() || matches!(self.mission, Mission::Feeds) {
+            return;
+        }
+        let battery = self.autopilot.state().map(|state| state.battery);
+        if let Some(alarm) = self.alarms.tick(now_ns, battery.as_ref()) {
+            tracing::warn!(?alarm, "Alarm");
+            self.health.count("alarms");
+            self.decide(now_ns, LanderEvent::Alarm(alarm));
+        }
     }
 
     /// Takes what the detector `publisher` found; that is whose key it was published on. True when it was used or
@@ -169,18 +224,48 @@ impl Flight {
             };
             self.frames.insert(publisher.to_owned(), frame);
             debug_assert!(self.frames.len() <= MOST);
+        } else if self.selection.active() == Some(publisher)
+            && (self.handover_stamp_ns..self.looked_stamp_ns).contains(&header.stamp_ns)
+            && let Some(marker) = marker
+        {
+            // Overtaken on its way by a later one: the estimator fuses it at its own time.
+            self.late_frame(now_ns, header, marker);
         }
         self.use_newest(now_ns)
+    }
+
+    fn late_frame(
+        &mut self,
+        now_ns: i64,
+        header: &messages::FrameHeader,
+        marker: landing::MarkerInFrame,
+    ) {
+        self.health.count("late frames");
+        let frame = landing::Frame {
+            stamp: Timestamp::from_nanos(header.stamp_ns),
+            detector: 0,
+            image_size: (header.width, header.height),
+            focal_px: None,
+            marker: Some(marker),
+        };
+        self.decide(now_ns, LanderEvent::Frame(frame));
+        if let Some(rejection) = self.decision.and_then(|decision| decision.rejected) {
+            self.health.dropped(&format!("late detection: {}", rejection.name()));
+        }
     }
 
     /// Gives the lander the frame that is to be used next, if there is one, and tells of a change of the detector.
     fn use_newest(&mut self, now_ns: i64) -> bool {
         let next = self.selection.next_frame();
         let next = next.and_then(|(name, _stamp)| self.frames.get(&name).copied());
+        let changed = self.selection.changes() != self.changes_told;
+        if changed {
+            self.handover_stamp_ns = self.looked_stamp_ns;
+        }
         if let Some(frame) = next {
             self.frame(now_ns, frame);
         }
-        if self.selection.changes() != self.changes_told {
+        if changed {
             self.changes_told = self.selection.changes();
             self.health.count("changes of the detector");
             let detector = self.selection.active().unwrap_or_default();
@@ -201,6 +286,7 @@ impl Flight {
             None if frame.marker.is_some() => {
                 self.detections_used += u64::from(self.is_landing());
                 self.used_stamp_ns = Some(stamp_ns);
+                self.feed(now_ns, &frame);
                 if self.setpoint_ns != sent_before {
                     let age_ns = now_ns.saturating_sub(stamp_ns).max(0);
                     self.health
@@ -208,6 +294,32 @@ impl Flight {
                 }
             }
             None => {}
+        }
+    }
+
+    /// Tells the autopilot's own precision landing where the landing point is.
+    fn feed(&mut self, now_ns: i64, frame: &landing::Frame) {
+        if self.feed.is_none() {
+            return;
+        }
+        let target = self.decision.and_then(|decision| decision.target);
+        let vehicle = self.autopilot.state().and_then(wire::vehicle);
+        let (Some(target), Some(vehicle)) = (target, vehicle) else { return };
+        let as_seen = frame.marker.and_then(|marker| marker.body_from_marker);
+        let is_raw = self.config.landing_target.source == LandingTargetSource::Detection;
+        let (stamp, in_body) = match as_seen.filter(|_| is_raw) {
+            Some(seen) => (frame.stamp, seen.origin()),
+            None => {
+                let offset = vehicle.ned_from_body.inverse() * (target.position - vehicle.position);
+                (vehicle.stamp, geometry::Point::origin() + offset)
+            }
+        };
+        let sent = self.autopilot.send_landing_target(stamp.nanos(), in_body, target.position);
+        if let Some(feed) = self.feed.as_mut().filter(|_| sent) {
+            feed.sent(now_ns);
+            self.health.count("landing targets");
+            let age_ns = now_ns.saturating_sub(frame.stamp.nanos()).max(0);
+            self.health.latency(STAMP_TO_SETPOINT, Duration::from_nanos(age_ns.unsigned_abs()));
         }
     }
 
@@ -252,6 +364,7 @@ impl Flight {
 
     /// Does what the operator asks for, or says why not.
     pub fn command(&mut self, now_ns: i64, command: &ControllerCommand) -> CommandReply {
+        self.alarms.operator_heard(now_ns);
         let result = match command {
             ControllerCommand::Start => self.start(now_ns),
             ControllerCommand::Hold => self.operator(now_ns, OperatorCommand::Hold),
@@ -299,6 +412,13 @@ impl Flight {
             height_m: target.map(|t| t.height_m),
             age_ms: self.detection_age_ms(now_ns),
             rejected: self.rejected.clone(),
+            decided: self.decision.and_then(|d| d.rejected).map(|why| why.to_string()),
+            velocity_ned_m_s: target.map(|t| t.velocity.coords.into()),
+            deviation_m: target.map(|t| t.deviation_m),
+            heading_rad: target.and_then(|t| t.heading_rad),
+            nis: target.and_then(|t| t.nis),
+            time_offset_ms: target.map(|t| t.time_offset_s * 1e3),
+            wind_ned_m_s: self.wind.velocity_m_s(self.config.autopilot.drag_per_s),
         }
     }
 
@@ -307,12 +427,15 @@ impl Flight {
         let target = self.decision.and_then(|decision| decision.target);
         let above_origin_m =
             self.autopilot.state().and_then(|s| s.position).map(|p| -p.position.z());
-        let (phase, why) = self.phase();
+        let (phase, why) = self.phase(now_ns);
         ControllerStatus {
             stamp_ns: now_ns,
             phase: phase.to_owned(),
             why,
-            guidance: self.config.guidance.name().to_owned(),
+            guidance: match self.config.mode {
+                Mode::Guided => self.config.guidance.name().to_owned(),
+                Mode::LandingTarget => self.config.mode.name().to_owned(),
+            },
             autopilot: self.link_in_words(),
             active_detector: self.selection.active().map(str::to_owned),
             detector_why: self.selection.why().to_owned(),
@@ -331,8 +454,14 @@ impl Flight {
         }
     }
 
-    fn phase(&self) -> (&'static str, String) {
+    fn phase(&self, now_ns: i64) -> (&'static str, String) {
         match &self.mission {
+            Mission::AwaitsCommand | Mission::AwaitsAir | Mission::Feeds
+                if let Some(feed) = &self.feed =>
+            {
+                feed.phase(now_ns, feed::problem(&self.autopilot))
+            }
+            Mission::Feeds => ("failed", "no landing target is told in this mode".to_owned()),
             Mission::AwaitsCommand => ("idle", "waiting for the start of a landing".to_owned()),
             Mission::AwaitsAir => ("idle", "waiting for the vehicle to fly in GUIDED".to_owned()),
             Mission::TakesOff { why, .. } => ("takeoff", why.clone()),
@@ -342,7 +471,13 @@ impl Flight {
                 (self.lander.phase().name(), why)
             }
             Mission::Lands => {
-                let why = self.decision.map_or_else(String::new, |d| d.why.to_string());
+                let mut why = self.decision.map_or_else(String::new, |d| d.why.to_string());
+                if self.lander.phase() == Phase::PilotInCommand
+                    && let Some(state) = self.autopilot.state()
+                {
+                    // It may as well be the autopilot's failsafe: when PX4 misses setpoints it leaves OFFBOARD.
+                    why = format!("{why} (or the autopilot's failsafe), in {}", state.mode);
+                }
                 (self.lander.phase().name(), why)
             }
         }
@@ -353,12 +488,17 @@ impl Flight {
         match self.mission {
             Mission::Failed { .. } => true,
             Mission::Lands => self.lander.phase().is_terminal() && silent,
+            Mission::Feeds => self.feed.as_ref().is_none_or(Feed::is_finished),
             Mission::AwaitsCommand | Mission::AwaitsAir | Mission::TakesOff { .. } => false,
         }
     }
 
     fn is_landing(&self) -> bool {
-        matches!(self.mission, Mission::Lands) && !self.lander.phase().is_terminal()
+        match self.mission {
+            Mission::Lands => !self.lander.phase().is_terminal(),
+            Mission::Feeds => self.feed.as_ref().is_some_and(Feed::is_under_way),
+            _ => false,
+        }
     }
 
     fn link_in_words(&self) -> String {
@@ -384,13 +524,16 @@ impl Flight {
 
     fn start(&mut self, now_ns: i64) -> Result<String, String> {
         if self.is_landing() {
-            return Err(format!("a landing is under way, in phase `{}`", self.lander.phase()));
+            return Err(format!("a landing is under way, in phase `{}`", self.phase(now_ns).0));
         }
         if let Mission::TakesOff { .. } = self.mission {
             return Err("the vehicle is taking off; the landing begins by itself".to_owned());
         }
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
             return Err("attitude and position of the vehicle are not known".to_owned());
+        }
+        if self.feed.is_some() {
+            return self.start_feeding(now_ns);
         }
         let awaits_air = matches!(self.mission, Mission::AwaitsAir);
         self.begin(now_ns);
@@ -405,6 +548,26 @@ impl Flight {
         }
     }
 
+    fn start_feeding(&mut self, now_ns: i64) -> Result<String, String> {
+        if let Some(problem) = feed::problem(&self.autopilot) {
+            return Err(problem);
+        }
+        if !self.flies_guided() {
+            return Err(
+                "the vehicle does not fly in a mode from which we may ask for LAND".to_owned()
+            );
+        }
+        self.begin(now_ns);
+        let (phase, why) = self.phase(now_ns);
+        Ok(format!("in phase `{phase}`: {why}"))
+    }
+
+    fn flies_guided(&self) -> bool {
+        self.autopilot
+            .state()
+            .is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
+    }
+
     fn operator(&mut self, now_ns: i64, command: OperatorCommand) -> Result<String, String> {
         if let Mission::TakesOff { .. } = self.mission {
             if command == OperatorCommand::Resume {
@@ -417,11 +580,25 @@ impl Flight {
         }
         let before = self.lander.phase();
         if !self.is_landing() {
-            return Err(format!("no landing is under way (phase `{}`)", self.phase().0));
+            return Err(format!("no landing is under way (phase `{}`)", self.phase(now_ns).0));
+        }
+        if let Some(feed) = self.feed.as_mut().filter(|_| matches!(self.mission, Mission::Feeds)) {
+            if command == OperatorCommand::Resume {
+                return Err("the autopilot steers; there is nothing to resume".to_owned());
+            }
+            let height_m = self.decision.and_then(|d| d.target).map(|target| target.height_m);
+            let lowest_m = self.config.phases.no_return_height_m;
+            return feed.give_up(now_ns, height_m, lowest_m, &mut self.autopilot);
         }
         self.decide(now_ns, LanderEvent::Operator(command));
         let why = self.decision.map_or_else(String::new, |d| d.why.to_string());
         let after = self.lander.phase();
+        if before == after && command == OperatorCommand::Abort {
+            let lowest_m = self.config.phases.no_return_height_m;
+            return Err(format!(
+                "the autopilot's landing is left to finish: it is lower than {lowest_m} m, or an abort would land as well"
+            ));
+        }
         if before == after {
             return Err(format!("it changes nothing in phase `{after}`: {why}"));
         }
@@ -435,9 +612,15 @@ impl Flight {
     }
 
     fn begin(&mut self, now_ns: i64) {
-        self.mission = Mission::Lands;
         self.started_ns = Some(now_ns);
         self.disarmed_ns = None;
+        self.alarms.begin();
+        if let Some(feed) = &mut self.feed {
+            feed.begin(now_ns);
+            self.mission = Mission::Feeds;
+            return;
+        }
+        self.mission = Mission::Lands;
         self.decide(now_ns, LanderEvent::Operator(OperatorCommand::Start));
     }
 
@@ -448,17 +631,29 @@ impl Flight {
         let is_known = state.is_some_and(|state| {
             Timestamp::from_nanos(now_ns).seconds_since(state.stamp) <= stale_s
         });
+        let flies = self.flies_guided();
+        if let Some(feed) = &mut self.feed
+            && feed.step(now_ns, &mut self.autopilot)
+            && !matches!(self.mission, Mission::Feeds)
+        {
+            // Somebody else began it; it is followed as if it were ours.
+            self.started_ns = Some(now_ns);
+            self.disarmed_ns = None;
+            self.mission = Mission::Feeds;
+        }
         match &mut self.mission {
             Mission::AwaitsAir if !is_known => {}
             Mission::AwaitsAir => {
-                let flies = self.autopilot.state().is_some_and(|state| {
-                    state.armed && state.mode == FlightMode::Guided && state.landed.is_flying()
-                });
                 let lands = self.autopilot.state().is_some_and(|state| {
-                    state.armed && state.mode == FlightMode::Land && state.landed.is_flying()
+                    state.armed && state.mode.is_landing() && state.landed.is_flying()
                 });
-                if flies || lands {
+                if flies || lands && self.feed.is_none() {
                     self.begin(now_ns);
+                }
+                // A pilot's own landing is none of ours while it is high; the next flight may be.
+                if matches!(self.mission, Mission::Lands) && self.lander.phase().is_terminal() {
+                    self.mission = Mission::AwaitsAir;
+                    self.started_ns = None;
                 }
             }
             Mission::TakesOff { takeoff, why } => {
@@ -466,7 +661,7 @@ impl Flight {
                     // LAND may be the end of the landing that an earlier controller began.
                     TakeoffProgress::Done
                     | TakeoffProgress::Failed(TakeoffError::PilotInCommand {
-                        mode: FlightMode::Land,
+                        mode: FlightMode::Land | FlightMode::AUTO_LAND,
                         ..
                     }) => {
                         if is_known {
@@ -483,7 +678,7 @@ impl Flight {
                     progress => *why = progress.to_string(),
                 }
             }
-            Mission::AwaitsCommand | Mission::Lands | Mission::Failed { .. } => {}
+            Mission::AwaitsCommand | Mission::Lands | Mission::Feeds | Mission::Failed { .. } => {}
         }
     }
 
@@ -492,12 +687,22 @@ impl Flight {
             match event {
                 Event::State(state) => {
                     if let Some(vehicle) = wire::vehicle(&state) {
+                        if state.landed == autopilot::LandedState::InAir {
+                            self.wind.take(&vehicle);
+                        }
                         self.decide(now_ns, LanderEvent::Vehicle(vehicle));
                     }
                 }
                 Event::ArmedChanged(armed) => {
                     if !armed && self.started_ns.is_some() {
                         self.disarmed_ns = self.disarmed_ns.or(Some(now_ns));
+                    }
+                    // The next flight is one more to be landed, if that is what was asked for.
+                    let over =
+                        self.is_finished() && !matches!(self.mission, Mission::Failed { .. });
+                    if armed && over && self.config.start == Start::Airborne {
+                        self.mission = Mission::AwaitsAir;
+                        self.started_ns = None;
                     }
                     tracing::info!(armed, "Motors");
                 }
@@ -580,8 +785,17 @@ impl Flight {
         }
         match decision.action {
             Action::None => self.setpoint = None,
+            Action::Guided => {
+                self.setpoint = None;
+                if let Some(mode) = self.autopilot.firmware().and_then(Firmware::guided) {
+                    self.ask(now_ns, Command::SetMode(mode));
+                }
+            }
+            Action::Disarm => self.ask(now_ns, Command::Disarm),
             Action::Land => {
-                self.autopilot.request(now_ns, Command::SetMode(FlightMode::Land));
+                let mode = self.autopilot.firmware().and_then(Firmware::land);
+                let mode = mode.unwrap_or(FlightMode::Land);
+                self.autopilot.request(now_ns, Command::SetMode(mode));
                 // Sent at once: at half a metre every tick counts.
                 self.autopilot.tick(now_ns);
             }
@@ -601,6 +815,15 @@ impl Flight {
         }
     }
 
+    /// Asks for something once, unless it is being asked for already.
+    fn ask(&mut self, now_ns: i64, command: Command) {
+        let is_pending = |id| self.autopilot.status(id) == CommandStatus::Pending;
+        if !self.asked.is_some_and(is_pending) {
+            self.asked = Some(self.autopilot.request(now_ns, command));
+            self.autopilot.tick(now_ns);
+        }
+    }
+
     fn send_velocity(&mut self, now_ns: i64, velocity: Vector<geometry::Ned>, yaw_rate: f64) {
         match self.autopilot.set_velocity(now_ns, velocity, yaw_rate) {
             Ok(()) => {
@@ -612,8 +835,9 @@ impl Flight {
                 });
             }
             // LAND was asked for and has just begun.
-            Err(_) if self.lander.phase() == Phase::Final => {}
+            Err(_) if self.lander.phase() == Phase::Final => self.setpoint = None,
             Err(problem) => {
+                self.setpoint = None;
                 if self.health.failed("setpoints") {
                     tracing::warn!(%problem, "A setpoint was not sent; further ones are counted only");
                 }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use autopilot::{Address, Link, LinkEvent};
+use autopilot::{Address, Link, LinkEvent, Parser};
 use messages::{ControllerStatus, MavlinkBytes, VehicleState, topic};
 use node::{Node, Publisher, Shutdown, now_ns};
 use tokio::sync::mpsc;
@@ -52,8 +52,10 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             // Whichever is ready, in no order: one that talks without end must not silence the others.
             () = shutdown.requested() => break,
             event = link.recv() => match event {
-                LinkEvent::Frame { frame, .. } => {
-                    flight.packet(now_ns(), &frame);
+                LinkEvent::Frame { frame, received } => {
+                    // What waited in a queue here was not under way from the autopilot.
+                    let waited_ns = i64::try_from(received.elapsed().as_nanos()).unwrap_or(0);
+                    flight.packet(now_ns().saturating_sub(waited_ns), &frame);
                     reports.pass_on(&node, frame.raw.to_vec());
                 }
                 LinkEvent::Connected { peer } => tracing::info!(peer, "Link to the autopilot"),
@@ -83,6 +85,9 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             Some(info) = cameras.next() => flight.camera(info),
             Some(message) = to_autopilot.next() => {
                 let is_packet = (1..=LONGEST_PACKET).contains(&message.packet.len());
+                for frame in Parser::new().push(&message.packet) {
+                    flight.ground_packet(now_ns(), &frame);
+                }
                 if !is_packet || link.send_spare(&message.packet).is_err() {
                     node.health().dropped("packets of the ground station");
                 }

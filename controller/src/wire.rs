@@ -1,6 +1,6 @@
 //! Between messages, the autopilot's types and the lander's types.
 
-use autopilot::{FlightMode, VehicleState};
+use autopilot::VehicleState;
 use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform, Vector};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp};
 use messages::{CameraInfo, Detection, Detections, MarkerPose, Transform3};
@@ -95,9 +95,9 @@ pub fn vehicle(state: &VehicleState) -> Option<landing::VehicleState> {
         position: position.position + position.velocity * since(position.stamp_ns),
         velocity: position.velocity,
         mode: match state.mode {
-            FlightMode::Guided => Mode::Guided,
-            FlightMode::Land => Mode::Land,
-            FlightMode::Other(_) | FlightMode::Px4(_) | FlightMode::Foreign(_) => Mode::Other,
+            mode if mode.is_guided() => Mode::Guided,
+            mode if mode.is_landing() => Mode::Land,
+            _ => Mode::Other,
         },
         armed: state.armed,
         landed: match state.landed {
@@ -181,7 +181,7 @@ mod tests {
 
     #[test]
     fn a_position_that_has_stopped_is_not_flown_on() {
-        use autopilot::{Attitude, Battery, Position};
+        use autopilot::{Attitude, Battery, FlightMode, Position};
         let ms = 1_000_000;
         let at = |attitude_ms: i64, position_ms: i64| VehicleState {
             stamp_ns: attitude_ms.max(position_ms) * ms,

@@ -18,15 +18,15 @@ const HYPOTHESES: usize = 2 * YAWS + 2;
 /// Past detections count less with this time constant, in seconds.
 const MEMORY_S: f64 = 3.0;
 /// What is expected to make a pad seem to move, in metres, and per metre of range.
-const NOISE_M: f64 = 0.02;
-const NOISE_PER_M: f64 = 0.005;
+const NOISE_M: f64 = 0.015;
+const NOISE_PER_M: f64 = 0.003;
 /// Fewer detections than this tell nothing.
 const FEWEST: u32 = 8;
 /// One hypothesis explains the detections much better than another when its sum of squares is so many times smaller, and
 /// smaller by so much at least.
 const BETTER: f64 = 4.0;
-const AGREES_BY: f64 = 30.0;
-const DISAGREES_BY: f64 = 200.0;
+const AGREES_BY: f64 = 20.0;
+const DISAGREES_BY: f64 = 400.0;
 /// Only a pad that seems to move by so much, as a deviation in metres and per metre of range, shows a wrong mount: the
 /// autopilot's drift makes it move a little as well.
 const MOVES_M: f64 = 0.15;
@@ -125,16 +125,20 @@ impl Agreement {
 
     fn judge(&mut self) {
         let configured = self.sums.first().map_or(0.0, |sum| sum.squares);
-        let others = self.sums.iter().enumerate().filter(|(index, _)| !is_near(*index));
-        let Some((index, best)) = others.min_by(|a, b| a.1.squares.total_cmp(&b.1.squares)) else {
+        let others = || self.sums.iter().enumerate().filter(|(index, _)| !is_near(*index));
+        let Some((index, best)) = others().min_by(|a, b| a.1.squares.total_cmp(&b.1.squares))
+        else {
             return;
         };
+        // A wrong sign shows only in tilt, and is not what is to be expected: it need not be ruled out.
+        let mounts = others().take_while(|(index, _)| *index < 2 * YAWS);
+        let nearest = mounts.map(|(_, sum)| sum.squares).fold(f64::INFINITY, f64::min);
         if self.detections < FEWEST || !best.squares.is_finite() || !configured.is_finite() {
             return;
         }
         let moves_m = MOVES_M + MOVES_PER_M * self.range_m;
         let moves = configured > moves_m * moves_m * self.weight;
-        if best.squares > BETTER * configured + AGREES_BY {
+        if nearest > BETTER * configured + AGREES_BY {
             self.verdict = Verdict::Agrees;
         } else if configured > BETTER * best.squares + DISAGREES_BY && moves {
             self.verdict = Verdict::Disagrees(Hypothesis::of(index).wrong());

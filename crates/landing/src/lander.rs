@@ -144,8 +144,7 @@ impl Lander {
         if !state.is_finite() {
             return Err(Rejection::NotFinite);
         }
-        if (state.position - Point::origin()).norm() > FARTHEST
-            || state.velocity.norm() > FARTHEST
+        if (state.position - Point::origin()).norm() > FARTHEST || state.velocity.norm() > FARTHEST
         {
             return Err(Rejection::Implausible);
         }

@@ -277,8 +277,11 @@ fn an_abort_takes_the_vehicle_back_from_land_while_it_is_high() {
             armed: true,
             landed: Landed::InAir,
         };
-        lander.step(now, Event::Vehicle(state));
-        lander.step(now, event.unwrap_or(Event::Tick))
+        let heard = lander.step(now, Event::Vehicle(state));
+        match event {
+            Some(event) => lander.step(now, event),
+            None => heard,
+        }
     };
     tell(1.0, Mode::Guided, Some(Event::Operator(OperatorCommand::Start)));
     let alarmed = tell(1.1, Mode::Guided, Some(Event::Alarm(landing::Alarm::BatteryLow)));

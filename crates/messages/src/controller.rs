@@ -6,7 +6,7 @@ use crate::codec::wire;
 use crate::detector::Place;
 
 wire! {
-    TargetEstimate = 6 v 1;
+    TargetEstimate = 6 v 2;
     ControllerStatus = 7 v 2;
     ControllerCommand = 8 v 2;
     CommandReply = 9 v 1;
@@ -25,8 +25,22 @@ pub struct TargetEstimate {
     pub height_m: Option<f64>,
     /// Since the capture of the frame that was used last, in milliseconds.
     pub age_ms: Option<f64>,
-    /// Why the latest detection was not used, if it was not.
+    /// Why the latest detection was not used, if it was not: a short name for machines.
     pub rejected: Option<String>,
+    /// The same in words.
+    pub decided: Option<String>,
+    /// How it moves in local NED, in m/s: its own motion and the drift of the autopilot's position.
+    pub velocity_ned_m_s: Option<[f64; 3]>,
+    /// Standard deviation of its horizontal position, in metres.
+    pub deviation_m: Option<f64>,
+    /// Heading of the marker's upper edge, from north to east, in radians.
+    pub heading_rad: Option<f64>,
+    /// The newest detection's squared innovation over its covariance: about 3 when all is as expected.
+    pub nis: Option<f64>,
+    /// By how much exposures are later than their stamps, in milliseconds.
+    pub time_offset_ms: Option<f64>,
+    /// The wind's velocity to the north and east, as the vehicle's lean tells it, in m/s.
+    pub wind_ned_m_s: Option<[f64; 2]>,
 }
 
 /// The velocity the autopilot was last asked for.

@@ -1,0 +1,135 @@
+//! What is watched beside the landing: the battery, and whether the operator is still heard.
+
+use autopilot::Battery;
+use landing::Alarm;
+
+use crate::config::AlarmSettings;
+
+/// Watches, and raises each alarm once in a landing.
+#[derive(Debug)]
+pub struct Alarms {
+    settings: AlarmSettings,
+    low_since_ns: Option<i64>,
+    critical_since_ns: Option<i64>,
+    operator_ns: Option<i64>,
+    raised: Vec<Alarm>,
+}
+
+impl Alarms {
+    /// Nothing is watched yet.
+    pub fn new(settings: AlarmSettings) -> Self {
+        Self {
+            settings,
+            low_since_ns: None,
+            critical_since_ns: None,
+            operator_ns: None,
+            raised: Vec::new(),
+        }
+    }
+
+    /// A landing begins: every alarm may be raised again.
+    pub fn begin(&mut self) {
+        self.raised.clear();
+    }
+
+    /// The operator, or a ground station, was heard.
+    pub fn operator_heard(&mut self, now_ns: i64) {
+        self.operator_ns = Some(now_ns);
+        // Heard again and lost again is told again.
+        self.raised.retain(|alarm| *alarm != Alarm::OperatorLost);
+    }
+
+    /// The gravest alarm that is to be raised now.
+    pub fn tick(&mut self, now_ns: i64, battery: Option<&Battery>) -> Option<Alarm> {
+        let s = &self.settings;
+        let is_below = |part: f64, volts: f64| {
+            battery.is_some_and(|b| {
+                b.remaining.is_some_and(|left| left < part)
+                    || b.voltage_v.is_some_and(|v| v > 0.0 && v < volts)
+            })
+        };
+        let low = is_below(s.battery_low, s.battery_low_v);
+        let critical = is_below(s.battery_critical, s.battery_critical_v);
+        since(&mut self.low_since_ns, low, now_ns);
+        since(&mut self.critical_since_ns, critical, now_ns);
+        let lasts = |from: Option<i64>, limit_s: f64| {
+            from.is_some_and(|from| now_ns.saturating_sub(from) as f64 * 1e-9 >= limit_s)
+        };
+        let watches = s.operator_lost_s > 0.0;
+        let due = [
+            (Alarm::BatteryCritical, lasts(self.critical_since_ns, s.battery_s)),
+            (Alarm::BatteryLow, lasts(self.low_since_ns, s.battery_s)),
+            (Alarm::OperatorLost, watches && lasts(self.operator_ns, s.operator_lost_s)),
+        ];
+        let new = |(alarm, due): &(Alarm, bool)| *due && !self.raised.contains(alarm);
+        let (alarm, _) = due.into_iter().find(new)?;
+        self.raised.push(alarm);
+        Some(alarm)
+    }
+}
+
+/// Keeps since when something has been so.
+fn since(since_ns: &mut Option<i64>, is_so: bool, now_ns: i64) {
+    *since_ns = if is_so { since_ns.or(Some(now_ns)) } else { None };
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: i64 = 1_000_000_000;
+
+    fn alarms() -> Alarms {
+        Alarms::new(AlarmSettings {
+            battery_low: 0.2,
+            battery_critical: 0.1,
+            battery_low_v: 0.0,
+            battery_critical_v: 10.5,
+            battery_s: 3.0,
+            operator_lost_s: 5.0,
+        })
+    }
+
+    fn battery(remaining: f64, voltage_v: f64) -> Battery {
+        Battery { remaining: Some(remaining), voltage_v: Some(voltage_v), current_a: None }
+    }
+
+    #[test]
+    fn a_battery_that_stays_low_is_told_once_and_a_dip_is_not() {
+        let mut alarms = alarms();
+        let mut told = Vec::new();
+        for second in 0..60 {
+            let battery = match second {
+                0..10 => battery(0.5, 12.0),
+                10..12 => battery(0.15, 12.0),
+                12..20 => battery(0.5, 12.0),
+                20..30 => battery(0.15, 12.0),
+                _ => battery(0.15, 10.0),
+            };
+            told.extend(alarms.tick(second * SECOND, Some(&battery)).map(|alarm| (second, alarm)));
+        }
+        assert_eq!(told, [(23, Alarm::BatteryLow), (33, Alarm::BatteryCritical)]);
+        alarms.begin();
+        let again = alarms.tick(60 * SECOND, Some(&battery(0.15, 12.0)));
+        assert_eq!(again, Some(Alarm::BatteryLow), "of the next landing");
+    }
+
+    #[test]
+    fn an_operator_is_missed_only_after_having_been_heard() {
+        let mut alarms = alarms();
+        assert_eq!(alarms.tick(100 * SECOND, None), None);
+        alarms.operator_heard(100 * SECOND);
+        assert_eq!(alarms.tick(104 * SECOND, None), None);
+        assert_eq!(alarms.tick(105 * SECOND, None), Some(Alarm::OperatorLost));
+        assert_eq!(alarms.tick(106 * SECOND, None), None, "once");
+        alarms.operator_heard(107 * SECOND);
+        assert_eq!(alarms.tick(112 * SECOND, None), Some(Alarm::OperatorLost), "lost again");
+    }
+
+    #[test]
+    fn what_is_not_told_raises_nothing() {
+        let unknown = Battery::default();
+        assert_eq!(alarms().tick(0, Some(&unknown)), None);
+        assert_eq!(alarms().tick(0, None), None);
+    }
+}
