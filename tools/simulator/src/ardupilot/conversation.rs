@@ -1,13 +1,14 @@
 //! What the autopilot answers to what it is sent.
 
 use autopilot::dialect::{
-    MavCmd, MavFrame, MavMessage, MavModeFlag, MavResult, MavSeverity, Message, PARAM_VALUE_DATA,
-    SET_POSITION_TARGET_LOCAL_NED_DATA, TIMESYNC_DATA,
+    LANDING_TARGET_DATA, MavCmd, MavFrame, MavMessage, MavModeFlag, MavResult, MavSeverity,
+    Message, PARAM_VALUE_DATA, SET_POSITION_TARGET_LOCAL_NED_DATA, TIMESYNC_DATA,
 };
 use autopilot::{Frame, Sender};
+use geometry::{Body, Ned, Rotation, Vector};
 
 use super::flight::{Mode, Setpoint};
-use super::parameters::{Parameters, Shown};
+use super::parameters::{Parameter, Parameters, Shown};
 use super::steering::Nose;
 use super::{SimulatedAutopilot, nanoseconds, packet};
 
@@ -48,6 +49,7 @@ impl SimulatedAutopilot {
                 self.acknowledge(SET_MODE, result, from);
             }
             MavMessage::SET_POSITION_TARGET_LOCAL_NED(target) => self.take_setpoint(now_s, target),
+            MavMessage::LANDING_TARGET(target) => self.take_landing_target(now_s, target),
             MavMessage::REQUEST_DATA_STREAM(r) => {
                 let rate = f64::from(r.req_message_rate);
                 let interval_s = (r.start_stop != 0 && rate > 0.0).then(|| 1.0 / rate);
@@ -104,12 +106,25 @@ impl SimulatedAutopilot {
         let result = match command {
             MavCmd::MAV_CMD_DO_SET_MODE => {
                 let custom = (first as i64) & 1 == 1;
+                if self.is_px4() {
+                    let [_, main, sub, ..] = values;
+                    let result = self.set_px4_mode(now_s, main as u8, sub as u8);
+                    self.acknowledge(command as u16, result, from);
+                    return;
+                }
                 // A number that is none names no mode.
                 let number = if second >= 0.0 { second as u32 } else { u32::MAX };
                 if custom { self.set_mode(now_s, number) } else { FAILED }
             }
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => {
                 self.arm_or_disarm(now_s, first, second == FORCE)
+            }
+            MavCmd::MAV_CMD_NAV_TAKEOFF if self.is_px4() => {
+                // To an altitude over the sea, in a mode of its own.
+                let height_m = f64::from(values[6]) - self.config.origin.altitude_m;
+                self.flight.follow_setpoints(now_s, &self.estimate);
+                self.px4.takes_off();
+                accepted(self.flight.take_off(now_s, height_m, &self.estimate))
             }
             MavCmd::MAV_CMD_NAV_TAKEOFF => {
                 accepted(self.flight.take_off(now_s, f64::from(values[6]), &self.estimate))
@@ -148,6 +163,56 @@ impl SimulatedAutopilot {
             self.tell_one(0);
         }
         ACCEPTED
+    }
+
+    fn set_px4_mode(&mut self, now_s: f64, main: u8, sub: u8) -> MavResult {
+        let Some(mode) = self.px4.asked(now_s, main, sub) else {
+            return MavResult::MAV_RESULT_TEMPORARILY_REJECTED;
+        };
+        if mode == Mode::Guided {
+            self.flight.follow_setpoints(now_s, &self.estimate);
+        } else {
+            self.flight.set_mode(now_s, mode, &self.estimate);
+        }
+        ACCEPTED
+    }
+
+    /// The frames and fields that each firmware takes; ArduPilot says once that it takes no other.
+    fn take_landing_target(&mut self, now_s: f64, target: &LANDING_TARGET_DATA) {
+        let place = [target.x, target.y, target.z].map(f64::from);
+        let valid = target.position_valid.bits() == 1;
+        if self.is_px4() {
+            if valid && target.frame == MavFrame::MAV_FRAME_LOCAL_NED && self.px4.precision {
+                self.flight.precision.take(now_s, [place[0], place[1]]);
+            }
+            return;
+        }
+        let listens = self.parameters.get(Parameter::PrecisionLanding) == 1.0
+            && self.parameters.get(Parameter::PrecisionType) == 1.0;
+        if !listens {
+            return;
+        }
+        if target.frame != MavFrame::MAV_FRAME_BODY_FRD {
+            if !std::mem::replace(&mut self.target_refused, true) {
+                self.text(MavSeverity::MAV_SEVERITY_INFO, "Plnd: Frame not supported");
+            }
+            return;
+        }
+        let distance = f64::from(target.distance);
+        if distance.is_nan() || distance <= 0.0 {
+            return;
+        }
+        let [x, y, z] = if valid {
+            place
+        } else {
+            let sight = [-target.angle_y.tan(), target.angle_x.tan(), 1.0].map(f64::from);
+            sight.map(|part| part * distance / super::shaping::norm(sight))
+        };
+        let e = &self.estimate;
+        let attitude = Rotation::<Ned, Body>::from_euler(e.roll, e.pitch, e.yaw);
+        let offset = attitude * Vector::<Body>::new(x, y, z);
+        let north_east = [e.position[0] + offset.x(), e.position[1] + offset.y()];
+        self.flight.precision.take(now_s, north_east);
     }
 
     fn arm_or_disarm(&mut self, now_s: f64, which: f32, forced: bool) -> MavResult {
@@ -192,6 +257,10 @@ impl SimulatedAutopilot {
 
     /// Velocities in the frames that ArduPilot takes; everything else it cannot fly is a stop.
     fn take_setpoint(&mut self, now_s: f64, target: &SET_POSITION_TARGET_LOCAL_NED_DATA) {
+        self.px4.setpoint_came(now_s);
+        if self.is_px4() && !self.px4.is_offboard() {
+            return;
+        }
         let setpoint = self.setpoint(target).unwrap_or(Setpoint::STOP);
         if self.setpoints.len() >= MOST_SETPOINTS {
             self.setpoints.pop_front();

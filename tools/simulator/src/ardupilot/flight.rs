@@ -4,6 +4,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::estimate::Estimate;
 use super::parameters::{Parameter, Parameters};
+use super::precision::Precision;
+use super::shaping::norm;
 use super::steering::{Envelope, Nose, Steering, SteeringConfig, Vertical, Wish};
 use crate::drift::{random_stream, uniform};
 use crate::laws::square_root_law;
@@ -127,6 +129,8 @@ pub(super) struct Flight {
     sure_after_s: f64,
     idle_since_s: f64,
     was_down: bool,
+    /// The target of a precision landing.
+    pub(super) precision: Precision,
     happenings: Vec<Happening>,
 }
 
@@ -144,6 +148,7 @@ impl Flight {
             sure_after_s: 0.0,
             idle_since_s: 0.0,
             was_down: true,
+            precision: Precision::default(),
             happenings: Vec::new(),
         }
     }
@@ -232,6 +237,12 @@ impl Flight {
         let until_s = now_s.max(armed_s + ARMING_DELAY_S) + SPOOL_S;
         self.guided = Guided::Spooling { until_s, z: -height_m };
         true
+    }
+
+    /// Stops and follows setpoints from now on, whatever was flown before.
+    pub(super) fn follow_setpoints(&mut self, now_s: f64, now: &Estimate) {
+        self.set_mode(now_s, Mode::Guided, now);
+        self.guided = Guided::Velocity(Setpoint::STOP, now_s);
     }
 
     /// Takes a setpoint, which also ends a takeoff; ignored in all modes but GUIDED.
@@ -349,7 +360,13 @@ impl Flight {
         match (self.mode, &mut self.guided) {
             (Mode::Land, _) => {
                 let down = descent(-now.position[2], parameters);
-                Wish { vertical: Vertical::Velocity(down), ..stay }
+                match self.precision.target(now_s) {
+                    None => Wish { vertical: Vertical::Velocity(down), ..stay },
+                    Some([north, east]) => {
+                        let way = [north - now.position[0], east - now.position[1]];
+                        precision_wish(way, -now.position[2], down, stay)
+                    }
+                }
             }
             (Mode::Guided, Guided::Velocity(setpoint, came_s)) => {
                 if now_s - *came_s > parameters.get(Parameter::GuidedTimeout) {
@@ -371,6 +388,18 @@ impl Flight {
             }
             _ => stay,
         }
+    }
+}
+
+/// Over the target first, and slowly through the last metres, as the real one was measured to do.
+fn precision_wish(way: [f64; 2], height_m: f64, down: f64, stay: Wish) -> Wish {
+    let size = norm(way);
+    let speed = square_root_law(size, 1.0, 0.5).min(2.0);
+    let slow = (0.35..2.0).contains(&height_m);
+    Wish {
+        velocity: way.map(|metres| if size > 0.0 { metres * speed / size } else { 0.0 }),
+        vertical: Vertical::Velocity(if slow { down.min(0.2) } else { down }),
+        ..stay
     }
 }
 

@@ -3,7 +3,7 @@
 //! It knows no socket: packets go in and come out, and time is an argument.
 //!
 //! Modules in reading order: `estimate` is what it believes of its motion, `flight` decides, `steering` flies by
-//! the smooth paths of `shaping`, `conversation` answers the link, `telemetry` tells, `parameters` and `packet` serve
+//! the smooth paths of `shaping` and to the target of `precision`, `px4` has the rules of the other firmware, `conversation` answers the link, `telemetry` tells, `parameters` and `packet` serve
 //! both.
 
 mod conversation;
@@ -11,6 +11,8 @@ mod estimate;
 mod flight;
 mod packet;
 mod parameters;
+mod precision;
+mod px4;
 mod shaping;
 mod steering;
 mod telemetry;
@@ -34,6 +36,7 @@ use crate::vehicle::{Demand, VehicleTruth};
 use estimate::{Estimate, Estimator};
 use flight::{Flight, Happening, Setpoint};
 use parameters::Parameters;
+use px4::Px4;
 use telemetry::{Readiness, Schedule, Situation};
 
 /// The simulated autopilot's settings.
@@ -53,6 +56,8 @@ pub struct AutopilotConfig {
     pub rangefinder: bool,
     /// True to forward the heartbeats of a ground station (255/190), as a real one with two links does.
     pub forward_ground_station: bool,
+    /// Whose rules it keeps.
+    pub firmware: Firmware,
     /// Parameters that differ from the defaults, by ArduPilot's names and in its units.
     pub parameters: Vec<(String, f32)>,
 }
@@ -67,9 +72,19 @@ impl Default for AutopilotConfig {
             origin: Origin::default(),
             rangefinder: false,
             forward_ground_station: false,
+            firmware: Firmware::ArduPilot,
             parameters: Vec::new(),
         }
     }
+}
+
+/// Whose rules a simulated autopilot keeps.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Firmware {
+    /// Those that were measured of ArduPilot.
+    ArduPilot,
+    /// Those that PX4's documentation tells: modes, OFFBOARD, takeoff, messages. It flies as the other does.
+    Px4,
 }
 
 /// What a serial line carries before the first packet of a real autopilot.
@@ -95,6 +110,9 @@ pub struct SimulatedAutopilot {
     estimate: Estimate,
     truth: Option<VehicleTruth>,
     flight: Flight,
+    px4: Px4,
+    /// The frame of landing targets was refused already.
+    target_refused: bool,
     schedule: Schedule,
     setpoints: VecDeque<(f64, Setpoint)>,
     outgoing: VecDeque<Vec<u8>>,
@@ -119,6 +137,8 @@ impl SimulatedAutopilot {
             estimate: Estimate::default(),
             truth: None,
             flight: Flight::new(config.steering.clone(), seed),
+            px4: Px4::default(),
+            target_refused: false,
             schedule: Schedule::default(),
             setpoints: VecDeque::new(),
             outgoing: VecDeque::from([BOOT_TEXT.as_bytes().to_vec()]),
@@ -169,6 +189,9 @@ impl SimulatedAutopilot {
                 self.flight.follow(due_s, setpoint);
             }
         }
+        if self.is_px4() && self.px4.misses_setpoints(now_s) {
+            self.flight.set_mode(now_s, Mode::Loiter, &self.estimate);
+        }
         let demand = self.flight.step(now_s, dt_s, &self.estimate, truth, &self.parameters);
         self.report_happenings();
         self.tell();
@@ -178,6 +201,10 @@ impl SimulatedAutopilot {
     /// Packets for the link, in order; the first is the text of the boot.
     pub fn outgoing(&mut self) -> impl Iterator<Item = Vec<u8>> + '_ {
         self.outgoing.drain(..)
+    }
+
+    fn is_px4(&self) -> bool {
+        self.config.firmware == Firmware::Px4
     }
 
     fn me(&self) -> Sender {
@@ -251,6 +278,7 @@ impl SimulatedAutopilot {
             landed: self.flight.landed(),
             target_velocity: self.flight.target_velocity(),
             rangefinder: self.config.rangefinder,
+            px4: self.is_px4().then(|| self.px4.shown(self.flight.mode(), self.flight.landed())),
         }
     }
 

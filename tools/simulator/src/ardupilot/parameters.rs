@@ -15,6 +15,10 @@ pub enum Parameter {
     LandSpeed,
     /// First speed of LAND, in cm/s; 0 takes the descent speed of missions.
     LandSpeedHigh,
+    /// Whether it lands on a target that it is told (1) or not (0).
+    PrecisionLanding,
+    /// Where that target comes from: 1 is MAVLink.
+    PrecisionType,
     /// Largest horizontal jerk, in m/s^3.
     JerkXy,
     /// Largest vertical jerk, in m/s^3.
@@ -40,12 +44,14 @@ const REAL: MavParamType = MavParamType::MAV_PARAM_TYPE_REAL32;
 const INT8: MavParamType = MavParamType::MAV_PARAM_TYPE_INT8;
 const INT16: MavParamType = MavParamType::MAV_PARAM_TYPE_INT16;
 
-const TABLE: [Row; 13] = [
+const TABLE: [Row; 15] = [
     (Parameter::DisarmDelay, "DISARM_DELAY", INT8, 10.0, 0.0, 127.0),
     (Parameter::GuidedTimeout, "GUID_TIMEOUT", REAL, 3.0, 0.1, 5.0),
     (Parameter::LandAltLow, "LAND_ALT_LOW", INT16, 1000.0, 100.0, 10_000.0),
     (Parameter::LandSpeed, "LAND_SPEED", INT16, 50.0, 30.0, 200.0),
     (Parameter::LandSpeedHigh, "LAND_SPEED_HIGH", INT16, 0.0, 0.0, 500.0),
+    (Parameter::PrecisionLanding, "PLND_ENABLED", INT8, 0.0, 0.0, 1.0),
+    (Parameter::PrecisionType, "PLND_TYPE", INT8, 0.0, 0.0, 4.0),
     (Parameter::JerkXy, "PSC_JERK_XY", REAL, 5.0, 1.0, 20.0),
     (Parameter::JerkZ, "PSC_JERK_Z", REAL, 5.0, 1.0, 20.0),
     (Parameter::SystemId, "SYSID_THISMAV", INT16, 1.0, 1.0, 255.0),

@@ -1,5 +1,6 @@
 //! What the autopilot tells, and when: each message at the interval that was asked for.
 
+use autopilot::FlightMode;
 use autopilot::dialect::{
     ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, AUTOPILOT_VERSION_DATA, BATTERY_STATUS_DATA,
     DISTANCE_SENSOR_DATA, EKF_STATUS_REPORT_DATA, EXTENDED_SYS_STATE_DATA, EkfStatusFlags,
@@ -17,7 +18,7 @@ use super::flight::{Landed, Mode};
 use crate::vehicle::{GRAVITY_M_S2, VehicleTruth};
 
 /// Message numbers that can be asked for, by the stream of REQUEST_DATA_STREAM they belong to (0: none).
-const MESSAGES: [(u32, u8); 18] = [
+const MESSAGES: [(u32, u8); 19] = [
     (1, 2),
     (2, 12),
     (24, 2),
@@ -34,6 +35,7 @@ const MESSAGES: [(u32, u8); 18] = [
     (164, 10),
     (173, 12),
     (193, 12),
+    (230, 0),
     (242, 0),
     (245, 0),
 ];
@@ -145,6 +147,8 @@ pub(super) struct Situation<'a> {
     pub(super) landed: Landed,
     pub(super) target_velocity: Option<[f64; 3]>,
     pub(super) rangefinder: bool,
+    /// The mode in PX4's terms, if it is one.
+    pub(super) px4: Option<FlightMode>,
 }
 
 impl Situation<'_> {
@@ -164,9 +168,12 @@ impl Situation<'_> {
         base_mode.set(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED, self.armed);
         let flying = self.landed != Landed::OnGround;
         MavMessage::HEARTBEAT(HEARTBEAT_DATA {
-            custom_mode: self.mode as u32,
+            custom_mode: self.px4.map_or(self.mode as u32, FlightMode::custom_mode),
             mavtype: MavType::MAV_TYPE_QUADROTOR,
-            autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            autopilot: match self.px4 {
+                Some(_) => MavAutopilot::MAV_AUTOPILOT_PX4,
+                None => MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+            },
             base_mode,
             system_status: if flying {
                 MavState::MAV_STATE_ACTIVE
@@ -203,7 +210,10 @@ impl Situation<'_> {
                 distance: self.range_m() as f32,
                 voltage: 0.0,
             }),
-            193 => self.ekf_status_report(),
+            193 if self.px4.is_none() => self.ekf_status_report(),
+            230 if self.px4.is_some() => {
+                super::px4::estimator_status(self.readiness == Readiness::Ready)
+            }
             242 if self.readiness >= Readiness::OriginSet => self.home_position(),
             245 => self.extended_sys_state(),
             _ => return None,

@@ -1,0 +1,84 @@
+//! The same vehicle under PX4's rules, as its documentation tells them and not measured: modes by two numbers, OFFBOARD
+//! only with a stream of setpoints before and during (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a
+//! takeoff to an altitude over the sea, and a heartbeat that says so once a second.
+
+use autopilot::FlightMode;
+use autopilot::dialect::{ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, MavMessage};
+
+use super::flight::{Landed, Mode};
+
+/// COM_OF_LOSS_T, in seconds.
+const LOSS_S: f64 = 1.0;
+/// Setpoints must have come for so long, at 2 Hz or more, in seconds.
+const PROOF_S: f64 = 1.0;
+const PROOF_GAP_S: f64 = 0.5;
+
+/// What a PX4 remembers beside what ArduPilot does.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Px4 {
+    /// Since when setpoints have come, and when the last one did.
+    stream: Option<(f64, f64)>,
+    offboard: bool,
+    pub(super) precision: bool,
+}
+
+impl Px4 {
+    pub(super) fn setpoint_came(&mut self, now_s: f64) {
+        let lasts = self.stream.filter(|(_, last_s)| now_s - last_s <= PROOF_GAP_S);
+        self.stream = Some((lasts.map_or(now_s, |(since_s, _)| since_s), now_s));
+    }
+
+    /// The mode that a companion asks for, in the terms of this vehicle; `None` when it is refused.
+    pub(super) fn asked(&mut self, now_s: f64, main: u8, sub: u8) -> Option<Mode> {
+        let proven = self.stream.is_some_and(|(since_s, last_s)| {
+            now_s - since_s >= PROOF_S && now_s - last_s <= PROOF_GAP_S
+        });
+        let mode = match (main, sub) {
+            (6, _) if proven => Mode::Guided,
+            (4, 6 | 9) => Mode::Land,
+            (4, 3) => Mode::Loiter,
+            (3, _) => Mode::PosHold,
+            _ => return None,
+        };
+        self.offboard = mode == Mode::Guided;
+        self.precision = (main, sub) == (4, 9);
+        Some(mode)
+    }
+
+    pub(super) fn takes_off(&mut self) {
+        self.offboard = false;
+    }
+
+    pub(super) fn is_offboard(&self) -> bool {
+        self.offboard
+    }
+
+    /// True when the setpoints of OFFBOARD have just been missed for too long.
+    pub(super) fn misses_setpoints(&mut self, now_s: f64) -> bool {
+        let lost = self.offboard && self.stream.is_none_or(|(_, last_s)| now_s - last_s > LOSS_S);
+        self.offboard &= !lost;
+        lost
+    }
+
+    /// What the heartbeat shows.
+    pub(super) fn shown(&self, mode: Mode, landed: Landed) -> FlightMode {
+        match mode {
+            Mode::Guided if self.offboard => FlightMode::OFFBOARD,
+            Mode::Guided if landed == Landed::TakingOff => FlightMode::AUTO_TAKEOFF,
+            Mode::Guided | Mode::Loiter | Mode::Brake => FlightMode::AUTO_HOLD,
+            Mode::Land if self.precision => FlightMode::AUTO_PRECLAND,
+            Mode::Land => FlightMode::AUTO_LAND,
+            Mode::Stabilize | Mode::AltHold | Mode::PosHold => FlightMode::Px4(3 << 16),
+        }
+    }
+}
+
+/// How PX4 tells of its estimator.
+pub(super) fn estimator_status(has_position: bool) -> MavMessage {
+    // Attitude and vertical motion; with a position also horizontal motion and places.
+    let bits = if has_position { 831 } else { 1 + 4 + 32 };
+    MavMessage::ESTIMATOR_STATUS(ESTIMATOR_STATUS_DATA {
+        flags: EstimatorStatusFlags::from_bits_truncate(bits),
+        ..ESTIMATOR_STATUS_DATA::default()
+    })
+}
