@@ -874,17 +874,24 @@ fn level(velocity: Vector<geometry::Ned>) -> Vector<geometry::Ned> {
 mod tests {
     use super::*;
     use autopilot::dialect::{
-        ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA,
-        MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag, MavType,
+        ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LANDING_TARGET_DATA,
+        LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
+        MavType, PARAM_VALUE_DATA, SYS_STATUS_DATA,
     };
     use autopilot::{Parser, Sender};
-    use messages::{Detection, FrameHeader, PixelFormat};
+    use messages::{Detection, FrameHeader, MarkerPose, PixelFormat, Transform3};
     use node::Layers;
 
     const MS: i64 = 1_000_000;
 
     fn flight(start: &str) -> Flight {
-        let layers = Layers { file: None, set: vec![format!("start={start}")] };
+        flight_with(start, &[])
+    }
+
+    fn flight_with(start: &str, set: &[&str]) -> Flight {
+        let mut all = vec![format!("start={start}")];
+        all.extend(set.iter().map(|s| (*s).to_owned()));
+        let layers = Layers { file: None, set: all };
         Flight::new(layers.load::<Config>().unwrap().settings, Arc::default()).unwrap()
     }
 
@@ -1068,5 +1075,247 @@ mod tests {
         flight.detections(now_ns, "intruder", &seen(now_ns));
         assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("another-detectors-name"));
         assert_eq!(flight.status(now_ns).candidates.len(), 1);
+    }
+
+    /// A frame in which the marker lies 5 m below a camera at the body's origin.
+    fn seen(stamp_ns: i64) -> Detections {
+        let mut covariance = [0.0; 21];
+        for diagonal in [0, 6, 11] {
+            covariance[diagonal] = 1e-4;
+        }
+        let pose = MarkerPose {
+            camera_from_marker: Transform3 {
+                translation_m: [0.2, 0.1, 5.0],
+                rotation_wxyz: [0.0, 1.0, 0.0, 0.0],
+            },
+            reprojection_rms_px: 0.1,
+            covariance,
+            alternative: None,
+        };
+        Detections {
+            detector: "main".into(),
+            header: FrameHeader {
+                camera: "down".into(),
+                sequence: 0,
+                stamp_ns,
+                clock: clock_name().into(),
+                exposure_ns: 0,
+                width: 1296,
+                height: 972,
+                format: PixelFormat::Mono8,
+                parts: Vec::new(),
+            },
+            detections: vec![Detection {
+                family: "rings".into(),
+                id: None,
+                centre_px: [720.0, 522.0],
+                centre_covariance_px2: [0.04, 0.0, 0.04],
+                corners_px: None,
+                size_px: 55.0,
+                wrong_bits: 0,
+                confidence: 1.0,
+                pose: Some(pose),
+            }],
+            stages: Vec::new(),
+        }
+    }
+
+    fn camera() -> CameraInfo {
+        CameraInfo {
+            camera: "down".into(),
+            width: 1296,
+            height: 972,
+            focal_px: Some([1818.0; 2]),
+            principal_px: [647.5, 485.5],
+            lens: messages::LensModel::Pinhole,
+            // Image right is the vehicle's right, image up its forward.
+            body_from_camera: Transform3 {
+                translation_m: [0.0; 3],
+                rotation_wxyz: [
+                    std::f64::consts::FRAC_1_SQRT_2,
+                    0.0,
+                    0.0,
+                    std::f64::consts::FRAC_1_SQRT_2,
+                ],
+            },
+        }
+    }
+
+    /// Hovers in view of the marker for so long, in the autopilot's mode of this number.
+    fn hover(flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32) -> Heard {
+        let mut heard = Heard::default();
+        for ms in (from_ms..to_ms).step_by(20) {
+            if ms % 1000 == 0 {
+                hear(flight, ms * MS, &heartbeat(mode, true));
+            }
+            pose(flight, ms * MS);
+            if ms % 60 == 0 {
+                flight.detections(ms * MS + 2, "main", &seen(ms * MS - 40 * MS));
+            }
+            flight.tick(ms * MS + 3);
+            heard.take(flight);
+        }
+        heard
+    }
+
+    #[derive(Default)]
+    struct Heard {
+        setpoints: usize,
+        targets: Vec<LANDING_TARGET_DATA>,
+        modes: Vec<f32>,
+        asked: Vec<String>,
+    }
+
+    impl Heard {
+        fn take(&mut self, flight: &mut Flight) {
+            while let Some(packet) = flight.poll_outgoing() {
+                for frame in Parser::new().push(&packet) {
+                    match frame.message {
+                        Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => self.setpoints += 1,
+                        Some(MavMessage::LANDING_TARGET(target)) => self.targets.push(target),
+                        Some(MavMessage::COMMAND_LONG(c))
+                            if c.command == MavCmd::MAV_CMD_DO_SET_MODE =>
+                        {
+                            self.modes.push(c.param2);
+                        }
+                        Some(MavMessage::PARAM_REQUEST_READ(r)) => {
+                            self.asked.push(r.param_id.to_str().unwrap_or_default().to_owned());
+                        }
+                        _ => {}
+                    }
+                }
+            }
+        }
+    }
+
+    fn told(flight: &mut Flight, now_ns: i64, name: &str, value: f32) {
+        let value =
+            PARAM_VALUE_DATA { param_value: value, param_id: name.into(), ..Default::default() };
+        hear(flight, now_ns, &MavMessage::PARAM_VALUE(value));
+    }
+
+    fn feeding(start: &str) -> Flight {
+        let mut flight = flight_with(start, &["mode=landing-target"]);
+        flight.camera(camera());
+        flight.presence(0, "main", true);
+        hear(&mut flight, 0, &heartbeat(4, true));
+        hear(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        flight
+    }
+
+    #[test]
+    fn the_autopilots_own_precision_landing_is_told_the_target_and_gets_no_setpoint() {
+        let mut flight = feeding("airborne");
+        told(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+        told(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+        let early = hover(&mut flight, 1000, 3000, 4);
+        assert!(early.modes.is_empty(), "it does not know the target for long enough");
+        let heard = hover(&mut flight, 3000, 6000, 4);
+        assert_eq!((early.setpoints, heard.setpoints), (0, 0));
+        assert_eq!(heard.modes.first(), Some(&9.0), "LAND");
+        assert!(heard.targets.len() >= 45, "at the frames' rate: {}", heard.targets.len());
+        for target in &heard.targets {
+            assert_eq!((target.frame as u8, target.position_valid.bits()), (12, 1));
+            // Image right (0.2 m) is the vehicle's right, image down (0.1 m) its back.
+            let [x, y, z] = [target.x, target.y, target.z];
+            assert!((x + 0.1).abs() < 0.03 && (y - 0.2).abs() < 0.03 && (z - 5.0).abs() < 0.1);
+        }
+        let stamps = heard.targets.windows(2).all(|pair| pair[0].time_usec <= pair[1].time_usec);
+        assert!(stamps, "of one steady clock");
+        hover(&mut flight, 6000, 7000, 9);
+        assert_eq!(flight.status(7000 * MS).phase, "final");
+        hear(&mut flight, 8000 * MS, &heartbeat(9, false));
+        flight.tick(8001 * MS);
+        let status = flight.status(8001 * MS);
+        assert!(status.phase == "landed" && status.finished, "{status:?}");
+        assert_eq!(status.guidance, "landing-target");
+    }
+
+    #[test]
+    fn a_precision_landing_that_is_off_is_told_with_what_to_set() {
+        let mut flight = feeding("command");
+        let asked = hover(&mut flight, 1000, 1500, 4).asked;
+        assert!(asked.iter().any(|name| name == "PLND_ENABLED"), "{asked:?}");
+        for (name, value, word) in [
+            ("PLND_ENABLED", 0.0, "set PLND_ENABLED to 1"),
+            ("PLND_ENABLED", 1.0, "PLND_TYPE"),
+            ("PLND_TYPE", 2.0, "set PLND_TYPE to 1"),
+        ] {
+            told(&mut flight, 1600 * MS, name, value);
+            let reply = flight.command(1600 * MS, &ControllerCommand::Start);
+            assert!(!reply.accepted && reply.reason.contains(word), "{reply:?}");
+            assert!(flight.status(1600 * MS).why.contains(word));
+        }
+        told(&mut flight, 1700 * MS, "PLND_TYPE", 1.0);
+        assert!(flight.command(1700 * MS, &ControllerCommand::Start).accepted);
+    }
+
+    #[test]
+    fn a_landing_that_the_pilot_began_is_fed_and_taken_back_only_from_high_up() {
+        let mut flight = feeding("command");
+        told(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+        told(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+        hover(&mut flight, 1000, 4000, 4);
+        let heard = hover(&mut flight, 4000, 5000, 9);
+        assert!(heard.targets.len() > 10 && heard.modes.is_empty());
+        assert_eq!(flight.status(5000 * MS).phase, "final");
+        assert!(flight.command(5000 * MS, &ControllerCommand::Abort).accepted);
+        let heard = hover(&mut flight, 5020, 5500, 9);
+        assert_eq!(heard.modes, [4.0], "GUIDED");
+        assert_eq!(flight.status(5500 * MS).phase, "aborted");
+    }
+
+    #[test]
+    fn a_low_battery_leads_to_what_is_configured() {
+        let set = ["phases.on_battery_low=\"hold\"", "alarms.battery_s=1"];
+        let mut flight = flight_with("airborne", &set);
+        hear(&mut flight, 0, &heartbeat(4, true));
+        hear(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        hover(&mut flight, 1000, 2000, 4);
+        assert_eq!(flight.status(2000 * MS).phase, "search");
+        let battery = SYS_STATUS_DATA { battery_remaining: 15, ..Default::default() };
+        hear(&mut flight, 2000 * MS, &MavMessage::SYS_STATUS(battery));
+        hover(&mut flight, 2000, 3500, 4);
+        let status = flight.status(3500 * MS);
+        assert_eq!((status.phase.as_str(), status.why.as_str()), ("hold", "the battery is low"));
+    }
+
+    #[test]
+    fn a_pilots_landing_high_up_does_not_end_the_readiness_for_the_next_flight() {
+        let mut flight = flight("airborne");
+        hear(&mut flight, 0, &heartbeat(9, true));
+        hear(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_LANDING));
+        hover(&mut flight, 20, 1000, 9);
+        assert_eq!(flight.status(1000 * MS).phase, "idle");
+        hear(&mut flight, 1000 * MS, &heartbeat(9, false));
+        hear(&mut flight, 1001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+        hear(&mut flight, 5000 * MS, &heartbeat(4, true));
+        hear(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        hover(&mut flight, 5020, 5500, 4);
+        assert_eq!(flight.status(5500 * MS).phase, "search");
+    }
+
+    #[test]
+    fn the_last_setpoint_before_the_pilots_switch_is_no_later_than_the_news_of_it() {
+        let mut flight = in_flight("airborne");
+        flight.presence(0, "main", true);
+        let mut last_ms = 0;
+        for ms in (20..4000).step_by(5) {
+            // The news of the switch comes at 2 s, between two ticks.
+            if ms == 2000 {
+                hear(&mut flight, ms * MS, &heartbeat(5, true));
+            }
+            if ms % 20 == 0 {
+                pose(&mut flight, ms * MS);
+            }
+            if ms % 25 == 0 {
+                flight.tick(ms * MS + 3);
+            }
+            if sent(&mut flight).0 > 0 {
+                last_ms = ms;
+            }
+        }
+        assert!((1900..2000).contains(&last_ms), "{last_ms} ms");
+        assert_eq!(flight.status(4000 * MS).setpoint, None);
     }
 }

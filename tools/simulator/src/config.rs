@@ -7,7 +7,7 @@ use node::{Check, Settings};
 use rendering::{CameraSettings, PadInScene, Scene, Surface};
 use serde::Deserialize;
 
-use crate::ardupilot::AutopilotConfig;
+use crate::ardupilot::{AutopilotConfig, Firmware};
 use crate::wind::{WindConfig, WindNoise};
 use crate::world::WorldConfig;
 
@@ -43,6 +43,16 @@ pub enum Flown {
     Reported,
 }
 
+/// Whose rules the simulated autopilot keeps.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FirmwareName {
+    /// Those of ArduPilot, as measured.
+    ArduPilot,
+    /// Those of PX4, as documented.
+    Px4,
+}
+
 /// The simulated autopilot.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -51,6 +61,10 @@ pub struct AutopilotSettings {
     pub address: String,
     /// Time until it can be armed, in seconds.
     pub ready_after_s: f64,
+    /// Whose rules it keeps.
+    pub firmware: FirmwareName,
+    /// Whether its own precision landing is on.
+    pub precision_landing: bool,
     /// Its speed of descent in LAND, in cm/s.
     pub land_speed_cm_s: f64,
 }
@@ -175,9 +189,18 @@ impl Config {
 
     /// The world of a simulated flight.
     pub fn world(&self) -> WorldConfig {
+        let precision = f32::from(u8::from(self.autopilot.precision_landing));
         let autopilot = AutopilotConfig {
             ready_after_s: self.autopilot.ready_after_s,
-            parameters: vec![("LAND_SPEED".to_owned(), self.autopilot.land_speed_cm_s as f32)],
+            firmware: match self.autopilot.firmware {
+                FirmwareName::ArduPilot => Firmware::ArduPilot,
+                FirmwareName::Px4 => Firmware::Px4,
+            },
+            parameters: vec![
+                ("LAND_SPEED".to_owned(), self.autopilot.land_speed_cm_s as f32),
+                ("PLND_ENABLED".to_owned(), precision),
+                ("PLND_TYPE".to_owned(), precision),
+            ],
             ..AutopilotConfig::default()
         };
         let wind = WindConfig {
