@@ -411,6 +411,13 @@ fn target() -> TargetEstimate {
         height_m: Some(10.0),
         age_ms: Some(60.0),
         rejected: None,
+        decided: None,
+        velocity_ned_m_s: None,
+        deviation_m: Some(0.02),
+        heading_rad: Some(0.0),
+        nis: Some(3.0),
+        time_offset_ms: Some(0.0),
+        wind_ned_m_s: None,
     }
 }
 
