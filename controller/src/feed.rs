@@ -35,6 +35,8 @@ enum Part {
     Asks(CommandId),
     /// The autopilot lands.
     Lands,
+    /// It is being taken back from landing.
+    Recalls(CommandId, String),
     /// On the ground, disarmed.
     Landed,
     /// It was given up, or somebody took over.
@@ -73,6 +75,14 @@ impl Feed {
                 self.part = Part::Ended(format!("the flight mode was changed to {}", state.mode));
             }
             Part::Lands => {}
+            Part::Recalls(request, why) => match autopilot.status(request) {
+                CommandStatus::Pending => {}
+                CommandStatus::Failed(problem) if lands => {
+                    tracing::error!(%problem, "The landing could not be taken back");
+                    self.part = Part::Lands;
+                }
+                _ => self.part = Part::Ended(why),
+            },
             // By the pilot or a mission, or because it was asked for.
             _ if lands => {
                 autopilot.withdraw();
@@ -138,12 +148,12 @@ impl Feed {
                     Some(Firmware::Px4) => FlightMode::AUTO_HOLD,
                     _ => FlightMode::Guided,
                 };
-                autopilot.request(now_ns, Command::SetMode(hover));
-                let why = format!("taken back by the operator; it hovers in {hover}");
-                self.part = Part::Ended(why.clone());
+                let request = autopilot.request(now_ns, Command::SetMode(hover));
+                let why = format!("taken back by the operator, to hover in {hover}");
+                self.part = Part::Recalls(request, why.clone());
                 Ok(why)
             }
-            Part::Waits | Part::Landed | Part::Ended(_) => {
+            Part::Waits | Part::Recalls(..) | Part::Landed | Part::Ended(_) => {
                 Err(format!("no landing is under way (phase `{}`)", self.phase(now_ns, None).0))
             }
         }
@@ -172,7 +182,7 @@ impl Feed {
             Part::Asks(_) => ("final", "asking for LAND".to_owned()),
             Part::Lands => ("final", format!("the autopilot lands by itself; {told}")),
             Part::Landed => ("landed", "landed and disarmed".to_owned()),
-            Part::Ended(why) => ("aborted", why.clone()),
+            Part::Recalls(_, why) | Part::Ended(why) => ("aborted", why.clone()),
         }
     }
 
