@@ -82,3 +82,34 @@ pub(super) fn estimator_status(has_position: bool) -> MavMessage {
         ..ESTIMATOR_STATUS_DATA::default()
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn offboard_needs_setpoints_before_and_during() {
+        let mut px4 = Px4::default();
+        assert_eq!(px4.asked(0.0, 6, 0), None, "no setpoint yet");
+        for step in 0..12 {
+            px4.setpoint_came(0.1 * f64::from(step));
+        }
+        assert_eq!(px4.asked(1.15, 6, 0), Some(Mode::Guided));
+        assert_eq!(px4.shown(Mode::Guided, Landed::InAir), FlightMode::OFFBOARD);
+        assert!(!px4.misses_setpoints(2.0));
+        assert!(px4.misses_setpoints(2.2), "its failsafe");
+        assert_eq!(px4.shown(Mode::Loiter, Landed::InAir), FlightMode::AUTO_HOLD);
+        px4.setpoint_came(5.0);
+        assert_eq!(px4.asked(5.1, 6, 0), None, "a gap begins anew");
+    }
+
+    #[test]
+    fn the_two_ways_to_land_are_told_apart() {
+        let mut px4 = Px4::default();
+        assert_eq!(px4.asked(0.0, 4, 6), Some(Mode::Land));
+        assert_eq!(px4.shown(Mode::Land, Landed::Landing), FlightMode::AUTO_LAND);
+        assert_eq!(px4.asked(0.0, 4, 9), Some(Mode::Land));
+        assert_eq!(px4.shown(Mode::Land, Landed::Landing), FlightMode::AUTO_PRECLAND);
+        assert_eq!(px4.shown(Mode::Guided, Landed::TakingOff), FlightMode::AUTO_TAKEOFF);
+    }
+}
