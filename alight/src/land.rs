@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
-use fiducial::Marker;
+use fiducial::{Marker, Pad};
 use messages::topic;
 use node::{Identity, Layers, Node, Shutdown};
 use tempfile::TempDir;
@@ -30,6 +30,9 @@ pub(crate) struct LandArgs {
     /// Marker to land on, on the simulated pad as well: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids.
     #[arg(long, value_name = "MARKER")]
     marker: Option<Marker>,
+    /// Pad of several markers to land on, in the simulator as well: `a4`, which comes with the program, or a TOML file.
+    #[arg(long, value_name = "PAD", conflicts_with = "marker")]
+    pad: Option<String>,
     /// What turns detections into velocity: `metric` (our own) or `thesis` (Algorithm 18).
     #[arg(long, value_name = "GUIDANCE")]
     guidance: Option<String>,
@@ -129,6 +132,15 @@ impl Settings {
             simulator.push(format!("pad.marker=\"{marker}\""));
             detector.push(format!("markers=[\"{marker}\"]"));
             controller.push(format!("marker=\"{}\"", marker.name()));
+        }
+        if let Some(name) = &args.pad {
+            let pad = Pad::named(name, |file| std::fs::read_to_string(file))?;
+            // The services are started in the same folder.
+            let name = toml::Value::from(name.as_str());
+            simulator.push(format!("pad.markers={name}"));
+            detector.push("markers=[]".to_owned());
+            detector.push(format!("pads=[{name}]"));
+            controller.push(format!("marker=\"{}\"", pad.name()));
         }
         let mut by_service = vec![
             (Service::Simulator, simulator),

@@ -1,6 +1,6 @@
 //! The detector's configuration, at the start and while it runs.
 
-use fiducial::{Detector, Marker, TrackingSettings};
+use fiducial::{Detector, Marker, Pad, TrackingSettings};
 use messages::Place;
 use node::{Check, Settings};
 use serde::{Deserialize, Serialize};
@@ -17,6 +17,8 @@ pub struct Config {
     pub camera: String,
     /// Markers to look for.
     pub markers: Vec<String>,
+    /// Pads whose markers are solved together.
+    pub pads: Vec<String>,
     /// Detections less sure than this are not published.
     pub least_confidence: f64,
     /// Threshold of `rings-thesis`, in grey levels.
@@ -43,6 +45,7 @@ impl Settings for Config {
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.name("camera", &self.camera);
+        check.parses("pads", self.parsed_pads());
         check.parses("markers", self.detector());
         check.range("least_confidence", self.least_confidence, 0.0..=1.0);
         check.range("thesis_threshold", self.thesis_threshold, 1..=255);
@@ -57,7 +60,15 @@ impl Config {
     /// # Errors
     /// Says which marker is wrong and why.
     pub fn detector(&self) -> Result<Detector, String> {
-        let markers = self.parsed_markers()?;
+        let mut markers = self.parsed_markers()?;
+        for pad in self.parsed_pads()? {
+            pad.add_markers(&mut markers);
+        }
+        if markers.is_empty() {
+            return Err(
+                "at least one marker is needed, for example \"rings:0.15341\", or a pad".to_owned()
+            );
+        }
         let settings = fiducial::Settings { thesis_threshold: self.thesis_threshold };
         Detector::new(&markers, settings).map_err(|problem| problem.to_string())
     }
@@ -90,10 +101,23 @@ impl Config {
         Ok(changed)
     }
 
-    fn parsed_markers(&self) -> Result<Vec<Marker>, String> {
-        if self.markers.is_empty() {
-            return Err("at least one marker is needed, for example \"rings:0.15341\"".to_owned());
+    /// The pads, read from their files.
+    ///
+    /// # Errors
+    /// Says which pad is wrong and why, or which file cannot be read.
+    pub fn parsed_pads(&self) -> Result<Vec<Pad>, String> {
+        let read = |name: &String| Pad::named(name, |file| std::fs::read_to_string(file));
+        let pads: Vec<Pad> =
+            self.pads.iter().map(read).collect::<Result<_, _>>().map_err(|e| e.to_string())?;
+        for (i, pad) in pads.iter().enumerate() {
+            if pads[..i].iter().any(|other| other.id() == pad.id()) {
+                return Err(format!("two pads are called `{}`; give one another `id`", pad.name()));
+            }
         }
+        Ok(pads)
+    }
+
+    fn parsed_markers(&self) -> Result<Vec<Marker>, String> {
         self.markers.iter().map(|text| text.parse().map_err(|e| format!("{e}"))).collect()
     }
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use fiducial::debug::{self, RgbImageBuf};
-use fiducial::{Detector, Stages, Tracker};
+use fiducial::{Detector, Pad, Stages, Tracker};
 use geometry::CameraModel;
 use imaging::{Converter, GrayView};
 use messages::{
@@ -101,6 +101,7 @@ fn info(config: &Config) -> DetectorInfo {
 struct Change {
     config: Config,
     detector: Detector,
+    pads: Vec<Pad>,
 }
 
 /// The parameters, as they are changed.
@@ -131,8 +132,8 @@ impl Live {
 
     fn set(&mut self, key: &str, value: &str) -> Result<(), String> {
         let config = self.config.with(key, value)?;
-        let detector = config.detector()?;
-        *lock(&self.change) = Some(Change { config: config.clone(), detector });
+        let (detector, pads) = (config.detector()?, config.parsed_pads()?);
+        *lock(&self.change) = Some(Change { config: config.clone(), detector, pads });
         self.config = config;
         Ok(())
     }
@@ -150,6 +151,7 @@ struct Work {
     config: Config,
     converter: Converter,
     detector: Detector,
+    pads: Vec<Pad>,
     tracker: Tracker,
     overlay: RgbImageBuf,
 }
@@ -162,6 +164,7 @@ impl Work {
         change: Arc<Mutex<Option<Change>>>,
     ) -> anyhow::Result<Self> {
         let detector = config.detector().map_err(anyhow::Error::msg)?;
+        let pads = config.parsed_pads().map_err(anyhow::Error::msg)?;
         let mut debug = Vec::new();
         for image in DEBUG_IMAGES {
             debug.push((
@@ -180,6 +183,7 @@ impl Work {
             config: config.clone(),
             converter: Converter::default(),
             detector,
+            pads,
             tracker: Tracker::new(config.tracking().unwrap_or_default()),
             overlay: RgbImageBuf::default(),
         })
@@ -232,8 +236,9 @@ impl Work {
     }
 
     fn take_change(&mut self) {
-        if let Some(Change { config, detector }) = lock(&self.change).take() {
+        if let Some(Change { config, detector, pads }) = lock(&self.change).take() {
             self.detector = detector;
+            self.pads = pads;
             self.tracker = Tracker::new(config.tracking().unwrap_or_default());
             self.config = config;
         }
@@ -253,8 +258,13 @@ impl Work {
             }
             false => self.detector.detect(view, camera.as_ref(), clock),
         };
-        let sure = found.iter().filter(|seen| seen.confidence >= self.config.least_confidence);
-        sure.map(wire::detection).collect()
+        let least = self.config.least_confidence;
+        let markers = found.iter().filter(|seen| seen.confidence >= least).map(wire::detection);
+        let pads = self.pads.iter().filter_map(|pad| {
+            let seen = pad.observe(found, camera.as_ref()?)?;
+            (seen.confidence >= least).then(|| wire::pad_detection(pad, &seen))
+        });
+        markers.chain(pads).collect()
     }
 
     async fn publish(&self, header: &FrameHeader, found: Vec<Detection>, clock: StageClock) {

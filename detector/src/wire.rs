@@ -1,6 +1,6 @@
 //! Between the algorithm's types and the messages.
 
-use fiducial::{MarkerPose, Observation};
+use fiducial::{MarkerPose, Observation, Pad, PadObservation};
 use geometry::{Camera, CameraModel, Distortion, Marker, Transform};
 use imaging::{Mosaic, SampleFormat};
 use messages::{
@@ -64,6 +64,22 @@ pub fn detection(observation: &Observation) -> Detection {
         wrong_bits: observation.wrong_bits,
         confidence: observation.confidence,
         pose: observation.pose.as_ref().map(marker_pose),
+    }
+}
+
+/// A pad as it is sent: a marker of the family `pad`, whose pose is that of the landing point.
+pub fn pad_detection(pad: &Pad, seen: &PadObservation) -> Detection {
+    let spread = &seen.centre_covariance_px2;
+    Detection {
+        family: Pad::FAMILY.to_owned(),
+        id: Some(pad.id()),
+        centre_px: [seen.centre.x, seen.centre.y],
+        centre_covariance_px2: [spread.m11 as f32, spread.m12 as f32, spread.m22 as f32],
+        corners_px: None,
+        size_px: seen.size_px,
+        wrong_bits: 0,
+        confidence: seen.confidence,
+        pose: Some(marker_pose(&seen.pose)),
     }
 }
 

@@ -15,7 +15,9 @@ use std::time::Instant;
 
 use camera_pub::read_calibration;
 use clap::{Args, ValueEnum};
-use fiducial::{Detector, Marker, MarkerPose, Observation, PoseSolution, Settings, Tracker};
+use fiducial::{
+    Detector, Marker, MarkerPose, Observation, Pad, PadObservation, PoseSolution, Settings, Tracker,
+};
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayImage, Mosaic};
 use serde::Serialize;
@@ -30,8 +32,12 @@ const AHEAD: usize = 4;
 #[derive(Args, Clone, Debug)]
 pub(crate) struct DetectArgs {
     /// Marker to look for: `FAMILY:ID[:SIZE_M]`, or `FAMILY[:SIZE_M]` for a family without ids (rings). May be repeated.
-    #[arg(long = "marker", required = true, value_name = "MARKER")]
+    #[arg(long = "marker", required_unless_present = "pads", value_name = "MARKER")]
     markers: Vec<Marker>,
+    /// Pad to look for, whose markers are solved together: `a4`, which comes with the program, or a TOML file. It needs
+    /// a camera, and is reported as a marker `pad:ID`. May be repeated.
+    #[arg(long = "pad", value_name = "PAD")]
+    pads: Vec<String>,
     /// Calibration of the camera (ROS camera_info, Kalibr camchain or OpenCV FileStorage, as YAML); with it, markers
     /// of known size have a pose.
     #[arg(long, value_name = "FILE", conflicts_with = "focal_px")]
@@ -102,8 +108,9 @@ enum Lens {
 }
 
 /// Looks for markers in one image after the other.
-struct Examiner<'a> {
-    markers: &'a [Marker],
+struct Examiner {
+    markers: Vec<Marker>,
+    pads: Vec<Pad>,
     mosaic: Option<Mosaic>,
     lens: Lens,
     tracks: bool,
@@ -117,10 +124,17 @@ struct Worker {
     tracker: Option<Tracker>,
 }
 
-impl<'a> Examiner<'a> {
-    fn new(args: &'a DetectArgs, lens: Lens) -> anyhow::Result<Self> {
+impl Examiner {
+    fn new(args: &DetectArgs, lens: Lens) -> anyhow::Result<Self> {
+        let read = |name: &String| Pad::named(name, |file| std::fs::read_to_string(file));
+        let pads: Vec<Pad> = args.pads.iter().map(read).collect::<Result<_, _>>()?;
+        let mut markers = args.markers.clone();
+        for pad in &pads {
+            pad.add_markers(&mut markers);
+        }
         Ok(Self {
-            markers: &args.markers,
+            markers,
+            pads,
             mosaic: args.bayer,
             lens,
             tracks: args.track,
@@ -130,7 +144,7 @@ impl<'a> Examiner<'a> {
     }
 
     fn worker(&self) -> anyhow::Result<Worker> {
-        let detector = Detector::new(self.markers, Settings::default())?;
+        let detector = Detector::new(&self.markers, Settings::default())?;
         Ok(Worker { detector, tracker: self.tracks.then(Tracker::default) })
     }
 
@@ -178,7 +192,11 @@ impl<'a> Examiner<'a> {
                 .add(name, image, found, camera.as_ref())
                 .map_err(|problem| format!("{problem:#}"))?;
         }
-        let detections = found.iter().map(Detection::from).collect();
+        let pads = self.pads.iter().filter_map(|pad| {
+            let seen = pad.observe(found, camera.as_ref()?)?;
+            Some(Detection::of_pad(pad, &seen))
+        });
+        let detections = found.iter().map(Detection::from).chain(pads).collect();
         Ok(Found { width: image.width(), height: image.height(), detect_ms, detections })
     }
 
@@ -338,6 +356,21 @@ impl Line {
 }
 
 impl Detection {
+    fn of_pad(pad: &Pad, seen: &PadObservation) -> Self {
+        let spread = &seen.centre_covariance_px2;
+        Self {
+            family: Pad::FAMILY,
+            id: Some(pad.id()),
+            centre_px: [seen.centre.x, seen.centre.y],
+            centre_covariance_px2: [spread.m11, spread.m12, spread.m22],
+            corners_px: None,
+            size_px: seen.size_px,
+            wrong_bits: 0,
+            confidence: seen.confidence,
+            pose: Some(Pose::from(&seen.pose)),
+        }
+    }
+
     fn append_text(&self, text: &mut String) {
         let id = self.id.map_or_else(String::new, |id| format!(":{id}"));
         let [x, y] = self.centre_px;
@@ -371,7 +404,7 @@ struct Totals {
 /// output may stop reading, which ends the work.
 fn examine_all<W: Write + Send>(
     source: Source,
-    examiner: &Examiner<'_>,
+    examiner: &Examiner,
     threads: usize,
     format: Format,
     out: W,

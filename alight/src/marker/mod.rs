@@ -12,7 +12,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
-use fiducial::Marker;
+use fiducial::{Marker, Pad};
 
 pub(crate) use sheet::SheetError;
 use sheet::{Paper, Sheet};
@@ -21,7 +21,11 @@ use sheet::{Paper, Sheet};
 #[derive(Args, Clone, Debug)]
 pub(crate) struct MarkerArgs {
     /// The marker: FAMILY:ID, or FAMILY for a family without ids (rings).
-    marker: Marker,
+    #[arg(required_unless_present = "pad")]
+    marker: Option<Marker>,
+    /// In place of one marker, a pad of several: `a4`, which comes with the program, or a TOML file.
+    #[arg(long, value_name = "PAD", conflicts_with_all = ["marker", "size"])]
+    pad: Option<String>,
     /// Its size in metres: the outer diameter of rings, the edge of the outer black square of others.
     #[arg(long, value_name = "M", value_parser = size_m)]
     size: Option<f64>,
@@ -79,8 +83,18 @@ fn size_m(text: &str) -> Result<f64, String> {
 /// # Errors
 /// [`SheetError`] when there is no such sheet; otherwise the file could not be written.
 pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
-    let size_m = stated_size(args)?;
-    let sheet = Sheet::new(&args.marker, size_m, args.paper)?;
+    let (sheet, what) = match (&args.marker, &args.pad) {
+        (Some(marker), _) => {
+            let size_m = stated_size(args.size, marker)?;
+            (Sheet::new(marker, size_m, args.paper)?, format!("{}, {size_m} m", marker.name()))
+        }
+        (None, pad) => {
+            let name = pad.as_deref().unwrap_or_default();
+            let pad = Pad::named(name, |file| std::fs::read_to_string(file))?;
+            let count = pad.markers().len();
+            (Sheet::of_pad(&pad, args.paper)?, format!("{}, {count} markers", pad.name()))
+        }
+    };
     let bytes = match args.output.form {
         Form::Pdf => pdf::document(&sheet),
         Form::Svg => svg::document(&sheet).into_bytes(),
@@ -88,10 +102,9 @@ pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
     };
     let path: &Path = &args.output.path;
     std::fs::write(path, bytes).with_context(|| format!("writing {path:?}"))?;
-    let name = args.marker.name();
     writeln!(
         std::io::stdout(),
-        "{}: {name}, {size_m} m, on {}. Print it at 100 %, then measure the ruler below it: 100 mm.",
+        "{}: {what}, on {}. Print it at 100 %, then measure the ruler below it: 100 mm.",
         path.display(),
         args.paper.name()
     )
@@ -99,8 +112,8 @@ pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn stated_size(args: &MarkerArgs) -> Result<f64, SheetError> {
-    match (args.size, args.marker.size_m) {
+fn stated_size(beside: Option<f64>, marker: &Marker) -> Result<f64, SheetError> {
+    match (beside, marker.size_m) {
         (Some(size), Some(other)) if size != other => Err(SheetError::TwoSizes { size, other }),
         (Some(size), _) | (None, Some(size)) => Ok(size),
         (None, None) => Err(SheetError::NoSize),
@@ -134,6 +147,21 @@ mod tests {
             write(&["rings", "--size", "0.15341", "--dpi", "72", "-o", text]).unwrap();
             assert!(std::fs::read(&path).unwrap().starts_with(start), "{name}");
         }
+    }
+
+    #[test]
+    fn a_pad_is_written_on_one_sheet() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["a.pdf", "a.svg", "a.png"] {
+            let path = folder.path().join(name);
+            write(&["--pad", "a4", "--dpi", "72", "-o", path.to_str().unwrap()]).unwrap();
+            assert!(path.metadata().unwrap().len() > 1000, "{name}");
+        }
+        let path = folder.path().join("a.pdf");
+        let problem = write(&["--pad", "a4", "--paper", "a5", "-o", path.to_str().unwrap()]);
+        assert!(problem.unwrap_err().contains("it fits on a4"));
+        let problem = write(&["--pad", "no/such.toml", "-o", path.to_str().unwrap()]).unwrap_err();
+        assert!(problem.contains("no/such.toml"), "{problem}");
     }
 
     #[test]

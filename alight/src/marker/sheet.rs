@@ -1,7 +1,7 @@
 //! What is on the paper, and where: the marker, lines to cut along, a ruler, and words.
 
 use clap::ValueEnum;
-use fiducial::{Drawing, Ink, Marker, Shape};
+use fiducial::{Drawing, Ink, Marker, Pad, Shape};
 
 /// The edge of the paper on which printers print nothing, in millimetres.
 const EDGE_MM: f64 = 5.0;
@@ -164,16 +164,39 @@ impl Sheet {
         if 2.0 * half_mm > paper.room_mm() + ROUNDING_MM {
             return Err(too_large(marker, size_m, half_mm, paper));
         }
+        Ok(Self::with(&drawing, &format!("{}, size {size_m} m", marker.name()), paper))
+    }
+
+    /// A sheet with all markers of a pad, its landing point in the middle.
+    pub(super) fn of_pad(pad: &Pad, paper: Paper) -> Result<Self, SheetError> {
+        let drawing = pad.drawing().ok_or(SheetError::NoId)?;
+        let needed_mm = 2e3 * drawing.half_extent_m;
+        if needed_mm > paper.room_mm() + ROUNDING_MM {
+            let instead = larger_paper(needed_mm)
+                .map_or(String::new(), |paper| format!("; it fits on {}", paper.name()));
+            let problem = format!(
+                "{} needs {needed_mm:.1} mm about its landing point; {} has {:.1} mm{instead}",
+                pad.name(),
+                paper.name(),
+                paper.room_mm()
+            );
+            return Err(SheetError::TooLarge { problem });
+        }
+        let count = pad.markers().len();
+        Ok(Self::with(&drawing, &format!("{}, {count} markers", pad.name()), paper))
+    }
+
+    fn with(drawing: &Drawing, title: &str, paper: Paper) -> Self {
         let mut sheet = Self { size_mm: paper.size_mm(), marks: Vec::new() };
-        sheet.draw_marker(&drawing);
-        sheet.draw_cut_marks(half_mm);
+        sheet.draw_marker(drawing);
+        sheet.draw_cut_marks(drawing.half_extent_m * 1e3);
         sheet.draw_ruler();
         let [width, height] = sheet.size_mm;
         let left = (width - RULER_MM) / 2.0;
-        sheet.write([left, height - 11.0], format!("{}, size {size_m} m", marker.name()));
+        sheet.write([left, height - 11.0], title.to_owned());
         let advice = "Print at 100 %: the ruler must measure 100 mm.";
         sheet.write([left, height - EDGE_MM - 1.0], advice.to_owned());
-        Ok(sheet)
+        sheet
     }
 
     fn middle(&self) -> [f64; 2] {
@@ -245,13 +268,16 @@ impl Sheet {
     }
 }
 
+/// The smallest paper with so much room.
+fn larger_paper(needed_mm: f64) -> Option<&'static Paper> {
+    Paper::value_variants().iter().find(|paper| paper.room_mm() + ROUNDING_MM >= needed_mm)
+}
+
 fn too_large(marker: &Marker, size_m: f64, half_mm: f64, paper: Paper) -> SheetError {
     let per_metre = 2.0 * half_mm / size_m;
     // Tenths of millimetres, rounded down, so that the size stated does fit.
     let largest_m = (paper.room_mm() / per_metre * 1e4).floor() / 1e4;
-    let mut larger =
-        Paper::value_variants().iter().filter(|p| p.room_mm() + ROUNDING_MM >= 2.0 * half_mm);
-    let instead = match larger.next() {
+    let instead = match larger_paper(2.0 * half_mm) {
         Some(paper) => format!("; {size_m} m fit on {}", paper.name()),
         None => String::new(),
     };

@@ -5,7 +5,7 @@
 //!
 //! Modules in reading order: [`marker`] names what is looked for, [`square`] has the codes of square markers and finds
 //! them, `stag` finds STags among the same quads, [`drawing`] says what a marker looks like, [`observation`] is what was
-//! found, [`pose`] where it is in space, [`detector`] finds it. [`ring`] and [`rings_thesis`] are the thesis' way
+//! found, [`pose`] where it is in space, [`detector`] finds it, [`pad`] solves the markers of one pad together. [`ring`] and [`rings_thesis`] are the thesis' way
 //! (Algorithms 1-15). [`rings`] is the second generation: `outline` takes ellipses from outlines, `profile` compares the
 //! bands about them with the marker's, `search` goes from one circle to all edges, `circles` and, for small markers,
 //! `photometry` give the pose, `lens` serves images of unknown cameras. `step` is what a camera makes of a sharp edge;
@@ -24,6 +24,7 @@ pub mod letters;
 pub mod marker;
 pub mod observation;
 mod outline;
+pub mod pad;
 mod photometry;
 pub mod pose;
 mod profile;
@@ -41,6 +42,7 @@ pub use detector::{Detector, DetectorError, Settings};
 pub use drawing::{Drawing, Ink, Layer, Shape};
 pub use marker::{Family, Marker, MarkerError};
 pub use observation::{MarkerPose, Observation, PoseSolution, Stages};
+pub use pad::{Pad, PadError, PadObservation, PlacedMarker};
 pub use pose::{PlanePoint, planar_pose, square_pose};
 pub use ring::{Ring, RingKind};
 pub use trace::{Candidate, Reason, Refusal, Trace, TracedMarker};

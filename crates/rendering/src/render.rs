@@ -134,18 +134,23 @@ const UNDERGROUND: f32 = 0.02;
 const FARTHEST_GRAIN_M: f64 = 500.0;
 
 impl PadInScene {
-    /// A pad that lies flat on the ground, as in the thesis (section 4.4.2): `heading` turns the marker's y axis
+    /// A marker that lies flat on the ground, as in the thesis (section 4.4.2): `heading` turns the marker's y axis
     /// from north towards east (radians), the box is 0.01 m high, and its lid holds the drawing's quiet zone.
     pub fn flat(marker: Marker, north_m: f64, east_m: f64, heading: f64) -> Self {
-        const THICKNESS_M: f64 = 0.01;
-        let up = Matrix3::from_columns(&[Vector3::y(), Vector3::x(), -Vector3::z()]);
-        let flat = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(up));
-        let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading) * flat;
         // What cannot be drawn is refused when it is rendered.
         let drawing = marker
             .size_m
             .and_then(|size_m| Drawing::new(&marker, size_m))
             .unwrap_or(Drawing { half_extent_m: f64::NAN, layers: Vec::new() });
+        Self::printed(drawing, north_m, east_m, heading)
+    }
+
+    /// Anything printed that lies flat on the ground, as [`PadInScene::flat`].
+    pub fn printed(drawing: Drawing, north_m: f64, east_m: f64, heading: f64) -> Self {
+        const THICKNESS_M: f64 = 0.01;
+        let up = Matrix3::from_columns(&[Vector3::y(), Vector3::x(), -Vector3::z()]);
+        let flat = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(up));
+        let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading) * flat;
         Self {
             ned_from_marker: Transform::new(
                 Rotation::from_quaternion(turned),

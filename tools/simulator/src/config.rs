@@ -1,7 +1,7 @@
 //! The simulator's configuration.
 
 use autopilot::Address;
-use fiducial::Marker;
+use fiducial::{Drawing, Marker, Pad};
 use geometry::{CameraModel, Point, Transform};
 use node::{Check, Settings};
 use rendering::{CameraSettings, PadInScene, Scene, Surface};
@@ -89,6 +89,8 @@ pub struct WindSettings {
 pub struct PadSettings {
     /// What is printed on it.
     pub marker: String,
+    /// The pad of several markers that is printed in place of one, or nothing.
+    pub markers: String,
     /// Where it lies, north of the start, in metres.
     pub north_m: f64,
     /// Where it lies, east of the start, in metres.
@@ -149,6 +151,7 @@ impl Settings for Config {
         check.range("wind.from_deg", self.wind.from_deg, 0.0..=360.0);
         check.range("wind.turbulence", self.wind.turbulence, 0.0..=10.0);
         check.parses("pad.marker", self.pad_marker());
+        check.parses("pad.markers", self.printed());
         check.range("pad.north_m", self.pad.north_m, -1000.0..=1000.0);
         check.range("pad.east_m", self.pad.east_m, -1000.0..=1000.0);
         check.range("pad.heading_deg", self.pad.heading_deg, -360.0..=360.0);
@@ -187,6 +190,19 @@ impl Config {
         }
     }
 
+    /// What is on the pad's lid, of one marker or several.
+    fn printed(&self) -> Result<Drawing, String> {
+        let name = self.pad.markers.as_str();
+        if name.is_empty() {
+            let marker = self.pad_marker()?;
+            let drawing = marker.size_m.and_then(|size_m| Drawing::new(&marker, size_m));
+            return drawing.ok_or_else(|| format!("`{marker}` cannot be printed: which id?"));
+        }
+        let pad = Pad::named(name, |file| std::fs::read_to_string(file));
+        let pad = pad.map_err(|problem| problem.to_string())?;
+        pad.drawing().ok_or_else(|| format!("pad `{name}` cannot be printed"))
+    }
+
     /// The world of a simulated flight.
     pub fn world(&self) -> WorldConfig {
         let precision = f32::from(u8::from(self.autopilot.precision_landing));
@@ -218,8 +234,8 @@ impl Config {
     /// Says what is wrong with the pad or the ground.
     pub fn scene(&self) -> Result<Scene, String> {
         let heading_rad = self.pad.heading_deg.to_radians();
-        let pad =
-            PadInScene::flat(self.pad_marker()?, self.pad.north_m, self.pad.east_m, heading_rad);
+        let (north_m, east_m) = (self.pad.north_m, self.pad.east_m);
+        let pad = PadInScene::printed(self.printed()?, north_m, east_m, heading_rad);
         Ok(Scene {
             surface: self.ground.surface.parse()?,
             pads: vec![pad],

@@ -1,0 +1,198 @@
+//! Pads of several markers, in pictures with truth.
+#![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
+#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+
+use fiducial::{Detector, Marker, Observation, Pad, PadObservation, Settings};
+use geometry::{Body, Camera, CameraModel, Marker as MarkerFrame, Ned, Point, Rotation, Transform};
+use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
+
+/// Four markers about the landing point, two of them turned.
+const FOUR: &str = r#"
+id = 7
+tolerance_m = 0.0001
+[[markers]]
+marker = "apriltag-36h11:1:0.16"
+x_m = -0.2
+y_m = 0.1
+[[markers]]
+marker = "aruco-4x4-50:2:0.08"
+x_m = 0.15
+y_m = 0.15
+quarter_turns = 1
+[[markers]]
+marker = "apriltag-16h5:3:0.06"
+x_m = 0.12
+y_m = -0.08
+quarter_turns = 2
+[[markers]]
+marker = "rings:0.1"
+x_m = -0.1
+y_m = -0.15
+"#;
+
+fn built_in() -> Pad {
+    Pad::named("a4", |_| unreachable!("it comes with the program")).unwrap()
+}
+
+struct Over {
+    pad: Pad,
+    camera: CameraModel,
+    detector: Detector,
+    renderer: Renderer,
+    settings: CameraSettings,
+    ned_from_pad: Transform<Ned, MarkerFrame>,
+    pixels: Vec<u8>,
+}
+
+impl Over {
+    fn new(pad: Pad) -> Self {
+        let settings = CameraSettings::thesis().exposed_for(1.0, 200.0, 0.008);
+        let printed = PadInScene::printed(pad.drawing().unwrap(), 0.0, 0.0, 0.3);
+        let ned_from_pad = printed.ned_from_marker;
+        let scene =
+            Scene { surface: Surface::Asphalt, pads: vec![printed], painted_marks: 0, light: 1.0 };
+        let renderer = Renderer::new(&scene, settings.clone(), 5).unwrap();
+        let markers: Vec<Marker> = pad.markers().iter().map(|it| it.marker).collect();
+        let detector = Detector::new(&markers, Settings::default()).unwrap();
+        let camera = settings.model;
+        let pixels = vec![0; camera.width as usize * camera.height as usize];
+        Self { pad, camera, detector, renderer, settings, ned_from_pad, pixels }
+    }
+
+    /// What is found from a place above the pad (metres north, east and up of its landing point), and the pad's pose in
+    /// truth.
+    fn look(
+        &mut self,
+        [north, east, up]: [f64; 3],
+        tilt: f64,
+    ) -> (Vec<Observation>, Transform<Camera, MarkerFrame>) {
+        let lid = self.ned_from_pad.origin().z();
+        let body: Transform<Ned, Body> = Transform::new(
+            Rotation::from_euler(tilt, -0.5 * tilt, 0.7),
+            Point::new(north, east, lid - up),
+        );
+        self.renderer.render(&[body], 1, &mut self.pixels).unwrap();
+        let (width, height) = (self.camera.width as usize, self.camera.height as usize);
+        let view = imaging::GrayView::new(&self.pixels, width, height, width).unwrap();
+        let found = self.detector.detect(view, Some(&self.camera), &mut ()).to_vec();
+        let ned_from_camera = body * self.settings.body_from_camera;
+        (found, ned_from_camera.inverse() * self.ned_from_pad)
+    }
+
+    fn observe(&self, found: &[Observation]) -> Option<PadObservation> {
+        self.pad.observe(found, &self.camera)
+    }
+}
+
+/// Distance between two poses' origins, in metres.
+fn apart(a: &Transform<Camera, MarkerFrame>, b: &Transform<Camera, MarkerFrame>) -> f64 {
+    (a.origin().coords - b.origin().coords).norm()
+}
+
+/// The angle between two poses, in radians.
+fn turned(a: &Transform<Camera, MarkerFrame>, b: &Transform<Camera, MarkerFrame>) -> f64 {
+    (a.rotation().inverse() * b.rotation()).angle()
+}
+
+#[test]
+fn the_sheet_of_a4_is_seen_from_15_m_to_a_hands_breadth() {
+    let mut over = Over::new(built_in());
+    for up in [15.0, 12.0, 8.0, 4.0, 2.0, 1.2, 0.8, 0.5, 0.3, 0.2, 0.12] {
+        let (found, truth) = over.look([0.01 * up, 0.02 * up, up], 0.03);
+        let pad = over.observe(&found).unwrap();
+        let error_m = apart(&pad.pose.camera_from_marker, &truth);
+        println!("{up} m: {} markers, {:.3} mm", pad.used, error_m * 1e3);
+        assert!(error_m < 0.001 * up, "{up} m: {error_m} m");
+        assert!(pad.centre.distance(&over.camera.project(truth.origin()).unwrap()) < 0.1);
+    }
+}
+
+#[test]
+fn all_markers_are_solved_together_however_they_are_turned() {
+    let mut over = Over::new(FOUR.parse().unwrap());
+    let (found, truth) = over.look([0.1, -0.1, 4.0], 0.05);
+    let pad = over.observe(&found).unwrap();
+    assert_eq!((pad.used, pad.left_out), (4, 0));
+    let pose = &pad.pose.camera_from_marker;
+    assert!(apart(pose, &truth) < 0.001 && turned(pose, &truth) < 0.005, "{pad:?}");
+    // Each square alone says the same, less surely.
+    for one in found.iter().filter(|it| it.corners.is_some()) {
+        let alone = over.observe(std::slice::from_ref(one)).unwrap();
+        assert!(turned(&alone.pose.camera_from_marker, &truth) < 0.1, "{one:?}");
+        for axis in 0..6 {
+            let (all, alone) = (pad.pose.covariance, alone.pose.covariance);
+            assert!(all[(axis, axis)] <= alone[(axis, axis)] * 1.01, "{one:?}");
+        }
+    }
+}
+
+#[test]
+fn nothing_jumps_when_a_marker_leaves_the_view() {
+    let mut over = Over::new(FOUR.parse().unwrap());
+    for up in [1.0, 2.0, 6.0] {
+        let (found, _) = over.look([0.0, 0.0, up], 0.04);
+        let all = over.observe(&found).unwrap();
+        assert!(all.used >= 3, "{up} m: {}", all.used);
+        for without in 0..found.len() {
+            let mut rest = found.clone();
+            rest.remove(without);
+            let rest = over.observe(&rest).unwrap();
+            let step = all.pose.camera_from_marker.origin().coords
+                - rest.pose.camera_from_marker.origin().coords;
+            for (axis, step) in [step.x(), step.y(), step.z()].into_iter().enumerate() {
+                let deviation = rest.pose.covariance[(axis, axis)].sqrt();
+                assert!(step.abs() < 4.0 * deviation, "{up} m, {step} m of {deviation} m");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_marker_that_lies_elsewhere_is_left_out() {
+    let mut over = Over::new(FOUR.parse().unwrap());
+    let (found, truth) = over.look([0.0, 0.0, 3.0], 0.0);
+    // The pad is described with one of its markers 3 cm from where it is printed.
+    for (right, wrong) in [("x_m = 0.15", "x_m = 0.18"), ("x_m = -0.1\n", "x_m = -0.07\n")] {
+        assert!(FOUR.contains(right));
+        let pad: Pad = FOUR.replace(right, wrong).parse().unwrap();
+        let seen = pad.observe(&found, &over.camera).unwrap();
+        assert_eq!((seen.used, seen.left_out), (3, 1), "{right}");
+        assert!(apart(&seen.pose.camera_from_marker, &truth) < 0.001, "{seen:?}");
+    }
+}
+
+#[test]
+fn rings_alone_are_a_pad_only_in_its_middle() {
+    let mut over = Over::new("id = 1\nmarkers = [{ marker = \"rings:0.15\" }]".parse().unwrap());
+    let (found, truth) = over.look([0.0, 0.1, 3.0], 0.02);
+    let seen = over.observe(&found).unwrap();
+    assert!(apart(&seen.pose.camera_from_marker, &truth) < 0.003, "{seen:?}");
+    let aside: Pad = "id = 1\nmarkers = [{ marker = \"rings:0.15\", x_m = 0.1 }]".parse().unwrap();
+    assert_eq!(aside.observe(&found, &over.camera), None);
+    assert_eq!(aside.observe(&[], &over.camera), None);
+}
+
+#[test]
+fn wrong_descriptions_say_what_is_wrong() {
+    let problem = |text: &str| text.parse::<Pad>().unwrap_err().to_string();
+    let check = |text: &str, part: &str| {
+        let problem = problem(text);
+        assert!(problem.contains(part), "`{part}` is not in: {problem}");
+    };
+    check("id = 1\nmarkers = []", "from 1 to 32");
+    check(
+        "id = 1\nmarkers = [{ marker = \"rings\" }]",
+        "marker 1, `rings`: a marker of a pad needs a size",
+    );
+    check("id = 1\nmarkers = [{ marker = \"apriltag-16h5:*:0.1\" }]", "needs an id");
+    check("id = 1\nmarkers = [{ marker = \"rings:0.1\" }, { marker = \"rings:0.2\" }]", "twice");
+    check("id = 1\nmarkers = [{ marker = \"rings:0.1\", x_m = 11 }]", "from -10 to 10");
+    check("id = 1\nmarkers = [{ marker = \"rings:0.1\", x_m = nan }]", "x_m of marker 1");
+    check("id = 1\nmarkers = [{ marker = \"rings:0.1\", quarter_turns = 4 }]", "from 0 to 3");
+    check("id = 1\ntolerance_m = 1\nmarkers = [{ marker = \"rings:0.1\" }]", "tolerance_m");
+    check("markers = [{ marker = \"rings:0.1\" }]", "missing field `id`");
+    check("id = 1\nsize = 3\nmarkers = []", "unknown field `size`");
+    let missing = Pad::named("no/such.toml", |_| Err(std::io::ErrorKind::NotFound.into()));
+    let missing = missing.unwrap_err().to_string();
+    assert!(missing.contains("no/such.toml") && missing.contains("a4"), "{missing}");
+}
