@@ -109,7 +109,7 @@ fn the_sheet_of_a4_is_seen_from_15_m_to_a_hands_breadth() {
 
 #[test]
 fn all_markers_are_solved_together_however_they_are_turned() {
-    let mut over = Over::new(FOUR.parse().unwrap());
+    let mut over = Over::new(FOUR.replace("0.0001", "0.0").parse().unwrap());
     let (found, truth) = over.look([0.1, -0.1, 4.0], 0.05);
     let pad = over.observe(&found).unwrap();
     assert_eq!((pad.used, pad.left_out), (4, 0));
@@ -118,7 +118,9 @@ fn all_markers_are_solved_together_however_they_are_turned() {
     // Each square alone says the same, less surely.
     for one in found.iter().filter(|it| it.corners.is_some()) {
         let alone = over.observe(std::slice::from_ref(one)).unwrap();
-        assert!(turned(&alone.pose.camera_from_marker, &truth) < 0.1, "{one:?}");
+        let other = alone.pose.alternative.map(|other| turned(&other.camera_from_marker, &truth));
+        let nearest = turned(&alone.pose.camera_from_marker, &truth).min(other.unwrap_or(9.0));
+        assert!(nearest < 0.1, "{one:?}");
         for axis in 0..6 {
             let (all, alone) = (pad.pose.covariance, alone.pose.covariance);
             assert!(all[(axis, axis)] <= alone[(axis, axis)] * 1.01, "{one:?}");
@@ -139,7 +141,7 @@ fn nothing_jumps_when_a_marker_leaves_the_view() {
             let rest = over.observe(&rest).unwrap();
             let step = all.pose.camera_from_marker.origin().coords
                 - rest.pose.camera_from_marker.origin().coords;
-            for (axis, step) in [step.x(), step.y(), step.z()].into_iter().enumerate() {
+            for (axis, step) in [step.x, step.y, step.z].into_iter().enumerate() {
                 let deviation = rest.pose.covariance[(axis, axis)].sqrt();
                 assert!(step.abs() < 4.0 * deviation, "{up} m, {step} m of {deviation} m");
             }
