@@ -49,10 +49,11 @@ const OUTSIDE: [&str; 17] = [
 ];
 
 /// The documents whose paths and names must exist.
-const DOCUMENTS: [&str; 5] = [
+const DOCUMENTS: [&str; 6] = [
     "README.md",
     "ARCHITECTURE.md",
     "CONTRIBUTING.md",
+    "docs/deploy.md",
     "docs/wire-format.md",
     "zenoh-config/README.md",
 ];
@@ -279,10 +280,11 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
             }
         }
     }
-    // All that have a configuration are services of the network, and `node` publishes the health of each.
+    // All that have a configuration are services of the network, and `node` publishes the health of each; of the
+    // relay as well, which has nothing to configure.
     let with_defaults = workspace.iter().filter(|p| defaults(p).is_file());
-    publishers
-        .insert("health/{service}/{instance}", with_defaults.map(|p| p.name.as_str()).collect());
+    let services = with_defaults.map(|p| p.name.as_str()).chain(["relay"]);
+    publishers.insert("health/{service}/{instance}", services.collect());
     for row in TOPICS.iter().filter(|row| row.delivery != Delivery::Query) {
         let stated: BTreeSet<_> = row.publishers.iter().copied().collect();
         let found = publishers.get(row.key).cloned().unwrap_or_default();

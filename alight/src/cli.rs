@@ -8,7 +8,7 @@ use messages::{ControllerCommand, DetectorCommand, topic};
 use node::{ConfigError, Identity, Layers, Network, Node, ZenohSource};
 
 use crate::services::{self, Service};
-use crate::{detect, detectors, experiment, land, marker, relay, swap};
+use crate::{detect, detectors, doctor, experiment, keys, land, marker, relay, swap, up};
 
 /// The role whose key a person at the command line holds.
 pub(crate) const OPERATOR: &str = "operator";
@@ -31,6 +31,8 @@ struct Cli {
 enum Command {
     /// Land: start all services as processes, show the landing, print the result.
     Land(land::LandArgs),
+    /// Start what belongs on this machine, and start it again when it ends, until Ctrl-C.
+    Up(up::UpArgs),
     /// Publish frames from image files.
     CameraPub(ServiceArgs),
     /// Find markers in frames.
@@ -43,6 +45,10 @@ enum Command {
     Simulator(ServiceArgs),
     /// Pass messages on between the drone's own processes and the ground.
     Relay(relay::RelayArgs),
+    /// Make keys, so that only those who have one take part, each by its role.
+    Keys(keys::KeysArgs),
+    /// Say what is wrong with this machine, its keys, its cameras and its links.
+    Doctor(doctor::DoctorArgs),
     /// Find markers in image files.
     Detect(detect::DetectArgs),
     /// Make a marker to print.
@@ -122,7 +128,7 @@ impl NetworkArgs {
         all.into_iter().filter_map(|(name, value)| Some((name, value?))).collect()
     }
 
-    fn network(&self) -> Network {
+    pub(crate) fn network(&self) -> Network {
         let Self { zenoh, connect, listen, meet, vehicle, keys } = self.clone();
         Network { config: zenoh, vehicle, connect, listen, meet, keys }
     }
@@ -222,12 +228,15 @@ pub(crate) fn run() -> ExitCode {
     let cli = Cli::parse();
     let result = match cli.command.unwrap_or(Command::Land(cli.land)) {
         Command::Land(args) => land::run(&args),
+        Command::Up(args) => up::run(&args),
         Command::CameraPub(args) => services::run(Service::CameraPub, &args),
         Command::Detector(args) => services::run(Service::Detector, &args),
         Command::Controller(args) => services::run(Service::Controller, &args),
         Command::GcsBridge(args) => services::run(Service::GcsBridge, &args),
         Command::Simulator(args) => services::run(Service::Simulator, &args),
         Command::Relay(args) => relay::run(&args),
+        Command::Keys(args) => keys::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Detect(args) => detect::run(&args),
         Command::Marker(args) => marker::run(&args),
         Command::Experiment(args) => experiment::run(args),

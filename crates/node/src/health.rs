@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use messages::{Count, Health, Latency, Rate};
 
-use crate::clock::now_ns;
+use crate::clock::{clock_name, now_ns};
 use crate::session::Identity;
 
 /// Latencies kept for the percentiles.
@@ -100,6 +100,10 @@ impl HealthCounters {
         Health {
             service: identity.service.to_owned(),
             instance: identity.instance.clone(),
+            host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
+            // All packages of the workspace have one version.
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            clock: clock_name().to_owned(),
             stamp_ns: now,
             pid: std::process::id(),
             cpu_s: process_cpu_s(),

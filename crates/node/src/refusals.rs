@@ -2,6 +2,7 @@
 //!
 //! Zenoh tells of them in its log only, below the level that is shown; they are picked out there.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::sync::{Mutex, PoisonError};
@@ -82,11 +83,34 @@ impl Visit for Message {
 
 fn reason(metadata: &Metadata<'_>, message: &str) -> Option<String> {
     if metadata.target() == ACCESS {
-        refused_message(message)
+        if is_foresight(message) { None } else { refused_message(message) }
     } else {
         refused_connection(message)
             .then(|| "refused: a connection without a valid certificate".to_owned())
     }
+}
+
+thread_local! {
+    /// The key for which Zenoh works out in advance, on this thread, what would be denied.
+    static FORESEEN: RefCell<Option<String>> = const { RefCell::new(None) };
+}
+
+/// When a key is first used, Zenoh looks up all that could be done with it, and tells of each as if it had been tried.
+/// It says so before, and the subscription to presence, which everybody may have, comes last.
+fn is_foresight(message: &str) -> bool {
+    FORESEEN.with_borrow_mut(|foreseen| {
+        if let Some(rest) = message.strip_prefix("ACL (ingress): caching permissions for `") {
+            *foreseen = rest.split('`').next().map(str::to_owned);
+            return true;
+        }
+        let Some(key) = foreseen.as_deref() else { return false };
+        let is_of_it = !message.starts_with("Using cached result")
+            && message.rsplit_once(" on ").is_some_and(|(_, of)| of == key);
+        if !is_of_it || message.contains("Declare Liveliness Subscriber (ingress)") {
+            *foreseen = None;
+        }
+        is_of_it
+    })
 }
 
 /// `ZID on SUBJECT is unauthorized to Query (ingress) on KEY`, or `ZID is unauthorized ...` from the cache. Only what
@@ -112,6 +136,22 @@ mod tests {
         assert!(refused_connection(&format!("invalid peer certificate: UnknownIssuer. {hint}")));
         assert!(!refused_connection(&format!("Too many open files (os error 24). {hint}")));
         assert!(!refused_connection("Unable to set LINGER option"));
+    }
+
+    #[test]
+    fn what_is_looked_up_in_advance_was_not_tried() {
+        let key = "drone/detector/main/detections";
+        let line = |action: &str, done: &str| {
+            format!("d480 on detector is {done} to {action} (ingress) on {key}")
+        };
+        assert!(is_foresight(&format!("ACL (ingress): caching permissions for `{key}` ...")));
+        assert!(is_foresight(&line("Query", "unauthorized")));
+        assert!(is_foresight(&line("Put", "authorized")));
+        assert!(is_foresight(&line("Declare Liveliness Subscriber", "authorized")));
+        assert!(!is_foresight(&line("Query", "unauthorized")));
+        assert!(is_foresight(&format!("ACL (ingress): caching permissions for `{key}` ...")));
+        assert!(!is_foresight("d480 on detector is unauthorized to Put (ingress) on drone/truth"));
+        assert!(!is_foresight(&line("Query", "unauthorized")));
     }
 
     #[test]

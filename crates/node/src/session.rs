@@ -176,6 +176,48 @@ impl Node {
         Ok(keys)
     }
 
+    /// Everybody who is ready, by liveliness: service and instance.
+    ///
+    /// # Errors
+    /// When the question cannot be asked.
+    pub async fn everybody(&self) -> anyhow::Result<Vec<(String, String)>> {
+        let key = topic::alive_key("*", "*");
+        let replies = self
+            .session
+            .liveliness()
+            .get(&key)
+            .timeout(PRESENCE_TIMEOUT)
+            .await
+            .map_err(|cause| anyhow!("asking who is at {key}: {cause}"))?;
+        let mut everybody = Vec::new();
+        while let Ok(reply) = replies.recv_async().await {
+            let key = reply.result().ok().map(|sample| sample.key_expr().as_str().to_owned());
+            let mut chunks = key.iter().flat_map(|key| key.rsplit('/'));
+            if let (Some(instance), Some(service)) = (chunks.next(), chunks.next()) {
+                everybody.push((service.to_owned(), instance.to_owned()));
+            }
+        }
+        everybody.sort();
+        everybody.dedup();
+        Ok(everybody)
+    }
+
+    /// How long a question to an instance and its answer took, or nothing when it did not answer within `patience`.
+    pub async fn round_trip(
+        &self,
+        service: &str,
+        instance: &str,
+        patience: Duration,
+    ) -> Option<Duration> {
+        let key = topic::HEALTH.key(&[service, instance]);
+        let began = std::time::Instant::now();
+        // With what steers, not behind the frames.
+        let get = self.session.get(key).priority(zenoh::qos::Priority::InteractiveHigh);
+        let replies = get.timeout(patience).await.ok()?;
+        let reply = replies.recv_async().await.ok()?;
+        reply.result().is_ok().then(|| began.elapsed())
+    }
+
     /// Tells everybody that the service is ready.
     ///
     /// # Errors

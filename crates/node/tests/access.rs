@@ -1,0 +1,162 @@
+//! Who may say what: the access rules are the topic table, and Zenoh keeps them.
+
+use std::collections::BTreeSet;
+
+use anyhow::{Context, ensure};
+use messages::{Delivery, Row, TOPICS, topic};
+use node::network::{SECURED_CONFIG, check_access};
+use serde_json::Value;
+use zenoh::key_expr::KeyExpr;
+
+/// Everybody there is: the roles of the certificates, and what the topic table calls them.
+const ROLES: [(&str, &str); 7] = [
+    ("camera-pub", "camera-pub"),
+    ("controller", "controller"),
+    ("detector", "detector"),
+    ("gcs-bridge", "gcs-bridge"),
+    ("operator", "alight"),
+    ("simulator", "simulator"),
+    ("observer", "nobody"),
+];
+
+/// What comes in from a role by a rule.
+const SPEAKING: [&str; 5] = ["put", "query", "reply", "declare_queryable", "liveliness_token"];
+
+fn access() -> anyhow::Result<Value> {
+    let config: Value = json5::from_str(SECURED_CONFIG)?;
+    check_access(&config)?;
+    Ok(config["access_control"].clone())
+}
+
+fn list<'a>(value: &'a Value, key: &str) -> impl Iterator<Item = &'a Value> {
+    value[key].as_array().into_iter().flatten()
+}
+
+fn has(value: &Value, key: &str, wanted: &str) -> bool {
+    list(value, key).any(|entry| entry == wanted)
+}
+
+/// What a role may do that others hear of: (message, key expression).
+fn rights(access: &Value, role: &str) -> BTreeSet<(String, String)> {
+    let subjects: Vec<_> = list(access, "subjects")
+        .filter(|s| has(s, "cert_common_names", role))
+        .filter_map(|s| s["id"].as_str())
+        .collect();
+    let policies =
+        list(access, "policies").filter(|p| subjects.iter().any(|s| has(p, "subjects", s)));
+    let names: Vec<_> = policies.flat_map(|p| list(p, "rules")).collect();
+    let rules = list(access, "rules").filter(|rule| {
+        names.contains(&&rule["id"])
+            && has(rule, "flows", "ingress")
+            && rule["permission"] == "allow"
+    });
+    let mut rights = BTreeSet::new();
+    for rule in rules {
+        for message in SPEAKING.iter().filter(|m| has(rule, "messages", m)) {
+            for key in list(rule, "key_exprs").filter_map(Value::as_str) {
+                rights.insert(((*message).to_owned(), key.to_owned()));
+            }
+        }
+    }
+    rights
+}
+
+fn may(rights: &BTreeSet<(String, String)>, message: &str, key: &str) -> anyhow::Result<bool> {
+    let key = KeyExpr::new(key.to_owned()).map_err(|cause| anyhow::anyhow!("{cause}"))?;
+    for (_, allowed) in rights.iter().filter(|(m, _)| m == message) {
+        let allowed = KeyExpr::new(allowed.as_str())
+            .map_err(|cause| anyhow::anyhow!("{allowed}: {cause}"))?;
+        if allowed.includes(&key) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
+/// The row's key on the wire, as `service` would use it.
+fn key_on_the_wire(row: &Row, service: &str) -> String {
+    format!("a-drone/{}", row.key.replace("{service}", service)).replace(['{', '}'], "")
+}
+
+/// True for the answer to a command, which shares its key with the command.
+fn is_answer(row: &Row) -> bool {
+    row.message == "CommandReply"
+}
+
+#[test]
+fn the_access_rules_allow_what_the_topic_table_says_and_nothing_else() -> anyhow::Result<()> {
+    let access = access()?;
+    for (role, service) in ROLES {
+        let rights = rights(&access, role);
+        for row in TOPICS {
+            let key = key_on_the_wire(row, service);
+            let stated = row.publishers.contains(&service);
+            let messages: &[&str] = match row.delivery {
+                Delivery::Query if is_answer(row) => &["declare_queryable", "reply"],
+                Delivery::Query => &["query"],
+                Delivery::LastValue => &["put", "declare_queryable", "reply"],
+                Delivery::Newest | Delivery::NewestFirst | Delivery::InOrder => &["put"],
+            };
+            for message in messages {
+                let allowed = may(&rights, message, &key)?;
+                ensure!(
+                    allowed == stated,
+                    "{role}: {message} on {key} is {allowed} by the rules, {stated} by the table"
+                );
+            }
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn every_access_rule_has_a_row_in_the_topic_table() -> anyhow::Result<()> {
+    let access = access()?;
+    for (role, service) in ROLES {
+        for (message, allowed) in rights(&access, role) {
+            let allowed_key =
+                KeyExpr::new(allowed.as_str()).map_err(|cause| anyhow::anyhow!("{cause}"))?;
+            let alive = format!("a-drone/{}", topic::alive_key(service, "name"));
+            let mut keys: Vec<String> = TOPICS
+                .iter()
+                .filter(|row| {
+                    row.publishers.contains(&service) || row.delivery == Delivery::LastValue
+                })
+                .map(|row| key_on_the_wire(row, service))
+                .collect();
+            keys.push(alive);
+            let named = keys
+                .iter()
+                .any(|key| KeyExpr::new(key.as_str()).is_ok_and(|key| allowed_key.includes(&key)));
+            ensure!(named, "{role}: {message} on {allowed} has no row in the topic table");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn nobody_may_speak_for_another_vehicle_part_by_a_wildcard() -> anyhow::Result<()> {
+    let access = access()?;
+    for (role, _) in ROLES {
+        for key in ["a-drone/**", "a-drone/*/command", "a-drone/controller/*", "**"] {
+            for message in ["put", "query", "declare_queryable", "reply"] {
+                ensure!(!may(&rights(&access, role), message, key)?, "{role}: {message} on {key}");
+            }
+        }
+    }
+    // The table's own services are all among the roles, but for the relay, which passes on.
+    let named: BTreeSet<_> = TOPICS.iter().flat_map(|row| row.publishers).copied().collect();
+    let known: BTreeSet<_> = ROLES.iter().map(|(_, service)| *service).chain(["relay"]).collect();
+    ensure!(named.is_subset(&known), "no role for {:?}", named.difference(&known));
+    Ok(())
+}
+
+#[test]
+fn each_role_of_the_relays_is_trusted_as_the_drone_is() -> anyhow::Result<()> {
+    let access = access()?;
+    for role in ["drone", "relay"] {
+        let rights = rights(&access, role);
+        ensure!(may(&rights, "put", "a-drone/**").context(role)?, "{role}");
+    }
+    Ok(())
+}

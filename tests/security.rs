@@ -1,0 +1,210 @@
+//! Keys: who has none or a foreign one stays outside, who has one says what its role may, and nobody else notices.
+
+#![expect(clippy::print_stdout, reason = "what was said helps when a test fails")]
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::Duration;
+
+use anyhow::{Context, anyhow, bail, ensure};
+use messages::{CommandReply, ControllerCommand, FrameReceipt, Health, topic};
+use node::{Identity, Network, Node, Subscriber};
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+
+const PATIENCE: Duration = Duration::from_secs(30);
+const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
+
+fn output_of(arguments: &[&str]) -> anyhow::Result<Output> {
+    Ok(Command::new(ALIGHT).args(arguments).stdin(Stdio::null()).output()?)
+}
+
+/// Runs `alight keys`.
+fn keys(arguments: &[&str]) -> anyhow::Result<()> {
+    let output = output_of(&[&["keys"], arguments].concat())?;
+    ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    Ok(())
+}
+
+fn free_port() -> anyhow::Result<u16> {
+    Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+}
+
+/// A drone with a relay that asks for keys, and a controller that takes every command.
+struct Drone {
+    relay: Child,
+    said: mpsc::UnboundedReceiver<String>,
+    controller: Node,
+    air: String,
+    folder: tempfile::TempDir,
+}
+
+impl Drone {
+    async fn start() -> anyhow::Result<Self> {
+        let folder = tempfile::tempdir()?;
+        let home = text(folder.path())?;
+        keys(&["init", "-o", home])?;
+        keys(&["issue", "--role", "drone", "--address", "127.0.0.1", "-o", home])?;
+        for role in ["detector", "operator", "observer"] {
+            keys(&["issue", "--role", role, "-o", home])?;
+        }
+        let meet = free_port()?;
+        let air = loop {
+            let port = free_port()?;
+            if std::net::TcpListener::bind(("127.0.0.1", port.saturating_add(1))).is_ok() {
+                break format!("127.0.0.1:{port}");
+            }
+        };
+        let mut relay = Command::new(ALIGHT)
+            .args(["relay", "--zenoh", "drone", "--listen", &air, "--keys", home])
+            .args(["--meet", &meet.to_string()])
+            .stdin(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()?;
+        let lines = BufReader::new(relay.stderr.take().context("standard error")?).lines();
+        let (sender, said) = mpsc::unbounded_channel();
+        std::thread::Builder::new()
+            .name("said".into())
+            .spawn(move || lines.map_while(Result::ok).all(|line| sender.send(line).is_ok()))?;
+        let local = Network { meet: Some(meet), ..Network::default() };
+        let identity = Identity { service: "controller", instance: "main".into() };
+        let controller = Node::open(identity, &local.source("controller")?).await?;
+        controller.announce().await?;
+        let drone = Self { relay, said, controller, air, folder };
+        // The relay is there when its health is.
+        let healths = drone.controller.subscriber(topic::HEALTH, &["relay", "drone"]).await?;
+        health(&healths, "the relay is ready", |_| true).await?;
+        Ok(drone)
+    }
+
+    fn network(&self, keys: Option<PathBuf>) -> Network {
+        let connect = Some(self.air.clone());
+        Network { config: Some("ground".into()), connect, keys, ..Network::default() }
+    }
+
+    async fn on_the_ground(&self, service: &'static str, role: &str) -> anyhow::Result<Node> {
+        let network = self.network(Some(self.folder.path().to_owned()));
+        let identity = Identity { service, instance: "ground".into() };
+        Node::open(identity, &network.source(role)?).await
+    }
+
+    /// `alight command hold` from the ground, with the keys of a directory.
+    fn command(&self, keys: Option<&Path>) -> anyhow::Result<Output> {
+        let mut arguments = vec!["command", "hold", "--zenoh", "ground", "--connect", &self.air];
+        if let Some(keys) = keys {
+            arguments.extend(["--keys", text(keys)?]);
+        }
+        output_of(&arguments)
+    }
+}
+
+impl Drop for Drone {
+    fn drop(&mut self) {
+        let _ = self.relay.kill();
+        let _ = self.relay.wait();
+        while let Ok(line) = self.said.try_recv() {
+            println!("{line}");
+        }
+    }
+}
+
+fn text(path: &Path) -> anyhow::Result<&str> {
+    path.to_str().context("a printable path")
+}
+
+async fn health(
+    healths: &Subscriber<Health>,
+    what: &str,
+    holds: impl Fn(&Health) -> bool,
+) -> anyhow::Result<Health> {
+    let found = async {
+        while let Some(health) = healths.next().await {
+            if holds(&health) {
+                return Ok(health);
+            }
+        }
+        bail!("the session is closed")
+    };
+    timeout(PATIENCE, found).await.map_err(|_| anyhow!("waiting until {what}"))?
+}
+
+/// Publishes receipts until one is heard.
+async fn is_heard(detector: &Node, controller: &Node) -> anyhow::Result<()> {
+    let subscriber = controller.subscriber(topic::RECEIVED, &["ground"]).await?;
+    let publisher = detector.publisher(topic::RECEIVED, &["ground"]).await?;
+    let receipt = FrameReceipt {
+        camera: "down".into(),
+        sequence: 1,
+        stamp_ns: 1,
+        clock: "a clock".into(),
+        bytes: 1,
+    };
+    let heard = async {
+        loop {
+            publisher.publish(&receipt).await;
+            if timeout(Duration::from_millis(50), subscriber.next()).await.is_ok() {
+                return;
+            }
+        }
+    };
+    timeout(PATIENCE, heard).await.context("the detector is not heard")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<()> {
+    let mut drone = Drone::start().await?;
+    let commands = drone.controller.commands(topic::COMMAND, &[]).await?;
+    let (sender, mut commanded) = mpsc::unbounded_channel();
+    let answering = tokio::spawn(async move {
+        while let Some(request) = commands.next().await {
+            let _ = sender.send(request.message.clone());
+            request.answer(&CommandReply { accepted: true, reason: "held".into() }).await;
+        }
+    });
+    let healths = drone.controller.subscriber(topic::HEALTH, &["relay", "drone"]).await?;
+    let refused = |health: &Health, part: &str| {
+        health.errors.iter().any(|e| e.reason.contains(part) && e.count > 0)
+    };
+
+    // A detector is heard as such, and as nothing else.
+    let detector = drone.on_the_ground("detector", "detector").await?;
+    detector.announce().await?;
+    is_heard(&detector, &drone.controller).await?;
+    ensure!(drone.controller.alive("detector", "*").await? == ["ground"]);
+    let command = detector.command(topic::COMMAND, &[], &ControllerCommand::Abort).await;
+    ensure!(command.is_err(), "a detector commanded: {command:?}");
+    health(&healths, "the command's refusal is counted", |h| {
+        refused(h, "query on drone/controller/command")
+    })
+    .await?;
+    let line = async {
+        while let Some(line) = drone.said.recv().await {
+            if line.contains("Not let in") && line.contains("controller/command") {
+                return;
+            }
+        }
+    };
+    timeout(PATIENCE, line).await.context("the refusal is not logged")?;
+    let counted = health(&healths, "its next health", |_| true).await?;
+    ensure!(!refused(&counted, "detector/ground"), "what it may do was refused: {counted:?}");
+
+    // Who has no key, or one of another authority, does not come in.
+    let output = drone.command(None)?;
+    ensure!(!output.status.success(), "without a key: {output:?}");
+    let foreign = tempfile::tempdir()?;
+    keys(&["init", "-o", text(foreign.path())?])?;
+    keys(&["issue", "--role", "operator", "-o", text(foreign.path())?])?;
+    let output = drone.command(Some(foreign.path()))?;
+    ensure!(!output.status.success(), "with a foreign key: {output:?}");
+    health(&healths, "the connections' refusal is counted", |h| refused(h, "connection")).await?;
+    ensure!(commanded.try_recv().is_err(), "a command came through");
+
+    // The operator commands, the detector is heard as before.
+    let output = drone.command(Some(drone.folder.path()))?;
+    ensure!(output.status.success(), "{output:?}");
+    ensure!(commanded.recv().await == Some(ControllerCommand::Hold));
+    is_heard(&detector, &drone.controller).await?;
+    answering.abort();
+    Ok(())
+}
