@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::codec::wire;
 
 wire! {
-    Health = 12 v 1;
+    Health = 12 v 2;
 }
 
 /// A service's health over the last second.
@@ -15,6 +15,12 @@ pub struct Health {
     pub service: String,
     /// Which one of them.
     pub instance: String,
+    /// The machine's name.
+    pub host: String,
+    /// The program's version.
+    pub version: String,
+    /// Names the host's clock: equal names mean that stamps may be compared.
+    pub clock: String,
     /// When, in nanoseconds of the host's clock.
     pub stamp_ns: i64,
     /// Process id on its host.
