@@ -1,4 +1,4 @@
-//! The services as child processes: start them, hear what they say, notice their end, stop them.
+//! Child processes by their names: start them, hear what they say, notice their end, stop them.
 
 use std::path::Path;
 use std::process::Stdio;
@@ -18,26 +18,36 @@ const STOP_PATIENCE: Duration = Duration::from_secs(2);
 const LINES_WAITING: usize = 256;
 
 /// What a child did.
-pub(crate) enum News {
+pub(crate) enum News<K> {
     /// It wrote a line.
-    Said(Service, String),
+    Said(K, String),
     /// It ended.
-    Ended(Service, String),
+    Ended(K, End),
 }
 
-/// The running children.
-pub(crate) struct Children {
-    pids: Vec<(Service, Pid)>,
-    sender: mpsc::Sender<News>,
-    news: mpsc::Receiver<News>,
+/// How a child ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct End {
+    /// In words.
+    pub(crate) words: String,
+    /// Its exit status, if it had one.
+    pub(crate) status: Option<i32>,
 }
 
-impl Children {
-    pub(crate) fn new() -> Self {
-        let (sender, news) = mpsc::channel(LINES_WAITING);
-        Self { pids: Vec::new(), sender, news }
+impl std::fmt::Display for End {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.words)
     }
+}
 
+/// The running children, each with its key.
+pub(crate) struct Children<K> {
+    pids: Vec<(K, Pid)>,
+    sender: mpsc::Sender<News<K>>,
+    news: mpsc::Receiver<News<K>>,
+}
+
+impl Children<Service> {
     /// Starts a service as a process of this same program; the answer is how to start it again by hand.
     pub(crate) fn start(
         &mut self,
@@ -61,28 +71,70 @@ impl Children {
         if std::env::var_os("ALIGHT_LOG").is_none() {
             command.env("ALIGHT_LOG", "warn");
         }
+        let number = self.spawn(service, command, service.name())?;
+        Ok(format!("{} is process {number}; by hand: {by_hand}", service.name()))
+    }
+}
+
+impl<K: Clone + PartialEq + Send + 'static> Children<K> {
+    pub(crate) fn new() -> Self {
+        let (sender, news) = mpsc::channel(LINES_WAITING);
+        Self { pids: Vec::new(), sender, news }
+    }
+
+    /// Starts a child; the answer is its process number.
+    pub(crate) fn spawn(
+        &mut self,
+        key: K,
+        mut command: Command,
+        name: &str,
+    ) -> anyhow::Result<i32> {
         let child = command
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
             .kill_on_drop(true)
             .spawn()
-            .with_context(|| format!("starting {}", service.name()))?;
+            .with_context(|| format!("starting {name}"))?;
         let pid = child.id().and_then(|id| i32::try_from(id).ok()).and_then(Pid::from_raw);
-        self.pids.extend(pid.map(|pid| (service, pid)));
-        tokio::spawn(follow(service, child, self.sender.clone()));
-        let number = pid.map_or(0, |pid| pid.as_raw_nonzero().get());
-        Ok(format!("{} is process {number}; by hand: {by_hand}", service.name()))
+        self.pids.extend(pid.map(|pid| (key.clone(), pid)));
+        tokio::spawn(follow(key, child, self.sender.clone()));
+        Ok(pid.map_or(0, |pid| pid.as_raw_nonzero().get()))
     }
 
     /// The next news.
-    pub(crate) async fn next(&mut self) -> Option<News> {
+    pub(crate) async fn next(&mut self) -> Option<News<K>> {
         self.news.recv().await
     }
 
     /// Forgets a child that has ended.
-    pub(crate) fn forget(&mut self, service: Service) {
-        self.pids.retain(|(running, _)| *running != service);
+    pub(crate) fn forget(&mut self, key: &K) {
+        self.pids.retain(|(running, _)| running != key);
+    }
+
+    /// Asks one to stop, waits, and stops it if it does not; what is heard meanwhile is told.
+    pub(crate) async fn stop_one(&mut self, key: &K, mut tell: impl FnMut(&News<K>)) {
+        for signal in [Signal::TERM, Signal::KILL] {
+            let Some((_, pid)) = self.pids.iter().find(|(running, _)| running == key) else {
+                return;
+            };
+            // One that has ended meanwhile needs no signal.
+            let _ = kill_process(*pid, signal);
+            let its_end = async {
+                while let Some(news) = self.news.recv().await {
+                    tell(&news);
+                    if let News::Ended(ended, _) = news {
+                        self.pids.retain(|(running, _)| *running != ended);
+                        if ended == *key {
+                            return;
+                        }
+                    }
+                }
+            };
+            if tokio::time::timeout(STOP_PATIENCE, its_end).await.is_ok() {
+                return;
+            }
+        }
     }
 
     /// Asks all to stop, waits, and stops those that do not.
@@ -95,9 +147,7 @@ impl Children {
             let all_ended = async {
                 while !self.pids.is_empty() {
                     match self.news.recv().await {
-                        Some(News::Ended(service, _)) => {
-                            self.pids.retain(|(running, _)| *running != service);
-                        }
+                        Some(News::Ended(ended, _)) => self.forget(&ended),
                         Some(News::Said(..)) => {}
                         None => return,
                     }
@@ -111,7 +161,7 @@ impl Children {
 }
 
 /// Tells what a child says, and then its end.
-async fn follow(service: Service, mut child: Child, news: mpsc::Sender<News>) {
+async fn follow<K: Clone>(key: K, mut child: Child, news: mpsc::Sender<News<K>>) {
     if let Some(stderr) = child.stderr.take() {
         let mut lines = BufReader::new(stderr).lines();
         let mut left_out = 0_u64;
@@ -122,12 +172,12 @@ async fn follow(service: Service, mut child: Child, news: mpsc::Sender<News>) {
             };
             // Nobody listens any more once everything is being stopped.
             left_out =
-                if news.try_send(News::Said(service, line)).is_ok() { 0 } else { left_out + 1 };
+                if news.try_send(News::Said(key.clone(), line)).is_ok() { 0 } else { left_out + 1 };
         }
     }
     let end = match child.wait().await {
-        Ok(status) => status.to_string(),
-        Err(cause) => cause.to_string(),
+        Ok(status) => End { words: status.to_string(), status: status.code() },
+        Err(cause) => End { words: cause.to_string(), status: None },
     };
-    drop(news.send(News::Ended(service, end)).await);
+    drop(news.send(News::Ended(key, end)).await);
 }

@@ -216,7 +216,7 @@ async fn fly(args: &LandArgs, settings: &Settings) -> anyhow::Result<Flight> {
 /// Follows the landing until it is over.
 async fn watch(
     node: &Node,
-    children: &mut Children,
+    children: &mut Children<Service>,
     progress: &mut Progress,
     shutdown: Shutdown,
     deadline: Instant,
@@ -241,7 +241,7 @@ async fn watch(
             Some(news) = children.next() => match news {
                 News::Said(service, line) => progress.say(&format!("{}: {line}", service.name())),
                 News::Ended(service, end) => {
-                    children.forget(service);
+                    children.forget(&service);
                     // Ctrl-C in a terminal reaches the services as well, and they may be the quicker ones.
                     if tokio::time::timeout(SIGNAL_GRACE, shutdown.requested()).await.is_ok() {
                         flight.interrupted("interrupted");
