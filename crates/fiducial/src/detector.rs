@@ -108,6 +108,9 @@ impl Detector {
             let bright_from = if self.squares.has_bright() { 0 } else { INVERTED_FROM };
             let bright_from = Some(bright_from);
             let mut settings = outline::Settings { bright_from, ..outline::Settings::default() };
+            if !self.squares.is_empty() {
+                settings.largest_px = settings.largest_px.max(Squares::LARGEST_PX);
+            }
             if !self.stags.is_empty() {
                 settings.largest_px = settings.largest_px.max(Stags::LARGEST_PX);
             }

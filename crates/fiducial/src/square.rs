@@ -3,6 +3,7 @@
 //! corners are. [`Squares`] does it all, for any number of families at once. Where outlines are broken, [`segments`]
 //! makes quads of straight pieces of edges, [`erasures`] reads what is left of a marker, and [`damaged`] does both.
 
+pub(crate) mod chance;
 pub mod code;
 pub(crate) mod codebook;
 pub mod damaged;
@@ -41,14 +42,16 @@ const MOST_UNEVEN: f64 = 0.6;
 /// Share of the variance of its pixels that a marker explains; textures that happen to spell a word explain less. In 565
 /// pictures without markers none did more than 0.75, but for one with a bit that was neither black nor white.
 const LEAST_EXPLAINED: f64 = 0.78;
-/// What a marker is sure to at least. Where cells are hardly wider than a pixel the doubtful bits of true markers are as
-/// doubtful as those of others, but chance spells no words there.
-const LEAST_CONFIDENCE: f64 = 0.5;
+/// The same for a word with as much evidence, in bits: chance spells none. Compression spoils the pixels of small ones.
+const LEAST_EXPLAINED_SURE: f64 = 0.68;
+const SURE_BITS: f64 = 14.0;
+/// What a marker is sure to at least: so much, less for each bit of evidence.
+const LEAST_CONFIDENCE: f64 = 0.68;
+const CONFIDENCE_PER_BIT: f64 = 0.02;
+/// Where cells are hardly wider than a pixel the doubtful bits of true markers are as doubtful as those of others, but
+/// there are fewer of the latter.
 const SMALL_CELL_PX: f64 = 1.5;
-/// Of random bits, one word in so many may be a marker that is looked for, before its cells must be clearly black and
-/// white: a pattern that is no marker spells one of the thousand words of 4 x 4 bits once in sixteen times.
-const OFTEN: f64 = 0.01;
-const LEAST_CONFIDENCE_OFTEN: f64 = 0.6;
+const CONFIDENCE_OF_SMALL: f64 = 0.06;
 
 /// How good corners are before they are refined: of an outline; of joined segments, at least, and as a share of the
 /// diagonal.
@@ -60,8 +63,8 @@ pub(crate) const JOINED_SHARE: f64 = 0.015;
 #[derive(Debug)]
 struct Wanted {
     code: &'static Code,
-    /// Index of the cells it shares with other families.
-    layout: usize,
+    /// Indices of the cells it shares with other families: with its border, and with one that is a cell wider.
+    layouts: [Option<usize>; 2],
     markers: Vec<Marker>,
     /// The ids that were not yet found in this image.
     missing: Vec<u32>,
@@ -69,11 +72,10 @@ struct Wanted {
 }
 
 impl Wanted {
-    /// How many of all words of as many bits are a marker that is looked for, in any of its four turns.
-    fn spelt_by_chance(&self) -> f64 {
+    /// How many markers are looked for.
+    fn words(&self) -> usize {
         let any_id = self.markers.iter().any(|m| m.id.is_none());
-        let words = if any_id { self.code.words.len() } else { self.markers.len() };
-        4.0 * words as f64 / (self.code.bits.len() as f64).exp2()
+        if any_id { self.code.words.len() } else { self.markers.len() }
     }
 }
 
@@ -99,6 +101,8 @@ struct Candidate {
 struct Found {
     wanted: usize,
     id: u32,
+    /// Cells by which its border is wider than the code's.
+    extra_border: u8,
     corners: [Pixel; 4],
     wrong_bits: u8,
     explained: f64,
@@ -110,6 +114,10 @@ struct Found {
 }
 
 impl Squares {
+    /// Outlines on the finest levels up to this size, in pixels of the level, may be a marker's: two levels on, cells of
+    /// markers of ten across would be narrower than two pixels, and a scratch in a border would open it.
+    pub(crate) const LARGEST_PX: u16 = 64;
+
     /// Looks for these markers; those of families without square cells are left out.
     pub fn new(markers: &[Marker]) -> Self {
         let mut squares = Self::default();
@@ -122,25 +130,32 @@ impl Squares {
                 known.markers.push(*marker);
                 continue;
             }
-            let known = squares.layouts.iter().position(|layout| layout.fits(code));
-            let layout = match (known, Layout::of(code)) {
-                (Some(layout), _) => layout,
-                (None, Some(layout)) => {
-                    squares.layouts.push(layout);
-                    squares.layouts.len() - 1
-                }
-                (None, None) => continue,
-            };
+            let mut layouts = [None; 2];
+            for (extra_border, index) in (0..=wider_by(code)).zip(&mut layouts) {
+                *index = squares.layout(code, extra_border);
+            }
+            if layouts[0].is_none() {
+                continue;
+            }
             let markers = vec![*marker];
             squares.wanted.push(Wanted {
                 code,
-                layout,
+                layouts,
                 markers,
                 missing: Vec::new(),
                 is_missing: false,
             });
         }
         squares
+    }
+
+    /// Index of a code's cells, which other codes may have in common; those with wider borders come last.
+    fn layout(&mut self, code: &Code, extra_border: u8) -> Option<usize> {
+        let known = self.layouts.iter().position(|layout| layout.fits(code, extra_border));
+        if known.is_none() {
+            self.layouts.push(Layout::of(code, extra_border)?);
+        }
+        known.or(Some(self.layouts.len() - 1))
     }
 
     /// True when there is nothing to look for.
@@ -249,6 +264,9 @@ impl Squares {
                 let Some(look) = Look::at(&quad.corners, cells, view, outlines.pyramid()) else {
                     continue;
                 };
+                if self.layouts[layout].extra_border > 0 && !look.has_second_ring(cells) {
+                    continue;
+                }
                 solved += 1;
                 let read = self.cells.solve(&look, &self.layouts[layout]);
                 match if read { self.match_words(&quad, layout) } else { Err(Reason::Small) } {
@@ -300,6 +318,7 @@ impl Squares {
             self.found.push(Found {
                 wanted: marker.index,
                 id: reading.id,
+                extra_border: 0,
                 corners,
                 wrong_bits: reading.wrong_bits,
                 explained: f64::from(reading.explained),
@@ -312,7 +331,7 @@ impl Squares {
 
     /// Whether a marker with these cells was found where the quad is.
     fn is_known(&self, quad: &Quad, layout: usize) -> bool {
-        let of_layout = |found: &&Found| self.wanted[found.wanted].layout == layout;
+        let of_layout = |found: &&Found| self.wanted[found.wanted].layouts.contains(&Some(layout));
         self.found.iter().filter(of_layout).any(|found| is_same(&found.corners, &quad.corners))
     }
 
@@ -320,7 +339,10 @@ impl Squares {
     fn match_words(&self, quad: &Quad, layout: usize) -> Result<Found, Reason> {
         let word = self.cells.word();
         let mut best = Err(Reason::Code);
-        for (index, wanted) in self.wanted.iter().enumerate().filter(|(_, w)| w.layout == layout) {
+        for (index, wanted) in self.wanted.iter().enumerate() {
+            if !wanted.layouts.contains(&Some(layout)) {
+                continue;
+            }
             let most = most_wrong(wanted.code);
             let Some((id, turns, wrong_bits)) = wanted.code.match_word(word, most) else {
                 continue;
@@ -330,7 +352,8 @@ impl Squares {
                 Err(_) => true,
             };
             if is_better {
-                best = self.admit(quad, index, (id, turns, wrong_bits));
+                let extra_border = self.layouts[layout].extra_border;
+                best = self.admit(quad, (index, extra_border), (id, turns, wrong_bits));
             }
         }
         best
@@ -340,7 +363,7 @@ impl Squares {
     fn admit(
         &self,
         quad: &Quad,
-        index: usize,
+        (index, extra_border): (usize, u8),
         (id, turns, wrong_bits): (u32, u8, u8),
     ) -> Result<Found, Reason> {
         let wanted = self.wanted.get(index).ok_or(Reason::Unwanted)?;
@@ -357,21 +380,20 @@ impl Squares {
             return Err(Reason::Contrast);
         }
         let explained = explanation.explained;
-        if explained < LEAST_EXPLAINED {
+        let bits = wanted.code.bits.len();
+        let evidence =
+            chance::evidence(wanted.code, *word, wanted.words(), bits as u32, wrong_bits.into());
+        let is_sure = evidence >= SURE_BITS;
+        if explained < if is_sure { LEAST_EXPLAINED_SURE } else { LEAST_EXPLAINED } {
             return Err(Reason::Confidence);
         }
-        let margin = (0..wanted.code.bits.len())
-            .map(|bit| (2.0 * self.cells.value(bit) - 1.0).abs())
-            .fold(1.0, f64::min);
-        let cell_px = mean_side(&quad.corners) / f64::from(wanted.code.cells);
-        let least = if wanted.spelt_by_chance() > OFTEN {
-            LEAST_CONFIDENCE_OFTEN
-        } else if cell_px >= SMALL_CELL_PX {
-            LEAST_CONFIDENCE
-        } else {
-            0.0
-        };
-        if confidence(explained, margin) < least {
+        let margin =
+            (0..bits).map(|bit| (2.0 * self.cells.value(bit) - 1.0).abs()).fold(1.0, f64::min);
+        let cells = wanted.code.cells + 2 * extra_border;
+        let cell_px = mean_side(&quad.corners) / f64::from(cells);
+        let small = if cell_px < SMALL_CELL_PX { CONFIDENCE_OF_SMALL } else { 0.0 };
+        if confidence(explained, margin) < LEAST_CONFIDENCE - CONFIDENCE_PER_BIT * evidence - small
+        {
             return Err(Reason::Confidence);
         }
         let mut corners = quad.corners;
@@ -379,6 +401,7 @@ impl Squares {
         Ok(Found {
             wanted: index,
             id,
+            extra_border,
             corners,
             wrong_bits,
             explained,
@@ -406,6 +429,12 @@ fn most_wrong(code: &Code) -> u8 {
         10..=12 => 2,
         _ => 3,
     }
+}
+
+/// How many cells the border of a family's markers may be wider than the code says: grids for calibration have borders of
+/// two cells. Only words that chance does not spell are read so.
+fn wider_by(code: &Code) -> u8 {
+    u8::from(code.min_hamming >= 9 && !code.reversed_border)
 }
 
 /// Whether two quads are of the same square, up to a turn.
@@ -473,8 +502,8 @@ fn observe(
     camera: Option<&CameraModel>,
     scratch: &mut Scratch,
 ) -> Observation {
-    let pattern =
-        wanted.code.words.get(found.id as usize).and_then(|w| Pattern::of(wanted.code, *w));
+    let word = wanted.code.words.get(found.id as usize);
+    let pattern = word.and_then(|w| Pattern::bordered(wanted.code, *w, found.extra_border));
     let mut refined = pattern
         .and_then(|pattern| refine(view, &found.corners, &pattern, camera, scratch))
         .unwrap_or_else(|| coarse(&found.corners, found.corner_px));

@@ -7,7 +7,7 @@
 
 use geometry::Pixel;
 use imaging::pyramid::from_level_0;
-use imaging::{GrayView, Pyramid};
+use imaging::{GrayView, Pyramid, bilinear};
 
 use crate::square::code::Code;
 use crate::square::mean_side;
@@ -34,7 +34,9 @@ const PULL: f64 = 0.05;
 /// The cells of one or several codes: they have these in common.
 #[derive(Clone, Debug)]
 pub(crate) struct Layout {
+    /// Cells across the square, and how many of them its border is wide beyond the one of the code.
     pub(crate) cells: usize,
+    pub(crate) extra_border: u8,
     pub(crate) bits: &'static [[i8; 2]],
     pub(crate) reversed: bool,
     margin: usize,
@@ -44,8 +46,9 @@ pub(crate) struct Layout {
 
 impl Layout {
     /// `None` for a code with more cells than any that is published.
-    pub(crate) fn of(code: &Code) -> Option<Self> {
-        let (cells, margin) = (usize::from(code.cells), usize::from(code.margin()));
+    pub(crate) fn of(code: &Code, extra_border: u8) -> Option<Self> {
+        let extra = usize::from(extra_border);
+        let (cells, margin) = (usize::from(code.cells) + 2 * extra, usize::from(code.margin()));
         let across = cells + 2 * margin;
         if across > MOST_ACROSS || code.bits.len() > MOST_BITS {
             return None;
@@ -61,16 +64,18 @@ impl Layout {
             }
         }
         for (index, [column, row]) in code.bits.iter().enumerate() {
-            let place = |at: i8| usize::try_from(i32::from(at) + margin as i32).ok();
+            let place = |at: i8| usize::try_from(i32::from(at) + (margin + extra) as i32).ok();
             let (column, row) = (place(*column)?, place(*row)?);
             *unknowns.get_mut(row * MOST_ACROSS + column)? = (index + 2) as u8;
         }
-        Some(Self { cells, bits: code.bits, reversed: code.reversed_border, margin, unknowns })
+        let (bits, reversed) = (code.bits, code.reversed_border);
+        Some(Self { cells, extra_border, bits, reversed, margin, unknowns })
     }
 
     /// Whether a code has these cells.
-    pub(crate) fn fits(&self, code: &Code) -> bool {
-        self.cells == usize::from(code.cells)
+    pub(crate) fn fits(&self, code: &Code, extra_border: u8) -> bool {
+        self.extra_border == extra_border
+            && self.cells == usize::from(code.cells + 2 * extra_border)
             && self.reversed == code.reversed_border
             && self.bits == code.bits
     }
@@ -204,6 +209,37 @@ impl<'a> Look<'a> {
             .min(pyramid.levels().saturating_sub(1));
         let corners = corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
         Some(Self { view: pyramid.level(view, level)?, grid: Grid::new(&corners, cells)? })
+    }
+}
+
+impl Look<'_> {
+    /// Whether the ring of cells within the outermost one of a square of `cells` cells is as dark as that, or as bright.
+    pub(crate) fn has_second_ring(&self, cells: usize) -> bool {
+        /// One of so many may look otherwise.
+        const MOST_ODD: usize = 12;
+        let ring = |depth: f64| {
+            let last = cells as f64 - depth;
+            let count = (last - depth).max(1.0) as usize;
+            (0..4 * count).filter_map(move |i| {
+                let along = depth + (i / 4) as f64;
+                let cell = match i % 4 {
+                    0 => [along, depth],
+                    1 => [last, along],
+                    2 => [last + depth - along, last],
+                    _ => [depth, last + depth - along],
+                };
+                let [x, y] = self.grid.pixel(cell);
+                bilinear(self.view, x, y)
+            })
+        };
+        let mean = |depth: f64| {
+            let [sum, count] = ring(depth).fold([0.0, 0.0], |[s, n], grey| [s + grey, n + 1.0]);
+            sum / count
+        };
+        let (paper, border) = (mean(-0.5), mean(0.5));
+        let is_paper = |grey: &f64| (grey - border) / (paper - border) > 0.5;
+        let odd = ring(1.5).filter(is_paper).count();
+        (paper - border).is_finite() && odd * MOST_ODD <= ring(1.5).count()
     }
 }
 

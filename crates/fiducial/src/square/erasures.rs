@@ -9,6 +9,7 @@
 use geometry::Pixel;
 use imaging::GrayView;
 
+use super::chance;
 use super::code::Code;
 use super::quad::Quad;
 
@@ -514,7 +515,8 @@ fn best_word(word: u64, known: u64, code: &Code, wanted: Option<&[u32]>) -> Opti
     let erased = code.bits.len() as u32 - bits;
     // As many as the words' distance allows for when so many bits are missing.
     let correctable = u32::from(code.min_hamming).saturating_sub(erased + 1) / 2;
-    let evidence = bits as f32 - chances - ways(bits, wrong).log2();
+    let expected = code.words.get(id as usize).copied()?;
+    let evidence = chance::evidence(code, expected, count, bits, wrong) as f32;
     (wrong <= correctable.max(u32::from(erased == 0))
         && second > wrong
         && evidence >= LEAST_EVIDENCE)
@@ -528,17 +530,6 @@ fn best_word(word: u64, known: u64, code: &Code, wanted: Option<&[u32]>) -> Opti
             washed_out: false,
             evidence,
         })
-}
-
-/// The number of words within `wrong` bits of one.
-pub(crate) fn ways(bits: u32, wrong: u32) -> f32 {
-    let mut term = 1.0;
-    let mut sum = 1.0;
-    for k in 1..=wrong.min(bits) {
-        term *= (bits - k + 1) as f32 / k as f32;
-        sum += term;
-    }
-    sum
 }
 
 /// The cells whose ink is known, by their places and grey values.

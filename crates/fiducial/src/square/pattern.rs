@@ -44,26 +44,36 @@ impl Pattern {
     /// The marker of a family that carries this word. Around a square the paper is white for a cell; what lies beside the
     /// bits outside of a square is known only where the bits leave no gaps.
     pub fn of(code: &Code, word: u64) -> Option<Self> {
-        let cells = i32::from(code.cells);
+        Self::bordered(code, word, 0)
+    }
+
+    /// The same with a border that is `extra` cells wider, as on grids for calibration. These have black squares at the
+    /// corners of the paper around each marker.
+    pub fn bordered(code: &Code, word: u64, extra: u8) -> Option<Self> {
+        let extra = i32::from(extra);
+        let cells = i32::from(code.cells) + 2 * extra;
         let depth = |x: i32, y: i32| x.min(y).min(cells - 1 - x).min(cells - 1 - y);
+        let beyond = |at: i32| at < 0 || at >= cells;
         let outside = if code.reversed_border { i32::from(code.margin()) } else { 0 };
         let ring = 4 * (cells + 2 * outside - 1);
         let bits = || code.bits.iter().map(|[x, y]| (i32::from(*x), i32::from(*y)));
         let outermost = bits().filter(|(x, y)| depth(*x, *y) == -outside).count();
         let is_closed = !code.reversed_border || outermost == ring as usize;
         let mut pattern =
-            Self::new(code.cells.into(), outside as usize + 1, |x, y| match depth(x, y) {
+            Self::new(cells as usize, outside as usize + 1, |x, y| match depth(x, y) {
                 0.. => Some(code.reversed_border),
+                _ if extra > 0 && beyond(x) && beyond(y) => None,
                 -1 if code.reversed_border => Some(false),
                 deep if deep < -outside && is_closed => Some(true),
                 _ => None,
             })?;
         for (k, (x, y)) in bits().enumerate() {
-            let column = usize::try_from(x + outside + 1).ok()?;
-            let row = pattern.white.get_mut(usize::try_from(y + outside + 1).ok()?)?;
+            let place = |at: i32| usize::try_from(at + extra + outside + 1).ok();
+            let (column, line) = (place(x)?, place(y)?);
+            let row = pattern.white.get_mut(line)?;
             let white = word >> (code.bits.len() - 1 - k) & 1 == 1;
             *row = *row & !(1 << column) | u32::from(white) << column;
-            *pattern.known.get_mut(usize::try_from(y + outside + 1).ok()?)? |= 1 << column;
+            *pattern.known.get_mut(line)? |= 1 << column;
         }
         Some(pattern)
     }

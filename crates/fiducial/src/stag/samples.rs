@@ -9,9 +9,10 @@ use std::sync::LazyLock;
 
 use imaging::{GrayView, bilinear};
 
+use crate::square::chance::ways;
 use crate::square::codebook::Codebook;
 use crate::square::decode::Grid;
-use crate::square::erasures::{Known, Light, ways};
+use crate::square::erasures::{Known, Light};
 use crate::stag::code::{self, DOT_RADIUS, DOTS};
 
 /// Units of length across the square: the border is one wide.
@@ -333,7 +334,7 @@ impl Sampled {
         if wrong > correctable || second <= wrong {
             return None;
         }
-        let evidence = known as f32 - (count as f32).log2() - ways(known, wrong).log2();
+        let evidence = known as f32 - (count as f32).log2() - ways(known, wrong).log2() as f32;
         Some(Agreement { id, turns, wrong_bits: wrong as u8, evidence })
     }
 }

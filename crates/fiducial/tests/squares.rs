@@ -1,0 +1,139 @@
+//! Square markers as printed boards and cheap cameras show them.
+#![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
+
+use fiducial::square::code::Code;
+use fiducial::{Detector, Family, Marker, Observation, Settings};
+use imaging::GrayImage;
+
+/// Black, white and the ground.
+const GREYS: [f64; 3] = [30.0, 200.0, 120.0];
+
+/// Whether a marker with a border of `border` cells is white at a place in cells from its top left corner.
+fn is_white(code: &Code, id: usize, border: usize, [x, y]: [f64; 2]) -> bool {
+    let extra = border as f64 - 1.0;
+    let cell = [x - extra, y - extra].map(|at| at.floor() as i8);
+    let Some(bit) = code.bits.iter().position(|bit| *bit == cell) else { return false };
+    code.words[id] >> (code.bits.len() - 1 - bit) & 1 == 1
+}
+
+/// An image of `size` pixels of what is at each place, each pixel the mean of a box of `blur` pixels.
+fn picture(size: [usize; 2], blur: f64, grey: impl Fn([f64; 2]) -> f64) -> GrayImage {
+    const PLACES: usize = 6;
+    let mut image = GrayImage::filled(size[0], size[1], 0);
+    for y in 0..size[1] {
+        for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+            let within =
+                |at: usize, k: usize| at as f64 + blur * ((k as f64 + 0.5) / PLACES as f64 - 0.5);
+            let sum: f64 = (0..PLACES * PLACES)
+                .map(|i| grey([within(x, i % PLACES), within(y, i / PLACES)]))
+                .sum();
+            *pixel = (sum / (PLACES * PLACES) as f64).round() as u8;
+        }
+    }
+    image
+}
+
+fn find(image: &GrayImage, markers: &[&str]) -> Vec<Observation> {
+    let markers: Vec<Marker> = markers.iter().map(|name| name.parse().unwrap()).collect();
+    let mut detector = Detector::new(&markers, Settings::default()).unwrap();
+    detector.detect(image.view().unwrap(), None, &mut ()).to_vec()
+}
+
+/// Places turned by `angle` about the middle of an image, in units of `unit` pixels.
+fn turned([x, y]: [f64; 2], middle: [f64; 2], angle: f64, unit: f64) -> [f64; 2] {
+    let (sin, cos) = angle.sin_cos();
+    let (dx, dy) = ((x - middle[0]) / unit, (y - middle[1]) / unit);
+    [dx * cos + dy * sin, dy * cos - dx * sin]
+}
+
+#[test]
+fn a_border_of_two_cells_is_read_and_its_outer_corners_are_found() {
+    let code = Code::of(Family::AprilTag36h11).unwrap();
+    let across = f64::from(code.cells) + 2.0;
+    for (cell_px, angle) in [(2.2, 0.2), (4.0, 0.7), (6.0, 1.3)] {
+        let middle = [80.2, 79.7];
+        let image = picture([160, 160], 1.0, |at| {
+            let [x, y] = turned(at, middle, angle, cell_px).map(|v| v + 0.5 * across);
+            let within = |v: f64| (0.0..across).contains(&v);
+            let around = |v: f64| (-2.0..0.0).contains(&v) || (across..across + 2.0).contains(&v);
+            // The squares at the corners do not quite touch the marker.
+            let squares = around(x + 0.2 * (x - 0.5 * across).signum()) && around(y);
+            match (within(x) && within(y), squares) {
+                (true, _) => GREYS[usize::from(is_white(code, 17, 2, [x, y]))],
+                (_, true) => GREYS[0],
+                _ => GREYS[1],
+            }
+        });
+        let found = find(&image, &["apriltag-36h11"]);
+        assert_eq!(found.len(), 1, "{cell_px} px");
+        assert_eq!(found[0].id, Some(17));
+        let (sin, cos) = f64::sin_cos(angle);
+        let half = 0.5 * across * cell_px;
+        for (corner, [a, b]) in found[0].corners.unwrap().iter().zip([
+            [-1.0, -1.0],
+            [1.0, -1.0],
+            [1.0, 1.0],
+            [-1.0, 1.0],
+        ]) {
+            let (u, v) = (half * a, half * b);
+            let truth = [middle[0] + u * cos - v * sin, middle[1] + u * sin + v * cos];
+            let off = (corner.x - truth[0]).hypot(corner.y - truth[1]);
+            assert!(off < 0.15, "{cell_px} px: {off} px off");
+        }
+    }
+}
+
+#[test]
+fn a_scratched_border_does_not_hide_a_marker_of_eighty_pixels() {
+    let code = Code::of(Family::Aruco6x6_250).unwrap();
+    let middle = [80.4, 80.1];
+    for step in 0..6 {
+        let angle = 0.1 + 0.25 * f64::from(step);
+        let image = picture([160, 160], 1.0, |at| {
+            let [u, v] = turned(at, middle, angle, 76.0);
+            let [x, y] = [u, v].map(|v| (v + 0.5) * 8.0);
+            if !(0.0..8.0).contains(&x) || !(0.0..8.0).contains(&y) {
+                return if u.abs().max(v.abs()) < 0.58 { GREYS[1] } else { GREYS[2] };
+            }
+            // A bare patch in the border, as wide as that but for a line of a pixel and a half.
+            let is_bare = (2.6..4.0).contains(&x) && (0.17..1.0).contains(&y);
+            GREYS[usize::from(is_bare || is_white(code, 18, 1, [x, y]))]
+        });
+        let found = find(&image, &["aruco-6x6-250"]);
+        assert_eq!(found.iter().map(|marker| marker.id).collect::<Vec<_>>(), [Some(18)], "{angle}");
+    }
+}
+
+#[test]
+fn a_tag_of_twelve_pixels_that_a_camera_sharpened_is_read() {
+    let code = Code::of(Family::AprilTag36h11).unwrap();
+    let mut found_all = 0;
+    for id in 0..20 {
+        let middle = [30.3, 29.8];
+        let angle = 0.06 * id as f64;
+        let soft = picture([60, 60], 1.5, |at| {
+            let [u, v] = turned(at, middle, angle, 12.5);
+            if u.abs().max(v.abs()) < 0.5 {
+                let cell = [u, v].map(|v| (v + 0.5) * 8.0);
+                GREYS[usize::from(is_white(code, id, 1, cell))]
+            } else {
+                GREYS[1]
+            }
+        });
+        let mut image = GrayImage::filled(60, 60, 0);
+        for y in 0..60_usize {
+            for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+                let view = soft.view().unwrap();
+                let at = |dx: usize, dy: usize| {
+                    f64::from(view.at((x + dx).clamp(1, 60) - 1, (y + dy).clamp(1, 60) - 1))
+                };
+                let around = (at(0, 1) + at(2, 1) + at(1, 0) + at(1, 2)) / 4.0;
+                *pixel = (at(1, 1) + 1.2 * (at(1, 1) - around)).clamp(0.0, 255.0) as u8;
+            }
+        }
+        let found = find(&image, &["apriltag-36h11"]);
+        assert!(found.iter().all(|marker| marker.id == Some(id as u32)));
+        found_all += found.len();
+    }
+    assert!(found_all >= 18, "{found_all} of 20");
+}
