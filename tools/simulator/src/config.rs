@@ -7,9 +7,9 @@ use node::{Check, Settings};
 use rendering::{CameraSettings, PadInScene, Scene, Surface};
 use serde::Deserialize;
 
-use crate::ardupilot::{AutopilotConfig, Firmware};
-use crate::wind::{WindConfig, WindNoise};
-use crate::world::WorldConfig;
+use world::ardupilot::{AutopilotConfig, Firmware};
+use world::wind::{WindConfig, WindNoise};
+use world::world::WorldConfig;
 
 /// The keys of `simulator.toml`; meanings, units and ranges are told there.
 #[derive(Clone, Debug, Deserialize)]

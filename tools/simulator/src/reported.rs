@@ -9,7 +9,7 @@ use autopilot::Frame;
 use autopilot::dialect::{ATTITUDE_DATA, LOCAL_POSITION_NED_DATA, MavMessage, SIM_STATE_DATA};
 use geometry::{Body, Ned, Point, Rotation, Vector};
 
-use crate::vehicle::VehicleTruth;
+use world::vehicle::VehicleTruth;
 
 /// The past that is kept: a second at 200 Hz.
 const MOST_PAST: usize = 200;

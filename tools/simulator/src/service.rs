@@ -22,8 +22,8 @@ use tokio::time::{MissedTickBehavior, interval};
 
 use crate::config::{Config, Flown};
 use crate::reported::Reported;
-use crate::vehicle::VehicleTruth;
-use crate::world::World;
+use world::vehicle::VehicleTruth;
+use world::world::World;
 
 /// How often the world is brought up to date.
 const TICK: Duration = Duration::from_millis(4);
@@ -450,7 +450,7 @@ impl Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::vehicle::{Vehicle, VehicleConfig};
+    use world::vehicle::{Vehicle, VehicleConfig};
     use geometry::{Point, Vector};
 
     #[test]

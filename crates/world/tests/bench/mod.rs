@@ -10,10 +10,10 @@ use autopilot::dialect::{
 };
 use autopilot::frame::encode;
 use autopilot::{Frame, Parser, Sender};
-use simulator::ardupilot::{AutopilotConfig, EstimateConfig};
-use simulator::vehicle::VehicleConfig;
-use simulator::wind::WindConfig;
-use simulator::world::{STEP_S, World, WorldConfig};
+use world::ardupilot::{AutopilotConfig, EstimateConfig};
+use world::vehicle::VehicleConfig;
+use world::wind::WindConfig;
+use world::world::{STEP_S, World, WorldConfig};
 
 /// Velocity only; heading held by a yaw rate of 0.
 pub(crate) const HOLD_HEADING: u16 = 0x5C7;

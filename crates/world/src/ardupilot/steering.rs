@@ -162,6 +162,21 @@ impl Steering {
         self.depth = Path::start([now.position[2]], [now.velocity[2]], self.depth.acceleration);
     }
 
+    /// Moves the path along with an estimate that has been reset, by metres.
+    pub(super) fn shift(&mut self, by: [f64; 2]) {
+        for (position, by) in self.level.position.iter_mut().zip(by) {
+            *position += by;
+        }
+    }
+
+    /// Moves the path along with a vehicle that is put elsewhere, by metres.
+    pub(super) fn carry(&mut self, [north, east, down]: [f64; 3]) {
+        self.shift([north, east]);
+        for position in &mut self.depth.position {
+            *position += down;
+        }
+    }
+
     /// The wanted z and its rate, in metres and m/s.
     pub(super) fn depth(&self) -> [f64; 2] {
         [self.depth.position[0], self.depth.velocity[0]]

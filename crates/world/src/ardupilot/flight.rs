@@ -218,6 +218,22 @@ impl Flight {
         true
     }
 
+    /// In the air, armed and in GUIDED, as after a takeoff.
+    pub(super) fn start_in_air(&mut self, now_s: f64) {
+        self.mode = Mode::Guided;
+        self.armed_s = Some(now_s);
+        self.on_ground = false;
+        self.was_down = false;
+        self.guided = Guided::Velocity(Setpoint::STOP, now_s);
+    }
+
+    /// Moves the path that is flown along with a vehicle that is put elsewhere.
+    pub(super) fn carry(&mut self, by: [f64; 3]) {
+        if let Some(steering) = &mut self.steering {
+            steering.carry(by);
+        }
+    }
+
     fn stop(&mut self) {
         if self.armed_s.take().is_some() {
             self.happenings.push(Happening::Disarmed);
@@ -273,6 +289,9 @@ impl Flight {
         let wish = self.wish(now_s, now, parameters);
         let config = &self.steering_config;
         let steering = self.steering.get_or_insert_with(|| Steering::start(config.clone(), now));
+        if let Some(by) = now.reset {
+            steering.shift(by);
+        }
         let mut demand = steering.steer(dt_s, now, &wish, &Envelope::new(parameters));
         // The loops see the believed attitude, so its errors become errors of the true one.
         demand.roll_rad -= now.roll_error;

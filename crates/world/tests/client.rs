@@ -10,8 +10,8 @@ use autopilot::{
     Autopilot, Command, CommandStatus, Config, Event, FlightMode, Parser, Takeoff, TakeoffProgress,
 };
 use geometry::Vector;
-use simulator::wind::WindConfig;
-use simulator::world::{World, WorldConfig};
+use world::wind::WindConfig;
+use world::world::{World, WorldConfig};
 
 const TICK_S: f64 = 0.02;
 

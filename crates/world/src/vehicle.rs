@@ -38,8 +38,14 @@ pub struct VehicleConfig {
     pub heading_lag_s: f64,
     /// Deviation of the lean that the propellers' unsteadiness causes in flight, in radians.
     pub unsteadiness_rad: f64,
+    /// Radius of the rotors for the ground effect (Cheeseman and Bennett 1955), in metres; 0 is none.
+    pub rotor_m: f64,
+    /// Height of the rotors over the vehicle's lowest point, in metres.
+    pub rotor_height_m: f64,
     /// Where the vehicle stands at the start; the ground is the horizontal plane through it.
     pub start: Point<Ned>,
+    /// How high over it the vehicle hovers at the start, in metres; 0 stands.
+    pub start_height_m: f64,
     /// Heading at the start, in radians from north to east.
     pub start_heading_rad: f64,
 }
@@ -59,7 +65,10 @@ impl Default for VehicleConfig {
             heading_gain: 8.0,
             heading_lag_s: 0.35,
             unsteadiness_rad: 0.03f64.to_radians(),
+            rotor_m: 0.0,
+            rotor_height_m: 0.2,
             start: Point::new(0.0, 0.0, 0.0),
+            start_height_m: 0.0,
             start_heading_rad: 0.0,
         }
     }
@@ -93,6 +102,24 @@ pub enum HeadingDemand {
     Rate(f64),
 }
 
+/// What is below the vehicle and carries it when it stands.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Support {
+    /// Where its surface is, in metres downwards.
+    pub z_m: f64,
+    /// Its velocity there, in m/s.
+    pub velocity: Vector<Ned>,
+    /// How fast it turns, in rad/s.
+    pub turn_rad_s: f64,
+}
+
+impl Support {
+    /// Ground that lies still.
+    pub fn ground(z_m: f64) -> Self {
+        Self { z_m, velocity: Vector::zero(), turn_rad_s: 0.0 }
+    }
+}
+
 /// How the vehicle really moves.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct VehicleTruth {
@@ -110,7 +137,7 @@ pub struct VehicleTruth {
     pub angular_rate: Vector<Body>,
     /// True while the ground carries the vehicle.
     pub on_ground: bool,
-    /// Height of the vehicle over the ground, in metres.
+    /// Height of the vehicle over what is below it, in metres.
     pub height_m: f64,
     /// Downward speed at the latest touch of the ground, in m/s; none before the first.
     pub impact_m_s: Option<f64>,
@@ -171,29 +198,32 @@ pub struct Vehicle {
     unsteadiness: [Drift; 2],
     on_ground: bool,
     impact_m_s: Option<f64>,
+    below: Support,
 }
 
 impl Vehicle {
-    /// A vehicle that stands on the ground, motors off.
+    /// A vehicle that stands on the ground, motors off, or hovers above it.
     pub fn new(config: VehicleConfig, seed: u64) -> Self {
         let mut random = random_stream(seed, 2);
         let mut drift = || Drift::new(config.unsteadiness_rad, 0.5, &mut random);
         let unsteadiness = [drift(), drift()];
         let heading = config.start_heading_rad;
+        let flies = config.start_height_m > 0.0;
         Self {
             random,
             time_s: 0.0,
-            position: config.start,
+            position: config.start - Vector::new(0.0, 0.0, config.start_height_m.max(0.0)),
             velocity: Vector::zero(),
             acceleration: Vector::zero(),
             roll: Axis::default(),
             pitch: Axis::default(),
             yaw: Axis { target: heading, angle: heading, rate: 0.0 },
             yaw_target_rate: 0.0,
-            thrust_m_s2: 0.0,
+            thrust_m_s2: if flies { GRAVITY_M_S2 } else { 0.0 },
             unsteadiness,
-            on_ground: true,
+            on_ground: !flies,
             impact_m_s: None,
+            below: Support::ground(config.start.z()),
             config,
         }
     }
@@ -208,21 +238,46 @@ impl Vehicle {
             ned_from_body: self.ned_from_body(),
             angular_rate: self.angular_rate(),
             on_ground: self.on_ground,
-            height_m: self.config.start.z() - self.position.z(),
+            height_m: self.below.z_m - self.position.z(),
             impact_m_s: self.impact_m_s,
         }
     }
 
-    /// Lets `dt_s` (a few milliseconds) pass in air that moves with `wind`, in m/s.
+    /// Where the vehicle is, as a way from elsewhere; what it has learnt of its motion stays.
+    pub fn put(&mut self, position: Point<Ned>) {
+        self.position = position;
+    }
+
+    /// Lets `dt_s` (a few milliseconds) pass in air that moves with `wind`, in m/s, over still ground.
     pub fn step(&mut self, dt_s: f64, wind: Vector<Ned>, demand: &Demand) {
+        self.step_over(dt_s, wind, demand, Support::ground(self.config.start.z()));
+    }
+
+    /// As [`Vehicle::step`], over something that may move.
+    pub fn step_over(
+        &mut self,
+        dt_s: f64,
+        wind: Vector<Ned>,
+        demand: &Demand,
+        below: Support,
+    ) {
         self.time_s += dt_s;
+        self.below = below;
         let wanted = demand.thrust_m_s2.clamp(0.0, self.config.thrust_limit_m_s2);
         self.thrust_m_s2 += (wanted - self.thrust_m_s2) * lag(dt_s, self.config.thrust_lag_s);
         self.lean(dt_s, demand);
         self.turn(dt_s, demand.heading);
-        let thrust = self.ned_from_body() * Vector::<Body>::new(0.0, 0.0, -self.thrust_m_s2);
+        let lift = self.thrust_m_s2 * self.ground_effect();
+        let thrust = self.ned_from_body() * Vector::<Body>::new(0.0, 0.0, -lift);
         let force = thrust + self.drag(wind) + Vector::new(0.0, 0.0, GRAVITY_M_S2);
         self.move_by(dt_s, force);
+    }
+
+    /// Thrust over the thrust far from the ground.
+    fn ground_effect(&self) -> f64 {
+        let height_m = self.below.z_m - self.position.z() + self.config.rotor_height_m;
+        let near = self.config.rotor_m / (4.0 * height_m.max(0.5 * self.config.rotor_m).max(1e-3));
+        1.0 / (1.0 - near * near)
     }
 
     fn drag(&self, wind: Vector<Ned>) -> Vector<Ned> {
@@ -253,7 +308,8 @@ impl Vehicle {
     fn turn(&mut self, dt_s: f64, demand: HeadingDemand) {
         let config = &self.config;
         if self.on_ground {
-            self.yaw = Axis { target: self.yaw.angle, rate: 0.0, ..self.yaw };
+            let angle = wrap(self.yaw.angle + self.below.turn_rad_s * dt_s);
+            self.yaw = Axis { target: angle, angle, rate: self.below.turn_rad_s };
             self.yaw_target_rate = 0.0;
             return;
         }
@@ -276,9 +332,11 @@ impl Vehicle {
     }
 
     fn move_by(&mut self, dt_s: f64, force: Vector<Ned>) {
-        let ground_z = self.config.start.z();
+        let below = self.below;
         if self.on_ground && force.z() >= 0.0 {
-            (self.velocity, self.acceleration) = (Vector::zero(), Vector::zero());
+            (self.velocity, self.acceleration) = (below.velocity, Vector::zero());
+            let moved = self.position + below.velocity * dt_s;
+            self.position = Point::new(moved.x(), moved.y(), below.z_m);
             return;
         }
         self.on_ground = false;
@@ -286,17 +344,17 @@ impl Vehicle {
         let before = self.velocity;
         self.velocity = before + force * dt_s;
         self.position = self.position + (before + self.velocity) * (0.5 * dt_s);
-        if self.position.z() >= ground_z && self.velocity.z() > 0.0 {
-            self.touch(ground_z);
+        if self.position.z() >= below.z_m && self.velocity.z() > below.velocity.z() {
+            self.touch(below);
         }
     }
 
     /// The ground takes all speed at once: legs neither bounce nor slide.
-    fn touch(&mut self, ground_z: f64) {
-        self.impact_m_s = Some(self.velocity.z());
+    fn touch(&mut self, below: Support) {
+        self.impact_m_s = Some(self.velocity.z() - below.velocity.z());
         self.on_ground = true;
-        self.position = Point::new(self.position.x(), self.position.y(), ground_z);
-        (self.velocity, self.acceleration) = (Vector::zero(), Vector::zero());
+        self.position = Point::new(self.position.x(), self.position.y(), below.z_m);
+        (self.velocity, self.acceleration) = (below.velocity, Vector::zero());
     }
 
     fn ned_from_body(&self) -> Rotation<Ned, Body> {

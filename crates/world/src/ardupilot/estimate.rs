@@ -29,6 +29,10 @@ pub struct EstimateConfig {
     pub lean_drift_rad: f64,
     /// Deviation of the constant error of the heading, in radians.
     pub heading_bias_rad: f64,
+    /// Velocity with which the believed position moves away from the true one from the world's begin on, in m/s.
+    pub gnss_drift_m_s: [f64; 2],
+    /// By how much the believed position jumps, in metres, and when, in seconds after the world's begin.
+    pub gnss_jump: Option<([f64; 2], f64)>,
 }
 
 impl Default for EstimateConfig {
@@ -44,6 +48,8 @@ impl Default for EstimateConfig {
             trim_rad: 0.13f64.to_radians(),
             lean_drift_rad: 0.05f64.to_radians(),
             heading_bias_rad: 0.7f64.to_radians(),
+            gnss_drift_m_s: [0.0; 2],
+            gnss_jump: None,
         }
     }
 }
@@ -62,6 +68,25 @@ impl EstimateConfig {
             trim_rad: 0.0,
             lean_drift_rad: 0.0,
             heading_bias_rad: 0.0,
+            gnss_drift_m_s: [0.0; 2],
+            gnss_jump: None,
+        }
+    }
+
+    /// The same with all errors that the logs show so many times as large; drift and jumps of GNSS stay.
+    #[must_use]
+    pub fn times(&self, factor: f64) -> Self {
+        Self {
+            velocity_bias_m_s: factor * self.velocity_bias_m_s,
+            velocity_drift_m_s: factor * self.velocity_drift_m_s,
+            position_drift_m: factor * self.position_drift_m,
+            height_drift_m: factor * self.height_drift_m,
+            height_scale: 1.0 + factor * (self.height_scale - 1.0),
+            climb_scale: 1.0 + factor * (self.climb_scale - 1.0),
+            trim_rad: factor * self.trim_rad,
+            lean_drift_rad: factor * self.lean_drift_rad,
+            heading_bias_rad: factor * self.heading_bias_rad,
+            ..self.clone()
         }
     }
 }
@@ -89,6 +114,8 @@ pub(super) struct Estimate {
     pub(super) pitch_error: f64,
     /// Believed minus true heading, in radians.
     pub(super) yaw_error: f64,
+    /// By how much the believed position has just been reset, in metres.
+    pub(super) reset: Option<[f64; 2]>,
 }
 
 /// Makes the errors.
@@ -103,6 +130,9 @@ pub(super) struct Estimator {
     lean: [Drift; 2],
     yaw_error: f64,
     height_error: f64,
+    /// Time since the world's begin, in seconds.
+    begun_s: Option<f64>,
+    gnss: [f64; 2],
 }
 
 impl Estimator {
@@ -126,11 +156,40 @@ impl Estimator {
             lean,
             yaw_error,
             height_error: 0.0,
+            begun_s: None,
+            gnss: [0.0; 2],
         }
+    }
+
+    /// From now on GNSS drifts and jumps as configured.
+    pub(super) fn begin(&mut self) {
+        self.begun_s = Some(0.0);
+    }
+
+    /// Takes over the barometer's error at a height at once, as it is after a long time there.
+    pub(super) fn settle(&mut self, truth: &VehicleTruth) {
+        self.height_error = truth.position.z() * (self.config.height_scale - 1.0);
+    }
+
+    /// Moves the error of GNSS on; the jump that happens in this step.
+    fn drift(&mut self, dt_s: f64) -> Option<[f64; 2]> {
+        let before_s = self.begun_s?;
+        let now_s = before_s + dt_s;
+        self.begun_s = Some(now_s);
+        let jump =
+            self.config.gnss_jump.filter(|(_, at_s)| (before_s..now_s).contains(at_s)).map(|j| j.0);
+        let rates = self.config.gnss_drift_m_s;
+        for (i, error) in self.gnss.iter_mut().enumerate() {
+            *error += rates[i] * dt_s + jump.map_or(0.0, |jump| jump[i]);
+        }
+        jump
     }
 
     /// Lets `dt_s` pass and gives what is believed of `truth`.
     pub(super) fn step(&mut self, dt_s: f64, truth: &VehicleTruth) -> Estimate {
+        let reset = self.drift(dt_s);
+        let drifts =
+            if self.begun_s.is_some() { self.config.gnss_drift_m_s } else { [0.0; 2] };
         let random = &mut self.random;
         let position = self.position.each_mut().map(|drift| drift.step(dt_s, random));
         let velocity = self.velocity.each_mut().map(|drift| drift.step(dt_s, random));
@@ -143,13 +202,13 @@ impl Estimator {
         let (roll_error, pitch_error) = (self.trim[0] + lean[0], self.trim[1] + lean[1]);
         Estimate {
             position: [
-                p.x() + position[0],
-                p.y() + position[1],
+                p.x() + position[0] + self.gnss[0],
+                p.y() + position[1] + self.gnss[1],
                 p.z() + self.height_error + position[2],
             ],
             velocity: [
-                v.x() + self.velocity_bias[0] + velocity[0],
-                v.y() + self.velocity_bias[1] + velocity[1],
+                v.x() + self.velocity_bias[0] + velocity[0] + drifts[0],
+                v.y() + self.velocity_bias[1] + velocity[1] + drifts[1],
                 v.z() * self.config.climb_scale,
             ],
             acceleration_z: truth.acceleration.z(),
@@ -160,6 +219,7 @@ impl Estimator {
             roll_error,
             pitch_error,
             yaw_error: self.yaw_error,
+            reset,
         }
     }
 }

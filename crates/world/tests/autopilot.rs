@@ -13,8 +13,8 @@ use autopilot::dialect::{
     SET_MODE_DATA, TIMESYNC_DATA,
 };
 use bench::{Bench, COMPANION, FREE_HEADING, GROUND, HOLD_HEADING, WITH_YAW, steady, whole, windy};
-use simulator::ardupilot::AutopilotConfig;
-use simulator::world::{STEP_S, WorldConfig};
+use world::ardupilot::AutopilotConfig;
+use world::world::{STEP_S, WorldConfig};
 
 const LOCAL: MavFrame = MavFrame::MAV_FRAME_LOCAL_NED;
 

@@ -29,11 +29,41 @@ pub struct WindConfig {
     pub turbulence: f64,
     /// The thesis' noise, added to the rest.
     pub noise: Option<WindNoise>,
+    /// Gusts along the mean wind.
+    pub gust: Option<Gust>,
+}
+
+/// A gust of the shape (1 - cos) / 2 along the mean wind. Times count from the world's begin.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Gust {
+    /// When it begins, in seconds.
+    pub start_s: f64,
+    /// How long it lasts, in seconds.
+    pub length_s: f64,
+    /// Its peak, in m/s.
+    pub peak_m_s: f64,
+    /// From one gust to the next, in seconds; 0 for one only.
+    pub period_s: f64,
+}
+
+impl Gust {
+    /// Speed that it adds, in m/s, so long after the world's begin.
+    pub fn speed_m_s(&self, begun_s: f64) -> f64 {
+        let since_s = begun_s - self.start_s;
+        let since_s =
+            if self.period_s > 0.0 && since_s > 0.0 { since_s % self.period_s } else { since_s };
+        let part = since_s / self.length_s.max(1e-3);
+        if (0.0..1.0).contains(&part) {
+            0.5 * self.peak_m_s * (1.0 - (part * std::f64::consts::TAU).cos())
+        } else {
+            0.0
+        }
+    }
 }
 
 impl Default for WindConfig {
     fn default() -> Self {
-        Self { mean_m_s: 0.0, from_rad: 0.0, turbulence: 0.0, noise: None }
+        Self { mean_m_s: 0.0, from_rad: 0.0, turbulence: 0.0, noise: None, gust: None }
     }
 }
 
@@ -74,12 +104,14 @@ impl Wind {
         Self { config, random, along, across, noise: [0.0; 2], noise_age_s: 0.0 }
     }
 
-    /// Lets `dt_s` pass and gives the velocity of the air, in m/s, at this height over the ground.
-    pub fn step(&mut self, dt_s: f64, height_m: f64) -> Vector<Ned> {
+    /// Lets `dt_s` pass and gives the velocity of the air, in m/s, at this height over the ground and so long after the
+    /// world's begin.
+    pub fn step(&mut self, dt_s: f64, height_m: f64, begun_s: Option<f64>) -> Vector<Ned> {
         let gust = self.turbulence(dt_s, height_m);
         let noise = self.noise(dt_s);
         let (sin, cos) = self.config.from_rad.sin_cos();
-        let along = gust[0] - self.config.mean_m_s;
+        let single = self.config.gust.zip(begun_s).map_or(0.0, |(gust, s)| gust.speed_m_s(s));
+        let along = gust[0] - self.config.mean_m_s - single;
         Vector::new(
             along * cos - gust[1] * sin + noise[0],
             along * sin + gust[1] * cos + noise[1],
@@ -159,7 +191,7 @@ mod tests {
         let (mut sum, mut square) = ([0.0; 3], [0.0; 3]);
         let n = 1_000_000;
         for _ in 0..n {
-            let v = wind.step(DT_S, height_m);
+            let v = wind.step(DT_S, height_m, None);
             for (axis, value) in [v.x(), v.y(), v.z()].into_iter().enumerate() {
                 sum[axis] += value;
                 square[axis] += value * value;
@@ -173,7 +205,7 @@ mod tests {
     #[test]
     fn the_mean_wind_blows_from_where_it_says() {
         let config = WindConfig { mean_m_s: 5.0, from_rad: 0.3, ..WindConfig::default() };
-        let wind = Wind::new(config, 1).step(DT_S, 10.0);
+        let wind = Wind::new(config, 1).step(DT_S, 10.0, None);
         let expected = Vector::new(-5.0 * 0.3f64.cos(), -5.0 * 0.3f64.sin(), 0.0);
         assert!((wind - expected).norm() < 1e-12);
     }
@@ -206,7 +238,7 @@ mod tests {
         let config = WindConfig { mean_m_s: 5.0, turbulence: 2.0, ..WindConfig::default() };
         let run = |seed| {
             let mut wind = Wind::new(config.clone(), seed);
-            (0..100).map(|_| wind.step(DT_S, 5.0).norm()).sum::<f64>()
+            (0..100).map(|_| wind.step(DT_S, 5.0, None).norm()).sum::<f64>()
         };
         assert_eq!(run(1), run(1));
         assert_ne!(run(1), run(2));

@@ -25,6 +25,7 @@ use autopilot::dialect::{
     TIMESYNC_DATA,
 };
 use autopilot::frame::encode;
+use geometry::{Ned, Vector};
 
 pub use estimate::EstimateConfig;
 pub use flight::{Landed, Mode};
@@ -150,6 +151,25 @@ impl SimulatedAutopilot {
             timesync_due_s: TIMESYNC_S,
             config,
         }
+    }
+
+    /// From now on GNSS drifts and jumps as configured.
+    pub fn begin(&mut self) {
+        self.estimator.begin();
+    }
+
+    /// Takes over a vehicle in the air, armed and in GUIDED, as after a takeoff.
+    pub fn start_in_air(&mut self, now_s: f64, truth: &VehicleTruth) {
+        self.estimator.settle(truth);
+        self.estimate = self.estimator.step(1e-4, truth);
+        self.truth = Some(*truth);
+        self.readiness = Readiness::Ready;
+        self.flight.start_in_air(now_s);
+    }
+
+    /// Goes on from another place, as if the vehicle had always been there; in metres.
+    pub fn carry(&mut self, by: Vector<Ned>) {
+        self.flight.carry([by.x(), by.y(), by.z()]);
     }
 
     /// Whether there is a parameter of this name.

@@ -1,0 +1,210 @@
+//! Vehicle, wind and autopilot together, in steps of one fixed length.
+
+use std::collections::VecDeque;
+
+use autopilot::Frame;
+use geometry::{Ned, Point, Vector};
+
+use crate::ardupilot::{AutopilotConfig, SimulatedAutopilot};
+use crate::pad::{PadConfig, PadState};
+use crate::vehicle::{Demand, Support, Vehicle, VehicleConfig, VehicleTruth};
+use crate::wind::{Wind, WindConfig};
+
+/// Length of a step, in seconds: the rate of ArduPilot's main loop.
+pub const STEP_S: f64 = 1.0 / 400.0;
+
+/// A vehicle that starts in the air hovers so long before anything is told of it, in seconds: its loops learn the wind.
+const WARM_UP_S: f64 = 8.0;
+
+/// What is in the world.
+#[derive(Clone, Debug, PartialEq)]
+pub struct WorldConfig {
+    /// The vehicle.
+    pub vehicle: VehicleConfig,
+    /// The wind.
+    pub wind: WindConfig,
+    /// The autopilot.
+    pub autopilot: AutopilotConfig,
+    /// The pad.
+    pub pad: PadConfig,
+    /// The autopilot is neither heard nor reached from the first time on, for so long, in seconds after the begin.
+    pub link_lost_s: Option<(f64, f64)>,
+    /// The world begins, and with it the pad's way, gusts, drifts and faults, once the vehicle has been so high, in
+    /// metres.
+    pub begin_height_m: f64,
+}
+
+impl Default for WorldConfig {
+    fn default() -> Self {
+        Self {
+            vehicle: VehicleConfig::default(),
+            wind: WindConfig::default(),
+            autopilot: AutopilotConfig::default(),
+            pad: PadConfig::default(),
+            link_lost_s: None,
+            begin_height_m: f64::INFINITY,
+        }
+    }
+}
+
+/// How long the past is kept for cameras with a long exposure, in steps: one second.
+const MOST_PAST: usize = 400;
+
+/// Vehicle, wind and autopilot. The same seed and the same packets at the same times give the same flight.
+#[derive(Clone, Debug)]
+pub struct World {
+    config: WorldConfig,
+    vehicle: Vehicle,
+    wind: Wind,
+    autopilot: SimulatedAutopilot,
+    demand: Demand,
+    air: Vector<Ned>,
+    steps: u64,
+    begun_s: Option<f64>,
+    past: VecDeque<VehicleTruth>,
+}
+
+impl World {
+    /// A world at time 0. A vehicle that starts in the air has hovered for a while, armed and in GUIDED.
+    pub fn new(config: &WorldConfig, seed: u64) -> Self {
+        let vehicle = Vehicle::new(config.vehicle.clone(), seed);
+        let past = VecDeque::from([vehicle.truth()]);
+        let mut world = Self {
+            vehicle,
+            wind: Wind::new(config.wind.clone(), seed),
+            autopilot: SimulatedAutopilot::new(config.autopilot.clone(), seed),
+            demand: Demand::IDLE,
+            air: Vector::zero(),
+            steps: 0,
+            begun_s: None,
+            past,
+            config: config.clone(),
+        };
+        if config.vehicle.start_height_m > 0.0 {
+            world.warm_up();
+        }
+        world
+    }
+
+    /// Hovers until the loops have learnt the wind, and goes back to the start.
+    fn warm_up(&mut self) {
+        let start = self.vehicle.truth();
+        self.autopilot.start_in_air(0.0, &start);
+        self.config.begin_height_m = f64::INFINITY;
+        self.advance_to(WARM_UP_S);
+        self.autopilot.carry(start.position - self.vehicle.truth().position);
+        self.vehicle.put(start.position);
+        self.past.clear();
+        self.outgoing().for_each(drop);
+    }
+
+    /// Begins the pad's way, gusts, drifts and faults, when that has not been done.
+    pub fn begin(&mut self) {
+        if self.begun_s.is_none() {
+            self.begun_s = Some(self.now_s());
+            self.autopilot.begin();
+        }
+    }
+
+    /// Time from the begin to `time_s`, in seconds; `None` before it.
+    pub fn since_begin_s(&self, time_s: f64) -> Option<f64> {
+        self.begun_s.map(|begun_s| time_s - begun_s).filter(|s| *s >= 0.0)
+    }
+
+    /// The pad at a time, in seconds.
+    pub fn pad_at(&self, time_s: f64) -> PadState {
+        self.config.pad.at(self.since_begin_s(time_s))
+    }
+
+    /// Time since the start, in seconds.
+    pub fn now_s(&self) -> f64 {
+        self.steps as f64 * STEP_S
+    }
+
+    /// Lets time pass until the last whole step before `time_s`.
+    pub fn advance_to(&mut self, time_s: f64) {
+        while self.now_s() + STEP_S <= time_s + 1e-9 {
+            self.step();
+        }
+    }
+
+    /// Takes a packet for the autopilot, now.
+    pub fn handle(&mut self, frame: &Frame) {
+        let now_s = self.now_s();
+        if !self.link_is_lost() {
+            self.autopilot.handle(now_s, frame);
+        }
+    }
+
+    fn link_is_lost(&self) -> bool {
+        let lost = self.config.link_lost_s.zip(self.since_begin_s(self.now_s()));
+        lost.is_some_and(|((from_s, for_s), now_s)| (from_s..from_s + for_s).contains(&now_s))
+    }
+
+    /// Packets from the autopilot.
+    pub fn outgoing(&mut self) -> impl Iterator<Item = Vec<u8>> + '_ {
+        let is_lost = self.link_is_lost();
+        self.autopilot.outgoing().filter(move |_| !is_lost)
+    }
+
+    /// How the vehicle moves now.
+    pub fn truth(&self) -> VehicleTruth {
+        self.vehicle.truth()
+    }
+
+    /// How the vehicle moved at `time_s`, within the last second; the nearest known state outside of it.
+    pub fn truth_at(&self, time_s: f64) -> VehicleTruth {
+        let after = self.past.partition_point(|truth| truth.time_s <= time_s);
+        let before = after.checked_sub(1).and_then(|index| self.past.get(index));
+        match (before, self.past.get(after)) {
+            (Some(before), Some(next)) => before.interpolate(next, time_s),
+            (Some(only), None) | (None, Some(only)) => *only,
+            (None, None) => self.vehicle.truth(),
+        }
+    }
+
+    /// Velocity of the air at the vehicle now, in m/s.
+    pub fn wind(&self) -> Vector<Ned> {
+        self.air
+    }
+
+    /// The autopilot.
+    pub fn autopilot(&self) -> &SimulatedAutopilot {
+        &self.autopilot
+    }
+
+    fn step(&mut self) {
+        self.steps += 1;
+        let now_s = self.now_s();
+        let before = self.vehicle.truth();
+        if before.height_m >= self.config.begin_height_m {
+            self.begin();
+        }
+        let height_m = self.config.vehicle.start.z() - before.position.z();
+        self.air = self.wind.step(STEP_S, height_m, self.since_begin_s(now_s));
+        let below = self.below(now_s, before.position);
+        self.vehicle.step_over(STEP_S, self.air, &self.demand, below);
+        let truth = VehicleTruth { time_s: now_s, ..self.vehicle.truth() };
+        self.demand = self.autopilot.step(now_s, &truth);
+        if self.past.len() >= MOST_PAST {
+            self.past.pop_front();
+        }
+        self.past.push_back(truth);
+    }
+
+    /// What carries a vehicle at this place: the deck about the pad, or the ground.
+    fn below(&self, now_s: f64, position: Point<Ned>) -> Support {
+        let pad = self.pad_at(now_s);
+        let from_pad = position - pad.position;
+        if from_pad.horizontal_norm() > self.config.pad.deck_m {
+            return Support::ground(self.config.vehicle.start.z());
+        }
+        // The deck turns about the pad's middle.
+        let turning = Vector::new(-from_pad.y(), from_pad.x(), 0.0) * pad.turn_rad_s;
+        Support {
+            z_m: pad.position.z(),
+            velocity: pad.velocity + turning,
+            turn_rad_s: pad.turn_rad_s,
+        }
+    }
+}
