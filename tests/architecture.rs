@@ -8,13 +8,14 @@ use anyhow::{Context, ensure};
 use messages::{Delivery, TOPICS};
 
 /// The algorithm crates, and what each may know of this workspace. `autopilot` is told apart for its link.
-const ALGORITHMS: [(&str, &[&str]); 6] = [
+const ALGORITHMS: [(&str, &[&str]); 7] = [
     ("geometry", &[]),
     ("imaging", &[]),
     ("messages", &[]),
     ("fiducial", &["geometry", "imaging"]),
     ("landing", &["geometry"]),
     ("rendering", &["fiducial", "geometry"]),
+    ("world", &["autopilot", "geometry"]),
 ];
 const AUTOPILOT: (&str, &[&str]) = ("autopilot", &["geometry"]);
 const NODE: (&str, &[&str]) = ("node", &["messages"]);
@@ -22,8 +23,10 @@ const SERVICES: [&str; 4] = ["camera-pub", "controller", "detector", "gcs-bridge
 /// What a service or a tool may know.
 const ROOMS: [&str; 7] =
     ["autopilot", "fiducial", "geometry", "imaging", "landing", "messages", "node"];
-/// What a tool may know beside: pictures with truth, which also the tests of any room may use.
-const PICTURES: &str = "rendering";
+/// What a tool may know beside: pictures and worlds with truth, which also the tests of any room may use.
+const TRUTH: [&str; 2] = ["rendering", "world"];
+/// The tool that stands above others: it calls their pure parts in lock-step.
+const EXPERIMENTS: (&str, [&str; 3]) = ("experiments", ["controller", "detector", "simulator"]);
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
 const ALIGHT: [&str; 5] = ["fiducial", "geometry", "imaging", "messages", "node"];
 
@@ -117,7 +120,7 @@ fn workspace() -> anyhow::Result<Vec<Package>> {
         list.filter_map(|entry| entry[key].as_str().map(str::to_owned)).collect()
     };
     let counts = |dependency: &&serde_json::Value| {
-        dependency["kind"] != "dev" || dependency["name"] != PICTURES
+        dependency["kind"] != "dev" || TRUTH.iter().all(|name| dependency["name"] != *name)
     };
     packages
         .iter()
@@ -182,7 +185,10 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
             None => {
                 let is_known = package.is_tool() || SERVICES.contains(&package.name.as_str());
                 ensure!(is_known, "{}: name what it may depend on in this test", package.name);
-                ROOMS.into_iter().chain(package.is_tool().then_some(PICTURES)).collect()
+                let truth = TRUTH.into_iter().filter(|_| package.is_tool());
+                let (above, below) = EXPERIMENTS;
+                let below = below.into_iter().filter(|_| package.name == above);
+                ROOMS.into_iter().chain(truth).chain(below).collect()
             }
         };
         for dependency in package.dependencies.iter().filter(|d| names.contains(d.as_str())) {

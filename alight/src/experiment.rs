@@ -4,7 +4,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use clap::{Args, Subcommand};
+use clap::{Args, Subcommand, ValueEnum};
+use experiments::landing;
+use experiments::landing::fault::Fault;
+use experiments::landing::plan::{Plan, Values, Vision};
 use experiments::markers::{self, Request};
 use experiments::sets::Set;
 use indicatif::ProgressBar;
@@ -22,6 +25,67 @@ enum Experiment {
     /// Find markers in rendered frames whose truth is known (the thesis' section 4.3, and more), and write tables and
     /// figures.
     Markers(MarkersArgs),
+    /// Land by the hundred in lock-step, faster than time: every combination of what is listed, so many seeds of each; with
+    /// tables, plots, and for every failure the command that repeats it (the thesis' section 4.4, and more).
+    Landing(LandingArgs),
+}
+
+#[derive(Args)]
+struct LandingArgs {
+    /// The folder for the report, every flight as CSV and JSON lines, and the plots.
+    #[arg(short, long, value_name = "DIR", default_value = "experiment-landing")]
+    output: PathBuf,
+    /// Flights of each combination.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    flights: u64,
+    /// How the marker is seen: frames rendered and searched by the detector, or a model of the detector's errors.
+    #[arg(long, value_enum, default_value_t = VisionArg::Modelled)]
+    vision: VisionArg,
+    /// Mean wind in m/s: one, a list 0,5,8, or a range 0..8 from which each seed draws.
+    #[arg(long, value_name = "M/S", default_value = "0,2,5,8")]
+    wind: Values,
+    /// Strength of the turbulence: 1 disturbs as much as ArduPilot's "turbulence 1". A list or range as well.
+    #[arg(long, value_name = "STRENGTH", default_value = "1")]
+    turbulence: Values,
+    /// From a frame's exposure to the arrival of its detections, in milliseconds; a quarter more by chance. A list or range
+    /// as well.
+    #[arg(long, value_name = "MS", default_value = "80")]
+    latency: Values,
+    /// Height at the start, in metres. A list or range as well.
+    #[arg(long, value_name = "M", default_value = "10")]
+    height: Values,
+    /// Horizontal distance from the pad at the start, in metres. A list or range as well.
+    #[arg(long, value_name = "M", default_value = "2.12")]
+    offset: Values,
+    /// What goes wrong; `all` for each of them. May be repeated. A wrong name lists those there are.
+    #[arg(long = "fault", value_name = "NAME", default_value = "none")]
+    faults: Vec<String>,
+    /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
+    #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = landing_setting)]
+    set: Vec<String>,
+    /// Flights at once; as many as there are cores by default.
+    #[arg(long, value_name = "N")]
+    jobs: Option<usize>,
+    /// Seed of the first flight of each combination; the others follow.
+    #[arg(long, value_name = "S", default_value_t = 1)]
+    seed: u64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum VisionArg {
+    /// Real pixels.
+    Rendered,
+    /// A fitted model.
+    Modelled,
+}
+
+fn landing_setting(text: &str) -> Result<String, String> {
+    let is_known = ["simulator.", "controller."].iter().any(|service| text.starts_with(service));
+    if is_known && text.contains('=') {
+        Ok(text.to_owned())
+    } else {
+        Err("write simulator.KEY=VALUE or controller.KEY=VALUE".to_owned())
+    }
 }
 
 #[derive(Args)]
@@ -44,8 +108,58 @@ struct MarkersArgs {
 
 /// Runs the experiment and prints its report.
 pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
-    use std::io::Write;
-    let Experiment::Markers(args) = args.experiment;
+    match args.experiment {
+        Experiment::Markers(args) => run_markers(args),
+        Experiment::Landing(args) => run_landing(args),
+    }
+}
+
+fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
+    let mut faults = Vec::new();
+    for name in &args.faults {
+        match name.as_str() {
+            "all" => faults.extend(Fault::all()),
+            name => faults.push(name.parse::<Fault>().map_err(anyhow::Error::msg)?),
+        }
+    }
+    let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    let request = landing::Request {
+        plan: Plan {
+            vision: match args.vision {
+                VisionArg::Rendered => Vision::Rendered,
+                VisionArg::Modelled => Vision::Modelled,
+            },
+            flights: args.flights,
+            seed: args.seed,
+            wind: args.wind,
+            turbulence: args.turbulence,
+            latency: args.latency,
+            height: args.height,
+            offset: args.offset,
+            faults,
+            set: args.set,
+        },
+        results_in: args.output,
+        jobs: args.jobs.unwrap_or(cores),
+    };
+    let bar = ProgressBar::no_length().with_style(
+        indicatif::ProgressStyle::with_template(
+            "{bar:40} {pos} of {len} flights, {elapsed}, {eta} left",
+        )
+        .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar()),
+    );
+    let report = landing::run(&request, &|done, of| {
+        bar.set_length(of as u64);
+        bar.set_position(done as u64);
+    })
+    .with_context(|| format!("working in {}", request.results_in.display()))?;
+    bar.finish_and_clear();
+    print(&report)?;
+    write_error(&format!("flights, plots and this report: {}", request.results_in.display()));
+    Ok(ExitCode::SUCCESS)
+}
+
+fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
     let sets = if args.sets.is_empty() { Set::ALL.to_vec() } else { args.sets };
     let request = Request {
         sets_in: args.output.join("sets"),
@@ -61,11 +175,16 @@ pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
     })
     .with_context(|| format!("working in {}", args.output.display()))?;
     progress.finish_and_clear();
-    match writeln!(std::io::stdout(), "{report}") {
-        // The reader has seen enough, as `head` does.
-        Err(problem) if problem.kind() == std::io::ErrorKind::BrokenPipe => {}
-        result => result?,
-    }
+    print(&report)?;
     write_error(&format!("tables and figures: {}", request.results_in.display()));
     Ok(ExitCode::SUCCESS)
+}
+
+fn print(report: &str) -> anyhow::Result<()> {
+    use std::io::Write;
+    match writeln!(std::io::stdout(), "{report}") {
+        // The reader has seen enough, as `head` does.
+        Err(problem) if problem.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        result => Ok(result?),
+    }
 }

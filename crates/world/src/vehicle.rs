@@ -254,13 +254,7 @@ impl Vehicle {
     }
 
     /// As [`Vehicle::step`], over something that may move.
-    pub fn step_over(
-        &mut self,
-        dt_s: f64,
-        wind: Vector<Ned>,
-        demand: &Demand,
-        below: Support,
-    ) {
+    pub fn step_over(&mut self, dt_s: f64, wind: Vector<Ned>, demand: &Demand, below: Support) {
         self.time_s += dt_s;
         self.below = below;
         let wanted = demand.thrust_m_s2.clamp(0.0, self.config.thrust_limit_m_s2);

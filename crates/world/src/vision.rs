@@ -13,10 +13,10 @@ use crate::drift::{normal, random_stream, uniform};
 /// The errors of a detector, for a marker of so many pixels in the image.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct VisionModel {
-    /// Markers up to this size are never found, in pixels.
-    pub never_px: f64,
-    /// Markers from this size on are always found, but for `miss`, in pixels.
-    pub always_px: f64,
+    /// Markers up to this size are never found, in pixels, and what it grows by per pixel of motion blur.
+    pub never_px: [f64; 2],
+    /// Markers from this size on are always found, but for `miss`, in pixels, and what it grows by per pixel of motion blur.
+    pub always_px: [f64; 2],
     /// Part of the frames in which a large marker is missed.
     pub miss: f64,
     /// Deviation of the centre along either axis of the image, in pixels.
@@ -43,18 +43,18 @@ pub struct VisionModel {
 
 /// The detector of the family `rings` with its defaults, on the thesis' camera.
 pub const RINGS: VisionModel = VisionModel {
-    never_px: 8.0,
-    always_px: 14.0,
+    never_px: [6.0, 4.5],
+    always_px: [8.0, 6.0],
     miss: 0.0,
-    centre_px: 0.05,
-    centre_per_blur: 0.02,
-    size_px: 0.08,
-    size_per_blur: 0.02,
+    centre_px: 0.003,
+    centre_per_blur: 0.0015,
+    size_px: 0.01,
+    size_per_blur: 0.005,
     range_bias: 0.0,
-    tilt_rad_px: 1.5,
-    tilt_rad: 0.2,
-    told: [1.0, 1.0],
-    outliers: 0.0,
+    tilt_rad_px: 0.13,
+    tilt_rad: 0.5,
+    told: [1.5, 1.5],
+    outliers: 0.02,
     outlier_times: 5.0,
 };
 
@@ -110,7 +110,9 @@ impl Vision {
         let depth_m = truth.origin().z();
         let size_px = self.size_px(truth)?;
         let model = &self.model;
-        let share = (size_px - model.never_px) / (model.always_px - model.never_px).max(1e-6);
+        let limit_px = |[still, per_blur]: [f64; 2]| still + per_blur * blur_px;
+        let (never_px, always_px) = (limit_px(model.never_px), limit_px(model.always_px));
+        let share = (size_px - never_px) / (always_px - never_px).max(1e-6);
         if luck[0] >= share.clamp(0.0, 1.0) * (1.0 - model.miss) || !self.sees_all_of(truth) {
             return None;
         }
@@ -119,10 +121,8 @@ impl Vision {
         let range_part = wild * (model.size_px + model.size_per_blur * blur_px) / size_px;
         let tilt_rad = wild * (model.tilt_rad_px / size_px).min(model.tilt_rad);
         let true_centre = self.camera.project(truth.origin())?;
-        let centre = Pixel::new(
-            true_centre.x + centre_px * noise[0],
-            true_centre.y + centre_px * noise[1],
-        );
+        let centre =
+            Pixel::new(true_centre.x + centre_px * noise[0], true_centre.y + centre_px * noise[1]);
         let range_m = depth_m * (1.0 + model.range_bias + range_part * noise[2]);
         let ray = self.camera.unproject(centre);
         let turned = Vector::<Camera>::new(tilt_rad * noise[3], tilt_rad * noise[4], 0.0);
@@ -141,6 +141,11 @@ impl Vision {
             covariance_m2: Matrix3::from_diagonal(&[sideways, sideways, 0.0].into())
                 + along * along.transpose() * spread,
         })
+    }
+
+    /// A number from 0 to 1 from the detector's chance.
+    pub fn draw(&mut self) -> f64 {
+        uniform(&mut self.random)
     }
 
     /// Size of the marker in the image, in pixels; `None` behind the camera.

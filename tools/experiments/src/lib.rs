@@ -1,13 +1,14 @@
-//! The thesis' experiment with markers (section 4.3), wider: sets of rendered frames with truth, detectors run over
-//! them, scores, tables and figures.
+//! The thesis' experiments, wider: markers in rendered frames (section 4.3), and landings (section 4.4) by the hundred.
 //!
-//! This crate knows cameras, markers and detectors as functions; it knows no vehicle and no network.
+//! It stands above the services: it calls their pure parts as functions, and knows no network and no clock.
 //!
-//! Modules in reading order: [`shot`] takes one frame, through a [`veil`]; [`sets`] says which frames there are;
-//! [`store`] keeps them on disk; [`record`] is what a detector answers; [`score`] how good that is; [`photographs`] asks
-//! real pictures; [`report`] writes it down, [`tables`] and [`figures`] as the [`thesis`] did; [`markers`] does all of it.
+//! Modules in reading order: [`markers`] is the experiment with markers. [`shot`] takes one frame; [`sets`] says which
+//! frames there are; [`store`] keeps them on disk; [`record`] is what a detector answers; [`score`] how good that is;
+//! [`photographs`] asks real pictures; [`report`] writes it down, [`tables`] and [`figures`] as the [`thesis`] did.
+//! [`landing`] is the experiment with landings.
 
 pub mod figures;
+pub mod landing;
 pub mod markers;
 pub mod photographs;
 pub mod record;
@@ -18,4 +19,3 @@ pub mod shot;
 pub mod store;
 pub mod tables;
 pub mod thesis;
-pub mod veil;

@@ -16,7 +16,7 @@ use rendering::views::{Binning, HIGHEST_M, laterals_m};
 use rendering::{CameraSettings, Surface};
 
 use crate::shot::{Shot, pose};
-use crate::veil::Veil;
+use rendering::veil::Veil;
 
 /// Size of the thesis' markers, in metres.
 pub const SIZE_M: f64 = rendering::views::SIZE_M;

@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use rendering::ground::Ground;
 use rendering::{CameraSettings, PadInScene, RenderError, Renderer, Scene, Surface};
 
-use crate::veil::Veil;
+use rendering::veil::Veil;
 
 /// A frame to take.
 #[derive(Clone, Debug)]

@@ -2,13 +2,16 @@
 
 use autopilot::Address;
 use fiducial::{Drawing, Marker, Pad};
-use geometry::{CameraModel, Point, Transform};
+use geometry::{CameraModel, Point, Transform, Vector};
 use node::{Check, Settings};
 use rendering::{CameraSettings, PadInScene, Scene, Surface};
 use serde::Deserialize;
 
-use world::ardupilot::{AutopilotConfig, Firmware};
-use world::wind::{WindConfig, WindNoise};
+use world::ardupilot::{AutopilotConfig, EstimateConfig, Firmware};
+use world::camera::CameraFaults;
+use world::pad::PadConfig;
+use world::vehicle::VehicleConfig;
+use world::wind::{Gust, WindConfig, WindNoise};
 use world::world::WorldConfig;
 
 /// The keys of `simulator.toml`; meanings, units and ranges are told there.
@@ -21,6 +24,10 @@ pub struct Config {
     pub seed: u64,
     /// What flies.
     pub vehicle: Flown,
+    /// Height at which the world begins, in metres.
+    pub begin_height_m: f64,
+    /// Where the vehicle starts.
+    pub start: StartSettings,
     /// The simulated autopilot.
     pub autopilot: AutopilotSettings,
     /// What blows.
@@ -31,6 +38,8 @@ pub struct Config {
     pub ground: GroundSettings,
     /// The camera.
     pub camera: CameraConfig,
+    /// What is between camera and pad.
+    pub veil: VeilSettings,
 }
 
 /// What flies.
@@ -53,6 +62,52 @@ pub enum FirmwareName {
     Px4,
 }
 
+/// Where the vehicle starts.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StartSettings {
+    /// Height, in metres; 0 stands on the ground.
+    pub height_m: f64,
+    /// North of the origin, in metres.
+    pub north_m: f64,
+    /// East of the origin, in metres.
+    pub east_m: f64,
+    /// Heading, in degrees.
+    pub heading_deg: f64,
+    /// Radius of the rotors for the ground effect, in metres.
+    pub rotor_m: f64,
+}
+
+/// What is between camera and pad for a while.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VeilSettings {
+    /// What it is.
+    pub kind: VeilKind,
+    /// How strong it is.
+    pub strength: f64,
+    /// From when on, in seconds.
+    pub at_s: f64,
+    /// For how long, in seconds.
+    pub for_s: f64,
+    /// Only below this height over the pad, in metres.
+    pub below_m: f64,
+}
+
+/// What is between camera and pad.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum VeilKind {
+    /// Nothing.
+    None,
+    /// A reflection beside the marker.
+    Glare,
+    /// Something over a part of the marker.
+    Cover,
+    /// Little contrast.
+    Haze,
+}
+
 /// The simulated autopilot.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -67,6 +122,20 @@ pub struct AutopilotSettings {
     pub precision_landing: bool,
     /// Its speed of descent in LAND, in cm/s.
     pub land_speed_cm_s: f64,
+    /// Errors of its estimator, as a multiple of the usual ones.
+    pub errors: f64,
+    /// Speed of the believed position's drift, in m/s.
+    pub gnss_drift_m_s: f64,
+    /// Direction of that drift, in degrees.
+    pub gnss_drift_to_deg: f64,
+    /// Jump of the believed position northwards, in metres.
+    pub gnss_jump_m: f64,
+    /// When it jumps, in seconds.
+    pub gnss_jump_at_s: f64,
+    /// When its link is lost, in seconds.
+    pub link_lost_at_s: f64,
+    /// For how long it is, in seconds.
+    pub link_lost_for_s: f64,
 }
 
 /// What blows.
@@ -81,6 +150,14 @@ pub struct WindSettings {
     pub turbulence: f64,
     /// Whether the thesis' wind noise is added.
     pub thesis_noise: bool,
+    /// Peak of a gust, in m/s.
+    pub gust_m_s: f64,
+    /// When it comes, in seconds.
+    pub gust_at_s: f64,
+    /// How long it lasts, in seconds.
+    pub gust_length_s: f64,
+    /// From one gust to the next, in seconds.
+    pub gust_every_s: f64,
 }
 
 /// The pad.
@@ -95,8 +172,28 @@ pub struct PadSettings {
     pub north_m: f64,
     /// Where it lies, east of the start, in metres.
     pub east_m: f64,
+    /// How high it rests over the ground, in metres.
+    pub height_m: f64,
     /// Heading of the marker's upper edge, in degrees.
     pub heading_deg: f64,
+    /// Speed of its straight way, in m/s.
+    pub speed_m_s: f64,
+    /// Direction of that way, in degrees.
+    pub course_deg: f64,
+    /// Amplitude of its heave, in metres.
+    pub heave_m: f64,
+    /// Period of its heave, in seconds.
+    pub heave_period_s: f64,
+    /// How fast it turns, in degrees per second.
+    pub turn_deg_s: f64,
+    /// Radius of the deck that moves with it, in metres.
+    pub deck_m: f64,
+    /// A second marker that moves with it; empty is none.
+    pub wrong_marker: String,
+    /// Where that lies, north of the pad's middle, in metres.
+    pub wrong_north_m: f64,
+    /// Where that lies, east of the pad's middle, in metres.
+    pub wrong_east_m: f64,
 }
 
 /// The ground.
@@ -135,6 +232,30 @@ pub struct CameraConfig {
     pub longest_exposure_ms: f64,
     /// Whether there is noise.
     pub noise: bool,
+    /// Deviation of the mount's error in roll and pitch, in degrees.
+    pub mount_error_deg: f64,
+    /// From the exposure to the arrival, in milliseconds.
+    pub latency_ms: f64,
+    /// What chance adds to it at most, in milliseconds.
+    pub jitter_ms: f64,
+    /// Part of the frames that never arrive.
+    pub drop: f64,
+    /// Part of the frames that arrive twice.
+    pub duplicate: f64,
+    /// By how much all stamps are early, in milliseconds.
+    pub stamp_early_ms: f64,
+    /// Part of the stamps that jump.
+    pub stamp_jumps: f64,
+    /// By how much they jump at most, in milliseconds.
+    pub stamp_jump_ms: f64,
+    /// From when on no frame is taken, in seconds.
+    pub outage_at_s: f64,
+    /// For how long none is, in seconds.
+    pub outage_for_s: f64,
+    /// From the first time below this height on no frame is taken, in metres.
+    pub outage_below_m: f64,
+    /// For how long none is, in seconds.
+    pub outage_below_for_s: f64,
     /// Quality of the JPEG frames.
     pub jpeg_quality: u8,
 }
@@ -144,21 +265,70 @@ impl Settings for Config {
 
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
+        check.range("begin_height_m", self.begin_height_m, 0.0..=1000.0);
+        check.range("start.height_m", self.start.height_m, 0.0..=100.0);
+        check.range("start.north_m", self.start.north_m, -1000.0..=1000.0);
+        check.range("start.east_m", self.start.east_m, -1000.0..=1000.0);
+        check.range("start.heading_deg", self.start.heading_deg, -360.0..=360.0);
+        check.range("start.rotor_m", self.start.rotor_m, 0.0..=1.0);
         check.parses("autopilot.address", self.autopilot.address.parse::<Address>());
         check.range("autopilot.ready_after_s", self.autopilot.ready_after_s, 0.5..=600.0);
         check.range("autopilot.land_speed_cm_s", self.autopilot.land_speed_cm_s, 30.0..=200.0);
-        check.range("wind.mean_m_s", self.wind.mean_m_s, 0.0..=20.0);
-        check.range("wind.from_deg", self.wind.from_deg, 0.0..=360.0);
-        check.range("wind.turbulence", self.wind.turbulence, 0.0..=10.0);
+        self.autopilot.check(check);
+        self.wind.check(check);
+        self.pad.check(check);
         check.parses("pad.marker", self.pad_marker());
         check.parses("pad.markers", self.printed());
-        check.range("pad.north_m", self.pad.north_m, -1000.0..=1000.0);
-        check.range("pad.east_m", self.pad.east_m, -1000.0..=1000.0);
-        check.range("pad.heading_deg", self.pad.heading_deg, -360.0..=360.0);
+        check.parses("pad.wrong_marker", self.wrong_marker());
         check.parses("ground.surface", self.ground.surface.parse::<Surface>());
         check.range("ground.painted_marks", self.ground.painted_marks, 0..=1000);
         check.range("ground.light", self.ground.light, 0.001..=2.0);
+        check.range("veil.strength", self.veil.strength, 0.0..=1.0);
+        check.range("veil.at_s", self.veil.at_s, 0.0..=3600.0);
+        check.range("veil.for_s", self.veil.for_s, 0.0..=3600.0);
+        check.range("veil.below_m", self.veil.below_m, 0.0..=1000.0);
         self.camera.check(check);
+    }
+}
+
+impl AutopilotSettings {
+    fn check(&self, check: &mut Check<'_>) {
+        check.range("autopilot.errors", self.errors, 0.0..=10.0);
+        check.range("autopilot.gnss_drift_m_s", self.gnss_drift_m_s, 0.0..=2.0);
+        check.range("autopilot.gnss_drift_to_deg", self.gnss_drift_to_deg, -360.0..=360.0);
+        check.range("autopilot.gnss_jump_m", self.gnss_jump_m, -100.0..=100.0);
+        check.range("autopilot.gnss_jump_at_s", self.gnss_jump_at_s, 0.0..=3600.0);
+        check.range("autopilot.link_lost_at_s", self.link_lost_at_s, 0.0..=3600.0);
+        check.range("autopilot.link_lost_for_s", self.link_lost_for_s, 0.0..=3600.0);
+    }
+}
+
+impl WindSettings {
+    fn check(&self, check: &mut Check<'_>) {
+        check.range("wind.mean_m_s", self.mean_m_s, 0.0..=20.0);
+        check.range("wind.from_deg", self.from_deg, 0.0..=360.0);
+        check.range("wind.turbulence", self.turbulence, 0.0..=10.0);
+        check.range("wind.gust_m_s", self.gust_m_s, 0.0..=20.0);
+        check.range("wind.gust_at_s", self.gust_at_s, 0.0..=3600.0);
+        check.range("wind.gust_length_s", self.gust_length_s, 0.1..=60.0);
+        check.range("wind.gust_every_s", self.gust_every_s, 0.0..=3600.0);
+    }
+}
+
+impl PadSettings {
+    fn check(&self, check: &mut Check<'_>) {
+        check.range("pad.north_m", self.north_m, -1000.0..=1000.0);
+        check.range("pad.east_m", self.east_m, -1000.0..=1000.0);
+        check.range("pad.height_m", self.height_m, 0.0..=10.0);
+        check.range("pad.heading_deg", self.heading_deg, -360.0..=360.0);
+        check.range("pad.speed_m_s", self.speed_m_s, 0.0..=10.0);
+        check.range("pad.course_deg", self.course_deg, -360.0..=360.0);
+        check.range("pad.heave_m", self.heave_m, 0.0..=2.0);
+        check.range("pad.heave_period_s", self.heave_period_s, 1.0..=60.0);
+        check.range("pad.turn_deg_s", self.turn_deg_s, -90.0..=90.0);
+        check.range("pad.deck_m", self.deck_m, 0.1..=100.0);
+        check.range("pad.wrong_north_m", self.wrong_north_m, -100.0..=100.0);
+        check.range("pad.wrong_east_m", self.wrong_east_m, -100.0..=100.0);
     }
 }
 
@@ -173,6 +343,18 @@ impl CameraConfig {
         check.range("camera.blur_px", self.blur_px, 0.0..=3.0);
         check.range("camera.white_level", self.white_level, 20.0..=255.0);
         check.range("camera.longest_exposure_ms", self.longest_exposure_ms, 0.01..=100.0);
+        check.range("camera.mount_error_deg", self.mount_error_deg, 0.0..=10.0);
+        check.range("camera.latency_ms", self.latency_ms, 0.0..=2000.0);
+        check.range("camera.jitter_ms", self.jitter_ms, 0.0..=2000.0);
+        check.range("camera.drop", self.drop, 0.0..=1.0);
+        check.range("camera.duplicate", self.duplicate, 0.0..=1.0);
+        check.range("camera.stamp_early_ms", self.stamp_early_ms, -1000.0..=1000.0);
+        check.range("camera.stamp_jumps", self.stamp_jumps, 0.0..=1.0);
+        check.range("camera.stamp_jump_ms", self.stamp_jump_ms, 0.0..=2000.0);
+        check.range("camera.outage_at_s", self.outage_at_s, 0.0..=3600.0);
+        check.range("camera.outage_for_s", self.outage_for_s, 0.0..=3600.0);
+        check.range("camera.outage_below_m", self.outage_below_m, 0.0..=100.0);
+        check.range("camera.outage_below_for_s", self.outage_below_for_s, 0.0..=3600.0);
         check.range("camera.jpeg_quality", self.jpeg_quality, 1..=100);
     }
 }
@@ -183,11 +365,16 @@ impl Config {
     /// # Errors
     /// Says what is wrong with it.
     pub fn pad_marker(&self) -> Result<Marker, String> {
-        let marker: Marker = self.pad.marker.parse().map_err(|e| format!("{e}"))?;
-        match marker.size_m {
-            Some(_) => Ok(marker),
-            None => Err(format!("`{marker}` needs a size in metres, as in `{marker}:0.15341`")),
-        }
+        sized_marker(&self.pad.marker)
+    }
+
+    /// The second marker, if there is one.
+    ///
+    /// # Errors
+    /// Says what is wrong with it.
+    pub fn wrong_marker(&self) -> Result<Option<Marker>, String> {
+        let name = &self.pad.wrong_marker;
+        if name.is_empty() { Ok(None) } else { sized_marker(name).map(Some) }
     }
 
     /// What is on the pad's lid, of one marker or several.
@@ -205,40 +392,46 @@ impl Config {
 
     /// The world of a simulated flight.
     pub fn world(&self) -> WorldConfig {
-        let precision = f32::from(u8::from(self.autopilot.precision_landing));
-        let autopilot = AutopilotConfig {
-            ready_after_s: self.autopilot.ready_after_s,
-            firmware: match self.autopilot.firmware {
-                FirmwareName::ArduPilot => Firmware::ArduPilot,
-                FirmwareName::Px4 => Firmware::Px4,
+        let start = &self.start;
+        let lost_for_s = self.autopilot.link_lost_for_s;
+        WorldConfig {
+            vehicle: VehicleConfig {
+                start: Point::new(start.north_m, start.east_m, 0.0),
+                start_height_m: start.height_m,
+                start_heading_rad: start.heading_deg.to_radians(),
+                rotor_m: start.rotor_m,
+                ..VehicleConfig::default()
             },
-            parameters: vec![
-                ("LAND_SPEED".to_owned(), self.autopilot.land_speed_cm_s as f32),
-                ("PLND_ENABLED".to_owned(), precision),
-                ("PLND_TYPE".to_owned(), precision),
-            ],
-            ..AutopilotConfig::default()
-        };
-        let wind = WindConfig {
-            mean_m_s: self.wind.mean_m_s,
-            from_rad: self.wind.from_deg.to_radians(),
-            turbulence: self.wind.turbulence,
-            noise: self.wind.thesis_noise.then(WindNoise::default),
-        };
-        WorldConfig { autopilot, wind, ..WorldConfig::default() }
+            wind: self.wind.config(),
+            autopilot: self.autopilot.config(),
+            pad: self.pad.config(),
+            link_lost_s: (lost_for_s > 0.0).then_some((self.autopilot.link_lost_at_s, lost_for_s)),
+            begin_height_m: self.begin_height_m,
+        }
     }
 
-    /// What there is to see.
+    /// What there is to see, before the pad moves. The pad is the first in the list.
     ///
     /// # Errors
     /// Says what is wrong with the pad or the ground.
     pub fn scene(&self) -> Result<Scene, String> {
-        let heading_rad = self.pad.heading_deg.to_radians();
-        let (north_m, east_m) = (self.pad.north_m, self.pad.east_m);
-        let pad = PadInScene::printed(self.printed()?, north_m, east_m, heading_rad);
+        let pad = &self.pad;
+        let heading_rad = pad.heading_deg.to_radians();
+        let mut pads =
+            vec![PadInScene::printed(self.printed()?, pad.north_m, pad.east_m, heading_rad)];
+        if let Some(wrong) = self.wrong_marker()? {
+            let [north, east] = [pad.north_m + pad.wrong_north_m, pad.east_m + pad.wrong_east_m];
+            pads.push(PadInScene::flat(wrong, north, east, heading_rad));
+        }
+        for flat in &mut pads {
+            let raised = Vector::new(0.0, 0.0, -pad.height_m);
+            let on_ground = flat.ned_from_marker;
+            flat.ned_from_marker =
+                Transform::new(on_ground.rotation(), on_ground.origin() + raised);
+        }
         Ok(Scene {
             surface: self.ground.surface.parse()?,
-            pads: vec![pad],
+            pads,
             painted_marks: self.ground.painted_marks,
             light: self.ground.light,
         })
@@ -261,6 +454,92 @@ impl Config {
             camera.white_level,
             camera.longest_exposure_ms * 1e-3,
         )
+    }
+}
+
+fn sized_marker(name: &str) -> Result<Marker, String> {
+    let marker: Marker = name.parse().map_err(|e| format!("{e}"))?;
+    match marker.size_m {
+        Some(_) => Ok(marker),
+        None => Err(format!("`{marker}` needs a size in metres, as in `{marker}:0.15341`")),
+    }
+}
+
+impl AutopilotSettings {
+    fn config(&self) -> AutopilotConfig {
+        let (east, north) = self.gnss_drift_to_deg.to_radians().sin_cos();
+        let jump = ([self.gnss_jump_m, 0.0], self.gnss_jump_at_s);
+        let precision = f32::from(u8::from(self.precision_landing));
+        AutopilotConfig {
+            ready_after_s: self.ready_after_s,
+            firmware: match self.firmware {
+                FirmwareName::ArduPilot => Firmware::ArduPilot,
+                FirmwareName::Px4 => Firmware::Px4,
+            },
+            parameters: vec![
+                ("LAND_SPEED".to_owned(), self.land_speed_cm_s as f32),
+                ("PLND_ENABLED".to_owned(), precision),
+                ("PLND_TYPE".to_owned(), precision),
+            ],
+            estimate: EstimateConfig {
+                gnss_drift_m_s: [self.gnss_drift_m_s * north, self.gnss_drift_m_s * east],
+                gnss_jump: (self.gnss_jump_m != 0.0).then_some(jump),
+                ..EstimateConfig::default().times(self.errors)
+            },
+            ..AutopilotConfig::default()
+        }
+    }
+}
+
+impl WindSettings {
+    fn config(&self) -> WindConfig {
+        WindConfig {
+            mean_m_s: self.mean_m_s,
+            from_rad: self.from_deg.to_radians(),
+            turbulence: self.turbulence,
+            noise: self.thesis_noise.then(WindNoise::default),
+            gust: (self.gust_m_s > 0.0).then_some(Gust {
+                start_s: self.gust_at_s,
+                length_s: self.gust_length_s,
+                peak_m_s: self.gust_m_s,
+                period_s: self.gust_every_s,
+            }),
+        }
+    }
+}
+
+impl PadSettings {
+    /// The pad as the world moves it.
+    pub fn config(&self) -> PadConfig {
+        let (east, north) = self.course_deg.to_radians().sin_cos();
+        PadConfig {
+            position: Point::new(self.north_m, self.east_m, -self.height_m),
+            heading_rad: self.heading_deg.to_radians(),
+            velocity: Vector::new(north, east, 0.0) * self.speed_m_s,
+            heave_m: self.heave_m,
+            heave_period_s: self.heave_period_s,
+            turn_rad_s: self.turn_deg_s.to_radians(),
+            deck_m: self.deck_m,
+        }
+    }
+}
+
+impl CameraConfig {
+    /// What happens to its frames on their way.
+    pub fn faults(&self) -> CameraFaults {
+        let lasting = |at: f64, for_s: f64| (for_s > 0.0).then_some((at, for_s));
+        CameraFaults {
+            latency_s: 1e-3 * self.latency_ms,
+            jitter_s: 1e-3 * self.jitter_ms,
+            drop: self.drop,
+            duplicate: self.duplicate,
+            stamp_early_s: 1e-3 * self.stamp_early_ms,
+            stamp_jumps: self.stamp_jumps,
+            stamp_jump_s: 1e-3 * self.stamp_jump_ms,
+            outage_s: lasting(self.outage_at_s, self.outage_for_s),
+            outage_below_m: lasting(self.outage_below_m, self.outage_below_for_s),
+            mount_error_rad: self.mount_error_deg.to_radians(),
+        }
     }
 }
 

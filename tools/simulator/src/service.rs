@@ -3,27 +3,29 @@
 //! The world advances on a task of its own; the camera renders on a thread of its own, named `camera`, and reads
 //! the world's recent past, so that neither waits for the other longer than it takes to copy a pose.
 
+use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context;
 use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use autopilot::{Address, Link, LinkEvent, Parser, Sender};
-use geometry::{Body, Ned, Transform};
 use messages::{
     CameraInfo, FrameHeader, LensModel, MavlinkBytes, PixelFormat, Touchdown, Transform3, Truth,
     Wind, topic,
 };
 use node::{FramePublisher, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
-use rendering::Renderer;
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval};
 
-use crate::config::{Config, Flown};
-use crate::reported::Reported;
+use world::pad::{PadConfig, PadState};
 use world::vehicle::VehicleTruth;
 use world::world::World;
+
+use crate::config::{Config, Flown};
+use crate::eye::{Eye, Moment};
+use crate::reported::Reported;
 
 /// How often the world is brought up to date.
 const TICK: Duration = Duration::from_millis(4);
@@ -31,8 +33,8 @@ const TICK: Duration = Duration::from_millis(4);
 const TRUTH_EVERY: u64 = 5;
 /// Every so many ticks the wind is published: 10 Hz.
 const WIND_EVERY: u64 = 25;
-/// Poses through an exposure.
-const POSES: usize = 5;
+/// Frames that are on their way late; the oldest is lost first.
+const MOST_LATE: usize = 32;
 /// After this time without SIM_STATE it is asked for (again).
 const ASK_PERIOD: Duration = Duration::from_secs(1);
 /// Time between two SIM_STATE messages, in microseconds.
@@ -65,6 +67,10 @@ struct Stage {
     /// The moment of the world's time 0, on the host's clock.
     start_ns: i64,
     witness: Mutex<Witness>,
+    pad: PadConfig,
+    begin_height_m: f64,
+    /// When the world of a reported vehicle began, in seconds.
+    begun_s: Mutex<Option<f64>>,
 }
 
 /// What flies.
@@ -81,11 +87,13 @@ impl Stage {
             }
             Flown::Reported => Actor::Reported(Reported::default()),
         };
-        let pad = [config.pad.north_m, config.pad.east_m];
         Self {
             actor: Mutex::new(actor),
             start_ns: now_ns(),
-            witness: Mutex::new(Witness { pad, ..Witness::default() }),
+            witness: Mutex::default(),
+            pad: config.pad.config(),
+            begin_height_m: config.begin_height_m,
+            begun_s: Mutex::new(None),
         }
     }
 
@@ -106,6 +114,24 @@ impl Stage {
         self.witness.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// The time since the world's begin at a moment, and the pad then.
+    fn pad_at(&self, time_s: f64) -> (Option<f64>, PadState) {
+        if let Actor::Simulated(world) = &*self.actor() {
+            return (world.since_begin_s(time_s), world.pad_at(time_s));
+        }
+        let begun_s = *self.begun_s.lock().unwrap_or_else(PoisonError::into_inner);
+        let moved_s = begun_s.map(|begun_s| time_s - begun_s).filter(|s| *s >= 0.0);
+        (moved_s, self.pad.at(moved_s))
+    }
+
+    /// Begins the world of a vehicle that is flown elsewhere; our own does so by itself.
+    fn begin_when_high(&self, truth: &VehicleTruth) {
+        if truth.height_m >= self.begin_height_m {
+            let mut begun_s = self.begun_s.lock().unwrap_or_else(PoisonError::into_inner);
+            begun_s.get_or_insert(truth.time_s);
+        }
+    }
+
     /// The motion at a moment; `None` while an autopilot has not told where the vehicle is.
     fn truth_at(&self, time_s: f64) -> Option<VehicleTruth> {
         match &*self.actor() {
@@ -118,7 +144,6 @@ impl Stage {
 /// Sees the touchdown.
 #[derive(Default)]
 struct Witness {
-    pad: [f64; 2],
     was_in_air: bool,
     /// The last motion clear of the ground: once the legs touch, the ground takes the speed in steps too short to see.
     clear: Option<VehicleTruth>,
@@ -128,7 +153,7 @@ struct Witness {
 }
 
 impl Witness {
-    fn see(&mut self, truth: &VehicleTruth, stamp_ns: i64) {
+    fn see(&mut self, truth: &VehicleTruth, pad: &PadState, stamp_ns: i64) {
         if truth.height_m > IN_AIR_M && !self.was_in_air {
             self.was_in_air = true;
             self.touchdown = None;
@@ -140,12 +165,12 @@ impl Witness {
         if self.was_in_air && truth.on_ground {
             self.was_in_air = false;
             let before = self.clear.unwrap_or(*truth);
-            let [north, east] = self.pad;
+            let speed = before.velocity - pad.velocity;
             self.touchdown = Some(Touchdown {
                 stamp_ns,
-                error_m: (truth.position.x() - north).hypot(truth.position.y() - east),
-                vertical_speed_m_s: before.velocity.z(),
-                lateral_speed_m_s: before.velocity.horizontal_norm(),
+                error_m: (truth.position - pad.position).horizontal_norm(),
+                vertical_speed_m_s: speed.z(),
+                lateral_speed_m_s: speed.horizontal_norm(),
             });
         }
         if truth.height_m > CLEAR_M {
@@ -153,14 +178,14 @@ impl Witness {
         }
     }
 
-    fn message(&self, truth: &VehicleTruth, stamp_ns: i64, pad_z_m: f64) -> Truth {
-        let [north, east] = self.pad;
+    /// `lid_m`: how high the marker is over the pad, in metres.
+    fn message(&self, truth: &VehicleTruth, pad: &PadState, stamp_ns: i64, lid_m: f64) -> Truth {
         Truth {
             stamp_ns,
             ned_from_body_wxyz: truth.ned_from_body.wxyz(),
             position_ned_m: truth.position.coords.into(),
             velocity_ned_m_s: truth.velocity.coords.into(),
-            pad_ned_m: [north, east, pad_z_m],
+            pad_ned_m: [pad.position.x(), pad.position.y(), pad.position.z() - lid_m],
             on_ground: truth.on_ground,
             touchdown: self.touchdown,
             max_tilt_rad: self.max_tilt_rad,
@@ -171,12 +196,8 @@ impl Witness {
 
 /// Lets the world's time pass as the host's does, and tells the truth.
 async fn advance(node: &Node, config: &Config, stage: &Stage) -> anyhow::Result<()> {
-    let pad_z_m = config
-        .scene()
-        .map_err(anyhow::Error::msg)?
-        .pads
-        .first()
-        .map_or(0.0, |pad| pad.ned_from_marker.origin().z());
+    let scene = config.scene().map_err(anyhow::Error::msg)?;
+    let lid_m = scene.pads.first().map_or(0.0, |pad| pad.thickness_m);
     let truths = node.publisher(topic::TRUTH, &[]).await?;
     let winds = node.publisher(topic::WIND, &[]).await?;
     let mut outside = Outside::open(node, config).await?;
@@ -200,9 +221,11 @@ async fn advance(node: &Node, config: &Config, stage: &Stage) -> anyhow::Result<
         };
         let Some(truth) = truth else { continue };
         let stamp_ns = stage.stamp_ns(truth.time_s);
-        stage.witness().see(&truth, stamp_ns);
+        stage.begin_when_high(&truth);
+        let (_, pad) = stage.pad_at(truth.time_s);
+        stage.witness().see(&truth, &pad, stamp_ns);
         if tick.is_multiple_of(TRUTH_EVERY) {
-            let message = stage.witness().message(&truth, stamp_ns, pad_z_m);
+            let message = stage.witness().message(&truth, &pad, stamp_ns, lid_m);
             truths.publish(&message).await;
         }
         let air = match &*stage.actor() {
@@ -314,11 +337,19 @@ fn request_for_sim_state() -> Vec<u8> {
     autopilot::frame::encode(Sender { system: 255, component: 192 }, 0, &message)
 }
 
+/// A frame that is on its way.
+struct Late {
+    due_s: f64,
+    header: FrameHeader,
+    pixels: Loan,
+}
+
 /// The camera's thread.
 struct Camera {
     node: Node,
     stage: Arc<Stage>,
-    renderer: Renderer,
+    eye: Eye,
+    late: VecDeque<Late>,
     frames: FramePublisher,
     jpegs: FramePublisher,
     infos: Publisher<CameraInfo>,
@@ -329,8 +360,8 @@ struct Camera {
 
 impl Camera {
     async fn new(node: &Node, config: &Config, stage: Arc<Stage>) -> anyhow::Result<Self> {
-        let scene = config.scene().map_err(anyhow::Error::msg)?;
-        let settings = config.camera_settings();
+        let eye = Eye::new(config)?;
+        let settings = eye.settings().clone();
         let name = &config.camera.name;
         let bytes = config.camera.width as usize * config.camera.height as usize;
         let mount = settings.body_from_camera;
@@ -348,8 +379,8 @@ impl Camera {
             },
         };
         Ok(Self {
-            renderer: Renderer::new(&scene, settings, config.seed)
-                .context("setting the simulated camera up")?,
+            eye,
+            late: VecDeque::new(),
             frames: node.frame_publisher(topic::FRAME, &[name], bytes).await?,
             jpegs: node.frame_publisher(topic::JPEG, &[name], 0).await?,
             infos: node.publisher(topic::CAMERA_INFO, &[name]).await?,
@@ -372,12 +403,14 @@ impl Camera {
                 let mut sequence = (self.stage.now_s() / self.period_s) as u64 + 1;
                 while !running.is_closed() {
                     let time_s = sequence as f64 * self.period_s;
-                    let exposed_s = time_s + self.renderer.settings().exposure_s / 2.0;
+                    let exposed_s = time_s + self.eye.settings().exposure_s / 2.0;
                     // A tick later the world's past holds the whole exposure.
-                    let wait_s = exposed_s + TICK.as_secs_f64() * 1.5 - self.stage.now_s();
-                    if wait_s > 0.0 {
-                        std::thread::sleep(Duration::from_secs_f64(wait_s));
+                    let ready_s = exposed_s + TICK.as_secs_f64() * 1.5;
+                    while let Some(due_s) = self.next_due_s().filter(|due_s| *due_s < ready_s) {
+                        self.sleep_until(due_s);
+                        runtime.block_on(self.publish_late());
                     }
+                    self.sleep_until(ready_s);
                     runtime.block_on(self.take(sequence, time_s));
                     let due = (self.stage.now_s() / self.period_s) as u64;
                     if due > sequence + 1 {
@@ -395,10 +428,15 @@ impl Camera {
         if sequence.is_multiple_of((1.0 / self.period_s).ceil() as u64) {
             self.infos.publish(&self.info).await;
         }
-        let Some(poses) = self.poses(time_s) else { return };
+        let Some(truth) = self.stage.truth_at(time_s) else { return };
+        let (begun_s, pad) = self.stage.pad_at(time_s);
+        let moment = Moment { sequence, time_s, begun_s, pad };
+        let Some(passage) = self.eye.open(&moment, &truth) else { return };
         let started_ns = now_ns();
         let mut frame = self.frames.loan(self.info.width as usize * self.info.height as usize);
-        if let Err(problem) = self.renderer.render(&poses, sequence, &mut frame) {
+        let stage = &self.stage;
+        let truth_at = |time_s| stage.truth_at(time_s).unwrap_or(truth);
+        if let Err(problem) = self.eye.render(&moment, truth_at, &mut frame) {
             if self.node.health().failed("render") {
                 tracing::error!(%problem, "A frame could not be rendered");
             }
@@ -409,27 +447,63 @@ impl Camera {
         let header = FrameHeader {
             camera: self.info.camera.clone(),
             sequence,
-            stamp_ns: self.stage.stamp_ns(time_s),
+            stamp_ns: self.stage.stamp_ns(time_s + passage.stamp_error_s),
             clock: clock_name().to_owned(),
-            exposure_ns: (self.renderer.settings().exposure_s * 1e9) as u32,
+            exposure_ns: (self.eye.settings().exposure_s * 1e9) as u32,
             width: self.info.width,
             height: self.info.height,
             format: PixelFormat::Mono8,
             parts: Vec::new(),
         };
-        if self.jpegs.has_subscribers().await {
-            self.publish_jpeg(&header, &frame).await;
+        let again = passage.again_after_s.map(|after_s| (time_s + after_s, frame.to_vec()));
+        let late = passage.arrives_after_s > 0.0;
+        if late {
+            self.delay(time_s + passage.arrives_after_s, header.clone(), frame);
+        } else {
+            self.publish(&header, frame).await;
         }
-        self.frames.publish(&header, frame).await;
+        if let Some((due_s, copy)) = again {
+            self.delay(due_s, header, Loan::Private(copy));
+        }
+        self.publish_late().await;
+    }
+
+    /// Publishes a frame, and its JPEG while somebody subscribes.
+    async fn publish(&mut self, header: &FrameHeader, frame: Loan) {
+        if self.jpegs.has_subscribers().await {
+            self.publish_jpeg(header, &frame).await;
+        }
+        self.frames.publish(header, frame).await;
         self.stage.witness().frames += 1;
     }
 
-    /// Where the vehicle is through the exposure about a moment.
-    fn poses(&self, time_s: f64) -> Option<Vec<Transform<Ned, Body>>> {
-        let exposure_s = self.renderer.settings().exposure_s;
-        let instant = |i: usize| time_s + exposure_s * (i as f64 / (POSES - 1) as f64 - 0.5);
-        let pose = |truth: VehicleTruth| Transform::new(truth.ned_from_body, truth.position);
-        (0..POSES).map(|i| self.stage.truth_at(instant(i)).map(pose)).collect()
+    /// Sends a frame on its way.
+    fn delay(&mut self, due_s: f64, header: FrameHeader, pixels: Loan) {
+        if self.late.len() >= MOST_LATE {
+            self.late.pop_front();
+            self.node.health().dropped("late frames");
+        }
+        let place = self.late.partition_point(|late| late.due_s <= due_s);
+        self.late.insert(place, Late { due_s, header, pixels });
+    }
+
+    fn next_due_s(&self) -> Option<f64> {
+        self.late.front().map(|late| late.due_s)
+    }
+
+    fn sleep_until(&self, time_s: f64) {
+        let wait_s = time_s - self.stage.now_s();
+        if wait_s > 0.0 {
+            std::thread::sleep(Duration::from_secs_f64(wait_s));
+        }
+    }
+
+    /// Publishes the frames that have arrived.
+    async fn publish_late(&mut self) {
+        while self.next_due_s().is_some_and(|due_s| due_s <= self.stage.now_s()) {
+            let Some(Late { header, pixels, .. }) = self.late.pop_front() else { return };
+            self.publish(&header, pixels).await;
+        }
     }
 
     async fn publish_jpeg(&self, header: &FrameHeader, pixels: &[u8]) {
@@ -450,12 +524,13 @@ impl Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use world::vehicle::{Vehicle, VehicleConfig};
     use geometry::{Point, Vector};
+    use world::vehicle::{Vehicle, VehicleConfig};
 
     #[test]
     fn a_touchdown_is_told_by_the_motion_before_the_legs_touch() {
-        let mut witness = Witness { pad: [1.5, -1.5], ..Witness::default() };
+        let mut witness = Witness::default();
+        let pad = PadConfig::default().at(None);
         let still = Vehicle::new(VehicleConfig::default(), 1).truth();
         let at = |height_m: f64, fall: f64, on_ground| VehicleTruth {
             position: Point::new(1.4, -1.5, -height_m),
@@ -464,13 +539,13 @@ mod tests {
             on_ground,
             ..still
         };
-        witness.see(&at(0.0, 0.0, true), 0);
+        witness.see(&at(0.0, 0.0, true), &pad, 0);
         assert!(witness.touchdown.is_none(), "it has not flown yet");
-        witness.see(&at(5.0, 1.0, false), 1);
-        witness.see(&at(0.1, 0.5, false), 2);
+        witness.see(&at(5.0, 1.0, false), &pad, 1);
+        witness.see(&at(0.1, 0.5, false), &pad, 2);
         // A hop too short to see ends in a touch without speed.
-        witness.see(&at(0.001, 0.0, false), 3);
-        witness.see(&at(0.0, 0.0, true), 4);
+        witness.see(&at(0.001, 0.0, false), &pad, 3);
+        witness.see(&at(0.0, 0.0, true), &pad, 4);
         let touchdown = witness.touchdown.unwrap();
         assert!((touchdown.error_m - 0.1).abs() < 1e-9 && touchdown.stamp_ns == 4);
         assert!((touchdown.vertical_speed_m_s - 0.5).abs() < 1e-9);

@@ -188,8 +188,7 @@ impl Estimator {
     /// Lets `dt_s` pass and gives what is believed of `truth`.
     pub(super) fn step(&mut self, dt_s: f64, truth: &VehicleTruth) -> Estimate {
         let reset = self.drift(dt_s);
-        let drifts =
-            if self.begun_s.is_some() { self.config.gnss_drift_m_s } else { [0.0; 2] };
+        let drifts = if self.begun_s.is_some() { self.config.gnss_drift_m_s } else { [0.0; 2] };
         let random = &mut self.random;
         let position = self.position.each_mut().map(|drift| drift.step(dt_s, random));
         let velocity = self.velocity.each_mut().map(|drift| drift.step(dt_s, random));

@@ -9,7 +9,7 @@ use rendering::CameraSettings;
 
 use super::{SIZE_M, Set, chance, view, with_id};
 use crate::shot::{Shot, pose};
-use crate::veil::{Line, Veil};
+use rendering::veil::{Line, Veil};
 
 const FRAMES: usize = 8;
 

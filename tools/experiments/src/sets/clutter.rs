@@ -11,7 +11,7 @@ use rendering::{PadInScene, Surface};
 
 use super::{Set, chance, middle, near};
 use crate::shot::{Shot, pose};
-use crate::veil::{Line, Veil};
+use rendering::veil::{Line, Veil};
 
 /// Scenes; with photographs and their crops there are more than a thousand.
 const SCENES: usize = 520;

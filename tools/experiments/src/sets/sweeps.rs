@@ -8,7 +8,7 @@ use rendering::{CameraSettings, Surface};
 
 use super::{Set, chance, middle, near, view, with_id};
 use crate::shot::{Shot, pose};
-use crate::veil::Veil;
+use rendering::veil::Veil;
 
 pub(super) fn tilt(marker: Marker) -> Vec<Shot> {
     let mut shots = Vec::new();

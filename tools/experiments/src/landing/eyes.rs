@@ -1,0 +1,226 @@
+//! From the world to a detector's message: rendered frames through the real detector, or the model of what it would find.
+
+use anyhow::Context;
+use detector::wire;
+use fiducial::Detector;
+use geometry::{Camera, CameraModel, Marker, Transform, Vector};
+use imaging::GrayView;
+use messages::{
+    CameraInfo, Detection, Detections, FrameHeader, LensModel, MarkerPose, PixelFormat, Transform3,
+};
+use node::{Layers, clock_name};
+use simulator::eye::{Eye, Moment};
+use world::World;
+use world::vehicle::VehicleTruth;
+use world::vision::{Found, RINGS, Vision, VisionFaults};
+
+use super::plan;
+
+/// The name of the detector.
+pub const DETECTOR: &str = "main";
+/// The marker is looked at twice so far apart to know how it moves in the image, in seconds.
+const BLUR_STEP_S: f64 = 1e-3;
+
+/// Camera and detector of one flight.
+pub struct Eyes {
+    eye: Eye,
+    seer: Seer,
+    info: CameraInfo,
+    model: CameraModel,
+    faults: VisionFaults,
+    family: &'static str,
+}
+
+enum Seer {
+    Rendered { detector: Box<Detector>, pixels: Vec<u8> },
+    Modelled(Box<Vision>),
+}
+
+/// A message and when it arrives, in seconds of the world.
+#[derive(Clone, Debug)]
+pub struct Arrival {
+    /// When.
+    pub at_s: f64,
+    /// What.
+    pub message: Detections,
+}
+
+impl Eyes {
+    /// The eyes of a simulator's configuration.
+    ///
+    /// # Errors
+    /// When the scene or the marker makes no sense.
+    pub fn new(
+        config: &simulator::Config,
+        how: plan::Vision,
+        faults: VisionFaults,
+    ) -> anyhow::Result<Self> {
+        let eye = Eye::new(config)?;
+        let marker = config.pad_marker().map_err(anyhow::Error::msg)?;
+        let settings = eye.settings();
+        let model = settings.model;
+        let seer = match how {
+            plan::Vision::Rendered => {
+                let set = vec![format!("markers=[\"{}\"]", config.pad.marker)];
+                let detector = Layers { file: None, set }.load::<detector::Config>()?.settings;
+                Seer::Rendered {
+                    detector: Box::new(detector.detector().map_err(anyhow::Error::msg)?),
+                    pixels: vec![0; model.width as usize * model.height as usize],
+                }
+            }
+            plan::Vision::Modelled => {
+                let size_m = marker.size_m.context("the pad's marker has no size")?;
+                Seer::Modelled(Box::new(Vision::new(RINGS, model, size_m, config.seed)))
+            }
+        };
+        let info = CameraInfo {
+            camera: config.camera.name.clone(),
+            width: model.width,
+            height: model.height,
+            focal_px: Some([model.fx, model.fy]),
+            principal_px: [model.cx, model.cy],
+            lens: LensModel::Pinhole,
+            body_from_camera: wire_transform(&settings.body_from_camera),
+        };
+        Ok(Self { eye, seer, info, model, faults, family: marker.family.name() })
+    }
+
+    /// The camera as the controller is told of it.
+    pub fn info(&self) -> &CameraInfo {
+        &self.info
+    }
+
+    /// How long the shutter is open, in seconds.
+    pub fn exposure_s(&self) -> f64 {
+        self.eye.settings().exposure_s
+    }
+
+    /// Takes the frame of a moment and looks for the marker. `stamp_ns` tells the stamp of a time of the world.
+    ///
+    /// # Errors
+    /// When a frame cannot be rendered.
+    pub fn look(
+        &mut self,
+        world: &World,
+        sequence: u64,
+        time_s: f64,
+        stamp_ns: impl Fn(f64) -> i64,
+    ) -> anyhow::Result<Vec<Arrival>> {
+        let truth = world.truth_at(time_s);
+        let begun_s = world.since_begin_s(time_s);
+        let moment = Moment { sequence, time_s, begun_s, pad: world.pad_at(time_s) };
+        let Some(passage) = self.eye.open(&moment, &truth) else { return Ok(Vec::new()) };
+        let detections = match &mut self.seer {
+            Seer::Rendered { detector, pixels } => {
+                self.eye.render(&moment, |s| world.truth_at(s), pixels)?;
+                let (width, height) = (self.info.width as usize, self.info.height as usize);
+                let view = GrayView::packed(pixels, width, height).context("an image")?;
+                let found = detector.detect(view, Some(&self.model), &mut ());
+                found.iter().map(wire::detection).collect()
+            }
+            Seer::Modelled(_) => self.model_detections(world, &moment, &truth),
+        };
+        let header = FrameHeader {
+            camera: self.info.camera.clone(),
+            sequence,
+            stamp_ns: stamp_ns(time_s + passage.stamp_error_s),
+            clock: clock_name().to_owned(),
+            exposure_ns: (self.exposure_s() * 1e9) as u32,
+            width: self.info.width,
+            height: self.info.height,
+            format: PixelFormat::Mono8,
+            parts: Vec::new(),
+        };
+        let message =
+            Detections { detector: DETECTOR.to_owned(), header, detections, stages: Vec::new() };
+        let arrivals = [Some(passage.arrives_after_s), passage.again_after_s];
+        Ok(arrivals
+            .into_iter()
+            .flatten()
+            .map(|after_s| Arrival { at_s: time_s + after_s, message: message.clone() })
+            .collect())
+    }
+
+    fn model_detections(
+        &mut self,
+        world: &World,
+        moment: &Moment,
+        truth: &VehicleTruth,
+    ) -> Vec<Detection> {
+        let Seer::Modelled(vision) = &mut self.seer else { return Vec::new() };
+        let mut pad = moment.pad;
+        let camera_from_marker = self.eye.camera_from_marker(truth, &pad);
+        let before = self.eye.camera_from_marker(
+            &world.truth_at(moment.time_s - BLUR_STEP_S),
+            &world.pad_at(moment.time_s - BLUR_STEP_S),
+        );
+        let pixels = [&camera_from_marker, &before].map(|pose| self.model.project(pose.origin()));
+        let [Some(now), Some(then)] = pixels else { return Vec::new() };
+        let blur_px = now.distance(&then) / BLUR_STEP_S * self.eye.settings().exposure_s;
+        let faults = self.faults;
+        let (misses, luck) = (vision.draw() < faults.miss, vision.draw());
+        if let Some((part, metres)) = faults.wrong
+            && luck < part
+        {
+            pad.position = pad.position + Vector::new(0.0, metres, 0.0);
+        }
+        if let Some((from_s, to_s, metres)) = faults.lie
+            && moment.begun_s.is_some_and(|now_s| (from_s..to_s).contains(&now_s))
+        {
+            pad.position = pad.position + Vector::new(metres, 0.0, 0.0);
+        }
+        let seen = self.eye.camera_from_marker(truth, &pad);
+        let low = seen.origin().z() < faults.blind_below_m;
+        let found = vision.look(&seen, blur_px).filter(|_| !misses && !low);
+        found.map(|found| detection(self.family, &found)).into_iter().collect()
+    }
+}
+
+fn detection(family: &str, found: &Found) -> Detection {
+    let c = &found.covariance_m2;
+    let mut covariance = [0.0_f32; 21];
+    let places = [(0, c.m11), (1, c.m12), (2, c.m13), (6, c.m22), (7, c.m23), (11, c.m33)];
+    for (index, value) in places {
+        if let Some(cell) = covariance.get_mut(index) {
+            *cell = value as f32;
+        }
+    }
+    Detection {
+        family: family.to_owned(),
+        id: None,
+        centre_px: [found.centre.x, found.centre.y],
+        centre_covariance_px2: [0.0; 3],
+        corners_px: None,
+        size_px: found.size_px,
+        wrong_bits: 0,
+        confidence: 1.0,
+        pose: Some(MarkerPose {
+            camera_from_marker: wire_transform(&found.camera_from_marker),
+            reprojection_rms_px: 0.1,
+            covariance,
+            alternative: None,
+        }),
+    }
+}
+
+fn wire_transform<A: geometry::Frame, B: geometry::Frame>(pose: &Transform<A, B>) -> Transform3 {
+    let origin = pose.origin();
+    Transform3 {
+        translation_m: [origin.x(), origin.y(), origin.z()],
+        rotation_wxyz: pose.rotation().wxyz(),
+    }
+}
+
+/// What the detector's error is for a pose that is known, for those who fit the model: centre in pixels along the image's
+/// axes, range as a part of it, tilt in radians.
+pub fn errors(
+    model: &CameraModel,
+    found: &Transform<Camera, Marker>,
+    truth: &Transform<Camera, Marker>,
+) -> Option<[f64; 4]> {
+    let (seen, right) = (model.project(found.origin())?, model.project(truth.origin())?);
+    let part = found.origin().z() / truth.origin().z() - 1.0;
+    let up = |pose: &Transform<Camera, Marker>| pose.rotation() * Vector::new(0.0, 0.0, 1.0);
+    let tilt = up(found).coords.dot(&up(truth).coords).clamp(-1.0, 1.0).acos();
+    Some([seen.x - right.x, seen.y - right.y, part, tilt])
+}

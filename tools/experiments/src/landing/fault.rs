@@ -1,0 +1,196 @@
+//! What goes wrong in a flight, and other circumstances with a name.
+
+use std::f64::consts::TAU;
+use std::str::FromStr;
+
+use world::vision::VisionFaults;
+
+/// A circumstance beside wind, height, offset and latency.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Fault(usize);
+
+/// What a fault changes: settings of the simulator and of the controller, and the modelled detector.
+#[derive(Clone, Debug, Default)]
+pub struct Change {
+    /// Settings of the simulator.
+    pub simulator: Vec<String>,
+    /// Settings of the controller.
+    pub controller: Vec<String>,
+    /// What the modelled detector does wrong; a rendered frame shows what it shows.
+    pub vision: VisionFaults,
+}
+
+/// A row of the table of faults: its name, what it is, and what it changes for the number (from 0 to 1) that a flight's seed
+/// draws.
+type Row = (&'static str, &'static str, fn(f64) -> Change);
+
+const TABLE: [Row; 22] = [
+    ("none", "nothing goes wrong", |_| Change::default()),
+    ("lost-below-2m", "no frame is taken from 2 m on", |_| {
+        simulator(&["camera.outage_below_m=2", "camera.outage_below_for_s=3600"])
+    }),
+    ("silence-2s", "no frame is taken for 2 s, at any time", |part| {
+        let at = format!("camera.outage_at_s={:.3}", 1.0 + 9.0 * part);
+        simulator(&[&at, "camera.outage_for_s=2"])
+    }),
+    ("latency-300ms", "frames arrive 300 to 350 ms late", |_| {
+        simulator(&["camera.latency_ms=300", "camera.jitter_ms=50"])
+    }),
+    ("half-dropped", "half of the frames never arrive", |_| simulator(&["camera.drop=0.5"])),
+    ("out-of-order", "frames arrive up to 250 ms late, a third twice", |_| {
+        simulator(&["camera.jitter_ms=250", "camera.duplicate=0.33"])
+    }),
+    ("wrong-marker", "in 30 % of the frames another marker, 1 m away, is taken for ours", |_| {
+        Change {
+            vision: VisionFaults { wrong: Some((0.3, 1.0)), ..VisionFaults::default() },
+            ..simulator(&["pad.wrong_marker=aruco-4x4-50:7:0.15", "pad.wrong_east_m=1"])
+        }
+    }),
+    ("lie", "detections lie by 0.5 m for 1 s, at any time", |part| {
+        let from_s = 1.0 + 9.0 * part;
+        let lie = Some((from_s, from_s + 1.0, 0.5));
+        Change { vision: VisionFaults { lie, ..VisionFaults::default() }, ..Change::default() }
+    }),
+    ("stamp-jumps", "a tenth of the stamps jumps by up to 250 ms", |_| {
+        simulator(&["camera.stamp_jumps=0.1", "camera.stamp_jump_ms=250"])
+    }),
+    ("stamps-early", "all stamps are 50 ms early", |_| simulator(&["camera.stamp_early_ms=50"])),
+    ("gnss-drift", "the believed position drifts by 0.05 m/s", |part| {
+        let to = format!("autopilot.gnss_drift_to_deg={:.1}", 360.0 * part);
+        simulator(&["autopilot.gnss_drift_m_s=0.05", &to])
+    }),
+    ("gnss-jump", "the believed position jumps by 1 m, at any time", |part| {
+        let at = format!("autopilot.gnss_jump_at_s={:.3}", 1.0 + 9.0 * part);
+        simulator(&["autopilot.gnss_jump_m=1", &at])
+    }),
+    ("link-lost-1s", "the autopilot's link is lost for 1 s, at any time", |part| {
+        let at = format!("autopilot.link_lost_at_s={:.3}", 1.0 + 9.0 * part);
+        simulator(&[&at, "autopilot.link_lost_for_s=1"])
+    }),
+    ("mount-1deg", "the mount is off by 1 degree (a deviation, in roll and pitch)", |_| {
+        simulator(&["camera.mount_error_deg=1"])
+    }),
+    ("estimates-3x", "the autopilot's estimates err three times as much as usual", |_| {
+        simulator(&["autopilot.errors=3"])
+    }),
+    ("gust", "a gust of 5 m/s in 3 s, at any time", |part| {
+        let at = format!("wind.gust_at_s={:.3}", 1.0 + 8.0 * part);
+        simulator(&["wind.gust_m_s=5", "wind.gust_length_s=3", &at])
+    }),
+    ("ground-effect", "rotors of 0.2 m push harder near the ground", |_| {
+        simulator(&["start.rotor_m=0.2"])
+    }),
+    ("glare", "a reflection beside the marker for 2 s (rendered only)", |part| veil("glare", part)),
+    ("cover", "a third of the marker is covered for 2 s (rendered only)", |part| {
+        veil("cover", part)
+    }),
+    ("pad-moves-2.5", "the pad moves at 2.5 m/s (its marker half as large again)", |part| {
+        moving(2.5, 0.0, part)
+    }),
+    ("pad-moves-4.2", "the pad moves at 4.2 m/s (its marker half as large again)", |part| {
+        moving(4.2, 0.0, part)
+    }),
+    ("pad-heaves", "the pad heaves by 0.3 m in 6 s (its marker half as large again)", |part| {
+        moving(0.0, 0.3, part)
+    }),
+];
+
+fn simulator(settings: &[&str]) -> Change {
+    Change {
+        simulator: settings.iter().map(|setting| (*setting).to_owned()).collect(),
+        ..Change::default()
+    }
+}
+
+fn veil(kind: &str, part: f64) -> Change {
+    let (kind, at) = (format!("veil.kind={kind}"), format!("veil.at_s={:.3}", 1.0 + 8.0 * part));
+    simulator(&[&kind, &at, "veil.strength=0.33", "veil.for_s=2"])
+}
+
+/// A pad that moves, seen twice as often, and a controller that is told to expect it.
+fn moving(speed_m_s: f64, heave_m: f64, part: f64) -> Change {
+    let speed = format!("pad.speed_m_s={speed_m_s}");
+    let course = format!("pad.course_deg={:.1}", 360.0 * part);
+    let heave = format!("pad.heave_m={heave_m}");
+    let simulated = ["pad.marker=rings:0.23", "camera.rate_hz=30", &speed, &course, &heave];
+    let told = [
+        "estimator.pad_speed_m_s=4.5",
+        "estimator.pad_heave_m_s=0.4",
+        "estimator.pad_acceleration=0.15",
+        "envelope.horizontal_m_s=7",
+        "metric.max_lateral_m_s=2.5",
+        "metric.lateral_acceleration_m_s2=2",
+        "metric.silence_s=1.2",
+        "metric.blind_deviation_m=0.2",
+    ];
+    Change {
+        controller: told.iter().map(|setting| (*setting).to_owned()).collect(),
+        ..simulator(&simulated)
+    }
+}
+
+impl Fault {
+    /// No fault.
+    pub const NONE: Self = Self(0);
+
+    /// All of them.
+    pub fn all() -> impl Iterator<Item = Self> {
+        (0..TABLE.len()).map(Self)
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        TABLE.get(self.0).map_or("none", |row| row.0)
+    }
+
+    /// What it is, in words.
+    pub fn words(self) -> &'static str {
+        TABLE.get(self.0).map_or("", |row| row.1)
+    }
+
+    /// What it changes in the flight of a seed.
+    pub fn change(self, seed: u64) -> Change {
+        TABLE.get(self.0).map_or_else(Change::default, |row| row.2(drawn(seed, 9)))
+    }
+}
+
+impl FromStr for Fault {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let found = TABLE.iter().position(|row| row.0 == name).map(Self);
+        found.ok_or_else(|| {
+            let names: Vec<&str> = TABLE.iter().map(|row| row.0).collect();
+            format!("there is no fault `{name}`; there are {}", names.join(", "))
+        })
+    }
+}
+
+/// A number from 0 to 1 that belongs to the seed, another one for each `which`.
+pub fn drawn(seed: u64, which: u32) -> f64 {
+    let mixed =
+        (seed.wrapping_add(1)).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(17 * which + 5);
+    (mixed.wrapping_mul(0xd6e8_feb8_6659_fd93) >> 11) as f64 / (1u64 << 53) as f64
+}
+
+/// An angle that belongs to the seed, in radians.
+pub fn drawn_angle(seed: u64, which: u32) -> f64 {
+    TAU * drawn(seed, which)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use node::Layers;
+
+    #[test]
+    fn every_fault_has_a_name_of_its_own_and_changes_what_there_is() {
+        for fault in Fault::all() {
+            assert_eq!(fault.name().parse(), Ok(fault));
+            let Change { simulator, controller, .. } = fault.change(3);
+            let layers = |set: Vec<String>| Layers { file: None, set };
+            layers(simulator).load::<simulator::Config>().unwrap();
+            layers(controller).load::<controller::Config>().unwrap();
+        }
+    }
+}

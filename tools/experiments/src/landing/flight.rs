@@ -1,0 +1,245 @@
+//! One flight in lock-step: the world's autopilot and the controller exchange MAVLink packets, the eyes' detections arrive
+//! when they are due, and nothing waits for a clock.
+
+use std::collections::VecDeque;
+
+use anyhow::Context;
+use autopilot::Parser;
+use controller::flight::Flight;
+use geometry::{Ned, Point, Vector};
+use node::Layers;
+use world::World;
+use world::vehicle::VehicleTruth;
+use world::world::STEP_S;
+
+use super::eyes::{Arrival, DETECTOR, Eyes};
+use super::outcome::{Ending, Outcome};
+use super::plan::Planned;
+
+/// The controller's own pace: a tick in so many steps of the world, 25 ms.
+const TICK_STEPS: u64 = 10;
+/// A landing that has not begun by then never will, in seconds.
+const MOST_WAIT_S: f64 = 30.0;
+/// The end of patience, in seconds from the start of the landing: a little more than the controller's own.
+const MOST_S: f64 = 320.0;
+/// How long it is watched after the controller's end, in seconds.
+const AFTER_S: f64 = 0.5;
+/// How long it is watched after the motors stood still: the autopilot tells of it once a second.
+const AFTER_DISARM_S: f64 = 3.0;
+/// The controller's clock at the world's time 0, in nanoseconds.
+const START_NS: i64 = 1_000_000_000;
+/// Detections on their way at most.
+const MOST_ON_THE_WAY: usize = 256;
+
+/// What happened at one time, for the figures.
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// Since the start of the landing, in seconds.
+    pub time_s: f64,
+    /// Where the vehicle is, in metres.
+    pub position: Point<Ned>,
+    /// Where the pad is, in metres.
+    pub pad: Point<Ned>,
+    /// The velocity asked for, in m/s, while one is.
+    pub command: Option<[f64; 3]>,
+    /// The air's velocity, in m/s.
+    pub wind: Vector<Ned>,
+    /// The controller's phase.
+    pub phase: String,
+}
+
+/// Flies it, and notes its samples 40 times a second if asked to.
+///
+/// # Errors
+/// When a setting is wrong or a frame cannot be rendered.
+pub fn fly(planned: &Planned, trace: Option<&mut Vec<Sample>>) -> anyhow::Result<Outcome> {
+    let mut rehearsal = Rehearsal::new(planned)
+        .with_context(|| format!("seed {} of {}", planned.seed, planned.cell))?;
+    rehearsal.run(trace)?;
+    Ok(rehearsal.outcome)
+}
+
+struct Rehearsal {
+    world: World,
+    eyes: Eyes,
+    controller: Flight,
+    from_world: Parser,
+    to_world: Parser,
+    frame_period_s: f64,
+    sequence: u64,
+    on_the_way: VecDeque<Arrival>,
+    start_s: Option<f64>,
+    was_in_retry: bool,
+    outcome: Outcome,
+}
+
+impl Rehearsal {
+    fn new(planned: &Planned) -> anyhow::Result<Self> {
+        let layers = |set: &[String]| Layers { file: None, set: set.to_vec() };
+        let simulated: simulator::Config =
+            layers(&planned.change.simulator).load::<simulator::Config>()?.settings;
+        let told = layers(&planned.change.controller).load::<controller::Config>()?.settings;
+        let world = World::new(&simulated.world(), simulated.seed);
+        let eyes = Eyes::new(&simulated, planned.vision, planned.change.vision)?;
+        let mut controller = Flight::new(told, std::sync::Arc::default())?;
+        let frame_period_s = 1.0 / simulated.camera.rate_hz;
+        controller.presence(stamp_ns(world.now_s()), DETECTOR, true);
+        controller.camera(eyes.info().clone());
+        Ok(Self {
+            sequence: (world.now_s() / frame_period_s) as u64 + 1,
+            world,
+            eyes,
+            controller,
+            from_world: Parser::new(),
+            to_world: Parser::new(),
+            frame_period_s,
+            on_the_way: VecDeque::new(),
+            start_s: None,
+            was_in_retry: false,
+            outcome: Outcome::of(planned),
+        })
+    }
+
+    fn run(&mut self, mut trace: Option<&mut Vec<Sample>>) -> anyhow::Result<()> {
+        let opened_s = self.world.now_s();
+        let mut steps: u64 = 0;
+        let mut over_s = None;
+        loop {
+            let before = self.world.truth();
+            let now_s = opened_s + (steps + 1) as f64 * STEP_S;
+            steps += 1;
+            self.world.advance_to(now_s);
+            self.watch(&before);
+            self.hear();
+            self.see()?;
+            if steps.is_multiple_of(TICK_STEPS) {
+                self.controller.tick(stamp_ns(self.world.now_s()));
+                self.note(trace.as_deref_mut());
+                if over_s.is_none() && self.is_over() {
+                    over_s = Some(now_s);
+                }
+            }
+            self.obey();
+            let waited_s = now_s - self.start_s.unwrap_or(opened_s);
+            let patience_s = if self.start_s.is_some() { MOST_S } else { MOST_WAIT_S };
+            if over_s.is_some_and(|at_s| now_s - at_s > AFTER_S) || waited_s > patience_s {
+                self.finish();
+                return Ok(());
+            }
+        }
+    }
+
+    /// The autopilot's packets reach the controller.
+    fn hear(&mut self) {
+        let now_ns = stamp_ns(self.world.now_s());
+        let packets: Vec<Vec<u8>> = self.world.outgoing().collect();
+        for frame in packets.iter().flat_map(|packet| self.from_world.push(packet)) {
+            self.controller.packet(now_ns, &frame);
+        }
+    }
+
+    /// Frames are taken when their exposure is past, and what was found in them arrives when it is due.
+    fn see(&mut self) -> anyhow::Result<()> {
+        let now_s = self.world.now_s();
+        let time_s = self.sequence as f64 * self.frame_period_s;
+        if now_s >= time_s + 0.5 * self.eyes.exposure_s() + STEP_S {
+            let arrivals = self.eyes.look(&self.world, self.sequence, time_s, stamp_ns)?;
+            self.sequence += 1;
+            self.outcome.frames += u64::from(!arrivals.is_empty());
+            for arrival in arrivals {
+                if self.on_the_way.len() < MOST_ON_THE_WAY {
+                    let place = self.on_the_way.partition_point(|other| other.at_s <= arrival.at_s);
+                    self.on_the_way.insert(place, arrival);
+                }
+            }
+        }
+        while self.on_the_way.front().is_some_and(|arrival| arrival.at_s <= now_s) {
+            if let Some(arrival) = self.on_the_way.pop_front() {
+                self.controller.detections(stamp_ns(now_s), DETECTOR, &arrival.message);
+            }
+        }
+        Ok(())
+    }
+
+    /// The controller's packets reach the autopilot.
+    fn obey(&mut self) {
+        while let Some(packet) = self.controller.poll_outgoing() {
+            for frame in self.to_world.push(&packet) {
+                self.world.handle(&frame);
+            }
+        }
+    }
+
+    fn watch(&mut self, before: &VehicleTruth) {
+        let now = self.world.truth();
+        let Some(start_s) = self.start_s else { return };
+        if !now.on_ground {
+            let tilt_deg = now.tilt_rad().to_degrees();
+            self.outcome.max_tilt_deg = self.outcome.max_tilt_deg.max(tilt_deg);
+        }
+        let since_s = self.world.now_s() - start_s;
+        if now.on_ground && !before.on_ground && self.outcome.touchdown_s.is_none() {
+            let pad = self.world.pad_at(self.world.now_s());
+            let away = now.position - pad.position;
+            let speed = before.velocity - pad.velocity;
+            self.outcome.touchdown_s = Some(since_s);
+            self.outcome.error_m = Some(away.horizontal_norm());
+            self.outcome.error_north_m = Some(away.x());
+            self.outcome.error_east_m = Some(away.y());
+            self.outcome.sink_m_s = Some(speed.z());
+            self.outcome.slide_m_s = Some(speed.horizontal_norm());
+            self.outcome.touch_tilt_deg = Some(before.tilt_rad().to_degrees());
+        }
+        let pilot = self.world.autopilot();
+        if pilot.mode() == world::ardupilot::Mode::Land {
+            self.outcome.land_s.get_or_insert(since_s);
+        }
+        if !pilot.armed() {
+            self.outcome.disarm_s.get_or_insert(since_s);
+        }
+    }
+
+    fn note(&mut self, trace: Option<&mut Vec<Sample>>) {
+        let now_s = self.world.now_s();
+        let status = self.controller.status(stamp_ns(now_s));
+        if status.started_ns.is_some() && self.start_s.is_none() {
+            self.start_s = Some(now_s);
+            self.world.begin();
+        }
+        let Some(start_s) = self.start_s else { return };
+        let retries = status.phase == "retry";
+        self.outcome.retries += u32::from(retries && !self.was_in_retry);
+        self.was_in_retry = retries;
+        self.outcome.detections = status.detections_used;
+        if let Some(trace) = trace {
+            trace.push(Sample {
+                time_s: now_s - start_s,
+                position: self.world.truth().position,
+                pad: self.world.pad_at(now_s).position,
+                command: status.setpoint.map(|setpoint| setpoint.velocity_ned_m_s),
+                wind: self.world.wind(),
+                phase: status.phase.clone(),
+            });
+        }
+        (self.outcome.phase, self.outcome.why) = (status.phase, status.why);
+    }
+
+    fn is_over(&self) -> bool {
+        let ended = matches!(self.outcome.phase.as_str(), "landed" | "aborted" | "failed");
+        let since_s = self.start_s.map_or(0.0, |start_s| self.world.now_s() - start_s);
+        ended || self.outcome.disarm_s.is_some_and(|at_s| since_s - at_s > AFTER_DISARM_S)
+    }
+
+    fn finish(&mut self) {
+        let outcome = &mut self.outcome;
+        outcome.ending = match outcome.phase.as_str() {
+            "landed" => Ending::Landed,
+            "aborted" | "failed" => Ending::Aborted,
+            _ => Ending::Unfinished,
+        };
+    }
+}
+
+fn stamp_ns(time_s: f64) -> i64 {
+    START_NS.saturating_add((time_s * 1e9).round() as i64)
+}

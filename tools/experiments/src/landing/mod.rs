@@ -1,0 +1,83 @@
+//! Landings by the hundred: the world of the simulator and the controller as it flies, in lock-step in one process, without
+//! network and clock, so that a seed gives the same flight to the bit.
+//!
+//! Modules in reading order: [`plan`] says which flights there are, with the faults of [`fault`]; [`flight`] flies one,
+//! [`eyes`] seeing rendered frames or modelling what would be seen; [`outcome`] is what came of it; [`table`] what many have
+//! in common; [`plots`] and [`thesis_figures`] draw; [`report`] writes it all down.
+
+pub mod eyes;
+pub mod fault;
+pub mod flight;
+pub mod outcome;
+pub mod plan;
+pub mod plots;
+pub mod report;
+pub mod table;
+pub mod thesis_figures;
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use anyhow::Context;
+
+use flight::fly;
+use outcome::Outcome;
+use plan::{Plan, Planned};
+
+/// What to do.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// Which flights.
+    pub plan: Plan,
+    /// The folder for results.
+    pub results_in: PathBuf,
+    /// How many flights at once.
+    pub jobs: usize,
+}
+
+/// Flies all, writes results, plots and the report, and returns the report. `progress` hears how many have been flown, of
+/// how many.
+///
+/// # Errors
+/// When a setting is wrong or a file cannot be written.
+pub fn run(request: &Request, progress: &(dyn Fn(usize, usize) + Sync)) -> anyhow::Result<String> {
+    let flights = request.plan.flights();
+    let done = AtomicUsize::new(0);
+    let outcomes = in_parallel(&flights, request.jobs, |planned| {
+        let outcome = fly(planned, None)?;
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, flights.len());
+        Ok(outcome)
+    })?;
+    std::fs::create_dir_all(&request.results_in)
+        .with_context(|| format!("making {}", request.results_in.display()))?;
+    report::write(request, &flights, &outcomes)
+}
+
+/// Flies on several threads; the outcomes are in the order of the flights.
+///
+/// # Errors
+/// The first problem.
+pub fn in_parallel(
+    flights: &[Planned],
+    jobs: usize,
+    fly: impl Fn(&Planned) -> anyhow::Result<Outcome> + Sync,
+) -> anyhow::Result<Vec<Outcome>> {
+    let next = AtomicUsize::new(0);
+    let results: Mutex<Vec<(usize, anyhow::Result<Outcome>)>> = Mutex::default();
+    std::thread::scope(|scope| {
+        for _ in 0..jobs.clamp(1, flights.len().max(1)) {
+            scope.spawn(|| {
+                loop {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    let Some(planned) = flights.get(index) else { break };
+                    let result = fly(planned);
+                    results.lock().unwrap_or_else(PoisonError::into_inner).push((index, result));
+                }
+            });
+        }
+    });
+    let mut results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
+    results.sort_by_key(|(index, _)| *index);
+    results.into_iter().map(|(_, result)| result).collect()
+}

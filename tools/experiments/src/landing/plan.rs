@@ -1,0 +1,296 @@
+//! Which flights there are: every combination of what is listed, so many seeds of each.
+
+use std::str::FromStr;
+
+use super::fault::{Change, Fault, drawn, drawn_angle};
+
+/// How the marker is seen.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Vision {
+    /// Frames are rendered and searched by the detector.
+    Rendered,
+    /// What the detector would find is drawn from a model of its errors.
+    Modelled,
+}
+
+impl Vision {
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Rendered => "rendered",
+            Self::Modelled => "modelled",
+        }
+    }
+}
+
+/// Values of one axis of the grid: a list `1,2,3`, or a range `0..8` from which each flight's seed draws one.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Values {
+    /// Each of them.
+    List(Vec<f64>),
+    /// One from this to that.
+    Range(f64, f64),
+}
+
+impl Values {
+    fn cells(&self) -> Vec<Self> {
+        match self {
+            Self::List(values) => values.iter().map(|value| Self::List(vec![*value])).collect(),
+            Self::Range(..) => vec![self.clone()],
+        }
+    }
+
+    /// The value of a flight in a cell.
+    fn of(&self, seed: u64, which: u32) -> f64 {
+        match self {
+            Self::List(values) => values.first().copied().unwrap_or_default(),
+            Self::Range(least, most) => least + (most - least) * drawn(seed, which),
+        }
+    }
+}
+
+impl std::fmt::Display for Values {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::List(values) => {
+                let texts: Vec<String> = values.iter().map(f64::to_string).collect();
+                write!(f, "{}", texts.join(","))
+            }
+            Self::Range(least, most) => write!(f, "{least}..{most}"),
+        }
+    }
+}
+
+impl FromStr for Values {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let number = |part: &str| {
+            let number: Option<f64> = part.trim().parse().ok();
+            number.filter(|n| n.is_finite() && *n >= 0.0).ok_or_else(|| {
+                format!("`{part}` is not a number from 0 on; write 5, or 0,5,8, or 0..8")
+            })
+        };
+        match text.split_once("..") {
+            Some((least, most)) => Ok(Self::Range(number(least)?, number(most)?)),
+            None => Ok(Self::List(text.split(',').map(number).collect::<Result<_, _>>()?)),
+        }
+    }
+}
+
+/// What is flown.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// How the marker is seen.
+    pub vision: Vision,
+    /// Flights of each combination.
+    pub flights: u64,
+    /// Seed of the first flight of each combination; the others follow.
+    pub seed: u64,
+    /// Mean wind, in m/s.
+    pub wind: Values,
+    /// Strength of the turbulence.
+    pub turbulence: Values,
+    /// From exposure to arrival, in milliseconds.
+    pub latency: Values,
+    /// Height over the pad at the start, in metres.
+    pub height: Values,
+    /// Horizontal distance from the pad at the start, in metres.
+    pub offset: Values,
+    /// Faults.
+    pub faults: Vec<Fault>,
+    /// Further settings, `simulator.KEY=VALUE` or `controller.KEY=VALUE`.
+    pub set: Vec<String>,
+}
+
+impl Default for Plan {
+    fn default() -> Self {
+        Self {
+            vision: Vision::Modelled,
+            flights: 20,
+            seed: 1,
+            wind: Values::List(vec![0.0, 2.0, 5.0, 8.0]),
+            turbulence: Values::List(vec![1.0]),
+            latency: Values::List(vec![80.0]),
+            height: Values::List(vec![10.0]),
+            offset: Values::List(vec![2.12]),
+            faults: vec![Fault::NONE],
+            set: Vec::new(),
+        }
+    }
+}
+
+/// One flight of a plan.
+#[derive(Clone, Debug)]
+pub struct Planned {
+    /// What it has in common with the others of its cell.
+    pub cell: String,
+    /// The options of the command that repeats it.
+    pub options: String,
+    /// How the marker is seen.
+    pub vision: Vision,
+    /// Its seed.
+    pub seed: u64,
+    /// In m/s.
+    pub wind_m_s: f64,
+    /// Strength.
+    pub turbulence: f64,
+    /// In milliseconds.
+    pub latency_ms: f64,
+    /// In metres.
+    pub height_m: f64,
+    /// In metres.
+    pub offset_m: f64,
+    /// The fault.
+    pub fault: Fault,
+    /// Settings of all of it, and what the modelled detector does wrong.
+    pub change: Change,
+}
+
+/// The controller takes detections as late as its target does. Its default refuses a detector after 0.2 s, in favour of
+/// another one.
+const LATE_DETECTIONS: &str = "detectors.max_age_s=0.5";
+
+impl Plan {
+    /// Its flights, cell after cell.
+    pub fn flights(&self) -> Vec<Planned> {
+        let mut flights = Vec::new();
+        for fault in &self.faults {
+            for [wind, turbulence, latency, height, offset] in self.cells() {
+                let axes = [&wind, &turbulence, &latency, &height, &offset];
+                for seed in (0..self.flights).map(|i| self.seed.wrapping_add(i)) {
+                    flights.push(self.flight(seed, *fault, axes));
+                }
+            }
+        }
+        flights
+    }
+
+    fn cells(&self) -> Vec<[Values; 5]> {
+        let mut cells = Vec::new();
+        for wind in self.wind.cells() {
+            for turbulence in self.turbulence.cells() {
+                for latency in self.latency.cells() {
+                    for height in self.height.cells() {
+                        for offset in self.offset.cells() {
+                            let axes = [&wind, &turbulence, &latency, &height, &offset];
+                            cells.push(axes.map(Clone::clone));
+                        }
+                    }
+                }
+            }
+        }
+        cells
+    }
+
+    fn flight(&self, seed: u64, fault: Fault, axes: [&Values; 5]) -> Planned {
+        let [wind, turbulence, latency, height, offset] = axes;
+        let mut planned = Planned {
+            cell: format!(
+                "{}, wind {wind} m/s, turbulence {turbulence}, {latency} ms, from {height} m, {offset} m aside",
+                fault.name()
+            ),
+            options: format!(
+                "--vision {} --wind {wind} --turbulence {turbulence} --latency {latency} --height {height} \
+                 --offset {offset} --fault {}",
+                self.vision.name(),
+                fault.name()
+            ),
+            vision: self.vision,
+            seed,
+            wind_m_s: wind.of(seed, 1),
+            turbulence: turbulence.of(seed, 2),
+            latency_ms: latency.of(seed, 3),
+            height_m: height.of(seed, 4),
+            offset_m: offset.of(seed, 5),
+            fault,
+            change: Change::default(),
+        };
+        for setting in &self.set {
+            planned.options.push_str(&format!(" --set {setting}"));
+        }
+        planned.change = self.change(&planned);
+        planned
+    }
+
+    /// The settings of a flight: its place and wind, then what the fault changes, then what was asked for.
+    fn change(&self, planned: &Planned) -> Change {
+        let seed = planned.seed;
+        let fault = planned.fault.change(seed);
+        let (east, north) = drawn_angle(seed, 6).sin_cos();
+        let (pad_north, pad_east) = (1.5, -1.5);
+        let mut simulator = vec![
+            format!("seed={}", seed & (i64::MAX as u64)),
+            format!("wind.mean_m_s={:.4}", planned.wind_m_s),
+            format!("wind.turbulence={:.4}", planned.turbulence),
+            format!("wind.from_deg={:.2}", drawn_angle(seed, 7).to_degrees()),
+            "wind.thesis_noise=false".to_owned(),
+            format!("camera.latency_ms={:.3}", planned.latency_ms),
+            format!("camera.jitter_ms={:.3}", 0.25 * planned.latency_ms),
+            format!("start.height_m={:.4}", planned.height_m),
+            format!("start.north_m={:.4}", pad_north + planned.offset_m * north),
+            format!("start.east_m={:.4}", pad_east + planned.offset_m * east),
+            format!("start.heading_deg={:.2}", drawn_angle(seed, 8).to_degrees()),
+            "begin_height_m=1000".to_owned(),
+        ];
+        simulator.extend(fault.simulator);
+        let mut controller = vec!["start=airborne".to_owned(), LATE_DETECTIONS.to_owned()];
+        controller.extend(fault.controller);
+        for setting in &self.set {
+            match setting.split_once('.') {
+                Some(("simulator", rest)) => simulator.push(rest.to_owned()),
+                Some(("controller", rest)) => controller.push(rest.to_owned()),
+                _ => {}
+            }
+        }
+        Change { simulator, controller, vision: fault.vision }
+    }
+}
+
+impl Planned {
+    /// The command that flies it again and draws it.
+    pub fn command(&self) -> String {
+        format!(
+            "alight experiment landing -o DIR {} --flights 1 --seed {}",
+            self.options, self.seed
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_and_ranges_are_read() {
+        assert_eq!("0,5".parse(), Ok(Values::List(vec![0.0, 5.0])));
+        assert_eq!("0..8".parse(), Ok(Values::Range(0.0, 8.0)));
+        for wrong in ["", "a", "1,", "0..", "-1"] {
+            assert!(wrong.parse::<Values>().is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn one_flight_alone_is_the_same_as_among_others() {
+        let plan = Plan {
+            wind: Values::Range(0.0, 8.0),
+            height: Values::List(vec![5.0, 15.0]),
+            flights: 7,
+            seed: 3,
+            ..Plan::default()
+        };
+        let flights = plan.flights();
+        assert_eq!(flights.len(), 14);
+        let sixth = &flights[5];
+        let again = Plan {
+            flights: 1,
+            seed: sixth.seed,
+            height: Values::List(vec![sixth.height_m]),
+            ..plan
+        };
+        let alone = &again.flights()[0];
+        assert_eq!((alone.wind_m_s, &alone.options), (sixth.wind_m_s, &sixth.options));
+        assert_eq!(alone.change.simulator, sixth.change.simulator);
+        assert!(alone.command().contains("--wind 0..8") && alone.command().ends_with("--seed 8"));
+    }
+}

@@ -1,0 +1,147 @@
+//! Results as files: every flight as CSV and JSON lines, the plots, the thesis' figures for one flight, and the report.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use anyhow::Context;
+use serde_json::Value;
+
+use super::Request;
+use super::flight::fly;
+use super::outcome::{Ending, Outcome};
+use super::plan::Planned;
+use super::table::{markdown, share_interval};
+use super::{plots, thesis_figures};
+
+/// Failures that the report lists; all are in the CSV.
+const MOST_LISTED: usize = 50;
+
+/// Writes everything and returns the report.
+///
+/// # Errors
+/// When a file cannot be written.
+pub fn write(
+    request: &Request,
+    flights: &[Planned],
+    outcomes: &[Outcome],
+) -> anyhow::Result<String> {
+    let folder = &request.results_in;
+    put(folder, "flights.jsonl", &json_lines(outcomes)?)?;
+    put(folder, "flights.csv", &csv(outcomes)?)?;
+    for (name, svg) in plots::all(outcomes)? {
+        put(folder, name, &svg)?;
+    }
+    let mut text = head(request, outcomes);
+    text.push_str(&markdown(outcomes));
+    text.push_str(&failures(flights, outcomes));
+    text.push_str(&one_flight(folder, flights, outcomes)?);
+    put(folder, "report.md", &text)?;
+    Ok(text)
+}
+
+fn put(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
+    let path = folder.join(name);
+    std::fs::write(&path, text).with_context(|| format!("writing {}", path.display()))
+}
+
+fn head(request: &Request, outcomes: &[Outcome]) -> String {
+    let plan = &request.plan;
+    let within = outcomes.iter().filter(|o| o.is_within(0.1)).count();
+    let [low, high] = share_interval(within, outcomes.len());
+    let dangerous = outcomes.iter().filter(|o| o.is_unsafe()).count();
+    format!(
+        "# Landings\n\n{} flights, vision {}, seeds from {}: {within} landed within 0.1 m ({:.2} %, 95 % interval {:.2} to {:.2} %), {dangerous} unsafe.\n\n\
+         Unsafe: touched down, without having given up, more than 0.3 m off, faster than 0.8 m/s down or 0.5 m/s sideways. Times count from the start of the landing. \
+         Numbers of error, time, speed and tilt are of those that landed.\n\n",
+        outcomes.len(),
+        plan.vision.name(),
+        plan.seed,
+        100.0 * within as f64 / outcomes.len().max(1) as f64,
+        100.0 * low,
+        100.0 * high,
+    )
+}
+
+fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
+    let failed: Vec<(&Planned, &Outcome)> =
+        flights.iter().zip(outcomes).filter(|(_, outcome)| outcome.is_failure()).collect();
+    if failed.is_empty() {
+        return "\nEvery flight landed within 0.1 m.\n".to_owned();
+    }
+    let mut text = format!("\n## Farther off than 0.1 m, or not landed: {}\n\n", failed.len());
+    for (planned, outcome) in failed.iter().take(MOST_LISTED) {
+        let error = outcome.error_m.map_or("no touch".to_owned(), |error| format!("{error:.3} m"));
+        let ending = match outcome.ending {
+            Ending::Landed => "landed",
+            Ending::Aborted => "given up",
+            Ending::Unfinished => "unfinished",
+        };
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "- {ending}, {error}, {}: `{}`", outcome.why, planned.command());
+    }
+    text
+}
+
+/// The flight with the largest error again, with the thesis' figures.
+fn one_flight(folder: &Path, flights: &[Planned], outcomes: &[Outcome]) -> anyhow::Result<String> {
+    let error = |outcome: &Outcome| outcome.error_m.unwrap_or(-1.0);
+    let pairs = flights.iter().zip(outcomes);
+    let Some((planned, _)) = pairs.max_by(|a, b| error(a.1).total_cmp(&error(b.1))) else {
+        return Ok(String::new());
+    };
+    let mut samples = Vec::new();
+    let again = fly(planned, Some(&mut samples))?;
+    let title = format!("seed {}", planned.seed);
+    for (name, svg) in thesis_figures::all(&title, &samples)? {
+        put(folder, &name, &svg)?;
+    }
+    Ok(format!(
+        "\n## The worst flight\n\nFigures 4.10 to 4.16 of the thesis, for the flight with the largest error ({}): `{}`\n",
+        again.error_m.map_or("no touch".to_owned(), |error| format!("{error:.3} m")),
+        planned.command()
+    ))
+}
+
+fn json_lines(outcomes: &[Outcome]) -> anyhow::Result<String> {
+    let mut text = String::new();
+    for outcome in outcomes {
+        text.push_str(&serde_json::to_string(outcome)?);
+        text.push('\n');
+    }
+    Ok(text)
+}
+
+/// The same as comma-separated values, columns in the order of their names.
+fn csv(outcomes: &[Outcome]) -> anyhow::Result<String> {
+    let mut text = String::new();
+    for (index, outcome) in outcomes.iter().enumerate() {
+        let Value::Object(row) = serde_json::to_value(outcome)? else { continue };
+        if index == 0 {
+            text.push_str(&row.keys().cloned().collect::<Vec<_>>().join(","));
+            text.push('\n');
+        }
+        text.push_str(&row.values().map(cell).collect::<Vec<_>>().join(","));
+        text.push('\n');
+    }
+    Ok(text)
+}
+
+fn cell(value: &Value) -> String {
+    match value {
+        Value::Null => String::new(),
+        Value::String(text) => format!("\"{}\"", text.replace('"', "\"\"")),
+        other => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_of_text_are_quoted_and_missing_numbers_empty() {
+        assert_eq!(cell(&Value::String("a \"b\", c".into())), "\"a \"\"b\"\", c\"");
+        assert_eq!(cell(&Value::Null), "");
+        assert_eq!(cell(&serde_json::json!(0.5)), "0.5");
+    }
+}

@@ -1,0 +1,111 @@
+//! What many flights have in common, as rows of tables.
+
+use super::outcome::{Ending, HARD_M_S, Outcome, SLIDING_M_S, TILTED_DEG};
+
+/// A column of numbers; those that are missing are left out.
+pub type Column = fn(&Outcome) -> Option<f64>;
+
+/// The value below which the part `part` of the numbers lies; `None` of none.
+pub fn quantile(numbers: &[f64], part: f64) -> Option<f64> {
+    let mut sorted = numbers.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let last = sorted.len().checked_sub(1)?;
+    sorted.get(((last as f64 * part).round() as usize).min(last)).copied()
+}
+
+/// The numbers of those that landed.
+pub fn numbers(outcomes: &[&Outcome], of: Column) -> Vec<f64> {
+    let landed = outcomes.iter().filter(|outcome| outcome.ending == Ending::Landed);
+    landed.filter_map(|outcome| of(outcome)).collect()
+}
+
+/// 95 % confidence interval of the median, by its order statistics (the binomial distribution, approximated).
+pub fn median_interval(numbers: &[f64]) -> Option<[f64; 2]> {
+    let count = numbers.len() as f64;
+    let reach = 0.98 * count.sqrt();
+    let at = |rank: f64| quantile(numbers, (rank / (count - 1.0).max(1.0)).clamp(0.0, 1.0));
+    Some([at((0.5 * count - reach - 0.5).floor())?, at((0.5 * count + reach - 0.5).ceil())?])
+}
+
+/// 95 % confidence interval of a share, after Wilson (1927).
+pub fn share_interval(hits: usize, of: usize) -> [f64; 2] {
+    let (z, n) = (1.96_f64, (of as f64).max(1.0));
+    let share = hits as f64 / n;
+    let middle = (share + z * z / (2.0 * n)) / (1.0 + z * z / n);
+    let reach = z * (share * (1.0 - share) / n + z * z / (4.0 * n * n)).sqrt() / (1.0 + z * z / n);
+    [(middle - reach).max(0.0), (middle + reach).min(1.0)]
+}
+
+/// The cells in their order, with their flights.
+pub fn cells(outcomes: &[Outcome]) -> Vec<(&str, Vec<&Outcome>)> {
+    let mut cells: Vec<(&str, Vec<&Outcome>)> = Vec::new();
+    for outcome in outcomes {
+        match cells.iter_mut().find(|(name, _)| *name == outcome.cell) {
+            Some((_, members)) => members.push(outcome),
+            None => cells.push((&outcome.cell, vec![outcome])),
+        }
+    }
+    cells
+}
+
+const HEADER: &str = "| circumstances | flights | landed | given up | within 0.1 m | error: median, 99 %, worst, m | to disarm: median, worst, s | sink worst, m/s | slide median, worst, m/s | tilt at touch worst, deg | beyond 0.6 m/s down, 0.1 m/s aside, 10 deg | unsafe |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n";
+
+/// All cells as a table in Markdown.
+pub fn markdown(outcomes: &[Outcome]) -> String {
+    let rows = cells(outcomes).into_iter().map(|(name, members)| row(name, &members));
+    rows.fold(HEADER.to_owned(), |text, row| text + &row)
+}
+
+fn row(name: &str, members: &[&Outcome]) -> String {
+    let count = |of: &dyn Fn(&Outcome) -> bool| members.iter().filter(|o| of(o)).count();
+    let text = |of: Column, part: f64, digits: usize| {
+        quantile(&numbers(members, of), part)
+            .map_or_else(|| "-".to_owned(), |number| format!("{number:.digits$}"))
+    };
+    let beyond = |of: Column, limit: f64| {
+        members.iter().filter(|o| of(o).is_some_and(|number| number > limit)).count()
+    };
+    let sink: Column = |o| o.sink_m_s;
+    let slide: Column = |o| o.slide_m_s;
+    let tilt: Column = |o| o.touch_tilt_deg;
+    let error: Column = |o| o.error_m;
+    let disarm: Column = |o| o.disarm_s;
+    format!(
+        "| {name} | {} | {} | {} | {} | {} {} {} | {} {} | {} | {} {} | {} | {} {} {} | {} |\n",
+        members.len(),
+        count(&|o| o.ending == Ending::Landed),
+        count(&|o| o.ending == Ending::Aborted),
+        count(&|o| o.is_within(0.1)),
+        text(error, 0.5, 3),
+        text(error, 0.99, 3),
+        text(error, 1.0, 3),
+        text(disarm, 0.5, 1),
+        text(disarm, 1.0, 1),
+        text(sink, 1.0, 2),
+        text(slide, 0.5, 2),
+        text(slide, 1.0, 2),
+        text(tilt, 1.0, 1),
+        beyond(sink, HARD_M_S),
+        beyond(slide, SLIDING_M_S),
+        beyond(tilt, TILTED_DEG),
+        count(&|o| o.is_unsafe()),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn intervals_hold_what_they_are_of_and_shrink_with_the_count() {
+        let numbers: Vec<f64> = (0..101).map(f64::from).collect();
+        let [low, high] = median_interval(&numbers).unwrap();
+        assert!((38.0..=42.0).contains(&low) && (58.0..=62.0).contains(&high), "{low} {high}");
+        assert_eq!(median_interval(&[3.0]), Some([3.0, 3.0]));
+        assert_eq!(median_interval(&[]), None);
+        let [low, high] = share_interval(1000, 1000);
+        assert!(low > 0.996 && high == 1.0, "{low}");
+        let [low, high] = share_interval(50, 100);
+        assert!((low - 0.404).abs() < 0.001 && (high - 0.596).abs() < 0.001, "{low} {high}");
+    }
+}

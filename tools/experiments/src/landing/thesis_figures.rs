@@ -1,0 +1,122 @@
+//! The thesis' Figures 4.10 to 4.16 for one flight: its way, position and command along each axis, and wind and command.
+
+use plotters::prelude::*;
+
+use super::flight::Sample;
+use super::plots::{COLOURS, Chart, DrawError, legend, picture};
+
+/// The axes, as the thesis names them, in its order of figures.
+const AXES: [&str; 3] = ["x (north)", "y (east)", "z (down)"];
+
+/// The figures: file names and contents. `title` names the flight.
+///
+/// # Errors
+/// When one cannot be drawn.
+pub fn all(title: &str, samples: &[Sample]) -> anyhow::Result<Vec<(String, String)>> {
+    let mut figures = vec![("figure-4-10.svg".to_owned(), trajectory(title, samples)?)];
+    for (axis, name) in AXES.into_iter().enumerate() {
+        let position = |s: &Sample| Some(component(s.position.coords.coords.into(), axis));
+        let pad = |s: &Sample| Some(component(s.pad.coords.coords.into(), axis));
+        let command = |s: &Sample| s.command.map(|command| component(command, axis));
+        let motion = [
+            Curve { name: "position, m", of: &position },
+            Curve { name: "pad, m", of: &pad },
+            Curve { name: "command velocity, m/s", of: &command },
+        ];
+        let caption = format!("Position and command velocity, {name}: {title}");
+        figures.push((format!("figure-4-{}.svg", 11 + axis), curves(&caption, samples, &motion)?));
+    }
+    for (axis, name) in AXES.into_iter().enumerate() {
+        let command = |s: &Sample| s.command.map(|command| component(command, axis));
+        let wind = |s: &Sample| Some(component(s.wind.coords.into(), axis));
+        let air = [
+            Curve { name: "wind, m/s", of: &wind },
+            Curve { name: "command velocity, m/s", of: &command },
+        ];
+        let caption = format!("Wind and command velocity, {name}: {title}");
+        figures.push((format!("figure-4-{}.svg", 14 + axis), curves(&caption, samples, &air)?));
+    }
+    Ok(figures)
+}
+
+struct Curve<'a> {
+    name: &'static str,
+    of: &'a dyn Fn(&Sample) -> Option<f64>,
+}
+
+fn component(vector: [f64; 3], axis: usize) -> f64 {
+    vector.get(axis).copied().unwrap_or_default()
+}
+
+/// Curves over time.
+fn curves(caption: &str, samples: &[Sample], curves: &[Curve<'_>]) -> anyhow::Result<String> {
+    let values = || curves.iter().flat_map(|curve| samples.iter().filter_map(curve.of));
+    let least = values().fold(-0.1, f64::min);
+    let most = values().fold(0.1, f64::max);
+    let last_s = samples.last().map_or(1.0, |sample| sample.time_s);
+    picture((900, 480), |area| {
+        let rim = 0.08 * (most - least);
+        let mut chart = ChartBuilder::on(area)
+            .caption(caption, ("sans-serif", 17))
+            .margin(12)
+            .x_label_area_size(40)
+            .y_label_area_size(56)
+            .build_cartesian_2d(0.0..last_s, least - rim..most + rim)?;
+        chart.configure_mesh().x_desc("time, s").draw()?;
+        for (index, curve) in curves.iter().enumerate() {
+            let points = samples.iter().filter_map(|s| Some((s.time_s, (curve.of)(s)?)));
+            draw_curve(&mut chart, index, curve.name, points.collect())?;
+        }
+        legend(&mut chart, SeriesLabelPosition::UpperRight)
+    })
+}
+
+fn draw_curve(
+    chart: &mut Chart<'_, '_>,
+    index: usize,
+    name: &str,
+    points: Vec<(f64, f64)>,
+) -> Result<(), DrawError> {
+    let colour = COLOURS[index % COLOURS.len()];
+    chart
+        .draw_series(LineSeries::new(points, colour.stroke_width(2)))?
+        .label(name)
+        .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
+    Ok(())
+}
+
+/// The way seen from above, and from the south.
+fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
+    let place = |s: &Sample| [s.position.y(), s.position.x(), -s.position.z()];
+    let pad = |s: &Sample| [s.pad.y(), s.pad.x(), -s.pad.z()];
+    let range = |axis: usize| {
+        let values = || samples.iter().flat_map(|s| [place(s), pad(s)]).map(|p| component(p, axis));
+        let (least, most) =
+            (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
+        let rim = 0.1 * (most - least).max(0.5);
+        least - rim..most + rim
+    };
+    picture((1100, 560), |area| {
+        let (left, right) = area.split_horizontally(550);
+        let views = [
+            (left, [0, 1], format!("{title}: from above"), "north, m"),
+            (right, [0, 2], "from the south".to_owned(), "height, m"),
+        ];
+        for (half, [across, up], caption, axis) in views {
+            let mut chart = ChartBuilder::on(&half)
+                .caption(caption, ("sans-serif", 15))
+                .margin(12)
+                .x_label_area_size(40)
+                .y_label_area_size(50)
+                .build_cartesian_2d(range(across), range(up))?;
+            chart.configure_mesh().x_desc("east, m").y_desc(axis).draw()?;
+            let flat = |p: [f64; 3]| (component(p, across), component(p, up));
+            draw_curve(&mut chart, 0, "vehicle", samples.iter().map(|s| flat(place(s))).collect())?;
+            draw_curve(&mut chart, 1, "pad", samples.iter().map(|s| flat(pad(s))).collect())?;
+            let pad_end = samples.last().map(|s| flat(pad(s)));
+            chart.draw_series(pad_end.map(|at| Cross::new(at, 6, COLOURS[1].stroke_width(2))))?;
+            legend(&mut chart, SeriesLabelPosition::UpperLeft)?;
+        }
+        Ok(())
+    })
+}
