@@ -146,6 +146,11 @@ impl Detector {
             self.squares.detect_damaged(view, &self.outlines, camera, watch, &mut self.found);
         }
         if self.found.is_empty() && !self.stags.is_empty() {
+            self.outlines.find(view, &Stags::papers());
+            let (watch, seen) = ((&mut self.trace, &mut *stages), (view, &self.outlines));
+            self.stags.detect_on_paper(seen, camera, watch, &mut self.found);
+        }
+        if self.found.is_empty() && !self.stags.is_empty() {
             let watch = (&mut self.trace, &mut *stages);
             let seen = (view, self.outlines.pyramid());
             self.stags.detect_damaged(seen, camera, watch, &mut self.found);

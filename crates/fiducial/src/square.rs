@@ -38,7 +38,7 @@ const MOST_SOLVED: usize = 400;
 const MOST_FOUND: usize = 256;
 
 /// How alike the steps from border to paper are all round a marker: the standard deviation as a share of the mean.
-const MOST_UNEVEN: f64 = 0.6;
+pub(crate) const MOST_UNEVEN: f64 = 0.6;
 /// Share of the variance of its pixels that a marker explains; textures that happen to spell a word explain less. In 565
 /// pictures without markers none did more than 0.75, but for one with a bit that was neither black nor white.
 const LEAST_EXPLAINED: f64 = 0.78;
@@ -445,7 +445,7 @@ fn is_same(a: &[Pixel; 4], b: &[Pixel; 4]) -> bool {
 
 /// Standard deviation of the steps from just within a quad to just outside, all round, as a share of their mean: in grey
 /// levels or, across the edge of a shadow, in their logarithms, whichever is less. Large where the mean is not positive.
-fn unevenness(quad: &Quad, view: GrayView<'_>, level: usize) -> f64 {
+pub(crate) fn unevenness(quad: &Quad, view: GrayView<'_>, level: usize) -> f64 {
     use imaging::pyramid::from_level_0;
     const POINTS: usize = 6;
     let corners = quad.corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);

@@ -14,7 +14,7 @@ mod samples;
 
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::from_level_0;
-use imaging::{GrayView, Pyramid};
+use imaging::{GrayView, Outlines, Pyramid, outline};
 
 use crate::marker::Marker;
 use crate::observation::{Observation, Stages};
@@ -22,7 +22,7 @@ use crate::pose::square_pose;
 use crate::square::codebook::Codebook;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
-use crate::square::{JOINED_PX, JOINED_SHARE, coarse};
+use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, unevenness};
 use crate::trace::{Reason, Trace};
 
 use damaged::Damaged;
@@ -40,6 +40,7 @@ const MOST_TRIED: usize = 40;
 /// Bounds on the work in one image.
 const MOST_LOOKS: usize = 400;
 const MOST_FOUND: usize = 64;
+const MOST_PAPERS: usize = 64;
 /// Pictures that are kept.
 const MOST_PICTURES: usize = 32;
 
@@ -161,6 +162,46 @@ impl Stags {
             }
         }
         stages.ended("stags");
+    }
+
+    /// How to look for the paper of markers too small for their border to be told from the disc.
+    pub(crate) fn papers() -> outline::Settings {
+        outline::Settings {
+            dark_from: None,
+            bright_from: Some(0),
+            largest_px: 40,
+            ..outline::Settings::default()
+        }
+    }
+
+    /// Finds small markers by the outlines of their paper, which were looked for as [`Stags::papers`] says.
+    pub(crate) fn detect_on_paper(
+        &mut self,
+        (view, outlines): (GrayView<'_>, &Outlines),
+        camera: Option<&CameraModel>,
+        (trace, stages): (&mut Trace, &mut impl Stages),
+        found: &mut Vec<Observation>,
+    ) {
+        let mut left = MOST_PAPERS;
+        for outline in outlines.iter().filter(|outline| !outline.dark && outline.level == 0) {
+            let Some(paper) = Quad::of(&outline) else { continue };
+            if left == 0 || unevenness(&paper, view, 0) > MOST_UNEVEN {
+                continue;
+            }
+            left -= 1;
+            let centre = middle(&paper.corners);
+            let share = 1.0 / (1.0 + 2.0 * code::QUIET);
+            let inner = |c: Pixel| {
+                let (dx, dy) = (c.x - centre.x, c.y - centre.y);
+                Pixel::new(centre.x + share * dx, centre.y + share * dy)
+            };
+            let quad = Quad { corners: paper.corners.map(inner), inverted: false };
+            if let Ok((reading, refined)) = self.read(view, outlines.pyramid(), &quad, camera) {
+                trace.accept_quad(refined.corners);
+                found.push(self.observe(&reading, &refined, camera));
+            }
+        }
+        stages.ended("papers");
     }
 
     /// Finds the markers that closed outlines do not show, as something hides a part of them; it takes several times as long

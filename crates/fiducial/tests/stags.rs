@@ -194,22 +194,25 @@ fn a_marker_that_the_frame_cuts_is_found() {
 
 /// A lens' Gaussian blur instead of the shot's even one, from samples a quarter of a pixel apart, elsewhere in each pixel.
 fn blurred(shot: &Shot) -> Vec<u8> {
-    const SAMPLES: usize = 21;
+    const SAMPLES: usize = 15;
     let (sin, cos) = shot.turn.sin_cos();
     let light = |x: f64, y: f64| {
         let (dx, dy) = (x - shot.centre[0], y - shot.centre[1]);
         let [u, v] = [cos * dx + sin * dy, cos * dy - sin * dx].map(|p| p / shot.side_px);
-        let is_white = u.abs().max(v.abs()) > 0.5 || shot.drawing.ink_at(u, -v) == Ink::White;
-        if is_white { 210.0 } else { 30.0 }
+        match shot.drawing.ink_at(u, -v) {
+            _ if u.abs().max(v.abs()) > 0.625 => 80.0,
+            Ink::White => 210.0,
+            Ink::Black => 30.0,
+        }
     };
     let grey = |i: usize| {
         let (x, y, place) = ((i % SIDE) as f64, (i / SIDE) as f64, i as f64);
         let offsets = [0.7549 * place, 0.5698 * place]
-            .map(|part| (0..SAMPLES).map(move |k| (k as f64 - 10.5 + part.fract()) / 4.0));
+            .map(|part| (0..SAMPLES).map(move |k| (k as f64 - 7.5 + part.fract()) / 4.0));
         let (mut sum, mut weights) = (0.0, 0.0);
         for dy in offsets[1].clone() {
             for dx in offsets[0].clone() {
-                let weight = (-dx * dx - dy * dy).exp();
+                let weight = (-2.5 * (dx * dx + dy * dy)).exp();
                 sum += weight * light(x + dx, y + dy);
                 weights += weight;
             }
@@ -237,5 +240,19 @@ fn small_markers_are_as_large_as_they_are() {
             .collect();
         let mean_px = errors.iter().sum::<f64>() / errors.len() as f64;
         assert!(mean_px.abs() < 0.004, "{side_px}: {mean_px} px");
+    }
+}
+
+#[test]
+fn where_the_border_is_hardly_seen_the_paper_shows_the_marker() {
+    for (id, turn) in [(0, 0.8), (1, 0.7), (2, 2.3), (3, 0.9)] {
+        let mut detector = detector("stag-hd23:*:0.1");
+        let shot = Shot::new(Family::StagHd23, id, 10.0, turn);
+        let found = detect(&mut detector, &blurred(&shot));
+        assert_eq!(found.len(), 1, "{id}");
+        assert_eq!(found[0].id, Some(id));
+        for (corner, truth) in found[0].corners.unwrap().iter().zip(shot.corners()) {
+            assert!(corner.distance(&truth) < 0.15, "{id}");
+        }
     }
 }
