@@ -19,10 +19,12 @@ const ALGORITHMS: [(&str, &[&str]); 7] = [
 ];
 const AUTOPILOT: (&str, &[&str]) = ("autopilot", &["geometry"]);
 const NODE: (&str, &[&str]) = ("node", &["messages"]);
+/// What cameras and detectors share.
+const AIRLINK: (&str, &[&str]) = ("airlink", &["imaging", "messages", "node"]);
 const SERVICES: [&str; 4] = ["camera-pub", "controller", "detector", "gcs-bridge"];
 /// What a service or a tool may know.
-const ROOMS: [&str; 7] =
-    ["autopilot", "fiducial", "geometry", "imaging", "landing", "messages", "node"];
+const ROOMS: [&str; 8] =
+    ["airlink", "autopilot", "fiducial", "geometry", "imaging", "landing", "messages", "node"];
 /// What a tool may know beside: pictures and worlds with truth, which also the tests of any room may use.
 const TRUTH: [&str; 2] = ["rendering", "world"];
 /// The tool that stands above others: it calls their pure parts in lock-step.
@@ -174,7 +176,7 @@ fn folders_packages_and_libraries_share_a_name() -> anyhow::Result<()> {
 fn dependencies_point_downwards_only() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let names: BTreeSet<&str> = workspace.iter().map(|p| p.name.as_str()).collect();
-    let crates: BTreeMap<_, _> = ALGORITHMS.into_iter().chain([AUTOPILOT, NODE]).collect();
+    let crates: BTreeMap<_, _> = ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK]).collect();
     for package in &workspace {
         let allowed: BTreeSet<&str> = match crates.get(package.name.as_str()) {
             Some(allowed) => allowed.iter().copied().collect(),

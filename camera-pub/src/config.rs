@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use airlink::AirConfig;
 use anyhow::{bail, ensure};
 use geometry::{Body, Camera, CameraModel, Distortion, Point, Rotation, Transform};
 use imaging::Mosaic;
@@ -16,7 +17,7 @@ use crate::calibration::read_calibration;
 pub struct Config {
     id: String,
     pub(crate) source: SourceConfig,
-    jpeg: JpegConfig,
+    pub(crate) air: AirConfig,
     calibration: CalibrationConfig,
     mount: MountConfig,
 }
@@ -30,12 +31,6 @@ pub(crate) struct SourceConfig {
     pub(crate) wait_for_subscriber: bool,
     bayer: String,
     largest_megapixels: f64,
-}
-
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct JpegConfig {
-    quality: i64,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -65,7 +60,7 @@ impl Settings for Config {
         check.range("source.rate_hz", self.source.rate_hz, 0.01..=1000.0);
         check.parses("source.bayer", self.source.mosaic());
         check.range("source.largest_megapixels", self.source.largest_megapixels, 0.001..=4294.0);
-        check.range("jpeg.quality", self.jpeg.quality, 1..=100);
+        self.air.check(check);
         self.calibration.check(check);
         self.mount.check(check);
     }
@@ -80,11 +75,6 @@ impl Config {
     /// Pixels an image may have.
     pub(crate) fn most_pixels(&self) -> u64 {
         (self.source.largest_megapixels * 1e6) as u64
-    }
-
-    /// Quality of the JPEG images, from 1 to 100.
-    pub(crate) fn jpeg_quality(&self) -> u8 {
-        self.jpeg.quality as u8
     }
 
     /// The intrinsics for images of this size (width, height); `None` for a camera that is not calibrated.
@@ -308,7 +298,7 @@ mod tests {
         check(&["source.rate_hz=0"], "from 0.01 to 1000");
         check(&["source.rate_hz=inf"], "from 0.01 to 1000");
         check(&["source.largest_megapixels=nan"], "from 0.001 to 4294");
-        check(&["jpeg.quality=0"], "from 1 to 100");
+        check(&["air.quality=0"], "from 1 to 100");
         check(&["calibration.focal_px=[900, 0]"], "or both 0");
         check(&["calibration.focal_px=[nan, 900]"], "above 0");
         check(&["calibration.principal_px=[1]"], "[cx, cy]");

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
 use geometry::{CameraModel, Distortion};
-use imaging::Mosaic;
-use jpeg_encoder::{ColorType, Encoder};
+use imaging::{GrayImage, Mosaic};
 use messages::{BayerPattern, CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
@@ -19,8 +19,6 @@ use crate::image::{Decoded, frame_bytes, images_in};
 /// Images whose size is looked up at the start, to make room for the largest in shared memory. Frames that are larger
 /// than these are published all the same, by a copy.
 const IMAGES_MEASURED: usize = 1000;
-/// A JPEG of a photograph is hardly ever larger than this part of its pixels.
-const JPEG_PART: usize = 4;
 /// How often a service that waits for a subscriber looks for one.
 const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 
@@ -145,7 +143,7 @@ struct Stream {
     images: Vec<PathBuf>,
     first_size: (usize, usize),
     frames: FramePublisher,
-    jpegs: FramePublisher,
+    air: AirSender,
     health: Arc<HealthCounters>,
     sequence: u64,
 }
@@ -169,19 +167,20 @@ struct Prepared {
     height: usize,
     format: PixelFormat,
     pixels: Loan,
-    jpeg: Option<Vec<u8>>,
+    /// Grey pixels for the air link where `pixels` are none, when one is wanted.
+    grey: Option<GrayImage>,
 }
 
 impl Stream {
     async fn new(node: &Node, config: &Config, found: Found) -> anyhow::Result<Self> {
         let names = [config.instance()];
-        let jpeg_bytes = (found.largest / JPEG_PART).max(4096);
+        let jpegs = node.frame_publisher(topic::JPEG, &names, 0).await?;
         Ok(Self {
             config: config.clone(),
             images: found.images,
             first_size: found.first_size,
             frames: node.frame_publisher(topic::FRAME, &names, found.largest).await?,
-            jpegs: node.frame_publisher(topic::JPEG, &names, jpeg_bytes).await?,
+            air: AirSender::start(node, config.instance(), jpegs, &config.air).await?,
             health: node.shared_health(),
             sequence: 0,
         })
@@ -205,7 +204,7 @@ impl Stream {
         let before = self.sequence;
         for index in 0..self.images.len() {
             let Some(path) = self.images.get(index) else { break };
-            match self.prepare(path).await {
+            match self.prepare(path) {
                 Ok(frame) => {
                     pace.wait().await;
                     self.publish(frame).await;
@@ -228,7 +227,7 @@ impl Stream {
     }
 
     /// Decodes an image into the buffer it is published from.
-    async fn prepare(&self, path: &Path) -> anyhow::Result<Prepared> {
+    fn prepare(&self, path: &Path) -> anyhow::Result<Prepared> {
         let began = Instant::now();
         let image = Decoded::read(path, self.config.most_pixels())?;
         let (width, height) = (image.width(), image.height());
@@ -246,31 +245,9 @@ impl Stream {
         let mut pixels = self.frames.loan(width * height * bytes);
         image.write_samples(&mut pixels);
         self.health.latency("read", began.elapsed());
-        let jpeg = match self.jpegs.has_subscribers().await {
-            true if format == PixelFormat::Mono8 => self.encode(&pixels, width, height),
-            true => self.encode(image.grey(mosaic).pixels(), width, height),
-            false => None,
-        };
-        Ok(Prepared { width, height, format, pixels, jpeg })
-    }
-
-    fn encode(&self, pixels: &[u8], width: usize, height: usize) -> Option<Vec<u8>> {
-        let began = Instant::now();
-        let mut bytes = Vec::new();
-        let encoder = Encoder::new(&mut bytes, self.config.jpeg_quality());
-        // No edge is longer than a JPEG can be.
-        match encoder.encode(pixels, width as u16, height as u16, ColorType::Luma) {
-            Ok(()) => {
-                self.health.latency("jpeg", began.elapsed());
-                Some(bytes)
-            }
-            Err(cause) => {
-                if self.health.failed("jpeg") {
-                    tracing::warn!(%cause, "A frame could not be made a JPEG");
-                }
-                None
-            }
-        }
+        let is_raw = format != PixelFormat::Mono8;
+        let grey = (is_raw && self.air.is_wanted()).then(|| image.grey(mosaic));
+        Ok(Prepared { width, height, format, pixels, grey })
     }
 
     async fn publish(&mut self, frame: Prepared) {
@@ -285,13 +262,12 @@ impl Stream {
             format: frame.format,
             parts: Vec::new(),
         };
-        self.frames.publish(&header, frame.pixels).await;
-        if let Some(jpeg) = frame.jpeg {
-            let mut bytes = self.jpegs.loan(jpeg.len());
-            bytes.copy_from_slice(&jpeg);
-            let header = FrameHeader { format: PixelFormat::Jpeg, ..header };
-            self.jpegs.publish(&header, bytes).await;
+        match &frame.grey {
+            Some(grey) => self.air.offer(&header, grey.pixels()),
+            None if frame.format == PixelFormat::Mono8 => self.air.offer(&header, &frame.pixels),
+            None => {}
         }
+        self.frames.publish(&header, frame.pixels).await;
         self.sequence += 1;
     }
 }

@@ -15,6 +15,8 @@ pub struct Config {
     pub place: Place,
     /// Name of the camera.
     pub camera: String,
+    /// Which of its frames are taken.
+    pub input: Input,
     /// Markers to look for.
     pub markers: Vec<String>,
     /// Pads whose markers are solved together.
@@ -27,6 +29,16 @@ pub struct Config {
     pub debug_jpeg_quality: u8,
     /// Whether and how markers are followed.
     pub tracking: TrackingConfig,
+}
+
+/// Which frames are taken.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Input {
+    /// Pixels as they are.
+    Raw,
+    /// JPEG files.
+    Jpeg,
 }
 
 /// Whether and how markers are followed from frame to frame.
@@ -98,6 +110,9 @@ impl Config {
                 ));
             }
         }
+        if self.input != changed.input {
+            return Err("`input` holds from start to end; start another detector".to_owned());
+        }
         Ok(changed)
     }
 
@@ -161,6 +176,8 @@ mod tests {
         let refused = |key, value| config.with(key, value).unwrap_err();
         assert!(refused("id", "other").contains("start the detector again"));
         assert!(refused("place", "ground").contains("--set place=ground"));
+        assert!(refused("input", "jpeg").contains("start another detector"));
+        assert!(refused("input", "video").contains("video"));
         assert!(refused("least_confidence", "2").contains("from 0 to 1"));
         assert!(refused("markers", "[]").contains("at least one marker"));
         assert!(refused("tracking", "7").contains("a table is needed"));

@@ -6,21 +6,24 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use airlink::Pictures;
 use anyhow::Context;
 use fiducial::debug::{self, RgbImageBuf};
-use fiducial::{Detector, Pad, Stages, Tracker};
+use fiducial::{Detector, Observation, Pad, Stages, Tracker};
 use geometry::CameraModel;
-use imaging::{Converter, GrayView};
+use imaging::{Converter, GrayImage, GrayView};
 use messages::{
     CameraInfo, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo, FrameHeader,
-    FrameReceipt, PixelFormat, StageTime, topic,
+    FramePart, FrameReceipt, PixelFormat, StageTime, topic,
 };
-use node::{Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, now_ns};
+use node::{
+    Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
+};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
-use crate::config::Config;
-use crate::wire;
+use crate::config::{Config, Input};
+use crate::{parts, wire};
 
 /// The debug images, as the topics name them: the thesis' three, and the squares.
 const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
@@ -150,6 +153,7 @@ struct Work {
     change: Arc<Mutex<Option<Change>>>,
     config: Config,
     converter: Converter,
+    pictures: Pictures,
     detector: Detector,
     pads: Vec<Pad>,
     tracker: Tracker,
@@ -165,6 +169,10 @@ impl Work {
     ) -> anyhow::Result<Self> {
         let detector = config.detector().map_err(anyhow::Error::msg)?;
         let pads = config.parsed_pads().map_err(anyhow::Error::msg)?;
+        let frames = match config.input {
+            Input::Raw => topic::FRAME,
+            Input::Jpeg => topic::JPEG,
+        };
         let mut debug = Vec::new();
         for image in DEBUG_IMAGES {
             debug.push((
@@ -174,7 +182,7 @@ impl Work {
         }
         Ok(Self {
             node: node.clone(),
-            frames: node.frame_subscriber(topic::FRAME, &[&config.camera]).await?,
+            frames: node.frame_subscriber(frames, &[&config.camera]).await?,
             detections: node.publisher(topic::DETECTIONS, &[&config.id]).await?,
             receipts: node.publisher(topic::RECEIVED, &[&config.id]).await?,
             debug,
@@ -182,6 +190,7 @@ impl Work {
             change,
             config: config.clone(),
             converter: Converter::default(),
+            pictures: Pictures::default(),
             detector,
             pads,
             tracker: Tracker::new(config.tracking().unwrap_or_default()),
@@ -209,11 +218,15 @@ impl Work {
         self.take_change();
         let health = self.node.shared_health();
         health.count("frames");
+        if frame.header.clock == clock_name() {
+            health.latency("stamp to frame", age(&frame.header));
+        }
+        if frame.header.format == PixelFormat::Jpeg {
+            self.receipts.publish(&self.receipt(frame)).await;
+            return self.search_parts(frame).await;
+        }
         let bytes = frame.bytes();
         let FrameHeader { width, height, format, .. } = frame.header;
-        if format == PixelFormat::Jpeg {
-            self.receipts.publish(&receipt(frame)).await;
-        }
         let Some(format) = wire::sample_format(format) else {
             health.dropped("frames in a pixel format that is not searched");
             return;
@@ -233,6 +246,62 @@ impl Work {
             Err(_) => health.dropped("frames of an impossible size"),
         }
         self.converter = converter;
+    }
+
+    /// Searches a frame for the air link, part by part.
+    async fn search_parts(&mut self, frame: &Frame) {
+        let mut clock = StageClock::start();
+        let mut pictures = std::mem::take(&mut self.pictures);
+        match pictures.read(&frame.header, &frame.bytes()) {
+            Ok(parts) => {
+                clock.ended("decode");
+                let found = self.detect_in_parts(&parts, &frame.header, &mut clock);
+                self.publish(&frame.header, found, clock).await;
+                if let Some(view) = parts.first().and_then(|(_, image)| image.view()) {
+                    self.publish_debug_images(view, &frame.header).await;
+                }
+            }
+            Err(problem) => {
+                if self.node.health().failed("frame that cannot be decoded") {
+                    tracing::warn!(%problem, "A frame cannot be decoded; further ones are counted only");
+                }
+            }
+        }
+        self.pictures = pictures;
+    }
+
+    fn detect_in_parts(
+        &mut self,
+        parts: &[(FramePart, &GrayImage)],
+        header: &FrameHeader,
+        clock: &mut StageClock,
+    ) -> Vec<Detection> {
+        if header.parts.is_empty()
+            && let Some(view) = parts.first().and_then(|(_, image)| image.view())
+        {
+            return self.detect(view, header, clock);
+        }
+        let whole = self.camera_model(header);
+        let mut found = Vec::new();
+        for (part, image) in parts.iter().rev() {
+            let Some(view) = image.view() else { continue };
+            let camera = whole.as_ref().map(|camera| parts::camera_of(part, camera));
+            let seen = self.detector.detect(view, camera.as_ref(), clock);
+            parts::add_finer(&mut found, seen.iter().map(|seen| parts::in_frame(part, seen)));
+        }
+        found.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
+        told(&found, &self.pads, whole.as_ref(), self.config.least_confidence)
+    }
+
+    fn receipt(&self, frame: &Frame) -> FrameReceipt {
+        let FrameHeader { camera, sequence, stamp_ns, clock, .. } = &frame.header;
+        FrameReceipt {
+            camera: camera.clone(),
+            sequence: *sequence,
+            stamp_ns: *stamp_ns,
+            clock: clock.clone(),
+            bytes: u32::try_from(frame.bytes().len()).unwrap_or(u32::MAX),
+        }
     }
 
     fn take_change(&mut self) {
@@ -258,13 +327,7 @@ impl Work {
             }
             false => self.detector.detect(view, camera.as_ref(), clock),
         };
-        let least = self.config.least_confidence;
-        let markers = found.iter().filter(|seen| seen.confidence >= least).map(wire::detection);
-        let pads = self.pads.iter().filter_map(|pad| {
-            let seen = pad.observe(found, camera.as_ref()?)?;
-            (seen.confidence >= least).then(|| wire::pad_detection(pad, &seen))
-        });
-        markers.chain(pads).collect()
+        told(found, &self.pads, camera.as_ref(), self.config.least_confidence)
     }
 
     async fn publish(&self, header: &FrameHeader, found: Vec<Detection>, clock: StageClock) {
@@ -280,8 +343,9 @@ impl Work {
             stages: clock.stages,
         };
         self.detections.publish(&message).await;
-        let age_ns = now_ns().saturating_sub(header.stamp_ns);
-        health.latency("stamp to detections", Duration::from_nanos(age_ns.max(0).unsigned_abs()));
+        if header.clock == clock_name() {
+            health.latency("stamp to detections", age(header));
+        }
     }
 
     /// The camera's model, when it is calibrated for frames of this size.
@@ -318,7 +382,8 @@ impl Work {
             }
             match jpeg(&self.overlay, self.config.debug_jpeg_quality) {
                 Ok(bytes) => {
-                    let header = FrameHeader { format: PixelFormat::Jpeg, ..header.clone() };
+                    let format = PixelFormat::Jpeg;
+                    let header = FrameHeader { format, parts: Vec::new(), ..header.clone() };
                     publisher.publish(&header, Loan::Private(bytes)).await;
                 }
                 Err(_) => self.node.health().dropped("debug images too large for a JPEG"),
@@ -327,16 +392,25 @@ impl Work {
     }
 }
 
-/// What the camera is told of a frame that has arrived.
-fn receipt(frame: &Frame) -> FrameReceipt {
-    let FrameHeader { camera, sequence, stamp_ns, clock, .. } = &frame.header;
-    FrameReceipt {
-        camera: camera.clone(),
-        sequence: *sequence,
-        stamp_ns: *stamp_ns,
-        clock: clock.clone(),
-        bytes: u32::try_from(frame.bytes().len()).unwrap_or(u32::MAX),
-    }
+/// What is published of the markers that were found, in the whole frame's pixels: those that are sure enough, and the
+/// pads they make up.
+fn told(
+    found: &[Observation],
+    pads: &[Pad],
+    camera: Option<&CameraModel>,
+    least: f64,
+) -> Vec<Detection> {
+    let markers = found.iter().filter(|seen| seen.confidence >= least).map(wire::detection);
+    let pads = pads.iter().filter_map(|pad| {
+        let seen = pad.observe(found, camera?)?;
+        (seen.confidence >= least).then(|| wire::pad_detection(pad, &seen))
+    });
+    markers.chain(pads).collect()
+}
+
+/// How old a frame of this host's clock is.
+fn age(header: &FrameHeader) -> Duration {
+    Duration::from_nanos(now_ns().saturating_sub(header.stamp_ns).max(0).unsigned_abs())
 }
 
 fn jpeg(image: &RgbImageBuf, quality: u8) -> anyhow::Result<Vec<u8>> {

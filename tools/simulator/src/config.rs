@@ -1,5 +1,6 @@
 //! The simulator's configuration.
 
+use airlink::AirConfig;
 use autopilot::Address;
 use fiducial::{Drawing, Marker, Pad};
 use geometry::{CameraModel, Point, Transform, Vector};
@@ -40,6 +41,8 @@ pub struct Config {
     pub camera: CameraConfig,
     /// What is between camera and pad.
     pub veil: VeilSettings,
+    /// Its frames for the air link.
+    pub air: AirConfig,
 }
 
 /// What flies.
@@ -256,8 +259,6 @@ pub struct CameraConfig {
     pub outage_below_m: f64,
     /// For how long none is, in seconds.
     pub outage_below_for_s: f64,
-    /// Quality of the JPEG frames.
-    pub jpeg_quality: u8,
 }
 
 impl Settings for Config {
@@ -288,6 +289,7 @@ impl Settings for Config {
         check.range("veil.for_s", self.veil.for_s, 0.0..=3600.0);
         check.range("veil.below_m", self.veil.below_m, 0.0..=1000.0);
         self.camera.check(check);
+        self.air.check(check);
     }
 }
 
@@ -355,7 +357,6 @@ impl CameraConfig {
         check.range("camera.outage_for_s", self.outage_for_s, 0.0..=3600.0);
         check.range("camera.outage_below_m", self.outage_below_m, 0.0..=100.0);
         check.range("camera.outage_below_for_s", self.outage_below_for_s, 0.0..=3600.0);
-        check.range("camera.jpeg_quality", self.jpeg_quality, 1..=100);
     }
 }
 

@@ -7,6 +7,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use airlink::AirSender;
 use anyhow::Context;
 use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use autopilot::{Address, Link, LinkEvent, Parser, Sender};
@@ -351,11 +352,10 @@ struct Camera {
     eye: Eye,
     late: VecDeque<Late>,
     frames: FramePublisher,
-    jpegs: FramePublisher,
+    air: AirSender,
     infos: Publisher<CameraInfo>,
     info: CameraInfo,
     period_s: f64,
-    jpeg_quality: u8,
 }
 
 impl Camera {
@@ -378,15 +378,15 @@ impl Camera {
                 rotation_wxyz: mount.rotation().wxyz(),
             },
         };
+        let jpegs = node.frame_publisher(topic::JPEG, &[name], 0).await?;
         Ok(Self {
             eye,
             late: VecDeque::new(),
             frames: node.frame_publisher(topic::FRAME, &[name], bytes).await?,
-            jpegs: node.frame_publisher(topic::JPEG, &[name], 0).await?,
+            air: AirSender::start(node, name, jpegs, &config.air).await?,
             infos: node.publisher(topic::CAMERA_INFO, &[name]).await?,
             info,
             period_s: 1.0 / config.camera.rate_hz,
-            jpeg_quality: config.camera.jpeg_quality,
             node: node.clone(),
             stage,
         })
@@ -468,11 +468,9 @@ impl Camera {
         self.publish_late().await;
     }
 
-    /// Publishes a frame, and its JPEG while somebody subscribes.
+    /// Publishes a frame, and offers it to the air link.
     async fn publish(&mut self, header: &FrameHeader, frame: Loan) {
-        if self.jpegs.has_subscribers().await {
-            self.publish_jpeg(header, &frame).await;
-        }
+        self.air.offer(header, &frame);
         self.frames.publish(header, frame).await;
         self.stage.witness().frames += 1;
     }
@@ -503,20 +501,6 @@ impl Camera {
         while self.next_due_s().is_some_and(|due_s| due_s <= self.stage.now_s()) {
             let Some(Late { header, pixels, .. }) = self.late.pop_front() else { return };
             self.publish(&header, pixels).await;
-        }
-    }
-
-    async fn publish_jpeg(&self, header: &FrameHeader, pixels: &[u8]) {
-        let size = u16::try_from(header.width).ok().zip(u16::try_from(header.height).ok());
-        let Some((width, height)) = size else { return };
-        let mut bytes = Vec::new();
-        let encoder = jpeg_encoder::Encoder::new(&mut bytes, self.jpeg_quality);
-        match encoder.encode(pixels, width, height, jpeg_encoder::ColorType::Luma) {
-            Ok(()) => {
-                let header = FrameHeader { format: PixelFormat::Jpeg, ..header.clone() };
-                self.jpegs.publish(&header, Loan::Private(bytes)).await;
-            }
-            Err(_) => self.node.health().dropped("JPEG frames that could not be encoded"),
         }
     }
 }

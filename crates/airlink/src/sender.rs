@@ -1,0 +1,221 @@
+//! The camera's side: takes frames that are offered, and sends those that the link has room for.
+//!
+//! All work is done on a thread of its own, named `air`, so that no link, however slow, ever holds up the camera or
+//! the frames in shared memory. A frame is copied only when it will be sent.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use imaging::GrayView;
+use messages::{Detections, FrameHeader, FrameReceipt, topic};
+use node::{FramePublisher, HealthCounters, Loan, Node, Subscriber, now_ns};
+use tokio::runtime::Handle;
+use tokio::sync::Notify;
+use tokio::time::MissedTickBehavior;
+
+use crate::config::{AirConfig, Mode};
+use crate::expected::Expected;
+use crate::payload::Packer;
+use crate::plan::Planner;
+use crate::window::Window;
+
+/// How often subscribers and overdue frames are looked for.
+const TICK: Duration = Duration::from_millis(10);
+
+/// Receipts do not tell their detectors apart: the first detector that has a frame makes room for the next.
+const RECEIVER: &str = "any";
+
+/// Sends frames over the air link; dropping it ends its thread.
+pub struct AirSender {
+    offers: Arc<Offers>,
+}
+
+/// Between the camera's thread and ours: one frame at most.
+#[derive(Default)]
+struct Offers {
+    is_wanted: AtomicBool,
+    is_over: AtomicBool,
+    newest: Mutex<Option<Offer>>,
+    arrived: Notify,
+}
+
+struct Offer {
+    header: FrameHeader,
+    pixels: Vec<u8>,
+}
+
+impl AirSender {
+    /// Starts to send on `jpegs`, a camera's publisher for `camera/{camera}/jpeg`.
+    ///
+    /// # Errors
+    /// When the session is closed or there is no thread to be had.
+    pub async fn start(
+        node: &Node,
+        camera: &str,
+        jpegs: FramePublisher,
+        config: &AirConfig,
+    ) -> anyhow::Result<Self> {
+        let detections = match config.mode {
+            Mode::Region => Some(node.subscriber(topic::DETECTIONS, &[]).await?),
+            Mode::Full => None,
+        };
+        let offers = Arc::<Offers>::default();
+        let mut work = Work {
+            camera: camera.to_owned(),
+            offers: Arc::clone(&offers),
+            jpegs,
+            receipts: node.subscriber(topic::RECEIVED, &[]).await?,
+            detections,
+            health: node.shared_health(),
+            window: Window::new(config),
+            planner: Planner::new(config),
+            expected: Expected::default(),
+            packer: Packer::default(),
+            has_subscribers: false,
+        };
+        let runtime = Handle::current();
+        std::thread::Builder::new()
+            .name("air".to_owned())
+            .spawn(move || runtime.block_on(work.run()))
+            .context("starting the thread that sends frames over the air link")?;
+        Ok(Self { offers })
+    }
+
+    /// True when the next frame will be sent.
+    pub fn is_wanted(&self) -> bool {
+        self.offers.is_wanted.load(Ordering::Relaxed)
+    }
+
+    /// Offers a frame with its grey pixels, one byte each. One that is not wanted costs nothing.
+    pub fn offer(&self, header: &FrameHeader, pixels: &[u8]) {
+        if !self.is_wanted() {
+            return;
+        }
+        let mut newest = lock(&self.offers.newest);
+        let mut buffer = newest.take().map(|offer| offer.pixels).unwrap_or_default();
+        buffer.clear();
+        buffer.extend_from_slice(pixels);
+        *newest = Some(Offer { header: header.clone(), pixels: buffer });
+        drop(newest);
+        self.offers.arrived.notify_one();
+    }
+}
+
+impl Drop for AirSender {
+    fn drop(&mut self) {
+        self.offers.is_over.store(true, Ordering::Relaxed);
+        self.offers.arrived.notify_one();
+    }
+}
+
+// A frame that a thread that panicked has left is still a frame.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Everything the thread needs.
+struct Work {
+    camera: String,
+    offers: Arc<Offers>,
+    jpegs: FramePublisher,
+    receipts: Subscriber<FrameReceipt>,
+    detections: Option<Subscriber<Detections>>,
+    health: Arc<HealthCounters>,
+    window: Window,
+    planner: Planner,
+    expected: Expected,
+    packer: Packer,
+    has_subscribers: bool,
+}
+
+/// What the thread wakes up for.
+enum News {
+    Receipt(FrameReceipt),
+    Detections(Box<Detections>),
+    Frame,
+    Tick,
+    Closed,
+}
+
+impl Work {
+    async fn run(&mut self) {
+        let mut ticks = tokio::time::interval(TICK);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        while !self.offers.is_over.load(Ordering::Relaxed) {
+            let news = tokio::select! {
+                biased;
+                receipt = self.receipts.next() => receipt.map_or(News::Closed, News::Receipt),
+                message = next_of(self.detections.as_ref()) => {
+                    message.map_or(News::Closed, |message| News::Detections(Box::new(message)))
+                }
+                () = self.offers.arrived.notified() => News::Frame,
+                _ = ticks.tick() => News::Tick,
+            };
+            match news {
+                News::Receipt(receipt) => self.receipt(&receipt),
+                News::Detections(message) if message.header.camera == self.camera => {
+                    self.expected.learn(&message);
+                }
+                News::Detections(_) => {}
+                News::Frame => self.send().await,
+                News::Tick => self.has_subscribers = self.jpegs.has_subscribers().await,
+                News::Closed => return,
+            }
+            let (is_open, lost) = self.window.is_open(now_ns());
+            for _ in 0..lost {
+                self.health.dropped("frames for the air link not answered in time");
+            }
+            self.offers.is_wanted.store(is_open && self.has_subscribers, Ordering::Relaxed);
+        }
+    }
+
+    fn receipt(&mut self, receipt: &FrameReceipt) {
+        if receipt.camera != self.camera {
+            return;
+        }
+        let took_ms = self.window.received(now_ns(), RECEIVER, receipt.sequence);
+        match took_ms {
+            Some(ms) => {
+                self.health
+                    .latency("frame sent to receipt", Duration::from_secs_f64(ms.max(0.0) * 1e-3));
+            }
+            None => self.health.dropped("receipts of frames that were not sent lately"),
+        }
+    }
+
+    async fn send(&mut self) {
+        let Some(Offer { header, pixels }) = lock(&self.offers.newest).take() else { return };
+        let started = Instant::now();
+        let Ok(view) = GrayView::packed(&pixels, header.width as usize, header.height as usize)
+        else {
+            self.health.dropped("frames of an impossible size");
+            return;
+        };
+        let region = self.expected.region(header.stamp_ns);
+        let size = (header.width, header.height);
+        let plan = self.planner.plan(size, region, self.window.size_bytes());
+        match self.packer.pack(view, &header, &plan) {
+            Ok((header, bytes)) => {
+                self.health.latency("jpeg", started.elapsed());
+                self.planner.learn_all(&plan, &header, bytes.len());
+                self.window.sent(now_ns(), header.sequence, bytes.len());
+                tracing::trace!(bytes = bytes.len(), ?plan, "A frame is sent over the air link");
+                self.jpegs.publish(&header, Loan::Private(bytes)).await;
+            }
+            Err(problem) => {
+                if self.health.failed("jpeg") {
+                    tracing::warn!(%problem, "A frame could not be made a JPEG");
+                }
+            }
+        }
+    }
+}
+
+async fn next_of(detections: Option<&Subscriber<Detections>>) -> Option<Detections> {
+    match detections {
+        Some(detections) => detections.next().await,
+        None => std::future::pending().await,
+    }
+}

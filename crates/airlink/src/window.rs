@@ -1,0 +1,272 @@
+//! When the next frame may go, and how large it may be: a window of frames under way, and a size that follows the time
+//! until they arrive.
+//!
+//! A frame is sent only while fewer than `window` others are under way, so nothing queues up on the way, whatever the
+//! link carries: frames that come meanwhile are left out at the camera. A frame that nobody has answered after a while
+//! counts as lost. The size grows while frames arrive sooner than aimed at, and shrinks while they arrive later; the
+//! mean of some frames decides, because a lost packet delays a single frame whatever its size.
+//!
+//! Time is any clock's, in nanoseconds, given by the caller.
+
+use std::collections::VecDeque;
+
+use crate::config::AirConfig;
+
+/// Receivers that are waited for; further ones get what the others can take.
+const MOST_RECEIVERS: usize = 16;
+/// A receiver that has not answered for this time is not waited for, in nanoseconds.
+const SILENT_NS: i64 = 2_000_000_000;
+/// Frames whose way is remembered for late answers.
+const REMEMBERED: usize = 16;
+/// Part of a new time in the mean.
+const WEIGHT: f64 = 1.0 / 6.0;
+/// How fast the size grows with every frame that arrives in time.
+const GROWTH: f64 = 1.04;
+/// How much it shrinks at most with one that does not.
+const LEAST_SHRINK: f64 = 0.75;
+/// How much it shrinks with one that is lost.
+const LOSS_SHRINK: f64 = 0.6;
+/// Each loss in a row makes the wait for the next twice as long, so many times at most.
+const MOST_DOUBLINGS: u32 = 3;
+
+/// The frames under way.
+#[derive(Clone, Debug)]
+pub struct Window {
+    limit: usize,
+    timeout_ns: i64,
+    aim_ms: f64,
+    bounds: [f64; 2],
+    size_bytes: f64,
+    mean_ms: Option<f64>,
+    losses_in_a_row: u32,
+    sent: VecDeque<Sent>,
+    receivers: Vec<Receiver>,
+}
+
+#[derive(Clone, Debug)]
+struct Sent {
+    sequence: u64,
+    at_ns: i64,
+    bytes: usize,
+    /// Still waited for.
+    is_under_way: bool,
+}
+
+#[derive(Clone, Debug)]
+struct Receiver {
+    name: String,
+    heard_ns: i64,
+    sequence: u64,
+}
+
+impl Window {
+    /// Nothing is under way yet.
+    pub fn new(config: &AirConfig) -> Self {
+        let bounds = [config.smallest_kb * 1000.0, config.largest_kb * 1000.0];
+        Self {
+            limit: config.window as usize,
+            timeout_ns: (config.timeout_ms * 1e6) as i64,
+            aim_ms: config.round_trip_ms,
+            bounds,
+            // The middle of what is possible, in proportion: from there either end is as near.
+            size_bytes: (bounds[0] * bounds[1]).sqrt(),
+            mean_ms: None,
+            losses_in_a_row: 0,
+            sent: VecDeque::new(),
+            receivers: Vec::new(),
+        }
+    }
+
+    /// Bytes that the next frame should have at most.
+    pub fn size_bytes(&self) -> usize {
+        self.size_bytes as usize
+    }
+
+    /// Mean time until a frame is known to have arrived, in milliseconds.
+    pub fn round_trip_ms(&self) -> Option<f64> {
+        self.mean_ms
+    }
+
+    /// True when the next frame may go; frames that are overdue are given up. The number tells how many were.
+    pub fn is_open(&mut self, now_ns: i64) -> (bool, usize) {
+        self.forget_the_silent(now_ns);
+        let patience_ns = self.timeout_ns << self.losses_in_a_row.min(MOST_DOUBLINGS);
+        let mut lost = 0;
+        for sent in self.sent.iter_mut().filter(|sent| sent.is_under_way) {
+            if now_ns - sent.at_ns >= patience_ns {
+                sent.is_under_way = false;
+                lost += 1;
+            }
+        }
+        // Who never answers (a recorder, say) says nothing of the link.
+        if self.receivers.is_empty() {
+            self.losses_in_a_row = 0;
+            lost = 0;
+        } else if lost > 0 {
+            self.losses_in_a_row += 1;
+            self.scale(LOSS_SHRINK);
+        }
+        let under_way = self.sent.iter().filter(|sent| sent.is_under_way).count();
+        (under_way < self.limit, lost)
+    }
+
+    /// A frame was sent.
+    pub fn sent(&mut self, now_ns: i64, sequence: u64, bytes: usize) {
+        if self.sent.len() == REMEMBERED {
+            self.sent.pop_front();
+        }
+        self.sent.push_back(Sent { sequence, at_ns: now_ns, bytes, is_under_way: true });
+    }
+
+    /// A receiver has a frame; the answer is how long that took since it was sent, in milliseconds.
+    pub fn received(&mut self, now_ns: i64, receiver: &str, sequence: u64) -> Option<f64> {
+        let sent = self.sent.iter().find(|sent| sent.sequence == sequence)?;
+        let (took_ms, bytes) = ((now_ns - sent.at_ns) as f64 * 1e-6, sent.bytes);
+        self.losses_in_a_row = 0;
+        self.forget_the_silent(now_ns);
+        let has_room = self.receivers.len() < MOST_RECEIVERS;
+        match self.receivers.iter_mut().find(|known| known.name == receiver) {
+            Some(known) => {
+                known.heard_ns = now_ns;
+                known.sequence = known.sequence.max(sequence);
+            }
+            None if has_room => {
+                self.receivers.push(Receiver {
+                    name: receiver.to_owned(),
+                    heard_ns: now_ns,
+                    sequence,
+                });
+            }
+            None => {}
+        }
+        let with_all = self.receivers.iter().map(|known| known.sequence).min().unwrap_or(sequence);
+        for sent in self.sent.iter_mut().filter(|sent| sent.sequence <= with_all) {
+            sent.is_under_way = false;
+        }
+        // The last of the receivers decides.
+        if with_all >= sequence {
+            self.adapt(took_ms, bytes);
+        }
+        Some(took_ms)
+    }
+
+    fn forget_the_silent(&mut self, now_ns: i64) {
+        self.receivers.retain(|receiver| now_ns - receiver.heard_ns < SILENT_NS);
+    }
+
+    fn adapt(&mut self, took_ms: f64, bytes: usize) {
+        let mean_ms = self.mean_ms.unwrap_or(took_ms);
+        let mean_ms = mean_ms + WEIGHT * (took_ms - mean_ms);
+        self.mean_ms = Some(mean_ms);
+        if mean_ms > self.aim_ms {
+            // A mean that is high for what was is not held against what is.
+            if took_ms > self.aim_ms {
+                self.scale((self.aim_ms / mean_ms).max(LEAST_SHRINK));
+            }
+        } else if bytes as f64 > 0.6 * self.size_bytes {
+            // A size that is not used says nothing of what the link would carry.
+            self.scale(GROWTH);
+        }
+    }
+
+    fn scale(&mut self, factor: f64) {
+        let [least, most] = self.bounds;
+        self.size_bytes = (self.size_bytes * factor).clamp(least, most);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Mode;
+
+    const MS: i64 = 1_000_000;
+
+    fn window() -> Window {
+        Window::new(&AirConfig {
+            mode: Mode::Full,
+            quality: 75,
+            quality_least: 40,
+            largest_kb: 200.0,
+            smallest_kb: 8.0,
+            round_trip_ms: 50.0,
+            window: 1,
+            timeout_ms: 250.0,
+        })
+    }
+
+    /// Sends frames at 15 Hz for a time over a link of a rate; the size in the end, in kilobytes.
+    fn settled_kb(window: &mut Window, from: u64, frames: u64, bytes_per_ms: f64) -> f64 {
+        let mut arrives: Option<(i64, u64)> = None;
+        for sequence in from..from + frames {
+            let now = sequence as i64 * 66 * MS;
+            if let Some((at, sequence)) = arrives.filter(|(at, _)| *at <= now) {
+                window.received(at, "ground", sequence);
+                arrives = None;
+            }
+            if window.is_open(now).0 {
+                let bytes = window.size_bytes();
+                window.sent(now, sequence, bytes);
+                let way_ms = 10.0 + bytes as f64 / bytes_per_ms;
+                arrives = Some((now + (way_ms * 1e6) as i64, sequence));
+            }
+        }
+        window.size_bytes() as f64 / 1000.0
+    }
+
+    #[test]
+    fn the_size_follows_what_the_link_carries() {
+        let mut window = window();
+        // 20 Mbit/s carry 2500 bytes in a millisecond: 100 kB in the 40 ms that are left of 50.
+        let fast = settled_kb(&mut window, 0, 200, 2500.0);
+        assert!((75.0..125.0).contains(&fast), "{fast} kB");
+        let slow = settled_kb(&mut window, 200, 200, 500.0);
+        assert!((13.0..25.0).contains(&slow), "{slow} kB");
+        let again = settled_kb(&mut window, 400, 200, 2500.0);
+        assert!((75.0..125.0).contains(&again), "{again} kB");
+    }
+
+    #[test]
+    fn nothing_is_sent_before_the_last_frame_arrived_or_is_overdue() {
+        let mut window = window();
+        assert!(window.is_open(0).0);
+        window.sent(0, 1, 1000);
+        assert!(!window.is_open(249 * MS).0);
+        assert_eq!(window.received(30 * MS, "ground", 1), Some(30.0));
+        assert!(window.is_open(30 * MS).0);
+        window.sent(40 * MS, 2, 1000);
+        assert_eq!(window.is_open(289 * MS), (false, 0));
+        let before = window.size_bytes();
+        assert_eq!(window.is_open(290 * MS), (true, 1));
+        assert!(window.size_bytes() < before);
+        // The next loss takes longer to believe.
+        window.sent(300 * MS, 3, 1000);
+        assert!(!window.is_open(700 * MS).0);
+        assert_eq!(window.is_open(800 * MS), (true, 1));
+    }
+
+    #[test]
+    fn the_slowest_receiver_decides_until_it_is_silent() {
+        let mut window = window();
+        window.sent(0, 1, 1000);
+        window.received(10 * MS, "near", 1);
+        window.received(20 * MS, "far", 1);
+        window.sent(30 * MS, 2, 1000);
+        window.received(40 * MS, "near", 2);
+        assert!(!window.is_open(50 * MS).0, "the far one has not got it");
+        window.received(60 * MS, "far", 2);
+        assert!(window.is_open(60 * MS).0);
+        window.sent(2500 * MS, 3, 1000);
+        window.received(2510 * MS, "near", 3);
+        assert!(window.is_open(2510 * MS).0, "the far one has been silent for too long");
+    }
+
+    #[test]
+    fn receipts_of_frames_that_were_never_sent_are_not_believed() {
+        let mut window = window();
+        assert_eq!(window.received(0, "ground", 7), None);
+        window.sent(0, 1, 1000);
+        assert_eq!(window.received(MS, "ground", u64::MAX), None);
+        assert!(!window.is_open(2 * MS).0);
+    }
+}

@@ -1,0 +1,292 @@
+//! Landings with the detector on the ground.
+
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use messages::{ControllerCommand, ControllerStatus, Detections, Health, Touchdown, Truth, topic};
+use node::{Subscriber, now_ns};
+use tokio::time::{Instant, timeout};
+
+use crate::probe::{self, Times};
+use crate::site::{Radio, Site};
+
+/// Longest flight.
+const PATIENCE: Duration = Duration::from_secs(110);
+/// A probe on the ground runs so long beside a landing.
+const PROBE_S: f64 = 14.0;
+
+/// What became of a landing.
+#[derive(Default)]
+pub(crate) struct Flight {
+    pub(crate) landed: bool,
+    pub(crate) error_m: f64,
+    seconds: f64,
+    /// Phase and reason at the end.
+    why: String,
+    /// Frames that the detector on the ground has taken.
+    pub(crate) frames_received: u64,
+    frame_age_ms: Option<[f64; 2]>,
+    round_trip_ms: Option<[f64; 2]>,
+    back: Times,
+    cut: Option<Cut>,
+}
+
+/// What a cut of the link did.
+#[derive(Default)]
+struct Cut {
+    /// From the cut to the onboard detector's being used.
+    failover_s: f64,
+    /// From the cut's end to the first detections from the ground.
+    back_s: Option<f64>,
+    /// Detections of the onboard detector arrived on the drone: the longest pause and the oldest, from the cut on.
+    longest_pause_ms: f64,
+    /// The state of the vehicle was at most so old when it arrived on the drone.
+    oldest_state_ms: f64,
+    /// Before the cut.
+    oldest_state_before_ms: f64,
+    longest_pause_before_ms: f64,
+}
+
+impl std::fmt::Display for Flight {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let verdict = if self.landed { "landed" } else { "NOT LANDED" };
+        write!(f, "{verdict}, {:.3} m off, {:.1} s", self.error_m, self.seconds)?;
+        if !self.landed {
+            write!(f, " ({})", self.why)?;
+        }
+        if let Some([p50, p99]) = self.frame_age_ms {
+            write!(f, "; {} frames, age p50 {p50:.0} p99 {p99:.0} ms", self.frames_received)?;
+        }
+        if let Some([p50, p99]) = self.round_trip_ms {
+            write!(f, "; to receipt p50 {p50:.0} p99 {p99:.0} ms")?;
+        }
+        let [p50, p99] = [0.5, 0.99].map(|part| self.back.at(part));
+        if p50.is_finite() {
+            write!(f, "; detections back p50 {p50:.0} p99 {p99:.0} ms")?;
+        }
+        if let Some(cut) = &self.cut {
+            write!(
+                f,
+                "; failover {:.2} s; ground back after {}; on the drone: pause {:.0} ms ({:.0} before), state at most {:.0} ms old ({:.0} before)",
+                cut.failover_s,
+                cut.back_s.map_or("-".to_owned(), |s| format!("{s:.1} s")),
+                cut.longest_pause_ms,
+                cut.longest_pause_before_ms,
+                cut.oldest_state_ms,
+                cut.oldest_state_before_ms,
+            )?;
+        }
+        Ok(())
+    }
+}
+
+/// Everything on the drone, and no link.
+pub(crate) async fn onboard(seed: u64) -> anyhow::Result<Option<Flight>> {
+    let any = Radio { rate_mbit: 20.0, delay_ms: 5.0, jitter_ms: 0.0, loss: 0.0 };
+    let Some(mut site) = Site::new(any).await? else { return Ok(None) };
+    site.drone("detector", &["--set", "id=onboard"])?;
+    let watch = Watch::new(&site).await?;
+    site.flight(seed, &[])?;
+    watch.landing(&mut site).await.map(Some)
+}
+
+/// The only detector is on the ground.
+pub(crate) async fn ground(
+    radio: Radio,
+    seed: u64,
+    camera: &[&str],
+) -> anyhow::Result<Option<Flight>> {
+    let Some(mut site) = Site::new(radio).await? else { return Ok(None) };
+    site.relay()?;
+    site.ground("detector", &["--set", "id=ground", "--set", "input=jpeg"])?;
+    let back = probe::beacon(&site.node).await?;
+    let watch = Watch::new(&site).await?;
+    site.flight(seed, camera)?;
+    let probe = site.probe(PROBE_S, false)?;
+    let mut flight = watch.landing(&mut site).await?;
+    tokio::task::spawn_blocking(move || probe.wait_with_output()).await??;
+    flight.back = probe::taken(&back);
+    Ok(Some(flight))
+}
+
+/// The detector on the ground is used and one onboard is its shadow; the link is cut on the way down.
+pub(crate) async fn cut(radio: Radio, seed: u64, seconds: f64) -> anyhow::Result<Option<Flight>> {
+    let Some(mut site) = Site::new(radio).await? else { return Ok(None) };
+    site.relay()?;
+    site.ground("detector", &["--set", "id=ground", "--set", "input=jpeg"])?;
+    site.drone("detector", &["--set", "id=onboard"])?;
+    let watch = Watch::new(&site).await?;
+    site.flight(seed, &[])?;
+    let statuses = site.node.subscriber(topic::STATUS, &[]).await?;
+    let both = |s: &ControllerStatus| s.candidates.len() == 2 && s.active_detector.is_some();
+    until(&statuses, "both detectors are there", both).await?;
+    let prefer = ControllerCommand::UseDetector("ground".into());
+    site.node.command(topic::COMMAND, &[], &prefer).await?;
+    until(&statuses, "it descends by the one on the ground", |s| {
+        s.active_detector.as_deref() == Some("ground")
+            && s.phase == "descend"
+            && s.height_m.is_some_and(|height_m| height_m < 8.0)
+    })
+    .await?;
+    let mut local = Local::new(&site).await?;
+    local.listen(Duration::from_secs(1)).await;
+    let before = local.take();
+    site.air.cut(true)?;
+    let cut = Instant::now();
+    let found = tokio::join!(
+        until(&statuses, "the onboard one is used", |s| {
+            s.active_detector.as_deref() == Some("onboard")
+        }),
+        local.listen(Duration::from_secs_f64(seconds)),
+    );
+    let (status, at) = found.0?;
+    let during = local.take();
+    site.air.cut(false)?;
+    let joined = Instant::now();
+    let heard = site.node.subscriber(topic::DETECTIONS, &["ground"]).await?;
+    let again = timeout(Duration::from_secs(15), heard.next()).await.is_ok();
+    let back_s = again.then(|| joined.elapsed().as_secs_f64());
+    drop(status);
+    let mut flight = watch.landing(&mut site).await?;
+    flight.cut = Some(Cut {
+        failover_s: (at - cut).as_secs_f64(),
+        back_s,
+        longest_pause_ms: during.0,
+        oldest_state_ms: during.1,
+        longest_pause_before_ms: before.0,
+        oldest_state_before_ms: before.1,
+    });
+    Ok(Some(flight))
+}
+
+/// Waits for a status; when it came.
+async fn until(
+    statuses: &Subscriber<ControllerStatus>,
+    what: &str,
+    mut holds: impl FnMut(&ControllerStatus) -> bool,
+) -> anyhow::Result<(ControllerStatus, Instant)> {
+    let mut last = None;
+    let found = timeout(PATIENCE, async {
+        while let Some(status) = statuses.next().await {
+            if holds(&status) {
+                return Some((status, Instant::now()));
+            }
+            last = Some(status);
+        }
+        None
+    });
+    found.await.ok().flatten().with_context(|| format!("waiting until {what}; last: {last:?}"))
+}
+
+/// What arrives on the drone from the drone.
+struct Local {
+    detections: Subscriber<Detections>,
+    states: Subscriber<messages::VehicleState>,
+    last: Option<Instant>,
+    longest_pause_ms: f64,
+    oldest_state_ms: f64,
+}
+
+impl Local {
+    async fn new(site: &Site) -> anyhow::Result<Self> {
+        Ok(Self {
+            detections: site.node.subscriber(topic::DETECTIONS, &["onboard"]).await?,
+            states: site.node.subscriber(topic::VEHICLE_STATE, &[]).await?,
+            last: None,
+            longest_pause_ms: 0.0,
+            oldest_state_ms: 0.0,
+        })
+    }
+
+    async fn listen(&mut self, duration: Duration) {
+        let end = Instant::now() + duration;
+        loop {
+            tokio::select! {
+                () = tokio::time::sleep_until(end) => return,
+                Some(_) = self.detections.next() => {
+                    let now = Instant::now();
+                    if let Some(last) = self.last.replace(now) {
+                        let pause_ms = (now - last).as_secs_f64() * 1e3;
+                        self.longest_pause_ms = self.longest_pause_ms.max(pause_ms);
+                    }
+                }
+                Some(state) = self.states.next() => {
+                    let age_ms = (now_ns() - state.stamp_ns) as f64 * 1e-6;
+                    self.oldest_state_ms = self.oldest_state_ms.max(age_ms);
+                }
+            }
+        }
+    }
+
+    /// The longest pause and the oldest state since the last time.
+    fn take(&mut self) -> (f64, f64) {
+        (std::mem::take(&mut self.longest_pause_ms), std::mem::take(&mut self.oldest_state_ms))
+    }
+}
+
+/// Watches a landing from its start.
+struct Watch {
+    truths: Subscriber<Truth>,
+    healths: Subscriber<Health>,
+    statuses: Subscriber<ControllerStatus>,
+}
+
+impl Watch {
+    async fn new(site: &Site) -> anyhow::Result<Self> {
+        Ok(Self {
+            truths: site.node.subscriber(topic::TRUTH, &[]).await?,
+            healths: site.node.subscriber(topic::HEALTH, &[]).await?,
+            statuses: site.node.subscriber(topic::STATUS, &[]).await?,
+        })
+    }
+
+    /// Waits until the vehicle has landed and the controller is done.
+    async fn landing(self, site: &mut Site) -> anyhow::Result<Flight> {
+        let mut flight = Flight::default();
+        let mut touchdown: Option<Touchdown> = None;
+        let mut done: Option<Instant> = None;
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let end = done.unwrap_or(deadline);
+            tokio::select! {
+                () = tokio::time::sleep_until(end) => break,
+                Some(truth) = self.truths.next() => touchdown = truth.touchdown,
+                Some(health) = self.healths.next() => flight.hear(&health),
+                Some(status) = self.statuses.next() => {
+                    flight.why = format!("{}: {}", status.phase, status.why);
+                    if status.finished && done.is_none() {
+                        flight.landed = status.disarmed_ns.is_some() && touchdown.is_some();
+                        if let (Some(from), Some(to)) = (status.started_ns, status.disarmed_ns) {
+                            flight.seconds = (to - from) as f64 * 1e-9;
+                        }
+                        done = Some(Instant::now() + Duration::from_millis(1200));
+                    }
+                }
+            }
+        }
+        site.all_run()?;
+        ensure!(done.is_some(), "no end of the flight: {flight}");
+        flight.error_m = touchdown.map_or(f64::NAN, |touchdown| touchdown.error_m);
+        Ok(flight)
+    }
+}
+
+impl Flight {
+    fn hear(&mut self, health: &Health) {
+        let latency = |name: &str| {
+            let found = health.latencies.iter().find(|latency| latency.name == name);
+            found.map(|latency| [latency.p50_ms, latency.p99_ms])
+        };
+        match (health.service.as_str(), health.instance.as_str()) {
+            ("detector", "ground") => {
+                self.frame_age_ms = latency("stamp to frame").or(self.frame_age_ms);
+                let frames = health.rates.iter().find(|rate| rate.name == "frames");
+                self.frames_received = frames.map_or(self.frames_received, |rate| rate.count);
+            }
+            ("simulator", _) => {
+                self.round_trip_ms = latency("frame sent to receipt").or(self.round_trip_ms);
+            }
+            _ => {}
+        }
+    }
+}

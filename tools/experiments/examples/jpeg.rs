@@ -1,0 +1,167 @@
+//! What JPEG costs: `cargo run --release -p experiments --example jpeg -- [MARKER...]` renders frames of the thesis' camera,
+//! compresses them as the air link does, and prints how far each marker is found and how far off its centre is.
+#![allow(clippy::print_stdout, reason = "a program for people at a terminal")]
+
+use anyhow::Context;
+use experiments::score::quantile;
+use experiments::sets::{MARKERS, SIZE_M, Set};
+use experiments::shot::{Shot, Studio};
+use fiducial::{Detector, Marker};
+use geometry::{CameraModel, Pixel};
+use imaging::GrayImage;
+use jpeg_encoder::{ColorType, Encoder};
+
+/// How a frame is sent: pixels along the edge of one of what is sent, and its quality; without one, as it is.
+const WAYS: [(usize, Option<u8>); 13] = [
+    (1, None),
+    (1, Some(95)),
+    (1, Some(90)),
+    (1, Some(85)),
+    (1, Some(75)),
+    (1, Some(65)),
+    (1, Some(55)),
+    (1, Some(45)),
+    (1, Some(35)),
+    (1, Some(30)),
+    (1, Some(20)),
+    (2, Some(75)),
+    (4, Some(75)),
+];
+/// Every so many of the thesis' positions is looked at.
+const POSITIONS_STEP: usize = 5;
+
+/// What one way of sending did to one marker.
+#[derive(Clone, Default)]
+struct Cost {
+    bytes: Vec<f64>,
+    /// Distance of each frame of the far set, in metres, and whether the marker was found.
+    far: Vec<(f64, bool)>,
+    near_found: usize,
+    near_frames: usize,
+    errors_px: Vec<f64>,
+}
+
+fn main() -> anyhow::Result<()> {
+    let mut names: Vec<String> = std::env::args().skip(1).collect();
+    if names.is_empty() {
+        names = MARKERS.iter().map(|name| (*name).to_owned()).collect();
+    }
+    println!(
+        "| marker | scale | quality | kB | every frame found to | found of {{10 to 40 m}} | centre median / 95 % px |"
+    );
+    println!("|---|---|---|---|---|---|---|");
+    let mut studio = Studio::default();
+    for name in &names {
+        let marker: Marker =
+            format!("{name}:{SIZE_M}").parse().with_context(|| format!("the marker {name}"))?;
+        let mut costs = vec![Cost::default(); WAYS.len()];
+        for shot in Set::Far.shots(marker) {
+            look(&mut studio, &shot, &mut costs, true)?;
+        }
+        let near = Set::Positions.shots(marker);
+        for shot in near.iter().take(near.len() / 2).step_by(POSITIONS_STEP) {
+            look(&mut studio, shot, &mut costs, false)?;
+        }
+        for ((scale, quality), cost) in WAYS.iter().zip(&costs) {
+            print(name, *scale, *quality, cost);
+        }
+    }
+    Ok(())
+}
+
+fn print(name: &str, scale: usize, quality: Option<u8>, cost: &Cost) {
+    let mut range_m: f64 = 0.0;
+    let mut missed_m = f64::INFINITY;
+    for (distance_m, found) in &cost.far {
+        if !found {
+            missed_m = missed_m.min(*distance_m);
+        }
+    }
+    for (distance_m, _) in &cost.far {
+        if *distance_m < missed_m {
+            range_m = range_m.max(*distance_m);
+        }
+    }
+    let far = cost.far.iter().filter(|(_, found)| *found).count();
+    let at = |part| quantile(&cost.errors_px, part).unwrap_or(f64::NAN);
+    println!(
+        "| {name} | {scale} | {} | {:.0} | {range_m:.0} m | {far} of {}, near {} of {} | {:.3} / {:.3} |",
+        quality.map_or("raw".to_owned(), |quality| quality.to_string()),
+        quantile(&cost.bytes, 0.5).unwrap_or(f64::NAN) / 1000.0,
+        cost.far.len(),
+        cost.near_found,
+        cost.near_frames,
+        at(0.5),
+        at(0.95),
+    );
+}
+
+/// Looks at one frame in every way.
+fn look(studio: &mut Studio, shot: &Shot, costs: &mut [Cost], is_far: bool) -> anyhow::Result<()> {
+    let (marker, shown) = shot.marker.zip(shot.shown()).context("a marker in the frame")?;
+    let model = shot.settings.model;
+    let pixels = studio.take(shot)?;
+    let mut detector = Detector::new(&[marker], fiducial::Settings::default())?;
+    for ((scale, quality), cost) in WAYS.iter().zip(costs) {
+        let coarse = shrunk(&pixels, &model, *scale);
+        let (image, bytes) = match quality {
+            Some(quality) => through_jpeg(&coarse, *quality)?,
+            None => (coarse, pixels.len()),
+        };
+        cost.bytes.push(bytes as f64);
+        let part = *scale as f64;
+        let half = (part - 1.0) / 2.0;
+        let camera = CameraModel {
+            width: image.width() as u32,
+            height: image.height() as u32,
+            fx: model.fx / part,
+            fy: model.fy / part,
+            cx: (model.cx - half) / part,
+            cy: (model.cy - half) / part,
+            ..model
+        };
+        let seen = detector.detect(image.view().context("an image")?, Some(&camera), &mut ());
+        let off_px = seen
+            .iter()
+            .map(|seen| Pixel::new(half + part * seen.centre.x, half + part * seen.centre.y))
+            .map(|centre| centre.distance(&shown.centre))
+            .fold(f64::INFINITY, f64::min);
+        let found = off_px < 0.25 * model.fx * SIZE_M / shown.camera_from_marker.origin().z();
+        if is_far {
+            cost.far.push((shown.camera_from_marker.origin().z().round(), found));
+        } else {
+            cost.near_frames += 1;
+            cost.near_found += usize::from(found);
+            cost.errors_px.extend(found.then_some(off_px));
+        }
+    }
+    Ok(())
+}
+
+/// Means of `scale` x `scale` pixels.
+fn shrunk(pixels: &[u8], model: &CameraModel, scale: usize) -> GrayImage {
+    let wide = model.width as usize;
+    let (width, height) = (wide / scale, model.height as usize / scale);
+    let mut image = GrayImage::filled(width, height, 0);
+    for v in 0..height {
+        for (u, pixel) in image.row_mut(v).iter_mut().enumerate() {
+            let block = (0..scale * scale).map(|i| {
+                let (x, y) = (u * scale + i % scale, v * scale + i / scale);
+                u32::from(pixels.get(y * wide + x).copied().unwrap_or(0))
+            });
+            let area = (scale * scale) as u32;
+            *pixel = ((block.sum::<u32>() + area / 2) / area) as u8;
+        }
+    }
+    image
+}
+
+fn through_jpeg(image: &GrayImage, quality: u8) -> anyhow::Result<(GrayImage, usize)> {
+    let mut bytes = Vec::new();
+    let (width, height) = (u16::try_from(image.width())?, u16::try_from(image.height())?);
+    Encoder::new(&mut bytes, quality).encode(image.pixels(), width, height, ColorType::Luma)?;
+    let decoded = image::load_from_memory(&bytes)?.into_luma8();
+    let mut out = GrayImage::filled(image.width(), image.height(), 0);
+    out.pixels_mut().copy_from_slice(decoded.as_raw());
+    Ok((out, bytes.len()))
+}
