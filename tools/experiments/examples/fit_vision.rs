@@ -243,11 +243,16 @@ fn suggest(looks: &[Look]) {
     println!("now: {RINGS:?}");
 }
 
+/// Takes what a panel shows from a look's errors and the marker's size in pixels.
+type ErrorOf = fn(&[f64; 4], f64) -> f64;
+/// Takes the deviation that a panel compares with from the model.
+type DeviationOf = fn(&VisionModel) -> f64;
+
 /// The errors of centre and range against the size, with the model's deviation without blur.
 fn plot(looks: &[Look]) -> anyhow::Result<String> {
     picture((1100, 520), |area| {
         let (left, right) = area.split_horizontally(550);
-        let panels: [(_, &str, fn(&[f64; 4], f64) -> f64, fn(&VisionModel) -> f64); 2] = [
+        let panels: [(_, &str, ErrorOf, DeviationOf); 2] = [
             (left, "centre along an axis, px", |e, _| e[0], |m| m.centre_px),
             (right, "range as a size, px", |e, size| e[2] * size, |m| m.size_px),
         ];
