@@ -143,9 +143,9 @@ impl Pad {
     ///
     /// # Errors
     /// [`PadError`] with the name, when there is no such pad or its description is wrong.
-    pub fn named(
+    pub fn named<E: std::fmt::Display>(
         name: &str,
-        read: impl FnOnce(&str) -> std::io::Result<String>,
+        read: impl FnOnce(&str) -> Result<String, E>,
     ) -> Result<Self, PadError> {
         let text = match BUILT_IN.iter().find(|(known, _)| *known == name) {
             Some((_, text)) => (*text).to_owned(),
