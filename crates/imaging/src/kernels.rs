@@ -3,6 +3,10 @@
 //! Each kernel exists twice, for AVX2 and in plain Rust, with the same result to the bit. The plain one also serves the
 //! ends of rows, and processors without AVX2.
 #![allow(unsafe_code, reason = "vector instructions; each is tested against its plain twin")]
+#![cfg_attr(
+    not(target_arch = "x86_64"),
+    allow(unused_mut, reason = "without vectors nothing is done before the plain part")
+)]
 
 /// Edge of a tile, in pixels.
 pub(crate) const TILE: usize = 4;
