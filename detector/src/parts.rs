@@ -84,13 +84,19 @@ mod tests {
         let marker = "aruco-4x4-50:7".parse().unwrap();
         let drawing = fiducial::Drawing::new(&marker, size_px).unwrap();
         let mut image = GrayImage::filled(640, 480, 180);
+        // A pixel is the mean of its area, and of some of its neighbours' as behind any lens.
+        let steps: Vec<f64> = (0..8).map(|i| f64::from(i) * 0.25 - 0.875).collect();
         for y in 0..480 {
             for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
                 let (right, up) = (x as f64 - centre[0], centre[1] - y as f64);
-                if right.abs().max(up.abs()) <= drawing.half_extent_m {
-                    let ink = drawing.ink_at(right, up);
-                    *pixel = if ink == fiducial::Ink::Black { 20 } else { 220 };
+                if right.abs().max(up.abs()) > drawing.half_extent_m {
+                    continue;
                 }
+                let white =
+                    |dx: f64, dy: f64| drawing.ink_at(right + dx, up + dy) == fiducial::Ink::White;
+                let all = steps.iter().flat_map(|dx| steps.iter().map(move |dy| (*dx, *dy)));
+                let count = all.filter(|(dx, dy)| white(*dx, *dy)).count();
+                *pixel = (20 + 200 * count / (steps.len() * steps.len())) as u8;
             }
         }
         image

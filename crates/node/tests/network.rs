@@ -104,37 +104,49 @@ async fn a_second_one_of_the_same_name_is_told_so() -> anyhow::Result<()> {
     spare.ensure_alone("spare").await
 }
 
+/// Asks until the answer is as wanted, patiently.
+async fn until<T>(
+    ask: impl AsyncFn() -> anyhow::Result<T>,
+    is_wanted: impl Fn(&T) -> bool,
+) -> anyhow::Result<T> {
+    let asked = async {
+        loop {
+            let answer = ask().await?;
+            if is_wanted(&answer) {
+                return anyhow::Ok(answer);
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, asked).await?
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn of_two_that_start_in_the_same_instant_one_goes_on() -> anyhow::Result<()> {
-    let port = free_port()?;
-    let host = open("simulator", "main", port).await?;
-    let start = async |instance: &str| {
-        let node = open("controller", instance, port).await?;
-        let alone = node.ensure_alone("*").await;
-        if alone.is_ok() {
-            node.announce().await?;
-        }
-        anyhow::Ok((node, alone))
-    };
-    for instances in [["main", "main"], ["a", "b"], ["b", "a"], ["main", "main"]] {
-        let [first, second] = instances;
-        let (first, second) = tokio::try_join!(start(first), start(second))?;
-        let refusals: Vec<String> = [&first, &second]
+    for [first, second] in [["main", "main"], ["a", "b"], ["b", "a"], ["main", "main"]] {
+        let port = free_port()?;
+        let host = open("simulator", "main", port).await?;
+        let start = async |instance: &str| {
+            let node = open("controller", instance, port).await?;
+            let alone = node.ensure_alone("*").await;
+            if alone.is_ok() {
+                node.announce().await?;
+            }
+            anyhow::Ok((node, alone))
+        };
+        let both = tokio::try_join!(start(first), start(second))?;
+        let refusals: Vec<String> = [&both.0, &both.1]
             .iter()
             .filter_map(|it| it.1.as_ref().err())
             .map(ToString::to_string)
             .collect();
-        assert_eq!(refusals.len(), 1, "{instances:?}: {refusals:?}");
-        let mut left = Vec::new();
-        while left.is_empty() {
-            left = host.alive("controller", "*").await?;
-        }
+        assert_eq!(refusals.len(), 1, "{first} and {second}: {refusals:?}");
+        let left = until(async || host.alive("controller", "*").await, |left| !left.is_empty());
+        let left = left.await.context("the one that goes on")?;
         assert_eq!(left.len(), 1, "{left:?}");
-        first.0.close().await;
-        second.0.close().await;
-        while !host.alive("controller", "*").await?.is_empty() {
-            tokio::task::yield_now().await;
-        }
+        both.0.0.close().await;
+        both.1.0.close().await;
+        host.close().await;
     }
     Ok(())
 }
