@@ -208,6 +208,10 @@ pub struct PhaseConfig {
     pub search_timeout_s: f64,
     /// Hovering before the search begins to move, in s (0 to 60).
     pub search_delay_s: f64,
+    /// Height over the local origin below which the search climbs before it flies its legs, in m; 0 never climbs (0 to 50).
+    pub search_height_m: f64,
+    /// Speed of that climb, in m/s (0.1 to 3).
+    pub search_climb_m_s: f64,
     /// Speed of the search, in m/s; 0 hovers (0 to 3).
     pub search_speed_m_s: f64,
     /// Distance between the legs of the expanding square, in m (0.5 to 20).
@@ -281,6 +285,8 @@ impl Default for PhaseConfig {
             stale_vehicle_s: 0.5,
             search_timeout_s: 60.0,
             search_delay_s: 1.0,
+            search_height_m: 5.0,
+            search_climb_m_s: 1.0,
             search_speed_m_s: 1.0,
             search_spacing_m: 2.0,
             search_radius_m: 5.0,
@@ -439,6 +445,8 @@ impl PhaseConfig {
         check("phases.stale_vehicle_s", self.stale_vehicle_s, 0.1, 5.0)?;
         check("phases.search_timeout_s", self.search_timeout_s, 1.0, 600.0)?;
         check("phases.search_delay_s", self.search_delay_s, 0.0, 60.0)?;
+        check("phases.search_height_m", self.search_height_m, 0.0, 50.0)?;
+        check("phases.search_climb_m_s", self.search_climb_m_s, 0.1, 3.0)?;
         check("phases.search_speed_m_s", self.search_speed_m_s, 0.0, 3.0)?;
         check("phases.search_spacing_m", self.search_spacing_m, 0.5, 20.0)?;
         check("phases.search_radius_m", self.search_radius_m, 0.0, 50.0)?;

@@ -48,8 +48,18 @@ pub struct Lander {
     retry_to_m: Option<f64>,
     /// Smallest angle from the middle of the camera's image to its edge, in radians.
     half_view_rad: Option<f64>,
-    /// Direction of the first leg of the search under way, in radians, and how far it goes upwind, in metres.
-    upwind: Option<(f64, f64)>,
+    /// The expanding square under way.
+    square: Option<Square>,
+}
+
+/// An expanding square under way.
+#[derive(Copy, Clone, Debug)]
+struct Square {
+    begun: Timestamp,
+    /// Direction of the first leg, in radians from north to east.
+    first_leg_rad: f64,
+    /// How far it goes upwind before the first leg, in metres.
+    upwind_m: f64,
 }
 
 /// Where the landing point is, by the filter that the guidance takes.
@@ -90,7 +100,7 @@ impl Lander {
             ceiling_m: 0.0,
             retry_to_m: None,
             half_view_rad: None,
-            upwind: None,
+            square: None,
         })
     }
 
@@ -323,7 +333,7 @@ impl Lander {
             self.guide.rest();
         }
         if self.machine.phase() != Phase::Search {
-            self.upwind = None;
+            self.square = None;
         }
         match self.machine.phase() {
             Phase::Idle | Phase::Landed | Phase::PilotInCommand => (Action::None, why),
@@ -373,21 +383,28 @@ impl Lander {
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
-    /// Flies the expanding square; low over the ground, where little is seen and much is in the way, climbs instead.
+    /// Climbs to where legs overlap in the camera's view, as far as the fence lets it, and flies the expanding square there.
     fn search(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
         let phases = &self.config.phases;
-        let (first_leg_rad, upwind_m) = *self.upwind.get_or_insert_with(|| {
-            let attitude = vehicle.ned_from_body;
-            let height_m = -vehicle.position.z();
-            (search::first_leg_rad(attitude), search::upwind_m(phases, attitude, height_m))
-        });
-        let elapsed_s = self.machine.elapsed_s(now);
-        let mut wanted = search::velocity(phases, elapsed_s, first_leg_rad, upwind_m);
-        if wanted.norm() > 0.0 && -vehicle.position.z() < phases.regain_height_m {
-            wanted = Vector::new(0.0, 0.0, -phases.regain_climb_m_s);
+        if self.machine.elapsed_s(now) < phases.search_delay_s {
+            return Action::hover();
         }
-        let wanted = inside(phases, vehicle.position, wanted);
+        let altitude_m = -vehicle.position.z();
+        let up = inside(phases, vehicle.position, Vector::new(0.0, 0.0, -phases.search_climb_m_s));
+        let wanted = if self.square.is_none() && altitude_m < phases.search_height_m && up.z() < 0.0
+        {
+            up
+        } else {
+            let square = self.square.get_or_insert_with(|| Square {
+                begun: now,
+                first_leg_rad: search::first_leg_rad(vehicle.ned_from_body),
+                upwind_m: search::upwind_m(phases, vehicle.ned_from_body, altitude_m),
+            });
+            let elapsed_s = now.seconds_since(square.begun);
+            let legs = search::velocity(phases, elapsed_s, square.first_leg_rad, square.upwind_m);
+            inside(phases, vehicle.position, legs)
+        };
         let velocity = envelope::admit(&self.config.envelope, wanted, false);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }

@@ -24,15 +24,14 @@ pub fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height
     if beside_m < CALM_RAD * height_m { 0.0 } else { beside_m.min(config.search_radius_m) }
 }
 
-/// The velocity at a time after the search began, in m/s: after a moment of hovering `upwind_m` along the first leg, then
-/// legs of 1, 1, 2, 2, 3, 3, ... spacings, each to the right of the one before; nought once the radius is reached.
+/// The velocity at a time after the square began, in m/s: `upwind_m` along the first leg, then legs of 1, 1, 2, 2, 3, 3, ... spacings, each to the right of the one before; nought once the radius is reached.
 pub fn velocity(
     config: &PhaseConfig,
     elapsed_s: f64,
     first_leg_rad: f64,
     upwind_m: f64,
 ) -> Vector<Ned> {
-    let mut way_m = (elapsed_s - config.search_delay_s) * config.search_speed_m_s;
+    let mut way_m = elapsed_s * config.search_speed_m_s;
     if way_m.is_nan() || way_m < 0.0 {
         return Vector::zero();
     }
@@ -41,10 +40,12 @@ pub fn velocity(
         return Vector::new(north, east, 0.0) * config.search_speed_m_s;
     }
     way_m -= upwind_m;
-    // The corner after leg n lies at most (n + 1) / 2 spacings from the start along either axis.
-    let legs = (2.0 * config.search_radius_m / config.search_spacing_m).floor() as u32;
-    for leg in 1..=legs {
-        let length_m = config.search_spacing_m * f64::from(leg.div_ceil(2));
+    // Four legs are one round, whose corners lie a spacing farther out; one more closes the last round.
+    let spacing_m = config.search_spacing_m.min(config.search_radius_m);
+    let rounds = (config.search_radius_m / spacing_m).floor() as u32;
+    for leg in 1..=4 * rounds + 1 {
+        let spacings = if leg > 4 * rounds { 2 * rounds } else { leg.div_ceil(2) };
+        let length_m = spacing_m * f64::from(spacings);
         if way_m < length_m {
             let direction = first_leg_rad + f64::from(leg - 1) * std::f64::consts::FRAC_PI_2;
             let (east, north) = direction.sin_cos();
@@ -72,8 +73,10 @@ mod tests {
         let farthest = path.iter().map(|p| p.x().hypot(p.y())).fold(0.0, f64::max);
         assert!(farthest <= config.search_radius_m * std::f64::consts::SQRT_2 + 0.1, "{farthest}");
         // Whatever lies within the square that is flown comes within the spacing of the path.
-        let reach = config.search_radius_m - config.search_spacing_m;
-        for (x, y) in [(0.0, 0.0), (reach, 0.0), (0.0, reach), (-reach, 0.0), (0.0, -reach)] {
+        let reach = config.search_radius_m - 0.5 * config.search_spacing_m;
+        for (x, y) in
+            [(0.0, 0.0), (reach, 0.0), (0.0, reach), (-reach, 0.0), (0.0, -reach), (2.5, -3.5)]
+        {
             let nearest =
                 path.iter().map(|p| (p.x() - x).hypot(p.y() - y)).fold(f64::MAX, f64::min);
             assert!(nearest < config.search_spacing_m, "({x}, {y}) is {nearest} m from the path");

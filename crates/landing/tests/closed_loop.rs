@@ -303,6 +303,24 @@ fn a_lander_started_in_mid_air_takes_the_landing_up() {
 }
 
 #[test]
+fn a_lander_started_low_and_out_of_sight_of_the_pad_climbs_to_find_it() {
+    for seed in 0..24u32 {
+        let (sin, cos) = (f64::from(seed) * 2.399).sin_cos();
+        let away_m = 1.5 + 0.1 * f64::from(seed);
+        let start = Point::new(1.5 + away_m * cos, -1.5 + away_m * sin, -2.1);
+        let flight = Scene { start, ..Scene::windy(u64::from(seed), 3.0, 1.0) }.fly();
+        let highest_m = flight.samples.iter().fold(0.0, |m: f64, s| m.max(-s.position.z()));
+        assert_eq!(flight.phase, Phase::Landed, "from {start:?}");
+        assert!(flight.error_m < 0.15 && highest_m < 6.0, "{} {highest_m}", flight.error_m);
+    }
+    let mut fenced = Scene { start: Point::new(-1.5, 1.5, -2.1), ..Scene::new(1) };
+    fenced.config.phases.fence_height_m = 4.0;
+    let flight = fenced.fly();
+    assert!(flight.samples.iter().all(|s| s.position.z() > -4.3));
+    assert_eq!(flight.phase, Phase::Landed);
+}
+
+#[test]
 fn the_thesis_landing_takes_about_its_55_seconds() {
     let calm = |scene: Scene| Scene { estimator: Estimator::PERFECT, ..scene };
     let flights = fly(0..20, |seed| calm(thesis(seed, ThesisConfig::default())));
