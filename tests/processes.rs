@@ -13,7 +13,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use messages::{ControllerCommand, topic};
+use messages::{ControllerCommand, DetectorCommand, topic};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::flight::{
@@ -154,6 +154,10 @@ async fn the_operators_choice_of_detector_is_followed_and_a_wrong_one_refused() 
     landing
         .status("the spare one is active", |s| s.active_detector.as_deref() == Some("spare"))
         .await?;
+    // The landing goes on without the one that it was begun with, be it before the take-off.
+    let stopped =
+        landing.node.command(topic::DETECTOR_COMMAND, &["main"], &DetectorCommand::Stop).await?;
+    ensure!(stopped.accepted, "{stopped:?}");
     // Hold and resume on the way down.
     landing.descends_below(9.0).await?;
     let hold = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Hold).await?;

@@ -1,7 +1,6 @@
 //! Detectors that come, go, are swapped and die in flight; and one that is written in Python.
 //!
-//! The long versions are ignored: `cargo test --test swap -- --ignored --nocapture`; the numbers of swaps and of
-//! flights with kills are in ALIGHT_SWAPS and ALIGHT_KILLS.
+//! The long version is ignored: `ALIGHT_SWAPS=100 cargo test --release --test swap -- --ignored --nocapture`.
 
 #![expect(
     clippy::print_stdout,
@@ -12,12 +11,12 @@ mod flight;
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use messages::{
-    ControllerCommand, ControllerStatus, Detections, DetectorCommand, DetectorState, Health,
-    TargetEstimate, topic,
+    ControllerCommand, Detections, DetectorCommand, DetectorState, Health, TargetEstimate, topic,
 };
 use node::{Identity, Node, Subscriber, ZenohSource, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
@@ -57,19 +56,17 @@ fn detectors(landing: &Landing, args: &[&str]) -> anyhow::Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// How often something was counted by the controller, by its latest health.
-async fn counted(healths: &Subscriber<Health>, what: &str) -> anyhow::Result<u64> {
+/// The latest health, and the next second's if that is none of now.
+async fn latest(healths: &Subscriber<Health>) -> anyhow::Result<Health> {
     let mut last = None;
-    // What has arrived meanwhile, and the next second's.
-    while let Ok(Some(health)) = timeout(Duration::from_millis(1500), healths.next()).await {
+    while let Ok(Some(health)) = timeout(PATIENCE, healths.next()).await {
         let is_fresh = seconds(now_ns() - health.stamp_ns) < 0.5;
         last = Some(health);
         if is_fresh {
             break;
         }
     }
-    let rates = last.context("no health of the controller")?.rates;
-    Ok(rates.iter().find(|rate| rate.name == what).map_or(0, |rate| rate.count))
+    last.context("no health of the controller")
 }
 
 async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Result<()> {
@@ -78,66 +75,189 @@ async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Resul
     Ok(())
 }
 
-/// Two versions of a detector, as files.
-fn versions(directory: &Path) -> anyhow::Result<[PathBuf; 2]> {
-    let [a, b] = ["a.toml", "b.toml"].map(|name| directory.join(name));
-    std::fs::write(&a, "id = \"version-a\"\n[tracking]\nenabled = true\n")?;
-    std::fs::write(&b, "id = \"version-b\"\nleast_confidence = 0.05\n")?;
-    Ok([a, b])
+/// A pad of two families: rings in its middle, an AprilTag beside them.
+const RINGS: &str = "[[markers]]\nmarker = \"rings:0.15341\"\n";
+const TAG: &str = "[[markers]]\nmarker = \"apriltag-36h11:3:0.12\"\nx_m = 0.17\n";
+
+/// The pad as it lies there, and four detectors of it as files: two families, each in two versions.
+fn pad_and_detectors(directory: &Path) -> anyhow::Result<(PathBuf, Vec<PathBuf>)> {
+    let write = |name: &str, text: String| -> anyhow::Result<PathBuf> {
+        let file = directory.join(name);
+        std::fs::write(&file, text)?;
+        Ok(file)
+    };
+    let pad = write("pad.toml", format!("id = 5\n{RINGS}{TAG}"))?;
+    let mut detectors = Vec::new();
+    for (version, settings) in
+        [("a", "[tracking]\nenabled = true\n"), ("b", "least_confidence = 0.05\n")]
+    {
+        for (family, marker) in [("rings", RINGS), ("tag", TAG)] {
+            let part = write(&format!("{family}.toml"), format!("id = 5\n{marker}"))?;
+            let part = toml_text(&part)?;
+            detectors.push(write(
+                &format!("{family}-{version}.toml"),
+                format!("id = \"{family}-{version}\"\nmarkers = []\npads = [{part}]\n{settings}"),
+            )?);
+        }
+    }
+    Ok((pad, detectors))
 }
 
+fn toml_text(path: &Path) -> anyhow::Result<String> {
+    Ok(format!("'{}'", path.to_str().context("a path")?))
+}
+
+const TICKS: &str = "ticks";
 const STALE: &str = "ticks without a fresh frame";
 const MISSED: &str = "ticks without a fresh frame although there was one";
+/// Age from which on a frame is not fresh: the controller's `detectors.max_age_s`.
+const FRESH_NS: i64 = 200_000_000;
 
-/// Holds over the pad, swaps again and again, and lands.
+/// Ticks of a controller: all, those without a fresh frame, and of these those although there was one.
+#[derive(Clone, Copy, Default)]
+struct Ticks([u64; 3]);
+
+impl Ticks {
+    async fn now(healths: &Subscriber<Health>) -> anyhow::Result<Self> {
+        let mut ticks = [0; 3];
+        let rates = latest(healths).await?.rates;
+        for (count, name) in ticks.iter_mut().zip([TICKS, STALE, MISSED]) {
+            *count = rates.iter().find(|rate| rate.name == name).map_or(0, |rate| rate.count);
+        }
+        Ok(Self(ticks))
+    }
+
+    fn add_since(&mut self, before: Self, after: Self) {
+        for (sum, (after, before)) in self.0.iter_mut().zip(after.0.into_iter().zip(before.0)) {
+            *sum += after - before;
+        }
+    }
+}
+
+impl std::fmt::Display for Ticks {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self([all, stale, missed]) = self;
+        write!(
+            f,
+            "{all} ticks, {stale} without a fresh frame, {missed} of them although there was one"
+        )
+    }
+}
+
+/// What was heard of any detector: when, and of which frame.
+#[derive(Clone, Copy)]
+struct Heard {
+    at_ns: i64,
+    stamp_ns: i64,
+    sequence: u64,
+}
+
+/// Notes all detections from now on.
+async fn listen(node: &Node) -> anyhow::Result<Arc<Mutex<Vec<Heard>>>> {
+    let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
+    let heard = Arc::new(Mutex::new(Vec::new()));
+    let noted = Arc::clone(&heard);
+    tokio::spawn(async move {
+        while let Some(message) = detections.next().await {
+            let Detections { header, .. } = message;
+            let heard =
+                Heard { at_ns: now_ns(), stamp_ns: header.stamp_ns, sequence: header.sequence };
+            noted.lock().unwrap_or_else(PoisonError::into_inner).push(heard);
+        }
+    });
+    Ok(heard)
+}
+
+/// The times in which no detector had told of a fresh frame, each with its length in ms and its cause.
+fn droughts(heard: &[Heard]) -> Vec<(i64, f64, String)> {
+    let mut droughts = Vec::new();
+    let Some(mut newest) = heard.first().copied() else { return droughts };
+    for next in heard {
+        if next.stamp_ns <= newest.stamp_ns {
+            continue;
+        }
+        let over_ns = next.at_ns - newest.stamp_ns - FRESH_NS;
+        if over_ns > 0 {
+            let ms = |ns: i64| ns as f64 * 1e-6;
+            let cause = format!(
+                "{:.0} ms and {} frames after the last one, heard {:.0} ms later",
+                ms(next.stamp_ns - newest.stamp_ns),
+                next.sequence - newest.sequence,
+                ms(next.at_ns - next.stamp_ns),
+            );
+            droughts.push((next.at_ns, ms(over_ns), cause));
+        }
+        newest = *next;
+    }
+    droughts
+}
+
+/// Holds over the pad, swaps detectors of two families again and again, and lands. Between the swaps, for half as long,
+/// the same hold without them.
 async fn swaps(number: usize) -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
     let directory = tempfile::tempdir()?;
-    let versions = versions(directory.path())?;
+    let (pad, detectors) = pad_and_detectors(directory.path())?;
     let mut outliving = Outliving::default();
     let long = [
         "--timeout-s",
         "3000",
         "--set",
-        "controller.phases.hold_timeout_s=600",
+        "controller.phases.operator_hold_timeout_s=3600",
         "--set",
         "controller.phases.landing_timeout_s=3000",
+        "--pad",
+        pad.to_str().context("a path")?,
     ];
     let landing = Landing::start(&[&["--seed", "21"], &long[..]].concat()).await?;
     let healths = landing.node.subscriber(topic::HEALTH, &["controller", "main"]).await?;
+    let heard = listen(&landing.node).await?;
     landing.descends_below(7.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
     landing.status("it holds", |s| s.phase == "hold").await?;
-    let before = (counted(&healths, STALE).await?, counted(&healths, MISSED).await?);
     let mut used = "main".to_owned();
     let mut took_s = Vec::new();
+    let (mut with, mut without) = (Ticks::default(), Ticks::default());
+    let mut marks = Vec::new();
     for i in 0..number {
-        if i % 25 == 24 && i + 3 < number {
-            // A hold must not end by its own patience.
-            command(&landing, ControllerCommand::Resume).await?;
-            command(&landing, ControllerCommand::Hold).await?;
-        }
-        let file = versions[i % 2].to_str().context("a path")?;
+        let before = Ticks::now(&healths).await?;
+        let began_ns = now_ns();
+        let file = detectors[i % detectors.len()].to_str().context("a path")?;
         let (is_done, report) = tokio::task::block_in_place(|| swap(&landing, file))?;
         outliving.0.extend(report["pid"].as_i64().and_then(|pid| Pid::from_raw(pid as i32)));
         ensure!(is_done && report["swapped"] == true, "swap {i}: {report}");
         ensure!(report["from"] == used.as_str() && report["old_stopped"] == true, "{report}");
         used = report["to"].as_str().context("a name")?.to_owned();
-        took_s.extend(report["active_s"].as_f64());
+        let at = |key: &str| report[key].as_f64().unwrap_or_default();
+        let ended_s = seconds(now_ns() - began_ns);
+        // The program itself starts first, and the last thing it does is to wait for the end of the old one.
+        marks.push((began_ns, [at("ready_s"), at("agreed_s"), at("active_s")], ended_s));
+        took_s.push(at("active_s"));
+        let after = Ticks::now(&healths).await?;
+        with.add_since(before, after);
         if i + 3 == number {
             command(&landing, ControllerCommand::Resume).await?;
+        } else if i + 3 < number {
+            sleep(Duration::from_secs_f64(0.5 * ended_s)).await;
+            without.add_since(after, Ticks::now(&healths).await?);
         }
     }
-    let after = (counted(&healths, STALE).await?, counted(&healths, MISSED).await?);
     took_s.sort_by(f64::total_cmp);
     println!(
-        "{number} swaps, {:.1} s each; ticks {}, without a fresh frame {}, although there was one {}",
+        "{number} swaps, in use after {:.1} s each; with them {with}; beside them {without}",
         took_s.get(took_s.len() / 2).copied().unwrap_or_default(),
-        counted(&healths, "ticks").await.unwrap_or_default(),
-        after.0 - before.0,
-        after.1 - before.1
     );
-    ensure!(after.1 == before.1, "{} ticks missed a frame that was there", after.1 - before.1);
+    let heard = heard.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    for (at_ns, over_ms, cause) in droughts(&heard) {
+        let swap = marks.iter().find(|(began_ns, _, ended_s)| {
+            (0.0..*ended_s + 0.2).contains(&seconds(at_ns - began_ns))
+        });
+        let when = swap.map_or("beside the swaps".to_owned(), |(began_ns, at_s, _)| {
+            format!("{:.2} s into a swap {at_s:.2?}", seconds(at_ns - began_ns))
+        });
+        println!("no fresh frame for {over_ms:.0} ms {when}: the next was taken {cause}");
+    }
+    ensure!(with.0[2] == 0, "{} ticks missed a frame that was there", with.0[2]);
     let result = landing.lands().await?;
     println!("{result}");
     Ok(())
@@ -247,122 +367,6 @@ async fn a_detector_in_python_lands_it() -> anyhow::Result<()> {
     let _ = python.wait();
     flown?;
     ensure!(ended.is_some_and(|status| status.success()), "{ended:?} after it was told to stop");
-    Ok(())
-}
-
-/// Waits until a status holds; the answer is how long after a moment.
-async fn after(
-    landing: &Landing,
-    since_ns: i64,
-    what: &str,
-    holds: impl Fn(&ControllerStatus) -> bool,
-) -> anyhow::Result<f64> {
-    let status = landing.status(what, |s| s.stamp_ns > since_ns && holds(s)).await?;
-    Ok(seconds(status.stamp_ns - since_ns))
-}
-
-/// What was noticed how long after a kill, and when all was well again, in seconds.
-type Times = Vec<(&'static str, f64, f64)>;
-
-/// One flight in which each process is killed once, at a moment of its own.
-async fn kills(round: u64, times: &mut Times) -> anyhow::Result<()> {
-    let seed = (30 + round).to_string();
-    let mut landing = Landing::start(&["--seed", &seed]).await?;
-    let presence = landing.node.presence("gcs-bridge").await?;
-    let active =
-        |name: &'static str| move |s: &ControllerStatus| s.active_detector.as_deref() == Some(name);
-    landing.status("the first detector is used", active("main")).await?;
-    let shadow = landing.start_by_hand("detector", &["id=spare"])?;
-    let is_shadow = |s: &ControllerStatus| {
-        s.candidates.iter().any(|c| c.detector == "spare" && c.state == DetectorState::Shadow)
-    };
-    landing.status("the second stands by", is_shadow).await?;
-    landing.status("it has taken off", |s| s.phase != "takeoff" && s.phase != "idle").await?;
-    // A moment that differs from round to round, by less than a frame and by more.
-    sleep(Duration::from_millis(300 + round * 137 % 900)).await;
-
-    kill_process(shadow, Signal::KILL)?;
-    let killed_ns = now_ns();
-    let gone =
-        |s: &ControllerStatus| s.candidates.iter().all(|c| c.detector != "spare" || !c.alive);
-    let noticed_s = after(&landing, killed_ns, "the shadow's end is noticed", gone).await?;
-    landing.start_by_hand("detector", &["id=spare"])?;
-    let back_s = after(&landing, killed_ns, "the shadow is back", is_shadow).await?;
-    times.push(("detector in shadow", noticed_s, back_s));
-
-    sleep(Duration::from_millis(round * 71 % 400)).await;
-    let killed_ns = landing.kill("detector")?;
-    let noticed_s = after(&landing, killed_ns, "the spare one is used", active("spare")).await?;
-    let fresh = |s: &ControllerStatus| {
-        s.active_detector.as_deref() == Some("spare")
-            && s.detection_age_ms.is_some_and(|age| age < 250.0)
-    };
-    let well_s = after(&landing, killed_ns, "its detections are used", fresh).await?;
-    times.push(("detector in use", noticed_s, well_s));
-
-    let killed_ns = landing.kill("gcs-bridge")?;
-    let left = async { while presence.next().await.is_some_and(|(_, alive)| alive) {} };
-    timeout(PATIENCE, left).await?;
-    let noticed_s = seconds(now_ns() - killed_ns);
-    landing.start_by_hand("gcs-bridge", &[])?;
-    timeout(PATIENCE, presence.next()).await?;
-    times.push(("gcs-bridge", noticed_s, seconds(now_ns() - killed_ns)));
-
-    sleep(Duration::from_millis(round * 53 % 400)).await;
-    let killed_ns = landing.kill("controller")?;
-    // Its supervisor notices the end of the process at once.
-    landing.start_by_hand("controller", &[])?;
-    let lands_again = |s: &ControllerStatus| {
-        s.started_ns.is_some() && s.setpoint.is_some() || s.phase == "landed"
-    };
-    let well_s = after(&landing, killed_ns, "the next controller steers", lands_again).await?;
-    times.push(("controller", 0.0, well_s));
-    let result = landing.lands().await?;
-    let speed_m_s = result["touchdown_speed_m_s"].as_f64().context("a speed")?;
-    ensure!(speed_m_s < 1.0, "touched down at {speed_m_s} m/s");
-    Ok(())
-}
-
-fn print_times(times: &Times) {
-    println!(
-        "{:20} {:>5} {:>22} {:>22}",
-        "killed", "times", "noticed, median / max", "well, median / max"
-    );
-    for name in ["detector in shadow", "detector in use", "gcs-bridge", "controller"] {
-        let column = |pick: fn(&(&'static str, f64, f64)) -> f64| {
-            let mut column: Vec<f64> = times.iter().filter(|it| it.0 == name).map(pick).collect();
-            column.sort_by(f64::total_cmp);
-            let median = column.get(column.len() / 2).copied().unwrap_or_default();
-            (
-                column.len(),
-                format!("{median:.2} / {:.2} s", column.last().copied().unwrap_or_default()),
-            )
-        };
-        let ((number, noticed), (_, well)) = (column(|it| it.1), column(|it| it.2));
-        println!("{name:20} {number:>5} {noticed:>22} {well:>22}");
-    }
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn processes_that_are_killed_are_missed_and_replaced_and_it_lands() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
-    let mut times = Times::new();
-    kills(0, &mut times).await?;
-    print_times(&times);
-    Ok(())
-}
-
-#[tokio::test(flavor = "multi_thread")]
-#[ignore = "takes ten minutes"]
-async fn processes_are_killed_at_many_moments() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
-    let rounds = std::env::var("ALIGHT_KILLS").ok().and_then(|text| text.parse().ok());
-    let mut times = Times::new();
-    for round in 1..=rounds.unwrap_or(20) {
-        let flown = kills(round, &mut times).await;
-        print_times(&times);
-        flown.with_context(|| format!("round {round}"))?;
-    }
     Ok(())
 }
 

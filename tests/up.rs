@@ -8,7 +8,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, ensure};
-use messages::{VehicleState, topic};
+use messages::{DetectorCommand, VehicleState, topic};
 use node::{Identity, Network, Node, Subscriber};
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 use tokio::sync::mpsc;
@@ -210,6 +210,28 @@ async fn two_roles_meet_what_dies_comes_back_and_the_end_is_orderly() -> anyhow:
     drone.says("relay", "again in").await?;
     processes.push(drone.process("relay").await?);
 
+    // A detector that was asked to stop stays away while another one stands in for it, and no longer.
+    let mut other = Command::new(ALIGHT)
+        .args(["detector", "--meet", &meet.to_string(), "--vehicle", "tested"])
+        .args(["--set", "id=other"])
+        .stdin(Stdio::null())
+        .spawn()?;
+    let relieved = async {
+        change("other", true).await?;
+        let stop = &DetectorCommand::Stop;
+        let reply = node.command(topic::DETECTOR_COMMAND, &["onboard"], stop).await?;
+        ensure!(reply.accepted, "{reply:?}");
+        drone.says("detector", "`other` stands in for it").await?;
+        change("onboard", false).await
+    };
+    let relieved = relieved.await;
+    other.kill()?;
+    other.wait()?;
+    relieved?;
+    drone.says("detector", "nobody stands in for it").await?;
+    processes.push(drone.process("detector").await?);
+    change("onboard", true).await?;
+
     // A controller comes back waiting for a command: there was no landing to be taken up.
     let controller = processes[3];
     kill_process(controller, Signal::KILL)?;
@@ -262,6 +284,30 @@ fn a_dry_run_says_what_would_be_run_and_a_mistake_is_named() -> anyhow::Result<(
     let output = alight(folder.path(), &["up", "drone", "--dry-run"])?;
     let text = String::from_utf8_lossy(&output.stderr);
     ensure!(output.status.code() == Some(2) && text.contains("detectr"), "{output:?}");
+    Ok(())
+}
+
+#[test]
+fn the_units_are_as_systemd_wants_them() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let deploy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
+    let mut command = Command::new("systemd-analyze");
+    command.arg("verify");
+    for role in ["drone", "ground", "relay"] {
+        let name = format!("alight-{role}.service");
+        let unit = std::fs::read_to_string(deploy.join(&name))?;
+        ensure!(unit.contains(&format!("/usr/local/bin/alight up {role} ")), "{unit}");
+        // It also looks whether the program is there.
+        std::fs::write(folder.path().join(&name), unit.replace("/usr/local/bin/alight", ALIGHT))?;
+        command.arg(folder.path().join(&name));
+    }
+    let Ok(output) = command.output() else {
+        println!("skipped: systemd-analyze is missing");
+        return Ok(());
+    };
+    let said = String::from_utf8_lossy(&output.stderr);
+    println!("{said}");
+    ensure!(!said.contains("alight-"), "{said}");
     Ok(())
 }
 

@@ -206,7 +206,7 @@ async fn fly(args: &LandArgs, settings: &Settings) -> anyhow::Result<Flight> {
         progress.debug(&started);
     }
     let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s);
-    let watched = watch(&node, &mut children, &mut progress, shutdown, deadline).await;
+    let watched = watch(&node, settings, &mut children, &mut progress, shutdown, deadline).await;
     progress.finish();
     children.stop().await;
     node.close().await;
@@ -216,6 +216,7 @@ async fn fly(args: &LandArgs, settings: &Settings) -> anyhow::Result<Flight> {
 /// Follows the landing until it is over.
 async fn watch(
     node: &Node,
+    settings: &Settings,
     children: &mut Children<Service>,
     progress: &mut Progress,
     shutdown: Shutdown,
@@ -249,7 +250,12 @@ async fn watch(
                     }
                     progress.say(&format!("{} ended: {end}{}", service.name(), remedy(service)));
                     // Nobody flies by the ground station, so its end is no reason to leave a vehicle that takes off.
-                    let is_needed = service != Service::GcsBridge;
+                    let is_needed = match service {
+                        Service::GcsBridge => false,
+                        // One that was swapped away, or whose place another one has taken.
+                        Service::Detector => !another_detector(node, settings).await?,
+                        _ => true,
+                    };
                     if service == Service::Simulator || is_needed && flight.never_flew() {
                         bail!("{} ended before the landing: {end}; its last words are above", service.name());
                     }
@@ -268,6 +274,13 @@ async fn watch(
             }
         }
     }
+}
+
+/// True when there is a detector beside the one that was started here.
+async fn another_detector(node: &Node, settings: &Settings) -> anyhow::Result<bool> {
+    let own = Layers { file: None, set: settings.of(Service::Detector).to_vec() };
+    let own = own.load::<detector::Config>()?.settings.id;
+    Ok(node.alive("detector", "*").await?.iter().any(|other| *other != own))
 }
 
 /// What can be done about the end of a service.

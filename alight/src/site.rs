@@ -152,6 +152,13 @@ impl Site {
         }
     }
 
+    /// What tells the supervisor of a role from others on the same machine.
+    pub(crate) fn instance(&self, role: Role) -> String {
+        let vehicle = self.vehicle.as_deref().unwrap_or("drone");
+        let meet = self.meet.unwrap_or(node::session::LOCAL_PORT);
+        format!("{}-{vehicle}-{meet}", role.name())
+    }
+
     /// What runs in a role, in the order in which it is started.
     ///
     /// # Errors
@@ -236,10 +243,14 @@ impl Site {
                 "it needs either `run`, a service, or `command`, a program with its arguments"
             ),
         };
-        let layers = Layers {
+        let mut layers = Layers {
             file: entry.config.as_ref().map(|file| self.folder.join(file)),
             set: entry.set.clone(),
         };
+        if service == Some(Service::Detector) && role == Role::Ground {
+            // Who prefers the detectors on the ground must be able to tell them.
+            layers.set.insert(0, "place=ground".to_owned());
+        }
         if let Some(service) = service {
             service.effective_config(&layers)?;
         }
@@ -292,6 +303,7 @@ mod tests {
         let jobs = site(SITE).jobs(Role::Ground).unwrap();
         let names: Vec<_> = jobs.iter().map(|job| job.name.as_str()).collect();
         assert_eq!(names, ["detector", "detector-2", "python3"]);
+        assert!(jobs[0].layers.set.contains(&"place=ground".to_owned()), "{:?}", jobs[0].layers);
         let environment = jobs[0].environment();
         assert!(environment.contains(&("ALIGHT_CONNECT", "10.42.0.1:8000".to_owned())));
         let mut between = site(SITE);

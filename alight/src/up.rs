@@ -8,12 +8,13 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use messages::topic;
-use node::{Identity, Node, Shutdown};
+use messages::Place;
+use node::Shutdown;
 use tokio::process::Command;
 use tokio::time::Instant;
 
 use crate::children::{Children, End, News};
+use crate::neighbours::{Memory, Neighbours};
 use crate::services::{self, Service};
 use crate::site::{Job, Role, Site};
 
@@ -86,6 +87,8 @@ fn arguments(job: &Job) -> Vec<String> {
 /// A process and its history.
 struct Watched {
     job: Job,
+    /// Its process number, once it was started.
+    pid: i32,
     ends: VecDeque<Instant>,
     state: State,
 }
@@ -95,10 +98,28 @@ enum State {
     Running,
     /// To be started again at this time.
     Waiting(Instant),
+    /// A detector that was asked to stop: not to be started while another one at its place stands in for it.
+    StoodDown(Place),
     GivenUp,
 }
 
 impl Watched {
+    fn new(job: Job) -> Self {
+        Self { job, pid: 0, ends: VecDeque::new(), state: State::Running }
+    }
+
+    /// What becomes of a detector that has ended in good order because another one was swapped in for it, and what is
+    /// said about it; `None` for any other process and any other end.
+    fn stands_down(&mut self, end: &End, neighbours: &Neighbours, own: &[i32]) -> Option<String> {
+        let place = neighbours.place_of(self.pid).filter(|_| end.status == Some(0))?;
+        let other = neighbours.stand_in(place, own)?;
+        self.state = State::StoodDown(place);
+        let name = &self.job.name;
+        Some(format!(
+            "{name}: was asked to stop, and the detector `{other}` stands in for it; it is started again when that has gone"
+        ))
+    }
+
     /// What becomes of a process that has ended now, and what is said about it.
     fn ended(&mut self, end: &End, now: Instant) -> String {
         self.ends.push_back(now);
@@ -126,14 +147,22 @@ impl Watched {
 
 async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<ExitCode> {
     let shutdown = Shutdown::on_signals()?;
-    let landing = Landing::follow(site, role, &jobs).await?;
+    let memory = Memory::of(&site.instance(role));
+    let neighbours = neighbours(site, role, &jobs, &memory).await?;
     let mut children = Children::new();
-    let mut watched = Vec::new();
-    for (index, job) in jobs.into_iter().enumerate() {
-        start(&mut children, index, &job, None, site)?;
-        watched.push(Watched { job, ends: VecDeque::new(), state: State::Running });
+    let mut watched: Vec<Watched> = jobs.into_iter().map(Watched::new).collect();
+    // After a supervisor that was killed the landing goes on.
+    let interrupted = memory.landing();
+    if interrupted {
+        say("a landing was under way a moment ago; it is taken up");
     }
-    let everything_given_up = watch(&mut children, &mut watched, &landing, site, shutdown).await?;
+    for (index, first) in watched.iter_mut().enumerate() {
+        let is_controller = first.job.service == Some(Service::Controller);
+        let start_as = (interrupted && is_controller).then_some("airborne");
+        first.pid = start(&mut children, index, &first.job, start_as, site)?;
+    }
+    let everything_given_up =
+        watch(&mut children, &mut watched, neighbours, site, shutdown).await?;
     say("stopping");
     // The last one first: whoever steers stops steering while there still is somebody to hear it.
     for (index, stopped) in watched.iter().enumerate().rev() {
@@ -142,14 +171,33 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
             say(&format!("{}: stopped", stopped.job.name));
         }
     }
+    // Who stops in good order does not want it to be taken up by the next one.
+    memory.note(false);
     Ok(ExitCode::from(u8::from(everything_given_up)))
+}
+
+/// Whoever must be heard so that the processes are started again rightly.
+async fn neighbours(
+    site: &Site,
+    role: Role,
+    jobs: &[Job],
+    memory: &Memory,
+) -> anyhow::Result<Neighbours> {
+    let of = |service| jobs.iter().find(|job| job.service == Some(service));
+    // The memory is that of who steers.
+    let (key, memory) = match (of(Service::Controller), of(Service::Detector)) {
+        (Some(controller), _) => (&controller.key, memory.clone()),
+        (None, Some(detector)) => (&detector.key, Memory::default()),
+        (None, None) => return Ok(Neighbours::none()),
+    };
+    Neighbours::follow(&site.network(role), key, memory).await
 }
 
 /// Starts again what ends, until the end is asked for (false) or nothing is left to be started (true).
 async fn watch(
     children: &mut Children<usize>,
     watched: &mut [Watched],
-    landing: &Landing,
+    mut neighbours: Neighbours,
     site: &Site,
     shutdown: Shutdown,
 ) -> anyhow::Result<bool> {
@@ -159,7 +207,7 @@ async fn watch(
         }
         let due = watched.iter().enumerate().filter_map(|(index, w)| match w.state {
             State::Waiting(at) => Some((at, index)),
-            State::Running | State::GivenUp => None,
+            State::Running | State::StoodDown(_) | State::GivenUp => None,
         });
         let next = due.min();
         let next_start = tokio::time::sleep_until(next.map_or_else(far_away, |(at, _)| at));
@@ -169,20 +217,47 @@ async fn watch(
                 tell(watched, &news);
                 if let News::Ended(index, end) = news {
                     children.forget(&index);
+                    let own = pids(watched);
                     if let Some(ended) = watched.get_mut(index) {
-                        say(&ended.ended(&end, Instant::now()));
+                        let said = ended.stands_down(&end, &neighbours, &own);
+                        say(&said.unwrap_or_else(|| ended.ended(&end, Instant::now())));
                     }
                 }
             }
+            () = neighbours.changed() => relieve(watched, &neighbours),
             () = next_start => {
                 let Some((_, index)) = next else { continue };
                 let Some(again) = watched.get_mut(index) else { continue };
-                let start_as = landing.start_of(&again.job);
-                start(children, index, &again.job, start_as, site)?;
+                let start_as = start_of(&again.job, neighbours.landing());
+                again.pid = start(children, index, &again.job, start_as, site)?;
                 again.state = State::Running;
             }
         }
     }
+}
+
+fn pids(watched: &[Watched]) -> Vec<i32> {
+    watched.iter().map(|watched| watched.pid).collect()
+}
+
+/// Has the detectors that stood down started again for which nobody stands in any more.
+fn relieve(watched: &mut [Watched], neighbours: &Neighbours) {
+    let own = pids(watched);
+    for down in watched {
+        if let State::StoodDown(place) = down.state
+            && neighbours.stand_in(place, &own).is_none()
+        {
+            say(&format!("{}: nobody stands in for it any more; again at once", down.job.name));
+            down.state = State::Waiting(Instant::now());
+        }
+    }
+}
+
+/// How a controller begins when it is started again. It never takes off a second time, and it takes a landing up only
+/// if there was one: a vehicle that is flown in GUIDED by somebody else is not landed.
+fn start_of(job: &Job, landing: bool) -> Option<&'static str> {
+    let is_controller = job.service == Some(Service::Controller);
+    is_controller.then_some(if landing { "airborne" } else { "command" })
 }
 
 fn far_away() -> Instant {
@@ -204,7 +279,7 @@ fn start(
     job: &Job,
     start_as: Option<&str>,
     site: &Site,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<i32> {
     let mut words = arguments(job);
     if let Some(start) = start_as {
         words.extend(["--set".to_owned(), format!("start=\"{start}\"")]);
@@ -226,41 +301,7 @@ fn start(
     let pid = children.spawn(index, command, &job.name)?;
     let as_what = start_as.map_or_else(String::new, |start| format!(", start = \"{start}\""));
     say(&format!("{}: started as process {pid}{as_what}", job.name));
-    Ok(())
-}
-
-/// Knows whether a landing is under way, so that a controller that is started again takes it up, and only then.
-struct Landing {
-    under_way: tokio::sync::watch::Receiver<bool>,
-    _node: Option<Node>,
-}
-
-impl Landing {
-    async fn follow(site: &Site, role: Role, jobs: &[Job]) -> anyhow::Result<Self> {
-        let (sender, under_way) = tokio::sync::watch::channel(false);
-        if !jobs.iter().any(|job| job.service == Some(Service::Controller)) {
-            return Ok(Self { under_way, _node: None });
-        }
-        let identity =
-            Identity { service: "alight", instance: format!("up-{}", std::process::id()) };
-        let node = Node::open(identity, &site.network(role).source("controller")?).await?;
-        let statuses = node.subscriber(topic::STATUS, &[]).await?;
-        tokio::spawn(async move {
-            while let Some(status) = statuses.next().await {
-                sender.send_replace(status.started_ns.is_some() && !status.finished);
-            }
-        });
-        Ok(Self { under_way, _node: Some(node) })
-    }
-
-    /// How a controller begins when it is started again. It never takes off a second time, and it takes a landing up
-    /// only if there was one: a vehicle that is flown in GUIDED by somebody else is not landed.
-    fn start_of(&self, job: &Job) -> Option<&'static str> {
-        if job.service != Some(Service::Controller) {
-            return None;
-        }
-        Some(if *self.under_way.borrow() { "airborne" } else { "command" })
-    }
+    Ok(pid)
 }
 
 #[cfg(test)]
@@ -276,7 +317,7 @@ mod tests {
             key: "detector".to_owned(),
             layers: node::Layers::default(),
         };
-        Watched { job, ends: VecDeque::new(), state: State::Running }
+        Watched::new(job)
     }
 
     fn failure(status: i32) -> End {

@@ -93,8 +93,10 @@ where
 pub fn start_logging(default_level: &str) {
     let ours = std::env::var("ALIGHT_LOG").unwrap_or_else(|_| default_level.to_owned());
     // Zenoh complains about every attempt at the meeting point, by whoever keeps it too; that is how it is meant to work.
+    // It also complains about each message that is still under way to a session that closes ("Route data with unknown
+    // scope", eclipse-zenoh/zenoh issue 1050).
     let filter = EnvFilter::try_new(format!(
-        "zenoh=error,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error,{ours}"
+        "zenoh=error,zenoh::net::routing::dispatcher::pubsub=off,zenoh::api::session=off,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error,{ours}"
     ))
     .unwrap_or_else(|_| EnvFilter::new("info,zenoh=error,zenoh_transport=off"));
     let log = tracing_subscriber::fmt::layer()

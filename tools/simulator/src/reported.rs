@@ -23,14 +23,19 @@ const JUMP_M: f64 = 0.5;
 const LONGEST_PREDICTION_S: f64 = 0.2;
 /// Without SIM_STATE for so long the autopilot's own estimate is used, in seconds.
 const TRUTH_PATIENCE_S: f64 = 1.0;
+/// Who is heard for the first time higher than this over the autopilot's origin has started elsewhere, in metres.
+const STARTED_BELOW_M: f64 = 1.0;
 /// Over the ground by less than this and slower than that is on it, in metres and m/s.
 const ON_GROUND: (f64, f64) = (0.03, 0.05);
 
 /// The vehicle that an autopilot reports.
 #[derive(Debug, Default)]
 pub struct Reported {
-    /// Latitude and longitude in 1e-7 degrees, and altitude in metres, where it was heard first.
+    /// Latitude and longitude in 1e-7 degrees, and altitude in metres, where it was heard first; the autopilot's origin
+    /// if that was in the air.
     home: Option<(i32, i32, f64)>,
+    /// True once `home` was compared with the autopilot's own origin.
+    is_settled: bool,
     past: VecDeque<VehicleTruth>,
     sim_state_s: Option<f64>,
     attitude: Option<(Rotation<Ned, Body>, Vector<Body>)>,
@@ -84,7 +89,10 @@ impl Reported {
             return;
         }
         let altitude_m = f64::from(state.alt);
-        let home = *self.home.get_or_insert((state.lat_int, state.lon_int, altitude_m));
+        let here = (state.lat_int, state.lon_int, altitude_m);
+        let airborne = self.past.back().filter(|last| last.height_m > STARTED_BELOW_M);
+        let origin = || airborne.map_or(here, |last| origin_of(here, last.position));
+        let home = *self.home.get_or_insert_with(origin);
         let told = position_from(home, state.lat_int, state.lon_int, altitude_m);
         let velocity = Vector::new(f64::from(state.vn), f64::from(state.ve), f64::from(state.vd));
         let [roll, pitch, yaw] = [state.roll, state.pitch, state.yaw].map(f64::from);
@@ -114,17 +122,30 @@ impl Reported {
     }
 
     fn local(&mut self, now_s: f64, message: &LOCAL_POSITION_NED_DATA) {
-        if self.is_true(now_s) {
-            return;
-        }
         let [x, y, z] = [message.x, message.y, message.z].map(f64::from);
         let [vx, vy, vz] = [message.vx, message.vy, message.vz].map(f64::from);
         let (position, velocity) = (Point::new(x, y, z), Vector::new(vx, vy, vz));
+        if self.is_true(now_s) {
+            self.settle(position);
+            return;
+        }
         if let Some(attitude) = self.attitude
             && position.is_finite()
             && velocity.is_finite()
         {
             self.push(now_s, position, velocity, attitude);
+        }
+    }
+
+    /// Moves the home to the autopilot's origin when it was taken from a vehicle in the air.
+    fn settle(&mut self, position: Point<Ned>) {
+        if std::mem::replace(&mut self.is_settled, true) || !position.is_finite() {
+            return;
+        }
+        let is_airborne = -position.z() > STARTED_BELOW_M;
+        if let (Some(home), Some(last), true) = (self.home, self.past.back(), is_airborne) {
+            self.home = Some(origin_of(home, Point::origin() + (position - last.position)));
+            self.past.clear();
         }
     }
 
@@ -163,6 +184,15 @@ impl Reported {
             self.past.pop_front();
         }
     }
+}
+
+/// The place from which another one, `here`, lies at `position`.
+fn origin_of(here: (i32, i32, f64), position: Point<Ned>) -> (i32, i32, f64) {
+    let (lat, lon, altitude_m) = here;
+    let shrink = (f64::from(lat) * 1e-7).to_radians().cos();
+    let north_e7 = (position.x() / M_PER_E7).round() as i32;
+    let east_e7 = (position.y() / (M_PER_E7 * shrink)).round() as i32;
+    (lat.saturating_sub(north_e7), lon.saturating_sub(east_e7), altitude_m + position.z())
 }
 
 fn position_from(home: (i32, i32, f64), lat_e7: i32, lon_e7: i32, altitude_m: f64) -> Point<Ned> {
@@ -208,6 +238,31 @@ mod tests {
             vd,
             ..SIM_STATE_DATA::default()
         }))
+    }
+
+    #[test]
+    fn whoever_is_heard_in_the_air_first_has_started_at_the_autopilots_origin() {
+        let attitude = || frame(MavMessage::ATTITUDE(ATTITUDE_DATA::default()));
+        let local = |x: f32, z: f32| {
+            frame(MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
+                x,
+                z,
+                ..LOCAL_POSITION_NED_DATA::default()
+            }))
+        };
+        let told = sim_state(0, 590.0, [0.0; 3]);
+        for order in [
+            [attitude(), local(3.0, -6.0), told.clone()],
+            [told.clone(), attitude(), local(3.0, -6.0)],
+        ] {
+            let mut reported = Reported::default();
+            for (i, packet) in order.iter().chain([&told]).enumerate() {
+                reported.handle(i as f64 * 0.02, packet);
+            }
+            let truth = reported.truth().unwrap();
+            assert!(reported.is_true(0.1), "told by SIM_STATE");
+            assert!((truth.position.x() - 3.0).abs() < 0.02 && (truth.height_m - 6.0).abs() < 0.02);
+        }
     }
 
     #[test]
