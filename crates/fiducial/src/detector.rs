@@ -8,6 +8,7 @@ use crate::observation::{Observation, Stages};
 use crate::rings::Rings;
 use crate::rings_thesis::RingsThesis;
 use crate::square::Squares;
+use crate::square::segments::ImageQuads;
 use crate::stag::Stags;
 use crate::trace::{Trace, TracedMarker};
 
@@ -55,6 +56,7 @@ pub struct Detector {
     stags: Stags,
     rings: Rings,
     thesis: RingsThesis,
+    broken: ImageQuads,
     found: Vec<Observation>,
     trace: Trace,
 }
@@ -81,6 +83,7 @@ impl Detector {
             stags: Stags::new(markers),
             rings: Rings::default(),
             thesis: RingsThesis::default(),
+            broken: ImageQuads::default(),
             found: Vec::new(),
             trace: Trace::default(),
         })
@@ -141,18 +144,21 @@ impl Detector {
             }
         }
         // Who finds nothing has time to look harder.
+        self.broken.begin();
         if self.found.is_empty() && !self.squares.is_empty() {
             let watch = (&mut self.trace, &mut *stages);
-            self.squares.detect_damaged(view, &self.outlines, camera, watch, &mut self.found);
+            let seen = (view, self.outlines.pyramid(), &mut self.broken);
+            self.squares.detect_damaged(seen, camera, watch, &mut self.found);
         }
         if self.found.is_empty() && !self.stags.is_empty() {
-            self.outlines.find(view, &Stags::papers());
-            let (watch, seen) = ((&mut self.trace, &mut *stages), (view, &self.outlines));
+            let first = self.outlines.len();
+            self.outlines.add(view, &Stags::papers(), 0..1);
+            let (watch, seen) = ((&mut self.trace, &mut *stages), (view, &self.outlines, first));
             self.stags.detect_on_paper(seen, camera, watch, &mut self.found);
         }
         if self.found.is_empty() && !self.stags.is_empty() {
             let watch = (&mut self.trace, &mut *stages);
-            let seen = (view, self.outlines.pyramid());
+            let seen = (view, self.outlines.pyramid(), &mut self.broken);
             self.stags.detect_damaged(seen, camera, watch, &mut self.found);
         }
         self.trace.markers.extend(self.found.iter().map(TracedMarker::from));

@@ -18,7 +18,7 @@ pub mod segments;
 mod tables;
 
 use geometry::{CameraModel, Pixel};
-use imaging::{GrayView, Outline, Outlines, bilinear};
+use imaging::{GrayView, Outline, Outlines, Pyramid, bilinear};
 use nalgebra::{Matrix2, SMatrix};
 
 use crate::marker::Marker;
@@ -30,6 +30,7 @@ use crate::square::decode::{Cells, Layout, Look};
 use crate::square::pattern::Pattern;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine};
+use crate::square::segments::ImageQuads;
 use crate::trace::{Reason, Trace};
 
 /// Bounds on the work in one image, far above what frames with markers need.
@@ -199,16 +200,15 @@ impl Squares {
 
     /// Finds the markers that closed outlines do not show, as something hides a part of them; it takes several times as long as
     /// [`Squares::detect`], whose outlines it needs.
-    pub fn detect_damaged(
+    pub(crate) fn detect_damaged(
         &mut self,
-        view: GrayView<'_>,
-        outlines: &Outlines,
+        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
         found: &mut Vec<Observation>,
     ) {
         self.found.clear();
-        self.read_damaged(view, outlines, trace);
+        self.read_damaged((view, pyramid, quads), trace);
         self.observe_all(view, camera, found);
         stages.ended("damaged");
     }
@@ -285,7 +285,11 @@ impl Squares {
 
     /// Looks for the markers that outlines do not show. A family of which any id is wanted is missing when none of it was
     /// found.
-    fn read_damaged(&mut self, view: GrayView<'_>, outlines: &Outlines, trace: &mut Trace) {
+    fn read_damaged(
+        &mut self,
+        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
+        trace: &mut Trace,
+    ) {
         let mut all_found = true;
         for (index, wanted) in self.wanted.iter_mut().enumerate() {
             wanted.missing.clear();
@@ -306,7 +310,7 @@ impl Squares {
             Sought { index, code: wanted.code, ids: (!any).then_some(wanted.missing.as_slice()) }
         });
         let whole = self.found.len();
-        for marker in self.damaged.find(view, outlines.pyramid(), sought) {
+        for marker in self.damaged.find(view, quads.of(view, pyramid), sought) {
             let corners = marker.quad.corners;
             if self.found[..whole].iter().any(|found| is_same(&found.corners, &corners)) {
                 continue;

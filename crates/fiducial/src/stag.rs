@@ -22,6 +22,7 @@ use crate::pose::square_pose;
 use crate::square::codebook::Codebook;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
+use crate::square::segments::ImageQuads;
 use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, unevenness};
 use crate::trace::{Reason, Trace};
 
@@ -174,16 +175,17 @@ impl Stags {
         }
     }
 
-    /// Finds small markers by the outlines of their paper, which were looked for as [`Stags::papers`] says.
+    /// Finds small markers by the outlines of their paper, which were looked for as [`Stags::papers`] says and are those from
+    /// the index `first` on.
     pub(crate) fn detect_on_paper(
         &mut self,
-        (view, outlines): (GrayView<'_>, &Outlines),
+        (view, outlines, first): (GrayView<'_>, &Outlines, usize),
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
         found: &mut Vec<Observation>,
     ) {
         let mut left = MOST_PAPERS;
-        for outline in outlines.iter().filter(|outline| !outline.dark && outline.level == 0) {
+        for outline in outlines.iter().skip(first) {
             let Some(paper) = Quad::of(&outline) else { continue };
             if left == 0 || unevenness(&paper, view, 0) > MOST_UNEVEN {
                 continue;
@@ -208,13 +210,13 @@ impl Stags {
     /// as [`Stags::detect`].
     pub(crate) fn detect_damaged(
         &mut self,
-        (view, pyramid): (GrayView<'_>, &Pyramid),
+        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
         found: &mut Vec<Observation>,
     ) {
         let mut damaged = std::mem::take(&mut self.damaged);
-        let candidates = damaged.find((view, pyramid), |quad| {
+        let candidates = damaged.find(quads.of(view, pyramid), |quad| {
             let reading = self.sampled((view, pyramid), quad, false)?;
             Some((reading, reading.explained * (1.0 - 1.0 / (1.0 + reading.ratio))))
         });

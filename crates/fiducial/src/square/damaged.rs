@@ -1,13 +1,11 @@
 //! Finds square markers that are in part in shadow, washed out, covered or beyond the frame: the slow way, for when
 //! closed outlines do not show them.
 
-use imaging::pyramid::to_level_0;
-use imaging::{GrayView, LeastEdge, Pyramid, Segments};
+use imaging::GrayView;
 
 use super::code::Code;
 use super::erasures::{self, Reading};
 use super::quad::{Quad, diagonal_px, middle, sides_px};
-use super::segments::{Placement, SegmentQuads};
 
 /// The markers of one family that are looked for.
 #[derive(Copy, Clone, Debug)]
@@ -34,15 +32,9 @@ pub struct DamagedMarker {
 /// Finds damaged markers. It keeps its memory from image to image.
 #[derive(Clone, Debug, Default)]
 pub struct Damaged {
-    segments: Segments,
-    quads: SegmentQuads,
     found: Vec<DamagedMarker>,
 }
 
-/// Segments are taken on the finest level of the pyramid with no more pixels than this, and on the next one.
-const MOST_PIXELS: usize = 400_000;
-const LEVELS: usize = 2;
-const LEAST_EDGE: LeastEdge = LeastEdge { gradient: 6, length_px: 5.0 };
 /// Cells that are narrower, in pixels, cannot be told apart one by one.
 const LEAST_CELL_PX: f64 = 2.5;
 /// The most quads that are read in an image, and the most markers that are found.
@@ -50,29 +42,17 @@ const MOST_READ: usize = 100;
 const MOST_FOUND: usize = 64;
 
 impl Damaged {
-    /// The markers in an image, of which `pyramid` was built; the surest first.
+    /// The markers in an image among the quads that its segments make; the surest first.
     pub fn find<'a>(
         &mut self,
         view: GrayView<'_>,
-        pyramid: &Pyramid,
+        quads: &[Quad],
         sought: impl Iterator<Item = Sought<'a>> + Clone,
     ) -> &[DamagedMarker] {
         self.found.clear();
-        let pixels = |level: usize| (view.width() * view.height()) >> (2 * level.min(31));
-        let finest = (0..pyramid.levels()).find(|level| pixels(*level) <= MOST_PIXELS);
-        let finest = finest.unwrap_or(pyramid.levels().saturating_sub(1));
         let mut left = MOST_READ;
-        for level in finest..(finest + LEVELS).min(pyramid.levels()) {
-            let Some(picture) = pyramid.level(view, level) else { continue };
-            let segments = self.segments.find(picture, LEAST_EDGE);
-            let offset = to_level_0(0.0, level) as f32;
-            let placement = Placement { scale: 1.0 + 2.0 * offset, offset };
-            for inverted in [false, true] {
-                let size = [picture.width(), picture.height()];
-                for quad in self.quads.find(segments, size, placement, inverted) {
-                    read(view, &quad.quad, sought.clone(), &mut left, &mut self.found);
-                }
-            }
+        for quad in quads {
+            read(view, quad, sought.clone(), &mut left, &mut self.found);
         }
         self.choose();
         &self.found
@@ -138,8 +118,9 @@ fn is_same_place(a: &Quad, b: &Quad) -> bool {
 mod tests {
     use super::*;
     use crate::marker::Family;
+    use crate::square::segments::ImageQuads;
     use geometry::Pixel;
-    use imaging::GrayImage;
+    use imaging::{GrayImage, Pyramid};
 
     const SIDE: f64 = 80.0;
     const ID: u32 = 7;
@@ -198,7 +179,8 @@ mod tests {
         let view = image.view().unwrap();
         pyramid.build(view, 4, 16);
         let sought = std::iter::once(Sought { index: 0, code, ids });
-        Damaged::default().find(view, &pyramid, sought).to_vec()
+        let mut quads = ImageQuads::default();
+        Damaged::default().find(view, quads.of(view, &pyramid), sought).to_vec()
     }
 
     /// Finds the one marker there is, whatever its turn, with its corners to so many pixels.

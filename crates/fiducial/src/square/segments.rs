@@ -7,7 +7,8 @@
 //! its neighbours.
 
 use geometry::Pixel;
-use imaging::Segment;
+use imaging::pyramid::to_level_0;
+use imaging::{GrayView, LeastEdge, Pyramid, Segment, Segments};
 
 use super::quad::Quad;
 
@@ -28,6 +29,52 @@ pub struct Placement {
     pub scale: f32,
     /// The place of the picture's first pixel in the image.
     pub offset: f32,
+}
+
+/// Segments are taken on the finest level of the pyramid with no more pixels than this, and on the next one.
+const MOST_PIXELS: usize = 400_000;
+const LEVELS: usize = 2;
+const LEAST_EDGE: LeastEdge = LeastEdge { gradient: 6, length_px: 5.0 };
+
+/// The quads that the segments of an image may belong to, which all families share. It keeps its memory from image to
+/// image.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct ImageQuads {
+    segments: Segments,
+    joining: SegmentQuads,
+    quads: Vec<Quad>,
+    is_made: bool,
+}
+
+impl ImageQuads {
+    /// Turns to another image.
+    pub(crate) fn begin(&mut self) {
+        self.is_made = false;
+    }
+
+    /// The quads of the image, of which `pyramid` was built: the finer level first, on each the dark ones first, then the
+    /// best. They are made when they are first asked for.
+    pub(crate) fn of(&mut self, view: GrayView<'_>, pyramid: &Pyramid) -> &[Quad] {
+        if std::mem::replace(&mut self.is_made, true) {
+            return &self.quads;
+        }
+        self.quads.clear();
+        let pixels = |level: usize| (view.width() * view.height()) >> (2 * level.min(31));
+        let finest = (0..pyramid.levels()).find(|level| pixels(*level) <= MOST_PIXELS);
+        let finest = finest.unwrap_or(pyramid.levels().saturating_sub(1));
+        for level in finest..(finest + LEVELS).min(pyramid.levels()) {
+            let Some(picture) = pyramid.level(view, level) else { continue };
+            let segments = self.segments.find(picture, LEAST_EDGE);
+            let offset = to_level_0(0.0, level) as f32;
+            let placement = Placement { scale: 1.0 + 2.0 * offset, offset };
+            let size = [picture.width(), picture.height()];
+            for inverted in [false, true] {
+                let found = self.joining.find(segments, size, placement, inverted);
+                self.quads.extend(found.iter().map(|found| found.quad));
+            }
+        }
+        &self.quads
+    }
 }
 
 /// The most sides, corners and quads that are looked at.
