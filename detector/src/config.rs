@@ -85,10 +85,10 @@ impl Config {
         Detector::new(&markers, settings).map_err(|problem| problem.to_string())
     }
 
-    /// How markers are followed; `None` when they are not.
-    pub fn tracking(&self) -> Option<TrackingSettings> {
+    /// How markers are followed; when they are not, the whole of each frame is searched.
+    pub fn tracking(&self) -> TrackingSettings {
         let TrackingConfig { enabled, full_search_period } = self.tracking;
-        enabled.then_some(TrackingSettings { full_search_period })
+        TrackingSettings { full_search_period: if enabled { full_search_period } else { 1 } }
     }
 
     /// This configuration with one setting changed while the service runs.
@@ -172,7 +172,7 @@ mod tests {
         let changed = config.with("markers", "[\"aruco-4x4-50:7:0.2\"]").unwrap();
         assert_eq!(changed.markers, ["aruco-4x4-50:7:0.2"]);
         let changed = changed.with("tracking.enabled", "true").unwrap();
-        assert!(changed.tracking().is_some() && changed.markers.len() == 1);
+        assert!(changed.tracking().full_search_period > 1 && changed.markers.len() == 1);
         let refused = |key, value| config.with(key, value).unwrap_err();
         assert!(refused("id", "other").contains("start the detector again"));
         assert!(refused("place", "ground").contains("--set place=ground"));

@@ -193,7 +193,7 @@ impl Work {
             pictures: Pictures::default(),
             detector,
             pads,
-            tracker: Tracker::new(config.tracking().unwrap_or_default()),
+            tracker: Tracker::new(config.tracking()),
             overlay: RgbImageBuf::default(),
         })
     }
@@ -308,7 +308,7 @@ impl Work {
         if let Some(Change { config, detector, pads }) = lock(&self.change).take() {
             self.detector = detector;
             self.pads = pads;
-            self.tracker = Tracker::new(config.tracking().unwrap_or_default());
+            self.tracker = Tracker::new(config.tracking());
             self.config = config;
         }
     }
@@ -320,13 +320,8 @@ impl Work {
         clock: &mut StageClock,
     ) -> Vec<Detection> {
         let camera = self.camera_model(header);
-        let found = match self.config.tracking.enabled {
-            true => {
-                let time_s = header.stamp_ns as f64 * 1e-9;
-                self.tracker.detect(&mut self.detector, view, camera.as_ref(), time_s, clock)
-            }
-            false => self.detector.detect(view, camera.as_ref(), clock),
-        };
+        let time_s = header.stamp_ns as f64 * 1e-9;
+        let found = self.tracker.detect(&mut self.detector, view, camera.as_ref(), time_s, clock);
         told(found, &self.pads, camera.as_ref(), self.config.least_confidence)
     }
 
@@ -370,10 +365,7 @@ impl Work {
             if !publisher.has_subscribers().await {
                 continue;
             }
-            let trace = match self.config.tracking.enabled {
-                true => self.tracker.trace(),
-                false => self.detector.trace(),
-            };
+            let trace = self.tracker.trace();
             match *image {
                 "ellipses" => debug::draw_ellipses(view, trace, &mut self.overlay),
                 "rings" => debug::draw_rings(view, trace, &mut self.overlay),

@@ -32,6 +32,37 @@ const INVERTED_FROM: usize = 2;
 /// Of so many quads at most the dots of a STag are read; of frames with markers, more than there are.
 const MOST_STAG_QUADS: usize = 128;
 
+/// What takes long, and is for markers that are not plain to see; it is done when nothing else was found.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) enum SlowPass {
+    /// Arcs of rings that are cut or covered.
+    Arcs,
+    /// Bright specks, which may be the paper of rings far away.
+    Specks,
+    /// Square markers that are damaged.
+    Squares,
+    /// The paper of STags far away.
+    Papers,
+    /// STags that are damaged.
+    Stags,
+}
+
+/// The slow passes that may be made in an image.
+#[derive(Copy, Clone, Debug)]
+pub(crate) enum Allowed {
+    All,
+    One(Option<SlowPass>),
+}
+
+impl Allowed {
+    pub(crate) fn has(self, pass: SlowPass) -> bool {
+        match self {
+            Self::All => true,
+            Self::One(one) => one == Some(pass),
+        }
+    }
+}
+
 /// Why there is no detector for these markers.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum DetectorError {
@@ -59,6 +90,9 @@ pub struct Detector {
     broken: ImageQuads,
     found: Vec<Observation>,
     trace: Trace,
+    /// The slow passes there are for these markers, and how many were made in turn.
+    slow_passes: Vec<SlowPass>,
+    turns: usize,
 }
 
 impl Detector {
@@ -75,17 +109,29 @@ impl Detector {
                 return Err(DetectorError::Twice { name: marker.name() });
             }
         }
+        let (squares, stags) = (Squares::new(markers), Stags::new(markers));
+        let has_rings = markers.iter().any(|marker| marker.family == Family::Rings);
+        let slow_passes = [
+            (SlowPass::Arcs, has_rings),
+            (SlowPass::Squares, !squares.is_empty()),
+            (SlowPass::Specks, has_rings),
+            (SlowPass::Papers, !stags.is_empty()),
+            (SlowPass::Stags, !stags.is_empty()),
+        ];
+        let slow_passes = slow_passes.into_iter().filter(|(_, is_there)| *is_there);
         Ok(Self {
             markers: markers.to_vec(),
             settings,
             outlines: Outlines::default(),
-            squares: Squares::new(markers),
-            stags: Stags::new(markers),
+            squares,
+            stags,
             rings: Rings::default(),
             thesis: RingsThesis::default(),
             broken: ImageQuads::default(),
             found: Vec::new(),
             trace: Trace::default(),
+            slow_passes: slow_passes.map(|(pass, _)| pass).collect(),
+            turns: 0,
         })
     }
 
@@ -95,6 +141,31 @@ impl Detector {
         &mut self,
         view: GrayView<'_>,
         camera: Option<&CameraModel>,
+        stages: &mut impl Stages,
+    ) -> &[Observation] {
+        self.search(view, camera, Allowed::All, stages)
+    }
+
+    /// As [`Detector::detect`], in a stream of images in which nothing was found of late: what takes long is spread over
+    /// the images. When no marker is plain to see, one of up to five slow passes is made, with the next image the next
+    /// one; a marker that is damaged, or very far, is found up to four images later.
+    pub fn detect_in_turn(
+        &mut self,
+        view: GrayView<'_>,
+        camera: Option<&CameraModel>,
+        stages: &mut impl Stages,
+    ) -> &[Observation] {
+        let pass = self.turns.checked_rem(self.slow_passes.len());
+        let pass = pass.and_then(|index| self.slow_passes.get(index).copied());
+        self.turns = self.turns.wrapping_add(1);
+        self.search(view, camera, Allowed::One(pass), stages)
+    }
+
+    fn search(
+        &mut self,
+        view: GrayView<'_>,
+        camera: Option<&CameraModel>,
+        allowed: Allowed,
         stages: &mut impl Stages,
     ) -> &[Observation] {
         self.found.clear();
@@ -135,7 +206,9 @@ impl Detector {
             let seen = (view, &mut self.outlines, !has_quads);
             let found = &mut self.found;
             match marker.family {
-                Family::Rings => self.rings.detect(seen, marker, camera, watch, found),
+                Family::Rings => {
+                    self.rings.detect(seen, marker, (camera, allowed), watch, found);
+                }
                 Family::RingsThesis => {
                     let threshold = self.settings.thesis_threshold;
                     found.extend(self.thesis.detect(view, marker, threshold, camera, watch));
@@ -145,24 +218,29 @@ impl Detector {
         }
         // Who finds nothing has time to look harder.
         self.broken.begin();
-        if self.found.is_empty() && !self.squares.is_empty() {
+        if self.is_open(SlowPass::Squares, allowed) {
             let watch = (&mut self.trace, &mut *stages);
             let seen = (view, self.outlines.pyramid(), &mut self.broken);
             self.squares.detect_damaged(seen, camera, watch, &mut self.found);
         }
-        if self.found.is_empty() && !self.stags.is_empty() {
+        if self.is_open(SlowPass::Papers, allowed) {
             let first = self.outlines.len();
             self.outlines.add(view, &Stags::papers(), 0..1);
             let (watch, seen) = ((&mut self.trace, &mut *stages), (view, &self.outlines, first));
             self.stags.detect_on_paper(seen, camera, watch, &mut self.found);
         }
-        if self.found.is_empty() && !self.stags.is_empty() {
+        if self.is_open(SlowPass::Stags, allowed) {
             let watch = (&mut self.trace, &mut *stages);
             let seen = (view, self.outlines.pyramid(), &mut self.broken);
             self.stags.detect_damaged(seen, camera, watch, &mut self.found);
         }
         self.trace.markers.extend(self.found.iter().map(TracedMarker::from));
         &self.found
+    }
+
+    /// Whether a slow pass is to be made: nothing was found, there is something to look for, and it may be.
+    fn is_open(&self, pass: SlowPass, allowed: Allowed) -> bool {
+        self.found.is_empty() && self.slow_passes.contains(&pass) && allowed.has(pass)
     }
 
     /// What the last detection saw on its way.

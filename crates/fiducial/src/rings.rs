@@ -12,6 +12,7 @@ use geometry::CameraModel;
 use imaging::{Ellipse, GrayView, Outlines, outline};
 
 use crate::circles::{EdgePoint, pixel_covariance, project};
+use crate::detector::{Allowed, SlowPass};
 use crate::lens::{guess_lens, nominal_camera};
 use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, PoseSolution, Stages};
@@ -70,9 +71,13 @@ const SPECKS: outline::Settings = outline::Settings {
 };
 
 impl Stage {
-    /// Whether it is for markers that are cut or hidden in part, or very far.
-    fn is_hard(self) -> bool {
-        matches!(self, Self::Parts | Self::Specks)
+    /// What it is of the detector's slow passes, for markers that are cut or hidden in part, or very far.
+    fn slow_pass(self) -> Option<SlowPass> {
+        match self {
+            Self::Whole(..) => None,
+            Self::Parts => Some(SlowPass::Arcs),
+            Self::Specks => Some(SlowPass::Specks),
+        }
     }
 
     fn name(self) -> &'static str {
@@ -109,11 +114,11 @@ impl Rings {
     /// Finds the markers in an image; the surest comes first. `outlines` has the outlines of that image as other families
     /// share them, or, when it is told to be empty, only its pyramid; what else is looked at is added to it. When markers of
     /// other families are among `found`, only those that are whole are looked for.
-    pub fn detect(
+    pub(crate) fn detect(
         &mut self,
         (view, outlines, is_empty): (GrayView<'_>, &mut Outlines, bool),
         marker: &Marker,
-        camera: Option<&CameraModel>,
+        (camera, allowed): (Option<&CameraModel>, Allowed),
         (trace, stages): (&mut Trace, &mut impl Stages),
         found: &mut Vec<Observation>,
     ) {
@@ -121,8 +126,8 @@ impl Rings {
         let first = found.len();
         for stage in STAGES {
             // Who has something to land on need not look harder.
-            if stage.is_hard() && first > 0 {
-                break;
+            if stage.slow_pass().is_some_and(|pass| first > 0 || !allowed.has(pass)) {
+                continue;
             }
             self.find_candidates((view, outlines, is_empty), stage);
             trace.ellipses.extend(self.borders.iter().map(|b| b.ellipse));

@@ -3,7 +3,8 @@
 //! A marker is expected where a constant velocity takes its centre and its size, in a region that grows with what is
 //! not known of its motion. Only these regions are searched, by the same detector with the same checks as ever, so
 //! that a marker is never made up; the whole image is searched every so often, for markers that are new, and whenever
-//! a marker is not where it was expected.
+//! a marker is not where it was expected. Where nothing is followed, what takes long is done in turn
+//! ([`Detector::detect_in_turn`]).
 
 use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
@@ -38,6 +39,8 @@ pub struct Tracker {
     /// Images since the whole of one was searched.
     since_full: u32,
     size: (usize, usize),
+    /// Whether an image was searched.
+    has_begun: bool,
 }
 
 /// A marker that was seen, and how it moves.
@@ -127,8 +130,15 @@ impl Tracker {
             self.since_full += 1;
         }
         if self.regions.is_empty() || self.is_one_missing(time_s) {
+            // The first image, and one that should show a marker, are searched with all there is.
+            let is_urgent =
+                !self.tracks.is_empty() || !std::mem::replace(&mut self.has_begun, true);
+            let seen = match is_urgent {
+                true => detector.detect(view, camera, stages),
+                false => detector.detect_in_turn(view, camera, stages),
+            };
             self.found.clear();
-            self.found.extend_from_slice(detector.detect(view, camera, stages));
+            self.found.extend_from_slice(seen);
             self.trace.clear();
             self.trace.add_part(detector.trace(), [0.0; 2]);
             self.since_full = 0;

@@ -70,3 +70,54 @@ fn a_marker_that_moves_jumps_and_vanishes_is_followed() {
         assert_eq!(stages.searches, searches, "{i}");
     }
 }
+
+/// Keeps the names of the slow passes' stages.
+#[derive(Default)]
+struct SlowPasses(Vec<&'static str>);
+
+impl fiducial::Stages for SlowPasses {
+    fn ended(&mut self, stage: &'static str) {
+        if ["arcs", "specks", "damaged", "papers"].contains(&stage) {
+            self.0.push(stage);
+        }
+    }
+}
+
+#[test]
+fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
+    let camera = CameraModel::pinhole(648, 486, 909.0);
+    let markers = [
+        format!("rings:{SIZE_M}"),
+        "apriltag-36h11:0:0.2".to_owned(),
+        "stag-hd23:0:0.2".to_owned(),
+    ];
+    let markers = markers.map(|marker| marker.parse().unwrap());
+    let mut detector = Detector::new(&markers, Settings::default()).unwrap();
+    let mut tracker = Tracker::default();
+    // Only arcs of the rings are in view.
+    let mut scene = Scene::new(camera, [0.53, 0.0, 1.5], 0.0, 0.0);
+    scene.seed = 3;
+    let (cut, bare) = (scene.render(), GrayImage::filled(648, 486, 110));
+    let mut passes = Vec::new();
+    let mut found_after = None;
+    for i in 0..16_u32 {
+        let image = if i < 6 { &bare } else { &cut };
+        let mut slow = SlowPasses::default();
+        let view = image.view().unwrap();
+        let time_s = f64::from(i) * 0.05;
+        let found =
+            !tracker.detect(&mut detector, view, Some(&camera), time_s, &mut slow).is_empty();
+        if i == 0 {
+            assert_eq!(slow.0, ["arcs", "specks", "damaged", "papers", "damaged"]);
+        } else {
+            assert_eq!(slow.0.len(), 1, "{i}: {:?}", slow.0);
+            passes.append(&mut slow.0);
+        }
+        if found {
+            found_after = Some(i - 6);
+            break;
+        }
+    }
+    assert_eq!(passes[..5], ["arcs", "damaged", "specks", "papers", "damaged"]);
+    assert!(found_after.is_some_and(|images| images < 5), "{found_after:?}");
+}

@@ -105,6 +105,9 @@ const SHORTEST_EDGE_PX: usize = 24;
 /// Bounds on the work and memory of one level: pixel edges followed per pixel, and points kept per pixel.
 const MOST_STEPS_PER_PIXEL: f32 = 3.0;
 const MOST_POINTS_PER_PIXEL: f32 = 0.3;
+/// There is room from the start for a point and for an outline in so many pixels.
+const POINTS_EVERY: usize = 24;
+const SPANS_EVERY: usize = 500;
 /// Tiny images may have this many anyway.
 const LEAST_BUDGET: usize = 4096;
 
@@ -132,6 +135,11 @@ impl Outlines {
         self.points.clear();
         self.spans.clear();
         self.pyramid.build(view, MOST_LEVELS, SHORTEST_EDGE_PX);
+        // As much as textures have; a frame that has more makes the buffers grow.
+        let pixels = view.width() * view.height();
+        self.points.reserve(pixels / POINTS_EVERY);
+        self.spans.reserve(pixels / SPANS_EVERY);
+        self.path.reserve(2 * (view.width() + view.height()));
     }
 
     /// Adds the outlines on some levels of the image that was begun with; `view` is that image.

@@ -4,6 +4,7 @@ use crate::view::GrayView;
 
 /// The grey value at a place between pixel centres, interpolated linearly both ways; `None` outside the pixels'
 /// centres.
+#[inline]
 pub fn bilinear(view: GrayView<'_>, x: f64, y: f64) -> Option<f64> {
     let (last_x, last_y) = (view.width() - 1, view.height() - 1);
     // Written so that a place that is not a number is outside.

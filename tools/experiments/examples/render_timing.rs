@@ -3,9 +3,8 @@
 #![allow(clippy::print_stdout, reason = "a table for people is what this example is for")]
 
 use std::path::PathBuf;
-use std::sync::OnceLock;
-use std::time::Instant;
 
+use experiments::record::processor_ms;
 use geometry::{Body, Ned, Point, Rotation, Transform};
 use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
 
@@ -39,16 +38,6 @@ fn main() -> Result<(), Failure> {
         }
     }
     Ok(())
-}
-
-/// Time this thread has had a processor, which other processes disturb less than the clock; the clock's where the
-/// system does not tell.
-fn processor_ms() -> f64 {
-    static START: OnceLock<Instant> = OnceLock::new();
-    let clock_ms = || START.get_or_init(Instant::now).elapsed().as_secs_f64() * 1e3;
-    let told = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
-    let running_ns = told.and_then(|text| text.split(' ').next()?.parse::<f64>().ok());
-    running_ns.map_or_else(clock_ms, |ns| ns / 1e6)
 }
 
 /// Renders one view several times.
