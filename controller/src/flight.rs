@@ -220,6 +220,7 @@ impl Flight {
                     let scale = f64::from(header.width) / f64::from(info.width.max(1));
                     info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
                 }),
+                body_from_camera: mount.map(|mount| mount.rotation()),
                 marker,
             };
             self.frames.insert(publisher.to_owned(), frame);
@@ -246,6 +247,7 @@ impl Flight {
             detector: 0,
             image_size: (header.width, header.height),
             focal_px: None,
+            body_from_camera: None,
             marker: Some(marker),
         };
         self.decide(now_ns, LanderEvent::Frame(frame));

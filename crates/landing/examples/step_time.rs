@@ -44,6 +44,7 @@ fn frame(now: Timestamp, ago_s: f64) -> Event {
         detector: 0,
         image_size: (1296, 972),
         focal_px: Some(1818.0),
+        body_from_camera: None,
         marker: Some(marker),
     })
 }

@@ -71,6 +71,8 @@ pub struct TargetEstimate {
     pub time_offset_s: f64,
     /// The newest detection's squared innovation over its covariance: about 3 when all is as expected.
     pub nis: Option<f64>,
+    /// True while the marker is seen more often elsewhere than here: nothing descends.
+    pub contested: bool,
 }
 
 macro_rules! named {
@@ -119,6 +121,8 @@ named! {
         DescendingUnseen = "descending-unseen", "descending on the estimate, the marker is out of view";
         /// No recent detection: the descent stops until there is one.
         TargetAging = "target-aging", "no recent detection, descent stopped";
+        /// The marker is seen at two places, and which is the pad is not decided.
+        Contested = "contested", "the marker is seen at two places, descent stopped until one is seen in most frames";
         /// Low over the marker, waiting for a small error and a small speed.
         Settling = "settling", "settling over the marker before the touchdown";
         /// Low over the marker and settled.

@@ -19,8 +19,14 @@
 //!
 //! A detection is fused at its own stamp: the last [`MEMORY`] detections are kept with the state after each, and one that comes late is put
 //! between them and those after it are fused again. A detection whose normalised innovation squared exceeds the gate is an
-//! outlier. Outliers that agree with each other for long enough are a new estimate: neither a false marker nor a jump is
-//! believed at once, and none is ignored for ever.
+//! outlier.
+//!
+//! Outliers that agree with each other are a rival of the estimate. Of both it is counted in which part of the frames that
+//! show their place the marker was there ([`crate::standing`]). The rival becomes the estimate, and the estimate the rival,
+//! when its part is clearly the larger, over a long enough time: so a pad that is moved is found again within seconds where its
+//! old place is in view, and a second marker is not believed because the first is just out of view. An estimate that was
+//! hardly begun gives way at once; one that was never confirmed for `forget_after_s` is forgotten. While the marker is
+//! elsewhere in most of the frames that show it, the estimate is contested, and nothing descends on it.
 
 use std::collections::VecDeque;
 
@@ -31,6 +37,7 @@ use crate::config::EstimatorConfig;
 use crate::decision::{Rejection, TargetEstimate};
 use crate::event::{Frame, MarkerInFrame};
 use crate::history::{History, Motion};
+use crate::standing::{Standing, View};
 use crate::time::Timestamp;
 
 /// Size of the state: `q`, `u`, `θ`, `τ`.
@@ -46,11 +53,24 @@ pub const MEMORY: usize = 32;
 /// Deviation of a position never measured, in metres.
 const UNKNOWN_M: f64 = 100.0;
 
+/// What a heaving pad's velocity changes by, over its fastest heave, per square root of a second: a wave of 4 to 8 s.
+const HEAVE_CHANGE: f64 = 1.0;
+
+/// Time constant with which the heave of a pad out of view is forgotten, in seconds.
+const HEAVE_S: f64 = 0.8;
+
 /// Two solutions of a flat marker's pose whose normals are equally upright within this angle are not told apart, in radians.
 const UNDECIDED_RAD: f64 = 0.05;
 
-/// A rival detection's distance from the rival before it, as a multiple of what the gate allows a single detection.
+/// A rival detection's distance from the rival before it, beside what both may be wrong by, in metres.
 const RIVAL_GATE_M: f64 = 0.15;
+
+/// A rival that stands for fewer detections than this gives way to the next outlier.
+const RIVAL_LEAST: f64 = 0.5;
+
+/// A rival that stands for so many detections makes an estimate contested that holds less than this part of its frames.
+const CONTENDER: f64 = 2.5;
+const CONTESTED: f64 = 0.5;
 
 type State = SVector<f64, STATES>;
 type Covariance = SMatrix<f64, STATES, STATES>;
@@ -63,7 +83,11 @@ pub struct Estimator {
     past: VecDeque<Fused>,
     detections: u32,
     heading: Option<[f64; 2]>,
+    /// How the estimate stands against its rival; `None` before the first detection.
+    standing: Option<Standing>,
     rival: Option<Rival>,
+    /// What the camera shows, once it is known.
+    view: Option<View>,
     nis: Option<f64>,
 }
 
@@ -94,12 +118,19 @@ struct Sight {
     slip: Vector3<f64>,
 }
 
+/// For whom a frame speaks.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Claim {
+    Estimate,
+    Rival,
+}
+
 /// Outliers that agree with each other.
 #[derive(Copy, Clone, Debug)]
 struct Rival {
     newest: Sight,
     since: Timestamp,
-    detections: u32,
+    standing: Standing,
 }
 
 impl Estimator {
@@ -110,8 +141,19 @@ impl Estimator {
             past: VecDeque::with_capacity(MEMORY + 1),
             detections: 0,
             heading: None,
+            standing: None,
             rival: None,
+            view: None,
             nis: None,
+        }
+    }
+
+    /// Takes note of a frame in which the marker was not found.
+    pub fn miss(&mut self, frame: &Frame, history: &History) {
+        self.view = View::of(frame).or(self.view);
+        if let Some(motion) = history.at(frame.stamp) {
+            self.count(frame.stamp, &motion, None);
+            self.settle(frame.stamp);
         }
     }
 
@@ -129,7 +171,8 @@ impl Estimator {
         self.plausible(from_vehicle)?;
         let in_body = self.noise_in_body(frame, marker, seen) + spread;
         let sight = self.sight(frame.stamp, &motion, from_vehicle, in_body);
-        self.fuse(sight)?;
+        self.view = View::of(frame).or(self.view);
+        self.fuse(sight, &motion)?;
         self.turn_towards(motion.ned_from_body * turned);
         Ok(())
     }
@@ -143,8 +186,15 @@ impl Estimator {
     ) -> Option<TargetEstimate> {
         let Fused { sight, belief } = self.past.back()?;
         let ahead_s = now.seconds_since(sight.stamp).clamp(0.0, self.config.forget_after_s);
-        let velocity = belief.velocity();
-        let place = belief.place() + velocity * ahead_s;
+        let mut velocity = belief.velocity();
+        let mut way = velocity * ahead_s;
+        if self.config.pad_heave_m_s > 0.0 {
+            // What heaves turns back, and nobody sees when.
+            let left = (-ahead_s / HEAVE_S).exp();
+            way.z = velocity.z * HEAVE_S * (1.0 - left);
+            velocity.z *= left;
+        }
+        let place = belief.place() + way;
         let position = Point::new(place.x, place.y, place.z) + way_origin;
         let offset = position - vehicle;
         Some(TargetEstimate {
@@ -158,7 +208,31 @@ impl Estimator {
             heading_rad: self.heading.map(|[north, east]| east.atan2(north)),
             time_offset_s: belief.state[OFFSET],
             nis: self.nis,
+            contested: self.is_contested(),
         })
+    }
+
+    fn is_contested(&self) -> bool {
+        let contender = self.rival.is_some_and(|rival| rival.standing.detections() >= CONTENDER);
+        contender && self.standing.is_some_and(|standing| standing.share() < CONTESTED)
+    }
+
+    /// Counts a frame for the estimate and for its rival, with the marker at the one, the other or neither place.
+    fn count(&mut self, stamp: Timestamp, motion: &Motion, seen: Option<Claim>) {
+        let view = self.view;
+        let is_shown = |place: Vector3<f64>| {
+            let place = Point::new(place.x, place.y, place.z);
+            view.is_none_or(|view| view.shows(place, motion))
+        };
+        if let (Some(standing), Some(newest)) = (&mut self.standing, self.past.back()) {
+            let ahead_s = stamp.seconds_since(newest.sight.stamp);
+            let place = newest.belief.place() + newest.belief.velocity() * ahead_s;
+            standing.count(stamp, is_shown(place), seen == Some(Claim::Estimate));
+        }
+        if let Some(rival) = &mut self.rival {
+            let place = rival.newest.place;
+            rival.standing.count(stamp, is_shown(place), seen == Some(Claim::Rival));
+        }
     }
 
     fn plausible(&self, from_vehicle: Vector<Ned>) -> Result<(), Rejection> {
@@ -233,7 +307,7 @@ impl Estimator {
     }
 
     /// Puts a detection where it belongs in time, and fuses those after it again.
-    fn fuse(&mut self, sight: Sight) -> Result<(), Rejection> {
+    fn fuse(&mut self, sight: Sight, motion: &Motion) -> Result<(), Rejection> {
         let newest = self.past.back().map(|fused| fused.sight.stamp);
         let forgotten = newest
             .is_some_and(|newest| sight.stamp.seconds_since(newest) > self.config.forget_after_s);
@@ -253,9 +327,12 @@ impl Estimator {
         let nis = belief.nis(&sight);
         self.nis = Some(nis);
         if nis > self.config.gate {
-            return self.rival(sight);
+            return self.rival(sight, motion);
         }
-        self.doubt();
+        self.count(sight.stamp, motion, Some(Claim::Estimate));
+        if self.settle(sight.stamp) {
+            return Err(Rejection::Outlier);
+        }
         belief.update(&self.config, &sight);
         self.detections = self.detections.saturating_add(1);
         if self.past.len() == MEMORY {
@@ -281,14 +358,6 @@ impl Estimator {
         }
     }
 
-    /// What agrees with the estimate speaks against its rival, as much as one detection speaks for it.
-    fn doubt(&mut self) {
-        self.rival = self.rival.and_then(|rival| {
-            let detections = rival.detections.saturating_sub(1);
-            (detections > 0).then_some(Rival { detections, ..rival })
-        });
-    }
-
     fn begin(&mut self, sight: Sight) {
         let mut belief = Belief::new(&self.config, sight.place);
         belief.update(&self.config, &sight);
@@ -296,34 +365,58 @@ impl Estimator {
         self.past.push_back(Fused { sight, belief });
         self.detections = 1;
         self.heading = None;
+        self.standing = Some(Standing::new(sight.stamp));
         self.rival = None;
     }
 
-    /// Outliers that agree become the estimate once there are enough more of them than of detections that confirm it, over a
-    /// long enough time; an estimate that was itself hardly begun gives way at once.
-    fn rival(&mut self, sight: Sight) -> Result<(), Rejection> {
-        let agrees = |rival: &Rival| {
-            let gap_s = sight.stamp.seconds_since(rival.newest.stamp);
-            let reach_m = RIVAL_GATE_M
-                + 3.0 * (sight.noise.trace() + rival.newest.noise.trace()).sqrt()
-                + self.config.pad_speed_m_s * gap_s.max(0.0);
-            (0.0..1.0).contains(&gap_s) && (sight.place - rival.newest.place).norm() <= reach_m
-        };
-        let rival = match self.rival.filter(agrees) {
-            Some(rival) => {
-                Rival { newest: sight, detections: rival.detections.saturating_add(1), ..rival }
+    /// An outlier speaks for the rival it agrees with, or is a new one where there is none to speak of.
+    fn rival(&mut self, sight: Sight, motion: &Motion) -> Result<(), Rejection> {
+        let agrees = self.rival.is_some_and(|rival| self.is_same_place(&sight, &rival.newest));
+        self.count(sight.stamp, motion, agrees.then_some(Claim::Rival));
+        match &mut self.rival {
+            Some(rival) if agrees => {
+                if sight.stamp > rival.newest.stamp {
+                    rival.newest = sight;
+                }
             }
-            None => Rival { newest: sight, since: sight.stamp, detections: 1 },
-        };
-        self.rival = Some(rival);
-        let lasted_s = sight.stamp.seconds_since(rival.since);
-        let young = self.detections < self.config.restart_after;
-        let enough = rival.detections >= self.config.restart_after;
-        if enough && (young || lasted_s >= self.config.restart_s) {
-            self.begin(sight);
-            return Ok(());
+            Some(rival) if rival.standing.detections() >= RIVAL_LEAST => {}
+            _ => {
+                let standing = Standing::new(sight.stamp);
+                self.rival = Some(Rival { newest: sight, since: sight.stamp, standing });
+            }
         }
-        Err(Rejection::Outlier)
+        if self.settle(sight.stamp) { Ok(()) } else { Err(Rejection::Outlier) }
+    }
+
+    fn is_same_place(&self, one: &Sight, other: &Sight) -> bool {
+        let gap_s = one.stamp.seconds_since(other.stamp).abs();
+        let reach_m = RIVAL_GATE_M
+            + 3.0 * (one.noise.trace() + other.noise.trace()).sqrt()
+            + (self.config.pad_speed_m_s + self.config.drift_m_s) * gap_s;
+        gap_s <= self.config.forget_after_s && (one.place - other.place).norm() <= reach_m
+    }
+
+    /// True when the rival is the pad by all that was seen.
+    fn gives_way(&self, now: Timestamp) -> bool {
+        let (Some(standing), Some(rival)) = (&self.standing, &self.rival) else { return false };
+        let lasted_s = now.seconds_since(rival.since);
+        let young = self.detections < self.config.restart_after;
+        let enough = self.is_contested()
+            || rival.standing.detections() >= f64::from(self.config.restart_after) - 1.0;
+        enough && (young || lasted_s >= self.config.restart_s) && rival.standing.beats(standing)
+    }
+
+    /// Lets estimate and rival change places when the rival is the pad; true when they did.
+    fn settle(&mut self, now: Timestamp) -> bool {
+        let (Some(rival), Some(standing)) = (self.rival, self.standing) else { return false };
+        if !self.gives_way(now) {
+            return false;
+        }
+        let old = self.past.back().map(|fused| fused.sight);
+        self.begin(rival.newest);
+        self.standing = Some(rival.standing);
+        self.rival = old.map(|newest| Rival { newest, since: newest.stamp, standing });
+        true
     }
 
     /// Largest horizontal deviation so long after the newest detection, in metres.
@@ -431,7 +524,10 @@ impl Belief {
             }
         }
         let level = config.drift_change.hypot(config.pad_acceleration);
-        let upright = config.height_drift_change.hypot(config.pad_acceleration);
+        let upright = config
+            .height_drift_change
+            .hypot(config.pad_acceleration)
+            .hypot(HEAVE_CHANGE * config.pad_heave_m_s);
         for (i, u) in [level, level, upright].into_iter().enumerate() {
             let (u, q) = (u * u, config.way_noise_m.powi(2));
             p[(Q + i, Q + i)] += q * dt_s + u * dt_s.powi(3) / 3.0;
@@ -584,7 +680,14 @@ mod tests {
             };
             let stamp = Timestamp::from_seconds(stamp_s);
             (
-                Frame { stamp, detector: 0, image_size: (1296, 972), focal_px: None, marker: None },
+                Frame {
+                    stamp,
+                    detector: 0,
+                    image_size: (1296, 972),
+                    focal_px: None,
+                    body_from_camera: None,
+                    marker: None,
+                },
                 marker,
             )
         }

@@ -1,12 +1,16 @@
 //! What the lander is told.
 
-use geometry::{Body, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
+use geometry::{Body, Camera, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
 use nalgebra::Matrix3;
 
 use crate::time::Timestamp;
 
 /// Something the lander must know of.
 #[derive(Copy, Clone, Debug, PartialEq)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "told by value, one at a time, and nothing may be allocated in flight"
+)]
 pub enum Event {
     /// The autopilot reported the vehicle's state.
     Vehicle(VehicleState),
@@ -100,6 +104,8 @@ pub struct Frame {
     pub image_size: (u32, u32),
     /// Focal length in pixels, when the camera is calibrated.
     pub focal_px: Option<f64>,
+    /// How the camera is mounted, when that is known.
+    pub body_from_camera: Option<Rotation<Body, Camera>>,
     /// The marker, when it was found.
     pub marker: Option<MarkerInFrame>,
 }

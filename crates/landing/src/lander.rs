@@ -181,6 +181,9 @@ impl Lander {
         let short_px = f64::from(frame.image_size.0.min(frame.image_size.1));
         let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0);
         self.half_view_rad = focal_px.map(|focal_px| (0.5 * short_px / focal_px).atan());
+        if frame.marker.is_none() {
+            self.tracker.miss(frame, &self.history);
+        }
         let seen = frame.marker.map_or(Ok(()), |marker| self.marker(frame, &marker));
         self.tell_guide(frame, seen.is_ok());
         seen
@@ -243,6 +246,11 @@ impl Lander {
         })
     }
 
+    fn pad_moves(&self) -> bool {
+        let estimator = &self.config.estimator;
+        estimator.pad_speed_m_s > 0.0 || estimator.pad_heave_m_s > 0.0
+    }
+
     /// A pad that moves cannot show what the camera does, and the thesis' guidance stays as it was.
     fn tests_itself(&self) -> bool {
         let metric = matches!(self.config.guidance, Guidance::Metric(_));
@@ -301,6 +309,8 @@ impl Lander {
             target: self.target(now),
             age_s: self.sightings.age_s(now),
             half_view_rad: self.half_view_rad,
+            pad_moves: self.pad_moves(),
+            pad_heave_m_s: self.config.estimator.pad_heave_m_s,
             phases: self.config.phases,
         }
     }
@@ -513,6 +523,12 @@ impl Tracker {
 
     fn takes_late_frames(&self) -> bool {
         matches!(self, Self::Filter(_))
+    }
+
+    fn miss(&mut self, frame: &Frame, history: &History) {
+        if let Self::Filter(estimator) = self {
+            estimator.miss(frame, history);
+        }
     }
 
     fn observe(

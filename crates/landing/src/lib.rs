@@ -8,7 +8,7 @@
 //! This crate knows no clock, network, file, thread, log or message, and no autopilot protocol.
 //!
 //! Modules in reading order: [`event`] is what the lander is told and [`decision`] what it answers, [`config`] has
-//! every number; [`lander`] joins [`history`] (the vehicle a moment ago), [`estimator`] (where the landing point is; [`target`] for the thesis' guidance),
+//! every number; [`lander`] joins [`history`] (the vehicle a moment ago), [`estimator`] (where the landing point is, by the `standing` of two places that claim to be it; [`target`] for the thesis' guidance),
 //! [`guidance`] (target to velocity), [`agreement`] (do camera and autopilot mean the same directions), [`phase`] (what comes next), [`search`] (where to look) and [`envelope`] (the last look at a setpoint);
 //! [`time`] has the stamps.
 
@@ -23,6 +23,7 @@ pub mod history;
 pub mod lander;
 pub mod phase;
 pub mod search;
+mod standing;
 pub mod target;
 pub mod time;
 

@@ -76,6 +76,7 @@ impl Target {
                 heading_rad: None,
                 time_offset_s: 0.0,
                 nis: None,
+                contested: false,
             }
         })
     }
@@ -209,6 +210,7 @@ mod tests {
                 detector: 0,
                 image_size: (1296, 972),
                 focal_px: None,
+                body_from_camera: None,
                 marker: Some(marker),
             };
             self.target.observe(&frame, &marker, &self.history)

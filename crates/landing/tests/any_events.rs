@@ -149,6 +149,7 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
             detector: 3,
             image_size: (width, 972),
             focal_px: Some(1818.0),
+            body_from_camera: None,
             marker: centre.map(|c| MarkerInFrame {
                 centre: Pixel::new(c[0], c[1]),
                 body_from_marker: origin

@@ -26,7 +26,7 @@ fn calm_and_wind_are_landed_in_as_declared() {
     for (name, error_m, worst_m, seconds) in [
         ("calm", 0.01, 0.03, 12.3),
         ("wind 5 m/s, turbulence 1", 0.02, 0.06, 14.0),
-        ("wind 5 m/s, turbulence 3", 0.025, 0.08, 14.6),
+        ("wind 5 m/s, turbulence 3", 0.025, 0.08, 14.0),
         ("wind 8 m/s, turbulence 1", 0.04, 0.1, 20.0),
     ] {
         let flights = fly(30, case(&WINDS, name).unwrap());
@@ -64,8 +64,7 @@ fn no_fault_leads_to_an_unsafe_touchdown() {
 #[test]
 fn a_moving_pad_is_landed_on() {
     println!("{HEADER}");
-    // The last, which moves and heaves, is beyond what is declared: some touch down too hard.
-    for (name, scene) in MOVING.into_iter().take(MOVING.len() - 1) {
+    for (name, scene) in MOVING {
         let flights = fly(8, scene);
         println!("{}", row(name, &flights));
         assert!(flights.iter().all(|f| !f.is_unsafe()), "{name}");

@@ -79,6 +79,7 @@ fn events(i: u32) -> (Timestamp, Vec<Event>) {
             detector: 0,
             image_size: (1296, 972),
             focal_px: None,
+            body_from_camera: None,
             marker,
         }));
     }

@@ -55,3 +55,42 @@ fn no_fault_leads_to_an_unsafe_touchdown() {
         assert!(outcome.ending != Ending::Unfinished, "{outcome:?}: {}", planned.command());
     }
 }
+
+/// The flights of these seeds in wind of 4 m/s, from 10 m, as `alight experiment landing` flies them.
+fn with_fault(fault: &str, seeds: &[u64]) -> Vec<Outcome> {
+    let flights = seeds.iter().flat_map(|seed| {
+        let faults = vec![fault.parse().unwrap_or(Fault::NONE)];
+        let wind = Values::List(vec![4.0]);
+        Plan { faults, wind, flights: 1, seed: *seed, ..Plan::default() }.flights()
+    });
+    let outcomes = fly_all(&flights.collect::<Vec<_>>());
+    assert_eq!(outcomes.len(), seeds.len());
+    outcomes
+}
+
+#[test]
+fn a_second_marker_is_not_believed_because_the_first_is_out_of_view() {
+    // In each of these the vehicle leans so that for a while only the wrong marker is in view.
+    for outcome in with_fault("wrong-marker", &[38, 54, 58, 81, 151, 265]) {
+        assert!(outcome.is_within(0.1) || outcome.ending == Ending::Aborted, "{outcome:?}");
+    }
+}
+
+#[test]
+fn a_gust_close_to_the_ground_does_not_end_in_a_sliding_touch() {
+    for outcome in with_fault("gust", &[26, 64, 68, 74, 92, 129]) {
+        assert!(outcome.is_within(0.3), "{outcome:?}");
+        assert!(outcome.slide_m_s.is_some_and(|slide| slide < 0.4), "{outcome:?}");
+    }
+}
+
+#[test]
+fn a_pad_that_heaves_is_touched_gently_and_one_that_moves_is_not_left_again() {
+    for outcome in with_fault("pad-heaves", &[4, 8, 29, 43]) {
+        assert!(outcome.is_within(0.1), "{outcome:?}");
+        assert!(outcome.sink_m_s.is_some_and(|sink| sink <= 0.6), "{outcome:?}");
+    }
+    for outcome in with_fault("pad-moves-4.2", &[3, 19, 24, 31]) {
+        assert!(outcome.is_within(0.1), "{outcome:?}");
+    }
+}

@@ -201,11 +201,27 @@ const TURN_GAIN: f64 = 0.8;
 /// Below this height the vehicle waits for a small error, in metres.
 const LOW_M: f64 = 0.5;
 
+/// Difference between the velocity of the path asked for and the vehicle's that a gust does not explain, in m/s.
+const STEADY_M_S: f64 = 0.3;
+
+/// A touch on a heaving pad is not slower than this, in m/s.
+const SLOWEST_TOUCH_M_S: f64 = 0.3;
+
+/// So far ahead its error is looked at there, in seconds.
+const LOW_LEAD_S: f64 = 0.4;
+
+/// A low vehicle that is pushed out of its funnel makes room at most so fast, in m/s, and in proportion to what it lacks, in 1/s.
+const ROOM_M_S: f64 = 0.5;
+const ROOM_GAIN: f64 = 2.0;
+
 /// A vehicle asked to descend this fast that stands still for so long is on the ground, in m/s and seconds: the first where it
 /// should be near the ground, the second where it may also just be turning from a climb.
 const PUSHING_M_S: f64 = 0.15;
 const STANDING_S: [f64; 2] = [0.4, 0.9];
 const NEAR_M: f64 = 0.3;
+
+/// So near the ground the rest of the way is shorter than another try, and so much more deviation is allowed.
+const COMMITTED: f64 = 1.5;
 
 /// Time constant of the filter over the acceleration, in seconds.
 const SLOPE_S: f64 = 0.05;
@@ -263,9 +279,11 @@ impl Metric {
         self.standing_since = None;
     }
 
-    /// True when the vehicle may go down: the target is recent, or low below and well known.
+    /// True when the vehicle may go down: the target is recent, or low below and well known, and no other place claims to
+    /// be it.
     pub fn may_descend(&self, situation: &Situation<'_>) -> bool {
-        self.sees(situation) || self.is_blind_but_sure(situation)
+        let contested = situation.target.is_some_and(|target| target.contested);
+        !contested && (self.sees(situation) || self.is_blind_but_sure(situation))
     }
 
     /// True when the target's place is good enough to fly to where it must be seen.
@@ -281,9 +299,13 @@ impl Metric {
 
     fn is_blind_but_sure(&self, situation: &Situation<'_>) -> bool {
         situation.target.is_some_and(|target| {
-            self.height_m(&target) <= self.config.blind_height_m
+            let height_m = self.height_m(&target);
+            let patience = if height_m <= NEAR_M { COMMITTED } else { 1.0 };
+            // What presses on something does not climb before it is known to stand there.
+            let stands = self.standing_since.is_some() && height_m <= NEAR_M;
+            height_m <= self.config.blind_height_m
                 && situation.age_s <= self.config.stale_target_s + self.config.blind_s
-                && target.deviation_m <= self.config.blind_deviation_m
+                && (stands || target.deviation_m <= self.config.blind_deviation_m * patience)
         })
     }
 
@@ -299,9 +321,12 @@ impl Metric {
         let seen = self.sees(situation);
         let height_m = self.height_m(&target);
         let outside = self.outside(situation, &target);
-        // LAND stops the vehicle over the ground: on a pad that moves it must come after the touch.
-        let lies_still = target.velocity.norm() <= STILL_M_S;
-        if height_m <= self.config.land_height_m && outside < 1.0 && lies_still {
+        let lies_still = !situation.pad_moves && target.velocity.norm() <= STILL_M_S;
+        if height_m <= self.config.land_height_m
+            && outside < 1.0
+            && lies_still
+            && self.is_steady(situation)
+        {
             return Progress::Ready(if seen {
                 Reason::LowAndAligned
             } else {
@@ -320,6 +345,14 @@ impl Metric {
             (true, _) => Progress::Unchanged,
             (false, _) => Progress::Blind,
         }
+    }
+
+    /// True while what is asked of the autopilot is what the vehicle does. In a gust it is not, and LAND, which forgets what was
+    /// asked for, would let the vehicle go: then the touch comes first.
+    fn is_steady(&self, situation: &Situation<'_>) -> bool {
+        self.memory.is_none_or(|memory| {
+            flat(memory.path.velocity() - situation.vehicle.velocity).norm() <= STEADY_M_S
+        })
     }
 
     /// The velocity wanted now, and what it does.
@@ -458,7 +491,15 @@ impl Metric {
         let radius_m = config.funnel_m
             + (widest_m - config.funnel_m) * patience
             + config.funnel_per_height * height_m;
-        self.error(situation, target).norm() / radius_m
+        let error = self.error(situation, target);
+        if height_m > LOW_M {
+            return error.norm() / radius_m;
+        }
+        // So low the vehicle has touched before an error that grows is seen.
+        let bias = self.memory.map_or(Vector::zero(), |memory| memory.bias);
+        let pad_m_s = shortened(flat(target.velocity), config.max_pad_m_s);
+        let closing = flat(situation.vehicle.velocity) + bias - pad_m_s;
+        error.norm().max((error - closing * LOW_LEAD_S).norm()) / radius_m
     }
 
     /// Notes since when the vehicle is low, and since when it stands although it is to go down.
@@ -521,6 +562,9 @@ impl Metric {
     /// Speed towards the pad, and what it does.
     fn descent(&self, situation: &Situation<'_>, target: &TargetEstimate) -> (f64, Reason) {
         let config = &self.config;
+        if target.contested {
+            return (0.0, Reason::Contested);
+        }
         if !self.may_descend(situation) {
             return (0.0, Reason::TargetAging);
         }
@@ -538,11 +582,18 @@ impl Metric {
         } else {
             Reason::DescendingUnseen
         };
+        let height_m = self.height_m(target);
+        if outside > FUNNEL_HYSTERESIS && height_m < LOW_M {
+            // Leaning against a gust costs height, and the ground must not be touched sliding.
+            return (-(ROOM_GAIN * (LOW_M - height_m)).min(ROOM_M_S), Reason::Settling);
+        }
         let sinking_m_s = (situation.vehicle.velocity.z() - target.velocity.z()).max(0.0);
         let ahead_m = self.height_m(target)
             - config.land_height_m
             - (sinking_m_s - config.touch_descend_m_s).max(0.0) * config.descend_lag_s;
-        let slowest = config.touch_descend_m_s;
+        // What is not known of a heave comes on top.
+        let least_m_s = SLOWEST_TOUCH_M_S.min(config.touch_descend_m_s);
+        let slowest = (config.touch_descend_m_s - 0.5 * situation.pad_heave_m_s).max(least_m_s);
         let brakes = slowest.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);
         let silent_m_s = (self.height_m(target) / config.silence_s).max(slowest);
         (brakes.sqrt().min(silent_m_s).min(config.max_descend_m_s) * centred * fresh, why)

@@ -26,6 +26,10 @@ pub struct Situation<'a> {
     pub age_s: f64,
     /// Smallest angle from the middle of the camera's image to its edge, in radians, when it is known.
     pub half_view_rad: Option<f64>,
+    /// The pad may move: LAND, which stops the vehicle over the ground, must come after the touch.
+    pub pad_moves: bool,
+    /// Fastest heave of the pad, in m/s.
+    pub pad_heave_m_s: f64,
     /// When a target is stale.
     pub phases: PhaseConfig,
 }

@@ -248,6 +248,7 @@ mod tests {
             detector: 0,
             image_size: (1296, 972),
             focal_px: None,
+            body_from_camera: None,
             marker,
         }
     }

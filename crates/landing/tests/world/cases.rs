@@ -95,9 +95,9 @@ fn moving(seed: u64, speed_m_s: f64, heave_m: f64) -> Scene {
     };
     scene.marker_scale = 1.5;
     scene.frames_hz = 30.0;
-    scene.config.estimator.pad_speed_m_s = 4.0;
-    scene.config.estimator.pad_heave_m_s = 0.4;
-    scene.config.estimator.pad_acceleration = 0.15;
+    scene.config.estimator.pad_speed_m_s = if speed_m_s > 0.0 { 4.5 } else { 0.0 };
+    scene.config.estimator.pad_heave_m_s = if heave_m > 0.0 { 0.4 } else { 0.0 };
+    scene.config.estimator.pad_acceleration = if speed_m_s > 0.0 { 0.08 } else { 0.0 };
     scene.config.envelope.horizontal_m_s = 7.0;
     let metric = MetricConfig {
         max_lateral_m_s: 2.5,

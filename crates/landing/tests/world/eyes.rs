@@ -175,6 +175,7 @@ impl Eyes {
             detector: 1,
             image_size: (WIDTH, HEIGHT),
             focal_px: Some(FOCAL_PX),
+            body_from_camera: Some(Rotation::from_euler(0.0, 0.0, std::f64::consts::FRAC_PI_2)),
             marker,
         }
     }

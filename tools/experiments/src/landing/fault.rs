@@ -84,14 +84,14 @@ const TABLE: [Row; 22] = [
     ("cover", "a third of the marker is covered for 2 s (rendered only)", |part| {
         veil("cover", part)
     }),
-    ("pad-moves-2.5", "the pad moves at 2.5 m/s (its marker half as large again)", |part| {
-        moving(2.5, 0.0, part)
+    ("pad-moves-2.5", "the pad comes at 2.5 m/s (its marker half as large again)", |_| {
+        moving(2.5, 0.0)
     }),
-    ("pad-moves-4.2", "the pad moves at 4.2 m/s (its marker half as large again)", |part| {
-        moving(4.2, 0.0, part)
+    ("pad-moves-4.2", "the pad comes at 4.2 m/s (its marker half as large again)", |_| {
+        moving(4.2, 0.0)
     }),
-    ("pad-heaves", "the pad heaves by 0.3 m in 6 s (its marker half as large again)", |part| {
-        moving(0.0, 0.3, part)
+    ("pad-heaves", "the pad heaves by 0.3 m in 6 s (its marker half as large again)", |_| {
+        moving(0.0, 0.3)
     }),
 ];
 
@@ -108,21 +108,23 @@ fn veil(kind: &str, part: f64) -> Change {
 }
 
 /// A pad that moves, seen twice as often, and a controller that is told to expect it.
-fn moving(speed_m_s: f64, heave_m: f64, part: f64) -> Change {
+fn moving(speed_m_s: f64, heave_m: f64) -> Change {
     let speed = format!("pad.speed_m_s={speed_m_s}");
-    let course = format!("pad.course_deg={:.1}", 360.0 * part);
     let heave = format!("pad.heave_m={heave_m}");
-    let simulated = ["pad.marker=rings:0.23", "camera.rate_hz=30", &speed, &course, &heave];
-    let told = [
-        "estimator.pad_speed_m_s=4.5",
-        "estimator.pad_heave_m_s=0.4",
-        "estimator.pad_acceleration=0.15",
-        "envelope.horizontal_m_s=7",
-        "metric.max_lateral_m_s=2.5",
-        "metric.lateral_acceleration_m_s2=2",
-        "metric.silence_s=1.2",
-        "metric.blind_deviation_m=0.2",
-    ];
+    let simulated = ["pad.marker=rings:0.23", "camera.rate_hz=30", &speed, &heave];
+    let told: &[&str] = if heave_m > 0.0 {
+        &["estimator.pad_heave_m_s=0.4", "metric.silence_s=1.2"]
+    } else {
+        &[
+            "estimator.pad_speed_m_s=4.5",
+            "estimator.pad_acceleration=0.08",
+            "envelope.horizontal_m_s=7",
+            "metric.max_lateral_m_s=2.5",
+            "metric.lateral_acceleration_m_s2=2",
+            "metric.silence_s=1.2",
+            "metric.blind_deviation_m=0.2",
+        ]
+    };
     Change {
         controller: told.iter().map(|setting| (*setting).to_owned()).collect(),
         ..simulator(&simulated)
@@ -150,7 +152,14 @@ impl Fault {
 
     /// What it changes in the flight of a seed.
     pub fn change(self, seed: u64) -> Change {
-        TABLE.get(self.0).map_or_else(Change::default, |row| row.2(drawn(seed, 9)))
+        let mut change =
+            TABLE.get(self.0).map_or_else(Change::default, |row| row.2(drawn(seed, 9)));
+        if change.simulator.iter().any(|setting| setting.starts_with("pad.speed_m_s")) {
+            // Towards the vehicle, within 45 degrees: a pad that runs away unseen is nobody's to find.
+            let course = drawn_angle(seed, START_ANGLE).to_degrees() + 90.0 * drawn(seed, 9) - 45.0;
+            change.simulator.push(format!("pad.course_deg={:.1}", course.rem_euclid(360.0)));
+        }
+        change
     }
 }
 
@@ -165,6 +174,9 @@ impl FromStr for Fault {
         })
     }
 }
+
+/// The number of the angle from the pad to where the vehicle starts.
+pub const START_ANGLE: u32 = 6;
 
 /// A number from 0 to 1 that belongs to the seed, another one for each `which`.
 pub fn drawn(seed: u64, which: u32) -> f64 {

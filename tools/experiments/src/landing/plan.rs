@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use super::fault::{Change, Fault, drawn, drawn_angle};
+use super::fault::{Change, Fault, START_ANGLE, drawn, drawn_angle};
 
 /// How the marker is seen.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -217,7 +217,7 @@ impl Plan {
     fn change(&self, planned: &Planned) -> Change {
         let seed = planned.seed;
         let fault = planned.fault.change(seed);
-        let (east, north) = drawn_angle(seed, 6).sin_cos();
+        let (east, north) = drawn_angle(seed, START_ANGLE).sin_cos();
         let (pad_north, pad_east) = (1.5, -1.5);
         let mut simulator = vec![
             format!("seed={}", seed & (i64::MAX as u64)),
