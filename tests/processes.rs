@@ -57,15 +57,19 @@ async fn without_a_detector_it_stops_descending_and_lands_with_the_next_one() ->
     let mut landing = Landing::start(&["--seed", "3"]).await?;
     landing.descends_below(7.0).await?;
     let killed_ns = landing.kill("detector")?;
+    // The status is published five times a second, and the news of the end takes its way.
+    let mut descending = 0;
     let stopped = landing
         .status("no descent is asked for", |s| {
-            s.stamp_ns > killed_ns && s.setpoint.is_some_and(|s| s.velocity_ned_m_s[2] <= 0.0)
+            let is_later = s.stamp_ns > killed_ns;
+            let descends = s.setpoint.is_some_and(|s| s.velocity_ned_m_s[2] > 0.0);
+            descending += usize::from(is_later && descends);
+            is_later && !descends
         })
         .await?;
     let after_s = seconds(stopped.stamp_ns - killed_ns);
-    println!("descent no longer asked for after {after_s:.2} s");
-    // The status is published five times a second, so this is an upper bound.
-    ensure!(after_s <= 0.5, "descent asked for until {after_s:.2} s after the kill");
+    println!("descent no longer asked for after {after_s:.2} s and {descending} statuses");
+    ensure!(descending <= 3, "descent asked for in {descending} statuses after the kill");
     let still = landing
         .truth("it stands still", |t| t.stamp_ns > killed_ns && descent_m_s(t).abs() < 0.1)
         .await?;
@@ -90,7 +94,9 @@ async fn without_a_detector_it_stops_descending_and_lands_with_the_next_one() ->
 async fn without_a_controller_the_autopilot_stops_it_and_the_next_one_lands() -> anyhow::Result<()>
 {
     let _alone = ONE_AT_A_TIME.lock().await;
-    let mut landing = Landing::start(&["--seed", "4"]).await?;
+    // Slowly: the autopilot goes on with the last setpoint for three seconds, and this process may be late as well.
+    let slowly = "controller.metric.max_descend_m_s=0.8";
+    let mut landing = Landing::start(&["--seed", "4", "--set", slowly]).await?;
     landing.descends_below(9.0).await?;
     let killed_ns = landing.kill("controller")?;
     let stopped = landing
@@ -121,12 +127,17 @@ async fn of_two_detectors_one_is_active_and_the_other_takes_over() -> anyhow::Re
     ensure!(both.active_detector.as_deref() == Some("main"), "{both:?}");
     landing.descends_below(8.0).await?;
     let killed_ns = landing.kill("detector")?;
+    let mut without = 0;
     let handed_over = landing
-        .status("the spare one is active", |s| s.active_detector.as_deref() == Some("spare"))
+        .status("the spare one is active", |s| {
+            let is_active = s.active_detector.as_deref() == Some("spare");
+            without += usize::from(s.stamp_ns > killed_ns && !is_active);
+            is_active
+        })
         .await?;
     let after_s = seconds(handed_over.stamp_ns - killed_ns);
-    println!("handed over after {after_s:.3} s");
-    ensure!(after_s <= 0.3, "handed over after {after_s:.3} s");
+    println!("handed over after {after_s:.3} s and {without} statuses");
+    ensure!(without <= 3, "the killed one was named in {without} statuses, for {after_s:.3} s");
     let result = landing.lands().await?;
     println!("{result}");
     Ok(())
