@@ -16,6 +16,8 @@ mod onehost;
 mod probe;
 #[path = "link/saturation.rs"]
 mod saturation;
+#[path = "link/setpoint.rs"]
+mod setpoint;
 #[path = "link/site.rs"]
 mod site;
 
@@ -25,11 +27,18 @@ use anyhow::{Context, ensure};
 use site::Radio;
 
 /// A WiFi link as it should be.
-const GOOD: Radio = Radio { rate_mbit: 20.0, delay_ms: 5.0, jitter_ms: 2.0, loss: 0.0 };
+const GOOD: Radio = Radio {
+    rate_mbit: 20.0,
+    delay_ms: 5.0,
+    jitter_ms: 2.0,
+    loss: 0.0,
+    marks: false,
+    resends_soon: false,
+};
 /// The same with packets lost.
 const LOSSY: Radio = Radio { loss: 0.02, ..GOOD };
 /// Far away.
-const POOR: Radio = Radio { rate_mbit: 4.0, delay_ms: 20.0, jitter_ms: 10.0, loss: 0.03 };
+const POOR: Radio = Radio { rate_mbit: 4.0, delay_ms: 20.0, jitter_ms: 10.0, loss: 0.03, ..GOOD };
 
 fn main() -> ExitCode {
     node::relaunch_with_zenoh_threads();
@@ -44,6 +53,7 @@ fn main() -> ExitCode {
                     println!("{}", onehost::reader(args.get(1).context("reader PORT")?).await?);
                     Ok(())
                 }
+                Some("answerer") => setpoint::answerer(args.get(1).context("answerer PORT")?).await,
                 Some("table") => table(args.get(1..).unwrap_or_default()).await,
                 // What a test runner asks of its harness; there is one test.
                 Some("--list") => Ok(()),
@@ -90,31 +100,49 @@ async fn test() -> anyhow::Result<()> {
 
 /// The long trials.
 async fn table(names: &[String]) -> anyhow::Result<()> {
-    let is_wanted = |name: &str| names.is_empty() || names.iter().any(|it| it == name);
+    // `KEY=VALUE` is for the camera, anything else names a trial.
+    let (camera, names): (Vec<&str>, Vec<&str>) =
+        names.iter().map(String::as_str).partition(|name| name.contains('='));
+    let camera = camera.as_slice();
+    let is_wanted = |name: &str| names.is_empty() || names.contains(&name);
     if is_wanted("onehost") {
         print("one host", onehost::run().await?);
+    }
+    if is_wanted("setpoint") {
+        print("stamp to setpoint without a detector", setpoint::run(GOOD).await?);
     }
     for seed in 1..=3 {
         if is_wanted("onboard") {
             print("onboard", flight::onboard(seed).await?);
         }
         if is_wanted("good") {
-            print("ground, 20 Mbit/s", flight::ground(GOOD, seed, &[]).await?);
+            print("ground, 20 Mbit/s", flight::ground(GOOD, seed, camera).await?);
         }
         if is_wanted("full") {
             let full = &["air.mode=\"full\""];
             print("ground, 20 Mbit/s, whole frames", flight::ground(GOOD, seed, full).await?);
         }
         if is_wanted("lossy") {
-            print("ground, 20 Mbit/s, 2 % loss", flight::ground(LOSSY, seed, &[]).await?);
+            print("ground, 20 Mbit/s, 2 % loss", flight::ground(LOSSY, seed, camera).await?);
+        }
+        if is_wanted("tuned") {
+            let tuned = Radio { resends_soon: true, ..LOSSY };
+            print(
+                "the same, lost packets sent again soon",
+                flight::ground(tuned, seed, camera).await?,
+            );
         }
         if is_wanted("poor") {
-            print("ground, 4 Mbit/s, 3 % loss", flight::ground(POOR, seed, &[]).await?);
+            print("ground, 4 Mbit/s, 3 % loss", flight::ground(POOR, seed, camera).await?);
         }
     }
     if is_wanted("saturation") {
         print("frames at twice the rate", saturation::run(GOOD, 15.0).await?);
         print("frames at twice the rate, 2 % loss", saturation::run(LOSSY, 15.0).await?);
+        let tuned = Radio { resends_soon: true, ..LOSSY };
+        print("the same, lost packets sent again soon", saturation::run(tuned, 15.0).await?);
+        let honoured = Radio { marks: true, ..GOOD };
+        print("frames at twice the rate, marks honoured", saturation::run(honoured, 15.0).await?);
     }
     for seconds in [3.0, 30.0] {
         if is_wanted("cut") {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use messages::{ControllerCommand, ControllerStatus, Detections, Health, Touchdown, Truth, topic};
 use node::{Subscriber, now_ns};
-use tokio::time::{Instant, timeout};
+use tokio::time::{Instant, timeout, timeout_at};
 
 use crate::probe::{self, Times};
 use crate::site::{Radio, Site};
@@ -38,6 +38,10 @@ struct Cut {
     failover_s: f64,
     /// From the cut's end to the first detections from the ground.
     back_s: Option<f64>,
+    /// From the cut's end until it is used again, as it is preferred.
+    preferred_s: Option<f64>,
+    /// Changes of the detector from the cut on.
+    changes: u64,
     /// Detections of the onboard detector arrived on the drone: the longest pause and the oldest, from the cut on.
     longest_pause_ms: f64,
     /// The state of the vehicle was at most so old when it arrived on the drone.
@@ -67,9 +71,11 @@ impl std::fmt::Display for Flight {
         if let Some(cut) = &self.cut {
             write!(
                 f,
-                "; failover {:.2} s; ground back after {}; on the drone: pause {:.0} ms ({:.0} before), state at most {:.0} ms old ({:.0} before)",
+                "; failover {:.2} s; ground back after {}, used after {}, {} changes; on the drone: pause {:.0} ms ({:.0} before), state at most {:.0} ms old ({:.0} before)",
                 cut.failover_s,
-                cut.back_s.map_or("-".to_owned(), |s| format!("{s:.1} s")),
+                seconds(cut.back_s),
+                seconds(cut.preferred_s),
+                cut.changes,
                 cut.longest_pause_ms,
                 cut.longest_pause_before_ms,
                 cut.oldest_state_ms,
@@ -80,9 +86,13 @@ impl std::fmt::Display for Flight {
     }
 }
 
+fn seconds(seconds: Option<f64>) -> String {
+    seconds.map_or("-".to_owned(), |s| format!("{s:.1} s"))
+}
+
 /// Everything on the drone, and no link.
 pub(crate) async fn onboard(seed: u64) -> anyhow::Result<Option<Flight>> {
-    let any = Radio { rate_mbit: 20.0, delay_ms: 5.0, jitter_ms: 0.0, loss: 0.0 };
+    let any = crate::GOOD;
     let Some(mut site) = Site::new(any).await? else { return Ok(None) };
     site.drone("detector", &["--set", "id=onboard"])?;
     let watch = Watch::new(&site).await?;
@@ -131,6 +141,8 @@ pub(crate) async fn cut(radio: Radio, seed: u64, seconds: f64) -> anyhow::Result
     let mut local = Local::new(&site).await?;
     local.listen(Duration::from_secs(1)).await;
     let before = local.take();
+    let changes = |status: &ControllerStatus| status.detector_changes;
+    let changed = statuses.next().await.as_ref().map_or(0, changes);
     site.air.cut(true)?;
     let cut = Instant::now();
     let found = tokio::join!(
@@ -139,18 +151,30 @@ pub(crate) async fn cut(radio: Radio, seed: u64, seconds: f64) -> anyhow::Result
         }),
         local.listen(Duration::from_secs_f64(seconds)),
     );
-    let (status, at) = found.0?;
+    let (_, at) = found.0?;
     let during = local.take();
     site.air.cut(false)?;
     let joined = Instant::now();
     let heard = site.node.subscriber(topic::DETECTIONS, &["ground"]).await?;
     let again = timeout(Duration::from_secs(15), heard.next()).await.is_ok();
     let back_s = again.then(|| joined.elapsed().as_secs_f64());
-    drop(status);
+    let is_used = |s: &ControllerStatus| s.active_detector.as_deref() == Some("ground");
+    let used = until(&statuses, "the one on the ground is used again", is_used);
+    let used = timeout(Duration::from_secs(10), used).await.ok().and_then(Result::ok);
+    let preferred_s = used.as_ref().map(|(_, at)| (*at - joined).as_secs_f64());
+    // Long enough to see it change its mind.
+    let end = Instant::now() + Duration::from_secs(3);
+    let mut last = used.map(|(status, _)| status);
+    while let Ok(Some(status)) = timeout_at(end, statuses.next()).await {
+        last = Some(status);
+    }
+    let changes = last.as_ref().map_or(0, changes).saturating_sub(changed);
     let mut flight = watch.landing(&mut site).await?;
     flight.cut = Some(Cut {
         failover_s: (at - cut).as_secs_f64(),
         back_s,
+        preferred_s,
+        changes,
         longest_pause_ms: during.0,
         oldest_state_ms: during.1,
         longest_pause_before_ms: before.0,

@@ -1,6 +1,7 @@
 //! One host: a frame from its camera to a reader in another process, beside a bare ring of buffers in shared memory.
 //!
-//! The ring is the limit: two threads that share the buffers, woken by a condition variable, which is a futex.
+//! The ring is the limit: two threads that share the buffers, in memory of the same kind, woken by a condition variable,
+//! which is a futex.
 
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
@@ -9,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use messages::{FrameHeader, PixelFormat, topic};
-use node::{FramePublisher, Identity, Network, Node, now_ns};
+use node::{FramePublisher, Identity, Loan, Network, Node, clock_name, now_ns};
 use serde_json::{Value, json};
 use tokio::time::interval;
 
@@ -17,7 +18,8 @@ use crate::probe::Times;
 
 const WIDTH: u32 = 1296;
 const HEIGHT: u32 = 972;
-const LEN: usize = WIDTH as usize * HEIGHT as usize;
+/// Bytes of a frame.
+pub(crate) const LEN: usize = WIDTH as usize * HEIGHT as usize;
 /// 30 frames a second.
 const PERIOD: Duration = Duration::from_micros(33_333);
 const FRAMES: u64 = 90;
@@ -79,7 +81,10 @@ pub(crate) async fn run() -> anyhow::Result<Option<OneHost>> {
             result.frames.add(ms.as_f64().context("a time")?);
         }
         let before_ms = cpu_ms();
-        for ms in tokio::task::spawn_blocking(ring).await?? {
+        for ms in {
+            let buffers = (0..BUFFERS).map(|_| Mutex::new(publisher.loan(LEN))).collect();
+            tokio::task::spawn_blocking(|| ring(buffers)).await??
+        } {
             result.ring.add(ms);
         }
         result.ring_cpu_ms += (cpu_ms() - before_ms) / FRAMES as f64 / ROUNDS as f64;
@@ -107,22 +112,27 @@ async fn film(publisher: &FramePublisher) {
     let mut ticks = interval(PERIOD);
     for sequence in 0..FRAMES + WARM_UP {
         ticks.tick().await;
-        let stamp_ns = now_ns();
-        let mut pixels = publisher.loan(LEN);
-        write(&mut pixels, sequence);
-        let header = FrameHeader {
-            camera: "probe".into(),
-            sequence,
-            stamp_ns,
-            clock: "probe".into(),
-            exposure_ns: 0,
-            width: WIDTH,
-            height: HEIGHT,
-            format: PixelFormat::Mono8,
-            parts: Vec::new(),
-        };
-        publisher.publish(&header, pixels).await;
+        take(publisher, sequence).await;
     }
+}
+
+/// Takes a frame of the camera `probe`, and publishes it.
+pub(crate) async fn take(publisher: &FramePublisher, sequence: u64) {
+    let stamp_ns = now_ns();
+    let mut pixels = publisher.loan(LEN);
+    write(&mut pixels, sequence);
+    let header = FrameHeader {
+        camera: "probe".into(),
+        sequence,
+        stamp_ns,
+        clock: clock_name().to_owned(),
+        exposure_ns: 0,
+        width: WIDTH,
+        height: HEIGHT,
+        format: PixelFormat::Mono8,
+        parts: Vec::new(),
+    };
+    publisher.publish(&header, pixels).await;
 }
 
 /// The reader, a process of its own.
@@ -155,9 +165,8 @@ pub(crate) async fn reader(meet: &str) -> anyhow::Result<Value> {
 }
 
 /// Frames through a bare ring; how long each took, in milliseconds.
-fn ring() -> anyhow::Result<Vec<f64>> {
-    let buffers: Arc<Vec<Mutex<Vec<u8>>>> =
-        Arc::new((0..BUFFERS).map(|_| Mutex::new(vec![0; LEN])).collect());
+fn ring(buffers: Vec<Mutex<Loan>>) -> anyhow::Result<Vec<f64>> {
+    let buffers = Arc::new(buffers);
     let newest = Arc::new((Mutex::new(None::<(u64, i64)>), Condvar::new()));
     let (theirs, announced) = (Arc::clone(&buffers), Arc::clone(&newest));
     let reader = std::thread::spawn(move || {

@@ -22,6 +22,10 @@ pub(crate) struct Radio {
     pub(crate) jitter_ms: f64,
     /// Part of the packets that are lost.
     pub(crate) loss: f64,
+    /// Packets marked for expedited forwarding go first.
+    pub(crate) marks: bool,
+    /// Both hosts send again what was lost after 30 ms at the soonest, instead of 200.
+    pub(crate) resends_soon: bool,
 }
 
 /// The emulated link and the ground's namespace; gone with this.
@@ -84,15 +88,24 @@ impl Air {
             println!("skipped: a link of two hosts is missing: ip {command:?}: {problem}");
             return Ok(None);
         }
+        if radio.resends_soon {
+            let route = format!("{subnet}.0/30");
+            for (namespace, end) in [(None, &drone_end), (Some(namespace.as_str()), &ground_end)] {
+                let mut command = Command::new("ip");
+                command.args(namespace.iter().flat_map(|name| ["-n", name]));
+                command.args(["route", "change", &route, "dev", end, "rto_min", "30ms"]);
+                ensure!(command.status()?.success(), "the route of {end} was not changed");
+            }
+        }
         air.set(radio)?;
         Ok(Some(air))
     }
 
     /// Changes how the link is.
     pub(crate) fn set(&mut self, radio: Radio) -> anyhow::Result<()> {
-        let Radio { rate_mbit, delay_ms, jitter_ms, loss } = radio;
+        let Radio { rate_mbit, delay_ms, jitter_ms, loss, marks, .. } = radio;
         self.tell(&serde_json::json!({
-            "rate_mbit": rate_mbit, "delay_ms": delay_ms, "jitter_ms": jitter_ms, "loss": loss,
+            "rate_mbit": rate_mbit, "delay_ms": delay_ms, "jitter_ms": jitter_ms, "loss": loss, "marks": marks,
         }))
     }
 
@@ -147,6 +160,11 @@ impl Site {
         Ok(Some(Self { air, meet, port: 7448, autopilot, children, node }))
     }
 
+    /// Where the drone's processes meet.
+    pub(crate) fn meet(&self) -> u16 {
+        self.meet
+    }
+
     /// Where the ground finds the drone.
     fn drone_address(&self) -> String {
         format!("{}:{}", self.air.drone, self.port)
@@ -167,13 +185,25 @@ impl Site {
 
     /// Starts a simulated flight: world, camera, autopilot and controller.
     pub(crate) fn flight(&mut self, seed: u64, camera: &[&str]) -> anyhow::Result<()> {
+        self.flight_by(seed, camera, &[])
+    }
+
+    /// The same with a controller that is started with further arguments.
+    pub(crate) fn flight_by(
+        &mut self,
+        seed: u64,
+        camera: &[&str],
+        controller: &[&str],
+    ) -> anyhow::Result<()> {
         let (seed, port) = (format!("seed={seed}"), self.autopilot);
         let address = format!("autopilot.address=\"udpout:127.0.0.1:{port}\"");
         let mut args = vec!["--set", seed.as_str(), "--set", &address];
         args.extend(camera.iter().flat_map(|set| ["--set", set]));
         self.drone("simulator", &args)?;
         let address = format!("autopilot.address=\"udpin:127.0.0.1:{port}\"");
-        self.drone("controller", &["--set", &address, "--set", "start=\"takeoff\""])
+        let mut args = vec!["--set", address.as_str(), "--set", "start=\"takeoff\""];
+        args.extend(controller);
+        self.drone("controller", &args)
     }
 
     /// A command that runs on the ground.

@@ -24,9 +24,6 @@ use crate::window::Window;
 /// How often subscribers and overdue frames are looked for.
 const TICK: Duration = Duration::from_millis(10);
 
-/// Receipts do not tell their detectors apart: the first detector that has a frame makes room for the next.
-const RECEIVER: &str = "any";
-
 /// Sends frames over the air link; dropping it ends its thread.
 pub struct AirSender {
     offers: Arc<Offers>,
@@ -132,7 +129,8 @@ struct Work {
 
 /// What the thread wakes up for.
 enum News {
-    Receipt(FrameReceipt),
+    /// The key, which names the detector, and what it says.
+    Receipt(String, FrameReceipt),
     Detections(Box<Detections>),
     Frame,
     Tick,
@@ -146,7 +144,9 @@ impl Work {
         while !self.offers.is_over.load(Ordering::Relaxed) {
             let news = tokio::select! {
                 biased;
-                receipt = self.receipts.next() => receipt.map_or(News::Closed, News::Receipt),
+                receipt = self.receipts.next_with_key() => {
+                    receipt.map_or(News::Closed, |(key, receipt)| News::Receipt(key, receipt))
+                }
                 message = next_of(self.detections.as_ref()) => {
                     message.map_or(News::Closed, |message| News::Detections(Box::new(message)))
                 }
@@ -154,7 +154,7 @@ impl Work {
                 _ = ticks.tick() => News::Tick,
             };
             match news {
-                News::Receipt(receipt) => self.receipt(&receipt),
+                News::Receipt(key, receipt) => self.receipt(&key, &receipt),
                 News::Detections(message) if message.header.camera == self.camera => {
                     self.expected.learn(&message);
                 }
@@ -171,11 +171,11 @@ impl Work {
         }
     }
 
-    fn receipt(&mut self, receipt: &FrameReceipt) {
+    fn receipt(&mut self, detector: &str, receipt: &FrameReceipt) {
         if receipt.camera != self.camera {
             return;
         }
-        let took_ms = self.window.received(now_ns(), RECEIVER, receipt.sequence);
+        let took_ms = self.window.received(now_ns(), detector, receipt.sequence);
         match took_ms {
             Some(ms) => {
                 self.health

@@ -3,7 +3,8 @@
 //!
 //! A frame is sent only while fewer than `window` others are under way, so nothing queues up on the way, whatever the
 //! link carries: frames that come meanwhile are left out at the camera. A frame that nobody has answered after a while
-//! counts as lost. The size grows while frames arrive sooner than aimed at, and shrinks while they arrive later; the
+//! counts as lost; one that the first of several receivers has answered is waited for a little longer only, so that a
+//! receiver that is slow or gone does not hold up the others. The size grows while frames arrive sooner than aimed at, and shrinks while they arrive later; the
 //! mean of some frames decides, because a lost packet delays a single frame whatever its size.
 //!
 //! Time is any clock's, in nanoseconds, given by the caller.
@@ -20,6 +21,8 @@ const SILENT_NS: i64 = 2_000_000_000;
 const REMEMBERED: usize = 16;
 /// Part of a new time in the mean.
 const WEIGHT: f64 = 1.0 / 6.0;
+/// The slower receivers of a frame are waited for so many times the time aimed at.
+const PATIENCE_WITH_OTHERS: f64 = 2.0;
 /// How fast the size grows with every frame that arrives in time.
 const GROWTH: f64 = 1.04;
 /// How much it shrinks at most with one that does not.
@@ -50,6 +53,8 @@ struct Sent {
     bytes: usize,
     /// Still waited for.
     is_under_way: bool,
+    /// Somebody has it.
+    is_answered: bool,
 }
 
 #[derive(Clone, Debug)]
@@ -91,11 +96,13 @@ impl Window {
     pub fn is_open(&mut self, now_ns: i64) -> (bool, usize) {
         self.forget_the_silent(now_ns);
         let patience_ns = self.timeout_ns << self.losses_in_a_row.min(MOST_DOUBLINGS);
+        let with_others_ns = (PATIENCE_WITH_OTHERS * self.aim_ms * 1e6) as i64;
         let mut lost = 0;
         for sent in self.sent.iter_mut().filter(|sent| sent.is_under_way) {
-            if now_ns - sent.at_ns >= patience_ns {
+            let limit_ns = if sent.is_answered { with_others_ns } else { patience_ns };
+            if now_ns - sent.at_ns >= limit_ns {
                 sent.is_under_way = false;
-                lost += 1;
+                lost += usize::from(!sent.is_answered);
             }
         }
         // Who never answers (a recorder, say) says nothing of the link.
@@ -115,12 +122,19 @@ impl Window {
         if self.sent.len() == REMEMBERED {
             self.sent.pop_front();
         }
-        self.sent.push_back(Sent { sequence, at_ns: now_ns, bytes, is_under_way: true });
+        self.sent.push_back(Sent {
+            sequence,
+            at_ns: now_ns,
+            bytes,
+            is_under_way: true,
+            is_answered: false,
+        });
     }
 
     /// A receiver has a frame; the answer is how long that took since it was sent, in milliseconds.
     pub fn received(&mut self, now_ns: i64, receiver: &str, sequence: u64) -> Option<f64> {
-        let sent = self.sent.iter().find(|sent| sent.sequence == sequence)?;
+        let sent = self.sent.iter_mut().find(|sent| sent.sequence == sequence)?;
+        sent.is_answered = true;
         let (took_ms, bytes) = ((now_ns - sent.at_ns) as f64 * 1e-6, sent.bytes);
         self.losses_in_a_row = 0;
         self.forget_the_silent(now_ns);
@@ -259,6 +273,20 @@ mod tests {
         window.sent(2500 * MS, 3, 1000);
         window.received(2510 * MS, "near", 3);
         assert!(window.is_open(2510 * MS).0, "the far one has been silent for too long");
+    }
+
+    #[test]
+    fn a_receiver_that_is_gone_or_slow_holds_the_others_up_for_a_moment_only() {
+        let mut window = window();
+        window.sent(0, 1, 1000);
+        window.received(10 * MS, "near", 1);
+        window.received(20 * MS, "gone", 1);
+        window.sent(30 * MS, 2, 1000);
+        window.received(40 * MS, "near", 2);
+        assert_eq!(window.is_open(129 * MS), (false, 0));
+        let before = window.size_bytes();
+        assert_eq!(window.is_open(130 * MS), (true, 0));
+        assert_eq!(window.size_bytes(), before, "it is not lost: somebody has it");
     }
 
     #[test]

@@ -313,9 +313,12 @@ mod tests {
             let network = Network { connect: Some(connect.into()), ..built_in("ground") };
             endpoints(&configured(&network).unwrap(), "connect").map(str::to_owned).collect()
         };
-        assert_eq!(ends("10.0.0.1"), ["tcp/10.0.0.1:7448?prio=1-4", "tcp/10.0.0.1:7449?prio=5-7"]);
+        assert_eq!(
+            ends("10.0.0.1"),
+            ["tcp/10.0.0.1:7448?prio=1-4#dscp=0xb8", "tcp/10.0.0.1:7449?prio=5-7"]
+        );
         assert_eq!(ends("uav.local:9000")[1], "tcp/uav.local:9001?prio=5-7");
-        assert_eq!(ends("fe80::1")[0], "tcp/[fe80::1]:7448?prio=1-4");
+        assert_eq!(ends("fe80::1")[0], "tcp/[fe80::1]:7448?prio=1-4#dscp=0xb8");
         let network = Network { listen: Some("10.0.0.7:9000".into()), ..built_in("drone") };
         let listens: Vec<_> =
             endpoints(&configured(&network).unwrap(), "listen").map(str::to_owned).collect();
@@ -323,8 +326,8 @@ mod tests {
             listens,
             [
                 "tcp/127.0.0.1:0",
-                "tcp/10.0.0.7:9000?prio=1-4",
-                "tcp/10.0.0.7:9001?prio=5-7#so_sndbuf=65536"
+                "tcp/10.0.0.7:9000?prio=1-4#dscp=0xb8",
+                "tcp/10.0.0.7:9001?prio=5-7#so_sndbuf=32768"
             ]
         );
     }
