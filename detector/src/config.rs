@@ -23,6 +23,10 @@ pub struct Config {
     pub pads: Vec<String>,
     /// Detections less sure than this are not published.
     pub least_confidence: f64,
+    /// Whether markers printed white on black are looked for as well.
+    pub inverted: bool,
+    /// Whether damaged markers are looked for where others were found, too.
+    pub thorough: bool,
     /// Threshold of `rings-thesis`, in grey levels.
     pub thesis_threshold: u8,
     /// Quality of the debug images.
@@ -81,7 +85,8 @@ impl Config {
                 "at least one marker is needed, for example \"rings:0.15341\", or a pad".to_owned()
             );
         }
-        let settings = fiducial::Settings { thesis_threshold: self.thesis_threshold };
+        let Self { thesis_threshold, inverted, thorough, .. } = *self;
+        let settings = fiducial::Settings { thesis_threshold, inverted, thorough };
         Detector::new(&markers, settings).map_err(|problem| problem.to_string())
     }
 
@@ -173,6 +178,9 @@ mod tests {
         assert_eq!(changed.markers, ["aruco-4x4-50:7:0.2"]);
         let changed = changed.with("tracking.enabled", "true").unwrap();
         assert!(changed.tracking().full_search_period > 1 && changed.markers.len() == 1);
+        assert!(config.inverted && !config.thorough);
+        let changed = changed.with("inverted", "false").unwrap().with("thorough", "true").unwrap();
+        assert!(!changed.inverted && changed.thorough && changed.detector().is_ok());
         let refused = |key, value| config.with(key, value).unwrap_err();
         assert!(refused("id", "other").contains("start the detector again"));
         assert!(refused("place", "ground").contains("--set place=ground"));

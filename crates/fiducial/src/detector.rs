@@ -18,11 +18,16 @@ pub struct Settings {
     /// T of Equation 3.3, in grey levels, for `rings-thesis`. The thesis does not state it; 70 finds most in
     /// renderings of its camera.
     pub thesis_threshold: u8,
+    /// Whether markers printed white on black are looked for as well; `rings-thesis` has none.
+    pub inverted: bool,
+    /// Whether what is slow, and finds markers that are damaged, seen in part or very small, is also done in images in which
+    /// others were found. Otherwise it is where none was, and for families of any id where two were, as on boards.
+    pub thorough: bool,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { thesis_threshold: 70 }
+        Self { thesis_threshold: 70, inverted: true, thorough: false }
     }
 }
 
@@ -41,7 +46,7 @@ pub(crate) enum SlowPass {
     Specks,
     /// Square markers that are damaged.
     Squares,
-    /// The paper of STags far away.
+    /// The paper of square markers far away, STags among them.
     Papers,
     /// STags that are damaged.
     Stags,
@@ -62,6 +67,21 @@ impl Allowed {
         }
     }
 }
+
+/// How to look for the paper of square markers so small that their border and what is in it, or, of STags, the disc, cannot
+/// be told apart.
+const PAPERS: outline::Settings = outline::Settings {
+    dark_from: None,
+    bright_from: Some(0),
+    whole_level: 2,
+    smallest_px: 5,
+    largest_px: 40,
+    least_contrast: 14,
+    least_contrast_percent: 12,
+    steep: true,
+    least_fill: 0.3,
+    most_ragged: 1.3,
+};
 
 /// Why there is no detector for these markers.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -109,13 +129,14 @@ impl Detector {
                 return Err(DetectorError::Twice { name: marker.name() });
             }
         }
-        let (squares, stags) = (Squares::new(markers), Stags::new(markers));
+        let (squares, stags) =
+            (Squares::new(markers, settings.inverted), Stags::new(markers, settings.inverted));
         let has_rings = markers.iter().any(|marker| marker.family == Family::Rings);
         let slow_passes = [
             (SlowPass::Arcs, has_rings),
             (SlowPass::Squares, !squares.is_empty()),
             (SlowPass::Specks, has_rings),
-            (SlowPass::Papers, !stags.is_empty()),
+            (SlowPass::Papers, !squares.is_empty() || !stags.is_empty()),
             (SlowPass::Stags, !stags.is_empty()),
         ];
         let slow_passes = slow_passes.into_iter().filter(|(_, is_there)| *is_there);
@@ -125,7 +146,7 @@ impl Detector {
             outlines: Outlines::default(),
             squares,
             stags,
-            rings: Rings::default(),
+            rings: Rings::new(settings.inverted, settings.thorough),
             thesis: RingsThesis::default(),
             broken: ImageQuads::default(),
             found: Vec::new(),
@@ -158,7 +179,8 @@ impl Detector {
         let pass = self.turns.checked_rem(self.slow_passes.len());
         let pass = pass.and_then(|index| self.slow_passes.get(index).copied());
         self.turns = self.turns.wrapping_add(1);
-        self.search(view, camera, Allowed::One(pass), stages)
+        let allowed = if self.settings.thorough { Allowed::All } else { Allowed::One(pass) };
+        self.search(view, camera, allowed, stages)
     }
 
     fn search(
@@ -180,7 +202,8 @@ impl Detector {
             // Markers with a white border may be as small as others; others printed white on black are only looked for where
             // they are large.
             let bright_from = if self.squares.has_bright() { 0 } else { INVERTED_FROM };
-            let bright_from = Some(bright_from);
+            let bright_from =
+                (self.settings.inverted || self.squares.has_bright()).then_some(bright_from);
             let mut settings = outline::Settings { bright_from, ..outline::Settings::default() };
             if !self.squares.is_empty() {
                 settings.largest_px = settings.largest_px.max(Squares::LARGEST_PX);
@@ -216,31 +239,43 @@ impl Detector {
                 _ => {}
             }
         }
-        // Who finds nothing has time to look harder.
-        self.broken.begin();
-        if self.is_open(SlowPass::Squares, allowed) {
-            let watch = (&mut self.trace, &mut *stages);
-            let seen = (view, self.outlines.pyramid(), &mut self.broken);
-            self.squares.detect_damaged(seen, camera, watch, &mut self.found);
-        }
-        if self.is_open(SlowPass::Papers, allowed) {
-            let first = self.outlines.len();
-            self.outlines.add(view, &Stags::papers(), 0..1);
-            let (watch, seen) = ((&mut self.trace, &mut *stages), (view, &self.outlines, first));
-            self.stags.detect_on_paper(seen, camera, watch, &mut self.found);
-        }
-        if self.is_open(SlowPass::Stags, allowed) {
-            let watch = (&mut self.trace, &mut *stages);
-            let seen = (view, self.outlines.pyramid(), &mut self.broken);
-            self.stags.detect_damaged(seen, camera, watch, &mut self.found);
-        }
+        self.look_harder(view, camera, allowed, stages);
         self.trace.markers.extend(self.found.iter().map(TracedMarker::from));
         &self.found
     }
 
-    /// Whether a slow pass is to be made: nothing was found, there is something to look for, and it may be.
-    fn is_open(&self, pass: SlowPass, allowed: Allowed) -> bool {
-        self.found.is_empty() && self.slow_passes.contains(&pass) && allowed.has(pass)
+    /// Looks in the slow ways that are allowed, one after the other: who finds nothing has time for them.
+    fn look_harder(
+        &mut self,
+        view: GrayView<'_>,
+        camera: Option<&CameraModel>,
+        allowed: Allowed,
+        stages: &mut impl Stages,
+    ) {
+        let is_needed = |found: &[Observation]| self.settings.thorough || found.is_empty();
+        let is_open = |pass| self.slow_passes.contains(&pass) && allowed.has(pass);
+        self.broken.begin();
+        if is_open(SlowPass::Squares) {
+            let all = is_needed(&self.found);
+            let watch = (&mut self.trace, &mut *stages);
+            let seen = (view, self.outlines.pyramid(), &mut self.broken);
+            self.squares.detect_damaged(seen, all, camera, watch, &mut self.found);
+        }
+        if is_open(SlowPass::Papers) && is_needed(&self.found) {
+            let first = self.outlines.len();
+            self.outlines.add(view, &PAPERS, 0..1);
+            let (seen, trace) = ((view, &self.outlines, first), &mut self.trace);
+            self.squares.detect_on_paper(seen, camera, trace, &mut self.found);
+            if self.stags.is_missing(is_needed(&self.found), &self.found) {
+                self.stags.detect_on_paper(seen, camera, trace, &mut self.found);
+            }
+            stages.ended("papers");
+        }
+        if is_open(SlowPass::Stags) && self.stags.is_missing(is_needed(&self.found), &self.found) {
+            let watch = (&mut self.trace, &mut *stages);
+            let seen = (view, self.outlines.pyramid(), &mut self.broken);
+            self.stags.detect_damaged(seen, camera, watch, &mut self.found);
+        }
     }
 
     /// What the last detection saw on its way.

@@ -8,8 +8,9 @@
 //! (`photometry`). That refines the pose, whose centre is the true projection of the
 //! marker's, and decides whether it is believed.
 
-use geometry::CameraModel;
-use imaging::{Ellipse, GrayView, Outlines, outline};
+use geometry::{CameraModel, Pixel};
+use imaging::pyramid::{from_level_0, to_level_0};
+use imaging::{Ellipse, GrayView, Outlines, Pyramid, outline};
 
 use crate::circles::{EdgePoint, pixel_covariance, project};
 use crate::detector::{Allowed, SlowPass};
@@ -98,12 +99,19 @@ const MOST_LOOKED_INTO: usize = 20;
 const MOST_DOUBTFUL: usize = 6;
 const DOUBTFUL: f64 = 0.75;
 const MOST_MARKERS: usize = 8;
+/// Levels of the pyramid on which what noise hides is looked for, and the least diameter there, in pixels.
+const COARSER: [usize; 2] = [1, 2];
+const LEAST_FROM_AFAR_PX: f64 = 16.0;
 /// What looks like the marker less than this share of how much one does that was found is no other one.
 const LEAST_OF_BEST: f64 = 0.8;
 
 /// The detector's working memory.
 #[derive(Debug, Default)]
 pub struct Rings {
+    /// Whether white rings on black are looked for.
+    inverted: bool,
+    /// Whether everything is looked at, whatever was found.
+    thorough: bool,
     borders: Vec<Border>,
     candidates: Vec<Candidate>,
     edges: Vec<EdgePoint>,
@@ -111,6 +119,11 @@ pub struct Rings {
 }
 
 impl Rings {
+    /// Looks for white rings on black as well when `inverted`, and on where some were found when `thorough`.
+    pub fn new(inverted: bool, thorough: bool) -> Self {
+        Self { inverted, thorough, ..Self::default() }
+    }
+
     /// Finds the markers in an image; the surest comes first. `outlines` has the outlines of that image as other families
     /// share them, or, when it is told to be empty, only its pyramid; what else is looked at is added to it. When markers of
     /// other families are among `found`, only those that are whole are looked for.
@@ -126,16 +139,18 @@ impl Rings {
         let first = found.len();
         for stage in STAGES {
             // Who has something to land on need not look harder.
-            if stage.slow_pass().is_some_and(|pass| first > 0 || !allowed.has(pass)) {
+            let is_closed = |pass| first > 0 && !self.thorough || !allowed.has(pass);
+            if stage.slow_pass().is_some_and(is_closed) {
                 continue;
             }
             self.find_candidates((view, outlines, is_empty), stage);
             trace.ellipses.extend(self.borders.iter().map(|b| b.ellipse));
             trace.rings.extend(self.candidates.iter().map(ring));
             stages.ended(stage.name());
-            self.look_into_all(view, marker, (camera, &nominal), trace, (found, first));
+            let seen = (view, outlines.pyramid());
+            self.look_into_all(seen, marker, (camera, &nominal), trace, (found, first));
             stages.ended("matching");
-            if found.len() > first {
+            if found.len() > first && !self.thorough {
                 break;
             }
         }
@@ -178,6 +193,8 @@ impl Rings {
                 break;
             }
         }
+        let inverted = self.inverted;
+        self.candidates.retain(|candidate| inverted || !candidate.inverted);
         let worth = |c: &Candidate| c.score + if c.border.whole { 0.1 } else { 0.0 };
         self.candidates.sort_unstable_by(|a, b| worth(b).total_cmp(&worth(a)));
         // The same circle is seen on several levels.
@@ -211,7 +228,7 @@ impl Rings {
     /// Adds the markers among the candidates to those found from the index `first` on.
     fn look_into_all(
         &mut self,
-        view: GrayView<'_>,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
         marker: &Marker,
         (camera, nominal): (Option<&CameraModel>, &CameraModel),
         trace: &mut Trace,
@@ -234,7 +251,13 @@ impl Rings {
             let outcome = if found[first..].iter().any(taken) {
                 Err(Reason::Repeated)
             } else {
-                self.look_into(view, &candidate, marker, camera, nominal)
+                let seen = self.look_into(view, &candidate, marker, camera, nominal);
+                if seen.is_err() && found.len() == first {
+                    let eyes = (view, pyramid, camera.unwrap_or(nominal));
+                    self.look_from_afar(eyes, &candidate, marker, camera.is_some()).or(seen)
+                } else {
+                    seen
+                }
             };
             match outcome {
                 Ok(observation) => {
@@ -250,6 +273,35 @@ impl Rings {
                 break;
             }
         }
+    }
+
+    /// As [`Rings::look_into`] on coarser levels of the pyramid, where noise has averaged out.
+    fn look_from_afar(
+        &mut self,
+        (view, pyramid, camera): (GrayView<'_>, &Pyramid, &CameraModel),
+        candidate: &Candidate,
+        marker: &Marker,
+        is_known: bool,
+    ) -> Result<Observation, Reason> {
+        let mut last = Err(Reason::Edges);
+        for level in COARSER {
+            let scale = to_level_0(1.0, level) - to_level_0(0.0, level);
+            if candidate.diameter_px() < LEAST_FROM_AFAR_PX * scale {
+                break;
+            }
+            let Some(coarse) = pyramid.level(view, level) else { break };
+            let lens = camera_on_level(camera, coarse, level);
+            let mut smaller = *candidate;
+            let Ellipse { centre, minor, major, .. } = &mut smaller.border.ellipse;
+            *centre = centre.map(|c| from_level_0(c, level));
+            (*minor, *major) = (*minor / scale, *major / scale);
+            let camera = is_known.then_some(&lens);
+            last = self.look_into(coarse, &smaller, marker, camera, &lens);
+            if let Ok(observation) = last {
+                return Ok(in_image(observation, level));
+            }
+        }
+        last
     }
 
     /// Whether a candidate is part of a marker, and where that marker is.
@@ -302,6 +354,36 @@ impl Rings {
             pose,
         })
     }
+}
+
+/// The camera whose image a level of the pyramid is.
+fn camera_on_level(camera: &CameraModel, view: GrayView<'_>, level: usize) -> CameraModel {
+    let scale = to_level_0(1.0, level) - to_level_0(0.0, level);
+    CameraModel {
+        width: view.width() as u32,
+        height: view.height() as u32,
+        fx: camera.fx / scale,
+        fy: camera.fy / scale,
+        cx: from_level_0(camera.cx, level),
+        cy: from_level_0(camera.cy, level),
+        ..*camera
+    }
+}
+
+/// What was observed on a level of the pyramid, in pixels of the image.
+fn in_image(mut observation: Observation, level: usize) -> Observation {
+    let scale = to_level_0(1.0, level) - to_level_0(0.0, level);
+    let Pixel { x, y } = observation.centre;
+    observation.centre = Pixel::new(to_level_0(x, level), to_level_0(y, level));
+    observation.centre_covariance_px2 *= scale * scale;
+    observation.size_px *= scale;
+    if let Some(pose) = &mut observation.pose {
+        pose.reprojection_rms_px *= scale;
+        if let Some(other) = &mut pose.alternative {
+            other.reprojection_rms_px *= scale;
+        }
+    }
+    observation
 }
 
 /// Whether two candidates are one circle.

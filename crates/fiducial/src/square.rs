@@ -37,6 +37,10 @@ use crate::trace::{Reason, Trace};
 const MOST_QUADS: usize = 4000;
 const MOST_SOLVED: usize = 400;
 const MOST_FOUND: usize = 256;
+const MOST_PAPERS: usize = 64;
+
+/// Borders are broken by what is in them where cells are not wider, in pixels.
+const MOST_BROKEN_CELL_PX: f64 = 2.0;
 
 /// How alike the steps from border to paper are all round a marker: the standard deviation as a share of the mean.
 pub(crate) const MOST_UNEVEN: f64 = 0.6;
@@ -90,6 +94,8 @@ pub struct Squares {
     found: Vec<Found>,
     scratch: Scratch,
     damaged: Damaged,
+    /// Whether markers printed in the other colours are looked for.
+    inverted: bool,
 }
 
 #[derive(Copy, Clone, Debug)]
@@ -119,9 +125,10 @@ impl Squares {
     /// markers of ten across would be narrower than two pixels, and a scratch in a border would open it.
     pub(crate) const LARGEST_PX: u16 = 64;
 
-    /// Looks for these markers; those of families without square cells are left out.
-    pub fn new(markers: &[Marker]) -> Self {
-        let mut squares = Self::default();
+    /// Looks for these markers, printed in the other colours as well when `inverted`; those of families without square cells
+    /// are left out.
+    pub fn new(markers: &[Marker], inverted: bool) -> Self {
+        let mut squares = Self { inverted, ..Self::default() };
         for marker in markers {
             let Some(code) = Code::of(marker.family) else {
                 continue;
@@ -194,33 +201,86 @@ impl Squares {
         self.found.clear();
         self.read(view, outlines, trace);
         stages.ended("codes");
-        self.observe_all(view, camera, found);
+        self.observe_all(view, 0, camera, found);
         stages.ended("poses");
     }
 
     /// Finds the markers that closed outlines do not show, as something hides a part of them; it takes several times as long as
-    /// [`Squares::detect`], whose outlines it needs.
+    /// [`Squares::detect`], which comes first. Looked for are `all` that are missing, or else those of any id of families of which
+    /// two were found: of a board.
     pub(crate) fn detect_damaged(
         &mut self,
         (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
+        all: bool,
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
         found: &mut Vec<Observation>,
     ) {
-        self.found.clear();
-        self.read_damaged((view, pyramid, quads), trace);
-        self.observe_all(view, camera, found);
-        stages.ended("damaged");
+        if self.note_missing(all) {
+            let whole = self.found.len();
+            self.read_damaged((view, pyramid, quads), trace);
+            self.observe_all(view, whole, camera, found);
+            stages.ended("damaged");
+        }
     }
 
+    /// Finds markers so small that their border is broken by the outlines of their paper, which are those from the index `first`
+    /// on and taken to be as wide around the border as a cell.
+    pub(crate) fn detect_on_paper(
+        &mut self,
+        (view, outlines, first): (GrayView<'_>, &Outlines, usize),
+        camera: Option<&CameraModel>,
+        trace: &mut Trace,
+        found: &mut Vec<Observation>,
+    ) {
+        let whole = self.found.len();
+        let mut left = MOST_PAPERS;
+        for outline in outlines.iter().skip(first) {
+            let Some(paper) = Quad::of(&outline) else { continue };
+            if left == 0 || unevenness(&paper, view, 0) > MOST_UNEVEN {
+                continue;
+            }
+            left -= 1;
+            for layout in 0..self.layouts.len() {
+                self.read_on_paper((view, outlines.pyramid()), &paper, layout, trace);
+            }
+        }
+        self.observe_all(view, whole, camera, found);
+    }
+
+    fn read_on_paper(
+        &mut self,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
+        paper: &Quad,
+        layout: usize,
+        trace: &mut Trace,
+    ) {
+        let Layout { cells, extra_border, reversed, .. } = self.layouts[layout];
+        let quad = Quad { inverted: false, ..paper.scaled(cells as f64 / (cells + 2) as f64) };
+        let cell_px = mean_side(&quad.corners) / cells as f64;
+        let is_known = self.found.iter().any(|found| covers(&found.corners, &quad.corners));
+        if reversed || extra_border > 0 || cell_px > MOST_BROKEN_CELL_PX || is_known {
+            return;
+        }
+        let Some(look) = Look::at(&quad.corners, cells, view, pyramid) else { return };
+        if self.cells.solve(&look, &self.layouts[layout])
+            && let Ok(found) = self.match_words(&quad, layout)
+        {
+            trace.accept_quad(quad.corners);
+            self.found.push(found);
+        }
+    }
+
+    /// Observes what was found from the index `from` on.
     fn observe_all(
         &mut self,
         view: GrayView<'_>,
+        from: usize,
         camera: Option<&CameraModel>,
         found: &mut Vec<Observation>,
     ) {
         let first = found.len();
-        for marker in &self.found {
+        for marker in self.found.iter().skip(from) {
             if let Some(wanted) = self.wanted.get(marker.wanted) {
                 found.push(observe(view, marker, wanted, camera, &mut self.scratch));
             }
@@ -283,38 +343,43 @@ impl Squares {
         }
     }
 
-    /// Looks for the markers that outlines do not show. A family of which any id is wanted is missing when none of it was
-    /// found.
-    fn read_damaged(
-        &mut self,
-        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
-        trace: &mut Trace,
-    ) {
-        let mut all_found = true;
+    /// Notes what is looked for on where closed outlines do not show it; false when nothing is.
+    fn note_missing(&mut self, all: bool) -> bool {
+        let mut is_any_missing = false;
         for (index, wanted) in self.wanted.iter_mut().enumerate() {
             wanted.missing.clear();
             let known = || self.found.iter().filter(|found| found.wanted == index);
             let any = wanted.markers.iter().any(|marker| marker.id.is_none());
             let ids = wanted.markers.iter().filter_map(|marker| marker.id);
             wanted.missing.extend(ids.filter(|id| known().all(|found| found.id != *id)));
-            wanted.is_missing =
-                if any { known().next().is_none() } else { !wanted.missing.is_empty() };
-            all_found &= !wanted.is_missing;
+            wanted.is_missing = if any {
+                all || known().nth(1).is_some()
+            } else {
+                all && !wanted.missing.is_empty()
+            };
+            is_any_missing |= wanted.is_missing;
         }
-        if all_found {
-            return;
-        }
+        is_any_missing
+    }
+
+    /// Looks for what is missing.
+    fn read_damaged(
+        &mut self,
+        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
+        trace: &mut Trace,
+    ) {
         let missing = self.wanted.iter().enumerate().filter(|(_, wanted)| wanted.is_missing);
         let sought = missing.map(|(index, wanted)| {
             let any = wanted.markers.iter().any(|marker| marker.id.is_none());
             Sought { index, code: wanted.code, ids: (!any).then_some(wanted.missing.as_slice()) }
         });
-        let whole = self.found.len();
-        for marker in self.damaged.find(view, quads.of(view, pyramid), sought) {
+        let (known, inverted) = (&self.found, self.inverted);
+        let is_open = |quad: &Quad, code: &Code| {
+            (inverted || quad.inverted == code.reversed_border)
+                && !known.iter().any(|found| covers(&found.corners, &quad.corners))
+        };
+        for marker in self.damaged.find(view, quads.of(view, pyramid), sought, is_open) {
             let corners = marker.quad.corners;
-            if self.found[..whole].iter().any(|found| is_same(&found.corners, &corners)) {
-                continue;
-            }
             trace.accept_quad(corners);
             let reading = marker.reading;
             // As many bits again as make the reading certain make it as sure as a whole marker's.
@@ -372,6 +437,9 @@ impl Squares {
     ) -> Result<Found, Reason> {
         let wanted = self.wanted.get(index).ok_or(Reason::Unwanted)?;
         if !wanted.markers.iter().any(|m| m.id.is_none_or(|wanted| wanted == id)) {
+            return Err(Reason::Unwanted);
+        }
+        if quad.inverted != wanted.code.reversed_border && !self.inverted {
             return Err(Reason::Unwanted);
         }
         let word = wanted.code.words.get(id as usize).ok_or(Reason::Unwanted)?;
@@ -445,6 +513,12 @@ fn wider_by(code: &Code) -> u8 {
 fn is_same(a: &[Pixel; 4], b: &[Pixel; 4]) -> bool {
     let (size, other) = (diagonal_px(a), diagonal_px(b));
     middle(a).distance(&middle(b)) < 0.2 * size && other < 1.5 * size && size < 1.5 * other
+}
+
+/// Whether a marker that was found leaves no place for another one there: one around it may be.
+pub(crate) fn covers(known: &[Pixel; 4], other: &[Pixel; 4]) -> bool {
+    let size = diagonal_px(known);
+    middle(known).distance(&middle(other)) < 0.4 * size && diagonal_px(other) < 1.5 * size
 }
 
 /// Standard deviation of the steps from just within a quad to just outside, all round, as a share of their mean: in grey

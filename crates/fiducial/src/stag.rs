@@ -14,7 +14,7 @@ mod samples;
 
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::from_level_0;
-use imaging::{GrayView, Outlines, Pyramid, bilinear, outline};
+use imaging::{GrayView, Outlines, Pyramid, bilinear};
 
 use crate::marker::Marker;
 use crate::observation::{Observation, Stages};
@@ -24,7 +24,7 @@ use crate::square::decode::Grid;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
 use crate::square::segments::ImageQuads;
-use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, unevenness};
+use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, covers, unevenness};
 use crate::trace::{Reason, Trace};
 
 use damaged::Damaged;
@@ -81,6 +81,8 @@ pub(crate) struct Stags {
     scratch: Scratch,
     damaged: Damaged,
     places: Vec<[Pixel; 4]>,
+    /// Whether markers printed white on black are looked for.
+    inverted: bool,
 }
 
 /// One family that is looked for, and which of its ids.
@@ -111,9 +113,9 @@ impl Stags {
     /// thin on the next level.
     pub(crate) const LARGEST_PX: u16 = 56;
 
-    /// Looks for these markers; those of other families are left out.
-    pub(crate) fn new(markers: &[Marker]) -> Self {
-        let mut stags = Self::default();
+    /// Looks for these markers, white on black as well when `inverted`; those of other families are left out.
+    pub(crate) fn new(markers: &[Marker], inverted: bool) -> Self {
+        let mut stags = Self { inverted, ..Self::default() };
         for marker in markers {
             let Some(book) = code::book(marker.family) else { continue };
             match stags.wanted.iter_mut().find(|w| w.markers[0].family == marker.family) {
@@ -142,6 +144,18 @@ impl Stags {
         self.wanted.is_empty()
     }
 
+    /// Whether markers that were not found are to be looked for: `all` of them, or else those of any id of a family of which two
+    /// were found.
+    pub(crate) fn is_missing(&self, all: bool, found: &[Observation]) -> bool {
+        self.wanted.iter().any(|wanted| {
+            let known = || found.iter().filter(|o| o.family == wanted.markers[0].family);
+            if wanted.markers.iter().any(|marker| marker.id.is_none()) {
+                return all || known().nth(1).is_some();
+            }
+            all && wanted.markers.iter().any(|marker| known().all(|o| o.id != marker.id))
+        })
+    }
+
     /// Finds the markers among the quads of an image.
     pub(crate) fn detect<'a>(
         &mut self,
@@ -152,7 +166,8 @@ impl Stags {
         found: &mut Vec<Observation>,
     ) {
         self.places.clear();
-        for quad in quads.take(MOST_LOOKS) {
+        let inverted = self.inverted;
+        for quad in quads.filter(|quad| inverted || !quad.inverted).take(MOST_LOOKS) {
             if self.places.len() >= MOST_FOUND {
                 break;
             }
@@ -171,23 +186,12 @@ impl Stags {
         stages.ended("stags");
     }
 
-    /// How to look for the paper of markers too small for their border to be told from the disc.
-    pub(crate) fn papers() -> outline::Settings {
-        outline::Settings {
-            dark_from: None,
-            bright_from: Some(0),
-            largest_px: 40,
-            ..outline::Settings::default()
-        }
-    }
-
-    /// Finds small markers by the outlines of their paper, which were looked for as [`Stags::papers`] says and are those from
-    /// the index `first` on.
+    /// Finds small markers by the outlines of their paper, which are those from the index `first` on.
     pub(crate) fn detect_on_paper(
         &mut self,
         (view, outlines, first): (GrayView<'_>, &Outlines, usize),
         camera: Option<&CameraModel>,
-        (trace, stages): (&mut Trace, &mut impl Stages),
+        trace: &mut Trace,
         found: &mut Vec<Observation>,
     ) {
         let mut left = MOST_PAPERS;
@@ -197,19 +201,17 @@ impl Stags {
                 continue;
             }
             left -= 1;
-            let centre = middle(&paper.corners);
             let share = 1.0 / (1.0 + 2.0 * code::QUIET);
-            let inner = |c: Pixel| {
-                let (dx, dy) = (c.x - centre.x, c.y - centre.y);
-                Pixel::new(centre.x + share * dx, centre.y + share * dy)
-            };
-            let quad = Quad { corners: paper.corners.map(inner), inverted: false };
+            let quad = Quad { inverted: false, ..paper.scaled(share) };
+            if self.places.iter().any(|place| covers(place, &quad.corners)) {
+                continue;
+            }
             if let Ok((reading, refined)) = self.read(view, outlines.pyramid(), &quad, camera) {
                 trace.accept_quad(refined.corners);
+                self.places.push(refined.corners);
                 found.push(self.observe(&reading, &refined, camera));
             }
         }
-        stages.ended("papers");
     }
 
     /// Finds the markers that closed outlines do not show, as something hides a part of them; it takes several times as long
@@ -223,6 +225,10 @@ impl Stags {
     ) {
         let mut damaged = std::mem::take(&mut self.damaged);
         let candidates = damaged.find(quads.of(view, pyramid), |quad| {
+            let is_taken = self.places.iter().any(|place| covers(place, &quad.corners));
+            if is_taken || quad.inverted && !self.inverted {
+                return None;
+            }
             let reading = self.sampled((view, pyramid), quad, false)?;
             Some((reading, reading.explained * (1.0 - 1.0 / (1.0 + reading.ratio))))
         });

@@ -137,3 +137,72 @@ fn a_tag_of_twelve_pixels_that_a_camera_sharpened_is_read() {
     }
     assert!(found_all >= 18, "{found_all} of 20");
 }
+
+/// Markers of 60 pixels, side by side on paper, the last one with a corner under something white.
+fn board(markers: usize, inverted: bool) -> GrayImage {
+    let code = Code::of(Family::Aruco4x4_50).unwrap();
+    picture([40 + 90 * markers, 130], 1.0, |[x, y]| {
+        let marker = ((x - 20.0) / 90.0).floor().clamp(0.0, markers as f64 - 1.0);
+        let place = [x - 35.0 - 90.0 * marker, y - 35.0].map(|v| v / 10.0);
+        let last = marker as usize + 1 == markers;
+        if markers > 1 && last && place[0] + place[1] > 9.9 && place[0].max(place[1]) < 6.5 {
+            return GREYS[1];
+        }
+        let within = place.iter().all(|v| (0.0..6.0).contains(v));
+        let white = !within || is_white(code, 5 + marker as usize, 1, place);
+        GREYS[usize::from(white != inverted)]
+    })
+}
+
+fn ids(image: &GrayImage, markers: &[&str], settings: Settings) -> Vec<u32> {
+    let markers: Vec<Marker> = markers.iter().map(|name| name.parse().unwrap()).collect();
+    let mut detector = Detector::new(&markers, settings).unwrap();
+    let found = detector.detect(image.view().unwrap(), None, &mut ());
+    let mut ids: Vec<u32> = found.iter().filter_map(|seen| seen.id).collect();
+    ids.sort_unstable();
+    ids
+}
+
+#[test]
+fn a_covered_marker_is_found_beside_others_on_boards_and_where_it_is_asked_for() {
+    let (quick, thorough) =
+        (Settings::default(), Settings { thorough: true, ..Settings::default() });
+    let any = ["aruco-4x4-50"];
+    assert_eq!(ids(&board(3, false), &any, quick), [5, 6, 7]);
+    assert_eq!(ids(&board(2, false), &any, quick), [5]);
+    assert_eq!(ids(&board(2, false), &any, thorough), [5, 6]);
+    let both = ["aruco-4x4-50:5", "aruco-4x4-50:6"];
+    assert_eq!(ids(&board(2, false), &both, quick), [5]);
+    assert_eq!(ids(&board(2, false), &both, thorough), [5, 6]);
+}
+
+#[test]
+fn markers_in_the_other_colours_can_be_left_out() {
+    let dark_only = Settings { inverted: false, ..Settings::default() };
+    let any = ["aruco-4x4-50"];
+    assert_eq!(ids(&board(1, true), &any, Settings::default()), [5]);
+    assert_eq!(ids(&board(1, true), &any, dark_only), []);
+    assert_eq!(ids(&board(1, false), &any, dark_only), [5]);
+}
+
+#[test]
+fn a_small_marker_beside_a_large_one_is_found_by_who_is_thorough() {
+    let marker = "rings:1".parse().unwrap();
+    let drawing = fiducial::Drawing::new(&marker, 1.0).unwrap();
+    let places = [([150.3, 130.7], 200.0), ([310.6, 80.2], 40.0)];
+    let image = picture([360, 260], 1.0, |[x, y]| {
+        let on = |(middle, size): ([f64; 2], f64)| {
+            let [u, v] = [(x - middle[0]) / size, (middle[1] - y) / size];
+            let ink = drawing.ink_at(u, v);
+            (u.abs().max(v.abs()) < drawing.half_extent_m)
+                .then_some(GREYS[usize::from(ink == fiducial::Ink::White)])
+        };
+        places.into_iter().find_map(on).unwrap_or(GREYS[2])
+    });
+    let count = |settings: Settings| {
+        let mut detector = Detector::new(&[marker], settings).unwrap();
+        detector.detect(image.view().unwrap(), None, &mut ()).len()
+    };
+    assert_eq!(count(Settings::default()), 1);
+    assert_eq!(count(Settings { thorough: true, ..Settings::default() }), 2);
+}

@@ -42,17 +42,20 @@ const MOST_READ: usize = 100;
 const MOST_FOUND: usize = 64;
 
 impl Damaged {
-    /// The markers in an image among the quads that its segments make; the surest first.
+    /// The markers in an image among the quads that its segments make, as far as these are open to markers of the code; the
+    /// surest first.
     pub fn find<'a>(
         &mut self,
         view: GrayView<'_>,
         quads: &[Quad],
         sought: impl Iterator<Item = Sought<'a>> + Clone,
+        is_open: impl Fn(&Quad, &Code) -> bool,
     ) -> &[DamagedMarker] {
         self.found.clear();
         let mut left = MOST_READ;
         for quad in quads {
-            read(view, quad, sought.clone(), &mut left, &mut self.found);
+            let sought = sought.clone().filter(|sought| is_open(quad, sought.code));
+            read(view, quad, sought, &mut left, &mut self.found);
         }
         self.choose();
         &self.found
@@ -180,7 +183,7 @@ mod tests {
         pyramid.build(view, 4, 16);
         let sought = std::iter::once(Sought { index: 0, code, ids });
         let mut quads = ImageQuads::default();
-        Damaged::default().find(view, quads.of(view, &pyramid), sought).to_vec()
+        Damaged::default().find(view, quads.of(view, &pyramid), sought, |_, _| true).to_vec()
     }
 
     /// Finds the one marker there is, whatever its turn, with its corners to so many pixels.

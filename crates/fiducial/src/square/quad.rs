@@ -30,6 +30,16 @@ pub(crate) fn diagonal_px(corners: &[Pixel; 4]) -> f64 {
 }
 
 impl Quad {
+    /// The quad drawn together about its middle by this factor.
+    pub(crate) fn scaled(&self, factor: f64) -> Self {
+        let centre = middle(&self.corners);
+        let inner = |c: Pixel| {
+            let (dx, dy) = (c.x - centre.x, c.y - centre.y);
+            Pixel::new(centre.x + factor * dx, centre.y + factor * dy)
+        };
+        Self { corners: self.corners.map(inner), ..*self }
+    }
+
     /// The quad that an outline is, its sides fitted to the outline's points; `None` when it is none.
     pub(crate) fn of(outline: &Outline<'_>) -> Option<Self> {
         let points = outline.points;
