@@ -53,7 +53,6 @@ fn main() -> ExitCode {
                     println!("{}", onehost::reader(args.get(1).context("reader PORT")?).await?);
                     Ok(())
                 }
-                Some("answerer") => setpoint::answerer(args.get(1).context("answerer PORT")?).await,
                 Some("table") => table(args.get(1..).unwrap_or_default()).await,
                 // What a test runner asks of its harness; there is one test.
                 Some("--list") => Ok(()),
@@ -108,12 +107,12 @@ async fn table(names: &[String]) -> anyhow::Result<()> {
     if is_wanted("onehost") {
         print("one host", onehost::run().await?);
     }
-    if is_wanted("setpoint") {
-        print("stamp to setpoint without a detector", setpoint::run(GOOD).await?);
-    }
     for seed in 1..=3 {
         if is_wanted("onboard") {
             print("onboard", flight::onboard(seed).await?);
+        }
+        if is_wanted("setpoint") {
+            print("frame to setpoint without the search", setpoint::run(GOOD, seed).await?);
         }
         if is_wanted("good") {
             print("ground, 20 Mbit/s", flight::ground(GOOD, seed, camera).await?);

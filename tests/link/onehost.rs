@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use messages::{FrameHeader, PixelFormat, topic};
-use node::{FramePublisher, Identity, Loan, Network, Node, clock_name, now_ns};
+use node::{FramePublisher, Identity, Loan, Network, Node, now_ns};
 use serde_json::{Value, json};
 use tokio::time::interval;
 
@@ -18,8 +18,7 @@ use crate::probe::Times;
 
 const WIDTH: u32 = 1296;
 const HEIGHT: u32 = 972;
-/// Bytes of a frame.
-pub(crate) const LEN: usize = WIDTH as usize * HEIGHT as usize;
+const LEN: usize = WIDTH as usize * HEIGHT as usize;
 /// 30 frames a second.
 const PERIOD: Duration = Duration::from_micros(33_333);
 const FRAMES: u64 = 90;
@@ -112,27 +111,22 @@ async fn film(publisher: &FramePublisher) {
     let mut ticks = interval(PERIOD);
     for sequence in 0..FRAMES + WARM_UP {
         ticks.tick().await;
-        take(publisher, sequence).await;
+        let stamp_ns = now_ns();
+        let mut pixels = publisher.loan(LEN);
+        write(&mut pixels, sequence);
+        let header = FrameHeader {
+            camera: "probe".into(),
+            sequence,
+            stamp_ns,
+            clock: "probe".into(),
+            exposure_ns: 0,
+            width: WIDTH,
+            height: HEIGHT,
+            format: PixelFormat::Mono8,
+            parts: Vec::new(),
+        };
+        publisher.publish(&header, pixels).await;
     }
-}
-
-/// Takes a frame of the camera `probe`, and publishes it.
-pub(crate) async fn take(publisher: &FramePublisher, sequence: u64) {
-    let stamp_ns = now_ns();
-    let mut pixels = publisher.loan(LEN);
-    write(&mut pixels, sequence);
-    let header = FrameHeader {
-        camera: "probe".into(),
-        sequence,
-        stamp_ns,
-        clock: clock_name().to_owned(),
-        exposure_ns: 0,
-        width: WIDTH,
-        height: HEIGHT,
-        format: PixelFormat::Mono8,
-        parts: Vec::new(),
-    };
-    publisher.publish(&header, pixels).await;
 }
 
 /// The reader, a process of its own.

@@ -1,114 +1,100 @@
-//! One host: from a frame's stamp to the setpoint, without the time a detector needs.
+//! One host: from a frame to the setpoint, without the time the detector needs, while the simulator flies.
 //!
-//! A whole flight runs, its camera and detector as well. Beside them this program films with a camera of its own whose
-//! stamp is the moment before it writes the pixels, and a process in the detector's place answers each of its frames at
-//! once with what the real detector saw last. The controller flies by these answers, and measures.
+//! This process receives the frames as the detector does, which is when the clock starts: what came before is the
+//! simulator's drawing, in the place of a camera's exposure. The detector tells with its detections how long its stages
+//! took, and the controller publishes its target right after it has sent the setpoint. How long a frame is under way in
+//! shared memory is the trial `onehost`.
 
-use std::process::{Command, Stdio};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::collections::BTreeMap;
 use std::time::Duration;
 
-use anyhow::Context;
-use messages::{ControllerStatus, Detection, Detections, topic};
-use node::{Identity, Network, Node};
-use tokio::time::{Instant, interval, timeout};
+use messages::{Detections, TargetEstimate, topic};
+use node::now_ns;
+use tokio::time::{Instant, sleep_until};
 
-use crate::onehost::{self, LEN};
+use crate::probe::Times;
 use crate::site::{Radio, Site};
 
-/// 15 frames a second.
-const PERIOD: Duration = Duration::from_micros(66_667);
 /// Longest flight.
 const PATIENCE: Duration = Duration::from_secs(90);
-/// What the controller lands on here: the real detector's answers are of another marker, and never used.
-const MARKER: &str = "aruco-4x4-50";
+/// The age of a detection is told in milliseconds: a frame's stamp is found again within this time.
+const ROUNDING_NS: i64 = 2_000;
 
 /// What was measured.
 pub(crate) struct Setpoint {
-    status: ControllerStatus,
+    times: Times,
+    frames: usize,
+    landed: bool,
 }
 
 impl std::fmt::Display for Setpoint {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let [p50, p99] = self.status.latency_ms.unwrap_or([f64::NAN; 2]);
-        let ControllerStatus { phase, why, detections_used, .. } = &self.status;
-        write!(
-            f,
-            "median {p50:.2} ms, p99 {p99:.2} ms of {detections_used} frames; ended in {phase}: {why}"
-        )
+        let [p50, p99] = [0.5, 0.99].map(|part| self.times.at(part));
+        let end = if self.landed { "landed" } else { "NOT LANDED" };
+        write!(f, "median {p50:.2} ms, p99 {p99:.2} ms of {} frames; {end}", self.frames)
+    }
+}
+
+/// When things happened to the frame of a stamp, in nanoseconds.
+#[derive(Default)]
+struct Journal {
+    arrived: BTreeMap<i64, i64>,
+    searched: BTreeMap<i64, i64>,
+    sent: BTreeMap<i64, i64>,
+}
+
+impl Journal {
+    fn detections(&mut self, message: &Detections) {
+        let micros: u64 = message.stages.iter().map(|stage| u64::from(stage.micros)).sum();
+        self.searched.insert(message.header.stamp_ns, micros as i64 * 1000);
+    }
+
+    fn target(&mut self, target: &TargetEstimate) {
+        if let Some(age_ms) = target.age_ms.filter(|_| target.velocity_ned_m_s.is_some()) {
+            self.sent.insert(target.stamp_ns - (age_ms * 1e6) as i64, target.stamp_ns);
+        }
+    }
+
+    /// From each frame's arrival to its setpoint, without the search.
+    fn times_ms(&self) -> Vec<f64> {
+        let time_ms = |(stamp_ns, sent_ns): (&i64, &i64)| {
+            let around = stamp_ns - ROUNDING_NS..=stamp_ns + ROUNDING_NS;
+            let (stamp_ns, arrived_ns) = self.arrived.range(around).next()?;
+            let searched_ns = self.searched.get(stamp_ns)?;
+            Some((sent_ns - arrived_ns - searched_ns) as f64 * 1e-6)
+        };
+        self.sent.iter().filter_map(time_ms).collect()
     }
 }
 
 /// Flies and measures.
-pub(crate) async fn run(radio: Radio) -> anyhow::Result<Option<Setpoint>> {
+pub(crate) async fn run(radio: Radio, seed: u64) -> anyhow::Result<Option<Setpoint>> {
     let Some(mut site) = Site::new(radio).await? else { return Ok(None) };
-    let mut answering = Command::new(std::env::current_exe()?);
-    answering.args(["answerer", &site.meet().to_string()]).stdin(Stdio::null());
-    let mut answering = answering.spawn().context("starting the one that answers")?;
-    let result = measure(&mut site).await;
-    answering.kill()?;
-    answering.wait()?;
-    result.map(Some)
-}
-
-async fn measure(site: &mut Site) -> anyhow::Result<Setpoint> {
     let node = site.node.clone();
-    let frames = node.frame_publisher(topic::FRAME, &["probe"], LEN).await?;
-    let infos = node.subscriber(topic::CAMERA_INFO, &["down"]).await?;
-    let info = node.publisher(topic::CAMERA_INFO, &["probe"]).await?;
+    let frames = node.frame_subscriber(topic::FRAME, &[]).await?;
+    let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
+    let targets = node.subscriber(topic::TARGET, &[]).await?;
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     site.drone("detector", &["--set", "id=onboard"])?;
-    site.flight_by(1, &[], &["--set", &format!("marker=\"{MARKER}\"")])?;
-    // The same mount and lens as the real camera's.
-    let real = timeout(PATIENCE, infos.next()).await?.context("no camera")?;
-    info.publish(&messages::CameraInfo { camera: "probe".into(), ..real }).await;
-    let mut ticks = interval(PERIOD);
-    let mut sequence = 0;
-    let mut last = None;
+    site.flight(seed, &[])?;
+    let mut journal = Journal::default();
+    let mut landed = false;
     let end = Instant::now() + PATIENCE;
-    while Instant::now() < end {
+    while !landed {
         tokio::select! {
-            _ = ticks.tick() => {
-                onehost::take(&frames, sequence).await;
-                sequence += 1;
+            () = sleep_until(end) => break,
+            Some(frame) = frames.next() => {
+                journal.arrived.insert(frame.header.stamp_ns, now_ns());
             }
-            Some(status) = statuses.next() => {
-                let is_done = status.finished;
-                last = Some(status);
-                if is_done {
-                    break;
-                }
-            }
+            Some(message) = detections.next() => journal.detections(&message),
+            Some(target) = targets.next() => journal.target(&target),
+            Some(status) = statuses.next() => landed = status.disarmed_ns.is_some(),
         }
     }
     site.all_run()?;
-    Ok(Setpoint { status: last.context("the controller says nothing")? })
-}
-
-/// The process in the detector's place.
-pub(crate) async fn answerer(meet: &str) -> anyhow::Result<()> {
-    let network = Network { meet: Some(meet.parse()?), ..Network::default() };
-    let identity = Identity { service: "detector", instance: "answerer".into() };
-    let node = Node::open(identity, &network.source("detector")?).await?;
-    let frames = node.frame_subscriber(topic::FRAME, &["probe"]).await?;
-    let answers = node.publisher(topic::DETECTIONS, &["answerer"]).await?;
-    let real = node.subscriber(topic::DETECTIONS, &["onboard"]).await?;
-    node.announce().await?;
-    let seen = Arc::new(Mutex::new(Vec::<Detection>::new()));
-    let newest = Arc::clone(&seen);
-    tokio::spawn(async move {
-        while let Some(message) = real.next().await {
-            *newest.lock().unwrap_or_else(PoisonError::into_inner) = message.detections;
-        }
-    });
-    while let Some(frame) = frames.next().await {
-        let mut detections = seen.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        for detection in &mut detections {
-            detection.family = MARKER.into();
-            detection.id = Some(0);
-        }
-        let (detector, header, stages) = ("answerer".into(), frame.header, Vec::new());
-        answers.publish(&Detections { detector, header, detections, stages }).await;
-    }
-    Ok(())
+    let mut times = Times::default();
+    let found = journal.times_ms();
+    let frames = found.len();
+    found.into_iter().for_each(|ms| times.add(ms));
+    Ok(Some(Setpoint { times, frames, landed }))
 }

@@ -160,11 +160,6 @@ impl Site {
         Ok(Some(Self { air, meet, port: 7448, autopilot, children, node }))
     }
 
-    /// Where the drone's processes meet.
-    pub(crate) fn meet(&self) -> u16 {
-        self.meet
-    }
-
     /// Where the ground finds the drone.
     fn drone_address(&self) -> String {
         format!("{}:{}", self.air.drone, self.port)
@@ -185,25 +180,13 @@ impl Site {
 
     /// Starts a simulated flight: world, camera, autopilot and controller.
     pub(crate) fn flight(&mut self, seed: u64, camera: &[&str]) -> anyhow::Result<()> {
-        self.flight_by(seed, camera, &[])
-    }
-
-    /// The same with a controller that is started with further arguments.
-    pub(crate) fn flight_by(
-        &mut self,
-        seed: u64,
-        camera: &[&str],
-        controller: &[&str],
-    ) -> anyhow::Result<()> {
         let (seed, port) = (format!("seed={seed}"), self.autopilot);
         let address = format!("autopilot.address=\"udpout:127.0.0.1:{port}\"");
         let mut args = vec!["--set", seed.as_str(), "--set", &address];
         args.extend(camera.iter().flat_map(|set| ["--set", set]));
         self.drone("simulator", &args)?;
         let address = format!("autopilot.address=\"udpin:127.0.0.1:{port}\"");
-        let mut args = vec!["--set", address.as_str(), "--set", "start=\"takeoff\""];
-        args.extend(controller);
-        self.drone("controller", &args)
+        self.drone("controller", &["--set", &address, "--set", "start=\"takeoff\""])
     }
 
     /// A command that runs on the ground.
