@@ -192,7 +192,7 @@ fn droughts(heard: &[Heard]) -> Vec<(i64, f64, String)> {
     droughts
 }
 
-/// Holds over the pad, swaps detectors of two families again and again, and lands. Between the swaps, for half as long,
+/// Holds over the pad, swaps detectors of two families again and again, and lands. Between the swaps, for a third as long,
 /// the same hold without them.
 async fn swaps(number: usize) -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
@@ -206,13 +206,16 @@ async fn swaps(number: usize) -> anyhow::Result<()> {
         "controller.phases.operator_hold_timeout_s=3600",
         "--set",
         "controller.phases.landing_timeout_s=3000",
+        // Slowly, as the last swap comes on the way down: the tag is in view down to 0.7 m.
+        "--set",
+        "controller.metric.max_descend_m_s=0.3",
         "--pad",
         pad.to_str().context("a path")?,
     ];
     let landing = Landing::start(&[&["--seed", "21"], &long[..]].concat()).await?;
     let healths = landing.node.subscriber(topic::HEALTH, &["controller", "main"]).await?;
     let heard = listen(&landing.node).await?;
-    landing.descends_below(7.0).await?;
+    landing.descends_below(8.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
     landing.status("it holds", |s| s.phase == "hold").await?;
     let mut used = "main".to_owned();
@@ -220,6 +223,9 @@ async fn swaps(number: usize) -> anyhow::Result<()> {
     let (mut with, mut without) = (Ticks::default(), Ticks::default());
     let mut marks = Vec::new();
     for i in 0..number {
+        if i + 1 == number {
+            command(&landing, ControllerCommand::Resume).await?;
+        }
         let before = Ticks::now(&healths).await?;
         let began_ns = now_ns();
         let file = detectors[i % detectors.len()].to_str().context("a path")?;
@@ -235,11 +241,12 @@ async fn swaps(number: usize) -> anyhow::Result<()> {
         took_s.push(at("active_s"));
         let after = Ticks::now(&healths).await?;
         with.add_since(before, after);
-        if i + 3 == number {
-            command(&landing, ControllerCommand::Resume).await?;
-        } else if i + 3 < number {
-            sleep(Duration::from_secs_f64(0.5 * ended_s)).await;
+        if i + 1 < number {
+            sleep(Duration::from_secs_f64(0.3 * ended_s)).await;
             without.add_since(after, Ticks::now(&healths).await?);
+        }
+        if i % 25 == 24 {
+            println!("{} swaps; with them {with}; beside them {without}", i + 1);
         }
     }
     took_s.sort_by(f64::total_cmp);
