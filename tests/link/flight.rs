@@ -269,6 +269,7 @@ impl Watch {
         let mut flight = Flight::default();
         let mut touchdown: Option<Touchdown> = None;
         let mut done: Option<Instant> = None;
+        let mut disarmed = false;
         let deadline = Instant::now() + PATIENCE;
         loop {
             let end = done.unwrap_or(deadline);
@@ -279,7 +280,7 @@ impl Watch {
                 Some(status) = self.statuses.next() => {
                     flight.why = format!("{}: {}", status.phase, status.why);
                     if status.finished && done.is_none() {
-                        flight.landed = status.disarmed_ns.is_some() && touchdown.is_some();
+                        disarmed = status.disarmed_ns.is_some();
                         if let (Some(from), Some(to)) = (status.started_ns, status.disarmed_ns) {
                             flight.seconds = (to - from) as f64 * 1e-9;
                         }
@@ -290,6 +291,8 @@ impl Watch {
         }
         site.all_run()?;
         ensure!(done.is_some(), "no end of the flight: {flight}");
+        // The truth may be heard after the status.
+        flight.landed = disarmed && touchdown.is_some();
         flight.error_m = touchdown.map_or(f64::NAN, |touchdown| touchdown.error_m);
         Ok(flight)
     }
