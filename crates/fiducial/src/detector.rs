@@ -1,8 +1,9 @@
 //! The detector: markers in, observations out.
 
-use geometry::CameraModel;
+use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outlines, outline};
 
+use crate::circles::Circles;
 use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
 use crate::rings::Rings;
@@ -82,6 +83,17 @@ const PAPERS: outline::Settings = outline::Settings {
     least_fill: 0.3,
     most_ragged: 1.3,
 };
+
+/// Where a marker should be.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Expected {
+    pub(crate) family: Family,
+    pub(crate) id: Option<u32>,
+    /// The corners of a square marker, its own top left first.
+    pub(crate) corners: Option<[Pixel; 4]>,
+    /// The place of rings.
+    pub(crate) circles: Option<Circles>,
+}
 
 /// Why there is no detector for these markers.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -181,6 +193,39 @@ impl Detector {
         self.turns = self.turns.wrapping_add(1);
         let allowed = if self.settings.thorough { Allowed::All } else { Allowed::One(pass) };
         self.search(view, camera, allowed, stages)
+    }
+
+    /// Looks for one marker where it should be, and nothing else. `None` when it is not plain to see there; a search of the
+    /// surroundings may still find it.
+    pub(crate) fn detect_at(
+        &mut self,
+        view: GrayView<'_>,
+        camera: Option<&CameraModel>,
+        expected: &Expected,
+        stages: &mut impl Stages,
+    ) -> Option<Observation> {
+        self.trace.clear();
+        // Who looks thoroughly looks for others beside it.
+        if self.settings.thorough {
+            return None;
+        }
+        let Expected { family, id, .. } = *expected;
+        let seen = match (expected.corners, expected.circles, camera) {
+            (Some(corners), _, _) => {
+                self.outlines.begin(view);
+                let (quad, seen) = ((family, id?, corners), (view, self.outlines.pyramid()));
+                let seen_again = self.squares.detect_at(seen, quad, camera);
+                seen_again.or_else(|| self.stags.detect_at(seen, quad, camera))?
+            }
+            (None, Some(circles), Some(camera)) => {
+                let marker = self.markers.iter().find(|m| m.family == family && m.id == id)?;
+                self.rings.detect_at(view, marker, camera, &circles)?
+            }
+            _ => return None,
+        };
+        self.trace.markers.push(TracedMarker::from(&seen));
+        stages.ended("following");
+        Some(seen)
     }
 
     fn search(

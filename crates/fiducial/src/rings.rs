@@ -12,7 +12,7 @@ use geometry::{CameraModel, Pixel};
 use imaging::pyramid::{from_level_0, to_level_0};
 use imaging::{Ellipse, GrayView, Outlines, Pyramid, outline};
 
-use crate::circles::{EdgePoint, pixel_covariance, project};
+use crate::circles::{Circles, EdgePoint, pixel_covariance, project};
 use crate::detector::{Allowed, SlowPass};
 use crate::lens::{guess_lens, nominal_camera};
 use crate::marker::{Family, Marker};
@@ -21,7 +21,7 @@ use crate::outline::{Border, add_arcs, whole_border};
 use crate::photometry::Spot;
 use crate::profile::{Candidate, candidates, speck};
 use crate::ring::{Ring, RingKind};
-use crate::search::Search;
+use crate::search::{Search, Seen};
 use crate::trace::{Reason, Trace};
 
 /// Where the marker is looked for; what comes later only when it was not found before.
@@ -102,6 +102,8 @@ const MOST_MARKERS: usize = 8;
 /// Levels of the pyramid on which what noise hides is looked for, and the least diameter there, in pixels.
 const COARSER: [usize; 2] = [1, 2];
 const LEAST_FROM_AFAR_PX: f64 = 16.0;
+/// What a followed marker's dark rings lack of the light beside them at least, as a share.
+const LEAST_CONTRAST: f64 = 0.15;
 /// What looks like the marker less than this share of how much one does that was found is no other one.
 const LEAST_OF_BEST: f64 = 0.8;
 
@@ -155,6 +157,21 @@ impl Rings {
             }
         }
         found[first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
+    }
+
+    /// Finds the marker that should be about here.
+    pub(crate) fn detect_at(
+        &mut self,
+        view: GrayView<'_>,
+        marker: &Marker,
+        camera: &CameraModel,
+        expected: &Circles,
+    ) -> Option<Observation> {
+        let size_m = marker.size_m?;
+        let search =
+            Search { view, camera, size_m, least_contrast: LEAST_CONTRAST, inverted: false };
+        let seen = search.again(expected, &mut self.edges, &mut self.spots)?;
+        observed(&seen, (seen.circles, camera), (Some(size_m), Some(camera)), camera).ok()
     }
 
     /// The circles that may be the marker's, those that look most like it first.
@@ -328,31 +345,7 @@ impl Rings {
             None => guess_lens(&seen.circles, lens, &mut self.edges),
         };
         let (circles, lens) = guessed.unwrap_or((seen.circles, *lens));
-        let pose = marker.size_m.and(camera).map(|_| MarkerPose {
-            camera_from_marker: circles.camera_from_marker(),
-            reprojection_rms_px: seen.rms_px,
-            covariance: seen.covariance,
-            alternative: seen.other.map(|(other, reprojection_rms_px)| PoseSolution {
-                camera_from_marker: other.camera_from_marker(),
-                reprojection_rms_px,
-            }),
-        });
-        let of_centre = seen.covariance.fixed_view::<3, 3>(0, 0).into_owned();
-        let centre_covariance_px2 =
-            pixel_covariance(seen.circles.centre, &of_centre, search.camera).ok_or(Reason::Pose)?;
-        let centre = project(circles.centre, &lens).ok_or(Reason::Pose)?;
-        let outline = circles.outline(size_m / 2.0, &lens).ok_or(Reason::Pose)?;
-        Ok(Observation {
-            family: Family::Rings,
-            id: None,
-            centre,
-            centre_covariance_px2,
-            corners: None,
-            wrong_bits: 0,
-            size_px: outline.major,
-            confidence: seen.confidence,
-            pose,
-        })
+        observed(&seen, (circles, &lens), (marker.size_m, camera), search.camera)
     }
 }
 
@@ -384,6 +377,40 @@ fn in_image(mut observation: Observation, level: usize) -> Observation {
         }
     }
     observation
+}
+
+/// A marker that was seen, its circles through a lens that may be guessed.
+fn observed(
+    seen: &Seen,
+    (circles, lens): (Circles, &CameraModel),
+    (size_m, camera): (Option<f64>, Option<&CameraModel>),
+    nominal: &CameraModel,
+) -> Result<Observation, Reason> {
+    let pose = size_m.and(camera).map(|_| MarkerPose {
+        camera_from_marker: circles.camera_from_marker(),
+        reprojection_rms_px: seen.rms_px,
+        covariance: seen.covariance,
+        alternative: seen.other.map(|(other, reprojection_rms_px)| PoseSolution {
+            camera_from_marker: other.camera_from_marker(),
+            reprojection_rms_px,
+        }),
+    });
+    let of_centre = seen.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+    let centre_covariance_px2 =
+        pixel_covariance(seen.circles.centre, &of_centre, nominal).ok_or(Reason::Pose)?;
+    let centre = project(circles.centre, lens).ok_or(Reason::Pose)?;
+    let outline = circles.outline(size_m.unwrap_or(1.0) / 2.0, lens).ok_or(Reason::Pose)?;
+    Ok(Observation {
+        family: Family::Rings,
+        id: None,
+        centre,
+        centre_covariance_px2,
+        corners: None,
+        wrong_bits: 0,
+        size_px: outline.major,
+        confidence: seen.confidence,
+        pose,
+    })
 }
 
 /// Whether two candidates are one circle.

@@ -128,6 +128,20 @@ impl Search<'_> {
         Ok(seen)
     }
 
+    /// The marker that should be where this pose has it, when it is neither too small nor too large and plain to see.
+    pub(crate) fn again(
+        &self,
+        expected: &Circles,
+        edges: &mut Vec<EdgePoint>,
+        spots: &mut Vec<Spot>,
+    ) -> Option<Seen> {
+        if expected.outline(self.size_m / 2.0, self.camera)?.major < SMALL_PX {
+            return None;
+        }
+        let rough = self.rough(expected, edges)?;
+        self.at_once(&rough, edges, spots)
+    }
+
     /// A marker too small for edges: its grey values decide.
     fn small(
         &self,

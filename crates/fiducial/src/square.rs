@@ -21,7 +21,7 @@ use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outline, Outlines, Pyramid, bilinear};
 use nalgebra::{Matrix2, SMatrix};
 
-use crate::marker::Marker;
+use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
 use crate::pose::square_pose;
 use crate::square::code::Code;
@@ -203,6 +203,32 @@ impl Squares {
         stages.ended("codes");
         self.observe_all(view, 0, camera, found);
         stages.ended("poses");
+    }
+
+    /// Finds the marker of this family and id whose corners, its own top left first, should be about here.
+    pub(crate) fn detect_at(
+        &mut self,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
+        (family, id, corners): (Family, u32, [Pixel; 4]),
+        camera: Option<&CameraModel>,
+    ) -> Option<Observation> {
+        let index = self.wanted.iter().position(|wanted| wanted.code.family == family)?;
+        let wanted = self.wanted.get(index)?;
+        let layout = self.layouts.get(wanted.layouts[0]?)?;
+        let quad = Quad { corners, inverted: wanted.code.reversed_border };
+        if unevenness(&quad, view, 0) > MOST_UNEVEN {
+            return None;
+        }
+        let look = Look::at(&corners, layout.cells, view, pyramid)?;
+        if !self.cells.solve(&look, layout) {
+            return None;
+        }
+        let code = wanted.code;
+        let found = code.match_word(self.cells.word(), most_wrong(code));
+        let found = found.filter(|(found, turns, _)| (*found, *turns) == (id, 0))?;
+        let found = self.admit(&quad, (index, 0), found).ok()?;
+        let refined = found.refined(view, wanted, camera, &mut self.scratch)?;
+        Some(observed(&found, wanted, refined, camera))
     }
 
     /// Finds the markers that closed outlines do not show, as something hides a part of them; it takes several times as long as
@@ -572,6 +598,21 @@ impl Spread {
     }
 }
 
+impl Found {
+    /// Its corners between the pixels.
+    fn refined(
+        &self,
+        view: GrayView<'_>,
+        wanted: &Wanted,
+        camera: Option<&CameraModel>,
+        scratch: &mut Scratch,
+    ) -> Option<Refined> {
+        let word = wanted.code.words.get(self.id as usize)?;
+        let pattern = Pattern::bordered(wanted.code, *word, self.extra_border)?;
+        refine(view, &self.corners, &pattern, camera, scratch)
+    }
+}
+
 /// The marker with its corners between the pixels and its pose.
 fn observe(
     view: GrayView<'_>,
@@ -580,11 +621,17 @@ fn observe(
     camera: Option<&CameraModel>,
     scratch: &mut Scratch,
 ) -> Observation {
-    let word = wanted.code.words.get(found.id as usize);
-    let pattern = word.and_then(|w| Pattern::bordered(wanted.code, *w, found.extra_border));
-    let mut refined = pattern
-        .and_then(|pattern| refine(view, &found.corners, &pattern, camera, scratch))
-        .unwrap_or_else(|| coarse(&found.corners, found.corner_px));
+    let refined = found.refined(view, wanted, camera, scratch);
+    let refined = refined.unwrap_or_else(|| coarse(&found.corners, found.corner_px));
+    observed(found, wanted, refined, camera)
+}
+
+fn observed(
+    found: &Found,
+    wanted: &Wanted,
+    mut refined: Refined,
+    camera: Option<&CameraModel>,
+) -> Observation {
     if found.washed_out {
         let coarse = coarse(&found.corners, found.corner_px);
         refined.covariance_px2 += coarse.covariance_px2;

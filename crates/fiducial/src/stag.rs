@@ -16,7 +16,7 @@ use geometry::{CameraModel, Pixel};
 use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Outlines, Pyramid, bilinear};
 
-use crate::marker::Marker;
+use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
 use crate::pose::square_pose;
 use crate::square::codebook::Codebook;
@@ -184,6 +184,24 @@ impl Stags {
             }
         }
         stages.ended("stags");
+    }
+
+    /// Finds the marker of this family and id whose corners, its own top left first, should be about here.
+    pub(crate) fn detect_at(
+        &mut self,
+        (view, pyramid): (GrayView<'_>, &Pyramid),
+        (family, id, corners): (Family, u32, [Pixel; 4]),
+        camera: Option<&CameraModel>,
+    ) -> Option<Observation> {
+        let quad = Quad { corners, inverted: false };
+        let is_wanted = self.wanted.iter().any(|wanted| wanted.markers[0].family == family);
+        if !is_wanted || unevenness(&quad, view, 0) > MOST_UNEVEN {
+            return None;
+        }
+        let (reading, refined) = self.read(view, pyramid, &quad, camera).ok()?;
+        let is_it =
+            (self.wanted.get(reading.wanted)?.markers[0].family, reading.id) == (family, id);
+        (is_it && reading.turns == 0).then(|| self.observe(&reading, &refined, camera))
     }
 
     /// Finds small markers by the outlines of their paper, which are those from the index `first` on.
@@ -470,7 +488,6 @@ impl Wanted {
 
     /// How many dots the words of the family differ in at least, however they are turned.
     fn distance(&self) -> u32 {
-        use crate::marker::Family;
         match self.markers[0].family {
             Family::StagHd11 => 11,
             Family::StagHd13 => 13,
@@ -484,7 +501,6 @@ impl Wanted {
 
     /// How many wrong bits are mended, so that a random word hardly ever becomes one of the family's.
     fn most_wrong(&self) -> u8 {
-        use crate::marker::Family;
         match self.markers[0].family {
             Family::StagHd11 => 4,
             Family::StagHd13 => 5,

@@ -3,13 +3,16 @@
 //! A marker is expected where a constant velocity takes its centre and its size, in a region that grows with what is
 //! not known of its motion. Only these regions are searched, by the same detector with the same checks as ever, so
 //! that a marker is never made up; the whole image is searched every so often, for markers that are new, and whenever
-//! a marker is not where it was expected. Where nothing is followed, what takes long is done in turn
+//! a marker is not where it was expected. A marker that is plain to see right where it was expected is read there, and its
+//! region is not searched for others. Where nothing is followed, what takes long is done in turn
 //! ([`Detector::detect_in_turn`]).
 
 use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
+use nalgebra::Vector3;
 
-use crate::detector::Detector;
+use crate::circles::Circles;
+use crate::detector::{Detector, Expected};
 use crate::marker::Family;
 use crate::observation::{Observation, Stages};
 use crate::trace::{Trace, moved_pixel};
@@ -41,6 +44,8 @@ pub struct Tracker {
     size: (usize, usize),
     /// Whether an image was searched.
     has_begun: bool,
+    /// Whether somebody else expects markers in this image.
+    is_asked: bool,
 }
 
 /// A marker that was seen, and how it moves.
@@ -56,6 +61,20 @@ struct Track {
     /// How far the last prediction was off, in pixels, and over which time.
     off_px: f64,
     period_s: f64,
+    shape: Shape,
+    /// How the shape changes in a second; `None` after a first sight.
+    change: Option<Shape>,
+}
+
+/// Where exactly a marker was seen: the corners of a square one, or the centre (m) and normal of rings. Noughts stand for what
+/// it does not have.
+#[derive(Copy, Clone, Debug, Default, PartialEq)]
+struct Shape {
+    has_corners: bool,
+    has_circles: bool,
+    corners: [[f64; 2]; 4],
+    centre: [f64; 3],
+    normal: [f64; 3],
 }
 
 #[derive(Copy, Clone, Debug)]
@@ -123,7 +142,7 @@ impl Tracker {
         if self.choose_regions(time_s) {
             for index in 0..self.regions.len() {
                 if let Some(region) = self.regions.get(index).copied() {
-                    self.search(detector, view, camera, region, stages);
+                    self.search(detector, view, camera, (region, time_s), stages);
                 }
             }
             self.found.sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
@@ -177,6 +196,7 @@ impl Tracker {
         }
         let of_tracks = self.tracks.iter().filter_map(|track| track.region(time_s, self.size));
         self.regions.extend(of_tracks);
+        self.is_asked = !self.expected.is_empty();
         self.regions.append(&mut self.expected);
         merge(&mut self.regions);
         let area: usize = self.regions.iter().map(Region::area).sum();
@@ -192,7 +212,7 @@ impl Tracker {
         detector: &mut Detector,
         view: GrayView<'_>,
         camera: Option<&CameraModel>,
-        region: Region,
+        (region, time_s): (Region, f64),
         stages: &mut impl Stages,
     ) {
         let [x, y] = region.from;
@@ -206,13 +226,31 @@ impl Tracker {
             cy: camera.cy - offset[1],
             ..*camera
         });
-        for seen in detector.detect(part, camera.as_ref(), stages) {
+        let moved = |seen: &Observation| {
             let mut seen = seen.clone();
             seen.centre = moved_pixel(seen.centre, offset);
             seen.corners = seen.corners.map(|corners| corners.map(|c| moved_pixel(c, offset)));
-            self.found.push(seen);
+            seen
+        };
+        let expected = self.only_track(&region, time_s).and_then(|track| {
+            let expected = track.expected(time_s, offset)?;
+            detector.detect_at(part, camera.as_ref(), &expected, stages)
+        });
+        match expected {
+            Some(seen) => self.found.push(moved(&seen)),
+            None => {
+                self.found.extend(detector.detect(part, camera.as_ref(), stages).iter().map(moved))
+            }
         }
         self.trace.add_part(detector.trace(), offset);
+    }
+
+    /// The track in a region in which there is no other, and in which nobody else expects a marker.
+    fn only_track(&self, region: &Region, time_s: f64) -> Option<&Track> {
+        let is_within = |track: &&Track| region.has(track.predicted(time_s).0);
+        let mut within = self.tracks.iter().filter(is_within);
+        let track = within.next()?;
+        (!self.is_asked && within.next().is_none()).then_some(track)
     }
 
     /// True when a marker that should be in the image was not found.
@@ -246,7 +284,10 @@ impl Tracker {
 impl Track {
     fn first(seen: &Observation, time_s: f64) -> Self {
         let Observation { family, id, centre, size_px, .. } = *seen;
-        Self { family, id, centre, size_px, time_s, motion: None, off_px: 0.0, period_s: 0.0 }
+        let shape = Shape::of(seen);
+        let (motion, change) = (None, None);
+        let (off_px, period_s) = (0.0, 0.0);
+        Self { family, id, centre, size_px, time_s, motion, off_px, period_s, shape, change }
     }
 
     fn next(&self, seen: &Observation, time_s: f64) -> Self {
@@ -264,7 +305,25 @@ impl Track {
             Some(_) => expected.distance(&seen.centre).max(0.7 * self.off_px),
             None => 0.5 * expected.distance(&seen.centre),
         };
-        Self { motion: Some(motion), off_px, period_s, ..Self::first(seen, time_s) }
+        let next = Self::first(seen, time_s);
+        let change = Some(next.shape.plus(&self.shape, -1.0).times(1.0 / period_s));
+        Self { motion: Some(motion), off_px, period_s, change, ..next }
+    }
+
+    /// Where exactly it should be in a part of the image that begins at `offset`.
+    fn expected(&self, time_s: f64, offset: [f64; 2]) -> Option<Expected> {
+        let shape = self.shape.plus(&self.change?, time_s - self.time_s);
+        let corner = |[x, y]: [f64; 2]| Pixel::new(x - offset[0], y - offset[1]);
+        let circles = || {
+            let [centre, normal] = [shape.centre, shape.normal].map(Vector3::from);
+            Some(Circles { centre, normal: normal.try_normalize(0.1)? })
+        };
+        Some(Expected {
+            family: self.family,
+            id: self.id,
+            corners: self.shape.has_corners.then(|| shape.corners.map(corner)),
+            circles: if self.shape.has_circles { circles() } else { None },
+        })
     }
 
     fn is_sound(&self) -> bool {
@@ -318,6 +377,47 @@ impl Track {
     }
 }
 
+impl Shape {
+    fn of(seen: &Observation) -> Self {
+        let circles = seen.pose.as_ref().filter(|_| seen.corners.is_none());
+        let (centre, normal) = match circles {
+            Some(pose) => {
+                let pose = &pose.camera_from_marker;
+                let face = pose.rotation() * geometry::Vector::new(0.0, 0.0, 1.0);
+                let origin = pose.origin();
+                ([origin.x(), origin.y(), origin.z()], [face.x(), face.y(), face.z()])
+            }
+            None => ([0.0; 3], [0.0; 3]),
+        };
+        Self {
+            has_corners: seen.corners.is_some(),
+            has_circles: circles.is_some(),
+            corners: seen.corners.map_or([[0.0; 2]; 4], |corners| corners.map(|c| [c.x, c.y])),
+            centre,
+            normal,
+        }
+    }
+
+    /// This one and so many times another.
+    fn plus(&self, other: &Self, times: f64) -> Self {
+        let mut sum = *self;
+        for (own, others) in sum.corners.iter_mut().zip(&other.corners) {
+            *own = [own[0] + times * others[0], own[1] + times * others[1]];
+        }
+        for (own, others) in [(&mut sum.centre, &other.centre), (&mut sum.normal, &other.normal)] {
+            for (own, others) in own.iter_mut().zip(others) {
+                *own += times * others;
+            }
+        }
+        sum
+    }
+
+    fn times(&self, factor: f64) -> Self {
+        let nought = Self { corners: [[0.0; 2]; 4], centre: [0.0; 3], normal: [0.0; 3], ..*self };
+        nought.plus(self, factor)
+    }
+}
+
 impl Region {
     /// The square about a place, in whole tiles, as far as it lies in an image of this size.
     fn about(centre: Pixel, half: f64, (width, height): (usize, usize)) -> Option<Self> {
@@ -330,6 +430,14 @@ impl Region {
         let ((left, right), (top, bottom)) = (span(centre.x, width), span(centre.y, height));
         (finite && left < right && top < bottom)
             .then_some(Self { from: [left, top], to: [right, bottom] })
+    }
+
+    fn has(&self, place: Pixel) -> bool {
+        let [x, y] = [place.x, place.y];
+        x >= self.from[0] as f64
+            && y >= self.from[1] as f64
+            && x < self.to[0] as f64
+            && y < self.to[1] as f64
     }
 
     fn edges(&self) -> [usize; 2] {

@@ -60,11 +60,17 @@ const LEAST_RUNS: usize = 16;
 const LEAST_SHARE: f64 = 0.35;
 /// Rough and fine passes over all runs.
 const ROUGH_PASSES: usize = 2;
-const FINE_PASSES: usize = 5;
-/// A fine pass that moves the corners less, in pixels, is the last.
-const SETTLED_PX: f64 = 0.01;
-/// Of the runs every so many-th takes part in a rough pass, unless they are few.
-const ROUGH_EVERY: usize = 3;
+const FINE_PASSES: usize = 6;
+/// A rough pass that moves the corners less, in pixels, is the last.
+const NEARBY_PX: f64 = 0.5;
+/// Of the runs every so many-th takes part in the first passes, unless they are few; in fine ones until the corners move
+/// less than this, in pixels.
+const FEW_EVERY: usize = 3;
+const SETTLED_BY_FEW_PX: f64 = 0.1;
+/// A fine pass over all runs that moves the corners less, in pixels, is the last: what is left to be moved after a step is
+/// in its square. When the blur was not fitted before, it takes less.
+const SETTLED_PX: f64 = 0.03;
+const SETTLED_AT_ONCE_PX: f64 = 0.01;
 /// Smaller differences, in grey levels, are no edges.
 const LEAST_CONTRAST: f64 = 5.0;
 /// Runs whose shift is more times its usual size pull no harder.
@@ -114,20 +120,31 @@ fn fit_runs(
         clipped: 0,
         pixels: 0,
     };
+    let mut every = if scratch.runs.len() >= 4 * LEAST_RUNS * FEW_EVERY { FEW_EVERY } else { 1 };
     for _ in 0..ROUGH_PASSES {
-        search.rough_pass(scratch)?;
+        let before = search.homography;
+        search.rough_pass(scratch, every)?;
+        if before.distance_px(&search.homography) < NEARBY_PX {
+            break;
+        }
     }
     let mut system = None;
     for pass in 0..FINE_PASSES {
-        search.compare_all(&mut scratch.runs)?;
+        search.compare_all(&mut scratch.runs, every)?;
         if search.clipped as f64 > MOST_CLIPPED * search.pixels as f64 {
             return None;
         }
-        search.weigh(scratch, 1)?;
+        search.weigh(scratch, every)?;
         let next = System::new(&scratch.runs);
         let moved_px = search.step(&next)?;
+        if every > 1 {
+            if moved_px < SETTLED_BY_FEW_PX || pass + 3 >= FINE_PASSES {
+                every = 1;
+            }
+            continue;
+        }
         system = Some(next);
-        if pass > 0 && moved_px < SETTLED_PX {
+        if moved_px < if pass > 0 { SETTLED_PX } else { SETTLED_AT_ONCE_PX } {
             break;
         }
     }
@@ -285,11 +302,9 @@ impl Search<'_> {
     }
 
     /// Moves the square to where grey values cross the middle between black and white.
-    fn rough_pass(&mut self, scratch: &mut Scratch) -> Option<()> {
+    fn rough_pass(&mut self, scratch: &mut Scratch, every: usize) -> Option<()> {
         const REACH_PX: f64 = 4.5;
         let mut pixels = [[0.0; 2]; MOST_PIXELS];
-        let every =
-            if scratch.runs.len() >= 4 * LEAST_RUNS * ROUGH_EVERY { ROUGH_EVERY } else { 1 };
         for (i, run) in scratch.runs.iter_mut().enumerate() {
             run.sight = None;
             if i % every != 0 {
@@ -327,11 +342,15 @@ impl Search<'_> {
         Some(())
     }
 
-    fn compare_all(&mut self, runs: &mut [Run]) -> Option<()> {
+    /// Compares every so many-th run with the profile of its edge.
+    fn compare_all(&mut self, runs: &mut [Run], every: usize) -> Option<()> {
         let mut pixels = [[0.0; 2]; MOST_PIXELS];
         (self.clipped, self.pixels) = (0, 0);
-        for run in runs {
+        for (i, run) in runs.iter_mut().enumerate() {
             run.sight = None;
+            if i % every != 0 {
+                continue;
+            }
             let Some(edge) = self.edge(run) else { continue };
             let reach = (3.0 * self.spread_px + 1.0).min(edge.cell_px - 2.3 * self.spread_px);
             if reach < 1.8 * self.spread_px + 0.5 {
@@ -504,22 +523,33 @@ struct System {
 
 impl System {
     fn new(runs: &[Run]) -> Self {
-        let mut matrix = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::zeros();
-        let mut right = SVector::<f64, UNKNOWNS>::zeros();
+        // All of the rows, though half would do: it takes no longer.
+        let (mut rows, mut mixed_row, mut spread_sum) = ([[0.0; 8]; 8], [0.0; 8], 0.0);
+        let (mut sums, mut right_spread) = ([0.0; 8], 0.0);
         for sight in runs.iter().filter_map(|run| run.sight.as_ref()) {
             let [shift, mixed, spread] = sight.matrix.map(|m| sight.weight * m);
-            for i in 0..8 {
-                let scaled = shift * sight.slope[i];
-                for j in 0..=i {
-                    matrix[(i, j)] += scaled * sight.slope[j];
+            let right = sight.right.map(|r| sight.weight * r);
+            let slope = &sight.slope;
+            for (row, along) in rows.iter_mut().zip(slope) {
+                let scaled = shift * along;
+                for (entry, other) in row.iter_mut().zip(slope) {
+                    *entry += scaled * other;
                 }
-                matrix[(8, i)] += mixed * sight.slope[i];
-                right[i] += sight.weight * sight.right[0] * sight.slope[i];
             }
-            matrix[(8, 8)] += spread;
-            right[8] += sight.weight * sight.right[1];
+            for ((entry, sum), along) in mixed_row.iter_mut().zip(&mut sums).zip(slope) {
+                *entry += mixed * along;
+                *sum += right[0] * along;
+            }
+            spread_sum += spread;
+            right_spread += right[1];
         }
-        matrix.fill_upper_triangle_with_lower_triangle();
+        let matrix = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|i, j| match (i, j) {
+            (8, 8) => spread_sum,
+            (8, other) | (other, 8) => mixed_row[other],
+            _ => rows[i][j],
+        });
+        let right =
+            SVector::<f64, UNKNOWNS>::from_fn(|i, _| if i < 8 { sums[i] } else { right_spread });
         Self { matrix, right }
     }
 
