@@ -23,6 +23,9 @@ const LEAST_DIAMETER_PX: f64 = 5.0;
 const ALL_PIXELS_PX: f64 = 22.0;
 /// About as many pixels take part of a larger marker.
 const SPOTS: f64 = 260.0;
+/// Of so many or more, every so many-th is enough for the first steps, and for the choice of what to compare in the end.
+const MANY_SPOTS: usize = 200;
+const FEW_EVERY: usize = 3;
 /// Standard deviation, in pixels, of the blur of a lens in focus and of the pixel's own extent.
 const FOCUSED_PX: f64 = 0.6;
 /// Brighter pixels may be of any brightness.
@@ -115,24 +118,31 @@ pub(crate) fn refined(
     let hopeless = if is_small { HOPELESS_OF_SMALL } else { HOPELESS };
     around.gather(start, FOCUSED_PX, spots)?;
     let tilted = |circles: &Circles| circles.tilted_at_least(LEAST_START_TILT);
-    let mut first =
-        Scene::new(spots, size_m, camera, hopeless).fitted(&tilted(start), None, None)?;
+    let every = if spots.len() < MANY_SPOTS { 1 } else { FEW_EVERY };
+    let few = Scene { every, ..Scene::new(spots, size_m, camera, hopeless) };
+    let mut first = few.fitted(&tilted(start), None, None)?;
     // What lies beyond the paper is kept out once the blur is known.
     let circles = first.picture.circles;
-    if first.difference(spots) < MOST_DIFFERENCE
+    if first.difference(&few) < MOST_DIFFERENCE
         && around.gather(&circles, first.picture.blur_px, spots)?
     {
-        let scene = Scene::new(spots, size_m, camera, hopeless);
+        let scene = Scene { every, ..Scene::new(spots, size_m, camera, hopeless) };
         first = scene.fitted(&tilted(&circles), None, None)?;
     }
-    let scene = Scene::new(spots, size_m, camera, hopeless);
-    if first.difference(spots) > MOST_DIFFERENCE {
-        return Some((scene.fit(&first)?, None));
+    let all = Scene::new(spots, size_m, camera, hopeless);
+    let few = Scene { every, ..Scene::new(spots, size_m, camera, hopeless) };
+    // The fit to all spots, from that to few of them.
+    let by_all = |fitted: Fitted| match every {
+        1 => Some(fitted),
+        _ => all.fitted(&fitted.picture.circles, Some(&fitted), None),
+    };
+    if first.difference(&few) > MOST_DIFFERENCE {
+        return Some((all.fit(&by_all(first)?)?, None));
     }
     // Tilted to a wrong side at first, it may have stopped where it faces the camera.
     if first.picture.circles.tilt() < LEAST_START_TILT / 2.0 {
         let turned = tilted(&first.picture.circles).turned();
-        if let Some(other) = scene.fitted(&turned, Some(&first), Some(1.1 * first.cost))
+        if let Some(other) = few.fitted(&turned, Some(&first), Some(1.1 * first.cost))
             && other.cost < first.cost
         {
             first = other;
@@ -140,12 +150,14 @@ pub(crate) fn refined(
     }
     let mirrored = tilted(&first.picture.circles).mirrored();
     let most = MOST_COST_OF_OTHER * first.cost;
-    let Some(second) = scene.fitted(&mirrored, Some(&first), Some(most)) else {
-        return Some((scene.fit(&first)?, None));
+    let second = few.fitted(&mirrored, Some(&first), Some(most));
+    let first = by_all(first)?;
+    let Some(second) = second.and_then(by_all) else {
+        return Some((all.fit(&first)?, None));
     };
     let (best, other) = if second.cost < first.cost { (second, first) } else { (first, second) };
-    let other = other.alternative(spots);
-    let fit = scene.fit(&best)?;
+    let other = other.alternative(&all);
+    let fit = all.fit(&best)?;
     let same = fit.circles.normal.angle(&other.circles.normal) < 0.02;
     Some((fit, (!same).then_some(other)))
 }
@@ -266,6 +278,8 @@ fn about_edges(
 /// What a picture is fitted to.
 struct Scene<'a> {
     spots: &'a [Spot],
+    /// Of the spots every so many-th counts.
+    every: usize,
     camera: &'a CameraModel,
     /// Radii of the circles in metres, the outermost first, and their logarithms.
     radii: [(f64, f64); 6],
@@ -286,14 +300,14 @@ struct Fitted {
 
 impl Fitted {
     /// Root mean square of the differences, in units of the contrast.
-    fn difference(&self, spots: &[Spot]) -> f64 {
-        (self.cost / spots.len() as f64).sqrt() / (self.picture.white - self.picture.black)
+    fn difference(&self, scene: &Scene<'_>) -> f64 {
+        (self.cost / scene.count()).sqrt() / (self.picture.white - self.picture.black)
     }
 
-    fn alternative(&self, spots: &[Spot]) -> Alternative {
+    fn alternative(&self, scene: &Scene<'_>) -> Alternative {
         Alternative {
             circles: self.picture.circles,
-            difference: self.difference(spots),
+            difference: self.difference(scene),
             blur_px: self.picture.blur_px,
         }
     }
@@ -308,7 +322,12 @@ impl<'a> Scene<'a> {
                 *slot = (radius * size_m, (radius * size_m).ln());
             }
         }
-        Self { spots, camera, radii, step: Step::new(), hopeless }
+        Self { spots, every: 1, camera, radii, step: Step::new(), hopeless }
+    }
+
+    /// The spots that count.
+    fn spots(&self) -> impl Iterator<Item = &'a Spot> {
+        self.spots.iter().step_by(self.every)
     }
 
     /// The best fit from here, in the light of another fit where there is one; `None` when its cost stays above what is
@@ -385,7 +404,7 @@ impl<'a> Scene<'a> {
         Some(Fit {
             circles: picture.circles,
             covariance: self.covariance(&fitted.system, fitted.cost)?,
-            difference: fitted.difference(self.spots),
+            difference: fitted.difference(self),
             explained,
             beside_disc,
             balance,
@@ -395,7 +414,7 @@ impl<'a> Scene<'a> {
     }
 
     fn count(&self) -> f64 {
-        self.spots.len() as f64
+        self.spots.len().div_ceil(self.every) as f64
     }
 
     /// Of the pose, from the differences that are left: noise, and what the model does not know.
@@ -492,7 +511,7 @@ impl Picture {
         let mut disc = SMatrix::<f64, 3, 3>::zeros();
         let mut rings = SMatrix::<f64, 4, 4>::zeros();
         let (mut n, mut sum, mut squares, mut unexplained) = (0.0, 0.0, 0.0, 0.0);
-        for spot in scene.spots {
+        for spot in scene.spots() {
             let looks = self.looks(spot, &plane, scene)?;
             let [a, b, c, d, e, f] = looks.within;
             let (grey, _) = self.grey(spot, looks.white());
@@ -528,7 +547,7 @@ impl Picture {
     fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
         let mut exposure = Exposure::default();
         let plane = self.circles.plane(scene.camera);
-        for spot in scene.spots {
+        for spot in scene.spots() {
             let white = self.looks(spot, &plane, scene)?.white();
             exposure.add(white, spot.grey);
         }
@@ -549,7 +568,7 @@ impl Picture {
         let (mut matrix, mut right) = ([[0.0; UNKNOWNS]; UNKNOWNS], [0.0; UNKNOWNS]);
         let mut cost = 0.0;
         let plane = self.circles.plane(scene.camera);
-        for spot in scene.spots {
+        for spot in scene.spots() {
             let looks = self.looks(spot, &plane, scene)?;
             let white = looks.white();
             let [x, y] = spot.offset;

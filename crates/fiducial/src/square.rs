@@ -29,7 +29,7 @@ use crate::square::damaged::{Damaged, Sought};
 use crate::square::decode::{Cells, Layout, Look};
 use crate::square::pattern::Pattern;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
-use crate::square::refine::{Refined, Scratch, refine};
+use crate::square::refine::{Refined, Scratch, refine_from};
 use crate::square::segments::ImageQuads;
 use crate::trace::{Reason, Trace};
 
@@ -227,7 +227,7 @@ impl Squares {
         let found = code.match_word(self.cells.word(), most_wrong(code));
         let found = found.filter(|(found, turns, _)| (*found, *turns) == (id, 0))?;
         let found = self.admit(&quad, (index, 0), found).ok()?;
-        let refined = found.refined(view, wanted, camera, &mut self.scratch)?;
+        let refined = found.refined((view, true), wanted, camera, &mut self.scratch)?;
         Some(observed(&found, wanted, refined, camera))
     }
 
@@ -599,17 +599,17 @@ impl Spread {
 }
 
 impl Found {
-    /// Its corners between the pixels.
+    /// Its corners between the pixels, when those it has may be near.
     fn refined(
         &self,
-        view: GrayView<'_>,
+        (view, are_near): (GrayView<'_>, bool),
         wanted: &Wanted,
         camera: Option<&CameraModel>,
         scratch: &mut Scratch,
     ) -> Option<Refined> {
         let word = wanted.code.words.get(self.id as usize)?;
         let pattern = Pattern::bordered(wanted.code, *word, self.extra_border)?;
-        refine(view, &self.corners, &pattern, camera, scratch)
+        refine_from((view, &self.corners, are_near), &pattern, camera, scratch)
     }
 }
 
@@ -621,7 +621,7 @@ fn observe(
     camera: Option<&CameraModel>,
     scratch: &mut Scratch,
 ) -> Observation {
-    let refined = found.refined(view, wanted, camera, scratch);
+    let refined = found.refined((view, false), wanted, camera, scratch);
     let refined = refined.unwrap_or_else(|| coarse(&found.corners, found.corner_px));
     observed(found, wanted, refined, camera)
 }

@@ -53,7 +53,7 @@ struct Edge {
 
 /// Numbers of the homography, and the spread.
 const UNKNOWNS: usize = 9;
-const MOST_RUNS: usize = 260;
+const MOST_RUNS: usize = 210;
 const MOST_PIXELS: usize = 24;
 /// Fewer runs than this, or than this share of those sought, do not make a square.
 const LEAST_RUNS: usize = 16;
@@ -84,11 +84,11 @@ pub(crate) fn fit(
     view: GrayView<'_>,
     lens: &Lens<'_>,
     start: &Homography,
-    pattern: &Pattern,
+    (pattern, is_near): (&Pattern, bool),
     scratch: &mut Scratch,
 ) -> Option<Fit> {
     place_runs(start, pattern, &mut scratch.runs);
-    fit_runs(view, lens, start, scratch)
+    fit_runs(view, lens, (start, is_near), scratch)
 }
 
 /// The same for edges that are given.
@@ -102,13 +102,14 @@ pub(crate) fn fit_edges(
     scratch.runs.clear();
     let run = |[place, across]: &[[f64; 2]; 2]| Run { place: *place, across: *across, sight: None };
     scratch.runs.extend(edges.iter().take(2 * MOST_RUNS).map(run));
-    fit_runs(view, lens, start, scratch)
+    fit_runs(view, lens, (start, false), scratch)
 }
 
+/// From a start that `is_near`, to about half a pixel, fine passes find the edges at once.
 fn fit_runs(
     view: GrayView<'_>,
     lens: &Lens<'_>,
-    start: &Homography,
+    (start, is_near): (&Homography, bool),
     scratch: &mut Scratch,
 ) -> Option<Fit> {
     let mut search = Search {
@@ -121,7 +122,7 @@ fn fit_runs(
         pixels: 0,
     };
     let mut every = if scratch.runs.len() >= 4 * LEAST_RUNS * FEW_EVERY { FEW_EVERY } else { 1 };
-    for _ in 0..ROUGH_PASSES {
+    for _ in 0..if is_near { 0 } else { ROUGH_PASSES } {
         let before = search.homography;
         search.rough_pass(scratch, every)?;
         if before.distance_px(&search.homography) < NEARBY_PX {

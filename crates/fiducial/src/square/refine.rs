@@ -65,11 +65,21 @@ pub fn refine(
     camera: Option<&CameraModel>,
     scratch: &mut Scratch,
 ) -> Option<Refined> {
+    refine_from((view, corners, false), pattern, camera, scratch)
+}
+
+/// As [`refine`], from corners that may be near, to about half a pixel.
+pub(crate) fn refine_from(
+    (view, corners, are_near): (GrayView<'_>, &[Pixel; 4], bool),
+    pattern: &Pattern,
+    camera: Option<&CameraModel>,
+    scratch: &mut Scratch,
+) -> Option<Refined> {
     let lens = Lens::new(camera, corners)?;
     let start = Homography::from_corners(&lens, corners)?;
     let cell_px = start.narrowest_cell_px(pattern.cells());
     let by_profiles = (cell_px >= LEAST_CELL_PX)
-        .then(|| profiles::fit(view, &lens, &start, pattern, scratch))
+        .then(|| profiles::fit(view, &lens, &start, (pattern, are_near), scratch))
         .flatten();
     let fit = match by_profiles {
         Some(fit) => fit,
