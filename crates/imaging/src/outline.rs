@@ -139,7 +139,8 @@ impl Outlines {
         let pixels = view.width() * view.height();
         self.points.reserve(pixels / POINTS_EVERY);
         self.spans.reserve(pixels / SPANS_EVERY);
-        self.path.reserve(2 * (view.width() + view.height()));
+        let longest = 2 * (view.width() + view.height());
+        self.path.reserve(longest.saturating_sub(self.path.len()));
     }
 
     /// Adds the outlines on some levels of the image that was begun with; `view` is that image.
