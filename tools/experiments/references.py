@@ -43,7 +43,7 @@ except ImportError:
 cv2.setNumThreads(1)
 
 SETS = [
-    "textured", "adverse", "landing", "far", "tilt", "blur", "noise", "light", "tracking", "negatives", "positions",
+    "textured", "adverse", "landing", "far", "tilt", "blur", "noise", "light", "rolling", "tracking", "negatives", "positions",
 ]  # fmt: skip
 # Families of the labelled photographs, as the labels name them.
 LABELS = {

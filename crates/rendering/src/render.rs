@@ -24,7 +24,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::ground::{Ground, Span, Surface};
-use exposure::{Exposure, MOST_INSTANTS};
+use exposure::{Exposure, MOST_INSTANTS, between};
 use lens::Lens;
 use painter::{Channels, Glimpse, Painter};
 use painting::{Area, BARE, Coat, Paint, Painting, Shown, Sight, View, shown};
@@ -65,6 +65,8 @@ pub struct CameraSettings {
     pub body_from_camera: Transform<Body, Camera>,
     /// How long the shutter is open, in seconds.
     pub exposure_s: f64,
+    /// Time from the exposure of the first row to that of the last, in seconds: 0 of a global shutter.
+    pub readout_s: f64,
     /// Amplification; 1 makes a full well white.
     pub gain: f64,
     /// Electrons a pixel collects per second from white in full sun.
@@ -172,6 +174,7 @@ impl CameraSettings {
             model: CameraModel::pinhole(1296, 972, 8e-3 / 4.4e-6),
             body_from_camera: Transform::new(down, Point::origin()),
             exposure_s: 0.002,
+            readout_s: 0.0,
             gain: 1.0,
             electrons_per_s: 4e6,
             full_well_e: 8_000.0,
@@ -193,6 +196,15 @@ impl CameraSettings {
         self
     }
 
+    /// When a row has been exposed for a part of its time, from 0 to 1, as a part of the time from the opening of the first row
+    /// to the closing of the last.
+    pub fn part_at_row(&self, v: f64, exposed: f64) -> f64 {
+        let last = f64::from(self.model.height.saturating_sub(1)).max(1.0);
+        let whole_s = self.readout_s + self.exposure_s;
+        let at_s = self.readout_s * v / last + self.exposure_s * exposed;
+        if whole_s > 0.0 { at_s / whole_s } else { 0.5 }
+    }
+
     /// Grey levels of a surface that reflects everything.
     fn levels_per_reflectance(&self, light: f64) -> f64 {
         self.electrons_per_s * self.exposure_s * light / self.full_well_e * self.gain * 255.0
@@ -207,6 +219,10 @@ impl CameraSettings {
             (positive(model.fx) && positive(model.fy), "a focal length is not above 0"),
             (model.cx.is_finite() && model.cy.is_finite(), "the principal point is not finite"),
             (self.exposure_s.is_finite() && self.exposure_s >= 0.0, "the exposure is below 0"),
+            (
+                self.readout_s.is_finite() && self.readout_s >= 0.0,
+                "the readout takes less than no time",
+            ),
             (positive(self.gain), "the gain is not above 0"),
             (positive(self.electrons_per_s), "the electrons per second are not above 0"),
             (positive(self.full_well_e), "the full well is not above 0"),
@@ -330,7 +346,8 @@ impl Renderer {
     }
 
     /// Renders frame `frame_index` as seen from a vehicle that goes through `poses` (`ned_from_body`, evenly spaced
-    /// in time from the opening to the closing of the shutter; one pose stands still) into `out`, row by row.
+    /// in time from the opening of the shutter to its closing, of a rolling one from that of the first row to that of the last;
+    /// one pose stands still) into `out`, row by row.
     ///
     /// # Errors
     /// [`RenderError`] when a pose is unsound or `out` has another size than the image.
@@ -363,15 +380,32 @@ impl Renderer {
         self.exposure.follow(poses, &self.settings.body_from_camera, &model)?;
         self.look_at_paintings();
         let tile = self.lens.tile;
+        let rolls = self.settings.readout_s > 0.0 && poses.len() > 1;
         for (index, rows) in out.chunks_mut(width * tile).enumerate() {
-            self.paint_band(index);
+            if !rolls {
+                self.paint_band(index);
+            }
             for (y, row) in rows.chunks_mut(width).enumerate() {
                 let v = index * tile + y;
+                if rolls {
+                    self.follow_row(poses, v)?;
+                    self.paint_band(index);
+                }
                 self.fill_row(v);
                 veil(v, self.band.light.get_mut(..width).unwrap_or(&mut []));
                 self.sensor.expose(frame_index, v, &self.band.light, row);
             }
         }
+        Ok(())
+    }
+
+    /// Follows the vehicle through the exposure of one row, of those through which a rolling shutter goes.
+    fn follow_row(&mut self, poses: &[Transform<Ned, Body>], v: usize) -> Result<(), RenderError> {
+        let at = |part: f64| between(poses, self.settings.part_at_row(v as f64, part));
+        let of_row = [at(0.0), at(0.5), at(1.0)];
+        let Self { exposure, settings, .. } = self;
+        exposure.follow(&of_row, &settings.body_from_camera, &settings.model)?;
+        self.look_at_paintings();
         Ok(())
     }
 

@@ -573,3 +573,23 @@ fn less_light_is_met_by_exposure_and_then_by_gain() {
     assert!(bright.1 < dusk.1 && dusk.1 <= dark.1 && dark.1 == 0.004);
     assert!(bright.2 == 1.0 && dark.2 > 5.0);
 }
+
+#[test]
+fn a_rolling_shutter_shows_each_row_at_its_own_time() {
+    let still = exact_settings();
+    let rolling = CameraSettings { exposure_s: 1e-4, readout_s: 0.02, gain: 20.0, ..still.clone() };
+    let scene = plain_scene();
+    let at = |right_px: f64| pose(1.0, 0.0, 0.0, 0.0, [right_px, 100.0]);
+    // Standing still, all rows see the same.
+    let global = CameraSettings { readout_s: 0.0, ..rolling.clone() };
+    let stands = [at(7.3), at(7.3)];
+    assert_eq!(rendered(&scene, &rolling, &stands, 0), rendered(&scene, &global, &stands, 0));
+    let out = rendered(&scene, &rolling, &[at(-20.0), at(20.0)], 0);
+    let row = rolling.model.cy + 100.0;
+    let right_px = -20.0 + 40.0 * rolling.part_at_row(row, 0.5);
+    let truth = Pixel::new(rolling.model.cx + right_px, row);
+    assert!((right_px - 4.1).abs() < 0.1, "{right_px}");
+    let white = f64::from(out[(row as usize - 170) * WIDTH + truth.x as usize]);
+    let seen = dark_centroid(&out, truth, 0.55 * 0.15341 * 1818.0, white);
+    assert!(seen.distance(&truth) < 0.05, "{seen:?} for {truth:?}");
+}

@@ -44,6 +44,8 @@ pub enum Set {
     Noise,
     /// From night to far too bright.
     Light,
+    /// Moving before a rolling shutter.
+    Rolling,
     /// Textured grounds for timing.
     Textured,
     /// A marker 48 px wide that drifts through the image.
@@ -54,7 +56,7 @@ pub enum Set {
 
 impl Set {
     /// Every set, in the order in which they are made.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 12] = [
         Self::Textured,
         Self::Adverse,
         Self::Landing,
@@ -63,6 +65,7 @@ impl Set {
         Self::Blur,
         Self::Noise,
         Self::Light,
+        Self::Rolling,
         Self::Tracking,
         Self::Negatives,
         Self::Positions,
@@ -79,6 +82,7 @@ impl Set {
             Self::Blur => "blur",
             Self::Noise => "noise",
             Self::Light => "light",
+            Self::Rolling => "rolling",
             Self::Textured => "textured",
             Self::Tracking => "tracking",
             Self::Negatives => "negatives",
@@ -101,6 +105,7 @@ impl Set {
             Self::Blur => sweeps::blur(marker),
             Self::Noise => sweeps::noise(marker),
             Self::Light => sweeps::light(marker),
+            Self::Rolling => sweeps::rolling(marker),
             Self::Textured => textured(marker),
             Self::Tracking => tracking(marker),
             Self::Negatives => clutter::shots(),
@@ -331,6 +336,7 @@ mod tests {
             ("blur", 84),
             ("noise", 42),
             ("light", 54),
+            ("rolling", 48),
             ("tracking", 30),
             ("negatives", 520),
             ("positions", 37 * 2 * 5),

@@ -28,8 +28,8 @@ pub struct Shot {
     pub inverted: bool,
     /// The camera and its setting.
     pub settings: CameraSettings,
-    /// `camera_from_marker` from the opening to the closing of the shutter; of one pose when nothing moves. Without
-    /// a marker, of the place where one would be.
+    /// `camera_from_marker` from the opening to the closing of the shutter, of a rolling one from that of the first row to
+    /// that of the last; of one pose when nothing moves. Without a marker, of the place where one would be.
     pub path: Vec<Transform<Camera, MarkerFrame>>,
     /// The ground.
     pub surface: Surface,
@@ -48,7 +48,7 @@ pub struct Shot {
 /// What a shot shows, for whoever measures.
 #[derive(Clone, Copy, Debug)]
 pub struct Shown {
-    /// The marker as seen by the camera half-way through the exposure.
+    /// The marker as seen by the camera half-way through the exposure, of a rolling shutter through that of the centre's row.
     pub camera_from_marker: Transform<Camera, MarkerFrame>,
     /// Where its centre appears.
     pub centre: Pixel,
@@ -85,13 +85,27 @@ impl Shot {
         pad(self).ned_from_marker.origin()
     }
 
+    /// Where a place on the marker appears, and the pose by which it does: that half-way through the exposure of its row.
+    fn seen(&self, place: Point<MarkerFrame>) -> Option<(Pixel, Transform<Camera, MarkerFrame>)> {
+        const ROUNDS: usize = 8;
+        let settings = &self.settings;
+        let mut pose = *self.path.get(self.path.len() / 2)?;
+        let mut pixel = settings.model.project(pose * place)?;
+        if settings.readout_s > 0.0 {
+            // Its row depends on the time, which depends on its row: a little less each round.
+            for _ in 0..ROUNDS {
+                pose = between(&self.path, settings.part_at_row(pixel.y, 0.5))?;
+                pixel = settings.model.project(pose * place)?;
+            }
+        }
+        Some((pixel, pose))
+    }
+
     /// What it shows; `None` when the marker is not in front of the camera, or there is none.
     pub fn shown(&self) -> Option<Shown> {
         let half = self.marker?.size_m? / 2.0;
-        let camera_from_marker = *self.path.get(self.path.len() / 2)?;
-        let project = |x: f64, y: f64| {
-            self.settings.model.project(camera_from_marker * Point::new(x, y, 0.0))
-        };
+        let project = |x: f64, y: f64| self.seen(Point::new(x, y, 0.0)).map(|(pixel, _)| pixel);
+        let (_, camera_from_marker) = self.seen(Point::origin())?;
         let corners = [
             project(-half, half)?,
             project(half, half)?,
@@ -122,6 +136,19 @@ pub fn pose(
         Rotation::from_quaternion(UnitQuaternion::from_rotation_matrix(&rotation)),
         Point::new(ray.x() * distance_m, ray.y() * distance_m, distance_m),
     )
+}
+
+/// The pose at a part of a path, from 0 to 1.
+fn between(
+    path: &[Transform<Camera, MarkerFrame>],
+    part: f64,
+) -> Option<Transform<Camera, MarkerFrame>> {
+    let along = part.clamp(0.0, 1.0) * path.len().saturating_sub(1) as f64;
+    let index = (along.floor() as usize).min(path.len().saturating_sub(2));
+    let (from, to) = (path.get(index)?, path.get(index + 1).or(path.get(index))?);
+    let share = along - index as f64;
+    let origin = from.origin() + (to.origin() - from.origin()) * share;
+    Some(Transform::new(from.rotation().interpolate(&to.rotation(), share), origin))
 }
 
 /// Takes shots; it keeps the grounds, which take long to grow.

@@ -3,6 +3,7 @@
 use std::f64::consts::TAU;
 
 use fiducial::Marker;
+use geometry::{Camera, Point, Rotation, Transform};
 use rand::RngExt;
 use rendering::{CameraSettings, Surface};
 
@@ -50,7 +51,7 @@ pub(super) fn blur(marker: Marker) -> Vec<Shot> {
             let per_px = origin.z() / shot.settings.model.fx * motion_px;
             let at = |part: f64| {
                 let offset = geometry::Vector::new(part * per_px * cos, part * per_px * sin, 0.0);
-                geometry::Transform::new(middle.rotation(), origin + offset)
+                Transform::new(middle.rotation(), origin + offset)
             };
             shot.path = vec![at(-0.5), at(0.0), at(0.5)];
             shots.push(shot.with(format!("motion{motion_px}"), Veil::Nothing));
@@ -84,6 +85,50 @@ pub(super) fn light(marker: Marker) -> Vec<Shot> {
             let (mut shot, _) = view(marker, settings, place, 30.0..120.0, 0.3);
             shot.surface = [Surface::Asphalt, Surface::Grass][frame % 2];
             shots.push(shot.with(format!("white{white}"), Veil::Nothing));
+        }
+    }
+    shots
+}
+
+/// How long the shutter takes to roll over the image, in seconds.
+const READOUT_S: f64 = 0.02;
+
+pub(super) fn rolling(marker: Marker) -> Vec<Shot> {
+    // The camera's velocity to the right, to the bottom and forward in the image in m/s, and its turn about its axis in rad/s.
+    let motions = [
+        ("still", [0.0, 0.0, 0.0], 0.0),
+        ("right0.5", [0.5, 0.0, 0.0], 0.0),
+        ("right1", [1.0, 0.0, 0.0], 0.0),
+        ("right2", [2.0, 0.0, 0.0], 0.0),
+        ("down1", [0.0, 1.0, 0.0], 0.0),
+        ("down2", [0.0, 2.0, 0.0], 0.0),
+        ("forward1", [0.0, 0.0, 1.0], 0.0),
+        ("turn1", [0.0, 0.0, 0.0], 1.0),
+    ];
+    let mut shots = Vec::new();
+    for (name, velocity, turn) in motions {
+        for _ in 0..6 {
+            let (mut rng, seed) = chance(Set::Rolling, shots.len());
+            let settings = CameraSettings { readout_s: READOUT_S, ..CameraSettings::thesis() };
+            let at = near(&mut rng, middle(&settings.model), 250.0);
+            let tilt = (rng.random_range(0.0..0.2), rng.random_range(0.0..TAU));
+            let heading = rng.random_range(0.0..TAU);
+            let still = pose(&settings.model, at, 3.0, tilt, heading);
+            let half_s = 0.5 * (settings.readout_s + settings.exposure_s);
+            let seen = |time_s: f64| {
+                let moved = geometry::Vector::new(
+                    -velocity[0] * time_s,
+                    -velocity[1] * time_s,
+                    -velocity[2] * time_s,
+                );
+                let turned = Rotation::<Camera, Camera>::from_euler(0.0, 0.0, -turn * time_s);
+                Transform::new(turned, Point::origin())
+                    * Transform::new(still.rotation(), still.origin() + moved)
+            };
+            let mut shot = Shot::of(marker, settings, still, seed);
+            shot.path = vec![seen(-half_s), seen(0.0), seen(half_s)];
+            shot.surface = Surface::ALL[shots.len() % 3];
+            shots.push(shot.with(name, Veil::Nothing));
         }
     }
     shots
