@@ -94,7 +94,7 @@ struct MarkersArgs {
     /// rendered again.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-markers")]
     output: PathBuf,
-    /// Only this set: positions, far, landing, adverse, tilt, blur, noise, light, textured, tracking or negatives. May
+    /// Only this set: positions, far, landing, adverse, tilt, blur, noise, light, rolling, textured, tracking or negatives. May
     /// be repeated.
     #[arg(long = "set", value_name = "NAME")]
     sets: Vec<Set>,
