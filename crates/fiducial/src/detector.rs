@@ -237,6 +237,7 @@ impl Detector {
     ) -> &[Observation] {
         self.found.clear();
         self.trace.clear();
+        self.make_room(view);
         let has_quads = !self.squares.is_empty() || !self.stags.is_empty();
         if !has_quads && self.markers.iter().any(|marker| marker.family == Family::Rings) {
             // Rings look for their outlines themselves, where those of other families are not there anyway.
@@ -287,6 +288,22 @@ impl Detector {
         self.look_harder(view, camera, allowed, stages);
         self.trace.markers.extend(self.found.iter().map(TracedMarker::from));
         &self.found
+    }
+
+    /// Makes the buffers as large as frames with texture need, so that none grows from one frame to another.
+    fn make_room(&mut self, view: GrayView<'_>) {
+        const MOST_AT_ONCE: usize = 64;
+        self.found.reserve(MOST_AT_ONCE);
+        self.trace.make_room();
+        self.squares.make_room();
+        self.stags.make_room();
+        let is_slow = |pass| self.slow_passes.contains(&pass);
+        if is_slow(SlowPass::Arcs) {
+            self.rings.make_room();
+        }
+        if is_slow(SlowPass::Squares) || is_slow(SlowPass::Stags) {
+            self.broken.make_room(view);
+        }
     }
 
     /// Looks in the slow ways that are allowed, one after the other: who finds nothing has time for them.

@@ -126,6 +126,19 @@ impl Rings {
         Self { inverted, thorough, ..Self::default() }
     }
 
+    /// Makes the buffers as large as frames with texture need.
+    pub(crate) fn make_room(&mut self) {
+        const MOST: usize = 1024;
+        self.borders.clear();
+        self.borders.reserve(MOST);
+        self.candidates.clear();
+        self.candidates.reserve(MOST);
+        self.edges.clear();
+        self.edges.reserve(MOST);
+        self.spots.clear();
+        self.spots.reserve(MOST);
+    }
+
     /// Finds the markers in an image; the surest comes first. `outlines` has the outlines of that image as other families
     /// share them, or, when it is told to be empty, only its pyramid; what else is looked at is added to it. When markers of
     /// other families are among `found`, only those that are whole are looked for.

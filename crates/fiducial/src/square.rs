@@ -166,6 +166,19 @@ impl Squares {
         known.or(Some(self.layouts.len() - 1))
     }
 
+    /// Makes the buffers as large as frames with texture need.
+    pub(crate) fn make_room(&mut self) {
+        const QUADS: usize = 2000;
+        if !self.is_empty() {
+            self.quads.clear();
+            self.quads.reserve(QUADS);
+            self.found.clear();
+            self.found.reserve(MOST_FOUND);
+            self.scratch.make_room();
+            self.damaged.make_room();
+        }
+    }
+
     /// True when there is nothing to look for.
     pub fn is_empty(&self) -> bool {
         self.wanted.is_empty()

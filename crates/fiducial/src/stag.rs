@@ -139,6 +139,16 @@ impl Stags {
         stags
     }
 
+    /// Makes the buffers as large as frames with texture need.
+    pub(crate) fn make_room(&mut self) {
+        if !self.is_empty() {
+            self.places.clear();
+            self.places.reserve(MOST_FOUND);
+            self.scratch.make_room();
+            self.damaged.make_room();
+        }
+    }
+
     /// True when there is nothing to look for.
     pub(crate) fn is_empty(&self) -> bool {
         self.wanted.is_empty()

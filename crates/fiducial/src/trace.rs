@@ -106,6 +106,16 @@ impl Reason {
 }
 
 impl Trace {
+    /// Makes the lists as large as frames with texture need.
+    pub(crate) fn make_room(&mut self) {
+        const MOST: usize = 1024;
+        self.ellipses.reserve(MOST);
+        self.rings.reserve(MOST);
+        self.quads.reserve(Self::MOST_REFUSALS);
+        self.refusals.reserve(Self::MOST_REFUSALS);
+        self.markers.reserve(Self::MOST_REFUSALS);
+    }
+
     /// How many refusals are kept, and how many quads.
     pub const MOST_REFUSALS: usize = 256;
 

@@ -239,7 +239,7 @@ impl Tracker {
         match expected {
             Some(seen) => self.found.push(moved(&seen)),
             None => {
-                self.found.extend(detector.detect(part, camera.as_ref(), stages).iter().map(moved))
+                self.found.extend(detector.detect(part, camera.as_ref(), stages).iter().map(moved));
             }
         }
         self.trace.add_part(detector.trace(), offset);

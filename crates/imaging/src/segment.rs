@@ -38,6 +38,9 @@ pub struct LeastEdge {
 /// No chain is longer than this many pixels; what goes on is the next chain.
 const LONGEST_CHAIN: usize = 1024;
 
+/// There is room for a segment in so many pixels from the start.
+const PIXELS_PER_SEGMENT: usize = 50;
+
 /// A chain is cut where it leaves the straight line by more than this many pixels.
 const STRAIGHT_PX: f32 = 0.8;
 
@@ -64,6 +67,25 @@ pub struct Segments {
 }
 
 impl Segments {
+    /// Makes the buffers as large as an image of this size with texture needs.
+    pub fn make_room(&mut self, width: usize, height: usize) {
+        fn reserve<T>(list: &mut Vec<T>, most: usize) {
+            list.reserve(most.saturating_sub(list.len()));
+        }
+        let pixels = width * height;
+        reserve(&mut self.across, pixels);
+        reserve(&mut self.down, pixels);
+        reserve(&mut self.edges, pixels);
+        reserve(&mut self.seeds, pixels.next_multiple_of(8));
+        for row in &mut self.strengths {
+            reserve(row, width);
+        }
+        reserve(&mut self.chain, LONGEST_CHAIN + 1);
+        reserve(&mut self.places, LONGEST_CHAIN + 1);
+        reserve(&mut self.parts, LONGEST_CHAIN);
+        reserve(&mut self.found, pixels / PIXELS_PER_SEGMENT);
+    }
+
     /// The segments in an image, in no order.
     pub fn find(&mut self, view: GrayView<'_>, least: LeastEdge) -> &[Segment] {
         self.found.clear();

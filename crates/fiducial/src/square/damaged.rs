@@ -42,6 +42,12 @@ const MOST_READ: usize = 100;
 const MOST_FOUND: usize = 64;
 
 impl Damaged {
+    /// Makes room for what may be found.
+    pub(crate) fn make_room(&mut self) {
+        self.found.clear();
+        self.found.reserve(MOST_FOUND);
+    }
+
     /// The markers in an image among the quads that its segments make, as far as these are open to markers of the code; the
     /// surest first.
     pub fn find<'a>(

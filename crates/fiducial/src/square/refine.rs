@@ -46,6 +46,19 @@ pub struct Scratch {
     pub(crate) spots: Vec<picture::Spot>,
 }
 
+impl Scratch {
+    /// Makes the buffers as large as markers need.
+    pub(crate) fn make_room(&mut self) {
+        const MOST: usize = 1024;
+        self.runs.clear();
+        self.runs.reserve(MOST / 2);
+        self.shifts.clear();
+        self.shifts.reserve(MOST / 2);
+        self.spots.clear();
+        self.spots.reserve(2 * MOST);
+    }
+}
+
 /// Cells narrower than this, in pixels, have edges that blur into each other.
 const LEAST_CELL_PX: f64 = 5.5;
 /// The same for a single border, beside which there is nothing as fine.

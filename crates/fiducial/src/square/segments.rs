@@ -47,6 +47,18 @@ pub(crate) struct ImageQuads {
 }
 
 impl ImageQuads {
+    /// Makes the buffers as large as frames with texture need, for images of this size.
+    pub(crate) fn make_room(&mut self, view: GrayView<'_>) {
+        let (mut width, mut height) = (view.width(), view.height());
+        while width * height > MOST_PIXELS {
+            (width, height) = (width / 2, height / 2);
+        }
+        self.segments.make_room(width, height);
+        self.joining.make_room([width, height]);
+        self.quads.clear();
+        self.quads.reserve(2 * LEVELS * MOST_QUADS);
+    }
+
     /// Turns to another image.
     pub(crate) fn begin(&mut self) {
         self.is_made = false;
@@ -127,6 +139,20 @@ struct Guess {
 }
 
 impl SegmentQuads {
+    fn make_room(&mut self, [width, height]: [usize; 2]) {
+        fn reserve<T>(list: &mut Vec<T>, most: usize) {
+            list.reserve(most.saturating_sub(list.len()));
+        }
+        reserve(&mut self.sides, MOST_SIDES);
+        reserve(&mut self.corners, MOST_CORNERS + MOST_CORNERS);
+        reserve(&mut self.corners_from, MOST_SIDES + 1);
+        reserve(&mut self.guesses, MOST_GUESSES);
+        reserve(&mut self.found, MOST_QUADS);
+        reserve(&mut self.starts.sides, MOST_SIDES);
+        let cells = (width / CELL_PX as usize + 1) * (height / CELL_PX as usize + 1);
+        reserve(&mut self.starts.from, cells + 1);
+    }
+
     /// The quads that these segments of a picture of `size` pixels may belong to, in the image's pixels, best first:
     /// dark ones, or bright ones when `inverted`.
     pub fn find(

@@ -22,6 +22,12 @@ pub(super) struct Candidate {
 }
 
 impl Damaged {
+    /// Makes room for what may be found.
+    pub(super) fn make_room(&mut self) {
+        self.found.clear();
+        self.found.reserve(MOST_FOUND);
+    }
+
     /// The quads that `read` reads, each place once, the surest first.
     pub(super) fn find(
         &mut self,
