@@ -298,7 +298,8 @@ fn ekf_is_ready(flags: EkfStatusFlags) -> bool {
     flags.contains(needed) && flags.intersects(horizontal) && !flags.intersects(wrong)
 }
 
-/// The same of PX4's ESTIMATOR_STATUS.
+/// The same of PX4's ESTIMATOR_STATUS. Its filter is in constant position mode whenever the vehicle stands still (since
+/// 1.15, `EKF/ekf_helper.cpp: get_ekf_soln_status`): that is wrong only where nothing from outside tells the position.
 fn estimator_is_ready(flags: EstimatorStatusFlags) -> bool {
     let needed = EstimatorStatusFlags::ESTIMATOR_ATTITUDE
         | EstimatorStatusFlags::ESTIMATOR_VELOCITY_HORIZ
@@ -306,8 +307,11 @@ fn estimator_is_ready(flags: EstimatorStatusFlags) -> bool {
         | EstimatorStatusFlags::ESTIMATOR_POS_VERT_ABS;
     let horizontal = EstimatorStatusFlags::ESTIMATOR_POS_HORIZ_ABS
         | EstimatorStatusFlags::ESTIMATOR_POS_HORIZ_REL;
-    let wrong = EstimatorStatusFlags::ESTIMATOR_CONST_POS_MODE;
-    flags.contains(needed) && flags.intersects(horizontal) && !flags.intersects(wrong)
+    let is_told = EstimatorStatusFlags::ESTIMATOR_PRED_POS_HORIZ_ABS
+        | EstimatorStatusFlags::ESTIMATOR_PRED_POS_HORIZ_REL;
+    let only_assumed = flags.contains(EstimatorStatusFlags::ESTIMATOR_CONST_POS_MODE)
+        && !flags.intersects(is_told);
+    flags.contains(needed) && flags.intersects(horizontal) && !only_assumed
 }
 
 #[cfg(test)]
@@ -347,6 +351,18 @@ mod tests {
         readiness.take_position();
         assert!(readiness.is_ready());
         assert!(readiness.reasons().is_empty());
+    }
+
+    #[test]
+    fn a_px4_at_rest_is_ready_and_one_that_only_assumes_its_place_is_not() {
+        let mut readiness = Readiness::default();
+        readiness.take_position();
+        // What PX4 1.17 reports before takeoff, with and without a satellite fix.
+        readiness.take_estimator(EstimatorStatusFlags::from_bits_retain(1023));
+        assert!(readiness.is_ready(), "{:?}", readiness.reasons());
+        readiness.take_estimator(EstimatorStatusFlags::from_bits_retain(1023 - 256 - 512));
+        assert!(!readiness.is_ready());
+        assert!(readiness.reasons().join("; ").contains("no position yet (flags 255)"));
     }
 
     #[test]

@@ -286,6 +286,10 @@ impl Machine {
     /// What ends or stops a landing in whatever phase it is.
     fn interruption(&self, facts: &Facts) -> Option<(Phase, Reason)> {
         if let Some(vehicle) = facts.vehicle {
+            // PX4 leaves LAND as it stops the motors (seen with 1.17); that is no pilot's doing.
+            if self.landing && !vehicle.armed {
+                return Some(self.disarmed(vehicle));
+            }
             let ours = vehicle.mode == Mode::Guided && !self.landing
                 || vehicle.mode == Mode::Land && self.phase == Phase::Final;
             if !ours {
@@ -585,6 +589,10 @@ mod tests {
         check(&all[..4], Phase::Final, Reason::LowAndAligned);
         check(&all[..5], Phase::Final, Reason::AutopilotLands);
         check(&all, Phase::Landed, Reason::TouchedDown);
+        // An autopilot may leave LAND as it stops the motors.
+        let left = flown(12.0, |v| (v.mode, v.armed) = (Mode::Guided, false));
+        let [a, b, c, d, e, _] = all;
+        check(&[a, b, c, d, e, left], Phase::Landed, Reason::TouchedDown);
     }
 
     #[test]

@@ -1,12 +1,15 @@
 //! A vehicle flown by a real autopilot: its true motion from what the autopilot reports.
 //!
-//! ArduPilot in simulation tells the truth in SIM_STATE, with the position in steps of about a centimetre and the
-//! velocity exactly; the two together give a smooth motion. Any other autopilot's own estimate has to do.
+//! ArduPilot in simulation tells the truth in SIM_STATE, PX4 in HIL_STATE_QUATERNION, both with the position in steps of
+//! about a centimetre and the velocity exactly or nearly so; the two together give a smooth motion. Any other autopilot's
+//! own estimate has to do.
 
 use std::collections::VecDeque;
 
 use autopilot::Frame;
-use autopilot::dialect::{ATTITUDE_DATA, LOCAL_POSITION_NED_DATA, MavMessage, SIM_STATE_DATA};
+use autopilot::dialect::{
+    ATTITUDE_DATA, HIL_STATE_QUATERNION_DATA, LOCAL_POSITION_NED_DATA, MavMessage, SIM_STATE_DATA,
+};
 use geometry::{Body, Ned, Point, Rotation, Vector};
 
 use world::vehicle::VehicleTruth;
@@ -21,7 +24,7 @@ const CORRECTION: f64 = 0.05;
 const JUMP_M: f64 = 0.5;
 /// Motion is predicted at most so far, in seconds.
 const LONGEST_PREDICTION_S: f64 = 0.2;
-/// Without SIM_STATE for so long the autopilot's own estimate is used, in seconds.
+/// Without the truth for so long the autopilot's own estimate is used, in seconds.
 const TRUTH_PATIENCE_S: f64 = 1.0;
 /// Who is heard for the first time higher than this over the autopilot's origin has started elsewhere, in metres.
 const STARTED_BELOW_M: f64 = 1.0;
@@ -37,7 +40,8 @@ pub struct Reported {
     /// True once `home` was compared with the autopilot's own origin.
     is_settled: bool,
     past: VecDeque<VehicleTruth>,
-    sim_state_s: Option<f64>,
+    /// When the simulation's truth was told last.
+    told_s: Option<f64>,
     attitude: Option<(Rotation<Ned, Body>, Vector<Body>)>,
     fastest_fall: VecDeque<(f64, f64)>,
 }
@@ -50,6 +54,7 @@ impl Reported {
         }
         match &frame.message {
             Some(MavMessage::SIM_STATE(state)) => self.sim_state(now_s, state),
+            Some(MavMessage::HIL_STATE_QUATERNION(state)) => self.hil_state(now_s, state),
             Some(MavMessage::ATTITUDE(attitude)) => self.attitude(attitude),
             Some(MavMessage::LOCAL_POSITION_NED(position)) => self.local(now_s, position),
             _ => {}
@@ -63,7 +68,7 @@ impl Reported {
 
     /// True while the simulation's truth is told, not only the autopilot's estimate.
     pub fn is_true(&self, now_s: f64) -> bool {
-        self.sim_state_s.is_some_and(|told| now_s - told < TRUTH_PATIENCE_S)
+        self.told_s.is_some_and(|told| now_s - told < TRUTH_PATIENCE_S)
     }
 
     /// The latest motion.
@@ -88,15 +93,41 @@ impl Reported {
         if !numbers.iter().chain(&rates).all(|n| n.is_finite()) {
             return;
         }
-        let altitude_m = f64::from(state.alt);
-        let here = (state.lat_int, state.lon_int, altitude_m);
-        let airborne = self.past.back().filter(|last| last.height_m > STARTED_BELOW_M);
-        let origin = || airborne.map_or(here, |last| origin_of(here, last.position));
-        let home = *self.home.get_or_insert_with(origin);
-        let told = position_from(home, state.lat_int, state.lon_int, altitude_m);
+        let here = (state.lat_int, state.lon_int, f64::from(state.alt));
         let velocity = Vector::new(f64::from(state.vn), f64::from(state.ve), f64::from(state.vd));
         let [roll, pitch, yaw] = [state.roll, state.pitch, state.yaw].map(f64::from);
         let [p, q, r] = rates.map(f64::from);
+        let attitude = (Rotation::from_euler(roll, pitch, yaw), Vector::new(p, q, r));
+        self.told(now_s, here, velocity, attitude);
+    }
+
+    fn hil_state(&mut self, now_s: f64, state: &HIL_STATE_QUATERNION_DATA) {
+        let wxyz = state.attitude_quaternion.map(f64::from);
+        let rates = [state.rollspeed, state.pitchspeed, state.yawspeed].map(f64::from);
+        let Some(attitude) = Rotation::from_wxyz(wxyz) else { return };
+        if !rates.iter().all(|n| n.is_finite()) {
+            return;
+        }
+        let here = (state.lat, state.lon, f64::from(state.alt) * 1e-3);
+        let [north, east, down] = [state.vx, state.vy, state.vz].map(|n| f64::from(n) * 0.01);
+        let [p, q, r] = rates;
+        let velocity = Vector::new(north, east, down);
+        self.told(now_s, here, velocity, (attitude, Vector::new(p, q, r)));
+    }
+
+    /// Joins a coarse position with the velocity.
+    fn told(
+        &mut self,
+        now_s: f64,
+        here: (i32, i32, f64),
+        velocity: Vector<Ned>,
+        attitude: (Rotation<Ned, Body>, Vector<Body>),
+    ) {
+        let airborne = self.past.back().filter(|last| last.height_m > STARTED_BELOW_M);
+        let origin = || airborne.map_or(here, |last| origin_of(here, last.position));
+        let home = *self.home.get_or_insert_with(origin);
+        let (lat_e7, lon_e7, altitude_m) = here;
+        let told = position_from(home, lat_e7, lon_e7, altitude_m);
         let position = match self.past.back() {
             Some(last) => {
                 let dt_s = (now_s - last.time_s).clamp(0.0, LONGEST_PREDICTION_S);
@@ -106,8 +137,7 @@ impl Reported {
             }
             None => told,
         };
-        self.sim_state_s = Some(now_s);
-        let attitude = (Rotation::from_euler(roll, pitch, yaw), Vector::new(p, q, r));
+        self.told_s = Some(now_s);
         self.push(now_s, position, velocity, attitude);
     }
 
@@ -238,6 +268,32 @@ mod tests {
             vd,
             ..SIM_STATE_DATA::default()
         }))
+    }
+
+    #[test]
+    fn a_simulated_px4_tells_the_truth_too() {
+        let state = |north_e7: i32| {
+            frame(MavMessage::HIL_STATE_QUATERNION(HIL_STATE_QUATERNION_DATA {
+                attitude_quaternion: [0.0, 0.0, 0.0, 1.0],
+                lat: 473_977_420 + north_e7,
+                lon: 85_455_940,
+                alt: 488_000 + north_e7 * 10,
+                vx: 100,
+                vz: -50,
+                ..Default::default()
+            }))
+        };
+        let mut reported = Reported::default();
+        // 1 m/s northwards and 0.5 m/s up.
+        for tick in 0..400 {
+            let seconds = f64::from(tick) * 0.01;
+            reported.handle(seconds, &state((seconds / M_PER_E7) as i32));
+        }
+        let truth = reported.truth().unwrap();
+        assert!(reported.is_true(4.0));
+        assert!((truth.position.x() - 3.99).abs() < 0.03, "{:?}", truth.position);
+        let east = truth.ned_from_body * Vector::<Body>::new(0.0, 1.0, 0.0);
+        assert!((east.y() + 1.0).abs() < 1e-6 && (truth.velocity.z() + 0.5).abs() < 1e-9);
     }
 
     #[test]

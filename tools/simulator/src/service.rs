@@ -36,10 +36,12 @@ const TRUTH_EVERY: u64 = 5;
 const WIND_EVERY: u64 = 25;
 /// Frames that are on their way late; the oldest is lost first.
 const MOST_LATE: usize = 32;
-/// After this time without SIM_STATE it is asked for (again).
+/// After this time without the truth it is asked for (again).
 const ASK_PERIOD: Duration = Duration::from_secs(1);
-/// Time between two SIM_STATE messages, in microseconds.
-const SIM_STATE_INTERVAL_US: f32 = 10_000.0;
+/// The messages in which a simulated ArduPilot (SIM_STATE) or PX4 (HIL_STATE_QUATERNION) tells the truth.
+const TRUTH_MESSAGES: [f32; 2] = [108.0, 115.0];
+/// Time between two of them, in microseconds.
+const TRUTH_INTERVAL_US: f32 = 10_000.0;
 /// Height at which the vehicle counts as having been in the air, in metres.
 const IN_AIR_M: f64 = 0.3;
 
@@ -318,18 +320,20 @@ impl Outside {
                 };
                 if !is_true && now_s - *asked_s > ASK_PERIOD.as_secs_f64() {
                     *asked_s = now_s;
-                    requests.publish(&MavlinkBytes { packet: request_for_sim_state() }).await;
+                    for message in TRUTH_MESSAGES {
+                        requests.publish(&MavlinkBytes { packet: request_for(message) }).await;
+                    }
                 }
             }
         }
     }
 }
 
-/// SET_MESSAGE_INTERVAL for SIM_STATE, to any system.
-fn request_for_sim_state() -> Vec<u8> {
+/// SET_MESSAGE_INTERVAL for a message, to any system.
+fn request_for(message: f32) -> Vec<u8> {
     let message = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
-        param1: 108.0,
-        param2: SIM_STATE_INTERVAL_US,
+        param1: message,
+        param2: TRUTH_INTERVAL_US,
         command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
         target_system: 0,
         target_component: 1,
