@@ -1,4 +1,4 @@
-//! What is watched beside the landing: the battery, and whether the operator is still heard.
+//! What is watched beside the landing: the battery, and whether autopilot and operator are still heard.
 
 use autopilot::Battery;
 use landing::Alarm;
@@ -12,6 +12,7 @@ pub struct Alarms {
     low_since_ns: Option<i64>,
     critical_since_ns: Option<i64>,
     operator_ns: Option<i64>,
+    autopilot_ns: Option<i64>,
     raised: Vec<Alarm>,
 }
 
@@ -23,6 +24,7 @@ impl Alarms {
             low_since_ns: None,
             critical_since_ns: None,
             operator_ns: None,
+            autopilot_ns: None,
             raised: Vec::new(),
         }
     }
@@ -37,6 +39,12 @@ impl Alarms {
         self.operator_ns = Some(now_ns);
         // Heard again and lost again is told again.
         self.raised.retain(|alarm| *alarm != Alarm::OperatorLost);
+    }
+
+    /// The autopilot was heard.
+    pub fn autopilot_heard(&mut self, now_ns: i64) {
+        self.autopilot_ns = Some(now_ns);
+        self.raised.retain(|alarm| *alarm != Alarm::AutopilotLost);
     }
 
     /// The gravest alarm that is to be raised now.
@@ -56,7 +64,9 @@ impl Alarms {
             from.is_some_and(|from| now_ns.saturating_sub(from) as f64 * 1e-9 >= limit_s)
         };
         let watches = s.operator_lost_s > 0.0;
+        let listens = s.autopilot_lost_s > 0.0;
         let due = [
+            (Alarm::AutopilotLost, listens && lasts(self.autopilot_ns, s.autopilot_lost_s)),
             (Alarm::BatteryCritical, lasts(self.critical_since_ns, s.battery_s)),
             (Alarm::BatteryLow, lasts(self.low_since_ns, s.battery_s)),
             (Alarm::OperatorLost, watches && lasts(self.operator_ns, s.operator_lost_s)),
@@ -87,6 +97,7 @@ mod tests {
             battery_critical_v: 10.5,
             battery_s: 3.0,
             operator_lost_s: 5.0,
+            autopilot_lost_s: 1.0,
         })
     }
 
@@ -124,6 +135,18 @@ mod tests {
         assert_eq!(alarms.tick(106 * SECOND, None), None, "once");
         alarms.operator_heard(107 * SECOND);
         assert_eq!(alarms.tick(112 * SECOND, None), Some(Alarm::OperatorLost), "lost again");
+    }
+
+    #[test]
+    fn an_autopilot_that_falls_silent_is_told_once_and_again_after_it_was_heard() {
+        let mut alarms = alarms();
+        assert_eq!(alarms.tick(100 * SECOND, None), None);
+        for lost_s in [101, 111] {
+            alarms.autopilot_heard((lost_s - 1) * SECOND);
+            assert_eq!(alarms.tick(lost_s * SECOND - 1, None), None);
+            assert_eq!(alarms.tick(lost_s * SECOND, None), Some(Alarm::AutopilotLost));
+            assert_eq!(alarms.tick((lost_s + 1) * SECOND, None), None, "once");
+        }
     }
 
     #[test]

@@ -92,6 +92,8 @@ pub struct AlarmSettings {
     pub battery_s: f64,
     /// Silence after which an operator who was heard is lost, in seconds; 0 does not watch.
     pub operator_lost_s: f64,
+    /// Silence of the autopilot after which it is lost, in seconds; 0 does not watch.
+    pub autopilot_lost_s: f64,
 }
 
 /// When the landing begins.
@@ -204,6 +206,7 @@ impl AlarmSettings {
         check.range("alarms.battery_critical_v", self.battery_critical_v, 0.0..=100.0);
         check.range("alarms.battery_s", self.battery_s, 0.0..=60.0);
         check.range("alarms.operator_lost_s", self.operator_lost_s, 0.0..=600.0);
+        check.range("alarms.autopilot_lost_s", self.autopilot_lost_s, 0.0..=600.0);
     }
 }
 

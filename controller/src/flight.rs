@@ -668,6 +668,13 @@ impl Flight {
                     }) => {
                         if is_known {
                             self.begin(now_ns);
+                            // The news of the mode may be newer than the state that the lander knows.
+                            if matches!(self.mission, Mission::Lands)
+                                && self.lander.phase() == Phase::Idle
+                            {
+                                self.mission = Mission::AwaitsAir;
+                                self.started_ns = None;
+                            }
                         } else {
                             "waiting for attitude and position".clone_into(why);
                         }
@@ -688,6 +695,7 @@ impl Flight {
         while let Some(event) = self.autopilot.poll_event() {
             match event {
                 Event::State(state) => {
+                    self.alarms.autopilot_heard(now_ns);
                     if let Some(vehicle) = wire::vehicle(&state) {
                         if state.landed == autopilot::LandedState::InAir {
                             self.wind.take(&vehicle);

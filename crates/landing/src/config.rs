@@ -273,6 +273,8 @@ pub struct PhaseConfig {
     pub on_battery_critical: AlarmAction,
     /// What follows when the operator is no longer heard.
     pub on_operator_lost: AlarmAction,
+    /// What follows when the autopilot is no longer heard; a hold ends when it is again.
+    pub on_autopilot_lost: AlarmAction,
 }
 
 impl Default for PhaseConfig {
@@ -317,6 +319,7 @@ impl Default for PhaseConfig {
             on_battery_low: AlarmAction::Ignore,
             on_battery_critical: AlarmAction::Land,
             on_operator_lost: AlarmAction::Ignore,
+            on_autopilot_lost: AlarmAction::Hold,
         }
     }
 }

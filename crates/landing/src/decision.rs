@@ -151,6 +151,8 @@ named! {
         BatteryCritical = "battery-critical", "the battery is nearly empty";
         /// The operator is no longer heard.
         OperatorLost = "operator-lost", "the operator is no longer heard";
+        /// The link to the autopilot is lost.
+        AutopilotLost = "autopilot-lost", "the autopilot is no longer heard, holding until it is";
         /// The autopilot's reports stopped.
         VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
         /// The vehicle came no nearer in the time allowed.

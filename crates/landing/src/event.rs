@@ -46,6 +46,8 @@ pub enum Alarm {
     BatteryCritical,
     /// The operator can no longer be heard.
     OperatorLost,
+    /// The autopilot is no longer heard.
+    AutopilotLost,
 }
 
 /// The vehicle as the autopilot estimates it at one moment.

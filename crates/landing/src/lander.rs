@@ -230,6 +230,7 @@ impl Lander {
             Alarm::BatteryLow => (phases.on_battery_low, Reason::BatteryLow),
             Alarm::BatteryCritical => (phases.on_battery_critical, Reason::BatteryCritical),
             Alarm::OperatorLost => (phases.on_operator_lost, Reason::OperatorLost),
+            Alarm::AutopilotLost => (phases.on_autopilot_lost, Reason::AutopilotLost),
         }
     }
 

@@ -310,6 +310,11 @@ impl Machine {
         {
             match action {
                 AlarmAction::Ignore => {}
+                // Whoever holds for another reason goes on holding for that when the link is back.
+                AlarmAction::Hold
+                    if why == Reason::AutopilotLost
+                        && self.phase == Phase::Hold
+                        && self.why != Reason::VehicleStale => {}
                 AlarmAction::Hold => return Some((Phase::Hold, why)),
                 AlarmAction::Abort => return Some((Phase::Aborted, why)),
                 AlarmAction::Land => return Some((Phase::Final, why)),
@@ -447,7 +452,7 @@ impl Machine {
         }
         let resumes = match self.why {
             Reason::TargetLost | Reason::TargetNotFound => self.sees(facts) && !deaf,
-            Reason::VehicleStale => !deaf,
+            Reason::VehicleStale | Reason::AutopilotLost => !deaf,
             _ => false,
         };
         resumes.then_some((Phase::Search, Reason::Searching))

@@ -97,8 +97,13 @@ fn operator() -> impl Strategy<Value = Kind> {
 }
 
 fn alarm() -> impl Strategy<Value = Kind> {
-    prop_oneof![Just(Alarm::BatteryLow), Just(Alarm::BatteryCritical), Just(Alarm::OperatorLost)]
-        .prop_map(Kind::Alarm)
+    prop_oneof![
+        Just(Alarm::BatteryLow),
+        Just(Alarm::BatteryCritical),
+        Just(Alarm::OperatorLost),
+        Just(Alarm::AutopilotLost)
+    ]
+    .prop_map(Kind::Alarm)
 }
 
 fn happening() -> impl Strategy<Value = Happening> {

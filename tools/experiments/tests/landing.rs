@@ -94,3 +94,34 @@ fn a_pad_that_heaves_is_touched_gently_and_one_that_moves_is_not_left_again() {
         assert!(outcome.is_within(0.1), "{outcome:?}");
     }
 }
+
+#[test]
+fn px4_is_landed_guided_and_by_its_own_precision_landing() {
+    let fly_with = |more: &[&str]| {
+        let always = ["simulator.autopilot.firmware=\"px4\"", "controller.start=takeoff"];
+        let set = always.iter().chain(more).map(|setting| (*setting).to_owned()).collect();
+        let one = |value| Values::List(vec![value]);
+        let plan = Plan {
+            set,
+            wind: one(2.0),
+            height: one(0.0),
+            offset: one(1.0),
+            ..plan(Vision::Modelled, 2)
+        };
+        let outcomes = fly_all(&plan.flights());
+        assert_eq!(outcomes.len(), 2);
+        for outcome in outcomes {
+            assert!(outcome.is_within(0.1), "{more:?}: {outcome:?}");
+        }
+    };
+    fly_with(&[]);
+    let precision = "simulator.autopilot.precision_landing=true";
+    fly_with(&["controller.mode=\"landing-target\"", precision]);
+}
+
+#[test]
+fn detections_that_are_all_late_are_used() {
+    for outcome in with_fault("latency-300ms", &[1, 2, 3]) {
+        assert!(outcome.is_within(0.1), "{outcome:?}");
+    }
+}

@@ -147,10 +147,6 @@ pub struct Planned {
     pub change: Change,
 }
 
-/// The controller takes detections as late as its target does. Its default refuses a detector after 0.2 s, in favour of
-/// another one.
-const LATE_DETECTIONS: &str = "detectors.max_age_s=0.5";
-
 impl Plan {
     /// Its flights, cell after cell.
     pub fn flights(&self) -> Vec<Planned> {
@@ -234,7 +230,7 @@ impl Plan {
             "begin_height_m=1000".to_owned(),
         ];
         simulator.extend(fault.simulator);
-        let mut controller = vec!["start=airborne".to_owned(), LATE_DETECTIONS.to_owned()];
+        let mut controller = vec!["start=airborne".to_owned()];
         controller.extend(fault.controller);
         for setting in &self.set {
             match setting.split_once('.') {
