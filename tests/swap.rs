@@ -378,8 +378,13 @@ async fn a_detector_in_python_lands_it() -> anyhow::Result<()> {
         anyhow::Ok(())
     };
     let flown = flown.await;
-    sleep(Duration::from_millis(500)).await;
-    let ended = python.try_wait()?;
+    // Closing its session takes Zenoh a while.
+    let mut ended = python.try_wait()?;
+    let told = std::time::Instant::now();
+    while flown.is_ok() && ended.is_none() && told.elapsed() < PATIENCE / 4 {
+        sleep(Duration::from_millis(50)).await;
+        ended = python.try_wait()?;
+    }
     let _ = python.kill();
     let _ = python.wait();
     flown?;
