@@ -102,6 +102,8 @@ const MOST_MARKERS: usize = 8;
 /// Levels of the pyramid on which what noise hides is looked for, and the least diameter there, in pixels.
 const COARSER: [usize; 2] = [1, 2];
 const LEAST_FROM_AFAR_PX: f64 = 16.0;
+/// Confidence that is believed there: every edge of the pattern is seen, or a ring that is not quite ours passes too.
+const LEAST_FROM_AFAR: f64 = 0.75;
 /// What a followed marker's dark rings lack of the light beside them at least, as a share.
 const LEAST_CONTRAST: f64 = 0.15;
 /// What looks like the marker less than this share of how much one does that was found is no other one.
@@ -328,7 +330,10 @@ impl Rings {
             let camera = is_known.then_some(&lens);
             last = self.look_into(coarse, &smaller, marker, camera, &lens);
             if let Ok(observation) = last {
-                return Ok(in_image(observation, level));
+                if observation.confidence >= LEAST_FROM_AFAR {
+                    return Ok(in_image(observation, level));
+                }
+                last = Err(Reason::Edges);
             }
         }
         last

@@ -17,7 +17,7 @@ use crate::trace::Reason;
 
 /// Where grey values differ more from a fitted marker's, as a share of its contrast, something else is in the picture,
 /// such as a shadow's edge.
-const MOST_DIFFERENCE: f64 = 0.08;
+const MOST_DIFFERENCE: f64 = 0.074;
 /// The rings must explain this share of the variance of the grey values about them, of a small marker within its rim
 /// more, of a faint one, whose differences are no more than so many grey levels, less.
 const LEAST_EXPLAINED: f64 = 0.95;
