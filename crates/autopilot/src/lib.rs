@@ -2,7 +2,7 @@
 //!
 //! It finds an autopilot on a serial line or a socket, asks it for the messages that landing needs, reports the
 //! vehicle's state in this project's types, and carries commands to it with acknowledgement, time limit and clear
-//! errors. ArduPilot Copter is flown; so is PX4 on a copter, as its documentation tells, though never tried on the real one.
+//! errors. ArduPilot Copter is flown; so is PX4 on a copter, as its documentation tells (1.17 in its own simulation was flown, too).
 //!
 //! Everything but [`link`] and [`session`] is a pure state machine that takes the time as an argument (nanoseconds of any clock that
 //! does not jump) and does no input or output. The crate knows nothing of markers, of landing or of other processes.

@@ -11,7 +11,7 @@ pub enum Firmware {
     Copter,
     /// ArduPilot on a vehicle of another kind, whose modes have other numbers: not supported.
     OtherArduPilot,
-    /// PX4 on a multicopter or helicopter: flown as its documentation tells, not tried on the real one.
+    /// PX4 on a multicopter or helicopter: flown as its documentation tells; OFFBOARD on 1.17 in simulation, too.
     Px4,
     /// PX4 on a vehicle of another kind: not supported.
     OtherPx4,

@@ -1,7 +1,7 @@
 //! The client against a PX4 that keeps the rules of its documentation
 //! (<https://docs.px4.io/main/en/flight_modes/offboard.html>, <https://docs.px4.io/main/en/advanced_features/precland.html>):
 //! OFFBOARD needs a second of setpoints before and goes on only with them, a takeoff goes to an altitude over the sea,
-//! and the estimator tells of itself in ESTIMATOR_STATUS. It was never tried on the real PX4.
+//! and the estimator tells of itself in ESTIMATOR_STATUS.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests may fail like tests")]
 

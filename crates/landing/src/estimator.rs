@@ -22,7 +22,7 @@
 //! outlier.
 //!
 //! Outliers that agree with each other are a rival of the estimate. Of both it is counted in which part of the frames that
-//! show their place the marker was there ([`crate::standing`]). The rival becomes the estimate, and the estimate the rival,
+//! show their place the marker was there (`standing.rs`). The rival becomes the estimate, and the estimate the rival,
 //! when its part is clearly the larger, over a long enough time: so a pad that is moved is found again within seconds where its
 //! old place is in view, and a second marker is not believed because the first is just out of view. An estimate that was
 //! hardly begun gives way at once; one that was never confirmed for `forget_after_s` is forgotten. While the marker is
