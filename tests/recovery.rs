@@ -8,7 +8,7 @@
 
 #![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -69,6 +69,8 @@ impl Victim {
 #[derive(Clone, Default)]
 struct Picture {
     alive: BTreeSet<(String, String)>,
+    /// How often each was missed: who is back at once may never be seen to be away.
+    missed: BTreeMap<(String, String), u32>,
     status: ControllerStatus,
     /// The truth: it has touched down.
     landed: bool,
@@ -203,6 +205,9 @@ impl Flight {
 
     /// Kills, and waits until it was noticed, and until all is well again: both in seconds from the kill.
     async fn kill(&mut self, victim: Victim) -> anyhow::Result<(f64, f64)> {
+        let alive = victim.alive();
+        let missed = |picture: &Picture| picture.missed.get(&alive).copied().unwrap_or(0);
+        let before = missed(&self.picture.borrow());
         let killed_ns = match victim {
             Victim::Process { side, name, .. } => {
                 kill_process(self.process(side, name)?, Signal::KILL)?;
@@ -215,8 +220,7 @@ impl Flight {
                 killed_ns
             }
         };
-        let alive = victim.alive();
-        let gone = |picture: &Picture| !picture.alive.contains(&alive);
+        let gone = |picture: &Picture| missed(picture) > before;
         let noticed_s = self.until("it is missed", killed_ns, gone).await?;
         if let Victim::Supervisor { side, .. } = victim {
             let waited = Duration::from_nanos((now_ns() - killed_ns).unsigned_abs());
@@ -290,7 +294,10 @@ async fn watch_picture(node: &Node, picture: &watch::Sender<Picture>) -> anyhow:
                 picture.send_modify(|picture| {
                     match alive {
                         true => picture.alive.insert(who),
-                        false => picture.alive.remove(&who),
+                        false => {
+                            *picture.missed.entry(who.clone()).or_default() += 1;
+                            picture.alive.remove(&who)
+                        }
                     };
                 });
             }

@@ -250,13 +250,16 @@ async fn watch(
                     }
                     progress.say(&format!("{} ended: {end}{}", service.name(), remedy(service)));
                     // Nobody flies by the ground station, so its end is no reason to leave a vehicle that takes off.
-                    let is_needed = match service {
-                        Service::GcsBridge => false,
-                        // One that was swapped away, or whose place another one has taken.
-                        Service::Detector => !another_detector(node, settings).await?,
-                        _ => true,
-                    };
-                    if service == Service::Simulator || is_needed && flight.never_flew() {
+                    let is_needed = flight.never_flew()
+                        && match service {
+                            Service::GcsBridge => false,
+                            // One that was swapped away, or whose place another one has taken.
+                            Service::Detector => {
+                                !another_detector(node, settings).await.unwrap_or(false)
+                            }
+                            _ => true,
+                        };
+                    if service == Service::Simulator || is_needed {
                         bail!("{} ended before the landing: {end}; its last words are above", service.name());
                     }
                 }

@@ -661,15 +661,17 @@ impl Flight {
             Mission::TakesOff { takeoff, why } => {
                 match takeoff.step(now_ns, &mut self.autopilot) {
                     // LAND may be the end of the landing that an earlier controller began.
-                    TakeoffProgress::Done
+                    end @ (TakeoffProgress::Done
                     | TakeoffProgress::Failed(TakeoffError::PilotInCommand {
                         mode: FlightMode::Land | FlightMode::AUTO_LAND,
                         ..
-                    }) => {
+                    })) => {
+                        let is_up = matches!(end, TakeoffProgress::Done);
                         if is_known {
                             self.begin(now_ns);
                             // The news of the mode may be newer than the state that the lander knows.
-                            if matches!(self.mission, Mission::Lands)
+                            if is_up
+                                && matches!(self.mission, Mission::Lands)
                                 && self.lander.phase() == Phase::Idle
                             {
                                 self.mission = Mission::AwaitsAir;
@@ -706,6 +708,13 @@ impl Flight {
                 Event::ArmedChanged(armed) => {
                     if !armed && self.started_ns.is_some() {
                         self.disarmed_ns = self.disarmed_ns.or(Some(now_ns));
+                    }
+                    // A takeoff was for one flight, which the pilot has ended.
+                    if !armed
+                        && self.config.start != Start::Airborne
+                        && matches!(self.mission, Mission::AwaitsAir)
+                    {
+                        self.mission = Mission::AwaitsCommand;
                     }
                     // The next flight is one more to be landed, if that is what was asked for.
                     let over =
