@@ -273,13 +273,7 @@ impl Squares {
         found: &mut Vec<Observation>,
     ) {
         let whole = self.found.len();
-        let mut left = MOST_PAPERS;
-        for outline in outlines.iter().skip(first) {
-            let Some(paper) = Quad::of(&outline) else { continue };
-            if left == 0 || unevenness(&paper, view, 0) > MOST_UNEVEN {
-                continue;
-            }
-            left -= 1;
+        for paper in papers(view, outlines, first) {
             for layout in 0..self.layouts.len() {
                 self.read_on_paper((view, outlines.pyramid()), &paper, layout, trace);
             }
@@ -558,6 +552,20 @@ fn is_same(a: &[Pixel; 4], b: &[Pixel; 4]) -> bool {
 pub(crate) fn covers(known: &[Pixel; 4], other: &[Pixel; 4]) -> bool {
     let size = diagonal_px(known);
     middle(known).distance(&middle(other)) < 0.4 * size && diagonal_px(other) < 1.5 * size
+}
+
+/// The quads of bright outlines from the index `first` on that stand out evenly all round, as the paper of a small marker does.
+pub(crate) fn papers<'a>(
+    view: GrayView<'a>,
+    outlines: &'a Outlines,
+    first: usize,
+) -> impl Iterator<Item = Quad> + 'a {
+    outlines
+        .iter()
+        .skip(first)
+        .filter_map(|outline| Quad::of(&outline))
+        .filter(move |paper| unevenness(paper, view, 0) <= MOST_UNEVEN)
+        .take(MOST_PAPERS)
 }
 
 /// Standard deviation of the steps from just within a quad to just outside, all round, as a share of their mean: in grey

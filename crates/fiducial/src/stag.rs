@@ -24,7 +24,7 @@ use crate::square::decode::Grid;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
 use crate::square::segments::ImageQuads;
-use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, covers, unevenness};
+use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, covers, papers, unevenness};
 use crate::trace::{Reason, Trace};
 
 use damaged::Damaged;
@@ -42,7 +42,6 @@ const MOST_TRIED: usize = 40;
 /// Bounds on the work in one image.
 const MOST_LOOKS: usize = 400;
 const MOST_FOUND: usize = 64;
-const MOST_PAPERS: usize = 64;
 /// Pictures that are kept.
 const MOST_PICTURES: usize = 32;
 
@@ -222,13 +221,7 @@ impl Stags {
         trace: &mut Trace,
         found: &mut Vec<Observation>,
     ) {
-        let mut left = MOST_PAPERS;
-        for outline in outlines.iter().skip(first) {
-            let Some(paper) = Quad::of(&outline) else { continue };
-            if left == 0 || unevenness(&paper, view, 0) > MOST_UNEVEN {
-                continue;
-            }
-            left -= 1;
+        for paper in papers(view, outlines, first) {
             let share = 1.0 / (1.0 + 2.0 * code::QUIET);
             let quad = Quad { inverted: false, ..paper.scaled(share) };
             if self.places.iter().any(|place| covers(place, &quad.corners)) {
