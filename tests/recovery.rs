@@ -8,6 +8,8 @@
 
 #![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
 
+mod ports;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions};
 use std::path::{Path, PathBuf};
@@ -105,22 +107,8 @@ struct Flight {
     _nodes: [Node; 2],
 }
 
-fn free_ports() -> anyhow::Result<[u16; 4]> {
-    let tcp = || -> anyhow::Result<u16> {
-        Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
-    };
-    let air = loop {
-        let port = tcp()?;
-        if std::net::TcpListener::bind(("127.0.0.1", port.saturating_add(1))).is_ok() {
-            break port;
-        }
-    };
-    let autopilot = std::net::UdpSocket::bind("127.0.0.1:0")?.local_addr()?.port();
-    Ok([tcp()?, tcp()?, air, autopilot])
-}
-
 /// The site: the drone's camera follows what the world's autopilot reports, as beside a real autopilot.
-fn site(seed: u64, [meet, _, air, autopilot]: [u16; 4]) -> String {
+fn site(seed: u64, [meet, air, autopilot]: [u16; 3]) -> String {
     format!(
         r#"
 vehicle = "tried"
@@ -151,9 +139,8 @@ set = ["ground=udpout:127.0.0.1:9"]
 
 impl Flight {
     async fn begin(folder: &Path, seed: u64) -> anyhow::Result<Self> {
-        let ports = free_ports()?;
-        std::fs::write(folder.join("site.toml"), site(seed, ports))?;
-        let [meet, apart, _, autopilot] = ports;
+        let ([meet, apart], air, autopilot) = ports::free()?;
+        std::fs::write(folder.join("site.toml"), site(seed, [meet, air, autopilot]))?;
         let world = Command::new(ALIGHT)
             .args(["simulator", "--meet", &apart.to_string(), "--vehicle", "world"])
             .args(["--set", &format!("autopilot.address=udpout:127.0.0.1:{autopilot}")])

@@ -2,6 +2,8 @@
 
 #![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
 
+mod ports;
+
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
@@ -17,23 +19,9 @@ use tokio::time::timeout;
 const PATIENCE: Duration = Duration::from_secs(60);
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
 
-fn free_ports() -> anyhow::Result<[u16; 3]> {
-    let tcp = || -> anyhow::Result<u16> {
-        Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
-    };
-    let air = loop {
-        let port = tcp()?;
-        if std::net::TcpListener::bind(("127.0.0.1", port.saturating_add(1))).is_ok() {
-            break port;
-        }
-    };
-    let autopilot = std::net::UdpSocket::bind("127.0.0.1:0")?.local_addr()?.port();
-    Ok([tcp()?, air, autopilot])
-}
-
 /// A site whose drone is simulated; the vehicle waits for a command.
 fn write_site(folder: &Path) -> anyhow::Result<u16> {
-    let [meet, air, autopilot] = free_ports()?;
+    let ([meet], air, autopilot) = ports::free()?;
     let site = format!(
         r#"
 vehicle = "tested"
