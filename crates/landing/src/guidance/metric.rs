@@ -201,6 +201,9 @@ const TURN_GAIN: f64 = 0.8;
 /// Below this height the vehicle waits for a small error, in metres.
 const LOW_M: f64 = 0.5;
 
+/// One that waits is no longer low so far above that: it makes room by climbing to about that height.
+const LOW_HYSTERESIS_M: f64 = 0.2;
+
 /// Difference between the velocity of the path asked for and the vehicle's that a gust does not explain, in m/s.
 const STEADY_M_S: f64 = 0.3;
 
@@ -505,10 +508,10 @@ impl Metric {
     /// Notes since when the vehicle is low, and since when it stands although it is to go down.
     fn wait(&mut self, situation: &Situation<'_>, target: &TargetEstimate) {
         let height_m = self.height_m(target);
-        if height_m > LOW_M {
-            self.waiting_since = None;
-        } else {
+        if height_m <= LOW_M {
             self.waiting_since.get_or_insert(situation.now);
+        } else if height_m > LOW_M + LOW_HYSTERESIS_M {
+            self.waiting_since = None;
         }
         let pushed = self
             .memory
@@ -628,4 +631,67 @@ fn approach_speed(last: f64, wanted: f64, step: f64) -> f64 {
 fn shortened(vector: Vector<Ned>, length: f64) -> Vector<Ned> {
     let norm = vector.norm();
     if norm > length { vector * (length / norm) } else { vector }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::PhaseConfig;
+    use crate::event::{Landed, Mode, VehicleState};
+    use geometry::{Point, Rotation};
+
+    /// A vehicle that stays so far beside its target at heights that change with time.
+    fn hovered(aside_m: f64, seconds: f64, height_m: impl Fn(f64) -> f64) -> Progress {
+        let mut metric = Metric::new(MetricConfig::default());
+        let mut progress = Progress::Unchanged;
+        for i in 0..(seconds * 40.0) as u32 {
+            let s = f64::from(i) / 40.0;
+            let now = Timestamp::from_seconds(s);
+            let vehicle = VehicleState {
+                stamp: now,
+                ned_from_body: Rotation::identity(),
+                position: Point::new(aside_m, 0.0, -height_m(s)),
+                velocity: Vector::zero(),
+                mode: Mode::Guided,
+                armed: true,
+                landed: Landed::InAir,
+            };
+            let target = TargetEstimate {
+                position: Point::origin(),
+                velocity: Vector::zero(),
+                lateral_error_m: aside_m,
+                height_m: height_m(s),
+                age_s: 0.05,
+                deviation_m: 0.01,
+                detections: 100,
+                heading_rad: None,
+                time_offset_s: 0.0,
+                nis: None,
+                contested: false,
+            };
+            let situation = Situation {
+                now,
+                vehicle: &vehicle,
+                target: Some(target),
+                age_s: 0.05,
+                half_view_rad: None,
+                pad_moves: false,
+                pad_heave_m_s: 0.0,
+                phases: PhaseConfig::default(),
+            };
+            progress = metric.progress(&situation);
+            let _ = metric.velocity(&situation);
+        }
+        progress
+    }
+
+    #[test]
+    fn patience_ends_also_for_a_vehicle_that_sways_about_the_height_at_which_it_waits() {
+        let sways = |s: f64| LOW_M + 0.1 * (2.0 * s).sin();
+        assert!(!matches!(hovered(0.6, 5.0, sways), Progress::Stuck));
+        assert!(matches!(hovered(0.6, 12.0, sways), Progress::Stuck));
+        // One that has climbed away waits no more.
+        let climbs = |s: f64| LOW_M - 0.1 + 0.5 * f64::from(u8::from(s > 6.0));
+        assert!(!matches!(hovered(0.6, 12.0, climbs), Progress::Stuck));
+    }
 }
