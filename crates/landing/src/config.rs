@@ -131,7 +131,7 @@ pub struct EstimatorConfig {
     /// Squared innovation over its covariance beyond which a detection is an outlier; chi-square with 3 degrees of
     /// freedom exceeds 16.3 once in a thousand times (7 to 100).
     pub gate: f64,
-    /// Outliers that agree with each other and so begin a new estimate (2 to 100).
+    /// Outliers that agree with each other and so begin a new estimate (2 to 30).
     pub restart_after: u32,
     /// Shortest time over which such outliers must come, in s (0 to 10).
     pub restart_s: f64,
@@ -424,7 +424,8 @@ impl EstimatorConfig {
         check("estimator.heading_error_rad", self.heading_error_rad, 1e-5, 0.5)?;
         check("estimator.time_offset_s", self.time_offset_s, 0.0, 0.2)?;
         check("estimator.gate", self.gate, 7.0, 100.0)?;
-        check("estimator.restart_after", f64::from(self.restart_after), 2.0, 100.0)?;
+        let most = f64::from(crate::standing::MOST_SIGHTED);
+        check("estimator.restart_after", f64::from(self.restart_after), 2.0, most)?;
         check("estimator.restart_s", self.restart_s, 0.0, 10.0)?;
         check("estimator.forget_after_s", self.forget_after_s, 0.5, 600.0)?;
         check("estimator.heading_share", self.heading_share, 0.01, 1.0)

@@ -148,12 +148,12 @@ impl Estimator {
         }
     }
 
-    /// Takes note of a frame in which the marker was not found.
+    /// Takes note of a frame in which the marker was not found. That alone makes no other place the pad: a pad that blinks
+    /// must not lose to one that nobody looks at.
     pub fn miss(&mut self, frame: &Frame, history: &History) {
         self.view = View::of(frame).or(self.view);
         if let Some(motion) = history.at(frame.stamp) {
             self.count(frame.stamp, &motion, None);
-            self.settle(frame.stamp);
         }
     }
 
@@ -603,6 +603,7 @@ mod tests {
         tilt_error: [f64; 2],
         late_s: f64,
         noise_m: [f64; 3],
+        focal_px: Option<f64>,
     }
 
     impl Scene {
@@ -618,6 +619,7 @@ mod tests {
                 tilt_error: [0.0; 2],
                 late_s: 0.0,
                 noise_m: [0.004, 0.004, 0.03],
+                focal_px: None,
             }
         }
 
@@ -684,7 +686,7 @@ mod tests {
                     stamp,
                     detector: 0,
                     image_size: (1296, 972),
-                    focal_px: None,
+                    focal_px: self.focal_px,
                     body_from_camera: None,
                     marker: None,
                 },
@@ -878,6 +880,29 @@ mod tests {
         assert!(fly(away, |i| i % 3 == 0) < 0.02, "it began with the wrong one");
         assert!(fly(home, |i| (60..74).contains(&i)) < 0.02, "a second of lies");
         assert!((fly(home, |i| i > 60) - 1.0).abs() < 0.02, "the marker is elsewhere now");
+    }
+
+    #[test]
+    fn a_pad_that_blinks_does_not_lose_to_a_place_that_nobody_looks_at() {
+        let mut scene = Scene::new(EstimatorConfig::default(), 10);
+        scene.focal_px = Some(1818.0);
+        let home = scene.pad;
+        let mut after_blinking_m = 0.0;
+        for i in 0..130 {
+            scene.pass(0.07);
+            // Four detections where the image ends, long ago, and 3 s without the pad, which is there before and after.
+            let is_away = (20..24).contains(&i);
+            scene.pad = if is_away { home + Vector::new(4.5, 0.0, 0.0) } else { home };
+            if (40..82).contains(&i) {
+                let (frame, _) = scene.frame(0.03);
+                scene.estimator.miss(&frame, &scene.history);
+                after_blinking_m = scene.error().horizontal_norm();
+            } else {
+                let _ = scene.see(0.03);
+            }
+        }
+        assert!(after_blinking_m < 0.1, "{after_blinking_m} m");
+        assert!(scene.error().horizontal_norm() < 0.02 && !scene.estimate().contested);
     }
 
     #[test]

@@ -16,6 +16,10 @@ const SHOWN_S: f64 = 2.0;
 /// Time constant with which a place that no frame shows loses its standing, in seconds.
 const UNSHOWN_S: f64 = 6.0;
 
+/// Detections beyond this number tell nothing more: a place that was seen for minutes is forgotten as soon as one that was
+/// seen for seconds.
+pub(crate) const MOST_SIGHTED: u32 = 30;
+
 /// A silence between two frames counts as this at most, in seconds.
 const LONGEST_GAP_S: f64 = 0.2;
 
@@ -51,7 +55,11 @@ impl Standing {
         let gap_s = stamp.seconds_since(self.newest).clamp(0.0, LONGEST_GAP_S);
         self.newest = self.newest.max(stamp);
         let lasting = (-gap_s / UNSHOWN_S).exp();
-        self.sighted = if is_seen { self.sighted + 1.0 } else { self.sighted * lasting };
+        self.sighted = if is_seen {
+            (self.sighted + 1.0).min(f64::from(MOST_SIGHTED))
+        } else {
+            self.sighted * lasting
+        };
         if !is_shown {
             self.trust = if is_seen { 1.0 } else { self.trust * lasting };
             return;
@@ -142,6 +150,21 @@ mod tests {
             other.count(stamp, true, i % 3 == 0);
         }
         assert!(pad.share() > 0.5 && !other.beats(&pad), "{pad:?}");
+    }
+
+    #[test]
+    fn a_place_seen_for_minutes_is_forgotten_as_soon_as_one_seen_for_seconds() {
+        let left_after_s = |frames: u32| {
+            let mut place = counted(frames, true, |_| true);
+            let begun_s = f64::from(frames) / 15.0;
+            for i in 0..15 * 30 {
+                let stamp = Timestamp::from_seconds(begun_s + f64::from(i) / 15.0);
+                place.count(stamp, true, false);
+            }
+            place.detections()
+        };
+        assert!((left_after_s(15 * 600) - left_after_s(15 * 3)).abs() < 1e-6);
+        assert!(left_after_s(15 * 600) < 0.5, "{}", left_after_s(15 * 600));
     }
 
     #[test]
