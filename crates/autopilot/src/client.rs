@@ -368,6 +368,10 @@ impl Autopilot {
     /// Asks for something. It is sent with the next [`Autopilot::tick`], and takes the place of an earlier request for
     /// the same thing; [`Autopilot::status`] and [`Event::Command`] tell how it went.
     pub fn request(&mut self, now_ns: i64, command: Command) -> CommandId {
+        if let Some(pending) = self.requests.iter_mut().find(|r| r.command == command) {
+            pending.ask_again(now_ns);
+            return pending.id;
+        }
         let id = CommandId(self.next_id);
         self.next_id += 1;
         let same = |request: &Request| request.command.concerns_same_as(&command);

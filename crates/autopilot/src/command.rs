@@ -338,6 +338,14 @@ impl Request {
         }
     }
 
+    /// The same was asked for once more: what was not answered is sent again now; what was accepted has until the next
+    /// heartbeat to show.
+    pub(crate) fn ask_again(&mut self, now_ns: i64) {
+        if matches!(self.phase, Phase::Sent(_)) {
+            self.phase = Phase::Due(now_ns);
+        }
+    }
+
     /// The autopilot said something while this was under way.
     pub(crate) fn hear(&mut self, text: &str) {
         let about_arming = is_about_arming(text);

@@ -534,6 +534,20 @@ fn a_later_command_takes_the_place_of_an_earlier_one() {
 }
 
 #[test]
+fn the_same_asked_for_again_without_an_answer_is_sent_at_once() {
+    let mut world = World::standing();
+    world.fake.lose_commands = 1;
+    let first = world.client.request(world.now, Command::SetMode(FlightMode::Land));
+    world.step();
+    let second = world.client.request(world.now, Command::SetMode(FlightMode::Land));
+    assert_eq!(first, second);
+    for _ in 0..10 {
+        world.step();
+    }
+    assert_eq!(world.client.state().unwrap().mode, FlightMode::Land, "not after a second only");
+}
+
+#[test]
 fn a_lost_heartbeat_is_told_ends_commands_and_returns() {
     let mut world = World::flying();
     let id = world.client.request(world.now, Command::SetMode(FlightMode::Land));

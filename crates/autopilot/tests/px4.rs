@@ -15,8 +15,8 @@ use autopilot::dialect::{
 };
 use autopilot::frame::{self, Sender};
 use autopilot::{
-    Autopilot, Command, CommandError, CommandStatus, Config, Firmware, FlightMode, Parser, Takeoff,
-    TakeoffProgress,
+    Autopilot, Command, CommandError, CommandStatus, Config, Event, Firmware, FlightMode, Parser,
+    Takeoff, TakeoffProgress,
 };
 use geometry::{Point, Vector};
 
@@ -36,6 +36,7 @@ struct Px4 {
     /// Since when setpoints have come at 2 Hz or more, and when the last one came.
     streaming: Option<(i64, i64)>,
     setpoints: Vec<[f32; 3]>,
+    modes_asked: usize,
     landing_targets: Vec<(u8, [f32; 3])>,
     queue: Vec<MavMessage>,
 }
@@ -79,6 +80,7 @@ impl Px4 {
             }
             MavCmd::MAV_CMD_DO_SET_MODE => {
                 assert_eq!(command.param1, 1.0);
+                self.modes_asked += 1;
                 let number = [0, 0, command.param2 as u8, command.param3 as u8];
                 let mode = FlightMode::Px4(u32::from_le_bytes(number));
                 let proven = self
@@ -187,6 +189,7 @@ impl World {
             intervals: BTreeMap::new(),
             streaming: None,
             setpoints: Vec::new(),
+            modes_asked: 0,
             landing_targets: Vec::new(),
             queue: Vec::new(),
         };
@@ -310,4 +313,25 @@ fn a_pilots_switch_on_the_way_up_ends_the_takeoff() {
         panic!("it went on");
     };
     assert!(problem.to_string().contains("PX4 POSITION"), "{problem}");
+}
+
+#[test]
+fn a_mode_asked_for_again_before_the_heartbeat_shows_it_is_neither_sent_twice_nor_a_failure() {
+    let mut world = World::flying(5.0);
+    let land = Command::SetMode(FlightMode::AUTO_LAND);
+    while world.now % SECOND != STEP {
+        world.step();
+    }
+    let before = world.px4.modes_asked;
+    let first = world.client.request(world.now, land);
+    for _ in 0..20 {
+        world.step();
+    }
+    let second = world.client.request(world.now, land);
+    assert_eq!(first, second);
+    world.run(2);
+    assert_eq!(world.client.status(first), CommandStatus::Done);
+    assert_eq!(world.px4.modes_asked - before, 1);
+    let failed = |event: Event| matches!(event, Event::Command { result: Err(_), .. });
+    assert!(!std::iter::from_fn(|| world.client.poll_event()).any(failed));
 }
