@@ -106,6 +106,8 @@ pub enum Start {
     Airborne,
     /// After a take-off.
     Takeoff,
+    /// Where a landing under way was left, in GUIDED or LAND; after that flight when the operator says so.
+    Resume,
 }
 
 /// Which guidance is used.
@@ -187,6 +189,11 @@ impl Settings for Config {
         check.range("autopilot.drag_per_s", self.autopilot.drag_per_s, 0.0..=5.0);
         check.range("landing_target.steady_s", self.landing_target.steady_s, 0.0..=30.0);
         self.alarms.check(check);
+        // A state that is stale holds the vehicle by itself; the alarm is for a silence that lasts.
+        let (lost_s, stale_s) = (self.alarms.autopilot_lost_s, self.phases.stale_vehicle_s);
+        if lost_s > 0.0 {
+            check.at_least("alarms.autopilot_lost_s", lost_s, "phases.stale_vehicle_s", stale_s);
+        }
         self.detectors.check(check);
         // Both guidances are checked, used or not: a wrong number should not wait for the day it is used.
         for guidance in [Guidance::Metric(self.metric), Guidance::Thesis(self.thesis)] {
@@ -294,5 +301,9 @@ mod tests {
         check("mode=magic", &["magic", "landing-target"]);
         check("alarms.battery_low=30", &["`alarms.battery_low` = 30", "from 0 to 1"]);
         check("metric.gain=1", &["no key `metric.gain`"]);
+        let stale = ["`alarms.autopilot_lost_s` = 0.3", "`phases.stale_vehicle_s` = 0.5"];
+        check("alarms.autopilot_lost_s=0.3", &stale);
+        check("phases.stale_vehicle_s=1.5", &["`alarms.autopilot_lost_s` = 1", "= 1.5"]);
+        assert!(load(&["alarms.autopilot_lost_s=0"]).is_ok(), "it is not watched at all");
     }
 }

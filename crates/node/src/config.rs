@@ -281,6 +281,11 @@ impl Check<'_> {
         self.holds(key, range.contains(&value), limit);
     }
 
+    /// The number `key` must not be less than the value of another key.
+    pub fn at_least(&mut self, key: &str, value: f64, other: &str, least: f64) {
+        self.holds(key, value >= least, || format!("it must not be less than `{other}` = {least}"));
+    }
+
     /// The value of `key` must be one of `allowed`.
     pub fn one_of(&mut self, key: &str, value: &str, allowed: &[&str]) {
         self.holds(key, allowed.contains(&value), || {
