@@ -66,7 +66,7 @@ impl Children<Service> {
         }
         if service == Service::Controller {
             // One that is started again takes the landing up, and never takes off a second time.
-            by_hand.push_str(" --set 'start=\"airborne\"'");
+            by_hand.push_str(" --set 'start=\"resume\"'");
         }
         if std::env::var_os("ALIGHT_LOG").is_none() {
             command.env("ALIGHT_LOG", "warn");

@@ -88,7 +88,7 @@ impl Flight {
     pub fn new(config: Config, health: Arc<HealthCounters>) -> anyhow::Result<Self> {
         let mission = match config.start {
             Start::Command => Mission::AwaitsCommand,
-            Start::Airborne => Mission::AwaitsAir,
+            Start::Airborne | Start::Resume => Mission::AwaitsAir,
             Start::Takeoff => Mission::TakesOff {
                 takeoff: Takeoff::new(config.takeoff_height_m),
                 why: "waiting for the autopilot's heartbeat".to_owned(),
@@ -570,6 +570,13 @@ impl Flight {
             .is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
     }
 
+    /// True when there is no landing to be taken up: it has ended, or the pilot flies.
+    fn is_nobodys_landing(&self) -> bool {
+        self.autopilot
+            .state()
+            .is_some_and(|s| !s.armed || !s.mode.is_guided() && !s.mode.is_landing())
+    }
+
     fn operator(&mut self, now_ns: i64, command: OperatorCommand) -> Result<String, String> {
         if let Mission::TakesOff { .. } = self.mission {
             if command == OperatorCommand::Resume {
@@ -649,12 +656,16 @@ impl Flight {
                 let lands = self.autopilot.state().is_some_and(|state| {
                     state.armed && state.mode.is_landing() && state.landed.is_flying()
                 });
+                let resumes = self.config.start == Start::Resume;
                 if flies || lands && self.feed.is_none() {
                     self.begin(now_ns);
+                } else if resumes && self.is_nobodys_landing() {
+                    self.mission = Mission::AwaitsCommand;
                 }
                 // A pilot's own landing is none of ours while it is high; the next flight may be.
                 if matches!(self.mission, Mission::Lands) && self.lander.phase().is_terminal() {
-                    self.mission = Mission::AwaitsAir;
+                    self.mission =
+                        if resumes { Mission::AwaitsCommand } else { Mission::AwaitsAir };
                     self.started_ns = None;
                 }
             }
@@ -1312,6 +1323,38 @@ mod tests {
         hear(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         hover(&mut flight, 5020, 5500, 4);
         assert_eq!(flight.status(5500 * MS).phase, "search");
+    }
+
+    #[test]
+    fn a_landing_taken_up_is_the_only_one_that_begins_by_itself() {
+        let next_flight = |start: &str, mode: u32, contact_at_start: MavLandedState| {
+            let mut flight = flight(start);
+            flight.presence(0, "main", true);
+            hear(&mut flight, 0, &heartbeat(mode, true));
+            hear(&mut flight, MS, &contact(contact_at_start));
+            hover(&mut flight, 20, 1000, mode);
+            let first = flight.status(1000 * MS).phase;
+            hear(&mut flight, 1000 * MS, &heartbeat(mode, false));
+            hear(&mut flight, 1001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+            pose(&mut flight, 1010 * MS);
+            flight.tick(1011 * MS);
+            hear(&mut flight, 5000 * MS, &heartbeat(4, true));
+            hear(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+            hover(&mut flight, 5020, 5500, 4);
+            (first, flight.status(5500 * MS).phase)
+        };
+        let (flying, landing) =
+            (MavLandedState::MAV_LANDED_STATE_IN_AIR, MavLandedState::MAV_LANDED_STATE_LANDING);
+        for (start, mode, contact, first, next) in [
+            ("resume", 4, flying, "search", "landed"),
+            ("resume", 5, flying, "idle", "idle"),
+            ("resume", 9, landing, "idle", "idle"),
+            ("airborne", 4, flying, "search", "search"),
+            ("airborne", 5, flying, "idle", "search"),
+        ] {
+            let phases = next_flight(start, mode, contact);
+            assert_eq!((phases.0.as_str(), phases.1.as_str()), (first, next), "{start} in {mode}");
+        }
     }
 
     #[test]
