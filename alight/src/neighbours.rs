@@ -9,6 +9,7 @@ use messages::{ControllerStatus, DetectorInfo, Place, topic};
 use node::{Identity, Network, Node, clock_name, now_ns};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
+use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 /// Detectors that are followed at most; more are a mistake in the network.
@@ -21,7 +22,14 @@ const FORGOTTEN: Duration = Duration::from_secs(15);
 /// The neighbours, as they are heard.
 pub(crate) struct Neighbours {
     heard: watch::Receiver<Heard>,
-    _node: Option<Node>,
+    follows: Option<(Node, JoinHandle<()>)>,
+}
+
+/// What a detector is there for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Post {
+    place: Place,
+    camera: String,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -34,7 +42,7 @@ struct Heard {
 impl Neighbours {
     /// Nobody is heard.
     pub(crate) fn none() -> Self {
-        Self { heard: watch::channel(Heard::default()).1, _node: None }
+        Self { heard: watch::channel(Heard::default()).1, follows: None }
     }
 
     /// Listens from now on, and notes landings in the memory.
@@ -50,7 +58,7 @@ impl Neighbours {
         let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
         let presence = node.presence("detector").await?;
         let (sender, heard) = watch::channel(Heard::default());
-        tokio::spawn(async move {
+        let task = tokio::spawn(async move {
             let mut landings = Landings { memory, ..Landings::default() };
             loop {
                 tokio::select! {
@@ -73,7 +81,16 @@ impl Neighbours {
                 }
             }
         });
-        Ok(Self { heard, _node: Some(node) })
+        Ok(Self { heard, follows: Some((node, task)) })
+    }
+
+    /// Listens no longer: after this nothing more is noted.
+    pub(crate) async fn close(&mut self) {
+        if let Some((_node, task)) = self.follows.take() {
+            task.abort();
+            // Its end is waited for; that it was broken off is no news.
+            drop(task.await);
+        }
     }
 
     /// True while a landing is under way.
@@ -81,16 +98,16 @@ impl Neighbours {
         self.heard.borrow().landing
     }
 
-    /// Where the detector with this process number on this host runs.
-    pub(crate) fn place_of(&self, pid: i32) -> Option<Place> {
+    /// Where the detector with this process number on this host runs, and for which camera.
+    pub(crate) fn post_of(&self, pid: i32) -> Option<Post> {
         let host = node::host_name();
         let heard = self.heard.borrow();
-        heard.told.values().find(|info| is_process(info, &host, pid)).map(|info| info.place)
+        heard.told.values().find(|info| is_process(info, &host, pid)).map(Post::of)
     }
 
-    /// A detector that runs at a place and is none of the processes with these numbers on this host.
-    pub(crate) fn stand_in(&self, place: Place, own: &[i32]) -> Option<String> {
-        self.heard.borrow().stand_in(place, &node::host_name(), own)
+    /// A detector at this post that is none of the processes with these numbers on this host.
+    pub(crate) fn stand_in(&self, post: &Post, own: &[i32]) -> Option<String> {
+        self.heard.borrow().stand_in(post, &node::host_name(), own)
     }
 
     /// Returns when something was heard that changes the answers.
@@ -99,6 +116,12 @@ impl Neighbours {
             // Nobody is heard any more.
             std::future::pending::<()>().await;
         }
+    }
+}
+
+impl Post {
+    fn of(info: &DetectorInfo) -> Self {
+        Self { place: info.place, camera: info.camera.clone() }
     }
 }
 
@@ -122,10 +145,10 @@ impl Heard {
         }
     }
 
-    fn stand_in(&self, place: Place, host: &str, own: &[i32]) -> Option<String> {
+    fn stand_in(&self, post: &Post, host: &str, own: &[i32]) -> Option<String> {
         let is_own = |info: &DetectorInfo| own.iter().any(|pid| is_process(info, host, *pid));
         let told = self.told.iter().filter(|(name, _)| self.alive.contains(*name));
-        let mut others = told.filter(|(_, info)| info.place == place && !is_own(info));
+        let mut others = told.filter(|(_, info)| Post::of(info) == *post && !is_own(info));
         others.next().map(|(name, _)| name.clone())
     }
 }
@@ -232,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn another_living_detector_of_the_same_place_stands_in() {
+    fn another_living_detector_of_the_same_place_and_camera_stands_in() {
         let mut heard = Heard::default();
         for (name, place, host, pid) in [
             ("main", Place::Onboard, "pi", 7),
@@ -243,11 +266,20 @@ mod tests {
             heard.tell(name, info(place, host, pid));
             heard.change(name.into(), true);
         }
-        let stand_in = |heard: &Heard| heard.stand_in(Place::Onboard, "pi", &[7, 8]);
+        // By its name it would come first.
+        let forward = DetectorInfo { camera: "forward".into(), ..info(Place::Onboard, "pi", 10) };
+        heard.tell("forward", forward);
+        heard.change("forward".into(), true);
+        let post = |place: Place| Post { place, camera: "down".into() };
+        let stand_in = |heard: &Heard| heard.stand_in(&post(Place::Onboard), "pi", &[7, 8]);
         assert_eq!(stand_in(&heard).as_deref(), Some("new"));
-        assert_eq!(heard.stand_in(Place::Ground, "laptop", &[7]), None);
+        assert_eq!(heard.stand_in(&post(Place::Ground), "laptop", &[7]), None);
         heard.change("new".into(), false);
-        assert_eq!(stand_in(&heard), None, "neither one's own nor the one on the ground does");
+        assert_eq!(
+            stand_in(&heard),
+            None,
+            "neither one's own, nor the one on the ground, nor one of another camera does"
+        );
     }
 
     #[test]

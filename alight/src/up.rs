@@ -8,13 +8,12 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use messages::Place;
 use node::Shutdown;
 use tokio::process::Command;
 use tokio::time::Instant;
 
 use crate::children::{Children, End, News};
-use crate::neighbours::{Memory, Neighbours};
+use crate::neighbours::{Memory, Neighbours, Post};
 use crate::services::{self, Service};
 use crate::site::{Job, Role, Site};
 
@@ -93,13 +92,13 @@ struct Watched {
     state: State,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 enum State {
     Running,
     /// To be started again at this time.
     Waiting(Instant),
-    /// A detector that was asked to stop: not to be started while another one at its place stands in for it.
-    StoodDown(Place),
+    /// A detector that was asked to stop: not to be started while another one at its post stands in for it.
+    StoodDown(Post),
     GivenUp,
 }
 
@@ -111,9 +110,9 @@ impl Watched {
     /// What becomes of a detector that has ended in good order because another one was swapped in for it, and what is
     /// said about it; `None` for any other process and any other end.
     fn stands_down(&mut self, end: &End, neighbours: &Neighbours, own: &[i32]) -> Option<String> {
-        let place = neighbours.place_of(self.pid).filter(|_| end.status == Some(0))?;
-        let other = neighbours.stand_in(place, own)?;
-        self.state = State::StoodDown(place);
+        let post = neighbours.post_of(self.pid).filter(|_| end.status == Some(0))?;
+        let other = neighbours.stand_in(&post, own)?;
+        self.state = State::StoodDown(post);
         let name = &self.job.name;
         Some(format!(
             "{name}: was asked to stop, and the detector `{other}` stands in for it; it is started again when that has gone"
@@ -148,7 +147,7 @@ impl Watched {
 async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<ExitCode> {
     let shutdown = Shutdown::on_signals()?;
     let memory = Memory::of(&site.instance(role));
-    let neighbours = neighbours(site, role, &jobs, &memory).await?;
+    let mut neighbours = neighbours(site, role, &jobs, &memory).await?;
     let mut children = Children::new();
     let mut watched: Vec<Watched> = jobs.into_iter().map(Watched::new).collect();
     // After a supervisor that was killed the landing goes on.
@@ -158,11 +157,11 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
     }
     for (index, first) in watched.iter_mut().enumerate() {
         let is_controller = first.job.service == Some(Service::Controller);
-        let start_as = (interrupted && is_controller).then_some("airborne");
+        let start_as = (interrupted && is_controller).then_some("resume");
         first.pid = start(&mut children, index, &first.job, start_as, site)?;
     }
     let everything_given_up =
-        watch(&mut children, &mut watched, neighbours, site, shutdown).await?;
+        watch(&mut children, &mut watched, &mut neighbours, site, shutdown).await?;
     say("stopping");
     // The last one first: whoever steers stops steering while there still is somebody to hear it.
     for (index, stopped) in watched.iter().enumerate().rev() {
@@ -171,7 +170,8 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
             say(&format!("{}: stopped", stopped.job.name));
         }
     }
-    // Who stops in good order does not want it to be taken up by the next one.
+    // Who stops in good order does not want it to be taken up by the next one; what is still heard must not be noted after.
+    neighbours.close().await;
     memory.note(false);
     Ok(ExitCode::from(u8::from(everything_given_up)))
 }
@@ -197,7 +197,7 @@ async fn neighbours(
 async fn watch(
     children: &mut Children<usize>,
     watched: &mut [Watched],
-    mut neighbours: Neighbours,
+    neighbours: &mut Neighbours,
     site: &Site,
     shutdown: Shutdown,
 ) -> anyhow::Result<bool> {
@@ -219,12 +219,12 @@ async fn watch(
                     children.forget(&index);
                     let own = pids(watched);
                     if let Some(ended) = watched.get_mut(index) {
-                        let said = ended.stands_down(&end, &neighbours, &own);
+                        let said = ended.stands_down(&end, neighbours, &own);
                         say(&said.unwrap_or_else(|| ended.ended(&end, Instant::now())));
                     }
                 }
             }
-            () = neighbours.changed() => relieve(watched, &neighbours),
+            () = neighbours.changed() => relieve(watched, neighbours),
             () = next_start => {
                 let Some((_, index)) = next else { continue };
                 let Some(again) = watched.get_mut(index) else { continue };
@@ -244,8 +244,8 @@ fn pids(watched: &[Watched]) -> Vec<i32> {
 fn relieve(watched: &mut [Watched], neighbours: &Neighbours) {
     let own = pids(watched);
     for down in watched {
-        if let State::StoodDown(place) = down.state
-            && neighbours.stand_in(place, &own).is_none()
+        if let State::StoodDown(post) = &down.state
+            && neighbours.stand_in(post, &own).is_none()
         {
             say(&format!("{}: nobody stands in for it any more; again at once", down.job.name));
             down.state = State::Waiting(Instant::now());
@@ -257,7 +257,7 @@ fn relieve(watched: &mut [Watched], neighbours: &Neighbours) {
 /// if there was one: a vehicle that is flown in GUIDED by somebody else is not landed.
 fn start_of(job: &Job, landing: bool) -> Option<&'static str> {
     let is_controller = job.service == Some(Service::Controller);
-    is_controller.then_some(if landing { "airborne" } else { "command" })
+    is_controller.then_some(if landing { "resume" } else { "command" })
 }
 
 fn far_away() -> Instant {
