@@ -1,15 +1,17 @@
 //! What can be chosen about a camera.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use airlink::AirConfig;
 use anyhow::{bail, ensure};
 use geometry::{Body, Camera, CameraModel, Distortion, Point, Rotation, Transform};
-use imaging::Mosaic;
+use imaging::{GrayView, Mosaic};
 use node::{Check, Settings};
 use serde::Deserialize;
 
 use crate::calibration::read_calibration;
+use crate::program::Form;
 
 /// The camera service's configuration; its keys are explained in `camera-pub.toml`.
 #[derive(Clone, Debug, Deserialize)]
@@ -31,6 +33,31 @@ pub(crate) struct SourceConfig {
     pub(crate) wait_for_subscriber: bool,
     bayer: String,
     largest_megapixels: f64,
+    command: Vec<String>,
+    pixels: String,
+    size_px: [u32; 2],
+    row_bytes: usize,
+    delay_ms: f64,
+    silence_s: f64,
+}
+
+/// A program that writes pictures.
+#[derive(Clone, Debug)]
+pub(crate) struct ProgramConfig {
+    /// The program and its arguments.
+    pub(crate) command: Vec<String>,
+    /// Width and height of its pictures, in pixels.
+    pub(crate) size: (usize, usize),
+    /// How it writes them.
+    pub(crate) form: Form,
+    /// Bits of a sample.
+    pub(crate) bits: u32,
+    /// Pictures a second that it was asked for.
+    pub(crate) rate_hz: f64,
+    /// From the middle of the exposure to a picture's first byte.
+    pub(crate) delay_ns: i64,
+    /// Longest time without a picture.
+    pub(crate) silence: Duration,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -60,6 +87,10 @@ impl Settings for Config {
         check.range("source.rate_hz", self.source.rate_hz, 0.01..=1000.0);
         check.parses("source.bayer", self.source.mosaic());
         check.range("source.largest_megapixels", self.source.largest_megapixels, 0.001..=4294.0);
+        check.one_of("source.pixels", &self.source.pixels, PIXELS);
+        check.range("source.delay_ms", self.source.delay_ms, 0.0..=10_000.0);
+        check.range("source.silence_s", self.source.silence_s, 0.1..=3600.0);
+        check.parses("source.command", self.source.program());
         self.air.check(check);
         self.calibration.check(check);
         self.mount.check(check);
@@ -117,7 +148,59 @@ impl Config {
     }
 }
 
+/// The forms in which a program may write pictures.
+const PIXELS: &[&str] = &["gray8", "gray16", "yuv420", "mjpeg"];
+
 impl SourceConfig {
+    /// The program that writes the pictures; `None` where they come from files.
+    pub(crate) fn program(&self) -> anyhow::Result<Option<ProgramConfig>> {
+        if self.command.is_empty() {
+            return Ok(None);
+        }
+        ensure!(self.paths.is_empty(), "with a program, `source.paths` must be empty");
+        let [width, height] = self.size_px.map(|edge| edge as usize);
+        let pixels = width.saturating_mul(height);
+        let edge = GrayView::LARGEST_EDGE_PX;
+        ensure!(
+            pixels > 0
+                && width.max(height) <= edge
+                && pixels as f64 <= self.largest_megapixels * 1e6,
+            "`source.size_px` is [{width}, {height}]; write the width and height that the program was asked for, within \
+             `source.largest_megapixels` ({}) and {edge} pixels an edge",
+            self.largest_megapixels
+        );
+        let bits = if self.pixels == "gray16" { 16 } else { 8 };
+        let bytes = width * bits as usize / 8;
+        let with_fill = if self.row_bytes == 0 { bytes } else { self.row_bytes };
+        ensure!(
+            (bytes..=16 * bytes + 4096).contains(&with_fill),
+            "`source.row_bytes` is {with_fill}, but a row has {bytes} bytes; write 0 if nothing fills it up"
+        );
+        let rest = match self.pixels.as_str() {
+            "yuv420" => 2 * with_fill.div_ceil(2) * height.div_ceil(2),
+            _ => 0,
+        };
+        let is_raw = self.pixels.starts_with("gray");
+        ensure!(
+            is_raw || self.bayer.is_empty(),
+            "`source.bayer` needs `source.pixels` gray8 or gray16"
+        );
+        let form = match self.pixels.as_str() {
+            // No picture that is worth looking at is larger as a JPEG than as it is.
+            "mjpeg" => Form::Jpeg { most_bytes: 4 * pixels + (1 << 16) },
+            _ => Form::Samples { row: (bytes, with_fill), rows: height, rest },
+        };
+        Ok(Some(ProgramConfig {
+            command: self.command.clone(),
+            size: (width, height),
+            form,
+            bits,
+            rate_hz: self.rate_hz,
+            delay_ns: (self.delay_ms * 1e6) as i64,
+            silence: Duration::from_secs_f64(self.silence_s),
+        }))
+    }
+
     /// The colours in front of the sensor's pixels.
     pub(crate) fn mosaic(&self) -> anyhow::Result<Option<Mosaic>> {
         Ok(match self.bayer.as_str() {
@@ -289,6 +372,22 @@ mod tests {
     }
 
     #[test]
+    fn a_program_writes_pictures_of_a_known_form() {
+        let form = |set: &[&str]| {
+            let all = [&["source.command=['cat']", "source.size_px=[5, 3]"], set].concat();
+            load(&all).unwrap().source.program().unwrap().unwrap().form
+        };
+        let samples = |row, rest| Form::Samples { row, rows: 3, rest };
+        assert_eq!(form(&[]), samples((5, 5), 0));
+        assert_eq!(form(&["source.pixels=gray16"]), samples((10, 10), 0));
+        // Colours of half the width and height, both rounded up, twice.
+        assert_eq!(form(&["source.pixels=yuv420"]), samples((5, 5), 12));
+        assert_eq!(form(&["source.pixels=yuv420", "source.row_bytes=8"]), samples((5, 8), 16));
+        assert!(matches!(form(&["source.pixels=mjpeg"]), Form::Jpeg { .. }));
+        assert!(load(&[]).unwrap().source.program().unwrap().is_none());
+    }
+
+    #[test]
     fn impossible_values_are_refused() {
         let check = |set: &[&str], part: &str| {
             let problem = load(set).unwrap_err();
@@ -309,5 +408,15 @@ mod tests {
         check(&["mount.translation_m=[0, 0, 1000]"], "-100 to 100");
         check(&["mount.orientation=quaternion", "mount.rotation_wxyz=[0,0,0,0]"], "a quaternion");
         check(&["source.path='x'"], "did you mean `source.paths`");
+        check(&["source.command=['cat']"], "`source.size_px` is [0, 0]");
+        let camera = |more: &[&'static str], part: &str| {
+            check(&[&["source.command=['cat']", "source.size_px=[64, 48]"], more].concat(), part);
+        };
+        camera(&["source.paths=['x']"], "`source.paths` must be empty");
+        camera(&["source.pixels=rgb"], "gray8, gray16");
+        camera(&["source.row_bytes=63"], "a row has 64 bytes");
+        camera(&["source.pixels=yuv420", "source.bayer=RGGB"], "gray8 or gray16");
+        camera(&["source.delay_ms=-1"], "from 0 to 10000");
+        camera(&["source.silence_s=0"], "from 0.1 to 3600");
     }
 }

@@ -205,7 +205,7 @@ impl Decoded {
     fn decode(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<Self, ImageError> {
         let mut decoder = decoder(path, bytes, most_pixels)?;
         // The decoder fills up what is missing of a JPEG with grey, which is no picture of anything.
-        if bytes.starts_with(JPEG_START) && !jpeg_is_complete(bytes) {
+        if bytes.starts_with(JPEG_START) && jpeg_len(bytes).is_none() {
             return Err(ImageError::Cut { path: path.to_owned() });
         }
         let damaged = |cause: ::image::ImageError| ImageError::Damaged {
@@ -247,15 +247,13 @@ impl Decoded {
                 self.write_samples(&mut samples);
                 let format = SampleFormat { bits, mosaic };
                 // An image that was decoded has a size that can be.
-                if let Ok(view) = Converter::default().convert(&samples, width, height, format) {
-                    for y in 0..height {
-                        image.row_mut(y).copy_from_slice(view.row(y));
-                    }
-                }
+                grey_of(&samples, width, height, format).unwrap_or(image)
             }
-            _ => self.write_grey(image.pixels_mut()),
+            _ => {
+                self.write_grey(image.pixels_mut());
+                image
+            }
         }
-        image
     }
 
     /// Writes the samples as they are, row by row, into a buffer of width times height times their bytes; those of two
@@ -293,6 +291,22 @@ impl Decoded {
             other => fill(out, &other.to_rgb8(), grey),
         }
     }
+}
+
+/// A sensor's samples in 8-bit grey; `None` when there are not as many as the size says.
+pub(crate) fn grey_of(
+    samples: &[u8],
+    width: usize,
+    height: usize,
+    format: SampleFormat,
+) -> Option<GrayImage> {
+    let mut image = GrayImage::filled(width, height, 0);
+    let mut converter = Converter::default();
+    let view = converter.convert(samples, width, height, format).ok()?;
+    for y in 0..height {
+        image.row_mut(y).copy_from_slice(view.row(y));
+    }
+    Some(image)
 }
 
 fn fill<T: Copy, const N: usize>(out: &mut [u8], samples: &[T], grey: impl Fn([T; N]) -> u8) {
@@ -377,23 +391,19 @@ fn decoder<'a>(
 
 const JPEG_START: &[u8] = &[0xff, 0xd8];
 
-/// True when the segments of a JPEG file lead to its end marker (ISO/IEC 10918-1, Annex B).
-fn jpeg_is_complete(bytes: &[u8]) -> bool {
-    let mut rest = bytes.get(JPEG_START.len()..).unwrap_or_default();
+/// Bytes of the JPEG file that begins here, when its segments lead to its end marker (ISO/IEC 10918-1, Annex B).
+pub(crate) fn jpeg_len(bytes: &[u8]) -> Option<usize> {
+    let mut at = JPEG_START.len();
     loop {
         // Between segments, and through the coded data after a scan's header, up to the next marker.
-        let Some(at) = rest.iter().position(|byte| *byte == 0xff) else { return false };
-        let Some(marker) = rest.get(at + 1) else { return false };
-        rest = &rest[at + 1..];
-        match marker {
+        at += 1 + bytes.get(at..)?.iter().position(|byte| *byte == 0xff)?;
+        match bytes.get(at)? {
             // Fill, stuffed byte, temporary marker, restart: none has a length.
             0xff | 0x00 | 0x01 | 0xd0..=0xd8 => {}
-            0xd9 => return true,
+            0xd9 => return Some(at + 1),
             _ => {
-                let &[_, high, low, ..] = rest else { return false };
-                let len = usize::from(u16::from_be_bytes([high, low]));
-                let Some(after) = rest.get(1 + len.max(2)..) else { return false };
-                rest = after;
+                let &[high, low] = bytes.get(at + 1..at + 3)? else { return None };
+                at += 1 + usize::from(u16::from_be_bytes([high, low])).max(2);
             }
         }
     }

@@ -1,14 +1,15 @@
 //! Light to frames: images are published with their stamp, and with the camera's calibration and mount.
 //!
-//! Frames come from image files. The crate also reads images, videos and calibrations for programs that publish nothing.
+//! Frames come from a program that reads a camera, or from image files. The crate also reads images, videos and calibrations for programs that publish nothing.
 //! It knows no marker, no vehicle and no detector.
 //!
-//! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, [`image`] reads image files,
-//! [`video`] reads videos, [`calibration`] reads calibration files.
+//! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, `program` reads what a camera's program
+//! writes, [`image`] reads image files, [`video`] reads videos, [`calibration`] reads calibration files.
 
 pub mod calibration;
 pub mod config;
 pub mod image;
+mod program;
 pub mod service;
 pub mod video;
 

@@ -1,4 +1,5 @@
-//! The camera service: images in the order of their names, published as frames at a steady rate.
+//! The camera service: a camera's pictures as they come, or images in the order of their names at a steady rate,
+//! published as frames.
 
 use std::convert::Infallible;
 use std::path::{Path, PathBuf};
@@ -8,13 +9,14 @@ use std::time::{Duration, Instant};
 use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
 use geometry::{CameraModel, Distortion};
-use imaging::{GrayImage, Mosaic};
+use imaging::{GrayImage, Mosaic, SampleFormat};
 use messages::{BayerPattern, CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
-use crate::config::Config;
-use crate::image::{Decoded, frame_bytes, images_in};
+use crate::config::{Config, ProgramConfig};
+use crate::image::{Decoded, decode_image, frame_bytes, grey_of, images_in};
+use crate::program::{Form, Program};
 
 /// Images whose size is looked up at the start, to make room for the largest in shared memory. Frames that are larger
 /// than these are published all the same, by a copy.
@@ -22,23 +24,24 @@ const IMAGES_MEASURED: usize = 1000;
 /// How often a service that waits for a subscriber looks for one.
 const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 
-/// Publishes frames until the images end, the service is asked to stop, or no image can be read.
+/// Publishes frames until the images end, the service is asked to stop, no image can be read, or the camera's program
+/// ends or falls silent.
 ///
 /// # Errors
-/// When there is no image to publish, or another camera of this name.
+/// When there is no image to publish, the program cannot be started or ends, or another camera has this name.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.ensure_alone(config.instance()).await?;
     let found = {
         let config = config.clone();
-        tokio::task::spawn_blocking(move || find_images(&config)).await??
+        tokio::task::spawn_blocking(move || find(&config)).await??
     };
-    let info = camera_info(&config, found.first_size)?;
+    let info = camera_info(&config, found.size)?;
     let infos = node.publisher(topic::CAMERA_INFO, &[config.instance()]).await?;
     infos.publish(&info).await;
-    let stream = Stream::new(&node, &config, found).await?;
+    let stream = Stream::new(&node, &config, &found).await?;
     node.announce().await?;
     tokio::select! {
-        result = on_own_thread(stream, shutdown) => result,
+        result = on_own_thread(stream, found.source, shutdown) => result,
         never = republish(&infos, &info) => match never {},
     }
 }
@@ -52,13 +55,17 @@ async fn republish(infos: &Publisher<CameraInfo>, info: &CameraInfo) -> Infallib
 }
 
 /// Runs the stream where its decoding holds up nobody else.
-async fn on_own_thread(mut stream: Stream, shutdown: Shutdown) -> anyhow::Result<()> {
+async fn on_own_thread(
+    mut stream: Stream,
+    source: Source,
+    shutdown: Shutdown,
+) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Handle::current();
     let (mut done, ended) = oneshot::channel();
     let work = move || {
         let result = runtime.block_on(async {
             tokio::select! {
-                result = stream.run() => result,
+                result = stream.run(source) => result,
                 () = shutdown.requested() => Ok(()),
                 // The service is gone, and with it whoever waits for the result.
                 () = done.closed() => Ok(()),
@@ -73,20 +80,40 @@ async fn on_own_thread(mut stream: Stream, shutdown: Shutdown) -> anyhow::Result
     ended.await.context("the camera's thread ended without a result")?
 }
 
+/// Where pictures come from.
+enum Source {
+    /// Image files.
+    Images(Vec<PathBuf>),
+    /// A camera's program.
+    Program(ProgramConfig),
+}
+
 /// What there is to publish.
 struct Found {
-    images: Vec<PathBuf>,
-    /// Width and height of the first image that can be read, in pixels.
-    first_size: (usize, usize),
-    /// Bytes of the largest frame that was measured.
+    source: Source,
+    /// Width and height that the camera info states, in pixels.
+    size: (usize, usize),
+    /// Bytes of the largest frame that is known of.
     largest: usize,
+}
+
+fn find(config: &Config) -> anyhow::Result<Found> {
+    match config.source.program()? {
+        Some(program) => {
+            let size = program.size;
+            let largest = program.form.frame_bytes().max(size.0 * size.1);
+            Ok(Found { source: Source::Program(program), size, largest })
+        }
+        None => find_images(config),
+    }
 }
 
 fn find_images(config: &Config) -> anyhow::Result<Found> {
     let mut images = Vec::new();
     ensure!(
         !config.source.paths.is_empty(),
-        "the camera `{}` has no images to publish; name files or folders in `source.paths`",
+        "the camera `{}` has nothing to publish; name image files or folders in `source.paths`, or a camera's program \
+         in `source.command`",
         config.instance()
     );
     for path in &config.source.paths {
@@ -102,14 +129,14 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
             None
         }
     });
-    let Some(first_size) = first_size else {
+    let Some(size) = first_size else {
         let problem = first_problem.map_or_else(String::new, |problem| problem.to_string());
         bail!("none of the {} images can be read; the first one: {problem}", images.len());
     };
     let sizes =
         images.iter().take(IMAGES_MEASURED).filter_map(|path| frame_bytes(path, most_pixels).ok());
-    let largest = sizes.max();
-    Ok(Found { images, first_size, largest: largest.unwrap_or(first_size.0 * first_size.1) })
+    let largest = sizes.max().unwrap_or(size.0 * size.1);
+    Ok(Found { source: Source::Images(images), size, largest })
 }
 
 fn camera_info(config: &Config, size: (usize, usize)) -> anyhow::Result<CameraInfo> {
@@ -137,11 +164,10 @@ fn camera_info(config: &Config, size: (usize, usize)) -> anyhow::Result<CameraIn
     })
 }
 
-/// Reads images and publishes them.
+/// Reads pictures and publishes them.
 struct Stream {
     config: Config,
-    images: Vec<PathBuf>,
-    first_size: (usize, usize),
+    size: (usize, usize),
     frames: FramePublisher,
     air: AirSender,
     health: Arc<HealthCounters>,
@@ -163,6 +189,8 @@ impl Pace {
 
 /// A frame that waits for its time.
 struct Prepared {
+    /// When it was exposed; `None` for a file, which is as old as its publication.
+    stamp_ns: Option<i64>,
     width: usize,
     height: usize,
     format: PixelFormat,
@@ -172,13 +200,12 @@ struct Prepared {
 }
 
 impl Stream {
-    async fn new(node: &Node, config: &Config, found: Found) -> anyhow::Result<Self> {
+    async fn new(node: &Node, config: &Config, found: &Found) -> anyhow::Result<Self> {
         let names = [config.instance()];
         let jpegs = node.frame_publisher(topic::JPEG, &names, 0).await?;
         Ok(Self {
             config: config.clone(),
-            images: found.images,
-            first_size: found.first_size,
+            size: found.size,
             frames: node.frame_publisher(topic::FRAME, &names, found.largest).await?,
             air: AirSender::start(node, config.instance(), jpegs, &config.air).await?,
             health: node.shared_health(),
@@ -186,24 +213,103 @@ impl Stream {
         })
     }
 
-    async fn run(&mut self) -> anyhow::Result<()> {
+    async fn run(&mut self, source: Source) -> anyhow::Result<()> {
+        match source {
+            Source::Images(images) => self.publish_images(&images).await,
+            Source::Program(program) => self.publish_program(&program).await,
+        }
+    }
+
+    /// Publishes what a camera's program writes.
+    async fn publish_program(&mut self, config: &ProgramConfig) -> anyhow::Result<()> {
+        let mosaic = self.config.source.mosaic()?;
+        let mut program = Program::start(config)?;
+        loop {
+            let arrival = program.wait().await?;
+            let began = Instant::now();
+            let mut frame = match config.form {
+                Form::Samples { .. } => {
+                    let mut pixels = self.frames.loan(config.form.frame_bytes());
+                    program.read(&mut pixels).await?;
+                    self.of_samples(pixels, config, mosaic)
+                }
+                Form::Jpeg { .. } => match self.of_jpeg(&program.read(&mut []).await?) {
+                    Some(frame) => frame,
+                    None => continue,
+                },
+            };
+            frame.stamp_ns = Some(arrival.stamp_ns - config.delay_ns);
+            self.health.latency("read", began.elapsed());
+            if arrival.has_waited {
+                self.health.dropped("picture that has waited");
+            } else {
+                self.publish(frame).await;
+            }
+        }
+    }
+
+    fn of_samples(&self, pixels: Loan, config: &ProgramConfig, mosaic: Option<Mosaic>) -> Prepared {
+        let (width, height) = config.size;
+        let format = pixel_format(Some(config.bits), mosaic);
+        let sample = SampleFormat { bits: config.bits, mosaic };
+        let is_raw = format != PixelFormat::Mono8;
+        let grey = (is_raw && self.air.is_wanted())
+            .then(|| grey_of(&pixels, width, height, sample))
+            .flatten();
+        Prepared { stamp_ns: None, width, height, format, pixels, grey }
+    }
+
+    /// A picture as the JPEG file of a camera's program; `None` when it is not fit to be published.
+    fn of_jpeg(&self, jpeg: &[u8]) -> Option<Prepared> {
+        let image = match decode_image(Path::new("a picture"), jpeg, self.config.most_pixels()) {
+            Ok(image) => image,
+            Err(problem) => {
+                if self.health.failed("image that cannot be read") {
+                    tracing::warn!(%problem, "A picture of the camera's program is left out");
+                }
+                return None;
+            }
+        };
+        let (width, height) = (image.width(), image.height());
+        if (width, height) != self.size {
+            if self.health.failed("image of another size") {
+                tracing::warn!(
+                    width,
+                    height,
+                    "A picture is not of the size in `source.size_px` and is left out"
+                );
+            }
+            return None;
+        }
+        let mut pixels = self.frames.loan(width * height);
+        pixels.copy_from_slice(image.pixels());
+        let format = PixelFormat::Mono8;
+        Some(Prepared { stamp_ns: None, width, height, format, pixels, grey: None })
+    }
+
+    /// Publishes image files at the rate that is asked for.
+    async fn publish_images(&mut self, images: &[PathBuf]) -> anyhow::Result<()> {
         while self.config.source.wait_for_subscriber && !self.frames.has_subscribers().await {
             tokio::time::sleep(SUBSCRIBER_POLL).await;
         }
         let period = Duration::from_secs_f64(1.0 / self.config.source.rate_hz);
         let mut pace = Pace { due: Instant::now(), period };
-        self.pass(&mut pace, true).await?;
+        self.pass(images, &mut pace, true).await?;
         while self.config.source.repeat {
-            self.pass(&mut pace, false).await?;
+            self.pass(images, &mut pace, false).await?;
         }
         Ok(())
     }
 
     /// Publishes every image once.
-    async fn pass(&mut self, pace: &mut Pace, is_first: bool) -> anyhow::Result<()> {
+    async fn pass(
+        &mut self,
+        images: &[PathBuf],
+        pace: &mut Pace,
+        is_first: bool,
+    ) -> anyhow::Result<()> {
         let before = self.sequence;
-        for index in 0..self.images.len() {
-            let Some(path) = self.images.get(index) else { break };
+        for path in images {
             match self.prepare(path) {
                 Ok(frame) => {
                     pace.wait().await;
@@ -218,11 +324,7 @@ impl Stream {
             }
         }
         // Without this a folder that was emptied meanwhile would keep a processor busy with nothing.
-        ensure!(
-            self.sequence > before,
-            "none of the {} images can be read any more",
-            self.images.len()
-        );
+        ensure!(self.sequence > before, "none of the {} images can be read any more", images.len());
         Ok(())
     }
 
@@ -231,7 +333,7 @@ impl Stream {
         let began = Instant::now();
         let image = Decoded::read(path, self.config.most_pixels())?;
         let (width, height) = (image.width(), image.height());
-        if (width, height) != self.first_size && self.health.failed("image of another size") {
+        if (width, height) != self.size && self.health.failed("image of another size") {
             tracing::warn!(
                 ?path,
                 width,
@@ -247,14 +349,14 @@ impl Stream {
         self.health.latency("read", began.elapsed());
         let is_raw = format != PixelFormat::Mono8;
         let grey = (is_raw && self.air.is_wanted()).then(|| image.grey(mosaic));
-        Ok(Prepared { width, height, format, pixels, grey })
+        Ok(Prepared { stamp_ns: None, width, height, format, pixels, grey })
     }
 
     async fn publish(&mut self, frame: Prepared) {
         let header = FrameHeader {
             camera: self.config.instance().to_owned(),
             sequence: self.sequence,
-            stamp_ns: now_ns(),
+            stamp_ns: frame.stamp_ns.unwrap_or_else(now_ns),
             clock: clock_name().to_owned(),
             exposure_ns: 0,
             width: frame.width as u32,

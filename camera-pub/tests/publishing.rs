@@ -33,6 +33,15 @@ fn config(folder: &Path, set: &[&str]) -> anyhow::Result<Config> {
     Ok(layers.load::<Config>()?.settings)
 }
 
+/// A camera that is a program which writes pictures of 64 x 48 pixels.
+fn program(command: &[&str], set: &[&str]) -> anyhow::Result<Config> {
+    let mut layers = Layers::default();
+    layers.set.push(format!("source.command={command:?}"));
+    layers.set.push("source.size_px=[64, 48]".into());
+    layers.set.extend(set.iter().map(|s| (*s).to_owned()));
+    Ok(layers.load::<Config>()?.settings)
+}
+
 /// Two grey images, a smaller coloured one, and two files that are none.
 fn folder_of_images() -> anyhow::Result<tempfile::TempDir> {
     let folder = tempfile::tempdir()?;
@@ -150,7 +159,10 @@ async fn a_start_without_images_says_why() -> anyhow::Result<()> {
         Ok(result.err().context("an error")?.to_string())
     };
     let nothing = problem(Layers::default().load::<Config>()?.settings).await?;
-    ensure!(nothing.contains("`source.paths`"), "{nothing}");
+    ensure!(
+        nothing.contains("`source.paths`") && nothing.contains("`source.command`"),
+        "{nothing}"
+    );
     let missing = problem(config(&folder.path().join("none"), &[])?).await?;
     ensure!(missing.contains("there is no") && missing.contains("none"), "{missing}");
     let empty = problem(config(folder.path(), &[])?).await?;
@@ -176,5 +188,105 @@ async fn the_rate_is_kept() -> anyhow::Result<()> {
     camera_pub::run(camera.clone(), config, Shutdown::on_signals()?).await?;
     // 59 periods of 25 ms; a busy machine may take longer, but none may be faster.
     ensure!(now_ns() - began >= 59 * 25_000_000, "{} ns", now_ns() - began);
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_program_writes_becomes_frames_with_the_time_of_its_arrival() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("picture");
+    // Rows of 64 pixels, filled up to 80 bytes, then colours.
+    let rows = (0..48_u8).flat_map(|y| (0..80_u8).map(move |x| if x < 64 { x + y } else { 255 }));
+    std::fs::write(&path, rows.chain([128; 2 * 40 * 24]).collect::<Vec<_>>())?;
+    let forever = format!("while sleep 0.05; do cat '{}'; done", path.display());
+    let set = [
+        "source.pixels=yuv420",
+        "source.row_bytes=80",
+        "source.delay_ms=1000",
+        "calibration.focal_px=[100, 100]",
+    ];
+    let config = program(&["sh", "-c", &forever], &set)?;
+    let port = free_port()?;
+    let (camera, viewer) = (open("camera-pub", port).await?, open("gcs-bridge", port).await?);
+    let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
+    for _ in 0..3 {
+        let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+        let (header, bytes) = (&frame.header, frame.bytes());
+        ensure!(header.format == PixelFormat::Mono8 && (header.width, header.height) == (64, 48));
+        ensure!(bytes.len() == 64 * 48 && bytes[63] == 63 && bytes[64] == 1 && bytes[3071] == 110);
+        ensure!(header.stamp_ns <= now_ns() - 1_000_000_000, "the delay is not in the stamp");
+        ensure!(header.stamp_ns > now_ns() - 1_000_000_000 - PATIENCE.as_nanos() as i64);
+    }
+    let infos = viewer.subscriber(topic::CAMERA_INFO, &["down"]).await?;
+    let info = timeout(PATIENCE, infos.next()).await?.context("a camera info")?;
+    ensure!(info.focal_px == Some([100.0, 100.0]) && (info.width, info.height) == (64, 48));
+    service.abort();
+    camera.close().await;
+    viewer.close().await;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_service_says_how_a_camera_s_program_ended() -> anyhow::Result<()> {
+    let problem = async |command: &[&str], set: &[&str]| -> anyhow::Result<String> {
+        let config = program(command, set)?;
+        let camera = open("camera-pub", free_port()?).await?;
+        let service = camera_pub::run(camera, config, Shutdown::on_signals()?);
+        let problem = timeout(PATIENCE, service).await?.err().context("an error")?;
+        Ok(format!("{problem:#}"))
+    };
+    let missing = problem(&["no-such-camera-program"], &[]).await?;
+    ensure!(missing.contains("`no-such-camera-program`"), "{missing}");
+    let ended = problem(&["sh", "-c", "head -c 3072 /dev/zero; exit 3"], &[]).await?;
+    ensure!(ended.contains("`sh` ended (exit status: 3) after 1 pictures"), "{ended}");
+    let cut = problem(&["head", "-c", "5000", "/dev/zero"], &[]).await?;
+    ensure!(cut.contains("not whole") && cut.contains("after 1 pictures"), "{cut}");
+    let silent = problem(&["sleep", "60"], &["source.silence_s=0.2"]).await?;
+    ensure!(silent.contains("no picture came from `sleep` for 0.2 s"), "{silent}");
+    let stuck = ["sh", "-c", "head -c 100 /dev/zero; exec sleep 60"];
+    let stuck = problem(&stuck, &["source.silence_s=0.2"]).await?;
+    ensure!(stuck.contains("in the middle of a picture"), "{stuck}");
+    let other = problem(&["head", "-c", "900000", "/dev/zero"], &["source.pixels=mjpeg"]).await?;
+    ensure!(other.contains("what `source.pixels` says"), "{other}");
+    Ok(())
+}
+
+/// The forms as `ffmpeg` writes them, from a picture of its own.
+#[tokio::test(flavor = "multi_thread")]
+async fn ffmpeg_is_a_camera() -> anyhow::Result<()> {
+    if std::process::Command::new("ffmpeg").arg("-version").output().is_err() {
+        println!("skipped: ffmpeg is missing");
+        return Ok(());
+    }
+    let grey = "color=c=0x808080:s=64x48:r=20,format=gray";
+    let forms: [(&str, &[&str]); 4] = [
+        ("gray8", &["-pix_fmt", "gray", "-f", "rawvideo"]),
+        ("gray16", &["-pix_fmt", "gray16le", "-f", "rawvideo"]),
+        ("yuv420", &["-pix_fmt", "yuv420p", "-f", "rawvideo"]),
+        ("mjpeg", &["-c:v", "mjpeg", "-f", "mjpeg"]),
+    ];
+    for (pixels, output) in forms {
+        let input = ["ffmpeg", "-nostdin", "-loglevel", "error", "-re", "-f", "lavfi", "-i", grey];
+        let command = [&input, output, &["-"]].concat();
+        let set = [format!("source.pixels={pixels}"), "source.rate_hz=20".into()];
+        let config = program(&command, &set.each_ref().map(String::as_str))?;
+        let port = free_port()?;
+        let (camera, viewer) = (open("camera-pub", port).await?, open("gcs-bridge", port).await?);
+        let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
+        let service =
+            tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
+        for _ in 0..3 {
+            let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+            let bytes = frame.bytes();
+            // The high byte of two, or the only one; video's grey ranges from 16 to 235 or to 255.
+            let level = bytes.last().context("pixels")?;
+            ensure!(level.abs_diff(0x80) < 6, "{pixels}: {level}");
+            ensure!(bytes.len() == 64 * 48 * if pixels == "gray16" { 2 } else { 1 });
+        }
+        service.abort();
+        camera.close().await;
+        viewer.close().await;
+    }
     Ok(())
 }
