@@ -314,7 +314,8 @@ mod tests {
 
     #[test]
     fn the_example_is_a_site() {
-        let example = site(include_str!("../../deploy/site.toml"));
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/site.toml");
+        let example = Site::read(&path).unwrap();
         for role in [Role::Drone, Role::Ground, Role::Relay] {
             example.jobs(role).unwrap();
         }
