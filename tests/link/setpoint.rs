@@ -6,6 +6,7 @@
 //! shared memory is the trial `onehost`.
 
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use messages::{Detections, TargetEstimate, topic};
@@ -24,6 +25,7 @@ const ROUNDING_NS: i64 = 2_000;
 pub(crate) struct Setpoint {
     times: Times,
     frames: usize,
+    without_marker: usize,
     landed: bool,
 }
 
@@ -31,7 +33,13 @@ impl std::fmt::Display for Setpoint {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let [p50, p99] = [0.5, 0.99].map(|part| self.times.at(part));
         let end = if self.landed { "landed" } else { "NOT LANDED" };
-        write!(f, "median {p50:.2} ms, p99 {p99:.2} ms of {} frames; {end}", self.frames)
+        write!(
+            f,
+            "median {p50:.2} ms, p99 {p99:.2} ms, most {:.2} ms of {} frames, {} more without a marker; {end}",
+            self.times.at(1.0),
+            self.frames,
+            self.without_marker
+        )
     }
 }
 
@@ -41,6 +49,8 @@ struct Journal {
     arrived: BTreeMap<i64, i64>,
     searched: BTreeMap<i64, i64>,
     sent: BTreeMap<i64, i64>,
+    /// Setpoints that tell of a frame again.
+    without_marker: usize,
 }
 
 impl Journal {
@@ -51,20 +61,30 @@ impl Journal {
 
     fn target(&mut self, target: &TargetEstimate) {
         if let Some(age_ms) = target.age_ms.filter(|_| target.velocity_ned_m_s.is_some()) {
-            self.sent.insert(target.stamp_ns - (age_ms * 1e6) as i64, target.stamp_ns);
+            let stamp_ns = target.stamp_ns - (age_ms * 1e6) as i64;
+            // A frame without a marker has a setpoint as well, and its target still tells of the last frame with one.
+            if self.sent.range(around(stamp_ns)).next().is_none() {
+                self.sent.insert(stamp_ns, target.stamp_ns);
+            } else {
+                self.without_marker += 1;
+            }
         }
     }
 
     /// From each frame's arrival to its setpoint, without the search.
     fn times_ms(&self) -> Vec<f64> {
         let time_ms = |(stamp_ns, sent_ns): (&i64, &i64)| {
-            let around = stamp_ns - ROUNDING_NS..=stamp_ns + ROUNDING_NS;
-            let (stamp_ns, arrived_ns) = self.arrived.range(around).next()?;
+            let (stamp_ns, arrived_ns) = self.arrived.range(around(*stamp_ns)).next()?;
             let searched_ns = self.searched.get(stamp_ns)?;
             Some((sent_ns - arrived_ns - searched_ns) as f64 * 1e-6)
         };
         self.sent.iter().filter_map(time_ms).collect()
     }
+}
+
+/// Where the stamp of a frame is found.
+fn around(stamp_ns: i64) -> RangeInclusive<i64> {
+    stamp_ns - ROUNDING_NS..=stamp_ns + ROUNDING_NS
 }
 
 /// Flies and measures.
@@ -96,5 +116,6 @@ pub(crate) async fn run(radio: Radio, seed: u64) -> anyhow::Result<Option<Setpoi
     let found = journal.times_ms();
     let frames = found.len();
     found.into_iter().for_each(|ms| times.add(ms));
-    Ok(Some(Setpoint { times, frames, landed }))
+    let without_marker = journal.without_marker;
+    Ok(Some(Setpoint { times, frames, without_marker, landed }))
 }
