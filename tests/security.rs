@@ -2,6 +2,8 @@
 
 #![expect(clippy::print_stdout, reason = "what was said helps when a test fails")]
 
+mod ports;
+
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -27,10 +29,6 @@ fn keys(arguments: &[&str]) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn free_port() -> anyhow::Result<u16> {
-    Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
-}
-
 /// A drone with a relay that asks for keys, and a controller that takes every command.
 struct Drone {
     relay: Child,
@@ -49,13 +47,8 @@ impl Drone {
         for role in ["detector", "operator", "observer"] {
             keys(&["issue", "--role", role, "-o", home])?;
         }
-        let meet = free_port()?;
-        let air = loop {
-            let port = free_port()?;
-            if std::net::TcpListener::bind(("127.0.0.1", port.saturating_add(1))).is_ok() {
-                break format!("127.0.0.1:{port}");
-            }
-        };
+        let ([meet], air, _) = ports::free()?;
+        let air = format!("127.0.0.1:{air}");
         let mut relay = Command::new(ALIGHT)
             .args(["relay", "--zenoh", "drone", "--listen", &air, "--keys", home])
             .args(["--meet", &meet.to_string()])

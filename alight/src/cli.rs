@@ -92,7 +92,7 @@ pub(crate) struct NetworkArgs {
     /// Where the drone, or the relay to it, is: HOST or HOST:PORT.
     #[arg(long, value_name = "ADDRESS", env = "ALIGHT_CONNECT")]
     pub(crate) connect: Option<String>,
-    /// Where the relay is found by others: HOST or HOST:PORT; port 7448 (and 7449 for frames) of all interfaces if it
+    /// Where the relay is found by others: HOST or HOST:PORT; port 7448 (7449 and 7450 for frames) of all interfaces if it
     /// is left out.
     #[arg(long, value_name = "ADDRESS", env = "ALIGHT_LISTEN")]
     pub(crate) listen: Option<String>,

@@ -298,7 +298,9 @@ fn look_at_way(findings: &mut Findings, network: &node::Network) {
         Some((host, port)) if !host.contains(':') => (host, port.parse().unwrap_or(0)),
         _ => (address.as_str(), node::network::AIR_PORT),
     };
-    for (what, port) in [("control", ports.1), ("frames", ports.1.saturating_add(1))] {
+    let over = if network.keys.is_some() { "TLS over TCP" } else { "TCP" };
+    for (further, what) in (0_u16..).zip(["control", "frames", "frames, when one is held up"]) {
+        let port = ports.1.saturating_add(further);
         let found = (ports.0, port).to_socket_addrs().ok().and_then(|mut all| all.next());
         let Some(found) = found else {
             findings.wrong(
@@ -309,7 +311,7 @@ fn look_at_way(findings: &mut Findings, network: &node::Network) {
             return;
         };
         match TcpStream::connect_timeout(&found, CONNECT_PATIENCE) {
-            Ok(_) => findings.good("way", format!("{found} answers ({what})")),
+            Ok(_) => findings.good("way", format!("{found} answers ({what}; {over})")),
             Err(cause) => findings.wrong(
                 "way",
                 format!("{found} ({what}) does not answer: {cause}"),

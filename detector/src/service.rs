@@ -30,6 +30,8 @@ const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
 
 /// How often a detector tells about itself, for those whose link was cut.
 const INFO_PERIOD: Duration = Duration::from_secs(1);
+/// A frame that is older than the newest by more than this belongs to a camera that began anew, in nanoseconds.
+const OVERTAKEN_NS: i64 = 5_000_000_000;
 /// Time for the answer to a last command to leave.
 const FAREWELL: Duration = Duration::from_millis(100);
 
@@ -154,6 +156,8 @@ struct Work {
     config: Config,
     converter: Converter,
     pictures: Pictures,
+    /// Clock and stamp of the newest frame from the air.
+    newest: Option<(String, i64)>,
     detector: Detector,
     pads: Vec<Pad>,
     tracker: Tracker,
@@ -191,6 +195,7 @@ impl Work {
             config: config.clone(),
             converter: Converter::default(),
             pictures: Pictures::default(),
+            newest: None,
             detector,
             pads,
             tracker: Tracker::new(config.tracking()),
@@ -217,12 +222,18 @@ impl Work {
     async fn search(&mut self, frame: &Frame) {
         self.take_change();
         let health = self.node.shared_health();
+        let is_jpeg = frame.header.format == PixelFormat::Jpeg;
+        if is_jpeg {
+            self.receipts.publish(&self.receipt(frame)).await;
+            if self.is_overtaken(&frame.header) {
+                return health.dropped("frames that a newer one has overtaken");
+            }
+        }
         health.count("frames");
         if frame.header.clock == clock_name() {
             health.latency("stamp to frame", age(&frame.header));
         }
-        if frame.header.format == PixelFormat::Jpeg {
-            self.receipts.publish(&self.receipt(frame)).await;
+        if is_jpeg {
             return self.search_parts(frame).await;
         }
         let bytes = frame.bytes();
@@ -246,6 +257,17 @@ impl Work {
             Err(_) => health.dropped("frames of an impossible size"),
         }
         self.converter = converter;
+    }
+
+    /// True for a frame that was held up on its way over the air while a newer one was searched already.
+    fn is_overtaken(&mut self, header: &FrameHeader) -> bool {
+        let newest = self.newest.get_or_insert_with(|| (header.clock.clone(), header.stamp_ns));
+        let is_later = newest.1.saturating_sub(header.stamp_ns);
+        if newest.0 == header.clock && (1..OVERTAKEN_NS).contains(&is_later) {
+            return true;
+        }
+        *newest = (header.clock.clone(), header.stamp_ns);
+        false
     }
 
     /// Searches a frame for the air link, part by part.

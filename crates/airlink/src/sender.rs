@@ -62,6 +62,7 @@ impl AirSender {
         let mut work = Work {
             camera: camera.to_owned(),
             offers: Arc::clone(&offers),
+            second_lane: jpegs.second_lane(node).await?,
             jpegs,
             receipts: node.subscriber(topic::RECEIVED, &[]).await?,
             detections,
@@ -117,6 +118,7 @@ struct Work {
     camera: String,
     offers: Arc<Offers>,
     jpegs: FramePublisher,
+    second_lane: FramePublisher,
     receipts: Subscriber<FrameReceipt>,
     detections: Option<Subscriber<Detections>>,
     health: Arc<HealthCounters>,
@@ -202,7 +204,8 @@ impl Work {
                 self.planner.learn_all(&plan, &header, bytes.len());
                 self.window.sent(now_ns(), header.sequence, bytes.len());
                 tracing::trace!(bytes = bytes.len(), ?plan, "A frame is sent over the air link");
-                self.jpegs.publish(&header, Loan::Private(bytes)).await;
+                let lane = if self.window.lane() == 0 { &self.jpegs } else { &self.second_lane };
+                lane.publish(&header, Loan::Private(bytes)).await;
             }
             Err(problem) => {
                 if self.health.failed("jpeg") {

@@ -2,10 +2,13 @@
 //! until they arrive.
 //!
 //! A frame is sent only while fewer than `window` others are under way, so nothing queues up on the way, whatever the
-//! link carries: frames that come meanwhile are left out at the camera. A frame that nobody has answered after a while
+//! link carries: frames that come meanwhile are left out at the camera. A frame that takes much longer than those before it
+//! is held up by a lost packet, and with it its connection, for at least 200 ms when the packet is lost again (TCP): the
+//! next frame overtakes it on the other of two connections, the lanes. A frame that nobody has answered after a while
 //! counts as lost; one that the first of several receivers has answered is waited for a little longer only, so that a
-//! receiver that is slow or gone does not hold up the others. The size grows while frames arrive sooner than aimed at, and shrinks while they arrive later; the
-//! mean of some frames decides, because a lost packet delays a single frame whatever its size.
+//! receiver that is slow or gone does not hold up the others. The size grows while frames arrive sooner than aimed at, and
+//! shrinks while they arrive later; the mean of some frames decides, because a lost packet delays a single frame whatever
+//! its size.
 //!
 //! Time is any clock's, in nanoseconds, given by the caller.
 
@@ -21,6 +24,14 @@ const SILENT_NS: i64 = 2_000_000_000;
 const REMEMBERED: usize = 16;
 /// Part of a new time in the mean.
 const WEIGHT: f64 = 1.0 / 6.0;
+/// Connections for frames.
+const LANES: usize = 2;
+/// Part of a new deviation in the mean deviation, and how many of those a frame may take longer than the mean before it is
+/// overtaken (RFC 6298, section 2).
+const DEVIATION_WEIGHT: f64 = 0.25;
+const DEVIATIONS: f64 = 4.0;
+/// A frame is never overtaken before this many times the time aimed at.
+const LEAST_PATIENCE: f64 = 1.5;
 /// The slower receivers of a frame are waited for so many times the time aimed at.
 const PATIENCE_WITH_OTHERS: f64 = 2.0;
 /// How fast the size grows with every frame that arrives in time.
@@ -41,6 +52,8 @@ pub struct Window {
     bounds: [f64; 2],
     size_bytes: f64,
     mean_ms: Option<f64>,
+    deviation_ms: f64,
+    lane: usize,
     losses_in_a_row: u32,
     sent: VecDeque<Sent>,
     receivers: Vec<Receiver>,
@@ -51,6 +64,7 @@ struct Sent {
     sequence: u64,
     at_ns: i64,
     bytes: usize,
+    lane: usize,
     /// Still waited for.
     is_under_way: bool,
     /// Somebody has it.
@@ -76,6 +90,8 @@ impl Window {
             // The middle of what is possible, in proportion: from there either end is as near.
             size_bytes: (bounds[0] * bounds[1]).sqrt(),
             mean_ms: None,
+            deviation_ms: 0.0,
+            lane: 0,
             losses_in_a_row: 0,
             sent: VecDeque::new(),
             receivers: Vec::new(),
@@ -113,8 +129,39 @@ impl Window {
             self.losses_in_a_row += 1;
             self.scale(LOSS_SHRINK);
         }
-        let under_way = self.sent.iter().filter(|sent| sent.is_under_way).count();
-        (under_way < self.limit, lost)
+        (self.has_room(now_ns), lost)
+    }
+
+    /// Looks for a lane on which nothing is late, the present one first.
+    fn has_room(&mut self, now_ns: i64) -> bool {
+        let late_ns = self.late_ns();
+        let mut under_way = 0;
+        let mut is_held_up = [false; LANES];
+        for sent in self.sent.iter().filter(|sent| sent.is_under_way) {
+            if !sent.is_answered && now_ns - sent.at_ns >= late_ns {
+                is_held_up[sent.lane % LANES] = true;
+            } else {
+                under_way += 1;
+            }
+        }
+        let lanes = (0..LANES).map(|further| (self.lane + further) % LANES);
+        match lanes.into_iter().find(|lane| !is_held_up[*lane]) {
+            Some(lane) => self.lane = lane,
+            None => return false,
+        }
+        under_way < self.limit
+    }
+
+    /// After this time without an answer a frame is overtaken.
+    fn late_ns(&self) -> i64 {
+        let Some(mean_ms) = self.mean_ms else { return self.timeout_ns };
+        let late_ms = mean_ms + DEVIATIONS * self.deviation_ms;
+        ((late_ms.max(LEAST_PATIENCE * self.aim_ms) * 1e6) as i64).min(self.timeout_ns)
+    }
+
+    /// The connection for the next frame, 0 or 1.
+    pub fn lane(&self) -> usize {
+        self.lane
     }
 
     /// A frame was sent.
@@ -126,6 +173,7 @@ impl Window {
             sequence,
             at_ns: now_ns,
             bytes,
+            lane: self.lane,
             is_under_way: true,
             is_answered: false,
         });
@@ -169,8 +217,20 @@ impl Window {
     }
 
     fn adapt(&mut self, took_ms: f64, bytes: usize) {
-        let mean_ms = self.mean_ms.unwrap_or(took_ms);
-        let mean_ms = mean_ms + WEIGHT * (took_ms - mean_ms);
+        // What a lost packet costs is no measure of the link; a link that has become slow is followed in some steps.
+        let most_ms = self.late_ns() as f64 * 1e-6;
+        let measured_ms = took_ms.min(most_ms);
+        let mean_ms = match self.mean_ms {
+            Some(mean_ms) => {
+                let deviation_ms = (measured_ms - mean_ms).abs();
+                self.deviation_ms += DEVIATION_WEIGHT * (deviation_ms - self.deviation_ms);
+                mean_ms + WEIGHT * (measured_ms - mean_ms)
+            }
+            None => {
+                self.deviation_ms = measured_ms / 2.0;
+                measured_ms
+            }
+        };
         self.mean_ms = Some(mean_ms);
         if mean_ms > self.aim_ms {
             // A mean that is high for what was is not held against what is.
@@ -248,15 +308,40 @@ mod tests {
         assert!(!window.is_open(249 * MS).0);
         assert_eq!(window.received(30 * MS, "ground", 1), Some(30.0));
         assert!(window.is_open(30 * MS).0);
+        // Both lanes are held up.
         window.sent(40 * MS, 2, 1000);
+        assert!(!window.is_open(129 * MS).0);
+        assert_eq!((window.is_open(130 * MS), window.lane()), ((true, 0), 1));
+        window.sent(130 * MS, 3, 1000);
         assert_eq!(window.is_open(289 * MS), (false, 0));
         let before = window.size_bytes();
-        assert_eq!(window.is_open(290 * MS), (true, 1));
+        assert_eq!((window.is_open(290 * MS), window.lane()), ((true, 1), 0));
         assert!(window.size_bytes() < before);
         // The next loss takes longer to believe.
-        window.sent(300 * MS, 3, 1000);
-        assert!(!window.is_open(700 * MS).0);
-        assert_eq!(window.is_open(800 * MS), (true, 1));
+        window.sent(300 * MS, 4, 1000);
+        assert!(!window.is_open(629 * MS).0);
+        assert_eq!(window.is_open(630 * MS), (true, 1));
+    }
+
+    #[test]
+    fn a_frame_that_is_held_up_is_overtaken_on_the_other_lane() {
+        let mut window = window();
+        let mut now = 0;
+        for sequence in 0..20 {
+            window.sent(now, sequence, 1000);
+            window.received(now + (20 + sequence as i64 % 3) * MS, "ground", sequence);
+            now += 66 * MS;
+        }
+        window.sent(now, 20, 1000);
+        assert!(!window.is_open(now + 74 * MS).0);
+        assert_eq!((window.is_open(now + 75 * MS), window.lane()), ((true, 0), 1));
+        window.sent(now + 132 * MS, 21, 1000);
+        window.received(now + 152 * MS, "ground", 21);
+        // It stays there, as the first lane has lost its pace; what comes late makes the frames little smaller.
+        let before = window.size_bytes();
+        assert_eq!(window.received(now + 240 * MS, "ground", 20), Some(240.0));
+        assert_eq!((window.is_open(now + 240 * MS), window.lane()), ((true, 0), 1));
+        assert!(window.size_bytes() as f64 > 0.9 * before as f64);
     }
 
     #[test]

@@ -27,6 +27,10 @@ use crate::topics::report_refused;
 /// because every subscriber keeps the whole pool mapped and locked.
 const FRAMES_IN_POOL: usize = 4;
 
+/// Over the air a priority is a connection (`zenoh-config/README.md`): frames have two.
+const FIRST_LANE: Priority = Priority::DataLow;
+const SECOND_LANE: Priority = Priority::Background;
+
 /// Publishes frames on one key.
 pub struct FramePublisher {
     publisher: zenoh::pubsub::Publisher<'static>,
@@ -68,14 +72,7 @@ impl Node {
     ) -> anyhow::Result<FramePublisher> {
         let key = topic.key(names);
         debug_assert_eq!(topic.delivery(), Delivery::Newest);
-        let publisher = self
-            .session
-            .declare_publisher(key.clone())
-            .priority(Priority::DataLow)
-            // Drop would lose large frames almost entirely on a lossy link; this sheds whole frames.
-            .congestion_control(CongestionControl::BlockFirst)
-            .await
-            .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
+        let publisher = self.declare_frames(key, FIRST_LANE).await?;
         if largest_frame_bytes == 0 {
             return Ok(FramePublisher { publisher, pool: None, health: self.shared_health() });
         }
@@ -88,6 +85,20 @@ impl Node {
             }
         };
         Ok(FramePublisher { publisher, pool, health: self.shared_health() })
+    }
+
+    async fn declare_frames(
+        &self,
+        key: String,
+        lane: Priority,
+    ) -> anyhow::Result<zenoh::pubsub::Publisher<'static>> {
+        self.session
+            .declare_publisher(key.clone())
+            .priority(lane)
+            // Drop would lose large frames almost entirely on a lossy link; this sheds whole frames.
+            .congestion_control(CongestionControl::BlockFirst)
+            .await
+            .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))
     }
 
     /// A subscriber to the frames of the keys that match.
@@ -143,6 +154,17 @@ impl FramePublisher {
                 }
             }
         }
+    }
+
+    /// The same key on the second connection that frames have over the air: what is published there does not wait
+    /// behind a frame that the first one has not delivered yet. It has no shared memory.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub async fn second_lane(&self, node: &Node) -> anyhow::Result<Self> {
+        let key = self.publisher.key_expr().as_str().to_owned();
+        let publisher = node.declare_frames(key, SECOND_LANE).await?;
+        Ok(Self { publisher, pool: None, health: Arc::clone(&self.health) })
     }
 
     /// True while somebody subscribes: what is costly to make is made only then.

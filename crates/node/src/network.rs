@@ -19,9 +19,11 @@ pub const RELAY_CONFIG: &str = include_str!("../../../zenoh-config/relay.json5")
 /// What `keys` lays over them: TLS and access control.
 pub const SECURED_CONFIG: &str = include_str!("../../../zenoh-config/secured.json5");
 
-/// The port of the air link for control; that for frames is the next one.
+/// The port of the air link for control; those for frames are the next two.
 pub const AIR_PORT: u16 = 7448;
 
+/// Two more ports follow that of an address.
+const HIGHEST_PORT: u16 = u16::MAX - 2;
 /// What stands in a file where the other side's address belongs.
 const ADDRESS_PLACEHOLDER: &str = "DRONE";
 /// The loopback interface, which no message leaves.
@@ -216,7 +218,7 @@ impl Address {
         };
         let is_host = !host.is_empty()
             && host.chars().all(|c| c.is_ascii_alphanumeric() || ".-_[]:%".contains(c));
-        if !is_host || port == Some(0) || port == Some(u16::MAX) {
+        if !is_host || port.is_some_and(|port| port == 0 || port > HIGHEST_PORT) {
             bail!(refused());
         }
         let host = if host.contains(':') && !host.starts_with('[') {
@@ -308,16 +310,20 @@ mod tests {
     }
 
     #[test]
-    fn an_address_goes_into_both_connections() {
+    fn an_address_goes_into_all_connections() {
         let ends = |connect: &str| -> Vec<String> {
             let network = Network { connect: Some(connect.into()), ..built_in("ground") };
             endpoints(&configured(&network).unwrap(), "connect").map(str::to_owned).collect()
         };
         assert_eq!(
             ends("10.0.0.1"),
-            ["tcp/10.0.0.1:7448?prio=1-4#dscp=0xb8", "tcp/10.0.0.1:7449?prio=5-7"]
+            [
+                "tcp/10.0.0.1:7448?prio=1-4#dscp=0xb8",
+                "tcp/10.0.0.1:7449?prio=5-6",
+                "tcp/10.0.0.1:7450?prio=7-7"
+            ]
         );
-        assert_eq!(ends("uav.local:9000")[1], "tcp/uav.local:9001?prio=5-7");
+        assert_eq!(ends("uav.local:9000")[1], "tcp/uav.local:9001?prio=5-6");
         assert_eq!(ends("fe80::1")[0], "tcp/[fe80::1]:7448?prio=1-4#dscp=0xb8");
         let network = Network { listen: Some("10.0.0.7:9000".into()), ..built_in("drone") };
         let listens: Vec<_> =
@@ -327,7 +333,8 @@ mod tests {
             [
                 "tcp/127.0.0.1:0",
                 "tcp/10.0.0.7:9000?prio=1-4#dscp=0xb8",
-                "tcp/10.0.0.7:9001?prio=5-7#so_sndbuf=32768"
+                "tcp/10.0.0.7:9001?prio=5-6#so_sndbuf=32768",
+                "tcp/10.0.0.7:9002?prio=7-7#so_sndbuf=32768"
             ]
         );
     }

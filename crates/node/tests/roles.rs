@@ -1,5 +1,8 @@
 //! Two hosts: the drone's own processes, its relay, and the ground.
 
+#[path = "../../../tests/ports/mod.rs"]
+mod ports;
+
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -19,17 +22,8 @@ struct Site {
 
 impl Site {
     fn new() -> anyhow::Result<Self> {
-        let free = || -> anyhow::Result<u16> {
-            Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
-        };
-        // The air link has two neighbouring ports.
-        let air = loop {
-            let port = free()?;
-            if port < u16::MAX && std::net::TcpListener::bind(("127.0.0.1", port + 1)).is_ok() {
-                break port;
-            }
-        };
-        Ok(Self { meet: free()?, air: format!("127.0.0.1:{air}") })
+        let ([meet], air, _) = ports::free()?;
+        Ok(Self { meet, air: format!("127.0.0.1:{air}") })
     }
 
     fn network(&self, role: &str) -> Network {
