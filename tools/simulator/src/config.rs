@@ -127,6 +127,10 @@ pub struct AutopilotSettings {
     pub land_speed_cm_s: f64,
     /// Errors of its estimator, as a multiple of the usual ones.
     pub errors: f64,
+    /// Deviation of the believed velocity's error as a wrong tilt makes it, in m/s.
+    pub velocity_wander_m_s: f64,
+    /// Its time constant, in seconds.
+    pub velocity_wander_s: f64,
     /// Speed of the believed position's drift, in m/s.
     pub gnss_drift_m_s: f64,
     /// Direction of that drift, in degrees.
@@ -296,6 +300,8 @@ impl Settings for Config {
 impl AutopilotSettings {
     fn check(&self, check: &mut Check<'_>) {
         check.range("autopilot.errors", self.errors, 0.0..=10.0);
+        check.range("autopilot.velocity_wander_m_s", self.velocity_wander_m_s, 0.0..=2.0);
+        check.range("autopilot.velocity_wander_s", self.velocity_wander_s, 0.5..=60.0);
         check.range("autopilot.gnss_drift_m_s", self.gnss_drift_m_s, 0.0..=2.0);
         check.range("autopilot.gnss_drift_to_deg", self.gnss_drift_to_deg, -360.0..=360.0);
         check.range("autopilot.gnss_jump_m", self.gnss_jump_m, -100.0..=100.0);
@@ -484,6 +490,8 @@ impl AutopilotSettings {
             ],
             estimate: EstimateConfig {
                 gnss_drift_m_s: [self.gnss_drift_m_s * north, self.gnss_drift_m_s * east],
+                wander_m_s: self.velocity_wander_m_s,
+                wander_s: self.velocity_wander_s,
                 gnss_jump: (self.gnss_jump_m != 0.0).then_some(jump),
                 ..EstimateConfig::default().times(self.errors)
             },

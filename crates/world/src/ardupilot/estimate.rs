@@ -4,7 +4,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::drift::{Drift, normal, random_stream};
 use crate::laws::{lag, wrap};
-use crate::vehicle::VehicleTruth;
+use crate::vehicle::{GRAVITY_M_S2, VehicleTruth};
 
 /// Sizes of the errors; the defaults are those seen in the logs of a real autopilot in simulation.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,6 +29,11 @@ pub struct EstimateConfig {
     pub lean_drift_rad: f64,
     /// Deviation of the constant error of the heading, in radians.
     pub heading_bias_rad: f64,
+    /// Deviation of the horizontal velocity's error as a filter with a wrong tilt makes it, in m/s per axis; 0 is none. The tilt
+    /// wanders, its part of gravity adds up to a velocity, and that to a position, which GNSS holds.
+    pub wander_m_s: f64,
+    /// Time constants of that tilt and of that velocity, in seconds.
+    pub wander_s: f64,
     /// Velocity with which the believed position moves away from the true one from the world's begin on, in m/s.
     pub gnss_drift_m_s: [f64; 2],
     /// By how much the believed position jumps, in metres, and when, in seconds after the world's begin.
@@ -48,6 +53,8 @@ impl Default for EstimateConfig {
             trim_rad: 0.13f64.to_radians(),
             lean_drift_rad: 0.05f64.to_radians(),
             heading_bias_rad: 0.7f64.to_radians(),
+            wander_m_s: 0.0,
+            wander_s: 4.0,
             gnss_drift_m_s: [0.0; 2],
             gnss_jump: None,
         }
@@ -68,12 +75,14 @@ impl EstimateConfig {
             trim_rad: 0.0,
             lean_drift_rad: 0.0,
             heading_bias_rad: 0.0,
+            wander_m_s: 0.0,
+            wander_s: 4.0,
             gnss_drift_m_s: [0.0; 2],
             gnss_jump: None,
         }
     }
 
-    /// The same with all errors that the logs show so many times as large; drift and jumps of GNSS stay.
+    /// The same with all errors that the logs show so many times as large; wander, drift and jumps of GNSS stay.
     #[must_use]
     pub fn times(&self, factor: f64) -> Self {
         Self {
@@ -118,6 +127,34 @@ pub(super) struct Estimate {
     pub(super) reset: Option<[f64; 2]>,
 }
 
+/// One axis of a filter whose tilt wanders.
+#[derive(Clone, Debug)]
+struct Wander {
+    /// The tilt's part of gravity, in m/s^2.
+    pull: Drift,
+    velocity: f64,
+    position: f64,
+}
+
+/// Time constant with which GNSS holds the believed position, in seconds.
+const GNSS_HOLDS_S: f64 = 0.6;
+
+impl Wander {
+    fn new(config: &EstimateConfig, random: &mut ChaCha8Rng) -> Self {
+        // Of a drift behind a lag of the same time constant half of the variance is left.
+        let deviation = config.wander_m_s * std::f64::consts::SQRT_2 / config.wander_s;
+        let velocity = config.wander_m_s * normal(random);
+        let position = GNSS_HOLDS_S * velocity;
+        Self { pull: Drift::new(deviation, config.wander_s, random), velocity, position }
+    }
+
+    fn step(&mut self, dt_s: f64, time_constant_s: f64, random: &mut ChaCha8Rng) {
+        let pull = self.pull.step(dt_s, random);
+        self.velocity += (pull - self.velocity / time_constant_s) * dt_s;
+        self.position += (self.velocity - self.position / GNSS_HOLDS_S) * dt_s;
+    }
+}
+
 /// Makes the errors.
 #[derive(Clone, Debug)]
 pub(super) struct Estimator {
@@ -130,6 +167,8 @@ pub(super) struct Estimator {
     lean: [Drift; 2],
     yaw_error: f64,
     height_error: f64,
+    wander: [Wander; 2],
+    wandering: ChaCha8Rng,
     /// Time since the world's begin, in seconds.
     begun_s: Option<f64>,
     gnss: [f64; 2],
@@ -146,7 +185,11 @@ impl Estimator {
         let trim = [(); 2].map(|()| config.trim_rad * normal(draw));
         let lean = [(); 2].map(|()| Drift::new(config.lean_drift_rad, 5.0, draw));
         let yaw_error = config.heading_bias_rad * normal(draw);
+        let mut wandering = random_stream(seed, 10);
+        let wander = [(); 2].map(|()| Wander::new(&config, &mut wandering));
         Self {
+            wander,
+            wandering,
             config,
             random,
             velocity_bias,
@@ -193,21 +236,31 @@ impl Estimator {
         let position = self.position.each_mut().map(|drift| drift.step(dt_s, random));
         let velocity = self.velocity.each_mut().map(|drift| drift.step(dt_s, random));
         let lean = self.lean.each_mut().map(|drift| drift.step(dt_s, random));
+        for wander in &mut self.wander {
+            wander.step(dt_s, self.config.wander_s, &mut self.wandering);
+        }
+        let [north, east] = &self.wander;
         let (p, v) = (truth.position, truth.velocity);
         let barometer_error = p.z() * (self.config.height_scale - 1.0);
         self.height_error +=
             (barometer_error - self.height_error) * lag(dt_s, self.config.height_lag_s);
         let (roll, pitch, yaw) = truth.ned_from_body.euler();
-        let (roll_error, pitch_error) = (self.trim[0] + lean[0], self.trim[1] + lean[1]);
+        // Who believes to lean less to the right than is true believes to be pulled to the left.
+        let (sin, cos) = yaw.sin_cos();
+        let [north_m_s2, east_m_s2] = [north.pull.value(), east.pull.value()];
+        let ahead_rad = (north_m_s2 * cos + east_m_s2 * sin) / GRAVITY_M_S2;
+        let aside_rad = (east_m_s2 * cos - north_m_s2 * sin) / GRAVITY_M_S2;
+        let roll_error = self.trim[0] + lean[0] + aside_rad;
+        let pitch_error = self.trim[1] + lean[1] - ahead_rad;
         Estimate {
             position: [
-                p.x() + position[0] + self.gnss[0],
-                p.y() + position[1] + self.gnss[1],
+                p.x() + position[0] + self.gnss[0] + north.position,
+                p.y() + position[1] + self.gnss[1] + east.position,
                 p.z() + self.height_error + position[2],
             ],
             velocity: [
-                v.x() + self.velocity_bias[0] + velocity[0] + drifts[0],
-                v.y() + self.velocity_bias[1] + velocity[1] + drifts[1],
+                v.x() + self.velocity_bias[0] + velocity[0] + drifts[0] + north.velocity,
+                v.y() + self.velocity_bias[1] + velocity[1] + drifts[1] + east.velocity,
                 v.z() * self.config.climb_scale,
             ],
             acceleration_z: truth.acceleration.z(),
@@ -220,5 +273,29 @@ impl Estimator {
             yaw_error: self.yaw_error,
             reset,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wandering_velocity_errs_as_much_as_asked_and_its_position_is_held() {
+        let config = EstimateConfig { wander_m_s: 0.3, ..EstimateConfig::perfect() };
+        let (mut square, mut farthest_m, mut tilt, steps) = (0.0, 0.0f64, 0.0, 100_000);
+        let mut random = random_stream(3, 10);
+        let mut wander = Wander::new(&config, &mut random);
+        for _ in 0..steps {
+            wander.step(0.02, config.wander_s, &mut random);
+            square += wander.velocity.powi(2);
+            tilt += (wander.pull.value() / GRAVITY_M_S2).powi(2);
+            farthest_m = farthest_m.max(wander.position.abs());
+        }
+        let deviation_m_s = (square / f64::from(steps)).sqrt();
+        assert!((deviation_m_s - 0.3).abs() < 0.05, "{deviation_m_s}");
+        assert!(farthest_m < 1.0, "{farthest_m}");
+        let tilt_rad = (tilt / f64::from(steps)).sqrt();
+        assert!((tilt_rad - 0.011).abs() < 0.002, "{tilt_rad}");
     }
 }

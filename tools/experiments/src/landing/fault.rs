@@ -24,7 +24,7 @@ pub struct Change {
 /// draws.
 type Row = (&'static str, &'static str, fn(f64) -> Change);
 
-const TABLE: [Row; 22] = [
+const TABLE: [Row; 23] = [
     ("none", "nothing goes wrong", |_| Change::default()),
     ("lost-below-2m", "no frame is taken from 2 m on", |_| {
         simulator(&["camera.outage_below_m=2", "camera.outage_below_for_s=3600"])
@@ -73,6 +73,11 @@ const TABLE: [Row; 22] = [
     ("estimates-3x", "the autopilot's estimates err three times as much as usual", |_| {
         simulator(&["autopilot.errors=3"])
     }),
+    (
+        "velocity-wander",
+        "the autopilot's velocity errs by 0.3 m/s (a deviation) for seconds",
+        |_| simulator(&["autopilot.velocity_wander_m_s=0.3"]),
+    ),
     ("gust", "a gust of 5 m/s in 3 s, at any time", |part| {
         let at = format!("wind.gust_at_s={:.3}", 1.0 + 8.0 * part);
         simulator(&["wind.gust_m_s=5", "wind.gust_length_s=3", &at])
