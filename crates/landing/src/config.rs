@@ -110,6 +110,9 @@ pub struct EstimatorConfig {
     pub drift_m_s: f64,
     /// What that drift changes by, in m/s per square root of a second (0 to 1).
     pub drift_change: f64,
+    /// What it changes by at most, where detections show that the autopilot's position wanders, in m/s per square root of a
+    /// second; tilts then change faster in the same proportion. Not more than `drift_change` adjusts nothing (0 to 1).
+    pub most_drift_change: f64,
     /// Drift of the autopilot's height at first, in m/s (0 to 1).
     pub height_drift_m_s: f64,
     /// What that drift changes by, in m/s per square root of a second (0 to 1).
@@ -154,6 +157,7 @@ impl Default for EstimatorConfig {
             way_noise_m: 0.01,
             drift_m_s: 0.05,
             drift_change: 0.01,
+            most_drift_change: 0.15,
             height_drift_m_s: 0.1,
             height_drift_change: 0.05,
             pad_speed_m_s: 0.0,
@@ -286,7 +290,7 @@ impl Default for PhaseConfig {
             lost_target_s: 1.0,
             stale_vehicle_s: 0.5,
             search_timeout_s: 60.0,
-            search_delay_s: 1.0,
+            search_delay_s: 0.5,
             search_height_m: 5.0,
             search_climb_m_s: 1.0,
             search_speed_m_s: 1.0,
@@ -414,6 +418,7 @@ impl EstimatorConfig {
         check("estimator.way_noise_m", self.way_noise_m, 0.0, 1.0)?;
         check("estimator.drift_m_s", self.drift_m_s, 0.0, 1.0)?;
         check("estimator.drift_change", self.drift_change, 0.0, 1.0)?;
+        check("estimator.most_drift_change", self.most_drift_change, 0.0, 1.0)?;
         check("estimator.height_drift_m_s", self.height_drift_m_s, 0.0, 1.0)?;
         check("estimator.height_drift_change", self.height_drift_change, 0.0, 1.0)?;
         check("estimator.pad_speed_m_s", self.pad_speed_m_s, 0.0, 10.0)?;

@@ -17,6 +17,12 @@
 //! Estimation with Applications to Tracking and Navigation, sections 5.2 and 10.3). Its covariance is the detector's, or one
 //! from pixel noise, size and range, plus what attitude and position are known to.
 //!
+//! How fast drift and tilt change is adjusted to what is seen (Bar-Shalom, Li, Kirubarajan, section 11.2.1): while the normalised
+//! innovations squared stay larger than their covariance allows, the process noise grows, within limits, and it shrinks again
+//! when they do not. An autopilot whose velocity errs by decimetres a second for seconds leans wrongly too, and its position
+//! wanders; one that knows its motion is believed as before. A detection beyond the gate adjusts nothing, so a lie opens no
+//! gate to itself.
+//!
 //! A detection is fused at its own stamp: the last [`MEMORY`] detections are kept with the state after each, and one that comes late is put
 //! between them and those after it are fused again. A detection whose normalised innovation squared exceeds the gate is an
 //! outlier.
@@ -62,6 +68,11 @@ const HEAVE_S: f64 = 0.8;
 /// Two solutions of a flat marker's pose whose normals are equally upright within this angle are not told apart, in radians.
 const UNDECIDED_RAD: f64 = 0.05;
 
+/// What the logarithm of the process noise changes by for a normalised innovation squared that is a degree of freedom too
+/// large, of each; and how much larger than its mean of one it may be.
+const UNREST_GAIN: f64 = 0.08;
+const UNREST_SLACK: f64 = 0.4;
+
 /// A rival detection's distance from the rival before it, beside what both may be wrong by, in metres.
 const RIVAL_GATE_M: f64 = 0.15;
 
@@ -103,6 +114,8 @@ struct Fused {
 struct Belief {
     state: State,
     covariance: Covariance,
+    /// Logarithm of what drift and tilt change by, over what is configured.
+    unrest: f64,
 }
 
 /// A detection joined with the vehicle's motion at its stamp.
@@ -496,7 +509,7 @@ impl Belief {
         for (i, deviation) in deviations.into_iter().enumerate() {
             covariance[(i, i)] = deviation * deviation;
         }
-        Self { state, covariance }
+        Self { state, covariance, unrest: 0.0 }
     }
 
     fn place(&self) -> Vector3<f64> {
@@ -523,7 +536,8 @@ impl Belief {
                 p[(j, Q + i)] += dt_s * p[(j, U + i)];
             }
         }
-        let level = config.drift_change.hypot(config.pad_acceleration);
+        let unrest = self.unrest.exp();
+        let level = (config.drift_change * unrest).hypot(config.pad_acceleration);
         let upright = config
             .height_drift_change
             .hypot(config.pad_acceleration)
@@ -536,7 +550,7 @@ impl Belief {
             p[(U + i, U + i)] += u * dt_s;
         }
         for i in 0..3 {
-            p[(TILT + i, TILT + i)] += config.tilt_change.powi(2) * dt_s;
+            p[(TILT + i, TILT + i)] += (config.tilt_change * unrest).powi(2) * dt_s;
         }
         p[(OFFSET, OFFSET)] += (0.02 * config.time_offset_s).powi(2) * dt_s;
     }
@@ -573,12 +587,30 @@ impl Belief {
         let ph = self.covariance * h.transpose();
         let Some(inverse) = (h * ph + sight.noise).try_inverse() else { return };
         let gain = ph * inverse;
-        self.state += gain * self.innovation(sight);
+        let innovation = self.innovation(sight);
+        self.stir(config, innovation, h * ph + sight.noise);
+        self.state += gain * innovation;
         let less = gain * ph.transpose();
         let p = self.covariance - (less + less.transpose()) * 0.5;
         self.covariance = (p + p.transpose()) * 0.5;
         let most_s = 3.0 * config.time_offset_s;
         self.state[OFFSET] = self.state[OFFSET].clamp(-most_s, most_s);
+    }
+
+    /// Adjusts the process noise to the horizontal part of an innovation; heights wander by their own rules.
+    fn stir(
+        &mut self,
+        config: &EstimatorConfig,
+        innovation: Vector3<f64>,
+        covariance: Matrix3<f64>,
+    ) {
+        let level = innovation.xy();
+        let Some(inverse) = covariance.fixed_view::<2, 2>(0, 0).into_owned().try_inverse() else {
+            return;
+        };
+        let excess = 0.5 * level.dot(&(inverse * level)) - 1.0 - UNREST_SLACK;
+        let most = (config.most_drift_change / config.drift_change.max(1e-6)).max(1.0).ln();
+        self.unrest = (self.unrest + UNREST_GAIN * excess).clamp(0.0, most);
     }
 }
 
@@ -854,6 +886,34 @@ mod tests {
         assert!(scene.error().horizontal_norm() < 0.01, "{:?}", scene.error());
         // The autopilot's frame moves with its drift, and with it the pad stands still in the world.
         assert!((scene.estimate().velocity - scene.drift).horizontal_norm() < 0.015);
+    }
+
+    #[test]
+    fn an_autopilot_whose_position_wanders_is_believed_less_and_a_steady_one_as_before() {
+        let fly = |most_drift_change: f64, wander_m_s: f64| {
+            let config = EstimatorConfig { most_drift_change, ..EstimatorConfig::default() };
+            let mut scene = Scene::new(config, 12);
+            let home = scene.pad;
+            let (mut refused, mut worst_m) = (0, 0.0f64);
+            for i in 0..300 {
+                // The reported position moves away and comes back, and the reported attitude leans as that velocity changes.
+                let (sin, cos) = (1.2 * scene.seconds).sin_cos();
+                scene.pad = home + Vector::new(wander_m_s / 1.2 * sin, 0.0, 0.0);
+                scene.tilt_error = [0.0, 0.1 * wander_m_s * cos];
+                scene.pass(0.07);
+                refused += u32::from(scene.see(0.03).is_err());
+                if i > 30 {
+                    worst_m = worst_m.max(scene.error().horizontal_norm());
+                }
+            }
+            let unrest = scene.estimator.past.back().unwrap().belief.unrest;
+            (refused, worst_m, unrest)
+        };
+        let (trusting, adjusted) = (fly(0.0, 0.15), fly(0.15, 0.15));
+        assert!(trusting.0 > 40 && adjusted.0 < 25, "refused of 300: {trusting:?}, {adjusted:?}");
+        assert!(trusting.1 > 0.3 && adjusted.1 < 0.2, "{trusting:?}, {adjusted:?}");
+        let steady = fly(0.15, 0.0);
+        assert!(steady.0 == 0 && steady.2 < 0.5, "{steady:?}");
     }
 
     #[test]

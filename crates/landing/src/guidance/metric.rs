@@ -8,8 +8,8 @@
 //! the time constant times the wanted acceleration. Wind that pushes the vehicle off its path is so seen and countered at
 //! once, and what stays is summed up in the path's velocity: there is nothing else that could wind up.
 //!
-//! The reported velocity is biased by 2 to 3 cm/s; the bias is what an observer finds left over between it and
-//! the way really covered.
+//! The reported velocity is biased, by 2 to 3 cm/s where all is well and by decimetres a second where the autopilot's filter
+//! leans wrongly; the bias is what an observer finds left over between it and the way that the reported position covers.
 //!
 //! Vertically: a funnel. Inside it the vehicle descends, as fast as it can still brake, fastest on the axis and not at all
 //! at the edge. A vehicle that leans into the wind looks past the target; above `view_height_m` it stays so far upwind
@@ -29,7 +29,7 @@
 //! The end: below `blind_height_m` the vehicle goes on down on the estimate when the marker leaves the view. LAND follows no target
 //! and in gusts drifts by a decimetre in a second, so it takes over only a hand's breadth above the ground.
 
-use geometry::{Body, Ned, Vector};
+use geometry::{Body, Ned, Point, Vector};
 use serde::Deserialize;
 
 use crate::config::{ConfigError, check};
@@ -127,7 +127,7 @@ impl Default for MetricConfig {
             fresh_target_s: 0.5,
             stale_target_s: 0.7,
             silence_s: 2.0,
-            land_height_m: 0.1,
+            land_height_m: 0.05,
             standing_height_m: 0.0,
             settle_s: 5.0,
             blind_error_m: 0.15,
@@ -137,8 +137,8 @@ impl Default for MetricConfig {
             view_height_m: 1.3,
             view_margin_m: 0.11,
             view_margin_rad: 0.07,
-            drift_time_s: 1.5,
-            max_drift_m_s: 0.1,
+            drift_time_s: 0.4,
+            max_drift_m_s: 0.8,
             max_pad_m_s: 5.0,
             turn_rad_s: 0.0,
             pad_heading_rad: 0.0,
@@ -207,6 +207,13 @@ const LOW_HYSTERESIS_M: f64 = 0.2;
 /// Difference between the velocity of the path asked for and the vehicle's that a gust does not explain, in m/s.
 const STEADY_M_S: f64 = 0.3;
 
+/// Lateral speed over the pad at which a low vehicle no longer descends, in m/s: at the ground, what is added per metre of
+/// height, and, after so many seconds of waiting, per second.
+const TOUCH_M_S: f64 = 0.2;
+const TOUCH_PER_HEIGHT: f64 = 0.4;
+const TOUCH_WAIT_S: f64 = 1.0;
+const TOUCH_PATIENCE_M_S2: f64 = 0.1;
+
 /// A touch on a heaving pad is not slower than this, in m/s.
 const SLOWEST_TOUCH_M_S: f64 = 0.3;
 
@@ -261,9 +268,9 @@ struct Memory {
     /// Stamp and velocity of the newest state, and the acceleration up to it.
     moved: (Timestamp, Vector<Ned>),
     acceleration: Vector<Ned>,
-    /// The lateral error expected now, in metres.
-    expected: Vector<Ned>,
-    /// Real minus reported velocity, in m/s.
+    /// Where the vehicle is expected to be now, in metres.
+    expected: Point<Ned>,
+    /// What the reported position moves with beside the reported velocity, in m/s.
     bias: Vector<Ned>,
     /// How far ahead of the vehicle the body's down axis points, as a part of the height.
     lean: Vector<Ned>,
@@ -327,6 +334,7 @@ impl Metric {
         let lies_still = !situation.pad_moves && target.velocity.norm() <= STILL_M_S;
         if height_m <= self.config.land_height_m
             && outside < 1.0
+            && self.hurry(situation, &target) < 1.0
             && lies_still
             && self.is_steady(situation)
         {
@@ -361,9 +369,9 @@ impl Metric {
     /// The velocity wanted now, and what it does.
     pub fn velocity(&mut self, situation: &Situation<'_>) -> (Vector<Ned>, Reason) {
         let Some(target) = situation.target else { return (Vector::zero(), Reason::Searching) };
-        let before = self.memory.unwrap_or_else(|| self.begin(situation, &target));
+        let before = self.memory.unwrap_or_else(|| Self::begin(situation));
         let step_s = situation.now.seconds_since(before.stamp).clamp(0.0, LONGEST_STEP_S);
-        let mut memory = self.observed(before, situation, &target, step_s);
+        let mut memory = self.observed(before, situation, step_s);
         self.memory = Some(memory);
         let lateral = self.lateral(&memory, situation, &target);
         let (descent_m_s, why) = self.descent(situation, &target);
@@ -400,7 +408,7 @@ impl Metric {
         (error * TURN_GAIN).clamp(-self.config.turn_rad_s, self.config.turn_rad_s)
     }
 
-    fn begin(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Memory {
+    fn begin(situation: &Situation<'_>) -> Memory {
         let velocity = situation.vehicle.velocity;
         let level = Vector::new(velocity.x(), velocity.y(), 0.0);
         Memory {
@@ -409,20 +417,14 @@ impl Metric {
             moved: (situation.vehicle.stamp, velocity),
             acceleration: Vector::zero(),
             path: Path::new(level),
-            expected: self.way(situation, target),
+            expected: situation.vehicle.position,
             bias: Vector::zero(),
             lean: lean(situation),
         }
     }
 
     /// The memory after the time that has passed: the path follows the setpoint, the observers what they see.
-    fn observed(
-        &self,
-        mut memory: Memory,
-        situation: &Situation<'_>,
-        target: &TargetEstimate,
-        step_s: f64,
-    ) -> Memory {
+    fn observed(&self, mut memory: Memory, situation: &Situation<'_>, step_s: f64) -> Memory {
         memory.stamp = situation.now;
         let (stamp, velocity) = memory.moved;
         let gap_s = situation.vehicle.stamp.seconds_since(stamp);
@@ -436,29 +438,31 @@ impl Metric {
         // What the vehicle leans beside what its path accelerates by, it leans against the wind.
         let against_wind = lean(situation) + memory.path.acceleration() * (1.0 / GRAVITY);
         memory.lean = memory.lean + (against_wind - memory.lean) * (step_s / LEAN_S).min(1.0);
-        let way = self.way(situation, target);
-        let closing = flat(situation.vehicle.velocity) + memory.bias - flat(target.velocity);
-        let expected = memory.expected - closing * step_s;
-        let surprise = way - expected;
+        let here = self.here(situation);
+        let expected = memory.expected + (situation.vehicle.velocity + memory.bias) * step_s;
+        let surprise = flat(here - expected);
         if surprise.norm() > JUMP_M {
-            memory.expected = way;
+            memory.expected = here;
             return memory;
         }
         // A critically damped observer.
         let time_s = self.config.drift_time_s;
         memory.expected = expected + surprise * (2.0 * step_s / time_s).min(1.0);
-        let bias = memory.bias - surprise * (step_s / time_s.powi(2));
+        let bias = memory.bias + surprise * (step_s / time_s.powi(2));
         memory.bias = shortened(bias, self.config.max_drift_m_s);
         memory
     }
 
     /// Horizontal way from the vehicle to the target, in metres.
     fn way(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Vector<Ned> {
+        flat(target.position - self.here(situation))
+    }
+
+    /// Where the vehicle is by now, in metres.
+    fn here(&self, situation: &Situation<'_>) -> Point<Ned> {
         let age_s = situation.now.seconds_since(situation.vehicle.stamp).clamp(0.0, LONGEST_STEP_S);
         let bias = self.memory.map_or(Vector::zero(), |memory| memory.bias);
-        let vehicle =
-            situation.vehicle.position + (flat(situation.vehicle.velocity) + bias) * age_s;
-        flat(target.position - vehicle)
+        situation.vehicle.position + (flat(situation.vehicle.velocity) + bias) * age_s
     }
 
     /// Horizontal way to the place that is aimed at, in metres: high up, where the wind makes the vehicle lean, that is
@@ -503,6 +507,19 @@ impl Metric {
         let pad_m_s = shortened(flat(target.velocity), config.max_pad_m_s);
         let closing = flat(situation.vehicle.velocity) + bias - pad_m_s;
         error.norm().max((error - closing * LOW_LEAD_S).norm()) / radius_m
+    }
+
+    /// The lateral speed over the pad as a part of what it may be so low, which grows with the time spent waiting: a vehicle
+    /// that touches while a gust moves it slides.
+    fn hurry(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
+        let height_m = self.height_m(target).max(0.0);
+        let Some(memory) = self.memory.filter(|_| height_m <= LOW_M) else { return 0.0 };
+        let waited_s = self.waiting_since.map_or(0.0, |since| situation.now.seconds_since(since));
+        let most_m_s = TOUCH_M_S
+            + TOUCH_PER_HEIGHT * height_m
+            + TOUCH_PATIENCE_M_S2 * (waited_s - TOUCH_WAIT_S).max(0.0);
+        let pad_m_s = shortened(flat(target.velocity), self.config.max_pad_m_s);
+        (flat(situation.vehicle.velocity) + memory.bias - pad_m_s).norm() / most_m_s
     }
 
     /// Notes since when the vehicle is low, and since when it stands although it is to go down.
@@ -572,7 +589,8 @@ impl Metric {
             return (0.0, Reason::TargetAging);
         }
         let outside = self.outside(situation, target);
-        let centred = (1.0 - outside * outside).max(0.0);
+        let hurry = self.hurry(situation, target);
+        let centred = (1.0 - outside * outside).max(0.0) * (1.0 - hurry * hurry).max(0.0);
         let fresh = self.freshness(situation);
         let why = if centred == 0.0 && self.height_m(target) <= LOW_M {
             Reason::Settling
@@ -638,7 +656,60 @@ mod tests {
     use super::*;
     use crate::config::PhaseConfig;
     use crate::event::{Landed, Mode, VehicleState};
-    use geometry::{Point, Rotation};
+    use geometry::Rotation;
+
+    #[test]
+    fn a_velocity_that_the_position_does_not_follow_is_found_out_within_two_seconds() {
+        let mut metric = Metric::new(MetricConfig::default());
+        for i in 0..80u32 {
+            let s = f64::from(i) / 40.0;
+            // It is reported to move at 0.5 m/s, and stays where it is.
+            let vehicle = vehicle(s, Point::new(0.3, 0.0, -5.0), Vector::new(0.0, 0.5, 0.0));
+            let _ = metric.velocity(&situation(&vehicle));
+        }
+        let bias = metric.memory.unwrap().bias;
+        assert!((bias - Vector::new(0.0, -0.5, 0.0)).norm() < 0.1, "{bias:?}");
+    }
+
+    fn vehicle(seconds: f64, position: Point<Ned>, velocity: Vector<Ned>) -> VehicleState {
+        VehicleState {
+            stamp: Timestamp::from_seconds(seconds),
+            ned_from_body: Rotation::identity(),
+            position,
+            velocity,
+            mode: Mode::Guided,
+            armed: true,
+            landed: Landed::InAir,
+        }
+    }
+
+    /// A well-known target at the origin.
+    fn situation(vehicle: &VehicleState) -> Situation<'_> {
+        let offset = Point::origin() - vehicle.position;
+        let target = TargetEstimate {
+            position: Point::origin(),
+            velocity: Vector::zero(),
+            lateral_error_m: offset.horizontal_norm(),
+            height_m: offset.z(),
+            age_s: 0.05,
+            deviation_m: 0.01,
+            detections: 100,
+            heading_rad: None,
+            time_offset_s: 0.0,
+            nis: None,
+            contested: false,
+        };
+        Situation {
+            now: vehicle.stamp,
+            vehicle,
+            target: Some(target),
+            age_s: 0.05,
+            half_view_rad: None,
+            pad_moves: false,
+            pad_heave_m_s: 0.0,
+            phases: PhaseConfig::default(),
+        }
+    }
 
     /// A vehicle that stays so far beside its target at heights that change with time.
     fn hovered(aside_m: f64, seconds: f64, height_m: impl Fn(f64) -> f64) -> Progress {
@@ -646,39 +717,8 @@ mod tests {
         let mut progress = Progress::Unchanged;
         for i in 0..(seconds * 40.0) as u32 {
             let s = f64::from(i) / 40.0;
-            let now = Timestamp::from_seconds(s);
-            let vehicle = VehicleState {
-                stamp: now,
-                ned_from_body: Rotation::identity(),
-                position: Point::new(aside_m, 0.0, -height_m(s)),
-                velocity: Vector::zero(),
-                mode: Mode::Guided,
-                armed: true,
-                landed: Landed::InAir,
-            };
-            let target = TargetEstimate {
-                position: Point::origin(),
-                velocity: Vector::zero(),
-                lateral_error_m: aside_m,
-                height_m: height_m(s),
-                age_s: 0.05,
-                deviation_m: 0.01,
-                detections: 100,
-                heading_rad: None,
-                time_offset_s: 0.0,
-                nis: None,
-                contested: false,
-            };
-            let situation = Situation {
-                now,
-                vehicle: &vehicle,
-                target: Some(target),
-                age_s: 0.05,
-                half_view_rad: None,
-                pad_moves: false,
-                pad_heave_m_s: 0.0,
-                phases: PhaseConfig::default(),
-            };
+            let vehicle = vehicle(s, Point::new(aside_m, 0.0, -height_m(s)), Vector::zero());
+            let situation = situation(&vehicle);
             progress = metric.progress(&situation);
             let _ = metric.velocity(&situation);
         }
