@@ -1,5 +1,7 @@
 //! The detector: markers in, observations out.
 
+use std::ops::Range;
+
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outlines, outline};
 
@@ -9,7 +11,7 @@ use crate::observation::{Observation, Stages};
 use crate::rings::Rings;
 use crate::rings_thesis::RingsThesis;
 use crate::square::Squares;
-use crate::square::segments::ImageQuads;
+use crate::square::segments::{ImageQuads, Scale};
 use crate::stag::Stags;
 use crate::trace::{Trace, TracedMarker};
 
@@ -41,16 +43,31 @@ const MOST_STAG_QUADS: usize = 128;
 /// What takes long, and is for markers that are not plain to see; it is done when nothing else was found.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum SlowPass {
-    /// Arcs of rings that are cut or covered.
+    /// Arcs of rings that are cut or covered, and rings that noise hides but on coarser levels.
     Arcs,
     /// Bright specks, which may be the paper of rings far away.
     Specks,
-    /// Square markers that are damaged.
-    Squares,
-    /// The paper of square markers far away, STags among them.
-    Papers,
-    /// STags that are damaged.
-    Stags,
+    /// Square markers that are damaged, STags among them, by the segments of edges in the image.
+    Segments(Scale),
+    /// The paper of square markers far away, STags among them, that begins in a part of the image.
+    Papers(Third),
+}
+
+/// A third of the image's rows.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Third {
+    Upper,
+    Middle,
+    Lower,
+}
+
+impl Third {
+    const ALL: [Self; 3] = [Self::Upper, Self::Middle, Self::Lower];
+
+    fn rows(self, height: usize) -> Range<usize> {
+        let from = self as usize * height / 3;
+        from..(self as usize + 1) * height / 3
+    }
 }
 
 /// The slow passes that may be made in an image.
@@ -144,12 +161,15 @@ impl Detector {
         let (squares, stags) =
             (Squares::new(markers, settings.inverted), Stags::new(markers, settings.inverted));
         let has_rings = markers.iter().any(|marker| marker.family == Family::Rings);
+        let has_quads = !squares.is_empty() || !stags.is_empty();
         let slow_passes = [
             (SlowPass::Arcs, has_rings),
-            (SlowPass::Squares, !squares.is_empty()),
+            (SlowPass::Papers(Third::Upper), has_quads),
+            (SlowPass::Segments(Scale::Fine), has_quads),
             (SlowPass::Specks, has_rings),
-            (SlowPass::Papers, !squares.is_empty() || !stags.is_empty()),
-            (SlowPass::Stags, !stags.is_empty()),
+            (SlowPass::Papers(Third::Middle), has_quads),
+            (SlowPass::Segments(Scale::Coarse), has_quads),
+            (SlowPass::Papers(Third::Lower), has_quads),
         ];
         let slow_passes = slow_passes.into_iter().filter(|(_, is_there)| *is_there);
         Ok(Self {
@@ -180,8 +200,8 @@ impl Detector {
     }
 
     /// As [`Detector::detect`], in a stream of images in which nothing was found of late: what takes long is spread over
-    /// the images. When no marker is plain to see, one of up to five slow passes is made, with the next image the next
-    /// one; a marker that is damaged, or very far, is found up to four images later.
+    /// the images. When no marker is plain to see, one of up to seven slow passes is made, with the next image the next
+    /// one; a marker that is damaged, or very far, is found up to six images later.
     pub fn detect_in_turn(
         &mut self,
         view: GrayView<'_>,
@@ -295,13 +315,15 @@ impl Detector {
         const MOST_AT_ONCE: usize = 64;
         self.found.reserve(MOST_AT_ONCE);
         self.trace.make_room();
-        self.squares.make_room();
-        self.stags.make_room();
+        if !self.squares.is_empty() || !self.stags.is_empty() {
+            self.squares.make_room();
+            self.stags.make_room();
+        }
         let is_slow = |pass| self.slow_passes.contains(&pass);
         if is_slow(SlowPass::Arcs) {
             self.rings.make_room();
         }
-        if is_slow(SlowPass::Squares) || is_slow(SlowPass::Stags) {
+        if is_slow(SlowPass::Papers(Third::Upper)) {
             self.broken.make_room(view);
         }
     }
@@ -315,17 +337,25 @@ impl Detector {
         stages: &mut impl Stages,
     ) {
         let is_needed = |found: &[Observation]| self.settings.thorough || found.is_empty();
-        let is_open = |pass| self.slow_passes.contains(&pass) && allowed.has(pass);
-        self.broken.begin();
-        if is_open(SlowPass::Squares) {
-            let all = is_needed(&self.found);
+        let passes = &self.slow_passes;
+        let is_open = |pass| passes.contains(&pass) && allowed.has(pass);
+        let scales = Scale::ALL.map(|scale| is_open(SlowPass::Segments(scale)).then_some(scale));
+        let has_segments = scales.iter().any(Option::is_some);
+        self.broken.begin(scales);
+        if has_segments && self.squares.note_missing(is_needed(&self.found)) {
+            if self.broken.make(view, self.outlines.pyramid()) {
+                stages.ended("segments");
+            }
+            let seen = (view, self.broken.quads());
             let watch = (&mut self.trace, &mut *stages);
-            let seen = (view, self.outlines.pyramid(), &mut self.broken);
-            self.squares.detect_damaged(seen, all, camera, watch, &mut self.found);
+            self.squares.detect_damaged(seen, camera, watch, &mut self.found);
         }
-        if is_open(SlowPass::Papers) && is_needed(&self.found) {
+        let thirds = Third::ALL.map(|third| is_open(SlowPass::Papers(third)).then_some(third));
+        if thirds.iter().any(Option::is_some) && is_needed(&self.found) {
             let first = self.outlines.len();
-            self.outlines.add(view, &PAPERS, 0..1);
+            for third in thirds.into_iter().flatten() {
+                self.outlines.add_rows(view, &PAPERS, third.rows(view.height()));
+            }
             let (seen, trace) = ((view, &self.outlines, first), &mut self.trace);
             self.squares.detect_on_paper(seen, camera, trace, &mut self.found);
             if self.stags.is_missing(is_needed(&self.found), &self.found) {
@@ -333,9 +363,13 @@ impl Detector {
             }
             stages.ended("papers");
         }
-        if is_open(SlowPass::Stags) && self.stags.is_missing(is_needed(&self.found), &self.found) {
+        if has_segments && self.stags.is_missing(is_needed(&self.found), &self.found) {
+            let pyramid = self.outlines.pyramid();
+            if self.broken.make(view, pyramid) {
+                stages.ended("segments");
+            }
+            let seen = (view, pyramid, self.broken.quads());
             let watch = (&mut self.trace, &mut *stages);
-            let seen = (view, self.outlines.pyramid(), &mut self.broken);
             self.stags.detect_damaged(seen, camera, watch, &mut self.found);
         }
     }

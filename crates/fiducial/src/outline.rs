@@ -38,7 +38,9 @@ pub(crate) fn whole_border(outline: &imaging::Outline<'_>) -> Option<Border> {
     let points = outline.points.iter().step_by(step).map(|p| p.map(f64::from));
     let ellipse = fit_ellipse(points.clone())?;
     let count = points.clone().count() as f64;
-    let squares: f64 = points.map(|p| off_px(&ellipse, p).powi(2)).sum();
+    let axes = ellipse.axes();
+    let squares: f64 =
+        points.map(|p| ((axes.radius_of(p) - 1.0) * ellipse.minor / 2.0).powi(2)).sum();
     let tolerance = 0.35 + 0.012 * ellipse.minor;
     let round = squares <= tolerance * tolerance * count
         && ellipse.minor > LEAST_FLATNESS * ellipse.major

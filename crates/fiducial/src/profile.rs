@@ -1,6 +1,7 @@
 //! Whether an ellipse, taken for one of the marker's circles, has the marker's bands about it.
 
 use std::f64::consts::TAU;
+use std::sync::LazyLock;
 
 use imaging::pyramid::to_level_0;
 use imaging::{Ellipse, GrayView, bilinear};
@@ -66,19 +67,19 @@ pub(crate) fn candidates(view: GrayView<'_>, border: &Border, found: &mut Vec<Ca
     }
 }
 
-/// Compares the bands along rays; the order of the rays makes the first few a fair sample.
+/// Compares the bands along rays.
 fn looks(view: GrayView<'_>, ellipse: &Ellipse, radius: f64, inverted: bool) -> Option<(f64, f64)> {
     const FIRST: u32 = 8;
     let px_per_size = ellipse.minor / (2.0 * radius);
     let bands = BANDS.iter().take_while(|(_, width)| width * px_per_size > 1.6).count();
     let (mut seen, mut agree, mut share) = (0.0, 0.0, 0.0);
     let mut by_edge = [[0_u32; 2]; 6];
-    for i in 0..RAYS {
+    let axes = ellipse.axes();
+    for (i, ray) in (0..RAYS).zip(rays()) {
         if i == FIRST && agree < 0.35 * seen {
             return None;
         }
-        let turn = f64::from(i * 13 % RAYS) * TAU / f64::from(RAYS);
-        let on = ellipse.at(turn);
+        let on = axes.at(*ray);
         let at = |band: f64| {
             let along = |axis: usize| {
                 ellipse.centre[axis] + (on[axis] - ellipse.centre[axis]) * (band / radius)
@@ -109,6 +110,21 @@ fn looks(view: GrayView<'_>, ellipse: &Ellipse, radius: f64, inverted: bool) -> 
     let clear = by_edge.iter().filter(|[seen, agree]| *seen >= 28 && agree + 2 >= *seen).count();
     let score = agree / seen;
     (edges >= 2 && (score >= LEAST_SCORE || clear >= 2)).then_some((score, share / agree))
+}
+
+/// Sines and cosines of the rays' directions, in an order in which the first few are a fair sample.
+fn rays() -> &'static [[f64; 2]; RAYS as usize] {
+    static ALL: LazyLock<[[f64; 2]; RAYS as usize]> =
+        LazyLock::new(|| directions(|index| index * 13));
+    &ALL
+}
+
+/// Sines and cosines of directions all round, each as often as `order` says.
+fn directions<const COUNT: usize>(order: impl Fn(usize) -> usize) -> [[f64; 2]; COUNT] {
+    std::array::from_fn(|index| {
+        let (sin, cos) = ((order(index) % COUNT) as f64 * TAU / COUNT as f64).sin_cos();
+        [sin, cos]
+    })
 }
 
 /// A marker so far away that only its paper is a region: looked for about the middle of a bright outline.
@@ -226,11 +242,13 @@ impl Means {
 }
 
 fn means(view: GrayView<'_>, ellipse: &Ellipse, radius: f64, inverted: bool) -> Option<Means> {
-    const RAYS: u32 = 12;
+    const RAYS: usize = 12;
+    static ALL: LazyLock<[[f64; 2]; RAYS]> = LazyLock::new(|| directions(|index| index));
     let mut sums = [0.0; 4];
     let mut rim = 0;
-    for i in 0..RAYS {
-        let on = ellipse.at(f64::from(i) * TAU / f64::from(RAYS));
+    let axes = ellipse.axes();
+    for ray in ALL.iter() {
+        let on = axes.at(*ray);
         let mut values = [0.0; 4];
         for (value, band) in values.iter_mut().zip([0.57, 0.45, 0.325, 0.2]) {
             let along = |axis: usize| {
@@ -241,7 +259,7 @@ fn means(view: GrayView<'_>, ellipse: &Ellipse, radius: f64, inverted: bool) -> 
         }
         rim += u32::from(values[0] > values[1] + 2.0);
         for (sum, value) in sums.iter_mut().zip(values) {
-            *sum += value / f64::from(RAYS);
+            *sum += value / RAYS as f64;
         }
     }
     let [paper, outer, gap, middle] = sums;

@@ -165,7 +165,8 @@ impl Rings {
             trace.rings.extend(self.candidates.iter().map(ring));
             stages.ended(stage.name());
             let seen = (view, outlines.pyramid());
-            self.look_into_all(seen, marker, (camera, &nominal), trace, (found, first));
+            let lens = (camera, &nominal, allowed.has(SlowPass::Arcs));
+            self.look_into_all(seen, marker, lens, trace, (found, first));
             stages.ended("matching");
             if found.len() > first && !self.thorough {
                 break;
@@ -257,12 +258,13 @@ impl Rings {
         }
     }
 
-    /// Adds the markers among the candidates to those found from the index `first` on.
+    /// Adds the markers among the candidates to those found from the index `first` on, looking on coarser levels as well when
+    /// `from_afar`.
     fn look_into_all(
         &mut self,
         (view, pyramid): (GrayView<'_>, &Pyramid),
         marker: &Marker,
-        (camera, nominal): (Option<&CameraModel>, &CameraModel),
+        (camera, nominal, from_afar): (Option<&CameraModel>, &CameraModel, bool),
         trace: &mut Trace,
         (found, first): (&mut Vec<Observation>, usize),
     ) {
@@ -284,7 +286,7 @@ impl Rings {
                 Err(Reason::Repeated)
             } else {
                 let seen = self.look_into(view, &candidate, marker, camera, nominal);
-                if seen.is_err() && found.len() == first {
+                if seen.is_err() && from_afar && found.len() == first {
                     let eyes = (view, pyramid, camera.unwrap_or(nominal));
                     self.look_from_afar(eyes, &candidate, marker, camera.is_some()).or(seen)
                 } else {

@@ -30,7 +30,6 @@ use crate::square::decode::{Cells, Layout, Look};
 use crate::square::pattern::Pattern;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_from};
-use crate::square::segments::ImageQuads;
 use crate::trace::{Reason, Trace};
 
 /// Bounds on the work in one image, far above what frames with markers need.
@@ -169,13 +168,18 @@ impl Squares {
     /// Makes the buffers as large as frames with texture need.
     pub(crate) fn make_room(&mut self) {
         const QUADS: usize = 2000;
+        // STags are looked for among these quads, too.
+        self.quads.clear();
+        self.quads.reserve(QUADS);
         if !self.is_empty() {
-            self.quads.clear();
-            self.quads.reserve(QUADS);
             self.found.clear();
             self.found.reserve(MOST_FOUND);
             self.scratch.make_room();
             self.damaged.make_room();
+            for wanted in &mut self.wanted {
+                wanted.missing.clear();
+                wanted.missing.reserve(wanted.markers.len());
+            }
         }
     }
 
@@ -233,7 +237,7 @@ impl Squares {
             return None;
         }
         let look = Look::at(&corners, layout.cells, view, pyramid)?;
-        if !self.cells.solve(&look, layout) {
+        if !self.cells.solve_plain(&look, layout) {
             return None;
         }
         let code = wanted.code;
@@ -244,23 +248,19 @@ impl Squares {
         Some(observed(&found, wanted, refined, camera))
     }
 
-    /// Finds the markers that closed outlines do not show, as something hides a part of them; it takes several times as long as
-    /// [`Squares::detect`], which comes first. Looked for are `all` that are missing, or else those of any id of families of which
-    /// two were found: of a board.
+    /// Finds the markers that closed outlines do not show, as something hides a part of them, among quads of segments, after
+    /// [`Squares::note_missing`] said that some are missing; it comes after [`Squares::detect`].
     pub(crate) fn detect_damaged(
         &mut self,
-        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
-        all: bool,
+        (view, quads): (GrayView<'_>, &[Quad]),
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
         found: &mut Vec<Observation>,
     ) {
-        if self.note_missing(all) {
-            let whole = self.found.len();
-            self.read_damaged((view, pyramid, quads), trace);
-            self.observe_all(view, whole, camera, found);
-            stages.ended("damaged");
-        }
+        let whole = self.found.len();
+        self.read_damaged((view, quads), trace);
+        self.observe_all(view, whole, camera, found);
+        stages.ended("damaged");
     }
 
     /// Finds markers so small that their border is broken by the outlines of their paper, which are those from the index `first`
@@ -376,8 +376,9 @@ impl Squares {
         }
     }
 
-    /// Notes what is looked for on where closed outlines do not show it; false when nothing is.
-    fn note_missing(&mut self, all: bool) -> bool {
+    /// Notes what is looked for on where closed outlines do not show it; false when nothing is. That is `all` that is missing, or
+    /// else those of any id of families of which two were found: of a board.
+    pub(crate) fn note_missing(&mut self, all: bool) -> bool {
         let mut is_any_missing = false;
         for (index, wanted) in self.wanted.iter_mut().enumerate() {
             wanted.missing.clear();
@@ -396,11 +397,7 @@ impl Squares {
     }
 
     /// Looks for what is missing.
-    fn read_damaged(
-        &mut self,
-        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
-        trace: &mut Trace,
-    ) {
+    fn read_damaged(&mut self, (view, quads): (GrayView<'_>, &[Quad]), trace: &mut Trace) {
         let missing = self.wanted.iter().enumerate().filter(|(_, wanted)| wanted.is_missing);
         let sought = missing.map(|(index, wanted)| {
             let any = wanted.markers.iter().any(|marker| marker.id.is_none());
@@ -411,7 +408,7 @@ impl Squares {
             (inverted || quad.inverted == code.reversed_border)
                 && !known.iter().any(|found| covers(&found.corners, &quad.corners))
         };
-        for marker in self.damaged.find(view, quads.of(view, pyramid), sought, is_open) {
+        for marker in self.damaged.find(view, quads, sought, is_open) {
             let corners = marker.quad.corners;
             trace.accept_quad(corners);
             let reading = marker.reading;

@@ -23,7 +23,6 @@ use crate::square::codebook::Codebook;
 use crate::square::decode::Grid;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
-use crate::square::segments::ImageQuads;
 use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, covers, papers, unevenness};
 use crate::trace::{Reason, Trace};
 
@@ -239,13 +238,13 @@ impl Stags {
     /// as [`Stags::detect`].
     pub(crate) fn detect_damaged(
         &mut self,
-        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &mut ImageQuads),
+        (view, pyramid, quads): (GrayView<'_>, &Pyramid, &[Quad]),
         camera: Option<&CameraModel>,
         (trace, stages): (&mut Trace, &mut impl Stages),
         found: &mut Vec<Observation>,
     ) {
         let mut damaged = std::mem::take(&mut self.damaged);
-        let candidates = damaged.find(quads.of(view, pyramid), |quad| {
+        let candidates = damaged.find(quads, |quad| {
             let is_taken = self.places.iter().any(|place| covers(place, &quad.corners));
             if is_taken || quad.inverted && !self.inverted {
                 return None;

@@ -77,7 +77,7 @@ struct SlowPasses(Vec<&'static str>);
 
 impl fiducial::Stages for SlowPasses {
     fn ended(&mut self, stage: &'static str) {
-        if ["arcs", "specks", "damaged", "papers"].contains(&stage) {
+        if ["arcs", "specks", "segments", "papers"].contains(&stage) {
             self.0.push(stage);
         }
     }
@@ -100,24 +100,25 @@ fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
     let (cut, bare) = (scene.render(), GrayImage::filled(648, 486, 110));
     let mut passes = Vec::new();
     let mut found_after = None;
-    for i in 0..16_u32 {
-        let image = if i < 6 { &bare } else { &cut };
+    for i in 0..18_u32 {
+        let image = if i < 7 { &bare } else { &cut };
         let mut slow = SlowPasses::default();
         let view = image.view().unwrap();
         let time_s = f64::from(i) * 0.05;
         let found =
             !tracker.detect(&mut detector, view, Some(&camera), time_s, &mut slow).is_empty();
         if i == 0 {
-            assert_eq!(slow.0, ["arcs", "specks", "damaged", "papers", "damaged"]);
+            assert_eq!(slow.0, ["arcs", "specks", "segments", "papers"]);
         } else {
             assert_eq!(slow.0.len(), 1, "{i}: {:?}", slow.0);
             passes.append(&mut slow.0);
         }
         if found {
-            found_after = Some(i - 6);
+            found_after = Some(i - 7);
             break;
         }
     }
-    assert_eq!(passes[..5], ["arcs", "damaged", "specks", "papers", "damaged"]);
-    assert!(found_after.is_some_and(|images| images < 5), "{found_after:?}");
+    let in_turn = ["arcs", "papers", "segments", "specks", "papers", "segments", "papers"];
+    assert_eq!(passes[..7], in_turn);
+    assert!(found_after.is_some_and(|images| images < 7), "{found_after:?}");
 }

@@ -26,6 +26,12 @@ impl BitImage {
         self.words.resize(stride * (height + 2) + 1, 0);
     }
 
+    /// Makes room for images of this size.
+    pub(crate) fn make_room(&mut self, width: usize, height: usize) {
+        let most = ((width + 1).div_ceil(64) + 1) * (height + 2) + 1;
+        self.words.reserve(most.saturating_sub(self.words.len()));
+    }
+
     /// Width in pixels.
     pub fn width(&self) -> usize {
         self.width
@@ -118,6 +124,20 @@ pub struct Binarizer {
 }
 
 impl Binarizer {
+    /// Makes room for images of this size.
+    pub(crate) fn make_room(&mut self, width: usize, height: usize) {
+        fn reserve<T>(list: &mut Vec<T>, most: usize) {
+            list.reserve(most.saturating_sub(list.len()));
+        }
+        let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
+        for buffer in [&mut self.low, &mut self.high, &mut self.wide_low, &mut self.wide_high] {
+            reserve(buffer, tiles);
+        }
+        reserve(&mut self.thresholds, tiles);
+        reserve(&mut self.extremes, tiles);
+        reserve(&mut self.row, width.next_multiple_of(TILE));
+    }
+
     /// Writes which pixels are dark, and if asked for which are bright.
     pub fn apply(
         &mut self,

@@ -33,21 +33,54 @@ impl Ellipse {
 
     /// The place on the ellipse at the parameter `t` (radians; 0 and pi are the ends of the minor axis).
     pub fn at(&self, t: f64) -> [f64; 2] {
-        let (along_minor, along_major) = (self.minor / 2.0 * t.cos(), self.major / 2.0 * t.sin());
+        let (sin, cos) = t.sin_cos();
+        self.axes().at([sin, cos])
+    }
+
+    /// Distance from the centre in units of the ellipse: 1 on it, less than 1 within.
+    pub fn radius_of(&self, point: [f64; 2]) -> f64 {
+        self.axes().radius_of(point)
+    }
+
+    /// Its half axes, for many places.
+    pub fn axes(&self) -> Axes {
         let (sin, cos) = self.angle.sin_cos();
+        let (minor, major) = (self.minor / 2.0, self.major / 2.0);
+        Axes { centre: self.centre, direction: [cos, sin], lengths: [minor, major] }
+    }
+}
+
+/// The half axes of an ellipse.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Axes {
+    /// The ellipse's centre, in pixels.
+    centre: [f64; 2],
+    /// Unit vector along the minor axis.
+    direction: [f64; 2],
+    /// Half of the minor and of the major axis, in pixels.
+    lengths: [f64; 2],
+}
+
+impl Axes {
+    /// The place on the ellipse at the parameter with this sine and cosine, as [`Ellipse::at`] has it.
+    #[inline]
+    pub fn at(&self, [sin, cos]: [f64; 2]) -> [f64; 2] {
+        let (along_minor, along_major) = (self.lengths[0] * cos, self.lengths[1] * sin);
+        let [cos, sin] = self.direction;
         [
             self.centre[0] + along_minor * cos - along_major * sin,
             self.centre[1] + along_minor * sin + along_major * cos,
         ]
     }
 
-    /// Distance from the centre in units of the ellipse: 1 on it, less than 1 within.
+    /// As [`Ellipse::radius_of`].
+    #[inline]
     pub fn radius_of(&self, point: [f64; 2]) -> f64 {
         let (dx, dy) = (point[0] - self.centre[0], point[1] - self.centre[1]);
-        let (sin, cos) = self.angle.sin_cos();
-        let along_minor = (dx * cos + dy * sin) / (self.minor / 2.0);
-        let along_major = (dy * cos - dx * sin) / (self.major / 2.0);
-        along_minor.hypot(along_major)
+        let [cos, sin] = self.direction;
+        let along_minor = (dx * cos + dy * sin) / self.lengths[0];
+        let along_major = (dy * cos - dx * sin) / self.lengths[1];
+        (along_minor * along_minor + along_major * along_major).sqrt()
     }
 }
 

@@ -25,7 +25,7 @@ pub mod view;
 pub use binary::{Binarizer, BitImage, Contrast, Middle};
 pub use contour::{Contour, Contours, Limits, contour_area, contour_length};
 pub use convert::{Converter, Mosaic, SampleFormat};
-pub use ellipse::{Ellipse, fit_ellipse};
+pub use ellipse::{Axes, Ellipse, fit_ellipse};
 pub use filter::{BilateralRows, bilateral_5x5};
 pub use outline::{Outline, Outlines};
 pub use pyramid::Pyramid;

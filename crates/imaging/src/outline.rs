@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use crate::binary::{Binarizer, BitImage, Contrast, Middle};
-use crate::kernels::sharpen_row;
+use crate::kernels::{TILE, sharpen_row};
 use crate::pyramid::Pyramid;
 use crate::view::{GrayImage, GrayView};
 
@@ -80,6 +80,8 @@ pub struct Outline<'a> {
 pub struct Outlines {
     pyramid: Pyramid,
     sharp: GrayImage,
+    /// Whether `sharp` is of this image.
+    is_sharp: bool,
     binarizer: Binarizer,
     dark: BitImage,
     bright: BitImage,
@@ -106,8 +108,8 @@ const SHORTEST_EDGE_PX: usize = 24;
 const MOST_STEPS_PER_PIXEL: f32 = 3.0;
 const MOST_POINTS_PER_PIXEL: f32 = 0.3;
 /// There is room from the start for a point and for an outline in so many pixels.
-const POINTS_EVERY: usize = 24;
-const SPANS_EVERY: usize = 500;
+const POINTS_EVERY: usize = 8;
+const SPANS_EVERY: usize = 250;
 /// Tiny images may have this many anyway.
 const LEAST_BUDGET: usize = 4096;
 
@@ -136,11 +138,18 @@ impl Outlines {
         self.spans.clear();
         self.pyramid.build(view, MOST_LEVELS, SHORTEST_EDGE_PX);
         // As much as textures have; a frame that has more makes the buffers grow.
-        let pixels = view.width() * view.height();
+        let (width, height) = (view.width(), view.height());
+        let pixels = width * height;
         self.points.reserve(pixels / POINTS_EVERY);
         self.spans.reserve(pixels / SPANS_EVERY);
-        let longest = 2 * (view.width() + view.height());
+        let longest = 4 * (width + height);
         self.path.reserve(longest.saturating_sub(self.path.len()));
+        self.dark.make_room(width, height);
+        self.bright.make_room(width, height);
+        self.binarizer.make_room(width, height);
+        self.tops.make_room(width);
+        self.sharp.resize(width, height);
+        self.is_sharp = false;
     }
 
     /// Adds the outlines on some levels of the image that was begun with; `view` is that image.
@@ -148,8 +157,36 @@ impl Outlines {
         let finest = settings.dark_from.into_iter().chain(settings.bright_from).min();
         let first = levels.start.max(finest.unwrap_or(MOST_LEVELS));
         for level in first..levels.end.min(self.pyramid.levels()) {
-            self.find_on(view, level, settings);
+            self.find_on(view, level, settings, None);
         }
+    }
+
+    /// Adds those outlines of the image itself, of which [`Outlines::add`] finds all, that begin in some rows of it, so that
+    /// the work can be spread; none is higher than `largest_px` of the settings.
+    pub fn add_rows(&mut self, view: GrayView<'_>, settings: &Settings, rows: Range<usize>) {
+        // What decides on a row and an outline's last: the tiles next to theirs, and the row next to those.
+        const MARGIN: usize = 3 * TILE;
+        let top = rows.start.saturating_sub(MARGIN) / TILE * TILE;
+        let below = rows.end + usize::from(settings.largest_px) + MARGIN;
+        let bottom = below.next_multiple_of(TILE).min(view.height());
+        let first = self.spans.len();
+        self.find_on(view, 0, settings, Some(top..bottom));
+        let mut kept = first;
+        for index in first..self.spans.len() {
+            let mut span = self.spans[index];
+            if !rows.contains(&(usize::from(span.bounds[1]) + top)) {
+                continue;
+            }
+            for row in [1, 3] {
+                span.bounds[row] += top as u16;
+            }
+            for point in self.points.get_mut(span.start..span.end).unwrap_or_default() {
+                point[1] += top as f32;
+            }
+            self.spans[kept] = span;
+            kept += 1;
+        }
+        self.spans.truncate(kept);
     }
 
     /// Number of outlines.
@@ -190,19 +227,36 @@ impl Outlines {
         }
     }
 
-    fn find_on(&mut self, view: GrayView<'_>, level: usize, settings: &Settings) {
-        let Some(view) = self.pyramid.level(view, level) else {
+    /// Finds the outlines on a level, or in some rows of it.
+    fn find_on(
+        &mut self,
+        view: GrayView<'_>,
+        level: usize,
+        settings: &Settings,
+        rows: Option<Range<usize>>,
+    ) {
+        let Some(whole) = self.pyramid.level(view, level) else {
             return;
         };
         let wanted = |from: Option<usize>| from.is_some_and(|from| from <= level);
         let bright = wanted(settings.bright_from).then_some(&mut self.bright);
         // Full resolution serves regions a few pixels wide, whose lines are hardly wider than a pixel and blurred.
         let sharp = if level == 0 {
-            sharpen(view, &mut self.sharp);
-            self.sharp.view().unwrap_or(view)
+            if !std::mem::replace(&mut self.is_sharp, true) {
+                sharpen(whole, &mut self.sharp);
+            }
+            self.sharp.view().unwrap_or(whole)
         } else {
-            view
+            whole
         };
+        fn part<'a>(view: GrayView<'a>, rows: Option<&Range<usize>>) -> Option<GrayView<'a>> {
+            match rows {
+                Some(rows) => view.crop(0, rows.start, view.width(), rows.len()),
+                None => Some(view),
+            }
+        }
+        let rows = rows.as_ref();
+        let Some((view, sharp)) = part(whole, rows).zip(part(sharp, rows)) else { return };
         self.binarizer.apply(sharp, contrast(settings, level), &mut self.dark, bright);
         let limits = Limits::new(settings, level, view);
         for (from, bits, dark) in
@@ -628,6 +682,13 @@ fn flood(bits: u64, seeds: u64) -> u64 {
 }
 
 impl Tops {
+    /// Makes room for rows of this length.
+    fn make_room(&mut self, width: usize) {
+        for words in [&mut self.ends, &mut self.flooded] {
+            words.reserve((width / 64 + 4).saturating_sub(words.len()));
+        }
+    }
+
     /// Marks the tops of a row. Both rows have a word of noes at their end.
     fn mark(&mut self, row: &[u64], above: &[u64]) {
         for words in [&mut self.ends, &mut self.flooded] {
@@ -703,6 +764,47 @@ mod tests {
         }
         let hole = outlines.iter().find(|o| !o.dark && !o.cut).unwrap();
         assert_eq!((hole.bounds, hole.area, hole.level), ([3, 3, 5, 5], 4, 0));
+    }
+
+    #[test]
+    fn rows_have_the_outlines_that_begin_in_them() {
+        let (width, height) = (230, 190);
+        let mut random = 1_u32;
+        let mut pixel = |i: usize| {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            let spot = (i % width / 9 * 7 + i / width / 11 * 5).is_multiple_of(4);
+            (random >> 26) as u8 + if spot { 180 } else { 30 }
+        };
+        let data: Vec<u8> = (0..width * height).map(&mut pixel).collect();
+        let view = GrayView::packed(&data, width, height).unwrap();
+        let settings =
+            Settings { whole_level: 1, smallest_px: 3, largest_px: 20, least_contrast: 14, ..ALL };
+        let list = |outlines: &Outlines| -> Vec<_> {
+            let keep = |o: Outline<'_>| (o.bounds, o.dark, o.area, o.cut, o.points.to_vec());
+            outlines.iter().map(keep).collect()
+        };
+        let (mut whole, mut parts) = (Outlines::default(), Outlines::default());
+        whole.begin(view);
+        parts.begin(view);
+        for kind in
+            [Settings { bright_from: None, ..settings }, Settings { dark_from: None, ..settings }]
+        {
+            whole.add(view, &kind, 0..1);
+            for rows in [0..61, 61..130, 130..height] {
+                parts.add_rows(view, &kind, rows);
+            }
+        }
+        let (parts, whole) = (list(&parts), list(&whole));
+        assert!(whole.len() > 50, "{}", whole.len());
+        assert_eq!(parts.len(), whole.len());
+        for (part, whole) in parts.iter().zip(&whole) {
+            assert_eq!((part.0, part.1, part.2, part.3), (whole.0, whole.1, whole.2, whole.3));
+            assert_eq!(part.4.len(), whole.4.len());
+            // Where rows are added to places, these are rounded.
+            for ([x, y], [u, v]) in part.4.iter().zip(&whole.4) {
+                assert!((x - u).abs() < 1e-3 && (y - v).abs() < 1e-3, "{x} {y} {u} {v}");
+            }
+        }
     }
 
     #[test]

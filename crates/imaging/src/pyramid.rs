@@ -48,12 +48,14 @@ impl Pyramid {
 }
 
 /// Where a place of a level lies in the image, along one axis: a pixel's centre on level l is the centre of 2^l pixels.
+#[inline]
 pub fn to_level_0(place: f64, level: usize) -> f64 {
     let pixels = (1_u64 << level.min(32)) as f64;
     (place + 0.5) * pixels - 0.5
 }
 
 /// Where a place in the image lies on a level, along one axis.
+#[inline]
 pub fn from_level_0(place: f64, level: usize) -> f64 {
     let pixels = (1_u64 << level.min(32)) as f64;
     (place + 0.5) / pixels - 0.5

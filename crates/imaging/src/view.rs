@@ -107,11 +107,13 @@ impl<'a> GrayView<'a> {
     }
 
     /// Width in pixels.
+    #[inline]
     pub fn width(&self) -> usize {
         self.width
     }
 
     /// Height in pixels.
+    #[inline]
     pub fn height(&self) -> usize {
         self.height
     }
@@ -120,8 +122,9 @@ impl<'a> GrayView<'a> {
     ///
     /// # Panics
     /// When `y` is not below the height, as a slice does.
+    #[inline]
     pub fn row(&self, y: usize) -> &'a [u8] {
-        assert!(y < self.height, "row {y} of an image {} rows high", self.height);
+        assert!(y < self.height, "no such row in the image");
         &self.data[y * self.stride..][..self.width]
     }
 
@@ -129,6 +132,7 @@ impl<'a> GrayView<'a> {
     ///
     /// # Panics
     /// When the place lies outside the image, as a slice does.
+    #[inline]
     pub fn at(&self, x: usize, y: usize) -> u8 {
         self.row(y)[x]
     }

@@ -127,7 +127,7 @@ fn is_same_place(a: &Quad, b: &Quad) -> bool {
 mod tests {
     use super::*;
     use crate::marker::Family;
-    use crate::square::segments::ImageQuads;
+    use crate::square::segments::{ImageQuads, Scale};
     use geometry::Pixel;
     use imaging::{GrayImage, Pyramid};
 
@@ -189,7 +189,9 @@ mod tests {
         pyramid.build(view, 4, 16);
         let sought = std::iter::once(Sought { index: 0, code, ids });
         let mut quads = ImageQuads::default();
-        Damaged::default().find(view, quads.of(view, &pyramid), sought, |_, _| true).to_vec()
+        quads.begin(Scale::ALL.map(Some));
+        quads.make(view, &pyramid);
+        Damaged::default().find(view, quads.quads(), sought, |_, _| true).to_vec()
     }
 
     /// Finds the one marker there is, whatever its turn, with its corners to so many pixels.

@@ -27,6 +27,8 @@ const BLUR_PX: f64 = 0.62;
 const CELL_PX: f64 = 1.7;
 /// How far outside of the known cells pixels are still looked at, in cells: what is beyond the paper is unknown.
 const REACH: f64 = -0.45;
+/// Of cells as wide as this, in pixels, half of the pixels say enough.
+const WIDE_CELL_PX: f64 = 2.0;
 /// Pulls bits towards the middle between dark and bright, as a share of a pixel's weight; it keeps noise down where cells
 /// are hardly seen.
 const PULL: f64 = 0.05;
@@ -134,6 +136,13 @@ fn apply(m: &[[f64; 3]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
     [(m[0][0] * x + m[0][1] * y + m[0][2]) * scale, (m[1][0] * x + m[1][1] * y + m[1][2]) * scale]
 }
 
+/// Which pixels of a picture count.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Pixels {
+    All,
+    Half,
+}
+
 /// The sums of a picture's least squares, and its solution.
 #[derive(Debug)]
 pub(crate) struct Cells {
@@ -213,6 +222,13 @@ impl<'a> Look<'a> {
 }
 
 impl Look<'_> {
+    /// About how wide a cell is in the middle of a square of `cells` cells, in pixels of the level.
+    fn cell_px(&self, cells: usize) -> f64 {
+        let middle = cells as f64 / 2.0;
+        let [a, b] = [middle - 0.5, middle + 0.5].map(|at| self.grid.pixel([at, at]));
+        (b[0] - a[0]).hypot(b[1] - a[1]) / std::f64::consts::SQRT_2
+    }
+
     /// Whether the ring of cells within the outermost one of a square of `cells` cells is as dark as that, or as bright.
     pub(crate) fn has_second_ring(&self, cells: usize) -> bool {
         /// One of so many may look otherwise.
@@ -246,9 +262,19 @@ impl Look<'_> {
 impl Cells {
     /// Solves for the cells of a picture; false when it does not determine them.
     pub(crate) fn solve(&mut self, look: &Look<'_>, layout: &Layout) -> bool {
+        self.solve_by(look, layout, Pixels::All)
+    }
+
+    /// As [`Cells::solve`], by half of the pixels where cells are wide: of a marker that is plain to see they say enough.
+    pub(crate) fn solve_plain(&mut self, look: &Look<'_>, layout: &Layout) -> bool {
+        let is_wide = look.cell_px(layout.cells) >= WIDE_CELL_PX;
+        self.solve_by(look, layout, if is_wide { Pixels::Half } else { Pixels::All })
+    }
+
+    fn solve_by(&mut self, look: &Look<'_>, layout: &Layout, pixels: Pixels) -> bool {
         self.bits = layout.bits.len();
         self.clear();
-        self.add_pixels(look, layout);
+        self.add_pixels(look, layout, pixels);
         // Fewer pixels than unknowns say too little, however they are pulled.
         self.count > self.bits + 2 && self.factorise() && self.substitute()
     }
@@ -306,7 +332,7 @@ impl Cells {
         (self.sum, self.sum_of_squares, self.count) = (0.0, 0.0, 0);
     }
 
-    fn add_pixels(&mut self, look: &Look<'_>, layout: &Layout) {
+    fn add_pixels(&mut self, look: &Look<'_>, layout: &Layout, pixels: Pixels) {
         let (n, margin) = (layout.cells as f64, layout.margin as f64);
         let reach = margin + REACH;
         let ends =
@@ -323,7 +349,12 @@ impl Cells {
         let blur = blur_in_cells(&look.grid, n / 2.0);
         for y in top..=bottom {
             let row = look.view.row(y);
-            for (x, grey) in row.iter().enumerate().take(right + 1).skip(left) {
+            // Half of them as on the squares of one colour of a chessboard.
+            let (first, step) = match pixels {
+                Pixels::All => (left, 1),
+                Pixels::Half => (left + (left + y) % 2, 2),
+            };
+            for (x, grey) in row.iter().enumerate().take(right + 1).skip(first).step_by(step) {
                 let [u, v] = look.grid.cell([x as f64, y as f64]);
                 if u > -reach && v > -reach && u < n + reach && v < n + reach {
                     self.add(layout, [u + margin, v + margin], blur, f64::from(*grey));
@@ -396,7 +427,7 @@ impl Cells {
             for column in 0..=row {
                 let mut value = self.normal[row][column] + self.pull(row, column);
                 let (a, b) = (&self.factor[row], &self.factor[column]);
-                value -= a[..column].iter().zip(&b[..column]).map(|(a, b)| a * b).sum::<f64>();
+                value -= dot(&a[..column], &b[..column]);
                 self.factor[row][column] = if row == column {
                     if value <= 1e-9 {
                         return false;
@@ -424,8 +455,7 @@ impl Cells {
     fn substitute(&mut self) -> bool {
         let n = self.bits + 2;
         for row in 0..n {
-            let known = self.factor[row][..row].iter().zip(&self.solution);
-            let known: f64 = known.map(|(a, b)| a * b).sum();
+            let known = dot(&self.factor[row][..row], &self.solution[..row]);
             self.solution[row] = (self.right[row] - known) / self.factor[row][row];
         }
         for row in (0..n).rev() {
@@ -437,6 +467,20 @@ impl Cells {
         }
         self.solution[..n].iter().all(|v| v.is_finite())
     }
+}
+
+/// The sum of products, in four sums at once, which need not wait for one another.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let (four_a, rest_a) = a.as_chunks::<4>();
+    let (four_b, rest_b) = b.as_chunks::<4>();
+    let mut sums = [0.0; 4];
+    for (a, b) in four_a.iter().zip(four_b) {
+        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
+            *sum += a * b;
+        }
+    }
+    let rest: f64 = rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum();
+    sums.iter().sum::<f64>() + rest
 }
 
 /// The blur along the cells' rows and columns, in cells, in the middle of the square.

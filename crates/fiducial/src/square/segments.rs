@@ -33,7 +33,18 @@ pub struct Placement {
 
 /// Segments are taken on the finest level of the pyramid with no more pixels than this, and on the next one.
 const MOST_PIXELS: usize = 400_000;
-const LEVELS: usize = 2;
+
+/// One of the levels on which segments are taken.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Scale {
+    Fine,
+    Coarse,
+}
+
+impl Scale {
+    pub(crate) const ALL: [Self; 2] = [Self::Fine, Self::Coarse];
+}
+
 const LEAST_EDGE: LeastEdge = LeastEdge { gradient: 6, length_px: 5.0 };
 
 /// The quads that the segments of an image may belong to, which all families share. It keeps its memory from image to
@@ -43,7 +54,8 @@ pub(crate) struct ImageQuads {
     segments: Segments,
     joining: SegmentQuads,
     quads: Vec<Quad>,
-    is_made: bool,
+    /// What is not yet looked at.
+    scales: [Option<Scale>; 2],
 }
 
 impl ImageQuads {
@@ -56,36 +68,41 @@ impl ImageQuads {
         self.segments.make_room(width, height);
         self.joining.make_room([width, height]);
         self.quads.clear();
-        self.quads.reserve(2 * LEVELS * MOST_QUADS);
+        self.quads.reserve(2 * Scale::ALL.len() * MOST_QUADS);
     }
 
-    /// Turns to another image.
-    pub(crate) fn begin(&mut self) {
-        self.is_made = false;
-    }
-
-    /// The quads of the image, of which `pyramid` was built: the finer level first, on each the dark ones first, then the
-    /// best. They are made when they are first asked for.
-    pub(crate) fn of(&mut self, view: GrayView<'_>, pyramid: &Pyramid) -> &[Quad] {
-        if std::mem::replace(&mut self.is_made, true) {
-            return &self.quads;
-        }
+    /// Turns to another image, of which these scales are looked at.
+    pub(crate) fn begin(&mut self, scales: [Option<Scale>; 2]) {
         self.quads.clear();
+        self.scales = scales;
+    }
+
+    /// Makes the quads of the image, of which `pyramid` was built; false when they were made before.
+    pub(crate) fn make(&mut self, view: GrayView<'_>, pyramid: &Pyramid) -> bool {
+        let scales = std::mem::take(&mut self.scales);
+        scales.iter().flatten().for_each(|scale| self.add(view, pyramid, *scale));
+        scales.iter().any(Option::is_some)
+    }
+
+    /// The quads that were made: the finer level first, on each the dark ones first, then the best.
+    pub(crate) fn quads(&self) -> &[Quad] {
+        &self.quads
+    }
+
+    fn add(&mut self, view: GrayView<'_>, pyramid: &Pyramid, scale: Scale) {
         let pixels = |level: usize| (view.width() * view.height()) >> (2 * level.min(31));
         let finest = (0..pyramid.levels()).find(|level| pixels(*level) <= MOST_PIXELS);
         let finest = finest.unwrap_or(pyramid.levels().saturating_sub(1));
-        for level in finest..(finest + LEVELS).min(pyramid.levels()) {
-            let Some(picture) = pyramid.level(view, level) else { continue };
-            let segments = self.segments.find(picture, LEAST_EDGE);
-            let offset = to_level_0(0.0, level) as f32;
-            let placement = Placement { scale: 1.0 + 2.0 * offset, offset };
-            let size = [picture.width(), picture.height()];
-            for inverted in [false, true] {
-                let found = self.joining.find(segments, size, placement, inverted);
-                self.quads.extend(found.iter().map(|found| found.quad));
-            }
+        let level = finest + usize::from(scale == Scale::Coarse);
+        let Some(picture) = pyramid.level(view, level) else { return };
+        let segments = self.segments.find(picture, LEAST_EDGE);
+        let offset = to_level_0(0.0, level) as f32;
+        let placement = Placement { scale: 1.0 + 2.0 * offset, offset };
+        let size = [picture.width(), picture.height()];
+        for inverted in [false, true] {
+            let found = self.joining.find(segments, size, placement, inverted);
+            self.quads.extend(found.iter().map(|found| found.quad));
         }
-        &self.quads
     }
 }
 
@@ -415,7 +432,7 @@ impl Side {
 
     fn between(start: [f32; 2], end: [f32; 2], seen: f32) -> Self {
         let way = minus(end, start);
-        let length = way[0].hypot(way[1]).max(1e-3);
+        let length = dot(way, way).sqrt().max(1e-3);
         Self { start, end, way: way.map(|v| v / length), length, seen }
     }
 
@@ -573,6 +590,6 @@ fn mix(a: [f32; 2], b: [f32; 2], share: f32) -> [f32; 2] {
 }
 
 fn distance(a: [f32; 2], b: [f32; 2]) -> f32 {
-    let [dx, dy] = minus(a, b);
-    dx.hypot(dy)
+    let way = minus(a, b);
+    dot(way, way).sqrt()
 }

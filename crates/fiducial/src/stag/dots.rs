@@ -162,9 +162,11 @@ impl Dots {
         for (j, down) in rows.each() {
             for (i, along) in columns.each() {
                 let weight = down * along;
-                for (unknown, share) in &self.parts[j * ACROSS + i] {
+                // The largest shares come first; most small cells belong to one unknown.
+                let parts = &self.parts[j * ACROSS + i];
+                for (unknown, share) in parts.iter().take_while(|(_, share)| *share > 0.0) {
                     let slot = &mut weights[usize::from(*unknown)];
-                    if *slot == 0.0 && *share > 0.0 {
+                    if *slot == 0.0 {
                         seen[count] = *unknown;
                         count += 1;
                     }
