@@ -38,15 +38,35 @@ const MOST_DIFFERENCE: f64 = 0.2;
 /// 800 had in a thousand pictures. Nine of ten other things that are looked at are given up at once, of larger ones half.
 const HOPELESS_OF_SMALL: [f64; 3] = [0.27, 0.22, 0.17];
 const HOPELESS: [f64; 3] = [0.45, 0.4, 0.35];
-const MOST_STEPS: usize = 14;
-/// Steps of a fit in the light of another.
-const MOST_STEPS_OF_OTHER: usize = 7;
+
+/// When a fit ends.
+#[derive(Copy, Clone, Debug)]
+struct Effort {
+    most_steps: usize,
+    /// Steps of a fit in the light of another.
+    most_steps_of_other: usize,
+    /// A step that improves the cost by a smaller share is the last one.
+    least_gain: f64,
+}
+
+impl Effort {
+    const FULL: Self = Self { most_steps: 14, most_steps_of_other: 7, least_gain: 3e-4 };
+    /// Of a marker that is about where it is expected.
+    const OF_FOLLOWED: Self = Self { most_steps: 6, most_steps_of_other: 3, least_gain: 3e-3 };
+}
+
 /// Pose (5), blur, black, white, and white's change across and down.
 const UNKNOWNS: usize = 10;
 /// A tilt, in radians, that is no longer a saddle of the fit: seen squarely, every tilt looks the same at first.
 const LEAST_START_TILT: f64 = 0.2;
 /// The pose tilted the other way is no alternative when it costs so many times more.
 const MOST_COST_OF_OTHER: f64 = 4.0;
+/// Poses whose normals differ by less, in radians, are one.
+const DISTINCT_TILT: f64 = 0.02;
+/// Where one pose costs so many times another, the other is the better one whatever the other spots say.
+const CLOSE_COST: f64 = 1.15;
+/// A last step that gains a larger share of the cost than this is no small one.
+const MOST_GAIN: f64 = 0.5;
 /// What is known of a normal before it is measured, as a standard deviation in radians.
 const PRIOR_NORMAL: f64 = 0.6;
 
@@ -158,8 +178,59 @@ pub(crate) fn refined(
     let (best, other) = if second.cost < first.cost { (second, first) } else { (first, second) };
     let other = other.alternative(&all);
     let fit = all.fit(&best)?;
-    let same = fit.circles.normal.angle(&other.circles.normal) < 0.02;
+    let same = fit.circles.normal.angle(&other.circles.normal) < DISTINCT_TILT;
     Some((fit, (!same).then_some(other)))
+}
+
+/// As [`refined`], of a marker that is followed, from where it should be: most of the way goes by few of the spots, and one
+/// step by all of them. `None` for one so small that all of its pixels count, too.
+pub(crate) fn refined_again(
+    view: GrayView<'_>,
+    camera: &CameraModel,
+    expected: &Circles,
+    size_m: f64,
+    spots: &mut Vec<Spot>,
+) -> Option<(Fit, Option<Alternative>)> {
+    spots.clear();
+    let around = Around { view, camera, size_m, inverted: false };
+    around.gather(expected, FOCUSED_PX, spots)?;
+    if spots.len() < MANY_SPOTS {
+        return None;
+    }
+    let all = Scene::new(spots, size_m, camera, HOPELESS);
+    let few = Scene {
+        every: FEW_EVERY,
+        effort: Effort::OF_FOLLOWED,
+        ..Scene::new(spots, size_m, camera, HOPELESS)
+    };
+    let first = few.fitted(expected, None, None)?;
+    if first.difference(&few) > MOST_DIFFERENCE {
+        return None;
+    }
+    let mirrored = first.picture.circles.tilted_at_least(LEAST_START_TILT).mirrored();
+    let most = MOST_COST_OF_OTHER * first.cost;
+    let second = few.fitted(&mirrored, Some(&first), Some(most));
+    let (mut best, mut other) = match second {
+        Some(second) if second.cost < first.cost => (second, Some(first)),
+        second => (first, second),
+    };
+    // Which of the two it is all spots say, where few hardly do.
+    let is_open = other.as_ref().is_some_and(|other| other.cost < CLOSE_COST * best.cost);
+    best = all.stepped(&best)?;
+    if is_open {
+        let stepped = other.as_ref().and_then(|other| all.stepped(other));
+        other = match stepped {
+            Some(stepped) if stepped.cost < best.cost => {
+                Some(std::mem::replace(&mut best, stepped))
+            }
+            stepped => stepped,
+        };
+    }
+    let scene = if is_open { &all } else { &few };
+    let other = other
+        .map(|other| other.alternative(scene))
+        .filter(|other| other.circles.normal.angle(&best.picture.circles.normal) >= DISTINCT_TILT);
+    Some((all.fit_judged(&best, best.picture.worth(&few)?)?, other))
 }
 
 /// The marker tilted the other way.
@@ -223,11 +294,13 @@ impl Around<'_> {
                 let to = (outline.centre[axis] + half).ceil() + 1.0;
                 from..to.clamp(0.0, size[axis] as f64) as usize
             };
-            for y in bound(1) {
-                for x in bound(0) {
+            let (around, rim) = (around.axes(), outline.axes());
+            let (rows, columns) = (bound(1), bound(0));
+            for y in rows {
+                for x in columns.clone() {
                     let place = [x as f64, y as f64];
                     if around.radius_of(place) <= 1.0 {
-                        add(x, y, outline.radius_of(place) < 0.95);
+                        add(x, y, rim.radius_of(place) < 0.95);
                     }
                 }
             }
@@ -286,6 +359,7 @@ struct Scene<'a> {
     step: Step,
     /// The difference before each of the first steps above which there is no hope.
     hopeless: [f64; 3],
+    effort: Effort,
 }
 
 /// A picture that fits as well as any near it.
@@ -322,7 +396,8 @@ impl<'a> Scene<'a> {
                 *slot = (radius * size_m, (radius * size_m).ln());
             }
         }
-        Self { spots, every: 1, camera, radii, step: Step::new(), hopeless }
+        let (every, effort) = (1, Effort::FULL);
+        Self { spots, every, camera, radii, step: Step::new(), hopeless, effort }
     }
 
     /// The spots that count.
@@ -360,7 +435,8 @@ impl<'a> Scene<'a> {
         let least_steps = if like.is_some() { 1 } else { 3 };
         let (mut system, mut cost) = best.system(self, limit)?;
         let mut damping = if like.is_some() { 1e-4 } else { 1e-3 };
-        let most_steps = if like.is_some() { MOST_STEPS_OF_OTHER } else { MOST_STEPS };
+        let Effort { most_steps, most_steps_of_other, least_gain } = self.effort;
+        let most_steps = if like.is_some() { most_steps_of_other } else { most_steps };
         for step in 0..most_steps {
             // Of what is no marker most is seen at once to be none.
             let most = self.hopeless.get(step).filter(|_| like.is_none());
@@ -376,7 +452,7 @@ impl<'a> Scene<'a> {
             let candidate = best.stepped(&system, damping);
             match candidate.and_then(|c| Some((c, c.system(self, limit)?))) {
                 Some((next, (next_system, next_cost))) if next_cost <= cost => {
-                    let settled = cost - next_cost < 3e-4 * cost;
+                    let settled = cost - next_cost < least_gain * cost;
                     (best, system, cost) = (next, next_system, next_cost);
                     damping = (damping * 0.1).max(1e-7);
                     if like.is_none() && step == 2 {
@@ -398,9 +474,26 @@ impl<'a> Scene<'a> {
         fits.then_some(Fitted { picture: best, system, cost, limit })
     }
 
+    /// One step from a fit that is nearly this scene's: so near, what the cost is after it follows from what it is before.
+    fn stepped(&self, fitted: &Fitted) -> Option<Fitted> {
+        const DAMPING: f64 = 1e-6;
+        let limit = fitted.limit;
+        let (system, cost) = fitted.picture.system(self, limit)?;
+        let (picture, gain) = fitted.picture.stepped_by(&system, DAMPING)?;
+        (gain < MOST_GAIN * cost).then_some(Fitted { picture, system, cost: cost - gain, limit })
+    }
+
     fn fit(&self, fitted: &Fitted) -> Option<Fit> {
+        self.fit_judged(fitted, fitted.picture.worth(self)?)
+    }
+
+    /// What a fit says, as worth what [`Picture::worth`] says.
+    fn fit_judged(
+        &self,
+        fitted: &Fitted,
+        [beside_disc, balance, explained]: [f64; 3],
+    ) -> Option<Fit> {
         let picture = &fitted.picture;
-        let [beside_disc, balance, explained] = picture.worth(self)?;
         Some(Fit {
             circles: picture.circles,
             covariance: self.covariance(&fitted.system, fitted.cost)?,
@@ -610,18 +703,24 @@ impl Picture {
     }
 
     fn stepped(&self, system: &System, damping: f64) -> Option<Self> {
+        self.stepped_by(system, damping).map(|(picture, _)| picture)
+    }
+
+    /// The picture after a step, and by how much less it costs.
+    fn stepped_by(&self, system: &System, damping: f64) -> Option<(Self, f64)> {
         let mut matrix = system.matrix;
         for i in 0..UNKNOWNS {
             matrix[(i, i)] += damping * system.matrix[(i, i)] + 1e-9;
         }
         let step = matrix.cholesky()?.solve(&system.right);
-        Some(Self {
+        let picture = Self {
             circles: self.circles.moved(&step.fixed_rows::<5>(0).into_owned())?,
             blur_px: (self.blur_px + step[5].clamp(-0.3, 0.3)).clamp(0.3, 6.0),
             black: self.black + step[6],
             white: self.white + step[7],
             slope: [self.slope[0] + step[8], self.slope[1] + step[9]],
-        })
+        };
+        Some((picture, step.dot(&system.right)))
     }
 }
 

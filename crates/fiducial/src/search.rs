@@ -135,11 +135,34 @@ impl Search<'_> {
         edges: &mut Vec<EdgePoint>,
         spots: &mut Vec<Spot>,
     ) -> Option<Seen> {
-        if expected.outline(self.size_m / 2.0, self.camera)?.major < SMALL_PX {
+        let diameter_px = expected.outline(self.size_m / 2.0, self.camera)?.major;
+        if diameter_px < SMALL_PX {
             return None;
+        }
+        if let Some(seen) = self.at_expected(expected, diameter_px, edges, spots) {
+            return Some(seen);
         }
         let rough = self.rough(expected, edges)?;
         self.at_once(&rough, edges, spots)
+    }
+
+    /// The marker right where this pose has it, when its grey values and its edges are a marker's.
+    fn at_expected(
+        &self,
+        expected: &Circles,
+        diameter_px: f64,
+        edges: &mut Vec<EdgePoint>,
+        spots: &mut Vec<Spot>,
+    ) -> Option<Seen> {
+        let (view, camera) = (self.view, self.camera);
+        let (fit, other) = photometry::refined_again(view, camera, expected, self.size_m, spots)?;
+        let is_near = self.is_near(expected, &fit.circles, 1.0 + 0.03 * diameter_px, 0.1);
+        if !is_near || !is_plain(&fit) {
+            return None;
+        }
+        let support = self.measure(&fit.circles, Reach::Near, edges);
+        let seen = self.seen_by_grey_values(&fit, other, confidence(&support))?;
+        (believable(&support) == Belief::All).then_some(seen)
     }
 
     /// A marker too small for edges: its grey values decide.
@@ -257,10 +280,8 @@ impl Search<'_> {
             self.inverted,
             spots,
         )?;
-        let is_it = fit.difference < MOST_DIFFERENCE
-            && fit.is_marker()
-            && fit.explained > LEAST_EXPLAINED
-            && self.is_near(circles, &fit.circles, 0.3 + 0.01 * diameter_px, 0.1);
+        let is_it =
+            is_plain(&fit) && self.is_near(circles, &fit.circles, 0.3 + 0.01 * diameter_px, 0.1);
         is_it.then_some((fit, other))
     }
 
@@ -459,6 +480,11 @@ impl Search<'_> {
             None => Sight::Nothing,
         }
     }
+}
+
+/// Whether a fit looks like a marker with nothing on it.
+fn is_plain(fit: &Fit) -> bool {
+    fit.difference < MOST_DIFFERENCE && fit.is_marker() && fit.explained > LEAST_EXPLAINED
 }
 
 /// How far from where it should be an edge is looked for: at first as far as its neighbours allow.
