@@ -1,4 +1,4 @@
-//! No image takes much longer than a frame from a camera.
+//! Images of any size are looked at, and none takes much longer than a frame from a camera.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
@@ -81,5 +81,17 @@ fn any_image_is_looked_at_in_bounded_time() {
         }
         println!("{name}: {least:.1} times a normal frame");
         assert!(least <= MOST, "{name}: {least:.1} times as long as a normal frame");
+    }
+}
+
+#[test]
+fn images_of_any_size_are_looked_at() {
+    let mut detector = detector();
+    assert!(GrayView::packed(&[], 0, 0).is_err());
+    for (width, height) in [(1, 1), (2, 3), (16_384, 1), (1, 16_384), (16_384, 40), (7, 16_384)] {
+        let pixels: Vec<u8> = (0..width * height).map(scattered).collect();
+        let view = GrayView::packed(&pixels, width, height).unwrap();
+        let found = detector.detect(view, None, &mut ()).len();
+        assert_eq!(found, 0, "{width} x {height}");
     }
 }
