@@ -186,7 +186,7 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
 }
 
 fn success_size(outcomes: &[Outcome]) -> (u32, u32) {
-    (1100, 110 + 30 * cells(outcomes).len() as u32)
+    (1250, 110 + 30 * cells(outcomes).len() as u32)
 }
 
 /// The share within a decimetre, with its interval, for each cell.
@@ -197,8 +197,22 @@ fn success(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
         .caption("Share that landed within 0.1 m, with its 95 % interval", ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(40)
-        .build_cartesian_2d(0.0..160.0, 0.0..count)?;
-    chart.configure_mesh().disable_y_mesh().disable_y_axis().x_desc("%").x_labels(9).draw()?;
+        .build_cartesian_2d(0.0..200.0, 0.0..count)?;
+    // Right of 100 % there is room for what the lines are of.
+    let percent =
+        |share: &f64| if *share > 100.5 { String::new() } else { format!("{share:.0} %") };
+    chart
+        .configure_mesh()
+        .disable_mesh()
+        .disable_y_axis()
+        .axis_style(TRANSPARENT)
+        .x_labels(11)
+        .x_label_formatter(&percent)
+        .draw()?;
+    for tick in (0..=100u32).step_by(20).map(f64::from) {
+        let line = PathElement::new([(tick, 0.0), (tick, count)], GREY.mix(0.5));
+        chart.draw_series([line])?;
+    }
     for (index, (name, members)) in cells.iter().enumerate() {
         let y = count - index as f64 - 0.5;
         let hits = members.iter().filter(|o| o.is_within(0.1)).count();

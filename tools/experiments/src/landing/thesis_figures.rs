@@ -1,5 +1,7 @@
 //! The thesis' Figures 4.10 to 4.16 for one flight: its way, position and command along each axis, and wind and command.
 
+use std::ops::Range;
+
 use plotters::prelude::*;
 
 use super::flight::Sample;
@@ -48,6 +50,14 @@ fn component(vector: [f64; 3], axis: usize) -> f64 {
     vector.get(axis).copied().unwrap_or_default()
 }
 
+/// What is left free above the curves for the legend, as a part of their height.
+const LEGEND_PART: f64 = 0.32;
+
+fn with_legend(range: Range<f64>) -> Range<f64> {
+    let height = range.end - range.start;
+    range.start..range.end + 0.5 * LEGEND_PART * height
+}
+
 /// Curves over time.
 fn curves(caption: &str, samples: &[Sample], curves: &[Curve<'_>]) -> anyhow::Result<String> {
     let values = || curves.iter().flat_map(|curve| samples.iter().filter_map(curve.of));
@@ -61,7 +71,7 @@ fn curves(caption: &str, samples: &[Sample], curves: &[Curve<'_>]) -> anyhow::Re
             .margin(12)
             .x_label_area_size(40)
             .y_label_area_size(56)
-            .build_cartesian_2d(0.0..last_s, least - rim..most + rim)?;
+            .build_cartesian_2d(0.0..last_s, least - rim..most + LEGEND_PART * (most - least))?;
         chart.configure_mesh().x_desc("time, s").draw()?;
         for (index, curve) in curves.iter().enumerate() {
             let points = samples.iter().filter_map(|s| Some((s.time_s, (curve.of)(s)?)));
@@ -108,7 +118,7 @@ fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
                 .margin(12)
                 .x_label_area_size(40)
                 .y_label_area_size(50)
-                .build_cartesian_2d(range(across), range(up))?;
+                .build_cartesian_2d(range(across), with_legend(range(up)))?;
             chart.configure_mesh().x_desc("east, m").y_desc(axis).draw()?;
             let flat = |p: [f64; 3]| (component(p, across), component(p, up));
             draw_curve(&mut chart, 0, "vehicle", samples.iter().map(|s| flat(place(s))).collect())?;
