@@ -15,19 +15,23 @@
 //! at the edge. A vehicle that leans into the wind looks past the target; above `view_height_m` it stays so far upwind
 //! that the marker remains in view.
 //!
-//! Where the error comes from, in 100 modelled flights in 5 m/s of wind with turbulence 3 (`examples/landings.rs`), median and worst:
+//! Where the error comes from, in 100 modelled flights in 5 m/s of wind with turbulence 3 (`alight experiment landing`), median and
+//! worst, and the largest slide at the touch:
 //!
-//! | change | error, m |
-//! |---|---|
-//! | as it is | 0.017, 0.075 |
-//! | LAND from 0.2 m | 0.026, 0.085 |
-//! | LAND from 0.4 m | 0.061, 0.148 |
-//! | LAND from 0.8 m | 0.116, 0.322 |
-//! | half of the gains, no look ahead | 0.040, 0.148 |
-//! | an autopilot that knows the truth | 0.014, 0.041 |
+//! | change | error, m | slide, m/s |
+//! |---|---|---|
+//! | as it is | 0.017, 0.066 | 0.09 |
+//! | LAND from 0.1 m | 0.017, 0.062 | 0.16 |
+//! | LAND from 0.2 m | 0.028, 0.098 | 0.29 |
+//! | LAND from 0.4 m | 0.067, 0.185 | 0.30 |
+//! | LAND from 0.8 m | 0.113, 0.427 | 0.24 |
+//! | half of the gains, no look ahead | 0.045, 0.157 | 0.18 |
+//! | the reported velocity believed | 0.024, 0.070 | 0.08 |
+//! | an autopilot that knows the truth | 0.014, 0.067 | 0.15 |
 //!
 //! The end: below `blind_height_m` the vehicle goes on down on the estimate when the marker leaves the view. LAND follows no target
-//! and in gusts drifts by a decimetre in a second, so it takes over only a hand's breadth above the ground.
+//! and in gusts drifts by a decimetre in a second, so it takes over only half a hand's breadth above the ground, and only from a vehicle
+//! that hardly moves sideways.
 
 use geometry::{Body, Ned, Point, Vector};
 use serde::Deserialize;
