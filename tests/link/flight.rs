@@ -128,10 +128,19 @@ pub(crate) async fn cut(radio: Radio, seed: u64, seconds: f64) -> anyhow::Result
     let watch = Watch::new(&site).await?;
     site.flight(seed, &[])?;
     let statuses = site.node.subscriber(topic::STATUS, &[]).await?;
-    let both = |s: &ControllerStatus| s.candidates.len() == 2 && s.active_detector.is_some();
-    until(&statuses, "both detectors are there", both).await?;
-    let prefer = ControllerCommand::UseDetector("ground".into());
-    site.node.command(topic::COMMAND, &[], &prefer).await?;
+    until(&statuses, "both detectors are there, on the way down", |s| {
+        s.candidates.len() == 2 && s.phase == "descend"
+    })
+    .await?;
+    // It waits up there, however long the ground takes to keep up on a busy machine.
+    for command in [ControllerCommand::Hold, ControllerCommand::UseDetector("ground".into())] {
+        site.node.command(topic::COMMAND, &[], &command).await?;
+    }
+    until(&statuses, "the one on the ground is used", |s| {
+        s.active_detector.as_deref() == Some("ground") && s.phase == "hold"
+    })
+    .await?;
+    site.node.command(topic::COMMAND, &[], &ControllerCommand::Resume).await?;
     until(&statuses, "it descends by the one on the ground", |s| {
         s.active_detector.as_deref() == Some("ground")
             && s.phase == "descend"
