@@ -143,33 +143,56 @@ struct Pictures<R> {
     input: R,
     form: Form,
     /// From picture to picture.
-    period: Duration,
-    /// When the one before this came, and when it had been read.
-    before_ns: Option<(i64, i64)>,
+    period_ns: i64,
+    /// When the one before this came.
+    before_ns: Option<i64>,
     count: u64,
 }
 
 impl<R: AsyncBufRead + Unpin> Pictures<R> {
     fn new(input: R, form: Form, period: Duration) -> Self {
-        Self { input, form, period, before_ns: None, count: 0 }
+        let period_ns = period.as_nanos().try_into().unwrap_or(i64::MAX);
+        Self { input, form, period_ns, before_ns: None, count: 0 }
     }
 
     /// Waits for the first byte of a picture; `None` at the end.
     async fn wait(&mut self) -> std::io::Result<Option<Arrival>> {
         let asked_ns = now_ns();
-        if self.input.fill_buf().await?.is_empty() {
+        let begins = match self.form {
+            Form::Samples { .. } => !self.input.fill_buf().await?.is_empty(),
+            Form::Jpeg { most_bytes } => self.find_jpeg(most_bytes).await?,
+        };
+        if !begins {
             return Ok(None);
         }
         let stamp_ns = now_ns();
-        // What comes sooner than a camera can is from a queue. What was there when it was asked for may have come at any
-        // time since the last one was read.
-        let soon_ns = self.period.as_nanos() as i64 / 2;
-        let has_waited = self.before_ns.is_some_and(|(came_ns, read_ns)| {
-            let was_there = stamp_ns - asked_ns < WAKE_UP_NS;
-            stamp_ns - came_ns < soon_ns || (was_there && asked_ns - read_ns > soon_ns)
-        });
-        self.before_ns = Some((stamp_ns, stamp_ns));
+        let has_waited = self
+            .before_ns
+            .is_some_and(|before_ns| has_waited(before_ns, asked_ns, stamp_ns, self.period_ns));
+        self.before_ns = Some(stamp_ns);
         Ok(Some(Arrival { stamp_ns, has_waited }))
+    }
+
+    /// Passes over what stands before the next start marker, and its first byte; false at the end.
+    async fn find_jpeg(&mut self, most_bytes: usize) -> std::io::Result<bool> {
+        let mut passed = 0;
+        let mut follows_ff = false;
+        loop {
+            let there = self.input.fill_buf().await?;
+            match there {
+                [] => return Ok(false),
+                [0xd8, ..] if follows_ff => return Ok(true),
+                _ => {}
+            }
+            let next = there.iter().position(|byte| *byte == 0xff);
+            follows_ff = next.is_some();
+            let taken = next.map_or(there.len(), |at| at + 1);
+            self.input.consume(taken);
+            passed += taken;
+            if passed > most_bytes {
+                return Err(no_jpeg("begins", most_bytes));
+            }
+        }
     }
 
     async fn read(&mut self, samples: &mut [u8]) -> std::io::Result<Vec<u8>> {
@@ -185,9 +208,6 @@ impl<R: AsyncBufRead + Unpin> Pictures<R> {
             Form::Jpeg { most_bytes } => self.read_jpeg(most_bytes).await?,
         };
         self.count += 1;
-        if let Some((_, read_ns)) = &mut self.before_ns {
-            *read_ns = now_ns();
-        }
         Ok(jpeg)
     }
 
@@ -205,47 +225,52 @@ impl<R: AsyncBufRead + Unpin> Pictures<R> {
         Ok(())
     }
 
-    /// Reads up to the end marker, beginning at the next start marker.
+    /// Reads up to the end marker, from the second byte on.
     async fn read_jpeg(&mut self, most_bytes: usize) -> std::io::Result<Vec<u8>> {
-        let mut jpeg = Vec::new();
+        let mut jpeg = vec![0xff];
         loop {
             let there = self.input.fill_buf().await?;
             if there.is_empty() {
                 return Err(std::io::ErrorKind::UnexpectedEof.into());
             }
-            let before = jpeg.len();
+            let (before, read) = (jpeg.len(), there.len());
             jpeg.extend_from_slice(there);
-            let read = there.len();
-            let start = jpeg.windows(3).position(|bytes| bytes == [0xff, 0xd8, 0xff]);
-            let len = start.and_then(|start| Some(start + jpeg_len(jpeg.get(start..)?)?));
+            let len = jpeg_len(&jpeg);
             self.input.consume(len.map_or(read, |len| len.saturating_sub(before)));
-            match (start, len) {
-                (Some(start), Some(len)) => {
-                    jpeg.truncate(len);
-                    jpeg.drain(..start);
-                    return Ok(jpeg);
-                }
-                _ if jpeg.len() > most_bytes => {
-                    return Err(std::io::Error::other(format!(
-                        "no JPEG ends within {most_bytes} bytes; does it write what `source.pixels` says?"
-                    )));
-                }
-                _ => {}
+            if let Some(len) = len {
+                jpeg.truncate(len);
+                return Ok(jpeg);
+            }
+            if jpeg.len() > most_bytes {
+                return Err(no_jpeg("ends", most_bytes));
             }
         }
     }
 }
 
-/// What was there already is given within this time.
-const WAKE_UP_NS: i64 = 200_000;
+/// What is there when it is asked for is given within this time, in nanoseconds.
+const AT_ONCE_NS: i64 = 200_000;
+
+/// True for a picture that comes sooner after the one before than a camera can, which is from a queue; and for one that was
+/// there when it was asked for, later than it was due: it may have come at any time since then.
+fn has_waited(before_ns: i64, asked_ns: i64, stamp_ns: i64, period_ns: i64) -> bool {
+    let quarter_ns = period_ns / 4;
+    let since_ns = stamp_ns - before_ns;
+    let was_there = stamp_ns - asked_ns < AT_ONCE_NS;
+    since_ns < quarter_ns || (was_there && since_ns > period_ns.saturating_add(quarter_ns))
+}
+
+fn no_jpeg(what: &str, most_bytes: usize) -> std::io::Error {
+    std::io::Error::other(format!(
+        "no JPEG {what} within {most_bytes} bytes; does it write what `source.pixels` says?"
+    ))
+}
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use ::image::{GrayImage, ImageFormat, Luma};
     use std::io::Cursor;
-    use tokio::io::{AsyncWriteExt, duplex};
-
     const PERIOD: Duration = Duration::from_millis(40);
 
     async fn all(form: Form, bytes: &[u8]) -> Result<Vec<Vec<u8>>, String> {
@@ -290,31 +315,15 @@ mod tests {
         assert!(problem.contains("`source.pixels`"), "{problem}");
     }
 
-    #[tokio::test]
-    async fn pictures_that_have_waited_are_known() {
-        let (mut camera, output) = duplex(1 << 16);
-        let form = Form::Samples { row: (4, 4), rows: 1, rest: 0 };
-        let mut pictures = Pictures::new(BufReader::new(output), form, PERIOD);
-        let mut next = async || {
-            let arrival = pictures.wait().await.unwrap().unwrap();
-            pictures.read(&mut [0; 4]).await.unwrap();
-            arrival.has_waited
-        };
-        camera.write_all(&[0; 4]).await.unwrap();
-        assert!(!next().await, "the first one");
-        let (has_waited, ()) = tokio::join!(next(), async {
-            tokio::time::sleep(PERIOD).await;
-            camera.write_all(&[0; 4]).await.unwrap();
-        });
-        assert!(!has_waited, "it came while it was waited for");
-        // Three at once, while nobody reads.
-        camera.write_all(&[0; 12]).await.unwrap();
-        tokio::time::sleep(PERIOD).await;
-        assert_eq!([next().await, next().await, next().await], [true; 3]);
-        let (has_waited, ()) = tokio::join!(next(), async {
-            tokio::time::sleep(PERIOD).await;
-            camera.write_all(&[0; 4]).await.unwrap();
-        });
-        assert!(!has_waited, "it came while it was waited for again");
+    #[test]
+    fn pictures_that_have_waited_are_known() {
+        const MS: i64 = 1_000_000;
+        let has_waited = |asked_ms, stamp_ns| has_waited(0, asked_ms * MS, stamp_ns, 40 * MS);
+        assert!(!has_waited(5, 40 * MS), "it was waited for");
+        assert!(!has_waited(5, 200 * MS), "the camera made a pause");
+        assert!(!has_waited(30, 30 * MS), "a little early, and there at once");
+        assert!(!has_waited(45, 45 * MS), "there at once, as it should be by now");
+        assert!(has_waited(3, 9 * MS), "no camera is so quick");
+        assert!(has_waited(70, 70 * MS), "there since some time between 40 and 70 ms");
     }
 }

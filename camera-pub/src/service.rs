@@ -224,26 +224,34 @@ impl Stream {
     async fn publish_program(&mut self, config: &ProgramConfig) -> anyhow::Result<()> {
         let mosaic = self.config.source.mosaic()?;
         let mut program = Program::start(config)?;
+        let mut fit = Instant::now();
         loop {
             let arrival = program.wait().await?;
             let began = Instant::now();
-            let mut frame = match config.form {
-                Form::Samples { .. } => {
-                    let mut pixels = self.frames.loan(config.form.frame_bytes());
-                    program.read(&mut pixels).await?;
-                    self.of_samples(pixels, config, mosaic)
-                }
-                Form::Jpeg { .. } => match self.of_jpeg(&program.read(&mut []).await?) {
-                    Some(frame) => frame,
-                    None => continue,
-                },
+            let mut pixels = match config.form {
+                Form::Samples { .. } => self.frames.loan(config.form.frame_bytes()),
+                Form::Jpeg { .. } => Loan::Private(Vec::new()),
             };
-            frame.stamp_ns = Some(arrival.stamp_ns - config.delay_ns);
-            self.health.latency("read", began.elapsed());
+            let jpeg = program.read(&mut pixels).await?;
             if arrival.has_waited {
                 self.health.dropped("picture that has waited");
-            } else {
-                self.publish(frame).await;
+                ensure!(
+                    fit.elapsed() < config.silence,
+                    "the pictures of `source.command` come in heaps, or more than four times as often as `source.rate_hz` \
+                     ({}) says, so that the age of none is known; set the rate that the program was asked for",
+                    config.rate_hz
+                );
+                continue;
+            }
+            fit = Instant::now();
+            let frame = match config.form {
+                Form::Samples { .. } => Some(self.of_samples(pixels, config, mosaic)),
+                Form::Jpeg { .. } => self.of_jpeg(&jpeg),
+            };
+            self.health.latency("read", began.elapsed());
+            if let Some(frame) = frame {
+                let stamp_ns = Some(arrival.stamp_ns - config.delay_ns);
+                self.publish(Prepared { stamp_ns, ..frame }).await;
             }
         }
     }

@@ -245,10 +245,13 @@ async fn the_service_says_how_a_camera_s_program_ended() -> anyhow::Result<()> {
     let silent = problem(&["sleep", "60"], &["source.silence_s=0.2"]).await?;
     ensure!(silent.contains("no picture came from `sleep` for 0.2 s"), "{silent}");
     let stuck = ["sh", "-c", "head -c 100 /dev/zero; exec sleep 60"];
-    let stuck = problem(&stuck, &["source.silence_s=0.2"]).await?;
+    let stuck = problem(&stuck, &["source.silence_s=3"]).await?;
     ensure!(stuck.contains("in the middle of a picture"), "{stuck}");
     let other = problem(&["head", "-c", "900000", "/dev/zero"], &["source.pixels=mjpeg"]).await?;
     ensure!(other.contains("what `source.pixels` says"), "{other}");
+    let fast = ["sh", "-c", "while head -c 3072 /dev/zero; do sleep 0.001; done"];
+    let fast = problem(&fast, &["source.rate_hz=0.1", "source.silence_s=0.5"]).await?;
+    ensure!(fast.contains("`source.rate_hz` (0.1)"), "{fast}");
     Ok(())
 }
 
