@@ -31,7 +31,7 @@ const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
 /// How often a detector tells about itself, for those whose link was cut.
 const INFO_PERIOD: Duration = Duration::from_secs(1);
 /// A frame that is older than the newest by more than this belongs to a camera that began anew, in nanoseconds.
-const OVERTAKEN_NS: i64 = 5_000_000_000;
+const OVERTAKEN_NS: i64 = 1_000_000_000;
 /// Time for the answer to a last command to leave.
 const FAREWELL: Duration = Duration::from_millis(100);
 
@@ -211,7 +211,7 @@ impl Work {
             .name("detect".to_owned())
             .spawn(move || {
                 while let Some(frame) = runtime.block_on(self.frames.next()) {
-                    runtime.block_on(self.search(&frame));
+                    runtime.block_on(self.search_newest(frame));
                 }
                 drop(running);
             })
@@ -219,16 +219,32 @@ impl Work {
         Ok((stopped, thread))
     }
 
+    /// Searches a frame, or one that waits behind it if that is newer: over the air they may come in any order. Each of them
+    /// gets its receipt.
+    async fn search_newest(&mut self, first: Frame) {
+        let mut newest = None;
+        let mut next = Some(first);
+        while let Some(frame) = next {
+            let is_jpeg = frame.header.format == PixelFormat::Jpeg;
+            if is_jpeg {
+                self.receipts.publish(&self.receipt(&frame)).await;
+            }
+            let is_overtaken = is_jpeg && self.is_overtaken(&frame.header);
+            let left_out = if is_overtaken { Some(frame) } else { newest.replace(frame) };
+            if left_out.is_some() {
+                self.node.shared_health().dropped("frames that a newer one has overtaken");
+            }
+            next = if is_jpeg { self.frames.waiting() } else { None };
+        }
+        if let Some(frame) = newest {
+            self.search(&frame).await;
+        }
+    }
+
     async fn search(&mut self, frame: &Frame) {
         self.take_change();
         let health = self.node.shared_health();
         let is_jpeg = frame.header.format == PixelFormat::Jpeg;
-        if is_jpeg {
-            self.receipts.publish(&self.receipt(frame)).await;
-            if self.is_overtaken(&frame.header) {
-                return health.dropped("frames that a newer one has overtaken");
-            }
-        }
         health.count("frames");
         if frame.header.clock == clock_name() {
             health.latency("stamp to frame", age(&frame.header));

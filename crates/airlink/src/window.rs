@@ -30,8 +30,9 @@ const LANES: usize = 2;
 /// overtaken (RFC 6298, section 2).
 const DEVIATION_WEIGHT: f64 = 0.25;
 const DEVIATIONS: f64 = 4.0;
-/// A frame is never overtaken before this many times the time aimed at.
+/// A frame is never overtaken before this many times the time aimed at, and the mean and this part of it.
 const LEAST_PATIENCE: f64 = 1.5;
+const LEAST_DEVIATION: f64 = 0.25;
 /// The slower receivers of a frame are waited for so many times the time aimed at.
 const PATIENCE_WITH_OTHERS: f64 = 2.0;
 /// How fast the size grows with every frame that arrives in time.
@@ -155,7 +156,7 @@ impl Window {
     /// After this time without an answer a frame is overtaken.
     fn late_ns(&self) -> i64 {
         let Some(mean_ms) = self.mean_ms else { return self.timeout_ns };
-        let late_ms = mean_ms + DEVIATIONS * self.deviation_ms;
+        let late_ms = mean_ms + (DEVIATIONS * self.deviation_ms).max(LEAST_DEVIATION * mean_ms);
         ((late_ms.max(LEAST_PATIENCE * self.aim_ms) * 1e6) as i64).min(self.timeout_ns)
     }
 
@@ -321,6 +322,25 @@ mod tests {
         window.sent(300 * MS, 4, 1000);
         assert!(!window.is_open(629 * MS).0);
         assert_eq!(window.is_open(630 * MS), (true, 1));
+    }
+
+    #[test]
+    fn a_link_that_becomes_slow_after_a_steady_time_is_followed() {
+        let mut window = window();
+        let after = |window: &mut Window, frames: std::ops::Range<u64>, took_ms: i64| {
+            for sequence in frames {
+                let now = sequence as i64 * 300 * MS;
+                window.sent(now, sequence, 1000);
+                window.received(now + took_ms * MS, "ground", sequence);
+            }
+            window.late_ns()
+        };
+        // Ever the same time: nothing deviates.
+        let late_ns = after(&mut window, 0..60, 58);
+        // 1.5 times what is aimed at, or the mean and a quarter of it.
+        assert!((72 * MS..=75 * MS).contains(&late_ns), "{late_ns}");
+        let late_ns = after(&mut window, 60..120, 160);
+        assert!(late_ns > 160 * MS, "{late_ns}");
     }
 
     #[test]

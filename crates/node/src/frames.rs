@@ -9,7 +9,7 @@ use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
 
 use anyhow::anyhow;
-use messages::{Delivery, FrameHeader, PixelFormat, Topic, decode, encode};
+use messages::{Delivery, FrameHeader, PixelFormat, Topic, decode, encode, topic};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::{RingChannel, RingChannelHandler};
@@ -30,6 +30,7 @@ const FRAMES_IN_POOL: usize = 4;
 /// Over the air a priority is a connection (`zenoh-config/README.md`): frames have two.
 const FIRST_LANE: Priority = Priority::DataLow;
 const SECOND_LANE: Priority = Priority::Background;
+const LANES: usize = 2;
 
 /// Publishes frames on one key.
 pub struct FramePublisher {
@@ -111,10 +112,12 @@ impl Node {
         names: &[&str],
     ) -> anyhow::Result<FrameSubscriber> {
         let key = topic.key(names);
+        // Over the air frames come by two lanes, and an older one may be the later: it must not push out the newer one.
+        let waiting = if key == topic::JPEG.key(names) { LANES } else { 1 };
         let subscriber = self
             .session
             .declare_subscriber(key.clone())
-            .with(RingChannel::new(1))
+            .with(RingChannel::new(waiting))
             .await
             .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
         Ok(FrameSubscriber { subscriber, health: self.shared_health() })
@@ -200,27 +203,41 @@ impl Frame {
 }
 
 impl FrameSubscriber {
-    /// The newest frame; `None` once the session is closed. A frame whose header cannot be read, or whose bytes do
+    /// The newest frame, of frames over the air one of the newest two; `None` once the session is closed. A frame whose header cannot be read, or whose bytes do
     /// not fit its header, is counted and logged once.
     pub async fn next(&self) -> Option<Frame> {
         loop {
             let sample = self.subscriber.recv_async().await.ok()?;
-            let attachment = sample.attachment().map(|a| a.to_bytes()).unwrap_or_default();
-            match decode::<FrameHeader>(&attachment) {
-                Err(problem) => {
-                    report_refused(&self.health, sample.key_expr().as_str(), &problem);
-                }
-                Ok(header) if !fits(&header, sample.payload().len()) => {
-                    if self.health.failed("frame of the wrong length") {
-                        tracing::warn!(
-                            ?header,
-                            len = sample.payload().len(),
-                            "A frame was refused: its bytes do not fit its header"
-                        );
-                    }
-                }
-                Ok(header) => return Some(Frame { header, payload: sample.payload().clone() }),
+            if let Some(frame) = self.frame(&sample) {
+                return Some(frame);
             }
+        }
+    }
+
+    /// A frame that has come already; `None` when none waits.
+    pub fn waiting(&self) -> Option<Frame> {
+        let sample = self.subscriber.try_recv().ok().flatten()?;
+        self.frame(&sample)
+    }
+
+    fn frame(&self, sample: &Sample) -> Option<Frame> {
+        let attachment = sample.attachment().map(|a| a.to_bytes()).unwrap_or_default();
+        match decode::<FrameHeader>(&attachment) {
+            Err(problem) => {
+                report_refused(&self.health, sample.key_expr().as_str(), &problem);
+                None
+            }
+            Ok(header) if !fits(&header, sample.payload().len()) => {
+                if self.health.failed("frame of the wrong length") {
+                    tracing::warn!(
+                        ?header,
+                        len = sample.payload().len(),
+                        "A frame was refused: its bytes do not fit its header"
+                    );
+                }
+                None
+            }
+            Ok(header) => Some(Frame { header, payload: sample.payload().clone() }),
         }
     }
 }
