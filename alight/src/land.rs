@@ -329,12 +329,24 @@ impl MeetingPoint {
     }
 }
 
+/// Ports that Linux gives to nobody who asks for just any (`ip_local_port_range` begins at 32768): what is free there still is
+/// when its service listens.
+const PORTS: std::ops::Range<u16> = 20_000..32_000;
+
+/// A port that can be bound so. Programs begin to look at different ones, so that two that start at once do not meet.
+fn free_port<T>(bind: impl Fn((&'static str, u16)) -> std::io::Result<T>) -> anyhow::Result<u16> {
+    let first = std::process::id().wrapping_mul(97);
+    let port = |further| PORTS.start + (first.wrapping_add(further) % PORTS.len() as u32) as u16;
+    (0..100)
+        .map(port)
+        .find(|port| bind(("127.0.0.1", *port)).is_ok())
+        .with_context(|| format!("finding a free port from {} to {}", PORTS.start, PORTS.end))
+}
+
 fn free_tcp_port() -> anyhow::Result<u16> {
-    let listener = std::net::TcpListener::bind("127.0.0.1:0").context("finding a free port")?;
-    Ok(listener.local_addr()?.port())
+    free_port(std::net::TcpListener::bind)
 }
 
 fn free_udp_port() -> anyhow::Result<u16> {
-    let socket = std::net::UdpSocket::bind("127.0.0.1:0").context("finding a free port")?;
-    Ok(socket.local_addr()?.port())
+    free_port(std::net::UdpSocket::bind)
 }

@@ -1,26 +1,37 @@
 //! Ports that are free, for the tests that name them in a file before anybody listens there.
 
 use std::net::{TcpListener, UdpSocket};
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use anyhow::Context;
+
+/// Ports that Linux gives to nobody who asks for just any, so that what is free there stays so.
+const FIRST: u32 = 20_000;
+const COUNT: u32 = 12_000;
+/// No port is chosen twice by one process, and processes begin at different ones.
+static CHOSEN: AtomicU32 = AtomicU32::new(0);
 
 /// So many TCP ports, one that is followed by two more free ones, as an air link needs them, and a UDP port; all different.
 pub(crate) fn free<const N: usize>() -> anyhow::Result<([u16; N], u16, u16)> {
-    // They stay taken until all are chosen, or one could be chosen twice.
-    let mut taken = Vec::new();
     let mut ports = [0; N];
     for port in &mut ports {
-        let listener = TcpListener::bind("127.0.0.1:0")?;
-        *port = listener.local_addr()?.port();
-        taken.push(listener);
+        *port = row(1)?;
     }
-    let row = loop {
-        let listener = TcpListener::bind("127.0.0.1:0")?;
-        let port = listener.local_addr()?.port();
-        let next =
-            [1, 2].map(|further| TcpListener::bind(("127.0.0.1", port.wrapping_add(further))));
-        if next.iter().all(Result::is_ok) {
-            break port;
-        }
+    Ok((ports, row(3)?, row(1)?))
+}
+
+/// The first of so many neighbouring ports.
+fn row(len: u16) -> anyhow::Result<u16> {
+    let is_free = |port: u16| {
+        TcpListener::bind(("127.0.0.1", port)).is_ok()
+            && UdpSocket::bind(("127.0.0.1", port)).is_ok()
     };
-    let udp = UdpSocket::bind("127.0.0.1:0")?.local_addr()?.port();
-    Ok((ports, row, udp))
+    let begin = std::process::id().wrapping_mul(97);
+    (0..1000)
+        .map(|_| {
+            let chosen = CHOSEN.fetch_add(u32::from(len), Ordering::Relaxed);
+            (FIRST + begin.wrapping_add(chosen) % (COUNT - u32::from(len))) as u16
+        })
+        .find(|first| (*first..first + len).all(is_free))
+        .context("no free port of 1000 that were tried")
 }
