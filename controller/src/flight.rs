@@ -570,11 +570,12 @@ impl Flight {
             .is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
     }
 
-    /// True when there is no landing to be taken up: it has ended, or the pilot flies.
+    /// True when there is no landing to be taken up: it has ended, though the motors may still run, or the pilot flies.
     fn is_nobodys_landing(&self) -> bool {
-        self.autopilot
-            .state()
-            .is_some_and(|s| !s.armed || !s.mode.is_guided() && !s.mode.is_landing())
+        self.autopilot.state().is_some_and(|s| {
+            let stands = s.landed == autopilot::LandedState::OnGround;
+            !s.armed || stands || !s.mode.is_guided() && !s.mode.is_landing()
+        })
     }
 
     fn operator(&mut self, now_ns: i64, command: OperatorCommand) -> Result<String, String> {
@@ -1354,6 +1355,46 @@ mod tests {
         ] {
             let phases = next_flight(start, mode, contact);
             assert_eq!((phases.0.as_str(), phases.1.as_str()), (first, next), "{start} in {mode}");
+        }
+    }
+
+    #[test]
+    fn a_controller_restarted_after_the_touch_lands_no_later_flight_with_the_motors_still_running()
+    {
+        let first_and_next = |mode: u32, contact_at_start: MavLandedState| {
+            let mut flight = flight("resume");
+            flight.presence(0, "main", true);
+            hear(&mut flight, 0, &heartbeat(mode, true));
+            // Whether it stands is not known yet.
+            hover(&mut flight, 20, 500, mode);
+            hear(&mut flight, 500 * MS, &contact(contact_at_start));
+            hover(&mut flight, 520, 1000, mode);
+            let first = flight.status(1000 * MS).phase;
+            hear(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+            hover(&mut flight, 5020, 5500, 4);
+            (first, flight.status(5500 * MS).phase)
+        };
+        let on_ground = MavLandedState::MAV_LANDED_STATE_ON_GROUND;
+        for mode in [4, 9] {
+            let (first, next) = first_and_next(mode, on_ground);
+            assert_eq!((first.as_str(), next.as_str()), ("idle", "idle"), "in mode {mode}");
+        }
+        let (first, _) = first_and_next(4, MavLandedState::MAV_LANDED_STATE_IN_AIR);
+        assert_eq!(first, "search");
+    }
+
+    #[test]
+    fn a_controller_restarted_in_the_last_metre_of_land_takes_the_landing_up() {
+        for contact_at_start in
+            [MavLandedState::MAV_LANDED_STATE_LANDING, MavLandedState::MAV_LANDED_STATE_IN_AIR]
+        {
+            let mut flight = flight("resume");
+            flight.presence(0, "main", true);
+            hear(&mut flight, 0, &heartbeat(9, true));
+            hear(&mut flight, MS, &contact(contact_at_start));
+            pose_at(&mut flight, 20 * MS, 0.5);
+            flight.tick(21 * MS);
+            assert_eq!(flight.status(21 * MS).phase, "final");
         }
     }
 

@@ -111,7 +111,8 @@ pub struct EstimatorConfig {
     /// What that drift changes by, in m/s per square root of a second (0 to 1).
     pub drift_change: f64,
     /// What it changes by at most, where detections show that the autopilot's position wanders, in m/s per square root of a
-    /// second; tilts then change faster in the same proportion. Not more than `drift_change` adjusts nothing (0 to 1).
+    /// second, and no more than 15 times `drift_change`; tilts then change faster in the same proportion. Not more than
+    /// `drift_change`, or a `drift_change` of 0, adjusts nothing (0 to 1).
     pub most_drift_change: f64,
     /// Drift of the autopilot's height at first, in m/s (0 to 1).
     pub height_drift_m_s: f64,

@@ -73,6 +73,10 @@ const UNDECIDED_RAD: f64 = 0.05;
 const UNREST_GAIN: f64 = 0.08;
 const UNREST_SLACK: f64 = 0.4;
 
+/// What drift and tilt change by is at most so many times what is configured: an estimate that takes any tilt for possible takes
+/// any detection.
+const MOST_UNREST: f64 = 15.0;
+
 /// A rival detection's distance from the rival before it, beside what both may be wrong by, in metres.
 const RIVAL_GATE_M: f64 = 0.15;
 
@@ -434,6 +438,10 @@ impl Estimator {
 
     /// Largest horizontal deviation so long after the newest detection, in metres.
     fn deviation_m(&self, belief: &Belief, ahead_s: f64) -> f64 {
+        // Of what drift changes by, only what was seen to be more than is configured: that much is in the limits for a descent
+        // without the marker.
+        let raised = self.config.drift_change.powi(2) * ((2.0 * belief.unrest).exp() - 1.0);
+        let change = self.config.pad_acceleration.powi(2) + raised;
         let p = &belief.covariance;
         let block = |row: usize, column: usize| p.fixed_view::<2, 2>(row, column).into_owned();
         let cross: Matrix2<f64> = block(Q, U);
@@ -441,7 +449,7 @@ impl Estimator {
             + (cross + cross.transpose()) * ahead_s
             + block(U, U) * ahead_s.powi(2)
             + Matrix2::identity() * (self.config.way_noise_m.powi(2) * ahead_s)
-            + Matrix2::identity() * (self.config.pad_acceleration.powi(2) * ahead_s.powi(3) / 3.0);
+            + Matrix2::identity() * (change * ahead_s.powi(3) / 3.0);
         let (mean, half) = (0.5 * (grown.m11 + grown.m22), 0.5 * (grown.m11 - grown.m22));
         (mean + half.hypot(grown.m12)).max(0.0).sqrt()
     }
@@ -609,7 +617,11 @@ impl Belief {
             return;
         };
         let excess = 0.5 * level.dot(&(inverse * level)) - 1.0 - UNREST_SLACK;
-        let most = (config.most_drift_change / config.drift_change.max(1e-6)).max(1.0).ln();
+        let most = if config.drift_change > 0.0 {
+            (config.most_drift_change / config.drift_change).clamp(1.0, MOST_UNREST).ln()
+        } else {
+            0.0
+        };
         self.unrest = (self.unrest + UNREST_GAIN * excess).clamp(0.0, most);
     }
 }
@@ -914,6 +926,39 @@ mod tests {
         assert!(trusting.1 > 0.3 && adjusted.1 < 0.2, "{trusting:?}, {adjusted:?}");
         let steady = fly(0.15, 0.0);
         assert!(steady.0 == 0 && steady.2 < 0.5, "{steady:?}");
+    }
+
+    #[test]
+    fn no_drift_change_opens_the_gate_to_tilts_beyond_reason() {
+        for (drift_change, most) in [(0.0, 1.0), (1e-6, MOST_UNREST), (0.01, MOST_UNREST)] {
+            let config = EstimatorConfig { drift_change, ..EstimatorConfig::default() };
+            let mut belief = Belief::new(&config, Vector3::zeros());
+            for _ in 0..1000 {
+                belief.stir(&config, Vector3::new(3.0, 0.0, 0.0), Matrix3::identity());
+            }
+            assert!((belief.unrest.exp() - most).abs() < 1e-6, "{drift_change}: {}", belief.unrest);
+        }
+    }
+
+    #[test]
+    fn the_deviation_foretold_grows_with_unrest_as_the_filters_does() {
+        let config = EstimatorConfig::default();
+        let estimator = Estimator::new(config);
+        let variances = |unrest: f64| {
+            let mut belief = Belief::new(&config, Vector3::zeros());
+            belief.covariance = Covariance::identity() * 1e-4;
+            belief.unrest = unrest;
+            let foretold_m = estimator.deviation_m(&belief, 2.0);
+            belief.pass(&config, 2.0);
+            [foretold_m, estimator.deviation_m(&belief, 0.0)].map(|m| m * m)
+        };
+        let calm = variances(0.0);
+        for unrest in [1.0, MOST_UNREST.ln()] {
+            let wild = variances(unrest);
+            let (foretold, reached) = (wild[0] - calm[0], wild[1] - calm[1]);
+            assert!((foretold - reached).abs() < 1e-9, "{foretold} m^2, {reached} m^2");
+            assert!(foretold > 1e-3, "{foretold} m^2");
+        }
     }
 
     #[test]

@@ -145,7 +145,7 @@ fn turning(earlier: &VehicleState, later: &VehicleState) -> Vector<Body> {
 }
 
 /// The jump of the autopilot's position between two states: what its velocity does not lead to.
-fn jump(earlier: &VehicleState, later: &VehicleState) -> Option<Vector<Ned>> {
+pub(crate) fn jump(earlier: &VehicleState, later: &VehicleState) -> Option<Vector<Ned>> {
     let gap_s = later.stamp.seconds_since(earlier.stamp);
     let led = (earlier.velocity + later.velocity) * (0.5 * gap_s);
     let beside = later.position - earlier.position - led;

@@ -38,8 +38,10 @@ use serde::Deserialize;
 
 use crate::config::{ConfigError, check};
 use crate::decision::{Reason, TargetEstimate};
+use crate::event::VehicleState;
 use crate::guidance::path::{JERK, PATH_TIME_S, Path};
 use crate::guidance::{Progress, Situation};
+use crate::history::jump;
 use crate::time::Timestamp;
 
 /// How the vehicle is brought over the target and down.
@@ -212,11 +214,12 @@ const LOW_HYSTERESIS_M: f64 = 0.2;
 const STEADY_M_S: f64 = 0.3;
 
 /// Lateral speed over the pad at which a low vehicle no longer descends, in m/s: at the ground, what is added per metre of
-/// height, and, after so many seconds of waiting, per second.
+/// height, and, after so many seconds of waiting, per second; and however long it waits, at most.
 const TOUCH_M_S: f64 = 0.2;
 const TOUCH_PER_HEIGHT: f64 = 0.4;
 const TOUCH_WAIT_S: f64 = 1.0;
 const TOUCH_PATIENCE_M_S2: f64 = 0.1;
+const MOST_TOUCH_M_S: f64 = 0.45;
 
 /// A touch on a heaving pad is not slower than this, in m/s.
 const SLOWEST_TOUCH_M_S: f64 = 0.3;
@@ -249,7 +252,10 @@ const LEAN_S: f64 = 1.0;
 /// Steps are taken as if no longer than this apart, in seconds.
 const LONGEST_STEP_S: f64 = 0.1;
 
-/// An observed error further than this from the expected one is a jump of the estimate, not drift, in metres.
+/// Between states further apart than this the velocity does not tell where the position should be, in seconds.
+const LONGEST_GAP_S: f64 = 0.25;
+
+/// A position further than this from the expected one is a jump of the estimate, not drift, in metres.
 const JUMP_M: f64 = 0.3;
 
 /// Our guidance with its memory.
@@ -269,10 +275,10 @@ struct Memory {
     setpoint: Vector<Ned>,
     /// The path that the autopilot makes of the setpoints.
     path: Path,
-    /// Stamp and velocity of the newest state, and the acceleration up to it.
-    moved: (Timestamp, Vector<Ned>),
+    /// The newest state, and the acceleration up to it.
+    newest: VehicleState,
     acceleration: Vector<Ned>,
-    /// Where the vehicle is expected to be now, in metres.
+    /// Where the vehicle was expected to be in the newest state, in metres.
     expected: Point<Ned>,
     /// What the reported position moves with beside the reported velocity, in m/s.
     bias: Vector<Ned>,
@@ -335,10 +341,11 @@ impl Metric {
         let seen = self.sees(situation);
         let height_m = self.height_m(&target);
         let outside = self.outside(situation, &target);
+        let hasty = self.hurry(situation, &target) >= 1.0;
         let lies_still = !situation.pad_moves && target.velocity.norm() <= STILL_M_S;
         if height_m <= self.config.land_height_m
             && outside < 1.0
-            && self.hurry(situation, &target) < 1.0
+            && !hasty
             && lies_still
             && self.is_steady(situation)
         {
@@ -349,7 +356,7 @@ impl Metric {
             });
         }
         let waited_s = self.waiting_since.map_or(0.0, |since| situation.now.seconds_since(since));
-        if waited_s > 2.0 * self.config.settle_s && outside >= 1.0 {
+        if waited_s > 2.0 * self.config.settle_s && (outside >= 1.0 || hasty) {
             return Progress::Stuck;
         }
         match (seen, outside) {
@@ -418,7 +425,7 @@ impl Metric {
         Memory {
             stamp: situation.now,
             setpoint: velocity,
-            moved: (situation.vehicle.stamp, velocity),
+            newest: *situation.vehicle,
             acceleration: Vector::zero(),
             path: Path::new(level),
             expected: situation.vehicle.position,
@@ -430,31 +437,37 @@ impl Metric {
     /// The memory after the time that has passed: the path follows the setpoint, the observers what they see.
     fn observed(&self, mut memory: Memory, situation: &Situation<'_>, step_s: f64) -> Memory {
         memory.stamp = situation.now;
-        let (stamp, velocity) = memory.moved;
-        let gap_s = situation.vehicle.stamp.seconds_since(stamp);
+        let gap_s = situation.vehicle.stamp.seconds_since(memory.newest.stamp);
         if gap_s > 1e-3 {
-            let slope = flat(situation.vehicle.velocity - velocity) * (1.0 / gap_s);
+            let slope = flat(situation.vehicle.velocity - memory.newest.velocity) * (1.0 / gap_s);
             memory.acceleration =
                 memory.acceleration + (slope - memory.acceleration) * (gap_s / (SLOPE_S + gap_s));
-            memory.moved = (situation.vehicle.stamp, situation.vehicle.velocity);
+            self.compare(&mut memory, situation.vehicle, gap_s);
         }
         memory.path.pass(step_s, memory.setpoint);
         // What the vehicle leans beside what its path accelerates by, it leans against the wind.
         let against_wind = lean(situation) + memory.path.acceleration() * (1.0 / GRAVITY);
         memory.lean = memory.lean + (against_wind - memory.lean) * (step_s / LEAN_S).min(1.0);
-        let here = self.here(situation);
-        let expected = memory.expected + (situation.vehicle.velocity + memory.bias) * step_s;
-        let surprise = flat(here - expected);
-        if surprise.norm() > JUMP_M {
-            memory.expected = here;
-            return memory;
+        memory
+    }
+
+    /// Compares the way from state to state with the velocity, from which neither a pause of ours nor the state's age keeps it.
+    /// After a gap or a jump there is nothing to compare.
+    fn compare(&self, memory: &mut Memory, vehicle: &VehicleState, gap_s: f64) {
+        let before = std::mem::replace(&mut memory.newest, *vehicle);
+        let velocity = (before.velocity + vehicle.velocity) * 0.5 + memory.bias;
+        let expected = memory.expected + velocity * gap_s;
+        let surprise = flat(vehicle.position - expected);
+        let has_jumped = jump(&before, vehicle).is_some() || surprise.norm() > JUMP_M;
+        if has_jumped || gap_s > LONGEST_GAP_S {
+            memory.expected = vehicle.position;
+            return;
         }
         // A critically damped observer.
         let time_s = self.config.drift_time_s;
-        memory.expected = expected + surprise * (2.0 * step_s / time_s).min(1.0);
-        let bias = memory.bias + surprise * (step_s / time_s.powi(2));
+        memory.expected = expected + surprise * (2.0 * gap_s / time_s).min(1.0);
+        let bias = memory.bias + surprise * (gap_s / time_s.powi(2));
         memory.bias = shortened(bias, self.config.max_drift_m_s);
-        memory
     }
 
     /// Horizontal way from the vehicle to the target, in metres.
@@ -522,6 +535,7 @@ impl Metric {
         let most_m_s = TOUCH_M_S
             + TOUCH_PER_HEIGHT * height_m
             + TOUCH_PATIENCE_M_S2 * (waited_s - TOUCH_WAIT_S).max(0.0);
+        let most_m_s = most_m_s.min(MOST_TOUCH_M_S);
         let pad_m_s = shortened(flat(target.velocity), self.config.max_pad_m_s);
         (flat(situation.vehicle.velocity) + memory.bias - pad_m_s).norm() / most_m_s
     }
@@ -673,6 +687,63 @@ mod tests {
         }
         let bias = metric.memory.unwrap().bias;
         assert!((bias - Vector::new(0.0, -0.5, 0.0)).norm() < 0.1, "{bias:?}");
+    }
+
+    /// The largest bias found in the velocity of a vehicle that moves east at 0.5 m/s and tells so, with states and ticks at the
+    /// times given, and whose reported position is shifted north as a function of time.
+    fn largest_bias(times: impl Iterator<Item = (f64, f64)>, north: impl Fn(f64) -> f64) -> f64 {
+        let mut metric = Metric::new(MetricConfig::default());
+        let mut largest_m_s = 0.0f64;
+        for (told_s, now_s) in times {
+            let place = Point::new(north(told_s), 0.5 * told_s, -5.0);
+            let vehicle = vehicle(told_s, place, Vector::new(0.0, 0.5, 0.0));
+            let now = Timestamp::from_seconds(now_s);
+            let _ = metric.velocity(&Situation { now, ..situation(&vehicle) });
+            largest_m_s = largest_m_s.max(metric.memory.unwrap().bias.norm());
+        }
+        largest_m_s
+    }
+
+    #[test]
+    fn neither_jumps_nor_pauses_nor_old_states_are_taken_for_a_bias() {
+        let steady = |i: u32| f64::from(i) * 0.025;
+        let every = || (0..120u32).map(steady);
+        let jumped = largest_bias(every().map(|s| (s, s)), |s| 0.25 * f64::from(u8::from(s > 1.0)));
+        assert!(jumped < 1e-6, "{jumped}");
+        for pause_s in [0.2, 0.3, 0.5] {
+            let missed = |s: f64| s > 1.0 && s < 1.0 + pause_s;
+            let paused = largest_bias(every().filter(|s| !missed(*s)).map(|s| (s, s)), |_| 0.0);
+            assert!(paused < 1e-6, "a pause of {pause_s} s: {paused}");
+            let told = |s: f64| (if missed(s) { 1.0 } else { s }, s);
+            let silent = largest_bias(every().map(told), |_| 0.0);
+            assert!(silent < 1e-6, "no state for {pause_s} s: {silent}");
+        }
+        let late = largest_bias(every().map(|s| (s, s + 0.3)), |_| 0.0);
+        assert!(late < 1e-6, "states that come late: {late}");
+    }
+
+    #[test]
+    fn no_patience_allows_a_fast_slide_at_the_touch_and_waiting_for_less_ends() {
+        for (speed_m_s, ready) in [(0.4, true), (0.5, false)] {
+            let mut metric = Metric::new(MetricConfig::default());
+            let mut ends = Vec::new();
+            for i in 0..600u32 {
+                let s = f64::from(i) / 40.0;
+                // Over the target, and never still.
+                let velocity =
+                    Vector::new(speed_m_s * if s % 2.0 < 1.0 { 1.0 } else { -1.0 }, 0.0, 0.0);
+                let aside_m = speed_m_s * (0.5 - (s % 2.0 - 1.0).abs());
+                let vehicle = vehicle(s, Point::new(aside_m, 0.0, -0.04), velocity);
+                let situation = situation(&vehicle);
+                let hurry = metric.hurry(&situation, &situation.target.unwrap());
+                ends.push((s, hurry < 1.0, metric.progress(&situation)));
+                let _ = metric.velocity(&situation);
+            }
+            let slow = ends.iter().any(|(s, slow, _)| *s > 3.5 && *slow);
+            assert_eq!(slow, ready, "at {speed_m_s} m/s");
+            let stuck = ends.iter().any(|(s, _, end)| *s > 10.1 && *end == Progress::Stuck);
+            assert!(stuck || ready, "at {speed_m_s} m/s");
+        }
     }
 
     fn vehicle(seconds: f64, position: Point<Ned>, velocity: Vector<Ned>) -> VehicleState {
