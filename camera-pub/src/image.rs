@@ -202,7 +202,7 @@ impl Decoded {
     }
 
     /// Decodes the bytes of a file.
-    fn decode(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<Self, ImageError> {
+    pub(crate) fn decode(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<Self, ImageError> {
         let mut decoder = decoder(path, bytes, most_pixels)?;
         // The decoder fills up what is missing of a JPEG with grey, which is no picture of anything.
         if bytes.starts_with(JPEG_START) && jpeg_len(bytes).is_none() {
@@ -240,16 +240,17 @@ impl Decoded {
     /// The image in 8-bit grey.
     pub(crate) fn grey(&self, mosaic: Option<Mosaic>) -> GrayImage {
         let (width, height) = (self.width(), self.height());
-        let mut image = GrayImage::filled(width, height, 0);
+        let black = || GrayImage::filled(width, height, 0);
         match self.raw_bits() {
             Some(bits) if bits > 8 || mosaic.is_some() => {
                 let mut samples = vec![0; width * height * bits.div_ceil(8) as usize];
                 self.write_samples(&mut samples);
                 let format = SampleFormat { bits, mosaic };
                 // An image that was decoded has a size that can be.
-                grey_of(&samples, width, height, format).unwrap_or(image)
+                grey_of(&samples, width, height, format).unwrap_or_else(black)
             }
             _ => {
+                let mut image = black();
                 self.write_grey(image.pixels_mut());
                 image
             }
@@ -271,7 +272,7 @@ impl Decoded {
     }
 
     /// Writes the pixels, row by row, into a buffer of width times height bytes.
-    fn write_grey(&self, out: &mut [u8]) {
+    pub(crate) fn write_grey(&self, out: &mut [u8]) {
         match &self.image {
             DynamicImage::ImageLuma8(image) => fill(out, image, |[v]| v),
             DynamicImage::ImageLumaA8(image) => fill(out, image, |[v, a]| over_white(v, a)),

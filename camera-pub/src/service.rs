@@ -15,7 +15,7 @@ use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, cloc
 use tokio::sync::oneshot;
 
 use crate::config::{Config, ProgramConfig};
-use crate::image::{Decoded, decode_image, frame_bytes, grey_of, images_in};
+use crate::image::{Decoded, frame_bytes, grey_of, images_in};
 use crate::program::{Form, Program};
 
 /// Images whose size is looked up at the start, to make room for the largest in shared memory. Frames that are larger
@@ -189,8 +189,6 @@ impl Pace {
 
 /// A frame that waits for its time.
 struct Prepared {
-    /// When it was exposed; `None` for a file, which is as old as its publication.
-    stamp_ns: Option<i64>,
     width: usize,
     height: usize,
     format: PixelFormat,
@@ -250,8 +248,7 @@ impl Stream {
             };
             self.health.latency("read", began.elapsed());
             if let Some(frame) = frame {
-                let stamp_ns = Some(arrival.stamp_ns - config.delay_ns);
-                self.publish(Prepared { stamp_ns, ..frame }).await;
+                self.publish(frame, arrival.stamp_ns - config.delay_ns).await;
             }
         }
     }
@@ -260,16 +257,15 @@ impl Stream {
         let (width, height) = config.size;
         let format = pixel_format(Some(config.bits), mosaic);
         let sample = SampleFormat { bits: config.bits, mosaic };
-        let is_raw = format != PixelFormat::Mono8;
-        let grey = (is_raw && self.air.is_wanted())
-            .then(|| grey_of(&pixels, width, height, sample))
-            .flatten();
-        Prepared { stamp_ns: None, width, height, format, pixels, grey }
+        let is_wanted = self.needs_grey(format);
+        let grey = is_wanted.then(|| grey_of(&pixels, width, height, sample)).flatten();
+        Prepared { width, height, format, pixels, grey }
     }
 
     /// A picture as the JPEG file of a camera's program; `None` when it is not fit to be published.
     fn of_jpeg(&self, jpeg: &[u8]) -> Option<Prepared> {
-        let image = match decode_image(Path::new("a picture"), jpeg, self.config.most_pixels()) {
+        let most_pixels = self.config.most_pixels();
+        let image = match Decoded::decode(Path::new("a picture"), jpeg, most_pixels) {
             Ok(image) => image,
             Err(problem) => {
                 if self.health.failed("image that cannot be read") {
@@ -290,9 +286,8 @@ impl Stream {
             return None;
         }
         let mut pixels = self.frames.loan(width * height);
-        pixels.copy_from_slice(image.pixels());
-        let format = PixelFormat::Mono8;
-        Some(Prepared { stamp_ns: None, width, height, format, pixels, grey: None })
+        image.write_grey(&mut pixels);
+        Some(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
     }
 
     /// Publishes image files at the rate that is asked for.
@@ -321,7 +316,8 @@ impl Stream {
             match self.prepare(path) {
                 Ok(frame) => {
                     pace.wait().await;
-                    self.publish(frame).await;
+                    // A file is as old as its publication.
+                    self.publish(frame, now_ns()).await;
                 }
                 Err(problem) => {
                     self.health.failed("image that cannot be read");
@@ -355,16 +351,20 @@ impl Stream {
         let mut pixels = self.frames.loan(width * height * bytes);
         image.write_samples(&mut pixels);
         self.health.latency("read", began.elapsed());
-        let is_raw = format != PixelFormat::Mono8;
-        let grey = (is_raw && self.air.is_wanted()).then(|| image.grey(mosaic));
-        Ok(Prepared { stamp_ns: None, width, height, format, pixels, grey })
+        let grey = self.needs_grey(format).then(|| image.grey(mosaic));
+        Ok(Prepared { width, height, format, pixels, grey })
     }
 
-    async fn publish(&mut self, frame: Prepared) {
+    /// True when a frame of this format must be made grey for the air link.
+    fn needs_grey(&self, format: PixelFormat) -> bool {
+        format != PixelFormat::Mono8 && self.air.is_wanted()
+    }
+
+    async fn publish(&mut self, frame: Prepared, stamp_ns: i64) {
         let header = FrameHeader {
             camera: self.config.instance().to_owned(),
             sequence: self.sequence,
-            stamp_ns: frame.stamp_ns.unwrap_or_else(now_ns),
+            stamp_ns,
             clock: clock_name().to_owned(),
             exposure_ns: 0,
             width: frame.width as u32,
