@@ -90,10 +90,9 @@ impl Score {
 
     fn measure(&mut self, found: &Found, truth: &MarkerLine) {
         self.centre_px.push(distance(found.centre_px, truth.centre_px));
-        if let Some([xx, xy, yy]) = found.covariance_px2 {
-            let [x, y] = [0, 1].map(|i| found.centre_px[i] - truth.centre_px[i]);
-            let determinant = xx * yy - xy * xy;
-            self.centre_chi2.push((yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant);
+        if let Some(covariance_px2) = found.covariance_px2 {
+            let off_px = [0, 1].map(|i| found.centre_px[i] - truth.centre_px[i]);
+            self.centre_chi2.push(normalised(off_px, covariance_px2));
         }
         if let Some(corners) = found.corners_px {
             // Which corner is the first differs between libraries.
@@ -176,6 +175,11 @@ pub struct Summary {
 
 fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
+}
+
+/// The square of an error x, y in units of its covariance xx, xy, yy.
+pub fn normalised([x, y]: [f64; 2], [xx, xy, yy]: [f64; 3]) -> f64 {
+    (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
 }
 
 /// The mean; none of no values.

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
-use experiments::score::quantile;
+use experiments::score;
 use experiments::sets::{MARKERS, SIZE_M, Set};
 use experiments::shot::Studio;
 use fiducial::{Detector, Marker, Settings};
@@ -13,7 +13,7 @@ const MEDIAN: f64 = 1.386;
 const ONE_IN_A_HUNDRED: f64 = 9.21;
 
 /// Squared errors of the centre in units of its covariance, in every so many-th frame of a set.
-fn normalised(set: Set, marker: Marker, every: usize) -> Vec<f64> {
+fn centre_errors(set: Set, marker: Marker, every: usize) -> Vec<f64> {
     let mut studio = Studio::default();
     let any = Marker { id: None, ..marker };
     let mut detector = Detector::new(&[any], Settings::default()).unwrap();
@@ -26,11 +26,9 @@ fn normalised(set: Set, marker: Marker, every: usize) -> Vec<f64> {
         let truth = shot.shown().unwrap();
         let found = detector.detect(view, Some(&camera), &mut ());
         for found in found.iter().filter(|found| found.centre.distance(&truth.centre) < 5.0) {
-            let (x, y) = (found.centre.x - truth.centre.x, found.centre.y - truth.centre.y);
+            let off_px = [found.centre.x - truth.centre.x, found.centre.y - truth.centre.y];
             let c = found.centre_covariance_px2;
-            let determinant = c[(0, 0)] * c[(1, 1)] - c[(0, 1)] * c[(1, 0)];
-            let sum = c[(1, 1)] * x * x - 2.0 * c[(0, 1)] * x * y + c[(0, 0)] * y * y;
-            all.push(sum / determinant);
+            all.push(score::normalised(off_px, [c[(0, 0)], c[(0, 1)], c[(1, 1)]]));
         }
     }
     all
@@ -40,8 +38,8 @@ fn normalised(set: Set, marker: Marker, every: usize) -> Vec<f64> {
 fn errors_are_as_large_as_told_in_every_blur() {
     for name in MARKERS {
         let marker: Marker = format!("{name}:{SIZE_M}").parse().unwrap();
-        let errors = normalised(Set::Blur, marker, 2);
-        let median = quantile(&errors, 0.5).unwrap();
+        let errors = centre_errors(Set::Blur, marker, 2);
+        let median = score::quantile(&errors, 0.5).unwrap();
         let beyond = errors.iter().filter(|error| **error > ONE_IN_A_HUNDRED).count();
         println!(
             "{name}: {} frames, median {median:.2} of {MEDIAN}, {beyond} beyond",
