@@ -12,6 +12,8 @@
 mod flight;
 #[path = "link/onehost.rs"]
 mod onehost;
+#[path = "ports/mod.rs"]
+mod ports;
 #[path = "link/probe.rs"]
 mod probe;
 #[path = "link/saturation.rs"]

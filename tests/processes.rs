@@ -8,6 +8,7 @@
 )]
 
 mod flight;
+mod ports;
 
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -216,7 +217,7 @@ async fn a_link_whose_port_is_taken_says_so() -> anyhow::Result<()> {
     let port = taken.local_addr()?.port();
     let directory = tempfile::tempdir()?;
     let zenoh = directory.path().join("zenoh.json5");
-    let free = std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
+    let ([free], _, _) = ports::free()?;
     std::fs::write(&zenoh, node::session::local_config(free))?;
     let output = output_of(
         Command::new(ALIGHT)
@@ -267,7 +268,7 @@ fn wrong_settings_stop_the_start_with_file_key_value_and_limit() -> anyhow::Resu
 #[tokio::test(flavor = "multi_thread")]
 async fn programs_of_others_see_the_services_the_frames_and_the_vehicle() -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
-    let ground = std::net::UdpSocket::bind("127.0.0.1:0")?.local_addr()?.port();
+    let ([], _, ground) = ports::free()?;
     let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{ground}");
     let station =
         python("gcs/ground_station.py", &["--connect", &format!("udpin:127.0.0.1:{ground}")])?;

@@ -109,7 +109,7 @@ impl Settings {
     fn new(args: &LandArgs) -> anyhow::Result<Self> {
         let autopilot = match &args.autopilot {
             Some(address) => address.clone(),
-            None => format!("udpin:127.0.0.1:{}", free_udp_port()?),
+            None => format!("udpin:127.0.0.1:{}", free_port(std::net::UdpSocket::bind)?),
         };
         let mut simulator = vec![format!("seed={}", args.seed)];
         match &args.autopilot {
@@ -320,7 +320,7 @@ impl MeetingPoint {
         }
         let usual = node::session::LOCAL_PORT;
         let usual_is_free = std::net::TcpListener::bind(("127.0.0.1", usual)).is_ok();
-        let port = if usual_is_free { usual } else { free_tcp_port()? };
+        let port = if usual_is_free { usual } else { free_port(std::net::TcpListener::bind)? };
         let file = directory.path().join("zenoh.json5");
         std::fs::write(&file, node::session::local_config(port))
             .with_context(|| format!("writing {file:?}"))?;
@@ -341,12 +341,4 @@ fn free_port<T>(bind: impl Fn((&'static str, u16)) -> std::io::Result<T>) -> any
         .map(port)
         .find(|port| bind(("127.0.0.1", *port)).is_ok())
         .with_context(|| format!("finding a free port from {} to {}", PORTS.start, PORTS.end))
-}
-
-fn free_tcp_port() -> anyhow::Result<u16> {
-    free_port(std::net::TcpListener::bind)
-}
-
-fn free_udp_port() -> anyhow::Result<u16> {
-    free_port(std::net::UdpSocket::bind)
 }

@@ -1,5 +1,8 @@
 //! A camera service and its subscribers, on a port of the test's own.
 
+#[path = "../../tests/ports/mod.rs"]
+mod ports;
+
 use std::path::Path;
 use std::time::Duration;
 
@@ -19,7 +22,8 @@ fn local(port: u16) -> ZenohSource {
 }
 
 fn free_port() -> anyhow::Result<u16> {
-    Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+    let ([port], _, _) = ports::free()?;
+    Ok(port)
 }
 
 async fn open(service: &'static str, port: u16) -> anyhow::Result<Node> {

@@ -1,5 +1,8 @@
 //! A detector service between a camera and an operator, on a port of the test's own.
 
+#[path = "../../tests/ports/mod.rs"]
+mod ports;
+
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
@@ -187,7 +190,7 @@ async fn check_live_changes(
 
 #[tokio::test(flavor = "multi_thread")]
 async fn several_families_are_found_and_parameters_change_while_it_runs() -> anyhow::Result<()> {
-    let port = std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
+    let ([port], _, _) = ports::free()?;
     let (camera, node) =
         (open("camera-pub", "down", port).await?, open("detector", "main", port).await?);
     let operator = open("alight", "test", port).await?;

@@ -1,5 +1,8 @@
 //! The bridge between a vehicle that is made up here and a ground station on a plain UDP socket.
 
+#[path = "../../tests/ports/mod.rs"]
+mod ports;
+
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -216,7 +219,8 @@ async fn pymavlink_agrees() -> anyhow::Result<()> {
 }
 
 fn free_port() -> anyhow::Result<u16> {
-    Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
+    let ([port], _, _) = ports::free()?;
+    Ok(port)
 }
 
 async fn open(service: &'static str, instance: &str, port: u16) -> anyhow::Result<Node> {

@@ -14,6 +14,7 @@ use node::{FramePublisher, Identity, Loan, Network, Node, now_ns};
 use serde_json::{Value, json};
 use tokio::time::interval;
 
+use crate::ports;
 use crate::probe::Times;
 
 const WIDTH: u32 = 1296;
@@ -52,7 +53,7 @@ impl std::fmt::Display for OneHost {
 
 /// Measures both in turns.
 pub(crate) async fn run() -> anyhow::Result<Option<OneHost>> {
-    let meet = std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
+    let ([meet], _, _) = ports::free()?;
     let network = Network { meet: Some(meet), ..Network::default() };
     let identity = Identity { service: "camera-pub", instance: "probe".into() };
     let node = Node::open(identity, &network.source("camera-pub")?).await?;

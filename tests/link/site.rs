@@ -1,12 +1,13 @@
 //! Two hosts on one machine: the drone, and the ground in a network namespace, joined by an emulated radio link.
 
 use std::io::{BufRead, BufReader, Write};
-use std::net::TcpListener;
 use std::path::PathBuf;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use anyhow::{Context, bail, ensure};
 use node::{Identity, Network, Node};
+
+use crate::ports;
 
 /// The program under test.
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
@@ -148,14 +149,10 @@ impl Site {
     /// Both hosts, with nothing on them but this process on the drone.
     pub(crate) async fn new(radio: Radio) -> anyhow::Result<Option<Self>> {
         let Some(air) = Air::new(radio)? else { return Ok(None) };
-        let free = || -> anyhow::Result<u16> {
-            Ok(TcpListener::bind("127.0.0.1:0")?.local_addr()?.port())
-        };
-        let meet = free()?;
+        let ([meet], _, autopilot) = ports::free()?;
         let network = Network { meet: Some(meet), ..Network::default() };
         let identity = Identity { service: "alight", instance: "link".into() };
         let node = Node::open(identity, &network.source("alight")?).await?;
-        let autopilot = std::net::UdpSocket::bind("127.0.0.1:0")?.local_addr()?.port();
         let children = Vec::new();
         Ok(Some(Self { air, meet, port: 7448, autopilot, children, node }))
     }
