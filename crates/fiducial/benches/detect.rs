@@ -1,11 +1,11 @@
-//! Whole detections in one frame of 1296 x 972 pixels with a textured ground, by family, and of an image without a marker:
-//! `cargo bench -p fiducial`.
+//! Whole detections in one frame of 1296 x 972 pixels with a textured ground, by family, and of an image without a marker;
+//! and a marker that is followed: `cargo bench -p fiducial`.
 #![allow(missing_docs, clippy::unwrap_used, reason = "a benchmark may stop anywhere")]
 
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use fiducial::{Detector, Marker, Settings};
+use fiducial::{Detector, Marker, Settings, Tracker, TrackingSettings};
 use geometry::{Body, Ned, Point, Rotation, Transform};
 use imaging::GrayView;
 use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
@@ -13,12 +13,12 @@ use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
 const MARKERS: [&str; 5] =
     ["rings", "apriltag-16h5:0", "aruco-4x4-50:0", "stag-hd23:0", "apriltag-36h11:0"];
 
-/// A marker from 5 m.
-fn frame(marker: Option<Marker>, settings: &CameraSettings) -> Vec<u8> {
+/// A marker seen from this height.
+fn frame(marker: Option<Marker>, settings: &CameraSettings, height_m: f64) -> Vec<u8> {
     let pads = marker.map(|marker| PadInScene::flat(marker, 0.2, -0.1, 0.4)).into_iter().collect();
     let scene = Scene { surface: Surface::Grass, pads, painted_marks: 20, light: 1.0 };
     let mut renderer = Renderer::new(&scene, settings.clone(), 3).unwrap();
-    let place = Point::<Ned>::new(0.0, 0.0, -5.0);
+    let place = Point::<Ned>::new(0.0, 0.0, -height_m);
     let pose: Transform<Ned, Body> = Transform::new(Rotation::from_euler(0.05, -0.1, 0.3), place);
     let mut pixels = vec![0; settings.model.width as usize * settings.model.height as usize];
     renderer.render(&[pose], 0, &mut pixels).unwrap();
@@ -31,7 +31,7 @@ fn detect(criterion: &mut Criterion) {
     let parse = |name: &str| format!("{name}:0.15341").parse::<Marker>().unwrap();
     let mut group = criterion.benchmark_group("detect");
     let mut measure = |name: &str, markers: &[Marker], shown: Option<Marker>| {
-        let pixels = frame(shown, &settings);
+        let pixels = frame(shown, &settings, 5.0);
         let view = GrayView::packed(&pixels, model.width as usize, model.height as usize).unwrap();
         let mut detector = Detector::new(markers, Settings::default()).unwrap();
         group.bench_function(name, |bencher| {
@@ -48,5 +48,28 @@ fn detect(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, detect);
+/// A marker of 48 px that is where it was expected.
+fn follow(criterion: &mut Criterion) {
+    let settings = CameraSettings::thesis();
+    let model = settings.model;
+    let mut group = criterion.benchmark_group("follow");
+    for name in MARKERS {
+        let marker: Marker = format!("{name}:0.15341").parse().unwrap();
+        let pixels = frame(Some(marker), &settings, 5.8);
+        let view = GrayView::packed(&pixels, model.width as usize, model.height as usize).unwrap();
+        let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+        let mut tracker = Tracker::new(TrackingSettings { full_search_period: u32::MAX });
+        let mut time_s = 0.0;
+        group.bench_function(name, |bencher| {
+            bencher.iter(|| {
+                time_s += 0.03;
+                let view = black_box(view);
+                tracker.detect(&mut detector, view, Some(&model), time_s, &mut ()).len()
+            });
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, detect, follow);
 criterion_main!(benches);

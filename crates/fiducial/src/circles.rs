@@ -304,7 +304,10 @@ pub(crate) struct Plane {
 }
 
 /// Where a ray meets the plane.
+#[derive(Copy, Clone)]
 pub(crate) struct Meeting {
+    /// How much the plane faces the ray; not below nought when they do not meet.
+    facing: f64,
     /// Distance from the centre, in metres.
     pub(crate) rho: f64,
     /// How the place changes with the pixel, to the right and down: outwards from the centre and around it, in metres.
@@ -315,17 +318,22 @@ pub(crate) struct Meeting {
     pub(crate) px_per_metre: f64,
     /// How the distance, in pixels, changes with the centre (three numbers) and with the normal along the two vectors of
     /// [`Circles::basis`].
-    pub(crate) slope: SVector<f64, 5>,
+    pub(crate) slope: [f64; 5],
+}
+
+impl Meeting {
+    /// Whether there is such a place, and it says how the pose moves it.
+    #[inline]
+    pub(crate) fn is_sound(&self) -> bool {
+        self.facing < -1e-9 && self.px_per_metre.is_finite()
+    }
 }
 
 impl Plane {
-    /// Where a ray meets it; `None` when it does not.
-    #[inline]
-    pub(crate) fn meets(&self, ray: &Vector3<f64>) -> Option<Meeting> {
+    /// Where a ray meets it, when that [`Meeting::is_sound`]. Without a branch, so that many are worked out at once.
+    #[inline(always)]
+    pub(crate) fn meets(&self, ray: &Vector3<f64>) -> Meeting {
         let facing = self.normal.dot(ray);
-        if facing > -1e-9 {
-            return None;
-        }
         let inverse = 1.0 / facing;
         let along = self.distance * inverse;
         let (ur, vr) = (self.u.dot(ray), self.v.dot(ray));
@@ -347,24 +355,16 @@ impl Plane {
         let scale = 1.0 / metres_per_px;
         let lean = (p * ur + q * vr) * inverse * scale;
         let by_centre = self.normal * lean - (self.u * p + self.v * q) * scale;
-        let slope =
-            SVector::<f64, 5>::new(by_centre.x, by_centre.y, by_centre.z, -a * lean, -b * lean);
-        let finite = scale.is_finite() && slope.iter().all(|s| s.is_finite());
-        finite.then_some(Meeting {
-            rho,
-            outwards,
-            around,
-            metres_per_px,
-            px_per_metre: scale,
-            slope,
-        })
+        let slope = [by_centre.x, by_centre.y, by_centre.z, -a * lean, -b * lean];
+        Meeting { facing, rho, outwards, around, metres_per_px, px_per_metre: scale, slope }
     }
 
     /// Distance in pixels from an edge point to its circle, positive outside, and how it changes with the pose.
     #[inline]
     fn residual(&self, point: &EdgePoint) -> Option<(f64, SVector<f64, 5>)> {
-        let meeting = self.meets(&point.ray)?;
-        Some(((meeting.rho - point.radius) * meeting.px_per_metre, meeting.slope))
+        let meeting = self.meets(&point.ray);
+        let off = (meeting.rho - point.radius) * meeting.px_per_metre;
+        (meeting.is_sound() && off.is_finite()).then_some((off, meeting.slope.into()))
     }
 }
 

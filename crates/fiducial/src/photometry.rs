@@ -31,7 +31,7 @@ const FOCUSED_PX: f64 = 0.6;
 /// Brighter pixels may be of any brightness.
 const WHITEST: f64 = 254.5;
 /// So many standard deviations of the blur from an edge nothing is seen of it.
-const FURTHEST_BLUR: f64 = 4.7;
+const FURTHEST_BLUR: f64 = 4.0;
 /// Root mean square differences above this, in units of the contrast, are not of a marker.
 const MOST_DIFFERENCE: f64 = 0.2;
 /// Where it is larger before each of the first steps, there is no marker: about a third above the largest that any marker of
@@ -42,6 +42,8 @@ const HOPELESS: [f64; 3] = [0.45, 0.4, 0.35];
 /// When a fit ends.
 #[derive(Copy, Clone, Debug)]
 struct Effort {
+    /// Steps before what differs much pulls no harder, and at least as many in all, as the first may hardly improve anything.
+    rough_steps: usize,
     most_steps: usize,
     /// Steps of a fit in the light of another.
     most_steps_of_other: usize,
@@ -50,9 +52,11 @@ struct Effort {
 }
 
 impl Effort {
-    const FULL: Self = Self { most_steps: 14, most_steps_of_other: 7, least_gain: 3e-4 };
+    const FULL: Self =
+        Self { rough_steps: 3, most_steps: 14, most_steps_of_other: 7, least_gain: 3e-4 };
     /// Of a marker that is about where it is expected.
-    const OF_FOLLOWED: Self = Self { most_steps: 6, most_steps_of_other: 3, least_gain: 3e-3 };
+    const OF_FOLLOWED: Self =
+        Self { rough_steps: 1, most_steps: 6, most_steps_of_other: 1, least_gain: 3e-2 };
 }
 
 /// Pose (5), blur, black, white, and white's change across and down.
@@ -400,11 +404,6 @@ impl<'a> Scene<'a> {
         Self { spots, every, camera, radii, step: Step::new(), hopeless, effort }
     }
 
-    /// The spots that count.
-    fn spots(&self) -> impl Iterator<Item = &'a Spot> {
-        self.spots.iter().step_by(self.every)
-    }
-
     /// The best fit from here, in the light of another fit where there is one; `None` when its cost stays above what is
     /// `hopeless`.
     fn fitted(
@@ -431,11 +430,10 @@ impl<'a> Scene<'a> {
             Some(like) => like.limit,
             None => 0.25 * (best.white - best.black),
         };
-        // So many steps at least, as the first may hardly improve anything.
-        let least_steps = if like.is_some() { 1 } else { 3 };
+        let Effort { rough_steps, most_steps, most_steps_of_other, least_gain } = self.effort;
+        let least_steps = if like.is_some() { 1 } else { rough_steps };
         let (mut system, mut cost) = best.system(self, limit)?;
         let mut damping = if like.is_some() { 1e-4 } else { 1e-3 };
-        let Effort { most_steps, most_steps_of_other, least_gain } = self.effort;
         let most_steps = if like.is_some() { most_steps_of_other } else { most_steps };
         for step in 0..most_steps {
             // Of what is no marker most is seen at once to be none.
@@ -455,7 +453,7 @@ impl<'a> Scene<'a> {
                     let settled = cost - next_cost < least_gain * cost;
                     (best, system, cost) = (next, next_system, next_cost);
                     damping = (damping * 0.1).max(1e-7);
-                    if like.is_none() && step == 2 {
+                    if like.is_none() && step + 1 == rough_steps {
                         limit = limit.min(3.0 * (cost / self.count()).sqrt() + 1.0);
                         (system, cost) = best.system(self, limit)?;
                     } else if settled && step >= least_steps {
@@ -530,7 +528,7 @@ struct Looks {
     /// The shares of the pixel's light from within each circle, the outermost first.
     within: [f64; 6],
     /// How the distance from the centre, in pixels, changes with the pose.
-    by_pose: SVector<f64, 5>,
+    by_pose: [f64; 5],
     /// How the whiteness changes with that distance, and with the blur.
     by_distance: f64,
     by_blur: f64,
@@ -544,17 +542,31 @@ impl Looks {
     }
 }
 
-impl Picture {
-    /// How much of what a pixel sees lies within each of the marker's circles, and how that changes.
-    ///
-    /// Of a place drawn from the blur about the pixel the squared distance from the centre is a quadratic form in
-    /// normal variables; how often it falls within a circle is known closely (Jensen and Solomon, "A Gaussian
-    /// approximation to the distribution of a definite quadratic form", JASA 1972), also for circles no larger than the blur.
-    #[inline]
-    fn looks(&self, spot: &Spot, plane: &Plane, scene: &Scene<'_>) -> Option<Looks> {
-        let meeting = plane.meets(&spot.ray)?;
-        let Meeting { rho, outwards: a, around: b, metres_per_px, px_per_metre, slope } = meeting;
-        let variance = self.blur_px * self.blur_px;
+/// Where the places lie that are drawn from the blur about a pixel.
+///
+/// Of such a place the squared distance from the centre is a quadratic form in normal variables; how often it falls within
+/// a circle is known closely (Jensen and Solomon, "A Gaussian approximation to the distribution of a definite quadratic
+/// form", JASA 1972), also for circles no larger than the blur: to this power, it is nearly normal.
+#[derive(Copy, Clone)]
+struct Places {
+    meeting: Meeting,
+    /// The logarithm of the mean of the squared distance.
+    log_square: f64,
+    power: f64,
+    /// Mean of that power of what the squared distance is in units of its mean, and one over its standard deviation.
+    mean: f64,
+    per_deviation: f64,
+    /// How the share within a circle changes with the pixel's distance, in pixels outwards.
+    outwards: f64,
+    boxiness: f64,
+}
+
+impl Places {
+    /// Without a branch, so that many are worked out at once.
+    #[inline(always)]
+    fn about(ray: &Vector3<f64>, plane: &Plane, variance: f64) -> Self {
+        let meeting = plane.meets(ray);
+        let Meeting { rho, outwards: a, around: b, metres_per_px, px_per_metre, .. } = meeting;
         // Variances outwards and around, and the two together.
         let rr = variance * (metres_per_px * metres_per_px);
         let tt = variance * (b[0] * b[0] + b[1] * b[1]);
@@ -569,11 +581,22 @@ impl Picture {
         let power = 1.0 - k1 * k3 * (per_k2 * per_k2) / 3.0;
         let mean = 1.0 + power * (power - 1.0) * k2 * (per_k1 * per_k1) / 2.0;
         let per_spread = k2.sqrt() * per_k2;
-        let (per_power, outwards) =
-            (k1 * per_spread / power, -2.0 * rho * metres_per_px * per_spread);
-        let log_k1 = k1.ln();
-        let boxiness = boxiness(a.map(|part| part * px_per_metre), variance);
-        let (per_blur, per_px) = (px_per_metre / self.blur_px, 1.0 / self.blur_px);
+        Self {
+            meeting,
+            log_square: k1.ln(),
+            power,
+            mean,
+            per_deviation: k1 * per_spread / power,
+            outwards: -2.0 * rho * metres_per_px * per_spread,
+            boxiness: boxiness(a.map(|part| part * px_per_metre), variance),
+        }
+    }
+
+    /// What a pixel with such a blur sees of the marker.
+    #[inline]
+    fn looks(&self, per_px: f64, scene: &Scene<'_>) -> Looks {
+        let Meeting { rho, px_per_metre, slope, .. } = self.meeting;
+        let per_blur = px_per_metre * per_px;
         let mut looks = Looks { within: [0.0; 6], by_distance: 0.0, by_blur: 0.0, by_pose: slope };
         for (index, (within, (radius, log_radius))) in
             looks.within.iter_mut().zip(scene.radii).enumerate()
@@ -585,27 +608,50 @@ impl Picture {
                 *within = if rough > 0.0 { 1.0 } else { 0.0 };
                 continue;
             }
-            let ratio = exp(power * (2.0 * log_radius - log_k1));
-            let z = (ratio - mean) * per_power;
-            let (step, density) = scene.step.at(z, boxiness);
+            let ratio = exp(self.power * (2.0 * log_radius - self.log_square));
+            let z = (ratio - self.mean) * self.per_deviation;
+            let (step, density) = scene.step.at(z, self.boxiness);
             *within = step;
             // Outwards, per pixel.
-            looks.by_distance += sign * density * outwards * ratio;
+            looks.by_distance += sign * density * self.outwards * ratio;
             looks.by_blur -= sign * density * z * per_px;
         }
-        Some(looks)
+        looks
+    }
+}
+
+impl Picture {
+    /// Tells what each spot that counts sees of the marker; `None` when one does not see its plane.
+    #[inline]
+    fn look_at(&self, scene: &Scene<'_>, mut tell: impl FnMut(&Spot, &Looks)) -> Option<()> {
+        // So many at once that divisions and roots do not wait for one another.
+        const BATCH: usize = 8;
+        let plane = self.circles.plane(scene.camera);
+        let (variance, per_px) = (self.blur_px * self.blur_px, 1.0 / self.blur_px);
+        for spots in scene.spots.chunks(BATCH * scene.every) {
+            let mut counted = spots.iter().step_by(scene.every);
+            let last = spots.last()?;
+            let batch: [&Spot; BATCH] = std::array::from_fn(|_| counted.next().unwrap_or(last));
+            let places = batch.map(|spot| Places::about(&spot.ray, &plane, variance));
+            let count = spots.len().div_ceil(scene.every);
+            for (spot, places) in batch.iter().zip(&places).take(count) {
+                if !places.meeting.is_sound() {
+                    return None;
+                }
+                tell(spot, &places.looks(per_px, scene));
+            }
+        }
+        Some(())
     }
 
     /// How many times less a marker differs from the image than a plain disc in its place does; how dark its middle ring
     /// is in units of the outer one, when each has a grey value of its own; and the share of the variance of the pixels
     /// within the rim that the picture explains.
     fn worth(&self, scene: &Scene<'_>) -> Option<[f64; 3]> {
-        let plane = self.circles.plane(scene.camera);
         let mut disc = SMatrix::<f64, 3, 3>::zeros();
         let mut rings = SMatrix::<f64, 4, 4>::zeros();
         let (mut n, mut sum, mut squares, mut unexplained) = (0.0, 0.0, 0.0, 0.0);
-        for spot in scene.spots() {
-            let looks = self.looks(spot, &plane, scene)?;
+        self.look_at(scene, |spot, looks| {
             let [a, b, c, d, e, f] = looks.within;
             let (grey, _) = self.grey(spot, looks.white());
             // The light's slope is taken as found.
@@ -621,7 +667,7 @@ impl Picture {
             disc.syger(1.0, &plain, &plain, 1.0);
             let apart = SVector::<f64, 4>::new(1.0, a - b, c - d + e - f, lit);
             rings.syger(1.0, &apart, &apart, 1.0);
-        }
+        })?;
         disc.fill_upper_triangle_with_lower_triangle();
         rings.fill_upper_triangle_with_lower_triangle();
         let of_disc = disc.fixed_view::<2, 2>(0, 0).into_owned();
@@ -639,11 +685,7 @@ impl Picture {
     /// Black and white that fit the image best with everything else as it is.
     fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
         let mut exposure = Exposure::default();
-        let plane = self.circles.plane(scene.camera);
-        for spot in scene.spots() {
-            let white = self.looks(spot, &plane, scene)?.white();
-            exposure.add(white, spot.grey);
-        }
+        self.look_at(scene, |spot, looks| exposure.add(looks.white(), spot.grey))?;
         let [black, contrast] = exposure.black_and_contrast();
         (self.black, self.white) = (black, black + contrast);
         (contrast > 1.0).then_some(())
@@ -660,22 +702,20 @@ impl Picture {
     fn system(&self, scene: &Scene<'_>, limit: f64) -> Option<(System, f64)> {
         let (mut matrix, mut right) = ([[0.0; UNKNOWNS]; UNKNOWNS], [0.0; UNKNOWNS]);
         let mut cost = 0.0;
-        let plane = self.circles.plane(scene.camera);
-        for spot in scene.spots() {
-            let looks = self.looks(spot, &plane, scene)?;
+        self.look_at(scene, |spot, looks| {
             let white = looks.white();
             let [x, y] = spot.offset;
             let (grey, contrast) = self.grey(spot, white);
             // Where both are beyond what a pixel tells, nothing is known.
             if grey > WHITEST && spot.grey > WHITEST {
-                continue;
+                return;
             }
             let difference = grey - spot.grey;
             let size = difference.abs();
             let weight = if size > limit { limit / size } else { 1.0 };
             cost += if size > limit { limit * (2.0 * size - limit) } else { size * size };
             let by_distance = looks.by_distance * contrast;
-            let [a, b, c, d, e] = looks.by_pose.into();
+            let [a, b, c, d, e] = looks.by_pose;
             let slope: [f64; UNKNOWNS] = [
                 a * by_distance,
                 b * by_distance,
@@ -696,7 +736,7 @@ impl Picture {
                     *entry += scaled * other;
                 }
             }
-        }
+        })?;
         let system =
             System { matrix: SMatrix::from_fn(|i, j| matrix[i][j]), right: SVector::from(right) };
         cost.is_finite().then_some((system, cost))
@@ -737,8 +777,11 @@ fn exp(x: f64) -> f64 {
     }
     // To the eighth power: wrong by about a billionth at most.
     let [a, b, c, d] = [1.0 / 6.0, 1.0 / 24.0, 1.0 / 120.0, 1.0 / 720.0];
-    let tail = d + x * (1.0 / 5040.0 + x * (1.0 / 40_320.0));
-    1.0 + x * (1.0 + x * (0.5 + x * (a + x * (b + x * (c + x * tail)))))
+    // In pairs, which need not wait for one another (Estrin's scheme).
+    let square = x * x;
+    let low = 1.0 + x + square * (0.5 + x * a);
+    let high = b + x * c + square * (d + x * (1.0 / 5040.0) + square * (1.0 / 40_320.0));
+    low + square * square * high
 }
 
 #[cfg(test)]
@@ -770,9 +813,10 @@ mod tests {
                 let (x, y) = (f64::from(i % 100), f64::from(i / 100));
                 let ray = camera.unproject(Pixel::new(x, y)).coords;
                 let offset = [x - middle.x, y - middle.y];
-                let spot = Spot { ray, offset, grey: 0.0, within: true };
-                let scene = Scene::new(&[], size_m, &camera, HOPELESS);
-                let white = picture.looks(&spot, &truth.plane(&camera), &scene).unwrap().white();
+                let spots = [Spot { ray, offset, grey: 0.0, within: true }];
+                let scene = Scene::new(&spots, size_m, &camera, HOPELESS);
+                let mut white = 0.0;
+                picture.look_at(&scene, |_, looks| white = looks.white()).unwrap();
                 let paper = 200.0 + 0.5 * offset[0] - 0.3 * offset[1];
                 (30.0 + (paper - 30.0) * white).round() as u8
             })

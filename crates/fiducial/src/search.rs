@@ -160,7 +160,7 @@ impl Search<'_> {
         if !is_near || !is_plain(&fit) {
             return None;
         }
-        let support = self.measure(&fit.circles, Reach::Near, edges);
+        let support = self.measure(&fit.circles, Reach::Glance, edges);
         let seen = self.seen_by_grey_values(&fit, other, confidence(&support))?;
         (believable(&support) == Belief::All).then_some(seen)
     }
@@ -407,7 +407,11 @@ impl Search<'_> {
         if width_px < 1.0 || radius * px_per_m < 3.0 {
             return support;
         }
-        let most = if reach == Reach::Far { 40.0 } else { 96.0 };
+        let most = match reach {
+            Reach::Near => 96.0,
+            Reach::Far => 40.0,
+            Reach::Glance => 24.0,
+        };
         let count = (PI * radius * px_per_m).clamp(16.0, most) as u32;
         let furthest = if reach == Reach::Far { 0.45 * width_px } else { 5.0 };
         let reach = (0.5 * width_px).min(furthest).max(1.25);
@@ -492,6 +496,8 @@ fn is_plain(fit: &Fit) -> bool {
 enum Reach {
     Far,
     Near,
+    /// As near, at so few places that it only tells whether the edge is there.
+    Glance,
 }
 
 /// What was seen at a place where an edge should be.
