@@ -255,6 +255,44 @@ fn corners_are_found_to_a_hundredth_of_a_pixel() {
     }
 }
 
+/// Of a marker that is larger than the image, what is put together of pieces is off by tens of pixels outside of it.
+#[test]
+fn corners_outside_of_the_image_are_found_from_far_off() {
+    let mut scratch = Scratch::default();
+    for seed in 0..12 {
+        let mut scene = scene(1818.0, 1.0, 0.2, seed);
+        // A third of a side beyond the centre, towards the middle of a side, the image ends.
+        let (corners, centre) = (scene.corners(), scene.centre());
+        let [from, to] = [0, 1].map(|next| corners[(seed as usize + next) % 4]);
+        let [x, y] = [(from.x + to.x) / 2.0 - centre.x, (from.y + to.y) / 2.0 - centre.y];
+        let size = 300;
+        let half = f64::from(size) / 2.0;
+        let back = half / x.abs().max(y.abs()) - 0.66;
+        scene.camera.cx += (half - centre.x + back * x).round();
+        scene.camera.cy += (half - centre.y + back * y).round();
+        (scene.camera.width, scene.camera.height) = (size, size);
+        let image = scene.developed(&scene.expose(), seed);
+        let mut coarse = scene.coarse(2.0);
+        let size = f64::from(size);
+        let mut hidden = 0;
+        for (i, corner) in coarse.iter_mut().enumerate() {
+            let inside = |at: f64| (0.0..size).contains(&at);
+            if !(inside(corner.x) && inside(corner.y)) {
+                hidden += 1;
+                corner.x += if i % 2 == 0 { 18.0 } else { -12.0 };
+                corner.y += if i % 3 == 0 { -14.0 } else { 16.0 };
+            }
+        }
+        assert!(hidden >= 1, "{seed}");
+        let view = image.view().unwrap();
+        let refined =
+            refine(view, &coarse, &scene.pattern(), Some(&scene.camera), &mut scratch).unwrap();
+        let off_px = refined.centre.distance(&scene.centre());
+        println!("{seed}: {hidden} hidden, {off_px:.4} px");
+        assert!(off_px < 0.1, "{seed}: {off_px}");
+    }
+}
+
 /// Squared errors in units of the covariance follow the chi-square distribution of eight unknowns: 8 on average, and
 /// in one of twenty cases above 15.5.
 #[test]

@@ -11,7 +11,7 @@ use nalgebra::{SMatrix, SVector};
 
 use crate::square::pattern::Pattern;
 use crate::square::picture::Picture;
-use crate::square::refine::{Fit, Homography, Lens, Scratch};
+use crate::square::refine::{CORNERS, Fit, Homography, Lens, Scratch};
 use crate::step::{Step, boxiness};
 
 /// A place at which an edge is looked at.
@@ -55,12 +55,17 @@ struct Edge {
 const UNKNOWNS: usize = 9;
 const MOST_RUNS: usize = 210;
 const MOST_PIXELS: usize = 24;
-/// Fewer runs than this, or than this share of those sought, do not make a square.
+/// Fewer runs than this, or than this share of those within the image, do not make a square.
 const LEAST_RUNS: usize = 16;
 const LEAST_SHARE: f64 = 0.35;
 /// Rough and fine passes over all runs.
 const ROUGH_PASSES: usize = 2;
 const FINE_PASSES: usize = 6;
+/// How far from their places edges are looked for in rough passes, in pixels; and how far at first where less than a
+/// share of those within the image is found so near: a quad that was put together of pieces can be off by much.
+const REACH_PX: f64 = 4.5;
+const WIDE_REACH_PX: f64 = 40.0;
+const FEW_SEEN: f64 = 0.7;
 /// A rough pass that moves the corners less, in pixels, is the last.
 const NEARBY_PX: f64 = 0.5;
 /// Of the runs every so many-th takes part in the first passes, unless they are few; in fine ones until the corners move
@@ -87,7 +92,7 @@ pub(crate) fn fit(
     (pattern, is_near): (&Pattern, bool),
     scratch: &mut Scratch,
 ) -> Option<Fit> {
-    place_runs(start, pattern, &mut scratch.runs);
+    place_runs((view, lens, start), pattern, &mut scratch.runs);
     fit_runs(view, lens, (start, is_near), scratch)
 }
 
@@ -118,13 +123,18 @@ fn fit_runs(
         homography: *start,
         spread_px: 0.75,
         step: Step::new(),
+        inside: 0,
         clipped: 0,
         pixels: 0,
     };
     let mut every = if scratch.runs.len() >= 4 * LEAST_RUNS * FEW_EVERY { FEW_EVERY } else { 1 };
-    for _ in 0..if is_near { 0 } else { ROUGH_PASSES } {
+    for pass in 0..if is_near { 0 } else { ROUGH_PASSES } {
         let before = search.homography;
-        search.rough_pass(scratch, every)?;
+        let seen = search.look(&mut scratch.runs, every, REACH_PX);
+        if pass == 0 && seen < FEW_SEEN {
+            search.look(&mut scratch.runs, every, WIDE_REACH_PX);
+        }
+        search.agree(scratch)?;
         if before.distance_px(&search.homography) < NEARBY_PX {
             break;
         }
@@ -135,7 +145,7 @@ fn fit_runs(
         if search.clipped as f64 > MOST_CLIPPED * search.pixels as f64 {
             return None;
         }
-        search.weigh(scratch, every)?;
+        search.weigh(scratch)?;
         let next = System::new(&scratch.runs);
         let moved_px = search.step(&next)?;
         if every > 1 {
@@ -152,12 +162,40 @@ fn fit_runs(
     search.result(system?, &scratch.runs)
 }
 
-/// Places along all edges of the pattern, spread so that their number is bounded.
-fn place_runs(start: &Homography, pattern: &Pattern, runs: &mut Vec<Run>) {
-    runs.clear();
+/// Places within the image along all edges of the pattern, spread so that their number is bounded.
+fn place_runs(
+    (view, lens, start): (GrayView<'_>, &Lens<'_>, &Homography),
+    pattern: &Pattern,
+    runs: &mut Vec<Run>,
+) {
     let mut length_px = 0.0;
     each_edge(pattern, |edge| length_px += edge.usable(start).map_or(0.0, |[from, to]| to - from));
     let spacing_px = (length_px / MOST_RUNS as f64).max(1.0);
+    spread_runs(start, pattern, (spacing_px, |_| true), runs);
+    let is_seen = |place: [f64; 2]| {
+        lens.seen(start.at(place).ideal).is_some_and(|(pixel, _)| is_inside(view, pixel))
+    };
+    if !CORNERS.into_iter().all(is_seen) {
+        // Those outside of the image would take the places of others.
+        let inside = runs.iter().filter(|run| is_seen(run.place)).count();
+        let share = inside as f64 / runs.len().max(1) as f64;
+        spread_runs(start, pattern, ((share * spacing_px).max(1.0), is_seen), runs);
+    }
+}
+
+fn is_inside(view: GrayView<'_>, pixel: Pixel) -> bool {
+    let within = |at: f64, size: usize| at >= 0.0 && at < size as f64;
+    within(pixel.x, view.width()) && within(pixel.y, view.height())
+}
+
+/// Places so far apart along all edges, of which some are kept.
+fn spread_runs(
+    start: &Homography,
+    pattern: &Pattern,
+    (spacing_px, is_kept): (f64, impl Fn([f64; 2]) -> bool),
+    runs: &mut Vec<Run>,
+) {
+    runs.clear();
     // Lengths are counted through, so that short edges get their share.
     let mut next_px = 0.5 * spacing_px;
     let mut passed_px = 0.0;
@@ -167,7 +205,9 @@ fn place_runs(start: &Homography, pattern: &Pattern, runs: &mut Vec<Run>) {
         while next_px < end_px && runs.len() < 2 * MOST_RUNS {
             let share = (from + next_px - passed_px) / edge.length_px(start);
             let place = [0, 1].map(|i| edge.from[i] + (edge.to[i] - edge.from[i]) * share);
-            runs.push(Run { place, across: edge.across, sight: None });
+            if is_kept(place) {
+                runs.push(Run { place, across: edge.across, sight: None });
+            }
             next_px += spacing_px;
         }
         passed_px = end_px;
@@ -236,7 +276,8 @@ struct Search<'a> {
     homography: Homography,
     spread_px: f64,
     step: Step,
-    /// Pixels at the sensor's end, and all, in the last pass.
+    /// Runs within the image in the last pass; pixels at the sensor's end, and all.
+    inside: usize,
     clipped: usize,
     pixels: usize,
 }
@@ -268,7 +309,8 @@ impl Search<'_> {
         (edge.cell_px.is_finite() && edge.cell_px > 1.0).then_some(edge)
     }
 
-    /// The pixels of the row or column that crosses the edge most steeply, up to `reach_px` away from it.
+    /// The pixels of the row or column that crosses the edge most steeply, up to `reach_px` away from it; of many, every
+    /// so many-th.
     fn pixels(&self, edge: &Edge, reach_px: f64, pixels: &mut Pixels) -> usize {
         let [nx, ny] = edge.normal;
         let level = nx.abs() >= ny.abs();
@@ -293,8 +335,9 @@ impl Search<'_> {
             return 0;
         }
         let (nearest, first, last) = (nearest as usize, first as usize, last as usize);
+        let stride = (last - first) / MOST_PIXELS + 1;
         let mut count = 0;
-        for (slot, at) in pixels.iter_mut().zip(first..=last) {
+        for (slot, at) in pixels.iter_mut().zip((first..=last).step_by(stride)) {
             let grey = if level { self.view.at(at, nearest) } else { self.view.at(nearest, at) };
             *slot = [(at as f64 - crossing) * steep, f64::from(grey)];
             count += 1;
@@ -302,17 +345,20 @@ impl Search<'_> {
         count
     }
 
-    /// Moves the square to where grey values cross the middle between black and white.
-    fn rough_pass(&mut self, scratch: &mut Scratch, every: usize) -> Option<()> {
-        const REACH_PX: f64 = 4.5;
+    /// Looks where grey values cross the middle between black and white, up to so far from every so many-th edge's place;
+    /// returns the share of the edges within the image that were found.
+    fn look(&mut self, runs: &mut [Run], every: usize, reach_px: f64) -> f64 {
         let mut pixels = [[0.0; 2]; MOST_PIXELS];
-        for (i, run) in scratch.runs.iter_mut().enumerate() {
+        let mut seen = 0;
+        self.inside = 0;
+        for (i, run) in runs.iter_mut().enumerate() {
             run.sight = None;
             if i % every != 0 {
                 continue;
             }
             let Some(edge) = self.edge(run) else { continue };
-            let reach = REACH_PX.min(edge.cell_px - 0.5);
+            self.inside += usize::from(is_inside(self.view, edge.pixel));
+            let reach = reach_px.min(edge.cell_px - 0.5);
             let count = self.pixels(&edge, reach, &mut pixels);
             let Some(pixels) = pixels.get_mut(..count).filter(|p| p.len() >= 4) else { continue };
             if pixels[0][0] > pixels[count - 1][0] {
@@ -328,10 +374,15 @@ impl Search<'_> {
                 contrast,
                 weight: 1.0,
             });
+            seen += usize::from(run.sight.is_some());
         }
-        // Those far from what the others say are something else's edges.
+        seen as f64 / self.inside.max(1) as f64
+    }
+
+    /// Moves the square to where what was looked at says; those far from what the others say are something else's edges.
+    fn agree(&mut self, scratch: &mut Scratch) -> Option<()> {
         for _ in 0..3 {
-            self.weigh(scratch, every)?;
+            self.weigh(scratch)?;
             let system = System::new(&scratch.runs);
             let step = system.solve()?;
             self.homography = self.homography.moved(|i| step[i])?;
@@ -346,13 +397,14 @@ impl Search<'_> {
     /// Compares every so many-th run with the profile of its edge.
     fn compare_all(&mut self, runs: &mut [Run], every: usize) -> Option<()> {
         let mut pixels = [[0.0; 2]; MOST_PIXELS];
-        (self.clipped, self.pixels) = (0, 0);
+        (self.inside, self.clipped, self.pixels) = (0, 0, 0);
         for (i, run) in runs.iter_mut().enumerate() {
             run.sight = None;
             if i % every != 0 {
                 continue;
             }
             let Some(edge) = self.edge(run) else { continue };
+            self.inside += usize::from(is_inside(self.view, edge.pixel));
             let reach = (3.0 * self.spread_px + 1.0).min(edge.cell_px - 2.3 * self.spread_px);
             if reach < 1.8 * self.spread_px + 0.5 {
                 continue;
@@ -426,15 +478,15 @@ impl Search<'_> {
         })
     }
 
-    /// Gives each run its weight by how far it is from what the others say; every so many-th was looked at.
-    fn weigh(&self, scratch: &mut Scratch, every: usize) -> Option<()> {
+    /// Gives each run its weight by how far it is from what the others say.
+    fn weigh(&self, scratch: &mut Scratch) -> Option<()> {
         let Scratch { runs, shifts, .. } = scratch;
-        let sought = runs.len() / every;
+        let least = LEAST_SHARE * self.inside as f64;
         let mut median_of = |of: &dyn Fn(&Sight) -> f64| {
             shifts.clear();
             shifts.extend(runs.iter().filter_map(|run| run.sight.as_ref()).map(of));
             let middle = shifts.len() / 2;
-            (shifts.len() > LEAST_RUNS && shifts.len() as f64 > LEAST_SHARE * sought as f64)
+            (shifts.len() > LEAST_RUNS && shifts.len() as f64 > least)
                 .then(|| *shifts.select_nth_unstable_by(middle, f64::total_cmp).1)
         };
         let contrast = median_of(&|sight| sight.contrast)?;
