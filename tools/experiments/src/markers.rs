@@ -41,6 +41,10 @@ pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<
     let Request { sets_in, results_in, .. } = request;
     std::fs::create_dir_all(results_in)
         .with_context(|| format!("making {}", results_in.display()))?;
+    if let Some(folder) = &request.photographs {
+        // Minutes later is late to learn of a wrong folder.
+        photographs::check(folder)?;
+    }
     let mut studio = Studio::default();
     let mut extra = String::new();
     for set in &request.sets {

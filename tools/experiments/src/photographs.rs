@@ -87,6 +87,16 @@ fn photographs(folder: &Path) -> anyhow::Result<Vec<Photograph>> {
         .collect()
 }
 
+/// Whether a folder has photographs with labels.
+///
+/// # Errors
+/// When `labels.jsonl` cannot be read, or has none.
+pub fn check(folder: &Path) -> anyhow::Result<()> {
+    let count = photographs(folder)?.len();
+    anyhow::ensure!(count > 0, "{} names no photograph", folder.join("labels.jsonl").display());
+    Ok(())
+}
+
 /// A marker of a family, any id, without a size.
 fn any_of(family: Family) -> Marker {
     Marker { family, id: None, size_m: None }
