@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use imaging::GrayView;
-use messages::{Detections, FrameHeader, FrameReceipt, topic};
+use messages::{ControllerStatus, Detections, FrameHeader, FrameReceipt, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Subscriber, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
@@ -66,6 +66,7 @@ impl AirSender {
             jpegs,
             receipts: node.subscriber(topic::RECEIVED, &[]).await?,
             detections,
+            status: node.subscriber(topic::STATUS, &[]).await?,
             health: node.shared_health(),
             window: Window::new(config),
             planner: Planner::new(config),
@@ -121,6 +122,8 @@ struct Work {
     second_lane: FramePublisher,
     receipts: Subscriber<FrameReceipt>,
     detections: Option<Subscriber<Detections>>,
+    /// Tells which detector is in use.
+    status: Subscriber<ControllerStatus>,
     health: Arc<HealthCounters>,
     window: Window,
     planner: Planner,
@@ -134,6 +137,7 @@ enum News {
     /// The key, which names the detector, and what it says.
     Receipt(String, FrameReceipt),
     Detections(Box<Detections>),
+    Status(Box<ControllerStatus>),
     Frame,
     Tick,
     Closed,
@@ -152,6 +156,9 @@ impl Work {
                 message = next_of(self.detections.as_ref()) => {
                     message.map_or(News::Closed, |message| News::Detections(Box::new(message)))
                 }
+                message = self.status.next() => {
+                    message.map_or(News::Closed, |message| News::Status(Box::new(message)))
+                }
                 () = self.offers.arrived.notified() => News::Frame,
                 _ = ticks.tick() => News::Tick,
             };
@@ -161,6 +168,10 @@ impl Work {
                     self.expected.learn(&message);
                 }
                 News::Detections(_) => {}
+                News::Status(status) => {
+                    let key = |detector: &String| topic::RECEIVED.key(&[detector]);
+                    self.window.use_receiver(status.active_detector.as_ref().map(key));
+                }
                 News::Frame => self.send().await,
                 News::Tick => self.has_subscribers = self.jpegs.has_subscribers().await,
                 News::Closed => return,

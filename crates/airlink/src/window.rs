@@ -8,7 +8,7 @@
 //! counts as lost; one that the first of several receivers has answered is waited for a little longer only, so that a
 //! receiver that is slow or gone does not hold up the others. The size grows while frames arrive sooner than aimed at, and
 //! shrinks while they arrive later; the mean of some frames decides, because a lost packet delays a single frame whatever
-//! its size.
+//! its size. Of several receivers the one in use decides; while none of them is in use, the slowest.
 //!
 //! Time is any clock's, in nanoseconds, given by the caller.
 
@@ -58,6 +58,8 @@ pub struct Window {
     losses_in_a_row: u32,
     sent: VecDeque<Sent>,
     receivers: Vec<Receiver>,
+    /// The receiver whose answers are used.
+    in_use: Option<String>,
 }
 
 #[derive(Clone, Debug)]
@@ -96,7 +98,13 @@ impl Window {
             losses_in_a_row: 0,
             sent: VecDeque::new(),
             receivers: Vec::new(),
+            in_use: None,
         }
+    }
+
+    /// From now on this receiver alone decides, while it answers; with `None`, or while it does not, the slowest of all does.
+    pub fn use_receiver(&mut self, name: Option<String>) {
+        self.in_use = name;
     }
 
     /// Bytes that the next frame should have at most.
@@ -202,12 +210,14 @@ impl Window {
             }
             None => {}
         }
-        let with_all = self.receivers.iter().map(|known| known.sequence).min().unwrap_or(sequence);
-        for sent in self.sent.iter_mut().filter(|sent| sent.sequence <= with_all) {
+        let in_use = self.receivers.iter().find(|known| Some(&known.name) == self.in_use.as_ref());
+        let slowest = self.receivers.iter().min_by_key(|known| known.sequence);
+        let decides = in_use.is_none_or(|known| known.name == receiver);
+        let arrived = in_use.or(slowest).map_or(sequence, |known| known.sequence);
+        for sent in self.sent.iter_mut().filter(|sent| sent.sequence <= arrived) {
             sent.is_under_way = false;
         }
-        // The last of the receivers decides.
-        if with_all >= sequence {
+        if decides && arrived >= sequence {
             self.adapt(took_ms, bytes);
         }
         Some(took_ms)
@@ -378,6 +388,46 @@ mod tests {
         window.sent(2500 * MS, 3, 1000);
         window.received(2510 * MS, "near", 3);
         assert!(window.is_open(2510 * MS).0, "the far one has been silent for too long");
+    }
+
+    /// A good link carries 100 kB in time, a slow one beside it nothing.
+    fn size_beside_a_slow_one(in_use: Option<&str>) -> usize {
+        let mut window = window();
+        window.use_receiver(in_use.map(str::to_owned));
+        for sequence in 0..200 {
+            let now = sequence as i64 * 300 * MS;
+            let bytes = window.size_bytes();
+            window.sent(now, sequence, bytes);
+            let way_ms = 10 + bytes as i64 / 2500;
+            window.received(now + way_ms * MS, "good", sequence);
+            window.received(now + 200 * MS, "slow", sequence);
+        }
+        window.size_bytes()
+    }
+
+    #[test]
+    fn a_slow_receiver_makes_frames_smaller_only_while_no_other_is_in_use() {
+        assert!((75_000..125_000).contains(&size_beside_a_slow_one(Some("good"))));
+        for in_use in [Some("slow"), None, Some("onboard, reads no JPEG")] {
+            assert_eq!(size_beside_a_slow_one(in_use), 8000, "{in_use:?}");
+        }
+    }
+
+    #[test]
+    fn only_the_receiver_in_use_is_waited_for() {
+        let mut window = window();
+        window.use_receiver(Some("far".to_owned()));
+        window.sent(0, 1, 1000);
+        window.received(10 * MS, "near", 1);
+        assert!(window.is_open(11 * MS).0, "the far one is not known yet");
+        window.received(20 * MS, "far", 1);
+        window.sent(30 * MS, 2, 1000);
+        window.received(40 * MS, "near", 2);
+        assert!(!window.is_open(50 * MS).0, "the far one has not got it");
+        window.use_receiver(Some("near".to_owned()));
+        window.sent(60 * MS, 3, 1000);
+        window.received(70 * MS, "near", 3);
+        assert!(window.is_open(70 * MS).0);
     }
 
     #[test]

@@ -93,10 +93,11 @@ where
 pub fn start_logging(default_level: &str) {
     let ours = std::env::var("ALIGHT_LOG").unwrap_or_else(|_| default_level.to_owned());
     // Zenoh complains about every attempt at the meeting point, by whoever keeps it too; that is how it is meant to work.
-    // It also complains about each message that is still under way to a session that closes ("Route data with unknown
-    // scope", eclipse-zenoh/zenoh issue 1050).
+    // It also complains about each message that is still under way when its sender's session closes ("Route data with
+    // unknown scope", "Route query with unknown scope"; eclipse-zenoh/zenoh issues 980 and 1050, pull request 2524). Such a
+    // question gets an empty answer, and a command that reached nobody is sent again.
     let filter = EnvFilter::try_new(format!(
-        "zenoh=error,zenoh::net::routing::dispatcher::pubsub=off,zenoh::api::session=off,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error,{ours}"
+        "zenoh=error,zenoh::net::routing::dispatcher::pubsub=off,zenoh::net::routing::dispatcher::queries=off,zenoh::api::session=off,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error,{ours}"
     ))
     .unwrap_or_else(|_| EnvFilter::new("info,zenoh=error,zenoh_transport=off"));
     let log = tracing_subscriber::fmt::layer()
