@@ -53,7 +53,7 @@ struct Effort {
 
 impl Effort {
     const FULL: Self =
-        Self { rough_steps: 3, most_steps: 14, most_steps_of_other: 7, least_gain: 3e-4 };
+        Self { rough_steps: 3, most_steps: 22, most_steps_of_other: 10, least_gain: 3e-4 };
     /// Of a marker that is about where it is expected.
     const OF_FOLLOWED: Self =
         Self { rough_steps: 1, most_steps: 6, most_steps_of_other: 1, least_gain: 3e-2 };
@@ -142,7 +142,7 @@ pub(crate) fn refined(
     let hopeless = if is_small { HOPELESS_OF_SMALL } else { HOPELESS };
     around.gather(start, FOCUSED_PX, spots)?;
     let tilted = |circles: &Circles| circles.tilted_at_least(LEAST_START_TILT);
-    let every = if spots.len() < MANY_SPOTS { 1 } else { FEW_EVERY };
+    let every = every(spots);
     let few = Scene { every, ..Scene::new(spots, size_m, camera, hopeless) };
     let mut first = few.fitted(&tilted(start), None, None)?;
     // What lies beyond the paper is kept out once the blur is known.
@@ -203,7 +203,7 @@ pub(crate) fn refined_again(
     }
     let all = Scene::new(spots, size_m, camera, HOPELESS);
     let few = Scene {
-        every: FEW_EVERY,
+        every: every(spots),
         effort: Effort::OF_FOLLOWED,
         ..Scene::new(spots, size_m, camera, HOPELESS)
     };
@@ -235,6 +235,12 @@ pub(crate) fn refined_again(
         .map(|other| other.alternative(scene))
         .filter(|other| other.circles.normal.angle(&best.picture.circles.normal) >= DISTINCT_TILT);
     Some((all.fit_judged(&best, best.picture.worth(&few)?)?, other))
+}
+
+/// Every so many-th spot that is enough for the first steps, of those not too bright to tell anything.
+fn every(spots: &[Spot]) -> usize {
+    let clear = spots.iter().filter(|spot| spot.grey <= WHITEST).count();
+    if clear < MANY_SPOTS { 1 } else { FEW_EVERY }
 }
 
 /// The marker tilted the other way.
@@ -510,7 +516,10 @@ impl<'a> Scene<'a> {
 
     /// Of the pose, from the differences that are left: noise, and what the model does not know.
     fn covariance(&self, system: &System, cost: f64) -> Option<SMatrix<f64, 5, 5>> {
-        let variance = cost / (self.count() - UNKNOWNS as f64).max(1.0) + 1.0 / 12.0;
+        let count = system.count;
+        // Of what noise there is where the picture tells of the pose, when that is more than elsewhere.
+        let mean = (cost / count).max(system.told_variance);
+        let variance = mean * count / (count - UNKNOWNS as f64).max(1.0) + 1.0 / 12.0;
         let mut information = system.matrix / variance;
         for i in 0..UNKNOWNS {
             information[(i, i)] += 1e-9;
@@ -684,9 +693,18 @@ impl Picture {
 
     /// Black and white that fit the image best with everything else as it is.
     fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
-        let mut exposure = Exposure::default();
-        self.look_at(scene, |spot, looks| exposure.add(looks.white(), spot.grey))?;
-        let [black, contrast] = exposure.black_and_contrast();
+        // How bright white is beyond the end of the scale, only what is darker says.
+        let (mut all, mut darker) = (Exposure::default(), Exposure::default());
+        self.look_at(scene, |spot, looks| {
+            let white = looks.white();
+            all.add(white, spot.grey);
+            if spot.grey <= WHITEST {
+                darker.add(white, spot.grey);
+            }
+        })?;
+        let is_beyond = |[black, contrast]: &[f64; 2]| black + contrast > WHITEST;
+        let beyond = Some(darker.black_and_contrast()).filter(is_beyond);
+        let [black, contrast] = beyond.unwrap_or_else(|| all.black_and_contrast());
         (self.black, self.white) = (black, black + contrast);
         (contrast > 1.0).then_some(())
     }
@@ -701,7 +719,7 @@ impl Picture {
     /// The normal equations of one step, and the cost here.
     fn system(&self, scene: &Scene<'_>, limit: f64) -> Option<(System, f64)> {
         let (mut matrix, mut right) = ([[0.0; UNKNOWNS]; UNKNOWNS], [0.0; UNKNOWNS]);
-        let mut cost = 0.0;
+        let (mut cost, mut count, mut telling, mut told) = (0.0, 0.0, 0.0, 0.0);
         self.look_at(scene, |spot, looks| {
             let white = looks.white();
             let [x, y] = spot.offset;
@@ -710,11 +728,15 @@ impl Picture {
             if grey > WHITEST && spot.grey > WHITEST {
                 return;
             }
+            count += 1.0;
             let difference = grey - spot.grey;
             let size = difference.abs();
             let weight = if size > limit { limit / size } else { 1.0 };
-            cost += if size > limit { limit * (2.0 * size - limit) } else { size * size };
+            let square = if size > limit { limit * (2.0 * size - limit) } else { size * size };
+            cost += square;
             let by_distance = looks.by_distance * contrast;
+            told += by_distance * by_distance * square;
+            telling += by_distance * by_distance;
             let [a, b, c, d, e] = looks.by_pose;
             let slope: [f64; UNKNOWNS] = [
                 a * by_distance,
@@ -737,8 +759,9 @@ impl Picture {
                 }
             }
         })?;
-        let system =
-            System { matrix: SMatrix::from_fn(|i, j| matrix[i][j]), right: SVector::from(right) };
+        let matrix = SMatrix::from_fn(|i, j| matrix[i][j]);
+        let told_variance = if telling > 0.0 { told / telling } else { 0.0 };
+        let system = System { matrix, right: SVector::from(right), count, told_variance };
         cost.is_finite().then_some((system, cost))
     }
 
@@ -767,6 +790,10 @@ impl Picture {
 struct System {
     matrix: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
     right: SVector<f64, UNKNOWNS>,
+    /// Of so many spots: not of those that are so bright that they say nothing.
+    count: f64,
+    /// Mean of the squared differences, each counting as much as it says about the pose.
+    told_variance: f64,
 }
 
 /// The exponential function, in fewer steps where the argument is small.
@@ -796,9 +823,20 @@ mod tests {
         }
     }
 
-    /// A picture made by the model itself leads back to the pose it was made with.
+    /// A picture made by the model itself leads back to the pose it was made with, also where white is beyond the scale.
     #[test]
     fn the_pose_comes_back_from_its_picture() {
+        for paper in [200.0, 500.0] {
+            let (found, truth) = from_its_picture(paper);
+            assert!(found.difference < 0.005 && found.explained > 0.999, "{paper} {found:?}");
+            let off = found.circles.centre - truth.centre;
+            assert!(off.norm() < 2e-4 * 6.0, "{paper} {found:?}");
+            assert!(found.circles.normal.angle(&truth.normal) < 0.02, "{paper} {found:?}");
+        }
+    }
+
+    /// What is found in a picture whose white is so bright, and the truth.
+    fn from_its_picture(paper: f64) -> (Fit, Circles) {
         let camera = CameraModel::pinhole(100, 80, 909.0);
         let size_m = 0.15341;
         let truth = Circles {
@@ -806,7 +844,7 @@ mod tests {
             normal: Vector3::new(0.3, 0.2, -0.9).normalize(),
         };
         let picture =
-            Picture { circles: truth, blur_px: 0.6, black: 30.0, white: 200.0, slope: [0.5, -0.3] };
+            Picture { circles: truth, blur_px: 0.6, black: 30.0, white: paper, slope: [0.5, -0.3] };
         let middle = project(truth.centre, &camera).unwrap();
         let data: Vec<u8> = (0..8000)
             .map(|i| {
@@ -815,10 +853,11 @@ mod tests {
                 let offset = [x - middle.x, y - middle.y];
                 let spots = [Spot { ray, offset, grey: 0.0, within: true }];
                 let scene = Scene::new(&spots, size_m, &camera, HOPELESS);
-                let mut white = 0.0;
-                picture.look_at(&scene, |_, looks| white = looks.white()).unwrap();
-                let paper = 200.0 + 0.5 * offset[0] - 0.3 * offset[1];
-                (30.0 + (paper - 30.0) * white).round() as u8
+                let mut grey = 0.0;
+                picture
+                    .look_at(&scene, |spot, looks| grey = picture.grey(spot, looks.white()).0)
+                    .unwrap();
+                grey.round() as u8
             })
             .collect();
         let view = GrayView::packed(&data, 100, 80).unwrap();
@@ -827,9 +866,6 @@ mod tests {
             normal: Vector3::new(0.1, 0.1, -0.9).normalize(),
         };
         let (fit, _) = refined(view, &camera, &start, size_m, false, &mut Vec::new()).unwrap();
-        let found = fit.circles;
-        assert!(fit.difference < 0.005 && fit.explained > 0.999, "{fit:?}");
-        assert!((found.centre - truth.centre).norm() < 2e-4 * 6.0, "{found:?}");
-        assert!(found.normal.angle(&truth.normal) < 0.02, "{found:?}");
+        (fit, truth)
     }
 }
