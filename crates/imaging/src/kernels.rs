@@ -64,6 +64,18 @@ pub(crate) fn above(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
     below(thresholds, pixels, words);
 }
 
+/// Does some work, with the loops of what is inlined into it compiled for AVX2 where the processor has it. It is the same
+/// code, and none of its arithmetic is fused, so the result is the same.
+#[inline]
+pub(crate) fn with_vectors<T>(work: impl FnOnce() -> T) -> T {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { avx2::with_vectors(work) };
+    }
+    work()
+}
+
 /// In plain Rust, from tile, pixel or word `from` on.
 mod plain {
     use std::ops::Range;
@@ -137,6 +149,11 @@ mod avx2 {
     };
 
     use super::TILE;
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn with_vectors<T>(work: impl FnOnce() -> T) -> T {
+        work()
+    }
 
     /// 32 bytes of `row` from `at` on.
     #[target_feature(enable = "avx2")]

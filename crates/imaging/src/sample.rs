@@ -6,19 +6,21 @@ use crate::view::GrayView;
 /// centres.
 #[inline]
 pub fn bilinear(view: GrayView<'_>, x: f64, y: f64) -> Option<f64> {
-    let (last_x, last_y) = (view.width() - 1, view.height() - 1);
-    // Written so that a place that is not a number is outside.
-    if !(x >= 0.0 && y >= 0.0 && x <= last_x as f64 && y <= last_y as f64) {
+    // What is negative or not a number becomes 0, and leaves a share that is not within 0 and 1.
+    let (left, top) = (x as u32, y as u32);
+    let (fx, fy) = (x - f64::from(left), y - f64::from(top));
+    if !(fx >= 0.0 && fy >= 0.0) {
         return None;
     }
-    let (left, top) = (x as usize, y as usize);
-    let (right, bottom) = ((left + 1).min(last_x), (top + 1).min(last_y));
-    let (fx, fy) = (x - left as f64, y - top as f64);
-    let across = |row: &[u8]| {
-        let (a, b) = (f64::from(row[left]), f64::from(row[right]));
-        a + (b - a) * fx
-    };
-    let (above, below) = (across(view.row(top)), across(view.row(bottom)));
+    let (left, top) = (left as usize, top as usize);
+    let beyond = |edge: usize, at: usize| edge.checked_sub(at)?.checked_sub(1);
+    let (right, below) = (beyond(view.width(), left)?, beyond(view.height(), top)?);
+    // In the last column and row are only its pixels' centres.
+    if (right == 0 && fx > 0.0) || (below == 0 && fy > 0.0) {
+        return None;
+    }
+    let [a, b, c, d] = view.square(left, top, [right.min(1), below.min(1)])?.map(f64::from);
+    let (above, below) = (a + (b - a) * fx, c + (d - c) * fx);
     Some(above + (below - above) * fy)
 }
 
@@ -32,9 +34,15 @@ mod tests {
         assert_eq!(bilinear(view, 1.0, 0.0), Some(100.0));
         assert_eq!(bilinear(view, 0.5, 0.5), Some(90.0));
         assert_eq!(bilinear(view, 1.0, 1.0), Some(60.0));
-        for (x, y) in
-            [(-0.01, 0.0), (1.01, 0.0), (0.0, 1.01), (f64::NAN, 0.0), (0.0, f64::INFINITY)]
-        {
+        for (x, y) in [
+            (-0.01, 0.0),
+            (1.01, 0.0),
+            (0.0, 1.01),
+            (f64::NAN, 0.0),
+            (0.0, f64::INFINITY),
+            (5e9, 0.0),
+            (-1e30, 1.0),
+        ] {
             assert_eq!(bilinear(view, x, y), None);
         }
     }

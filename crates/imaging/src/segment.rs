@@ -5,6 +5,7 @@
 //! its direction, is cut where it bends, and each part is fitted with a line, to a fraction of a pixel. This is the
 //! way of edge drawing (Topal and Akinlar, 2012), with the direction of the gradient in place of its routing.
 
+use crate::kernels::with_vectors;
 use crate::view::GrayView;
 
 /// A straight piece of an edge. Its dark side is on the right of the way from start to end, so the outline of
@@ -98,9 +99,7 @@ impl Segments {
             return &self.found;
         }
         (self.width, self.height) = (view.width(), view.height());
-        self.measure(view);
-        self.thin(least);
-        self.sow();
+        with_vectors(|| self.mark(view, least));
         for start in 0..self.seeds.len() / 8 {
             let eight = &self.seeds[8 * start..][..8];
             if eight == [0; 8] {
@@ -116,6 +115,15 @@ impl Segments {
         &self.found
     }
 
+    /// Finds the edge pixels, and where chains may begin.
+    #[inline(always)]
+    fn mark(&mut self, view: GrayView<'_>, least: LeastEdge) {
+        self.measure(view);
+        self.thin(least);
+        self.sow();
+    }
+
+    #[inline(always)]
     fn measure(&mut self, view: GrayView<'_>) {
         let (width, height) = (self.width, self.height);
         self.across.resize(width * height, 0);
@@ -128,6 +136,7 @@ impl Segments {
         }
     }
 
+    #[inline(always)]
     fn thin(&mut self, least: LeastEdge) {
         let (width, height) = (self.width, self.height);
         self.edges.clear();
@@ -156,6 +165,7 @@ impl Segments {
     }
 
     /// Marks where chains may begin: texture has many edge pixels, but few that go on to both sides.
+    #[inline(always)]
     fn sow(&mut self) {
         let (width, height) = (self.width, self.height);
         // The last pixels up to a multiple of eight are never seeds.
@@ -261,6 +271,7 @@ const NEIGHBOURS: [[isize; 2]; 8] =
 const EDGE: u8 = 1;
 
 /// Whether a pixel is an edge whose direction differs by no more than a sixteenth of a turn.
+#[inline(always)]
 fn is_like(direction: u8, other: u8) -> bool {
     (other.wrapping_sub(direction).wrapping_add(16) <= 32) & (other != 0)
 }
@@ -283,6 +294,7 @@ const fn ahead() -> [[usize; 3]; 16] {
 }
 
 /// Twice the gradients in the middle of each two by two pixels.
+#[inline(always)]
 fn gradients(above: &[u8], below: &[u8], across: &mut [i16], down: &mut [i16]) {
     let above = above.iter().zip(&above[1..]);
     let below = below.iter().zip(&below[1..]);
@@ -296,6 +308,7 @@ fn gradients(above: &[u8], below: &[u8], across: &mut [i16], down: &mut [i16]) {
     }
 }
 
+#[inline(always)]
 fn strengths(across: &[i16], down: &[i16], out: &mut [i16]) {
     for ((out, across), down) in out.iter_mut().zip(across).zip(down) {
         *out = across.wrapping_abs() + down.wrapping_abs();
@@ -304,6 +317,7 @@ fn strengths(across: &[i16], down: &[i16], out: &mut [i16]) {
 
 /// Marks where the strength is at least `least` and the largest along the axis the gradient is nearest to, and
 /// writes the gradient's direction, as [`EDGE`] says.
+#[inline(always)]
 fn strongest(
     [across, down]: [&[i16]; 2],
     [above, here, below]: [&[i16]; 3],
@@ -334,6 +348,7 @@ fn strongest(
 }
 
 /// Marks the edge pixels of the middle row that have two neighbours of like direction or more.
+#[inline(always)]
 fn continued([above, here, below]: [&[u8]; 3], out: &mut [u8]) {
     let inner = out.len().saturating_sub(2);
     let around = [

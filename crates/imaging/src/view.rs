@@ -128,6 +128,15 @@ impl<'a> GrayView<'a> {
         &self.data[y * self.stride..][..self.width]
     }
 
+    /// The pixel at a place, and those so many columns to the right, rows below, and both; `None` outside the image, as far as
+    /// the memory ends there.
+    #[inline]
+    pub(crate) fn square(&self, x: usize, y: usize, [right, below]: [usize; 2]) -> Option<[u8; 4]> {
+        let (first, down) = (y * self.stride + x, below * self.stride);
+        let pixels = self.data.get(first..=first + down + right)?;
+        Some([*pixels.first()?, *pixels.get(right)?, *pixels.get(down)?, *pixels.last()?])
+    }
+
     /// The pixel at column `x` of row `y`.
     ///
     /// # Panics

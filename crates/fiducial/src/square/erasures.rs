@@ -539,38 +539,60 @@ fn best_word(word: u64, known: u64, code: &Code, wanted: Option<&[u32]>) -> Opti
         })
 }
 
-/// The cells whose ink is known, by their places and grey values.
+/// So many known cells are looked at at a time.
+const LANES: usize = 8;
+const MOST_KNOWN: usize = MOST_CELLS.next_multiple_of(LANES);
+
+/// The cells whose ink is known, by their places and grey values. After the last one, up to a whole number of [`LANES`], are
+/// cells of neither ink, whose logarithm is 0.
 pub(crate) struct Known {
     count: usize,
-    places: [[f32; 2]; MOST_CELLS],
-    values: [f32; MOST_CELLS],
+    columns: [f32; MOST_KNOWN],
+    rows: [f32; MOST_KNOWN],
+    values: [f32; MOST_KNOWN],
     /// Logarithms: of a shadow, black and white keep their ratio.
-    logs: [f32; MOST_CELLS],
-    white: [bool; MOST_CELLS],
+    logs: [f32; MOST_KNOWN],
+    /// 1 for cells of the ink, 0 for others.
+    black: [f32; MOST_KNOWN],
+    white: [f32; MOST_KNOWN],
+    /// Of black and of white cells, how many there are and the sum of their logarithms.
+    sums: [[f32; 2]; 2],
 }
 
 impl Default for Known {
     fn default() -> Self {
+        let none = [0.0; MOST_KNOWN];
         Self {
             count: 0,
-            places: [[0.0; 2]; MOST_CELLS],
-            values: [0.0; MOST_CELLS],
-            logs: [0.0; MOST_CELLS],
-            white: [false; MOST_CELLS],
+            columns: none,
+            rows: none,
+            values: none,
+            logs: none,
+            black: none,
+            white: none,
+            sums: [[0.0; 2]; 2],
         }
     }
 }
 
 impl Known {
     /// Adds a place, in cells from the middle of the square's upper left one.
-    pub(crate) fn push(&mut self, place: [f32; 2], value: f32, white: bool) {
+    pub(crate) fn push(&mut self, [column, row]: [f32; 2], value: f32, white: bool) {
         if self.count < MOST_CELLS {
-            self.places[self.count] = place;
-            self.values[self.count] = value;
-            self.logs[self.count] = log(value);
-            self.white[self.count] = white;
+            let (at, log) = (self.count, log(value));
+            (self.columns[at], self.rows[at]) = (column, row);
+            (self.values[at], self.logs[at]) = (value, log);
+            let ink = if white { &mut self.white } else { &mut self.black };
+            ink[at] = 1.0;
+            let [count, sum] = &mut self.sums[usize::from(white)];
+            *count += 1.0;
+            *sum += log;
             self.count += 1;
         }
+    }
+
+    fn is_white(&self, index: usize) -> bool {
+        self.white[index] > 0.0
     }
 
     /// The light about a grid whose middle is at `middle` both ways.
@@ -625,16 +647,13 @@ impl Known {
 
     /// The light when a line separates two, and the squares that remain, each bounded.
     fn split(&self, normal: [f32; 2], offset: f32) -> Option<(Light, f32)> {
-        let mut sums = [[[0.0_f32; 2]; 2]; 2];
-        let side = |i: usize| {
-            let [x, y] = self.places[i];
-            usize::from(x * normal[0] + y * normal[1] > offset)
-        };
-        for i in 0..self.count {
-            let sum = &mut sums[side(i)][usize::from(self.white[i])];
-            sum[0] += 1.0;
-            sum[1] += self.logs[i];
-        }
+        let beyond = self.beyond(normal, offset);
+        let [black, white] = self.sums;
+        let before = [
+            [black[0] - beyond[0][0], black[1] - beyond[0][1]],
+            [white[0] - beyond[1][0], white[1] - beyond[1][1]],
+        ];
+        let sums = [before, beyond];
         let mut means = sums.map(|side| side.map(|[n, sum]| (n >= 2.0).then_some(sum / n)));
         if offset.is_infinite() {
             means[1] = means[0];
@@ -657,11 +676,45 @@ impl Known {
                 [None, None] => return None,
             };
         }
-        let misfit = (0..self.count)
-            .map(|i| bounded(self.logs[i] - logs[side(i)][usize::from(self.white[i])]))
-            .sum();
+        let misfit = self.misfit(normal, offset, logs);
         let levels = logs.map(|side| side.map(|log| log.exp() - SCATTERED));
         Some((Light { normal, offset, levels, reflection: None }, misfit))
+    }
+
+    /// Of black and of white cells beyond a line, how many there are and the sum of their logarithms.
+    fn beyond(&self, normal: [f32; 2], offset: f32) -> [[f32; 2]; 2] {
+        let mut sums = [[[0.0_f32; LANES]; 2]; 2];
+        for from in (0..self.count).step_by(LANES) {
+            let [x, y, log, black, white] =
+                [&self.columns, &self.rows, &self.logs, &self.black, &self.white]
+                    .map(|list| lanes(list, from));
+            for lane in 0..LANES {
+                let is_beyond = x[lane] * normal[0] + y[lane] * normal[1] > offset;
+                let share = f32::from(u8::from(is_beyond));
+                for (sums, ink) in sums.iter_mut().zip([black, white]) {
+                    sums[0][lane] += share * ink[lane];
+                    sums[1][lane] += share * ink[lane] * log[lane];
+                }
+            }
+        }
+        sums.map(|sums| sums.map(|lanes| lanes.iter().sum()))
+    }
+
+    /// The squares that remain, each bounded, when black and white have these logarithms before and beyond a line.
+    fn misfit(&self, normal: [f32; 2], offset: f32, levels: [[f32; 2]; 2]) -> f32 {
+        let mut sums = [0.0_f32; LANES];
+        for from in (0..self.count).step_by(LANES) {
+            let [x, y, log, black, white] =
+                [&self.columns, &self.rows, &self.logs, &self.black, &self.white]
+                    .map(|list| lanes(list, from));
+            for lane in 0..LANES {
+                let is_beyond = x[lane] * normal[0] + y[lane] * normal[1] > offset;
+                let [dark, bright] = if is_beyond { levels[1] } else { levels[0] };
+                let expected = black[lane] * dark + white[lane] * bright;
+                sums[lane] += bounded(log[lane] - expected);
+            }
+        }
+        sums.iter().sum()
     }
 
     /// One light and a reflection, and what they leave to explain.
@@ -673,11 +726,11 @@ impl Known {
         let mut sums = nalgebra::Matrix4::<f32>::zeros();
         let mut sides = nalgebra::Vector4::<f32>::zeros();
         for i in 0..self.count {
-            let added = self.values[i] - levels[0][usize::from(self.white[i])];
+            let added = self.values[i] - levels[0][usize::from(self.is_white(i))];
             if added < 5.0 || self.values[i] > SATURATED {
                 continue;
             }
-            let [x, y] = self.places[i];
+            let [x, y] = [self.columns[i], self.rows[i]];
             let row = nalgebra::Vector4::new(1.0, x, y, x * x + y * y);
             // The error of a logarithm is that of the level by the level.
             let weight = (added / 20.0).powi(2).min(25.0);
@@ -692,8 +745,8 @@ impl Known {
         let light = Light { normal: [1.0, 0.0], offset: f32::INFINITY, levels, reflection };
         let misfit = (0..self.count)
             .map(|i| {
-                let [black, white] = light.at(self.places[i], 0);
-                let expected = if self.white[i] { white } else { black };
+                let [black, white] = light.at([self.columns[i], self.rows[i]], 0);
+                let expected = if self.is_white(i) { white } else { black };
                 bounded(self.logs[i] - log(expected))
             })
             .sum();
@@ -705,7 +758,7 @@ impl Known {
         let mut values = [0.0; MOST_CELLS];
         let mut count = 0;
         for i in 0..self.count {
-            if self.white[i] == white {
+            if self.is_white(i) == white {
                 values[count] = self.values[i];
                 count += 1;
             }
@@ -714,6 +767,13 @@ impl Known {
         values.sort_unstable_by(f32::total_cmp);
         values.get(count / 4).copied()
     }
+}
+
+/// Some cells of a list.
+#[inline]
+fn lanes(list: &[f32; MOST_KNOWN], from: usize) -> &[f32; LANES] {
+    const NONE: [f32; LANES] = [0.0; LANES];
+    list.get(from..).and_then(|list| list.first_chunk()).unwrap_or(&NONE)
 }
 
 /// What the lens scatters into the dark, in grey levels: it keeps the logarithm of the darkest from deciding alone.
