@@ -34,6 +34,9 @@ use samples::{Agreement, Sampled, sample};
 /// A quad is looked at on the level of the pyramid on which its sides are from this long to twice that, in pixels: at first
 /// and, when it may be a marker, again.
 const SIDE_PX: [f64; 2] = [12.0, 20.0];
+/// Where that does not do, it is looked at again where its sides are from this long to twice that: the blur of a lens out of
+/// focus is there what is expected of one in focus.
+const UNSHARP_SIDE_PX: f64 = 8.0;
 /// Shorter sides tell nothing.
 const LEAST_SIDE_PX: f64 = 7.0;
 /// Of families with more words than this, or of so many ids, not every word is tried.
@@ -108,8 +111,8 @@ struct Reading {
 
 impl Stags {
     /// Outlines up to this size are looked for in the image itself: the border of a marker, a tenth of its side, is too
-    /// thin on the next level.
-    pub(crate) const LARGEST_PX: u16 = 56;
+    /// thin on the next level, and out of focus too bright.
+    pub(crate) const LARGEST_PX: u16 = 88;
 
     /// Looks for these markers, white on black as well when `inverted`; those of other families are left out.
     pub(crate) fn new(markers: &[Marker], inverted: bool) -> Self {
@@ -352,9 +355,15 @@ impl Stags {
         let mut better = Quad { corners: refined.corners, ..*quad };
         better.corners.rotate_right(usize::from(first.turns) % 4);
         let second = self.look((view, pyramid), &better, SIDE_PX[1])?;
-        if second.explained < LEAST_EXPLAINED || second.ratio < LEAST_RATIO {
-            return Err(Reason::Confidence);
-        }
+        let second = if is_believed(&second) {
+            second
+        } else {
+            let unsharp = self.look((view, pyramid), &better, UNSHARP_SIDE_PX)?;
+            if !is_believed(&unsharp) {
+                return Err(Reason::Confidence);
+            }
+            unsharp
+        };
         if (second.wanted, second.id, second.turns) == (first.wanted, first.id, first.turns) {
             return Ok((second, refined));
         }
@@ -510,6 +519,11 @@ impl Wanted {
             _ => 7,
         }
     }
+}
+
+/// Whether a word explains enough, and more than the others.
+fn is_believed(reading: &Reading) -> bool {
+    reading.explained >= LEAST_EXPLAINED && reading.ratio >= LEAST_RATIO
 }
 
 /// Whether there is more light about a quad's middle than in its corners, as on an STag's disc.

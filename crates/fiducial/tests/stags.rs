@@ -256,3 +256,45 @@ fn where_the_border_is_hardly_seen_the_paper_shows_the_marker() {
         }
     }
 }
+
+/// A square image seen through a lens out of focus, whose blur is normal with this standard deviation, in pixels.
+fn out_of_focus(image: &[u8], blur_px: f64) -> Vec<u8> {
+    let size = image.len().isqrt();
+    let reach = (3.0 * blur_px).ceil() as isize;
+    let weights: Vec<f64> =
+        (-reach..=reach).map(|k| (-0.5 * (k as f64 / blur_px).powi(2)).exp()).collect();
+    let whole: f64 = weights.iter().sum();
+    // Along the rows, with rows and columns exchanged.
+    let along = |image: &[f64]| -> Vec<f64> {
+        let grey = |i: usize| {
+            let (x, y) = (i / size, i % size);
+            let place = |k: usize| (x + k).saturating_sub(reach as usize).min(size - 1);
+            let sum = weights.iter().enumerate().map(|(k, w)| w * image[y * size + place(k)]);
+            sum.sum::<f64>() / whole
+        };
+        (0..size * size).map(grey).collect()
+    };
+    let greys: Vec<f64> = image.iter().map(|grey| f64::from(*grey)).collect();
+    along(&along(&greys)).iter().map(|grey| grey.round() as u8).collect()
+}
+
+#[test]
+fn a_lens_out_of_focus_does_not_hide_a_marker() {
+    let mut detector = detector("stag-hd23:*:0.15341");
+    for (k, side_px) in [38.0, 42.0, 45.0, 48.0, 53.0].into_iter().enumerate() {
+        for id in 0..6 {
+            let turn = 0.3 + 0.9 * f64::from(id) + 0.2 * k as f64;
+            let shot =
+                Shot { centre: [95.3, 96.6], ..Shot::new(Family::StagHd23, id, side_px, turn) };
+            let image = out_of_focus(&shot.seen(LARGE, |_, light| light), 2.5);
+            let found = detect(&mut detector, &image);
+            let name = format!("{id} of {side_px} px turned by {turn}");
+            assert_eq!(found.len(), 1, "{name}");
+            assert_eq!(found[0].id, Some(id), "{name}");
+            for (corner, truth) in found[0].corners.unwrap().iter().zip(shot.corners()) {
+                let off = corner.distance(&truth);
+                assert!(off < 0.3, "{name}: {off} px");
+            }
+        }
+    }
+}
