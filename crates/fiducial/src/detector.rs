@@ -10,8 +10,9 @@ use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
 use crate::rings::Rings;
 use crate::rings_thesis::RingsThesis;
-use crate::square::Squares;
+use crate::square::quad::Quad;
 use crate::square::segments::{ImageQuads, Scale};
+use crate::square::{MOST_PAPERS, Squares, papers};
 use crate::stag::Stags;
 use crate::trace::{Trace, TracedMarker};
 
@@ -137,6 +138,8 @@ pub struct Detector {
     rings: Rings,
     thesis: RingsThesis,
     broken: ImageQuads,
+    /// Quads that may be the paper of markers far away.
+    papers: Vec<Quad>,
     found: Vec<Observation>,
     trace: Trace,
     /// The slow passes there are for these markers, and how many were made in turn.
@@ -181,6 +184,7 @@ impl Detector {
             rings: Rings::new(settings.inverted, settings.thorough),
             thesis: RingsThesis::default(),
             broken: ImageQuads::default(),
+            papers: Vec::new(),
             found: Vec::new(),
             trace: Trace::default(),
             slow_passes: slow_passes.map(|(pass, _)| pass).collect(),
@@ -325,6 +329,8 @@ impl Detector {
         }
         if is_slow(SlowPass::Papers(Third::Upper)) {
             self.broken.make_room(view);
+            self.papers.clear();
+            self.papers.reserve(MOST_PAPERS);
         }
     }
 
@@ -356,7 +362,10 @@ impl Detector {
             for third in thirds.into_iter().flatten() {
                 self.outlines.add_rows(view, &PAPERS, third.rows(view.height()));
             }
-            let (seen, trace) = ((view, &self.outlines, first), &mut self.trace);
+            self.papers.clear();
+            self.papers.extend(papers(view, &self.outlines, first));
+            let (seen, trace) =
+                ((view, self.outlines.pyramid(), self.papers.as_slice()), &mut self.trace);
             self.squares.detect_on_paper(seen, camera, trace, &mut self.found);
             if self.stags.is_missing(is_needed(&self.found), &self.found) {
                 self.stags.detect_on_paper(seen, camera, trace, &mut self.found);

@@ -36,7 +36,7 @@ use crate::trace::{Reason, Trace};
 const MOST_QUADS: usize = 4000;
 const MOST_SOLVED: usize = 400;
 const MOST_FOUND: usize = 256;
-const MOST_PAPERS: usize = 64;
+pub(crate) const MOST_PAPERS: usize = 64;
 
 /// Borders are broken by what is in them where cells are not wider, in pixels.
 const MOST_BROKEN_CELL_PX: f64 = 2.0;
@@ -263,19 +263,19 @@ impl Squares {
         stages.ended("damaged");
     }
 
-    /// Finds markers so small that their border is broken by the outlines of their paper, which are those from the index `first`
-    /// on and taken to be as wide around the border as a cell.
+    /// Finds markers so small that their border is broken by the outlines of their paper, which is taken to be as wide around
+    /// the border as a cell.
     pub(crate) fn detect_on_paper(
         &mut self,
-        (view, outlines, first): (GrayView<'_>, &Outlines, usize),
+        (view, pyramid, papers): (GrayView<'_>, &Pyramid, &[Quad]),
         camera: Option<&CameraModel>,
         trace: &mut Trace,
         found: &mut Vec<Observation>,
     ) {
         let whole = self.found.len();
-        for paper in papers(view, outlines, first) {
+        for paper in papers {
             for layout in 0..self.layouts.len() {
-                self.read_on_paper((view, outlines.pyramid()), &paper, layout, trace);
+                self.read_on_paper((view, pyramid), paper, layout, trace);
             }
         }
         self.observe_all(view, whole, camera, found);

@@ -14,7 +14,7 @@ mod samples;
 
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::from_level_0;
-use imaging::{GrayView, Outlines, Pyramid, bilinear};
+use imaging::{GrayView, Pyramid, bilinear};
 
 use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
@@ -23,7 +23,7 @@ use crate::square::codebook::Codebook;
 use crate::square::decode::Grid;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
-use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, covers, papers, unevenness};
+use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, covers, unevenness};
 use crate::trace::{Reason, Trace};
 
 use damaged::Damaged;
@@ -215,21 +215,21 @@ impl Stags {
         (is_it && reading.turns == 0).then(|| self.observe(&reading, &refined, camera))
     }
 
-    /// Finds small markers by the outlines of their paper, which are those from the index `first` on.
+    /// Finds small markers by the outlines of their paper.
     pub(crate) fn detect_on_paper(
         &mut self,
-        (view, outlines, first): (GrayView<'_>, &Outlines, usize),
+        (view, pyramid, papers): (GrayView<'_>, &Pyramid, &[Quad]),
         camera: Option<&CameraModel>,
         trace: &mut Trace,
         found: &mut Vec<Observation>,
     ) {
-        for paper in papers(view, outlines, first) {
+        for paper in papers {
             let share = 1.0 / (1.0 + 2.0 * code::QUIET);
             let quad = Quad { inverted: false, ..paper.scaled(share) };
             if self.places.iter().any(|place| covers(place, &quad.corners)) {
                 continue;
             }
-            if let Ok((reading, refined)) = self.read(view, outlines.pyramid(), &quad, camera) {
+            if let Ok((reading, refined)) = self.read(view, pyramid, &quad, camera) {
                 trace.accept_quad(refined.corners);
                 self.places.push(refined.corners);
                 found.push(self.observe(&reading, &refined, camera));

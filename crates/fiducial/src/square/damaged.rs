@@ -4,7 +4,7 @@
 use imaging::GrayView;
 
 use super::code::Code;
-use super::erasures::{self, Reading};
+use super::erasures::{Reading, Seen, has_border, have_same_cells, look};
 use super::quad::{Quad, diagonal_px, middle, sides_px};
 
 /// The markers of one family that are looked for.
@@ -100,16 +100,29 @@ fn read<'a>(
         return;
     }
     let shortest = sides_px(&quad.corners).into_iter().fold(f64::MAX, f64::min);
+    // Families with the same cells see the same.
+    let mut border: Option<(u8, bool)> = None;
+    let mut looked: Option<(&Code, Option<Seen>)> = None;
     for family in sought {
-        if shortest < LEAST_CELL_PX * f64::from(family.code.cells) {
+        let code = family.code;
+        if shortest < LEAST_CELL_PX * f64::from(code.cells) {
             continue;
         }
-        if *left == 0 || found.len() >= MOST_FOUND || !erasures::has_border(view, quad, family.code)
-        {
+        if *left == 0 || found.len() >= MOST_FOUND {
+            return;
+        }
+        let known = border.filter(|(cells, _)| *cells == code.cells);
+        let (_, has_border) =
+            *border.insert(known.unwrap_or_else(|| (code.cells, has_border(view, quad, code))));
+        if !has_border {
             continue;
         }
         *left -= 1;
-        if let Some(reading) = erasures::read(view, quad, family.code, family.ids) {
+        if looked.as_ref().is_none_or(|(other, _)| !have_same_cells(other, code)) {
+            looked = Some((code, look(view, quad, code)));
+        }
+        let seen = looked.as_ref().and_then(|(_, seen)| seen.as_ref());
+        if let Some(reading) = seen.and_then(|seen| seen.reading(code, family.ids)) {
             let mut quad = *quad;
             quad.corners.rotate_left(usize::from(reading.quarter_turns % 4));
             found.push(DamagedMarker { index: family.index, quad, reading });

@@ -56,37 +56,59 @@ const MOST_CELLS: usize = MOST_ACROSS * MOST_ACROSS;
 /// Places across a cell at which it is sampled.
 const SAMPLES: usize = 3;
 
-/// Reads the marker of one family in `quad`. `wanted` are the ids that are looked for; `None` stands for all.
-pub fn read(
-    view: GrayView<'_>,
-    quad: &Quad,
-    code: &Code,
-    wanted: Option<&[u32]>,
-) -> Option<Reading> {
+/// What the cells of a quad look like, for all codes with the same cells.
+pub(crate) struct Seen {
+    grid: Grid,
+    cells: [Cell; MOST_CELLS],
+    intact: f32,
+    explained: f32,
+    washed_out: bool,
+}
+
+/// Looks at the cells of a code in `quad`; `None` when it has no border and paper.
+pub(crate) fn look(view: GrayView<'_>, quad: &Quad, code: &Code) -> Option<Seen> {
     let place = Projection::of(&quad.corners)?;
-    let grid = Grid::sample(view, quad, &place, code)?;
+    let look = Look { view, place: &place, cells: f64::from(code.cells), inverted: quad.inverted };
+    let mut grid = Grid::new(code)?;
+    // Most quads are no marker, as their border and paper tell before a bit is looked at.
+    grid.sample(&look, |kind| matches!(kind, Kind::Border | Kind::Paper));
     let light = grid.light()?;
     let mut read = [Cell::Unknown; MOST_CELLS];
     grid.judge(&light, &mut read);
     let intact = grid.intact(&read)?;
+    grid.sample(&look, |kind| kind == Kind::Bit);
+    grid.judge(&light, &mut read);
     let glares = grid.distrust(&mut read);
-    let mut whole = read;
+    let mut cells = read;
     let washed_out = glares || light.reflection.is_some();
     if washed_out {
-        let look =
-            Look { view, place: &place, cells: f64::from(code.cells), inverted: quad.inverted };
-        grid.step(&look, &light, &mut whole);
+        grid.step(&look, &light, &mut cells);
     }
-    let (word, known) = grid.word(&whole, code);
-    let mut reading = best_word(word, known, code, wanted)?;
-    reading.intact = intact;
-    reading.washed_out = washed_out;
-    reading.explained = grid.explained(&light, &read);
-    let least = match reading.evidence {
-        EVIDENCE_OF_DOUBTFUL.. => LEAST_EXPLAINED,
-        _ => LEAST_EXPLAINED_WITH_LITTLE,
-    };
-    (reading.explained >= least).then_some(reading)
+    let explained = grid.explained(&light, &read);
+    Some(Seen { grid, cells, intact, explained, washed_out })
+}
+
+impl Seen {
+    /// The marker of one family that it is. `wanted` are the ids that are looked for; `None` stands for all.
+    pub(crate) fn reading(&self, code: &Code, wanted: Option<&[u32]>) -> Option<Reading> {
+        let (word, known) = self.grid.word(&self.cells, code);
+        let mut reading = best_word(word, known, code, wanted)?;
+        reading.intact = self.intact;
+        reading.washed_out = self.washed_out;
+        reading.explained = self.explained;
+        let least = match reading.evidence {
+            EVIDENCE_OF_DOUBTFUL.. => LEAST_EXPLAINED,
+            _ => LEAST_EXPLAINED_WITH_LITTLE,
+        };
+        (reading.explained >= least).then_some(reading)
+    }
+}
+
+/// Whether two codes have the same cells, in whatever order their bits are.
+pub(crate) fn have_same_cells(a: &Code, b: &Code) -> bool {
+    let has =
+        |cells: &[[i8; 2]], others: &[[i8; 2]]| others.iter().all(|cell| cells.contains(cell));
+    a.cells == b.cells && a.bits.len() == b.bits.len() && has(a.bits, b.bits)
 }
 
 /// Whether the border is darker than what lies beside it, by nearly the same ratio for most of its cells: a shadow keeps
@@ -168,7 +190,8 @@ pub(crate) struct Light {
 }
 
 impl Grid {
-    fn sample(view: GrayView<'_>, quad: &Quad, place: &Projection, code: &Code) -> Option<Self> {
+    /// The cells of a code, not yet sampled; `None` for a code with more cells than any that is published.
+    fn new(code: &Code) -> Option<Self> {
         let margin = code.margin();
         let across = usize::from(code.cells + 2 * margin);
         if across > MOST_ACROSS {
@@ -181,15 +204,18 @@ impl Grid {
             samples: [[f32::NAN; SAMPLES * SAMPLES]; MOST_CELLS],
         };
         grid.name(code);
-        // A marker printed the other way round is read as its negative.
-        let negative = quad.inverted;
-        for index in 0..across * across {
-            let kind = grid.kinds[index];
-            if kind == Kind::Nothing {
+        Some(grid)
+    }
+
+    /// Samples the cells of some kinds.
+    fn sample(&mut self, look: &Look<'_>, is_sampled: impl Fn(Kind) -> bool) {
+        let last = look.cells - 1.0;
+        for index in 0..self.across * self.across {
+            let kind = self.kinds[index];
+            if !is_sampled(kind) {
                 continue;
             }
-            let [column, row] = grid.cell(index);
-            let last = f64::from(code.cells) - 1.0;
+            let [column, row] = self.cell(index);
             for sample in 0..SAMPLES * SAMPLES {
                 let within = [sample % SAMPLES, sample / SAMPLES].map(|i| 0.22 + 0.28 * i as f64);
                 // Little paper may be around the border, so it is taken near the border.
@@ -201,17 +227,16 @@ impl Grid {
                         _ => cell + within,
                     }
                 };
-                let at = [near(column, within[0]), near(row, within[1])]
-                    .map(|v| v / f64::from(code.cells));
-                let value = place.at(at).and_then(|p| bilinear(view, p));
-                grid.samples[index][sample] = match value {
-                    Some(value) if negative => 255.0 - value,
+                let at = [near(column, within[0]), near(row, within[1])].map(|v| v / look.cells);
+                let value = look.place.at(at).and_then(|p| bilinear(look.view, p));
+                // A marker printed the other way round is read as its negative.
+                self.samples[index][sample] = match value {
+                    Some(value) if look.inverted => 255.0 - value,
                     Some(value) => value,
                     None => f32::NAN,
                 };
             }
         }
-        Some(grid)
     }
 
     /// Says what each cell is.
@@ -559,6 +584,13 @@ pub(crate) struct Known {
     sums: [[f32; 2]; 2],
 }
 
+/// Where cells lie across the lines of a direction, in cells.
+struct Across {
+    angle: f32,
+    normal: [f32; 2],
+    places: [f32; MOST_KNOWN],
+}
+
 impl Default for Known {
     fn default() -> Self {
         let none = [0.0; MOST_KNOWN];
@@ -597,7 +629,7 @@ impl Known {
 
     /// The light about a grid whose middle is at `middle` both ways.
     pub(crate) fn light(&self, middle: f32) -> Option<Light> {
-        let (mut best, mut misfit) = self.split([1.0, 0.0], f32::INFINITY)?;
+        let (mut best, mut misfit) = self.split(&self.across(0.0), f32::INFINITY)?;
         // Little is left to explain: one light.
         if misfit > 0.01 * self.count as f32 {
             let most = 0.6 * misfit;
@@ -612,26 +644,39 @@ impl Known {
         best.levels.into_iter().all(enough).then_some(best)
     }
 
+    /// Where the cells lie across lines of a direction.
+    #[inline]
+    fn across(&self, angle: f32) -> Across {
+        let normal = [angle.cos(), angle.sin()];
+        let mut across = Across { angle, normal, places: [0.0; MOST_KNOWN] };
+        for ((place, x), y) in across.places.iter_mut().zip(&self.columns).zip(&self.rows) {
+            *place = x * normal[0] + y * normal[1];
+        }
+        across
+    }
+
     /// Two lights, and what they leave to explain: the best of lines all over the grid, then of lines near it.
+    #[inline]
     fn shaded(&self, middle: f32) -> Option<(Light, f32)> {
         const DIRECTIONS: i32 = 12;
         let (mut turn, mut step) = (std::f32::consts::PI / DIRECTIONS as f32, (middle + 1.0) / 5.0);
-        let line = |angle: f32, aside: f32| {
-            let normal = [angle.cos(), angle.sin()];
-            self.split(normal, middle * (normal[0] + normal[1]) + aside)
+        let line = |across: &Across, aside: f32| {
+            let [a, b] = across.normal;
+            self.split(across, middle * (a + b) + aside)
         };
         let mut best: Option<(Light, f32)> = None;
         let mut at = (0.0, 0.0);
-        let mut look = |angle: f32, aside: f32, at: &mut (f32, f32)| {
-            let Some(found) = line(angle, aside) else { return };
+        let mut look = |across: &Across, aside: f32, at: &mut (f32, f32)| {
+            let Some(found) = line(across, aside) else { return };
             if best.is_none_or(|best| found.1 < best.1) {
                 best = Some(found);
-                *at = (angle, aside);
+                *at = (across.angle, aside);
             }
         };
         for direction in 0..DIRECTIONS {
+            let across = self.across(turn * direction as f32);
             for aside in -5..=5 {
-                look(turn * direction as f32, step * aside as f32, &mut at);
+                look(&across, step * aside as f32, &mut at);
             }
         }
         for _ in 0..4 {
@@ -639,15 +684,16 @@ impl Known {
             step *= 0.5;
             let (angle, aside) = at;
             for (dt, ds) in [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)] {
-                look(angle + dt * turn, aside + ds * step, &mut at);
+                look(&self.across(angle + dt * turn), aside + ds * step, &mut at);
             }
         }
         best
     }
 
     /// The light when a line separates two, and the squares that remain, each bounded.
-    fn split(&self, normal: [f32; 2], offset: f32) -> Option<(Light, f32)> {
-        let beyond = self.beyond(normal, offset);
+    #[inline]
+    fn split(&self, across: &Across, offset: f32) -> Option<(Light, f32)> {
+        let beyond = self.beyond(across, offset);
         let [black, white] = self.sums;
         let before = [
             [black[0] - beyond[0][0], black[1] - beyond[0][1]],
@@ -676,21 +722,20 @@ impl Known {
                 [None, None] => return None,
             };
         }
-        let misfit = self.misfit(normal, offset, logs);
+        let misfit = self.misfit(across, offset, logs);
         let levels = logs.map(|side| side.map(|log| log.exp() - SCATTERED));
-        Some((Light { normal, offset, levels, reflection: None }, misfit))
+        Some((Light { normal: across.normal, offset, levels, reflection: None }, misfit))
     }
 
     /// Of black and of white cells beyond a line, how many there are and the sum of their logarithms.
-    fn beyond(&self, normal: [f32; 2], offset: f32) -> [[f32; 2]; 2] {
+    #[inline]
+    fn beyond(&self, across: &Across, offset: f32) -> [[f32; 2]; 2] {
         let mut sums = [[[0.0_f32; LANES]; 2]; 2];
         for from in (0..self.count).step_by(LANES) {
-            let [x, y, log, black, white] =
-                [&self.columns, &self.rows, &self.logs, &self.black, &self.white]
-                    .map(|list| lanes(list, from));
+            let [place, log, black, white] = [&across.places, &self.logs, &self.black, &self.white]
+                .map(|list| lanes(list, from));
             for lane in 0..LANES {
-                let is_beyond = x[lane] * normal[0] + y[lane] * normal[1] > offset;
-                let share = f32::from(u8::from(is_beyond));
+                let share = f32::from(u8::from(place[lane] > offset));
                 for (sums, ink) in sums.iter_mut().zip([black, white]) {
                     sums[0][lane] += share * ink[lane];
                     sums[1][lane] += share * ink[lane] * log[lane];
@@ -701,15 +746,14 @@ impl Known {
     }
 
     /// The squares that remain, each bounded, when black and white have these logarithms before and beyond a line.
-    fn misfit(&self, normal: [f32; 2], offset: f32, levels: [[f32; 2]; 2]) -> f32 {
+    #[inline]
+    fn misfit(&self, across: &Across, offset: f32, levels: [[f32; 2]; 2]) -> f32 {
         let mut sums = [0.0_f32; LANES];
         for from in (0..self.count).step_by(LANES) {
-            let [x, y, log, black, white] =
-                [&self.columns, &self.rows, &self.logs, &self.black, &self.white]
-                    .map(|list| lanes(list, from));
+            let [place, log, black, white] = [&across.places, &self.logs, &self.black, &self.white]
+                .map(|list| lanes(list, from));
             for lane in 0..LANES {
-                let is_beyond = x[lane] * normal[0] + y[lane] * normal[1] > offset;
-                let [dark, bright] = if is_beyond { levels[1] } else { levels[0] };
+                let [dark, bright] = if place[lane] > offset { levels[1] } else { levels[0] };
                 let expected = black[lane] * dark + white[lane] * bright;
                 sums[lane] += bounded(log[lane] - expected);
             }
@@ -787,6 +831,7 @@ fn log(value: f32) -> f32 {
 }
 
 /// The square of a difference of logarithms; what is covered counts no more than so much.
+#[inline]
 fn bounded(difference: f32) -> f32 {
     const MOST: f32 = 0.5;
     difference.abs().min(MOST).powi(2)
