@@ -23,8 +23,14 @@ const COLOURS: [RGBColor; 6] = [
     RGBColor(23, 190, 207),
 ];
 
-/// One curve: name, and the mean error at each position in metres.
+/// One curve: a family, and the mean error at each position in metres.
 type Curve = (String, Vec<Option<f64>>);
+
+/// The colour of a family: that of its place among ours.
+fn colour_of(family: &str, ours: &[Curve]) -> RGBColor {
+    let place = ours.iter().position(|(name, _)| name == family).unwrap_or(ours.len());
+    COLOURS[place % COLOURS.len()]
+}
 
 /// The figure of a binning as SVG; `None` when no marker was looked for at the positions.
 ///
@@ -58,7 +64,7 @@ pub fn svg(runs: &[Run], binning: &str) -> anyhow::Result<Option<String>> {
                 };
                 table.rows.iter().find(is_there).map(|row| row.2[0])
             });
-            (format!("{} (thesis)", table.family), errors.collect())
+            (table.family.to_owned(), errors.collect())
         })
         .collect();
     let mut svg = String::new();
@@ -85,14 +91,19 @@ fn draw(
         .x_label_area_size(40)
         .y_label_area_size(60)
         .build_cartesian_2d(0.0..last + 1.0, 0.0..15.0)?;
-    chart.configure_mesh().x_desc("position (Table 4.1)").y_desc("distance, m").draw()?;
+    chart
+        .configure_mesh()
+        .x_desc("position (Table 4.1)")
+        .x_label_formatter(&|x| format!("{x:.0}"))
+        .y_desc("distance, m")
+        .draw()?;
     let line = truth.iter().enumerate().map(|(i, (x, _))| (i as f64 + 1.0, f64::from(*x)));
     chart
         .draw_series(LineSeries::new(line, BLACK.stroke_width(1)))?
         .label("truth")
         .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], BLACK));
     for (index, (name, errors)) in ours.iter().chain(thesis).enumerate() {
-        let colour = COLOURS[index % COLOURS.len()];
+        let colour = colour_of(name, ours);
         let is_thesis = index >= ours.len();
         let points =
             truth.iter().zip(errors).enumerate().filter_map(|(i, ((x, _), error))| {
@@ -101,7 +112,7 @@ fn draw(
         if is_thesis {
             chart
                 .draw_series(points.map(|place| Cross::new(place, 3, colour.mix(0.7))))?
-                .label(name)
+                .label(format!("{name} (thesis)"))
                 .legend(move |(x, y)| Cross::new((x + 8, y), 3, colour.mix(0.7)));
         } else {
             chart
@@ -132,9 +143,14 @@ fn draw_errors(
         .x_label_area_size(40)
         .y_label_area_size(60)
         .build_cartesian_2d(0.0..count as f64 + 1.0, -most..most)?;
-    chart.configure_mesh().x_desc("position (Table 4.1)").y_desc("mean error, mm").draw()?;
-    for (index, (_, errors)) in ours.iter().enumerate() {
-        let colour = COLOURS[index % COLOURS.len()];
+    chart
+        .configure_mesh()
+        .x_desc("position (Table 4.1)")
+        .x_label_formatter(&|x| format!("{x:.0}"))
+        .y_desc("mean error, mm")
+        .draw()?;
+    for (name, errors) in ours {
+        let colour = colour_of(name, ours);
         let points = errors
             .iter()
             .enumerate()
