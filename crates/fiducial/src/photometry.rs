@@ -28,6 +28,8 @@ const MANY_SPOTS: usize = 200;
 const FEW_EVERY: usize = 3;
 /// Standard deviation, in pixels, of the blur of a lens in focus and of the pixel's own extent.
 const FOCUSED_PX: f64 = 0.6;
+/// The least blur in any direction.
+const LEAST_BLUR_PX: f64 = 0.3;
 /// Brighter pixels may be of any brightness.
 const WHITEST: f64 = 254.5;
 /// So many standard deviations of the blur from an edge nothing is seen of it.
@@ -42,8 +44,10 @@ const HOPELESS: [f64; 3] = [0.45, 0.4, 0.35];
 /// When a fit ends.
 #[derive(Copy, Clone, Debug)]
 struct Effort {
-    /// Steps before what differs much pulls no harder, and at least as many in all, as the first may hardly improve anything.
-    rough_steps: usize,
+    /// So many steps at least, as the first may hardly improve anything; ...
+    least_steps: usize,
+    /// ... and after so many, where it is a number, what differs much pulls no harder.
+    rough_steps: Option<usize>,
     most_steps: usize,
     /// Steps of a fit in the light of another.
     most_steps_of_other: usize,
@@ -52,15 +56,31 @@ struct Effort {
 }
 
 impl Effort {
-    const FULL: Self =
-        Self { rough_steps: 3, most_steps: 22, most_steps_of_other: 10, least_gain: 3e-4 };
+    const FULL: Self = Self {
+        least_steps: 3,
+        rough_steps: Some(3),
+        most_steps: 22,
+        most_steps_of_other: 10,
+        least_gain: 3e-4,
+    };
     /// Of a marker that is about where it is expected.
-    const OF_FOLLOWED: Self =
-        Self { rough_steps: 1, most_steps: 6, most_steps_of_other: 1, least_gain: 3e-2 };
+    const OF_FOLLOWED: Self = Self {
+        least_steps: 1,
+        rough_steps: None,
+        most_steps: 6,
+        most_steps_of_other: 1,
+        least_gain: 3e-2,
+    };
 }
 
 /// Pose (5), blur, black, white, and white's change across and down.
 const UNKNOWNS: usize = 10;
+/// The same and the blur of a motion.
+const UNKNOWNS_MOVING: usize = 12;
+/// Where a larger difference is left, in units of the contrast, motion may be why, ...
+const LEAST_OF_MOVING: f64 = 0.03;
+/// ... if it leaves no more than this share of the cost.
+const MOST_COST_OF_MOVING: f64 = 0.5;
 /// A tilt, in radians, that is no longer a saddle of the fit: seen squarely, every tilt looks the same at first.
 const LEAST_START_TILT: f64 = 0.2;
 /// The pose tilted the other way is no alternative when it costs so many times more.
@@ -78,8 +98,11 @@ const PRIOR_NORMAL: f64 = 0.6;
 #[derive(Copy, Clone, Debug)]
 struct Picture {
     circles: Circles,
-    /// Standard deviation of the blur in pixels: the lens', and the pixels' own extent.
+    /// Standard deviation of the blur in pixels: the lens', and the pixels' own extent; its mean over all directions.
     blur_px: f64,
+    /// What its variance has more to the right than down, over two, and the covariance of both, in square pixels: what a
+    /// motion blurs.
+    motion: [f64; 2],
     black: f64,
     white: f64,
     /// Change of white per pixel to the right and down.
@@ -153,8 +176,16 @@ pub(crate) fn refined(
         let scene = Scene { every, ..Scene::new(spots, size_m, camera, hopeless) };
         first = scene.fitted(&tilted(&circles), None, None)?;
     }
-    let all = Scene::new(spots, size_m, camera, hopeless);
-    let few = Scene { every, ..Scene::new(spots, size_m, camera, hopeless) };
+    let mut all = Scene::new(spots, size_m, camera, hopeless);
+    let mut few = Scene { every, ..Scene::new(spots, size_m, camera, hopeless) };
+    if (LEAST_OF_MOVING..MOST_DIFFERENCE).contains(&first.difference(&few)) {
+        few.moving = true;
+        let moving = few.fitted(&first.picture.circles, Some(&first), None);
+        match moving.filter(|moving| moving.cost < MOST_COST_OF_MOVING * first.cost) {
+            Some(moving) => (first, all.moving) = (moving, true),
+            None => few.moving = false,
+        }
+    }
     // The fit to all spots, from that to few of them.
     let by_all = |fitted: Fitted| match every {
         1 => Some(fitted),
@@ -218,6 +249,10 @@ pub(crate) fn refined_again(
         Some(second) if second.cost < first.cost => (second, Some(first)),
         second => (first, second),
     };
+    best.limit = few.limit(best.limit, best.cost);
+    if let Some(other) = &mut other {
+        other.limit = best.limit;
+    }
     // Which of the two it is all spots say, where few hardly do.
     let is_open = other.as_ref().is_some_and(|other| other.cost < CLOSE_COST * best.cost);
     best = all.stepped(&best)?;
@@ -370,6 +405,8 @@ struct Scene<'a> {
     /// The difference before each of the first steps above which there is no hope.
     hopeless: [f64; 3],
     effort: Effort,
+    /// Whether the blur may be a motion's.
+    moving: bool,
 }
 
 /// A picture that fits as well as any near it.
@@ -407,7 +444,7 @@ impl<'a> Scene<'a> {
             }
         }
         let (every, effort) = (1, Effort::FULL);
-        Self { spots, every, camera, radii, step: Step::new(), hopeless, effort }
+        Self { spots, every, camera, radii, step: Step::new(), hopeless, effort, moving: false }
     }
 
     /// The best fit from here, in the light of another fit where there is one; `None` when its cost stays above what is
@@ -423,6 +460,7 @@ impl<'a> Scene<'a> {
             None => Picture {
                 circles: *start,
                 blur_px: FOCUSED_PX,
+                motion: [0.0; 2],
                 black: 0.0,
                 white: 255.0,
                 slope: [0.0; 2],
@@ -436,8 +474,8 @@ impl<'a> Scene<'a> {
             Some(like) => like.limit,
             None => 0.25 * (best.white - best.black),
         };
-        let Effort { rough_steps, most_steps, most_steps_of_other, least_gain } = self.effort;
-        let least_steps = if like.is_some() { 1 } else { rough_steps };
+        let Effort { least_steps, most_steps, most_steps_of_other, least_gain, .. } = self.effort;
+        let least_steps = if like.is_some() { 1 } else { least_steps };
         let (mut system, mut cost) = best.system(self, limit)?;
         let mut damping = if like.is_some() { 1e-4 } else { 1e-3 };
         let most_steps = if like.is_some() { most_steps_of_other } else { most_steps };
@@ -459,8 +497,8 @@ impl<'a> Scene<'a> {
                     let settled = cost - next_cost < least_gain * cost;
                     (best, system, cost) = (next, next_system, next_cost);
                     damping = (damping * 0.1).max(1e-7);
-                    if like.is_none() && step + 1 == rough_steps {
-                        limit = limit.min(3.0 * (cost / self.count()).sqrt() + 1.0);
+                    if like.is_none() && self.effort.rough_steps == Some(step + 1) {
+                        limit = self.limit(limit, cost);
                         (system, cost) = best.system(self, limit)?;
                     } else if settled && step >= least_steps {
                         break;
@@ -510,6 +548,11 @@ impl<'a> Scene<'a> {
         })
     }
 
+    /// Differences of a good fit are hardly larger than this.
+    fn limit(&self, before: f64, cost: f64) -> f64 {
+        before.min(3.0 * (cost / self.count()).sqrt() + 1.0)
+    }
+
     fn count(&self) -> f64 {
         self.spots.len().div_ceil(self.every) as f64
     }
@@ -521,7 +564,7 @@ impl<'a> Scene<'a> {
         let mean = (cost / count).max(system.told_variance);
         let variance = mean * count / (count - UNKNOWNS as f64).max(1.0) + 1.0 / 12.0;
         let mut information = system.matrix / variance;
-        for i in 0..UNKNOWNS {
+        for i in 0..UNKNOWNS_MOVING {
             information[(i, i)] += 1e-9;
         }
         for i in 3..5 {
@@ -541,6 +584,7 @@ struct Looks {
     /// How the whiteness changes with that distance, and with the blur.
     by_distance: f64,
     by_blur: f64,
+    by_motion: [f64; 2],
 }
 
 impl Looks {
@@ -549,6 +593,15 @@ impl Looks {
         let [a, b, c, d, e, f] = self.within;
         1.0 - a + b - c + d - e + f
     }
+}
+
+/// The blur of a picture.
+struct Blur {
+    blur_px: f64,
+    /// To the right, between right and down, and down, in square pixels.
+    covariance: [f64; 3],
+    /// In the direction in which there is least.
+    least_variance: f64,
 }
 
 /// Where the places lie that are drawn from the blur about a pixel.
@@ -568,18 +621,24 @@ struct Places {
     /// How the share within a circle changes with the pixel's distance, in pixels outwards.
     outwards: f64,
     boxiness: f64,
+    /// One over the standard deviation of the distance, in metres.
+    per_blur: f64,
+    /// How the logarithm of that deviation changes with the blur and with the motion's two numbers.
+    by_blur: f64,
+    by_motion: [f64; 2],
 }
 
 impl Places {
     /// Without a branch, so that many are worked out at once.
     #[inline(always)]
-    fn about(ray: &Vector3<f64>, plane: &Plane, variance: f64) -> Self {
+    fn about(ray: &Vector3<f64>, plane: &Plane, blur: &Blur) -> Self {
         let meeting = plane.meets(ray);
         let Meeting { rho, outwards: a, around: b, metres_per_px, px_per_metre, .. } = meeting;
         // Variances outwards and around, and the two together.
-        let rr = variance * (metres_per_px * metres_per_px);
-        let tt = variance * (b[0] * b[0] + b[1] * b[1]);
-        let rt = variance * (a[0] * b[0] + a[1] * b[1]);
+        let [xx, xy, yy] = blur.covariance;
+        let blurred = |[x, y]: [f64; 2]| [xx * x + xy * y, xy * x + yy * y];
+        let dot = |[x, y]: [f64; 2], [u, v]: [f64; 2]| x * u + y * v;
+        let (rr, tt, rt) = (dot(a, blurred(a)), dot(b, blurred(b)), dot(b, blurred(a)));
         let (trace, det) = (rr + tt, rr * tt - rt * rt);
         let square = rho * rho;
         // Cumulants of the squared distance.
@@ -590,6 +649,12 @@ impl Places {
         let power = 1.0 - k1 * k3 * (per_k2 * per_k2) / 3.0;
         let mean = 1.0 + power * (power - 1.0) * k2 * (per_k1 * per_k1) / 2.0;
         let per_spread = k2.sqrt() * per_k2;
+        let normal = a.map(|part| part * px_per_metre);
+        let [nx, ny] = normal;
+        let variance = rr * (px_per_metre * px_per_metre);
+        let per_variance = 1.0 / variance;
+        // A motion is a box, as a pixel is, of which the variance here is that beyond the least in any direction.
+        let of_box = 1.0 - blur.least_variance * per_variance;
         Self {
             meeting,
             log_square: k1.ln(),
@@ -597,22 +662,24 @@ impl Places {
             mean,
             per_deviation: k1 * per_spread / power,
             outwards: -2.0 * rho * metres_per_px * per_spread,
-            boxiness: boxiness(a.map(|part| part * px_per_metre), variance),
+            boxiness: boxiness(normal, variance) - of_box * of_box / 20.0,
+            per_blur: px_per_metre * per_variance.sqrt(),
+            by_blur: blur.blur_px * per_variance,
+            by_motion: [0.5 * (nx * nx - ny * ny) * per_variance, nx * ny * per_variance],
         }
     }
 
     /// What a pixel with such a blur sees of the marker.
     #[inline]
-    fn looks(&self, per_px: f64, scene: &Scene<'_>) -> Looks {
-        let Meeting { rho, px_per_metre, slope, .. } = self.meeting;
-        let per_blur = px_per_metre * per_px;
-        let mut looks = Looks { within: [0.0; 6], by_distance: 0.0, by_blur: 0.0, by_pose: slope };
+    fn looks(&self, scene: &Scene<'_>) -> Looks {
+        let Meeting { rho, slope, .. } = self.meeting;
+        let (mut within, mut by_distance, mut by_deviation) = ([0.0; 6], 0.0, 0.0);
         for (index, (within, (radius, log_radius))) in
-            looks.within.iter_mut().zip(scene.radii).enumerate()
+            within.iter_mut().zip(scene.radii).enumerate()
         {
             // Outer edges end the black, inner ones begin the white.
             let sign = if index % 2 == 0 { -1.0 } else { 1.0 };
-            let rough = (radius - rho) * per_blur;
+            let rough = (radius - rho) * self.per_blur;
             if rough.abs() > FURTHEST_BLUR {
                 *within = if rough > 0.0 { 1.0 } else { 0.0 };
                 continue;
@@ -622,10 +689,16 @@ impl Places {
             let (step, density) = scene.step.at(z, self.boxiness);
             *within = step;
             // Outwards, per pixel.
-            looks.by_distance += sign * density * self.outwards * ratio;
-            looks.by_blur -= sign * density * z * per_px;
+            by_distance += sign * density * self.outwards * ratio;
+            by_deviation -= sign * density * z;
         }
-        looks
+        Looks {
+            within,
+            by_pose: slope,
+            by_distance,
+            by_blur: by_deviation * self.by_blur,
+            by_motion: self.by_motion.map(|by| by_deviation * by),
+        }
     }
 }
 
@@ -636,18 +709,23 @@ impl Picture {
         // So many at once that divisions and roots do not wait for one another.
         const BATCH: usize = 8;
         let plane = self.circles.plane(scene.camera);
-        let (variance, per_px) = (self.blur_px * self.blur_px, 1.0 / self.blur_px);
+        let (variance, [p, q]) = (self.blur_px * self.blur_px, self.motion);
+        let blur = Blur {
+            blur_px: self.blur_px,
+            covariance: [variance + p, q, variance - p],
+            least_variance: variance - p.hypot(q),
+        };
         for spots in scene.spots.chunks(BATCH * scene.every) {
             let mut counted = spots.iter().step_by(scene.every);
             let last = spots.last()?;
             let batch: [&Spot; BATCH] = std::array::from_fn(|_| counted.next().unwrap_or(last));
-            let places = batch.map(|spot| Places::about(&spot.ray, &plane, variance));
+            let places = batch.map(|spot| Places::about(&spot.ray, &plane, &blur));
             let count = spots.len().div_ceil(scene.every);
             for (spot, places) in batch.iter().zip(&places).take(count) {
                 if !places.meeting.is_sound() {
                     return None;
                 }
-                tell(spot, &places.looks(per_px, scene));
+                tell(spot, &places.looks(scene));
             }
         }
         Some(())
@@ -719,6 +797,7 @@ impl Picture {
     /// The normal equations of one step, and the cost here.
     fn system(&self, scene: &Scene<'_>, limit: f64) -> Option<(System, f64)> {
         let (mut matrix, mut right) = ([[0.0; UNKNOWNS]; UNKNOWNS], [0.0; UNKNOWNS]);
+        let mut of_motion = [[0.0; UNKNOWNS_MOVING + 1]; 2];
         let (mut cost, mut count, mut telling, mut told) = (0.0, 0.0, 0.0, 0.0);
         self.look_at(scene, |spot, looks| {
             let white = looks.white();
@@ -758,10 +837,18 @@ impl Picture {
                     *entry += scaled * other;
                 }
             }
+            if scene.moving {
+                let by_motion = looks.by_motion.map(|by| by * contrast);
+                let others = slope.iter().chain(&by_motion).copied().chain([-difference]);
+                for (index, other) in others.enumerate() {
+                    of_motion[0][index] += weight * by_motion[0] * other;
+                    of_motion[1][index] += weight * by_motion[1] * other;
+                }
+            }
         })?;
-        let matrix = SMatrix::from_fn(|i, j| matrix[i][j]);
         let told_variance = if telling > 0.0 { told / telling } else { 0.0 };
-        let system = System { matrix, right: SVector::from(right), count, told_variance };
+        let (matrix, right) = with_motion((matrix, right), of_motion, scene.moving);
+        let system = System { matrix, right, count, told_variance };
         cost.is_finite().then_some((system, cost))
     }
 
@@ -772,13 +859,19 @@ impl Picture {
     /// The picture after a step, and by how much less it costs.
     fn stepped_by(&self, system: &System, damping: f64) -> Option<(Self, f64)> {
         let mut matrix = system.matrix;
-        for i in 0..UNKNOWNS {
+        for i in 0..UNKNOWNS_MOVING {
             matrix[(i, i)] += damping * system.matrix[(i, i)] + 1e-9;
         }
         let step = matrix.cholesky()?.solve(&system.right);
+        let blur_px = (self.blur_px + step[5].clamp(-0.3, 0.3)).clamp(LEAST_BLUR_PX, 6.0);
+        // In no direction may less blur be left.
+        let motion = [self.motion[0] + step[10], self.motion[1] + step[11]];
+        let most = blur_px * blur_px - LEAST_BLUR_PX * LEAST_BLUR_PX;
+        let scale = (most / motion[0].hypot(motion[1]).max(1e-12)).min(1.0);
         let picture = Self {
             circles: self.circles.moved(&step.fixed_rows::<5>(0).into_owned())?,
-            blur_px: (self.blur_px + step[5].clamp(-0.3, 0.3)).clamp(0.3, 6.0),
+            blur_px,
+            motion: motion.map(|part| part * scale),
             black: self.black + step[6],
             white: self.white + step[7],
             slope: [self.slope[0] + step[8], self.slope[1] + step[9]],
@@ -788,12 +881,38 @@ impl Picture {
 }
 
 struct System {
-    matrix: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
-    right: SVector<f64, UNKNOWNS>,
+    matrix: Matrix,
+    right: Column,
     /// Of so many spots: not of those that are so bright that they say nothing.
     count: f64,
     /// Mean of the squared differences, each counting as much as it says about the pose.
     told_variance: f64,
+}
+
+type Matrix = SMatrix<f64, UNKNOWNS_MOVING, UNKNOWNS_MOVING>;
+type Column = SVector<f64, UNKNOWNS_MOVING>;
+
+/// The normal equations of one step with the rows of the motion; a motion that is not asked for is nought for sure.
+fn with_motion(
+    (matrix, right): ([[f64; UNKNOWNS]; UNKNOWNS], [f64; UNKNOWNS]),
+    of_motion: [[f64; UNKNOWNS_MOVING + 1]; 2],
+    moving: bool,
+) -> (Matrix, Column) {
+    const SURE: f64 = 1e12;
+    let (mut all, mut all_right) = (Matrix::zeros(), Column::zeros());
+    all.fixed_view_mut::<UNKNOWNS, UNKNOWNS>(0, 0).copy_from(&SMatrix::from(matrix));
+    all_right.fixed_rows_mut::<UNKNOWNS>(0).copy_from(&SVector::from(right));
+    for (row, sums) in (UNKNOWNS..).zip(of_motion) {
+        let Some((right, sums)) = sums.split_last() else { continue };
+        all_right[row] = *right;
+        for (column, sum) in sums.iter().enumerate() {
+            (all[(row, column)], all[(column, row)]) = (*sum, *sum);
+        }
+        if !moving {
+            all[(row, row)] = SURE;
+        }
+    }
+    (all, all_right)
 }
 
 /// The exponential function, in fewer steps where the argument is small.
@@ -823,11 +942,14 @@ mod tests {
         }
     }
 
-    /// A picture made by the model itself leads back to the pose it was made with, also where white is beyond the scale.
+    /// A picture made by the model itself leads back to the pose it was made with, also where white is beyond the scale
+    /// or a motion blurs it.
     #[test]
     fn the_pose_comes_back_from_its_picture() {
-        for paper in [200.0, 500.0] {
-            let (found, truth) = from_its_picture(paper);
+        for (paper, blur_px, motion) in
+            [(200.0, 0.6, [0.0; 2]), (500.0, 0.6, [0.0; 2]), (200.0, 1.1, [0.8, -0.5])]
+        {
+            let (found, truth) = from_its_picture(paper, blur_px, motion);
             assert!(found.difference < 0.005 && found.explained > 0.999, "{paper} {found:?}");
             let off = found.circles.centre - truth.centre;
             assert!(off.norm() < 2e-4 * 6.0, "{paper} {found:?}");
@@ -835,16 +957,22 @@ mod tests {
         }
     }
 
-    /// What is found in a picture whose white is so bright, and the truth.
-    fn from_its_picture(paper: f64) -> (Fit, Circles) {
+    /// What is found in a picture whose white is so bright and that is blurred so, and the truth.
+    fn from_its_picture(paper: f64, blur_px: f64, motion: [f64; 2]) -> (Fit, Circles) {
         let camera = CameraModel::pinhole(100, 80, 909.0);
         let size_m = 0.15341;
         let truth = Circles {
             centre: Vector3::new(0.03, -0.05, 6.0),
             normal: Vector3::new(0.3, 0.2, -0.9).normalize(),
         };
-        let picture =
-            Picture { circles: truth, blur_px: 0.6, black: 30.0, white: paper, slope: [0.5, -0.3] };
+        let picture = Picture {
+            circles: truth,
+            blur_px,
+            motion,
+            black: 30.0,
+            white: paper,
+            slope: [0.5, -0.3],
+        };
         let middle = project(truth.centre, &camera).unwrap();
         let data: Vec<u8> = (0..8000)
             .map(|i| {

@@ -410,7 +410,7 @@ impl Search<'_> {
         let most = match reach {
             Reach::Near => 96.0,
             Reach::Far => 40.0,
-            Reach::Glance => 24.0,
+            Reach::Glance => 16.0,
         };
         let count = (PI * radius * px_per_m).clamp(16.0, most) as u32;
         let furthest = if reach == Reach::Far { 0.45 * width_px } else { 5.0 };
