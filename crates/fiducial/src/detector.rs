@@ -99,7 +99,7 @@ const PAPERS: outline::Settings = outline::Settings {
     least_contrast_percent: 12,
     steep: true,
     least_fill: 0.3,
-    most_ragged: 1.3,
+    most_ragged: 1.2,
 };
 
 /// Where a marker should be.

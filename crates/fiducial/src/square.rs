@@ -34,7 +34,7 @@ use crate::trace::{Reason, Trace};
 
 /// Bounds on the work in one image, far above what frames with markers need.
 const MOST_QUADS: usize = 4000;
-const MOST_SOLVED: usize = 400;
+const MOST_SOLVED: usize = 500;
 const MOST_FOUND: usize = 256;
 pub(crate) const MOST_PAPERS: usize = 64;
 

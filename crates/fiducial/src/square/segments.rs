@@ -45,7 +45,13 @@ impl Scale {
     pub(crate) const ALL: [Self; 2] = [Self::Fine, Self::Coarse];
 }
 
-const LEAST_EDGE: LeastEdge = LeastEdge { gradient: 6, length_px: 5.0 };
+/// Sides of markers are edges at least as steep as this, in grey levels per pixel, or as the first where the image is dark:
+/// a twelfth of its brightest part. Textures have many that are less steep.
+const LEAST_GRADIENT: [u8; 2] = [6, 10];
+const DARKEST_PER_BRIGHTEST: u8 = 12;
+const LEAST_LENGTH_PX: f32 = 6.0;
+/// The brightest part is looked for on the level this many above, where a glint is none.
+const BRIGHTNESS_LEVELS: usize = 2;
 
 /// The quads that the segments of an image may belong to, which all families share. It keeps its memory from image to
 /// image.
@@ -95,7 +101,8 @@ impl ImageQuads {
         let finest = finest.unwrap_or(pyramid.levels().saturating_sub(1));
         let level = finest + usize::from(scale == Scale::Coarse);
         let Some(picture) = pyramid.level(view, level) else { return };
-        let segments = self.segments.find(picture, LEAST_EDGE);
+        let far = pyramid.level(view, finest + BRIGHTNESS_LEVELS).unwrap_or(picture);
+        let segments = self.segments.find(picture, least_edge(far));
         let offset = to_level_0(0.0, level) as f32;
         let placement = Placement { scale: 1.0 + 2.0 * offset, offset };
         let size = [picture.width(), picture.height()];
@@ -104,6 +111,14 @@ impl ImageQuads {
             self.quads.extend(found.iter().map(|found| found.quad));
         }
     }
+}
+
+/// The edges that may be a marker's, in an image of this brightness.
+fn least_edge(view: GrayView<'_>) -> LeastEdge {
+    let brightest = (0..view.height()).flat_map(|y| view.row(y)).copied().max().unwrap_or(0);
+    let [least, most] = LEAST_GRADIENT;
+    let gradient = (brightest / DARKEST_PER_BRIGHTEST).clamp(least, most);
+    LeastEdge { gradient, length_px: LEAST_LENGTH_PX }
 }
 
 /// The most sides, corners and quads that are looked at.
