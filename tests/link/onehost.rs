@@ -1,7 +1,8 @@
 //! One host: a frame from its camera to a reader in another process, beside a bare ring of buffers in shared memory.
 //!
 //! The ring is the limit: two threads that share the buffers, in memory of the same kind, woken by a condition variable,
-//! which is a futex.
+//! which is a futex. (Two processes with a futex between them take the same time within 5 %, but need `unsafe`.) Between both
+//! stands Zenoh alone, the example `bare_zenoh` of `node`, when it is built: what it takes is not ours to save.
 
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
@@ -34,6 +35,14 @@ pub(crate) struct OneHost {
     frames: Times,
     cpu_ms: [f64; 2],
     ring_cpu_ms: f64,
+    bare: Option<Bare>,
+}
+
+/// Zenoh without anything of ours.
+#[derive(Default)]
+struct Bare {
+    frames: Times,
+    cpu_ms: [f64; 2],
 }
 
 impl std::fmt::Display for OneHost {
@@ -47,6 +56,20 @@ impl std::fmt::Display for OneHost {
             self.frames.at(0.99) * 1e3,
             self.ring.at(0.99) * 1e3,
             self.ring_cpu_ms,
+        )?;
+        let Some(bare) = &self.bare else {
+            return write!(
+                f,
+                "; Zenoh alone is not measured: `cargo build --release -p node --example bare_zenoh` first"
+            );
+        };
+        let (us, [writer, reader]) = (bare.frames.at(0.5) * 1e3, bare.cpu_ms);
+        write!(
+            f,
+            "\nZenoh alone: median {us:.0} us: ratio to the ring {:.2}, ours to it {:.2}; p99 {:.0} us; processor per frame: camera {writer:.2} ms, reader {reader:.2} ms",
+            us / ring,
+            frames / us,
+            bare.frames.at(0.99) * 1e3,
         )
     }
 }
@@ -63,6 +86,7 @@ pub(crate) async fn run() -> anyhow::Result<Option<OneHost>> {
         frames: Times::default(),
         cpu_ms: [0.0; 2],
         ring_cpu_ms: 0.0,
+        bare: None,
     };
     for _ in 0..ROUNDS {
         let reader = start_reader(meet)?;
@@ -80,6 +104,7 @@ pub(crate) async fn run() -> anyhow::Result<Option<OneHost>> {
         for ms in report["ms"].as_array().context("ms")? {
             result.frames.add(ms.as_f64().context("a time")?);
         }
+        tokio::task::block_in_place(|| add_bare(&mut result.bare))?;
         let before_ms = cpu_ms();
         for ms in {
             let buffers = (0..BUFFERS).map(|_| Mutex::new(publisher.loan(LEN))).collect();
@@ -90,6 +115,27 @@ pub(crate) async fn run() -> anyhow::Result<Option<OneHost>> {
         result.ring_cpu_ms += (cpu_ms() - before_ms) / FRAMES as f64 / ROUNDS as f64;
     }
     Ok(Some(result))
+}
+
+/// Frames through Zenoh alone.
+fn add_bare(bare: &mut Option<Bare>) -> anyhow::Result<()> {
+    let program = std::env::current_exe()?;
+    let folder = program.parent().and_then(std::path::Path::parent).context("a folder")?;
+    let program = folder.join("examples/bare_zenoh");
+    if !program.is_file() {
+        return Ok(());
+    }
+    let numbers = [PERIOD.as_micros() as u64, FRAMES, WARM_UP, LEN as u64];
+    let output = Command::new(program).args(numbers.map(|number| number.to_string())).output()?;
+    let report: Value = serde_json::from_slice(&output.stdout).context("Zenoh alone failed")?;
+    let bare = bare.get_or_insert_default();
+    for ms in report["ms"].as_array().context("ms")? {
+        bare.frames.add(ms.as_f64().context("a time")?);
+    }
+    for (sum, key) in bare.cpu_ms.iter_mut().zip(["writer_cpu_ms", "reader_cpu_ms"]) {
+        *sum += report[key].as_f64().context(key)? / ROUNDS as f64;
+    }
+    Ok(())
 }
 
 fn start_reader(meet: u16) -> anyhow::Result<Child> {

@@ -14,8 +14,10 @@ use crate::config::Layers;
 use crate::refusals::{OnlyRefusals, Refusals};
 use crate::session::{Identity, Node, ZenohSource};
 
-/// The number of threads a cut air link must not be able to stop (see `zenoh-config/README.md`).
-const ZENOH_RUNTIME: &str = "(tx:(worker_threads:4),rx:(worker_threads:4),net:(worker_threads:4))";
+/// The number of threads a cut air link must not be able to stop, and one group of them for all that comes in, so that a
+/// message is not handed from the group that made the connection to the one that receives (see `zenoh-config/README.md`).
+const ZENOH_RUNTIME: &str =
+    "(tx:(worker_threads:4),net:(worker_threads:8),rx:(handover:net),acc:(handover:net))";
 const ZENOH_RUNTIME_VARIABLE: &str = "ZENOH_RUNTIME";
 
 /// What every service is started with.
