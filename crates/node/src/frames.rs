@@ -6,7 +6,8 @@
 
 use std::borrow::Cow;
 use std::ops::{Deref, DerefMut};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use messages::{Delivery, FrameHeader, PixelFormat, Topic, decode, encode, topic};
@@ -27,6 +28,12 @@ use crate::topics::report_refused;
 /// because every subscriber keeps the whole pool mapped and locked.
 const FRAMES_IN_POOL: usize = 4;
 
+/// A pool in which there was no room for so long is given up for a new one: a reader that was killed never returns the
+/// frames it had. Longer than any reader keeps a frame.
+const POOL_GIVEN_UP: Duration = Duration::from_secs(1);
+/// New pools a publisher makes at most, for the readers that never return anything.
+const MOST_NEW_POOLS: u32 = 16;
+
 /// Over the air a priority is a connection (`zenoh-config/README.md`): frames have two.
 const FIRST_LANE: Priority = Priority::DataLow;
 const SECOND_LANE: Priority = Priority::Background;
@@ -35,8 +42,18 @@ const LANES: usize = 2;
 /// Publishes frames on one key.
 pub struct FramePublisher {
     publisher: zenoh::pubsub::Publisher<'static>,
-    pool: Option<ShmProvider<PosixShmProviderBackend>>,
+    pool: Option<Mutex<Pool>>,
     health: Arc<HealthCounters>,
+}
+
+/// Shared memory for a few frames.
+struct Pool {
+    provider: ShmProvider<PosixShmProviderBackend>,
+    bytes: usize,
+    /// Since when there was no room.
+    full_since: Option<Instant>,
+    /// How many were given up before it.
+    predecessors: u32,
 }
 
 /// A buffer for one frame.
@@ -78,13 +95,7 @@ impl Node {
             return Ok(FramePublisher { publisher, pool: None, health: self.shared_health() });
         }
         let pool_bytes = FRAMES_IN_POOL * largest_frame_bytes.next_multiple_of(4096) + 4096;
-        let pool = match ShmProviderBuilder::default_backend(pool_bytes).wait() {
-            Ok(pool) => Some(pool),
-            Err(cause) => {
-                tracing::warn!(pool_bytes, %cause, "No shared memory: frames are copied instead");
-                None
-            }
-        };
+        let pool = Pool::new(pool_bytes).map(Mutex::new);
         Ok(FramePublisher { publisher, pool, health: self.shared_health() })
     }
 
@@ -124,13 +135,45 @@ impl Node {
     }
 }
 
+impl Pool {
+    fn new(bytes: usize) -> Option<Self> {
+        match ShmProviderBuilder::default_backend(bytes).wait() {
+            Ok(provider) => Some(Self { provider, bytes, full_since: None, predecessors: 0 }),
+            Err(cause) => {
+                tracing::warn!(bytes, %cause, "No shared memory: frames are copied instead");
+                None
+            }
+        }
+    }
+
+    fn alloc(&mut self, len: usize) -> Option<ZShmMut> {
+        let buffer = self.provider.alloc(len).with_policy::<GarbageCollect>().wait().ok();
+        if buffer.is_some() || len > self.bytes {
+            self.full_since = None;
+            return buffer;
+        }
+        let since = *self.full_since.get_or_insert_with(Instant::now);
+        if since.elapsed() < POOL_GIVEN_UP || self.predecessors == MOST_NEW_POOLS {
+            return None;
+        }
+        tracing::info!(
+            "Readers that are gone keep all frames in shared memory: there is new memory"
+        );
+        let predecessors = self.predecessors + 1;
+        // Tried no more often than it is needed, also when it cannot be had.
+        (self.full_since, self.predecessors) = (None, predecessors);
+        *self = Self { predecessors, ..Self::new(self.bytes)? };
+        self.provider.alloc(len).with_policy::<GarbageCollect>().wait().ok()
+    }
+}
+
 impl FramePublisher {
     /// A buffer of `len` bytes to write a frame into.
     pub fn loan(&self, len: usize) -> Loan {
         let shared = self
             .pool
             .as_ref()
-            .and_then(|pool| pool.alloc(len).with_policy::<GarbageCollect>().wait().ok());
+            .and_then(|pool| pool.lock().unwrap_or_else(PoisonError::into_inner).alloc(len));
         match shared {
             Some(buffer) => Loan::Shared(buffer),
             None => {

@@ -77,6 +77,42 @@ async fn a_pool_that_is_full_falls_back_to_copies() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn frames_that_a_reader_never_returns_are_given_up() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let camera = open("camera-pub", "down", port).await?;
+    let detector = open("detector", "main", port).await?;
+    let subscriber = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let publisher = camera.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
+    while !publisher.has_subscribers().await {
+        tokio::task::yield_now().await;
+    }
+    let is_shared = |loan: &node::Loan| matches!(loan, node::Loan::Shared(_));
+    let kept = timeout(PATIENCE, async {
+        for kept in 0.. {
+            let loan = publisher.loan(64 * 48);
+            if !is_shared(&loan) {
+                return Some(kept);
+            }
+            publisher.publish(&header(kept), loan).await;
+            // As a process that is killed while it reads.
+            std::mem::forget(subscriber.next().await);
+        }
+        None
+    });
+    assert!(kept.await?.is_some_and(|kept| kept > 0));
+    timeout(PATIENCE, async {
+        while !is_shared(&publisher.loan(64 * 48)) {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    })
+    .await?;
+    publisher.publish(&header(99), publisher.loan(64 * 48)).await;
+    let received = timeout(PATIENCE, subscriber.next()).await?.context("a frame")?;
+    assert_eq!(received.header.sequence, 99);
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn the_others_still_meet_after_the_first_process_is_gone() -> anyhow::Result<()> {
     let port = free_port()?;
     let first = open("simulator", "main", port).await?;
