@@ -127,7 +127,7 @@ fn fit_grid(
     if contrast < LEAST_CONTRAST || freedom < 1.0 {
         return None;
     }
-    let variance = system.squares / freedom;
+    let variance = system.variance() * system.weight / freedom;
     let covariance = system.full().cholesky()?.inverse().fixed_view::<8, 8>(0, 0) * variance;
     Some(Fit {
         homography: state.homography,
@@ -539,9 +539,21 @@ struct System {
     /// Weighted squares of the differences, and the sum of their weights.
     squares: f64,
     weight: f64,
+    /// The same, each counting as much as it says about the marker's place.
+    told: f64,
+    telling: f64,
+    /// Pixels of which the sensor cannot tell how bright or dark they are.
+    clipped: usize,
 }
 
 impl System {
+    /// Of a pixel. Where the sensor clips, little is left but edges, and dark places with little noise say nothing of how
+    /// well these agree.
+    fn variance(&self) -> f64 {
+        let mean = self.squares / self.weight;
+        if self.clipped > 0 { mean.max(self.told / self.telling) } else { mean }
+    }
+
     fn full(&self) -> SMatrix<f64, UNKNOWNS, UNKNOWNS> {
         SMatrix::from_fn(|i, j| self.matrix[i.min(j)][i.max(j)])
     }
@@ -552,13 +564,19 @@ impl State {
     fn expose(&mut self, grid: &Grid, spots: &[Spot]) -> Option<()> {
         let map = grid.map(&self.homography, self.light.spread_px);
         let mut work = [Bands::NONE; 2];
-        let mut exposure = Exposure::default();
+        // How bright white is beyond the end of the scale, only what is darker says.
+        let (mut all, mut darker) = (Exposure::default(), Exposure::default());
         for spot in spots {
             let spread = grid.spread(&map, spot.ideal)?;
             let white = grid.look_at(&spread, self.light.spread_px, &mut work).white;
-            exposure.add(white, spot.grey);
+            all.add(white, spot.grey);
+            if spot.grey < 255.0 {
+                darker.add(white, spot.grey);
+            }
         }
-        let [black, contrast] = exposure.black_and_contrast();
+        let is_beyond = |[black, contrast]: &[f64; 2]| black + contrast > 255.0;
+        let beyond = Some(darker.black_and_contrast()).filter(is_beyond);
+        let [black, contrast] = beyond.unwrap_or_else(|| all.black_and_contrast());
         (self.light.black, self.light.contrast) = (black, contrast);
         (contrast.is_finite() && contrast.abs() > LEAST_CONTRAST).then_some(())
     }
@@ -610,6 +628,9 @@ impl State {
             cost: 0.0,
             squares: 0.0,
             weight: 0.0,
+            told: 0.0,
+            telling: 0.0,
+            clipped: 0,
         };
         let mut work = [Bands::NONE; 2];
         let map = grid.map(&self.homography, self.light.spread_px);
@@ -625,6 +646,7 @@ impl State {
             // Where the sensor has reached its end, nothing more can be asked of it.
             if spot.grey >= 255.0 && predicted > 254.5 || spot.grey <= 0.0 && predicted < 0.5 {
                 spot.difference = f64::NAN;
+                system.clipped += 1;
                 continue;
             }
             let difference = spot.grey - predicted;
@@ -636,6 +658,9 @@ impl State {
             let place = self.homography.at(look.square);
             let steepness = -shade * light.contrast;
             let tilt = [steepness * look.by_place[0], steepness * look.by_place[1]];
+            let telling = weight * (tilt[0] * tilt[0] + tilt[1] * tilt[1]);
+            system.told += telling * difference * difference;
+            system.telling += telling;
             let moved = place.along(tilt);
             let mut slope = [0.0; UNKNOWNS];
             slope[..8].copy_from_slice(&moved);
@@ -678,5 +703,27 @@ impl State {
             },
             ..*self
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn where_the_sensor_clips_pixels_count_as_much_as_they_tell() {
+        let system = |clipped: usize| System {
+            matrix: [[0.0; UNKNOWNS]; UNKNOWNS],
+            right: [0.0; UNKNOWNS],
+            cost: 0.0,
+            // Of a hundred pixels ten tell something, and differ by three grey levels, the others by one.
+            squares: 90.0 + 10.0 * 9.0,
+            weight: 100.0,
+            told: 10.0 * 50.0 * 9.0,
+            telling: 10.0 * 50.0,
+            clipped,
+        };
+        assert!((system(0).variance() - 1.8).abs() < 1e-12);
+        assert!((system(40).variance() - 9.0).abs() < 1e-12);
     }
 }
