@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use messages::{Delivery, FrameHeader, PixelFormat, Topic, decode, encode, topic};
+use rustix::process::{Resource, getrlimit};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::{RingChannel, RingChannelHandler};
@@ -31,8 +32,10 @@ const FRAMES_IN_POOL: usize = 4;
 /// A pool in which there was no room for so long is given up for a new one: a reader that was killed never returns the
 /// frames it had. Longer than any reader keeps a frame.
 const POOL_GIVEN_UP: Duration = Duration::from_secs(1);
-/// New pools a publisher makes at most, for the readers that never return anything.
-const MOST_NEW_POOLS: u32 = 16;
+/// So many frames must have been refused as well, as few are asked for at a low rate.
+const REFUSALS_BEFORE_GIVEN_UP: u32 = 4;
+/// New pools a publisher makes at most, for the readers that never return anything: readers keep the old ones mapped.
+const MOST_NEW_POOLS: u32 = 3;
 
 /// Over the air a priority is a connection (`zenoh-config/README.md`): frames have two.
 const FIRST_LANE: Priority = Priority::DataLow;
@@ -50,8 +53,9 @@ pub struct FramePublisher {
 struct Pool {
     provider: ShmProvider<PosixShmProviderBackend>,
     bytes: usize,
-    /// Since when there was no room.
+    /// Since when there was no room, and how often it was asked for.
     full_since: Option<Instant>,
+    refusals: u32,
     /// How many were given up before it.
     predecessors: u32,
 }
@@ -138,7 +142,9 @@ impl Node {
 impl Pool {
     fn new(bytes: usize) -> Option<Self> {
         match ShmProviderBuilder::default_backend(bytes).wait() {
-            Ok(provider) => Some(Self { provider, bytes, full_since: None, predecessors: 0 }),
+            Ok(provider) => {
+                Some(Self { provider, bytes, full_since: None, refusals: 0, predecessors: 0 })
+            }
             Err(cause) => {
                 tracing::warn!(bytes, %cause, "No shared memory: frames are copied instead");
                 None
@@ -149,11 +155,14 @@ impl Pool {
     fn alloc(&mut self, len: usize) -> Option<ZShmMut> {
         let buffer = self.provider.alloc(len).with_policy::<GarbageCollect>().wait().ok();
         if buffer.is_some() || len > self.bytes {
-            self.full_since = None;
+            (self.full_since, self.refusals) = (None, 0);
             return buffer;
         }
         let since = *self.full_since.get_or_insert_with(Instant::now);
-        if since.elapsed() < POOL_GIVEN_UP || self.predecessors == MOST_NEW_POOLS {
+        self.refusals = self.refusals.saturating_add(1);
+        let is_given_up =
+            since.elapsed() >= POOL_GIVEN_UP && self.refusals > REFUSALS_BEFORE_GIVEN_UP;
+        if !is_given_up || self.predecessors == MOST_NEW_POOLS || !self.may_have_successor() {
             return None;
         }
         tracing::info!(
@@ -161,9 +170,17 @@ impl Pool {
         );
         let predecessors = self.predecessors + 1;
         // Tried no more often than it is needed, also when it cannot be had.
-        (self.full_since, self.predecessors) = (None, predecessors);
+        (self.full_since, self.refusals, self.predecessors) = (None, 0, predecessors);
         *self = Self { predecessors, ..Self::new(self.bytes)? };
         self.provider.alloc(len).with_policy::<GarbageCollect>().wait().ok()
+    }
+
+    /// Whether readers may lock one more pool beside those they keep, and as much again for what else they lock. One that
+    /// may not would get no frames at all; without a new pool they are copied. Readers are taken to have this process' limit.
+    fn may_have_successor(&self) -> bool {
+        let pools = u64::from(self.predecessors) + 2;
+        let needed = (pools + 1).saturating_mul(self.bytes as u64);
+        getrlimit(Resource::Memlock).current.is_none_or(|limit| limit >= needed)
     }
 }
 

@@ -54,12 +54,20 @@ async fn frames_arrive_as_they_were_written_and_misfits_are_skipped() -> anyhow:
     }
     let too_short = publisher.loan(5);
     publisher.publish(&header(1), too_short).await;
-    let mut frame = publisher.loan(64 * 48);
-    for (i, pixel) in frame.iter_mut().enumerate() {
-        *pixel = (i % 251) as u8;
-    }
-    publisher.publish(&header(2), frame).await;
-    let received = timeout(PATIENCE, subscriber.next()).await?.context("a frame")?;
+    // A frame that comes when its predecessor is under way may be left out: then another one is published.
+    let received = timeout(PATIENCE, async {
+        loop {
+            let mut frame = publisher.loan(64 * 48);
+            for (i, pixel) in frame.iter_mut().enumerate() {
+                *pixel = (i % 251) as u8;
+            }
+            publisher.publish(&header(2), frame).await;
+            if let Ok(received) = timeout(Duration::from_millis(500), subscriber.next()).await {
+                return received;
+            }
+        }
+    });
+    let received = received.await?.context("a frame")?;
     assert_eq!(received.header.sequence, 2);
     assert!(received.bytes().iter().enumerate().all(|(i, p)| *p == (i % 251) as u8));
     Ok(())
@@ -87,19 +95,10 @@ async fn frames_that_a_reader_never_returns_are_given_up() -> anyhow::Result<()>
         tokio::task::yield_now().await;
     }
     let is_shared = |loan: &node::Loan| matches!(loan, node::Loan::Shared(_));
-    let kept = timeout(PATIENCE, async {
-        for kept in 0.. {
-            let loan = publisher.loan(64 * 48);
-            if !is_shared(&loan) {
-                return Some(kept);
-            }
-            publisher.publish(&header(kept), loan).await;
-            // As a process that is killed while it reads.
-            std::mem::forget(subscriber.next().await);
-        }
-        None
-    });
-    assert!(kept.await?.is_some_and(|kept| kept > 0));
+    // As a process that is killed while it reads.
+    let shared = std::iter::repeat_with(|| publisher.loan(64 * 48)).take(8).filter(is_shared);
+    let kept = shared.map(std::mem::forget).count();
+    assert!((1..8).contains(&kept), "{kept} of 8 loans were in shared memory");
     timeout(PATIENCE, async {
         while !is_shared(&publisher.loan(64 * 48)) {
             tokio::time::sleep(Duration::from_millis(50)).await;
