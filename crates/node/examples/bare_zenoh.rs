@@ -7,8 +7,9 @@
 
 #![expect(clippy::print_stdout, reason = "what was measured is for the program that started it")]
 
-use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::io::Read;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, ensure};
 use node::{Network, ZenohSource, now_ns};
@@ -23,6 +24,8 @@ const KEY: &str = "camera/bare/frame";
 const BUFFERS: usize = 4;
 /// How often the writer looks for the reader.
 const POLL: Duration = Duration::from_millis(10);
+/// How long it waits for the reader to have everything.
+const PATIENCE: Duration = Duration::from_secs(10);
 
 /// What is measured.
 #[derive(Copy, Clone)]
@@ -31,6 +34,17 @@ struct Trial {
     frames: u64,
     warm_up: u64,
     bytes: usize,
+}
+
+/// The process that reads; it does not outlive this one's work.
+struct Reader(Child);
+
+impl Drop for Reader {
+    fn drop(&mut self) {
+        // One that has ended needs no end.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }
 
 fn main() -> anyhow::Result<()> {
@@ -65,28 +79,42 @@ impl Trial {
             .map_err(problem)?;
         let pool_bytes = BUFFERS * self.bytes.next_multiple_of(4096) + 4096;
         let pool = ShmProviderBuilder::default_backend(pool_bytes).wait().map_err(problem)?;
-        let reader = Command::new(std::env::current_exe()?)
-            .args(std::env::args().skip(1))
-            .arg(meet.to_string())
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .spawn()?;
+        let mut reader = Reader(
+            Command::new(std::env::current_exe()?)
+                .args(std::env::args().skip(1))
+                .arg(meet.to_string())
+                .stdin(Stdio::null())
+                .stdout(Stdio::piped())
+                .spawn()?,
+        );
         while !publisher.matching_status().wait().map_err(problem)?.matching() {
             std::thread::sleep(POLL);
         }
         let before_ms = cpu_ms();
-        for sequence in 0..self.warm_up + self.frames {
-            std::thread::sleep(self.period);
+        let publish = |sequence: u64| -> anyhow::Result<()> {
             let stamp_ns = now_ns();
             let mut pixels =
                 pool.alloc(self.bytes).with_policy::<GarbageCollect>().wait().map_err(problem)?;
             pixels.fill(sequence as u8);
             let header: Vec<u8> = [stamp_ns.to_le_bytes(), sequence.to_le_bytes()].concat();
-            publisher.put(ZBytes::from(pixels)).attachment(header).wait().map_err(problem)?;
+            publisher.put(ZBytes::from(pixels)).attachment(header).wait().map_err(problem)
+        };
+        let count = self.warm_up + self.frames;
+        for sequence in 0..count {
+            std::thread::sleep(self.period);
+            publish(sequence)?;
         }
         let used_ms = (cpu_ms() - before_ms) / self.frames.max(1) as f64;
-        let output = reader.wait_with_output()?;
-        let mut report: Value = serde_json::from_slice(&output.stdout)?;
+        // Zenoh may leave out a frame, also the last one, for which the reader waits.
+        let until = Instant::now() + PATIENCE;
+        while reader.0.try_wait()?.is_none() {
+            ensure!(Instant::now() < until, "the reader had no last frame within {PATIENCE:?}");
+            std::thread::sleep(POLL);
+            publish(count.saturating_sub(1))?;
+        }
+        let mut said = String::new();
+        reader.0.stdout.take().context("what the reader says")?.read_to_string(&mut said)?;
+        let mut report: Value = serde_json::from_str(&said)?;
         report["writer_cpu_ms"] = json!(used_ms);
         Ok(report)
     }
