@@ -560,9 +560,10 @@ impl<'a> Scene<'a> {
     /// Of the pose, from the differences that are left: noise, and what the model does not know.
     fn covariance(&self, system: &System, cost: f64) -> Option<SMatrix<f64, 5, 5>> {
         let count = system.count;
+        let unknowns = if self.moving { UNKNOWNS_MOVING } else { UNKNOWNS };
         // Of what noise there is where the picture tells of the pose, when that is more than elsewhere.
         let mean = (cost / count).max(system.told_variance);
-        let variance = mean * count / (count - UNKNOWNS as f64).max(1.0) + 1.0 / 12.0;
+        let variance = mean * count / (count - unknowns as f64).max(1.0) + 1.0 / 12.0;
         let mut information = system.matrix / variance;
         for i in 0..UNKNOWNS_MOVING {
             information[(i, i)] += 1e-9;
@@ -602,6 +603,8 @@ struct Blur {
     covariance: [f64; 3],
     /// In the direction in which there is least.
     least_variance: f64,
+    /// One over the standard deviation in the direction in which there is most.
+    per_most: f64,
 }
 
 /// Where the places lie that are drawn from the blur about a pixel.
@@ -621,7 +624,7 @@ struct Places {
     /// How the share within a circle changes with the pixel's distance, in pixels outwards.
     outwards: f64,
     boxiness: f64,
-    /// One over the standard deviation of the distance, in metres.
+    /// One over what the blur is at most, in metres outwards: what is around the centre moves places outwards as well.
     per_blur: f64,
     /// How the logarithm of that deviation changes with the blur and with the motion's two numbers.
     by_blur: f64,
@@ -663,7 +666,7 @@ impl Places {
             per_deviation: k1 * per_spread / power,
             outwards: -2.0 * rho * metres_per_px * per_spread,
             boxiness: boxiness(normal, variance) - of_box * of_box / 20.0,
-            per_blur: px_per_metre * per_variance.sqrt(),
+            per_blur: px_per_metre * blur.per_most,
             by_blur: blur.blur_px * per_variance,
             by_motion: [0.5 * (nx * nx - ny * ny) * per_variance, nx * ny * per_variance],
         }
@@ -714,6 +717,7 @@ impl Picture {
             blur_px: self.blur_px,
             covariance: [variance + p, q, variance - p],
             least_variance: variance - p.hypot(q),
+            per_most: 1.0 / (variance + p.hypot(q)).sqrt(),
         };
         for spots in scene.spots.chunks(BATCH * scene.every) {
             let mut counted = spots.iter().step_by(scene.every);

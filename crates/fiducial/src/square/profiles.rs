@@ -170,6 +170,10 @@ fn place_runs(
 ) {
     let mut length_px = 0.0;
     each_edge(pattern, |edge| length_px += edge.usable(start).map_or(0.0, |[from, to]| to - from));
+    runs.clear();
+    if !length_px.is_finite() {
+        return;
+    }
     let spacing_px = (length_px / MOST_RUNS as f64).max(1.0);
     spread_runs(start, pattern, (spacing_px, |_| true), runs);
     let is_seen = |place: [f64; 2]| {
@@ -178,7 +182,7 @@ fn place_runs(
     if !CORNERS.into_iter().all(is_seen) {
         // Those outside of the image would take the places of others.
         let inside = runs.iter().filter(|run| is_seen(run.place)).count();
-        let share = inside as f64 / runs.len().max(1) as f64;
+        let share = inside.max(1) as f64 / runs.len().max(1) as f64;
         spread_runs(start, pattern, ((share * spacing_px).max(1.0), is_seen), runs);
     }
 }

@@ -45,8 +45,9 @@ impl Scale {
     pub(crate) const ALL: [Self; 2] = [Self::Fine, Self::Coarse];
 }
 
-/// Sides of markers are edges at least as steep as this, in grey levels per pixel, or as the first where the image is dark:
-/// a twelfth of its brightest part. Textures have many that are less steep.
+/// Sides of markers are edges at least as steep as a twelfth of the image's brightest part, in grey levels per pixel, but
+/// within these bounds. Textures have many that are less steep; so has a damaged marker deep in the shade beside sunlit
+/// ground, which is then found only where it is sharp.
 const LEAST_GRADIENT: [u8; 2] = [6, 10];
 const DARKEST_PER_BRIGHTEST: u8 = 12;
 const LEAST_LENGTH_PX: f32 = 6.0;
