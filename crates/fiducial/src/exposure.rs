@@ -2,7 +2,7 @@
 
 /// The line of least squares from the share of white that a pixel should see to the grey value it has.
 #[derive(Copy, Clone, Debug, Default)]
-pub(crate) struct Exposure {
+struct Exposure {
     n: f64,
     white: f64,
     white_white: f64,
@@ -12,7 +12,7 @@ pub(crate) struct Exposure {
 
 impl Exposure {
     /// Takes a pixel into account: its share of white, from 0 to 1, and its grey value.
-    pub(crate) fn add(&mut self, white: f64, grey: f64) {
+    fn add(&mut self, white: f64, grey: f64) {
         self.n += 1.0;
         self.white += white;
         self.white_white += white * white;
@@ -21,10 +21,40 @@ impl Exposure {
     }
 
     /// Black and the contrast from black to white, in grey levels; not finite where all pixels have the same share.
-    pub(crate) fn black_and_contrast(&self) -> [f64; 2] {
+    fn black_and_contrast(&self) -> [f64; 2] {
         let Self { n, white, white_white, grey, white_grey } = *self;
         let contrast = (n * white_grey - white * grey) / (n * white_white - white * white);
         [(grey - contrast * white) / n, contrast]
+    }
+}
+
+/// The same of pixels that end at a grey value: how bright white is beyond it, only what is darker says.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct ClippedExposure {
+    end: f64,
+    all: Exposure,
+    darker: Exposure,
+}
+
+impl ClippedExposure {
+    /// No pixels yet, of which the brightest are at `end`.
+    pub(crate) fn new(end: f64) -> Self {
+        Self { end, all: Exposure::default(), darker: Exposure::default() }
+    }
+
+    /// As [`Exposure::add`].
+    pub(crate) fn add(&mut self, white: f64, grey: f64) {
+        self.all.add(white, grey);
+        if grey < self.end {
+            self.darker.add(white, grey);
+        }
+    }
+
+    /// As [`Exposure::black_and_contrast`].
+    pub(crate) fn black_and_contrast(&self) -> [f64; 2] {
+        let is_beyond = |[black, contrast]: &[f64; 2]| black + contrast > self.end;
+        let beyond = Some(self.darker.black_and_contrast()).filter(is_beyond);
+        beyond.unwrap_or_else(|| self.all.black_and_contrast())
     }
 }
 
@@ -44,5 +74,17 @@ mod tests {
         alike.add(0.5, 90.0);
         alike.add(0.5, 91.0);
         assert!(!alike.black_and_contrast()[1].is_finite());
+    }
+
+    #[test]
+    fn white_beyond_the_scale_is_known_by_what_is_darker() {
+        for (white_grey, seen) in [(400.0_f64, 255.0_f64), (200.0, 200.0)] {
+            let mut exposure = ClippedExposure::new(255.0);
+            for white in [0.0, 0.25, 0.5, 1.0] {
+                exposure.add(white, (20.0 + white * (white_grey - 20.0)).min(seen));
+            }
+            let [black, contrast] = exposure.black_and_contrast();
+            assert!((black - 20.0).abs() < 1e-9 && (black + contrast - white_grey).abs() < 1e-9);
+        }
     }
 }

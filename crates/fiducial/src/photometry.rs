@@ -11,7 +11,7 @@ use imaging::GrayView;
 use nalgebra::{SMatrix, SVector, Vector3};
 
 use crate::circles::{Circles, Meeting, Plane, project};
-use crate::exposure::Exposure;
+use crate::exposure::ClippedExposure;
 use crate::ring::RingKind;
 use crate::step::{Step, boxiness};
 
@@ -775,18 +775,9 @@ impl Picture {
 
     /// Black and white that fit the image best with everything else as it is.
     fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
-        // How bright white is beyond the end of the scale, only what is darker says.
-        let (mut all, mut darker) = (Exposure::default(), Exposure::default());
-        self.look_at(scene, |spot, looks| {
-            let white = looks.white();
-            all.add(white, spot.grey);
-            if spot.grey <= WHITEST {
-                darker.add(white, spot.grey);
-            }
-        })?;
-        let is_beyond = |[black, contrast]: &[f64; 2]| black + contrast > WHITEST;
-        let beyond = Some(darker.black_and_contrast()).filter(is_beyond);
-        let [black, contrast] = beyond.unwrap_or_else(|| all.black_and_contrast());
+        let mut exposure = ClippedExposure::new(WHITEST);
+        self.look_at(scene, |spot, looks| exposure.add(looks.white(), spot.grey))?;
+        let [black, contrast] = exposure.black_and_contrast();
         (self.black, self.white) = (black, black + contrast);
         (contrast > 1.0).then_some(())
     }

@@ -9,7 +9,7 @@ use geometry::Pixel;
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
-use crate::exposure::Exposure;
+use crate::exposure::ClippedExposure;
 use crate::square::pattern::Pattern;
 use crate::square::refine::{Design, Fit, Homography, Lens, MOST_ACROSS, Scratch};
 use crate::step::{END, PIXEL_VARIANCE, Step, boxiness};
@@ -564,19 +564,13 @@ impl State {
     fn expose(&mut self, grid: &Grid, spots: &[Spot]) -> Option<()> {
         let map = grid.map(&self.homography, self.light.spread_px);
         let mut work = [Bands::NONE; 2];
-        // How bright white is beyond the end of the scale, only what is darker says.
-        let (mut all, mut darker) = (Exposure::default(), Exposure::default());
+        let mut exposure = ClippedExposure::new(255.0);
         for spot in spots {
             let spread = grid.spread(&map, spot.ideal)?;
             let white = grid.look_at(&spread, self.light.spread_px, &mut work).white;
-            all.add(white, spot.grey);
-            if spot.grey < 255.0 {
-                darker.add(white, spot.grey);
-            }
+            exposure.add(white, spot.grey);
         }
-        let is_beyond = |[black, contrast]: &[f64; 2]| black + contrast > 255.0;
-        let beyond = Some(darker.black_and_contrast()).filter(is_beyond);
-        let [black, contrast] = beyond.unwrap_or_else(|| all.black_and_contrast());
+        let [black, contrast] = exposure.black_and_contrast();
         (self.light.black, self.light.contrast) = (black, contrast);
         (contrast.is_finite() && contrast.abs() > LEAST_CONTRAST).then_some(())
     }
