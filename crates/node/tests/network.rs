@@ -9,7 +9,7 @@ use anyhow::{Context, anyhow};
 use messages::{
     CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, PixelFormat, Wind, encode, topic,
 };
-use node::{Identity, Node, ZenohSource, clock_name, now_ns};
+use node::{FramePublisher, FrameSubscriber, Identity, Node, ZenohSource, clock_name, now_ns};
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -28,6 +28,19 @@ async fn open(service: &'static str, instance: &str, port: u16) -> anyhow::Resul
     Node::open(Identity { service, instance: instance.into() }, &local(port)).await
 }
 
+/// A camera and a detector that have met, and what frames go through.
+async fn frames() -> anyhow::Result<([Node; 2], FramePublisher, FrameSubscriber)> {
+    let port = free_port()?;
+    let camera = open("camera-pub", "down", port).await?;
+    let detector = open("detector", "main", port).await?;
+    let subscriber = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let publisher = camera.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
+    while !publisher.has_subscribers().await {
+        tokio::task::yield_now().await;
+    }
+    Ok(([camera, detector], publisher, subscriber))
+}
+
 fn header(sequence: u64) -> FrameHeader {
     FrameHeader {
         camera: "down".into(),
@@ -44,14 +57,7 @@ fn header(sequence: u64) -> FrameHeader {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn frames_arrive_as_they_were_written_and_misfits_are_skipped() -> anyhow::Result<()> {
-    let port = free_port()?;
-    let camera = open("camera-pub", "down", port).await?;
-    let detector = open("detector", "main", port).await?;
-    let subscriber = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
-    let publisher = camera.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
-    while !publisher.has_subscribers().await {
-        tokio::task::yield_now().await;
-    }
+    let (_nodes, publisher, subscriber) = frames().await?;
     let too_short = publisher.loan(5);
     publisher.publish(&header(1), too_short).await;
     // A frame that comes when its predecessor is under way may be left out: then another one is published.
@@ -86,14 +92,7 @@ async fn a_pool_that_is_full_falls_back_to_copies() -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn frames_that_a_reader_never_returns_are_given_up() -> anyhow::Result<()> {
-    let port = free_port()?;
-    let camera = open("camera-pub", "down", port).await?;
-    let detector = open("detector", "main", port).await?;
-    let subscriber = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
-    let publisher = camera.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
-    while !publisher.has_subscribers().await {
-        tokio::task::yield_now().await;
-    }
+    let (_nodes, publisher, subscriber) = frames().await?;
     let is_shared = |loan: &node::Loan| matches!(loan, node::Loan::Shared(_));
     // As a process that is killed while it reads.
     let shared = std::iter::repeat_with(|| publisher.loan(64 * 48)).take(8).filter(is_shared);
