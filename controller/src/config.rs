@@ -2,7 +2,7 @@
 
 use autopilot::Address;
 use landing::{
-    EnvelopeConfig, EstimatorConfig, Guidance, MetricConfig, PhaseConfig, TargetConfig,
+    EnvelopeConfig, EstimatorConfig, GuidanceConfig, MetricConfig, PhaseConfig, TargetConfig,
     ThesisConfig,
 };
 use node::{Check, Settings};
@@ -196,7 +196,7 @@ impl Settings for Config {
         }
         self.detectors.check(check);
         // Both guidances are checked, used or not: a wrong number should not wait for the day it is used.
-        for guidance in [Guidance::Metric(self.metric), Guidance::Thesis(self.thesis)] {
+        for guidance in [GuidanceConfig::Metric(self.metric), GuidanceConfig::Thesis(self.thesis)] {
             if let Err(problem) = self.landing(guidance).validate() {
                 let (key, min, max) = (problem.key, problem.min, problem.max);
                 check.range(key, problem.value, min..=max);
@@ -231,12 +231,12 @@ impl Config {
     /// The lander's settings.
     pub fn lander(&self) -> landing::Config {
         self.landing(match self.guidance {
-            GuidanceName::Metric => Guidance::Metric(self.metric),
-            GuidanceName::Thesis => Guidance::Thesis(self.thesis),
+            GuidanceName::Metric => GuidanceConfig::Metric(self.metric),
+            GuidanceName::Thesis => GuidanceConfig::Thesis(self.thesis),
         })
     }
 
-    fn landing(&self, guidance: Guidance) -> landing::Config {
+    fn landing(&self, guidance: GuidanceConfig) -> landing::Config {
         landing::Config {
             guidance,
             target: self.target,

@@ -40,7 +40,7 @@ pub struct Flight {
     mission: Mission,
     selection: Selection,
     /// The newest frame of each detector, to be used when it becomes the active one.
-    frames: BTreeMap<String, landing::Frame>,
+    frames: BTreeMap<String, landing::FrameObservation>,
     changes_told: u64,
     cameras: BTreeMap<String, CameraInfo>,
     decision: Option<Decision>,
@@ -212,9 +212,8 @@ impl Flight {
             }),
         });
         if self.selection.heard(now_ns, publisher, header.stamp_ns, sight) {
-            let frame = landing::Frame {
+            let frame = landing::FrameObservation {
                 stamp: Timestamp::from_nanos(header.stamp_ns),
-                detector: 0,
                 image_size: (header.width, header.height),
                 focal_px: self.cameras.get(&header.camera).and_then(|info| {
                     let scale = f64::from(header.width) / f64::from(info.width.max(1));
@@ -242,9 +241,8 @@ impl Flight {
         marker: landing::MarkerInFrame,
     ) {
         self.health.count("late frames");
-        let frame = landing::Frame {
+        let frame = landing::FrameObservation {
             stamp: Timestamp::from_nanos(header.stamp_ns),
-            detector: 0,
             image_size: (header.width, header.height),
             focal_px: None,
             body_from_camera: None,
@@ -276,7 +274,7 @@ impl Flight {
         next.is_some()
     }
 
-    fn frame(&mut self, now_ns: i64, frame: landing::Frame) {
+    fn frame(&mut self, now_ns: i64, frame: landing::FrameObservation) {
         let stamp_ns = frame.stamp.nanos();
         self.looked_stamp_ns = stamp_ns;
         let sent_before = self.setpoint_ns;
@@ -300,7 +298,7 @@ impl Flight {
     }
 
     /// Tells the autopilot's own precision landing where the landing point is.
-    fn feed(&mut self, now_ns: i64, frame: &landing::Frame) {
+    fn feed(&mut self, now_ns: i64, frame: &landing::FrameObservation) {
         if self.feed.is_none() {
             return;
         }

@@ -28,4 +28,6 @@ frames! {
     Body = "body";
     /// The world: x north, y east, z down, with the autopilot's local origin.
     Ned = "NED";
+    /// The autopilot's local frame without its jumps: axes as NED, an origin that moves with each jump (REP 105 `odom`).
+    Odometry = "odometry";
 }

@@ -14,5 +14,5 @@ pub mod frame;
 pub mod transform;
 
 pub use camera::{CameraModel, Distortion, Pixel};
-pub use frame::{Body, Camera, Frame, Marker, Ned, Pad};
+pub use frame::{Body, Camera, Frame, Marker, Ned, Odometry, Pad};
 pub use transform::{Point, Rotation, Transform, Vector};

@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use geometry::{Body, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
-    Config, ConfigError, Event, Frame, Landed, Lander, MarkerInFrame, Mode, OperatorCommand,
-    Timestamp, VehicleState,
+    Config, ConfigError, Event, FrameObservation, Landed, Lander, MarkerInFrame, Mode,
+    OperatorCommand, Timestamp, VehicleState,
 };
 
 fn vehicle(now: Timestamp) -> Event {
@@ -39,9 +39,8 @@ fn frame(now: Timestamp, ago_s: f64) -> Event {
         size_px: Some(50.0),
         confidence: 1.0,
     };
-    Event::Frame(Frame {
+    Event::Frame(FrameObservation {
         stamp,
-        detector: 0,
         image_size: (1296, 972),
         focal_px: Some(1818.0),
         body_from_camera: None,

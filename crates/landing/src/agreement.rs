@@ -6,7 +6,7 @@
 //! place of the pad is computed under each of a few dozen hypotheses, and the one under which it lies stillest is
 //! compared with the configured one: a likelihood ratio that needs no motion of its own, only enough of any.
 
-use geometry::{Body, Ned, Point, Rotation, Vector};
+use geometry::{Body, Odometry, Point, Rotation, Vector};
 
 use crate::history::Motion;
 use crate::time::Timestamp;
@@ -107,12 +107,12 @@ impl Agreement {
         for (index, sum) in self.sums.iter_mut().enumerate() {
             let from_vehicle = match Hypothesis::of(index) {
                 Hypothesis::Mount { turn, mirrored } => {
-                    motion.ned_from_body * undone(seen, turn, mirrored)
+                    motion.odometry_from_body() * undone(seen, turn, mirrored)
                 }
-                Hypothesis::Roll => Rotation::<Ned, Body>::from_euler(-roll, pitch, yaw) * seen,
-                Hypothesis::Pitch => Rotation::<Ned, Body>::from_euler(roll, -pitch, yaw) * seen,
+                Hypothesis::Roll => Rotation::from_euler(-roll, pitch, yaw) * seen,
+                Hypothesis::Pitch => Rotation::from_euler(roll, -pitch, yaw) * seen,
             };
-            sum.add(motion.way + from_vehicle, keep, weight, share);
+            sum.add(motion.odometry + from_vehicle, keep, weight, share);
         }
         self.detections = self.detections.saturating_add(1);
         self.judge();
@@ -148,7 +148,7 @@ impl Agreement {
 
 impl Sum {
     /// West's algorithm for a weighted variance, with forgetting.
-    fn add(&mut self, place: Point<Ned>, keep: f64, weight: f64, share: f64) {
+    fn add(&mut self, place: Point<Odometry>, keep: f64, weight: f64, share: f64) {
         let (north, east) = (place.x() - self.north, place.y() - self.east);
         self.north += share * north;
         self.east += share * east;
@@ -202,6 +202,7 @@ fn is_near(index: usize) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use geometry::Ned;
     use std::f64::consts::{FRAC_PI_2, PI};
 
     /// Hovers and sways over a pad, whose marker is seen through a distortion; the last verdict, and when it came.
@@ -228,7 +229,7 @@ mod tests {
                 ned_from_body: attitude,
                 position,
                 velocity: Vector::zero(),
-                way: position,
+                odometry: Point::from_coords(position.coords),
                 rate: Vector::zero(),
             };
             agreement.add(
@@ -288,7 +289,7 @@ mod tests {
             ned_from_body: Rotation::identity(),
             position: Point::origin(),
             velocity: Vector::zero(),
-            way: Point::origin(),
+            odometry: Point::origin(),
             rate: Vector::zero(),
         };
         for i in 0..50 {

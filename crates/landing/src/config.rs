@@ -1,22 +1,23 @@
 //! Every number the lander uses, with its default, unit and range.
 
-use std::fmt;
-
 use serde::Deserialize;
 
-pub use crate::guidance::metric::MetricConfig;
-pub use crate::guidance::thesis::ThesisConfig;
+use crate::limits::{ConfigError, check, settings};
+
+/// Upper bound of a hypothesis' detection count, so that a place seen for minutes is replaced as fast as one seen for
+/// seconds. Also the largest `estimator.restart_after` that can be reached.
+pub(crate) const MAX_COUNTED_DETECTIONS: u32 = 30;
 
 /// All settings of a landing. Plain data: check it with [`Config::validate`].
 #[derive(Copy, Clone, Debug, PartialEq, Default)]
 pub struct Config {
     /// What turns the target into a velocity.
-    pub guidance: Guidance,
-    /// Which detections are used at all, and the mean that the thesis' guidance takes its height from.
+    pub guidance: GuidanceConfig,
+    /// Which detections are used, and the mean from which the thesis' guidance takes its height.
     pub target: TargetConfig,
-    /// How detections become a target for our own guidance.
+    /// The Kalman filter of the metric guidance.
     pub estimator: EstimatorConfig,
-    /// What no setpoint exceeds.
+    /// Limits of every setpoint.
     pub envelope: EnvelopeConfig,
     /// When the phases end.
     pub phases: PhaseConfig,
@@ -24,364 +25,25 @@ pub struct Config {
 
 /// What turns the target into a velocity.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub enum Guidance {
+pub enum GuidanceConfig {
     /// The thesis' pixel controller (its section 3.2).
     Thesis(ThesisConfig),
-    /// Our controller in metres.
+    /// The controller in metres.
     Metric(MetricConfig),
 }
 
-impl Default for Guidance {
+impl Default for GuidanceConfig {
     fn default() -> Self {
         Self::Metric(MetricConfig::default())
     }
 }
 
-/// How detections become a target.
-#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TargetConfig {
-    /// A frame older than this on arrival is not used, in s (0.05 to 5).
-    pub max_latency_s: f64,
-    /// A frame from further in the future than this is not used, in s (0 to 1).
-    pub max_future_s: f64,
-    /// The vehicle's states are extrapolated over at most this time, in s (0 to 1).
-    pub max_extrapolation_s: f64,
-    /// A detection less certain than this is not used (0 to 1).
-    pub min_confidence: f64,
-    /// A detection further than this is not used, in m (1 to 200).
-    pub max_range_m: f64,
-    /// Horizontal distance from the estimate beyond which a detection is an outlier, at height 0, in m (0.02 to 10).
-    pub gate_m: f64,
-    /// What the gate grows by per metre of height (0 to 1).
-    pub gate_per_height: f64,
-    /// Time constant of the filter over detections at height 0, in s (0 to 5).
-    pub smoothing_s: f64,
-    /// What the time constant grows by per metre of height, in s/m (0 to 1).
-    pub smoothing_s_per_height: f64,
-    /// After so long without a detection the estimate is forgotten, in s (0.5 to 600).
-    pub forget_after_s: f64,
-    /// Outliers in a row that agree with each other and so begin a new estimate (2 to 100).
-    pub restart_after: u32,
-    /// Detections that make a target (1 to 100).
-    pub confirm_after: u32,
-}
-
-impl Default for TargetConfig {
-    fn default() -> Self {
-        Self {
-            max_latency_s: 0.5,
-            max_future_s: 0.05,
-            max_extrapolation_s: 0.1,
-            min_confidence: 0.0,
-            max_range_m: 40.0,
-            gate_m: 0.15,
-            gate_per_height: 0.1,
-            smoothing_s: 0.1,
-            smoothing_s_per_height: 0.05,
-            forget_after_s: 5.0,
-            restart_after: 6,
-            confirm_after: 3,
-        }
-    }
-}
-
-/// How detections become a target: what is noise, what may change, and what is believed.
-#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct EstimatorConfig {
-    /// A detection further than this is not used, in m (1 to 200).
-    pub max_range_m: f64,
-    /// Noise of a marker's place in the image where the detector does not tell it, in px (0.01 to 10).
-    pub pixel_noise_px: f64,
-    /// The same as an angle, where the focal length is not known either, in rad (0.00001 to 0.1).
-    pub direction_noise_rad: f64,
-    /// Noise of the range as a part of it, where the marker's size in the image is not told (0.0001 to 0.5).
-    pub range_noise_part: f64,
-    /// What the range is wrong by as a part of it, beside what the detector tells (0 to 0.1).
-    pub range_floor_part: f64,
-    /// Fast noise of the attitude at an exposure, in rad (0.00001 to 0.1).
-    pub attitude_noise_rad: f64,
-    /// Fast noise of the autopilot's position, in m (0.0001 to 1).
-    pub position_noise_m: f64,
-    /// Slow error of the autopilot's position, in m per square root of a second (0 to 1).
-    pub way_noise_m: f64,
-    /// Drift of the autopilot's horizontal position at first, in m/s (0 to 1).
-    pub drift_m_s: f64,
-    /// What that drift changes by, in m/s per square root of a second (0 to 1).
-    pub drift_change: f64,
-    /// What it changes by at most, where detections show that the autopilot's position wanders, in m/s per square root of a
-    /// second, and no more than 15 times `drift_change`; tilts then change faster in the same proportion. Not more than
-    /// `drift_change`, or a `drift_change` of 0, adjusts nothing (0 to 1).
-    pub most_drift_change: f64,
-    /// Drift of the autopilot's height at first, in m/s (0 to 1).
-    pub height_drift_m_s: f64,
-    /// What that drift changes by, in m/s per square root of a second (0 to 1).
-    pub height_drift_change: f64,
-    /// Fastest pad, in m/s; 0 for one that lies still (0 to 10).
-    pub pad_speed_m_s: f64,
-    /// Fastest heave of the pad, in m/s (0 to 5).
-    pub pad_heave_m_s: f64,
-    /// What the pad's velocity changes by, in m/s per square root of a second (0 to 5).
-    pub pad_acceleration: f64,
-    /// Error of mount and attitude, in rad (0.00001 to 0.2).
-    pub mount_error_rad: f64,
-    /// What that error changes by, in rad per square root of a second (0 to 0.1).
-    pub tilt_change: f64,
-    /// Error of the heading, in rad (0.00001 to 0.5).
-    pub heading_error_rad: f64,
-    /// Error of the frames' stamps, in s; 0 trusts them (0 to 0.2).
-    pub time_offset_s: f64,
-    /// Squared innovation over its covariance beyond which a detection is an outlier; chi-square with 3 degrees of
-    /// freedom exceeds 16.3 once in a thousand times (7 to 100).
-    pub gate: f64,
-    /// Outliers that agree with each other and so begin a new estimate (2 to 30).
-    pub restart_after: u32,
-    /// Shortest time over which such outliers must come, in s (0 to 10).
-    pub restart_s: f64,
-    /// After so long without a detection the estimate is forgotten, in s (0.5 to 600).
-    pub forget_after_s: f64,
-    /// Weight of a new detection in the pad's heading (0.01 to 1).
-    pub heading_share: f64,
-}
-
-impl Default for EstimatorConfig {
-    fn default() -> Self {
-        Self {
-            max_range_m: 40.0,
-            pixel_noise_px: 0.3,
-            direction_noise_rad: 0.0003,
-            range_noise_part: 0.015,
-            range_floor_part: 0.002,
-            attitude_noise_rad: 0.0003,
-            position_noise_m: 0.002,
-            way_noise_m: 0.01,
-            drift_m_s: 0.05,
-            drift_change: 0.01,
-            most_drift_change: 0.15,
-            height_drift_m_s: 0.1,
-            height_drift_change: 0.05,
-            pad_speed_m_s: 0.0,
-            pad_heave_m_s: 0.0,
-            pad_acceleration: 0.0,
-            mount_error_rad: 0.005,
-            tilt_change: 0.0005,
-            heading_error_rad: 0.015,
-            time_offset_s: 0.02,
-            gate: 16.3,
-            restart_after: 8,
-            restart_s: 1.5,
-            forget_after_s: 10.0,
-            heading_share: 0.1,
-        }
-    }
-}
-
-/// What no setpoint exceeds, whatever the guidance wants.
-#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct EnvelopeConfig {
-    /// Horizontal speed in m/s (0.05 to 10).
-    pub horizontal_m_s: f64,
-    /// Speed upwards in m/s (0 to 5).
-    pub climb_m_s: f64,
-    /// Speed downwards in m/s (0.05 to 5).
-    pub descend_m_s: f64,
-}
-
-impl Default for EnvelopeConfig {
-    fn default() -> Self {
-        Self { horizontal_m_s: 2.0, climb_m_s: 1.0, descend_m_s: 2.0 }
-    }
-}
-
-/// When the phases end.
-#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PhaseConfig {
-    /// Age of the target beyond which nothing descends, in s (0.1 to 5).
-    pub stale_target_s: f64,
-    /// Below this height over the target the descent goes on for `low_grace_s` more, in m (0 to 5).
-    pub low_height_m: f64,
-    /// What a low vehicle adds to `stale_target_s`, in s (0 to 5).
-    pub low_grace_s: f64,
-    /// Age of the target beyond which the vehicle stops and holds, in s (0.1 to 10).
-    pub lost_target_s: f64,
-    /// Age of the vehicle's state beyond which the vehicle holds, in s (0.1 to 5).
-    pub stale_vehicle_s: f64,
-    /// Longest search before a hold, in s (1 to 600).
-    pub search_timeout_s: f64,
-    /// Hovering before the search begins to move, in s (0 to 60).
-    pub search_delay_s: f64,
-    /// Height over the local origin below which the search climbs before it flies its legs, in m; 0 never climbs (0 to 50).
-    pub search_height_m: f64,
-    /// Speed of that climb, in m/s (0.1 to 3).
-    pub search_climb_m_s: f64,
-    /// Speed of the search, in m/s; 0 hovers (0 to 3).
-    pub search_speed_m_s: f64,
-    /// Distance between the legs of the expanding square, in m (0.5 to 20).
-    pub search_spacing_m: f64,
-    /// How far the search goes along either axis, in m (0 to 50).
-    pub search_radius_m: f64,
-    /// Radius about the local origin that the search does not leave, in m; 0 sets none (0 to 10000).
-    pub fence_radius_m: f64,
-    /// Height over the local origin that neither search nor retry exceeds, in m; 0 sets none (0 to 1000).
-    pub fence_height_m: f64,
-    /// Longest wait before the descent for natural motion that shows whether camera and autopilot mean the same
-    /// directions, in s; 0 does not look (0 to 60).
-    pub self_test_s: f64,
-    /// Longest approach before a hold, in s (1 to 600).
-    pub approach_timeout_s: f64,
-    /// Longest descent before a hold, in s (1 to 600).
-    pub descend_timeout_s: f64,
-    /// Longest hold for a lost target or vehicle state before the landing is aborted, in s (1 to 600).
-    pub hold_timeout_s: f64,
-    /// Longest hold by the operator before the landing is aborted, in s (1 to 3600).
-    pub operator_hold_timeout_s: f64,
-    /// A vehicle that has held for a lost marker so long climbs to `regain_height_m`, in s (0 to 60).
-    pub regain_after_s: f64,
-    /// Height over the target up to which a vehicle climbs to see a lost marker again, in m; 0 is never (0 to 10).
-    pub regain_height_m: f64,
-    /// Speed of that climb, in m/s (0.1 to 2).
-    pub regain_climb_m_s: f64,
-    /// How often a landing that lost the marker or its patience climbs and begins again (0 to 20).
-    pub retries: u32,
-    /// How far it climbs, in m (0 to 20), never above the height where the landing began.
-    pub retry_climb_m: f64,
-    /// Speed of that climb, in m/s (0.1 to 3).
-    pub retry_climb_m_s: f64,
-    /// Longest climb and look-out before a search, in s (1 to 60).
-    pub retry_timeout_s: f64,
-    /// Interval at which LAND is asked for again, in s (0.1 to 5).
-    pub land_retry_s: f64,
-    /// Longest wait for the LAND mode before the landing is aborted, in s (0.5 to 60).
-    pub land_timeout_s: f64,
-    /// Longest time in LAND before the landing is aborted, in s (5 to 600).
-    pub touchdown_timeout_s: f64,
-    /// Speed downwards without LAND, where the autopilot refuses it close to the ground, in m/s (0.1 to 1).
-    pub refused_descend_m_s: f64,
-    /// Height over the target below which the autopilot's LAND is not taken back any more, in m (0 to 20).
-    pub no_return_height_m: f64,
-    /// Longest landing, from start to LAND, before it is aborted, in s (10 to 3600).
-    pub landing_timeout_s: f64,
-    /// Height over the local origin below which a start in LAND mode just watches the touchdown, in m (0 to 20).
-    pub watch_height_m: f64,
-    /// What an aborted landing does.
-    pub on_abort: OnAbort,
-    /// Height over the local origin to which an aborted landing climbs when it is to climb, in m (0 to 100).
-    pub abort_height_m: f64,
-    /// How long an aborted landing hovers before it falls silent, in s (0 to 60).
-    pub release_after_s: f64,
-    /// What a low battery leads to.
-    pub on_battery_low: AlarmAction,
-    /// What a nearly empty battery leads to.
-    pub on_battery_critical: AlarmAction,
-    /// What follows when the operator is no longer heard.
-    pub on_operator_lost: AlarmAction,
-    /// What follows when the autopilot is no longer heard; a hold ends when it is again.
-    pub on_autopilot_lost: AlarmAction,
-}
-
-impl Default for PhaseConfig {
-    fn default() -> Self {
-        Self {
-            stale_target_s: 0.4,
-            low_height_m: 0.8,
-            low_grace_s: 0.4,
-            lost_target_s: 1.0,
-            stale_vehicle_s: 0.5,
-            search_timeout_s: 60.0,
-            search_delay_s: 0.5,
-            search_height_m: 5.0,
-            search_climb_m_s: 1.0,
-            search_speed_m_s: 1.0,
-            search_spacing_m: 2.0,
-            search_radius_m: 5.0,
-            fence_radius_m: 0.0,
-            fence_height_m: 0.0,
-            self_test_s: 1.5,
-            approach_timeout_s: 60.0,
-            descend_timeout_s: 120.0,
-            hold_timeout_s: 60.0,
-            operator_hold_timeout_s: 180.0,
-            regain_after_s: 2.0,
-            regain_height_m: 1.5,
-            regain_climb_m_s: 0.3,
-            retries: 5,
-            retry_climb_m: 2.0,
-            retry_climb_m_s: 0.8,
-            retry_timeout_s: 8.0,
-            land_retry_s: 0.5,
-            land_timeout_s: 5.0,
-            touchdown_timeout_s: 60.0,
-            refused_descend_m_s: 0.3,
-            no_return_height_m: 1.0,
-            landing_timeout_s: 300.0,
-            watch_height_m: 2.0,
-            on_abort: OnAbort::Hover,
-            abort_height_m: 10.0,
-            release_after_s: 5.0,
-            on_battery_low: AlarmAction::Ignore,
-            on_battery_critical: AlarmAction::Land,
-            on_operator_lost: AlarmAction::Ignore,
-            on_autopilot_lost: AlarmAction::Hold,
-        }
-    }
-}
-
-/// What an aborted landing does.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum OnAbort {
-    /// Hover for `release_after_s`, then fall silent: the autopilot holds its position by itself.
-    Hover,
-    /// Land where it is, by the autopilot's LAND mode.
-    Land,
-    /// Climb to `abort_height_m`, then as `Hover`.
-    Climb,
-}
-
-/// What an alarm leads to.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum AlarmAction {
-    /// The landing goes on.
-    Ignore,
-    /// As if the operator had asked to hold.
-    Hold,
-    /// The landing is given up, and `on_abort` follows.
-    Abort,
-    /// The autopilot's LAND mode, where the vehicle is.
-    Land,
-}
-
-/// A setting that cannot be used.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ConfigError {
-    /// The key, with dots, as in `phases.hold_timeout_s`.
-    pub key: &'static str,
-    /// What it was set to.
-    pub value: f64,
-    /// The smallest value allowed.
-    pub min: f64,
-    /// The largest value allowed.
-    pub max: f64,
-}
-
-impl fmt::Display for ConfigError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} is {}, must lie between {} and {}", self.key, self.value, self.min, self.max)
-    }
-}
-
-impl std::error::Error for ConfigError {}
-
 impl Config {
-    /// Checks every number against its range; the first that lies outside is named.
+    /// Checks every number against its range; the error names the first that lies outside.
     pub fn validate(&self) -> Result<(), ConfigError> {
         match &self.guidance {
-            Guidance::Thesis(thesis) => thesis.validate()?,
-            Guidance::Metric(metric) => metric.validate()?,
+            GuidanceConfig::Thesis(thesis) => thesis.validate()?,
+            GuidanceConfig::Metric(metric) => metric.validate()?,
         }
         self.target.validate()?;
         self.estimator.validate()?;
@@ -390,105 +52,324 @@ impl Config {
     }
 }
 
-impl TargetConfig {
-    fn validate(&self) -> Result<(), ConfigError> {
-        check("target.max_latency_s", self.max_latency_s, 0.05, 5.0)?;
-        check("target.max_future_s", self.max_future_s, 0.0, 1.0)?;
-        check("target.max_extrapolation_s", self.max_extrapolation_s, 0.0, 1.0)?;
-        check("target.min_confidence", self.min_confidence, 0.0, 1.0)?;
-        check("target.max_range_m", self.max_range_m, 1.0, 200.0)?;
-        check("target.gate_m", self.gate_m, 0.02, 10.0)?;
-        check("target.gate_per_height", self.gate_per_height, 0.0, 1.0)?;
-        check("target.smoothing_s", self.smoothing_s, 0.0, 5.0)?;
-        check("target.smoothing_s_per_height", self.smoothing_s_per_height, 0.0, 1.0)?;
-        check("target.forget_after_s", self.forget_after_s, 0.5, 600.0)?;
-        check("target.restart_after", f64::from(self.restart_after), 2.0, 100.0)?;
-        check("target.confirm_after", f64::from(self.confirm_after), 1.0, 100.0)
+settings! {
+    /// Which detections are used, and how the thesis' guidance averages them.
+    TargetConfig in "target" {
+        /// Maximum age of a frame on arrival, in s.
+        max_latency_s: f64 = 0.5, 0.05..=5.0;
+        /// Maximum time by which a frame's stamp may lie in the future, in s.
+        max_future_s: f64 = 0.05, 0.0..=1.0;
+        /// Maximum time over which the vehicle's states are extrapolated, in s.
+        max_extrapolation_s: f64 = 0.1, 0.0..=1.0;
+        /// Minimum confidence of a detection.
+        min_confidence: f64 = 0.0, 0.0..=1.0;
+        /// Maximum range of a detection, in m (thesis guidance).
+        max_range_m: f64 = 40.0, 1.0..=200.0;
+        /// Horizontal distance from the estimate beyond which a detection is an outlier, at height 0, in m (thesis guidance).
+        gate_m: f64 = 0.15, 0.02..=10.0;
+        /// Growth of that distance per metre of height.
+        gate_per_height: f64 = 0.1, 0.0..=1.0;
+        /// Time constant of the mean over detections at height 0, in s (thesis guidance).
+        smoothing_s: f64 = 0.1, 0.0..=5.0;
+        /// Growth of that time constant per metre of height, in s/m.
+        smoothing_s_per_height: f64 = 0.05, 0.0..=1.0;
+        /// Time without a detection after which the mean is discarded, in s (thesis guidance).
+        forget_after_s: f64 = 5.0, 0.5..=600.0;
+        /// Consecutive outliers in agreement that start a new mean (thesis guidance).
+        restart_after: u32 = 6, 2.0..=100.0;
+        /// Number of detections, without a long gap, that confirm a target.
+        confirm_after: u32 = 3, 1.0..=100.0;
     }
 }
 
-impl EstimatorConfig {
-    fn validate(&self) -> Result<(), ConfigError> {
-        check("estimator.max_range_m", self.max_range_m, 1.0, 200.0)?;
-        check("estimator.pixel_noise_px", self.pixel_noise_px, 0.01, 10.0)?;
-        check("estimator.direction_noise_rad", self.direction_noise_rad, 1e-5, 0.1)?;
-        check("estimator.range_noise_part", self.range_noise_part, 1e-4, 0.5)?;
-        check("estimator.range_floor_part", self.range_floor_part, 0.0, 0.1)?;
-        check("estimator.attitude_noise_rad", self.attitude_noise_rad, 1e-5, 0.1)?;
-        check("estimator.position_noise_m", self.position_noise_m, 1e-4, 1.0)?;
-        check("estimator.way_noise_m", self.way_noise_m, 0.0, 1.0)?;
-        check("estimator.drift_m_s", self.drift_m_s, 0.0, 1.0)?;
-        check("estimator.drift_change", self.drift_change, 0.0, 1.0)?;
-        check("estimator.most_drift_change", self.most_drift_change, 0.0, 1.0)?;
-        check("estimator.height_drift_m_s", self.height_drift_m_s, 0.0, 1.0)?;
-        check("estimator.height_drift_change", self.height_drift_change, 0.0, 1.0)?;
-        check("estimator.pad_speed_m_s", self.pad_speed_m_s, 0.0, 10.0)?;
-        check("estimator.pad_heave_m_s", self.pad_heave_m_s, 0.0, 5.0)?;
-        check("estimator.pad_acceleration", self.pad_acceleration, 0.0, 5.0)?;
-        check("estimator.mount_error_rad", self.mount_error_rad, 1e-5, 0.2)?;
-        check("estimator.tilt_change", self.tilt_change, 0.0, 0.1)?;
-        check("estimator.heading_error_rad", self.heading_error_rad, 1e-5, 0.5)?;
-        check("estimator.time_offset_s", self.time_offset_s, 0.0, 0.2)?;
-        check("estimator.gate", self.gate, 7.0, 100.0)?;
-        let most = f64::from(crate::standing::MOST_SIGHTED);
-        check("estimator.restart_after", f64::from(self.restart_after), 2.0, most)?;
-        check("estimator.restart_s", self.restart_s, 0.0, 10.0)?;
-        check("estimator.forget_after_s", self.forget_after_s, 0.5, 600.0)?;
-        check("estimator.heading_share", self.heading_share, 0.01, 1.0)
+settings! {
+    /// The Kalman filter: measurement noise, process noise, gating.
+    EstimatorConfig in "estimator" {
+        /// Maximum range of a detection, in m.
+        max_range_m: f64 = 40.0, 1.0..=200.0;
+        /// Standard deviation of a marker's position in the image where the detector gives no covariance, in px.
+        pixel_noise_px: f64 = 0.3, 0.01..=10.0;
+        /// The same as an angle, where the focal length is unknown too, in rad.
+        direction_noise_rad: f64 = 0.0003, 1e-5..=0.1;
+        /// Standard deviation of the range relative to the range, where the marker's size in the image is unknown.
+        range_noise_ratio: f64 = 0.015, 1e-4..=0.5;
+        /// Standard deviation of the range relative to the range, added to the detector's covariance.
+        range_floor_ratio: f64 = 0.002, 0.0..=0.1;
+        /// Fast noise of the attitude at an exposure, in rad.
+        attitude_noise_rad: f64 = 0.0003, 1e-5..=0.1;
+        /// Fast noise of the autopilot's position, in m.
+        position_noise_m: f64 = 0.002, 1e-4..=1.0;
+        /// Random walk of the autopilot's position, in m per square root of a second.
+        odometry_noise_m: f64 = 0.01, 0.0..=1.0;
+        /// Initial standard deviation of the drift of the autopilot's horizontal position, in m/s.
+        drift_m_s: f64 = 0.05, 0.0..=1.0;
+        /// Random walk of that drift, in m/s per square root of a second.
+        drift_change: f64 = 0.01, 0.0..=1.0;
+        /// Maximum random walk of that drift while detections show that the autopilot's position wanders, in m/s per
+        /// square root of a second. At most 15 times `drift_change`; the random walk of tilts grows in the same
+        /// proportion. Values up to `drift_change`, or a `drift_change` of 0, turn the adaptation off.
+        max_drift_change: f64 = 0.15, 0.0..=1.0;
+        /// Initial standard deviation of the drift of the autopilot's height, in m/s.
+        height_drift_m_s: f64 = 0.1, 0.0..=1.0;
+        /// Random walk of that drift, in m/s per square root of a second.
+        height_drift_change: f64 = 0.05, 0.0..=1.0;
+        /// Maximum speed of the pad, in m/s; 0 for a pad that does not move.
+        pad_speed_m_s: f64 = 0.0, 0.0..=10.0;
+        /// Maximum heave speed of the pad, in m/s.
+        pad_heave_m_s: f64 = 0.0, 0.0..=5.0;
+        /// Random walk of the pad's velocity, in m/s per square root of a second.
+        pad_acceleration: f64 = 0.0, 0.0..=5.0;
+        /// Initial standard deviation of the error of mount and attitude, in rad.
+        mount_error_rad: f64 = 0.005, 1e-5..=0.2;
+        /// Random walk of that error, in rad per square root of a second.
+        tilt_change: f64 = 0.0005, 0.0..=0.1;
+        /// Initial standard deviation of the heading error, in rad.
+        heading_error_rad: f64 = 0.015, 1e-5..=0.5;
+        /// Initial standard deviation of the frames' time offset, in s; 0 trusts the stamps.
+        time_offset_s: f64 = 0.02, 0.0..=0.2;
+        /// Normalised innovation squared (NIS) beyond which a detection is an outlier; chi-square with 3 degrees of
+        /// freedom exceeds 16.3 once in a thousand times.
+        gate: f64 = 16.3, 7.0..=100.0;
+        /// Outliers in agreement that start a new estimate, when the marker is found in a larger share of the frames
+        /// that show their place than of those that show the estimate's place.
+        restart_after: u32 = 8, 2.0..=f64::from(MAX_COUNTED_DETECTIONS);
+        /// Minimum time over which such outliers must come, in s.
+        restart_s: f64 = 1.5, 0.0..=10.0;
+        /// Time without a detection after which the estimate is discarded, in s.
+        forget_after_s: f64 = 10.0, 0.5..=600.0;
+        /// Weight of a new detection in the average of the pad's heading.
+        heading_weight: f64 = 0.1, 0.01..=1.0;
     }
 }
 
-impl EnvelopeConfig {
-    fn validate(&self) -> Result<(), ConfigError> {
-        check("envelope.horizontal_m_s", self.horizontal_m_s, 0.05, 10.0)?;
-        check("envelope.climb_m_s", self.climb_m_s, 0.0, 5.0)?;
-        check("envelope.descend_m_s", self.descend_m_s, 0.05, 5.0)
+settings! {
+    /// Limits of every setpoint, whatever the guidance asks for.
+    EnvelopeConfig in "envelope" {
+        /// Maximum horizontal speed, in m/s.
+        horizontal_m_s: f64 = 2.0, 0.05..=10.0;
+        /// Maximum climb speed, in m/s.
+        climb_m_s: f64 = 1.0, 0.0..=5.0;
+        /// Maximum descent speed, in m/s.
+        descend_m_s: f64 = 2.0, 0.05..=5.0;
     }
 }
 
-impl PhaseConfig {
-    fn validate(&self) -> Result<(), ConfigError> {
-        check("phases.stale_target_s", self.stale_target_s, 0.1, 5.0)?;
-        check("phases.low_height_m", self.low_height_m, 0.0, 5.0)?;
-        check("phases.low_grace_s", self.low_grace_s, 0.0, 5.0)?;
-        check("phases.lost_target_s", self.lost_target_s, 0.1, 10.0)?;
-        check("phases.stale_vehicle_s", self.stale_vehicle_s, 0.1, 5.0)?;
-        check("phases.search_timeout_s", self.search_timeout_s, 1.0, 600.0)?;
-        check("phases.search_delay_s", self.search_delay_s, 0.0, 60.0)?;
-        check("phases.search_height_m", self.search_height_m, 0.0, 50.0)?;
-        check("phases.search_climb_m_s", self.search_climb_m_s, 0.1, 3.0)?;
-        check("phases.search_speed_m_s", self.search_speed_m_s, 0.0, 3.0)?;
-        check("phases.search_spacing_m", self.search_spacing_m, 0.5, 20.0)?;
-        check("phases.search_radius_m", self.search_radius_m, 0.0, 50.0)?;
-        check("phases.fence_radius_m", self.fence_radius_m, 0.0, 10_000.0)?;
-        check("phases.fence_height_m", self.fence_height_m, 0.0, 1_000.0)?;
-        check("phases.self_test_s", self.self_test_s, 0.0, 60.0)?;
-        check("phases.approach_timeout_s", self.approach_timeout_s, 1.0, 600.0)?;
-        check("phases.descend_timeout_s", self.descend_timeout_s, 1.0, 600.0)?;
-        check("phases.hold_timeout_s", self.hold_timeout_s, 1.0, 600.0)?;
-        check("phases.operator_hold_timeout_s", self.operator_hold_timeout_s, 1.0, 3600.0)?;
-        check("phases.regain_after_s", self.regain_after_s, 0.0, 60.0)?;
-        check("phases.regain_height_m", self.regain_height_m, 0.0, 10.0)?;
-        check("phases.regain_climb_m_s", self.regain_climb_m_s, 0.1, 2.0)?;
-        check("phases.retries", f64::from(self.retries), 0.0, 20.0)?;
-        check("phases.retry_climb_m", self.retry_climb_m, 0.0, 20.0)?;
-        check("phases.retry_climb_m_s", self.retry_climb_m_s, 0.1, 3.0)?;
-        check("phases.retry_timeout_s", self.retry_timeout_s, 1.0, 60.0)?;
-        check("phases.abort_height_m", self.abort_height_m, 0.0, 100.0)?;
-        check("phases.land_retry_s", self.land_retry_s, 0.1, 5.0)?;
-        check("phases.land_timeout_s", self.land_timeout_s, 0.5, 60.0)?;
-        check("phases.touchdown_timeout_s", self.touchdown_timeout_s, 5.0, 600.0)?;
-        check("phases.refused_descend_m_s", self.refused_descend_m_s, 0.1, 1.0)?;
-        check("phases.no_return_height_m", self.no_return_height_m, 0.0, 20.0)?;
-        check("phases.landing_timeout_s", self.landing_timeout_s, 10.0, 3600.0)?;
-        check("phases.watch_height_m", self.watch_height_m, 0.0, 20.0)?;
-        check("phases.release_after_s", self.release_after_s, 0.0, 60.0)
+settings! {
+    /// When the phases end.
+    PhaseConfig in "phases" {
+        /// Maximum age of the newest detection for the marker to count as visible, in s.
+        stale_target_s: f64 = 0.4, 0.1..=5.0;
+        /// Age of the newest detection beyond which the marker is lost and the vehicle holds or retries, in s.
+        lost_target_s: f64 = 1.0, 0.1..=10.0;
+        /// Age of the vehicle's state beyond which the vehicle holds, in s.
+        stale_vehicle_s: f64 = 0.5, 0.1..=5.0;
+        /// Maximum duration of a search, in s; then the vehicle holds.
+        search_timeout_s: f64 = 60.0, 1.0..=600.0;
+        /// Hover time before the search moves, in s.
+        search_delay_s: f64 = 0.5, 0.0..=60.0;
+        /// Height over the local origin to which the search climbs before it flies its legs, in m; 0 never climbs.
+        search_height_m: f64 = 5.0, 0.0..=50.0;
+        /// Speed of that climb, in m/s.
+        search_climb_m_s: f64 = 1.0, 0.1..=3.0;
+        /// Speed of the search, in m/s; 0 hovers.
+        search_speed_m_s: f64 = 1.0, 0.0..=3.0;
+        /// Distance between the legs of the expanding square, in m.
+        search_spacing_m: f64 = 2.0, 0.5..=20.0;
+        /// Maximum distance of the search along either axis, in m.
+        search_radius_m: f64 = 5.0, 0.0..=50.0;
+        /// Radius about the local origin that the search does not leave, in m; 0 sets none.
+        fence_radius_m: f64 = 0.0, 0.0..=10_000.0;
+        /// Height over the local origin that neither search nor retry exceeds, in m; 0 sets none.
+        fence_height_m: f64 = 0.0, 0.0..=1_000.0;
+        /// Maximum wait before the descent for natural motion that shows whether the axes of camera and autopilot
+        /// agree, in s; 0 turns the check off.
+        axis_check_s: f64 = 1.5, 0.0..=60.0;
+        /// Maximum duration of an approach, in s; then the vehicle holds.
+        approach_timeout_s: f64 = 60.0, 1.0..=600.0;
+        /// Maximum duration of a descent, in s; then the vehicle holds.
+        descend_timeout_s: f64 = 120.0, 1.0..=600.0;
+        /// Maximum hold for a lost target or vehicle state, in s; then the landing is aborted.
+        hold_timeout_s: f64 = 60.0, 1.0..=600.0;
+        /// Maximum hold by the operator, in s; then the landing is aborted.
+        operator_hold_timeout_s: f64 = 180.0, 1.0..=3600.0;
+        /// Hold time for a lost marker after which the vehicle climbs to `regain_height_m`, in s.
+        regain_after_s: f64 = 2.0, 0.0..=60.0;
+        /// Height over the target to which the vehicle climbs to see a lost marker again, in m; 0 never climbs.
+        regain_height_m: f64 = 1.5, 0.0..=10.0;
+        /// Speed of that climb, in m/s.
+        regain_climb_m_s: f64 = 0.3, 0.1..=2.0;
+        /// Maximum number of retries: climbs after which the landing starts again, for a lost marker or a vehicle that
+        /// does not settle.
+        retries: u32 = 5, 0.0..=20.0;
+        /// Height gain of a retry, in m, never above the height where the landing started.
+        retry_climb_m: f64 = 2.0, 0.0..=20.0;
+        /// Speed of that climb, in m/s.
+        retry_climb_m_s: f64 = 0.8, 0.1..=3.0;
+        /// Maximum duration of a retry, in s; then the search starts.
+        retry_timeout_s: f64 = 8.0, 1.0..=60.0;
+        /// Interval at which LAND is requested again, in s.
+        land_retry_s: f64 = 0.5, 0.1..=5.0;
+        /// Maximum wait for the LAND mode, in s; then the landing is aborted.
+        land_timeout_s: f64 = 5.0, 0.5..=60.0;
+        /// Maximum time in LAND, in s; then the landing is aborted.
+        touchdown_timeout_s: f64 = 60.0, 5.0..=600.0;
+        /// Descent speed without LAND, where the autopilot refuses it close to the ground, in m/s.
+        refused_descend_m_s: f64 = 0.3, 0.1..=1.0;
+        /// Height over the target below which LAND can no longer be aborted, in m.
+        no_return_height_m: f64 = 1.0, 0.0..=20.0;
+        /// Maximum duration of a landing, from start to LAND, in s; then it is aborted.
+        landing_timeout_s: f64 = 300.0, 10.0..=3600.0;
+        /// Height over the local origin below which a start in LAND mode only monitors the touchdown, in m.
+        watch_height_m: f64 = 2.0, 0.0..=20.0;
+        /// What an aborted landing does.
+        on_abort: OnAbort = OnAbort::Hover;
+        /// Height over the local origin to which an aborted landing climbs with `on_abort = "climb"`, in m.
+        abort_height_m: f64 = 10.0, 0.0..=100.0;
+        /// Hover time of an aborted landing before setpoints stop, in s.
+        release_after_s: f64 = 5.0, 0.0..=60.0;
+        /// Reaction to a low battery.
+        on_battery_low: AlarmAction = AlarmAction::Ignore;
+        /// Reaction to a nearly empty battery.
+        on_battery_critical: AlarmAction = AlarmAction::Land;
+        /// Reaction to a lost operator link.
+        on_operator_lost: AlarmAction = AlarmAction::Ignore;
+        /// Reaction to a lost autopilot link; a hold ends when the link is back.
+        on_autopilot_lost: AlarmAction = AlarmAction::Hold;
     }
 }
 
-/// Refuses a value outside its range; not a number lies outside every range.
-pub(crate) fn check(key: &'static str, value: f64, min: f64, max: f64) -> Result<(), ConfigError> {
-    if (min..=max).contains(&value) { Ok(()) } else { Err(ConfigError { key, value, min, max }) }
+/// What an aborted landing does.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OnAbort {
+    /// Hover for `release_after_s`, then stop sending setpoints: the autopilot holds its position by itself.
+    Hover,
+    /// Land where it is, by the autopilot's LAND mode.
+    Land,
+    /// Climb to `abort_height_m`, then as `Hover`.
+    Climb,
+}
+
+/// Reaction to an alarm.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum AlarmAction {
+    /// The landing continues.
+    Ignore,
+    /// As if the operator had commanded a hold.
+    Hold,
+    /// The landing is aborted, and `on_abort` follows.
+    Abort,
+    /// The autopilot's LAND mode, where the vehicle is.
+    Land,
+}
+
+settings! {
+    /// How the metric guidance brings the vehicle over the target and down.
+    MetricConfig in "metric" {
+        /// Closing speed per metre of predicted error, in 1/s.
+        lateral_gain: f64 = 1.8, 0.1..=3.0;
+        /// Acceleration per difference between commanded and actual closing speed, in 1/s.
+        velocity_gain: f64 = 4.5, 0.2..=6.0;
+        /// Maximum closing speed, in m/s.
+        max_lateral_m_s: f64 = 2.0, 0.1..=5.0;
+        /// Maximum lateral acceleration, in m/s^2; it tilts the camera.
+        lateral_acceleration_m_s2: f64 = 1.2, 0.1..=2.5;
+        /// Dead time from the arrival of a detection to the vehicle's response, in s.
+        dead_time_s: f64 = 0.3, 0.0..=1.0;
+        /// Time for which the present acceleration is assumed to continue, in s.
+        acceleration_lead_s: f64 = 0.1, 0.0..=1.0;
+        /// Maximum descent speed, in m/s.
+        max_descend_m_s: f64 = 2.0, 0.1..=3.0;
+        /// Descent speed at the ground, in m/s.
+        touchdown_descend_m_s: f64 = 0.5, 0.1..=1.0;
+        /// Deceleration of the descent, in m/s^2.
+        descend_braking_m_s2: f64 = 0.5, 0.1..=2.5;
+        /// Lag from a descent setpoint to its speed, in s.
+        descend_lag_s: f64 = 0.45, 0.0..=2.0;
+        /// Maximum rate of change of the descent setpoint, in m/s^2.
+        descend_acceleration_m_s2: f64 = 2.0, 0.1..=5.0;
+        /// Radius of the funnel at the ground, in m; at its edge the descent stops.
+        funnel_m: f64 = 0.08, 0.02..=5.0;
+        /// Growth of the funnel's radius per metre of height.
+        funnel_per_height: f64 = 0.25, 0.0..=2.0;
+        /// Age of the newest detection up to which the descent is not slowed, in s.
+        fresh_target_s: f64 = 0.5, 0.0..=5.0;
+        /// Age of the newest detection beyond which the descent stops, in s, except low over a well-known target
+        /// (`blind_height_m`).
+        stale_target_s: f64 = 0.7, 0.1..=5.0;
+        /// If setpoints stop, the vehicle must not reach the ground faster than `touchdown_descend_m_s` within this
+        /// time, in s.
+        setpoint_loss_s: f64 = 2.0, 0.1..=10.0;
+        /// Height over the target at which LAND takes over, in m.
+        land_height_m: f64 = 0.05, 0.02..=5.0;
+        /// Height of the body's origin over the pad when the vehicle stands on it, in m.
+        standing_height_m: f64 = 0.0, -1.0..=2.0;
+        /// Waiting time near the ground over which the funnel widens to `blind_error_m`, in s.
+        settle_s: f64 = 5.0, 0.1..=60.0;
+        /// Maximum lateral error for a touchdown after that wait or without the marker in view, in m.
+        blind_error_m: f64 = 0.15, 0.01..=1.0;
+        /// Height over the target below which the descent continues without the marker, in m.
+        blind_height_m: f64 = 2.2, 0.0..=10.0;
+        /// Maximum duration of a descent without the marker, in s.
+        blind_s: f64 = 6.0, 0.0..=20.0;
+        /// Maximum standard deviation of the estimate for a descent without the marker, in m.
+        blind_deviation_m: f64 = 0.06, 0.005..=1.0;
+        /// Height down to which the vehicle stays upwind to keep the marker in view, in m.
+        view_height_m: f64 = 1.3, 0.2..=50.0;
+        /// Image margin around the marker's centre for the marker's size, in m.
+        view_margin_m: f64 = 0.11, 0.0..=2.0;
+        /// Image margin for the vehicle's attitude changes, in rad.
+        view_margin_rad: f64 = 0.07, 0.0..=0.5;
+        /// Time constant of the observer of the autopilot's velocity bias, in s.
+        drift_time_s: f64 = 0.4, 0.2..=60.0;
+        /// Maximum bias of the autopilot's velocity, in m/s; 0 turns the observer off.
+        max_drift_m_s: f64 = 0.8, 0.0..=1.0;
+        /// Maximum speed of a pad that is followed, in m/s.
+        max_pad_m_s: f64 = 5.0, 0.0..=10.0;
+        /// Maximum yaw rate towards the pad's heading, in rad/s; 0 holds the heading.
+        turn_rad_s: f64 = 0.0, 0.0..=1.0;
+        /// Heading at touchdown relative to the marker's upper edge, in rad, clockwise seen from above.
+        pad_heading_rad: f64 = 0.0, -7.0..=7.0;
+    }
+}
+
+settings! {
+    /// The constants of the thesis' section 3.2.1, and when its guidance descends.
+    ThesisConfig in "thesis" {
+        /// Proportional gain for x and y, in m/s per pixel; printed as 1e-6, see `guidance/thesis.rs`.
+        kp: f64 = 1e-3, 0.0..=0.1;
+        /// Integral gain for x and y, in m/s per pixel and frame.
+        ki: f64 = 7e-7, 0.0..=0.01;
+        /// Proportional gain for the descent, in m/s per centimetre of altitude; negative is down.
+        kpz: f64 = -5e-4, -0.01..=0.0;
+        /// Maximum speed along x and y, in m/s.
+        max_horizontal_m_s: f64 = 0.5, 0.01..=5.0;
+        /// Minimum descent speed, in m/s.
+        min_descend_m_s: f64 = 1e-5, 0.0..=1.0;
+        /// Maximum descent speed, in m/s.
+        max_descend_m_s: f64 = 0.5, 0.01..=5.0;
+        /// Radius of the circle around the image's centre in which the marker counts as aligned, in pixels.
+        tolerance_px: f64 = 300.0, 1.0..=5000.0;
+        /// Altitude over the marker at which the autopilot's LAND takes over, in m.
+        land_altitude_m: f64 = 0.8, 0.1..=10.0;
+        /// Age of the newest detection beyond which the descent stops, in s.
+        stale_target_s: f64 = 0.4, 0.1..=5.0;
+        /// Height over the target below which `low_grace_s` is added to that age, in m.
+        low_height_m: f64 = 0.8, 0.0..=5.0;
+        /// Time added to `stale_target_s` below `low_height_m`, in s.
+        low_grace_s: f64 = 0.4, 0.0..=5.0;
+        /// Weight of the previous wind noise (lambda of Equation 3.15).
+        wind_memory: f64 = 0.9, 0.0..=1.0;
+        /// Mean of the wind noise's random term, in m/s.
+        wind_mean_m_s: f64 = 0.0, -5.0..=5.0;
+        /// Standard deviation of the wind noise's random term, in m/s; 0 turns the noise off.
+        wind_sigma_m_s: f64 = 0.1, 0.0..=5.0;
+        /// Seed of the wind noise.
+        seed: u64 = 0;
+        /// Heading of the image's upper edge relative to the vehicle's nose, in rad, clockwise seen from above.
+        image_up_rad: f64 = 0.0, -7.0..=7.0;
+    }
 }
 
 #[cfg(test)]
@@ -498,9 +379,8 @@ mod tests {
     #[test]
     fn the_defaults_are_within_their_ranges() {
         assert_eq!(Config::default().validate(), Ok(()));
-        let thesis =
-            Config { guidance: Guidance::Thesis(ThesisConfig::default()), ..Config::default() };
-        assert_eq!(thesis.validate(), Ok(()));
+        let guidance = GuidanceConfig::Thesis(ThesisConfig::default());
+        assert_eq!(Config { guidance, ..Config::default() }.validate(), Ok(()));
     }
 
     #[test]

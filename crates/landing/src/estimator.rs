@@ -36,12 +36,12 @@
 
 use std::collections::VecDeque;
 
-use geometry::{Body, Marker, Ned, Point, Rotation, Transform, Vector};
+use geometry::{Body, Marker, Ned, Odometry, Point, Rotation, Transform, Vector};
 use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector3};
 
 use crate::config::EstimatorConfig;
 use crate::decision::{Rejection, TargetEstimate};
-use crate::event::{Frame, MarkerInFrame};
+use crate::event::{FrameObservation, MarkerInFrame};
 use crate::history::{History, Motion};
 use crate::standing::{Standing, View};
 use crate::time::Timestamp;
@@ -167,7 +167,7 @@ impl Estimator {
 
     /// Takes note of a frame in which the marker was not found. That alone makes no other place the pad: a pad that blinks
     /// must not lose to one that nobody looks at.
-    pub fn miss(&mut self, frame: &Frame, history: &History) {
+    pub fn miss(&mut self, frame: &FrameObservation, history: &History) {
         self.view = View::of(frame).or(self.view);
         if let Some(motion) = history.at(frame.stamp) {
             self.count(frame.stamp, &motion, None);
@@ -177,7 +177,7 @@ impl Estimator {
     /// Uses one marker of a frame, or says why not.
     pub fn observe(
         &mut self,
-        frame: &Frame,
+        frame: &FrameObservation,
         marker: &MarkerInFrame,
         history: &History,
     ) -> Result<(), Rejection> {
@@ -198,7 +198,7 @@ impl Estimator {
     pub fn seen_from(
         &self,
         vehicle: Point<Ned>,
-        way_origin: Vector<Ned>,
+        ned_from_odometry: Transform<Ned, Odometry>,
         now: Timestamp,
     ) -> Option<TargetEstimate> {
         let Fused { sight, belief } = self.past.back()?;
@@ -212,7 +212,7 @@ impl Estimator {
             velocity.z *= left;
         }
         let place = belief.place() + way;
-        let position = Point::new(place.x, place.y, place.z) + way_origin;
+        let position = ned_from_odometry * Point::<Odometry>::new(place.x, place.y, place.z);
         let offset = position - vehicle;
         Some(TargetEstimate {
             position,
@@ -265,13 +265,13 @@ impl Estimator {
     /// Covariance of a pose's origin: as told, or from the noise of pixels.
     fn noise_in_body(
         &self,
-        frame: &Frame,
+        frame: &FrameObservation,
         marker: &MarkerInFrame,
         seen: Vector<Body>,
     ) -> Matrix3<f64> {
         if let Some(told) = marker.covariance_m2 {
             // A detector knows its pixels, not how large the marker was printed.
-            let range = (self.config.range_floor_part * seen.norm()).powi(2);
+            let range = (self.config.range_floor_ratio * seen.norm()).powi(2);
             let along = seen.coords / seen.norm().max(1e-6);
             return (told + told.transpose()) * 0.5 + along * along.transpose() * range;
         }
@@ -282,7 +282,7 @@ impl Estimator {
                 self.config.pixel_noise_px / focal_px
             });
         let size_px = marker.size_px.filter(|size_px| *size_px > 1.0);
-        let range_part = size_px.map_or(self.config.range_noise_part, |size_px| {
+        let range_part = size_px.map_or(self.config.range_noise_ratio, |size_px| {
             2.0 * self.config.pixel_noise_px / size_px
         });
         let range_m = seen.norm();
@@ -316,7 +316,7 @@ impl Estimator {
             + Matrix3::identity() * position;
         Sight {
             stamp,
-            place: motion.way.coords.coords + r,
+            place: motion.odometry.coords.coords + r,
             noise,
             tilt,
             slip: -motion.velocity.coords - turning.cross(&r),
@@ -448,7 +448,7 @@ impl Estimator {
         let grown = block(Q, Q)
             + (cross + cross.transpose()) * ahead_s
             + block(U, U) * ahead_s.powi(2)
-            + Matrix2::identity() * (self.config.way_noise_m.powi(2) * ahead_s)
+            + Matrix2::identity() * (self.config.odometry_noise_m.powi(2) * ahead_s)
             + Matrix2::identity() * (change * ahead_s.powi(3) / 3.0);
         let (mean, half) = (0.5 * (grown.m11 + grown.m22), 0.5 * (grown.m11 - grown.m22));
         (mean + half.hypot(grown.m12)).max(0.0).sqrt()
@@ -462,7 +462,7 @@ impl Estimator {
             return;
         }
         let seen = [up.x() / length, up.y() / length];
-        let share = self.config.heading_share;
+        let share = self.config.heading_weight;
         self.heading = Some(match self.heading {
             Some([north, east]) => {
                 [north + (seen[0] - north) * share, east + (seen[1] - east) * share]
@@ -551,7 +551,7 @@ impl Belief {
             .hypot(config.pad_acceleration)
             .hypot(HEAVE_CHANGE * config.pad_heave_m_s);
         for (i, u) in [level, level, upright].into_iter().enumerate() {
-            let (u, q) = (u * u, config.way_noise_m.powi(2));
+            let (u, q) = (u * u, config.odometry_noise_m.powi(2));
             p[(Q + i, Q + i)] += q * dt_s + u * dt_s.powi(3) / 3.0;
             p[(Q + i, U + i)] += u * dt_s.powi(2) / 2.0;
             p[(U + i, Q + i)] += u * dt_s.powi(2) / 2.0;
@@ -618,7 +618,7 @@ impl Belief {
         };
         let excess = 0.5 * level.dot(&(inverse * level)) - 1.0 - UNREST_SLACK;
         let most = if config.drift_change > 0.0 {
-            (config.most_drift_change / config.drift_change).clamp(1.0, MOST_UNREST).ln()
+            (config.max_drift_change / config.drift_change).clamp(1.0, MOST_UNREST).ln()
         } else {
             0.0
         };
@@ -700,7 +700,7 @@ mod tests {
         }
 
         /// A frame taken `ago_s` ago.
-        fn frame(&mut self, ago_s: f64) -> (Frame, MarkerInFrame) {
+        fn frame(&mut self, ago_s: f64) -> (FrameObservation, MarkerInFrame) {
             let stamp_s = self.seconds - ago_s;
             let exposed_s = stamp_s + self.late_s;
             let (position, _, ned_from_body) = self.motion(exposed_s);
@@ -726,9 +726,8 @@ mod tests {
             };
             let stamp = Timestamp::from_seconds(stamp_s);
             (
-                Frame {
+                FrameObservation {
                     stamp,
-                    detector: 0,
                     image_size: (1296, 972),
                     focal_px: self.focal_px,
                     body_from_camera: None,
@@ -753,7 +752,7 @@ mod tests {
 
         fn estimate(&self) -> TargetEstimate {
             let newest = self.history.newest().unwrap();
-            let origin = self.history.way_origin();
+            let origin = self.history.ned_from_odometry();
             self.estimator.seen_from(newest.position, origin, newest.stamp).unwrap()
         }
     }
@@ -763,11 +762,11 @@ mod tests {
         EstimatorConfig {
             attitude_noise_rad: 1e-5,
             position_noise_m: 1e-4,
-            way_noise_m: 0.0005,
+            odometry_noise_m: 0.0005,
             drift_change: 0.0005,
             height_drift_change: 0.0005,
             tilt_change: 1e-5,
-            range_floor_part: 0.0,
+            range_floor_ratio: 0.0,
             ..EstimatorConfig::default()
         }
     }
@@ -902,8 +901,8 @@ mod tests {
 
     #[test]
     fn an_autopilot_whose_position_wanders_is_believed_less_and_a_steady_one_as_before() {
-        let fly = |most_drift_change: f64, wander_m_s: f64| {
-            let config = EstimatorConfig { most_drift_change, ..EstimatorConfig::default() };
+        let fly = |max_drift_change: f64, wander_m_s: f64| {
+            let config = EstimatorConfig { max_drift_change, ..EstimatorConfig::default() };
             let mut scene = Scene::new(config, 12);
             let home = scene.pad;
             let (mut refused, mut worst_m) = (0, 0.0f64);

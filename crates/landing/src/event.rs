@@ -15,7 +15,7 @@ pub enum Event {
     /// The autopilot reported the vehicle's state.
     Vehicle(VehicleState),
     /// A detector has looked at a frame.
-    Frame(Frame),
+    Frame(FrameObservation),
     /// A person decided something.
     Operator(OperatorCommand),
     /// A limit was reached.
@@ -95,13 +95,11 @@ pub enum Landed {
     Landing,
 }
 
-/// What a detector found in one frame; a frame without the marker is told too.
+/// What a detector found in one image, with or without the marker.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct Frame {
+pub struct FrameObservation {
     /// Mid-exposure.
     pub stamp: Timestamp,
-    /// Which detector looked, for reports.
-    pub detector: u32,
     /// Width and height of the image in pixels.
     pub image_size: (u32, u32),
     /// Focal length in pixels, when the camera is calibrated.

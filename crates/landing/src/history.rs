@@ -1,20 +1,20 @@
-//! Where the vehicle was a moment ago.
+//! The vehicle's recent motion.
 
 use std::collections::VecDeque;
 
-use geometry::{Body, Ned, Point, Rotation, Vector};
+use geometry::{Body, Ned, Odometry, Point, Rotation, Transform, Vector};
 
 use crate::event::VehicleState;
 use crate::time::Timestamp;
 
-/// States kept: five seconds at 50 Hz.
+/// Number of states kept: five seconds at 50 Hz.
 const CAPACITY: usize = 256;
 
-/// Two neighbouring states further apart than this are not interpolated between, in seconds.
-const WIDEST_GAP_S: f64 = 0.5;
+/// Longest interval between two states over which motion is interpolated, in seconds.
+const MAX_GAP_S: f64 = 0.5;
 
-/// A position this far from where the velocity leads is a jump of the autopilot's estimate, in metres, and what is added
-/// for each second between the two states.
+/// A position further than this from where the velocity leads is a jump of the autopilot's estimate: in metres, plus
+/// metres per second between the two states.
 const JUMP_M: f64 = 0.1;
 const JUMP_M_S: f64 = 0.5;
 
@@ -22,8 +22,8 @@ const JUMP_M_S: f64 = 0.5;
 #[derive(Clone, Debug)]
 pub struct History {
     states: VecDeque<VehicleState>,
-    /// For each state: by how much the autopilot's position had jumped altogether.
-    jumps: VecDeque<Vector<Ned>>,
+    /// For each state: the origin of the odometry frame, which moves with every jump of the autopilot's position.
+    odom_origins: VecDeque<Vector<Ned>>,
     max_extrapolation_s: f64,
 }
 
@@ -32,22 +32,29 @@ pub struct History {
 pub struct Motion {
     /// The attitude.
     pub ned_from_body: Rotation<Ned, Body>,
-    /// Where the body's origin was, in metres.
+    /// Position of the body's origin.
     pub position: Point<Ned>,
     /// Velocity in m/s.
     pub velocity: Vector<Ned>,
-    /// The position without the jumps of the autopilot's estimate.
-    pub way: Point<Ned>,
-    /// Turning rate in rad/s, as the neighbouring attitudes tell.
+    /// Position of the body's origin without the jumps of the autopilot's estimate.
+    pub odometry: Point<Odometry>,
+    /// Turn rate in rad/s, from the neighbouring attitudes.
     pub rate: Vector<Body>,
 }
 
+impl Motion {
+    /// The attitude in the odometry frame, whose axes are those of NED.
+    pub fn odometry_from_body(&self) -> Rotation<Odometry, Body> {
+        Rotation::from_quaternion(self.ned_from_body.quaternion)
+    }
+}
+
 impl History {
-    /// An empty history that reaches at most so many seconds beyond its newest state.
+    /// An empty history that extrapolates at most this long beyond its newest state.
     pub fn new(max_extrapolation_s: f64) -> Self {
         Self {
             states: VecDeque::with_capacity(CAPACITY),
-            jumps: VecDeque::with_capacity(CAPACITY),
+            odom_origins: VecDeque::with_capacity(CAPACITY),
             max_extrapolation_s,
         }
     }
@@ -57,15 +64,15 @@ impl History {
         if self.newest().is_some_and(|newest| state.stamp <= newest.stamp) {
             return false;
         }
-        let jumps = self.newest().map_or(Vector::zero(), |newest| {
-            self.way_origin() + jump(newest, &state).unwrap_or(Vector::zero())
+        let origin = self.newest().map_or(Vector::zero(), |newest| {
+            self.odom_origin() + jump(newest, &state).unwrap_or(Vector::zero())
         });
         if self.states.len() == CAPACITY {
             self.states.pop_front();
-            self.jumps.pop_front();
+            self.odom_origins.pop_front();
         }
         self.states.push_back(state);
-        self.jumps.push_back(jumps);
+        self.odom_origins.push_back(origin);
         true
     }
 
@@ -74,9 +81,13 @@ impl History {
         self.states.back()
     }
 
-    /// By how much the autopilot's position has jumped altogether: where the way's origin now lies.
-    pub fn way_origin(&self) -> Vector<Ned> {
-        self.jumps.back().copied().unwrap_or(Vector::zero())
+    /// From the odometry frame, as it now lies, to NED.
+    pub fn ned_from_odometry(&self) -> Transform<Ned, Odometry> {
+        Transform::new(Rotation::identity(), Point::origin() + self.odom_origin())
+    }
+
+    fn odom_origin(&self) -> Vector<Ned> {
+        self.odom_origins.back().copied().unwrap_or(Vector::zero())
     }
 
     /// The motion at `stamp`, interpolated between its neighbours; `None` before the oldest state, inside a gap,
@@ -85,71 +96,77 @@ impl History {
         let after = self.states.partition_point(|state| state.stamp < stamp);
         let Some(later) = self.states.get(after) else { return self.extrapolate(stamp) };
         if later.stamp == stamp {
-            return self.known(after);
+            return self.at_state(after);
         }
-        let earlier = self.states.get(after.checked_sub(1)?)?;
+        let before = after.checked_sub(1)?;
+        let earlier = self.states.get(before)?;
         let gap_s = later.stamp.seconds_since(earlier.stamp);
-        if gap_s > WIDEST_GAP_S {
+        if gap_s > MAX_GAP_S {
             return None;
         }
         let fraction = stamp.seconds_since(earlier.stamp) / gap_s;
-        let between = |a: Vector<Ned>, b: Vector<Ned>| a + (b - a) * fraction;
-        let way = |index: usize, state: &VehicleState| {
-            self.jumps.get(index).map(|jumps| state.position - *jumps)
-        };
-        let (from, to) = (way(after - 1, earlier)?, way(after, later)?);
+        let (from, to) = (self.odometry(before)?, self.odometry(after)?);
         Some(Motion {
-            way: from + (to - from) * fraction,
-            rate: turning(earlier, later),
+            odometry: from + (to - from) * fraction,
+            rate: turn_rate(earlier, later),
             ned_from_body: earlier.ned_from_body.interpolate(&later.ned_from_body, fraction),
             position: earlier.position + (later.position - earlier.position) * fraction,
-            velocity: between(earlier.velocity, later.velocity),
+            velocity: earlier.velocity + (later.velocity - earlier.velocity) * fraction,
         })
     }
 
-    /// A frame may be newer than the last report of the vehicle: position follows velocity, attitude stays.
+    /// A frame may be newer than the newest state: position follows velocity, attitude stays.
     fn extrapolate(&self, stamp: Timestamp) -> Option<Motion> {
         let newest = self.newest()?;
         let ahead_s = stamp.seconds_since(newest.stamp);
         if ahead_s > self.max_extrapolation_s {
             return None;
         }
-        let known = self.known(self.states.len() - 1)?;
-        let further = newest.velocity * ahead_s;
-        Some(Motion { position: newest.position + further, way: known.way + further, ..known })
+        let motion = self.at_state(self.states.len() - 1)?;
+        let moved = newest.velocity * ahead_s;
+        Some(Motion {
+            position: newest.position + moved,
+            odometry: motion.odometry + Vector::from_coords(moved.coords),
+            ..motion
+        })
     }
 
-    /// The motion at a state that is known.
-    fn known(&self, index: usize) -> Option<Motion> {
+    fn at_state(&self, index: usize) -> Option<Motion> {
         let state = self.states.get(index)?;
         let before = index.checked_sub(1).and_then(|before| self.states.get(before));
         Some(Motion {
             ned_from_body: state.ned_from_body,
             position: state.position,
             velocity: state.velocity,
-            way: state.position - *self.jumps.get(index)?,
-            rate: before.map_or(Vector::zero(), |before| turning(before, state)),
+            odometry: self.odometry(index)?,
+            rate: before.map_or(Vector::zero(), |before| turn_rate(before, state)),
         })
+    }
+
+    fn odometry(&self, index: usize) -> Option<Point<Odometry>> {
+        let position = self.states.get(index)?.position - *self.odom_origins.get(index)?;
+        Some(Point::from_coords(position.coords))
     }
 }
 
-/// Turning rate between two states, in rad/s; nought over a gap.
-fn turning(earlier: &VehicleState, later: &VehicleState) -> Vector<Body> {
+/// Turn rate between two states, in rad/s; zero over a gap.
+fn turn_rate(earlier: &VehicleState, later: &VehicleState) -> Vector<Body> {
     let gap_s = later.stamp.seconds_since(earlier.stamp);
-    if !(1e-4..=WIDEST_GAP_S).contains(&gap_s) {
+    if !(1e-4..=MAX_GAP_S).contains(&gap_s) {
         return Vector::zero();
     }
     let [w, x, y, z] = (earlier.ned_from_body.inverse() * later.ned_from_body).wxyz();
-    // Half the angle's sine and the half angle are one for what a vehicle turns between two states.
+    // Small angle: the sine of half the angle is half the angle.
     Vector::new(x, y, z) * (2.0 * w.signum() / gap_s)
 }
 
-/// The jump of the autopilot's position between two states: what its velocity does not lead to.
+/// The jump of the autopilot's position between two states: the part of the displacement that its velocity does not
+/// explain, when that is large.
 pub(crate) fn jump(earlier: &VehicleState, later: &VehicleState) -> Option<Vector<Ned>> {
     let gap_s = later.stamp.seconds_since(earlier.stamp);
-    let led = (earlier.velocity + later.velocity) * (0.5 * gap_s);
-    let beside = later.position - earlier.position - led;
-    (beside.norm() > JUMP_M + JUMP_M_S * gap_s).then_some(beside)
+    let expected = (earlier.velocity + later.velocity) * (0.5 * gap_s);
+    let difference = later.position - earlier.position - expected;
+    (difference.norm() > JUMP_M + JUMP_M_S * gap_s).then_some(difference)
 }
 
 #[cfg(test)]
@@ -185,19 +202,30 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_said_outside_of_what_is_known() {
+    fn motion_is_unknown_before_the_first_state_in_gaps_and_far_ahead() {
         let mut history = History::new(0.1);
         assert!(at(&history, 1.0).is_none());
         history.push(state(1.0, 0.0, 0.0));
         history.push(state(2.0, 1.0, 0.0));
         assert!(at(&history, 0.9).is_none());
-        assert!(at(&history, 1.5).is_none(), "a gap of a second is no knowledge");
+        assert!(at(&history, 1.5).is_none(), "a gap of a second");
         assert!((at(&history, 2.05).unwrap().position.x() - 1.05).abs() < 1e-9);
         assert!(at(&history, 2.2).is_none());
     }
 
     #[test]
-    fn states_out_of_order_are_refused_and_old_ones_forgotten() {
+    fn a_jump_moves_the_odometry_frame_and_not_the_odometry() {
+        let mut history = History::new(0.1);
+        history.push(state(1.0, 0.0, 0.0));
+        history.push(state(1.1, 3.1, 0.0));
+        let motion = at(&history, 1.1).unwrap();
+        assert!((motion.odometry.x() - 0.1).abs() < 1e-9, "{motion:?}");
+        let back = history.ned_from_odometry() * motion.odometry;
+        assert!((back - motion.position).norm() < 1e-12);
+    }
+
+    #[test]
+    fn states_out_of_order_are_refused_and_old_ones_dropped() {
         let mut history = History::new(0.1);
         for i in 0..1000 {
             assert!(history.push(state(f64::from(i) * 0.02, 0.0, 0.0)));

@@ -3,14 +3,16 @@
 use geometry::{Ned, Point, Vector};
 
 use crate::agreement::{Agreement, Verdict, Wrong};
-use crate::config::{AlarmAction, Config, ConfigError, Guidance, OnAbort, PhaseConfig};
-use crate::decision::{Action, Decision, Reason, Rejection, TargetEstimate};
+use crate::config::{AlarmAction, Config, GuidanceConfig, OnAbort, PhaseConfig};
+use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 use crate::envelope;
 use crate::estimator::Estimator;
-use crate::event::{Alarm, Event, Frame, Landed, MarkerInFrame, Mode, VehicleState};
-use crate::guidance::{Guide, Progress, Situation};
+use crate::event::{Alarm, Event, FrameObservation, Landed, MarkerInFrame, Mode, VehicleState};
+use crate::guidance::Guide;
+use crate::guidance::situation::{Progress, Situation};
 use crate::history::History;
-use crate::phase::{Facts, Machine, Phase, VehicleFacts};
+use crate::limits::ConfigError;
+use crate::phase::{Facts, Machine, VehicleFacts};
 use crate::search;
 use crate::target::Target;
 use crate::time::Timestamp;
@@ -162,7 +164,7 @@ impl Lander {
         if self.history.push(state) { Ok(()) } else { Err(Rejection::OutOfOrder) }
     }
 
-    fn frame(&mut self, now: Timestamp, frame: &Frame) -> Result<(), Rejection> {
+    fn frame(&mut self, now: Timestamp, frame: &FrameObservation) -> Result<(), Rejection> {
         if frame.image_size.0 == 0
             || frame.image_size.1 == 0
             || frame.marker.is_some_and(|m| !m.is_finite())
@@ -190,7 +192,11 @@ impl Lander {
     }
 
     /// A marker with a pose goes through the target's gates; one without serves only a guidance that needs none.
-    fn marker(&mut self, frame: &Frame, marker: &MarkerInFrame) -> Result<(), Rejection> {
+    fn marker(
+        &mut self,
+        frame: &FrameObservation,
+        marker: &MarkerInFrame,
+    ) -> Result<(), Rejection> {
         if marker.confidence < self.config.target.min_confidence {
             return Err(Rejection::LowConfidence);
         }
@@ -209,7 +215,7 @@ impl Lander {
     }
 
     /// The thesis' controller runs once per frame, and only while it descends.
-    fn tell_guide(&mut self, frame: &Frame, used: bool) {
+    fn tell_guide(&mut self, frame: &FrameObservation, used: bool) {
         let Some(state) = self.history.newest() else { return };
         if !matches!(self.machine.phase(), Phase::Approach | Phase::Descend) {
             return;
@@ -220,7 +226,7 @@ impl Lander {
         let altitude_m = self.target(frame.stamp);
         let altitude_m = altitude_m.map_or(-state.position.z(), |target| target.height_m);
         let marker = frame.marker.filter(|_| used);
-        self.guide.frame(&Frame { marker, ..*frame }, heading_rad, altitude_m);
+        self.guide.frame(&FrameObservation { marker, ..*frame }, heading_rad, altitude_m);
     }
 
     /// What is configured to follow an alarm.
@@ -254,8 +260,10 @@ impl Lander {
 
     /// A pad that moves cannot show what the camera does, and the thesis' guidance stays as it was.
     fn tests_itself(&self) -> bool {
-        let metric = matches!(self.config.guidance, Guidance::Metric(_));
-        metric && self.config.phases.self_test_s > 0.0 && self.config.estimator.pad_speed_m_s == 0.0
+        let metric = matches!(self.config.guidance, GuidanceConfig::Metric(_));
+        metric
+            && self.config.phases.axis_check_s > 0.0
+            && self.config.estimator.pad_speed_m_s == 0.0
     }
 
     /// Why camera and autopilot do not mean the same directions.
@@ -273,7 +281,7 @@ impl Lander {
     /// True once camera and autopilot agree, or natural motion has not shown it in the time allowed.
     fn is_tested(&self, now: Timestamp) -> bool {
         let waited_s = self.first_seen.map_or(0.0, |seen| now.seconds_since(seen));
-        let over = waited_s > self.config.phases.self_test_s;
+        let over = waited_s > self.config.phases.axis_check_s;
         !self.tests_itself() || over || self.agreement.verdict() == Verdict::Agrees
     }
 
@@ -298,7 +306,7 @@ impl Lander {
         match &self.tracker {
             Tracker::Mean(target) => target.seen_from(vehicle, now),
             Tracker::Filter(estimator) => {
-                estimator.seen_from(vehicle, self.history.way_origin(), now)
+                estimator.seen_from(vehicle, self.history.ned_from_odometry(), now)
             }
         }
     }
@@ -312,7 +320,6 @@ impl Lander {
             half_view_rad: self.half_view_rad,
             pad_moves: self.pad_moves(),
             pad_heave_m_s: self.config.estimator.pad_heave_m_s,
-            phases: self.config.phases,
         }
     }
 
@@ -517,8 +524,8 @@ impl Lander {
 impl Tracker {
     fn new(config: &Config) -> Self {
         match config.guidance {
-            Guidance::Thesis(_) => Self::Mean(Target::new(config.target)),
-            Guidance::Metric(_) => Self::Filter(Estimator::new(config.estimator)),
+            GuidanceConfig::Thesis(_) => Self::Mean(Target::new(config.target)),
+            GuidanceConfig::Metric(_) => Self::Filter(Estimator::new(config.estimator)),
         }
     }
 
@@ -526,7 +533,7 @@ impl Tracker {
         matches!(self, Self::Filter(_))
     }
 
-    fn miss(&mut self, frame: &Frame, history: &History) {
+    fn miss(&mut self, frame: &FrameObservation, history: &History) {
         if let Self::Filter(estimator) = self {
             estimator.miss(frame, history);
         }
@@ -534,7 +541,7 @@ impl Tracker {
 
     fn observe(
         &mut self,
-        frame: &Frame,
+        frame: &FrameObservation,
         marker: &MarkerInFrame,
         history: &History,
     ) -> Result<(), Rejection> {

@@ -21,6 +21,7 @@ pub mod event;
 pub mod guidance;
 pub mod history;
 pub mod lander;
+mod limits;
 pub mod phase;
 pub mod search;
 mod standing;
@@ -28,11 +29,13 @@ pub mod target;
 pub mod time;
 
 pub use config::{
-    AlarmAction, Config, ConfigError, EnvelopeConfig, EstimatorConfig, Guidance, MetricConfig,
-    OnAbort, PhaseConfig, TargetConfig, ThesisConfig,
+    AlarmAction, Config, EnvelopeConfig, EstimatorConfig, GuidanceConfig, MetricConfig, OnAbort,
+    PhaseConfig, TargetConfig, ThesisConfig,
 };
-pub use decision::{Action, Decision, Reason, Rejection, TargetEstimate};
-pub use event::{Alarm, Event, Frame, Landed, MarkerInFrame, Mode, OperatorCommand, VehicleState};
+pub use decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
+pub use event::{
+    Alarm, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand, VehicleState,
+};
 pub use lander::Lander;
-pub use phase::Phase;
+pub use limits::ConfigError;
 pub use time::Timestamp;

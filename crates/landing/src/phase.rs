@@ -41,41 +41,14 @@
 //! | Final | `land_timeout_s` until LAND, `touchdown_timeout_s` until the ground, both ways | Aborted, Landed |
 //! | all together until LAND | `landing_timeout_s` | Aborted |
 
-use std::fmt;
-
 use crate::config::{AlarmAction, OnAbort, PhaseConfig};
-use crate::decision::Reason;
+use crate::decision::{Phase, Reason};
 use crate::event::{Landed, Mode, OperatorCommand};
-use crate::guidance::Progress;
+use crate::guidance::situation::Progress;
 use crate::time::Timestamp;
 
 /// A vehicle that could not settle climbs at least so long before it tries again, in seconds.
 const RETRY_REST_S: f64 = 2.0;
-
-/// Where the landing stands.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
-pub enum Phase {
-    /// Nothing asked for.
-    Idle,
-    /// Flying an expanding square until the marker is seen.
-    Search,
-    /// Moving over the marker.
-    Approach,
-    /// Descending over the marker.
-    Descend,
-    /// Climbing to where the lost marker must be in view.
-    Retry,
-    /// The autopilot's LAND mode does the rest.
-    Final,
-    /// On the ground, disarmed.
-    Landed,
-    /// Hovering until the reason passes.
-    Hold,
-    /// Given up.
-    Aborted,
-    /// Somebody else flies; silent until a new start.
-    PilotInCommand,
-}
 
 /// What the machine looks at.
 #[derive(Copy, Clone, Debug)]
@@ -135,35 +108,6 @@ pub struct Machine {
     recalls: bool,
     /// Retries of this landing so far.
     retries: u32,
-}
-
-impl Phase {
-    /// True when only a new start leaves this phase.
-    pub fn is_terminal(self) -> bool {
-        matches!(self, Self::Idle | Self::Landed | Self::Aborted | Self::PilotInCommand)
-    }
-
-    /// A short name for machines, in kebab-case; it does not change between versions.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Idle => "idle",
-            Self::Search => "search",
-            Self::Approach => "approach",
-            Self::Descend => "descend",
-            Self::Retry => "retry",
-            Self::Final => "final",
-            Self::Landed => "landed",
-            Self::Hold => "hold",
-            Self::Aborted => "aborted",
-            Self::PilotInCommand => "pilot-in-command",
-        }
-    }
-}
-
-impl fmt::Display for Phase {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
 }
 
 impl Machine {

@@ -4,9 +4,10 @@
 //! view, low over the ground or because the vehicle leans into the wind. So each is counted by the frames that show it: the pad
 //! is where the marker is in most of those, and a place out of view keeps what it has earned, for a while.
 
-use geometry::{Body, Camera, Ned, Point, Rotation, Vector};
+use geometry::{Body, Camera, Odometry, Point, Rotation, Vector};
 
-use crate::event::Frame;
+use crate::config::MAX_COUNTED_DETECTIONS;
+use crate::event::FrameObservation;
 use crate::history::Motion;
 use crate::time::Timestamp;
 
@@ -15,10 +16,6 @@ const SHOWN_S: f64 = 2.0;
 
 /// Time constant with which a place that no frame shows loses its standing, in seconds.
 const UNSHOWN_S: f64 = 6.0;
-
-/// Detections beyond this number tell nothing more: a place that was seen for minutes is forgotten as soon as one that was
-/// seen for seconds.
-pub(crate) const MOST_SIGHTED: u32 = 30;
 
 /// A silence between two frames counts as this at most, in seconds.
 const LONGEST_GAP_S: f64 = 0.2;
@@ -56,7 +53,7 @@ impl Standing {
         self.newest = self.newest.max(stamp);
         let lasting = (-gap_s / UNSHOWN_S).exp();
         self.sighted = if is_seen {
-            (self.sighted + 1.0).min(f64::from(MOST_SIGHTED))
+            (self.sighted + 1.0).min(f64::from(MAX_COUNTED_DETECTIONS))
         } else {
             self.sighted * lasting
         };
@@ -97,7 +94,7 @@ pub(crate) struct View {
 impl View {
     /// What a frame's camera shows, when it is calibrated. One of which the mount is not known looks down, and only what
     /// is shown however it is turned counts.
-    pub(crate) fn of(frame: &Frame) -> Option<Self> {
+    pub(crate) fn of(frame: &FrameObservation) -> Option<Self> {
         let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0)?;
         let (width, height) = frame.image_size;
         let half = |px: u32| (0.5 * f64::from(px) / focal_px).atan();
@@ -109,8 +106,9 @@ impl View {
     }
 
     /// True when a place in the vehicle's way is shown with a marker that lies there.
-    pub(crate) fn shows(&self, place: Point<Ned>, motion: &Motion) -> bool {
-        let in_body: Vector<Body> = motion.ned_from_body.inverse() * (place - motion.way);
+    pub(crate) fn shows(&self, place: Point<Odometry>, motion: &Motion) -> bool {
+        let in_body: Vector<Body> =
+            motion.odometry_from_body().inverse() * (place - motion.odometry);
         let seen = self.body_from_camera.inverse() * in_body;
         let is_inside = |aside_m: f64, half_rad: f64| {
             (aside_m.abs() + RIM_M).atan2(seen.z()) < half_rad - RIM_RAD
@@ -173,12 +171,11 @@ mod tests {
             ned_from_body: Rotation::identity(),
             position: Point::origin(),
             velocity: Vector::zero(),
-            way: Point::origin(),
+            odometry: Point::origin(),
             rate: Vector::zero(),
         };
-        let frame = Frame {
+        let frame = FrameObservation {
             stamp: Timestamp::default(),
-            detector: 0,
             image_size: (1296, 972),
             focal_px: Some(1818.0),
             body_from_camera: None,
@@ -194,7 +191,8 @@ mod tests {
         for (turn, [north, east]) in [(std::f64::consts::FRAC_PI_2, [0.0, 0.9]), (0.0, [0.9, 0.0])]
         {
             let mount = Rotation::from_euler(0.0, 0.0, turn);
-            let view = View::of(&Frame { body_from_camera: Some(mount), ..frame }).unwrap();
+            let view =
+                View::of(&FrameObservation { body_from_camera: Some(mount), ..frame }).unwrap();
             assert!(view.shows(Point::new(north, east, 3.0), &motion));
             assert!(!view.shows(Point::new(east, north, 3.0), &motion));
         }

@@ -11,7 +11,7 @@ use geometry::{Ned, Point, Vector};
 
 use crate::config::TargetConfig;
 use crate::decision::{Rejection, TargetEstimate};
-use crate::event::{Frame, MarkerInFrame};
+use crate::event::{FrameObservation, MarkerInFrame};
 use crate::history::{History, Motion};
 use crate::time::Timestamp;
 
@@ -49,7 +49,7 @@ impl Target {
     /// Uses one marker of a frame, or says why not.
     pub fn observe(
         &mut self,
-        frame: &Frame,
+        frame: &FrameObservation,
         marker: &MarkerInFrame,
         history: &History,
     ) -> Result<(), Rejection> {
@@ -205,9 +205,8 @@ mod tests {
                 size_px: None,
                 confidence: 1.0,
             };
-            let frame = Frame {
+            let frame = FrameObservation {
                 stamp,
-                detector: 0,
                 image_size: (1296, 972),
                 focal_px: None,
                 body_from_camera: None,

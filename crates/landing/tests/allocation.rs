@@ -4,8 +4,8 @@ use std::hint::black_box;
 
 use geometry::{Body, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
-    Config, Event, Frame, Landed, Lander, MarkerInFrame, Mode, OperatorCommand, Phase, Timestamp,
-    VehicleState,
+    Config, Event, FrameObservation, Landed, Lander, MarkerInFrame, Mode, OperatorCommand, Phase,
+    Timestamp, VehicleState,
 };
 
 fn vehicle(now: Timestamp) -> Event {
@@ -26,9 +26,8 @@ fn frame(now: Timestamp, ago_s: f64) -> Event {
     let from_vehicle = Vector::new(0.5 - 0.05 * stamp.seconds().sin(), 0.3, 5.0);
     let in_body = attitude.inverse() * from_vehicle;
     let place = Point::new(in_body.x(), in_body.y(), in_body.z());
-    Event::Frame(Frame {
+    Event::Frame(FrameObservation {
         stamp,
-        detector: 0,
         image_size: (1296, 972),
         focal_px: Some(1818.0),
         body_from_camera: None,

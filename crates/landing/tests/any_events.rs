@@ -3,8 +3,8 @@
 
 use geometry::{Body, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
-    Action, Alarm, Config, Event, Frame, Guidance, Landed, Lander, MarkerInFrame, Mode,
-    OperatorCommand, Phase, Reason, ThesisConfig, Timestamp, VehicleState,
+    Action, Alarm, Config, Event, FrameObservation, GuidanceConfig, Landed, Lander, MarkerInFrame,
+    Mode, OperatorCommand, Phase, Reason, ThesisConfig, Timestamp, VehicleState,
 };
 use proptest::prelude::*;
 
@@ -149,9 +149,8 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
                 landed,
             })
         }
-        Kind::Frame { age_s, centre, origin, width } => Event::Frame(Frame {
+        Kind::Frame { age_s, centre, origin, width } => Event::Frame(FrameObservation {
             stamp: now.plus_seconds(-age_s),
-            detector: 3,
             image_size: (width, 972),
             focal_px: Some(1818.0),
             body_from_camera: None,
@@ -233,10 +232,11 @@ impl Watcher {
         height_m: Option<f64>,
     ) -> Result<(), TestCaseError> {
         let age_s = self.newest_marker.map_or(f64::INFINITY, |stamp| now.seconds_since(stamp));
-        let phases = &config.phases;
         let (low_m, grace_s, stale_s) = match config.guidance {
-            Guidance::Thesis(_) => (phases.low_height_m, phases.low_grace_s, phases.stale_target_s),
-            Guidance::Metric(metric) => {
+            GuidanceConfig::Thesis(thesis) => {
+                (thesis.low_height_m, thesis.low_grace_s, thesis.stale_target_s)
+            }
+            GuidanceConfig::Metric(metric) => {
                 (metric.blind_height_m, metric.blind_s, metric.stale_target_s)
             }
         };
@@ -301,7 +301,7 @@ proptest! {
     fn the_thesis_guidance_survives_anything(
         seed: u64, happenings in prop::collection::vec(happening(), 0..400),
     ) {
-        let guidance = Guidance::Thesis(ThesisConfig { seed, ..ThesisConfig::default() });
+        let guidance = GuidanceConfig::Thesis(ThesisConfig { seed, ..ThesisConfig::default() });
         survives(Config { guidance, ..Config::default() }, 0.0, &happenings)?;
     }
 }

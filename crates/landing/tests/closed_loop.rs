@@ -4,8 +4,8 @@ mod world;
 
 use geometry::{Point, Rotation, Vector};
 use landing::{
-    Action, Config, Event, Guidance, Landed, Lander, MetricConfig, Mode, OnAbort, OperatorCommand,
-    Phase, Reason, ThesisConfig, Timestamp, VehicleState,
+    Action, Config, Event, GuidanceConfig, Landed, Lander, MetricConfig, Mode, OnAbort,
+    OperatorCommand, Phase, Reason, ThesisConfig, Timestamp, VehicleState,
 };
 use world::autopilot::Estimator;
 use world::eyes::Faults;
@@ -36,7 +36,7 @@ fn fly(seeds: std::ops::Range<u64>, scene: impl Fn(u64) -> Scene) -> Vec<Flight>
 }
 
 fn thesis(seed: u64, constants: ThesisConfig) -> Scene {
-    let guidance = Guidance::Thesis(ThesisConfig { seed, ..constants });
+    let guidance = GuidanceConfig::Thesis(ThesisConfig { seed, ..constants });
     Scene { config: Config { guidance, ..Config::default() }, ..Scene::new(seed) }
 }
 
@@ -183,7 +183,10 @@ fn a_marker_lost_for_good_below_two_metres_is_landed_on_from_memory() {
 fn a_retry_climbs_a_little_and_is_not_repeated_for_ever() {
     let unsure = |scene: Scene| {
         let metric = MetricConfig { blind_height_m: 0.0, ..MetricConfig::default() };
-        Scene { config: Config { guidance: Guidance::Metric(metric), ..scene.config }, ..scene }
+        Scene {
+            config: Config { guidance: GuidanceConfig::Metric(metric), ..scene.config },
+            ..scene
+        }
     };
     let lost_s = below(&Scene::new(2).fly(), 1.3);
     let flight = unsure(outage(lost_s, lost_s + 5.0, 2)).fly();
@@ -207,7 +210,7 @@ fn a_retry_climbs_a_little_and_is_not_repeated_for_ever() {
 fn the_vehicle_turns_to_the_pad_when_asked_to() {
     let turning = MetricConfig { turn_rad_s: 0.5, pad_heading_rad: 0.2, ..MetricConfig::default() };
     for (seed, pad_rad) in [(1, 0.5), (2, -1.5), (3, 2.8)] {
-        let config = Config { guidance: Guidance::Metric(turning), ..Config::default() };
+        let config = Config { guidance: GuidanceConfig::Metric(turning), ..Config::default() };
         let mut scene = Scene { config, heading_rad: 0.3, ..Scene::windy(seed, 3.0, 1.0) };
         scene.pad_motion.yaw = (pad_rad, 0.0);
         let flight = scene.fly();

@@ -2,8 +2,8 @@
 
 use geometry::{Body, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
-    Action, Config, Decision, Event, Frame, Guidance, Landed, Lander, MarkerInFrame, Mode,
-    OperatorCommand, ThesisConfig, Timestamp, VehicleState,
+    Action, Config, Decision, Event, FrameObservation, GuidanceConfig, Landed, Lander,
+    MarkerInFrame, Mode, OperatorCommand, ThesisConfig, Timestamp, VehicleState,
 };
 
 /// FNV-1a over what a decision says.
@@ -74,9 +74,8 @@ fn events(i: u32) -> (Timestamp, Vec<Event>) {
             size_px: None,
             confidence: 0.9,
         });
-        events.push(Event::Frame(Frame {
+        events.push(Event::Frame(FrameObservation {
             stamp: now.plus_seconds(-0.08),
-            detector: 0,
             image_size: (1296, 972),
             focal_px: None,
             body_from_camera: None,
@@ -89,7 +88,7 @@ fn events(i: u32) -> (Timestamp, Vec<Event>) {
 
 #[test]
 fn the_thesis_decisions_are_what_they_were() {
-    let guidance = Guidance::Thesis(ThesisConfig { seed: 5, ..ThesisConfig::default() });
+    let guidance = GuidanceConfig::Thesis(ThesisConfig { seed: 5, ..ThesisConfig::default() });
     let mut lander = Lander::new(Config { guidance, ..Config::default() }).unwrap();
     let mut hash = 0xcbf2_9ce4_8422_2325;
     let mut phases = Vec::new();

@@ -34,159 +34,14 @@
 //! that hardly moves sideways.
 
 use geometry::{Body, Ned, Point, Vector};
-use serde::Deserialize;
 
-use crate::config::{ConfigError, check};
+use crate::config::MetricConfig;
 use crate::decision::{Reason, TargetEstimate};
 use crate::event::VehicleState;
 use crate::guidance::path::{JERK, PATH_TIME_S, Path};
-use crate::guidance::{Progress, Situation};
+use crate::guidance::situation::{Progress, Situation};
 use crate::history::jump;
 use crate::time::Timestamp;
-
-/// How the vehicle is brought over the target and down.
-#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct MetricConfig {
-    /// Closing speed per metre of predicted error, in 1/s (0.1 to 3).
-    pub lateral_gain: f64,
-    /// Acceleration per difference between wanted and real closing speed, in 1/s (0.2 to 6).
-    pub velocity_gain: f64,
-    /// Largest closing speed, in m/s (0.1 to 5).
-    pub max_lateral_m_s: f64,
-    /// Largest lateral acceleration, in m/s^2; tilts the camera (0.1 to 2.5).
-    pub lateral_acceleration_m_s2: f64,
-    /// Time from a detection's arrival to the motion that answers it, in s (0 to 1).
-    pub dead_time_s: f64,
-    /// Time over which the present acceleration is taken to go on, in s (0 to 1).
-    pub acceleration_lead_s: f64,
-    /// Largest speed of descent, in m/s (0.1 to 3).
-    pub max_descend_m_s: f64,
-    /// Speed of descent at the ground, in m/s (0.1 to 1).
-    pub touch_descend_m_s: f64,
-    /// Braking on the way down, in m/s^2 (0.1 to 2.5).
-    pub descend_braking_m_s2: f64,
-    /// Time from a setpoint of descent to its speed, in s (0 to 2).
-    pub descend_lag_s: f64,
-    /// Largest growth of the descent's setpoint, in m/s^2 (0.1 to 5).
-    pub descend_acceleration_m_s2: f64,
-    /// Radius of the funnel at the ground, in m; at its edge the descent stops (0.02 to 5).
-    pub funnel_m: f64,
-    /// What the funnel's radius grows by per metre of height (0 to 2).
-    pub funnel_per_height: f64,
-    /// Age of the target up to which the descent is not slowed, in s (0 to 5).
-    pub fresh_target_s: f64,
-    /// Age of the target beyond which nothing descends, in s (0.1 to 5).
-    pub stale_target_s: f64,
-    /// A vehicle that no longer gets any setpoint is not to reach the ground faster than at `touch_descend_m_s` within this
-    /// time, in s (0.1 to 10).
-    pub silence_s: f64,
-    /// Height over the target at which LAND takes over, in m (0.02 to 5).
-    pub land_height_m: f64,
-    /// Height of the body's origin over the pad when the vehicle stands on it, in m (-1 to 2).
-    pub standing_height_m: f64,
-    /// Over this time of waiting near the ground the funnel widens to `blind_error_m`, in s (0.1 to 60).
-    pub settle_s: f64,
-    /// Largest lateral error with which the vehicle lands although it waited in vain or the marker left the view, in m
-    /// (0.01 to 1).
-    pub blind_error_m: f64,
-    /// Height over the target below which the descent goes on without the marker, in m (0 to 10).
-    pub blind_height_m: f64,
-    /// For how long it does, in s (0 to 20).
-    pub blind_s: f64,
-    /// Largest deviation of the estimate with which it does, in m (0.005 to 1).
-    pub blind_deviation_m: f64,
-    /// Height down to which the marker is kept in view by staying upwind, in m (0.2 to 50).
-    pub view_height_m: f64,
-    /// Free rim that is left around the marker's centre in the image for the marker's size, in m (0 to 2).
-    pub view_margin_m: f64,
-    /// Free rim that is left in the image for what the vehicle sways, in rad (0 to 0.5).
-    pub view_margin_rad: f64,
-    /// Time constant of the observer of the bias of the autopilot's velocity, in s (0.2 to 60).
-    pub drift_time_s: f64,
-    /// Largest bias believed, in m/s; 0 turns the observer off (0 to 1).
-    pub max_drift_m_s: f64,
-    /// Fastest pad that is followed, in m/s (0 to 10).
-    pub max_pad_m_s: f64,
-    /// Fastest turn towards the pad's heading, in rad/s; 0 holds the heading (0 to 1).
-    pub turn_rad_s: f64,
-    /// Heading to land with, from the direction of the marker's upper edge, in rad, clockwise seen from above (-7 to 7).
-    pub pad_heading_rad: f64,
-}
-
-impl Default for MetricConfig {
-    fn default() -> Self {
-        Self {
-            lateral_gain: 1.8,
-            velocity_gain: 4.5,
-            max_lateral_m_s: 2.0,
-            lateral_acceleration_m_s2: 1.2,
-            dead_time_s: 0.3,
-            acceleration_lead_s: 0.1,
-            max_descend_m_s: 2.0,
-            touch_descend_m_s: 0.5,
-            descend_braking_m_s2: 0.5,
-            descend_lag_s: 0.45,
-            descend_acceleration_m_s2: 2.0,
-            funnel_m: 0.08,
-            funnel_per_height: 0.25,
-            fresh_target_s: 0.5,
-            stale_target_s: 0.7,
-            silence_s: 2.0,
-            land_height_m: 0.05,
-            standing_height_m: 0.0,
-            settle_s: 5.0,
-            blind_error_m: 0.15,
-            blind_height_m: 2.2,
-            blind_s: 6.0,
-            blind_deviation_m: 0.06,
-            view_height_m: 1.3,
-            view_margin_m: 0.11,
-            view_margin_rad: 0.07,
-            drift_time_s: 0.4,
-            max_drift_m_s: 0.8,
-            max_pad_m_s: 5.0,
-            turn_rad_s: 0.0,
-            pad_heading_rad: 0.0,
-        }
-    }
-}
-
-impl MetricConfig {
-    pub(crate) fn validate(&self) -> Result<(), ConfigError> {
-        check("metric.lateral_gain", self.lateral_gain, 0.1, 3.0)?;
-        check("metric.velocity_gain", self.velocity_gain, 0.2, 6.0)?;
-        check("metric.max_lateral_m_s", self.max_lateral_m_s, 0.1, 5.0)?;
-        check("metric.lateral_acceleration_m_s2", self.lateral_acceleration_m_s2, 0.1, 2.5)?;
-        check("metric.dead_time_s", self.dead_time_s, 0.0, 1.0)?;
-        check("metric.acceleration_lead_s", self.acceleration_lead_s, 0.0, 1.0)?;
-        check("metric.max_descend_m_s", self.max_descend_m_s, 0.1, 3.0)?;
-        check("metric.touch_descend_m_s", self.touch_descend_m_s, 0.1, 1.0)?;
-        check("metric.descend_braking_m_s2", self.descend_braking_m_s2, 0.1, 2.5)?;
-        check("metric.descend_lag_s", self.descend_lag_s, 0.0, 2.0)?;
-        check("metric.descend_acceleration_m_s2", self.descend_acceleration_m_s2, 0.1, 5.0)?;
-        check("metric.funnel_m", self.funnel_m, 0.02, 5.0)?;
-        check("metric.funnel_per_height", self.funnel_per_height, 0.0, 2.0)?;
-        check("metric.fresh_target_s", self.fresh_target_s, 0.0, 5.0)?;
-        check("metric.stale_target_s", self.stale_target_s, 0.1, 5.0)?;
-        check("metric.silence_s", self.silence_s, 0.1, 10.0)?;
-        check("metric.land_height_m", self.land_height_m, 0.02, 5.0)?;
-        check("metric.standing_height_m", self.standing_height_m, -1.0, 2.0)?;
-        check("metric.settle_s", self.settle_s, 0.1, 60.0)?;
-        check("metric.blind_error_m", self.blind_error_m, 0.01, 1.0)?;
-        check("metric.blind_height_m", self.blind_height_m, 0.0, 10.0)?;
-        check("metric.blind_s", self.blind_s, 0.0, 20.0)?;
-        check("metric.blind_deviation_m", self.blind_deviation_m, 0.005, 1.0)?;
-        check("metric.view_height_m", self.view_height_m, 0.2, 50.0)?;
-        check("metric.view_margin_m", self.view_margin_m, 0.0, 2.0)?;
-        check("metric.view_margin_rad", self.view_margin_rad, 0.0, 0.5)?;
-        check("metric.drift_time_s", self.drift_time_s, 0.2, 60.0)?;
-        check("metric.max_drift_m_s", self.max_drift_m_s, 0.0, 1.0)?;
-        check("metric.max_pad_m_s", self.max_pad_m_s, 0.0, 10.0)?;
-        check("metric.turn_rad_s", self.turn_rad_s, 0.0, 1.0)?;
-        check("metric.pad_heading_rad", self.pad_heading_rad, -7.0, 7.0)
-    }
-}
 
 /// Outside this multiple of the funnel's radius a descent becomes an approach again.
 const FUNNEL_HYSTERESIS: f64 = 1.2;
@@ -629,12 +484,12 @@ impl Metric {
         let sinking_m_s = (situation.vehicle.velocity.z() - target.velocity.z()).max(0.0);
         let ahead_m = self.height_m(target)
             - config.land_height_m
-            - (sinking_m_s - config.touch_descend_m_s).max(0.0) * config.descend_lag_s;
+            - (sinking_m_s - config.touchdown_descend_m_s).max(0.0) * config.descend_lag_s;
         // What is not known of a heave comes on top.
-        let least_m_s = SLOWEST_TOUCH_M_S.min(config.touch_descend_m_s);
-        let slowest = (config.touch_descend_m_s - 0.5 * situation.pad_heave_m_s).max(least_m_s);
+        let least_m_s = SLOWEST_TOUCH_M_S.min(config.touchdown_descend_m_s);
+        let slowest = (config.touchdown_descend_m_s - 0.5 * situation.pad_heave_m_s).max(least_m_s);
         let brakes = slowest.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);
-        let silent_m_s = (self.height_m(target) / config.silence_s).max(slowest);
+        let silent_m_s = (self.height_m(target) / config.setpoint_loss_s).max(slowest);
         (brakes.sqrt().min(silent_m_s).min(config.max_descend_m_s) * centred * fresh, why)
     }
 
@@ -672,7 +527,6 @@ fn shortened(vector: Vector<Ned>, length: f64) -> Vector<Ned> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::PhaseConfig;
     use crate::event::{Landed, Mode, VehicleState};
     use geometry::Rotation;
 
@@ -782,7 +636,6 @@ mod tests {
             half_view_rad: None,
             pad_moves: false,
             pad_heave_m_s: 0.0,
-            phases: PhaseConfig::default(),
         }
     }
 

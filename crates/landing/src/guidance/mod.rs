@@ -2,54 +2,17 @@
 
 pub mod metric;
 mod path;
+pub mod situation;
 pub mod thesis;
 
 use geometry::{Ned, Vector};
 
-use crate::config::{Guidance, PhaseConfig};
-use crate::decision::{Reason, TargetEstimate};
-use crate::event::{Frame, VehicleState};
-use crate::time::Timestamp;
+use crate::config::GuidanceConfig;
+use crate::decision::Reason;
+use crate::event::FrameObservation;
 use metric::Metric;
+use situation::{Progress, Situation};
 use thesis::Thesis;
-
-/// What a guidance looks at.
-#[derive(Copy, Clone, Debug)]
-pub struct Situation<'a> {
-    /// The time.
-    pub now: Timestamp,
-    /// The vehicle's newest state.
-    pub vehicle: &'a VehicleState,
-    /// The target, when detections have poses.
-    pub target: Option<TargetEstimate>,
-    /// Time since the exposure of the newest marker used, in seconds; infinite when there was none.
-    pub age_s: f64,
-    /// Smallest angle from the middle of the camera's image to its edge, in radians, when it is known.
-    pub half_view_rad: Option<f64>,
-    /// The pad may move: LAND, which stops the vehicle over the ground, must come after the touch.
-    pub pad_moves: bool,
-    /// Fastest heave of the pad, in m/s.
-    pub pad_heave_m_s: f64,
-    /// When a target is stale.
-    pub phases: PhaseConfig,
-}
-
-/// How far a guidance has brought the vehicle.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum Progress {
-    /// Too far beside the target to descend.
-    Aligning,
-    /// Over the target.
-    Descending,
-    /// Over the target, which is not seen; its estimate is good enough for the rest of the way.
-    Blind,
-    /// Low for long and never near enough.
-    Stuck,
-    /// As before.
-    Unchanged,
-    /// Low enough for the autopilot's LAND, for this reason.
-    Ready(Reason),
-}
 
 /// The guidance that was chosen, with its memory.
 #[derive(Clone, Debug)]
@@ -58,31 +21,18 @@ pub(crate) enum Guide {
     Metric(Metric),
 }
 
-impl Situation<'_> {
-    /// Height over the target in metres: by the detections' poses, else over the autopilot's local origin.
-    pub fn height_m(&self) -> f64 {
-        self.target.map_or(-self.vehicle.position.z(), |target| target.height_m)
-    }
-
-    /// True when the target is recent enough for a descent: near the ground a short gap may be flown through.
-    pub fn may_descend(&self) -> bool {
-        let low = self.height_m() <= self.phases.low_height_m;
-        self.age_s <= self.phases.stale_target_s + if low { self.phases.low_grace_s } else { 0.0 }
-    }
-}
-
 impl Guide {
-    pub(crate) fn new(config: Guidance) -> Self {
+    pub(crate) fn new(config: GuidanceConfig) -> Self {
         match config {
-            Guidance::Thesis(config) => Self::Thesis(Thesis::new(config)),
-            Guidance::Metric(config) => Self::Metric(Metric::new(config)),
+            GuidanceConfig::Thesis(config) => Self::Thesis(Thesis::new(config)),
+            GuidanceConfig::Metric(config) => Self::Metric(Metric::new(config)),
         }
     }
 
     /// True when the vehicle may go down.
     pub(crate) fn may_descend(&self, situation: &Situation<'_>) -> bool {
         match self {
-            Self::Thesis(_) => situation.may_descend(),
+            Self::Thesis(thesis) => thesis.may_descend(situation),
             Self::Metric(metric) => metric.may_descend(situation),
         }
     }
@@ -106,7 +56,7 @@ impl Guide {
     }
 
     /// A frame has arrived while the vehicle is guided.
-    pub(crate) fn frame(&mut self, frame: &Frame, heading_rad: f64, altitude_m: f64) {
+    pub(crate) fn frame(&mut self, frame: &FrameObservation, heading_rad: f64, altitude_m: f64) {
         if let Self::Thesis(thesis) = self {
             thesis.frame(frame, heading_rad, altitude_m);
         }

@@ -1,7 +1,7 @@
 //! The circumstances that a landing must stand, by name.
 
 use geometry::{Point, Vector};
-use landing::{Guidance, MetricConfig};
+use landing::{GuidanceConfig, MetricConfig};
 
 use super::air::{Gust, Wind};
 use super::autopilot::Estimator;
@@ -102,11 +102,11 @@ fn moving(seed: u64, speed_m_s: f64, heave_m: f64) -> Scene {
     let metric = MetricConfig {
         max_lateral_m_s: 2.5,
         lateral_acceleration_m_s2: 2.0,
-        silence_s: 1.2,
+        setpoint_loss_s: 1.2,
         blind_deviation_m: 0.2,
         ..MetricConfig::default()
     };
-    scene.config.guidance = Guidance::Metric(metric);
+    scene.config.guidance = GuidanceConfig::Metric(metric);
     scene
 }
 

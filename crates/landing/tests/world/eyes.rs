@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use geometry::{Body, CameraModel, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
-use landing::{Frame, MarkerInFrame, Timestamp};
+use landing::{FrameObservation, MarkerInFrame, Timestamp};
 use nalgebra::Matrix3;
 use rand_chacha::ChaCha8Rng;
 
@@ -77,7 +77,7 @@ pub(crate) struct Eyes {
     random: ChaCha8Rng,
     mount_error: Rotation<Body, Body>,
     due_s: f64,
-    on_the_way: VecDeque<(f64, Frame)>,
+    on_the_way: VecDeque<(f64, FrameObservation)>,
     dark_since_s: Option<f64>,
 }
 
@@ -114,12 +114,12 @@ impl Eyes {
     }
 
     /// The frames that have arrived, one at a time.
-    pub(crate) fn arrived(&mut self, now_s: f64) -> Option<Frame> {
+    pub(crate) fn arrived(&mut self, now_s: f64) -> Option<FrameObservation> {
         let is_due = self.on_the_way.front().is_some_and(|(at, _)| *at <= now_s);
         if is_due { self.on_the_way.pop_front().map(|(_, frame)| frame) } else { None }
     }
 
-    fn put(&mut self, arrives_s: f64, frame: Frame) {
+    fn put(&mut self, arrives_s: f64, frame: FrameObservation) {
         let place = self.on_the_way.partition_point(|(at, _)| *at <= arrives_s);
         self.on_the_way.insert(place, (arrives_s, frame));
     }
@@ -149,7 +149,7 @@ impl Eyes {
         now_s: f64,
         vehicle: &Multirotor,
         (pad, pad_yaw): (Point<Ned>, f64),
-    ) -> Frame {
+    ) -> FrameObservation {
         let faults = &scene.faults;
         let [wrong, jumps, jump] = [(); 3].map(|()| uniform(&mut self.random));
         let mut place = pad;
@@ -170,9 +170,8 @@ impl Eyes {
         {
             stamp_s += most_s * (2.0 * jump - 1.0);
         }
-        Frame {
+        FrameObservation {
             stamp: Timestamp::from_seconds(stamp_s),
-            detector: 1,
             image_size: (WIDTH, HEIGHT),
             focal_px: Some(FOCAL_PX),
             body_from_camera: Some(Rotation::from_euler(0.0, 0.0, std::f64::consts::FRAC_PI_2)),
