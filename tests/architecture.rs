@@ -21,16 +21,27 @@ const AUTOPILOT: (&str, &[&str]) = ("autopilot", &["geometry"]);
 const NODE: (&str, &[&str]) = ("node", &["messages"]);
 /// What cameras and detectors share.
 const AIRLINK: (&str, &[&str]) = ("airlink", &["imaging", "messages", "node"]);
+/// Files that people bring: images, videos, calibrations.
+const MEDIA: (&str, &[&str]) = ("media", &["geometry", "imaging"]);
 const SERVICES: [&str; 4] = ["camera-pub", "controller", "detector", "gcs-bridge"];
 /// What a service or a tool may know.
-const ROOMS: [&str; 8] =
-    ["airlink", "autopilot", "fiducial", "geometry", "imaging", "landing", "messages", "node"];
+const ROOMS: [&str; 9] = [
+    "airlink",
+    "autopilot",
+    "fiducial",
+    "geometry",
+    "imaging",
+    "landing",
+    "media",
+    "messages",
+    "node",
+];
 /// What a tool may know beside: pictures and worlds with truth, which also the tests of any room may use.
 const TRUTH: [&str; 2] = ["rendering", "world"];
 /// The tool that stands above others: it calls their pure parts in lock-step.
 const EXPERIMENTS: (&str, [&str; 3]) = ("experiments", ["controller", "detector", "simulator"]);
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
-const ALIGHT: [&str; 5] = ["fiducial", "geometry", "imaging", "messages", "node"];
+const ALIGHT: [&str; 6] = ["fiducial", "geometry", "imaging", "media", "messages", "node"];
 
 /// What an algorithm does without.
 const OUTSIDE: [&str; 17] = [
@@ -176,7 +187,7 @@ fn folders_packages_and_libraries_share_a_name() -> anyhow::Result<()> {
 fn dependencies_point_downwards_only() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let names: BTreeSet<&str> = workspace.iter().map(|p| p.name.as_str()).collect();
-    let crates: BTreeMap<_, _> = ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK]).collect();
+    let crates: BTreeMap<_, _> = ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK, MEDIA]).collect();
     for package in &workspace {
         let allowed: BTreeSet<&str> = match crates.get(package.name.as_str()) {
             Some(allowed) => allowed.iter().copied().collect(),

@@ -257,7 +257,7 @@ fn is_wrong_use(problem: &anyhow::Error) -> bool {
         || problem.is::<clap::Error>()
         || problem.is::<fiducial::DetectorError>()
         || problem.is::<fiducial::PadError>()
-        || problem.is::<camera_pub::CalibrationError>()
+        || problem.is::<media::CalibrationError>()
         || problem.is::<marker::SheetError>()
 }
 

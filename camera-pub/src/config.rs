@@ -7,10 +7,10 @@ use airlink::AirConfig;
 use anyhow::{bail, ensure};
 use geometry::{Body, Camera, CameraModel, Distortion, Point, Rotation, Transform};
 use imaging::{GrayView, Mosaic};
+use media::read_calibration;
 use node::{Check, Settings};
 use serde::Deserialize;
 
-use crate::calibration::read_calibration;
 use crate::program::Form;
 
 /// The camera service's configuration; its keys are explained in `camera-pub.toml`.

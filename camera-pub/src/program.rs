@@ -7,13 +7,13 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail};
+use media::jpeg_len;
 use node::now_ns;
 use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncReadExt, BufReader};
 use tokio::process::{Child, ChildStdout, Command};
 use tokio::time::timeout;
 
 use crate::config::ProgramConfig;
-use crate::image::jpeg_len;
 
 /// Bytes that are read ahead, as many as a pipe of Linux holds.
 const READ_AHEAD: usize = 1 << 16;

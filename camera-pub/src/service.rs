@@ -10,12 +10,12 @@ use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
 use geometry::{CameraModel, Distortion};
 use imaging::{GrayImage, Mosaic, SampleFormat};
+use media::{Decoded, frame_bytes, grey_of, images_in};
 use messages::{BayerPattern, CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
 use crate::config::{Config, ProgramConfig};
-use crate::image::{Decoded, frame_bytes, grey_of, images_in};
 use crate::program::{Form, Program};
 
 /// Images whose size is looked up at the start, to make room for the largest in shared memory. Frames that are larger

@@ -13,13 +13,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
-use camera_pub::read_calibration;
 use clap::{Args, ValueEnum};
 use fiducial::{
     Detector, Marker, MarkerPose, Observation, Pad, PadObservation, PoseSolution, Settings, Tracker,
 };
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayImage, Mosaic};
+use media::read_calibration;
 use serde::Serialize;
 
 use picture::Gallery;

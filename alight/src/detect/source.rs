@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use camera_pub::{
+use imaging::{GrayImage, Mosaic};
+use media::{
     IMAGE_EXTENSIONS, MOST_PIXELS, Picture, VIDEO_EXTENSIONS, Video, files_in, is_video, read_image,
 };
-use imaging::{GrayImage, Mosaic};
 
 /// Between the images of a folder, in seconds, for want of anything better.
 const IMAGE_PERIOD_S: f64 = 0.1;

@@ -182,7 +182,7 @@ pub fn decode_image(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<GrayI
 }
 
 /// Bytes of the frame that an image file makes, from its first bytes alone.
-pub(crate) fn frame_bytes(path: &Path, most_pixels: u64) -> Result<usize, ImageError> {
+pub fn frame_bytes(path: &Path, most_pixels: u64) -> Result<usize, ImageError> {
     let bytes = file_bytes(path, most_pixels)?;
     let decoder = decoder(path, &bytes, most_pixels)?;
     let (width, height) = decoder.dimensions();
@@ -191,18 +191,18 @@ pub(crate) fn frame_bytes(path: &Path, most_pixels: u64) -> Result<usize, ImageE
 }
 
 /// An image in the form its file has.
-pub(crate) struct Decoded {
+pub struct Decoded {
     image: DynamicImage,
 }
 
 impl Decoded {
     /// Reads and decodes a file.
-    pub(crate) fn read(path: &Path, most_pixels: u64) -> Result<Self, ImageError> {
+    pub fn read(path: &Path, most_pixels: u64) -> Result<Self, ImageError> {
         Self::decode(path, &file_bytes(path, most_pixels)?, most_pixels)
     }
 
     /// Decodes the bytes of a file.
-    pub(crate) fn decode(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<Self, ImageError> {
+    pub fn decode(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<Self, ImageError> {
         let mut decoder = decoder(path, bytes, most_pixels)?;
         // The decoder fills up what is missing of a JPEG with grey, which is no picture of anything.
         if bytes.starts_with(JPEG_START) && jpeg_len(bytes).is_none() {
@@ -219,17 +219,17 @@ impl Decoded {
     }
 
     /// Width in pixels.
-    pub(crate) fn width(&self) -> usize {
+    pub fn width(&self) -> usize {
         self.image.width() as usize
     }
 
     /// Height in pixels.
-    pub(crate) fn height(&self) -> usize {
+    pub fn height(&self) -> usize {
         self.image.height() as usize
     }
 
     /// Bits of a sample, of an image that can be what a sensor gave: grey without more.
-    pub(crate) fn raw_bits(&self) -> Option<u32> {
+    pub fn raw_bits(&self) -> Option<u32> {
         match &self.image {
             DynamicImage::ImageLuma8(_) => Some(8),
             DynamicImage::ImageLuma16(_) => Some(16),
@@ -238,7 +238,7 @@ impl Decoded {
     }
 
     /// The image in 8-bit grey.
-    pub(crate) fn grey(&self, mosaic: Option<Mosaic>) -> GrayImage {
+    pub fn grey(&self, mosaic: Option<Mosaic>) -> GrayImage {
         let (width, height) = (self.width(), self.height());
         let black = || GrayImage::filled(width, height, 0);
         match self.raw_bits() {
@@ -259,7 +259,7 @@ impl Decoded {
 
     /// Writes the samples as they are, row by row, into a buffer of width times height times their bytes; those of two
     /// bytes with the low one first. Images that are not raw are written in grey.
-    pub(crate) fn write_samples(&self, out: &mut [u8]) {
+    pub fn write_samples(&self, out: &mut [u8]) {
         match &self.image {
             DynamicImage::ImageLuma16(image) => {
                 let (pairs, _) = out.as_chunks_mut::<2>();
@@ -272,7 +272,7 @@ impl Decoded {
     }
 
     /// Writes the pixels, row by row, into a buffer of width times height bytes.
-    pub(crate) fn write_grey(&self, out: &mut [u8]) {
+    pub fn write_grey(&self, out: &mut [u8]) {
         match &self.image {
             DynamicImage::ImageLuma8(image) => fill(out, image, |[v]| v),
             DynamicImage::ImageLumaA8(image) => fill(out, image, |[v, a]| over_white(v, a)),
@@ -295,7 +295,7 @@ impl Decoded {
 }
 
 /// A sensor's samples in 8-bit grey; `None` when there are not as many as the size says.
-pub(crate) fn grey_of(
+pub fn grey_of(
     samples: &[u8],
     width: usize,
     height: usize,
@@ -393,7 +393,7 @@ fn decoder<'a>(
 const JPEG_START: &[u8] = &[0xff, 0xd8];
 
 /// Bytes of the JPEG file that begins here, when its segments lead to its end marker (ISO/IEC 10918-1, Annex B).
-pub(crate) fn jpeg_len(bytes: &[u8]) -> Option<usize> {
+pub fn jpeg_len(bytes: &[u8]) -> Option<usize> {
     let mut at = JPEG_START.len();
     loop {
         // Between segments, and through the coded data after a scan's header, up to the next marker.
