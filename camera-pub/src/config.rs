@@ -1,4 +1,4 @@
-//! What can be chosen about a camera.
+//! Configuration of the camera service.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -11,9 +11,7 @@ use media::read_calibration;
 use node::{Check, Settings};
 use serde::Deserialize;
 
-use crate::program::Form;
-
-/// The camera service's configuration; its keys are explained in `camera-pub.toml`.
+/// The keys of `camera-pub.toml`, which explains them.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -32,32 +30,59 @@ pub(crate) struct SourceConfig {
     pub(crate) repeat: bool,
     pub(crate) wait_for_subscriber: bool,
     bayer: String,
-    largest_megapixels: f64,
+    max_megapixels: f64,
     command: Vec<String>,
     pixels: String,
     size_px: [u32; 2],
     row_bytes: usize,
     delay_ms: f64,
-    silence_s: f64,
+    timeout_s: f64,
 }
 
-/// A program that writes pictures.
+/// A program that writes frames.
 #[derive(Clone, Debug)]
 pub(crate) struct ProgramConfig {
     /// The program and its arguments.
     pub(crate) command: Vec<String>,
-    /// Width and height of its pictures, in pixels.
+    /// Width and height of its frames, in pixels.
     pub(crate) size: (usize, usize),
-    /// How it writes them.
-    pub(crate) form: Form,
+    /// Bytes of a frame.
+    pub(crate) format: FrameFormat,
     /// Bits of a sample.
     pub(crate) bits: u32,
-    /// Pictures a second that it was asked for.
+    /// Nominal frame rate.
     pub(crate) rate_hz: f64,
-    /// From the middle of the exposure to a picture's first byte.
+    /// Time from the middle of the exposure to a frame's first byte.
     pub(crate) delay_ns: i64,
-    /// Longest time without a picture.
-    pub(crate) silence: Duration,
+    /// Maximum time without a frame.
+    pub(crate) timeout: Duration,
+}
+
+/// The bytes in which a program writes a frame.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) enum FrameFormat {
+    /// Rows of samples of one or two bytes, then chroma planes, which are skipped.
+    Samples {
+        /// Bytes of a row's samples.
+        row_bytes: usize,
+        /// Bytes from row to row.
+        stride_bytes: usize,
+        rows: usize,
+        /// Bytes of the chroma planes.
+        chroma_bytes: usize,
+    },
+    /// A JPEG file.
+    Jpeg { max_bytes: usize },
+}
+
+impl FrameFormat {
+    /// Bytes of a frame's samples.
+    pub(crate) fn frame_bytes(self) -> usize {
+        match self {
+            Self::Samples { row_bytes, rows, .. } => row_bytes * rows,
+            Self::Jpeg { .. } => 0,
+        }
+    }
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -85,11 +110,11 @@ impl Settings for Config {
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.range("source.rate_hz", self.source.rate_hz, 0.01..=1000.0);
-        check.parses("source.bayer", self.source.mosaic());
-        check.range("source.largest_megapixels", self.source.largest_megapixels, 0.001..=4294.0);
-        check.one_of("source.pixels", &self.source.pixels, PIXELS);
+        check.parses("source.bayer", self.source.bayer_pattern());
+        check.range("source.max_megapixels", self.source.max_megapixels, 0.001..=4294.0);
+        check.one_of("source.pixels", &self.source.pixels, PIXEL_FORMATS);
         check.range("source.delay_ms", self.source.delay_ms, 0.0..=10_000.0);
-        check.range("source.silence_s", self.source.silence_s, 0.1..=3600.0);
+        check.range("source.timeout_s", self.source.timeout_s, 0.1..=3600.0);
         check.parses("source.command", self.source.program());
         self.air.check(check);
         self.calibration.check(check);
@@ -103,12 +128,12 @@ impl Config {
         &self.id
     }
 
-    /// Pixels an image may have.
-    pub(crate) fn most_pixels(&self) -> u64 {
-        (self.source.largest_megapixels * 1e6) as u64
+    /// Maximum pixels of an image.
+    pub(crate) fn max_pixels(&self) -> u64 {
+        (self.source.max_megapixels * 1e6) as u64
     }
 
-    /// The intrinsics for images of this size (width, height); `None` for a camera that is not calibrated.
+    /// The intrinsics for images of this size (width, height); `None` for an uncalibrated camera.
     pub(crate) fn intrinsics(&self, size: (usize, usize)) -> anyhow::Result<Option<CameraModel>> {
         let (width, height) = (size.0 as u32, size.1 as u32);
         let calibration = &self.calibration;
@@ -129,7 +154,7 @@ impl Config {
             return Ok(None);
         }
         let Ok(distortion) = calibration.lens() else {
-            bail!("the lens was not checked");
+            bail!("`calibration.distortion` is invalid");
         };
         let middle = CameraModel::pinhole(width, height, fx);
         let (cx, cy) = match *calibration.principal_px.as_slice() {
@@ -139,20 +164,20 @@ impl Config {
         Ok(Some(CameraModel { fy, cx, cy, distortion, ..middle }))
     }
 
-    /// The camera in the vehicle.
+    /// The camera's mount on the vehicle.
     pub(crate) fn body_from_camera(&self) -> Transform<Body, Camera> {
         let [x, y, z] = self.mount.translation_m;
-        // A quaternion of no length does not pass the check.
+        // The check refuses a quaternion of length zero.
         let rotation = self.mount.rotation().unwrap_or_else(Rotation::identity);
         Transform::new(rotation, Point::new(x, y, z))
     }
 }
 
-/// The forms in which a program may write pictures.
-const PIXELS: &[&str] = &["gray8", "gray16", "yuv420", "mjpeg"];
+/// Pixel formats that a program may write.
+const PIXEL_FORMATS: &[&str] = &["gray8", "gray16", "yuv420", "mjpeg"];
 
 impl SourceConfig {
-    /// The program that writes the pictures; `None` where they come from files.
+    /// The program that writes the frames; `None` where they come from files.
     pub(crate) fn program(&self) -> anyhow::Result<Option<ProgramConfig>> {
         if self.command.is_empty() {
             return Ok(None);
@@ -162,22 +187,20 @@ impl SourceConfig {
         let pixels = width.saturating_mul(height);
         let edge = GrayView::LARGEST_EDGE_PX;
         ensure!(
-            pixels > 0
-                && width.max(height) <= edge
-                && pixels as f64 <= self.largest_megapixels * 1e6,
-            "`source.size_px` is [{width}, {height}]; write the width and height that the program was asked for, within \
-             `source.largest_megapixels` ({}) and {edge} pixels an edge",
-            self.largest_megapixels
+            pixels > 0 && width.max(height) <= edge && pixels as f64 <= self.max_megapixels * 1e6,
+            "`source.size_px` is [{width}, {height}]; it must be the width and height of the program's frames, within \
+             `source.max_megapixels` ({}) and {edge} pixels per edge",
+            self.max_megapixels
         );
         let bits = if self.pixels == "gray16" { 16 } else { 8 };
-        let bytes = width * bits as usize / 8;
-        let with_fill = if self.row_bytes == 0 { bytes } else { self.row_bytes };
+        let row_bytes = width * bits as usize / 8;
+        let stride_bytes = if self.row_bytes == 0 { row_bytes } else { self.row_bytes };
         ensure!(
-            (bytes..=16 * bytes + 4096).contains(&with_fill),
-            "`source.row_bytes` is {with_fill}, but a row has {bytes} bytes; write 0 if nothing fills it up"
+            (row_bytes..=16 * row_bytes + 4096).contains(&stride_bytes),
+            "`source.row_bytes` is {stride_bytes}, but a row has {row_bytes} bytes; write 0 for rows without padding"
         );
-        let rest = match self.pixels.as_str() {
-            "yuv420" => 2 * with_fill.div_ceil(2) * height.div_ceil(2),
+        let chroma_bytes = match self.pixels.as_str() {
+            "yuv420" => 2 * stride_bytes.div_ceil(2) * height.div_ceil(2),
             _ => 0,
         };
         let is_raw = self.pixels.starts_with("gray");
@@ -185,24 +208,24 @@ impl SourceConfig {
             is_raw || self.bayer.is_empty(),
             "`source.bayer` needs `source.pixels` gray8 or gray16"
         );
-        let form = match self.pixels.as_str() {
-            // No picture that is worth looking at is larger as a JPEG than as it is.
-            "mjpeg" => Form::Jpeg { most_bytes: 4 * pixels + (1 << 16) },
-            _ => Form::Samples { row: (bytes, with_fill), rows: height, rest },
+        let format = match self.pixels.as_str() {
+            // A generous bound: a JPEG is smaller than its pixels in all but pathological cases.
+            "mjpeg" => FrameFormat::Jpeg { max_bytes: 4 * pixels + (1 << 16) },
+            _ => FrameFormat::Samples { row_bytes, stride_bytes, rows: height, chroma_bytes },
         };
         Ok(Some(ProgramConfig {
             command: self.command.clone(),
             size: (width, height),
-            form,
+            format,
             bits,
             rate_hz: self.rate_hz,
             delay_ns: (self.delay_ms * 1e6) as i64,
-            silence: Duration::from_secs_f64(self.silence_s),
+            timeout: Duration::from_secs_f64(self.timeout_s),
         }))
     }
 
-    /// The colours in front of the sensor's pixels.
-    pub(crate) fn mosaic(&self) -> anyhow::Result<Option<Mosaic>> {
+    /// The sensor's Bayer pattern.
+    pub(crate) fn bayer_pattern(&self) -> anyhow::Result<Option<Mosaic>> {
         Ok(match self.bayer.as_str() {
             "" => None,
             name => Some(name.parse()?),
@@ -256,14 +279,14 @@ impl CalibrationConfig {
                 .map(Distortion::KannalaBrandt)
                 .map_err(|_cause| "a kannala-brandt lens has 4 coefficients"),
             _ if k.is_empty() => Ok(Distortion::None),
-            _ => Err("a pinhole has none; name the lens"),
+            _ => Err("a pinhole lens has no coefficients; set `calibration.lens`"),
         }
     }
 }
 
 impl MountConfig {
     fn check(&self, check: &mut Check<'_>) {
-        let within = |values: &[f64], most: f64| values.iter().all(|v| (-most..=most).contains(v));
+        let within = |values: &[f64], max: f64| values.iter().all(|v| (-max..=max).contains(v));
         check.parses(
             "mount.translation_m",
             holds(within(&self.translation_m, 100.0), "each must be from -100 to 100"),
@@ -279,14 +302,14 @@ impl MountConfig {
         );
         check.parses(
             "mount.rotation_wxyz",
-            self.rotation().ok_or("it must be a quaternion w, x, y, z with a length"),
+            self.rotation().ok_or("it must be a quaternion w, x, y, z of a length above 0"),
         );
     }
 
     fn rotation(&self) -> Option<Rotation<Body, Camera>> {
         match self.orientation.as_str() {
             "quaternion" => Rotation::from_wxyz(self.rotation_wxyz),
-            // The image's right is the vehicle's right, its bottom down, its depth ahead.
+            // Image right is vehicle right, image down is down, depth is forward.
             "forward" => Rotation::from_wxyz([0.5; 4]),
             "angles" => {
                 let [roll, pitch, yaw] = self.roll_pitch_yaw_deg.map(f64::to_radians);
@@ -325,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_looks_forward_sees_the_sky_at_the_top_of_its_image() {
+    fn the_image_of_a_forward_camera_has_the_sky_at_its_top() {
         let mount = load(&["mount.orientation=forward"]).unwrap().body_from_camera();
         let right = mount * Vector::new(1.0, 0.0, 0.0);
         let top = mount * Vector::new(0.0, -1.0, 0.0);
@@ -334,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn angles_and_quaternions_say_the_same() {
+    fn angles_and_quaternions_agree() {
         let down = load(&[]).unwrap().body_from_camera();
         let angles = load(&["mount.orientation=angles"]).unwrap().body_from_camera();
         let quaternion =
@@ -372,18 +395,23 @@ mod tests {
     }
 
     #[test]
-    fn a_program_writes_pictures_of_a_known_form() {
-        let form = |set: &[&str]| {
+    fn the_format_of_a_programs_frames_follows_from_the_keys() {
+        let format = |set: &[&str]| {
             let all = [&["source.command=['cat']", "source.size_px=[5, 3]"], set].concat();
-            load(&all).unwrap().source.program().unwrap().unwrap().form
+            load(&all).unwrap().source.program().unwrap().unwrap().format
         };
-        let samples = |row, rest| Form::Samples { row, rows: 3, rest };
-        assert_eq!(form(&[]), samples((5, 5), 0));
-        assert_eq!(form(&["source.pixels=gray16"]), samples((10, 10), 0));
-        // Colours of half the width and height, both rounded up, twice.
-        assert_eq!(form(&["source.pixels=yuv420"]), samples((5, 5), 12));
-        assert_eq!(form(&["source.pixels=yuv420", "source.row_bytes=8"]), samples((5, 8), 16));
-        assert!(matches!(form(&["source.pixels=mjpeg"]), Form::Jpeg { .. }));
+        let samples = |row_bytes, stride_bytes, chroma_bytes| FrameFormat::Samples {
+            row_bytes,
+            stride_bytes,
+            rows: 3,
+            chroma_bytes,
+        };
+        assert_eq!(format(&[]), samples(5, 5, 0));
+        assert_eq!(format(&["source.pixels=gray16"]), samples(10, 10, 0));
+        // Two chroma planes of half the width and height, both rounded up.
+        assert_eq!(format(&["source.pixels=yuv420"]), samples(5, 5, 12));
+        assert_eq!(format(&["source.pixels=yuv420", "source.row_bytes=8"]), samples(5, 8, 16));
+        assert!(matches!(format(&["source.pixels=mjpeg"]), FrameFormat::Jpeg { .. }));
         assert!(load(&[]).unwrap().source.program().unwrap().is_none());
     }
 
@@ -396,13 +424,13 @@ mod tests {
         check(&["id=a/b"], "letters, digits");
         check(&["source.rate_hz=0"], "from 0.01 to 1000");
         check(&["source.rate_hz=inf"], "from 0.01 to 1000");
-        check(&["source.largest_megapixels=nan"], "from 0.001 to 4294");
+        check(&["source.max_megapixels=nan"], "from 0.001 to 4294");
         check(&["air.quality=0"], "from 1 to 100");
         check(&["calibration.focal_px=[900, 0]"], "or both 0");
         check(&["calibration.focal_px=[nan, 900]"], "above 0");
         check(&["calibration.principal_px=[1]"], "[cx, cy]");
         check(&["calibration.lens=fish"], "kannala-brandt");
-        check(&["calibration.distortion=[1]"], "name the lens");
+        check(&["calibration.distortion=[1]"], "`calibration.lens`");
         check(&["calibration.lens=kannala-brandt"], "4 coefficients");
         check(&["mount.orientation=up"], "down, forward");
         check(&["mount.translation_m=[0, 0, 1000]"], "-100 to 100");
@@ -417,6 +445,6 @@ mod tests {
         camera(&["source.row_bytes=63"], "a row has 64 bytes");
         camera(&["source.pixels=yuv420", "source.bayer=RGGB"], "gray8 or gray16");
         camera(&["source.delay_ms=-1"], "from 0 to 10000");
-        camera(&["source.silence_s=0"], "from 0.1 to 3600");
+        camera(&["source.timeout_s=0"], "from 0.1 to 3600");
     }
 }

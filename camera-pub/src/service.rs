@@ -1,5 +1,4 @@
-//! The camera service: a camera's pictures as they come, or images in the order of their names at a steady rate,
-//! published as frames.
+//! The camera service: publishes a camera's frames as they arrive, or image files, sorted by path, at a constant rate.
 
 use std::convert::Infallible;
 use std::path::{Path, PathBuf};
@@ -10,25 +9,25 @@ use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
 use geometry::{CameraModel, Distortion};
 use imaging::{GrayImage, Mosaic, SampleFormat};
-use media::{Decoded, frame_bytes, grey_of, images_in};
+use media::{DecodedImage, frame_bytes, images_in, samples_to_grey};
 use messages::{BayerPattern, CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
-use crate::config::{Config, ProgramConfig};
-use crate::program::{Form, Program};
+use crate::config::{Config, FrameFormat, ProgramConfig};
+use crate::program::Program;
 
-/// Images whose size is looked up at the start, to make room for the largest in shared memory. Frames that are larger
-/// than these are published all the same, by a copy.
-const IMAGES_MEASURED: usize = 1000;
-/// How often a service that waits for a subscriber looks for one.
+/// Maximum number of images whose size is read at the start, to size the shared memory. Larger frames are published by
+/// a copy.
+const MAX_MEASURED_IMAGES: usize = 1000;
+/// Interval at which a service that waits for a subscriber looks for one.
 const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 
-/// Publishes frames until the images end, the service is asked to stop, no image can be read, or the camera's program
-/// ends or falls silent.
+/// Publishes frames until the images end, a shutdown is requested, no image can be read, or the camera's program exits
+/// or stops writing.
 ///
 /// # Errors
-/// When there is no image to publish, the program cannot be started or ends, or another camera has this name.
+/// When there is no image to publish, the program cannot be started or exits, or another camera has this name.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.ensure_alone(config.instance()).await?;
     let found = {
@@ -54,7 +53,7 @@ async fn republish(infos: &Publisher<CameraInfo>, info: &CameraInfo) -> Infallib
     }
 }
 
-/// Runs the stream where its decoding holds up nobody else.
+/// Runs the stream on a thread of its own, so that decoding does not block other tasks.
 async fn on_own_thread(
     mut stream: Stream,
     source: Source,
@@ -67,7 +66,7 @@ async fn on_own_thread(
             tokio::select! {
                 result = stream.run(source) => result,
                 () = shutdown.requested() => Ok(()),
-                // The service is gone, and with it whoever waits for the result.
+                // The service is gone: nobody waits for the result.
                 () = done.closed() => Ok(()),
             }
         });
@@ -80,7 +79,7 @@ async fn on_own_thread(
     ended.await.context("the camera's thread ended without a result")?
 }
 
-/// Where pictures come from.
+/// Where frames come from.
 enum Source {
     /// Image files.
     Images(Vec<PathBuf>),
@@ -93,16 +92,16 @@ struct Found {
     source: Source,
     /// Width and height that the camera info states, in pixels.
     size: (usize, usize),
-    /// Bytes of the largest frame that is known of.
-    largest: usize,
+    /// Bytes of the largest known frame.
+    max_frame_bytes: usize,
 }
 
 fn find(config: &Config) -> anyhow::Result<Found> {
     match config.source.program()? {
         Some(program) => {
             let size = program.size;
-            let largest = program.form.frame_bytes().max(size.0 * size.1);
-            Ok(Found { source: Source::Program(program), size, largest })
+            let max_frame_bytes = program.format.frame_bytes().max(size.0 * size.1);
+            Ok(Found { source: Source::Program(program), size, max_frame_bytes })
         }
         None => find_images(config),
     }
@@ -112,17 +111,17 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
     let mut images = Vec::new();
     ensure!(
         !config.source.paths.is_empty(),
-        "the camera `{}` has nothing to publish; name image files or folders in `source.paths`, or a camera's program \
-         in `source.command`",
+        "the camera `{}` has nothing to publish; set image files or folders in `source.paths`, or a camera program in \
+         `source.command`",
         config.instance()
     );
     for path in &config.source.paths {
-        ensure!(path.exists(), "there is no {path:?}, which `source.paths` names");
+        ensure!(path.exists(), "{path:?} of `source.paths` does not exist");
         images.extend(images_in(path)?);
     }
-    let most_pixels = config.most_pixels();
+    let max_pixels = config.max_pixels();
     let mut first_problem = None;
-    let first_size = images.iter().find_map(|path| match Decoded::read(path, most_pixels) {
+    let first_size = images.iter().find_map(|path| match DecodedImage::read(path, max_pixels) {
         Ok(image) => Some((image.width(), image.height())),
         Err(problem) => {
             first_problem.get_or_insert(problem);
@@ -133,10 +132,12 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
         let problem = first_problem.map_or_else(String::new, |problem| problem.to_string());
         bail!("none of the {} images can be read; the first one: {problem}", images.len());
     };
-    let sizes =
-        images.iter().take(IMAGES_MEASURED).filter_map(|path| frame_bytes(path, most_pixels).ok());
-    let largest = sizes.max().unwrap_or(size.0 * size.1);
-    Ok(Found { source: Source::Images(images), size, largest })
+    let sizes = images
+        .iter()
+        .take(MAX_MEASURED_IMAGES)
+        .filter_map(|path| frame_bytes(path, max_pixels).ok());
+    let max_frame_bytes = sizes.max().unwrap_or(size.0 * size.1);
+    Ok(Found { source: Source::Images(images), size, max_frame_bytes })
 }
 
 fn camera_info(config: &Config, size: (usize, usize)) -> anyhow::Result<CameraInfo> {
@@ -164,7 +165,7 @@ fn camera_info(config: &Config, size: (usize, usize)) -> anyhow::Result<CameraIn
     })
 }
 
-/// Reads pictures and publishes them.
+/// Reads frames and publishes them.
 struct Stream {
     config: Config,
     size: (usize, usize),
@@ -174,7 +175,7 @@ struct Stream {
     sequence: u64,
 }
 
-/// Keeps a rate exactly as long as the work keeps up with it; what is late is not caught up with.
+/// Keeps a constant rate. Time lost to slow work is not made up for.
 struct Pace {
     due: Instant,
     period: Duration,
@@ -187,13 +188,13 @@ impl Pace {
     }
 }
 
-/// A frame that waits for its time.
+/// A frame ready to be published.
 struct Prepared {
     width: usize,
     height: usize,
     format: PixelFormat,
     pixels: Loan,
-    /// Grey pixels for the air link where `pixels` are none, when one is wanted.
+    /// Grey pixels for the air link, when it wants a frame and `pixels` are in another format.
     grey: Option<GrayImage>,
 }
 
@@ -204,7 +205,7 @@ impl Stream {
         Ok(Self {
             config: config.clone(),
             size: found.size,
-            frames: node.frame_publisher(topic::FRAME, &names, found.largest).await?,
+            frames: node.frame_publisher(topic::FRAME, &names, found.max_frame_bytes).await?,
             air: AirSender::start(node, config.instance(), jpegs, &config.air).await?,
             health: node.shared_health(),
             sequence: 0,
@@ -218,33 +219,33 @@ impl Stream {
         }
     }
 
-    /// Publishes what a camera's program writes.
+    /// Publishes the frames of a camera's program.
     async fn publish_program(&mut self, config: &ProgramConfig) -> anyhow::Result<()> {
-        let mosaic = self.config.source.mosaic()?;
+        let bayer = self.config.source.bayer_pattern()?;
         let mut program = Program::start(config)?;
-        let mut fit = Instant::now();
+        let mut last_published = Instant::now();
         loop {
             let arrival = program.wait().await?;
             let began = Instant::now();
-            let mut pixels = match config.form {
-                Form::Samples { .. } => self.frames.loan(config.form.frame_bytes()),
-                Form::Jpeg { .. } => Loan::Private(Vec::new()),
+            let mut pixels = match config.format {
+                FrameFormat::Samples { .. } => self.frames.loan(config.format.frame_bytes()),
+                FrameFormat::Jpeg { .. } => Loan::Private(Vec::new()),
             };
             let jpeg = program.read(&mut pixels).await?;
-            if arrival.has_waited {
-                self.health.dropped("picture that has waited");
+            if arrival.was_queued {
+                self.health.dropped("frames that were queued");
                 ensure!(
-                    fit.elapsed() < config.silence,
-                    "the pictures of `source.command` come in heaps, or more than four times as often as `source.rate_hz` \
-                     ({}) says, so that the age of none is known; set the rate that the program was asked for",
+                    last_published.elapsed() < config.timeout,
+                    "frames from `source.command` arrive in bursts or faster than 4x `source.rate_hz` ({}), so that their \
+                     age is unknown; set `source.rate_hz` to the program's frame rate",
                     config.rate_hz
                 );
                 continue;
             }
-            fit = Instant::now();
-            let frame = match config.form {
-                Form::Samples { .. } => Some(self.of_samples(pixels, config, mosaic)),
-                Form::Jpeg { .. } => self.of_jpeg(&jpeg),
+            last_published = Instant::now();
+            let frame = match config.format {
+                FrameFormat::Samples { .. } => Some(self.prepare_samples(pixels, config, bayer)),
+                FrameFormat::Jpeg { .. } => self.prepare_jpeg(&jpeg),
             };
             self.health.latency("read", began.elapsed());
             if let Some(frame) = frame {
@@ -253,23 +254,28 @@ impl Stream {
         }
     }
 
-    fn of_samples(&self, pixels: Loan, config: &ProgramConfig, mosaic: Option<Mosaic>) -> Prepared {
+    fn prepare_samples(
+        &self,
+        pixels: Loan,
+        config: &ProgramConfig,
+        bayer: Option<Mosaic>,
+    ) -> Prepared {
         let (width, height) = config.size;
-        let format = pixel_format(Some(config.bits), mosaic);
-        let sample = SampleFormat { bits: config.bits, mosaic };
+        let format = pixel_format(Some(config.bits), bayer);
+        let sample = SampleFormat { bits: config.bits, mosaic: bayer };
         let is_wanted = self.needs_grey(format);
-        let grey = is_wanted.then(|| grey_of(&pixels, width, height, sample)).flatten();
+        let grey = is_wanted.then(|| samples_to_grey(&pixels, width, height, sample)).flatten();
         Prepared { width, height, format, pixels, grey }
     }
 
-    /// A picture as the JPEG file of a camera's program; `None` when it is not fit to be published.
-    fn of_jpeg(&self, jpeg: &[u8]) -> Option<Prepared> {
-        let most_pixels = self.config.most_pixels();
-        let image = match Decoded::decode(Path::new("a picture"), jpeg, most_pixels) {
+    /// A frame from a JPEG file of the program; `None` when it cannot be decoded or has the wrong size.
+    fn prepare_jpeg(&self, jpeg: &[u8]) -> Option<Prepared> {
+        let max_pixels = self.config.max_pixels();
+        let image = match DecodedImage::decode(Path::new("a JPEG frame"), jpeg, max_pixels) {
             Ok(image) => image,
             Err(problem) => {
-                if self.health.failed("image that cannot be read") {
-                    tracing::warn!(%problem, "A picture of the camera's program is left out");
+                if self.health.failed("unreadable image") {
+                    tracing::warn!(%problem, "Dropped a frame of the camera program");
                 }
                 return None;
             }
@@ -277,11 +283,7 @@ impl Stream {
         let (width, height) = (image.width(), image.height());
         if (width, height) != self.size {
             if self.health.failed("image of another size") {
-                tracing::warn!(
-                    width,
-                    height,
-                    "A picture is not of the size in `source.size_px` and is left out"
-                );
+                tracing::warn!(width, height, "Dropped a frame whose size is not `source.size_px`");
             }
             return None;
         }
@@ -290,7 +292,7 @@ impl Stream {
         Some(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
     }
 
-    /// Publishes image files at the rate that is asked for.
+    /// Publishes image files at the configured rate.
     async fn publish_images(&mut self, images: &[PathBuf]) -> anyhow::Result<()> {
         while self.config.source.wait_for_subscriber && !self.frames.has_subscribers().await {
             tokio::time::sleep(SUBSCRIBER_POLL).await;
@@ -316,46 +318,46 @@ impl Stream {
             match self.prepare(path) {
                 Ok(frame) => {
                     pace.wait().await;
-                    // A file is as old as its publication.
+                    // An image file is stamped with its time of publication.
                     self.publish(frame, now_ns()).await;
                 }
                 Err(problem) => {
-                    self.health.failed("image that cannot be read");
+                    self.health.failed("unreadable image");
                     if is_first {
-                        tracing::warn!(%problem, "An image is skipped");
+                        tracing::warn!(%problem, "Skipped an image");
                     }
                 }
             }
         }
-        // Without this a folder that was emptied meanwhile would keep a processor busy with nothing.
+        // An emptied folder would make this a busy loop.
         ensure!(self.sequence > before, "none of the {} images can be read any more", images.len());
         Ok(())
     }
 
-    /// Decodes an image into the buffer it is published from.
+    /// Decodes an image into the buffer from which it is published.
     fn prepare(&self, path: &Path) -> anyhow::Result<Prepared> {
         let began = Instant::now();
-        let image = Decoded::read(path, self.config.most_pixels())?;
+        let image = DecodedImage::read(path, self.config.max_pixels())?;
         let (width, height) = (image.width(), image.height());
         if (width, height) != self.size && self.health.failed("image of another size") {
             tracing::warn!(
                 ?path,
                 width,
                 height,
-                "An image is not of the size that the camera info states"
+                "The size of an image differs from that in the camera info"
             );
         }
-        let mosaic = self.config.source.mosaic()?;
-        let format = pixel_format(image.raw_bits(), mosaic);
+        let bayer = self.config.source.bayer_pattern()?;
+        let format = pixel_format(image.raw_bits(), bayer);
         let bytes = format.bytes_per_pixel().unwrap_or(1);
         let mut pixels = self.frames.loan(width * height * bytes);
         image.write_samples(&mut pixels);
         self.health.latency("read", began.elapsed());
-        let grey = self.needs_grey(format).then(|| image.grey(mosaic));
+        let grey = self.needs_grey(format).then(|| image.grey(bayer));
         Ok(Prepared { width, height, format, pixels, grey })
     }
 
-    /// True when a frame of this format must be made grey for the air link.
+    /// True when a frame of this format must be converted to grey for the air link.
     fn needs_grey(&self, format: PixelFormat) -> bool {
         format != PixelFormat::Mono8 && self.air.is_wanted()
     }
@@ -382,9 +384,9 @@ impl Stream {
     }
 }
 
-/// The format of a frame whose samples have so many bits; an image that is not raw is published in grey.
-fn pixel_format(raw_bits: Option<u32>, mosaic: Option<Mosaic>) -> PixelFormat {
-    let pattern = mosaic.map(|mosaic| match mosaic {
+/// The format of a frame by the bits of its raw samples; images that are not raw are published in grey.
+fn pixel_format(raw_bits: Option<u32>, bayer: Option<Mosaic>) -> PixelFormat {
+    let pattern = bayer.map(|bayer| match bayer {
         Mosaic::Rggb => BayerPattern::Rggb,
         Mosaic::Grbg => BayerPattern::Grbg,
         Mosaic::Gbrg => BayerPattern::Gbrg,

@@ -37,7 +37,7 @@ fn config(folder: &Path, set: &[&str]) -> anyhow::Result<Config> {
     Ok(layers.load::<Config>()?.settings)
 }
 
-/// A camera that is a program which writes pictures of 64 x 48 pixels.
+/// A camera program that writes frames of 64 x 48 pixels.
 fn program(command: &[&str], set: &[&str]) -> anyhow::Result<Config> {
     let mut layers = Layers::default();
     layers.set.push(format!("source.command={command:?}"));
@@ -46,7 +46,7 @@ fn program(command: &[&str], set: &[&str]) -> anyhow::Result<Config> {
     Ok(layers.load::<Config>()?.settings)
 }
 
-/// Two grey images, a smaller coloured one, and two files that are none.
+/// Two grey images, a smaller coloured one, and two files that are not images.
 fn folder_of_images() -> anyhow::Result<tempfile::TempDir> {
     let folder = tempfile::tempdir()?;
     let path = |name: &str| folder.path().join(name);
@@ -61,7 +61,7 @@ fn folder_of_images() -> anyhow::Result<tempfile::TempDir> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn images_become_frames_in_order_and_the_unreadable_are_counted() -> anyhow::Result<()> {
+async fn images_become_frames_in_order_and_unreadable_ones_are_counted() -> anyhow::Result<()> {
     let folder = folder_of_images()?;
     let port = free_port()?;
     let (camera, detector) = (open("camera-pub", port).await?, open("detector", port).await?);
@@ -77,7 +77,7 @@ async fn images_become_frames_in_order_and_the_unreadable_are_counted() -> anyho
             let header = &frame.header;
             ensure!(header.camera == "down" && header.format == PixelFormat::Mono8);
             ensure!(header.stamp_ns <= now_ns());
-            // The newest wins, so that a slow test may miss some.
+            // Only the newest frame is kept: a slow test may miss some.
             ensure!(expected.is_none_or(|expected| header.sequence >= expected));
             expected = Some(header.sequence + 1);
             let bytes = frame.bytes();
@@ -99,14 +99,14 @@ async fn images_become_frames_in_order_and_the_unreadable_are_counted() -> anyho
     }?;
     let health = camera.health().report(camera.identity(), now_ns());
     let failed = |reason: &str| health.errors.iter().find(|e| e.reason == reason).map(|e| e.count);
-    ensure!(failed("image that cannot be read").is_some_and(|count| count >= 2), "{health:?}");
+    ensure!(failed("unreadable image").is_some_and(|count| count >= 2), "{health:?}");
     ensure!(failed("image of another size").is_some(), "{health:?}");
     ensure!(health.drops.is_empty(), "{health:?}");
     Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn sixteen_bits_behind_a_mosaic_are_published_as_they_are() -> anyhow::Result<()> {
+async fn raw_16_bit_bayer_samples_are_published_unchanged() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let image = image::ImageBuffer::from_fn(6, 4, |x, y| Luma([(1000 * x + y) as u16]));
     image.save(folder.path().join("1.png"))?;
@@ -124,7 +124,7 @@ async fn sixteen_bits_behind_a_mosaic_are_published_as_they_are() -> anyhow::Res
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn jpegs_are_made_while_somebody_subscribes() -> anyhow::Result<()> {
+async fn jpegs_are_made_while_there_is_a_subscriber() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     GrayImage::from_pixel(64, 48, Luma([200])).save(folder.path().join("1.png"))?;
     let port = free_port()?;
@@ -133,7 +133,7 @@ async fn jpegs_are_made_while_somebody_subscribes() -> anyhow::Result<()> {
     let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
     let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
     timeout(PATIENCE, frames.next()).await?.context("a frame")?;
-    ensure!(camera.health().percentiles("jpeg").is_none(), "a JPEG was made for nobody");
+    ensure!(camera.health().percentiles("jpeg").is_none(), "a JPEG was made without a subscriber");
     let jpegs = viewer.frame_subscriber(topic::JPEG, &["down"]).await?;
     let jpeg = timeout(PATIENCE, jpegs.next()).await?.context("a JPEG")?;
     ensure!(jpeg.header.format == PixelFormat::Jpeg && jpeg.header.width == 64);
@@ -144,7 +144,7 @@ async fn jpegs_are_made_while_somebody_subscribes() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_folder_is_published_once_when_it_should() -> anyhow::Result<()> {
+async fn a_folder_is_published_once_without_repeat() -> anyhow::Result<()> {
     let folder = folder_of_images()?;
     let camera = open("camera-pub", free_port()?).await?;
     let config = config(folder.path(), &["source.rate_hz=1000", "source.repeat=false"])?;
@@ -155,7 +155,7 @@ async fn a_folder_is_published_once_when_it_should() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_start_without_images_says_why() -> anyhow::Result<()> {
+async fn a_start_without_images_is_an_error_with_its_reason() -> anyhow::Result<()> {
     let camera = open("camera-pub", free_port()?).await?;
     let folder = tempfile::tempdir()?;
     let problem = async |config: Config| -> anyhow::Result<String> {
@@ -168,14 +168,14 @@ async fn a_start_without_images_says_why() -> anyhow::Result<()> {
         "{nothing}"
     );
     let missing = problem(config(&folder.path().join("none"), &[])?).await?;
-    ensure!(missing.contains("there is no") && missing.contains("none"), "{missing}");
+    ensure!(missing.contains("does not exist") && missing.contains("none"), "{missing}");
     let empty = problem(config(folder.path(), &[])?).await?;
     ensure!(empty.contains("holds no images"), "{empty}");
     std::fs::write(folder.path().join("1.png"), "text")?;
     let unreadable = problem(config(folder.path(), &[])?).await?;
     ensure!(unreadable.contains("none of the 1 images can be read"), "{unreadable}");
     GrayImage::from_pixel(64, 48, Luma([200])).save(folder.path().join("2.png"))?;
-    let too_large = problem(config(folder.path(), &["source.largest_megapixels=0.003"])?).await?;
+    let too_large = problem(config(folder.path(), &["source.max_megapixels=0.003"])?).await?;
     ensure!(too_large.contains("none of the 2 images"), "{too_large}");
     Ok(())
 }
@@ -196,10 +196,10 @@ async fn the_rate_is_kept() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_program_writes_becomes_frames_with_the_time_of_its_arrival() -> anyhow::Result<()> {
+async fn frames_of_a_program_are_stamped_with_their_arrival() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("picture");
-    // Rows of 64 pixels, filled up to 80 bytes, then colours.
+    // Rows of 64 pixels, padded to 80 bytes, then chroma.
     let rows = (0..48_u8).flat_map(|y| (0..80_u8).map(move |x| if x < 64 { x + y } else { 255 }));
     std::fs::write(&path, rows.chain([128; 2 * 40 * 24]).collect::<Vec<_>>())?;
     let forever = format!("while sleep 0.05; do cat '{}'; done", path.display());
@@ -232,7 +232,7 @@ async fn what_a_program_writes_becomes_frames_with_the_time_of_its_arrival() -> 
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_service_says_how_a_camera_s_program_ended() -> anyhow::Result<()> {
+async fn the_error_says_how_a_camera_program_ended() -> anyhow::Result<()> {
     let problem = async |command: &[&str], set: &[&str]| -> anyhow::Result<String> {
         let config = program(command, set)?;
         let camera = open("camera-pub", free_port()?).await?;
@@ -243,23 +243,23 @@ async fn the_service_says_how_a_camera_s_program_ended() -> anyhow::Result<()> {
     let missing = problem(&["no-such-camera-program"], &[]).await?;
     ensure!(missing.contains("`no-such-camera-program`"), "{missing}");
     let ended = problem(&["sh", "-c", "head -c 3072 /dev/zero; exit 3"], &[]).await?;
-    ensure!(ended.contains("`sh` ended (exit status: 3) after 1 pictures"), "{ended}");
+    ensure!(ended.contains("`sh` ended (exit status: 3) after 1 frames"), "{ended}");
     let cut = problem(&["head", "-c", "5000", "/dev/zero"], &[]).await?;
-    ensure!(cut.contains("not whole") && cut.contains("after 1 pictures"), "{cut}");
-    let silent = problem(&["sleep", "60"], &["source.silence_s=0.2"]).await?;
-    ensure!(silent.contains("no picture came from `sleep` for 0.2 s"), "{silent}");
+    ensure!(cut.contains("incomplete") && cut.contains("after 1 frames"), "{cut}");
+    let silent = problem(&["sleep", "60"], &["source.timeout_s=0.2"]).await?;
+    ensure!(silent.contains("no frame from `sleep` for 0.2 s"), "{silent}");
     let stuck = ["sh", "-c", "head -c 100 /dev/zero; exec sleep 60"];
-    let stuck = problem(&stuck, &["source.silence_s=3"]).await?;
-    ensure!(stuck.contains("in the middle of a picture"), "{stuck}");
+    let stuck = problem(&stuck, &["source.timeout_s=3"]).await?;
+    ensure!(stuck.contains("in the middle of a frame"), "{stuck}");
     let other = problem(&["head", "-c", "900000", "/dev/zero"], &["source.pixels=mjpeg"]).await?;
-    ensure!(other.contains("what `source.pixels` says"), "{other}");
+    ensure!(other.contains("is `source.pixels` the format it writes"), "{other}");
     let fast = ["sh", "-c", "while head -c 3072 /dev/zero; do sleep 0.001; done"];
-    let fast = problem(&fast, &["source.rate_hz=0.1", "source.silence_s=0.5"]).await?;
+    let fast = problem(&fast, &["source.rate_hz=0.1", "source.timeout_s=0.5"]).await?;
     ensure!(fast.contains("`source.rate_hz` (0.1)"), "{fast}");
     Ok(())
 }
 
-/// The forms as `ffmpeg` writes them, from a picture of its own.
+/// The pixel formats as `ffmpeg` writes them, from a test picture of its own.
 #[tokio::test(flavor = "multi_thread")]
 async fn ffmpeg_is_a_camera() -> anyhow::Result<()> {
     if std::process::Command::new("ffmpeg").arg("-version").output().is_err() {
@@ -286,7 +286,7 @@ async fn ffmpeg_is_a_camera() -> anyhow::Result<()> {
         for _ in 0..3 {
             let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
             let bytes = frame.bytes();
-            // The high byte of two, or the only one; video's grey ranges from 16 to 235 or to 255.
+            // The high byte of two, or the only one. The range of video grey is 16 to 235, or full.
             let level = bytes.last().context("pixels")?;
             ensure!(level.abs_diff(0x80) < 6, "{pixels}: {level}");
             ensure!(bytes.len() == 64 * 48 * if pixels == "gray16" { 2 } else { 1 });

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use imaging::{GrayImage, Mosaic};
 use media::{
-    IMAGE_EXTENSIONS, MOST_PIXELS, Picture, VIDEO_EXTENSIONS, Video, files_in, is_video, read_image,
+    DEFAULT_MAX_PIXELS, IMAGE_EXTENSIONS, VIDEO_EXTENSIONS, Video, VideoImage, files_in, is_video,
+    read_image,
 };
 
 /// Between the images of a folder, in seconds, for want of anything better.
@@ -30,7 +31,7 @@ pub(super) struct Item {
 
 enum Content {
     File(PathBuf),
-    Picture(PathBuf, Picture),
+    Frame(PathBuf, VideoImage),
     /// Why there is nothing.
     Nothing(String),
 }
@@ -54,7 +55,7 @@ impl Source {
             match video.next_frame() {
                 Some(Ok(frame)) => {
                     let name = format!("{}#{}", path.display(), frame.index);
-                    let content = Content::Picture(path.clone(), frame.picture);
+                    let content = Content::Frame(path.clone(), frame.image);
                     return Some(Item { name, time_s: frame.time_s, is_frame: true, content });
                 }
                 Some(Err(problem)) => return Some(Item::nothing(path, problem.to_string())),
@@ -66,7 +67,7 @@ impl Source {
             Err((path, problem)) => return Some(Item::nothing(&path, problem)),
         };
         if is_video(&path) {
-            match Video::open(&path, MOST_PIXELS) {
+            match Video::open(&path, DEFAULT_MAX_PIXELS) {
                 Ok(video) => {
                     self.video = Some((path, video));
                     return self.next();
@@ -90,8 +91,8 @@ impl Item {
     /// The picture in grey, or why there is none.
     pub(super) fn into_image(self, mosaic: Option<Mosaic>) -> Result<GrayImage, String> {
         let image = match self.content {
-            Content::File(path) => read_image(&path, MOST_PIXELS, mosaic),
-            Content::Picture(path, picture) => picture.grey(&path, MOST_PIXELS),
+            Content::File(path) => read_image(&path, DEFAULT_MAX_PIXELS, mosaic),
+            Content::Frame(path, image) => image.grey(&path, DEFAULT_MAX_PIXELS),
             Content::Nothing(problem) => return Err(problem),
         };
         image.map_err(|problem| problem.to_string())

@@ -1,22 +1,22 @@
 //! Calibration files of other programs: their intrinsics as a camera model.
 //!
-//! Three forms are read, told apart by their keys: ROS `camera_info` (`camera_matrix` or `K`, with `image_width`),
-//! Kalibr's camera chain (`cam0` with `intrinsics`), and OpenCV's `FileStorage` (`camera_matrix` of type
-//! `opencv-matrix`). All of them take the centre of the top-left pixel as (0, 0), as this project does.
+//! Three formats are read and distinguished by their keys: ROS `camera_info` (`camera_matrix` or `K`, with
+//! `image_width`), Kalibr's camera chain (`cam0` with `intrinsics`), and OpenCV's `FileStorage` (`camera_matrix` of type
+//! `opencv-matrix`). In all of them the centre of the top-left pixel is (0, 0), as in this project.
 
 use std::path::{Path, PathBuf};
 
 use geometry::{CameraModel, Distortion};
 use serde_yaml_ng::Value;
 
-/// Largest calibration file that is read, in bytes.
-const LARGEST_FILE: u64 = 1 << 20;
-/// Largest edge of an image, in pixels.
-const LARGEST_EDGE_PX: f64 = 65_535.0;
-/// Largest focal length that is taken for one, in pixels.
-const LONGEST_FOCAL_PX: f64 = 1e6;
+/// Maximum size of a calibration file, in bytes.
+const MAX_FILE_BYTES: u64 = 1 << 20;
+/// Maximum edge of an image, in pixels.
+const MAX_EDGE_PX: f64 = 65_535.0;
+/// Maximum focal length, in pixels.
+const MAX_FOCAL_PX: f64 = 1e6;
 
-/// Names that programs give to the same thing; the first is the one told to people.
+/// Keys that different programs use for the same value; messages name the first.
 const MATRIX: &[&str] = &["camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k"];
 const COEFFICIENTS: &[&str] =
     &["distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d"];
@@ -26,7 +26,7 @@ const HEIGHT: &[&str] = &["image_height", "image_Height", "height"];
 /// Why a calibration file was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum CalibrationError {
-    /// A file that the system does not open.
+    /// The system does not open the file.
     #[error("reading the calibration {path:?}: {cause}")]
     Unreadable {
         /// The file.
@@ -34,7 +34,7 @@ pub enum CalibrationError {
         /// The system's reason.
         cause: std::io::Error,
     },
-    /// Text that is none of the forms.
+    /// Text in none of the three formats.
     #[error(
         "the calibration {path:?} {problem}; it must be ROS camera_info YAML (with `camera_matrix`), a Kalibr \
          camchain (with `cam0`) or OpenCV FileStorage YAML (with `camera_matrix`)"
@@ -45,7 +45,7 @@ pub enum CalibrationError {
         /// What is wrong with it.
         problem: String,
     },
-    /// A key that is missing or has an impossible value.
+    /// A key that is missing or has an invalid value.
     #[error("the calibration {path:?}: `{key}` {problem}; {expected}")]
     Key {
         /// The file.
@@ -59,7 +59,7 @@ pub enum CalibrationError {
     },
 }
 
-/// A key with what is wrong about it, before the file's name is known.
+/// A problem with a key, before the file's name is added.
 #[derive(Debug)]
 struct Problem {
     key: String,
@@ -71,14 +71,14 @@ struct Problem {
 /// radtan, equidistant or no distortion), or OpenCV `FileStorage` YAML.
 ///
 /// # Errors
-/// [`CalibrationError`] names the file, the key and what was expected.
+/// [`CalibrationError`] names the file, the key and the expected value.
 pub fn read_calibration(path: &Path) -> Result<CameraModel, CalibrationError> {
     let path = || path.to_owned();
     let unreadable = |cause| CalibrationError::Unreadable { path: path(), cause };
     let metadata = std::fs::metadata(path()).map_err(unreadable)?;
     let form = |problem: String| CalibrationError::Form { path: path(), problem };
-    if !metadata.is_file() || metadata.len() > LARGEST_FILE {
-        return Err(form(format!("is not a file of at most {LARGEST_FILE} bytes")));
+    if !metadata.is_file() || metadata.len() > MAX_FILE_BYTES {
+        return Err(form(format!("is not a file of at most {MAX_FILE_BYTES} bytes")));
     }
     let bytes = std::fs::read(path()).map_err(unreadable)?;
     let text = String::from_utf8(bytes).map_err(|_cause| form("is not text".to_owned()))?;
@@ -90,7 +90,7 @@ pub fn read_calibration(path: &Path) -> Result<CameraModel, CalibrationError> {
     } else if find(&root, MATRIX).is_some() {
         matrix_form(&root)
     } else {
-        return Err(form("has none of the keys by which a calibration is known".to_owned()));
+        return Err(form("has none of the keys of a calibration".to_owned()));
     };
     model.map_err(|Problem { key, problem, expected }| CalibrationError::Key {
         path: path(),
@@ -107,7 +107,7 @@ fn parse(text: &str) -> Result<Value, String> {
             "is XML; save it as YAML instead (in OpenCV, by a name that ends in .yaml)".to_owned()
         );
     }
-    // OpenCV writes a directive and a type that YAML does not know.
+    // OpenCV writes a directive and a type tag that are not valid YAML.
     let body = match text.strip_prefix("%YAML") {
         Some(rest) => rest.split_once('\n').map_or("", |(_, body)| body),
         None => text,
@@ -145,7 +145,7 @@ fn kalibr(camera: &Value) -> Result<CameraModel, Problem> {
     checked("intrinsics", size, [fx, fy, cx, cy], distortion)
 }
 
-/// The form of ROS and OpenCV: a 3 x 3 matrix, a list of coefficients, a size.
+/// The format of ROS and OpenCV: a 3 x 3 matrix, a list of coefficients, a size.
 fn matrix_form(root: &Value) -> Result<CameraModel, Problem> {
     let expected = "it must hold the 9 numbers fx, 0, cx, 0, fy, cy, 0, 0, 1";
     let (key, value) = required(root, MATRIX, expected)?;
@@ -190,7 +190,7 @@ fn size(root: &Value) -> Result<[u32; 2], Problem> {
 }
 
 fn edge(key: &str, px: f64) -> Result<u32, Problem> {
-    if px.fract() == 0.0 && (1.0..=LARGEST_EDGE_PX).contains(&px) {
+    if px.fract() == 0.0 && (1.0..=MAX_EDGE_PX).contains(&px) {
         return Ok(px as u32);
     }
     Err(Problem {
@@ -238,12 +238,12 @@ fn distortion(
     }
 }
 
-/// OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6; its thin prism and tilted sensor are taken only when they are nought.
+/// OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6. Coefficients of a thin prism or a tilted sensor must be zero.
 fn brown_conrady(key: &str, coefficients: &[f64]) -> Result<Distortion, Problem> {
     let beyond = coefficients.iter().skip(8).any(|c| *c != 0.0);
     if !matches!(coefficients.len(), 4 | 5 | 8 | 12 | 14) || beyond {
         let problem = format!("has {} numbers", coefficients.len());
-        let expected = "it must hold k1, k2, p1, p2, then none, k3, or k3 to k6 (a thin prism or tilted sensor is not modelled)";
+        let expected = "it must be k1, k2, p1, p2, optionally k3, or k3 to k6 (a thin prism or tilted sensor is not modelled)";
         return Err(Problem { key: key.to_owned(), problem, expected });
     }
     let mut k = [0.0; 8];
@@ -261,7 +261,7 @@ fn checked(
 ) -> Result<CameraModel, Problem> {
     let [fx, fy, cx, cy] = intrinsics;
     for (name, focal) in [("fx", fx), ("fy", fy)] {
-        if !(focal > 0.0 && focal <= LONGEST_FOCAL_PX) {
+        if !(focal > 0.0 && focal <= MAX_FOCAL_PX) {
             let problem = format!("has {name} = {focal}");
             let expected = "focal lengths must be above 0 and at most 1e6 pixels";
             return Err(Problem { key: key.to_owned(), problem, expected });
@@ -304,7 +304,7 @@ fn numbers(key: &str, value: &Value, expected: &'static str) -> Result<Vec<f64>,
     flat.iter().map(one).collect::<Option<Vec<f64>>>().ok_or_else(|| wrong(key, list, expected))
 }
 
-/// A number, also in the forms that C programs write and YAML takes for text (`1.`, `.5e-3`).
+/// A number, also as C programs write it and YAML reads as text (`1.`, `.5e-3`).
 fn number(value: &Value) -> Option<f64> {
     value.as_f64().or_else(|| value.as_str().and_then(|text| text.parse().ok()))
 }
@@ -313,7 +313,7 @@ fn wrong(key: &str, value: &Value, expected: &'static str) -> Problem {
     Problem { key: key.to_owned(), problem: format!("is {}", short(value)), expected }
 }
 
-/// A value as people see it in the file, as far as it fits on a line.
+/// A value as it stands in the file, cut to 60 characters.
 fn short(value: &Value) -> String {
     let text = serde_yaml_ng::to_string(value).unwrap_or_default();
     let line = text.split_whitespace().collect::<Vec<_>>().join(" ");
@@ -433,7 +433,7 @@ distortion_coefficients: !!opencv-matrix
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn errors_name_the_key() {
         let check = |text: &str, from: &str, to: &str, parts: &[&str]| {
             assert!(text.contains(from), "{from}");
             let problem = read(&text.replace(from, to)).unwrap_err();
@@ -455,7 +455,7 @@ distortion_coefficients: !!opencv-matrix
     }
 
     #[test]
-    fn what_is_wrong_with_kalibr_and_opencv_is_named() {
+    fn errors_name_the_key_of_kalibr_and_opencv_too() {
         let check = |text: &str, from: &str, to: &str, part: &str| {
             assert!(text.contains(from), "{from}");
             let problem = read(&text.replace(from, to)).unwrap_err();

@@ -1,4 +1,4 @@
-//! Image files: which ones there are, and their pixels in grey.
+//! Image files (PNG and JPEG): found in folders, and decoded to grey.
 
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -6,19 +6,21 @@ use std::path::{Path, PathBuf};
 use ::image::{ColorType, DynamicImage, ImageDecoder, ImageReader, Limits};
 use imaging::{Converter, GrayImage, GrayView, Mosaic, SampleFormat};
 
-/// Pixels an image may have unless another limit is chosen.
-pub const MOST_PIXELS: u64 = 100_000_000;
+use crate::jpeg::{is_jpeg, jpeg_len};
 
-/// Folders within folders that are entered.
-const DEEPEST_FOLDER: usize = 16;
+/// Default limit for the pixels of an image.
+pub const DEFAULT_MAX_PIXELS: u64 = 100_000_000;
 
-/// Bytes of a file beyond its pixels: thumbnails, profiles and comments.
-const MOST_EXTRA_BYTES: u64 = 64 << 20;
+/// Maximum depth of nested folders.
+const MAX_FOLDER_DEPTH: usize = 16;
+
+/// Maximum bytes of a file beyond its pixels: thumbnails, colour profiles and comments.
+const MAX_METADATA_BYTES: u64 = 64 << 20;
 
 /// Why an image was not read, and what to do about it.
 #[derive(Debug, thiserror::Error)]
 pub enum ImageError {
-    /// A file or folder that the system does not open.
+    /// The system does not open a file or folder.
     #[error("{path:?} cannot be read: {cause}; check the path and its permissions")]
     Unreadable {
         /// The file or folder.
@@ -26,10 +28,10 @@ pub enum ImageError {
         /// The system's reason.
         cause: std::io::Error,
     },
-    /// A pipe, device or folder in the place of a file.
+    /// A pipe, device or folder instead of a file.
     #[error("{path:?} is not a file")]
     NotAFile {
-        /// What it is called.
+        /// Its path.
         path: PathBuf,
     },
     /// A folder without images.
@@ -37,7 +39,7 @@ pub enum ImageError {
     EmptyFolder {
         /// The folder.
         path: PathBuf,
-        /// The ends of names that were looked for.
+        /// The file extensions of images.
         extensions: String,
     },
     /// Bytes that are neither PNG nor JPEG.
@@ -48,8 +50,8 @@ pub enum ImageError {
     },
     /// An image larger than the limit.
     #[error(
-        "{path:?} has {width} x {height} pixels, more than the {most_pixels} that are allowed (or an edge of more \
-         than {edge}); make it smaller or raise the limit",
+        "{path:?} has {width} x {height} pixels; the limit is {max_pixels} pixels, and {edge} for an edge; make it \
+         smaller or raise the limit",
         edge = GrayView::LARGEST_EDGE_PX
     )]
     TooLarge {
@@ -60,25 +62,25 @@ pub enum ImageError {
         /// Its height in pixels.
         height: u32,
         /// The limit.
-        most_pixels: u64,
+        max_pixels: u64,
     },
-    /// A file that is larger than its pixels could be.
-    #[error("{path:?} is {len} bytes long, more than an image of the allowed size can be")]
+    /// A file larger than an image of the allowed size can be.
+    #[error("{path:?} has {len} bytes, more than an image of the allowed size can have")]
     TooLong {
         /// The file.
         path: PathBuf,
         /// Its length in bytes.
         len: u64,
     },
-    /// A JPEG file without an end.
+    /// A JPEG file without its end-of-image marker.
     #[error("{path:?} ends in the middle of the image; copy or record it again")]
     Cut {
         /// The file.
         path: PathBuf,
     },
-    /// A colour image where the raw samples of a mosaic were expected.
-    #[error("{path:?} has colours already, so that it is no mosaic; leave the mosaic out")]
-    NoMosaic {
+    /// A colour image where raw samples behind a Bayer pattern were expected.
+    #[error("{path:?} is a colour image, not raw samples; leave the Bayer pattern out")]
+    NotRaw {
         /// The file.
         path: PathBuf,
     },
@@ -92,11 +94,11 @@ pub enum ImageError {
     },
 }
 
-/// Ends of the names of images.
+/// File extensions of images.
 pub const IMAGE_EXTENSIONS: &[&str] = &["png", "jpg", "jpeg"];
 
-/// The images that a path names: the file itself, or those in a folder and in the folders in it, in the order of
-/// their names. Whether a file can be read turns out when it is read.
+/// The images at a path: the file itself, or those in a folder and its subfolders, sorted by path. The files are not
+/// opened.
 ///
 /// # Errors
 /// [`ImageError`] for a folder that cannot be listed or holds no images.
@@ -104,7 +106,7 @@ pub fn images_in(path: &Path) -> Result<Vec<PathBuf>, ImageError> {
     files_in(path, &[IMAGE_EXTENSIONS])
 }
 
-/// As [`images_in`], for files whose names have one of these extensions.
+/// Like [`images_in`], for files with any of these extensions.
 ///
 /// # Errors
 /// As [`images_in`].
@@ -114,7 +116,7 @@ pub fn files_in(path: &Path, extensions: &[&[&str]]) -> Result<Vec<PathBuf>, Ima
     }
     let extensions = extensions.concat();
     let mut files = Vec::new();
-    collect(path, DEEPEST_FOLDER, &extensions, &mut files)?;
+    collect(path, MAX_FOLDER_DEPTH, &extensions, &mut files)?;
     if files.is_empty() {
         let extensions =
             extensions.iter().map(|end| format!(".{end}")).collect::<Vec<_>>().join(", ");
@@ -137,7 +139,7 @@ fn collect(
         if entry.file_name().as_encoded_bytes().starts_with(b".") {
             continue;
         }
-        // A link to a folder is not followed, as it may lead back here.
+        // Links to folders are not followed: they may form a circle.
         if entry.file_type().map_err(unreadable)?.is_dir() {
             if depth > 0 {
                 collect(&path, depth - 1, extensions, files)?;
@@ -149,63 +151,69 @@ fn collect(
     Ok(())
 }
 
-/// True when a file's name ends in one of these, in capitals or not.
+/// True when a file has one of these extensions, in upper or lower case.
 pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
     extensions.iter().any(|known| extension.eq_ignore_ascii_case(known))
 }
 
-/// An image file (PNG or JPEG) in grey, the way up that its Exif data says. Colours are weighted by Rec. 601, 16-bit
-/// grey is scaled to the range it uses, transparent pixels are laid over white. With a `mosaic`, an image of one
-/// channel is what a sensor gave behind it.
+/// An image file (PNG or JPEG) in grey, oriented as its Exif data says. Colours are weighted by ITU-R BT.601, 16-bit
+/// grey is scaled to the range it uses, transparent pixels are blended with white. With a `bayer` pattern, an image of
+/// one channel is a sensor's raw samples.
 ///
 /// # Errors
-/// [`ImageError`] when the file cannot be read, is no complete image, or has more than `most_pixels`.
+/// [`ImageError`] when the file cannot be read, is not a complete image, or has more than `max_pixels`.
 pub fn read_image(
     path: &Path,
-    most_pixels: u64,
-    mosaic: Option<Mosaic>,
+    max_pixels: u64,
+    bayer: Option<Mosaic>,
 ) -> Result<GrayImage, ImageError> {
-    let decoded = Decoded::read(path, most_pixels)?;
-    if mosaic.is_some() && decoded.raw_bits().is_none() {
-        return Err(ImageError::NoMosaic { path: path.to_owned() });
+    let decoded = DecodedImage::read(path, max_pixels)?;
+    if bayer.is_some() && decoded.raw_bits().is_none() {
+        return Err(ImageError::NotRaw { path: path.to_owned() });
     }
-    Ok(decoded.grey(mosaic))
+    Ok(decoded.grey(bayer))
 }
 
-/// As [`read_image`], from the bytes of a file; `path` is what errors name.
+/// Like [`read_image`], from the bytes of a file; errors name `path`.
 ///
 /// # Errors
 /// As [`read_image`].
-pub fn decode_image(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<GrayImage, ImageError> {
-    Ok(Decoded::decode(path, bytes, most_pixels)?.grey(None))
+pub fn decode_image(path: &Path, bytes: &[u8], max_pixels: u64) -> Result<GrayImage, ImageError> {
+    Ok(DecodedImage::decode(path, bytes, max_pixels)?.grey(None))
 }
 
-/// Bytes of the frame that an image file makes, from its first bytes alone.
-pub fn frame_bytes(path: &Path, most_pixels: u64) -> Result<usize, ImageError> {
-    let bytes = file_bytes(path, most_pixels)?;
-    let decoder = decoder(path, &bytes, most_pixels)?;
+/// Bytes of the frame that an image file becomes, read from its header.
+pub fn frame_bytes(path: &Path, max_pixels: u64) -> Result<usize, ImageError> {
+    let bytes = file_bytes(path, max_pixels)?;
+    let decoder = decoder(path, &bytes, max_pixels)?;
     let (width, height) = decoder.dimensions();
     let per_pixel = if decoder.color_type() == ColorType::L16 { 2 } else { 1 };
     Ok((width as usize).saturating_mul(height as usize).saturating_mul(per_pixel))
 }
 
-/// An image in the form its file has.
-pub struct Decoded {
+/// A decoded image, in the pixel format of its file.
+pub struct DecodedImage {
     image: DynamicImage,
 }
 
-impl Decoded {
+impl DecodedImage {
     /// Reads and decodes a file.
-    pub fn read(path: &Path, most_pixels: u64) -> Result<Self, ImageError> {
-        Self::decode(path, &file_bytes(path, most_pixels)?, most_pixels)
+    ///
+    /// # Errors
+    /// As [`read_image`].
+    pub fn read(path: &Path, max_pixels: u64) -> Result<Self, ImageError> {
+        Self::decode(path, &file_bytes(path, max_pixels)?, max_pixels)
     }
 
-    /// Decodes the bytes of a file.
-    pub fn decode(path: &Path, bytes: &[u8], most_pixels: u64) -> Result<Self, ImageError> {
-        let mut decoder = decoder(path, bytes, most_pixels)?;
-        // The decoder fills up what is missing of a JPEG with grey, which is no picture of anything.
-        if bytes.starts_with(JPEG_START) && jpeg_len(bytes).is_none() {
+    /// Decodes the bytes of a file; errors name `path`.
+    ///
+    /// # Errors
+    /// As [`read_image`].
+    pub fn decode(path: &Path, bytes: &[u8], max_pixels: u64) -> Result<Self, ImageError> {
+        let mut decoder = decoder(path, bytes, max_pixels)?;
+        // The decoder fills the missing part of a JPEG with grey.
+        if is_jpeg(bytes) && jpeg_len(bytes).is_none() {
             return Err(ImageError::Cut { path: path.to_owned() });
         }
         let damaged = |cause: ::image::ImageError| ImageError::Damaged {
@@ -228,7 +236,7 @@ impl Decoded {
         self.image.height() as usize
     }
 
-    /// Bits of a sample, of an image that can be what a sensor gave: grey without more.
+    /// Bits of a sample, of an image that can be raw: grey without alpha.
     pub fn raw_bits(&self) -> Option<u32> {
         match &self.image {
             DynamicImage::ImageLuma8(_) => Some(8),
@@ -238,16 +246,16 @@ impl Decoded {
     }
 
     /// The image in 8-bit grey.
-    pub fn grey(&self, mosaic: Option<Mosaic>) -> GrayImage {
+    pub fn grey(&self, bayer: Option<Mosaic>) -> GrayImage {
         let (width, height) = (self.width(), self.height());
         let black = || GrayImage::filled(width, height, 0);
         match self.raw_bits() {
-            Some(bits) if bits > 8 || mosaic.is_some() => {
+            Some(bits) if bits > 8 || bayer.is_some() => {
                 let mut samples = vec![0; width * height * bits.div_ceil(8) as usize];
                 self.write_samples(&mut samples);
-                let format = SampleFormat { bits, mosaic };
-                // An image that was decoded has a size that can be.
-                grey_of(&samples, width, height, format).unwrap_or_else(black)
+                let format = SampleFormat { bits, mosaic: bayer };
+                // A decoded image has a valid size.
+                samples_to_grey(&samples, width, height, format).unwrap_or_else(black)
             }
             _ => {
                 let mut image = black();
@@ -257,8 +265,8 @@ impl Decoded {
         }
     }
 
-    /// Writes the samples as they are, row by row, into a buffer of width times height times their bytes; those of two
-    /// bytes with the low one first. Images that are not raw are written in grey.
+    /// Writes the samples unchanged, row by row, into a buffer of width times height times bytes per sample; 16-bit
+    /// samples little-endian. Images that are not raw are written in grey.
     pub fn write_samples(&self, out: &mut [u8]) {
         match &self.image {
             DynamicImage::ImageLuma16(image) => {
@@ -271,31 +279,31 @@ impl Decoded {
         }
     }
 
-    /// Writes the pixels, row by row, into a buffer of width times height bytes.
+    /// Writes the pixels in 8-bit grey, row by row, into a buffer of width times height bytes.
     pub fn write_grey(&self, out: &mut [u8]) {
         match &self.image {
             DynamicImage::ImageLuma8(image) => fill(out, image, |[v]| v),
-            DynamicImage::ImageLumaA8(image) => fill(out, image, |[v, a]| over_white(v, a)),
+            DynamicImage::ImageLumaA8(image) => fill(out, image, |[v, a]| blend_with_white(v, a)),
             DynamicImage::ImageRgb8(image) => fill(out, image, grey),
             DynamicImage::ImageRgba8(image) => {
-                fill(out, image, |[r, g, b, a]| over_white(grey([r, g, b]), a));
+                fill(out, image, |[r, g, b, a]| blend_with_white(grey([r, g, b]), a));
             }
-            DynamicImage::ImageLuma16(image) => fill(out, image, |[v]| eight_bits(v)),
+            DynamicImage::ImageLuma16(image) => fill(out, image, |[v]| to_8_bits(v)),
             DynamicImage::ImageLumaA16(image) => {
-                fill(out, image, |[v, a]| over_white(eight_bits(v), eight_bits(a)));
+                fill(out, image, |[v, a]| blend_with_white(to_8_bits(v), to_8_bits(a)));
             }
             DynamicImage::ImageRgb16(image) => fill(out, image, grey_of_16_bits),
             DynamicImage::ImageRgba16(image) => fill(out, image, |[r, g, b, a]| {
-                over_white(grey_of_16_bits([r, g, b]), eight_bits(a))
+                blend_with_white(grey_of_16_bits([r, g, b]), to_8_bits(a))
             }),
-            // Neither PNG nor JPEG has other forms.
+            // PNG and JPEG have no other pixel formats.
             other => fill(out, &other.to_rgb8(), grey),
         }
     }
 }
 
-/// A sensor's samples in 8-bit grey; `None` when there are not as many as the size says.
-pub fn grey_of(
+/// Raw samples in 8-bit grey; `None` when their number does not match the size.
+pub fn samples_to_grey(
     samples: &[u8],
     width: usize,
     height: usize,
@@ -328,36 +336,36 @@ fn grey(rgb: [u8; 3]) -> u8 {
 }
 
 fn grey_of_16_bits(rgb: [u16; 3]) -> u8 {
-    eight_bits(luma(rgb.map(u32::from)) as u16)
+    to_8_bits(luma(rgb.map(u32::from)) as u16)
 }
 
-fn eight_bits(value: u16) -> u8 {
+fn to_8_bits(value: u16) -> u8 {
     ((u32::from(value) * 255 + 32_767) / 65_535) as u8
 }
 
-fn over_white(grey: u8, alpha: u8) -> u8 {
+fn blend_with_white(grey: u8, alpha: u8) -> u8 {
     let (grey, alpha) = (u32::from(grey), u32::from(alpha));
     ((grey * alpha + 255 * (255 - alpha) + 127) / 255) as u8
 }
 
-fn file_bytes(path: &Path, most_pixels: u64) -> Result<Vec<u8>, ImageError> {
+fn file_bytes(path: &Path, max_pixels: u64) -> Result<Vec<u8>, ImageError> {
     let unreadable = |cause| ImageError::Unreadable { path: path.to_owned(), cause };
     let metadata = std::fs::metadata(path).map_err(unreadable)?;
     // Opening a pipe would wait for its writer.
     if !metadata.is_file() {
         return Err(ImageError::NotAFile { path: path.to_owned() });
     }
-    if metadata.len() > most_pixels.saturating_mul(8).saturating_add(MOST_EXTRA_BYTES) {
+    if metadata.len() > max_pixels.saturating_mul(8).saturating_add(MAX_METADATA_BYTES) {
         return Err(ImageError::TooLong { path: path.to_owned(), len: metadata.len() });
     }
     std::fs::read(path).map_err(unreadable)
 }
 
-/// A decoder of an image whose size was found to be within the limit.
+/// A decoder of an image whose size is within the limit.
 fn decoder<'a>(
     path: &Path,
     bytes: &'a [u8],
-    most_pixels: u64,
+    max_pixels: u64,
 ) -> Result<impl ImageDecoder + 'a, ImageError> {
     let damaged = |cause: &dyn std::fmt::Display| ImageError::Damaged {
         path: path.to_owned(),
@@ -377,37 +385,17 @@ fn decoder<'a>(
     let (width, height) = decoder.dimensions();
     let edge = GrayView::LARGEST_EDGE_PX as u64;
     let pixels = u64::from(width) * u64::from(height);
-    if pixels > most_pixels || u64::from(width.max(height)) > edge {
-        return Err(ImageError::TooLarge { path: path.to_owned(), width, height, most_pixels });
+    if pixels > max_pixels || u64::from(width.max(height)) > edge {
+        return Err(ImageError::TooLarge { path: path.to_owned(), width, height, max_pixels });
     }
     if pixels == 0 {
         return Err(damaged(&format!("an image of {width} x {height} pixels")));
     }
-    // Eight bytes a pixel is the widest form there is, and a decoder may need it twice.
+    // The widest pixel format has 8 bytes, and a decoder may need twice that.
     let mut limits = Limits::no_limits();
-    limits.max_alloc = Some(most_pixels.saturating_mul(16).saturating_add(MOST_EXTRA_BYTES));
+    limits.max_alloc = Some(max_pixels.saturating_mul(16).saturating_add(MAX_METADATA_BYTES));
     decoder.set_limits(limits).map_err(|cause| damaged(&cause))?;
     Ok(decoder)
-}
-
-const JPEG_START: &[u8] = &[0xff, 0xd8];
-
-/// Bytes of the JPEG file that begins here, when its segments lead to its end marker (ISO/IEC 10918-1, Annex B).
-pub fn jpeg_len(bytes: &[u8]) -> Option<usize> {
-    let mut at = JPEG_START.len();
-    loop {
-        // Between segments, and through the coded data after a scan's header, up to the next marker.
-        at += 1 + bytes.get(at..)?.iter().position(|byte| *byte == 0xff)?;
-        match bytes.get(at)? {
-            // Fill, stuffed byte, temporary marker, restart: none has a length.
-            0xff | 0x00 | 0x01 | 0xd0..=0xd8 => {}
-            0xd9 => return Some(at + 1),
-            _ => {
-                let &[high, low] = bytes.get(at + 1..at + 3)? else { return None };
-                at += 1 + usize::from(u16::from_be_bytes([high, low])).max(2);
-            }
-        }
-    }
 }
 
 #[cfg(test)]
@@ -421,10 +409,10 @@ mod tests {
         bytes.into_inner()
     }
 
-    fn read_bytes(bytes: &[u8], most_pixels: u64) -> Result<GrayImage, String> {
+    fn read_bytes(bytes: &[u8], max_pixels: u64) -> Result<GrayImage, String> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), bytes).unwrap();
-        read_image(file.path(), most_pixels, None).map_err(|e| e.to_string())
+        read_image(file.path(), max_pixels, None).map_err(|e| e.to_string())
     }
 
     fn photo() -> DynamicImage {
@@ -463,7 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mosaic_becomes_grey_and_an_image_with_colours_is_none() {
+    fn raw_samples_become_grey_and_a_colour_image_is_refused() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let read = |image: DynamicImage| {
             std::fs::write(file.path(), bytes_of(&image, ImageFormat::Png)).unwrap();
@@ -473,14 +461,14 @@ mod tests {
         let grey = read(ImageBuffer::from_fn(8, 6, |x, y| Luma([mosaic(x, y)])).into()).unwrap();
         assert!(grey.pixels().iter().all(|pixel| *pixel == 120));
         let problem = read(ImageBuffer::from_pixel(8, 6, Rgb([1_u8, 2, 3])).into()).unwrap_err();
-        assert!(problem.contains("has colours already"), "{problem}");
+        assert!(problem.contains("is a colour image"), "{problem}");
     }
 
     #[test]
     fn a_jpeg_keeps_its_grey_levels() {
-        let read = read_bytes(&bytes_of(&photo(), ImageFormat::Jpeg), MOST_PIXELS).unwrap();
+        let read = read_bytes(&bytes_of(&photo(), ImageFormat::Jpeg), DEFAULT_MAX_PIXELS).unwrap();
         let mut exact = vec![0; 64 * 48];
-        Decoded { image: photo() }.write_grey(&mut exact);
+        DecodedImage { image: photo() }.write_grey(&mut exact);
         let error: u32 =
             read.pixels().iter().zip(&exact).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
         assert!(error / (64 * 48) < 6, "{error}");
@@ -490,10 +478,13 @@ mod tests {
     fn files_that_are_cut_anywhere_are_refused() {
         for format in [ImageFormat::Png, ImageFormat::Jpeg] {
             let whole = bytes_of(&photo(), format);
-            assert!(read_bytes(&whole, MOST_PIXELS).is_ok());
+            assert!(read_bytes(&whole, DEFAULT_MAX_PIXELS).is_ok());
             // A PNG without its 12 last bytes has all its pixels.
             for len in (0..whole.len() - 12).step_by(7) {
-                assert!(read_bytes(&whole[..len], MOST_PIXELS).is_err(), "{format:?} cut at {len}");
+                assert!(
+                    read_bytes(&whole[..len], DEFAULT_MAX_PIXELS).is_err(),
+                    "{format:?} cut at {len}"
+                );
             }
         }
     }
@@ -505,7 +496,7 @@ mod tests {
             for at in (0..whole.len()).step_by(11) {
                 let mut damaged = whole.clone();
                 damaged[at] ^= 0x5a;
-                // Whether it can be read depends on the place; what counts is that there is an answer.
+                // Some places do not matter: the test is that there is an answer.
                 drop(read_bytes(&damaged, 100_000));
             }
         }
@@ -517,25 +508,25 @@ mod tests {
             let image: DynamicImage = ImageBuffer::from_pixel(width, height, Luma([9_u8])).into();
             read_bytes(&bytes_of(&image, ImageFormat::Png), most).map(|i| i.width())
         };
-        assert_eq!(problem(65_535, 1, MOST_PIXELS), Ok(65_535));
-        assert!(problem(65_536, 1, MOST_PIXELS).unwrap_err().contains("65536 x 1 pixels"));
-        assert!(problem(11, 10, 100).unwrap_err().contains("more than the 100 that are allowed"));
+        assert_eq!(problem(65_535, 1, DEFAULT_MAX_PIXELS), Ok(65_535));
+        assert!(problem(65_536, 1, DEFAULT_MAX_PIXELS).unwrap_err().contains("65536 x 1 pixels"));
+        assert!(problem(11, 10, 100).unwrap_err().contains("the limit is 100 pixels"));
         // The header of a PNG of 65535 x 65535 pixels, without pixels.
         let small = bytes_of(&photo(), ImageFormat::Png);
         let header = png_of_size(&small, 65_535, 65_535);
-        assert!(read_bytes(&header, MOST_PIXELS).unwrap_err().contains("65535 x 65535"));
+        assert!(read_bytes(&header, DEFAULT_MAX_PIXELS).unwrap_err().contains("65535 x 65535"));
         let nothing = png_of_size(&small, 0, 0);
-        assert!(read_bytes(&nothing, MOST_PIXELS).is_err());
-        // The same of a JPEG, whose size stands in its frame header.
+        assert!(read_bytes(&nothing, DEFAULT_MAX_PIXELS).is_err());
+        // The same with a JPEG, whose size is in its frame header.
         let mut jpeg = bytes_of(&photo(), ImageFormat::Jpeg);
         let at = jpeg.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
         jpeg[at + 5..at + 9].copy_from_slice(&[0xff; 4]);
-        assert!(read_bytes(&jpeg, MOST_PIXELS).unwrap_err().contains("65535 x 65535"));
+        assert!(read_bytes(&jpeg, DEFAULT_MAX_PIXELS).unwrap_err().contains("65535 x 65535"));
         jpeg[at + 5..at + 9].copy_from_slice(&[0; 4]);
-        assert!(read_bytes(&jpeg, MOST_PIXELS).is_err());
+        assert!(read_bytes(&jpeg, DEFAULT_MAX_PIXELS).is_err());
     }
 
-    /// A PNG with another size in its header, and the checksum to go with it.
+    /// A PNG with another size in its header, and a correct checksum.
     fn png_of_size(png: &[u8], width: u32, height: u32) -> Vec<u8> {
         let mut png = png.to_vec();
         png[16..20].copy_from_slice(&width.to_be_bytes());
@@ -552,8 +543,9 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_image_is_named() {
-        let problem = |path: &Path| read_image(path, MOST_PIXELS, None).unwrap_err().to_string();
+    fn files_that_are_not_images_are_named() {
+        let problem =
+            |path: &Path| read_image(path, DEFAULT_MAX_PIXELS, None).unwrap_err().to_string();
         let folder = tempfile::tempdir().unwrap();
         assert!(problem(Path::new("no/such.png")).contains("no/such.png"));
         assert!(problem(folder.path()).contains("is not a file"));
@@ -565,7 +557,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_is_listed_by_name_and_to_the_bottom() {
+    fn folders_are_listed_recursively_and_sorted() {
         let folder = tempfile::tempdir().unwrap();
         let empty = images_in(folder.path()).unwrap_err().to_string();
         assert!(empty.contains("holds no images; their names end in .png, .jpg"), "{empty}");

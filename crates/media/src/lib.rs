@@ -1,17 +1,19 @@
 //! Images, videos and calibration files, read into grey images and camera models.
 //!
-//! The crate reads files. It knows no marker, no connected camera, and no other process.
+//! The crate reads files. It knows no marker, no camera that is connected, and no other process.
 //!
-//! Modules in reading order: [`image`] reads image files, [`video`] reads videos frame by frame, [`calibration`] reads
-//! the calibration files of other programs.
+//! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, [`image`] reads image files, [`video`]
+//! reads videos frame by frame, [`calibration`] reads the calibration files of other programs.
 
 pub mod calibration;
 pub mod image;
+pub mod jpeg;
 pub mod video;
 
 pub use calibration::{CalibrationError, read_calibration};
 pub use image::{
-    Decoded, IMAGE_EXTENSIONS, ImageError, MOST_PIXELS, decode_image, files_in, frame_bytes,
-    grey_of, images_in, jpeg_len, read_image,
+    DEFAULT_MAX_PIXELS, DecodedImage, IMAGE_EXTENSIONS, ImageError, decode_image, files_in,
+    frame_bytes, images_in, read_image, samples_to_grey,
 };
-pub use video::{Picture, VIDEO_EXTENSIONS, Video, VideoError, VideoFrame, is_video};
+pub use jpeg::JpegScanner;
+pub use video::{VIDEO_EXTENSIONS, Video, VideoError, VideoFrame, VideoImage, is_video};

@@ -10,22 +10,25 @@ use rust_h264::decoder::OrderedDecoder;
 use rust_h264::nal::{NalUnit, NalUnitType, parse_annex_b, parse_avcc, parse_sps_info};
 
 use crate::image::{ImageError, decode_image, has_extension};
+use crate::jpeg::next_jpeg;
 
-/// Ends of the names of videos, those that cannot be read included, so that their owner hears what to do.
+/// File extensions of videos, including formats that are refused with advice on how to convert them.
 pub const VIDEO_EXTENSIONS: &[&str] = &[
     "avi", "mjpeg", "mjpg", "mp4", "m4v", "mov", "h264", "264", "mkv", "webm", "wmv", "mpg",
     "mpeg", "ts",
 ];
 
-/// Bare streams are read as a whole up to this many bytes.
-const LARGEST_STREAM: u64 = 1 << 30;
-/// Bytes of one coded frame.
-const LARGEST_FRAME: u64 = 256 << 20;
+/// Maximum bytes of a bare stream, which is read into memory as a whole.
+const MAX_STREAM_BYTES: u64 = 1 << 30;
+/// Maximum bytes of one coded frame.
+const MAX_FRAME_BYTES: u64 = 256 << 20;
+/// Frame rate of streams that do not state theirs, in hertz.
+const DEFAULT_RATE_HZ: f64 = 25.0;
 
 /// Why a video or one of its frames was not read, and what to do about it.
 #[derive(Debug, thiserror::Error)]
 pub enum VideoError {
-    /// A file that the system does not open or read.
+    /// The system does not open or read a file.
     #[error("{path:?} cannot be read: {cause}; check the path and its permissions")]
     Unreadable {
         /// The file.
@@ -33,10 +36,10 @@ pub enum VideoError {
         /// The system's reason.
         cause: std::io::Error,
     },
-    /// A form of video that is not read here.
+    /// A container or codec that is not supported.
     #[error(
-        "{path:?} is {what}; videos are read as Motion JPEG (.avi, .mjpeg) or H.264 of 8 bits (.mp4, .mov, .h264). \
-         Convert it without loss that matters: ffmpeg -i {path:?} -c:v mjpeg -q:v 2 -an video.avi"
+        "{path:?} is {what}; supported are Motion JPEG (.avi, .mjpeg) and 8-bit H.264 (.mp4, .mov, .h264). \
+         Convert it with: ffmpeg -i {path:?} -c:v mjpeg -q:v 2 -an video.avi"
     )]
     Unsupported {
         /// The file.
@@ -44,7 +47,7 @@ pub enum VideoError {
         /// What it is.
         what: String,
     },
-    /// Bytes that make no video.
+    /// Bytes that are not a valid video.
     #[error("{path:?} is damaged or cut short: {cause}")]
     Damaged {
         /// The file.
@@ -54,7 +57,7 @@ pub enum VideoError {
     },
 }
 
-/// True for files whose names say that they are videos.
+/// True for files with the extension of a video.
 pub fn is_video(path: &Path) -> bool {
     has_extension(path, VIDEO_EXTENSIONS)
 }
@@ -62,31 +65,31 @@ pub fn is_video(path: &Path) -> bool {
 /// A frame of a video.
 #[derive(Debug)]
 pub struct VideoFrame {
-    /// Counts the frames from 0.
+    /// Number of the frame, from 0.
     pub index: u64,
-    /// Since the first frame, in seconds.
+    /// Time since the first frame, in seconds.
     pub time_s: f64,
-    /// The picture.
-    pub picture: Picture,
+    /// The image.
+    pub image: VideoImage,
 }
 
-/// A picture, decoded or not yet.
+/// The image of a frame. JPEG files are decoded later, by whoever needs the pixels and on any thread.
 #[derive(Debug)]
-pub enum Picture {
+pub enum VideoImage {
     /// A JPEG file.
     Jpeg(Vec<u8>),
-    /// Grey.
+    /// Decoded to grey.
     Grey(GrayImage),
 }
 
-impl Picture {
-    /// The picture in grey; `path` is what errors name.
+impl VideoImage {
+    /// The image in grey; errors name `path`.
     ///
     /// # Errors
-    /// When a JPEG is damaged or too large.
-    pub fn grey(self, path: &Path, most_pixels: u64) -> Result<GrayImage, ImageError> {
+    /// When a JPEG is damaged or has more than `max_pixels`.
+    pub fn grey(self, path: &Path, max_pixels: u64) -> Result<GrayImage, ImageError> {
         match self {
-            Self::Jpeg(bytes) => decode_image(path, &bytes, most_pixels),
+            Self::Jpeg(bytes) => decode_image(path, &bytes, max_pixels),
             Self::Grey(image) => Ok(image),
         }
     }
@@ -95,7 +98,7 @@ impl Picture {
 /// An opened video.
 pub struct Video {
     path: PathBuf,
-    most_pixels: u64,
+    max_pixels: u64,
     stream: Stream,
     period_s: f64,
     next: u64,
@@ -108,15 +111,12 @@ enum Stream {
     Ended,
 }
 
-/// Frames a second of streams that do not say how many.
-const USUAL_RATE_HZ: f64 = 25.0;
-
 impl Video {
-    /// Opens a video whose frames have up to `most_pixels`.
+    /// Opens a video whose frames have at most `max_pixels`.
     ///
     /// # Errors
-    /// [`VideoError`] when it cannot be read, or is none that is read here.
-    pub fn open(path: &Path, most_pixels: u64) -> Result<Self, VideoError> {
+    /// [`VideoError`] when it cannot be read or is not supported.
+    pub fn open(path: &Path, max_pixels: u64) -> Result<Self, VideoError> {
         let problems = Problems { path };
         let mut file = BufReader::new(File::open(path).map_err(|e| problems.unreadable(e))?);
         let mut start = Vec::new();
@@ -129,38 +129,40 @@ impl Video {
             }
             [0xff, 0xd8, ..] => {
                 let bytes = whole(file, &problems)?;
-                (Stream::Jpegs { bytes, at: 0 }, 1.0 / USUAL_RATE_HZ)
+                (Stream::Jpegs { bytes, at: 0 }, 1.0 / DEFAULT_RATE_HZ)
             }
             [_, _, _, _, b'f', b't', b'y', b'p', ..] => {
-                let (decoder, period_s) = H264::from_mp4(file, &problems, most_pixels)?;
+                let (decoder, period_s) = H264::from_mp4(file, &problems, max_pixels)?;
                 (Stream::H264(Box::new(decoder)), period_s)
             }
             [0, 0, 1, ..] | [0, 0, 0, 1, ..] if has_extension(path, &["h264", "264"]) => {
                 let decoder = H264::from_stream(whole(file, &problems)?);
-                (Stream::H264(Box::new(decoder)), 1.0 / USUAL_RATE_HZ)
+                (Stream::H264(Box::new(decoder)), 1.0 / DEFAULT_RATE_HZ)
             }
-            _ => return Err(problems.unsupported("of a kind that is not read")),
+            _ => return Err(problems.unsupported("in an unknown container")),
         };
         let path = path.to_owned();
-        Ok(Self { path, most_pixels, stream, period_s, next: 0 })
+        Ok(Self { path, max_pixels, stream, period_s, next: 0 })
     }
 
     /// The next frame; `None` after the last. After an error there are no more.
     pub fn next_frame(&mut self) -> Option<Result<VideoFrame, VideoError>> {
         let problems = Problems { path: &self.path };
-        let picture = match &mut self.stream {
+        let image = match &mut self.stream {
             Stream::Avi(reader) => reader.next(&problems),
-            Stream::Jpegs { bytes, at } => next_jpeg(bytes, at).map(Ok),
-            Stream::H264(decoder) => decoder.next(&problems, self.most_pixels),
+            Stream::Jpegs { bytes, at } => {
+                next_jpeg(bytes, at).map(|jpeg| Ok(VideoImage::Jpeg(jpeg.to_vec())))
+            }
+            Stream::H264(decoder) => decoder.next(&problems, self.max_pixels),
             Stream::Ended => None,
         };
-        if !matches!(picture, Some(Ok(_))) {
+        if !matches!(image, Some(Ok(_))) {
             self.stream = Stream::Ended;
         }
         let index = self.next;
         self.next += 1;
         let time_s = index as f64 * self.period_s;
-        picture.map(|picture| Ok(VideoFrame { index, time_s, picture: picture? }))
+        image.map(|image| Ok(VideoFrame { index, time_s, image: image? }))
     }
 }
 
@@ -172,7 +174,7 @@ struct Problems<'a> {
 impl Problems<'_> {
     fn unreadable(&self, cause: std::io::Error) -> VideoError {
         match cause.kind() {
-            ErrorKind::UnexpectedEof => self.damaged("it ends in the middle of something"),
+            ErrorKind::UnexpectedEof => self.damaged("it ends in the middle of a chunk"),
             _ => VideoError::Unreadable { path: self.path.to_owned(), cause },
         }
     }
@@ -188,41 +190,46 @@ impl Problems<'_> {
 
 fn whole(file: BufReader<File>, problems: &Problems<'_>) -> Result<Vec<u8>, VideoError> {
     let mut bytes = Vec::new();
-    file.take(LARGEST_STREAM).read_to_end(&mut bytes).map_err(|e| problems.unreadable(e))?;
-    if bytes.len() as u64 == LARGEST_STREAM {
+    file.take(MAX_STREAM_BYTES).read_to_end(&mut bytes).map_err(|e| problems.unreadable(e))?;
+    if bytes.len() as u64 == MAX_STREAM_BYTES {
         return Err(problems.unsupported("a bare stream of more than 1 GiB"));
     }
     Ok(bytes)
 }
 
-/// The next file in a row of JPEG files: from one start to the byte before the next start after an end.
-fn next_jpeg(bytes: &[u8], at: &mut usize) -> Option<Picture> {
-    let rest = bytes.get(*at..)?;
-    let start = rest.windows(3).position(|w| w == [0xff, 0xd8, 0xff])?;
-    let body = rest.get(start..)?;
-    let is_end = |w: &[u8]| w == [0xff, 0xd9, 0xff, 0xd8];
-    let len = body.windows(4).position(is_end).map_or(body.len(), |end| end + 2);
-    *at += start + len;
-    body.get(..len).map(|jpeg| Picture::Jpeg(jpeg.to_vec()))
-}
-
-/// The chunks of an AVI file (RIFF) that are frames of its first video stream, in order.
+/// Reads the frames of the first video stream of an AVI file (RIFF).
 struct AviReader {
     file: BufReader<File>,
-    /// Ids of the stream's chunks: compressed and uncompressed.
+    /// Ids of the stream's chunks, compressed and uncompressed.
     ids: [[u8; 4]; 2],
-    /// Width and height of frames that are grey pixels; those of others are JPEG files.
+    /// Width and height of raw grey frames; `None` for frames that are JPEG files.
     grey: Option<[usize; 2]>,
 }
 
-/// What the header says of a stream.
+/// A chunk among the frames.
+enum AviChunk {
+    Frame(Vec<u8>),
+    Other,
+    End,
+}
+
+/// What the header says.
 #[derive(Default)]
 struct AviHeader {
     period_us: u32,
     streams: u32,
-    /// The first video stream: its number, codec, width and height.
-    video: Option<(u32, [u8; 4], [i32; 2])>,
+    video: Option<AviStream>,
+    /// Whether the last stream header was that of a video.
     is_video: bool,
+}
+
+/// The first video stream.
+struct AviStream {
+    number: u32,
+    codec: [u8; 4],
+    width: i32,
+    /// Negative for rows from top to bottom.
+    height: i32,
 }
 
 impl AviReader {
@@ -238,7 +245,7 @@ impl AviReader {
                 file.read_exact(&mut kind).map_err(|e| problems.unreadable(e))?;
                 match &kind {
                     b"movi" => break,
-                    // Its parts are chunks like others.
+                    // These lists are entered: their parts are chunks.
                     b"hdrl" | b"strl" => {}
                     _ => skip(&mut file, u64::from(len).saturating_sub(4), len)
                         .map_err(|e| problems.unreadable(e))?,
@@ -251,7 +258,7 @@ impl AviReader {
             skip(&mut file, u64::from(len) - known, len).map_err(|e| problems.unreadable(e))?;
             header.take(id, &body);
         }
-        let Some((number, codec, [width, height])) = header.video else {
+        let Some(AviStream { number, codec, width, height }) = header.video else {
             return Err(problems.unsupported("an AVI file without video"));
         };
         let grey = match &codec.map(|c| c.to_ascii_uppercase()) {
@@ -267,42 +274,41 @@ impl AviReader {
         let digits = [number / 10 % 10, number % 10].map(|digit| b'0' + digit as u8);
         let ids = [*b"dc", *b"db"].map(|kind| [digits[0], digits[1], kind[0], kind[1]]);
         let period_s = match header.period_us {
-            0 => 1.0 / USUAL_RATE_HZ,
+            0 => 1.0 / DEFAULT_RATE_HZ,
             micros => f64::from(micros) * 1e-6,
         };
         Ok((Self { file, ids, grey }, period_s))
     }
 
-    fn next(&mut self, problems: &Problems<'_>) -> Option<Result<Picture, VideoError>> {
+    fn next(&mut self, problems: &Problems<'_>) -> Option<Result<VideoImage, VideoError>> {
         loop {
             match self.next_chunk() {
-                Ok(Some(Some(bytes))) => match self.grey {
-                    None => return Some(Ok(Picture::Jpeg(bytes))),
-                    Some([width, height]) => return grey_picture(&bytes, width, height).map(Ok),
+                Ok(AviChunk::Frame(bytes)) => match self.grey {
+                    None => return Some(Ok(VideoImage::Jpeg(bytes))),
+                    Some([width, height]) => return grey_image(&bytes, width, height).map(Ok),
                 },
-                Ok(Some(None)) => {}
-                Ok(None) => return None,
+                Ok(AviChunk::Other) => {}
+                Ok(AviChunk::End) => return None,
                 Err(cause) => return Some(Err(problems.unreadable(cause))),
             }
         }
     }
 
-    /// The next chunk: `None` at the end, nothing in it when it is no frame.
-    fn next_chunk(&mut self) -> std::io::Result<Option<Option<Vec<u8>>>> {
-        let Some((id, len)) = chunk(&mut self.file)? else { return Ok(None) };
+    fn next_chunk(&mut self) -> std::io::Result<AviChunk> {
+        let Some((id, len)) = chunk(&mut self.file)? else { return Ok(AviChunk::End) };
         if id == *b"LIST" || id == *b"RIFF" {
-            // Groups of frames, and what follows in files of more than 1 GiB.
+            // Groups of frames, and the further parts of files of more than 1 GiB.
             let mut kind = [0; 4];
             self.file.read_exact(&mut kind)?;
             if !matches!(&kind, b"rec " | b"movi" | b"AVIX") {
                 skip(&mut self.file, u64::from(len).saturating_sub(4), len)?;
             }
-            return Ok(Some(None));
+            return Ok(AviChunk::Other);
         }
-        // A dropped frame is a chunk without bytes.
-        if !self.ids.contains(&id) || len == 0 || u64::from(len) > LARGEST_FRAME {
+        // A dropped frame is an empty chunk.
+        if !self.ids.contains(&id) || len == 0 || u64::from(len) > MAX_FRAME_BYTES {
             skip(&mut self.file, u64::from(len), len)?;
-            return Ok(Some(None));
+            return Ok(AviChunk::Other);
         }
         let mut bytes = Vec::new();
         self.file.by_ref().take(u64::from(len)).read_to_end(&mut bytes)?;
@@ -310,7 +316,7 @@ impl AviReader {
             return Err(ErrorKind::UnexpectedEof.into());
         }
         skip(&mut self.file, 0, len)?;
-        Ok(Some(Some(bytes)))
+        Ok(AviChunk::Frame(bytes))
     }
 }
 
@@ -326,7 +332,8 @@ impl AviHeader {
             }
             b"strf" if self.is_video && self.video.is_none() => {
                 if let (Some(width), Some(height), Some(codec)) = (number(4), number(8), four(16)) {
-                    self.video = Some((self.streams - 1, codec, [width, height]));
+                    let number = self.streams - 1;
+                    self.video = Some(AviStream { number, codec, width, height });
                 }
             }
             _ => {}
@@ -334,7 +341,7 @@ impl AviHeader {
     }
 }
 
-/// The head of the next chunk; `None` at the end of the file.
+/// Id and length of the next chunk; `None` at the end of the file.
 fn chunk(file: &mut impl Read) -> std::io::Result<Option<([u8; 4], u32)>> {
     let mut head = [0; 8];
     match file.read_exact(&mut head) {
@@ -347,13 +354,13 @@ fn chunk(file: &mut impl Read) -> std::io::Result<Option<([u8; 4], u32)>> {
     }
 }
 
-/// Goes on behind the rest of a chunk of `len` bytes; chunks begin at even places.
+/// Skips the remaining `rest` bytes of a chunk of `len` bytes, and the padding to an even address.
 fn skip(file: &mut BufReader<File>, rest: u64, len: u32) -> std::io::Result<()> {
     file.seek_relative((rest + u64::from(len % 2)) as i64)
 }
 
-/// Rows of grey pixels, padded to four bytes.
-fn grey_picture(bytes: &[u8], width: usize, height: usize) -> Option<Picture> {
+/// Grey pixels in rows that are padded to a multiple of four bytes.
+fn grey_image(bytes: &[u8], width: usize, height: usize) -> Option<VideoImage> {
     let stride = width.next_multiple_of(4);
     if bytes.len() < stride.checked_mul(height)? {
         return None;
@@ -362,14 +369,14 @@ fn grey_picture(bytes: &[u8], width: usize, height: usize) -> Option<Picture> {
     for (y, row) in bytes.chunks_exact(stride).take(height).enumerate() {
         image.row_mut(y).copy_from_slice(row.get(..width)?);
     }
-    Some(Picture::Grey(image))
+    Some(VideoImage::Grey(image))
 }
 
-/// Decodes H.264, one coded picture after the other.
+/// Decodes H.264, one access unit after the other.
 struct H264 {
     decoder: OrderedDecoder,
     source: Source,
-    /// Pictures that are decoded and wait for their turn.
+    /// Decoded images, in order of presentation.
     ready: VecDeque<GrayImage>,
     is_over: bool,
 }
@@ -383,7 +390,7 @@ impl H264 {
     fn from_mp4(
         file: BufReader<File>,
         problems: &Problems<'_>,
-        most_pixels: u64,
+        max_pixels: u64,
     ) -> Result<(Self, f64), VideoError> {
         let size = file.get_ref().metadata().map_err(|e| problems.unreadable(e))?.len();
         let reader = mp4::Mp4Reader::read_header(file, size).map_err(|e| problems.damaged(e))?;
@@ -391,7 +398,7 @@ impl H264 {
             track.track_type().is_ok_and(|kind| kind == mp4::TrackType::Video)
         };
         let Some(track) = reader.tracks().values().find(is_video) else {
-            return Err(problems.unsupported("an MP4 file without video that is known here"));
+            return Err(problems.unsupported("an MP4 file without a known video track"));
         };
         let Some(avc1) = &track.trak.mdia.minf.stbl.stsd.avc1 else {
             return Err(problems.unsupported("an MP4 file whose video is not H.264"));
@@ -402,12 +409,12 @@ impl H264 {
         for parameter in parameters {
             let bytes = [&[0, 0, 1], parameter.bytes.as_slice()].concat();
             for unit in parse_annex_b(&bytes) {
-                check_size(&unit, problems, most_pixels)?;
+                check_size(&unit, problems, max_pixels)?;
                 decoder.decode_nal(&unit).map_err(|e| problems.damaged(e))?;
             }
         }
         let seconds = track.duration().as_secs_f64() / f64::from(track.sample_count().max(1));
-        let period_s = if seconds > 0.0 { seconds } else { 1.0 / USUAL_RATE_HZ };
+        let period_s = if seconds > 0.0 { seconds } else { 1.0 / DEFAULT_RATE_HZ };
         let length_bytes = usize::from(avc1.avcc.length_size_minus_one & 3) + 1;
         let track = track.track_id();
         let source = Source::Mp4 { reader: Box::new(reader), track, next: 1, length_bytes };
@@ -422,21 +429,21 @@ impl H264 {
     fn next(
         &mut self,
         problems: &Problems<'_>,
-        most_pixels: u64,
-    ) -> Option<Result<Picture, VideoError>> {
+        max_pixels: u64,
+    ) -> Option<Result<VideoImage, VideoError>> {
         while self.ready.is_empty() && !self.is_over {
-            if let Err(problem) = self.decode_more(problems, most_pixels) {
+            if let Err(problem) = self.decode_more(problems, max_pixels) {
                 self.is_over = true;
                 return Some(Err(problem));
             }
         }
-        self.ready.pop_front().map(|image| Ok(Picture::Grey(image)))
+        self.ready.pop_front().map(|image| Ok(VideoImage::Grey(image)))
     }
 
-    fn decode_more(&mut self, problems: &Problems<'_>, most_pixels: u64) -> Result<(), VideoError> {
+    fn decode_more(&mut self, problems: &Problems<'_>, max_pixels: u64) -> Result<(), VideoError> {
         let mut frames = Vec::new();
         let mut decode = |unit: &NalUnit<'_>| {
-            check_size(unit, problems, most_pixels)?;
+            check_size(unit, problems, max_pixels)?;
             frames.extend(self.decoder.decode_nal(unit).map_err(|e| problems.damaged(e))?);
             Ok(())
         };
@@ -485,19 +492,20 @@ fn next_unit<'a>(bytes: &'a [u8], at: &mut usize) -> Option<&'a [u8]> {
     rest.get(..len)
 }
 
-/// Refuses pictures of more pixels than are allowed before they are decoded.
+/// Refuses images of more than `max_pixels` before they are decoded.
 fn check_size(
     unit: &NalUnit<'_>,
     problems: &Problems<'_>,
-    most_pixels: u64,
+    max_pixels: u64,
 ) -> Result<(), VideoError> {
     if unit.nal_unit_type != NalUnitType::Sps {
         return Ok(());
     }
     let info = parse_sps_info(unit).map_err(|e| problems.damaged(e))?;
     let pixels = u64::from(info.coded_width) * u64::from(info.coded_height);
-    if pixels > most_pixels {
-        return Err(problems.unsupported(&format!("a video of {pixels} pixels, too many,")));
+    if pixels > max_pixels {
+        return Err(problems
+            .unsupported(&format!("a video of {pixels} pixels per frame (limit {max_pixels})")));
     }
     Ok(())
 }
@@ -508,7 +516,7 @@ mod tests {
     use ::image::{ImageFormat, Luma};
     use std::io::Cursor;
 
-    const MOST: u64 = 1_000_000;
+    const MAX_PIXELS: u64 = 1_000_000;
 
     fn jpeg(level: u8) -> Vec<u8> {
         let image = ::image::GrayImage::from_pixel(16, 8, Luma([level]));
@@ -552,11 +560,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).unwrap();
-        let mut video = Video::open(&path, MOST).map_err(|e| e.to_string())?;
+        let mut video = Video::open(&path, MAX_PIXELS).map_err(|e| e.to_string())?;
         let mut levels = Vec::new();
         while let Some(frame) = video.next_frame() {
             let frame = frame.map_err(|e| e.to_string())?;
-            let image = frame.picture.grey(&path, MOST).map_err(|e| e.to_string())?;
+            let image = frame.image.grey(&path, MAX_PIXELS).map_err(|e| e.to_string())?;
             assert_eq!((image.width(), image.height()), (16, 8));
             levels.push((image.pixels()[20], frame.time_s));
         }
@@ -583,7 +591,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_read_says_how_to_convert_it() {
+    fn unsupported_videos_are_refused_with_advice() {
         for (name, bytes) in [
             ("a.avi", avi(b"XVID", &[])),
             ("a.mkv", b"\x1a\x45\xdf\xa3 and more".to_vec()),
@@ -593,7 +601,7 @@ mod tests {
             assert!(problem.contains("ffmpeg -i") && problem.contains(name), "{problem}");
         }
         assert!(levels("a.avi", &avi(b"XVID", &[])).unwrap_err().contains("\"XVID\""));
-        assert!(Video::open(Path::new("no/such.avi"), MOST).is_err());
+        assert!(Video::open(Path::new("no/such.avi"), MAX_PIXELS).is_err());
         assert!(is_video(Path::new("a.MP4")) && !is_video(Path::new("a.png")));
     }
 
@@ -609,7 +617,7 @@ mod tests {
             let folder = tempfile::tempdir().unwrap();
             let path = folder.path().join("a.avi");
             std::fs::write(&path, damaged).unwrap();
-            if let Ok(mut video) = Video::open(&path, MOST) {
+            if let Ok(mut video) = Video::open(&path, MAX_PIXELS) {
                 while let Some(Ok(_)) = video.next_frame() {}
             }
         }

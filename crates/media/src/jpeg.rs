@@ -1,0 +1,167 @@
+//! JPEG files in a stream of bytes: where one starts (SOI) and where it ends (EOI), after ISO/IEC 10918-1, Annex B.
+
+/// Start-of-image marker.
+const SOI: [u8; 2] = [0xff, 0xd8];
+/// End-of-image marker.
+const EOI: [u8; 2] = [0xff, 0xd9];
+
+/// True for bytes that begin as a JPEG file does.
+pub(crate) fn is_jpeg(bytes: &[u8]) -> bool {
+    bytes.starts_with(&SOI)
+}
+
+/// Length of the JPEG file at the start of `bytes`, to its EOI marker; `None` when there is none.
+pub(crate) fn jpeg_len(bytes: &[u8]) -> Option<usize> {
+    end_of_image(bytes, &mut SOI.len())
+}
+
+/// The next JPEG file in `bytes`, at or after `at`, which moves behind it. A file whose segments do not lead to an EOI
+/// marker ends where EOI and SOI follow each other, or with the stream.
+pub(crate) fn next_jpeg<'a>(bytes: &'a [u8], at: &mut usize) -> Option<&'a [u8]> {
+    let rest = bytes.get(*at..)?;
+    let start = rest.windows(3).position(|w| w == [SOI[0], SOI[1], 0xff])?;
+    let file = rest.get(start..)?;
+    let boundary = [EOI, SOI].concat();
+    let len = jpeg_len(file)
+        .or_else(|| Some(file.windows(4).position(|w| w == boundary)? + EOI.len()))
+        .unwrap_or(file.len());
+    *at += start + len;
+    file.get(..len)
+}
+
+/// Follows the segments from `at`, a place between segments or in coded data, to the end of the EOI marker. Where bytes
+/// are missing, `at` is the place to go on from once there are more.
+fn end_of_image(bytes: &[u8], at: &mut usize) -> Option<usize> {
+    loop {
+        let ahead = bytes.get(*at..)?;
+        let Some(next) = ahead.iter().position(|byte| *byte == 0xff) else {
+            *at = bytes.len();
+            return None;
+        };
+        *at += next;
+        let code = *at + 1;
+        match bytes.get(code)? {
+            // A fill byte may be the first byte of a marker itself.
+            0xff => *at = code,
+            // A stuffed byte, TEM, RST0 to RST7 and SOI have no length.
+            0x00 | 0x01 | 0xd0..=0xd8 => *at = code + 1,
+            0xd9 => return Some(code + 1),
+            _ => {
+                let &[high, low] = bytes.get(code + 1..code + 3)? else { return None };
+                *at = code + 1 + usize::from(u16::from_be_bytes([high, low])).max(2);
+            }
+        }
+    }
+}
+
+/// Takes JPEG files out of a stream that comes in pieces of any size.
+#[derive(Debug, Default)]
+pub struct JpegScanner {
+    /// The file so far; before its start only what may be the first byte of an SOI marker.
+    file: Vec<u8>,
+    /// Where to look for the next marker.
+    at: usize,
+    is_complete: bool,
+}
+
+impl JpegScanner {
+    /// Takes bytes up to the next event, which is the end of an SOI marker or of an EOI marker, and returns how many it
+    /// took. After an EOI marker it takes nothing until [`Self::take`].
+    pub fn push(&mut self, bytes: &[u8]) -> usize {
+        if self.is_complete {
+            return 0;
+        }
+        if self.has_started() {
+            let before = self.file.len();
+            self.file.extend_from_slice(bytes);
+            let Some(end) = end_of_image(&self.file, &mut self.at) else { return bytes.len() };
+            self.is_complete = true;
+            self.file.truncate(end);
+            return end.saturating_sub(before);
+        }
+        for (taken, byte) in bytes.iter().enumerate() {
+            let follows_ff = self.file.pop() == Some(SOI[0]);
+            if follows_ff && *byte == SOI[1] {
+                self.file.extend(SOI);
+                self.at = SOI.len();
+                return taken + 1;
+            }
+            if *byte == SOI[0] {
+                self.file.push(*byte);
+            }
+        }
+        bytes.len()
+    }
+
+    /// True between an SOI marker and [`Self::take`].
+    pub fn has_started(&self) -> bool {
+        self.file.len() >= SOI.len()
+    }
+
+    /// True once the file has its EOI marker.
+    pub fn is_complete(&self) -> bool {
+        self.is_complete
+    }
+
+    /// Bytes of the file so far.
+    pub fn file_len(&self) -> usize {
+        self.file.len()
+    }
+
+    /// The file, as far as it has come; the scanner begins anew.
+    pub fn take(&mut self) -> Vec<u8> {
+        std::mem::take(self).file
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// SOI, a comment that holds EOI and SOI, a scan with a stuffed byte and a restart marker, EOI.
+    const FILE: &[u8] = &[
+        0xff, 0xd8, 0xff, 0xff, 0xfe, 0, 6, 0xff, 0xd9, 0xff, 0xd8, 0xff, 0xda, 0, 2, 7, 0xff, 0,
+        8, 0xff, 0xd3, 9, 0xff, 0xd9,
+    ];
+
+    #[test]
+    fn the_length_of_a_file_is_found() {
+        assert_eq!(jpeg_len(FILE), Some(FILE.len()));
+        assert_eq!(jpeg_len(&[FILE, b"more"].concat()), Some(FILE.len()));
+        for len in 0..FILE.len() {
+            assert_eq!(jpeg_len(&FILE[..len]), None, "{len}");
+        }
+    }
+
+    #[test]
+    fn files_are_found_in_pieces_of_any_size() {
+        let stream = [b"text\xff", FILE, b"\r\n\xff\xff", FILE, FILE, b"\xff"].concat();
+        for size in 1..stream.len() {
+            let mut scanner = JpegScanner::default();
+            let mut files = 0;
+            for mut piece in stream.chunks(size) {
+                while !piece.is_empty() {
+                    let taken = scanner.push(piece);
+                    piece = &piece[taken..];
+                    if scanner.is_complete() {
+                        assert_eq!(scanner.take(), FILE, "pieces of {size}");
+                        files += 1;
+                    }
+                }
+            }
+            assert_eq!((files, scanner.has_started()), (3, false), "pieces of {size}");
+        }
+    }
+
+    #[test]
+    fn a_cut_file_in_a_stream_does_not_take_the_next_one_with_it() {
+        // The comment's length leads beyond the end.
+        let mut cut = FILE.to_vec();
+        cut[5] = 0xff;
+        let (stream, mut at) = ([b"x", cut.as_slice(), FILE].concat(), 0);
+        assert_eq!(next_jpeg(&stream, &mut at), Some(&cut[..9]));
+        assert_eq!(next_jpeg(&stream, &mut at), Some(&cut[9..]));
+        assert_eq!(next_jpeg(&stream, &mut at), Some(FILE));
+        assert_eq!(next_jpeg(&stream, &mut at), None);
+    }
+}
