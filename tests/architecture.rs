@@ -43,6 +43,10 @@ const EXPERIMENTS: (&str, [&str; 3]) = ("experiments", ["controller", "detector"
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
 const ALIGHT: [&str; 6] = ["fiducial", "geometry", "imaging", "media", "messages", "node"];
 
+/// Crates of algorithms but for these modules, which have the threads, the clock and the network.
+const WITH_THREADS: [(&str, &[&str]); 2] =
+    [("autopilot", &["link", "session"]), ("airlink", &["sender"])];
+
 /// What an algorithm does without.
 const OUTSIDE: [&str; 17] = [
     "std::env",
@@ -187,7 +191,8 @@ fn folders_packages_and_libraries_share_a_name() -> anyhow::Result<()> {
 fn dependencies_point_downwards_only() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let names: BTreeSet<&str> = workspace.iter().map(|p| p.name.as_str()).collect();
-    let crates: BTreeMap<_, _> = ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK, MEDIA]).collect();
+    let crates: BTreeMap<_, _> =
+        ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK, MEDIA]).collect();
     for package in &workspace {
         let allowed: BTreeSet<&str> = match crates.get(package.name.as_str()) {
             Some(allowed) => allowed.iter().copied().collect(),
@@ -234,10 +239,18 @@ fn algorithms_know_no_clock_file_network_thread_or_log() -> anyhow::Result<()> {
         }
         files.extend(package.sources()?);
     }
-    let link = ["link.rs", "session.rs"];
-    let mut conversation = package(&workspace, "autopilot")?.sources()?;
-    conversation.retain(|path| !link.iter().any(|name| path.ends_with(name)));
-    files.extend(conversation);
+    for (name, modules) in WITH_THREADS {
+        let mut sources = package(&workspace, name)?.sources()?;
+        sources.retain(|path| !modules.iter().any(|module| path.ends_with(format!("{module}.rs"))));
+        for path in sources.iter().filter(|path| !path.ends_with("lib.rs")) {
+            let code = code(path)?;
+            for outside in modules.iter().map(|module| format!("crate::{module}")) {
+                ensure!(!code.contains(&outside), "{path:?} mentions `{outside}`");
+            }
+            ensure!(!code.contains("node::"), "{path:?} mentions `node::`");
+        }
+        files.extend(sources);
+    }
     ensure!(files.len() > 30, "only {} files are algorithms", files.len());
     for path in files {
         let code = code(&path)?;

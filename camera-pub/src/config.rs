@@ -116,7 +116,9 @@ impl Settings for Config {
         check.range("source.delay_ms", self.source.delay_ms, 0.0..=10_000.0);
         check.range("source.timeout_s", self.source.timeout_s, 0.1..=3600.0);
         check.parses("source.command", self.source.program());
-        self.air.check(check);
+        for (key, value, range) in self.air.ranges() {
+            check.range(key, value, range);
+        }
         self.calibration.check(check);
         self.mount.check(check);
     }

@@ -6,7 +6,7 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use airlink::Pictures;
+use airlink::Unpacker;
 use anyhow::Context;
 use fiducial::debug::{self, RgbImageBuf};
 use fiducial::{Detector, Observation, Pad, Stages, Tracker};
@@ -155,7 +155,7 @@ struct Work {
     change: Arc<Mutex<Option<Change>>>,
     config: Config,
     converter: Converter,
-    pictures: Pictures,
+    unpacker: Unpacker,
     /// Clock and stamp of the newest frame from the air.
     newest: Option<(String, i64)>,
     detector: Detector,
@@ -194,7 +194,7 @@ impl Work {
             change,
             config: config.clone(),
             converter: Converter::default(),
-            pictures: Pictures::default(),
+            unpacker: Unpacker::default(),
             newest: None,
             detector,
             pads,
@@ -289,8 +289,8 @@ impl Work {
     /// Searches a frame for the air link, part by part.
     async fn search_parts(&mut self, frame: &Frame) {
         let mut clock = StageClock::start();
-        let mut pictures = std::mem::take(&mut self.pictures);
-        match pictures.read(&frame.header, &frame.bytes()) {
+        let mut unpacker = std::mem::take(&mut self.unpacker);
+        match unpacker.unpack(&frame.header, &frame.bytes()) {
             Ok(parts) => {
                 clock.ended("decode");
                 let found = self.detect_in_parts(&parts, &frame.header, &mut clock);
@@ -305,7 +305,7 @@ impl Work {
                 }
             }
         }
-        self.pictures = pictures;
+        self.unpacker = unpacker;
     }
 
     fn detect_in_parts(

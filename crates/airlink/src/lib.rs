@@ -1,21 +1,23 @@
-//! Frames for the link between drone and ground: the part that matters, compressed, and no more than the link carries.
+//! Frames for the link between drone and ground: the part that matters, compressed to what the link carries.
 //!
-//! The camera's side sends JPEG frames on `camera/{camera}/jpeg`, whole or as a region about the markers with a small
-//! overview, and sends the next one only when the last one has arrived. The detector's side turns such a payload back
-//! into pictures. The crate knows no marker beyond where detections saw it, and no Zenoh but through `node`.
+//! The camera's side sends JPEG frames on `camera/{camera}/jpeg`: the region of interest around the markers with a small
+//! overview, one tile of the frame after the other while no marker is detected, or always the whole frame. It sends the
+//! next one only once the last one has arrived. The detector's side decodes such a payload. The crate knows markers only
+//! as rectangles in detections.
 //!
-//! Modules in reading order: [`config`] says what can be chosen, [`sender`] is the camera's side, [`window`] says when
-//! the next frame may go and how large it may be, [`expected`] where the markers should be in it, [`plan`] which parts
-//! of it are sent how finely, and [`payload`] makes the bytes and reads them again.
+//! Modules in reading order: [`config`] has the keys, [`window`] decides when the next frame may be sent and how large it
+//! may be, [`prediction`] where the markers should be in it, [`plan`] which parts are sent at which scale and quality,
+//! [`payload`] encodes and decodes the bytes. These are algorithms, without clock, thread and network; [`sender`] is the
+//! camera's side, which has all three.
 
 pub mod config;
-pub mod expected;
 pub mod payload;
 pub mod plan;
+pub mod prediction;
 pub mod sender;
 pub mod window;
 
 pub use config::AirConfig;
-pub use payload::{Packer, PayloadError, Pictures};
-pub use plan::{Plan, Planner};
+pub use payload::{Packer, PayloadError, Unpacker};
+pub use plan::{FrameSize, Plan, Planner};
 pub use sender::AirSender;

@@ -1,6 +1,6 @@
-//! The bytes of a JPEG frame: one file after the other, as the header's parts say.
+//! The bytes of a JPEG frame: consecutive JPEG files, one per part in the header.
 //!
-//! Reading trusts nothing: sizes are checked against the header before anything is decoded.
+//! Payloads are untrusted: all sizes are checked against the header before anything is decoded.
 
 use imaging::{GrayImage, GrayView};
 use jpeg_encoder::{ColorType, Encoder};
@@ -12,38 +12,38 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 
 use crate::plan::Plan;
 
-/// Parts that a frame may have.
-pub const MOST_PARTS: usize = 8;
-/// The longest edge of a JPEG, in pixels.
-const MOST_EDGE: u32 = 65_535;
-/// Pixels that all parts together may have.
-const MOST_PIXELS: u64 = 100_000_000;
+/// Maximum number of parts of a frame.
+pub const MAX_PARTS: usize = 8;
+/// Maximum edge of a JPEG image, in pixels.
+const MAX_EDGE_PX: u32 = 65_535;
+/// Maximum number of pixels of all parts together.
+const MAX_PIXELS: u64 = 100_000_000;
 
-/// Why a payload was not made or not read.
+/// Why a payload was not encoded or not decoded.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PayloadError {
-    /// A part that is not in its frame, or bytes that are not those of the parts.
-    #[error("parts that do not fit the frame or its bytes")]
+    /// A part outside of its frame, or parts that do not match the bytes.
+    #[error("the parts do not match the frame or its bytes")]
     Misfit,
     /// A size that a JPEG cannot have.
-    #[error("a size that a JPEG cannot have")]
+    #[error("a JPEG cannot have this size")]
     Size,
     /// The encoder's or the decoder's reason.
-    #[error("a JPEG that cannot be made or read: {0}")]
+    #[error("JPEG encoding or decoding failed: {0}")]
     Jpeg(String),
 }
 
-/// Makes payloads; keeps its buffers.
+/// Encodes payloads; reuses its buffers.
 #[derive(Debug, Default)]
 pub struct Packer {
     scratch: GrayImage,
 }
 
 impl Packer {
-    /// The payload of a frame, and the header it travels with.
+    /// The header and the payload of a frame.
     ///
     /// # Errors
-    /// [`PayloadError`] when the plan does not fit the picture.
+    /// [`PayloadError`] when the plan does not match the image.
     pub fn pack(
         &mut self,
         view: GrayView<'_>,
@@ -65,11 +65,11 @@ impl Packer {
         Ok((header, bytes))
     }
 
-    /// A part's own pixels.
+    /// The pixels of a part, at its scale.
     fn cut(&mut self, view: GrayView<'_>, part: &FramePart) -> Result<&GrayImage, PayloadError> {
         let [x, y, width, height, scale] =
             [part.x, part.y, part.width, part.height, part.scale].map(|n| n as usize);
-        if scale == 0 || width.max(height) > MOST_EDGE as usize {
+        if scale == 0 || width.max(height) > MAX_EDGE_PX as usize {
             return Err(PayloadError::Size);
         }
         let source = view.crop(x, y, width * scale, height * scale).ok_or(PayloadError::Misfit)?;
@@ -86,7 +86,7 @@ impl Packer {
     }
 }
 
-/// The means of blocks of `scale` x `scale` pixels, from the row `top` on.
+/// Means of the blocks of `scale` x `scale` pixels whose upper edge is the row `top`.
 fn shrink_row(source: GrayView<'_>, top: usize, scale: usize, out: &mut [u8]) {
     let half = (scale * scale / 2) as u32;
     let area = (scale * scale) as u32;
@@ -112,18 +112,18 @@ fn whole(width: usize, height: usize) -> FramePart {
     FramePart { x: 0, y: 0, width: width as u32, height: height as u32, scale: 1, bytes: 0 }
 }
 
-/// The pictures of a payload; keeps its buffers.
+/// Decodes payloads; reuses its buffers.
 #[derive(Debug, Default)]
-pub struct Pictures {
+pub struct Unpacker {
     images: Vec<GrayImage>,
 }
 
-impl Pictures {
-    /// Decodes the parts of a payload, finest first as they came.
+impl Unpacker {
+    /// The parts of a payload in its order, which is finest first.
     ///
     /// # Errors
-    /// [`PayloadError`] when header and bytes do not fit each other, or a file is none.
-    pub fn read(
+    /// [`PayloadError`] when header and bytes do not match, or a file is not a valid JPEG.
+    pub fn unpack(
         &mut self,
         header: &FrameHeader,
         bytes: &[u8],
@@ -141,7 +141,7 @@ impl Pictures {
     }
 }
 
-/// The parts of a frame; the whole one is a part, too.
+/// The parts of a frame; without any, the whole frame as one.
 fn parts_of(header: &FrameHeader, len: usize) -> Result<Vec<FramePart>, PayloadError> {
     if header.parts.is_empty() {
         let bytes = u32::try_from(len).map_err(|_| PayloadError::Size)?;
@@ -161,16 +161,16 @@ fn check(
     };
     let fits = |part: &FramePart| {
         part.scale > 0
-            && (1..=MOST_EDGE).contains(&part.width)
-            && (1..=MOST_EDGE).contains(&part.height)
+            && (1..=MAX_EDGE_PX).contains(&part.width)
+            && (1..=MAX_EDGE_PX).contains(&part.height)
             && lies_within(part.x, part.width, part.scale, header.width)
             && lies_within(part.y, part.height, part.scale, header.height)
     };
     let pixels: u64 = parts.iter().map(|p| u64::from(p.width) * u64::from(p.height)).sum();
     let bytes: u64 = parts.iter().map(|part| u64::from(part.bytes)).sum();
-    let all_fit = parts.len() <= MOST_PARTS
+    let all_fit = parts.len() <= MAX_PARTS
         && parts.iter().all(fits)
-        && pixels <= MOST_PIXELS
+        && pixels <= MAX_PIXELS
         && bytes == len as u64;
     all_fit.then_some(parts).ok_or(PayloadError::Misfit)
 }
@@ -196,8 +196,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// A wave that is different everywhere.
-    fn picture(width: usize, height: usize) -> GrayImage {
+    /// A wave that does not repeat.
+    fn wave(width: usize, height: usize) -> GrayImage {
         let mut image = GrayImage::filled(width, height, 0);
         for y in 0..height {
             for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
@@ -236,20 +236,20 @@ mod tests {
     }
 
     #[test]
-    fn parts_come_back_as_they_were_cut() {
-        let image = picture(320, 240);
+    fn parts_are_unpacked_as_they_were_packed() {
+        let image = wave(320, 240);
         let plans = [plan(&[]), plan(&[[64, 40, 96, 64, 1], [0, 0, 80, 60, 4]])];
         for plan in plans {
             let (header, bytes) =
                 Packer::default().pack(image.view().unwrap(), &header(320, 240), &plan).unwrap();
             assert_eq!((header.width, header.height, header.format), (320, 240, PixelFormat::Jpeg));
-            let mut pictures = Pictures::default();
-            let read = pictures.read(&header, &bytes).unwrap();
+            let mut unpacker = Unpacker::default();
+            let read = unpacker.unpack(&header, &bytes).unwrap();
             assert_eq!(read.len(), plan.parts.len().max(1));
             for (part, found) in read {
                 for v in 0..found.height() {
                     for u in 0..found.width() {
-                        // The middle of the part's pixel in the frame, where the wave is nearly straight.
+                        // The centre of the part's pixel in the frame.
                         let centre = |from: u32, at: usize| {
                             (from as usize + part.scale as usize * at) as f64
                                 + f64::from(part.scale - 1) / 2.0
@@ -265,13 +265,13 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused_before_it_is_decoded() {
-        let image = picture(64, 48);
+    fn parts_that_do_not_match_are_refused_before_decoding() {
+        let image = wave(64, 48);
         let (good, bytes) = Packer::default()
             .pack(image.view().unwrap(), &header(64, 48), &plan(&[[8, 8, 16, 16, 2]]))
             .unwrap();
-        let mut pictures = Pictures::default();
-        assert!(pictures.read(&good, &bytes).is_ok());
+        let mut unpacker = Unpacker::default();
+        assert!(unpacker.unpack(&good, &bytes).is_ok());
         let with = |change: &dyn Fn(&mut FramePart)| {
             let mut header = good.clone();
             change(&mut header.parts[0]);
@@ -286,9 +286,9 @@ mod tests {
             FrameHeader { parts: vec![good.parts[0]; 9], ..good.clone() },
             FrameHeader { parts: Vec::new(), ..good.clone() },
         ] {
-            assert!(pictures.read(&bad, &bytes).is_err(), "{bad:?}");
+            assert!(unpacker.unpack(&bad, &bytes).is_err(), "{bad:?}");
         }
-        assert!(pictures.read(&good, &bytes[1..]).is_err());
+        assert!(unpacker.unpack(&good, &bytes[1..]).is_err());
         let outside = plan(&[[60, 8, 16, 16, 2]]);
         let packed = Packer::default().pack(image.view().unwrap(), &header(64, 48), &outside);
         assert_eq!(packed.map(|_| ()), Err(PayloadError::Misfit));
@@ -296,14 +296,14 @@ mod tests {
 
     proptest! {
         #[test]
-        fn damaged_files_do_not_make_it_panic(at in 0_usize..1000, to in any::<u8>()) {
-            let image = picture(64, 48);
+        fn damaged_files_do_not_panic(at in 0_usize..1000, to in any::<u8>()) {
+            let image = wave(64, 48);
             let (header, mut bytes) = Packer::default()
                 .pack(image.view().unwrap(), &header(64, 48), &plan(&[]))
                 .unwrap();
             let len = bytes.len();
             bytes[at % len] = to;
-            let _ = Pictures::default().read(&header, &bytes);
+            let _ = Unpacker::default().unpack(&header, &bytes);
         }
     }
 }

@@ -1,32 +1,33 @@
-//! Where the markers should be in the next frame, from where detections saw them.
+//! Predicts the region of interest (ROI) of the next frame from the detections of the last ones.
 //!
-//! A marker's centre is taken to move on as it moved between its last two sightings, and its size to stay. What is
-//! not known of its motion widens the region. A frame that was searched without finding it is believed only the
-//! second time: one may have been cut off by its region.
+//! Each marker's centre moves at constant velocity, from its last two detections; its size stays. Uncertainty of the
+//! motion widens the ROI. A track ends after two frames without a detection: one may have been cut off by its ROI.
 
-use messages::Detections;
+use messages::{Detection, Detections};
 
-/// Markers that are followed; further ones are found by the overview.
-const MOST_MARKERS: usize = 8;
-/// A marker that was not seen for so long is expected nowhere, in seconds.
-const FORGOTTEN_S: f64 = 0.7;
-/// Frames without a marker, one after the other, until it counts as lost.
-const MISSES: u32 = 2;
-/// The marker's surroundings that belong to the region, on each side, in units of its size and in pixels.
-const SURROUNDINGS: f64 = 0.4;
-const LEAST_REACH_PX: f64 = 24.0;
-/// How far off the prediction may be, in units of the way since it was last seen, and in pixels per second.
-const UNSTEADY: f64 = 0.5;
-const UNSTEADY_PX_S: f64 = 150.0;
+/// Maximum number of tracks; further markers are found in the overview.
+const MAX_TRACKS: usize = 8;
+/// Maximum age of a track without a detection, in seconds.
+const MAX_AGE_S: f64 = 0.7;
+/// Consecutive frames without a detection after which a track ends.
+const MAX_MISSES: u32 = 2;
+/// Margin around a marker on each side, in units of its size.
+const MARGIN: f64 = 0.4;
+/// Margin in addition to that, in pixels.
+const MARGIN_PX: f64 = 24.0;
+/// Uncertainty of the prediction, in units of the predicted displacement.
+const DISPLACEMENT_UNCERTAINTY: f64 = 0.5;
+/// Uncertainty of the prediction, in pixels per second.
+const UNCERTAINTY_PX_S: f64 = 150.0;
 
-/// The markers that were seen.
+/// Tracks the detected markers.
 #[derive(Clone, Debug, Default)]
-pub struct Expected {
-    sightings: Vec<Sighting>,
+pub struct RoiPredictor {
+    tracks: Vec<Track>,
 }
 
 #[derive(Clone, Debug)]
-struct Sighting {
+struct Track {
     family: String,
     id: Option<u32>,
     stamp_ns: i64,
@@ -36,9 +37,9 @@ struct Sighting {
     misses: u32,
 }
 
-/// A part of a frame that should hold all markers.
+/// The part of a frame that should contain all markers.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct Region {
+pub struct Roi {
     /// Left and upper edge, in pixels.
     pub from: [f64; 2],
     /// Right and lower edge, in pixels.
@@ -47,79 +48,80 @@ pub struct Region {
     pub marker_px: f64,
 }
 
-impl Expected {
-    /// Learns from what a detector saw in a frame of this camera, whichever detector it was.
-    pub fn learn(&mut self, message: &Detections) {
+impl RoiPredictor {
+    /// Updates the tracks with a detector's message about a frame of this camera; any detector's will do.
+    pub fn update(&mut self, message: &Detections) {
         let stamp_ns = message.header.stamp_ns;
-        for seen in &message.detections {
-            let is_sound = seen.size_px > 0.0
-                && [seen.centre_px[0], seen.centre_px[1], seen.size_px]
-                    .iter()
-                    .all(|n| n.is_finite());
-            if !is_sound {
+        for detection in &message.detections {
+            let [x, y] = detection.centre_px;
+            let is_finite = [x, y, detection.size_px].iter().all(|n| n.is_finite());
+            if !is_finite || detection.size_px <= 0.0 {
                 continue;
             }
-            let has_room = self.sightings.len() < MOST_MARKERS;
-            let known =
-                self.sightings.iter_mut().find(|it| it.family == seen.family && it.id == seen.id);
-            match known {
-                Some(known) => known.see(stamp_ns, seen.centre_px, seen.size_px),
-                None if has_room => self.sightings.push(Sighting {
-                    family: seen.family.clone(),
-                    id: seen.id,
+            let has_room = self.tracks.len() < MAX_TRACKS;
+            match self.tracks.iter_mut().find(|track| track.is_of(detection)) {
+                Some(track) => track.update(stamp_ns, detection),
+                None if has_room => self.tracks.push(Track {
+                    family: detection.family.clone(),
+                    id: detection.id,
                     stamp_ns,
-                    centre_px: seen.centre_px,
-                    size_px: seen.size_px,
+                    centre_px: detection.centre_px,
+                    size_px: detection.size_px,
                     velocity_px_s: [0.0; 2],
                     misses: 0,
                 }),
                 None => {}
             }
         }
-        for known in &mut self.sightings {
-            let is_seen =
-                message.detections.iter().any(|it| it.family == known.family && it.id == known.id);
-            if !is_seen && stamp_ns > known.stamp_ns {
-                known.misses += 1;
+        for track in &mut self.tracks {
+            let is_detected = message.detections.iter().any(|detection| track.is_of(detection));
+            if !is_detected && stamp_ns > track.stamp_ns {
+                track.misses += 1;
             }
         }
-        self.sightings.retain(|known| known.misses < MISSES);
+        self.tracks.retain(|track| track.misses < MAX_MISSES);
     }
 
-    /// Where all markers should be in the frame of a moment; `None` when none is expected.
-    pub fn region(&mut self, stamp_ns: i64) -> Option<Region> {
-        self.sightings.retain(|known| known.age_s(stamp_ns).abs() < FORGOTTEN_S);
-        let mut sightings = self.sightings.iter();
-        let first = sightings.next()?.region(stamp_ns);
-        Some(sightings.fold(first, |all, known| all.with(&known.region(stamp_ns))))
+    /// The ROI of a frame with this stamp; `None` without a track.
+    pub fn roi(&mut self, stamp_ns: i64) -> Option<Roi> {
+        self.tracks.retain(|track| track.age_s(stamp_ns).abs() < MAX_AGE_S);
+        let mut tracks = self.tracks.iter();
+        let first = tracks.next()?.roi(stamp_ns);
+        Some(tracks.fold(first, |all, track| all.union(&track.roi(stamp_ns))))
     }
 }
 
-impl Sighting {
+impl Track {
+    fn is_of(&self, detection: &Detection) -> bool {
+        self.family == detection.family && self.id == detection.id
+    }
+
     fn age_s(&self, stamp_ns: i64) -> f64 {
         stamp_ns.saturating_sub(self.stamp_ns) as f64 * 1e-9
     }
 
-    fn see(&mut self, stamp_ns: i64, centre_px: [f64; 2], size_px: f64) {
+    fn update(&mut self, stamp_ns: i64, detection: &Detection) {
         let period_s = self.age_s(stamp_ns);
-        // Another detector may tell of the same frame, or of an older one.
+        // Another detector may report the same frame, or an older one.
         if period_s > 1e-3 {
-            if period_s < FORGOTTEN_S {
-                let [x, y] = self.centre_px;
-                self.velocity_px_s = [(centre_px[0] - x) / period_s, (centre_px[1] - y) / period_s];
+            let ([x, y], [new_x, new_y]) = (self.centre_px, detection.centre_px);
+            if period_s < MAX_AGE_S {
+                self.velocity_px_s = [(new_x - x) / period_s, (new_y - y) / period_s];
             }
-            (self.stamp_ns, self.centre_px, self.size_px) = (stamp_ns, centre_px, size_px);
+            self.stamp_ns = stamp_ns;
+            self.centre_px = detection.centre_px;
+            self.size_px = detection.size_px;
             self.misses = 0;
         }
     }
 
-    fn region(&self, stamp_ns: i64) -> Region {
+    fn roi(&self, stamp_ns: i64) -> Roi {
         let age_s = self.age_s(stamp_ns).max(0.0);
-        let way = self.velocity_px_s.map(|v| v * age_s);
-        let reach = self.size_px * (0.5 + SURROUNDINGS) + LEAST_REACH_PX + UNSTEADY_PX_S * age_s;
-        let half = way.map(|way| reach + UNSTEADY * way.abs());
-        let centre = [self.centre_px[0] + way[0], self.centre_px[1] + way[1]];
-        Region {
+        let displacement = self.velocity_px_s.map(|v| v * age_s);
+        let margin = self.size_px * (0.5 + MARGIN) + MARGIN_PX + UNCERTAINTY_PX_S * age_s;
+        let half = displacement.map(|d| margin + DISPLACEMENT_UNCERTAINTY * d.abs());
+        let centre = [self.centre_px[0] + displacement[0], self.centre_px[1] + displacement[1]];
+        Roi {
             from: [centre[0] - half[0], centre[1] - half[1]],
             to: [centre[0] + half[0], centre[1] + half[1]],
             marker_px: self.size_px,
@@ -127,8 +129,8 @@ impl Sighting {
     }
 }
 
-impl Region {
-    fn with(&self, other: &Self) -> Self {
+impl Roi {
+    fn union(&self, other: &Self) -> Self {
         Self {
             from: [self.from[0].min(other.from[0]), self.from[1].min(other.from[1])],
             to: [self.to[0].max(other.to[0]), self.to[1].max(other.to[1])],
@@ -140,11 +142,11 @@ impl Region {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{Detection, FrameHeader, PixelFormat};
+    use messages::{FrameHeader, PixelFormat};
 
     const MS: i64 = 1_000_000;
 
-    fn seen(stamp_ms: i64, markers: &[(u32, [f64; 2], f64)]) -> Detections {
+    fn detections(stamp_ms: i64, markers: &[(u32, [f64; 2], f64)]) -> Detections {
         let detections = markers.iter().map(|(id, centre_px, size_px)| Detection {
             family: "aruco-4x4-50".into(),
             id: Some(*id),
@@ -174,43 +176,43 @@ mod tests {
         }
     }
 
-    fn holds(region: Region, [x, y]: [f64; 2]) -> bool {
-        (region.from[0]..=region.to[0]).contains(&x) && (region.from[1]..=region.to[1]).contains(&y)
+    fn contains(roi: Roi, [x, y]: [f64; 2]) -> bool {
+        (roi.from[0]..=roi.to[0]).contains(&x) && (roi.from[1]..=roi.to[1]).contains(&y)
     }
 
     #[test]
-    fn a_marker_is_expected_where_its_motion_takes_it() {
-        let mut expected = Expected::default();
-        assert!(expected.region(0).is_none());
-        expected.learn(&seen(0, &[(1, [100.0, 500.0], 40.0)]));
-        expected.learn(&seen(66, &[(1, [120.0, 500.0], 40.0)]));
-        let region = expected.region(198 * MS).unwrap();
-        assert!(holds(region, [160.0 - 36.0, 500.0 - 36.0]));
-        assert!(holds(region, [160.0 + 36.0, 500.0 + 36.0]));
-        assert!(region.to[0] - region.from[0] < 250.0, "{region:?}");
+    fn the_roi_follows_a_markers_motion() {
+        let mut predictor = RoiPredictor::default();
+        assert!(predictor.roi(0).is_none());
+        predictor.update(&detections(0, &[(1, [100.0, 500.0], 40.0)]));
+        predictor.update(&detections(66, &[(1, [120.0, 500.0], 40.0)]));
+        let roi = predictor.roi(198 * MS).unwrap();
+        assert!(contains(roi, [160.0 - 36.0, 500.0 - 36.0]));
+        assert!(contains(roi, [160.0 + 36.0, 500.0 + 36.0]));
+        assert!(roi.to[0] - roi.from[0] < 250.0, "{roi:?}");
     }
 
     #[test]
-    fn it_is_lost_after_two_frames_without_it_or_a_long_silence() {
-        let mut expected = Expected::default();
-        expected.learn(&seen(0, &[(1, [100.0, 500.0], 40.0)]));
-        expected.learn(&seen(66, &[]));
-        assert!(expected.region(100 * MS).is_some());
-        expected.learn(&seen(132, &[]));
-        assert!(expected.region(140 * MS).is_none());
-        expected.learn(&seen(200, &[(1, [100.0, 500.0], 40.0)]));
-        assert!(expected.region(300 * MS).is_some());
-        assert!(expected.region(950 * MS).is_none());
+    fn a_track_ends_after_two_misses_or_a_long_time() {
+        let mut predictor = RoiPredictor::default();
+        predictor.update(&detections(0, &[(1, [100.0, 500.0], 40.0)]));
+        predictor.update(&detections(66, &[]));
+        assert!(predictor.roi(100 * MS).is_some());
+        predictor.update(&detections(132, &[]));
+        assert!(predictor.roi(140 * MS).is_none());
+        predictor.update(&detections(200, &[(1, [100.0, 500.0], 40.0)]));
+        assert!(predictor.roi(300 * MS).is_some());
+        assert!(predictor.roi(950 * MS).is_none());
     }
 
     #[test]
-    fn all_markers_are_in_the_region_and_nonsense_is_not() {
-        let mut expected = Expected::default();
+    fn the_roi_contains_all_markers_and_ignores_invalid_detections() {
+        let mut predictor = RoiPredictor::default();
         let markers = [(1, [100.0, 500.0], 40.0), (2, [900.0, 100.0], 80.0)];
-        expected.learn(&seen(0, &markers));
-        expected.learn(&seen(0, &[(3, [f64::NAN, 0.0], 40.0), (4, [0.0, 0.0], -1.0)]));
-        let region = expected.region(0).unwrap();
-        assert!(markers.iter().all(|(_, centre, _)| holds(region, *centre)));
-        assert!(region.marker_px == 40.0 && region.from.iter().all(|edge| edge.is_finite()));
+        predictor.update(&detections(0, &markers));
+        predictor.update(&detections(0, &[(3, [f64::NAN, 0.0], 40.0), (4, [0.0, 0.0], -1.0)]));
+        let roi = predictor.roi(0).unwrap();
+        assert!(markers.iter().all(|(_, centre, _)| contains(roi, *centre)));
+        assert!(roi.marker_px == 40.0 && roi.from.iter().all(|edge| edge.is_finite()));
     }
 }

@@ -1,7 +1,7 @@
-//! The camera's side: takes frames that are offered, and sends those that the link has room for.
+//! The camera's side: takes offered frames and sends those that the link has room for.
 //!
-//! All work is done on a thread of its own, named `air`, so that no link, however slow, ever holds up the camera or
-//! the frames in shared memory. A frame is copied only when it will be sent.
+//! Its thread, named `air`, does all the work, so that a slow link never blocks the camera or the frames in shared
+//! memory. A frame is copied only when it will be sent. This is the only module with a thread, a clock and the network.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -16,12 +16,12 @@ use tokio::sync::Notify;
 use tokio::time::MissedTickBehavior;
 
 use crate::config::{AirConfig, Mode};
-use crate::expected::Expected;
 use crate::payload::Packer;
-use crate::plan::Planner;
+use crate::plan::{FrameSize, Planner};
+use crate::prediction::RoiPredictor;
 use crate::window::Window;
 
-/// How often subscribers and overdue frames are looked for.
+/// Interval of the checks for subscribers and overdue frames.
 const TICK: Duration = Duration::from_millis(10);
 
 /// Sends frames over the air link; dropping it ends its thread.
@@ -29,7 +29,7 @@ pub struct AirSender {
     offers: Arc<Offers>,
 }
 
-/// Between the camera's thread and ours: one frame at most.
+/// Hands at most one frame from the camera's thread to this one.
 #[derive(Default)]
 struct Offers {
     is_wanted: AtomicBool,
@@ -47,7 +47,7 @@ impl AirSender {
     /// Starts to send on `jpegs`, a camera's publisher for `camera/{camera}/jpeg`.
     ///
     /// # Errors
-    /// When the session is closed or there is no thread to be had.
+    /// When the session is closed or the thread cannot be started.
     pub async fn start(
         node: &Node,
         camera: &str,
@@ -55,7 +55,7 @@ impl AirSender {
         config: &AirConfig,
     ) -> anyhow::Result<Self> {
         let detections = match config.mode {
-            Mode::Region => Some(node.subscriber(topic::DETECTIONS, &[]).await?),
+            Mode::Roi => Some(node.subscriber(topic::DETECTIONS, &[]).await?),
             Mode::Full => None,
         };
         let offers = Arc::<Offers>::default();
@@ -70,7 +70,7 @@ impl AirSender {
             health: node.shared_health(),
             window: Window::new(config),
             planner: Planner::new(config),
-            expected: Expected::default(),
+            predictor: RoiPredictor::default(),
             packer: Packer::default(),
             has_subscribers: false,
         };
@@ -78,7 +78,7 @@ impl AirSender {
         std::thread::Builder::new()
             .name("air".to_owned())
             .spawn(move || runtime.block_on(work.run()))
-            .context("starting the thread that sends frames over the air link")?;
+            .context("starting the air link's thread")?;
         Ok(Self { offers })
     }
 
@@ -87,7 +87,7 @@ impl AirSender {
         self.offers.is_wanted.load(Ordering::Relaxed)
     }
 
-    /// Offers a frame with its grey pixels, one byte each. One that is not wanted costs nothing.
+    /// Offers a frame with its 8-bit grey pixels. An unwanted frame costs nothing.
     pub fn offer(&self, header: &FrameHeader, pixels: &[u8]) {
         if !self.is_wanted() {
             return;
@@ -109,12 +109,12 @@ impl Drop for AirSender {
     }
 }
 
-// A frame that a thread that panicked has left is still a frame.
+// The frame stays valid when another thread panicked.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Everything the thread needs.
+/// The state of the thread.
 struct Work {
     camera: String,
     offers: Arc<Offers>,
@@ -122,19 +122,19 @@ struct Work {
     second_lane: FramePublisher,
     receipts: Subscriber<FrameReceipt>,
     detections: Option<Subscriber<Detections>>,
-    /// Tells which detector is in use.
+    /// Names the detector in use.
     status: Subscriber<ControllerStatus>,
     health: Arc<HealthCounters>,
     window: Window,
     planner: Planner,
-    expected: Expected,
+    predictor: RoiPredictor,
     packer: Packer,
     has_subscribers: bool,
 }
 
-/// What the thread wakes up for.
-enum News {
-    /// The key, which names the detector, and what it says.
+/// An event for the thread.
+enum Event {
+    /// The key, which names the detector, and the receipt.
     Receipt(String, FrameReceipt),
     Detections(Box<Detections>),
     Status(Box<ControllerStatus>),
@@ -148,37 +148,37 @@ impl Work {
         let mut ticks = tokio::time::interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         while !self.offers.is_over.load(Ordering::Relaxed) {
-            let news = tokio::select! {
+            let event = tokio::select! {
                 biased;
                 receipt = self.receipts.next_with_key() => {
-                    receipt.map_or(News::Closed, |(key, receipt)| News::Receipt(key, receipt))
+                    receipt.map_or(Event::Closed, |(key, receipt)| Event::Receipt(key, receipt))
                 }
                 message = next_of(self.detections.as_ref()) => {
-                    message.map_or(News::Closed, |message| News::Detections(Box::new(message)))
+                    message.map_or(Event::Closed, |message| Event::Detections(Box::new(message)))
                 }
                 message = self.status.next() => {
-                    message.map_or(News::Closed, |message| News::Status(Box::new(message)))
+                    message.map_or(Event::Closed, |message| Event::Status(Box::new(message)))
                 }
-                () = self.offers.arrived.notified() => News::Frame,
-                _ = ticks.tick() => News::Tick,
+                () = self.offers.arrived.notified() => Event::Frame,
+                _ = ticks.tick() => Event::Tick,
             };
-            match news {
-                News::Receipt(key, receipt) => self.receipt(&key, &receipt),
-                News::Detections(message) if message.header.camera == self.camera => {
-                    self.expected.learn(&message);
+            match event {
+                Event::Receipt(key, receipt) => self.receipt(&key, &receipt),
+                Event::Detections(message) if message.header.camera == self.camera => {
+                    self.predictor.update(&message);
                 }
-                News::Detections(_) => {}
-                News::Status(status) => {
+                Event::Detections(_) => {}
+                Event::Status(status) => {
                     let key = |detector: &String| topic::RECEIVED.key(&[detector]);
                     self.window.use_receiver(status.active_detector.as_ref().map(key));
                 }
-                News::Frame => self.send().await,
-                News::Tick => self.has_subscribers = self.jpegs.has_subscribers().await,
-                News::Closed => return,
+                Event::Frame => self.send().await,
+                Event::Tick => self.has_subscribers = self.jpegs.has_subscribers().await,
+                Event::Closed => return,
             }
             let (is_open, lost) = self.window.is_open(now_ns());
             for _ in 0..lost {
-                self.health.dropped("frames for the air link not answered in time");
+                self.health.dropped("air link frames without a receipt in time");
             }
             self.offers.is_wanted.store(is_open && self.has_subscribers, Ordering::Relaxed);
         }
@@ -194,7 +194,7 @@ impl Work {
                 self.health
                     .latency("frame sent to receipt", Duration::from_secs_f64(ms.max(0.0) * 1e-3));
             }
-            None => self.health.dropped("receipts of frames that were not sent lately"),
+            None => self.health.dropped("receipts of unknown frames"),
         }
     }
 
@@ -203,24 +203,24 @@ impl Work {
         let started = Instant::now();
         let Ok(view) = GrayView::packed(&pixels, header.width as usize, header.height as usize)
         else {
-            self.health.dropped("frames of an impossible size");
+            self.health.dropped("frames of an invalid size");
             return;
         };
-        let region = self.expected.region(header.stamp_ns);
-        let size = (header.width, header.height);
-        let plan = self.planner.plan(size, region, self.window.size_bytes());
+        let roi = self.predictor.roi(header.stamp_ns);
+        let size = FrameSize { width: header.width, height: header.height };
+        let plan = self.planner.plan(size, roi, self.window.size_bytes());
         match self.packer.pack(view, &header, &plan) {
             Ok((header, bytes)) => {
                 self.health.latency("jpeg", started.elapsed());
-                self.planner.learn_all(&plan, &header, bytes.len());
+                self.planner.learn(&plan, &header, bytes.len());
                 self.window.sent(now_ns(), header.sequence, bytes.len());
-                tracing::trace!(bytes = bytes.len(), ?plan, "A frame is sent over the air link");
+                tracing::trace!(bytes = bytes.len(), ?plan, "Sending a frame over the air link");
                 let lane = if self.window.lane() == 0 { &self.jpegs } else { &self.second_lane };
                 lane.publish(&header, Loan::Private(bytes)).await;
             }
             Err(problem) => {
                 if self.health.failed("jpeg") {
-                    tracing::warn!(%problem, "A frame could not be made a JPEG");
+                    tracing::warn!(%problem, "Failed to encode a frame for the air link");
                 }
             }
         }

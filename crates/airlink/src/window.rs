@@ -1,64 +1,67 @@
-//! When the next frame may go, and how large it may be: a window of frames under way, and a size that follows the time
-//! until they arrive.
+//! Flow and congestion control: when the next frame may be sent, and how large it may be.
 //!
-//! A frame is sent only while fewer than `window` others are under way, so nothing queues up on the way, whatever the
-//! link carries: frames that come meanwhile are left out at the camera. A frame that takes much longer than those before it
-//! is held up by a lost packet, and with it its connection, for at least 200 ms when the packet is lost again (TCP): the
-//! next frame overtakes it on the other of two connections, the lanes. A frame that nobody has answered after a while
-//! counts as lost; one that the first of several receivers has answered is waited for a little longer only, so that a
-//! receiver that is slow or gone does not hold up the others. The size grows while frames arrive sooner than aimed at, and
-//! shrinks while they arrive later; the mean of some frames decides, because a lost packet delays a single frame whatever
-//! its size. Of several receivers the one in use decides; while none of them is in use, the slowest.
+//! A frame is sent only while fewer than `window` others are in flight, so that nothing queues on the link; frames that
+//! come meanwhile are dropped at the camera. A frame that takes much longer than those before it is delayed by a lost
+//! packet, and its TCP connection with it, for at least 200 ms when the packet is lost again: the next frame overtakes it
+//! on the other of two connections, the lanes. A frame without a receipt counts as lost after a timeout. Once one of
+//! several receivers has acknowledged a frame, the others get only a little more time, so that a slow or dead receiver
+//! does not block the rest. The size grows while the mean round trip is below its target, and shrinks above it: a mean,
+//! because a lost packet delays a single frame of any size. Of several receivers the one in use decides; while none of
+//! them is in use, the slowest.
 //!
-//! Time is any clock's, in nanoseconds, given by the caller.
+//! The caller gives the time, in nanoseconds of any clock.
 
 use std::collections::VecDeque;
 
 use crate::config::AirConfig;
 
-/// Receivers that are waited for; further ones get what the others can take.
-const MOST_RECEIVERS: usize = 16;
-/// A receiver that has not answered for this time is not waited for, in nanoseconds.
-const SILENT_NS: i64 = 2_000_000_000;
-/// Frames whose way is remembered for late answers.
-const REMEMBERED: usize = 16;
-/// Part of a new time in the mean.
-const WEIGHT: f64 = 1.0 / 6.0;
-/// Connections for frames.
+/// Maximum number of receivers that are waited for.
+const MAX_RECEIVERS: usize = 16;
+/// Time without a receipt after which a receiver is forgotten, in nanoseconds.
+const RECEIVER_TIMEOUT_NS: i64 = 2_000_000_000;
+/// Number of frames remembered for late receipts.
+const HISTORY: usize = 16;
+/// Weight of a new round trip in the mean.
+const MEAN_WEIGHT: f64 = 1.0 / 6.0;
+/// Number of connections for frames.
 const LANES: usize = 2;
-/// Part of a new deviation in the mean deviation, and how many of those a frame may take longer than the mean before it is
-/// overtaken (RFC 6298, section 2).
+/// Weight of a new deviation in the mean deviation (RFC 6298, section 2).
 const DEVIATION_WEIGHT: f64 = 0.25;
-const DEVIATIONS: f64 = 4.0;
-/// A frame is never overtaken before this many times the time aimed at, and the mean and this part of it.
-const LEAST_PATIENCE: f64 = 1.5;
-const LEAST_DEVIATION: f64 = 0.25;
-/// The slower receivers of a frame are waited for so many times the time aimed at.
-const PATIENCE_WITH_OTHERS: f64 = 2.0;
-/// How fast the size grows with every frame that arrives in time.
+/// A frame is overtaken this number of mean deviations after the mean round trip (RFC 6298, section 2).
+const OVERTAKE_DEVIATIONS: f64 = 4.0;
+/// Minimum of that time beyond the mean, in units of the mean.
+const MIN_DEVIATION: f64 = 0.25;
+/// Minimum time before a frame is overtaken, in units of the target round trip.
+const MIN_OVERTAKE: f64 = 1.5;
+/// Time the slower receivers of a frame are waited for, in units of the target round trip.
+const OTHER_RECEIVERS_WAIT: f64 = 2.0;
+/// Growth of the size for each frame that arrives in time.
 const GROWTH: f64 = 1.04;
-/// How much it shrinks at most with one that does not.
-const LEAST_SHRINK: f64 = 0.75;
-/// How much it shrinks with one that is lost.
+/// Minimum factor on the size for a frame that is late.
+const MIN_SHRINK: f64 = 0.75;
+/// Factor on the size for a lost frame.
 const LOSS_SHRINK: f64 = 0.6;
-/// Each loss in a row makes the wait for the next twice as long, so many times at most.
-const MOST_DOUBLINGS: u32 = 3;
+/// Minimum share of the allowed size that a frame must use for the size to grow.
+const MIN_USE: f64 = 0.6;
+/// Maximum number of times that consecutive losses double the timeout.
+const MAX_DOUBLINGS: u32 = 3;
 
-/// The frames under way.
+/// The frames in flight and the receivers' answers.
 #[derive(Clone, Debug)]
 pub struct Window {
-    limit: usize,
+    max_in_flight: usize,
     timeout_ns: i64,
-    aim_ms: f64,
-    bounds: [f64; 2],
+    target_ms: f64,
+    min_bytes: f64,
+    max_bytes: f64,
     size_bytes: f64,
     mean_ms: Option<f64>,
     deviation_ms: f64,
     lane: usize,
-    losses_in_a_row: u32,
+    consecutive_losses: u32,
     sent: VecDeque<Sent>,
     receivers: Vec<Receiver>,
-    /// The receiver whose answers are used.
+    /// The receiver whose receipts decide.
     in_use: Option<String>,
 }
 
@@ -68,114 +71,115 @@ struct Sent {
     at_ns: i64,
     bytes: usize,
     lane: usize,
-    /// Still waited for.
-    is_under_way: bool,
-    /// Somebody has it.
-    is_answered: bool,
+    is_in_flight: bool,
+    /// True once any receiver has it.
+    is_acknowledged: bool,
 }
 
 #[derive(Clone, Debug)]
 struct Receiver {
     name: String,
-    heard_ns: i64,
+    last_receipt_ns: i64,
     sequence: u64,
 }
 
 impl Window {
-    /// Nothing is under way yet.
+    /// A window without frames in flight.
     pub fn new(config: &AirConfig) -> Self {
-        let bounds = [config.smallest_kb * 1000.0, config.largest_kb * 1000.0];
+        let [min_bytes, max_bytes] = [config.min_kb, config.max_kb].map(|kb| kb * 1000.0);
         Self {
-            limit: config.window as usize,
+            max_in_flight: config.window as usize,
             timeout_ns: (config.timeout_ms * 1e6) as i64,
-            aim_ms: config.round_trip_ms,
-            bounds,
-            // The middle of what is possible, in proportion: from there either end is as near.
-            size_bytes: (bounds[0] * bounds[1]).sqrt(),
+            target_ms: config.round_trip_ms,
+            min_bytes,
+            max_bytes,
+            // The geometric mean: as many steps from either end.
+            size_bytes: (min_bytes * max_bytes).sqrt(),
             mean_ms: None,
             deviation_ms: 0.0,
             lane: 0,
-            losses_in_a_row: 0,
+            consecutive_losses: 0,
             sent: VecDeque::new(),
             receivers: Vec::new(),
             in_use: None,
         }
     }
 
-    /// From now on this receiver alone decides, while it answers; with `None`, or while it does not, the slowest of all does.
+    /// Makes this receiver decide while it answers. With `None`, or while it does not, the slowest of all decides.
     pub fn use_receiver(&mut self, name: Option<String>) {
         self.in_use = name;
     }
 
-    /// Bytes that the next frame should have at most.
+    /// Maximum size of the next frame, in bytes.
     pub fn size_bytes(&self) -> usize {
         self.size_bytes as usize
     }
 
-    /// Mean time until a frame is known to have arrived, in milliseconds.
+    /// Mean time from sending a frame to its receipt, in milliseconds.
     pub fn round_trip_ms(&self) -> Option<f64> {
         self.mean_ms
     }
 
-    /// True when the next frame may go; frames that are overdue are given up. The number tells how many were.
+    /// Gives up overdue frames. Returns whether the next frame may be sent, and how many frames were lost.
     pub fn is_open(&mut self, now_ns: i64) -> (bool, usize) {
-        self.forget_the_silent(now_ns);
-        let patience_ns = self.timeout_ns << self.losses_in_a_row.min(MOST_DOUBLINGS);
-        let with_others_ns = (PATIENCE_WITH_OTHERS * self.aim_ms * 1e6) as i64;
+        self.remove_silent_receivers(now_ns);
+        let timeout_ns = self.timeout_ns << self.consecutive_losses.min(MAX_DOUBLINGS);
+        let others_ns = (OTHER_RECEIVERS_WAIT * self.target_ms * 1e6) as i64;
         let mut lost = 0;
-        for sent in self.sent.iter_mut().filter(|sent| sent.is_under_way) {
-            let limit_ns = if sent.is_answered { with_others_ns } else { patience_ns };
+        for sent in self.sent.iter_mut().filter(|sent| sent.is_in_flight) {
+            let limit_ns = if sent.is_acknowledged { others_ns } else { timeout_ns };
             if now_ns - sent.at_ns >= limit_ns {
-                sent.is_under_way = false;
-                lost += usize::from(!sent.is_answered);
+                sent.is_in_flight = false;
+                lost += usize::from(!sent.is_acknowledged);
             }
         }
-        // Who never answers (a recorder, say) says nothing of the link.
+        // Subscribers that never send receipts do not measure the link.
         if self.receivers.is_empty() {
-            self.losses_in_a_row = 0;
+            self.consecutive_losses = 0;
             lost = 0;
         } else if lost > 0 {
-            self.losses_in_a_row += 1;
+            self.consecutive_losses += 1;
             self.scale(LOSS_SHRINK);
         }
         (self.has_room(now_ns), lost)
     }
 
-    /// Looks for a lane on which nothing is late, the present one first.
+    /// Switches to a lane without a late frame, the present one first. True when there is one and the window is not full.
     fn has_room(&mut self, now_ns: i64) -> bool {
         let late_ns = self.late_ns();
-        let mut under_way = 0;
-        let mut is_held_up = [false; LANES];
-        for sent in self.sent.iter().filter(|sent| sent.is_under_way) {
-            if !sent.is_answered && now_ns - sent.at_ns >= late_ns {
-                is_held_up[sent.lane % LANES] = true;
+        let mut in_flight = 0;
+        let mut is_blocked = [false; LANES];
+        for sent in self.sent.iter().filter(|sent| sent.is_in_flight) {
+            if !sent.is_acknowledged && now_ns - sent.at_ns >= late_ns {
+                is_blocked[sent.lane % LANES] = true;
             } else {
-                under_way += 1;
+                in_flight += 1;
             }
         }
-        let lanes = (0..LANES).map(|further| (self.lane + further) % LANES);
-        match lanes.into_iter().find(|lane| !is_held_up[*lane]) {
+        let lanes = (0..LANES).map(|offset| (self.lane + offset) % LANES);
+        match lanes.into_iter().find(|lane| !is_blocked[*lane]) {
             Some(lane) => self.lane = lane,
             None => return false,
         }
-        under_way < self.limit
+        in_flight < self.max_in_flight
     }
 
-    /// After this time without an answer a frame is overtaken.
+    /// Time without a receipt after which a frame is overtaken, in nanoseconds.
     fn late_ns(&self) -> i64 {
         let Some(mean_ms) = self.mean_ms else { return self.timeout_ns };
-        let late_ms = mean_ms + (DEVIATIONS * self.deviation_ms).max(LEAST_DEVIATION * mean_ms);
-        ((late_ms.max(LEAST_PATIENCE * self.aim_ms) * 1e6) as i64).min(self.timeout_ns)
+        let late_ms =
+            mean_ms + (OVERTAKE_DEVIATIONS * self.deviation_ms).max(MIN_DEVIATION * mean_ms);
+        ((late_ms.max(MIN_OVERTAKE * self.target_ms) * 1e6) as i64).min(self.timeout_ns)
     }
 
-    /// The connection for the next frame, 0 or 1.
+    /// The lane of the next frame, 0 or 1.
     pub fn lane(&self) -> usize {
         self.lane
     }
 
-    /// A frame was sent.
+    /// Records a frame that was sent.
     pub fn sent(&mut self, now_ns: i64, sequence: u64, bytes: usize) {
-        if self.sent.len() == REMEMBERED {
+        if self.sent.len() == HISTORY {
             self.sent.pop_front();
         }
         self.sent.push_back(Sent {
@@ -183,28 +187,28 @@ impl Window {
             at_ns: now_ns,
             bytes,
             lane: self.lane,
-            is_under_way: true,
-            is_answered: false,
+            is_in_flight: true,
+            is_acknowledged: false,
         });
     }
 
-    /// A receiver has a frame; the answer is how long that took since it was sent, in milliseconds.
+    /// Records a receipt. Returns the time since the frame was sent, in milliseconds; `None` for an unknown frame.
     pub fn received(&mut self, now_ns: i64, receiver: &str, sequence: u64) -> Option<f64> {
         let sent = self.sent.iter_mut().find(|sent| sent.sequence == sequence)?;
-        sent.is_answered = true;
+        sent.is_acknowledged = true;
         let (took_ms, bytes) = ((now_ns - sent.at_ns) as f64 * 1e-6, sent.bytes);
-        self.losses_in_a_row = 0;
-        self.forget_the_silent(now_ns);
-        let has_room = self.receivers.len() < MOST_RECEIVERS;
+        self.consecutive_losses = 0;
+        self.remove_silent_receivers(now_ns);
+        let has_room = self.receivers.len() < MAX_RECEIVERS;
         match self.receivers.iter_mut().find(|known| known.name == receiver) {
             Some(known) => {
-                known.heard_ns = now_ns;
+                known.last_receipt_ns = now_ns;
                 known.sequence = known.sequence.max(sequence);
             }
             None if has_room => {
                 self.receivers.push(Receiver {
                     name: receiver.to_owned(),
-                    heard_ns: now_ns,
+                    last_receipt_ns: now_ns,
                     sequence,
                 });
             }
@@ -215,7 +219,7 @@ impl Window {
         let decides = in_use.is_none_or(|known| known.name == receiver);
         let arrived = in_use.or(slowest).map_or(sequence, |known| known.sequence);
         for sent in self.sent.iter_mut().filter(|sent| sent.sequence <= arrived) {
-            sent.is_under_way = false;
+            sent.is_in_flight = false;
         }
         if decides && arrived >= sequence {
             self.adapt(took_ms, bytes);
@@ -223,19 +227,19 @@ impl Window {
         Some(took_ms)
     }
 
-    fn forget_the_silent(&mut self, now_ns: i64) {
-        self.receivers.retain(|receiver| now_ns - receiver.heard_ns < SILENT_NS);
+    fn remove_silent_receivers(&mut self, now_ns: i64) {
+        self.receivers.retain(|receiver| now_ns - receiver.last_receipt_ns < RECEIVER_TIMEOUT_NS);
     }
 
     fn adapt(&mut self, took_ms: f64, bytes: usize) {
-        // What a lost packet costs is no measure of the link; a link that has become slow is followed in some steps.
-        let most_ms = self.late_ns() as f64 * 1e-6;
-        let measured_ms = took_ms.min(most_ms);
+        // Clamped, because a lost packet does not measure the link; a link that becomes slow is followed in some steps.
+        let late_ms = self.late_ns() as f64 * 1e-6;
+        let measured_ms = took_ms.min(late_ms);
         let mean_ms = match self.mean_ms {
             Some(mean_ms) => {
                 let deviation_ms = (measured_ms - mean_ms).abs();
                 self.deviation_ms += DEVIATION_WEIGHT * (deviation_ms - self.deviation_ms);
-                mean_ms + WEIGHT * (measured_ms - mean_ms)
+                mean_ms + MEAN_WEIGHT * (measured_ms - mean_ms)
             }
             None => {
                 self.deviation_ms = measured_ms / 2.0;
@@ -243,20 +247,19 @@ impl Window {
             }
         };
         self.mean_ms = Some(mean_ms);
-        if mean_ms > self.aim_ms {
-            // A mean that is high for what was is not held against what is.
-            if took_ms > self.aim_ms {
-                self.scale((self.aim_ms / mean_ms).max(LEAST_SHRINK));
+        if mean_ms > self.target_ms {
+            // A frame in time does not shrink the size, even while the mean is still high.
+            if took_ms > self.target_ms {
+                self.scale((self.target_ms / mean_ms).max(MIN_SHRINK));
             }
-        } else if bytes as f64 > 0.6 * self.size_bytes {
-            // A size that is not used says nothing of what the link would carry.
+        } else if bytes as f64 > MIN_USE * self.size_bytes {
+            // Smaller frames do not show that the link carries more.
             self.scale(GROWTH);
         }
     }
 
     fn scale(&mut self, factor: f64) {
-        let [least, most] = self.bounds;
-        self.size_bytes = (self.size_bytes * factor).clamp(least, most);
+        self.size_bytes = (self.size_bytes * factor).clamp(self.min_bytes, self.max_bytes);
     }
 }
 
@@ -271,16 +274,16 @@ mod tests {
         Window::new(&AirConfig {
             mode: Mode::Full,
             quality: 75,
-            quality_least: 40,
-            largest_kb: 200.0,
-            smallest_kb: 8.0,
+            min_quality: 40,
+            max_kb: 200.0,
+            min_kb: 8.0,
             round_trip_ms: 50.0,
             window: 1,
             timeout_ms: 250.0,
         })
     }
 
-    /// Sends frames at 15 Hz for a time over a link of a rate; the size in the end, in kilobytes.
+    /// Sends frames at 15 Hz over a link; returns the final size in kilobytes.
     fn settled_kb(window: &mut Window, from: u64, frames: u64, bytes_per_ms: f64) -> f64 {
         let mut arrives: Option<(i64, u64)> = None;
         for sequence in from..from + frames {
@@ -292,15 +295,15 @@ mod tests {
             if window.is_open(now).0 {
                 let bytes = window.size_bytes();
                 window.sent(now, sequence, bytes);
-                let way_ms = 10.0 + bytes as f64 / bytes_per_ms;
-                arrives = Some((now + (way_ms * 1e6) as i64, sequence));
+                let travel_ms = 10.0 + bytes as f64 / bytes_per_ms;
+                arrives = Some((now + (travel_ms * 1e6) as i64, sequence));
             }
         }
         window.size_bytes() as f64 / 1000.0
     }
 
     #[test]
-    fn the_size_follows_what_the_link_carries() {
+    fn the_size_follows_the_rate_of_the_link() {
         let mut window = window();
         // 20 Mbit/s carry 2500 bytes in a millisecond: 100 kB in the 40 ms that are left of 50.
         let fast = settled_kb(&mut window, 0, 200, 2500.0);
@@ -312,14 +315,14 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_sent_before_the_last_frame_arrived_or_is_overdue() {
+    fn a_frame_waits_until_the_last_one_arrived_or_is_overdue() {
         let mut window = window();
         assert!(window.is_open(0).0);
         window.sent(0, 1, 1000);
         assert!(!window.is_open(249 * MS).0);
         assert_eq!(window.received(30 * MS, "ground", 1), Some(30.0));
         assert!(window.is_open(30 * MS).0);
-        // Both lanes are held up.
+        // Both lanes are blocked.
         window.sent(40 * MS, 2, 1000);
         assert!(!window.is_open(129 * MS).0);
         assert_eq!((window.is_open(130 * MS), window.lane()), ((true, 0), 1));
@@ -328,14 +331,14 @@ mod tests {
         let before = window.size_bytes();
         assert_eq!((window.is_open(290 * MS), window.lane()), ((true, 1), 0));
         assert!(window.size_bytes() < before);
-        // The next loss takes longer to believe.
+        // The loss doubles the timeout.
         window.sent(300 * MS, 4, 1000);
         assert!(!window.is_open(629 * MS).0);
         assert_eq!(window.is_open(630 * MS), (true, 1));
     }
 
     #[test]
-    fn a_link_that_becomes_slow_after_a_steady_time_is_followed() {
+    fn a_steady_link_that_becomes_slow_is_followed() {
         let mut window = window();
         let after = |window: &mut Window, frames: std::ops::Range<u64>, took_ms: i64| {
             for sequence in frames {
@@ -345,16 +348,16 @@ mod tests {
             }
             window.late_ns()
         };
-        // Ever the same time: nothing deviates.
+        // No deviation.
         let late_ns = after(&mut window, 0..60, 58);
-        // 1.5 times what is aimed at, or the mean and a quarter of it.
+        // 1.5 times the target, or the mean and a quarter of it.
         assert!((72 * MS..=75 * MS).contains(&late_ns), "{late_ns}");
         let late_ns = after(&mut window, 60..120, 160);
         assert!(late_ns > 160 * MS, "{late_ns}");
     }
 
     #[test]
-    fn a_frame_that_is_held_up_is_overtaken_on_the_other_lane() {
+    fn a_delayed_frame_is_overtaken_on_the_other_lane() {
         let mut window = window();
         let mut now = 0;
         for sequence in 0..20 {
@@ -367,7 +370,7 @@ mod tests {
         assert_eq!((window.is_open(now + 75 * MS), window.lane()), ((true, 0), 1));
         window.sent(now + 132 * MS, 21, 1000);
         window.received(now + 152 * MS, "ground", 21);
-        // It stays there, as the first lane has lost its pace; what comes late makes the frames little smaller.
+        // The lane stays. A single late frame shrinks the size only a little.
         let before = window.size_bytes();
         assert_eq!(window.received(now + 240 * MS, "ground", 20), Some(240.0));
         assert_eq!((window.is_open(now + 240 * MS), window.lane()), ((true, 0), 1));
@@ -390,7 +393,7 @@ mod tests {
         assert!(window.is_open(2510 * MS).0, "the far one has been silent for too long");
     }
 
-    /// A good link carries 100 kB in time, a slow one beside it nothing.
+    /// The size beside a receiver that is always late, on a link that carries 100 kB in time.
     fn size_beside_a_slow_one(in_use: Option<&str>) -> usize {
         let mut window = window();
         window.use_receiver(in_use.map(str::to_owned));
@@ -398,15 +401,15 @@ mod tests {
             let now = sequence as i64 * 300 * MS;
             let bytes = window.size_bytes();
             window.sent(now, sequence, bytes);
-            let way_ms = 10 + bytes as i64 / 2500;
-            window.received(now + way_ms * MS, "good", sequence);
+            let travel_ms = 10 + bytes as i64 / 2500;
+            window.received(now + travel_ms * MS, "good", sequence);
             window.received(now + 200 * MS, "slow", sequence);
         }
         window.size_bytes()
     }
 
     #[test]
-    fn a_slow_receiver_makes_frames_smaller_only_while_no_other_is_in_use() {
+    fn a_slow_receiver_shrinks_frames_only_while_no_other_is_in_use() {
         assert!((75_000..125_000).contains(&size_beside_a_slow_one(Some("good"))));
         for in_use in [Some("slow"), None, Some("onboard, reads no JPEG")] {
             assert_eq!(size_beside_a_slow_one(in_use), 8000, "{in_use:?}");
@@ -431,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn a_receiver_that_is_gone_or_slow_holds_the_others_up_for_a_moment_only() {
+    fn a_dead_receiver_blocks_the_others_only_briefly() {
         let mut window = window();
         window.sent(0, 1, 1000);
         window.received(10 * MS, "near", 1);
@@ -441,11 +444,11 @@ mod tests {
         assert_eq!(window.is_open(129 * MS), (false, 0));
         let before = window.size_bytes();
         assert_eq!(window.is_open(130 * MS), (true, 0));
-        assert_eq!(window.size_bytes(), before, "it is not lost: somebody has it");
+        assert_eq!(window.size_bytes(), before, "it is not lost: one receiver has it");
     }
 
     #[test]
-    fn receipts_of_frames_that_were_never_sent_are_not_believed() {
+    fn receipts_of_unknown_frames_are_ignored() {
         let mut window = window();
         assert_eq!(window.received(0, "ground", 7), None);
         window.sent(0, 1, 1000);

@@ -293,7 +293,9 @@ impl Settings for Config {
         check.range("veil.for_s", self.veil.for_s, 0.0..=3600.0);
         check.range("veil.below_m", self.veil.below_m, 0.0..=1000.0);
         self.camera.check(check);
-        self.air.check(check);
+        for (key, value, range) in self.air.ranges() {
+            check.range(key, value, range);
+        }
     }
 }
 
