@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use fiducial::debug::{ALIGNMENT_RADIUS_PX, RgbImageBuf, draw_ellipses, draw_rings, draw_target};
-use fiducial::rings_thesis::{ContourEllipse, ellipse_filter};
+use fiducial::families::rings_thesis::{ContourEllipse, ellipse_filter};
 use fiducial::{Detector, Settings, Stages};
 use geometry::CameraModel;
 use imaging::{

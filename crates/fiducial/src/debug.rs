@@ -3,8 +3,8 @@
 use geometry::Pixel;
 use imaging::GrayView;
 
+use crate::candidates::ring::RingKind;
 pub use crate::canvas::{Colour, RgbImageBuf};
-use crate::ring::RingKind;
 use crate::trace::{Candidate, Trace};
 
 /// Radius of the thesis' alignment circle, in pixels.

@@ -5,11 +5,11 @@ use std::ops::Range;
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outlines, outline};
 
-use crate::circles::Circles;
+use crate::families::rings::Rings;
+use crate::families::rings::circle_pose::Circles;
+use crate::families::rings_thesis::RingsThesis;
 use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
-use crate::rings::Rings;
-use crate::rings_thesis::RingsThesis;
 use crate::square::quad::Quad;
 use crate::square::segments::{ImageQuads, Scale};
 use crate::square::{MOST_PAPERS, Squares, papers};

@@ -3,8 +3,8 @@
 use geometry::Pixel;
 use imaging::Ellipse;
 
+use crate::candidates::ring::Ring;
 use crate::observation::Observation;
-use crate::ring::Ring;
 
 /// What the last detection saw.
 #[derive(Clone, Debug, Default)]

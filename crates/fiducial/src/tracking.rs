@@ -11,8 +11,8 @@ use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
 use nalgebra::Vector3;
 
-use crate::circles::Circles;
 use crate::detector::{Detector, Expected};
+use crate::families::rings::circle_pose::Circles;
 use crate::marker::Family;
 use crate::observation::{Observation, Stages};
 use crate::trace::{Trace, moved_pixel};

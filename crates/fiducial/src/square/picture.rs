@@ -9,10 +9,10 @@ use geometry::Pixel;
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
-use crate::exposure::ClippedExposure;
+use crate::optics::edge_response::{END, PIXEL_VARIANCE, Step, boxiness};
+use crate::optics::exposure::ClippedExposure;
 use crate::square::pattern::Pattern;
 use crate::square::refine::{Design, Fit, Homography, Lens, MOST_ACROSS, Scratch};
-use crate::step::{END, PIXEL_VARIANCE, Step, boxiness};
 
 /// Light and blur of a marker's picture.
 #[derive(Copy, Clone, Debug, PartialEq)]

@@ -9,10 +9,10 @@ use geometry::Pixel;
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
+use crate::optics::edge_response::{Step, boxiness};
 use crate::square::pattern::Pattern;
 use crate::square::picture::Picture;
 use crate::square::refine::{CORNERS, Fit, Homography, Lens, Scratch};
-use crate::step::{Step, boxiness};
 
 /// A place at which an edge is looked at.
 #[derive(Copy, Clone, Debug)]

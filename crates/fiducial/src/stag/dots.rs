@@ -8,9 +8,9 @@
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
+use crate::optics::edge_response::Step;
 use crate::square::decode::Grid;
 use crate::stag::code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET};
-use crate::step::Step;
 
 /// Small cells across the square and its paper; their borders are the square's outline.
 const CELLS: usize = 24;

@@ -8,11 +8,11 @@ use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, bilinear};
 use nalgebra::Matrix6;
 
-use crate::circles::{Circles, EdgePoint, project};
+use crate::candidates::ring::RingKind;
+use crate::candidates::ring_profile::{Candidate, LEAST_SCORE, LEAST_STEP, SMALL_PX};
 use crate::drawing::RING_RADII;
-use crate::photometry::{self, Alternative, Fit, Spot};
-use crate::profile::{Candidate, LEAST_SCORE, LEAST_STEP, SMALL_PX};
-use crate::ring::RingKind;
+use crate::families::rings::circle_pose::{Circles, EdgePoint, project};
+use crate::families::rings::photometric::{self, Alternative, Fit, Spot};
 use crate::trace::Reason;
 
 /// Where grey values differ more from a fitted marker's, as a share of its contrast, something else is in the picture,
@@ -105,7 +105,7 @@ impl Search<'_> {
         self.measure(&circles, Reach::Near, edges);
         let bias_px = circles.bias_px(edges, self.camera);
         circles.leave_outliers(edges, self.camera);
-        let large = diameter_px > photometry::MOST_DIAMETER_PX;
+        let large = diameter_px > photometric::MOST_DIAMETER_PX;
         let share = if large { 2e-3 } else { 6e-4 };
         let lies = |rms: f64, bias: f64| {
             rms_px < (rms + 3e-3 * diameter_px).min(0.9)
@@ -155,7 +155,7 @@ impl Search<'_> {
         spots: &mut Vec<Spot>,
     ) -> Option<Seen> {
         let (view, camera) = (self.view, self.camera);
-        let (fit, other) = photometry::refined_again(view, camera, expected, self.size_m, spots)?;
+        let (fit, other) = photometric::refined_again(view, camera, expected, self.size_m, spots)?;
         let is_near = self.is_near(expected, &fit.circles, 1.0 + 0.03 * diameter_px, 0.1);
         if !is_near || !is_plain(&fit) {
             return None;
@@ -173,7 +173,7 @@ impl Search<'_> {
         spots: &mut Vec<Spot>,
     ) -> Result<Seen, Reason> {
         let (fit, other) =
-            photometry::refined(self.view, self.camera, start, self.size_m, self.inverted, spots)
+            photometric::refined(self.view, self.camera, start, self.size_m, self.inverted, spots)
                 .ok_or(Reason::Pose)?;
         // Noise may be a large part of a faint marker.
         let faint = fit.explained > LEAST_EXPLAINED_OF_FAINT
@@ -272,7 +272,7 @@ impl Search<'_> {
         diameter_px: f64,
         spots: &mut Vec<Spot>,
     ) -> Option<(Fit, Option<Alternative>)> {
-        let (fit, other) = photometry::refined(
+        let (fit, other) = photometric::refined(
             self.view,
             self.camera,
             circles,

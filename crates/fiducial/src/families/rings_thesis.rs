@@ -12,10 +12,10 @@ use imaging::{
 };
 use nalgebra::{Matrix2, Matrix3, Matrix6};
 
-use crate::circles::ANY_ANGLE_VARIANCE;
+use crate::candidates::ring::{Ring, RingKind};
+use crate::families::rings::circle_pose::ANY_ANGLE_VARIANCE;
 use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, Stages};
-use crate::ring::{Ring, RingKind};
 use crate::trace::{Reason, Trace};
 
 /// Relative area tolerance of Algorithm 1.

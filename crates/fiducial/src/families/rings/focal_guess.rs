@@ -3,7 +3,7 @@
 use geometry::CameraModel;
 use imaging::GrayView;
 
-use crate::circles::{Circles, EdgePoint};
+use crate::families::rings::circle_pose::{Circles, EdgePoint};
 
 /// A camera for images whose own is not known; the marker's centre hardly depends on it.
 pub(crate) fn nominal_camera(view: GrayView<'_>) -> CameraModel {

@@ -10,10 +10,10 @@ use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector, Vector3};
 
-use crate::circles::{Circles, Meeting, Plane, project};
-use crate::exposure::ClippedExposure;
-use crate::ring::RingKind;
-use crate::step::{Step, boxiness};
+use crate::candidates::ring::RingKind;
+use crate::families::rings::circle_pose::{Circles, Meeting, Plane, project};
+use crate::optics::edge_response::{Step, boxiness};
+use crate::optics::exposure::ClippedExposure;
 
 /// Markers of more pixels across have edges far enough apart.
 pub(crate) const MOST_DIAMETER_PX: f64 = 180.0;

@@ -8,20 +8,25 @@
 //! (`photometry`). That refines the pose, whose centre is the true projection of the
 //! marker's, and decides whether it is believed.
 
+pub(crate) mod circle_pose;
+mod edges;
+mod focal_guess;
+mod photometric;
+
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::{from_level_0, to_level_0};
 use imaging::{Ellipse, GrayView, Outlines, Pyramid, outline};
 
-use crate::circles::{Circles, EdgePoint, pixel_covariance, project};
+use crate::candidates::ellipses::{Border, add_arcs, whole_border};
+use crate::candidates::ring::{Ring, RingKind};
+use crate::candidates::ring_profile::{Candidate, candidates, speck};
 use crate::detector::{Allowed, SlowPass};
-use crate::lens::{guess_lens, nominal_camera};
+use crate::families::rings::circle_pose::{Circles, EdgePoint, pixel_covariance, project};
+use crate::families::rings::edges::{Search, Seen};
+use crate::families::rings::focal_guess::{guess_lens, nominal_camera};
+use crate::families::rings::photometric::Spot;
 use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, PoseSolution, Stages};
-use crate::outline::{Border, add_arcs, whole_border};
-use crate::photometry::Spot;
-use crate::profile::{Candidate, candidates, speck};
-use crate::ring::{Ring, RingKind};
-use crate::search::{Search, Seen};
 use crate::trace::{Reason, Trace};
 
 /// Where the marker is looked for; what comes later only when it was not found before.

@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use imaging::pyramid::to_level_0;
 use imaging::{Ellipse, GrayView, bilinear};
 
-use crate::outline::Border;
+use crate::candidates::ellipses::Border;
 
 /// Fewer grey levels are noise.
 pub(crate) const LEAST_STEP: f64 = 6.0;

@@ -1,0 +1,4 @@
+//! The detectors, one for each kind of marker.
+
+pub mod rings;
+pub mod rings_thesis;

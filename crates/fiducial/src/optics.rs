@@ -1,0 +1,4 @@
+//! What a camera and its lens do to an edge, and the numerics that fit a model to pixels.
+
+pub(crate) mod edge_response;
+pub(crate) mod exposure;
