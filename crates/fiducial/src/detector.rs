@@ -6,7 +6,7 @@ use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outlines, outline};
 
 use crate::families::rings::Rings;
-use crate::families::rings::circle_pose::Circles;
+use crate::families::rings::circle_pose::CirclePose;
 use crate::families::rings_thesis::RingsThesis;
 use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
@@ -110,7 +110,7 @@ pub(crate) struct Expected {
     /// The corners of a square marker, its own top left first.
     pub(crate) corners: Option<[Pixel; 4]>,
     /// The place of rings.
-    pub(crate) circles: Option<Circles>,
+    pub(crate) circles: Option<CirclePose>,
 }
 
 /// Why there is no detector for these markers.

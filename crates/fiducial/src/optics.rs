@@ -2,3 +2,5 @@
 
 pub(crate) mod edge_response;
 pub(crate) mod exposure;
+pub(crate) mod least_squares;
+pub(crate) mod normal;

@@ -12,7 +12,7 @@ use imaging::GrayView;
 use nalgebra::Vector3;
 
 use crate::detector::{Detector, Expected};
-use crate::families::rings::circle_pose::Circles;
+use crate::families::rings::circle_pose::CirclePose;
 use crate::marker::Family;
 use crate::observation::{Observation, Stages};
 use crate::trace::{Trace, moved_pixel};
@@ -316,7 +316,7 @@ impl Track {
         let corner = |[x, y]: [f64; 2]| Pixel::new(x - offset[0], y - offset[1]);
         let circles = || {
             let [centre, normal] = [shape.centre, shape.normal].map(Vector3::from);
-            Some(Circles { centre, normal: normal.try_normalize(0.1)? })
+            Some(CirclePose { centre, normal: normal.try_normalize(0.1)? })
         };
         Some(Expected {
             family: self.family,

@@ -21,7 +21,7 @@ use crate::candidates::ellipses::{Border, add_arcs, whole_border};
 use crate::candidates::ring::{Ring, RingKind};
 use crate::candidates::ring_profile::{Candidate, candidates, speck};
 use crate::detector::{Allowed, SlowPass};
-use crate::families::rings::circle_pose::{Circles, EdgePoint, pixel_covariance, project};
+use crate::families::rings::circle_pose::{CirclePose, EdgePoint, pixel_covariance, project};
 use crate::families::rings::edges::{Search, Seen};
 use crate::families::rings::focal_guess::{guess_lens, nominal_camera};
 use crate::families::rings::photometric::Spot;
@@ -186,7 +186,7 @@ impl Rings {
         view: GrayView<'_>,
         marker: &Marker,
         camera: &CameraModel,
-        expected: &Circles,
+        expected: &CirclePose,
     ) -> Option<Observation> {
         let size_m = marker.size_m?;
         let search =
@@ -407,7 +407,7 @@ fn in_image(mut observation: Observation, level: usize) -> Observation {
 /// A marker that was seen, its circles through a lens that may be guessed.
 fn observed(
     seen: &Seen,
-    (circles, lens): (Circles, &CameraModel),
+    (circles, lens): (CirclePose, &CameraModel),
     (size_m, camera): (Option<f64>, Option<&CameraModel>),
     nominal: &CameraModel,
 ) -> Result<Observation, Reason> {
@@ -424,7 +424,7 @@ fn observed(
     let centre_covariance_px2 =
         pixel_covariance(seen.circles.centre, &of_centre, nominal).ok_or(Reason::Pose)?;
     let centre = project(circles.centre, lens).ok_or(Reason::Pose)?;
-    let outline = circles.outline(size_m.unwrap_or(1.0) / 2.0, lens).ok_or(Reason::Pose)?;
+    let outline = circles.projected(size_m.unwrap_or(1.0) / 2.0, lens).ok_or(Reason::Pose)?;
     Ok(Observation {
         family: Family::Rings,
         id: None,

@@ -13,7 +13,7 @@ use imaging::{
 use nalgebra::{Matrix2, Matrix3, Matrix6};
 
 use crate::candidates::ring::{Ring, RingKind};
-use crate::families::rings::circle_pose::ANY_ANGLE_VARIANCE;
+use crate::families::rings::circle_pose::UNKNOWN_ANGLE_VARIANCE;
 use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, Stages};
 use crate::trace::{Reason, Trace};
@@ -420,7 +420,7 @@ fn facing_covariance(
     let aside_m = CENTRE_ERROR_PX * metres_per_px + CENTRE_ERROR_OF_SIZE * size_m;
     let along = ray * ray.transpose() * (range_m * RANGE_ERROR).powi(2);
     let sight = ray.normalize();
-    let turn = sight * sight.transpose() * (ANY_ANGLE_VARIANCE - TILT_ERROR * TILT_ERROR);
+    let turn = sight * sight.transpose() * (UNKNOWN_ANGLE_VARIANCE - TILT_ERROR * TILT_ERROR);
     let mut covariance = Matrix6::zeros();
     let place = along + Matrix3::identity() * (aside_m * aside_m);
     covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&place);

@@ -1,7 +1,8 @@
 //! What a camera makes of a sharp edge between black and white.
 
-use std::f64::consts::TAU;
 use std::sync::LazyLock;
+
+use crate::optics::normal;
 
 /// The edge's profile has ended at this many standard deviations.
 pub(crate) const END: f64 = 3.75;
@@ -34,7 +35,7 @@ impl Step {
             let mut nodes = [[0.0; 2]; NODES];
             for (i, node) in nodes.iter_mut().enumerate() {
                 let z = FIRST + i as f64 / PER_UNIT;
-                *node = [distribution(z), (-0.5 * z * z).exp() / TAU.sqrt()];
+                *node = [normal::cumulative(z), normal::density(z)];
             }
             nodes
         });
@@ -60,16 +61,6 @@ impl Step {
         let fourth = square * (square - 6.0) + 3.0;
         (height - boxiness * third * slope, slope * (1.0 + boxiness * fourth))
     }
-}
-
-/// The normal distribution by its series, which converges for all arguments.
-fn distribution(z: f64) -> f64 {
-    let (mut term, mut sum) = (z, z);
-    for k in 1..200 {
-        term *= z * z / f64::from(2 * k + 1);
-        sum += term;
-    }
-    0.5 + sum * (-0.5 * z * z).exp() / TAU.sqrt()
 }
 
 #[cfg(test)]
@@ -114,7 +105,7 @@ mod tests {
                     let mut mean = 0.0;
                     for k in 0..1600 {
                         let (dx, dy) = (f64::from(k % 40) - 19.5, f64::from(k / 40) - 19.5);
-                        mean += distribution((at + (x * dx + y * dy) / 40.0) / blur) / 1600.0;
+                        mean += normal::cumulative((at + (x * dx + y * dy) / 40.0) / blur) / 1600.0;
                     }
                     let (height, _) = step.at(at / variance.sqrt(), boxiness([x, y], variance));
                     assert!(

@@ -11,7 +11,7 @@ use nalgebra::Matrix6;
 use crate::candidates::ring::RingKind;
 use crate::candidates::ring_profile::{Candidate, LEAST_SCORE, LEAST_STEP, SMALL_PX};
 use crate::drawing::RING_RADII;
-use crate::families::rings::circle_pose::{Circles, EdgePoint, project};
+use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
 use crate::families::rings::photometric::{self, Alternative, Fit, Spot};
 use crate::trace::Reason;
 
@@ -56,13 +56,13 @@ pub(crate) struct Search<'a> {
 /// A marker that was looked for and seen.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Seen {
-    pub(crate) circles: Circles,
+    pub(crate) circles: CirclePose,
     /// Between the edges in the image and the pose's, in pixels.
     pub(crate) rms_px: f64,
     /// Of centre (m) and rotation vector (rad), in the camera frame.
     pub(crate) covariance: Matrix6<f64>,
     /// The same tilted the other way, and its difference from the edges in pixels, where it is a pose of its own.
-    pub(crate) other: Option<(Circles, f64)>,
+    pub(crate) other: Option<(CirclePose, f64)>,
     /// From 0 to 1.
     pub(crate) confidence: f64,
 }
@@ -77,7 +77,7 @@ impl Search<'_> {
     ) -> Result<Seen, Reason> {
         edges.clear();
         let radius_m = candidate.radius * self.size_m;
-        let both = Circles::from_ellipse(&candidate.border.ellipse, radius_m, self.camera)
+        let both = CirclePose::from_ellipse(&candidate.border.ellipse, radius_m, self.camera)
             .ok_or(Reason::Pose)?;
         if candidate.diameter_px() < SMALL_PX {
             return self.small(&both[0], candidate.diameter_px(), spots);
@@ -94,7 +94,7 @@ impl Search<'_> {
         }
         let (circles, rms_px, support) = self.whole(rough, &both[1], edges)?;
         let diameter_px =
-            circles.outline(self.size_m / 2.0, self.camera).ok_or(Reason::Pose)?.major;
+            circles.projected(self.size_m / 2.0, self.camera).ok_or(Reason::Pose)?.major;
         let judged = believable(&support);
         if judged != Belief::None
             && let Some((fit, other)) = self.by_grey_values(&circles, diameter_px, spots)
@@ -103,8 +103,8 @@ impl Search<'_> {
         }
         // Paper is not quite flat, and lenses bend; but each circle has its radius.
         self.measure(&circles, Reach::Near, edges);
-        let bias_px = circles.bias_px(edges, self.camera);
-        circles.leave_outliers(edges, self.camera);
+        let bias_px = circles.max_bias_px(edges, self.camera);
+        circles.remove_outliers(edges, self.camera);
         let large = diameter_px > photometric::MOST_DIAMETER_PX;
         let share = if large { 2e-3 } else { 6e-4 };
         let lies = |rms: f64, bias: f64| {
@@ -131,11 +131,11 @@ impl Search<'_> {
     /// The marker that should be where this pose has it, when it is neither too small nor too large and plain to see.
     pub(crate) fn again(
         &self,
-        expected: &Circles,
+        expected: &CirclePose,
         edges: &mut Vec<EdgePoint>,
         spots: &mut Vec<Spot>,
     ) -> Option<Seen> {
-        let diameter_px = expected.outline(self.size_m / 2.0, self.camera)?.major;
+        let diameter_px = expected.projected(self.size_m / 2.0, self.camera)?.major;
         if diameter_px < SMALL_PX {
             return None;
         }
@@ -149,7 +149,7 @@ impl Search<'_> {
     /// The marker right where this pose has it, when its grey values and its edges are a marker's.
     fn at_expected(
         &self,
-        expected: &Circles,
+        expected: &CirclePose,
         diameter_px: f64,
         edges: &mut Vec<EdgePoint>,
         spots: &mut Vec<Spot>,
@@ -168,7 +168,7 @@ impl Search<'_> {
     /// A marker too small for edges: its grey values decide.
     fn small(
         &self,
-        start: &Circles,
+        start: &CirclePose,
         candidate_px: f64,
         spots: &mut Vec<Spot>,
     ) -> Result<Seen, Reason> {
@@ -195,14 +195,14 @@ impl Search<'_> {
     }
 
     /// Whether a pose has its centre within so many pixels of another's, at nearly its distance.
-    fn is_near(&self, start: &Circles, found: &Circles, px: f64, share: f64) -> bool {
+    fn is_near(&self, start: &CirclePose, found: &CirclePose, px: f64, share: f64) -> bool {
         let ends = project(start.centre, self.camera).zip(project(found.centre, self.camera));
         ends.is_some_and(|(a, b)| a.distance(&b) < px)
             && (found.centre.z / start.centre.z - 1.0).abs() < share
     }
 
     /// The pose that the edges speak for that are near enough to where this one has them; `None` when too few are.
-    fn rough(&self, start: &Circles, edges: &mut Vec<EdgePoint>) -> Option<Circles> {
+    fn rough(&self, start: &CirclePose, edges: &mut Vec<EdgePoint>) -> Option<CirclePose> {
         let support = self.measure(start, Reach::Far, edges);
         let there = |s: &&Support| s.share().is_some_and(|share| share > 0.4);
         let beyond_view = support[..4].iter().all(|s| s.share().is_none());
@@ -215,11 +215,11 @@ impl Search<'_> {
     /// The marker of which a pose is known roughly, when it is not too large and its grey values are a marker's.
     fn at_once(
         &self,
-        rough: &Circles,
+        rough: &CirclePose,
         edges: &mut Vec<EdgePoint>,
         spots: &mut Vec<Spot>,
     ) -> Option<Seen> {
-        let diameter_px = rough.outline(self.size_m / 2.0, self.camera)?.major;
+        let diameter_px = rough.projected(self.size_m / 2.0, self.camera)?.major;
         let (fit, other) = self.by_grey_values(rough, diameter_px, spots)?;
         let support = self.measure(&fit.circles, Reach::Near, edges);
         let seen = self.seen_by_grey_values(&fit, other, confidence(&support))?;
@@ -230,11 +230,11 @@ impl Search<'_> {
     /// roughly or from another start.
     fn whole(
         &self,
-        rough: Option<Circles>,
-        start: &Circles,
+        rough: Option<CirclePose>,
+        start: &CirclePose,
         edges: &mut Vec<EdgePoint>,
-    ) -> Result<(Circles, f64, [Support; 6]), Reason> {
-        let mut best: Option<(Circles, f64)> = None;
+    ) -> Result<(CirclePose, f64, [Support; 6]), Reason> {
+        let mut best: Option<(CirclePose, f64)> = None;
         for is_first in [true, false] {
             let rough = if is_first { rough } else { self.rough(start, edges) };
             let Some(rough) = rough else { continue };
@@ -252,7 +252,7 @@ impl Search<'_> {
         }
         let (mut circles, _) = best.ok_or(Reason::Edges)?;
         let support = self.measure(&circles, Reach::Near, edges);
-        circles.leave_outliers(edges, self.camera);
+        circles.remove_outliers(edges, self.camera);
         let mut rms_px;
         (circles, rms_px) = circles.refined(edges, self.camera).ok_or(Reason::Edges)?;
         // The same outlines come nearly as well from the marker tilted the other way.
@@ -268,7 +268,7 @@ impl Search<'_> {
     /// are not a marker's or disagree with its edges.
     fn by_grey_values(
         &self,
-        circles: &Circles,
+        circles: &CirclePose,
         diameter_px: f64,
         spots: &mut Vec<Spot>,
     ) -> Option<(Fit, Option<Alternative>)> {
@@ -286,7 +286,12 @@ impl Search<'_> {
     }
 
     /// The marker of which only one ring can be seen, because its neighbour's place is covered by something.
-    fn alone(&self, start: &Circles, kind: RingKind, edges: &mut Vec<EdgePoint>) -> Option<Seen> {
+    fn alone(
+        &self,
+        start: &CirclePose,
+        kind: RingKind,
+        edges: &mut Vec<EdgePoint>,
+    ) -> Option<Seen> {
         if kind == RingKind::Inner || self.inverted || !self.is_covered(start, kind)? {
             return None;
         }
@@ -304,12 +309,12 @@ impl Search<'_> {
         }
         let whole = support.iter().skip(own).take(2).all(|s| s.share().is_some_and(|s| s >= 0.95));
         let (circles, rms_px) = start.refined(edges, self.camera)?;
-        let diameter_px = circles.outline(self.size_m / 2.0, self.camera)?.major;
+        let diameter_px = circles.projected(self.size_m / 2.0, self.camera)?.major;
         // Of two circles alone the radii must be right.
         let limit_px = 0.06 + 4e-4 * diameter_px;
         let fits = diameter_px > LEAST_ALONE_PX
             && rms_px < 2.0 * limit_px
-            && circles.bias_px(edges, self.camera) < limit_px;
+            && circles.max_bias_px(edges, self.camera) < limit_px;
         let good = whole && fits && self.is_covered(&circles, kind)?;
         good.then(|| self.seen(circles, rms_px, edges, 0.5 * confidence(&support))).flatten()
     }
@@ -317,7 +322,7 @@ impl Search<'_> {
     /// The marker with how well it is known and what else it could be.
     fn seen(
         &self,
-        circles: Circles,
+        circles: CirclePose,
         rms_px: f64,
         edges: &[EdgePoint],
         confidence: f64,
@@ -338,7 +343,7 @@ impl Search<'_> {
     ) -> Option<Seen> {
         // A step as high as the contrast rises within two and a half times the blur.
         let rms_px = |blur_px: f64, difference: f64| 2.5 * blur_px * difference;
-        let covariance = fit.circles.spread(&fit.covariance);
+        let covariance = fit.circles.full_covariance(&fit.covariance);
         Some(Seen {
             circles: fit.circles,
             rms_px: rms_px(fit.blur_px, fit.difference),
@@ -349,7 +354,7 @@ impl Search<'_> {
     }
 
     /// Whether the place of a ring's neighbour is not plain white, as beside other rings, but covered.
-    fn is_covered(&self, circles: &Circles, kind: RingKind) -> Option<bool> {
+    fn is_covered(&self, circles: &CirclePose, kind: RingKind) -> Option<bool> {
         let neighbour = if kind == RingKind::Middle { RingKind::Outer } else { RingKind::Middle };
         let middle = |(inner, outer): (f64, f64)| self.median_at(circles, (inner + outer) / 2.0);
         let (inner, outer) = kind.radii();
@@ -361,7 +366,7 @@ impl Search<'_> {
     }
 
     /// The middle grey value on a circle of this radius (in marker sizes).
-    fn median_at(&self, circles: &Circles, radius: f64) -> Option<f64> {
+    fn median_at(&self, circles: &CirclePose, radius: f64) -> Option<f64> {
         const PLACES: usize = 24;
         let (u, v) = circles.basis();
         let mut values = [0.0; PLACES];
@@ -381,7 +386,12 @@ impl Search<'_> {
     }
 
     /// Looks for all six edges.
-    fn measure(&self, circles: &Circles, reach: Reach, edges: &mut Vec<EdgePoint>) -> [Support; 6] {
+    fn measure(
+        &self,
+        circles: &CirclePose,
+        reach: Reach,
+        edges: &mut Vec<EdgePoint>,
+    ) -> [Support; 6] {
         edges.clear();
         let mut support = [Support::default(); 6];
         for (index, support) in support.iter_mut().enumerate() {
@@ -393,7 +403,7 @@ impl Search<'_> {
     /// Looks for one edge all round; nowhere when its bands are too narrow to be seen.
     fn measure_edge(
         &self,
-        circles: &Circles,
+        circles: &CirclePose,
         index: usize,
         reach: Reach,
         edges: &mut Vec<EdgePoint>,

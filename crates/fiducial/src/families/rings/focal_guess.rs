@@ -3,7 +3,7 @@
 use geometry::CameraModel;
 use imaging::GrayView;
 
-use crate::families::rings::circle_pose::{Circles, EdgePoint};
+use crate::families::rings::circle_pose::{CirclePose, EdgePoint};
 
 /// A camera for images whose own is not known; the marker's centre hardly depends on it.
 pub(crate) fn nominal_camera(view: GrayView<'_>) -> CameraModel {
@@ -14,10 +14,10 @@ pub(crate) fn nominal_camera(view: GrayView<'_>) -> CameraModel {
 /// The focal length at which the circles fit a tilted marker's edges best: without it the true centre of a large one
 /// would be a pixel off. `None` when none fits better than the `nominal` one.
 pub(crate) fn guess_lens(
-    circles: &Circles,
+    circles: &CirclePose,
     nominal: &CameraModel,
     edges: &mut [EdgePoint],
-) -> Option<(Circles, CameraModel)> {
+) -> Option<(CirclePose, CameraModel)> {
     const STEPS: i32 = 9;
     const RATIO: f64 = 1.18;
     let mut best = None;

@@ -11,7 +11,7 @@ use imaging::GrayView;
 use nalgebra::{SMatrix, SVector, Vector3};
 
 use crate::candidates::ring::RingKind;
-use crate::families::rings::circle_pose::{Circles, Meeting, Plane, project};
+use crate::families::rings::circle_pose::{CirclePlane, CirclePose, RayPlaneIntersection, project};
 use crate::optics::edge_response::{Step, boxiness};
 use crate::optics::exposure::ClippedExposure;
 
@@ -97,7 +97,7 @@ const PRIOR_NORMAL: f64 = 0.6;
 /// Everything that is fitted.
 #[derive(Copy, Clone, Debug)]
 struct Picture {
-    circles: Circles,
+    circles: CirclePose,
     /// Standard deviation of the blur in pixels: the lens', and the pixels' own extent; its mean over all directions.
     blur_px: f64,
     /// What its variance has more to the right than down, over two, and the covariance of both, in square pixels: what a
@@ -123,8 +123,8 @@ pub(crate) struct Spot {
 /// What a marker of a known look fitted to an image says.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Fit {
-    pub(crate) circles: Circles,
-    /// Covariance of the centre (m) and of the normal along [`Circles::basis`] (rad).
+    pub(crate) circles: CirclePose,
+    /// Covariance of the centre (m) and of the normal along [`CirclePose::basis`] (rad).
     pub(crate) covariance: SMatrix<f64, 5, 5>,
     /// Root mean square of the differences left, in units of the marker's contrast.
     pub(crate) difference: f64,
@@ -154,17 +154,17 @@ impl Fit {
 pub(crate) fn refined(
     view: GrayView<'_>,
     camera: &CameraModel,
-    start: &Circles,
+    start: &CirclePose,
     size_m: f64,
     inverted: bool,
     spots: &mut Vec<Spot>,
 ) -> Option<(Fit, Option<Alternative>)> {
     spots.clear();
     let around = Around { view, camera, size_m, inverted };
-    let is_small = start.outline(size_m / 2.0, camera)?.major < ALL_PIXELS_PX;
+    let is_small = start.projected(size_m / 2.0, camera)?.major < ALL_PIXELS_PX;
     let hopeless = if is_small { HOPELESS_OF_SMALL } else { HOPELESS };
     around.gather(start, FOCUSED_PX, spots)?;
-    let tilted = |circles: &Circles| circles.tilted_at_least(LEAST_START_TILT);
+    let tilted = |circles: &CirclePose| circles.with_min_tilt(LEAST_START_TILT);
     let every = every(spots);
     let few = Scene { every, ..Scene::new(spots, size_m, camera, hopeless) };
     let mut first = few.fitted(&tilted(start), None, None)?;
@@ -196,7 +196,7 @@ pub(crate) fn refined(
     }
     // Tilted to a wrong side at first, it may have stopped where it faces the camera.
     if first.picture.circles.tilt() < LEAST_START_TILT / 2.0 {
-        let turned = tilted(&first.picture.circles).turned();
+        let turned = tilted(&first.picture.circles).with_tilt_rotated();
         if let Some(other) = few.fitted(&turned, Some(&first), Some(1.1 * first.cost))
             && other.cost < first.cost
         {
@@ -222,7 +222,7 @@ pub(crate) fn refined(
 pub(crate) fn refined_again(
     view: GrayView<'_>,
     camera: &CameraModel,
-    expected: &Circles,
+    expected: &CirclePose,
     size_m: f64,
     spots: &mut Vec<Spot>,
 ) -> Option<(Fit, Option<Alternative>)> {
@@ -242,7 +242,7 @@ pub(crate) fn refined_again(
     if first.difference(&few) > MOST_DIFFERENCE {
         return None;
     }
-    let mirrored = first.picture.circles.tilted_at_least(LEAST_START_TILT).mirrored();
+    let mirrored = first.picture.circles.with_min_tilt(LEAST_START_TILT).mirrored();
     let most = MOST_COST_OF_OTHER * first.cost;
     let second = few.fitted(&mirrored, Some(&first), Some(most));
     let (mut best, mut other) = match second {
@@ -281,7 +281,7 @@ fn every(spots: &[Spot]) -> usize {
 /// The marker tilted the other way.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Alternative {
-    pub(crate) circles: Circles,
+    pub(crate) circles: CirclePose,
     /// As of [`Fit`].
     pub(crate) difference: f64,
     pub(crate) blur_px: f64,
@@ -298,8 +298,8 @@ struct Around<'a> {
 impl Around<'_> {
     /// The pixels in and just around the marker; of a large one those about its edges. False when they would be the same
     /// as those of a lens in focus that are there already.
-    fn gather(&self, circles: &Circles, blur_px: f64, spots: &mut Vec<Spot>) -> Option<bool> {
-        let outline = circles.outline(self.size_m / 2.0, self.camera)?;
+    fn gather(&self, circles: &CirclePose, blur_px: f64, spots: &mut Vec<Spot>) -> Option<bool> {
+        let outline = circles.projected(self.size_m / 2.0, self.camera)?;
         let middle = project(circles.centre, self.camera)?;
         let diameter_px = outline.major;
         if !(LEAST_DIAMETER_PX..=MOST_DIAMETER_PX).contains(&diameter_px) {
@@ -356,7 +356,7 @@ impl Around<'_> {
 
 /// Tells places across each edge of the marker, all round, and whether they lie within its rim.
 fn about_edges(
-    circles: &Circles,
+    circles: &CirclePose,
     size_m: f64,
     camera: &CameraModel,
     mut tell: impl FnMut([f64; 2], bool),
@@ -451,7 +451,7 @@ impl<'a> Scene<'a> {
     /// `hopeless`.
     fn fitted(
         &self,
-        start: &Circles,
+        start: &CirclePose,
         like: Option<&Fitted>,
         hopeless: Option<f64>,
     ) -> Option<Fitted> {
@@ -614,7 +614,7 @@ struct Blur {
 /// form", JASA 1972), also for circles no larger than the blur: to this power, it is nearly normal.
 #[derive(Copy, Clone)]
 struct Places {
-    meeting: Meeting,
+    meeting: RayPlaneIntersection,
     /// The logarithm of the mean of the squared distance.
     log_square: f64,
     power: f64,
@@ -634,9 +634,11 @@ struct Places {
 impl Places {
     /// Without a branch, so that many are worked out at once.
     #[inline(always)]
-    fn about(ray: &Vector3<f64>, plane: &Plane, blur: &Blur) -> Self {
-        let meeting = plane.meets(ray);
-        let Meeting { rho, outwards: a, around: b, metres_per_px, px_per_metre, .. } = meeting;
+    fn about(ray: &Vector3<f64>, plane: &CirclePlane, blur: &Blur) -> Self {
+        let meeting = plane.intersect(ray);
+        let RayPlaneIntersection {
+            rho, radial: a, tangential: b, metres_per_px, px_per_metre, ..
+        } = meeting;
         // Variances outwards and around, and the two together.
         let [xx, xy, yy] = blur.covariance;
         let blurred = |[x, y]: [f64; 2]| [xx * x + xy * y, xy * x + yy * y];
@@ -675,7 +677,7 @@ impl Places {
     /// What a pixel with such a blur sees of the marker.
     #[inline]
     fn looks(&self, scene: &Scene<'_>) -> Looks {
-        let Meeting { rho, slope, .. } = self.meeting;
+        let RayPlaneIntersection { rho, by_pose, .. } = self.meeting;
         let (mut within, mut by_distance, mut by_deviation) = ([0.0; 6], 0.0, 0.0);
         for (index, (within, (radius, log_radius))) in
             within.iter_mut().zip(scene.radii).enumerate()
@@ -697,7 +699,7 @@ impl Places {
         }
         Looks {
             within,
-            by_pose: slope,
+            by_pose,
             by_distance,
             by_blur: by_deviation * self.by_blur,
             by_motion: self.by_motion.map(|by| by_deviation * by),
@@ -726,7 +728,7 @@ impl Picture {
             let places = batch.map(|spot| Places::about(&spot.ray, &plane, &blur));
             let count = spots.len().div_ceil(scene.every);
             for (spot, places) in batch.iter().zip(&places).take(count) {
-                if !places.meeting.is_sound() {
+                if !places.meeting.is_valid() {
                     return None;
                 }
                 tell(spot, &places.looks(scene));
@@ -953,10 +955,10 @@ mod tests {
     }
 
     /// What is found in a picture whose white is so bright and that is blurred so, and the truth.
-    fn from_its_picture(paper: f64, blur_px: f64, motion: [f64; 2]) -> (Fit, Circles) {
+    fn from_its_picture(paper: f64, blur_px: f64, motion: [f64; 2]) -> (Fit, CirclePose) {
         let camera = CameraModel::pinhole(100, 80, 909.0);
         let size_m = 0.15341;
-        let truth = Circles {
+        let truth = CirclePose {
             centre: Vector3::new(0.03, -0.05, 6.0),
             normal: Vector3::new(0.3, 0.2, -0.9).normalize(),
         };
@@ -984,7 +986,7 @@ mod tests {
             })
             .collect();
         let view = GrayView::packed(&data, 100, 80).unwrap();
-        let start = Circles {
+        let start = CirclePose {
             centre: truth.centre * 1.01,
             normal: Vector3::new(0.1, 0.1, -0.9).normalize(),
         };
