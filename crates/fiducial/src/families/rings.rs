@@ -24,7 +24,7 @@ use crate::detector::{Allowed, SlowPass};
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, pixel_covariance, project};
 use crate::families::rings::edges::{Search, Seen};
 use crate::families::rings::focal_guess::{guess_lens, nominal_camera};
-use crate::families::rings::photometric::Spot;
+use crate::families::rings::photometric::PixelSample;
 use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, PoseSolution, Stages};
 use crate::trace::{Reason, Trace};
@@ -124,7 +124,7 @@ pub struct Rings {
     borders: Vec<Border>,
     candidates: Vec<Candidate>,
     edges: Vec<EdgePoint>,
-    spots: Vec<Spot>,
+    spots: Vec<PixelSample>,
 }
 
 impl Rings {

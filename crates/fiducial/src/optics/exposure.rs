@@ -1,6 +1,6 @@
-//! Black and contrast of a picture whose shares of white are known.
+//! Linear gain/offset fit with saturation: black and contrast of an image whose shares of white are known.
 
-/// The line of least squares from the share of white that a pixel should see to the grey value it has.
+/// Least-squares line from the share of white that a pixel should see to the grey value it has.
 #[derive(Copy, Clone, Debug, Default)]
 struct Exposure {
     n: f64,
@@ -11,7 +11,7 @@ struct Exposure {
 }
 
 impl Exposure {
-    /// Takes a pixel into account: its share of white, from 0 to 1, and its grey value.
+    /// Adds a pixel: its share of white, from 0 to 1, and its grey value.
     fn add(&mut self, white: f64, grey: f64) {
         self.n += 1.0;
         self.white += white;
@@ -20,7 +20,7 @@ impl Exposure {
         self.white_grey += white * grey;
     }
 
-    /// Black and the contrast from black to white, in grey levels; not finite where all pixels have the same share.
+    /// Black, and white minus black, in grey levels; not finite when all pixels have the same share.
     fn black_and_contrast(&self) -> [f64; 2] {
         let Self { n, white, white_white, grey, white_grey } = *self;
         let contrast = (n * white_grey - white * grey) / (n * white_white - white * white);
@@ -28,33 +28,33 @@ impl Exposure {
     }
 }
 
-/// The same of pixels that end at a grey value: how bright white is beyond it, only what is darker says.
+/// The same for pixels that saturate: when white is brighter than the saturation level, only the darker pixels count.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct ClippedExposure {
-    end: f64,
+    saturation: f64,
     all: Exposure,
     darker: Exposure,
 }
 
 impl ClippedExposure {
-    /// No pixels yet, of which the brightest are at `end`.
-    pub(crate) fn new(end: f64) -> Self {
-        Self { end, all: Exposure::default(), darker: Exposure::default() }
+    /// No pixels yet; the brightest have the grey value `saturation`.
+    pub(crate) fn new(saturation: f64) -> Self {
+        Self { saturation, all: Exposure::default(), darker: Exposure::default() }
     }
 
     /// As [`Exposure::add`].
     pub(crate) fn add(&mut self, white: f64, grey: f64) {
         self.all.add(white, grey);
-        if grey < self.end {
+        if grey < self.saturation {
             self.darker.add(white, grey);
         }
     }
 
     /// As [`Exposure::black_and_contrast`].
     pub(crate) fn black_and_contrast(&self) -> [f64; 2] {
-        let is_beyond = |[black, contrast]: &[f64; 2]| black + contrast > self.end;
-        let beyond = Some(self.darker.black_and_contrast()).filter(is_beyond);
-        beyond.unwrap_or_else(|| self.all.black_and_contrast())
+        let is_saturated = |[black, contrast]: &[f64; 2]| black + contrast > self.saturation;
+        let saturated = Some(self.darker.black_and_contrast()).filter(is_saturated);
+        saturated.unwrap_or_else(|| self.all.black_and_contrast())
     }
 }
 
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn white_beyond_the_scale_is_known_by_what_is_darker() {
+    fn saturated_white_follows_from_the_darker_pixels() {
         for (white_grey, seen) in [(400.0_f64, 255.0_f64), (200.0, 200.0)] {
             let mut exposure = ClippedExposure::new(255.0);
             for white in [0.0, 0.25, 0.5, 1.0] {

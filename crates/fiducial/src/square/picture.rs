@@ -9,7 +9,7 @@ use geometry::Pixel;
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
-use crate::optics::edge_response::{END, PIXEL_VARIANCE, Step, boxiness};
+use crate::optics::edge_response::{EdgeResponse, MAX_SIGMAS, PIXEL_VARIANCE, pixel_kurtosis};
 use crate::optics::exposure::ClippedExposure;
 use crate::square::pattern::Pattern;
 use crate::square::refine::{Design, Fit, Homography, Lens, MOST_ACROSS, Scratch};
@@ -194,7 +194,7 @@ struct Grid {
     unknown: [[f64; MOST_ACROSS]; MOST_ACROSS],
     has_unknown: bool,
     bend: [[f64; 2]; 2],
-    step: Step,
+    step: EdgeResponse,
 }
 
 /// The shares that the columns (or rows) of cells have of a blurred place's light, times what they are multiplied by
@@ -239,7 +239,7 @@ struct Blur {
     /// Standard deviations across columns and rows, in cells, and one over them.
     sigma: [f64; 2],
     scale: [f64; 2],
-    boxiness: [f64; 2],
+    pixel_kurtosis: [f64; 2],
     correlation: f64,
 }
 
@@ -288,7 +288,7 @@ impl Grid {
             unknown,
             has_unknown: unknown.iter().flatten().any(|u| *u > 0.0),
             bend: [[bend[(0, 0)], bend[(0, 1)]], [bend[(1, 0)], bend[(1, 1)]]],
-            step: Step::new(),
+            step: EdgeResponse::new(),
         }
     }
 
@@ -419,7 +419,7 @@ impl Grid {
         Blur {
             sigma,
             scale: sigma.map(|s| 1.0 / s),
-            boxiness: normals.map(|normal| boxiness(normal, spread_px * spread_px)),
+            pixel_kurtosis: normals.map(|normal| pixel_kurtosis(normal, spread_px * spread_px)),
             correlation: p[0] * q[0] + p[1] * q[1],
         }
     }
@@ -427,14 +427,14 @@ impl Grid {
     #[inline]
     fn bands(&self, at: f64, blur: &Blur, axis: usize, bands: &mut Bands) {
         let last = self.across as f64;
-        let reach = (END * blur.sigma[axis]).min(0.5 * MOST_BANDS as f64 - 1.0);
+        let reach = (MAX_SIGMAS * blur.sigma[axis]).min(0.5 * MOST_BANDS as f64 - 1.0);
         // The lines between columns from `first` until before `beyond`: casts round down.
         let first = (at - reach).clamp(0.0, last - 1.0) as usize + 1;
         let beyond = ((at + reach).clamp(0.0, last - 1.0) as usize + 1).max(first);
         (bands.first, bands.count) = (first - 1, beyond - first + 1);
         // Of each line between two columns: the light from before it, and that number's derivatives.
         let mut before = [0.0; 3];
-        let (scale, boxiness) = (blur.scale[axis], blur.boxiness[axis]);
+        let (scale, pixel_kurtosis) = (blur.scale[axis], blur.pixel_kurtosis[axis]);
         let mut z = (first as f64 - at) * scale;
         let Some((end, shares)) =
             bands.share.get_mut(..bands.count).and_then(<[_]>::split_last_mut)
@@ -442,7 +442,7 @@ impl Grid {
             return;
         };
         for share in shares {
-            let (height, slope) = self.step.at(z, boxiness);
+            let (height, slope) = self.step.at(z, pixel_kurtosis);
             let here = [height, -slope, -z * slope];
             *share = [here[0] - before[0], here[1] - before[1], here[2] - before[2]];
             before = here;
@@ -481,11 +481,11 @@ impl Grid {
         let size = self.across as f64;
         let within = |axis: usize| {
             let (at, scale) = (spread.cells[axis], spread.blur.scale[axis]);
-            if at.min(size - at) * scale > END {
+            if at.min(size - at) * scale > MAX_SIGMAS {
                 return 1.0;
             }
-            let before = self.step.at(-at * scale, spread.blur.boxiness[axis]).0;
-            self.step.at((size - at) * scale, spread.blur.boxiness[axis]).0 - before
+            let before = self.step.at(-at * scale, spread.blur.pixel_kurtosis[axis]).0;
+            self.step.at((size - at) * scale, spread.blur.pixel_kurtosis[axis]).0 - before
         };
         1.0 - within(0) * within(1)
     }

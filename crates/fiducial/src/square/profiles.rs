@@ -9,7 +9,7 @@ use geometry::Pixel;
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
-use crate::optics::edge_response::{Step, boxiness};
+use crate::optics::edge_response::{EdgeResponse, pixel_kurtosis};
 use crate::square::pattern::Pattern;
 use crate::square::picture::Picture;
 use crate::square::refine::{CORNERS, Fit, Homography, Lens, Scratch};
@@ -122,7 +122,7 @@ fn fit_runs(
         lens,
         homography: *start,
         spread_px: 0.75,
-        step: Step::new(),
+        step: EdgeResponse::new(),
         inside: 0,
         clipped: 0,
         pixels: 0,
@@ -279,7 +279,7 @@ struct Search<'a> {
     lens: &'a Lens<'a>,
     homography: Homography,
     spread_px: f64,
-    step: Step,
+    step: EdgeResponse,
     /// Runs within the image in the last pass; pixels at the sensor's end, and all.
     inside: usize,
     clipped: usize,
@@ -425,14 +425,14 @@ impl Search<'_> {
 
     /// What pixels say of the edge's shift and of the spread.
     fn compare(&self, edge: &Edge, pixels: &[[f64; 2]]) -> Option<Sight> {
-        let boxiness = boxiness(edge.normal, self.spread_px * self.spread_px);
+        let pixel_kurtosis = pixel_kurtosis(edge.normal, self.spread_px * self.spread_px);
         let mut looks = [[0.0; 3]; MOST_PIXELS];
         let count = pixels.len() as f64;
         // Sums for the straight line of grey over whiteness, and over both slopes.
         let (mut sf, mut sff, mut sg, mut sfg) = (0.0, 0.0, 0.0, 0.0);
         for ([distance, grey], look) in pixels.iter().zip(&mut looks) {
             let z = distance / self.spread_px;
-            let (white, slope) = self.step.at(z, boxiness);
+            let (white, slope) = self.step.at(z, pixel_kurtosis);
             *look = [white, -slope, -z * slope];
             sf += white;
             sff += white * white;

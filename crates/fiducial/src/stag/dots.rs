@@ -8,7 +8,7 @@
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
-use crate::optics::edge_response::Step;
+use crate::optics::edge_response::EdgeResponse;
 use crate::square::decode::Grid;
 use crate::stag::code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET};
 
@@ -140,7 +140,7 @@ impl Dots {
         let (left, right) = bounds(0, view.width());
         let (top, bottom) = bounds(1, view.height());
         let blur = [u, v].map(|per_pixel| (per_pixel * BLUR_PX).clamp(0.05, 3.5));
-        let step = Step::new();
+        let step = EdgeResponse::new();
         for y in top..=bottom {
             for (x, grey) in view.row(y).iter().enumerate().take(right + 1).skip(left) {
                 let cell = grid.cell([x as f64, y as f64]);
@@ -153,7 +153,7 @@ impl Dots {
     }
 
     /// Adds a pixel at a place in small cells.
-    fn add(&mut self, step: &Step, place: [f64; 2], blur: [f64; 2], grey: f64) {
+    fn add(&mut self, step: &EdgeResponse, place: [f64; 2], blur: [f64; 2], grey: f64) {
         let columns = Shares::new(step, place[0], blur[0]);
         let rows = Shares::new(step, place[1], blur[1]);
         let mut weights = [0.0_f64; UNKNOWNS];
@@ -266,7 +266,7 @@ struct Shares {
 }
 
 impl Shares {
-    fn new(step: &Step, place: f64, blur: f64) -> Self {
+    fn new(step: &EdgeResponse, place: f64, blur: f64) -> Self {
         let reach = SEEN * blur;
         let last = ACROSS as f64 - 1.0;
         let first = (place - reach).floor().clamp(0.0, last) as usize;

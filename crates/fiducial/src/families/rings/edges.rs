@@ -12,7 +12,9 @@ use crate::candidates::ring::RingKind;
 use crate::candidates::ring_profile::{Candidate, LEAST_SCORE, LEAST_STEP, SMALL_PX};
 use crate::drawing::RING_RADII;
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
-use crate::families::rings::photometric::{self, Alternative, Fit, Spot};
+use crate::families::rings::photometric::{
+    Alternative, MAX_DIAMETER_PX, PhotometricFit, PhotometricInput, PhotometricPoses, PixelSample,
+};
 use crate::trace::Reason;
 
 /// Where grey values differ more from a fitted marker's, as a share of its contrast, something else is in the picture,
@@ -73,7 +75,7 @@ impl Search<'_> {
         &self,
         candidate: &Candidate,
         edges: &mut Vec<EdgePoint>,
-        spots: &mut Vec<Spot>,
+        spots: &mut Vec<PixelSample>,
     ) -> Result<Seen, Reason> {
         edges.clear();
         let radius_m = candidate.radius * self.size_m;
@@ -105,7 +107,7 @@ impl Search<'_> {
         self.measure(&circles, Reach::Near, edges);
         let bias_px = circles.max_bias_px(edges, self.camera);
         circles.remove_outliers(edges, self.camera);
-        let large = diameter_px > photometric::MOST_DIAMETER_PX;
+        let large = diameter_px > MAX_DIAMETER_PX;
         let share = if large { 2e-3 } else { 6e-4 };
         let lies = |rms: f64, bias: f64| {
             rms_px < (rms + 3e-3 * diameter_px).min(0.9)
@@ -128,12 +130,17 @@ impl Search<'_> {
         Ok(seen)
     }
 
+    fn photometric(&self) -> PhotometricInput<'_> {
+        let Self { view, camera, size_m, inverted, .. } = *self;
+        PhotometricInput { view, camera, size_m, white_on_black: inverted }
+    }
+
     /// The marker that should be where this pose has it, when it is neither too small nor too large and plain to see.
     pub(crate) fn again(
         &self,
         expected: &CirclePose,
         edges: &mut Vec<EdgePoint>,
-        spots: &mut Vec<Spot>,
+        spots: &mut Vec<PixelSample>,
     ) -> Option<Seen> {
         let diameter_px = expected.projected(self.size_m / 2.0, self.camera)?.major;
         if diameter_px < SMALL_PX {
@@ -152,15 +159,15 @@ impl Search<'_> {
         expected: &CirclePose,
         diameter_px: f64,
         edges: &mut Vec<EdgePoint>,
-        spots: &mut Vec<Spot>,
+        spots: &mut Vec<PixelSample>,
     ) -> Option<Seen> {
-        let (view, camera) = (self.view, self.camera);
-        let (fit, other) = photometric::refined_again(view, camera, expected, self.size_m, spots)?;
-        let is_near = self.is_near(expected, &fit.circles, 1.0 + 0.03 * diameter_px, 0.1);
+        let PhotometricPoses { best: fit, alternative: other } =
+            self.photometric().fit_tracked(expected, spots)?;
+        let is_near = self.is_near(expected, &fit.pose, 1.0 + 0.03 * diameter_px, 0.1);
         if !is_near || !is_plain(&fit) {
             return None;
         }
-        let support = self.measure(&fit.circles, Reach::Glance, edges);
+        let support = self.measure(&fit.pose, Reach::Glance, edges);
         let seen = self.seen_by_grey_values(&fit, other, confidence(&support))?;
         (believable(&support) == Belief::All).then_some(seen)
     }
@@ -170,28 +177,27 @@ impl Search<'_> {
         &self,
         start: &CirclePose,
         candidate_px: f64,
-        spots: &mut Vec<Spot>,
+        spots: &mut Vec<PixelSample>,
     ) -> Result<Seen, Reason> {
-        let (fit, other) =
-            photometric::refined(self.view, self.camera, start, self.size_m, self.inverted, spots)
-                .ok_or(Reason::Pose)?;
+        let PhotometricPoses { best: fit, alternative: other } =
+            self.photometric().fit(start, spots).ok_or(Reason::Pose)?;
         // Noise may be a large part of a faint marker.
-        let faint = fit.explained > LEAST_EXPLAINED_OF_FAINT
-            && fit.difference * fit.contrast < MOST_NOISE
-            && fit.difference < 1.5 * MOST_DIFFERENCE;
+        let faint = fit.r_squared > LEAST_EXPLAINED_OF_FAINT
+            && fit.residual * fit.contrast < MOST_NOISE
+            && fit.residual < 1.5 * MOST_DIFFERENCE;
         let tiny = candidate_px < TINY_PX;
         let least = if tiny { LEAST_EXPLAINED_OF_TINY } else { LEAST_EXPLAINED_OF_SMALL };
-        let clear = fit.explained > least && fit.difference < MOST_DIFFERENCE;
+        let clear = fit.r_squared > least && fit.residual < MOST_DIFFERENCE;
         let sound = (clear || faint)
             && fit.contrast > 2.0 * LEAST_STEP
             // Blur that hides the rings of something else makes them blacker than black.
             && (!tiny || fit.contrast < 260.0)
-            && fit.is_marker()
-            && self.is_near(start, &fit.circles, 1.5, 0.3);
+            && fit.has_rings()
+            && self.is_near(start, &fit.pose, 1.5, 0.3);
         if !sound {
             return Err(Reason::Edges);
         }
-        self.seen_by_grey_values(&fit, other, fit.explained).ok_or(Reason::Pose)
+        self.seen_by_grey_values(&fit, other, fit.r_squared).ok_or(Reason::Pose)
     }
 
     /// Whether a pose has its centre within so many pixels of another's, at nearly its distance.
@@ -217,11 +223,11 @@ impl Search<'_> {
         &self,
         rough: &CirclePose,
         edges: &mut Vec<EdgePoint>,
-        spots: &mut Vec<Spot>,
+        spots: &mut Vec<PixelSample>,
     ) -> Option<Seen> {
         let diameter_px = rough.projected(self.size_m / 2.0, self.camera)?.major;
         let (fit, other) = self.by_grey_values(rough, diameter_px, spots)?;
-        let support = self.measure(&fit.circles, Reach::Near, edges);
+        let support = self.measure(&fit.pose, Reach::Near, edges);
         let seen = self.seen_by_grey_values(&fit, other, confidence(&support))?;
         (believable(&support) != Belief::None).then_some(seen)
     }
@@ -270,18 +276,12 @@ impl Search<'_> {
         &self,
         circles: &CirclePose,
         diameter_px: f64,
-        spots: &mut Vec<Spot>,
-    ) -> Option<(Fit, Option<Alternative>)> {
-        let (fit, other) = photometric::refined(
-            self.view,
-            self.camera,
-            circles,
-            self.size_m,
-            self.inverted,
-            spots,
-        )?;
+        spots: &mut Vec<PixelSample>,
+    ) -> Option<(PhotometricFit, Option<Alternative>)> {
+        let PhotometricPoses { best: fit, alternative: other } =
+            self.photometric().fit(circles, spots)?;
         let is_it =
-            is_plain(&fit) && self.is_near(circles, &fit.circles, 0.3 + 0.01 * diameter_px, 0.1);
+            is_plain(&fit) && self.is_near(circles, &fit.pose, 0.3 + 0.01 * diameter_px, 0.1);
         is_it.then_some((fit, other))
     }
 
@@ -337,18 +337,18 @@ impl Search<'_> {
 
     fn seen_by_grey_values(
         &self,
-        fit: &Fit,
+        fit: &PhotometricFit,
         other: Option<Alternative>,
         confidence: f64,
     ) -> Option<Seen> {
         // A step as high as the contrast rises within two and a half times the blur.
         let rms_px = |blur_px: f64, difference: f64| 2.5 * blur_px * difference;
-        let covariance = fit.circles.full_covariance(&fit.covariance);
+        let covariance = fit.pose.full_covariance(&fit.covariance);
         Some(Seen {
-            circles: fit.circles,
-            rms_px: rms_px(fit.blur_px, fit.difference),
+            circles: fit.pose,
+            rms_px: rms_px(fit.blur_px, fit.residual),
             covariance: covariance.iter().all(|c| c.is_finite()).then_some(covariance)?,
-            other: other.map(|o| (o.circles, rms_px(o.blur_px, o.difference))),
+            other: other.map(|o| (o.pose, rms_px(o.blur_px, o.residual))),
             confidence,
         })
     }
@@ -497,8 +497,8 @@ impl Search<'_> {
 }
 
 /// Whether a fit looks like a marker with nothing on it.
-fn is_plain(fit: &Fit) -> bool {
-    fit.difference < MOST_DIFFERENCE && fit.is_marker() && fit.explained > LEAST_EXPLAINED
+fn is_plain(fit: &PhotometricFit) -> bool {
+    fit.residual < MOST_DIFFERENCE && fit.has_rings() && fit.r_squared > LEAST_EXPLAINED
 }
 
 /// How far from where it should be an edge is looked for: at first as far as its neighbours allow.

@@ -1,0 +1,182 @@
+//! What one pixel sees of the marker through the blur of the lens and of motion.
+
+use nalgebra::Vector3;
+
+use super::scene::Scene;
+use crate::families::rings::circle_pose::{CirclePlane, RayPlaneIntersection};
+use crate::optics::edge_response::pixel_kurtosis;
+
+/// An edge further away than this many standard deviations of the blur does not show.
+const MAX_BLUR_SIGMAS: f64 = 4.0;
+
+/// The model's response at one pixel, with its derivatives.
+pub(super) struct PixelResponse {
+    /// The shares of the pixel's light from inside each circle, the outermost first.
+    pub(super) inside: [f64; 6],
+    /// Gradient of the distance from the centre, in pixels, by the pose.
+    pub(super) distance_by_pose: [f64; 5],
+    /// Derivatives of the whiteness by that distance, by the blur and by the motion.
+    pub(super) by_distance: f64,
+    pub(super) by_blur: f64,
+    pub(super) by_motion: [f64; 2],
+}
+
+impl PixelResponse {
+    /// How white the pixel is, from 0 (black) to 1.
+    #[inline]
+    pub(super) fn white(&self) -> f64 {
+        let [a, b, c, d, e, f] = self.inside;
+        1.0 - a + b - c + d - e + f
+    }
+}
+
+/// A Gaussian blur that may differ by direction.
+pub(super) struct Blur {
+    blur_px: f64,
+    /// Variance to the right, covariance, variance down, in square pixels.
+    covariance: [f64; 3],
+    /// Variance in the direction of least blur.
+    min_variance: f64,
+    /// Inverse of the standard deviation in the direction of most blur.
+    inverse_max: f64,
+}
+
+impl Blur {
+    /// A blur of this standard deviation, averaged over all directions, and with this motion (see
+    /// [`RingModel::motion`](super::solve::RingModel)).
+    pub(super) fn new(blur_px: f64, [p, q]: [f64; 2]) -> Self {
+        let variance = blur_px * blur_px;
+        Self {
+            blur_px,
+            covariance: [variance + p, q, variance - p],
+            min_variance: variance - p.hypot(q),
+            inverse_max: 1.0 / (variance + p.hypot(q)).sqrt(),
+        }
+    }
+}
+
+/// Distribution of the distance from the centre over the blur about a pixel.
+///
+/// The squared distance is a quadratic form in normal variables. Raised to `power` it is nearly normal, also for circles no
+/// larger than the blur (Jensen and Solomon, "A Gaussian approximation to the distribution of a definite quadratic form",
+/// JASA 1972).
+#[derive(Copy, Clone)]
+pub(super) struct RadiusDistribution {
+    pub(super) at: RayPlaneIntersection,
+    /// The logarithm of the mean of the squared distance.
+    log_mean_square: f64,
+    power: f64,
+    /// Of the squared distance over its mean, to that power: its mean and the inverse of its standard deviation.
+    mean: f64,
+    inverse_deviation: f64,
+    /// Derivative of the share inside a circle by the pixel's distance from the centre.
+    by_distance: f64,
+    pixel_kurtosis: f64,
+    /// Inverse of an upper bound of the blur, in metres: near the centre, tangential blur changes the distance as well.
+    inverse_max_blur: f64,
+    /// Derivatives of the logarithm of the deviation by the blur and by the motion.
+    by_blur: f64,
+    by_motion: [f64; 2],
+}
+
+impl RadiusDistribution {
+    /// Free of branches, for vectorisation.
+    #[inline(always)]
+    pub(super) fn about(ray: &Vector3<f64>, plane: &CirclePlane, blur: &Blur) -> Self {
+        let at = plane.intersect(ray);
+        let RayPlaneIntersection {
+            rho, radial: a, tangential: b, metres_per_px, px_per_metre, ..
+        } = at;
+        // Radial and tangential variance, and their covariance.
+        let [xx, xy, yy] = blur.covariance;
+        let blurred = |[x, y]: [f64; 2]| [xx * x + xy * y, xy * x + yy * y];
+        let dot = |[x, y]: [f64; 2], [u, v]: [f64; 2]| x * u + y * v;
+        let (rr, tt, rt) = (dot(a, blurred(a)), dot(b, blurred(b)), dot(b, blurred(a)));
+        let (trace, det) = (rr + tt, rr * tt - rt * rt);
+        let square = rho * rho;
+        // Cumulants of the squared distance.
+        let k1 = square + trace;
+        let k2 = 2.0 * (trace * trace - 2.0 * det) + 4.0 * square * rr;
+        let k3 = 8.0 * (trace * trace - 3.0 * det) * trace + 24.0 * square * (rr * rr + rt * rt);
+        let (per_k1, per_k2) = (1.0 / k1, 1.0 / k2);
+        let power = 1.0 - k1 * k3 * (per_k2 * per_k2) / 3.0;
+        let mean = 1.0 + power * (power - 1.0) * k2 * (per_k1 * per_k1) / 2.0;
+        let per_spread = k2.sqrt() * per_k2;
+        let normal = a.map(|part| part * px_per_metre);
+        let [nx, ny] = normal;
+        let variance = rr * (px_per_metre * px_per_metre);
+        let per_variance = 1.0 / variance;
+        // Motion blurs like a box, as a pixel does; its variance is what exceeds the least of any direction.
+        let of_box = 1.0 - blur.min_variance * per_variance;
+        Self {
+            at,
+            log_mean_square: k1.ln(),
+            power,
+            mean,
+            inverse_deviation: k1 * per_spread / power,
+            by_distance: -2.0 * rho * metres_per_px * per_spread,
+            pixel_kurtosis: pixel_kurtosis(normal, variance) - of_box * of_box / 20.0,
+            inverse_max_blur: px_per_metre * blur.inverse_max,
+            by_blur: blur.blur_px * per_variance,
+            by_motion: [0.5 * (nx * nx - ny * ny) * per_variance, nx * ny * per_variance],
+        }
+    }
+
+    #[inline]
+    pub(super) fn response(&self, scene: &Scene<'_>) -> PixelResponse {
+        let RayPlaneIntersection { rho, by_pose, .. } = self.at;
+        let (mut inside, mut by_distance, mut by_deviation) = ([0.0; 6], 0.0, 0.0);
+        for (index, (inside, (radius, log_radius))) in
+            inside.iter_mut().zip(scene.radii).enumerate()
+        {
+            // Inside an outer edge it is black, inside an inner one white.
+            let sign = if index % 2 == 0 { -1.0 } else { 1.0 };
+            let sigmas = (radius - rho) * self.inverse_max_blur;
+            if sigmas.abs() > MAX_BLUR_SIGMAS {
+                *inside = if sigmas > 0.0 { 1.0 } else { 0.0 };
+                continue;
+            }
+            let ratio = exp(self.power * (2.0 * log_radius - self.log_mean_square));
+            let z = (ratio - self.mean) * self.inverse_deviation;
+            let (share, density) = scene.edge.at(z, self.pixel_kurtosis);
+            *inside = share;
+            by_distance += sign * density * self.by_distance * ratio;
+            by_deviation -= sign * density * z;
+        }
+        PixelResponse {
+            inside,
+            distance_by_pose: by_pose,
+            by_distance,
+            by_blur: by_deviation * self.by_blur,
+            by_motion: self.by_motion.map(|by| by_deviation * by),
+        }
+    }
+}
+
+/// The exponential function, faster for small arguments.
+#[inline]
+fn exp(x: f64) -> f64 {
+    if x.abs() > 0.4 {
+        return x.exp();
+    }
+    // Taylor series to the eighth power: relative error below 2e-9.
+    let [a, b, c, d] = [1.0 / 6.0, 1.0 / 24.0, 1.0 / 120.0, 1.0 / 720.0];
+    // Estrin's scheme: pairs that can be computed in parallel.
+    let square = x * x;
+    let low = 1.0 + x + square * (0.5 + x * a);
+    let high = b + x * c + square * (d + x * (1.0 / 5040.0) + square * (1.0 / 40_320.0));
+    low + square * square * high
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_fast_exponential_matches_the_exact_one() {
+        for i in -80..=80 {
+            let x = f64::from(i) * 0.01;
+            assert!((exp(x) / x.exp() - 1.0).abs() < 2e-9, "{x}");
+        }
+    }
+}

@@ -1,0 +1,114 @@
+//! How well a fitted model explains the image.
+
+use nalgebra::{SMatrix, SVector};
+
+use super::scene::Scene;
+use super::solve::{ModelFit, RingModel, Sums, UNKNOWNS, UNKNOWNS_WITH_MOTION};
+use super::{Alternative, MAX_GREY, PhotometricFit};
+
+/// Prior standard deviation of the normal, in radians.
+const PRIOR_NORMAL: f64 = 0.6;
+
+/// The figures by which a marker is told from other things.
+pub(super) struct Score {
+    disc_ratio: f64,
+    ring_balance: f64,
+    r_squared: f64,
+}
+
+impl RingModel {
+    /// Compares the model with a plain disc and with rings of free grey values.
+    pub(super) fn score(&self, scene: &Scene<'_>) -> Option<Score> {
+        let mut disc = SMatrix::<f64, 3, 3>::zeros();
+        let mut rings = SMatrix::<f64, 4, 4>::zeros();
+        let (mut n, mut sum, mut squares, mut unexplained) = (0.0, 0.0, 0.0, 0.0);
+        self.for_each_response(scene, |sample, response| {
+            let [a, b, c, d, e, f] = response.inside;
+            let white = response.white();
+            let (grey, _) = self.grey(sample, white);
+            let seen = if sample.grey > MAX_GREY { sample.grey.max(grey) } else { sample.grey };
+            if sample.inside {
+                n += 1.0;
+                sum += seen;
+                squares += seen * seen;
+                unexplained += (grey - seen).powi(2);
+            }
+            // Without the fitted gradient of the light.
+            let flat = seen - grey + self.black + (self.white - self.black) * white;
+            let of_disc = SVector::<f64, 3>::new(1.0, a, flat);
+            disc.syger(1.0, &of_disc, &of_disc, 1.0);
+            let of_rings = SVector::<f64, 4>::new(1.0, a - b, c - d + e - f, flat);
+            rings.syger(1.0, &of_rings, &of_rings, 1.0);
+        })?;
+        disc.fill_upper_triangle_with_lower_triangle();
+        rings.fill_upper_triangle_with_lower_triangle();
+        let of_disc = disc.fixed_view::<2, 2>(0, 0).into_owned();
+        let to_disc = disc.fixed_view::<2, 1>(0, 2).into_owned();
+        let left_by_disc = disc[(2, 2)] - to_disc.dot(&(of_disc.try_inverse()? * to_disc));
+        let of_rings = rings.fixed_view::<3, 3>(0, 0).into_owned();
+        let to_rings = rings.fixed_view::<3, 1>(0, 3).into_owned();
+        let levels = of_rings.try_inverse()? * to_rings;
+        let left_by_rings = rings[(3, 3)] - to_rings.dot(&levels);
+        let variance = squares - sum * sum / n;
+        let r_squared = (variance > 0.0).then(|| 1.0 - unexplained / variance)?;
+        Some(Score {
+            disc_ratio: left_by_rings.max(0.0) / left_by_disc.max(1e-9),
+            ring_balance: levels[2] / levels[1],
+            r_squared,
+        })
+    }
+}
+
+impl ModelFit {
+    /// Root mean square residual, in units of the contrast.
+    pub(super) fn residual(&self, scene: &Scene<'_>) -> f64 {
+        (self.cost() / scene.count()).sqrt() / self.model.contrast()
+    }
+
+    pub(super) fn alternative(&self, scene: &Scene<'_>) -> Alternative {
+        Alternative {
+            pose: self.model.pose,
+            residual: self.residual(scene),
+            blur_px: self.model.blur_px,
+        }
+    }
+}
+
+impl Scene<'_> {
+    /// A fit with its score and covariance.
+    pub(super) fn rated(&self, fit: &ModelFit) -> Option<PhotometricFit> {
+        self.with_score(fit, &fit.model.score(self)?)
+    }
+
+    /// A fit with its covariance and a score that may come from fewer samples.
+    pub(super) fn with_score(&self, fit: &ModelFit, score: &Score) -> Option<PhotometricFit> {
+        Some(PhotometricFit {
+            pose: fit.model.pose,
+            covariance: self.covariance(fit)?,
+            residual: fit.residual(self),
+            r_squared: score.r_squared,
+            disc_ratio: score.disc_ratio,
+            ring_balance: score.ring_balance,
+            contrast: fit.model.contrast(),
+            blur_px: fit.model.blur_px,
+        })
+    }
+
+    /// Covariance of the pose, from the remaining residuals: noise and errors of the model.
+    fn covariance(&self, fit: &ModelFit) -> Option<SMatrix<f64, 5, 5>> {
+        let Sums { count, pose_variance } = fit.equations.extra;
+        let unknowns = if self.has_motion { UNKNOWNS_WITH_MOTION } else { UNKNOWNS };
+        // Where the pixels that depend on the pose are noisier than the others, their noise counts.
+        let mean = (fit.cost() / count).max(pose_variance);
+        let variance = mean * count / (count - unknowns as f64).max(1.0) + 1.0 / 12.0;
+        let mut information = fit.equations.matrix / variance;
+        for i in 0..UNKNOWNS_WITH_MOTION {
+            information[(i, i)] += 1e-9;
+        }
+        for i in 3..5 {
+            information[(i, i)] += 1.0 / (PRIOR_NORMAL * PRIOR_NORMAL);
+        }
+        let all = information.cholesky()?.inverse();
+        Some(all.fixed_view::<5, 5>(0, 0).into_owned())
+    }
+}

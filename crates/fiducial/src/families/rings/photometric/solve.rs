@@ -1,0 +1,393 @@
+//! The model of a marker's image, and its fit to the samples.
+
+use nalgebra::{SMatrix, SVector};
+
+use super::blur::{Blur, PixelResponse, RadiusDistribution};
+use super::scene::{FOCUSED_PX, PixelSample, Scene};
+use super::{MAX_GREY, MAX_RESIDUAL};
+use crate::families::rings::circle_pose::CirclePose;
+use crate::optics::exposure::ClippedExposure;
+use crate::optics::least_squares::{
+    Damping, Influence, Next, NormalEquations, Problem, Schedule, huber, minimise,
+};
+
+/// Pose (5), blur, black, white, and the gradient of white to the right and down.
+pub(super) const UNKNOWNS: usize = 10;
+/// The same and the two numbers of the motion.
+pub(super) const UNKNOWNS_WITH_MOTION: usize = 12;
+/// Bounds of the blur in any direction, as a standard deviation in pixels.
+const MIN_BLUR_PX: f64 = 0.3;
+const MAX_BLUR_PX: f64 = 6.0;
+/// Largest change of the blur in one step, in pixels.
+const MAX_BLUR_STEP_PX: f64 = 0.3;
+/// A single step that lowers the cost by a larger share than this is too long for the quadratic model.
+const MAX_GAIN: f64 = 0.5;
+/// Added to the diagonal of the normal equations.
+const RIDGE: f64 = 1e-9;
+
+/// When a fit ends.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct Effort {
+    /// The first steps may hardly improve anything.
+    min_steps: usize,
+    max_steps: usize,
+    /// Steps of a fit that starts from another one.
+    max_steps_from_other: usize,
+    /// After this many steps the Huber limit follows the residuals.
+    rough_steps: Option<usize>,
+    /// A step that lowers the cost by a smaller share is the last one.
+    min_gain: f64,
+}
+
+impl Effort {
+    pub(super) const FULL: Self = Self {
+        min_steps: 3,
+        max_steps: 22,
+        max_steps_from_other: 10,
+        rough_steps: Some(3),
+        min_gain: 3e-4,
+    };
+    /// For a tracked marker near its predicted pose.
+    pub(super) const TRACKED: Self = Self {
+        min_steps: 1,
+        max_steps: 6,
+        max_steps_from_other: 1,
+        rough_steps: None,
+        min_gain: 3e-2,
+    };
+}
+
+/// Everything that is fitted.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct RingModel {
+    pub(super) pose: CirclePose,
+    /// Blur of lens and pixel, averaged over all directions, as a standard deviation in pixels.
+    pub(super) blur_px: f64,
+    /// Motion blur, in square pixels: half of the difference between the blur's variances to the right and down, and
+    /// their covariance.
+    pub(super) motion: [f64; 2],
+    pub(super) black: f64,
+    pub(super) white: f64,
+    /// Change of white per pixel to the right and down.
+    pub(super) gradient: [f64; 2],
+}
+
+impl RingModel {
+    /// White minus black, in grey levels.
+    pub(super) fn contrast(&self) -> f64 {
+        self.white - self.black
+    }
+
+    /// Calls `visit` with each sample that counts and the model's response there; `None` when a ray misses the plane.
+    #[inline]
+    pub(super) fn for_each_response(
+        &self,
+        scene: &Scene<'_>,
+        mut visit: impl FnMut(&PixelSample, &PixelResponse),
+    ) -> Option<()> {
+        // Large enough to hide the latency of divisions and roots.
+        const BATCH: usize = 8;
+        let plane = self.pose.plane(scene.camera);
+        let blur = Blur::new(self.blur_px, self.motion);
+        for samples in scene.samples.chunks(BATCH * scene.stride) {
+            let mut counted = samples.iter().step_by(scene.stride);
+            let last = samples.last()?;
+            let batch: [&PixelSample; BATCH] =
+                std::array::from_fn(|_| counted.next().unwrap_or(last));
+            let radii = batch.map(|sample| RadiusDistribution::about(&sample.ray, &plane, &blur));
+            let count = samples.len().div_ceil(scene.stride);
+            for (sample, radius) in batch.iter().zip(&radii).take(count) {
+                if !radius.at.is_valid() {
+                    return None;
+                }
+                visit(sample, &radius.response(scene));
+            }
+        }
+        Some(())
+    }
+
+    /// The predicted grey value of a pixel of this whiteness, and the contrast there.
+    #[inline]
+    pub(super) fn grey(&self, sample: &PixelSample, white: f64) -> (f64, f64) {
+        let [x, y] = sample.offset;
+        let contrast = self.white + self.gradient[0] * x + self.gradient[1] * y - self.black;
+        (self.black + contrast * white, contrast)
+    }
+
+    /// Sets black and white to what fits best with everything else fixed.
+    fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
+        let mut exposure = ClippedExposure::new(MAX_GREY);
+        self.for_each_response(scene, |sample, response| {
+            exposure.add(response.white(), sample.grey);
+        })?;
+        let [black, contrast] = exposure.black_and_contrast();
+        (self.black, self.white) = (black, black + contrast);
+        (contrast > 1.0).then_some(())
+    }
+
+    /// The normal equations with residuals weighted by this Huber limit, in grey levels.
+    fn linearised(&self, scene: &Scene<'_>, limit: f64) -> Option<Equations> {
+        let mut fixed = ([[0.0; UNKNOWNS]; UNKNOWNS], [0.0; UNKNOWNS]);
+        let (matrix, right) = (&mut fixed.0, &mut fixed.1);
+        let mut motion = [[0.0; UNKNOWNS_WITH_MOTION + 1]; 2];
+        let (mut total, mut count, mut pose_weight, mut pose_squares) = (0.0, 0.0, 0.0, 0.0);
+        self.for_each_response(scene, |sample, response| {
+            let white = response.white();
+            let [x, y] = sample.offset;
+            let (grey, contrast) = self.grey(sample, white);
+            // Both saturated: no information.
+            if grey > MAX_GREY && sample.grey > MAX_GREY {
+                return;
+            }
+            count += 1.0;
+            let residual = grey - sample.grey;
+            let Influence { weight, cost } = huber(residual, limit);
+            total += cost;
+            let by_distance = response.by_distance * contrast;
+            pose_squares += by_distance * by_distance * cost;
+            pose_weight += by_distance * by_distance;
+            let [a, b, c, d, e] = response.distance_by_pose;
+            let gradient: [f64; UNKNOWNS] = [
+                a * by_distance,
+                b * by_distance,
+                c * by_distance,
+                d * by_distance,
+                e * by_distance,
+                contrast * response.by_blur,
+                1.0 - white,
+                white,
+                white * x,
+                white * y,
+            ];
+            let weighted = gradient.map(|g| g * weight);
+            for (row, (scaled, sum)) in matrix.iter_mut().zip(weighted.iter().zip(&mut *right)) {
+                *sum -= scaled * residual;
+                // The whole row takes no longer than half of it.
+                for (entry, other) in row.iter_mut().zip(&gradient) {
+                    *entry += scaled * other;
+                }
+            }
+            if scene.has_motion {
+                let by_motion = response.by_motion.map(|by| by * contrast);
+                let others = gradient.iter().chain(&by_motion).copied().chain([-residual]);
+                for (index, other) in others.enumerate() {
+                    motion[0][index] += weight * by_motion[0] * other;
+                    motion[1][index] += weight * by_motion[1] * other;
+                }
+            }
+        })?;
+        let pose_variance = if pose_weight > 0.0 { pose_squares / pose_weight } else { 0.0 };
+        let (matrix, right) = with_motion(&fixed, &motion, scene.has_motion);
+        let extra = Sums { count, pose_variance };
+        total.is_finite().then_some(NormalEquations { matrix, right, cost: total, extra })
+    }
+
+    fn moved(&self, step: &SVector<f64, UNKNOWNS_WITH_MOTION>) -> Option<Self> {
+        let blur_px = self.blur_px + step[5].clamp(-MAX_BLUR_STEP_PX, MAX_BLUR_STEP_PX);
+        let blur_px = blur_px.clamp(MIN_BLUR_PX, MAX_BLUR_PX);
+        let motion = [self.motion[0] + step[10], self.motion[1] + step[11]];
+        let most = blur_px * blur_px - MIN_BLUR_PX * MIN_BLUR_PX;
+        let scale = (most / motion[0].hypot(motion[1]).max(1e-12)).min(1.0);
+        Some(Self {
+            pose: self.pose.moved(&step.fixed_rows::<5>(0).into_owned())?,
+            blur_px,
+            motion: motion.map(|part| part * scale),
+            black: self.black + step[6],
+            white: self.white + step[7],
+            gradient: [self.gradient[0] + step[8], self.gradient[1] + step[9]],
+        })
+    }
+}
+
+/// Sums that come with the normal equations.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct Sums {
+    /// Samples without those that are saturated.
+    pub(super) count: f64,
+    /// Mean squared residual, weighted by the squared dependence on the pose.
+    pub(super) pose_variance: f64,
+}
+
+type Equations = NormalEquations<UNKNOWNS_WITH_MOTION, Sums>;
+
+/// The normal equations with the rows of the motion; a motion that is not fitted gets a prior that keeps it at zero.
+fn with_motion(
+    (matrix, right): &([[f64; UNKNOWNS]; UNKNOWNS], [f64; UNKNOWNS]),
+    motion: &[[f64; UNKNOWNS_WITH_MOTION + 1]; 2],
+    has_motion: bool,
+) -> (SMatrix<f64, UNKNOWNS_WITH_MOTION, UNKNOWNS_WITH_MOTION>, SVector<f64, UNKNOWNS_WITH_MOTION>)
+{
+    const FIXED: f64 = 1e12;
+    let mut all = SMatrix::<f64, UNKNOWNS_WITH_MOTION, UNKNOWNS_WITH_MOTION>::zeros();
+    let mut all_right = SVector::<f64, UNKNOWNS_WITH_MOTION>::zeros();
+    all.fixed_view_mut::<UNKNOWNS, UNKNOWNS>(0, 0).copy_from(&SMatrix::from(*matrix));
+    all_right.fixed_rows_mut::<UNKNOWNS>(0).copy_from(&SVector::from(*right));
+    for (row, sums) in (UNKNOWNS..).zip(motion) {
+        let Some((right, sums)) = sums.split_last() else { continue };
+        all_right[row] = *right;
+        for (column, sum) in sums.iter().enumerate() {
+            (all[(row, column)], all[(column, row)]) = (*sum, *sum);
+        }
+        if !has_motion {
+            all[(row, row)] = FIXED;
+        }
+    }
+    (all, all_right)
+}
+
+/// A model at its least cost.
+pub(super) struct ModelFit {
+    pub(super) model: RingModel,
+    pub(super) equations: Equations,
+    /// Huber limit of the residuals, in grey levels.
+    pub(super) huber_limit: f64,
+}
+
+impl ModelFit {
+    pub(super) fn cost(&self) -> f64 {
+        self.equations.cost
+    }
+}
+
+/// Where a fit starts.
+#[derive(Copy, Clone)]
+pub(super) enum Start<'a> {
+    /// From a pose, with nothing known of blur and light.
+    Pose(&'a CirclePose),
+    /// From a pose, with blur and light of another fit. The result costs no more than `max_cost`, if there is one.
+    Other { pose: &'a CirclePose, other: &'a ModelFit, max_cost: Option<f64> },
+}
+
+impl<'a> Start<'a> {
+    pub(super) fn like(pose: &'a CirclePose, other: &'a ModelFit) -> Self {
+        Self::Other { pose, other, max_cost: None }
+    }
+
+    pub(super) fn rival(pose: &'a CirclePose, other: &'a ModelFit, max_cost: f64) -> Self {
+        Self::Other { pose, other, max_cost: Some(max_cost) }
+    }
+}
+
+/// A fit in progress.
+struct Solver<'a> {
+    scene: &'a Scene<'a>,
+    huber_limit: f64,
+    min_steps: usize,
+    /// Without another fit to start from: residuals too large are rejected early, and the limit is tightened once.
+    is_first: bool,
+    max_cost: Option<f64>,
+}
+
+impl Problem<UNKNOWNS_WITH_MOTION> for Solver<'_> {
+    type Place = RingModel;
+    type Extra = Sums;
+
+    #[inline]
+    fn linearised(&mut self, at: &RingModel) -> Option<Equations> {
+        at.linearised(self.scene, self.huber_limit)
+    }
+
+    #[inline]
+    fn moved(
+        &self,
+        from: &RingModel,
+        step: &SVector<f64, UNKNOWNS_WITH_MOTION>,
+    ) -> Option<RingModel> {
+        from.moved(step)
+    }
+
+    fn before_step(&mut self, tried: usize, best: &RingModel, equations: &Equations) -> Next {
+        let cost_of = |residual: f64| self.scene.count() * (residual * best.contrast()).powi(2);
+        let early = self.scene.early_reject.get(tried).filter(|_| self.is_first);
+        if early.is_some_and(|max| equations.cost > cost_of(*max)) {
+            return Next::Fail;
+        }
+        let is_bad = self.max_cost.is_some_and(|max| equations.cost > max)
+            || equations.cost > cost_of(MAX_RESIDUAL);
+        if tried > self.min_steps && is_bad { Next::Stop } else { Next::Continue }
+    }
+
+    fn after_step(
+        &mut self,
+        tried: usize,
+        has_settled: bool,
+        best: &RingModel,
+        equations: &mut Equations,
+    ) -> Next {
+        if self.is_first && self.scene.effort.rough_steps == Some(tried + 1) {
+            self.huber_limit = self.scene.huber_limit(self.huber_limit, equations.cost);
+            let Some(next) = self.linearised(best) else { return Next::Fail };
+            *equations = next;
+            return Next::Continue;
+        }
+        if has_settled && tried >= self.min_steps { Next::Stop } else { Next::Continue }
+    }
+}
+
+impl Scene<'_> {
+    /// The model of least cost near the start. `None` when it is rejected early or its cost exceeds the start's bound.
+    pub(super) fn fitted(&self, start: Start<'_>) -> Option<ModelFit> {
+        let Effort { min_steps, max_steps, max_steps_from_other, min_gain, .. } = self.effort;
+        let (model, mut solver, max_steps) = match start {
+            Start::Pose(pose) => {
+                let mut model = RingModel {
+                    pose: *pose,
+                    blur_px: FOCUSED_PX,
+                    motion: [0.0; 2],
+                    black: 0.0,
+                    white: 255.0,
+                    gradient: [0.0; 2],
+                };
+                model.expose(self)?;
+                // About three times the residuals of a good fit.
+                let huber_limit = 0.25 * model.contrast();
+                let (is_first, max_cost) = (true, None);
+                let solver = Solver { scene: self, huber_limit, min_steps, is_first, max_cost };
+                (model, solver, max_steps)
+            }
+            Start::Other { pose, other, max_cost } => {
+                let (huber_limit, is_first) = (other.huber_limit, false);
+                let solver = Solver { scene: self, huber_limit, min_steps: 1, is_first, max_cost };
+                (RingModel { pose: *pose, ..other.model }, solver, max_steps_from_other)
+            }
+        };
+        let schedule = Schedule {
+            max_steps,
+            damping: Damping {
+                first: if solver.is_first { 1e-3 } else { 1e-4 },
+                min: 1e-7,
+                increase: 20.0,
+                min_after_bad: 0.0,
+                max: 1e4,
+                ridge: RIDGE,
+            },
+            settled_ratio: min_gain,
+            settled_cost: 0.0,
+            fails_without_step: false,
+            fails_without_equations: false,
+        };
+        let best = minimise(&mut solver, model, &schedule)?;
+        let (model, equations) = (best.place, best.equations);
+        let fits =
+            model.white > model.black && solver.max_cost.is_none_or(|max| equations.cost <= max);
+        fits.then_some(ModelFit { model, equations, huber_limit: solver.huber_limit })
+    }
+
+    /// One step from a fit close to this scene's. The cost after it is that of the quadratic model.
+    pub(super) fn stepped(&self, fit: &ModelFit) -> Option<ModelFit> {
+        const DAMPING: f64 = 1e-6;
+        let huber_limit = fit.huber_limit;
+        let mut equations = fit.model.linearised(self, huber_limit)?;
+        let step = equations.step(DAMPING, RIDGE)?;
+        let model = fit.model.moved(&step)?;
+        let gain = step.dot(&equations.right);
+        let is_small = gain < MAX_GAIN * equations.cost;
+        equations.cost -= gain;
+        is_small.then_some(ModelFit { model, equations, huber_limit })
+    }
+
+    /// A limit that residuals of a good fit hardly exceed, but no more than before.
+    pub(super) fn huber_limit(&self, before: f64, cost: f64) -> f64 {
+        before.min(3.0 * (cost / self.count()).sqrt() + 1.0)
+    }
+}
