@@ -187,7 +187,7 @@ impl SourceConfig {
         ensure!(self.paths.is_empty(), "with a program, `source.paths` must be empty");
         let [width, height] = self.size_px.map(|edge| edge as usize);
         let pixels = width.saturating_mul(height);
-        let edge = GrayView::LARGEST_EDGE_PX;
+        let edge = GrayView::MAX_EDGE_PX;
         ensure!(
             pixels > 0 && width.max(height) <= edge && pixels as f64 <= self.max_megapixels * 1e6,
             "`source.size_px` is [{width}, {height}]; it must be the width and height of the program's frames, within \

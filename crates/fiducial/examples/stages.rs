@@ -69,7 +69,7 @@ fn thesis_stages(view: GrayView<'_>, folder: &Path) -> Outcome<()> {
     threshold(filtered.view().ok_or("no pixels")?, level, &mut binary);
     save(&binary, &folder.join("binary.png"))?;
     let mut contours = Contours::default();
-    let all = Limits { least_points: 1, most_points: usize::MAX };
+    let all = Limits { min_points: 1, max_points: usize::MAX };
     contours.find(binary.view().ok_or("no pixels")?, all);
     let mut valid: Vec<ContourEllipse> = Vec::new();
     ellipse_filter(&contours, &mut valid);

@@ -93,13 +93,13 @@ const PAPERS: outline::Settings = outline::Settings {
     dark_from: None,
     bright_from: Some(0),
     whole_level: 2,
-    smallest_px: 5,
-    largest_px: 40,
-    least_contrast: 14,
-    least_contrast_percent: 12,
+    min_size_px: 5,
+    max_size_px: 40,
+    min_contrast: 14,
+    min_contrast_percent: 12,
     steep: true,
-    least_fill: 0.3,
-    most_ragged: 1.2,
+    min_fill: 0.3,
+    max_raggedness: 1.2,
 };
 
 /// Where a marker should be.
@@ -276,10 +276,10 @@ impl Detector {
                 (self.settings.inverted || self.squares.has_bright()).then_some(bright_from);
             let mut settings = outline::Settings { bright_from, ..outline::Settings::default() };
             if !self.squares.is_empty() {
-                settings.largest_px = settings.largest_px.max(Squares::LARGEST_PX);
+                settings.max_size_px = settings.max_size_px.max(Squares::LARGEST_PX);
             }
             if !self.stags.is_empty() {
-                settings.largest_px = settings.largest_px.max(Stags::LARGEST_PX);
+                settings.max_size_px = settings.max_size_px.max(Stags::LARGEST_PX);
             }
             self.outlines.find(view, &settings);
             stages.ended("outlines");

@@ -1,13 +1,13 @@
-//! Which pixels are dark and which are bright, one bit each.
+//! Adaptive binarisation: which pixels are dark and which are bright, one bit each.
 
 use crate::kernels::{TILE, above, below, tile_extremes};
 use crate::view::GrayView;
 
-/// A yes or no for each pixel of an image, 64 in a word, with no all round.
+/// One bit for each pixel of an image, 64 in a word, surrounded by zeros.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct BitImage {
-    /// A row of noes, the rows, another row of noes and a word of them. Each row begins with a word of noes and ends with at
-    /// least one no.
+    /// A row of zeros, the rows, another row of zeros and a zero word. Each row begins with a zero word and
+    /// ends with at least one zero bit.
     words: Vec<u64>,
     width: usize,
     height: usize,
@@ -15,7 +15,7 @@ pub struct BitImage {
 }
 
 impl BitImage {
-    /// Takes a size; the bits within are then of no meaning, those all round are no.
+    /// Takes a size; the bits inside are then undefined, those around zero.
     fn resize(&mut self, width: usize, height: usize) {
         let stride = (width + 1).div_ceil(64) + 1;
         if (self.width, self.height, self.stride) == (width, height, stride) {
@@ -26,10 +26,10 @@ impl BitImage {
         self.words.resize(stride * (height + 2) + 1, 0);
     }
 
-    /// Makes room for images of this size.
+    /// Reserves what images of this size need.
     pub(crate) fn make_room(&mut self, width: usize, height: usize) {
-        let most = ((width + 1).div_ceil(64) + 1) * (height + 2) + 1;
-        self.words.reserve(most.saturating_sub(self.words.len()));
+        let words = ((width + 1).div_ceil(64) + 1) * (height + 2) + 1;
+        self.words.reserve(words.saturating_sub(self.words.len()));
     }
 
     /// Width in pixels.
@@ -42,13 +42,13 @@ impl BitImage {
         self.height
     }
 
-    /// The bit of a pixel; no for those beyond the image.
+    /// The bit of a pixel; false outside the image.
     pub fn at(&self, x: i32, y: i32) -> bool {
         let inside = x >= 0 && y >= 0 && (x as usize) < self.width && (y as usize) < self.height;
         inside && self.bit(self.place(x as usize, y as usize))
     }
 
-    /// Number of a pixel's bit.
+    /// Index of a pixel's bit.
     pub(crate) fn place(&self, x: usize, y: usize) -> usize {
         (y + 1) * self.row_bits() + 64 + x
     }
@@ -58,23 +58,23 @@ impl BitImage {
         self.stride * 64
     }
 
-    /// All words; bit n of them is that of number n from [`BitImage::place`].
+    /// All words; [`BitImage::place`] is the index of a bit.
     pub(crate) fn bits(&self) -> &[u64] {
         &self.words
     }
 
-    /// The bit of a number from [`BitImage::place`], or of a neighbour's.
+    /// The bit of an index from [`BitImage::place`], or of a neighbour's.
     #[inline]
     pub(crate) fn bit(&self, place: usize) -> bool {
         self.words.get(place >> 6).is_some_and(|word| word >> (place & 63) & 1 == 1)
     }
 
-    /// The words of row `y` and one of noes; bit 0 of the first is pixel 0.
+    /// The words of row `y` and a zero word; bit 0 of the first is pixel 0.
     pub(crate) fn row(&self, y: usize) -> &[u64] {
         &self.words[(y + 1) * self.stride + 1..][..self.stride]
     }
 
-    /// The words of the row above row `y`, all no for row 0, and one of noes.
+    /// The words of the row above row `y`, zeros for row 0, and a zero word.
     pub(crate) fn row_above(&self, y: usize) -> &[u64] {
         &self.words[y * self.stride + 1..][..self.stride]
     }
@@ -84,30 +84,30 @@ impl BitImage {
     }
 }
 
-/// Where between the darkest and the brightest pixel of a neighbourhood the line between dark and bright is drawn.
+/// Where the threshold lies between the darkest and the brightest pixel of a neighbourhood.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Middle {
-    /// So many 256ths of the way from the darkest to the brightest. 128 keeps lines whole that are hardly wider than a
-    /// pixel, dark and bright ones alike.
+    /// This many 256ths of the range above the darkest. 128 keeps dark and bright lines whole that are hardly
+    /// wider than a pixel.
     Share(u8),
-    /// The geometric mean: in the middle by ratio. White paper in shade stays brighter than it while black ink in the sun,
-    /// across the shadow's edge, stays darker, as ink lacks more of the light than shade does.
+    /// The geometric mean. At a shadow's edge, white paper in the shade stays above it and black ink in the
+    /// sun below, as ink reflects a smaller share of the light than shade leaves.
     Ratio,
 }
 
 /// What is dark and what is bright.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Contrast {
-    /// The line between the two.
+    /// The threshold.
     pub middle: Middle,
-    /// Where darkest and brightest differ by fewer grey levels, pixels are neither; noise should not reach it.
-    pub least_levels: u8,
-    /// The same, as a share of the brightest in percent.
-    pub least_percent: u8,
+    /// Minimum range of grey levels; below it pixels are neither dark nor bright. Above the noise.
+    pub min_levels: u8,
+    /// Minimum range as a share of the brightest, in percent.
+    pub min_percent: u8,
 }
 
-/// Decides which pixels are dark and which are bright by their neighbourhood: tiles of 4 x 4 pixels, each with its eight
-/// neighbours (as in Wang and Olson, "AprilTag 2", 2016). Where the contrast is too small they are neither.
+/// Classifies pixels as dark or bright by their neighbourhood: tiles of 4 x 4 pixels with their eight
+/// neighbours (Wang and Olson, "AprilTag 2", 2016). Where the contrast is too small they are neither.
 #[derive(Clone, Debug, Default)]
 pub struct Binarizer {
     columns: usize,
@@ -116,7 +116,7 @@ pub struct Binarizer {
     /// The same, with the tiles to the left and right.
     wide_low: Vec<u8>,
     wide_high: Vec<u8>,
-    /// A pixel below it is dark; 0 where the contrast is too small.
+    /// Dark pixels are below it; 0 where the contrast is too small.
     thresholds: Vec<u8>,
     /// Darkest and brightest of a tile and its neighbours.
     extremes: Vec<[u8; 2]>,
@@ -124,10 +124,10 @@ pub struct Binarizer {
 }
 
 impl Binarizer {
-    /// Makes room for images of this size.
+    /// Reserves what images of this size need.
     pub(crate) fn make_room(&mut self, width: usize, height: usize) {
-        fn reserve<T>(list: &mut Vec<T>, most: usize) {
-            list.reserve(most.saturating_sub(list.len()));
+        fn reserve<T>(list: &mut Vec<T>, count: usize) {
+            list.reserve(count.saturating_sub(list.len()));
         }
         let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
         for buffer in [&mut self.low, &mut self.high, &mut self.wide_low, &mut self.wide_high] {
@@ -138,7 +138,7 @@ impl Binarizer {
         reserve(&mut self.row, width.next_multiple_of(TILE));
     }
 
-    /// Writes which pixels are dark, and if asked for which are bright.
+    /// Writes which pixels are dark, and optionally which are bright.
     pub fn apply(
         &mut self,
         view: GrayView<'_>,
@@ -162,7 +162,7 @@ impl Binarizer {
                 below(view.row(y), &self.row[..width], dark.row_mut(y));
             }
             if let Some(bright) = bright.as_deref_mut() {
-                // Nothing is above 255, so 0 - 1 serves where the contrast is too small.
+                // Nothing is above 255: 0 wraps to it where the contrast is too small.
                 expand(tiles, &mut self.row, |threshold| threshold.wrapping_sub(1));
                 for y in rows {
                     above(view.row(y), &self.row[..width], bright.row_mut(y));
@@ -171,8 +171,8 @@ impl Binarizer {
         }
     }
 
-    /// The threshold at a pixel of the last image: dark pixels are below it, bright ones not. 0 where the contrast is
-    /// too small, and outside.
+    /// The threshold at a pixel of the last image: dark pixels are below it, bright ones not. 0 where the
+    /// contrast is too small, and outside.
     pub fn threshold(&self, x: usize, y: usize) -> u8 {
         self.of_tile(&self.thresholds, x, y)
     }
@@ -200,7 +200,7 @@ impl Binarizer {
         self.extremes.resize(count, [0, 0]);
         let rows = self.low.chunks_mut(self.columns).zip(self.high.chunks_mut(self.columns));
         for (index, (low, high)) in rows.enumerate() {
-            // The last rows of an image count again where fewer than four are left.
+            // Where fewer than four rows are left, the last one is repeated.
             let rows = [0, 1, 2, 3].map(|i| view.row((index * TILE + i).min(view.height() - 1)));
             tile_extremes(&rows, low, high);
         }
@@ -252,8 +252,8 @@ impl Contrast {
     fn gate(&self, low: u8, high: u8, threshold: u8) -> u8 {
         let difference = high.saturating_sub(low);
         let share =
-            100 * u16::from(difference) >= u16::from(self.least_percent.min(100)) * u16::from(high);
-        if difference >= self.least_levels.max(1) && share { threshold } else { 0 }
+            100 * u16::from(difference) >= u16::from(self.min_percent.min(100)) * u16::from(high);
+        if difference >= self.min_levels.max(1) && share { threshold } else { 0 }
     }
 }
 
@@ -276,12 +276,12 @@ fn between(low: u8, high: u8, share: u8) -> u8 {
     low + ((up + 255) >> 8) as u8
 }
 
-/// Above `low` unless both are the same. What the lens scatters into the dark is allowed for, or else the darkest pixels
-/// would decide alone.
+/// Above `low` unless both are the same. An offset for stray light keeps the darkest pixels from dominating.
 #[inline]
 fn mean_by_ratio(low: u8, high: u8) -> u8 {
-    const SCATTERED: f32 = 4.0;
-    let mean = ((f32::from(low) + SCATTERED) * (f32::from(high) + SCATTERED)).sqrt() - SCATTERED;
+    const STRAY_LIGHT: f32 = 4.0;
+    let mean =
+        ((f32::from(low) + STRAY_LIGHT) * (f32::from(high) + STRAY_LIGHT)).sqrt() - STRAY_LIGHT;
     (mean + 0.999) as u8
 }
 
@@ -297,8 +297,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const PLAIN: Contrast =
-        Contrast { middle: Middle::Share(128), least_levels: 10, least_percent: 0 };
+    const PLAIN: Contrast = Contrast { middle: Middle::Share(128), min_levels: 10, min_percent: 0 };
 
     fn apply(data: &[u8], width: usize, contrast: Contrast) -> (BitImage, BitImage) {
         let view = GrayView::packed(data, width, data.len() / width).unwrap();
@@ -317,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn ink_and_paper_on_both_sides_of_a_shadow_keep_their_sides() {
+    fn the_geometric_mean_separates_ink_and_paper_across_a_shadow() {
         // Paper 200 and ink 30 in the sun, a quarter of that in the shade that begins in column 16.
         let shade = |x: i32, value: u8| if x >= 16 { value / 4 } else { value };
         let ink = |x: i32, y: i32| (x / 6 + y / 6) % 2 == 0;
@@ -340,7 +339,7 @@ mod tests {
             ratio in any::<bool>(),
         ) {
             let middle = if ratio { Middle::Ratio } else { Middle::Share(140) };
-            let contrast = Contrast { middle, least_levels: 40, least_percent: 30 };
+            let contrast = Contrast { middle, min_levels: 40, min_percent: 30 };
             let view = GrayView::packed(&data, width, data.len() / width).unwrap();
             let (mut dark, mut bright) = (BitImage::default(), BitImage::default());
             let mut binarizer = Binarizer::default();

@@ -5,14 +5,14 @@ use crate::view::GrayView;
 /// The borders between the white (not 0) and the black (0) pixels of an image, by Suzuki and Abe's border
 /// following (1985), as OpenCV's `findContours` with `RETR_LIST` and `CHAIN_APPROX_SIMPLE`.
 ///
-/// White is connected across corners. The points are white pixels: an outer border's are the outermost of a white
-/// region, a hole's are those around a black region. Pixels beyond the image count as black. Of straight runs
-/// (upright, level, diagonal) only the ends are kept. Borders come in the order in which a scan from the top left
-/// meets them; OpenCV lists them the other way round.
+/// White is connected across corners. The points are white pixels: an outer border's are the outermost of a
+/// white region, a hole's are those around a black region. Pixels beyond the image count as black. Of
+/// straight runs (vertical, horizontal, diagonal) only the ends are kept. Borders come in raster order from
+/// the top left; OpenCV lists them in reverse.
 #[derive(Clone, Debug, Default)]
 pub struct Contours {
-    /// One byte per pixel with a border of one: 0 black, 1 white, [`SEEN`] on a border, [`SEEN_RIGHT`] on a border
-    /// with black to the right.
+    /// One byte per pixel with a border of one: 0 black, 1 white, [`SEEN`] on a border, [`SEEN_RIGHT`] on a
+    /// border with black to the right.
     labels: Vec<u8>,
     points: Vec<[i32; 2]>,
     spans: Vec<Span>,
@@ -34,13 +34,13 @@ pub struct Contour<'a> {
     pub hole: bool,
 }
 
-/// What is kept of what [`Contours::find`] meets.
+/// Which borders [`Contours::find`] keeps.
 #[derive(Copy, Clone, Debug)]
 pub struct Limits {
-    /// Borders of fewer points are left out.
-    pub least_points: usize,
+    /// Borders of fewer points are dropped.
+    pub min_points: usize,
     /// The search ends when the borders kept have this many points.
-    pub most_points: usize,
+    pub max_points: usize,
 }
 
 const SEEN: u8 = 2;
@@ -51,7 +51,7 @@ const NEIGHBOURS: [[i32; 2]; 8] =
     [[1, 0], [1, -1], [0, -1], [-1, -1], [-1, 0], [-1, 1], [0, 1], [1, 1]];
 
 impl Contours {
-    /// Finds the borders of an image; those found before are forgotten.
+    /// Finds the borders of an image, replacing those found before.
     pub fn find(&mut self, binary: GrayView<'_>, limits: Limits) {
         self.points.clear();
         self.spans.clear();
@@ -69,7 +69,7 @@ impl Contours {
                 } else if here == 0 && matches!(before, 1 | SEEN) {
                     self.keep(at - 1, [x as i32 - 2, y as i32], true, stride, limits);
                 }
-                if self.points.len() >= limits.most_points {
+                if self.points.len() >= limits.max_points {
                     return;
                 }
                 x += 1;
@@ -134,14 +134,14 @@ impl Contours {
         let start = self.points.len();
         self.follow(at, pixel, hole, stride);
         let end = self.points.len();
-        if end - start < limits.least_points {
+        if end - start < limits.min_points {
             self.points.truncate(start);
         } else {
             self.spans.push(Span { start, end, hole });
         }
     }
 
-    /// Follows the border that begins at label `start` (pixel `pixel`), marks it and notes its corners.
+    /// Follows the border that begins at label `start` (pixel `pixel`), marks it and stores its corners.
     fn follow(&mut self, start: usize, mut pixel: [i32; 2], hole: bool, stride: usize) {
         let offsets = NEIGHBOURS.map(|[dx, dy]| dx as isize + dy as isize * stride as isize);
         let step = |at: usize, direction: usize| at.wrapping_add_signed(offsets[direction & 7]);
@@ -164,7 +164,7 @@ impl Contours {
                 turn += 1;
             }
             let direction = (from + turn) & 7;
-            // The neighbour to the right (direction 0) was passed over as black exactly when the turn went round it.
+            // The right neighbour (direction 0) was skipped as black exactly when the turn passed it.
             if from + turn > 8 {
                 self.labels[at] = SEEN_RIGHT;
             } else if self.labels[at] == 1 {
@@ -200,28 +200,12 @@ pub fn contour_area(points: &[[i32; 2]]) -> f64 {
     twice.abs() as f64 / 2.0
 }
 
-/// Length of a border, in pixels. Its runs are level, upright or diagonal.
-pub fn contour_length(points: &[[i32; 2]]) -> f64 {
-    let Some(last) = points.last() else {
-        return 0.0;
-    };
-    let mut previous = *last;
-    let (mut long, mut short) = (0_i64, 0_i64);
-    for point in points {
-        let (dx, dy) = ((point[0] - previous[0]).abs(), (point[1] - previous[1]).abs());
-        long += i64::from(dx.max(dy));
-        short += i64::from(dx.min(dy));
-        previous = *point;
-    }
-    long as f64 + short as f64 * (std::f64::consts::SQRT_2 - 1.0)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const ALL: Limits = Limits { least_points: 1, most_points: usize::MAX };
+    const ALL: Limits = Limits { min_points: 1, max_points: usize::MAX };
 
     fn find(rows: &[&str]) -> Vec<(Vec<[i32; 2]>, bool)> {
         let data: Vec<u8> = rows
@@ -258,24 +242,21 @@ mod tests {
     }
 
     #[test]
-    fn short_and_surplus_borders_are_left_out() {
+    fn short_and_surplus_borders_are_dropped() {
         let data: Vec<u8> =
             (0..10_000).map(|i| if (i % 100 + i / 100) % 2 == 0 { 255 } else { 0 }).collect();
         let view = GrayView::packed(&data, 100, 100).unwrap();
         let mut contours = Contours::default();
-        contours.find(view, Limits { least_points: 5, most_points: 1000 });
+        contours.find(view, Limits { min_points: 5, max_points: 1000 });
         assert!(contours.iter().all(|c| c.points.len() >= 5));
-        contours.find(view, Limits { least_points: 1, most_points: 1000 });
+        contours.find(view, Limits { min_points: 1, max_points: 1000 });
         let total: usize = contours.iter().map(|c| c.points.len()).sum();
         assert!((1000..1000 + 400).contains(&total), "{total}");
     }
 
     #[test]
-    fn areas_and_lengths_of_polygons() {
-        let square = [[0, 0], [0, 3], [4, 3], [4, 0]];
-        assert_eq!((contour_area(&square), contour_length(&square)), (12.0, 14.0));
-        let diamond = [[0, 3], [3, 0], [6, 3], [3, 6]];
-        assert!((contour_length(&diamond) - 12.0 * 2.0_f64.sqrt()).abs() < 1e-9);
+    fn areas_of_polygons() {
+        assert_eq!(contour_area(&[[0, 0], [0, 3], [4, 3], [4, 0]]), 12.0);
         assert_eq!((contour_area(&[]), contour_area(&[[3, 4]])), (0.0, 0.0));
     }
 

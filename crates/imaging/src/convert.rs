@@ -1,11 +1,11 @@
-//! Images of more than 8 bits, and colour mosaics, made 8-bit grey.
+//! Conversion of raw images (more than 8 bits, Bayer mosaics) to 8-bit grey.
 
 use crate::view::{GrayImage, GrayView, ViewError};
 
-/// How the samples of a raw image lie, row by row without gaps.
+/// The layout of the samples of a raw image, row by row without gaps.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct SampleFormat {
-    /// Bits that count: up to 8 in one byte a pixel; more, up to 16, in two, the low byte first.
+    /// Significant bits: up to 8 in one byte per pixel, up to 16 in two, the low byte first.
     pub bits: u32,
     /// The colours in front of the pixels; `None` for a grey sensor.
     pub mosaic: Option<Mosaic>,
@@ -24,7 +24,7 @@ pub enum Mosaic {
     Bggr,
 }
 
-/// A text that names no mosaic.
+/// A text that is not the name of a mosaic.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NoMosaic(String);
 
@@ -51,7 +51,7 @@ impl std::str::FromStr for Mosaic {
     }
 }
 
-/// Makes raw images 8-bit grey; keeps its memory from image to image.
+/// Converts raw images to 8-bit grey. Its buffers are reused from image to image.
 #[derive(Clone, Debug, Default)]
 pub struct Converter {
     histogram: Vec<u32>,
@@ -59,22 +59,23 @@ pub struct Converter {
     gray: GrayImage,
 }
 
-/// Bins of the histogram by which the range of grey levels is found.
+/// Bins of the histogram that gives the range of grey levels.
 const BINS: usize = 4096;
-/// Part of the pixels, at either end, that are taken for faults of the sensor and do not set the range.
+/// Share of the pixels, at either end, that count as defects of the sensor and do not set the range.
 const OUTLIERS: f64 = 2e-5;
-/// Levels that are never spread over more than the 8 bits have, so that noise is not made contrast.
+/// Minimum range of levels mapped to 8 bits, so that noise is not amplified.
 const LEAST_RANGE: u32 = 255;
 
 impl Converter {
-    /// An image in 8-bit grey: the image itself when it is that already.
+    /// An image in 8-bit grey; the image itself when it is that already.
     ///
-    /// More than 8 bits are scaled linearly, which leaves edges where they are, so that all levels but for outliers
-    /// fit. In a mosaic, missing green is interpolated along edges with the other colour's curvature as a correction
-    /// (Hamilton and Adams, US patent 5629734, expired); black and white stay sharp and colours make no pattern.
+    /// More than 8 bits are scaled linearly, which leaves edges where they are, so that all levels but for
+    /// outliers fit. In a mosaic, missing green is interpolated along edges with the other colour's curvature
+    /// as a correction (Hamilton and Adams, US patent 5629734, expired); black and white stay sharp and
+    /// colours make no pattern.
     ///
     /// # Errors
-    /// [`ViewError`] when the size is nought or too large, or the bytes are too few for it.
+    /// [`ViewError`] when the size is zero or too large, or there are too few bytes.
     pub fn convert<'a>(
         &'a mut self,
         data: &'a [u8],
@@ -119,7 +120,7 @@ impl Converter {
         }
     }
 
-    /// The lowest and the highest level, outliers left out.
+    /// The lowest and the highest level without outliers.
     fn range(&mut self, pairs: &[[u8; 2]], bits: u32) -> [u32; 2] {
         let shift = bits.saturating_sub(BINS.ilog2());
         let top = (1_u32 << bits) - 1;
@@ -189,12 +190,12 @@ fn mirrored(at: usize, offset: isize, len: usize) -> usize {
     folded.clamp(0, last) as usize
 }
 
-/// By how much the red or blue pixels of even and of odd rows differ less than green ones do, in 256ths: the curvature
-/// of a darker channel is smaller by its part of the light.
+/// By how much the red or blue pixels of even and of odd rows differ less than green ones do, in 256ths: the
+/// curvature of a darker channel is smaller by its part of the light.
 fn balance(view: GrayView<'_>, green: usize) -> [i32; 2] {
     [0, 1].map(|parity| {
         let (mut greens, mut others) = (0_u64, 0_u64);
-        // A few rows tell the light as well as all.
+        // A few rows suffice.
         for y in (parity..view.height()).step_by(16) {
             let (pairs, _) = view.row(y).as_chunks::<2>();
             let even: u64 = pairs.iter().map(|[even, _]| u64::from(*even)).sum();
@@ -236,8 +237,8 @@ impl Neighbours {
         }
     }
 
-    /// Green here: the mean of its neighbours in the direction in which the image changes less, corrected by the other
-    /// colour's curvature; where it changes as much in both, the mean of both.
+    /// Green here: the mean of its neighbours in the direction in which the image changes less, corrected by
+    /// the other colour's curvature; where it changes as much in both, the mean of both.
     #[inline]
     fn green(&self, balance: i32) -> u8 {
         let [left, right, above, below] = self.greens;
@@ -287,7 +288,7 @@ mod tests {
         assert_eq!(scaled(&[0, 2048, 4095], 12), [0, 128, 255]);
         assert_eq!(scaled(&[1000, 1500, 2000], 12), [0, 128, 255]);
         assert_eq!(scaled(&[0, 0xffff], 16), [0, 255]);
-        // What does not fit the bits is as bright as can be, and little contrast stays little.
+        // Values beyond the bits saturate, and low contrast stays low.
         assert_eq!(scaled(&[0, 1023, 0xffff], 10), [0, 255, 255]);
         assert_eq!(scaled(&[500, 510, 500], 10), [0, 10, 0]);
     }
@@ -321,7 +322,8 @@ mod tests {
         }
     }
 
-    /// A slanted black edge on white paper through a mosaic whose red is half, and whose blue a third as bright.
+    /// A slanted black edge on white paper through a mosaic whose red is half, and whose blue a third as
+    /// bright.
     fn slanted(x: usize, y: usize) -> f64 {
         let distance = (x as f64 - 20.0) * 0.94 + (y as f64 - 16.0) * 0.34;
         20.0 + 200.0 / (1.0 + (-2.5 * distance).exp())

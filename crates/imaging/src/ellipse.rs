@@ -11,7 +11,8 @@ pub struct Ellipse {
     pub minor: f64,
     /// Whole length of its major axis, in pixels (b in the thesis).
     pub major: f64,
-    /// From the image's x axis to the minor axis, turning from x to y, in radians from 0 to pi (OpenCV's angle).
+    /// From the image's x axis to the minor axis, turning from x to y, in radians from 0 to pi (OpenCV's
+    /// angle).
     pub angle: f64,
 }
 
@@ -26,23 +27,23 @@ impl Ellipse {
         (self.major * self.major - self.minor * self.minor).max(0.0).sqrt() / self.major
     }
 
-    /// The same ellipse with both axes longer by `by_px` pixels.
+    /// The ellipse with both axes longer by `by_px` pixels.
     pub fn grown(&self, by_px: f64) -> Self {
         Self { minor: self.minor + by_px, major: self.major + by_px, ..*self }
     }
 
-    /// The place on the ellipse at the parameter `t` (radians; 0 and pi are the ends of the minor axis).
+    /// The point at the parameter `t` (radians; 0 and pi are the ends of the minor axis).
     pub fn at(&self, t: f64) -> [f64; 2] {
         let (sin, cos) = t.sin_cos();
         self.axes().at([sin, cos])
     }
 
-    /// Distance from the centre in units of the ellipse: 1 on it, less than 1 within.
+    /// Distance from the centre in units of the ellipse: 1 on it, less inside.
     pub fn radius_of(&self, point: [f64; 2]) -> f64 {
         self.axes().radius_of(point)
     }
 
-    /// Its half axes, for many places.
+    /// Its half axes, prepared for many points.
     pub fn axes(&self) -> Axes {
         let (sin, cos) = self.angle.sin_cos();
         let (minor, major) = (self.minor / 2.0, self.major / 2.0);
@@ -62,7 +63,7 @@ pub struct Axes {
 }
 
 impl Axes {
-    /// The place on the ellipse at the parameter with this sine and cosine, as [`Ellipse::at`] has it.
+    /// As [`Ellipse::at`], for the sine and cosine of the parameter.
     #[inline]
     pub fn at(&self, [sin, cos]: [f64; 2]) -> [f64; 2] {
         let (along_minor, along_major) = (self.lengths[0] * cos, self.lengths[1] * sin);
@@ -84,9 +85,9 @@ impl Axes {
     }
 }
 
-/// The ellipse through points by algebraic least squares, as OpenCV's `fitEllipse`: first all five coefficients of
-/// the conic, which give the centre, then the three of second degree about that centre. `None` for fewer than
-/// five points, and for points of which no ellipse comes.
+/// The ellipse through points by algebraic least squares, as OpenCV's `fitEllipse`: first all five
+/// coefficients of the conic, which give the centre, then the three of second degree about that centre.
+/// `None` for fewer than five points, and when the conic is not an ellipse.
 pub fn fit_ellipse<I>(points: I) -> Option<Ellipse>
 where
     I: Iterator<Item = [f64; 2]> + Clone,
@@ -94,7 +95,7 @@ where
     let (mean, scale) = spread(points.clone())?;
     let scaled = points.map(|[x, y]| [(x - mean[0]) * scale, (y - mean[1]) * scale]);
     let [a, b, c, d, e] = least_squares(scaled.clone().map(|[x, y]| [x * x, y * y, x * y, x, y]))?;
-    let [cx, cy] = solve([[2.0 * a, c, -d], [c, 2.0 * b, -e]])?;
+    let [cx, cy] = solve([[2.0 * a, c], [c, 2.0 * b]], [-d, -e])?;
     let about = scaled.map(|[x, y]| {
         let (x, y) = (x - cx, y - cy);
         [x * x, y * y, x * y]
@@ -132,7 +133,7 @@ fn spread(points: impl Iterator<Item = [f64; 2]> + Clone) -> Option<([f64; 2], f
     scale.is_finite().then_some((mean, scale))
 }
 
-/// The coefficients whose products with each row come closest to 1.
+/// The coefficients whose products with each row are closest to 1, by the normal equations.
 fn least_squares<const N: usize>(rows: impl Iterator<Item = [f64; N]>) -> Option<[f64; N]> {
     let mut normal = [[0.0; N]; N];
     let mut right = [0.0; N];
@@ -144,17 +145,12 @@ fn least_squares<const N: usize>(rows: impl Iterator<Item = [f64; N]>) -> Option
             *sum += a;
         }
     }
-    eliminate(normal, right)
+    solve(normal, right)
 }
 
-/// Solves two equations, each written as its two coefficients and its right side.
-fn solve(rows: [[f64; 3]; 2]) -> Option<[f64; 2]> {
-    eliminate(rows.map(|[a, b, _]| [a, b]), rows.map(|row| row[2]))
-}
-
-/// Gaussian elimination with partial pivoting; `None` when the equations say too little.
-fn eliminate<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; N]) -> Option<[f64; N]> {
-    let largest = matrix.iter().flatten().fold(0.0_f64, |most, entry| most.max(entry.abs()));
+/// Solves linear equations by Gaussian elimination with partial pivoting; `None` when they are singular.
+fn solve<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; N]) -> Option<[f64; N]> {
+    let largest = matrix.iter().flatten().fold(0.0_f64, |max, entry| max.max(entry.abs()));
     for column in 0..N {
         let pivot = (column..N)
             .max_by(|i, j| matrix[*i][column].abs().total_cmp(&matrix[*j][column].abs()))?;
@@ -192,7 +188,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn an_ellipse_comes_back_from_its_points(
+        fn an_ellipse_is_recovered_from_its_points(
             x in -100.0..5000.0f64, y in -100.0..5000.0f64,
             minor in 3.0..1000.0f64, ratio in 1.05..4.0f64, angle in 0.0..PI, count in 6_u32..200,
         ) {
@@ -206,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_ellipse_has_none() {
+    fn points_without_an_ellipse_give_none() {
         let fit = |points: &[[f64; 2]]| fit_ellipse(points.iter().copied());
         assert_eq!(fit(&[[0.0, 0.0]; 9]), None);
         assert_eq!(fit(&[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]), None);

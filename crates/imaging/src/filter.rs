@@ -2,10 +2,11 @@
 
 use crate::view::{GrayImage, GrayView};
 
-/// Standard deviation of both weights: grey levels for the range, pixels for the distance (thesis, section 3.1.1).
+/// Standard deviation of both weights: grey levels for the range, pixels for the distance (thesis, section
+/// 3.1.1).
 pub const BILATERAL_SIGMA: f32 = 175.0;
 
-/// How far the neighbourhood reaches, in pixels.
+/// Radius of the neighbourhood, in pixels.
 const REACH: usize = 2;
 
 /// Working memory of [`bilateral_5x5`]: the rows around the one being filtered, with their borders.
@@ -14,10 +15,12 @@ pub struct BilateralRows {
     rows: [Vec<f32>; 2 * REACH + 1],
 }
 
-/// Bilateral filter (Equations 3.1 and 3.2) in 5 x 5 neighbourhoods with [`BILATERAL_SIGMA`] for both weights.
+/// Bilateral filter (Equations 3.1 and 3.2) in 5 x 5 neighbourhoods with [`BILATERAL_SIGMA`] for both
+/// weights.
 ///
-/// As OpenCV's `bilateralFilter(src, 5, 175, 175)`: of the 25 pixels the 13 no further than 2 pixels away count,
-/// borders are mirrored without repeating the edge pixel, and the mean is rounded to the nearest integer.
+/// As OpenCV's `bilateralFilter(src, 5, 175, 175)`: of the 25 pixels the 13 no further than 2 pixels away
+/// count, borders are mirrored without repeating the edge pixel, and the mean is rounded to the nearest
+/// integer.
 pub fn bilateral_5x5(view: GrayView<'_>, rows: &mut BilateralRows, out: &mut GrayImage) {
     out.resize(view.width(), view.height());
     for (slot, row) in rows.rows.iter_mut().enumerate() {
@@ -33,7 +36,7 @@ pub fn bilateral_5x5(view: GrayView<'_>, rows: &mut BilateralRows, out: &mut Gra
     }
 }
 
-/// The place that stands for `at` beyond the ends of a line of `len`: mirrored about the end pixels' centres.
+/// The index for `at` beyond the ends of a line of `len`: mirrored about the centres of the end pixels.
 fn mirrored(at: isize, len: usize) -> usize {
     let last = len as isize - 1;
     if last == 0 {
@@ -61,9 +64,9 @@ fn filter_row(rows: [&[f32]; 5], out: &mut [u8]) {
     if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
         #[allow(
             unsafe_code,
-            reason = "the wide registers must be asked for by name; twice as fast on the flight computer"
+            reason = "wide registers need a named feature; twice as fast on the flight computer"
         )]
-        // SAFETY: the processor has just said that it has both features.
+        // SAFETY: both features were just detected.
         return unsafe { filter_row_avx2(rows, out) };
     }
     kernel::<false>(rows, out);
@@ -77,7 +80,7 @@ fn filter_row_avx2(rows: [&[f32]; 5], out: &mut [u8]) {
 
 #[inline(always)]
 fn multiply_add<const FUSED: bool>(a: f32, b: f32, c: f32) -> f32 {
-    // Without the instruction, a fused product is a slow call into the library.
+    // Without the instruction, `mul_add` is a slow library call.
     if FUSED { a.mul_add(b, c) } else { a * b + c }
 }
 

@@ -1,7 +1,7 @@
 //! The loops over all pixels, eight to sixty-four at a time where the processor can.
 //!
-//! Each kernel exists twice, for AVX2 and in plain Rust, with the same result to the bit. The plain one also serves the
-//! ends of rows, and processors without AVX2.
+//! Each kernel exists twice, for AVX2 and in plain Rust, with the same result to the bit. The plain one also
+//! serves the ends of rows, and processors without AVX2.
 #![allow(unsafe_code, reason = "vector instructions; each is tested against its plain twin")]
 #![cfg_attr(
     not(target_arch = "x86_64"),
@@ -11,7 +11,8 @@
 /// Edge of a tile, in pixels.
 pub(crate) const TILE: usize = 4;
 
-/// Darkest and brightest pixel of each tile of up to four rows of the same length; the last tile may be narrower.
+/// Darkest and brightest pixel of each tile of up to four rows of the same length; the last tile may be
+/// narrower.
 pub(crate) fn tile_extremes(rows: &[&[u8]; TILE], low: &mut [u8], high: &mut [u8]) {
     let tiles = rows[0].len().div_ceil(TILE).min(low.len()).min(high.len());
     let mut done = 0;
@@ -34,8 +35,8 @@ pub(crate) fn halve_rows(above: &[u8], below: &[u8], out: &mut [u8]) {
     plain::halve_rows(above, below, out, done);
 }
 
-/// A row sharpened: each pixel moves away from the mean of its 3 x 3 neighbours (weights 1 2 1, both ways) by as much as
-/// it differs from it. Beyond the ends of the row its last pixels count again.
+/// A row sharpened: each pixel moves away from the mean of its 3 x 3 neighbours (weights 1 2 1, both ways) by
+/// as much as it differs from it. Beyond the ends of the row its last pixels count again.
 pub(crate) fn sharpen_row(above: &[u8], here: &[u8], below: &[u8], out: &mut [u8]) {
     let mut done = 0;
     #[cfg(target_arch = "x86_64")]
@@ -64,8 +65,8 @@ pub(crate) fn above(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
     below(thresholds, pixels, words);
 }
 
-/// Does some work, with the loops of what is inlined into it compiled for AVX2 where the processor has it. It is the same
-/// code, and none of its arithmetic is fused, so the result is the same.
+/// Does some work, with the loops of what is inlined into it compiled for AVX2 where the processor has it. It
+/// is the same code, and none of its arithmetic is fused, so the result is the same.
 #[inline]
 pub(crate) fn with_vectors<T>(work: impl FnOnce() -> T) -> T {
     #[cfg(target_arch = "x86_64")]
@@ -211,7 +212,8 @@ mod avx2 {
         done
     }
 
-    /// Of 8 tiles from a column on, the least and the greatest pixel in the lowest byte of each group of four.
+    /// Of 8 tiles from a column on, the least and the greatest pixel in the lowest byte of each group of
+    /// four.
     #[target_feature(enable = "avx2")]
     fn extremes_of_tiles(rows: &[&[u8]; TILE], at: usize) -> (__m256i, __m256i) {
         let [a, b, c, d] = rows.map(|row| load(row, at));

@@ -1,13 +1,12 @@
-//! Grey images as borrowed views, and what detectors do to them.
+//! Grey images as borrowed views, and the image processing of the detectors.
 //!
 //! This crate knows no marker, no camera, no file and no thread.
 //!
-//! Modules in reading order: [`view`] is an image, [`convert`] makes one
-//! of what other sensors give, [`mod@filter`] smooths it, [`mod@threshold`] makes it black and
-//! white, [`contour`] follows the borders between the two, [`ellipse`] fits ellipses to borders, [`sample`] reads
-//! grey values between the pixels. The fast way to regions of any size: [`pyramid`] halves an image again and again,
-//! [`binary`] decides which pixels are dark or bright, [`outline`] follows the outlines of the regions they make.
-//! [`segment`] takes straight pieces of edges where regions are broken.
+//! Modules in reading order: [`view`] is an image, [`convert`] makes one of raw sensor data, [`mod@filter`]
+//! smooths it, [`mod@threshold`] binarises it, [`contour`] follows the borders, [`ellipse`] fits ellipses to
+//! them, [`sample`] interpolates grey values. The fast path to regions of any size: [`pyramid`] halves an
+//! image again and again, [`binary`] binarises with a local threshold, [`outline`] follows the outlines of
+//! the regions. [`segment`] finds straight edge segments where regions are broken.
 
 pub mod binary;
 pub mod contour;
@@ -23,13 +22,13 @@ pub mod threshold;
 pub mod view;
 
 pub use binary::{Binarizer, BitImage, Contrast, Middle};
-pub use contour::{Contour, Contours, Limits, contour_area, contour_length};
+pub use contour::{Contour, Contours, Limits, contour_area};
 pub use convert::{Converter, Mosaic, SampleFormat};
 pub use ellipse::{Axes, Ellipse, fit_ellipse};
 pub use filter::{BilateralRows, bilateral_5x5};
 pub use outline::{Outline, Outlines};
 pub use pyramid::Pyramid;
 pub use sample::bilinear;
-pub use segment::{LeastEdge, Segment, Segments};
-pub use threshold::{LeastContrast, LocalThreshold, threshold};
+pub use segment::{Segment, SegmentLimits, Segments};
+pub use threshold::threshold;
 pub use view::{GrayImage, GrayView, ViewError};

@@ -1,10 +1,10 @@
-//! The same image at half, a quarter, an eighth ... of its size.
+//! Image pyramid: the image at half, a quarter, an eighth ... of its size.
 
 use crate::kernels::halve_rows;
 use crate::view::{GrayImage, GrayView};
 
-/// An image at ever smaller sizes: level 0 is the image itself, each further level has the means of 2 x 2 pixels of the
-/// level before. A last odd row or column is left out of the next level.
+/// Level 0 is the image itself, each further level has the means of 2 x 2 pixels of the level before. An odd
+/// last row or column is dropped.
 #[derive(Clone, Debug, Default)]
 pub struct Pyramid {
     halved: Vec<GrayImage>,
@@ -12,11 +12,11 @@ pub struct Pyramid {
 }
 
 impl Pyramid {
-    /// Makes `levels` levels of an image, level 0 included, or fewer: none has an edge shorter than `shortest_px`.
-    /// Level 0 is not copied.
-    pub fn build(&mut self, view: GrayView<'_>, levels: usize, shortest_px: usize) {
+    /// Builds up to `levels` levels of an image, level 0 included. None has an edge shorter than
+    /// `min_edge_px`. Level 0 is not copied.
+    pub fn build(&mut self, view: GrayView<'_>, levels: usize, min_edge_px: usize) {
         self.levels = 1;
-        let fits = |edge: usize| edge / 2 >= shortest_px.max(1);
+        let fits = |edge: usize| edge / 2 >= min_edge_px.max(1);
         let (mut width, mut height) = (view.width(), view.height());
         while self.levels < levels && fits(width) && fits(height) {
             (width, height) = (width / 2, height / 2);
@@ -32,12 +32,12 @@ impl Pyramid {
         }
     }
 
-    /// How many levels there are, level 0 included.
+    /// Number of levels, level 0 included.
     pub fn levels(&self) -> usize {
         self.levels
     }
 
-    /// A level; `view` is the image that the pyramid was built of.
+    /// A level; `view` is the image of which the pyramid was built.
     pub fn level<'a>(&'a self, view: GrayView<'a>, level: usize) -> Option<GrayView<'a>> {
         match level {
             0 => Some(view),
@@ -47,14 +47,15 @@ impl Pyramid {
     }
 }
 
-/// Where a place of a level lies in the image, along one axis: a pixel's centre on level l is the centre of 2^l pixels.
+/// From a level's coordinate to the image's, along one axis: the centre of a pixel on level l is that of 2^l
+/// pixels.
 #[inline]
 pub fn to_level_0(place: f64, level: usize) -> f64 {
     let pixels = (1_u64 << level.min(32)) as f64;
     (place + 0.5) * pixels - 0.5
 }
 
-/// Where a place in the image lies on a level, along one axis.
+/// From the image's coordinate to a level's, along one axis.
 #[inline]
 pub fn from_level_0(place: f64, level: usize) -> f64 {
     let pixels = (1_u64 << level.min(32)) as f64;
@@ -93,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn places_go_to_level_0_and_back() {
+    fn coordinates_map_to_level_0_and_back() {
         assert_eq!(to_level_0(0.0, 1), 0.5);
         assert_eq!(to_level_0(1.0, 2), 5.5);
         assert_eq!(from_level_0(to_level_0(7.25, 3), 3), 7.25);

@@ -1,12 +1,11 @@
-//! Grey values between the pixels.
+//! Grey values between pixels.
 
 use crate::view::GrayView;
 
-/// The grey value at a place between pixel centres, interpolated linearly both ways; `None` outside the pixels'
-/// centres.
+/// The bilinearly interpolated grey value; `None` outside the pixels' centres.
 #[inline]
 pub fn bilinear(view: GrayView<'_>, x: f64, y: f64) -> Option<f64> {
-    // What is negative or not a number becomes 0, and leaves a share that is not within 0 and 1.
+    // The casts saturate: negative numbers and NaN become 0 and fail the check of the fractions.
     let (left, top) = (x as u32, y as u32);
     let (fx, fy) = (x - f64::from(left), y - f64::from(top));
     if !(fx >= 0.0 && fy >= 0.0) {
@@ -15,7 +14,7 @@ pub fn bilinear(view: GrayView<'_>, x: f64, y: f64) -> Option<f64> {
     let (left, top) = (left as usize, top as usize);
     let beyond = |edge: usize, at: usize| edge.checked_sub(at)?.checked_sub(1);
     let (right, below) = (beyond(view.width(), left)?, beyond(view.height(), top)?);
-    // In the last column and row are only its pixels' centres.
+    // The last column and row end at their pixels' centres.
     if (right == 0 && fx > 0.0) || (below == 0 && fy > 0.0) {
         return None;
     }
@@ -29,7 +28,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_between_pixels_and_beyond_them() {
+    fn values_are_interpolated_inside_the_image_only() {
         let view = GrayView::packed(&[0, 100, 200, 60], 2, 2).unwrap();
         assert_eq!(bilinear(view, 1.0, 0.0), Some(100.0));
         assert_eq!(bilinear(view, 0.5, 0.5), Some(90.0));

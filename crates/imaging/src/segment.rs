@@ -1,15 +1,16 @@
-//! Straight pieces of edges, from the gradient.
+//! Straight edge segments, from the gradient.
 //!
-//! Where a threshold fails (the edge of a shadow, glare, something in front), edges are still edges, in pieces.
-//! Edge pixels are those of the strongest gradient across the edge; a chain follows them while the gradient keeps
-//! its direction, is cut where it bends, and each part is fitted with a line, to a fraction of a pixel. This is the
-//! way of edge drawing (Topal and Akinlar, 2012), with the direction of the gradient in place of its routing.
+//! Where a threshold fails (the edge of a shadow, glare, an occluder), edges are still there, in pieces. Edge
+//! pixels are those of the strongest gradient across the edge; a chain follows them while the gradient keeps
+//! its direction, is split where it bends, and each part is fitted with a line, to a fraction of a pixel.
+//! This is edge drawing (Topal and Akinlar, 2012), with the direction of the gradient in place of its
+//! routing.
 
 use crate::kernels::with_vectors;
 use crate::view::GrayView;
 
-/// A straight piece of an edge. Its dark side is on the right of the way from start to end, so the outline of
-/// a dark shape is walked clockwise as seen in the image.
+/// A straight edge. Its dark side is to the right of the direction from start to end, so the segments of a
+/// dark shape run clockwise as seen in the image.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Segment {
     /// Where it starts, in pixels.
@@ -27,30 +28,30 @@ impl Segment {
     }
 }
 
-/// No overflow threatens within an image, so this is faster than the careful way.
+/// Faster than `hypot`, whose protection against overflow is not needed here.
 fn length([dx, dy]: [f32; 2]) -> f32 {
     (dx * dx + dy * dy).sqrt()
 }
 
-/// Which edges are taken.
+/// Which segments are kept.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct LeastEdge {
-    /// At least this gradient, in grey levels per pixel.
-    pub gradient: u8,
-    /// At least this length, in pixels.
-    pub length_px: f32,
+pub struct SegmentLimits {
+    /// Minimum gradient, in grey levels per pixel.
+    pub min_gradient: u8,
+    /// Minimum length, in pixels.
+    pub min_length_px: f32,
 }
 
-/// No chain is longer than this many pixels; what goes on is the next chain.
-const LONGEST_CHAIN: usize = 1024;
+/// Maximum length of a chain, in pixels; the rest becomes the next chain.
+const MAX_CHAIN: usize = 1024;
 
-/// There is room for a segment in so many pixels from the start.
+/// Memory is reserved for one segment in this many pixels.
 const PIXELS_PER_SEGMENT: usize = 50;
 
-/// A chain is cut where it leaves the straight line by more than this many pixels.
+/// A chain is split where it deviates from the straight line by more, in pixels.
 const STRAIGHT_PX: f32 = 0.8;
 
-/// Finds segments. It keeps its memory from image to image.
+/// Finds segments. Its buffers are reused from image to image.
 #[derive(Clone, Debug, Default)]
 pub struct Segments {
     width: usize,
@@ -60,10 +61,10 @@ pub struct Segments {
     down: Vec<i16>,
     /// Sum of the two gradients' sizes, of three rows.
     strengths: [Vec<i16>; 3],
-    /// Not nought where the gradient is the strongest across the edge, and no chain was yet; then as
-    /// [`strongest`] writes it.
+    /// Not zero where the gradient is strongest across the edge and no chain has passed yet; written by
+    /// [`strongest`].
     edges: Vec<u8>,
-    /// Not nought where an edge goes on to both sides.
+    /// Not zero where an edge continues on both sides.
     seeds: Vec<u8>,
     /// Indices of the pixels of a chain, then their places and strengths.
     chain: Vec<u32>,
@@ -73,10 +74,10 @@ pub struct Segments {
 }
 
 impl Segments {
-    /// Makes the buffers as large as an image of this size with texture needs.
+    /// Reserves what a textured image of this size needs.
     pub fn make_room(&mut self, width: usize, height: usize) {
-        fn reserve<T>(list: &mut Vec<T>, most: usize) {
-            list.reserve(most.saturating_sub(list.len()));
+        fn reserve<T>(list: &mut Vec<T>, count: usize) {
+            list.reserve(count.saturating_sub(list.len()));
         }
         let pixels = width * height;
         reserve(&mut self.across, pixels);
@@ -86,20 +87,20 @@ impl Segments {
         for row in &mut self.strengths {
             reserve(row, width);
         }
-        reserve(&mut self.chain, LONGEST_CHAIN + 1);
-        reserve(&mut self.places, LONGEST_CHAIN + 1);
-        reserve(&mut self.parts, LONGEST_CHAIN);
+        reserve(&mut self.chain, MAX_CHAIN + 1);
+        reserve(&mut self.places, MAX_CHAIN + 1);
+        reserve(&mut self.parts, MAX_CHAIN);
         reserve(&mut self.found, pixels / PIXELS_PER_SEGMENT);
     }
 
-    /// The segments in an image, in no order.
-    pub fn find(&mut self, view: GrayView<'_>, least: LeastEdge) -> &[Segment] {
+    /// Finds the segments in an image, in no particular order.
+    pub fn find(&mut self, view: GrayView<'_>, limits: SegmentLimits) -> &[Segment] {
         self.found.clear();
         if view.width() < 4 || view.height() < 4 {
             return &self.found;
         }
         (self.width, self.height) = (view.width(), view.height());
-        with_vectors(|| self.mark(view, least));
+        with_vectors(|| self.mark(view, limits));
         for start in 0..self.seeds.len() / 8 {
             let eight = &self.seeds[8 * start..][..8];
             if eight == [0; 8] {
@@ -108,7 +109,7 @@ impl Segments {
             for seed in 8 * start..8 * start + 8 {
                 if self.seeds[seed] != 0 && self.edges[seed] != 0 {
                     self.follow(seed);
-                    self.cut(least);
+                    self.cut(limits);
                 }
             }
         }
@@ -117,9 +118,9 @@ impl Segments {
 
     /// Finds the edge pixels, and where chains may begin.
     #[inline(always)]
-    fn mark(&mut self, view: GrayView<'_>, least: LeastEdge) {
+    fn mark(&mut self, view: GrayView<'_>, limits: SegmentLimits) {
         self.measure(view);
-        self.thin(least);
+        self.thin(limits);
         self.sow();
     }
 
@@ -137,14 +138,14 @@ impl Segments {
     }
 
     #[inline(always)]
-    fn thin(&mut self, least: LeastEdge) {
+    fn thin(&mut self, limits: SegmentLimits) {
         let (width, height) = (self.width, self.height);
         self.edges.clear();
         self.edges.resize(width * height, 0);
         for row in &mut self.strengths {
             row.resize(width, 0);
         }
-        let least = 2 * i16::from(least.gradient);
+        let min_strength = 2 * i16::from(limits.min_gradient);
         for y in 0..height - 1 {
             self.strengths.rotate_left(1);
             let (across, down) =
@@ -158,13 +159,13 @@ impl Segments {
             strongest(
                 [&self.across[start..][..width], &self.down[start..][..width]],
                 [above, here, below],
-                least,
+                min_strength,
                 &mut self.edges[start..][..width],
             );
         }
     }
 
-    /// Marks where chains may begin: texture has many edge pixels, but few that go on to both sides.
+    /// Marks where chains may begin: texture has many edge pixels, but few that continue on both sides.
     #[inline(always)]
     fn sow(&mut self) {
         let (width, height) = (self.width, self.height);
@@ -178,7 +179,7 @@ impl Segments {
         }
     }
 
-    /// Puts the chain through `seed` into `self.chain`, the dark side on its right.
+    /// Writes the chain through `seed` to `self.chain`, the dark side on its right.
     fn follow(&mut self, seed: usize) {
         self.chain.clear();
         self.walk(seed, false);
@@ -188,7 +189,7 @@ impl Segments {
         self.edges[seed] = 0;
     }
 
-    /// Goes on from `seed` over edge pixels whose gradients have the seed's direction.
+    /// Continues from `seed` over edge pixels whose gradients have the seed's direction.
     fn walk(&mut self, seed: usize, forward: bool) {
         let turn = if forward { 0 } else { 4 };
         let ahead = AHEAD[usize::from(self.edges[seed] >> 4)].map(|octant| {
@@ -197,7 +198,7 @@ impl Segments {
         });
         let direction = self.edges[seed];
         let mut at = seed;
-        while self.chain.len() < LONGEST_CHAIN {
+        while self.chain.len() < MAX_CHAIN {
             let next = ahead.iter().find_map(|step| {
                 // An edge pixel is never in the outermost rows or columns.
                 let next = at.wrapping_add_signed(*step);
@@ -211,7 +212,7 @@ impl Segments {
         }
     }
 
-    /// Where the gradient along its own axis is strongest about an edge pixel, and how strong it is there.
+    /// Sub-pixel location of the gradient's maximum about an edge pixel, and the strength there.
     fn place(&self, at: usize) -> [f32; 3] {
         let (y, x) = (at / self.width, at % self.width);
         let strength = |at: usize| {
@@ -226,10 +227,10 @@ impl Segments {
         if sideways { [x + shift, y, here] } else { [x, y + shift, here] }
     }
 
-    /// Cuts the chain into straight parts and keeps those that are long enough.
-    fn cut(&mut self, least: LeastEdge) {
-        // Diagonally a chain is longer than its pixels are many.
-        if (self.chain.len() as f32) * std::f32::consts::SQRT_2 < least.length_px {
+    /// Splits the chain into straight parts and keeps those that are long enough.
+    fn cut(&mut self, limits: SegmentLimits) {
+        // A diagonal chain is longer than its number of pixels.
+        if (self.chain.len() as f32) * std::f32::consts::SQRT_2 < limits.min_length_px {
             return;
         }
         self.places.clear();
@@ -243,7 +244,7 @@ impl Segments {
             let chain = &self.places[from..to];
             let (Some(first), Some(last)) = (chain.first(), chain.last()) else { continue };
             let length = length([last[0] - first[0], last[1] - first[1]]);
-            if length + 1.0 < least.length_px {
+            if length + 1.0 < limits.min_length_px {
                 continue;
             }
             let [dx, dy] = [(last[0] - first[0]) / length, (last[1] - first[1]) / length];
@@ -251,12 +252,12 @@ impl Segments {
                 .iter()
                 .map(|p| ((p[0] - first[0]) * dy - (p[1] - first[1]) * dx).abs())
                 .enumerate()
-                .fold((0, 0.0), |most, here| if here.1 > most.1 { here } else { most });
+                .fold((0, 0.0), |max, here| if here.1 > max.1 { here } else { max });
             if distance > STRAIGHT_PX {
                 self.parts.push([from, from + farthest]);
                 self.parts.push([from + farthest, to]);
             } else {
-                self.found.extend(fit(chain).filter(|s| s.length() >= least.length_px));
+                self.found.extend(fit(chain).filter(|s| s.length() >= limits.min_length_px));
             }
         }
     }
@@ -266,8 +267,8 @@ impl Segments {
 const NEIGHBOURS: [[isize; 2]; 8] =
     [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]];
 
-/// An edge pixel. Its upper four bits are the direction of its gradient, in sixteenths of a turn, clockwise as seen in
-/// the image from the right; so differences of directions go round as bytes do.
+/// An edge pixel. Its upper four bits are the direction of its gradient, in sixteenths of a turn, clockwise
+/// as seen in the image from the right, so that differences of directions wrap like bytes.
 const EDGE: u8 = 1;
 
 /// Whether a pixel is an edge whose direction differs by no more than a sixteenth of a turn.
@@ -276,8 +277,8 @@ fn is_like(direction: u8, other: u8) -> bool {
     (other.wrapping_sub(direction).wrapping_add(16) <= 32) & (other != 0)
 }
 
-/// For each direction of a gradient the neighbours its edge goes on to, likeliest first, so that the dark side is on
-/// the right.
+/// For each direction of a gradient the neighbours to which its edge may continue, likeliest first, with the
+/// dark side on the right.
 static AHEAD: [[usize; 3]; 16] = ahead();
 
 const fn ahead() -> [[usize; 3]; 16] {
@@ -315,17 +316,17 @@ fn strengths(across: &[i16], down: &[i16], out: &mut [i16]) {
     }
 }
 
-/// Marks where the strength is at least `least` and the largest along the axis the gradient is nearest to, and
-/// writes the gradient's direction, as [`EDGE`] says.
+/// Marks where the strength is at least `min_strength` and the largest along the axis the gradient is nearest
+/// to, and writes the gradient's direction, as [`EDGE`] says.
 #[inline(always)]
 fn strongest(
     [across, down]: [&[i16]; 2],
     [above, here, below]: [&[i16]; 3],
-    least: i16,
+    min_strength: i16,
     out: &mut [u8],
 ) {
     let inner = out.len().saturating_sub(2);
-    // Slices of one length, so that no bound is checked within the loop.
+    // Slices of one length spare bounds checks in the loop.
     let (left, right) = (&here[..inner], &here[2..][..inner]);
     let (above, here, below) = (&above[1..][..inner], &here[1..][..inner], &below[1..][..inner]);
     let (across, down) = (&across[1..][..inner], &down[1..][..inner]);
@@ -335,19 +336,20 @@ fn strongest(
         let sideways = ax > ay;
         let along_row = (here[x] > left[x]) & (here[x] >= right[x]);
         let along_column = (here[x] > above[x]) & (here[x] >= below[x]);
-        let most = (here[x] >= least) & ((sideways & along_row) | (!sideways & along_column));
-        // More than 22.5 degrees from the nearer axis: its tangent is nearly 5 / 12.
+        let is_max =
+            (here[x] >= min_strength) & ((sideways & along_row) | (!sideways & along_column));
+        // More than 22.5 degrees from the nearer axis, whose tangent is close to 5 / 12.
         let oblique = 12 * ax.min(ay) > 5 * ax.max(ay);
         // The sixteenth within the quarter of both signs positive, then mirrored into the others.
         let direction = i16::from(oblique)
             ^ (3 & -i16::from(!sideways))
             ^ (7 & -i16::from(across[x] < 0))
             ^ (15 & -i16::from(down[x] < 0));
-        out[x] = ((direction << 4 | i16::from(EDGE)) & -i16::from(most)) as u8;
+        out[x] = ((direction << 4 | i16::from(EDGE)) & -i16::from(is_max)) as u8;
     }
 }
 
-/// Marks the edge pixels of the middle row that have two neighbours of like direction or more.
+/// Marks the edge pixels of the middle row with at least two neighbours of similar direction.
 #[inline(always)]
 fn continued([above, here, below]: [&[u8]; 3], out: &mut [u8]) {
     let inner = out.len().saturating_sub(2);
@@ -372,7 +374,7 @@ fn continued([above, here, below]: [&[u8]; 3], out: &mut [u8]) {
     }
 }
 
-/// The line of least squares through a chain, from beside its first to beside its last point.
+/// The least-squares line through a chain, from the projection of its first point to that of its last.
 fn fit(chain: &[[f32; 3]]) -> Option<Segment> {
     let (first, last) = (chain.first()?, chain.last()?);
     let count = chain.len() as f32;
@@ -388,11 +390,11 @@ fn fit(chain: &[[f32; 3]]) -> Option<Segment> {
     let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
     let (dy, dx) = angle.sin_cos();
     let middle = [first[0] + x, first[1] + y];
-    let beside = |p: &[f32; 3]| {
+    let projected = |p: &[f32; 3]| {
         let along = (p[0] - middle[0]) * dx + (p[1] - middle[1]) * dy;
         [middle[0] + along * dx, middle[1] + along * dy]
     };
-    Some(Segment { start: beside(first), end: beside(last), gradient: 0.5 * strength })
+    Some(Segment { start: projected(first), end: projected(last), gradient: 0.5 * strength })
 }
 
 #[cfg(test)]
@@ -400,7 +402,7 @@ mod tests {
     use super::*;
     use crate::view::GrayImage;
 
-    const LEAST: LeastEdge = LeastEdge { gradient: 6, length_px: 5.0 };
+    const LIMITS: SegmentLimits = SegmentLimits { min_gradient: 6, min_length_px: 5.0 };
 
     /// A dark square, turned by `angle`, on bright ground; each pixel has the mean of 16 places.
     fn square(angle: f32, centre: [f32; 2], half: f32) -> GrayImage {
@@ -420,30 +422,30 @@ mod tests {
     }
 
     #[test]
-    fn the_sides_of_a_square_are_walked_clockwise_and_lie_where_they_are() {
+    fn the_sides_of_a_square_are_found_in_place_and_clockwise() {
         let centre = [60.3, 49.8];
         for step in 0..40 {
             let angle = 0.04 * step as f32;
             let image = square(angle, centre, 30.0);
             let mut segments = Segments::default();
-            let found = segments.find(image.view().unwrap(), LEAST);
+            let found = segments.find(image.view().unwrap(), LIMITS);
             let mut seen = [0.0; 4];
             for segment in found {
                 // From the centre to the segment is the side's outward normal.
                 let mut sides = [0.0; 2];
                 for (side, [x, y]) in sides.iter_mut().zip([segment.start, segment.end]) {
                     let (dx, dy) = (x - centre[0], y - centre[1]);
-                    let way = segment.length();
+                    let length = segment.length();
                     let across =
                         [segment.end[1] - segment.start[1], segment.start[0] - segment.end[0]];
-                    *side = (dx * across[0] + dy * across[1]) / way;
+                    *side = (dx * across[0] + dy * across[1]) / length;
                 }
                 for side in sides {
                     assert!((side - 30.0).abs() < 0.5, "{angle}: {side} in {segment:?}");
                 }
-                let way =
+                let direction =
                     (segment.end[1] - segment.start[1]).atan2(segment.end[0] - segment.start[0]);
-                let quarter = (way - angle) / std::f32::consts::FRAC_PI_2;
+                let quarter = (direction - angle) / std::f32::consts::FRAC_PI_2;
                 seen[(quarter.round() as i32).rem_euclid(4) as usize] += segment.length();
             }
             for length in seen {
@@ -453,12 +455,12 @@ mod tests {
     }
 
     #[test]
-    fn images_without_edges_or_with_nothing_else_are_survived() {
+    fn flat_and_noisy_images_are_harmless() {
         let mut segments = Segments::default();
         let mut random = 1_u32;
         for (width, height) in [(1, 1), (3, 9), (4, 4), (5, 64), (64, 5), (97, 61), (33, 2)] {
             let mut image = GrayImage::filled(width, height, 128);
-            assert!(segments.find(image.view().unwrap(), LEAST).is_empty());
+            assert!(segments.find(image.view().unwrap(), LIMITS).is_empty());
             for pattern in 0..4 {
                 for (i, pixel) in image.pixels_mut().iter_mut().enumerate() {
                     random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -469,7 +471,7 @@ mod tests {
                         _ => 255 * (i / width / 3 % 2) as u8,
                     };
                 }
-                for segment in segments.find(image.view().unwrap(), LEAST) {
+                for segment in segments.find(image.view().unwrap(), LIMITS) {
                     assert!(segment.start.iter().chain(&segment.end).all(|v| v.is_finite()));
                 }
             }
@@ -486,7 +488,7 @@ mod tests {
             }
         }
         let mut segments = Segments::default();
-        let found = segments.find(image.view().unwrap(), LEAST);
+        let found = segments.find(image.view().unwrap(), LIMITS);
         assert!(found.iter().all(|segment| segment.length() < 35.0));
     }
 }

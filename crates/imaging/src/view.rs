@@ -1,9 +1,9 @@
 //! Grey images: borrowed views and owned buffers, 8 bits a pixel.
 
-/// Why bytes are not an image.
+/// Why bytes cannot be viewed as an image.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum ViewError {
-    /// An image without pixels, or wider or higher than [`GrayView::LARGEST_EDGE_PX`].
+    /// An image without pixels, or wider or higher than [`GrayView::MAX_EDGE_PX`].
     Size {
         /// Stated width in pixels.
         width: usize,
@@ -17,23 +17,23 @@ pub enum ViewError {
         /// Stated bytes from row to row.
         stride: usize,
     },
-    /// Fewer bytes than the size asks for.
+    /// Fewer bytes than the size needs.
     Length {
-        /// Bytes there are.
+        /// Available bytes.
         len: usize,
-        /// Bytes the size asks for.
+        /// Bytes that the size needs.
         needed: usize,
     },
 }
 
 impl std::fmt::Display for ViewError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let largest = GrayView::LARGEST_EDGE_PX;
+        let max = GrayView::MAX_EDGE_PX;
         match *self {
             Self::Size { width, height } => {
                 write!(
                     f,
-                    "an image of {width} x {height} pixels; each edge must be from 1 to {largest}"
+                    "an image of {width} x {height} pixels; each edge must be from 1 to {max}"
                 )
             }
             Self::Stride { width, stride } => {
@@ -58,20 +58,20 @@ pub struct GrayView<'a> {
 }
 
 impl<'a> GrayView<'a> {
-    /// The largest width and height that are taken, in pixels.
-    pub const LARGEST_EDGE_PX: usize = 65_535;
+    /// Maximum width and height, in pixels.
+    pub const MAX_EDGE_PX: usize = 65_535;
 
     /// A view of `width` x `height` pixels whose rows begin `stride` bytes apart.
     ///
     /// # Errors
-    /// [`ViewError`] when the size is nought or too large, or the bytes are too few for it.
+    /// [`ViewError`] when the size is zero or too large, or there are too few bytes.
     pub fn new(
         data: &'a [u8],
         width: usize,
         height: usize,
         stride: usize,
     ) -> Result<Self, ViewError> {
-        let in_range = |edge: usize| (1..=Self::LARGEST_EDGE_PX).contains(&edge);
+        let in_range = |edge: usize| (1..=Self::MAX_EDGE_PX).contains(&edge);
         if !in_range(width) || !in_range(height) {
             return Err(ViewError::Size { width, height });
         }
@@ -93,8 +93,8 @@ impl<'a> GrayView<'a> {
         Self::new(data, width, height, width)
     }
 
-    /// The part of `width` x `height` pixels whose top left pixel is (x, y); `None` when it is empty or reaches beyond the
-    /// image.
+    /// The part of `width` x `height` pixels whose top left pixel is (x, y); `None` when it is empty or
+    /// reaches beyond the image.
     pub fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Option<Self> {
         let fits = |from: usize, edge: usize, whole: usize| {
             edge > 0 && from.checked_add(edge).is_some_and(|end| end <= whole)
@@ -128,8 +128,8 @@ impl<'a> GrayView<'a> {
         &self.data[y * self.stride..][..self.width]
     }
 
-    /// The pixel at a place, and those so many columns to the right, rows below, and both; `None` outside the image, as far as
-    /// the memory ends there.
+    /// The pixel at a place, and those `right` columns to the right, `below` rows below, and both; `None`
+    /// beyond the end of the memory.
     #[inline]
     pub(crate) fn square(&self, x: usize, y: usize, [right, below]: [usize; 2]) -> Option<[u8; 4]> {
         let (first, down) = (y * self.stride + x, below * self.stride);
@@ -147,7 +147,7 @@ impl<'a> GrayView<'a> {
     }
 }
 
-/// An owned 8-bit grey image without gaps between the rows; a buffer that is used again grows only when needed.
+/// An owned 8-bit grey image without gaps between the rows. Its buffer is reused.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct GrayImage {
     data: Vec<u8>,
@@ -161,7 +161,7 @@ impl GrayImage {
         Self { data: vec![value; width * height], width, height }
     }
 
-    /// Takes the size of another image; the pixels' values are then of no meaning.
+    /// Changes the size; the values of the pixels are then undefined.
     pub fn resize(&mut self, width: usize, height: usize) {
         self.data.resize(width * height, 0);
         (self.width, self.height) = (width, height);
@@ -182,7 +182,7 @@ impl GrayImage {
         &self.data
     }
 
-    /// All pixels, row by row, to be written.
+    /// All pixels, row by row, mutable.
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         &mut self.data
     }
@@ -192,12 +192,12 @@ impl GrayImage {
         &self.data[y * self.width..][..self.width]
     }
 
-    /// The pixels of row `y`, to be written.
+    /// The pixels of row `y`, mutable.
     pub fn row_mut(&mut self, y: usize) -> &mut [u8] {
         &mut self.data[y * self.width..][..self.width]
     }
 
-    /// The image, borrowed; `None` while it has no pixels.
+    /// A view of the image; `None` while it has no pixels.
     pub fn view(&self) -> Option<GrayView<'_>> {
         GrayView::packed(&self.data, self.width, self.height).ok()
     }
@@ -208,7 +208,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn impossible_images_are_refused() {
+    fn impossible_sizes_are_refused() {
         let check = |len: usize, size: (usize, usize), stride, expected| {
             let data = vec![0; len];
             assert_eq!(GrayView::new(&data, size.0, size.1, stride).map(|v| v.width()), expected);
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_has_the_pixels_of_its_place() {
+    fn a_crop_has_the_pixels_of_its_place() {
         let data: Vec<u8> = (0..20).collect();
         let view = GrayView::packed(&data, 5, 4).unwrap();
         let part = view.crop(1, 2, 3, 2).unwrap();
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_view_with_a_stride_skips_what_lies_between_the_rows() {
+    fn a_stride_skips_the_gaps_between_rows() {
         let view = GrayView::new(&[1, 2, 9, 3, 4], 2, 2, 3).unwrap();
         assert_eq!((view.row(0), view.row(1)), (&[1, 2][..], &[3, 4][..]));
     }

@@ -52,7 +52,7 @@ pub enum ImageError {
     #[error(
         "{path:?} has {width} x {height} pixels; the limit is {max_pixels} pixels, and {edge} for an edge; make it \
          smaller or raise the limit",
-        edge = GrayView::LARGEST_EDGE_PX
+        edge = GrayView::MAX_EDGE_PX
     )]
     TooLarge {
         /// The file.
@@ -383,7 +383,7 @@ fn decoder<'a>(
         cause => damaged(&cause),
     })?;
     let (width, height) = decoder.dimensions();
-    let edge = GrayView::LARGEST_EDGE_PX as u64;
+    let edge = GrayView::MAX_EDGE_PX as u64;
     let pixels = u64::from(width) * u64::from(height);
     if pixels > max_pixels || u64::from(width.max(height)) > edge {
         return Err(ImageError::TooLarge { path: path.to_owned(), width, height, max_pixels });

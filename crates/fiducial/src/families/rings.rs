@@ -54,13 +54,13 @@ const PARTS: outline::Settings = outline::Settings {
     dark_from: Some(2),
     bright_from: None,
     whole_level: 2,
-    smallest_px: 16,
-    largest_px: 36,
-    least_contrast: 14,
-    least_contrast_percent: 12,
+    min_size_px: 16,
+    max_size_px: 36,
+    min_contrast: 14,
+    min_contrast_percent: 12,
     steep: true,
-    least_fill: 0.02,
-    most_ragged: 5.0,
+    min_fill: 0.02,
+    max_raggedness: 5.0,
 };
 
 /// Regions as small as the paper of a marker far away.
@@ -68,11 +68,11 @@ const SPECKS: outline::Settings = outline::Settings {
     dark_from: None,
     bright_from: Some(1),
     whole_level: usize::MAX,
-    smallest_px: 4,
-    largest_px: 16,
+    min_size_px: 4,
+    max_size_px: 16,
     steep: false,
-    least_fill: 0.5,
-    most_ragged: 1.3,
+    min_fill: 0.5,
+    max_raggedness: 1.3,
     ..PARTS
 };
 
@@ -189,8 +189,7 @@ impl Rings {
         expected: &CirclePose,
     ) -> Option<Observation> {
         let size_m = marker.size_m?;
-        let search =
-            Search { view, camera, size_m, least_contrast: LEAST_CONTRAST, inverted: false };
+        let search = Search { view, camera, size_m, min_contrast: LEAST_CONTRAST, inverted: false };
         let seen = search.again(expected, &mut self.edges, &mut self.spots)?;
         observed(&seen, (seen.circles, camera), (Some(size_m), Some(camera)), camera).ok()
     }
@@ -361,7 +360,7 @@ impl Rings {
             view,
             camera: lens,
             size_m,
-            least_contrast: 0.35 * candidate.contrast,
+            min_contrast: 0.35 * candidate.contrast,
             inverted: candidate.inverted,
         };
         let seen = search.marker(candidate, &mut self.edges, &mut self.spots)?;

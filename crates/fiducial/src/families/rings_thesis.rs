@@ -89,7 +89,7 @@ impl RingsThesis {
         }
         stages.ended("threshold");
         if let Some(binary) = self.binary.view() {
-            let limits = Limits { least_points: 5, most_points: MOST_CONTOUR_POINTS };
+            let limits = Limits { min_points: 5, max_points: MOST_CONTOUR_POINTS };
             self.contours.find(binary, limits);
         }
         stages.ended("contours");

@@ -8,7 +8,7 @@
 
 use geometry::Pixel;
 use imaging::pyramid::to_level_0;
-use imaging::{GrayView, LeastEdge, Pyramid, Segment, Segments};
+use imaging::{GrayView, Pyramid, Segment, SegmentLimits, Segments};
 
 use super::quad::Quad;
 
@@ -115,11 +115,11 @@ impl ImageQuads {
 }
 
 /// The edges that may be a marker's, in an image of this brightness.
-fn least_edge(view: GrayView<'_>) -> LeastEdge {
+fn least_edge(view: GrayView<'_>) -> SegmentLimits {
     let brightest = (0..view.height()).flat_map(|y| view.row(y)).copied().max().unwrap_or(0);
     let [least, most] = LEAST_GRADIENT;
     let gradient = (brightest / DARKEST_PER_BRIGHTEST).clamp(least, most);
-    LeastEdge { gradient, length_px: LEAST_LENGTH_PX }
+    SegmentLimits { min_gradient: gradient, min_length_px: LEAST_LENGTH_PX }
 }
 
 /// The most sides, corners and quads that are looked at.

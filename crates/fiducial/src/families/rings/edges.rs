@@ -50,7 +50,7 @@ pub(crate) struct Search<'a> {
     /// The marker's size in metres.
     pub(crate) size_m: f64,
     /// At an edge the dark side lacks at least this share of the bright side's light.
-    pub(crate) least_contrast: f64,
+    pub(crate) min_contrast: f64,
     /// White rings on black.
     pub(crate) inverted: bool,
 }
@@ -474,7 +474,7 @@ impl Search<'_> {
         }
         let ends = (values[0].min(values[1]), values[2 * half].max(values[2 * half - 1]));
         let bright = if black_within { ends.1 } else { -ends.0 };
-        if ends.1 - ends.0 < (self.least_contrast * bright).max(LEAST_STEP) {
+        if ends.1 - ends.0 < (self.min_contrast * bright).max(LEAST_STEP) {
             return Sight::Nothing;
         }
         let middle = (ends.0 + ends.1) / 2.0;

@@ -1,0 +1,449 @@
+//! Following the outlines of one kind of region on one level.
+
+use super::Settings;
+use crate::binary::{Binarizer, BitImage};
+use crate::view::GrayView;
+
+/// Bounds on time and memory of one level: pixel edges followed and points kept, per pixel of the level.
+const MAX_STEPS_PER_PIXEL: f32 = 3.0;
+const MAX_POINTS_PER_PIXEL: f32 = 0.3;
+/// Added to both bounds, for tiny images.
+const MIN_BUDGET: usize = 4096;
+
+#[derive(Copy, Clone, Debug)]
+pub(super) struct Span {
+    pub(super) level: u8,
+    pub(super) dark: bool,
+    pub(super) cut: bool,
+    pub(super) start: usize,
+    pub(super) end: usize,
+    pub(super) bounds: [u16; 4],
+    pub(super) area: u32,
+    pub(super) contrast: f32,
+}
+
+/// Where outlines may begin in one row. Each list has a zero word before and after.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Tops {
+    /// The right ends of runs that touch no pixel of the row above.
+    ends: Vec<u64>,
+    /// The pixels of the other runs, from one that touches to the end of the run.
+    flooded: Vec<u64>,
+}
+
+/// The settings applied to one level.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct Limits {
+    min_size: i32,
+    max_size: i32,
+    max_path: usize,
+    max_steps: usize,
+    max_points: usize,
+    detour_256ths: i32,
+    steep: bool,
+    min_fill: f32,
+    max_raggedness: f32,
+}
+
+impl Limits {
+    pub(super) fn new(settings: &Settings, level: usize, view: GrayView<'_>) -> Self {
+        let longest = view.width().max(view.height()) as i32;
+        let max_size = if level >= settings.whole_level {
+            longest
+        } else {
+            longest.min(i32::from(settings.max_size_px))
+        };
+        let pixels = view.width() as f32 * view.height() as f32;
+        Self {
+            min_size: i32::from(settings.min_size_px).max(2),
+            max_size,
+            // The number of pixel edges in the image.
+            max_path: ((4.0 * max_size as f32 * settings.max_raggedness) as usize)
+                .min(4 * view.width() * view.height()),
+            max_steps: (pixels * MAX_STEPS_PER_PIXEL) as usize + MIN_BUDGET,
+            max_points: (pixels * MAX_POINTS_PER_PIXEL) as usize + MIN_BUDGET,
+            steep: settings.steep && level < 2,
+            detour_256ths: ((settings.max_raggedness - 1.0).clamp(0.0, 1e4) * 256.0) as i32,
+            min_fill: settings.min_fill,
+            max_raggedness: settings.max_raggedness,
+        }
+    }
+}
+
+/// The search for one kind of region on one level.
+pub(super) struct Search<'a> {
+    pub(super) view: GrayView<'a>,
+    /// The image that was binarised.
+    pub(super) sharp: GrayView<'a>,
+    pub(super) bits: &'a BitImage,
+    pub(super) binarizer: &'a Binarizer,
+    pub(super) dark: bool,
+    pub(super) level: u8,
+    pub(super) path: &'a mut Vec<u8>,
+    pub(super) tops: &'a mut Tops,
+    pub(super) points: &'a mut Vec<[f32; 2]>,
+    pub(super) spans: &'a mut Vec<Span>,
+}
+
+/// Directions along pixel edges.
+const RIGHT: u8 = 0;
+const DOWN: u8 = 1;
+const LEFT: u8 = 2;
+const UP: u8 = 3;
+
+/// A closed outline; the region is to its right.
+struct Trace {
+    bounds: [i32; 4],
+    area: i64,
+    length: usize,
+}
+
+/// A walk along pixel edges.
+struct Walk {
+    start: [i32; 2],
+    x: i32,
+    y: i32,
+    /// The pixel to the lower right of the current point.
+    place: usize,
+    row: usize,
+    direction: u8,
+    left: i32,
+    right: i32,
+    bottom: i32,
+    /// Sum of the columns of vertical edges, downwards minus upwards.
+    area: i64,
+    /// Steps down and to the left; a convex outline has as many as its width plus its height.
+    back: i32,
+}
+
+impl Walk {
+    /// After the upper edge of pixel (x, y); `place` belongs to the next pixel.
+    #[inline]
+    fn new(x: usize, y: usize, place: usize, row: usize) -> Self {
+        let (x, y) = (x as i32 + 1, y as i32);
+        let (start, left, right, bottom) = ([x, y], x - 1, x, y);
+        Self { start, x, y, place, row, direction: RIGHT, left, right, bottom, area: 0, back: 0 }
+    }
+
+    /// The outline, if it is closed here.
+    fn closed(&self, length: usize) -> Option<Trace> {
+        let bounds = [self.left, self.start[1], self.right, self.bottom];
+        let closed = self.direction == RIGHT && [self.x, self.y] == self.start;
+        closed.then_some(Trace { bounds, area: self.area, length })
+    }
+
+    /// One step; false when the walk ends.
+    #[inline]
+    fn right(&mut self, limits: &Limits) -> bool {
+        self.direction = RIGHT;
+        self.place += 1;
+        self.x += 1;
+        self.right = self.right.max(self.x);
+        let is_top = self.y == self.start[1] && self.x >= self.start[0];
+        !is_top && self.right - self.left <= limits.max_size
+    }
+
+    #[inline]
+    fn down(&mut self, limits: &Limits) -> bool {
+        self.direction = DOWN;
+        self.place += self.row;
+        self.y += 1;
+        self.area += i64::from(self.x);
+        self.back += 1;
+        self.bottom = self.bottom.max(self.y);
+        self.bottom - self.start[1] <= limits.max_size && !self.is_ragged(limits)
+    }
+
+    #[inline]
+    fn left(&mut self, limits: &Limits) -> bool {
+        self.direction = LEFT;
+        self.place -= 1;
+        self.x -= 1;
+        self.back += 1;
+        self.left = self.left.min(self.x);
+        self.right - self.left <= limits.max_size && !self.is_ragged(limits)
+    }
+
+    #[inline]
+    fn up(&mut self) -> bool {
+        self.direction = UP;
+        self.place -= self.row;
+        self.y -= 1;
+        self.area -= i64::from(self.x);
+        self.y >= self.start[1]
+    }
+
+    /// Whether the steps down and to the left exceed those of a nearly convex outline with these bounds.
+    #[inline]
+    fn is_ragged(&self, limits: &Limits) -> bool {
+        const SLACK: i32 = 2;
+        let convex = self.right - self.left + self.bottom - self.start[1];
+        self.back - convex > SLACK + ((convex * limits.detour_256ths) >> 8)
+    }
+}
+
+impl Search<'_> {
+    pub(super) fn scan(mut self, limits: &Limits) {
+        let mut steps_left = limits.max_steps;
+        let points_end = self.points.len() + limits.max_points;
+        self.path.resize(limits.max_path, 0);
+        let bits = self.bits;
+        for y in 0..bits.height() {
+            let mut tops = std::mem::take(self.tops);
+            tops.mark(bits.row(y), bits.row_above(y));
+            let continues = self.scan_row(y, &tops, limits, &mut steps_left);
+            *self.tops = tops;
+            if !continues || self.points.len() >= points_end {
+                return;
+            }
+        }
+    }
+
+    /// Follows the outlines that begin in a row; false when there are no steps left.
+    fn scan_row(&mut self, y: usize, tops: &Tops, limits: &Limits, steps_left: &mut usize) -> bool {
+        for (index, word) in tops.ends.iter().skip(1).enumerate() {
+            let mut word = *word;
+            while word != 0 {
+                let x = index * 64 + word.trailing_zeros() as usize;
+                word &= word - 1;
+                if limits.steep && !self.is_steep(x, y) || self.rises(x, y, tops) {
+                    continue;
+                }
+                let (trace, steps) = self.follow(x, y, limits);
+                if let Some(trace) = trace
+                    && limits.admit(&trace)
+                {
+                    self.keep(x, y, &trace);
+                }
+                // Starting costs about as much as four steps.
+                *steps_left = steps_left.saturating_sub(steps + 4);
+                if *steps_left == 0 {
+                    return false;
+                }
+            }
+        }
+        true
+    }
+
+    /// Whether the region at a top rises above it elsewhere, or begins further right as well, as far as the
+    /// next rows show within half a word to both sides. Its outline, followed from here, would be dropped.
+    fn rises(&self, x: usize, y: usize, tops: &Tops) -> bool {
+        const ROWS: usize = 3;
+        let (words, place) = (self.bits.bits(), self.bits.place(x, y));
+        let mut rows = [0; ROWS];
+        for (down, row) in rows.iter_mut().enumerate() {
+            *row = window(words, place + down * self.bits.row_bits());
+        }
+        let flooded = window(&tops.flooded, 64 + x);
+        // The top's own run, from its end to the left.
+        let end = 1_u64 << HALF_WORD;
+        let own = flood(rows[0], end);
+        let mut parts = [0; ROWS];
+        parts[0] = own;
+        // Down and back up.
+        for (row, from) in
+            (1..ROWS).map(|row| (row, row - 1)).chain((1..ROWS).rev().map(|row| (row - 1, row)))
+        {
+            let part = parts[from];
+            let touched = (part | part << 1 | part >> 1) & rows[row];
+            if touched & !parts[row] != 0 {
+                parts[row] = flood(rows[row], touched | parts[row]);
+            }
+        }
+        let others = parts[0] & !own;
+        others & !(end - 1) != 0 || others & flooded != 0
+    }
+
+    /// Whether the grey values at a top step by half of their range. Two pixels up and down count, as blur
+    /// spreads a step over two or three.
+    fn is_steep(&self, x: usize, y: usize) -> bool {
+        let row = |y: usize| self.sharp.row(y.min(self.sharp.height() - 1));
+        let (near, far) = (row(y.saturating_sub(1)), row(y.saturating_sub(2)));
+        let (here, next, last) = (row(y), row(y + 1), row(y + 2));
+        let (before, after) = (x.saturating_sub(1), (x + 1).min(self.sharp.width() - 1));
+        let (bright, dark) = if self.dark {
+            let above = near[x].max(far[x]).max(near[after]);
+            (above, here[x].min(next[x]).min(next[before]).min(last[before]))
+        } else {
+            let within = here[x].max(next[x]).max(next[before]).max(last[before]);
+            (within, near[x].min(far[x]).min(near[after]))
+        };
+        let [low, high] = self.binarizer.extremes(x, y);
+        let [bright, dark, low, high] = [bright, dark, low, high].map(i64::from);
+        if self.level == 0 {
+            2 * (bright - dark) >= high - low
+        } else {
+            // The same in logarithms; the offset avoids the logarithm of zero.
+            let [bright, dark, low, high] = [bright, dark, low, high].map(|grey| grey + 4);
+            bright * bright * low >= dark * dark * high
+        }
+    }
+
+    /// Follows an outline once round from the upper edge of pixel (x, y), the right end of a run. `None` when
+    /// it belongs to another run, is too large or too ragged; with the number of steps.
+    fn follow(&mut self, x: usize, y: usize, limits: &Limits) -> (Option<Trace>, usize) {
+        let (bits, row) = (self.bits.bits(), self.bits.row_bits());
+        // Whether the pixel is part of the region; false outside the image.
+        let part = |place: usize| bits.get(place >> 6).is_some_and(|w| w >> (place & 63) & 1 == 1);
+        let mut walk = Walk::new(x, y, self.bits.place(x + 1, y), row);
+        for (length, step) in self.path.iter_mut().enumerate() {
+            // Regions are connected across corners: turn left if the pixel ahead to the left is set, go
+            // straight on if the one ahead to the right is, else turn right.
+            let place = walk.place;
+            let continues = match walk.direction {
+                RIGHT if part(place - row) => walk.up(),
+                RIGHT if part(place) => walk.right(limits),
+                RIGHT => walk.down(limits),
+                DOWN if part(place) => walk.right(limits),
+                DOWN if part(place - 1) => walk.down(limits),
+                DOWN => walk.left(limits),
+                LEFT if part(place - 1) => walk.down(limits),
+                LEFT if part(place - row - 1) => walk.left(limits),
+                LEFT => walk.up(),
+                _ if part(place - row - 1) => walk.left(limits),
+                _ if part(place - row) => walk.up(),
+                _ => walk.right(limits),
+            };
+            *step = walk.direction;
+            if !continues {
+                return (walk.closed(length + 1), length + 1);
+            }
+        }
+        (None, self.path.len())
+    }
+
+    /// Keeps an outline that was just followed from pixel (x, y).
+    fn keep(&mut self, x: usize, y: usize, trace: &Trace) {
+        let start = self.points.len();
+        let (mut x, mut y) = (x as i32 + 1, y as i32);
+        let (mut cut, mut contrast) = (false, 0_i64);
+        for step in self.path.iter().take(trace.length) {
+            // The pixels on both sides of the edge.
+            let ([ax, ay], [bx, by], [nx, ny]) = match *step {
+                RIGHT => ([x, y], [x, y - 1], [x + 1, y]),
+                DOWN => ([x - 1, y], [x, y], [x, y + 1]),
+                LEFT => ([x - 1, y - 1], [x - 1, y], [x - 1, y]),
+                _ => ([x, y - 1], [x - 1, y - 1], [x, y - 1]),
+            };
+            let (dx, dy) = (bx - ax, by - ay);
+            let inside = self.grey(ax, ay).unwrap_or(0);
+            let share = if let Some(outside) = self.grey(bx, by) {
+                contrast += i64::from(outside) - i64::from(inside);
+                let inner = self.grey(ax - dx, ay - dy).unwrap_or(inside);
+                let outer = self.grey(bx + dx, by + dy).unwrap_or(outside);
+                crossing([inner, inside, outside, outer], self.dark)
+            } else {
+                cut = true;
+                0.5
+            };
+            self.points.push([ax as f32 + share * dx as f32, ay as f32 + share * dy as f32]);
+            (x, y) = (nx, ny);
+        }
+        let contrast = contrast as f32 / trace.length.max(1) as f32;
+        self.spans.push(Span {
+            level: self.level,
+            dark: self.dark,
+            cut,
+            start,
+            end: self.points.len(),
+            bounds: trace.bounds.map(|b| b as u16),
+            area: trace.area as u32,
+            contrast: if self.dark { contrast } else { -contrast },
+        });
+    }
+
+    #[inline]
+    fn grey(&self, x: i32, y: i32) -> Option<u8> {
+        let inside = x >= 0
+            && y >= 0
+            && (x as usize) < self.view.width()
+            && (y as usize) < self.view.height();
+        inside.then(|| self.view.at(x as usize, y as usize))
+    }
+}
+
+/// Where the grey values of four pixels across an edge cross the middle between the inner and the outer two,
+/// in pixels outwards from the second.
+fn crossing(greys: [u8; 4], dark: bool) -> f32 {
+    let upwards = |grey: u8| f32::from(if dark { grey } else { !grey });
+    let [inner, a, b, outer] = greys.map(upwards);
+    let middle = (inner.min(a) + outer.max(b)) / 2.0;
+    let between = |low: f32, high: f32| (middle - low) / (high - low);
+    let share = if b < middle {
+        1.0 + between(b, outer)
+    } else if a > middle {
+        between(inner, a) - 1.0
+    } else {
+        between(a, b)
+    };
+    // Equal values have no crossing.
+    if share.is_finite() { share.clamp(-1.0, 2.0) } else { 0.5 }
+}
+
+impl Limits {
+    fn admit(&self, trace: &Trace) -> bool {
+        let [left, top, right, bottom] = trace.bounds;
+        let (width, height) = (right - left, bottom - top);
+        let around = 2 * (width + height);
+        width.max(height) >= self.min_size
+            && trace.length as f32 <= self.max_raggedness * around as f32
+            && trace.area as f32 >= self.min_fill * width as f32 * height as f32
+    }
+}
+
+/// Bit in the middle of a [`window`].
+const HALF_WORD: usize = 31;
+
+/// 64 bits with that of `place` in the middle; zeros outside.
+#[inline]
+fn window(words: &[u64], place: usize) -> u64 {
+    let first = place - HALF_WORD;
+    let word = |index: usize| words.get(index).copied().unwrap_or(0);
+    let (low, shift) = (word(first >> 6), first & 63);
+    // Two shifts, as a shift by 64 is undefined.
+    low >> shift | word((first >> 6) + 1) << 1 << (63 - shift)
+}
+
+/// The runs of ones that contain `seeds`.
+#[inline]
+fn flood(bits: u64, seeds: u64) -> u64 {
+    // Adding the seeds carries a one from each to the end of its run and changes the bits in between.
+    let upwards = |bits: u64, seeds: u64| (bits ^ bits.wrapping_add(seeds)) & bits | seeds;
+    let up = upwards(bits, seeds);
+    up | upwards(bits.reverse_bits(), seeds.reverse_bits()).reverse_bits()
+}
+
+impl Tops {
+    /// Reserves what rows of this length need.
+    pub(super) fn make_room(&mut self, width: usize) {
+        for words in [&mut self.ends, &mut self.flooded] {
+            words.reserve((width / 64 + 4).saturating_sub(words.len()));
+        }
+    }
+
+    /// Marks the tops of a row. Both rows end with a zero word.
+    fn mark(&mut self, row: &[u64], above: &[u64]) {
+        for words in [&mut self.ends, &mut self.flooded] {
+            words.resize(row.len() + 1, 0);
+            if let Some(last) = words.last_mut() {
+                *last = 0;
+            }
+        }
+        let (mut above_before, mut carry) = (0, false);
+        let out = self.ends.iter_mut().zip(&mut self.flooded).skip(1);
+        for ((end, flooded), (run, above)) in out.zip(row.windows(2).zip(above.windows(2))) {
+            let ([run, run_after], [above, above_after]) = ([run[0], run[1]], [above[0], above[1]]);
+            let touched = above | above << 1 | above_before >> 63 | above >> 1 | above_after << 63;
+            above_before = above;
+            // Adding a run's touched pixels carries a one from each to the end of the run and changes the
+            // bits in between: the last bit of a run is unchanged only where nothing touches.
+            let seeds = run & touched;
+            let (sum, over) = run.overflowing_add(seeds);
+            let (sum, over_too) = sum.overflowing_add(u64::from(carry));
+            *flooded = (run ^ sum) & run | seeds;
+            *end = run & !(run >> 1 | run_after << 63) & !*flooded;
+            // A run that touches may continue in the next word.
+            carry = (over | over_too) && run_after & 1 == 1;
+        }
+    }
+}
