@@ -1,11 +1,19 @@
 //! Keeps true what ARCHITECTURE.md says of the tree: its arrows, its names, its topics, and what each room leaves out.
 
+#[path = "architecture/circles.rs"]
+mod circles;
+#[path = "architecture/source.rs"]
+mod source;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, ensure};
 use messages::{Delivery, TOPICS};
+
+use crate::circles::{Graph, circles, modules};
+use crate::source::{lines_of_code, tokens, without_tests};
 
 /// The algorithm crates, and what each may know of this workspace. `autopilot` is told apart for its link.
 const ALGORITHMS: [(&str, &[&str]); 7] = [
@@ -38,6 +46,10 @@ const ROOMS: [&str; 9] = [
 ];
 /// What a tool may know beside: pictures and worlds with truth, which also the tests of any room may use.
 const TRUTH: [&str; 2] = ["rendering", "world"];
+/// What only tests may know.
+const TESTING: &str = "testing";
+/// The tests of the whole system.
+const TESTS: &str = "tests";
 /// The tool that stands above others: it calls their pure parts in lock-step.
 const EXPERIMENTS: (&str, [&str; 3]) = ("experiments", ["controller", "detector", "simulator"]);
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
@@ -68,15 +80,14 @@ const OUTSIDE: [&str; 17] = [
     "rustix",
 ];
 
-/// The documents whose paths and names must exist.
-const DOCUMENTS: [&str; 6] = [
-    "README.md",
-    "ARCHITECTURE.md",
-    "CONTRIBUTING.md",
-    "docs/deploy.md",
-    "docs/wire-format.md",
-    "zenoh-config/README.md",
-];
+/// Most lines of code in one source file, comments and tests aside.
+const MAX_LINES: usize = 700;
+
+/// Circles of modules that are not cut yet: the crate, and one module of the circle.
+const KNOWN_CIRCLES: [(&str, &str); 0] = [];
+
+/// Crates that need each other by way of their tests and benches, not cut yet.
+const KNOWN_CRATE_CIRCLES: [&str; 0] = [];
 
 /// Keys that share the comment of the key above them.
 const SHARED_COMMENTS: [(&str, &str); 3] =
@@ -90,6 +101,8 @@ struct Package {
     targets: Vec<String>,
     /// What it depends on, for tests included, but for the pictures that tests look at.
     dependencies: BTreeSet<String>,
+    /// What it depends on for anything: itself, its tests, benches and examples.
+    all_dependencies: BTreeSet<String>,
 }
 
 impl Package {
@@ -100,6 +113,7 @@ impl Package {
     /// Its source files.
     fn sources(&self) -> anyhow::Result<Vec<PathBuf>> {
         let mut folders = vec![self.folder.join("src")];
+        folders.retain(|folder| folder.is_dir());
         let mut files = Vec::new();
         while let Some(folder) = folders.pop() {
             for entry in std::fs::read_dir(&folder).with_context(|| format!("{folder:?}"))? {
@@ -124,6 +138,25 @@ fn text(path: impl AsRef<Path>) -> anyhow::Result<String> {
     std::fs::read_to_string(path).with_context(|| format!("reading {path:?}"))
 }
 
+/// The files of the repository whose names end so, by their paths from its root; without git, a skip and none.
+fn tracked(extension: &str) -> anyhow::Result<Vec<String>> {
+    // Those that are not committed yet count as well.
+    let listing = ["ls-files", "--cached", "--others", "--exclude-standard"];
+    let listing = Command::new("git").args(listing).current_dir(root()).output();
+    let Some(listing) = listing.ok().filter(|output| output.status.success()) else {
+        testing::skip("git", "this is no git repository, or git is missing");
+        return Ok(Vec::new());
+    };
+    let files = String::from_utf8(listing.stdout)?;
+    ensure!(files.lines().count() > 100, "only {} files are tracked", files.lines().count());
+    let is_wanted = |file: &&str| {
+        let end = file.rsplit('.').next().unwrap_or_default();
+        // A file may have been removed and not yet committed.
+        (extension.is_empty() || end == extension) && root().join(file).is_file()
+    };
+    Ok(files.lines().filter(is_wanted).map(str::to_owned).collect())
+}
+
 fn workspace() -> anyhow::Result<Vec<Package>> {
     let output = Command::new(env!("CARGO"))
         .args(["metadata", "--no-deps", "--format-version", "1", "--offline"])
@@ -137,7 +170,8 @@ fn workspace() -> anyhow::Result<Vec<Package>> {
         list.filter_map(|entry| entry[key].as_str().map(str::to_owned)).collect()
     };
     let counts = |dependency: &&serde_json::Value| {
-        dependency["kind"] != "dev" || TRUTH.iter().all(|name| dependency["name"] != *name)
+        dependency["kind"] != "dev"
+            || TRUTH.iter().chain([&TESTING]).all(|name| dependency["name"] != *name)
     };
     packages
         .iter()
@@ -145,6 +179,7 @@ fn workspace() -> anyhow::Result<Vec<Package>> {
             let manifest = Path::new(package["manifest_path"].as_str().context("manifest_path")?);
             let targets = package["targets"].as_array().context("targets")?;
             let dependencies = package["dependencies"].as_array().context("dependencies")?;
+            let all = serde_json::Value::Array(dependencies.clone());
             let dependencies = dependencies.iter().filter(counts).cloned().collect();
             let main = |target: &&serde_json::Value| target["kind"][0] == "lib";
             let library = targets.iter().filter(main).cloned().collect::<Vec<_>>();
@@ -157,6 +192,7 @@ fn workspace() -> anyhow::Result<Vec<Package>> {
                 dependencies: strings(&serde_json::Value::Array(dependencies), "name")
                     .into_iter()
                     .collect(),
+                all_dependencies: strings(&all, "name").into_iter().collect(),
             })
         })
         .collect()
@@ -179,7 +215,7 @@ fn code(path: &Path) -> anyhow::Result<String> {
 
 #[test]
 fn folders_packages_and_libraries_share_a_name() -> anyhow::Result<()> {
-    for package in workspace()? {
+    for package in workspace()?.into_iter().filter(|package| package.name != TESTS) {
         let Package { name, folder, targets, .. } = package;
         ensure!(folder.ends_with(&name), "the package {name} is in {folder:?}");
         ensure!(targets == [name.replace('-', "_")], "the package {name} builds {targets:?}");
@@ -196,6 +232,8 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
     for package in &workspace {
         let allowed: BTreeSet<&str> = match crates.get(package.name.as_str()) {
             Some(allowed) => allowed.iter().copied().collect(),
+            None if package.name == TESTS => continue,
+            None if package.name == TESTING => BTreeSet::new(),
             None if package.name == "alight" => {
                 let tools = workspace.iter().filter(|p| p.is_tool()).map(|p| p.name.as_str());
                 ALIGHT.into_iter().chain(SERVICES).chain(tools).collect()
@@ -215,6 +253,119 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
         }
     }
     Ok(())
+}
+
+#[test]
+fn no_crates_need_each_other() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    let names: BTreeSet<String> = workspace.iter().map(|package| package.name.clone()).collect();
+    let needs =
+        |package: &Package| package.all_dependencies.intersection(&names).cloned().collect();
+    let graph: Graph = workspace.iter().map(|p| (p.name.clone(), needs(p))).collect();
+    let known = KNOWN_CRATE_CIRCLES.map(str::to_owned).into();
+    let found = circles(&graph);
+    ensure!(found == [known] || found.is_empty(), "crates need each other: {found:?}");
+    Ok(())
+}
+
+#[test]
+fn no_modules_of_a_crate_need_each_other() -> anyhow::Result<()> {
+    let mut known: BTreeSet<_> = KNOWN_CIRCLES.into_iter().collect();
+    for package in workspace()? {
+        let src = package.folder.join("src");
+        let graph = modules(&src, &package.sources()?)?;
+        for circle in circles(&graph) {
+            let is_known =
+                |(name, module): &(&str, &str)| *name == package.name && circle.contains(*module);
+            let listed: Vec<_> = known.iter().copied().filter(is_known).collect();
+            ensure!(!listed.is_empty(), "in {} these need each other: {circle:?}", package.name);
+            known.retain(|it| !listed.contains(it));
+        }
+    }
+    ensure!(known.is_empty(), "these circles are cut, take them off the list: {known:?}");
+    Ok(())
+}
+
+#[test]
+fn no_source_file_is_long() -> anyhow::Result<()> {
+    for path in tracked("rs")? {
+        let lines = lines_of_code(&text(root().join(&path))?);
+        ensure!(lines <= MAX_LINES, "{path}: {lines} lines of code");
+    }
+    Ok(())
+}
+
+#[test]
+fn bounds_are_named_min_and_max() -> anyhow::Result<()> {
+    for path in tracked("rs")?.into_iter().chain(tracked("toml")?) {
+        let content = text(root().join(&path))?;
+        let code = if path.ends_with(".rs") { without_tests(&content) } else { content };
+        for name in tokens(&code) {
+            let upper = name.split('_').any(|part| part == "MOST" || part == "LEAST");
+            let lower = name.starts_with("most_") || name.starts_with("least_");
+            let is_private = upper || lower && !name.starts_with("least_squares");
+            ensure!(!is_private, "{path}: `{name}`: say MIN or MAX");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn parameters_are_no_tuples() -> anyhow::Result<()> {
+    let mut found = Vec::new();
+    for package in workspace()? {
+        for path in package.sources()? {
+            let code = without_tests(&text(&path)?);
+            found.extend(with_tuples(&code).into_iter().map(|name| format!("{path:?}: {name}")));
+        }
+    }
+    ensure!(found.len() < 5, "{} functions take tuples: {found:#?}", found.len());
+    Ok(())
+}
+
+/// The functions of which a parameter is a tuple, a reference to one, or a list of some.
+fn with_tuples(code: &str) -> Vec<String> {
+    let tokens = tokens(code);
+    let mut found = Vec::new();
+    for (at, _) in tokens.iter().enumerate().filter(|(_, token)| **token == "fn") {
+        let rest = &tokens[at + 1..];
+        // After the name and what is generic about it.
+        let Some(open) = rest.iter().position(|token| *token == "(") else { continue };
+        let mut depth = 0;
+        let mut before = "";
+        for (at, token) in rest.iter().enumerate().skip(open) {
+            let list = &rest[at..];
+            depth += usize::from(*token == "(");
+            let opens = ["(", ":", "&", "[", "<", "mut"].contains(&before) && depth > 1;
+            if *token == "(" && opens && list.get(1) != Some(&")") && has_comma(list) {
+                found.extend(rest.first().map(|name| (*name).to_owned()));
+                break;
+            }
+            depth -= usize::from(*token == ")");
+            if depth == 0 {
+                break;
+            }
+            before = token;
+        }
+    }
+    found
+}
+
+/// Whether there is a comma directly in the brackets at the beginning.
+fn has_comma(tokens: &[&str]) -> bool {
+    let mut depth = 0;
+    for token in tokens {
+        match *token {
+            "(" | "[" | "<" | "{" => depth += 1,
+            ")" | "]" | ">" | "}" => depth -= 1,
+            "," if depth == 1 => return true,
+            _ => {}
+        }
+        if depth == 0 {
+            return false;
+        }
+    }
+    false
 }
 
 #[test]
@@ -301,13 +452,18 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
         }
     }
     ensure!(constants.len() == TOPICS.len(), "{} constants of topics", constants.len());
-    let mut publishers: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
-    for package in workspace.iter().filter(|p| p.name != "node") {
+    let mut publishers: BTreeMap<(&str, &str), BTreeSet<&str>> = BTreeMap::new();
+    for package in workspace.iter().filter(|p| p.name != "node" && p.name != TESTS) {
         for path in package.sources()? {
             let code: String = code(&path)?.split_whitespace().collect();
             for (name, key) in &constants {
-                if code.contains(&format!("publisher(topic::{name},")) {
-                    publishers.entry(key).or_default().insert(&package.name);
+                // A query's row names who asks, its reply's row who answers.
+                let reply = format!("{name}_REPLY");
+                let calls = [("publisher", name), ("command", name), ("commands", &reply)];
+                for (call, row) in calls {
+                    if code.contains(&format!(".{call}(topic::{name},")) {
+                        publishers.entry((row, key)).or_default().insert(&package.name);
+                    }
                 }
             }
         }
@@ -316,12 +472,17 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
     // relay as well, which has nothing to configure.
     let with_defaults = workspace.iter().filter(|p| defaults(p).is_file());
     let services = with_defaults.map(|p| p.name.as_str()).chain(["relay"]);
-    publishers.insert("health/{service}/{instance}", services.collect());
-    for row in TOPICS.iter().filter(|row| row.delivery != Delivery::Query) {
+    let health = "health/{service}/{instance}";
+    publishers.insert(("HEALTH", health), services.collect());
+    for ((name, key), found) in &publishers {
+        let replies = name.ends_with("_REPLY");
+        let of_row =
+            |row: &&messages::Row| row.key == *key && (row.message == "CommandReply") == replies;
+        let row = TOPICS.iter().find(of_row).with_context(|| format!("a row of {name}"))?;
         let stated: BTreeSet<_> = row.publishers.iter().copied().collect();
-        let found = publishers.get(row.key).cloned().unwrap_or_default();
-        ensure!(stated == found, "{} is published by {found:?}, its row says {stated:?}", row.key);
+        ensure!(stated == *found, "{key} is published by {found:?}, its row says {stated:?}");
     }
+    ensure!(publishers.len() == TOPICS.len(), "rows that nobody publishes: only {publishers:#?}");
     Ok(())
 }
 
@@ -385,8 +546,8 @@ fn defines(code: &str, name: &str) -> bool {
 fn documents_name_only_what_exists() -> anyhow::Result<()> {
     let extensions = [".rs", ".toml", ".md", ".json5", ".py"];
     let mut names = 0;
-    for document in DOCUMENTS {
-        let markdown = text(root().join(document))?;
+    for document in tracked("md")? {
+        let markdown = text(root().join(&document))?;
         for quote in quoted(&markdown) {
             ensure!(!quote.contains('\n'), "{document}: `{quote}` goes over two lines");
             let (path, name) = match quote.split_once(": ") {
@@ -442,17 +603,9 @@ fn the_architecture_has_the_topic_table() -> anyhow::Result<()> {
 
 #[test]
 fn nothing_names_a_folder_of_somebodys_machine() -> anyhow::Result<()> {
-    let listing = Command::new("git").arg("ls-files").current_dir(root()).output();
-    let Some(listing) = listing.ok().filter(|output| output.status.success()) else {
-        println!("skipped: this is no git repository, or git is missing");
-        return Ok(());
-    };
     let folders = ["home", "root", "tmp", "Users", "work"].map(|name| format!("/{name}/"));
-    let files = String::from_utf8(listing.stdout)?;
-    ensure!(files.lines().count() > 100, "only {} files are tracked", files.lines().count());
-    for file in files.lines() {
-        // A file may have been removed and not yet committed.
-        let Ok(bytes) = std::fs::read(root().join(file)) else { continue };
+    for file in tracked("")? {
+        let bytes = std::fs::read(root().join(&file))?;
         let content = String::from_utf8_lossy(&bytes);
         for folder in &folders {
             let found = content.match_indices(folder.as_str()).find(|(at, _)| {

@@ -1,5 +1,5 @@
 //! `alight detect` on rendered frames whose truth is known, on files that are no images, and on photographs without the
-//! marker. `cargo test --release -p alight --test detect_frames -- --nocapture` prints the tables.
+//! marker. `cargo test --release -p tests --test detect_frames -- --nocapture` prints the tables.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
@@ -17,7 +17,11 @@ const FAMILIES: [&str; 2] = ["rings", "rings-thesis"];
 const ELSEWHERE_PX: f64 = 5.0;
 
 fn detect(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_alight")).arg("detect").args(arguments).output().unwrap()
+    Command::new(env!("CARGO_BIN_EXE_alight-under-test"))
+        .arg("detect")
+        .args(arguments)
+        .output()
+        .unwrap()
 }
 
 fn lines(output: &Output) -> Vec<Value> {
@@ -358,11 +362,7 @@ fn an_image_that_is_read_ends_with_status_0_and_wrong_use_with_2() {
 
 #[test]
 fn photographs_without_the_marker_have_none() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/photos");
-    if !root.is_dir() {
-        println!("skipped: {} is missing", root.display());
-        return;
-    }
+    let Some(root) = testing::recording("photos") else { return };
     let path = root.to_str().unwrap();
     let output =
         detect(&["--marker", "rings", "--marker", "rings-thesis", "--format", "jsonl", path]);

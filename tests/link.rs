@@ -1,7 +1,7 @@
 //! Two hosts joined by a bad radio link: what must hold with the detector on the ground, and how well it holds.
 //!
-//! `cargo test --test link` tries the short ones; they are skipped where namespaces and TUN devices may not be made.
-//! `cargo test --release --test link -- table [NAME...]` measures all, longer, and prints a table.
+//! `cargo test -p tests --test link` tries the short ones; they are skipped where namespaces and TUN devices may not be made.
+//! `cargo test --release -p tests --test link -- table [NAME...]` measures all, longer, and prints a table.
 
 #![expect(
     clippy::print_stdout,
@@ -12,8 +12,6 @@
 mod flight;
 #[path = "link/onehost.rs"]
 mod onehost;
-#[path = "ports/mod.rs"]
-mod ports;
 #[path = "link/probe.rs"]
 mod probe;
 #[path = "link/saturation.rs"]

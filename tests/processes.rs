@@ -8,19 +8,15 @@
 )]
 
 mod flight;
-mod ports;
-
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use messages::{ControllerCommand, DetectorCommand, topic};
 use rustix::process::{Pid, Signal, kill_process};
+use testing::{ports, python, python_passes};
 
-use crate::flight::{
-    ALIGHT, Landing, ONE_AT_A_TIME, descent_m_s, output_of, python, python_says_yes, seconds,
-    speed_m_s,
-};
+use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, descent_m_s, output_of, seconds, speed_m_s};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn it_lands_and_says_how_well_and_losing_the_ground_station_changes_nothing()
@@ -270,8 +266,8 @@ async fn programs_of_others_see_the_services_the_frames_and_the_vehicle() -> any
     let _alone = ONE_AT_A_TIME.lock().await;
     let ([], _, ground) = ports::free()?;
     let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{ground}");
-    let station =
-        python("gcs/ground_station.py", &["--connect", &format!("udpin:127.0.0.1:{ground}")])?;
+    let connect = ["--connect", &format!("udpin:127.0.0.1:{ground}")];
+    let station = python("tests/gcs/ground_station.py", &connect);
     let landing = Landing::start(&["--seed", "8", "--set", &address]).await?;
     landing.status("a detector is active", |s| s.active_detector.is_some()).await?;
     let port = std::fs::read_to_string(&landing.zenoh)?
@@ -279,8 +275,13 @@ async fn programs_of_others_see_the_services_the_frames_and_the_vehicle() -> any
         .nth(1)
         .and_then(|rest| rest.split("127.0.0.1:").nth(1)?.split('"').next().map(str::to_owned))
         .context("the meeting point's port")?;
-    let client = python("zenoh_client.py", &[&format!("tcp/127.0.0.1:{port}")])?;
-    tokio::task::block_in_place(|| client.map_or(Ok(()), python_says_yes))?;
+    let client = python("tests/zenoh_client.py", &[&format!("tcp/127.0.0.1:{port}")]);
+    if let Some(client) = client {
+        tokio::task::block_in_place(|| python_passes(&client.wait_with_output()?))?;
+    }
     landing.lands().await?;
-    tokio::task::block_in_place(|| station.map_or(Ok(()), python_says_yes))
+    if let Some(station) = station {
+        tokio::task::block_in_place(|| python_passes(&station.wait_with_output()?))?;
+    }
+    Ok(())
 }

@@ -3,12 +3,10 @@
 //! A drone and a ground station, each under its supervisor, on one machine; the world is apart from both. Processes of
 //! both sides, the relay and the supervisors are killed (`kill -9`) at random moments of landings.
 //!
-//! The long version is ignored: `ALIGHT_KILLS=20 cargo test --release --test recovery -- --ignored --nocapture` kills
+//! The long version is ignored: `ALIGHT_KILLS=20 cargo test --release -p tests --test recovery -- --ignored --nocapture` kills
 //! each process so often.
 
 #![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
-
-mod ports;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, OpenOptions};
@@ -20,10 +18,11 @@ use anyhow::{Context, anyhow, bail, ensure};
 use messages::{ControllerStatus, DetectorState, Truth, topic};
 use node::{Identity, Network, Node, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
+use testing::ports;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
-const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
+const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 /// Longest wait for anything.
 const PATIENCE: Duration = Duration::from_secs(90);
 /// The pause after which systemd starts a supervisor again: `RestartSec` of the units.

@@ -2,8 +2,6 @@
 
 #![expect(clippy::print_stdout, reason = "what was said helps when a test fails")]
 
-mod ports;
-
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -12,11 +10,12 @@ use std::time::Duration;
 use anyhow::{Context, anyhow, bail, ensure};
 use messages::{CommandReply, ControllerCommand, FrameReceipt, Health, topic};
 use node::{Identity, Network, Node, Subscriber};
+use testing::ports;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(30);
-const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
+const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
 fn output_of(arguments: &[&str]) -> anyhow::Result<Output> {
     Ok(Command::new(ALIGHT).args(arguments).stdin(Stdio::null()).output()?)

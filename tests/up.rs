@@ -2,8 +2,6 @@
 
 #![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
 
-mod ports;
-
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
@@ -13,11 +11,12 @@ use anyhow::{Context, anyhow, ensure};
 use messages::{DetectorCommand, VehicleState, topic};
 use node::{Identity, Network, Node, Subscriber};
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+use testing::ports;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
+const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
 /// A site whose drone is simulated; the vehicle waits for a command.
 fn write_site(folder: &Path) -> anyhow::Result<u16> {
@@ -290,7 +289,7 @@ fn the_units_are_as_systemd_wants_them() -> anyhow::Result<()> {
         command.arg(folder.path().join(&name));
     }
     let Ok(output) = command.output() else {
-        println!("skipped: systemd-analyze is missing");
+        testing::skip("systemd-analyze", "it does not start");
         return Ok(());
     };
     let said = String::from_utf8_lossy(&output.stderr);

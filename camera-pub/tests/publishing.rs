@@ -1,8 +1,5 @@
 //! A camera service and its subscribers, on a port of the test's own.
 
-#[path = "../../tests/ports/mod.rs"]
-mod ports;
-
 use std::path::Path;
 use std::time::Duration;
 
@@ -11,6 +8,7 @@ use camera_pub::Config;
 use image::{GrayImage, Luma, RgbImage};
 use messages::{BayerPattern, PixelFormat, topic};
 use node::{Identity, Layers, Node, Shutdown, ZenohSource, now_ns};
+use testing::ports;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -263,7 +261,7 @@ async fn the_error_says_how_a_camera_program_ended() -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread")]
 async fn ffmpeg_is_a_camera() -> anyhow::Result<()> {
     if std::process::Command::new("ffmpeg").arg("-version").output().is_err() {
-        println!("skipped: ffmpeg is missing");
+        testing::skip("ffmpeg", "it does not start");
         return Ok(());
     }
     let grey = "color=c=0x808080:s=64x48:r=20,format=gray";

@@ -1,8 +1,5 @@
 //! A detector service between a camera and an operator, on a port of the test's own.
 
-#[path = "../../tests/ports/mod.rs"]
-mod ports;
-
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
@@ -15,6 +12,7 @@ use messages::{
 use node::{
     FramePublisher, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, clock_name, now_ns,
 };
+use testing::ports;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(30);

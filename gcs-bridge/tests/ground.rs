@@ -1,8 +1,5 @@
 //! The bridge between a vehicle that is made up here and a ground station on a plain UDP socket.
 
-#[path = "../../tests/ports/mod.rs"]
-mod ports;
-
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -17,6 +14,7 @@ use autopilot::{Frame, Parser, Sender};
 use gcs_bridge::Config;
 use messages::{ControllerStatus, MavlinkBytes, TargetEstimate, topic};
 use node::{Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
+use testing::ports;
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -186,9 +184,8 @@ async fn pymavlink_agrees() -> anyhow::Result<()> {
     let vehicle = FakeVehicle::start(port).await?;
     let bridge = start_bridge(port, &free, &[]).await?;
     drop(free);
-    let python = std::env::var("ALIGHT_PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/gcs/ground_station.py");
-    let run = tokio::process::Command::new(&python)
+    let run = tokio::process::Command::new(testing::interpreter())
         .args([script, "--connect", &format!("udpin:{address}"), "--timeout", "30"])
         .kill_on_drop(true)
         .output();
@@ -205,17 +202,13 @@ async fn pymavlink_agrees() -> anyhow::Result<()> {
         () = phases => bail!("the phases ended"),
     };
     bridge.abort();
-    let Ok(output) = output else {
-        println!("skipped: {python} is missing (ALIGHT_PYTHON names another one)");
-        return Ok(());
-    };
-    let said = String::from_utf8_lossy(&output.stdout);
-    match output.status.code() {
-        Some(0) => println!("{said}"),
-        Some(77) => println!("skipped: {said}"),
-        _ => bail!("{said}{}", String::from_utf8_lossy(&output.stderr)),
+    match output {
+        Ok(output) => testing::python_passes(&output).map(drop),
+        Err(problem) => {
+            testing::skip("python", format_args!("it does not start: {problem}"));
+            Ok(())
+        }
     }
-    Ok(())
 }
 
 fn free_port() -> anyhow::Result<u16> {

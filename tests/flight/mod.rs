@@ -16,7 +16,7 @@ use tokio::time::timeout;
 
 /// Longest wait for anything; a landing takes a fifth of it.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
-pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
+pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
 /// Two landings at once would share the processor.
 pub(crate) static ONE_AT_A_TIME: Mutex<()> = Mutex::const_new(());
@@ -224,28 +224,4 @@ pub(crate) fn speed_m_s(truth: &Truth) -> f64 {
 
 pub(crate) fn seconds(ns: i64) -> f64 {
     ns as f64 * 1e-9
-}
-
-/// Runs a Python script that status 77 lets skip; the interpreter is $ALIGHT_PYTHON, or python3.
-pub(crate) fn python(script: &str, args: &[&str]) -> anyhow::Result<Option<Child>> {
-    let interpreter = std::env::var("ALIGHT_PYTHON").unwrap_or_else(|_| "python3".into());
-    let script = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests").join(script);
-    let child = Command::new(&interpreter).arg(&script).args(args).stdout(Stdio::piped()).spawn();
-    match child {
-        Ok(child) => Ok(Some(child)),
-        Err(problem) => {
-            println!("skipped: {interpreter} does not start: {problem}");
-            Ok(None)
-        }
-    }
-}
-
-pub(crate) fn python_says_yes(child: Child) -> anyhow::Result<()> {
-    let output = child.wait_with_output()?;
-    let said = String::from_utf8_lossy(&output.stdout);
-    println!("{said}");
-    match output.status.code() {
-        Some(0 | 77) => Ok(()),
-        _ => bail!("the script ended with {}: {said}", output.status),
-    }
 }

@@ -13,9 +13,9 @@ use anyhow::Context;
 use messages::{FrameHeader, PixelFormat, topic};
 use node::{FramePublisher, Identity, Loan, Network, Node, now_ns};
 use serde_json::{Value, json};
+use testing::ports;
 use tokio::time::interval;
 
-use crate::ports;
 use crate::probe::Times;
 
 const WIDTH: u32 = 1296;

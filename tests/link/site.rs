@@ -6,12 +6,11 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use anyhow::{Context, bail, ensure};
 use node::{Identity, Network, Node};
-
-use crate::ports;
+use testing::ports;
 
 /// The program under test.
-const ALIGHT: &str = env!("CARGO_BIN_EXE_alight");
-const EMULATOR: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/link/emulator.py");
+const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
+const EMULATOR: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/link/emulator.py");
 /// Runs a program on the ground, where there is no shared memory of the drone's.
 const WITHOUT_SHARED_MEMORY: &str = "mount -t tmpfs tmpfs /dev/shm && exec \"$@\"";
 
@@ -52,7 +51,7 @@ impl Air {
         let mut emulator = match emulator {
             Ok(emulator) => emulator,
             Err(problem) => {
-                println!("skipped: python3 is missing: {problem}");
+                testing::skip("python", problem);
                 return Ok(None);
             }
         };
@@ -61,7 +60,7 @@ impl Air {
         let mut line = String::new();
         answers.read_line(&mut line)?;
         if line.trim() != "ready" {
-            println!("skipped: a link of two hosts is missing: {}", line.trim());
+            testing::skip("namespaces", line.trim());
             emulator.kill().context("ending the emulator")?;
             emulator.wait()?;
             return Ok(None);
@@ -86,7 +85,7 @@ impl Air {
                 Ok(output) => String::from_utf8_lossy(&output.stderr).into_owned(),
                 Err(problem) => problem.to_string(),
             };
-            println!("skipped: a link of two hosts is missing: ip {command:?}: {problem}");
+            testing::skip("namespaces", format_args!("ip {command:?}: {problem}"));
             return Ok(None);
         }
         if radio.resends_soon {

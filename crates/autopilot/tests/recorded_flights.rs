@@ -17,14 +17,6 @@ use autopilot::frame::Counters;
 use autopilot::{Autopilot, Config, Event, FlightMode, Frame, LandedState, Parser};
 use serde_json::Value;
 
-fn data(path: &str) -> Option<PathBuf> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data").join(path);
-    if !folder.exists() {
-        println!("skipped: ../shared/data/{path} is missing");
-    }
-    folder.exists().then_some(folder)
-}
-
 /// All logs under a folder.
 fn logs(folder: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
@@ -62,7 +54,7 @@ fn timed(log: &[u8]) -> Vec<(i64, Frame)> {
 
 #[test]
 fn every_packet_of_the_simulated_flights_is_found() {
-    let Some(folder) = data("ardupilot") else { return };
+    let Some(folder) = testing::recording("ardupilot") else { return };
     for path in logs(&folder) {
         let log = std::fs::read(&path).unwrap();
         let (frames, counters) = parse(&log);
@@ -75,7 +67,7 @@ fn every_packet_of_the_simulated_flights_is_found() {
 
 #[test]
 fn the_real_logs_give_what_pymavlink_finds_in_them() {
-    let Some(folder) = data("autopilot-logs") else { return };
+    let Some(folder) = testing::recording("autopilot-logs") else { return };
     let summary = std::fs::read(folder.join("logs_summary.json")).unwrap();
     let summary: Value = serde_json::from_slice(&summary).unwrap();
     for path in logs(&folder) {
@@ -175,7 +167,7 @@ fn told_by_events(events: &[Value]) -> Vec<(f64, Told)> {
 
 #[test]
 fn the_client_tells_what_happened_when_it_happened() {
-    let Some(folder) = data("ardupilot") else { return };
+    let Some(folder) = testing::recording("ardupilot") else { return };
     let mut compared = 0;
     for path in logs(&folder) {
         let events = path.with_extension("tlog.events.json");
@@ -202,7 +194,7 @@ fn the_client_tells_what_happened_when_it_happened() {
 
 #[test]
 fn a_precision_landing_is_followed_to_the_ground() {
-    let Some(folder) = data("ardupilot") else { return };
+    let Some(folder) = testing::recording("ardupilot") else { return };
     for path in logs(&folder) {
         let (told, client) = told_by_client(&std::fs::read(&path).unwrap());
         let state = client.state().unwrap();

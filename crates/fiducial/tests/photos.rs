@@ -18,11 +18,7 @@ const FAMILIES: [&str; 2] = ["rings", "rings-thesis"];
 
 #[test]
 fn photographs_without_the_marker_have_none() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/photos");
-    if !root.is_dir() {
-        println!("skipped: {} is missing", root.display());
-        return;
-    }
+    let Some(root) = testing::recording("photos") else { return };
     let mut detectors = FAMILIES
         .map(|family| Detector::new(&[family.parse().unwrap()], Settings::default()).unwrap());
     let mut counts = BTreeMap::<String, Count>::new();

@@ -1,8 +1,5 @@
 //! Sessions that meet: the local configuration's promises, on a port of the test's own.
 
-#[path = "../../../tests/ports/mod.rs"]
-mod ports;
-
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
@@ -10,6 +7,7 @@ use messages::{
     CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, PixelFormat, Wind, encode, topic,
 };
 use node::{FramePublisher, FrameSubscriber, Identity, Node, ZenohSource, clock_name, now_ns};
+use testing::ports;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);

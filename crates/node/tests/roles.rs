@@ -1,14 +1,12 @@
 //! Two hosts: the drone's own processes, its relay, and the ground.
 
-#[path = "../../../tests/ports/mod.rs"]
-mod ports;
-
 use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, ensure};
 use messages::{CommandReply, ControllerCommand, Wind, topic};
 use node::{Identity, Network, Node};
+use testing::ports;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);

@@ -81,14 +81,8 @@ fn rise_times_are_those_of_the_summary() {
 
 #[test]
 fn rise_times_are_those_of_the_measured_curves() {
-    let file = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/../../../shared/data/ardupilot/velocity_steps_truth.json"
-    );
-    let Ok(text) = std::fs::read_to_string(file) else {
-        println!("skipped: {file} is missing");
-        return;
-    };
+    let Some(file) = testing::recording("ardupilot/velocity_steps_truth.json") else { return };
+    let text = std::fs::read_to_string(file).unwrap();
     let curves: serde_json::Map<String, serde_json::Value> = serde_json::from_str(&text).unwrap();
     assert!(!curves.is_empty());
     for (key, points) in curves {

@@ -11,8 +11,11 @@ const COUNT: u32 = 12_000;
 /// No port is chosen twice by one process, and processes begin at different ones.
 static CHOSEN: AtomicU32 = AtomicU32::new(0);
 
-/// So many TCP ports, one that is followed by two more free ones, as an air link needs them, and a UDP port; all different.
-pub(crate) fn free<const N: usize>() -> anyhow::Result<([u16; N], u16, u16)> {
+/// `N` TCP ports, the first of three neighbouring ports for an air link, and a UDP port; all different.
+///
+/// # Errors
+/// A thousand ports that were tried are all in use.
+pub fn free<const N: usize>() -> anyhow::Result<([u16; N], u16, u16)> {
     let mut ports = [0; N];
     for port in &mut ports {
         *port = row(1)?;
