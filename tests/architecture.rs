@@ -452,17 +452,16 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
         }
     }
     ensure!(constants.len() == TOPICS.len(), "{} constants of topics", constants.len());
-    let mut publishers: BTreeMap<(&str, &str), BTreeSet<&str>> = BTreeMap::new();
+    let mut publishers: BTreeMap<(String, &str), BTreeSet<&str>> = BTreeMap::new();
     for package in workspace.iter().filter(|p| p.name != "node" && p.name != TESTS) {
         for path in package.sources()? {
             let code: String = code(&path)?.split_whitespace().collect();
             for (name, key) in &constants {
                 // A query's row names who asks, its reply's row who answers.
-                let reply = format!("{name}_REPLY");
-                let calls = [("publisher", name), ("command", name), ("commands", &reply)];
-                for (call, row) in calls {
+                for (call, end) in [("publisher", ""), ("command", ""), ("commands", "_REPLY")] {
                     if code.contains(&format!(".{call}(topic::{name},")) {
-                        publishers.entry((row, key)).or_default().insert(&package.name);
+                        let row = (format!("{name}{end}"), key.as_str());
+                        publishers.entry(row).or_default().insert(&package.name);
                     }
                 }
             }
@@ -473,7 +472,7 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
     let with_defaults = workspace.iter().filter(|p| defaults(p).is_file());
     let services = with_defaults.map(|p| p.name.as_str()).chain(["relay"]);
     let health = "health/{service}/{instance}";
-    publishers.insert(("HEALTH", health), services.collect());
+    publishers.insert(("HEALTH".to_owned(), health), services.collect());
     for ((name, key), found) in &publishers {
         let replies = name.ends_with("_REPLY");
         let of_row =
