@@ -16,13 +16,14 @@ use crate::circles::{Graph, circles, modules};
 use crate::source::{lines_of_code, tokens, without_tests};
 
 /// The algorithm crates, and what each may know of this workspace. `autopilot` is told apart for its link.
-const ALGORITHMS: [(&str, &[&str]); 7] = [
+const ALGORITHMS: [(&str, &[&str]); 8] = [
     ("geometry", &[]),
     ("imaging", &[]),
     ("messages", &[]),
-    ("fiducial", &["geometry", "imaging"]),
+    ("markers", &[]),
+    ("fiducial", &["geometry", "imaging", "markers"]),
     ("landing", &["geometry"]),
-    ("rendering", &["fiducial", "geometry"]),
+    ("rendering", &["geometry", "markers"]),
     ("world", &["autopilot", "geometry"]),
 ];
 const AUTOPILOT: (&str, &[&str]) = ("autopilot", &["geometry"]);
@@ -33,13 +34,14 @@ const AIRLINK: (&str, &[&str]) = ("airlink", &["imaging", "messages", "node"]);
 const MEDIA: (&str, &[&str]) = ("media", &["geometry", "imaging"]);
 const SERVICES: [&str; 4] = ["camera-pub", "controller", "detector", "gcs-bridge"];
 /// What a service or a tool may know.
-const ROOMS: [&str; 9] = [
+const ROOMS: [&str; 10] = [
     "airlink",
     "autopilot",
     "fiducial",
     "geometry",
     "imaging",
     "landing",
+    "markers",
     "media",
     "messages",
     "node",
@@ -53,7 +55,8 @@ const TESTS: &str = "tests";
 /// The tool that stands above others: it calls their pure parts in lock-step.
 const EXPERIMENTS: (&str, [&str; 3]) = ("experiments", ["controller", "detector", "simulator"]);
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
-const ALIGHT: [&str; 6] = ["fiducial", "geometry", "imaging", "media", "messages", "node"];
+const ALIGHT: [&str; 7] =
+    ["fiducial", "geometry", "imaging", "markers", "media", "messages", "node"];
 
 /// Crates of algorithms but for these modules, which have the threads, the clock and the network.
 const WITH_THREADS: [(&str, &[&str]); 2] =

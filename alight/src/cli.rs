@@ -256,7 +256,7 @@ fn is_wrong_use(problem: &anyhow::Error) -> bool {
     problem.is::<ConfigError>()
         || problem.is::<clap::Error>()
         || problem.is::<fiducial::DetectorError>()
-        || problem.is::<fiducial::PadError>()
+        || problem.is::<markers::PadError>()
         || problem.is::<media::CalibrationError>()
         || problem.is::<marker::SheetError>()
 }

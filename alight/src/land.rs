@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
-use fiducial::{Marker, Pad};
+use markers::{Marker, Pad};
 use messages::topic;
 use node::{Identity, Layers, Node, Shutdown};
 use tempfile::TempDir;

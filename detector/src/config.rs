@@ -1,6 +1,7 @@
 //! The detector's configuration, at the start and while it runs.
 
-use fiducial::{Detector, Marker, Pad, TrackingSettings};
+use fiducial::{Detector, TrackingSettings};
+use markers::{Marker, Pad};
 use messages::Place;
 use node::{Check, Settings};
 use serde::{Deserialize, Serialize};

@@ -82,7 +82,7 @@ mod tests {
     /// A marker drawn at a place of a frame.
     fn frame(centre: [f64; 2], size_px: f64) -> GrayImage {
         let marker = "aruco-4x4-50:7".parse().unwrap();
-        let drawing = fiducial::Drawing::new(&marker, size_px).unwrap();
+        let drawing = markers::Drawing::new(&marker, size_px).unwrap();
         let mut image = GrayImage::filled(640, 480, 180);
         // A pixel is the mean of its area, and of some of its neighbours' as behind any lens.
         let steps: Vec<f64> = (0..8).map(|i| f64::from(i) * 0.25 - 0.875).collect();
@@ -93,7 +93,7 @@ mod tests {
                     continue;
                 }
                 let white =
-                    |dx: f64, dy: f64| drawing.ink_at(right + dx, up + dy) == fiducial::Ink::White;
+                    |dx: f64, dy: f64| drawing.ink_at(right + dx, up + dy) == markers::Ink::White;
                 let all = steps.iter().flat_map(|dx| steps.iter().map(move |dy| (*dx, *dy)));
                 let count = all.filter(|(dx, dy)| white(*dx, *dy)).count();
                 *pixel = (20 + 200 * count / (steps.len() * steps.len())) as u8;

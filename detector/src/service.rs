@@ -9,9 +9,10 @@ use std::time::{Duration, Instant};
 use airlink::Unpacker;
 use anyhow::Context;
 use fiducial::debug::{self, RgbImageBuf};
-use fiducial::{Detector, Observation, Pad, Stages, Tracker};
+use fiducial::{Detector, Observation, Stages, Tracker};
 use geometry::CameraModel;
 use imaging::{Converter, GrayImage, GrayView};
+use markers::Pad;
 use messages::{
     CameraInfo, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo, FrameHeader,
     FramePart, FrameReceipt, PixelFormat, StageTime, topic,
@@ -432,7 +433,7 @@ fn told(
 ) -> Vec<Detection> {
     let markers = found.iter().filter(|seen| seen.confidence >= least).map(wire::detection);
     let pads = pads.iter().filter_map(|pad| {
-        let seen = pad.observe(found, camera?)?;
+        let seen = fiducial::observe_pad(pad, found, camera?)?;
         (seen.confidence >= least).then(|| wire::pad_detection(pad, &seen))
     });
     markers.chain(pads).collect()

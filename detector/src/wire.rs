@@ -1,8 +1,9 @@
 //! Between the algorithm's types and the messages.
 
-use fiducial::{MarkerPose, Observation, Pad, PadObservation};
+use fiducial::{MarkerPose, Observation, PadObservation};
 use geometry::{Camera, CameraModel, Distortion, Marker, Transform};
 use imaging::{Mosaic, SampleFormat};
+use markers::Pad;
 use messages::{
     AlternativePose, BayerPattern, CameraInfo, Detection, LensModel, PixelFormat, Transform3,
 };

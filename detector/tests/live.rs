@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use detector::Config;
-use fiducial::{Drawing, Ink};
 use imaging::GrayImage;
+use markers::{Drawing, Ink};
 use messages::{
     BayerPattern, CommandReply, Detections, DetectorCommand, FrameHeader, PixelFormat, topic,
 };

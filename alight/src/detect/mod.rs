@@ -15,10 +15,11 @@ use std::time::Instant;
 
 use clap::{Args, ValueEnum};
 use fiducial::{
-    Detector, Marker, MarkerPose, Observation, Pad, PadObservation, PoseSolution, Settings, Tracker,
+    Detector, MarkerPose, Observation, PadObservation, PoseSolution, Settings, Tracker,
 };
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayImage, Mosaic};
+use markers::{Marker, Pad};
 use media::read_calibration;
 use serde::Serialize;
 
@@ -193,7 +194,7 @@ impl Examiner {
                 .map_err(|problem| format!("{problem:#}"))?;
         }
         let pads = self.pads.iter().filter_map(|pad| {
-            let seen = pad.observe(found, camera.as_ref()?)?;
+            let seen = fiducial::observe_pad(pad, found, camera.as_ref()?)?;
             Some(Detection::of_pad(pad, &seen))
         });
         let detections = found.iter().map(Detection::from).chain(pads).collect();
@@ -558,7 +559,7 @@ mod tests {
 
     /// The thesis' marker, seen head-on, `size_px` large, in the middle of a grey image.
     fn picture_of_rings(size_px: f64) -> image::GrayImage {
-        let drawing = fiducial::Drawing::new(&"rings".parse().unwrap(), size_px).unwrap();
+        let drawing = markers::Drawing::new(&"rings".parse().unwrap(), size_px).unwrap();
         image::GrayImage::from_fn(320, 240, |x, y| {
             let sample = |i: u32| {
                 let (dx, dy) = (f64::from(i % 4), f64::from(i / 4));
@@ -566,8 +567,8 @@ mod tests {
                 let (right, up) = (at(x, dx, 159.5), -at(y, dy, 119.5));
                 match drawing.ink_at(right, up) {
                     _ if right.abs().max(up.abs()) > drawing.half_extent_m => 120,
-                    fiducial::Ink::Black => 20,
-                    fiducial::Ink::White => 220,
+                    markers::Ink::Black => 20,
+                    markers::Ink::White => 220,
                 }
             };
             image::Luma([((0..16).map(sample).sum::<u32>() / 16) as u8])

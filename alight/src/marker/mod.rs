@@ -12,7 +12,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
-use fiducial::{Marker, Pad};
+use markers::{Marker, Pad};
 
 pub(crate) use sheet::SheetError;
 use sheet::{Paper, Sheet};
@@ -167,7 +167,7 @@ mod tests {
     #[test]
     fn every_family_is_written() {
         let folder = tempfile::tempdir().unwrap();
-        for family in fiducial::Family::ALL {
+        for family in markers::Family::ALL {
             let marker = match family.id_count() {
                 Some(count) => format!("{family}:{}:0.07", count - 1),
                 None => format!("{family}:0.07"),

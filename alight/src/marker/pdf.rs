@@ -1,6 +1,6 @@
 //! The sheet as PDF: vectors in units of 1/72 inch.
 
-use fiducial::Ink;
+use markers::Ink;
 use pdf_writer::{Content, Name, Pdf, Rect, Ref, Str};
 
 use super::sheet::{Mark, Sheet, TEXT_MM};
@@ -93,7 +93,7 @@ fn circle(content: &mut Content, [x, y]: [f64; 2], radius: f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::marker::sheet::Paper;
+    use markers::sheet::Paper;
 
     fn text_of(size_m: f64, paper: Paper) -> String {
         let sheet = Sheet::new(&"rings".parse().unwrap(), size_m, paper).unwrap();

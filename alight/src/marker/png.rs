@@ -3,8 +3,8 @@
 use std::io::Cursor;
 
 use anyhow::Context;
-use fiducial::Ink;
 use image::{GrayImage, ImageFormat};
+use markers::Ink;
 
 use super::glyphs;
 use super::sheet::{Mark, Sheet, SheetError};
@@ -108,8 +108,8 @@ fn crc32(bytes: &[u8]) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::marker::sheet::Paper;
-    use fiducial::{Drawing, Marker};
+    use markers::sheet::Paper;
+    use markers::{Drawing, Marker};
 
     #[test]
     fn ink_is_where_the_drawing_has_it() {

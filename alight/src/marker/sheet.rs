@@ -1,7 +1,7 @@
 //! What is on the paper, and where: the marker, lines to cut along, a ruler, and words.
 
 use clap::ValueEnum;
-use fiducial::{Drawing, Ink, Marker, Pad, Shape};
+use markers::{Drawing, Ink, Marker, Pad, Shape};
 
 /// The edge of the paper on which printers print nothing, in millimetres.
 const EDGE_MM: f64 = 5.0;

@@ -1,6 +1,6 @@
 //! The sheet as SVG: one user unit is one millimetre.
 
-use fiducial::Ink;
+use markers::Ink;
 use svg::Document;
 use svg::node::element::path::Data;
 use svg::node::element::{Circle, Path, Rectangle, Text};
@@ -73,7 +73,7 @@ fn colour(ink: Ink) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::marker::sheet::Paper;
+    use markers::sheet::Paper;
     use svg::parser::Event;
 
     #[test]

@@ -5,9 +5,10 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use fiducial::{Detector, Marker, Settings, Tracker, TrackingSettings};
+use fiducial::{Detector, Settings, Tracker, TrackingSettings};
 use geometry::{Body, Ned, Point, Rotation, Transform};
 use imaging::GrayView;
+use markers::Marker;
 use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
 
 const MARKERS: [&str; 5] =

@@ -2,8 +2,8 @@
 
 use geometry::Pixel;
 use imaging::GrayView;
+use markers::RingKind;
 
-use crate::candidates::ring::RingKind;
 pub use crate::canvas::{Colour, RgbImageBuf};
 use crate::trace::{Candidate, Trace};
 

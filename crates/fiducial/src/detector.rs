@@ -4,11 +4,11 @@ use std::ops::Range;
 
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outlines, outline};
+use markers::{Family, Marker};
 
 use crate::families::rings::Rings;
 use crate::families::rings::circle_pose::CirclePose;
 use crate::families::rings_thesis::RingsThesis;
-use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
 use crate::square::quad::Quad;
 use crate::square::segments::{ImageQuads, Scale};

@@ -1,9 +1,8 @@
 //! What was found in an image.
 
 use geometry::{Camera, Marker as MarkerFrame, Pixel, Transform};
+use markers::Family;
 use nalgebra::{Matrix2, Matrix6};
-
-use crate::marker::Family;
 
 /// A marker found in an image.
 #[derive(Clone, Debug, PartialEq)]

@@ -4,8 +4,6 @@
 //! makes quads of straight pieces of edges, [`erasures`] reads what is left of a marker, and [`damaged`] does both.
 
 pub(crate) mod chance;
-pub mod code;
-pub(crate) mod codebook;
 pub mod damaged;
 pub(crate) mod decode;
 pub mod erasures;
@@ -15,16 +13,14 @@ mod profiles;
 pub mod quad;
 pub mod refine;
 pub mod segments;
-mod tables;
 
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outline, Outlines, Pyramid, bilinear};
+use markers::{Family, Marker, Match, SquareCode};
 use nalgebra::{Matrix2, SMatrix};
 
-use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
 use crate::pose::square_pose;
-use crate::square::code::Code;
 use crate::square::damaged::{Damaged, Sought};
 use crate::square::decode::{Cells, Layout, Look};
 use crate::square::pattern::Pattern;
@@ -66,7 +62,7 @@ pub(crate) const JOINED_SHARE: f64 = 0.015;
 /// One family that is looked for, and which of its ids.
 #[derive(Debug)]
 struct Wanted {
-    code: &'static Code,
+    code: &'static SquareCode,
     /// Indices of the cells it shares with other families: with its border, and with one that is a cell wider.
     layouts: [Option<usize>; 2],
     markers: Vec<Marker>,
@@ -79,7 +75,7 @@ impl Wanted {
     /// How many markers are looked for.
     fn words(&self) -> usize {
         let any_id = self.markers.iter().any(|m| m.id.is_none());
-        if any_id { self.code.words.len() } else { self.markers.len() }
+        if any_id { self.code.codewords.len() } else { self.markers.len() }
     }
 }
 
@@ -129,7 +125,7 @@ impl Squares {
     pub fn new(markers: &[Marker], inverted: bool) -> Self {
         let mut squares = Self { inverted, ..Self::default() };
         for marker in markers {
-            let Some(code) = Code::of(marker.family) else {
+            let Some(code) = SquareCode::for_family(marker.family) else {
                 continue;
             };
             if let Some(known) = squares.wanted.iter_mut().find(|w| w.code.family == marker.family)
@@ -157,7 +153,7 @@ impl Squares {
     }
 
     /// Index of a code's cells, which other codes may have in common; those with wider borders come last.
-    fn layout(&mut self, code: &Code, extra_border: u8) -> Option<usize> {
+    fn layout(&mut self, code: &SquareCode, extra_border: u8) -> Option<usize> {
         let known = self.layouts.iter().position(|layout| layout.fits(code, extra_border));
         if known.is_none() {
             self.layouts.push(Layout::of(code, extra_border)?);
@@ -241,8 +237,8 @@ impl Squares {
             return None;
         }
         let code = wanted.code;
-        let found = code.match_word(self.cells.word(), most_wrong(code));
-        let found = found.filter(|(found, turns, _)| (*found, *turns) == (id, 0))?;
+        let found = code.nearest(self.cells.word(), most_wrong(code));
+        let found = found.filter(|found| (found.id, found.rotation) == (id, 0))?;
         let found = self.admit(&quad, (index, 0), found).ok()?;
         let refined = found.refined((view, true), wanted, camera, &mut self.scratch)?;
         Some(observed(&found, wanted, refined, camera))
@@ -404,7 +400,7 @@ impl Squares {
             Sought { index, code: wanted.code, ids: (!any).then_some(wanted.missing.as_slice()) }
         });
         let (known, inverted) = (&self.found, self.inverted);
-        let is_open = |quad: &Quad, code: &Code| {
+        let is_open = |quad: &Quad, code: &SquareCode| {
             (inverted || quad.inverted == code.reversed_border)
                 && !known.iter().any(|found| covers(&found.corners, &quad.corners))
         };
@@ -443,16 +439,16 @@ impl Squares {
                 continue;
             }
             let most = most_wrong(wanted.code);
-            let Some((id, turns, wrong_bits)) = wanted.code.match_word(word, most) else {
+            let Some(nearest) = wanted.code.nearest(word, most) else {
                 continue;
             };
             let is_better = match &best {
-                Ok(Found { wrong_bits: least, .. }) => wrong_bits < *least,
+                Ok(Found { wrong_bits: least, .. }) => nearest.hamming < *least,
                 Err(_) => true,
             };
             if is_better {
                 let extra_border = self.layouts[layout].extra_border;
-                best = self.admit(quad, (index, extra_border), (id, turns, wrong_bits));
+                best = self.admit(quad, (index, extra_border), nearest);
             }
         }
         best
@@ -463,7 +459,7 @@ impl Squares {
         &self,
         quad: &Quad,
         (index, extra_border): (usize, u8),
-        (id, turns, wrong_bits): (u32, u8, u8),
+        Match { id, rotation, hamming }: Match,
     ) -> Result<Found, Reason> {
         let wanted = self.wanted.get(index).ok_or(Reason::Unwanted)?;
         if !wanted.markers.iter().any(|m| m.id.is_none_or(|wanted| wanted == id)) {
@@ -472,9 +468,9 @@ impl Squares {
         if quad.inverted != wanted.code.reversed_border && !self.inverted {
             return Err(Reason::Unwanted);
         }
-        let word = wanted.code.words.get(id as usize).ok_or(Reason::Unwanted)?;
+        let word = wanted.code.codewords.get(id as usize).ok_or(Reason::Unwanted)?;
         // The word as it stands in the picture.
-        let seen = (0..(4 - turns) % 4).fold(*word, |word, _| wanted.code.turned(word));
+        let seen = (0..(4 - rotation) % 4).fold(*word, |word, _| wanted.code.rotated(word));
         let explanation = self.cells.explain(seen);
         let [dark, bright] = explanation.levels;
         // A marker printed in the other colours has them the other way round.
@@ -484,7 +480,7 @@ impl Squares {
         let explained = explanation.explained;
         let bits = wanted.code.bits.len();
         let evidence =
-            chance::evidence(wanted.code, *word, wanted.words(), bits as u32, wrong_bits.into());
+            chance::evidence(wanted.code, *word, wanted.words(), bits as u32, hamming.into());
         let is_sure = evidence >= SURE_BITS;
         if explained < if is_sure { LEAST_EXPLAINED_SURE } else { LEAST_EXPLAINED } {
             return Err(Reason::Confidence);
@@ -499,13 +495,13 @@ impl Squares {
             return Err(Reason::Confidence);
         }
         let mut corners = quad.corners;
-        corners.rotate_left(usize::from(turns) % 4);
+        corners.rotate_left(usize::from(rotation) % 4);
         Ok(Found {
             wanted: index,
             id,
             extra_border,
             corners,
-            wrong_bits,
+            wrong_bits: hamming,
             explained,
             margin,
             corner_px: OUTLINED_PX,
@@ -524,7 +520,7 @@ fn mean_side(corners: &[Pixel; 4]) -> f64 {
 }
 
 /// How many wrong bits are mended. Families of few bits have words near most words; theirs must be read as they are.
-fn most_wrong(code: &Code) -> u8 {
+fn most_wrong(code: &SquareCode) -> u8 {
     match code.min_hamming {
         0..=6 => 0,
         7..=9 => 1,
@@ -535,7 +531,7 @@ fn most_wrong(code: &Code) -> u8 {
 
 /// How many cells the border of a family's markers may be wider than the code says: grids for calibration have borders of
 /// two cells. Only words that chance does not spell are read so.
-fn wider_by(code: &Code) -> u8 {
+fn wider_by(code: &SquareCode) -> u8 {
     u8::from(code.min_hamming >= 9 && !code.reversed_border)
 }
 
@@ -625,7 +621,7 @@ impl Found {
         camera: Option<&CameraModel>,
         scratch: &mut Scratch,
     ) -> Option<Refined> {
-        let word = wanted.code.words.get(self.id as usize)?;
+        let word = wanted.code.codewords.get(self.id as usize)?;
         let pattern = Pattern::bordered(wanted.code, *word, self.extra_border)?;
         refine_from((view, &self.corners, are_near), &pattern, camera, scratch)
     }

@@ -6,7 +6,6 @@
 //! with dots left out that are hidden or washed out. Then the whole marker is compared with the image: its outline and the disc's edge where they are wide enough apart, the picture
 //! as a whole where they are not.
 
-pub(crate) mod code;
 mod damaged;
 mod dots;
 mod picture;
@@ -15,11 +14,10 @@ mod samples;
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Pyramid, bilinear};
+use markers::{Codebook, Family, Marker, stag_code};
 
-use crate::marker::{Family, Marker};
 use crate::observation::{Observation, Stages};
 use crate::pose::square_pose;
-use crate::square::codebook::Codebook;
 use crate::square::decode::Grid;
 use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
 use crate::square::refine::{Refined, Scratch, refine_design};
@@ -118,7 +116,7 @@ impl Stags {
     pub(crate) fn new(markers: &[Marker], inverted: bool) -> Self {
         let mut stags = Self { inverted, ..Self::default() };
         for marker in markers {
-            let Some(book) = code::book(marker.family) else { continue };
+            let Some(book) = stag_code::codebook(marker.family) else { continue };
             match stags.wanted.iter_mut().find(|w| w.markers[0].family == marker.family) {
                 Some(known) => known.markers.push(*marker),
                 None => {
@@ -129,7 +127,7 @@ impl Stags {
         }
         for wanted in &mut stags.wanted {
             wanted.tried = if wanted.markers.iter().any(|m| m.id.is_none()) {
-                (0..wanted.book.words().len() as u32).collect()
+                (0..wanted.book.codewords().len() as u32).collect()
             } else {
                 wanted.markers.iter().filter_map(|m| m.id).collect()
             };
@@ -224,7 +222,7 @@ impl Stags {
         found: &mut Vec<Observation>,
     ) {
         for paper in papers {
-            let share = 1.0 / (1.0 + 2.0 * code::QUIET);
+            let share = 1.0 / (1.0 + 2.0 * stag_code::QUIET_ZONE);
             let quad = Quad { inverted: false, ..paper.scaled(share) };
             if self.places.iter().any(|place| covers(place, &quad.corners)) {
                 continue;
@@ -299,7 +297,7 @@ impl Stags {
         let (level, places) = on_level(&quad.corners, SAMPLED_PX, pyramid);
         let image = pyramid.level(view, level)?;
         let seen = sample(image, &places, quad.inverted)?;
-        let is_whole = seen.known.count_ones() as usize == code::DOTS;
+        let is_whole = seen.known.count_ones() as usize == stag_code::DOTS;
         let is_plain = is_whole && seen.intact >= LEAST_INTACT_PLAIN && !seen.washed_out;
         let (explained, evidence) = if plain {
             (LEAST_EXPLAINED_PLAIN, LEAST_EVIDENCE_PLAIN)
@@ -449,7 +447,7 @@ impl Wanted {
         let reading = |id: u32, turns: u8| {
             // The word as it stands in the picture.
             let seen = (0..(4 - turns) % 4)
-                .fold(*self.book.words().get(id as usize)?, |word, _| self.book.turned(word));
+                .fold(*self.book.codewords().get(id as usize)?, |word, _| self.book.rotated(word));
             let explanation = dots.explain(seen);
             let [black, white] = explanation.levels;
             ((white > black) != inverted).then(|| Reading {
@@ -465,7 +463,7 @@ impl Wanted {
         if self.tried.is_empty() {
             let found = self.book.nearest(word, self.most_wrong())?;
             let is_wanted = self.markers.iter().any(|m| m.id.is_none_or(|id| id == found.id));
-            let reading = reading(found.id, found.quarter_turns).filter(|_| is_wanted)?;
+            let reading = reading(found.id, found.rotation).filter(|_| is_wanted)?;
             return Some(Reading { ratio: 2.0 * LEAST_RATIO, ..reading });
         }
         let mut best: Option<Reading> = None;
@@ -492,7 +490,7 @@ impl Wanted {
     fn agreement(&self, seen: &Sampled) -> Option<Agreement> {
         let distance = self.distance();
         if self.markers.iter().any(|m| m.id.is_none()) {
-            return seen.agreement(self.book, 0..self.book.words().len() as u32, distance);
+            return seen.agreement(self.book, 0..self.book.codewords().len() as u32, distance);
         }
         seen.agreement(self.book, self.markers.iter().filter_map(|m| m.id), distance)
     }

@@ -9,11 +9,11 @@
 
 use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
+use markers::Family;
 use nalgebra::Vector3;
 
 use crate::detector::{Detector, Expected};
 use crate::families::rings::circle_pose::CirclePose;
-use crate::marker::Family;
 use crate::observation::{Observation, Stages};
 use crate::trace::{Trace, moved_pixel};
 

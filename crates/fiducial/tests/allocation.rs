@@ -3,9 +3,10 @@
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
 use allocation_counter::{AllocationInfo, measure};
-use fiducial::{Detector, Marker, Settings};
+use fiducial::{Detector, Settings};
 use geometry::CameraModel;
 use imaging::GrayView;
+use markers::Marker;
 use rendering::views::{Binning, Studio, View};
 
 /// What a detector may allocate at first, in frames.

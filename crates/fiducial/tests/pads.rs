@@ -2,8 +2,9 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
-use fiducial::{Detector, Marker, Observation, Pad, PadObservation, Settings};
+use fiducial::{Detector, Observation, PadObservation, Settings, observe_pad};
 use geometry::{Body, Camera, CameraModel, Marker as MarkerFrame, Ned, Point, Rotation, Transform};
+use markers::{Marker, Pad};
 use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
 
 /// Four markers about the landing point, two of them turned.
@@ -80,7 +81,7 @@ impl Over {
     }
 
     fn observe(&self, found: &[Observation]) -> Option<PadObservation> {
-        self.pad.observe(found, &self.camera)
+        observe_pad(&self.pad, found, &self.camera)
     }
 }
 
@@ -157,7 +158,7 @@ fn a_marker_that_lies_elsewhere_is_left_out() {
     for (right, wrong) in [("x_m = 0.15", "x_m = 0.18"), ("x_m = -0.1\n", "x_m = -0.07\n")] {
         assert!(FOUR.contains(right));
         let pad: Pad = FOUR.replace(right, wrong).parse().unwrap();
-        let seen = pad.observe(&found, &over.camera).unwrap();
+        let seen = observe_pad(&pad, &found, &over.camera).unwrap();
         assert_eq!((seen.used, seen.left_out), (3, 1), "{right}");
         assert!(apart(&seen.pose.camera_from_marker, &truth) < 0.001, "{seen:?}");
     }
@@ -170,31 +171,6 @@ fn rings_alone_are_a_pad_only_in_its_middle() {
     let seen = over.observe(&found).unwrap();
     assert!(apart(&seen.pose.camera_from_marker, &truth) < 0.003, "{seen:?}");
     let aside: Pad = "id = 1\nmarkers = [{ marker = \"rings:0.15\", x_m = 0.1 }]".parse().unwrap();
-    assert_eq!(aside.observe(&found, &over.camera), None);
-    assert_eq!(aside.observe(&[], &over.camera), None);
-}
-
-#[test]
-fn wrong_descriptions_say_what_is_wrong() {
-    let problem = |text: &str| text.parse::<Pad>().unwrap_err().to_string();
-    let check = |text: &str, part: &str| {
-        let problem = problem(text);
-        assert!(problem.contains(part), "`{part}` is not in: {problem}");
-    };
-    check("id = 1\nmarkers = []", "from 1 to 32");
-    check(
-        "id = 1\nmarkers = [{ marker = \"rings\" }]",
-        "marker 1, `rings`: a marker of a pad needs a size",
-    );
-    check("id = 1\nmarkers = [{ marker = \"apriltag-16h5:*:0.1\" }]", "needs an id");
-    check("id = 1\nmarkers = [{ marker = \"rings:0.1\" }, { marker = \"rings:0.2\" }]", "twice");
-    check("id = 1\nmarkers = [{ marker = \"rings:0.1\", x_m = 11 }]", "from -10 to 10");
-    check("id = 1\nmarkers = [{ marker = \"rings:0.1\", x_m = nan }]", "x_m of marker 1");
-    check("id = 1\nmarkers = [{ marker = \"rings:0.1\", quarter_turns = 4 }]", "from 0 to 3");
-    check("id = 1\ntolerance_m = 1\nmarkers = [{ marker = \"rings:0.1\" }]", "tolerance_m");
-    check("markers = [{ marker = \"rings:0.1\" }]", "missing field `id`");
-    check("id = 1\nsize = 3\nmarkers = []", "unknown field `size`");
-    let missing = Pad::named("no/such.toml", |_| Err("there is no such file"));
-    let missing = missing.unwrap_err().to_string();
-    assert!(missing.contains("no/such.toml") && missing.contains("a4"), "{missing}");
+    assert_eq!(observe_pad(&aside, &found, &over.camera), None);
+    assert_eq!(observe_pad(&aside, &[], &over.camera), None);
 }

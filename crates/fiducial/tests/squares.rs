@@ -1,19 +1,20 @@
 //! Square markers as printed boards and cheap cameras show them.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
-use fiducial::square::code::Code;
-use fiducial::{Detector, Family, Marker, Observation, Settings};
+use fiducial::{Detector, Observation, Settings};
 use imaging::GrayImage;
+use markers::SquareCode;
+use markers::{Family, Marker};
 
 /// Black, white and the ground.
 const GREYS: [f64; 3] = [30.0, 200.0, 120.0];
 
 /// Whether a marker with a border of `border` cells is white at a place in cells from its top left corner.
-fn is_white(code: &Code, id: usize, border: usize, [x, y]: [f64; 2]) -> bool {
+fn is_white(code: &SquareCode, id: usize, border: usize, [x, y]: [f64; 2]) -> bool {
     let extra = border as f64 - 1.0;
     let cell = [x - extra, y - extra].map(|at| at.floor() as i8);
     let Some(bit) = code.bits.iter().position(|bit| *bit == cell) else { return false };
-    code.words[id] >> (code.bits.len() - 1 - bit) & 1 == 1
+    code.codewords[id] >> (code.bits.len() - 1 - bit) & 1 == 1
 }
 
 /// An image of `size` pixels of what is at each place, each pixel the mean of a box of `blur` pixels.
@@ -48,7 +49,7 @@ fn turned([x, y]: [f64; 2], middle: [f64; 2], angle: f64, unit: f64) -> [f64; 2]
 
 #[test]
 fn a_border_of_two_cells_is_read_and_its_outer_corners_are_found() {
-    let code = Code::of(Family::AprilTag36h11).unwrap();
+    let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
     let across = f64::from(code.cells) + 2.0;
     for (cell_px, angle) in [(2.2, 0.2), (4.0, 0.7), (6.0, 1.3)] {
         let middle = [80.2, 79.7];
@@ -85,7 +86,7 @@ fn a_border_of_two_cells_is_read_and_its_outer_corners_are_found() {
 
 #[test]
 fn a_scratched_border_does_not_hide_a_marker_of_eighty_pixels() {
-    let code = Code::of(Family::Aruco6x6_250).unwrap();
+    let code = SquareCode::for_family(Family::Aruco6x6_250).unwrap();
     let middle = [80.4, 80.1];
     for step in 0..6 {
         let angle = 0.1 + 0.25 * f64::from(step);
@@ -106,7 +107,7 @@ fn a_scratched_border_does_not_hide_a_marker_of_eighty_pixels() {
 
 #[test]
 fn a_tag_of_twelve_pixels_that_a_camera_sharpened_is_read() {
-    let code = Code::of(Family::AprilTag36h11).unwrap();
+    let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
     let mut found_all = 0;
     for id in 0..20 {
         let middle = [30.3, 29.8];
@@ -140,7 +141,7 @@ fn a_tag_of_twelve_pixels_that_a_camera_sharpened_is_read() {
 
 /// Markers of 60 pixels, side by side on paper, the last one with a corner under something white.
 fn board(markers: usize, inverted: bool) -> GrayImage {
-    let code = Code::of(Family::Aruco4x4_50).unwrap();
+    let code = SquareCode::for_family(Family::Aruco4x4_50).unwrap();
     picture([40 + 90 * markers, 130], 1.0, |[x, y]| {
         let marker = ((x - 20.0) / 90.0).floor().clamp(0.0, markers as f64 - 1.0);
         let place = [x - 35.0 - 90.0 * marker, y - 35.0].map(|v| v / 10.0);
@@ -188,14 +189,14 @@ fn markers_in_the_other_colours_can_be_left_out() {
 #[test]
 fn a_small_marker_beside_a_large_one_is_found_by_who_is_thorough() {
     let marker = "rings:1".parse().unwrap();
-    let drawing = fiducial::Drawing::new(&marker, 1.0).unwrap();
+    let drawing = markers::Drawing::new(&marker, 1.0).unwrap();
     let places = [([150.3, 130.7], 200.0), ([310.6, 80.2], 40.0)];
     let image = picture([360, 260], 1.0, |[x, y]| {
         let on = |(middle, size): ([f64; 2], f64)| {
             let [u, v] = [(x - middle[0]) / size, (middle[1] - y) / size];
             let ink = drawing.ink_at(u, v);
             (u.abs().max(v.abs()) < drawing.half_extent_m)
-                .then_some(GREYS[usize::from(ink == fiducial::Ink::White)])
+                .then_some(GREYS[usize::from(ink == markers::Ink::White)])
         };
         places.into_iter().find_map(on).unwrap_or(GREYS[2])
     });

@@ -2,9 +2,10 @@
 //! and printed the other way round.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop anywhere")]
 
-use fiducial::{Detector, Drawing, Family, Ink, Marker, Observation, Settings};
+use fiducial::{Detector, Observation, Settings};
 use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
+use markers::{Drawing, Family, Ink, Marker};
 
 const SIDE: usize = 72;
 /// Width and height of the images of markers of which a part cannot be seen.

@@ -1,23 +1,24 @@
-//! What a marker looks like: shapes painted one over the other, in the marker's plane.
+//! What a marker looks like: layers of shapes in the marker's plane.
 //!
-//! A family's drawing is that of its reference: the bitmaps of AprilTag and OpenCV cell by cell (white where AprilTag's
-//! pictures are transparent), STag as its marker generator paints it, without the id in letters. One description
-//! serves the printer (SVG, PDF, PNG), the simulator's camera and the tests.
+//! A family's drawing is that of its reference implementation: the bitmaps of AprilTag and OpenCV cell by cell (white
+//! where AprilTag's pictures are transparent), STag as its marker generator paints it, without the id in letters.
+//! Printing (SVG, PDF, PNG), the simulated camera and the tests use this one description.
 
 use crate::marker::{Family, Marker};
-use crate::square::code::Code;
-use crate::square::codebook;
+use crate::ring_design::RING_RADII;
+use crate::square_code::SquareCode;
+use crate::tables;
 
 mod cover;
 mod square;
 mod stag;
 
-/// What a shape is painted with.
+/// The colour of a shape.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Ink {
-    /// No light comes back.
+    /// Reflects no light.
     Black,
-    /// All light comes back.
+    /// Reflects all light.
     White,
 }
 
@@ -49,37 +50,33 @@ pub struct Layer {
     pub ink: Ink,
 }
 
-/// A marker as layers on paper; later layers hide earlier ones. Around and under them the paper is white.
+/// A marker as layers on white paper; later layers hide earlier ones.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Drawing {
-    /// Half the edge of the square the layers and their quiet zone need, in metres.
+    /// Half the edge of the square that the layers and their quiet zone fill, in metres.
     pub half_extent_m: f64,
     /// The layers, bottom first.
     pub layers: Vec<Layer>,
 }
 
-/// Inner and outer radius of the three rings, outer ring first, in units of `x`, the inner radius of the
-/// innermost ring (Table 3.1). The marker's size is twice the outermost radius.
-pub const RING_RADII: [(f64, f64); 3] = [(40.0, 50.0), (15.0, 25.0), (1.0, 3.0)];
-
 impl Drawing {
-    /// The drawing of `marker` at `size_m`, whatever size the marker itself states; `None` without an id that the family
-    /// has.
+    /// The drawing of `marker` at `size_m`, whatever size the marker itself states; `None` when the family has ids and
+    /// this is none of them.
     pub fn new(marker: &Marker, size_m: f64) -> Option<Self> {
         match (marker.family, marker.id) {
             (Family::Rings | Family::RingsThesis, _) => Some(rings(size_m)),
             (family, Some(id)) => {
-                let word = *codebook::words(family).get(id as usize)?;
-                Some(match Code::of(family) {
-                    Some(code) => square::drawing(code, word, size_m),
-                    None => stag::drawing(word, size_m),
+                let codeword = *tables::codewords(family).get(id as usize)?;
+                Some(match SquareCode::for_family(family) {
+                    Some(code) => square::drawing(code, codeword, size_m),
+                    None => stag::drawing(codeword, size_m),
                 })
             }
             (_, None) => None,
         }
     }
 
-    /// Ink at a place in the marker's plane (metres, x right, y up).
+    /// Ink at a point of the marker's plane (metres, x right, y up).
     pub fn ink_at(&self, x_m: f64, y_m: f64) -> Ink {
         let covers = |layer: &&Layer| match layer.shape {
             Shape::Disc { centre_m: [x, y], radius_m } => (x_m - x).hypot(y_m - y) <= radius_m,

@@ -1,4 +1,4 @@
-//! What is looked for: a marker's family, id and size, written `family:id:size`.
+//! A marker's family, id and size, written `family:id:size`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -74,9 +74,9 @@ pub enum Family {
     StagHd21,
     /// STag of Hamming distance 23: 6 ids, a square with a white disc of 48 dots in it.
     StagHd23,
-    /// The three-ring marker of the thesis, found by the detector of Algorithms 1-15 with its three faults mended.
+    /// The three-ring marker of the thesis.
     Rings,
-    /// The same marker, found by Algorithms 1-15 to the letter.
+    /// The same marker, to be detected by the thesis' Algorithms 1-15 to the letter.
     RingsThesis,
 }
 
@@ -213,7 +213,7 @@ impl fmt::Display for Family {
 pub struct Marker {
     /// Its family.
     pub family: Family,
-    /// Its id; `None` for a family without ids, and for any id of a family with ids.
+    /// Its id; `None` for a family without ids, and to stand for any id of a family.
     pub id: Option<u32>,
     /// Its size in metres (for rings the outer diameter of the outer ring); `None` when unknown, and then a
     /// detection has no pose.
@@ -233,7 +233,7 @@ pub enum MarkerError {
         /// The families there are.
         known: String,
     },
-    /// An id that is no number or outside the family, or something after the size.
+    /// An id that is not a number of the family, or text after the size.
     #[error("marker `{text}`: {problem}")]
     Id {
         /// The whole text.
@@ -241,7 +241,7 @@ pub enum MarkerError {
         /// What is wrong with the id.
         problem: String,
     },
-    /// A size that is no number or outside the limits.
+    /// A size that is not a number within the limits.
     #[error("marker `{text}`: the size `{size}` is not a number of metres from {min} to {max}", min = Marker::SIZE_LIMITS_M.0, max = Marker::SIZE_LIMITS_M.1)]
     Size {
         /// The whole text.
@@ -255,7 +255,7 @@ impl Marker {
     /// The sizes a marker may have, in metres.
     pub const SIZE_LIMITS_M: (f64, f64) = (0.001, 100.0);
 
-    /// The marker's name without its size: `family:id`, or `family` where there is no id or any will do.
+    /// The marker's name without its size: `family:id`, or `family` without an id.
     pub fn name(&self) -> String {
         match self.id {
             Some(id) => format!("{}:{id}", self.family),
@@ -263,7 +263,7 @@ impl Marker {
         }
     }
 
-    /// Whether a marker of this family and id is one of those that are looked for.
+    /// Whether a marker of this family and id is this marker or one of those that it stands for.
     pub fn includes(&self, family: Family, id: Option<u32>) -> bool {
         self.family == family && (self.id.is_none() || self.id == id)
     }
@@ -377,7 +377,7 @@ mod tests {
     fn wrong_markers_say_what_is_wrong() {
         let problem = |text: &str| text.parse::<Marker>().unwrap_err().to_string();
         assert!(problem("ring").contains("known are apriltag-16h5, "));
-        assert!(problem("rings:nought").contains("`nought` is not a number of metres"));
+        assert!(problem("rings:zero").contains("`zero` is not a number of metres"));
         assert!(problem("rings:0").contains("from 0.001 to 100"));
         assert!(problem("rings:NaN").contains("NaN"));
         assert!(problem("rings:1:2").contains("`2` follows the size"));

@@ -1,23 +1,24 @@
-//! What the dots of an STag mean, and where they lie. Lengths are in units of the black square's edge, from the marker's
+//! What the dots of an STag mean and where they lie. Lengths are in units of the black square's edge, from the marker's
 //! centre, x right, y up.
 //!
 //! The numbers are those of STag's marker generator at 53a3667 (github.com/bbenligiray/stag).
 
 use std::sync::OnceLock;
 
+use crate::codebook::Codebook;
 use crate::marker::Family;
-use crate::square::codebook::{self, Codebook};
+use crate::tables;
 
-/// Width of the white paper around the black square.
-pub(crate) const QUIET: f64 = 0.125;
+/// Width of the quiet zone around the black square.
+pub const QUIET_ZONE: f64 = 0.125;
 /// Radius of the white disc.
-pub(crate) const DISC_RADIUS: f64 = 0.4;
+pub const DISC_RADIUS: f64 = 0.4;
 /// Radius of the circle that the outermost dots touch from within.
 const CODE_RADIUS: f64 = 0.35;
 /// Radius of a dot.
-pub(crate) const DOT_RADIUS: f64 = 2.0 * CODE_RADIUS * 0.062_482_177_287_080;
+pub const DOT_RADIUS: f64 = 2.0 * CODE_RADIUS * 0.062_482_177_287_080;
 /// Number of dots.
-pub(crate) const DOTS: usize = 48;
+pub const DOTS: usize = 48;
 
 /// The dots of the first quadrant: distance in diameters of the circle of code, and angle.
 const QUADRANT: [(f64, f64); 12] = {
@@ -39,7 +40,7 @@ const QUADRANT: [(f64, f64); 12] = {
 };
 
 /// The centre of each dot, that of the most significant bit first; a set bit is a black dot.
-pub(crate) fn dots() -> [[f64; 2]; DOTS] {
+pub fn dots() -> [[f64; 2]; DOTS] {
     std::array::from_fn(|k| {
         let (distance, angle) = QUADRANT[k % QUADRANT.len()];
         let angle = angle + std::f64::consts::FRAC_PI_2 * (k / QUADRANT.len()) as f64;
@@ -49,13 +50,13 @@ pub(crate) fn dots() -> [[f64; 2]; DOTS] {
     })
 }
 
-/// Whether dot `k` is black in a word.
-pub(crate) fn is_black(word: u64, k: usize) -> bool {
-    word >> (DOTS - 1 - k) & 1 == 1
+/// Whether dot `k` is black in a codeword.
+pub fn is_black(codeword: u64, k: usize) -> bool {
+    codeword >> (DOTS - 1 - k) & 1 == 1
 }
 
-/// The words of a family of STags and the search among them; `None` for other families. Prepared at the first call.
-pub(crate) fn book(family: Family) -> Option<&'static Codebook> {
+/// The codebook of a family of STags; `None` for other families. Prepared at the first call.
+pub fn codebook(family: Family) -> Option<&'static Codebook> {
     static BOOKS: [OnceLock<Codebook>; 7] = [const { OnceLock::new() }; 7];
     let slot = match family {
         Family::StagHd11 => 0,
@@ -68,8 +69,8 @@ pub(crate) fn book(family: Family) -> Option<&'static Codebook> {
         _ => return None,
     };
     // Counted from the next corner, clockwise, a dot is where the one a quarter turn behind it was.
-    let turn: [u8; DOTS] = std::array::from_fn(|k| ((k + 3 * DOTS / 4) % DOTS) as u8);
-    Some(BOOKS.get(slot)?.get_or_init(|| Codebook::new(codebook::words(family), &turn)))
+    let quarter_turn: [u8; DOTS] = std::array::from_fn(|k| ((k + 3 * DOTS / 4) % DOTS) as u8);
+    Some(BOOKS.get(slot)?.get_or_init(|| Codebook::new(tables::codewords(family), &quarter_turn)))
 }
 
 #[cfg(test)]
@@ -77,16 +78,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_word_of_every_family_is_read_in_every_orientation() {
+    fn every_codeword_of_every_family_is_read_in_every_rotation() {
         for family in Family::ALL {
-            let Some(book) = book(family) else { continue };
-            for (&word, id) in book.words().iter().zip(0u32..) {
+            let Some(book) = codebook(family) else { continue };
+            for (&word, id) in book.codewords().iter().zip(0u32..) {
                 let mut read = word;
-                for turns in [0, 3, 2, 1] {
+                for rotation in [0, 3, 2, 1] {
                     let found = book.nearest(read, 0).unwrap();
-                    let all = (found.id, found.quarter_turns, found.wrong_bits);
-                    assert_eq!(all, (id, turns, 0), "{family} {id}");
-                    read = book.turned(read);
+                    let all = (found.id, found.rotation, found.hamming);
+                    assert_eq!(all, (id, rotation, 0), "{family} {id}");
+                    read = book.rotated(read);
                 }
                 assert_eq!(read, word);
             }

@@ -15,10 +15,10 @@ mod sensor;
 
 use std::sync::Arc;
 
-use fiducial::{Drawing, Ink, Marker, Shape};
 use geometry::{
     Body, Camera, CameraModel, Distortion, Marker as MarkerFrame, Ned, Point, Rotation, Transform,
 };
+use markers::{Drawing, Ink, Marker, Shape};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -199,7 +199,7 @@ impl Studio {
     /// [`RenderError`] when the scene makes no sense.
     pub fn new(binning: Binning) -> Result<Self, RenderError> {
         let marker =
-            fiducial::Marker { family: fiducial::Family::Rings, id: None, size_m: Some(SIZE_M) };
+            markers::Marker { family: markers::Family::Rings, id: None, size_m: Some(SIZE_M) };
         let pad = PadInScene::flat(marker, 0.0, 0.0, 0.0);
         let ned_from_marker = pad.ned_from_marker;
         let scene =

@@ -5,11 +5,11 @@
     reason = "helpers of tests fail like tests, and print what they measure"
 )]
 
-use fiducial::{Drawing, Ink, Layer, Marker, Shape};
 use geometry::{
     Body, Camera, CameraModel, Distortion, Marker as MarkerFrame, Ned, Pixel, Point, Rotation,
     Transform, Vector,
 };
+use markers::{Drawing, Ink, Layer, Marker, Shape};
 use rendering::{CameraSettings, PadInScene, RenderError, Renderer, Scene, Surface};
 
 const WIDTH: usize = 1296;

@@ -6,10 +6,11 @@ use anyhow::Context;
 use experiments::score::quantile;
 use experiments::sets::{MARKERS, SIZE_M, Set};
 use experiments::shot::{Shot, Studio};
-use fiducial::{Detector, Marker};
+use fiducial::Detector;
 use geometry::{CameraModel, Pixel};
 use imaging::GrayImage;
 use jpeg_encoder::{ColorType, Encoder};
+use markers::Marker;
 
 /// How a frame is sent: pixels along the edge of one of what is sent, and its quality; without one, as it is.
 const WAYS: [(usize, Option<u8>); 13] = [

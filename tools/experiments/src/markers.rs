@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use fiducial::{Family, Marker};
+use markers::{Family, Marker};
 
 use crate::figures::{self, FIGURES};
 use crate::photographs;

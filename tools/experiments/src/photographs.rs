@@ -5,8 +5,9 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::Context;
-use fiducial::{Detector, Family, Marker, Settings};
+use fiducial::{Detector, Settings};
 use image::GrayImage;
+use markers::{Family, Marker};
 use serde::Deserialize;
 
 use crate::record::{self, Found, Record};

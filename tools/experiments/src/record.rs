@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use fiducial::tracking::{Tracker, TrackingSettings};
-use fiducial::{Detector, Marker, Observation, Settings};
+use fiducial::{Detector, Observation, Settings};
 use image::GrayImage;
 use imaging::GrayView;
+use markers::Marker;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 

@@ -8,8 +8,8 @@ mod sweeps;
 
 use std::f64::consts::{PI, TAU};
 
-use fiducial::Marker;
 use geometry::{CameraModel, Distortion, Pixel};
+use markers::Marker;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rendering::views::{Binning, HIGHEST_M, laterals_m};

@@ -3,10 +3,10 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use fiducial::{Drawing, Ink, Layer, Marker, Shape};
 use geometry::{
     Camera, CameraModel, Marker as MarkerFrame, Ned, Pixel, Point, Rotation, Transform,
 };
+use markers::{Drawing, Ink, Layer, Marker, Shape};
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -208,7 +208,7 @@ fn pad(shot: &Shot) -> PadInScene {
     let mut place = || rng.random_range(-20.0..20.0);
     let (north_m, east_m, heading) = (place(), place(), place());
     let marker = shot.marker.unwrap_or(Marker {
-        family: fiducial::Family::Rings,
+        family: markers::Family::Rings,
         id: None,
         size_m: Some(0.1),
     });

@@ -5,10 +5,10 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use fiducial::Marker;
 use geometry::{CameraModel, Distortion, Pixel, Point, Rotation, Transform};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
+use markers::Marker;
 use serde::{Deserialize, Serialize};
 
 use crate::sets::Set;

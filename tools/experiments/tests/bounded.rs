@@ -3,8 +3,9 @@
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
 use experiments::record::processor_ms;
-use fiducial::{Detector, Marker, Settings};
+use fiducial::{Detector, Settings};
 use imaging::GrayView;
+use markers::Marker;
 use rendering::views::{Binning, Studio, View};
 
 /// How many times as long as a normal frame of the same size any image may take.

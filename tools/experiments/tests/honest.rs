@@ -6,8 +6,9 @@
 use experiments::score;
 use experiments::sets::{MARKERS, SIZE_M, Set};
 use experiments::shot::{Shot, Studio};
-use fiducial::{Detector, Marker, Settings};
+use fiducial::{Detector, Settings};
 use imaging::GrayView;
+use markers::Marker;
 
 /// The median of the squared errors of two unknowns in units of their covariance, and what one in a hundred exceeds.
 const MEDIAN: f64 = 1.386;

@@ -2,8 +2,8 @@
 
 use airlink::AirConfig;
 use autopilot::Address;
-use fiducial::{Drawing, Marker, Pad};
 use geometry::{CameraModel, Point, Transform, Vector};
+use markers::{Drawing, Marker, Pad};
 use node::{Check, Settings};
 use rendering::{CameraSettings, PadInScene, Scene, Surface};
 use serde::Deserialize;

@@ -2,37 +2,7 @@
 
 use geometry::Pixel;
 use imaging::Ellipse;
-
-use crate::drawing::RING_RADII;
-
-/// Which of the marker's three rings.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum RingKind {
-    /// Seen from afar; inner radius 4/5 of the outer one.
-    Outer,
-    /// Between the others; inner radius 3/5 of the outer one.
-    Middle,
-    /// Seen from close up; inner radius 1/3 of the outer one.
-    Inner,
-}
-
-impl RingKind {
-    /// All kinds, in the thesis' order (types 0, 1, 2).
-    pub const ALL: [Self; 3] = [Self::Outer, Self::Middle, Self::Inner];
-
-    /// Inner and outer radius in units of the marker's size (its outermost diameter).
-    pub fn radii(self) -> (f64, f64) {
-        let (inner, outer) = RING_RADII[self as usize];
-        let size = 2.0 * RING_RADII[0].1;
-        (inner / size, outer / size)
-    }
-
-    /// Inner radius in units of the outer one.
-    pub fn ratio(self) -> f64 {
-        let (inner, outer) = self.radii();
-        inner / outer
-    }
-}
+use markers::RingKind;
 
 /// A black ring in an image: two ellipses about one another.
 #[derive(Copy, Clone, Debug, PartialEq)]

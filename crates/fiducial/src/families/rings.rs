@@ -16,16 +16,16 @@ mod photometric;
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::{from_level_0, to_level_0};
 use imaging::{Ellipse, GrayView, Outlines, Pyramid, outline};
+use markers::{Family, Marker, RingKind};
 
 use crate::candidates::ellipses::{Border, add_arcs, whole_border};
-use crate::candidates::ring::{Ring, RingKind};
+use crate::candidates::ring::Ring;
 use crate::candidates::ring_profile::{Candidate, candidates, speck};
 use crate::detector::{Allowed, SlowPass};
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, pixel_covariance, project};
 use crate::families::rings::edges::{Search, Seen};
 use crate::families::rings::focal_guess::{guess_lens, nominal_camera};
 use crate::families::rings::photometric::PixelSample;
-use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, PoseSolution, Stages};
 use crate::trace::{Reason, Trace};
 

@@ -10,11 +10,11 @@ use imaging::{
     BilateralRows, Contours, Ellipse, GrayImage, GrayView, Limits, bilateral_5x5, contour_area,
     fit_ellipse, threshold,
 };
+use markers::{Family, Marker, RingKind};
 use nalgebra::{Matrix2, Matrix3, Matrix6};
 
-use crate::candidates::ring::{Ring, RingKind};
+use crate::candidates::ring::Ring;
 use crate::families::rings::circle_pose::UNKNOWN_ANGLE_VARIANCE;
-use crate::marker::{Family, Marker};
 use crate::observation::{MarkerPose, Observation, Stages};
 use crate::trace::{Reason, Trace};
 

@@ -4,7 +4,7 @@
 //! shortest way to say it is long, in bits: bit by bit, or by its few different rows and which of them stands where, or
 //! by where its few white cells are. What remains of that after the choice among all words looked for and four turns is the evidence.
 
-use super::code::Code;
+use markers::SquareCode;
 
 /// Most rows and columns of bits.
 const MOST_LINES: usize = 16;
@@ -13,7 +13,7 @@ const WAY_BITS: f64 = 2.0;
 
 /// By how many bits the agreement with a word exceeds what chance gives among `words` words in four turns, when `bits` of
 /// the word's bits were read and `wrong` of these are not as they should be.
-pub(crate) fn evidence(code: &Code, word: u64, words: usize, bits: u32, wrong: u32) -> f64 {
+pub(crate) fn evidence(code: &SquareCode, word: u64, words: usize, bits: u32, wrong: u32) -> f64 {
     let all = code.bits.len() as f64;
     // What is simple about a word is so of the bits that were read as well, in proportion.
     let read = f64::from(bits) * (surprise(code, word) / all).min(1.0);
@@ -31,7 +31,7 @@ fn choices(n: u32, k: u32) -> f64 {
 }
 
 /// Length of the shortest way to say a word, in bits.
-fn surprise(code: &Code, word: u64) -> f64 {
+fn surprise(code: &SquareCode, word: u64) -> f64 {
     let (mut rows, mut columns) = ([0_u32; MOST_LINES], [0_u32; MOST_LINES]);
     let margin = code.margin() as i8;
     let mut across = 0;
@@ -67,24 +67,24 @@ fn surprise(code: &Code, word: u64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::marker::Family;
+    use markers::Family;
 
     #[test]
     fn stripes_say_little() {
-        let code = Code::of(Family::ArucoOriginal).unwrap();
+        let code = SquareCode::for_family(Family::ArucoOriginal).unwrap();
         // One white column on black, two, and two different rows.
         for (id, most) in [(0, 7.0), (682, 7.0), (255, 16.0)] {
-            let bits = surprise(code, code.words[id]);
+            let bits = surprise(code, code.codewords[id]);
             assert!(bits < most + 1e-9, "{id}: {bits}");
         }
-        let plain = code.words.iter().filter(|word| surprise(code, **word) > 22.0).count();
+        let plain = code.codewords.iter().filter(|word| surprise(code, **word) > 22.0).count();
         assert!(plain > 700, "{plain}");
     }
 
     #[test]
     fn evidence_falls_with_the_words_looked_for_and_those_that_are_mended() {
-        let code = Code::of(Family::AprilTag36h11).unwrap();
-        let word = code.words[5];
+        let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
+        let word = code.codewords[5];
         let one = evidence(code, word, 1, 36, 0);
         assert!((one - 34.0).abs() < 1e-9, "{one}");
         assert!((one - evidence(code, word, 512, 36, 0) - 9.0).abs() < 1e-9);
@@ -94,8 +94,8 @@ mod tests {
 
     #[test]
     fn any_word_of_any_family_is_weighed() {
-        for code in Family::ALL.into_iter().filter_map(Code::of) {
-            for word in code.words {
+        for code in Family::ALL.into_iter().filter_map(SquareCode::for_family) {
+            for word in code.codewords {
                 let bits = surprise(code, *word);
                 assert!(bits >= 3.0 && bits <= code.bits.len() as f64, "{} {word:x}", code.family);
             }

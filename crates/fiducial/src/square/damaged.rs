@@ -2,8 +2,8 @@
 //! closed outlines do not show them.
 
 use imaging::GrayView;
+use markers::SquareCode;
 
-use super::code::Code;
 use super::erasures::{Reading, Seen, has_border, have_same_cells, look};
 use super::quad::{Quad, diagonal_px, middle, sides_px};
 
@@ -13,7 +13,7 @@ pub struct Sought<'a> {
     /// What the caller knows the family by.
     pub index: usize,
     /// The family's code.
-    pub code: &'a Code,
+    pub code: &'a SquareCode,
     /// The ids; `None` stands for all.
     pub ids: Option<&'a [u32]>,
 }
@@ -55,7 +55,7 @@ impl Damaged {
         view: GrayView<'_>,
         quads: &[Quad],
         sought: impl Iterator<Item = Sought<'a>> + Clone,
-        is_open: impl Fn(&Quad, &Code) -> bool,
+        is_open: impl Fn(&Quad, &SquareCode) -> bool,
     ) -> &[DamagedMarker] {
         self.found.clear();
         let mut left = MOST_READ;
@@ -102,7 +102,7 @@ fn read<'a>(
     let shortest = sides_px(&quad.corners).into_iter().fold(f64::MAX, f64::min);
     // Families with the same cells see the same.
     let mut border: Option<(u8, bool)> = None;
-    let mut looked: Option<(&Code, Option<Seen>)> = None;
+    let mut looked: Option<(&SquareCode, Option<Seen>)> = None;
     for family in sought {
         let code = family.code;
         if shortest < LEAST_CELL_PX * f64::from(code.cells) {
@@ -139,10 +139,10 @@ fn is_same_place(a: &Quad, b: &Quad) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::marker::Family;
     use crate::square::segments::{ImageQuads, Scale};
     use geometry::Pixel;
     use imaging::{GrayImage, Pyramid};
+    use markers::Family;
 
     const SIDE: f64 = 80.0;
     const ID: u32 = 7;
@@ -150,7 +150,7 @@ mod tests {
     /// A marker on paper on grey ground, turned, with its middle at `centre`; `light` says what becomes of the grey value
     /// at a place, which is given in sides from the marker's middle and along its edges.
     fn picture(
-        code: &Code,
+        code: &SquareCode,
         centre: [f64; 2],
         turn: f64,
         light: impl Fn([f64; 2], f64) -> f64,
@@ -160,7 +160,7 @@ mod tests {
         let grey = |u: f64, v: f64| {
             let cell = [u, v].map(|at| ((at + 0.5) * cells).floor() as i8);
             let bit = code.bits.iter().position(|bit| *bit == cell);
-            let word = code.words[ID as usize] >> (code.bits.len() - 1 - bit.unwrap_or(0));
+            let word = code.codewords[ID as usize] >> (code.bits.len() - 1 - bit.unwrap_or(0));
             match (u.abs().max(v.abs()), bit) {
                 (_, Some(_)) => {
                     if word & 1 != 0 {
@@ -196,7 +196,7 @@ mod tests {
         (image, corners)
     }
 
-    fn find(image: &GrayImage, code: &Code, ids: Option<&[u32]>) -> Vec<DamagedMarker> {
+    fn find(image: &GrayImage, code: &SquareCode, ids: Option<&[u32]>) -> Vec<DamagedMarker> {
         let mut pyramid = Pyramid::default();
         let view = image.view().unwrap();
         pyramid.build(view, 4, 16);
@@ -214,7 +214,7 @@ mod tests {
         most_px: f64,
         light: impl Fn([f64; 2], f64) -> f64,
     ) {
-        let code = Code::of(family).unwrap();
+        let code = SquareCode::for_family(family).unwrap();
         for step in 0..8 {
             let turn = 0.1 + 0.8 * f64::from(step);
             let (image, corners) = picture(code, centre, turn, &light);
@@ -272,7 +272,7 @@ mod tests {
 
     #[test]
     fn cut_by_the_frame() {
-        let code = Code::of(Family::AprilTag36h11).unwrap();
+        let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
         // A corner is beyond the left edge of the frame.
         let (image, corners) = picture(code, [46.0, 120.0], std::f64::consts::FRAC_PI_4, |_, g| g);
         let found = find(&image, code, None);
@@ -285,7 +285,7 @@ mod tests {
 
     #[test]
     fn a_dark_square_and_another_id_are_no_such_marker() {
-        let code = Code::of(Family::AprilTag16h5).unwrap();
+        let code = SquareCode::for_family(Family::AprilTag16h5).unwrap();
         let (image, _) =
             picture(
                 code,
@@ -303,7 +303,7 @@ mod tests {
 
     #[test]
     fn any_image_is_survived() {
-        let code = Code::of(Family::AprilTagCircle21h7).unwrap();
+        let code = SquareCode::for_family(Family::AprilTagCircle21h7).unwrap();
         let mut random = 1_u32;
         for (width, height) in [(1, 1), (2, 9), (16, 16), (64, 48), (301, 7), (150, 150)] {
             for pattern in 0..4 {

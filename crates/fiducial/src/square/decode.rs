@@ -8,8 +8,8 @@
 use geometry::Pixel;
 use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Pyramid, bilinear};
+use markers::SquareCode;
 
-use crate::square::code::Code;
 use crate::square::mean_side;
 
 /// Most bits of a code, and with them the two values of known cells.
@@ -48,7 +48,7 @@ pub(crate) struct Layout {
 
 impl Layout {
     /// `None` for a code with more cells than any that is published.
-    pub(crate) fn of(code: &Code, extra_border: u8) -> Option<Self> {
+    pub(crate) fn of(code: &SquareCode, extra_border: u8) -> Option<Self> {
         let extra = usize::from(extra_border);
         let (cells, margin) = (usize::from(code.cells) + 2 * extra, usize::from(code.margin()));
         let across = cells + 2 * margin;
@@ -75,7 +75,7 @@ impl Layout {
     }
 
     /// Whether a code has these cells.
-    pub(crate) fn fits(&self, code: &Code, extra_border: u8) -> bool {
+    pub(crate) fn fits(&self, code: &SquareCode, extra_border: u8) -> bool {
         self.extra_border == extra_border
             && self.cells == usize::from(code.cells + 2 * extra_border)
             && self.reversed == code.reversed_border

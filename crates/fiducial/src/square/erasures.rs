@@ -8,9 +8,9 @@
 
 use geometry::Pixel;
 use imaging::GrayView;
+use markers::SquareCode;
 
 use super::chance;
-use super::code::Code;
 use super::quad::Quad;
 
 /// What a damaged marker says.
@@ -66,7 +66,7 @@ pub(crate) struct Seen {
 }
 
 /// Looks at the cells of a code in `quad`; `None` when it has no border and paper.
-pub(crate) fn look(view: GrayView<'_>, quad: &Quad, code: &Code) -> Option<Seen> {
+pub(crate) fn look(view: GrayView<'_>, quad: &Quad, code: &SquareCode) -> Option<Seen> {
     let place = Projection::of(&quad.corners)?;
     let look = Look { view, place: &place, cells: f64::from(code.cells), inverted: quad.inverted };
     let mut grid = Grid::new(code)?;
@@ -90,7 +90,7 @@ pub(crate) fn look(view: GrayView<'_>, quad: &Quad, code: &Code) -> Option<Seen>
 
 impl Seen {
     /// The marker of one family that it is. `wanted` are the ids that are looked for; `None` stands for all.
-    pub(crate) fn reading(&self, code: &Code, wanted: Option<&[u32]>) -> Option<Reading> {
+    pub(crate) fn reading(&self, code: &SquareCode, wanted: Option<&[u32]>) -> Option<Reading> {
         let (word, known) = self.grid.word(&self.cells, code);
         let mut reading = best_word(word, known, code, wanted)?;
         reading.intact = self.intact;
@@ -105,7 +105,7 @@ impl Seen {
 }
 
 /// Whether two codes have the same cells, in whatever order their bits are.
-pub(crate) fn have_same_cells(a: &Code, b: &Code) -> bool {
+pub(crate) fn have_same_cells(a: &SquareCode, b: &SquareCode) -> bool {
     let has =
         |cells: &[[i8; 2]], others: &[[i8; 2]]| others.iter().all(|cell| cells.contains(cell));
     a.cells == b.cells && a.bits.len() == b.bits.len() && has(a.bits, b.bits)
@@ -113,7 +113,7 @@ pub(crate) fn have_same_cells(a: &Code, b: &Code) -> bool {
 
 /// Whether the border is darker than what lies beside it, by nearly the same ratio for most of its cells: a shadow keeps
 /// the ratio of ink and paper.
-pub(crate) fn has_border(view: GrayView<'_>, quad: &Quad, code: &Code) -> bool {
+pub(crate) fn has_border(view: GrayView<'_>, quad: &Quad, code: &SquareCode) -> bool {
     let Some(place) = Projection::of(&quad.corners) else { return false };
     let cells = f64::from(code.cells);
     let mut ratios = [0.0_f32; 4 * MOST_ACROSS];
@@ -191,7 +191,7 @@ pub(crate) struct Light {
 
 impl Grid {
     /// The cells of a code, not yet sampled; `None` for a code with more cells than any that is published.
-    fn new(code: &Code) -> Option<Self> {
+    fn new(code: &SquareCode) -> Option<Self> {
         let margin = code.margin();
         let across = usize::from(code.cells + 2 * margin);
         if across > MOST_ACROSS {
@@ -240,7 +240,7 @@ impl Grid {
     }
 
     /// Says what each cell is.
-    fn name(&mut self, code: &Code) {
+    fn name(&mut self, code: &SquareCode) {
         let last = code.cells as i8 - 1;
         for index in 0..self.across * self.across {
             let [column, row] = self.cell(index);
@@ -458,7 +458,7 @@ impl Grid {
     }
 
     /// The bits, and which of them are known.
-    fn word(&self, read: &[Cell; MOST_CELLS], code: &Code) -> (u64, u64) {
+    fn word(&self, read: &[Cell; MOST_CELLS], code: &SquareCode) -> (u64, u64) {
         let (mut word, mut known) = (0, 0);
         for cell in code.bits {
             let cell = self.index(*cell).map_or(Cell::Unknown, |index| read[index]);
@@ -507,9 +507,9 @@ fn within(sample: usize) -> [f32; 2] {
 }
 
 /// The word that agrees best with the known bits.
-fn best_word(word: u64, known: u64, code: &Code, wanted: Option<&[u32]>) -> Option<Reading> {
+fn best_word(word: u64, known: u64, code: &SquareCode, wanted: Option<&[u32]>) -> Option<Reading> {
     let bits = known.count_ones();
-    let count = wanted.map_or(code.words.len(), <[u32]>::len);
+    let count = wanted.map_or(code.codewords.len(), <[u32]>::len);
     let chances = (4.0 * count as f32).log2();
     if (bits as f32) < LEAST_EVIDENCE + chances {
         return None;
@@ -529,25 +529,25 @@ fn best_word(word: u64, known: u64, code: &Code, wanted: Option<&[u32]>) -> Opti
         match wanted {
             Some(ids) => {
                 for id in ids {
-                    if let Some(expected) = code.words.get(*id as usize) {
+                    if let Some(expected) = code.codewords.get(*id as usize) {
                         look(*id, turns, ((expected ^ word) & known).count_ones());
                     }
                 }
             }
             None => {
-                for (expected, id) in code.words.iter().zip(0..) {
+                for (expected, id) in code.codewords.iter().zip(0..) {
                     look(id, turns, ((expected ^ word) & known).count_ones());
                 }
             }
         }
-        word = code.turned(word);
-        known = code.turned(known);
+        word = code.rotated(word);
+        known = code.rotated(known);
     }
     let (wrong, id, quarter_turns) = best;
     let erased = code.bits.len() as u32 - bits;
     // As many as the words' distance allows for when so many bits are missing.
     let correctable = u32::from(code.min_hamming).saturating_sub(erased + 1) / 2;
-    let expected = code.words.get(id as usize).copied()?;
+    let expected = code.codewords.get(id as usize).copied()?;
     let evidence = chance::evidence(code, expected, count, bits, wrong) as f32;
     (wrong <= correctable.max(u32::from(erased == 0))
         && second > wrong
@@ -922,14 +922,14 @@ fn bilinear(view: GrayView<'_>, [x, y]: [f64; 2]) -> Option<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::marker::Family;
+    use markers::Family;
 
     #[test]
     fn two_bits_of_sixteen_may_be_washed_out_when_any_id_is_looked_for() {
-        let code = Code::of(Family::Aruco4x4_50).unwrap();
+        let code = SquareCode::for_family(Family::Aruco4x4_50).unwrap();
         for (hidden, is_read) in [(0, true), (2, true), (4, false)] {
             let known = 0xffff_u64 << hidden & 0xffff;
-            let reading = best_word(code.words[7] & known, known, code, None);
+            let reading = best_word(code.codewords[7] & known, known, code, None);
             assert_eq!(reading.map(|reading| reading.id), is_read.then_some(7), "{hidden} bits");
         }
     }

@@ -1,6 +1,6 @@
 //! Which cells of a square marker are black and which are white, as far as it is known.
 
-use crate::square::code::Code;
+use markers::SquareCode;
 
 /// Most cells across a pattern, its surroundings included.
 pub const MOST_CELLS: usize = 32;
@@ -43,13 +43,13 @@ impl Pattern {
 
     /// The marker of a family that carries this word. Around a square the paper is white for a cell; what lies beside the
     /// bits outside of a square is known only where the bits leave no gaps.
-    pub fn of(code: &Code, word: u64) -> Option<Self> {
+    pub fn of(code: &SquareCode, word: u64) -> Option<Self> {
         Self::bordered(code, word, 0)
     }
 
     /// The same with a border that is `extra` cells wider, as on grids for calibration. These have black squares at the
     /// corners of the paper around each marker.
-    pub fn bordered(code: &Code, word: u64, extra: u8) -> Option<Self> {
+    pub fn bordered(code: &SquareCode, word: u64, extra: u8) -> Option<Self> {
         let extra = i32::from(extra);
         let cells = i32::from(code.cells) + 2 * extra;
         let depth = |x: i32, y: i32| x.min(y).min(cells - 1 - x).min(cells - 1 - y);
@@ -114,8 +114,8 @@ impl Pattern {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drawing::{Drawing, Ink};
-    use crate::marker::{Family, Marker};
+    use markers::{Drawing, Ink};
+    use markers::{Family, Marker};
 
     #[test]
     fn a_border_is_black_in_white_or_white_in_black() {
@@ -135,10 +135,10 @@ mod tests {
     #[test]
     fn every_family_is_as_it_is_drawn() {
         for family in Family::ALL {
-            let Some(code) = Code::of(family) else { continue };
+            let Some(code) = SquareCode::for_family(family) else { continue };
             let marker = Marker { family, id: Some(3), size_m: None };
             let drawing = Drawing::new(&marker, f64::from(code.cells)).unwrap();
-            let pattern = Pattern::of(code, code.words[3]).unwrap();
+            let pattern = Pattern::of(code, code.codewords[3]).unwrap();
             let half = pattern.across() as f64 / 2.0 - 0.5;
             let mut known = 0;
             for y in 0..pattern.across() {

@@ -6,15 +6,15 @@
 //! the same sums tell how well any word explains the pixels, also where no dot can be told from its neighbours.
 
 use imaging::GrayView;
+use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};
 use nalgebra::{SMatrix, SVector};
 
 use crate::optics::edge_response::EdgeResponse;
 use crate::square::decode::Grid;
-use crate::stag::code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET};
 
 /// Small cells across the square and its paper; their borders are the square's outline.
 const CELLS: usize = 24;
-const MARGIN: usize = (CELLS as f64 * QUIET) as usize;
+const MARGIN: usize = (CELLS as f64 * QUIET_ZONE) as usize;
 const ACROSS: usize = CELLS + 2 * MARGIN;
 
 const UNKNOWNS: usize = DOTS + 2;
@@ -54,7 +54,7 @@ pub(crate) struct Dots {
 
 impl Default for Dots {
     fn default() -> Self {
-        let dots = code::dots();
+        let dots = stag_code::dots();
         let mut parts = Box::new([[(0, 0.0); 4]; ACROSS * ACROSS]);
         for (index, parts) in parts.iter_mut().enumerate() {
             *parts = parts_of([index % ACROSS, index / ACROSS], &dots);
@@ -220,7 +220,7 @@ impl Dots {
     pub(crate) fn explain(&self, word: u64) -> Explanation {
         let is_white = |unknown: usize| match unknown {
             DARK | BRIGHT => unknown == BRIGHT,
-            _ => !code::is_black(word, unknown - 2),
+            _ => !stag_code::is_black(word, unknown - 2),
         };
         // Sums over what is white, and over all: the light of all is 1 in each pixel.
         let (mut white, mut grey) = (0.0, 0.0);

@@ -1,15 +1,15 @@
 //! What an STag looks like, for the comparison with an image: small cells with their share of white, and edges.
 
-use crate::drawing::{Drawing, Ink, Shape};
-use crate::marker::{Family, Marker};
+use markers::stag_code::{DISC_RADIUS, QUIET_ZONE};
+use markers::{Drawing, Family, Ink, Marker, Shape};
+
 use crate::square::refine::{Design, MOST_ACROSS};
-use crate::stag::code::{DISC_RADIUS, QUIET};
 
 /// Small cells across the square and its paper; their borders are the square's outline. What a disc's edge looks like in
 /// them is blurred by their width, which must be well below the blur's: of a small square in the image they are twice as
 /// wide.
 const CELLS: usize = 48;
-const MARGIN: usize = (CELLS as f64 * QUIET) as usize;
+const MARGIN: usize = (CELLS as f64 * QUIET_ZONE) as usize;
 const ACROSS: usize = CELLS + 2 * MARGIN;
 const _: () = assert!(ACROSS <= MOST_ACROSS);
 const SMALL_PX: f64 = 14.0;

@@ -8,12 +8,12 @@
 use std::sync::LazyLock;
 
 use imaging::{GrayView, bilinear};
+use markers::Codebook;
+use markers::stag_code::{self, DOT_RADIUS, DOTS};
 
 use crate::square::chance::ways;
-use crate::square::codebook::Codebook;
 use crate::square::decode::Grid;
 use crate::square::erasures::{Known, Light};
-use crate::stag::code::{self, DOT_RADIUS, DOTS};
 
 /// Units of length across the square: the border is one wide.
 const ACROSS: usize = 10;
@@ -125,7 +125,7 @@ fn places() -> &'static Places {
                 (Place::of(turned(CORNERS[index / 4], index % 4)), false)
             };
         }
-        let centres = code::dots();
+        let centres = stag_code::dots();
         let dots = std::array::from_fn(|dot| {
             std::array::from_fn(|sample| {
                 let [x, y] = centres[dot];
@@ -314,7 +314,7 @@ impl Sampled {
         let (mut word, mut mask) = (self.word, self.known);
         for turns in 0..4 {
             for id in ids.clone() {
-                let Some(expected) = book.words().get(id as usize) else { continue };
+                let Some(expected) = book.codewords().get(id as usize) else { continue };
                 let wrong = ((expected ^ word) & mask).count_ones();
                 count += 1;
                 // The same id at another turn is a rival as well.
@@ -325,8 +325,8 @@ impl Sampled {
                     second = second.min(wrong);
                 }
             }
-            word = book.turned(word);
-            mask = book.turned(mask);
+            word = book.rotated(word);
+            mask = book.rotated(mask);
         }
         let (wrong, id, turns) = best;
         // As many as the words' distance allows for when so many dots are unknown.

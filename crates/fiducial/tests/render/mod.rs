@@ -4,11 +4,11 @@
 
 use std::sync::OnceLock;
 
-use fiducial::{Drawing, Ink, Marker, Shape};
 use geometry::{
     Camera, CameraModel, Distortion, Marker as MarkerFrame, Pixel, Point, Rotation, Transform,
 };
 use imaging::GrayImage;
+use markers::{Drawing, Ink, Marker, Shape};
 
 /// Size of the thesis' marker, in metres.
 pub(crate) const SIZE_M: f64 = 0.15341;
@@ -178,7 +178,7 @@ impl Scene {
 /// The drawing's discs, smallest first: radius in metres and ink.
 fn discs() -> Vec<(f64, Ink)> {
     let drawing = Drawing::new(&"rings".parse::<Marker>().unwrap(), SIZE_M).unwrap();
-    let disc = |layer: &fiducial::Layer| match layer.shape {
+    let disc = |layer: &markers::Layer| match layer.shape {
         Shape::Disc { radius_m, .. } => (radius_m, layer.ink),
         Shape::Rectangle { .. } => panic!("rings are discs"),
     };

@@ -1,10 +1,10 @@
-//! Cells as few rectangles.
+//! Covers cells with few rectangles.
 
 /// A rectangle of cells: its first column and row, and those after its last.
 pub(super) type Rectangle = [[usize; 2]; 2];
 
-/// The marked cells of a square of `side` cells, given row by row, as rectangles side by side. Each time the largest one
-/// is taken from what is left.
+/// The marked cells of a square of `side` cells, given row by row, as rectangles side by side: each is the largest of the
+/// cells that are left.
 pub(super) fn rectangles(side: usize, mut cells: Vec<bool>) -> Vec<Rectangle> {
     let mut chosen = Vec::new();
     while let Some(next) = largest(side, &cells) {

@@ -2,11 +2,11 @@
 
 use super::cover;
 use super::{Drawing, Ink, Layer, Shape};
-use crate::square::code::Code;
+use crate::square_code::SquareCode;
 
-/// The marker with this word. Rectangles of one ink lie side by side, on one rectangle of the other.
-pub(super) fn drawing(code: &Code, word: u64, size_m: f64) -> Drawing {
-    let grid = Grid { code, word, cell_m: size_m / f64::from(code.cells) };
+/// The marker with this codeword. Rectangles of one ink lie side by side on one rectangle of the other.
+pub(super) fn drawing(code: &SquareCode, codeword: u64, size_m: f64) -> Drawing {
+    let grid = Grid { code, codeword, cell_m: size_m / f64::from(code.cells) };
     let margin = i32::from(code.margin());
     let mut layers = Vec::new();
     let quiet = if code.reversed_border {
@@ -30,17 +30,17 @@ pub(super) fn drawing(code: &Code, word: u64, size_m: f64) -> Drawing {
 }
 
 struct Grid<'a> {
-    code: &'a Code,
-    word: u64,
+    code: &'a SquareCode,
+    codeword: u64,
     cell_m: f64,
 }
 
 impl Grid<'_> {
-    /// What the word has at a cell, column and row from the square's top left.
+    /// The codeword's bit at a cell, column and row from the square's top left.
     fn bit(&self, cell: [i32; 2]) -> Option<bool> {
         let bits = self.code.bits;
         let place = bits.iter().position(|bit| bit.map(i32::from) == cell)?;
-        Some(self.word >> (bits.len() - 1 - place) & 1 == 1)
+        Some(self.codeword >> (bits.len() - 1 - place) & 1 == 1)
     }
 
     /// How many cells lie between a cell and the square's outline; negative outside.

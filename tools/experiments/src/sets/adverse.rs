@@ -2,8 +2,8 @@
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 
-use fiducial::Marker;
 use geometry::{Pixel, Point};
+use markers::Marker;
 use rand::RngExt;
 use rendering::CameraSettings;
 

@@ -2,8 +2,8 @@
 
 use std::f64::consts::TAU;
 
-use fiducial::{Drawing, Ink, Layer, Shape};
 use geometry::{Marker as MarkerFrame, Ned, Point, Rotation, Transform};
+use markers::{Drawing, Ink, Layer, Shape};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rendering::views::Binning;

@@ -2,8 +2,8 @@
 
 use std::f64::consts::TAU;
 
-use fiducial::Marker;
 use geometry::{Camera, Point, Rotation, Transform};
+use markers::Marker;
 use rand::RngExt;
 use rendering::{CameraSettings, Surface};
 

@@ -6,11 +6,10 @@ use std::f64::consts::{PI, TAU};
 
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, bilinear};
+use markers::{RING_RADII, RingKind};
 use nalgebra::Matrix6;
 
-use crate::candidates::ring::RingKind;
 use crate::candidates::ring_profile::{Candidate, LEAST_SCORE, LEAST_STEP, SMALL_PX};
-use crate::drawing::RING_RADII;
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
 use crate::families::rings::photometric::{
     Alternative, MAX_DIAMETER_PX, PhotometricFit, PhotometricInput, PhotometricPoses, PixelSample,

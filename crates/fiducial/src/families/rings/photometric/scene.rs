@@ -3,11 +3,11 @@
 use std::f64::consts::TAU;
 
 use geometry::{CameraModel, Pixel};
+use markers::RingKind;
 use nalgebra::Vector3;
 
 use super::PhotometricInput;
 use super::solve::{Effort, UNKNOWNS};
-use crate::candidates::ring::RingKind;
 use crate::families::rings::circle_pose::{CirclePose, project};
 use crate::optics::edge_response::EdgeResponse;
 

@@ -1,0 +1,310 @@
+//! A pad: several markers in known positions around one landing point.
+//!
+//! A pad is described in TOML, positions in metres from the landing point on the printed face (x right, y up):
+//!
+//! ```toml
+//! id = 0                  # the pad is named `pad:0` wherever a marker is named
+//! tolerance_m = 0.0005    # standard deviation of the markers' positions on the sheet
+//!
+//! [[markers]]
+//! marker = "apriltag-36h11:3:0.15"
+//! x_m = -0.1
+//! y_m = 0.0
+//! quarter_turns = 0       # counter-clockwise, as seen by who reads the sheet
+//! ```
+
+use std::str::FromStr;
+
+use serde::Deserialize;
+
+use crate::drawing::{Drawing, Ink, Layer, Shape};
+use crate::marker::Marker;
+
+/// Markers in known positions around one landing point, the origin of the pad's frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pad {
+    id: u32,
+    tolerance_m: f64,
+    markers: Vec<PlacedMarker>,
+}
+
+/// A marker of a pad.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct PlacedMarker {
+    /// The marker, with its id where its family has ids.
+    pub marker: Marker,
+    /// Its size in metres, as [`Marker::size_m`].
+    pub size_m: f64,
+    /// Its centre in the pad's frame, in metres.
+    pub position_m: [f64; 2],
+    /// Its rotation counter-clockwise, in quarters of a turn, from 0 to 3.
+    pub quarter_turns: u8,
+}
+
+/// Why a pad's description was refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum PadError {
+    /// Neither the name of a built-in pad nor a readable file.
+    #[error("pad `{name}`: {problem}; neither a readable file nor a built-in pad ({known})")]
+    Unreadable {
+        /// The name.
+        name: String,
+        /// Why it cannot be read.
+        problem: String,
+        /// The built-in pads.
+        known: String,
+    },
+    /// A file with a wrong description.
+    #[error("pad `{name}`: {problem}")]
+    Described {
+        /// The file's name.
+        name: String,
+        /// What is wrong.
+        problem: Box<PadError>,
+    },
+    /// Not TOML, or not a description of a pad.
+    #[error("{0}")]
+    Toml(String),
+    /// A number outside its limits.
+    #[error("`{key}` = {value}, but it must be from {min} to {max}")]
+    Range {
+        /// Which number.
+        key: String,
+        /// Its value.
+        value: f64,
+        /// Its minimum.
+        min: f64,
+        /// Its maximum.
+        max: f64,
+    },
+    /// A marker that cannot be part of a pad.
+    #[error("marker {number}, `{text}`: {problem}")]
+    Marker {
+        /// Its place in the list, from 1.
+        number: usize,
+        /// Its text.
+        text: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+}
+
+/// The built-in pads: name and description.
+const BUILT_IN: [(&str, &str); 1] = [("a4", include_str!("../pads/a4.toml"))];
+/// Largest distance of a marker from the landing point along each axis, in metres.
+const MAX_OFFSET_M: f64 = 10.0;
+/// Largest tolerance of the markers' positions, in metres.
+const MAX_TOLERANCE_M: f64 = 0.05;
+/// Tolerance of markers printed on one sheet, in metres; used where a description names none.
+const PRINTED_TOLERANCE_M: f64 = 0.0005;
+/// Largest number of markers on a pad.
+const MAX_MARKERS: usize = 32;
+
+impl Pad {
+    /// The name of the family under which pads are reported beside markers.
+    pub const FAMILY: &'static str = "pad";
+
+    /// The built-in pad of this name, or the one that the file of this name describes; `read` reads files.
+    ///
+    /// # Errors
+    /// [`PadError`] with the name, when there is no such pad or its description is wrong.
+    pub fn named<E: std::fmt::Display>(
+        name: &str,
+        read: impl FnOnce(&str) -> Result<String, E>,
+    ) -> Result<Self, PadError> {
+        let text = match BUILT_IN.iter().find(|(known, _)| *known == name) {
+            Some((_, text)) => (*text).to_owned(),
+            None => read(name).map_err(|problem| PadError::Unreadable {
+                name: name.to_owned(),
+                problem: problem.to_string(),
+                known: BUILT_IN.map(|(known, _)| known).join(", "),
+            })?,
+        };
+        text.parse().map_err(|problem: PadError| PadError::Described {
+            name: name.to_owned(),
+            problem: Box::new(problem),
+        })
+    }
+
+    /// Its number; its name is `pad:` and this.
+    pub fn id(&self) -> u32 {
+        self.id
+    }
+
+    /// Its name, used like that of a marker: `pad:ID`.
+    pub fn name(&self) -> String {
+        format!("{}:{}", Self::FAMILY, self.id)
+    }
+
+    /// Standard deviation of its markers' positions, in metres.
+    pub fn tolerance_m(&self) -> f64 {
+        self.tolerance_m
+    }
+
+    /// Its markers, in the order in which they are printed.
+    pub fn markers(&self) -> &[PlacedMarker] {
+        &self.markers
+    }
+
+    /// Adds its markers to a list of markers to detect, without duplicates.
+    pub fn add_markers(&self, markers: &mut Vec<Marker>) {
+        for PlacedMarker { marker, .. } in &self.markers {
+            if !markers.iter().any(|m| m.family == marker.family && m.id == marker.id) {
+                markers.push(*marker);
+            }
+        }
+    }
+
+    /// All its markers, each on white paper of its quiet zone, later ones over earlier ones; `None` for an id that cannot
+    /// be drawn.
+    pub fn drawing(&self) -> Option<Drawing> {
+        let mut whole = Drawing { half_extent_m: 0.0, layers: Vec::new() };
+        for placed in &self.markers {
+            let drawing = Drawing::new(&placed.marker, placed.size_m)?;
+            let half_m = drawing.half_extent_m;
+            let paper = Shape::Rectangle { min_m: [-half_m; 2], max_m: [half_m; 2] };
+            let paper = Layer { shape: paper, ink: Ink::White };
+            let layers = std::iter::once(&paper).chain(&drawing.layers);
+            whole.layers.extend(layers.map(|layer| placed.on_pad(layer)));
+            let [x, y] = placed.position_m.map(f64::abs);
+            whole.half_extent_m = whole.half_extent_m.max(x.max(y) + half_m);
+        }
+        Some(whole)
+    }
+}
+
+impl PlacedMarker {
+    /// The position on the pad of a point of the marker.
+    pub fn position_on_pad(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        let [right, up] = match self.quarter_turns {
+            0 => [x, y],
+            1 => [-y, x],
+            2 => [-x, -y],
+            _ => [y, -x],
+        };
+        [self.position_m[0] + right, self.position_m[1] + up]
+    }
+
+    fn on_pad(&self, layer: &Layer) -> Layer {
+        let shape = match layer.shape {
+            Shape::Disc { centre_m, radius_m } => {
+                Shape::Disc { centre_m: self.position_on_pad(centre_m), radius_m }
+            }
+            Shape::Rectangle { min_m, max_m } => {
+                let (a, b) = (self.position_on_pad(min_m), self.position_on_pad(max_m));
+                Shape::Rectangle {
+                    min_m: [a[0].min(b[0]), a[1].min(b[1])],
+                    max_m: [a[0].max(b[0]), a[1].max(b[1])],
+                }
+            }
+        };
+        Layer { shape, ink: layer.ink }
+    }
+}
+
+/// A pad as described in TOML.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Description {
+    id: u32,
+    tolerance_m: Option<f64>,
+    markers: Vec<Placed>,
+}
+
+/// A marker of a pad as described in TOML.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Placed {
+    marker: String,
+    #[serde(default)]
+    x_m: f64,
+    #[serde(default)]
+    y_m: f64,
+    #[serde(default)]
+    quarter_turns: u8,
+}
+
+impl FromStr for Pad {
+    type Err = PadError;
+
+    /// Reads a description in TOML, as at the head of this module.
+    fn from_str(text: &str) -> Result<Self, PadError> {
+        let described: Description =
+            toml::from_str(text).map_err(|e| PadError::Toml(e.to_string()))?;
+        let tolerance_m = described.tolerance_m.unwrap_or(PRINTED_TOLERANCE_M);
+        within("tolerance_m", tolerance_m, (0.0, MAX_TOLERANCE_M))?;
+        within("number of markers", described.markers.len() as f64, (1.0, MAX_MARKERS as f64))?;
+        let mut markers: Vec<PlacedMarker> = Vec::with_capacity(described.markers.len());
+        for (i, placed) in described.markers.iter().enumerate() {
+            let number = i + 1;
+            within(&format!("x_m of marker {number}"), placed.x_m, (-MAX_OFFSET_M, MAX_OFFSET_M))?;
+            within(&format!("y_m of marker {number}"), placed.y_m, (-MAX_OFFSET_M, MAX_OFFSET_M))?;
+            let turns = f64::from(placed.quarter_turns);
+            within(&format!("quarter_turns of marker {number}"), turns, (0.0, 3.0))?;
+            let placed = placed.checked(&markers).map_err(|problem| PadError::Marker {
+                number,
+                text: placed.marker.clone(),
+                problem,
+            })?;
+            markers.push(placed);
+        }
+        Ok(Self { id: described.id, tolerance_m, markers })
+    }
+}
+
+impl Placed {
+    fn checked(&self, before: &[PlacedMarker]) -> Result<PlacedMarker, String> {
+        let marker: Marker = self.marker.parse().map_err(|e| format!("{e}"))?;
+        if marker.id.is_none() && marker.family.id_count().is_some() {
+            return Err("a marker of a pad needs an id, as in `apriltag-36h11:3:0.15`".to_owned());
+        }
+        let size_m =
+            marker.size_m.ok_or("a marker of a pad needs a size in metres, as its last part")?;
+        if before.iter().any(|it| it.marker.includes(marker.family, marker.id)) {
+            return Err("it is on the pad twice, and the two could not be told apart in an image"
+                .to_owned());
+        }
+        let position_m = [self.x_m, self.y_m];
+        Ok(PlacedMarker { marker, size_m, position_m, quarter_turns: self.quarter_turns })
+    }
+}
+
+fn within(key: &str, value: f64, (min, max): (f64, f64)) -> Result<(), PadError> {
+    match (min..=max).contains(&value) {
+        true => Ok(()),
+        false => Err(PadError::Range { key: key.to_owned(), value, min, max }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wrong_descriptions_are_refused_with_the_reason() {
+        let problem = |text: &str| text.parse::<Pad>().unwrap_err().to_string();
+        let check = |text: &str, part: &str| {
+            let problem = problem(text);
+            assert!(problem.contains(part), "`{part}` is not in: {problem}");
+        };
+        check("id = 1\nmarkers = []", "from 1 to 32");
+        check(
+            "id = 1\nmarkers = [{ marker = \"rings\" }]",
+            "marker 1, `rings`: a marker of a pad needs a size",
+        );
+        check("id = 1\nmarkers = [{ marker = \"apriltag-16h5:*:0.1\" }]", "needs an id");
+        check(
+            "id = 1\nmarkers = [{ marker = \"rings:0.1\" }, { marker = \"rings:0.2\" }]",
+            "twice",
+        );
+        check("id = 1\nmarkers = [{ marker = \"rings:0.1\", x_m = 11 }]", "from -10 to 10");
+        check("id = 1\nmarkers = [{ marker = \"rings:0.1\", x_m = nan }]", "x_m of marker 1");
+        check("id = 1\nmarkers = [{ marker = \"rings:0.1\", quarter_turns = 4 }]", "from 0 to 3");
+        check("id = 1\ntolerance_m = 1\nmarkers = [{ marker = \"rings:0.1\" }]", "tolerance_m");
+        check("markers = [{ marker = \"rings:0.1\" }]", "missing field `id`");
+        check("id = 1\nsize = 3\nmarkers = []", "unknown field `size`");
+        let missing = Pad::named("no/such.toml", |_| Err("there is no such file"));
+        let missing = missing.unwrap_err().to_string();
+        assert!(missing.contains("no/such.toml") && missing.contains("a4"), "{missing}");
+    }
+}
