@@ -93,7 +93,7 @@ fn circle(content: &mut Content, [x, y]: [f64; 2], radius: f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use markers::sheet::Paper;
+    use crate::marker::sheet::Paper;
 
     fn text_of(size_m: f64, paper: Paper) -> String {
         let sheet = Sheet::new(&"rings".parse().unwrap(), size_m, paper).unwrap();

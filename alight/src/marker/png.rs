@@ -108,7 +108,7 @@ fn crc32(bytes: &[u8]) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use markers::sheet::Paper;
+    use crate::marker::sheet::Paper;
     use markers::{Drawing, Marker};
 
     #[test]

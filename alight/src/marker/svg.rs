@@ -73,7 +73,7 @@ fn colour(ink: Ink) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use markers::sheet::Paper;
+    use crate::marker::sheet::Paper;
     use svg::parser::Event;
 
     #[test]
