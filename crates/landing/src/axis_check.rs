@@ -1,54 +1,55 @@
-//! Do the camera and the autopilot mean the same directions? Told from natural motion, before the descent.
+//! Are the axes of camera and autopilot consistent? Decided from natural motion, before the descent.
 //!
-//! A pad that lies still has one place, whatever the vehicle does, if attitude, position and camera mount are what they
-//! are said to be. If the camera is turned about the vertical, or its image is mirrored, or roll or pitch has the wrong
-//! sign, the pad seems to move with every motion of the vehicle, and lies still only if the error is undone. So the
-//! place of the pad is computed under each of a few dozen hypotheses, and the one under which it lies stillest is
-//! compared with the configured one: a likelihood ratio that needs no motion of its own, only enough of any.
+//! A pad that does not move has one place whatever the vehicle does, if attitude, position and camera mount are as
+//! configured. If the camera is turned about the vertical, its image is mirrored, or roll or pitch has the wrong sign, the
+//! pad appears to move with every motion of the vehicle, unless the error is undone. So the place of the pad is computed
+//! under each of a few dozen alternatives, and the one with the smallest scatter is compared with the configured one: a
+//! likelihood ratio that needs no motion of its own, only enough of any.
 
 use geometry::{Body, Odometry, Point, Rotation, Vector};
 
 use crate::history::Motion;
 use crate::time::Timestamp;
 
-/// Directions in which the camera may really be mounted.
+/// Number of camera yaw angles that are tested.
 const YAWS: usize = 16;
-/// Each of them plain and mirrored, and two wrong signs.
-const HYPOTHESES: usize = 2 * YAWS + 2;
-/// Past detections count less with this time constant, in seconds.
+/// Each yaw plain and mirrored, and two wrong signs.
+const ALTERNATIVES: usize = 2 * YAWS + 2;
+/// Time constant with which past detections are forgotten, in seconds.
 const MEMORY_S: f64 = 3.0;
-/// What is expected to make a pad seem to move, in metres, and per metre of range.
+/// Expected scatter of a pad's place, in metres, and per metre of range.
 const NOISE_M: f64 = 0.015;
 const NOISE_PER_M: f64 = 0.003;
-/// Fewer detections than this tell nothing.
-const FEWEST: u32 = 8;
-/// One hypothesis explains the detections much better than another when its sum of squares is so many times smaller, and
-/// smaller by so much at least.
-const BETTER: f64 = 4.0;
-const AGREES_BY: f64 = 20.0;
-const DISAGREES_BY: f64 = 400.0;
-/// Only a pad that seems to move by so much, as a deviation in metres and per metre of range, shows a wrong mount: the
-/// autopilot's drift makes it move a little as well.
-const MOVES_M: f64 = 0.15;
-const MOVES_PER_M: f64 = 0.02;
+/// Minimum number of detections for a verdict.
+const MIN_DETECTIONS: u32 = 8;
+/// One alternative explains the detections much better than another when its sum of squares is smaller by this factor,
+/// and by this difference: to confirm the configured mount, and to reject it.
+const MIN_RATIO: f64 = 4.0;
+const CONSISTENT_BY: f64 = 20.0;
+const MISMATCH_BY: f64 = 400.0;
+/// Minimum apparent motion of the pad that rejects the configured mount, as a standard deviation in metres and per metre
+/// of range: the autopilot's drift makes it move a little as well.
+const MIN_MOTION_M: f64 = 0.15;
+const MIN_MOTION_PER_M: f64 = 0.02;
 
-/// What is known of the agreement.
+/// The result so far.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub enum Verdict {
-    /// Too little motion to tell.
-    Open,
+    /// Too little motion to decide.
+    Undecided,
     /// The configured mount explains the detections.
-    Agrees,
+    Consistent,
     /// Another one explains them, and the configured one does not.
-    Disagrees(Wrong),
+    Mismatch(AxisError),
 }
 
-/// What would explain the detections.
+/// The error that would explain the detections.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub enum Wrong {
-    /// The camera is turned about the vertical by so much more than is configured, in radians, clockwise seen from above.
+pub enum AxisError {
+    /// The camera is turned about the vertical by this much more than configured, in radians, clockwise seen
+    /// from above.
     Turned(f64),
-    /// The image is mirrored, and turned by so much.
+    /// The image is mirrored, and turned by this much.
     Mirrored(f64),
     /// Roll has the wrong sign.
     RollSign,
@@ -56,10 +57,10 @@ pub enum Wrong {
     PitchSign,
 }
 
-/// Weighs the hypotheses with each detection; nothing is allocated.
+/// Compares the alternatives with each detection; nothing is allocated.
 #[derive(Clone, Debug)]
-pub struct Agreement {
-    sums: [Sum; HYPOTHESES],
+pub struct AxisConsistencyCheck {
+    sums: [Sum; ALTERNATIVES],
     weight: f64,
     detections: u32,
     newest: Option<Timestamp>,
@@ -75,21 +76,21 @@ struct Sum {
     squares: f64,
 }
 
-impl Default for Agreement {
+impl Default for AxisConsistencyCheck {
     fn default() -> Self {
         Self {
-            sums: [Sum::default(); HYPOTHESES],
+            sums: [Sum::default(); ALTERNATIVES],
             weight: 0.0,
             detections: 0,
             newest: None,
             range_m: 0.0,
-            verdict: Verdict::Open,
+            verdict: Verdict::Undecided,
         }
     }
 }
 
-impl Agreement {
-    /// Takes a marker's place in the body, by the configured mount, and the vehicle's motion at the exposure.
+impl AxisConsistencyCheck {
+    /// Adds a marker's place in the body, by the configured mount, with the vehicle's motion at the exposure.
     pub fn add(&mut self, stamp: Timestamp, motion: &Motion, in_body: Point<Body>) {
         let after_s = self.newest.map_or(0.0, |newest| stamp.seconds_since(newest));
         if after_s < 0.0 {
@@ -105,43 +106,44 @@ impl Agreement {
         let share = weight / self.weight;
         let (roll, pitch, yaw) = motion.ned_from_body.euler();
         for (index, sum) in self.sums.iter_mut().enumerate() {
-            let from_vehicle = match Hypothesis::of(index) {
-                Hypothesis::Mount { turn, mirrored } => {
+            let from_vehicle = match Alternative::from_index(index) {
+                Alternative::Mount { turn, mirrored } => {
                     motion.odometry_from_body() * undone(seen, turn, mirrored)
                 }
-                Hypothesis::Roll => Rotation::from_euler(-roll, pitch, yaw) * seen,
-                Hypothesis::Pitch => Rotation::from_euler(roll, -pitch, yaw) * seen,
+                Alternative::Roll => Rotation::from_euler(-roll, pitch, yaw) * seen,
+                Alternative::Pitch => Rotation::from_euler(roll, -pitch, yaw) * seen,
             };
             sum.add(motion.odometry + from_vehicle, keep, weight, share);
         }
         self.detections = self.detections.saturating_add(1);
-        self.judge();
+        self.decide();
     }
 
-    /// What is known by now. Once it agrees, it stays so until much speaks against it.
+    /// The result so far. A consistent one changes only with strong evidence.
     pub fn verdict(&self) -> Verdict {
         self.verdict
     }
 
-    fn judge(&mut self) {
+    fn decide(&mut self) {
         let configured = self.sums.first().map_or(0.0, |sum| sum.squares);
         let others = || self.sums.iter().enumerate().filter(|(index, _)| !is_near(*index));
         let Some((index, best)) = others().min_by(|a, b| a.1.squares.total_cmp(&b.1.squares))
         else {
             return;
         };
-        // A wrong sign shows only in tilt, and is not what is to be expected: it need not be ruled out.
+        // A wrong sign is unlikely and shows in tilt only: it need not be ruled out.
         let mounts = others().take_while(|(index, _)| *index < 2 * YAWS);
         let nearest = mounts.map(|(_, sum)| sum.squares).fold(f64::INFINITY, f64::min);
-        if self.detections < FEWEST || !best.squares.is_finite() || !configured.is_finite() {
+        if self.detections < MIN_DETECTIONS || !best.squares.is_finite() || !configured.is_finite()
+        {
             return;
         }
-        let moves_m = MOVES_M + MOVES_PER_M * self.range_m;
-        let moves = configured > moves_m * moves_m * self.weight;
-        if nearest > BETTER * configured + AGREES_BY {
-            self.verdict = Verdict::Agrees;
-        } else if configured > BETTER * best.squares + DISAGREES_BY && moves {
-            self.verdict = Verdict::Disagrees(Hypothesis::of(index).wrong());
+        let min_motion_m = MIN_MOTION_M + MIN_MOTION_PER_M * self.range_m;
+        let is_moving = configured > min_motion_m * min_motion_m * self.weight;
+        if nearest > MIN_RATIO * configured + CONSISTENT_BY {
+            self.verdict = Verdict::Consistent;
+        } else if configured > MIN_RATIO * best.squares + MISMATCH_BY && is_moving {
+            self.verdict = Verdict::Mismatch(Alternative::from_index(index).mismatch());
         }
     }
 }
@@ -157,16 +159,16 @@ impl Sum {
     }
 }
 
-/// What may be wrong.
-enum Hypothesis {
+/// One alternative to test.
+enum Alternative {
     Mount { turn: f64, mirrored: bool },
     Roll,
     Pitch,
 }
 
-impl Hypothesis {
-    /// The first is what is configured.
-    fn of(index: usize) -> Self {
+impl Alternative {
+    /// The first is the configured mount.
+    fn from_index(index: usize) -> Self {
         if index >= 2 * YAWS {
             return if index == 2 * YAWS { Self::Roll } else { Self::Pitch };
         }
@@ -174,27 +176,27 @@ impl Hypothesis {
         Self::Mount { turn, mirrored: index >= YAWS }
     }
 
-    fn wrong(&self) -> Wrong {
+    fn mismatch(&self) -> AxisError {
         let wrapped = |turn: f64| {
             if turn > std::f64::consts::PI { turn - std::f64::consts::TAU } else { turn }
         };
         match *self {
-            Self::Mount { turn, mirrored: false } => Wrong::Turned(wrapped(turn)),
-            Self::Mount { turn, mirrored: true } => Wrong::Mirrored(wrapped(turn)),
-            Self::Roll => Wrong::RollSign,
-            Self::Pitch => Wrong::PitchSign,
+            Self::Mount { turn, mirrored: false } => AxisError::Turned(wrapped(turn)),
+            Self::Mount { turn, mirrored: true } => AxisError::Mirrored(wrapped(turn)),
+            Self::Roll => AxisError::RollSign,
+            Self::Pitch => AxisError::PitchSign,
         }
     }
 }
 
-/// Where the marker really is in the body if the camera is turned by `turn` more than is configured.
+/// The true place of the marker in the body if the camera is turned by `turn` more than configured.
 fn undone(seen: Vector<Body>, turn: f64, mirrored: bool) -> Vector<Body> {
     let (sin, cos) = turn.sin_cos();
     let y = if mirrored { -seen.y() } else { seen.y() };
     Vector::new(cos * seen.x() - sin * y, sin * seen.x() + cos * y, seen.z())
 }
 
-/// The configured mount and its two neighbours, which are no other ones.
+/// The configured mount and its two neighbours, which are not distinguished from it.
 fn is_near(index: usize) -> bool {
     index == 0 || index == 1 || index == YAWS - 1
 }
@@ -205,14 +207,14 @@ mod tests {
     use geometry::Ned;
     use std::f64::consts::{FRAC_PI_2, PI};
 
-    /// Hovers and sways over a pad, whose marker is seen through a distortion; the last verdict, and when it came.
+    /// Hovers and sways over a pad whose marker is seen through a distortion; returns the last verdict and its time.
     fn sway(
         distort: impl Fn(Vector<Body>, Rotation<Ned, Body>) -> Vector<Body>,
         sway_m: f64,
         tilt_rad: f64,
         seconds: f64,
     ) -> (Verdict, f64) {
-        let mut agreement = Agreement::default();
+        let mut check = AxisConsistencyCheck::default();
         let pad = Point::new(1.5, -1.5, 0.0);
         for i in 0..(seconds * 15.0) as u32 {
             let t = f64::from(i) / 15.0;
@@ -232,23 +234,23 @@ mod tests {
                 odometry: Point::from_coords(position.coords),
                 rate: Vector::zero(),
             };
-            agreement.add(
+            check.add(
                 Timestamp::from_seconds(t),
                 &motion,
                 Point::new(seen.x(), seen.y(), seen.z()),
             );
-            if agreement.verdict() != Verdict::Open {
-                return (agreement.verdict(), t);
+            if check.verdict() != Verdict::Undecided {
+                return (check.verdict(), t);
             }
         }
-        (Verdict::Open, seconds)
+        (Verdict::Undecided, seconds)
     }
 
     #[test]
-    fn a_right_mount_agrees_by_sway_or_by_tilt_alone() {
-        assert_eq!(sway(|p, _| p, 0.2, 0.0, 8.0).0, Verdict::Agrees);
-        assert_eq!(sway(|p, _| p, 0.0, 0.02, 8.0).0, Verdict::Agrees);
-        assert_eq!(sway(|p, _| p, 0.0, 0.0005, 8.0).0, Verdict::Open, "nothing moves");
+    fn a_right_mount_is_consistent_by_sway_or_by_tilt_alone() {
+        assert_eq!(sway(|p, _| p, 0.2, 0.0, 8.0).0, Verdict::Consistent);
+        assert_eq!(sway(|p, _| p, 0.0, 0.02, 8.0).0, Verdict::Consistent);
+        assert_eq!(sway(|p, _| p, 0.0, 0.0005, 8.0).0, Verdict::Undecided, "nothing moves");
     }
 
     #[test]
@@ -256,13 +258,13 @@ mod tests {
         let turned = |turn: f64| move |p: Vector<Body>, _| undone(p, -turn, false);
         for turn in [FRAC_PI_2, -FRAC_PI_2, PI] {
             let (verdict, _) = sway(turned(turn), 1.5, 0.03, 8.0);
-            let Verdict::Disagrees(Wrong::Turned(found)) = verdict else {
+            let Verdict::Mismatch(AxisError::Turned(found)) = verdict else {
                 unreachable!("{turn}: {verdict:?}")
             };
             assert!((found - turn).abs() < 1e-9, "{found} instead of {turn}");
         }
         let mirrored = |p: Vector<Body>, _| Vector::new(p.x(), -p.y(), p.z());
-        assert_eq!(sway(mirrored, 1.5, 0.03, 8.0).0, Verdict::Disagrees(Wrong::Mirrored(0.0)));
+        assert_eq!(sway(mirrored, 1.5, 0.03, 8.0).0, Verdict::Mismatch(AxisError::Mirrored(0.0)));
     }
 
     #[test]
@@ -273,18 +275,18 @@ mod tests {
             let other = Rotation::<Ned, Body>::from_euler(-roll, pitch, yaw);
             other.inverse() * (attitude * p)
         };
-        assert_eq!(sway(wrong, 1.5, 0.1, 8.0).0, Verdict::Disagrees(Wrong::RollSign));
+        assert_eq!(sway(wrong, 1.5, 0.1, 8.0).0, Verdict::Mismatch(AxisError::RollSign));
     }
 
     #[test]
-    fn a_small_error_of_the_mount_is_no_wrong_mount() {
+    fn a_small_mount_error_is_consistent() {
         let turned = |p: Vector<Body>, _| undone(p, 0.15, false);
-        assert_eq!(sway(turned, 1.0, 0.03, 8.0).0, Verdict::Agrees);
+        assert_eq!(sway(turned, 1.0, 0.03, 8.0).0, Verdict::Consistent);
     }
 
     #[test]
-    fn numbers_without_sense_change_nothing() {
-        let mut agreement = Agreement::default();
+    fn huge_numbers_change_nothing() {
+        let mut check = AxisConsistencyCheck::default();
         let motion = Motion {
             ned_from_body: Rotation::identity(),
             position: Point::origin(),
@@ -293,12 +295,8 @@ mod tests {
             rate: Vector::zero(),
         };
         for i in 0..50 {
-            agreement.add(
-                Timestamp::from_seconds(f64::from(i)),
-                &motion,
-                Point::new(1e200, 0.0, 1.0),
-            );
+            check.add(Timestamp::from_seconds(f64::from(i)), &motion, Point::new(1e200, 0.0, 1.0));
         }
-        assert_eq!(agreement.verdict(), Verdict::Open);
+        assert_eq!(check.verdict(), Verdict::Undecided);
     }
 }

@@ -1,4 +1,4 @@
-//! What the lander answers, with its reasons.
+//! The lander's decisions, with their reasons.
 
 use std::fmt;
 
@@ -69,8 +69,8 @@ pub struct TargetEstimate {
     pub time_offset_s: f64,
     /// The newest detection's squared innovation over its covariance: about 3 when all is as expected.
     pub nis: Option<f64>,
-    /// True while the marker is seen more often elsewhere than here: nothing descends.
-    pub contested: bool,
+    /// True while the marker is seen more often elsewhere than here: the vehicle does not descend.
+    pub ambiguous: bool,
 }
 
 /// Where the landing stands.
@@ -174,7 +174,7 @@ named! {
         /// No recent detection: the descent stops until there is one.
         TargetAging = "target-aging", "no recent detection, descent stopped";
         /// The marker is seen at two places, and which is the pad is not decided.
-        Contested = "contested", "the marker is seen at two places, descent stopped until one is seen in most frames";
+        Ambiguous = "ambiguous", "the marker is seen at two places, descent stopped until one is seen in most frames";
         /// Low over the marker, waiting for a small error and a small speed.
         Settling = "settling", "settling over the marker before the touchdown";
         /// Low over the marker and settled.
@@ -226,7 +226,7 @@ named! {
         /// The same.
         AttitudeSign = "attitude-sign", "the camera's image moves as if roll or pitch had the wrong sign, holding: check mount and autopilot";
         /// The descent waits for motion that shows whether camera and autopilot mean the same directions.
-        SelfTest = "self-test", "looking whether camera and autopilot mean the same directions before descending";
+        AxisCheck = "axis-check", "checking camera/autopilot axis alignment before descending";
         /// The autopilot did not enter its LAND mode.
         LandRefused = "land-refused", "aborted: the autopilot did not enter LAND";
         /// The autopilot did not reach the ground.

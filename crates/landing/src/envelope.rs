@@ -1,25 +1,29 @@
-//! The last look at every setpoint.
+//! The last check of every setpoint.
 
 use geometry::{Ned, Vector};
 
 use crate::config::EnvelopeConfig;
 
-/// The setpoint nearest to what was wanted that may be sent: finite, within the limits, and downwards only when
-/// `may_descend`. What is not finite becomes a stop.
-pub fn admit(config: &EnvelopeConfig, wanted: Vector<Ned>, may_descend: bool) -> Vector<Ned> {
+/// The nearest setpoint that may be sent: finite, within the limits, and downwards only when `may_descend`. A setpoint
+/// that is not finite becomes a stop.
+pub fn clamp_setpoint(
+    config: &EnvelopeConfig,
+    wanted: Vector<Ned>,
+    may_descend: bool,
+) -> Vector<Ned> {
     if !wanted.is_finite() {
         return Vector::zero();
     }
     let speed = wanted.horizontal_norm();
     let scale = if speed > config.horizontal_m_s { config.horizontal_m_s / speed } else { 1.0 };
-    let deepest = if may_descend { config.descend_m_s } else { 0.0 };
-    let admitted = Vector::new(
+    let max_down = if may_descend { config.descend_m_s } else { 0.0 };
+    let clamped = Vector::new(
         wanted.x() * scale,
         wanted.y() * scale,
-        wanted.z().clamp(-config.climb_m_s, deepest),
+        wanted.z().clamp(-config.climb_m_s, max_down),
     );
     // Finite components can have an infinite length.
-    if admitted.is_finite() { admitted } else { Vector::zero() }
+    if clamped.is_finite() { clamped } else { Vector::zero() }
 }
 
 #[cfg(test)]
@@ -33,7 +37,7 @@ mod tests {
             x in prop::num::f64::ANY, y in prop::num::f64::ANY, z in prop::num::f64::ANY, may_descend: bool,
         ) {
             let config = EnvelopeConfig::default();
-            let sent = admit(&config, Vector::new(x, y, z), may_descend);
+            let sent = clamp_setpoint(&config, Vector::new(x, y, z), may_descend);
             prop_assert!(sent.is_finite());
             prop_assert!(sent.horizontal_norm() <= config.horizontal_m_s + 1e-9);
             prop_assert!(sent.z() >= -config.climb_m_s && sent.z() <= config.descend_m_s);
@@ -42,9 +46,9 @@ mod tests {
     }
 
     #[test]
-    fn what_is_inside_stays_as_it_is() {
+    fn a_setpoint_inside_is_not_changed() {
         let wanted = Vector::new(0.3, -0.4, 0.5);
-        assert_eq!(admit(&EnvelopeConfig::default(), wanted, true), wanted);
-        assert_eq!(admit(&EnvelopeConfig::default(), wanted, false).z(), 0.0);
+        assert_eq!(clamp_setpoint(&EnvelopeConfig::default(), wanted, true), wanted);
+        assert_eq!(clamp_setpoint(&EnvelopeConfig::default(), wanted, false).z(), 0.0);
     }
 }

@@ -1,22 +1,22 @@
-//! What the lander is told.
+//! The events that the lander reacts to.
 
 use geometry::{Body, Camera, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
 use nalgebra::Matrix3;
 
 use crate::time::Timestamp;
 
-/// Something the lander must know of.
+/// Something that happened.
 #[derive(Copy, Clone, Debug, PartialEq)]
 #[expect(
     clippy::large_enum_variant,
-    reason = "told by value, one at a time, and nothing may be allocated in flight"
+    reason = "passed by value, one at a time; nothing may be allocated in flight"
 )]
 pub enum Event {
     /// The autopilot reported the vehicle's state.
     Vehicle(VehicleState),
-    /// A detector has looked at a frame.
+    /// A detector has searched an image.
     Frame(FrameObservation),
-    /// A person decided something.
+    /// The operator gave a command.
     Operator(OperatorCommand),
     /// A limit was reached.
     Alarm(Alarm),
@@ -24,40 +24,40 @@ pub enum Event {
     Tick,
 }
 
-/// What an operator can ask for.
+/// An operator's command.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum OperatorCommand {
-    /// Begin a landing, or begin again after a terminal phase.
+    /// Start a landing, also after a terminal phase.
     Start,
     /// Stop and hover until `Resume`.
     Hold,
-    /// Go on after `Hold`.
+    /// Continue after `Hold`.
     Resume,
-    /// Give the landing up.
+    /// Abort the landing.
     Abort,
 }
 
-/// A limit that others watch; what follows is configured for each.
+/// A limit that the caller monitors; the reaction to each is configured.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Alarm {
     /// There is enough left for one landing.
     BatteryLow,
     /// There is enough left to go straight down.
     BatteryCritical,
-    /// The operator can no longer be heard.
+    /// The link to the operator is lost.
     OperatorLost,
-    /// The autopilot is no longer heard.
+    /// The link to the autopilot is lost.
     AutopilotLost,
 }
 
 /// The vehicle as the autopilot estimates it at one moment.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct VehicleState {
-    /// When this was so.
+    /// Time of the state.
     pub stamp: Timestamp,
     /// The attitude.
     pub ned_from_body: Rotation<Ned, Body>,
-    /// Where the body's origin is, in metres from the autopilot's local origin.
+    /// Position of the body's origin, in metres from the autopilot's local origin.
     pub position: Point<Ned>,
     /// Velocity in m/s.
     pub velocity: Vector<Ned>,
@@ -65,7 +65,7 @@ pub struct VehicleState {
     pub mode: Mode,
     /// True when the motors may turn.
     pub armed: bool,
-    /// What the autopilot thinks of the ground.
+    /// The autopilot's landed state.
     pub landed: Landed,
 }
 

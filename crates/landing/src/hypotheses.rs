@@ -1,64 +1,193 @@
-//! How often a place at which the marker was seen shows it, when a frame shows that place.
+//! Two hypotheses of where the pad is: the estimate, and a competing place at which outliers agree.
 //!
-//! Two places that both claim to be the pad are not told apart by the detections of one alone: one of them may just be out of
-//! view, low over the ground or because the vehicle leans into the wind. So each is counted by the frames that show it: the pad
-//! is where the marker is in most of those, and a place out of view keeps what it has earned, for a while.
+//! Detections of one place alone do not decide between the two, because the other may just be out of view: low over the
+//! ground, or while the vehicle tilts into the wind. So support is the share of the frames showing a place in which the
+//! marker was there, and a place out of view keeps its support for a while. The competing place becomes the estimate, and
+//! the estimate the competing place, once its share is clearly larger over a long enough time. A pad that is moved is
+//! found again within seconds where its old place is in view, and a second marker is not accepted just because the first is
+//! out of view. An estimate with few detections is replaced at once. While the marker is elsewhere in most of the frames
+//! that show the estimate's place, the estimate is ambiguous, and the vehicle does not descend.
 
-use geometry::{Body, Camera, Odometry, Point, Rotation, Vector};
+use geometry::{Odometry, Point};
+use nalgebra::Vector3;
 
-use crate::config::MAX_COUNTED_DETECTIONS;
+use crate::config::{EstimatorConfig, MAX_COUNTED_DETECTIONS};
 use crate::event::FrameObservation;
 use crate::history::Motion;
+use crate::measurement::Measurement;
 use crate::time::Timestamp;
+use crate::view::View;
 
 /// Time constant with which frames that show the place are forgotten, in seconds.
 const SHOWN_S: f64 = 2.0;
 
-/// Time constant with which a place that no frame shows loses its standing, in seconds.
+/// Time constant with which a place out of view loses its support, in seconds.
 const UNSHOWN_S: f64 = 6.0;
 
-/// A silence between two frames counts as this at most, in seconds.
-const LONGEST_GAP_S: f64 = 0.2;
+/// Longest interval between two frames that is counted, in seconds.
+const MAX_GAP_S: f64 = 0.2;
 
-/// What of the image's edge is not taken for view: an angle in radians, and room for the marker in metres.
-const RIM_RAD: f64 = 0.01;
-const RIM_M: f64 = 0.1;
-
-/// Part of the frames that must show more of one place than of the other for a change.
+/// Difference of the shares from which one hypothesis is clearly better than the other.
 const MAJORITY: f64 = 0.2;
 
-/// The record of one place.
+/// Gate for associating an outlier with the competing hypothesis, in metres, in addition to both uncertainties.
+const ASSOCIATION_GATE_M: f64 = 0.15;
+
+/// A competing hypothesis with fewer detections than this is replaced by the next outlier.
+const MIN_DETECTIONS: f64 = 0.5;
+
+/// The estimate is ambiguous when the competing hypothesis has this many detections and the estimate's share is below
+/// the second number.
+const AMBIGUOUS_DETECTIONS: f64 = 2.5;
+const AMBIGUOUS_SHARE: f64 = 0.5;
+
+/// Which hypothesis a frame's marker supports.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Supported {
+    Estimate,
+    Competitor,
+}
+
+/// The frames that support one hypothesis, older ones with less weight.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub(crate) struct Standing {
-    /// Frames in which the marker was there, and frames that showed the place, the older the less.
+struct HypothesisSupport {
+    /// Frames showing the place with the marker there, and all frames showing the place.
     seen: f64,
     shown: f64,
-    /// All detections there, those at the image's rim too, the older the less.
-    sighted: f64,
-    /// What is left of its standing after a time out of view.
+    /// All detections there, including those at the image's edge.
+    detections: f64,
+    /// Share of the support that is left after a time out of view.
     trust: f64,
     newest: Timestamp,
 }
 
-impl Standing {
-    /// A place seen in one frame.
-    pub(crate) fn new(stamp: Timestamp) -> Self {
-        Self { seen: 1.0, shown: 1.0, sighted: 1.0, trust: 1.0, newest: stamp }
+/// A place at which outliers agree.
+#[derive(Copy, Clone, Debug)]
+struct Hypothesis {
+    newest: Measurement,
+    since: Timestamp,
+    support: HypothesisSupport,
+}
+
+/// The estimate's support, and the competing hypothesis.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Hypotheses {
+    /// `None` before the first detection.
+    estimate: Option<HypothesisSupport>,
+    competitor: Option<Hypothesis>,
+    /// The camera's field of view, once it is known.
+    view: Option<View>,
+}
+
+impl Hypotheses {
+    /// Takes the field of view from a frame.
+    pub(crate) fn set_view(&mut self, frame: &FrameObservation) {
+        self.view = View::from_frame(frame).or(self.view);
     }
 
-    /// Counts a frame that showed the place or did not, with the marker there or not. At the image's rim, where a marker is
-    /// found by chance, it only lasts.
-    pub(crate) fn count(&mut self, stamp: Timestamp, is_shown: bool, is_seen: bool) {
-        let gap_s = stamp.seconds_since(self.newest).clamp(0.0, LONGEST_GAP_S);
+    /// Starts again with an estimate from one detection.
+    pub(crate) fn restart(&mut self, stamp: Timestamp) {
+        self.estimate = Some(HypothesisSupport::new(stamp));
+        self.competitor = None;
+    }
+
+    /// Counts a frame for both hypotheses; `estimate` is the estimated place at its stamp.
+    pub(crate) fn count(
+        &mut self,
+        stamp: Timestamp,
+        motion: &Motion,
+        estimate: Option<Point<Odometry>>,
+        supported: Option<Supported>,
+    ) {
+        let view = self.view;
+        let is_shown = |place: Point<Odometry>| view.is_none_or(|view| view.shows(place, motion));
+        if let (Some(support), Some(place)) = (&mut self.estimate, estimate) {
+            support.count(stamp, is_shown(place), supported == Some(Supported::Estimate));
+        }
+        if let Some(competitor) = &mut self.competitor {
+            let place = point(competitor.newest.position);
+            let is_seen = supported == Some(Supported::Competitor);
+            competitor.support.count(stamp, is_shown(place), is_seen);
+        }
+    }
+
+    /// Counts an outlier: for the competing hypothesis it agrees with, or as a new one where the old has little support.
+    pub(crate) fn count_outlier(
+        &mut self,
+        config: &EstimatorConfig,
+        outlier: &Measurement,
+        motion: &Motion,
+        estimate: Option<Point<Odometry>>,
+    ) {
+        let agrees = self.competitor.is_some_and(|it| is_same_place(config, outlier, &it.newest));
+        self.count(outlier.stamp, motion, estimate, agrees.then_some(Supported::Competitor));
+        match &mut self.competitor {
+            Some(competitor) if agrees => {
+                if outlier.stamp > competitor.newest.stamp {
+                    competitor.newest = *outlier;
+                }
+            }
+            Some(competitor) if competitor.support.detections >= MIN_DETECTIONS => {}
+            _ => {
+                self.competitor = Some(Hypothesis {
+                    newest: *outlier,
+                    since: outlier.stamp,
+                    support: HypothesisSupport::new(outlier.stamp),
+                });
+            }
+        }
+    }
+
+    /// True while it is undecided which of two places is the pad.
+    pub(crate) fn is_ambiguous(&self) -> bool {
+        self.competitor.is_some_and(|it| it.support.detections >= AMBIGUOUS_DETECTIONS)
+            && self.estimate.is_some_and(|support| support.share() < AMBIGUOUS_SHARE)
+    }
+
+    /// Swaps the hypotheses when the competing one is clearly better; returns the measurement from which the estimate
+    /// starts again. `detections` and `newest` are those of the present estimate.
+    pub(crate) fn resolve(
+        &mut self,
+        config: &EstimatorConfig,
+        now: Timestamp,
+        detections: u32,
+        newest: Option<Measurement>,
+    ) -> Option<Measurement> {
+        let (support, competitor) = (self.estimate?, self.competitor?);
+        let lasted_s = now.seconds_since(competitor.since);
+        let is_young = detections < config.restart_after;
+        let is_enough = self.is_ambiguous()
+            || competitor.support.detections >= f64::from(config.restart_after) - 1.0;
+        let yields = is_enough
+            && (is_young || lasted_s >= config.restart_s)
+            && competitor.support.beats(&support);
+        if !yields {
+            return None;
+        }
+        self.estimate = Some(competitor.support);
+        self.competitor = newest.map(|newest| Hypothesis { newest, since: newest.stamp, support });
+        Some(competitor.newest)
+    }
+}
+
+impl HypothesisSupport {
+    /// A place seen in one frame.
+    fn new(stamp: Timestamp) -> Self {
+        Self { seen: 1.0, shown: 1.0, detections: 1.0, trust: 1.0, newest: stamp }
+    }
+
+    /// Counts a frame. A detection at the image's edge, where the marker is found by chance, only keeps the trust.
+    fn count(&mut self, stamp: Timestamp, is_shown: bool, is_seen: bool) {
+        let gap_s = stamp.seconds_since(self.newest).clamp(0.0, MAX_GAP_S);
         self.newest = self.newest.max(stamp);
-        let lasting = (-gap_s / UNSHOWN_S).exp();
-        self.sighted = if is_seen {
-            (self.sighted + 1.0).min(f64::from(MAX_COUNTED_DETECTIONS))
+        let unshown = (-gap_s / UNSHOWN_S).exp();
+        self.detections = if is_seen {
+            (self.detections + 1.0).min(f64::from(MAX_COUNTED_DETECTIONS))
         } else {
-            self.sighted * lasting
+            self.detections * unshown
         };
         if !is_shown {
-            self.trust = if is_seen { 1.0 } else { self.trust * lasting };
+            self.trust = if is_seen { 1.0 } else { self.trust * unshown };
             return;
         }
         let kept = (-gap_s / SHOWN_S).exp();
@@ -67,67 +196,39 @@ impl Standing {
         self.trust = 1.0;
     }
 
-    /// The part of the frames showing the place in which the marker was there, from 0 to 1.
-    pub(crate) fn share(&self) -> f64 {
+    /// Share of the frames showing the place in which the marker was there, from 0 to 1.
+    fn share(&self) -> f64 {
         self.trust * self.seen / self.shown.max(1.0)
     }
 
-    /// Detections at the place, the older the less.
-    pub(crate) fn detections(&self) -> f64 {
-        self.sighted
-    }
-
-    /// True when the marker is so clearly more often here than at the other place that this one is the pad.
-    pub(crate) fn beats(&self, other: &Self) -> bool {
+    /// True when the marker is clearly more often here than at the other place.
+    fn beats(&self, other: &Self) -> bool {
         self.share() > other.share() + MAJORITY
     }
 }
 
-/// What a camera shows.
-#[derive(Copy, Clone, Debug, PartialEq)]
-pub(crate) struct View {
-    body_from_camera: Rotation<Body, Camera>,
-    /// Half the angle of view to the right, and to the bottom, in radians.
-    half_rad: [f64; 2],
+fn is_same_place(config: &EstimatorConfig, one: &Measurement, other: &Measurement) -> bool {
+    let gap_s = one.stamp.seconds_since(other.stamp).abs();
+    let reach_m = ASSOCIATION_GATE_M
+        + 3.0 * (one.noise.trace() + other.noise.trace()).sqrt()
+        + (config.pad_speed_m_s + config.drift_m_s) * gap_s;
+    gap_s <= config.forget_after_s && (one.position - other.position).norm() <= reach_m
 }
 
-impl View {
-    /// What a frame's camera shows, when it is calibrated. One of which the mount is not known looks down, and only what
-    /// is shown however it is turned counts.
-    pub(crate) fn of(frame: &FrameObservation) -> Option<Self> {
-        let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0)?;
-        let (width, height) = frame.image_size;
-        let half = |px: u32| (0.5 * f64::from(px) / focal_px).atan();
-        let short = half(width.min(height));
-        Some(frame.body_from_camera.map_or(
-            Self { body_from_camera: Rotation::identity(), half_rad: [short; 2] },
-            |body_from_camera| Self { body_from_camera, half_rad: [half(width), half(height)] },
-        ))
-    }
-
-    /// True when a place in the vehicle's way is shown with a marker that lies there.
-    pub(crate) fn shows(&self, place: Point<Odometry>, motion: &Motion) -> bool {
-        let in_body: Vector<Body> =
-            motion.odometry_from_body().inverse() * (place - motion.odometry);
-        let seen = self.body_from_camera.inverse() * in_body;
-        let is_inside = |aside_m: f64, half_rad: f64| {
-            (aside_m.abs() + RIM_M).atan2(seen.z()) < half_rad - RIM_RAD
-        };
-        let [right_rad, bottom_rad] = self.half_rad;
-        seen.z() > 0.0 && is_inside(seen.x(), right_rad) && is_inside(seen.y(), bottom_rad)
-    }
+fn point(position: Vector3<f64>) -> Point<Odometry> {
+    Point::new(position.x, position.y, position.z)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn counted(frames: u32, shown: bool, seen: impl Fn(u32) -> bool) -> Standing {
-        let mut standing = Standing::new(Timestamp::default());
+    fn counted(frames: u32, shown: bool, seen: impl Fn(u32) -> bool) -> HypothesisSupport {
+        let mut support = HypothesisSupport::new(Timestamp::default());
         for i in 1..=frames {
-            standing.count(Timestamp::from_seconds(f64::from(i) / 15.0), shown, seen(i));
+            support.count(Timestamp::from_seconds(f64::from(i) / 15.0), shown, seen(i));
         }
-        standing
+        support
     }
 
     #[test]
@@ -139,9 +240,9 @@ mod tests {
     }
 
     #[test]
-    fn out_of_view_a_place_keeps_its_standing_for_seconds() {
+    fn a_place_out_of_view_keeps_its_support_for_seconds() {
         let mut pad = counted(60, true, |_| true);
-        let mut other = Standing::new(Timestamp::from_seconds(4.0));
+        let mut other = HypothesisSupport::new(Timestamp::from_seconds(4.0));
         for i in 0..60 {
             let stamp = Timestamp::from_seconds(4.0 + f64::from(i) / 15.0);
             pad.count(stamp, false, false);
@@ -154,47 +255,14 @@ mod tests {
     fn a_place_seen_for_minutes_is_forgotten_as_soon_as_one_seen_for_seconds() {
         let left_after_s = |frames: u32| {
             let mut place = counted(frames, true, |_| true);
-            let begun_s = f64::from(frames) / 15.0;
+            let start_s = f64::from(frames) / 15.0;
             for i in 0..15 * 30 {
-                let stamp = Timestamp::from_seconds(begun_s + f64::from(i) / 15.0);
+                let stamp = Timestamp::from_seconds(start_s + f64::from(i) / 15.0);
                 place.count(stamp, true, false);
             }
-            place.detections()
+            place.detections
         };
         assert!((left_after_s(15 * 600) - left_after_s(15 * 3)).abs() < 1e-6);
         assert!(left_after_s(15 * 600) < 0.5, "{}", left_after_s(15 * 600));
-    }
-
-    #[test]
-    fn what_is_below_is_in_view_and_what_is_beside_is_not() {
-        let motion = Motion {
-            ned_from_body: Rotation::identity(),
-            position: Point::origin(),
-            velocity: Vector::zero(),
-            odometry: Point::origin(),
-            rate: Vector::zero(),
-        };
-        let frame = FrameObservation {
-            stamp: Timestamp::default(),
-            image_size: (1296, 972),
-            focal_px: Some(1818.0),
-            body_from_camera: None,
-            marker: None,
-        };
-        let view = View::of(&frame).unwrap();
-        assert!(view.shows(Point::new(0.5, 0.0, 3.0), &motion));
-        assert!(!view.shows(Point::new(1.0, 0.0, 3.0), &motion));
-        assert!(!view.shows(Point::new(0.0, 0.0, -3.0), &motion));
-        let leaning = Motion { ned_from_body: Rotation::from_euler(0.0, 0.3, 0.0), ..motion };
-        assert!(!view.shows(Point::new(-0.5, 0.0, 3.0), &leaning));
-        // The image's longer side is along the body's y axis, then along its x axis.
-        for (turn, [north, east]) in [(std::f64::consts::FRAC_PI_2, [0.0, 0.9]), (0.0, [0.9, 0.0])]
-        {
-            let mount = Rotation::from_euler(0.0, 0.0, turn);
-            let view =
-                View::of(&FrameObservation { body_from_camera: Some(mount), ..frame }).unwrap();
-            assert!(view.shows(Point::new(north, east, 3.0), &motion));
-            assert!(!view.shows(Point::new(east, north, 3.0), &motion));
-        }
     }
 }

@@ -1,32 +1,41 @@
 //! The landing decision, a pure function of time and events.
 //!
-//! [`Lander::step`] is told the time and what happened (the vehicle's state, a frame looked at, an operator's
-//! command, or nothing) and answers with a phase, an action for the autopilot, and the reasons. It keeps the
-//! vehicle's recent motion, joins every detection with the motion at its exposure, estimates the target's place and motion,
-//! and steers by one of two guidances. Same events, same decisions, to the bit.
+//! [`Lander::step`] takes the time and an event (the vehicle's state, a searched image, an operator's command, an alarm, or
+//! a tick) and returns a phase, an action for the autopilot, and the reasons. It keeps the vehicle's recent motion, joins
+//! every detection with the motion at its exposure, estimates the target's position and motion, and steers by one of two
+//! guidances. The same events give the same decisions, to the bit.
 //!
 //! This crate knows no clock, network, file, thread, log or message, and no autopilot protocol.
 //!
-//! Modules in reading order: [`event`] is what the lander is told and [`decision`] what it answers, [`config`] has
-//! every number; [`lander`] joins [`history`] (the vehicle a moment ago), [`estimator`] (where the landing point is, by the `standing` of two places that claim to be it; [`target`] for the thesis' guidance),
-//! [`guidance`] (target to velocity), [`agreement`] (do camera and autopilot mean the same directions), [`phase`] (what comes next), [`search`] (where to look) and [`envelope`] (the last look at a setpoint);
-//! [`time`] has the stamps.
+//! Modules in reading order:
+//!
+//! - [`time`], [`event`], [`decision`]: stamps, inputs, outputs; [`config`] has every number.
+//! - [`history`]: the vehicle's recent motion, and the odometry frame.
+//! - `measurement`, `filter`, `view`, `hypotheses`, [`estimator`]: from detections to the landing point; [`mean_target`] for
+//!   the thesis' guidance.
+//! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker.
+//! - [`axis_check`]: are the axes of camera and autopilot consistent?
+//! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
+//! - [`lander`] joins them.
 
-pub mod agreement;
+pub mod axis_check;
 pub mod config;
 pub mod decision;
 pub mod envelope;
 pub mod estimator;
 pub mod event;
+mod filter;
 pub mod guidance;
 pub mod history;
+mod hypotheses;
 pub mod lander;
 mod limits;
-pub mod phase;
+pub mod mean_target;
+mod measurement;
 pub mod search;
-mod standing;
-pub mod target;
+pub mod state_machine;
 pub mod time;
+mod view;
 
 pub use config::{
     AlarmAction, Config, EnvelopeConfig, EstimatorConfig, GuidanceConfig, MetricConfig, OnAbort,

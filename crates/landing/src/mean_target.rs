@@ -1,11 +1,8 @@
-//! The target: where the landing point is, from detections that are joined with the vehicle's motion at their
-//! exposure.
+//! The target of the thesis' guidance: a mean of detections, each joined with the vehicle's motion at its exposure.
 //!
-//! The filter is a mean that forgets: high up, where a degree of tilt is 20 cm on the ground, it averages over
-//! more detections than close to the ground, where each one is good to millimetres and the vehicle's own
-//! position drifts by more. A detection far from the estimate is an outlier; several outliers in a row that
-//! agree with each other are a new estimate, so neither a false marker nor a jump of the vehicle's position is
-//! believed at once, and none is ignored for ever.
+//! The mean forgets: high up, where a degree of tilt is 20 cm on the ground, it averages over more detections than close to
+//! the ground, where each one is good to millimetres and the vehicle's own position drifts by more. A detection far from the
+//! mean is an outlier; several consecutive outliers in agreement start a new mean.
 
 use geometry::{Ned, Point, Vector};
 
@@ -13,18 +10,19 @@ use crate::config::TargetConfig;
 use crate::decision::{Rejection, TargetEstimate};
 use crate::event::{FrameObservation, MarkerInFrame};
 use crate::history::{History, Motion};
+use crate::measurement::check_plausible;
 use crate::time::Timestamp;
 
 /// The estimate of the landing point.
 #[derive(Clone, Debug)]
-pub struct Target {
+pub struct MeanTarget {
     config: TargetConfig,
-    estimate: Option<Mean>,
+    mean: Option<Mean>,
     /// Outliers that agree with each other.
-    rival: Option<Mean>,
+    candidate: Option<Mean>,
 }
 
-/// A mean of positions that forgets.
+/// An exponentially weighted mean of positions.
 #[derive(Copy, Clone, Debug)]
 struct Mean {
     position: Point<Ned>,
@@ -34,19 +32,13 @@ struct Mean {
     spread_m2: f64,
 }
 
-impl Target {
-    /// A target never seen.
+impl MeanTarget {
+    /// A target without a detection.
     pub fn new(config: TargetConfig) -> Self {
-        Self { config, estimate: None, rival: None }
+        Self { config, mean: None, candidate: None }
     }
 
-    /// Forgets everything.
-    pub fn clear(&mut self) {
-        self.estimate = None;
-        self.rival = None;
-    }
-
-    /// Uses one marker of a frame, or says why not.
+    /// Fuses one marker of a frame, or returns why not.
     pub fn observe(
         &mut self,
         frame: &FrameObservation,
@@ -57,13 +49,13 @@ impl Target {
         let motion = history.at(frame.stamp).ok_or(Rejection::NoAttitude)?;
         let marker_in_body = body_from_marker.origin() - Point::origin();
         let marker_from_vehicle = motion.ned_from_body * marker_in_body;
-        self.plausible(marker_from_vehicle)?;
+        check_plausible(marker_from_vehicle, self.config.max_range_m)?;
         self.fuse(frame.stamp, &motion, marker_from_vehicle)
     }
 
-    /// The estimate as seen from `vehicle` at `now`.
-    pub fn seen_from(&self, vehicle: Point<Ned>, now: Timestamp) -> Option<TargetEstimate> {
-        self.estimate.map(|mean| {
+    /// The estimate relative to a vehicle at `vehicle`, at `now`.
+    pub fn estimate(&self, vehicle: Point<Ned>, now: Timestamp) -> Option<TargetEstimate> {
+        self.mean.map(|mean| {
             let offset = mean.position - vehicle;
             TargetEstimate {
                 position: mean.position,
@@ -76,19 +68,9 @@ impl Target {
                 heading_rad: None,
                 time_offset_s: 0.0,
                 nis: None,
-                contested: false,
+                ambiguous: false,
             }
         })
-    }
-
-    fn plausible(&self, marker_from_vehicle: Vector<Ned>) -> Result<(), Rejection> {
-        let below = marker_from_vehicle.z() > 0.0;
-        let steep = marker_from_vehicle.horizontal_norm() < 3.0 * marker_from_vehicle.z();
-        if below && steep && marker_from_vehicle.norm() <= self.config.max_range_m {
-            Ok(())
-        } else {
-            Err(Rejection::Implausible)
-        }
     }
 
     fn fuse(
@@ -102,30 +84,30 @@ impl Target {
         let gate_m = self.config.gate_m + self.config.gate_per_height * height_m;
         let smoothing_s = self.config.smoothing_s + self.config.smoothing_s_per_height * height_m;
         let forget_after_s = self.config.forget_after_s;
-        let known =
-            self.estimate.as_mut().filter(|mean| stamp.seconds_since(mean.stamp) <= forget_after_s);
-        let Some(estimate) = known else {
-            self.estimate = Some(Mean::new(position, stamp));
+        let recent =
+            self.mean.as_mut().filter(|mean| stamp.seconds_since(mean.stamp) <= forget_after_s);
+        let Some(estimate) = recent else {
+            self.mean = Some(Mean::new(position, stamp));
             return Ok(());
         };
         if estimate.accepts(position, gate_m) {
             estimate.add(position, stamp, smoothing_s);
-            self.rival = None;
+            self.candidate = None;
             return Ok(());
         }
-        let rival = match self.rival {
-            Some(mut rival) if rival.accepts(position, gate_m) => {
-                rival.add(position, stamp, smoothing_s);
-                rival
+        let candidate = match self.candidate {
+            Some(mut candidate) if candidate.accepts(position, gate_m) => {
+                candidate.add(position, stamp, smoothing_s);
+                candidate
             }
             _ => Mean::new(position, stamp),
         };
-        if rival.detections < self.config.restart_after {
-            self.rival = Some(rival);
+        if candidate.detections < self.config.restart_after {
+            self.candidate = Some(candidate);
             return Err(Rejection::Outlier);
         }
-        self.estimate = Some(rival);
-        self.rival = None;
+        self.mean = Some(candidate);
+        self.candidate = None;
         Ok(())
     }
 }
@@ -162,7 +144,7 @@ mod tests {
     /// A vehicle at 5 m that nods, and a detector that sees a marker at `target`.
     struct Scene {
         history: History,
-        target: Target,
+        target: MeanTarget,
         seconds: f64,
     }
 
@@ -170,7 +152,7 @@ mod tests {
         fn new() -> Self {
             Self {
                 history: History::new(0.1),
-                target: Target::new(TargetConfig::default()),
+                target: MeanTarget::new(TargetConfig::default()),
                 seconds: 0.0,
             }
         }
@@ -217,7 +199,7 @@ mod tests {
 
         fn estimate(&self) -> TargetEstimate {
             self.target
-                .seen_from(Point::new(0.0, 0.0, -5.0), Timestamp::from_seconds(self.seconds))
+                .estimate(Point::new(0.0, 0.0, -5.0), Timestamp::from_seconds(self.seconds))
                 .unwrap()
         }
     }
@@ -236,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn an_outlier_is_refused_and_a_steady_new_place_is_believed() {
+    fn an_outlier_is_refused_and_a_steady_new_place_accepted() {
         let mut scene = Scene::new();
         for _ in 0..10 {
             scene.see(Point::new(1.0, 0.0, 0.0)).unwrap();

@@ -1,57 +1,58 @@
-//! Looking for the marker: an expanding square about the place where the search began.
+//! The search for the marker: an expanding square about the place where the search started.
 //!
-//! A camera that is fixed to the vehicle looks downwind, because the vehicle leans into the wind: what lies straight
-//! below it may be out of view, and what is out of view lies upwind. So the first leg goes upwind.
+//! A camera that is fixed to the vehicle looks downwind, because the vehicle tilts into the wind: a marker right below may
+//! be out of view, upwind of the image. So the first leg goes upwind.
 
 use geometry::{Body, Ned, Rotation, Vector};
 
 use crate::config::PhaseConfig;
 
-/// Leans below this show no wind worth a direction, in radians.
-const CALM_RAD: f64 = 0.02;
+/// Minimum tilt that shows the direction of the wind, in radians.
+const MIN_TILT_RAD: f64 = 0.02;
 
-/// The direction of the first leg, in radians from north to east: that into which the vehicle leans.
+/// The direction of the first leg, in radians from north to east: the one into which the vehicle tilts.
 pub fn first_leg_rad(ned_from_body: Rotation<Ned, Body>) -> f64 {
     let up = ned_from_body * Vector::<Body>::new(0.0, 0.0, -1.0);
-    if up.horizontal_norm() < CALM_RAD.sin() { 0.0 } else { up.y().atan2(up.x()) }
+    if up.horizontal_norm() < MIN_TILT_RAD.sin() { 0.0 } else { up.y().atan2(up.x()) }
 }
 
-/// How far upwind the camera must go to look at what lies below the vehicle, in metres: the way from below the vehicle to
-/// the ground that the camera looks at, as far as the search goes at all.
+/// Distance upwind that the camera must fly to see the ground below the vehicle, in metres: the distance from that ground to
+/// the centre of the image, at most `search_radius_m`.
 pub fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: f64) -> f64 {
     let down = ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
-    let beside_m = height_m.max(0.0) * down.horizontal_norm() / down.z().max(0.5);
-    if beside_m < CALM_RAD * height_m { 0.0 } else { beside_m.min(config.search_radius_m) }
+    let offset_m = height_m.max(0.0) * down.horizontal_norm() / down.z().max(0.5);
+    if offset_m < MIN_TILT_RAD * height_m { 0.0 } else { offset_m.min(config.search_radius_m) }
 }
 
-/// The velocity at a time after the square began, in m/s: `upwind_m` along the first leg, then legs of 1, 1, 2, 2, 3, 3, ... spacings, each to the right of the one before; nought once the radius is reached.
+/// The velocity at a time after the square started, in m/s: `upwind_m` along the first leg, then legs of 1, 1, 2, 2, 3, 3,
+/// ... spacings, each to the right of the one before; zero once the radius is reached.
 pub fn velocity(
     config: &PhaseConfig,
     elapsed_s: f64,
     first_leg_rad: f64,
     upwind_m: f64,
 ) -> Vector<Ned> {
-    let mut way_m = elapsed_s * config.search_speed_m_s;
-    if way_m.is_nan() || way_m < 0.0 {
+    let mut flown_m = elapsed_s * config.search_speed_m_s;
+    if flown_m.is_nan() || flown_m < 0.0 {
         return Vector::zero();
     }
     let (east, north) = first_leg_rad.sin_cos();
-    if way_m < upwind_m {
+    if flown_m < upwind_m {
         return Vector::new(north, east, 0.0) * config.search_speed_m_s;
     }
-    way_m -= upwind_m;
-    // Four legs are one round, whose corners lie a spacing farther out; one more closes the last round.
+    flown_m -= upwind_m;
+    // Four legs are one round, each round one spacing farther out; one more leg closes the last round.
     let spacing_m = config.search_spacing_m.min(config.search_radius_m);
     let rounds = (config.search_radius_m / spacing_m).floor() as u32;
     for leg in 1..=4 * rounds + 1 {
         let spacings = if leg > 4 * rounds { 2 * rounds } else { leg.div_ceil(2) };
         let length_m = spacing_m * f64::from(spacings);
-        if way_m < length_m {
+        if flown_m < length_m {
             let direction = first_leg_rad + f64::from(leg - 1) * std::f64::consts::FRAC_PI_2;
             let (east, north) = direction.sin_cos();
             return Vector::new(north, east, 0.0) * config.search_speed_m_s;
         }
-        way_m -= length_m;
+        flown_m -= length_m;
     }
     Vector::zero()
 }
@@ -72,7 +73,7 @@ mod tests {
         }
         let farthest = path.iter().map(|p| p.x().hypot(p.y())).fold(0.0, f64::max);
         assert!(farthest <= config.search_radius_m * std::f64::consts::SQRT_2 + 0.1, "{farthest}");
-        // Whatever lies within the square that is flown comes within the spacing of the path.
+        // Every point within the square is within the spacing of the path.
         let reach = config.search_radius_m - 0.5 * config.search_spacing_m;
         for (x, y) in
             [(0.0, 0.0), (reach, 0.0), (0.0, reach), (-reach, 0.0), (0.0, -reach), (2.5, -3.5)]
@@ -87,13 +88,13 @@ mod tests {
 
     #[test]
     fn the_first_leg_goes_into_the_wind() {
-        // Nose down at heading east: it leans eastwards.
-        let leans_east = Rotation::<Ned, Body>::from_euler(0.0, -0.2, std::f64::consts::FRAC_PI_2);
-        assert!((first_leg_rad(leans_east) - std::f64::consts::FRAC_PI_2).abs() < 1e-9);
+        // Nose down at heading east: it tilts eastwards.
+        let tilts_east = Rotation::<Ned, Body>::from_euler(0.0, -0.2, std::f64::consts::FRAC_PI_2);
+        assert!((first_leg_rad(tilts_east) - std::f64::consts::FRAC_PI_2).abs() < 1e-9);
         assert!(first_leg_rad(Rotation::identity()).abs() < 1e-12);
         let config = PhaseConfig::default();
-        assert!((upwind_m(&config, leans_east, 10.0) - 10.0 * 0.2f64.tan()).abs() < 1e-9);
-        assert_eq!(upwind_m(&config, leans_east, 100.0), config.search_radius_m);
+        assert!((upwind_m(&config, tilts_east, 10.0) - 10.0 * 0.2f64.tan()).abs() < 1e-9);
+        assert_eq!(upwind_m(&config, tilts_east, 100.0), config.search_radius_m);
         assert_eq!(upwind_m(&config, Rotation::identity(), 10.0), 0.0);
     }
 }

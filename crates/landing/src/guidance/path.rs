@@ -26,14 +26,14 @@ pub(super) struct Path {
     setpoint: Level,
     velocity: Level,
     acceleration: Level,
-    rest_s: f64,
+    remainder_s: f64,
 }
 
 impl Path {
     /// The path of a vehicle that moves steadily, as it is asked to.
     pub(super) fn new(velocity: Vector<Ned>) -> Self {
         let velocity = Level::new(velocity.x(), velocity.y());
-        Self { setpoint: velocity, velocity, acceleration: Level::zeros(), rest_s: 0.0 }
+        Self { setpoint: velocity, velocity, acceleration: Level::zeros(), remainder_s: 0.0 }
     }
 
     /// Its velocity now, in m/s.
@@ -46,21 +46,21 @@ impl Path {
         Vector::new(self.acceleration.x, self.acceleration.y, 0.0)
     }
 
-    /// Lets `dt_s` pass with this setpoint.
-    pub(super) fn pass(&mut self, dt_s: f64, setpoint: Vector<Ned>) {
+    /// Advances the path by `dt_s` towards this setpoint.
+    pub(super) fn advance(&mut self, dt_s: f64, setpoint: Vector<Ned>) {
         let setpoint = Level::new(setpoint.x(), setpoint.y());
-        self.rest_s += dt_s;
-        while self.rest_s >= STEP_S {
-            self.rest_s -= STEP_S;
+        self.remainder_s += dt_s;
+        while self.remainder_s >= STEP_S {
+            self.remainder_s -= STEP_S;
             self.setpoint += (setpoint - self.setpoint) * (STEP_S / SETPOINT_LAG_S);
-            let wanted = shortened((self.setpoint - self.velocity) / PATH_TIME_S, ACCELERATION);
-            self.acceleration += shortened(wanted - self.acceleration, JERK * STEP_S);
+            let wanted = limited((self.setpoint - self.velocity) / PATH_TIME_S, ACCELERATION);
+            self.acceleration += limited(wanted - self.acceleration, JERK * STEP_S);
             self.velocity += self.acceleration * STEP_S;
         }
     }
 }
 
-fn shortened(v: Level, length: f64) -> Level {
+fn limited(v: Level, length: f64) -> Level {
     let norm = v.norm();
     if norm > length { v * (length / norm) } else { v }
 }
@@ -74,7 +74,7 @@ mod tests {
         let mut path = Path::new(Vector::zero());
         (1..1000)
             .find_map(|i| {
-                path.pass(0.01, Vector::new(size, 0.0, 0.0));
+                path.advance(0.01, Vector::new(size, 0.0, 0.0));
                 (path.velocity().x() >= part * size).then_some(f64::from(i) * 0.01)
             })
             .unwrap_or(f64::NAN)
@@ -93,11 +93,11 @@ mod tests {
     fn a_steady_motion_goes_on_and_limits_hold() {
         let steady = Vector::new(0.4, -0.2, 0.0);
         let mut path = Path::new(steady);
-        path.pass(5.0, steady);
+        path.advance(5.0, steady);
         assert!((path.velocity() - steady).norm() < 1e-9);
         let mut before = path.velocity();
         for _ in 0..1200 {
-            path.pass(STEP_S, Vector::new(-5.0, 5.0, 0.0));
+            path.advance(STEP_S, Vector::new(-5.0, 5.0, 0.0));
             assert!((path.velocity() - before).norm() <= 1.01 * ACCELERATION * STEP_S);
             before = path.velocity();
         }

@@ -1,7 +1,9 @@
-//! The input of a guidance, and its progress.
+//! The interface of a guidance: its input, its progress and the trait.
+
+use geometry::{Ned, Vector};
 
 use crate::decision::{Reason, TargetEstimate};
-use crate::event::VehicleState;
+use crate::event::{FrameObservation, VehicleState};
 use crate::time::Timestamp;
 
 /// The input of a guidance.
@@ -11,33 +13,74 @@ pub struct Situation<'a> {
     pub now: Timestamp,
     /// The vehicle's newest state.
     pub vehicle: &'a VehicleState,
-    /// The target, when detections have poses.
+    /// The target, once it was measured.
     pub target: Option<TargetEstimate>,
-    /// Time since the exposure of the newest marker used, in seconds; infinite when there was none.
+    /// Age of the newest detection used, in seconds; infinite without one.
     pub age_s: f64,
-    /// Smallest angle from the middle of the camera's image to its edge, in radians, when it is known.
+    /// Smallest angle from the image's centre to its edge, in radians, when it is known.
     pub half_view_rad: Option<f64>,
-    /// The pad may move: LAND, which stops the vehicle over the ground, must come after the touch.
+    /// The pad may move: LAND, which stops the vehicle over the ground, must come after the touchdown.
     pub pad_moves: bool,
-    /// Fastest heave of the pad, in m/s.
+    /// Maximum heave speed of the pad, in m/s.
     pub pad_heave_m_s: f64,
 }
 
-/// How far a guidance has brought the vehicle.
+/// The progress of a guidance.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Progress {
-    /// Too far beside the target to descend.
+    /// Too far from the target to descend.
     Aligning,
     /// Over the target.
     Descending,
-    /// Over the target, which is not seen; its estimate is good enough for the rest of the way.
+    /// Over the target without a recent detection; the estimate is good enough for the rest of the descent.
     Blind,
-    /// Low for long and never near enough.
+    /// Low for too long without reaching the target.
     Stuck,
     /// As before.
     Unchanged,
     /// Low enough for the autopilot's LAND, for this reason.
     Ready(Reason),
+}
+
+/// What steers the vehicle over the target and down.
+pub trait Guidance {
+    /// True when the vehicle may descend.
+    fn may_descend(&self, situation: &Situation<'_>) -> bool;
+
+    /// True when the target's position is known well enough to wait there for the marker.
+    fn has_target(&self, _situation: &Situation<'_>) -> bool {
+        false
+    }
+
+    /// True when it also steers the vehicle while LAND is awaited.
+    fn steers_until_land(&self) -> bool {
+        false
+    }
+
+    /// True when it cannot use a marker without a pose.
+    fn needs_pose(&self) -> bool {
+        false
+    }
+
+    /// A frame has arrived while the vehicle is guided; heading in radians from north, altitude over the marker in metres.
+    fn observe(&mut self, _frame: &FrameObservation, _heading_rad: f64, _altitude_m: f64) {}
+
+    /// How far it has brought the vehicle.
+    fn progress(&mut self, situation: &Situation<'_>) -> Progress;
+
+    /// The commanded velocity, and why.
+    fn velocity(&mut self, situation: &Situation<'_>) -> (Vector<Ned>, Reason);
+
+    /// The setpoint that was sent in place of the commanded velocity.
+    fn on_setpoint_sent(&mut self, _velocity: Vector<Ned>) {}
+
+    /// The commanded yaw rate, in rad/s clockwise seen from above.
+    fn yaw_rate(&self, _situation: &Situation<'_>) -> f64 {
+        0.0
+    }
+
+    /// Forgets what builds up while guiding: the vehicle is not guided now.
+    fn reset(&mut self);
 }
 
 impl Situation<'_> {

@@ -12,7 +12,7 @@
 //! | unit of the altitude in `K_pz e_z` | centimetres, as in "80 cm" | -5e-4 * 1000 cm is the limit 0.5 m/s at 10 m exactly, and 20 s * ln(10 / 0.8) = 50.5 s until LAND; with metres the descent would take hours |
 //! | sign of `K_pz` and the limits 1e-5 to 0.5 m/s | the limits are of the speed of descent: `u_z = -limit(-K_pz e_z)` (up positive) | to the letter every command would be the lower limit, a climb |
 //! | `K_p` = 1e-6 | 1e-3 (`kp`) | see below |
-//! | errors of x and y inside the tolerance | used as they are, as Algorithm 18 lists them: the tolerance only gates the descent | set to nought, as the text can be read, the vehicle drifts through the circle: it is over the pad after 31 s instead of 8 s, LAND comes after 55.5 s instead of 50.4 s, and the error is 0.11 m instead of 0.065 m |
+//! | errors of x and y inside the tolerance | used as they are, as Algorithm 18 lists them: the tolerance only gates the descent | set to zero, as the text can be read, the vehicle drifts through the circle: it is over the pad after 31 s instead of 8 s, LAND comes after 55.5 s instead of 50.4 s, and the error is 0.11 m instead of 0.065 m |
 //! | how fast the loop runs, and the sum's time step | once per frame; the sum counts frames, not seconds (Equation 3.14) | "upon receiving a message" |
 //! | anti-windup | none: the sum grows while the output is limited | none is described; with these gains x and y hardly reach their limit |
 //! | altitude over the marker | the target's height where the detector gives a pose, else the altitude over the autopilot's origin | the text says "relative to the marker", the algorithm `drone.altitude()`; on the thesis' field they are equal |
@@ -27,9 +27,8 @@
 //! with 2e-3 the loop is unstable near the ground. Only 1e-3 fits all that the thesis reports, so the exponent is taken
 //! for a misprint. `K_i` is as printed. [`ThesisConfig::as_printed`] has the printed gain.
 //!
-//! Two additions keep the house's rules and do not show in a flight with a marker in view: the envelope of all
-//! guidances applies, so the wind noise cannot push the vehicle down while the marker is unseen, and a marker that
-//! stays away leads to a hold.
+//! Two additions do not show in a flight with the marker in view: the envelope of all guidances applies, so the wind noise
+//! cannot push the vehicle down without a detection, and a marker that stays lost leads to a hold.
 
 use geometry::{Ned, Vector};
 use rand_chacha::ChaCha8Rng;
@@ -39,7 +38,7 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::config::ThesisConfig;
 use crate::decision::Reason;
 use crate::event::FrameObservation;
-use crate::guidance::situation::{Progress, Situation};
+use crate::guidance::situation::{Guidance, Progress, Situation};
 
 impl ThesisConfig {
     /// The constants with the proportional gain as printed, which does not land.
@@ -62,23 +61,16 @@ pub struct Thesis {
     why: Reason,
 }
 
-impl Thesis {
-    /// A controller whose sums and wind noise are nought.
-    pub fn new(config: ThesisConfig) -> Self {
-        Self {
-            config,
-            random: ChaCha8Rng::seed_from_u64(config.seed),
-            wind_m_s: [0.0; 3],
-            sum_px: [0.0; 2],
-            progress: Progress::Unchanged,
-            command: Vector::zero(),
-            why: Reason::Searching,
-        }
+impl Guidance for Thesis {
+    /// True when the newest detection is recent; near the ground a short gap is allowed.
+    fn may_descend(&self, situation: &Situation<'_>) -> bool {
+        let config = &self.config;
+        let is_low = situation.height_m() <= config.low_height_m;
+        situation.age_s <= config.stale_target_s + if is_low { config.low_grace_s } else { 0.0 }
     }
 
     /// Algorithm 18: one frame, with or without the marker, becomes the velocity command until the next frame.
-    /// The heading is in radians from north, the altitude in metres over the marker.
-    pub fn frame(&mut self, frame: &FrameObservation, heading_rad: f64, altitude_m: f64) {
+    fn observe(&mut self, frame: &FrameObservation, heading_rad: f64, altitude_m: f64) {
         self.step_wind();
         let [wind_right, wind_forward, wind_up] = self.wind_m_s;
         let Some(marker) = frame.marker else {
@@ -107,27 +99,35 @@ impl Thesis {
         self.command = self.ned(heading_rad, velocity);
     }
 
-    /// True when the newest detection is recent enough for a descent; near the ground a short gap may be flown through.
-    pub fn may_descend(&self, situation: &Situation<'_>) -> bool {
-        let config = &self.config;
-        let is_low = situation.height_m() <= config.low_height_m;
-        situation.age_s <= config.stale_target_s + if is_low { config.low_grace_s } else { 0.0 }
-    }
-
     /// Where the last frame showed the marker.
-    pub fn progress(&self) -> Progress {
+    fn progress(&mut self, _situation: &Situation<'_>) -> Progress {
         self.progress
     }
 
     /// The command of the last frame.
-    pub fn velocity(&self) -> (Vector<Ned>, Reason) {
+    fn velocity(&mut self, _situation: &Situation<'_>) -> (Vector<Ned>, Reason) {
         (self.command, self.why)
     }
 
     /// Stops; the sums stay, as the thesis' script knows no pause.
-    pub fn rest(&mut self) {
+    fn reset(&mut self) {
         self.command = Vector::zero();
         self.progress = Progress::Unchanged;
+    }
+}
+
+impl Thesis {
+    /// A controller whose sums and wind noise are zero.
+    pub fn new(config: ThesisConfig) -> Self {
+        Self {
+            config,
+            random: ChaCha8Rng::seed_from_u64(config.seed),
+            wind_m_s: [0.0; 3],
+            sum_px: [0.0; 2],
+            progress: Progress::Unchanged,
+            command: Vector::zero(),
+            why: Reason::Searching,
+        }
     }
 
     /// Algorithm 16, Equation 3.15: noise that stands for wind, one independent value per axis.
@@ -146,7 +146,7 @@ impl Thesis {
         limited(self.config.kp * error_px + self.config.ki * sum_px, -limit, limit)
     }
 
-    /// The vertical command, up positive, from the altitude in metres (nought when not aligned).
+    /// The vertical command, up positive, from the altitude in metres (zero when not aligned).
     fn vertical(&self, altitude_m: f64) -> f64 {
         let descent = -self.config.kpz * altitude_m * 100.0;
         -limited(descent, self.config.min_descend_m_s, self.config.max_descend_m_s)
@@ -198,19 +198,19 @@ mod tests {
     #[test]
     fn the_first_command_is_algorithm_18_by_hand() {
         let mut thesis = Thesis::new(calm());
-        thesis.frame(&frame(Some((748.0, 436.0))), 0.0, 6.0);
-        let (velocity, why) = thesis.velocity();
+        thesis.observe(&frame(Some((748.0, 436.0))), 0.0, 6.0);
+        let (velocity, why) = (thesis.command, thesis.why);
         assert!((velocity.y() - (1e-3 + 7e-7) * 100.0).abs() < 1e-12, "image right is east");
         assert!((velocity.x() - (1e-3 + 7e-7) * 50.0).abs() < 1e-12, "image up is north");
         assert!((velocity.z() - 0.3).abs() < 1e-12);
-        assert_eq!((why, thesis.progress()), (Reason::Descending, Progress::Descending));
+        assert_eq!((why, thesis.progress), (Reason::Descending, Progress::Descending));
     }
 
     #[test]
     fn the_command_turns_with_the_vehicle() {
         let mut thesis = Thesis::new(calm());
-        thesis.frame(&frame(Some((648.0, 386.0))), FRAC_PI_2, 5.0);
-        let (velocity, _) = thesis.velocity();
+        thesis.observe(&frame(Some((648.0, 386.0))), FRAC_PI_2, 5.0);
+        let velocity = thesis.command;
         assert!(
             velocity.y() > 0.09 && velocity.x().abs() < 1e-12,
             "forward is east now: {velocity:?}"
@@ -220,23 +220,23 @@ mod tests {
     #[test]
     fn outside_the_tolerance_it_descends_at_the_lower_limit_only() {
         let mut thesis = Thesis::new(calm());
-        thesis.frame(&frame(Some((648.0 + 301.0, 486.0))), 0.0, 10.0);
-        assert_eq!(thesis.velocity().0.z(), 1e-5);
-        assert_eq!(thesis.progress(), Progress::Aligning);
-        thesis.frame(&frame(Some((648.0 + 299.0, 486.0))), 0.0, 0.79);
-        assert_eq!(thesis.progress(), Progress::Ready(Reason::LowAndAligned));
+        thesis.observe(&frame(Some((648.0 + 301.0, 486.0))), 0.0, 10.0);
+        assert_eq!(thesis.command.z(), 1e-5);
+        assert_eq!(thesis.progress, Progress::Aligning);
+        thesis.observe(&frame(Some((648.0 + 299.0, 486.0))), 0.0, 0.79);
+        assert_eq!(thesis.progress, Progress::Ready(Reason::LowAndAligned));
     }
 
     #[test]
     fn commands_stay_within_their_limits() {
         let mut thesis = Thesis::new(calm());
         for _ in 0..10_000 {
-            thesis.frame(&frame(Some((0.0, 971.0))), 0.0, 100.0);
+            thesis.observe(&frame(Some((0.0, 971.0))), 0.0, 100.0);
         }
-        let (velocity, _) = thesis.velocity();
+        let velocity = thesis.command;
         assert_eq!((velocity.x(), velocity.y()), (-0.5, -0.5));
-        thesis.frame(&frame(Some((648.0, 486.0))), 0.0, 100.0);
-        assert_eq!(thesis.velocity().0.z(), 0.5);
+        thesis.observe(&frame(Some((648.0, 486.0))), 0.0, 100.0);
+        assert_eq!(thesis.command.z(), 0.5);
     }
 
     #[test]
@@ -244,8 +244,8 @@ mod tests {
         let mut thesis = Thesis::new(ThesisConfig::default());
         let mut speeds = Vec::new();
         for _ in 0..20_000 {
-            thesis.frame(&frame(None), 0.0, 5.0);
-            speeds.push(thesis.velocity().0.x());
+            thesis.observe(&frame(None), 0.0, 5.0);
+            speeds.push(thesis.command.x());
         }
         let mean = speeds.iter().sum::<f64>() / 20_000.0;
         let deviation = (speeds.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 20_000.0).sqrt();
@@ -262,9 +262,9 @@ mod tests {
             (Thesis::new(ThesisConfig::default()), Thesis::new(ThesisConfig::default()));
         let mut other = Thesis::new(ThesisConfig { seed: 1, ..ThesisConfig::default() });
         for thesis in [&mut a, &mut b, &mut other] {
-            thesis.frame(&frame(None), 0.0, 5.0);
+            thesis.observe(&frame(None), 0.0, 5.0);
         }
-        assert_eq!(a.velocity(), b.velocity());
-        assert_ne!(a.velocity(), other.velocity());
+        assert_eq!(a.command, b.command);
+        assert_ne!(a.command, other.command);
     }
 }

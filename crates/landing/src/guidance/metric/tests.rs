@@ -1,0 +1,138 @@
+//! The metric guidance on modelled states.
+
+use super::*;
+use crate::event::{Landed, Mode, VehicleState};
+use geometry::Rotation;
+
+#[test]
+fn a_velocity_bias_is_observed_within_two_seconds() {
+    let mut metric = Metric::new(MetricConfig::default());
+    for i in 0..80u32 {
+        let s = f64::from(i) / 40.0;
+        // Its reported velocity is 0.5 m/s, its reported position constant.
+        let vehicle = vehicle(s, Point::new(0.3, 0.0, -5.0), Vector::new(0.0, 0.5, 0.0));
+        let _ = metric.velocity(&situation(&vehicle));
+    }
+    let bias = metric.observer.unwrap().bias;
+    assert!((bias - Vector::new(0.0, -0.5, 0.0)).norm() < 0.1, "{bias:?}");
+}
+
+/// The largest bias observed of a vehicle that moves and reports to move east at 0.5 m/s, with states and ticks at the given
+/// times, and with a reported position that is shifted north as a function of time.
+fn largest_bias(times: impl Iterator<Item = (f64, f64)>, north: impl Fn(f64) -> f64) -> f64 {
+    let mut metric = Metric::new(MetricConfig::default());
+    let mut largest_m_s = 0.0f64;
+    for (stamp_s, now_s) in times {
+        let place = Point::new(north(stamp_s), 0.5 * stamp_s, -5.0);
+        let vehicle = vehicle(stamp_s, place, Vector::new(0.0, 0.5, 0.0));
+        let now = Timestamp::from_seconds(now_s);
+        let _ = metric.velocity(&Situation { now, ..situation(&vehicle) });
+        largest_m_s = largest_m_s.max(metric.observer.unwrap().bias.norm());
+    }
+    largest_m_s
+}
+
+#[test]
+fn jumps_pauses_and_old_states_make_no_bias() {
+    let steady = |i: u32| f64::from(i) * 0.025;
+    let every = || (0..120u32).map(steady);
+    let jumped = largest_bias(every().map(|s| (s, s)), |s| 0.25 * f64::from(u8::from(s > 1.0)));
+    assert!(jumped < 1e-6, "{jumped}");
+    for pause_s in [0.2, 0.3, 0.5] {
+        let missed = |s: f64| s > 1.0 && s < 1.0 + pause_s;
+        let paused = largest_bias(every().filter(|s| !missed(*s)).map(|s| (s, s)), |_| 0.0);
+        assert!(paused < 1e-6, "a pause of {pause_s} s: {paused}");
+        let held = |s: f64| (if missed(s) { 1.0 } else { s }, s);
+        let silent = largest_bias(every().map(held), |_| 0.0);
+        assert!(silent < 1e-6, "no state for {pause_s} s: {silent}");
+    }
+    let late = largest_bias(every().map(|s| (s, s + 0.3)), |_| 0.0);
+    assert!(late < 1e-6, "states that come late: {late}");
+}
+
+#[test]
+fn waiting_never_allows_a_fast_slide_and_ends() {
+    for (speed_m_s, ready) in [(0.4, true), (0.5, false)] {
+        let mut metric = Metric::new(MetricConfig::default());
+        let mut ends = Vec::new();
+        for i in 0..600u32 {
+            let s = f64::from(i) / 40.0;
+            // Over the target, and never still.
+            let velocity =
+                Vector::new(speed_m_s * if s % 2.0 < 1.0 { 1.0 } else { -1.0 }, 0.0, 0.0);
+            let aside_m = speed_m_s * (0.5 - (s % 2.0 - 1.0).abs());
+            let vehicle = vehicle(s, Point::new(aside_m, 0.0, -0.04), velocity);
+            let situation = situation(&vehicle);
+            let speed_scale = metric.lateral_speed_scale(&situation, &situation.target.unwrap());
+            ends.push((s, speed_scale < 1.0, metric.progress(&situation)));
+            let _ = metric.velocity(&situation);
+        }
+        let slow = ends.iter().any(|(s, slow, _)| *s > 3.5 && *slow);
+        assert_eq!(slow, ready, "at {speed_m_s} m/s");
+        let stuck = ends.iter().any(|(s, _, end)| *s > 10.1 && *end == Progress::Stuck);
+        assert!(stuck || ready, "at {speed_m_s} m/s");
+    }
+}
+
+fn vehicle(seconds: f64, position: Point<Ned>, velocity: Vector<Ned>) -> VehicleState {
+    VehicleState {
+        stamp: Timestamp::from_seconds(seconds),
+        ned_from_body: Rotation::identity(),
+        position,
+        velocity,
+        mode: Mode::Guided,
+        armed: true,
+        landed: Landed::InAir,
+    }
+}
+
+/// A well-known target at the origin.
+fn situation(vehicle: &VehicleState) -> Situation<'_> {
+    let offset = Point::origin() - vehicle.position;
+    let target = TargetEstimate {
+        position: Point::origin(),
+        velocity: Vector::zero(),
+        lateral_error_m: offset.horizontal_norm(),
+        height_m: offset.z(),
+        age_s: 0.05,
+        deviation_m: 0.01,
+        detections: 100,
+        heading_rad: None,
+        time_offset_s: 0.0,
+        nis: None,
+        ambiguous: false,
+    };
+    Situation {
+        now: vehicle.stamp,
+        vehicle,
+        target: Some(target),
+        age_s: 0.05,
+        half_view_rad: None,
+        pad_moves: false,
+        pad_heave_m_s: 0.0,
+    }
+}
+
+/// A vehicle that stays beside its target at heights that change with time.
+fn hovered(aside_m: f64, seconds: f64, height_m: impl Fn(f64) -> f64) -> Progress {
+    let mut metric = Metric::new(MetricConfig::default());
+    let mut progress = Progress::Unchanged;
+    for i in 0..(seconds * 40.0) as u32 {
+        let s = f64::from(i) / 40.0;
+        let vehicle = vehicle(s, Point::new(aside_m, 0.0, -height_m(s)), Vector::zero());
+        let situation = situation(&vehicle);
+        progress = metric.progress(&situation);
+        let _ = metric.velocity(&situation);
+    }
+    progress
+}
+
+#[test]
+fn waiting_ends_also_for_a_vehicle_that_sways_about_the_waiting_height() {
+    let sways = |s: f64| LOW_M + 0.1 * (2.0 * s).sin();
+    assert!(!matches!(hovered(0.6, 5.0, sways), Progress::Stuck));
+    assert!(matches!(hovered(0.6, 12.0, sways), Progress::Stuck));
+    // A vehicle that has climbed away no longer waits.
+    let climbs = |s: f64| LOW_M - 0.1 + 0.5 * f64::from(u8::from(s > 6.0));
+    assert!(!matches!(hovered(0.6, 12.0, climbs), Progress::Stuck));
+}

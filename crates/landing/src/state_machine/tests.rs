@@ -1,0 +1,440 @@
+//! Single transitions, and all of them.
+
+use super::*;
+
+const FLYING: VehicleInputs = VehicleInputs {
+    age_s: 0.0,
+    mode: Mode::Guided,
+    armed: true,
+    landed: Landed::InAir,
+    altitude_m: 5.0,
+    height_m: 5.0,
+};
+
+fn at(seconds: f64) -> Inputs {
+    Inputs {
+        now: Timestamp::from_seconds(seconds),
+        operator: None,
+        alarm: None,
+        vehicle: Some(FLYING),
+        target_age_s: f64::INFINITY,
+        target_confirmed: false,
+        target_known: false,
+        progress: Progress::Unchanged,
+        axis_mismatch: None,
+        may_descend: true,
+    }
+}
+
+fn seen(seconds: f64, progress: Progress) -> Inputs {
+    Inputs { target_age_s: 0.1, target_confirmed: true, progress, ..at(seconds) }
+}
+
+fn commanded(seconds: f64, command: OperatorCommand) -> Inputs {
+    Inputs { operator: Some(command), ..at(seconds) }
+}
+
+fn flown(seconds: f64, change: impl Fn(&mut VehicleInputs)) -> Inputs {
+    let mut vehicle = FLYING;
+    change(&mut vehicle);
+    Inputs { vehicle: Some(vehicle), ..at(seconds) }
+}
+
+/// Takes a new machine through the inputs and compares where it ends.
+fn check(inputs: &[Inputs], phase: Phase, reason: Reason) {
+    let mut machine = StateMachine::new(PhaseConfig::default());
+    for input in inputs {
+        machine.advance(input);
+    }
+    assert_eq!((machine.phase(), machine.reason()), (phase, reason), "after {inputs:#?}");
+}
+
+fn start() -> Inputs {
+    commanded(0.0, OperatorCommand::Start)
+}
+
+#[test]
+fn a_start_is_refused_with_the_reason() {
+    let starting = |change: fn(&mut VehicleInputs)| Inputs {
+        operator: start().operator,
+        ..flown(0.0, change)
+    };
+    check(&[Inputs { vehicle: None, ..start() }], Phase::Idle, Reason::NoVehicleState);
+    check(&[starting(|v| v.age_s = 0.6)], Phase::Idle, Reason::NoVehicleState);
+    check(&[starting(|v| v.armed = false)], Phase::Idle, Reason::NotArmed);
+    check(&[starting(|v| v.landed = Landed::OnGround)], Phase::Idle, Reason::OnTheGround);
+    check(&[starting(|v| v.mode = Mode::Other)], Phase::Idle, Reason::NotGuided);
+    check(&[starting(|v| v.mode = Mode::Land)], Phase::Idle, Reason::NotGuided);
+    check(&[start()], Phase::Search, Reason::Searching);
+}
+
+#[test]
+fn a_start_low_in_land_mode_monitors_the_touchdown() {
+    let low = |v: &mut VehicleInputs| (v.mode, v.altitude_m) = (Mode::Land, 0.4);
+    let starting = Inputs { operator: start().operator, ..flown(0.0, low) };
+    check(&[starting], Phase::Final, Reason::AutopilotLands);
+    let down = flown(3.0, |v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround));
+    check(&[starting, down], Phase::Landed, Reason::TouchedDown);
+}
+
+#[test]
+fn a_landing_goes_through_its_phases() {
+    let aligned = seen(2.0, Progress::Descending);
+    let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+    let land = flown(9.2, |v| v.mode = Mode::Land);
+    let down = flown(12.0, |v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround));
+    let all = [start(), seen(1.0, Progress::Unchanged), aligned, ready, land, down];
+    check(&all[..2], Phase::Approach, Reason::Aligning);
+    check(&all[..3], Phase::Descend, Reason::Descending);
+    check(&all[..4], Phase::Final, Reason::LowAndAligned);
+    check(&all[..5], Phase::Final, Reason::AutopilotLands);
+    check(&all, Phase::Landed, Reason::TouchedDown);
+    // An autopilot may leave LAND as it stops the motors.
+    let left = flown(12.0, |v| (v.mode, v.armed) = (Mode::Guided, false));
+    let [a, b, c, d, e, _] = all;
+    check(&[a, b, c, d, e, left], Phase::Landed, Reason::TouchedDown);
+}
+
+#[test]
+fn every_wait_has_a_timeout() {
+    let approach = [start(), seen(1.0, Progress::Unchanged)];
+    check(&[start(), at(60.1)], Phase::Hold, Reason::TargetNotFound);
+    check(&[start(), at(60.1), at(120.3)], Phase::Aborted, Reason::HeldTooLong);
+    check(
+        &[approach[0], approach[1], seen(61.2, Progress::Aligning)],
+        Phase::Hold,
+        Reason::NoProgress,
+    );
+    check(
+        &[start(), commanded(1.0, OperatorCommand::Hold), at(182.0)],
+        Phase::Aborted,
+        Reason::HeldTooLong,
+    );
+    check(
+        &[start(), commanded(1.0, OperatorCommand::Hold), at(301.0)],
+        Phase::Aborted,
+        Reason::LandingTooLong,
+    );
+    let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+    let refused = [approach[0], approach[1], ready, at(14.1), at(74.2)];
+    check(&refused[..4], Phase::Final, Reason::LandingBySetpoints);
+    check(&refused, Phase::Aborted, Reason::LandRefused);
+    let alarm = Inputs { alarm: Some((AlarmAction::Land, Reason::BatteryCritical)), ..at(1.0) };
+    check(&[start(), alarm, at(6.1)], Phase::Aborted, Reason::LandRefused);
+    let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
+    check(
+        &[approach[0], approach[1], ready, land(9.1), land(69.3)],
+        Phase::Aborted,
+        Reason::TouchdownOverdue,
+    );
+}
+
+#[test]
+fn an_abort_ends_land_only_while_the_vehicle_is_high() {
+    let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+    let land =
+        |seconds, height_m| flown(seconds, move |v| (v.mode, v.height_m) = (Mode::Land, height_m));
+    let abort = |inputs| Inputs { operator: Some(OperatorCommand::Abort), ..inputs };
+    let all = [start(), seen(1.0, Progress::Unchanged), ready, land(9.2, 3.0)];
+    let [a, b, c, d] = all;
+    check(&[a, b, c, d, abort(land(9.3, 0.5))], Phase::Final, Reason::AutopilotLands);
+    check(&[a, b, c, d, abort(land(9.3, 3.0))], Phase::Aborted, Reason::OperatorAbort);
+    let after = |inputs: &[Inputs]| {
+        let mut machine = StateMachine::new(PhaseConfig::default());
+        all.iter().chain([&abort(land(9.3, 3.0))]).chain(inputs).for_each(|inputs| {
+            machine.advance(inputs);
+        });
+        (machine.is_recalling(), machine.is_released())
+    };
+    assert_eq!(after(&[]), (true, false));
+    assert_eq!(after(&[land(9.4, 3.0)]), (true, false));
+    assert_eq!(after(&[land(9.4, 3.0), at(9.6)]), (false, false), "it follows again");
+    assert_eq!(after(&[land(15.0, 1.0)]), (false, true), "it did not come back");
+    assert_eq!(after(&[flown(9.4, |v| v.mode = Mode::Other)]), (false, true));
+    let landing = PhaseConfig { on_abort: OnAbort::Land, ..PhaseConfig::default() };
+    let mut machine = StateMachine::new(landing);
+    for inputs in all.iter().chain([&abort(land(9.3, 3.0))]) {
+        machine.advance(inputs);
+    }
+    assert_eq!(machine.phase(), Phase::Final, "it lands already");
+}
+
+#[test]
+fn an_axis_mismatch_holds_and_a_running_check_delays_the_descent() {
+    let open = Inputs { may_descend: false, ..seen(2.0, Progress::Descending) };
+    check(&[start(), seen(1.0, Progress::Unchanged), open], Phase::Approach, Reason::Aligning);
+    let turned = Inputs { axis_mismatch: Some(Reason::CameraTurned), ..open };
+    let all = [start(), seen(1.0, Progress::Unchanged), turned, turned];
+    check(&all, Phase::Hold, Reason::CameraTurned);
+    check(&[all[0], all[1], all[2], at(63.0)], Phase::Aborted, Reason::HeldTooLong);
+}
+
+#[test]
+fn a_lost_vehicle_or_target_holds() {
+    let approach = [start(), seen(1.0, Progress::Unchanged)];
+    let stale = flown(2.0, |v| v.age_s = 0.6);
+    check(&[approach[0], approach[1], stale], Phase::Hold, Reason::VehicleStale);
+    check(&[approach[0], approach[1], stale, at(3.0)], Phase::Search, Reason::Searching);
+    check(&[approach[0], approach[1], at(2.0)], Phase::Hold, Reason::TargetLost);
+    let again = seen(3.0, Progress::Unchanged);
+    check(&[approach[0], approach[1], at(2.0), again, again], Phase::Approach, Reason::Aligning);
+}
+
+#[test]
+fn the_pilot_and_only_the_pilot_takes_over() {
+    let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
+    let taken = (Phase::PilotInCommand, Reason::PilotTookOver);
+    check(&[start(), flown(1.0, |v| v.mode = Mode::Other)], taken.0, taken.1);
+    check(&[start(), land(1.0)], taken.0, taken.1);
+    let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
+    let finals = [start(), seen(1.0, Progress::Unchanged), ready, land(9.1)];
+    check(&[finals[0], finals[1], finals[2], finals[3], at(10.0)], taken.0, taken.1);
+    check(&[start(), land(1.0), at(2.0), start()], Phase::Search, Reason::Searching);
+}
+
+#[test]
+fn disarmed_motors_end_the_landing() {
+    check(&[start(), flown(1.0, |v| v.armed = false)], Phase::Aborted, Reason::Disarmed);
+    let down = |v: &mut VehicleInputs| (v.armed, v.landed) = (false, Landed::OnGround);
+    check(&[start(), flown(1.0, down)], Phase::Landed, Reason::TouchedDown);
+    check(
+        &[start(), flown(1.0, |v| v.landed = Landed::OnGround)],
+        Phase::Final,
+        Reason::TouchedEarly,
+    );
+}
+
+#[test]
+fn nothing_is_sent_during_a_take_off() {
+    let rising = |seconds| flown(seconds, |v| v.landed = Landed::TakingOff);
+    let starting = Inputs { operator: start().operator, ..rising(0.0) };
+    check(&[starting, rising(0.1)], Phase::Search, Reason::TakingOff);
+    check(&[starting, rising(30.0), at(31.0)], Phase::Search, Reason::Searching);
+}
+
+mod every_transition {
+    //! Everything the machine can do: it is driven through every event of an alphabet from every state that it can be
+    //! in, where two states count as the same when phase, reason, flags, retries and the timeouts already over agree.
+
+    use super::*;
+    use std::collections::hash_map::Entry;
+    use std::collections::{HashMap, VecDeque};
+
+    /// What tells two states apart.
+    type Key = (Phase, Reason, bool, bool, bool, u32, [bool; 4], bool);
+
+    const LONG_S: f64 = 1e6;
+
+    fn config() -> PhaseConfig {
+        PhaseConfig { retries: 2, on_battery_low: AlarmAction::Hold, ..PhaseConfig::default() }
+    }
+
+    fn now() -> Timestamp {
+        Timestamp::from_seconds(LONG_S)
+    }
+
+    fn key(machine: &StateMachine) -> Key {
+        let (config, elapsed_s) = (&machine.config, machine.elapsed_s(now()));
+        let over = [
+            elapsed_s > MIN_RETRY_S,
+            elapsed_s > config.retry_timeout_s,
+            elapsed_s > config.search_timeout_s.min(config.hold_timeout_s),
+            elapsed_s > config.descend_timeout_s.max(config.operator_hold_timeout_s),
+        ];
+        let late = now().seconds_since(machine.started) > config.landing_timeout_s;
+        let terminal = machine.phase.is_terminal();
+        // The time spent in a terminal phase does not matter.
+        let (over, late) = if terminal { ([false; 4], false) } else { (over, late) };
+        let released = machine.phase == Phase::Aborted && machine.released;
+        let retries = if terminal { 0 } else { machine.retries };
+        let is_recalling = machine.is_recalling;
+        (
+            machine.phase,
+            machine.reason,
+            machine.landing,
+            released,
+            is_recalling,
+            retries,
+            over,
+            late,
+        )
+    }
+
+    /// The same machine, so much later, with its moments moved so that it is always the same time.
+    fn aged(machine: &StateMachine, seconds: f64) -> StateMachine {
+        let earlier = |moment: Timestamp| {
+            let age_s = (now().seconds_since(moment) + seconds).min(2000.0);
+            now().plus_seconds(-age_s)
+        };
+        StateMachine {
+            entered: earlier(machine.entered),
+            started: earlier(machine.started),
+            ..machine.clone()
+        }
+    }
+
+    fn vehicles() -> Vec<Option<VehicleInputs>> {
+        let change = |change: fn(&mut VehicleInputs)| {
+            let mut vehicle = FLYING;
+            change(&mut vehicle);
+            Some(vehicle)
+        };
+        vec![
+            None,
+            Some(FLYING),
+            change(|v| v.age_s = 1.0),
+            change(|v| v.mode = Mode::Land),
+            change(|v| (v.mode, v.altitude_m, v.height_m) = (Mode::Land, 0.4, 0.4)),
+            change(|v| v.mode = Mode::Other),
+            change(|v| v.armed = false),
+            change(|v| (v.armed, v.landed) = (false, Landed::OnGround)),
+            change(|v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround)),
+            change(|v| v.landed = Landed::OnGround),
+            change(|v| (v.mode, v.landed) = (Mode::Land, Landed::OnGround)),
+            change(|v| v.landed = Landed::TakingOff),
+        ]
+    }
+
+    fn alphabet() -> Vec<Inputs> {
+        let operators = [
+            None,
+            Some(OperatorCommand::Start),
+            Some(OperatorCommand::Hold),
+            Some(OperatorCommand::Resume),
+            Some(OperatorCommand::Abort),
+        ];
+        let alarms = [
+            None,
+            Some((AlarmAction::Hold, Reason::BatteryLow)),
+            Some((AlarmAction::Abort, Reason::OperatorLost)),
+            Some((AlarmAction::Land, Reason::BatteryCritical)),
+        ];
+        let progresses = [
+            Progress::Aligning,
+            Progress::Descending,
+            Progress::Blind,
+            Progress::Stuck,
+            Progress::Unchanged,
+            Progress::Ready(Reason::LowAndAligned),
+        ];
+        let mut all = Vec::new();
+        for vehicle in vehicles() {
+            for operator in operators {
+                for alarm in alarms {
+                    // A command and an alarm never come as one event.
+                    if operator.is_some() && alarm.is_some() {
+                        continue;
+                    }
+                    for progress in progresses {
+                        for (target_age_s, target_known) in
+                            [(0.1, true), (0.7, true), (5.0, true), (5.0, false)]
+                        {
+                            all.push(Inputs {
+                                now: now(),
+                                operator,
+                                alarm,
+                                vehicle,
+                                target_age_s,
+                                target_confirmed: true,
+                                target_known,
+                                progress,
+                                axis_mismatch: None,
+                                may_descend: true,
+                            });
+                        }
+                    }
+                }
+            }
+        }
+        let turned = Some(Reason::CameraTurned);
+        all.push(Inputs { axis_mismatch: turned, may_descend: false, now: now(), ..at(0.0) });
+        all
+    }
+
+    /// What holds for every single step.
+    fn check_step(before: &StateMachine, inputs: &Inputs, after: &StateMachine) {
+        let (from, to) = (before.phase, after.phase);
+        let step = format!("{from} to {to} after {inputs:?}");
+        if from.is_terminal() {
+            let started = inputs.operator == Some(OperatorCommand::Start);
+            assert!(from == to || started, "left by itself: {step}");
+            return;
+        }
+        let vehicle = inputs.vehicle;
+        if vehicle.is_some_and(|v| v.mode == Mode::Other) {
+            assert_eq!(to, Phase::PilotInCommand, "the pilot is not obeyed: {step}");
+            return;
+        }
+        if to == Phase::Descend && from != Phase::Descend {
+            let seen = inputs.target_age_s <= before.config.lost_target_s;
+            assert!(seen || inputs.progress == Progress::Blind, "descends blindly: {step}");
+            assert!(vehicle.is_some_and(|v| v.age_s < 0.5), "descends stale: {step}");
+        }
+        if to == Phase::Landed {
+            assert!(vehicle.is_some_and(|v| !v.armed || v.landed == Landed::OnGround), "{step}");
+        }
+        if inputs.operator == Some(OperatorCommand::Abort) {
+            let lands = before.landing || vehicle.is_some_and(|v| v.mode == Mode::Land);
+            let too_late = lands && vehicle.is_none_or(|v| v.height_m < 1.0);
+            assert!(to.is_terminal() || too_late, "an abort is not obeyed: {step}");
+        }
+        assert!(after.retries <= before.config.retries, "too many retries: {step}");
+    }
+
+    #[test]
+    fn every_transition_is_allowed_and_every_phase_ends() {
+        let alphabet = alphabet();
+        let first = aged(&StateMachine::new(config()), 10.0);
+        let mut found = HashMap::from([(key(&first), first.clone())]);
+        let mut open = VecDeque::from([first]);
+        while let Some(machine) = open.pop_front() {
+            for wait_s in [0.0, 3.0, 10.0, 65.0, 200.0, 400.0] {
+                let waited = aged(&machine, wait_s);
+                for inputs in &alphabet {
+                    let mut after = waited.clone();
+                    after.advance(inputs);
+                    check_step(&waited, inputs, &after);
+                    let key = key(&after);
+                    if let Entry::Vacant(place) = found.entry(key) {
+                        place.insert(after.clone());
+                        open.push_back(after);
+                    }
+                }
+            }
+        }
+        for phase in [
+            Phase::Idle,
+            Phase::Search,
+            Phase::Approach,
+            Phase::Descend,
+            Phase::Retry,
+            Phase::Final,
+            Phase::Landed,
+            Phase::Hold,
+            Phase::Aborted,
+            Phase::PilotInCommand,
+        ] {
+            assert!(found.values().any(|m| m.phase == phase), "{phase} is never reached");
+        }
+        for machine in found.values() {
+            assert!(ends(machine), "does not end: {machine:?}");
+        }
+    }
+
+    /// Left alone with a vehicle that flies or lands as asked, whatever state it is in ends.
+    fn ends(machine: &StateMachine) -> bool {
+        let mut machine = machine.clone();
+        for _ in 0..200 {
+            if machine.phase.is_terminal() {
+                return true;
+            }
+            let mut vehicle = FLYING;
+            if machine.landing {
+                vehicle.mode = Mode::Land;
+            }
+            machine = aged(&machine, 5.0);
+            machine.advance(&Inputs { vehicle: Some(vehicle), now: now(), ..at(0.0) });
+        }
+        false
+    }
+}
