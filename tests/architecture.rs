@@ -586,10 +586,10 @@ fn the_architecture_has_the_topic_table() -> anyhow::Result<()> {
         markdown.lines().filter(|line| line.starts_with("| `")).filter(is_row).collect();
     for row in TOPICS {
         let delivery = match row.delivery {
-            Delivery::Newest => "newest",
-            Delivery::NewestFirst => "newest, first",
+            Delivery::Latest => "latest",
+            Delivery::LatestPriority => "latest, priority",
             Delivery::LastValue => "last value",
-            Delivery::InOrder => "in order",
+            Delivery::Reliable => "reliable",
             Delivery::Query => "query",
         };
         let publishers = row.publishers.join(", ");

@@ -191,10 +191,13 @@ async fn a_second_controller_and_a_port_in_use_are_refused_in_words() -> anyhow:
         ]))?;
     let said = String::from_utf8_lossy(&second.stderr);
     ensure!(second.status.code() == Some(1), "{second:?}");
-    ensure!(said.contains("another controller (`main`) is at work for this vehicle"), "{said}");
+    ensure!(said.contains("another controller (`main`) is running for this vehicle"), "{said}");
     let twin = output_of(Command::new(ALIGHT).args(&landing.service("detector")?.by_hand))?;
     let said = String::from_utf8_lossy(&twin.stderr);
-    ensure!(twin.status.code() == Some(1) && said.contains("called `main` already"), "{said}");
+    ensure!(
+        twin.status.code() == Some(1) && said.contains("has the name `main` already"),
+        "{said}"
+    );
     // The first still flies; it is asked to stop, and stops all of its services.
     let pids: Vec<Pid> = landing.services.iter().map(|s| s.pid).collect();
     kill_process(Pid::from_raw(i32::try_from(landing.land.id())?).context("pid")?, Signal::TERM)?;

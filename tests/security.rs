@@ -172,7 +172,7 @@ async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<(
     .await?;
     let line = async {
         while let Some(line) = drone.said.recv().await {
-            if line.contains("Not let in") && line.contains("controller/command") {
+            if line.contains("Access denied") && line.contains("controller/command") {
                 return;
             }
         }

@@ -197,7 +197,7 @@ async fn two_roles_meet_what_dies_comes_back_and_the_end_is_orderly() -> anyhow:
     drone.says("relay", "again in").await?;
     processes.push(drone.process("relay").await?);
 
-    // A detector that was asked to stop stays away while another one stands in for it, and no longer.
+    // A detector that was swapped stays stopped while its replacement runs, and no longer.
     let mut other = Command::new(ALIGHT)
         .args(["detector", "--meet", &meet.to_string(), "--vehicle", "tested"])
         .args(["--set", "id=other"])
@@ -208,14 +208,14 @@ async fn two_roles_meet_what_dies_comes_back_and_the_end_is_orderly() -> anyhow:
         let stop = &DetectorCommand::Stop;
         let reply = node.command(topic::DETECTOR_COMMAND, &["onboard"], stop).await?;
         ensure!(reply.accepted, "{reply:?}");
-        drone.says("detector", "`other` stands in for it").await?;
+        drone.says("detector", "replaced by the detector `other`").await?;
         change("onboard", false).await
     };
     let relieved = relieved.await;
     other.kill()?;
     other.wait()?;
     relieved?;
-    drone.says("detector", "nobody stands in for it").await?;
+    drone.says("detector", "its replacement is gone").await?;
     processes.push(drone.process("detector").await?);
     change("onboard", true).await?;
 

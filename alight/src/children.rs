@@ -1,4 +1,4 @@
-//! Child processes by their names: start them, hear what they say, notice their end, stop them.
+//! Child processes: starts them, forwards their output, reports their exit, stops them.
 
 use std::path::Path;
 use std::process::Stdio;
@@ -12,43 +12,43 @@ use tokio::sync::mpsc;
 
 use crate::services::Service;
 
-/// How long a service may take to stop by itself.
-const STOP_PATIENCE: Duration = Duration::from_secs(2);
-/// Lines that wait to be shown; more are left out, as no service may ever wait for a terminal.
-const LINES_WAITING: usize = 256;
+/// Time that a child gets to stop after SIGTERM.
+const STOP_TIMEOUT: Duration = Duration::from_secs(2);
+/// Maximum number of queued output lines; further ones are dropped, so that a service never waits for a terminal.
+const MAX_QUEUED_LINES: usize = 256;
 
-/// What a child did.
-pub(crate) enum News<K> {
-    /// It wrote a line.
-    Said(K, String),
-    /// It ended.
-    Ended(K, End),
+/// An event of a child.
+pub(crate) enum ChildEvent<K> {
+    /// A line on its standard error.
+    Line(K, String),
+    /// Its exit.
+    Exited(K, Exit),
 }
 
-/// How a child ended.
+/// How a child exited.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct End {
-    /// In words.
+pub(crate) struct Exit {
+    /// The description by the system.
     pub(crate) words: String,
-    /// Its exit status, if it had one.
+    /// Its exit status, unless a signal ended it.
     pub(crate) status: Option<i32>,
 }
 
-impl std::fmt::Display for End {
+impl std::fmt::Display for Exit {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(&self.words)
     }
 }
 
-/// The running children, each with its key.
+/// The running children, by key.
 pub(crate) struct Children<K> {
     pids: Vec<(K, Pid)>,
-    sender: mpsc::Sender<News<K>>,
-    news: mpsc::Receiver<News<K>>,
+    sender: mpsc::Sender<ChildEvent<K>>,
+    events: mpsc::Receiver<ChildEvent<K>>,
 }
 
 impl Children<Service> {
-    /// Starts a service as a process of this same program; the answer is how to start it again by hand.
+    /// Starts a service as a process of this program; returns how to start it again by hand.
     pub(crate) fn start(
         &mut self,
         service: Service,
@@ -65,7 +65,7 @@ impl Children<Service> {
             by_hand.push_str(&format!(" --set '{setting}'"));
         }
         if service == Service::Controller {
-            // One that is started again takes the landing up, and never takes off a second time.
+            // A restarted controller resumes the landing, and never takes off a second time.
             by_hand.push_str(" --set 'start=\"resume\"'");
         }
         if std::env::var_os("ALIGHT_LOG").is_none() {
@@ -78,11 +78,11 @@ impl Children<Service> {
 
 impl<K: Clone + PartialEq + Send + 'static> Children<K> {
     pub(crate) fn new() -> Self {
-        let (sender, news) = mpsc::channel(LINES_WAITING);
-        Self { pids: Vec::new(), sender, news }
+        let (sender, events) = mpsc::channel(MAX_QUEUED_LINES);
+        Self { pids: Vec::new(), sender, events }
     }
 
-    /// Starts a child; the answer is its process number.
+    /// Starts a child; returns its process number.
     pub(crate) fn spawn(
         &mut self,
         key: K,
@@ -102,28 +102,28 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
         Ok(pid.map_or(0, |pid| pid.as_raw_nonzero().get()))
     }
 
-    /// The next news.
-    pub(crate) async fn next(&mut self) -> Option<News<K>> {
-        self.news.recv().await
+    /// The next event.
+    pub(crate) async fn next(&mut self) -> Option<ChildEvent<K>> {
+        self.events.recv().await
     }
 
-    /// Forgets a child that has ended.
-    pub(crate) fn forget(&mut self, key: &K) {
+    /// Removes a child that has exited.
+    pub(crate) fn remove(&mut self, key: &K) {
         self.pids.retain(|(running, _)| running != key);
     }
 
-    /// Asks one to stop, waits, and stops it if it does not; what is heard meanwhile is told.
-    pub(crate) async fn stop_one(&mut self, key: &K, mut tell: impl FnMut(&News<K>)) {
+    /// Stops a child, by SIGKILL if it ignores SIGTERM; events until then go to `on_event`.
+    pub(crate) async fn stop_one(&mut self, key: &K, mut on_event: impl FnMut(&ChildEvent<K>)) {
         for signal in [Signal::TERM, Signal::KILL] {
             let Some((_, pid)) = self.pids.iter().find(|(running, _)| running == key) else {
                 return;
             };
-            // One that has ended meanwhile needs no signal.
+            // Fails when the child has exited already.
             let _ = kill_process(*pid, signal);
-            let its_end = async {
-                while let Some(news) = self.news.recv().await {
-                    tell(&news);
-                    if let News::Ended(ended, _) = news {
+            let exited = async {
+                while let Some(event) = self.events.recv().await {
+                    on_event(&event);
+                    if let ChildEvent::Exited(ended, _) = event {
                         self.pids.retain(|(running, _)| *running != ended);
                         if ended == *key {
                             return;
@@ -131,53 +131,53 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
                     }
                 }
             };
-            if tokio::time::timeout(STOP_PATIENCE, its_end).await.is_ok() {
+            if tokio::time::timeout(STOP_TIMEOUT, exited).await.is_ok() {
                 return;
             }
         }
     }
 
-    /// Asks all to stop, waits, and stops those that do not.
+    /// Stops all children, by SIGKILL those that ignore SIGTERM.
     pub(crate) async fn stop(mut self) {
         for signal in [Signal::TERM, Signal::KILL] {
             for (_, pid) in &self.pids {
-                // One that has ended meanwhile needs no signal.
+                // Fails when the child has exited already.
                 let _ = kill_process(*pid, signal);
             }
-            let all_ended = async {
+            let all_exited = async {
                 while !self.pids.is_empty() {
-                    match self.news.recv().await {
-                        Some(News::Ended(ended, _)) => self.forget(&ended),
-                        Some(News::Said(..)) => {}
+                    match self.events.recv().await {
+                        Some(ChildEvent::Exited(ended, _)) => self.remove(&ended),
+                        Some(ChildEvent::Line(..)) => {}
                         None => return,
                     }
                 }
             };
-            if tokio::time::timeout(STOP_PATIENCE, all_ended).await.is_ok() {
+            if tokio::time::timeout(STOP_TIMEOUT, all_exited).await.is_ok() {
                 return;
             }
         }
     }
 }
 
-/// Tells what a child says, and then its end.
-async fn follow<K: Clone>(key: K, mut child: Child, news: mpsc::Sender<News<K>>) {
+/// Sends the output lines of a child, and then its exit.
+async fn follow<K: Clone>(key: K, mut child: Child, events: mpsc::Sender<ChildEvent<K>>) {
     if let Some(stderr) = child.stderr.take() {
         let mut lines = BufReader::new(stderr).lines();
-        let mut left_out = 0_u64;
+        let mut dropped = 0_u64;
         while let Ok(Some(line)) = lines.next_line().await {
-            let line = match left_out {
+            let line = match dropped {
                 0 => line,
-                _ => format!("({left_out} lines are left out) {line}"),
+                _ => format!("({dropped} lines dropped) {line}"),
             };
-            // Nobody listens any more once everything is being stopped.
-            left_out =
-                if news.try_send(News::Said(key.clone(), line)).is_ok() { 0 } else { left_out + 1 };
+            let sent = events.try_send(ChildEvent::Line(key.clone(), line));
+            dropped = if sent.is_ok() { 0 } else { dropped + 1 };
         }
     }
-    let end = match child.wait().await {
-        Ok(status) => End { words: status.to_string(), status: status.code() },
-        Err(cause) => End { words: cause.to_string(), status: None },
+    let exit = match child.wait().await {
+        Ok(status) => Exit { words: status.to_string(), status: status.code() },
+        Err(cause) => Exit { words: cause.to_string(), status: None },
     };
-    drop(news.send(News::Ended(key, end)).await);
+    // There is no receiver left when all children are being stopped.
+    drop(events.send(ChildEvent::Exited(key, exit)).await);
 }

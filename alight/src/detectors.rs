@@ -1,8 +1,6 @@
-//! `alight detectors`: which there are, which is used, and which should be.
+//! `alight detectors`: lists the detectors, and chooses the one to use.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt::Write as _;
-use std::io::Write as _;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -10,23 +8,24 @@ use clap::{Args, Subcommand, ValueEnum};
 use messages::{
     Candidate, ControllerCommand, ControllerStatus, DetectorInfo, DetectorState, Place, topic,
 };
-use node::{Identity, Node};
+use node::Node;
 use serde::Serialize;
 
-use crate::cli::{NetworkArgs, OPERATOR};
-use crate::land::Format;
-use crate::services;
+use crate::args::{Format, NetworkArgs};
+use crate::command::send_to_controller;
+use crate::runtime::with_node;
+use crate::terminal::{aligned, print};
 
-/// Time for the network's answers: every detector tells about itself once a second.
+/// Duration of listening: every detector publishes its information once a second.
 const LISTENING: Duration = Duration::from_millis(1500);
 
-/// What can be asked about detectors.
+/// The arguments of `alight detectors`.
 #[derive(Args)]
 #[command(args_conflicts_with_subcommands = true)]
 pub(crate) struct DetectorsArgs {
     #[command(subcommand)]
     action: Option<Action>,
-    /// A table for people, or one JSON object.
+    /// Format of the list: a table, or one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
     #[command(flatten)]
@@ -42,9 +41,9 @@ enum Action {
         #[command(flatten)]
         network: NetworkArgs,
     },
-    /// Use detectors that run there rather than others, while they are healthy.
+    /// Prefer detectors that run at this place, while they are healthy.
     Prefer {
-        /// Where they run.
+        /// The place.
         #[arg(value_enum)]
         place: Where,
         #[command(flatten)]
@@ -61,7 +60,7 @@ enum Where {
     Ground,
 }
 
-/// Lists the detectors, or tells the controller which to use.
+/// Lists the detectors, or has the controller choose one.
 pub(crate) fn run(args: DetectorsArgs) -> anyhow::Result<ExitCode> {
     let (network, command) = match args.action {
         None => return list(&args.network, args.format),
@@ -74,65 +73,42 @@ pub(crate) fn run(args: DetectorsArgs) -> anyhow::Result<ExitCode> {
             (network, ControllerCommand::PreferDetectors(place))
         }
     };
-    node::start_logging("warn");
-    let zenoh = network.source(OPERATOR)?;
-    let reply = services::runtime()?.block_on(async {
-        let node = Node::open(operator("detectors"), &zenoh).await?;
-        let reply = node.command(topic::COMMAND, &[], &command).await;
-        node.close().await;
-        reply
-    })?;
-    let verdict = if reply.accepted { "accepted" } else { "refused" };
-    writeln!(std::io::stdout(), "{verdict}: {}", reply.reason)?;
-    Ok(ExitCode::from(u8::from(!reply.accepted)))
-}
-
-/// The name under which a tool of this program joins.
-pub(crate) fn operator(tool: &str) -> Identity {
-    Identity { service: "alight", instance: format!("{tool}-{}", std::process::id()) }
+    send_to_controller(&network, "detectors", &command)
 }
 
 fn list(network: &NetworkArgs, format: Format) -> anyhow::Result<ExitCode> {
-    node::start_logging("warn");
-    let zenoh = network.source(OPERATOR)?;
-    let overview = services::runtime()?.block_on(async {
-        let node = Node::open(operator("detectors"), &zenoh).await?;
-        let overview = listen(&node).await;
-        node.close().await;
-        overview
-    })?;
-    let text = match format {
+    let overview = with_node(network, "detectors", listen)?;
+    print(&match format {
         Format::Text => overview.table(),
         Format::Json => serde_json::to_string(&overview)?,
-    };
-    writeln!(std::io::stdout(), "{text}")?;
+    })?;
     Ok(ExitCode::SUCCESS)
 }
 
 async fn listen(node: &Node) -> anyhow::Result<Overview> {
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let infos = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
-    let (mut status, mut told) = (None, BTreeMap::new());
-    let hear = async {
+    let (mut status, mut announced) = (None, BTreeMap::new());
+    let receive = async {
         loop {
             tokio::select! {
-                Some(news) = statuses.next() => status = Some(news),
+                Some(latest) = statuses.next() => status = Some(latest),
                 Some((key, info)) = infos.next_with_key() => {
-                    // Its key says who it is, whatever it says.
+                    // A detector is identified by its key, not by the message.
                     let name = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
-                    told.insert(name.to_owned(), info);
+                    announced.insert(name.to_owned(), info);
                 }
                 else => return,
             }
         }
     };
-    // Listening ends by the time that is allowed for it.
-    let _ = tokio::time::timeout(LISTENING, hear).await;
+    // Ends by the timeout.
+    let _ = tokio::time::timeout(LISTENING, receive).await;
     let ready = node.alive("detector", "*").await?.into_iter().collect();
-    Ok(Overview::new(status, &told, ready))
+    Ok(Overview::new(status, &announced, ready))
 }
 
-/// Everything about the detectors of a vehicle.
+/// The detectors of a vehicle.
 #[derive(Serialize)]
 struct Overview {
     controller: bool,
@@ -143,11 +119,11 @@ struct Overview {
     detectors: Vec<Entry>,
 }
 
-/// A detector as it is listed.
+/// A detector in the list.
 #[derive(Serialize)]
 struct Entry {
     id: String,
-    /// `active`, `shadow`, `stale`; `waiting` for one that the controller has not heard.
+    /// `active`, `shadow`, `stale`; `waiting` for one from which the controller has received nothing.
     state: &'static str,
     place: Option<Place>,
     host: Option<String>,
@@ -164,16 +140,17 @@ struct Entry {
 impl Overview {
     fn new(
         status: Option<ControllerStatus>,
-        told: &BTreeMap<String, DetectorInfo>,
+        announced: &BTreeMap<String, DetectorInfo>,
         ready: BTreeSet<String>,
     ) -> Self {
         let controller = status.is_some();
         let status = status.unwrap_or_default();
-        let heard: BTreeMap<&str, &Candidate> =
-            status.candidates.iter().map(|heard| (heard.detector.as_str(), heard)).collect();
-        let mut names: BTreeSet<&str> = heard.keys().copied().collect();
+        let candidates: BTreeMap<&str, &Candidate> =
+            status.candidates.iter().map(|c| (c.detector.as_str(), c)).collect();
+        let mut names: BTreeSet<&str> = candidates.keys().copied().collect();
         names.extend(ready.iter().map(String::as_str));
-        let entry = |name: &str| Entry::new(name, heard.get(name).copied(), told.get(name));
+        let entry =
+            |name: &str| Entry::new(name, candidates.get(name).copied(), announced.get(name));
         let mut detectors: Vec<Entry> = names.into_iter().map(entry).collect();
         detectors.sort_by_key(|entry| entry.state != "active");
         Self {
@@ -205,27 +182,27 @@ impl Overview {
                 }
                 _ => "-".to_owned(),
             };
-            let word = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
+            let cell = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
             rows.push([
                 entry.id.clone(),
                 entry.state.to_owned(),
                 entry.place.map_or("-", Place::name).to_owned(),
-                word(&entry.host),
+                cell(&entry.host),
                 number(entry.rate_hz, "Hz", 1),
                 number(entry.latency_ms, "ms", 0),
                 number(entry.age_ms, "ms", 0),
                 agrees,
                 if entry.markers.is_empty() { "-".to_owned() } else { entry.markers.join(" ") },
-                word(&entry.version),
+                cell(&entry.version),
             ]);
         }
         let mut text = aligned(&rows);
         let summary = match (self.controller, &self.active) {
-            (false, _) => "No controller was heard: nobody uses them.".to_owned(),
-            (true, None) => format!("None is used: {}.", self.why),
+            (false, _) => "No controller is running, so none is in use.".to_owned(),
+            (true, None) => format!("None is in use: {}.", self.why),
             (true, Some(active)) => {
                 let preference = match self.preference.as_str() {
-                    "" => "nothing is preferred".to_owned(),
+                    "" => "no preference".to_owned(),
                     preference => format!("preferred: {preference}"),
                 };
                 let changes = self.changes;
@@ -238,46 +215,27 @@ impl Overview {
 }
 
 impl Entry {
-    fn new(name: &str, heard: Option<&Candidate>, told: Option<&DetectorInfo>) -> Self {
+    fn new(name: &str, candidate: Option<&Candidate>, info: Option<&DetectorInfo>) -> Self {
         Self {
             id: name.to_owned(),
-            state: match heard.map(|heard| heard.state) {
+            state: match candidate.map(|c| c.state) {
                 Some(DetectorState::Active) => "active",
                 Some(DetectorState::Shadow) => "shadow",
                 Some(DetectorState::Stale) => "stale",
                 None => "waiting",
             },
-            place: heard.and_then(|heard| heard.place).or(told.map(|told| told.place)),
-            host: told.map(|told| told.host.clone()),
-            markers: told.map(|told| told.markers.clone()).unwrap_or_default(),
-            version: told.map(|told| told.version.clone()),
-            rate_hz: heard.map(|heard| heard.rate_hz),
-            latency_ms: heard.map(|heard| heard.latency_ms),
-            age_ms: heard.map(|heard| heard.age_ms),
-            compared: heard.map(|heard| heard.compared),
-            agreed: heard.map(|heard| heard.agreed),
-            disagreement_m: heard.and_then(|heard| heard.disagreement_m),
+            place: candidate.and_then(|c| c.place).or(info.map(|info| info.place)),
+            host: info.map(|info| info.host.clone()),
+            markers: info.map(|info| info.markers.clone()).unwrap_or_default(),
+            version: info.map(|info| info.version.clone()),
+            rate_hz: candidate.map(|c| c.rate_hz),
+            latency_ms: candidate.map(|c| c.latency_ms),
+            age_ms: candidate.map(|c| c.age_ms),
+            compared: candidate.map(|c| c.compared),
+            agreed: candidate.map(|c| c.agreed),
+            disagreement_m: candidate.and_then(|c| c.disagreement_m),
         }
     }
-}
-
-/// Rows as lines whose columns stand below each other.
-fn aligned<const N: usize>(rows: &[[String; N]]) -> String {
-    let mut text = String::new();
-    let width = |column: usize| {
-        let cells = rows.iter().filter_map(|row| row.get(column));
-        cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
-    };
-    for row in rows {
-        let mut line = String::new();
-        for (column, cell) in row.iter().enumerate() {
-            // Writing to a string cannot fail.
-            let _ = write!(line, "{cell:<width$}  ", width = width(column));
-        }
-        text.push_str(line.trim_end());
-        text.push('\n');
-    }
-    text
 }
 
 #[cfg(test)]
@@ -285,7 +243,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_list_joins_what_the_controller_hears_with_what_the_detectors_tell() {
+    fn the_list_joins_candidates_and_announced_detectors() {
         let candidate = |name: &str, state| Candidate {
             detector: name.into(),
             state,
@@ -318,15 +276,15 @@ mod tests {
             version: "alight 0.1.0".into(),
             pid: 7,
         };
-        let told = [("main".to_owned(), info)].into();
+        let announced = [("main".to_owned(), info)].into();
         let ready = ["main".to_owned(), "late".to_owned()].into();
-        let table = Overview::new(Some(status), &told, ready).table();
+        let table = Overview::new(Some(status), &announced, ready).table();
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[1].starts_with("main") && lines[1].contains("rings:0.15341"), "{table}");
         assert!(lines[2].contains("shadow") && lines[2].contains("29 of 30, 0.012 m"), "{table}");
         assert!(lines[3].starts_with("late") && lines[3].contains("waiting"), "{table}");
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
-        let nobody = Overview::new(None, &told, BTreeSet::new()).table();
+        let nobody = Overview::new(None, &announced, BTreeSet::new()).table();
         assert!(nobody.contains("No controller"), "{nobody}");
     }
 }

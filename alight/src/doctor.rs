@@ -1,6 +1,6 @@
-//! `alight doctor`: what is wrong here, in plain sentences, within seconds.
+//! `alight doctor`: checks this machine and its network, and says what to do about each problem.
 //!
-//! First what can be told alone (the machine, the site, its keys, its ports), then what can be seen of the network.
+//! First the machine, the site, its keys and devices; then the network: services, cameras, clocks, links.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -9,48 +9,50 @@ use std::time::Duration;
 
 use clap::Args;
 use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, topic};
-use node::{Identity, Node, clock_name, now_ns};
+use node::network::{AIR_PORT, AUTHORITY, Address};
+use node::{Network, Node, clock_name, now_ns, stats};
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 use tokio::time::timeout;
 
-use crate::cli::{NetworkArgs, OPERATOR};
+use crate::Service;
+use crate::args::{Format, NetworkArgs, OPERATOR};
 use crate::keys;
-use crate::land::Format;
-use crate::services;
+use crate::runtime::{runtime, tool_identity};
 use crate::site::{Job, Role, Site};
+use crate::terminal::print;
 
-/// What is looked at.
+/// The arguments of `alight doctor`.
 #[derive(Args, Clone)]
 pub(crate) struct DoctorArgs {
-    /// What this machine is for.
+    /// Role of this machine.
     #[arg(value_enum, requires = "config")]
     role: Option<Role>,
     /// The site (TOML), as for `alight up`.
     #[arg(long, value_name = "FILE", requires = "role")]
     config: Option<PathBuf>,
-    /// How long the network is watched, in seconds, from 1 to 60.
+    /// Time for which to watch the network, in seconds, from 1 to 60.
     #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=60))]
     seconds: u64,
-    /// For people, or one JSON object for programs.
+    /// Format of the result: text, or one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
     #[command(flatten)]
     network: NetworkArgs,
 }
 
-/// Memory that a reader of frames must be able to lock, in bytes: a camera of 1296 x 972 takes 5 MB, and a reader
-/// keeps that of each camera process it has seen.
-const ENOUGH_LOCKED: u64 = 64 << 20;
-/// A certificate that ends sooner is told of.
-const ENDS_SOON_S: i64 = 30 * 86_400;
-/// Questions to each process.
-const QUESTIONS: u32 = 10;
-const ANSWER_PATIENCE: Duration = Duration::from_millis(300);
-const CONNECT_PATIENCE: Duration = Duration::from_millis(1000);
-const OPEN_PATIENCE: Duration = Duration::from_secs(5);
+/// Minimum memlock limit of a reader of frames, in bytes: a camera of 1296 x 972 pixels takes 5 MB, and a reader keeps
+/// the memory of every camera process it has seen.
+const MIN_MEMLOCK: u64 = 64 << 20;
+/// Certificates that expire within this time are reported, in seconds.
+const EXPIRES_SOON_S: i64 = 30 * 86_400;
+/// Number of round trips to each process.
+const ROUND_TRIPS: u32 = 10;
+const REPLY_TIMEOUT: Duration = Duration::from_millis(300);
+const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
+const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How bad something is.
+/// The severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 enum Verdict {
@@ -62,15 +64,15 @@ enum Verdict {
 #[derive(Clone, Debug, Serialize)]
 struct Finding {
     verdict: Verdict,
-    /// What was looked at.
+    /// The subject.
     about: &'static str,
-    /// What was found.
+    /// The observation.
     finding: String,
-    /// What can be done about it.
+    /// What to do about it.
     remedy: Option<String>,
 }
 
-/// Everything that was found.
+/// All findings.
 #[derive(Default, Serialize)]
 struct Findings {
     findings: Vec<Finding>,
@@ -118,11 +120,11 @@ impl Findings {
     }
 }
 
-/// Looks at everything, and says what is wrong.
+/// Runs all checks; the exit status is 1 when something is wrong.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     node::start_logging("off");
     let mut findings = Findings::default();
-    look_at_machine(&mut findings);
+    check_machine(&mut findings);
     let mut network = args.network.network();
     let mut expected = Vec::new();
     if let (Some(role), Some(file)) = (args.role, &args.config) {
@@ -130,29 +132,27 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         network = site.network(role);
         match site.jobs(role) {
             Ok(jobs) => {
-                look_at_site(&mut findings, role, &jobs);
+                check_site(&mut findings, role, &jobs);
                 expected = jobs;
             }
             Err(problem) => findings.wrong(
                 "site",
                 format!("{}: {problem:#}", file.display()),
-                "mend the file; `alight up ... --dry-run` says the same",
+                "fix the file; `alight up ... --dry-run` reports the same",
             ),
         }
     } else if let Some(keys) = &network.keys {
-        look_at_certificate(&mut findings, keys, OPERATOR);
+        check_certificate(&mut findings, keys, OPERATOR);
     }
     let before = findings.findings.len();
     match network.source(OPERATOR) {
-        Ok(zenoh) => services::runtime()?.block_on(async {
-            let identity =
-                Identity { service: "alight", instance: format!("doctor-{}", std::process::id()) };
-            match timeout(OPEN_PATIENCE, Node::open(identity, &zenoh)).await {
-                Ok(Ok(node)) => look_at_network(&mut findings, node, args.seconds, &expected).await,
+        Ok(zenoh) => runtime()?.block_on(async {
+            match timeout(OPEN_TIMEOUT, Node::open(tool_identity("doctor"), &zenoh)).await {
+                Ok(Ok(node)) => check_network(&mut findings, node, args.seconds, &expected).await,
                 Ok(Err(problem)) => findings.wrong("network", format!("{problem:#}"), "see above"),
                 Err(_) => findings.wrong(
                     "network",
-                    format!("the network cannot be joined within {} s", OPEN_PATIENCE.as_secs()),
+                    format!("cannot join the network within {} s", OPEN_TIMEOUT.as_secs()),
                     "see above",
                 ),
             }
@@ -160,24 +160,24 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
         Err(problem) => findings.wrong(
             "network",
             format!("{problem:#}"),
-            "`alight doctor` looks at the network with the operator's key",
+            "`alight doctor` uses the operator's key",
         ),
     }
-    // Knocking at the doors would be counted as a stranger's attempt, so it is done only when nobody was met.
-    let told = &findings.findings[before..];
-    if !told.iter().any(|f| f.about == "services" && f.verdict == Verdict::Good) {
-        look_at_way(&mut findings, &network);
+    // The relay counts a connection to its ports as a denial, so they are tried only when no service was found.
+    if !findings.findings[before..]
+        .iter()
+        .any(|f| f.about == "services" && f.verdict == Verdict::Good)
+    {
+        check_ports(&mut findings, &network);
     }
-    use std::io::Write;
-    let text = match args.format {
+    print(&match args.format {
         Format::Text => findings.text(),
         Format::Json => serde_json::to_string(&findings)?,
-    };
-    writeln!(std::io::stdout(), "{text}")?;
+    })?;
     Ok(ExitCode::from(u8::from(findings.count(Verdict::Wrong) > 0)))
 }
 
-fn look_at_machine(findings: &mut Findings) {
+fn check_machine(findings: &mut Findings) {
     let system = rustix::system::uname();
     let cores = std::thread::available_parallelism().map_or(0, std::num::NonZero::get);
     findings.good(
@@ -192,49 +192,49 @@ fn look_at_machine(findings: &mut Findings) {
         ),
     );
     match getrlimit(Resource::Memlock).current {
-        Some(limit) if limit < ENOUGH_LOCKED => findings.doubtful(
+        Some(limit) if limit < MIN_MEMLOCK => findings.doubtful(
             "memory",
             format!(
-                "a process may lock {} MB of memory; a detector that sees its camera start again and again comes to the limit, and then receives copies or nothing",
+                "memlock limit: {} MB; restarts of the camera exhaust it, and frames are then copied or dropped",
                 limit >> 20
             ),
-            "LimitMEMLOCK=infinity in the systemd unit, or a `memlock` line in /etc/security/limits.conf",
+            "set LimitMEMLOCK=infinity in the systemd unit, or a `memlock` line in /etc/security/limits.conf",
         ),
-        Some(limit) => findings.good("memory", format!("a process may lock {} MB", limit >> 20)),
-        None => findings.good("memory", "a process may lock all it wants".to_owned()),
+        Some(limit) => findings.good("memory", format!("memlock limit: {} MB", limit >> 20)),
+        None => findings.good("memory", "memlock limit: unlimited".to_owned()),
     }
     let shared = Path::new("/dev/shm");
     match tempfile::Builder::new().prefix("alight-doctor-").tempfile_in(shared) {
         Ok(_) => {}
         Err(cause) => findings.wrong(
             "memory",
-            format!("/dev/shm cannot be written to ({cause}), so every frame is copied"),
-            "mount a tmpfs there, in a container with --ipc=host or --shm-size=64m",
+            format!("/dev/shm is not writable ({cause}), so every frame is copied"),
+            "mount a tmpfs there; in a container use --ipc=host or --shm-size=64m",
         ),
     }
 }
 
-fn look_at_site(findings: &mut Findings, role: Role, jobs: &[Job]) {
+fn check_site(findings: &mut Findings, role: Role, jobs: &[Job]) {
     let names: Vec<_> = jobs.iter().map(|job| job.name.as_str()).collect();
     findings.good("site", format!("{} runs {}", role.name(), names.join(", ")));
-    let mut seen = Vec::new();
+    let mut checked = Vec::new();
     for job in jobs {
         if let Some(keys) = job.network.keys.as_deref().filter(|_| job.needs_key())
-            && !seen.contains(&job.key)
+            && !checked.contains(&job.key)
         {
-            look_at_certificate(findings, keys, &job.key);
-            seen.push(job.key.clone());
+            check_certificate(findings, keys, &job.key);
+            checked.push(job.key.clone());
         }
         if let Some(service) = job.service {
-            look_at_devices(findings, job, service);
+            check_devices(findings, job, service);
         }
     }
 }
 
-/// Files and devices that a service needs.
-fn look_at_devices(findings: &mut Findings, job: &Job, service: services::Service) {
+/// Checks the files and devices that a service needs.
+fn check_devices(findings: &mut Findings, job: &Job, service: Service) {
     let Ok(config) = service.effective_config(&job.layers) else { return };
-    if service == services::Service::Controller
+    if service == Service::Controller
         && let Some(address) = config["autopilot"]["address"].as_str()
         && let Some(device) =
             address.strip_prefix("serial:").and_then(|rest| rest.split(':').next())
@@ -243,10 +243,10 @@ fn look_at_devices(findings: &mut Findings, job: &Job, service: services::Servic
         findings.wrong(
             "autopilot",
             format!("{device} cannot be opened: {cause}"),
-            "is the autopilot connected, and is the user in the group that owns the device (often `dialout`)?",
+            "connect the autopilot, and add the user to the group that owns the device (often `dialout`)",
         );
     }
-    if service == services::Service::CameraPub {
+    if service == Service::CameraPub {
         let paths = config["source"]["paths"].as_array().into_iter().flatten();
         for path in paths.filter_map(toml::Value::as_str) {
             if let Err(cause) = std::fs::metadata(path) {
@@ -256,27 +256,27 @@ fn look_at_devices(findings: &mut Findings, job: &Job, service: services::Servic
     }
 }
 
-fn look_at_certificate(findings: &mut Findings, keys: &Path, role: &str) {
-    for name in [role, "authority"] {
-        let path = keys.join(format!("{name}.pem"));
+fn check_certificate(findings: &mut Findings, keys: &Path, role: &str) {
+    for (name, file) in [(role, format!("{role}.pem")), ("authority", AUTHORITY.to_owned())] {
+        let path = keys.join(file);
         let again = "make a new one with `alight keys`, in a new directory";
         match keys::certificate(&path) {
             Err(problem) => findings.wrong("keys", format!("{problem:#}"), again),
             Ok(read) if name == role && read.role != role => findings.wrong(
                 "keys",
                 format!("{path:?} is for the role `{}`", read.role),
-                "keep the file names that `alight keys issue` gave",
+                "keep the file names of `alight keys issue`",
             ),
-            Ok(read) if read.ends_in_s < 0 => {
-                findings.wrong("keys", format!("{path:?} has ended"), again);
+            Ok(read) if read.expires_in_s < 0 => {
+                findings.wrong("keys", format!("{path:?} has expired"), again);
             }
-            Ok(read) if read.ends_in_s < ENDS_SOON_S => findings.doubtful(
+            Ok(read) if read.expires_in_s < EXPIRES_SOON_S => findings.doubtful(
                 "keys",
-                format!("{path:?} ends in {} days", read.ends_in_s / 86_400),
+                format!("{path:?} expires in {} days", read.expires_in_s / 86_400),
                 again,
             ),
             Ok(read) => findings
-                .good("keys", format!("{path:?} is good for {} days", read.ends_in_s / 86_400)),
+                .good("keys", format!("{path:?} is valid for {} days", read.expires_in_s / 86_400)),
         }
     }
     use std::os::unix::fs::PermissionsExt;
@@ -284,62 +284,62 @@ fn look_at_certificate(findings: &mut Findings, keys: &Path, role: &str) {
     if std::fs::metadata(&key).is_ok_and(|file| file.permissions().mode() & 0o077 != 0) {
         findings.wrong(
             "keys",
-            format!("{key:?} can be read by others"),
+            format!("{key:?} is readable by other users"),
             "chmod 600; if somebody may have read it, make a new authority",
         );
     }
 }
 
-/// Whether the other side's ports answer.
-fn look_at_way(findings: &mut Findings, network: &node::Network) {
+/// Checks whether the ports of the other side accept connections.
+fn check_ports(findings: &mut Findings, network: &Network) {
     use std::net::{TcpStream, ToSocketAddrs};
     let Some(address) = &network.connect else { return };
-    let ports = match address.rsplit_once(':') {
-        Some((host, port)) if !host.contains(':') => (host, port.parse().unwrap_or(0)),
-        _ => (address.as_str(), node::network::AIR_PORT),
-    };
+    // An invalid address is reported with the network's configuration.
+    let Ok(Address { host, port }) = Address::parse(address) else { return };
+    let first_port = port.unwrap_or(AIR_PORT);
+    let bare_host = host.trim_matches(['[', ']']);
     let over = if network.keys.is_some() { "TLS over TCP" } else { "TCP" };
-    for (further, what) in (0_u16..).zip(["control", "frames", "frames, when one is held up"]) {
-        let port = ports.1.saturating_add(further);
-        let found = (ports.0, port).to_socket_addrs().ok().and_then(|mut all| all.next());
+    for (offset, what) in (0_u16..).zip(["control", "frames", "frames, second connection"]) {
+        let port = first_port.saturating_add(offset);
+        let found = (bare_host, port).to_socket_addrs().ok().and_then(|mut all| all.next());
         let Some(found) = found else {
             findings.wrong(
-                "way",
-                format!("the address {} has no meaning here", ports.0),
-                "write an IP address, or a name that this machine knows",
+                "ports",
+                format!("address {host} cannot be resolved"),
+                "use an IP address, or a name that this machine can resolve",
             );
             return;
         };
-        match TcpStream::connect_timeout(&found, CONNECT_PATIENCE) {
-            Ok(_) => findings.good("way", format!("{found} answers ({what}; {over})")),
+        match TcpStream::connect_timeout(&found, CONNECT_TIMEOUT) {
+            Ok(_) => findings.good("ports", format!("{found} answers ({what}; {over})")),
             Err(cause) => findings.wrong(
-                "way",
+                "ports",
                 format!("{found} ({what}) does not answer: {cause}"),
-                "is `alight up drone` running there, is the address right, and does no firewall stand between?",
+                "check that `alight up drone` runs there, the address, and firewalls",
             ),
         }
     }
 }
 
-/// What was seen of the network.
+/// What was received from the network.
 #[derive(Default)]
 struct Seen {
-    everybody: Vec<(String, String)>,
+    peers: Vec<(String, String)>,
     healths: Vec<Health>,
     cameras: Vec<CameraInfo>,
     status: Option<ControllerStatus>,
     frames: Vec<(FrameHeader, usize, i64)>,
 }
 
-async fn look_at_network(findings: &mut Findings, node: Node, seconds: u64, expected: &[Job]) {
+async fn check_network(findings: &mut Findings, node: Node, seconds: u64, expected: &[Job]) {
     let mut seen = Seen::default();
     match watch(&node, &mut seen, Duration::from_secs(seconds)).await {
         Ok(()) => {
-            tell_presence(findings, &seen, expected);
-            tell_answers(findings, &node, &seen).await;
-            tell_healths(findings, &seen);
-            tell_cameras(findings, &seen, seconds);
-            tell_landing(findings, &seen);
+            check_presence(findings, &seen, expected);
+            check_replies(findings, &node, &seen).await;
+            check_healths(findings, &seen);
+            check_cameras(findings, &seen, seconds);
+            check_landing(findings, &seen);
         }
         Err(problem) => findings.wrong("network", format!("{problem:#}"), "start it again"),
     }
@@ -347,13 +347,13 @@ async fn look_at_network(findings: &mut Findings, node: Node, seconds: u64, expe
 }
 
 async fn watch(node: &Node, seen: &mut Seen, duration: Duration) -> anyhow::Result<()> {
-    seen.everybody = node.everybody().await?;
+    seen.peers = node.list_peers().await?;
     let (healths, cameras, statuses) = tokio::try_join!(
         node.subscriber(topic::HEALTH, &[]),
         node.subscriber(topic::CAMERA_INFO, &[]),
         node.subscriber(topic::STATUS, &[]),
     )?;
-    // As pictures, as they cross every link; the camera makes them while somebody looks.
+    // JPEG frames, which fit every link; the camera makes them while there is a subscriber.
     let frames = node.frame_subscriber(topic::JPEG, &[]).await?;
     let watching = async {
         loop {
@@ -373,14 +373,14 @@ async fn watch(node: &Node, seen: &mut Seen, duration: Duration) -> anyhow::Resu
         }
     };
     let _: Result<(), _> = timeout(duration, watching).await;
-    // Who was late to be met.
-    seen.everybody.extend(node.everybody().await?);
-    seen.everybody.sort();
-    seen.everybody.dedup();
+    // Peers that joined meanwhile.
+    seen.peers.extend(node.list_peers().await?);
+    seen.peers.sort();
+    seen.peers.dedup();
     Ok(())
 }
 
-/// Keeps the newest of its kind.
+/// Replaces an older message of the same sender.
 fn keep<T>(kept: &mut Vec<T>, new: T, same: impl Fn(&T, &T) -> bool) {
     match kept.iter_mut().find(|old| same(old, &new)) {
         Some(old) => *old = new,
@@ -388,82 +388,82 @@ fn keep<T>(kept: &mut Vec<T>, new: T, same: impl Fn(&T, &T) -> bool) {
     }
 }
 
-fn tell_presence(findings: &mut Findings, seen: &Seen, expected: &[Job]) {
-    if seen.everybody.is_empty() {
+fn check_presence(findings: &mut Findings, seen: &Seen, expected: &[Job]) {
+    if seen.peers.is_empty() {
         findings.wrong(
             "services",
-            "nobody is to be seen".to_owned(),
+            "no service found".to_owned(),
             "start them (`alight up`), and compare the vehicle's name and the address on both sides",
         );
         return;
     }
     for job in expected {
         let Some(service) = job.service else { continue };
-        if !seen.everybody.iter().any(|(alive, _)| alive == service.name()) {
+        if !seen.peers.iter().any(|(alive, _)| alive == service.name()) {
             findings.wrong(
                 "services",
-                format!("no {} is ready, and this machine should run one", service.name()),
-                "look at what `alight up` says about it",
+                format!("no {} is ready, but this machine should run one", service.name()),
+                "see the output of `alight up`",
             );
         }
     }
-    if !seen.everybody.iter().any(|(service, _)| service == "controller") {
+    if !seen.peers.iter().any(|(service, _)| service == "controller") {
         findings.doubtful(
             "services",
-            "there is no controller, so nothing is going to land".to_owned(),
-            "on the drone: `alight up drone`",
+            "no controller is running, so nothing can land".to_owned(),
+            "run `alight up drone` on the drone",
         );
     }
 }
 
-async fn tell_answers(findings: &mut Findings, node: &Node, seen: &Seen) {
-    let mut questions = tokio::task::JoinSet::new();
-    for (service, instance) in seen.everybody.iter().filter(|(service, _)| service != "alight") {
+async fn check_replies(findings: &mut Findings, node: &Node, seen: &Seen) {
+    let mut queries = tokio::task::JoinSet::new();
+    for (service, instance) in seen.peers.iter().filter(|(service, _)| service != "alight") {
         let (node, service, instance) = (node.clone(), service.clone(), instance.clone());
-        questions.spawn(async move {
-            let mut times = Vec::new();
-            for _ in 0..QUESTIONS {
-                times.extend(node.round_trip(&service, &instance, ANSWER_PATIENCE).await);
+        queries.spawn(async move {
+            let mut times_ms = Vec::new();
+            for _ in 0..ROUND_TRIPS {
+                let time = node.round_trip(&service, &instance, REPLY_TIMEOUT).await;
+                times_ms.extend(time.map(|time| time.as_secs_f64() * 1e3));
             }
-            times.sort_unstable();
-            (service, instance, times)
+            (service, instance, times_ms)
         });
     }
-    let mut answers = questions.join_all().await;
-    answers.sort();
-    for (service, instance, times) in &answers {
+    let mut replies = queries.join_all().await;
+    replies.sort_by(|a, b| (&a.0, &a.1).cmp(&(&b.0, &b.1)));
+    for (service, instance, times_ms) in replies {
         let health = seen
             .healths
             .iter()
-            .find(|health| (&health.service, &health.instance) == (service, instance));
+            .find(|health| (&health.service, &health.instance) == (&service, &instance));
         let who = match health {
             Some(health) => {
                 format!("{service} `{instance}` on {} (alight {})", health.host, health.version)
             }
             None => format!("{service} `{instance}`"),
         };
-        let lost = QUESTIONS as usize - times.len().min(QUESTIONS as usize);
-        let Some(median) = times.get(times.len() / 2) else {
+        let lost = ROUND_TRIPS as usize - times_ms.len().min(ROUND_TRIPS as usize);
+        let Some(median_ms) = stats::quantile(times_ms, 0.5) else {
             findings.wrong(
                 "services",
-                format!("{who} is there and does not answer"),
-                "it is of another version, it hangs, or the link does; look at its log",
+                format!("{who} does not answer"),
+                "it has another version, or it or the link hangs; see its log",
             );
             continue;
         };
-        let took = format!("{who} answers in {:.1} ms", median.as_secs_f64() * 1e3);
+        let took = format!("{who} answers in {median_ms:.1} ms");
         match lost {
             0 => findings.good("services", took),
             _ => findings.doubtful(
                 "link",
-                format!("{took}; {lost} of {QUESTIONS} questions were lost"),
-                "come nearer, or take a channel with less traffic",
+                format!("{took}; {lost} of {ROUND_TRIPS} queries were lost"),
+                "reduce the distance, or use a channel with less traffic",
             ),
         }
     }
 }
 
-fn tell_healths(findings: &mut Findings, seen: &Seen) {
+fn check_healths(findings: &mut Findings, seen: &Seen) {
     for health in &seen.healths {
         let who = format!("{} `{}`", health.service, health.instance);
         if health.version != env!("CARGO_PKG_VERSION") {
@@ -477,27 +477,25 @@ fn tell_healths(findings: &mut Findings, seen: &Seen) {
                 "install the same version on all machines",
             );
         }
-        let troubles: Vec<_> =
+        let errors: Vec<_> =
             health.errors.iter().map(|e| format!("{} ({} times)", e.reason, e.count)).collect();
-        if !troubles.is_empty() {
+        if !errors.is_empty() {
             findings.doubtful(
                 "services",
-                format!("{who} counted errors since its start: {}", troubles.join(", ")),
-                "its log says more about the first of each kind",
+                format!("{who} counted errors since its start: {}", errors.join(", ")),
+                "its log has the first one of each reason",
             );
         }
     }
 }
 
-fn tell_cameras(findings: &mut Findings, seen: &Seen, seconds: u64) {
+fn check_cameras(findings: &mut Findings, seen: &Seen, seconds: u64) {
     for info in &seen.cameras {
         let camera = &info.camera;
         let Some([fx, fy]) = info.focal_px else {
             findings.doubtful(
                 "calibration",
-                format!(
-                    "camera `{camera}` is not calibrated, so nothing can tell how far a marker is"
-                ),
+                format!("camera `{camera}` is not calibrated, so distances are unknown"),
                 "calibrate it, and set `calibration.file` of camera-pub",
             );
             continue;
@@ -507,7 +505,7 @@ fn tell_cameras(findings: &mut Findings, seen: &Seen, seconds: u64) {
             Some(problem) => findings.wrong(
                 "calibration",
                 format!("camera `{camera}`: {problem}"),
-                "is the calibration of this camera, at this resolution?",
+                "use the calibration of this camera at this resolution",
             ),
             None => findings.good(
                 "calibration",
@@ -524,25 +522,25 @@ fn tell_cameras(findings: &mut Findings, seen: &Seen, seconds: u64) {
     names.dedup();
     for camera in names {
         let frames: Vec<_> = seen.frames.iter().filter(|(h, ..)| h.camera == camera).collect();
-        findings.good("camera", frames_in_words(camera, &frames, seconds));
+        findings.good("camera", describe_frames(camera, &frames, seconds));
         if let Some((header, ..)) = frames.first()
             && let Some(controller) = clocks.iter().find(|health| health.clock != header.clock)
         {
             findings.wrong(
                 "clock",
                 format!(
-                    "camera `{camera}` stamps with {}, the controller has {}, so it uses no frame",
+                    "camera `{camera}` stamps with the clock {}, the controller has {}, so it rejects all frames",
                     header.clock, controller.clock
                 ),
-                "camera and controller belong on one machine",
+                "run camera and controller on one machine",
             );
         }
     }
-    if seen.frames.is_empty() && !seen.everybody.is_empty() {
+    if seen.frames.is_empty() && !seen.peers.is_empty() {
         findings.doubtful(
             "camera",
-            format!("no picture arrived within {seconds} s"),
-            "is a camera-pub running, and does the link carry its pictures?",
+            format!("no frame arrived within {seconds} s"),
+            "check that a camera-pub runs, and the bandwidth of the link",
         );
     }
 }
@@ -558,41 +556,39 @@ fn implausible(info: &CameraInfo, focal_px: [f64; 2]) -> Option<String> {
     let [cx, cy] = info.principal_px;
     let off = ((cx - width / 2.0) / width).abs().max(((cy - height / 2.0) / height).abs());
     (off > 0.2).then(|| {
-        format!("the principal point ({cx:.0}, {cy:.0}) is far from the middle of {width} x {height} pixels")
+        format!("the principal point ({cx:.0}, {cy:.0}) is far from the centre of {width} x {height} pixels")
     })
 }
 
-fn frames_in_words(camera: &str, frames: &[&(FrameHeader, usize, i64)], seconds: u64) -> String {
+fn describe_frames(camera: &str, frames: &[&(FrameHeader, usize, i64)], seconds: u64) -> String {
     let rate_hz = frames.len() as f64 / seconds as f64;
     let bytes: usize = frames.iter().map(|(_, bytes, _)| bytes).sum();
     let megabits_s = bytes as f64 * 8e-6 / seconds as f64;
-    let mut words =
-        format!("camera `{camera}`: {rate_hz:.1} pictures a second, {megabits_s:.2} Mbit/s");
-    let mut ages: Vec<i64> = frames
+    let mut text = format!("camera `{camera}`: {rate_hz:.1} frames/s, {megabits_s:.2} Mbit/s");
+    let ages_ms = frames
         .iter()
         .filter(|(header, ..)| header.clock == clock_name())
-        .map(|(header, _, now_ns)| now_ns - header.stamp_ns)
-        .collect();
-    ages.sort_unstable();
-    match ages.get(ages.len() / 2) {
-        Some(median) => {
-            let _ = write!(words, ", {:.0} ms old on arrival", *median as f64 * 1e-6);
+        .map(|(header, _, now_ns)| (now_ns - header.stamp_ns) as f64 * 1e-6);
+    match stats::quantile(ages_ms, 0.5) {
+        Some(median_ms) => {
+            // Writing to a string cannot fail.
+            let _ = write!(text, ", {median_ms:.0} ms old on arrival");
         }
-        None => words.push_str(", their age is told by the drone's clock only"),
+        None => text.push_str(", of unknown age, as their clock is that of another machine"),
     }
-    words
+    text
 }
 
-fn tell_landing(findings: &mut Findings, seen: &Seen) {
+fn check_landing(findings: &mut Findings, seen: &Seen) {
     let Some(status) = &seen.status else { return };
-    let words = format!("{} ({}); autopilot: {}", status.phase, status.why, status.autopilot);
-    findings.good("controller", words);
+    let text = format!("{} ({}); autopilot: {}", status.phase, status.why, status.autopilot);
+    findings.good("controller", text);
     match &status.active_detector {
         Some(detector) => findings.good("detector", format!("`{detector}` is in use")),
         None => findings.doubtful(
             "detector",
             "the controller uses none".to_owned(),
-            "is one running, and does it get frames?",
+            "check that one runs and gets frames",
         ),
     }
 }

@@ -1,4 +1,4 @@
-//! `alight experiment`: the thesis' experiments again.
+//! `alight experiment`: repeats the thesis' experiments.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -12,7 +12,7 @@ use experiments::markers::{self, Request};
 use experiments::sets::Set;
 use indicatif::ProgressBar;
 
-use crate::cli::write_error;
+use crate::terminal::{print, write_error};
 
 #[derive(Args)]
 pub(crate) struct ExperimentArgs {
@@ -178,13 +178,4 @@ fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
     print(&report)?;
     write_error(&format!("tables and figures: {}", request.results_in.display()));
     Ok(ExitCode::SUCCESS)
-}
-
-fn print(report: &str) -> anyhow::Result<()> {
-    use std::io::Write;
-    match writeln!(std::io::stdout(), "{report}") {
-        // The reader has seen enough, as `head` does.
-        Err(problem) if problem.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        result => Ok(result?),
-    }
 }

@@ -1,8 +1,7 @@
 //! `alight keys`: a development certificate authority, and a key for each role.
 //!
-//! A certificate's common name is its role, by which `zenoh-config/secured.json5` says who may do what. An authority
-//! for development has no way to take a key back: keys end by themselves, and a site whose key was lost makes a new
-//! authority.
+//! The common name of a certificate is its role, to which `zenoh-config/secured.json5` grants access rights. The
+//! development authority cannot revoke keys: they expire, and a site that lost a key makes a new authority.
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;
@@ -13,20 +12,19 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow, ensure};
 use clap::{Args, Subcommand, ValueEnum};
+use node::network::AUTHORITY;
 use rcgen::{
     BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
     KeyUsagePurpose,
 };
 
-/// The authority's certificate, which every process needs.
-pub(crate) const AUTHORITY: &str = "authority.pem";
-/// The authority's key, which stays at home.
+/// The authority's private key, which is not copied to other machines.
 const AUTHORITY_KEY: &str = "authority.key";
-/// Certificates begin a day early, as a drone's clock may be slow before it has heard the time.
-const HEAD_START: Duration = DAY;
+/// Certificates are valid a day early, as a drone's clock may be slow before it is synchronised.
+const BACKDATING: Duration = DAY;
 const DAY: Duration = Duration::from_secs(86_400);
 
-/// What is done with keys.
+/// The arguments of `alight keys`.
 #[derive(Args, Clone)]
 pub(crate) struct KeysArgs {
     #[command(subcommand)]
@@ -35,55 +33,55 @@ pub(crate) struct KeysArgs {
 
 #[derive(Clone, Subcommand)]
 enum Action {
-    /// Make a certificate authority: `authority.pem` for everybody, `authority.key` to be kept at home.
+    /// Make a certificate authority: `authority.pem` for all machines, `authority.key` to be kept private.
     Init {
-        /// The directory.
+        /// Output directory.
         #[arg(short, long, value_name = "DIRECTORY")]
         output: PathBuf,
-        /// Days until it ends.
+        /// Days until it expires.
         #[arg(long, value_name = "DAYS", default_value_t = 3650, value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
     },
     /// Make a key and its certificate: `ROLE.key` and `ROLE.pem`, with `authority.pem` beside them.
     Issue {
-        /// What the holder may do.
+        /// Role of the holder, which has its access rights.
         #[arg(long, value_enum)]
         role: Role,
-        /// The directory.
+        /// Output directory.
         #[arg(short, long, value_name = "DIRECTORY")]
         output: PathBuf,
-        /// The directory of the authority; that of the output otherwise.
+        /// Directory of the authority [default: the output directory].
         #[arg(long, value_name = "DIRECTORY")]
         authority: Option<PathBuf>,
-        /// Where others find the holder: an IP address or a host name. Needed for `drone` and `relay`. May be repeated.
+        /// Address of the holder: an IP address or a host name. Required for `drone` and `relay`. May be repeated.
         #[arg(long, value_name = "HOST")]
         address: Vec<String>,
-        /// Days until it ends.
+        /// Days until it expires.
         #[arg(long, value_name = "DAYS", default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
     },
 }
 
-/// What a key is for.
+/// The role of a key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Role {
     /// The drone's relay.
     Drone,
-    /// A relay between the drone and the ground.
+    /// A relay between drone and ground.
     Relay,
-    /// A person who commands: `alight command`, `alight doctor`.
+    /// An operator: `alight command`, `alight doctor`.
     Operator,
-    /// Listens only: recorders, dashboards.
+    /// Subscribes only.
     Observer,
     /// Publishes frames.
     CameraPub,
     /// Publishes detections.
     Detector,
-    /// Publishes the vehicle's state, and obeys commands.
+    /// Publishes the vehicle's state, and receives commands.
     Controller,
-    /// Sends MAVLink to the autopilot, and commands for the ground station.
+    /// Forwards MAVLink between the autopilot and the ground station.
     GcsBridge,
-    /// Stands in for camera and vehicle.
+    /// Simulates camera and vehicle.
     Simulator,
 }
 
@@ -104,7 +102,7 @@ pub(crate) struct Certificate {
     /// The common name.
     pub(crate) role: String,
     /// Seconds until it ends; negative when it has.
-    pub(crate) ends_in_s: i64,
+    pub(crate) expires_in_s: i64,
 }
 
 /// Makes an authority or a key.
@@ -126,14 +124,14 @@ pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
 pub(crate) fn certificate(path: &Path) -> anyhow::Result<Certificate> {
     let text = fs::read(path).with_context(|| format!("reading the certificate {path:?}"))?;
     let (_, pem) = x509_parser::pem::parse_x509_pem(&text)
-        .map_err(|cause| anyhow!("{path:?} is no certificate: {cause}"))?;
+        .map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))?;
     let certificate =
-        pem.parse_x509().map_err(|cause| anyhow!("{path:?} is no certificate: {cause}"))?;
+        pem.parse_x509().map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))?;
     let role = certificate.subject().iter_common_name().next();
     let role = role.and_then(|name| name.as_str().ok()).unwrap_or_default().to_owned();
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-    let ends_in_s = certificate.validity().not_after.timestamp() - now.cast_signed();
-    Ok(Certificate { role, ends_in_s })
+    let expires_in_s = certificate.validity().not_after.timestamp() - now.cast_signed();
+    Ok(Certificate { role, expires_in_s })
 }
 
 fn init(output: &Path, days: u32) -> anyhow::Result<Vec<PathBuf>> {
@@ -160,7 +158,7 @@ fn issue(
     let name = role.name();
     ensure!(
         !role.is_found_by_others() || !addresses.is_empty(),
-        "the key of `{name}` is good for the addresses it names: add `--address HOST`, as the others connect to it"
+        "the key of `{name}` needs the address to which others connect: add `--address HOST`"
     );
     let files = [output.join(format!("{name}.key")), output.join(format!("{name}.pem"))];
     refuse_existing(&files)?;
@@ -175,12 +173,12 @@ fn issue(
     };
     let authority_certificate = read(AUTHORITY)?;
     let signing_key = KeyPair::from_pem(&read(AUTHORITY_KEY)?)
-        .with_context(|| format!("{:?} is no key", authority.join(AUTHORITY_KEY)))?;
+        .with_context(|| format!("{:?} is not a key", authority.join(AUTHORITY_KEY)))?;
     let issuer =
         Issuer::from_ca_cert_pem(&authority_certificate, signing_key).with_context(|| {
-            format!("{:?} is no authority's certificate", authority.join(AUTHORITY))
+            format!("{:?} is not the certificate of an authority", authority.join(AUTHORITY))
         })?;
-    // Processes of one machine also connect to each other.
+    // Processes on one machine also connect to each other.
     let mut names = addresses.to_vec();
     for here in ["127.0.0.1", "localhost"] {
         if !names.iter().any(|name| name == here) {
@@ -203,23 +201,23 @@ fn issue(
 
 fn parameters(name: &str, addresses: &[String], days: u32) -> anyhow::Result<CertificateParams> {
     let mut params = CertificateParams::new(addresses.to_vec())
-        .with_context(|| format!("the addresses {addresses:?} make no certificate"))?;
+        .with_context(|| format!("invalid addresses {addresses:?}"))?;
     params.distinguished_name = rcgen::DistinguishedName::new();
     params.distinguished_name.push(DnType::CommonName, name);
     let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     let now = rcgen::date_time_ymd(1970, 1, 1) + Duration::from_secs(since_1970.as_secs());
-    params.not_before = now - HEAD_START;
+    params.not_before = now - BACKDATING;
     params.not_after = now + DAY * days;
     Ok(params)
 }
 
-/// The authority's certificate beside the keys, unless it is there.
+/// Writes the authority's certificate beside the keys, unless it is there.
 fn put_authority(path: &Path, certificate: &str) -> anyhow::Result<()> {
     match fs::read_to_string(path) {
         Ok(there) => {
             ensure!(
                 there == certificate,
-                "{path:?} is that of another authority; keys of two authorities need two directories"
+                "{path:?} is of another authority; use one directory for each authority"
             );
             Ok(())
         }
@@ -231,7 +229,7 @@ fn refuse_existing(files: &[PathBuf]) -> anyhow::Result<()> {
     for file in files {
         ensure!(
             !file.exists(),
-            "{file:?} exists, and keys are never written over; remove it, or name another directory"
+            "{file:?} exists, and keys are never overwritten; remove it, or choose another directory"
         );
     }
     Ok(())
@@ -262,23 +260,23 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_key_names_its_role_ends_in_time_and_is_for_its_owner_only() {
+    fn a_key_has_a_role_expires_and_is_private() {
         let home = tempfile::tempdir().unwrap();
         let drone = home.path().join("drone");
         init(home.path(), 30).unwrap();
         let files = issue(Role::Drone, &drone, home.path(), &["10.0.0.1".into()], 7).unwrap();
         let read = certificate(&files[1]).unwrap();
         assert_eq!(read.role, "drone");
-        assert!((read.ends_in_s - 7 * 86_400).abs() < 120, "{} s", read.ends_in_s);
+        assert!((read.expires_in_s - 7 * 86_400).abs() < 120, "{} s", read.expires_in_s);
         for file in files.iter().chain([&drone.join(AUTHORITY)]) {
             let mode = fs::metadata(file).unwrap().permissions().mode();
             assert_eq!(mode & 0o777, 0o600, "{file:?}");
         }
-        assert!(!drone.join(AUTHORITY_KEY).exists(), "the authority's key stays at home");
+        assert!(!drone.join(AUTHORITY_KEY).exists(), "the authority's key is not copied");
     }
 
     #[test]
-    fn nothing_is_written_over_and_authorities_are_not_mixed() {
+    fn keys_are_not_overwritten_and_authorities_are_not_mixed() {
         let home = tempfile::tempdir().unwrap();
         let other = tempfile::tempdir().unwrap();
         init(home.path(), 30).unwrap();
@@ -287,10 +285,10 @@ mod tests {
             let problem = format!("{:#}", result.unwrap_err());
             assert!(problem.contains(part), "`{part}` is not in: {problem}");
         };
-        refused(init(home.path(), 30), "never written over");
+        refused(init(home.path(), 30), "never overwritten");
         let here = home.path();
         issue(Role::Detector, here, here, &[], 30).unwrap();
-        refused(issue(Role::Detector, here, here, &[], 30), "never written over");
+        refused(issue(Role::Detector, here, here, &[], 30), "never overwritten");
         refused(issue(Role::Operator, here, other.path(), &[], 30), "another authority");
         refused(issue(Role::Relay, here, here, &[], 30), "--address HOST");
         refused(issue(Role::Operator, here, &here.join("none"), &[], 30), "alight keys init");

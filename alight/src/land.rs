@@ -5,20 +5,22 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use markers::{Marker, Pad};
 use messages::topic;
-use node::{Identity, Layers, Node, Shutdown};
+use node::{Layers, Node, Shutdown, ZenohSource};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
-use crate::children::{Children, News};
-use crate::cli::{write_error, zenoh_source};
-use crate::outcome::Flight;
+use crate::args::Format;
+use crate::children::{ChildEvent, Children};
+use crate::outcome::LandingSummary;
 use crate::progress::Progress;
-use crate::services::{self, Service};
+use crate::runtime::{runtime, tool_identity};
+use crate::services::Service;
+use crate::terminal::{print, write_error};
 
-/// What a landing takes.
+/// The arguments of a landing.
 #[derive(Args, Clone)]
 pub(crate) struct LandArgs {
     /// Seed of everything random: wind, noise, ground.
@@ -30,82 +32,69 @@ pub(crate) struct LandArgs {
     /// Marker to land on, on the simulated pad as well: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids.
     #[arg(long, value_name = "MARKER")]
     marker: Option<Marker>,
-    /// Pad of several markers to land on, in the simulator as well: `a4`, which comes with the program, or a TOML file.
+    /// Pad of several markers to land on, in the simulator as well: the built-in `a4`, or a TOML file.
     #[arg(long, value_name = "PAD", conflicts_with = "marker")]
     pad: Option<String>,
-    /// What turns detections into velocity: `metric` (our own) or `thesis` (Algorithm 18).
+    /// Guidance law: `metric`, or `thesis` (Algorithm 18 of the thesis).
     #[arg(long, value_name = "GUIDANCE")]
     guidance: Option<String>,
     /// Fly this autopilot instead of the simulated one: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or
     /// serial:DEVICE:BAUD. The simulated camera then follows the pose it reports.
     #[arg(long, value_name = "ADDRESS")]
     autopilot: Option<String>,
-    /// Zenoh configuration (JSON5); the built-in `local.json5` otherwise.
+    /// Zenoh configuration (JSON5) [default: the built-in `local.json5`].
     #[arg(long, value_name = "FILE")]
     zenoh: Option<PathBuf>,
     /// Give up after this many seconds, from 1 to 86400.
-    #[arg(long, default_value_t = 300.0, value_name = "SECONDS", value_parser = patience_s)]
+    #[arg(long, default_value_t = 300.0, value_name = "SECONDS", value_parser = timeout_s)]
     timeout_s: f64,
-    /// What is printed at the end: a table, or one JSON object on the last line.
+    /// Format of the result: a table, or one JSON object on the last line.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
 }
 
-/// A number of seconds that can be waited for.
-fn patience_s(text: &str) -> Result<f64, String> {
-    let seconds = text.parse().map_err(|_| "it is not a number".to_owned())?;
+fn timeout_s(text: &str) -> Result<f64, String> {
+    let seconds = text.parse().map_err(|_| "not a number".to_owned())?;
     if (1.0..=86_400.0).contains(&seconds) {
         Ok(seconds)
     } else {
-        Err("it must be from 1 to 86400".to_owned())
+        Err("must be from 1 to 86400".to_owned())
     }
 }
 
-/// Form of the result.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Format {
-    /// For people.
-    #[default]
-    Text,
-    /// For programs.
-    Json,
-}
-
-/// The services of a landing, in the order in which they are started.
+/// The services of a landing, in starting order.
 const SERVICES: [Service; 4] =
     [Service::Simulator, Service::Detector, Service::Controller, Service::GcsBridge];
 
-/// Where ground stations such as QGroundControl listen.
+/// The UDP port at which ground stations such as QGroundControl listen.
 const GROUND_PORT: u16 = 14_550;
 
-/// How much later than its services this process may hear of Ctrl-C.
+/// Maximum delay of Ctrl-C in this process after its services.
 const SIGNAL_GRACE: Duration = Duration::from_millis(200);
 
-/// Time for the services to settle and tell their last words after the landing.
-const AFTERMATH: Duration = Duration::from_millis(1200);
+/// Time after the landing for the last messages of the services.
+const AFTER_LANDING: Duration = Duration::from_millis(1200);
 
 /// Lands, and prints the result.
 pub(crate) fn run(args: &LandArgs) -> anyhow::Result<ExitCode> {
     node::start_logging("warn");
-    let settings = Settings::new(args)?;
-    let flight = services::runtime()?.block_on(fly(args, &settings))?;
-    let outcome = flight.outcome();
-    use std::io::Write;
-    let text = match args.format {
+    let settings = ServiceSettings::new(args)?;
+    let outcome = runtime()?.block_on(fly(args, &settings))?.outcome();
+    print(&match args.format {
         Format::Text => outcome.table(),
         Format::Json => serde_json::to_string(&outcome)?,
-    };
-    writeln!(std::io::stdout(), "{text}").context("printing the result")?;
+    })
+    .context("printing the result")?;
     Ok(ExitCode::from(u8::from(!outcome.landed)))
 }
 
 /// The settings of each service.
-struct Settings {
+struct ServiceSettings {
     by_service: Vec<(Service, Vec<String>)>,
 }
 
-impl Settings {
-    /// Sorts the command line's settings by service, and checks them all before anything starts.
+impl ServiceSettings {
+    /// Sorts the settings of the command line by service, and checks all of them before anything starts.
     fn new(args: &LandArgs) -> anyhow::Result<Self> {
         let autopilot = match &args.autopilot {
             Some(address) => address.clone(),
@@ -135,7 +124,7 @@ impl Settings {
         }
         if let Some(name) = &args.pad {
             let pad = Pad::named(name, |file| std::fs::read_to_string(file))?;
-            // The services are started in the same folder.
+            // The services run in the same working directory.
             let name = toml::Value::from(name.as_str());
             simulator.push(format!("pad.markers={name}"));
             detector.push("markers=[]".to_owned());
@@ -174,7 +163,7 @@ impl Settings {
     }
 }
 
-/// Where the ground station is listened for, when its usual port is where the autopilot already talks to.
+/// Moves the ground station's port when the autopilot uses it.
 fn ground_station(autopilot: Option<&str>) -> Vec<String> {
     let taken = autopilot.is_some_and(|address| {
         address.starts_with("udpin:") && address.ends_with(&format!(":{GROUND_PORT}"))
@@ -184,25 +173,25 @@ fn ground_station(autopilot: Option<&str>) -> Vec<String> {
     }
     let port = GROUND_PORT + 1;
     write_error(&format!(
-        "The autopilot talks to port {GROUND_PORT}; the ground station is served at UDP port {port} instead"
+        "The autopilot uses port {GROUND_PORT}; the ground station is served at UDP port {port} instead"
     ));
     vec![format!("ground=\"udpout:127.0.0.1:{port}\"")]
 }
 
-async fn fly(args: &LandArgs, settings: &Settings) -> anyhow::Result<Flight> {
+async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<LandingSummary> {
     let shutdown = Shutdown::on_signals()?;
-    let meeting = MeetingPoint::new(args.zenoh.as_deref())?;
-    let identity = Identity { service: "alight", instance: format!("land-{}", std::process::id()) };
-    let node = Node::open(identity, &zenoh_source(Some(meeting.file.clone()))).await?;
+    let rendezvous = Rendezvous::new(args.zenoh.as_deref())?;
+    let zenoh = ZenohSource::File(rendezvous.file.clone());
+    let node = Node::open(tool_identity("land"), &zenoh).await?;
     let mut progress = Progress::new(args.format);
     progress.say(&format!(
-        "Zenoh: {}. A detector beside the one that runs: alight detector --zenoh {} --set id=spare",
-        meeting.description,
-        meeting.file.display()
+        "Zenoh: {}. To add a second detector: alight detector --zenoh {} --set id=spare",
+        rendezvous.description,
+        rendezvous.file.display()
     ));
     let mut children = Children::new();
     for service in SERVICES {
-        let started = children.start(service, &meeting.file, settings.of(service))?;
+        let started = children.start(service, &rendezvous.file, settings.of(service))?;
         progress.debug(&started);
     }
     let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s);
@@ -216,16 +205,16 @@ async fn fly(args: &LandArgs, settings: &Settings) -> anyhow::Result<Flight> {
 /// Follows the landing until it is over.
 async fn watch(
     node: &Node,
-    settings: &Settings,
+    settings: &ServiceSettings,
     children: &mut Children<Service>,
     progress: &mut Progress,
     shutdown: Shutdown,
     deadline: Instant,
-) -> anyhow::Result<Flight> {
+) -> anyhow::Result<LandingSummary> {
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let truths = node.subscriber(topic::TRUTH, &[]).await?;
     let healths = node.subscriber(topic::HEALTH, &[]).await?;
-    let mut flight = Flight::default();
+    let mut landing = LandingSummary::default();
     let mut over: Option<Instant> = None;
     let mut redraw = tokio::time::interval(Duration::from_millis(200));
     loop {
@@ -233,81 +222,83 @@ async fn watch(
         tokio::select! {
             Some(status) = statuses.next() => {
                 progress.status(&status);
-                if flight.status(status) && over.is_none() {
-                    over = Some(Instant::now() + AFTERMATH);
+                if landing.status(status) && over.is_none() {
+                    over = Some(Instant::now() + AFTER_LANDING);
                 }
             }
-            Some(truth) = truths.next() => flight.truth(truth),
-            Some(health) = healths.next() => flight.health(health),
-            Some(news) = children.next() => match news {
-                News::Said(service, line) => progress.say(&format!("{}: {line}", service.name())),
-                News::Ended(service, end) => {
-                    children.forget(&service);
-                    // Ctrl-C in a terminal reaches the services as well, and they may be the quicker ones.
+            Some(truth) = truths.next() => landing.truth(truth),
+            Some(health) = healths.next() => landing.health(health),
+            Some(event) = children.next() => match event {
+                ChildEvent::Line(service, line) => {
+                    progress.say(&format!("{}: {line}", service.name()));
+                }
+                ChildEvent::Exited(service, exit) => {
+                    children.remove(&service);
+                    // Ctrl-C in a terminal reaches the services as well, which may exit first.
                     if tokio::time::timeout(SIGNAL_GRACE, shutdown.requested()).await.is_ok() {
-                        flight.interrupted("interrupted");
-                        return Ok(flight);
+                        landing.interrupted("interrupted");
+                        return Ok(landing);
                     }
-                    progress.say(&format!("{} ended: {end}{}", service.name(), remedy(service)));
-                    // Nobody flies by the ground station, so its end is no reason to leave a vehicle that takes off.
-                    let is_needed = flight.never_flew()
+                    progress.say(&format!("{} exited: {exit}{}", service.name(), consequence(service)));
+                    // The landing does not need the ground station.
+                    let is_needed = landing.never_flew()
                         && match service {
                             Service::GcsBridge => false,
-                            // One that was swapped away, or whose place another one has taken.
+                            // Not needed if it was swapped, or another one runs.
                             Service::Detector => {
                                 !another_detector(node, settings).await.unwrap_or(false)
                             }
                             _ => true,
                         };
                     if service == Service::Simulator || is_needed {
-                        bail!("{} ended before the landing: {end}; its last words are above", service.name());
+                        bail!("{} exited before the landing: {exit}; see its stderr above", service.name());
                     }
                 }
             },
-            _ = redraw.tick() => progress.draw(&flight),
+            _ = redraw.tick() => progress.draw(&landing),
             () = shutdown.requested() => {
-                flight.interrupted("interrupted");
-                return Ok(flight);
+                landing.interrupted("interrupted");
+                return Ok(landing);
             }
             () = tokio::time::sleep_until(end) => {
                 if over.is_none() {
-                    flight.interrupted("no landing in the time allowed (--timeout-s)");
+                    landing.interrupted("timeout before the landing (--timeout-s)");
                 }
-                return Ok(flight);
+                return Ok(landing);
             }
         }
     }
 }
 
-/// True when there is a detector beside the one that was started here.
-async fn another_detector(node: &Node, settings: &Settings) -> anyhow::Result<bool> {
+/// Whether a detector other than the one started here is ready.
+async fn another_detector(node: &Node, settings: &ServiceSettings) -> anyhow::Result<bool> {
     let own = Layers { file: None, set: settings.of(Service::Detector).to_vec() };
     let own = own.load::<detector::Config>()?.settings.id;
     Ok(node.alive("detector", "*").await?.iter().any(|other| *other != own))
 }
 
-/// What can be done about the end of a service.
-fn remedy(service: Service) -> &'static str {
+/// What the exit of a service means for the landing.
+fn consequence(service: Service) -> &'static str {
     match service {
-        Service::Detector => "; another detector is used as soon as it is there",
+        Service::Detector => "; another detector is used as soon as one is ready",
         Service::Controller => {
-            "; the autopilot stops the vehicle by itself, a controller started again takes the landing up"
+            "; the autopilot stops the vehicle, and a restarted controller resumes the landing"
         }
-        Service::GcsBridge => "; the landing goes on without the ground station",
+        Service::GcsBridge => "; the landing continues without the ground station",
         Service::Simulator | Service::CameraPub => "",
     }
 }
 
-/// Where the processes meet.
-struct MeetingPoint {
+/// The Zenoh configuration with which the processes find each other.
+struct Rendezvous {
     file: PathBuf,
     description: String,
-    /// Keeps the file until the landing is over.
+    /// Deletes the file at the end.
     _directory: TempDir,
 }
 
-impl MeetingPoint {
-    /// The user's file, or the built-in one on its own port, or on another when that is taken.
+impl Rendezvous {
+    /// The user's file, or the built-in configuration at its usual port or at a free one.
     fn new(user_file: Option<&Path>) -> anyhow::Result<Self> {
         let directory = tempfile::Builder::new()
             .prefix("alight-")
@@ -324,19 +315,19 @@ impl MeetingPoint {
         let file = directory.path().join("zenoh.json5");
         std::fs::write(&file, node::session::local_config(port))
             .with_context(|| format!("writing {file:?}"))?;
-        let description = format!("local, meeting at port {port}");
+        let description = format!("local, rendezvous at port {port}");
         Ok(Self { file, description, _directory: directory })
     }
 }
 
-/// Ports that Linux gives to nobody who asks for just any (`ip_local_port_range` begins at 32768): what is free there still is
-/// when its service listens.
+/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768), so that one that is free now is
+/// still free when its service binds it.
 const PORTS: std::ops::Range<u16> = 20_000..32_000;
 
-/// A port that can be bound so. Programs begin to look at different ones, so that two that start at once do not meet.
+/// A free port. Each process begins its search at another one, so that two that start at once do not collide.
 fn free_port<T>(bind: impl Fn((&'static str, u16)) -> std::io::Result<T>) -> anyhow::Result<u16> {
     let first = std::process::id().wrapping_mul(97);
-    let port = |further| PORTS.start + (first.wrapping_add(further) % PORTS.len() as u32) as u16;
+    let port = |offset| PORTS.start + (first.wrapping_add(offset) % PORTS.len() as u32) as u16;
     (0..100)
         .map(port)
         .find(|port| bind(("127.0.0.1", *port)).is_ok())

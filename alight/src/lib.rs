@@ -1,14 +1,16 @@
 //! Lands a UAV on a printed marker: every service and tool as a subcommand of one program.
 //!
-//! Modules in reading order: [`cli`] is what can be asked, [`services`] runs one service in this process, [`relay`]
-//! stands between the drone and the ground; [`up`] runs what a [`site`] says belongs on this machine and listens to its
-//! [`neighbours`], [`keys`] makes the keys for it, [`doctor`] says what is wrong; [`land`] runs all services as processes and watches the landing, with
-//! [`children`] for the processes, [`progress`] for what is shown meanwhile and [`outcome`] for the result;
-//! [`detectors`] lists the detectors that run and [`swap`] replaces one; [`detect`], [`marker`] and [`experiment`] are
-//! tools.
+//! Modules in reading order: [`cli`] is the command line, with the shared [`args`]; [`services`] runs one service in this
+//! process, [`relay`] connects drone and ground; [`up`] runs the processes of a [`site`] on this machine and follows its
+//! [`peers`], [`keys`] makes the site's keys, [`doctor`] diagnoses it; [`land`] runs all services as processes and
+//! watches the landing, with [`children`] for the processes, [`progress`] for the display and [`outcome`] for the
+//! result; [`command`] sends a command, [`detectors`] lists the running detectors and [`swap`] replaces one; [`detect`],
+//! [`marker`] and [`experiment`] are tools. [`runtime`] and [`terminal`] serve all of them.
 
+mod args;
 mod children;
 mod cli;
+mod command;
 mod detect;
 mod detectors;
 mod doctor;
@@ -16,13 +18,15 @@ mod experiment;
 mod keys;
 mod land;
 mod marker;
-mod neighbours;
 mod outcome;
+mod peers;
 mod progress;
 mod relay;
+mod runtime;
 mod services;
 mod site;
 mod swap;
+mod terminal;
 mod up;
 
 use std::process::ExitCode;

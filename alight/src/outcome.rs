@@ -1,4 +1,4 @@
-//! What came of a landing: the flight as it was watched, and its result.
+//! The result of a landing, from the messages received during it.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -10,18 +10,18 @@ use serde::Serialize;
 const THESIS_TIME_S: f64 = 55.0;
 const THESIS_ERROR_M: f64 = 0.0682;
 
-/// A flight, as it is being watched.
+/// What is known of a landing under way.
 #[derive(Default)]
-pub(crate) struct Flight {
+pub(crate) struct LandingSummary {
     pub(crate) last_status: Option<ControllerStatus>,
     pub(crate) last_truth: Option<Truth>,
     /// First and last health by service and process.
     healths: BTreeMap<(String, u32), (Health, Health)>,
-    /// The first start that was told: a controller that was started again counts from its own.
+    /// The first start: a restarted controller reports its own.
     started_ns: Option<i64>,
     disarmed_ns: Option<i64>,
     interrupted: Option<String>,
-    /// Detections used by controllers that are gone.
+    /// Detections used by earlier controllers.
     detections_before: u64,
 }
 
@@ -59,8 +59,8 @@ struct Process {
     cpu_percent: f64,
 }
 
-impl Flight {
-    /// Takes a status in; true when the controller says that nothing more will happen.
+impl LandingSummary {
+    /// Adds a status; true when the controller has finished.
     pub(crate) fn status(&mut self, status: ControllerStatus) -> bool {
         self.started_ns = self.started_ns.or(status.started_ns);
         self.disarmed_ns = self.disarmed_ns.or(status.disarmed_ns);
@@ -84,7 +84,7 @@ impl Flight {
         span.1 = health;
     }
 
-    /// Ends the watch before the landing.
+    /// Notes why the landing was not watched to its end.
     pub(crate) fn interrupted(&mut self, why: &str) {
         self.interrupted = Some(why.to_owned());
     }
@@ -115,10 +115,10 @@ impl Flight {
             (Some(why), Some(status)) => {
                 format!("{why}; it was in `{}`: {}", status.phase, status.why)
             }
-            (Some(why), None) => format!("{why}; no controller was heard"),
+            (Some(why), None) => format!("{why}; no controller was running"),
             (None, _) if landed => "landed".to_owned(),
             (None, Some(status)) => format!("{}: {}", status.phase, status.why),
-            (None, None) => "no controller was heard".to_owned(),
+            (None, None) => "no controller was running".to_owned(),
         };
         Outcome {
             landed,
@@ -151,7 +151,7 @@ impl Flight {
 }
 
 impl Outcome {
-    /// The result beside the thesis' flight, for people.
+    /// The result beside that of the thesis, as a table.
     pub(crate) fn table(&self) -> String {
         let mut text = String::new();
         let verdict = match self.landed {
@@ -223,16 +223,16 @@ mod tests {
     }
 
     #[test]
-    fn a_landing_counts_from_the_first_start_whatever_controller_ends_it() {
-        let mut flight = Flight::default();
+    fn times_count_from_the_first_start_of_any_controller() {
+        let mut landing = LandingSummary::default();
         let second = 1_000_000_000;
-        flight.status(ControllerStatus {
+        landing.status(ControllerStatus {
             started_ns: Some(second),
             detections_used: 40,
             ..status("descend")
         });
-        // A controller that was started again.
-        flight.status(ControllerStatus {
+        // A restarted controller.
+        landing.status(ControllerStatus {
             started_ns: Some(9 * second),
             detections_used: 2,
             ..status("descend")
@@ -243,7 +243,7 @@ mod tests {
             vertical_speed_m_s: 0.5,
             lateral_speed_m_s: 0.0,
         };
-        flight.truth(truth(Some(touchdown)));
+        landing.truth(truth(Some(touchdown)));
         let done = ControllerStatus {
             started_ns: Some(9 * second),
             disarmed_ns: Some(16 * second),
@@ -251,8 +251,8 @@ mod tests {
             detections_used: 60,
             ..status("landed")
         };
-        assert!(flight.status(done));
-        let outcome = flight.outcome();
+        assert!(landing.status(done));
+        let outcome = landing.outcome();
         assert!(outcome.landed && outcome.outcome == "landed");
         assert_eq!(
             (outcome.time_to_disarm_s, outcome.time_to_touchdown_s),
@@ -263,11 +263,11 @@ mod tests {
     }
 
     #[test]
-    fn a_flight_that_is_broken_off_says_where_it_was() {
-        let mut flight = Flight::default();
-        flight.status(status("search"));
-        flight.interrupted("interrupted");
-        let outcome = flight.outcome();
+    fn an_interrupted_landing_names_its_phase() {
+        let mut landing = LandingSummary::default();
+        landing.status(status("search"));
+        landing.interrupted("interrupted");
+        let outcome = landing.outcome();
         assert!(!outcome.landed);
         assert_eq!(outcome.outcome, "interrupted; it was in `search`: because");
     }

@@ -1,17 +1,17 @@
-//! What is shown during a landing: a few lines that are redrawn on a terminal, else a line for each change.
+//! The display of a landing: a few lines that are redrawn on a terminal, else a line for each change.
 
 use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use messages::ControllerStatus;
 
-use crate::cli::write_error;
-use crate::land::Format;
-use crate::outcome::Flight;
+use crate::args::Format;
+use crate::outcome::LandingSummary;
+use crate::terminal::write_error;
 
-/// The view of a landing.
+/// The display of a landing.
 pub(crate) struct Progress {
-    /// Nothing where standard error is no terminal.
+    /// `None` where standard error is not a terminal.
     live: Option<ProgressBar>,
     phase: String,
     active_detector: Option<String>,
@@ -42,14 +42,14 @@ impl Progress {
         }
     }
 
-    /// Shows a line that only programs and the curious want.
+    /// Shows a line where the output is not a terminal.
     pub(crate) fn debug(&self, line: &str) {
         if self.live.is_none() {
             write_error(line);
         }
     }
 
-    /// Tells a change of phase or of detector.
+    /// Shows a change of phase or of detector.
     pub(crate) fn status(&mut self, status: &ControllerStatus) {
         if status.phase != self.phase {
             self.phase.clone_from(&status.phase);
@@ -63,9 +63,9 @@ impl Progress {
     }
 
     /// Redraws the live view.
-    pub(crate) fn draw(&self, flight: &Flight) {
-        if let (Some(bar), Some(status)) = (&self.live, &flight.last_status) {
-            bar.set_message(live_lines(status, flight.frame_rate_hz()));
+    pub(crate) fn draw(&self, landing: &LandingSummary) {
+        if let (Some(bar), Some(status)) = (&self.live, &landing.last_status) {
+            bar.set_message(live_lines(status, landing.frame_rate_hz()));
         }
     }
 
@@ -111,7 +111,7 @@ mod tests {
     use messages::{Candidate, DetectorState};
 
     #[test]
-    fn the_live_view_names_what_a_pilot_asks_for() {
+    fn the_live_view_has_phase_height_error_and_detectors() {
         let candidate = |name: &str| Candidate {
             detector: name.into(),
             state: DetectorState::Shadow,

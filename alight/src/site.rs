@@ -1,16 +1,16 @@
-//! A site: one TOML file that says for every machine what runs there, and how the machines find each other.
+//! A site: one TOML file that lists the processes of every machine, and how the machines find each other.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use clap::ValueEnum;
+use node::network::Address;
 use node::{ConfigError, Layers, Network};
 use serde::Deserialize;
 
-use crate::relay;
-use crate::services::Service;
+use crate::services::{RELAY, Service};
 
-/// What a machine is for.
+/// The role of a machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Role {
     /// The companion computer: its services, and the relay to the ground.
@@ -19,12 +19,12 @@ pub(crate) enum Role {
     Ground,
     /// A base station between both.
     Relay,
-    /// Everything on one machine, nothing outside.
+    /// All processes on one machine, without a network.
     Local,
 }
 
 impl Role {
-    /// The name of its table in the file, and of its Zenoh configuration.
+    /// The name of its table in the file and of its Zenoh configuration.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Drone => "drone",
@@ -35,42 +35,42 @@ impl Role {
     }
 }
 
-/// The file.
+/// The contents of the file.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct Site {
     /// The vehicle's name.
     vehicle: Option<String>,
-    /// Where the drone is for the ground: HOST or HOST:PORT.
+    /// The drone's address for the ground: HOST or HOST:PORT.
     address: Option<String>,
-    /// Where a relay between both is, if there is one: HOST or HOST:PORT.
+    /// The address of a relay between both, if there is one: HOST or HOST:PORT.
     relay_address: Option<String>,
     /// The directory with the keys.
     keys: Option<PathBuf>,
-    /// Where the processes of one machine meet.
+    /// The rendezvous port of the processes of one machine.
     meet: Option<u16>,
     drone: Vec<Entry>,
     ground: Vec<Entry>,
     relay: Vec<Entry>,
     local: Vec<Entry>,
-    /// Where the file is: all paths in it are relative to it.
+    /// The folder of the file; all paths in it are relative to it.
     #[serde(skip)]
     pub(crate) folder: PathBuf,
 }
 
-/// A process.
+/// A process in the file.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Entry {
     /// A service: camera-pub, detector, controller, gcs-bridge, simulator.
     run: Option<String>,
-    /// Or a program of one's own.
+    /// Or another program with its arguments.
     command: Option<Vec<String>>,
-    /// What it is called in the output; the service's or the program's name if it is left out.
+    /// Its name in the output [default: that of the service or the program].
     name: Option<String>,
     /// The service's configuration file.
     config: Option<PathBuf>,
-    /// Settings laid over it.
+    /// Settings over the file.
     #[serde(default)]
     set: Vec<String>,
 }
@@ -78,41 +78,24 @@ pub(crate) struct Entry {
 /// A process of a role, ready to be started.
 #[derive(Clone, Debug)]
 pub(crate) struct Job {
-    /// What it is called.
+    /// Its name.
     pub(crate) name: String,
-    /// The service, unless it is the relay or a program of one's own.
+    /// The service, unless it is the relay or another program.
     pub(crate) service: Option<Service>,
-    /// The program, and what follows it; `alight` for this one.
+    /// The program and its arguments; `alight` for this program.
     pub(crate) command: Vec<String>,
-    /// What its environment says of the network.
+    /// The network that it joins.
     pub(crate) network: Network,
-    /// The role whose key it shows.
+    /// The role whose key it uses.
     pub(crate) key: String,
-    /// What is laid over the service's defaults.
+    /// The settings over the service's defaults.
     pub(crate) layers: Layers,
 }
 
 impl Job {
-    /// Whether it shows a key: the services on the drone are among themselves.
+    /// Whether it needs a key; local processes do not.
     pub(crate) fn needs_key(&self) -> bool {
         self.network.config.as_deref().is_none_or(|config| config != Path::new("local"))
-    }
-
-    /// The network as environment variables, which every subcommand reads.
-    pub(crate) fn environment(&self) -> Vec<(&'static str, String)> {
-        let Network { config, vehicle, connect, listen, meet, keys } = self.network.clone();
-        let path = |path: PathBuf| path.display().to_string();
-        [
-            ("ALIGHT_ZENOH", config.map(path)),
-            ("ALIGHT_CONNECT", connect),
-            ("ALIGHT_LISTEN", listen),
-            ("ALIGHT_MEET", meet.map(|port| port.to_string())),
-            ("ALIGHT_VEHICLE", vehicle),
-            ("ALIGHT_KEYS", keys.map(path)),
-        ]
-        .into_iter()
-        .filter_map(|(name, value)| Some((name, value?)))
-        .collect()
     }
 }
 
@@ -120,7 +103,7 @@ impl Site {
     /// Reads a file.
     ///
     /// # Errors
-    /// Names the file and what is wrong in it.
+    /// Names the file and the problem.
     pub(crate) fn read(path: &Path) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path)
             .map_err(|cause| ConfigError::Unreadable { path: path.to_owned(), cause })?;
@@ -134,7 +117,7 @@ impl Site {
         Ok(site)
     }
 
-    /// The network as a process of a role joins it.
+    /// The network of the processes of a role.
     pub(crate) fn network(&self, role: Role) -> Network {
         let connect = match role {
             Role::Ground => self.relay_address.clone().or_else(|| self.address.clone()),
@@ -142,7 +125,7 @@ impl Site {
             Role::Drone | Role::Local => None,
         };
         Network {
-            // On the drone the processes are among themselves; its relay is their way out.
+            // The services on the drone are local; only its relay connects to others.
             config: Some(if role == Role::Drone { Role::Local } else { role }.name().into()),
             vehicle: self.vehicle.clone(),
             connect,
@@ -152,17 +135,17 @@ impl Site {
         }
     }
 
-    /// What tells the supervisor of a role from others on the same machine.
+    /// A name for the supervisor of a role, unique on its machine.
     pub(crate) fn instance(&self, role: Role) -> String {
         let vehicle = self.vehicle.as_deref().unwrap_or("drone");
         let meet = self.meet.unwrap_or(node::session::LOCAL_PORT);
         format!("{}-{vehicle}-{meet}", role.name())
     }
 
-    /// What runs in a role, in the order in which it is started.
+    /// The processes of a role, in starting order.
     ///
     /// # Errors
-    /// When an entry makes no sense, a setting is refused, or an address or a key is missing.
+    /// When an entry or a setting is invalid, or an address or a key is missing.
     pub(crate) fn jobs(&self, role: Role) -> anyhow::Result<Vec<Job>> {
         let entries = match role {
             Role::Drone => &self.drone,
@@ -177,7 +160,11 @@ impl Site {
                 .with_context(|| format!("[[{}]] number {}", role.name(), number + 1))?;
             jobs.push(job);
         }
-        ensure!(!jobs.is_empty(), "the site has no [[{}]]: there is nothing to run", role.name());
+        ensure!(
+            !jobs.is_empty(),
+            "the site has no [[{}]], so there is nothing to run",
+            role.name()
+        );
         for index in 1..jobs.len() {
             let (before, rest) = jobs.split_at_mut(index);
             let taken = before.iter().filter(|job| job.name == rest[0].name).count();
@@ -197,24 +184,25 @@ impl Site {
             Role::Relay => (Role::Relay, &self.relay_address),
             Role::Ground | Role::Local => return None,
         };
-        // Others find it at the port that they are given.
-        let port = reached_at.as_deref().and_then(port_of);
+        // It listens at the port to which others connect.
+        let address = reached_at.as_deref().map(Address::parse).transpose().ok().flatten();
+        let port = address.and_then(|address| address.port);
         let network = Network {
             config: Some(config.name().into()),
             listen: port.map(|port| format!("0.0.0.0:{port}")),
             ..self.network(role)
         };
         Some(Job {
-            name: relay::NAME.to_owned(),
+            name: RELAY.to_owned(),
             service: None,
             command: vec![
                 "alight".to_owned(),
-                relay::NAME.to_owned(),
+                RELAY.to_owned(),
                 "--id".to_owned(),
                 if role == Role::Drone { "drone" } else { "base" }.to_owned(),
             ],
             network,
-            key: if role == Role::Drone { "drone" } else { relay::NAME }.to_owned(),
+            key: if role == Role::Drone { "drone" } else { RELAY }.to_owned(),
             layers: Layers::default(),
         })
     }
@@ -227,7 +215,7 @@ impl Site {
                     source_name: "the site".to_owned(),
                     key: "run".to_owned(),
                     value: run.clone(),
-                    limit: "it must be camera-pub, detector, controller, gcs-bridge or simulator"
+                    limit: "must be camera-pub, detector, controller, gcs-bridge or simulator"
                         .to_owned(),
                 })?;
                 (Some(service), vec!["alight".to_owned(), service.name().to_owned()])
@@ -235,12 +223,12 @@ impl Site {
             (None, Some(command)) if !command.is_empty() => {
                 ensure!(
                     entry.config.is_none() && entry.set.is_empty(),
-                    "`config` and `set` are for services; write the arguments of a program into its `command`"
+                    "`config` and `set` are for services; put the arguments of a program into its `command`"
                 );
                 (None, command.clone())
             }
             _ => anyhow::bail!(
-                "it needs either `run`, a service, or `command`, a program with its arguments"
+                "needs either `run`, a service, or `command`, a program with its arguments"
             ),
         };
         let mut layers = Layers {
@@ -248,7 +236,7 @@ impl Site {
             set: entry.set.clone(),
         };
         if service == Some(Service::Detector) && role == Role::Ground {
-            // Who prefers the detectors on the ground must be able to tell them.
+            // The controller can prefer detectors by their place.
             layers.set.insert(0, "place=ground".to_owned());
         }
         if let Some(service) = service {
@@ -260,11 +248,6 @@ impl Site {
         let key = service.map_or("detector", Service::name).to_owned();
         Ok(Job { name, service, command, network, key, layers })
     }
-}
-
-fn port_of(address: &str) -> Option<u16> {
-    let (host, port) = address.rsplit_once(':')?;
-    (!host.contains(':') || host.ends_with(']')).then(|| port.parse().ok())?
 }
 
 #[cfg(test)]
@@ -286,16 +269,16 @@ mod tests {
         ground = [{ run = 'detector', set = ['id=\"ground\"'] }, { run = 'detector' }, { command = ['/usr/bin/python3', 'x.py'] }]";
 
     #[test]
-    fn the_drone_has_a_relay_and_its_services_are_among_themselves() {
+    fn the_drone_has_a_relay_and_local_services() {
         let jobs = site(SITE).jobs(Role::Drone).unwrap();
         let names: Vec<_> = jobs.iter().map(|job| job.name.as_str()).collect();
         assert_eq!(names, ["relay", "detector", "controller"]);
-        let relay = jobs[0].environment();
-        assert!(relay.contains(&("ALIGHT_ZENOH", "drone".to_owned())), "{relay:?}");
-        assert!(relay.contains(&("ALIGHT_LISTEN", "0.0.0.0:8000".to_owned())), "{relay:?}");
-        let detector = jobs[1].environment();
-        assert!(detector.contains(&("ALIGHT_ZENOH", "local".to_owned())), "{detector:?}");
-        assert!(detector.contains(&("ALIGHT_VEHICLE", "kestrel".to_owned())), "{detector:?}");
+        let relay = jobs[0].network.environment();
+        assert!(relay.contains(&("ALIGHT_ZENOH", "drone".into())), "{relay:?}");
+        assert!(relay.contains(&("ALIGHT_LISTEN", "0.0.0.0:8000".into())), "{relay:?}");
+        let detector = jobs[1].network.environment();
+        assert!(detector.contains(&("ALIGHT_ZENOH", "local".into())), "{detector:?}");
+        assert!(detector.contains(&("ALIGHT_VEHICLE", "kestrel".into())), "{detector:?}");
     }
 
     #[test]
@@ -304,16 +287,16 @@ mod tests {
         let names: Vec<_> = jobs.iter().map(|job| job.name.as_str()).collect();
         assert_eq!(names, ["detector", "detector-2", "python3"]);
         assert!(jobs[0].layers.set.contains(&"place=ground".to_owned()), "{:?}", jobs[0].layers);
-        let environment = jobs[0].environment();
-        assert!(environment.contains(&("ALIGHT_CONNECT", "10.42.0.1:8000".to_owned())));
+        let environment = jobs[0].network.environment();
+        assert!(environment.contains(&("ALIGHT_CONNECT", "10.42.0.1:8000".into())));
         let mut between = site(SITE);
         between.relay_address = Some("base.local".to_owned());
         let jobs = between.jobs(Role::Ground).unwrap();
-        assert!(jobs[0].environment().contains(&("ALIGHT_CONNECT", "base.local".to_owned())));
+        assert!(jobs[0].network.environment().contains(&("ALIGHT_CONNECT", "base.local".into())));
     }
 
     #[test]
-    fn the_example_is_a_site() {
+    fn the_example_is_valid() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/site.toml");
         let example = Site::read(&path).unwrap();
         for role in [Role::Drone, Role::Ground, Role::Relay] {
@@ -322,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_in_a_site_is_said() {
+    fn problems_in_a_site_are_reported() {
         assert!(problem("vehicle = 'x'", Role::Ground).contains("no [[ground]]"));
         assert!(problem("ground = [{ run = 'detector' }]", Role::Ground).contains("--connect"));
         let wrong = "drone = [{ run = 'detectr' }]";

@@ -1,12 +1,11 @@
-//! `alight swap`: replaces the detector in use by another, in flight, without a gap.
+//! `alight swap`: replaces the detector in use in flight, without a gap.
 //!
-//! The new detector is started as a process of its own that outlives this one. It runs in shadow until it agrees with
-//! the active one, becomes the active one, and only then is the old one stopped. Whatever goes wrong before, the old
-//! one stays and the new one is stopped.
+//! The new detector is started as a process that outlives this one. It runs in shadow until it agrees with the active
+//! one, becomes the active one, and only then the old one is stopped. On any failure before that, the old one stays in
+//! use and the new one is stopped.
 
 use std::collections::BTreeSet;
 use std::fs::File;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::{ExitCode, Stdio};
 use std::time::Duration;
@@ -22,61 +21,60 @@ use serde::Serialize;
 use tokio::process::{Child, Command};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
-use crate::cli::{NetworkArgs, OPERATOR, write_error};
-use crate::detectors::operator;
-use crate::land::Format;
-use crate::services;
+use crate::args::{Format, NetworkArgs};
+use crate::runtime::with_node;
+use crate::terminal::{print, write_error};
 
-/// Longest wait for the controller's first word.
-const CONTROLLER_PATIENCE: Duration = Duration::from_secs(5);
-/// Longest wait until the controller uses the new detector.
-const ACTIVE_PATIENCE: Duration = Duration::from_secs(5);
-/// For how long the new detector must stay the active one before the old one is stopped.
+/// Timeout for the controller's first status.
+const CONTROLLER_TIMEOUT: Duration = Duration::from_secs(5);
+/// Timeout until the controller uses the new detector.
+const ACTIVE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time that the new detector must stay active before the old one is stopped.
 const PROBATION: Duration = Duration::from_millis(600);
-/// Longest wait for the end of a detector that was asked to stop.
-const STOP_PATIENCE: Duration = Duration::from_secs(3);
-/// Of the frames that were compared, the part in which the new one must agree.
-const LEAST_AGREEMENT: f64 = 0.9;
-/// Of a log, what is shown when a detector fails, in lines.
-const LAST_LINES: usize = 8;
+/// Timeout for a detector that was asked to stop.
+const STOP_TIMEOUT: Duration = Duration::from_secs(3);
+/// Minimum ratio of agreeing frames to compared frames for the new detector.
+const MIN_AGREEMENT: f64 = 0.9;
+/// Number of lines of the log that are shown when a detector fails.
+const LOG_LINES_SHOWN: usize = 8;
 
-/// What a swap takes.
+/// The arguments of a swap.
 #[derive(Args, Clone)]
 pub(crate) struct SwapArgs {
-    /// What to start: a detector's configuration (a `.toml` file), or any command; it is split into words as a shell
-    /// does, and finds the network's options in its environment (ALIGHT_ZENOH, ALIGHT_CONNECT, ...).
+    /// The new detector: a configuration (a `.toml` file), or a command, which is split into words as by a shell and gets
+    /// the network's options in its environment (ALIGHT_ZENOH, ALIGHT_CONNECT, ...).
     #[arg(long, value_name = "FILE|COMMAND")]
     to: String,
-    /// Name of the new detector when a configuration is given; the file's own, with a number if that is taken.
+    /// Name of the new detector when a configuration is given [default: that of the file, with a number if it is taken].
     #[arg(long, value_name = "ID")]
     id: Option<String>,
-    /// Frames that are compared with the active detector's, from 1 to 30.
+    /// Number of frames to compare with the active detector, from 1 to 30.
     #[arg(long, default_value_t = 15, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=30))]
     frames: u32,
-    /// Longest wait until the new detector is ready, in seconds.
+    /// Timeout until the new detector is ready, in seconds.
     #[arg(long, default_value_t = 20, value_name = "SECONDS")]
     ready_s: u64,
-    /// Longest wait until it agrees, in seconds. Where the active one sees no marker, nothing is concluded.
+    /// Timeout until it agrees, in seconds. Frames in which the active one sees no marker are not compared.
     #[arg(long, default_value_t = 20, value_name = "SECONDS")]
     agree_s: u64,
-    /// Leave the old detector running, in shadow.
+    /// Keep the old detector running, in shadow.
     #[arg(long)]
     keep_old: bool,
-    /// Stay until the new detector ends; Ctrl-C stops it. Otherwise it goes on by itself, in a process group of its
+    /// Wait until the new detector exits; Ctrl-C stops it. Without this option it continues in a process group of its
     /// own, and writes to the log.
     #[arg(long)]
     wait: bool,
-    /// Where the new detector's output goes; a file in the system's directory for temporary files otherwise.
+    /// File for the output of the new detector [default: `detector.log` in a new private folder for temporary files].
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
-    /// What is printed at the end: a sentence, or one JSON object.
+    /// Format of the result: a sentence, or one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
     #[command(flatten)]
     network: NetworkArgs,
 }
 
-/// How it went.
+/// The result of a swap.
 #[derive(Default, Serialize)]
 struct Report {
     swapped: bool,
@@ -96,38 +94,31 @@ struct Report {
 
 /// Swaps; the exit status is 0 when the new detector is in use.
 pub(crate) fn run(args: &SwapArgs) -> anyhow::Result<ExitCode> {
-    node::start_logging("warn");
-    let zenoh = args.network.source(OPERATOR)?;
-    let report = services::runtime()?.block_on(async {
-        let shutdown = Shutdown::on_signals()?;
-        let node = Node::open(operator("swap"), &zenoh).await?;
-        let report = swap(args, &node, &shutdown).await;
-        node.close().await;
-        report
+    let report = with_node(&args.network, "swap", async |node| {
+        swap(args, node, &Shutdown::on_signals()?).await
     })?;
-    let text = match args.format {
+    print(&match args.format {
         Format::Json => serde_json::to_string(&report)?,
         Format::Text => report.why.clone(),
-    };
-    writeln!(std::io::stdout(), "{text}")?;
+    })?;
     Ok(ExitCode::from(u8::from(!report.swapped)))
 }
 
 async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Result<Report> {
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let presence = node.presence("detector").await?;
-    let first = timeout(CONTROLLER_PATIENCE, statuses.next()).await.ok().flatten();
-    let first = first.context("no controller answered; a detector is swapped while one runs")?;
-    let mut there: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();
-    there.extend(first.candidates.iter().map(|candidate| candidate.detector.clone()));
-    let newcomer = Newcomer::new(args, &there)?;
+    let first = timeout(CONTROLLER_TIMEOUT, statuses.next()).await.ok().flatten();
+    let first = first.context("no controller answered; `swap` needs a running controller")?;
+    let mut existing: BTreeSet<String> = node.alive("detector", "*").await?.into_iter().collect();
+    existing.extend(first.candidates.iter().map(|candidate| candidate.detector.clone()));
+    let new_detector = NewDetector::new(args, &existing)?;
     let mut report = Report {
         from: first.active_detector.clone(),
-        to: newcomer.id.clone(),
-        log: newcomer.log.clone(),
+        to: new_detector.id.clone(),
+        log: new_detector.log.clone(),
         ..Report::default()
     };
-    let child = newcomer.start(args)?;
+    let child = new_detector.start(args)?;
     report.pid = child.id();
     let mut swap = Swap {
         args,
@@ -135,10 +126,10 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
         shutdown,
         statuses,
         presence,
-        there,
+        existing,
         child,
         began: Instant::now(),
-        say: args.format == Format::Text,
+        is_verbose: args.format == Format::Text,
     };
     match swap.carry_out(&mut report).await {
         Ok(()) => {
@@ -150,42 +141,39 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
                 report.agreed, report.compared
             );
             if args.wait {
-                swap.stay().await;
+                swap.wait().await;
             }
         }
         Err(problem) => {
-            swap.give_up(&report).await;
+            swap.roll_back(&report).await;
             let old = report.from.as_deref().unwrap_or("none");
             report.why = format!("not swapped, {old} stays in use: {problem:#}");
             if let Some(last) = report.log.as_deref().and_then(last_lines)
-                && swap.say
+                && swap.is_verbose
             {
-                write_error(&format!("The new detector's last words:\n{last}"));
+                write_error(&format!("End of the new detector's log:\n{last}"));
             }
         }
     }
     Ok(report)
 }
 
-/// The detector that is to be started.
-struct Newcomer {
+/// The detector to start.
+struct NewDetector {
     program: PathBuf,
     args: Vec<String>,
-    /// Its name, where that is known beforehand.
+    /// Its name, if known beforehand.
     id: Option<String>,
     log: Option<PathBuf>,
 }
 
-impl Newcomer {
-    fn new(args: &SwapArgs, there: &BTreeSet<String>) -> anyhow::Result<Self> {
+impl NewDetector {
+    fn new(args: &SwapArgs, existing: &BTreeSet<String>) -> anyhow::Result<Self> {
         let file = Path::new(&args.to);
-        let log = |name: &str| match (&args.log, args.wait) {
+        let log = match (&args.log, args.wait) {
             (Some(log), _) => Some(log.clone()),
             (None, true) => None,
-            (None, false) => {
-                let file = format!("alight-{name}-{}.log", std::process::id());
-                Some(std::env::temp_dir().join(file))
-            }
+            (None, false) => Some(private_folder()?.join("detector.log")),
         };
         if file.extension().is_some_and(|extension| extension == "toml") {
             let layers = Layers { file: Some(file.to_owned()), set: Vec::new() };
@@ -193,44 +181,51 @@ impl Newcomer {
                 Some(id) => id.clone(),
                 None => layers.load::<detector::Config>()?.settings.id,
             };
-            let id = free_name(&wanted, there);
+            let id = free_name(&wanted, existing);
             let layers = Layers { set: vec![format!("id={id}")], ..layers };
             layers.load::<detector::Config>()?;
             let words = ["detector", "--config", &args.to, "--set", &format!("id={id}")];
             return Ok(Self {
                 program: std::env::current_exe().context("finding this program's own file")?,
                 args: words.map(str::to_owned).into(),
-                log: log(&id),
+                log,
                 id: Some(id),
             });
         }
         let words = shlex::split(&args.to).filter(|words| !words.is_empty());
         let mut words = words
-            .with_context(|| format!("`{}` is no command: a quote is missing in it", args.to))?
+            .with_context(|| format!("`{}` is not a command: a quote is missing", args.to))?
             .into_iter();
         let program = words.next().unwrap_or_default().into();
-        Ok(Self { program, args: words.collect(), id: args.id.clone(), log: log("detector") })
+        Ok(Self { program, args: words.collect(), id: args.id.clone(), log })
     }
 
     fn start(&self, args: &SwapArgs) -> anyhow::Result<Child> {
         let mut command = Command::new(&self.program);
-        command.args(&self.args).envs(args.network.environment()).stdin(Stdio::null());
+        command.args(&self.args).envs(args.network.network().environment()).stdin(Stdio::null());
         if let Some(log) = &self.log {
             let file = File::create(log).with_context(|| format!("writing the log {log:?}"))?;
             command.stdout(file.try_clone()?).stderr(file);
         }
-        // Neither this program's end nor Ctrl-C in its terminal ends the detector.
+        // The detector outlives this program, also after Ctrl-C in its terminal.
         command.process_group(0);
         command.spawn().with_context(|| format!("starting {}", self.program.display()))
     }
 }
 
-/// The name itself, or with the first number that makes it free.
-fn free_name(wanted: &str, there: &BTreeSet<String>) -> String {
+/// A new folder for temporary files that only this user can access: a file of a predictable name in a shared directory
+/// could be a link that somebody else placed there.
+fn private_folder() -> anyhow::Result<PathBuf> {
+    let folder = tempfile::Builder::new().prefix("alight-").tempdir();
+    Ok(folder.context("making a private folder for the log")?.keep())
+}
+
+/// The name itself, or the first free one with a number.
+fn free_name(wanted: &str, existing: &BTreeSet<String>) -> String {
     let numbered = (2_u32..).map(|number| format!("{wanted}-{number}"));
     std::iter::once(wanted.to_owned())
         .chain(numbered)
-        .find(|name| !there.contains(name))
+        .find(|name| !existing.contains(name))
         .unwrap_or_default()
 }
 
@@ -241,16 +236,16 @@ struct Swap<'a> {
     shutdown: &'a Shutdown,
     statuses: Subscriber<ControllerStatus>,
     presence: Presence,
-    there: BTreeSet<String>,
+    existing: BTreeSet<String>,
     child: Child,
     began: Instant,
-    say: bool,
+    is_verbose: bool,
 }
 
-/// What happened meanwhile.
-enum News {
+/// An event during a swap.
+enum Event {
     Status(Box<ControllerStatus>),
-    Came(String),
+    Joined(String),
     Left(String),
 }
 
@@ -259,14 +254,14 @@ impl Swap<'_> {
         let new = self.until_ready(report.to.clone()).await?;
         report.to = Some(new.clone());
         report.ready_s = Some(self.elapsed_s());
-        self.tell(&format!("{new} is ready and runs in shadow"));
+        self.show(&format!("{new} is ready and runs in shadow"));
         self.until_agreed(&new, report).await?;
         report.agreed_s = Some(self.elapsed_s());
-        self.tell(&format!("it agrees in {} of {} frames", report.agreed, report.compared));
+        self.show(&format!("it agrees in {} of {} frames", report.agreed, report.compared));
         self.use_detector(&new).await?;
         self.until_active(&new).await?;
         report.active_s = Some(self.elapsed_s());
-        self.tell(&format!("{new} is used"));
+        self.show(&format!("{new} is used"));
         if let Some(old) = report.from.clone().filter(|old| *old != new && !self.args.keep_old) {
             match self.stop_old(&old).await {
                 Ok(()) => report.old_stopped = true,
@@ -282,34 +277,36 @@ impl Swap<'_> {
         self.began.elapsed().as_secs_f64()
     }
 
-    fn tell(&self, line: &str) {
-        if self.say {
+    fn show(&self, line: &str) {
+        if self.is_verbose {
             write_error(&format!("{:5.1} s  {line}", self.elapsed_s()));
         }
     }
 
-    /// The next news; an error when the new detector ends, somebody asks to stop, or it takes too long.
-    async fn news(&mut self, deadline: Instant, waiting_for: &str) -> anyhow::Result<News> {
+    /// The next event; an error when the new detector exits, on a shutdown request, and at the deadline.
+    async fn next_event(&mut self, deadline: Instant, waiting_for: &str) -> anyhow::Result<Event> {
         tokio::select! {
-            Some(status) = self.statuses.next() => Ok(News::Status(Box::new(status))),
+            Some(status) = self.statuses.next() => Ok(Event::Status(Box::new(status))),
             Some((name, alive)) = self.presence.next() => {
-                Ok(if alive { News::Came(name) } else { News::Left(name) })
+                Ok(if alive { Event::Joined(name) } else { Event::Left(name) })
             }
             status = self.child.wait() => {
                 let status = status.map_or_else(|cause| cause.to_string(), |s| s.to_string());
-                bail!("the new detector ended ({status}) while waiting until {waiting_for}")
+                bail!("the new detector exited ({status}) while waiting until {waiting_for}")
             }
             () = self.shutdown.requested() => bail!("interrupted"),
-            () = sleep_until(deadline) => bail!("it takes too long until {waiting_for}"),
+            () = sleep_until(deadline) => bail!("timeout while waiting until {waiting_for}"),
         }
     }
 
     async fn until_ready(&mut self, expected: Option<String>) -> anyhow::Result<String> {
         let deadline = Instant::now() + Duration::from_secs(self.args.ready_s);
         loop {
-            if let News::Came(name) = self.news(deadline, "the new detector is ready").await? {
-                let is_it = expected.as_ref().is_none_or(|expected| *expected == name);
-                if is_it && !self.there.contains(&name) {
+            if let Event::Joined(name) =
+                self.next_event(deadline, "the new detector is ready").await?
+            {
+                let is_new = expected.as_ref().is_none_or(|expected| *expected == name);
+                if is_new && !self.existing.contains(&name) {
                     return Ok(name);
                 }
             }
@@ -320,18 +317,18 @@ impl Swap<'_> {
         let deadline = Instant::now() + Duration::from_secs(self.args.agree_s);
         loop {
             let waiting_for = match (report.compared, report.agreed) {
-                (0, _) => "it can be compared: the active detector sees no marker, or the new one \
-                           searches other frames, and so nothing is concluded"
+                (0, _) => "it can be compared: the active detector sees no marker, or the new one searches \
+                           other frames"
                     .to_owned(),
                 (compared, agreed) => format!("it agrees, so far in {agreed} of {compared} frames"),
             };
-            match self.news(deadline, &waiting_for).await? {
-                News::Left(name) if name == new => bail!("the new detector left the network"),
-                News::Status(status) if status.active_detector.as_deref() == Some(new) => {
-                    self.tell("the old one failed meanwhile, and the new one took over by itself");
+            match self.next_event(deadline, &waiting_for).await? {
+                Event::Left(name) if name == new => bail!("the new detector left the network"),
+                Event::Status(status) if status.active_detector.as_deref() == Some(new) => {
+                    self.show("the old one failed, and the new one took over");
                     return Ok(());
                 }
-                News::Status(status) => {
+                Event::Status(status) => {
                     let Some(shadow) = find(&status, new) else { continue };
                     (report.compared, report.agreed) = (shadow.compared, shadow.agreed);
                     report.disagreement_m = shadow.disagreement_m;
@@ -339,7 +336,7 @@ impl Swap<'_> {
                         return verdict;
                     }
                 }
-                News::Came(_) | News::Left(_) => {}
+                Event::Joined(_) | Event::Left(_) => {}
             }
         }
     }
@@ -354,10 +351,11 @@ impl Swap<'_> {
     }
 
     async fn until_active(&mut self, new: &str) -> anyhow::Result<()> {
-        let deadline = Instant::now() + ACTIVE_PATIENCE;
+        let deadline = Instant::now() + ACTIVE_TIMEOUT;
         let mut since: Option<Instant> = None;
         loop {
-            let News::Status(status) = self.news(deadline, "the new detector is used").await?
+            let Event::Status(status) =
+                self.next_event(deadline, "the new detector is used").await?
             else {
                 continue;
             };
@@ -367,7 +365,7 @@ impl Swap<'_> {
                 (true, Some(since)) if since.elapsed() >= PROBATION => return Ok(()),
                 (true, since_before) => since = since_before.or(Some(Instant::now())),
                 (false, Some(_)) if status.active_detector.as_deref() != Some(new) => {
-                    bail!("it was left again: {}", status.detector_why)
+                    bail!("the controller switched back: {}", status.detector_why)
                 }
                 (false, _) => {}
             }
@@ -380,21 +378,21 @@ impl Swap<'_> {
         if !reply.accepted {
             bail!("it refuses to stop: {}", reply.reason);
         }
-        let deadline = Instant::now() + STOP_PATIENCE;
+        let deadline = Instant::now() + STOP_TIMEOUT;
         loop {
-            match self.news(deadline, "the old detector has stopped").await? {
-                News::Left(name) if name == old => return Ok(()),
-                News::Left(_) | News::Came(_) | News::Status(_) => {}
+            match self.next_event(deadline, "the old detector has stopped").await? {
+                Event::Left(name) if name == old => return Ok(()),
+                Event::Left(_) | Event::Joined(_) | Event::Status(_) => {}
             }
         }
     }
 
-    /// Back to the old detector, and the new one is stopped.
-    async fn give_up(&mut self, report: &Report) {
+    /// Switches back to the old detector and stops the new one.
+    async fn roll_back(&mut self, report: &Report) {
         if let (Some(old), Some(_)) = (&report.from, report.agreed_s)
             && let Err(problem) = self.use_detector(old).await
         {
-            write_error(&format!("{old} could not be made the preferred one again: {problem:#}"));
+            write_error(&format!("{old} could not be preferred again: {problem:#}"));
         }
         self.end_child().await;
     }
@@ -403,25 +401,25 @@ impl Swap<'_> {
         let group = self.child.id().and_then(|id| i32::try_from(id).ok()).and_then(Pid::from_raw);
         for signal in [Signal::TERM, Signal::KILL] {
             if let Some(group) = group {
-                // One that has ended meanwhile needs no signal.
+                // Fails when the group has exited already.
                 let _ = kill_process_group(group, signal);
             }
-            if timeout(STOP_PATIENCE, self.child.wait()).await.is_ok() {
+            if timeout(STOP_TIMEOUT, self.child.wait()).await.is_ok() {
                 return;
             }
         }
     }
 
-    /// Until the new detector ends, or somebody wants it to.
-    async fn stay(&mut self) {
-        self.tell("the new detector runs until Ctrl-C");
+    /// Waits until the new detector exits or a shutdown is requested.
+    async fn wait(&mut self) {
+        self.show("the new detector runs until Ctrl-C");
         let ended = tokio::select! {
             _ = self.child.wait() => true,
             () = self.shutdown.requested() => false,
         };
         if !ended {
             self.end_child().await;
-            // Its last words go to the same terminal.
+            // Its last output goes to the same terminal.
             sleep(Duration::from_millis(50)).await;
         }
     }
@@ -431,29 +429,29 @@ fn find<'a>(status: &'a ControllerStatus, name: &str) -> Option<&'a Candidate> {
     status.candidates.iter().find(|candidate| candidate.detector == name)
 }
 
-/// Whether a detector agrees, once enough frames were compared; `None` while that is open.
+/// Whether a detector agrees, once enough frames are compared; `None` while that is undecided.
 fn verdict(shadow: &Candidate, frames: u32) -> Option<anyhow::Result<()>> {
     let (agreed, compared) = (shadow.agreed, shadow.compared);
     if compared < frames {
         return None;
     }
-    let part = f64::from(agreed) / f64::from(compared);
-    if part >= LEAST_AGREEMENT && shadow.state == DetectorState::Shadow {
+    let ratio = f64::from(agreed) / f64::from(compared);
+    if ratio >= MIN_AGREEMENT && shadow.state == DetectorState::Shadow {
         return Some(Ok(()));
     }
-    (part < 0.5).then(|| {
+    (ratio < 0.5).then(|| {
         let apart = shadow.disagreement_m.map_or_else(
             || "it does not see the marker".to_owned(),
-            |apart_m| format!("it last saw the marker {apart_m:.2} m elsewhere"),
+            |apart_m| format!("its last position of the marker is {apart_m:.2} m off"),
         );
-        Err(anyhow!("it agrees in {agreed} of {compared} frames only; {apart}"))
+        Err(anyhow!("it agrees in only {agreed} of {compared} frames; {apart}"))
     })
 }
 
 fn last_lines(log: &Path) -> Option<String> {
     let text = std::fs::read_to_string(log).ok()?;
     let lines: Vec<&str> = text.lines().collect();
-    let last = lines.get(lines.len().saturating_sub(LAST_LINES)..)?;
+    let last = lines.get(lines.len().saturating_sub(LOG_LINES_SHOWN)..)?;
     (!last.is_empty()).then(|| last.join("\n"))
 }
 
@@ -477,10 +475,10 @@ mod tests {
     }
 
     #[test]
-    fn agreement_is_concluded_from_enough_frames_only() {
+    fn agreement_needs_enough_frames() {
         assert!(verdict(&shadow(14, 14), 15).is_none());
         assert!(verdict(&shadow(15, 14), 15).unwrap().is_ok());
-        assert!(verdict(&shadow(15, 10), 15).is_none(), "it may still come to agree");
+        assert!(verdict(&shadow(15, 10), 15).is_none(), "undecided");
         let refused = verdict(&shadow(15, 3), 15).unwrap().unwrap_err().to_string();
         assert!(refused.contains("3 of 15") && refused.contains("0.40 m"), "{refused}");
         let stale = Candidate { state: DetectorState::Stale, ..shadow(15, 15) };
@@ -488,9 +486,9 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_is_taken_gets_a_number() {
-        let there: BTreeSet<String> = ["main", "main-2"].map(Into::into).into();
-        assert_eq!(free_name("main", &there), "main-3");
-        assert_eq!(free_name("spare", &there), "spare");
+    fn a_taken_name_gets_a_number() {
+        let existing: BTreeSet<String> = ["main", "main-2"].map(Into::into).into();
+        assert_eq!(free_name("main", &existing), "main-3");
+        assert_eq!(free_name("spare", &existing), "spare");
     }
 }

@@ -1,7 +1,6 @@
-//! `alight up ROLE`: the processes of one machine, started in order, started again when they end, stopped in order.
+//! `alight up ROLE`: supervises the processes of one machine: starts them in order, restarts them, stops them in order.
 
 use std::collections::VecDeque;
-use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -12,35 +11,37 @@ use node::Shutdown;
 use tokio::process::Command;
 use tokio::time::Instant;
 
-use crate::children::{Children, End, News};
-use crate::neighbours::{Memory, Neighbours, Post};
-use crate::services::{self, Service};
+use crate::children::{ChildEvent, Children, Exit};
+use crate::peers::{LandingMarkerFile, Peers, Slot};
+use crate::runtime::runtime;
+use crate::services::Service;
 use crate::site::{Job, Role, Site};
+use crate::terminal::print;
 
-/// What is started.
+/// The arguments of `alight up`.
 #[derive(Args, Clone)]
 pub(crate) struct UpArgs {
-    /// What this machine is for.
+    /// Role of this machine.
     #[arg(value_enum)]
     role: Role,
-    /// The site: what runs where (TOML); `docs/deploy.md` explains it.
+    /// The site: which processes run on which machine (TOML, `docs/deploy.md`).
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Print what would be run, and run nothing.
+    /// Print the processes without starting them.
     #[arg(long)]
     dry_run: bool,
 }
 
-/// Pause before a process is started again; doubled each time it ends soon.
-const FIRST_PAUSE: Duration = Duration::from_millis(500);
-const LONGEST_PAUSE: Duration = Duration::from_secs(8);
-/// So many ends within this time, and a process is given up.
-const MOST_ENDS: usize = 6;
+/// Pause before a process is restarted; doubled with each further exit within [`PERIOD`].
+const MIN_PAUSE: Duration = Duration::from_millis(500);
+const MAX_PAUSE: Duration = Duration::from_secs(8);
+/// A process that exits this many times within [`PERIOD`] is given up.
+const MAX_EXITS: usize = 6;
 const PERIOD: Duration = Duration::from_secs(60);
-/// The exit status of a process that was asked for something impossible: starting it again changes nothing.
+/// The exit status for an invalid configuration, with which a restart is useless.
 const WRONG_USE: i32 = 2;
 
-/// Runs a role until it is asked to stop, or until everything has been given up.
+/// Runs a role until it is asked to stop, or until all processes have been given up.
 pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
     let site = Site::read(&args.config)?;
     let jobs = site.jobs(args.role)?;
@@ -51,18 +52,21 @@ pub(crate) fn run(args: &UpArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     node::start_logging("warn");
-    services::runtime()?.block_on(supervise(&site, args.role, jobs))
+    runtime()?.block_on(supervise(&site, args.role, jobs))
 }
 
-/// A line for whoever watches; when nobody does, it is lost.
+/// Prints a line. A failure is ignored: the supervisor continues without a terminal.
 fn say(line: &str) {
-    drop(writeln!(std::io::stdout(), "{line}"));
+    drop(print(line));
 }
 
-/// The command line that does the same.
+/// The equivalent command line.
 fn by_hand(job: &Job) -> String {
-    let environment: Vec<_> =
-        job.environment().into_iter().map(|(name, value)| format!("{name}={value}")).collect();
+    let environment = job.network.environment();
+    let environment: Vec<_> = environment
+        .iter()
+        .map(|(name, value)| format!("{name}={}", value.to_string_lossy()))
+        .collect();
     let arguments = arguments(job).into_iter().map(|argument| {
         let plain = |c: char| c.is_ascii_alphanumeric() || "-_./:,".contains(c);
         if argument.chars().all(plain) { argument } else { format!("'{argument}'") }
@@ -84,151 +88,150 @@ fn arguments(job: &Job) -> Vec<String> {
 }
 
 /// A process and its history.
-struct Watched {
+struct Supervised {
     job: Job,
-    /// Its process number, once it was started.
+    /// Its process number, once started.
     pid: i32,
-    ends: VecDeque<Instant>,
+    exits: VecDeque<Instant>,
     state: State,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum State {
     Running,
-    /// To be started again at this time.
+    /// To be restarted at this time.
     Waiting(Instant),
-    /// A detector that was asked to stop: not to be started while another one at its post stands in for it.
-    StoodDown(Post),
+    /// A detector that was stopped in favour of another one in its slot, and is restarted when that one is gone.
+    Replaced(Slot),
     GivenUp,
 }
 
-impl Watched {
+impl Supervised {
     fn new(job: Job) -> Self {
-        Self { job, pid: 0, ends: VecDeque::new(), state: State::Running }
+        Self { job, pid: 0, exits: VecDeque::new(), state: State::Running }
     }
 
-    /// What becomes of a detector that has ended in good order because another one was swapped in for it, and what is
-    /// said about it; `None` for any other process and any other end.
-    fn stands_down(&mut self, end: &End, neighbours: &Neighbours, own: &[i32]) -> Option<String> {
-        let post = neighbours.post_of(self.pid).filter(|_| end.status == Some(0))?;
-        let other = neighbours.stand_in(&post, own)?;
-        self.state = State::StoodDown(post);
+    /// Handles the regular exit of a detector for which another one was swapped in; returns the message to show, `None`
+    /// for any other process and any other exit.
+    fn on_replaced(&mut self, exit: &Exit, peers: &Peers, own: &[i32]) -> Option<String> {
+        let slot = peers.slot_of(self.pid).filter(|_| exit.status == Some(0))?;
+        let other = peers.replacement(&slot, own)?;
+        self.state = State::Replaced(slot);
         let name = &self.job.name;
         Some(format!(
-            "{name}: was asked to stop, and the detector `{other}` stands in for it; it is started again when that has gone"
+            "{name}: stopped and replaced by the detector `{other}`; restarted when that one is gone"
         ))
     }
 
-    /// What becomes of a process that has ended now, and what is said about it.
-    fn ended(&mut self, end: &End, now: Instant) -> String {
-        self.ends.push_back(now);
-        self.ends.retain(|end| now.duration_since(*end) <= PERIOD);
+    /// Handles the exit of a process; returns the message to show.
+    fn on_exit(&mut self, exit: &Exit, now: Instant) -> String {
+        self.exits.push_back(now);
+        self.exits.retain(|exit| now.duration_since(*exit) <= PERIOD);
         let name = &self.job.name;
-        if end.status == Some(WRONG_USE) {
+        if exit.status == Some(WRONG_USE) {
             self.state = State::GivenUp;
             return format!(
-                "{name}: it cannot run as it is configured ({end}); given up. Its last words above say what to change; then start `alight up` again"
+                "{name}: cannot run with its configuration ({exit}); given up. See its stderr above, then restart `alight up`"
             );
         }
-        if self.ends.len() >= MOST_ENDS {
+        if self.exits.len() >= MAX_EXITS {
             self.state = State::GivenUp;
             return format!(
-                "{name}: ended {MOST_ENDS} times within {} s, at last with {end}; given up. Its last words above say why; the others go on without it",
+                "{name}: exited {MAX_EXITS} times within {} s, last with {exit}; given up. See its stderr above; the others continue without it",
                 PERIOD.as_secs()
             );
         }
-        let doublings = u32::try_from(self.ends.len()).unwrap_or(u32::MAX).saturating_sub(1);
-        let pause = (FIRST_PAUSE * 2_u32.saturating_pow(doublings)).min(LONGEST_PAUSE);
+        let doublings = u32::try_from(self.exits.len()).unwrap_or(u32::MAX).saturating_sub(1);
+        let pause = (MIN_PAUSE * 2_u32.saturating_pow(doublings)).min(MAX_PAUSE);
         self.state = State::Waiting(now + pause);
-        format!("{name}: ended with {end}; again in {} s", pause.as_secs_f64())
+        format!("{name}: exited with {exit}; restarting in {} s", pause.as_secs_f64())
     }
 }
 
 async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<ExitCode> {
     let shutdown = Shutdown::on_signals()?;
-    let memory = Memory::of(&site.instance(role));
-    let mut neighbours = neighbours(site, role, &jobs, &memory).await?;
+    let marker_file = LandingMarkerFile::for_supervisor(&site.instance(role));
+    let mut peers = follow_peers(site, role, &jobs, &marker_file).await?;
     let mut children = Children::new();
-    let mut watched: Vec<Watched> = jobs.into_iter().map(Watched::new).collect();
-    // After a supervisor that was killed the landing goes on.
-    let interrupted = memory.landing();
+    let mut supervised: Vec<Supervised> = jobs.into_iter().map(Supervised::new).collect();
+    // A supervisor that was killed during a landing left its marker file.
+    let interrupted = marker_file.landing();
     if interrupted {
-        say("a landing was under way a moment ago; it is taken up");
+        say("a landing was interrupted a moment ago; resuming it");
     }
-    for (index, first) in watched.iter_mut().enumerate() {
+    for (index, first) in supervised.iter_mut().enumerate() {
         let is_controller = first.job.service == Some(Service::Controller);
         let start_as = (interrupted && is_controller).then_some("resume");
         first.pid = start(&mut children, index, &first.job, start_as, site)?;
     }
-    let everything_given_up =
-        watch(&mut children, &mut watched, &mut neighbours, site, shutdown).await?;
+    let all_given_up = watch(&mut children, &mut supervised, &mut peers, site, shutdown).await?;
     say("stopping");
-    // The last one first: whoever steers stops steering while there still is somebody to hear it.
-    for (index, stopped) in watched.iter().enumerate().rev() {
-        children.stop_one(&index, |news| tell(&watched, news)).await;
+    // In reverse order: the controller stops while its peers can still receive its last messages.
+    for (index, stopped) in supervised.iter().enumerate().rev() {
+        children.stop_one(&index, |event| show(&supervised, event)).await;
         if stopped.state == State::Running {
             say(&format!("{}: stopped", stopped.job.name));
         }
     }
-    // Who stops in good order does not want it to be taken up by the next one; what is still heard must not be noted after.
-    neighbours.close().await;
-    memory.note(false);
-    Ok(ExitCode::from(u8::from(everything_given_up)))
+    // After a regular stop the landing is not resumed. The peers are closed first, as they write the marker file too.
+    peers.close().await;
+    marker_file.note(false);
+    Ok(ExitCode::from(u8::from(all_given_up)))
 }
 
-/// Whoever must be heard so that the processes are started again rightly.
-async fn neighbours(
+/// Follows the peers on which restarts depend.
+async fn follow_peers(
     site: &Site,
     role: Role,
     jobs: &[Job],
-    memory: &Memory,
-) -> anyhow::Result<Neighbours> {
-    let of = |service| jobs.iter().find(|job| job.service == Some(service));
-    // The memory is that of who steers.
-    let (key, memory) = match (of(Service::Controller), of(Service::Detector)) {
-        (Some(controller), _) => (&controller.key, memory.clone()),
-        (None, Some(detector)) => (&detector.key, Memory::default()),
-        (None, None) => return Ok(Neighbours::none()),
+    marker_file: &LandingMarkerFile,
+) -> anyhow::Result<Peers> {
+    let job_of = |service| jobs.iter().find(|job| job.service == Some(service));
+    // Only the supervisor of the controller keeps the marker file.
+    let (key, marker_file) = match (job_of(Service::Controller), job_of(Service::Detector)) {
+        (Some(controller), _) => (&controller.key, marker_file.clone()),
+        (None, Some(detector)) => (&detector.key, LandingMarkerFile::default()),
+        (None, None) => return Ok(Peers::none()),
     };
-    Neighbours::follow(&site.network(role), key, memory).await
+    Peers::follow(&site.network(role), key, marker_file).await
 }
 
-/// Starts again what ends, until the end is asked for (false) or nothing is left to be started (true).
+/// Restarts processes that exit; returns false on a shutdown request, true when all processes are given up.
 async fn watch(
     children: &mut Children<usize>,
-    watched: &mut [Watched],
-    neighbours: &mut Neighbours,
+    supervised: &mut [Supervised],
+    peers: &mut Peers,
     site: &Site,
     shutdown: Shutdown,
 ) -> anyhow::Result<bool> {
     loop {
-        if watched.iter().all(|w| w.state == State::GivenUp) {
+        if supervised.iter().all(|s| s.state == State::GivenUp) {
             return Ok(true);
         }
-        let due = watched.iter().enumerate().filter_map(|(index, w)| match w.state {
+        let due = supervised.iter().enumerate().filter_map(|(index, s)| match s.state {
             State::Waiting(at) => Some((at, index)),
-            State::Running | State::StoodDown(_) | State::GivenUp => None,
+            State::Running | State::Replaced(_) | State::GivenUp => None,
         });
         let next = due.min();
         let next_start = tokio::time::sleep_until(next.map_or_else(far_away, |(at, _)| at));
         tokio::select! {
             () = shutdown.requested() => return Ok(false),
-            Some(news) = children.next() => {
-                tell(watched, &news);
-                if let News::Ended(index, end) = news {
-                    children.forget(&index);
-                    let own = pids(watched);
-                    if let Some(ended) = watched.get_mut(index) {
-                        let said = ended.stands_down(&end, neighbours, &own);
-                        say(&said.unwrap_or_else(|| ended.ended(&end, Instant::now())));
+            Some(event) = children.next() => {
+                show(supervised, &event);
+                if let ChildEvent::Exited(index, exit) = event {
+                    children.remove(&index);
+                    let own = pids(supervised);
+                    if let Some(exited) = supervised.get_mut(index) {
+                        let message = exited.on_replaced(&exit, peers, &own);
+                        say(&message.unwrap_or_else(|| exited.on_exit(&exit, Instant::now())));
                     }
                 }
             }
-            () = neighbours.changed() => relieve(watched, neighbours),
+            () = peers.changed() => restart_unreplaced(supervised, peers),
             () = next_start => {
                 let Some((_, index)) = next else { continue };
-                let Some(again) = watched.get_mut(index) else { continue };
-                let start_as = start_of(&again.job, neighbours.landing());
+                let Some(again) = supervised.get_mut(index) else { continue };
+                let start_as = start_mode(&again.job, peers.landing());
                 again.pid = start(children, index, &again.job, start_as, site)?;
                 again.state = State::Running;
             }
@@ -236,26 +239,26 @@ async fn watch(
     }
 }
 
-fn pids(watched: &[Watched]) -> Vec<i32> {
-    watched.iter().map(|watched| watched.pid).collect()
+fn pids(supervised: &[Supervised]) -> Vec<i32> {
+    supervised.iter().map(|s| s.pid).collect()
 }
 
-/// Has the detectors that stood down started again for which nobody stands in any more.
-fn relieve(watched: &mut [Watched], neighbours: &Neighbours) {
-    let own = pids(watched);
-    for down in watched {
-        if let State::StoodDown(post) = &down.state
-            && neighbours.stand_in(post, &own).is_none()
+/// Restarts the replaced detectors whose replacement is gone.
+fn restart_unreplaced(supervised: &mut [Supervised], peers: &Peers) {
+    let own = pids(supervised);
+    for replaced in supervised {
+        if let State::Replaced(slot) = &replaced.state
+            && peers.replacement(slot, &own).is_none()
         {
-            say(&format!("{}: nobody stands in for it any more; again at once", down.job.name));
-            down.state = State::Waiting(Instant::now());
+            say(&format!("{}: its replacement is gone; restarting", replaced.job.name));
+            replaced.state = State::Waiting(Instant::now());
         }
     }
 }
 
-/// How a controller begins when it is started again. It never takes off a second time, and it takes a landing up only
-/// if there was one: a vehicle that is flown in GUIDED by somebody else is not landed.
-fn start_of(job: &Job, landing: bool) -> Option<&'static str> {
+/// The start mode of a restarted controller. It never takes off a second time, and it resumes only a landing that was
+/// under way: a vehicle that somebody else flies in GUIDED is not landed.
+fn start_mode(job: &Job, landing: bool) -> Option<&'static str> {
     let is_controller = job.service == Some(Service::Controller);
     is_controller.then_some(if landing { "resume" } else { "command" })
 }
@@ -264,12 +267,12 @@ fn far_away() -> Instant {
     Instant::now() + Duration::from_secs(3600)
 }
 
-/// Shows what a child says.
-fn tell(watched: &[Watched], news: &News<usize>) {
-    if let News::Said(index, line) = news
-        && let Some(speaker) = watched.get(*index)
+/// Shows an output line of a child.
+fn show(supervised: &[Supervised], event: &ChildEvent<usize>) {
+    if let ChildEvent::Line(index, line) = event
+        && let Some(child) = supervised.get(*index)
     {
-        say(&format!("{}: {line}", speaker.job.name));
+        say(&format!("{}: {line}", child.job.name));
     }
 }
 
@@ -280,11 +283,11 @@ fn start(
     start_as: Option<&str>,
     site: &Site,
 ) -> anyhow::Result<i32> {
-    let mut words = arguments(job);
+    let mut command_line = arguments(job);
     if let Some(start) = start_as {
-        words.extend(["--set".to_owned(), format!("start=\"{start}\"")]);
+        command_line.extend(["--set".to_owned(), format!("start=\"{start}\"")]);
     }
-    let (program, rest) = words.split_first().context("an empty command")?;
+    let (program, rest) = command_line.split_first().context("an empty command")?;
     let own = program == "alight";
     let file = if own {
         std::env::current_exe().context("finding this program's own file")?
@@ -292,15 +295,15 @@ fn start(
         PathBuf::from(program)
     };
     let mut command = Command::new(file);
-    command.args(rest).envs(job.environment()).current_dir(&site.folder);
-    // Ctrl-C in a terminal is for the supervisor, which stops the others in order.
+    command.args(rest).envs(job.network.environment()).current_dir(&site.folder);
+    // Ctrl-C in a terminal goes to the supervisor only, which stops its processes in order.
     command.process_group(0);
     if own {
         command.arg("--stop-with-parent").arg(std::process::id().to_string());
     }
     let pid = children.spawn(index, command, &job.name)?;
-    let as_what = start_as.map_or_else(String::new, |start| format!(", start = \"{start}\""));
-    say(&format!("{}: started as process {pid}{as_what}", job.name));
+    let mode = start_as.map_or_else(String::new, |start| format!(", start = \"{start}\""));
+    say(&format!("{}: started as process {pid}{mode}", job.name));
     Ok(pid)
 }
 
@@ -308,7 +311,7 @@ fn start(
 mod tests {
     use super::*;
 
-    fn watched() -> Watched {
+    fn supervised() -> Supervised {
         let job = Job {
             name: "detector".to_owned(),
             service: Some(Service::Detector),
@@ -317,25 +320,25 @@ mod tests {
             key: "detector".to_owned(),
             layers: node::Layers::default(),
         };
-        Watched::new(job)
+        Supervised::new(job)
     }
 
-    fn failure(status: i32) -> End {
-        End { words: format!("exit status: {status}"), status: Some(status) }
+    fn failure(status: i32) -> Exit {
+        Exit { words: format!("exit status: {status}"), status: Some(status) }
     }
 
     #[test]
-    fn what_keeps_ending_is_started_ever_later_and_then_given_up() {
-        let mut watched = watched();
+    fn repeated_exits_delay_the_restart_and_then_give_up() {
+        let mut process = supervised();
         let mut now = Instant::now();
         let mut pauses = Vec::new();
-        while watched.state != State::GivenUp {
-            let said = watched.ended(&failure(1), now);
-            if let State::Waiting(at) = watched.state {
+        while process.state != State::GivenUp {
+            let message = process.on_exit(&failure(1), now);
+            if let State::Waiting(at) = process.state {
                 pauses.push(at - now);
                 now = at;
             } else {
-                assert!(said.contains("given up"), "{said}");
+                assert!(message.contains("given up"), "{message}");
             }
         }
         let half_seconds: Vec<_> = pauses.iter().map(|p| p.as_millis() / 500).collect();
@@ -343,21 +346,21 @@ mod tests {
     }
 
     #[test]
-    fn what_ends_now_and_then_is_started_at_once() {
-        let mut watched = watched();
+    fn rare_exits_do_not_delay_the_restart() {
+        let mut process = supervised();
         let mut now = Instant::now();
         for _ in 0..20 {
-            watched.ended(&failure(1), now);
-            assert_eq!(watched.state, State::Waiting(now + FIRST_PAUSE));
-            now += PERIOD + FIRST_PAUSE;
+            process.on_exit(&failure(1), now);
+            assert_eq!(process.state, State::Waiting(now + MIN_PAUSE));
+            now += PERIOD + MIN_PAUSE;
         }
     }
 
     #[test]
-    fn what_cannot_run_is_given_up_at_once() {
-        let mut watched = watched();
-        let said = watched.ended(&failure(WRONG_USE), Instant::now());
-        assert_eq!(watched.state, State::GivenUp);
-        assert!(said.contains("cannot run"), "{said}");
+    fn an_invalid_configuration_gives_up_at_once() {
+        let mut process = supervised();
+        let message = process.on_exit(&failure(WRONG_USE), Instant::now());
+        assert_eq!(process.state, State::GivenUp);
+        assert!(message.contains("cannot run"), "{message}");
     }
 }

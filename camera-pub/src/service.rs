@@ -29,7 +29,7 @@ const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 /// # Errors
 /// When there is no image to publish, the program cannot be started or exits, or another camera has this name.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
-    node.ensure_alone(config.instance()).await?;
+    node.claim_unique_name(config.instance()).await?;
     let found = {
         let config = config.clone();
         tokio::task::spawn_blocking(move || find(&config)).await??

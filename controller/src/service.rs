@@ -30,7 +30,7 @@ const LONGEST_PACKET: usize = 280;
 /// # Errors
 /// When another controller is there, the link cannot be opened, or the network fails.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
-    node.ensure_alone("*").await?;
+    node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
     let mut link = Link::open(address).await.context("opening the link to the autopilot")?;
     let mut flight = Flight::new(config, node.shared_health())?;

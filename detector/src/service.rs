@@ -41,7 +41,7 @@ const FAREWELL: Duration = Duration::from_millis(100);
 /// # Errors
 /// When another detector has the same name, or the network fails.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
-    node.ensure_alone(&config.id).await?;
+    node.claim_unique_name(&config.id).await?;
     let camera = Arc::new(Mutex::new(None));
     let infos = node.subscriber(topic::CAMERA_INFO, &[&config.camera]).await?;
     let commands = node.commands(topic::DETECTOR_COMMAND, &[&config.id]).await?;

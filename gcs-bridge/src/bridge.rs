@@ -32,7 +32,7 @@ const GROUND_SILENCE_NS: i64 = 10_000_000_000;
 /// that is not there is no error.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     let address: Address = config.ground.parse()?;
-    node.ensure_alone(&node.identity().instance).await?;
+    node.claim_unique_name(&node.identity().instance).await?;
     let mut ground = Link::open(address).await.context("opening the link to the ground station")?;
     let from_autopilot = node.subscriber(topic::FROM_AUTOPILOT, &[]).await?;
     let to_autopilot = node.publisher(topic::TO_AUTOPILOT, &[]).await?;

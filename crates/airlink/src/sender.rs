@@ -62,7 +62,7 @@ impl AirSender {
         let mut work = Work {
             camera: camera.to_owned(),
             offers: Arc::clone(&offers),
-            second_lane: jpegs.second_lane(node).await?,
+            second_lane: jpegs.second_publisher(node).await?,
             jpegs,
             receipts: node.subscriber(topic::RECEIVED, &[]).await?,
             detections,

@@ -15,15 +15,15 @@ use crate::vehicle::{MavlinkBytes, VehicleState};
 /// How messages of a topic travel.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Delivery {
-    /// A stream: a subscriber sees the newest, older ones are dropped under congestion.
-    Newest,
-    /// A stream that steers the vehicle: as `Newest`, before everything else on the link.
-    NewestFirst,
-    /// A state: as `Newest`, and who comes late gets the last value.
+    /// A stream: under congestion older messages are dropped in favour of the latest.
+    Latest,
+    /// A stream on the control path: as `Latest`, with priority over all other traffic.
+    LatestPriority,
+    /// A state: as `Latest`, and late subscribers get the last value.
     LastValue,
-    /// A dialogue: everything, in order, as long as the bounded queues last.
-    InOrder,
-    /// A question that gets one answer.
+    /// A dialogue: every message in order, within the bounds of the queues.
+    Reliable,
+    /// A request with one reply.
     Query,
 }
 
@@ -106,21 +106,21 @@ const SIMULATOR: &[&str] = &["simulator"];
 
 /// Pixels as they are; the message is the attachment.
 pub const FRAME: Topic<FrameHeader> =
-    Topic::new("camera/{camera}/frame", Delivery::Newest, CAMERAS);
+    Topic::new("camera/{camera}/frame", Delivery::Latest, CAMERAS);
 /// JPEG files, of the whole frame or of parts of it; the message is the attachment.
-pub const JPEG: Topic<FrameHeader> = Topic::new("camera/{camera}/jpeg", Delivery::Newest, CAMERAS);
+pub const JPEG: Topic<FrameHeader> = Topic::new("camera/{camera}/jpeg", Delivery::Latest, CAMERAS);
 /// A camera's calibration and mount.
 pub const CAMERA_INFO: Topic<CameraInfo> =
     Topic::new("camera/{camera}/info", Delivery::LastValue, CAMERAS);
 /// What a detector found.
 pub const DETECTIONS: Topic<Detections> =
-    Topic::new("detector/{detector}/detections", Delivery::NewestFirst, DETECTOR);
+    Topic::new("detector/{detector}/detections", Delivery::LatestPriority, DETECTOR);
 /// That a frame of `camera/{camera}/jpeg` has arrived.
 pub const RECEIVED: Topic<FrameReceipt> =
-    Topic::new("detector/{detector}/received", Delivery::NewestFirst, DETECTOR);
+    Topic::new("detector/{detector}/received", Delivery::LatestPriority, DETECTOR);
 /// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
 pub const DEBUG_IMAGE: Topic<FrameHeader> =
-    Topic::new("detector/{detector}/debug/{image}", Delivery::Newest, DETECTOR);
+    Topic::new("detector/{detector}/debug/{image}", Delivery::Latest, DETECTOR);
 /// What a detector says about itself.
 pub const DETECTOR_INFO: Topic<DetectorInfo> =
     Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR);
@@ -132,10 +132,10 @@ pub const DETECTOR_COMMAND_REPLY: Topic<CommandReply> =
     Topic::new("detector/{detector}/command", Delivery::Query, DETECTOR);
 /// Attitude, position, velocity, mode.
 pub const VEHICLE_STATE: Topic<VehicleState> =
-    Topic::new("vehicle/state", Delivery::NewestFirst, CONTROLLER);
+    Topic::new("vehicle/state", Delivery::LatestPriority, CONTROLLER);
 /// The estimate of the landing point.
 pub const TARGET: Topic<TargetEstimate> =
-    Topic::new("controller/target", Delivery::Newest, CONTROLLER);
+    Topic::new("controller/target", Delivery::Latest, CONTROLLER);
 /// What the controller does and why.
 pub const STATUS: Topic<ControllerStatus> =
     Topic::new("controller/status", Delivery::LastValue, CONTROLLER);
@@ -146,15 +146,15 @@ pub const COMMAND: Topic<ControllerCommand> =
 pub const COMMAND_REPLY: Topic<CommandReply> =
     Topic::new("controller/command", Delivery::Query, CONTROLLER);
 /// The wind, as it really is.
-pub const WIND: Topic<Wind> = Topic::new("wind", Delivery::Newest, SIMULATOR);
+pub const WIND: Topic<Wind> = Topic::new("wind", Delivery::Latest, SIMULATOR);
 /// Where everything really is.
-pub const TRUTH: Topic<Truth> = Topic::new("truth", Delivery::Newest, SIMULATOR);
+pub const TRUTH: Topic<Truth> = Topic::new("truth", Delivery::Latest, SIMULATOR);
 /// Packets from the autopilot.
 pub const FROM_AUTOPILOT: Topic<MavlinkBytes> =
-    Topic::new("mavlink/from-autopilot", Delivery::InOrder, CONTROLLER);
+    Topic::new("mavlink/from-autopilot", Delivery::Reliable, CONTROLLER);
 /// Packets for the autopilot.
 pub const TO_AUTOPILOT: Topic<MavlinkBytes> =
-    Topic::new("mavlink/to-autopilot", Delivery::InOrder, &["gcs-bridge", "simulator"]);
+    Topic::new("mavlink/to-autopilot", Delivery::Reliable, &["gcs-bridge", "simulator"]);
 /// How a service fares.
 pub const HEALTH: Topic<Health> = Topic::new(
     "health/{service}/{instance}",

@@ -2,16 +2,13 @@
 
 use std::sync::OnceLock;
 
-/// A source of time, so that a service can be given another.
-pub type Clock = fn() -> i64;
-
 /// Nanoseconds of the host's monotonic clock.
 pub fn now_ns() -> i64 {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     time.tv_sec.saturating_mul(1_000_000_000).saturating_add(time.tv_nsec)
 }
 
-/// Names the clock of [`now_ns`]: equal names mean that stamps may be compared.
+/// The name of the clock of [`now_ns`]. Stamps of clocks with the same name are comparable.
 pub fn clock_name() -> &'static str {
     static NAME: OnceLock<String> = OnceLock::new();
     NAME.get_or_init(|| {
@@ -23,7 +20,7 @@ pub fn clock_name() -> &'static str {
     })
 }
 
-/// Name of this host.
+/// The name of this host.
 pub fn host_name() -> String {
     rustix::system::uname().nodename().to_string_lossy().into_owned()
 }
@@ -31,7 +28,7 @@ pub fn host_name() -> String {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn time_goes_forward_on_a_named_clock() {
+    fn time_increases_on_a_named_clock() {
         let before = super::now_ns();
         assert!(super::now_ns() >= before && before > 0);
         assert!(super::clock_name().len() > "monotonic/".len());

@@ -1,8 +1,8 @@
 //! Layered configuration: defaults, a user's file, and `key=value` settings.
 //!
 //! Each service ships a TOML file with every key, its default, and a comment with meaning, unit and range. A user's
-//! file and single settings are laid over it. A key that is not among the defaults, a value of another type and a
-//! value out of range are refused with the place it came from, the key, the value and the limit.
+//! file and single settings override it. An unknown key, a value of another type and a value out of range are rejected
+//! with their source, the key, the value and the limit.
 
 use std::fmt::Display;
 use std::ops::RangeInclusive;
@@ -21,21 +21,21 @@ pub trait Settings: DeserializeOwned {
     fn check(&self, check: &mut Check<'_>);
 }
 
-/// What a user lays over the defaults.
+/// The settings of a user over the defaults.
 #[derive(Clone, Debug, Default)]
 pub struct Layers {
     /// A file.
     pub file: Option<PathBuf>,
-    /// Settings `key=value`, with dotted keys and TOML values; the quotes of a string may be left out.
+    /// Settings `key=value` with dotted keys and TOML values; the quotes of a string may be omitted.
     pub set: Vec<String>,
 }
 
-/// Why a configuration was refused.
+/// Why a configuration was rejected.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// A file that cannot be read.
     #[error(
-        "reading the configuration file {path:?}: {cause}; check the path, or leave `--config` out for the defaults"
+        "reading the configuration file {path:?}: {cause}; check the path, or omit `--config` for the defaults"
     )]
     Unreadable {
         /// The file.
@@ -43,7 +43,7 @@ pub enum ConfigError {
         /// The system's reason.
         cause: std::io::Error,
     },
-    /// Text that is no TOML.
+    /// Text that is not TOML.
     #[error("{source_name} is not valid TOML: {cause}")]
     Syntax {
         /// The file or setting.
@@ -67,7 +67,7 @@ pub enum ConfigError {
         /// A similar key, or nothing.
         hint: String,
     },
-    /// A value of a type that the key does not take.
+    /// A value of the wrong type.
     #[error("{source_name}: `{key}` = {value} is {found}, where {wanted} is needed")]
     WrongType {
         /// The file or setting.
@@ -81,8 +81,8 @@ pub enum ConfigError {
         /// The default's type.
         wanted: &'static str,
     },
-    /// A value that the service does not take.
-    #[error("{source_name}: `{key}` = {value} is refused: {limit}")]
+    /// A value that the service rejects.
+    #[error("{source_name}: `{key}` = {value} is invalid: {limit}")]
     Refused {
         /// The file or setting.
         source_name: String,
@@ -95,12 +95,12 @@ pub enum ConfigError {
     },
 }
 
-/// A configuration, and what it was made from.
+/// A configuration as values and as TOML.
 #[derive(Clone, Debug)]
 pub struct Effective<T> {
     /// The values.
     pub settings: T,
-    /// The same as TOML.
+    /// The values as TOML.
     pub table: Table,
 }
 
@@ -129,7 +129,7 @@ impl Layers {
     }
 }
 
-/// A configuration with one more setting `key=value` laid over it.
+/// A configuration with one more setting `key=value`.
 ///
 /// # Errors
 /// As [`Layers::load`].
@@ -142,7 +142,7 @@ pub fn changed<T: Settings + Serialize>(current: &T, setting: &str) -> Result<T,
     Ok(effective(table, &[layer])?.settings)
 }
 
-/// The configuration that layers over a table make.
+/// The configuration that results from layers over a table.
 fn effective<T: Settings>(mut table: Table, layers: &[Layer]) -> Result<Effective<T>, ConfigError> {
     for layer in layers {
         lay_over(&mut table, &layer.table, &layer.name, &mut String::new())?;
@@ -181,7 +181,7 @@ fn setting_layer(text: &str, defaults: &Table) -> Result<Layer, ConfigError> {
     let (key, value) =
         text.split_once('=').ok_or_else(|| ConfigError::Form { text: text.to_owned() })?;
     let (key, value) = (key.trim(), value.trim());
-    // A bare word is a string where the default is one, so that the shell's quotes are enough.
+    // A word without quotes is a string where the default is one.
     let quoted = || parse(&name, &format!("{key} = {}", Value::String(value.to_owned())));
     let default = look_up(defaults, key);
     let default_is_text = matches!(default, Some(Value::String(_)));
@@ -190,7 +190,7 @@ fn setting_layer(text: &str, defaults: &Table) -> Result<Layer, ConfigError> {
             quoted()?
         }
         Ok(table) => table,
-        // A key that does not exist is a worse mistake than its value, and is reported when the layers are joined.
+        // An unknown key is reported when the layers are merged, before its value.
         Err(_) if default_is_text || default.is_none() => quoted()?,
         Err(problem) => return Err(problem),
     };
@@ -226,7 +226,7 @@ fn lay_over(
             (Value::Table(slot), Value::Table(value)) => {
                 lay_over(slot, value, source_name, &mut format!("{key}."))?;
             }
-            // Whole numbers are numbers.
+            // A number may be written without a point.
             (Value::Float(slot), Value::Integer(value)) => *slot = *value as f64,
             (slot, value) if slot.same_type(value) => *slot = value.clone(),
             (slot, value) => {
@@ -262,7 +262,16 @@ fn similar<'a>(keys: impl Iterator<Item = &'a String>, wanted: &str) -> Option<&
         .map(|(_, key)| key)
 }
 
-/// Collects the first value that is out of range, with the layer it came from.
+/// The rule of [`is_name`].
+pub const NAME_RULE: &str = "a name has 1 to 64 letters, digits, `-` and `_`";
+
+/// Whether a text is a name: it becomes a part of topic keys.
+pub fn is_name(text: &str) -> bool {
+    (1..=64).contains(&text.len())
+        && text.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c))
+}
+
+/// Collects the first invalid value, with the layer it came from.
 pub struct Check<'a> {
     table: &'a Table,
     layers: &'a [Layer],
@@ -281,9 +290,9 @@ impl Check<'_> {
         self.holds(key, range.contains(&value), limit);
     }
 
-    /// The number `key` must not be less than the value of another key.
-    pub fn at_least(&mut self, key: &str, value: f64, other: &str, least: f64) {
-        self.holds(key, value >= least, || format!("it must not be less than `{other}` = {least}"));
+    /// The number `key` must be at least the value of another key.
+    pub fn at_least(&mut self, key: &str, value: f64, other: &str, min: f64) {
+        self.holds(key, value >= min, || format!("it must be >= `{other}` ({min})"));
     }
 
     /// The value of `key` must be one of `allowed`.
@@ -293,12 +302,9 @@ impl Check<'_> {
         });
     }
 
-    /// The value of `key` must be a name: letters, digits, `-` and `_`, as it becomes a part of topic keys.
+    /// The value of `key` must be a name ([`is_name`]).
     pub fn name(&mut self, key: &str, value: &str) {
-        let is_name = !value.is_empty()
-            && value.len() <= 64
-            && value.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c));
-        self.holds(key, is_name, || "a name is 1 to 64 letters, digits, `-` and `_`".to_owned());
+        self.holds(key, is_name(value), || NAME_RULE.to_owned());
     }
 
     /// The value of `key` must be accepted by `parse`.
@@ -365,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_lie_over_the_file_and_the_file_over_the_defaults() {
+    fn settings_override_the_file_and_the_file_the_defaults() {
         let camera =
             load(Some("rate_hz = 20\n[lens]\nfocal_px = 900.0"), &["rate_hz=30", "name=left"]);
         let lens = Lens { focal_px: 900.0 };
@@ -373,12 +379,12 @@ mod tests {
     }
 
     #[test]
-    fn a_text_that_looks_like_a_number_stays_a_text() {
+    fn a_string_that_looks_like_a_number_stays_a_string() {
         assert_eq!(load(None, &["name=7"]).unwrap().name, "7");
     }
 
     #[test]
-    fn refusals_name_place_key_value_and_limit() {
+    fn errors_name_source_key_value_and_limit() {
         let check = |file: Option<&str>, set: &[&str], parts: &[&str]| {
             let problem = load(file, set).unwrap_err();
             for part in parts {
@@ -406,7 +412,7 @@ mod tests {
     }
 
     #[test]
-    fn a_setting_is_laid_over_the_configuration_in_use() {
+    fn a_setting_changes_the_configuration_in_use() {
         let camera = load(None, &["rate_hz=30"]).unwrap();
         let changed = |setting| changed(&camera, setting).map_err(|e| e.to_string());
         let left = changed("name=left").unwrap();

@@ -1,8 +1,8 @@
-//! Pixels: written in place into shared memory, read where they lie.
+//! Frames in shared memory, without a copy.
 //!
-//! On one host a frame is never copied between the camera and the detector: the camera borrows a buffer
-//! ([`FramePublisher::loan`]), writes into it and publishes it; a subscriber reads the same memory. When shared
-//! memory cannot be had, the buffer is ordinary memory and Zenoh copies it: slower, never silent.
+//! On one host a frame is never copied between camera and detector: the camera borrows a buffer
+//! ([`FramePublisher::loan`]), writes into it and publishes it; a subscriber reads the same memory. Without shared
+//! memory the buffer is ordinary memory, which Zenoh copies; this is counted.
 
 use std::borrow::Cow;
 use std::ops::{Deref, DerefMut};
@@ -25,22 +25,22 @@ use crate::health::HealthCounters;
 use crate::session::Node;
 use crate::topics::report_refused;
 
-/// Frames the shared memory holds: one being written, one in flight, and one each for two slow readers. Few,
-/// because every subscriber keeps the whole pool mapped and locked.
+/// Capacity of the shared memory pool, in frames: one being written, one in flight, and one each for two slow
+/// readers. Small, because every subscriber keeps the whole pool mapped and locked.
 const FRAMES_IN_POOL: usize = 4;
 
-/// A pool in which there was no room for so long is given up for a new one: a reader that was killed never returns the
-/// frames it had. Longer than any reader keeps a frame.
-const POOL_GIVEN_UP: Duration = Duration::from_secs(1);
-/// So many frames must have been refused as well, as few are asked for at a low rate.
-const REFUSALS_BEFORE_GIVEN_UP: u32 = 4;
-/// New pools a publisher makes at most, for the readers that never return anything: readers keep the old ones mapped.
-const MOST_NEW_POOLS: u32 = 3;
+/// A pool that is exhausted for this time is replaced: a reader that was killed never returns its frames. Longer than
+/// any reader keeps a frame.
+const POOL_EXHAUSTED_TIMEOUT: Duration = Duration::from_secs(1);
+/// Minimum failed allocations, besides, before a pool is replaced: at a low frame rate the time alone says little.
+const MIN_FAILED_ALLOCATIONS: u32 = 4;
+/// Maximum number of replacement pools of a publisher, as readers keep the old ones mapped.
+const MAX_NEW_POOLS: u32 = 3;
 
-/// Over the air a priority is a connection (`zenoh-config/README.md`): frames have two.
-const FIRST_LANE: Priority = Priority::DataLow;
-const SECOND_LANE: Priority = Priority::Background;
-const LANES: usize = 2;
+/// On the air link each priority has a connection of its own (`zenoh-config/README.md`); frames use these two.
+const FIRST_PRIORITY: Priority = Priority::DataLow;
+const SECOND_PRIORITY: Priority = Priority::Background;
+const FRAME_CONNECTIONS: usize = 2;
 
 /// Publishes frames on one key.
 pub struct FramePublisher {
@@ -53,11 +53,11 @@ pub struct FramePublisher {
 struct Pool {
     provider: ShmProvider<PosixShmProviderBackend>,
     bytes: usize,
-    /// Since when there was no room, and how often it was asked for.
-    full_since: Option<Instant>,
-    refusals: u32,
-    /// How many were given up before it.
-    predecessors: u32,
+    /// Since when allocations fail, and how many have failed.
+    exhausted_since: Option<Instant>,
+    failed_allocations: u32,
+    /// Number of pools that were replaced before.
+    replaced_pools: u32,
 }
 
 /// A buffer for one frame.
@@ -75,14 +75,14 @@ pub struct Frame {
     payload: ZBytes,
 }
 
-/// Receives frames; always the newest.
+/// Receives frames, always the latest.
 pub struct FrameSubscriber {
     subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
     health: Arc<HealthCounters>,
 }
 
 impl Node {
-    /// A publisher of frames of at most `largest_frame_bytes`; with 0 it has no shared memory of its own.
+    /// A publisher of frames of at most `max_frame_bytes`; with 0 it has no shared memory.
     ///
     /// # Errors
     /// When the session is closed or a name makes no key.
@@ -90,15 +90,15 @@ impl Node {
         &self,
         topic: Topic<FrameHeader>,
         names: &[&str],
-        largest_frame_bytes: usize,
+        max_frame_bytes: usize,
     ) -> anyhow::Result<FramePublisher> {
         let key = topic.key(names);
-        debug_assert_eq!(topic.delivery(), Delivery::Newest);
-        let publisher = self.declare_frames(key, FIRST_LANE).await?;
-        if largest_frame_bytes == 0 {
+        debug_assert_eq!(topic.delivery(), Delivery::Latest);
+        let publisher = self.declare_frames(key, FIRST_PRIORITY).await?;
+        if max_frame_bytes == 0 {
             return Ok(FramePublisher { publisher, pool: None, health: self.shared_health() });
         }
-        let pool_bytes = FRAMES_IN_POOL * largest_frame_bytes.next_multiple_of(4096) + 4096;
+        let pool_bytes = FRAMES_IN_POOL * max_frame_bytes.next_multiple_of(4096) + 4096;
         let pool = Pool::new(pool_bytes).map(Mutex::new);
         Ok(FramePublisher { publisher, pool, health: self.shared_health() })
     }
@@ -106,12 +106,12 @@ impl Node {
     async fn declare_frames(
         &self,
         key: String,
-        lane: Priority,
+        priority: Priority,
     ) -> anyhow::Result<zenoh::pubsub::Publisher<'static>> {
         self.session
             .declare_publisher(key.clone())
-            .priority(lane)
-            // Drop would lose large frames almost entirely on a lossy link; this sheds whole frames.
+            .priority(priority)
+            // `Drop` would lose almost all large frames on a lossy link; this drops whole frames.
             .congestion_control(CongestionControl::BlockFirst)
             .await
             .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))
@@ -127,12 +127,12 @@ impl Node {
         names: &[&str],
     ) -> anyhow::Result<FrameSubscriber> {
         let key = topic.key(names);
-        // Over the air frames come by two lanes, and an older one may be the later: it must not push out the newer one.
-        let waiting = if key == topic::JPEG.key(names) { LANES } else { 1 };
+        // On the air link an older frame can arrive after a newer one and must not displace it.
+        let capacity = if key == topic::JPEG.key(names) { FRAME_CONNECTIONS } else { 1 };
         let subscriber = self
             .session
             .declare_subscriber(key.clone())
-            .with(RingChannel::new(waiting))
+            .with(RingChannel::new(capacity))
             .await
             .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
         Ok(FrameSubscriber { subscriber, health: self.shared_health() })
@@ -142,11 +142,15 @@ impl Node {
 impl Pool {
     fn new(bytes: usize) -> Option<Self> {
         match ShmProviderBuilder::default_backend(bytes).wait() {
-            Ok(provider) => {
-                Some(Self { provider, bytes, full_since: None, refusals: 0, predecessors: 0 })
-            }
+            Ok(provider) => Some(Self {
+                provider,
+                bytes,
+                exhausted_since: None,
+                failed_allocations: 0,
+                replaced_pools: 0,
+            }),
             Err(cause) => {
-                tracing::warn!(bytes, %cause, "No shared memory: frames are copied instead");
+                tracing::warn!(bytes, %cause, "No shared memory; frames are copied instead");
                 None
             }
         }
@@ -155,30 +159,30 @@ impl Pool {
     fn alloc(&mut self, len: usize) -> Option<ZShmMut> {
         let buffer = self.provider.alloc(len).with_policy::<GarbageCollect>().wait().ok();
         if buffer.is_some() || len > self.bytes {
-            (self.full_since, self.refusals) = (None, 0);
+            (self.exhausted_since, self.failed_allocations) = (None, 0);
             return buffer;
         }
-        let since = *self.full_since.get_or_insert_with(Instant::now);
-        self.refusals = self.refusals.saturating_add(1);
-        let is_given_up =
-            since.elapsed() >= POOL_GIVEN_UP && self.refusals > REFUSALS_BEFORE_GIVEN_UP;
-        if !is_given_up || self.predecessors == MOST_NEW_POOLS || !self.may_have_successor() {
+        let since = *self.exhausted_since.get_or_insert_with(Instant::now);
+        self.failed_allocations = self.failed_allocations.saturating_add(1);
+        let is_abandoned = since.elapsed() >= POOL_EXHAUSTED_TIMEOUT
+            && self.failed_allocations > MIN_FAILED_ALLOCATIONS;
+        if !is_abandoned || self.replaced_pools == MAX_NEW_POOLS || !self.is_replaceable() {
             return None;
         }
-        tracing::info!(
-            "Readers that are gone keep all frames in shared memory: there is new memory"
-        );
-        let predecessors = self.predecessors + 1;
-        // Tried no more often than it is needed, also when it cannot be had.
-        (self.full_since, self.refusals, self.predecessors) = (None, 0, predecessors);
-        *self = Self { predecessors, ..Self::new(self.bytes)? };
+        tracing::info!("Shared-memory pool exhausted by dead readers; allocated a new pool");
+        let replaced_pools = self.replaced_pools + 1;
+        // Counted also when there is no memory for a new pool, so that it is not tried again at once.
+        (self.exhausted_since, self.failed_allocations) = (None, 0);
+        self.replaced_pools = replaced_pools;
+        *self = Self { replaced_pools, ..Self::new(self.bytes)? };
         self.provider.alloc(len).with_policy::<GarbageCollect>().wait().ok()
     }
 
-    /// Whether readers may lock one more pool beside those they keep, and as much again for what else they lock. One that
-    /// may not would get no frames at all; without a new pool they are copied. Readers are taken to have this process' limit.
-    fn may_have_successor(&self) -> bool {
-        let pools = u64::from(self.predecessors) + 2;
+    /// Whether readers may lock one more pool beside those they keep, and as much again for other locked memory: a
+    /// reader beyond its limit would get no frames, while without a new pool they are copied. Readers are assumed to
+    /// have the limit of this process.
+    fn is_replaceable(&self) -> bool {
+        let pools = u64::from(self.replaced_pools) + 2;
         let needed = (pools + 1).saturating_mul(self.bytes as u64);
         getrlimit(Resource::Memlock).current.is_none_or(|limit| limit >= needed)
     }
@@ -213,24 +217,24 @@ impl FramePublisher {
             }),
             Err(cause) => {
                 if self.health.failed("publish frame") {
-                    tracing::warn!(%cause, "A frame could not be published");
+                    tracing::warn!(%cause, "Frame not published");
                 }
             }
         }
     }
 
-    /// The same key on the second connection that frames have over the air: what is published there does not wait
-    /// behind a frame that the first one has not delivered yet. It has no shared memory.
+    /// A publisher on the same key that uses the second connection for frames on the air link: its frames do not wait
+    /// behind one that the first connection has not delivered yet. It has no shared memory.
     ///
     /// # Errors
     /// When the session is closed.
-    pub async fn second_lane(&self, node: &Node) -> anyhow::Result<Self> {
+    pub async fn second_publisher(&self, node: &Node) -> anyhow::Result<Self> {
         let key = self.publisher.key_expr().as_str().to_owned();
-        let publisher = node.declare_frames(key, SECOND_LANE).await?;
+        let publisher = node.declare_frames(key, SECOND_PRIORITY).await?;
         Ok(Self { publisher, pool: None, health: Arc::clone(&self.health) })
     }
 
-    /// True while somebody subscribes: what is costly to make is made only then.
+    /// Whether there is a subscriber; images that are expensive to make are made only then.
     pub async fn has_subscribers(&self) -> bool {
         self.publisher.matching_status().await.is_ok_and(|status| status.matching())
     }
@@ -263,8 +267,8 @@ impl Frame {
 }
 
 impl FrameSubscriber {
-    /// The newest frame, of frames over the air one of the newest two; `None` once the session is closed. A frame whose header cannot be read, or whose bytes do
-    /// not fit its header, is counted and logged once.
+    /// The latest frame, or one of the latest two on the air link; `None` once the session is closed. A frame with an
+    /// invalid header, or with a length that does not match its header, is counted, and logged once.
     pub async fn next(&self) -> Option<Frame> {
         loop {
             let sample = self.subscriber.recv_async().await.ok()?;
@@ -274,7 +278,7 @@ impl FrameSubscriber {
         }
     }
 
-    /// A frame that has come already; `None` when none waits.
+    /// A frame that has arrived already, without waiting.
     pub fn waiting(&self) -> Option<Frame> {
         let sample = self.subscriber.try_recv().ok().flatten()?;
         self.frame(&sample)
@@ -287,12 +291,12 @@ impl FrameSubscriber {
                 report_refused(&self.health, sample.key_expr().as_str(), &problem);
                 None
             }
-            Ok(header) if !fits(&header, sample.payload().len()) => {
+            Ok(header) if !has_length(&header, sample.payload().len()) => {
                 if self.health.failed("frame of the wrong length") {
                     tracing::warn!(
                         ?header,
                         len = sample.payload().len(),
-                        "A frame was refused: its bytes do not fit its header"
+                        "Frame rejected: its length does not match its header"
                     );
                 }
                 None
@@ -302,7 +306,7 @@ impl FrameSubscriber {
     }
 }
 
-fn fits(header: &FrameHeader, len: usize) -> bool {
+fn has_length(header: &FrameHeader, len: usize) -> bool {
     let pixels = u64::from(header.width) * u64::from(header.height);
     match header.format.bytes_per_pixel() {
         Some(bytes) => pixels > 0 && pixels.checked_mul(bytes as u64) == Some(len as u64),

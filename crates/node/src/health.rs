@@ -1,4 +1,4 @@
-//! A service's counters, and the health it publishes from them once a second.
+//! A service's counters, published once a second as its health.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -6,13 +6,14 @@ use std::time::Duration;
 
 use messages::{Count, Health, Latency, Rate};
 
-use crate::clock::{clock_name, now_ns};
-use crate::session::Identity;
+use crate::clock::{clock_name, host_name, now_ns};
+use crate::identity::Identity;
+use crate::stats;
 
-/// Latencies kept for the percentiles.
+/// Number of recent latencies over which percentiles are taken.
 const LATENCIES_KEPT: usize = 512;
 
-/// Counters that any thread of a service may raise.
+/// Counters of a service, for all of its threads.
 #[derive(Debug, Default)]
 pub struct HealthCounters {
     inner: Mutex<Counters>,
@@ -28,12 +29,12 @@ struct Counters {
 }
 
 impl HealthCounters {
-    /// Something happened once more.
+    /// Counts an event.
     pub fn count(&self, name: &'static str) {
         self.lock().rates.entry(name).or_default().0 += 1;
     }
 
-    /// Something took this long.
+    /// Records a latency.
     pub fn latency(&self, name: &'static str, took: Duration) {
         let mut counters = self.lock();
         let kept = counters.latencies.entry(name).or_default();
@@ -43,7 +44,7 @@ impl HealthCounters {
         kept.push_back(took.as_secs_f64() * 1e3);
     }
 
-    /// Something was dropped.
+    /// Counts a drop.
     pub fn dropped(&self, reason: &str) {
         let mut counters = self.lock();
         match counters.drops.get_mut(reason) {
@@ -52,12 +53,12 @@ impl HealthCounters {
         }
     }
 
-    /// Something failed; true when it is the first failure for this reason, which is the one to log.
+    /// Counts a failure; true for the first one of this reason, which is the one to log.
     pub fn failed(&self, reason: &str) -> bool {
         self.failed_times(reason, 1)
     }
 
-    /// Something failed so many times; true when these are the first for this reason.
+    /// Counts several failures; true when they are the first of this reason.
     pub fn failed_times(&self, reason: &str, times: u64) -> bool {
         let mut counters = self.lock();
         match counters.errors.get_mut(reason) {
@@ -74,7 +75,7 @@ impl HealthCounters {
         self.lock().latencies.get(name).and_then(percentiles)
     }
 
-    /// The health now.
+    /// The current health.
     pub fn report(&self, identity: &Identity, started_ns: i64) -> Health {
         let now = now_ns();
         let mut counters = self.lock();
@@ -100,7 +101,7 @@ impl HealthCounters {
         Health {
             service: identity.service.to_owned(),
             instance: identity.instance.clone(),
-            host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
+            host: host_name(),
             // All packages of the workspace have one version.
             version: env!("CARGO_PKG_VERSION").to_owned(),
             clock: clock_name().to_owned(),
@@ -115,7 +116,7 @@ impl HealthCounters {
         }
     }
 
-    // A thread that panicked while counting leaves counts that are still counts.
+    // The counts stay valid when a thread panics while counting.
     fn lock(&self) -> MutexGuard<'_, Counters> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -126,16 +127,11 @@ fn counts(counts: &BTreeMap<String, u64>) -> Vec<Count> {
 }
 
 fn percentiles(kept: &VecDeque<f64>) -> Option<[f64; 2]> {
-    let mut sorted: Vec<f64> = kept.iter().copied().collect();
-    sorted.sort_unstable_by(f64::total_cmp);
-    let at = |fraction: f64| {
-        let rank = (fraction * (sorted.len() as f64 - 1.0)).round();
-        sorted.get(rank as usize).copied()
-    };
+    let at = |fraction: f64| stats::quantile(kept.iter().copied(), fraction);
     Some([at(0.5)?, at(0.99)?])
 }
 
-/// Processor time this process has used, user and system, in seconds.
+/// Processor time used by this process (user and system), in seconds.
 fn process_cpu_s() -> f64 {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
@@ -146,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_report_tells_what_was_counted() {
+    fn a_report_has_what_was_counted() {
         let counters = HealthCounters::default();
         for ms in 1..=100 {
             counters.count("frames");

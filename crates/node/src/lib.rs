@@ -1,26 +1,30 @@
-//! What every service needs: configuration, a session, presence, typed topics, health, and an orderly end.
+//! What every service needs: configuration, a session, presence, typed topics, health, and an orderly shutdown.
 //!
-//! This is the only crate that knows Zenoh. It knows no image, no marker and no autopilot.
+//! This is the only crate that uses Zenoh. It knows nothing of images, markers or autopilots.
 //!
-//! Modules in reading order: [`config`] lays a user's settings over the defaults, [`service`] runs a service from
-//! its start to its end, [`network`] says which network it joins, [`session`] is its place there, [`topics`] are its
-//! typed messages, [`frames`] its pixels, [`health`] its counters, [`refusals`] what was not let in, [`clock`] its clock.
+//! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a service from
+//! start to shutdown; [`network`] configures the network, and [`session`] joins it under an [`identity`]; [`topics`]
+//! has typed messages and [`frames`] pixels; [`health`] counts, with [`stats`]; [`denied`] counts what access control
+//! denies; [`clock`] is the host's clock.
 
 pub mod clock;
 pub mod config;
+pub mod denied;
 pub mod frames;
 pub mod health;
+pub mod identity;
 pub mod network;
-pub mod refusals;
 pub mod service;
 pub mod session;
+pub mod stats;
 pub mod topics;
 
-pub use clock::{Clock, clock_name, host_name, now_ns};
+pub use clock::{clock_name, host_name, now_ns};
 pub use config::{Check, ConfigError, Effective, Layers, Settings, changed};
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
+pub use identity::Identity;
 pub use network::Network;
 pub use service::{Options, Shutdown, relaunch_with_zenoh_threads, run, start_logging};
-pub use session::{Identity, Node, Presence, ZenohSource};
+pub use session::{Node, Presence, ZenohSource};
 pub use topics::{Commands, Publisher, Request, Subscriber};

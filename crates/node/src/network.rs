@@ -1,63 +1,97 @@
-//! Which network a process joins: the built-in configurations, and what a person lays over them.
+//! The network that a process joins: a built-in configuration and the settings of a site.
 //!
-//! A role's JSON5 file says how its processes meet; the vehicle's name, the other side's address and the keys differ
-//! from site to site and are put in here, so that nobody has to write a file of his own.
+//! The JSON5 file of a role configures how its processes connect; the vehicle's name, addresses and keys differ from
+//! site to site and are filled in here, so that no site needs files of its own.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, bail, ensure};
 use serde_json::{Value, json};
 
+use crate::config::{NAME_RULE, is_name};
 use crate::session::{LOCAL_CONFIG, LOCAL_PORT, ZenohSource};
 
-/// The drone's end of the air link.
+/// The relay on the drone.
 pub const DRONE_CONFIG: &str = include_str!("../../../zenoh-config/drone.json5");
 /// A process on the ground.
 pub const GROUND_CONFIG: &str = include_str!("../../../zenoh-config/ground.json5");
-/// A relay between both.
+/// A relay between drone and ground.
 pub const RELAY_CONFIG: &str = include_str!("../../../zenoh-config/relay.json5");
-/// What `keys` lays over them: TLS and access control.
+/// TLS and access control, added by [`Network::keys`].
 pub const SECURED_CONFIG: &str = include_str!("../../../zenoh-config/secured.json5");
 
-/// The port of the air link for control; those for frames are the next two.
+/// The port of the air link for control; the next two are for frames.
 pub const AIR_PORT: u16 = 7448;
 
-/// Two more ports follow that of an address.
-const HIGHEST_PORT: u16 = u16::MAX - 2;
-/// What stands in a file where the other side's address belongs.
-const ADDRESS_PLACEHOLDER: &str = "DRONE";
-/// The loopback interface, which no message leaves.
-const LOOPBACK: &str = "127.0.0.1";
-/// The name of the authority's certificate in a directory of keys.
-const AUTHORITY: &str = "authority.pem";
+/// The file name of the authority's certificate in a directory of keys.
+pub const AUTHORITY: &str = "authority.pem";
 
-/// A network to join. The default is this machine's own.
+/// Maximum port of an address: the next two are used as well.
+const MAX_PORT: u16 = u16::MAX - 2;
+/// The placeholder in a configuration for the address of the other side.
+const ADDRESS_PLACEHOLDER: &str = "DRONE";
+/// The loopback interface.
+const LOOPBACK: &str = "127.0.0.1";
+
+/// The environment variables that set a [`Network`].
+pub mod variable {
+    /// [`Network::config`](super::Network::config).
+    pub const ZENOH: &str = "ALIGHT_ZENOH";
+    /// [`Network::connect`](super::Network::connect).
+    pub const CONNECT: &str = "ALIGHT_CONNECT";
+    /// [`Network::listen`](super::Network::listen).
+    pub const LISTEN: &str = "ALIGHT_LISTEN";
+    /// [`Network::meet`](super::Network::meet).
+    pub const MEET: &str = "ALIGHT_MEET";
+    /// [`Network::vehicle`](super::Network::vehicle).
+    pub const VEHICLE: &str = "ALIGHT_VEHICLE";
+    /// [`Network::keys`](super::Network::keys).
+    pub const KEYS: &str = "ALIGHT_KEYS";
+}
+
+/// A network to join. The default is local to this machine.
 #[derive(Clone, Debug, Default)]
 pub struct Network {
     /// A built-in configuration (`local`, `drone`, `ground`, `relay`) or a JSON5 file; `local` if there is none.
     pub config: Option<PathBuf>,
     /// The vehicle's name, the namespace of all keys.
     pub vehicle: Option<String>,
-    /// Where the drone or its relay is: `HOST` or `HOST:PORT`.
+    /// The address of the drone or of the relay to it: `HOST` or `HOST:PORT`.
     pub connect: Option<String>,
-    /// Where others find this process: `HOST` or `HOST:PORT`.
+    /// The address at which this process listens: `HOST` or `HOST:PORT`.
     pub listen: Option<String>,
-    /// The port at which the processes of this machine meet.
+    /// The rendezvous port of this machine.
     pub meet: Option<u16>,
-    /// The directory with the keys; TLS and access control are used then.
+    /// The directory with the keys; enables TLS and access control.
     pub keys: Option<PathBuf>,
 }
 
 impl Network {
-    /// The session's configuration for a process that shows the certificate of `role`.
+    /// The session's configuration for a process with the certificate of `role`.
     ///
     /// # Errors
-    /// When a file cannot be read or is no configuration, or when an address is needed or makes no sense.
+    /// When a file cannot be read or is not a configuration, or when an address is missing or invalid.
     pub fn source(&self, role: &str) -> anyhow::Result<ZenohSource> {
         Ok(ZenohSource::Text(serde_json::to_string(&self.configuration(role)?)?))
     }
 
-    /// The same as JSON.
+    /// This network as environment variables, for a child process.
+    pub fn environment(&self) -> Vec<(&'static str, OsString)> {
+        let path = |path: &Option<PathBuf>| path.as_ref().map(|path| path.clone().into_os_string());
+        let text = |text: &Option<String>| text.as_ref().map(Into::into);
+        let all = [
+            (variable::ZENOH, path(&self.config)),
+            (variable::CONNECT, text(&self.connect)),
+            (variable::LISTEN, text(&self.listen)),
+            (variable::MEET, self.meet.map(|port| port.to_string().into())),
+            (variable::VEHICLE, text(&self.vehicle)),
+            (variable::KEYS, path(&self.keys)),
+        ];
+        all.into_iter().filter_map(|(name, value)| Some((name, value?))).collect()
+    }
+
+    /// The session's configuration as JSON.
     ///
     /// # Errors
     /// As [`Network::source`].
@@ -65,26 +99,27 @@ impl Network {
         let (name, text) = self.text()?;
         let mut config = parse(&name, &text)?;
         if let Some(vehicle) = &self.vehicle {
-            config["namespace"] = json!(checked_name(vehicle)?);
+            ensure!(is_name(vehicle), "invalid vehicle name `{vehicle}`: {NAME_RULE}");
+            config["namespace"] = json!(vehicle);
         }
         if let Some(keys) = &self.keys {
             secure(&mut config, keys, role).with_context(|| format!("securing {name}"))?;
         }
         if let Some(port) = self.meet {
-            each_endpoint(&mut config, &["connect", "listen"], |e| e.move_meeting_point(port));
+            each_endpoint(&mut config, &["connect", "listen"], |e| e.move_rendezvous(port));
         }
         if let Some(address) = &self.connect {
             let address = Address::parse(address)?;
-            each_endpoint(&mut config, &["connect"], |e| e.go_to(ADDRESS_PLACEHOLDER, &address));
+            each_endpoint(&mut config, &["connect"], |e| e.redirect(ADDRESS_PLACEHOLDER, &address));
         }
         if let Some(address) = &self.listen {
             let address = Address::parse(address)?;
-            each_endpoint(&mut config, &["listen"], |e| e.go_to("0.0.0.0", &address));
+            each_endpoint(&mut config, &["listen"], |e| e.redirect("0.0.0.0", &address));
         }
         let missing = endpoints(&config, "connect").any(|e| e.contains(ADDRESS_PLACEHOLDER));
         ensure!(
             !missing,
-            "{name} needs to know where the drone is: `--connect ADDRESS`, or ALIGHT_CONNECT in the environment"
+            "{name} needs the address of the drone: `--connect ADDRESS`, or ALIGHT_CONNECT in the environment"
         );
         check_access(&config).with_context(|| name.clone())?;
         Ok(config)
@@ -112,8 +147,8 @@ impl Network {
     }
 }
 
-/// Refuses access control whose policies name rules or subjects that are not there: Zenoh would open, and deny or allow
-/// something else than was meant.
+/// Rejects access control with policies that name undefined rules or subjects: Zenoh would accept them, and then allow
+/// or deny something else than intended.
 ///
 /// # Errors
 /// Names the policy's entry.
@@ -131,7 +166,7 @@ pub fn check_access(config: &Value) -> anyhow::Result<()> {
                 let name = name.as_str().unwrap_or_default();
                 ensure!(
                     known.iter().any(|k| k == name),
-                    "a policy of `access_control` names `{name}`, which is not among its {kind}"
+                    "a policy of `access_control` names `{name}`, which is not one of its {kind}"
                 );
             }
         }
@@ -143,40 +178,29 @@ fn parse(name: &str, text: &str) -> anyhow::Result<Value> {
     json5::from_str(text).map_err(|cause| anyhow!("{name} is not JSON5: {cause}"))
 }
 
-fn checked_name(vehicle: &str) -> anyhow::Result<&str> {
-    let is_name = !vehicle.is_empty()
-        && vehicle.len() <= 64
-        && vehicle.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c));
-    ensure!(
-        is_name,
-        "the vehicle's name `{vehicle}` is refused: 1 to 64 letters, digits, `-` and `_`"
-    );
-    Ok(vehicle)
-}
-
-/// Lays TLS and access control over a configuration.
+/// Adds TLS and access control to a configuration.
 fn secure(config: &mut Value, keys: &Path, role: &str) -> anyhow::Result<()> {
-    // The services on the drone meet on its loopback interface, where who has a login is trusted.
-    let meets_here = endpoints(config, "connect").any(|e| e.contains(LOOPBACK));
-    let only_here = endpoints(config, "listen").all(|e| e.contains(LOOPBACK));
-    if meets_here && only_here {
+    // The services on the drone use its loopback interface, where everybody with a login is trusted.
+    let connects_locally = endpoints(config, "connect").any(|e| e.contains(LOOPBACK));
+    let listens_locally = endpoints(config, "listen").all(|e| e.contains(LOOPBACK));
+    if connects_locally && listens_locally {
         return Ok(());
     }
     for file in [AUTHORITY.to_owned(), format!("{role}.pem"), format!("{role}.key")] {
         let path = keys.join(&file);
         ensure!(
             path.is_file(),
-            "there is no {path:?}; make it with `alight keys issue --role {role} -o {}`",
+            "missing key file {path:?}; make it with `alight keys issue --role {role} -o {}`",
             keys.display()
         );
     }
     each_endpoint(config, &["connect", "listen"], |e| {
-        if !(meets_here && e.host == LOOPBACK) {
+        if !(connects_locally && e.host == LOOPBACK) {
             e.protocol = "tls".to_owned();
         }
     });
     let mut layer = parse("secured.json5", SECURED_CONFIG)?;
-    let directory = keys.to_str().context("the directory of the keys has no printable name")?;
+    let directory = keys.to_str().context("the path of the key directory is not valid UTF-8")?;
     for value in layer["transport"]["link"]["tls"].as_object_mut().into_iter().flatten() {
         if let Some(file) = value.1.as_str() {
             *value.1 = json!(file.replace("DIRECTORY", directory).replace("NAME", role));
@@ -197,29 +221,36 @@ fn merge(below: &mut Value, above: Value) {
     }
 }
 
-/// The host and port of another process.
-struct Address {
-    host: String,
-    port: Option<u16>,
+/// The address of another process.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Address {
+    /// A host name or an IP address, an IPv6 address in brackets.
+    pub host: String,
+    /// The port; [`AIR_PORT`] if it is omitted.
+    pub port: Option<u16>,
 }
 
 impl Address {
-    fn parse(text: &str) -> anyhow::Result<Self> {
-        let refused = || {
+    /// Parses `HOST` or `HOST:PORT`.
+    ///
+    /// # Errors
+    /// When the text has another form.
+    pub fn parse(text: &str) -> anyhow::Result<Self> {
+        let invalid = || {
             anyhow!(
-                "the address `{text}` is refused: it must be HOST or HOST:PORT, for example 192.168.1.10"
+                "invalid address `{text}`: expected HOST or HOST:PORT, for example 192.168.1.10"
             )
         };
         let (host, port) = match text.rsplit_once(':') {
-            // A bare IPv6 address has colons of its own.
+            // An IPv6 address without brackets.
             Some((host, _)) if host.contains(':') && !host.ends_with(']') => (text, None),
-            Some((host, port)) => (host, Some(port.parse().map_err(|_| refused())?)),
+            Some((host, port)) => (host, Some(port.parse().map_err(|_| invalid())?)),
             None => (text, None),
         };
         let is_host = !host.is_empty()
             && host.chars().all(|c| c.is_ascii_alphanumeric() || ".-_[]:%".contains(c));
-        if !is_host || port.is_some_and(|port| port == 0 || port > HIGHEST_PORT) {
-            bail!(refused());
+        if !is_host || port.is_some_and(|port| port == 0 || port > MAX_PORT) {
+            bail!(invalid());
         }
         let host = if host.contains(':') && !host.starts_with('[') {
             format!("[{host}]")
@@ -255,16 +286,16 @@ impl Endpoint {
         format!("{}/{}:{}{}", self.protocol, self.host, self.port, self.rest)
     }
 
-    /// Replaces a host; the ports keep their distance from the first one.
-    fn go_to(&mut self, replaced: &str, address: &Address) {
+    /// Replaces a host; the ports keep their offsets from the first one.
+    fn redirect(&mut self, replaced: &str, address: &Address) {
         if self.host == replaced {
             self.host.clone_from(&address.host);
-            let beyond_the_first = self.port.saturating_sub(AIR_PORT);
-            self.port = address.port.unwrap_or(AIR_PORT).saturating_add(beyond_the_first);
+            let offset = self.port.saturating_sub(AIR_PORT);
+            self.port = address.port.unwrap_or(AIR_PORT).saturating_add(offset);
         }
     }
 
-    fn move_meeting_point(&mut self, port: u16) {
+    fn move_rendezvous(&mut self, port: u16) {
         if self.host == LOOPBACK && self.port == LOCAL_PORT {
             self.port = port;
         }
@@ -340,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn invalid_networks_are_rejected_with_the_reason() {
         let refused = |network: Network, part: &str| {
             let problem = configured(&network).unwrap_err();
             assert!(problem.contains(part), "`{part}` is not in: {problem}");
@@ -361,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn a_policy_that_names_no_rule_or_subject_is_refused() {
+    fn a_policy_with_an_undefined_rule_is_rejected() {
         let mut config = parse("secured.json5", SECURED_CONFIG).unwrap();
         check_access(&config).unwrap();
         config["access_control"]["policies"][0]["rules"][0] = json!("lisen");

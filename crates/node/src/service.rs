@@ -1,4 +1,4 @@
-//! A service from its start to its end.
+//! A service from start to shutdown.
 
 use std::future::Future;
 use std::io::IsTerminal;
@@ -11,35 +11,36 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer};
 
 use crate::config::Layers;
-use crate::refusals::{OnlyRefusals, Refusals};
-use crate::session::{Identity, Node, ZenohSource};
+use crate::denied::{DeniedCounter, DeniedFilter};
+use crate::identity::Identity;
+use crate::session::{Node, ZenohSource};
 
-/// The number of threads a cut air link must not be able to stop, and one group of them for all that comes in, so that a
-/// message is not handed from the group that made the connection to the one that receives (see `zenoh-config/README.md`).
+/// Zenoh's threads: enough that a broken air link cannot block them all, and one pool for everything incoming, so
+/// that a message is not passed from the accepting to the receiving pool (measured: `zenoh-config/README.md`).
 const ZENOH_RUNTIME: &str =
     "(tx:(worker_threads:4),net:(worker_threads:8),rx:(handover:net),acc:(handover:net))";
 const ZENOH_RUNTIME_VARIABLE: &str = "ZENOH_RUNTIME";
 
-/// What every service is started with.
+/// The start options of a service.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
-    /// What is laid over the defaults.
+    /// Settings over the defaults.
     pub layers: Layers,
     /// The network.
     pub zenoh: ZenohSource,
 }
 
-/// Becomes true when the service should end; clones see the same.
+/// A request to shut down; clones share it.
 #[derive(Clone, Debug)]
 pub struct Shutdown {
     requested: watch::Receiver<bool>,
 }
 
 impl Shutdown {
-    /// Ends when the process is asked to (Ctrl-C, SIGTERM).
+    /// Requested by SIGINT (Ctrl-C) or SIGTERM.
     ///
     /// # Errors
-    /// When the system refuses the signal handlers.
+    /// When the signal handlers cannot be installed.
     pub fn on_signals() -> anyhow::Result<Self> {
         let mut interrupt = signal(SignalKind::interrupt()).context("listening to SIGINT")?;
         let mut terminate = signal(SignalKind::terminate()).context("listening to SIGTERM")?;
@@ -49,28 +50,28 @@ impl Shutdown {
                 _ = interrupt.recv() => {}
                 _ = terminate.recv() => {}
             }
-            // Nobody listens any more when the service has ended by itself.
+            // There is no receiver left when the service has ended by itself.
             sender.send_replace(true);
-            // The sender must outlive the request, or receivers would see a closed channel instead.
+            // Keeps the sender: without it receivers would see a closed channel.
             std::future::pending::<()>().await;
         });
         Ok(Self { requested })
     }
 
-    /// Returns when the service should end.
+    /// Returns when a shutdown is requested.
     pub async fn requested(&self) {
         let mut requested = self.requested.clone();
-        // A closed channel means that the runtime is going down, which is a request too.
+        // The channel closes when the runtime shuts down, which is a request too.
         drop(requested.wait_for(|requested| *requested).await);
     }
 }
 
-/// Runs a service on the network until it ends, fails, or is asked to stop; publishes its health meanwhile.
+/// Runs a service until it ends, fails or is asked to stop, and publishes its health.
 ///
 /// `service` must call [`Node::announce`] when it is ready.
 ///
 /// # Errors
-/// What the service failed with.
+/// The error of the service.
 pub async fn run<F, Fut>(identity: Identity, zenoh: &ZenohSource, service: F) -> anyhow::Result<()>
 where
     F: FnOnce(Node, Shutdown) -> Fut,
@@ -79,7 +80,7 @@ where
     let shutdown = Shutdown::on_signals()?;
     let node = tokio::select! {
         node = Node::open(identity, zenoh) => node?,
-        // A network that cannot be joined must not keep the process from being stopped.
+        // The process can be stopped also while it cannot join the network.
         () = shutdown.requested() => return Ok(()),
     };
     let result = tokio::select! {
@@ -91,13 +92,13 @@ where
     result
 }
 
-/// Starts logging to standard error: at `default_level` and above, unless `ALIGHT_LOG` says otherwise.
+/// Starts logging to standard error, at `default_level` unless `ALIGHT_LOG` sets another.
 pub fn start_logging(default_level: &str) {
     let ours = std::env::var("ALIGHT_LOG").unwrap_or_else(|_| default_level.to_owned());
-    // Zenoh complains about every attempt at the meeting point, by whoever keeps it too; that is how it is meant to work.
-    // It also complains about each message that is still under way when its sender's session closes ("Route data with
-    // unknown scope", "Route query with unknown scope"; eclipse-zenoh/zenoh issues 980 and 1050, pull request 2524). Such a
-    // question gets an empty answer, and a command that reached nobody is sent again.
+    // Zenoh warns about every failed attempt to listen at or connect to the rendezvous, which are expected here.
+    // It also warns about messages in flight when their sender's session closes ("Route data with unknown scope",
+    // "Route query with unknown scope"; eclipse-zenoh/zenoh issues 980 and 1050, pull request 2524). Such a query gets
+    // an empty reply, and a command without a recipient is sent again.
     let filter = EnvFilter::try_new(format!(
         "zenoh=error,zenoh::net::routing::dispatcher::pubsub=off,zenoh::net::routing::dispatcher::queries=off,zenoh::api::session=off,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error,{ours}"
     ))
@@ -106,16 +107,17 @@ pub fn start_logging(default_level: &str) {
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
-        // A log that nobody reads any more (a broken pipe) is lost; complaining about it there would end the process.
+        // Reporting a broken pipe to that pipe would end the process.
         .log_internal_errors(false)
         .with_filter(filter);
-    let refusals = Refusals.with_filter(OnlyRefusals);
-    // Logging that was started already (by a test, say) stays as it is.
-    drop(tracing_subscriber::registry().with(log).with(refusals).try_init());
+    let denied = DeniedCounter.with_filter(DeniedFilter);
+    // A subscriber that is installed already (by a test, say) stays.
+    drop(tracing_subscriber::registry().with(log).with(denied).try_init());
 }
 
-/// Gives Zenoh the threads it needs, by starting this program over with the setting in its environment; it is read
-/// once, before anything else can change it. Call it first in `main`. Returns when nothing is to be done.
+/// Sets the number of Zenoh's threads by re-executing this program with `ZENOH_RUNTIME` in its environment, which
+/// Zenoh reads once, and which a program with threads must not change. Call it first in `main`; returns when the
+/// variable is set already.
 pub fn relaunch_with_zenoh_threads() {
     use std::os::unix::process::CommandExt;
     if std::env::var_os(ZENOH_RUNTIME_VARIABLE).is_some() {
@@ -126,6 +128,6 @@ pub fn relaunch_with_zenoh_threads() {
         .args(std::env::args_os().skip(1))
         .env(ZENOH_RUNTIME_VARIABLE, ZENOH_RUNTIME)
         .exec();
-    // Fewer threads are enough for one machine; only a cut air link needs more.
+    // The default is enough on one machine; only a broken air link needs more.
     tracing::warn!(%problem, "Zenoh runs with its default threads");
 }

@@ -1,4 +1,4 @@
-//! A service's place on the network: its session, its name, its presence and that of others.
+//! A service on the network: its session, its unique name, its presence and that of others.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,48 +12,34 @@ use zenoh::sample::{Sample, SampleKind};
 
 use crate::clock::now_ns;
 use crate::health::HealthCounters;
+use crate::identity::Identity;
 
-/// The configuration for one machine, used unless another is named.
+/// The configuration for one machine, the default.
 pub const LOCAL_CONFIG: &str = include_str!("../../../zenoh-config/local.json5");
 
-/// The port at which the processes of one machine meet, by [`LOCAL_CONFIG`].
+/// The rendezvous port of one machine in [`LOCAL_CONFIG`].
 pub const LOCAL_PORT: u16 = 7447;
 
-/// [`LOCAL_CONFIG`] with another meeting point.
+/// [`LOCAL_CONFIG`] with another rendezvous port.
 pub fn local_config(port: u16) -> String {
     LOCAL_CONFIG.replace(&format!(":{LOCAL_PORT}"), &format!(":{port}"))
 }
 
-/// Comings and goings a mailbox keeps.
+/// Presence changes that a mailbox keeps.
 const PRESENCE_DEPTH: usize = 256;
 
-/// How long a question about presence may take.
+/// Timeout of a presence query.
 const PRESENCE_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// Pauses before each look for others of the same kind. A session that is new meets the others one by one, through the
-/// meeting point, and knows of nobody whom it has not met.
-const GREETING: [Duration; 3] =
+/// Delays before each check for other instances. A new session learns of the others one by one, through the
+/// rendezvous, so that a single early check would miss some.
+const CLAIM_CHECK_DELAYS: [Duration; 3] =
     [Duration::ZERO, Duration::from_millis(200), Duration::from_millis(500)];
 
-/// How long leaving the network may take.
+/// Timeout for closing the session.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(300);
 
-/// Which service this is, and which one of them.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Identity {
-    /// The service.
-    pub service: &'static str,
-    /// The instance: a name without slashes.
-    pub instance: String,
-}
-
-impl std::fmt::Display for Identity {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} `{}`", self.service, self.instance)
-    }
-}
-
-/// Where the session's configuration comes from.
+/// The source of the session's configuration.
 #[derive(Clone, Debug, Default)]
 pub enum ZenohSource {
     /// [`LOCAL_CONFIG`].
@@ -72,12 +58,12 @@ pub struct Node {
     identity: Arc<Identity>,
     health: Arc<HealthCounters>,
     token: Arc<Mutex<Option<LivelinessToken>>>,
-    /// Held from before the look for others until the service is announced.
+    /// Held from before the check for other instances until the service is announced.
     claim: Arc<Mutex<Option<LivelinessToken>>>,
     started_ns: i64,
 }
 
-/// Tells who comes and goes.
+/// Follows which instances join and leave.
 pub struct Presence {
     subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
 }
@@ -86,7 +72,7 @@ impl Node {
     /// Opens the session. The service is not announced before [`Node::announce`].
     ///
     /// # Errors
-    /// When the configuration cannot be read or the session not opened; the message names the file.
+    /// When the configuration cannot be read or the session cannot be opened.
     pub async fn open(identity: Identity, source: &ZenohSource) -> anyhow::Result<Self> {
         let config = zenoh_config(source)?;
         let session = zenoh::open(config)
@@ -102,7 +88,7 @@ impl Node {
         })
     }
 
-    /// Who this is.
+    /// The identity of this process.
     pub fn identity(&self) -> &Identity {
         &self.identity
     }
@@ -112,40 +98,42 @@ impl Node {
         &self.health
     }
 
-    /// The counters, to be kept by a thread.
+    /// The counters, for a thread.
     pub fn shared_health(&self) -> Arc<HealthCounters> {
         Arc::clone(&self.health)
     }
 
-    /// Stops with an error when a service of this kind is there already whose instance `matches` (`*` for any), or
-    /// starts in the same moment and goes first.
+    /// Claims the name of this instance: fails when an instance of this service that `matches` (`*` for any) is
+    /// running, or is starting at the same time and has priority.
     ///
-    /// The intention is told before the others are looked for, so that of two that start at once at least one sees
-    /// the other; the one whose name and session come first goes on.
+    /// The claim is declared before the check, so that of two that start at once at least one sees the other; the one
+    /// whose name and session id sort first has priority.
     ///
     /// # Errors
     /// Names the other instance.
-    pub async fn ensure_alone(&self, matches: &str) -> anyhow::Result<()> {
+    pub async fn claim_unique_name(&self, matches: &str) -> anyhow::Result<()> {
         let service = self.identity.service;
         let ours = (self.identity.instance.clone(), self.session.zid().to_string());
         let claim = self.declare(&topic::claim_key(service, &ours.0, &ours.1)).await?;
         *self.claim.lock().unwrap_or_else(PoisonError::into_inner) = Some(claim);
-        for pause in GREETING {
-            tokio::time::sleep(pause).await;
+        for delay in CLAIM_CHECK_DELAYS {
+            tokio::time::sleep(delay).await;
             match self.alive(service, matches).await?.first() {
                 None => {}
                 Some(other) if matches == "*" => bail!(
-                    "another {service} (`{other}`) is at work for this vehicle; stop it first, or give this one another vehicle (`namespace` in the Zenoh configuration)"
+                    "another {service} (`{other}`) is running for this vehicle; stop it first, or set another vehicle (`namespace` in the Zenoh configuration)"
                 ),
                 Some(other) => bail!(
-                    "another {service} is called `{other}` already; give this one another name with `--set id=...`"
+                    "another {service} has the name `{other}` already; choose another with `--set id=...`"
                 ),
             }
             let claims = self.tokens(&topic::claim_key(service, matches, "*")).await?;
             if let Some((other, _)) =
-                claims.iter().filter_map(|key| claim_of(key)).find(|it| *it < ours)
+                claims.iter().filter_map(|key| last_two(key)).find(|it| *it < ours)
             {
-                bail!("another {service} (`{other}`) starts in the same moment and goes first");
+                bail!(
+                    "another {service} (`{other}`) is starting at the same time and has priority"
+                );
             }
         }
         Ok(())
@@ -154,7 +142,7 @@ impl Node {
     /// The instances of a service that are ready, by liveliness.
     ///
     /// # Errors
-    /// When the question cannot be asked.
+    /// When the query fails.
     pub async fn alive(&self, service: &str, instance: &str) -> anyhow::Result<Vec<String>> {
         let keys = self.tokens(&topic::alive_key(service, instance)).await?;
         Ok(keys.iter().filter_map(|key| instance_of(key)).collect())
@@ -168,7 +156,7 @@ impl Node {
             .get(key)
             .timeout(PRESENCE_TIMEOUT)
             .await
-            .map_err(|cause| anyhow!("asking who is at {key}: {cause}"))?;
+            .map_err(|cause| anyhow!("querying the liveliness of {key}: {cause}"))?;
         let mut keys = Vec::new();
         while let Ok(reply) = replies.recv_async().await {
             keys.extend(reply.result().map(|sample| sample.key_expr().as_str().to_owned()));
@@ -176,49 +164,35 @@ impl Node {
         Ok(keys)
     }
 
-    /// Everybody who is ready, by liveliness: service and instance.
+    /// All services that are ready, by liveliness: service and instance, sorted.
     ///
     /// # Errors
-    /// When the question cannot be asked.
-    pub async fn everybody(&self) -> anyhow::Result<Vec<(String, String)>> {
-        let key = topic::alive_key("*", "*");
-        let replies = self
-            .session
-            .liveliness()
-            .get(&key)
-            .timeout(PRESENCE_TIMEOUT)
-            .await
-            .map_err(|cause| anyhow!("asking who is at {key}: {cause}"))?;
-        let mut everybody = Vec::new();
-        while let Ok(reply) = replies.recv_async().await {
-            let key = reply.result().ok().map(|sample| sample.key_expr().as_str().to_owned());
-            let mut chunks = key.iter().flat_map(|key| key.rsplit('/'));
-            if let (Some(instance), Some(service)) = (chunks.next(), chunks.next()) {
-                everybody.push((service.to_owned(), instance.to_owned()));
-            }
-        }
-        everybody.sort();
-        everybody.dedup();
-        Ok(everybody)
+    /// When the query fails.
+    pub async fn list_peers(&self) -> anyhow::Result<Vec<(String, String)>> {
+        let keys = self.tokens(&topic::alive_key("*", "*")).await?;
+        let mut peers: Vec<_> = keys.iter().filter_map(|key| last_two(key)).collect();
+        peers.sort();
+        peers.dedup();
+        Ok(peers)
     }
 
-    /// How long a question to an instance and its answer took, or nothing when it did not answer within `patience`.
+    /// The round-trip time of a query to an instance; `None` without a reply within `timeout`.
     pub async fn round_trip(
         &self,
         service: &str,
         instance: &str,
-        patience: Duration,
+        timeout: Duration,
     ) -> Option<Duration> {
         let key = topic::HEALTH.key(&[service, instance]);
         let began = std::time::Instant::now();
-        // With what steers, not behind the frames.
+        // With the priority of commands, so that frames do not delay it.
         let get = self.session.get(key).priority(zenoh::qos::Priority::InteractiveHigh);
-        let replies = get.timeout(patience).await.ok()?;
+        let replies = get.timeout(timeout).await.ok()?;
         let reply = replies.recv_async().await.ok()?;
         reply.result().is_ok().then(|| began.elapsed())
     }
 
-    /// Tells everybody that the service is ready.
+    /// Announces that the service is ready.
     ///
     /// # Errors
     /// When the session is closed.
@@ -226,7 +200,7 @@ impl Node {
         let key = topic::alive_key(self.identity.service, &self.identity.instance);
         let token = self.declare(&key).await?;
         *self.token.lock().unwrap_or_else(PoisonError::into_inner) = Some(token);
-        // From here on the announcement says the same.
+        // The announcement replaces the claim.
         drop(self.claim.lock().unwrap_or_else(PoisonError::into_inner).take());
         tracing::info!(service = self.identity.service, instance = %self.identity.instance, "Ready");
         Ok(())
@@ -237,7 +211,7 @@ impl Node {
         token.map_err(|cause| anyhow!("declaring {key}: {cause}"))
     }
 
-    /// Follows the comings and goings of a service's instances, beginning with those that are there.
+    /// Follows which instances of a service join and leave, beginning with those that are ready.
     ///
     /// # Errors
     /// When the session is closed.
@@ -254,7 +228,7 @@ impl Node {
         Ok(Presence { subscriber })
     }
 
-    /// Publishes the service's health once a second, for ever.
+    /// Publishes the service's health once a second, until it fails.
     ///
     /// # Errors
     /// When the session is closed.
@@ -268,20 +242,20 @@ impl Node {
         }
     }
 
-    /// Leaves the network in good order.
+    /// Closes the session.
     ///
-    /// A session that still waits for the meeting point would take its own time; the process' end closes what is left.
+    /// A session that still waits for the rendezvous can take long to close; the end of the process then closes it.
     pub async fn close(self) {
         match tokio::time::timeout(CLOSE_TIMEOUT, self.session.close()).await {
             Ok(Ok(())) => {}
-            Ok(Err(cause)) => tracing::debug!(%cause, "The session did not close in good order"),
-            Err(_) => tracing::debug!("The session is closed by the end of the process"),
+            Ok(Err(cause)) => tracing::debug!(%cause, "Zenoh session did not close cleanly"),
+            Err(_) => tracing::debug!("Zenoh session left to be closed by the end of the process"),
         }
     }
 }
 
 impl Presence {
-    /// The next change: an instance, and whether it is there now. `None` once the session is closed.
+    /// The next change: an instance, and whether it is ready. `None` once the session is closed.
     pub async fn next(&self) -> Option<(String, bool)> {
         loop {
             let sample = self.subscriber.recv_async().await.ok()?;
@@ -296,11 +270,11 @@ fn instance_of(key: &str) -> Option<String> {
     key.rsplit('/').next().map(str::to_owned)
 }
 
-/// Instance and session of a claim.
-fn claim_of(key: &str) -> Option<(String, String)> {
+/// The last two chunks of a key: service and instance, or instance and session of a claim.
+fn last_two(key: &str) -> Option<(String, String)> {
     let mut chunks = key.rsplit('/');
-    let session = chunks.next()?;
-    Some((chunks.next()?.to_owned(), session.to_owned()))
+    let last = chunks.next()?;
+    Some((chunks.next()?.to_owned(), last.to_owned()))
 }
 
 fn zenoh_config(source: &ZenohSource) -> anyhow::Result<zenoh::Config> {

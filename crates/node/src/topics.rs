@@ -1,6 +1,6 @@
-//! Typed publishers and subscribers: the topic table on the network.
+//! Typed publishers, subscribers and commands: the topic table on the network.
 //!
-//! Every mailbox is a ring: a reader that is slow loses the oldest messages, and nobody ever waits for it.
+//! Every mailbox is a ring: a slow reader loses the oldest messages, and never blocks a publisher.
 
 use std::marker::PhantomData;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -18,60 +18,60 @@ use crate::clock::now_ns;
 use crate::health::HealthCounters;
 use crate::session::Node;
 
-/// How long a command waits for its answer.
-const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
-/// Pause before a command that reached nobody is sent again.
-const ASK_AGAIN: Duration = Duration::from_millis(100);
+/// Timeout of the reply to a query.
+const REPLY_TIMEOUT: Duration = Duration::from_secs(2);
+/// Pause before a command without a recipient is sent again.
+const RETRY_PAUSE: Duration = Duration::from_millis(100);
 
 /// Publishes messages of one type on one key.
 pub struct Publisher<M> {
     publisher: zenoh::pubsub::Publisher<'static>,
-    /// Answers those who come late; only for states.
+    /// Replies to late subscribers; only for states.
     last_value: Option<LastValue>,
     health: Arc<HealthCounters>,
     message: PhantomData<fn(M)>,
 }
 
-/// What is answered to those who come late, and the answering itself, which ends when this is dropped.
+/// The last value, and the queryable that sends it to late subscribers until this is dropped.
 struct LastValue {
     bytes: Arc<Mutex<Vec<u8>>>,
-    _answers: Queryable<()>,
+    _queryable: Queryable<()>,
 }
 
 /// Receives messages of one type from the keys that match.
 pub struct Subscriber<M> {
     subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
-    /// States that were there before the subscription.
-    early: Mutex<Vec<(String, M)>>,
+    /// Last values from before the subscription.
+    initial: Mutex<Vec<(String, M)>>,
     health: Arc<HealthCounters>,
     message: PhantomData<fn() -> M>,
 }
 
-/// A command with the way to answer it.
+/// A command, to be answered.
 pub struct Request<M> {
-    /// What is asked.
+    /// The command.
     pub message: M,
     query: Query,
 }
 
-/// Zenoh's terms for a delivery.
+/// Zenoh's quality of service for a delivery.
 struct Qos {
     priority: Priority,
     congestion: CongestionControl,
-    /// Messages a mailbox keeps.
+    /// Capacity of a mailbox, in messages.
     depth: usize,
 }
 
-/// Nothing is published with `CongestionControl::Block`: a link that is cut would hold up the one who publishes, and
-/// with it the messages to everybody else, until Zenoh gives the link up. Dropping waits a millisecond at most, and only
-/// when the link's own queue for this priority is full.
+/// Nothing is published with `CongestionControl::Block`: a broken link would block the publisher, and with it the
+/// messages to all others, until Zenoh closes the link. `Drop` waits at most a millisecond, and only when the link's
+/// queue for this priority is full.
 fn qos(delivery: Delivery) -> Qos {
     let (priority, congestion, depth) = match delivery {
-        Delivery::Newest => (Priority::Data, CongestionControl::Drop, 4),
-        // Deep enough for all detectors at once.
-        Delivery::NewestFirst => (Priority::RealTime, CongestionControl::Drop, 64),
+        Delivery::Latest => (Priority::Data, CongestionControl::Drop, 4),
+        // Room for the messages of all detectors at once.
+        Delivery::LatestPriority => (Priority::RealTime, CongestionControl::Drop, 64),
         Delivery::LastValue => (Priority::InteractiveHigh, CongestionControl::Drop, 64),
-        Delivery::InOrder => (Priority::InteractiveLow, CongestionControl::Drop, 512),
+        Delivery::Reliable => (Priority::InteractiveLow, CongestionControl::Drop, 512),
         Delivery::Query => (Priority::InteractiveHigh, CongestionControl::Drop, 16),
     };
     Qos { priority, congestion, depth }
@@ -98,7 +98,9 @@ impl Node {
             .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
         let last_value = match topic.delivery() {
             Delivery::LastValue => Some(self.last_value(&key).await?),
-            Delivery::Newest | Delivery::NewestFirst | Delivery::InOrder | Delivery::Query => None,
+            Delivery::Latest | Delivery::LatestPriority | Delivery::Reliable | Delivery::Query => {
+                None
+            }
         };
         Ok(Publisher { publisher, last_value, health: self.shared_health(), message: PhantomData })
     }
@@ -106,25 +108,25 @@ impl Node {
     async fn last_value(&self, key: &str) -> anyhow::Result<LastValue> {
         let bytes = Arc::new(Mutex::new(Vec::new()));
         let kept = Arc::clone(&bytes);
-        // Our own key, whatever was asked for: of several answers on one key only one arrives.
+        // Replies on its own key, not on that of the query: of several replies on one key only one arrives.
         let own_key = key.to_owned();
-        let answer = move |query: Query| {
+        let reply = move |query: Query| {
             let bytes: Vec<u8> = kept.lock().unwrap_or_else(PoisonError::into_inner).clone();
             if !bytes.is_empty() {
-                // Whoever asked may be gone; there is nobody to tell.
+                // The requester may be gone.
                 drop(zenoh::Wait::wait(query.reply(own_key.as_str(), bytes)));
             }
         };
-        let answers = self
+        let queryable = self
             .session
             .declare_queryable(key.to_owned())
-            .callback(answer)
+            .callback(reply)
             .await
             .map_err(|cause| anyhow!("declaring the last value of {key}: {cause}"))?;
-        Ok(LastValue { bytes, _answers: answers })
+        Ok(LastValue { bytes, _queryable: queryable })
     }
 
-    /// A subscriber to the topic's keys; names that are left out stand for any.
+    /// A subscriber to the topic's keys; omitted names match any.
     ///
     /// # Errors
     /// When the session is closed.
@@ -142,7 +144,7 @@ impl Node {
             .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
         let subscriber = Subscriber {
             subscriber,
-            early: Mutex::default(),
+            initial: Mutex::default(),
             health: self.shared_health(),
             message: PhantomData,
         };
@@ -153,16 +155,16 @@ impl Node {
     }
 
     async fn fetch_last_values<M: Message>(&self, key: &str, subscriber: &Subscriber<M>) {
-        // No publisher yet is the usual case at the start of a system, not an error.
-        let question = question(self.session.get(key));
-        let Ok(replies) = question.timeout(ANSWER_TIMEOUT).await else { return };
+        // At the start of a system there is no publisher yet, which is not an error.
+        let query = with_query_qos(self.session.get(key));
+        let Ok(replies) = query.timeout(REPLY_TIMEOUT).await else { return };
         while let Ok(reply) = replies.recv_async().await {
             if let Ok(sample) = reply.result()
                 && let Some(message) = subscriber.decode(sample)
             {
                 let key = sample.key_expr().as_str().to_owned();
                 subscriber
-                    .early
+                    .initial
                     .lock()
                     .unwrap_or_else(PoisonError::into_inner)
                     .push((key, message));
@@ -170,7 +172,7 @@ impl Node {
         }
     }
 
-    /// The commands that are sent on a topic's key to this service.
+    /// The commands sent to this service on a topic's key.
     ///
     /// # Errors
     /// When the session is closed or a name makes no key.
@@ -189,11 +191,11 @@ impl Node {
         Ok(Commands { queryable, health: self.shared_health(), message: PhantomData })
     }
 
-    /// Sends a command on a topic's key and waits for its answer. A session that is new may not have met the other
-    /// side yet, so a command that reached nobody is sent again; one that reached somebody never is.
+    /// Sends a command on a topic's key and waits for its reply. A new session may not be connected to the recipient
+    /// yet, so a command without a recipient is sent again; one that reached a recipient never is.
     ///
     /// # Errors
-    /// When nobody answers in time.
+    /// When there is no reply in time.
     pub async fn command<M: Message>(
         &self,
         topic: Topic<M>,
@@ -201,27 +203,25 @@ impl Node {
         command: &M,
     ) -> anyhow::Result<messages::CommandReply> {
         let key = topic.key(names);
-        let until_ns = now_ns() + ANSWER_TIMEOUT.as_nanos() as i64;
+        let until_ns = now_ns() + REPLY_TIMEOUT.as_nanos() as i64;
         while now_ns() < until_ns {
-            if let Some(reply) = self.ask(&key, command).await? {
+            if let Some(reply) = self.query(&key, command).await? {
                 return Ok(reply);
             }
-            tokio::time::sleep(ASK_AGAIN).await;
+            tokio::time::sleep(RETRY_PAUSE).await;
         }
         let who = key.rsplit_once('/').map_or(key.as_str(), |(who, _command)| who);
-        Err(anyhow!(
-            "no {who} answered within {ANSWER_TIMEOUT:?}; is one running for this vehicle?"
-        ))
+        Err(anyhow!("no {who} answered within {REPLY_TIMEOUT:?}; is one running for this vehicle?"))
     }
 
-    async fn ask<M: Message>(
+    async fn query<M: Message>(
         &self,
         key: &str,
         command: &M,
     ) -> anyhow::Result<Option<messages::CommandReply>> {
-        let replies = question(self.session.get(key))
+        let replies = with_query_qos(self.session.get(key))
             .payload(encode(command))
-            .timeout(ANSWER_TIMEOUT)
+            .timeout(REPLY_TIMEOUT)
             .await
             .map_err(|cause| anyhow!("sending a command on {key}: {cause}"))?;
         while let Ok(reply) = replies.recv_async().await {
@@ -233,13 +233,13 @@ impl Node {
     }
 }
 
-/// A question that holds up nobody; its answers travel the same way.
-fn question<'a, 'b, H>(get: SessionGetBuilder<'a, 'b, H>) -> SessionGetBuilder<'a, 'b, H> {
+/// A query with the quality of service of commands; its replies get the same.
+fn with_query_qos<'a, 'b, H>(get: SessionGetBuilder<'a, 'b, H>) -> SessionGetBuilder<'a, 'b, H> {
     let Qos { priority, congestion, .. } = qos(Delivery::Query);
     get.priority(priority).congestion_control(congestion)
 }
 
-/// A service's side of its commands.
+/// Receives the commands to a service.
 pub struct Commands<M> {
     queryable: Queryable<RingChannelHandler<Query>>,
     health: Arc<HealthCounters>,
@@ -247,7 +247,7 @@ pub struct Commands<M> {
 }
 
 impl<M: Message> Commands<M> {
-    /// The next command; `None` once the session is closed. A payload that is no command is answered as such.
+    /// The next command; `None` once the session is closed. A payload that cannot be decoded is refused.
     pub async fn next(&self) -> Option<Request<M>> {
         loop {
             let query = self.queryable.recv_async().await.ok()?;
@@ -270,13 +270,13 @@ impl<M> Request<M> {
     pub async fn answer(self, reply: &messages::CommandReply) {
         let key = self.query.key_expr().clone();
         if let Err(cause) = self.query.reply(key, encode(reply)).await {
-            tracing::debug!(%cause, "A command's answer was not delivered");
+            tracing::debug!(%cause, "The reply to a command was not delivered");
         }
     }
 }
 
 impl<M: Message> Publisher<M> {
-    /// Publishes a message. A failure is counted: a stream goes on with the next one.
+    /// Publishes a message. A failure is counted, and the stream continues with the next message.
     pub async fn publish(&self, message: &M) {
         let bytes = encode(message);
         if let Some(last_value) = &self.last_value {
@@ -291,16 +291,16 @@ impl<M: Message> Publisher<M> {
 }
 
 impl<M: Message> Subscriber<M> {
-    /// The next message that can be read; `None` once the session is closed. Others are counted and logged once.
+    /// The next valid message; `None` once the session is closed. Others are counted, and logged once.
     pub async fn next(&self) -> Option<M> {
         self.next_with_key().await.map(|(_key, message)| message)
     }
 
     /// As [`Subscriber::next`], with the key on which it was published.
     pub async fn next_with_key(&self) -> Option<(String, M)> {
-        let early = self.early.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        if early.is_some() {
-            return early;
+        let initial = self.initial.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        if initial.is_some() {
+            return initial;
         }
         loop {
             let sample = self.subscriber.recv_async().await.ok()?;
@@ -317,9 +317,9 @@ impl<M: Message> Subscriber<M> {
     }
 }
 
-/// Counts a payload that was refused, and logs the first of its kind.
+/// Counts an invalid payload, and logs the first one of its reason.
 pub(crate) fn report_refused(health: &HealthCounters, key: &str, problem: &messages::DecodeError) {
     if health.failed(&format!("payload: {}", problem.reason())) {
-        tracing::warn!(key, %problem, "A payload was refused; further ones are counted only");
+        tracing::warn!(key, %problem, "Invalid payload (further ones are only counted)");
     }
 }

@@ -1,4 +1,4 @@
-//! Who may say what: the access rules are the topic table, and Zenoh keeps them.
+//! Access rights: the rules in `zenoh-config/secured.json5` match the topic table.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use node::network::{SECURED_CONFIG, check_access};
 use serde_json::Value;
 use zenoh::key_expr::KeyExpr;
 
-/// Everybody there is: the roles of the certificates, and what the topic table calls them.
+/// The roles of the certificates, and their names in the topic table.
 const ROLES: [(&str, &str); 7] = [
     ("camera-pub", "camera-pub"),
     ("controller", "controller"),
@@ -19,8 +19,8 @@ const ROLES: [(&str, &str); 7] = [
     ("observer", "nobody"),
 ];
 
-/// What comes in from a role by a rule.
-const SPEAKING: [&str; 5] = ["put", "query", "reply", "declare_queryable", "liveliness_token"];
+/// The incoming messages by which a role publishes, queries or replies.
+const SENDING: [&str; 5] = ["put", "query", "reply", "declare_queryable", "liveliness_token"];
 
 fn access() -> anyhow::Result<Value> {
     let config: Value = json5::from_str(SECURED_CONFIG)?;
@@ -36,7 +36,7 @@ fn has(value: &Value, key: &str, wanted: &str) -> bool {
     list(value, key).any(|entry| entry == wanted)
 }
 
-/// What a role may do that others hear of: (message, key expression).
+/// The rights of a role to send: (message, key expression).
 fn rights(access: &Value, role: &str) -> BTreeSet<(String, String)> {
     let subjects: Vec<_> = list(access, "subjects")
         .filter(|s| has(s, "cert_common_names", role))
@@ -52,7 +52,7 @@ fn rights(access: &Value, role: &str) -> BTreeSet<(String, String)> {
     });
     let mut rights = BTreeSet::new();
     for rule in rules {
-        for message in SPEAKING.iter().filter(|m| has(rule, "messages", m)) {
+        for message in SENDING.iter().filter(|m| has(rule, "messages", m)) {
             for key in list(rule, "key_exprs").filter_map(Value::as_str) {
                 rights.insert(((*message).to_owned(), key.to_owned()));
             }
@@ -73,13 +73,13 @@ fn may(rights: &BTreeSet<(String, String)>, message: &str, key: &str) -> anyhow:
     Ok(false)
 }
 
-/// The row's key on the wire, as `service` would use it.
+/// The row's key on the wire for a service.
 fn key_on_the_wire(row: &Row, service: &str) -> String {
     format!("a-drone/{}", row.key.replace("{service}", service)).replace(['{', '}'], "")
 }
 
-/// True for the answer to a command, which shares its key with the command.
-fn is_answer(row: &Row) -> bool {
+/// Whether a row is the reply to a command, which has the key of the command.
+fn is_reply(row: &Row) -> bool {
     row.message == "CommandReply"
 }
 
@@ -92,10 +92,10 @@ fn the_access_rules_allow_what_the_topic_table_says_and_nothing_else() -> anyhow
             let key = key_on_the_wire(row, service);
             let stated = row.publishers.contains(&service);
             let messages: &[&str] = match row.delivery {
-                Delivery::Query if is_answer(row) => &["declare_queryable", "reply"],
+                Delivery::Query if is_reply(row) => &["declare_queryable", "reply"],
                 Delivery::Query => &["query"],
                 Delivery::LastValue => &["put", "declare_queryable", "reply"],
-                Delivery::Newest | Delivery::NewestFirst | Delivery::InOrder => &["put"],
+                Delivery::Latest | Delivery::LatestPriority | Delivery::Reliable => &["put"],
             };
             for message in messages {
                 let allowed = may(&rights, message, &key)?;
@@ -135,7 +135,7 @@ fn every_access_rule_has_a_row_in_the_topic_table() -> anyhow::Result<()> {
 }
 
 #[test]
-fn nobody_may_speak_for_another_vehicle_part_by_a_wildcard() -> anyhow::Result<()> {
+fn no_role_has_rights_to_wildcards() -> anyhow::Result<()> {
     let access = access()?;
     for (role, _) in ROLES {
         for key in ["a-drone/**", "a-drone/*/command", "a-drone/controller/*", "**"] {
@@ -144,7 +144,7 @@ fn nobody_may_speak_for_another_vehicle_part_by_a_wildcard() -> anyhow::Result<(
             }
         }
     }
-    // The table's own services are all among the roles, but for the relay, which passes on.
+    // Every service of the table has a role, except the relay, which forwards.
     let named: BTreeSet<_> = TOPICS.iter().flat_map(|row| row.publishers).copied().collect();
     let known: BTreeSet<_> = ROLES.iter().map(|(_, service)| *service).chain(["relay"]).collect();
     ensure!(named.is_subset(&known), "no role for {:?}", named.difference(&known));
@@ -152,7 +152,7 @@ fn nobody_may_speak_for_another_vehicle_part_by_a_wildcard() -> anyhow::Result<(
 }
 
 #[test]
-fn each_role_of_the_relays_is_trusted_as_the_drone_is() -> anyhow::Result<()> {
+fn relays_have_all_rights() -> anyhow::Result<()> {
     let access = access()?;
     for role in ["drone", "relay"] {
         let rights = rights(&access, role);

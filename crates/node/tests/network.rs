@@ -1,4 +1,4 @@
-//! Sessions that meet: the local configuration's promises, on a port of the test's own.
+//! Sessions with the local configuration, on a port of the test's own.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// The local configuration with another meeting point.
+/// The local configuration with another rendezvous port.
 fn local(port: u16) -> ZenohSource {
     ZenohSource::Text(node::session::local_config(port))
 }
@@ -26,7 +26,7 @@ async fn open(service: &'static str, instance: &str, port: u16) -> anyhow::Resul
     Node::open(Identity { service, instance: instance.into() }, &local(port)).await
 }
 
-/// A camera and a detector that have met, and what frames go through.
+/// A connected camera and detector, with a publisher and a subscriber of frames.
 async fn frames() -> anyhow::Result<([Node; 2], FramePublisher, FrameSubscriber)> {
     let port = free_port()?;
     let camera = open("camera-pub", "down", port).await?;
@@ -58,7 +58,7 @@ async fn frames_arrive_as_they_were_written_and_misfits_are_skipped() -> anyhow:
     let (_nodes, publisher, subscriber) = frames().await?;
     let too_short = publisher.loan(5);
     publisher.publish(&header(1), too_short).await;
-    // A frame that comes when its predecessor is under way may be left out: then another one is published.
+    // A frame published while another one is in flight may be dropped; then another one is published.
     let received = timeout(PATIENCE, async {
         loop {
             let mut frame = publisher.loan(64 * 48);
@@ -89,10 +89,10 @@ async fn a_pool_that_is_full_falls_back_to_copies() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn frames_that_a_reader_never_returns_are_given_up() -> anyhow::Result<()> {
+async fn a_pool_exhausted_by_dead_readers_is_replaced() -> anyhow::Result<()> {
     let (_nodes, publisher, subscriber) = frames().await?;
     let is_shared = |loan: &node::Loan| matches!(loan, node::Loan::Shared(_));
-    // As a process that is killed while it reads.
+    // As by a process that is killed while it reads.
     let shared = std::iter::repeat_with(|| publisher.loan(64 * 48)).take(8).filter(is_shared);
     let kept = shared.map(std::mem::forget).count();
     assert!((1..8).contains(&kept), "{kept} of 8 loans were in shared memory");
@@ -116,7 +116,7 @@ async fn the_others_still_meet_after_the_first_process_is_gone() -> anyhow::Resu
     let presence = second.presence("controller").await?;
     second.announce().await?;
     first.close().await;
-    // The third knows only the meeting point, and must find the second.
+    // The third knows only the rendezvous, and must find the second.
     let third = open("controller", "main", port).await?;
     third.announce().await?;
     let arrived = timeout(PATIENCE, presence.next()).await?;
@@ -128,19 +128,20 @@ async fn the_others_still_meet_after_the_first_process_is_gone() -> anyhow::Resu
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_second_one_of_the_same_name_is_told_so() -> anyhow::Result<()> {
+async fn a_second_instance_of_the_same_name_is_rejected() -> anyhow::Result<()> {
     let port = free_port()?;
     let first = open("detector", "main", port).await?;
-    first.ensure_alone("main").await?;
+    first.claim_unique_name("main").await?;
     first.announce().await?;
     let second = open("detector", "main", port).await?;
-    let refusal = second.ensure_alone("main").await.err().context("two of one name")?.to_string();
+    let refusal =
+        second.claim_unique_name("main").await.err().context("two of one name")?.to_string();
     assert!(refusal.contains("`main` already") && refusal.contains("--set id="), "{refusal}");
     let spare = open("detector", "spare", port).await?;
-    spare.ensure_alone("spare").await
+    spare.claim_unique_name("spare").await
 }
 
-/// Asks until the answer is as wanted, patiently.
+/// Repeats a query until its result satisfies the condition.
 async fn until<T>(
     ask: impl AsyncFn() -> anyhow::Result<T>,
     is_wanted: impl Fn(&T) -> bool,
@@ -158,13 +159,13 @@ async fn until<T>(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn of_two_that_start_in_the_same_instant_one_goes_on() -> anyhow::Result<()> {
+async fn of_two_that_start_at_once_one_has_priority() -> anyhow::Result<()> {
     for [first, second] in [["main", "main"], ["a", "b"], ["b", "a"], ["main", "main"]] {
         let port = free_port()?;
         let host = open("simulator", "main", port).await?;
         let start = async |instance: &str| {
             let node = open("controller", instance, port).await?;
-            let alone = node.ensure_alone("*").await;
+            let alone = node.claim_unique_name("*").await;
             if alone.is_ok() {
                 node.announce().await?;
             }
@@ -188,7 +189,7 @@ async fn of_two_that_start_in_the_same_instant_one_goes_on() -> anyhow::Result<(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_state_is_told_to_those_who_come_late() -> anyhow::Result<()> {
+async fn a_late_subscriber_gets_the_last_value() -> anyhow::Result<()> {
     let port = free_port()?;
     let controller = open("controller", "main", port).await?;
     let health = controller.publisher(topic::HEALTH, &["controller", "main"]).await?;
@@ -199,12 +200,12 @@ async fn a_state_is_told_to_those_who_come_late() -> anyhow::Result<()> {
     other.publish(&other_report).await;
     let late = open("alight", "main", port).await?;
     let subscriber = late.subscriber(topic::HEALTH, &[]).await?;
-    let mut told = Vec::new();
-    while told.len() < 2 {
-        told.push(timeout(PATIENCE, subscriber.next()).await?.context("a state")?);
+    let mut received = Vec::new();
+    while received.len() < 2 {
+        received.push(timeout(PATIENCE, subscriber.next()).await?.context("a state")?);
     }
-    told.sort_by(|a, b| a.instance.cmp(&b.instance));
-    assert_eq!(told, [report, other_report]);
+    received.sort_by(|a, b| a.instance.cmp(&b.instance));
+    assert_eq!(received, [report, other_report]);
     Ok(())
 }
 
@@ -257,7 +258,7 @@ async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> a
             request.answer(&CommandReply { accepted: true, reason }).await;
         }
     });
-    // Until the two sessions know each other, the answer is that nobody is there.
+    // Until the two sessions are connected, the reply is that there is no controller.
     let answered = async {
         loop {
             if let Ok(reply) =
@@ -274,7 +275,7 @@ async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> a
     Ok(())
 }
 
-/// A Zenoh program that knows nothing of ours.
+/// A Zenoh program without this crate.
 struct Foreign {
     session: zenoh::Session,
 }

@@ -1,4 +1,4 @@
-//! Two hosts: the drone's own processes, its relay, and the ground.
+//! Two hosts: the processes on the drone, its relay, and the ground.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// Where the processes of one test meet.
+/// The ports of one test.
 #[derive(Clone)]
 struct Site {
     meet: u16,
@@ -37,7 +37,7 @@ impl Site {
     async fn open(&self, role: &str, service: &'static str, name: &str) -> anyhow::Result<Node> {
         let mut network = self.network(role);
         if role == "drone" {
-            // What `drone` connects to is its own meeting point.
+            // `drone` connects to its own rendezvous.
             network.connect = None;
         }
         let identity = Identity { service, instance: name.into() };
@@ -45,21 +45,21 @@ impl Site {
     }
 }
 
-/// Publishes until it is heard.
-async fn is_heard(from: &Node, by: &Node) -> anyhow::Result<()> {
+/// Publishes until a message is received.
+async fn is_received(from: &Node, by: &Node) -> anyhow::Result<()> {
     let subscriber = by.subscriber(topic::WIND, &[]).await?;
     let publisher = from.publisher(topic::WIND, &[]).await?;
     let wind = Wind { velocity_ned_m_s: [1.0, 2.0, 3.0], stamp_ns: 7 };
-    let heard = async {
+    let received = async {
         loop {
             publisher.publish(&wind).await;
-            if let Ok(Some(heard)) = timeout(Duration::from_millis(50), subscriber.next()).await {
-                return heard;
+            if let Ok(Some(wind)) = timeout(Duration::from_millis(50), subscriber.next()).await {
+                return wind;
             }
         }
     };
-    let heard = timeout(PATIENCE, heard).await.context("nothing is heard")?;
-    ensure!(heard == wind);
+    let received = timeout(PATIENCE, received).await.context("nothing is received")?;
+    ensure!(received == wind);
     Ok(())
 }
 
@@ -70,12 +70,12 @@ async fn the_ground_takes_part_through_the_drones_relay() -> anyhow::Result<()> 
     let camera = site.open("local", "camera-pub", "down").await?;
     let commands = controller.commands(topic::COMMAND, &[]).await?;
     controller.announce().await?;
-    // The ground is there before the relay is.
+    // The ground starts before the relay.
     let detector = site.open("ground", "detector", "ground").await?;
     detector.announce().await?;
     let relay = site.open("drone", "relay", "drone").await?;
-    is_heard(&camera, &detector).await?;
-    is_heard(&detector, &controller).await?;
+    is_received(&camera, &detector).await?;
+    is_received(&detector, &controller).await?;
     let answering = tokio::spawn(async move {
         let request = commands.next().await.context("a command")?;
         request.answer(&CommandReply { accepted: true, reason: "it is done".into() }).await;
@@ -86,32 +86,32 @@ async fn the_ground_takes_part_through_the_drones_relay() -> anyhow::Result<()> 
     let _commands = answering.await??;
     ensure!(controller.alive("detector", "*").await? == ["ground"]);
     ensure!(detector.alive("controller", "*").await? == ["main"]);
-    // Without the relay the drone is by itself; the next one has all together again.
+    // Without the relay the drone is disconnected; the next relay connects both again.
     let presence = controller.presence("detector").await?;
     let change = || async { timeout(PATIENCE, presence.next()).await?.ok_or(anyhow!("closed")) };
     ensure!(change().await? == ("ground".to_owned(), true));
     relay.close().await;
     ensure!(change().await? == ("ground".to_owned(), false));
-    is_heard(&camera, &controller).await?;
+    is_received(&camera, &controller).await?;
     let _relay = site.open("drone", "relay", "drone").await?;
     ensure!(change().await? == ("ground".to_owned(), true));
-    is_heard(&camera, &detector).await?;
-    is_heard(&detector, &controller).await
+    is_received(&camera, &detector).await?;
+    is_received(&detector, &controller).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn processes_on_the_ground_hear_each_other_without_the_drone() -> anyhow::Result<()> {
+async fn processes_on_the_ground_are_connected_without_the_drone() -> anyhow::Result<()> {
     let site = Site::new()?;
     let relay = site.open("drone", "relay", "drone").await?;
     let first = site.open("ground", "detector", "ground").await?;
     let second = site.open("ground", "gcs-bridge", "ground").await?;
-    is_heard(&first, &second).await?;
+    is_received(&first, &second).await?;
     relay.close().await;
-    is_heard(&first, &second).await
+    is_received(&first, &second).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_relay_stands_between() -> anyhow::Result<()> {
+async fn a_base_station_relays_between_drone_and_ground() -> anyhow::Result<()> {
     let drone = Site::new()?;
     let base = Site::new()?;
     let camera = drone.open("local", "camera-pub", "down").await?;
@@ -120,6 +120,6 @@ async fn a_relay_stands_between() -> anyhow::Result<()> {
     let identity = Identity { service: "relay", instance: "base".into() };
     let _between = Node::open(identity, &between.source("relay")?).await?;
     let detector = base.open("ground", "detector", "ground").await?;
-    is_heard(&camera, &detector).await?;
-    is_heard(&detector, &camera).await
+    is_received(&camera, &detector).await?;
+    is_received(&detector, &camera).await
 }

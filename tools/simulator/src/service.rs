@@ -53,7 +53,7 @@ const CLEAR_M: f64 = 0.04;
 /// # Errors
 /// When another simulator has the same name, the link cannot be opened, or the scene makes no sense.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
-    node.ensure_alone(&config.id).await?;
+    node.claim_unique_name(&config.id).await?;
     let stage = Arc::new(Stage::new(&config));
     let (stopped, _thread) = Camera::new(&node, &config, Arc::clone(&stage)).await?.start()?;
     let world = advance(&node, &config, &stage);

@@ -1,0 +1,81 @@
+//! Arguments that several subcommands share.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use node::network::variable;
+use node::{Network, ZenohSource};
+
+/// The role whose key the tools at the command line use.
+pub(crate) const OPERATOR: &str = "operator";
+
+/// The arguments of every service.
+#[derive(Args, Clone, Default)]
+pub(crate) struct ServiceArgs {
+    /// Settings over the defaults (TOML).
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// One setting over the file: dotted key, TOML value. May be repeated.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+    #[command(flatten)]
+    pub(crate) network: NetworkArgs,
+    #[command(flatten)]
+    pub(crate) parent: ParentArgs,
+}
+
+/// The process that started this one.
+#[derive(Args, Clone, Default)]
+pub(crate) struct ParentArgs {
+    /// Stop when the parent process with this number ends.
+    #[arg(long, hide = true, value_name = "PID")]
+    pub(crate) stop_with_parent: Option<u32>,
+}
+
+/// The network to join.
+#[derive(Args, Clone, Default)]
+#[command(next_help_heading = "Network")]
+pub(crate) struct NetworkArgs {
+    /// The network configuration: `local` (one machine), `ground`, or for the relay `drone` or `relay`; or a JSON5 file
+    /// [default: local].
+    #[arg(long, value_name = "ROLE|FILE", env = variable::ZENOH)]
+    zenoh: Option<PathBuf>,
+    /// Address of the drone, or of the relay to it: HOST or HOST:PORT.
+    #[arg(long, value_name = "ADDRESS", env = variable::CONNECT)]
+    connect: Option<String>,
+    /// Address at which the relay listens: HOST or HOST:PORT [default: port 7448 of all interfaces, with 7449 and 7450
+    /// for frames].
+    #[arg(long, value_name = "ADDRESS", env = variable::LISTEN)]
+    listen: Option<String>,
+    /// Rendezvous port of the processes of this machine, with `local` and `drone` [default: 7447].
+    #[arg(long, value_name = "PORT", env = variable::MEET)]
+    meet: Option<u16>,
+    /// The vehicle's name, the first part of all keys [default: drone].
+    #[arg(long, value_name = "NAME", env = variable::VEHICLE)]
+    vehicle: Option<String>,
+    /// Directory with the keys (`alight keys`). Connections are then encrypted, and each role has its access rights.
+    #[arg(long, value_name = "DIRECTORY", env = variable::KEYS)]
+    keys: Option<PathBuf>,
+}
+
+impl NetworkArgs {
+    /// The session's configuration for a process with the certificate of `role`.
+    pub(crate) fn source(&self, role: &str) -> anyhow::Result<ZenohSource> {
+        self.network().source(role)
+    }
+
+    pub(crate) fn network(&self) -> Network {
+        let Self { zenoh, connect, listen, meet, vehicle, keys } = self.clone();
+        Network { config: zenoh, vehicle, connect, listen, meet, keys }
+    }
+}
+
+/// The format of a result.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Format {
+    /// For people.
+    #[default]
+    Text,
+    /// For programs.
+    Json,
+}
