@@ -15,10 +15,10 @@ use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 use tokio::time::timeout;
 
-use crate::Service;
 use crate::args::{Format, NetworkArgs, OPERATOR};
 use crate::keys;
 use crate::runtime::{runtime, tool_identity};
+use crate::services::Service;
 use crate::site::{Job, Role, Site};
 use crate::terminal::print;
 
