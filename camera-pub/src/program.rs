@@ -1,5 +1,5 @@
-//! A camera read by another program (`rpicam-vid`, `ffmpeg`, `gst-launch-1.0`): frames from its standard output, each
-//! with its time of arrival.
+//! A camera read by another program (`rpicam-vid`, `ffmpeg`, `gst-launch-1.0`): frames from its standard
+//! output, each with its time of arrival.
 //!
 //! Any camera with such a program can be used, and none of their libraries is needed here.
 
@@ -73,8 +73,8 @@ impl Program {
         }
     }
 
-    /// Reads the frame that has begun to arrive: samples into `samples`, of [`FrameFormat::frame_bytes`]; a JPEG file is
-    /// returned.
+    /// Reads the frame that has begun to arrive: samples into `samples`, of [`FrameFormat::frame_bytes`]; a
+    /// JPEG file is returned.
     ///
     /// # Errors
     /// As [`Self::wait`].
@@ -219,9 +219,9 @@ impl<R: AsyncBufRead + Unpin> FrameReader<R> {
     }
 }
 
-/// True for a frame that was queued on its way, told from the time since the previous frame and the time the read waited:
-/// one that follows sooner than a camera can deliver, and one that was late but already there, so that it may have
-/// arrived at any time since it was due.
+/// True for a frame that was queued on its way, told from the time since the previous frame and the time the
+/// read waited: one that follows sooner than a camera can deliver, and one that was late but already there,
+/// so that it may have arrived at any time since it was due.
 fn was_queued(since_previous_ns: i64, waited_ns: i64, period_ns: i64) -> bool {
     let quarter_ns = period_ns / 4;
     since_previous_ns < quarter_ns

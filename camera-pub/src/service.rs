@@ -1,4 +1,5 @@
-//! The camera service: publishes a camera's frames as they arrive, or image files, sorted by path, at a constant rate.
+//! The camera service: publishes a camera's frames as they arrive, or image files, sorted by path, at a
+//! constant rate.
 
 use std::convert::Infallible;
 use std::path::{Path, PathBuf};
@@ -17,17 +18,18 @@ use tokio::sync::oneshot;
 use crate::config::{Config, FrameFormat, ProgramConfig};
 use crate::program::Program;
 
-/// Maximum number of images whose size is read at the start, to size the shared memory. Larger frames are published by
-/// a copy.
+/// Maximum number of images whose size is read at the start, to size the shared memory. Larger frames are
+/// published by a copy.
 const MAX_MEASURED_IMAGES: usize = 1000;
 /// Interval at which a service that waits for a subscriber looks for one.
 const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 
-/// Publishes frames until the images end, a shutdown is requested, no image can be read, or the camera's program exits
-/// or stops writing.
+/// Publishes frames until the images end, a shutdown is requested, no image can be read, or the camera's
+/// program exits or stops writing.
 ///
 /// # Errors
-/// When there is no image to publish, the program cannot be started or exits, or another camera has this name.
+/// When there is no image to publish, the program cannot be started or exits, or another camera has this
+/// name.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(config.instance()).await?;
     let found = {

@@ -32,8 +32,8 @@ pub struct AirConfig {
 pub enum Mode {
     /// The whole frame.
     Full,
-    /// The region of interest around the markers at full resolution, and an overview; while no marker is detected, one
-    /// tile of the frame after the other.
+    /// The region of interest around the markers at full resolution, and an overview; while no marker is
+    /// detected, one tile of the frame after the other.
     Roi,
 }
 

@@ -1,7 +1,7 @@
 //! Plans which parts of a frame are sent, at which scale and JPEG quality, so that they fit a size.
 //!
-//! The size of a JPEG file is predicted from the bytes per pixel of the last ones and a measured curve of size over
-//! quality.
+//! The size of a JPEG file is predicted from the bytes per pixel of the last ones and a measured curve of
+//! size over quality.
 
 use messages::{FrameHeader, FramePart};
 
@@ -12,7 +12,8 @@ use crate::prediction::Roi;
 const QUALITIES: [u8; 9] = [95, 90, 85, 75, 65, 55, 45, 35, 25];
 /// Candidate scales: pixels of the frame along the edge of one pixel of a part.
 const SCALES: [u32; 7] = [1, 2, 3, 4, 6, 8, 12];
-/// Minimum size of the smallest marker in an ROI of reduced resolution, in pixels: twice what is detected well.
+/// Minimum size of the smallest marker in an ROI of reduced resolution, in pixels: twice what is detected
+/// well.
 const MIN_MARKER_PX: f64 = 64.0;
 /// Share of the overview in the bytes of a frame.
 const OVERVIEW_SHARE: f64 = 0.25;
@@ -33,8 +34,8 @@ const MAX_OVERVIEW_PX: u32 = 330;
 const BLOCK: u32 = 8;
 /// Weight of a new file in the mean of bytes per pixel.
 const WEIGHT: f64 = 0.3;
-/// Size of JPEG files of rendered ground by quality, relative to quality 75, as measured by the example `jpeg` of
-/// `tools/experiments`.
+/// Size of JPEG files of rendered ground by quality, relative to quality 75, as measured by the example
+/// `jpeg` of `tools/experiments`.
 const SIZE_BY_QUALITY: [(u8, f64); 12] = [
     (1, 0.1),
     (20, 0.22),
@@ -113,8 +114,8 @@ impl Planner {
         }
     }
 
-    /// The whole frame if it fits, else its next tile at full resolution and an overview: reduced resolution or quality
-    /// would hide a distant marker.
+    /// The whole frame if it fits, else its next tile at full resolution and an overview: reduced resolution
+    /// or quality would hide a distant marker.
     fn tile(&mut self, size: FrameSize, max_bytes: f64) -> Plan {
         let whole = covering(size, 1);
         if whole.is_none_or(|whole| self.predicted_bytes(self.max_quality, &whole) <= max_bytes) {

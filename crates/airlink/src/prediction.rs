@@ -1,7 +1,8 @@
 //! Predicts the region of interest (ROI) of the next frame from the detections of the last ones.
 //!
-//! Each marker's centre moves at constant velocity, from its last two detections; its size stays. Uncertainty of the
-//! motion widens the ROI. A track ends after two frames without a detection: one may have been cut off by its ROI.
+//! Each marker's centre moves at constant velocity, from its last two detections; its size stays. Uncertainty
+//! of the motion widens the ROI. A track ends after two frames without a detection: one may have been cut off
+//! by its ROI.
 
 use messages::{Detection, Detections};
 

@@ -1,13 +1,13 @@
 //! Flow and congestion control: when the next frame may be sent, and how large it may be.
 //!
-//! A frame is sent only while fewer than `window` others are in flight, so that nothing queues on the link; frames that
-//! come meanwhile are dropped at the camera. A frame that takes much longer than those before it is delayed by a lost
-//! packet, and its TCP connection with it, for at least 200 ms when the packet is lost again: the next frame overtakes it
-//! on the other of two connections, the lanes. A frame without a receipt counts as lost after a timeout. Once one of
-//! several receivers has acknowledged a frame, the others get only a little more time, so that a slow or dead receiver
-//! does not block the rest. The size grows while the mean round trip is below its target, and shrinks above it: a mean,
-//! because a lost packet delays a single frame of any size. Of several receivers the one in use decides; while none of
-//! them is in use, the slowest.
+//! A frame is sent only while fewer than `window` others are in flight, so that nothing queues on the link;
+//! frames that come meanwhile are dropped at the camera. A frame that takes much longer than those before it
+//! is delayed by a lost packet, and its TCP connection with it, for at least 200 ms when the packet is lost
+//! again: the next frame overtakes it on the other of two connections, the lanes. A frame without a receipt
+//! counts as lost after a timeout. Once one of several receivers has acknowledged a frame, the others get
+//! only a little more time, so that a slow or dead receiver does not block the rest. The size grows while the
+//! mean round trip is below its target, and shrinks above it: a mean, because a lost packet delays a single
+//! frame of any size. Of several receivers the one in use decides; while none of them is in use, the slowest.
 //!
 //! The caller gives the time, in nanoseconds of any clock.
 
@@ -105,7 +105,8 @@ impl Window {
         }
     }
 
-    /// Makes this receiver decide while it answers. With `None`, or while it does not, the slowest of all decides.
+    /// Makes this receiver decide while it answers. With `None`, or while it does not, the slowest of all
+    /// decides.
     pub fn use_receiver(&mut self, name: Option<String>) {
         self.in_use = name;
     }
@@ -144,7 +145,8 @@ impl Window {
         (self.has_room(now_ns), lost)
     }
 
-    /// Switches to a lane without a late frame, the present one first. True when there is one and the window is not full.
+    /// Switches to a lane without a late frame, the present one first. True when there is one and the window
+    /// is not full.
     fn has_room(&mut self, now_ns: i64) -> bool {
         let late_ns = self.late_ns();
         let mut in_flight = 0;
@@ -192,7 +194,8 @@ impl Window {
         });
     }
 
-    /// Records a receipt. Returns the time since the frame was sent, in milliseconds; `None` for an unknown frame.
+    /// Records a receipt. Returns the time since the frame was sent, in milliseconds; `None` for an unknown
+    /// frame.
     pub fn received(&mut self, now_ns: i64, receiver: &str, sequence: u64) -> Option<f64> {
         let sent = self.sent.iter_mut().find(|sent| sent.sequence == sequence)?;
         sent.is_acknowledged = true;
@@ -232,7 +235,8 @@ impl Window {
     }
 
     fn adapt(&mut self, took_ms: f64, bytes: usize) {
-        // Clamped, because a lost packet does not measure the link; a link that becomes slow is followed in some steps.
+        // Clamped, because a lost packet does not measure the link; a link that becomes slow is followed in
+        // some steps.
         let late_ms = self.late_ns() as f64 * 1e-6;
         let measured_ms = took_ms.min(late_ms);
         let mean_ms = match self.mean_ms {

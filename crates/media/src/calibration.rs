@@ -1,8 +1,9 @@
 //! Calibration files of other programs: their intrinsics as a camera model.
 //!
 //! Three formats are read and distinguished by their keys: ROS `camera_info` (`camera_matrix` or `K`, with
-//! `image_width`), Kalibr's camera chain (`cam0` with `intrinsics`), and OpenCV's `FileStorage` (`camera_matrix` of type
-//! `opencv-matrix`). In all of them the centre of the top-left pixel is (0, 0), as in this project.
+//! `image_width`), Kalibr's camera chain (`cam0` with `intrinsics`), and OpenCV's `FileStorage`
+//! (`camera_matrix` of type `opencv-matrix`). In all of them the centre of the top-left pixel is (0, 0), as
+//! in this project.
 
 use std::path::{Path, PathBuf};
 
@@ -67,8 +68,8 @@ struct Problem {
     expected: &'static str,
 }
 
-/// The intrinsics in a calibration file: ROS `camera_info` YAML, the first camera of a Kalibr camchain (pinhole with
-/// radtan, equidistant or no distortion), or OpenCV `FileStorage` YAML.
+/// The intrinsics in a calibration file: ROS `camera_info` YAML, the first camera of a Kalibr camchain
+/// (pinhole with radtan, equidistant or no distortion), or OpenCV `FileStorage` YAML.
 ///
 /// # Errors
 /// [`CalibrationError`] names the file, the key and the expected value.
@@ -238,7 +239,8 @@ fn distortion(
     }
 }
 
-/// OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6. Coefficients of a thin prism or a tilted sensor must be zero.
+/// OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6. Coefficients of a thin prism or a tilted sensor must be
+/// zero.
 fn brown_conrady(key: &str, coefficients: &[f64]) -> Result<Distortion, Problem> {
     let beyond = coefficients.iter().skip(8).any(|c| *c != 0.0);
     if !matches!(coefficients.len(), 4 | 5 | 8 | 12 | 14) || beyond {

@@ -97,8 +97,8 @@ pub enum ImageError {
 /// File extensions of images.
 pub const IMAGE_EXTENSIONS: &[&str] = &["png", "jpg", "jpeg"];
 
-/// The images at a path: the file itself, or those in a folder and its subfolders, sorted by path. The files are not
-/// opened.
+/// The images at a path: the file itself, or those in a folder and its subfolders, sorted by path. The files
+/// are not opened.
 ///
 /// # Errors
 /// [`ImageError`] for a folder that cannot be listed or holds no images.
@@ -157,9 +157,9 @@ pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
     extensions.iter().any(|known| extension.eq_ignore_ascii_case(known))
 }
 
-/// An image file (PNG or JPEG) in grey, oriented as its Exif data says. Colours are weighted by ITU-R BT.601, 16-bit
-/// grey is scaled to the range it uses, transparent pixels are blended with white. With a `bayer` pattern, an image of
-/// one channel is a sensor's raw samples.
+/// An image file (PNG or JPEG) in grey, oriented as its Exif data says. Colours are weighted by ITU-R BT.601,
+/// 16-bit grey is scaled to the range it uses, transparent pixels are blended with white. With a `bayer`
+/// pattern, an image of one channel is a sensor's raw samples.
 ///
 /// # Errors
 /// [`ImageError`] when the file cannot be read, is not a complete image, or has more than `max_pixels`.
@@ -265,8 +265,8 @@ impl DecodedImage {
         }
     }
 
-    /// Writes the samples unchanged, row by row, into a buffer of width times height times bytes per sample; 16-bit
-    /// samples little-endian. Images that are not raw are written in grey.
+    /// Writes the samples unchanged, row by row, into a buffer of width times height times bytes per sample;
+    /// 16-bit samples little-endian. Images that are not raw are written in grey.
     pub fn write_samples(&self, out: &mut [u8]) {
         match &self.image {
             DynamicImage::ImageLuma16(image) => {

@@ -1,4 +1,5 @@
-//! JPEG files in a stream of bytes: where one starts (SOI) and where it ends (EOI), after ISO/IEC 10918-1, Annex B.
+//! JPEG files in a stream of bytes: where one starts (SOI) and where it ends (EOI), after ISO/IEC 10918-1,
+//! Annex B.
 
 /// Start-of-image marker.
 const SOI: [u8; 2] = [0xff, 0xd8];
@@ -15,8 +16,8 @@ pub(crate) fn jpeg_len(bytes: &[u8]) -> Option<usize> {
     end_of_image(bytes, &mut SOI.len())
 }
 
-/// The next JPEG file in `bytes`, at or after `at`, which moves behind it. A file whose segments do not lead to an EOI
-/// marker ends where EOI and SOI follow each other, or with the stream.
+/// The next JPEG file in `bytes`, at or after `at`, which moves behind it. A file whose segments do not lead
+/// to an EOI marker ends where EOI and SOI follow each other, or with the stream.
 pub(crate) fn next_jpeg<'a>(bytes: &'a [u8], at: &mut usize) -> Option<&'a [u8]> {
     let rest = bytes.get(*at..)?;
     let start = rest.windows(3).position(|w| w == [SOI[0], SOI[1], 0xff])?;
@@ -29,8 +30,8 @@ pub(crate) fn next_jpeg<'a>(bytes: &'a [u8], at: &mut usize) -> Option<&'a [u8]>
     file.get(..len)
 }
 
-/// Follows the segments from `at`, a place between segments or in coded data, to the end of the EOI marker. Where bytes
-/// are missing, `at` is the place to go on from once there are more.
+/// Follows the segments from `at`, a place between segments or in coded data, to the end of the EOI marker.
+/// Where bytes are missing, `at` is the place to go on from once there are more.
 fn end_of_image(bytes: &[u8], at: &mut usize) -> Option<usize> {
     loop {
         let ahead = bytes.get(*at..)?;
@@ -65,8 +66,8 @@ pub struct JpegScanner {
 }
 
 impl JpegScanner {
-    /// Takes bytes up to the next event, which is the end of an SOI marker or of an EOI marker, and returns how many it
-    /// took. After an EOI marker it takes nothing until [`Self::take`].
+    /// Takes bytes up to the next event, which is the end of an SOI marker or of an EOI marker, and returns
+    /// how many it took. After an EOI marker it takes nothing until [`Self::take`].
     pub fn push(&mut self, bytes: &[u8]) -> usize {
         if self.is_complete {
             return 0;

@@ -2,8 +2,8 @@
 //!
 //! The crate reads files. It knows no marker, no camera that is connected, and no other process.
 //!
-//! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, [`image`] reads image files, [`video`]
-//! reads videos frame by frame, [`calibration`] reads the calibration files of other programs.
+//! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, [`image`] reads image files,
+//! [`video`] reads videos frame by frame, [`calibration`] reads the calibration files of other programs.
 
 pub mod calibration;
 pub mod image;

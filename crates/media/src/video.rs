@@ -1,4 +1,5 @@
-//! Videos, frame by frame: Motion JPEG (AVI, or a bare stream of JPEG files) and H.264 (MP4, or a bare stream).
+//! Videos, frame by frame: Motion JPEG (AVI, or a bare stream of JPEG files) and H.264 (MP4, or a bare
+//! stream).
 
 use std::collections::VecDeque;
 use std::fs::File;
