@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use geometry::Pixel;
-use rendering::views::{Binning, HIGHEST_M, SIZE_M, Studio, Truth, View, laterals_m, views};
+use rendering::views::{Binning, MAX_HEIGHT_M, SIZE_M, TestScene, Truth, View, laterals_m, views};
 use serde_json::Value;
 
 const FAMILIES: [&str; 2] = ["rings", "rings-thesis"];
@@ -108,7 +108,7 @@ fn measure(binning: Binning, repeats: u32) -> [Vec<Row>; 2] {
     let lines = lines(&output);
     assert_eq!(lines.len(), shown.len());
     FAMILIES.map(|family| {
-        let mut rows: Vec<Row> = (0..HIGHEST_M).map(|_| Row::default()).collect();
+        let mut rows: Vec<Row> = (0..MAX_HEIGHT_M).map(|_| Row::default()).collect();
         for line in &lines {
             let (view, truth) = &shown[line["image"].as_str().unwrap()];
             let detections = list(&line["detections"]).iter();
@@ -121,10 +121,10 @@ fn measure(binning: Binning, repeats: u32) -> [Vec<Row>; 2] {
 
 fn take_frames(binning: Binning, repeats: u32, folder: &Path) -> HashMap<String, (View, Truth)> {
     let camera = binning.camera();
-    let mut studio = Studio::new(binning).unwrap();
+    let mut scene = TestScene::new(binning).unwrap();
     let mut shown = HashMap::new();
     for view in [0.0, 5.0].into_iter().flat_map(|tilt_deg| views(binning, tilt_deg, repeats)) {
-        let (pixels, truth) = studio.take(&view).unwrap();
+        let (pixels, truth) = scene.render(&view).unwrap();
         let path = folder.join(format!("{}.png", view.name()));
         let grey = image::ColorType::L8;
         image::save_buffer(&path, &pixels, camera.width, camera.height, grey).unwrap();
@@ -269,7 +269,7 @@ fn crc_32(bytes: &[u8]) -> u32 {
 fn photo_of_the_marker(folder: &Path, name: &str) -> Vec<u8> {
     let binning = Binning::FourByFour;
     let view = View { binning, height_m: 2, lateral_m: 0.0, tilt_deg: 0.0, repeat: 0 };
-    let (pixels, _) = Studio::new(binning).unwrap().take(&view).unwrap();
+    let (pixels, _) = TestScene::new(binning).unwrap().render(&view).unwrap();
     let camera = binning.camera();
     let path = folder.join(name);
     let grey = image::ColorType::L8;

@@ -7,17 +7,17 @@ use fiducial::{Detector, Settings};
 use geometry::CameraModel;
 use imaging::GrayView;
 use markers::Marker;
-use rendering::views::{Binning, Studio, View};
+use rendering::views::{Binning, TestScene, View};
 
 /// What a detector may allocate at first, in frames.
 const MOST_FRAMES: f64 = 8.0;
 
 /// A marker on painted asphalt, from several heights.
 fn frames(binning: Binning) -> [Vec<u8>; 4] {
-    let mut studio = Studio::new(binning).unwrap();
+    let mut scene = TestScene::new(binning).unwrap();
     [3, 2, 6, 9].map(|height_m| {
         let view = View { binning, height_m, lateral_m: 0.0, tilt_deg: 5.0, repeat: 0 };
-        studio.take(&view).unwrap().0
+        scene.render(&view).unwrap().0
     })
 }
 

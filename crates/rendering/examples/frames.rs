@@ -1,8 +1,8 @@
-//! Writes frames of the thesis' marker with their truth, at both binnings, for `alight detect` and other detectors:
-//! `cargo run --release -p rendering --example frames -- FOLDER`.
+//! Writes frames of the thesis' marker with their truth, at both binnings, for `alight detect` and other
+//! detectors: `cargo run --release -p rendering --example frames -- FOLDER`.
 //!
-//! Five frames at each of the thesis' positions, straight down and tilted by 5 degrees: PNG files in a folder for each
-//! camera and tilt, its calibration beside it, and a line for each in `truth.jsonl`.
+//! Five frames at each of the thesis' positions, straight down and tilted by 5 degrees: PNG files in a folder
+//! for each camera and tilt, its calibration beside it, and a line for each in `truth.jsonl`.
 #![allow(clippy::print_stdout, reason = "a program for people at a terminal")]
 
 use std::error::Error;
@@ -10,7 +10,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-use rendering::views::{Binning, Studio, views};
+use rendering::views::{Binning, TestScene, views};
 use serde_json::json;
 
 const BINNINGS: [Binning; 2] = [Binning::TwoByTwo, Binning::FourByFour];
@@ -41,10 +41,10 @@ fn write_frames(
     let inner = format!("{}-tilt{tilt_deg}", binning.name());
     std::fs::create_dir_all(folder.join(&inner))?;
     let camera = binning.camera();
-    let mut studio = Studio::new(binning)?;
+    let mut scene = TestScene::new(binning)?;
     let views = views(binning, tilt_deg, REPEATS);
     for view in &views {
-        let (pixels, shown) = studio.take(view)?;
+        let (pixels, shown) = scene.render(view)?;
         let image = format!("{inner}/{}.png", view.name());
         let grey = image::ColorType::L8;
         image::save_buffer(folder.join(&image), &pixels, camera.width, camera.height, grey)?;

@@ -1,8 +1,7 @@
-//! What the ground looks like: textures that repeat, each over a period and at a resolution of its own.
+//! Textures of the ground, which repeat, each with its own period and resolution.
 //!
-//! Coarse and fine grain are tiles of 8-bit texels with all their halved copies (a mip pyramid); patches
-//! metres across lie under both, so that no repetition is seen from the heights at which a tile's period fits into
-//! the picture.
+//! Coarse and fine grain are tiles of 8-bit texels with mipmaps. Patches metres across hide the repetition from
+//! heights at which a tile's period fits into the image.
 
 use std::f32::consts::TAU;
 use std::str::FromStr;
@@ -24,7 +23,7 @@ pub enum Surface {
 }
 
 impl Surface {
-    /// Every kind, in the order in which they are listed to people.
+    /// Every kind, in the order of messages.
     pub const ALL: [Self; 4] = [Self::Asphalt, Self::Grass, Self::Tiles, Self::Plain];
 
     /// The name in configuration.
@@ -44,25 +43,25 @@ impl FromStr for Surface {
     fn from_str(text: &str) -> Result<Self, String> {
         Self::ALL.into_iter().find(|surface| surface.name() == text).ok_or_else(|| {
             let known = Self::ALL.map(Self::name).join(", ");
-            format!("there is no ground `{text}`; known are {known}")
+            format!("unknown ground `{text}`; it must be one of {known}")
         })
     }
 }
 
-/// A row of pixels on the ground: where it begins and ends, and how much of the ground a pixel mixes.
+/// A row of pixels on the ground: its ends, and the area that a pixel averages.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Span {
     /// North and east of the first pixel's centre, in metres.
     pub from_m: [f64; 2],
     /// North and east of the pixel after the last, in metres.
     pub to_m: [f64; 2],
-    /// How far the pixels move over the ground during the exposure, in metres.
+    /// Motion of the pixels over the ground during the exposure, in metres.
     pub smear_m: [f64; 2],
-    /// Edge of the ground that a pixel sees, in metres.
+    /// Edge of the area that a pixel sees, in metres.
     pub footprint_m: f64,
 }
 
-/// A ground, ready to be looked at.
+/// The ground and its textures.
 #[derive(Clone, Debug)]
 pub struct Ground {
     mean: f32,
@@ -71,30 +70,30 @@ pub struct Ground {
     patches: Option<Patches>,
 }
 
-/// A texel's edge in footprints: the blur of bilinear sampling then equals that of a pixel behind a usual lens
-/// (variances of a texel's box and of the interpolation's triangle against a box and a Gaussian).
+/// Edge of a texel in footprints for bilinear sampling, whose blur (box and triangle) then has the variance of a
+/// pixel behind a common lens (box and Gaussian).
 const TEXEL_PER_FOOTPRINT: f64 = 1.33;
 
-/// Nearest texels, whose blur has no triangle, are finer.
+/// Edge of a texel in footprints for nearest-neighbour sampling, whose blur has no triangle.
 const NEAREST_TEXEL_PER_FOOTPRINT: f64 = 0.8;
 
-/// A smear longer than this many texels is made of several nearest texels instead of four interpolated ones.
+/// Motion above which samples along it replace bilinear interpolation, in texels.
 const LONG_SMEAR: f64 = 1.5;
 
-/// Places at which a pixel with a long smear looks at the ground.
+/// Number of samples along a long motion.
 const TAPS: usize = 3;
 
-/// Pixels looked up at a time.
+/// Number of pixels sampled together.
 const BATCH: usize = 64;
 
-/// Pixels from one look at a texture to the next where they are that fine.
+/// Distance between samples where pixels are much finer than texels, in pixels.
 const STRIDE: usize = 4;
 
-/// Variations below this reflectance are left out: they are a fraction of a grey level.
-const LEAST_CONTRAST: f32 = 0.0025;
+/// Minimum standard deviation of a texture level, as a reflectance: less is a fraction of a grey level.
+const MIN_CONTRAST: f32 = 0.0025;
 
 impl Ground {
-    /// The ground of this kind that `seed` grows.
+    /// A ground of this kind, generated from `seed`.
     pub fn new(surface: Surface, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x6772_6f75_6e64);
         match surface {
@@ -105,12 +104,12 @@ impl Ground {
         }
     }
 
-    /// Reflectance from afar.
+    /// Mean reflectance.
     pub fn mean(&self) -> f32 {
         self.mean
     }
 
-    /// Reflectance of the ground at a place (north and east in metres) as far as it changes over metres only.
+    /// Reflectance at a point (north and east in metres) without the grain.
     pub fn patch(&self, place_m: [f64; 2]) -> f32 {
         self.mean + self.patches.as_ref().map_or(0.0, |patches| patches.at(place_m))
     }
@@ -123,28 +122,28 @@ impl Ground {
     }
 }
 
-/// A square tile of texels and its halved copies.
+/// A square tile of texels and its mipmaps.
 #[derive(Clone, Debug)]
 struct Texture {
     texel_m: f64,
     /// Reflectance per unit of a texel.
     gain: f32,
-    /// From fine to coarse; each has half the edge of the one before.
+    /// From fine to coarse; each has half the edge of the previous one.
     levels: Vec<Level>,
 }
 
-/// One resolution of a tile; a texel of 128 changes nothing.
+/// One resolution of a tile. A texel of 128 adds nothing.
 #[derive(Clone, Debug)]
 struct Level {
     /// Edge in texels as a power of two.
     log2: u32,
-    /// Each texel with the one below it in the upper byte, row by row; a row is followed by its first texel again, so
-    /// that the neighbour to the right always comes next.
+    /// Each texel with the one below it in the upper byte, row by row. Each row ends with its first texel again,
+    /// so that the right neighbour always follows.
     pairs: Vec<u16>,
 }
 
 impl Texture {
-    /// From reflectances about 0 on a square of 2^`log2` texels.
+    /// From zero-mean reflectances on a square of 2^`log2` texels.
     fn new(texel_m: f64, log2: u32, mut values: Vec<f32>) -> Self {
         let largest = values.iter().fold(1e-6f32, |m, v| m.max(v.abs()));
         let gain = largest / 127.0;
@@ -152,7 +151,7 @@ impl Texture {
         for log2 in (0..=log2).rev() {
             levels.push(Level::new(log2, &values, gain));
             values = halve(&values, 1 << log2);
-            if deviation(&values) < LEAST_CONTRAST {
+            if deviation(&values) < MIN_CONTRAST {
                 break;
             }
         }
@@ -170,7 +169,7 @@ impl Texture {
             }
             return;
         }
-        // What a tap does not see of its share of the smear, coarser texels see for it.
+        // The texels are as coarse as the distance between samples.
         let share_m = (smear_m / TAPS as f64).max(span.footprint_m);
         let halvings = nearest_log2(share_m * NEAREST_TEXEL_PER_FOOTPRINT / self.texel_m);
         let texel_m = self.texel_m * (1u64 << halvings) as f64;
@@ -180,7 +179,7 @@ impl Texture {
     }
 }
 
-/// A span in texels with 16 binary places; whole periods wrap.
+/// A span in texels, as fixed-point numbers with 16 fractional bits, which wrap around.
 struct Walk {
     start: [u32; 2],
     step: [u32; 2],
@@ -219,7 +218,7 @@ impl Level {
     }
 
     fn add_bilinear(&self, gain: f32, walk: &Walk, row: &mut [f32]) {
-        // The centre of a texel is half a texel from its corner.
+        // From texel corners to texel centres.
         let [mut x, mut y] = walk.start.map(|s| s.wrapping_sub(1 << 15));
         let [dx, dy] = walk.step;
         let fine = |step: u32| (step as i32).unsigned_abs() < (1 << 16) / STRIDE as u32;
@@ -229,7 +228,7 @@ impl Level {
         }
         let mut fours = [0; BATCH];
         for values in row.chunks_mut(BATCH) {
-            // Where to look, looking, and mixing in turn lets the first and the last work on several pixels at once.
+            // Three loops, so that indices and interpolation are vectorised.
             for (index, four) in fours.iter_mut().enumerate() {
                 let ahead = index as u32;
                 let (x, y) = (
@@ -248,7 +247,7 @@ impl Level {
         }
     }
 
-    /// Looks up only some of the pixels within a texel, and interpolates those between.
+    /// Samples every [`STRIDE`]th pixel and interpolates between them.
     fn add_sparsely(&self, gain: f32, start: [u32; 2], step: [u32; 2], row: &mut [f32]) {
         let [mut x, mut y] = start;
         let mut from = mixed(self.four(self.index(x, y)), x, y) * gain;
@@ -264,14 +263,14 @@ impl Level {
         }
     }
 
-    /// Where the texel at a place is.
+    /// Index of the texel at a point.
     fn index(&self, x: u32, y: u32) -> u32 {
         let mask = (1u32 << self.log2) - 1;
         let (column, row) = ((x >> 16) & mask, (y >> 16) & mask);
         (row << self.log2) + row + column
     }
 
-    /// A texel and, in the higher bytes, those below, to the right, and below that.
+    /// A texel and, in the higher bytes, those below, right, and below right.
     fn four(&self, index: u32) -> u32 {
         match self.pairs.get(index as usize..index as usize + 2) {
             Some(&[left, right]) => u32::from(left) | (u32::from(right) << 16),
@@ -312,7 +311,7 @@ impl Level {
     }
 }
 
-/// Four texels, interpolated, about 128.
+/// Bilinear interpolation of four texels, minus 128.
 fn mixed(four: u32, x: u32, y: u32) -> f32 {
     let byte = |shift: u32| ((four >> shift) & 255) as i32 as f32;
     let [fx, fy] = [x, y].map(|place| (place & 0xffff) as i32 as f32 * (1.0 / 65_536.0));
@@ -321,12 +320,12 @@ fn mixed(four: u32, x: u32, y: u32) -> f32 {
     left + (right - left) * fx - 128.0
 }
 
-/// Texels with 16 binary places; whole periods wrap.
+/// Texels as a fixed-point number with 16 fractional bits, which wraps around.
 fn fixed(texels: f64) -> u32 {
     (texels * 65_536.0) as i64 as u32
 }
 
-/// The binary logarithm, rounded, and 0 for what is below 1: read off the exponent.
+/// The rounded binary logarithm, from the exponent; 0 below 1.
 fn nearest_log2(value: f64) -> usize {
     let exponent = ((value * std::f64::consts::SQRT_2).to_bits() >> 52) & 0x7ff;
     (exponent as usize).saturating_sub(1023)
@@ -346,7 +345,7 @@ fn halve(values: &[f32], edge: usize) -> Vec<f32> {
         .collect()
 }
 
-/// Slow changes over metres.
+/// Variation over metres.
 #[derive(Clone, Debug)]
 struct Patches {
     values: Vec<f32>,
@@ -446,7 +445,8 @@ fn tiles(rng: &mut ChaCha8Rng) -> Ground {
     }
 }
 
-/// Value noise on a square of 2^`log2` texels that repeats: a sum of (log2 of the wavelength in texels, amplitude).
+/// Periodic value noise on a square of 2^`log2` texels: a sum of octaves (log2 of the wavelength in texels,
+/// amplitude).
 fn noise(rng: &mut impl Rng, log2: u32, octaves: &[(u32, f32)]) -> Vec<f32> {
     let edge = 1usize << log2;
     let mut sum = vec![0.0f32; edge * edge];
@@ -488,14 +488,14 @@ fn normalise(values: &mut [f32], to: f32) {
     values.iter_mut().for_each(|v| *v *= factor);
 }
 
-/// Values about their mean.
+/// Values minus their mean.
 fn centred(mut values: Vec<f32>) -> Vec<f32> {
     let mean = values.iter().map(|v| f64::from(*v)).sum::<f64>() / values.len().max(1) as f64;
     values.iter_mut().for_each(|v| *v -= mean as f32);
     values
 }
 
-/// A place on a tile at which something small is drawn; what crosses an edge comes in on the other side.
+/// A point on a tile at which a small shape is drawn; it wraps around at the edges.
 struct Canvas<'a> {
     values: &'a mut [f32],
     log2: u32,
@@ -503,13 +503,13 @@ struct Canvas<'a> {
     y: f32,
 }
 
-/// The texel that holds a place not far outside a tile.
+/// The texel at a coordinate near a tile.
 fn texel(place: f32) -> i32 {
     const FAR: f32 = 4096.0;
     (place + FAR) as i32 - FAR as i32
 }
 
-/// Draws `count` things at random places.
+/// Draws `count` shapes at random points.
 fn scatter(
     values: &mut [f32],
     log2: u32,
@@ -591,7 +591,7 @@ mod tests {
     }
 
     #[test]
-    fn every_ground_but_the_plain_one_has_grain_at_every_height() {
+    fn every_ground_except_plain_has_grain_at_every_height() {
         for surface in Surface::ALL {
             let ground = Ground::new(surface, 1);
             for height_m in [0.3, 1.0, 3.0, 10.0] {
@@ -603,7 +603,7 @@ mod tests {
     }
 
     #[test]
-    fn motion_wipes_grain_out_and_keeps_the_mean() {
+    fn motion_blurs_grain_and_keeps_the_mean() {
         let ground = Ground::new(Surface::Asphalt, 1);
         let (still, moved) = (row(&ground, &span(2.0, 0.0)), row(&ground, &span(2.0, 24.0)));
         assert!(contrast(&moved) < 0.85 * contrast(&still));
@@ -612,14 +612,14 @@ mod tests {
     }
 
     #[test]
-    fn the_seed_is_all_that_chance_knows() {
+    fn a_ground_depends_on_its_seed_only() {
         let look = |seed| row(&Ground::new(Surface::Grass, seed), &span(2.0, 0.0));
         assert_eq!(look(7), look(7));
         assert_ne!(look(7), look(8));
     }
 
     #[test]
-    fn a_texture_repeats_without_a_seam_and_takes_any_place() {
+    fn a_texture_repeats_without_a_seam_and_accepts_any_point() {
         let ground = Ground::new(Surface::Tiles, 3);
         let at = |north_m: f64| {
             let mut value = [0.0];

@@ -1,16 +1,19 @@
-//! Pictures of printed markers on the ground, with their truth: what a camera over a pad would see.
+//! Images of printed markers on the ground, with their truth: what a camera above a pad would see.
 //!
-//! This crate knows drawings of markers, cameras as models, and poses. It knows no vehicle, no file, no clock, and
-//! nothing of how markers are found; a seed decides all that is left to chance.
+//! The crate knows drawings of markers, camera models and poses. It knows no vehicle, file or clock, and no
+//! detector. All randomness comes from a seed.
 //!
-//! Modules in reading order: [`render`] is the camera, [`veil`] what is between it and the scene, [`ground`] what lies
-//! around the pads, [`views`] the frames of the thesis' experiment.
+//! Modules in reading order: [`scene`] has what is rendered and the camera, [`render`] renders it,
+//! [`occluder`] has effects between scene and sensor, [`ground`] the textures around the pads, [`views`] the
+//! frames of the thesis' experiment.
 
 pub mod ground;
+pub mod occluder;
 pub mod render;
-pub mod veil;
+pub mod scene;
 pub mod views;
 
 pub use ground::Surface;
-pub use render::{CameraSettings, PadInScene, RenderError, Renderer, Scene};
-pub use veil::Veil;
+pub use occluder::Occluder;
+pub use render::Renderer;
+pub use scene::{CameraSettings, PadInScene, RenderError, Scene};

@@ -1,20 +1,21 @@
-//! The thesis' marker from above, at the reference positions of the thesis' experiment (Table 4.1): which frames there
-//! are, their pixels and their truth.
+//! The thesis' marker from above, at the reference positions of the thesis' experiment (Table 4.1): the
+//! frames, their pixels and their truth.
 
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 
 use crate::ground::Surface;
-use crate::render::{CameraSettings, PadInScene, RenderError, Renderer, Scene};
+use crate::render::Renderer;
+use crate::scene::{CameraSettings, PadInScene, RenderError, Scene};
 use geometry::{Body, Camera, CameraModel, Marker, Ned, Pixel, Rotation, Transform, Vector};
 
 /// Outer diameter of the thesis' marker, in metres.
 pub const SIZE_M: f64 = 0.15341;
 
-/// The highest camera, in metres above the marker; the lowest is at 1 m.
-pub const HIGHEST_M: u32 = 13;
+/// Maximum height of the camera above the marker, in metres; the minimum is 1 m.
+pub const MAX_HEIGHT_M: u32 = 13;
 
-/// Neighbouring photosites of the thesis' sensor that make one pixel.
+/// Binning of the thesis' sensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Binning {
     /// 1296 x 972 pixels of 4.4 um behind 8 mm.
@@ -37,8 +38,8 @@ impl Binning {
         self.settings().model
     }
 
-    /// At 4 x 4 a pixel is the sum of four of those at 2 x 2: the lens' blur is half as many pixels, light and well
-    /// are four times as much, and four readings have twice the noise of one.
+    /// The camera's settings. At 4 x 4 a pixel is the sum of four of those at 2 x 2: half the lens blur in
+    /// pixels, four times the light and full well, and twice the read noise.
     pub fn settings(self) -> CameraSettings {
         let fine = CameraSettings::thesis();
         match self {
@@ -54,11 +55,11 @@ impl Binning {
         }
     }
 
-    /// The intrinsics in the form of ROS `camera_info`.
+    /// The intrinsics as ROS `camera_info` YAML.
     pub fn calibration(self) -> String {
         let CameraModel { width, height, fx, fy, cx, cy, .. } = self.camera();
         let mut text = format!("image_width: {width}\nimage_height: {height}\n");
-        // Writing to a text cannot fail.
+        // Writing to a string cannot fail.
         let _ = writeln!(
             text,
             "camera_matrix: {{rows: 3, cols: 3, data: [{fx}, 0, {cx}, 0, {fy}, {cy}, 0, 0, 1]}}"
@@ -71,22 +72,22 @@ impl Binning {
     }
 }
 
-/// One frame to take.
+/// A frame to render.
 #[derive(Clone, Copy, Debug)]
 pub struct View {
     /// The camera's binning.
     pub binning: Binning,
     /// Height of the camera above the marker's face.
     pub height_m: u32,
-    /// How far the marker is to the right of the camera's axis, where the camera does not tilt.
+    /// Distance of the marker to the right of the axis of a camera without tilt, in metres.
     pub lateral_m: f64,
-    /// The axis' angle from straight down, in degrees.
+    /// Angle of the axis from straight down, in degrees.
     pub tilt_deg: f64,
-    /// Counts the frames of a position.
+    /// Number of the frame at its position.
     pub repeat: u32,
 }
 
-/// Where the thesis' marker lies across the axis, in metres, at a distance (Table 4.1).
+/// Lateral positions of the thesis' marker at a height, in metres (Table 4.1).
 pub fn laterals_m(height_m: u32) -> &'static [f64] {
     match height_m {
         ..=1 => &[0.0],
@@ -96,10 +97,10 @@ pub fn laterals_m(height_m: u32) -> &'static [f64] {
     }
 }
 
-/// So many frames at each position of one camera that tilts by so much.
+/// `repeats` frames at each position, of one camera at one tilt.
 pub fn views(binning: Binning, tilt_deg: f64, repeats: u32) -> Vec<View> {
     let mut views = Vec::new();
-    for height_m in 1..=HIGHEST_M {
+    for height_m in 1..=MAX_HEIGHT_M {
         for lateral_m in laterals_m(height_m).iter().copied() {
             let view = |repeat| View { binning, height_m, lateral_m, tilt_deg, repeat };
             views.extend((0..repeats).map(view));
@@ -109,7 +110,7 @@ pub fn views(binning: Binning, tilt_deg: f64, repeats: u32) -> Vec<View> {
 }
 
 impl View {
-    /// A name that says it all: `2x2-tilt0-07m-left2.0m-3`.
+    /// A unique name, such as `2x2-tilt0-07m-left2.0m-3`.
     pub fn name(&self) -> String {
         let side = match self.lateral_m {
             ..0.0 => "left",
@@ -126,20 +127,20 @@ impl View {
         )
     }
 
-    /// A number that no other frame of the same binning has.
+    /// A number that is unique among the frames of a binning.
     fn index(&self) -> u32 {
         let position = self.height_m * 10 + (self.lateral_m * 2.0 + 4.0) as u32;
         (position * 100 + self.repeat % 100) * 100 + self.tilt_deg as u32
     }
 
-    /// `ned_from_body` for a camera that sees the marker's centre within a few pixels of where the position says.
+    /// `ned_from_body` for a camera that sees the marker's centre within a few pixels of the position's.
     /// Heading, direction of the tilt and the pixel are spread evenly over the frames.
     fn ned_from_body(
         &self,
         settings: &CameraSettings,
         ned_from_marker: &Transform<Ned, Marker>,
     ) -> Transform<Ned, Body> {
-        const FEW_PX: f64 = 4.0;
+        const MAX_JITTER_PX: f64 = 4.0;
         let spread = Spread { index: self.index() };
         let (heading, towards) = (spread.fraction(1) * TAU, spread.fraction(2) * TAU);
         let tilt = self.tilt_deg.to_radians();
@@ -152,7 +153,7 @@ impl View {
         let ned_from_camera = ned_from_body * settings.body_from_camera.rotation();
         let camera = &settings.model;
         let lateral_px = camera.fx * self.lateral_m / f64::from(self.height_m);
-        let jitter_px = |i| FEW_PX * (2.0 * spread.fraction(i) - 1.0);
+        let jitter_px = |i| MAX_JITTER_PX * (2.0 * spread.fraction(i) - 1.0);
         let seen_at = Pixel::new(camera.cx + lateral_px + jitter_px(3), camera.cy + jitter_px(4));
         let sight = ned_from_camera * camera.unproject(seen_at);
         let place = ned_from_marker.origin() - sight * (f64::from(self.height_m) / sight.z());
@@ -161,14 +162,14 @@ impl View {
     }
 }
 
-/// Evenly spread numbers: the additive sequence in four dimensions of the generalised golden ratio (Roberts, "The
-/// unreasonable effectiveness of quasirandom sequences", 2018).
+/// Quasirandom numbers: the additive sequence in four dimensions of the generalised golden ratio (Roberts,
+/// "The unreasonable effectiveness of quasirandom sequences", 2018).
 struct Spread {
     index: u32,
 }
 
 impl Spread {
-    /// From 0 to 1, in dimension 1 to 4.
+    /// A number from 0 to 1, in dimension 1 to 4.
     fn fraction(&self, dimension: i32) -> f64 {
         // The root of x^5 = x + 1.
         const RATIO: f64 = 1.167_303_978_261_418_7;
@@ -176,27 +177,27 @@ impl Spread {
     }
 }
 
-/// What a frame shows.
+/// The truth of a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Truth {
-    /// Where the marker's centre appears.
+    /// The marker's centre in the image.
     pub centre: Pixel,
-    /// The marker as seen by the camera.
+    /// The marker in the camera frame.
     pub camera_from_marker: Transform<Camera, Marker>,
 }
 
 /// A camera over the marker on painted asphalt in full sun.
 #[derive(Debug)]
-pub struct Studio {
+pub struct TestScene {
     renderer: Renderer,
     ned_from_marker: Transform<Ned, Marker>,
 }
 
-impl Studio {
+impl TestScene {
     /// The marker of the thesis under a camera of this binning.
     ///
     /// # Errors
-    /// [`RenderError`] when the scene makes no sense.
+    /// [`RenderError`] when the scene is invalid.
     pub fn new(binning: Binning) -> Result<Self, RenderError> {
         let marker =
             markers::Marker { family: markers::Family::Rings, id: None, size_m: Some(SIZE_M) };
@@ -207,11 +208,11 @@ impl Studio {
         Ok(Self { renderer: Renderer::new(&scene, binning.settings(), 1)?, ned_from_marker })
     }
 
-    /// The pixels, row by row, and what they show.
+    /// The pixels, row by row, and their truth.
     ///
     /// # Errors
-    /// [`RenderError`] when the marker cannot be seen.
-    pub fn take(&mut self, view: &View) -> Result<(Vec<u8>, Truth), RenderError> {
+    /// [`RenderError`] when the marker is behind the camera.
+    pub fn render(&mut self, view: &View) -> Result<(Vec<u8>, Truth), RenderError> {
         let settings = self.renderer.settings().clone();
         let ned_from_body = view.ned_from_body(&settings, &self.ned_from_marker);
         let mut pixels = vec![0; settings.model.width as usize * settings.model.height as usize];

@@ -15,7 +15,7 @@ use rendering::{CameraSettings, PadInScene, RenderError, Renderer, Scene, Surfac
 const WIDTH: usize = 1296;
 const HEIGHT: usize = 972;
 
-/// Grey levels by which a pixel may differ from brute force: one, and half a one by rounding.
+/// Maximum difference of a pixel from brute force, in grey levels: one, and half a level of rounding.
 const WORST_LEVELS: f64 = 1.5;
 
 fn marker() -> Marker {
@@ -71,7 +71,7 @@ fn rendered(
     out
 }
 
-/// Reflectance at a place on the image plane, ray by ray.
+/// Reflectance at a point of the image plane, by ray casting.
 fn reflectance(
     pad: &PadInScene,
     drawing: &Drawing,
@@ -80,7 +80,7 @@ fn reflectance(
 ) -> f64 {
     let (eye, ray) = (marker_from_camera.origin(), *marker_from_camera * ray);
     let half = pad.paper_m / 2.0;
-    // Where the ray is inside the box's three slabs.
+    // The part of the ray inside the box's three slabs.
     let slabs = [
         (eye.x(), ray.x(), -half, half),
         (eye.y(), ray.y(), -half, half),
@@ -140,7 +140,7 @@ fn brute_force(
         let ned_from_camera = *instant * settings.body_from_camera;
         let marker_from_camera = pad.ned_from_marker.inverse() * ned_from_camera;
         for (index, value) in fine.iter_mut().enumerate() {
-            // Each row and column of rays is shifted, lest an edge runs along one.
+            // Each row and column of rays is shifted, so that no edge runs along one.
             let place = |centre: usize, k: usize, other: usize| {
                 let first = centre as f64 - (half + margin) as f64 - 0.5;
                 first + (k as f64 + (other as f64 * 0.618_034).fract()) / RAYS as f64
@@ -172,7 +172,7 @@ fn brute_force(
     pixels
 }
 
-/// A pixel's width convolved with the lens's blur, in fine steps.
+/// A pixel's box convolved with the lens blur, in fine steps.
 fn blur_weights(sigma: f64, pixel: usize, margin: usize) -> Vec<f64> {
     let mut weights = vec![0.0; pixel + 2 * margin];
     for start in 0..pixel {
@@ -186,7 +186,7 @@ fn blur_weights(sigma: f64, pixel: usize, margin: usize) -> Vec<f64> {
     weights.iter().map(|w| w / total).collect()
 }
 
-/// Renders, and compares a square of the picture about `centre` with brute force.
+/// Renders, and compares a square of the image around `centre` with brute force.
 fn check(
     name: &str,
     (scene, settings): (&Scene, &CameraSettings),
@@ -253,7 +253,7 @@ fn pixels_agree_with_brute_force() {
 }
 
 #[test]
-fn cells_side_by_side_have_no_seams() {
+fn adjacent_cells_have_no_seams() {
     let settings = exact_settings();
     for (height_m, roll, half, centre) in [
         (0.5, 0.1, 16, [640, 480]),
@@ -270,7 +270,7 @@ fn cells_side_by_side_have_no_seams() {
 }
 
 #[test]
-fn a_veil_changes_the_light_before_the_sensor() {
+fn an_occluder_changes_the_light_before_the_sensor() {
     let settings = exact_settings();
     let pose = pose(2.0, 0.0, 0.0, 0.0, [0.0; 2]);
     let mut renderer = Renderer::new(&plain_scene(), settings.clone(), 5).unwrap();
@@ -369,7 +369,7 @@ fn the_rings_are_centred_where_the_camera_model_projects_the_marker() {
 }
 
 #[test]
-fn the_nose_is_at_the_top_of_the_image_and_the_right_wing_on_its_right() {
+fn the_nose_is_at_the_top_of_the_image_and_the_right_side_on_its_right() {
     let scene = plain_scene();
     let settings = exact_settings();
     let camera = |north: f64, east: f64, yaw: f64| {
@@ -392,7 +392,7 @@ fn the_nose_is_at_the_top_of_the_image_and_the_right_wing_on_its_right() {
 }
 
 #[test]
-fn noise_has_the_variance_of_its_electrons_and_no_memory() {
+fn noise_has_the_variance_of_its_electrons_and_is_independent() {
     let settings = CameraSettings { vignetting: 0.0, ..CameraSettings::thesis() };
     let levels_per_electron = 255.0 / settings.full_well_e;
     for light in [0.1, 0.3, 1.0, 2.0] {
@@ -425,7 +425,7 @@ fn noise_has_the_variance_of_its_electrons_and_no_memory() {
 }
 
 #[test]
-fn a_frame_depends_on_seed_index_and_poses_and_on_nothing_else() {
+fn a_frame_depends_on_seed_index_and_poses_only() {
     let scene = Scene { surface: Surface::Grass, painted_marks: 5, ..plain_scene() };
     let settings = CameraSettings::thesis();
     let poses = [pose(2.0, 0.1, 0.1, 0.1, [0.0; 2]), pose(2.0, 0.1, 0.1, 0.1, [4.0, 0.0])];
@@ -448,7 +448,7 @@ fn a_frame_depends_on_seed_index_and_poses_and_on_nothing_else() {
 }
 
 #[test]
-fn a_moved_pad_is_seen_where_it_is() {
+fn a_moved_pad_is_rendered_where_it_is() {
     let scene = plain_scene();
     let settings = exact_settings();
     let pose = [pose(2.0, 0.0, 0.0, 0.0, [0.0; 2])];
@@ -463,7 +463,7 @@ fn a_moved_pad_is_seen_where_it_is() {
 }
 
 #[test]
-fn any_pose_gives_a_picture_or_a_reason() {
+fn any_pose_gives_an_image_or_an_error() {
     use std::f64::consts::{FRAC_PI_2, PI};
     let settings = CameraSettings { noise: false, ..CameraSettings::thesis() };
     let scene = Scene { surface: Surface::Asphalt, painted_marks: 20, ..plain_scene() };
@@ -512,7 +512,7 @@ fn any_pose_gives_a_picture_or_a_reason() {
 }
 
 #[test]
-fn pictures_of_any_size_are_filled_and_others_refused() {
+fn images_of_any_size_are_filled_and_wrong_buffers_refused() {
     for (width, height) in [(1, 1), (17, 5), (33, 70), (3, 400)] {
         let model = CameraModel::pinhole(width, height, 20.0);
         let barrel = Distortion::BrownConrady([-0.9, 5.0, 0.1, 0.1, 9.0, 0.0, 0.0, 0.0]);
@@ -532,7 +532,7 @@ fn pictures_of_any_size_are_filled_and_others_refused() {
 }
 
 #[test]
-fn settings_without_sense_are_refused() {
+fn invalid_settings_are_refused() {
     let thesis = CameraSettings::thesis;
     let model = |change: fn(&mut CameraModel)| {
         let mut settings = thesis();
@@ -559,7 +559,7 @@ fn settings_without_sense_are_refused() {
 }
 
 #[test]
-fn less_light_is_met_by_exposure_and_then_by_gain() {
+fn low_light_raises_the_exposure_and_then_the_gain() {
     let white = |light: f64| {
         let settings = CameraSettings { noise: false, vignetting: 0.0, ..CameraSettings::thesis() };
         let settings = settings.exposed_for(light, 200.0, 0.004);

@@ -17,7 +17,7 @@ use geometry::{Point, Rotation, Transform, Vector};
 use imaging::GrayView;
 use node::Layers;
 use plotters::prelude::*;
-use simulator::eye::{Eye, Moment};
+use simulator::camera::{FrameRequest, SimCamera};
 use world::drift::{random_stream, uniform};
 use world::vehicle::{Vehicle, VehicleConfig, VehicleTruth};
 use world::vision::{RINGS, VisionModel};
@@ -67,7 +67,7 @@ fn main() -> anyhow::Result<()> {
 }
 
 struct Studio {
-    eye: Eye,
+    camera: SimCamera,
     detector: Detector,
     pixels: Vec<u8>,
     still: VehicleTruth,
@@ -79,15 +79,15 @@ impl Studio {
     fn new() -> anyhow::Result<Self> {
         let config = Layers { file: None, set: Vec::new() }.load::<simulator::Config>()?.settings;
         let marker = config.pad_marker().map_err(anyhow::Error::msg)?;
-        let eye = Eye::new(&config)?;
-        let model = eye.settings().model;
+        let camera = SimCamera::new(&config)?;
+        let model = camera.settings().model;
         Ok(Self {
             detector: Detector::new(&[marker], fiducial::Settings::default())?,
             pixels: vec![0; model.width as usize * model.height as usize],
             still: Vehicle::new(VehicleConfig::default(), 1).truth(),
             pad: config.pad.config().at(None),
             marker_m: marker.size_m.unwrap_or_default(),
-            eye,
+            camera,
         })
     }
 
@@ -97,7 +97,7 @@ impl Studio {
         let [depth, tilt, about, u, v, heading, blur, towards] =
             [(); 8].map(|()| uniform(&mut random));
         let turn = std::f64::consts::TAU;
-        let settings = self.eye.settings().clone();
+        let settings = self.camera.settings().clone();
         let model = settings.model;
         let depth_m = 0.4 * (25.0_f64 / 0.4).powf(depth);
         let (tilt, about) = (20.0_f64.to_radians() * tilt, turn * about);
@@ -115,8 +115,8 @@ impl Studio {
         let (sin, cos) = (turn * towards).sin_cos();
         let velocity = Vector::new(cos, sin, 0.0) * speed_m_s;
         let truth = VehicleTruth { position, ned_from_body, velocity, ..self.still };
-        let moment = Moment { sequence: seed, time_s: 0.0, begun_s: None, pad: self.pad };
-        let right = self.eye.camera_from_marker(&truth, &self.pad);
+        let request = FrameRequest { sequence: seed, time_s: 0.0, begun_s: None, pad: self.pad };
+        let right = self.camera.camera_from_marker(&truth, &self.pad);
         let half = 0.5 * self.marker_m;
         let rim = [(half, half), (half, -half), (-half, half), (-half, -half)];
         let whole = rim.iter().all(|(x, y)| {
@@ -127,7 +127,7 @@ impl Studio {
         }
         let truth_at =
             |time_s: f64| VehicleTruth { position: position + velocity * time_s, ..truth };
-        self.eye.render(&moment, truth_at, &mut self.pixels)?;
+        self.camera.render(&request, truth_at, &mut self.pixels)?;
         let view = GrayView::packed(&self.pixels, model.width as usize, model.height as usize)
             .context("an image")?;
         let found = self.detector.detect(view, Some(&model), &mut ()).first().and_then(|seen| {

@@ -12,11 +12,11 @@ use geometry::{CameraModel, Distortion, Pixel};
 use markers::Marker;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rendering::views::{Binning, HIGHEST_M, laterals_m};
+use rendering::views::{Binning, MAX_HEIGHT_M, laterals_m};
 use rendering::{CameraSettings, Surface};
 
 use crate::shot::{Shot, pose};
-use rendering::veil::Veil;
+use rendering::occluder::Occluder;
 
 /// Size of the thesis' markers, in metres.
 pub const SIZE_M: f64 = rendering::views::SIZE_M;
@@ -150,7 +150,7 @@ const FRAMES_OF_A_POSITION: usize = 5;
 fn positions(marker: Marker) -> Vec<Shot> {
     let mut shots = Vec::new();
     for binning in [Binning::TwoByTwo, Binning::FourByFour] {
-        for height_m in 1..=HIGHEST_M {
+        for height_m in 1..=MAX_HEIGHT_M {
             for lateral_m in laterals_m(height_m) {
                 for _ in 0..FRAMES_OF_A_POSITION {
                     let (mut rng, seed) = chance(Set::Positions, shots.len());
@@ -292,9 +292,9 @@ impl Shot {
         })
     }
 
-    fn with(mut self, group: impl Into<String>, veil: Veil) -> Self {
+    fn with(mut self, group: impl Into<String>, occluder: Occluder) -> Self {
         self.group = group.into();
-        self.veil = veil;
+        self.occluder = occluder;
         self
     }
 }

@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use rendering::ground::Ground;
 use rendering::{CameraSettings, PadInScene, RenderError, Renderer, Scene, Surface};
 
-use rendering::veil::Veil;
+use rendering::occluder::Occluder;
 
 /// A frame to take.
 #[derive(Clone, Debug)]
@@ -38,7 +38,7 @@ pub struct Shot {
     /// Light on the scene; 1 is full sun.
     pub light: f64,
     /// What happens to the light on its way.
-    pub veil: Veil,
+    pub occluder: Occluder,
     /// Whether the sensor has colour filters, and grey is interpolated from them.
     pub bayer: bool,
     /// Chance.
@@ -74,7 +74,7 @@ impl Shot {
             surface: Surface::Asphalt,
             painted_marks: 20,
             light: 1.0,
-            veil: Veil::Nothing,
+            occluder: Occluder::None,
             bayer: false,
             seed,
         }
@@ -183,7 +183,7 @@ impl Studio {
             painted_marks: shot.painted_marks,
             light: shot.light,
         };
-        let mut renderer = Renderer::on(ground, &scene, shot.settings.clone(), shot.seed)?;
+        let mut renderer = Renderer::with_ground(ground, &scene, shot.settings.clone(), shot.seed)?;
         let poses: Vec<_> = shot
             .path
             .iter()
@@ -191,13 +191,13 @@ impl Studio {
             .collect();
         let model = shot.settings.model;
         let mut pixels = vec![0; model.width as usize * model.height as usize];
-        let mut veil = |v: usize, light: &mut [f32]| {
-            shot.veil.dim(v, light);
+        let mut apply = |v: usize, light: &mut [f32]| {
+            shot.occluder.apply(v, light);
             if shot.bayer {
                 filter_colours(v, light);
             }
         };
-        renderer.render_through(&mut veil, &poses, shot.seed, &mut pixels)?;
+        renderer.render_through(&mut apply, &poses, shot.seed, &mut pixels)?;
         Ok(if shot.bayer { interpolated(&pixels, model.width as usize) } else { pixels })
     }
 }

@@ -6,7 +6,7 @@ use experiments::record::processor_ms;
 use fiducial::{Detector, Settings};
 use imaging::GrayView;
 use markers::Marker;
-use rendering::views::{Binning, Studio, View};
+use rendering::views::{Binning, TestScene, View};
 
 /// How many times as long as a normal frame of the same size any image may take.
 const MOST: f64 = 20.0;
@@ -48,7 +48,7 @@ fn any_image_is_looked_at_in_bounded_time() {
     let binning = Binning::FourByFour;
     let (width, height) = (binning.camera().width as usize, binning.camera().height as usize);
     let view = View { binning, height_m: 3, lateral_m: 0.0, tilt_deg: 5.0, repeat: 0 };
-    let (normal, _) = Studio::new(binning).unwrap().take(&view).unwrap();
+    let (normal, _) = TestScene::new(binning).unwrap().render(&view).unwrap();
     let black_or_white = |white: bool| if white { 255 } else { 0 };
     let images: [(&str, Grey<'_>); 10] = [
         ("constant", &|_, _| 128),

@@ -7,7 +7,6 @@ use markers::{Drawing, Marker, Pad};
 use node::{Check, Settings};
 use rendering::{CameraSettings, PadInScene, Scene, Surface};
 use serde::Deserialize;
-
 use world::ardupilot::{AutopilotConfig, EstimateConfig, Firmware};
 use world::camera::CameraFaults;
 use world::pad::PadConfig;
@@ -15,7 +14,26 @@ use world::vehicle::VehicleConfig;
 use world::wind::{Gust, WindConfig, WindNoise};
 use world::world::WorldConfig;
 
-/// The keys of `simulator.toml`; meanings, units and ranges are told there.
+/// Declares a table of `simulator.toml`: each key with its type and, for a number, its range. The file
+/// explains the keys.
+macro_rules! table {
+    ($(#[$doc:meta])* $name:ident: $table:literal { $($key:ident: $type:ty $(= $range:expr)?,)* }) => {
+        $(#[$doc])*
+        #[derive(Clone, Debug, Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub struct $name {
+            $(#[doc = concat!("The key `", $table, ".", stringify!($key), "`.")] pub $key: $type,)*
+        }
+
+        impl $name {
+            fn check_ranges(&self, check: &mut Check<'_>) {
+                $($(check.range(concat!($table, ".", stringify!($key)), self.$key, $range);)?)*
+            }
+        }
+    };
+}
+
+/// The keys of `simulator.toml`, which explains them.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -24,14 +42,14 @@ pub struct Config {
     /// Seed of everything random.
     pub seed: u64,
     /// What flies.
-    pub vehicle: Flown,
-    /// Height at which the world begins, in metres.
+    pub vehicle: VehicleKind,
+    /// Height above which the scenario begins, in metres.
     pub begin_height_m: f64,
     /// Where the vehicle starts.
     pub start: StartSettings,
     /// The simulated autopilot.
     pub autopilot: AutopilotSettings,
-    /// What blows.
+    /// The wind.
     pub wind: WindSettings,
     /// The pad.
     pub pad: PadSettings,
@@ -39,230 +57,158 @@ pub struct Config {
     pub ground: GroundSettings,
     /// The camera.
     pub camera: CameraConfig,
-    /// What is between camera and pad.
-    pub veil: VeilSettings,
-    /// Its frames for the air link.
+    /// An effect between camera and pad.
+    pub occluder: OccluderSettings,
+    /// The camera's frames for the air link.
     pub air: AirConfig,
 }
 
 /// What flies.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Flown {
-    /// Our own vehicle and autopilot.
+pub enum VehicleKind {
+    /// A simulated vehicle and autopilot.
     Simulated,
-    /// The vehicle whose pose an autopilot reports.
+    /// A vehicle whose pose an autopilot reports.
     Reported,
 }
 
-/// Whose rules the simulated autopilot keeps.
+/// The firmware that the simulated autopilot imitates.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FirmwareName {
-    /// Those of ArduPilot, as measured.
+    /// ArduPilot, as measured.
     ArduPilot,
-    /// Those of PX4, as documented.
+    /// PX4, as documented.
     Px4,
 }
 
-/// Where the vehicle starts.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct StartSettings {
-    /// Height, in metres; 0 stands on the ground.
-    pub height_m: f64,
-    /// North of the origin, in metres.
-    pub north_m: f64,
-    /// East of the origin, in metres.
-    pub east_m: f64,
-    /// Heading, in degrees.
-    pub heading_deg: f64,
-    /// Radius of the rotors for the ground effect, in metres.
-    pub rotor_m: f64,
+table! {
+    /// Where the vehicle starts.
+    StartSettings: "start" {
+        height_m: f64 = 0.0..=100.0,
+        north_m: f64 = -1000.0..=1000.0,
+        east_m: f64 = -1000.0..=1000.0,
+        heading_deg: f64 = -360.0..=360.0,
+        rotor_m: f64 = 0.0..=1.0,
+    }
 }
 
-/// What is between camera and pad for a while.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct VeilSettings {
-    /// What it is.
-    pub kind: VeilKind,
-    /// How strong it is.
-    pub strength: f64,
-    /// From when on, in seconds.
-    pub at_s: f64,
-    /// For how long, in seconds.
-    pub for_s: f64,
-    /// Only below this height over the pad, in metres.
-    pub below_m: f64,
+table! {
+    /// An effect between camera and pad.
+    OccluderSettings: "occluder" {
+        kind: OccluderKind,
+        strength: f64 = 0.0..=1.0,
+        at_s: f64 = 0.0..=3600.0,
+        for_s: f64 = 0.0..=3600.0,
+        below_m: f64 = 0.0..=1000.0,
+    }
 }
 
-/// What is between camera and pad.
+/// The kind of effect between camera and pad.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum VeilKind {
-    /// Nothing.
+pub enum OccluderKind {
+    /// No effect.
     None,
     /// A reflection beside the marker.
     Glare,
-    /// Something over a part of the marker.
+    /// An object in front of a part of the marker.
     Cover,
-    /// Little contrast.
+    /// Low contrast.
     Haze,
 }
 
-/// The simulated autopilot.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct AutopilotSettings {
-    /// Where it talks MAVLink to.
-    pub address: String,
-    /// Time until it can be armed, in seconds.
-    pub ready_after_s: f64,
-    /// Whose rules it keeps.
-    pub firmware: FirmwareName,
-    /// Whether its own precision landing is on.
-    pub precision_landing: bool,
-    /// Its speed of descent in LAND, in cm/s.
-    pub land_speed_cm_s: f64,
-    /// Errors of its estimator, as a multiple of the usual ones.
-    pub errors: f64,
-    /// Deviation of the believed velocity's error as a wrong tilt makes it, in m/s.
-    pub velocity_wander_m_s: f64,
-    /// Its time constant, in seconds.
-    pub velocity_wander_s: f64,
-    /// Speed of the believed position's drift, in m/s.
-    pub gnss_drift_m_s: f64,
-    /// Direction of that drift, in degrees.
-    pub gnss_drift_to_deg: f64,
-    /// Jump of the believed position northwards, in metres.
-    pub gnss_jump_m: f64,
-    /// When it jumps, in seconds.
-    pub gnss_jump_at_s: f64,
-    /// When its link is lost, in seconds.
-    pub link_lost_at_s: f64,
-    /// For how long it is, in seconds.
-    pub link_lost_for_s: f64,
+table! {
+    /// The simulated autopilot.
+    AutopilotSettings: "autopilot" {
+        address: String,
+        ready_after_s: f64 = 0.5..=600.0,
+        firmware: FirmwareName,
+        precision_landing: bool,
+        land_speed_cm_s: f64 = 30.0..=200.0,
+        errors: f64 = 0.0..=10.0,
+        velocity_wander_m_s: f64 = 0.0..=2.0,
+        velocity_wander_s: f64 = 0.5..=60.0,
+        gnss_drift_m_s: f64 = 0.0..=2.0,
+        gnss_drift_to_deg: f64 = -360.0..=360.0,
+        gnss_jump_m: f64 = -100.0..=100.0,
+        gnss_jump_at_s: f64 = 0.0..=3600.0,
+        link_lost_at_s: f64 = 0.0..=3600.0,
+        link_lost_for_s: f64 = 0.0..=3600.0,
+    }
 }
 
-/// What blows.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct WindSettings {
-    /// Speed of the mean wind, in m/s.
-    pub mean_m_s: f64,
-    /// Where it comes from, in degrees.
-    pub from_deg: f64,
-    /// Strength of the turbulence.
-    pub turbulence: f64,
-    /// Whether the thesis' wind noise is added.
-    pub thesis_noise: bool,
-    /// Peak of a gust, in m/s.
-    pub gust_m_s: f64,
-    /// When it comes, in seconds.
-    pub gust_at_s: f64,
-    /// How long it lasts, in seconds.
-    pub gust_length_s: f64,
-    /// From one gust to the next, in seconds.
-    pub gust_every_s: f64,
+table! {
+    /// The wind.
+    WindSettings: "wind" {
+        mean_m_s: f64 = 0.0..=20.0,
+        from_deg: f64 = 0.0..=360.0,
+        turbulence: f64 = 0.0..=10.0,
+        thesis_noise: bool,
+        gust_m_s: f64 = 0.0..=20.0,
+        gust_at_s: f64 = 0.0..=3600.0,
+        gust_length_s: f64 = 0.1..=60.0,
+        gust_every_s: f64 = 0.0..=3600.0,
+    }
 }
 
-/// The pad.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PadSettings {
-    /// What is printed on it.
-    pub marker: String,
-    /// The pad of several markers that is printed in place of one, or nothing.
-    pub markers: String,
-    /// Where it lies, north of the start, in metres.
-    pub north_m: f64,
-    /// Where it lies, east of the start, in metres.
-    pub east_m: f64,
-    /// How high it rests over the ground, in metres.
-    pub height_m: f64,
-    /// Heading of the marker's upper edge, in degrees.
-    pub heading_deg: f64,
-    /// Speed of its straight way, in m/s.
-    pub speed_m_s: f64,
-    /// Direction of that way, in degrees.
-    pub course_deg: f64,
-    /// Amplitude of its heave, in metres.
-    pub heave_m: f64,
-    /// Period of its heave, in seconds.
-    pub heave_period_s: f64,
-    /// How fast it turns, in degrees per second.
-    pub turn_deg_s: f64,
-    /// Radius of the deck that moves with it, in metres.
-    pub deck_m: f64,
-    /// A second marker that moves with it; empty is none.
-    pub wrong_marker: String,
-    /// Where that lies, north of the pad's middle, in metres.
-    pub wrong_north_m: f64,
-    /// Where that lies, east of the pad's middle, in metres.
-    pub wrong_east_m: f64,
+table! {
+    /// The pad.
+    PadSettings: "pad" {
+        marker: String,
+        markers: String,
+        north_m: f64 = -1000.0..=1000.0,
+        east_m: f64 = -1000.0..=1000.0,
+        height_m: f64 = 0.0..=10.0,
+        heading_deg: f64 = -360.0..=360.0,
+        speed_m_s: f64 = 0.0..=10.0,
+        course_deg: f64 = -360.0..=360.0,
+        heave_m: f64 = 0.0..=2.0,
+        heave_period_s: f64 = 1.0..=60.0,
+        turn_deg_s: f64 = -90.0..=90.0,
+        deck_m: f64 = 0.1..=100.0,
+        wrong_marker: String,
+        wrong_north_m: f64 = -100.0..=100.0,
+        wrong_east_m: f64 = -100.0..=100.0,
+    }
 }
 
-/// The ground.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GroundSettings {
-    /// What it looks like.
-    pub surface: String,
-    /// Painted marks that are no markers.
-    pub painted_marks: u32,
-    /// Light on the scene.
-    pub light: f64,
+table! {
+    /// The ground.
+    GroundSettings: "ground" {
+        surface: String,
+        painted_marks: u32 = 0..=1000,
+        light: f64 = 0.001..=2.0,
+    }
 }
 
-/// The camera.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CameraConfig {
-    /// Its name.
-    pub name: String,
-    /// Frames a second.
-    pub rate_hz: f64,
-    /// Image width in pixels.
-    pub width: u32,
-    /// Image height in pixels.
-    pub height: u32,
-    /// Focal length in pixels.
-    pub focal_px: f64,
-    /// Height above the vehicle's lowest point, in metres.
-    pub mount_height_m: f64,
-    /// The lens's blur, in pixels.
-    pub blur_px: f64,
-    /// Grey level of white paper.
-    pub white_level: f64,
-    /// Longest exposure, in milliseconds.
-    pub longest_exposure_ms: f64,
-    /// Whether there is noise.
-    pub noise: bool,
-    /// Deviation of the mount's error in roll and pitch, in degrees.
-    pub mount_error_deg: f64,
-    /// From the exposure to the arrival, in milliseconds.
-    pub latency_ms: f64,
-    /// What chance adds to it at most, in milliseconds.
-    pub jitter_ms: f64,
-    /// Part of the frames that never arrive.
-    pub drop: f64,
-    /// Part of the frames that arrive twice.
-    pub duplicate: f64,
-    /// By how much all stamps are early, in milliseconds.
-    pub stamp_early_ms: f64,
-    /// Part of the stamps that jump.
-    pub stamp_jumps: f64,
-    /// By how much they jump at most, in milliseconds.
-    pub stamp_jump_ms: f64,
-    /// From when on no frame is taken, in seconds.
-    pub outage_at_s: f64,
-    /// For how long none is, in seconds.
-    pub outage_for_s: f64,
-    /// From the first time below this height on no frame is taken, in metres.
-    pub outage_below_m: f64,
-    /// For how long none is, in seconds.
-    pub outage_below_for_s: f64,
+table! {
+    /// The camera.
+    CameraConfig: "camera" {
+        name: String,
+        rate_hz: f64 = 0.1..=120.0,
+        width: u32 = 16..=8192,
+        height: u32 = 16..=8192,
+        focal_px: f64 = 10.0..=1e5,
+        mount_height_m: f64 = -1.0..=1.0,
+        blur_px: f64 = 0.0..=3.0,
+        white_level: f64 = 20.0..=255.0,
+        max_exposure_ms: f64 = 0.01..=100.0,
+        noise: bool,
+        mount_error_deg: f64 = 0.0..=10.0,
+        latency_ms: f64 = 0.0..=2000.0,
+        jitter_ms: f64 = 0.0..=2000.0,
+        drop: f64 = 0.0..=1.0,
+        duplicate: f64 = 0.0..=1.0,
+        stamp_early_ms: f64 = -1000.0..=1000.0,
+        stamp_jumps: f64 = 0.0..=1.0,
+        stamp_jump_ms: f64 = 0.0..=2000.0,
+        outage_at_s: f64 = 0.0..=3600.0,
+        outage_for_s: f64 = 0.0..=3600.0,
+        outage_below_m: f64 = 0.0..=100.0,
+        outage_below_for_s: f64 = 0.0..=3600.0,
+    }
 }
 
 impl Settings for Config {
@@ -271,108 +217,30 @@ impl Settings for Config {
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
         check.range("begin_height_m", self.begin_height_m, 0.0..=1000.0);
-        check.range("start.height_m", self.start.height_m, 0.0..=100.0);
-        check.range("start.north_m", self.start.north_m, -1000.0..=1000.0);
-        check.range("start.east_m", self.start.east_m, -1000.0..=1000.0);
-        check.range("start.heading_deg", self.start.heading_deg, -360.0..=360.0);
-        check.range("start.rotor_m", self.start.rotor_m, 0.0..=1.0);
+        self.start.check_ranges(check);
         check.parses("autopilot.address", self.autopilot.address.parse::<Address>());
-        check.range("autopilot.ready_after_s", self.autopilot.ready_after_s, 0.5..=600.0);
-        check.range("autopilot.land_speed_cm_s", self.autopilot.land_speed_cm_s, 30.0..=200.0);
-        self.autopilot.check(check);
-        self.wind.check(check);
-        self.pad.check(check);
+        self.autopilot.check_ranges(check);
+        self.wind.check_ranges(check);
+        self.pad.check_ranges(check);
         check.parses("pad.marker", self.pad_marker());
         check.parses("pad.markers", self.printed());
         check.parses("pad.wrong_marker", self.wrong_marker());
         check.parses("ground.surface", self.ground.surface.parse::<Surface>());
-        check.range("ground.painted_marks", self.ground.painted_marks, 0..=1000);
-        check.range("ground.light", self.ground.light, 0.001..=2.0);
-        check.range("veil.strength", self.veil.strength, 0.0..=1.0);
-        check.range("veil.at_s", self.veil.at_s, 0.0..=3600.0);
-        check.range("veil.for_s", self.veil.for_s, 0.0..=3600.0);
-        check.range("veil.below_m", self.veil.below_m, 0.0..=1000.0);
-        self.camera.check(check);
+        self.ground.check_ranges(check);
+        self.occluder.check_ranges(check);
+        check.name("camera.name", &self.camera.name);
+        self.camera.check_ranges(check);
         for (key, value, range) in self.air.ranges() {
             check.range(key, value, range);
         }
     }
 }
 
-impl AutopilotSettings {
-    fn check(&self, check: &mut Check<'_>) {
-        check.range("autopilot.errors", self.errors, 0.0..=10.0);
-        check.range("autopilot.velocity_wander_m_s", self.velocity_wander_m_s, 0.0..=2.0);
-        check.range("autopilot.velocity_wander_s", self.velocity_wander_s, 0.5..=60.0);
-        check.range("autopilot.gnss_drift_m_s", self.gnss_drift_m_s, 0.0..=2.0);
-        check.range("autopilot.gnss_drift_to_deg", self.gnss_drift_to_deg, -360.0..=360.0);
-        check.range("autopilot.gnss_jump_m", self.gnss_jump_m, -100.0..=100.0);
-        check.range("autopilot.gnss_jump_at_s", self.gnss_jump_at_s, 0.0..=3600.0);
-        check.range("autopilot.link_lost_at_s", self.link_lost_at_s, 0.0..=3600.0);
-        check.range("autopilot.link_lost_for_s", self.link_lost_for_s, 0.0..=3600.0);
-    }
-}
-
-impl WindSettings {
-    fn check(&self, check: &mut Check<'_>) {
-        check.range("wind.mean_m_s", self.mean_m_s, 0.0..=20.0);
-        check.range("wind.from_deg", self.from_deg, 0.0..=360.0);
-        check.range("wind.turbulence", self.turbulence, 0.0..=10.0);
-        check.range("wind.gust_m_s", self.gust_m_s, 0.0..=20.0);
-        check.range("wind.gust_at_s", self.gust_at_s, 0.0..=3600.0);
-        check.range("wind.gust_length_s", self.gust_length_s, 0.1..=60.0);
-        check.range("wind.gust_every_s", self.gust_every_s, 0.0..=3600.0);
-    }
-}
-
-impl PadSettings {
-    fn check(&self, check: &mut Check<'_>) {
-        check.range("pad.north_m", self.north_m, -1000.0..=1000.0);
-        check.range("pad.east_m", self.east_m, -1000.0..=1000.0);
-        check.range("pad.height_m", self.height_m, 0.0..=10.0);
-        check.range("pad.heading_deg", self.heading_deg, -360.0..=360.0);
-        check.range("pad.speed_m_s", self.speed_m_s, 0.0..=10.0);
-        check.range("pad.course_deg", self.course_deg, -360.0..=360.0);
-        check.range("pad.heave_m", self.heave_m, 0.0..=2.0);
-        check.range("pad.heave_period_s", self.heave_period_s, 1.0..=60.0);
-        check.range("pad.turn_deg_s", self.turn_deg_s, -90.0..=90.0);
-        check.range("pad.deck_m", self.deck_m, 0.1..=100.0);
-        check.range("pad.wrong_north_m", self.wrong_north_m, -100.0..=100.0);
-        check.range("pad.wrong_east_m", self.wrong_east_m, -100.0..=100.0);
-    }
-}
-
-impl CameraConfig {
-    fn check(&self, check: &mut Check<'_>) {
-        check.name("camera.name", &self.name);
-        check.range("camera.rate_hz", self.rate_hz, 0.1..=120.0);
-        check.range("camera.width", self.width, 16..=8192);
-        check.range("camera.height", self.height, 16..=8192);
-        check.range("camera.focal_px", self.focal_px, 10.0..=1e5);
-        check.range("camera.mount_height_m", self.mount_height_m, -1.0..=1.0);
-        check.range("camera.blur_px", self.blur_px, 0.0..=3.0);
-        check.range("camera.white_level", self.white_level, 20.0..=255.0);
-        check.range("camera.longest_exposure_ms", self.longest_exposure_ms, 0.01..=100.0);
-        check.range("camera.mount_error_deg", self.mount_error_deg, 0.0..=10.0);
-        check.range("camera.latency_ms", self.latency_ms, 0.0..=2000.0);
-        check.range("camera.jitter_ms", self.jitter_ms, 0.0..=2000.0);
-        check.range("camera.drop", self.drop, 0.0..=1.0);
-        check.range("camera.duplicate", self.duplicate, 0.0..=1.0);
-        check.range("camera.stamp_early_ms", self.stamp_early_ms, -1000.0..=1000.0);
-        check.range("camera.stamp_jumps", self.stamp_jumps, 0.0..=1.0);
-        check.range("camera.stamp_jump_ms", self.stamp_jump_ms, 0.0..=2000.0);
-        check.range("camera.outage_at_s", self.outage_at_s, 0.0..=3600.0);
-        check.range("camera.outage_for_s", self.outage_for_s, 0.0..=3600.0);
-        check.range("camera.outage_below_m", self.outage_below_m, 0.0..=100.0);
-        check.range("camera.outage_below_for_s", self.outage_below_for_s, 0.0..=3600.0);
-    }
-}
-
 impl Config {
-    /// What is printed on the pad.
+    /// The marker on the pad.
     ///
     /// # Errors
-    /// Says what is wrong with it.
+    /// When it is invalid or has no size.
     pub fn pad_marker(&self) -> Result<Marker, String> {
         sized_marker(&self.pad.marker)
     }
@@ -380,19 +248,19 @@ impl Config {
     /// The second marker, if there is one.
     ///
     /// # Errors
-    /// Says what is wrong with it.
+    /// When it is invalid or has no size.
     pub fn wrong_marker(&self) -> Result<Option<Marker>, String> {
         let name = &self.pad.wrong_marker;
         if name.is_empty() { Ok(None) } else { sized_marker(name).map(Some) }
     }
 
-    /// What is on the pad's lid, of one marker or several.
+    /// The drawing on the pad, of one marker or several.
     fn printed(&self) -> Result<Drawing, String> {
         let name = self.pad.markers.as_str();
         if name.is_empty() {
             let marker = self.pad_marker()?;
             let drawing = marker.size_m.and_then(|size_m| Drawing::new(&marker, size_m));
-            return drawing.ok_or_else(|| format!("`{marker}` cannot be printed: which id?"));
+            return drawing.ok_or_else(|| format!("`{marker}` cannot be printed: it needs an id"));
         }
         let pad = Pad::named(name, |file| std::fs::read_to_string(file));
         let pad = pad.map_err(|problem| problem.to_string())?;
@@ -419,10 +287,10 @@ impl Config {
         }
     }
 
-    /// What there is to see, before the pad moves. The pad is the first in the list.
+    /// The scene before the pad moves. The pad is the first in its list.
     ///
     /// # Errors
-    /// Says what is wrong with the pad or the ground.
+    /// When the pad or the ground is invalid.
     pub fn scene(&self) -> Result<Scene, String> {
         let pad = &self.pad;
         let heading_rad = pad.heading_deg.to_radians();
@@ -446,7 +314,7 @@ impl Config {
         })
     }
 
-    /// The camera and its setting.
+    /// The camera and its settings.
     pub fn camera_settings(&self) -> CameraSettings {
         let camera = &self.camera;
         let thesis = CameraSettings::thesis();
@@ -458,11 +326,7 @@ impl Config {
             noise: camera.noise,
             ..thesis
         }
-        .exposed_for(
-            self.ground.light,
-            camera.white_level,
-            camera.longest_exposure_ms * 1e-3,
-        )
+        .exposed_for(self.ground.light, camera.white_level, camera.max_exposure_ms * 1e-3)
     }
 }
 
@@ -520,7 +384,7 @@ impl WindSettings {
 }
 
 impl PadSettings {
-    /// The pad as the world moves it.
+    /// The pad and its motion.
     pub fn config(&self) -> PadConfig {
         let (east, north) = self.course_deg.to_radians().sin_cos();
         PadConfig {
@@ -536,7 +400,7 @@ impl PadSettings {
 }
 
 impl CameraConfig {
-    /// What happens to its frames on their way.
+    /// The faults of the camera and of its connection.
     pub fn faults(&self) -> CameraFaults {
         let lasting = |at: f64, for_s: f64| (for_s > 0.0).then_some((at, for_s));
         CameraFaults {
@@ -575,10 +439,11 @@ mod tests {
     }
 
     #[test]
-    fn impossible_worlds_are_refused() {
+    fn invalid_values_are_refused() {
         for (set, part) in [
             ("pad.marker=rings", "needs a size"),
             ("ground.surface=lava", "lava"),
+            ("camera.rate_hz=0", "`camera.rate_hz`"),
             ("camera.rate_hz=0", "from 0.1 to 120"),
             ("vehicle=pigeon", "pigeon"),
             ("seed=-1", "-1"),

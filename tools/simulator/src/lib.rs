@@ -1,13 +1,13 @@
-//! The world of the crate `world` in real time: its autopilot on a MAVLink link, its camera on the topics.
+//! The simulation of the crate `world` in real time: its autopilot on a MAVLink link, its camera on the
+//! topics.
 //!
-//! It stands in for camera-pub and for the autopilot by speaking their topics and MAVLink; no service knows of it.
+//! It replaces camera-pub and the autopilot by using the same topics and MAVLink; no service knows of it.
 //!
-//! Modules in reading order: [`config`] says what there is; [`eye`] is the camera as a function;
-//! [`reported`] is a vehicle that a real autopilot flies;
-//! [`service`] runs it all in real time.
+//! Modules in reading order: [`config`] has the keys, [`camera`] is the camera as a function, [`reported`] a
+//! vehicle that a real autopilot flies, [`service`] runs everything in real time.
 
+pub mod camera;
 pub mod config;
-pub mod eye;
 pub mod reported;
 pub mod service;
 

@@ -1,8 +1,8 @@
-//! A vehicle flown by a real autopilot: its true motion from what the autopilot reports.
+//! A vehicle flown by a real autopilot: its motion from the autopilot's messages.
 //!
-//! ArduPilot in simulation tells the truth in SIM_STATE, PX4 in HIL_STATE_QUATERNION, both with the position in steps of
-//! about a centimetre and the velocity exactly or nearly so; the two together give a smooth motion. Any other autopilot's
-//! own estimate has to do.
+//! A simulated ArduPilot sends the truth in SIM_STATE, a simulated PX4 in HIL_STATE_QUATERNION, with the
+//! position in steps of about a centimetre and an accurate velocity; combined they give a smooth motion. Of
+//! other autopilots the estimate is used.
 
 use std::collections::VecDeque;
 
@@ -14,40 +14,59 @@ use geometry::{Body, Ned, Point, Rotation, Vector};
 
 use world::vehicle::VehicleTruth;
 
-/// The past that is kept: a second at 200 Hz.
-const MOST_PAST: usize = 200;
+/// Maximum number of states in the history: a second at 200 Hz.
+const MAX_HISTORY: usize = 200;
 /// A degree of latitude in metres (mean radius of the earth, 6371 km), per 1e-7 degree.
 const M_PER_E7: f64 = 6_371_000.0 * std::f64::consts::PI / 180.0 * 1e-7;
-/// Part of the difference between the told and the predicted position that is taken over at each report.
-const CORRECTION: f64 = 0.05;
-/// A larger difference is a jump, in metres.
+/// Gain of the position correction at each report.
+const POSITION_GAIN: f64 = 0.05;
+/// Difference between reported and predicted position above which it is a jump, in metres.
 const JUMP_M: f64 = 0.5;
-/// Motion is predicted at most so far, in seconds.
-const LONGEST_PREDICTION_S: f64 = 0.2;
-/// Without the truth for so long the autopilot's own estimate is used, in seconds.
-const TRUTH_PATIENCE_S: f64 = 1.0;
-/// Who is heard for the first time higher than this over the autopilot's origin has started elsewhere, in metres.
-const STARTED_BELOW_M: f64 = 1.0;
-/// Over the ground by less than this and slower than that is on it, in metres and m/s.
-const ON_GROUND: (f64, f64) = (0.03, 0.05);
+/// Maximum prediction time, in seconds.
+const MAX_PREDICTION_S: f64 = 0.2;
+/// Time without the truth after which the autopilot's estimate is used, in seconds.
+const TRUTH_TIMEOUT_S: f64 = 1.0;
+/// Height above the autopilot's origin from which a vehicle was already airborne when first reported, in
+/// metres.
+const AIRBORNE_M: f64 = 1.0;
+/// Maximum height of a vehicle on the ground, in metres.
+const MAX_GROUND_HEIGHT_M: f64 = 0.03;
+/// Maximum vertical speed of a vehicle on the ground, in m/s.
+const MAX_GROUND_SPEED_M_S: f64 = 0.05;
+/// Time over which the maximum speed of descent is the speed of impact, in seconds.
+const IMPACT_WINDOW_S: f64 = 0.3;
+
+/// A global position.
+#[derive(Copy, Clone, Debug)]
+struct GlobalPosition {
+    lat_e7: i32,
+    lon_e7: i32,
+    altitude_m: f64,
+}
+
+#[derive(Copy, Clone, Debug)]
+struct Attitude {
+    ned_from_body: Rotation<Ned, Body>,
+    angular_rate: Vector<Body>,
+}
 
 /// The vehicle that an autopilot reports.
 #[derive(Debug, Default)]
-pub struct Reported {
-    /// Latitude and longitude in 1e-7 degrees, and altitude in metres, where it was heard first; the autopilot's origin
-    /// if that was in the air.
-    home: Option<(i32, i32, f64)>,
+pub struct ReportedVehicle {
+    /// Where it was first reported; the autopilot's origin if that was in the air.
+    home: Option<GlobalPosition>,
     /// True once `home` was compared with the autopilot's own origin.
     is_settled: bool,
-    past: VecDeque<VehicleTruth>,
-    /// When the simulation's truth was told last.
-    told_s: Option<f64>,
-    attitude: Option<(Rotation<Ned, Body>, Vector<Body>)>,
-    fastest_fall: VecDeque<(f64, f64)>,
+    history: VecDeque<VehicleTruth>,
+    /// Time of the last message with the truth.
+    last_truth_s: Option<f64>,
+    attitude: Option<Attitude>,
+    /// Times and speeds of descent in the last [`IMPACT_WINDOW_S`].
+    descent: VecDeque<(f64, f64)>,
 }
 
-impl Reported {
-    /// Takes a packet that arrived at `now_s`.
+impl ReportedVehicle {
+    /// Handles a packet that arrived at `now_s`.
     pub fn handle(&mut self, now_s: f64, frame: &Frame) {
         if frame.sender.component != 1 {
             return;
@@ -61,26 +80,26 @@ impl Reported {
         }
     }
 
-    /// True once the autopilot tells where the vehicle is.
+    /// True once the autopilot has reported the vehicle's state.
     pub fn is_known(&self) -> bool {
-        !self.past.is_empty()
+        !self.history.is_empty()
     }
 
-    /// True while the simulation's truth is told, not only the autopilot's estimate.
+    /// True while the truth arrives, and not only the autopilot's estimate.
     pub fn is_true(&self, now_s: f64) -> bool {
-        self.told_s.is_some_and(|told| now_s - told < TRUTH_PATIENCE_S)
+        self.last_truth_s.is_some_and(|last_s| now_s - last_s < TRUTH_TIMEOUT_S)
     }
 
-    /// The latest motion.
+    /// The latest state.
     pub fn truth(&self) -> Option<VehicleTruth> {
-        self.past.back().copied()
+        self.history.back().copied()
     }
 
-    /// The motion at `time_s`, between reports or a little beyond the latest.
+    /// The state at `time_s`, interpolated, or predicted a little beyond the latest.
     pub fn truth_at(&self, time_s: f64) -> Option<VehicleTruth> {
-        let after = self.past.partition_point(|truth| truth.time_s <= time_s);
-        let before = after.checked_sub(1).and_then(|index| self.past.get(index));
-        match (before, self.past.get(after)) {
+        let after = self.history.partition_point(|truth| truth.time_s <= time_s);
+        let before = after.checked_sub(1).and_then(|index| self.history.get(index));
+        match (before, self.history.get(after)) {
             (Some(before), Some(next)) => Some(before.interpolate(next, time_s)),
             (Some(last), None) => Some(predicted(last, time_s)),
             (None, first) => first.copied(),
@@ -93,51 +112,61 @@ impl Reported {
         if !numbers.iter().chain(&rates).all(|n| n.is_finite()) {
             return;
         }
-        let here = (state.lat_int, state.lon_int, f64::from(state.alt));
+        let here = GlobalPosition {
+            lat_e7: state.lat_int,
+            lon_e7: state.lon_int,
+            altitude_m: f64::from(state.alt),
+        };
         let velocity = Vector::new(f64::from(state.vn), f64::from(state.ve), f64::from(state.vd));
         let [roll, pitch, yaw] = [state.roll, state.pitch, state.yaw].map(f64::from);
         let [p, q, r] = rates.map(f64::from);
-        let attitude = (Rotation::from_euler(roll, pitch, yaw), Vector::new(p, q, r));
-        self.told(now_s, here, velocity, attitude);
+        let ned_from_body = Rotation::from_euler(roll, pitch, yaw);
+        let attitude = Attitude { ned_from_body, angular_rate: Vector::new(p, q, r) };
+        self.update(now_s, here, velocity, attitude);
     }
 
     fn hil_state(&mut self, now_s: f64, state: &HIL_STATE_QUATERNION_DATA) {
         let wxyz = state.attitude_quaternion.map(f64::from);
         let rates = [state.rollspeed, state.pitchspeed, state.yawspeed].map(f64::from);
-        let Some(attitude) = Rotation::from_wxyz(wxyz) else { return };
+        let Some(ned_from_body) = Rotation::from_wxyz(wxyz) else { return };
         if !rates.iter().all(|n| n.is_finite()) {
             return;
         }
-        let here = (state.lat, state.lon, f64::from(state.alt) * 1e-3);
+        let altitude_m = f64::from(state.alt) * 1e-3;
+        let here = GlobalPosition { lat_e7: state.lat, lon_e7: state.lon, altitude_m };
         let [north, east, down] = [state.vx, state.vy, state.vz].map(|n| f64::from(n) * 0.01);
         let [p, q, r] = rates;
         let velocity = Vector::new(north, east, down);
-        self.told(now_s, here, velocity, (attitude, Vector::new(p, q, r)));
+        let attitude = Attitude { ned_from_body, angular_rate: Vector::new(p, q, r) };
+        self.update(now_s, here, velocity, attitude);
     }
 
-    /// Joins a coarse position with the velocity.
-    fn told(
+    /// Updates the state from the truth: the coarse position corrects the integrated velocity.
+    fn update(
         &mut self,
         now_s: f64,
-        here: (i32, i32, f64),
+        here: GlobalPosition,
         velocity: Vector<Ned>,
-        attitude: (Rotation<Ned, Body>, Vector<Body>),
+        attitude: Attitude,
     ) {
-        let airborne = self.past.back().filter(|last| last.height_m > STARTED_BELOW_M);
+        let airborne = self.history.back().filter(|last| last.height_m > AIRBORNE_M);
         let origin = || airborne.map_or(here, |last| origin_of(here, last.position));
         let home = *self.home.get_or_insert_with(origin);
-        let (lat_e7, lon_e7, altitude_m) = here;
-        let told = position_from(home, lat_e7, lon_e7, altitude_m);
-        let position = match self.past.back() {
+        let reported = position_from(home, here);
+        let position = match self.history.back() {
             Some(last) => {
-                let dt_s = (now_s - last.time_s).clamp(0.0, LONGEST_PREDICTION_S);
-                let expected = last.position + (last.velocity + velocity) * (0.5 * dt_s);
-                let difference = told - expected;
-                if difference.norm() > JUMP_M { told } else { expected + difference * CORRECTION }
+                let dt_s = (now_s - last.time_s).clamp(0.0, MAX_PREDICTION_S);
+                let predicted = last.position + (last.velocity + velocity) * (0.5 * dt_s);
+                let difference = reported - predicted;
+                if difference.norm() > JUMP_M {
+                    reported
+                } else {
+                    predicted + difference * POSITION_GAIN
+                }
             }
-            None => told,
+            None => reported,
         };
-        self.told_s = Some(now_s);
+        self.last_truth_s = Some(now_s);
         self.push(now_s, position, velocity, attitude);
     }
 
@@ -147,7 +176,10 @@ impl Reported {
         if angles.iter().chain(&rates).all(|n| n.is_finite()) {
             let [roll, pitch, yaw] = angles;
             let [p, q, r] = rates;
-            self.attitude = Some((Rotation::from_euler(roll, pitch, yaw), Vector::new(p, q, r)));
+            self.attitude = Some(Attitude {
+                ned_from_body: Rotation::from_euler(roll, pitch, yaw),
+                angular_rate: Vector::new(p, q, r),
+            });
         }
     }
 
@@ -167,15 +199,15 @@ impl Reported {
         }
     }
 
-    /// Moves the home to the autopilot's origin when it was taken from a vehicle in the air.
+    /// Moves the home to the autopilot's origin if the vehicle was first reported in the air.
     fn settle(&mut self, position: Point<Ned>) {
         if std::mem::replace(&mut self.is_settled, true) || !position.is_finite() {
             return;
         }
-        let is_airborne = -position.z() > STARTED_BELOW_M;
-        if let (Some(home), Some(last), true) = (self.home, self.past.back(), is_airborne) {
+        let is_airborne = -position.z() > AIRBORNE_M;
+        if let (Some(home), Some(last), true) = (self.home, self.history.back(), is_airborne) {
             self.home = Some(origin_of(home, Point::origin() + (position - last.position)));
-            self.past.clear();
+            self.history.clear();
         }
     }
 
@@ -184,22 +216,22 @@ impl Reported {
         now_s: f64,
         position: Point<Ned>,
         velocity: Vector<Ned>,
-        (ned_from_body, angular_rate): (Rotation<Ned, Body>, Vector<Body>),
+        Attitude { ned_from_body, angular_rate }: Attitude,
     ) {
-        let last = self.past.back().copied();
+        let last = self.history.back().copied();
         if last.is_some_and(|last| now_s <= last.time_s) {
             return;
         }
         let dt_s = last.map_or(f64::INFINITY, |last| now_s - last.time_s);
         let before = last.map_or(velocity, |last| last.velocity);
         let height_m = -position.z();
-        self.fastest_fall.push_back((now_s, velocity.z()));
-        while self.fastest_fall.front().is_some_and(|(time_s, _)| now_s - time_s > 0.3) {
-            self.fastest_fall.pop_front();
+        self.descent.push_back((now_s, velocity.z()));
+        while self.descent.front().is_some_and(|(time_s, _)| now_s - time_s > IMPACT_WINDOW_S) {
+            self.descent.pop_front();
         }
-        let on_ground = height_m < ON_GROUND.0 && velocity.z().abs() < ON_GROUND.1;
-        let impact = self.fastest_fall.iter().map(|(_, fall)| *fall).fold(0.0, f64::max);
-        self.past.push_back(VehicleTruth {
+        let on_ground = height_m < MAX_GROUND_HEIGHT_M && velocity.z().abs() < MAX_GROUND_SPEED_M_S;
+        let impact = self.descent.iter().map(|(_, speed)| *speed).fold(0.0, f64::max);
+        self.history.push_back(VehicleTruth {
             time_s: now_s,
             position,
             velocity,
@@ -210,31 +242,38 @@ impl Reported {
             height_m,
             impact_m_s: on_ground.then_some(impact),
         });
-        if self.past.len() > MOST_PAST {
-            self.past.pop_front();
+        if self.history.len() > MAX_HISTORY {
+            self.history.pop_front();
         }
     }
 }
 
-/// The place from which another one, `here`, lies at `position`.
-fn origin_of(here: (i32, i32, f64), position: Point<Ned>) -> (i32, i32, f64) {
-    let (lat, lon, altitude_m) = here;
-    let shrink = (f64::from(lat) * 1e-7).to_radians().cos();
+/// The origin of the local frame in which `here` has the coordinates `position`.
+fn origin_of(here: GlobalPosition, position: Point<Ned>) -> GlobalPosition {
     let north_e7 = (position.x() / M_PER_E7).round() as i32;
-    let east_e7 = (position.y() / (M_PER_E7 * shrink)).round() as i32;
-    (lat.saturating_sub(north_e7), lon.saturating_sub(east_e7), altitude_m + position.z())
+    let east_e7 = (position.y() / (M_PER_E7 * here.cos_latitude())).round() as i32;
+    GlobalPosition {
+        lat_e7: here.lat_e7.saturating_sub(north_e7),
+        lon_e7: here.lon_e7.saturating_sub(east_e7),
+        altitude_m: here.altitude_m + position.z(),
+    }
 }
 
-fn position_from(home: (i32, i32, f64), lat_e7: i32, lon_e7: i32, altitude_m: f64) -> Point<Ned> {
-    let (home_lat, home_lon, home_altitude_m) = home;
-    let north_m = (f64::from(lat_e7) - f64::from(home_lat)) * M_PER_E7;
-    let shrink = (f64::from(home_lat) * 1e-7).to_radians().cos();
-    let east_m = (f64::from(lon_e7) - f64::from(home_lon)) * M_PER_E7 * shrink;
-    Point::new(north_m, east_m, home_altitude_m - altitude_m)
+/// The coordinates of `here` in the local frame at `home`.
+fn position_from(home: GlobalPosition, here: GlobalPosition) -> Point<Ned> {
+    let north_m = (f64::from(here.lat_e7) - f64::from(home.lat_e7)) * M_PER_E7;
+    let east_m = (f64::from(here.lon_e7) - f64::from(home.lon_e7)) * M_PER_E7 * home.cos_latitude();
+    Point::new(north_m, east_m, home.altitude_m - here.altitude_m)
+}
+
+impl GlobalPosition {
+    fn cos_latitude(self) -> f64 {
+        (f64::from(self.lat_e7) * 1e-7).to_radians().cos()
+    }
 }
 
 fn predicted(last: &VehicleTruth, time_s: f64) -> VehicleTruth {
-    let dt_s = (time_s - last.time_s).clamp(0.0, LONGEST_PREDICTION_S);
+    let dt_s = (time_s - last.time_s).clamp(0.0, MAX_PREDICTION_S);
     VehicleTruth {
         time_s,
         position: last.position + last.velocity * dt_s,
@@ -271,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn a_simulated_px4_tells_the_truth_too() {
+    fn the_truth_of_a_simulated_px4_is_used() {
         let state = |north_e7: i32| {
             frame(MavMessage::HIL_STATE_QUATERNION(HIL_STATE_QUATERNION_DATA {
                 attitude_quaternion: [0.0, 0.0, 0.0, 1.0],
@@ -283,7 +322,7 @@ mod tests {
                 ..Default::default()
             }))
         };
-        let mut reported = Reported::default();
+        let mut reported = ReportedVehicle::default();
         // 1 m/s northwards and 0.5 m/s up.
         for tick in 0..400 {
             let seconds = f64::from(tick) * 0.01;
@@ -297,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_is_heard_in_the_air_first_has_started_at_the_autopilots_origin() {
+    fn a_vehicle_first_reported_in_the_air_started_at_the_autopilots_origin() {
         let attitude = || frame(MavMessage::ATTITUDE(ATTITUDE_DATA::default()));
         let local = |x: f32, z: f32| {
             frame(MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
@@ -306,24 +345,24 @@ mod tests {
                 ..LOCAL_POSITION_NED_DATA::default()
             }))
         };
-        let told = sim_state(0, 590.0, [0.0; 3]);
+        let truth_message = sim_state(0, 590.0, [0.0; 3]);
         for order in [
-            [attitude(), local(3.0, -6.0), told.clone()],
-            [told.clone(), attitude(), local(3.0, -6.0)],
+            [attitude(), local(3.0, -6.0), truth_message.clone()],
+            [truth_message.clone(), attitude(), local(3.0, -6.0)],
         ] {
-            let mut reported = Reported::default();
-            for (i, packet) in order.iter().chain([&told]).enumerate() {
+            let mut reported = ReportedVehicle::default();
+            for (i, packet) in order.iter().chain([&truth_message]).enumerate() {
                 reported.handle(i as f64 * 0.02, packet);
             }
             let truth = reported.truth().unwrap();
-            assert!(reported.is_true(0.1), "told by SIM_STATE");
+            assert!(reported.is_true(0.1), "from SIM_STATE");
             assert!((truth.position.x() - 3.0).abs() < 0.02 && (truth.height_m - 6.0).abs() < 0.02);
         }
     }
 
     #[test]
-    fn positions_in_centimetres_become_a_smooth_motion() {
-        let mut reported = Reported::default();
+    fn positions_in_steps_of_a_centimetre_become_a_smooth_motion() {
+        let mut reported = ReportedVehicle::default();
         let mut worst_m: f64 = 0.0;
         for i in 0..200 {
             let time_s = f64::from(i) * 0.02;
@@ -341,8 +380,8 @@ mod tests {
     }
 
     #[test]
-    fn the_ground_is_where_it_was_first_heard_and_the_impact_is_remembered() {
-        let mut reported = Reported::default();
+    fn the_ground_is_at_the_first_reported_height_and_the_impact_is_measured() {
+        let mut reported = ReportedVehicle::default();
         reported.handle(0.0, &sim_state(0, 584.09, [0.0; 3]));
         assert!(reported.truth().unwrap().on_ground);
         reported.handle(0.1, &sim_state(0, 586.09, [0.0, 0.0, 0.5]));
@@ -364,7 +403,7 @@ mod tests {
 
     #[test]
     fn without_a_simulation_the_autopilots_estimate_is_used() {
-        let mut reported = Reported::default();
+        let mut reported = ReportedVehicle::default();
         let position = LOCAL_POSITION_NED_DATA { x: 1.0, y: 2.0, z: -3.0, ..Default::default() };
         reported.handle(0.0, &frame(MavMessage::LOCAL_POSITION_NED(position.clone())));
         assert!(!reported.is_known(), "no attitude yet");

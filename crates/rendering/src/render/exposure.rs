@@ -2,47 +2,48 @@
 
 use geometry::{Body, Camera, CameraModel, Ned, Pixel, Point, Transform};
 
-use super::RenderError;
+use crate::scene::RenderError;
 
-/// The camera's way through one exposure.
+/// The camera's poses during one exposure.
 #[derive(Debug)]
 pub(super) struct Exposure {
     /// Half-way through the exposure.
     pub(super) middle: Transform<Ned, Camera>,
-    /// When the shutter opens and when it closes.
+    /// At the opening and the closing of the shutter.
     pub(super) ends: [Transform<Ned, Camera>; 2],
-    /// Evenly spaced instants over which the picture of the markers is averaged.
+    /// Evenly spaced instants over which the image of the markers is averaged.
     pub(super) instants: Vec<Transform<Ned, Camera>>,
-    /// The longest way of any pixel over the scene, in pixels.
+    /// Maximum motion of any point in the image, in pixels.
     pub(super) motion_px: f64,
 }
 
-/// Instants come in groups of so many, of which the middle one can stand for all.
+/// Number of instants in a group, whose middle one can represent it.
 pub(super) const GROUP: usize = 5;
 
-/// A group spans at most this much motion as long as there are fewer than [`MOST_GROUPS`]: the blur of a pixel and a
-/// lens leaves no ripple from steps of a fifth of it.
+/// Maximum motion within a group, in pixels, while there are fewer than [`MAX_GROUPS`]: the blur of pixel and
+/// lens hides steps of a fifth of it.
 const GROUP_PX: f64 = 5.0;
 
-const MOST_GROUPS: usize = 4;
+/// Maximum number of groups.
+const MAX_GROUPS: usize = 4;
 
-/// Instants of an average at most.
-pub(super) const MOST_INSTANTS: usize = GROUP * MOST_GROUPS;
+/// Maximum number of instants.
+pub(super) const MAX_INSTANTS: usize = GROUP * MAX_GROUPS;
 
-/// For less motion one instant is enough.
-const SHORT_PX: f64 = 0.3;
+/// Motion below which one instant suffices, in pixels.
+const MIN_MOTION_PX: f64 = 0.3;
 
-/// Places farther than this from the origin are refused: a picture of the ground makes no sense there.
-const FARTHEST_M: f64 = 1e5;
+/// Maximum distance of the vehicle from the origin, in metres.
+const MAX_DISTANCE_M: f64 = 1e5;
 
 impl Exposure {
     pub(super) fn new() -> Self {
         let still = Transform::identity();
-        let instants = Vec::with_capacity(MOST_INSTANTS);
+        let instants = Vec::with_capacity(MAX_INSTANTS);
         Self { middle: still, ends: [still; 2], instants, motion_px: 0.0 }
     }
 
-    /// Follows the vehicle through `poses`, evenly spaced in time over the exposure.
+    /// Sets the exposure to that of a vehicle with these poses, evenly spaced in time.
     pub(super) fn follow(
         &mut self,
         poses: &[Transform<Ned, Body>],
@@ -59,8 +60,8 @@ impl Exposure {
         self.middle = camera_at(&0.5);
         self.ends = [*first * *body_from_camera, *last * *body_from_camera];
         self.motion_px = motion_px(poses, &self.middle, body_from_camera, model);
-        let groups = (self.motion_px / GROUP_PX).ceil().clamp(1.0, MOST_GROUPS as f64) as usize;
-        let count = if self.motion_px < SHORT_PX { 1 } else { GROUP * groups };
+        let groups = (self.motion_px / GROUP_PX).ceil().clamp(1.0, MAX_GROUPS as f64) as usize;
+        let count = if self.motion_px < MIN_MOTION_PX { 1 } else { GROUP * groups };
         self.instants.clear();
         let fraction = |k| (k as f64 + 0.5) / count as f64;
         self.instants.extend((0..count).map(|k| camera_at(&fraction(k))));
@@ -86,40 +87,41 @@ pub(super) fn between(poses: &[Transform<Ned, Body>], fraction: f64) -> Transfor
 fn is_sound(pose: &Transform<Ned, Body>) -> bool {
     let place = pose.origin();
     let norm = pose.isometry.rotation.norm();
-    place.is_finite() && place.coords.coords.norm() < FARTHEST_M && (norm - 1.0).abs() < 1e-3
+    place.is_finite() && place.coords.coords.norm() < MAX_DISTANCE_M && (norm - 1.0).abs() < 1e-3
 }
 
-/// The longest way, in pixels, of what nine pixels all over the image see half-way through the exposure.
+/// Maximum motion, in pixels, of the points that nine pixels across the image see in the middle of the
+/// exposure.
 fn motion_px(
     poses: &[Transform<Ned, Body>],
     middle: &Transform<Ned, Camera>,
     body_from_camera: &Transform<Body, Camera>,
     model: &CameraModel,
 ) -> f64 {
-    let mut longest = 0.0f64;
+    let mut max_px = 0.0f64;
     for (i, j) in (0..9).map(|k| (f64::from(k % 3) / 2.0, f64::from(k / 3) / 2.0)) {
         let edge = |size: u32| f64::from(size.saturating_sub(1));
         let pixel = Pixel::new(edge(model.width) * i, edge(model.height) * j);
         let seen = seen_by(model, middle, pixel);
         let mut before = None;
-        let mut way = 0.0;
+        let mut path_px = 0.0;
         for pose in poses {
             let camera_from_ned = (*pose * *body_from_camera).inverse();
             let now = model.project(camera_from_ned * seen);
-            way += match (before, now) {
+            path_px += match (before, now) {
                 (None, _) => 0.0,
                 (Some(Some(a)), Some(b)) => Pixel::distance(&a, &b),
-                // Seen and not seen in one exposure: the vehicle tumbles.
+                // Visible and invisible in one exposure: the vehicle tumbles.
                 _ => f64::from(model.width),
             };
             before = Some(now);
         }
-        longest = longest.max(way);
+        max_px = max_px.max(path_px);
     }
-    longest
+    max_px
 }
 
-/// What a pixel sees: a place on the ground, or one far away.
+/// The point on the ground that a pixel sees, or one far away.
 fn seen_by(
     model: &CameraModel,
     ned_from_camera: &Transform<Ned, Camera>,

@@ -1,15 +1,14 @@
-//! From pixels to directions, and what the lens and a pixel's area blur.
+//! From pixels to directions, and the blur of the lens and of a pixel's area.
 
 use geometry::{CameraModel, Distortion, Pixel};
 
-/// Directions of pixels, fast: exact for a pinhole, from a table for a lens that distorts.
+/// Directions of pixels: exact for a pinhole, from a table for a distorting lens.
 #[derive(Debug)]
 pub(super) struct Lens {
-    /// Edge of the square of pixels in which the lens counts as linear.
+    /// Edge of the tile in which the lens is approximated as linear, in pixels.
     pub(super) tile: usize,
     model: CameraModel,
-    /// Ideal coordinates of the pixels at multiples of the tile's edge, and how many there are in a row; empty for a
-    /// pinhole.
+    /// Ideal coordinates of the pixels at multiples of the tile's edge, row by row; empty for a pinhole.
     nodes: Vec<[f64; 2]>,
     nodes_per_row: usize,
 }
@@ -22,10 +21,11 @@ pub(super) struct Linear {
     pub(super) per_row: [f64; 2],
 }
 
-/// Edge of a tile for a pinhole, which is linear everywhere.
+/// Edge of a tile for a pinhole, which is linear everywhere, in pixels.
 pub(super) const PINHOLE_TILE: usize = 16;
 
-/// Edge of a tile for a lens that distorts; within it a usual lens strays from linear by thousandths of a pixel.
+/// Edge of a tile for a distorting lens, in pixels; within it common lenses are linear to thousandths of a
+/// pixel.
 const DISTORTED_TILE: usize = 8;
 
 impl Lens {
@@ -45,7 +45,7 @@ impl Lens {
         lens
     }
 
-    /// Ideal coordinates of a pixel; where the lens model has no answer, those of a pinhole.
+    /// Ideal coordinates of a pixel; where the lens model has no solution, those of a pinhole.
     fn exact(&self, u: f64, v: f64) -> [f64; 2] {
         let ray = self.model.unproject(Pixel::new(u, v));
         if ray.is_finite() { [ray.x(), ray.y()] } else { self.pinhole(u, v) }
@@ -68,7 +68,7 @@ impl Lens {
         }
     }
 
-    /// Least and greatest ideal coordinates of the image and of `margin` pixels about it.
+    /// Minimum and maximum ideal coordinates of the image with a margin, in pixels.
     pub(super) fn field(&self, margin: f64) -> ([f64; 2], [f64; 2]) {
         let (mut min, mut max) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
         let mut include = |place: [f64; 2]| {
@@ -88,7 +88,7 @@ impl Lens {
         (min, max)
     }
 
-    /// The lens about the pixel place (u, v), over `reach` pixels to each side.
+    /// The lens linearised around pixel (u, v), over `reach` pixels to each side.
     pub(super) fn about(&self, u: f64, v: f64, reach: f64) -> Linear {
         if self.nodes.is_empty() {
             return Linear {
@@ -102,7 +102,7 @@ impl Lens {
         let middle = self.exact(u, v);
         let mean = |i: usize| (left[i] + right[i] + top[i] + bottom[i]) / 4.0;
         Linear {
-            // Half-way between the tangent and the chord, which spreads the error over the tile.
+            // The mean of tangent and chord spreads the error over the tile.
             centre: [0, 1].map(|i| (middle[i] + mean(i)) / 2.0),
             per_column: [0, 1].map(|i| (right[i] - left[i]) / (2.0 * reach)),
             per_row: [0, 1].map(|i| (bottom[i] - top[i]) / (2.0 * reach)),
@@ -110,30 +110,30 @@ impl Lens {
     }
 }
 
-/// Weights of the subsamples of a row (or column) in a pixel: the pixel's own width, blurred by the lens.
+/// Weights of the subsamples of a row or column in a pixel: a box of one pixel, blurred by the lens.
 #[derive(Debug)]
 pub(super) struct Blur {
-    /// Subsamples to a pixel.
+    /// Subsamples per pixel.
     pub(super) per_pixel: usize,
-    /// Subsamples before the pixel's first that still count.
+    /// Subsamples beyond the pixel on each side.
     pub(super) margin: usize,
     /// `per_pixel + 2 * margin` weights whose sum is 1.
     pub(super) weights: Vec<f32>,
 }
 
-/// Standard deviations at which a lens's blur ends.
+/// Half width of the lens blur, in standard deviations.
 const BLUR_REACH: f64 = 3.3;
 
-/// Width of an edge's profile in subsamples: wide enough that the subsamples' grid folds little of an edge, whatever
-/// its direction, onto frequencies that the blur lets through.
+/// Width of an edge's profile in subsamples: wide enough against aliasing of edges in any direction into
+/// frequencies that the blur passes.
 pub(super) const PROFILE_WIDTH: f64 = 2.0;
 
 impl Blur {
     pub(super) fn new(sigma_px: f64, per_pixel: usize) -> Self {
-        // What the profile blurs beyond a subsample's own width, the weights need not.
+        // The profile already blurs more than a subsample does.
         let excess = PROFILE_WIDTH * PROFILE_WIDTH / 28.0 - 1.0 / 12.0;
         let sigma = ((sigma_px * per_pixel as f64).powi(2) - excess).max(0.0).sqrt();
-        // A blur well below a subsample is lost in the subsample's own width.
+        // A blur well below a subsample is negligible.
         let margin = if sigma < 0.25 { 0 } else { (BLUR_REACH * sigma).ceil() as usize };
         let spread =
             |offset: f64| if margin == 0 { 1.0 } else { (-0.5 * (offset / sigma).powi(2)).exp() };
@@ -148,7 +148,7 @@ impl Blur {
         Self { per_pixel, margin, weights }
     }
 
-    /// How far from a pixel's centre the light may come, in pixels.
+    /// Maximum distance from a pixel's centre to the light it gets, in pixels.
     pub(super) fn reach_px(&self) -> f64 {
         0.5 + self.margin as f64 / self.per_pixel as f64
     }
@@ -159,7 +159,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_blur_keeps_the_light_and_has_the_variance_of_pixel_and_lens() {
+    fn a_blur_has_sum_one_and_the_variance_of_pixel_and_lens() {
         for (sigma, per_pixel) in [(0.0, 8), (0.5, 2), (0.6, 4), (1.5, 2)] {
             let blur = Blur::new(sigma, per_pixel);
             let centre = (blur.weights.len() as f64 - 1.0) / 2.0;
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lens_that_distorts_is_linear_in_a_tile() {
+    fn a_distorting_lens_is_linear_in_a_tile() {
         let pinhole = CameraModel::pinhole(1296, 972, 1818.0);
         let barrel = Distortion::BrownConrady([-0.28, 0.07, 2e-4, 2e-5, 0.0, 0.0, 0.0, 0.0]);
         let lens = Lens::new(CameraModel { distortion: barrel, ..pinhole });

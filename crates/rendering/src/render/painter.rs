@@ -1,19 +1,19 @@
-//! Tiles of a painting in which edges are: subsamples, weighted with the blur.
+//! Paints the tiles that contain edges: subsamples, weighted with the blur.
 
 use super::exposure::GROUP;
 use super::lens::{Blur, Lens, Linear, PROFILE_WIDTH};
-use super::painting::{Affine, Area, Coat, Paint, Sight};
+use super::painting::{Affine, Area, Coat, Paint, Sight, jacobian};
 
 /// Paints tiles.
 #[derive(Debug)]
 pub(super) struct Painter {
     tile: usize,
-    /// From coarse to fine subsamples, and the coarsest that serves straight edges.
+    /// From coarse to fine subsamples, and the coarsest that suffices for straight edges.
     blurs: [Blur; 3],
     coarsest: usize,
     offsets: Vec<f32>,
     outlines: Outlines,
-    /// Of the row of subsamples being painted.
+    /// Coverage of the row of subsamples being painted.
     cover: Vec<f32>,
     paint: Channels,
     /// Sums over the instants, subsample by subsample.
@@ -24,7 +24,7 @@ pub(super) struct Painter {
     pub(super) tile_paint: Channels,
 }
 
-/// Cover and light, place by place.
+/// Coverage and light of each sample.
 #[derive(Debug, Default)]
 pub(super) struct Channels {
     pub(super) cover: Vec<f32>,
@@ -49,47 +49,48 @@ fn columns(
     index(from).min(end)..end
 }
 
-/// A tile of a painting during the exposure.
+/// What a tile sees of a painting during the exposure.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Glimpse<'a> {
-    /// At its instants.
+    /// At each instant.
     pub(super) sights: &'a [Sight],
-    /// About the tile's centre.
+    /// Around the tile's centre.
     pub(super) lens: &'a Linear,
-    /// How far what the tile shows moves during the exposure, in pixels.
+    /// Motion in the image during the exposure, in pixels.
     pub(super) motion_px: [f64; 2],
-    /// Whether accuracy matters.
+    /// Whether to render at full accuracy.
     pub(super) exact: bool,
 }
 
 /// How finely a tile is resolved.
 #[derive(Copy, Clone, Debug)]
 struct Resolution {
-    /// Which of the blurs.
+    /// Index of the blur.
     blur: usize,
-    /// Every how many of the instants is painted.
+    /// One of this number of instants is painted.
     group: usize,
-    /// Motion in pixels from one painted instant to the next, over which edges are averaged.
+    /// Motion between painted instants, over which edges are averaged, in pixels.
     motion: [f64; 2],
-    /// Whether edges of polygons, too, are averaged; corners are not made of averaged edges.
+    /// Whether the edges of polygons are averaged too. Corners do not follow from averaged edges.
     polygons_move: bool,
-    /// Discs smaller than this are not averaged, in metres: their edges are too bent.
-    smallest_moving_m: f64,
+    /// Minimum radius of averaged discs, in metres: the edges of smaller ones are too curved.
+    min_moving_m: f64,
 }
 
-/// Blurs of lenses, in pixels, too sharp for the coarsest and for the next coarsest subsamples.
+/// Minimum lens blur for the coarsest and for the next finer subsamples, in pixels.
 const SHARP_PX: [f64; 2] = [0.5, 0.2];
 
-/// From this size in pixels on, a shape's edge is nearly straight within a subsample.
+/// Size in pixels above which a shape's edge is nearly straight within a subsample.
 const LARGE_PX: f64 = 4.0;
 
-/// A shape of so many times the motion during a group of instants is nearly straight along it.
+/// Size above which a shape is nearly straight along its motion, in units of the motion within a group of
+/// instants.
 const STRAIGHT: f64 = 4.0;
 
-/// A disc of a radius below so many times the motion during an instant is too bent to be averaged over it.
+/// Minimum radius of a disc that is averaged over its motion, in units of the motion within an instant.
 const BENT: f64 = 2.0;
 
-/// Below this size in pixels a shape needs the finest subsamples.
+/// Size in pixels below which a shape needs the finest subsamples.
 const SMALL_PX: f64 = 0.7;
 
 impl Painter {
@@ -111,12 +112,12 @@ impl Painter {
         }
     }
 
-    /// How far outside a tile its light may come from, in pixels.
+    /// Maximum distance from a tile to the light it gets, in pixels.
     pub(super) fn reach_px(&self) -> f64 {
         self.blurs.iter().map(Blur::reach_px).fold(0.0, f64::max)
     }
 
-    /// Paints coats, top first, over what lies `beneath`, into [`Painter::tile_paint`].
+    /// Paints coats, top first, over the paint `beneath`, into [`Painter::tile_paint`].
     pub(super) fn paint(&mut self, coats: &[Coat], beneath: Paint, glimpse: &Glimpse<'_>) {
         let resolution = self.resolution(coats, glimpse);
         let Some(blur) = self.blurs.get(resolution.blur) else { return };
@@ -137,12 +138,12 @@ impl Painter {
         }
         let count = glimpse.sights.len() / resolution.group;
         let part = 1.0 / count.max(1) as f32;
-        // The middle one of each group stands for it.
+        // The middle instant represents its group.
         let chosen = glimpse.sights.iter().skip(resolution.group / 2).step_by(resolution.group);
         for (instant, sight) in chosen.enumerate() {
             let plane = sight.about(glimpse.lens);
-            let size = (f64::from(step), f64::from(-first));
-            self.outlines.draw(coats, (sight, &plane), &resolution, size);
+            let samples = Samples { step: f64::from(step), reach: f64::from(-first) };
+            self.outlines.draw(coats, sight, &plane, &resolution, samples);
             let rows =
                 self.sums.cover.chunks_exact_mut(edge).zip(self.sums.light.chunks_exact_mut(edge));
             for ((sum_cover, sum_light), v) in rows.zip(&*offsets) {
@@ -179,7 +180,7 @@ impl Painter {
         }
     }
 
-    /// What resolves the smallest of the shapes.
+    /// The resolution that the smallest shape needs.
     fn resolution(&self, coats: &[Coat], glimpse: &Glimpse<'_>) -> Resolution {
         let count = glimpse.sights.len();
         let coarse = Resolution {
@@ -187,14 +188,14 @@ impl Painter {
             group: GROUP.min(count.max(1)),
             motion: glimpse.motion_px.map(|m| m * GROUP as f64 / count.max(GROUP) as f64),
             polygons_move: true,
-            smallest_moving_m: 0.0,
+            min_moving_m: 0.0,
         };
         let Some(middle) = glimpse.sights.get(count / 2) else { return coarse };
         if !glimpse.exact {
             return coarse;
         }
         let plane = middle.about(glimpse.lens);
-        let [du, dv] = slopes(&plane);
+        let [du, dv] = jacobian(&plane);
         let metres_per_pixel =
             (du[0] * du[0] + du[1] * du[1]).max(dv[0] * dv[0] + dv[1] * dv[1]).sqrt();
         let smallest_m = coats.iter().fold(f64::INFINITY, |smallest, coat| match coat.area {
@@ -213,14 +214,14 @@ impl Painter {
         let blur = match smallest_px {
             px if px > LARGE_PX => self.coarsest,
             px if px > SMALL_PX || count > 1 => self.coarsest.max(1),
-            // Also when it is not a number, at the horizon.
+            // Also at the horizon, where it is NaN.
             _ => 2,
         };
-        let smallest_moving_m = BENT * step_px(motion) * metres_per_pixel;
-        Resolution { blur, group: 1, motion, polygons_move: !cornered, smallest_moving_m }
+        let min_moving_m = BENT * step_px(motion) * metres_per_pixel;
+        Resolution { blur, group: 1, motion, polygons_move: !cornered, min_moving_m }
     }
 
-    /// Whether two edges of one shape come near the tile.
+    /// True when two edges of one shape are near the tile.
     fn has_corner(&self, coats: &[Coat], sight: &Sight, plane: &[Affine; 3]) -> bool {
         let near = (self.tile as f64 / 2.0 + self.reach_px()) * std::f64::consts::SQRT_2;
         let edges_near = |edges: &[Affine]| {
@@ -234,10 +235,11 @@ impl Painter {
     }
 }
 
-/// How the place on the plane changes per column and per row of pixels at a tile's centre.
-pub(super) fn slopes([x, y, w]: &[Affine; 3]) -> [[f64; 2]; 2] {
-    let slope = |f: &Affine, axis: usize| (f[axis] * w[0] - f[0] * w[axis]) / (w[0] * w[0]);
-    [1, 2].map(|axis| [slope(x, axis), slope(y, axis)])
+/// The subsamples of a tile: their size, and their maximum distance from its centre, in pixels.
+#[derive(Copy, Clone)]
+struct Samples {
+    step: f64,
+    reach: f64,
 }
 
 /// The coats' outlines in a tile at one instant.
@@ -255,23 +257,22 @@ enum Outline {
     Disc {
         /// Coefficients 1, u, v, uu, uv, vv of a quadratic that is negative inside.
         quadratic: [f32; 6],
-        /// How far it moves.
         motion: [f32; 2],
-        /// From which column and row to which it may be seen.
+        /// First and last column and row of its bounding box.
         bounds: [[f32; 2]; 2],
     },
-    /// Which of the half-planes.
+    /// Its range of the half-planes.
     Polygon { first: usize, len: usize },
 }
 
-/// Depth within its edge, in pixels: constant, per column, per row; and how far the edge moves.
+/// Depth behind its edge, in pixels: constant, per column, per row; and the motion of the edge.
 #[derive(Copy, Clone, Debug)]
 struct HalfPlane {
     depth: [f32; 3],
     motion: f32,
 }
 
-/// How cover rises across an edge: the integral of a biweight kernel.
+/// Coverage across an edge: the integral of a biweight kernel.
 #[derive(Copy, Clone, Debug, Default)]
 struct Profile {
     /// Width of the kernel, and its inverse, in pixels.
@@ -279,7 +280,7 @@ struct Profile {
     inverse: f32,
 }
 
-/// Below this an edge stands still, in pixels.
+/// Motion below which an edge counts as still, in pixels.
 const STILL_PX: f32 = 0.05;
 
 impl Profile {
@@ -287,24 +288,25 @@ impl Profile {
         Self { width: width as f32, inverse: (1.0 / width) as f32 }
     }
 
-    /// How far from an edge that moves there is neither full cover nor none.
+    /// Half width of the band of partial coverage along a moving edge, in pixels.
     fn margin(self, motion: [f32; 2]) -> f32 {
         let moved = (motion[0] * motion[0] + motion[1] * motion[1]).sqrt();
         0.5 * (self.width + moved.max(STILL_PX))
     }
 
-    /// Cover at a depth within an edge that stands still.
+    /// Coverage at a depth behind a still edge.
     fn cover(self, depth: f32) -> f32 {
         let t = (0.5 + depth * self.inverse).clamp(0.0, 1.0);
         t * t * t * (10.0 + t * (6.0 * t - 15.0))
     }
 
-    /// Mean cover at a depth within an edge that moves along its normal by `motion`, at least [`STILL_PX`].
+    /// Mean coverage at a depth behind an edge that moves along its normal by `motion`, at least
+    /// [`STILL_PX`].
     fn mean_cover(self, depth: f32, motion: f32) -> f32 {
         (self.integral(depth + 0.5 * motion) - self.integral(depth - 0.5 * motion)) / motion
     }
 
-    /// Integral of the cover up to a depth.
+    /// Integral of the coverage up to a depth.
     fn integral(self, depth: f32) -> f32 {
         let t = (0.5 + depth * self.inverse).clamp(0.0, 1.0);
         let t2 = t * t;
@@ -313,17 +315,17 @@ impl Profile {
 }
 
 impl Outlines {
-    /// Draws coats, top first, as seen in `sight`, for subsamples of size `step` at most `reach` columns and rows from
-    /// the tile's centre.
+    /// Computes the outlines of coats, top first, as seen in `sight`.
     fn draw(
         &mut self,
         coats: &[Coat],
-        (sight, plane): (&Sight, &[Affine; 3]),
+        sight: &Sight,
+        plane: &[Affine; 3],
         resolution: &Resolution,
-        (step, reach): (f64, f64),
+        Samples { step, reach }: Samples,
     ) {
-        let least = |f: &Affine| f[0] - (f[1].abs() + f[2].abs()) * reach;
-        self.behind = (least(&plane[2]) < 1e-6).then(|| plane[2].map(|w| w as f32));
+        let min = |f: &Affine| f[0] - (f[1].abs() + f[2].abs()) * reach;
+        self.behind = (min(&plane[2]) < 1e-6).then(|| plane[2].map(|w| w as f32));
         self.profile = Profile::new(PROFILE_WIDTH * step);
         let spread = (PROFILE_WIDTH * step).powi(2) / 28.0;
         let motion_of_polygons =
@@ -333,7 +335,7 @@ impl Outlines {
         for coat in coats.iter().rev() {
             let outline = match coat.area {
                 Area::Disc { centre, radius } => {
-                    let moves = radius > resolution.smallest_moving_m;
+                    let moves = radius > resolution.min_moving_m;
                     let motion = if moves { resolution.motion } else { [0.0; 2] };
                     let about = about(plane, centre);
                     let quadratic = disc(&about, radius, motion, spread);
@@ -362,8 +364,8 @@ impl Outlines {
         for edge in edges {
             let depth = depth_px(plane, edge);
             let moved = (depth[1] * motion[0] + depth[2] * motion[1]).abs();
-            let least = depth[0] - (depth[1].abs() + depth[2].abs()) * reach;
-            if least < f64::from(self.profile.width) + moved {
+            let min = depth[0] - (depth[1].abs() + depth[2].abs()) * reach;
+            if min < f64::from(self.profile.width) + moved {
                 let depth = depth.map(|d| d as f32);
                 self.half_planes.push(HalfPlane { depth, motion: moved as f32 });
             }
@@ -371,7 +373,7 @@ impl Outlines {
         Outline::Polygon { first, len: self.half_planes.len() - first }
     }
 
-    /// From where to where row `v` of a tile, itself from `from` to `to`, may be covered by an outline.
+    /// The part of row `v` of a tile, which spans `from` to `to`, that an outline may cover.
     fn reach(&self, outline: &Outline, v: f32, [from, to]: [f32; 2]) -> Option<[f32; 2]> {
         match outline {
             Outline::Disc { quadratic, motion, bounds: [columns, rows] } => {
@@ -382,12 +384,11 @@ impl Outlines {
                 if from > to {
                     return None;
                 }
-                // Where the quadratic is below the most that it can be at the margin.
+                // Where the quadratic is below its maximum at the margin.
                 let row = Row::new(quadratic, v);
-                let most =
-                    row.steepness(from).max(row.steepness(to)) * self.profile.margin(*motion);
+                let max = row.steepness(from).max(row.steepness(to)) * self.profile.margin(*motion);
                 let half = 0.5 * row.slope / row.bend;
-                let square = half * half - (row.start - most) / row.bend;
+                let square = half * half - (row.start - max) / row.bend;
                 if row.bend.is_nan() || row.bend < 1e-6 {
                     return Some([from, to]);
                 }
@@ -412,7 +413,7 @@ impl Outlines {
         }
     }
 
-    /// How much of each subsample in row `v` an outline covers.
+    /// Coverage of each subsample in row `v` by an outline.
     fn cover_row(&self, outline: &Outline, v: f32, offsets: &[f32], cover: &mut [f32]) {
         let ends = [offsets.first(), offsets.last()].map(|end| end.copied().unwrap_or(0.0));
         match outline {
@@ -420,7 +421,7 @@ impl Outlines {
                 let row = Row::new(quadratic, v);
                 let margin = self.profile.margin(*motion);
                 let deep = |u: f32| -row.value(u) > row.steepness(u) * margin;
-                // What lies between two places within lies within.
+                // A convex shape that contains both ends contains what is between them.
                 if row.bend > 0.0 && ends.iter().all(|u| deep(*u)) {
                     cover.fill(1.0);
                 } else if *motion == [0.0; 2] {
@@ -450,7 +451,7 @@ impl Outlines {
         }
     }
 
-    /// Multiplies the cover with a half-plane's.
+    /// Multiplies the coverage with that of a half-plane.
     fn half_plane_row(&self, plane: &HalfPlane, v: f32, offsets: &[f32], cover: &mut [f32]) {
         let [start, per_u, per_v] = plane.depth;
         let start = start + per_v * v;
@@ -465,7 +466,7 @@ impl Outlines {
         }
     }
 
-    /// The distance of a quadratic's nought in pixels is its value over its gradient.
+    /// The distance to a quadratic's zero, in pixels, is its value over its gradient.
     fn disc_row(&self, row: &Row, offsets: &[f32], cover: &mut [f32]) {
         for (cover, u) in cover.iter_mut().zip(offsets) {
             *cover = self.profile.cover(-row.value(*u) / row.steepness(*u));
@@ -518,8 +519,7 @@ impl Row {
     }
 }
 
-/// The columns and the rows within which a quadratic is negative, and a margin about them; all where they have no
-/// bounds.
+/// First and last column and row where a quadratic is negative, with a margin; infinite without bounds.
 fn bounds(&[c, u1, v1, uu, uv, vv]: &[f32; 6], margin: f32) -> [[f32; 2]; 2] {
     let everywhere = [[f32::NEG_INFINITY, f32::INFINITY]; 2];
     let [c, u1, v1, uu, uv, vv] = [c, u1, v1, uu, uv, vv].map(f64::from);
@@ -529,31 +529,32 @@ fn bounds(&[c, u1, v1, uu, uv, vv]: &[f32; 6], margin: f32) -> [[f32; 2]; 2] {
     }
     let centre = [(uv * v1 - 2.0 * vv * u1) / round, (uv * u1 - 2.0 * uu * v1) / round];
     let depth = -(c + 0.5 * (u1 * centre[0] + v1 * centre[1]));
-    // Far from a small disc, twice the distance goes by value over gradient.
+    // Far from a small disc, value over gradient is half the distance.
     let margin = 2.0 * f64::from(margin) + 0.1;
     let half = [vv, uu].map(|q| (depth.max(0.0) * 4.0 * q / round).sqrt() + margin);
     [0, 1].map(|i| [(centre[i] - half[i]) as f32, (centre[i] + half[i]) as f32])
 }
 
-/// The half-planes of an upright rectangle.
+/// The half-planes of an axis-aligned rectangle.
 fn rectangle(min: [f64; 2], max: [f64; 2]) -> [Affine; 4] {
     [[max[0], -1.0, 0.0], [-min[0], 1.0, 0.0], [max[1], 0.0, -1.0], [-min[1], 0.0, 1.0]]
 }
 
-/// Depth in pixels within the edge of a half-plane.
+/// Depth behind the edge of a half-plane, in pixels.
 fn depth_px([x, y, w]: &[Affine; 3], edge: &Affine) -> Affine {
     let line = [0, 1, 2].map(|i| edge[0] * w[i] + edge[1] * x[i] + edge[2] * y[i]);
     let steepness = (line[1] * line[1] + line[2] * line[2]).sqrt().max(1e-30);
     line.map(|l| (l / steepness).clamp(-1e9, 1e9))
 }
 
-/// The plane's homogeneous coordinates about a place.
+/// The plane's homogeneous coordinates relative to a point.
 fn about([x, y, w]: &[Affine; 3], centre: [f64; 2]) -> [Affine; 3] {
     [[0, 1, 2].map(|i| x[i] - centre[0] * w[i]), [0, 1, 2].map(|i| y[i] - centre[1] * w[i]), *w]
 }
 
-/// A disc about the origin: x^2 + y^2 - radius^2 w^2, a quadratic in the image. Its bend is accounted for: along the
-/// motion by the mean over it, within the profile, whose variance is `spread`, by that of a round one.
+/// A disc around the origin: x^2 + y^2 - radius^2 w^2, a quadratic in the image. Its curvature is corrected
+/// for: along the motion by the mean over it, and within the profile of variance `spread` by that of a round
+/// one.
 fn disc([x, y, w]: &[Affine; 3], radius: f64, [mu, mv]: [f64; 2], spread: f64) -> [f32; 6] {
     let r2 = radius * radius;
     let product = |i: usize, j: usize| x[i] * x[j] + y[i] * y[j] - r2 * w[i] * w[j];
@@ -594,7 +595,7 @@ fn accumulate(sums: &mut [f32], values: &[f32], part: f32, first: bool) {
     }
 }
 
-/// Subsamples on their way into pixels.
+/// Combines subsamples into pixels.
 struct Blurred<'a> {
     tile: usize,
     edge: usize,

@@ -1,17 +1,15 @@
-//! Flat vector drawings in the scene, and how they appear.
-//!
-//! This module tells what a tile of pixels shows of a painting: one ink all over, or edges.
+//! Planar vector drawings in the scene, and what a tile of pixels shows of them: one paint, or edges.
 
-use geometry::{Camera, Marker, Ned, Transform};
+use geometry::{Camera, CameraModel, Distortion, Marker, Ned, Point, Transform};
 
-use super::lens::Linear;
-use super::painter::slopes;
+use super::exposure::Exposure;
+use super::lens::{Lens, Linear};
 
 /// A drawing on a plane in the scene.
 #[derive(Clone, Debug)]
 pub(super) struct Painting {
     pub(super) ned_from_plane: Transform<Ned, Marker>,
-    /// Half the edge of the square that holds everything.
+    /// Half the edge of the bounding square.
     pub(super) half_extent_m: f64,
     /// Depth of the box whose lid the square is.
     pub(super) thickness_m: f64,
@@ -19,16 +17,16 @@ pub(super) struct Painting {
     pub(super) coats: Vec<Coat>,
 }
 
-/// A shape and what comes back from it.
+/// A shape and its paint.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Coat {
     pub(super) area: Area,
     pub(super) paint: Paint,
-    /// The light of the coat beneath, for a coat whose outline may coincide with that coat's and never crosses it.
+    /// The light of the coat beneath, for a coat whose outline may touch that coat's but never crosses it.
     pub(super) within: Option<f32>,
 }
 
-/// How much of the ground is covered (1 all, 0 none), and the light that comes back from the cover.
+/// Coverage of the ground (0 none, 1 all), and reflectance of the cover.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(super) struct Paint {
     pub(super) cover: f32,
@@ -41,7 +39,7 @@ pub(super) const BARE: Paint = Paint { cover: 0.0, light: 0.0 };
 /// A shape in the plane.
 #[derive(Copy, Clone, Debug)]
 pub(super) enum Area {
-    /// All of the box that can be seen: lid and sides.
+    /// The visible part of the box: lid and sides.
     Box,
     /// A disc.
     Disc {
@@ -54,30 +52,30 @@ pub(super) enum Area {
     Rectangle([f64; 2], [f64; 2]),
 }
 
-/// Three numbers that make a function linear in two coordinates: constant, per x, per y.
+/// An affine function of two coordinates: constant, per x, per y.
 pub(super) type Affine = [f64; 3];
 
-/// A painting from one instant's camera.
+/// A painting seen from the camera of one instant.
 #[derive(Clone, Debug)]
 pub(super) struct Sight {
-    /// The plane's homogeneous coordinates (x, y, w), each from ideal image coordinates; w is positive in front of
-    /// the camera.
+    /// The plane's homogeneous coordinates (x, y, w), each from ideal image coordinates; w is positive in
+    /// front of the camera.
     plane_from_ideal: [Affine; 3],
-    /// The box's outline on the plane of its lid: half-planes in which the functions are positive, the first four
-    /// along its edges.
+    /// The box's outline on the plane of its lid: half-planes in which the functions are positive, the first
+    /// four along its edges.
     outline: [Affine; 8],
     outline_len: usize,
 }
 
 impl Sight {
-    /// `None` when the camera does not look at the painted face.
+    /// `None` when the camera does not see the painted face.
     pub(super) fn new(
         painting: &Painting,
         ned_from_camera: &Transform<Ned, Camera>,
     ) -> Option<Self> {
         let plane_from_camera = painting.ned_from_plane.inverse() * *ned_from_camera;
         let eye = plane_from_camera.origin();
-        if eye.z() < CLOSEST_M {
+        if eye.z() < MIN_DISTANCE_M {
             return None;
         }
         let turn = plane_from_camera.isometry.rotation.to_rotation_matrix();
@@ -104,8 +102,8 @@ impl Sight {
     }
 }
 
-/// A camera nearer to the painted plane than this sees nothing of it.
-const CLOSEST_M: f64 = 1e-3;
+/// Minimum distance of the camera from the painted plane, in metres.
+const MIN_DISTANCE_M: f64 = 1e-3;
 
 /// The half-planes that bound a box seen from `eye`: the hull of its lid and its bottom, the latter projected
 /// onto the plane of the lid, where it is a smaller square.
@@ -143,26 +141,26 @@ fn box_outline(painting: &Painting, eye: [f64; 3]) -> ([Affine; 8], usize) {
 /// What a tile shows of a painting.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(super) enum Shown {
-    /// The same paint all over.
+    /// The same paint everywhere.
     Even(Paint),
     /// Coats whose outlines may cross the tile, on this paint.
     Edges(Paint),
 }
 
-/// A painting during the exposure of a frame.
+/// A painting during an exposure.
 #[derive(Debug)]
 pub(super) struct View {
-    /// When the shutter opens, half-way through, and when it closes; none when the painting cannot be seen.
+    /// At the opening, middle and closing of the shutter; `None` when the painting is not visible.
     pub(super) looks: Option<[Sight; 3]>,
-    /// At the instants of the exposure.
+    /// At each instant of the exposure.
     pub(super) sights: Vec<Sight>,
-    /// First and last column and row of pixels that may show it.
+    /// First and last column and row that may show it.
     pub(super) columns: [usize; 2],
     pub(super) rows: [usize; 2],
 }
 
 impl View {
-    /// How far what a tile's centre sees moves in the image during the exposure, in pixels.
+    /// Motion in the image of the point at a tile's centre during the exposure, in pixels.
     pub(super) fn motion_px(&self, lens: &Linear) -> [f64; 2] {
         let Some([first, middle, last]) = &self.looks else { return [0.0; 2] };
         let place = |sight: &Sight| {
@@ -170,7 +168,7 @@ impl View {
             [x[0] / w[0], y[0] / w[0]]
         };
         let (from, to) = (place(first), place(last));
-        let [du, dv] = slopes(&middle.about(lens));
+        let [du, dv] = jacobian(&middle.about(lens));
         let (x, y) = (to[0] - from[0], to[1] - from[1]);
         let area = du[0] * dv[1] - du[1] * dv[0];
         let motion = [(x * dv[1] - y * dv[0]) / area, (y * du[0] - x * du[1]) / area];
@@ -178,8 +176,71 @@ impl View {
     }
 }
 
-/// What a window of `half` its edge about the lens's centre shows of a painting; it must contain all that light may
-/// come from. The coats with edges in it are put into `crossing`, top first.
+/// Derivatives of the point on the plane per column and per row of pixels, at a tile's centre.
+pub(super) fn jacobian([x, y, w]: &[Affine; 3]) -> [[f64; 2]; 2] {
+    let slope = |f: &Affine, axis: usize| (f[axis] * w[0] - f[0] * w[axis]) / (w[0] * w[0]);
+    [1, 2].map(|axis| [slope(x, axis), slope(y, axis)])
+}
+
+/// First and last columns and rows of pixels.
+pub(super) struct PixelBounds {
+    pub(super) columns: [usize; 2],
+    pub(super) rows: [usize; 2],
+}
+
+/// The pixels that may show a painting during an exposure; `None` when there are none.
+pub(super) fn pixel_bounds(
+    painting: &Painting,
+    exposure: &Exposure,
+    lens: &Lens,
+    model: &CameraModel,
+    reach: f64,
+) -> Option<PixelBounds> {
+    let last = [model.width, model.height].map(|edge| edge as usize - 1);
+    let (ideal_min, ideal_max) = lens.field(reach + MAX_DEVIATION_PX);
+    let (mut min, mut max) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+    let mut in_front = true;
+    // Number of corners beyond the left, top, right and bottom edge of the view.
+    let (mut beyond, mut corners) = ([0; 4], 0);
+    for instant in exposure.ends.iter().chain(&exposure.instants) {
+        let camera_from_plane = instant.inverse() * painting.ned_from_plane;
+        let half = painting.half_extent_m;
+        for corner in 0..8 {
+            let side = |bit: u32| if corner >> bit & 1 == 0 { -half } else { half };
+            let depth = if corner >> 2 & 1 == 0 { 0.0 } else { -painting.thickness_m };
+            let point = camera_from_plane * Point::new(side(0), side(1), depth);
+            let (place, z) = ([point.x(), point.y()], point.z());
+            corners += 1;
+            in_front &= z > 1e-3;
+            for i in 0..2 {
+                beyond[i] += usize::from(place[i] < ideal_min[i] * z);
+                beyond[i + 2] += usize::from(place[i] > ideal_max[i] * z);
+                min[i] = min[i].min(place[i] / z);
+                max[i] = max[i].max(place[i] / z);
+            }
+        }
+    }
+    if beyond.contains(&corners) {
+        return None;
+    }
+    // With a distorting lens the corners do not bound what lies between them.
+    if !in_front || model.distortion != Distortion::None {
+        return Some(PixelBounds { columns: [0, last[0]], rows: [0, last[1]] });
+    }
+    let (focal, centre) = ([model.fx, model.fy], [model.cx, model.cy]);
+    let bound = |i: usize| {
+        let from = (min[i] * focal[i] + centre[i] - reach - MAX_DEVIATION_PX).max(0.0);
+        let to = (max[i] * focal[i] + centre[i] + reach + MAX_DEVIATION_PX).min(last[i] as f64);
+        (from <= to).then_some([from.floor() as usize, to.ceil() as usize])
+    };
+    Some(PixelBounds { columns: bound(0)?, rows: bound(1)? })
+}
+
+/// Maximum deviation of a corner from a straight path between the instants of an exposure, in pixels.
+const MAX_DEVIATION_PX: f64 = 1.0;
+
+/// What a window of half edge `half` around the lens's centre shows of a painting. The window must contain
+/// all points from which the tile gets light. The coats with edges in it are put into `crossing`, top first.
 pub(super) fn shown(
     painting: &Painting,
     looks: &[Sight; 3],
@@ -216,7 +277,7 @@ pub(super) fn shown(
     if crossing.is_empty() { Shown::Even(beneath) } else { Shown::Edges(beneath) }
 }
 
-/// Places whose hull holds all that a tile sees of the plane.
+/// Points whose convex hull contains all that a tile sees of the plane.
 struct Around<'a> {
     places: &'a [[f64; 2]],
     min: [f64; 2],

@@ -4,27 +4,28 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::CameraSettings;
+use crate::scene::CameraSettings;
 
-/// Turns the light on rows of pixels into grey levels.
+/// Converts the light on rows of pixels into grey levels.
 #[derive(Debug)]
 pub(super) struct Sensor {
     seed: u64,
-    /// Grey levels squared of noise per grey level of signal, and without signal.
+    /// Variance of the shot noise per grey level of signal, in squared grey levels.
     shot: f32,
+    /// Variance of the read noise, in squared grey levels.
     read: f32,
-    /// Normal deviates of variance 1/2, two of which from different places add up to one of variance 1.
+    /// Normal deviates of variance 1/2; the sum of two has variance 1.
     deviates: Vec<f32>,
-    /// Loss of light with the square of the distance from the axis, for each column and for each row.
+    /// Vignetting by column and by row.
     column_loss: Vec<f32>,
     row_loss: Vec<f32>,
 }
 
-/// Deviates to start from; a power of two.
+/// Number of start positions in the deviates, a power of two.
 const STARTS: usize = 1 << 15;
 
-/// Pixels that take their deviates from one pair of places. Two stretches with the same pair, which would show as
-/// repeated noise, are a matter of one in 2^30.
+/// Number of pixels that take their deviates from one pair of positions. Repeated noise needs the same pair
+/// twice, with a probability of 2^-30.
 const STRETCH: usize = 128;
 
 impl Sensor {
@@ -39,7 +40,7 @@ impl Sensor {
         let levels_per_electron = 255.0 * settings.gain / settings.full_well_e;
         let model = &settings.model;
         let loss = |count: u32, centre: f64, focal: f64| {
-            // cos^4 of the angle off axis is 1 - 2 tan^2 to first order, less what the lens maker mends.
+            // cos^4 of the angle off axis is 1 - 2 tan^2 to first order.
             let at =
                 |i| (settings.vignetting * 2.0 * ((f64::from(i) - centre) / focal).powi(2)) as f32;
             (0..count).map(at).collect()
@@ -89,7 +90,8 @@ impl Sensor {
 
 /// The nearest grey level.
 fn quantise(level: f32) -> u8 {
-    // Adding 2^23 leaves the rounded integer in the lowest bits; unlike a cast from float it needs no test for NaN.
+    // Adding 2^23 leaves the rounded integer in the lowest bits; unlike a cast from float it needs no test
+    // for NaN.
     (level.clamp(0.0, 255.0) + 8_388_608.0).to_bits() as u8
 }
 

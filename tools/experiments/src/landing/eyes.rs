@@ -9,7 +9,7 @@ use messages::{
     CameraInfo, Detection, Detections, FrameHeader, LensModel, MarkerPose, PixelFormat, Transform3,
 };
 use node::{Layers, clock_name};
-use simulator::eye::{Eye, Moment};
+use simulator::camera::{FrameRequest, SimCamera};
 use world::World;
 use world::vehicle::VehicleTruth;
 use world::vision::{Found, RINGS, Vision, VisionFaults};
@@ -23,7 +23,7 @@ const BLUR_STEP_S: f64 = 1e-3;
 
 /// Camera and detector of one flight.
 pub struct Eyes {
-    eye: Eye,
+    camera: SimCamera,
     seer: Seer,
     info: CameraInfo,
     model: CameraModel,
@@ -55,9 +55,9 @@ impl Eyes {
         how: plan::Vision,
         faults: VisionFaults,
     ) -> anyhow::Result<Self> {
-        let eye = Eye::new(config)?;
+        let camera = SimCamera::new(config)?;
         let marker = config.pad_marker().map_err(anyhow::Error::msg)?;
-        let settings = eye.settings();
+        let settings = camera.settings();
         let model = settings.model;
         let seer = match how {
             plan::Vision::Rendered => {
@@ -82,7 +82,7 @@ impl Eyes {
             lens: LensModel::Pinhole,
             body_from_camera: wire_transform(&settings.body_from_camera),
         };
-        Ok(Self { eye, seer, info, model, faults, family: marker.family.name() })
+        Ok(Self { camera, seer, info, model, faults, family: marker.family.name() })
     }
 
     /// The camera as the controller is told of it.
@@ -92,10 +92,10 @@ impl Eyes {
 
     /// How long the shutter is open, in seconds.
     pub fn exposure_s(&self) -> f64 {
-        self.eye.settings().exposure_s
+        self.camera.settings().exposure_s
     }
 
-    /// Takes the frame of a moment and looks for the marker. `stamp_ns` tells the stamp of a time of the world.
+    /// Takes the frame of a request and looks for the marker. `stamp_ns` tells the stamp of a time of the world.
     ///
     /// # Errors
     /// When a frame cannot be rendered.
@@ -108,17 +108,17 @@ impl Eyes {
     ) -> anyhow::Result<Vec<Arrival>> {
         let truth = world.truth_at(time_s);
         let begun_s = world.since_begin_s(time_s);
-        let moment = Moment { sequence, time_s, begun_s, pad: world.pad_at(time_s) };
-        let Some(passage) = self.eye.open(&moment, &truth) else { return Ok(Vec::new()) };
+        let request = FrameRequest { sequence, time_s, begun_s, pad: world.pad_at(time_s) };
+        let Some(passage) = self.camera.open(&request, &truth) else { return Ok(Vec::new()) };
         let detections = match &mut self.seer {
             Seer::Rendered { detector, pixels } => {
-                self.eye.render(&moment, |s| world.truth_at(s), pixels)?;
+                self.camera.render(&request, |s| world.truth_at(s), pixels)?;
                 let (width, height) = (self.info.width as usize, self.info.height as usize);
                 let view = GrayView::packed(pixels, width, height).context("an image")?;
                 let found = detector.detect(view, Some(&self.model), &mut ());
                 found.iter().map(wire::detection).collect()
             }
-            Seer::Modelled(_) => self.model_detections(world, &moment, &truth),
+            Seer::Modelled(_) => self.model_detections(world, &request, &truth),
         };
         let header = FrameHeader {
             camera: self.info.camera.clone(),
@@ -144,19 +144,19 @@ impl Eyes {
     fn model_detections(
         &mut self,
         world: &World,
-        moment: &Moment,
+        request: &FrameRequest,
         truth: &VehicleTruth,
     ) -> Vec<Detection> {
         let Seer::Modelled(vision) = &mut self.seer else { return Vec::new() };
-        let mut pad = moment.pad;
-        let camera_from_marker = self.eye.camera_from_marker(truth, &pad);
-        let before = self.eye.camera_from_marker(
-            &world.truth_at(moment.time_s - BLUR_STEP_S),
-            &world.pad_at(moment.time_s - BLUR_STEP_S),
+        let mut pad = request.pad;
+        let camera_from_marker = self.camera.camera_from_marker(truth, &pad);
+        let before = self.camera.camera_from_marker(
+            &world.truth_at(request.time_s - BLUR_STEP_S),
+            &world.pad_at(request.time_s - BLUR_STEP_S),
         );
         let pixels = [&camera_from_marker, &before].map(|pose| self.model.project(pose.origin()));
         let [Some(now), Some(then)] = pixels else { return Vec::new() };
-        let blur_px = now.distance(&then) / BLUR_STEP_S * self.eye.settings().exposure_s;
+        let blur_px = now.distance(&then) / BLUR_STEP_S * self.camera.settings().exposure_s;
         let faults = self.faults;
         let (misses, luck) = (vision.draw() < faults.miss, vision.draw());
         if let Some((part, metres)) = faults.wrong
@@ -165,11 +165,11 @@ impl Eyes {
             pad.position = pad.position + Vector::new(0.0, metres, 0.0);
         }
         if let Some((from_s, to_s, metres)) = faults.lie
-            && moment.begun_s.is_some_and(|now_s| (from_s..to_s).contains(&now_s))
+            && request.begun_s.is_some_and(|now_s| (from_s..to_s).contains(&now_s))
         {
             pad.position = pad.position + Vector::new(metres, 0.0, 0.0);
         }
-        let seen = self.eye.camera_from_marker(truth, &pad);
+        let seen = self.camera.camera_from_marker(truth, &pad);
         let low = seen.origin().z() < faults.blind_below_m;
         let found = vision.look(&seen, blur_px).filter(|_| !misses && !low);
         found.map(|found| detection(self.family, &found)).into_iter().collect()

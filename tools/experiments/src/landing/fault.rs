@@ -85,9 +85,11 @@ const TABLE: [Row; 23] = [
     ("ground-effect", "rotors of 0.2 m push harder near the ground", |_| {
         simulator(&["start.rotor_m=0.2"])
     }),
-    ("glare", "a reflection beside the marker for 2 s (rendered only)", |part| veil("glare", part)),
+    ("glare", "a reflection beside the marker for 2 s (rendered only)", |part| {
+        occluder("glare", part)
+    }),
     ("cover", "a third of the marker is covered for 2 s (rendered only)", |part| {
-        veil("cover", part)
+        occluder("cover", part)
     }),
     ("pad-moves-2.5", "the pad comes at 2.5 m/s (its marker half as large again)", |_| {
         moving(2.5, 0.0)
@@ -107,9 +109,10 @@ fn simulator(settings: &[&str]) -> Change {
     }
 }
 
-fn veil(kind: &str, part: f64) -> Change {
-    let (kind, at) = (format!("veil.kind={kind}"), format!("veil.at_s={:.3}", 1.0 + 8.0 * part));
-    simulator(&[&kind, &at, "veil.strength=0.33", "veil.for_s=2"])
+fn occluder(kind: &str, part: f64) -> Change {
+    let (kind, at) =
+        (format!("occluder.kind={kind}"), format!("occluder.at_s={:.3}", 1.0 + 8.0 * part));
+    simulator(&[&kind, &at, "occluder.strength=0.33", "occluder.for_s=2"])
 }
 
 /// A pad that moves, seen twice as often, and a controller that is told to expect it.

@@ -9,7 +9,7 @@ use rendering::CameraSettings;
 
 use super::{SIZE_M, Set, chance, view, with_id};
 use crate::shot::{Shot, pose};
-use rendering::veil::{Line, Veil};
+use rendering::occluder::{Line, Occluder};
 
 const FRAMES: usize = 8;
 
@@ -28,12 +28,12 @@ fn shadow(marker: Marker, frame: usize) -> Shot {
         through: beside(&shot, rng.random_range(-0.25..0.25), rng.random_range(-0.25..0.25)),
         normal: rng.random_range(0.0..TAU),
     };
-    let veil = Veil::Shadow {
+    let occluder = Occluder::Shadow {
         edge,
-        soft_px: rng.random_range(1.5..4.0),
-        left: rng.random_range(0.12..0.35),
+        penumbra_px: rng.random_range(1.5..4.0),
+        transmission: rng.random_range(0.12..0.35),
     };
-    shot.with("shadow", veil)
+    shot.with("shadow", occluder)
 }
 
 /// A reflection that saturates a part of the marker.
@@ -41,12 +41,12 @@ fn glare(marker: Marker, frame: usize) -> Shot {
     let (shot, mut rng) = large(marker, frame);
     let size_px = shot.size_px();
     let centre = beside(&shot, rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
-    let veil = Veil::Glare {
+    let occluder = Occluder::Glare {
         centre,
         radius_px: (size_px * rng.random_range(0.15..0.3)) as f32,
         levels: rng.random_range(220.0..500.0),
     };
-    shot.with("glare", veil)
+    shot.with("glare", occluder)
 }
 
 /// A corner of a square, or a third of the outer ring, behind something.
@@ -64,15 +64,17 @@ fn occlusion(marker: Marker, frame: usize) -> Shot {
     let level = [20.0, 90.0, 230.0][frame % 3];
     let (through, centre) = (beside(&shot, away * cos, away * sin), beside(&shot, 0.0, 0.0));
     let normal = (through.y - centre.y).atan2(through.x - centre.x);
-    shot.with("occlusion", Veil::Cover { edge: Line { through, normal }, level })
+    shot.with("occlusion", Occluder::Cover { edge: Line { through, normal }, level })
 }
 
 /// Haze that leaves little of the contrast.
 fn contrast(marker: Marker, frame: usize) -> Shot {
     let (shot, mut rng) = large(marker, frame);
-    let veil =
-        Veil::Haze { left: rng.random_range(0.07..0.16), levels: rng.random_range(40.0..150.0) };
-    shot.with("contrast", veil)
+    let occluder = Occluder::Haze {
+        transmission: rng.random_range(0.07..0.16),
+        levels: rng.random_range(40.0..150.0),
+    };
+    shot.with("contrast", occluder)
 }
 
 /// The amplified picture of a dark place.
@@ -81,7 +83,7 @@ fn noise(marker: Marker, frame: usize) -> Shot {
     let settings = CameraSettings::thesis().exposed_for(light, 200.0, 0.004);
     let (mut shot, _) = view(marker, settings, (Set::Adverse, frame), 60.0..140.0, 0.4);
     shot.light = light;
-    shot.with("noise", Veil::Nothing)
+    shot.with("noise", Occluder::None)
 }
 
 /// Out of focus.
@@ -89,14 +91,14 @@ fn defocus(marker: Marker, frame: usize) -> Shot {
     let blur_px = 2.0 + 0.14 * (frame % FRAMES) as f64;
     let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
     let (shot, _) = view(marker, settings, (Set::Adverse, frame), 45.0..90.0, 0.4);
-    shot.with("defocus", Veil::Nothing)
+    shot.with("defocus", Occluder::None)
 }
 
 /// White on black.
 fn inverted(marker: Marker, frame: usize) -> Shot {
     let (mut shot, _) = large(marker, frame);
     shot.inverted = true;
-    shot.with("inverted", Veil::Nothing)
+    shot.with("inverted", Occluder::None)
 }
 
 /// A corner beyond the border of the frame.
@@ -106,7 +108,7 @@ fn cut(marker: Marker, frame: usize) -> Shot {
         let legs = rng.random_range(0.15..0.32);
         (FRAC_PI_4 + rng.random_range(-0.25..0.25), (1.0 - legs) * 0.68)
     })
-    .with("cut", Veil::Nothing)
+    .with("cut", Occluder::None)
 }
 
 /// Half of one edge's border beyond the border of the frame; of rings almost half the marker.
@@ -116,7 +118,7 @@ fn cut_border(marker: Marker, frame: usize) -> Shot {
         let away = if without_ids { 0.1 } else { 0.47 };
         (rng.random_range(-0.02..0.02), away)
     })
-    .with("cut-border", Veil::Nothing)
+    .with("cut-border", Occluder::None)
 }
 
 /// A marker whose centre is so many of its sizes from a side of the frame, turned by so much against it.

@@ -11,7 +11,7 @@ use rendering::{PadInScene, Surface};
 
 use super::{Set, chance, middle, near};
 use crate::shot::{Shot, pose};
-use rendering::veil::{Line, Veil};
+use rendering::occluder::{Line, Occluder};
 
 /// Scenes; with photographs and their crops there are more than a thousand.
 const SCENES: usize = 520;
@@ -67,7 +67,7 @@ fn shot(frame: usize) -> Shot {
         surface: Surface::ALL[frame / KINDS.len() % 4],
         painted_marks: rng.random_range(0..60),
         light,
-        veil: Veil::Nothing,
+        occluder: Occluder::None,
         bayer: frame % 7 == 3,
         seed,
     };
@@ -83,7 +83,11 @@ fn shot(frame: usize) -> Shot {
     }
     if frame % 5 == 4 {
         let line = Line { through: near(&mut rng, at, 150.0), normal: rng.random_range(0.0..TAU) };
-        shot.veil = Veil::Shadow { edge: line, soft_px: 2.0, left: rng.random_range(0.2..0.6) };
+        shot.occluder = Occluder::Shadow {
+            edge: line,
+            penumbra_px: 2.0,
+            transmission: rng.random_range(0.2..0.6),
+        };
     }
     shot
 }

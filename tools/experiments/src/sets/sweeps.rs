@@ -9,7 +9,7 @@ use rendering::{CameraSettings, Surface};
 
 use super::{Set, chance, middle, near, view, with_id};
 use crate::shot::{Shot, pose};
-use rendering::veil::Veil;
+use rendering::occluder::Occluder;
 
 pub(super) fn tilt(marker: Marker) -> Vec<Shot> {
     let mut shots = Vec::new();
@@ -37,7 +37,7 @@ pub(super) fn blur(marker: Marker) -> Vec<Shot> {
         for _ in 0..6 {
             let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
             let (shot, _) = view(marker, settings, (Set::Blur, shots.len()), 35.0..120.0, 0.3);
-            shots.push(shot.with(format!("lens{blur_px}"), Veil::Nothing));
+            shots.push(shot.with(format!("lens{blur_px}"), Occluder::None));
         }
     }
     for motion_px in [1.0f64, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0] {
@@ -54,7 +54,7 @@ pub(super) fn blur(marker: Marker) -> Vec<Shot> {
                 Transform::new(middle.rotation(), origin + offset)
             };
             shot.path = vec![at(-0.5), at(0.0), at(0.5)];
-            shots.push(shot.with(format!("motion{motion_px}"), Veil::Nothing));
+            shots.push(shot.with(format!("motion{motion_px}"), Occluder::None));
         }
     }
     shots
@@ -69,7 +69,7 @@ pub(super) fn noise(marker: Marker) -> Vec<Shot> {
             let frame = (Set::Noise, shots.len());
             let (mut shot, _) = view(marker, settings, frame, 40.0..120.0, 0.3);
             shot.light = light;
-            shots.push(shot.with(format!("light{light}"), Veil::Nothing));
+            shots.push(shot.with(format!("light{light}"), Occluder::None));
         }
     }
     shots
@@ -84,7 +84,7 @@ pub(super) fn light(marker: Marker) -> Vec<Shot> {
             let place = (Set::Light, shots.len());
             let (mut shot, _) = view(marker, settings, place, 30.0..120.0, 0.3);
             shot.surface = [Surface::Asphalt, Surface::Grass][frame % 2];
-            shots.push(shot.with(format!("white{white}"), Veil::Nothing));
+            shots.push(shot.with(format!("white{white}"), Occluder::None));
         }
     }
     shots
@@ -128,7 +128,7 @@ pub(super) fn rolling(marker: Marker) -> Vec<Shot> {
             let mut shot = Shot::of(marker, settings, still, seed);
             shot.path = vec![seen(-half_s), seen(0.0), seen(half_s)];
             shot.surface = Surface::ALL[shots.len() % 3];
-            shots.push(shot.with(name, Veil::Nothing));
+            shots.push(shot.with(name, Occluder::None));
         }
     }
     shots

@@ -1,60 +1,62 @@
-//! The simulated camera as a function of the world: which frames are taken, how they travel, and their pixels.
+//! The simulated camera as a function of the simulation: which frames it takes, how they are delayed, and
+//! their pixels.
 
 use anyhow::Context;
 use geometry::{Body, Camera, Marker, Ned, Pixel, Rotation, Transform, Vector};
-use rendering::veil::Line;
-use rendering::{CameraSettings, RenderError, Renderer, Scene, Veil};
+use rendering::occluder::Line;
+use rendering::{CameraSettings, Occluder, RenderError, Renderer, Scene};
 use world::camera::{Passage, Shutter};
 use world::pad::PadState;
 use world::vehicle::VehicleTruth;
 
-use crate::config::{Config, VeilKind, VeilSettings};
+use crate::config::{Config, OccluderKind, OccluderSettings};
 
-/// Poses through an exposure.
+/// Number of poses during an exposure.
 const POSES: usize = 5;
-/// Grey level of what covers a marker, and what white glare adds.
+/// Grey level of an object that covers the marker.
 const COVER_LEVEL: f32 = 40.0;
+/// Grey levels that glare of strength 1 adds.
 const GLARE_LEVELS: f64 = 400.0;
 
-/// A moment that may become a frame.
+/// A frame to take.
 #[derive(Copy, Clone, Debug)]
-pub struct Moment {
+pub struct FrameRequest {
     /// The frame's number.
     pub sequence: u64,
-    /// Mid-exposure, in seconds of the world.
+    /// Time of mid-exposure, in seconds of the simulation.
     pub time_s: f64,
-    /// Time since the world's begin, in seconds.
+    /// Time since the beginning of the scenario, in seconds.
     pub begun_s: Option<f64>,
-    /// The pad then.
+    /// The pad at that time.
     pub pad: PadState,
 }
 
-/// The camera.
+/// The simulated camera.
 #[derive(Debug)]
-pub struct Eye {
+pub struct SimCamera {
     scene: Scene,
     settings: CameraSettings,
     true_settings: CameraSettings,
     seed: u64,
     renderer: Option<Renderer>,
     shutter: Shutter,
-    veil: VeilSettings,
+    occluder: OccluderSettings,
     marker_m: f64,
 }
 
-impl Eye {
+impl SimCamera {
     /// The camera of this configuration.
     ///
     /// # Errors
-    /// When the scene makes no sense.
+    /// When the scene is invalid.
     pub fn new(config: &Config) -> anyhow::Result<Self> {
         let scene = config.scene().map_err(anyhow::Error::msg)?;
         let settings = config.camera_settings();
         let shutter = Shutter::new(config.camera.faults(), config.seed);
         let [roll, pitch] = shutter.mount_error_rad();
-        let told = settings.body_from_camera;
+        let nominal = settings.body_from_camera;
         let tilt = Rotation::<Body, Body>::from_euler(roll, pitch, 0.0);
-        let body_from_camera = Transform::new(tilt * told.rotation(), told.origin());
+        let body_from_camera = Transform::new(tilt * nominal.rotation(), nominal.origin());
         let marker = config.pad_marker().map_err(anyhow::Error::msg)?;
         Ok(Self {
             true_settings: CameraSettings { body_from_camera, ..settings.clone() },
@@ -63,17 +65,17 @@ impl Eye {
             seed: config.seed,
             renderer: None,
             shutter,
-            veil: config.veil.clone(),
+            occluder: config.occluder.clone(),
             marker_m: marker.size_m.unwrap_or_default(),
         })
     }
 
-    /// The camera as everybody is told, without the error of its mount.
+    /// The published camera, without the error of its mount.
     pub fn settings(&self) -> &CameraSettings {
         &self.settings
     }
 
-    /// Where the pad's marker really is, from a vehicle that moves like this.
+    /// The true pose of the pad's marker, seen from a vehicle in this state.
     pub fn camera_from_marker(
         &self,
         truth: &VehicleTruth,
@@ -85,86 +87,90 @@ impl Eye {
     }
 
     /// Opens the shutter; `None` when the frame is lost.
-    pub fn open(&mut self, moment: &Moment, truth: &VehicleTruth) -> Option<Passage> {
-        let height_m = moment.pad.position.z() - truth.position.z();
-        self.shutter.take(moment.begun_s, height_m)
+    pub fn open(&mut self, request: &FrameRequest, truth: &VehicleTruth) -> Option<Passage> {
+        let height_m = request.pad.position.z() - truth.position.z();
+        self.shutter.take(request.begun_s, height_m)
     }
 
-    /// The pixels of a moment, the vehicle's motion taken from `truth_at` (seconds of the world).
+    /// Renders a frame into `out`. `truth_at` gives the vehicle's state at a time, in seconds of the
+    /// simulation.
     ///
     /// # Errors
-    /// When the camera's settings make no sense, a pose is unsound, or `out` has not the image's size.
+    /// When the camera's settings or a pose are invalid, or `out` does not have the size of the image.
     pub fn render(
         &mut self,
-        moment: &Moment,
+        request: &FrameRequest,
         truth_at: impl Fn(f64) -> VehicleTruth,
         out: &mut [u8],
     ) -> anyhow::Result<()> {
         let exposure_s = self.settings.exposure_s;
         let pose = |i: usize| {
             let aside_s = exposure_s * (i as f64 / (POSES - 1) as f64 - 0.5);
-            let truth = truth_at(moment.time_s + aside_s);
-            // The picture's pad stands still, so the vehicle moves as seen from the pad.
-            let carried = moment.pad.velocity * -aside_s;
+            let truth = truth_at(request.time_s + aside_s);
+            // The renderer's pad stands still, so the vehicle moves relative to it.
+            let carried = request.pad.velocity * -aside_s;
             Transform::<Ned, Body>::new(truth.ned_from_body, truth.position + carried)
         };
         let poses: Vec<_> = (0..POSES).map(pose).collect();
-        let veil = self.veil(moment, &truth_at(moment.time_s));
+        let occluder = self.occluder(request, &truth_at(request.time_s));
         let pads: Vec<_> = (0..self.scene.pads.len())
-            .filter_map(|i| self.ned_from_marker(i, &moment.pad))
+            .filter_map(|i| self.ned_from_marker(i, &request.pad))
             .collect();
-        let renderer = self.renderer().context("setting the simulated camera up")?;
+        let renderer = self.renderer().context("setting up the simulated camera")?;
         for (index, pad) in pads.into_iter().enumerate() {
             renderer.move_pad(index, pad);
         }
-        let mut dim = |v: usize, light: &mut [f32]| veil.dim(v, light);
-        renderer.render_through(&mut dim, &poses, moment.sequence, out)?;
+        let mut apply = |v: usize, light: &mut [f32]| occluder.apply(v, light);
+        renderer.render_through(&mut apply, &poses, request.sequence, out)?;
         Ok(())
     }
 
-    /// Made when the first frame is rendered: growing the ground takes long, and modelled vision needs none.
+    /// Created with the first frame: generating the ground takes long, and modelled vision does not need it.
     fn renderer(&mut self) -> Result<&mut Renderer, RenderError> {
         if self.renderer.is_none() {
-            let made = Renderer::new(&self.scene, self.true_settings.clone(), self.seed)?;
-            return Ok(self.renderer.insert(made));
+            let renderer = Renderer::new(&self.scene, self.true_settings.clone(), self.seed)?;
+            return Ok(self.renderer.insert(renderer));
         }
         self.renderer.as_mut().ok_or(RenderError::NoPose)
     }
 
-    /// A pad of the scene after the way that the first of them has gone; they move as one.
+    /// The pose of a pad of the scene. All pads move together with the first.
     fn ned_from_marker(&self, index: usize, pad: &PadState) -> Option<Transform<Ned, Marker>> {
         let first = self.scene.pads.first()?.ned_from_marker;
         let rest = self.scene.pads.get(index)?.ned_from_marker;
         let turned = pad.ned_from_marker().rotation() * first.rotation().inverse();
         let beside = turned * (rest.origin() - first.origin());
-        // The marker is on the lid of a box that stands on the pad.
+        // The marker is on the lid of a box on the pad.
         let lid = Vector::new(0.0, 0.0, -self.scene.pads.first()?.thickness_m);
         Some(Transform::new(turned * rest.rotation(), pad.position + lid + beside))
     }
 
-    fn veil(&self, moment: &Moment, truth: &VehicleTruth) -> Veil {
-        let VeilSettings { kind, strength, at_s, for_s, below_m } = self.veil;
-        let is_time = moment.begun_s.is_some_and(|now_s| (at_s..at_s + for_s).contains(&now_s));
-        let is_low = moment.pad.position.z() - truth.position.z() < below_m;
-        let camera_from_marker = self.camera_from_marker(truth, &moment.pad);
+    fn occluder(&self, request: &FrameRequest, truth: &VehicleTruth) -> Occluder {
+        let OccluderSettings { kind, strength, at_s, for_s, below_m } = self.occluder;
+        let is_time = request.begun_s.is_some_and(|now_s| (at_s..at_s + for_s).contains(&now_s));
+        let is_low = request.pad.position.z() - truth.position.z() < below_m;
+        let camera_from_marker = self.camera_from_marker(truth, &request.pad);
         let model = &self.settings.model;
-        let Some(centre) = model.project(camera_from_marker.origin()) else { return Veil::Nothing };
+        let Some(centre) = model.project(camera_from_marker.origin()) else {
+            return Occluder::None;
+        };
         let size_px = self.marker_m * model.fx / camera_from_marker.origin().z();
         match kind {
-            _ if !(is_time && is_low) => Veil::Nothing,
-            VeilKind::None => Veil::Nothing,
-            VeilKind::Glare => Veil::Glare {
+            _ if !(is_time && is_low) => Occluder::None,
+            OccluderKind::None => Occluder::None,
+            OccluderKind::Glare => Occluder::Glare {
                 centre: Pixel::new(centre.x + 0.5 * size_px, centre.y),
                 radius_px: (0.5 * size_px) as f32,
                 levels: (GLARE_LEVELS * strength) as f32,
             },
-            VeilKind::Cover => {
+            OccluderKind::Cover => {
                 let through = Pixel::new(centre.x + size_px * (0.5 - strength), centre.y);
-                Veil::Cover { edge: Line { through, normal: 0.0 }, level: COVER_LEVEL }
+                Occluder::Cover { edge: Line { through, normal: 0.0 }, level: COVER_LEVEL }
             }
-            VeilKind::Haze => {
-                Veil::Haze { left: 1.0 - strength as f32, levels: 120.0 * strength as f32 }
-            }
+            OccluderKind::Haze => Occluder::Haze {
+                transmission: 1.0 - strength as f32,
+                levels: 120.0 * strength as f32,
+            },
         }
     }
 }

@@ -1,42 +1,42 @@
-//! What happens to light between a scene and the sensor: shadows, glare, things in the way, haze.
+//! Effects between the scene and the sensor: shadows, glare, occlusion, haze.
 
 use geometry::Pixel;
 
-/// A change of light over the image.
+/// An effect on the light in the image.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Veil {
-    /// None.
-    Nothing,
+pub enum Occluder {
+    /// No effect.
+    None,
     /// A shadow on one side of a line.
     Shadow {
-        /// The shadow's edge; the shadow is where the line's distance is positive.
+        /// Its edge; the shadow is where the line's distance is positive.
         edge: Line,
-        /// Width of the half-shadow, in pixels.
-        soft_px: f32,
-        /// Part of the light that is left.
-        left: f32,
+        /// Width of the penumbra, in pixels.
+        penumbra_px: f32,
+        /// Fraction of the light that remains.
+        transmission: f32,
     },
     /// A reflection that adds light.
     Glare {
-        /// Its middle.
+        /// Its centre.
         centre: Pixel,
-        /// Standard deviation of its round blob, in pixels.
+        /// Standard deviation of the round blob, in pixels.
         radius_px: f32,
-        /// Grey levels that it adds in its middle.
+        /// Grey levels added at its centre.
         levels: f32,
     },
-    /// A thing in front of the scene on one side of a line.
+    /// An object in front of the scene on one side of a line.
     Cover {
         /// Its edge; it covers where the line's distance is positive.
         edge: Line,
         /// Its grey level.
         level: f32,
     },
-    /// Little contrast: a part of the light is left, and grey levels are added.
+    /// Low contrast: less light, and added grey levels.
     Haze {
-        /// Part of the light that is left.
-        left: f32,
-        /// Grey levels that are added.
+        /// Fraction of the light that remains.
+        transmission: f32,
+        /// Grey levels added everywhere.
         levels: f32,
     },
 }
@@ -58,36 +58,36 @@ impl Line {
     }
 }
 
-/// How softly the edge of a thing in the way is seen, in pixels.
-const SHARP_PX: f32 = 1.5;
+/// Width of the edge of an object in front of the scene, in pixels.
+const EDGE_PX: f32 = 1.5;
 
-impl Veil {
-    /// Changes the light of row `v`, in grey levels.
-    pub fn dim(&self, v: usize, light: &mut [f32]) {
+impl Occluder {
+    /// Applies the effect to the light of row `v`, in grey levels.
+    pub fn apply(&self, v: usize, light: &mut [f32]) {
         let y = v as f64;
         for (x, level) in light.iter_mut().enumerate() {
             let x = x as f64;
             match self {
-                Self::Nothing => return,
-                Self::Shadow { edge, soft_px, left } => {
-                    let shade = rise(edge.distance(x, y) as f32 / soft_px);
-                    *level *= 1.0 - shade * (1.0 - left);
+                Self::None => return,
+                Self::Shadow { edge, penumbra_px, transmission } => {
+                    let shade = rise(edge.distance(x, y) as f32 / penumbra_px);
+                    *level *= 1.0 - shade * (1.0 - transmission);
                 }
                 Self::Glare { centre, radius_px, levels } => {
                     let away = (Pixel::new(x, y).distance(centre) as f32) / radius_px;
                     *level += levels * (-0.5 * away * away).exp();
                 }
                 Self::Cover { edge, level: own } => {
-                    let cover = rise(edge.distance(x, y) as f32 / SHARP_PX);
+                    let cover = rise(edge.distance(x, y) as f32 / EDGE_PX);
                     *level += cover * (own - *level);
                 }
-                Self::Haze { left, levels } => *level = *level * left + levels,
+                Self::Haze { transmission, levels } => *level = *level * transmission + levels,
             }
         }
     }
 }
 
-/// A smooth step from 0 to 1 over one unit about 0.
+/// A smooth step from 0 to 1 over the interval from -0.5 to 0.5.
 fn rise(place: f32) -> f32 {
     let t = (place + 0.5).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
