@@ -1,53 +1,16 @@
-//! Markers found in parts of a frame, told in the whole frame's pixels.
-//!
-//! A part is a camera of its own: the same place and direction, another size, centre and focal length. So poses come
-//! out the same, and only what is in pixels is moved and scaled.
+//! Markers found in parts of a frame, in pixels of the whole frame.
 
 use fiducial::Observation;
-use geometry::{CameraModel, Pixel};
+use geometry::Roi;
 use messages::FramePart;
 
-/// The camera that a part was taken by.
-pub fn camera_of(part: &FramePart, camera: &CameraModel) -> CameraModel {
-    let scale = f64::from(part.scale);
-    let [left, top] = offset(part);
-    CameraModel {
-        width: part.width,
-        height: part.height,
-        fx: camera.fx / scale,
-        fy: camera.fy / scale,
-        cx: (camera.cx - left) / scale,
-        cy: (camera.cy - top) / scale,
-        ..*camera
-    }
+/// The region of the frame that a part shows.
+pub fn roi(part: &FramePart) -> Roi {
+    let [left, top, scale] = [part.x, part.y, part.scale].map(f64::from);
+    Roi::binned(left, top, part.width, part.height, scale)
 }
 
-/// An observation in a part, in pixels of the frame.
-pub fn in_frame(part: &FramePart, seen: &Observation) -> Observation {
-    let scale = f64::from(part.scale);
-    let [left, top] = offset(part);
-    let moved = |at: Pixel| Pixel::new(left + scale * at.x, top + scale * at.y);
-    let mut seen = seen.clone();
-    seen.centre = moved(seen.centre);
-    seen.corners = seen.corners.map(|corners| corners.map(moved));
-    seen.centre_covariance_px2 *= scale * scale;
-    seen.size_px *= scale;
-    if let Some(pose) = &mut seen.pose {
-        pose.reprojection_rms_px *= scale;
-        if let Some(other) = &mut pose.alternative {
-            other.reprojection_rms_px *= scale;
-        }
-    }
-    seen
-}
-
-/// Where the middle of the part's first pixel lies in the frame.
-fn offset(part: &FramePart) -> [f64; 2] {
-    let half = (f64::from(part.scale) - 1.0) / 2.0;
-    [f64::from(part.x) + half, f64::from(part.y) + half]
-}
-
-/// Adds what was seen in a finer part, in the place of the same markers in coarser ones.
+/// Adds the observations of a finer part; they replace those of the same markers in coarser parts.
 pub fn add_finer(found: &mut Vec<Observation>, finer: impl Iterator<Item = Observation>) {
     for seen in finer {
         let is_same = |other: &Observation| {
@@ -63,21 +26,11 @@ pub fn add_finer(found: &mut Vec<Observation>, finer: impl Iterator<Item = Obser
 mod tests {
     use super::*;
     use fiducial::Detector;
-    use geometry::Point;
+    use geometry::CameraModel;
     use imaging::GrayImage;
 
     const PART: FramePart =
         FramePart { x: 160, y: 80, width: 120, height: 100, scale: 2, bytes: 0 };
-
-    #[test]
-    fn a_parts_camera_sees_the_same_directions() {
-        let camera = CameraModel::pinhole(640, 480, 500.0);
-        let part = camera_of(&PART, &camera);
-        let point = Point::new(-0.3, 0.2, 2.0);
-        let (whole, own) = (camera.project(point).unwrap(), part.project(point).unwrap());
-        assert!((whole.x - (160.5 + 2.0 * own.x)).abs() < 1e-9);
-        assert!((whole.y - (80.5 + 2.0 * own.y)).abs() < 1e-9);
-    }
 
     /// A marker drawn at a place of a frame.
     fn frame(centre: [f64; 2], size_px: f64) -> GrayImage {
@@ -103,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_part_shows_is_where_the_frame_shows_it() {
+    fn a_marker_in_a_part_is_where_it_is_in_the_frame() {
         let image = frame([270.0, 170.0], 90.0);
         let camera = CameraModel::pinhole(640, 480, 500.0);
         let marker = "aruco-4x4-50:7:0.2".parse().unwrap();
@@ -116,9 +69,9 @@ mod tests {
                 *pixel = ((at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1) + 2) / 4) as u8;
             }
         }
-        let part_camera = camera_of(&PART, &camera);
+        let part_camera = roi(&PART).camera(&camera);
         let seen = detector.detect(coarse.view().unwrap(), Some(&part_camera), &mut ());
-        let mut found: Vec<_> = seen.iter().map(|seen| in_frame(&PART, seen)).collect();
+        let mut found: Vec<_> = seen.iter().map(|seen| seen.mapped(&roi(&PART))).collect();
         assert_eq!((whole.len(), found.len()), (1, 1));
         assert!(whole[0].centre.distance(&found[0].centre) < 0.2, "{whole:?} {found:?}");
         assert!((whole[0].size_px / found[0].size_px - 1.0).abs() < 0.03);

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use airlink::Unpacker;
 use anyhow::Context;
-use fiducial::debug::{self, RgbImageBuf};
+use fiducial::overlay::canvas::RgbImageBuf;
+use fiducial::overlay::debug;
 use fiducial::{Detector, Observation, Stages, Tracker};
 use geometry::CameraModel;
 use imaging::{Converter, GrayImage, GrayView};
@@ -324,9 +325,10 @@ impl Work {
         let mut found = Vec::new();
         for (part, image) in parts.iter().rev() {
             let Some(view) = image.view() else { continue };
-            let camera = whole.as_ref().map(|camera| parts::camera_of(part, camera));
+            let roi = parts::roi(part);
+            let camera = whole.as_ref().map(|camera| roi.camera(camera));
             let seen = self.detector.detect(view, camera.as_ref(), clock);
-            parts::add_finer(&mut found, seen.iter().map(|seen| parts::in_frame(part, seen)));
+            parts::add_finer(&mut found, seen.iter().map(|seen| seen.mapped(&roi)));
         }
         found.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
         told(&found, &self.pads, whole.as_ref(), self.config.least_confidence)

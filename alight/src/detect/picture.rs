@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use fiducial::Observation;
-use fiducial::canvas::{Colour, RgbImageBuf};
+use fiducial::overlay::canvas::{Colour, RgbImageBuf};
 use geometry::{CameraModel, Pixel, Point, Transform};
 use imaging::{GrayImage, GrayView};
 

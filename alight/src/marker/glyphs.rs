@@ -1,6 +1,6 @@
 //! Letters of dots as rectangles on the sheet.
 
-use fiducial::letters::rows;
+use fiducial::overlay::font::rows;
 
 use super::sheet::TEXT_MM;
 

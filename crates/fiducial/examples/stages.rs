@@ -6,8 +6,9 @@ use std::error::Error;
 use std::path::Path;
 use std::time::Instant;
 
-use fiducial::debug::{ALIGNMENT_RADIUS_PX, RgbImageBuf, draw_ellipses, draw_rings, draw_target};
 use fiducial::families::rings_thesis::{ContourEllipse, ellipse_filter};
+use fiducial::overlay::canvas::RgbImageBuf;
+use fiducial::overlay::debug::{ALIGNMENT_RADIUS_PX, draw_ellipses, draw_rings, draw_target};
 use fiducial::{Detector, Settings, Stages};
 use geometry::CameraModel;
 use imaging::{

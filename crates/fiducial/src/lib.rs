@@ -6,23 +6,21 @@
 //! What a marker is stands in the crate `markers`. Modules in reading order: [`square`] finds square markers, `stag` finds
 //! STags among the same quads, [`observation`] is what was found, [`pose`] where it is in space, [`detector`] finds it, [`bundle`] solves the markers of one pad together.
 //! `optics` is what camera and lens do to an edge, `candidates` where a marker may be, [`families`] one detector for each
-//! kind of marker. [`trace`] is what they saw, [`debug`] draws that on a [`canvas`] with its [`letters`]. [`tracking`]
+//! kind of marker. [`trace`] is what they saw, [`overlay`] draws that on the image. [`tracker`]
 //! searches first where the markers of the last images should be.
 
 pub mod bundle;
 mod candidates;
-pub mod canvas;
-pub mod debug;
 pub mod detector;
 pub mod families;
-pub mod letters;
 pub mod observation;
 mod optics;
+pub mod overlay;
 pub mod pose;
 pub mod square;
 mod stag;
 pub mod trace;
-pub mod tracking;
+pub mod tracker;
 
 pub use bundle::{PadObservation, observe_pad};
 pub use candidates::ring::Ring;
@@ -30,4 +28,4 @@ pub use detector::{Detector, DetectorError, Settings};
 pub use observation::{MarkerPose, Observation, PoseSolution, Stages};
 pub use pose::{PlanePoint, planar_pose, square_pose};
 pub use trace::{Candidate, Reason, Refusal, Trace, TracedMarker};
-pub use tracking::{Tracker, TrackingSettings};
+pub use tracker::{Tracker, TrackingSettings};

@@ -1,6 +1,6 @@
-//! What was found in an image.
+//! What the detector reports of a marker.
 
-use geometry::{Camera, Marker as MarkerFrame, Pixel, Transform};
+use geometry::{Camera, Marker as MarkerFrame, Pixel, Roi, Transform};
 use markers::Family;
 use nalgebra::{Matrix2, Matrix6};
 
@@ -11,53 +11,71 @@ pub struct Observation {
     pub family: Family,
     /// Its id, where the family has ids.
     pub id: Option<u32>,
-    /// The projection of the marker's centre (not the centre of its ellipse).
+    /// The projection of the marker's centre, which is not the centre of its ellipse.
     pub centre: Pixel,
     /// Covariance of `centre`, in square pixels.
     pub centre_covariance_px2: Matrix2<f64>,
     /// The corners of a square marker: its own top-left first, then clockwise as seen in the image.
     pub corners: Option<[Pixel; 4]>,
-    /// Cells of the code that were read wrong and mended; 0 where there is no code.
+    /// Hamming distance of the bits that were read from the codeword; 0 where there is no code.
     pub wrong_bits: u8,
     /// Its largest extent in the image, in pixels.
     pub size_px: f64,
     /// From 0 (a guess) to 1 (certain).
     pub confidence: f64,
-    /// Where it is, when its size and the camera are known.
+    /// Its pose, when its size and the camera are known.
     pub pose: Option<MarkerPose>,
 }
 
-/// Where a marker is.
+impl Observation {
+    /// An observation in a region of interest, in pixels of the whole frame.
+    pub fn mapped(&self, roi: &Roi) -> Self {
+        let mut seen = self.clone();
+        seen.centre = roi.to_frame(seen.centre);
+        seen.corners = seen.corners.map(|corners| corners.map(|corner| roi.to_frame(corner)));
+        seen.centre_covariance_px2 *= roi.scale * roi.scale;
+        seen.size_px *= roi.scale;
+        if let Some(pose) = &mut seen.pose {
+            pose.reprojection_rms_px *= roi.scale;
+            if let Some(other) = &mut pose.alternative {
+                other.reprojection_rms_px *= roi.scale;
+            }
+        }
+        seen
+    }
+}
+
+/// Pose of a marker.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct MarkerPose {
     /// The marker in the camera frame.
     pub camera_from_marker: Transform<Camera, MarkerFrame>,
-    /// Root mean square distance, in pixels, between the image's edges and the pose's.
+    /// Root mean square distance between the edges in the image and those of the pose, in pixels.
     pub reprojection_rms_px: f64,
     /// Covariance of the pose: translation (m), then rotation vector (rad), both in the camera frame. A rotation
     /// vector `w` moves the rotation `R` to `exp(w) R`.
     pub covariance: Matrix6<f64>,
-    /// The other pose of the same plane that explains the image nearly as well, when there is one: from afar a marker
-    /// tilted one way looks like one tilted the other way.
+    /// The second solution of the planar pose ambiguity, when it fits the image nearly as well: in a small image two tilts
+    /// look alike.
     pub alternative: Option<PoseSolution>,
 }
 
-/// A pose and how well it explains the image.
+/// A pose and its residual.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct PoseSolution {
     /// The marker in the camera frame.
     pub camera_from_marker: Transform<Camera, MarkerFrame>,
-    /// Root mean square distance, in pixels, between the image's edges and the pose's.
+    /// Root mean square distance between the edges in the image and those of the pose, in pixels.
     pub reprojection_rms_px: f64,
 }
 
-/// Told when a stage of a detection ends, so that whoever has a clock can time it.
+/// Observes the stages of a detection, for timing by a caller that has a clock.
 pub trait Stages {
-    /// `stage` has just ended.
+    /// Called when `stage` has ended.
     fn ended(&mut self, stage: &'static str);
 }
 
-/// Nobody listens.
+/// Ignores the stages.
 impl Stages for () {
     fn ended(&mut self, _stage: &'static str) {}
 }

@@ -1,36 +1,36 @@
-//! What a detection saw on its way: for people, and for the debug images.
+//! The candidates of a detection and why they were refused, for debug images.
 
-use geometry::Pixel;
+use geometry::{Pixel, Roi};
 use imaging::Ellipse;
 
 use crate::candidates::ring::Ring;
 use crate::observation::Observation;
 
-/// What the last detection saw.
+/// Candidates and markers of the last detection.
 #[derive(Clone, Debug, Default)]
 pub struct Trace {
-    /// The contours that are ellipses.
+    /// Contours that are ellipses.
     pub ellipses: Vec<Ellipse>,
-    /// The pairs of ellipses that are rings.
+    /// Pairs of ellipses that are rings.
     pub rings: Vec<Ring>,
-    /// The candidates for square markers whose code was read, clockwise; no more than [`Trace::MOST_REFUSALS`].
+    /// Corners, clockwise, of square candidates whose code was read; at most [`Trace::MAX_REFUSALS`].
     pub quads: Vec<[Pixel; 4]>,
-    /// The candidates that did not hold; no more than [`Trace::MOST_REFUSALS`].
+    /// Refused candidates; at most [`Trace::MAX_REFUSALS`].
     pub refusals: Vec<Refusal>,
-    /// The markers found: centre and outer edge.
+    /// The markers that were found.
     pub markers: Vec<TracedMarker>,
 }
 
 /// A candidate that was refused.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Refusal {
-    /// What was looked at.
+    /// The candidate.
     pub candidate: Candidate,
     /// The first check that failed.
     pub reason: Reason,
 }
 
-/// What could have been a marker.
+/// A candidate for a marker.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub enum Candidate {
     /// The two edges of a ring.
@@ -39,36 +39,36 @@ pub enum Candidate {
     Quad([Pixel; 4]),
 }
 
-/// Why a candidate is no marker.
+/// Why a candidate was refused.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Reason {
     /// Two ellipses whose shapes differ (Algorithm 3).
     Eccentricity,
     /// Two ellipses whose orientations differ (Algorithm 4).
     Orientation,
-    /// The ratio of two ellipses' axes is no ring's (Algorithm 5).
+    /// The ratio of two ellipses' axes is not that of a ring (Algorithm 5).
     Type,
-    /// What lies between two ellipses is not black (Algorithm 6), or what lies around is not white.
+    /// The area between two ellipses is not black (Algorithm 6), or the area around them is not white.
     Blackness,
-    /// No circle or square in space looks like this.
+    /// No circle or square in space has this projection.
     Pose,
     /// The edges are not where a marker of this size and pose has them.
     Edges,
-    /// It lies in a marker that was found already.
+    /// It lies in a marker that was already found.
     Repeated,
     /// A quad that is too small to be read.
     Small,
-    /// A quad whose sides are not straight, or that no square in space looks like.
+    /// A quad whose sides are not straight, or that is not the projection of a square.
     Shape,
-    /// A quad that is not darker than what is around it (or brighter, for a marker printed white on black).
+    /// A quad that is not darker than its surroundings, or brighter for a marker printed white on black.
     Contrast,
-    /// A quad whose border is not of one colour all round.
+    /// A quad whose border is not of one colour.
     Border,
-    /// A quad whose cells make no word of the families looked for.
+    /// A quad whose cells are no codeword of the requested families.
     Code,
-    /// A word of a marker that is not looked for.
+    /// The codeword of a marker that is not requested.
     Unwanted,
-    /// The evidence is too weak to be believed.
+    /// The confidence is too low.
     Confidence,
 }
 
@@ -84,7 +84,7 @@ pub struct TracedMarker {
 }
 
 impl Reason {
-    /// One word for people.
+    /// One word for labels.
     pub fn name(self) -> &'static str {
         match self {
             Self::Eccentricity => "eccentricity",
@@ -106,18 +106,18 @@ impl Reason {
 }
 
 impl Trace {
-    /// Makes the lists as large as frames with texture need.
+    /// Reserves what textured images need.
     pub(crate) fn make_room(&mut self) {
-        const MOST: usize = 1024;
-        self.ellipses.reserve(MOST);
-        self.rings.reserve(MOST);
-        self.quads.reserve(Self::MOST_REFUSALS);
-        self.refusals.reserve(Self::MOST_REFUSALS);
-        self.markers.reserve(Self::MOST_REFUSALS);
+        const CAPACITY: usize = 1024;
+        self.ellipses.reserve(CAPACITY);
+        self.rings.reserve(CAPACITY);
+        self.quads.reserve(Self::MAX_REFUSALS);
+        self.refusals.reserve(Self::MAX_REFUSALS);
+        self.markers.reserve(Self::MAX_REFUSALS);
     }
 
-    /// How many refusals are kept, and how many quads.
-    pub const MOST_REFUSALS: usize = 256;
+    /// Largest number of refusals, and of quads, that are kept.
+    pub const MAX_REFUSALS: usize = 256;
 
     pub(crate) fn clear(&mut self) {
         self.ellipses.clear();
@@ -127,59 +127,58 @@ impl Trace {
         self.markers.clear();
     }
 
-    /// Two ellipses are no ring, or a ring is no marker.
+    /// Notes that two ellipses are not a ring, or that a ring is not a marker.
     pub(crate) fn refuse(&mut self, first: Ellipse, second: Ellipse, reason: Reason) {
         self.keep(Candidate::Ring([first, second]), reason);
     }
 
-    /// A quad is no marker.
+    /// Notes that a quad is not a marker.
     pub fn refuse_quad(&mut self, corners: [Pixel; 4], reason: Reason) {
         self.keep(Candidate::Quad(corners), reason);
     }
 
-    /// The code in a quad was read.
+    /// Notes that the code in a quad was read.
     pub fn accept_quad(&mut self, corners: [Pixel; 4]) {
-        if self.quads.len() < Self::MOST_REFUSALS {
+        if self.quads.len() < Self::MAX_REFUSALS {
             self.quads.push(corners);
         }
     }
 
     fn keep(&mut self, candidate: Candidate, reason: Reason) {
-        if self.refusals.len() < Self::MOST_REFUSALS {
+        if self.refusals.len() < Self::MAX_REFUSALS {
             self.refusals.push(Refusal { candidate, reason });
         }
     }
 
-    /// Adds what was seen in a part of the image whose top-left pixel lies at `offset`.
-    pub fn add_part(&mut self, part: &Self, offset: [f64; 2]) {
-        self.ellipses.extend(part.ellipses.iter().map(|ellipse| moved(ellipse, offset)));
-        self.rings.extend(part.rings.iter().map(|ring| {
-            Ring::new(ring.kind, moved(&ring.inner, offset), moved(&ring.outer, offset))
-        }));
-        self.quads.extend(part.quads.iter().map(|quad| quad.map(|c| moved_pixel(c, offset))));
+    /// Adds the trace of a region of interest, in pixels of the whole frame.
+    pub fn add_roi(&mut self, part: &Self, roi: &Roi) {
+        self.ellipses.extend(part.ellipses.iter().map(|ellipse| mapped(ellipse, roi)));
+        self.rings.extend(
+            part.rings.iter().map(|ring| {
+                Ring::new(ring.kind, mapped(&ring.inner, roi), mapped(&ring.outer, roi))
+            }),
+        );
+        self.quads.extend(part.quads.iter().map(|quad| quad.map(|c| roi.to_frame(c))));
         for refusal in &part.refusals {
             let candidate = match refusal.candidate {
-                Candidate::Ring(pair) => Candidate::Ring(pair.map(|e| moved(&e, offset))),
-                Candidate::Quad(quad) => Candidate::Quad(quad.map(|c| moved_pixel(c, offset))),
+                Candidate::Ring(pair) => Candidate::Ring(pair.map(|e| mapped(&e, roi))),
+                Candidate::Quad(quad) => Candidate::Quad(quad.map(|c| roi.to_frame(c))),
             };
             self.keep(candidate, refusal.reason);
         }
         self.markers.extend(part.markers.iter().map(|marker| TracedMarker {
-            centre: moved_pixel(marker.centre, offset),
-            corners: marker.corners.map(|corners| corners.map(|c| moved_pixel(c, offset))),
-            ..*marker
+            centre: roi.to_frame(marker.centre),
+            size_px: marker.size_px * roi.scale,
+            corners: marker.corners.map(|corners| corners.map(|c| roi.to_frame(c))),
         }));
     }
 }
 
-fn moved(ellipse: &Ellipse, [dx, dy]: [f64; 2]) -> Ellipse {
+fn mapped(ellipse: &Ellipse, roi: &Roi) -> Ellipse {
     let [x, y] = ellipse.centre;
-    Ellipse { centre: [x + dx, y + dy], ..*ellipse }
-}
-
-/// A pixel of a part of the image as a pixel of the whole.
-pub(crate) fn moved_pixel(pixel: Pixel, [dx, dy]: [f64; 2]) -> Pixel {
-    Pixel::new(pixel.x + dx, pixel.y + dy)
+    let Pixel { x, y } = roi.to_frame(Pixel::new(x, y));
+    let (minor, major) = (ellipse.minor * roi.scale, ellipse.major * roi.scale);
+    Ellipse { centre: [x, y], minor, major, angle: ellipse.angle }
 }
 
 impl From<&Observation> for TracedMarker {

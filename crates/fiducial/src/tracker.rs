@@ -1,13 +1,12 @@
-//! Where to look first: the places where the markers of the last images should be by now.
+//! Tracks markers from image to image, to search only the regions where they should be.
 //!
-//! A marker is expected where a constant velocity takes its centre and its size, in a region that grows with what is
-//! not known of its motion. Only these regions are searched, by the same detector with the same checks as ever, so
-//! that a marker is never made up; the whole image is searched every so often, for markers that are new, and whenever
-//! a marker is not where it was expected. A marker that is plain to see right where it was expected is read there, and its
-//! region is not searched for others. Where nothing is followed, what takes long is done in turn
-//! ([`Detector::detect_in_turn`]).
+//! The prediction is a constant velocity of the marker's centre and of its size; its region grows with the uncertainty of
+//! the motion. Regions are searched by the same detector with the same checks, so no marker is reported that is not seen
+//! in this image. The whole image is searched periodically, for new markers, and when a marker is not found in its region.
+//! A marker that is visible right at its predicted place is read there, and the rest of its region is not searched. While
+//! nothing is tracked, the fallback passes take turns ([`Detector::detect_in_turn`]).
 
-use geometry::{CameraModel, Pixel};
+use geometry::{CameraModel, Pixel, Roi};
 use imaging::GrayView;
 use markers::Family;
 use nalgebra::Vector3;
@@ -15,12 +14,12 @@ use nalgebra::Vector3;
 use crate::detector::{Detector, Expected};
 use crate::families::rings::circle_pose::CirclePose;
 use crate::observation::{Observation, Stages};
-use crate::trace::{Trace, moved_pixel};
+use crate::trace::Trace;
 
-/// What can be chosen about tracking.
+/// Settings of tracking.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct TrackingSettings {
-    /// The whole image is searched in every image of this number; with 1 in each, which is no tracking at all.
+    /// The whole image is searched in every so many images; with 1 in each one, which is no tracking.
     pub full_search_period: u32,
 }
 
@@ -30,25 +29,26 @@ impl Default for TrackingSettings {
     }
 }
 
-/// Markers followed from image to image.
+/// Tracks markers from image to image.
 #[derive(Debug, Default)]
 pub struct Tracker {
     settings: TrackingSettings,
     tracks: Vec<Track>,
-    expected: Vec<Region>,
+    /// Regions that the caller wants searched in the next image.
+    requested: Vec<Region>,
     regions: Vec<Region>,
     found: Vec<Observation>,
     trace: Trace,
-    /// Images since the whole of one was searched.
+    /// Images since the last search of a whole image.
     since_full: u32,
     size: (usize, usize),
     /// Whether an image was searched.
     has_begun: bool,
-    /// Whether somebody else expects markers in this image.
-    is_asked: bool,
+    /// Whether regions were requested for this image.
+    has_requests: bool,
 }
 
-/// A marker that was seen, and how it moves.
+/// A tracked marker: its last observation and its motion.
 #[derive(Copy, Clone, Debug)]
 struct Track {
     family: Family,
@@ -56,18 +56,17 @@ struct Track {
     centre: Pixel,
     size_px: f64,
     time_s: f64,
-    /// Velocity of the centre in px/s and growth of the size in 1/s; `None` after a first sight.
+    /// `None` after a first observation.
     motion: Option<Motion>,
-    /// How far the last prediction was off, in pixels, and over which time.
-    off_px: f64,
+    /// Error of the last prediction, in pixels, and the time it was over.
+    error_px: f64,
     period_s: f64,
     shape: Shape,
-    /// How the shape changes in a second; `None` after a first sight.
+    /// Change of the shape per second; `None` after a first observation.
     change: Option<Shape>,
 }
 
-/// Where exactly a marker was seen: the corners of a square one, or the centre (m) and normal of rings. Noughts stand for what
-/// it does not have.
+/// Corners of a square marker, or centre (m) and normal of rings; the fields it lacks are zero.
 #[derive(Copy, Clone, Debug, Default, PartialEq)]
 struct Shape {
     has_corners: bool,
@@ -77,57 +76,59 @@ struct Shape {
     normal: [f64; 3],
 }
 
+/// Motion of the centre in the image, and relative growth of the size.
 #[derive(Copy, Clone, Debug)]
 struct Motion {
     velocity_px_s: [f64; 2],
     growth_per_s: f64,
 }
 
-/// A rectangle of pixels, from a corner up to but not including the other.
+/// A rectangle of pixels; `to` is exclusive.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 struct Region {
     from: [usize; 2],
     to: [usize; 2],
 }
 
-/// Markers that are followed at most; more are found by searching the whole image.
-const MOST_TRACKS: usize = 16;
-/// Nothing is predicted over a longer time, in seconds.
-const LONGEST_S: f64 = 1.0;
-/// A marker's surroundings that belong to the search, in units of its size on each side.
-const SURROUNDINGS: f64 = 0.25;
-/// What a prediction is never better than, in pixels and in units of the marker's size.
-const LEAST_REACH_PX: f64 = 4.0;
-const LEAST_REACH: f64 = 0.1;
-/// Regions begin and end at multiples of this, in pixels, so that what is done by tiles is done as in the whole image.
+/// Largest number of tracked markers; others are found by searches of the whole image.
+const MAX_TRACKS: usize = 16;
+/// Largest age of an observation that is predicted from, in seconds.
+const MAX_PREDICTION_S: f64 = 1.0;
+/// Margin of a region around the marker, in units of its size on each side.
+const MARGIN: f64 = 0.25;
+/// Lower bound of a prediction's uncertainty: the sum of a part in pixels and a part in units of the marker's size.
+const MIN_UNCERTAINTY_PX: f64 = 4.0;
+const MIN_UNCERTAINTY_RATIO: f64 = 0.1;
+/// Regions begin and end at multiples of this, in pixels, so that processing by tiles gives what it gives in the whole
+/// image.
 const TILE: usize = 16;
-/// Regions that cover more than this part of the image are not worth it.
-const MOST_COVER: f64 = 0.4;
+/// Largest share of the image that regions may cover; above it the whole image is searched.
+const MAX_COVERED: f64 = 0.4;
 
 impl Tracker {
-    /// Follows nothing yet.
+    /// A tracker without tracks.
     pub fn new(settings: TrackingSettings) -> Self {
         Self { settings, ..Self::default() }
     }
 
-    /// Changes the settings; what is followed is followed on.
+    /// Changes the settings and keeps the tracks.
     pub fn set(&mut self, settings: TrackingSettings) {
         self.settings = settings;
     }
 
-    /// Looks in the next image also about `centre`, where somebody else expects a marker of about `size_px`, give or take
+    /// Has the next image also searched around `centre`, for a marker of about `size_px`, with an uncertainty of
     /// `spread_px`.
-    pub fn expect(&mut self, centre: Pixel, size_px: f64, spread_px: f64) {
-        let half = size_px * (0.5 + SURROUNDINGS) + spread_px + LEAST_REACH_PX;
-        if self.expected.len() < MOST_TRACKS
-            && let Some(region) = Region::about(centre, half, self.size)
+    pub fn add_roi(&mut self, centre: Pixel, size_px: f64, spread_px: f64) {
+        let half = size_px * (0.5 + MARGIN) + spread_px + MIN_UNCERTAINTY_PX;
+        if self.requested.len() < MAX_TRACKS
+            && let Some(region) = Region::around(centre, half, self.size)
         {
-            self.expected.push(region);
+            self.requested.push(region);
         }
     }
 
-    /// Finds the markers in an image taken at `time_s` (seconds of any clock), as [`Detector::detect`] does, the surest
-    /// first.
+    /// Finds the markers in an image taken at `time_s` (seconds of any clock), as [`Detector::detect`] does, the most
+    /// confident first.
     pub fn detect(
         &mut self,
         detector: &mut Detector,
@@ -149,7 +150,7 @@ impl Tracker {
             self.since_full += 1;
         }
         if self.regions.is_empty() || self.is_one_missing(time_s) {
-            // The first image, and one that should show a marker, are searched with all there is.
+            // All passes search the first image, and one that should show a marker.
             let is_urgent =
                 !self.tracks.is_empty() || !std::mem::replace(&mut self.has_begun, true);
             let seen = match is_urgent {
@@ -159,49 +160,50 @@ impl Tracker {
             self.found.clear();
             self.found.extend_from_slice(seen);
             self.trace.clear();
-            self.trace.add_part(detector.trace(), [0.0; 2]);
+            let whole = Roi::cropped(0.0, 0.0, view.width() as u32, view.height() as u32);
+            self.trace.add_roi(detector.trace(), &whole);
             self.since_full = 0;
         }
-        self.follow(time_s);
+        self.update_tracks(time_s);
         &self.found
     }
 
-    /// What the last detection saw on its way, in pixels of the whole image.
+    /// The trace of the last detection, in pixels of the whole image.
     pub fn trace(&self) -> &Trace {
         &self.trace
     }
 
-    /// Forgets what can no longer be followed.
+    /// Drops tracks that can no longer be predicted.
     fn begin(&mut self, size: (usize, usize), time_s: f64) {
         if size != self.size {
             self.size = size;
             self.tracks.clear();
-            self.expected.clear();
+            self.requested.clear();
         }
         // Also a time that is not a number, or runs backwards.
         self.tracks.retain(|track| {
             let elapsed_s = time_s - track.time_s;
-            elapsed_s > 0.0 && elapsed_s <= LONGEST_S
+            elapsed_s > 0.0 && elapsed_s <= MAX_PREDICTION_S
         });
     }
 
-    /// Lists the regions to be searched; false when it is the whole image.
+    /// Lists the regions to search; false when that is the whole image.
     fn choose_regions(&mut self, time_s: f64) -> bool {
         self.regions.clear();
         let is_due = self.since_full + 1 >= self.settings.full_search_period;
-        // Regions that only somebody else expects are no reason to leave the rest out.
+        // Requested regions alone do not limit the search.
         if self.tracks.is_empty() || is_due {
-            self.expected.clear();
+            self.requested.clear();
             return false;
         }
         let of_tracks = self.tracks.iter().filter_map(|track| track.region(time_s, self.size));
         self.regions.extend(of_tracks);
-        self.is_asked = !self.expected.is_empty();
-        self.regions.append(&mut self.expected);
+        self.has_requests = !self.requested.is_empty();
+        self.regions.append(&mut self.requested);
         merge(&mut self.regions);
         let area: usize = self.regions.iter().map(Region::area).sum();
         let whole = (self.size.0 * self.size.1) as f64;
-        if area as f64 > MOST_COVER * whole {
+        if area as f64 > MAX_COVERED * whole {
             self.regions.clear();
         }
         !self.regions.is_empty()
@@ -215,65 +217,54 @@ impl Tracker {
         (region, time_s): (Region, f64),
         stages: &mut impl Stages,
     ) {
-        let [x, y] = region.from;
+        let [left, top] = region.from;
         let [width, height] = region.edges();
-        let Some(part) = view.crop(x, y, width, height) else { return };
-        let offset = [x as f64, y as f64];
-        let camera = camera.map(|camera| CameraModel {
-            width: width as u32,
-            height: height as u32,
-            cx: camera.cx - offset[0],
-            cy: camera.cy - offset[1],
-            ..*camera
-        });
-        let moved = |seen: &Observation| {
-            let mut seen = seen.clone();
-            seen.centre = moved_pixel(seen.centre, offset);
-            seen.corners = seen.corners.map(|corners| corners.map(|c| moved_pixel(c, offset)));
-            seen
-        };
+        let Some(part) = view.crop(left, top, width, height) else { return };
+        let roi = Roi::cropped(left as f64, top as f64, width as u32, height as u32);
+        let camera = camera.map(|camera| roi.camera(camera));
         let expected = self.only_track(&region, time_s).and_then(|track| {
-            let expected = track.expected(time_s, offset)?;
+            let expected = track.expected(time_s, roi.origin)?;
             detector.detect_at(part, camera.as_ref(), &expected, stages)
         });
         match expected {
-            Some(seen) => self.found.push(moved(&seen)),
+            Some(seen) => self.found.push(seen.mapped(&roi)),
             None => {
-                self.found.extend(detector.detect(part, camera.as_ref(), stages).iter().map(moved));
+                let found = detector.detect(part, camera.as_ref(), stages);
+                self.found.extend(found.iter().map(|seen| seen.mapped(&roi)));
             }
         }
-        self.trace.add_part(detector.trace(), offset);
+        self.trace.add_roi(detector.trace(), &roi);
     }
 
-    /// The track in a region in which there is no other, and in which nobody else expects a marker.
+    /// The track of a region in which there is no other and none was requested.
     fn only_track(&self, region: &Region, time_s: f64) -> Option<&Track> {
-        let is_within = |track: &&Track| region.has(track.predicted(time_s).0);
+        let is_within = |track: &&Track| region.contains(track.predicted(time_s).0);
         let mut within = self.tracks.iter().filter(is_within);
         let track = within.next()?;
-        (!self.is_asked && within.next().is_none()).then_some(track)
+        (!self.has_requests && within.next().is_none()).then_some(track)
     }
 
-    /// True when a marker that should be in the image was not found.
+    /// True when a tracked marker that should be in the image was not found.
     fn is_one_missing(&self, time_s: f64) -> bool {
         self.tracks.iter().any(|track| {
             track.region(time_s, self.size).is_some()
-                && !self.found.iter().any(|seen| track.may_be(seen, time_s))
+                && !self.found.iter().any(|seen| track.matches(seen, time_s))
         })
     }
 
-    /// Joins what was found to what is followed.
-    fn follow(&mut self, time_s: f64) {
+    /// Associates the observations with the tracks.
+    fn update_tracks(&mut self, time_s: f64) {
         let before = self.tracks.len();
         for seen in &self.found {
             let old = self.tracks.get(..before).unwrap_or_default();
-            let of_seen = |track: &&Track| track.time_s < time_s && track.may_be(seen, time_s);
-            let off = |track: &Track| track.predicted(time_s).0.distance(&seen.centre);
-            let track = old.iter().filter(of_seen).min_by(|a, b| off(a).total_cmp(&off(b)));
+            let of_seen = |track: &&Track| track.time_s < time_s && track.matches(seen, time_s);
+            let error = |track: &Track| track.predicted(time_s).0.distance(&seen.centre);
+            let track = old.iter().filter(of_seen).min_by(|a, b| error(a).total_cmp(&error(b)));
             let next = match track {
                 Some(track) => track.next(seen, time_s),
                 None => Track::first(seen, time_s),
             };
-            if self.tracks.len() < before + MOST_TRACKS && next.is_sound() {
+            if self.tracks.len() < before + MAX_TRACKS && next.is_sound() {
                 self.tracks.push(next);
             }
         }
@@ -284,10 +275,10 @@ impl Tracker {
 impl Track {
     fn first(seen: &Observation, time_s: f64) -> Self {
         let Observation { family, id, centre, size_px, .. } = *seen;
-        let shape = Shape::of(seen);
+        let shape = Shape::from_observation(seen);
         let (motion, change) = (None, None);
-        let (off_px, period_s) = (0.0, 0.0);
-        Self { family, id, centre, size_px, time_s, motion, off_px, period_s, shape, change }
+        let (error_px, period_s) = (0.0, 0.0);
+        Self { family, id, centre, size_px, time_s, motion, error_px, period_s, shape, change }
     }
 
     fn next(&self, seen: &Observation, time_s: f64) -> Self {
@@ -300,20 +291,20 @@ impl Track {
             ],
             growth_per_s: (seen.size_px / self.size_px).ln() / period_s,
         };
-        // A prediction without a motion says nothing of how steady the motion is.
-        let off_px = match self.motion {
-            Some(_) => expected.distance(&seen.centre).max(0.7 * self.off_px),
+        // Without a motion the prediction's error does not measure how steady the motion is.
+        let error_px = match self.motion {
+            Some(_) => expected.distance(&seen.centre).max(0.7 * self.error_px),
             None => 0.5 * expected.distance(&seen.centre),
         };
         let next = Self::first(seen, time_s);
         let change = Some(next.shape.plus(&self.shape, -1.0).times(1.0 / period_s));
-        Self { motion: Some(motion), off_px, period_s, change, ..next }
+        Self { motion: Some(motion), error_px, period_s, change, ..next }
     }
 
-    /// Where exactly it should be in a part of the image that begins at `offset`.
-    fn expected(&self, time_s: f64, offset: [f64; 2]) -> Option<Expected> {
+    /// Its predicted shape in a region.
+    fn expected(&self, time_s: f64, origin: Pixel) -> Option<Expected> {
         let shape = self.shape.plus(&self.change?, time_s - self.time_s);
-        let corner = |[x, y]: [f64; 2]| Pixel::new(x - offset[0], y - offset[1]);
+        let corner = |[x, y]: [f64; 2]| Pixel::new(x - origin.x, y - origin.y);
         let circles = || {
             let [centre, normal] = [shape.centre, shape.normal].map(Vector3::from);
             Some(CirclePose { centre, normal: normal.try_normalize(0.1)? })
@@ -331,7 +322,7 @@ impl Track {
         self.size_px > 0.0 && [x, y, self.size_px].iter().all(|n| n.is_finite())
     }
 
-    /// Where its centre should be, and how large it should be, in pixels.
+    /// Its predicted centre and size, in pixels.
     fn predicted(&self, time_s: f64) -> (Pixel, f64) {
         let elapsed_s = time_s - self.time_s;
         let Pixel { x, y } = self.centre;
@@ -344,41 +335,41 @@ impl Track {
         }
     }
 
-    /// How far from the prediction it may be, in pixels.
-    fn reach_px(&self, time_s: f64, size_px: f64) -> f64 {
-        let least = LEAST_REACH_PX + LEAST_REACH * size_px;
+    /// Uncertainty of the prediction, in pixels.
+    fn uncertainty_px(&self, time_s: f64, size_px: f64) -> f64 {
+        let min = MIN_UNCERTAINTY_PX + MIN_UNCERTAINTY_RATIO * size_px;
         match self.motion {
-            None => least + size_px,
+            None => min + size_px,
             Some(_) => {
-                // What a change of the velocity does grows with the square of time.
+                // The effect of an acceleration grows with the square of time.
                 let longer = ((time_s - self.time_s) / self.period_s).max(1.0);
-                least + 2.0 * self.off_px * longer * longer
+                min + 2.0 * self.error_px * longer * longer
             }
         }
     }
 
-    /// Where to look for it; `None` when it should have left the image.
+    /// The region to search for it; `None` when it should have left the image.
     fn region(&self, time_s: f64, size: (usize, usize)) -> Option<Region> {
         let (centre, size_px) = self.predicted(time_s);
         let inside = |at: f64, edge: usize| at >= -0.5 && at <= edge as f64 - 0.5;
-        let half = size_px * (0.5 + SURROUNDINGS) + self.reach_px(time_s, size_px);
+        let half = size_px * (0.5 + MARGIN) + self.uncertainty_px(time_s, size_px);
         (inside(centre.x, size.0) && inside(centre.y, size.1))
-            .then(|| Region::about(centre, half, size))
+            .then(|| Region::around(centre, half, size))
             .flatten()
     }
 
-    /// True when an observation can be of this marker.
-    fn may_be(&self, seen: &Observation, time_s: f64) -> bool {
+    /// Whether an observation is within the gates of this track.
+    fn matches(&self, seen: &Observation, time_s: f64) -> bool {
         let (centre, size_px) = self.predicted(time_s);
         let ratio = seen.size_px / size_px;
         (seen.family, seen.id) == (self.family, self.id)
-            && centre.distance(&seen.centre) <= self.reach_px(time_s, size_px) + size_px / 2.0
+            && centre.distance(&seen.centre) <= self.uncertainty_px(time_s, size_px) + size_px / 2.0
             && (0.5..=2.0).contains(&ratio)
     }
 }
 
 impl Shape {
-    fn of(seen: &Observation) -> Self {
+    fn from_observation(seen: &Observation) -> Self {
         let circles = seen.pose.as_ref().filter(|_| seen.corners.is_none());
         let (centre, normal) = match circles {
             Some(pose) => {
@@ -398,7 +389,7 @@ impl Shape {
         }
     }
 
-    /// This one and so many times another.
+    /// The sum of this one and `times` another.
     fn plus(&self, other: &Self, times: f64) -> Self {
         let mut sum = *self;
         for (own, others) in sum.corners.iter_mut().zip(&other.corners) {
@@ -413,14 +404,14 @@ impl Shape {
     }
 
     fn times(&self, factor: f64) -> Self {
-        let nought = Self { corners: [[0.0; 2]; 4], centre: [0.0; 3], normal: [0.0; 3], ..*self };
-        nought.plus(self, factor)
+        let zero = Self { corners: [[0.0; 2]; 4], centre: [0.0; 3], normal: [0.0; 3], ..*self };
+        zero.plus(self, factor)
     }
 }
 
 impl Region {
-    /// The square about a place, in whole tiles, as far as it lies in an image of this size.
-    fn about(centre: Pixel, half: f64, (width, height): (usize, usize)) -> Option<Self> {
+    /// The square around a pixel, in whole tiles, cut to an image of this size.
+    fn around(centre: Pixel, half: f64, (width, height): (usize, usize)) -> Option<Self> {
         let finite = centre.x.is_finite() && centre.y.is_finite() && half.is_finite() && half > 0.0;
         let span = |at: f64, edge: usize| {
             let from = (at - half).max(0.0) as usize / TILE * TILE;
@@ -432,8 +423,8 @@ impl Region {
             .then_some(Self { from: [left, top], to: [right, bottom] })
     }
 
-    fn has(&self, place: Pixel) -> bool {
-        let [x, y] = [place.x, place.y];
+    fn contains(&self, pixel: Pixel) -> bool {
+        let [x, y] = [pixel.x, pixel.y];
         x >= self.from[0] as f64
             && y >= self.from[1] as f64
             && x < self.to[0] as f64
@@ -460,7 +451,7 @@ impl Region {
     }
 }
 
-/// Joins regions that overlap, so that no marker is found twice.
+/// Joins overlapping regions, so that no marker is found twice.
 fn merge(regions: &mut Vec<Region>) {
     let mut index = 0;
     while index < regions.len() {
@@ -470,7 +461,7 @@ fn merge(regions: &mut Vec<Region>) {
             Some(other) => {
                 let gone = regions.swap_remove(other);
                 regions[index] = regions[index].joined(&gone);
-                // What has grown may overlap those before it.
+                // The joined region may overlap earlier ones.
                 index = 0;
             }
             None => index += 1,
@@ -500,13 +491,13 @@ mod tests {
         }
     }
 
-    /// What is searched at `time_s` after some images in which markers were found.
+    /// The regions that are searched at `time_s` after images with these observations.
     fn regions(images: &[(f64, &[Observation])], time_s: f64) -> Vec<Region> {
         let mut tracker = Tracker::default();
         for (time_s, found) in images {
             tracker.begin(SIZE, *time_s);
             tracker.found = found.to_vec();
-            tracker.follow(*time_s);
+            tracker.update_tracks(*time_s);
         }
         tracker.begin(SIZE, time_s);
         tracker.choose_regions(time_s);
@@ -514,14 +505,14 @@ mod tests {
     }
 
     #[test]
-    fn a_marker_is_looked_for_where_its_velocity_takes_it() {
+    fn a_marker_is_searched_where_its_velocity_takes_it() {
         let places = (0..8).map(|i| (0.1 * f64::from(i), f64::from(i)));
         let images: Vec<_> = places
             .map(|(time_s, i)| (time_s, [seen(280.0 + 30.0 * i, 340.0 - 10.0 * i, 48.0, 7)]))
             .collect();
         let images: Vec<(f64, &[Observation])> = images.iter().map(|(t, f)| (*t, &f[..])).collect();
         let [region] = regions(&images, 0.8)[..] else { panic!("one region") };
-        // About (520, 260), and little more than the marker.
+        // Around (520, 260), and little more than the marker.
         assert!(
             region.from[0] < 485
                 && region.to[0] > 555
@@ -529,13 +520,13 @@ mod tests {
                 && region.to[1] > 295
         );
         assert!(region.area() <= 128 * 128, "{region:?}");
-        // A marker seen once may have gone anywhere near.
+        // The velocity of a marker seen once is unknown.
         let [first] = regions(&images[..1], 0.1)[..] else { panic!("one region") };
         assert!(first.area() > region.area());
     }
 
     #[test]
-    fn an_unsteady_marker_is_looked_for_further_around() {
+    fn an_unsteady_marker_has_a_larger_region() {
         let steady: Vec<_> =
             (0..4).map(|i| [seen(300.0 + 20.0 * f64::from(i), 300.0, 40.0, 1)]).collect();
         let mut jerky = steady.clone();
@@ -563,11 +554,11 @@ mod tests {
     }
 
     #[test]
-    fn every_so_often_the_whole_image_is_searched() {
+    fn the_whole_image_is_searched_periodically() {
         let mut tracker = Tracker::new(TrackingSettings { full_search_period: 4 });
         tracker.begin(SIZE, 0.0);
         tracker.found = vec![seen(400.0, 300.0, 48.0, 7)];
-        tracker.follow(0.0);
+        tracker.update_tracks(0.0);
         let searched = [1, 2, 3, 4].map(|_| {
             let by_region = tracker.choose_regions(0.1);
             tracker.since_full = if by_region { tracker.since_full + 1 } else { 0 };
@@ -577,7 +568,7 @@ mod tests {
     }
 
     #[test]
-    fn two_markers_of_one_name_are_told_apart_by_their_place() {
+    fn two_markers_of_one_name_are_kept_apart_by_position() {
         let images: Vec<(f64, Vec<Observation>)> = (0..3)
             .map(|i| (0.1 * f64::from(i), 10.0 * f64::from(i)))
             .map(|(time_s, x)| {
@@ -592,11 +583,11 @@ mod tests {
     }
 
     #[test]
-    fn a_marker_that_is_not_found_where_it_should_be_is_missing() {
+    fn a_marker_that_is_not_found_in_its_region_is_missing() {
         let mut tracker = Tracker::default();
         tracker.begin(SIZE, 0.0);
         tracker.found = vec![seen(400.0, 300.0, 48.0, 7)];
-        tracker.follow(0.0);
+        tracker.update_tracks(0.0);
         for (found, missing) in [
             (vec![seen(410.0, 300.0, 50.0, 7)], false),
             (vec![seen(410.0, 300.0, 50.0, 8)], true),
@@ -620,10 +611,10 @@ mod tests {
                 let time_s = i as f64 * 0.1;
                 tracker.begin(SIZE, time_s);
                 tracker.found = list.iter().map(|(x, y, size, id)| seen(*x, *y, *size, *id)).collect();
-                tracker.follow(time_s);
+                tracker.update_tracks(time_s);
             }
             for (x, y, size) in expected {
-                tracker.expect(Pixel::new(x, y), size, y);
+                tracker.add_roi(Pixel::new(x, y), size, y);
             }
             tracker.begin(SIZE, 0.3);
             tracker.choose_regions(0.3);

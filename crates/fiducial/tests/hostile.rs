@@ -5,7 +5,8 @@ mod render;
 
 use std::time::{Duration, Instant};
 
-use fiducial::debug::{ALIGNMENT_RADIUS_PX, RgbImageBuf, draw_ellipses, draw_rings, draw_target};
+use fiducial::overlay::canvas::RgbImageBuf;
+use fiducial::overlay::debug::{ALIGNMENT_RADIUS_PX, draw_ellipses, draw_rings, draw_target};
 use fiducial::{Detector, DetectorError, Settings};
 use geometry::{CameraModel, Distortion};
 use imaging::GrayView;

@@ -7,12 +7,14 @@
 //! This crate knows no image, no marker, no clock and no file.
 //!
 //! Modules in reading order: [`frame`] names the coordinate frames, [`transform`] moves between them,
-//! [`camera`] goes from the camera frame to pixels and back.
+//! [`camera`] goes from the camera frame to pixels and back, [`roi`] from a region of an image to the whole.
 
 pub mod camera;
 pub mod frame;
+pub mod roi;
 pub mod transform;
 
 pub use camera::{CameraModel, Distortion, Pixel};
 pub use frame::{Body, Camera, Frame, Marker, Ned, Odometry, Pad};
+pub use roi::Roi;
 pub use transform::{Point, Rotation, Transform, Vector};

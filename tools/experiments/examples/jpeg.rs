@@ -7,7 +7,7 @@ use experiments::score::quantile;
 use experiments::sets::{MARKERS, SIZE_M, Set};
 use experiments::shot::{Shot, Studio};
 use fiducial::Detector;
-use geometry::{CameraModel, Pixel};
+use geometry::{CameraModel, Roi};
 use imaging::GrayImage;
 use jpeg_encoder::{ColorType, Encoder};
 use markers::Marker;
@@ -110,22 +110,13 @@ fn look(studio: &mut Studio, shot: &Shot, costs: &mut [Cost], is_far: bool) -> a
             None => (coarse, pixels.len()),
         };
         cost.bytes.push(bytes as f64);
-        let part = *scale as f64;
-        let half = (part - 1.0) / 2.0;
-        let camera = CameraModel {
-            width: image.width() as u32,
-            height: image.height() as u32,
-            fx: model.fx / part,
-            fy: model.fy / part,
-            cx: (model.cx - half) / part,
-            cy: (model.cy - half) / part,
-            ..model
-        };
+        let (width, height) = (image.width() as u32, image.height() as u32);
+        let roi = Roi::binned(0.0, 0.0, width, height, *scale as f64);
+        let camera = roi.camera(&model);
         let seen = detector.detect(image.view().context("an image")?, Some(&camera), &mut ());
         let off_px = seen
             .iter()
-            .map(|seen| Pixel::new(half + part * seen.centre.x, half + part * seen.centre.y))
-            .map(|centre| centre.distance(&shown.centre))
+            .map(|seen| roi.to_frame(seen.centre).distance(&shown.centre))
             .fold(f64::INFINITY, f64::min);
         let found = off_px < 0.25 * model.fx * SIZE_M / shown.camera_from_marker.origin().z();
         if is_far {

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use fiducial::tracking::{Tracker, TrackingSettings};
+use fiducial::tracker::{Tracker, TrackingSettings};
 use fiducial::{Detector, Observation, Settings};
 use image::GrayImage;
 use imaging::GrayView;

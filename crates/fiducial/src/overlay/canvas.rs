@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use imaging::{Ellipse, GrayView};
 
-use crate::letters;
+use crate::overlay::font;
 
 /// A colour image, three bytes (red, green, blue) a pixel, row by row.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -20,11 +20,11 @@ pub struct RgbImageBuf {
 /// Red, green and blue.
 pub type Colour = [u8; 3];
 
-/// Dots from one letter to the next, and from one line to the next.
+/// Distance from one letter to the next, and from one line to the next, in dots.
 const ADVANCE: f64 = 6.0;
 const LINE: f64 = 9.0;
-/// An ellipse or a line far larger than the image needs no more dots than this.
-const MOST_DOTS: f64 = 40_000.0;
+/// Largest number of dots of an ellipse or a line, for those far larger than the image.
+const MAX_DOTS: f64 = 40_000.0;
 
 impl RgbImageBuf {
     /// Becomes a copy of a grey image.
@@ -45,7 +45,7 @@ impl RgbImageBuf {
     /// Draws an ellipse.
     pub fn ellipse(&mut self, ellipse: &Ellipse, colour: Colour) {
         // Two dots a pixel leave no gap.
-        let dots = (2.0 * PI * ellipse.major).clamp(8.0, MOST_DOTS) as u32;
+        let dots = (2.0 * PI * ellipse.major).clamp(8.0, MAX_DOTS) as u32;
         for i in 0..dots {
             let [x, y] = ellipse.at(f64::from(i) * 2.0 * PI / f64::from(dots));
             self.dot(x, y, colour);
@@ -56,7 +56,7 @@ impl RgbImageBuf {
     pub fn line(&mut self, from: [f64; 2], to: [f64; 2], width_px: f64, colour: Colour) {
         let step = [to[0] - from[0], to[1] - from[1]];
         let length = step[0].hypot(step[1]);
-        let dots = (2.0 * length).clamp(1.0, MOST_DOTS) as u32;
+        let dots = (2.0 * length).clamp(1.0, MAX_DOTS) as u32;
         let across = [-step[1] / length.max(1e-9), step[0] / length.max(1e-9)];
         let strands = (2.0 * width_px - 1.0).clamp(1.0, 32.0) as u32;
         for strand in 0..strands {
@@ -69,15 +69,15 @@ impl RgbImageBuf {
         }
     }
 
-    /// Draws a closed line through some points.
+    /// Draws a closed line through points.
     pub fn polygon(&mut self, points: &[[f64; 2]], width_px: f64, colour: Colour) {
         for (from, to) in points.iter().zip(points.iter().cycle().skip(1)) {
             self.line(*from, *to, width_px, colour);
         }
     }
 
-    /// Writes a line of text on a dark ground, its top-left corner at `at`, moved so that as much as can be lies in the
-    /// image. A dot of a letter is `dot_px` wide.
+    /// Writes a line of text on a dark ground, its top-left corner at `at`, moved into the image as far as it fits. A dot of
+    /// a letter is `dot_px` wide.
     pub fn text(&mut self, at: [f64; 2], text: &str, dot_px: usize, colour: Colour) {
         let dot = dot_px.clamp(1, 64) as f64;
         let size = [(text.chars().count() as f64 * ADVANCE + 1.0) * dot, LINE * dot];
@@ -87,7 +87,7 @@ impl RgbImageBuf {
         });
         self.fill([left, top], size, |pixel| *pixel /= 4);
         for (index, letter) in (0..).zip(text.chars()) {
-            for (row, bits) in (0..).zip(letters::rows(letter)) {
+            for (row, bits) in (0..).zip(font::rows(letter)) {
                 for column in (0..5).filter(|column| bits >> (4 - column) & 1 == 1) {
                     let x = left + (1.0 + f64::from(index) * ADVANCE + f64::from(column)) * dot;
                     let y = top + (1.0 + f64::from(row)) * dot;
@@ -97,7 +97,7 @@ impl RgbImageBuf {
         }
     }
 
-    /// Sets the pixel nearest to a place, if it is in the image.
+    /// Sets the pixel nearest to a point, if it is in the image.
     pub fn dot(&mut self, x: f64, y: f64, colour: Colour) {
         let (x, y) = (x.round(), y.round());
         if !(x >= 0.0 && y >= 0.0 && x < self.width as f64 && y < self.height as f64) {

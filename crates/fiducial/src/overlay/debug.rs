@@ -1,10 +1,10 @@
-//! Debug images: the thesis' three (valid ellipses, rings, and the marker with the alignment circle), and the squares.
+//! Debug images: the three of the thesis (valid ellipses, rings, the marker with the alignment circle), and the quads.
 
 use geometry::Pixel;
 use imaging::GrayView;
 use markers::RingKind;
 
-pub use crate::canvas::{Colour, RgbImageBuf};
+use crate::overlay::canvas::{Colour, RgbImageBuf};
 use crate::trace::{Candidate, Trace};
 
 /// Radius of the thesis' alignment circle, in pixels.
@@ -50,22 +50,21 @@ pub fn draw_rings(view: GrayView<'_>, trace: &Trace, out: &mut RgbImageBuf) {
     }
 }
 
-/// The image with the quads: those whose code was read (green), and those that were refused (magenta) with the reason.
+/// The image with the quads: those whose code was read (green), those that were refused (magenta) with the reason.
 pub fn draw_squares(view: GrayView<'_>, trace: &Trace, out: &mut RgbImageBuf) {
     out.copy(view);
     for refusal in &trace.refusals {
         if let Candidate::Quad(corners) = refusal.candidate {
-            out.polygon(&corners.map(place), 1.0, MAGENTA);
+            out.polygon(&corners.map(point), 1.0, MAGENTA);
             label(out, below(&corners), refusal.reason.name(), YELLOW);
         }
     }
     for corners in &trace.quads {
-        out.polygon(&corners.map(place), 1.0, GREEN);
+        out.polygon(&corners.map(point), 1.0, GREEN);
     }
 }
 
-/// The image with the markers found, and the circle about its middle within which the thesis takes the marker as
-/// aligned.
+/// The image with the markers, and the circle around its middle within which the thesis takes the marker as aligned.
 pub fn draw_target(
     view: GrayView<'_>,
     trace: &Trace,
@@ -78,7 +77,7 @@ pub fn draw_target(
     for marker in &trace.markers {
         let Pixel { x, y } = marker.centre;
         match marker.corners {
-            Some(corners) => out.polygon(&corners.map(place), 1.0, GREEN),
+            Some(corners) => out.polygon(&corners.map(point), 1.0, GREEN),
             None => out.circle([x, y], marker.size_px / 2.0, GREEN),
         }
         out.line([x - 10.0, y], [x + 10.0, y], 1.0, RED);
@@ -86,23 +85,24 @@ pub fn draw_target(
     }
 }
 
-fn place(pixel: Pixel) -> [f64; 2] {
+fn point(pixel: Pixel) -> [f64; 2] {
     [pixel.x, pixel.y]
 }
 
-/// A place under a quad.
+/// A point under a quad.
 fn below(corners: &[Pixel; 4]) -> [f64; 2] {
     let x = corners.iter().map(|c| c.x).sum::<f64>() / 4.0;
     [x, corners.iter().map(|c| c.y).fold(f64::NEG_INFINITY, f64::max)]
 }
 
-/// A word centred under a place.
+/// A word centred under a point.
 fn label(out: &mut RgbImageBuf, [x, y]: [f64; 2], word: &str, colour: Colour) {
     out.text([x - 3.0 * word.len() as f64, y + 2.0], word, 1, colour);
 }
 
 #[cfg(test)]
 mod tests {
+    use geometry::Roi;
     use imaging::Ellipse;
 
     use super::*;
@@ -135,7 +135,7 @@ mod tests {
         part.refuse_quad(square(10.0), Reason::Border);
         part.accept_quad(square(60.0));
         let mut trace = Trace::default();
-        trace.add_part(&part, [5.0, 2.0]);
+        trace.add_roi(&part, &Roi::cropped(5.0, 2.0, 95, 78));
         let mut out = RgbImageBuf::default();
         draw_squares(view, &trace, &mut out);
         let at = |x: usize, y: usize| &out.data[(y * 100 + x) * 3..][..3];
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn marks_beyond_the_image_are_left_out() {
+    fn marks_outside_the_image_are_clipped() {
         let view = GrayView::packed(&[1], 1, 1).unwrap();
         let mut trace = Trace::default();
         for size_px in [1.0, 1e9, f64::NAN, f64::INFINITY] {

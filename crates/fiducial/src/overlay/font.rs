@@ -1,7 +1,7 @@
-//! Letters as dots, seven high and five wide, for images, which have no fonts.
+//! A font of 5 x 7 dots for images.
 
-/// The seven rows of a letter, from the top; the lowest of five bits is its right column. Small letters look like
-/// capitals; what has no shape is blank.
+/// The seven rows of a letter, from the top; the lowest of five bits is its right column. Lower case is drawn as upper case,
+/// an unknown letter as a blank.
 pub fn rows(letter: char) -> [u8; 7] {
     match letter.to_ascii_uppercase() {
         'A' => [0b01110, 0b10001, 0b10001, 0b11111, 0b10001, 0b10001, 0b10001],

@@ -1,0 +1,5 @@
+//! Draws what a detection saw on the image: [`debug`] the marks, on a [`canvas`], with the letters of a [`font`].
+
+pub mod canvas;
+pub mod debug;
+pub mod font;
