@@ -926,7 +926,7 @@ mod tests {
 
     fn hear(flight: &mut Flight, now_ns: i64, message: &MavMessage) {
         let sender = Sender { system: 1, component: 1 };
-        for frame in Parser::new().push(&autopilot::frame::encode(sender, 0, message)) {
+        for frame in Parser::new().push(&autopilot::packet::encode(sender, 0, message)) {
             flight.packet(now_ns, &frame);
         }
     }

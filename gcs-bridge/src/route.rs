@@ -79,7 +79,7 @@ mod tests {
         COMMAND_LONG_DATA, HEARTBEAT_DATA, LANDING_TARGET_DATA, MavAutopilot,
         PARAM_REQUEST_LIST_DATA,
     };
-    use autopilot::frame::encode;
+    use autopilot::packet::encode;
 
     const ME: Sender = Sender { system: 7, component: 191 };
     const AUTOPILOT: Sender = Sender { system: 7, component: 1 };

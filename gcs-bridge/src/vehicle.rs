@@ -95,7 +95,7 @@ mod tests {
     use super::*;
     use autopilot::Parser;
     use autopilot::dialect::HEARTBEAT_DATA;
-    use autopilot::frame::encode;
+    use autopilot::packet::encode;
 
     const SECOND_NS: i64 = 1_000_000_000;
 

@@ -9,7 +9,7 @@ use autopilot::dialect::{
     COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavBool, MavCmd, MavFrame, MavMessage,
     MavResult, MavState, MavType, PARAM_REQUEST_READ_DATA, PARAM_VALUE_DATA,
 };
-use autopilot::frame::encode;
+use autopilot::packet::encode;
 use autopilot::{Frame, Parser, Sender};
 use gcs_bridge::Config;
 use messages::{ControllerStatus, MavlinkBytes, TargetEstimate, topic};

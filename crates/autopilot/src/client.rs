@@ -18,8 +18,8 @@ use crate::dialect::{
     COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
     MavType, TIMESYNC_DATA,
 };
-use crate::frame::{self, Frame, Sender};
 use crate::mode::{Firmware, FlightMode};
+use crate::packet::{self, Frame, Sender};
 use crate::parameter::{Parameter, Parameters};
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::{Notice, Stream, Streams};
@@ -459,7 +459,7 @@ impl Autopilot {
 
     /// Sends any message in our name (LANDING_TARGET, STATUSTEXT, ...).
     pub fn send(&mut self, message: &MavMessage) {
-        let packet = frame::encode(self.our_address(), self.sequence, message);
+        let packet = packet::encode(self.our_address(), self.sequence, message);
         self.sequence = self.sequence.wrapping_add(1);
         if self.outgoing.len() >= MAX_QUEUED {
             self.outgoing.pop_front();

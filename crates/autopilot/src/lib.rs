@@ -8,7 +8,7 @@
 //! does not jump) and does no input or output. The crate knows nothing of markers, of landing or of other processes.
 //!
 //! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it,
-//! [`frame`] finds MAVLink packets in them, [`mode`], [`state`] and [`parameter`] are what the vehicle tells about itself,
+//! [`packet`] finds MAVLink packets in them, [`mode`], [`state`] and [`parameter`] are what the vehicle tells about itself,
 //! [`clock`] is when that was so, [`client`] keeps up the conversation, [`command`] is what can be asked and why it may fail, [`takeoff`] is the way
 //! from the ground into the air, [`compose`] makes the messages a companion sends, [`session`] ties link and client
 //! together for a service.
@@ -18,9 +18,9 @@ pub mod client;
 pub mod clock;
 pub mod command;
 pub mod compose;
-pub mod frame;
 pub mod link;
 pub mod mode;
+pub mod packet;
 pub mod parameter;
 pub mod session;
 pub mod state;
@@ -38,9 +38,9 @@ pub mod dialect {
 pub use address::Address;
 pub use client::{Autopilot, Config, Event};
 pub use command::{Command, CommandError, CommandId, CommandStatus};
-pub use frame::{Frame, Parser, Sender};
 pub use link::{Link, LinkEvent, LinkSender};
 pub use mode::{Firmware, FlightMode};
+pub use packet::{Frame, Parser, Sender};
 pub use parameter::Parameter;
 pub use session::{Happening, Session};
 pub use state::{Attitude, Battery, LandedState, Position, Range, VehicleState};

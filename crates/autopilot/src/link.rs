@@ -20,7 +20,7 @@ use tokio_serial::{SerialPortBuilderExt, SerialStream};
 
 use crate::address::{Address, Endpoint};
 use crate::dialect::{MavAutopilot, MavMessage};
-use crate::frame::{Counters, Frame, Parser};
+use crate::packet::{Counters, Frame, Parser};
 
 /// Packets received and not yet read, about 4 s of an autopilot's talk.
 const INCOMING: usize = 1024;

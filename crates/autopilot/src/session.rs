@@ -7,8 +7,8 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::address::Address;
 use crate::client::{Autopilot, Config, Event};
-use crate::frame::{Counters, Frame};
 use crate::link::{Link, LinkError, LinkEvent, LinkSender, SendError};
+use crate::packet::{Counters, Frame};
 
 /// How often time passes for the client when nothing is received.
 const TICK: Duration = Duration::from_millis(20);

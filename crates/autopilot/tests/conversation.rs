@@ -16,7 +16,7 @@ use autopilot::dialect::{
     MavCmd, MavLandedState, MavMessage, MavModeFlag, MavResult, MavSeverity, MavSysStatusSensor,
     MavType, STATUSTEXT_DATA, SYS_STATUS_DATA, TIMESYNC_DATA,
 };
-use autopilot::frame::{self, Sender};
+use autopilot::packet::{self, Sender};
 use autopilot::{
     Autopilot, Command, CommandError, CommandId, CommandStatus, Config, Event, Firmware,
     FlightMode, LandedState, Parser, Takeoff, TakeoffError, TakeoffProgress,
@@ -283,7 +283,7 @@ impl World {
     }
 
     fn hear(&mut self, sender: Sender, message: &MavMessage) {
-        let packet = frame::encode(sender, self.sequence, message);
+        let packet = packet::encode(sender, self.sequence, message);
         self.sequence = self.sequence.wrapping_add(1);
         for frame in Parser::new().push(&packet) {
             self.client.handle(self.now, &frame);
@@ -877,11 +877,11 @@ proptest::proptest! {
         let mut client = Autopilot::new(Config::default());
         let mut takeoff = Takeoff::new(10.0);
         let copter = Fake::new().heartbeat();
-        let found = frame::encode(AUTOPILOT, 0, &copter);
+        let found = packet::encode(AUTOPILOT, 0, &copter);
         client.handle(0, &Parser::new().push(&found)[0]);
         for (id, payload, now) in messages {
             let plain = MavMessage::default_message_from_id(id).unwrap();
-            let mut packet = frame::encode(AUTOPILOT, 0, &plain);
+            let mut packet = packet::encode(AUTOPILOT, 0, &plain);
             packet.truncate(10);
             packet[1] = payload.len() as u8;
             packet.extend_from_slice(&payload);

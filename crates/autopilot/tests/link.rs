@@ -6,8 +6,8 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use autopilot::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage, MavType, SYSTEM_TIME_DATA};
-use autopilot::frame::{self, Sender};
 use autopilot::link::SendError;
+use autopilot::packet::{self, Sender};
 use autopilot::{Address, Link, LinkEvent};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, UdpSocket};
@@ -27,12 +27,12 @@ fn heartbeat(autopilot: bool) -> Vec<u8> {
         ..Default::default()
     };
     let sender = if autopilot { AUTOPILOT } else { Sender { system: 255, component: 190 } };
-    frame::encode(sender, 0, &MavMessage::HEARTBEAT(message))
+    packet::encode(sender, 0, &MavMessage::HEARTBEAT(message))
 }
 
 fn time() -> Vec<u8> {
     let message = SYSTEM_TIME_DATA { time_unix_usec: 7, time_boot_ms: 9 };
-    frame::encode(AUTOPILOT, 1, &MavMessage::SYSTEM_TIME(message))
+    packet::encode(AUTOPILOT, 1, &MavMessage::SYSTEM_TIME(message))
 }
 
 async fn open(address: String) -> Link {
@@ -243,7 +243,7 @@ async fn a_reader_that_sleeps_gets_the_newest_packets() {
         for _ in 0..20 {
             sent += 1;
             let message = SYSTEM_TIME_DATA { time_unix_usec: 7, time_boot_ms: sent };
-            let raw = frame::encode(AUTOPILOT, 0, &MavMessage::SYSTEM_TIME(message));
+            let raw = packet::encode(AUTOPILOT, 0, &MavMessage::SYSTEM_TIME(message));
             autopilot.send_to(&raw, at).await.unwrap();
         }
         tokio::task::yield_now().await;

@@ -13,7 +13,7 @@ use autopilot::dialect::{
     LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
     MavResult, MavType,
 };
-use autopilot::frame::{self, Sender};
+use autopilot::packet::{self, Sender};
 use autopilot::{
     Autopilot, Command, CommandError, CommandStatus, Config, Event, Firmware, FlightMode, Parser,
     Takeoff, TakeoffProgress,
@@ -201,7 +201,7 @@ impl World {
     fn step(&mut self) {
         self.now += STEP;
         for message in self.px4.step(self.now) {
-            let packet = frame::encode(AUTOPILOT, 0, &message);
+            let packet = packet::encode(AUTOPILOT, 0, &message);
             for frame in Parser::new().push(&packet) {
                 self.client.handle(self.now, &frame);
             }

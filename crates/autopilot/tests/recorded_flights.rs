@@ -13,7 +13,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use autopilot::frame::Counters;
+use autopilot::packet::Counters;
 use autopilot::{Autopilot, Config, Event, FlightMode, Frame, LandedState, Parser};
 use serde_json::Value;
 

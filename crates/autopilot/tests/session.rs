@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use autopilot::dialect::{
     ATTITUDE_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavType,
 };
-use autopilot::frame::{self, Sender};
+use autopilot::packet::{self, Sender};
 use autopilot::{Config, Event, Firmware, Happening, Parser, Session};
 use tokio::net::UdpSocket;
 use tokio::time::timeout;
@@ -20,7 +20,7 @@ fn heartbeat() -> Vec<u8> {
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         ..Default::default()
     };
-    frame::encode(AUTOPILOT, 0, &MavMessage::HEARTBEAT(message))
+    packet::encode(AUTOPILOT, 0, &MavMessage::HEARTBEAT(message))
 }
 
 async fn next(session: &mut Session<impl Fn() -> i64>) -> Happening {
@@ -62,7 +62,7 @@ async fn a_session_finds_the_autopilot_asks_it_and_tells_its_state() {
 
     let before = clock();
     let attitude = ATTITUDE_DATA { roll: 0.25, ..Default::default() };
-    autopilot.send(&frame::encode(AUTOPILOT, 1, &MavMessage::ATTITUDE(attitude))).await.unwrap();
+    autopilot.send(&packet::encode(AUTOPILOT, 1, &MavMessage::ATTITUDE(attitude))).await.unwrap();
     let attitude = loop {
         if let Happening::Vehicle(Event::Attitude(attitude)) = next(&mut session).await {
             break attitude;

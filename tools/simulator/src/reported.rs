@@ -291,7 +291,7 @@ mod tests {
     fn frame(message: MavMessage) -> Frame {
         let sender = Sender { system: 1, component: 1 };
         let mut parser = autopilot::Parser::new();
-        let mut frames = parser.push(&autopilot::frame::encode(sender, 0, &message));
+        let mut frames = parser.push(&autopilot::packet::encode(sender, 0, &message));
         frames.extend(parser.finish());
         frames.remove(0)
     }

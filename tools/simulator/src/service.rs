@@ -342,7 +342,7 @@ fn request_for(message: f32) -> Vec<u8> {
         target_component: 1,
         ..COMMAND_LONG_DATA::default()
     });
-    autopilot::frame::encode(Sender { system: 255, component: 192 }, 0, &message)
+    autopilot::packet::encode(Sender { system: 255, component: 192 }, 0, &message)
 }
 
 /// A frame that arrives later.

@@ -24,7 +24,7 @@ use autopilot::dialect::{
     HEARTBEAT_DATA, MavAutopilot, MavMessage, MavModeFlag, MavSeverity, MavState, MavType,
     TIMESYNC_DATA,
 };
-use autopilot::frame::encode;
+use autopilot::packet::encode;
 use geometry::{Ned, Vector};
 
 pub use estimate::EstimateConfig;

@@ -4,7 +4,7 @@ use autopilot::Sender;
 use autopilot::dialect::{
     COMMAND_ACK_DATA, MavMessage, MavResult, MavSeverity, Message, STATUSTEXT_DATA,
 };
-use autopilot::frame::encode;
+use autopilot::packet::encode;
 
 /// Longest text of one STATUSTEXT.
 const TEXT: usize = 50;

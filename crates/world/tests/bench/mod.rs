@@ -8,7 +8,7 @@ use autopilot::dialect::{
     COMMAND_LONG_DATA, MavCmd, MavFrame, MavMessage, PositionTargetTypemask,
     SET_POSITION_TARGET_LOCAL_NED_DATA,
 };
-use autopilot::frame::encode;
+use autopilot::packet::encode;
 use autopilot::{Frame, Parser, Sender};
 use world::ardupilot::{AutopilotConfig, EstimateConfig};
 use world::vehicle::VehicleConfig;
