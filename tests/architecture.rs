@@ -60,7 +60,7 @@ const ALIGHT: [&str; 7] =
 
 /// Crates of algorithms but for these modules, which have the threads, the clock and the network.
 const WITH_THREADS: [(&str, &[&str]); 2] =
-    [("autopilot", &["link", "session"]), ("airlink", &["sender"])];
+    [("autopilot", &["link"]), ("airlink", &["sender"])];
 
 /// What an algorithm does without.
 const OUTSIDE: [&str; 17] = [

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use autopilot::dialect::{MavMessage, MavType};
 use autopilot::{
-    Autopilot, Command, CommandId, CommandStatus, Event, Firmware, FlightMode, Frame, Takeoff,
+    Autopilot, Command, CommandId, CommandStatus, Event, Firmware, FlightMode, Packet, Takeoff,
     TakeoffError, TakeoffProgress,
 };
 use geometry::Vector;
@@ -136,19 +136,19 @@ impl Flight {
     }
 
     /// Takes a packet from the autopilot's link.
-    pub fn packet(&mut self, now_ns: i64, frame: &Frame) {
-        self.listen_for_operator(now_ns, frame);
-        self.autopilot.handle(now_ns, frame);
+    pub fn packet(&mut self, now_ns: i64, packet: &Packet) {
+        self.listen_for_operator(now_ns, packet);
+        self.autopilot.handle(now_ns, packet);
         self.take_autopilot_events(now_ns);
     }
 
     /// Takes note of what the ground station sends to the autopilot through us.
-    pub fn ground_packet(&mut self, now_ns: i64, frame: &Frame) {
-        self.listen_for_operator(now_ns, frame);
+    pub fn ground_packet(&mut self, now_ns: i64, packet: &Packet) {
+        self.listen_for_operator(now_ns, packet);
     }
 
-    fn listen_for_operator(&mut self, now_ns: i64, frame: &Frame) {
-        if let Some(MavMessage::HEARTBEAT(heartbeat)) = &frame.message
+    fn listen_for_operator(&mut self, now_ns: i64, packet: &Packet) {
+        if let Some(MavMessage::HEARTBEAT(heartbeat)) = &packet.message
             && heartbeat.mavtype == MavType::MAV_TYPE_GCS
         {
             self.alarms.operator_heard(now_ns);
@@ -926,8 +926,8 @@ mod tests {
 
     fn hear(flight: &mut Flight, now_ns: i64, message: &MavMessage) {
         let sender = Sender { system: 1, component: 1 };
-        for frame in Parser::new().push(&autopilot::packet::encode(sender, 0, message)) {
-            flight.packet(now_ns, &frame);
+        for packet in Parser::new().push(&autopilot::packet::encode(sender, 0, message)) {
+            flight.packet(now_ns, &packet);
         }
     }
 
@@ -967,8 +967,8 @@ mod tests {
     fn sent(flight: &mut Flight) -> (usize, Vec<MavCmd>) {
         let (mut setpoints, mut commands) = (0, Vec::new());
         while let Some(packet) = flight.poll_outgoing() {
-            for frame in Parser::new().push(&packet) {
-                match frame.message {
+            for packet in Parser::new().push(&packet) {
+                match packet.message {
                     Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => setpoints += 1,
                     Some(MavMessage::COMMAND_LONG(c))
                         if c.command != MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL =>
@@ -1198,8 +1198,8 @@ mod tests {
     impl Heard {
         fn take(&mut self, flight: &mut Flight) {
             while let Some(packet) = flight.poll_outgoing() {
-                for frame in Parser::new().push(&packet) {
-                    match frame.message {
+                for packet in Parser::new().push(&packet) {
+                    match packet.message {
                         Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => self.setpoints += 1,
                         Some(MavMessage::LANDING_TARGET(target)) => self.targets.push(target),
                         Some(MavMessage::COMMAND_LONG(c))

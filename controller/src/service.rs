@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use anyhow::Context;
+use autopilot::packet::MAX_PACKET;
 use autopilot::{Address, Link, LinkEvent, Parser};
 use messages::{ControllerStatus, MavlinkBytes, VehicleState, topic};
 use node::{Node, Publisher, Shutdown, now_ns};
@@ -22,8 +23,6 @@ const LOOK_PERIOD_NS: i64 = 20_000_000;
 const VEHICLE_PERIOD_NS: i64 = 18_000_000;
 /// Packets of the autopilot that wait to be passed on; more are dropped, as the flight never waits for the network.
 const PACKETS_WAITING: usize = 512;
-/// The longest packet of MAVLink 2, signed, in bytes.
-const LONGEST_PACKET: usize = 280;
 
 /// Runs the service until it is asked to stop.
 ///
@@ -52,11 +51,11 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             // Whichever is ready, in no order: one that talks without end must not silence the others.
             () = shutdown.requested() => break,
             event = link.recv() => match event {
-                LinkEvent::Frame { frame, received } => {
+                LinkEvent::Packet { packet, received } => {
                     // What waited in a queue here was not under way from the autopilot.
                     let waited_ns = i64::try_from(received.elapsed().as_nanos()).unwrap_or(0);
-                    flight.packet(now_ns().saturating_sub(waited_ns), &frame);
-                    reports.pass_on(&node, frame.raw.to_vec());
+                    flight.packet(now_ns().saturating_sub(waited_ns), &packet);
+                    reports.pass_on(&node, packet.raw);
                 }
                 LinkEvent::Connected { peer } => tracing::info!(peer, "Link to the autopilot"),
                 LinkEvent::Disconnected { reason } => {
@@ -84,9 +83,9 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             }
             Some(info) = cameras.next() => flight.camera(info),
             Some(message) = to_autopilot.next() => {
-                let is_packet = (1..=LONGEST_PACKET).contains(&message.packet.len());
-                for frame in Parser::new().push(&message.packet) {
-                    flight.ground_packet(now_ns(), &frame);
+                let is_packet = (1..=MAX_PACKET).contains(&message.packet.len());
+                for packet in Parser::new().push(&message.packet) {
+                    flight.ground_packet(now_ns(), &packet);
                 }
                 if !is_packet || link.send_spare(&message.packet).is_err() {
                     node.health().dropped("packets of the ground station");

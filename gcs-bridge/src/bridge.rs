@@ -9,7 +9,7 @@ use autopilot::compose::heartbeat;
 use autopilot::dialect::{MavMessage, MavSeverity, MavState};
 use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
-use autopilot::{Address, Frame, Link, LinkEvent, LinkSender, Parser, Sender};
+use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Sender};
 use messages::{ControllerStatus, MavlinkBytes, TargetEstimate, topic};
 use node::{HealthCounters, Node, Shutdown, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
@@ -126,18 +126,18 @@ impl Bridge {
 
     /// Passes packets of the autopilot down.
     fn down(&mut self, now_ns: i64, payload: &[u8]) {
-        let mut frames = self.parser.push(payload);
-        frames.extend(self.parser.finish());
-        if frames.is_empty() {
+        let mut packets = self.parser.push(payload);
+        packets.extend(self.parser.finish());
+        if packets.is_empty() {
             self.health.dropped("from autopilot: no MAVLink packet");
         }
-        for frame in frames {
-            self.vehicle.hear(now_ns, &frame);
-            match route::from_autopilot(&frame, self.me(now_ns)) {
+        for packet in packets {
+            self.vehicle.hear(now_ns, &packet);
+            match route::from_autopilot(&packet, self.me(now_ns)) {
                 Route::Drop(reason) => self.health.dropped(reason),
                 Route::Pass | Route::Answer(_) => {
                     self.health.count("from autopilot");
-                    self.send(&frame.raw);
+                    self.send(&packet.raw);
                 }
             }
         }
@@ -155,23 +155,23 @@ impl Bridge {
                 tracing::warn!(reason, "The link to the ground station is closed");
                 None
             }
-            LinkEvent::Frame { frame, .. } => self.packet_from_ground(now_ns, *frame),
+            LinkEvent::Packet { packet, .. } => self.packet_from_ground(now_ns, *packet),
         }
     }
 
-    fn packet_from_ground(&mut self, now_ns: i64, frame: Frame) -> Option<Vec<u8>> {
+    fn packet_from_ground(&mut self, now_ns: i64, packet: Packet) -> Option<Vec<u8>> {
         self.health.count("from ground");
-        match route::from_ground(&frame, self.me(now_ns), &self.vehicle) {
+        match route::from_ground(&packet, self.me(now_ns), &self.vehicle) {
             Route::Drop(reason) => self.health.dropped(reason),
             Route::Answer(message) => {
-                self.hear_ground(now_ns, frame.sender);
+                self.hear_ground(now_ns, packet.sender);
                 self.speak(now_ns, &message);
             }
             Route::Pass => {
-                self.hear_ground(now_ns, frame.sender);
+                self.hear_ground(now_ns, packet.sender);
                 if self.forwards {
                     self.health.count("to autopilot");
-                    return Some(frame.raw);
+                    return Some(packet.raw);
                 }
                 self.health.dropped("from ground: forward_to_autopilot is off");
             }

@@ -4,7 +4,7 @@
 //! component, everything else to everybody, and nothing back to where it came from.
 
 use autopilot::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message};
-use autopilot::{Frame, Sender};
+use autopilot::{Packet, Sender};
 
 use crate::vehicle::Vehicle;
 
@@ -20,13 +20,13 @@ pub(crate) enum Route {
 }
 
 /// What becomes of a packet from the ground station; `me` is the bridge, once it has a number.
-pub(crate) fn from_ground(frame: &Frame, me: Option<Sender>, vehicle: &Vehicle) -> Route {
-    if Some(frame.sender) == me || vehicle.is_aboard(frame.sender) {
+pub(crate) fn from_ground(packet: &Packet, me: Option<Sender>, vehicle: &Vehicle) -> Route {
+    if Some(packet.sender) == me || vehicle.is_aboard(packet.sender) {
         // A ground program that repeats everything would otherwise make the vehicle hear itself.
         return Route::Drop("from ground: an echo of the vehicle");
     }
-    match me.filter(|me| is_for(frame, *me)) {
-        Some(_) => match answer(frame) {
+    match me.filter(|me| is_for(packet, *me)) {
+        Some(_) => match answer(packet) {
             Some(message) => Route::Answer(Box::new(message)),
             None => Route::Drop("from ground: for the companion, which does not know it"),
         },
@@ -35,26 +35,26 @@ pub(crate) fn from_ground(frame: &Frame, me: Option<Sender>, vehicle: &Vehicle) 
 }
 
 /// What becomes of a packet from the autopilot's side.
-pub(crate) fn from_autopilot(frame: &Frame, me: Option<Sender>) -> Route {
+pub(crate) fn from_autopilot(packet: &Packet, me: Option<Sender>) -> Route {
     match me {
-        Some(me) if frame.sender == me => Route::Drop("from autopilot: an echo of the companion"),
+        Some(me) if packet.sender == me => Route::Drop("from autopilot: an echo of the companion"),
         // The autopilot answers the controller, which speaks as this companion; a ground station would take such an
         // acknowledgement for that of its own command.
-        Some(me) if is_for(frame, me) => Route::Drop("from autopilot: for the companion"),
+        Some(me) if is_for(packet, me) => Route::Drop("from autopilot: for the companion"),
         _ => Route::Pass,
     }
 }
 
-fn is_for(frame: &Frame, me: Sender) -> bool {
-    frame.message.as_ref().is_some_and(|message| {
+fn is_for(packet: &Packet, me: Sender) -> bool {
+    packet.message.as_ref().is_some_and(|message| {
         message.target_system_id() == Some(me.system)
             && message.target_component_id() == Some(me.component)
     })
 }
 
-fn answer(frame: &Frame) -> Option<MavMessage> {
-    let to = frame.sender;
-    match frame.message.as_ref()? {
+fn answer(packet: &Packet) -> Option<MavMessage> {
+    let to = packet.sender;
+    match packet.message.as_ref()? {
         MavMessage::COMMAND_LONG(command) => Some(unsupported(command.command, to)),
         MavMessage::COMMAND_INT(command) => Some(unsupported(command.command, to)),
         _ => None,
@@ -85,7 +85,7 @@ mod tests {
     const AUTOPILOT: Sender = Sender { system: 7, component: 1 };
     const GROUND: Sender = Sender { system: 255, component: 190 };
 
-    fn frame(sender: Sender, message: &MavMessage) -> Frame {
+    fn packet(sender: Sender, message: &MavMessage) -> Packet {
         Parser::new().push(&encode(sender, 0, message)).remove(0)
     }
 
@@ -105,12 +105,12 @@ mod tests {
 
     fn vehicle() -> Vehicle {
         let mut vehicle = Vehicle::new(0, 0);
-        vehicle.hear(0, &frame(AUTOPILOT, &heartbeat()));
+        vehicle.hear(0, &packet(AUTOPILOT, &heartbeat()));
         vehicle
     }
 
     fn up(sender: Sender, message: &MavMessage) -> Route {
-        from_ground(&frame(sender, message), Some(ME), &vehicle())
+        from_ground(&packet(sender, message), Some(ME), &vehicle())
     }
 
     #[test]
@@ -145,7 +145,8 @@ mod tests {
 
     #[test]
     fn the_ground_hears_the_vehicle_but_not_its_talk_with_the_companion() {
-        let down = |sender, message: &MavMessage| from_autopilot(&frame(sender, message), Some(ME));
+        let down =
+            |sender, message: &MavMessage| from_autopilot(&packet(sender, message), Some(ME));
         assert_eq!(down(AUTOPILOT, &heartbeat()), Route::Pass);
         assert_eq!(down(GROUND, &heartbeat()), Route::Pass);
         let to = |to| unsupported(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL, to);
@@ -157,7 +158,7 @@ mod tests {
     #[test]
     fn everything_passes_while_the_bridge_has_no_number() {
         let vehicle = Vehicle::new(0, i64::MAX);
-        assert_eq!(from_ground(&frame(GROUND, &command(ME)), None, &vehicle), Route::Pass);
-        assert_eq!(from_autopilot(&frame(ME, &heartbeat()), None), Route::Pass);
+        assert_eq!(from_ground(&packet(GROUND, &command(ME)), None, &vehicle), Route::Pass);
+        assert_eq!(from_autopilot(&packet(ME, &heartbeat()), None), Route::Pass);
     }
 }

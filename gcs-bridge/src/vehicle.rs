@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 
 use autopilot::dialect::{MavAutopilot, MavMessage};
-use autopilot::{Frame, Sender};
+use autopilot::{Packet, Sender};
 
 /// Assumed when no autopilot is heard: the number autopilots are delivered with.
 const USUAL_SYSTEM: u8 = 1;
@@ -37,12 +37,12 @@ impl Vehicle {
     }
 
     /// Learns from a packet from the autopilot's side.
-    pub(crate) fn hear(&mut self, now_ns: i64, frame: &Frame) {
-        if is_autopilot(frame) {
-            self.hear_autopilot(now_ns, frame.sender.system);
+    pub(crate) fn hear(&mut self, now_ns: i64, packet: &Packet) {
+        if is_autopilot(packet) {
+            self.hear_autopilot(now_ns, packet.sender.system);
         }
-        if self.number() == Some(frame.sender.system) {
-            self.aboard.insert(frame.sender.component);
+        if self.number() == Some(packet.sender.system) {
+            self.aboard.insert(packet.sender.component);
         }
     }
 
@@ -80,10 +80,10 @@ impl Vehicle {
     }
 }
 
-fn is_autopilot(frame: &Frame) -> bool {
-    match &frame.message {
+fn is_autopilot(packet: &Packet) -> bool {
+    match &packet.message {
         Some(MavMessage::HEARTBEAT(heartbeat)) => {
-            frame.sender.component == AUTOPILOT
+            packet.sender.component == AUTOPILOT
                 && heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
         }
         _ => false,
@@ -99,13 +99,13 @@ mod tests {
 
     const SECOND_NS: i64 = 1_000_000_000;
 
-    fn heartbeat(system: u8, component: u8, autopilot: MavAutopilot) -> Frame {
+    fn heartbeat(system: u8, component: u8, autopilot: MavAutopilot) -> Packet {
         let message =
             MavMessage::HEARTBEAT(HEARTBEAT_DATA { autopilot, ..HEARTBEAT_DATA::default() });
         Parser::new().push(&encode(Sender { system, component }, 0, &message)).remove(0)
     }
 
-    fn ardupilot(system: u8) -> Frame {
+    fn ardupilot(system: u8) -> Packet {
         heartbeat(system, 1, MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA)
     }
 

@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail, ensure};
 use autopilot::dialect::{
     COMMAND_LONG_DATA, HEARTBEAT_DATA, MavAutopilot, MavBool, MavCmd, MavFrame, MavMessage,
-    MavResult, MavState, MavType, PARAM_REQUEST_READ_DATA, PARAM_VALUE_DATA,
+    MavResult, MavState, MavType, PARAM_REQUEST_READ_DATA, PARAM_VALUE_DATA, calculate_crc,
 };
 use autopilot::packet::encode;
-use autopilot::{Frame, Parser, Sender};
+use autopilot::{Packet, Parser, Sender};
 use gcs_bridge::Config;
 use messages::{ControllerStatus, MavlinkBytes, TargetEstimate, topic};
 use node::{Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
@@ -48,7 +48,7 @@ async fn the_ground_hears_the_companion_and_the_vehicle_as_it_spoke() -> anyhow:
     ground.expect_text(&format!("Alight: approach: {why}")).await?;
     ground.expect_text("Alight: detector spare").await?;
 
-    let active = |f: &Frame| match &f.message {
+    let active = |f: &Packet| match &f.message {
         Some(MavMessage::HEARTBEAT(h)) => h.system_status == MavState::MAV_STATE_ACTIVE,
         _ => false,
     };
@@ -245,7 +245,7 @@ async fn start_bridge(
 struct Ground {
     socket: UdpSocket,
     parser: Parser,
-    waiting: Vec<Frame>,
+    waiting: Vec<Packet>,
     /// The companion's texts so far.
     texts: Vec<String>,
     bridge: Option<SocketAddr>,
@@ -258,24 +258,24 @@ impl Ground {
         Ok(Self { socket, parser: Parser::new(), waiting, texts, bridge: None })
     }
 
-    async fn next(&mut self) -> anyhow::Result<Frame> {
+    async fn next(&mut self) -> anyhow::Result<Packet> {
         let mut bytes = [0; 2048];
         while self.waiting.is_empty() {
             let (count, from) = timeout(PATIENCE, self.socket.recv_from(&mut bytes)).await??;
             self.bridge = Some(from);
             self.waiting = self.parser.push(&bytes[..count]);
         }
-        let frame = self.waiting.remove(0);
-        self.keep_text(&frame)?;
-        Ok(frame)
+        let packet = self.waiting.remove(0);
+        self.keep_text(&packet)?;
+        Ok(packet)
     }
 
-    async fn expect(&mut self, wanted: impl Fn(&Frame) -> bool) -> anyhow::Result<Frame> {
+    async fn expect(&mut self, wanted: impl Fn(&Packet) -> bool) -> anyhow::Result<Packet> {
         let seen = async {
             loop {
-                let frame = self.next().await?;
-                if wanted(&frame) {
-                    return Ok(frame);
+                let packet = self.next().await?;
+                if wanted(&packet) {
+                    return Ok(packet);
                 }
             }
         };
@@ -295,9 +295,9 @@ impl Ground {
     }
 
     /// Keeps a text, and joins its parts.
-    fn keep_text(&mut self, frame: &Frame) -> anyhow::Result<()> {
-        let Some(MavMessage::STATUSTEXT(part)) = &frame.message else { return Ok(()) };
-        ensure!(frame.sender == COMPANION, "a text of {:?}", frame.sender);
+    fn keep_text(&mut self, packet: &Packet) -> anyhow::Result<()> {
+        let Some(MavMessage::STATUSTEXT(part)) = &packet.message else { return Ok(()) };
+        ensure!(packet.sender == COMPANION, "a text of {:?}", packet.sender);
         let text = part.text.to_str()?;
         match self.texts.last_mut() {
             Some(last) if part.chunk_seq > 0 => last.push_str(text),
@@ -369,8 +369,8 @@ async fn answer_parameters(node: Node) -> anyhow::Result<()> {
     let requests = node.subscriber(topic::TO_AUTOPILOT, &[]).await?;
     let answers = node.publisher(topic::FROM_AUTOPILOT, &[]).await?;
     while let Some(MavlinkBytes { packet }) = requests.next().await {
-        for frame in Parser::new().push(&packet) {
-            let Some(MavMessage::PARAM_REQUEST_READ(request)) = frame.message else { continue };
+        for packet in Parser::new().push(&packet) {
+            let Some(MavMessage::PARAM_REQUEST_READ(request)) = packet.message else { continue };
             let value = MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
                 param_id: request.param_id,
                 param_value: 50.0,
@@ -418,8 +418,8 @@ fn target() -> TargetEstimate {
     }
 }
 
-fn is_heartbeat(frame: &Frame) -> bool {
-    matches!(frame.message, Some(MavMessage::HEARTBEAT(_)))
+fn is_heartbeat(packet: &Packet) -> bool {
+    matches!(packet.message, Some(MavMessage::HEARTBEAT(_)))
 }
 
 fn autopilot_heartbeat() -> Vec<u8> {
@@ -456,17 +456,6 @@ fn unknown_packet(sender: Sender) -> Vec<u8> {
     let [id0, id1, id2, _] = UNKNOWN_ID.to_le_bytes();
     let mut packet = vec![0xFD, 4, 0, 0, 9, sender.system, sender.component, id0, id1, id2];
     packet.extend([1, 2, 3, 4]);
-    let crc = packet.iter().skip(1).fold(0xFFFF, |crc, byte| crc_step(crc, *byte));
-    packet.extend(crc_step(crc, 42).to_le_bytes());
+    packet.extend(calculate_crc(&packet[1..], 42).to_le_bytes());
     packet
-}
-
-/// One byte of the X.25 checksum, bit by bit.
-fn crc_step(crc: u16, byte: u8) -> u16 {
-    (0..8).fold(
-        crc ^ u16::from(byte),
-        |crc, _| {
-            if crc & 1 == 1 { (crc >> 1) ^ 0x8408 } else { crc >> 1 }
-        },
-    )
 }

@@ -19,7 +19,7 @@ use crate::dialect::{
     MavType, TIMESYNC_DATA,
 };
 use crate::mode::{Firmware, FlightMode};
-use crate::packet::{self, Frame, Sender};
+use crate::packet::{self, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::{Notice, Stream, Streams};
@@ -250,22 +250,22 @@ impl Autopilot {
     }
 
     /// Takes a packet that was received at `now_ns`.
-    pub fn handle(&mut self, now_ns: i64, frame: &Frame) {
-        let Some(message) = &frame.message else { return };
-        if frame.sender == self.our_address() && !std::mem::replace(&mut self.same_address, true) {
-            self.push(Event::SameAddress { sender: frame.sender });
+    pub fn handle(&mut self, now_ns: i64, packet: &Packet) {
+        let Some(message) = &packet.message else { return };
+        if packet.sender == self.our_address() && !std::mem::replace(&mut self.same_address, true) {
+            self.push(Event::SameAddress { sender: packet.sender });
         }
-        if frame.sender.component != AUTOPILOT {
+        if packet.sender.component != AUTOPILOT {
             return;
         }
         if let MavMessage::HEARTBEAT(heartbeat) = message {
-            self.take_heartbeat(now_ns, frame.sender.system, heartbeat);
+            self.take_heartbeat(now_ns, packet.sender.system, heartbeat);
             return;
         }
-        if self.vehicle.as_ref().is_none_or(|vehicle| vehicle.system != frame.sender.system) {
+        if self.vehicle.as_ref().is_none_or(|vehicle| vehicle.system != packet.sender.system) {
             return;
         }
-        self.streams.received(now_ns, frame.message_id);
+        self.streams.received(now_ns, packet.message_id);
         match message {
             MavMessage::COMMAND_ACK(ack) => self.take_acknowledgement(now_ns, ack),
             MavMessage::STATUSTEXT(text) => {
@@ -274,7 +274,7 @@ impl Autopilot {
                     self.take_text(severity, text);
                 }
             }
-            MavMessage::TIMESYNC(sync) => self.take_time(now_ns, frame.sender, sync),
+            MavMessage::TIMESYNC(sync) => self.take_time(now_ns, packet.sender, sync),
             MavMessage::PARAM_VALUE(value) => {
                 self.parameters.take(self.firmware().unwrap_or(Firmware::Unknown), value);
             }

@@ -111,30 +111,6 @@ pub fn landing_target_local(time_usec: u64, target: Point<Ned>) -> Option<MavMes
     })
 }
 
-/// The landing target in a direction in the body frame, of any length: without a distance (m along the line of sight)
-/// it needs a rangefinder.
-///
-/// `time_usec` is the capture time by one steady clock. `None` when a number is not finite or the target is not below.
-pub fn landing_target_angles(
-    time_usec: u64,
-    sight: Vector<Body>,
-    distance_m: Option<f64>,
-) -> Option<MavMessage> {
-    let (angle_x, angle_y) = angles(sight)?;
-    let distance = distance_m.unwrap_or(0.0) as f32;
-    distance.is_finite().then_some(MavMessage::LANDING_TARGET(LANDING_TARGET_DATA {
-        time_usec,
-        angle_x,
-        angle_y,
-        distance,
-        frame: MavFrame::MAV_FRAME_BODY_FRD,
-        q: [1.0, 0.0, 0.0, 0.0],
-        mavtype: LandingTargetType::LANDING_TARGET_TYPE_VISION_FIDUCIAL,
-        position_valid: MavBool::empty(),
-        ..Default::default()
-    }))
-}
-
 /// ArduPilot takes the line of sight to be (-tan `angle_y`, tan `angle_x`, 1).
 fn angles(sight: Vector<Body>) -> Option<(f32, f32)> {
     let below = sight.is_finite() && sight.z() > 1e-6;
@@ -187,8 +163,7 @@ mod tests {
     #[test]
     fn a_target_beside_or_above_is_refused() {
         assert!(landing_target_position(0, Point::new(1.0, 0.0, 0.0)).is_none());
-        assert!(landing_target_angles(0, Vector::new(0.0, 0.0, -1.0), None).is_none());
-        assert!(landing_target_angles(0, Vector::new(0.0, f64::NAN, 1.0), None).is_none());
-        assert!(landing_target_angles(0, Vector::new(0.0, 0.0, 1.0), Some(f64::NAN)).is_none());
+        assert!(landing_target_position(0, Point::new(0.0, 0.0, -1.0)).is_none());
+        assert!(landing_target_position(0, Point::new(0.0, f64::NAN, 1.0)).is_none());
     }
 }

@@ -20,7 +20,7 @@ use tokio_serial::{SerialPortBuilderExt, SerialStream};
 
 use crate::address::{Address, Endpoint};
 use crate::dialect::{MavAutopilot, MavMessage};
-use crate::packet::{Counters, Frame, Parser};
+use crate::packet::{Counters, Packet, Parser};
 
 /// Packets received and not yet read, about 4 s of an autopilot's talk.
 const INCOMING: usize = 1024;
@@ -72,9 +72,9 @@ pub enum LinkEvent {
         reason: String,
     },
     /// A packet.
-    Frame {
+    Packet {
         /// The packet.
-        frame: Box<Frame>,
+        packet: Box<Packet>,
         /// When its last byte was received.
         received: Instant,
     },
@@ -252,7 +252,7 @@ impl Shared {
         let mut events = self.events();
         if events.len() >= INCOMING {
             // The oldest packet goes; what was said about the connection stays, unless there is nothing else.
-            let oldest = events.iter().position(|event| matches!(event, LinkEvent::Frame { .. }));
+            let oldest = events.iter().position(|event| matches!(event, LinkEvent::Packet { .. }));
             events.remove(oldest.unwrap_or(0));
             self.dropped.fetch_add(1, Ordering::Relaxed);
         }
@@ -292,11 +292,11 @@ impl Port {
         self.shared.push(LinkEvent::Disconnected { reason });
     }
 
-    fn received(&self, frames: Vec<Frame>, counted: Counters) {
+    fn received(&self, packets: Vec<Packet>, counted: Counters) {
         self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner).add(counted);
         let received = Instant::now();
-        for frame in frames {
-            self.shared.push(LinkEvent::Frame { frame: Box::new(frame), received });
+        for packet in packets {
+            self.shared.push(LinkEvent::Packet { packet: Box::new(packet), received });
         }
     }
 }
@@ -487,8 +487,8 @@ where
                 Ok(count) => {
                     heard = tokio::time::Instant::now();
                     port.shared.hear();
-                    let frames = parser.push(bytes.get(..count).unwrap_or(&[]));
-                    port.received(frames, parser.take_counters());
+                    let packets = parser.push(bytes.get(..count).unwrap_or(&[]));
+                    port.received(packets, parser.take_counters());
                 }
                 Err(error) => return format!("reading failed: {error}"),
             },
@@ -501,8 +501,8 @@ where
                 }
             }
             () = sleep_until(heard + PACKET_GAP), if parser.is_waiting() => {
-                let frames = parser.finish();
-                port.received(frames, parser.take_counters());
+                let packets = parser.finish();
+                port.received(packets, parser.take_counters());
             }
             () = sleep_until(heard + patience), if silence.is_some() => {
                 return format!("silent for {} s", patience.as_secs());
@@ -525,11 +525,11 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                 Ok((count, from)) => {
                     let before = peers.chosen;
                     let datagram = bytes.get(..count).unwrap_or(&[]);
-                    let (frames, counted) = peers.take(from, datagram, Instant::now());
+                    let (packets, counted) = peers.take(from, datagram, Instant::now());
                     if let Some(peer) = peers.chosen.filter(|_| peers.chosen != before) {
                         port.connected(peer.to_string());
                     }
-                    port.received(frames, counted);
+                    port.received(packets, counted);
                 }
                 // A datagram of ours found nobody: the other side is not running yet, or not now.
                 Err(error) if is_refusal(&error) => {}
@@ -575,23 +575,23 @@ impl Peers {
     }
 
     /// Takes a datagram and returns its packets if they come from the chosen peer.
-    fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> (Vec<Frame>, Counters) {
+    fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> (Vec<Packet>, Counters) {
         let peer = self.peer(from, now);
         if now.duration_since(peer.heard) > PACKET_GAP {
             // What began so long ago has lost its end.
             peer.parser.finish();
         }
         peer.heard = now;
-        let frames = peer.parser.push(bytes);
+        let packets = peer.parser.push(bytes);
         let counted = peer.parser.take_counters();
-        let is_autopilot = frames.iter().any(is_autopilot_heartbeat);
+        let is_autopilot = packets.iter().any(is_autopilot_heartbeat);
         if is_autopilot {
             peer.autopilot = Some(now);
         }
-        if !frames.is_empty() && self.chosen != Some(from) && self.gives_way(is_autopilot, now) {
+        if !packets.is_empty() && self.chosen != Some(from) && self.gives_way(is_autopilot, now) {
             self.chosen = Some(from);
         }
-        (if self.chosen == Some(from) { frames } else { Vec::new() }, counted)
+        (if self.chosen == Some(from) { packets } else { Vec::new() }, counted)
     }
 
     /// Whether the chosen peer gives way to one that just sent a packet.
@@ -637,11 +637,11 @@ impl Peers {
 }
 
 /// True for the heartbeat of a flight controller, as opposed to that of a ground station, camera or companion.
-fn is_autopilot_heartbeat(frame: &Frame) -> bool {
-    match &frame.message {
+fn is_autopilot_heartbeat(packet: &Packet) -> bool {
+    match &packet.message {
         Some(MavMessage::HEARTBEAT(heartbeat)) => {
             heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-                && frame.sender.component == 1
+                && packet.sender.component == 1
         }
         _ => false,
     }

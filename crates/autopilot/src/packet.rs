@@ -1,8 +1,10 @@
-//! MAVLink packets in a stream of bytes: found, checked and decoded, or made.
+//! MAVLink packets: found in a stream of bytes, checked and decoded, or encoded.
 //!
-//! The packet formats and the checksum are those of <https://mavlink.io/en/guide/serialization.html>.
+//! The packet formats are those of <https://mavlink.io/en/guide/serialization.html>. Checksum, encoding and decoding are
+//! the `mavlink` crate's; the framing is not, because packets of unknown messages must pass byte for byte and a damaged
+//! packet must not hide the good one behind it.
 
-use mavlink::{MavlinkVersion, Message};
+use mavlink::{MAVLinkV2MessageRaw, MavHeader, MavlinkVersion, Message, calculate_crc};
 
 use crate::dialect::MavMessage;
 
@@ -13,56 +15,56 @@ const HEADER_V2: usize = 10;
 const CHECKSUM: usize = 2;
 const SIGNATURE: usize = 13;
 const SIGNED: u8 = 0x01;
-/// Longest packet: version 2 with 255 bytes of payload and a signature.
+/// Length of the longest packet, in bytes: MAVLink 2 with 255 bytes of payload and a signature.
 pub const MAX_PACKET: usize = HEADER_V2 + 255 + CHECKSUM + SIGNATURE;
 
-/// How much is looked at in one go, so that a huge input does not make a huge buffer.
+/// Bytes scanned at a time, which bounds the buffer for any input.
 const PIECE: usize = 4096;
-/// Senders whose packets of unknown kind are passed on.
+/// Maximum number of senders whose packets with unknown message ids are passed on.
 const MAX_SENDERS: usize = 32;
 
-/// Who sends a packet.
+/// The sender of a packet.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Sender {
-    /// System number: 1 is the first vehicle, 255 the usual ground station.
+    /// System id: 1 is the first vehicle, 255 the usual ground station.
     pub system: u8,
-    /// Component number: 1 is the autopilot, 190 a ground station, 191 a companion computer.
+    /// Component id: 1 is the autopilot, 190 a ground station, 191 a companion computer.
     pub component: u8,
 }
 
-/// One packet whose checksum is right, or whose kind is unknown and whose shape is plausible.
+/// A packet with a correct checksum, or a plausible one with an unknown message id.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Frame {
+pub struct Packet {
     /// The packet as it was received, from start byte to checksum or signature.
     pub raw: Vec<u8>,
     /// Who sent it.
     pub sender: Sender,
     /// The sender's packet counter.
     pub sequence: u8,
-    /// Which message it is.
+    /// The message id.
     pub message_id: u32,
-    /// The decoded message; `None` when the dialect does not know its number or one of its values.
+    /// The decoded message; `None` when the dialect does not know its id or one of its values.
     pub message: Option<MavMessage>,
 }
 
-/// What a parser has seen so far.
+/// What a parser has counted so far.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
     /// Packets passed on.
-    pub frames: u64,
-    /// Bytes that belong to no packet.
+    pub packets: u64,
+    /// Bytes outside of any packet.
     pub bad_bytes: u64,
-    /// Places that looked like a packet of a known kind but had a wrong checksum.
+    /// Candidates with a known message id and a wrong checksum.
     pub bad_checksums: u64,
-    /// Packets of a kind that the dialect does not know, passed on as they are.
+    /// Packets with a message id that the dialect does not know, passed on unchanged.
     pub unknown_ids: u64,
-    /// Packets with a right checksum and a value the dialect does not know, passed on as they are.
+    /// Packets with a correct checksum and a value that the dialect does not know, passed on unchanged.
     pub undecodable: u64,
 }
 
-/// Finds packets of MAVLink 1 and 2 in any stream of bytes, and loses none to the noise around them.
+/// Finds packets of MAVLink 1 and 2 in a stream of bytes, and loses none to the noise around them.
 ///
-/// It keeps at most one incomplete packet, so it neither grows nor needs the bytes in whole packets.
+/// It keeps at most one incomplete packet, so its memory is bounded and packets may arrive in pieces.
 #[derive(Clone, Debug, Default)]
 pub struct Parser {
     buffer: Vec<u8>,
@@ -72,7 +74,7 @@ pub struct Parser {
 
 impl Counters {
     pub(crate) fn add(&mut self, more: Self) {
-        self.frames += more.frames;
+        self.packets += more.packets;
         self.bad_bytes += more.bad_bytes;
         self.bad_checksums += more.bad_checksums;
         self.unknown_ids += more.unknown_ids;
@@ -81,58 +83,58 @@ impl Counters {
 }
 
 impl Parser {
-    /// A parser that has seen nothing.
+    /// A parser in its initial state.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Takes bytes as they come and returns the packets that they complete.
-    pub fn push(&mut self, bytes: &[u8]) -> Vec<Frame> {
-        let mut frames = Vec::new();
+    /// Adds received bytes and returns the packets that they complete.
+    pub fn push(&mut self, bytes: &[u8]) -> Vec<Packet> {
+        let mut packets = Vec::new();
         for piece in bytes.chunks(PIECE) {
             self.buffer.extend_from_slice(piece);
-            self.scan(&mut frames, false);
+            self.scan(&mut packets, false);
         }
-        frames
+        packets
     }
 
-    /// Says that nothing follows (the line went quiet, the log ended): what is incomplete is noise, and the packets
-    /// that hid behind it are returned.
-    pub fn finish(&mut self) -> Vec<Frame> {
-        let mut frames = Vec::new();
-        self.scan(&mut frames, true);
-        frames
+    /// Ends the stream (the line went quiet, the log ended): an incomplete packet is noise, and the packets found
+    /// behind its start byte are returned.
+    pub fn finish(&mut self) -> Vec<Packet> {
+        let mut packets = Vec::new();
+        self.scan(&mut packets, true);
+        packets
     }
 
-    /// True while the beginning of a packet waits for its end.
+    /// True while a packet is incomplete.
     pub fn is_waiting(&self) -> bool {
         !self.buffer.is_empty()
     }
 
-    /// What was seen so far.
+    /// The counters since the start.
     pub fn counters(&self) -> Counters {
         self.counters
     }
 
-    /// What was seen since this was asked last.
+    /// The counters since the last call, which resets them.
     pub(crate) fn take_counters(&mut self) -> Counters {
         std::mem::take(&mut self.counters)
     }
 
-    fn scan(&mut self, frames: &mut Vec<Frame>, last: bool) {
+    fn scan(&mut self, packets: &mut Vec<Packet>, last: bool) {
         let mut at = 0;
         while let Some(rest) = self.buffer.get(at..).filter(|rest| !rest.is_empty()) {
             match look(rest, &self.senders) {
                 Verdict::Packet(shape) => {
                     let Some(raw) = rest.get(..shape.length) else { break };
-                    let frame = decode(raw, &shape);
+                    let packet = decode(raw, &shape);
                     at += shape.length;
-                    self.count(&frame, shape.known);
-                    frames.push(frame);
+                    self.count(&packet, shape.known);
+                    packets.push(packet);
                 }
                 Verdict::Incomplete if !last => break,
                 verdict => {
-                    // Only the start byte is given up: a good packet may begin right behind it.
+                    // Only the start byte is skipped: a good packet may begin right behind it.
                     self.counters.bad_checksums +=
                         u64::from(matches!(verdict, Verdict::BadChecksum));
                     self.counters.bad_bytes += 1;
@@ -143,24 +145,24 @@ impl Parser {
         self.buffer.drain(..at.min(self.buffer.len()));
     }
 
-    fn count(&mut self, frame: &Frame, known: bool) {
-        self.counters.frames += 1;
+    fn count(&mut self, packet: &Packet, known: bool) {
+        self.counters.packets += 1;
         if !known {
             self.counters.unknown_ids += 1;
-        } else if frame.message.is_none() {
+        } else if packet.message.is_none() {
             self.counters.undecodable += 1;
         }
-        if known && !self.senders.contains(&frame.sender) {
+        if known && !self.senders.contains(&packet.sender) {
             if self.senders.len() >= MAX_SENDERS {
                 self.senders.remove(0);
             }
-            self.senders.push(frame.sender);
+            self.senders.push(packet.sender);
         }
     }
 }
 
-impl Frame {
-    /// The message's fields as they were sent; version 2 leaves out nought bytes at the end.
+impl Packet {
+    /// The payload as it was sent; MAVLink 2 leaves out zero bytes at its end.
     pub fn payload(&self) -> &[u8] {
         let header = if self.is_v2() { HEADER_V2 } else { HEADER_V1 };
         let length = self.raw.get(1).copied().unwrap_or(0).into();
@@ -172,28 +174,22 @@ impl Frame {
         self.raw.first() == Some(&START_V2)
     }
 
-    /// The message's name, `None` when the dialect does not know it.
+    /// The message's name; `None` when the dialect does not know it.
     pub fn name(&self) -> Option<&'static str> {
         self.message.as_ref().map(Message::message_name)
     }
 }
 
-/// Makes the MAVLink 2 packet that carries `message`.
+/// Encodes `message` as an unsigned MAVLink 2 packet.
 pub fn encode(sender: Sender, sequence: u8, message: &MavMessage) -> Vec<u8> {
-    let mut payload = [0_u8; 255];
-    let length = message.ser(MavlinkVersion::V2, &mut payload).min(payload.len());
-    let [id0, id1, id2, _] = message.message_id().to_le_bytes();
-    let mut raw = Vec::with_capacity(HEADER_V2 + length + CHECKSUM);
-    raw.extend_from_slice(&[START_V2, length as u8, 0, 0]);
-    raw.extend_from_slice(&[sequence, sender.system, sender.component, id0, id1, id2]);
-    raw.extend_from_slice(payload.get(..length).unwrap_or(&[]));
-    let crc = raw.iter().skip(1).copied().fold(CRC_START, crc_step);
-    let crc = crc_step(crc, MavMessage::extra_crc(message.message_id()));
-    raw.extend_from_slice(&crc.to_le_bytes());
-    raw
+    let header =
+        MavHeader { system_id: sender.system.into(), component_id: sender.component, sequence };
+    let mut raw = MAVLinkV2MessageRaw::new();
+    raw.serialize_message(header, message);
+    raw.raw_bytes().to_vec()
 }
 
-/// Where a packet's parts are.
+/// The layout of a packet.
 #[derive(Copy, Clone)]
 struct Shape {
     v2: bool,
@@ -229,18 +225,23 @@ fn look(bytes: &[u8], senders: &[Sender]) -> Verdict {
         return Verdict::Incomplete;
     }
     let sent = u16::from_le_bytes([low, high]);
-    let crc = covered.iter().copied().fold(CRC_START, crc_step);
     if shape.known {
-        let right = crc_step(crc, MavMessage::extra_crc(shape.id)) == sent;
-        return if right { Verdict::Packet(shape) } else { Verdict::BadChecksum };
+        let is_right = calculate_crc(covered, MavMessage::extra_crc(shape.id)) == sent;
+        return if is_right { Verdict::Packet(shape) } else { Verdict::BadChecksum };
     }
-    // The checksum of an unknown kind contains a byte that is not sent. It is believed when some value of that byte
-    // fits, its sender is known from checked packets, and what follows begins a packet or has not come yet.
+    // The checksum of an unknown message also covers a byte that is not sent (CRC_EXTRA). The packet is accepted when
+    // some value of that byte fits, its sender is known from checked packets, and what follows begins a packet or has
+    // not come yet.
     let follows = bytes.get(shape.length).is_none_or(|next| [START_V1, START_V2].contains(next));
-    let fits = follows
-        && senders.contains(&shape.sender)
-        && (0..=u8::MAX).any(|extra| crc_step(crc, extra) == sent);
-    if fits { Verdict::Packet(shape) } else { Verdict::Noise }
+    let is_plausible = follows && senders.contains(&shape.sender) && fits_some_extra(covered, sent);
+    if is_plausible { Verdict::Packet(shape) } else { Verdict::Noise }
+}
+
+/// True when the checksum is right for some value of the byte CRC_EXTRA. The checksum is linear, so this byte changes
+/// it by the same bits whatever comes before.
+fn fits_some_extra(covered: &[u8], sent: u16) -> bool {
+    let difference = calculate_crc(covered, 0) ^ sent;
+    (0..=u8::MAX).any(|extra| calculate_crc(&[], extra) ^ calculate_crc(&[], 0) == difference)
 }
 
 /// Reads the header at the first byte.
@@ -264,7 +265,7 @@ fn shape(bytes: &[u8]) -> Result<Shape, Verdict> {
             })
         }
         [START_V2, payload, flags, _, sequence, system, component, id0, id1, id2, ..] => {
-            // A receiver must refuse incompatible features that it does not know; signing is the only one it knows.
+            // A receiver must refuse incompatibility flags that it does not know; it knows signing only.
             if flags & !SIGNED != 0 {
                 return Err(Verdict::Noise);
             }
@@ -291,12 +292,12 @@ fn shape(bytes: &[u8]) -> Result<Shape, Verdict> {
     }
 }
 
-fn decode(raw: &[u8], shape: &Shape) -> Frame {
+fn decode(raw: &[u8], shape: &Shape) -> Packet {
     let version = if shape.v2 { MavlinkVersion::V2 } else { MavlinkVersion::V1 };
     let payload = raw.get(shape.header..shape.header + shape.payload).unwrap_or(&[]);
     let message =
         if shape.known { MavMessage::parse(version, shape.id, payload).ok() } else { None };
-    Frame {
+    Packet {
         raw: raw.to_vec(),
         sender: shape.sender,
         sequence: shape.sequence,
@@ -305,19 +306,9 @@ fn decode(raw: &[u8], shape: &Shape) -> Frame {
     }
 }
 
-/// The dialect lists its message numbers in ascending order (a test checks it).
+/// The dialect lists its message ids in ascending order (a test checks it).
 fn is_known(id: u32) -> bool {
     MavMessage::all_ids().binary_search(&id).is_ok()
-}
-
-const CRC_START: u16 = 0xFFFF;
-
-/// One byte of the X.25 checksum (CRC-16/MCRF4XX).
-fn crc_step(crc: u16, byte: u8) -> u16 {
-    let mut mixed = byte ^ (crc & 0xFF) as u8;
-    mixed ^= mixed << 4;
-    let mixed = u16::from(mixed);
-    (crc >> 8) ^ (mixed << 8) ^ (mixed << 3) ^ (mixed >> 4)
 }
 
 #[cfg(test)]
@@ -340,7 +331,7 @@ mod tests {
         }
     }
 
-    /// The same packet as MAVLink 1, written by hand because only version 2 is ever sent.
+    /// The same packet as MAVLink 1, encoded by hand because only version 2 is ever sent.
     fn encode_v1(sequence: u8, message: &MavMessage) -> Vec<u8> {
         let mut payload = [0; 255];
         let length = message.ser(MavlinkVersion::V1, &mut payload);
@@ -348,7 +339,7 @@ mod tests {
         let mut raw = vec![START_V1, length as u8, sequence, 1, 1, id];
         raw.extend_from_slice(&payload[..length]);
         let extra = MavMessage::extra_crc(id.into());
-        raw.extend_from_slice(&mavlink::calculate_crc(&raw[1..], extra).to_le_bytes());
+        raw.extend_from_slice(&calculate_crc(&raw[1..], extra).to_le_bytes());
         raw
     }
 
@@ -356,7 +347,7 @@ mod tests {
         let [id0, id1, id2, _] = id.to_le_bytes();
         let mut raw =
             vec![START_V2, 3, 0, 0, 7, sender.system, sender.component, id0, id1, id2, 1, 2, 3];
-        let crc = mavlink::calculate_crc(&raw[1..], 77);
+        let crc = calculate_crc(&raw[1..], 77);
         raw.extend_from_slice(&crc.to_le_bytes());
         raw
     }
@@ -389,7 +380,7 @@ mod tests {
     }
 
     proptest! {
-        // One in 65536 damaged packets has a right checksum by chance; a fixed seed keeps that out of the test.
+        // One in 65536 damaged packets has a correct checksum by chance; a fixed seed keeps that out of the test.
         #![proptest_config(ProptestConfig { cases: 400, rng_seed: RngSeed::Fixed(7), ..Default::default() })]
 
         #[test]
@@ -420,11 +411,11 @@ mod tests {
             }
             found.extend(parser.finish());
             prop_assert!(!parser.is_waiting());
-            let bytes: usize = found.iter().map(|frame| frame.raw.len()).sum();
+            let bytes: usize = found.iter().map(|packet| packet.raw.len()).sum();
             prop_assert_eq!(bytes as u64 + parser.counters().bad_bytes, stream.len() as u64);
             let mut found = found.iter();
             for raw in &good {
-                prop_assert!(found.any(|frame| &frame.raw == raw), "a good packet was lost");
+                prop_assert!(found.any(|packet| &packet.raw == raw), "a good packet was lost");
             }
         }
 
@@ -436,11 +427,11 @@ mod tests {
             let [id0, id1, id2, _] = id.to_le_bytes();
             let mut raw = vec![START_V2, payload.len() as u8, 0, 0, 0, 1, 1, id0, id1, id2];
             raw.extend_from_slice(&payload);
-            let crc = mavlink::calculate_crc(&raw[1..], MavMessage::extra_crc(id));
+            let crc = calculate_crc(&raw[1..], MavMessage::extra_crc(id));
             raw.extend_from_slice(&crc.to_le_bytes());
-            let frames = Parser::new().push(&raw);
-            prop_assert_eq!(frames.len(), 1);
-            prop_assert_eq!(frames[0].payload(), payload.as_slice());
+            let packets = Parser::new().push(&raw);
+            prop_assert_eq!(packets.len(), 1);
+            prop_assert_eq!(packets[0].payload(), payload.as_slice());
         }
     }
 
@@ -454,12 +445,12 @@ mod tests {
         for kind in 0..3 {
             let sender = Sender { system: 7, component: 191 };
             let raw = encode(sender, 200, &message(kind));
-            let frames = Parser::new().push(&raw);
-            assert_eq!(frames.len(), 1);
-            assert_eq!(frames[0].sender, sender);
-            assert_eq!(frames[0].sequence, 200);
-            assert_eq!(frames[0].raw, raw);
-            assert_eq!(frames[0].message, Some(message(kind)));
+            let packets = Parser::new().push(&raw);
+            assert_eq!(packets.len(), 1);
+            assert_eq!(packets[0].sender, sender);
+            assert_eq!(packets[0].sequence, 200);
+            assert_eq!(packets[0].raw, raw);
+            assert_eq!(packets[0].message, Some(message(kind)));
         }
     }
 
@@ -469,10 +460,10 @@ mod tests {
         let raw = unknown(9_999_999, AUTOPILOT);
         assert!(parser.push(&raw).is_empty(), "its sender is not known yet");
         parser.push(&encode(AUTOPILOT, 0, &message(0)));
-        let frames = parser.push(&raw);
-        assert_eq!(frames.len(), 1);
-        assert_eq!((frames[0].message_id, &frames[0].message), (9_999_999, &None));
-        assert_eq!(frames[0].raw, raw);
+        let packets = parser.push(&raw);
+        assert_eq!(packets.len(), 1);
+        assert_eq!((packets[0].message_id, &packets[0].message), (9_999_999, &None));
+        assert_eq!(packets[0].raw, raw);
         assert_eq!(parser.counters().unknown_ids, 1);
         assert!(parser.push(&unknown(9_999_999, Sender { system: 9, component: 9 })).is_empty());
     }
@@ -482,15 +473,15 @@ mod tests {
         let mut raw = encode(AUTOPILOT, 3, &message(1));
         raw.truncate(raw.len() - CHECKSUM);
         raw[2] = SIGNED;
-        let crc = mavlink::calculate_crc(&raw[1..], MavMessage::extra_crc(30));
+        let crc = calculate_crc(&raw[1..], MavMessage::extra_crc(30));
         raw.extend_from_slice(&crc.to_le_bytes());
         raw.extend_from_slice(&[0xFD; SIGNATURE]);
         let mut parser = Parser::new();
         let (head, tail) = raw.split_at(raw.len() - 1);
         assert!(parser.push(head).is_empty());
-        let frames = parser.push(tail);
-        assert_eq!(frames[0].raw, raw);
-        assert_eq!(frames[0].message, Some(message(1)));
+        let packets = parser.push(tail);
+        assert_eq!(packets[0].raw, raw);
+        assert_eq!(packets[0].message, Some(message(1)));
         assert_eq!(parser.counters().bad_bytes, 0);
     }
 

@@ -84,13 +84,13 @@ impl Fake {
     }
 
     fn receive(&mut self, packet: &[u8]) {
-        for frame in self.parser.push(packet) {
-            match frame.message.unwrap() {
+        for packet in self.parser.push(packet) {
+            match packet.message.unwrap() {
                 MavMessage::COMMAND_LONG(_) if self.lose_commands > 0 => self.lose_commands -= 1,
                 MavMessage::COMMAND_LONG(command) => {
                     assert_eq!((command.target_system, command.target_component), (1, 1));
                     self.heard.push(command.command);
-                    self.obey(&command, frame.sender);
+                    self.obey(&command, packet.sender);
                 }
                 MavMessage::SET_POSITION_TARGET_LOCAL_NED(setpoint) => {
                     assert_eq!(
@@ -101,7 +101,7 @@ impl Fake {
                 }
                 MavMessage::HEARTBEAT(heartbeat) => {
                     assert_eq!(heartbeat.mavtype, MavType::MAV_TYPE_ONBOARD_CONTROLLER);
-                    assert_eq!(frame.sender, Sender { system: 1, component: 191 });
+                    assert_eq!(packet.sender, Sender { system: 1, component: 191 });
                 }
                 MavMessage::TIMESYNC(question) if question.tc1 == 0 => {
                     self.questions.push(question.ts1);
@@ -285,8 +285,8 @@ impl World {
     fn hear(&mut self, sender: Sender, message: &MavMessage) {
         let packet = packet::encode(sender, self.sequence, message);
         self.sequence = self.sequence.wrapping_add(1);
-        for frame in Parser::new().push(&packet) {
-            self.client.handle(self.now, &frame);
+        for packet in Parser::new().push(&packet) {
+            self.client.handle(self.now, &packet);
         }
     }
 
@@ -887,8 +887,8 @@ proptest::proptest! {
             packet.extend_from_slice(&payload);
             let crc = checksum(&packet[1..], MavMessage::extra_crc(id));
             packet.extend_from_slice(&crc.to_le_bytes());
-            for frame in Parser::new().push(&packet) {
-                client.handle(now, &frame);
+            for packet in Parser::new().push(&packet) {
+                client.handle(now, &packet);
                 client.tick(now);
                 takeoff.step(now, &mut client);
                 let _ = client.set_velocity(now, Vector::zero(), 0.0);

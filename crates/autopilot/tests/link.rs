@@ -3,12 +3,14 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "helpers of tests may fail like tests")]
 
 use std::net::SocketAddr;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use autopilot::dialect::{HEARTBEAT_DATA, MavAutopilot, MavMessage, MavType, SYSTEM_TIME_DATA};
+use autopilot::dialect::{
+    HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavType, SYSTEM_TIME_DATA,
+};
 use autopilot::link::SendError;
 use autopilot::packet::{self, Sender};
-use autopilot::{Address, Link, LinkEvent};
+use autopilot::{Address, Autopilot, Config, Event, Firmware, Link, LinkEvent, Parser};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, UdpSocket};
 use tokio::time::timeout;
@@ -45,8 +47,8 @@ async fn next(link: &mut Link) -> LinkEvent {
 
 async fn packet(link: &mut Link) -> Vec<u8> {
     loop {
-        if let LinkEvent::Frame { frame, .. } = next(link).await {
-            return frame.raw;
+        if let LinkEvent::Packet { packet, .. } = next(link).await {
+            return packet.raw;
         }
     }
 }
@@ -94,6 +96,36 @@ async fn udpin_answers_to_whoever_sends_the_autopilots_heartbeat() {
     assert_eq!(packet(&mut link).await, time());
     link.send(&heartbeat(false)).unwrap();
     assert_eq!(datagram(&autopilot).await.0, heartbeat(false));
+}
+
+#[tokio::test]
+async fn a_client_over_a_link_finds_the_autopilot_and_requests_its_messages() {
+    let mut link = open("udpin:127.0.0.1:0".into()).await;
+    let before = Instant::now();
+    let autopilot = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    autopilot.send_to(&heartbeat(true), link.local_address().unwrap()).await.unwrap();
+    let mut client = Autopilot::new(Config::default());
+    while client.system().is_none() {
+        if let LinkEvent::Packet { packet, received } = next(&mut link).await {
+            assert!((before..=Instant::now()).contains(&received));
+            client.handle(0, &packet);
+        }
+    }
+    let found = Event::Found { system: 1, firmware: Firmware::Copter };
+    assert_eq!(client.poll_event(), Some(found));
+    client.tick(1);
+    while let Some(packet) = client.poll_outgoing() {
+        link.send(&packet).unwrap();
+    }
+    let is_request = |message: MavMessage| {
+        matches!(message, MavMessage::COMMAND_LONG(command)
+            if command.command == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL)
+    };
+    while !Parser::new()
+        .push(&datagram(&autopilot).await.0)
+        .into_iter()
+        .any(|packet| packet.message.is_some_and(is_request))
+    {}
 }
 
 #[tokio::test]
@@ -250,8 +282,8 @@ async fn a_reader_that_sleeps_gets_the_newest_packets() {
     }
     let mut newest = 0;
     while newest < sent {
-        if let LinkEvent::Frame { frame, .. } = next(&mut link).await
-            && let Some(MavMessage::SYSTEM_TIME(time)) = frame.message
+        if let LinkEvent::Packet { packet, .. } = next(&mut link).await
+            && let Some(MavMessage::SYSTEM_TIME(time)) = packet.message
         {
             newest = time.time_boot_ms;
         }

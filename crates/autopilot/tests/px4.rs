@@ -43,15 +43,15 @@ struct Px4 {
 
 impl Px4 {
     fn receive(&mut self, now: i64, packet: &[u8]) {
-        for frame in Parser::new().push(packet) {
-            match frame.message.unwrap() {
+        for packet in Parser::new().push(packet) {
+            match packet.message.unwrap() {
                 MavMessage::COMMAND_LONG(command) => {
                     let result = self.carry_out(now, &command);
                     self.queue.push(MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
                         command: command.command,
                         result,
-                        target_system: frame.sender.system,
-                        target_component: frame.sender.component,
+                        target_system: packet.sender.system,
+                        target_component: packet.sender.component,
                         ..Default::default()
                     }));
                 }
@@ -202,8 +202,8 @@ impl World {
         self.now += STEP;
         for message in self.px4.step(self.now) {
             let packet = packet::encode(AUTOPILOT, 0, &message);
-            for frame in Parser::new().push(&packet) {
-                self.client.handle(self.now, &frame);
+            for packet in Parser::new().push(&packet) {
+                self.client.handle(self.now, &packet);
             }
         }
         self.client.tick(self.now);

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use autopilot::packet::Counters;
-use autopilot::{Autopilot, Config, Event, FlightMode, Frame, LandedState, Parser};
+use autopilot::{Autopilot, Config, Event, FlightMode, LandedState, Packet, Parser};
 use serde_json::Value;
 
 /// All logs under a folder.
@@ -34,20 +34,20 @@ fn logs(folder: &Path) -> Vec<PathBuf> {
 
 /// A log is, for each packet, the time in microseconds (8 bytes, big endian) and the packet; the parser gets it as it
 /// is, with the times as noise between the packets.
-fn parse(log: &[u8]) -> (Vec<Frame>, Counters) {
+fn parse(log: &[u8]) -> (Vec<Packet>, Counters) {
     let mut parser = Parser::new();
-    let mut frames: Vec<Frame> = log.chunks(1000).flat_map(|piece| parser.push(piece)).collect();
-    frames.extend(parser.finish());
-    (frames, parser.counters())
+    let mut packets: Vec<Packet> = log.chunks(1000).flat_map(|piece| parser.push(piece)).collect();
+    packets.extend(parser.finish());
+    (packets, parser.counters())
 }
 
 /// The packets with their times in ns, of a log without bad bytes.
-fn timed(log: &[u8]) -> Vec<(i64, Frame)> {
+fn timed(log: &[u8]) -> Vec<(i64, Packet)> {
     let mut at = 0;
-    let stamp = |frame: Frame| {
+    let stamp = |packet: Packet| {
         let time = i64::from_be_bytes(log[at..at + 8].try_into().unwrap()) * 1000;
-        at += 8 + frame.raw.len();
-        (time, frame)
+        at += 8 + packet.raw.len();
+        (time, packet)
     };
     parse(log).0.into_iter().map(stamp).collect()
 }
@@ -57,11 +57,11 @@ fn every_packet_of_the_simulated_flights_is_found() {
     let Some(folder) = testing::recording("ardupilot") else { return };
     for path in logs(&folder) {
         let log = std::fs::read(&path).unwrap();
-        let (frames, counters) = parse(&log);
+        let (packets, counters) = parse(&log);
         println!("{}: {counters:?}", path.display());
-        assert_eq!(counters.bad_bytes, 8 * frames.len() as u64, "only the times are no packets");
+        assert_eq!(counters.bad_bytes, 8 * packets.len() as u64, "only the times are no packets");
         assert_eq!((counters.undecodable, counters.unknown_ids), (0, 0));
-        assert!(frames.len() > 10_000);
+        assert!(packets.len() > 10_000);
     }
 }
 
@@ -71,10 +71,10 @@ fn the_real_logs_give_what_pymavlink_finds_in_them() {
     let summary = std::fs::read(folder.join("logs_summary.json")).unwrap();
     let summary: Value = serde_json::from_slice(&summary).unwrap();
     for path in logs(&folder) {
-        let (frames, counters) = parse(&std::fs::read(&path).unwrap());
+        let (packets, counters) = parse(&std::fs::read(&path).unwrap());
         let mut names = BTreeMap::<&str, u64>::new();
-        for frame in &frames {
-            *names.entry(frame.name().unwrap_or("unknown")).or_default() += 1;
+        for packet in &packets {
+            *names.entry(packet.name().unwrap_or("unknown")).or_default() += 1;
         }
         let file = path.strip_prefix(&folder).unwrap().to_str().unwrap();
         let entries = summary.as_array().unwrap();
@@ -83,8 +83,8 @@ fn the_real_logs_give_what_pymavlink_finds_in_them() {
             continue;
         };
         let good = entry["messages"].as_u64().unwrap() - entry["bad_data"].as_u64().unwrap();
-        println!("{file}: {} packets, {counters:?}", frames.len());
-        assert_eq!(frames.len() as u64, good, "{file}");
+        println!("{file}: {} packets, {counters:?}", packets.len());
+        assert_eq!(packets.len() as u64, good, "{file}");
         for (name, count) in entry["message_counts"].as_object().unwrap() {
             assert_eq!(names.get(name.as_str()), count.as_u64().as_ref(), "{name} in {file}");
         }
@@ -103,8 +103,8 @@ fn told_by_client(log: &[u8]) -> (Vec<(f64, Told)>, Autopilot) {
     let mut client = Autopilot::new(Config::default());
     let mut told = Vec::new();
     let mut first_ns = None;
-    for (now_ns, frame) in timed(log) {
-        client.handle(now_ns, &frame);
+    for (now_ns, packet) in timed(log) {
+        client.handle(now_ns, &packet);
         client.tick(now_ns);
         while client.poll_outgoing().is_some() {}
         while let Some(event) = client.poll_event() {

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use autopilot::Frame;
+use autopilot::Packet;
 use geometry::{Ned, Point, Vector};
 
 use crate::ardupilot::{AutopilotConfig, SimulatedAutopilot};
@@ -129,10 +129,10 @@ impl World {
     }
 
     /// Takes a packet for the autopilot, now.
-    pub fn handle(&mut self, frame: &Frame) {
+    pub fn handle(&mut self, packet: &Packet) {
         let now_s = self.now_s();
         if !self.link_is_lost() {
-            self.autopilot.handle(now_s, frame);
+            self.autopilot.handle(now_s, packet);
         }
     }
 

@@ -123,9 +123,10 @@ fn a_slow_start_is_ready_after_42_seconds() {
         assert_eq!(bench.ask(id, 10.0), 0);
     }
     bench.run(60.0);
-    let prearm = |frame: &autopilot::Frame| whole(frame)[11] & 0x10 != 0;
+    let prearm = |frame: &autopilot::Packet| whole(frame)[11] & 0x10 != 0;
     near(bench.of(1).find(|(_, frame)| prearm(frame)).unwrap().0, 42.0, 0.2);
-    let flags = |frame: &autopilot::Frame| u16::from_le_bytes([whole(frame)[20], whole(frame)[21]]);
+    let flags =
+        |frame: &autopilot::Packet| u16::from_le_bytes([whole(frame)[20], whole(frame)[21]]);
     near(bench.of(193).find(|(_, frame)| flags(frame) == 831).unwrap().0, 42.0, 0.2);
     near(bench.of(32).next().unwrap().0, 20.0, 0.5);
 }

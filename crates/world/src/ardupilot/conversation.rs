@@ -4,7 +4,7 @@ use autopilot::dialect::{
     LANDING_TARGET_DATA, MavCmd, MavFrame, MavMessage, MavModeFlag, MavResult, MavSeverity,
     Message, PARAM_VALUE_DATA, SET_POSITION_TARGET_LOCAL_NED_DATA, TIMESYNC_DATA,
 };
-use autopilot::{Frame, Sender};
+use autopilot::{Packet, Sender};
 use geometry::{Body, Ned, Rotation, Vector};
 
 use super::flight::{Mode, Setpoint};
@@ -29,11 +29,12 @@ fn accepted(yes: bool) -> MavResult {
 impl SimulatedAutopilot {
     /// Takes one packet from the link.
     #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
-    pub fn handle(&mut self, now_s: f64, frame: &Frame) {
-        let Some(message) = frame.message.as_ref().filter(|message| self.is_for_me(message)) else {
+    pub fn handle(&mut self, now_s: f64, packet: &Packet) {
+        let Some(message) = packet.message.as_ref().filter(|message| self.is_for_me(message))
+        else {
             return;
         };
-        let from = frame.sender;
+        let from = packet.sender;
         match message {
             MavMessage::COMMAND_LONG(c) => {
                 let values = [c.param1, c.param2, c.param3, c.param4, c.param5, c.param6, c.param7];
@@ -59,8 +60,8 @@ impl SimulatedAutopilot {
                 let reply = TIMESYNC_DATA {
                     tc1: nanoseconds(now_s),
                     ts1: t.ts1,
-                    target_system: frame.sender.system,
-                    target_component: frame.sender.component,
+                    target_system: packet.sender.system,
+                    target_component: packet.sender.component,
                 };
                 self.send(&MavMessage::TIMESYNC(reply));
             }

@@ -2,7 +2,7 @@
 
 use autopilot::Sender;
 use autopilot::dialect::{
-    COMMAND_ACK_DATA, MavMessage, MavResult, MavSeverity, Message, STATUSTEXT_DATA,
+    COMMAND_ACK_DATA, MavMessage, MavResult, MavSeverity, Message, STATUSTEXT_DATA, calculate_crc,
 };
 use autopilot::packet::encode;
 
@@ -32,18 +32,9 @@ pub(super) fn acknowledgement(
         *byte = number;
     }
     let extra = MavMessage::extra_crc(message.message_id());
-    let checksum =
-        raw.iter().skip(1).chain([&extra]).fold(0xFFFF, |sum, byte| accumulate(sum, *byte));
+    let checksum = calculate_crc(raw.get(1..).unwrap_or(&[]), extra);
     raw.extend_from_slice(&checksum.to_le_bytes());
     raw
-}
-
-/// CRC-16/MCRF4XX (<https://mavlink.io/en/guide/serialization.html>).
-fn accumulate(sum: u16, byte: u8) -> u16 {
-    let mut low = byte ^ (sum as u8);
-    low ^= low << 4;
-    let low = u16::from(low);
-    (sum >> 8) ^ (low << 8) ^ (low << 3) ^ (low >> 4)
 }
 
 /// The STATUSTEXTs that carry one text: a long one comes in numbered parts.
@@ -77,12 +68,12 @@ mod tests {
     fn an_acknowledgement_is_a_right_packet_for_any_number() {
         for command in [0_u16, 11, 22, 400, 65535] {
             let raw = acknowledgement(ME, 7, command, MavResult::MAV_RESULT_FAILED, OTHER);
-            let frames = Parser::new().push(&raw);
-            assert_eq!(frames.len(), 1, "{command}");
-            assert_eq!((frames[0].sequence, frames[0].message_id), (7, 77));
+            let packets = Parser::new().push(&raw);
+            assert_eq!(packets.len(), 1, "{command}");
+            assert_eq!((packets[0].sequence, packets[0].message_id), (7, 77));
             let mut expected = command.to_le_bytes().to_vec();
             expected.extend_from_slice(&[4, 0, 0, 0, 0, 0, 255, 190]);
-            assert_eq!(frames[0].payload(), expected);
+            assert_eq!(packets[0].payload(), expected);
         }
     }
 

@@ -9,7 +9,7 @@ use autopilot::dialect::{
     SET_POSITION_TARGET_LOCAL_NED_DATA,
 };
 use autopilot::packet::encode;
-use autopilot::{Frame, Parser, Sender};
+use autopilot::{Packet, Parser, Sender};
 use world::ardupilot::{AutopilotConfig, EstimateConfig};
 use world::vehicle::VehicleConfig;
 use world::wind::WindConfig;
@@ -27,7 +27,7 @@ pub(crate) const GROUND: Sender = Sender { system: 255, component: 190 };
 
 pub(crate) struct Bench {
     pub(crate) world: World,
-    pub(crate) log: Vec<(f64, Frame)>,
+    pub(crate) log: Vec<(f64, Packet)>,
     pub(crate) raw: Vec<u8>,
     parser: Parser,
     sender: Sender,
@@ -206,8 +206,8 @@ impl Bench {
     }
 
     /// The packets of one kind from the autopilot itself, with their times.
-    pub(crate) fn of(&self, id: u32) -> impl DoubleEndedIterator<Item = (f64, &Frame)> {
-        let mine = move |frame: &Frame| frame.message_id == id && frame.sender.component == 1;
+    pub(crate) fn of(&self, id: u32) -> impl DoubleEndedIterator<Item = (f64, &Packet)> {
+        let mine = move |frame: &Packet| frame.message_id == id && frame.sender.component == 1;
         self.log
             .iter()
             .filter(move |(_, frame)| mine(frame))
@@ -243,7 +243,7 @@ impl Bench {
 }
 
 /// A packet's payload with the zeros that the wire leaves out.
-pub(crate) fn whole(frame: &Frame) -> Vec<u8> {
+pub(crate) fn whole(frame: &Packet) -> Vec<u8> {
     let mut payload = frame.payload().to_vec();
     payload.resize(255, 0);
     payload
