@@ -19,7 +19,7 @@ use crate::source::{lines_of_code, tokens, without_tests};
 const ALGORITHMS: [(&str, &[&str]); 8] = [
     ("geometry", &[]),
     ("imaging", &[]),
-    ("messages", &[]),
+    ("messages", &["geometry", "imaging"]),
     ("markers", &[]),
     ("fiducial", &["geometry", "imaging", "markers"]),
     ("landing", &["geometry"]),
@@ -446,12 +446,12 @@ fn every_queue_has_a_bound() -> anyhow::Result<()> {
 fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let table = code(&package(&workspace, "messages")?.folder.join("src/topic.rs"))?;
-    let mut constants = BTreeMap::new();
+    let mut constants = Vec::new();
     for part in table.split("pub const ").skip(1) {
         let (name, rest) = part.split_once(": ").context("a constant")?;
         if rest.starts_with("Topic<") {
             let key = rest.split('"').nth(1).with_context(|| format!("the key of {name}"))?;
-            constants.insert(name.to_owned(), key.to_owned());
+            constants.push((name.to_owned(), key.to_owned()));
         }
     }
     ensure!(constants.len() == TOPICS.len(), "{} constants of topics", constants.len());

@@ -12,7 +12,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use messages::{ControllerCommand, DetectorCommand, topic};
+use messages::{ControllerCommand, DetectorCommand, Phase, topic};
 use rustix::process::{Pid, Signal, kill_process};
 use testing::{ports, python, python_passes};
 
@@ -71,7 +71,7 @@ async fn without_a_detector_it_stops_descending_and_lands_with_the_next_one() ->
         .truth("it stands still", |t| t.stamp_ns > killed_ns && descent_m_s(t).abs() < 0.1)
         .await?;
     println!("descent ended after {:.2} s", seconds(still.stamp_ns - killed_ns));
-    landing.status("it holds", |s| s.phase == "hold").await?;
+    landing.status("it holds", |s| s.phase == Phase::Hold).await?;
     // Drained first: what follows is the motion from now on.
     landing.motion(Duration::from_millis(100)).await;
     let motion = landing.motion(Duration::from_secs(2)).await;
@@ -80,7 +80,7 @@ async fn without_a_detector_it_stops_descending_and_lands_with_the_next_one() ->
     landing.start_by_hand("detector", &["id=second"])?;
     landing
         .status("the second detector is used", |s| {
-            s.active_detector.as_deref() == Some("second") && s.phase == "descend"
+            s.active_detector.as_deref() == Some("second") && s.phase == Phase::Descend
         })
         .await?;
     landing.lands().await?;
@@ -170,7 +170,7 @@ async fn the_operators_choice_of_detector_is_followed_and_a_wrong_one_refused() 
     landing.descends_below(9.0).await?;
     let hold = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Hold).await?;
     ensure!(hold.accepted, "{hold:?}");
-    landing.status("it holds", |s| s.phase == "hold").await?;
+    landing.status("it holds", |s| s.phase == Phase::Hold).await?;
     let resume = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Resume).await?;
     ensure!(resume.accepted, "{resume:?}");
     landing.lands().await?;

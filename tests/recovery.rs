@@ -15,7 +15,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail, ensure};
-use messages::{ControllerStatus, DetectorState, Truth, topic};
+use messages::{ControllerStatus, DetectorState, Phase, Truth, topic};
 use node::{Identity, Network, Node, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
 use testing::ports;
@@ -92,7 +92,7 @@ impl Picture {
         let steers = status.started_ns.is_some() && status.setpoint.is_some();
         let both = heard("onboard") && heard("ground");
         // One that is started after the touchdown has nothing to steer any more.
-        there && (self.landed || status.finished || status.phase == "final" || steers && both)
+        there && (self.landed || status.finished || status.phase == Phase::Final || steers && both)
     }
 }
 
@@ -343,7 +343,7 @@ async fn fly(
     let flown = async {
         let began = |picture: &Picture| {
             let there = VICTIMS.iter().all(|victim| picture.alive.contains(&victim.alive()));
-            there && picture.status.phase == "descend" || picture.landed
+            there && picture.status.phase == Phase::Descend || picture.landed
         };
         flight.until("everybody is there and it descends", now_ns(), began).await?;
         while let Some(victim) = victims.last().copied() {

@@ -8,7 +8,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail, ensure};
-use messages::{CommandReply, ControllerCommand, FrameReceipt, Health, topic};
+use messages::{CommandReply, ControllerCommand, FrameAck, Health, topic};
 use node::{Identity, Network, Node, Subscriber};
 use testing::ports;
 use tokio::sync::mpsc;
@@ -121,20 +121,14 @@ async fn health(
     timeout(PATIENCE, found).await.map_err(|_| anyhow!("waiting until {what}"))?
 }
 
-/// Publishes receipts until one is heard.
+/// Publishes acknowledgements until one is heard.
 async fn is_heard(detector: &Node, controller: &Node) -> anyhow::Result<()> {
-    let subscriber = controller.subscriber(topic::RECEIVED, &["ground"]).await?;
-    let publisher = detector.publisher(topic::RECEIVED, &["ground"]).await?;
-    let receipt = FrameReceipt {
-        camera: "down".into(),
-        sequence: 1,
-        stamp_ns: 1,
-        clock: "a clock".into(),
-        bytes: 1,
-    };
+    let subscriber = controller.subscriber(topic::FRAME_ACK, &["ground"]).await?;
+    let publisher = detector.publisher(topic::FRAME_ACK, &["ground"]).await?;
+    let ack = FrameAck::sample();
     let heard = async {
         loop {
-            publisher.publish(&receipt).await;
+            publisher.publish(&ack).await;
             if timeout(Duration::from_millis(50), subscriber.next()).await.is_ok() {
                 return;
             }

@@ -218,7 +218,7 @@ async fn swaps(number: usize) -> anyhow::Result<()> {
     let heard = listen(&landing.node).await?;
     landing.descends_below(8.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
-    landing.status("it holds", |s| s.phase == "hold").await?;
+    landing.status("it holds", |s| s.phase == messages::Phase::Hold).await?;
     let mut used = "main".to_owned();
     let mut took_s = Vec::new();
     let (mut with, mut without) = (Ticks::default(), Ticks::default());

@@ -250,11 +250,10 @@ mod tests {
             place: Some(Place::Onboard),
             age_ms: 60.0,
             latency_ms: 41.4,
-            rate_hz: 15.0,
-            alive: true,
             disagreement_m: Some(0.0123),
             compared: if state == DetectorState::Shadow { 30 } else { 0 },
             agreed: 29,
+            ..Candidate::sample()
         };
         let status = ControllerStatus {
             active_detector: Some("main".into()),

@@ -197,11 +197,11 @@ impl Outcome {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::Touchdown;
+    use messages::{Phase, Touchdown};
 
-    fn status(phase: &str) -> ControllerStatus {
+    fn status(phase: Phase) -> ControllerStatus {
         ControllerStatus {
-            phase: phase.into(),
+            phase,
             why: "because".into(),
             guidance: "metric".into(),
             ..ControllerStatus::default()
@@ -229,13 +229,13 @@ mod tests {
         landing.status(ControllerStatus {
             started_ns: Some(second),
             detections_used: 40,
-            ..status("descend")
+            ..status(Phase::Descend)
         });
         // A restarted controller.
         landing.status(ControllerStatus {
             started_ns: Some(9 * second),
             detections_used: 2,
-            ..status("descend")
+            ..status(Phase::Descend)
         });
         let touchdown = Touchdown {
             stamp_ns: 14 * second,
@@ -249,7 +249,7 @@ mod tests {
             disarmed_ns: Some(16 * second),
             finished: true,
             detections_used: 60,
-            ..status("landed")
+            ..status(Phase::Landed)
         };
         assert!(landing.status(done));
         let outcome = landing.outcome();
@@ -265,7 +265,7 @@ mod tests {
     #[test]
     fn an_interrupted_landing_names_its_phase() {
         let mut landing = LandingSummary::default();
-        landing.status(status("search"));
+        landing.status(status(Phase::Search));
         landing.interrupted("interrupted");
         let outcome = landing.outcome();
         assert!(!outcome.landed);

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use messages::ControllerStatus;
+use messages::{ControllerStatus, Phase};
 
 use crate::args::Format;
 use crate::outcome::LandingSummary;
@@ -13,7 +13,7 @@ use crate::terminal::write_error;
 pub(crate) struct Progress {
     /// `None` where standard error is not a terminal.
     live: Option<ProgressBar>,
-    phase: String,
+    phase: Option<Phase>,
     active_detector: Option<String>,
 }
 
@@ -31,7 +31,7 @@ impl Progress {
             bar.enable_steady_tick(Duration::from_millis(200));
             bar
         });
-        Self { live, phase: String::new(), active_detector: None }
+        Self { live, phase: None, active_detector: None }
     }
 
     /// Shows a line that stays.
@@ -51,8 +51,7 @@ impl Progress {
 
     /// Shows a change of phase or of detector.
     pub(crate) fn status(&mut self, status: &ControllerStatus) {
-        if status.phase != self.phase {
-            self.phase.clone_from(&status.phase);
+        if self.phase.replace(status.phase) != Some(status.phase) {
             self.say(&format!("{}: {}", status.phase, status.why));
         }
         if status.active_detector != self.active_detector {
@@ -108,24 +107,13 @@ fn live_lines(status: &ControllerStatus, frame_rate_hz: Option<f64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{Candidate, DetectorState};
+    use messages::Candidate;
 
     #[test]
     fn the_live_view_has_phase_height_error_and_detectors() {
-        let candidate = |name: &str| Candidate {
-            detector: name.into(),
-            state: DetectorState::Shadow,
-            place: None,
-            age_ms: 60.0,
-            latency_ms: 40.0,
-            rate_hz: 15.0,
-            alive: true,
-            disagreement_m: None,
-            compared: 0,
-            agreed: 0,
-        };
+        let candidate = |name: &str| Candidate { detector: name.into(), ..Candidate::sample() };
         let status = ControllerStatus {
-            phase: "descend".into(),
+            phase: Phase::Descend,
             why: "descending over the marker".into(),
             guidance: "metric".into(),
             active_detector: Some("main".into()),

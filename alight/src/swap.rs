@@ -462,15 +462,10 @@ mod tests {
     fn shadow(compared: u32, agreed: u32) -> Candidate {
         Candidate {
             detector: "new".into(),
-            state: DetectorState::Shadow,
-            place: None,
-            age_ms: 50.0,
-            latency_ms: 40.0,
-            rate_hz: 15.0,
-            alive: true,
             disagreement_m: Some(0.4),
             compared,
             agreed,
+            ..Candidate::sample()
         }
     }
 

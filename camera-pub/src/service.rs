@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 
 use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
-use geometry::{CameraModel, Distortion};
+use geometry::CameraModel;
 use imaging::{GrayImage, Mosaic, SampleFormat};
 use media::{DecodedImage, frame_bytes, images_in, samples_to_grey};
-use messages::{BayerPattern, CameraInfo, FrameHeader, LensModel, PixelFormat, Transform3, topic};
+use messages::{BayerPattern, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
@@ -145,26 +145,10 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
 fn camera_info(config: &Config, size: (usize, usize)) -> anyhow::Result<CameraInfo> {
     let intrinsics = config.intrinsics(size)?;
     let (width, height) = (size.0 as u32, size.1 as u32);
-    let shape = intrinsics.unwrap_or_else(|| CameraModel::pinhole(width, height, 1.0));
-    let lens = match shape.distortion {
-        Distortion::None => LensModel::Pinhole,
-        Distortion::BrownConrady(k) => LensModel::BrownConrady(k),
-        Distortion::KannalaBrandt(k) => LensModel::KannalaBrandt(k),
-    };
-    let body_from_camera = config.body_from_camera();
-    let origin = body_from_camera.origin();
-    Ok(CameraInfo {
-        camera: config.instance().to_owned(),
-        width,
-        height,
-        focal_px: intrinsics.map(|camera| [camera.fx, camera.fy]),
-        principal_px: [shape.cx, shape.cy],
-        lens,
-        body_from_camera: Transform3 {
-            translation_m: [origin.x(), origin.y(), origin.z()],
-            rotation_wxyz: body_from_camera.rotation().wxyz(),
-        },
-    })
+    let model = intrinsics.unwrap_or_else(|| CameraModel::pinhole(width, height, 1.0));
+    let info = CameraInfo::new(config.instance(), &model, &config.body_from_camera());
+    let focal_px = info.focal_px.filter(|_| intrinsics.is_some());
+    Ok(CameraInfo { width, height, focal_px, ..info })
 }
 
 /// Reads frames and publishes them.
@@ -388,12 +372,7 @@ impl Stream {
 
 /// The format of a frame by the bits of its raw samples; images that are not raw are published in grey.
 fn pixel_format(raw_bits: Option<u32>, bayer: Option<Mosaic>) -> PixelFormat {
-    let pattern = bayer.map(|bayer| match bayer {
-        Mosaic::Rggb => BayerPattern::Rggb,
-        Mosaic::Grbg => BayerPattern::Grbg,
-        Mosaic::Gbrg => BayerPattern::Gbrg,
-        Mosaic::Bggr => BayerPattern::Bggr,
-    });
+    let pattern = bayer.map(BayerPattern::from);
     match (raw_bits, pattern) {
         (Some(9..), Some(pattern)) => PixelFormat::Bayer16(pattern),
         (Some(9..), None) => PixelFormat::Mono16,

@@ -5,6 +5,8 @@
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
 
+use messages::Phase;
+
 use crate::config::LandingTargetSettings;
 
 /// The parameters of ArduPilot that decide whether it listens.
@@ -160,7 +162,7 @@ impl Feed {
     }
 
     /// The phase and the reason for it, in words; `problem` is what keeps the autopilot from listening.
-    pub fn phase(&self, now_ns: i64, problem: Option<String>) -> (&'static str, String) {
+    pub fn phase(&self, now_ns: i64, problem: Option<String>) -> (Phase, String) {
         let told = if self.is_fed(now_ns) {
             "the autopilot is told the landing point"
         } else {
@@ -168,21 +170,21 @@ impl Feed {
         };
         match &self.part {
             Part::Waits => (
-                "idle",
+                Phase::Idle,
                 problem.unwrap_or_else(|| {
                     format!("waiting for LAND by the pilot, a mission or a start; {told}")
                 }),
             ),
             Part::Steadies(_) => (
-                "approach",
+                Phase::Approach,
                 problem.unwrap_or_else(|| {
                     format!("waiting until the autopilot knows the target; {told}")
                 }),
             ),
-            Part::Asks(_) => ("final", "asking for LAND".to_owned()),
-            Part::Lands => ("final", format!("the autopilot lands by itself; {told}")),
-            Part::Landed => ("landed", "landed and disarmed".to_owned()),
-            Part::Recalls(_, why) | Part::Ended(why) => ("aborted", why.clone()),
+            Part::Asks(_) => (Phase::Final, "asking for LAND".to_owned()),
+            Part::Lands => (Phase::Final, format!("the autopilot lands by itself; {told}")),
+            Part::Landed => (Phase::Landed, "landed and disarmed".to_owned()),
+            Part::Recalls(_, why) | Part::Ended(why) => (Phase::Aborted, why.clone()),
         }
     }
 

@@ -13,10 +13,13 @@ use autopilot::{
     TakeoffError, TakeoffProgress,
 };
 use geometry::Vector;
-use landing::{Action, Decision, Event as LanderEvent, Lander, OperatorCommand, Phase, Timestamp};
+use landing::{
+    Action, Decision, Event as LanderEvent, Lander, OperatorCommand, Phase as LanderPhase,
+    Timestamp,
+};
 use messages::{
-    CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo, Place,
-    Setpoint, TargetEstimate,
+    CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo, Phase,
+    Place, Setpoint, TargetEstimate,
 };
 use node::{HealthCounters, clock_name};
 
@@ -374,9 +377,6 @@ impl Flight {
             ControllerCommand::PreferDetectors(place) => {
                 Ok(self.selection.prefer_place(now_ns, *place))
             }
-            ControllerCommand::SetParameter { key, .. } => Err(format!(
-                "`{key}` cannot be changed while the controller runs; start it with --set {key}=VALUE"
-            )),
         };
         self.use_newest(now_ns);
         match result {
@@ -430,7 +430,7 @@ impl Flight {
         let (phase, why) = self.phase(now_ns);
         ControllerStatus {
             stamp_ns: now_ns,
-            phase: phase.to_owned(),
+            phase,
             why,
             guidance: match self.config.mode {
                 Mode::Guided => self.config.guidance.name().to_owned(),
@@ -454,31 +454,35 @@ impl Flight {
         }
     }
 
-    fn phase(&self, now_ns: i64) -> (&'static str, String) {
+    fn phase(&self, now_ns: i64) -> (Phase, String) {
         match &self.mission {
             Mission::AwaitsCommand | Mission::AwaitsAir | Mission::Feeds
                 if let Some(feed) = &self.feed =>
             {
                 feed.phase(now_ns, feed::problem(&self.autopilot))
             }
-            Mission::Feeds => ("failed", "no landing target is told in this mode".to_owned()),
-            Mission::AwaitsCommand => ("idle", "waiting for the start of a landing".to_owned()),
-            Mission::AwaitsAir => ("idle", "waiting for the vehicle to fly in GUIDED".to_owned()),
-            Mission::TakesOff { why, .. } => ("takeoff", why.clone()),
-            Mission::Failed { why } => ("failed", why.clone()),
+            Mission::Feeds => (Phase::Failed, "no landing target is told in this mode".to_owned()),
+            Mission::AwaitsCommand => {
+                (Phase::Idle, "waiting for the start of a landing".to_owned())
+            }
+            Mission::AwaitsAir => {
+                (Phase::Idle, "waiting for the vehicle to fly in GUIDED".to_owned())
+            }
+            Mission::TakesOff { why, .. } => (Phase::Takeoff, why.clone()),
+            Mission::Failed { why } => (Phase::Failed, why.clone()),
             Mission::Lands if self.is_landing() && self.selection.is_blind() => {
                 let why = "no detector is alive, nothing descends".to_owned();
-                (self.lander.phase().name(), why)
+                (wire::phase(self.lander.phase()), why)
             }
             Mission::Lands => {
                 let mut why = self.decision.map_or_else(String::new, |d| d.why.to_string());
-                if self.lander.phase() == Phase::PilotInCommand
+                if self.lander.phase() == LanderPhase::PilotInCommand
                     && let Some(state) = self.autopilot.state()
                 {
                     // It may as well be the autopilot's failsafe: when PX4 misses setpoints it leaves OFFBOARD.
                     why = format!("{why} (or the autopilot's failsafe), in {}", state.mode);
                 }
-                (self.lander.phase().name(), why)
+                (wire::phase(self.lander.phase()), why)
             }
         }
     }
@@ -539,7 +543,10 @@ impl Flight {
         self.begin(now_ns);
         let why = self.decision.map_or_else(String::new, |d| d.why.to_string());
         match self.lander.phase() {
-            Phase::Idle | Phase::Landed | Phase::PilotInCommand | Phase::Aborted => {
+            LanderPhase::Idle
+            | LanderPhase::Landed
+            | LanderPhase::PilotInCommand
+            | LanderPhase::Aborted => {
                 self.mission = if awaits_air { Mission::AwaitsAir } else { Mission::AwaitsCommand };
                 self.started_ns = None;
                 Err(format!("no landing was started: {why}"))
@@ -682,7 +689,7 @@ impl Flight {
                             // The news of the mode may be newer than the state that the lander knows.
                             if is_up
                                 && matches!(self.mission, Mission::Lands)
-                                && self.lander.phase() == Phase::Idle
+                                && self.lander.phase() == LanderPhase::Idle
                             {
                                 self.mission = Mission::AwaitsAir;
                                 self.started_ns = None;
@@ -831,7 +838,7 @@ impl Flight {
             Action::Velocity { velocity, yaw_rate } => {
                 let velocity = match self.selection.is_blind() {
                     // A search without a detector finds nothing.
-                    true if decision.phase == Phase::Search => Vector::zero(),
+                    true if decision.phase == LanderPhase::Search => Vector::zero(),
                     true => level(velocity),
                     false => velocity,
                 };
@@ -864,7 +871,7 @@ impl Flight {
                 });
             }
             // LAND was asked for and has just begun.
-            Err(_) if self.lander.phase() == Phase::Final => self.setpoint = None,
+            Err(_) if self.lander.phase() == LanderPhase::Final => self.setpoint = None,
             Err(problem) => {
                 self.setpoint = None;
                 if self.health.failed("setpoints") {
@@ -908,7 +915,7 @@ mod tests {
         MavType, PARAM_VALUE_DATA, SYS_STATUS_DATA,
     };
     use autopilot::{Parser, Sender};
-    use messages::{Detection, FrameHeader, MarkerPose, PixelFormat, Transform3};
+    use messages::{Detection, FrameHeader};
     use node::Layers;
 
     const MS: i64 = 1_000_000;
@@ -995,10 +1002,10 @@ mod tests {
             let mut flight = in_flight(start);
             flight.tick(2 * MS);
             let status = flight.status(2 * MS);
-            assert!(!status.finished && status.phase != "search", "{status:?}");
+            assert!(!status.finished && status.phase != Phase::Search, "{status:?}");
             pose(&mut flight, 30 * MS);
             flight.tick(31 * MS);
-            assert_eq!(flight.status(31 * MS).phase, "search");
+            assert_eq!(flight.status(31 * MS).phase, Phase::Search);
             assert_eq!(sent(&mut flight).0, 1);
         }
     }
@@ -1015,7 +1022,7 @@ mod tests {
             pose(&mut flight, now_ns);
             flight.tick(now_ns + 2);
         }
-        assert_eq!(flight.status(3000 * MS).phase, "pilot-in-command");
+        assert_eq!(flight.status(3000 * MS).phase, Phase::PilotInCommand);
         assert_eq!(sent(&mut flight), (0, vec![]));
     }
 
@@ -1032,7 +1039,7 @@ mod tests {
                 flight.tick(now_ns + 2);
             }
             let status = flight.status(2030 * MS);
-            assert_eq!(status.phase, "search");
+            assert_eq!(status.phase, Phase::Search);
             status.setpoint.unwrap().velocity_ned_m_s
         };
         assert_eq!(searched(5.0, false), [0.0; 3]);
@@ -1058,7 +1065,7 @@ mod tests {
         hear(&mut flight, 11 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         pose(&mut flight, 12 * MS);
         flight.tick(13 * MS);
-        assert_eq!(flight.status(13 * MS).phase, "search");
+        assert_eq!(flight.status(13 * MS).phase, Phase::Search);
     }
 
     #[test]
@@ -1066,30 +1073,9 @@ mod tests {
         let mut flight = in_flight("airborne");
         let now_ns = 1000 * MS;
         let seen = |stamp_ns: i64| Detections {
-            detector: "main".into(),
-            header: FrameHeader {
-                camera: "down".into(),
-                sequence: 0,
-                stamp_ns,
-                clock: clock_name().into(),
-                exposure_ns: 0,
-                width: 64,
-                height: 48,
-                format: PixelFormat::Mono8,
-                parts: Vec::new(),
-            },
-            detections: vec![Detection {
-                family: "rings".into(),
-                id: None,
-                centre_px: [1.0, 2.0],
-                centre_covariance_px2: [1.0, 0.0, 1.0],
-                corners_px: None,
-                size_px: 3.0,
-                wrong_bits: 0,
-                confidence: 1.0,
-                pose: None,
-            }],
-            stages: Vec::new(),
+            header: FrameHeader { width: 64, height: 48, ..header(stamp_ns) },
+            detections: vec![Detection { pose: None, ..Detection::sample() }],
+            ..Detections::sample()
         };
         for stamp_ns in [i64::MAX, now_ns + 10_000 * MS, now_ns + 60 * MS] {
             flight.detections(now_ns, "main", &seen(stamp_ns));
@@ -1106,68 +1092,13 @@ mod tests {
         assert_eq!(flight.status(now_ns).candidates.len(), 1);
     }
 
-    /// A frame in which the marker lies 5 m below a camera at the body's origin.
-    fn seen(stamp_ns: i64) -> Detections {
-        let mut covariance = [0.0; 21];
-        for diagonal in [0, 6, 11] {
-            covariance[diagonal] = 1e-4;
-        }
-        let pose = MarkerPose {
-            camera_from_marker: Transform3 {
-                translation_m: [0.2, 0.1, 5.0],
-                rotation_wxyz: [0.0, 1.0, 0.0, 0.0],
-            },
-            reprojection_rms_px: 0.1,
-            covariance,
-            alternative: None,
-        };
-        Detections {
-            detector: "main".into(),
-            header: FrameHeader {
-                camera: "down".into(),
-                sequence: 0,
-                stamp_ns,
-                clock: clock_name().into(),
-                exposure_ns: 0,
-                width: 1296,
-                height: 972,
-                format: PixelFormat::Mono8,
-                parts: Vec::new(),
-            },
-            detections: vec![Detection {
-                family: "rings".into(),
-                id: None,
-                centre_px: [720.0, 522.0],
-                centre_covariance_px2: [0.04, 0.0, 0.04],
-                corners_px: None,
-                size_px: 55.0,
-                wrong_bits: 0,
-                confidence: 1.0,
-                pose: Some(pose),
-            }],
-            stages: Vec::new(),
-        }
+    fn header(stamp_ns: i64) -> FrameHeader {
+        FrameHeader { stamp_ns, clock: clock_name().into(), ..FrameHeader::sample() }
     }
 
-    fn camera() -> CameraInfo {
-        CameraInfo {
-            camera: "down".into(),
-            width: 1296,
-            height: 972,
-            focal_px: Some([1818.0; 2]),
-            principal_px: [647.5, 485.5],
-            lens: messages::LensModel::Pinhole,
-            // Image right is the vehicle's right, image up its forward.
-            body_from_camera: Transform3 {
-                translation_m: [0.0; 3],
-                rotation_wxyz: [
-                    std::f64::consts::FRAC_1_SQRT_2,
-                    0.0,
-                    0.0,
-                    std::f64::consts::FRAC_1_SQRT_2,
-                ],
-            },
-        }
+    /// A frame in which the marker lies 5 m below a camera at the body's origin.
+    fn seen(stamp_ns: i64) -> Detections {
+        Detections { header: header(stamp_ns), ..Detections::sample() }
     }
 
     /// Hovers in view of the marker for so long, in the autopilot's mode of this number.
@@ -1225,7 +1156,7 @@ mod tests {
 
     fn feeding(start: &str) -> Flight {
         let mut flight = flight_with(start, &["mode=landing-target"]);
-        flight.camera(camera());
+        flight.camera(CameraInfo::sample());
         flight.presence(0, "main", true);
         hear(&mut flight, 0, &heartbeat(4, true));
         hear(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
@@ -1252,11 +1183,11 @@ mod tests {
         let stamps = heard.targets.windows(2).all(|pair| pair[0].time_usec <= pair[1].time_usec);
         assert!(stamps, "of one steady clock");
         hover(&mut flight, 6000, 7000, 9);
-        assert_eq!(flight.status(7000 * MS).phase, "final");
+        assert_eq!(flight.status(7000 * MS).phase, Phase::Final);
         hear(&mut flight, 8000 * MS, &heartbeat(9, false));
         flight.tick(8001 * MS);
         let status = flight.status(8001 * MS);
-        assert!(status.phase == "landed" && status.finished, "{status:?}");
+        assert!(status.phase == Phase::Landed && status.finished, "{status:?}");
         assert_eq!(status.guidance, "landing-target");
     }
 
@@ -1287,11 +1218,11 @@ mod tests {
         hover(&mut flight, 1000, 4000, 4);
         let heard = hover(&mut flight, 4000, 5000, 9);
         assert!(heard.targets.len() > 10 && heard.modes.is_empty());
-        assert_eq!(flight.status(5000 * MS).phase, "final");
+        assert_eq!(flight.status(5000 * MS).phase, Phase::Final);
         assert!(flight.command(5000 * MS, &ControllerCommand::Abort).accepted);
         let heard = hover(&mut flight, 5020, 5500, 9);
         assert_eq!(heard.modes, [4.0], "GUIDED");
-        assert_eq!(flight.status(5500 * MS).phase, "aborted");
+        assert_eq!(flight.status(5500 * MS).phase, Phase::Aborted);
     }
 
     #[test]
@@ -1301,12 +1232,12 @@ mod tests {
         hear(&mut flight, 0, &heartbeat(4, true));
         hear(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         hover(&mut flight, 1000, 2000, 4);
-        assert_eq!(flight.status(2000 * MS).phase, "search");
+        assert_eq!(flight.status(2000 * MS).phase, Phase::Search);
         let battery = SYS_STATUS_DATA { battery_remaining: 15, ..Default::default() };
         hear(&mut flight, 2000 * MS, &MavMessage::SYS_STATUS(battery));
         hover(&mut flight, 2000, 3500, 4);
         let status = flight.status(3500 * MS);
-        assert_eq!((status.phase.as_str(), status.why.as_str()), ("hold", "the battery is low"));
+        assert_eq!((status.phase, status.why.as_str()), (Phase::Hold, "the battery is low"));
     }
 
     #[test]
@@ -1315,13 +1246,13 @@ mod tests {
         hear(&mut flight, 0, &heartbeat(9, true));
         hear(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_LANDING));
         hover(&mut flight, 20, 1000, 9);
-        assert_eq!(flight.status(1000 * MS).phase, "idle");
+        assert_eq!(flight.status(1000 * MS).phase, Phase::Idle);
         hear(&mut flight, 1000 * MS, &heartbeat(9, false));
         hear(&mut flight, 1001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
         hear(&mut flight, 5000 * MS, &heartbeat(4, true));
         hear(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         hover(&mut flight, 5020, 5500, 4);
-        assert_eq!(flight.status(5500 * MS).phase, "search");
+        assert_eq!(flight.status(5500 * MS).phase, Phase::Search);
     }
 
     #[test]
@@ -1345,14 +1276,14 @@ mod tests {
         let (flying, landing) =
             (MavLandedState::MAV_LANDED_STATE_IN_AIR, MavLandedState::MAV_LANDED_STATE_LANDING);
         for (start, mode, contact, first, next) in [
-            ("resume", 4, flying, "search", "landed"),
-            ("resume", 5, flying, "idle", "idle"),
-            ("resume", 9, landing, "idle", "idle"),
-            ("airborne", 4, flying, "search", "search"),
-            ("airborne", 5, flying, "idle", "search"),
+            ("resume", 4, flying, Phase::Search, Phase::Landed),
+            ("resume", 5, flying, Phase::Idle, Phase::Idle),
+            ("resume", 9, landing, Phase::Idle, Phase::Idle),
+            ("airborne", 4, flying, Phase::Search, Phase::Search),
+            ("airborne", 5, flying, Phase::Idle, Phase::Search),
         ] {
             let phases = next_flight(start, mode, contact);
-            assert_eq!((phases.0.as_str(), phases.1.as_str()), (first, next), "{start} in {mode}");
+            assert_eq!(phases, (first, next), "{start} in {mode}");
         }
     }
 
@@ -1375,10 +1306,10 @@ mod tests {
         let on_ground = MavLandedState::MAV_LANDED_STATE_ON_GROUND;
         for mode in [4, 9] {
             let (first, next) = first_and_next(mode, on_ground);
-            assert_eq!((first.as_str(), next.as_str()), ("idle", "idle"), "in mode {mode}");
+            assert_eq!((first, next), (Phase::Idle, Phase::Idle), "in mode {mode}");
         }
         let (first, _) = first_and_next(4, MavLandedState::MAV_LANDED_STATE_IN_AIR);
-        assert_eq!(first, "search");
+        assert_eq!(first, Phase::Search);
     }
 
     #[test]
@@ -1392,7 +1323,7 @@ mod tests {
             hear(&mut flight, MS, &contact(contact_at_start));
             pose_at(&mut flight, 20 * MS, 0.5);
             flight.tick(21 * MS);
-            assert_eq!(flight.status(21 * MS).phase, "final");
+            assert_eq!(flight.status(21 * MS).phase, Phase::Final);
         }
     }
 

@@ -3,25 +3,15 @@
 use autopilot::VehicleState;
 use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform, Vector};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp};
-use messages::{CameraInfo, Detection, Detections, MarkerPose, Transform3};
+use messages::{CameraInfo, Detection, Detections, MarkerPose, Phase, Transform3};
 use nalgebra::Matrix3;
 
 /// Attitude and position further apart than this are not of one moment: one of the two has stopped.
 const MOST_APART_NS: i64 = 300_000_000;
 
-/// A transform as a message tells it; `None` when its numbers make none.
-pub fn transform<To: geometry::Frame, From: geometry::Frame>(
-    wire: &Transform3,
-) -> Option<Transform<To, From>> {
-    let [x, y, z] = wire.translation_m;
-    let origin = Point::new(x, y, z);
-    let rotation = Rotation::from_wxyz(wire.rotation_wxyz)?;
-    origin.is_finite().then(|| Transform::new(rotation, origin))
-}
-
 /// Where a camera is mounted.
 pub fn body_from_camera(info: &CameraInfo) -> Option<Transform<Body, Camera>> {
-    transform(&info.body_from_camera)
+    info.body_from_camera.transform()
 }
 
 /// A marker's name, `family` or `family:id`, in its parts.
@@ -52,7 +42,7 @@ pub fn marker_in_frame(
     mount: Option<Transform<Body, Camera>>,
 ) -> MarkerInFrame {
     let in_body = |pose: &Transform3| -> Option<Transform<Body, Marker>> {
-        mount.zip(transform(pose)).map(|(mount, pose): (_, Transform<Camera, Marker>)| mount * pose)
+        mount.zip(pose.transform::<Camera, _>()).map(|(mount, pose)| mount * pose)
     };
     let pose = detection.pose.as_ref();
     let [x, y] = detection.centre_px;
@@ -70,12 +60,26 @@ pub fn marker_in_frame(
 
 /// Covariance of a marker's place, from the camera's axes to the body's.
 fn covariance_in_body(mount: &Transform<Body, Camera>, pose: &MarkerPose) -> Matrix3<f64> {
-    let [xx, xy, xz, _, _, _, yy, yz, _, _, _, zz, ..] = pose.covariance.map(f64::from);
-    let in_camera = Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz);
     let axis = |x, y, z| (mount.rotation() * Vector::<Camera>::new(x, y, z)).coords;
     let turn =
         Matrix3::from_columns(&[axis(1.0, 0.0, 0.0), axis(0.0, 1.0, 0.0), axis(0.0, 0.0, 1.0)]);
-    turn * in_camera * turn.transpose()
+    turn * pose.translation_covariance_m2() * turn.transpose()
+}
+
+/// The lander's phase as it is sent.
+pub fn phase(phase: landing::Phase) -> Phase {
+    match phase {
+        landing::Phase::Idle => Phase::Idle,
+        landing::Phase::Search => Phase::Search,
+        landing::Phase::Approach => Phase::Approach,
+        landing::Phase::Descend => Phase::Descend,
+        landing::Phase::Retry => Phase::Retry,
+        landing::Phase::Final => Phase::Final,
+        landing::Phase::Landed => Phase::Landed,
+        landing::Phase::Hold => Phase::Hold,
+        landing::Phase::Aborted => Phase::Aborted,
+        landing::Phase::PilotInCommand => Phase::PilotInCommand,
+    }
 }
 
 /// The vehicle as the lander sees it: attitude and position at one moment, that of the newer of the two; `None` when
@@ -135,42 +139,17 @@ pub fn vehicle_message(state: &VehicleState) -> Option<messages::VehicleState> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{FrameHeader, PixelFormat};
-
-    fn detection(family: &str, id: Option<u32>) -> Detection {
-        Detection {
-            family: family.into(),
-            id,
-            centre_px: [1.0, 2.0],
-            centre_covariance_px2: [1.0, 0.0, 1.0],
-            corners_px: None,
-            size_px: 3.0,
-            wrong_bits: 0,
-            confidence: 1.0,
-            pose: None,
-        }
-    }
 
     #[test]
     fn the_wanted_marker_is_found_by_family_and_id() {
-        let header = FrameHeader {
-            camera: "down".into(),
-            sequence: 0,
-            stamp_ns: 0,
-            clock: "c".into(),
-            exposure_ns: 0,
-            width: 1,
-            height: 1,
-            format: PixelFormat::Mono8,
-            parts: Vec::new(),
-        };
+        let detection =
+            |family: &str, id| Detection { family: family.into(), id, ..Detection::sample() };
         let detections = vec![
             detection("aruco-4x4-50", Some(3)),
             detection("aruco-4x4-50", Some(7)),
             detection("rings", None),
         ];
-        let message =
-            Detections { detector: "main".into(), header, detections, stages: Vec::new() };
+        let message = Detections { detections, ..Detections::sample() };
         let id = |marker: &str| wanted(&message, marker).map(|d| d.id);
         assert_eq!(id("rings"), Some(None));
         assert_eq!(id("aruco-4x4-50:7"), Some(Some(7)));
@@ -210,16 +189,5 @@ mod tests {
         assert!((seen.position.x() - 0.1).abs() < 1e-9);
         assert!(vehicle(&at(1301, 1000)).is_none());
         assert!(vehicle(&at(1000, 1301)).is_none());
-    }
-
-    #[test]
-    fn numbers_that_make_no_transform_make_none() {
-        let good =
-            Transform3 { translation_m: [0.0, 0.0, 1.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
-        assert!(transform::<Body, Camera>(&good).is_some());
-        let nan = Transform3 { translation_m: [f64::NAN, 0.0, 1.0], ..good };
-        assert!(transform::<Body, Camera>(&nan).is_none());
-        let flat = Transform3 { rotation_wxyz: [0.0; 4], ..good };
-        assert!(transform::<Body, Camera>(&flat).is_none());
     }
 }

@@ -15,8 +15,8 @@ use geometry::CameraModel;
 use imaging::{Converter, GrayImage, GrayView};
 use markers::Pad;
 use messages::{
-    CameraInfo, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo, FrameHeader,
-    FramePart, FrameReceipt, PixelFormat, StageTime, topic,
+    CameraInfo, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo, FrameAck,
+    FrameHeader, FramePart, PixelFormat, StageTime, topic,
 };
 use node::{
     Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
@@ -151,7 +151,7 @@ struct Work {
     node: Node,
     frames: FrameSubscriber,
     detections: Publisher<Detections>,
-    receipts: Publisher<FrameReceipt>,
+    acks: Publisher<FrameAck>,
     debug: Vec<(&'static str, FramePublisher)>,
     camera: Arc<Mutex<Option<CameraInfo>>>,
     change: Arc<Mutex<Option<Change>>>,
@@ -190,7 +190,7 @@ impl Work {
             node: node.clone(),
             frames: node.frame_subscriber(frames, &[&config.camera]).await?,
             detections: node.publisher(topic::DETECTIONS, &[&config.id]).await?,
-            receipts: node.publisher(topic::RECEIVED, &[&config.id]).await?,
+            acks: node.publisher(topic::FRAME_ACK, &[&config.id]).await?,
             debug,
             camera,
             change,
@@ -222,14 +222,14 @@ impl Work {
     }
 
     /// Searches a frame, or one that waits behind it if that is newer: over the air they may come in any order. Each of them
-    /// gets its receipt.
+    /// is acknowledged.
     async fn search_newest(&mut self, first: Frame) {
         let mut newest = None;
         let mut next = Some(first);
         while let Some(frame) = next {
             let is_jpeg = frame.header.format == PixelFormat::Jpeg;
             if is_jpeg {
-                self.receipts.publish(&self.receipt(&frame)).await;
+                self.acks.publish(&self.ack(&frame)).await;
             }
             let is_overtaken = is_jpeg && self.is_overtaken(&frame.header);
             let left_out = if is_overtaken { Some(frame) } else { newest.replace(frame) };
@@ -256,7 +256,7 @@ impl Work {
         }
         let bytes = frame.bytes();
         let FrameHeader { width, height, format, .. } = frame.header;
-        let Some(format) = wire::sample_format(format) else {
+        let Some(format) = format.sample_format() else {
             health.dropped("frames in a pixel format that is not searched");
             return;
         };
@@ -334,9 +334,9 @@ impl Work {
         told(&found, &self.pads, whole.as_ref(), self.config.least_confidence)
     }
 
-    fn receipt(&self, frame: &Frame) -> FrameReceipt {
+    fn ack(&self, frame: &Frame) -> FrameAck {
         let FrameHeader { camera, sequence, stamp_ns, clock, .. } = &frame.header;
-        FrameReceipt {
+        FrameAck {
             camera: camera.clone(),
             sequence: *sequence,
             stamp_ns: *stamp_ns,
@@ -387,7 +387,7 @@ impl Work {
     /// The camera's model, when it is calibrated for frames of this size.
     fn camera_model(&self, header: &FrameHeader) -> Option<CameraModel> {
         let info = lock(&self.camera);
-        let model = wire::camera_model(info.as_ref()?)?;
+        let model = info.as_ref()?.model()?;
         if (model.width, model.height) == (header.width, header.height) {
             return Some(model);
         }

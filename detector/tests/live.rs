@@ -74,15 +74,13 @@ async fn film(frames: FramePublisher, format: PixelFormat, bytes: Vec<u8>) {
         let mut loan = frames.loan(bytes.len());
         loan.copy_from_slice(&bytes);
         let header = FrameHeader {
-            camera: "down".into(),
             sequence,
             stamp_ns: now_ns(),
             clock: clock_name().into(),
-            exposure_ns: 0,
             width: 640,
             height: 480,
             format,
-            parts: Vec::new(),
+            ..FrameHeader::sample()
         };
         frames.publish(&header, loan).await;
         tokio::time::sleep(Duration::from_millis(50)).await;

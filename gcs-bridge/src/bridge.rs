@@ -10,7 +10,7 @@ use autopilot::dialect::{MavMessage, MavSeverity, MavState};
 use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
 use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Sender};
-use messages::{ControllerStatus, MavlinkBytes, TargetEstimate, topic};
+use messages::{ControllerStatus, MavlinkBytes, Phase, TargetEstimate, topic};
 use node::{HealthCounters, Node, Shutdown, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
 
@@ -267,8 +267,10 @@ impl Bridge {
     }
 
     fn heartbeat(&self) -> MavMessage {
-        let lands =
-            self.status.as_ref().is_some_and(|status| !status.finished && status.phase != "idle");
+        let lands = self
+            .status
+            .as_ref()
+            .is_some_and(|status| !status.finished && status.phase != Phase::Idle);
         let mut message = heartbeat();
         if let MavMessage::HEARTBEAT(heartbeat) = &mut message
             && !lands

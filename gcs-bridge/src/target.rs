@@ -68,14 +68,7 @@ mod tests {
             lateral_error_m: Some(3.0),
             height_m: Some(4.0),
             age_ms: Some(40.0),
-            rejected: None,
-            decided: None,
-            velocity_ned_m_s: None,
-            deviation_m: None,
-            heading_rad: None,
-            nis: None,
-            time_offset_ms: None,
-            wind_ned_m_s: None,
+            ..TargetEstimate::sample()
         }
     }
 

@@ -2,7 +2,7 @@
 
 use autopilot::compose::status_text;
 use autopilot::dialect::{MavMessage, MavSeverity};
-use messages::ControllerStatus;
+use messages::{ControllerStatus, Phase};
 
 /// Characters in one text, which fit four packets; what is longer is cut.
 const LONGEST: usize = 199;
@@ -38,7 +38,7 @@ impl Teller {
         // A height that changes while everything else stays is no news.
         let news: String = text.chars().filter(|c| !c.is_ascii_digit()).collect();
         if self.told.as_ref() != Some(&news)
-            && let Some(text) = self.say(now_ns, severity(&status.phase), &text)
+            && let Some(text) = self.say(now_ns, severity(status.phase), &text)
         {
             packets.extend(text);
             self.told = Some(news);
@@ -88,11 +88,11 @@ impl Teller {
 }
 
 /// How loud a phase is told; a ground station reads warnings and worse aloud.
-fn severity(phase: &str) -> MavSeverity {
+fn severity(phase: Phase) -> MavSeverity {
     match phase {
-        "aborted" | "failed" => MavSeverity::MAV_SEVERITY_CRITICAL,
-        "hold" => MavSeverity::MAV_SEVERITY_WARNING,
-        "landed" | "pilot-in-command" => MavSeverity::MAV_SEVERITY_NOTICE,
+        Phase::Aborted | Phase::Failed => MavSeverity::MAV_SEVERITY_CRITICAL,
+        Phase::Hold => MavSeverity::MAV_SEVERITY_WARNING,
+        Phase::Landed | Phase::PilotInCommand => MavSeverity::MAV_SEVERITY_NOTICE,
         _ => MavSeverity::MAV_SEVERITY_INFO,
     }
 }
@@ -121,9 +121,9 @@ fn plain(c: char) -> char {
 mod tests {
     use super::*;
 
-    fn status(phase: &str, why: &str, detector: Option<&str>) -> ControllerStatus {
+    fn status(phase: Phase, why: &str, detector: Option<&str>) -> ControllerStatus {
         ControllerStatus {
-            phase: phase.into(),
+            phase,
             why: why.into(),
             active_detector: detector.map(Into::into),
             ..ControllerStatus::default()
@@ -148,15 +148,15 @@ mod tests {
     #[test]
     fn a_phase_and_its_reason_are_told_once() {
         let mut teller = Teller::new(0);
-        let search = status("search", "looking for the marker", None);
+        let search = status(Phase::Search, "looking for the marker", None);
         let told = join(&teller.status(0, &search));
         assert_eq!(told.len(), 1);
         assert_eq!(told[0].1, "Alight: search: looking for the marker");
         assert!(teller.status(0, &search).is_empty());
-        let told = join(&teller.status(0, &status("search", "waiting 1 s", None)));
+        let told = join(&teller.status(0, &status(Phase::Search, "waiting 1 s", None)));
         assert_eq!(told[0].1, "Alight: search: waiting 1 s");
-        assert!(teller.status(0, &status("search", "waiting 2 s", None)).is_empty());
-        let told = join(&teller.status(0, &status("aborted", "", None)));
+        assert!(teller.status(0, &status(Phase::Search, "waiting 2 s", None)).is_empty());
+        let told = join(&teller.status(0, &status(Phase::Aborted, "", None)));
         assert_eq!(told, [(MavSeverity::MAV_SEVERITY_CRITICAL, "Alight: aborted".to_owned())]);
         teller.forget();
         assert_eq!(join(&teller.status(0, &search)).len(), 1);
@@ -165,15 +165,15 @@ mod tests {
     #[test]
     fn the_active_detector_is_told_when_it_changes() {
         let mut teller = Teller::new(0);
-        let told = join(&teller.status(0, &status("search", "", Some("main"))));
+        let told = join(&teller.status(0, &status(Phase::Search, "", Some("main"))));
         assert_eq!(told[1].1, "Alight: detector main");
-        let told = join(&teller.status(0, &status("search", "", Some("spare"))));
+        let told = join(&teller.status(0, &status(Phase::Search, "", Some("spare"))));
         assert_eq!(told[0].1, "Alight: detector spare");
-        let mut changed = status("search", "", Some("main"));
+        let mut changed = status(Phase::Search, "", Some("main"));
         changed.detector_why = "spare has gone".into();
         let told = join(&teller.status(0, &changed));
         assert_eq!(told[0].1, "Alight: detector main: spare has gone");
-        let told = join(&teller.status(0, &status("search", "", None)));
+        let told = join(&teller.status(0, &status(Phase::Search, "", None)));
         assert_eq!(told, [(MavSeverity::MAV_SEVERITY_WARNING, "Alight: no detector".to_owned())]);
     }
 
@@ -183,12 +183,12 @@ mod tests {
         let mut told = 0;
         // Ten seconds of changes at 20 Hz.
         for i in 0..200 {
-            let phase = ["approach", "descend"][i % 2];
+            let phase = [Phase::Approach, Phase::Descend][i % 2];
             told += teller.status(i as i64 * 50_000_000, &status(phase, "", None)).len();
         }
         assert!(told <= BURST as usize + 20, "{told}");
         // The bucket is empty, and yet the last phase comes through once there is room.
-        let last = status("landed", "", None);
+        let last = status(Phase::Landed, "", None);
         assert_eq!(join(&teller.status(60_000_000_000, &last))[0].1, "Alight: landed");
     }
 

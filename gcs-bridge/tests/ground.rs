@@ -12,7 +12,7 @@ use autopilot::dialect::{
 use autopilot::packet::encode;
 use autopilot::{Packet, Parser, Sender};
 use gcs_bridge::Config;
-use messages::{ControllerStatus, MavlinkBytes, TargetEstimate, topic};
+use messages::{ControllerStatus, MavlinkBytes, Phase, TargetEstimate, topic};
 use node::{Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
 use testing::ports;
 use tokio::net::UdpSocket;
@@ -44,7 +44,7 @@ async fn the_ground_hears_the_companion_and_the_vehicle_as_it_spoke() -> anyhow:
 
     ground.expect_text("Alight: search: looking for the marker").await?;
     let why = "1.93 m beside the marker, which is more than the 0.35 m of the funnel";
-    vehicle.status.send_replace(status("approach", why));
+    vehicle.status.send_replace(status(Phase::Approach, why));
     ground.expect_text(&format!("Alight: approach: {why}")).await?;
     ground.expect_text("Alight: detector spare").await?;
 
@@ -192,7 +192,7 @@ async fn pymavlink_agrees() -> anyhow::Result<()> {
     // The phases of a landing, again and again, until the script has seen enough.
     let phases = async {
         let mut tick = interval(Duration::from_millis(700));
-        for phase in ["search", "approach", "descend"].into_iter().cycle() {
+        for phase in [Phase::Search, Phase::Approach, Phase::Descend].into_iter().cycle() {
             tick.tick().await;
             vehicle.status.send_replace(status(phase, "so that pymavlink sees it"));
         }
@@ -326,7 +326,7 @@ impl FakeVehicle {
         let node = open("controller", "main", port).await?;
         let first = ControllerStatus {
             active_detector: None,
-            ..status("search", "looking for the marker")
+            ..status(Phase::Search, "looking for the marker")
         };
         let status = Arc::new(watch::Sender::new(first));
         let to_autopilot = node.subscriber(topic::TO_AUTOPILOT, &[]).await?;
@@ -383,10 +383,10 @@ async fn answer_parameters(node: Node) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn status(phase: &str, why: &str) -> ControllerStatus {
+fn status(phase: Phase, why: &str) -> ControllerStatus {
     ControllerStatus {
         stamp_ns: now_ns(),
-        phase: phase.into(),
+        phase,
         why: why.into(),
         guidance: "metric".into(),
         autopilot: "connected".into(),
@@ -401,21 +401,7 @@ fn status(phase: &str, why: &str) -> ControllerStatus {
 }
 
 fn target() -> TargetEstimate {
-    TargetEstimate {
-        stamp_ns: now_ns(),
-        position_ned_m: Some([1.5, -1.5, 0.0]),
-        lateral_error_m: Some(1.93),
-        height_m: Some(10.0),
-        age_ms: Some(60.0),
-        rejected: None,
-        decided: None,
-        velocity_ned_m_s: None,
-        deviation_m: Some(0.02),
-        heading_rad: Some(0.0),
-        nis: Some(3.0),
-        time_offset_ms: Some(0.0),
-        wind_ned_m_s: None,
-    }
+    TargetEstimate { stamp_ns: now_ns(), ..TargetEstimate::sample() }
 }
 
 fn is_heartbeat(packet: &Packet) -> bool {

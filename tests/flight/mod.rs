@@ -8,7 +8,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail, ensure};
-use messages::{ControllerStatus, Truth, topic};
+use messages::{ControllerStatus, Phase, Truth, topic};
 use node::{Identity, Node, Subscriber, ZenohSource, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::sync::{Mutex, mpsc};
@@ -140,7 +140,7 @@ impl Landing {
     /// Waits until the vehicle descends below a height.
     pub(crate) async fn descends_below(&self, height_m: f64) -> anyhow::Result<ControllerStatus> {
         self.status(&format!("it descends below {height_m} m"), |s| {
-            s.phase == "descend" && s.height_m.is_some_and(|h| h < height_m)
+            s.phase == Phase::Descend && s.height_m.is_some_and(|h| h < height_m)
         })
         .await
     }

@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use messages::{ControllerCommand, ControllerStatus, Detections, Health, Touchdown, Truth, topic};
+use messages::{
+    ControllerCommand, ControllerStatus, Detections, Health, Phase, Touchdown, Truth, topic,
+};
 use node::{Subscriber, now_ns};
 use tokio::time::{Instant, timeout, timeout_at};
 
@@ -62,7 +64,7 @@ impl std::fmt::Display for Flight {
             write!(f, "; {} frames, age p50 {p50:.0} p99 {p99:.0} ms", self.frames_received)?;
         }
         if let Some([p50, p99]) = self.round_trip_ms {
-            write!(f, "; to receipt p50 {p50:.0} p99 {p99:.0} ms")?;
+            write!(f, "; to ack p50 {p50:.0} p99 {p99:.0} ms")?;
         }
         let [p50, p99] = [0.5, 0.99].map(|part| self.back.at(part));
         if p50.is_finite() {
@@ -129,7 +131,7 @@ pub(crate) async fn cut(radio: Radio, seed: u64, seconds: f64) -> anyhow::Result
     site.flight(seed, &[])?;
     let statuses = site.node.subscriber(topic::STATUS, &[]).await?;
     until(&statuses, "both detectors are there, on the way down", |s| {
-        s.candidates.len() == 2 && s.phase == "descend"
+        s.candidates.len() == 2 && s.phase == Phase::Descend
     })
     .await?;
     // It waits up there, however long the ground takes to keep up on a busy machine.
@@ -137,13 +139,13 @@ pub(crate) async fn cut(radio: Radio, seed: u64, seconds: f64) -> anyhow::Result
         site.node.command(topic::COMMAND, &[], &command).await?;
     }
     until(&statuses, "the one on the ground is used", |s| {
-        s.active_detector.as_deref() == Some("ground") && s.phase == "hold"
+        s.active_detector.as_deref() == Some("ground") && s.phase == Phase::Hold
     })
     .await?;
     site.node.command(topic::COMMAND, &[], &ControllerCommand::Resume).await?;
     until(&statuses, "it descends by the one on the ground", |s| {
         s.active_detector.as_deref() == Some("ground")
-            && s.phase == "descend"
+            && s.phase == Phase::Descend
             && s.height_m.is_some_and(|height_m| height_m < 8.0)
     })
     .await?;
@@ -320,7 +322,7 @@ impl Flight {
                 self.frames_received = frames.map_or(self.frames_received, |rate| rate.count);
             }
             ("simulator", _) => {
-                self.round_trip_ms = latency("frame sent to receipt").or(self.round_trip_ms);
+                self.round_trip_ms = latency("frame sent to ack").or(self.round_trip_ms);
             }
             _ => {}
         }

@@ -165,12 +165,9 @@ async fn film(publisher: &FramePublisher) {
             camera: "probe".into(),
             sequence,
             stamp_ns,
-            clock: "probe".into(),
-            exposure_ns: 0,
             width: WIDTH,
             height: HEIGHT,
-            format: PixelFormat::Mono8,
-            parts: Vec::new(),
+            ..FrameHeader::sample()
         };
         publisher.publish(&header, pixels).await;
     }

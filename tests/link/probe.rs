@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use messages::{CommandReply, ControllerCommand, FrameReceipt, MavlinkBytes, topic};
+use messages::{CommandReply, ControllerCommand, FrameAck, MavlinkBytes, topic};
 use node::{Identity, Node, now_ns};
 use serde_json::{Value, json};
 use tokio::time::{Instant, interval};
@@ -73,20 +73,14 @@ fn note(times: &Shared, sequence: u64, sent_ns: i64) {
     times.lock().unwrap_or_else(PoisonError::into_inner).add_numbered(sequence, sent_ns);
 }
 
-fn stamped(sequence: u64) -> FrameReceipt {
-    FrameReceipt {
-        camera: "probe".into(),
-        sequence,
-        stamp_ns: now_ns(),
-        clock: "probe".into(),
-        bytes: 0,
-    }
+fn stamped(sequence: u64) -> FrameAck {
+    FrameAck { sequence, stamp_ns: now_ns(), ..FrameAck::sample() }
 }
 
 /// The drone's end: sends as the state of the vehicle goes, and hears what comes as detections do.
 pub(crate) async fn beacon(node: &Node) -> anyhow::Result<Shared> {
-    let sender = node.publisher(topic::RECEIVED, &[DRONE]).await?;
-    let heard = node.subscriber(topic::RECEIVED, &[GROUND]).await?;
+    let sender = node.publisher(topic::FRAME_ACK, &[DRONE]).await?;
+    let heard = node.subscriber(topic::FRAME_ACK, &[GROUND]).await?;
     let back = Shared::default();
     tokio::spawn(async move {
         let mut ticks = interval(PERIOD);
@@ -129,8 +123,8 @@ pub(crate) async fn run(address: &str, seconds: f64, commands: bool) -> anyhow::
     let identity = Identity { service: "alight", instance: "probe".into() };
     let node = Node::open(identity, &ground_network(address).source("alight")?).await?;
     let until = Instant::now() + Duration::from_secs_f64(seconds);
-    let sender = node.publisher(topic::RECEIVED, &[GROUND]).await?;
-    let states = node.subscriber(topic::RECEIVED, &[DRONE]).await?;
+    let sender = node.publisher(topic::FRAME_ACK, &[GROUND]).await?;
+    let states = node.subscriber(topic::FRAME_ACK, &[DRONE]).await?;
     let packets = node.subscriber(topic::FROM_AUTOPILOT, &[]).await?;
     let frames = node.frame_subscriber(topic::JPEG, &["probe"]).await?;
     let (mut state, mut mavlink, mut frame) = <(Times, Times, Times)>::default();

@@ -88,12 +88,8 @@ async fn offer(frames: FramePublisher, rate_hz: f64) {
             camera: "probe".into(),
             sequence,
             stamp_ns: now_ns(),
-            clock: "probe".into(),
-            exposure_ns: 0,
-            width: 1296,
-            height: 972,
             format: PixelFormat::Jpeg,
-            parts: Vec::new(),
+            ..FrameHeader::sample()
         };
         frames.publish(&header, Loan::Private(noise.clone())).await;
     }

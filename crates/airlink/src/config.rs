@@ -18,11 +18,11 @@ pub struct AirConfig {
     pub max_kb: f64,
     /// Size below which frames do not shrink, in kilobytes.
     pub min_kb: f64,
-    /// Target for the time from sending a frame to its receipt, in milliseconds.
+    /// Target for the time from sending a frame to its acknowledgement, in milliseconds.
     pub round_trip_ms: f64,
     /// Maximum number of frames in flight.
     pub window: u32,
-    /// Time without a receipt after which a frame counts as lost, in milliseconds.
+    /// Time without an acknowledgement after which a frame counts as lost, in milliseconds.
     pub timeout_ms: f64,
 }
 

@@ -209,17 +209,7 @@ mod tests {
     }
 
     fn header(width: u32, height: u32) -> FrameHeader {
-        FrameHeader {
-            camera: "down".into(),
-            sequence: 1,
-            stamp_ns: 2,
-            clock: "c".into(),
-            exposure_ns: 0,
-            width,
-            height,
-            format: PixelFormat::Mono8,
-            parts: Vec::new(),
-        }
+        FrameHeader { width, height, ..FrameHeader::sample() }
     }
 
     fn plan(parts: &[[u32; 5]]) -> Plan {

@@ -152,28 +152,18 @@ mod tests {
             family: "aruco-4x4-50".into(),
             id: Some(*id),
             centre_px: *centre_px,
-            centre_covariance_px2: [1.0, 0.0, 1.0],
-            corners_px: None,
             size_px: *size_px,
-            wrong_bits: 0,
-            confidence: 1.0,
             pose: None,
+            ..Detection::sample()
         });
         Detections {
-            detector: "main".into(),
             header: FrameHeader {
-                camera: "down".into(),
-                sequence: 0,
                 stamp_ns: stamp_ms * MS,
-                clock: "c".into(),
-                exposure_ns: 0,
-                width: 1296,
-                height: 972,
                 format: PixelFormat::Jpeg,
-                parts: Vec::new(),
+                ..FrameHeader::sample()
             },
             detections: detections.collect(),
-            stages: Vec::new(),
+            ..Detections::sample()
         }
     }
 

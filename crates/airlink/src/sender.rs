@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use imaging::GrayView;
-use messages::{ControllerStatus, Detections, FrameHeader, FrameReceipt, topic};
+use messages::{ControllerStatus, Detections, FrameHeader, FrameAck, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Subscriber, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
@@ -65,7 +65,7 @@ impl AirSender {
             offers: Arc::clone(&offers),
             second_lane: jpegs.second_publisher(node).await?,
             jpegs,
-            receipts: node.subscriber(topic::RECEIVED, &[]).await?,
+            acks: node.subscriber(topic::FRAME_ACK, &[]).await?,
             detections,
             status: node.subscriber(topic::STATUS, &[]).await?,
             health: node.shared_health(),
@@ -121,7 +121,7 @@ struct Work {
     offers: Arc<Offers>,
     jpegs: FramePublisher,
     second_lane: FramePublisher,
-    receipts: Subscriber<FrameReceipt>,
+    acks: Subscriber<FrameAck>,
     detections: Option<Subscriber<Detections>>,
     /// Names the detector in use.
     status: Subscriber<ControllerStatus>,
@@ -135,8 +135,8 @@ struct Work {
 
 /// An event for the thread.
 enum Event {
-    /// The key, which names the detector, and the receipt.
-    Receipt(String, FrameReceipt),
+    /// The key, which names the detector, and the ack.
+    Ack(String, FrameAck),
     Detections(Box<Detections>),
     Status(Box<ControllerStatus>),
     Frame,
@@ -151,8 +151,8 @@ impl Work {
         while !self.offers.is_over.load(Ordering::Relaxed) {
             let event = tokio::select! {
                 biased;
-                receipt = self.receipts.next_with_key() => {
-                    receipt.map_or(Event::Closed, |(key, receipt)| Event::Receipt(key, receipt))
+                ack = self.acks.next_with_key() => {
+                    ack.map_or(Event::Closed, |(key, ack)| Event::Ack(key, ack))
                 }
                 message = next_of(self.detections.as_ref()) => {
                     message.map_or(Event::Closed, |message| Event::Detections(Box::new(message)))
@@ -164,13 +164,13 @@ impl Work {
                 _ = ticks.tick() => Event::Tick,
             };
             match event {
-                Event::Receipt(key, receipt) => self.receipt(&key, &receipt),
+                Event::Ack(key, ack) => self.ack(&key, &ack),
                 Event::Detections(message) if message.header.camera == self.camera => {
                     self.predictor.update(&message);
                 }
                 Event::Detections(_) => {}
                 Event::Status(status) => {
-                    let key = |detector: &String| topic::RECEIVED.key(&[detector]);
+                    let key = |detector: &String| topic::FRAME_ACK.key(&[detector]);
                     self.window.use_receiver(status.active_detector.as_ref().map(key));
                 }
                 Event::Frame => self.send().await,
@@ -179,23 +179,23 @@ impl Work {
             }
             let (is_open, lost) = self.window.is_open(now_ns());
             for _ in 0..lost {
-                self.health.dropped("air link frames without a receipt in time");
+                self.health.dropped("air link frames without a ack in time");
             }
             self.offers.is_wanted.store(is_open && self.has_subscribers, Ordering::Relaxed);
         }
     }
 
-    fn receipt(&mut self, detector: &str, receipt: &FrameReceipt) {
-        if receipt.camera != self.camera {
+    fn ack(&mut self, detector: &str, ack: &FrameAck) {
+        if ack.camera != self.camera {
             return;
         }
-        let took_ms = self.window.received(now_ns(), detector, receipt.sequence);
+        let took_ms = self.window.received(now_ns(), detector, ack.sequence);
         match took_ms {
             Some(ms) => {
                 self.health
-                    .latency("frame sent to receipt", Duration::from_secs_f64(ms.max(0.0) * 1e-3));
+                    .latency("frame sent to ack", Duration::from_secs_f64(ms.max(0.0) * 1e-3));
             }
-            None => self.health.dropped("receipts of unknown frames"),
+            None => self.health.dropped("acks of unknown frames"),
         }
     }
 

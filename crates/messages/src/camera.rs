@@ -7,25 +7,25 @@ use crate::codec::wire;
 wire! {
     FrameHeader = 1 v 3;
     CameraInfo = 2 v 1;
-    FrameReceipt = 16 v 1;
+    FrameAck = 16 v 1;
 }
 
-/// How a frame's pixels lie in its payload, row by row without gaps.
+/// Layout of a frame's pixels in its payload, row by row without gaps.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum PixelFormat {
-    /// One byte a pixel, grey.
+    /// One byte per pixel, grey.
     Mono8,
     /// A JPEG file.
     Jpeg,
-    /// Two bytes a pixel, the low one first, of which 10 bits count; grey.
+    /// Two bytes per pixel, little-endian, 10 significant bits; grey.
     Mono10,
     /// As `Mono10`, with 12 bits.
     Mono12,
     /// As `Mono10`, with 16 bits.
     Mono16,
-    /// One byte a pixel, each behind one colour of a mosaic.
+    /// One byte per pixel, behind a Bayer filter.
     Bayer8(BayerPattern),
-    /// Two bytes a pixel, the low one first, of which 10 bits count; each behind one colour of a mosaic.
+    /// Two bytes per pixel, little-endian, 10 significant bits, behind a Bayer filter.
     Bayer10(BayerPattern),
     /// As `Bayer10`, with 12 bits.
     Bayer12(BayerPattern),
@@ -33,7 +33,7 @@ pub enum PixelFormat {
     Bayer16(BayerPattern),
 }
 
-/// The colours of a mosaic's first two rows: of two pixels each, red, green or blue.
+/// The Bayer pattern: colours of the first two pixels of the first two rows.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum BayerPattern {
     /// Red, green; green, blue.
@@ -47,7 +47,7 @@ pub enum BayerPattern {
 }
 
 impl PixelFormat {
-    /// Bytes of one pixel; `None` where their number differs from image to image.
+    /// Bytes per pixel; `None` for compressed formats.
     pub fn bytes_per_pixel(self) -> Option<usize> {
         match self {
             Self::Jpeg => None,
@@ -62,30 +62,30 @@ impl PixelFormat {
     }
 }
 
-/// What travels with a frame, and unchanged with everything that is derived from it.
+/// The metadata of a frame; it goes unchanged with everything that is derived from the frame.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FrameHeader {
     /// The camera's name.
     pub camera: String,
-    /// Counts the frames of this camera since it started.
+    /// Frame counter of this camera since its start.
     pub sequence: u64,
     /// Mid-exposure, in nanoseconds of `clock`.
     pub stamp_ns: i64,
-    /// The clock of the stamp: a name that is the same for all processes that share it.
+    /// Name of the stamp's clock; processes that share a clock use the same name.
     pub clock: String,
-    /// How long the shutter was open, in nanoseconds; 0 when unknown.
+    /// Exposure time in nanoseconds; 0 when unknown.
     pub exposure_ns: u32,
-    /// Width of the whole frame in pixels, whatever part of it the payload has.
+    /// Width of the whole frame in pixels, also when the payload has only parts of it.
     pub width: u32,
     /// Height of the whole frame in pixels.
     pub height: u32,
-    /// How the pixels lie in the payload.
+    /// Format of the payload.
     pub format: PixelFormat,
-    /// What of the frame the payload has, one file after the other, finest first; empty: the whole frame.
+    /// Parts of the frame in the payload, one file after the other, finest first; empty for the whole frame.
     pub parts: Vec<FramePart>,
 }
 
-/// A rectangle of a frame as a file of its own, in the frame's pixels or coarser.
+/// A rectangle of a frame as a file of its own, at full or reduced resolution.
 ///
 /// The part's pixel (u, v) is the mean of `scale` x `scale` pixels of the frame, the first of which is
 /// (`x` + `scale` u, `y` + `scale` v); so its centre is at `x` + `scale` u + (`scale` - 1) / 2 in the frame, and
@@ -100,18 +100,18 @@ pub struct FramePart {
     pub width: u32,
     /// Its height in its own pixels.
     pub height: u32,
-    /// Pixels of the frame along the edge of one of its own; from 1.
+    /// Pixels of the frame along the edge of one of the part's pixels; from 1.
     pub scale: u32,
     /// Bytes of its file.
     pub bytes: u32,
 }
 
-/// Tells the camera that a frame for the air link has arrived; sent before it is looked at.
+/// Acknowledges a frame of the air link; sent when the frame has arrived, before it is searched.
 ///
-/// The stamp comes back to the clock it was taken from, so the way there and back is one subtraction and needs no
+/// It carries the frame's stamp back to the clock it was taken from, so the round trip is one subtraction and needs no
 /// synchronised clocks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct FrameReceipt {
+pub struct FrameAck {
     /// The frame's camera.
     pub camera: String,
     /// The frame's number.
@@ -133,7 +133,7 @@ pub struct Transform3 {
     pub rotation_wxyz: [f64; 4],
 }
 
-/// A lens, as far as it departs from a pinhole.
+/// Lens distortion.
 #[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum LensModel {
     /// None.

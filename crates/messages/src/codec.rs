@@ -12,7 +12,7 @@ pub trait Message: Serialize + DeserializeOwned {
     const TYPE: u8;
     /// Raised with every change of the type's fields.
     const VERSION: u8;
-    /// The type's name, for messages to people.
+    /// The type's name, for error messages.
     const NAME: &'static str;
 }
 
@@ -24,16 +24,16 @@ const HEADER_LEN: usize = 3;
 /// Why a payload was refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
-    /// Not a payload of this system.
-    #[error("{len} bytes that are no Alight payload, where a {expected} was expected")]
+    /// Not an Alight payload.
+    #[error("expected a {expected}, got {len} bytes that are not an Alight payload")]
     Foreign {
-        /// Bytes there are.
+        /// Length in bytes.
         len: usize,
         /// The message that was expected.
         expected: &'static str,
     },
     /// A payload of another type.
-    #[error("a payload of type {found}, where a {expected} (type {wanted}) was expected")]
+    #[error("expected a {expected} (type {wanted}), got a payload of type {found}")]
     Type {
         /// The type found.
         found: u8,
@@ -44,7 +44,7 @@ pub enum DecodeError {
     },
     /// A payload of another version of the program.
     #[error(
-        "a {expected} of version {found}, where this program speaks version {wanted}; run the same version everywhere"
+        "{expected} has version {found}, this program expects version {wanted}; run the same version everywhere"
     )]
     Version {
         /// The version found.
@@ -55,17 +55,17 @@ pub enum DecodeError {
         expected: &'static str,
     },
     /// Bytes that end too early or hold impossible values.
-    #[error("a {expected} of {len} bytes that is cut short or damaged")]
+    #[error("a {expected} of {len} bytes is truncated or damaged")]
     Damaged {
-        /// Bytes there are.
+        /// Length in bytes.
         len: usize,
         /// The message that was expected.
         expected: &'static str,
     },
     /// Bytes after the end of the message.
-    #[error("a {expected} with {extra} bytes after its end")]
+    #[error("a {expected} has {extra} bytes after its end")]
     Trailing {
-        /// Bytes too many.
+        /// Surplus bytes.
         extra: usize,
         /// The message that was expected.
         expected: &'static str,
@@ -73,7 +73,7 @@ pub enum DecodeError {
 }
 
 impl DecodeError {
-    /// A short name, by which refusals are counted.
+    /// A short name for the refusal counters.
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Foreign { .. } => "foreign",

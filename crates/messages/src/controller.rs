@@ -1,4 +1,6 @@
-//! What the controller publishes, and what it can be told.
+//! What the controller publishes, and the commands it takes.
+
+use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
@@ -7,43 +9,43 @@ use crate::detector::Place;
 
 wire! {
     TargetEstimate = 6 v 2;
-    ControllerStatus = 7 v 2;
-    ControllerCommand = 8 v 2;
+    ControllerStatus = 7 v 3;
+    ControllerCommand = 8 v 3;
     CommandReply = 9 v 1;
 }
 
 /// The landing point, as estimated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TargetEstimate {
-    /// When the estimate holds, in nanoseconds of the controller's clock.
+    /// Time of the estimate, in nanoseconds of the controller's clock.
     pub stamp_ns: i64,
-    /// The landing point in local NED, in metres; `None` while it was never seen.
+    /// The landing point in local NED, in metres; `None` before the first detection.
     pub position_ned_m: Option<[f64; 3]>,
     /// Horizontal distance from the vehicle to it, in metres.
     pub lateral_error_m: Option<f64>,
     /// Height of the vehicle above it, in metres.
     pub height_m: Option<f64>,
-    /// Since the capture of the frame that was used last, in milliseconds.
+    /// Age of the last frame that was used, since its exposure, in milliseconds.
     pub age_ms: Option<f64>,
-    /// Why the latest detection was not used, if it was not: a short name for machines.
+    /// Why the latest detection was rejected: a short name for programs.
     pub rejected: Option<String>,
-    /// The same in words.
+    /// The same as a sentence.
     pub decided: Option<String>,
-    /// How it moves in local NED, in m/s: its own motion and the drift of the autopilot's position.
+    /// Its velocity in local NED, in m/s: its own motion and the drift of the autopilot's position.
     pub velocity_ned_m_s: Option<[f64; 3]>,
     /// Standard deviation of its horizontal position, in metres.
     pub deviation_m: Option<f64>,
     /// Heading of the marker's upper edge, from north to east, in radians.
     pub heading_rad: Option<f64>,
-    /// The newest detection's squared innovation over its covariance: about 3 when all is as expected.
+    /// Normalised innovation squared of the newest detection: about 3 for a consistent filter.
     pub nis: Option<f64>,
-    /// By how much exposures are later than their stamps, in milliseconds.
+    /// Delay of exposures after their stamps, in milliseconds.
     pub time_offset_ms: Option<f64>,
-    /// The wind's velocity to the north and east, as the vehicle's lean tells it, in m/s.
+    /// Wind velocity north and east, estimated from the vehicle's tilt, in m/s.
     pub wind_ned_m_s: Option<[f64; 2]>,
 }
 
-/// The velocity the autopilot was last asked for.
+/// The last velocity setpoint.
 #[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Setpoint {
     /// In local NED, in m/s.
@@ -52,28 +54,28 @@ pub struct Setpoint {
     pub yaw_rate_rad_s: f64,
 }
 
-/// A detector that could be used.
+/// A detector known to the controller.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Candidate {
     /// Its name.
     pub detector: String,
-    /// Whether it is used, could be, or could not.
+    /// Whether it is used.
     pub state: DetectorState,
-    /// Where it runs, if it has told.
+    /// Where it runs, if known.
     pub place: Option<Place>,
-    /// Since the capture of the frame of its latest detections, in milliseconds.
+    /// Age of the frame of its latest detections, since its exposure, in milliseconds.
     pub age_ms: f64,
-    /// From the capture of a frame to the arrival of its detections, the median of the last ones, in milliseconds.
+    /// Median time from a frame's exposure to the arrival of its detections, in milliseconds.
     pub latency_ms: f64,
-    /// Detections messages a second.
+    /// Rate of its detection messages, in Hz.
     pub rate_hz: f64,
-    /// True while it tells of its presence.
+    /// True while its liveliness token is present.
     pub alive: bool,
-    /// Distance between its marker and the active detector's in the last frame in which both saw it, in metres.
+    /// Distance between its marker position and the active detector's in the last frame with both, in metres.
     pub disagreement_m: Option<f64>,
-    /// Of the latest frames in which the active detector saw the marker, those that this one has searched too.
+    /// Latest frames with a marker from the active detector that this detector has searched too.
     pub compared: u32,
-    /// Those of them in which it saw the marker at the same place.
+    /// Those of them in which both positions agree.
     pub agreed: u32,
 }
 
@@ -81,50 +83,107 @@ pub struct Candidate {
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DetectorState {
-    /// Its detections steer the vehicle.
+    /// Its detections control the vehicle.
     Active,
-    /// It is healthy and stands by.
+    /// It is healthy and on standby.
     Shadow,
     /// It is silent, late, slow or gone.
     Stale,
 }
 
-/// What the controller is doing, and why.
+/// The phase of a flight.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Phase {
+    /// Waiting for the start of a landing.
+    #[default]
+    Idle,
+    /// Taking off before the landing.
+    Takeoff,
+    /// Searching for the marker.
+    Search,
+    /// Flying above the marker, or waiting until the autopilot has the landing target.
+    Approach,
+    /// Descending to the marker.
+    Descend,
+    /// Climbing for another attempt.
+    Retry,
+    /// The autopilot lands.
+    Final,
+    /// On the ground, disarmed.
+    Landed,
+    /// Holding the position.
+    Hold,
+    /// Ended before the landing.
+    Aborted,
+    /// The pilot, or a failsafe of the autopilot, flies.
+    PilotInCommand,
+    /// Ended by a failure; nothing is sent any more.
+    Failed,
+}
+
+impl Phase {
+    /// Its name in kebab-case, as in JSON.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Idle => "idle",
+            Self::Takeoff => "takeoff",
+            Self::Search => "search",
+            Self::Approach => "approach",
+            Self::Descend => "descend",
+            Self::Retry => "retry",
+            Self::Final => "final",
+            Self::Landed => "landed",
+            Self::Hold => "hold",
+            Self::Aborted => "aborted",
+            Self::PilotInCommand => "pilot-in-command",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+impl fmt::Display for Phase {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+/// What the controller does, and why.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ControllerStatus {
-    /// When, in nanoseconds of the controller's clock.
+    /// Time in nanoseconds of the controller's clock.
     pub stamp_ns: i64,
     /// The phase of the flight.
-    pub phase: String,
-    /// Why it does what it does, in words.
+    pub phase: Phase,
+    /// The reason, as text.
     pub why: String,
     /// The guidance in use.
     pub guidance: String,
-    /// The link to the autopilot, in words.
+    /// State of the link to the autopilot, as text.
     pub autopilot: String,
-    /// The detector in use.
+    /// The active detector.
     pub active_detector: Option<String>,
-    /// Why it is this one, in words.
+    /// Why this one is active, as text.
     pub detector_why: String,
     /// What the operator prefers: a detector's name, `onboard`, `ground` or nothing.
     pub preference: String,
-    /// How often another detector became the active one.
+    /// Number of changes of the active detector.
     pub detector_changes: u64,
-    /// All detectors there are, the active one included.
+    /// All known detectors, the active one included.
     pub candidates: Vec<Candidate>,
-    /// Since the capture of the frame that was used last, in milliseconds.
+    /// Age of the last frame that was used, since its exposure, in milliseconds.
     pub detection_age_ms: Option<f64>,
     /// Height above the target, in metres; above the take-off point while no target was seen.
     pub height_m: Option<f64>,
     /// Horizontal distance to the target, in metres.
     pub lateral_error_m: Option<f64>,
-    /// The setpoint that was sent last.
+    /// The last setpoint that was sent.
     pub setpoint: Option<Setpoint>,
     /// When the landing began, in nanoseconds of the controller's clock.
     pub started_ns: Option<i64>,
     /// When the motors stopped after the landing, in nanoseconds of the controller's clock.
     pub disarmed_ns: Option<i64>,
-    /// True once nothing more will happen without a command.
+    /// True once nothing more happens without a command.
     pub finished: bool,
     /// Detections of the marker that were used.
     pub detections_used: u64,
@@ -132,35 +191,28 @@ pub struct ControllerStatus {
     pub latency_ms: Option<[f64; 2]>,
 }
 
-/// What the controller can be told.
+/// A command to the controller.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum ControllerCommand {
-    /// Begin to land.
+    /// Begin a landing.
     Start,
-    /// Stop where it is, and wait.
+    /// Stop and hold the position.
     Hold,
-    /// Go on after a hold.
+    /// Continue after a hold.
     Resume,
-    /// Give the landing up.
+    /// Abort the landing.
     Abort,
     /// Use this detector from now on.
     UseDetector(String),
-    /// Change a parameter.
-    SetParameter {
-        /// Its key in the controller's configuration.
-        key: String,
-        /// Its new value, in TOML.
-        value: String,
-    },
-    /// Use detectors that run there rather than others.
+    /// Prefer detectors that run there.
     PreferDetectors(Place),
 }
 
 /// The answer to a command.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CommandReply {
-    /// Whether it is carried out.
+    /// Whether the command is carried out.
     pub accepted: bool,
-    /// Why not, or what happens now.
+    /// Why not, or what happens next.
     pub reason: String,
 }

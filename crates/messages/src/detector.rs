@@ -1,9 +1,8 @@
-//! What a detector publishes, and what it can be told.
+//! What a detector publishes, and the commands it takes.
 
 use serde::{Deserialize, Serialize};
 
-use crate::camera::FrameHeader;
-pub use crate::camera::Transform3;
+use crate::camera::{FrameHeader, Transform3};
 use crate::codec::wire;
 
 wire! {
@@ -12,7 +11,7 @@ wire! {
     DetectorInfo = 15 v 1;
 }
 
-/// What a detector found in one frame; also sent when it found nothing.
+/// The markers that a detector found in one frame; also sent when there are none.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Detections {
     /// The detector's name.
@@ -40,15 +39,15 @@ pub struct Detection {
     pub corners_px: Option<[[f64; 2]; 4]>,
     /// Its largest extent in the image, in pixels.
     pub size_px: f64,
-    /// Bits of its code that were read wrongly and corrected; 0 for families without a code.
+    /// Corrected bits of its codeword (Hamming distance); 0 for families without a code.
     pub wrong_bits: u8,
     /// From 0 (a guess) to 1 (certain).
     pub confidence: f64,
-    /// Where it is, when its size and the camera are known.
+    /// Its pose, when its size and the camera are known.
     pub pose: Option<MarkerPose>,
 }
 
-/// Where a marker is.
+/// A marker's pose.
 #[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MarkerPose {
     /// The marker frame in the camera frame.
@@ -58,7 +57,7 @@ pub struct MarkerPose {
     /// Covariance of translation (x, y, z in metres) and rotation (a rotation vector in radians, applied after the
     /// pose), both in the camera frame: the upper triangle of the 6 x 6 matrix, row by row.
     pub covariance: [f32; 21],
-    /// The other place from which a flat marker looks much the same, if there is one.
+    /// The second solution of the pose of a flat marker, if there is one.
     pub alternative: Option<AlternativePose>,
 }
 
@@ -71,7 +70,7 @@ pub struct AlternativePose {
     pub reprojection_rms_px: f64,
 }
 
-/// How long a stage took.
+/// The duration of a stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct StageTime {
     /// The stage's name.
@@ -80,7 +79,7 @@ pub struct StageTime {
     pub micros: u32,
 }
 
-/// What a detector can be told; answered with a [`crate::CommandReply`].
+/// A command to a detector; answered with a [`crate::CommandReply`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum DetectorCommand {
     /// Change a parameter from the next frame on.
@@ -90,18 +89,18 @@ pub enum DetectorCommand {
         /// Its new value, in TOML.
         value: String,
     },
-    /// End, with exit status 0: another detector has taken over.
+    /// Exit with status 0: another detector has taken over.
     Stop,
 }
 
-/// What a detector says about itself.
+/// A detector's identity and settings.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DetectorInfo {
     /// The detector's name.
     pub detector: String,
-    /// The host it runs on.
+    /// Name of its host.
     pub host: String,
-    /// Where that host is.
+    /// Where it runs.
     pub place: Place,
     /// The camera whose frames it searches.
     pub camera: String,

@@ -1,4 +1,4 @@
-//! How a service fares.
+//! Health of a service.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,13 +13,13 @@ wire! {
 pub struct Health {
     /// The service.
     pub service: String,
-    /// Which one of them.
+    /// Name of this instance.
     pub instance: String,
-    /// The machine's name.
+    /// The host's name.
     pub host: String,
     /// The program's version.
     pub version: String,
-    /// Names the host's clock: equal names mean that stamps may be compared.
+    /// Name of the host's clock; stamps with the same name may be compared.
     pub clock: String,
     /// When, in nanoseconds of the host's clock.
     pub stamp_ns: i64,
@@ -29,31 +29,31 @@ pub struct Health {
     pub cpu_s: f64,
     /// Wall time since it started, in seconds.
     pub uptime_s: f64,
-    /// How often things happened.
+    /// Events per second, by name.
     pub rates: Vec<Rate>,
-    /// How long things took.
+    /// Durations, by name.
     pub latencies: Vec<Latency>,
-    /// What was dropped since the start, by reason.
+    /// Dropped inputs since the start, by reason.
     pub drops: Vec<Count>,
-    /// What failed since the start, by reason.
+    /// Failures since the start, by reason.
     pub errors: Vec<Count>,
 }
 
-/// How often something happened.
+/// Rate of an event.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Rate {
-    /// What.
+    /// Its name.
     pub name: String,
-    /// Times since the start.
+    /// Count since the start.
     pub count: u64,
-    /// Times a second, over the last period.
+    /// Count per second over the last period.
     pub hz: f64,
 }
 
-/// How long something took, over the last seconds.
+/// A duration, over the last seconds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Latency {
-    /// What.
+    /// Its name.
     pub name: String,
     /// Median in milliseconds.
     pub p50_ms: f64,
@@ -61,11 +61,11 @@ pub struct Latency {
     pub p99_ms: f64,
 }
 
-/// How many times, by reason.
+/// A count with its reason.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Count {
     /// The reason.
     pub reason: String,
-    /// Times since the start.
+    /// Count since the start.
     pub count: u64,
 }

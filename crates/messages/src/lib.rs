@@ -1,28 +1,30 @@
 //! What crosses a process: types, the topic table, and the codec.
 //!
 //! Wire types are plain data. They say nothing of what is done with them, and this crate knows no Zenoh, no
-//! clock and no algorithm. Units are in the fields' names; frames and pixel conventions are those of the
+//! clock and no algorithm. Units are in the fields' names; coordinate frames and pixel conventions are those of the
 //! `geometry` crate.
 //!
 //! Modules in reading order: [`topic`] is the table of everything that is published, [`codec`] turns it into
-//! bytes and back, and the others are the types by publisher.
+//! bytes and back, [`convert`] into the types of `geometry` and `imaging` and back; [`sample`] has messages for tests, and
+//! the others are the types by publisher.
 
 pub mod camera;
 pub mod codec;
 pub mod controller;
+pub mod convert;
 pub mod detector;
 pub mod health;
+pub mod sample;
 pub mod simulation;
 pub mod topic;
 pub mod vehicle;
 
 pub use camera::{
-    BayerPattern, CameraInfo, FrameHeader, FramePart, FrameReceipt, LensModel, PixelFormat,
-    Transform3,
+    BayerPattern, CameraInfo, FrameAck, FrameHeader, FramePart, LensModel, PixelFormat, Transform3,
 };
 pub use codec::{DecodeError, Message, decode, encode};
 pub use controller::{
-    Candidate, CommandReply, ControllerCommand, ControllerStatus, DetectorState, Setpoint,
+    Candidate, CommandReply, ControllerCommand, ControllerStatus, DetectorState, Phase, Setpoint,
     TargetEstimate,
 };
 pub use detector::{

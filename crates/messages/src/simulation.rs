@@ -1,4 +1,4 @@
-//! What only a simulator can publish: the truth.
+//! Ground truth, which only a simulator can publish.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +9,7 @@ wire! {
     Wind = 11 v 1;
 }
 
-/// Where everything really is.
+/// The true state of vehicle and pad.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Truth {
     /// When, in nanoseconds of the simulator's clock.

@@ -4,7 +4,7 @@
 
 use std::marker::PhantomData;
 
-use crate::camera::{CameraInfo, FrameHeader, FrameReceipt};
+use crate::camera::{CameraInfo, FrameAck, FrameHeader};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
 use crate::detector::{Detections, DetectorCommand, DetectorInfo};
@@ -12,7 +12,7 @@ use crate::health::Health;
 use crate::simulation::{Truth, Wind};
 use crate::vehicle::{MavlinkBytes, VehicleState};
 
-/// How messages of a topic travel.
+/// How the messages of a topic are delivered.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Delivery {
     /// A stream: under congestion older messages are dropped in favour of the latest.
@@ -36,9 +36,9 @@ pub struct Row {
     pub message: &'static str,
     /// The type's version.
     pub version: u8,
-    /// How it travels.
+    /// How it is delivered.
     pub delivery: Delivery,
-    /// The services that may publish it (or, for a query, ask).
+    /// The services that may publish it, or, for a query, send it.
     pub publishers: &'static [&'static str],
 }
 
@@ -67,7 +67,7 @@ impl<M: Message> Topic<M> {
         Self { row, message: PhantomData }
     }
 
-    /// How its messages travel.
+    /// How its messages are delivered.
     pub fn delivery(&self) -> Delivery {
         self.row.delivery
     }
@@ -81,8 +81,7 @@ impl<M: Message> Topic<M> {
         chunks.collect::<Vec<_>>().join("/")
     }
 
-    /// What stands for the first placeholder in a key of this topic, whatever the key begins with; `None` when it is
-    /// no key of this topic.
+    /// The value of the first placeholder in a key of this topic, with any prefix; `None` for a key of another topic.
     pub fn first_name<'a>(&self, key: &'a str) -> Option<&'a str> {
         let pattern = self.row.key.rsplit('/');
         let mut chunks = key.rsplit('/');
@@ -112,19 +111,19 @@ pub const JPEG: Topic<FrameHeader> = Topic::new("camera/{camera}/jpeg", Delivery
 /// A camera's calibration and mount.
 pub const CAMERA_INFO: Topic<CameraInfo> =
     Topic::new("camera/{camera}/info", Delivery::LastValue, CAMERAS);
-/// What a detector found.
+/// Markers found in a frame.
 pub const DETECTIONS: Topic<Detections> =
     Topic::new("detector/{detector}/detections", Delivery::LatestPriority, DETECTOR);
-/// That a frame of `camera/{camera}/jpeg` has arrived.
-pub const RECEIVED: Topic<FrameReceipt> =
-    Topic::new("detector/{detector}/received", Delivery::LatestPriority, DETECTOR);
+/// Acknowledges a frame of `camera/{camera}/jpeg`.
+pub const FRAME_ACK: Topic<FrameAck> =
+    Topic::new("detector/{detector}/ack", Delivery::LatestPriority, DETECTOR);
 /// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
 pub const DEBUG_IMAGE: Topic<FrameHeader> =
     Topic::new("detector/{detector}/debug/{image}", Delivery::Latest, DETECTOR);
-/// What a detector says about itself.
+/// A detector's identity and settings.
 pub const DETECTOR_INFO: Topic<DetectorInfo> =
     Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR);
-/// What a detector is told; answered with a [`CommandReply`].
+/// A command to a detector; answered with a [`CommandReply`].
 pub const DETECTOR_COMMAND: Topic<DetectorCommand> =
     Topic::new("detector/{detector}/command", Delivery::Query, &["alight"]);
 /// The answer to a detector's command; travels as the reply, on the command's key.
@@ -136,18 +135,18 @@ pub const VEHICLE_STATE: Topic<VehicleState> =
 /// The estimate of the landing point.
 pub const TARGET: Topic<TargetEstimate> =
     Topic::new("controller/target", Delivery::Latest, CONTROLLER);
-/// What the controller does and why.
+/// The controller's phase and the reason for it.
 pub const STATUS: Topic<ControllerStatus> =
     Topic::new("controller/status", Delivery::LastValue, CONTROLLER);
-/// What the controller is told; answered with a [`CommandReply`].
+/// A command to the controller; answered with a [`CommandReply`].
 pub const COMMAND: Topic<ControllerCommand> =
-    Topic::new("controller/command", Delivery::Query, &["alight", "gcs-bridge"]);
+    Topic::new("controller/command", Delivery::Query, &["alight"]);
 /// The answer to a command; travels as the reply, on the command's key.
 pub const COMMAND_REPLY: Topic<CommandReply> =
     Topic::new("controller/command", Delivery::Query, CONTROLLER);
-/// The wind, as it really is.
+/// The true wind.
 pub const WIND: Topic<Wind> = Topic::new("wind", Delivery::Latest, SIMULATOR);
-/// Where everything really is.
+/// The true state of vehicle and pad.
 pub const TRUTH: Topic<Truth> = Topic::new("truth", Delivery::Latest, SIMULATOR);
 /// Packets from the autopilot.
 pub const FROM_AUTOPILOT: Topic<MavlinkBytes> =
@@ -155,7 +154,7 @@ pub const FROM_AUTOPILOT: Topic<MavlinkBytes> =
 /// Packets for the autopilot.
 pub const TO_AUTOPILOT: Topic<MavlinkBytes> =
     Topic::new("mavlink/to-autopilot", Delivery::Reliable, &["gcs-bridge", "simulator"]);
-/// How a service fares.
+/// Health of a service.
 pub const HEALTH: Topic<Health> = Topic::new(
     "health/{service}/{instance}",
     Delivery::LastValue,
@@ -167,18 +166,18 @@ pub fn alive_key(service: &str, instance: &str) -> String {
     format!("alive/{service}/{instance}")
 }
 
-/// Key of the liveliness token by which a service says, before it looks for others, that it is about to start.
+/// Key of the liveliness token that a service declares before it looks for others of its name.
 pub fn claim_key(service: &str, instance: &str, session: &str) -> String {
     format!("alive/{service}/{instance}/{session}")
 }
 
-/// Every topic there is.
+/// All topics.
 pub const TOPICS: &[Row] = &[
     FRAME.row,
     JPEG.row,
     CAMERA_INFO.row,
     DETECTIONS.row,
-    RECEIVED.row,
+    FRAME_ACK.row,
     DEBUG_IMAGE.row,
     DETECTOR_INFO.row,
     DETECTOR_COMMAND.row,

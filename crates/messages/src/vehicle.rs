@@ -1,4 +1,4 @@
-//! What the controller knows of the vehicle, and the autopilot's own words.
+//! The vehicle's state as the controller knows it, and the autopilot's packets.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,10 +9,10 @@ wire! {
     MavlinkBytes = 5 v 1;
 }
 
-/// Whether the vehicle stands or flies, as the autopilot says.
+/// Contact with the ground, as the autopilot reports it.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum LandedState {
-    /// Not said yet.
+    /// Not reported yet.
     Unknown,
     /// On the ground.
     OnGround,
@@ -27,7 +27,7 @@ pub enum LandedState {
 /// The vehicle's state.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct VehicleState {
-    /// When it was received, in nanoseconds of the controller's clock.
+    /// Time of the newer of attitude and position, in nanoseconds of the controller's clock.
     pub stamp_ns: i64,
     /// Attitude: the body frame (FRD) in NED, as a unit quaternion w, x, y, z.
     pub ned_from_body_wxyz: [f64; 4],
@@ -39,9 +39,9 @@ pub struct VehicleState {
     pub mode: String,
     /// True when the motors are armed.
     pub armed: bool,
-    /// Whether it stands or flies.
+    /// Contact with the ground.
     pub landed: LandedState,
-    /// Remaining battery from 0 to 1, when the autopilot tells.
+    /// Remaining battery from 0 to 1, if reported.
     pub battery: Option<f32>,
 }
 

@@ -3,23 +3,19 @@
 use messages::{
     AlternativePose, BayerPattern, CameraInfo, Candidate, CommandReply, ControllerCommand,
     ControllerStatus, Count, DecodeError, Detection, Detections, DetectorCommand, DetectorInfo,
-    DetectorState, FrameHeader, FramePart, FrameReceipt, Health, LandedState, Latency, LensModel,
-    MarkerPose, MavlinkBytes, Message, PixelFormat, Place, Rate, Setpoint, StageTime,
+    DetectorState, FrameAck, FrameHeader, FramePart, Health, LandedState, Latency, LensModel,
+    MarkerPose, MavlinkBytes, Message, Phase, PixelFormat, Place, Rate, Setpoint, StageTime,
     TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind, decode, encode,
 };
 use proptest::prelude::*;
 
 fn header() -> FrameHeader {
     FrameHeader {
-        camera: "down".into(),
         sequence: 300,
         stamp_ns: -1,
         clock: "c".into(),
         exposure_ns: 2,
-        width: 1296,
-        height: 972,
-        format: PixelFormat::Mono8,
-        parts: Vec::new(),
+        ..FrameHeader::sample()
     }
 }
 
@@ -106,8 +102,8 @@ fn detections() {
 }
 
 #[test]
-fn frame_receipt() {
-    let message = FrameReceipt {
+fn frame_ack() {
+    let message = FrameAck {
         camera: "down".into(),
         sequence: 300,
         stamp_ns: -1,
@@ -209,7 +205,7 @@ fn target_estimate() {
 fn controller_status() {
     let message = ControllerStatus {
         stamp_ns: 1,
-        phase: "descend".into(),
+        phase: Phase::Descend,
         why: "w".into(),
         guidance: "metric".into(),
         autopilot: "ok".into(),
@@ -241,15 +237,37 @@ fn controller_status() {
     };
     check(
         &message,
-        "410702020764657363656e640177066d6574726963026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e0000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f0000000000000040",
+        "41070302040177066d6574726963026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e0000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f0000000000000040",
     );
+}
+
+#[test]
+fn phases() {
+    let phases = [
+        Phase::Idle,
+        Phase::Takeoff,
+        Phase::Search,
+        Phase::Approach,
+        Phase::Descend,
+        Phase::Retry,
+        Phase::Final,
+        Phase::Landed,
+        Phase::Hold,
+        Phase::Aborted,
+        Phase::PilotInCommand,
+        Phase::Failed,
+    ];
+    for (number, phase) in (0..).zip(phases) {
+        let message = ControllerStatus { phase, ..ControllerStatus::default() };
+        assert_eq!(encode(&message)[4], number, "{phase}");
+    }
 }
 
 #[test]
 fn controller_command() {
     let message = ControllerCommand::UseDetector("spare".into());
-    check(&message, "41080204057370617265");
-    check(&ControllerCommand::PreferDetectors(Place::Ground), "4108020601");
+    check(&message, "41080304057370617265");
+    check(&ControllerCommand::PreferDetectors(Place::Ground), "4108030501");
 }
 
 #[test]
@@ -384,7 +402,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
     };
     let set = DetectorCommand::SetParameter { key: "markers".into(), value: "[]".into() };
     let reply = CommandReply { accepted: true, reason: "it stops".into() };
-    let receipt = FrameReceipt {
+    let ack = FrameAck {
         camera: "down".into(),
         sequence: 300,
         stamp_ns: 1_000_000_000,
@@ -399,7 +417,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         ("DetectorCommand SetParameter", encode(&set)),
         ("DetectorCommand Stop", encode(&DetectorCommand::Stop)),
         ("CommandReply", encode(&reply)),
-        ("FrameReceipt", encode(&receipt)),
+        ("FrameAck", encode(&ack)),
     ]
 }
 

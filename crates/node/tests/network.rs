@@ -41,15 +41,12 @@ async fn frames() -> anyhow::Result<([Node; 2], FramePublisher, FrameSubscriber)
 
 fn header(sequence: u64) -> FrameHeader {
     FrameHeader {
-        camera: "down".into(),
         sequence,
         stamp_ns: now_ns(),
         clock: clock_name().into(),
-        exposure_ns: 0,
         width: 64,
         height: 48,
-        format: PixelFormat::Mono8,
-        parts: Vec::new(),
+        ..FrameHeader::sample()
     }
 }
 

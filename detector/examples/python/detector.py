@@ -33,7 +33,7 @@ except ImportError as missing:
 
 # Types and versions of the messages (docs/wire-format.md).
 FRAME_HEADER, CAMERA_INFO, DETECTIONS = (1, 3), (2, 1), (3, 3)
-COMMAND_REPLY, DETECTOR_COMMAND, DETECTOR_INFO, FRAME_RECEIPT = (9, 1), (13, 2), (15, 1), (16, 1)
+COMMAND_REPLY, DETECTOR_COMMAND, DETECTOR_INFO, FRAME_ACK = (9, 1), (13, 2), (15, 1), (16, 1)
 CORNER_NOISE_PX = 0.3
 
 
@@ -325,7 +325,7 @@ class Detector:
         name, camera = self.args.id, self.args.camera
         urgent = {"priority": zenoh.Priority.REAL_TIME, "congestion_control": zenoh.CongestionControl.DROP}
         detections = self.session.declare_publisher(self.key(f"detector/{name}/detections"), **urgent)
-        receipts = self.session.declare_publisher(self.key(f"detector/{name}/received"), **urgent)
+        acks = self.session.declare_publisher(self.key(f"detector/{name}/ack"), **urgent)
         info_key = self.key(f"detector/{name}/info")
         topic = "frame" if self.args.input == "raw" else "jpeg"
         kept = [
@@ -346,18 +346,18 @@ class Detector:
                 self.session.put(info_key, self.info())
             sample = self.frames.take(0.2)
             if sample is not None:
-                self.search(sample, detections, receipts)
+                self.search(sample, detections, acks)
         time.sleep(0.1)
         return kept
 
-    def search(self, sample, detections, receipts):
+    def search(self, sample, detections, acks):
         try:
             header = read_header(sample.attachment.to_bytes())
             payload = sample.payload.to_bytes()
             if self.args.input == "jpeg":
-                receipt = Writer(FRAME_RECEIPT).text(header["camera"]).unsigned(header["sequence"])
-                receipt.signed(header["stamp_ns"]).text(header["clock"]).unsigned(len(payload))
-                receipts.put(receipt.bytes())
+                ack = Writer(FRAME_ACK).text(header["camera"]).unsigned(header["sequence"])
+                ack.signed(header["stamp_ns"]).text(header["clock"]).unsigned(len(payload))
+                acks.put(ack.bytes())
             began = time.monotonic()
             corners = self.args.marker.find(header, payload)
             stages = [("opencv", int((time.monotonic() - began) * 1e6))]

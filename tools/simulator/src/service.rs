@@ -375,20 +375,7 @@ impl Camera {
         let settings = sensor.settings().clone();
         let name = &config.camera.name;
         let bytes = config.camera.width as usize * config.camera.height as usize;
-        let mount = settings.body_from_camera;
-        let origin = mount.origin();
-        let info = CameraInfo {
-            camera: name.clone(),
-            width: config.camera.width,
-            height: config.camera.height,
-            focal_px: Some([settings.model.fx, settings.model.fy]),
-            principal_px: [settings.model.cx, settings.model.cy],
-            lens: LensModel::Pinhole,
-            body_from_camera: Transform3 {
-                translation_m: [origin.x(), origin.y(), origin.z()],
-                rotation_wxyz: mount.rotation().wxyz(),
-            },
-        };
+        let info = CameraInfo::new(name, &settings.model, &settings.body_from_camera);
         let jpegs = node.frame_publisher(topic::JPEG, &[name], 0).await?;
         Ok(Self {
             sensor,

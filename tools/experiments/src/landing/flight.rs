@@ -7,6 +7,7 @@ use anyhow::Context;
 use autopilot::Parser;
 use controller::flight::Flight;
 use geometry::{Ned, Point, Vector};
+use messages::Phase;
 use node::Layers;
 use world::World;
 use world::vehicle::VehicleTruth;
@@ -45,7 +46,7 @@ pub struct Sample {
     /// The air's velocity, in m/s.
     pub wind: Vector<Ned>,
     /// The controller's phase.
-    pub phase: String,
+    pub phase: Phase,
 }
 
 /// Flies it, and notes its samples 40 times a second if asked to.
@@ -207,7 +208,7 @@ impl Rehearsal {
             self.world.begin();
         }
         let Some(start_s) = self.start_s else { return };
-        let retries = status.phase == "retry";
+        let retries = status.phase == Phase::Retry;
         self.outcome.retries += u32::from(retries && !self.was_in_retry);
         self.was_in_retry = retries;
         self.outcome.detections = status.detections_used;
@@ -218,23 +219,23 @@ impl Rehearsal {
                 pad: self.world.pad_at(now_s).position,
                 command: status.setpoint.map(|setpoint| setpoint.velocity_ned_m_s),
                 wind: self.world.wind(),
-                phase: status.phase.clone(),
+                phase: status.phase,
             });
         }
         (self.outcome.phase, self.outcome.why) = (status.phase, status.why);
     }
 
     fn is_over(&self) -> bool {
-        let ended = matches!(self.outcome.phase.as_str(), "landed" | "aborted" | "failed");
+        let ended = matches!(self.outcome.phase, Phase::Landed | Phase::Aborted | Phase::Failed);
         let since_s = self.start_s.map_or(0.0, |start_s| self.world.now_s() - start_s);
         ended || self.outcome.disarm_s.is_some_and(|at_s| since_s - at_s > AFTER_DISARM_S)
     }
 
     fn finish(&mut self) {
         let outcome = &mut self.outcome;
-        outcome.ending = match outcome.phase.as_str() {
-            "landed" => Ending::Landed,
-            "aborted" | "failed" => Ending::Aborted,
+        outcome.ending = match outcome.phase {
+            Phase::Landed => Ending::Landed,
+            Phase::Aborted | Phase::Failed => Ending::Aborted,
             _ => Ending::Unfinished,
         };
     }

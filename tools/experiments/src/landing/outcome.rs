@@ -53,7 +53,7 @@ pub struct Outcome {
     /// How it ended.
     pub ending: Ending,
     /// The controller's last phase.
-    pub phase: String,
+    pub phase: messages::Phase,
     /// Its last reason.
     pub why: String,
     /// Horizontal distance from the pad at the touch, in metres.
@@ -98,7 +98,7 @@ impl Outcome {
             height_m: planned.height_m,
             offset_m: planned.offset_m,
             ending: Ending::Unfinished,
-            phase: String::new(),
+            phase: messages::Phase::default(),
             why: String::new(),
             error_m: None,
             error_north_m: None,
