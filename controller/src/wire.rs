@@ -1,7 +1,7 @@
 //! Between messages, the autopilot's types and the lander's types.
 
 use autopilot::VehicleState;
-use geometry::{Body, Camera, Marker, Pixel, Point, Rotation, Transform, Vector};
+use geometry::{Body, Camera, Marker, Pixel, Rotation, Transform, Vector};
 use landing::{Landed, MarkerInFrame, Mode, Timestamp};
 use messages::{CameraInfo, Detection, Detections, MarkerPose, Phase, Transform3};
 use nalgebra::Matrix3;
@@ -161,6 +161,7 @@ mod tests {
     #[test]
     fn a_position_that_has_stopped_is_not_flown_on() {
         use autopilot::{Attitude, Battery, FlightMode, Position};
+        use geometry::Point;
         let ms = 1_000_000;
         let at = |attitude_ms: i64, position_ms: i64| VehicleState {
             stamp_ns: attitude_ms.max(position_ms) * ms,

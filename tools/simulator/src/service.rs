@@ -12,10 +12,7 @@ use airlink::AirSender;
 use anyhow::Context;
 use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use autopilot::{Address, Link, LinkEvent, Parser, Sender};
-use messages::{
-    CameraInfo, FrameHeader, LensModel, MavlinkBytes, PixelFormat, Touchdown, Transform3, Truth,
-    Wind, topic,
-};
+use messages::{CameraInfo, FrameHeader, MavlinkBytes, PixelFormat, Touchdown, Truth, Wind, topic};
 use node::{FramePublisher, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
