@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use imaging::GrayView;
-use messages::{ControllerStatus, Detections, FrameHeader, FrameAck, topic};
+use messages::{ControllerStatus, Detections, FrameAck, FrameHeader, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Subscriber, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;

@@ -1,0 +1,164 @@
+//! Detections of all detectors in, the lander's next frame out.
+
+use std::collections::BTreeMap;
+
+use landing::{FrameObservation, Timestamp};
+use messages::{CameraInfo, Detections, Place};
+use node::clock_name;
+
+use crate::config::{Config, DetectorSettings, PreferredPlace};
+use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection, Sight};
+use crate::wire;
+
+/// Maximum number of cameras whose calibration is kept; more are a mistake in the network.
+const MAX_CAMERAS: usize = 16;
+
+/// The newest frame of each detector, and the choice among them.
+#[derive(Debug)]
+pub struct Frames {
+    marker: String,
+    max_future_s: f64,
+    /// The detectors and the active one.
+    pub selection: Selection,
+    /// The newest frame of each detector, to be used when it becomes the active one.
+    newest: BTreeMap<String, FrameObservation>,
+    cameras: BTreeMap<String, CameraInfo>,
+    known_changes: u64,
+    /// Stamp of the newest frame that was used, with a marker in it or without.
+    used_stamp_ns: i64,
+    /// Late frames of the active detector are used only if they are newer than the last one of its predecessor.
+    handover_stamp_ns: i64,
+}
+
+/// What becomes of detections on arrival.
+#[derive(Debug)]
+pub enum Arrival {
+    /// They are kept until they are used.
+    Kept,
+    /// They are older than the frame that was used last, but the estimator can still fuse them at their own time.
+    Late(FrameObservation),
+    /// They are refused for this reason.
+    Refused(&'static str),
+}
+
+/// The frame to be used now.
+#[derive(Debug)]
+pub struct Next {
+    /// The frame, if there is a new one.
+    pub frame: Option<FrameObservation>,
+    /// Another detector has become the active one.
+    pub is_handover: bool,
+}
+
+impl Frames {
+    /// No detector and no camera is known yet.
+    pub fn new(config: &Config) -> Self {
+        Self {
+            marker: config.marker.clone(),
+            max_future_s: config.target.max_future_s,
+            selection: selection(&config.detectors),
+            newest: BTreeMap::new(),
+            cameras: BTreeMap::new(),
+            known_changes: 0,
+            used_stamp_ns: i64::MIN,
+            handover_stamp_ns: i64::MIN,
+        }
+    }
+
+    /// Adds a camera's calibration and mount.
+    pub fn add_camera(&mut self, info: CameraInfo) {
+        if self.cameras.len() < MAX_CAMERAS || self.cameras.contains_key(&info.camera) {
+            self.cameras.insert(info.camera.clone(), info);
+        }
+    }
+
+    /// Adds the detections that were published on the key of the detector `publisher`.
+    pub fn add(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> Arrival {
+        let header = &message.header;
+        // Who may publish is decided by the key; the name in the message is only a claim.
+        if message.detector != publisher {
+            return Arrival::Refused("another-detectors-name");
+        }
+        if header.clock != clock_name() {
+            return Arrival::Refused("another-clock");
+        }
+        // Refused here, because later stamps are compared with the newest: one from the future would block them all.
+        let ahead_ns = header.stamp_ns.saturating_sub(now_ns);
+        if ahead_ns as f64 * 1e-9 > self.max_future_s {
+            return Arrival::Refused("from-the-future");
+        }
+        let camera = self.cameras.get(&header.camera);
+        let mount = camera.and_then(wire::body_from_camera);
+        let marker = wire::wanted(message, &self.marker)
+            .map(|detection| wire::marker_in_frame(detection, mount));
+        let sight = marker.as_ref().map(|marker| Sight {
+            position_m: marker.body_from_marker.map(|pose| pose.origin().coords.into()),
+        });
+        let mut frame = FrameObservation {
+            stamp: Timestamp::from_nanos(header.stamp_ns),
+            image_size: (header.width, header.height),
+            focal_px: None,
+            body_from_camera: None,
+            marker,
+        };
+        if self.selection.received(now_ns, publisher, header.stamp_ns, sight) {
+            frame.focal_px = camera.and_then(|info| {
+                let scale = f64::from(header.width) / f64::from(info.width.max(1));
+                info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
+            });
+            frame.body_from_camera = mount.map(|mount| mount.rotation());
+            self.newest.insert(publisher.to_owned(), frame);
+            debug_assert!(self.newest.len() <= MAX_DETECTORS);
+        } else if self.selection.active() == Some(publisher)
+            && (self.handover_stamp_ns..self.used_stamp_ns).contains(&header.stamp_ns)
+            && frame.marker.is_some()
+        {
+            return Arrival::Late(frame);
+        }
+        Arrival::Kept
+    }
+
+    /// The frame to be used now: the active detector's newest, if it is newer than all that were used.
+    pub fn next(&mut self) -> Next {
+        let next = self.selection.next_frame();
+        let frame = next.and_then(|(name, _stamp)| self.newest.get(&name).copied());
+        let is_handover = self.selection.changes() != self.known_changes;
+        if is_handover {
+            self.handover_stamp_ns = self.used_stamp_ns;
+            self.known_changes = self.selection.changes();
+        }
+        if let Some(frame) = &frame {
+            self.used_stamp_ns = frame.stamp.nanos();
+        }
+        Next { frame, is_handover }
+    }
+
+    /// Lets time pass, and forgets detectors that have gone.
+    pub fn tick(&mut self, now_ns: i64) {
+        self.selection.tick(now_ns);
+        self.newest.retain(|name, _| self.selection.knows(name));
+    }
+
+    /// Age of the newest frame that was used, in seconds.
+    pub fn age_s(&self, now_ns: i64) -> f64 {
+        now_ns.saturating_sub(self.used_stamp_ns) as f64 * 1e-9
+    }
+}
+
+/// The choice of the detector, as configured.
+fn selection(settings: &DetectorSettings) -> Selection {
+    let limits = Limits {
+        max_age_s: settings.max_age_s,
+        min_rate_hz: settings.min_rate_hz,
+        return_after_s: settings.return_after_s,
+        tolerance_m: settings.tolerance_m,
+        tolerance_per_m: settings.tolerance_per_m,
+    };
+    let detector = Some(settings.preferred.clone()).filter(|name| !name.is_empty());
+    let place = match settings.place {
+        PreferredPlace::Any => None,
+        PreferredPlace::Onboard => Some(Place::Onboard),
+        PreferredPlace::Ground => Some(Place::Ground),
+    };
+    Selection::new(limits, Preference { detector, place })
+}

@@ -1,0 +1,147 @@
+//! Logs and health counters of a flight.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use autopilot::Event;
+use autopilot::command::SetpointError;
+use landing::{Alarm, Decision, Phase};
+use node::HealthCounters;
+
+/// The latency from a frame's stamp to the setpoint that used it, as health and status name it.
+const STAMP_TO_SETPOINT: &str = "stamp to setpoint";
+
+/// Writes the log and counts what the health report shows.
+#[derive(Debug)]
+pub struct Journal {
+    health: Arc<HealthCounters>,
+    /// Why the latest detection was rejected, if it was.
+    rejection: Option<String>,
+}
+
+impl Journal {
+    /// A journal that counts into `health`.
+    pub fn new(health: Arc<HealthCounters>) -> Self {
+        Self { health, rejection: None }
+    }
+
+    /// Counts an event.
+    pub fn count(&self, name: &'static str) {
+        self.health.count(name);
+    }
+
+    /// Counts a rejected detection and remembers the reason, a short name for programs.
+    pub fn reject(&mut self, reason: &str) {
+        self.health.dropped(&format!("detection: {reason}"));
+        self.rejection = Some(reason.to_owned());
+    }
+
+    /// Counts a rejected detection that arrived after a newer one.
+    pub fn reject_late(&self, reason: &str) {
+        self.health.dropped(&format!("late detection: {reason}"));
+    }
+
+    /// The latest detection was not rejected.
+    pub fn accept(&mut self) {
+        self.rejection = None;
+    }
+
+    /// Why the latest detection was rejected, if it was.
+    pub fn rejection(&self) -> Option<&str> {
+        self.rejection.as_deref()
+    }
+
+    /// Counts a tick of a landing, and whether the newest frame that was used was no longer fresh then: because no
+    /// detector had a newer one, or although one had.
+    pub fn tick(&self, is_fresh: bool, has_newer: bool) {
+        self.health.count("ticks");
+        if !is_fresh {
+            self.health.count("ticks without a fresh frame");
+            if has_newer {
+                self.health.count("ticks without a fresh frame although there was one");
+            }
+        }
+    }
+
+    /// Records the latency of a setpoint or landing target that used the frame with this stamp.
+    pub fn used_frame(&self, now_ns: i64, stamp_ns: i64) {
+        let age_ns = now_ns.saturating_sub(stamp_ns).max(0);
+        self.health.latency(STAMP_TO_SETPOINT, Duration::from_nanos(age_ns.unsigned_abs()));
+    }
+
+    /// Median and 99th percentile from a frame's stamp to the setpoint that used it, in milliseconds.
+    pub fn latency_ms(&self) -> Option<[f64; 2]> {
+        self.health.percentiles(STAMP_TO_SETPOINT)
+    }
+
+    /// Counts a setpoint that was sent or refused.
+    pub fn setpoint(&self, result: Result<(), SetpointError>) {
+        match result {
+            Ok(()) => self.health.count("setpoints"),
+            Err(problem) => {
+                if self.health.failed("setpoints") {
+                    tracing::warn!(%problem, "Setpoint not sent (further failures are only counted)");
+                }
+            }
+        }
+    }
+
+    /// Logs an alarm.
+    pub fn alarm(&self, alarm: Alarm) {
+        tracing::warn!(?alarm, "Alarm");
+        self.health.count("alarms");
+    }
+
+    /// Logs a change of the active detector.
+    pub fn detector_changed(&self, detector: &str, why: &str) {
+        self.health.count("changes of the detector");
+        tracing::warn!(detector, why, "Active detector changed");
+    }
+
+    /// Logs a change of the lander's phase.
+    pub fn phase_changed(&self, from: Phase, decision: &Decision) {
+        tracing::info!(%from, to = %decision.phase, why = %decision.why, "Phase");
+    }
+
+    /// Logs an event of the autopilot.
+    pub fn autopilot(&self, event: &Event) {
+        match event {
+            Event::Found { system, firmware } => {
+                tracing::info!(system, %firmware, "Autopilot found");
+            }
+            Event::OtherVehicle { system } => tracing::warn!(
+                system,
+                "Another vehicle is on the link and is ignored; pin ours with `autopilot.system_id`"
+            ),
+            Event::SameAddress { .. } => tracing::warn!(
+                "Another companion uses our system and component id; change `autopilot.component_id` on one of them"
+            ),
+            Event::Lost { silence } => tracing::error!(?silence, "Autopilot heartbeat lost"),
+            Event::Returned => tracing::info!("Autopilot heartbeat regained"),
+            Event::Restarted => tracing::error!("Autopilot restarted"),
+            Event::ArmedChanged(armed) => tracing::info!(armed, "Motors"),
+            Event::ModeChanged { from, to } => tracing::info!(?from, %to, "Flight mode"),
+            Event::LandedChanged { from, to } => tracing::info!(%from, %to, "Landed state"),
+            Event::ReadyChanged { ready, reasons } => tracing::info!(ready, ?reasons, "Readiness"),
+            Event::Text { severity, text } => tracing::info!(?severity, text, "Autopilot"),
+            Event::Command { command, result: Ok(()), .. } => tracing::info!(%command, "Done"),
+            Event::Command { result: Err(problem), .. } => {
+                self.health.failed("commands");
+                tracing::warn!(%problem, "Command failed");
+            }
+            Event::StreamMissing { message, wanted_hz, measured_hz } => {
+                self.health.failed("missing messages");
+                tracing::warn!(
+                    message,
+                    wanted_hz,
+                    measured_hz,
+                    "A requested MAVLink message is not streaming at the requested rate"
+                );
+            }
+            Event::StreamRestored { message, measured_hz } => {
+                tracing::info!(message, measured_hz, "A MAVLink message is streaming again");
+            }
+            Event::State(_) | Event::Attitude(_) | Event::Position(_) | Event::Range(_) => {}
+        }
+    }
+}

@@ -1,0 +1,211 @@
+//! The mission: when a landing begins, and what comes before and after it.
+
+use autopilot::{Autopilot, FlightMode, LandedState, Takeoff, TakeoffError, TakeoffProgress};
+
+use crate::config::Start;
+
+/// The mission of a flight.
+#[derive(Debug)]
+pub struct Mission {
+    start: Start,
+    state: State,
+    started_ns: Option<i64>,
+    disarmed_ns: Option<i64>,
+}
+
+/// The state of a mission.
+#[derive(Debug)]
+pub enum State {
+    /// Waiting for the operator's command.
+    Idle,
+    /// Waiting until the vehicle flies in GUIDED.
+    AwaitingTakeoff,
+    /// From the ground into the air.
+    TakingOff {
+        /// The take-off.
+        takeoff: Takeoff,
+        /// What it waits for.
+        why: String,
+    },
+    /// The lander decides.
+    Landing,
+    /// The autopilot's own precision landing decides; it gets the landing target.
+    SendingLandingTarget,
+    /// Nothing more happens without a command.
+    Failed {
+        /// The reason.
+        why: String,
+    },
+}
+
+/// Why a landing begins without a command.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Trigger {
+    /// The vehicle was found in flight.
+    InFlight,
+    /// The take-off is done.
+    TakenOff,
+    /// The vehicle was found in LAND instead: the end of a landing that an earlier controller began.
+    LandInsteadOfTakeoff,
+}
+
+impl Mission {
+    /// A mission that has not begun.
+    pub fn new(start: Start, takeoff_height_m: f64) -> Self {
+        let state = match start {
+            Start::Command => State::Idle,
+            Start::Airborne | Start::Resume => State::AwaitingTakeoff,
+            Start::Takeoff => State::TakingOff {
+                takeoff: Takeoff::new(takeoff_height_m),
+                why: "waiting for the autopilot's heartbeat".to_owned(),
+            },
+        };
+        Self { start, state, started_ns: None, disarmed_ns: None }
+    }
+
+    /// The state.
+    pub fn state(&self) -> &State {
+        &self.state
+    }
+
+    /// When the landing began.
+    pub fn started_ns(&self) -> Option<i64> {
+        self.started_ns
+    }
+
+    /// When the motors stopped after the landing.
+    pub fn disarmed_ns(&self) -> Option<i64> {
+        self.disarmed_ns
+    }
+
+    /// True while the vehicle takes off.
+    pub fn is_taking_off(&self) -> bool {
+        matches!(self.state, State::TakingOff { .. })
+    }
+
+    /// True while a landing begins by itself once the vehicle flies.
+    pub fn is_awaiting_takeoff(&self) -> bool {
+        matches!(self.state, State::AwaitingTakeoff)
+    }
+
+    /// True once the lander decides.
+    pub fn is_landing(&self) -> bool {
+        matches!(self.state, State::Landing)
+    }
+
+    /// True once the autopilot's own precision landing decides.
+    pub fn is_sending_landing_target(&self) -> bool {
+        matches!(self.state, State::SendingLandingTarget)
+    }
+
+    /// A landing begins: the lander's, or the autopilot's own.
+    pub fn begin(&mut self, now_ns: i64, is_autopilots: bool) {
+        self.started_ns = Some(now_ns);
+        self.disarmed_ns = None;
+        self.state = if is_autopilots { State::SendingLandingTarget } else { State::Landing };
+    }
+
+    /// The landing that was to begin does not: back to waiting, for the vehicle to fly or for a command.
+    pub fn stand_down(&mut self, awaits_takeoff: bool) {
+        self.started_ns = None;
+        self.state = if awaits_takeoff { State::AwaitingTakeoff } else { State::Idle };
+    }
+
+    /// The pilot landed high up or had landed already. Where only a landing under way was to be resumed, nothing begins
+    /// without a command any more; otherwise the next flight may be landed.
+    pub fn skip(&mut self) {
+        self.stand_down(self.start != Start::Resume);
+    }
+
+    /// Ends the mission: nothing is sent any more, and no pending command is repeated.
+    pub fn fail(&mut self, autopilot: &mut Autopilot, why: String) {
+        autopilot.withdraw();
+        self.state = State::Failed { why };
+    }
+
+    /// Advances take-off and waiting; the trigger when a landing is to begin. `is_known` says that the vehicle's state is
+    /// fresh, without which the lander refuses a start; `steers` that our setpoints control the landing.
+    pub fn step(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+        is_known: bool,
+        steers: bool,
+    ) -> Option<Trigger> {
+        match &mut self.state {
+            State::AwaitingTakeoff if is_known => {
+                let lands = autopilot.state().is_some_and(|state| {
+                    state.armed && state.mode.is_landing() && state.landed.is_flying()
+                });
+                if is_flying_guided(autopilot) || lands && steers {
+                    return Some(Trigger::InFlight);
+                }
+                if self.start == Start::Resume && has_no_landing(autopilot) {
+                    self.state = State::Idle;
+                }
+                None
+            }
+            State::TakingOff { takeoff, why } => match takeoff.step(now_ns, autopilot) {
+                end @ (TakeoffProgress::Done
+                | TakeoffProgress::Failed(TakeoffError::PilotInCommand {
+                    mode: FlightMode::Land | FlightMode::AUTO_LAND,
+                    ..
+                })) => {
+                    if !is_known {
+                        "waiting for attitude and position".clone_into(why);
+                        return None;
+                    }
+                    Some(match end {
+                        TakeoffProgress::Done => Trigger::TakenOff,
+                        _ => Trigger::LandInsteadOfTakeoff,
+                    })
+                }
+                TakeoffProgress::Failed(problem) => {
+                    tracing::error!(%problem, "Take-off failed");
+                    self.fail(autopilot, problem.to_string());
+                    None
+                }
+                progress => {
+                    *why = match progress {
+                        TakeoffProgress::Waiting(reasons) => reasons.join("; "),
+                        progress => progress.to_string(),
+                    };
+                    None
+                }
+            },
+            State::Idle
+            | State::AwaitingTakeoff
+            | State::Landing
+            | State::SendingLandingTarget
+            | State::Failed { .. } => None,
+        }
+    }
+
+    /// The motors were armed or disarmed; `is_finished` says that the landing had ended.
+    pub fn armed_changed(&mut self, now_ns: i64, armed: bool, is_finished: bool) {
+        if !armed && self.started_ns.is_some() {
+            self.disarmed_ns = self.disarmed_ns.or(Some(now_ns));
+        }
+        // Only `airborne` lands flight after flight; others wait for a command once the pilot has ended the flight.
+        if !armed && self.start != Start::Airborne && self.is_awaiting_takeoff() {
+            self.state = State::Idle;
+        }
+        let is_over = is_finished && !matches!(self.state, State::Failed { .. });
+        if armed && is_over && self.start == Start::Airborne {
+            self.stand_down(true);
+        }
+    }
+}
+
+/// True when the vehicle flies in the mode that follows setpoints.
+pub fn is_flying_guided(autopilot: &Autopilot) -> bool {
+    autopilot.state().is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
+}
+
+/// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies.
+fn has_no_landing(autopilot: &Autopilot) -> bool {
+    autopilot.state().is_some_and(|s| {
+        let stands = s.landed == LandedState::OnGround;
+        !s.armed || stands || !s.mode.is_guided() && !s.mode.is_landing()
+    })
+}

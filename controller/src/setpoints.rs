@@ -1,0 +1,122 @@
+//! The lander's actions, sent to the autopilot.
+
+use autopilot::command::SetpointError;
+use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode};
+use geometry::{Ned, Vector};
+use landing::{Action, Decision, Phase};
+use messages::Setpoint;
+
+/// Sends setpoints at their rate, mode changes and disarming.
+#[derive(Debug)]
+pub struct Setpoints {
+    period_ns: i64,
+    last: Option<Setpoint>,
+    sent_ns: i64,
+    /// The change to the mode that follows setpoints, or the disarming, that was requested last.
+    request: Option<CommandId>,
+}
+
+impl Setpoints {
+    /// Nothing was sent yet.
+    pub fn new(rate_hz: f64) -> Self {
+        Self { period_ns: (1e9 / rate_hz) as i64, last: None, sent_ns: i64::MIN, request: None }
+    }
+
+    /// The last setpoint; `None` while none is sent.
+    pub fn last(&self) -> Option<Setpoint> {
+        self.last
+    }
+
+    /// When the last setpoint was sent.
+    pub fn sent_ns(&self) -> i64 {
+        self.sent_ns
+    }
+
+    /// Carries out an action; the result is that of a setpoint, if one was due. One that `is_urgent` is sent before its
+    /// time.
+    pub fn carry_out(
+        &mut self,
+        now_ns: i64,
+        action: Action,
+        is_urgent: bool,
+        autopilot: &mut Autopilot,
+    ) -> Option<Result<(), SetpointError>> {
+        match action {
+            Action::None => self.last = None,
+            Action::Guided => {
+                self.last = None;
+                if let Some(mode) = autopilot.firmware().and_then(Firmware::guided) {
+                    self.request(now_ns, Command::SetMode(mode), autopilot);
+                }
+            }
+            Action::Disarm => self.request(now_ns, Command::Disarm, autopilot),
+            Action::Land => {
+                let mode = autopilot.firmware().and_then(Firmware::land);
+                autopilot.request(now_ns, Command::SetMode(mode.unwrap_or(FlightMode::Land)));
+                // Sent at once: at half a metre every tick counts.
+                autopilot.tick(now_ns);
+            }
+            Action::Velocity { velocity, yaw_rate } => {
+                let is_due = now_ns.saturating_sub(self.sent_ns) >= self.period_ns;
+                return (is_urgent || is_due)
+                    .then(|| self.send(now_ns, velocity, yaw_rate, autopilot));
+            }
+        }
+        None
+    }
+
+    /// Stops the vehicle, if setpoints are being sent: without one it would stop only after 3 s.
+    pub fn stop(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+    ) -> Option<Result<(), SetpointError>> {
+        self.last.map(|_| self.send(now_ns, Vector::zero(), 0.0, autopilot))
+    }
+
+    fn send(
+        &mut self,
+        now_ns: i64,
+        velocity: Vector<Ned>,
+        yaw_rate: f64,
+        autopilot: &mut Autopilot,
+    ) -> Result<(), SetpointError> {
+        let result = autopilot.set_velocity(now_ns, velocity, yaw_rate);
+        self.last = result.is_ok().then(|| Setpoint {
+            velocity_ned_m_s: velocity.coords.into(),
+            yaw_rate_rad_s: yaw_rate,
+        });
+        if result.is_ok() {
+            self.sent_ns = now_ns;
+        }
+        result
+    }
+
+    /// Sends a command, unless one is pending.
+    fn request(&mut self, now_ns: i64, command: Command, autopilot: &mut Autopilot) {
+        if !self.request.is_some_and(|id| autopilot.status(id) == CommandStatus::Pending) {
+            self.request = Some(autopilot.request(now_ns, command));
+            autopilot.tick(now_ns);
+        }
+    }
+}
+
+/// The action of a decision while no detector is alive: nothing descends, and no search moves. A crash of the last
+/// detector is known at once, so this does not wait until the target is stale.
+pub fn without_detector(decision: &Decision) -> Action {
+    match decision.action {
+        // A search without a detector finds nothing.
+        Action::Velocity { yaw_rate, .. } if decision.phase == Phase::Search => {
+            Action::Velocity { velocity: Vector::zero(), yaw_rate }
+        }
+        Action::Velocity { velocity, yaw_rate } => {
+            Action::Velocity { velocity: level(velocity), yaw_rate }
+        }
+        other => other,
+    }
+}
+
+/// The same velocity without its downward part.
+fn level(velocity: Vector<Ned>) -> Vector<Ned> {
+    Vector::new(velocity.x(), velocity.y(), velocity.z().min(0.0))
+}

@@ -1,0 +1,178 @@
+//! What the controller publishes about a flight.
+
+use autopilot::Autopilot;
+use landing::{Action, Decision, Lander};
+use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
+
+use crate::config::{Config, Mode};
+use crate::frames::Frames;
+use crate::journal::Journal;
+use crate::landing_target::{self, LandingTargetMode};
+use crate::mission::{Mission, State};
+use crate::wire;
+
+/// The parts of a flight that its status shows.
+pub struct View<'a> {
+    /// The configuration.
+    pub config: &'a Config,
+    /// The autopilot.
+    pub autopilot: &'a Autopilot,
+    /// The lander.
+    pub lander: &'a Lander,
+    /// The lander's latest decision.
+    pub decision: Option<Decision>,
+    /// The mission.
+    pub mission: &'a Mission,
+    /// The autopilot's own precision landing, where that steers.
+    pub landing_target: Option<&'a LandingTargetMode>,
+    /// Frames and detectors.
+    pub frames: &'a Frames,
+    /// Logs and counters.
+    pub journal: &'a Journal,
+    /// The last setpoint.
+    pub setpoint: Option<Setpoint>,
+    /// What was used of the detections.
+    pub used: Used,
+    /// Wind velocity to the north and east, in m/s.
+    pub wind_ned_m_s: Option<[f64; 2]>,
+}
+
+/// The detections that were used.
+#[derive(Copy, Clone, Debug, Default)]
+pub struct Used {
+    /// How many in landings.
+    pub count: u64,
+    /// Stamp of the newest.
+    pub stamp_ns: Option<i64>,
+}
+
+impl View<'_> {
+    /// The estimate of the landing point.
+    pub fn target(&self, now_ns: i64) -> TargetEstimate {
+        let target = self.decision.and_then(|decision| decision.target);
+        TargetEstimate {
+            stamp_ns: now_ns,
+            position_ned_m: target.map(|t| t.position.coords.into()),
+            lateral_error_m: target.map(|t| t.lateral_error_m),
+            height_m: target.map(|t| t.height_m),
+            age_ms: self.detection_age_ms(now_ns),
+            rejected: self.journal.rejection().map(str::to_owned),
+            decided: self.decision.and_then(|d| d.rejected).map(|why| why.to_string()),
+            velocity_ned_m_s: target.map(|t| t.velocity.coords.into()),
+            deviation_m: target.map(|t| t.deviation_m),
+            heading_rad: target.and_then(|t| t.heading_rad),
+            nis: target.and_then(|t| t.nis),
+            time_offset_ms: target.map(|t| t.time_offset_s * 1e3),
+            wind_ned_m_s: self.wind_ned_m_s,
+        }
+    }
+
+    /// What is being done, and why.
+    pub fn status(&self, now_ns: i64) -> ControllerStatus {
+        let target = self.decision.and_then(|decision| decision.target);
+        let position = self.autopilot.state().and_then(|state| state.position);
+        let above_origin_m = position.map(|position| -position.position.z());
+        let selection = &self.frames.selection;
+        let (phase, why) = self.phase(now_ns);
+        ControllerStatus {
+            stamp_ns: now_ns,
+            phase,
+            why,
+            guidance: match self.config.mode {
+                Mode::Guided => self.config.guidance.name().to_owned(),
+                Mode::LandingTarget => self.config.mode.name().to_owned(),
+            },
+            autopilot: self.link(),
+            active_detector: selection.active().map(str::to_owned),
+            detector_why: selection.why().to_owned(),
+            preference: selection.preference().to_owned(),
+            detector_changes: selection.changes(),
+            candidates: selection.candidates(now_ns),
+            detection_age_ms: self.detection_age_ms(now_ns),
+            height_m: target.map(|t| t.height_m).or(above_origin_m),
+            lateral_error_m: target.map(|t| t.lateral_error_m),
+            setpoint: self.setpoint,
+            started_ns: self.mission.started_ns(),
+            disarmed_ns: self.mission.disarmed_ns(),
+            finished: self.is_finished(),
+            detections_used: self.used.count,
+            latency_ms: self.journal.latency_ms(),
+        }
+    }
+
+    /// The phase and the reason for it.
+    pub fn phase(&self, now_ns: i64) -> (Phase, String) {
+        match (self.mission.state(), self.landing_target) {
+            (
+                State::Idle | State::AwaitingTakeoff | State::SendingLandingTarget,
+                Some(landing_target),
+            ) => landing_target.phase(now_ns, landing_target::problem(self.autopilot)),
+            (State::SendingLandingTarget, None) => {
+                (Phase::Failed, "no landing target is sent in this mode".to_owned())
+            }
+            (State::Idle, None) => (Phase::Idle, "waiting for the start of a landing".to_owned()),
+            (State::AwaitingTakeoff, None) => {
+                (Phase::Idle, "waiting for the vehicle to fly in GUIDED".to_owned())
+            }
+            (State::TakingOff { why, .. }, _) => (Phase::Takeoff, why.clone()),
+            (State::Failed { why }, _) => (Phase::Failed, why.clone()),
+            (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason()),
+        }
+    }
+
+    /// The reason for the lander's phase.
+    fn reason(&self) -> String {
+        if self.is_landing() && self.frames.selection.is_blind() {
+            return "no detector is alive, nothing descends".to_owned();
+        }
+        let why = self.decision.map_or_else(String::new, |decision| decision.why.to_string());
+        match self.autopilot.state() {
+            // It may as well be the autopilot's failsafe: when PX4 misses setpoints it leaves OFFBOARD.
+            Some(state) if self.lander.phase() == landing::Phase::PilotInCommand => {
+                format!("{why} (or the autopilot's failsafe), in {}", state.mode)
+            }
+            _ => why,
+        }
+    }
+
+    /// True once nothing more happens without a command.
+    pub fn is_finished(&self) -> bool {
+        let is_silent = self.decision.is_none_or(|decision| decision.action == Action::None);
+        match self.mission.state() {
+            State::Failed { .. } => true,
+            State::Landing => self.lander.phase().is_terminal() && is_silent,
+            State::SendingLandingTarget => {
+                self.landing_target.is_none_or(LandingTargetMode::is_finished)
+            }
+            State::Idle | State::AwaitingTakeoff | State::TakingOff { .. } => false,
+        }
+    }
+
+    /// True from the beginning of a landing to its end.
+    pub fn is_landing(&self) -> bool {
+        match self.mission.state() {
+            State::Landing => !self.lander.phase().is_terminal(),
+            State::SendingLandingTarget => {
+                self.landing_target.is_some_and(LandingTargetMode::is_active)
+            }
+            _ => false,
+        }
+    }
+
+    /// The link to the autopilot, as text.
+    fn link(&self) -> String {
+        match (self.autopilot.system(), self.autopilot.is_connected()) {
+            (Some(system), true) => {
+                let mode = self.autopilot.state().map(|state| state.mode);
+                let mode = mode.map_or_else(String::new, |mode| format!(" in {mode}"));
+                format!("system {system}{mode}")
+            }
+            (Some(system), false) => format!("system {system} is silent"),
+            (None, _) => "no heartbeat yet".to_owned(),
+        }
+    }
+
+    fn detection_age_ms(&self, now_ns: i64) -> Option<f64> {
+        self.used.stamp_ns.map(|stamp| now_ns.saturating_sub(stamp) as f64 * 1e-6)
+    }
+}
