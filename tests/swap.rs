@@ -327,7 +327,7 @@ async fn a_swap_that_fails_keeps_the_old_one_and_says_why() -> anyhow::Result<()
     let answer = tokio::task::block_in_place(|| detectors(&landing, &["prefer", "ground"]))?;
     ensure!(answer.contains("accepted") && answer.contains("none yet"), "{answer}");
     let answer = tokio::task::block_in_place(|| detectors(&landing, &["use", "nobody"]))?;
-    ensure!(answer.contains("refused") && answer.contains("there is: main"), "{answer}");
+    ensure!(answer.contains("refused") && answer.contains("known detectors: main"), "{answer}");
     command(&landing, ControllerCommand::Resume).await?;
     landing.lands().await?;
     Ok(())

@@ -1,11 +1,11 @@
-//! What is watched beside the landing: the battery, and whether autopilot and operator are still heard.
+//! Alarms of battery, autopilot link and operator.
 
 use autopilot::Battery;
 use landing::Alarm;
 
 use crate::config::AlarmSettings;
 
-/// Watches, and raises each alarm once in a landing.
+/// Raises each alarm once in a landing.
 #[derive(Debug)]
 pub struct Alarms {
     settings: AlarmSettings,
@@ -17,7 +17,7 @@ pub struct Alarms {
 }
 
 impl Alarms {
-    /// Nothing is watched yet.
+    /// No alarm was raised, and nothing was received.
     pub fn new(settings: AlarmSettings) -> Self {
         Self {
             settings,
@@ -34,25 +34,25 @@ impl Alarms {
         self.raised.clear();
     }
 
-    /// The operator, or a ground station, was heard.
-    pub fn operator_heard(&mut self, now_ns: i64) {
+    /// A command or a heartbeat of the ground station was received.
+    pub fn operator_active(&mut self, now_ns: i64) {
         self.operator_ns = Some(now_ns);
-        // Heard again and lost again is told again.
+        // Lost again after this, it is raised again.
         self.raised.retain(|alarm| *alarm != Alarm::OperatorLost);
     }
 
-    /// The autopilot was heard.
-    pub fn autopilot_heard(&mut self, now_ns: i64) {
+    /// A state of the autopilot was received.
+    pub fn autopilot_active(&mut self, now_ns: i64) {
         self.autopilot_ns = Some(now_ns);
         self.raised.retain(|alarm| *alarm != Alarm::AutopilotLost);
     }
 
-    /// The gravest alarm that is to be raised now.
+    /// The most severe alarm that is to be raised now.
     pub fn tick(&mut self, now_ns: i64, battery: Option<&Battery>) -> Option<Alarm> {
         let s = &self.settings;
-        let is_below = |part: f64, volts: f64| {
+        let is_below = |charge: f64, volts: f64| {
             battery.is_some_and(|b| {
-                b.remaining.is_some_and(|left| left < part)
+                b.remaining.is_some_and(|left| left < charge)
                     || b.voltage_v.is_some_and(|v| v > 0.0 && v < volts)
             })
         };
@@ -63,13 +63,16 @@ impl Alarms {
         let lasts = |from: Option<i64>, limit_s: f64| {
             from.is_some_and(|from| now_ns.saturating_sub(from) as f64 * 1e-9 >= limit_s)
         };
-        let watches = s.operator_lost_s > 0.0;
-        let listens = s.autopilot_lost_s > 0.0;
+        let checks_operator = s.operator_lost_s > 0.0;
+        let checks_autopilot = s.autopilot_lost_s > 0.0;
         let due = [
-            (Alarm::AutopilotLost, listens && lasts(self.autopilot_ns, s.autopilot_lost_s)),
+            (
+                Alarm::AutopilotLost,
+                checks_autopilot && lasts(self.autopilot_ns, s.autopilot_lost_s),
+            ),
             (Alarm::BatteryCritical, lasts(self.critical_since_ns, s.battery_s)),
             (Alarm::BatteryLow, lasts(self.low_since_ns, s.battery_s)),
-            (Alarm::OperatorLost, watches && lasts(self.operator_ns, s.operator_lost_s)),
+            (Alarm::OperatorLost, checks_operator && lasts(self.operator_ns, s.operator_lost_s)),
         ];
         let new = |(alarm, due): &(Alarm, bool)| *due && !self.raised.contains(alarm);
         let (alarm, _) = due.into_iter().find(new)?;
@@ -78,9 +81,9 @@ impl Alarms {
     }
 }
 
-/// Keeps since when something has been so.
-fn since(since_ns: &mut Option<i64>, is_so: bool, now_ns: i64) {
-    *since_ns = if is_so { since_ns.or(Some(now_ns)) } else { None };
+/// Keeps since when a condition has held.
+fn since(since_ns: &mut Option<i64>, holds: bool, now_ns: i64) {
+    *since_ns = if holds { since_ns.or(Some(now_ns)) } else { None };
 }
 
 #[cfg(test)]
@@ -106,9 +109,9 @@ mod tests {
     }
 
     #[test]
-    fn a_battery_that_stays_low_is_told_once_and_a_dip_is_not() {
+    fn a_battery_that_stays_low_raises_one_alarm_and_a_dip_none() {
         let mut alarms = alarms();
-        let mut told = Vec::new();
+        let mut raised = Vec::new();
         for second in 0..60 {
             let battery = match second {
                 0..10 => battery(0.5, 12.0),
@@ -117,32 +120,33 @@ mod tests {
                 20..30 => battery(0.15, 12.0),
                 _ => battery(0.15, 10.0),
             };
-            told.extend(alarms.tick(second * SECOND, Some(&battery)).map(|alarm| (second, alarm)));
+            raised
+                .extend(alarms.tick(second * SECOND, Some(&battery)).map(|alarm| (second, alarm)));
         }
-        assert_eq!(told, [(23, Alarm::BatteryLow), (33, Alarm::BatteryCritical)]);
+        assert_eq!(raised, [(23, Alarm::BatteryLow), (33, Alarm::BatteryCritical)]);
         alarms.begin();
         let again = alarms.tick(60 * SECOND, Some(&battery(0.15, 12.0)));
         assert_eq!(again, Some(Alarm::BatteryLow), "of the next landing");
     }
 
     #[test]
-    fn an_operator_is_missed_only_after_having_been_heard() {
+    fn only_a_known_operator_is_lost() {
         let mut alarms = alarms();
         assert_eq!(alarms.tick(100 * SECOND, None), None);
-        alarms.operator_heard(100 * SECOND);
+        alarms.operator_active(100 * SECOND);
         assert_eq!(alarms.tick(104 * SECOND, None), None);
         assert_eq!(alarms.tick(105 * SECOND, None), Some(Alarm::OperatorLost));
         assert_eq!(alarms.tick(106 * SECOND, None), None, "once");
-        alarms.operator_heard(107 * SECOND);
+        alarms.operator_active(107 * SECOND);
         assert_eq!(alarms.tick(112 * SECOND, None), Some(Alarm::OperatorLost), "lost again");
     }
 
     #[test]
-    fn an_autopilot_that_falls_silent_is_told_once_and_again_after_it_was_heard() {
+    fn a_silent_autopilot_raises_one_alarm_per_silence() {
         let mut alarms = alarms();
         assert_eq!(alarms.tick(100 * SECOND, None), None);
         for lost_s in [101, 111] {
-            alarms.autopilot_heard((lost_s - 1) * SECOND);
+            alarms.autopilot_active((lost_s - 1) * SECOND);
             assert_eq!(alarms.tick(lost_s * SECOND - 1, None), None);
             assert_eq!(alarms.tick(lost_s * SECOND, None), Some(Alarm::AutopilotLost));
             assert_eq!(alarms.tick((lost_s + 1) * SECOND, None), None, "once");
@@ -150,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_told_raises_nothing() {
+    fn unknown_values_raise_no_alarm() {
         let unknown = Battery::default();
         assert_eq!(alarms().tick(0, Some(&unknown)), None);
         assert_eq!(alarms().tick(0, None), None);

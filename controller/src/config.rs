@@ -8,7 +8,7 @@ use landing::{
 use node::{Check, Settings};
 use serde::Deserialize;
 
-/// The keys of `controller.toml`; meanings, units and ranges are told there.
+/// The keys of `controller.toml`, which has their meanings, units and ranges.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
@@ -18,7 +18,7 @@ pub struct Config {
     pub start: Start,
     /// Height of the take-off in metres.
     pub takeoff_height_m: f64,
-    /// Who steers.
+    /// Who controls the landing.
     pub mode: Mode,
     /// Which guidance is used.
     pub guidance: GuidanceName,
@@ -26,73 +26,73 @@ pub struct Config {
     pub marker: String,
     /// The link to the autopilot.
     pub autopilot: AutopilotSettings,
-    /// What the autopilot's own precision landing is told.
+    /// The landing targets for the autopilot's own precision landing.
     pub landing_target: LandingTargetSettings,
-    /// What is watched beside the landing.
+    /// Limits of battery, operator and link.
     pub alarms: AlarmSettings,
     /// The choice of the detector.
     pub detectors: DetectorSettings,
-    /// Which detections are used at all.
+    /// Which detections are used.
     pub target: TargetConfig,
     /// How detections become a target.
     pub estimator: EstimatorConfig,
-    /// What no setpoint exceeds.
+    /// Limits of all setpoints.
     pub envelope: EnvelopeConfig,
-    /// When the phases end.
+    /// Limits of the phases.
     pub phases: PhaseConfig,
-    /// Our guidance.
+    /// The metric guidance.
     pub metric: MetricConfig,
     /// The thesis' guidance.
     pub thesis: ThesisConfig,
 }
 
-/// Who steers.
+/// Who controls the landing.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
-    /// We do, by velocity setpoints.
+    /// This controller, by velocity setpoints.
     Guided,
-    /// The autopilot's own precision landing, which is told where the landing point is.
+    /// The autopilot's own precision landing, which is sent the landing target.
     LandingTarget,
 }
 
-/// What the autopilot's own precision landing is told.
+/// The landing targets for the autopilot's own precision landing.
 #[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LandingTargetSettings {
-    /// What is sent.
+    /// Which position is sent.
     pub source: LandingTargetSource,
-    /// For how long it is sent without a gap before LAND is asked for, in seconds.
+    /// Time for which it is sent without a gap before LAND is requested, in seconds.
     pub steady_s: f64,
 }
 
-/// What is sent as the landing target.
+/// Which position is sent as the landing target.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LandingTargetSource {
-    /// The estimate, as seen from the vehicle's newest state.
+    /// The estimate, relative to the vehicle's newest state.
     Estimate,
-    /// Each detection as it is, with the stamp of its frame; PX4 is told the estimate all the same.
+    /// Each detection as it is, with the stamp of its frame; PX4 gets the estimate in either case.
     Detection,
 }
 
-/// What is watched beside the landing.
+/// Limits of battery, operator and link.
 #[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AlarmSettings {
     /// Charge below which the battery is low, from 0 to 1.
     pub battery_low: f64,
-    /// Charge below which it is nearly empty, from 0 to 1.
+    /// Charge below which the battery is critical, from 0 to 1.
     pub battery_critical: f64,
-    /// Voltage below which it is low, in V.
+    /// Voltage below which the battery is low, in V.
     pub battery_low_v: f64,
-    /// Voltage below which it is nearly empty, in V.
+    /// Voltage below which the battery is critical, in V.
     pub battery_critical_v: f64,
-    /// For how long it must be so, in seconds.
+    /// Time for which the battery must be below a limit, in seconds.
     pub battery_s: f64,
-    /// Silence after which an operator who was heard is lost, in seconds; 0 does not watch.
+    /// Silence after which a known operator is lost, in seconds; 0 turns the alarm off.
     pub operator_lost_s: f64,
-    /// Silence of the autopilot after which it is lost, in seconds; 0 does not watch.
+    /// Silence after which the autopilot is lost, in seconds; 0 turns the alarm off.
     pub autopilot_lost_s: f64,
 }
 
@@ -100,13 +100,13 @@ pub struct AlarmSettings {
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Start {
-    /// When the operator says so.
+    /// On the operator's command.
     Command,
     /// As soon as the vehicle is seen flying in GUIDED.
     Airborne,
     /// After a take-off.
     Takeoff,
-    /// Where a landing under way was left, in GUIDED or LAND; after that flight when the operator says so.
+    /// Resumes an active landing, in GUIDED or LAND; after that flight on the operator's command.
     Resume,
 }
 
@@ -114,9 +114,9 @@ pub enum Start {
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GuidanceName {
-    /// Our own.
+    /// The metric guidance.
     Metric,
-    /// The thesis'.
+    /// The thesis' guidance.
     Thesis,
 }
 
@@ -126,17 +126,17 @@ pub enum GuidanceName {
 pub struct AutopilotSettings {
     /// Where it is.
     pub address: String,
-    /// The vehicle's system number, or 0.
+    /// The vehicle's system id, or 0.
     pub system_id: u8,
-    /// Our own component number.
+    /// Our own component id.
     pub component_id: u8,
-    /// How often attitude and position are asked for, in Hz.
+    /// Requested rate of attitude and position, in Hz.
     pub state_rate_hz: f64,
-    /// How often setpoints are sent, in Hz.
+    /// Rate of setpoints, in Hz.
     pub setpoint_rate_hz: f64,
-    /// Whether to ask for the autopilot's clock.
+    /// Whether to synchronise with the autopilot's clock.
     pub timesync: bool,
-    /// The vehicle's drag, from which the wind is told, in 1/s; 0 tells none.
+    /// The vehicle's drag, for the estimate of the wind, in 1/s; 0 turns it off.
     pub drag_per_s: f64,
 }
 
@@ -144,23 +144,23 @@ pub struct AutopilotSettings {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DetectorSettings {
-    /// The detector to use while it is healthy, or nothing.
+    /// The preferred detector, or nothing.
     pub preferred: String,
-    /// Where the detector to use should run.
+    /// Where the preferred detectors run.
     pub place: PreferredPlace,
-    /// The usual age of its frames on arrival, in seconds, up to which a detector is healthy.
+    /// Maximum median age of a healthy detector's frames on arrival, in seconds.
     pub max_age_s: f64,
-    /// Frames a second from which on a detector is healthy.
-    pub least_rate_hz: f64,
-    /// For how long a preferred detector must have been healthy before it is used, in seconds.
+    /// Minimum frame rate of a healthy detector, in Hz.
+    pub min_rate_hz: f64,
+    /// Time for which a preferred detector must have been healthy before it is used, in seconds.
     pub return_after_s: f64,
-    /// Distance up to which two detectors agree, in metres.
+    /// Maximum distance between the marker positions of two detectors that agree, in metres.
     pub tolerance_m: f64,
-    /// What that distance grows by per metre of range.
+    /// Growth of that distance per metre of range.
     pub tolerance_per_m: f64,
 }
 
-/// Where the detector to use should run.
+/// Where the preferred detectors run.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PreferredPlace {
@@ -189,13 +189,13 @@ impl Settings for Config {
         check.range("autopilot.drag_per_s", self.autopilot.drag_per_s, 0.0..=5.0);
         check.range("landing_target.steady_s", self.landing_target.steady_s, 0.0..=30.0);
         self.alarms.check(check);
-        // A state that is stale holds the vehicle by itself; the alarm is for a silence that lasts.
+        // A stale state makes the vehicle hold already; the alarm is for a longer silence.
         let (lost_s, stale_s) = (self.alarms.autopilot_lost_s, self.phases.stale_vehicle_s);
         if lost_s > 0.0 {
             check.at_least("alarms.autopilot_lost_s", lost_s, "phases.stale_vehicle_s", stale_s);
         }
         self.detectors.check(check);
-        // Both guidances are checked, used or not: a wrong number should not wait for the day it is used.
+        // Both guidances are checked, so that a wrong number is found before it is used.
         for guidance in [GuidanceConfig::Metric(self.metric), GuidanceConfig::Thesis(self.thesis)] {
             if let Err(problem) = self.landing(guidance).validate() {
                 let (key, min, max) = (problem.key, problem.min, problem.max);
@@ -220,7 +220,7 @@ impl AlarmSettings {
 impl DetectorSettings {
     fn check(&self, check: &mut Check<'_>) {
         check.range("detectors.max_age_s", self.max_age_s, 0.05..=5.0);
-        check.range("detectors.least_rate_hz", self.least_rate_hz, 0.1..=100.0);
+        check.range("detectors.min_rate_hz", self.min_rate_hz, 0.1..=100.0);
         check.range("detectors.return_after_s", self.return_after_s, 0.0..=60.0);
         check.range("detectors.tolerance_m", self.tolerance_m, 0.001..=10.0);
         check.range("detectors.tolerance_per_m", self.tolerance_per_m, 0.0..=1.0);
@@ -304,6 +304,6 @@ mod tests {
         let stale = ["`alarms.autopilot_lost_s` = 0.3", "`phases.stale_vehicle_s` = 0.5"];
         check("alarms.autopilot_lost_s=0.3", &stale);
         check("phases.stale_vehicle_s=1.5", &["`alarms.autopilot_lost_s` = 1", "= 1.5"]);
-        assert!(load(&["alarms.autopilot_lost_s=0"]).is_ok(), "it is not watched at all");
+        assert!(load(&["alarms.autopilot_lost_s=0"]).is_ok(), "the alarm is off");
     }
 }

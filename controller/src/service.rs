@@ -13,21 +13,21 @@ use tokio::time::{MissedTickBehavior, interval};
 use crate::config::Config;
 use crate::flight::Flight;
 
-/// How often time is let pass for the flight.
+/// Period of the flight's ticks.
 const TICK: Duration = Duration::from_millis(25);
-/// How often the status is published when nothing changes.
+/// Period of the status while nothing changes, in nanoseconds.
 const STATUS_PERIOD_NS: i64 = 200_000_000;
-/// How often it is looked at whether something has changed.
-const LOOK_PERIOD_NS: i64 = 20_000_000;
-/// How often the vehicle's state is published at most.
+/// Period of the check whether the status has changed, in nanoseconds.
+const CHECK_PERIOD_NS: i64 = 20_000_000;
+/// Minimum period of the vehicle's state, in nanoseconds.
 const VEHICLE_PERIOD_NS: i64 = 18_000_000;
-/// Packets of the autopilot that wait to be passed on; more are dropped, as the flight never waits for the network.
-const PACKETS_WAITING: usize = 512;
+/// Maximum number of the autopilot's packets that wait for the network; more are dropped, as the flight never waits.
+const MAX_WAITING_PACKETS: usize = 512;
 
-/// Runs the service until it is asked to stop.
+/// Runs the service until shutdown.
 ///
 /// # Errors
-/// When another controller is there, the link cannot be opened, or the network fails.
+/// When another controller is running, the link cannot be opened, or the network fails.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
@@ -48,19 +48,19 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         tokio::select! {
-            // Whichever is ready, in no order: one that talks without end must not silence the others.
+            // Whichever is ready, in random order: a busy source must not starve the others.
             () = shutdown.requested() => break,
             event = link.recv() => match event {
                 LinkEvent::Packet { packet, received } => {
-                    // What waited in a queue here was not under way from the autopilot.
+                    // The time spent in our own queue is not part of the link's delay.
                     let waited_ns = i64::try_from(received.elapsed().as_nanos()).unwrap_or(0);
                     flight.packet(now_ns().saturating_sub(waited_ns), &packet);
                     reports.pass_on(&node, packet.raw);
                 }
-                LinkEvent::Connected { peer } => tracing::info!(peer, "Link to the autopilot"),
+                LinkEvent::Connected { peer } => tracing::info!(peer, "Link to the autopilot is up"),
                 LinkEvent::Disconnected { reason } => {
                     node.health().failed("link");
-                    tracing::warn!(reason, "The link to the autopilot is down; it is tried again");
+                    tracing::warn!(reason, "Link to the autopilot is down; reconnecting");
                 }
             },
             Some((key, message)) = detections.next_with_key() => {
@@ -74,11 +74,11 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             Some((detector, alive)) = presence.next() => flight.presence(now_ns(), &detector, alive),
             Some((key, info)) = infos.next_with_key() => {
                 let publisher = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
-                flight.introduced(now_ns(), publisher, &info);
+                flight.on_detector_info(now_ns(), publisher, &info);
             }
             Some(request) = commands.next() => {
                 let reply = flight.command(now_ns(), &request.message);
-                // Whoever asked may not listen, and the setpoints do not wait for that.
+                // The requester may be gone, and the setpoints do not wait for it.
                 tokio::spawn(async move { request.answer(&reply).await });
             }
             Some(info) = cameras.next() => flight.camera(info),
@@ -95,14 +95,14 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         send(&node, &link, &mut flight);
         reports.publish(&flight).await;
     }
-    flight.leave(now_ns());
+    flight.shutdown(now_ns());
     send(&node, &link, &mut flight);
     // The link's own task needs a moment to put the last packet on the wire.
     tokio::time::sleep(TICK).await;
     Ok(())
 }
 
-/// Sends what the flight wants to say.
+/// Sends the flight's packets.
 fn send(node: &Node, link: &Link, flight: &mut Flight) {
     while let Some(packet) = flight.poll_outgoing() {
         if link.send(&packet).is_err() {
@@ -111,19 +111,19 @@ fn send(node: &Node, link: &Link, flight: &mut Flight) {
     }
 }
 
-/// What the service tells others.
+/// Publishes status, vehicle state and the autopilot's packets.
 struct Reports {
     status: Publisher<ControllerStatus>,
     vehicle: Publisher<VehicleState>,
     packets: mpsc::Sender<Vec<u8>>,
     last: Option<ControllerStatus>,
     vehicle_ns: i64,
-    looked_ns: i64,
+    checked_ns: i64,
 }
 
 impl Reports {
     async fn new(node: &Node) -> anyhow::Result<Self> {
-        let (packets, mut waiting) = mpsc::channel::<Vec<u8>>(PACKETS_WAITING);
+        let (packets, mut waiting) = mpsc::channel::<Vec<u8>>(MAX_WAITING_PACKETS);
         let publisher = node.publisher(topic::FROM_AUTOPILOT, &[]).await?;
         tokio::spawn(async move {
             while let Some(packet) = waiting.recv().await {
@@ -136,7 +136,7 @@ impl Reports {
             packets,
             last: None,
             vehicle_ns: i64::MIN,
-            looked_ns: i64::MIN,
+            checked_ns: i64::MIN,
         })
     }
 
@@ -155,10 +155,10 @@ impl Reports {
             self.vehicle_ns = now;
             self.vehicle.publish(&vehicle).await;
         }
-        if now.saturating_sub(self.looked_ns) < LOOK_PERIOD_NS {
+        if now.saturating_sub(self.checked_ns) < CHECK_PERIOD_NS {
             return;
         }
-        self.looked_ns = now;
+        self.checked_ns = now;
         let status = flight.status(now);
         let is_due = self.last.as_ref().is_none_or(|last| {
             now - last.stamp_ns >= STATUS_PERIOD_NS

@@ -1,7 +1,6 @@
-//! The wind, from how the vehicle leans.
+//! Wind estimate from the vehicle's tilt.
 //!
-//! What the lean accelerates and the motion does not show is taken by the air: with a drag that grows with the speed
-//! through it, `dv/dt = lean - drag * (v - wind)`.
+//! The tilt accelerates the vehicle against a drag proportional to the airspeed: `dv/dt = tilt - drag * (v - wind)`.
 
 use geometry::{Body, Vector};
 use landing::VehicleState;
@@ -9,13 +8,13 @@ use landing::VehicleState;
 const GRAVITY_M_S2: f64 = 9.806_65;
 /// Time constant of the mean, in seconds.
 const MEAN_S: f64 = 3.0;
-/// A longer gap begins anew, in seconds.
-const LONGEST_GAP_S: f64 = 1.0;
+/// Maximum gap between two states, in seconds; after a longer one the mean starts again.
+const MAX_GAP_S: f64 = 1.0;
 
-/// Follows one vehicle.
+/// Estimates the wind at one vehicle.
 #[derive(Clone, Debug, Default)]
 pub struct WindEstimate {
-    /// Means of velocity and of what the lean accelerates, north and east, and of when.
+    /// Means of velocity and of the acceleration by the tilt, north and east.
     mean: Option<Mean>,
 }
 
@@ -25,26 +24,26 @@ struct Mean {
     since_s: f64,
     newest: [f64; 2],
     velocity: [f64; 2],
-    lean: [f64; 2],
+    tilt: [f64; 2],
 }
 
 impl WindEstimate {
-    /// Takes a state of the flying vehicle.
-    pub fn take(&mut self, state: &VehicleState) {
+    /// Updates the estimate with a state of the flying vehicle.
+    pub fn update(&mut self, state: &VehicleState) {
         let up = state.ned_from_body * Vector::<Body>::new(0.0, 0.0, -1.0);
         let scale = GRAVITY_M_S2 / (-up.z()).max(0.5);
         let (now_s, velocity) = (state.stamp.seconds(), [state.velocity.x(), state.velocity.y()]);
-        let lean = [up.x() * scale, up.y() * scale];
-        let last = self.mean.filter(|mean| (0.0..LONGEST_GAP_S).contains(&(now_s - mean.stamp_s)));
+        let tilt = [up.x() * scale, up.y() * scale];
+        let last = self.mean.filter(|mean| (0.0..MAX_GAP_S).contains(&(now_s - mean.stamp_s)));
         let Some(mut mean) = last else {
             let (stamp_s, since_s) = (now_s, now_s);
-            self.mean = Some(Mean { stamp_s, since_s, newest: velocity, velocity, lean });
+            self.mean = Some(Mean { stamp_s, since_s, newest: velocity, velocity, tilt });
             return;
         };
-        let share = 1.0 - (-(now_s - mean.stamp_s) / MEAN_S).exp();
+        let weight = 1.0 - (-(now_s - mean.stamp_s) / MEAN_S).exp();
         for axis in 0..2 {
-            mean.velocity[axis] += share * (velocity[axis] - mean.velocity[axis]);
-            mean.lean[axis] += share * (lean[axis] - mean.lean[axis]);
+            mean.velocity[axis] += weight * (velocity[axis] - mean.velocity[axis]);
+            mean.tilt[axis] += weight * (tilt[axis] - mean.tilt[axis]);
         }
         (mean.stamp_s, mean.newest) = (now_s, velocity);
         self.mean = Some(mean);
@@ -55,9 +54,9 @@ impl WindEstimate {
         let mean = self.mean.filter(|mean| mean.stamp_s - mean.since_s > 2.0 * MEAN_S)?;
         (drag_per_s > 0.0).then(|| {
             [0, 1].map(|axis| {
-                // The mean lags, and by so much that its lag tells the mean acceleration.
+                // The lag of the mean is proportional to the mean acceleration.
                 let acceleration = (mean.newest[axis] - mean.velocity[axis]) / MEAN_S;
-                mean.velocity[axis] + (acceleration - mean.lean[axis]) / drag_per_s
+                mean.velocity[axis] + (acceleration - mean.tilt[axis]) / drag_per_s
             })
         })
     }
@@ -79,10 +78,10 @@ mod tests {
             // A sine to the north, steady to the east.
             let velocity = [(0.5 * t).sin(), 0.7];
             let acceleration = [0.5 * (0.5 * t).cos(), 0.0];
-            let lean: [f64; 2] =
+            let tilt: [f64; 2] =
                 [0, 1].map(|axis| acceleration[axis] + drag * (velocity[axis] - wind[axis]));
-            let (roll, pitch) = ((lean[1] / GRAVITY_M_S2).atan(), -(lean[0] / GRAVITY_M_S2).atan());
-            estimate.take(&VehicleState {
+            let (roll, pitch) = ((tilt[1] / GRAVITY_M_S2).atan(), -(tilt[0] / GRAVITY_M_S2).atan());
+            estimate.update(&VehicleState {
                 stamp: Timestamp::from_seconds(t),
                 ned_from_body: Rotation::from_euler(roll, pitch, 0.0),
                 position: Point::origin(),

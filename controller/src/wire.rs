@@ -6,18 +6,18 @@ use landing::{Landed, MarkerInFrame, Mode, Timestamp};
 use messages::{CameraInfo, Detection, Detections, MarkerPose, Phase, Transform3};
 use nalgebra::Matrix3;
 
-/// Attitude and position further apart than this are not of one moment: one of the two has stopped.
-const MOST_APART_NS: i64 = 300_000_000;
+/// Maximum time between attitude and position, in nanoseconds: beyond it one of the two has stopped.
+const MAX_SKEW_NS: i64 = 300_000_000;
 
 /// Where a camera is mounted.
 pub fn body_from_camera(info: &CameraInfo) -> Option<Transform<Body, Camera>> {
     info.body_from_camera.transform()
 }
 
-/// A marker's name, `family` or `family:id`, in its parts.
+/// Splits a marker's name, `family` or `family:id`.
 ///
 /// # Errors
-/// Says what a name looks like.
+/// Says which form a name has.
 pub fn marker_name(name: &str) -> Result<(&str, Option<u32>), String> {
     let (family, id) = match name.split_once(':') {
         Some((family, id)) => (family, Some(id)),
@@ -30,13 +30,13 @@ pub fn marker_name(name: &str) -> Result<(&str, Option<u32>), String> {
         .ok_or_else(|| "it must be FAMILY or FAMILY:ID, with a whole number as ID".to_owned())
 }
 
-/// The first detection of a marker, named `family` or `family:id`, among those in a frame; none for what is no name.
+/// The first detection of the marker `family` or `family:id` in a frame; none for an invalid name.
 pub fn wanted<'a>(message: &'a Detections, marker: &str) -> Option<&'a Detection> {
     let (family, id) = marker_name(marker).ok()?;
     message.detections.iter().find(|d| d.family == family && (id.is_none() || d.id == id))
 }
 
-/// A detection as the lander sees it.
+/// Converts a detection for the lander.
 pub fn marker_in_frame(
     detection: &Detection,
     mount: Option<Transform<Body, Camera>>,
@@ -58,7 +58,7 @@ pub fn marker_in_frame(
     }
 }
 
-/// Covariance of a marker's place, from the camera's axes to the body's.
+/// Covariance of a marker's position, rotated from the camera's axes to the body's.
 fn covariance_in_body(mount: &Transform<Body, Camera>, pose: &MarkerPose) -> Matrix3<f64> {
     let axis = |x, y, z| (mount.rotation() * Vector::<Camera>::new(x, y, z)).coords;
     let turn =
@@ -82,12 +82,12 @@ pub fn phase(phase: landing::Phase) -> Phase {
     }
 }
 
-/// The vehicle as the lander sees it: attitude and position at one moment, that of the newer of the two; `None` when
-/// one of the two has stopped (an autopilot without a position estimate goes on telling its attitude), as what is
-/// extrapolated further would be made up.
+/// Converts the vehicle's state for the lander: attitude and position at the time of the newer of the two. `None` when one
+/// of the two has stopped (an autopilot without a position estimate still sends its attitude), because it would have to be
+/// extrapolated too far.
 pub fn vehicle(state: &VehicleState) -> Option<landing::VehicleState> {
     let (attitude, position) = (state.attitude?, state.position?);
-    if attitude.stamp_ns.abs_diff(position.stamp_ns) > MOST_APART_NS.unsigned_abs() {
+    if attitude.stamp_ns.abs_diff(position.stamp_ns) > MAX_SKEW_NS.unsigned_abs() {
         return None;
     }
     let stamp_ns = attitude.stamp_ns.max(position.stamp_ns);
@@ -155,7 +155,7 @@ mod tests {
         assert_eq!(id("aruco-4x4-50:7"), Some(Some(7)));
         assert_eq!(id("aruco-4x4-50"), Some(Some(3)));
         assert_eq!(id("stag-hd23:0"), None);
-        assert_eq!(id("aruco-4x4-50:x7"), None, "what is no number is not any number");
+        assert_eq!(id("aruco-4x4-50:x7"), None, "an id that is not a number is refused");
     }
 
     #[test]

@@ -16,20 +16,20 @@ use tokio::time::{MissedTickBehavior, interval};
 
 use crate::config::Config;
 use crate::route::{self, Route};
-use crate::target::Display;
-use crate::text::Teller;
+use crate::target::LandingTargetPublisher;
+use crate::text::StatusTextSender;
 use crate::vehicle::Vehicle;
 
-/// How often MAVLink wants a heartbeat.
+/// Period of heartbeats in MAVLink.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// A ground station that was silent for so long is told everything anew.
-const GROUND_SILENCE_NS: i64 = 10_000_000_000;
+/// Silence of the ground station after which all texts are repeated, in nanoseconds.
+const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
 
-/// Passes MAVLink between the autopilot's topics and the ground station, and tells it of the landing, until shutdown.
+/// Passes MAVLink between the autopilot's topics and the ground station, and reports the landing to it, until shutdown.
 ///
 /// # Errors
-/// When the address cannot be listened on, another bridge has this name, or the network session ends. A ground station
-/// that is not there is no error.
+/// When the address cannot be opened, another bridge has this name, or the network session ends. A missing ground
+/// station is not an error.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     let address: Address = config.ground.parse()?;
     node.claim_unique_name(&node.identity().instance).await?;
@@ -63,7 +63,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             }
             _ = second.tick() => {
                 bridge.count_losses(ground.counters(), ground.dropped());
-                bridge.second(now_ns());
+                bridge.every_second(now_ns());
             }
         }
     }
@@ -80,17 +80,17 @@ struct Bridge {
     vehicle: Vehicle,
     /// Reads what comes from the autopilot's topic.
     parser: Parser,
-    teller: Teller,
-    display: Display,
+    texts: StatusTextSender,
+    targets: LandingTargetPublisher,
     status: Option<ControllerStatus>,
     controllers: BTreeSet<String>,
-    /// Whether a controller was there and left.
-    deserted: bool,
-    ground_heard_ns: Option<i64>,
-    /// Bytes and packets of the ground that were lost, as far as they are counted.
-    noise: u64,
+    /// True once the last controller has gone.
+    is_abandoned: bool,
+    ground_ns: Option<i64>,
+    /// Bytes that are not packets, and packets not read in time, as counted so far.
+    bad_bytes: u64,
     unread: u64,
-    /// Number of our next packet.
+    /// Sequence number of our next packet.
     sequence: u8,
 }
 
@@ -106,33 +106,33 @@ impl Bridge {
             health,
             vehicle: Vehicle::new(config.system_id, assume_at_ns),
             parser: Parser::new(),
-            teller: Teller::new(now_ns),
-            display: Display::new(config.target_rate_hz, config.target_max_age_ms),
+            texts: StatusTextSender::new(now_ns),
+            targets: LandingTargetPublisher::new(config.target_rate_hz, config.target_max_age_ms),
             status: None,
             controllers: BTreeSet::new(),
-            deserted: false,
-            ground_heard_ns: None,
-            noise: 0,
+            is_abandoned: false,
+            ground_ns: None,
+            bad_bytes: 0,
             unread: 0,
             sequence: 0,
         }
     }
 
-    /// Who we are, once it is known whose companion.
+    /// Our system and component id, once the vehicle's system id is known.
     fn me(&self, now_ns: i64) -> Option<Sender> {
         let system = self.vehicle.system(now_ns)?;
         Some(Sender { system, component: self.component })
     }
 
-    /// Passes packets of the autopilot down.
+    /// Passes the autopilot's packets to the ground station.
     fn down(&mut self, now_ns: i64, payload: &[u8]) {
         let mut packets = self.parser.push(payload);
         packets.extend(self.parser.finish());
         if packets.is_empty() {
-            self.health.dropped("from autopilot: no MAVLink packet");
+            self.health.dropped("from autopilot: not a MAVLink packet");
         }
         for packet in packets {
-            self.vehicle.hear(now_ns, &packet);
+            self.vehicle.received(now_ns, &packet);
             match route::from_autopilot(&packet, self.me(now_ns)) {
                 Route::Drop(reason) => self.health.dropped(reason),
                 Route::Pass | Route::Answer(_) => {
@@ -143,16 +143,16 @@ impl Bridge {
         }
     }
 
-    /// The packet for the autopilot in what happened on the ground's side, if there is one.
+    /// The packet for the autopilot in an event of the ground station's link, if there is one.
     fn up(&mut self, now_ns: i64, event: LinkEvent) -> Option<Vec<u8>> {
         match event {
             LinkEvent::Connected { peer } => {
-                tracing::info!(peer, "The link to the ground station is open");
+                tracing::info!(peer, "Link to the ground station is up");
                 None
             }
             LinkEvent::Disconnected { reason } => {
                 self.health.failed("link to the ground station lost");
-                tracing::warn!(reason, "The link to the ground station is closed");
+                tracing::warn!(reason, "Link to the ground station is down; reconnecting");
                 None
             }
             LinkEvent::Packet { packet, .. } => self.packet_from_ground(now_ns, *packet),
@@ -164,11 +164,11 @@ impl Bridge {
         match route::from_ground(&packet, self.me(now_ns), &self.vehicle) {
             Route::Drop(reason) => self.health.dropped(reason),
             Route::Answer(message) => {
-                self.hear_ground(now_ns, packet.sender);
-                self.speak(now_ns, &message);
+                self.ground_active(now_ns, packet.sender);
+                self.send_own(now_ns, &message);
             }
             Route::Pass => {
-                self.hear_ground(now_ns, packet.sender);
+                self.ground_active(now_ns, packet.sender);
                 if self.forwards {
                     self.health.count("to autopilot");
                     return Some(packet.raw);
@@ -179,62 +179,62 @@ impl Bridge {
         None
     }
 
-    fn hear_ground(&mut self, now_ns: i64, sender: Sender) {
-        let heard = self.ground_heard_ns.replace(now_ns);
-        if heard.is_none_or(|heard| now_ns.saturating_sub(heard) > GROUND_SILENCE_NS) {
+    fn ground_active(&mut self, now_ns: i64, sender: Sender) {
+        let last = self.ground_ns.replace(now_ns);
+        if last.is_none_or(|last| now_ns.saturating_sub(last) > GROUND_TIMEOUT_NS) {
             let Sender { system, component } = sender;
-            tracing::info!(system, component, "A ground station is heard");
-            self.teller.forget();
-            self.tell(now_ns);
+            tracing::info!(system, component, "Ground station found");
+            self.texts.reset();
+            self.send_texts(now_ns);
         }
     }
 
-    /// Takes what the controller does.
+    /// Handles the controller's status.
     fn status(&mut self, now_ns: i64, status: ControllerStatus) {
         self.status = Some(status);
-        self.tell(now_ns);
+        self.send_texts(now_ns);
     }
 
-    /// Tells what is new in the controller's status.
-    fn tell(&mut self, now_ns: i64) {
-        // Nothing counts as told that could not be sent.
+    /// Sends what is new in the controller's status.
+    fn send_texts(&mut self, now_ns: i64) {
+        // A text counts as sent only if it can be sent.
         if self.me(now_ns).is_none() {
             return;
         }
         let Some(status) = &self.status else { return };
-        for packet in self.teller.status(now_ns, status) {
+        for packet in self.texts.status(now_ns, status) {
             self.health.count("texts");
-            self.speak(now_ns, &packet);
+            self.send_own(now_ns, &packet);
         }
     }
 
-    /// Shows the landing point.
+    /// Sends the landing point.
     fn target(&mut self, now_ns: i64, estimate: &TargetEstimate) {
         if self.me(now_ns).is_none() {
             return;
         }
-        if let Some(message) = self.display.show(now_ns, estimate) {
+        if let Some(message) = self.targets.message(now_ns, estimate) {
             self.health.count("landing targets");
-            self.speak(now_ns, &message);
+            self.send_own(now_ns, &message);
         }
     }
 
-    /// Tells when the last controller leaves, and when one is back.
+    /// Reports when the last controller leaves, and when one is back.
     fn controller(&mut self, now_ns: i64, controller: String, is_there: bool) {
         if is_there {
             self.controllers.insert(controller);
         } else {
             self.controllers.remove(&controller);
         }
-        let deserted = self.controllers.is_empty() && !is_there;
-        if deserted == self.deserted {
+        let is_abandoned = self.controllers.is_empty() && !is_there;
+        if is_abandoned == self.is_abandoned {
             return;
         }
-        self.deserted = deserted;
-        let (severity, text) = if deserted {
-            // The next controller's phase is news even when it is the same.
+        self.is_abandoned = is_abandoned;
+        let (severity, text) = if is_abandoned {
+            // The next controller's phase is sent even when it is the same.
             self.status = None;
-            self.teller.forget();
+            self.texts.reset();
             (MavSeverity::MAV_SEVERITY_WARNING, "Alight: the controller is gone")
         } else {
             (MavSeverity::MAV_SEVERITY_NOTICE, "Alight: the controller is back")
@@ -242,46 +242,46 @@ impl Bridge {
         if self.me(now_ns).is_none() {
             return;
         }
-        match self.teller.say(now_ns, severity, text) {
-            Some(packets) => packets.iter().for_each(|packet| self.speak(now_ns, packet)),
+        match self.texts.text(now_ns, severity, text) {
+            Some(packets) => packets.iter().for_each(|packet| self.send_own(now_ns, packet)),
             None => self.health.dropped("texts: too many"),
         }
     }
 
-    /// Counts what was lost on the ground's side since the last second.
-    fn count_losses(&mut self, heard: Counters, unread: u64) {
-        if heard.bad_bytes > self.noise {
-            self.health.dropped("from ground: seconds with bytes that are no packet");
+    /// Counts losses on the ground station's link since the last second.
+    fn count_losses(&mut self, counters: Counters, unread: u64) {
+        if counters.bad_bytes > self.bad_bytes {
+            self.health.dropped("from ground: seconds with bytes outside of packets");
         }
         for _ in self.unread..unread {
             self.health.dropped("from ground: not read in time");
         }
-        self.noise = heard.bad_bytes;
+        self.bad_bytes = counters.bad_bytes;
         self.unread = unread;
     }
 
-    /// What is done every second: the heartbeat, and what could not be told earlier.
-    fn second(&mut self, now_ns: i64) {
-        self.speak(now_ns, &self.heartbeat());
-        self.tell(now_ns);
+    /// Sends the heartbeat, and texts that could not be sent earlier.
+    fn every_second(&mut self, now_ns: i64) {
+        self.send_own(now_ns, &self.heartbeat());
+        self.send_texts(now_ns);
     }
 
     fn heartbeat(&self) -> MavMessage {
-        let lands = self
+        let is_landing = self
             .status
             .as_ref()
             .is_some_and(|status| !status.finished && status.phase != Phase::Idle);
         let mut message = heartbeat();
         if let MavMessage::HEARTBEAT(heartbeat) = &mut message
-            && !lands
+            && !is_landing
         {
             heartbeat.system_status = MavState::MAV_STATE_STANDBY;
         }
         message
     }
 
-    /// Sends a message of our own to the ground, if we have a number.
-    fn speak(&mut self, now_ns: i64, message: &MavMessage) {
+    /// Sends a message of our own to the ground station, if we have a system id.
+    fn send_own(&mut self, now_ns: i64, message: &MavMessage) {
         let Some(me) = self.me(now_ns) else { return };
         let packet = encode(me, self.sequence, message);
         self.sequence = self.sequence.wrapping_add(1);
@@ -291,7 +291,7 @@ impl Bridge {
     fn send(&self, packet: &[u8]) {
         match self.ground.send(packet) {
             Ok(()) => self.health.count("to ground"),
-            Err(SendError::NotConnected) => self.health.dropped("to ground: nobody there"),
+            Err(SendError::NotConnected) => self.health.dropped("to ground: not connected"),
             Err(SendError::Full) => self.health.dropped("to ground: the line is too slow"),
         }
     }

@@ -1,27 +1,27 @@
-//! What can be set.
+//! The bridge's configuration.
 
 use autopilot::Address;
 use serde::Deserialize;
 
-/// The configuration; `gcs-bridge.toml` explains every key.
+/// The keys of `gcs-bridge.toml`, which has their meanings, units and ranges.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Name of this instance.
     pub id: String,
-    /// Where the ground station is, as an [`Address`].
+    /// Address of the ground station, as an [`Address`].
     pub ground: String,
-    /// The vehicle's MAVLink system number; 0 when it is to be learned.
+    /// The vehicle's MAVLink system id; 0 takes it from the autopilot's heartbeat.
     pub system_id: u8,
-    /// How long to wait for the vehicle's number before 1 is assumed, in seconds.
+    /// Time without a heartbeat after which the system id 1 is assumed, in seconds.
     pub assume_system_after_s: f64,
-    /// MAVLink component number of this companion.
+    /// MAVLink component id of this companion.
     pub component_id: u8,
     /// Whether the ground station's packets reach the autopilot.
     pub forward_to_autopilot: bool,
-    /// How often the landing point is shown, in Hz.
+    /// Rate of the landing target, in Hz.
     pub target_rate_hz: f64,
-    /// Age above which the landing point is not shown, in milliseconds.
+    /// Maximum age of the landing target, in milliseconds.
     pub target_max_age_ms: f64,
 }
 

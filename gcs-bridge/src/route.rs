@@ -1,44 +1,44 @@
-//! What passes between the autopilot and the ground station, and what is answered here.
+//! Which packets pass between the autopilot and the ground station, and which are answered here.
 //!
-//! The rules are those of <https://mavlink.io/en/guide/routing.html>: what is addressed to a component goes to that
-//! component, everything else to everybody, and nothing back to where it came from.
+//! The rules are those of <https://mavlink.io/en/guide/routing.html>: a packet for a component goes to that component, every
+//! other packet to all, and none back to where it came from.
 
 use autopilot::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message};
 use autopilot::{Packet, Sender};
 
 use crate::vehicle::Vehicle;
 
-/// What becomes of a packet.
+/// The route of a packet.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Route {
-    /// It goes to the other side, byte for byte.
+    /// To the other side, byte for byte.
     Pass,
-    /// It ends here and is answered.
+    /// Answered here.
     Answer(Box<MavMessage>),
-    /// It ends here, for this reason.
+    /// Dropped, for this reason.
     Drop(&'static str),
 }
 
-/// What becomes of a packet from the ground station; `me` is the bridge, once it has a number.
+/// The route of a packet from the ground station; `me` is the bridge, once it has a system id.
 pub(crate) fn from_ground(packet: &Packet, me: Option<Sender>, vehicle: &Vehicle) -> Route {
     if Some(packet.sender) == me || vehicle.is_aboard(packet.sender) {
-        // A ground program that repeats everything would otherwise make the vehicle hear itself.
+        // A ground program that repeats everything would otherwise send the vehicle its own packets.
         return Route::Drop("from ground: an echo of the vehicle");
     }
     match me.filter(|me| is_for(packet, *me)) {
         Some(_) => match answer(packet) {
             Some(message) => Route::Answer(Box::new(message)),
-            None => Route::Drop("from ground: for the companion, which does not know it"),
+            None => Route::Drop("from ground: for the companion, and not supported"),
         },
         None => Route::Pass,
     }
 }
 
-/// What becomes of a packet from the autopilot's side.
+/// The route of a packet from the autopilot's side.
 pub(crate) fn from_autopilot(packet: &Packet, me: Option<Sender>) -> Route {
     match me {
         Some(me) if packet.sender == me => Route::Drop("from autopilot: an echo of the companion"),
-        // The autopilot answers the controller, which speaks as this companion; a ground station would take such an
+        // The autopilot answers the controller, which uses this companion's ids; a ground station would take such an
         // acknowledgement for that of its own command.
         Some(me) if is_for(packet, me) => Route::Drop("from autopilot: for the companion"),
         _ => Route::Pass,
@@ -105,7 +105,7 @@ mod tests {
 
     fn vehicle() -> Vehicle {
         let mut vehicle = Vehicle::new(0, 0);
-        vehicle.hear(0, &packet(AUTOPILOT, &heartbeat()));
+        vehicle.received(0, &packet(AUTOPILOT, &heartbeat()));
         vehicle
     }
 

@@ -1,31 +1,31 @@
 //! The landing point for the ground station's display (LANDING_TARGET in local NED).
 //!
-//! It never goes to the autopilot, which would take it for a command of its own precision landing.
+//! It never goes to the autopilot, which would use it for its own precision landing.
 
 use autopilot::dialect::{LANDING_TARGET_DATA, LandingTargetType, MavBool, MavFrame, MavMessage};
 use messages::TargetEstimate;
 
-/// Shows the landing point at a bounded rate.
+/// Makes landing targets at a bounded rate.
 #[derive(Debug)]
-pub(crate) struct Display {
+pub(crate) struct LandingTargetPublisher {
     period_ns: i64,
     max_age_ms: f64,
     due_ns: i64,
 }
 
-impl Display {
-    /// A display with this rate, for estimates up to this age.
+impl LandingTargetPublisher {
+    /// A publisher with this rate, for estimates up to this age.
     pub(crate) fn new(rate_hz: f64, max_age_ms: f64) -> Self {
         Self { period_ns: (1e9 / rate_hz) as i64, max_age_ms, due_ns: i64::MIN }
     }
 
-    /// The message for an estimate, if one is due and the estimate tells where the landing point is now.
-    pub(crate) fn show(&mut self, now_ns: i64, estimate: &TargetEstimate) -> Option<MavMessage> {
+    /// The message for an estimate, if one is due and the estimate is recent.
+    pub(crate) fn message(&mut self, now_ns: i64, estimate: &TargetEstimate) -> Option<MavMessage> {
         let due = now_ns >= self.due_ns;
         let fresh = estimate.age_ms.is_some_and(|age_ms| age_ms <= self.max_age_ms);
         let position = estimate.position_ned_m.filter(|p| p.iter().all(|c| c.is_finite()));
         let message = position.filter(|_| due && fresh).map(|at| message(estimate, at))?;
-        // Counted from when it was due, so that the rate is right whenever estimates come; but nothing is made up for.
+        // Counted from when it was due, so that the rate is right whenever estimates come; missed messages are not repeated.
         self.due_ns = self.due_ns.max(now_ns.saturating_sub(self.period_ns)) + self.period_ns;
         Some(message)
     }
@@ -73,8 +73,8 @@ mod tests {
     }
 
     #[test]
-    fn the_landing_point_is_shown_in_local_ned() {
-        let shown = Display::new(5.0, 1000.0).show(0, &estimate());
+    fn the_landing_point_is_sent_in_local_ned() {
+        let shown = LandingTargetPublisher::new(5.0, 1000.0).message(0, &estimate());
         let Some(MavMessage::LANDING_TARGET(target)) = shown else { panic!("{shown:?}") };
         assert_eq!([target.x, target.y, target.z], [1.5, -1.5, 0.25]);
         assert_eq!(target.frame, MavFrame::MAV_FRAME_LOCAL_NED);
@@ -84,18 +84,19 @@ mod tests {
 
     #[test]
     fn the_rate_is_bounded() {
-        let mut display = Display::new(5.0, 1000.0);
-        // Two seconds of estimates, then two more after a pause, at a rate that is no multiple of the display's.
+        let mut publisher = LandingTargetPublisher::new(5.0, 1000.0);
+        // Two seconds of estimates, then two more after a pause, at a rate that is not a multiple of the publisher's.
         for start_s in [0, 60] {
             let times = (0..34).map(|i| start_s * SECOND_NS + i * SECOND_NS / 17);
-            let shown = times.filter(|now_ns| display.show(*now_ns, &estimate()).is_some()).count();
+            let shown =
+                times.filter(|now_ns| publisher.message(*now_ns, &estimate()).is_some()).count();
             assert!((10..=11).contains(&shown), "{shown}");
         }
     }
 
     #[test]
-    fn what_is_not_known_now_is_not_shown() {
-        let mut display = Display::new(5.0, 1000.0);
+    fn unknown_or_old_estimates_are_not_sent() {
+        let mut publisher = LandingTargetPublisher::new(5.0, 1000.0);
         for unknown in [
             TargetEstimate { position_ned_m: None, ..estimate() },
             TargetEstimate { position_ned_m: Some([0.0, f64::NAN, 0.0]), ..estimate() },
@@ -103,9 +104,9 @@ mod tests {
             TargetEstimate { age_ms: Some(f64::NAN), ..estimate() },
             TargetEstimate { age_ms: Some(1001.0), ..estimate() },
         ] {
-            assert_eq!(display.show(0, &unknown), None);
+            assert_eq!(publisher.message(0, &unknown), None);
         }
         let odd = TargetEstimate { height_m: Some(f64::INFINITY), stamp_ns: -1, ..estimate() };
-        assert!(display.show(0, &odd).is_some());
+        assert!(publisher.message(0, &odd).is_some());
     }
 }

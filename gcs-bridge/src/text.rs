@@ -1,47 +1,48 @@
-//! What the controller does, in words for the ground station (STATUSTEXT).
+//! The controller's status as texts for the ground station (STATUSTEXT).
 
 use autopilot::compose::status_text;
 use autopilot::dialect::{MavMessage, MavSeverity};
 use messages::{ControllerStatus, Phase};
 
-/// Characters in one text, which fit four packets; what is longer is cut.
-const LONGEST: usize = 199;
-/// Texts that may be sent at once, and the time after which one more may.
-const BURST: u32 = 6;
+/// Maximum length of a text, in characters: it fits four packets. Longer texts are cut.
+const MAX_TEXT: usize = 199;
+/// Maximum number of texts sent at once.
+const MAX_BURST: u32 = 6;
+/// Time after which one more text may be sent, in nanoseconds.
 const REFILL_NS: i64 = 500_000_000;
 
-/// Tells changes, each once; a controller that flutters cannot flood the ground.
+/// Sends each change once, at a bounded rate.
 #[derive(Debug)]
-pub(crate) struct Teller {
-    /// The phase and reason that the ground was told last, without numbers; none when it was told nothing.
-    told: Option<String>,
-    /// The same for the active detector; none while there was none.
+pub(crate) struct StatusTextSender {
+    /// The last text of a phase, without digits; none before the first.
+    last: Option<String>,
+    /// The last active detector; none before the first.
     detector: Option<String>,
     tokens: u32,
     refilled_ns: i64,
     next_id: u16,
 }
 
-impl Teller {
-    /// A teller that has told nothing.
+impl StatusTextSender {
+    /// A sender that has sent nothing.
     pub(crate) fn new(now_ns: i64) -> Self {
-        Self { told: None, detector: None, tokens: BURST, refilled_ns: now_ns, next_id: 1 }
+        Self { last: None, detector: None, tokens: MAX_BURST, refilled_ns: now_ns, next_id: 1 }
     }
 
-    /// The texts for what is new in a status. What does not fit now is told with a later status, if it still holds.
+    /// The texts for what is new in a status. What exceeds the rate is sent with a later status, if it still holds.
     pub(crate) fn status(&mut self, now_ns: i64, status: &ControllerStatus) -> Vec<MavMessage> {
         let mut packets = Vec::new();
         let text = match status.why.is_empty() {
             true => format!("Alight: {}", status.phase),
             false => format!("Alight: {}: {}", status.phase, status.why),
         };
-        // A height that changes while everything else stays is no news.
-        let news: String = text.chars().filter(|c| !c.is_ascii_digit()).collect();
-        if self.told.as_ref() != Some(&news)
-            && let Some(text) = self.say(now_ns, severity(status.phase), &text)
+        // A change of digits alone, as of a height, is not sent.
+        let change: String = text.chars().filter(|c| !c.is_ascii_digit()).collect();
+        if self.last.as_ref() != Some(&change)
+            && let Some(text) = self.text(now_ns, severity(status.phase), &text)
         {
             packets.extend(text);
-            self.told = Some(news);
+            self.last = Some(change);
         }
         if self.detector != status.active_detector {
             let (severity, text) = match &status.active_detector {
@@ -54,7 +55,7 @@ impl Teller {
                 }
                 None => (MavSeverity::MAV_SEVERITY_WARNING, "Alight: no detector".to_owned()),
             };
-            if let Some(text) = self.say(now_ns, severity, &text) {
+            if let Some(text) = self.text(now_ns, severity, &text) {
                 packets.extend(text);
                 self.detector.clone_from(&status.active_detector);
             }
@@ -62,8 +63,8 @@ impl Teller {
         packets
     }
 
-    /// The packets of a text; none when too much was said already.
-    pub(crate) fn say(
+    /// The packets of a text; none when it exceeds the rate.
+    pub(crate) fn text(
         &mut self,
         now_ns: i64,
         severity: MavSeverity,
@@ -71,8 +72,8 @@ impl Teller {
     ) -> Option<Vec<MavMessage>> {
         let earned = now_ns.saturating_sub(self.refilled_ns).max(0) / REFILL_NS;
         self.refilled_ns = self.refilled_ns.saturating_add(earned.saturating_mul(REFILL_NS));
-        let earned = u32::try_from(earned).unwrap_or(BURST);
-        self.tokens = self.tokens.saturating_add(earned).min(BURST);
+        let earned = u32::try_from(earned).unwrap_or(MAX_BURST);
+        self.tokens = self.tokens.saturating_add(earned).min(MAX_BURST);
         self.tokens = self.tokens.checked_sub(1)?;
         let packets = packets(severity, text, self.next_id);
         // 0 is the id of texts of one packet.
@@ -80,14 +81,14 @@ impl Teller {
         Some(packets)
     }
 
-    /// Tells everything anew, to a ground station or of a controller that was not there before.
-    pub(crate) fn forget(&mut self) {
-        self.told = None;
+    /// Sends everything again: to a new ground station, or of a new controller.
+    pub(crate) fn reset(&mut self) {
+        self.last = None;
         self.detector = None;
     }
 }
 
-/// How loud a phase is told; a ground station reads warnings and worse aloud.
+/// The severity of a phase's text; a ground station reads warnings and worse aloud.
 fn severity(phase: Phase) -> MavSeverity {
     match phase {
         Phase::Aborted | Phase::Failed => MavSeverity::MAV_SEVERITY_CRITICAL,
@@ -97,17 +98,17 @@ fn severity(phase: Phase) -> MavSeverity {
     }
 }
 
-/// The packets of a text of any length and kind.
+/// The packets of a text, cut to its maximum length and to plain characters.
 fn packets(severity: MavSeverity, text: &str, id: u16) -> Vec<MavMessage> {
-    let mut text: String = text.chars().take(LONGEST + 1).map(plain).collect();
-    if text.len() > LONGEST {
-        text.truncate(LONGEST - 3);
+    let mut text: String = text.chars().take(MAX_TEXT + 1).map(plain).collect();
+    if text.len() > MAX_TEXT {
+        text.truncate(MAX_TEXT - 3);
         text.push_str("...");
     }
     status_text(severity, &text, id)
 }
 
-/// Ground stations show ASCII reliably and nothing else.
+/// Ground stations show only ASCII reliably.
 fn plain(c: char) -> char {
     match c {
         ' '..='~' => c,
@@ -146,50 +147,50 @@ mod tests {
     }
 
     #[test]
-    fn a_phase_and_its_reason_are_told_once() {
-        let mut teller = Teller::new(0);
+    fn a_phase_and_its_reason_are_sent_once() {
+        let mut sender = StatusTextSender::new(0);
         let search = status(Phase::Search, "looking for the marker", None);
-        let told = join(&teller.status(0, &search));
-        assert_eq!(told.len(), 1);
-        assert_eq!(told[0].1, "Alight: search: looking for the marker");
-        assert!(teller.status(0, &search).is_empty());
-        let told = join(&teller.status(0, &status(Phase::Search, "waiting 1 s", None)));
-        assert_eq!(told[0].1, "Alight: search: waiting 1 s");
-        assert!(teller.status(0, &status(Phase::Search, "waiting 2 s", None)).is_empty());
-        let told = join(&teller.status(0, &status(Phase::Aborted, "", None)));
-        assert_eq!(told, [(MavSeverity::MAV_SEVERITY_CRITICAL, "Alight: aborted".to_owned())]);
-        teller.forget();
-        assert_eq!(join(&teller.status(0, &search)).len(), 1);
+        let sent = join(&sender.status(0, &search));
+        assert_eq!(sent.len(), 1);
+        assert_eq!(sent[0].1, "Alight: search: looking for the marker");
+        assert!(sender.status(0, &search).is_empty());
+        let sent = join(&sender.status(0, &status(Phase::Search, "waiting 1 s", None)));
+        assert_eq!(sent[0].1, "Alight: search: waiting 1 s");
+        assert!(sender.status(0, &status(Phase::Search, "waiting 2 s", None)).is_empty());
+        let sent = join(&sender.status(0, &status(Phase::Aborted, "", None)));
+        assert_eq!(sent, [(MavSeverity::MAV_SEVERITY_CRITICAL, "Alight: aborted".to_owned())]);
+        sender.reset();
+        assert_eq!(join(&sender.status(0, &search)).len(), 1);
     }
 
     #[test]
-    fn the_active_detector_is_told_when_it_changes() {
-        let mut teller = Teller::new(0);
-        let told = join(&teller.status(0, &status(Phase::Search, "", Some("main"))));
-        assert_eq!(told[1].1, "Alight: detector main");
-        let told = join(&teller.status(0, &status(Phase::Search, "", Some("spare"))));
-        assert_eq!(told[0].1, "Alight: detector spare");
+    fn the_active_detector_is_sent_when_it_changes() {
+        let mut sender = StatusTextSender::new(0);
+        let sent = join(&sender.status(0, &status(Phase::Search, "", Some("main"))));
+        assert_eq!(sent[1].1, "Alight: detector main");
+        let sent = join(&sender.status(0, &status(Phase::Search, "", Some("spare"))));
+        assert_eq!(sent[0].1, "Alight: detector spare");
         let mut changed = status(Phase::Search, "", Some("main"));
         changed.detector_why = "spare has gone".into();
-        let told = join(&teller.status(0, &changed));
-        assert_eq!(told[0].1, "Alight: detector main: spare has gone");
-        let told = join(&teller.status(0, &status(Phase::Search, "", None)));
-        assert_eq!(told, [(MavSeverity::MAV_SEVERITY_WARNING, "Alight: no detector".to_owned())]);
+        let sent = join(&sender.status(0, &changed));
+        assert_eq!(sent[0].1, "Alight: detector main: spare has gone");
+        let sent = join(&sender.status(0, &status(Phase::Search, "", None)));
+        assert_eq!(sent, [(MavSeverity::MAV_SEVERITY_WARNING, "Alight: no detector".to_owned())]);
     }
 
     #[test]
-    fn fluttering_is_bounded_and_ends_with_the_truth() {
-        let mut teller = Teller::new(0);
-        let mut told = 0;
+    fn rapid_changes_are_bounded_and_the_last_one_arrives() {
+        let mut sender = StatusTextSender::new(0);
+        let mut sent = 0;
         // Ten seconds of changes at 20 Hz.
         for i in 0..200 {
             let phase = [Phase::Approach, Phase::Descend][i % 2];
-            told += teller.status(i as i64 * 50_000_000, &status(phase, "", None)).len();
+            sent += sender.status(i as i64 * 50_000_000, &status(phase, "", None)).len();
         }
-        assert!(told <= BURST as usize + 20, "{told}");
+        assert!(sent <= MAX_BURST as usize + 20, "{sent}");
         // The bucket is empty, and yet the last phase comes through once there is room.
         let last = status(Phase::Landed, "", None);
-        assert_eq!(join(&teller.status(60_000_000_000, &last))[0].1, "Alight: landed");
+        assert_eq!(join(&sender.status(60_000_000_000, &last))[0].1, "Alight: landed");
     }
 
     #[test]
@@ -198,10 +199,10 @@ mod tests {
             let text = "x".repeat(length);
             let packets = packets(MavSeverity::MAV_SEVERITY_INFO, &text, 9);
             let joined = &join(&packets)[0].1;
-            if length <= LONGEST {
+            if length <= MAX_TEXT {
                 assert_eq!(*joined, text);
             } else {
-                assert!(joined.ends_with("x...") && joined.len() == LONGEST);
+                assert!(joined.ends_with("x...") && joined.len() == MAX_TEXT);
             }
             assert!(packets.len() <= 4, "{length}: {} packets", packets.len());
         }
@@ -209,7 +210,7 @@ mod tests {
 
     #[test]
     fn only_plain_characters_are_sent() {
-        let told = join(&packets(MavSeverity::MAV_SEVERITY_INFO, "a\u{b7}b\u{7}c\u{e9}", 1));
-        assert_eq!(told[0].1, "a-b c?");
+        let sent = join(&packets(MavSeverity::MAV_SEVERITY_INFO, "a\u{b7}b\u{7}c\u{e9}", 1));
+        assert_eq!(sent[0].1, "a-b c?");
     }
 }

@@ -1,22 +1,22 @@
-//! Whom the bridge speaks for: the autopilot's system number, and who else is aboard.
+//! The vehicle whose companion the bridge is: the autopilot's system id, and the components on board.
 
 use std::collections::HashSet;
 
 use autopilot::dialect::{MavAutopilot, MavMessage};
 use autopilot::{Packet, Sender};
 
-/// Assumed when no autopilot is heard: the number autopilots are delivered with.
-const USUAL_SYSTEM: u8 = 1;
-/// The component number of an autopilot.
+/// Assumed without an autopilot: the default system id of autopilots.
+const DEFAULT_SYSTEM: u8 = 1;
+/// The component id of an autopilot.
 const AUTOPILOT: u8 = 1;
-/// After this silence another autopilot is believed to be the vehicle.
-const SILENCE_NS: i64 = 10_000_000_000;
+/// Silence of the autopilot after which another one is accepted, in nanoseconds.
+const TIMEOUT_NS: i64 = 10_000_000_000;
 
-/// What is known of the vehicle.
+/// The known ids of the vehicle.
 #[derive(Debug)]
 pub(crate) struct Vehicle {
     configured: Option<u8>,
-    heard: Option<Heard>,
+    found: Option<Found>,
     /// When 1 is assumed, in ns.
     assume_at_ns: i64,
     /// Components of the vehicle whose packets came from the autopilot's side; at most 256.
@@ -24,59 +24,59 @@ pub(crate) struct Vehicle {
 }
 
 #[derive(Copy, Clone, Debug)]
-struct Heard {
+struct Found {
     system: u8,
     at_ns: i64,
 }
 
 impl Vehicle {
-    /// A vehicle with a configured number, or with 0 for one that is to be learned.
+    /// A vehicle with a configured system id, or 0 to take that of the autopilot's heartbeat.
     pub(crate) fn new(configured: u8, assume_at_ns: i64) -> Self {
         let configured = (configured != 0).then_some(configured);
-        Self { configured, heard: None, assume_at_ns, aboard: HashSet::new() }
+        Self { configured, found: None, assume_at_ns, aboard: HashSet::new() }
     }
 
-    /// Learns from a packet from the autopilot's side.
-    pub(crate) fn hear(&mut self, now_ns: i64, packet: &Packet) {
+    /// Registers the sender of a packet from the autopilot's side.
+    pub(crate) fn received(&mut self, now_ns: i64, packet: &Packet) {
         if is_autopilot(packet) {
-            self.hear_autopilot(now_ns, packet.sender.system);
+            self.autopilot_active(now_ns, packet.sender.system);
         }
-        if self.number() == Some(packet.sender.system) {
+        if self.id() == Some(packet.sender.system) {
             self.aboard.insert(packet.sender.component);
         }
     }
 
-    /// The system number to speak under; none while it would be a guess.
+    /// Our system id; none while it would be a guess.
     pub(crate) fn system(&self, now_ns: i64) -> Option<u8> {
-        self.number().or_else(|| (now_ns >= self.assume_at_ns).then_some(USUAL_SYSTEM))
+        self.id().or_else(|| (now_ns >= self.assume_at_ns).then_some(DEFAULT_SYSTEM))
     }
 
     /// True for the sender of packets that came from the autopilot's side.
     pub(crate) fn is_aboard(&self, sender: Sender) -> bool {
-        self.number() == Some(sender.system) && self.aboard.contains(&sender.component)
+        self.id() == Some(sender.system) && self.aboard.contains(&sender.component)
     }
 
-    fn number(&self) -> Option<u8> {
-        self.configured.or(self.heard.map(|heard| heard.system))
+    fn id(&self) -> Option<u8> {
+        self.configured.or(self.found.map(|found| found.system))
     }
 
     /// The link may carry heartbeats of other vehicles too, so the first autopilot stays until it falls silent.
-    fn hear_autopilot(&mut self, now_ns: i64, system: u8) {
-        let stays = self.heard.is_some_and(|heard| {
-            heard.system != system && now_ns.saturating_sub(heard.at_ns) <= SILENCE_NS
+    fn autopilot_active(&mut self, now_ns: i64, system: u8) {
+        let stays = self.found.is_some_and(|found| {
+            found.system != system && now_ns.saturating_sub(found.at_ns) <= TIMEOUT_NS
         });
         if stays || system == 0 {
             return;
         }
-        if self.heard.is_none_or(|heard| heard.system != system) {
+        if self.found.is_none_or(|found| found.system != system) {
             if self.configured.is_none() {
-                tracing::info!(system, "The vehicle's system number is known");
+                tracing::info!(system, "Vehicle found");
                 self.aboard.clear();
             } else if self.configured != Some(system) {
-                tracing::warn!(system, configured = ?self.configured, "The autopilot has another system number than configured");
+                tracing::warn!(system, configured = ?self.configured, "The autopilot's system id differs from the configured one");
             }
         }
-        self.heard = Some(Heard { system, at_ns: now_ns });
+        self.found = Some(Found { system, at_ns: now_ns });
     }
 }
 
@@ -110,41 +110,41 @@ mod tests {
     }
 
     #[test]
-    fn the_number_is_that_of_the_autopilot_and_of_nobody_else() {
+    fn the_system_id_is_that_of_the_autopilot_only() {
         let mut vehicle = Vehicle::new(0, 5 * SECOND_NS);
-        vehicle.hear(0, &heartbeat(255, 190, MavAutopilot::MAV_AUTOPILOT_INVALID));
-        vehicle.hear(0, &heartbeat(9, 1, MavAutopilot::MAV_AUTOPILOT_INVALID));
-        vehicle.hear(0, &heartbeat(9, 154, MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA));
+        vehicle.received(0, &heartbeat(255, 190, MavAutopilot::MAV_AUTOPILOT_INVALID));
+        vehicle.received(0, &heartbeat(9, 1, MavAutopilot::MAV_AUTOPILOT_INVALID));
+        vehicle.received(0, &heartbeat(9, 154, MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA));
         assert_eq!(vehicle.system(5 * SECOND_NS - 1), None);
         assert_eq!(vehicle.system(5 * SECOND_NS), Some(1));
-        vehicle.hear(6 * SECOND_NS, &ardupilot(7));
+        vehicle.received(6 * SECOND_NS, &ardupilot(7));
         assert_eq!(vehicle.system(6 * SECOND_NS), Some(7));
     }
 
     #[test]
     fn another_vehicle_takes_over_only_after_silence() {
         let mut vehicle = Vehicle::new(0, 0);
-        vehicle.hear(0, &ardupilot(7));
-        vehicle.hear(SILENCE_NS, &ardupilot(8));
-        assert_eq!(vehicle.system(SILENCE_NS), Some(7));
-        vehicle.hear(SILENCE_NS + 1, &ardupilot(8));
-        assert_eq!(vehicle.system(SILENCE_NS + 1), Some(8));
+        vehicle.received(0, &ardupilot(7));
+        vehicle.received(TIMEOUT_NS, &ardupilot(8));
+        assert_eq!(vehicle.system(TIMEOUT_NS), Some(7));
+        vehicle.received(TIMEOUT_NS + 1, &ardupilot(8));
+        assert_eq!(vehicle.system(TIMEOUT_NS + 1), Some(8));
         assert!(!vehicle.is_aboard(Sender { system: 7, component: 1 }));
     }
 
     #[test]
-    fn a_configured_number_is_never_replaced() {
+    fn a_configured_system_id_is_never_replaced() {
         let mut vehicle = Vehicle::new(3, SECOND_NS);
-        vehicle.hear(0, &ardupilot(7));
+        vehicle.received(0, &ardupilot(7));
         assert_eq!(vehicle.system(0), Some(3));
     }
 
     #[test]
-    fn who_is_aboard_is_known_by_what_came_from_there() {
+    fn components_on_board_are_known_by_their_packets() {
         let mut vehicle = Vehicle::new(0, 0);
-        vehicle.hear(0, &ardupilot(7));
-        vehicle.hear(0, &heartbeat(7, 154, MavAutopilot::MAV_AUTOPILOT_INVALID));
-        vehicle.hear(0, &heartbeat(255, 190, MavAutopilot::MAV_AUTOPILOT_INVALID));
+        vehicle.received(0, &ardupilot(7));
+        vehicle.received(0, &heartbeat(7, 154, MavAutopilot::MAV_AUTOPILOT_INVALID));
+        vehicle.received(0, &heartbeat(255, 190, MavAutopilot::MAV_AUTOPILOT_INVALID));
         assert!(vehicle.is_aboard(Sender { system: 7, component: 154 }));
         assert!(!vehicle.is_aboard(Sender { system: 7, component: 100 }));
         assert!(!vehicle.is_aboard(Sender { system: 255, component: 190 }));

@@ -26,7 +26,7 @@ const COMPANION: Sender = Sender { system: 7, component: 191 };
 const GROUND: Sender = Sender { system: 255, component: 190 };
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_ground_hears_the_companion_and_the_vehicle_as_it_spoke() -> anyhow::Result<()> {
+async fn the_ground_gets_the_companions_and_the_vehicles_packets() -> anyhow::Result<()> {
     let port = free_port()?;
     let mut ground = Ground::open().await?;
     let vehicle = FakeVehicle::start(port).await?;
@@ -68,7 +68,7 @@ async fn the_ground_hears_the_companion_and_the_vehicle_as_it_spoke() -> anyhow:
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn only_the_grounds_own_packets_go_up_and_as_they_were_sent() -> anyhow::Result<()> {
+async fn only_the_grounds_own_packets_go_up_unchanged() -> anyhow::Result<()> {
     let port = free_port()?;
     let mut ground = Ground::open().await?;
     let vehicle = FakeVehicle::start(port).await?;
@@ -125,7 +125,7 @@ async fn only_the_grounds_own_packets_go_up_and_as_they_were_sent() -> anyhow::R
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nothing_is_sent_under_a_number_that_is_a_guess() -> anyhow::Result<()> {
+async fn nothing_is_sent_before_the_system_id_is_known_or_assumed() -> anyhow::Result<()> {
     let mut ground = Ground::open().await?;
     let began = Instant::now();
     let bridge = start_bridge(free_port()?, &ground, &["assume_system_after_s=1.5"]).await?;
@@ -145,7 +145,7 @@ async fn the_bridge_outlives_the_ground_station() -> anyhow::Result<()> {
     let address = ground.socket.local_addr()?;
     let vehicle = FakeVehicle::start(port).await?;
     let bridge = start_bridge(port, &ground, &[]).await?;
-    // Its packets now find nobody, which the system reports to the bridge as refused connections.
+    // Its packets now find no receiver, which the system reports to the bridge as refused connections.
     drop(ground);
     let health = vehicle.node.subscriber(topic::HEALTH, &["gcs-bridge", "main"]).await?;
     let sent = || async {
@@ -158,7 +158,7 @@ async fn the_bridge_outlives_the_ground_station() -> anyhow::Result<()> {
     let mut ground = Ground { socket: UdpSocket::bind(address).await?, ..Ground::open().await? };
     ground.expect(|f| f.sender == COMPANION && is_heartbeat(f)).await?;
     ground.send(&encode(GROUND, 0, &param_request(1))).await?;
-    // A ground station that comes late is told where the landing stands.
+    // A ground station that comes late gets the phase of the landing.
     ground.expect_text("Alight: search: looking for the marker").await?;
     assert!(!bridge.is_finished());
     bridge.abort();
@@ -166,7 +166,7 @@ async fn the_bridge_outlives_the_ground_station() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_port_in_use_is_an_error_that_says_so() -> anyhow::Result<()> {
+async fn a_port_in_use_is_an_error() -> anyhow::Result<()> {
     let taken = Ground::open().await?;
     let setting = format!("ground=udpin:{}", taken.socket.local_addr()?);
     let bridge = start_bridge(free_port()?, &taken, &[&setting]).await?;
@@ -307,7 +307,7 @@ impl Ground {
     }
 
     async fn send(&self, bytes: &[u8]) -> anyhow::Result<()> {
-        let to = self.bridge.context("the bridge was not heard yet")?;
+        let to = self.bridge.context("no packet of the bridge yet")?;
         self.socket.send_to(bytes, to).await?;
         Ok(())
     }

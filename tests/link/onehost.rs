@@ -10,7 +10,7 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context;
-use messages::{FrameHeader, PixelFormat, topic};
+use messages::{FrameHeader, topic};
 use node::{FramePublisher, Identity, Loan, Network, Node, now_ns};
 use serde_json::{Value, json};
 use testing::ports;

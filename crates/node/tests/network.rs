@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use messages::{
-    CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, PixelFormat, Wind, encode, topic,
+    CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, Wind, encode, topic,
 };
 use node::{FramePublisher, FrameSubscriber, Identity, Node, ZenohSource, clock_name, now_ns};
 use testing::ports;

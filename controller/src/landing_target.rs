@@ -1,0 +1,269 @@
+//! The other way to land: the autopilot's own precision landing, which is sent the landing target.
+//!
+//! No setpoint is sent. Every frame that was used gives the autopilot a landing target; the pilot, a mission or our own
+//! start changes to LAND (PRECISION LAND on PX4), and the autopilot does the rest.
+
+use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
+use geometry::Point;
+use landing::{FrameObservation, TargetEstimate};
+use messages::Phase;
+
+use crate::config::{LandingTargetSettings, LandingTargetSource};
+use crate::wire;
+
+/// The parameters of ArduPilot that decide whether it uses landing targets.
+pub const PARAMETERS: [&str; 2] = ["PLND_ENABLED", "PLND_TYPE"];
+/// PLND_TYPE of landing targets that come by MAVLink.
+const MAVLINK: f64 = 1.0;
+/// Maximum gap between two landing targets, in nanoseconds; after a longer one ArduPilot starts a new estimate.
+const MAX_GAP_NS: i64 = 500_000_000;
+
+/// A precision landing by the autopilot.
+#[derive(Debug)]
+pub struct LandingTargetMode {
+    settings: LandingTargetSettings,
+    /// Timeout for the marker, in seconds.
+    timeout_s: f64,
+    stream: Option<Stream>,
+    state: State,
+}
+
+/// Landing targets sent without a gap.
+#[derive(Copy, Clone, Debug)]
+struct Stream {
+    first_ns: i64,
+    last_ns: i64,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum State {
+    /// No landing was requested.
+    Idle,
+    /// The landing began at this time; the autopilot has not had the target long enough.
+    Stabilising(i64),
+    /// LAND is requested.
+    Commanding(CommandId),
+    /// The autopilot lands.
+    Landing,
+    /// The autopilot is taken back from landing, for this reason.
+    Recalling(CommandId, String),
+    /// On the ground, disarmed.
+    Landed,
+    /// Aborted, or somebody took over.
+    Ended(String),
+}
+
+impl LandingTargetMode {
+    /// A mode in which nothing was sent yet; a landing that begins waits `timeout_s` for the marker.
+    pub fn new(settings: LandingTargetSettings, timeout_s: f64) -> Self {
+        Self { settings, timeout_s, stream: None, state: State::Idle }
+    }
+
+    /// Sends the landing target of a frame that was used; false when there is nothing to send.
+    pub fn send(
+        &mut self,
+        now_ns: i64,
+        frame: &FrameObservation,
+        target: Option<TargetEstimate>,
+        autopilot: &mut Autopilot,
+    ) -> bool {
+        let vehicle = autopilot.state().and_then(wire::vehicle);
+        let (Some(target), Some(vehicle)) = (target, vehicle) else { return false };
+        let detected = frame.marker.and_then(|marker| marker.body_from_marker);
+        let is_raw = self.settings.source == LandingTargetSource::Detection;
+        let (stamp, in_body) = match detected.filter(|_| is_raw) {
+            Some(pose) => (frame.stamp, pose.origin()),
+            None => {
+                let offset = vehicle.ned_from_body.inverse() * (target.position - vehicle.position);
+                (vehicle.stamp, Point::origin() + offset)
+            }
+        };
+        let is_sent = autopilot.send_landing_target(stamp.nanos(), in_body, target.position);
+        if is_sent {
+            let first_ns = self.active_stream(now_ns).map_or(now_ns, |stream| stream.first_ns);
+            self.stream = Some(Stream { first_ns, last_ns: now_ns });
+        }
+        is_sent
+    }
+
+    /// Begins a landing: LAND is requested once the autopilot has had the target long enough.
+    pub fn begin(&mut self, now_ns: i64) {
+        self.state = State::Stabilising(now_ns);
+    }
+
+    /// Follows what the autopilot does; true when it has just begun to land, whoever requested it.
+    pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> bool {
+        let Some(state) = autopilot.state().copied() else { return false };
+        let lands = state.armed && state.mode.is_landing();
+        match self.state.clone() {
+            State::Landing if !state.armed => self.state = State::Landed,
+            State::Landing if !lands => {
+                self.state = State::Ended(format!("the flight mode was changed to {}", state.mode));
+            }
+            State::Landing => {}
+            State::Recalling(request, why) => match autopilot.status(request) {
+                CommandStatus::Pending => {}
+                CommandStatus::Failed(problem) if lands => {
+                    tracing::error!(%problem, "Recall of the landing failed");
+                    self.state = State::Landing;
+                }
+                _ => self.state = State::Ended(why),
+            },
+            // By the pilot or a mission, or as requested.
+            _ if lands => {
+                autopilot.withdraw();
+                self.state = State::Landing;
+                return true;
+            }
+            State::Stabilising(_) | State::Commanding(_)
+                if !state.mode.is_guided() || !state.armed =>
+            {
+                autopilot.withdraw();
+                self.state = State::Ended(format!("the pilot flies, in {}", state.mode));
+            }
+            State::Stabilising(since_ns) => self.command_when_steady(now_ns, since_ns, autopilot),
+            State::Commanding(request) => {
+                if let CommandStatus::Failed(problem) = autopilot.status(request) {
+                    self.state = State::Ended(problem.to_string());
+                }
+            }
+            State::Idle | State::Landed | State::Ended(_) => {}
+        }
+        false
+    }
+
+    fn command_when_steady(&mut self, now_ns: i64, since_ns: i64, autopilot: &mut Autopilot) {
+        let mode = autopilot.firmware().and_then(Firmware::precision_land);
+        let waited_s = now_ns.saturating_sub(since_ns) as f64 * 1e-9;
+        if self.is_steady(now_ns)
+            && problem(autopilot).is_none()
+            && let Some(mode) = mode
+        {
+            self.state = State::Commanding(autopilot.request(now_ns, Command::SetMode(mode)));
+        } else if waited_s > self.timeout_s {
+            self.state = State::Ended(problem(autopilot).unwrap_or_else(|| {
+                format!("no marker without gaps for {waited_s:.0} s; hovering")
+            }));
+        }
+    }
+
+    /// Aborts a landing: one that the autopilot flies already is taken back to the mode in which it hovers, unless it is
+    /// lower than `no_return_m`.
+    ///
+    /// # Errors
+    /// Says why not.
+    pub fn abort(
+        &mut self,
+        now_ns: i64,
+        height_m: Option<f64>,
+        no_return_m: f64,
+        autopilot: &mut Autopilot,
+    ) -> Result<String, String> {
+        match self.state {
+            State::Stabilising(_) | State::Commanding(_) => {
+                autopilot.withdraw();
+                let why = "aborted by the operator; hovering".to_owned();
+                self.state = State::Ended(why.clone());
+                Ok(why)
+            }
+            State::Landing if height_m.is_some_and(|height_m| height_m <= no_return_m) => {
+                Err(format!("below {no_return_m} m the autopilot's landing is not interrupted"))
+            }
+            State::Landing => {
+                let hover = match autopilot.firmware() {
+                    Some(Firmware::Px4) => FlightMode::AUTO_HOLD,
+                    _ => FlightMode::Guided,
+                };
+                let request = autopilot.request(now_ns, Command::SetMode(hover));
+                let why = format!("aborted by the operator; hovering in {hover}");
+                self.state = State::Recalling(request, why.clone());
+                Ok(why)
+            }
+            State::Idle | State::Recalling(..) | State::Landed | State::Ended(_) => {
+                Err(format!("no landing is active (phase `{}`)", self.phase(now_ns, None).0))
+            }
+        }
+    }
+
+    /// The phase and the reason for it; `problem` is what keeps the autopilot from using landing targets.
+    pub fn phase(&self, now_ns: i64, problem: Option<String>) -> (Phase, String) {
+        let target = match self.active_stream(now_ns) {
+            Some(_) => "sending the landing target",
+            None => "no landing target to send",
+        };
+        match &self.state {
+            State::Idle => (
+                Phase::Idle,
+                problem.unwrap_or_else(|| {
+                    format!("waiting for LAND by the pilot, a mission or a start; {target}")
+                }),
+            ),
+            State::Stabilising(_) => (
+                Phase::Approach,
+                problem.unwrap_or_else(|| {
+                    format!("waiting until the autopilot has the target; {target}")
+                }),
+            ),
+            State::Commanding(_) => (Phase::Final, "requesting LAND".to_owned()),
+            State::Landing => (Phase::Final, format!("the autopilot lands; {target}")),
+            State::Landed => (Phase::Landed, "landed and disarmed".to_owned()),
+            State::Recalling(_, why) | State::Ended(why) => (Phase::Aborted, why.clone()),
+        }
+    }
+
+    /// True from the beginning of a landing to its end.
+    pub fn is_active(&self) -> bool {
+        matches!(self.state, State::Stabilising(_) | State::Commanding(_) | State::Landing)
+    }
+
+    /// True once a landing has ended.
+    pub fn is_finished(&self) -> bool {
+        matches!(self.state, State::Landed | State::Ended(_))
+    }
+
+    fn active_stream(&self, now_ns: i64) -> Option<Stream> {
+        self.stream.filter(|stream| now_ns.saturating_sub(stream.last_ns) < MAX_GAP_NS)
+    }
+
+    fn is_steady(&self, now_ns: i64) -> bool {
+        let steady_ns = (self.settings.steady_s * 1e9) as i64;
+        self.active_stream(now_ns).is_some_and(|s| s.last_ns - s.first_ns >= steady_ns)
+    }
+}
+
+/// What keeps this autopilot from using landing targets, and what to do about it.
+pub fn problem(autopilot: &Autopilot) -> Option<String> {
+    match autopilot.firmware()? {
+        // PX4 needs no preparation: its mode PRECISION LAND uses them.
+        Firmware::Px4 => return None,
+        Firmware::Copter => {}
+        other => return Some(format!("{other} has no supported precision landing")),
+    }
+    match autopilot.parameter("PLND_ENABLED") {
+        Parameter::Unknown => return Some("waiting for the parameter PLND_ENABLED".to_owned()),
+        Parameter::Silent => {
+            return Some(
+                "the autopilot does not report PLND_ENABLED: it was built without precision landing, or does not receive our packets"
+                    .to_owned(),
+            );
+        }
+        Parameter::Value(0.0) => {
+            return Some(
+                "the autopilot's precision landing is off: set PLND_ENABLED to 1 and PLND_TYPE to 1, and restart it"
+                    .to_owned(),
+            );
+        }
+        Parameter::Value(_) => {}
+    }
+    match autopilot.parameter("PLND_TYPE") {
+        Parameter::Unknown => Some("waiting for the parameter PLND_TYPE".to_owned()),
+        Parameter::Value(MAVLINK) => None,
+        Parameter::Value(other) => Some(format!(
+            "the autopilot's precision landing uses another sensor (PLND_TYPE is {other}): set PLND_TYPE to 1 and restart it"
+        )),
+        Parameter::Silent => Some(
+            "the autopilot does not report PLND_TYPE: restart it, as PLND_ENABLED enables the others only at its start"
+                .to_owned(),
+        ),
+    }
+}

@@ -1,0 +1,444 @@
+//! A flight by its packets and detections: what is sent, and in which phase it is.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
+
+use std::sync::Arc;
+
+use autopilot::dialect::{
+    ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LANDING_TARGET_DATA,
+    LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
+    MavType, PARAM_VALUE_DATA, SYS_STATUS_DATA,
+};
+use autopilot::{Parser, Sender};
+use controller::Config;
+use controller::flight::Flight;
+use messages::{CameraInfo, ControllerCommand, Detection, Detections, FrameHeader, Phase};
+use node::{Layers, clock_name};
+
+const MS: i64 = 1_000_000;
+
+fn flight(start: &str) -> Flight {
+    flight_with(start, &[])
+}
+
+fn flight_with(start: &str, set: &[&str]) -> Flight {
+    let mut all = vec![format!("start={start}")];
+    all.extend(set.iter().map(|s| (*s).to_owned()));
+    let layers = Layers { file: None, set: all };
+    Flight::new(layers.load::<Config>().unwrap().settings, Arc::default()).unwrap()
+}
+
+fn receive(flight: &mut Flight, now_ns: i64, message: &MavMessage) {
+    let sender = Sender { system: 1, component: 1 };
+    for packet in Parser::new().push(&autopilot::packet::encode(sender, 0, message)) {
+        flight.packet(now_ns, &packet);
+    }
+}
+
+fn heartbeat(mode: u32, armed: bool) -> MavMessage {
+    let armed = if armed { MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED } else { MavModeFlag::empty() };
+    MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+        custom_mode: mode,
+        mavtype: MavType::MAV_TYPE_QUADROTOR,
+        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+        base_mode: armed,
+        ..Default::default()
+    })
+}
+
+fn contact(landed_state: MavLandedState) -> MavMessage {
+    MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA { landed_state, ..Default::default() })
+}
+
+/// Attitude and position 5 m over the origin.
+fn pose(flight: &mut Flight, now_ns: i64) {
+    pose_at(flight, now_ns, 5.0);
+}
+
+fn pose_at(flight: &mut Flight, now_ns: i64, height_m: f32) {
+    let time_boot_ms = (now_ns / MS) as u32;
+    let attitude = ATTITUDE_DATA { time_boot_ms, ..Default::default() };
+    receive(flight, now_ns, &MavMessage::ATTITUDE(attitude));
+    let position = LOCAL_POSITION_NED_DATA { time_boot_ms, z: -height_m, ..Default::default() };
+    receive(flight, now_ns + 1, &MavMessage::LOCAL_POSITION_NED(position));
+}
+
+/// Setpoints, and commands other than for messages, since the last call.
+fn sent(flight: &mut Flight) -> (usize, Vec<MavCmd>) {
+    let (mut setpoints, mut commands) = (0, Vec::new());
+    while let Some(packet) = flight.poll_outgoing() {
+        for packet in Parser::new().push(&packet) {
+            match packet.message {
+                Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => setpoints += 1,
+                Some(MavMessage::COMMAND_LONG(c))
+                    if c.command != MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL =>
+                {
+                    commands.push(c.command);
+                }
+                _ => {}
+            }
+        }
+    }
+    (setpoints, commands)
+}
+
+fn in_flight(start: &str) -> Flight {
+    let mut flight = flight(start);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    flight
+}
+
+#[test]
+fn a_landing_begins_only_once_attitude_and_position_are_known() {
+    for start in ["takeoff", "airborne"] {
+        let mut flight = in_flight(start);
+        flight.tick(2 * MS);
+        let status = flight.status(2 * MS);
+        assert!(!status.finished && status.phase != Phase::Search, "{status:?}");
+        pose(&mut flight, 30 * MS);
+        flight.tick(31 * MS);
+        assert_eq!(flight.status(31 * MS).phase, Phase::Search);
+        assert_eq!(sent(&mut flight).0, 1);
+    }
+}
+
+#[test]
+fn the_pilots_mode_change_stops_the_setpoints_for_good() {
+    let mut flight = in_flight("airborne");
+    pose(&mut flight, 30 * MS);
+    flight.tick(31 * MS);
+    assert_eq!(sent(&mut flight), (1, vec![]));
+    receive(&mut flight, 100 * MS, &heartbeat(5, true));
+    for i in 0..100 {
+        let now_ns = (101 + i * 25) * MS;
+        pose(&mut flight, now_ns);
+        flight.tick(now_ns + 2);
+    }
+    assert_eq!(flight.status(3000 * MS).phase, Phase::PilotInCommand);
+    assert_eq!(sent(&mut flight), (0, vec![]));
+}
+
+#[test]
+fn the_search_waits_for_a_detector_and_climbs_before_it_goes_sideways() {
+    let searched = |height_m: f32, has_detector: bool| {
+        let mut flight = in_flight("airborne");
+        if has_detector {
+            flight.presence(0, "main", true);
+        }
+        for i in 0..80 {
+            let now_ns = (30 + i * 25) * MS;
+            pose_at(&mut flight, now_ns, height_m);
+            flight.tick(now_ns + 2);
+        }
+        let status = flight.status(2030 * MS);
+        assert_eq!(status.phase, Phase::Search);
+        status.setpoint.unwrap().velocity_ned_m_s
+    };
+    assert_eq!(searched(5.0, false), [0.0; 3]);
+    let [north, east, down] = searched(5.0, true);
+    assert!(north.hypot(east) > 0.5 && down == 0.0);
+    let [north, east, down] = searched(0.6, true);
+    assert!(north.hypot(east) == 0.0 && down < 0.0);
+}
+
+#[test]
+fn a_start_is_refused_on_the_ground_and_while_taking_off() {
+    let mut rising = flight("takeoff");
+    let reply = rising.command(0, &ControllerCommand::Start);
+    assert!(!reply.accepted && reply.reason.contains("taking off"), "{reply:?}");
+    let mut flight = flight("airborne");
+    receive(&mut flight, 0, &heartbeat(4, false));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    pose(&mut flight, 2 * MS);
+    let reply = flight.command(3 * MS, &ControllerCommand::Start);
+    assert!(!reply.accepted && reply.reason.contains("not armed"), "{reply:?}");
+    // It still begins by itself, as configured.
+    receive(&mut flight, 10 * MS, &heartbeat(4, true));
+    receive(&mut flight, 11 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    pose(&mut flight, 12 * MS);
+    flight.tick(13 * MS);
+    assert_eq!(flight.status(13 * MS).phase, Phase::Search);
+}
+
+#[test]
+fn a_frame_from_the_future_does_not_shut_out_those_of_now() {
+    let mut flight = in_flight("airborne");
+    let now_ns = 1000 * MS;
+    let seen = |stamp_ns: i64| Detections {
+        header: FrameHeader { width: 64, height: 48, ..header(stamp_ns) },
+        detections: vec![Detection { pose: None, ..Detection::sample() }],
+        ..Detections::sample()
+    };
+    for stamp_ns in [i64::MAX, now_ns + 10_000 * MS, now_ns + 60 * MS] {
+        flight.detections(now_ns, "main", &seen(stamp_ns));
+        assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("from-the-future"));
+    }
+    for stamp_ns in [i64::MIN, now_ns - 1] {
+        flight.detections(now_ns, "main", &seen(stamp_ns));
+    }
+    assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("no-pose"), "it was looked at");
+    assert_eq!(flight.status(now_ns).active_detector.as_deref(), Some("main"));
+    // Another one's name is no way into the flight.
+    flight.detections(now_ns, "intruder", &seen(now_ns));
+    assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("another-detectors-name"));
+    assert_eq!(flight.status(now_ns).candidates.len(), 1);
+}
+
+fn header(stamp_ns: i64) -> FrameHeader {
+    FrameHeader { stamp_ns, clock: clock_name().into(), ..FrameHeader::sample() }
+}
+
+/// A frame in which the marker lies 5 m below a camera at the body's origin.
+fn seen(stamp_ns: i64) -> Detections {
+    Detections { header: header(stamp_ns), ..Detections::sample() }
+}
+
+/// Hovers in view of the marker in a mode of the autopilot.
+fn hover(flight: &mut Flight, from_ms: i64, to_ms: i64, mode: u32) -> Sent {
+    let mut sent = Sent::default();
+    for ms in (from_ms..to_ms).step_by(20) {
+        if ms % 1000 == 0 {
+            receive(flight, ms * MS, &heartbeat(mode, true));
+        }
+        pose(flight, ms * MS);
+        if ms % 60 == 0 {
+            flight.detections(ms * MS + 2, "main", &seen(ms * MS - 40 * MS));
+        }
+        flight.tick(ms * MS + 3);
+        sent.take(flight);
+    }
+    sent
+}
+
+#[derive(Default)]
+struct Sent {
+    setpoints: usize,
+    targets: Vec<LANDING_TARGET_DATA>,
+    modes: Vec<f32>,
+    requested: Vec<String>,
+}
+
+impl Sent {
+    fn take(&mut self, flight: &mut Flight) {
+        while let Some(packet) = flight.poll_outgoing() {
+            for packet in Parser::new().push(&packet) {
+                match packet.message {
+                    Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(_)) => self.setpoints += 1,
+                    Some(MavMessage::LANDING_TARGET(target)) => self.targets.push(target),
+                    Some(MavMessage::COMMAND_LONG(c))
+                        if c.command == MavCmd::MAV_CMD_DO_SET_MODE =>
+                    {
+                        self.modes.push(c.param2);
+                    }
+                    Some(MavMessage::PARAM_REQUEST_READ(r)) => {
+                        self.requested.push(r.param_id.to_str().unwrap_or_default().to_owned());
+                    }
+                    _ => {}
+                }
+            }
+        }
+    }
+}
+
+fn parameter(flight: &mut Flight, now_ns: i64, name: &str, value: f32) {
+    let value =
+        PARAM_VALUE_DATA { param_value: value, param_id: name.into(), ..Default::default() };
+    receive(flight, now_ns, &MavMessage::PARAM_VALUE(value));
+}
+
+fn landing_target(start: &str) -> Flight {
+    let mut flight = flight_with(start, &["mode=landing-target"]);
+    flight.camera(CameraInfo::sample());
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    flight
+}
+
+#[test]
+fn precision_landing_gets_the_target_and_no_setpoint() {
+    let mut flight = landing_target("airborne");
+    parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+    parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+    let early = hover(&mut flight, 1000, 3000, 4);
+    assert!(early.modes.is_empty(), "it has not had the target long enough");
+    let sent = hover(&mut flight, 3000, 6000, 4);
+    assert_eq!((early.setpoints, sent.setpoints), (0, 0));
+    assert_eq!(sent.modes.first(), Some(&9.0), "LAND");
+    assert!(sent.targets.len() >= 45, "at the frames' rate: {}", sent.targets.len());
+    for target in &sent.targets {
+        assert_eq!((target.frame as u8, target.position_valid.bits()), (12, 1));
+        // Image right (0.2 m) is the vehicle's right, image down (0.1 m) its back.
+        let [x, y, z] = [target.x, target.y, target.z];
+        assert!((x + 0.1).abs() < 0.03 && (y - 0.2).abs() < 0.03 && (z - 5.0).abs() < 0.1);
+    }
+    let stamps = sent.targets.windows(2).all(|pair| pair[0].time_usec <= pair[1].time_usec);
+    assert!(stamps, "of one steady clock");
+    hover(&mut flight, 6000, 7000, 9);
+    assert_eq!(flight.status(7000 * MS).phase, Phase::Final);
+    receive(&mut flight, 8000 * MS, &heartbeat(9, false));
+    flight.tick(8001 * MS);
+    let status = flight.status(8001 * MS);
+    assert!(status.phase == Phase::Landed && status.finished, "{status:?}");
+    assert_eq!(status.guidance, "landing-target");
+}
+
+#[test]
+fn a_precision_landing_that_is_off_is_reported_with_what_to_set() {
+    let mut flight = landing_target("command");
+    let asked = hover(&mut flight, 1000, 1500, 4).requested;
+    assert!(asked.iter().any(|name| name == "PLND_ENABLED"), "{asked:?}");
+    for (name, value, word) in [
+        ("PLND_ENABLED", 0.0, "set PLND_ENABLED to 1"),
+        ("PLND_ENABLED", 1.0, "PLND_TYPE"),
+        ("PLND_TYPE", 2.0, "set PLND_TYPE to 1"),
+    ] {
+        parameter(&mut flight, 1600 * MS, name, value);
+        let reply = flight.command(1600 * MS, &ControllerCommand::Start);
+        assert!(!reply.accepted && reply.reason.contains(word), "{reply:?}");
+        assert!(flight.status(1600 * MS).why.contains(word));
+    }
+    parameter(&mut flight, 1700 * MS, "PLND_TYPE", 1.0);
+    assert!(flight.command(1700 * MS, &ControllerCommand::Start).accepted);
+}
+
+#[test]
+fn the_pilots_landing_gets_the_target_and_is_recalled_from_high_up() {
+    let mut flight = landing_target("command");
+    parameter(&mut flight, 2 * MS, "PLND_ENABLED", 1.0);
+    parameter(&mut flight, 2 * MS, "PLND_TYPE", 1.0);
+    hover(&mut flight, 1000, 4000, 4);
+    let sent = hover(&mut flight, 4000, 5000, 9);
+    assert!(sent.targets.len() > 10 && sent.modes.is_empty());
+    assert_eq!(flight.status(5000 * MS).phase, Phase::Final);
+    assert!(flight.command(5000 * MS, &ControllerCommand::Abort).accepted);
+    let sent = hover(&mut flight, 5020, 5500, 9);
+    assert_eq!(sent.modes, [4.0], "GUIDED");
+    assert_eq!(flight.status(5500 * MS).phase, Phase::Aborted);
+}
+
+#[test]
+fn a_low_battery_leads_to_what_is_configured() {
+    let set = ["phases.on_battery_low=\"hold\"", "alarms.battery_s=1"];
+    let mut flight = flight_with("airborne", &set);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 1000, 2000, 4);
+    assert_eq!(flight.status(2000 * MS).phase, Phase::Search);
+    let battery = SYS_STATUS_DATA { battery_remaining: 15, ..Default::default() };
+    receive(&mut flight, 2000 * MS, &MavMessage::SYS_STATUS(battery));
+    hover(&mut flight, 2000, 3500, 4);
+    let status = flight.status(3500 * MS);
+    assert_eq!((status.phase, status.why.as_str()), (Phase::Hold, "the battery is low"));
+}
+
+#[test]
+fn after_a_pilots_landing_the_next_flight_is_landed() {
+    let mut flight = flight("airborne");
+    receive(&mut flight, 0, &heartbeat(9, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_LANDING));
+    hover(&mut flight, 20, 1000, 9);
+    assert_eq!(flight.status(1000 * MS).phase, Phase::Idle);
+    receive(&mut flight, 1000 * MS, &heartbeat(9, false));
+    receive(&mut flight, 1001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    receive(&mut flight, 5000 * MS, &heartbeat(4, true));
+    receive(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 5020, 5500, 4);
+    assert_eq!(flight.status(5500 * MS).phase, Phase::Search);
+}
+
+#[test]
+fn only_a_resumed_landing_begins_by_itself() {
+    let next_flight = |start: &str, mode: u32, contact_at_start: MavLandedState| {
+        let mut flight = flight(start);
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(mode, true));
+        receive(&mut flight, MS, &contact(contact_at_start));
+        hover(&mut flight, 20, 1000, mode);
+        let first = flight.status(1000 * MS).phase;
+        receive(&mut flight, 1000 * MS, &heartbeat(mode, false));
+        receive(&mut flight, 1001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+        pose(&mut flight, 1010 * MS);
+        flight.tick(1011 * MS);
+        receive(&mut flight, 5000 * MS, &heartbeat(4, true));
+        receive(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        hover(&mut flight, 5020, 5500, 4);
+        (first, flight.status(5500 * MS).phase)
+    };
+    let (flying, landing) =
+        (MavLandedState::MAV_LANDED_STATE_IN_AIR, MavLandedState::MAV_LANDED_STATE_LANDING);
+    for (start, mode, contact, first, next) in [
+        ("resume", 4, flying, Phase::Search, Phase::Landed),
+        ("resume", 5, flying, Phase::Idle, Phase::Idle),
+        ("resume", 9, landing, Phase::Idle, Phase::Idle),
+        ("airborne", 4, flying, Phase::Search, Phase::Search),
+        ("airborne", 5, flying, Phase::Idle, Phase::Search),
+    ] {
+        let phases = next_flight(start, mode, contact);
+        assert_eq!(phases, (first, next), "{start} in {mode}");
+    }
+}
+
+#[test]
+fn a_controller_restarted_after_touchdown_lands_no_later_flight() {
+    let first_and_next = |mode: u32, contact_at_start: MavLandedState| {
+        let mut flight = flight("resume");
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(mode, true));
+        // Whether it stands is not known yet.
+        hover(&mut flight, 20, 500, mode);
+        receive(&mut flight, 500 * MS, &contact(contact_at_start));
+        hover(&mut flight, 520, 1000, mode);
+        let first = flight.status(1000 * MS).phase;
+        receive(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        hover(&mut flight, 5020, 5500, 4);
+        (first, flight.status(5500 * MS).phase)
+    };
+    let on_ground = MavLandedState::MAV_LANDED_STATE_ON_GROUND;
+    for mode in [4, 9] {
+        let (first, next) = first_and_next(mode, on_ground);
+        assert_eq!((first, next), (Phase::Idle, Phase::Idle), "in mode {mode}");
+    }
+    let (first, _) = first_and_next(4, MavLandedState::MAV_LANDED_STATE_IN_AIR);
+    assert_eq!(first, Phase::Search);
+}
+
+#[test]
+fn a_controller_restarted_in_the_last_metre_of_land_resumes_the_landing() {
+    for contact_at_start in
+        [MavLandedState::MAV_LANDED_STATE_LANDING, MavLandedState::MAV_LANDED_STATE_IN_AIR]
+    {
+        let mut flight = flight("resume");
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(9, true));
+        receive(&mut flight, MS, &contact(contact_at_start));
+        pose_at(&mut flight, 20 * MS, 0.5);
+        flight.tick(21 * MS);
+        assert_eq!(flight.status(21 * MS).phase, Phase::Final);
+    }
+}
+
+#[test]
+fn no_setpoint_follows_the_heartbeat_with_the_pilots_mode() {
+    let mut flight = in_flight("airborne");
+    flight.presence(0, "main", true);
+    let mut last_ms = 0;
+    for ms in (20..4000).step_by(5) {
+        // The news of the switch comes at 2 s, between two ticks.
+        if ms == 2000 {
+            receive(&mut flight, ms * MS, &heartbeat(5, true));
+        }
+        if ms % 20 == 0 {
+            pose(&mut flight, ms * MS);
+        }
+        if ms % 25 == 0 {
+            flight.tick(ms * MS + 3);
+        }
+        if sent(&mut flight).0 > 0 {
+            last_ms = ms;
+        }
+    }
+    assert!((1900..2000).contains(&last_ms), "{last_ms} ms");
+    assert_eq!(flight.status(4000 * MS).setpoint, None);
+}

@@ -1,0 +1,429 @@
+//! Which detector is used, as they come, go, fall silent and disagree.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
+
+use controller::selection::{
+    Limits, MAX_DETECTORS, MAX_SILENCE_NS, MAX_VERDICTS, MIN_SILENCE_NS, Preference, Selection,
+    Sight,
+};
+use messages::{DetectorState, Place};
+use proptest::prelude::*;
+
+const MS: i64 = 1_000_000;
+const PERIOD: i64 = 67 * MS;
+
+fn limits() -> Limits {
+    Limits {
+        max_age_s: 0.2,
+        min_rate_hz: 3.0,
+        return_after_s: 2.0,
+        tolerance_m: 0.1,
+        tolerance_per_m: 0.03,
+    }
+}
+
+fn preferring(detector: Option<&str>, place: Option<Place>) -> Selection {
+    Selection::new(limits(), Preference { detector: detector.map(Into::into), place })
+}
+
+/// Detectors that answer to the frames of one camera, each with its latency, and what was used when.
+struct Bench {
+    selection: Selection,
+    now_ns: i64,
+    /// Stamps used, with the time of their use and their detector.
+    used: Vec<(i64, i64, String)>,
+    /// When which detector became the active one.
+    changes: Vec<(i64, String)>,
+}
+
+impl Bench {
+    fn new(selection: Selection) -> Self {
+        Self { selection, now_ns: 0, used: Vec::new(), changes: Vec::new() }
+    }
+
+    /// Notes what came of the last call, and checks what must always hold.
+    fn note(&mut self) {
+        if let Some((name, stamp)) = self.selection.next_frame() {
+            assert_eq!(self.selection.active(), Some(name.as_str()));
+            assert!(self.used.last().is_none_or(|last| last.0 < stamp), "an older stamp");
+            self.used.push((stamp, self.now_ns, name));
+        }
+        let active = self.selection.active().unwrap_or("none").to_owned();
+        let last = self.changes.last().map_or("none", |(_, last)| last.as_str());
+        if last != active {
+            self.changes.push((self.now_ns, active));
+        }
+    }
+
+    /// Lets time pass up to a frame's stamp plus 66 ms: ticks every 25 ms, and the answers of those that answer.
+    fn frame(&mut self, stamp_ns: i64, answers: &[(&str, i64)]) {
+        let sight = Some(Sight { position_m: Some([0.0, 0.0, 5.0]) });
+        let answers: Vec<_> = answers.iter().map(|(name, late)| (*name, *late, sight)).collect();
+        self.frame_seen(stamp_ns, &answers);
+    }
+
+    fn frame_seen(&mut self, stamp_ns: i64, answers: &[(&str, i64, Option<Sight>)]) {
+        let answered = |(name, late, sight): &(_, i64, _)| (stamp_ns + late, Some((*name, *sight)));
+        let mut events: Vec<_> = answers.iter().map(answered).collect();
+        events.extend((0..3).map(|i| (stamp_ns + i * 25 * MS, None)));
+        events.sort_by_key(|(at, _)| *at);
+        for (at, event) in events {
+            self.now_ns = self.now_ns.max(at);
+            match event {
+                Some((name, sight)) => {
+                    self.selection.received(self.now_ns, name, stamp_ns, sight);
+                }
+                None => self.selection.tick(self.now_ns),
+            }
+            self.note();
+        }
+    }
+
+    fn frames(&mut self, frames: std::ops::Range<i64>, answers: &[(&str, i64)]) {
+        frames.for_each(|i| self.frame(i * PERIOD, answers));
+    }
+
+    fn gone(&mut self, name: &str) {
+        self.selection.presence(self.now_ns, name, false);
+        self.note();
+    }
+
+    fn state(&self, name: &str) -> DetectorState {
+        let all = self.selection.candidates(self.now_ns);
+        all.iter().find(|candidate| candidate.detector == name).unwrap().state
+    }
+
+    fn longest_gap_ms(&self) -> i64 {
+        self.used.windows(2).map(|pair| (pair[1].1 - pair[0].1) / MS).max().unwrap_or(0)
+    }
+}
+
+const BOTH: [(&str, i64); 2] = [("main", 30 * MS), ("spare", 35 * MS)];
+
+#[test]
+fn one_detector_is_used_and_the_other_stands_by() {
+    let mut bench = Bench::new(preferring(None, None));
+    bench.frames(0..30, &BOTH);
+    assert_eq!(bench.changes.len(), 1);
+    assert_eq!(
+        (bench.state("main"), bench.state("spare")),
+        (DetectorState::Active, DetectorState::Shadow)
+    );
+    assert_eq!(bench.used.len(), 30);
+    let spare = &bench.selection.candidates(bench.now_ns)[1];
+    assert_eq!((spare.compared, spare.agreed), (30, 30));
+    assert!((spare.rate_hz - 15.0).abs() < 0.5 && (spare.latency_ms - 35.0).abs() < 0.1);
+}
+
+#[test]
+fn a_crash_hands_over_at_once_and_uses_the_frame_that_is_there() {
+    let mut bench = Bench::new(preferring(None, None));
+    bench.frames(0..10, &BOTH);
+    // The active one dies over a frame that the other has searched.
+    bench.frame(10 * PERIOD, &BOTH[1..]);
+    bench.gone("main");
+    assert_eq!(bench.selection.active(), Some("spare"));
+    assert_eq!(bench.used.last().unwrap().0, 10 * PERIOD);
+    bench.frames(11..20, &BOTH[1..]);
+    assert_eq!(bench.used.len(), 20);
+    assert!(bench.selection.why().contains("main: it has gone"), "{}", bench.selection.why());
+    assert_eq!(bench.selection.changes(), 1);
+}
+
+#[test]
+fn a_silent_one_is_replaced_within_three_of_its_periods_whatever_the_latencies() {
+    for latency_ms in [5, 30, 60, 100, 140] {
+        for spare_ms in [5, 30, 60, 100] {
+            for period_ms in [20, 33, 67, 100] {
+                let answers = [("main", latency_ms * MS), ("spare", spare_ms * MS)];
+                let period = period_ms * MS;
+                let mut events = Vec::new();
+                for (name, late) in answers {
+                    let last = if name == "main" { 20 } else { 40 };
+                    events.extend((0..last).map(|i| (i * period + late, Some((name, i * period)))));
+                }
+                events.extend((0..200).map(|i| (i * 25 * MS, None)));
+                events.sort_by_key(|(at, _)| *at);
+                let mut bench = Bench::new(preferring(None, None));
+                bench.selection.received(0, "main", -period, None);
+                for (at, event) in events {
+                    bench.now_ns = at;
+                    match event {
+                        Some((name, stamp)) => {
+                            bench.selection.received(at, name, stamp, None);
+                        }
+                        None => bench.selection.tick(at),
+                    }
+                    bench.note();
+                }
+                let last_ns = 19 * period + latency_ms * MS;
+                let taken_over =
+                    bench.changes.iter().find(|(at, name)| *at > last_ns && name == "spare");
+                let took_ns = taken_over.unwrap().0 - last_ns;
+                // The other must have had a newer frame for a period; a tick may pass before it is noticed.
+                let lag_ns = (spare_ms - latency_ms).max(0) * MS;
+                let bound_ns = (3 * period).max(2 * period + lag_ns).max(MIN_SILENCE_NS) + 25 * MS;
+                assert!(
+                    took_ns <= bound_ns,
+                    "{latency_ms} {spare_ms} {period_ms}: {} ms",
+                    took_ns / MS
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn a_lost_frame_and_a_camera_that_pauses_change_nothing() {
+    let mut bench = Bench::new(preferring(None, None));
+    bench.frames(0..10, &BOTH);
+    bench.frame(10 * PERIOD, &BOTH[1..]);
+    bench.frames(11..20, &BOTH);
+    for i in 20..60 {
+        bench.frame(i * PERIOD, &[]);
+    }
+    // The spare one is heard first after the pause.
+    bench.frames(60..80, &[("main", 35 * MS), ("spare", 20 * MS)]);
+    assert_eq!(bench.changes.len(), 1, "{:?}", bench.changes);
+}
+
+#[test]
+fn the_operators_choice_is_followed_at_once_and_left_while_it_is_not_healthy() {
+    let mut bench = Bench::new(preferring(None, None));
+    assert!(bench.selection.prefer(0, "spare").unwrap_err().contains("known detectors: none"));
+    bench.frames(0..10, &BOTH);
+    assert!(bench.selection.prefer(bench.now_ns, "spare").unwrap().contains("is used while"));
+    bench.note();
+    assert_eq!(bench.selection.active(), Some("spare"));
+    bench.frames(10..20, &BOTH);
+    bench.frames(20..30, &BOTH[..1]);
+    assert_eq!(bench.selection.active(), Some("main"));
+    let why = bench.selection.why().to_owned();
+    assert!(why.contains("spare: it has been silent for"), "{why}");
+    // Back only after it was healthy for a while.
+    bench.frames(30..58, &BOTH);
+    assert_eq!(bench.selection.active(), Some("main"));
+    bench.frames(58..64, &BOTH);
+    assert_eq!(
+        (bench.selection.active(), bench.selection.why()),
+        (Some("spare"), "it is preferred")
+    );
+    assert_eq!(bench.used.len(), 63);
+    bench.gone("main");
+    let refused = bench.selection.prefer(bench.now_ns, "main").unwrap_err();
+    assert!(refused.contains("has gone"), "{refused}");
+}
+
+#[test]
+fn a_place_is_preferred_and_left_and_taken_again() {
+    let mut bench = Bench::new(preferring(None, None));
+    let answers = [("air", 30 * MS), ("ground", 95 * MS)];
+    let none_yet = bench.selection.prefer_place(0, Place::Ground);
+    assert!(none_yet.contains("none yet"), "{none_yet}");
+    bench.selection.set_place(0, "air", Place::Onboard);
+    bench.selection.set_place(0, "ground", Place::Ground);
+    bench.frames(0..20, &answers);
+    assert_eq!(bench.selection.active(), Some("ground"));
+    // The link is cut for three seconds: the process is missed only after its lease.
+    bench.frames(20..30, &answers[..1]);
+    assert_eq!(bench.selection.active(), Some("air"));
+    bench.gone("ground");
+    bench.frames(30..65, &answers[..1]);
+    bench.selection.presence(bench.now_ns, "ground", true);
+    bench.frames(65..90, &answers);
+    assert_eq!(bench.selection.active(), Some("air"), "it must prove itself first");
+    bench.frames(90..110, &answers);
+    assert_eq!(bench.selection.active(), Some("ground"));
+    assert!(bench.longest_gap_ms() <= 201, "{}", bench.longest_gap_ms());
+    assert_eq!(bench.selection.preference(), "ground");
+}
+
+#[test]
+fn one_that_fails_again_and_again_is_trusted_more_slowly() {
+    let mut bench = Bench::new(preferring(Some("main"), None));
+    // Silent for half a second, then well for three seconds.
+    for i in 0..900 {
+        let answers = if i % 52 < 8 { &BOTH[1..] } else { &BOTH[..] };
+        bench.frame(i * PERIOD, answers);
+    }
+    // A minute of it: without doubt it would be 34 changes.
+    assert!((3..=6).contains(&bench.selection.changes()), "{}", bench.selection.changes());
+}
+
+#[test]
+fn slow_and_late_ones_give_way_and_are_better_than_none() {
+    let mut bench = Bench::new(preferring(None, None));
+    bench.frames(0..20, &[("main", 250 * MS)]);
+    assert_eq!(bench.selection.active(), Some("main"), "a late one is better than none");
+    bench.frames(20..25, &[("main", 250 * MS), ("spare", 30 * MS)]);
+    assert_eq!(bench.selection.active(), Some("spare"));
+    assert!(bench.selection.why().contains("main: its frames are 250 ms old"));
+    let mut bench = Bench::new(preferring(None, None));
+    for i in 0..100 {
+        let slow = i % 7 == 0;
+        bench.frame(i * PERIOD, if slow { &BOTH[..1] } else { &[] });
+    }
+    assert_eq!(bench.selection.active(), Some("main"));
+    bench.frames(100..110, &BOTH[1..]);
+    assert_eq!(bench.selection.active(), Some("spare"));
+}
+
+#[test]
+fn one_that_sees_the_marker_elsewhere_is_not_taken_unless_it_is_named() {
+    let mut bench = Bench::new(preferring(None, Some(Place::Ground)));
+    bench.selection.set_place(0, "spare", Place::Ground);
+    let at = |x: f64| Some(Sight { position_m: Some([x, 0.0, 5.0]) });
+    bench.frames(0..2, &BOTH[..1]);
+    for i in 2..100 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(0.8))]);
+    }
+    assert_eq!(bench.selection.active(), Some("main"));
+    let spare = bench.selection.candidates(bench.now_ns).swap_remove(0);
+    assert_eq!((spare.compared, spare.agreed), (MAX_VERDICTS as u32, 0));
+    assert!((spare.disagreement_m.unwrap() - 0.8).abs() < 1e-9);
+    let answer = bench.selection.prefer(bench.now_ns, "spare").unwrap();
+    assert!(answer.contains("although it agrees with the active one in only 0 of 30"), "{answer}");
+    assert_eq!(bench.selection.active(), Some("spare"));
+}
+
+#[test]
+fn where_the_active_one_sees_nothing_agreement_is_not_concluded() {
+    let mut bench = Bench::new(preferring(None, None));
+    let seen = Some(Sight { position_m: None });
+    for i in 0..20 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, None), ("spare", 35 * MS, seen)]);
+    }
+    let compared = |bench: &Bench| {
+        let spare = bench.selection.candidates(bench.now_ns).pop().unwrap();
+        (spare.compared, spare.agreed)
+    };
+    assert_eq!(compared(&bench), (0, 0));
+    for i in 20..30 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, seen), ("spare", 35 * MS, None)]);
+    }
+    assert_eq!(compared(&bench), (10, 0));
+    for i in 30..40 {
+        bench.frame_seen(i * PERIOD, &[("spare", 20 * MS, seen), ("main", 30 * MS, seen)]);
+    }
+    assert_eq!(compared(&bench), (20, 10));
+}
+
+#[test]
+fn a_word_from_before_its_end_brings_no_detector_back() {
+    let mut bench = Bench::new(preferring(None, None));
+    bench.frames(0..10, &BOTH[..1]);
+    bench.gone("main");
+    assert!(bench.selection.is_blind());
+    bench.selection.received(bench.now_ns + MS, "main", bench.now_ns - MS, None);
+    assert!(bench.selection.is_blind());
+    bench.selection.received(bench.now_ns + 90 * MS, "main", bench.now_ns + 50 * MS, None);
+    assert!(!bench.selection.is_blind());
+}
+
+#[test]
+fn those_that_left_are_forgotten_and_a_flood_of_names_is_bounded() {
+    let mut selection = preferring(None, None);
+    selection.received(0, "main", 0, None);
+    assert!(!selection.is_blind());
+    selection.presence(1, "main", false);
+    assert!(selection.is_blind());
+    selection.tick(11_000 * MS);
+    assert!(selection.active().is_none() && selection.candidates(0).is_empty());
+    for i in 0..1000 {
+        selection.received(i, &format!("d{i}"), i, None);
+    }
+    assert_eq!(selection.candidates(0).len(), MAX_DETECTORS);
+    assert!(!selection.received(1000, "main", 1000, None), "there is no room");
+    let later = 61_000 * MS;
+    selection.tick(later);
+    assert!(!selection.received(later, &"d".repeat(65), later, None), "no name of a service");
+    assert!(selection.received(later, "main", later, None));
+}
+
+/// What can happen, after some time.
+#[derive(Clone, Debug)]
+enum Step {
+    Received { who: usize, stamp_ago_ms: i64, seen: bool },
+    Presence { who: usize, alive: bool },
+    Prefer { who: usize },
+    Place { ground: bool },
+    Tick,
+}
+
+fn step() -> impl Strategy<Value = (i64, Step)> {
+    let what = prop_oneof![
+        6 => (0..5_usize, -20..400_i64, any::<bool>())
+            .prop_map(|(who, stamp_ago_ms, seen)| Step::Received { who, stamp_ago_ms, seen }),
+        1 => (0..5_usize, any::<bool>()).prop_map(|(who, alive)| Step::Presence { who, alive }),
+        1 => (0..5_usize).prop_map(|who| Step::Prefer { who }),
+        1 => any::<bool>().prop_map(|ground| Step::Place { ground }),
+        3 => Just(Step::Tick),
+    ];
+    (0..120_i64, what)
+}
+
+const NAMES: [&str; 5] = ["a", "b", "c", "d", "e"];
+
+proptest! {
+    #[test]
+    fn whatever_happens_stamps_only_grow_and_the_active_one_is_known(
+        steps in prop::collection::vec(step(), 1..400),
+    ) {
+        let mut bench = Bench::new(preferring(None, None));
+        for (wait_ms, what) in steps {
+            bench.now_ns += wait_ms * MS;
+            let now = bench.now_ns;
+            match what {
+                Step::Received { who, stamp_ago_ms, seen } => {
+                    let sight = seen.then_some(Sight { position_m: Some([0.0, 0.0, 3.0]) });
+                    bench.selection.received(now, NAMES[who], now - stamp_ago_ms * MS, sight);
+                }
+                Step::Presence { who, alive } => bench.selection.presence(now, NAMES[who], alive),
+                Step::Prefer { who } => drop(bench.selection.prefer(now, NAMES[who])),
+                Step::Place { ground } => {
+                    let place = if ground { Place::Ground } else { Place::Onboard };
+                    bench.selection.set_place(now, NAMES[who_of(place)], place);
+                    bench.selection.prefer_place(now, place);
+                }
+                Step::Tick => bench.selection.tick(now),
+            }
+            bench.note();
+            let active = bench.selection.active();
+            prop_assert!(active.is_none_or(|name| bench.selection.knows(name)));
+            let is_blind = bench.selection.is_blind();
+            prop_assert!(!is_blind || bench.selection.candidates(now).iter().all(|c| !c.alive));
+        }
+    }
+
+    #[test]
+    fn without_orders_a_preferred_one_that_comes_and_goes_causes_few_changes(
+        spells in prop::collection::vec((1..60_i64, 1..40_i64), 5..40),
+    ) {
+        let mut bench = Bench::new(preferring(Some("main"), None));
+        let mut frame = 0;
+        for (well, silent) in spells {
+            bench.frames(frame..frame + well, &BOTH);
+            bench.frames(frame + well..frame + well + silent, &BOTH[1..]);
+            frame += well + silent;
+        }
+        // The delays double from 2 s: in any 30 s there are few returns, each after its delay.
+        for (i, (at, name)) in bench.changes.iter().enumerate().skip(2) {
+            if name == "main" {
+                prop_assert!(at - bench.changes[i - 1].0 >= 2_000 * MS - PERIOD, "{:?}", bench.changes);
+            }
+            let before = bench.changes.iter().filter(|(then, _)| (0..30_000 * MS).contains(&(at - then))).count();
+            prop_assert!(before <= 12, "{:?}", bench.changes);
+        }
+        // The other one is always there, so no gap is long; the period of one that is heard now and then looks longer than
+        // it is, but a silence has an end.
+        let longest_ms = (MAX_SILENCE_NS + 2 * PERIOD) / MS;
+        prop_assert!(bench.longest_gap_ms() <= longest_ms, "{} ms", bench.longest_gap_ms());
+    }
+}
+
+fn who_of(place: Place) -> usize {
+    match place {
+        Place::Onboard => 0,
+        Place::Ground => 1,
+    }
+}
