@@ -3,9 +3,7 @@
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use messages::{
-    CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, Wind, encode, topic,
-};
+use messages::{CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, Wind, encode, topic};
 use node::{FramePublisher, FrameSubscriber, Identity, Node, ZenohSource, clock_name, now_ns};
 use testing::ports;
 use tokio::time::timeout;
