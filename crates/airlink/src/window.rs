@@ -3,7 +3,7 @@
 //! A frame is sent only while fewer than `window` others are in flight, so that nothing queues on the link;
 //! frames that come meanwhile are dropped at the camera. A frame that takes much longer than those before it
 //! is delayed by a lost packet, and its TCP connection with it, for at least 200 ms when the packet is lost
-//! again: the next frame overtakes it on the other of two connections, the lanes. A frame without a receipt
+//! again: the next frame overtakes it on the other of two connections, the lanes. A frame without an acknowledgement
 //! counts as lost after a timeout. Once one of several receivers has acknowledged a frame, the others get
 //! only a little more time, so that a slow or dead receiver does not block the rest. The size grows while the
 //! mean round trip is below its target, and shrinks above it: a mean, because a lost packet delays a single
@@ -17,9 +17,9 @@ use crate::config::AirConfig;
 
 /// Maximum number of receivers that are waited for.
 const MAX_RECEIVERS: usize = 16;
-/// Time without a receipt after which a receiver is forgotten, in nanoseconds.
+/// Time without an acknowledgement after which a receiver is forgotten, in nanoseconds.
 const RECEIVER_TIMEOUT_NS: i64 = 2_000_000_000;
-/// Number of frames remembered for late receipts.
+/// Number of frames remembered for late acknowledgements.
 const HISTORY: usize = 16;
 /// Weight of a new round trip in the mean.
 const MEAN_WEIGHT: f64 = 1.0 / 6.0;
@@ -61,7 +61,7 @@ pub struct Window {
     consecutive_losses: u32,
     sent: VecDeque<Sent>,
     receivers: Vec<Receiver>,
-    /// The receiver whose receipts decide.
+    /// The receiver whose acknowledgements decide.
     in_use: Option<String>,
 }
 
@@ -79,7 +79,7 @@ struct Sent {
 #[derive(Clone, Debug)]
 struct Receiver {
     name: String,
-    last_receipt_ns: i64,
+    last_ack_ns: i64,
     sequence: u64,
 }
 
@@ -116,7 +116,7 @@ impl Window {
         self.size_bytes as usize
     }
 
-    /// Mean time from sending a frame to its receipt, in milliseconds.
+    /// Mean time from sending a frame to its acknowledgement, in milliseconds.
     pub fn round_trip_ms(&self) -> Option<f64> {
         self.mean_ms
     }
@@ -134,7 +134,7 @@ impl Window {
                 lost += usize::from(!sent.is_acknowledged);
             }
         }
-        // Subscribers that never send receipts do not measure the link.
+        // Subscribers that never send acknowledgements do not measure the link.
         if self.receivers.is_empty() {
             self.consecutive_losses = 0;
             lost = 0;
@@ -166,7 +166,7 @@ impl Window {
         in_flight < self.max_in_flight
     }
 
-    /// Time without a receipt after which a frame is overtaken, in nanoseconds.
+    /// Time without an acknowledgement after which a frame is overtaken, in nanoseconds.
     fn late_ns(&self) -> i64 {
         let Some(mean_ms) = self.mean_ms else { return self.timeout_ns };
         let late_ms =
@@ -194,7 +194,7 @@ impl Window {
         });
     }
 
-    /// Records a receipt. Returns the time since the frame was sent, in milliseconds; `None` for an unknown
+    /// Records an acknowledgement. Returns the time since the frame was sent, in milliseconds; `None` for an unknown
     /// frame.
     pub fn received(&mut self, now_ns: i64, receiver: &str, sequence: u64) -> Option<f64> {
         let sent = self.sent.iter_mut().find(|sent| sent.sequence == sequence)?;
@@ -205,13 +205,13 @@ impl Window {
         let has_room = self.receivers.len() < MAX_RECEIVERS;
         match self.receivers.iter_mut().find(|known| known.name == receiver) {
             Some(known) => {
-                known.last_receipt_ns = now_ns;
+                known.last_ack_ns = now_ns;
                 known.sequence = known.sequence.max(sequence);
             }
             None if has_room => {
                 self.receivers.push(Receiver {
                     name: receiver.to_owned(),
-                    last_receipt_ns: now_ns,
+                    last_ack_ns: now_ns,
                     sequence,
                 });
             }
@@ -231,7 +231,7 @@ impl Window {
     }
 
     fn remove_silent_receivers(&mut self, now_ns: i64) {
-        self.receivers.retain(|receiver| now_ns - receiver.last_receipt_ns < RECEIVER_TIMEOUT_NS);
+        self.receivers.retain(|receiver| now_ns - receiver.last_ack_ns < RECEIVER_TIMEOUT_NS);
     }
 
     fn adapt(&mut self, took_ms: f64, bytes: usize) {
@@ -452,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn receipts_of_unknown_frames_are_ignored() {
+    fn acks_of_unknown_frames_are_ignored() {
         let mut window = window();
         assert_eq!(window.received(0, "ground", 7), None);
         window.sent(0, 1, 1000);

@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use autopilot::Frame;
+use autopilot::Packet;
 use autopilot::dialect::{
     ATTITUDE_DATA, HIL_STATE_QUATERNION_DATA, LOCAL_POSITION_NED_DATA, MavMessage, SIM_STATE_DATA,
 };
@@ -67,11 +67,11 @@ pub struct ReportedVehicle {
 
 impl ReportedVehicle {
     /// Handles a packet that arrived at `now_s`.
-    pub fn handle(&mut self, now_s: f64, frame: &Frame) {
-        if frame.sender.component != 1 {
+    pub fn handle(&mut self, now_s: f64, packet: &Packet) {
+        if packet.sender.component != 1 {
             return;
         }
-        match &frame.message {
+        match &packet.message {
             Some(MavMessage::SIM_STATE(state)) => self.sim_state(now_s, state),
             Some(MavMessage::HIL_STATE_QUATERNION(state)) => self.hil_state(now_s, state),
             Some(MavMessage::ATTITUDE(attitude)) => self.attitude(attitude),
@@ -288,17 +288,17 @@ mod tests {
     use super::*;
     use autopilot::Sender;
 
-    fn frame(message: MavMessage) -> Frame {
+    fn packet(message: MavMessage) -> Packet {
         let sender = Sender { system: 1, component: 1 };
         let mut parser = autopilot::Parser::new();
-        let mut frames = parser.push(&autopilot::packet::encode(sender, 0, &message));
-        frames.extend(parser.finish());
-        frames.remove(0)
+        let mut packets = parser.push(&autopilot::packet::encode(sender, 0, &message));
+        packets.extend(parser.finish());
+        packets.remove(0)
     }
 
-    fn sim_state(north_e7: i32, altitude_m: f32, velocity: [f32; 3]) -> Frame {
+    fn sim_state(north_e7: i32, altitude_m: f32, velocity: [f32; 3]) -> Packet {
         let [vn, ve, vd] = velocity;
-        frame(MavMessage::SIM_STATE(SIM_STATE_DATA {
+        packet(MavMessage::SIM_STATE(SIM_STATE_DATA {
             lat_int: -353_632_620 + north_e7,
             lon_int: 1_491_652_370,
             alt: altitude_m,
@@ -312,7 +312,7 @@ mod tests {
     #[test]
     fn the_truth_of_a_simulated_px4_is_used() {
         let state = |north_e7: i32| {
-            frame(MavMessage::HIL_STATE_QUATERNION(HIL_STATE_QUATERNION_DATA {
+            packet(MavMessage::HIL_STATE_QUATERNION(HIL_STATE_QUATERNION_DATA {
                 attitude_quaternion: [0.0, 0.0, 0.0, 1.0],
                 lat: 473_977_420 + north_e7,
                 lon: 85_455_940,
@@ -337,9 +337,9 @@ mod tests {
 
     #[test]
     fn a_vehicle_first_reported_in_the_air_started_at_the_autopilots_origin() {
-        let attitude = || frame(MavMessage::ATTITUDE(ATTITUDE_DATA::default()));
+        let attitude = || packet(MavMessage::ATTITUDE(ATTITUDE_DATA::default()));
         let local = |x: f32, z: f32| {
-            frame(MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
+            packet(MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
                 x,
                 z,
                 ..LOCAL_POSITION_NED_DATA::default()
@@ -405,10 +405,10 @@ mod tests {
     fn without_a_simulation_the_autopilots_estimate_is_used() {
         let mut reported = ReportedVehicle::default();
         let position = LOCAL_POSITION_NED_DATA { x: 1.0, y: 2.0, z: -3.0, ..Default::default() };
-        reported.handle(0.0, &frame(MavMessage::LOCAL_POSITION_NED(position.clone())));
+        reported.handle(0.0, &packet(MavMessage::LOCAL_POSITION_NED(position.clone())));
         assert!(!reported.is_known(), "no attitude yet");
-        reported.handle(0.01, &frame(MavMessage::ATTITUDE(ATTITUDE_DATA::default())));
-        reported.handle(0.02, &frame(MavMessage::LOCAL_POSITION_NED(position)));
+        reported.handle(0.01, &packet(MavMessage::ATTITUDE(ATTITUDE_DATA::default())));
+        reported.handle(0.02, &packet(MavMessage::LOCAL_POSITION_NED(position)));
         assert!((reported.truth().unwrap().height_m - 3.0).abs() < 1e-6 && !reported.is_true(0.02));
     }
 }

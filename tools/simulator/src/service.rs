@@ -272,11 +272,11 @@ impl AutopilotSide {
     async fn receive(&mut self, simulation: &Simulation) {
         match self {
             Self::Link(link) => {
-                if let LinkEvent::Frame { frame, .. } = link.recv().await
+                if let LinkEvent::Packet { packet, .. } = link.recv().await
                     && let VehicleSource::Simulated(world) = &mut *simulation.source()
                 {
                     world.advance_to(simulation.now_s());
-                    world.handle(&frame);
+                    world.handle(&packet);
                 }
             }
             Self::Topics { packets, .. } => {
@@ -284,11 +284,11 @@ impl AutopilotSide {
                     return std::future::pending().await;
                 };
                 let mut parser = Parser::new();
-                let mut frames = parser.push(&message.packet);
-                frames.extend(parser.finish());
+                let mut packets = parser.push(&message.packet);
+                packets.extend(parser.finish());
                 let now_s = simulation.now_s();
                 if let VehicleSource::Reported(reported) = &mut *simulation.source() {
-                    frames.iter().for_each(|frame| reported.handle(now_s, frame));
+                    packets.iter().for_each(|packet| reported.handle(now_s, packet));
                 }
             }
         }

@@ -5,9 +5,8 @@ use detector::wire;
 use fiducial::Detector;
 use geometry::{Camera, CameraModel, Marker, Transform, Vector};
 use imaging::GrayView;
-use messages::{
-    CameraInfo, Detection, Detections, FrameHeader, LensModel, MarkerPose, PixelFormat, Transform3,
-};
+use messages::{CameraInfo, Detection, Detections, FrameHeader, MarkerPose, PixelFormat};
+use nalgebra::Matrix6;
 use node::{Layers, clock_name};
 use simulator::camera::{FrameRequest, SimCamera};
 use world::World;
@@ -73,15 +72,7 @@ impl Eyes {
                 Seer::Modelled(Box::new(Vision::new(RINGS, model, size_m, config.seed)))
             }
         };
-        let info = CameraInfo {
-            camera: config.camera.name.clone(),
-            width: model.width,
-            height: model.height,
-            focal_px: Some([model.fx, model.fy]),
-            principal_px: [model.cx, model.cy],
-            lens: LensModel::Pinhole,
-            body_from_camera: wire_transform(&settings.body_from_camera),
-        };
+        let info = CameraInfo::new(&config.camera.name, &model, &settings.body_from_camera);
         Ok(Self { camera, seer, info, model, faults, family: marker.family.name() })
     }
 
@@ -177,14 +168,8 @@ impl Eyes {
 }
 
 fn detection(family: &str, found: &Found) -> Detection {
-    let c = &found.covariance_m2;
-    let mut covariance = [0.0_f32; 21];
-    let places = [(0, c.m11), (1, c.m12), (2, c.m13), (6, c.m22), (7, c.m23), (11, c.m33)];
-    for (index, value) in places {
-        if let Some(cell) = covariance.get_mut(index) {
-            *cell = value as f32;
-        }
-    }
+    let mut covariance = Matrix6::zeros();
+    covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&found.covariance_m2);
     Detection {
         family: family.to_owned(),
         id: None,
@@ -195,19 +180,11 @@ fn detection(family: &str, found: &Found) -> Detection {
         wrong_bits: 0,
         confidence: 1.0,
         pose: Some(MarkerPose {
-            camera_from_marker: wire_transform(&found.camera_from_marker),
+            camera_from_marker: (&found.camera_from_marker).into(),
             reprojection_rms_px: 0.1,
-            covariance,
+            covariance: MarkerPose::upper_triangle(&covariance),
             alternative: None,
         }),
-    }
-}
-
-fn wire_transform<A: geometry::Frame, B: geometry::Frame>(pose: &Transform<A, B>) -> Transform3 {
-    let origin = pose.origin();
-    Transform3 {
-        translation_m: [origin.x(), origin.y(), origin.z()],
-        rotation_wxyz: pose.rotation().wxyz(),
     }
 }
 
