@@ -121,13 +121,12 @@ fn instants(poses: &[Transform<Ned, Body>], count: usize) -> Vec<Transform<Ned, 
         .collect()
 }
 
-/// Grey levels of a square of the image about `centre`, from 32 x 32 rays a pixel and instant.
+/// Grey levels of a window of the image, from 32 x 32 rays per pixel and instant.
 fn brute_force(
     scene: &Scene,
     settings: &CameraSettings,
     poses: &[Transform<Ned, Body>],
-    centre: [usize; 2],
-    half: usize,
+    Window { centre, half }: Window,
 ) -> Vec<f64> {
     const RAYS: usize = 32;
     let pad = &scene.pads[0];
@@ -186,16 +185,24 @@ fn blur_weights(sigma: f64, pixel: usize, margin: usize) -> Vec<f64> {
     weights.iter().map(|w| w / total).collect()
 }
 
-/// Renders, and compares a square of the image around `centre` with brute force.
-fn check(
-    name: &str,
-    (scene, settings): (&Scene, &CameraSettings),
-    poses: &[Transform<Ned, Body>],
+/// A square of the image of `2 * half + 1` pixels.
+#[derive(Copy, Clone)]
+struct Window {
     centre: [usize; 2],
     half: usize,
+}
+
+/// Renders, and compares a window of the image with brute force.
+fn check(
+    name: &str,
+    scene: &Scene,
+    settings: &CameraSettings,
+    poses: &[Transform<Ned, Body>],
+    window: Window,
 ) -> f64 {
     let out = rendered(scene, settings, poses, 0);
-    let expected = brute_force(scene, settings, poses, centre, half);
+    let expected = brute_force(scene, settings, poses, window);
+    let Window { centre, half } = window;
     let size = 2 * half + 1;
     let (mut worst, mut squares) = (0.0f64, 0.0);
     let mut at = [0, 0];
@@ -244,7 +251,8 @@ fn pixels_agree_with_brute_force() {
     ];
     let mut failures = Vec::new();
     for (name, poses, centre, half) in &cases {
-        let worst = check(name, (&plain_scene(), &settings), poses, *centre, *half);
+        let worst =
+            check(name, &plain_scene(), &settings, poses, Window { centre: *centre, half: *half });
         if worst > WORST_LEVELS {
             failures.push((*name, worst));
         }
@@ -263,8 +271,13 @@ fn adjacent_cells_have_no_seams() {
     ] {
         let pose = pose(height_m, roll, 0.05, 0.7, [0.3, 0.4]);
         let scene = scene_of_cells();
-        let worst =
-            check(&format!("cells, {height_m} m"), (&scene, &settings), &[pose], centre, half);
+        let worst = check(
+            &format!("cells, {height_m} m"),
+            &scene,
+            &settings,
+            &[pose],
+            Window { centre, half },
+        );
         assert!(worst <= WORST_LEVELS, "{worst} at {height_m} m");
     }
 }
@@ -320,7 +333,7 @@ fn other_lenses_agree_with_brute_force() {
         let face = plain_scene().pads[0].ned_from_marker.origin();
         let centre = settings.model.project(ned_from_camera.inverse() * face).unwrap();
         let centre = [centre.x as usize, centre.y as usize];
-        let worst = check(name, (&plain_scene(), &settings), &poses, centre, 25);
+        let worst = check(name, &plain_scene(), &settings, &poses, Window { centre, half: 25 });
         assert!(worst <= WORST_LEVELS, "{name}: {worst}");
     }
 }
