@@ -6,7 +6,7 @@ use std::time::Duration;
 use airlink::AirConfig;
 use anyhow::{bail, ensure};
 use geometry::{Body, Camera, CameraModel, Distortion, Point, Rotation, Transform};
-use imaging::{GrayView, Mosaic};
+use imaging::{BayerPattern, GrayView};
 use media::read_calibration;
 use node::{Check, Settings};
 use serde::Deserialize;
@@ -44,8 +44,8 @@ pub(crate) struct SourceConfig {
 pub(crate) struct ProgramConfig {
     /// The program and its arguments.
     pub(crate) command: Vec<String>,
-    /// Width and height of its frames, in pixels.
-    pub(crate) size: (usize, usize),
+    /// Size of its frames.
+    pub(crate) size: FrameSize,
     /// Bytes of a frame.
     pub(crate) format: FrameFormat,
     /// Bits of a sample.
@@ -56,6 +56,19 @@ pub(crate) struct ProgramConfig {
     pub(crate) delay_ns: i64,
     /// Maximum time without a frame.
     pub(crate) timeout: Duration,
+}
+
+/// The size of a frame, in pixels.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) struct FrameSize {
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+}
+
+impl FrameSize {
+    pub(crate) fn pixels(self) -> usize {
+        self.width.saturating_mul(self.height)
+    }
 }
 
 /// The bytes in which a program writes a frame.
@@ -135,9 +148,9 @@ impl Config {
         (self.source.max_megapixels * 1e6) as u64
     }
 
-    /// The intrinsics for images of this size (width, height); `None` for an uncalibrated camera.
-    pub(crate) fn intrinsics(&self, size: (usize, usize)) -> anyhow::Result<Option<CameraModel>> {
-        let (width, height) = (size.0 as u32, size.1 as u32);
+    /// The intrinsics for images of this size; `None` for an uncalibrated camera.
+    pub(crate) fn intrinsics(&self, size: FrameSize) -> anyhow::Result<Option<CameraModel>> {
+        let [width, height] = [size.width, size.height].map(|edge| edge as u32);
         let calibration = &self.calibration;
         if calibration.file != Path::new("") {
             let camera = read_calibration(&calibration.file)?;
@@ -217,7 +230,7 @@ impl SourceConfig {
         };
         Ok(Some(ProgramConfig {
             command: self.command.clone(),
-            size: (width, height),
+            size: FrameSize { width, height },
             format,
             bits,
             rate_hz: self.rate_hz,
@@ -227,7 +240,7 @@ impl SourceConfig {
     }
 
     /// The sensor's Bayer pattern.
-    pub(crate) fn bayer_pattern(&self) -> anyhow::Result<Option<Mosaic>> {
+    pub(crate) fn bayer_pattern(&self) -> anyhow::Result<Option<BayerPattern>> {
         Ok(match self.bayer.as_str() {
             "" => None,
             name => Some(name.parse()?),
@@ -342,7 +355,7 @@ mod tests {
     fn the_defaults_are_an_uncalibrated_camera_that_looks_down() {
         let config = load(&[]).unwrap();
         assert_eq!(config.instance(), "down");
-        assert!(config.intrinsics((640, 480)).unwrap().is_none());
+        assert!(config.intrinsics(FrameSize { width: 640, height: 480 }).unwrap().is_none());
         let ahead = config.body_from_camera() * Vector::new(0.0, 0.0, 1.0);
         let top = config.body_from_camera() * Vector::new(0.0, -1.0, 0.0);
         assert!((ahead - Vector::new(0.0, 0.0, 1.0)).norm() < 1e-12);
@@ -372,7 +385,7 @@ mod tests {
     #[test]
     fn intrinsics_come_from_keys() {
         let config = load(&["calibration.focal_px=[900, 901]"]).unwrap();
-        let camera = config.intrinsics((640, 480)).unwrap().unwrap();
+        let camera = config.intrinsics(FrameSize { width: 640, height: 480 }).unwrap().unwrap();
         assert_eq!([camera.fx, camera.fy, camera.cx, camera.cy], [900.0, 901.0, 319.5, 239.5]);
         let config = load(&[
             "calibration.focal_px=[900, 900]",
@@ -380,7 +393,8 @@ mod tests {
             "calibration.lens=brown-conrady",
             "calibration.distortion=[-0.3, 0.1]",
         ]);
-        let camera = config.unwrap().intrinsics((640, 480)).unwrap().unwrap();
+        let camera =
+            config.unwrap().intrinsics(FrameSize { width: 640, height: 480 }).unwrap().unwrap();
         let k = [-0.3, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
         assert_eq!((camera.cx, camera.distortion), (300.0, Distortion::BrownConrady(k)));
     }
@@ -391,8 +405,12 @@ mod tests {
         let text = "cam0: {camera_model: pinhole, intrinsics: [500, 500, 320, 240], resolution: [640, 480]}";
         std::fs::write(file.path(), text).unwrap();
         let config = load(&[&format!("calibration.file={}", file.path().display())]).unwrap();
-        assert_eq!(config.intrinsics((640, 480)).unwrap().unwrap().fx, 500.0);
-        let problem = config.intrinsics((320, 240)).unwrap_err().to_string();
+        assert_eq!(
+            config.intrinsics(FrameSize { width: 640, height: 480 }).unwrap().unwrap().fx,
+            500.0
+        );
+        let problem =
+            config.intrinsics(FrameSize { width: 320, height: 240 }).unwrap_err().to_string();
         assert!(problem.contains("for images of 640 x 480") && problem.contains("have 320 x 240"));
     }
 

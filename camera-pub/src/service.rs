@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
 use geometry::CameraModel;
-use imaging::{GrayImage, Mosaic, SampleFormat};
+use imaging::{GrayImage, SampleFormat};
 use media::{DecodedImage, frame_bytes, images_in, samples_to_grey};
 use messages::{BayerPattern, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
-use crate::config::{Config, FrameFormat, ProgramConfig};
+use crate::config::{Config, FrameFormat, FrameSize, ProgramConfig};
 use crate::program::Program;
 
 /// Maximum number of images whose size is read at the start, to size the shared memory. Larger frames are
@@ -92,8 +92,8 @@ enum Source {
 /// What there is to publish.
 struct Found {
     source: Source,
-    /// Width and height that the camera info states, in pixels.
-    size: (usize, usize),
+    /// The size in the camera info.
+    size: FrameSize,
     /// Bytes of the largest known frame.
     max_frame_bytes: usize,
 }
@@ -102,7 +102,7 @@ fn find(config: &Config) -> anyhow::Result<Found> {
     match config.source.program()? {
         Some(program) => {
             let size = program.size;
-            let max_frame_bytes = program.format.frame_bytes().max(size.0 * size.1);
+            let max_frame_bytes = program.format.frame_bytes().max(size.pixels());
             Ok(Found { source: Source::Program(program), size, max_frame_bytes })
         }
         None => find_images(config),
@@ -124,7 +124,7 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
     let max_pixels = config.max_pixels();
     let mut first_problem = None;
     let first_size = images.iter().find_map(|path| match DecodedImage::read(path, max_pixels) {
-        Ok(image) => Some((image.width(), image.height())),
+        Ok(image) => Some(FrameSize { width: image.width(), height: image.height() }),
         Err(problem) => {
             first_problem.get_or_insert(problem);
             None
@@ -138,13 +138,13 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
         .iter()
         .take(MAX_MEASURED_IMAGES)
         .filter_map(|path| frame_bytes(path, max_pixels).ok());
-    let max_frame_bytes = sizes.max().unwrap_or(size.0 * size.1);
+    let max_frame_bytes = sizes.max().unwrap_or(size.pixels());
     Ok(Found { source: Source::Images(images), size, max_frame_bytes })
 }
 
-fn camera_info(config: &Config, size: (usize, usize)) -> anyhow::Result<CameraInfo> {
+fn camera_info(config: &Config, size: FrameSize) -> anyhow::Result<CameraInfo> {
     let intrinsics = config.intrinsics(size)?;
-    let (width, height) = (size.0 as u32, size.1 as u32);
+    let [width, height] = [size.width, size.height].map(|edge| edge as u32);
     let model = intrinsics.unwrap_or_else(|| CameraModel::pinhole(width, height, 1.0));
     let info = CameraInfo::new(config.instance(), &model, &config.body_from_camera());
     let focal_px = info.focal_px.filter(|_| intrinsics.is_some());
@@ -154,7 +154,7 @@ fn camera_info(config: &Config, size: (usize, usize)) -> anyhow::Result<CameraIn
 /// Reads frames and publishes them.
 struct Stream {
     config: Config,
-    size: (usize, usize),
+    size: FrameSize,
     frames: FramePublisher,
     air: AirSender,
     health: Arc<HealthCounters>,
@@ -244,11 +244,11 @@ impl Stream {
         &self,
         pixels: Loan,
         config: &ProgramConfig,
-        bayer: Option<Mosaic>,
+        bayer: Option<imaging::BayerPattern>,
     ) -> Prepared {
-        let (width, height) = config.size;
+        let FrameSize { width, height } = config.size;
         let format = pixel_format(Some(config.bits), bayer);
-        let sample = SampleFormat { bits: config.bits, mosaic: bayer };
+        let sample = SampleFormat { bits: config.bits, bayer };
         let is_wanted = self.needs_grey(format);
         let grey = is_wanted.then(|| samples_to_grey(&pixels, width, height, sample)).flatten();
         Prepared { width, height, format, pixels, grey }
@@ -267,7 +267,7 @@ impl Stream {
             }
         };
         let (width, height) = (image.width(), image.height());
-        if (width, height) != self.size {
+        if (FrameSize { width, height }) != self.size {
             if self.health.failed("image of another size") {
                 tracing::warn!(width, height, "Dropped a frame whose size is not `source.size_px`");
             }
@@ -325,7 +325,8 @@ impl Stream {
         let began = Instant::now();
         let image = DecodedImage::read(path, self.config.max_pixels())?;
         let (width, height) = (image.width(), image.height());
-        if (width, height) != self.size && self.health.failed("image of another size") {
+        if (FrameSize { width, height }) != self.size && self.health.failed("image of another size")
+        {
             tracing::warn!(
                 ?path,
                 width,
@@ -371,7 +372,7 @@ impl Stream {
 }
 
 /// The format of a frame by the bits of its raw samples; images that are not raw are published in grey.
-fn pixel_format(raw_bits: Option<u32>, bayer: Option<Mosaic>) -> PixelFormat {
+fn pixel_format(raw_bits: Option<u32>, bayer: Option<imaging::BayerPattern>) -> PixelFormat {
     let pattern = bayer.map(BayerPattern::from);
     match (raw_bits, pattern) {
         (Some(9..), Some(pattern)) => PixelFormat::Bayer16(pattern),

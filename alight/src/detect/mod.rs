@@ -18,7 +18,7 @@ use fiducial::{
     Detector, MarkerPose, Observation, PadObservation, PoseSolution, Settings, Tracker,
 };
 use geometry::{CameraModel, Pixel};
-use imaging::{GrayImage, Mosaic};
+use imaging::{BayerPattern, GrayImage};
 use markers::{Marker, Pad};
 use media::read_calibration;
 use serde::Serialize;
@@ -54,7 +54,7 @@ pub(crate) struct DetectArgs {
     format: Format,
     /// The colours in front of the pixels of grey images that are a sensor's raw samples: RGGB, GRBG, GBRG or BGGR.
     #[arg(long, value_name = "PATTERN")]
-    bayer: Option<Mosaic>,
+    bayer: Option<BayerPattern>,
     /// Look first where the markers of the last images should be by now; one image after the other.
     #[arg(long, conflicts_with = "threads")]
     track: bool,
@@ -112,7 +112,7 @@ enum Lens {
 struct Examiner {
     markers: Vec<Marker>,
     pads: Vec<Pad>,
-    mosaic: Option<Mosaic>,
+    bayer: Option<BayerPattern>,
     lens: Lens,
     tracks: bool,
     gallery: Option<Gallery>,
@@ -136,7 +136,7 @@ impl Examiner {
         Ok(Self {
             markers,
             pads,
-            mosaic: args.bayer,
+            bayer: args.bayer,
             lens,
             tracks: args.track,
             gallery: args.draw.as_deref().map(Gallery::new).transpose()?,
@@ -154,7 +154,7 @@ impl Examiner {
         let error = |error: String| Line::Error { image: name.clone(), error };
         // A fault in one image must neither cost the others nor leave them waiting for its line.
         let examined = catch_unwind(AssertUnwindSafe(|| {
-            let image = item.into_image(self.mosaic)?;
+            let image = item.into_image(self.bayer)?;
             let found = self.detect(&image, &name, time_s, worker)?;
             Ok(Line::Image { image: name.clone(), time_s: is_frame.then_some(time_s), found })
         }));
@@ -744,7 +744,7 @@ mod tests {
         check(&["--marker", "rings", "--focal-px=-3", "a.png"], "above 0");
         check(&["--marker", "rings", "--focal-px=nan", "a.png"], "above 0");
         check(&["--marker", "rings", "--format", "xml", "a.png"], "jsonl");
-        check(&["--marker", "rings", "--bayer", "RGB", "a.png"], "there are RGGB");
+        check(&["--marker", "rings", "--bayer", "RGB", "a.png"], "it must be RGGB");
         check(&["--marker", "rings", "--track", "--threads", "2", "a.png"], "cannot be used with");
         let twice = examine(&["--marker", "rings", "--marker", "rings:1", "a.png"], Vec::new());
         assert!(twice.unwrap_err().to_string().contains("listed twice"));

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use imaging::{GrayImage, Mosaic};
+use imaging::{BayerPattern, GrayImage};
 use media::{
     DEFAULT_MAX_PIXELS, IMAGE_EXTENSIONS, VIDEO_EXTENSIONS, Video, VideoImage, files_in, is_video,
     read_image,
@@ -89,9 +89,9 @@ impl Item {
     }
 
     /// The picture in grey, or why there is none.
-    pub(super) fn into_image(self, mosaic: Option<Mosaic>) -> Result<GrayImage, String> {
+    pub(super) fn into_image(self, bayer: Option<BayerPattern>) -> Result<GrayImage, String> {
         let image = match self.content {
-            Content::File(path) => read_image(&path, DEFAULT_MAX_PIXELS, mosaic),
+            Content::File(path) => read_image(&path, DEFAULT_MAX_PIXELS, bayer),
             Content::Frame(path, image) => image.grey(&path, DEFAULT_MAX_PIXELS),
             Content::Nothing(problem) => return Err(problem),
         };

@@ -143,25 +143,19 @@ impl Roi {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{FrameHeader, PixelFormat};
+    use messages::FrameHeader;
 
     const MS: i64 = 1_000_000;
 
     fn detections(stamp_ms: i64, markers: &[(u32, [f64; 2], f64)]) -> Detections {
         let detections = markers.iter().map(|(id, centre_px, size_px)| Detection {
-            family: "aruco-4x4-50".into(),
             id: Some(*id),
             centre_px: *centre_px,
             size_px: *size_px,
-            pose: None,
             ..Detection::sample()
         });
         Detections {
-            header: FrameHeader {
-                stamp_ns: stamp_ms * MS,
-                format: PixelFormat::Jpeg,
-                ..FrameHeader::sample()
-            },
+            header: FrameHeader { stamp_ns: stamp_ms * MS, ..FrameHeader::sample() },
             detections: detections.collect(),
             ..Detections::sample()
         }

@@ -179,7 +179,7 @@ impl Work {
             }
             let (is_open, lost) = self.window.is_open(now_ns());
             for _ in 0..lost {
-                self.health.dropped("air link frames without a ack in time");
+                self.health.dropped("air link frames without an acknowledgement in time");
             }
             self.offers.is_wanted.store(is_open && self.has_subscribers, Ordering::Relaxed);
         }

@@ -1,4 +1,4 @@
-//! Conversion of raw images (more than 8 bits, Bayer mosaics) to 8-bit grey.
+//! Conversion of raw images (more than 8 bits, Bayer patterns) to 8-bit grey.
 
 use crate::view::{GrayImage, GrayView, ViewError};
 
@@ -7,13 +7,13 @@ use crate::view::{GrayImage, GrayView, ViewError};
 pub struct SampleFormat {
     /// Significant bits: up to 8 in one byte per pixel, up to 16 in two, the low byte first.
     pub bits: u32,
-    /// The colours in front of the pixels; `None` for a grey sensor.
-    pub mosaic: Option<Mosaic>,
+    /// The Bayer pattern; `None` for a grey sensor.
+    pub bayer: Option<BayerPattern>,
 }
 
-/// A Bayer mosaic, named by its first two rows of two pixels.
+/// A Bayer pattern, named by its first two rows of two pixels.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub enum Mosaic {
+pub enum BayerPattern {
     /// Red, green; green, blue.
     Rggb,
     /// Green, red; blue, green.
@@ -24,29 +24,29 @@ pub enum Mosaic {
     Bggr,
 }
 
-/// A text that is not the name of a mosaic.
+/// The error for an invalid name of a Bayer pattern.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct NoMosaic(String);
+pub struct UnknownBayerPattern(String);
 
-impl std::fmt::Display for NoMosaic {
+impl std::fmt::Display for UnknownBayerPattern {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "`{}` is no mosaic; there are RGGB, GRBG, GBRG and BGGR", self.0)
+        write!(f, "`{}` is not a Bayer pattern; it must be RGGB, GRBG, GBRG or BGGR", self.0)
     }
 }
 
-impl std::error::Error for NoMosaic {}
+impl std::error::Error for UnknownBayerPattern {}
 
-impl std::str::FromStr for Mosaic {
-    type Err = NoMosaic;
+impl std::str::FromStr for BayerPattern {
+    type Err = UnknownBayerPattern;
 
     /// Reads the colours of the first two rows of two pixels, as in `RGGB`.
-    fn from_str(text: &str) -> Result<Self, NoMosaic> {
+    fn from_str(text: &str) -> Result<Self, UnknownBayerPattern> {
         match text.to_ascii_uppercase().as_str() {
             "RGGB" => Ok(Self::Rggb),
             "GRBG" => Ok(Self::Grbg),
             "GBRG" => Ok(Self::Gbrg),
             "BGGR" => Ok(Self::Bggr),
-            _ => Err(NoMosaic(text.to_owned())),
+            _ => Err(UnknownBayerPattern(text.to_owned())),
         }
     }
 }
@@ -70,7 +70,7 @@ impl Converter {
     /// An image in 8-bit grey; the image itself when it is that already.
     ///
     /// More than 8 bits are scaled linearly, which leaves edges where they are, so that all levels but for
-    /// outliers fit. In a mosaic, missing green is interpolated along edges with the other colour's curvature
+    /// outliers fit. Behind a Bayer pattern, missing green is interpolated along edges with the other colour's curvature
     /// as a correction (Hamilton and Adams, US patent 5629734, expired); black and white stay sharp and
     /// colours make no pattern.
     ///
@@ -98,10 +98,10 @@ impl Converter {
         } else {
             plain
         };
-        match format.mosaic {
+        match format.bayer {
             None => Ok(view),
-            Some(mosaic) => {
-                demosaic(view, mosaic, &mut self.gray);
+            Some(pattern) => {
+                demosaic(view, pattern, &mut self.gray);
                 GrayView::packed(self.gray.pixels(), width, height)
             }
         }
@@ -149,14 +149,14 @@ impl Converter {
     }
 }
 
-/// The green channel at every pixel of a mosaic.
-fn demosaic(view: GrayView<'_>, mosaic: Mosaic, out: &mut GrayImage) {
+/// The green channel at every pixel of a Bayer image.
+fn demosaic(view: GrayView<'_>, pattern: BayerPattern, out: &mut GrayImage) {
     let (width, height) = (view.width(), view.height());
     out.resize(width, height);
     // The parity of the columns of green in the first row.
-    let green = match mosaic {
-        Mosaic::Rggb | Mosaic::Bggr => 1,
-        Mosaic::Grbg | Mosaic::Gbrg => 0,
+    let green = match pattern {
+        BayerPattern::Rggb | BayerPattern::Bggr => 1,
+        BayerPattern::Grbg | BayerPattern::Gbrg => 0,
     };
     let balance = balance(view, green);
     for y in 0..height {
@@ -264,7 +264,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const GREY: SampleFormat = SampleFormat { bits: 8, mosaic: None };
+    const GREY: SampleFormat = SampleFormat { bits: 8, bayer: None };
 
     fn wide(levels: &[u16]) -> Vec<u8> {
         levels.iter().flat_map(|level| level.to_le_bytes()).collect()
@@ -282,7 +282,7 @@ mod tests {
     fn more_bits_are_scaled_to_the_range_they_use() {
         let mut converter = Converter::default();
         let mut scaled = |levels: &[u16], bits| {
-            let format = SampleFormat { bits, mosaic: None };
+            let format = SampleFormat { bits, bayer: None };
             converter.convert(&wide(levels), levels.len(), 1, format).unwrap().row(0).to_vec()
         };
         assert_eq!(scaled(&[0, 2048, 4095], 12), [0, 128, 255]);
@@ -298,7 +298,7 @@ mod tests {
         let mut levels = vec![400_u16; 100_000];
         levels[50_000..].fill(800);
         (levels[7], levels[99_999]) = (4095, 0);
-        let format = SampleFormat { bits: 12, mosaic: None };
+        let format = SampleFormat { bits: 12, bayer: None };
         let mut converter = Converter::default();
         let data = wide(&levels);
         let view = converter.convert(&data, 1000, 100, format).unwrap();
@@ -306,15 +306,15 @@ mod tests {
     }
 
     #[test]
-    fn mosaics_are_read_by_their_colours() {
-        assert_eq!("rggb".parse(), Ok(Mosaic::Rggb));
-        assert!("RGB".parse::<Mosaic>().unwrap_err().to_string().contains("BGGR"));
+    fn bayer_patterns_are_named_by_their_colours() {
+        assert_eq!("rggb".parse(), Ok(BayerPattern::Rggb));
+        assert!("RGB".parse::<BayerPattern>().unwrap_err().to_string().contains("BGGR"));
     }
 
     #[test]
     fn wrong_sizes_are_refused() {
         let mut converter = Converter::default();
-        let bits12 = SampleFormat { bits: 12, mosaic: Some(Mosaic::Rggb) };
+        let bits12 = SampleFormat { bits: 12, bayer: Some(BayerPattern::Rggb) };
         for (len, width, height, format) in
             [(0, 0, 0, GREY), (3, 2, 1, bits12), (9, usize::MAX, 3, bits12), (5, 2, 3, GREY)]
         {
@@ -322,19 +322,19 @@ mod tests {
         }
     }
 
-    /// A slanted black edge on white paper through a mosaic whose red is half, and whose blue a third as
+    /// A slanted black edge on white paper through a Bayer pattern whose red is half, and whose blue a third as
     /// bright.
     fn slanted(x: usize, y: usize) -> f64 {
         let distance = (x as f64 - 20.0) * 0.94 + (y as f64 - 16.0) * 0.34;
         20.0 + 200.0 / (1.0 + (-2.5 * distance).exp())
     }
 
-    fn colour_gain(mosaic: Mosaic, x: usize, y: usize) -> f64 {
-        let names = match mosaic {
-            Mosaic::Rggb => "RGGB",
-            Mosaic::Grbg => "GRBG",
-            Mosaic::Gbrg => "GBRG",
-            Mosaic::Bggr => "BGGR",
+    fn colour_gain(pattern: BayerPattern, x: usize, y: usize) -> f64 {
+        let names = match pattern {
+            BayerPattern::Rggb => "RGGB",
+            BayerPattern::Grbg => "GRBG",
+            BayerPattern::Gbrg => "GBRG",
+            BayerPattern::Bggr => "BGGR",
         };
         match names.as_bytes()[y % 2 * 2 + x % 2] {
             b'G' => 1.0,
@@ -344,21 +344,23 @@ mod tests {
     }
 
     #[test]
-    fn edges_stay_as_sharp_as_they_were_behind_every_mosaic() {
-        for mosaic in [Mosaic::Rggb, Mosaic::Grbg, Mosaic::Gbrg, Mosaic::Bggr] {
+    fn edges_stay_as_sharp_as_they_were_behind_every_bayer_pattern() {
+        for pattern in
+            [BayerPattern::Rggb, BayerPattern::Grbg, BayerPattern::Gbrg, BayerPattern::Bggr]
+        {
             let (width, height) = (41, 33);
             let data: Vec<u8> = (0..width * height)
                 .map(|i| (i % width, i / width))
-                .map(|(x, y)| (slanted(x, y) * colour_gain(mosaic, x, y)).round() as u8)
+                .map(|(x, y)| (slanted(x, y) * colour_gain(pattern, x, y)).round() as u8)
                 .collect();
             let mut converter = Converter::default();
-            let format = SampleFormat { bits: 8, mosaic: Some(mosaic) };
+            let format = SampleFormat { bits: 8, bayer: Some(pattern) };
             let view = converter.convert(&data, width, height, format).unwrap();
             let error = |x: usize, y: usize| f64::from(view.at(x, y)) - slanted(x, y);
             let errors = (0..width * height).map(|i| error(i % width, i / width));
             let squares: f64 = errors.map(|e| e * e).sum();
             let rms = (squares / (width * height) as f64).sqrt();
-            assert!(rms < 3.5, "{mosaic:?}: {rms}");
+            assert!(rms < 3.5, "{pattern:?}: {rms}");
         }
     }
 
@@ -368,8 +370,8 @@ mod tests {
             width in 0_usize..9, height in 0_usize..9, bits in 0_u32..20,
             data in prop::collection::vec(any::<u8>(), 0..200), pattern in 0_usize..5,
         ) {
-            let patterns = [Mosaic::Rggb, Mosaic::Grbg, Mosaic::Gbrg, Mosaic::Bggr];
-            let format = SampleFormat { bits, mosaic: patterns.get(pattern).copied() };
+            let patterns = [BayerPattern::Rggb, BayerPattern::Grbg, BayerPattern::Gbrg, BayerPattern::Bggr];
+            let format = SampleFormat { bits, bayer: patterns.get(pattern).copied() };
             let mut converter = Converter::default();
             if let Ok(view) = converter.convert(&data, width, height, format) {
                 prop_assert_eq!((view.width(), view.height()), (width, height));

@@ -23,7 +23,7 @@ pub mod view;
 
 pub use binary::{Binarizer, BitImage, Contrast, Middle};
 pub use contour::{Contour, Contours, Limits, contour_area};
-pub use convert::{Converter, Mosaic, SampleFormat};
+pub use convert::{BayerPattern, Converter, SampleFormat};
 pub use ellipse::{Axes, Ellipse, fit_ellipse};
 pub use filter::{BilateralRows, bilateral_5x5};
 pub use outline::{Outline, Outlines};

@@ -4,7 +4,7 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use ::image::{ColorType, DynamicImage, ImageDecoder, ImageReader, Limits};
-use imaging::{Converter, GrayImage, GrayView, Mosaic, SampleFormat};
+use imaging::{BayerPattern, Converter, GrayImage, GrayView, SampleFormat};
 
 use crate::jpeg::{is_jpeg, jpeg_len};
 
@@ -166,7 +166,7 @@ pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
 pub fn read_image(
     path: &Path,
     max_pixels: u64,
-    bayer: Option<Mosaic>,
+    bayer: Option<BayerPattern>,
 ) -> Result<GrayImage, ImageError> {
     let decoded = DecodedImage::read(path, max_pixels)?;
     if bayer.is_some() && decoded.raw_bits().is_none() {
@@ -246,14 +246,14 @@ impl DecodedImage {
     }
 
     /// The image in 8-bit grey.
-    pub fn grey(&self, bayer: Option<Mosaic>) -> GrayImage {
+    pub fn grey(&self, bayer: Option<BayerPattern>) -> GrayImage {
         let (width, height) = (self.width(), self.height());
         let black = || GrayImage::filled(width, height, 0);
         match self.raw_bits() {
             Some(bits) if bits > 8 || bayer.is_some() => {
                 let mut samples = vec![0; width * height * bits.div_ceil(8) as usize];
                 self.write_samples(&mut samples);
-                let format = SampleFormat { bits, mosaic: bayer };
+                let format = SampleFormat { bits, bayer };
                 // A decoded image has a valid size.
                 samples_to_grey(&samples, width, height, format).unwrap_or_else(black)
             }
@@ -455,10 +455,10 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let read = |image: DynamicImage| {
             std::fs::write(file.path(), bytes_of(&image, ImageFormat::Png)).unwrap();
-            read_image(file.path(), 1000, Some(Mosaic::Rggb)).map_err(|e| e.to_string())
+            read_image(file.path(), 1000, Some(BayerPattern::Rggb)).map_err(|e| e.to_string())
         };
-        let mosaic = |x: u32, y: u32| [[60_u8, 120], [120, 40]][y as usize % 2][x as usize % 2];
-        let grey = read(ImageBuffer::from_fn(8, 6, |x, y| Luma([mosaic(x, y)])).into()).unwrap();
+        let samples = |x: u32, y: u32| [[60_u8, 120], [120, 40]][y as usize % 2][x as usize % 2];
+        let grey = read(ImageBuffer::from_fn(8, 6, |x, y| Luma([samples(x, y)])).into()).unwrap();
         assert!(grey.pixels().iter().all(|pixel| *pixel == 120));
         let problem = read(ImageBuffer::from_pixel(8, 6, Rgb([1_u8, 2, 3])).into()).unwrap_err();
         assert!(problem.contains("is a colour image"), "{problem}");

@@ -470,7 +470,7 @@ impl H264 {
             frames.extend(self.decoder.flush());
         }
         for frame in frames {
-            let bits = SampleFormat { bits: u32::from(frame.bit_depth), mosaic: None };
+            let bits = SampleFormat { bits: u32::from(frame.bit_depth), bayer: None };
             let (width, height) = (frame.width as usize, frame.height as usize);
             let mut converter = Converter::default();
             let view = converter

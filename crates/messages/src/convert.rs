@@ -1,7 +1,7 @@
 //! Between wire types and the types of `geometry` and `imaging`.
 
 use geometry::{Body, Camera, CameraModel, Distortion, Frame, Point, Rotation, Transform};
-use imaging::{Mosaic, SampleFormat};
+use imaging::SampleFormat;
 use nalgebra::{Matrix3, Matrix6};
 
 use crate::camera::{BayerPattern, CameraInfo, LensModel, PixelFormat, Transform3};
@@ -82,18 +82,19 @@ impl CameraInfo {
     }
 }
 
-impl From<Mosaic> for BayerPattern {
-    fn from(mosaic: Mosaic) -> Self {
-        match mosaic {
-            Mosaic::Rggb => Self::Rggb,
-            Mosaic::Grbg => Self::Grbg,
-            Mosaic::Gbrg => Self::Gbrg,
-            Mosaic::Bggr => Self::Bggr,
+impl From<imaging::BayerPattern> for BayerPattern {
+    fn from(pattern: imaging::BayerPattern) -> Self {
+        use imaging::BayerPattern as Raw;
+        match pattern {
+            Raw::Rggb => Self::Rggb,
+            Raw::Grbg => Self::Grbg,
+            Raw::Gbrg => Self::Gbrg,
+            Raw::Bggr => Self::Bggr,
         }
     }
 }
 
-impl From<BayerPattern> for Mosaic {
+impl From<BayerPattern> for imaging::BayerPattern {
     fn from(pattern: BayerPattern) -> Self {
         match pattern {
             BayerPattern::Rggb => Self::Rggb,
@@ -118,7 +119,7 @@ impl PixelFormat {
             Self::Bayer12(pattern) => (12, Some(pattern)),
             Self::Bayer16(pattern) => (16, Some(pattern)),
         };
-        Some(SampleFormat { bits, mosaic: pattern.map(Mosaic::from) })
+        Some(SampleFormat { bits, bayer: pattern.map(imaging::BayerPattern::from) })
     }
 }
 
@@ -178,8 +179,9 @@ mod tests {
 
     #[test]
     fn every_pattern_and_lens_is_read_back() {
-        for mosaic in [Mosaic::Rggb, Mosaic::Grbg, Mosaic::Gbrg, Mosaic::Bggr] {
-            assert_eq!(Mosaic::from(BayerPattern::from(mosaic)), mosaic);
+        use BayerPattern::{Bggr, Gbrg, Grbg, Rggb};
+        for pattern in [Rggb, Grbg, Gbrg, Bggr] {
+            assert_eq!(BayerPattern::from(imaging::BayerPattern::from(pattern)), pattern);
         }
         let lens = LensModel::BrownConrady([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]);
         assert_eq!(LensModel::from(Distortion::from(lens)), lens);
