@@ -13,19 +13,44 @@ use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use messages::{ControllerCommand, DetectorCommand, Phase, topic};
+use node::now_ns;
 use rustix::process::{Pid, Signal, kill_process};
 use testing::{ports, python, python_passes};
 
 use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, descent_m_s, output_of, seconds, speed_m_s};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn it_lands_and_says_how_well_and_losing_the_ground_station_changes_nothing()
--> anyhow::Result<()> {
+async fn it_lands_with_other_programs_watching_and_without_the_ground_station() -> anyhow::Result<()>
+{
     let _alone = ONE_AT_A_TIME.lock().await;
-    let landing = Landing::start(&["--seed", "2"]).await?;
+    let ([], _, ground) = ports::free()?;
+    let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{ground}");
+    let connect = ["--connect", &format!("udpin:127.0.0.1:{ground}")];
+    let station = python("tests/gcs/ground_station.py", &connect);
+    let landing = Landing::start(&["--seed", "2", "--set", &address]).await?;
+    landing.descends_below(9.0).await?;
+    // It waits up there for the other programs, which take their time.
+    command(&landing, ControllerCommand::Hold).await?;
+    let port = std::fs::read_to_string(&landing.zenoh)?
+        .split("connect: {")
+        .nth(1)
+        .and_then(|rest| rest.split("127.0.0.1:").nth(1)?.split('"').next().map(str::to_owned))
+        .context("the meeting point's port")?;
+    let client = python("tests/zenoh_client.py", &[&format!("tcp/127.0.0.1:{port}")]);
+    if let Some(client) = client {
+        tokio::task::block_in_place(|| python_passes(&client.wait_with_output()?))?;
+    }
+    if let Some(station) = station {
+        tokio::task::block_in_place(|| python_passes(&station.wait_with_output()?))?;
+    }
+    command(&landing, ControllerCommand::Resume).await?;
     landing.descends_below(8.0).await?;
     landing.kill("gcs-bridge")?;
-    let result = landing.lands().await?;
+    says_how_well(&landing.lands().await?)
+}
+
+/// The result of a landing has all that it should tell.
+fn says_how_well(result: &serde_json::Value) -> anyhow::Result<()> {
     for key in [
         "time_to_disarm_s",
         "time_to_touchdown_s",
@@ -48,11 +73,44 @@ async fn it_lands_and_says_how_well_and_losing_the_ground_station_changes_nothin
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_detector_it_stops_descending_and_lands_with_the_next_one() -> anyhow::Result<()>
+async fn without_controller_or_detector_it_stops_and_lands_with_the_next_one() -> anyhow::Result<()>
 {
     let _alone = ONE_AT_A_TIME.lock().await;
-    let mut landing = Landing::start(&["--seed", "3"]).await?;
-    landing.descends_below(7.0).await?;
+    // Slowly: the autopilot goes on with the last setpoint for three seconds, and this process may be late as well.
+    let slowly = "controller.metric.max_descend_m_s=0.8";
+    let mut landing = Landing::start(&["--seed", "4", "--set", slowly]).await?;
+    landing.descends_below(9.0).await?;
+    without_a_controller_the_autopilot_stops_it(&landing).await?;
+    landing.start_by_hand("controller", &["metric.max_descend_m_s=0.8"])?;
+    landing.descends_below(6.0).await?;
+    without_a_detector_it_stops_descending(&landing).await?;
+    landing.start_by_hand("detector", &["id=second"])?;
+    landing
+        .status("the second detector is used", |s| {
+            s.active_detector.as_deref() == Some("second") && s.phase == Phase::Descend
+        })
+        .await?;
+    landing.lands().await?;
+    Ok(())
+}
+
+async fn without_a_controller_the_autopilot_stops_it(landing: &Landing) -> anyhow::Result<()> {
+    let killed_ns = landing.kill("controller")?;
+    let stopped = landing
+        .truth("the autopilot has stopped it", |t| {
+            seconds(t.stamp_ns - killed_ns) > 3.0 && speed_m_s(t) < 0.15
+        })
+        .await?;
+    println!(
+        "stopped after {:.1} s at {:.1} m",
+        seconds(stopped.stamp_ns - killed_ns),
+        -stopped.position_ned_m[2]
+    );
+    ensure!(!stopped.on_ground, "it came down without a controller");
+    Ok(())
+}
+
+async fn without_a_detector_it_stops_descending(landing: &Landing) -> anyhow::Result<()> {
     let killed_ns = landing.kill("detector")?;
     // The status is published five times a second, and the news of the end takes its way.
     let mut descending = 0;
@@ -77,53 +135,48 @@ async fn without_a_detector_it_stops_descending_and_lands_with_the_next_one() ->
     let motion = landing.motion(Duration::from_secs(2)).await;
     let fastest = motion.iter().map(speed_m_s).fold(0.0, f64::max);
     ensure!(!motion.is_empty() && fastest < 0.25, "it moves at {fastest:.2} m/s while it holds");
-    landing.start_by_hand("detector", &["id=second"])?;
-    landing
-        .status("the second detector is used", |s| {
-            s.active_detector.as_deref() == Some("second") && s.phase == Phase::Descend
-        })
-        .await?;
-    landing.lands().await?;
     Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_controller_the_autopilot_stops_it_and_the_next_one_lands() -> anyhow::Result<()>
+async fn of_two_detectors_the_chosen_one_is_active_and_the_other_takes_over() -> anyhow::Result<()>
 {
     let _alone = ONE_AT_A_TIME.lock().await;
-    // Slowly: the autopilot goes on with the last setpoint for three seconds, and this process may be late as well.
-    let slowly = "controller.metric.max_descend_m_s=0.8";
-    let mut landing = Landing::start(&["--seed", "4", "--set", slowly]).await?;
-    landing.descends_below(9.0).await?;
-    let killed_ns = landing.kill("controller")?;
-    let stopped = landing
-        .truth("the autopilot has stopped it", |t| {
-            seconds(t.stamp_ns - killed_ns) > 3.0 && speed_m_s(t) < 0.15
-        })
-        .await?;
-    println!(
-        "stopped after {:.1} s at {:.1} m",
-        seconds(stopped.stamp_ns - killed_ns),
-        -stopped.position_ned_m[2]
-    );
-    ensure!(!stopped.on_ground, "it came down without a controller");
-    landing.start_by_hand("controller", &[])?;
-    landing.lands().await?;
-    Ok(())
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn of_two_detectors_one_is_active_and_the_other_takes_over() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
     let mut landing = Landing::start(&["--seed", "5"]).await?;
-    landing.status("the first detector is active", |s| s.active_detector.is_some()).await?;
+    landing.status("a detector is active", |s| s.active_detector.is_some()).await?;
     landing.start_by_hand("detector", &["id=spare"])?;
     let both = landing
         .status("both are named", |s| s.candidates.iter().filter(|c| c.alive).count() == 2)
         .await?;
     ensure!(both.active_detector.as_deref() == Some("main"), "{both:?}");
+    the_operators_choice_is_followed(&landing).await?;
+    // The landing goes on without the one that it was begun with, be it before the take-off.
+    let stopped =
+        landing.node.command(topic::DETECTOR_COMMAND, &["main"], &DetectorCommand::Stop).await?;
+    ensure!(stopped.accepted, "{stopped:?}");
+    landing
+        .status("the first one is gone", |s| {
+            s.candidates.iter().all(|c| c.detector != "main" || !c.alive)
+        })
+        .await?;
+    let third = landing.start_by_hand("detector", &["id=third"])?;
+    landing
+        .status("the third one is there", |s| {
+            s.candidates.iter().any(|c| c.detector == "third" && c.alive)
+        })
+        .await?;
+    // Hold and resume on the way down.
+    landing.descends_below(9.0).await?;
+    command(&landing, ControllerCommand::Hold).await?;
+    landing.status("it holds", |s| s.phase == Phase::Hold).await?;
+    command(&landing, ControllerCommand::UseDetector("third".into())).await?;
+    landing
+        .status("the third one is active", |s| s.active_detector.as_deref() == Some("third"))
+        .await?;
+    command(&landing, ControllerCommand::Resume).await?;
     landing.descends_below(8.0).await?;
-    let killed_ns = landing.kill("detector")?;
+    kill_process(third, Signal::KILL)?;
+    let killed_ns = now_ns();
     let mut without = 0;
     let handed_over = landing
         .status("the spare one is active", |s| {
@@ -140,18 +193,9 @@ async fn of_two_detectors_one_is_active_and_the_other_takes_over() -> anyhow::Re
     Ok(())
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn the_operators_choice_of_detector_is_followed_and_a_wrong_one_refused() -> anyhow::Result<()>
-{
-    let _alone = ONE_AT_A_TIME.lock().await;
-    let mut landing = Landing::start(&["--seed", "6"]).await?;
-    landing.status("a detector is active", |s| s.active_detector.is_some()).await?;
-    landing.start_by_hand("detector", &["id=spare"])?;
-    landing.status("both are named", |s| s.candidates.len() == 2).await?;
-    let refused = landing
-        .node
-        .command(topic::COMMAND, &[], &ControllerCommand::UseDetector("nobody".into()))
-        .await?;
+async fn the_operators_choice_is_followed(landing: &Landing) -> anyhow::Result<()> {
+    let nobody = ControllerCommand::UseDetector("nobody".into());
+    let refused = landing.node.command(topic::COMMAND, &[], &nobody).await?;
     ensure!(!refused.accepted && refused.reason.contains("main"), "{refused:?}");
     let output = output_of(
         Command::new(ALIGHT)
@@ -162,18 +206,12 @@ async fn the_operators_choice_of_detector_is_followed_and_a_wrong_one_refused() 
     landing
         .status("the spare one is active", |s| s.active_detector.as_deref() == Some("spare"))
         .await?;
-    // The landing goes on without the one that it was begun with, be it before the take-off.
-    let stopped =
-        landing.node.command(topic::DETECTOR_COMMAND, &["main"], &DetectorCommand::Stop).await?;
-    ensure!(stopped.accepted, "{stopped:?}");
-    // Hold and resume on the way down.
-    landing.descends_below(9.0).await?;
-    let hold = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Hold).await?;
-    ensure!(hold.accepted, "{hold:?}");
-    landing.status("it holds", |s| s.phase == Phase::Hold).await?;
-    let resume = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Resume).await?;
-    ensure!(resume.accepted, "{resume:?}");
-    landing.lands().await?;
+    Ok(())
+}
+
+async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Result<()> {
+    let reply = landing.node.command(topic::COMMAND, &[], &command).await?;
+    ensure!(reply.accepted, "{reply:?}");
     Ok(())
 }
 
@@ -261,30 +299,5 @@ fn wrong_settings_stop_the_start_with_file_key_value_and_limit() -> anyhow::Resu
     check(&["land", "--autopilot", "usb"], &["usb"])?;
     check(&["config", "detector", "--set", "camera=a/b"], &["camera", "letters, digits"])?;
     check(&["fly"], &["fly"])?;
-    Ok(())
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn programs_of_others_see_the_services_the_frames_and_the_vehicle() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
-    let ([], _, ground) = ports::free()?;
-    let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{ground}");
-    let connect = ["--connect", &format!("udpin:127.0.0.1:{ground}")];
-    let station = python("tests/gcs/ground_station.py", &connect);
-    let landing = Landing::start(&["--seed", "8", "--set", &address]).await?;
-    landing.status("a detector is active", |s| s.active_detector.is_some()).await?;
-    let port = std::fs::read_to_string(&landing.zenoh)?
-        .split("connect: {")
-        .nth(1)
-        .and_then(|rest| rest.split("127.0.0.1:").nth(1)?.split('"').next().map(str::to_owned))
-        .context("the meeting point's port")?;
-    let client = python("tests/zenoh_client.py", &[&format!("tcp/127.0.0.1:{port}")]);
-    if let Some(client) = client {
-        tokio::task::block_in_place(|| python_passes(&client.wait_with_output()?))?;
-    }
-    landing.lands().await?;
-    if let Some(station) = station {
-        tokio::task::block_in_place(|| python_passes(&station.wait_with_output()?))?;
-    }
     Ok(())
 }

@@ -1,6 +1,5 @@
 //! Detectors that come, go, are swapped and die in flight; and one that is written in Python.
-//!
-//! The long version is ignored: `ALIGHT_SWAPS=100 cargo test --release -p tests --test swap -- --ignored --nocapture`.
+//! `measure.rs` swaps them more often.
 
 #![expect(
     clippy::print_stdout,
@@ -8,47 +7,21 @@
 )]
 
 mod flight;
+mod swaps;
 
-use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use messages::{
-    ControllerCommand, Detections, DetectorCommand, DetectorState, Health, TargetEstimate, topic,
+    ControllerCommand, Detections, DetectorCommand, DetectorState, TargetEstimate, topic,
 };
-use node::{Identity, Node, Subscriber, ZenohSource, now_ns};
-use rustix::process::{Pid, Signal, kill_process};
+use node::{Identity, Node, Subscriber, ZenohSource};
 use testing::{python, python_passes};
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, PATIENCE, output_of, seconds};
-
-/// Ends processes that outlive those who started them.
-#[derive(Default)]
-struct Outliving(Vec<Pid>);
-
-impl Drop for Outliving {
-    fn drop(&mut self) {
-        for pid in &self.0 {
-            // Those that were swapped away have ended.
-            let _ = kill_process(*pid, Signal::KILL);
-        }
-    }
-}
-
-/// `alight swap --to TO`; its report, and whether its exit status is 0.
-fn swap(landing: &Landing, to: &str) -> anyhow::Result<(bool, serde_json::Value)> {
-    let output = output_of(
-        Command::new(ALIGHT)
-            .args(["swap", "--format", "json", "--to", to, "--zenoh"])
-            .arg(&landing.zenoh),
-    )?;
-    let said = String::from_utf8_lossy(&output.stdout);
-    let report = said.lines().last().with_context(|| format!("no report: {output:?}"))?;
-    Ok((output.status.success(), serde_json::from_str(report)?))
-}
+use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, PATIENCE, output_of};
+use crate::swaps::command;
 
 fn detectors(landing: &Landing, args: &[&str]) -> anyhow::Result<String> {
     let output = output_of(
@@ -57,280 +30,9 @@ fn detectors(landing: &Landing, args: &[&str]) -> anyhow::Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// The latest health, and the next second's if that is none of now.
-async fn latest(healths: &Subscriber<Health>) -> anyhow::Result<Health> {
-    let mut last = None;
-    while let Ok(Some(health)) = timeout(PATIENCE, healths.next()).await {
-        let is_fresh = seconds(now_ns() - health.stamp_ns) < 0.5;
-        last = Some(health);
-        if is_fresh {
-            break;
-        }
-    }
-    last.context("no health of the controller")
-}
-
-async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Result<()> {
-    let reply = landing.node.command(topic::COMMAND, &[], &command).await?;
-    ensure!(reply.accepted, "{reply:?}");
-    Ok(())
-}
-
-/// A pad of two families: rings in its middle, an AprilTag beside them.
-const RINGS: &str = "[[markers]]\nmarker = \"rings:0.15341\"\n";
-const TAG: &str = "[[markers]]\nmarker = \"apriltag-36h11:3:0.12\"\nx_m = 0.17\n";
-
-/// The pad as it lies there, and four detectors of it as files: two families, each in two versions.
-fn pad_and_detectors(directory: &Path) -> anyhow::Result<(PathBuf, Vec<PathBuf>)> {
-    let write = |name: &str, text: String| -> anyhow::Result<PathBuf> {
-        let file = directory.join(name);
-        std::fs::write(&file, text)?;
-        Ok(file)
-    };
-    let pad = write("pad.toml", format!("id = 5\n{RINGS}{TAG}"))?;
-    let mut detectors = Vec::new();
-    for (version, settings) in
-        [("a", "[tracking]\nenabled = true\n"), ("b", "least_confidence = 0.05\n")]
-    {
-        for (family, marker) in [("rings", RINGS), ("tag", TAG)] {
-            let part = write(&format!("{family}.toml"), format!("id = 5\n{marker}"))?;
-            let part = toml_text(&part)?;
-            detectors.push(write(
-                &format!("{family}-{version}.toml"),
-                format!("id = \"{family}-{version}\"\nmarkers = []\npads = [{part}]\n{settings}"),
-            )?);
-        }
-    }
-    Ok((pad, detectors))
-}
-
-fn toml_text(path: &Path) -> anyhow::Result<String> {
-    Ok(format!("'{}'", path.to_str().context("a path")?))
-}
-
-const TICKS: &str = "ticks";
-const STALE: &str = "ticks without a fresh frame";
-const MISSED: &str = "ticks without a fresh frame although there was one";
-/// Age from which on a frame is not fresh: the controller's `detectors.max_age_s`.
-const FRESH_NS: i64 = 200_000_000;
-
-/// Ticks of a controller: all, those without a fresh frame, and of these those although there was one.
-#[derive(Clone, Copy, Default)]
-struct Ticks([u64; 3]);
-
-impl Ticks {
-    async fn now(healths: &Subscriber<Health>) -> anyhow::Result<Self> {
-        let mut ticks = [0; 3];
-        let rates = latest(healths).await?.rates;
-        for (count, name) in ticks.iter_mut().zip([TICKS, STALE, MISSED]) {
-            *count = rates.iter().find(|rate| rate.name == name).map_or(0, |rate| rate.count);
-        }
-        Ok(Self(ticks))
-    }
-
-    fn add_since(&mut self, before: Self, after: Self) {
-        for (sum, (after, before)) in self.0.iter_mut().zip(after.0.into_iter().zip(before.0)) {
-            *sum += after - before;
-        }
-    }
-}
-
-impl std::fmt::Display for Ticks {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self([all, stale, missed]) = self;
-        write!(
-            f,
-            "{all} ticks, {stale} without a fresh frame, {missed} of them although there was one"
-        )
-    }
-}
-
-/// What was heard of any detector: when, and of which frame.
-#[derive(Clone, Copy)]
-struct Heard {
-    at_ns: i64,
-    stamp_ns: i64,
-    sequence: u64,
-}
-
-/// Notes all detections from now on.
-async fn listen(node: &Node) -> anyhow::Result<Arc<Mutex<Vec<Heard>>>> {
-    let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
-    let heard = Arc::new(Mutex::new(Vec::new()));
-    let noted = Arc::clone(&heard);
-    tokio::spawn(async move {
-        while let Some(message) = detections.next().await {
-            let Detections { header, .. } = message;
-            let heard =
-                Heard { at_ns: now_ns(), stamp_ns: header.stamp_ns, sequence: header.sequence };
-            noted.lock().unwrap_or_else(PoisonError::into_inner).push(heard);
-        }
-    });
-    Ok(heard)
-}
-
-/// The times in which no detector had told of a fresh frame, each with its length in ms and its cause.
-fn droughts(heard: &[Heard]) -> Vec<(i64, f64, String)> {
-    let mut droughts = Vec::new();
-    let Some(mut newest) = heard.first().copied() else { return droughts };
-    for next in heard {
-        if next.stamp_ns <= newest.stamp_ns {
-            continue;
-        }
-        let over_ns = next.at_ns - newest.stamp_ns - FRESH_NS;
-        if over_ns > 0 {
-            let ms = |ns: i64| ns as f64 * 1e-6;
-            let cause = format!(
-                "{:.0} ms and {} frames after the last one, heard {:.0} ms later",
-                ms(next.stamp_ns - newest.stamp_ns),
-                next.sequence - newest.sequence,
-                ms(next.at_ns - next.stamp_ns),
-            );
-            droughts.push((next.at_ns, ms(over_ns), cause));
-        }
-        newest = *next;
-    }
-    droughts
-}
-
-/// Holds over the pad, swaps detectors of two families again and again, and lands. Between the swaps, for a third as long,
-/// the same hold without them.
-async fn swaps(number: usize) -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
-    let directory = tempfile::tempdir()?;
-    let (pad, detectors) = pad_and_detectors(directory.path())?;
-    let mut outliving = Outliving::default();
-    let long = [
-        "--timeout-s",
-        "3000",
-        "--set",
-        "controller.phases.operator_hold_timeout_s=3600",
-        "--set",
-        "controller.phases.landing_timeout_s=3000",
-        // Slowly, as the last swap comes on the way down: the tag is in view down to 0.7 m.
-        "--set",
-        "controller.metric.max_descend_m_s=0.3",
-        "--pad",
-        pad.to_str().context("a path")?,
-    ];
-    let landing = Landing::start(&[&["--seed", "21"], &long[..]].concat()).await?;
-    let healths = landing.node.subscriber(topic::HEALTH, &["controller", "main"]).await?;
-    let heard = listen(&landing.node).await?;
-    landing.descends_below(8.0).await?;
-    command(&landing, ControllerCommand::Hold).await?;
-    landing.status("it holds", |s| s.phase == messages::Phase::Hold).await?;
-    let mut used = "main".to_owned();
-    let mut took_s = Vec::new();
-    let (mut with, mut without) = (Ticks::default(), Ticks::default());
-    let mut marks = Vec::new();
-    for i in 0..number {
-        if i + 1 == number {
-            command(&landing, ControllerCommand::Resume).await?;
-        }
-        let before = Ticks::now(&healths).await?;
-        let began_ns = now_ns();
-        let file = detectors[i % detectors.len()].to_str().context("a path")?;
-        let (mut is_done, mut report) = tokio::task::block_in_place(|| swap(&landing, file))?;
-        for _ in 0..2 {
-            if is_done {
-                break;
-            }
-            // Where the machine is too busy for the frames to be fresh, the old one stays, as it should.
-            println!("swap {i}: {report}");
-            (is_done, report) = tokio::task::block_in_place(|| swap(&landing, file))?;
-        }
-        outliving.0.extend(report["pid"].as_i64().and_then(|pid| Pid::from_raw(pid as i32)));
-        ensure!(is_done && report["swapped"] == true, "swap {i}: {report}");
-        ensure!(report["from"] == used.as_str() && report["old_stopped"] == true, "{report}");
-        used = report["to"].as_str().context("a name")?.to_owned();
-        let at = |key: &str| report[key].as_f64().unwrap_or_default();
-        let ended_s = seconds(now_ns() - began_ns);
-        // The program itself starts first, and the last thing it does is to wait for the end of the old one.
-        marks.push((began_ns, [at("ready_s"), at("agreed_s"), at("active_s")], ended_s));
-        took_s.push(at("active_s"));
-        let after = Ticks::now(&healths).await?;
-        with.add_since(before, after);
-        if i + 1 < number {
-            sleep(Duration::from_secs_f64(0.3 * ended_s)).await;
-            without.add_since(after, Ticks::now(&healths).await?);
-        }
-        if i % 25 == 24 {
-            println!("{} swaps; with them {with}; beside them {without}", i + 1);
-        }
-    }
-    took_s.sort_by(f64::total_cmp);
-    println!(
-        "{number} swaps, in use after {:.1} s each; with them {with}; beside them {without}",
-        took_s.get(took_s.len() / 2).copied().unwrap_or_default(),
-    );
-    let heard = heard.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    for (at_ns, over_ms, cause) in droughts(&heard) {
-        let swap = marks.iter().find(|(began_ns, _, ended_s)| {
-            (0.0..*ended_s + 0.2).contains(&seconds(at_ns - began_ns))
-        });
-        let when = swap.map_or("beside the swaps".to_owned(), |(began_ns, at_s, _)| {
-            format!("{:.2} s into a swap {at_s:.2?}", seconds(at_ns - began_ns))
-        });
-        println!("no fresh frame for {over_ms:.0} ms {when}: the next was taken {cause}");
-    }
-    // A hand-over with a gap would miss a tenth of a swap's ticks; a machine that is late misses single ones.
-    let Ticks([all, _, missed]) = with;
-    ensure!(100 * missed <= all, "{missed} of {all} ticks missed a frame that was there");
-    let result = landing.lands().await?;
-    println!("{result}");
-    Ok(())
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn detectors_are_swapped_in_flight_without_a_gap() -> anyhow::Result<()> {
-    swaps(3).await
-}
-
-#[tokio::test(flavor = "multi_thread")]
-#[ignore = "takes ten minutes"]
-async fn detectors_are_swapped_a_hundred_times() -> anyhow::Result<()> {
-    let number = std::env::var("ALIGHT_SWAPS").ok().and_then(|text| text.parse().ok());
-    swaps(number.unwrap_or(100)).await
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_swap_that_fails_keeps_the_old_one_and_says_why() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
-    let landing = Landing::start(&["--seed", "22"]).await?;
-    landing.descends_below(9.0).await?;
-    command(&landing, ControllerCommand::Hold).await?;
-    let zenoh = landing.zenoh.display();
-    let blind = format!(
-        "'{ALIGHT}' detector --set id=blind --set 'markers=[\"apriltag-36h11:5:0.2\"]' --zenoh '{zenoh}'"
-    );
-    for (to, parts) in [
-        (blind.as_str(), &["main stays in use", "agrees in 0 of", "does not see the marker"][..]),
-        ("false", &["main stays in use", "the new detector ended"]),
-        ("no-such-program --x", &["no-such-program"]),
-        ("detector 'x", &["a quote is missing"]),
-    ] {
-        let output = tokio::task::block_in_place(|| {
-            output_of(
-                Command::new(ALIGHT).args(["swap", "--to", to, "--zenoh"]).arg(&landing.zenoh),
-            )
-        })?;
-        let said = String::from_utf8_lossy(&[output.stdout.as_slice(), &output.stderr].concat())
-            .into_owned();
-        ensure!(output.status.code() == Some(1), "{to} ended with {}: {said}", output.status);
-        for part in parts {
-            ensure!(said.contains(part), "`{part}` is not in: {said}");
-        }
-    }
-    let listed = tokio::task::block_in_place(|| detectors(&landing, &[]))?;
-    println!("{listed}");
-    ensure!(listed.contains("Used: main") && listed.contains("rings:0.15341"), "{listed}");
-    let answer = tokio::task::block_in_place(|| detectors(&landing, &["prefer", "ground"]))?;
-    ensure!(answer.contains("accepted") && answer.contains("none yet"), "{answer}");
-    let answer = tokio::task::block_in_place(|| detectors(&landing, &["use", "nobody"]))?;
-    ensure!(answer.contains("refused") && answer.contains("known detectors: main"), "{answer}");
-    command(&landing, ControllerCommand::Resume).await?;
-    landing.lands().await?;
-    Ok(())
+    swaps::swaps(3).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -425,10 +127,52 @@ async fn ten_more(node: Node, tens: usize) -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn twenty_detectors_and_ten_dashboards_leave_the_controls_latency_as_it_was()
--> anyhow::Result<()> {
+async fn failed_swaps_and_twenty_more_detectors_change_nothing() -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
-    let landing = Landing::start(&["--seed", "24"]).await?;
+    let landing = Landing::start(&["--seed", "22"]).await?;
+    landing.descends_below(9.0).await?;
+    command(&landing, ControllerCommand::Hold).await?;
+    tokio::task::block_in_place(|| a_swap_that_fails_keeps_the_old_one_and_says_why(&landing))?;
+    twenty_detectors_and_ten_dashboards_leave_the_latency_as_it_was(&landing).await?;
+    command(&landing, ControllerCommand::Resume).await?;
+    landing.lands().await?;
+    Ok(())
+}
+
+fn a_swap_that_fails_keeps_the_old_one_and_says_why(landing: &Landing) -> anyhow::Result<()> {
+    let zenoh = landing.zenoh.display();
+    let blind = format!(
+        "'{ALIGHT}' detector --set id=blind --set 'markers=[\"apriltag-36h11:5:0.2\"]' --zenoh '{zenoh}'"
+    );
+    for (to, parts) in [
+        (blind.as_str(), &["main stays in use", "agrees in 0 of", "does not see the marker"][..]),
+        ("false", &["main stays in use", "the new detector ended"]),
+        ("no-such-program --x", &["no-such-program"]),
+        ("detector 'x", &["a quote is missing"]),
+    ] {
+        let output = output_of(
+            Command::new(ALIGHT).args(["swap", "--to", to, "--zenoh"]).arg(&landing.zenoh),
+        )?;
+        let said = String::from_utf8_lossy(&[output.stdout.as_slice(), &output.stderr].concat())
+            .into_owned();
+        ensure!(output.status.code() == Some(1), "{to} ended with {}: {said}", output.status);
+        for part in parts {
+            ensure!(said.contains(part), "`{part}` is not in: {said}");
+        }
+    }
+    let listed = detectors(landing, &[])?;
+    println!("{listed}");
+    ensure!(listed.contains("Used: main") && listed.contains("rings:0.15341"), "{listed}");
+    let answer = detectors(landing, &["prefer", "ground"])?;
+    ensure!(answer.contains("accepted") && answer.contains("none yet"), "{answer}");
+    let answer = detectors(landing, &["use", "nobody"])?;
+    ensure!(answer.contains("refused") && answer.contains("known detectors: main"), "{answer}");
+    Ok(())
+}
+
+async fn twenty_detectors_and_ten_dashboards_leave_the_latency_as_it_was(
+    landing: &Landing,
+) -> anyhow::Result<()> {
     let open = async |instance: String| {
         let identity = Identity { service: "alight", instance };
         Node::open(identity, &ZenohSource::File(landing.zenoh.clone())).await
@@ -448,8 +192,6 @@ async fn twenty_detectors_and_ten_dashboards_leave_the_controls_latency_as_it_wa
             }
         }
     };
-    landing.descends_below(9.0).await?;
-    command(&landing, ControllerCommand::Hold).await?;
     let targets = landing.node.subscriber(topic::TARGET, &[]).await?;
     let mut ratio = f64::INFINITY;
     // What else the machine does comes and goes.
@@ -479,7 +221,5 @@ async fn twenty_detectors_and_ten_dashboards_leave_the_controls_latency_as_it_wa
         sleep(Duration::from_secs(2)).await;
     }
     ensure!(ratio < 2.0, "{ratio:.2} times the latency without them");
-    command(&landing, ControllerCommand::Resume).await?;
-    landing.lands().await?;
     Ok(())
 }

@@ -44,8 +44,8 @@ struct Module {
 
 /// The modules of a crate by their paths (`a::b`; the crate's root is `crate`), and which uses which.
 ///
-/// A module uses another one when it names something of it; declaring a module is no use of it, and neither is it when the
-/// crate's root passes on its names.
+/// A module uses another one when it names something of it. Not counted: a module's declaration, what a module's children
+/// use of it (they are parts of it), and names that the crate's root passes on.
 pub(crate) fn modules(src: &Path, files: &[PathBuf]) -> std::io::Result<Graph> {
     let mut modules = BTreeMap::new();
     for file in files {
@@ -90,7 +90,11 @@ pub(crate) fn modules(src: &Path, files: &[PathBuf]) -> std::io::Result<Graph> {
                 continue;
             }
             let target = resolve(&modules, path, names, 0);
-            needed.extend(target.filter(|target| target != path).map(|target| name_of(&target)));
+            let is_part = |target: &[String]| {
+                target == path || !target.is_empty() && path.starts_with(target)
+            };
+            let target = target.filter(|target| !is_part(target));
+            needed.extend(target.map(|target| name_of(&target)));
         }
     }
     Ok(graph)

@@ -9,8 +9,8 @@ use messages::{
 use node::{Subscriber, now_ns};
 use tokio::time::{Instant, timeout, timeout_at};
 
-use crate::probe::{self, Times};
-use crate::site::{Radio, Site};
+use super::probe::{self, Times};
+use super::site::{Radio, Site};
 
 /// Longest flight.
 const PATIENCE: Duration = Duration::from_secs(110);
@@ -94,7 +94,7 @@ fn seconds(seconds: Option<f64>) -> String {
 
 /// Everything on the drone, and no link.
 pub(crate) async fn onboard(seed: u64) -> anyhow::Result<Option<Flight>> {
-    let any = crate::GOOD;
+    let any = super::GOOD;
     let Some(mut site) = Site::new(any).await? else { return Ok(None) };
     site.drone("detector", &["--set", "id=onboard"])?;
     let watch = Watch::new(&site).await?;

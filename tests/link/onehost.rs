@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 use testing::ports;
 use tokio::time::interval;
 
-use crate::probe::Times;
+use crate::link::probe::Times;
 
 const WIDTH: u32 = 1296;
 const HEIGHT: u32 = 972;

@@ -8,7 +8,7 @@ use node::{Identity, Node, now_ns};
 use serde_json::{Value, json};
 use tokio::time::{Instant, interval};
 
-use crate::site::ground_network;
+use super::site::ground_network;
 
 /// Between two small messages: 50 in a second.
 const PERIOD: Duration = Duration::from_millis(20);

@@ -8,8 +8,8 @@ use node::{FramePublisher, Loan, now_ns};
 use serde_json::Value;
 use tokio::time::interval;
 
-use crate::probe;
-use crate::site::{Radio, Site};
+use super::probe;
+use super::site::{Radio, Site};
 
 /// Kinds of small messages, as the probe names them.
 pub(crate) const CLASSES: [&str; 4] = ["state", "mavlink", "commands", "detections back"];

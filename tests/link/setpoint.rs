@@ -13,8 +13,8 @@ use messages::{Detections, TargetEstimate, topic};
 use node::now_ns;
 use tokio::time::{Instant, sleep_until};
 
-use crate::probe::Times;
-use crate::site::{Radio, Site};
+use crate::link::probe::Times;
+use crate::link::site::{Radio, Site};
 
 /// Longest flight.
 const PATIENCE: Duration = Duration::from_secs(90);

@@ -5,7 +5,7 @@
 
 Without images it renders three and takes some of the photographs beside the repository, if they are there. The
 stages come from the example `stages` of the crate `fiducial`, which is built first. Exit status: 0 when the stages
-agree within the limits below, 1 when not, 0 with a message when Python lacks what this needs.
+agree within the limits below, 1 when not, 77 with a message when Python lacks what this needs.
 """
 
 import json
@@ -19,7 +19,7 @@ try:
     import numpy as np
 except ImportError as missing:
     print(f"skipped: this comparison needs Python with numpy and OpenCV ({missing})")
-    sys.exit(0)
+    sys.exit(77)
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PHOTOS = ROOT.parent / "shared" / "data" / "photos"

@@ -1,0 +1,107 @@
+//! Measurements of the whole system that take too long for a test; each prints what it measured and fails as the test of
+//! the same name does.
+//!
+//! ```text
+//! cargo bench -p tests -- kills [TIMES]       kill each process so often (20)
+//! cargo bench -p tests -- swaps [TIMES]       swap detectors so often in one flight (100)
+//! cargo bench -p tests -- link [NAME...]      the trials on a bad radio link, or some of them
+//! ```
+
+#![expect(clippy::print_stdout, reason = "what was measured is for people to read")]
+
+mod flight;
+mod kills;
+#[path = "link/mod.rs"]
+mod link;
+#[path = "link/onehost.rs"]
+mod onehost;
+#[path = "link/setpoint.rs"]
+mod setpoint;
+mod swaps;
+
+use std::process::ExitCode;
+
+use anyhow::{Context, bail};
+
+use crate::link::site::Radio;
+use crate::link::{GOOD, LOSSY, POOR, flight as trial, saturation};
+
+fn main() -> ExitCode {
+    link::run(async |args| {
+        let times = |default: usize| args.get(1).map_or(Ok(default), |text| text.parse());
+        match args.first().map(String::as_str) {
+            Some("kills") => kills::kill_each(times(20)?).await,
+            Some("swaps") => swaps::swaps(times(100)?).await,
+            Some("link") => table(&args[1..]).await,
+            Some("reader") => {
+                println!("{}", onehost::reader(args.get(1).context("reader PORT")?).await?);
+                Ok(())
+            }
+            Some(other) => bail!("`{other}` is not measured: kills, swaps and link are"),
+            None => {
+                println!("Nothing is measured: say kills, swaps or link");
+                Ok(())
+            }
+        }
+    })
+}
+
+/// The long trials.
+async fn table(names: &[String]) -> anyhow::Result<()> {
+    // `KEY=VALUE` is for the camera, anything else names a trial.
+    let (camera, names): (Vec<&str>, Vec<&str>) =
+        names.iter().map(String::as_str).partition(|name| name.contains('='));
+    let camera = camera.as_slice();
+    let is_wanted = |name: &str| names.is_empty() || names.contains(&name);
+    if is_wanted("onehost") {
+        print("one host", onehost::run().await?);
+    }
+    for seed in 1..=3 {
+        if is_wanted("onboard") {
+            print("onboard", trial::onboard(seed).await?);
+        }
+        if is_wanted("setpoint") {
+            print("frame to setpoint without the search", setpoint::run(GOOD, seed).await?);
+        }
+        if is_wanted("good") {
+            print("ground, 20 Mbit/s", trial::ground(GOOD, seed, camera).await?);
+        }
+        if is_wanted("full") {
+            let full = &["air.mode=\"full\""];
+            print("ground, 20 Mbit/s, whole frames", trial::ground(GOOD, seed, full).await?);
+        }
+        if is_wanted("lossy") {
+            print("ground, 20 Mbit/s, 2 % loss", trial::ground(LOSSY, seed, camera).await?);
+        }
+        if is_wanted("tuned") {
+            let tuned = Radio { resends_soon: true, ..LOSSY };
+            print(
+                "the same, lost packets sent again soon",
+                trial::ground(tuned, seed, camera).await?,
+            );
+        }
+        if is_wanted("poor") {
+            print("ground, 4 Mbit/s, 3 % loss", trial::ground(POOR, seed, camera).await?);
+        }
+    }
+    if is_wanted("saturation") {
+        print("frames at twice the rate", saturation::run(GOOD, 15.0).await?);
+        print("frames at twice the rate, 2 % loss", saturation::run(LOSSY, 15.0).await?);
+        let tuned = Radio { resends_soon: true, ..LOSSY };
+        print("the same, lost packets sent again soon", saturation::run(tuned, 15.0).await?);
+        let honoured = Radio { marks: true, ..GOOD };
+        print("frames at twice the rate, marks honoured", saturation::run(honoured, 15.0).await?);
+    }
+    for seconds in [3.0, 30.0] {
+        if is_wanted("cut") {
+            print(&format!("link cut for {seconds} s"), trial::cut(GOOD, 1, seconds).await?);
+        }
+    }
+    Ok(())
+}
+
+fn print(name: &str, trial: Option<impl std::fmt::Display>) {
+    if let Some(trial) = trial {
+        println!("{name}: {trial}");
+    }
+}
