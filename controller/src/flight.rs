@@ -1,6 +1,7 @@
 //! One vehicle's flight: an event loop without input and output.
 //!
-//! The service feeds it packets, detections, commands and the time, and sends what [`Flight::poll_outgoing`] returns.
+//! The service feeds it packets, detections, commands and the time, and sends what [`Flight::poll_outgoing`]
+//! returns.
 
 use std::sync::Arc;
 
@@ -122,8 +123,8 @@ impl Flight {
         }
     }
 
-    /// Handles the detections that were published on the key of the detector `publisher`. True when a frame was used or
-    /// these detections were refused; false when they wait, as those of a detector on standby do.
+    /// Handles the detections that were published on the key of the detector `publisher`. True when a frame
+    /// was used or these detections were refused; false when they wait, as those of a detector on standby do.
     pub fn detections(&mut self, now_ns: i64, publisher: &str, message: &Detections) -> bool {
         self.journal.count("detections");
         match self.frames.add(now_ns, publisher, message) {

@@ -26,7 +26,8 @@ pub struct Frames {
     known_changes: u64,
     /// Stamp of the newest frame that was used, with a marker in it or without.
     used_stamp_ns: i64,
-    /// Late frames of the active detector are used only if they are newer than the last one of its predecessor.
+    /// Late frames of the active detector are used only if they are newer than the last one of its
+    /// predecessor.
     handover_stamp_ns: i64,
 }
 
@@ -35,7 +36,8 @@ pub struct Frames {
 pub enum Arrival {
     /// They are kept until they are used.
     Kept,
-    /// They are older than the frame that was used last, but the estimator can still fuse them at their own time.
+    /// They are older than the frame that was used last, but the estimator can still fuse them at their own
+    /// time.
     Late(FrameObservation),
     /// They are refused for this reason.
     Refused(&'static str),
@@ -82,7 +84,8 @@ impl Frames {
         if header.clock != clock_name() {
             return Arrival::Refused("another-clock");
         }
-        // Refused here, because later stamps are compared with the newest: one from the future would block them all.
+        // Refused here, because later stamps are compared with the newest: one from the future would block
+        // them all.
         let ahead_ns = header.stamp_ns.saturating_sub(now_ns);
         if ahead_ns as f64 * 1e-9 > self.max_future_s {
             return Arrival::Refused("from-the-future");

@@ -51,8 +51,8 @@ impl Journal {
         self.rejection.as_deref()
     }
 
-    /// Counts a tick of a landing, and whether the newest frame that was used was no longer fresh then: because no
-    /// detector had a newer one, or although one had.
+    /// Counts a tick of a landing, and whether the newest frame that was used was no longer fresh then:
+    /// because no detector had a newer one, or although one had.
     pub fn tick(&self, is_fresh: bool, has_newer: bool) {
         self.health.count("ticks");
         if !is_fresh {

@@ -1,7 +1,7 @@
 //! The other way to land: the autopilot's own precision landing, which is sent the landing target.
 //!
-//! No setpoint is sent. Every frame that was used gives the autopilot a landing target; the pilot, a mission or our own
-//! start changes to LAND (PRECISION LAND on PX4), and the autopilot does the rest.
+//! No setpoint is sent. Every frame that was used gives the autopilot a landing target; the pilot, a mission
+//! or our own start changes to LAND (PRECISION LAND on PX4), and the autopilot does the rest.
 
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode, Parameter};
 use geometry::Point;
@@ -15,7 +15,8 @@ use crate::wire;
 pub const PARAMETERS: [&str; 2] = ["PLND_ENABLED", "PLND_TYPE"];
 /// PLND_TYPE of landing targets that come by MAVLink.
 const MAVLINK: f64 = 1.0;
-/// Maximum gap between two landing targets, in nanoseconds; after a longer one ArduPilot starts a new estimate.
+/// Maximum gap between two landing targets, in nanoseconds; after a longer one ArduPilot starts a new
+/// estimate.
 const MAX_GAP_NS: i64 = 500_000_000;
 
 /// A precision landing by the autopilot.
@@ -147,8 +148,8 @@ impl LandingTargetMode {
         }
     }
 
-    /// Aborts a landing: one that the autopilot flies already is taken back to the mode in which it hovers, unless it is
-    /// lower than `no_return_m`.
+    /// Aborts a landing: one that the autopilot flies already is taken back to the mode in which it hovers,
+    /// unless it is lower than `no_return_m`.
     ///
     /// # Errors
     /// Says why not.

@@ -1,14 +1,15 @@
 //! Marker detections in, velocity setpoints out.
 //!
-//! The service receives detections and the autopilot's state, lets the lander decide, and sends setpoints. It stands
-//! between three crates that do not know each other: `messages` (what detectors find), `landing` (what to do) and
-//! `autopilot` (how to do it).
+//! The service receives detections and the autopilot's state, lets the lander decide, and sends setpoints. It
+//! stands between three crates that do not know each other: `messages` (what detectors find), `landing` (what
+//! to do) and `autopilot` (how to do it).
 //!
-//! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the [`flight`], an event
-//! loop over [`frames`] (detections in, the lander's next frame out, with [`selection`] of the detector), [`mission`] (when
-//! a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`landing_target`] (the other way to land, by
-//! the autopilot's own precision landing), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is
-//! logged and counted, [`wire`] converts messages into the lander's types and back.
+//! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the
+//! [`flight`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
+//! of the detector), [`mission`] (when a landing begins), [`setpoints`] (the lander's actions to the
+//! autopilot), [`landing_target`] (the other way to land, by the autopilot's own precision landing),
+//! [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and counted, [`wire`]
+//! converts messages into the lander's types and back.
 
 pub mod alarms;
 pub mod config;

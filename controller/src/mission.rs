@@ -111,8 +111,8 @@ impl Mission {
         self.state = if awaits_takeoff { State::AwaitingTakeoff } else { State::Idle };
     }
 
-    /// The pilot landed high up or had landed already. Where only a landing under way was to be resumed, nothing begins
-    /// without a command any more; otherwise the next flight may be landed.
+    /// The pilot landed high up or had landed already. Where only a landing under way was to be resumed,
+    /// nothing begins without a command any more; otherwise the next flight may be landed.
     pub fn skip(&mut self) {
         self.stand_down(self.start != Start::Resume);
     }
@@ -123,8 +123,9 @@ impl Mission {
         self.state = State::Failed { why };
     }
 
-    /// Advances take-off and waiting; the trigger when a landing is to begin. `is_known` says that the vehicle's state is
-    /// fresh, without which the lander refuses a start; `steers` that our setpoints control the landing.
+    /// Advances take-off and waiting; the trigger when a landing is to begin. `is_known` says that the
+    /// vehicle's state is fresh, without which the lander refuses a start; `steers` that our setpoints
+    /// control the landing.
     pub fn step(
         &mut self,
         now_ns: i64,
@@ -186,7 +187,8 @@ impl Mission {
         if !armed && self.started_ns.is_some() {
             self.disarmed_ns = self.disarmed_ns.or(Some(now_ns));
         }
-        // Only `airborne` lands flight after flight; others wait for a command once the pilot has ended the flight.
+        // Only `airborne` lands flight after flight; others wait for a command once the pilot has ended the
+        // flight.
         if !armed && self.start != Start::Airborne && self.is_awaiting_takeoff() {
             self.state = State::Idle;
         }
@@ -202,7 +204,8 @@ pub fn is_flying_guided(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
 }
 
-/// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies.
+/// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot
+/// flies.
 fn has_no_landing(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| {
         let stands = s.landed == LandedState::OnGround;

@@ -1,9 +1,10 @@
 //! Selects the active detector: one at a time, by the operator's preference, then by health.
 //!
-//! A function of time and of the messages received. Another detector becomes the active one when the active one is gone,
-//! silent, late or slow and the other is not, or when the operator prefers the other and it has been healthy for a
-//! while. The next frame is always the active detector's newest, and only if it is newer than all before: so a crash, an
-//! operator's choice and a swap take the same path, and no stamp is used that is older than the last.
+//! A function of time and of the messages received. Another detector becomes the active one when the active
+//! one is gone, silent, late or slow and the other is not, or when the operator prefers the other and it has
+//! been healthy for a while. The next frame is always the active detector's newest, and only if it is newer
+//! than all before: so a crash, an operator's choice and a swap take the same path, and no stamp is used that
+//! is older than the last.
 
 use std::collections::VecDeque;
 
@@ -11,7 +12,8 @@ use messages::{Candidate, DetectorState, Place};
 
 /// Silence after which a detector that has gone is forgotten, in nanoseconds.
 const GONE_TIMEOUT_NS: i64 = 10_000_000_000;
-/// Silence after which a detector whose presence was not withdrawn is forgotten, until its next message, in nanoseconds.
+/// Silence after which a detector whose presence was not withdrawn is forgotten, until its next message, in
+/// nanoseconds.
 const SILENT_TIMEOUT_NS: i64 = 60_000_000_000;
 /// Maximum length of a service's name, in bytes.
 const MAX_NAME_BYTES: usize = 64;
@@ -23,8 +25,8 @@ const MAX_SAMPLES: usize = 16;
 pub const MAX_VERDICTS: usize = 30;
 /// Minimum number of comparisons, or of frame intervals, for a conclusion.
 const MIN_SAMPLES: usize = 8;
-/// Silence timeout, in frame periods of the detector. One lost frame makes an interval of 2 periods; after 3 another
-/// detector must be active.
+/// Silence timeout, in frame periods of the detector. One lost frame makes an interval of 2 periods; after 3
+/// another detector must be active.
 const SILENT_PERIODS: f64 = 2.25;
 /// Period assumed for a detector with too few frames, in nanoseconds.
 const UNKNOWN_PERIOD_NS: i64 = 100_000_000;
@@ -120,8 +122,8 @@ impl Selection {
         }
     }
 
-    /// Registers the detections of the frame with this stamp, and the wanted marker in them; true when they are the newest
-    /// of this detector.
+    /// Registers the detections of the frame with this stamp, and the wanted marker in them; true when they
+    /// are the newest of this detector.
     pub fn received(
         &mut self,
         now_ns: i64,
@@ -215,8 +217,8 @@ impl Selection {
         self.choose(now_ns);
     }
 
-    /// The frame to be used now, by its detector and stamp: the active detector's newest, if it is newer than all that
-    /// were used. To be called after each of the functions above.
+    /// The frame to be used now, by its detector and stamp: the active detector's newest, if it is newer than
+    /// all that were used. To be called after each of the functions above.
     pub fn next_frame(&mut self) -> Option<(String, i64)> {
         let active = self.known_active()?;
         let frame = (active.name.clone(), active.stamp_ns);
@@ -304,7 +306,8 @@ impl Selection {
         self.known.last_mut()
     }
 
-    /// Compares the marker positions in one frame: the active detector's with all others', or another's with the active one's.
+    /// Compares the marker positions in one frame: the active detector's with all others', or another's with
+    /// the active one's.
     fn compare(&mut self, name: &str, stamp_ns: i64, sight: Option<Sight>) {
         let limits = self.limits;
         let Some(active) = self.active.clone() else { return };
@@ -344,8 +347,8 @@ impl Selection {
         None
     }
 
-    /// Why the active detector is to be replaced. A silence counts only when another detector has a newer frame for a
-    /// period: after a camera's pause the others may merely be faster.
+    /// Why the active detector is to be replaced. A silence counts only when another detector has a newer
+    /// frame for a period: after a camera's pause the others may merely be faster.
     fn failure(&self, now_ns: i64, active: &Known) -> Option<String> {
         let trouble = self.trouble(now_ns, active)?;
         let is_silent = active.alive
@@ -512,8 +515,8 @@ impl Known {
         self.sights.iter().find(|(stamp, _)| *stamp == stamp_ns).map(|(_, sight)| *sight)
     }
 
-    /// Compares this detector's marker in a frame with the active detector's. Without a marker from the active one there
-    /// is no verdict.
+    /// Compares this detector's marker in a frame with the active detector's. Without a marker from the
+    /// active one there is no verdict.
     fn judge(&mut self, limits: &Limits, active: Option<Sight>, ours: Option<Sight>) {
         let Some(active) = active else { return };
         let agrees = match (active.position_m, ours.map(|ours| ours.position_m)) {

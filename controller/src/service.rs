@@ -21,7 +21,8 @@ const STATUS_PERIOD_NS: i64 = 200_000_000;
 const CHECK_PERIOD_NS: i64 = 20_000_000;
 /// Minimum period of the vehicle's state, in nanoseconds.
 const VEHICLE_PERIOD_NS: i64 = 18_000_000;
-/// Maximum number of the autopilot's packets that wait for the network; more are dropped, as the flight never waits.
+/// Maximum number of the autopilot's packets that wait for the network; more are dropped, as the flight never
+/// waits.
 const MAX_WAITING_PACKETS: usize = 512;
 
 /// Runs the service until shutdown.

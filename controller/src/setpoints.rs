@@ -32,8 +32,8 @@ impl Setpoints {
         self.sent_ns
     }
 
-    /// Carries out an action; the result is that of a setpoint, if one was due. One that `is_urgent` is sent before its
-    /// time.
+    /// Carries out an action; the result is that of a setpoint, if one was due. One that `is_urgent` is sent
+    /// before its time.
     pub fn carry_out(
         &mut self,
         now_ns: i64,
@@ -101,8 +101,8 @@ impl Setpoints {
     }
 }
 
-/// The action of a decision while no detector is alive: nothing descends, and no search moves. A crash of the last
-/// detector is known at once, so this does not wait until the target is stale.
+/// The action of a decision while no detector is alive: nothing descends, and no search moves. A crash of the
+/// last detector is known at once, so this does not wait until the target is stale.
 pub fn without_detector(decision: &Decision) -> Action {
     match decision.action {
         // A search without a detector finds nothing.

@@ -1,6 +1,7 @@
 //! Wind estimate from the vehicle's tilt.
 //!
-//! The tilt accelerates the vehicle against a drag proportional to the airspeed: `dv/dt = tilt - drag * (v - wind)`.
+//! The tilt accelerates the vehicle against a drag proportional to the airspeed: `dv/dt = tilt - drag * (v -
+//! wind)`.
 
 use geometry::{Body, Vector};
 use landing::VehicleState;

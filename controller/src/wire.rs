@@ -82,9 +82,9 @@ pub fn phase(phase: landing::Phase) -> Phase {
     }
 }
 
-/// Converts the vehicle's state for the lander: attitude and position at the time of the newer of the two. `None` when one
-/// of the two has stopped (an autopilot without a position estimate still sends its attitude), because it would have to be
-/// extrapolated too far.
+/// Converts the vehicle's state for the lander: attitude and position at the time of the newer of the two.
+/// `None` when one of the two has stopped (an autopilot without a position estimate still sends its
+/// attitude), because it would have to be extrapolated too far.
 pub fn vehicle(state: &VehicleState) -> Option<landing::VehicleState> {
     let (attitude, position) = (state.attitude?, state.position?);
     if attitude.stamp_ns.abs_diff(position.stamp_ns) > MAX_SKEW_NS.unsigned_abs() {

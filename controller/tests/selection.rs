@@ -55,7 +55,8 @@ impl Bench {
         }
     }
 
-    /// Lets time pass up to a frame's stamp plus 66 ms: ticks every 25 ms, and the answers of those that answer.
+    /// Lets time pass up to a frame's stamp plus 66 ms: ticks every 25 ms, and the answers of those that
+    /// answer.
     fn frame(&mut self, stamp_ns: i64, answers: &[(&str, i64)]) {
         let sight = Some(Sight { position_m: Some([0.0, 0.0, 5.0]) });
         let answers: Vec<_> = answers.iter().map(|(name, late)| (*name, *late, sight)).collect();
@@ -414,8 +415,8 @@ proptest! {
             let before = bench.changes.iter().filter(|(then, _)| (0..30_000 * MS).contains(&(at - then))).count();
             prop_assert!(before <= 12, "{:?}", bench.changes);
         }
-        // The other one is always there, so no gap is long; the period of one that is heard now and then looks longer than
-        // it is, but a silence has an end.
+        // The other one is always there, so no gap is long; the period of one that is heard now and then
+        // looks longer than it is, but a silence has an end.
         let longest_ms = (MAX_SILENCE_NS + 2 * PERIOD) / MS;
         prop_assert!(bench.longest_gap_ms() <= longest_ms, "{} ms", bench.longest_gap_ms());
     }

@@ -25,11 +25,12 @@ const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Silence of the ground station after which all texts are repeated, in nanoseconds.
 const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
 
-/// Passes MAVLink between the autopilot's topics and the ground station, and reports the landing to it, until shutdown.
+/// Passes MAVLink between the autopilot's topics and the ground station, and reports the landing to it, until
+/// shutdown.
 ///
 /// # Errors
-/// When the address cannot be opened, another bridge has this name, or the network session ends. A missing ground
-/// station is not an error.
+/// When the address cannot be opened, another bridge has this name, or the network session ends. A missing
+/// ground station is not an error.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     let address: Address = config.ground.parse()?;
     node.claim_unique_name(&node.identity().instance).await?;

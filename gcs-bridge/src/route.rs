@@ -1,7 +1,7 @@
 //! Which packets pass between the autopilot and the ground station, and which are answered here.
 //!
-//! The rules are those of <https://mavlink.io/en/guide/routing.html>: a packet for a component goes to that component, every
-//! other packet to all, and none back to where it came from.
+//! The rules are those of <https://mavlink.io/en/guide/routing.html>: a packet for a component goes to that
+//! component, every other packet to all, and none back to where it came from.
 
 use autopilot::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message};
 use autopilot::{Packet, Sender};
@@ -38,8 +38,8 @@ pub(crate) fn from_ground(packet: &Packet, me: Option<Sender>, vehicle: &Vehicle
 pub(crate) fn from_autopilot(packet: &Packet, me: Option<Sender>) -> Route {
     match me {
         Some(me) if packet.sender == me => Route::Drop("from autopilot: an echo of the companion"),
-        // The autopilot answers the controller, which uses this companion's ids; a ground station would take such an
-        // acknowledgement for that of its own command.
+        // The autopilot answers the controller, which uses this companion's ids; a ground station would take
+        // such an acknowledgement for that of its own command.
         Some(me) if is_for(packet, me) => Route::Drop("from autopilot: for the companion"),
         _ => Route::Pass,
     }

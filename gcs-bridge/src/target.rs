@@ -25,7 +25,8 @@ impl LandingTargetPublisher {
         let fresh = estimate.age_ms.is_some_and(|age_ms| age_ms <= self.max_age_ms);
         let position = estimate.position_ned_m.filter(|p| p.iter().all(|c| c.is_finite()));
         let message = position.filter(|_| due && fresh).map(|at| message(estimate, at))?;
-        // Counted from when it was due, so that the rate is right whenever estimates come; missed messages are not repeated.
+        // Counted from when it was due, so that the rate is right whenever estimates come; missed messages
+        // are not repeated.
         self.due_ns = self.due_ns.max(now_ns.saturating_sub(self.period_ns)) + self.period_ns;
         Some(message)
     }
@@ -85,7 +86,8 @@ mod tests {
     #[test]
     fn the_rate_is_bounded() {
         let mut publisher = LandingTargetPublisher::new(5.0, 1000.0);
-        // Two seconds of estimates, then two more after a pause, at a rate that is not a multiple of the publisher's.
+        // Two seconds of estimates, then two more after a pause, at a rate that is not a multiple of the
+        // publisher's.
         for start_s in [0, 60] {
             let times = (0..34).map(|i| start_s * SECOND_NS + i * SECOND_NS / 17);
             let shown =

@@ -29,7 +29,8 @@ impl StatusTextSender {
         Self { last: None, detector: None, tokens: MAX_BURST, refilled_ns: now_ns, next_id: 1 }
     }
 
-    /// The texts for what is new in a status. What exceeds the rate is sent with a later status, if it still holds.
+    /// The texts for what is new in a status. What exceeds the rate is sent with a later status, if it still
+    /// holds.
     pub(crate) fn status(&mut self, now_ns: i64, status: &ControllerStatus) -> Vec<MavMessage> {
         let mut packets = Vec::new();
         let text = match status.why.is_empty() {

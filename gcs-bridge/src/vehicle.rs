@@ -60,7 +60,8 @@ impl Vehicle {
         self.configured.or(self.found.map(|found| found.system))
     }
 
-    /// The link may carry heartbeats of other vehicles too, so the first autopilot stays until it falls silent.
+    /// The link may carry heartbeats of other vehicles too, so the first autopilot stays until it falls
+    /// silent.
     fn autopilot_active(&mut self, now_ns: i64, system: u8) {
         let stays = self.found.is_some_and(|found| {
             found.system != system && now_ns.saturating_sub(found.at_ns) <= TIMEOUT_NS

@@ -1,4 +1,5 @@
-//! Age of the autopilot's attitude on arrival, by its own clock: `cargo run -p autopilot --example clock -- ADDRESS`.
+//! Age of the autopilot's attitude on arrival, by its own clock: `cargo run -p autopilot --example clock --
+//! ADDRESS`.
 //!
 //! It listens for 30 s and sends no command to the vehicle.
 

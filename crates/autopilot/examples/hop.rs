@@ -1,4 +1,5 @@
-//! Takes off, flies a little to the north, and lands again: `cargo run -p autopilot --example hop -- ADDRESS`.
+//! Takes off, flies a little to the north, and lands again: `cargo run -p autopilot --example hop --
+//! ADDRESS`.
 //!
 //! It shows a whole flight with this crate; try it on ArduPilot's simulator with `udpin:127.0.0.1:14550`.
 

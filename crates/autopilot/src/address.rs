@@ -1,12 +1,12 @@
-//! Where the autopilot is, as a person writes it.
+//! The address of the autopilot's link.
 
 use std::fmt;
 use std::str::FromStr;
 
-/// Speed of a serial line when the address does not say it: ArduPilot's default for a telemetry port.
+/// Default speed of a serial line, in baud: ArduPilot's default for a telemetry port.
 pub const DEFAULT_BAUD: u32 = 57_600;
 
-/// Where the autopilot is.
+/// The address of the autopilot's link.
 ///
 /// ```
 /// use autopilot::Address;
@@ -17,13 +17,13 @@ pub const DEFAULT_BAUD: u32 = 57_600;
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Address {
-    /// Wait for packets on this UDP port, and answer to whoever the autopilot turns out to be.
+    /// Listen on this UDP port, and reply to the autopilot's address.
     UdpIn(Endpoint),
-    /// Send to this UDP port, and take the answers.
+    /// Send to this UDP port, and receive its replies.
     UdpOut(Endpoint),
     /// Connect to this TCP port.
     Tcp(Endpoint),
-    /// Wait for one connection on this TCP port.
+    /// Accept one connection on this TCP port.
     TcpIn(Endpoint),
     /// A serial line.
     Serial {
@@ -43,7 +43,7 @@ pub struct Endpoint {
     pub port: u16,
 }
 
-/// Why a text is no address.
+/// Why an address is invalid.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("`{text}` is not an autopilot address: {problem}; {EXPECTED}")]
 pub struct AddressError {
@@ -84,9 +84,9 @@ impl fmt::Display for Endpoint {
 fn parse(text: &str) -> Result<Address, String> {
     let Some((kind, rest)) = text.split_once(':') else {
         return Err(if text.starts_with('/') {
-            format!("a device needs its kind in front, as in serial:{text}")
+            format!("missing scheme: write serial:{text}")
         } else {
-            "there is no `:` in it".into()
+            "it has no `:`".into()
         });
     };
     match kind {
@@ -95,15 +95,10 @@ fn parse(text: &str) -> Result<Address, String> {
         "tcp" => endpoint(rest, false).map(Address::Tcp),
         "tcpin" => endpoint(rest, true).map(Address::TcpIn),
         "serial" => serial(rest),
-        "udp" => {
-            Err("`udp` does not say who begins: udpin waits for the autopilot, udpout calls it"
-                .into())
-        }
-        "tcpout" => Err("a TCP connection that this side opens is written tcp".into()),
-        _ if kind.starts_with('/') => {
-            Err(format!("a device needs its kind in front, as in serial:{text}"))
-        }
-        _ => Err(format!("`{kind}` is no kind of link")),
+        "udp" => Err("ambiguous scheme `udp`: use `udpin` (listen) or `udpout` (connect)".into()),
+        "tcpout" => Err("unknown scheme `tcpout`: use `tcp` (connect) or `tcpin` (listen)".into()),
+        _ if kind.starts_with('/') => Err(format!("missing scheme: write serial:{text}")),
+        _ => Err(format!("unknown scheme `{kind}`")),
     }
 }
 
@@ -117,16 +112,16 @@ fn endpoint(text: &str, listens: bool) -> Result<Endpoint, String> {
     }
     let host = bare.unwrap_or(host);
     if host.is_empty() || host.contains(|c: char| c.is_whitespace() || "[]/".contains(c)) {
-        return Err(format!("`{host}` is no host (0.0.0.0 means every network of this machine)"));
+        return Err(format!("invalid host `{host}` (use 0.0.0.0 for all interfaces)"));
     }
     match port.parse() {
-        Ok(0) if !listens => Err("port 0 cannot be called".into()),
+        Ok(0) if !listens => Err("cannot connect to port 0".into()),
         Ok(port) => Ok(Endpoint { host: host.into(), port }),
-        Err(_) => Err(format!("`{port}` is no port from 1 to 65535")),
+        Err(_) => Err(format!("invalid port `{port}` (1 to 65535)")),
     }
 }
 
-/// A device path may contain colons, so only a number at the end is a speed.
+/// A device path may contain colons, so only a number at its end is the speed.
 fn serial(text: &str) -> Result<Address, String> {
     let (device, baud) = match text.rsplit_once(':') {
         Some((device, baud)) if baud.is_empty() || baud.bytes().all(|b| b.is_ascii_digit()) => {
@@ -167,13 +162,13 @@ mod tests {
         for (text, problem) in [
             ("", "no `:`"),
             ("/dev/ttyACM0", "serial:/dev/ttyACM0"),
-            ("udp:0.0.0.0:14550", "who begins"),
-            ("usb:0", "`usb` is no kind"),
+            ("udp:0.0.0.0:14550", "ambiguous scheme"),
+            ("usb:0", "unknown scheme `usb`"),
             ("udpin:14550", "no port"),
             ("udpin:::1:14550", "needs brackets"),
-            ("udpin::14550", "is no host"),
+            ("udpin::14550", "invalid host"),
             ("tcp:host:0", "port 0"),
-            ("tcp:host:70000", "no port from 1"),
+            ("tcp:host:70000", "invalid port"),
             ("serial::57600", "device is missing"),
             ("serial:/dev/ttyS0:99", "from 1200"),
         ] {

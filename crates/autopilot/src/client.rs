@@ -1,8 +1,9 @@
 //! The conversation with one autopilot, as a state machine without input and output.
 //!
-//! Feed it every packet ([`Autopilot::handle`]) and the time ([`Autopilot::tick`], 20 times a second or more); send what
-//! [`Autopilot::poll_outgoing`] returns and act on what [`Autopilot::poll_event`] returns. Only the heartbeat says what
-//! is true: an acknowledgement is a promise, and the pilot may have changed the mode in between.
+//! Feed it every packet ([`Autopilot::handle`]) and the time ([`Autopilot::tick`], 20 times a second or
+//! more); send what [`Autopilot::poll_outgoing`] returns and act on what [`Autopilot::poll_event`] returns.
+//! Only the heartbeat says what is true: an acknowledgement is a promise, and the pilot may have changed the
+//! mode in between.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -11,7 +12,7 @@ use geometry::{Body, Ned, Point, Vector};
 
 use crate::clock::Clock;
 use crate::command::{
-    Command, CommandError, CommandId, CommandStatus, Patience, Request, SetpointError, Step, ns,
+    Command, CommandError, CommandId, CommandStatus, Request, SetpointError, Step, Timeouts, ns,
 };
 use crate::compose;
 use crate::dialect::{
@@ -25,46 +26,49 @@ use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, V
 use crate::stream::{Notice, Stream, Streams};
 use crate::text::Joiner;
 
-/// The component number of every autopilot.
+/// The component id of every autopilot.
 const AUTOPILOT: u8 = 1;
-/// Events and packets that nobody takes: the oldest go.
+/// Maximum number of events and packets that wait; the oldest are dropped.
 const MAX_QUEUED: usize = 1024;
-/// Finished commands whose outcome is remembered.
+/// Maximum number of finished commands whose outcome is kept.
 const MAX_OUTCOMES: usize = 32;
+/// Period of our heartbeat, in nanoseconds.
 const HEARTBEAT_NS: i64 = 1_000_000_000;
-/// The autopilot's clock going back by so much means that it restarted.
+/// Backward step of the autopilot's clock that counts as a restart, in milliseconds.
 const RESTART_MS: u32 = 1_000;
-/// PX4 enters OFFBOARD only after it has heard setpoints for a second, at 2 Hz or more
-/// (<https://docs.px4.io/main/en/flight_modes/offboard.html>): for so long, and so often, it is told to stand still before.
+/// Time for which setpoints are sent before OFFBOARD is requested, in nanoseconds: PX4 enters it only after a
+/// second of setpoints at 2 Hz or more (<https://docs.px4.io/main/en/flight_modes/offboard.html>).
 const PROOF_NS: i64 = 1_300_000_000;
+/// Period of these setpoints, in nanoseconds.
 const PROOF_PERIOD_NS: i64 = 50_000_000;
-/// Messages that PX4 has in the place of ArduPilot's (ESTIMATOR_STATUS for EKF_STATUS_REPORT), or beside them
-/// (GLOBAL_POSITION_INT, as its takeoff wants an altitude over the sea).
+/// PX4 sends ESTIMATOR_STATUS instead of ArduPilot's EKF_STATUS_REPORT, and its takeoff needs an altitude
+/// above mean sea level, from GLOBAL_POSITION_INT.
 const EKF_STATUS_REPORT: u32 = 193;
 const ESTIMATOR_STATUS: u32 = 230;
 const GLOBAL_POSITION_INT: u32 = 33;
 
-/// How to talk to the autopilot.
+/// Settings of the conversation with the autopilot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
-    /// The vehicle's system number; `None` takes the first autopilot that is heard, and stays with it.
+    /// The vehicle's system id; `None` takes the first autopilot found, and keeps it.
     pub system_id: Option<u8>,
-    /// Our own system number; `None` takes the vehicle's, as a part of it.
+    /// Our own system id; `None` takes the vehicle's.
     pub our_system: Option<u8>,
-    /// Our own component number.
+    /// Our own component id.
     pub our_component: u8,
     /// Whether to send our own heartbeat once a second.
     pub heartbeat: bool,
-    /// The silence after which the autopilot counts as lost.
+    /// Silence after which the autopilot counts as lost.
     pub heartbeat_timeout: Duration,
-    /// The messages to ask for; those that only ArduPilot has are asked of PX4 by their other names.
+    /// The messages to request; ArduPilot's own are replaced by their equivalents on PX4.
     pub streams: Vec<Stream>,
     /// The parameters to read.
     pub parameters: Vec<&'static str>,
-    /// Whether to ask for the autopilot's clock, so that what it measured carries the time of its measurement.
+    /// Whether to synchronise with the autopilot's clock, so that measurements are stamped with their own
+    /// time.
     pub timesync: bool,
-    /// How long commands are tried.
-    pub patience: Patience,
+    /// Timeouts of commands.
+    pub timeouts: Timeouts,
 }
 
 impl Default for Config {
@@ -78,7 +82,7 @@ impl Default for Config {
             streams: default_streams(50.0),
             parameters: Vec::new(),
             timesync: true,
-            patience: Patience::default(),
+            timeouts: Timeouts::default(),
         }
     }
 }
@@ -98,34 +102,35 @@ pub fn default_streams(rate_hz: f64) -> Vec<Stream> {
     ]
 }
 
-/// What happened.
+/// An event of the conversation.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
-    /// The autopilot was heard for the first time.
+    /// The autopilot was found.
     Found {
-        /// Its system number.
+        /// Its system id.
         system: u8,
-        /// What flies it.
+        /// Its firmware.
         firmware: Firmware,
     },
-    /// Another vehicle is on the same link; it is ignored. Said once: pin the right one in the configuration.
+    /// Another vehicle is on the same link; it is ignored. Reported once: pin the right one in the
+    /// configuration.
     OtherVehicle {
-        /// Its system number.
+        /// Its system id.
         system: u8,
     },
-    /// Somebody else speaks in our name, probably a second controller of the same vehicle. Said once.
+    /// Another companion uses our ids, probably a second controller of the same vehicle. Reported once.
     SameAddress {
-        /// Our name.
+        /// Our ids.
         sender: Sender,
     },
-    /// The heartbeat is not heard any more.
+    /// The heartbeat was lost.
     Lost {
-        /// For how long.
+        /// The silence.
         silence: Duration,
     },
-    /// The heartbeat is heard again.
+    /// The heartbeat is back.
     Returned,
-    /// The autopilot restarted: what it was told is forgotten, and its origin may be another one.
+    /// The autopilot restarted: requests are lost, and its origin may have changed.
     Restarted,
     /// A new attitude.
     Attitude(Attitude),
@@ -135,7 +140,7 @@ pub enum Event {
     Range(Range),
     /// The whole state, after each attitude and position.
     State(VehicleState),
-    /// The flight mode changed, by whoever.
+    /// The flight mode changed.
     ModeChanged {
         /// The mode before; none at the beginning.
         from: Option<FlightMode>,
@@ -144,50 +149,50 @@ pub enum Event {
     },
     /// The motors were armed (true) or disarmed.
     ArmedChanged(bool),
-    /// It left the ground, or came down.
+    /// The contact with the ground changed.
     LandedChanged {
         /// The state before.
         from: LandedState,
         /// The state now.
         to: LandedState,
     },
-    /// It became ready to fly, or ceased to be.
+    /// Its readiness to fly changed.
     ReadyChanged {
         /// Whether it is ready.
         ready: bool,
-        /// What is missing, for people.
+        /// What is missing, as texts.
         reasons: Vec<String>,
     },
-    /// The autopilot says something to people.
+    /// A text of the autopilot.
     Text {
-        /// How urgent it is.
+        /// Its severity.
         severity: MavSeverity,
         /// The whole text.
         text: String,
     },
     /// A command is finished.
     Command {
-        /// Which request.
+        /// The request.
         id: CommandId,
-        /// What was asked.
+        /// The command.
         command: Command,
-        /// Whether it was done.
+        /// The result.
         result: Result<(), CommandError>,
     },
-    /// A required message does not come as asked, though it was asked for repeatedly.
+    /// A required message does not stream at the requested rate, in spite of repeated requests.
     StreamMissing {
         /// Its name.
         message: &'static str,
-        /// How often it should come, in Hz.
+        /// Requested rate, in Hz.
         wanted_hz: f64,
-        /// How often it comes, in Hz.
+        /// Measured rate, in Hz.
         measured_hz: f64,
     },
-    /// A missing message comes again.
+    /// A missing message streams again.
     StreamRestored {
         /// Its name.
         message: &'static str,
-        /// How often it comes, in Hz.
+        /// Measured rate, in Hz.
         measured_hz: f64,
     },
 }
@@ -221,7 +226,7 @@ struct Vehicle {
     readiness: Readiness,
     heartbeat_ns: i64,
     boot_ms: u32,
-    /// Altitude over the sea, in m.
+    /// Altitude above mean sea level, in m.
     amsl_m: Option<f64>,
     joiner: Joiner,
 }
@@ -249,7 +254,7 @@ impl Autopilot {
         }
     }
 
-    /// Takes a packet that was received at `now_ns`.
+    /// Handles a packet received at `now_ns`.
     pub fn handle(&mut self, now_ns: i64, packet: &Packet) {
         let Some(message) = &packet.message else { return };
         if packet.sender == self.our_address() && !std::mem::replace(&mut self.same_address, true) {
@@ -283,11 +288,11 @@ impl Autopilot {
         self.step_requests(now_ns);
     }
 
-    /// Lets time pass: call it often (20 Hz), also when nothing is received.
+    /// Lets time pass: to be called at 20 Hz or more, also when nothing is received.
     pub fn tick(&mut self, now_ns: i64) {
         if self.config.heartbeat && now_ns >= self.heartbeat_due_ns {
             self.send(&compose::heartbeat());
-            // The next one is a second after this one was due, unless time has run far ahead.
+            // The next one is due a second after this one was, unless time jumped ahead.
             let regular = self.heartbeat_due_ns.saturating_add(HEARTBEAT_NS);
             self.heartbeat_due_ns =
                 if regular > now_ns { regular } else { now_ns.saturating_add(HEARTBEAT_NS) };
@@ -305,8 +310,8 @@ impl Autopilot {
             if let Some(request) = request {
                 self.send_to_vehicle(request);
             }
-            self.ask(now_ns);
-            self.prove_life(now_ns);
+            self.send_requests(now_ns);
+            self.prove_setpoints(now_ns);
         }
         self.step_requests(now_ns);
     }
@@ -321,38 +326,38 @@ impl Autopilot {
         self.outgoing.pop_front()
     }
 
-    /// What is known about the vehicle; none before it is found.
+    /// The vehicle's state; none before it is found.
     pub fn state(&self) -> Option<&VehicleState> {
         self.vehicle.as_ref().map(|vehicle| &vehicle.state)
     }
 
-    /// What flies the vehicle; none before it is found.
+    /// The vehicle's firmware; none before it is found.
     pub fn firmware(&self) -> Option<Firmware> {
         self.vehicle.as_ref().map(|vehicle| vehicle.firmware)
     }
 
-    /// The vehicle's system number; none before it is found.
+    /// The vehicle's system id; none before it is found.
     pub fn system(&self) -> Option<u8> {
         self.vehicle.as_ref().map(|vehicle| vehicle.system)
     }
 
-    /// Whether the heartbeat is heard.
+    /// Whether heartbeats are received.
     pub fn is_connected(&self) -> bool {
         self.vehicle.as_ref().is_some_and(|vehicle| vehicle.state.connected)
     }
 
-    /// What is known of a parameter that [`Config::parameters`] names.
+    /// The state of a parameter of [`Config::parameters`].
     pub fn parameter(&self, name: &str) -> Parameter {
         self.parameters.get(name)
     }
 
-    /// How long a packet to the autopilot and back takes at best; `None` while its clock is not known, so that what it
-    /// measured carries the time of its reception.
+    /// The shortest round trip to the autopilot; `None` while its clock is not known and measurements are
+    /// stamped with the time of their reception.
     pub fn round_trip(&self, now_ns: i64) -> Option<Duration> {
         self.clock.round_trip_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
     }
 
-    /// Why the vehicle cannot be armed and flown yet, for people; empty when it can.
+    /// Why the vehicle cannot be armed and flown yet, as texts; empty when it can.
     pub fn not_ready_because(&self) -> Vec<String> {
         match &self.vehicle {
             None => vec!["waiting for the autopilot's heartbeat".to_owned()],
@@ -360,16 +365,16 @@ impl Autopilot {
         }
     }
 
-    /// How many messages were refused because a number in them was not finite.
+    /// Number of messages refused because a number in them was not finite.
     pub fn refused_numbers(&self) -> u64 {
         self.refused_numbers
     }
 
-    /// Asks for something. It is sent with the next [`Autopilot::tick`], and takes the place of an earlier request for
-    /// the same thing; [`Autopilot::status`] and [`Event::Command`] tell how it went.
+    /// Requests a command. It is sent with the next [`Autopilot::tick`], and replaces an earlier request of
+    /// the same kind; [`Autopilot::status`] and [`Event::Command`] report its result.
     pub fn request(&mut self, now_ns: i64, command: Command) -> CommandId {
         if let Some(pending) = self.requests.iter_mut().find(|r| r.command == command) {
-            pending.ask_again(now_ns);
+            pending.repeat(now_ns);
             return pending.id;
         }
         let id = CommandId(self.next_id);
@@ -389,13 +394,13 @@ impl Autopilot {
         id
     }
 
-    /// Gives up all that was asked for and is not done: nothing of it is sent again. Whoever ends a flight, or sees
-    /// another take it over, must call this, or a command that was lost on the way is repeated against the pilot.
+    /// Withdraws all pending requests: none is sent again. To be called at the end of a flight and when the
+    /// pilot takes over, or a command that was lost on the way is repeated against the pilot.
     pub fn withdraw(&mut self) {
         self.fail_requests(|command| CommandError::Withdrawn { command });
     }
 
-    /// How a request stands.
+    /// The status of a request.
     pub fn status(&self, id: CommandId) -> CommandStatus {
         if self.requests.iter().any(|request| request.id == id) {
             return CommandStatus::Pending;
@@ -404,8 +409,8 @@ impl Autopilot {
         outcome.map_or(CommandStatus::Unknown, |(_, status)| status.clone())
     }
 
-    /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second, because the
-    /// autopilot flies on with the last one for 3 s. To stop, send noughts.
+    /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,
+    /// because the autopilot flies on with the last one for 3 s. Zeros stop the vehicle.
     pub fn set_velocity(
         &mut self,
         now_ns: i64,
@@ -427,7 +432,7 @@ impl Autopilot {
         if !state.mode.is_guided() {
             return Err(SetpointError::NotGuided(state.mode));
         }
-        // "Landing" lasts a moment after LAND was left. During the takeoff a setpoint would end it.
+        // "Landing" lasts for a moment after LAND. During a takeoff a setpoint would end it.
         if !state.armed || !matches!(state.landed, LandedState::InAir | LandedState::Landing) {
             return Err(SetpointError::NotFlying(state.landed));
         }
@@ -437,11 +442,12 @@ impl Autopilot {
         Ok(())
     }
 
-    /// Tells the autopilot where the landing point is, for its own precision landing, in the frame that this firmware
-    /// takes: ArduPilot `in_body`, relative to the vehicle and by its present attitude; PX4 `in_local`. False when it
-    /// cannot be told: no autopilot of a kind that lands so, a number is not finite, or the point is not below.
+    /// Sends the landing target for the autopilot's own precision landing, in the coordinate frame that the
+    /// firmware takes: ArduPilot `in_body`, relative to the vehicle and by its present attitude; PX4
+    /// `in_local`. False when it cannot be sent: the firmware has no precision landing, a number is not
+    /// finite, or the point is not below.
     ///
-    /// `stamp_ns` is when this was so, by our clock.
+    /// `stamp_ns` is the time of the position, by our clock.
     pub fn send_landing_target(
         &mut self,
         stamp_ns: i64,
@@ -457,7 +463,7 @@ impl Autopilot {
         message.inspect(|message| self.send(message)).is_some()
     }
 
-    /// Sends any message in our name (LANDING_TARGET, STATUSTEXT, ...).
+    /// Sends a message under our ids (LANDING_TARGET, STATUSTEXT, ...).
     pub fn send(&mut self, message: &MavMessage) {
         let packet = packet::encode(self.our_address(), self.sequence, message);
         self.sequence = self.sequence.wrapping_add(1);
@@ -467,7 +473,7 @@ impl Autopilot {
         self.outgoing.push_back(packet);
     }
 
-    /// In whose name messages are sent.
+    /// The ids under which messages are sent.
     pub fn our_address(&self) -> Sender {
         let system = self.config.our_system.or(self.config.system_id).or(self.system());
         Sender { system: system.unwrap_or(1), component: self.config.our_component }
@@ -480,23 +486,23 @@ impl Autopilot {
     }
 
     /// Asks for the time and for parameters, when it is time to.
-    fn ask(&mut self, now_ns: i64) {
+    fn send_requests(&mut self, now_ns: i64) {
         let Some(system) = self.system() else { return };
         if self.config.timesync
-            && let Some(ts1) = self.clock.ask(now_ns)
+            && let Some(ts1) = self.clock.request(now_ns)
         {
             self.send(&timesync(0, ts1, Sender { system, component: AUTOPILOT }));
         }
-        if let Some(question) = self.parameters.ask(now_ns, system, AUTOPILOT) {
-            self.send(&question);
+        if let Some(request) = self.parameters.request(now_ns, system, AUTOPILOT) {
+            self.send(&request);
         }
     }
 
-    /// While OFFBOARD is asked for, PX4 hears setpoints that stand still.
-    fn prove_life(&mut self, now_ns: i64) {
+    /// While OFFBOARD is requested, PX4 gets setpoints of zero velocity.
+    fn prove_setpoints(&mut self, now_ns: i64) {
         let offboard = Command::SetMode(FlightMode::OFFBOARD);
-        let asks = self.requests.iter().any(|request| request.command == offboard);
-        if !asks || now_ns < self.proof_due_ns {
+        let is_requested = self.requests.iter().any(|request| request.command == offboard);
+        if !is_requested || now_ns < self.proof_due_ns {
             return;
         }
         self.proof_due_ns = now_ns.saturating_add(PROOF_PERIOD_NS);
@@ -507,7 +513,7 @@ impl Autopilot {
 
     fn take_time(&mut self, now_ns: i64, from: Sender, message: &TIMESYNC_DATA) {
         if message.tc1 == 0 {
-            // It asks for our clock, to understand our stamps.
+            // It requests our time, to synchronise with our stamps.
             self.send(&timesync(now_ns, message.ts1, from));
         } else if self.config.timesync {
             self.clock.answered(now_ns, message.tc1, message.ts1);
@@ -607,7 +613,7 @@ impl Autopilot {
         let silence_ns = now_ns.saturating_sub(vehicle.heartbeat_ns);
         if vehicle.state.connected && silence_ns > limit_ns {
             vehicle.state.connected = false;
-            // It may have restarted when it returns, so it must show again that it is ready.
+            // It may have restarted when it returns, so its readiness is unknown.
             vehicle.readiness = Readiness::default();
             vehicle.state.ready = false;
             let silence = Duration::from_nanos(silence_ns.max(0) as u64);
@@ -617,10 +623,10 @@ impl Autopilot {
     }
 
     fn take_text(&mut self, severity: MavSeverity, text: String) {
-        // Information ("Arming motors") explains no refusal.
+        // Information ("Arming motors") does not explain a refusal.
         if (severity as u8) <= MavSeverity::MAV_SEVERITY_WARNING as u8 {
             for request in &mut self.requests {
-                request.hear(&text);
+                request.add_text(&text);
             }
         }
         if let Some(vehicle) = &mut self.vehicle {
@@ -630,21 +636,22 @@ impl Autopilot {
     }
 
     fn take_acknowledgement(&mut self, now_ns: i64, ack: &COMMAND_ACK_DATA) {
-        // Old autopilots do not say whom they answer; others name a ground station that asked the same.
+        // Old autopilots do not address the requester; others may address a ground station that requested the
+        // same.
         let ours = self.our_address();
-        let for_us = ack.target_system == 0
+        let is_ours = ack.target_system == 0
             || (ack.target_system == ours.system
                 && [0, ours.component].contains(&ack.target_component));
-        if !for_us {
+        if !is_ours {
             return;
         }
         if ack.command == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL {
             self.streams.acknowledged(now_ns, ack.result);
             return;
         }
-        let patience = self.config.patience;
+        let timeouts = self.config.timeouts;
         for request in self.requests.iter_mut().filter(|r| r.command.is_answered_by(ack.command)) {
-            request.answer(now_ns, ack.result, &patience);
+            request.acknowledge(now_ns, ack.result, &timeouts);
         }
     }
 
@@ -738,7 +745,7 @@ impl Autopilot {
         }
     }
 
-    /// Notices a restart by the autopilot's clock, which may be quicker than a lost heartbeat.
+    /// Detects a restart by the autopilot's clock, which may be quicker than by a lost heartbeat.
     fn take_boot_time(&mut self, boot_ms: u32) {
         let Some(vehicle) = &mut self.vehicle else { return };
         let restarted = boot_ms.saturating_add(RESTART_MS) < vehicle.boot_ms;
@@ -768,7 +775,7 @@ impl Autopilot {
         }
     }
 
-    /// Why a command is not even sent.
+    /// Why a command is not sent.
     fn refusal(&self, command: Command) -> Option<CommandError> {
         let vehicle = self.vehicle.as_ref().filter(|vehicle| vehicle.state.connected);
         let Some(vehicle) = vehicle else { return Some(CommandError::NoAutopilot { command }) };
@@ -777,7 +784,8 @@ impl Autopilot {
         }
         let is_blind = vehicle.firmware == Firmware::Px4 && vehicle.amsl_m.is_none();
         if matches!(command, Command::Takeoff { .. }) && is_blind {
-            let problem = "PX4 has not told its altitude over the sea (GLOBAL_POSITION_INT)";
+            let problem =
+                "PX4 has not reported its altitude above mean sea level (GLOBAL_POSITION_INT)";
             return Some(CommandError::Invalid { command, problem });
         }
         let problem = command.problem(Some(&vehicle.state))?;
@@ -786,10 +794,10 @@ impl Autopilot {
 
     fn step_requests(&mut self, now_ns: i64) {
         let Some(state) = self.state().copied() else { return };
-        let patience = self.config.patience;
+        let timeouts = self.config.timeouts;
         let mut index = 0;
         while let Some(request) = self.requests.get_mut(index) {
-            match request.step(now_ns, &state, &patience) {
+            match request.step(now_ns, &state, &timeouts) {
                 Step::Wait => index += 1,
                 Step::Send(command, attempt) => {
                     index += 1;
@@ -823,7 +831,7 @@ impl Autopilot {
     }
 }
 
-/// A question for the time (`tc1` nought), or the answer to one.
+/// A request for the time (`tc1` zero), or the reply to one.
 fn timesync(tc1: i64, ts1: i64, to: Sender) -> MavMessage {
     MavMessage::TIMESYNC(TIMESYNC_DATA {
         tc1,
@@ -833,7 +841,7 @@ fn timesync(tc1: i64, ts1: i64, to: Sender) -> MavMessage {
     })
 }
 
-/// The streams by the names that this firmware has for them.
+/// The streams with the message ids of this firmware.
 fn streams_of(firmware: Firmware, streams: &[Stream]) -> Vec<Stream> {
     let mut streams = streams.to_vec();
     if firmware == Firmware::Px4 {

@@ -1,43 +1,47 @@
-//! The autopilot's clock, seen by ours: TIMESYNC round trips (<https://mavlink.io/en/services/timesync.html>).
+//! Synchronisation with the autopilot's clock by TIMESYNC round trips
+//! (<https://mavlink.io/en/services/timesync.html>).
 //!
-//! A round trip bounds the difference of the two clocks to half its length, so the shortest one of the last seconds
-//! is believed, and loses some of its worth with age as the clocks drift. What the autopilot measured can then carry its
-//! own time instead of that of its reception, however long and however irregularly it was under way.
+//! A round trip bounds the offset of the two clocks to half its length, so the shortest one of the last
+//! seconds is used; its uncertainty grows with age as the clocks drift. With the offset the autopilot's
+//! measurements are stamped with the time of the measurement instead of that of the reception, whatever the
+//! delay and the jitter of the link.
 
 use std::collections::VecDeque;
 
 const MS: i64 = 1_000_000;
-/// How often it is asked at first, and later.
+/// Period of the first requests, in nanoseconds.
 const FIRST_NS: i64 = 100 * MS;
+/// Period of later requests, in nanoseconds.
 const LATER_NS: i64 = 1_000 * MS;
-/// So many round trips are made quickly.
+/// Number of round trips at the first period.
 const FIRST: usize = 12;
-/// Round trips that are remembered, and for how long.
-const MOST: usize = 64;
+/// Maximum number of round trips kept.
+const MAX_TRIPS: usize = 64;
+/// Time for which a round trip is kept, in nanoseconds.
 const WINDOW_NS: i64 = 30_000 * MS;
-/// Questions that wait for their answers.
-const MOST_ASKED: usize = 16;
-/// A longer round trip tells nothing.
-const LONGEST_NS: i64 = 200 * MS;
-/// What two clocks drift apart at most: 100 parts in a million.
+/// Maximum number of requests without a reply.
+const MAX_REQUESTS: usize = 16;
+/// Maximum length of a round trip that is used, in nanoseconds.
+const MAX_TRIP_NS: i64 = 200 * MS;
+/// Maximum drift between two clocks: 100 ppm.
 const DRIFT: f64 = 1e-4;
-/// What a clock may be read wrong by.
+/// Error of reading a clock, in nanoseconds.
 const SLACK_NS: i64 = 2 * MS;
-/// So many contradictions in a row mean that a clock was set.
+/// Consecutive contradictions after which a clock counts as reset.
 const CONTRADICTIONS: u32 = 3;
-/// What was measured longer ago than this is not told by a live link.
-const OLDEST_NS: i64 = 1_000 * MS;
+/// Maximum age of a measurement on arrival over a live link, in nanoseconds.
+const MAX_AGE_NS: i64 = 1_000 * MS;
 
-/// The difference of the two clocks.
+/// The offset of the two clocks.
 #[derive(Clone, Debug, Default)]
 pub struct Clock {
-    asked: VecDeque<i64>,
+    requests: VecDeque<i64>,
     due_ns: i64,
     trips: VecDeque<Trip>,
     contradictions: u32,
 }
 
-/// One question and its answer.
+/// One request and its reply.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 struct Trip {
     at_ns: i64,
@@ -47,29 +51,29 @@ struct Trip {
 }
 
 impl Clock {
-    /// The question to send now, if one is due: its `ts1`.
-    pub fn ask(&mut self, now_ns: i64) -> Option<i64> {
+    /// The request to send now, if one is due: its `ts1`.
+    pub fn request(&mut self, now_ns: i64) -> Option<i64> {
         if now_ns < self.due_ns {
             return None;
         }
         let pause_ns = if self.trips.len() < FIRST { FIRST_NS } else { LATER_NS };
         self.due_ns = now_ns.saturating_add(pause_ns);
-        if self.asked.len() >= MOST_ASKED {
-            self.asked.pop_front();
+        if self.requests.len() >= MAX_REQUESTS {
+            self.requests.pop_front();
         }
-        self.asked.push_back(now_ns);
+        self.requests.push_back(now_ns);
         Some(now_ns)
     }
 
-    /// Takes an answer that was received at `now_ns`: their time and the question's `ts1`. False when it is no answer
-    /// to a question of ours, or was under way too long.
+    /// Handles a reply received at `now_ns`: their time and the request's `ts1`. False when it is not a reply
+    /// to a request of ours, or took too long.
     pub fn answered(&mut self, now_ns: i64, theirs_ns: i64, ts1_ns: i64) -> bool {
-        let Some(index) = self.asked.iter().position(|asked| *asked == ts1_ns) else {
+        let Some(index) = self.requests.iter().position(|requests| *requests == ts1_ns) else {
             return false;
         };
-        self.asked.remove(index);
+        self.requests.remove(index);
         let length_ns = now_ns.saturating_sub(ts1_ns);
-        if !(0..=LONGEST_NS).contains(&length_ns) || theirs_ns <= 0 {
+        if !(0..=MAX_TRIP_NS).contains(&length_ns) || theirs_ns <= 0 {
             return false;
         }
         let offset_ns = theirs_ns.saturating_sub(ts1_ns.saturating_add(length_ns / 2));
@@ -82,34 +86,34 @@ impl Clock {
             self.trips.clear();
         }
         self.contradictions = 0;
-        if self.trips.len() >= MOST {
+        if self.trips.len() >= MAX_TRIPS {
             self.trips.pop_front();
         }
         self.trips.push_back(trip);
         true
     }
 
-    /// The autopilot restarted: everything begins anew.
+    /// The autopilot restarted: starts again.
     pub fn restart(&mut self) {
         *self = Self::default();
     }
 
-    /// The length of the round trip that is believed, in ns; `None` while there is none.
+    /// The length of the round trip in use, in ns; `None` while there is none.
     pub fn round_trip_ns(&self, now_ns: i64) -> Option<i64> {
         self.best(now_ns).map(|trip| trip.length_ns)
     }
 
-    /// By our clock, when the autopilot's showed `boot_ms` milliseconds, for what was received at `now_ns`; `None`
-    /// while the clocks are not known, and for a moment that no live link tells of.
+    /// The time by our clock at which the autopilot's showed `boot_ms` milliseconds, for a message received
+    /// at `now_ns`; `None` while the offset is unknown, and for a time that is too old for a live link.
     pub fn stamp_ns(&self, now_ns: i64, boot_ms: u32) -> Option<i64> {
         let offset_ns = self.best(now_ns)?.offset_ns;
         let theirs_ns = now_ns.checked_add(offset_ns)?;
-        // The counter of milliseconds begins again after 49 days, so only the difference counts. It is cut off, half a
-        // millisecond too early in the mean.
+        // The counter of milliseconds wraps after 49 days, so only the difference counts. It is truncated,
+        // half a millisecond too early on average.
         let ahead_ms = boot_ms.wrapping_sub((theirs_ns / MS) as u32).cast_signed();
         let measured_ns = (theirs_ns / MS + i64::from(ahead_ms)) * MS + MS / 2;
         let stamp_ns = measured_ns.checked_sub(offset_ns)?;
-        let is_live = stamp_ns >= now_ns - OLDEST_NS && stamp_ns <= now_ns + SLACK_NS;
+        let is_live = stamp_ns >= now_ns - MAX_AGE_NS && stamp_ns <= now_ns + SLACK_NS;
         is_live.then_some(stamp_ns.min(now_ns))
     }
 
@@ -121,13 +125,13 @@ impl Clock {
 }
 
 impl Trip {
-    /// How wrong it may be, twice; smaller is better.
+    /// Twice its uncertainty.
     fn worth_ns(&self, now_ns: i64) -> i64 {
         let age_ns = now_ns.saturating_sub(self.at_ns).max(0);
         self.length_ns.saturating_add((2.0 * DRIFT * age_ns as f64) as i64)
     }
 
-    /// True when both cannot be true of two clocks that run on.
+    /// True when two round trips contradict each other for clocks without a reset.
     fn contradicts(&self, later: &Self) -> bool {
         let apart_ns = later.offset_ns.abs_diff(self.offset_ns);
         let allowed_ns = self.worth_ns(later.at_ns) / 2 + later.length_ns / 2 + SLACK_NS;
@@ -145,12 +149,12 @@ mod tests {
         let (mut clock, mut now_ns) = (Clock::default(), 1_000 * MS);
         for i in 0..count {
             let (there, back) = ways_ms[i % ways_ms.len()];
-            while clock.ask(now_ns).is_none() {
+            while clock.request(now_ns).is_none() {
                 now_ns += 10 * MS;
             }
-            let asked_ns = now_ns;
+            let request_ns = now_ns;
             now_ns += (there + back) * MS;
-            clock.answered(now_ns, asked_ns + there * MS + ahead_ns, asked_ns);
+            clock.answered(now_ns, request_ns + there * MS + ahead_ns, request_ns);
         }
         (clock, now_ns)
     }
@@ -168,7 +172,7 @@ mod tests {
             let measured_ns = now_ns - age_ms * MS;
             let boot_ms = ((measured_ns + ahead_ns) / MS) as u32;
             let Some(stamp_ns) = clock.stamp_ns(now_ns, boot_ms) else {
-                // Only what would lie in the future, or too long ago, is not told.
+                // Only times in the future, or too long ago, are unknown.
                 prop_assert!(age_ms * 2 <= shortest_ms || age_ms * 2 + shortest_ms > 1_990);
                 return Ok(());
             };
@@ -184,7 +188,7 @@ mod tests {
         ) {
             let mut clock = Clock::default();
             for (now_ns, theirs_ns, ts1_ns) in told {
-                clock.ask(now_ns);
+                clock.request(now_ns);
                 clock.answered(now_ns, theirs_ns, ts1_ns);
                 clock.answered(now_ns, theirs_ns, now_ns);
                 if let Some(stamp_ns) = clock.stamp_ns(1_000 * MS, boot_ms) {
@@ -217,7 +221,7 @@ mod tests {
     fn a_clock_that_was_set_is_believed_after_a_while() {
         let (mut clock, mut now_ns) = synchronised(&[(1, 1)], 20, 0);
         let trip = |clock: &mut Clock, now_ns: &mut i64| {
-            while clock.ask(*now_ns).is_none() {
+            while clock.request(*now_ns).is_none() {
                 *now_ns += 10 * MS;
             }
             *now_ns += 2 * MS;
@@ -233,6 +237,6 @@ mod tests {
         assert_eq!(Clock::default().stamp_ns(1_000 * MS, 1_000), None);
         let (clock, now_ns) = synchronised(&[(1, 1)], 20, 0);
         assert!(clock.stamp_ns(now_ns + WINDOW_NS + MS, 0).is_none());
-        assert!(!Clock::default().answered(2 * MS, MS, MS), "nobody asked");
+        assert!(!Clock::default().answered(2 * MS, MS, MS), "without a request");
     }
 }

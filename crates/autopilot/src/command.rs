@@ -1,4 +1,4 @@
-//! What an autopilot can be asked to do, and why it may not happen.
+//! Commands to the autopilot, and why they may fail.
 
 use std::fmt;
 use std::time::Duration;
@@ -7,14 +7,14 @@ use crate::dialect::{COMMAND_LONG_DATA, MavCmd, MavResult};
 use crate::mode::{Firmware, FlightMode};
 use crate::state::{LandedState, VehicleState};
 
-/// Something asked of the autopilot.
+/// A command to the autopilot.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub enum Command {
     /// Change the flight mode; done when the heartbeat shows it.
     SetMode(FlightMode),
-    /// Let the motors turn; done when the heartbeat shows it.
+    /// Arm the motors; done when the heartbeat shows it.
     Arm,
-    /// Stop the motors; refused in the air; done when the heartbeat shows it.
+    /// Disarm the motors; refused in the air; done when the heartbeat shows it.
     Disarm,
     /// Climb to this height in m above the ground, in GUIDED and armed; done when it is accepted.
     Takeoff {
@@ -23,102 +23,104 @@ pub enum Command {
     },
 }
 
-/// Names one request.
+/// The id of a request.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct CommandId(pub(crate) u64);
 
-/// How a request stands.
+/// The status of a request.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CommandStatus {
-    /// On its way.
+    /// Not finished.
     Pending,
     /// Done, as its [`Command`] defines it.
     Done,
-    /// Not done, and not being tried any more.
+    /// Failed, and not repeated.
     Failed(CommandError),
-    /// So long ago that it is forgotten.
+    /// Too old: no longer known.
     Unknown,
 }
 
 /// Why a command was not carried out, and what to do about it.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum CommandError {
-    /// There is no autopilot, or no more.
+    /// No autopilot.
     #[error(
         "{command}: no heartbeat of an autopilot; check the power, the cable and the address of the link"
     )]
     NoAutopilot {
-        /// What was asked.
+        /// The command.
         command: Command,
     },
-    /// This firmware is not flown.
-    #[error("{command}: the vehicle runs {firmware}; only copters with ArduPilot or PX4 are flown")]
+    /// The firmware is not supported.
+    #[error(
+        "{command}: the vehicle runs {firmware}; only copters with ArduPilot or PX4 are supported"
+    )]
     Unsupported {
-        /// What was asked.
+        /// The command.
         command: Command,
-        /// What flies the vehicle.
+        /// The vehicle's firmware.
         firmware: Firmware,
     },
-    /// The command makes no sense.
+    /// The command is invalid.
     #[error("{command}: {problem}")]
     Invalid {
-        /// What was asked.
+        /// The command.
         command: Command,
-        /// What is wrong with it.
+        /// The problem.
         problem: &'static str,
     },
-    /// The autopilot was heard but did not answer.
+    /// Heartbeats are received, but no acknowledgement.
     #[error(
-        "{command}: no answer to {attempts} requests; the link carries packets from the autopilot, check \
-         that it also carries packets to it"
+        "{command}: no acknowledgement of {attempts} requests; packets from the autopilot arrive, check \
+         that packets to it do"
     )]
     NoAnswer {
-        /// What was asked.
+        /// The command.
         command: Command,
-        /// How often.
+        /// Number of attempts.
         attempts: u32,
     },
-    /// The autopilot said no.
-    #[error("{command}: the autopilot refused it ({}){}; {}", result_in_words(*result), reason(said), advice(command))]
+    /// The autopilot refused.
+    #[error("{command}: the autopilot refused it ({}){}; {}", result_text(*result), reason(texts), advice(command))]
     Refused {
-        /// What was asked.
+        /// The command.
         command: Command,
-        /// Its answer.
+        /// Its result.
         result: MavResult,
-        /// What it said at the same time, `Arm: ...` for example; may be empty.
-        said: Vec<String>,
+        /// Its texts at the same time, `Arm: ...` for example; may be empty.
+        texts: Vec<String>,
     },
-    /// The autopilot said yes, and yet nothing changed.
+    /// The autopilot accepted, and nothing changed.
     #[error(
-        "{command}: accepted, but the heartbeat still shows {seen} after {} s; somebody else may command the vehicle",
+        "{command}: accepted, but the heartbeat still shows {seen} after {} s; another station may command the vehicle",
         waited.as_secs_f32()
     )]
     NotConfirmed {
-        /// What was asked.
+        /// The command.
         command: Command,
-        /// What the vehicle does instead.
+        /// What the heartbeat shows instead.
         seen: String,
-        /// For how long the change was waited for.
+        /// Time waited for the change.
         waited: Duration,
     },
-    /// A later command took its place.
+    /// A later command replaced it.
     #[error("{command}: replaced by {by}")]
     Replaced {
-        /// What was asked.
+        /// The command.
         command: Command,
-        /// What was asked later.
+        /// The later command.
         by: Command,
     },
-    /// Nobody wants it any more.
-    #[error("{command}: withdrawn before it was done, because somebody else decides now")]
+    /// It was withdrawn.
+    #[error("{command}: withdrawn before it was done")]
     Withdrawn {
-        /// What was asked.
+        /// The command.
         command: Command,
     },
-    /// The autopilot restarted in between.
+    /// The autopilot restarted.
     #[error("{command}: the autopilot restarted")]
     Restarted {
-        /// What was asked.
+        /// The command.
         command: Command,
     },
 }
@@ -126,23 +128,23 @@ pub enum CommandError {
 /// Why a velocity setpoint was not sent.
 #[derive(Copy, Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SetpointError {
-    /// The heartbeat is not heard.
+    /// No heartbeat.
     #[error("velocity not sent: no heartbeat of an autopilot")]
     NoAutopilot,
-    /// This firmware is not flown.
+    /// The firmware is not supported.
     #[error(
-        "velocity not sent: the vehicle runs {0}; only copters with ArduPilot or PX4 are flown"
+        "velocity not sent: the vehicle runs {0}; only copters with ArduPilot or PX4 are supported"
     )]
     Unsupported(Firmware),
-    /// A number is infinite or not a number, which ArduPilot takes for a stop.
+    /// A number is not finite, which ArduPilot would take for a stop.
     #[error("velocity not sent: {0:?} m/s with {1} rad/s of yaw is not finite")]
     NotFinite([f64; 3], f64),
-    /// Somebody else flies.
+    /// The pilot flies.
     #[error(
         "velocity not sent: the vehicle is in {0}, which follows no setpoints; the pilot is in command"
     )]
     NotGuided(FlightMode),
-    /// A setpoint now would end the takeoff or do nothing.
+    /// A setpoint would end the takeoff or have no effect.
     #[error("velocity not sent: the vehicle is not armed and in the air ({0})")]
     NotFlying(LandedState),
 }
@@ -158,8 +160,8 @@ impl fmt::Display for Command {
     }
 }
 
-/// The result of a command, for people.
-pub fn result_in_words(result: MavResult) -> &'static str {
+/// The result of a command, as text.
+pub fn result_text(result: MavResult) -> &'static str {
     match result {
         MavResult::MAV_RESULT_ACCEPTED => "accepted",
         MavResult::MAV_RESULT_TEMPORARILY_REJECTED => "not now",
@@ -172,8 +174,8 @@ pub fn result_in_words(result: MavResult) -> &'static str {
     }
 }
 
-fn reason(said: &[String]) -> String {
-    if said.is_empty() { String::new() } else { format!(": {}", said.join("; ")) }
+fn reason(texts: &[String]) -> String {
+    if texts.is_empty() { String::new() } else { format!(": {}", texts.join("; ")) }
 }
 
 fn advice(command: &Command) -> &'static str {
@@ -188,7 +190,7 @@ fn advice(command: &Command) -> &'static str {
 }
 
 impl Command {
-    /// The message that asks for it. `ground_amsl_m` is the altitude over the sea, in m, of where the vehicle stands:
+    /// The message of the command. `ground_amsl_m` is the altitude above mean sea level of the ground, in m:
     /// PX4 takes off to an altitude.
     pub(crate) fn message(&self, attempt: u32, ground_amsl_m: Option<f64>) -> COMMAND_LONG_DATA {
         let mut message = COMMAND_LONG_DATA {
@@ -198,7 +200,7 @@ impl Command {
         };
         match *self {
             Self::SetMode(mode) => {
-                // MAV_MODE_FLAG_CUSTOM_MODE_ENABLED: what follows is the firmware's own mode.
+                // MAV_MODE_FLAG_CUSTOM_MODE_ENABLED: the firmware's own mode follows.
                 message.param1 = 1.0;
                 if let FlightMode::Px4(number) = mode {
                     let [_, _, main, sub] = number.to_le_bytes();
@@ -211,7 +213,7 @@ impl Command {
             Self::Arm => message.param1 = 1.0,
             Self::Disarm => {}
             Self::Takeoff { height_m } => match ground_amsl_m {
-                // Not a number: the present heading, latitude and longitude.
+                // NaN: the present heading, latitude and longitude.
                 Some(ground_m) => {
                     message.param4 = f32::NAN;
                     message.param5 = f32::NAN;
@@ -236,12 +238,12 @@ impl Command {
         self.number() == command
     }
 
-    /// Whether both are about the same thing, so that the later one takes the earlier one's place.
+    /// Whether the later of both replaces the earlier one.
     pub(crate) fn concerns_same_as(&self, other: &Self) -> bool {
         self.number() == other.number()
     }
 
-    /// Whether the vehicle's own report shows that it happened.
+    /// Whether the vehicle's state shows that it is done.
     pub(crate) fn is_shown_by(&self, state: &VehicleState) -> bool {
         match self {
             Self::SetMode(mode) => state.mode == *mode,
@@ -251,7 +253,7 @@ impl Command {
         }
     }
 
-    /// Whether an acknowledgement alone is enough.
+    /// Whether the acknowledgement alone is enough.
     pub(crate) fn is_done_when_accepted(&self) -> bool {
         matches!(self, Self::Takeoff { .. })
     }
@@ -269,7 +271,7 @@ impl Command {
     }
 }
 
-/// A command on its way.
+/// A pending command.
 #[derive(Clone, Debug)]
 pub(crate) struct Request {
     pub(crate) id: CommandId,
@@ -277,45 +279,45 @@ pub(crate) struct Request {
     phase: Phase,
     attempts: u32,
     began_ns: i64,
-    said: Vec<String>,
+    texts: Vec<String>,
 }
 
 #[derive(Copy, Clone, Debug)]
 enum Phase {
     /// To be sent at this time.
     Due(i64),
-    /// Sent; an answer is waited for until then.
+    /// Sent; the acknowledgement is awaited until then.
     Sent(i64),
-    /// Accepted; the change is waited for until then.
+    /// Accepted; the change is awaited until then.
     Accepted(i64),
-    /// Refused; what the autopilot says about it is collected until then.
+    /// Refused; the autopilot's texts are collected until then.
     Refused(MavResult, i64),
 }
 
-/// What a request needs next.
+/// The next step of a request.
 pub(crate) enum Step {
     Wait,
     Send(Command, u32),
     Finish(Result<(), CommandError>),
 }
 
-/// How long commands are tried.
+/// Timeouts of commands.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct Patience {
-    /// How long an acknowledgement may take.
-    pub answer: Duration,
-    /// How often a command is sent when no acknowledgement comes.
+pub struct Timeouts {
+    /// Timeout of an acknowledgement.
+    pub acknowledgement: Duration,
+    /// Maximum number of attempts without an acknowledgement.
     pub attempts: u32,
-    /// How long an accepted change may take to show; a heartbeat comes once a second.
+    /// Timeout of the change after acceptance; a heartbeat comes once a second.
     pub confirmation: Duration,
-    /// How long reasons are collected after a refusal; they come after it.
+    /// Time for which texts are collected after a refusal; they come after it.
     pub explanation: Duration,
 }
 
-impl Default for Patience {
+impl Default for Timeouts {
     fn default() -> Self {
         Self {
-            answer: Duration::from_secs(1),
+            acknowledgement: Duration::from_secs(1),
             attempts: 4,
             confirmation: Duration::from_secs(3),
             explanation: Duration::from_millis(300),
@@ -323,8 +325,8 @@ impl Default for Patience {
     }
 }
 
-/// More of the autopilot's words than this is no explanation.
-const MAX_SAID: usize = 8;
+/// Maximum number of texts kept as an explanation.
+const MAX_TEXTS: usize = 8;
 
 impl Request {
     pub(crate) fn new(id: CommandId, command: Command, now_ns: i64) -> Self {
@@ -334,66 +336,66 @@ impl Request {
             phase: Phase::Due(now_ns),
             attempts: 0,
             began_ns: now_ns,
-            said: Vec::new(),
+            texts: Vec::new(),
         }
     }
 
-    /// The same was asked for once more: what was not answered is sent again now; what was accepted has until the next
-    /// heartbeat to show.
-    pub(crate) fn ask_again(&mut self, now_ns: i64) {
+    /// The same was requested again: without an acknowledgement it is sent again now; after one the timeout
+    /// of the change stays.
+    pub(crate) fn repeat(&mut self, now_ns: i64) {
         if matches!(self.phase, Phase::Sent(_)) {
             self.phase = Phase::Due(now_ns);
         }
     }
 
-    /// The autopilot said something while this was under way.
-    pub(crate) fn hear(&mut self, text: &str) {
+    /// The autopilot sent a text while this was pending.
+    pub(crate) fn add_text(&mut self, text: &str) {
         let about_arming = is_about_arming(text);
         if about_arming && self.command != Command::Arm {
             return;
         }
-        if about_arming && !self.said.iter().any(|said| is_about_arming(said)) {
-            // It names the reason, so what was said before is about something else.
-            self.said.clear();
+        if about_arming && !self.texts.iter().any(|text| is_about_arming(text)) {
+            // It names the reason, so earlier texts are about something else.
+            self.texts.clear();
         }
-        let needed = about_arming || !self.said.iter().any(|said| is_about_arming(said));
+        let needed = about_arming || !self.texts.iter().any(|text| is_about_arming(text));
         if needed
             && self.attempts > 0
-            && self.said.len() < MAX_SAID
-            && !self.said.iter().any(|s| s == text)
+            && self.texts.len() < MAX_TEXTS
+            && !self.texts.iter().any(|s| s == text)
         {
-            self.said.push(text.to_owned());
+            self.texts.push(text.to_owned());
         }
     }
 
-    /// The autopilot answered.
-    pub(crate) fn answer(&mut self, now_ns: i64, result: MavResult, patience: &Patience) {
+    /// The autopilot acknowledged.
+    pub(crate) fn acknowledge(&mut self, now_ns: i64, result: MavResult, timeouts: &Timeouts) {
         let after = |wait: Duration| now_ns.saturating_add(ns(wait));
         self.phase = match (self.phase, result) {
-            // An answer to an earlier attempt changes nothing any more.
+            // An acknowledgement of an earlier attempt changes nothing.
             (Phase::Accepted(_) | Phase::Refused(..) | Phase::Due(_), _) => return,
-            (_, MavResult::MAV_RESULT_ACCEPTED) => Phase::Accepted(after(patience.confirmation)),
-            (_, MavResult::MAV_RESULT_IN_PROGRESS) => Phase::Sent(after(patience.confirmation)),
+            (_, MavResult::MAV_RESULT_ACCEPTED) => Phase::Accepted(after(timeouts.confirmation)),
+            (_, MavResult::MAV_RESULT_IN_PROGRESS) => Phase::Sent(after(timeouts.confirmation)),
             (_, MavResult::MAV_RESULT_TEMPORARILY_REJECTED)
-                if self.attempts < patience.attempts =>
+                if self.attempts < timeouts.attempts =>
             {
-                Phase::Due(after(patience.answer))
+                Phase::Due(after(timeouts.acknowledgement))
             }
-            (_, refusal) => Phase::Refused(refusal, after(patience.explanation)),
+            (_, refusal) => Phase::Refused(refusal, after(timeouts.explanation)),
         };
     }
 
-    pub(crate) fn step(&mut self, now_ns: i64, state: &VehicleState, patience: &Patience) -> Step {
+    pub(crate) fn step(&mut self, now_ns: i64, state: &VehicleState, timeouts: &Timeouts) -> Step {
         let command = self.command;
         let sent = self.attempts > 0;
         if command.is_shown_by(state) && (sent || !command.is_done_when_accepted()) {
             return Step::Finish(Ok(()));
         }
         match self.phase {
-            Phase::Due(at) if now_ns >= at => self.send(now_ns, patience),
+            Phase::Due(at) if now_ns >= at => self.send(now_ns, timeouts),
             Phase::Sent(until) if now_ns >= until => {
-                if self.attempts < patience.attempts {
-                    return self.send(now_ns, patience);
+                if self.attempts < timeouts.attempts {
+                    return self.send(now_ns, timeouts);
                 }
                 Step::Finish(Err(CommandError::NoAnswer { command, attempts: self.attempts }))
             }
@@ -409,21 +411,21 @@ impl Request {
                 Step::Finish(Err(CommandError::NotConfirmed { command, seen, waited }))
             }
             Phase::Refused(result, until) if now_ns >= until => {
-                let said = std::mem::take(&mut self.said);
-                Step::Finish(Err(CommandError::Refused { command, result, said }))
+                let texts = std::mem::take(&mut self.texts);
+                Step::Finish(Err(CommandError::Refused { command, result, texts }))
             }
             _ => Step::Wait,
         }
     }
 
-    fn send(&mut self, now_ns: i64, patience: &Patience) -> Step {
+    fn send(&mut self, now_ns: i64, timeouts: &Timeouts) -> Step {
         self.attempts += 1;
-        self.phase = Phase::Sent(now_ns.saturating_add(ns(patience.answer)));
+        self.phase = Phase::Sent(now_ns.saturating_add(ns(timeouts.acknowledgement)));
         Step::Send(self.command, self.attempts)
     }
 }
 
-/// How ArduPilot begins the reasons why it does not arm.
+/// True for ArduPilot's reasons not to arm.
 fn is_about_arming(text: &str) -> bool {
     text.starts_with("Arm: ") || text.starts_with("PreArm: ")
 }

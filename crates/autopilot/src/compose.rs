@@ -8,9 +8,9 @@ use crate::dialect::{
     SET_POSITION_TARGET_LOCAL_NED_DATA, STATUSTEXT_DATA,
 };
 
-/// Bytes of text in one packet.
+/// Maximum length of the text in one packet, in bytes.
 const PART: usize = 50;
-/// A longer text is cut.
+/// Maximum number of packets of one text; longer texts are cut.
 const MAX_PARTS: usize = 10;
 
 /// The heartbeat of a companion computer.
@@ -27,10 +27,10 @@ pub fn heartbeat() -> MavMessage {
 
 /// A text for the ground station's message window, in as many packets as it needs.
 ///
-/// `id` joins the packets of one text: take another number from 1 to 65535 for each text.
+/// `id` joins the packets of one text: a different number from 1 to 65535 for each text.
 pub fn status_text(severity: MavSeverity, text: &str, id: u16) -> Vec<MavMessage> {
-    // Every part but the last is full, because a part that is not full is the end: so a character may be cut in two,
-    // and an empty part ends a text that fills its last one.
+    // A part that is not full ends the text: so all others are full, a character may be split, and an empty
+    // part ends a text that fills its last one.
     let mut parts: Vec<&[u8]> = text.trim_end().as_bytes().chunks(PART).take(MAX_PARTS).collect();
     let id = if parts.len() > 1 { id.max(1) } else { 0 };
     if parts.len() > 1 && parts.last().is_some_and(|last| last.len() >= PART) {
@@ -45,10 +45,10 @@ pub fn status_text(severity: MavSeverity, text: &str, id: u16) -> Vec<MavMessage
     parts.into_iter().enumerate().map(packet).collect()
 }
 
-/// A velocity in m/s, with a yaw rate in rad/s that holds the heading when it is nought.
+/// A velocity setpoint in m/s, with a yaw rate in rad/s; zero holds the heading.
 ///
-/// Type mask 1479: position, acceleration and yaw are ignored. With the yaw rate ignored as well, ArduPilot would turn
-/// the nose into the direction of travel.
+/// Type mask 1479: position, acceleration and yaw are ignored. With the yaw rate ignored as well, ArduPilot
+/// would turn the nose into the direction of travel.
 pub fn velocity(
     time_ms: u32,
     velocity: Vector<Ned>,
@@ -71,7 +71,8 @@ pub fn velocity(
 
 /// The landing target at a place in the body frame (m from the vehicle's origin): needs no rangefinder.
 ///
-/// `time_usec` is the capture time by one steady clock. `None` when a number is not finite or the target is not below.
+/// `time_usec` is the capture time by one steady clock. `None` when a number is not finite or the target is
+/// not below.
 pub fn landing_target_position(time_usec: u64, target: Point<Body>) -> Option<MavMessage> {
     let sight = target - Point::origin();
     let (angle_x, angle_y) = angles(sight)?;
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn px4_is_told_a_place_and_nothing_else() {
+    fn px4_gets_a_position_and_nothing_else() {
         let message = landing_target_local(7, Point::new(1.0, 2.0, -0.5)).unwrap();
         let MavMessage::LANDING_TARGET(target) = message else { unreachable!() };
         assert_eq!((target.frame as u8, target.position_valid.bits(), target.time_usec), (1, 1, 7));

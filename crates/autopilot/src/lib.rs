@@ -1,16 +1,19 @@
 //! The link to the autopilot, and the only crate that knows MAVLink.
 //!
-//! It finds an autopilot on a serial line or a socket, requests the messages that landing needs, reports the vehicle's
-//! state in this project's types, and sends it commands with acknowledgement, time limit and clear errors. ArduPilot
-//! Copter and PX4 multicopters are supported; both were flown in their own simulators (PX4 1.17).
+//! It finds an autopilot on a serial line or a socket, requests the messages that landing needs, reports the
+//! vehicle's state in this project's types, and sends it commands with acknowledgement, time limit and clear
+//! errors. ArduPilot Copter and PX4 multicopters are supported; both were flown in their own simulators (PX4
+//! 1.17).
 //!
-//! Everything but [`link`] is a pure state machine that takes the time as an argument (nanoseconds of any monotonic
-//! clock) and does no input or output. The crate knows nothing of markers, of landing or of other processes.
+//! Everything but [`link`] is a pure state machine that takes the time as an argument (nanoseconds of any
+//! monotonic clock) and does no input or output. The crate knows nothing of markers, of landing or of other
+//! processes.
 //!
-//! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it, [`packet`]
-//! finds MAVLink packets in them, [`mode`], [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts
-//! its time stamps, [`client`] is the conversation with it, [`command`] is what can be requested and why it may fail,
-//! [`takeoff`] arms the vehicle and takes off, [`compose`] makes the messages that a companion sends.
+//! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it,
+//! [`packet`] finds MAVLink packets in them, [`mode`], [`state`] and [`parameter`] are what the vehicle
+//! reports, [`clock`] converts its time stamps, [`client`] is the conversation with it, [`command`] is what
+//! can be requested and why it may fail, [`takeoff`] arms the vehicle and takes off, [`compose`] makes the
+//! messages that a companion sends.
 
 pub mod address;
 pub mod client;

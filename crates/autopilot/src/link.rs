@@ -1,8 +1,9 @@
-//! Bytes to and from the autopilot over UDP, TCP or a serial line, for ever.
+//! The link to the autopilot over UDP, TCP or a serial line.
 //!
-//! What cannot heal (a port held by another program) is an error at once; what can (no device yet, nobody answers,
-//! a cable pulled) is retried for ever. Nothing here waits for a slow reader or a slow line: queues are bounded, the
-//! newest packet received wins, and a packet that cannot be sent is refused, because a late command is a wrong one.
+//! A permanent problem (a port used by another program) is an error at once; a temporary one (no device yet,
+//! no reply, a cable pulled) is retried for ever. Slow readers and slow lines block nothing: queues are
+//! bounded, the oldest received packet is dropped, and a packet that cannot be sent is refused, because a
+//! late command is a wrong one.
 
 use std::collections::VecDeque;
 use std::io;
@@ -22,27 +23,30 @@ use crate::address::{Address, Endpoint};
 use crate::dialect::{MavAutopilot, MavMessage};
 use crate::packet::{Counters, Packet, Parser};
 
-/// Packets received and not yet read, about 4 s of an autopilot's talk.
+/// Maximum number of packets received and not yet read, about 4 s of an autopilot's traffic.
 const INCOMING: usize = 1024;
-/// Packets to be sent and not yet taken by the line.
+/// Maximum number of packets waiting to be sent.
 const OUTGOING: usize = 256;
-/// Packets that may wait when one is sent that is of less account.
+/// Maximum number of waiting packets for another one of low priority.
 const SPARE: usize = 8;
+/// Pause before the first retry; it doubles up to the last.
 const FIRST_RETRY: Duration = Duration::from_millis(200);
+/// Maximum pause between two retries.
 const LAST_RETRY: Duration = Duration::from_secs(2);
-/// How long opening a connection may take.
+/// Timeout of opening a connection.
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
-/// How long the line may take to accept one packet.
+/// Timeout of writing one packet.
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
-/// After this silence the beginning of a packet has no end any more.
+/// Silence after which an incomplete packet is discarded.
 const PACKET_GAP: Duration = Duration::from_millis(200);
-/// A TCP connection on which an autopilot says nothing for so long is dead, though TCP does not notice.
+/// Silence after which a TCP connection counts as dead.
 const TCP_SILENCE: Duration = Duration::from_secs(10);
-/// A peer that was silent for so long gives way to another one.
+/// Silence after which a peer is replaced by another one.
 const PEER_SILENCE: Duration = Duration::from_secs(3);
+/// Maximum number of known UDP peers.
 const MAX_PEERS: usize = 8;
 
-/// A connection to an autopilot that repairs itself.
+/// A connection to an autopilot that reconnects by itself.
 #[derive(Debug)]
 pub struct Link {
     shared: Arc<Shared>,
@@ -58,60 +62,60 @@ pub struct LinkSender {
     queue: mpsc::Sender<Vec<u8>>,
 }
 
-/// What happens on a link.
+/// An event of a link.
 #[derive(Clone, Debug, PartialEq)]
 pub enum LinkEvent {
-    /// Packets can be sent; over `udpin` it says whom the packets now come from and go to.
+    /// Packets can be sent; over `udpin` a peer was chosen.
     Connected {
-        /// The other side, for people.
+        /// The other side, as text.
         peer: String,
     },
-    /// Packets cannot be sent; it is being retried. Said once per reason.
+    /// Packets cannot be sent; the link is retried. Reported once per reason.
     Disconnected {
-        /// Why, for people.
+        /// The reason, as text.
         reason: String,
     },
     /// A packet.
     Packet {
         /// The packet.
         packet: Box<Packet>,
-        /// When its last byte was received.
+        /// Time of reception of its last byte.
         received: Instant,
     },
 }
 
-/// Why a link cannot be opened at all.
+/// Why a link cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
-    /// Another program listens there.
+    /// Another program uses the port.
     #[error(
         "{address}: port {port} is already in use by another program, often a ground station \
          (QGroundControl, MAVProxy) or a second controller; stop that program, or listen on another \
          port and send the autopilot's packets there"
     )]
     PortInUse {
-        /// What was to be opened.
+        /// The address.
         address: Address,
-        /// The port that is taken.
+        /// The port.
         port: u16,
     },
-    /// The host to listen on belongs to another machine.
+    /// The host to listen on is not this machine.
     #[error(
         "{address}: this machine has no network address `{host}`, so it cannot listen there; \
          0.0.0.0 listens on every network, 127.0.0.1 on this machine only"
     )]
     NotLocal {
-        /// What was to be opened.
+        /// The address.
         address: Address,
-        /// The host that is not here.
+        /// The host.
         host: String,
     },
-    /// Anything else that listening may meet.
+    /// Any other error of listening.
     #[error("{address}: cannot listen there: {source}")]
     Listen {
-        /// What was to be opened.
+        /// The address.
         address: Address,
-        /// What the operating system says.
+        /// The error of the operating system.
         source: io::Error,
     },
 }
@@ -119,11 +123,11 @@ pub enum LinkError {
 /// Why a packet was not sent.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SendError {
-    /// There is nobody to send to yet, or not any more.
+    /// No connection.
     #[error("not sent: the link to the autopilot is not connected")]
     NotConnected,
-    /// The line does not keep up.
-    #[error("not sent: too many packets already wait, the line to the autopilot is too slow")]
+    /// The line is too slow.
+    #[error("not sent: the queue is full, the line to the autopilot is too slow")]
     Full,
 }
 
@@ -164,12 +168,12 @@ impl Link {
         self.sender.send(packet)
     }
 
-    /// Sends a packet of somebody else's without waiting; see [`LinkSender::send_spare`].
+    /// Sends a packet of low priority without waiting; see [`LinkSender::send_spare`].
     pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
         self.sender.send_spare(packet)
     }
 
-    /// A handle that sends over this link from elsewhere.
+    /// A handle for sending over this link.
     pub fn sender(&self) -> LinkSender {
         self.sender.clone()
     }
@@ -179,12 +183,12 @@ impl Link {
         self.local
     }
 
-    /// What was received so far, good and bad.
+    /// The parser's counters.
     pub fn counters(&self) -> Counters {
         *self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How many received packets were thrown away because nobody read them in time.
+    /// Number of received packets that were dropped because they were not read in time.
     pub fn dropped(&self) -> u64 {
         self.shared.dropped.load(Ordering::Relaxed)
     }
@@ -197,7 +201,7 @@ impl Drop for Link {
 }
 
 impl LinkSender {
-    /// Sends a packet without waiting. It is refused when there is nobody to send it to or the line is too slow, and
+    /// Sends a packet without waiting. It is refused without a connection or when the line is too slow;
     /// packets that wait when a connection breaks are not sent on the next one.
     pub fn send(&self, packet: &[u8]) -> Result<(), SendError> {
         if !self.shared.connected.load(Ordering::Acquire) {
@@ -209,7 +213,7 @@ impl LinkSender {
         })
     }
 
-    /// Sends a packet only while hardly any wait, so that whoever talks much (a ground station that reads all
+    /// Sends a packet only while few others wait, so that heavy traffic (a ground station that reads all
     /// parameters over a slow line) never delays the setpoints.
     pub fn send_spare(&self, packet: &[u8]) -> Result<(), SendError> {
         if self.queue.capacity() + SPARE < OUTGOING {
@@ -228,7 +232,7 @@ struct Shared {
     counters: Mutex<Counters>,
     opened: Instant,
     /// When bytes came last, in milliseconds since the link was opened.
-    heard_ms: AtomicU64,
+    active_ms: AtomicU64,
 }
 
 impl Shared {
@@ -240,7 +244,7 @@ impl Shared {
             dropped: AtomicU64::new(0),
             counters: Mutex::new(Counters::default()),
             opened: Instant::now(),
-            heard_ms: AtomicU64::new(0),
+            active_ms: AtomicU64::new(0),
         }
     }
 
@@ -251,7 +255,7 @@ impl Shared {
     fn push(&self, event: LinkEvent) {
         let mut events = self.events();
         if events.len() >= INCOMING {
-            // The oldest packet goes; what was said about the connection stays, unless there is nothing else.
+            // The oldest packet is dropped; events of the connection stay, unless there is nothing else.
             let oldest = events.iter().position(|event| matches!(event, LinkEvent::Packet { .. }));
             events.remove(oldest.unwrap_or(0));
             self.dropped.fetch_add(1, Ordering::Relaxed);
@@ -261,14 +265,14 @@ impl Shared {
         self.arrived.notify_one();
     }
 
-    fn hear(&self) {
+    fn mark_active(&self) {
         let now = self.opened.elapsed().as_millis().try_into().unwrap_or(u64::MAX);
-        self.heard_ms.store(now, Ordering::Relaxed);
+        self.active_ms.store(now, Ordering::Relaxed);
     }
 
     fn silence(&self) -> Duration {
-        let heard = Duration::from_millis(self.heard_ms.load(Ordering::Relaxed));
-        self.opened.elapsed().saturating_sub(heard)
+        let active = Duration::from_millis(self.active_ms.load(Ordering::Relaxed));
+        self.opened.elapsed().saturating_sub(active)
     }
 }
 
@@ -281,8 +285,8 @@ struct Port {
 impl Port {
     fn connected(&mut self, peer: String) {
         while self.outgoing.try_recv().is_ok() {}
-        self.shared.hear();
-        tracing::info!(%peer, "autopilot link connected");
+        self.shared.mark_active();
+        tracing::info!(%peer, "Link connected");
         self.shared.connected.store(true, Ordering::Release);
         self.shared.push(LinkEvent::Connected { peer });
     }
@@ -331,15 +335,15 @@ async fn listen(address: &Address) -> Result<Listener, LinkError> {
 /// Serves one connection after the other, with a pause that grows while nothing works.
 async fn run(address: Address, mut listener: Listener, mut port: Port) {
     let mut pause = FIRST_RETRY;
-    let mut said = String::new();
+    let mut last_reason = String::new();
     loop {
         let began = Instant::now();
         let (worked, reason) = serve(&address, &mut listener, &mut port).await;
         let reason = format!("{address}: {reason}");
-        if worked || reason != said {
-            tracing::warn!(%reason, "autopilot link lost, trying again");
+        if worked || reason != last_reason {
+            tracing::warn!(%reason, "Link lost, reconnecting");
             port.disconnected(reason.clone());
-            said = reason;
+            last_reason = reason;
         }
         if worked && began.elapsed() > LAST_RETRY {
             pause = FIRST_RETRY;
@@ -416,9 +420,9 @@ fn open_serial(device: &str, baud: u32) -> tokio_serial::Result<SerialStream> {
 fn explain_socket(error: &io::Error) -> String {
     match error.kind() {
         io::ErrorKind::ConnectionRefused => {
-            "nobody listens there; is the autopilot (or its simulator) running?".into()
+            "connection refused; is the autopilot (or its simulator) running?".into()
         }
-        io::ErrorKind::TimedOut => "no answer; is the autopilot switched on and in reach?".into(),
+        io::ErrorKind::TimedOut => "no reply; is the autopilot switched on and in reach?".into(),
         _ => format!("cannot reach it: {error}"),
     }
 }
@@ -427,18 +431,16 @@ fn explain_serial(device: &str, error: &tokio_serial::Error) -> String {
     use tokio_serial::ErrorKind;
     match error.kind() {
         ErrorKind::NoDevice | ErrorKind::Io(io::ErrorKind::NotFound) => {
-            format!(
-                "there is no device {device}; is the cable plugged in and the autopilot switched on?"
-            )
+            format!("no device {device}; is the cable plugged in and the autopilot switched on?")
         }
         ErrorKind::Io(io::ErrorKind::PermissionDenied) => format!(
-            "this user may not open {device}; on most systems the group `dialout` may (then log in again)"
+            "no permission to open {device}; on most systems the group `dialout` has it (then log in again)"
         ),
         _ => format!("cannot open {device} (another program may hold it): {error}"),
     }
 }
 
-/// One connection at a time; a newcomer takes the place of one that has been silent.
+/// One connection at a time; a new one replaces one that has been silent.
 async fn serve_tcp_in(listener: &TcpListener, port: &mut Port) -> (bool, String) {
     let mut next = match listener.accept().await {
         Ok(next) => next,
@@ -461,16 +463,16 @@ async fn accept_when_silent(listener: &TcpListener, shared: &Shared) -> (TcpStre
     loop {
         match listener.accept().await {
             Ok(newcomer) if shared.silence() > PEER_SILENCE => return newcomer,
-            Ok((_, peer)) => tracing::warn!(%peer, "refused: another connection is in use"),
+            Ok((_, peer)) => tracing::warn!(%peer, "Connection refused: another one is in use"),
             Err(error) => {
-                tracing::warn!(%error, "cannot accept a connection");
+                tracing::warn!(%error, "Cannot accept a connection");
                 sleep(LAST_RETRY).await;
             }
         }
     }
 }
 
-/// Moves bytes both ways until the line breaks; returns why.
+/// Moves bytes in both directions until the connection breaks; returns why.
 async fn serve_stream<S>(stream: S, port: &mut Port, silence: Option<Duration>) -> String
 where
     S: AsyncRead + AsyncWrite,
@@ -478,15 +480,15 @@ where
     let (mut reader, mut writer) = tokio::io::split(stream);
     let mut parser = Parser::new();
     let mut bytes = [0; 4096];
-    let mut heard = tokio::time::Instant::now();
+    let mut active = tokio::time::Instant::now();
     loop {
-        let patience = silence.unwrap_or(Duration::from_secs(3600));
+        let limit = silence.unwrap_or(Duration::from_secs(3600));
         tokio::select! {
             read = reader.read(&mut bytes) => match read {
                 Ok(0) => return "the other side closed the connection".into(),
                 Ok(count) => {
-                    heard = tokio::time::Instant::now();
-                    port.shared.hear();
+                    active = tokio::time::Instant::now();
+                    port.shared.mark_active();
                     let packets = parser.push(bytes.get(..count).unwrap_or(&[]));
                     port.received(packets, parser.take_counters());
                 }
@@ -500,19 +502,19 @@ where
                     Err(_) => return "the other side takes no more bytes".into(),
                 }
             }
-            () = sleep_until(heard + PACKET_GAP), if parser.is_waiting() => {
+            () = sleep_until(active + PACKET_GAP), if parser.is_waiting() => {
                 let packets = parser.finish();
                 port.received(packets, parser.take_counters());
             }
-            () = sleep_until(heard + patience), if silence.is_some() => {
-                return format!("silent for {} s", patience.as_secs());
+            () = sleep_until(active + limit), if silence.is_some() => {
+                return format!("silent for {} s", limit.as_secs());
             }
         }
     }
 }
 
-/// Moves datagrams both ways until the socket breaks; returns why. Without a `fixed` peer, the peer is whoever sends
-/// the autopilot's heartbeat.
+/// Moves datagrams in both directions until the socket breaks; returns why. Without a `fixed` peer, the peer
+/// is the sender of the autopilot's heartbeat.
 async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr>) -> String {
     let mut peers = Peers::new(fixed);
     if let Some(peer) = fixed {
@@ -531,7 +533,7 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                     }
                     port.received(packets, counted);
                 }
-                // A datagram of ours found nobody: the other side is not running yet, or not now.
+                // A datagram of ours had no receiver: the other side is not running.
                 Err(error) if is_refusal(&error) => {}
                 Err(error) => return format!("receiving failed: {error}"),
             },
@@ -542,7 +544,7 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                     (None, Some(peer)) => socket.send_to(&packet, peer).await,
                     (None, None) => continue,
                 };
-                // A network that is away for a moment comes back; the packet is as good as lost in the air.
+                // A network may be away for a moment; the packet counts as lost.
                 if let Err(error) = sent {
                     tracing::debug!(%error, "datagram not sent");
                 }
@@ -555,7 +557,7 @@ fn is_refusal(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::ConnectionRefused | io::ErrorKind::ConnectionReset)
 }
 
-/// Those who send to a UDP port, each with its own stream of packets.
+/// The senders to a UDP port, each with its own stream of packets.
 struct Peers {
     known: Vec<Peer>,
     chosen: Option<SocketAddr>,
@@ -564,8 +566,8 @@ struct Peers {
 struct Peer {
     address: SocketAddr,
     parser: Parser,
-    heard: Instant,
-    /// When the heartbeat of an autopilot came from there last.
+    active: Instant,
+    /// Time of the last autopilot heartbeat from there.
     autopilot: Option<Instant>,
 }
 
@@ -574,28 +576,28 @@ impl Peers {
         Self { known: Vec::new(), chosen }
     }
 
-    /// Takes a datagram and returns its packets if they come from the chosen peer.
+    /// Parses a datagram and returns its packets if they come from the chosen peer.
     fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> (Vec<Packet>, Counters) {
         let peer = self.peer(from, now);
-        if now.duration_since(peer.heard) > PACKET_GAP {
-            // What began so long ago has lost its end.
+        if now.duration_since(peer.active) > PACKET_GAP {
+            // The rest of an incomplete packet is lost.
             peer.parser.finish();
         }
-        peer.heard = now;
+        peer.active = now;
         let packets = peer.parser.push(bytes);
         let counted = peer.parser.take_counters();
         let is_autopilot = packets.iter().any(is_autopilot_heartbeat);
         if is_autopilot {
             peer.autopilot = Some(now);
         }
-        if !packets.is_empty() && self.chosen != Some(from) && self.gives_way(is_autopilot, now) {
+        if !packets.is_empty() && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
             self.chosen = Some(from);
         }
         (if self.chosen == Some(from) { packets } else { Vec::new() }, counted)
     }
 
-    /// Whether the chosen peer gives way to one that just sent a packet.
-    fn gives_way(&self, to_autopilot: bool, now: Instant) -> bool {
+    /// Whether the chosen peer is replaced by one that just sent a packet.
+    fn is_replaced(&self, to_autopilot: bool, now: Instant) -> bool {
         let recent = |at: Instant| now.duration_since(at) <= PEER_SILENCE;
         let Some(chosen) = self.chosen else { return true };
         let Some(chosen) = self.known.iter().find(|peer| peer.address == chosen) else {
@@ -603,7 +605,7 @@ impl Peers {
         };
         match chosen.autopilot {
             Some(at) => to_autopilot && !recent(at),
-            None => to_autopilot || !recent(chosen.heard),
+            None => to_autopilot || !recent(chosen.active),
         }
     }
 
@@ -615,7 +617,7 @@ impl Peers {
                 self.known.push(Peer {
                     address,
                     parser: Parser::new(),
-                    heard: now,
+                    active: now,
                     autopilot: None,
                 });
                 self.known.len() - 1
@@ -624,19 +626,19 @@ impl Peers {
         &mut self.known[index]
     }
 
-    /// Makes room by forgetting the peer that was silent for longest, never the chosen one.
+    /// Forgets the peer with the longest silence, never the chosen one.
     fn forget_one(&mut self) {
         if self.known.len() < MAX_PEERS {
             return;
         }
         let others = self.known.iter().enumerate().filter(|(_, p)| Some(p.address) != self.chosen);
-        if let Some((oldest, _)) = others.min_by_key(|(_, peer)| peer.heard) {
+        if let Some((oldest, _)) = others.min_by_key(|(_, peer)| peer.active) {
             self.known.swap_remove(oldest);
         }
     }
 }
 
-/// True for the heartbeat of a flight controller, as opposed to that of a ground station, camera or companion.
+/// True for the heartbeat of an autopilot, as opposed to a ground station, camera or companion.
 fn is_autopilot_heartbeat(packet: &Packet) -> bool {
     match &packet.message {
         Some(MavMessage::HEARTBEAT(heartbeat)) => {
@@ -652,7 +654,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn talk_of_others_never_fills_the_line() {
+    fn packets_of_low_priority_never_fill_the_queue() {
         let (queue, mut line) = mpsc::channel(OUTGOING);
         let sender = LinkSender { shared: Arc::new(Shared::new()), queue };
         assert_eq!(sender.send_spare(b"packet"), Err(SendError::NotConnected));

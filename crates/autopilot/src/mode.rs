@@ -1,17 +1,17 @@
-//! Which firmware flies, and in which mode.
+//! Firmware and flight mode.
 
 use std::fmt;
 
 use crate::dialect::{HEARTBEAT_DATA, MavAutopilot, MavType};
 
-/// What flies the vehicle.
+/// The autopilot's firmware.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Firmware {
     /// ArduPilot on a multicopter or helicopter: supported.
     Copter,
-    /// ArduPilot on a vehicle of another kind, whose modes have other numbers: not supported.
+    /// ArduPilot on a vehicle of another kind, with other mode numbers: not supported.
     OtherArduPilot,
-    /// PX4 on a multicopter or helicopter: flown as its documentation tells; OFFBOARD on 1.17 in simulation, too.
+    /// PX4 on a multicopter or helicopter: supported as documented; OFFBOARD was flown on 1.17 in simulation.
     Px4,
     /// PX4 on a vehicle of another kind: not supported.
     OtherPx4,
@@ -24,13 +24,13 @@ pub enum Firmware {
 pub enum FlightMode {
     /// ArduPilot Copter follows the setpoints of a companion.
     Guided,
-    /// ArduPilot Copter lands where it is.
+    /// ArduPilot Copter lands at its position.
     Land,
-    /// Another mode of ArduPilot Copter, by its number.
+    /// Another mode of ArduPilot Copter, by number.
     Other(u32),
     /// A mode of PX4: main mode in bits 16 to 23, sub mode in bits 24 to 31.
     Px4(u32),
-    /// A mode of a firmware that is not known.
+    /// A mode of an unknown firmware.
     Foreign(u32),
 }
 
@@ -38,7 +38,7 @@ const GUIDED: u32 = 4;
 const LAND: u32 = 9;
 
 impl Firmware {
-    /// What a heartbeat says.
+    /// The firmware of a heartbeat.
     pub fn of(heartbeat: &HEARTBEAT_DATA) -> Self {
         let hovers = matches!(
             heartbeat.mavtype,
@@ -60,7 +60,7 @@ impl Firmware {
         }
     }
 
-    /// The mode in which it follows a companion's setpoints; `None` for one that is not flown.
+    /// The mode that follows a companion's setpoints; `None` when not supported.
     pub fn guided(self) -> Option<FlightMode> {
         match self {
             Self::Copter => Some(FlightMode::Guided),
@@ -69,7 +69,7 @@ impl Firmware {
         }
     }
 
-    /// The mode in which it lands by itself; `None` for one that is not flown.
+    /// The mode that lands; `None` when not supported.
     pub fn land(self) -> Option<FlightMode> {
         match self {
             Self::Copter => Some(FlightMode::Land),
@@ -78,7 +78,7 @@ impl Firmware {
         }
     }
 
-    /// The mode in which it lands by itself on a target that it is told: the same as [`Firmware::land`] but on PX4.
+    /// The mode of the precision landing on a landing target: differs from [`Firmware::land`] only on PX4.
     pub fn precision_land(self) -> Option<FlightMode> {
         if self == Self::Px4 { Some(FlightMode::AUTO_PRECLAND) } else { self.land() }
     }
@@ -88,9 +88,9 @@ impl fmt::Display for Firmware {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Copter => "ArduPilot Copter",
-            Self::OtherArduPilot => "ArduPilot on a vehicle that is no copter",
+            Self::OtherArduPilot => "ArduPilot on a vehicle that is not a copter",
             Self::Px4 => "PX4",
-            Self::OtherPx4 => "PX4 on a vehicle that is no copter",
+            Self::OtherPx4 => "PX4 on a vehicle that is not a copter",
             Self::Unknown => "an unknown firmware",
         })
     }
@@ -101,11 +101,11 @@ impl FlightMode {
     pub const OFFBOARD: Self = Self::Px4(6 << 16);
     /// PX4 takes off (main mode 4, sub mode 2).
     pub const AUTO_TAKEOFF: Self = Self::Px4(0x0204_0000);
-    /// PX4 stays where it is (main mode 4, sub mode 3).
+    /// PX4 holds its position (main mode 4, sub mode 3).
     pub const AUTO_HOLD: Self = Self::Px4(0x0304_0000);
-    /// PX4 lands where it is (main mode 4, sub mode 6).
+    /// PX4 lands at its position (main mode 4, sub mode 6).
     pub const AUTO_LAND: Self = Self::Px4(0x0604_0000);
-    /// PX4 lands on a target that it is told (main mode 4, sub mode 9).
+    /// PX4 lands on a landing target (main mode 4, sub mode 9).
     pub const AUTO_PRECLAND: Self = Self::Px4(0x0904_0000);
 
     /// True when the autopilot follows setpoints.
@@ -113,12 +113,12 @@ impl FlightMode {
         self == Self::Guided || self == Self::OFFBOARD
     }
 
-    /// True when the autopilot lands by itself.
+    /// True when the autopilot lands.
     pub fn is_landing(self) -> bool {
         [Self::Land, Self::AUTO_LAND, Self::AUTO_PRECLAND].contains(&self)
     }
 
-    /// The mode that `firmware` means by this number.
+    /// The mode of `firmware` with this number.
     pub fn of(firmware: Firmware, custom_mode: u32) -> Self {
         match (firmware, custom_mode) {
             (Firmware::Copter, GUIDED) => Self::Guided,
@@ -129,7 +129,7 @@ impl FlightMode {
         }
     }
 
-    /// The number by which its firmware means this mode.
+    /// The firmware's number of this mode.
     pub fn custom_mode(self) -> u32 {
         match self {
             Self::Guided => GUIDED,

@@ -1,8 +1,8 @@
 //! MAVLink packets: found in a stream of bytes, checked and decoded, or encoded.
 //!
-//! The packet formats are those of <https://mavlink.io/en/guide/serialization.html>. Checksum, encoding and decoding are
-//! the `mavlink` crate's; the framing is not, because packets of unknown messages must pass byte for byte and a damaged
-//! packet must not hide the good one behind it.
+//! The packet formats are those of <https://mavlink.io/en/guide/serialization.html>. Checksum, encoding and
+//! decoding are the `mavlink` crate's; the framing is not, because packets of unknown messages must pass byte
+//! for byte and a damaged packet must not hide the good one behind it.
 
 use mavlink::{MAVLinkV2MessageRaw, MavHeader, MavlinkVersion, Message, calculate_crc};
 
@@ -98,8 +98,8 @@ impl Parser {
         packets
     }
 
-    /// Ends the stream (the line went quiet, the log ended): an incomplete packet is noise, and the packets found
-    /// behind its start byte are returned.
+    /// Ends the stream (the line went quiet, the log ended): an incomplete packet is noise, and the packets
+    /// found behind its start byte are returned.
     pub fn finish(&mut self) -> Vec<Packet> {
         let mut packets = Vec::new();
         self.scan(&mut packets, true);
@@ -229,16 +229,16 @@ fn look(bytes: &[u8], senders: &[Sender]) -> Verdict {
         let is_right = calculate_crc(covered, MavMessage::extra_crc(shape.id)) == sent;
         return if is_right { Verdict::Packet(shape) } else { Verdict::BadChecksum };
     }
-    // The checksum of an unknown message also covers a byte that is not sent (CRC_EXTRA). The packet is accepted when
-    // some value of that byte fits, its sender is known from checked packets, and what follows begins a packet or has
-    // not come yet.
+    // The checksum of an unknown message also covers a byte that is not sent (CRC_EXTRA). The packet is
+    // accepted when some value of that byte fits, its sender is known from checked packets, and what follows
+    // begins a packet or has not come yet.
     let follows = bytes.get(shape.length).is_none_or(|next| [START_V1, START_V2].contains(next));
     let is_plausible = follows && senders.contains(&shape.sender) && fits_some_extra(covered, sent);
     if is_plausible { Verdict::Packet(shape) } else { Verdict::Noise }
 }
 
-/// True when the checksum is right for some value of the byte CRC_EXTRA. The checksum is linear, so this byte changes
-/// it by the same bits whatever comes before.
+/// True when the checksum is right for some value of the byte CRC_EXTRA. The checksum is linear, so this byte
+/// changes it by the same bits whatever comes before.
 fn fits_some_extra(covered: &[u8], sent: u16) -> bool {
     let difference = calculate_crc(covered, 0) ^ sent;
     (0..=u8::MAX).any(|extra| calculate_crc(&[], extra) ^ calculate_crc(&[], 0) == difference)
@@ -380,7 +380,8 @@ mod tests {
     }
 
     proptest! {
-        // One in 65536 damaged packets has a correct checksum by chance; a fixed seed keeps that out of the test.
+        // One in 65536 damaged packets has a correct checksum by chance; a fixed seed keeps that out of the
+        // test.
         #![proptest_config(ProptestConfig { cases: 400, rng_seed: RngSeed::Fixed(7), ..Default::default() })]
 
         #[test]

@@ -1,25 +1,26 @@
-//! Parameters of the autopilot that are read, never written: asked for one after the other, a bounded number of times.
+//! Reads parameters of the autopilot, one after the other, with a bounded number of requests; never writes
+//! them.
 
 use crate::dialect::{MavMessage, MavParamType, PARAM_REQUEST_READ_DATA, PARAM_VALUE_DATA};
 use crate::mode::Firmware;
 
-/// How long an answer may take.
-const ANSWER_NS: i64 = 500_000_000;
-/// How often each is asked for.
+/// Timeout of a reply, in nanoseconds.
+const REPLY_TIMEOUT_NS: i64 = 500_000_000;
+/// Maximum number of requests for each parameter.
 const ATTEMPTS: u32 = 6;
 
-/// What is known of a parameter.
+/// The state of a parameter.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub enum Parameter {
-    /// Not asked for, or its answer is awaited.
+    /// Not requested, or the reply is pending.
     Unknown,
-    /// It does not answer: this autopilot has none of this name, or is deaf.
+    /// No reply: the autopilot has no parameter of this name, or does not receive our packets.
     Silent,
     /// Its value.
     Value(f64),
 }
 
-/// The parameters that are asked for.
+/// The requested parameters.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Parameters {
     list: Vec<Wanted>,
@@ -39,7 +40,7 @@ impl Parameters {
         Self { list: names.iter().map(wanted).collect(), due_ns: i64::MIN }
     }
 
-    /// Asks for everything anew.
+    /// Requests everything again.
     pub(crate) fn restart(&mut self) {
         let names: Vec<_> = self.list.iter().map(|wanted| wanted.name).collect();
         *self = Self::new(&names);
@@ -53,16 +54,16 @@ impl Parameters {
         }
     }
 
-    /// The next question, if one is due.
-    pub(crate) fn ask(&mut self, now_ns: i64, system: u8, component: u8) -> Option<MavMessage> {
+    /// The next request, if one is due.
+    pub(crate) fn request(&mut self, now_ns: i64, system: u8, component: u8) -> Option<MavMessage> {
         if now_ns < self.due_ns {
             return None;
         }
         let waits = |wanted: &&mut Wanted| wanted.value.is_none() && wanted.attempts <= ATTEMPTS;
-        // The one that was asked for least, so that a silent one holds up no other.
+        // The one with the fewest requests, so that a silent one does not delay the others.
         let wanted = self.list.iter_mut().filter(waits).min_by_key(|wanted| wanted.attempts)?;
         wanted.attempts += 1;
-        self.due_ns = now_ns.saturating_add(ANSWER_NS);
+        self.due_ns = now_ns.saturating_add(REPLY_TIMEOUT_NS);
         (wanted.attempts <= ATTEMPTS).then(|| {
             MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
                 param_index: -1,
@@ -73,13 +74,13 @@ impl Parameters {
         })
     }
 
-    /// Takes a value that is told, whoever asked for it.
+    /// Handles a value, whoever requested it.
     pub(crate) fn take(&mut self, firmware: Firmware, message: &PARAM_VALUE_DATA) {
         let name = message.param_id.to_str().unwrap_or_default();
         let Some(wanted) = self.list.iter_mut().find(|wanted| wanted.name == name) else { return };
         let is_whole = message.param_type == MavParamType::MAV_PARAM_TYPE_INT32;
         let value = match firmware {
-            // PX4 puts a whole number's bits where the float is.
+            // PX4 sends the bits of an integer in the place of the float.
             Firmware::Px4 if is_whole => f64::from(message.param_value.to_bits().cast_signed()),
             _ => f64::from(message.param_value),
         };
@@ -104,21 +105,22 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_answer_is_asked_for_a_few_times_and_holds_up_no_other() {
+    fn a_silent_parameter_is_requested_a_few_times_and_delays_no_other() {
         let mut parameters = Parameters::new(&["A", "B"]);
-        let mut asked = Vec::new();
+        let mut requests = Vec::new();
         for now_ns in (0..20_000_000_000).step_by(100_000_000) {
-            if let Some(MavMessage::PARAM_REQUEST_READ(request)) = parameters.ask(now_ns, 1, 1) {
+            if let Some(MavMessage::PARAM_REQUEST_READ(request)) = parameters.request(now_ns, 1, 1)
+            {
                 let name = request.param_id.to_str().unwrap().to_owned();
                 if name == "B" {
                     let answer = value("B", 3.0, MavParamType::MAV_PARAM_TYPE_INT8);
                     parameters.take(Firmware::Copter, &answer);
                 }
-                asked.push(name);
+                requests.push(name);
             }
         }
-        assert_eq!(asked.iter().filter(|name| *name == "B").count(), 1);
-        assert_eq!(asked.len(), 1 + ATTEMPTS as usize);
+        assert_eq!(requests.iter().filter(|name| *name == "B").count(), 1);
+        assert_eq!(requests.len(), 1 + ATTEMPTS as usize);
         assert_eq!(parameters.get("A"), Parameter::Silent);
         assert_eq!(parameters.get("B"), Parameter::Value(3.0));
         assert_eq!(parameters.get("C"), Parameter::Unknown);

@@ -1,7 +1,7 @@
-//! What the vehicle tells about itself.
+//! The vehicle's state, as it reports it.
 //!
-//! A stamp is in nanoseconds of the caller's clock: the time of the measurement where the autopilot's clock is known
-//! ([`crate::clock`]), else that of its reception. `boot_ms` is the autopilot's own clock.
+//! A stamp is in nanoseconds of the caller's clock: the time of the measurement where the autopilot's clock
+//! is known ([`crate::clock`]), else that of its reception. `boot_ms` is the autopilot's own clock.
 
 use std::fmt;
 
@@ -14,12 +14,12 @@ use crate::dialect::{
 };
 use crate::mode::FlightMode;
 
-/// How the vehicle is turned, at one moment.
+/// The attitude at one time.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Attitude {
-    /// When it was measured, or else received, in ns.
+    /// Time of the measurement, or of the reception, in ns.
     pub stamp_ns: i64,
-    /// When it was measured, in ms since the autopilot started.
+    /// Time of the measurement, in ms since the autopilot started.
     pub boot_ms: u32,
     /// The attitude.
     pub ned_from_body: Rotation<Ned, Body>,
@@ -27,12 +27,12 @@ pub struct Attitude {
     pub rate_in_body: Vector<Body>,
 }
 
-/// Where the vehicle is and how fast, at one moment.
+/// Position and velocity at one time.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Position {
-    /// When it was measured, or else received, in ns.
+    /// Time of the measurement, or of the reception, in ns.
     pub stamp_ns: i64,
-    /// When it was measured, in ms since the autopilot started.
+    /// Time of the measurement, in ms since the autopilot started.
     pub boot_ms: u32,
     /// The position in m from the autopilot's local origin.
     pub position: Point<Ned>,
@@ -49,37 +49,37 @@ pub struct Range {
     pub distance_m: f64,
 }
 
-/// The battery, as far as it is known.
+/// The battery; unknown values are `None`.
 #[derive(Copy, Clone, Debug, Default, PartialEq)]
 pub struct Battery {
     /// Voltage in V.
     pub voltage_v: Option<f64>,
     /// Current in A.
     pub current_a: Option<f64>,
-    /// What is left, from 0 to 1.
+    /// Remaining charge, from 0 to 1.
     pub remaining: Option<f64>,
 }
 
-/// Whether the vehicle flies, as the autopilot sees it.
+/// Contact with the ground, as the autopilot reports it.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 pub enum LandedState {
-    /// Not told yet.
+    /// Not reported yet.
     #[default]
     Unknown,
-    /// Stands on the ground.
+    /// On the ground.
     OnGround,
-    /// Flies.
+    /// In the air.
     InAir,
-    /// Leaves the ground.
+    /// Taking off.
     TakingOff,
-    /// Comes down in LAND.
+    /// Landing in LAND.
     Landing,
 }
 
-/// Everything known about the vehicle.
+/// The state of the vehicle.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct VehicleState {
-    /// When the newest part of it was received, in ns.
+    /// Time of the last reception, in ns.
     pub stamp_ns: i64,
     /// The newest attitude.
     pub attitude: Option<Attitude>,
@@ -89,28 +89,28 @@ pub struct VehicleState {
     pub range: Option<Range>,
     /// The flight mode.
     pub mode: FlightMode,
-    /// Whether the motors may turn.
+    /// Whether the motors are armed.
     pub armed: bool,
-    /// Whether it flies.
+    /// Contact with the ground.
     pub landed: LandedState,
     /// Whether it can be armed and flown: pre-arm checks passed and a position known.
     pub ready: bool,
     /// The battery.
     pub battery: Battery,
-    /// Whether the heartbeat is heard.
+    /// Whether heartbeats are received.
     pub connected: bool,
 }
 
 /// Whether the vehicle can be armed and flown by position, and why not.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Readiness {
-    /// Outcome of the pre-arm checks; none while unknown or not offered.
+    /// Result of the pre-arm checks; none while unknown or not supported.
     prearm: Option<bool>,
     ekf: Option<EkfStatusFlags>,
-    /// What PX4 tells in the place of the former.
+    /// The same of PX4.
     estimator: Option<EstimatorStatusFlags>,
     has_position: bool,
-    /// What the autopilot said about its pre-arm checks last.
+    /// The last text about the pre-arm checks.
     complaint: Option<String>,
 }
 
@@ -206,7 +206,7 @@ impl Battery {
         }
     }
 
-    /// The same battery with what BATTERY_STATUS knows better.
+    /// The same battery with the details of BATTERY_STATUS.
     pub fn with_details(self, message: &BATTERY_STATUS_DATA) -> Self {
         Self {
             current_a: amperes(message.current_battery).or(self.current_a),
@@ -261,7 +261,7 @@ impl Readiness {
         self.prearm != Some(false) && estimates && self.has_position
     }
 
-    /// What is missing, for people; empty when it is ready.
+    /// What is missing, as texts; empty when it is ready.
     pub(crate) fn reasons(&self) -> Vec<String> {
         let mut reasons = Vec::new();
         if !self.has_position {
@@ -287,7 +287,8 @@ impl Readiness {
     }
 }
 
-/// Attitude, velocity and an absolute or relative position are known, and the filter is not only holding still.
+/// Attitude, velocity and an absolute or relative position are valid, and the filter is not in constant
+/// position mode.
 fn ekf_is_ready(flags: EkfStatusFlags) -> bool {
     let needed = EkfStatusFlags::EKF_ATTITUDE
         | EkfStatusFlags::EKF_VELOCITY_HORIZ
@@ -298,8 +299,9 @@ fn ekf_is_ready(flags: EkfStatusFlags) -> bool {
     flags.contains(needed) && flags.intersects(horizontal) && !flags.intersects(wrong)
 }
 
-/// The same of PX4's ESTIMATOR_STATUS. Its filter is in constant position mode whenever the vehicle stands still (since
-/// 1.15, `EKF/ekf_helper.cpp: get_ekf_soln_status`): that is wrong only where nothing from outside tells the position.
+/// The same of PX4's ESTIMATOR_STATUS. Its filter is in constant position mode whenever the vehicle stands
+/// still (since
+/// 1.15, `EKF/ekf_helper.cpp: get_ekf_soln_status`): that is a problem only without any position source.
 fn estimator_is_ready(flags: EstimatorStatusFlags) -> bool {
     let needed = EstimatorStatusFlags::ESTIMATOR_ATTITUDE
         | EstimatorStatusFlags::ESTIMATOR_VELOCITY_HORIZ

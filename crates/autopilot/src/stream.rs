@@ -1,39 +1,39 @@
-//! Messages that must keep coming: asked for, counted, and asked for again when they stop.
+//! Message streams: requested, counted, and requested again when they stop.
 //!
-//! An autopilot forgets what it was asked when it restarts, another station may overwrite it, and some messages begin
-//! long after they were promised; so nothing is believed but the rate at which messages arrive.
+//! An autopilot forgets requests when it restarts, another station may overwrite them, and some messages
+//! begin long after their acknowledgement; so only the measured rate counts.
 
 use crate::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage, MavResult, Message};
 
 const SECOND_NS: i64 = 1_000_000_000;
-/// A message is missing below this part of the rate that was asked for.
-const ENOUGH: f64 = 0.7;
-/// How long to wait for the acknowledgement of one request.
+/// Minimum measured rate, relative to the requested rate.
+const MIN_RATE_RATIO: f64 = 0.7;
+/// Timeout of an acknowledgement, in nanoseconds.
 const ACK_NS: i64 = SECOND_NS;
-/// How long to leave an autopilot alone that refused.
+/// Pause after a refused request, in nanoseconds.
 const REFUSED_NS: i64 = 30 * SECOND_NS;
-/// The time over which messages are counted, unless they are rare.
+/// Time over which messages are counted, unless they are rare, in nanoseconds.
 const COUNT_NS: i64 = 2 * SECOND_NS;
-/// Longest pause between vain requests; it grows with their number.
+/// Maximum pause between requests without effect, in nanoseconds; it grows with their number.
 const MAX_PAUSE_NS: i64 = 10 * SECOND_NS;
-/// A missing message is worth a word after this many requests.
-const VAIN: u32 = 2;
-/// One that has never come may still begin for so long: ArduPilot promises its position at once, and has one after 20
-/// to 40 s.
+/// Number of requests without effect after which a missing message is reported.
+const REPORT_AFTER: u32 = 2;
+/// Time for which a message may be missing at first, in nanoseconds: ArduPilot acknowledges its position at
+/// once, and has one after 20 to 40 s.
 const BEGINNING_NS: i64 = 60 * SECOND_NS;
 
-/// A message that the autopilot is asked to send.
+/// A requested message.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Stream {
-    /// The message's number.
+    /// The message id.
     pub message_id: u32,
-    /// How often it should come, in Hz.
+    /// Requested rate, in Hz.
     pub rate_hz: f64,
-    /// Whether it is missed when it does not come (a rangefinder may not exist).
+    /// Whether its absence is reported (a rangefinder may not exist).
     pub required: bool,
 }
 
-/// What is to be said about a stream.
+/// A report about a stream.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Notice {
     Missing { message: &'static str, wanted_hz: f64, measured_hz: f64 },
@@ -44,7 +44,8 @@ pub(crate) enum Notice {
 #[derive(Clone, Debug)]
 pub(crate) struct Streams {
     list: Vec<Watched>,
-    /// The stream whose request waits for its acknowledgement (which does not name it), and until when.
+    /// The stream whose request waits for its acknowledgement (which does not name the message), and until
+    /// when.
     asking: Option<(usize, i64)>,
 }
 
@@ -52,17 +53,17 @@ pub(crate) struct Streams {
 struct Watched {
     stream: Stream,
     name: &'static str,
-    /// When to ask; none while messages are being counted.
+    /// When to request it; none while messages are counted.
     ask_at_ns: Option<i64>,
-    /// How often it was asked for in vain, or once, and when last.
-    asked: u32,
-    asked_ns: i64,
+    /// Number of requests without effect, or 1, and the time of the last.
+    requests: u32,
+    request_ns: i64,
     count: u32,
     since_ns: i64,
     missing: bool,
-    /// It has come since everything was asked for anew.
+    /// It has arrived since the last restart.
     began: bool,
-    first_asked_ns: Option<i64>,
+    first_request_ns: Option<i64>,
 }
 
 impl Streams {
@@ -73,33 +74,33 @@ impl Streams {
                     stream,
                     name: message_name(stream.message_id),
                     ask_at_ns: Some(i64::MIN),
-                    asked: 0,
-                    asked_ns: 0,
+                    requests: 0,
+                    request_ns: 0,
                     count: 0,
                     since_ns: 0,
                     missing: false,
                     began: false,
-                    first_asked_ns: None,
+                    first_request_ns: None,
                 }
             });
         Self { list: list.collect(), asking: None }
     }
 
-    /// Asks for everything anew.
+    /// Requests everything again.
     pub(crate) fn restart(&mut self) {
         self.asking = None;
         for watched in &mut self.list {
             watched.ask_at_ns = Some(i64::MIN);
-            watched.asked = 0;
+            watched.requests = 0;
             watched.began = false;
-            watched.first_asked_ns = None;
+            watched.first_request_ns = None;
         }
     }
 
     pub(crate) fn received(&mut self, now_ns: i64, message_id: u32) {
         for watched in &mut self.list {
             if watched.stream.message_id == message_id {
-                // It began in the middle of the counting.
+                // It began during the count.
                 if !std::mem::replace(&mut watched.began, true) && watched.ask_at_ns.is_none() {
                     watched.count_anew(now_ns);
                 }
@@ -108,7 +109,7 @@ impl Streams {
         }
     }
 
-    /// The autopilot answered the request that is under way.
+    /// The autopilot acknowledged the pending request.
     pub(crate) fn acknowledged(&mut self, now_ns: i64, result: MavResult) {
         let Some((index, _)) = self.asking.take() else { return };
         let Some(watched) = self.list.get_mut(index) else { return };
@@ -121,14 +122,15 @@ impl Streams {
         }
     }
 
-    /// Judges the rates; returns what there is to say and what is to be requested.
+    /// Checks the rates; returns reports and the next request.
     pub(crate) fn tick(&mut self, now_ns: i64) -> (Vec<Notice>, Option<MavMessage>) {
         let notices = self.list.iter_mut().filter_map(|watched| watched.judge(now_ns)).collect();
         if let Some((index, until_ns)) = self.asking {
             if now_ns < until_ns {
                 return (notices, None);
             }
-            // Without an answer it is asked again after the others; it may have been heard all the same.
+            // Without an acknowledgement it is requested again after the others; it may have been received
+            // all the same.
             self.asking = None;
             if let Some(watched) = self.list.get_mut(index) {
                 watched.ask_at_ns = Some(now_ns);
@@ -139,9 +141,9 @@ impl Streams {
         let Some(watched) = self.list.get_mut(index).filter(|_| at_ns <= now_ns) else {
             return (notices, None);
         };
-        watched.asked = watched.asked.saturating_add(1);
-        watched.asked_ns = now_ns;
-        watched.first_asked_ns.get_or_insert(now_ns);
+        watched.requests = watched.requests.saturating_add(1);
+        watched.request_ns = now_ns;
+        watched.first_request_ns.get_or_insert(now_ns);
         self.asking = Some((index, now_ns.saturating_add(ACK_NS)));
         (notices, Some(request(watched.stream)))
     }
@@ -165,31 +167,32 @@ impl Watched {
         }
         let measured_hz = f64::from(self.count) / (elapsed_ns as f64 / SECOND_NS as f64);
         self.count_anew(now_ns);
-        if measured_hz >= ENOUGH * self.stream.rate_hz {
-            self.asked = 1;
+        if measured_hz >= MIN_RATE_RATIO * self.stream.rate_hz {
+            self.requests = 1;
             let restored = std::mem::take(&mut self.missing);
             return restored.then_some(Notice::Restored { message: self.name, measured_hz });
         }
         if !self.stream.required && measured_hz == 0.0 {
             return None;
         }
-        let pause_ns = COUNT_NS.saturating_mul(self.asked.into()).min(MAX_PAUSE_NS);
-        if now_ns.saturating_sub(self.asked_ns) >= pause_ns {
+        let pause_ns = COUNT_NS.saturating_mul(self.requests.into()).min(MAX_PAUSE_NS);
+        if now_ns.saturating_sub(self.request_ns) >= pause_ns {
             self.ask_at_ns = Some(now_ns);
         }
         let waits = !self.began
-            && self.first_asked_ns.is_some_and(|at| now_ns.saturating_sub(at) < BEGINNING_NS);
-        let news = self.asked >= VAIN && self.stream.required && !self.missing && !waits;
-        self.missing |= news;
+            && self.first_request_ns.is_some_and(|at| now_ns.saturating_sub(at) < BEGINNING_NS);
+        let is_report =
+            self.requests >= REPORT_AFTER && self.stream.required && !self.missing && !waits;
+        self.missing |= is_report;
         let wanted_hz = self.stream.rate_hz;
-        news.then_some(Notice::Missing { message: self.name, wanted_hz, measured_hz })
+        is_report.then_some(Notice::Missing { message: self.name, wanted_hz, measured_hz })
     }
 }
 
 fn request(stream: Stream) -> MavMessage {
     MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
         command: MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
-        // A message number has 24 bits, which a 32-bit float holds exactly.
+        // A message id has 24 bits, which a 32-bit float holds exactly.
         param1: stream.message_id as f32,
         param2: (1e6 / stream.rate_hz).round() as f32,
         ..Default::default()
@@ -215,13 +218,13 @@ mod tests {
         result: Option<MavResult>,
         every: i64,
     ) -> (Vec<Notice>, Vec<u32>) {
-        let (mut said, mut asked) = (Vec::new(), Vec::new());
+        let (mut notices, mut requests) = (Vec::new(), Vec::new());
         for step in 0..seconds * 50 {
             let now_ns = from_s * SECOND_NS + step * 20_000_000;
-            let (notices, request) = streams.tick(now_ns);
-            said.extend(notices);
+            let (reports, request) = streams.tick(now_ns);
+            notices.extend(reports);
             if let Some(MavMessage::COMMAND_LONG(request)) = request {
-                asked.push(request.param1 as u32);
+                requests.push(request.param1 as u32);
                 if let Some(result) = result {
                     streams.acknowledged(now_ns, result);
                 }
@@ -230,49 +233,52 @@ mod tests {
                 streams.received(now_ns, 30);
             }
         }
-        (said, asked)
+        (notices, requests)
     }
 
     const OK: Option<MavResult> = Some(MavResult::MAV_RESULT_ACCEPTED);
 
     #[test]
-    fn what_comes_as_asked_is_asked_for_once() {
+    fn a_message_at_its_rate_is_requested_once() {
         let mut streams = Streams::new(&[ATTITUDE, RANGE]);
-        let (said, asked) = run(&mut streams, 0, 30, OK, 1);
-        assert_eq!(asked, [30, 132]);
-        assert!(said.is_empty());
+        let (notices, requests) = run(&mut streams, 0, 30, OK, 1);
+        assert_eq!(requests, [30, 132]);
+        assert!(notices.is_empty());
     }
 
     #[test]
-    fn what_stops_is_asked_for_again_and_its_return_is_told() {
+    fn a_message_that_stops_is_requested_again_and_its_return_reported() {
         let mut streams = Streams::new(&[ATTITUDE]);
         run(&mut streams, 0, 10, OK, 1);
-        let (said, asked) = run(&mut streams, 10, 40, OK, 12);
-        assert!((3..12).contains(&asked.len()), "{asked:?}");
-        assert!(matches!(said[..], [Notice::Missing { message: "ATTITUDE", wanted_hz: 50.0, .. }]));
-        let (said, _) = run(&mut streams, 50, 20, OK, 1);
-        assert!(matches!(said[..], [Notice::Restored { message: "ATTITUDE", .. }]));
+        let (notices, requests) = run(&mut streams, 10, 40, OK, 12);
+        assert!((3..12).contains(&requests.len()), "{requests:?}");
+        assert!(matches!(
+            notices[..],
+            [Notice::Missing { message: "ATTITUDE", wanted_hz: 50.0, .. }]
+        ));
+        let (notices, _) = run(&mut streams, 50, 20, OK, 1);
+        assert!(matches!(notices[..], [Notice::Restored { message: "ATTITUDE", .. }]));
     }
 
     #[test]
     fn what_begins_late_is_no_alarm_and_what_never_begins_is_one() {
         let mut streams = Streams::new(&[ATTITUDE]);
-        let (said, _) = run(&mut streams, 0, 40, OK, 0);
-        assert!(said.is_empty(), "{said:?}");
+        let (notices, _) = run(&mut streams, 0, 40, OK, 0);
+        assert!(notices.is_empty(), "{notices:?}");
         assert!(run(&mut streams, 40, 20, OK, 1).0.is_empty());
         let mut streams = Streams::new(&[ATTITUDE]);
-        let (said, _) = run(&mut streams, 0, 80, OK, 0);
-        assert!(matches!(said[..], [Notice::Missing { measured_hz: 0.0, .. }]), "{said:?}");
+        let (notices, _) = run(&mut streams, 0, 80, OK, 0);
+        assert!(matches!(notices[..], [Notice::Missing { measured_hz: 0.0, .. }]), "{notices:?}");
     }
 
     #[test]
     fn a_lost_request_is_repeated_and_a_refused_one_rests() {
         let mut streams = Streams::new(&[ATTITUDE]);
-        let (_, asked) = run(&mut streams, 0, 5, None, 0);
-        assert_eq!(asked.len(), 5);
+        let (_, requests) = run(&mut streams, 0, 5, None, 0);
+        assert_eq!(requests.len(), 5);
         let mut streams = Streams::new(&[ATTITUDE]);
-        let (_, asked) = run(&mut streams, 0, 29, Some(MavResult::MAV_RESULT_DENIED), 0);
-        assert_eq!(asked.len(), 1);
+        let (_, requests) = run(&mut streams, 0, 29, Some(MavResult::MAV_RESULT_DENIED), 0);
+        assert_eq!(requests.len(), 1);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! From the ground into the air. ArduPilot: wait until ready, GUIDED, arm, climb. PX4: wait until ready, arm, climb in its
+//! The take-off. ArduPilot: wait until ready, GUIDED, arm, climb. PX4: wait until ready, arm, climb in its
 //! own takeoff mode, OFFBOARD.
 
 use std::fmt;
@@ -9,17 +9,17 @@ use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
 use crate::mode::{Firmware, FlightMode};
 use crate::state::{LandedState, VehicleState};
 
-/// How close to its height the vehicle must be, in m.
-const HEIGHT_M: f64 = 0.5;
-/// How slow it must be vertically, in m/s.
-const CLIMB_M_S: f64 = 0.3;
+/// Maximum height error at the end of the climb, in m.
+const MAX_HEIGHT_ERROR_M: f64 = 0.5;
+/// Maximum vertical speed at the end of the climb, in m/s.
+const MAX_CLIMB_M_S: f64 = 0.3;
 /// Pause between two attempts to arm.
-const ARM_AGAIN: Duration = Duration::from_secs(2);
+const ARM_RETRY: Duration = Duration::from_secs(2);
 
-/// How long each part of a takeoff may take.
+/// Timeouts of the parts of a takeoff.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Until the autopilot is heard and ready; ArduPilot needs about 42 s after it was switched on.
+    /// Until the autopilot is connected and ready; ArduPilot needs about 42 s after power-on.
     pub ready: Duration,
     /// Until arming succeeds, with all its attempts.
     pub arm: Duration,
@@ -37,63 +37,63 @@ impl Default for Limits {
     }
 }
 
-/// A takeoff under way: call [`Takeoff::step`] after each packet or each tick until it says that it is finished.
+/// A takeoff: call [`Takeoff::step`] after each packet or each tick until it is finished.
 #[derive(Clone, Debug)]
 pub struct Takeoff {
     height_m: f64,
     limits: Limits,
     part: Part,
-    /// The end of the current part.
+    /// The timeout of the current part.
     until_ns: Option<i64>,
     /// The vertical position before the climb, in m downwards from the origin.
     ground_z: Option<f64>,
     guided: bool,
     /// It has reached its height.
     risen: bool,
-    /// It stood with armed motors before anything was asked for.
+    /// Its motors were armed before the first request.
     found_armed: bool,
 }
 
-/// Where a takeoff stands.
+/// The progress of a takeoff.
 #[derive(Clone, Debug, PartialEq)]
 pub enum TakeoffProgress {
     /// The vehicle is not ready, for these reasons.
     Waiting(Vec<String>),
-    /// GUIDED or OFFBOARD is asked for.
+    /// GUIDED or OFFBOARD is requested.
     ChangingMode,
     /// Arming; a number of attempts was refused, the last one for a reason.
     Arming {
         /// Why the last attempt failed, if one did.
         refused: Option<String>,
     },
-    /// It climbs.
+    /// Climbing.
     Climbing {
         /// The height in m above the ground.
         height_m: f64,
     },
-    /// It flies in GUIDED: setpoints may be sent.
+    /// It flies in GUIDED or OFFBOARD: setpoints may be sent.
     Done,
-    /// It ended before; nothing more will be sent.
+    /// It ended; nothing more is sent.
     Failed(TakeoffError),
 }
 
 /// Why a takeoff ended before it was done.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum TakeoffError {
-    /// Somebody else flies, or has taken over.
+    /// The pilot flies, or has taken over.
     #[error(
         "no takeoff: the vehicle is {landed} in {mode}, so the pilot is in command; change to GUIDED (OFFBOARD on PX4) to hand over"
     )]
     PilotInCommand {
-        /// The mode the pilot chose.
+        /// The pilot's mode.
         mode: FlightMode,
-        /// Whether it flies.
+        /// Contact with the ground.
         landed: LandedState,
     },
     /// It did not become ready.
     #[error("no takeoff: not ready after {} s: {}", after.as_secs(), reasons.join("; "))]
     NotReady {
-        /// For how long it was waited for.
+        /// Time waited.
         after: Duration,
         /// What is missing.
         reasons: Vec<String>,
@@ -101,22 +101,22 @@ pub enum TakeoffError {
     /// A command failed.
     #[error("no takeoff: {0}")]
     Command(#[from] CommandError),
-    /// The heartbeat is not heard any more.
+    /// The heartbeat was lost.
     #[error("takeoff interrupted: the autopilot's heartbeat is lost")]
     Lost,
-    /// The motors were stopped.
+    /// The motors were disarmed.
     #[error("takeoff ended: the autopilot or the pilot disarmed the motors")]
     Disarmed,
-    /// It flies lower than it should for too long.
+    /// The climb took too long.
     #[error("takeoff not finished after {} s: {height_m:.1} m of {wanted_m:.1} m, {landed}", after.as_secs())]
     TooSlow {
-        /// For how long it climbed.
+        /// Time of the climb.
         after: Duration,
         /// The height reached in m.
         height_m: f64,
-        /// The height asked for in m.
+        /// The requested height in m.
         wanted_m: f64,
-        /// Whether it flies.
+        /// Contact with the ground.
         landed: LandedState,
     },
 }
@@ -125,11 +125,19 @@ pub enum TakeoffError {
 enum Part {
     Ready,
     Mode(CommandId),
-    Arm { request: Option<CommandId>, again_ns: i64, refused: Option<CommandError> },
+    Arm(Arming),
     Lift(CommandId),
     Climb,
     Done,
     Failed(TakeoffError),
+}
+
+/// Attempts to arm.
+#[derive(Clone, Debug)]
+struct Arming {
+    request: Option<CommandId>,
+    retry_ns: i64,
+    refused: Option<CommandError>,
 }
 
 impl Takeoff {
@@ -152,10 +160,10 @@ impl Takeoff {
         }
     }
 
-    /// Does what is due and says where the takeoff stands.
+    /// Advances the takeoff and returns its progress.
     ///
-    /// A vehicle that already flies in GUIDED is done at once; one that flies in another mode is left alone. One that
-    /// stands with armed motors is watched, never lifted: it may have landed a moment ago.
+    /// A vehicle that already flies in GUIDED is done at once; one that flies in another mode is left alone.
+    /// One that stands with armed motors is left on the ground: it may have landed a moment ago.
     pub fn step(&mut self, now_ns: i64, autopilot: &mut Autopilot) -> TakeoffProgress {
         if let Err(error) = self.advance(now_ns, autopilot) {
             autopilot.withdraw();
@@ -180,22 +188,20 @@ impl Takeoff {
         match self.part.clone() {
             Part::Ready => self.wait_until_ready(now_ns, autopilot, state.as_ref()),
             Part::Mode(request) => self.wait_for_mode(now_ns, autopilot, request),
-            Part::Arm { request, again_ns, refused } => {
-                self.arm(now_ns, autopilot, (request, again_ns, refused))
-            }
+            Part::Arm(arming) => self.arm(now_ns, autopilot, arming),
             Part::Lift(request) => self.wait_for_lift(now_ns, autopilot, request),
             Part::Climb => self.climb(now_ns, autopilot, state.as_ref()),
             Part::Done | Part::Failed(_) => Ok(()),
         }
     }
 
-    /// The pilot's mode switch wins at once, and so do hands on an armed vehicle.
+    /// The pilot's mode change wins at once, and so does a vehicle armed by the pilot.
     fn check_pilot(&mut self, state: &VehicleState) -> Result<(), TakeoffError> {
         let waiting = matches!(self.part, Part::Ready);
         if !state.connected {
             return if waiting { Ok(()) } else { Err(TakeoffError::Lost) };
         }
-        // PX4 passes through modes of its own on the way up.
+        // PX4 passes through modes of its own during the climb.
         let rises =
             !waiting && [FlightMode::AUTO_TAKEOFF, FlightMode::AUTO_HOLD].contains(&state.mode);
         let guided = state.mode.is_guided() || rises;
@@ -265,20 +271,20 @@ impl Takeoff {
     }
 
     fn begin_arming(&mut self, now_ns: i64) {
-        let part = Part::Arm { request: None, again_ns: now_ns, refused: None };
-        self.begin(now_ns, part, self.limits.arm);
+        let arming = Arming { request: None, retry_ns: now_ns, refused: None };
+        self.begin(now_ns, Part::Arm(arming), self.limits.arm);
     }
 
     fn arm(
         &mut self,
         now_ns: i64,
         autopilot: &mut Autopilot,
-        (request, again_ns, refused): (Option<CommandId>, i64, Option<CommandError>),
+        arming: Arming,
     ) -> Result<(), TakeoffError> {
-        let Some(id) = request else {
-            if now_ns >= again_ns {
+        let Some(id) = arming.request else {
+            if now_ns >= arming.retry_ns {
                 let request = Some(autopilot.request(now_ns, Command::Arm));
-                self.part = Part::Arm { request, again_ns, refused };
+                self.part = Part::Arm(Arming { request, ..arming });
             }
             return Ok(());
         };
@@ -290,12 +296,12 @@ impl Takeoff {
                 let request = autopilot.request(now_ns, Command::Takeoff { height_m });
                 self.begin(now_ns, Part::Lift(request), self.climb_limit());
             }
-            // Shortly after it was switched on, checks may pass and fail by turns.
+            // Shortly after power-on, checks may alternately pass and fail.
             Err(error @ CommandError::Refused { .. })
                 if self.until_ns.is_some_and(|until_ns| now_ns < until_ns) =>
             {
-                let again_ns = now_ns.saturating_add(ns(ARM_AGAIN));
-                self.part = Part::Arm { request: None, again_ns, refused: Some(error) };
+                let retry_ns = now_ns.saturating_add(ns(ARM_RETRY));
+                self.part = Part::Arm(Arming { request: None, retry_ns, refused: Some(error) });
             }
             Err(error) => return Err(error.into()),
         }
@@ -322,9 +328,11 @@ impl Takeoff {
     ) -> Result<(), TakeoffError> {
         let Some(state) = state else { return Ok(()) };
         let height_m = self.height(state);
-        let level = state.position.is_some_and(|p| p.velocity.z().abs() < CLIMB_M_S);
-        // A climb that an earlier controller began ends where that one wanted it: the ground was not seen from here.
-        let arrived = self.ground_z.is_none() || (height_m - self.height_m).abs() < HEIGHT_M;
+        let level = state.position.is_some_and(|p| p.velocity.z().abs() < MAX_CLIMB_M_S);
+        // A climb that an earlier controller began ends at that one's height: the ground's position is
+        // unknown here.
+        let arrived =
+            self.ground_z.is_none() || (height_m - self.height_m).abs() < MAX_HEIGHT_ERROR_M;
         if state.landed == LandedState::InAir && level && arrived {
             self.risen = true;
             if state.mode.is_guided() {
@@ -359,7 +367,7 @@ impl Takeoff {
         match &self.part {
             Part::Ready => TakeoffProgress::Waiting(reasons(autopilot)),
             Part::Mode(_) => TakeoffProgress::ChangingMode,
-            Part::Arm { refused, .. } => {
+            Part::Arm(Arming { refused, .. }) => {
                 TakeoffProgress::Arming { refused: refused.as_ref().map(ToString::to_string) }
             }
             Part::Lift(_) | Part::Climb => TakeoffProgress::Climbing {
@@ -410,7 +418,7 @@ fn reasons(autopilot: &Autopilot) -> Vec<String> {
         }
         Some(state) if state.landed == LandedState::OnGround && state.armed => {
             reasons.push(
-                "it stands with motors that somebody else armed, or has just landed; disarm it first"
+                "it is armed on the ground, by another station or after a landing; disarm it first"
                     .to_owned(),
             );
         }

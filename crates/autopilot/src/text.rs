@@ -1,14 +1,14 @@
-//! Texts of the autopilot, which may come in several packets.
+//! Texts of the autopilot, joined from several packets.
 
 use crate::dialect::{MavSeverity, STATUSTEXT_DATA};
 
-/// Characters in one packet; a part of this length is followed by another one.
+/// Length of a full part, in bytes; another part follows it.
 const PART: usize = 50;
-/// No text is longer.
+/// Maximum number of parts.
 const MAX_PARTS: u8 = 20;
 const MAX_BYTES: usize = PART * 20;
-/// A text whose next part does not come within this time is complete as it is.
-const PATIENCE_NS: i64 = 500_000_000;
+/// Timeout of the next part, in nanoseconds; after it the text is complete.
+const PART_TIMEOUT_NS: i64 = 500_000_000;
 
 /// Joins the parts of a text.
 #[derive(Clone, Debug, Default)]
@@ -29,7 +29,7 @@ struct Partial {
 pub(crate) type Text = (MavSeverity, String);
 
 impl Joiner {
-    /// Takes a packet and returns the texts that it completes, an interrupted one first.
+    /// Adds a packet and returns the texts that it completes, an interrupted one first.
     pub(crate) fn push(&mut self, now_ns: i64, message: &STATUSTEXT_DATA) -> Vec<Text> {
         let mut texts = Vec::new();
         let bytes: &[u8] = &*message.text;
@@ -62,9 +62,9 @@ impl Joiner {
         texts
     }
 
-    /// Returns a text whose end did not come in time.
+    /// Returns a text whose last part did not come in time.
     pub(crate) fn tick(&mut self, now_ns: i64) -> Option<Text> {
-        let late = |partial: &Partial| now_ns.saturating_sub(partial.since_ns) > PATIENCE_NS;
+        let late = |partial: &Partial| now_ns.saturating_sub(partial.since_ns) > PART_TIMEOUT_NS;
         if self.partial.as_ref().is_some_and(late) { self.take() } else { None }
     }
 
@@ -73,7 +73,8 @@ impl Joiner {
     }
 }
 
-/// Text from outside (its characters may have been cut between parts, so all parts are decoded together), without what would disturb a terminal or a log.
+/// The text of all parts, decoded together because characters may be split between parts, without control
+/// characters.
 fn clean(bytes: &[u8]) -> String {
     let text = String::from_utf8_lossy(bytes);
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
@@ -105,8 +106,8 @@ mod tests {
         let texts = joiner.push(1, &part(4, 0, "next"));
         assert_eq!(texts.iter().map(|text| text.1.as_str()).collect::<Vec<_>>(), [&long, "next"]);
         joiner.push(2, &part(5, 0, &long));
-        assert!(joiner.tick(2 + PATIENCE_NS).is_none());
-        assert_eq!(joiner.tick(3 + PATIENCE_NS).unwrap().1, long);
+        assert!(joiner.tick(2 + PART_TIMEOUT_NS).is_none());
+        assert_eq!(joiner.tick(3 + PART_TIMEOUT_NS).unwrap().1, long);
         joiner.push(2, &part(6, 0, &long));
         assert!(joiner.push(3, &part(6, 2, "end"))[0].1.contains(" ... end"));
     }

@@ -27,7 +27,7 @@ const SECOND: i64 = 1_000_000_000;
 const STEP: i64 = SECOND / 50;
 const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
 
-/// An autopilot that does what ArduPilot was measured to do, and what a test tells it.
+/// A fake autopilot with ArduPilot's measured behaviour, and what a test sets.
 #[derive(Clone)]
 struct Fake {
     firmware: MavAutopilot,
@@ -40,12 +40,12 @@ struct Fake {
     ready: bool,
     intervals: BTreeMap<u32, i64>,
     /// Commands as they were received.
-    heard: Vec<MavCmd>,
+    received: Vec<MavCmd>,
     velocities: Vec<[f32; 3]>,
     /// So many commands are lost on the way here, and so many acknowledgements on the way back.
     lose_commands: u32,
     lose_acks: u32,
-    /// A command that is refused so many times, and what is said about it.
+    /// A command that is refused a number of times, with a text about it.
     refuse: Option<(MavCmd, MavResult, &'static str, u32)>,
     silent: bool,
     ignores_modes: bool,
@@ -69,7 +69,7 @@ impl Fake {
             climbs_to: None,
             ready: true,
             intervals: BTreeMap::new(),
-            heard: Vec::new(),
+            received: Vec::new(),
             velocities: Vec::new(),
             lose_commands: 0,
             lose_acks: 0,
@@ -89,7 +89,7 @@ impl Fake {
                 MavMessage::COMMAND_LONG(_) if self.lose_commands > 0 => self.lose_commands -= 1,
                 MavMessage::COMMAND_LONG(command) => {
                     assert_eq!((command.target_system, command.target_component), (1, 1));
-                    self.heard.push(command.command);
+                    self.received.push(command.command);
                     self.obey(&command, packet.sender);
                 }
                 MavMessage::SET_POSITION_TARGET_LOCAL_NED(setpoint) => {
@@ -112,11 +112,11 @@ impl Fake {
     }
 
     fn obey(&mut self, command: &COMMAND_LONG_DATA, from: Sender) {
-        let mut said = None;
+        let mut texts = None;
         let result = match &mut self.refuse {
             Some((refused, result, text, times)) if *refused == command.command && *times > 0 => {
                 *times -= 1;
-                said = Some(*text);
+                texts = Some(*text);
                 *result
             }
             _ => self.carry_out(command),
@@ -133,8 +133,8 @@ impl Fake {
             }));
         }
         // The reason comes after the refusal.
-        if let Some(text) = said {
-            self.say(text);
+        if let Some(text) = texts {
+            self.text(text);
         }
     }
 
@@ -162,7 +162,7 @@ impl Fake {
         MavResult::MAV_RESULT_ACCEPTED
     }
 
-    fn say(&mut self, text: &str) {
+    fn text(&mut self, text: &str) {
         self.queue.push(MavMessage::STATUSTEXT(STATUSTEXT_DATA {
             severity: MavSeverity::MAV_SEVERITY_CRITICAL,
             text: text.into(),
@@ -282,7 +282,7 @@ impl World {
         world
     }
 
-    fn hear(&mut self, sender: Sender, message: &MavMessage) {
+    fn receive(&mut self, sender: Sender, message: &MavMessage) {
         let packet = packet::encode(sender, self.sequence, message);
         self.sequence = self.sequence.wrapping_add(1);
         for packet in Parser::new().push(&packet) {
@@ -293,7 +293,7 @@ impl World {
     fn step(&mut self) {
         self.now += STEP;
         for message in self.fake.step(self.now) {
-            self.hear(AUTOPILOT, &message);
+            self.receive(AUTOPILOT, &message);
         }
         self.client.tick(self.now);
         while let Some(packet) = self.client.poll_outgoing() {
@@ -310,8 +310,8 @@ impl World {
         }
     }
 
-    /// Asks and waits for the outcome.
-    fn ask(&mut self, command: Command) -> Result<(), CommandError> {
+    /// Requests a command and waits for the outcome.
+    fn request(&mut self, command: Command) -> Result<(), CommandError> {
         let id = self.client.request(self.now, command);
         self.outcome(id)
     }
@@ -328,29 +328,29 @@ impl World {
         panic!("a command without an end");
     }
 
-    /// Takes off; returns the end, and all that was said on the way.
+    /// Takes off; returns the end, and all texts of the progress.
     fn take_off(&mut self, takeoff: &mut Takeoff, seconds: i64) -> (TakeoffProgress, Vec<String>) {
-        let mut said = Vec::<String>::new();
+        let mut texts = Vec::<String>::new();
         for _ in 0..seconds * SECOND / STEP {
             self.step();
             let progress = takeoff.step(self.now, &mut self.client);
             let words = progress.to_string();
-            if said.last() != Some(&words) {
-                said.push(words);
+            if texts.last() != Some(&words) {
+                texts.push(words);
             }
             if takeoff.is_finished() {
-                return (progress, said);
+                return (progress, texts);
             }
         }
-        panic!("a takeoff without an end: {said:?}");
+        panic!("a takeoff without an end: {texts:?}");
     }
 
     fn count(&self, wanted: impl Fn(&Event) -> bool) -> usize {
         self.events.iter().filter(|event| wanted(event)).count()
     }
 
-    fn heard(&self, command: MavCmd) -> usize {
-        self.fake.heard.iter().filter(|&&heard| heard == command).count()
+    fn commands(&self, command: MavCmd) -> usize {
+        self.fake.received.iter().filter(|&&received| received == command).count()
     }
 }
 
@@ -362,7 +362,7 @@ fn it_finds_the_vehicle_and_gets_its_messages_at_their_rates() {
     world.run(10);
     let positions = world.count(|event| matches!(event, Event::Position(_))) - before;
     assert_eq!(positions, 500);
-    assert_eq!(world.heard(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL), 7, "each is asked for once");
+    assert_eq!(world.commands(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL), 7, "each is requested once");
     let state = world.client.state().unwrap();
     assert!(state.ready && state.connected && !state.armed);
     assert_eq!(state.landed, LandedState::OnGround);
@@ -379,14 +379,14 @@ fn other_senders_on_the_link_are_not_the_autopilot() {
         autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
         ..Default::default()
     });
-    world.hear(Sender { system: 255, component: 190 }, &station);
-    world.hear(Sender { system: 255, component: 1 }, &station);
+    world.receive(Sender { system: 255, component: 190 }, &station);
+    world.receive(Sender { system: 255, component: 1 }, &station);
     let camera = MavMessage::HEARTBEAT(HEARTBEAT_DATA {
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         mavtype: MavType::MAV_TYPE_CAMERA,
         ..Default::default()
     });
-    world.hear(Sender { system: 1, component: 100 }, &camera);
+    world.receive(Sender { system: 1, component: 100 }, &camera);
     assert!(world.client.state().is_none());
 
     world.run(3);
@@ -397,7 +397,7 @@ fn other_senders_on_the_link_are_not_the_autopilot() {
         ..Default::default()
     };
     for _ in 0..3 {
-        world.hear(Sender { system: 2, component: 1 }, &MavMessage::HEARTBEAT(armed.clone()));
+        world.receive(Sender { system: 2, component: 1 }, &MavMessage::HEARTBEAT(armed.clone()));
     }
     world.step();
     assert!(!world.client.state().unwrap().armed, "that was another vehicle");
@@ -405,25 +405,25 @@ fn other_senders_on_the_link_are_not_the_autopilot() {
 }
 
 #[test]
-fn a_second_controller_in_our_name_is_told_once() {
+fn a_second_controller_with_our_ids_is_reported_once() {
     let mut world = World::standing();
     let companion = Sender { system: 1, component: 191 };
     for _ in 0..3 {
-        world.hear(companion, &autopilot::compose::heartbeat());
+        world.receive(companion, &autopilot::compose::heartbeat());
         world.step();
     }
     assert_eq!(world.count(|event| *event == Event::SameAddress { sender: companion }), 1);
 }
 
 #[test]
-fn a_pinned_system_is_waited_for() {
+fn only_the_pinned_system_is_found() {
     let config = Config { system_id: Some(7), ..Config::default() };
     let mut world = World::with(Fake::new(), config);
     world.client.tick(world.now);
     while world.client.poll_outgoing().is_some() {}
-    world.hear(AUTOPILOT, &world.fake.heartbeat());
+    world.receive(AUTOPILOT, &world.fake.heartbeat());
     assert!(world.client.state().is_none());
-    world.hear(Sender { system: 7, component: 1 }, &world.fake.heartbeat());
+    world.receive(Sender { system: 7, component: 1 }, &world.fake.heartbeat());
     assert_eq!(world.client.system(), Some(7));
     assert_eq!(world.client.our_address(), Sender { system: 7, component: 191 });
 }
@@ -433,13 +433,13 @@ fn a_lost_command_and_a_lost_acknowledgement_do_no_harm() {
     for (lose_commands, lose_acks) in [(0, 0), (2, 0), (0, 2), (1, 1)] {
         let mut world = World::standing();
         (world.fake.lose_commands, world.fake.lose_acks) = (lose_commands, lose_acks);
-        assert_eq!(world.ask(Command::SetMode(FlightMode::Guided)), Ok(()));
+        assert_eq!(world.request(Command::SetMode(FlightMode::Guided)), Ok(()));
         assert_eq!(world.client.state().unwrap().mode, FlightMode::Guided);
         (world.fake.lose_commands, world.fake.lose_acks) = (lose_commands, lose_acks);
-        assert_eq!(world.ask(Command::Arm), Ok(()));
+        assert_eq!(world.request(Command::Arm), Ok(()));
         assert!(world.client.state().unwrap().armed, "done only when the heartbeat shows it");
         (world.fake.lose_commands, world.fake.lose_acks) = (lose_commands, lose_acks);
-        assert_eq!(world.ask(Command::Takeoff { height_m: 10.0 }), Ok(()));
+        assert_eq!(world.request(Command::Takeoff { height_m: 10.0 }), Ok(()));
         assert!(world.fake.climbs_to.is_some());
     }
 }
@@ -448,20 +448,24 @@ fn a_lost_command_and_a_lost_acknowledgement_do_no_harm() {
 fn silence_after_a_command_is_an_error_that_names_it() {
     let mut world = World::standing();
     world.fake.lose_commands = 100;
-    let error = world.ask(Command::Arm).unwrap_err();
+    let error = world.request(Command::Arm).unwrap_err();
     assert_eq!(error, CommandError::NoAnswer { command: Command::Arm, attempts: 4 });
-    assert!(error.to_string().starts_with("arm: no answer to 4 requests"), "{error}");
+    assert!(error.to_string().starts_with("arm: no acknowledgement of 4 requests"), "{error}");
 }
 
 #[test]
-fn a_refusal_is_told_with_the_autopilots_own_reason() {
+fn a_refusal_has_the_autopilots_own_reason() {
     let mut world = World::standing();
     let denied = MavResult::MAV_RESULT_FAILED;
     world.fake.refuse =
         Some((MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, denied, "Arm: Accels inconsistent", 9));
-    let error = world.ask(Command::Arm).unwrap_err().to_string();
+    let error = world.request(Command::Arm).unwrap_err().to_string();
     assert!(error.contains("failed") && error.contains("Arm: Accels inconsistent"), "{error}");
-    assert_eq!(world.heard(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM), 1, "a refusal is not repeated");
+    assert_eq!(
+        world.commands(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM),
+        1,
+        "a refusal is not repeated"
+    );
 }
 
 #[test]
@@ -475,15 +479,15 @@ fn each_refusal_gets_its_own_reason() {
         "Arm: Accels inconsistent",
         1,
     ));
-    world.fake.say("No such mode 99");
+    world.fake.text("No such mode 99");
     world.step();
-    world.fake.say("No such mode 99");
-    let said = |error| match error {
-        Err(CommandError::Refused { said, .. }) => said,
+    world.fake.text("No such mode 99");
+    let texts = |error| match error {
+        Err(CommandError::Refused { texts, .. }) => texts,
         other => panic!("{other:?}"),
     };
-    assert_eq!(said(world.outcome(arm)), ["Arm: Accels inconsistent"]);
-    assert_eq!(said(world.outcome(takeoff)), ["No such mode 99"]);
+    assert_eq!(texts(world.outcome(arm)), ["Arm: Accels inconsistent"]);
+    assert_eq!(texts(world.outcome(takeoff)), ["No such mode 99"]);
 }
 
 #[test]
@@ -491,20 +495,20 @@ fn a_temporary_refusal_is_tried_again() {
     let mut world = World::standing();
     let later = MavResult::MAV_RESULT_TEMPORARILY_REJECTED;
     world.fake.refuse = Some((MavCmd::MAV_CMD_DO_SET_MODE, later, "wait", 2));
-    assert_eq!(world.ask(Command::SetMode(FlightMode::Land)), Ok(()));
+    assert_eq!(world.request(Command::SetMode(FlightMode::Land)), Ok(()));
 }
 
 #[test]
 fn an_accepted_mode_that_never_shows_is_an_error() {
     let mut world = World::standing();
     world.fake.ignores_modes = true;
-    let error = world.ask(Command::SetMode(FlightMode::Land)).unwrap_err();
+    let error = world.request(Command::SetMode(FlightMode::Land)).unwrap_err();
     assert!(matches!(error, CommandError::NotConfirmed { .. }));
     assert!(error.to_string().contains("still shows STABILIZE"), "{error}");
 }
 
 #[test]
-fn an_answer_to_another_station_is_not_taken_for_ours() {
+fn an_acknowledgement_for_another_station_is_ignored() {
     let mut world = World::standing();
     world.fake.lose_commands = 1;
     let id = world.client.request(world.now, Command::Arm);
@@ -516,17 +520,17 @@ fn an_answer_to_another_station_is_not_taken_for_ours() {
         target_component: 190,
         ..Default::default()
     };
-    world.hear(AUTOPILOT, &MavMessage::COMMAND_ACK(ack));
+    world.receive(AUTOPILOT, &MavMessage::COMMAND_ACK(ack));
     assert_eq!(world.outcome(id), Ok(()));
 }
 
 #[test]
-fn a_later_command_takes_the_place_of_an_earlier_one() {
+fn a_later_command_replaces_an_earlier_one() {
     let mut world = World::standing();
     world.fake.lose_commands = 1;
     let first = world.client.request(world.now, Command::SetMode(FlightMode::Guided));
     world.step();
-    assert_eq!(world.ask(Command::SetMode(FlightMode::Land)), Ok(()));
+    assert_eq!(world.request(Command::SetMode(FlightMode::Land)), Ok(()));
     assert!(matches!(
         world.client.status(first),
         CommandStatus::Failed(CommandError::Replaced { .. })
@@ -534,7 +538,7 @@ fn a_later_command_takes_the_place_of_an_earlier_one() {
 }
 
 #[test]
-fn the_same_asked_for_again_without_an_answer_is_sent_at_once() {
+fn a_repeated_request_without_acknowledgement_is_sent_at_once() {
     let mut world = World::standing();
     world.fake.lose_commands = 1;
     let first = world.client.request(world.now, Command::SetMode(FlightMode::Land));
@@ -548,7 +552,7 @@ fn the_same_asked_for_again_without_an_answer_is_sent_at_once() {
 }
 
 #[test]
-fn a_lost_heartbeat_is_told_ends_commands_and_returns() {
+fn a_lost_heartbeat_is_reported_and_ends_commands() {
     let mut world = World::flying();
     let id = world.client.request(world.now, Command::SetMode(FlightMode::Land));
     world.fake.silent = true;
@@ -559,20 +563,20 @@ fn a_lost_heartbeat_is_told_ends_commands_and_returns() {
     assert_eq!(world.outcome(id), Err(lost));
     let velocity = world.client.set_velocity(world.now, Vector::zero(), 0.0);
     assert_eq!(velocity, Err(SetpointError::NoAutopilot));
-    assert!(world.ask(Command::Arm).unwrap_err().to_string().contains("no heartbeat"));
+    assert!(world.request(Command::Arm).unwrap_err().to_string().contains("no heartbeat"));
 
-    let asked = world.heard(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL);
+    let requests = world.commands(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL);
     world.fake.silent = false;
     world.run(5);
     assert_eq!(world.count(|event| *event == Event::Returned), 1);
     assert!(
-        world.heard(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL) >= asked + 7,
-        "rates are asked for again"
+        world.commands(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL) >= requests + 7,
+        "rates are requested again"
     );
 }
 
 #[test]
-fn a_restart_is_noticed_and_everything_is_asked_for_again() {
+fn a_restart_is_detected_and_everything_requested_again() {
     let mut world = World::standing();
     world.run(5);
     let boot_ns = world.now;
@@ -622,7 +626,7 @@ fn a_message_that_never_comes_is_named() {
 }
 
 #[test]
-fn velocities_are_sent_only_where_they_mean_something() {
+fn velocities_are_sent_only_in_flight_in_guided() {
     let mut world = World::flying();
     let forward = Vector::new(0.5, 0.0, -0.1);
     assert_eq!(world.client.set_velocity(world.now, forward, 0.0), Ok(()));
@@ -649,18 +653,18 @@ fn velocities_are_sent_only_where_they_mean_something() {
 }
 
 #[test]
-fn what_is_not_flown_is_recognised_and_refused_by_name() {
+fn unsupported_firmware_is_refused_by_name() {
     let fake = Fake { firmware: MavAutopilot::MAV_AUTOPILOT_GENERIC, mode: 4, ..Fake::new() };
     let mut world = World::with(fake, Config::default());
     world.run(3);
-    let error = world.ask(Command::Arm).unwrap_err().to_string();
+    let error = world.request(Command::Arm).unwrap_err().to_string();
     assert!(error.contains("unknown firmware") && error.contains("ArduPilot or PX4"), "{error}");
     let error = world.client.set_velocity(world.now, Vector::zero(), 0.0).unwrap_err();
     assert_eq!(error, SetpointError::Unsupported(Firmware::Unknown));
 }
 
 #[test]
-fn what_was_measured_carries_its_own_time_once_the_clocks_are_known() {
+fn measurements_carry_their_own_time_once_clocks_are_synchronised() {
     let boot_ns = 63 * SECOND;
     let fake = Fake { boot_ns, late_steps: 15, ..Fake::new() };
     let age_ms = |world: &World| {
@@ -676,18 +680,18 @@ fn what_was_measured_carries_its_own_time_once_the_clocks_are_known() {
     without.run(10);
     assert!(without.client.round_trip(without.now).is_none());
     assert!(age_ms(&without) <= 20, "that of its reception");
-    // It asks for our time as well, and is told.
+    // It requests our time as well, and gets it.
     let question = TIMESYNC_DATA { tc1: 0, ts1: 77, ..Default::default() };
-    world.hear(AUTOPILOT, &MavMessage::TIMESYNC(question));
+    world.receive(AUTOPILOT, &MavMessage::TIMESYNC(question));
     let mut answers = Vec::new();
     while let Some(packet) = world.client.poll_outgoing() {
         answers.extend(Parser::new().push(&packet).into_iter().filter_map(|f| f.message));
     }
-    let told = |message: &MavMessage| match message {
+    let reply = |message: &MavMessage| match message {
         MavMessage::TIMESYNC(answer) => Some((answer.tc1, answer.ts1)),
         _ => None,
     };
-    assert_eq!(answers.iter().find_map(told), Some((world.now, 77)));
+    assert_eq!(answers.iter().find_map(reply), Some((world.now, 77)));
 }
 
 #[test]
@@ -695,7 +699,7 @@ fn a_takeoff_waits_arms_again_and_ends_at_its_height() {
     let mut world = World::with(Fake { ready: false, ..Fake::new() }, Config::default());
     let mut takeoff = Takeoff::new(10.0);
     world.run(3);
-    world.fake.say("PreArm: Need Position Estimate");
+    world.fake.text("PreArm: Need Position Estimate");
     for _ in 0..100 {
         world.step();
         takeoff.step(world.now, &mut world.client);
@@ -710,14 +714,14 @@ fn a_takeoff_waits_arms_again_and_ends_at_its_height() {
     let failed = MavResult::MAV_RESULT_FAILED;
     world.fake.refuse =
         Some((MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, failed, "Arm: Gyros not healthy", 2));
-    let (end, said) = world.take_off(&mut takeoff, 60);
-    assert_eq!(end, TakeoffProgress::Done, "{said:?}");
+    let (end, texts) = world.take_off(&mut takeoff, 60);
+    assert_eq!(end, TakeoffProgress::Done, "{texts:?}");
     assert!((world.fake.height - 10.0).abs() < 0.5);
-    assert!(said.iter().any(|words| words.contains("Gyros not healthy")), "{said:?}");
+    assert!(texts.iter().any(|words| words.contains("Gyros not healthy")), "{texts:?}");
     assert!(world.fake.velocities.is_empty());
     let orders: Vec<MavCmd> = world
         .fake
-        .heard
+        .received
         .iter()
         .copied()
         .filter(|command| *command != MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL)
@@ -739,7 +743,7 @@ fn a_vehicle_that_flies_already_needs_no_takeoff() {
     let mut world = World::flying();
     let (end, _) = world.take_off(&mut Takeoff::new(10.0), 5);
     assert_eq!(end, TakeoffProgress::Done);
-    assert_eq!(world.heard(MavCmd::MAV_CMD_NAV_TAKEOFF), 0);
+    assert_eq!(world.commands(MavCmd::MAV_CMD_NAV_TAKEOFF), 0);
 }
 
 #[test]
@@ -753,7 +757,7 @@ fn a_vehicle_that_the_pilot_flies_is_left_alone() {
     };
     assert_eq!(*mode, FlightMode::Other(5));
     assert!(end.to_string().contains("in the air in LOITER"), "{end}");
-    assert_eq!(world.heard(MavCmd::MAV_CMD_DO_SET_MODE), 0);
+    assert_eq!(world.commands(MavCmd::MAV_CMD_DO_SET_MODE), 0);
 }
 
 #[test]
@@ -773,7 +777,7 @@ fn the_pilots_mode_switch_ends_a_takeoff() {
 }
 
 #[test]
-fn what_was_lost_on_the_way_is_not_repeated_against_the_pilot() {
+fn a_lost_command_is_not_repeated_against_the_pilot() {
     let mut world = World::flying();
     world.fake.lose_commands = 1;
     let id = world.client.request(world.now, Command::SetMode(FlightMode::Land));
@@ -783,7 +787,7 @@ fn what_was_lost_on_the_way_is_not_repeated_against_the_pilot() {
     world.run(5);
     let withdrawn = CommandError::Withdrawn { command: Command::SetMode(FlightMode::Land) };
     assert_eq!(world.client.status(id), CommandStatus::Failed(withdrawn));
-    assert_eq!((world.heard(MavCmd::MAV_CMD_DO_SET_MODE), world.fake.mode), (0, 5));
+    assert_eq!((world.commands(MavCmd::MAV_CMD_DO_SET_MODE), world.fake.mode), (0, 5));
 
     // The pilot switches while we arm, and the motors stay off.
     let mut world = World::standing();
@@ -801,7 +805,7 @@ fn what_was_lost_on_the_way_is_not_repeated_against_the_pilot() {
     let (end, _) = world.take_off(&mut takeoff, 3);
     assert!(matches!(end, TakeoffProgress::Failed(TakeoffError::PilotInCommand { .. })), "{end}");
     world.run(5);
-    assert!(!world.fake.armed && world.heard(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM) == 0);
+    assert!(!world.fake.armed && world.commands(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM) == 0);
 }
 
 #[test]
@@ -824,9 +828,9 @@ fn a_vehicle_found_standing_with_armed_motors_is_not_lifted() {
     world.fake.armed = false;
     let (end, _) = world.take_off(&mut takeoff, 5);
     assert_eq!(end, TakeoffProgress::Failed(TakeoffError::Disarmed));
-    assert!(world.fake.heard.iter().all(|c| *c == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL));
+    assert!(world.fake.received.iter().all(|c| *c == MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL));
 
-    // Its motors were being started for a take-off that an earlier controller asked for.
+    // Its motors were being started for a take-off that an earlier controller requested.
     let mut world = found(MavLandedState::MAV_LANDED_STATE_ON_GROUND);
     let mut takeoff = Takeoff::new(10.0);
     takeoff.step(world.now, &mut world.client);

@@ -1,7 +1,8 @@
 //! The client against a PX4 that keeps the rules of its documentation
-//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>, <https://docs.px4.io/main/en/advanced_features/precland.html>):
-//! OFFBOARD needs a second of setpoints before and goes on only with them, a takeoff goes to an altitude over the sea,
-//! and the estimator tells of itself in ESTIMATOR_STATUS.
+//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>,
+//! <https://docs.px4.io/main/en/advanced_features/precland.html>): OFFBOARD needs a second of setpoints
+//! before and goes on only with them, a takeoff goes to an altitude over the sea, and the estimator tells of
+//! itself in ESTIMATOR_STATUS.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests may fail like tests")]
 
@@ -36,7 +37,7 @@ struct Px4 {
     /// Since when setpoints have come at 2 Hz or more, and when the last one came.
     streaming: Option<(i64, i64)>,
     setpoints: Vec<[f32; 3]>,
-    modes_asked: usize,
+    mode_requests: usize,
     landing_targets: Vec<(u8, [f32; 3])>,
     queue: Vec<MavMessage>,
 }
@@ -80,7 +81,7 @@ impl Px4 {
             }
             MavCmd::MAV_CMD_DO_SET_MODE => {
                 assert_eq!(command.param1, 1.0);
-                self.modes_asked += 1;
+                self.mode_requests += 1;
                 let number = [0, 0, command.param2 as u8, command.param3 as u8];
                 let mode = FlightMode::Px4(u32::from_le_bytes(number));
                 let proven = self
@@ -189,7 +190,7 @@ impl World {
             intervals: BTreeMap::new(),
             streaming: None,
             setpoints: Vec::new(),
-            modes_asked: 0,
+            mode_requests: 0,
             landing_targets: Vec::new(),
             queue: Vec::new(),
         };
@@ -218,7 +219,7 @@ impl World {
         }
     }
 
-    fn ask(&mut self, command: Command) -> Result<(), CommandError> {
+    fn request(&mut self, command: Command) -> Result<(), CommandError> {
         let id = self.client.request(self.now, command);
         for _ in 0..1000 {
             match self.client.status(id) {
@@ -267,7 +268,7 @@ fn a_takeoff_arms_rises_to_an_altitude_and_ends_in_offboard() {
 #[test]
 fn offboard_is_entered_with_a_stream_and_lost_without_one() {
     let mut world = World::flying(5.0);
-    world.ask(Command::SetMode(FlightMode::OFFBOARD)).unwrap();
+    world.request(Command::SetMode(FlightMode::OFFBOARD)).unwrap();
     for _ in 0..200 {
         world.client.set_velocity(world.now, Vector::new(0.3, 0.0, 0.0), 0.0).unwrap();
         world.step();
@@ -280,20 +281,20 @@ fn offboard_is_entered_with_a_stream_and_lost_without_one() {
 }
 
 #[test]
-fn it_lands_in_its_own_mode_and_is_told_where_in_its_own_frame() {
+fn it_lands_in_its_own_mode_with_targets_in_its_own_frame() {
     let mut world = World::flying(5.0);
-    world.ask(Command::SetMode(Firmware::Px4.land().unwrap())).unwrap();
+    world.request(Command::SetMode(Firmware::Px4.land().unwrap())).unwrap();
     assert_eq!(world.px4.mode, FlightMode::AUTO_LAND);
     let (in_body, in_local) = (Point::new(0.1, 0.2, 4.8), Point::new(3.0, 4.0, -0.2));
     assert!(world.client.send_landing_target(world.now, in_body, in_local));
     world.step();
     assert_eq!(world.px4.landing_targets, [(1, [3.0, 4.0, -0.2])]);
-    world.ask(Command::SetMode(Firmware::Px4.precision_land().unwrap())).unwrap();
+    world.request(Command::SetMode(Firmware::Px4.precision_land().unwrap())).unwrap();
     assert_eq!(world.px4.mode.to_string(), "PX4 PRECISION LAND");
 }
 
 #[test]
-fn a_pilots_switch_on_the_way_up_ends_the_takeoff() {
+fn the_pilots_mode_change_ends_the_takeoff() {
     let mut world = World::new();
     let mut takeoff = Takeoff::new(10.0);
     let mut rises = false;
@@ -316,13 +317,13 @@ fn a_pilots_switch_on_the_way_up_ends_the_takeoff() {
 }
 
 #[test]
-fn a_mode_asked_for_again_before_the_heartbeat_shows_it_is_neither_sent_twice_nor_a_failure() {
+fn a_mode_requested_again_before_the_heartbeat_is_sent_once() {
     let mut world = World::flying(5.0);
     let land = Command::SetMode(FlightMode::AUTO_LAND);
     while world.now % SECOND != STEP {
         world.step();
     }
-    let before = world.px4.modes_asked;
+    let before = world.px4.mode_requests;
     let first = world.client.request(world.now, land);
     for _ in 0..20 {
         world.step();
@@ -331,7 +332,7 @@ fn a_mode_asked_for_again_before_the_heartbeat_shows_it_is_neither_sent_twice_no
     assert_eq!(first, second);
     world.run(2);
     assert_eq!(world.client.status(first), CommandStatus::Done);
-    assert_eq!(world.px4.modes_asked - before, 1);
+    assert_eq!(world.px4.mode_requests - before, 1);
     let failed = |event: Event| matches!(event, Event::Command { result: Err(_), .. });
     assert!(!std::iter::from_fn(|| world.client.poll_event()).any(failed));
 }

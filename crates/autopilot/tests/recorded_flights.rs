@@ -1,4 +1,5 @@
-//! Logs of real and simulated flights: every packet is found, and the client tells what happened when.
+//! Logs of real and simulated flights: every packet is found, and the client reports changes when they
+//! happen.
 //!
 //! The logs are not part of the repository; without them these tests say so and pass.
 
@@ -32,8 +33,8 @@ fn logs(folder: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// A log is, for each packet, the time in microseconds (8 bytes, big endian) and the packet; the parser gets it as it
-/// is, with the times as noise between the packets.
+/// A log is, for each packet, the time in microseconds (8 bytes, big endian) and the packet; the parser gets
+/// it as it is, with the times as noise between the packets.
 fn parse(log: &[u8]) -> (Vec<Packet>, Counters) {
     let mut parser = Parser::new();
     let mut packets: Vec<Packet> = log.chunks(1000).flat_map(|piece| parser.push(piece)).collect();
@@ -91,17 +92,17 @@ fn the_real_logs_give_what_pymavlink_finds_in_them() {
     }
 }
 
-/// What the client must tell, in seconds since the first heartbeat.
+/// The changes that the client must report, in seconds since the first heartbeat.
 #[derive(Debug, PartialEq)]
-enum Told {
+enum Change {
     Mode(FlightMode),
     Armed(bool),
     Landed(LandedState),
 }
 
-fn told_by_client(log: &[u8]) -> (Vec<(f64, Told)>, Autopilot) {
+fn changes_of_client(log: &[u8]) -> (Vec<(f64, Change)>, Autopilot) {
     let mut client = Autopilot::new(Config::default());
-    let mut told = Vec::new();
+    let mut changes = Vec::new();
     let mut first_ns = None;
     for (now_ns, packet) in timed(log) {
         client.handle(now_ns, &packet);
@@ -113,9 +114,9 @@ fn told_by_client(log: &[u8]) -> (Vec<(f64, Told)>, Autopilot) {
                     first_ns = Some(now_ns);
                     continue;
                 }
-                Event::ModeChanged { from: Some(_), to } => Told::Mode(to),
-                Event::ArmedChanged(armed) => Told::Armed(armed),
-                Event::LandedChanged { to, .. } => Told::Landed(to),
+                Event::ModeChanged { from: Some(_), to } => Change::Mode(to),
+                Event::ArmedChanged(armed) => Change::Armed(armed),
+                Event::LandedChanged { to, .. } => Change::Landed(to),
                 // The simulator pauses for 3 s while it starts.
                 Event::Lost { .. } if !client.state().unwrap().armed => continue,
                 Event::Lost { .. } | Event::Restarted | Event::OtherVehicle { .. } => {
@@ -124,17 +125,17 @@ fn told_by_client(log: &[u8]) -> (Vec<(f64, Told)>, Autopilot) {
                 _ => continue,
             };
             let first_ns = first_ns.expect("the vehicle is found before it does anything");
-            told.push(((now_ns - first_ns) as f64 * 1e-9, what));
+            changes.push(((now_ns - first_ns) as f64 * 1e-9, what));
         }
     }
-    (told, client)
+    (changes, client)
 }
 
-fn told_by_events(events: &[Value]) -> Vec<(f64, Told)> {
+fn told_by_events(events: &[Value]) -> Vec<(f64, Change)> {
     let text = |event: &Value| event["name"].as_str().unwrap().to_owned();
     let first =
         events.iter().find(|event| text(event) == "HEARTBEAT").unwrap()["wall"].as_f64().unwrap();
-    let mut told = Vec::new();
+    let mut changes = Vec::new();
     let (mut mode, mut armed) = (0, false);
     for event in events {
         let at = event["wall"].as_f64().unwrap() - first;
@@ -142,11 +143,12 @@ fn told_by_events(events: &[Value]) -> Vec<(f64, Told)> {
             "HEARTBEAT" => {
                 let now = event["custom_mode"].as_u64().unwrap() as u32;
                 if std::mem::replace(&mut mode, now) != now {
-                    told.push((at, Told::Mode(FlightMode::of(autopilot::Firmware::Copter, now))));
+                    changes
+                        .push((at, Change::Mode(FlightMode::of(autopilot::Firmware::Copter, now))));
                 }
                 let now = event["base_mode"].as_u64().unwrap() & 128 != 0;
                 if std::mem::replace(&mut armed, now) != now {
-                    told.push((at, Told::Armed(now)));
+                    changes.push((at, Change::Armed(now)));
                 }
             }
             "LANDED_STATE" => {
@@ -157,26 +159,26 @@ fn told_by_events(events: &[Value]) -> Vec<(f64, Told)> {
                     4 => LandedState::Landing,
                     other => panic!("landed state {other}"),
                 };
-                told.push((at, Told::Landed(state)));
+                changes.push((at, Change::Landed(state)));
             }
             _ => {}
         }
     }
-    told
+    changes
 }
 
 #[test]
-fn the_client_tells_what_happened_when_it_happened() {
+fn the_client_reports_changes_when_they_happen() {
     let Some(folder) = testing::recording("ardupilot") else { return };
     let mut compared = 0;
     for path in logs(&folder) {
         let events = path.with_extension("tlog.events.json");
         let Ok(events) = std::fs::read(events) else { continue };
         let events: Vec<Value> = serde_json::from_slice(&events).unwrap();
-        let (told, client) = told_by_client(&std::fs::read(&path).unwrap());
+        let (changes, client) = changes_of_client(&std::fs::read(&path).unwrap());
         let expected = told_by_events(&events);
-        assert_eq!(told.len(), expected.len(), "{told:?}\n{expected:?}");
-        for ((at, what), (expected_at, expected)) in told.iter().zip(&expected) {
+        assert_eq!(changes.len(), expected.len(), "{changes:?}\n{expected:?}");
+        for ((at, what), (expected_at, expected)) in changes.iter().zip(&expected) {
             assert_eq!(what, expected, "at {at} s");
             assert!(
                 (at - expected_at).abs() < 0.1,
@@ -184,11 +186,11 @@ fn the_client_tells_what_happened_when_it_happened() {
             );
             compared += 1;
         }
-        assert!(expected.iter().any(|(_, what)| *what == Told::Mode(FlightMode::Land)));
+        assert!(expected.iter().any(|(_, what)| *what == Change::Mode(FlightMode::Land)));
         assert_eq!(client.refused_numbers(), 0);
         assert!(client.state().unwrap().position.is_some());
     }
-    println!("{compared} changes told at the right time");
+    println!("{compared} changes reported at the right time");
     assert!(compared > 10);
 }
 
@@ -196,10 +198,10 @@ fn the_client_tells_what_happened_when_it_happened() {
 fn a_precision_landing_is_followed_to_the_ground() {
     let Some(folder) = testing::recording("ardupilot") else { return };
     for path in logs(&folder) {
-        let (told, client) = told_by_client(&std::fs::read(&path).unwrap());
+        let (changes, client) = changes_of_client(&std::fs::read(&path).unwrap());
         let state = client.state().unwrap();
         assert!(!state.armed && state.landed == LandedState::OnGround, "{}", path.display());
-        assert!(told.iter().any(|(_, what)| *what == Told::Landed(LandedState::InAir)));
-        println!("{}: {} changes, {state:?}", path.display(), told.len());
+        assert!(changes.iter().any(|(_, what)| *what == Change::Landed(LandedState::InAir)));
+        println!("{}: {} changes, {state:?}", path.display(), changes.len());
     }
 }

@@ -87,8 +87,8 @@ pub struct FrameHeader {
 
 /// A rectangle of a frame as a file of its own, at full or reduced resolution.
 ///
-/// The part's pixel (u, v) is the mean of `scale` x `scale` pixels of the frame, the first of which is
-/// (`x` + `scale` u, `y` + `scale` v); so its centre is at `x` + `scale` u + (`scale` - 1) / 2 in the frame, and
+/// The part's pixel (u, v) is the mean of `scale` x `scale` pixels of the frame, the first of which is (`x` +
+/// `scale` u, `y` + `scale` v); so its centre is at `x` + `scale` u + (`scale` - 1) / 2 in the frame, and
 /// likewise downwards.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FramePart {
@@ -108,8 +108,8 @@ pub struct FramePart {
 
 /// Acknowledges a frame of the air link; sent when the frame has arrived, before it is searched.
 ///
-/// It carries the frame's stamp back to the clock it was taken from, so the round trip is one subtraction and needs no
-/// synchronised clocks.
+/// It carries the frame's stamp back to the clock it was taken from, so the round trip is one subtraction and
+/// needs no synchronised clocks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FrameAck {
     /// The frame's camera.

@@ -88,8 +88,8 @@ impl DecodeError {
 /// The bytes of a message.
 pub fn encode<M: Message>(message: &M) -> Vec<u8> {
     let mut bytes = vec![MAGIC, M::TYPE, M::VERSION];
-    // Postcard fails only on sequences of unknown length, which no message has; were one to appear, the receiver
-    // would refuse the header without a body.
+    // Postcard fails only on sequences of unknown length, which no message has; were one to appear, the
+    // receiver would refuse the header without a body.
     if let Ok(body) = postcard::to_stdvec(message) {
         bytes.extend_from_slice(&body);
     }

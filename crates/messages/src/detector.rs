@@ -54,8 +54,8 @@ pub struct MarkerPose {
     pub camera_from_marker: Transform3,
     /// Root mean square distance, in pixels, between the image's edges and the pose's.
     pub reprojection_rms_px: f64,
-    /// Covariance of translation (x, y, z in metres) and rotation (a rotation vector in radians, applied after the
-    /// pose), both in the camera frame: the upper triangle of the 6 x 6 matrix, row by row.
+    /// Covariance of translation (x, y, z in metres) and rotation (a rotation vector in radians, applied
+    /// after the pose), both in the camera frame: the upper triangle of the 6 x 6 matrix, row by row.
     pub covariance: [f32; 21],
     /// The second solution of the pose of a flat marker, if there is one.
     pub alternative: Option<AlternativePose>,

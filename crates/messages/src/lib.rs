@@ -1,12 +1,12 @@
 //! What crosses a process: types, the topic table, and the codec.
 //!
 //! Wire types are plain data. They say nothing of what is done with them, and this crate knows no Zenoh, no
-//! clock and no algorithm. Units are in the fields' names; coordinate frames and pixel conventions are those of the
-//! `geometry` crate.
+//! clock and no algorithm. Units are in the fields' names; coordinate frames and pixel conventions are those
+//! of the `geometry` crate.
 //!
 //! Modules in reading order: [`topic`] is the table of everything that is published, [`codec`] turns it into
-//! bytes and back, [`convert`] into the types of `geometry` and `imaging` and back; [`sample`] has messages for tests, and
-//! the others are the types by publisher.
+//! bytes and back, [`convert`] into the types of `geometry` and `imaging` and back; [`sample`] has messages
+//! for tests, and the others are the types by publisher.
 
 pub mod camera;
 pub mod codec;

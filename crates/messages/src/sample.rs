@@ -1,4 +1,5 @@
-//! Plausible messages for tests, to be changed where a test cares: `FrameHeader { width: 8, ..FrameHeader::sample() }`.
+//! Plausible messages for tests, to be changed where a test cares: `FrameHeader { width: 8,
+//! ..FrameHeader::sample() }`.
 
 use std::f64::consts::FRAC_1_SQRT_2;
 

@@ -72,7 +72,8 @@ impl<M: Message> Topic<M> {
         self.row.delivery
     }
 
-    /// The key with its placeholders filled in, in order; `*` stands for any. Placeholders beyond `names` become `*`.
+    /// The key with its placeholders filled in, in order; `*` stands for any. Placeholders beyond `names`
+    /// become `*`.
     pub fn key(&self, names: &[&str]) -> String {
         let mut names = names.iter();
         let chunks = self.row.key.split('/').map(|chunk| {
@@ -81,7 +82,8 @@ impl<M: Message> Topic<M> {
         chunks.collect::<Vec<_>>().join("/")
     }
 
-    /// The value of the first placeholder in a key of this topic, with any prefix; `None` for a key of another topic.
+    /// The value of the first placeholder in a key of this topic, with any prefix; `None` for a key of
+    /// another topic.
     pub fn first_name<'a>(&self, key: &'a str) -> Option<&'a str> {
         let pattern = self.row.key.rsplit('/');
         let mut chunks = key.rsplit('/');

@@ -23,7 +23,8 @@ fn transform() -> Transform3 {
     Transform3 { translation_m: [0.0, 0.0, 1.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] }
 }
 
-/// The message reads back as it was, its encoding has the bytes it always had, and every damaged copy is refused.
+/// The message reads back as it was, its encoding has the bytes it always had, and every damaged copy is
+/// refused.
 fn check<M: Message + PartialEq + std::fmt::Debug>(message: &M, golden: &str) {
     let bytes = encode(message);
     let hex: String = bytes.iter().map(|b| format!("{b:02x}")).collect();
