@@ -135,7 +135,7 @@ struct Work {
 
 /// An event for the thread.
 enum Event {
-    /// The key, which names the detector, and the ack.
+    /// The key, which names the detector, and the acknowledgement.
     Ack(String, FrameAck),
     Detections(Box<Detections>),
     Status(Box<ControllerStatus>),
@@ -195,7 +195,7 @@ impl Work {
                 self.health
                     .latency("frame sent to ack", Duration::from_secs_f64(ms.max(0.0) * 1e-3));
             }
-            None => self.health.dropped("acks of unknown frames"),
+            None => self.health.dropped("acknowledgements of unknown frames"),
         }
     }
 

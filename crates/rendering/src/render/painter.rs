@@ -198,20 +198,20 @@ impl Painter {
         let [du, dv] = jacobian(&plane);
         let metres_per_pixel =
             (du[0] * du[0] + du[1] * du[1]).max(dv[0] * dv[0] + dv[1] * dv[1]).sqrt();
-        let smallest_m = coats.iter().fold(f64::INFINITY, |smallest, coat| match coat.area {
-            Area::Disc { radius, .. } => smallest.min(radius),
-            Area::Rectangle(min, max) => smallest.min((max[0] - min[0]).min(max[1] - min[1])),
-            Area::Box => smallest,
+        let min_size_m = coats.iter().fold(f64::INFINITY, |size, coat| match coat.area {
+            Area::Disc { radius, .. } => size.min(radius),
+            Area::Rectangle(min, max) => size.min((max[0] - min[0]).min(max[1] - min[1])),
+            Area::Box => size,
         });
-        let smallest_px = smallest_m / metres_per_pixel;
+        let min_size_px = min_size_m / metres_per_pixel;
         let cornered = self.has_corner(coats, middle, &plane);
         let step_px = |motion: [f64; 2]| (motion[0] * motion[0] + motion[1] * motion[1]).sqrt();
-        let straight = smallest_px > STRAIGHT * step_px(coarse.motion);
-        if smallest_px > LARGE_PX && (count == 1 || (straight && !cornered)) {
+        let straight = min_size_px > STRAIGHT * step_px(coarse.motion);
+        if min_size_px > LARGE_PX && (count == 1 || (straight && !cornered)) {
             return coarse;
         }
         let motion = glimpse.motion_px.map(|m| m / count as f64);
-        let blur = match smallest_px {
+        let blur = match min_size_px {
             px if px > LARGE_PX => self.coarsest,
             px if px > SMALL_PX || count > 1 => self.coarsest.max(1),
             // Also at the horizon, where it is NaN.
