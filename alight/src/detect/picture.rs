@@ -1,4 +1,4 @@
-//! Annotated pictures: what was found, drawn where it was found.
+//! Annotated images: the detections drawn into the image.
 
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
@@ -15,29 +15,29 @@ const BLUE: Colour = [70, 140, 255];
 const YELLOW: Colour = [255, 235, 80];
 const WHITE: Colour = [255, 255, 255];
 
-/// Pictures narrower than this are enlarged, so that labels have room.
-const LEAST_WIDTH: usize = 900;
-/// Markers smaller than this get a circle about them, in pixels of the drawing.
-const EASILY_SEEN_PX: f64 = 40.0;
+/// Images narrower than this, in pixels, are enlarged to make room for labels.
+const MIN_WIDTH_PX: usize = 900;
+/// Markers smaller than this, in pixels of the drawing, get a circle of this radius.
+const MIN_VISIBLE_PX: f64 = 40.0;
 
-/// Draws pictures into a folder.
+/// Writes annotated images into a folder.
 #[derive(Debug)]
 pub(super) struct Gallery {
     folder: PathBuf,
 }
 
 impl Gallery {
-    /// Makes the folder if it is not there.
+    /// Creates the folder if it is missing.
     ///
     /// # Errors
-    /// When it cannot be made.
+    /// When it cannot be created.
     pub(super) fn new(folder: &Path) -> anyhow::Result<Self> {
         std::fs::create_dir_all(folder)
-            .with_context(|| format!("making the folder {folder:?} for annotated pictures"))?;
+            .with_context(|| format!("creating the folder {folder:?} for annotated images"))?;
         Ok(Self { folder: folder.to_owned() })
     }
 
-    /// Writes the picture of an image.
+    /// Writes the annotated image.
     ///
     /// # Errors
     /// When it cannot be written.
@@ -53,24 +53,24 @@ impl Gallery {
         let drawn = draw(view, found, camera);
         let (width, height) = (drawn.width as u32, drawn.height as u32);
         image::save_buffer(&path, &drawn.data, width, height, image::ColorType::Rgb8)
-            .with_context(|| format!("writing the annotated picture {path:?}"))
+            .with_context(|| format!("writing the annotated image {path:?}"))
     }
 }
 
-/// The name of an image as that of one file: folders become parts of the name, so that no two share one.
+/// A file name for an image: folders become parts of it, so that it is unique.
 fn file_name(name: &str) -> String {
     let parts = name.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));
     format!("{}.png", parts.collect::<Vec<_>>().join("_").replace(['#', ':'], "-"))
 }
 
 fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>) -> RgbImageBuf {
-    let enlarged = LEAST_WIDTH.div_ceil(view.width()).clamp(1, 4);
+    let enlarged = MIN_WIDTH_PX.div_ceil(view.width()).clamp(1, 4);
     let mut brush = Brush {
         canvas: RgbImageBuf::default(),
         scale: enlarged as f64,
         dot_px: (view.width() * enlarged / 640).clamp(1, 6),
     };
-    brush.lay_ground(view, enlarged);
+    brush.draw_image(view, enlarged);
     for seen in found {
         brush.outline(seen, camera);
     }
@@ -87,30 +87,30 @@ fn draw(view: GrayView<'_>, found: &[Observation], camera: Option<&CameraModel>)
 struct Brush {
     canvas: RgbImageBuf,
     scale: f64,
-    /// Width of a dot of a letter, in pixels of the drawing.
+    /// Width of a dot of the font, in pixels of the drawing.
     dot_px: usize,
 }
 
 impl Brush {
-    fn lay_ground(&mut self, view: GrayView<'_>, enlarged: usize) {
+    fn draw_image(&mut self, view: GrayView<'_>, enlarged: usize) {
         if enlarged == 1 {
             self.canvas.copy(view);
             return;
         }
-        let mut ground = GrayImage::filled(view.width() * enlarged, view.height() * enlarged, 0);
-        for y in 0..ground.height() {
+        let mut large = GrayImage::filled(view.width() * enlarged, view.height() * enlarged, 0);
+        for y in 0..large.height() {
             let row = view.row(y / enlarged);
-            for (x, pixel) in ground.row_mut(y).iter_mut().enumerate() {
+            for (x, pixel) in large.row_mut(y).iter_mut().enumerate() {
                 *pixel = row.get(x / enlarged).copied().unwrap_or_default();
             }
         }
-        if let Some(ground) = ground.view() {
-            self.canvas.copy(ground);
+        if let Some(large) = large.view() {
+            self.canvas.copy(large);
         }
     }
 
-    /// A place of the image in the drawing.
-    fn place(&self, pixel: Pixel) -> [f64; 2] {
+    /// A pixel of the image in the drawing.
+    fn to_drawing(&self, pixel: Pixel) -> [f64; 2] {
         [pixel.x, pixel.y].map(|at| (at + 0.5) * self.scale - 0.5)
     }
 
@@ -118,48 +118,52 @@ impl Brush {
         self.dot_px as f64
     }
 
-    /// The marker's outline; at its own top-left corner a red mark.
+    /// Draws the marker's outline, with a red circle at its own top-left corner.
     fn outline(&mut self, seen: &Observation, camera: Option<&CameraModel>) {
-        let (line, centre) = (self.line_px(), self.place(seen.centre));
+        let (line, centre) = (self.line_px(), self.to_drawing(seen.centre));
         match seen.corners {
             Some(corners) => {
-                let corners = corners.map(|corner| self.place(corner));
+                let corners = corners.map(|corner| self.to_drawing(corner));
                 self.canvas.polygon(&corners, line, GREEN);
                 self.canvas.circle(corners[0], 2.0 * line, RED);
                 self.canvas.circle(corners[0], 2.0 * line + 1.0, RED);
             }
             None => {
-                let rim = self.rim(seen, camera);
-                self.canvas.polygon(&rim, line, GREEN);
+                let outline = self.round_outline(seen, camera);
+                self.canvas.polygon(&outline, line, GREEN);
             }
         }
-        if seen.size_px * self.scale < EASILY_SEEN_PX {
-            self.canvas.circle(centre, EASILY_SEEN_PX, YELLOW);
+        if seen.size_px * self.scale < MIN_VISIBLE_PX {
+            self.canvas.circle(centre, MIN_VISIBLE_PX, YELLOW);
         }
     }
 
-    /// The rim of a round marker: of its pose, or else a circle.
-    fn rim(&self, seen: &Observation, camera: Option<&CameraModel>) -> Vec<[f64; 2]> {
+    /// The outline of a round marker: projected from its pose, or else a circle.
+    fn round_outline(&self, seen: &Observation, camera: Option<&CameraModel>) -> Vec<[f64; 2]> {
         const POINTS: u32 = 90;
         let turns = (0..POINTS).map(|i| f64::from(i) * TAU / f64::from(POINTS));
         let of_pose = seen.pose.zip(camera).map(|(pose, camera)| {
             let radius_m = size_m(seen, camera) / 2.0;
             let at = |turn: f64| Point::new(radius_m * turn.cos(), radius_m * turn.sin(), 0.0);
             let seen_at = |turn| camera.project(pose.camera_from_marker * at(turn));
-            turns.clone().filter_map(seen_at).map(|pixel| self.place(pixel)).collect::<Vec<_>>()
+            turns
+                .clone()
+                .filter_map(seen_at)
+                .map(|pixel| self.to_drawing(pixel))
+                .collect::<Vec<_>>()
         });
         of_pose.unwrap_or_else(|| {
             let radius = seen.size_px / 2.0;
             let at = |turn: f64| {
                 Pixel::new(seen.centre.x + radius * turn.cos(), seen.centre.y + radius * turn.sin())
             };
-            turns.map(|turn| self.place(at(turn))).collect()
+            turns.map(|turn| self.to_drawing(at(turn))).collect()
         })
     }
 
-    /// The axes of the pose: x red, y green, z (towards the viewer) blue; without a pose a cross.
+    /// Draws the axes of the pose: x red, y green, z (towards the viewer) blue; without a pose a cross.
     fn axes(&mut self, seen: &Observation, camera: Option<&CameraModel>) {
-        let (centre, line) = (self.place(seen.centre), self.line_px());
+        let (centre, line) = (self.to_drawing(seen.centre), self.line_px());
         let Some((pose, camera)) = seen.pose.zip(camera) else {
             let arm = (0.15 * seen.size_px * self.scale).clamp(3.0, 20.0);
             let [x, y] = centre;
@@ -175,12 +179,12 @@ impl Brush {
         ];
         for (tip, colour) in tips {
             if let Some(tip) = tip_of(camera, &pose.camera_from_marker, tip) {
-                self.canvas.line(centre, self.place(tip), 2.0 * line, colour);
+                self.canvas.line(centre, self.to_drawing(tip), 2.0 * line, colour);
             }
         }
     }
 
-    /// Name, confidence, and where it is; among neighbours only as much as there is room for.
+    /// Draws name, confidence and position; beside other markers only as much as fits.
     fn label(&mut self, seen: &Observation, all: &[Observation]) {
         let id = seen.id.map_or_else(String::new, |id| format!(":{id}"));
         let wrong = match seen.wrong_bits {
@@ -201,12 +205,14 @@ impl Brush {
                 lines = vec![id.trim_start_matches(':').to_owned()];
             }
         }
-        let [x, y] = self.place(seen.centre);
+        let [x, y] = self.to_drawing(seen.centre);
         let reach = match seen.corners {
-            Some(corners) => corners.map(|c| self.place(c)[1] - y).into_iter().fold(0.0, f64::max),
+            Some(corners) => {
+                corners.map(|c| self.to_drawing(c)[1] - y).into_iter().fold(0.0, f64::max)
+            }
             None => seen.size_px * self.scale / 2.0,
         };
-        let reach = if seen.size_px * self.scale < EASILY_SEEN_PX { EASILY_SEEN_PX } else { reach };
+        let reach = if seen.size_px * self.scale < MIN_VISIBLE_PX { MIN_VISIBLE_PX } else { reach };
         let dot = self.dot_px as f64;
         for (index, text) in (0..).zip(&lines) {
             let left = x - 3.0 * dot * text.len() as f64;
@@ -217,12 +223,11 @@ impl Brush {
     }
 }
 
-/// About how large a marker of this pose is, in metres: the drawing need not know what was configured.
+/// The approximate size of a marker from its pose, in metres.
 fn size_m(seen: &Observation, camera: &CameraModel) -> f64 {
     let Some(pose) = &seen.pose else { return 0.0 };
     match seen.corners {
         Some(corners) => {
-            // The corner and the centre on the marker's plane.
             let at = |pixel: Pixel| on_plane(&pose.camera_from_marker, camera, pixel);
             let away = |corner: Pixel| {
                 let (corner, centre) = (at(corner)?, at(seen.centre)?);
@@ -235,7 +240,7 @@ fn size_m(seen: &Observation, camera: &CameraModel) -> f64 {
     }
 }
 
-/// Where the ray of a pixel meets the marker's plane, in the marker frame.
+/// The intersection of a pixel's ray with the marker's plane, in the marker frame.
 fn on_plane(
     camera_from_marker: &Transform<geometry::Camera, geometry::Marker>,
     camera: &CameraModel,
@@ -263,14 +268,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_of_pictures_keep_their_folders_apart() {
+    fn file_names_are_unique_across_folders() {
         assert_eq!(file_name("../a/b.c/1.jpg"), "a_b.c_1.jpg.png");
         assert_eq!(file_name("/d/flight.avi#12"), "d_flight.avi-12.png");
         assert_ne!(file_name("a/1.png"), file_name("b/1.png"));
     }
 
     #[test]
-    fn small_images_are_enlarged_and_say_when_there_is_nothing() {
+    fn small_images_are_enlarged_and_labelled_without_a_marker() {
         let image = GrayImage::filled(300, 100, 80);
         let drawn = draw(image.view().unwrap(), &[], None);
         assert_eq!((drawn.width, drawn.height, drawn.data.len()), (900, 300, 900 * 300 * 3));

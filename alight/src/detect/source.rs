@@ -1,4 +1,4 @@
-//! The pictures of files, folders and videos, one after the other.
+//! The images of files, folders and videos, in order.
 
 use std::path::{Path, PathBuf};
 
@@ -8,23 +8,23 @@ use media::{
     read_image,
 };
 
-/// Between the images of a folder, in seconds, for want of anything better.
+/// Assumed interval between image files, in seconds.
 const IMAGE_PERIOD_S: f64 = 0.1;
 
-/// Goes through files, folders and videos.
+/// Iterates over files, folders and videos.
 pub(super) struct Source {
     listed: std::vec::IntoIter<Result<PathBuf, (PathBuf, String)>>,
     video: Option<(PathBuf, Video)>,
     images: u32,
 }
 
-/// Something to look at, decoded or not yet.
+/// An image, decoded or not yet.
 pub(super) struct Item {
-    /// What it is called: a path, for a frame of a video with its number.
+    /// Its name: a path, for a video frame with its number.
     pub(super) name: String,
-    /// When it was taken, in seconds after the first.
+    /// Its time, in seconds after the first image.
     pub(super) time_s: f64,
-    /// True for a frame of a video.
+    /// Whether it is a frame of a video.
     pub(super) is_frame: bool,
     content: Content,
 }
@@ -32,12 +32,12 @@ pub(super) struct Item {
 enum Content {
     File(PathBuf),
     Frame(PathBuf, VideoImage),
-    /// Why there is nothing.
-    Nothing(String),
+    /// The reason why it cannot be read.
+    Unreadable(String),
 }
 
 impl Source {
-    /// All that some paths name.
+    /// The images of some paths.
     pub(super) fn new(paths: &[PathBuf]) -> Self {
         let mut listed = Vec::new();
         for path in paths {
@@ -49,7 +49,7 @@ impl Source {
         Self { listed: listed.into_iter(), video: None, images: 0 }
     }
 
-    /// The next picture; frames of a video are decoded here as far as one depends on another.
+    /// The next image; frames of a video are decoded here as far as they depend on each other.
     pub(super) fn next(&mut self) -> Option<Item> {
         if let Some((path, video)) = &mut self.video {
             match video.next_frame() {
@@ -58,13 +58,13 @@ impl Source {
                     let content = Content::Frame(path.clone(), frame.image);
                     return Some(Item { name, time_s: frame.time_s, is_frame: true, content });
                 }
-                Some(Err(problem)) => return Some(Item::nothing(path, problem.to_string())),
+                Some(Err(problem)) => return Some(Item::unreadable(path, problem.to_string())),
                 None => self.video = None,
             }
         }
         let path = match self.listed.next()? {
             Ok(path) => path,
-            Err((path, problem)) => return Some(Item::nothing(&path, problem)),
+            Err((path, problem)) => return Some(Item::unreadable(&path, problem)),
         };
         if is_video(&path) {
             match Video::open(&path, DEFAULT_MAX_PIXELS) {
@@ -72,7 +72,7 @@ impl Source {
                     self.video = Some((path, video));
                     return self.next();
                 }
-                Err(problem) => return Some(Item::nothing(&path, problem.to_string())),
+                Err(problem) => return Some(Item::unreadable(&path, problem.to_string())),
             }
         }
         let time_s = f64::from(self.images) * IMAGE_PERIOD_S;
@@ -83,17 +83,17 @@ impl Source {
 }
 
 impl Item {
-    fn nothing(path: &Path, problem: String) -> Self {
+    fn unreadable(path: &Path, problem: String) -> Self {
         let name = path.display().to_string();
-        Self { name, time_s: 0.0, is_frame: false, content: Content::Nothing(problem) }
+        Self { name, time_s: 0.0, is_frame: false, content: Content::Unreadable(problem) }
     }
 
-    /// The picture in grey, or why there is none.
+    /// The grey image, or the reason why there is none.
     pub(super) fn into_image(self, bayer: Option<BayerPattern>) -> Result<GrayImage, String> {
         let image = match self.content {
             Content::File(path) => read_image(&path, DEFAULT_MAX_PIXELS, bayer),
             Content::Frame(path, image) => image.grey(&path, DEFAULT_MAX_PIXELS),
-            Content::Nothing(problem) => return Err(problem),
+            Content::Unreadable(problem) => return Err(problem),
         };
         image.map_err(|problem| problem.to_string())
     }

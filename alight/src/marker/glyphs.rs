@@ -1,19 +1,19 @@
-//! Letters of dots as rectangles on the sheet.
+//! A dot-matrix font as rectangles on the sheet.
 
 use fiducial::overlay::font::rows;
 
 use super::sheet::TEXT_MM;
 
-/// Height of a capital letter as part of the letters' body, as in the font of the other forms.
+/// Cap height relative to the font size, as in the font of the PDF.
 const CAPITAL: f64 = 0.72;
 const ROWS: f64 = 7.0;
-/// Columns from one letter to the next.
+/// Columns per letter, with the gap.
 const ADVANCE: f64 = 6.0;
 
 type Rectangle = ([f64; 2], [f64; 2]);
 
 /// The dots of a text as rectangles (top left and bottom right corner), in millimetres; `at_mm` is the left end of its
-/// base line. Small letters look like capitals; what has no shape is left blank.
+/// baseline. The font has capitals only; unknown characters are blank.
 pub(super) fn rectangles(text: &str, at_mm: [f64; 2]) -> impl Iterator<Item = Rectangle> {
     let dot = TEXT_MM * CAPITAL / ROWS;
     text.chars().zip(0..).flat_map(move |(letter, index)| {

@@ -6,7 +6,6 @@ mod png;
 mod sheet;
 mod svg;
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -14,25 +13,26 @@ use anyhow::Context;
 use clap::Args;
 use markers::{Marker, Pad};
 
+use crate::terminal::print;
 pub(crate) use sheet::SheetError;
 use sheet::{Paper, Sheet};
 
-/// What `alight marker` is told.
+/// The arguments of `alight marker`.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct MarkerArgs {
     /// The marker: FAMILY:ID, or FAMILY for a family without ids (rings).
     #[arg(required_unless_present = "pad")]
     marker: Option<Marker>,
-    /// In place of one marker, a pad of several: `a4`, which comes with the program, or a TOML file.
+    /// A pad of several markers instead of one marker: the built-in `a4`, or a TOML file.
     #[arg(long, value_name = "PAD", conflicts_with_all = ["marker", "size"])]
     pad: Option<String>,
-    /// Its size in metres: the outer diameter of rings, the edge of the outer black square of others.
+    /// Its size in metres: the outer diameter of rings, the side of the outer black square of others.
     #[arg(long, value_name = "M", value_parser = size_m)]
     size: Option<f64>,
-    /// The paper it is printed on.
+    /// The paper size.
     #[arg(long, value_enum, ignore_case = true, default_value_t = Paper::A4)]
     paper: Paper,
-    /// The file to write; its name ends in .pdf, .svg or .png.
+    /// The output file; its name ends in .pdf, .svg or .png.
     #[arg(short, long, value_name = "FILE")]
     output: Output,
     /// Pixels per inch of a PNG.
@@ -40,15 +40,15 @@ pub(crate) struct MarkerArgs {
     dpi: u16,
 }
 
-/// A file whose name says its form.
+/// An output file and its format, from the extension.
 #[derive(Clone, Debug)]
 struct Output {
     path: PathBuf,
-    form: Form,
+    format: FileFormat,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Form {
+enum FileFormat {
     Pdf,
     Svg,
     Png,
@@ -60,13 +60,13 @@ impl std::str::FromStr for Output {
     fn from_str(text: &str) -> Result<Self, String> {
         let path = PathBuf::from(text);
         let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
-        let form = match ending.to_ascii_lowercase().as_str() {
-            "pdf" => Form::Pdf,
-            "svg" => Form::Svg,
-            "png" => Form::Png,
+        let format = match ending.to_ascii_lowercase().as_str() {
+            "pdf" => FileFormat::Pdf,
+            "svg" => FileFormat::Svg,
+            "png" => FileFormat::Png,
             _ => return Err("the name must end in .pdf, .svg or .png".to_owned()),
         };
-        Ok(Self { path, form })
+        Ok(Self { path, format })
     }
 }
 
@@ -78,10 +78,10 @@ fn size_m(text: &str) -> Result<f64, String> {
         .ok_or_else(|| format!("a size is a number of metres from {min} to {max}"))
 }
 
-/// Writes the marker's file.
+/// Writes the file.
 ///
 /// # Errors
-/// [`SheetError`] when there is no such sheet; otherwise the file could not be written.
+/// [`SheetError`] when the sheet is impossible; else when the file cannot be written.
 pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
     let (sheet, what) = match (&args.marker, &args.pad) {
         (Some(marker), _) => {
@@ -92,22 +92,21 @@ pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
             let name = pad.as_deref().unwrap_or_default();
             let pad = Pad::named(name, |file| std::fs::read_to_string(file))?;
             let count = pad.markers().len();
-            (Sheet::of_pad(&pad, args.paper)?, format!("{}, {count} markers", pad.name()))
+            (Sheet::with_pad(&pad, args.paper)?, format!("{}, {count} markers", pad.name()))
         }
     };
-    let bytes = match args.output.form {
-        Form::Pdf => pdf::document(&sheet),
-        Form::Svg => svg::document(&sheet).into_bytes(),
-        Form::Png => png::image(&sheet, args.dpi)?,
+    let bytes = match args.output.format {
+        FileFormat::Pdf => pdf::document(&sheet),
+        FileFormat::Svg => svg::document(&sheet).into_bytes(),
+        FileFormat::Png => png::image(&sheet, args.dpi)?,
     };
     let path: &Path = &args.output.path;
     std::fs::write(path, bytes).with_context(|| format!("writing {path:?}"))?;
-    writeln!(
-        std::io::stdout(),
-        "{}: {what}, on {}. Print it at 100 %, then measure the ruler below it: 100 mm.",
+    print(&format!(
+        "{}: {what}, on {}. Print it at 100 %, then check that the ruler below it measures 100 mm.",
         path.display(),
         args.paper.name()
-    )
+    ))
     .context("writing the result")?;
     Ok(ExitCode::SUCCESS)
 }
@@ -138,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn the_file_has_the_form_that_its_name_says() {
+    fn the_extension_selects_the_format() {
         let folder = tempfile::tempdir().unwrap();
         for (name, start) in [("a.pdf", &b"%PDF-1"[..]), ("b.SVG", b"<svg"), ("c.png", b"\x89PNG")]
         {

@@ -7,8 +7,8 @@ use super::sheet::{Mark, Sheet, TEXT_MM};
 
 /// Units of a PDF in a millimetre.
 const PER_MM: f64 = 72.0 / 25.4;
-/// How far along its tangent the control point of a quarter circle's Bezier curve lies, in radii: the curve leaves
-/// the circle by less than 0.03 %.
+/// Distance of the control points of a quarter circle's Bezier curve along the tangent, in radii; the error is below
+/// 0.03 %.
 const QUARTER_CIRCLE: f64 = 0.552_284_749_830_793_4;
 
 const FONT: Name<'static> = Name(b"F1");
@@ -19,7 +19,7 @@ pub(super) fn document(sheet: &Sheet) -> Vec<u8> {
     let mut pdf = Pdf::new();
     let mut root = pdf.catalog(catalog);
     root.pages(pages);
-    // Viewers then propose to print without "fit to page".
+    // Viewers then suggest printing without "fit to page".
     root.viewer_preferences().pair(Name(b"PrintScaling"), Name(b"None"));
     drop(root);
     pdf.pages(pages).kids([page]).count(1);
@@ -28,7 +28,7 @@ pub(super) fn document(sheet: &Sheet) -> Vec<u8> {
     leaf.media_box(Rect::new(0.0, 0.0, width, height)).parent(pages).contents(content);
     leaf.resources().fonts().pair(FONT, font);
     drop(leaf);
-    // One of the fonts that every viewer has.
+    // A standard font of every viewer.
     pdf.type1_font(font).base_font(Name(b"Helvetica"));
     pdf.stream(content, &drawn(sheet));
     pdf.finish()
@@ -42,7 +42,7 @@ fn drawn(sheet: &Sheet) -> Vec<u8> {
     let mut content = Content::new();
     // The origin of a PDF page is its bottom left corner.
     let flip = |[x, y]: [f64; 2]| [x, sheet.size_mm[1] - y];
-    // Shapes of one ink that follow each other are filled at once: viewers leave hairlines between two that touch.
+    // Consecutive shapes of one ink are filled together, as viewers leave hairlines between touching shapes.
     for marks in sheet.marks.chunk_by(|a, b| a.ink() == b.ink() && a.ink().is_some()) {
         set_ink(&mut content, marks[0].ink().unwrap_or(Ink::Black));
         for mark in marks {
@@ -100,7 +100,7 @@ mod tests {
         String::from_utf8_lossy(&document(&sheet)).into_owned()
     }
 
-    /// The numbers before each use of an operator.
+    /// The operands of each use of an operator.
     fn operands(pdf: &str, operator: &str) -> Vec<Vec<f64>> {
         let operator = format!(" {operator}");
         let lines = pdf.lines().filter_map(|line| line.strip_suffix(&operator));
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rings_are_as_large_as_they_should_be() {
+    fn the_rings_have_their_size() {
         let pdf = text_of(0.15341, Paper::A4);
         let curves = operands(&pdf, "c");
         assert_eq!(curves.len(), 4 * 6);

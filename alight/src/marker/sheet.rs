@@ -1,21 +1,22 @@
-//! What is on the paper, and where: the marker, lines to cut along, a ruler, and words.
+//! The layout of the sheet: the marker, cut marks, a ruler, and text.
 
 use clap::ValueEnum;
 use markers::{Drawing, Ink, Marker, Pad, Shape};
 
-/// The edge of the paper on which printers print nothing, in millimetres.
-const EDGE_MM: f64 = 5.0;
-/// What lies below the marker: cut marks, the ruler and two lines of text.
+/// Margin that printers leave blank, in millimetres.
+const MARGIN_MM: f64 = 5.0;
+/// Height of what is below the marker (cut marks, ruler, two lines of text), in millimetres.
 const BELOW_MM: f64 = 33.0;
-/// Far below what a printer can do, far above what arithmetic loses.
+/// Tolerance for rounding errors when fitting to the paper, in millimetres.
 const ROUNDING_MM: f64 = 1e-6;
-/// Length of the ruler.
+/// Length of the ruler, in millimetres.
 const RULER_MM: f64 = 100.0;
-/// Width of the lines.
+/// Width of the lines, in millimetres.
 const LINE_MM: f64 = 0.2;
-/// Cut marks begin this far from the quiet zone, and are this long.
-const CUT_MM: (f64, f64) = (1.0, 3.5);
-/// Height of the letters' bodies.
+/// Distance of the cut marks from the quiet zone, and their length, in millimetres.
+const CUT_MARK_GAP_MM: f64 = 1.0;
+const CUT_MARK_LENGTH_MM: f64 = 3.5;
+/// Font size, in millimetres.
 pub(super) const TEXT_MM: f64 = 3.2;
 
 /// Paper sizes, upright.
@@ -75,35 +76,35 @@ impl Paper {
     /// The largest marker with its quiet zone that fits between the edges and above the ruler, in millimetres.
     fn room_mm(self) -> f64 {
         let [width, height] = self.size_mm();
-        (width - 2.0 * EDGE_MM).min(height - 2.0 * BELOW_MM)
+        (width - 2.0 * MARGIN_MM).min(height - 2.0 * BELOW_MM)
     }
 }
 
-/// Why there is no sheet.
+/// Why a sheet is impossible.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum SheetError {
-    /// A marker that is larger than the paper.
+    /// The marker does not fit on the paper.
     TooLarge {
-        /// What is too large, and what would fit.
+        /// What does not fit, and what would.
         problem: String,
     },
-    /// A marker that may have any id.
+    /// The marker has no id.
     NoId,
-    /// A marker without a size.
+    /// The marker has no size.
     NoSize,
-    /// A size with the marker, and another one beside it.
+    /// The marker has a size, and `--size` is another one.
     TwoSizes {
-        /// The one beside it, in metres.
+        /// That of `--size`, in metres.
         size: f64,
-        /// The one with it, in metres.
+        /// That of the marker, in metres.
         other: f64,
     },
-    /// An image larger than what printers take.
+    /// The image has too many pixels.
     TooManyPixels {
         /// Width and height in pixels.
         pixels: [u32; 2],
-        /// The most pixels per inch for this paper.
-        most_dpi: u32,
+        /// The maximum pixels per inch for this paper.
+        max_dpi: u32,
     },
 }
 
@@ -111,17 +112,14 @@ impl std::fmt::Display for SheetError {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::TooLarge { problem } => f.write_str(problem),
-            Self::NoId => f.write_str("which id? Name the marker as FAMILY:ID"),
-            Self::NoSize => f.write_str("how large is the marker? Say it with `--size`, in metres"),
+            Self::NoId => f.write_str("missing id: write the marker as FAMILY:ID"),
+            Self::NoSize => f.write_str("missing marker size: pass `--size` in metres"),
             Self::TwoSizes { size, other } => {
-                write!(
-                    f,
-                    "two sizes are stated: {size} m by `--size`, and {other} m with the marker"
-                )
+                write!(f, "two sizes: {size} m by `--size`, and {other} m with the marker")
             }
-            Self::TooManyPixels { pixels: [width, height], most_dpi } => write!(
+            Self::TooManyPixels { pixels: [width, height], max_dpi } => write!(
                 f,
-                "an image of {width} x {height} pixels is too large; take `--dpi {most_dpi}` or less, or a PDF"
+                "an image of {width} x {height} pixels is too large; use `--dpi {max_dpi}` or less, or a PDF"
             ),
         }
     }
@@ -129,7 +127,7 @@ impl std::fmt::Display for SheetError {
 
 impl std::error::Error for SheetError {}
 
-/// Something on the paper. Millimetres from its top left corner, x right, y down; later marks hide earlier ones.
+/// An element on the paper, in millimetres from its top left corner, x right, y down; later marks cover earlier ones.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Mark {
     /// A filled circle.
@@ -141,7 +139,7 @@ pub(super) enum Mark {
 }
 
 impl Mark {
-    /// What a shape is filled with; text is written, not filled.
+    /// The fill of a shape; `None` for text.
     pub(super) fn ink(&self) -> Option<Ink> {
         match self {
             Self::Disc { ink, .. } | Self::Rectangle { ink, .. } => Some(*ink),
@@ -150,7 +148,7 @@ impl Mark {
     }
 }
 
-/// A sheet of paper with a marker in its middle.
+/// A sheet of paper with a marker at its centre.
 #[derive(Clone, Debug)]
 pub(super) struct Sheet {
     pub(super) size_mm: [f64; 2],
@@ -164,11 +162,11 @@ impl Sheet {
         if 2.0 * half_mm > paper.room_mm() + ROUNDING_MM {
             return Err(too_large(marker, size_m, half_mm, paper));
         }
-        Ok(Self::with(&drawing, &format!("{}, size {size_m} m", marker.name()), paper))
+        Ok(Self::from_drawing(&drawing, &format!("{}, size {size_m} m", marker.name()), paper))
     }
 
-    /// A sheet with all markers of a pad, its landing point in the middle.
-    pub(super) fn of_pad(pad: &Pad, paper: Paper) -> Result<Self, SheetError> {
+    /// A sheet with all markers of a pad, its landing point at the centre.
+    pub(super) fn with_pad(pad: &Pad, paper: Paper) -> Result<Self, SheetError> {
         let drawing = pad.drawing().ok_or(SheetError::NoId)?;
         let needed_mm = 2e3 * drawing.half_extent_m;
         if needed_mm > paper.room_mm() + ROUNDING_MM {
@@ -183,10 +181,10 @@ impl Sheet {
             return Err(SheetError::TooLarge { problem });
         }
         let count = pad.markers().len();
-        Ok(Self::with(&drawing, &format!("{}, {count} markers", pad.name()), paper))
+        Ok(Self::from_drawing(&drawing, &format!("{}, {count} markers", pad.name()), paper))
     }
 
-    fn with(drawing: &Drawing, title: &str, paper: Paper) -> Self {
+    fn from_drawing(drawing: &Drawing, title: &str, paper: Paper) -> Self {
         let mut sheet = Self { size_mm: paper.size_mm(), marks: Vec::new() };
         sheet.draw_marker(drawing);
         sheet.draw_cut_marks(drawing.half_extent_m * 1e3);
@@ -195,16 +193,16 @@ impl Sheet {
         let left = (width - RULER_MM) / 2.0;
         sheet.write([left, height - 11.0], title.to_owned());
         let advice = "Print at 100 %: the ruler must measure 100 mm.";
-        sheet.write([left, height - EDGE_MM - 1.0], advice.to_owned());
+        sheet.write([left, height - MARGIN_MM - 1.0], advice.to_owned());
         sheet
     }
 
-    fn middle(&self) -> [f64; 2] {
+    fn centre(&self) -> [f64; 2] {
         self.size_mm.map(|edge| edge / 2.0)
     }
 
     fn draw_marker(&mut self, drawing: &Drawing) {
-        let [x, y] = self.middle();
+        let [x, y] = self.centre();
         // The marker's y axis points up, the paper's down.
         let place = |[right, up]: [f64; 2]| [x + right * 1e3, y - up * 1e3];
         self.marks.extend(drawing.layers.iter().map(|layer| match layer.shape {
@@ -218,11 +216,11 @@ impl Sheet {
         }));
     }
 
-    /// Lines outside the quiet zone's corners: cut along them, and the marker is in the middle of what is left.
+    /// Draws cut marks outside the quiet zone's corners.
     fn draw_cut_marks(&mut self, half_mm: f64) {
-        let [x, y] = self.middle();
-        let (from, len) = CUT_MM;
-        let (near, far) = (half_mm + from, half_mm + from + len);
+        let [x, y] = self.centre();
+        let near = half_mm + CUT_MARK_GAP_MM;
+        let far = near + CUT_MARK_LENGTH_MM;
         for (right, down) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
             self.line(
                 [x + right * near, y + down * half_mm],
@@ -253,7 +251,7 @@ impl Sheet {
         }
     }
 
-    /// An upright or level line, whose middle lies on the points.
+    /// Draws a vertical or horizontal line centred on the points.
     fn line(&mut self, from_mm: [f64; 2], to_mm: [f64; 2]) {
         let half = LINE_MM / 2.0;
         let level = from_mm[1] == to_mm[1];
@@ -268,14 +266,14 @@ impl Sheet {
     }
 }
 
-/// The smallest paper with so much room.
+/// The smallest paper on which it fits.
 fn larger_paper(needed_mm: f64) -> Option<&'static Paper> {
     Paper::value_variants().iter().find(|paper| paper.room_mm() + ROUNDING_MM >= needed_mm)
 }
 
 fn too_large(marker: &Marker, size_m: f64, half_mm: f64, paper: Paper) -> SheetError {
     let per_metre = 2.0 * half_mm / size_m;
-    // Tenths of millimetres, rounded down, so that the size stated does fit.
+    // Rounded down to tenths of millimetres, so that the stated size fits.
     let largest_m = (paper.room_mm() / per_metre * 1e4).floor() / 1e4;
     let instead = match larger_paper(2.0 * half_mm) {
         Some(paper) => format!("; {size_m} m fit on {}", paper.name()),
@@ -300,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn a_marker_that_does_not_fit_names_the_largest_that_does() {
+    fn a_marker_that_does_not_fit_is_reported_with_the_largest_that_does() {
         let problem = sheet(0.2, Paper::A4).unwrap_err().to_string();
         assert!(problem.contains("needs 240.0 mm"), "{problem}");
         assert!(problem.contains("at most 0.1666 m fit on a4; 0.2 m fit on a3"), "{problem}");
@@ -310,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_lies_on_the_paper_and_nothing_in_the_quiet_zone() {
+    fn marks_are_on_the_paper_and_outside_the_quiet_zone() {
         for paper in Paper::value_variants() {
             let size_m = paper.room_mm() / 1200.0;
             let sheet = sheet(size_m, *paper).unwrap();
@@ -330,9 +328,9 @@ mod tests {
                         assert!(is_clear(*min_mm) && is_clear(*max_mm), "{mark:?} on {paper:?}");
                     }
                     Mark::Text { at_mm: [x, y], text } => {
-                        // No letter is wider than its body is high.
+                        // No letter is wider than the font size.
                         assert!(x + 0.75 * TEXT_MM * text.len() as f64 <= width, "{text}");
-                        assert!(*y <= height - EDGE_MM && is_clear([*x, y - TEXT_MM]));
+                        assert!(*y <= height - MARGIN_MM && is_clear([*x, y - TEXT_MM]));
                     }
                 }
             }

@@ -16,7 +16,7 @@ pub(super) fn document(sheet: &Sheet) -> String {
         .set("height", format!("{height}mm"))
         .set("viewBox", (0, 0, width, height))
         .add(paper);
-    // Shapes of one ink that follow each other are filled at once: viewers leave hairlines between two that touch.
+    // Consecutive shapes of one ink are filled together, as viewers leave hairlines between touching shapes.
     let runs = sheet.marks.chunk_by(|a, b| match (a, b) {
         (Mark::Rectangle { ink: a, .. }, Mark::Rectangle { ink: b, .. }) => a == b,
         _ => false,
@@ -58,7 +58,7 @@ fn outline(marks: &[Mark]) -> Data {
     })
 }
 
-/// To a tenth of a micrometre, which no printer can tell apart.
+/// Rounded to 0.1 micrometres.
 fn rounded(mm: f64) -> f64 {
     (mm * 1e4).round() / 1e4
 }
