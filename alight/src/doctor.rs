@@ -328,7 +328,13 @@ struct Seen {
     healths: Vec<Health>,
     cameras: Vec<CameraInfo>,
     status: Option<ControllerStatus>,
-    frames: Vec<(FrameHeader, usize, i64)>,
+    frames: Vec<ReceivedFrame>,
+}
+
+struct ReceivedFrame {
+    header: FrameHeader,
+    bytes: usize,
+    received_ns: i64,
 }
 
 async fn check_network(findings: &mut Findings, node: Node, seconds: u64, expected: &[Job]) {
@@ -367,7 +373,8 @@ async fn watch(node: &Node, seen: &mut Seen, duration: Duration) -> anyhow::Resu
                 Some(status) = statuses.next() => seen.status = Some(status),
                 Some(frame) = frames.next() => {
                     let bytes = frame.bytes().len();
-                    seen.frames.push((frame.header, bytes, now_ns()));
+                    let received_ns = now_ns();
+                    seen.frames.push(ReceivedFrame { header: frame.header, bytes, received_ns });
                 }
             }
         }
@@ -443,7 +450,7 @@ async fn check_replies(findings: &mut Findings, node: &Node, seen: &Seen) {
             None => format!("{service} `{instance}`"),
         };
         let lost = ROUND_TRIPS as usize - times_ms.len().min(ROUND_TRIPS as usize);
-        let Some(median_ms) = stats::quantile(times_ms, 0.5) else {
+        let Some(median_ms) = stats::quantile(&times_ms, 0.5) else {
             findings.wrong(
                 "services",
                 format!("{who} does not answer"),
@@ -517,13 +524,15 @@ fn check_cameras(findings: &mut Findings, seen: &Seen, seconds: u64) {
         }
     }
     let clocks: Vec<_> = seen.healths.iter().filter(|h| h.service == "controller").collect();
-    let mut names: Vec<&str> = seen.frames.iter().map(|(h, ..)| h.camera.as_str()).collect();
+    let mut names: Vec<&str> =
+        seen.frames.iter().map(|frame| frame.header.camera.as_str()).collect();
     names.sort_unstable();
     names.dedup();
     for camera in names {
-        let frames: Vec<_> = seen.frames.iter().filter(|(h, ..)| h.camera == camera).collect();
+        let frames: Vec<_> =
+            seen.frames.iter().filter(|frame| frame.header.camera == camera).collect();
         findings.good("camera", describe_frames(camera, &frames, seconds));
-        if let Some((header, ..)) = frames.first()
+        if let Some(ReceivedFrame { header, .. }) = frames.first()
             && let Some(controller) = clocks.iter().find(|health| health.clock != header.clock)
         {
             findings.wrong(
@@ -560,16 +569,17 @@ fn implausible(info: &CameraInfo, focal_px: [f64; 2]) -> Option<String> {
     })
 }
 
-fn describe_frames(camera: &str, frames: &[&(FrameHeader, usize, i64)], seconds: u64) -> String {
+fn describe_frames(camera: &str, frames: &[&ReceivedFrame], seconds: u64) -> String {
     let rate_hz = frames.len() as f64 / seconds as f64;
-    let bytes: usize = frames.iter().map(|(_, bytes, _)| bytes).sum();
+    let bytes: usize = frames.iter().map(|frame| frame.bytes).sum();
     let megabits_s = bytes as f64 * 8e-6 / seconds as f64;
     let mut text = format!("camera `{camera}`: {rate_hz:.1} frames/s, {megabits_s:.2} Mbit/s");
-    let ages_ms = frames
+    let ages_ms: Vec<f64> = frames
         .iter()
-        .filter(|(header, ..)| header.clock == clock_name())
-        .map(|(header, _, now_ns)| (now_ns - header.stamp_ns) as f64 * 1e-6);
-    match stats::quantile(ages_ms, 0.5) {
+        .filter(|frame| frame.header.clock == clock_name())
+        .map(|frame| (frame.received_ns - frame.header.stamp_ns) as f64 * 1e-6)
+        .collect();
+    match stats::quantile(&ages_ms, 0.5) {
         Some(median_ms) => {
             // Writing to a string cannot fail.
             let _ = write!(text, ", {median_ms:.0} ms old on arrival");

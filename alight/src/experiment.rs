@@ -7,9 +7,9 @@ use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use experiments::landing;
 use experiments::landing::fault::Fault;
-use experiments::landing::plan::{Plan, Values, Vision};
+use experiments::landing::plan::{self, Plan, Values, Vision};
 use experiments::markers::{self, Request};
-use experiments::sets::Set;
+use experiments::set::Set;
 use indicatif::ProgressBar;
 
 use crate::terminal::{print, write_error};
@@ -123,7 +123,7 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
         }
     }
     let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    let request = landing::Request {
+    let request = plan::Request {
         plan: Plan {
             vision: match args.vision {
                 VisionArg::Rendered => Vision::Rendered,

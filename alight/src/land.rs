@@ -1,5 +1,6 @@
 //! `alight land`: all services as processes, watched until the vehicle has landed.
 
+use std::net::{TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -66,6 +67,9 @@ fn timeout_s(text: &str) -> Result<f64, String> {
 const SERVICES: [Service; 4] =
     [Service::Simulator, Service::Detector, Service::Controller, Service::GcsBridge];
 
+/// The loopback interface.
+const LOOPBACK: &str = "127.0.0.1";
+
 /// The UDP port at which ground stations such as QGroundControl listen.
 const GROUND_PORT: u16 = 14_550;
 
@@ -98,7 +102,9 @@ impl ServiceSettings {
     fn new(args: &LandArgs) -> anyhow::Result<Self> {
         let autopilot = match &args.autopilot {
             Some(address) => address.clone(),
-            None => format!("udpin:127.0.0.1:{}", free_port(std::net::UdpSocket::bind)?),
+            None => {
+                format!("udpin:127.0.0.1:{}", free_port(|port| UdpSocket::bind((LOOPBACK, port)))?)
+            }
         };
         let mut simulator = vec![format!("seed={}", args.seed)];
         match &args.autopilot {
@@ -310,8 +316,12 @@ impl Rendezvous {
             return Ok(Self { file, description, _directory: directory });
         }
         let usual = node::session::LOCAL_PORT;
-        let usual_is_free = std::net::TcpListener::bind(("127.0.0.1", usual)).is_ok();
-        let port = if usual_is_free { usual } else { free_port(std::net::TcpListener::bind)? };
+        let usual_is_free = TcpListener::bind((LOOPBACK, usual)).is_ok();
+        let port = if usual_is_free {
+            usual
+        } else {
+            free_port(|port| TcpListener::bind((LOOPBACK, port)))?
+        };
         let file = directory.path().join("zenoh.json5");
         std::fs::write(&file, node::session::local_config(port))
             .with_context(|| format!("writing {file:?}"))?;
@@ -325,11 +335,11 @@ impl Rendezvous {
 const PORTS: std::ops::Range<u16> = 20_000..32_000;
 
 /// A free port. Each process begins its search at another one, so that two that start at once do not collide.
-fn free_port<T>(bind: impl Fn((&'static str, u16)) -> std::io::Result<T>) -> anyhow::Result<u16> {
+fn free_port<T>(bind: impl Fn(u16) -> std::io::Result<T>) -> anyhow::Result<u16> {
     let first = std::process::id().wrapping_mul(97);
     let port = |offset| PORTS.start + (first.wrapping_add(offset) % PORTS.len() as u32) as u16;
     (0..100)
         .map(port)
-        .find(|port| bind(("127.0.0.1", *port)).is_ok())
+        .find(|port| bind(*port).is_ok())
         .with_context(|| format!("finding a free port from {} to {}", PORTS.start, PORTS.end))
 }

@@ -376,7 +376,7 @@ mod tests {
         check(&["--marker", "rings", "--focal-px=-3", "a.png"], "above 0");
         check(&["--marker", "rings", "--focal-px=nan", "a.png"], "above 0");
         check(&["--marker", "rings", "--format", "xml", "a.png"], "jsonl");
-        check(&["--marker", "rings", "--bayer", "RGB", "a.png"], "there are RGGB");
+        check(&["--marker", "rings", "--bayer", "RGB", "a.png"], "it must be RGGB");
         check(&["--marker", "rings", "--track", "--threads", "2", "a.png"], "cannot be used with");
         let twice = examine(&["--marker", "rings", "--marker", "rings:1", "a.png"], Vec::new());
         assert!(twice.unwrap_err().to_string().contains("listed twice"));

@@ -25,7 +25,7 @@ const BUFFERS: usize = 4;
 /// How often the writer looks for the reader.
 const POLL: Duration = Duration::from_millis(10);
 /// How often it looks before it gives up, and before it publishes the last frame once more.
-const MOST_POLLS: u32 = 1000;
+const MAX_POLLS: u32 = 1000;
 const POLLS_BEFORE_ANOTHER: u32 = 100;
 
 /// What is measured.
@@ -111,7 +111,7 @@ impl Trial {
             if reader.0.try_wait()?.is_some() {
                 break;
             }
-            ensure!(polls < MOST_POLLS, "the reader had no last frame in {:?}", MOST_POLLS * POLL);
+            ensure!(polls < MAX_POLLS, "the reader had no last frame in {:?}", MAX_POLLS * POLL);
             std::thread::sleep(POLL);
             if polls % POLLS_BEFORE_ANOTHER == 0 {
                 publish(count.saturating_sub(1))?;

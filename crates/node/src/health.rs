@@ -127,7 +127,8 @@ fn counts(counts: &BTreeMap<String, u64>) -> Vec<Count> {
 }
 
 fn percentiles(kept: &VecDeque<f64>) -> Option<[f64; 2]> {
-    let at = |fraction: f64| stats::quantile(kept.iter().copied(), fraction);
+    let kept: Vec<f64> = kept.iter().copied().collect();
+    let at = |fraction: f64| stats::quantile(&kept, fraction);
     Some([at(0.5)?, at(0.99)?])
 }
 

@@ -13,21 +13,21 @@ pub fn standard_deviation(values: &[f64]) -> Option<f64> {
 }
 
 /// The quantile at `fraction` (0.5 for the median): the value of nearest rank. `None` for an empty sample.
-pub fn quantile(values: impl IntoIterator<Item = f64>, fraction: f64) -> Option<f64> {
+pub fn quantile(values: &[f64], fraction: f64) -> Option<f64> {
     let sorted = sorted(values);
     sorted.get((fraction * sorted.len().saturating_sub(1) as f64).round() as usize).copied()
 }
 
 /// The quantile at `fraction`, interpolated between the two nearest values. `None` for an empty sample.
-pub fn interpolated_quantile(values: impl IntoIterator<Item = f64>, fraction: f64) -> Option<f64> {
+pub fn interpolated_quantile(values: &[f64], fraction: f64) -> Option<f64> {
     let sorted = sorted(values);
     let rank = fraction * sorted.len().saturating_sub(1) as f64;
     let (low, high) = (sorted.get(rank.floor() as usize)?, sorted.get(rank.ceil() as usize)?);
     Some(low + (high - low) * rank.fract())
 }
 
-fn sorted(values: impl IntoIterator<Item = f64>) -> Vec<f64> {
-    let mut sorted: Vec<f64> = values.into_iter().collect();
+fn sorted(values: &[f64]) -> Vec<f64> {
+    let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);
     sorted
 }
@@ -39,10 +39,10 @@ mod tests {
     #[test]
     fn quantiles_are_values_of_the_sample_or_lie_between_two() {
         let sample = [4.0, 1.0, 3.0, 2.0];
-        assert_eq!([0.0, 0.5, 0.99].map(|part| quantile(sample, part).unwrap()), [1.0, 3.0, 4.0]);
-        assert_eq!(interpolated_quantile(sample, 0.5), Some(2.5));
-        assert_eq!(interpolated_quantile([3.0, 1.0, 2.0], 0.5), Some(2.0));
-        assert_eq!((quantile([], 0.5), interpolated_quantile([], 0.5)), (None, None));
+        assert_eq!([0.0, 0.5, 0.99].map(|part| quantile(&sample, part).unwrap()), [1.0, 3.0, 4.0]);
+        assert_eq!(interpolated_quantile(&sample, 0.5), Some(2.5));
+        assert_eq!(interpolated_quantile(&[3.0, 1.0, 2.0], 0.5), Some(2.0));
+        assert_eq!((quantile(&[], 0.5), interpolated_quantile(&[], 0.5)), (None, None));
     }
 
     #[test]

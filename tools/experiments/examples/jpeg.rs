@@ -1,19 +1,20 @@
-//! What JPEG costs: `cargo run --release -p experiments --example jpeg -- [MARKER...]` renders frames of the thesis' camera,
-//! compresses them as the air link does, and prints how far each marker is found and how far off its centre is.
+//! The effect of JPEG: `cargo run --release -p experiments --example jpeg -- [MARKER...]` renders frames of the thesis'
+//! camera, compresses them as the air link does, and prints the detection range and the centre error of each marker.
 #![allow(clippy::print_stdout, reason = "a program for people at a terminal")]
 
 use anyhow::Context;
-use experiments::score::quantile;
-use experiments::sets::{MARKERS, SIZE_M, Set};
-use experiments::shot::{Shot, Studio};
+use experiments::frame_spec::{FrameRenderer, FrameSpec};
+use experiments::set::{MARKERS, SIZE_M, Set};
+use experiments::sets;
 use fiducial::Detector;
 use geometry::{CameraModel, Roi};
 use imaging::GrayImage;
 use jpeg_encoder::{ColorType, Encoder};
 use markers::Marker;
+use node::stats::interpolated_quantile;
 
-/// How a frame is sent: pixels along the edge of one of what is sent, and its quality; without one, as it is.
-const WAYS: [(usize, Option<u8>); 13] = [
+/// Compressions: the scale of reduction, and the JPEG quality (`None` for raw pixels).
+const COMPRESSIONS: [(usize, Option<u8>); 13] = [
     (1, None),
     (1, Some(95)),
     (1, Some(90)),
@@ -28,14 +29,14 @@ const WAYS: [(usize, Option<u8>); 13] = [
     (2, Some(75)),
     (4, Some(75)),
 ];
-/// Every so many of the thesis' positions is looked at.
+/// One in this many of the thesis' positions is used.
 const POSITIONS_STEP: usize = 5;
 
-/// What one way of sending did to one marker.
+/// The results of one compression for one marker.
 #[derive(Clone, Default)]
 struct Cost {
     bytes: Vec<f64>,
-    /// Distance of each frame of the far set, in metres, and whether the marker was found.
+    /// For each frame of the far set, its distance in metres and whether the marker was detected.
     far: Vec<(f64, bool)>,
     near_found: usize,
     near_frames: usize,
@@ -51,19 +52,19 @@ fn main() -> anyhow::Result<()> {
         "| marker | scale | quality | kB | every frame found to | found of {{10 to 40 m}} | centre median / 95 % px |"
     );
     println!("|---|---|---|---|---|---|---|");
-    let mut studio = Studio::default();
+    let mut renderer = FrameRenderer::default();
     for name in &names {
         let marker: Marker =
             format!("{name}:{SIZE_M}").parse().with_context(|| format!("the marker {name}"))?;
-        let mut costs = vec![Cost::default(); WAYS.len()];
-        for shot in Set::Far.shots(marker) {
-            look(&mut studio, &shot, &mut costs, true)?;
+        let mut costs = vec![Cost::default(); COMPRESSIONS.len()];
+        for spec in sets::frames(Set::Far, marker) {
+            measure(&mut renderer, &spec, &mut costs, true)?;
         }
-        let near = Set::Positions.shots(marker);
-        for shot in near.iter().take(near.len() / 2).step_by(POSITIONS_STEP) {
-            look(&mut studio, shot, &mut costs, false)?;
+        let near = sets::frames(Set::Positions, marker);
+        for spec in near.iter().take(near.len() / 2).step_by(POSITIONS_STEP) {
+            measure(&mut renderer, spec, &mut costs, false)?;
         }
-        for ((scale, quality), cost) in WAYS.iter().zip(&costs) {
+        for ((scale, quality), cost) in COMPRESSIONS.iter().zip(&costs) {
             print(name, *scale, *quality, cost);
         }
     }
@@ -84,11 +85,11 @@ fn print(name: &str, scale: usize, quality: Option<u8>, cost: &Cost) {
         }
     }
     let far = cost.far.iter().filter(|(_, found)| *found).count();
-    let at = |part| quantile(&cost.errors_px, part).unwrap_or(f64::NAN);
+    let at = |part| interpolated_quantile(&cost.errors_px, part).unwrap_or(f64::NAN);
     println!(
         "| {name} | {scale} | {} | {:.0} | {range_m:.0} m | {far} of {}, near {} of {} | {:.3} / {:.3} |",
         quality.map_or("raw".to_owned(), |quality| quality.to_string()),
-        quantile(&cost.bytes, 0.5).unwrap_or(f64::NAN) / 1000.0,
+        interpolated_quantile(&cost.bytes, 0.5).unwrap_or(f64::NAN) / 1000.0,
         cost.far.len(),
         cost.near_found,
         cost.near_frames,
@@ -97,13 +98,18 @@ fn print(name: &str, scale: usize, quality: Option<u8>, cost: &Cost) {
     );
 }
 
-/// Looks at one frame in every way.
-fn look(studio: &mut Studio, shot: &Shot, costs: &mut [Cost], is_far: bool) -> anyhow::Result<()> {
-    let (marker, shown) = shot.marker.zip(shot.shown()).context("a marker in the frame")?;
-    let model = shot.settings.model;
-    let pixels = studio.take(shot)?;
+/// Runs the detector on one frame with every compression.
+fn measure(
+    renderer: &mut FrameRenderer,
+    spec: &FrameSpec,
+    costs: &mut [Cost],
+    is_far: bool,
+) -> anyhow::Result<()> {
+    let (marker, shown) = spec.marker.zip(spec.ground_truth()).context("a marker in the frame")?;
+    let model = spec.settings.model;
+    let pixels = renderer.render(spec)?;
     let mut detector = Detector::new(&[marker], fiducial::Settings::default())?;
-    for ((scale, quality), cost) in WAYS.iter().zip(costs) {
+    for ((scale, quality), cost) in COMPRESSIONS.iter().zip(costs) {
         let coarse = shrunk(&pixels, &model, *scale);
         let (image, bytes) = match quality {
             Some(quality) => through_jpeg(&coarse, *quality)?,

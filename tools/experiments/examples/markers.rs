@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 
 use experiments::markers::{Request, run};
-use experiments::sets::Set;
+use experiments::set::Set;
 
 fn main() -> anyhow::Result<()> {
     let mut arguments = std::env::args().skip(1);

@@ -4,8 +4,8 @@
 use std::path::PathBuf;
 use std::time::Instant;
 
-use experiments::sets::{MARKERS, SIZE_M, Set};
-use experiments::shot::Studio;
+use experiments::frame_spec::FrameRenderer;
+use experiments::set::{MARKERS, SIZE_M, Set};
 use experiments::store;
 
 fn main() -> anyhow::Result<()> {
@@ -19,7 +19,7 @@ fn main() -> anyhow::Result<()> {
     if sets.is_empty() {
         sets = Set::ALL.to_vec();
     }
-    let mut studio = Studio::default();
+    let mut renderer = FrameRenderer::default();
     for set in sets {
         let markers = if set.has_marker() { &MARKERS[..] } else { &MARKERS[..1] };
         for name in markers {
@@ -28,7 +28,7 @@ fn main() -> anyhow::Result<()> {
                 continue;
             };
             let start = Instant::now();
-            let frames = store::make(&root, set, marker, &mut studio)?;
+            let frames = store::make(&root, set, marker, &mut renderer)?;
             println!(
                 "{} {name}: {frames} frames, {:.1} s",
                 set.name(),

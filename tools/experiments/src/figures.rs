@@ -1,13 +1,13 @@
-//! Figures 4.7 and 4.8 of the thesis again: the mean estimated distance at each position for every marker.
+//! Figures 4.7 and 4.8 of the thesis: the mean estimated distance at each position for every marker.
 
 use anyhow::anyhow;
+use node::stats::mean;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
 use crate::record::OURS;
 use crate::report::Run;
-use crate::score::mean;
-use crate::sets::Set;
+use crate::set::Set;
 use crate::tables::positions;
 use crate::thesis::TABLES;
 
@@ -26,15 +26,14 @@ const COLOURS: [RGBColor; 6] = [
 /// One curve: a family, and the mean error at each position in metres.
 type Curve = (String, Vec<Option<f64>>);
 
-/// The colour of a family: that of its place among ours.
+/// The colour of a family.
 fn colour_of(family: &str, ours: &[Curve]) -> RGBColor {
     let place = ours.iter().position(|(name, _)| name == family).unwrap_or(ours.len());
     COLOURS[place % COLOURS.len()]
 }
 
-/// The figure of a binning as SVG; `None` when no marker was looked for at the positions.
-///
-/// Above the estimated distances, below their errors on a scale that shows them, with the thesis' beside.
+/// The figure of a binning as SVG: the estimated distances with those of the thesis above, their errors below. `None`
+/// without a run of the positions.
 ///
 /// # Errors
 /// When it cannot be drawn.
@@ -70,7 +69,8 @@ pub fn svg(runs: &[Run], binning: &str) -> anyhow::Result<Option<String>> {
     let mut svg = String::new();
     {
         let area = SVGBackend::with_string(&mut svg, (1000, 900)).into_drawing_area();
-        draw(&area, binning, &truth, (&curves, &thesis)).map_err(|problem| anyhow!("{problem}"))?;
+        let truth_m: Vec<u32> = truth.iter().map(|(x, _)| *x).collect();
+        draw(&area, binning, &truth_m, &curves, &thesis).map_err(|problem| anyhow!("{problem}"))?;
     }
     Ok(Some(svg))
 }
@@ -78,12 +78,13 @@ pub fn svg(runs: &[Run], binning: &str) -> anyhow::Result<Option<String>> {
 fn draw(
     area: &DrawingArea<SVGBackend<'_>, Shift>,
     binning: &str,
-    truth: &[(u32, f64)],
-    (ours, thesis): (&[Curve], &[Curve]),
+    truth_m: &[u32],
+    ours: &[Curve],
+    thesis: &[Curve],
 ) -> Result<(), Box<dyn std::error::Error>> {
     area.fill(&WHITE)?;
     let (upper, lower) = area.split_vertically(500);
-    let last = truth.len() as f64;
+    let last = truth_m.len() as f64;
     let title = format!("Mean estimated distance at each position, {binning} binning");
     let mut chart = ChartBuilder::on(&upper)
         .caption(title, ("sans-serif", 20))
@@ -97,7 +98,7 @@ fn draw(
         .x_label_formatter(&|x| format!("{x:.0}"))
         .y_desc("distance, m")
         .draw()?;
-    let line = truth.iter().enumerate().map(|(i, (x, _))| (i as f64 + 1.0, f64::from(*x)));
+    let line = truth_m.iter().enumerate().map(|(i, x)| (i as f64 + 1.0, f64::from(*x)));
     chart
         .draw_series(LineSeries::new(line, BLACK.stroke_width(1)))?
         .label("truth")
@@ -105,10 +106,11 @@ fn draw(
     for (index, (name, errors)) in ours.iter().chain(thesis).enumerate() {
         let colour = colour_of(name, ours);
         let is_thesis = index >= ours.len();
-        let points =
-            truth.iter().zip(errors).enumerate().filter_map(|(i, ((x, _), error))| {
-                Some((i as f64 + 1.0, f64::from(*x) + (*error)?))
-            });
+        let points = truth_m
+            .iter()
+            .zip(errors)
+            .enumerate()
+            .filter_map(|(i, (x, error))| Some((i as f64 + 1.0, f64::from(*x) + (*error)?)));
         if is_thesis {
             chart
                 .draw_series(points.map(|place| Cross::new(place, 3, colour.mix(0.7))))?
@@ -127,7 +129,7 @@ fn draw(
         .background_style(WHITE.mix(0.8))
         .border_style(BLACK)
         .draw()?;
-    draw_errors(&lower, truth.len(), ours)
+    draw_errors(&lower, truth_m.len(), ours)
 }
 
 fn draw_errors(
@@ -136,13 +138,13 @@ fn draw_errors(
     ours: &[Curve],
 ) -> Result<(), Box<dyn std::error::Error>> {
     let errors_mm = || ours.iter().flat_map(|(_, errors)| errors.iter().flatten().map(|e| 1e3 * e));
-    let most = errors_mm().fold(1.0, |most: f64, error| most.max(error.abs())) * 1.1;
+    let max = errors_mm().fold(1.0, |max: f64, error| max.max(error.abs())) * 1.1;
     let mut chart = ChartBuilder::on(area)
         .caption("Errors of this detector", ("sans-serif", 16))
         .margin(10)
         .x_label_area_size(40)
         .y_label_area_size(60)
-        .build_cartesian_2d(0.0..count as f64 + 1.0, -most..most)?;
+        .build_cartesian_2d(0.0..count as f64 + 1.0, -max..max)?;
     chart
         .configure_mesh()
         .x_desc("position (Table 4.1)")

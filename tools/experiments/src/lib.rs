@@ -1,21 +1,22 @@
-//! The thesis' experiments, wider: markers in rendered frames (section 4.3), and landings (section 4.4) by the hundred.
+//! The thesis' experiments, extended: markers in rendered frames (section 4.3), and hundreds of landings (section 4.4).
 //!
-//! It stands above the services: it calls their pure parts as functions, and knows no network and no clock.
+//! This crate is above the services: it calls their pure parts as functions, without a network or a clock.
 //!
-//! Modules in reading order: [`markers`] is the experiment with markers. [`shot`] takes one frame; [`sets`] says which
-//! frames there are; [`store`] keeps them on disk; [`record`] is what a detector answers; [`score`] how good that is;
-//! [`photographs`] asks real pictures; [`report`] writes it down, [`tables`] and [`figures`] as the [`thesis`] did.
-//! [`landing`] is the experiment with landings.
+//! Modules in reading order: [`markers`] is the experiment with markers. [`frame_spec`] specifies and renders one frame;
+//! [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`] has a detector's
+//! results, and [`score`] their errors; [`photographs`] has the results on real images; [`report`] is the report, with
+//! the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the experiment with landings.
 
 pub mod figures;
+pub mod frame_spec;
 pub mod landing;
 pub mod markers;
 pub mod photographs;
 pub mod record;
 pub mod report;
 pub mod score;
+pub mod set;
 pub mod sets;
-pub mod shot;
 pub mod store;
 pub mod tables;
 pub mod thesis;

@@ -1,4 +1,4 @@
-//! The experiment with markers: renders what is missing, runs our detector, scores all answers, writes the report.
+//! The experiment with markers: renders missing sets, runs the detector, scores all results, writes the report.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -7,33 +7,33 @@ use anyhow::Context;
 use markers::{Family, Marker};
 
 use crate::figures::{self, FIGURES};
+use crate::frame_spec::FrameRenderer;
 use crate::photographs;
 use crate::record::{self, ALL_AT_ONCE, FOLLOWING, OURS, Record};
 use crate::report;
-use crate::sets::{MARKERS, SIZE_M, Set};
-use crate::shot::Studio;
+use crate::set::{MARKERS, SIZE_M, Set};
 use crate::store;
 use crate::tables;
 
-/// What to do.
+/// What to run.
 #[derive(Clone, Debug)]
 pub struct Request {
-    /// Folder of the sets, rendered where they are missing.
+    /// Folder of the sets; missing ones are rendered.
     pub sets_in: PathBuf,
-    /// Folder of answers, scores and figures.
+    /// Folder of results, scores and figures.
     pub results_in: PathBuf,
-    /// Which sets.
+    /// The sets.
     pub sets: Vec<Set>,
-    /// Which families of the experiment's; all when empty.
+    /// The families; all of the experiment's if empty.
     pub families: Vec<String>,
     /// Folder of labelled photographs.
     pub photographs: Option<PathBuf>,
 }
 
-/// Runs in which the shortest time is taken, where time matters.
+/// Number of runs of timed sets; the shortest time of each frame counts.
 const TIMED_RUNS: usize = 5;
 
-/// Does it, telling `progress` what is being done; returns the report.
+/// Runs the experiment, with messages to `progress`; returns the report.
 ///
 /// # Errors
 /// When a file cannot be read or written.
@@ -42,32 +42,32 @@ pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<
     std::fs::create_dir_all(results_in)
         .with_context(|| format!("making {}", results_in.display()))?;
     if let Some(folder) = &request.photographs {
-        // Minutes later is late to learn of a wrong folder.
+        // Before the rendering, which takes minutes.
         photographs::check(folder)?;
     }
-    let mut studio = Studio::default();
+    let mut renderer = FrameRenderer::default();
     let mut extra = String::new();
     for set in &request.sets {
         for marker in markers(request, *set)? {
             let name = marker.family.name();
             progress(&format!("{} {name}", set.name()));
-            store::make(sets_in, *set, marker, &mut studio)?;
+            store::make(sets_in, *set, marker, &mut renderer)?;
             let folder = store::folder(sets_in, *set, marker);
             if set.has_marker() {
                 let any = Marker { id: None, ..marker };
-                answer(results_in, *set, name, (&folder, &[any]))?;
+                detect(results_in, *set, name, &folder, &[any])?;
                 time(results_in, *set, any, &folder)?;
             } else {
                 for (name, families) in photographs::families_for_negatives() {
                     let markers = sized(&families);
-                    answer(results_in, *set, name, (&folder, &markers))?;
+                    detect(results_in, *set, name, &folder, &markers)?;
                 }
             }
         }
     }
     if let Some(folder) = &request.photographs {
         progress("photographs");
-        extra = ask_photographs(folder, results_in)?;
+        extra = run_photographs(folder, results_in)?;
     }
     let runs = report::runs(sets_in, results_in)?;
     let mut text = report::text(&runs) + &extra;
@@ -90,7 +90,7 @@ fn sized(families: &[Family]) -> Vec<Marker> {
     families.iter().map(sized).collect()
 }
 
-/// The markers with which a set is rendered.
+/// The markers of a set.
 fn markers(request: &Request, set: Set) -> anyhow::Result<Vec<Marker>> {
     let wanted = |name: &&&str| {
         let family = name.split(':').next().unwrap_or_default();
@@ -105,11 +105,13 @@ fn markers(request: &Request, set: Set) -> anyhow::Result<Vec<Marker>> {
         .collect()
 }
 
-fn answer(
+/// Runs the detector over a set and writes the results.
+fn detect(
     results: &Path,
     set: Set,
     name: &str,
-    (folder, markers): (&Path, &[Marker]),
+    folder: &Path,
+    markers: &[Marker],
 ) -> anyhow::Result<()> {
     let is_timed = matches!(set, Set::Textured | Set::Tracking);
     let runs = if is_timed { TIMED_RUNS } else { 1 };
@@ -118,7 +120,7 @@ fn answer(
     record::write(&file, answers.iter().map(|(_, record)| record))
 }
 
-/// Sets that are there to measure time, with all families at once and with the marker followed.
+/// The timed sets, with all families at once and with tracking.
 fn time(results: &Path, set: Set, marker: Marker, folder: &Path) -> anyhow::Result<()> {
     const RATE_HZ: f64 = 30.0;
     let name = marker.family.name();
@@ -135,17 +137,17 @@ fn time(results: &Path, set: Set, marker: Marker, folder: &Path) -> anyhow::Resu
     Ok(())
 }
 
-/// The folder in which a detector's answers to photographs are.
+/// The folder of a detector's results on photographs.
 const PHOTOGRAPHS: &str = "photographs";
 
-fn ask_photographs(folder: &Path, results: &Path) -> anyhow::Result<String> {
+fn run_photographs(folder: &Path, results: &Path) -> anyhow::Result<String> {
     for (_, name) in photographs::FAMILIES {
         if let Some(family) = Family::ALL.into_iter().find(|family| family.name() == name) {
             let records = photographs::run(folder, family)?;
             record::write(&photographs_file(results, OURS, name), &records)?;
         }
     }
-    let mut recalls = BTreeMap::new();
+    let mut recalls: photographs::Recalls = BTreeMap::new();
     for entry in std::fs::read_dir(results)? {
         let detector = entry?.file_name().to_string_lossy().into_owned();
         for (_, name) in photographs::FAMILIES {
@@ -154,7 +156,7 @@ fn ask_photographs(folder: &Path, results: &Path) -> anyhow::Result<String> {
             let records: Vec<Record> =
                 text.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;
             let recall = photographs::recall(folder, name, &records)?;
-            recalls.insert((name.to_owned(), detector.clone()), recall);
+            recalls.entry(name.to_owned()).or_default().insert(detector.clone(), recall);
         }
     }
     let mut text = photographs::text(&recalls);

@@ -1,4 +1,4 @@
-//! Real photographs: recall on those that are labelled, false detections on those that show no marker.
+//! Real photographs: recall on labelled ones, false detections on those without a marker.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -12,7 +12,7 @@ use serde::Deserialize;
 
 use crate::record::{self, Found, Record};
 
-/// The labels' families and ours.
+/// The families of the labels, and their names here.
 pub const FAMILIES: [(&str, &str); 5] = [
     ("tag36h11", "apriltag-36h11"),
     ("aruco_4x4_1000", "aruco-4x4-1000"),
@@ -29,7 +29,7 @@ struct Photograph {
     uncertain: Vec<Label>,
     #[serde(default)]
     negative: bool,
-    /// Whether the markers are all that there are.
+    /// Whether all markers are labelled.
     #[serde(default)]
     complete: Option<bool>,
 }
@@ -46,13 +46,13 @@ impl Label {
         [0, 1].map(|i| self.corners.iter().map(|corner| corner[i]).sum::<f64>() / 4.0)
     }
 
-    /// Half of a diagonal.
+    /// Half of the longest diagonal.
     fn reach_px(&self) -> f64 {
         let centre = self.centre();
         self.corners.iter().map(|c| away(*c, centre)).fold(0.0, f64::max)
     }
 
-    /// Whether a detection lies on it.
+    /// Whether a detection is at this label.
     fn is_at(&self, found: &Found) -> bool {
         away(found.centre_px, self.centre()) < 0.35 * self.reach_px()
     }
@@ -62,20 +62,20 @@ fn away(a: [f64; 2], b: [f64; 2]) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
-/// What a detector made of the labelled photographs, for one family.
+/// The results of a detector on the labelled photographs of one family.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Recall {
     /// Labelled markers.
     pub markers: usize,
-    /// Of those, found.
+    /// Detected markers.
     pub found: usize,
-    /// Found with another id.
+    /// Detections with another id.
     pub wrong_ids: usize,
-    /// Found where no label is, though the labels are complete.
+    /// Detections without a label in photographs with complete labels.
     pub elsewhere: usize,
-    /// Found where no label is, and nobody knows.
+    /// Detections without a label in the other photographs.
     pub unlabelled: usize,
-    /// Photographs and how many markers were missed in them.
+    /// Photographs with missed markers, and their number.
     pub missed: Vec<(String, usize)>,
 }
 
@@ -91,19 +91,19 @@ fn photographs(folder: &Path) -> anyhow::Result<Vec<Photograph>> {
 /// Whether a folder has photographs with labels.
 ///
 /// # Errors
-/// When `labels.jsonl` cannot be read, or has none.
+/// When `labels.jsonl` cannot be read or is empty.
 pub fn check(folder: &Path) -> anyhow::Result<()> {
     let count = photographs(folder)?.len();
     anyhow::ensure!(count > 0, "{} names no photograph", folder.join("labels.jsonl").display());
     Ok(())
 }
 
-/// A marker of a family, any id, without a size.
+/// Any marker of a family, without a size.
 fn any_of(family: Family) -> Marker {
     Marker { family, id: None, size_m: None }
 }
 
-/// Runs our detector for one family over the labelled photographs that show it.
+/// Runs the detector for one family over the photographs with labels of it.
 ///
 /// # Errors
 /// When a photograph or the labels cannot be read.
@@ -125,10 +125,10 @@ fn label_of(family: &str) -> Option<&'static str> {
     FAMILIES.iter().find(|(_, ours)| *ours == family).map(|(label, _)| *label)
 }
 
-/// How many of the labelled markers of a family are among the answers.
+/// The recall of the labelled markers of a family.
 ///
 /// # Errors
-/// When the labels cannot be read, or an answer is missing.
+/// When the labels cannot be read, or a result is missing.
 pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result<Recall> {
     let label = label_of(family);
     let mut recall = Recall::default();
@@ -139,7 +139,7 @@ pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result
             continue;
         }
         let record = records.iter().find(|record| record.image == photograph.image);
-        let record = record.with_context(|| format!("no answer to {}", photograph.image))?;
+        let record = record.with_context(|| format!("no result for {}", photograph.image))?;
         let has = |label: &&&Label| {
             record.found.iter().any(|found| label.is_at(found) && found.id == Some(label.id))
         };
@@ -165,9 +165,9 @@ pub fn recall(folder: &Path, family: &str, records: &[Record]) -> anyhow::Result
     Ok(recall)
 }
 
-/// Which families are looked for in negatives: those of the experiment, and all there are.
+/// The families to find in negatives: those of the experiment, and all.
 pub fn families_for_negatives() -> [(&'static str, Vec<Family>); 2] {
-    let thesis = crate::sets::MARKERS.iter().filter_map(|name| {
+    let thesis = crate::set::MARKERS.iter().filter_map(|name| {
         let name = name.split(':').next()?;
         Family::ALL.into_iter().find(|family| family.name() == name)
     });
@@ -175,11 +175,11 @@ pub fn families_for_negatives() -> [(&'static str, Vec<Family>); 2] {
     [("experiment", thesis.collect()), ("all", all.collect())]
 }
 
-/// Images, and what was found in those where something was.
+/// The number of images, and the false detections by image.
 pub type Negatives = (usize, Vec<(String, Vec<Found>)>);
 
-/// False detections in the photographs without a marker: whole, in quarters and in ninths, each at full resolution.
-/// Returns how many images there were, and the false detections by image.
+/// False detections in the photographs without a marker: the whole image, its quarters and its ninths, each at full
+/// resolution.
 ///
 /// # Errors
 /// When a photograph or the labels cannot be read.
@@ -200,7 +200,7 @@ pub fn negatives(folder: &Path, families: &[Family]) -> anyhow::Result<Negatives
     Ok((images, wrong))
 }
 
-/// The whole image, its quarters and its ninths, and what to add to its name.
+/// The whole image, its quarters and its ninths, with suffixes for its name.
 fn parts(whole: &GrayImage) -> Vec<(String, GrayImage)> {
     let mut parts = vec![(String::new(), whole.clone())];
     for count in [2, 3] {
@@ -214,20 +214,28 @@ fn parts(whole: &GrayImage) -> Vec<(String, GrayImage)> {
     parts
 }
 
+/// Recalls by family and detector.
+pub type Recalls = BTreeMap<String, BTreeMap<String, Recall>>;
+
 /// The table of recall on photographs.
-pub fn text(recalls: &BTreeMap<(String, String), Recall>) -> String {
+pub fn text(recalls: &Recalls) -> String {
+    let rows = || {
+        recalls.iter().flat_map(|(family, of_family)| {
+            of_family.iter().map(move |(detector, recall)| (family, detector, recall))
+        })
+    };
     let mut text = String::from(
         "\n## Labelled photographs\n\n| marker | detector | found | wrong ids | elsewhere | unlabelled |\n|---|---|---|---|---|---|\n",
     );
-    // Writing to a text cannot fail.
-    for ((family, detector), r) in recalls {
+    // Writing to a string cannot fail.
+    for (family, detector, r) in rows() {
         let _ = writeln!(
             text,
             "| {family} | {detector} | {}/{} | {} | {} | {} |",
             r.found, r.markers, r.wrong_ids, r.elsewhere, r.unlabelled
         );
     }
-    for ((family, detector), r) in recalls {
+    for (family, detector, r) in rows() {
         if detector == record::OURS {
             let _ = writeln!(text, "\nMissed by us, {family}:");
             for (image, count) in &r.missed {

@@ -1,4 +1,4 @@
-//! What a detector found in a frame, as a line of JSON: the same for ours and for others'.
+//! The results of a detector, one line of JSON per frame; the same format for this detector and for others.
 
 use std::path::{Path, PathBuf};
 
@@ -11,37 +11,37 @@ use markers::Marker;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
-use crate::sets::Set;
+use crate::set::Set;
 use crate::store::{self, Frame};
 
-/// The name under which our own results are kept.
+/// The name of this detector's results.
 pub const OURS: &str = "alight";
 
-/// The same looking for all of the experiment's families at once.
+/// The name of its results with all families of the experiment at once.
 pub const ALL_AT_ONCE: &str = "alight-all";
 
-/// The same following the marker from frame to frame.
+/// The name of its results with tracking.
 pub const FOLLOWING: &str = "alight-following";
 
-/// A detector's answer to one frame.
+/// The result for one frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Record {
     /// The frame's file.
     pub image: String,
     /// Processor time in milliseconds.
     pub ms: f64,
-    /// What was found.
+    /// The detections.
     pub found: Vec<Found>,
 }
 
-/// A marker that was found.
+/// A detection.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Found {
     /// Its family.
     pub family: String,
     /// Its id.
     pub id: Option<u32>,
-    /// Where its centre appears.
+    /// The pixel of its centre.
     pub centre_px: [f64; 2],
     /// Covariance of the centre: xx, xy, yy.
     #[serde(default)]
@@ -49,13 +49,13 @@ pub struct Found {
     /// Its corners: its own top left first, then clockwise.
     #[serde(default)]
     pub corners_px: Option<[[f64; 2]; 4]>,
-    /// Its place in the camera frame.
+    /// Its position in the camera frame.
     #[serde(default)]
     pub translation_m: Option<[f64; 3]>,
     /// Variance of the distance along the optical axis, in square metres.
     #[serde(default)]
     pub range_variance_m2: Option<f64>,
-    /// How sure the detector is, on a scale of its own.
+    /// The confidence, on the detector's own scale.
     #[serde(default)]
     pub confidence: f64,
 }
@@ -126,10 +126,10 @@ pub fn answer(
     Ok((shortest, found))
 }
 
-/// Runs our detector for `markers` over the frames of a folder.
+/// Runs the detector for `markers` over the frames of a folder.
 ///
 /// # Errors
-/// When a frame cannot be read, or there is no such detector.
+/// When a frame cannot be read or the markers are invalid.
 pub fn run(folder: &Path, markers: &[Marker], runs: usize) -> anyhow::Result<Vec<(Frame, Record)>> {
     let mut detector = Detector::new(markers, Settings::default())?;
     store::frames(folder)?
@@ -143,11 +143,10 @@ pub fn run(folder: &Path, markers: &[Marker], runs: usize) -> anyhow::Result<Vec
         .collect()
 }
 
-/// Follows markers through the frames of a folder, taken at so many a second, some times over; the shortest time of
-/// each frame counts, but for the first of all, in which there is nothing to follow.
+/// Tracks markers through the frames of a folder, several times; the shortest time of each frame counts.
 ///
 /// # Errors
-/// When a frame cannot be read, or there is no such detector.
+/// When a frame cannot be read or the markers are invalid.
 pub fn follow(
     folder: &Path,
     markers: &[Marker],
@@ -160,7 +159,7 @@ pub fn follow(
     let mut records: Vec<Record> = Vec::new();
     for _ in 0..runs.max(1) {
         let mut detector = Detector::new(markers, Settings::default())?;
-        // Nothing but following, so that the times are of that.
+        // Without full searches, to time tracking only.
         let mut tracker = Tracker::new(TrackingSettings { full_search_period: u32::MAX });
         for (index, (frame, image)) in frames.iter().zip(&images).enumerate() {
             let (width, height) = (image.width() as usize, image.height() as usize);
@@ -181,7 +180,7 @@ pub fn follow(
     Ok(records)
 }
 
-/// Writes a detector's answers.
+/// Writes the results of a detector.
 ///
 /// # Errors
 /// When the file cannot be written.
@@ -197,10 +196,10 @@ pub fn write<'a>(path: &Path, records: impl IntoIterator<Item = &'a Record>) -> 
     std::fs::write(path, text).with_context(|| format!("writing {}", path.display()))
 }
 
-/// A detector's answers, joined with the frames of a folder; `None` when it has not been run.
+/// The results of a detector with the frames of a folder; `None` if there are none.
 ///
 /// # Errors
-/// When the answers are damaged, or not those to these frames.
+/// When the results are damaged or of other frames.
 pub fn join(path: &Path, folder: &Path) -> anyhow::Result<Option<Vec<(Frame, Record)>>> {
     let Ok(text) = std::fs::read_to_string(path) else { return Ok(None) };
     let mut records = std::collections::HashMap::new();

@@ -1,27 +1,28 @@
-//! The scores as text: one table of all sets, one of their groups, and which frames were missed.
+//! The report: tables of all sets and of their groups, and the missed frames.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::Context;
+use node::stats::interpolated_quantile as quantile;
 use serde::Serialize;
 
 use crate::record::{self, OURS, Record};
-use crate::score::{Score, Summary, quantile};
-use crate::sets::Set;
+use crate::score::{Score, Summary};
+use crate::set::Set;
 use crate::store::Frame;
 
-/// What one detector made of one family's frames of one set.
+/// The results of one detector on one family in one set.
 #[derive(Debug)]
 pub struct Run {
     /// The set.
     pub set: Set,
-    /// The family; of negatives all that were looked for.
+    /// The family; for negatives the name of the list of families.
     pub family: String,
     /// The detector.
     pub detector: String,
-    /// Its answers.
+    /// The results by frame.
     pub answers: Vec<(Frame, Record)>,
 }
 
@@ -36,10 +37,10 @@ struct Line<'a> {
     summary: Summary,
 }
 
-/// All runs whose answers are kept below `results`, ours first.
+/// All runs in the folder `results`, those of this detector first.
 ///
 /// # Errors
-/// When answers are damaged or of other frames.
+/// When results are damaged or of other frames.
 pub fn runs(root: &Path, results: &Path) -> anyhow::Result<Vec<Run>> {
     let mut detectors = Vec::new();
     for entry in std::fs::read_dir(results).with_context(|| format!("{}", results.display()))? {
@@ -110,7 +111,7 @@ pub fn json_lines(runs: &[Run]) -> anyhow::Result<String> {
         Ok(())
     };
     for run in runs {
-        append(run, None, &Score::of(&run.answers))?;
+        append(run, None, &Score::new(&run.answers))?;
         for (group, score) in groups(run) {
             append(run, Some(&group), &score)?;
         }
@@ -124,7 +125,7 @@ pub fn groups(run: &Run) -> BTreeMap<String, Score> {
     for answer in &run.answers {
         groups.entry(&answer.0.group).or_default().push(answer);
     }
-    groups.into_iter().map(|(group, list)| (group.to_owned(), Score::of(list))).collect()
+    groups.into_iter().map(|(group, list)| (group.to_owned(), Score::new(list))).collect()
 }
 
 /// A number, or a dash where there is none.
@@ -132,19 +133,19 @@ pub fn number(value: Option<f64>, digits: usize) -> String {
     value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
 }
 
-// Writing to a text cannot fail, so that the results of `writeln!` are of no use here.
+// Writing to a string cannot fail, so that the results of `writeln!` are ignored.
 
 fn append_summary(text: &mut String, runs: &[Run]) {
     let _ = writeln!(
         text,
-        "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) when the covariance is true. Times are processor time.\n"
+        "## All sets\n\nchi2 are medians: 1.39 (centre) and 0.45 (range) for a consistent covariance. Times are processor time.\n"
     );
     let _ = writeln!(
         text,
         "| set | marker | detector | found | wrong ids | elsewhere | centre px median | p95 | worst | corner px | range % median | p95 | bias % | centre chi2 | range chi2 | ms | p95 |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
     );
     for run in runs {
-        let s = Score::of(&run.answers).summary();
+        let s = Score::new(&run.answers).summary();
         let found = if run.set.has_marker() {
             format!("{}/{}", s.found, s.frames)
         } else {
@@ -173,7 +174,7 @@ fn append_summary(text: &mut String, runs: &[Run]) {
     }
 }
 
-/// Height in metres of a group of positions, `2x2-07m-2m`.
+/// Parses the height in metres from the group of a position, `2x2-07m-2m`.
 pub fn height_m(group: &str) -> Option<u32> {
     group.split('-').nth(1)?.get(..2)?.parse().ok()
 }
@@ -186,7 +187,7 @@ fn append_positions(text: &mut String, runs: &[Run]) {
     for run in runs.iter().filter(|run| run.set == Set::Positions) {
         for binning in ["2x2", "4x4"] {
             let of = |from: u32, to: u32| {
-                Score::of(run.answers.iter().filter(|(frame, _)| {
+                Score::new(run.answers.iter().filter(|(frame, _)| {
                     frame.group.starts_with(binning)
                         && height_m(&frame.group)
                             .is_some_and(|height| (from..=to).contains(&height))
@@ -272,7 +273,7 @@ fn append_groups(text: &mut String, runs: &[Run]) {
 fn append_misses(text: &mut String, runs: &[Run]) {
     let _ = writeln!(text, "\n## Our misses and false detections\n");
     for run in runs.iter().filter(|run| run.detector == OURS) {
-        let score = Score::of(&run.answers);
+        let score = Score::new(&run.answers);
         if run.set.has_marker() && !score.missed.is_empty() {
             let _ = writeln!(
                 text,

@@ -1,4 +1,4 @@
-//! Sets on disk: `FOLDER/SET/FAMILY/`, a PNG file for each frame and a line of JSON for each in `truth.jsonl`.
+//! Sets on disk, `FOLDER/SET/FAMILY/`: a PNG file per frame, and a line of JSON per frame in `truth.jsonl`.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -11,16 +11,17 @@ use image::{ExtendedColorType, ImageEncoder};
 use markers::Marker;
 use serde::{Deserialize, Serialize};
 
-use crate::sets::Set;
-use crate::shot::{Shot, Studio};
+use crate::frame_spec::{FrameRenderer, FrameSpec};
+use crate::set::Set;
+use crate::sets;
 
-/// The file that says what the frames beside it show.
+/// The file with the ground truth of the frames beside it.
 pub const TRUTH: &str = "truth.jsonl";
 
-/// A frame and what it shows.
+/// A frame with its ground truth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Frame {
-    /// Its file, in the folder of its truth.
+    /// Its file, in the same folder.
     pub image: String,
     /// The set.
     pub set: String,
@@ -28,11 +29,11 @@ pub struct Frame {
     pub group: String,
     /// The camera.
     pub camera: CameraLine,
-    /// The marker; none in a negative.
+    /// The marker; `None` in a negative.
     pub marker: Option<MarkerLine>,
 }
 
-/// A camera, as OpenCV states one.
+/// A camera with the parameters of OpenCV.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CameraLine {
     /// Image width in pixels.
@@ -51,7 +52,7 @@ pub struct CameraLine {
     pub distortion: Vec<f64>,
 }
 
-/// A marker and where it is.
+/// A marker and its pose.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MarkerLine {
     /// Its family.
@@ -60,22 +61,22 @@ pub struct MarkerLine {
     pub id: Option<u32>,
     /// Its size in metres.
     pub size_m: f64,
-    /// Where its centre appears.
+    /// The pixel of its centre.
     pub centre_px: [f64; 2],
-    /// Its corners, its own top left first, then clockwise; of rings those of the square about the outer circle.
+    /// The pixels of its corners, its own top left first, then clockwise; for rings of the square about the outer circle.
     pub corners_px: [[f64; 2]; 4],
-    /// Its largest edge in the image.
+    /// Its longest side in the image.
     pub size_px: f64,
-    /// Whether the square is all in the frame.
+    /// Whether its square is inside the frame.
     pub is_whole: bool,
-    /// Its place in the camera frame.
+    /// Its position in the camera frame.
     pub translation_m: [f64; 3],
     /// Its orientation in the camera frame.
     pub rotation_wxyz: [f64; 4],
 }
 
 impl CameraLine {
-    fn of(model: &CameraModel) -> Self {
+    fn new(model: &CameraModel) -> Self {
         let CameraModel { width, height, fx, fy, cx, cy, distortion } = *model;
         let distortion = match distortion {
             Distortion::BrownConrady(k) => k.to_vec(),
@@ -96,8 +97,8 @@ impl CameraLine {
 }
 
 impl MarkerLine {
-    fn of(shot: &Shot) -> Option<Self> {
-        let (marker, shown) = (shot.marker?, shot.shown()?);
+    fn new(spec: &FrameSpec) -> Option<Self> {
+        let (marker, shown) = (spec.marker?, spec.ground_truth()?);
         let pixel = |p: Pixel| [p.x, p.y];
         let origin = shown.camera_from_marker.origin();
         Some(Self {
@@ -106,14 +107,14 @@ impl MarkerLine {
             size_m: marker.size_m?,
             centre_px: pixel(shown.centre),
             corners_px: shown.corners.map(pixel),
-            size_px: shot.size_px(),
-            is_whole: shot.is_whole(),
+            size_px: spec.size_px(),
+            is_whole: spec.is_whole(),
             translation_m: [origin.x(), origin.y(), origin.z()],
             rotation_wxyz: shown.camera_from_marker.rotation().wxyz(),
         })
     }
 
-    /// The marker in the camera frame; `None` when the rotation is none.
+    /// The pose in the camera frame; `None` when the rotation is invalid.
     pub fn camera_from_marker(&self) -> Option<Transform<geometry::Camera, geometry::Marker>> {
         let [x, y, z] = self.translation_m;
         Some(Transform::new(Rotation::from_wxyz(self.rotation_wxyz)?, Point::new(x, y, z)))
@@ -126,39 +127,44 @@ pub fn folder(root: &Path, set: Set, marker: Marker) -> PathBuf {
     if set.has_marker() { root.join(marker.family.name()) } else { root }
 }
 
-/// Renders a set with one marker, unless it is there; says how many frames it has.
+/// Renders a set with one marker if it is missing; returns its number of frames.
 ///
 /// # Errors
 /// When a file cannot be written.
-pub fn make(root: &Path, set: Set, marker: Marker, studio: &mut Studio) -> anyhow::Result<usize> {
+pub fn make(
+    root: &Path,
+    set: Set,
+    marker: Marker,
+    renderer: &mut FrameRenderer,
+) -> anyhow::Result<usize> {
     let folder = folder(root, set, marker);
     let truth = folder.join(TRUTH);
     if let Ok(text) = std::fs::read_to_string(&truth) {
         return Ok(text.lines().count());
     }
     std::fs::create_dir_all(&folder).with_context(|| format!("making {}", folder.display()))?;
-    // The truth is complete when it has its name.
+    // Renamed when it is complete.
     let unfinished = folder.join("truth.unfinished");
     let mut lines = BufWriter::new(File::create(&unfinished)?);
-    let shots = set.shots(marker);
-    for (index, shot) in shots.iter().enumerate() {
-        let image = format!("{index:04}-{}.png", shot.group);
-        let pixels = studio.take(shot)?;
-        let camera = CameraLine::of(&shot.settings.model);
+    let specs = sets::frames(set, marker);
+    for (index, spec) in specs.iter().enumerate() {
+        let image = format!("{index:04}-{}.png", spec.group);
+        let pixels = renderer.render(spec)?;
+        let camera = CameraLine::new(&spec.settings.model);
         write_png(&folder.join(&image), &pixels, &camera)?;
         let frame = Frame {
             image,
             set: set.name().to_owned(),
-            group: shot.group.clone(),
+            group: spec.group.clone(),
             camera,
-            marker: MarkerLine::of(shot),
+            marker: MarkerLine::new(spec),
         };
         serde_json::to_writer(&mut lines, &frame)?;
         lines.write_all(b"\n")?;
     }
     lines.flush()?;
     std::fs::rename(&unfinished, &truth)?;
-    Ok(shots.len())
+    Ok(specs.len())
 }
 
 fn write_png(path: &Path, pixels: &[u8], camera: &CameraLine) -> anyhow::Result<()> {

@@ -1,11 +1,12 @@
-//! Tables A.1 to A.8 of the thesis again, from rendered frames, beside the thesis' values and the references'.
+//! Tables A.1 to A.8 of the thesis from rendered frames, beside the values of the thesis and of reference detectors.
 
 use std::fmt::Write as _;
 
+use node::stats::{mean, standard_deviation};
+
 use crate::record::{OURS, Record};
 use crate::report::Run;
-use crate::score::{deviation, mean};
-use crate::sets::Set;
+use crate::set::Set;
 use crate::store::{Frame, MarkerLine};
 use crate::thesis::{TABLES, Table};
 
@@ -19,22 +20,22 @@ pub struct Written {
     pub csv: String,
 }
 
-/// What a detector estimated at one position.
+/// The estimates of a detector at one position.
 pub struct Position {
     /// Distance along the axis, in metres.
     pub x_m: u32,
     /// Distance across, to the right, in metres.
     pub y_m: f64,
-    /// Frames.
+    /// Number of frames.
     pub frames: usize,
-    /// Errors along the axis, to the right and downwards of each frame in which the marker was found, in metres.
+    /// Errors along the axis, to the right and downwards for each frame with a detection, in metres.
     pub errors_m: Vec<[f64; 3]>,
     /// Estimated distances along the axis, in metres.
     pub estimates_m: Vec<f64>,
 }
 
 impl Position {
-    /// Whether the marker was found in every frame; otherwise the thesis' statistics are not computed.
+    /// Whether the marker was detected in every frame; otherwise the thesis has no statistics.
     pub fn is_complete(&self) -> bool {
         self.errors_m.len() == self.frames
     }
@@ -66,13 +67,13 @@ pub fn positions(run: &Run, binning: &str) -> Vec<Position> {
     positions
 }
 
-/// Distances along and across of a group of positions, `2x2-07m-2m`.
+/// Parses the distances along and across from the group of a position, `2x2-07m-2m`.
 fn place(group: &str, binning: &str) -> Option<(u32, f64)> {
     let (x, y) = group.strip_prefix(binning)?.strip_prefix('-')?.split_once('m')?;
     Some((x.parse().ok()?, y.strip_suffix('m')?.parse().ok()?))
 }
 
-/// The estimate of the marker itself, not of something else.
+/// The estimate of the marker itself.
 fn estimate(frame: &Frame, record: &Record, truth: &MarkerLine) -> Option<[f64; 3]> {
     let reach_px = 0.5 * truth.size_px;
     record
@@ -86,7 +87,7 @@ fn estimate(frame: &Frame, record: &Record, truth: &MarkerLine) -> Option<[f64; 
         .translation_m
 }
 
-/// All tables of which there are runs.
+/// All tables with runs.
 pub fn all(runs: &[Run]) -> Vec<Written> {
     TABLES
         .iter()
@@ -101,7 +102,7 @@ pub fn all(runs: &[Run]) -> Vec<Written> {
         .collect()
 }
 
-// Writing to a text cannot fail, so that the results of `write!` are of no use here.
+// Writing to a string cannot fail, so that the results of `write!` are ignored.
 
 fn write(table: &Table, ours: &Run, others: &[&Run]) -> Written {
     let name = format!("table-{}", table.name.to_lowercase().replace('.', ""));
@@ -128,7 +129,7 @@ fn write(table: &Table, ours: &Run, others: &[&Run]) -> Written {
         others.iter().map(|run| (run, positions(run, table.binning))).collect();
     for (index, position) in positions(ours, table.binning).iter().enumerate() {
         let _ = write!(markdown, "| {} | {} |", position.x_m, position.y_m);
-        for statistic in [mean, deviation] {
+        for statistic in [mean, standard_deviation] {
             for axis in 0..3 {
                 let _ = write!(markdown, " {} |", millimetres(position, axis, statistic));
             }
@@ -147,7 +148,8 @@ fn write(table: &Table, ours: &Run, others: &[&Run]) -> Written {
         }
         for (run, positions) in &other_positions {
             let Some(position) = positions.get(index) else { continue };
-            let [m, d] = [mean, deviation].map(|statistic| millimetres(position, 0, statistic));
+            let [m, d] =
+                [mean, standard_deviation].map(|statistic| millimetres(position, 0, statistic));
             let _ = write!(markdown, " {m} | {d} |");
             append_csv(&mut csv, &run.detector, position);
         }
@@ -164,7 +166,7 @@ fn millimetres(position: &Position, axis: usize, statistic: fn(&[f64]) -> Option
 fn append_csv(csv: &mut String, detector: &str, position: &Position) {
     let Position { x_m, y_m, frames, errors_m, .. } = position;
     let _ = write!(csv, "{x_m},{y_m},{detector},{frames},{}", errors_m.len());
-    for statistic in [mean, deviation] {
+    for statistic in [mean, standard_deviation] {
         for axis in 0..3 {
             let value = position.is_complete().then(|| statistic(&position.axis(axis))).flatten();
             let _ = match value {
@@ -176,7 +178,7 @@ fn append_csv(csv: &mut String, detector: &str, position: &Position) {
     csv.push('\n');
 }
 
-/// The thesis' frame need not be ours: its y and z are as it states them.
+/// The y and z axes are those of the thesis, which may differ.
 fn append_thesis(csv: &mut String, position: &Position, means: [f64; 3], deviations: [f64; 3]) {
     let _ = write!(csv, "{},{},thesis,5,5", position.x_m, position.y_m);
     for value in means.into_iter().chain(deviations) {
@@ -190,14 +192,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn groups_are_places() {
+    fn groups_are_parsed() {
         assert_eq!(place("2x2-07m-2m", "2x2"), Some((7, -2.0)));
         assert_eq!(place("4x4-03m+0.5m", "4x4"), Some((3, 0.5)));
         assert_eq!(place("4x4-03m+0.5m", "2x2"), None);
     }
 
     #[test]
-    fn the_thesis_has_as_many_complete_positions_as_it_says() {
+    fn the_tables_have_their_number_of_rows() {
         let complete: Vec<usize> = TABLES.iter().map(|table| table.rows.len()).collect();
         assert_eq!(complete, [37, 12, 26, 19, 30, 14, 20, 7]);
     }

@@ -1,4 +1,4 @@
-//! From the world to a detector's message: rendered frames through the real detector, or the model of what it would find.
+//! From the simulated world to a detector's message: rendered frames with the real detector, or a model of its errors.
 
 use anyhow::Context;
 use detector::wire;
@@ -17,7 +17,7 @@ use super::plan;
 
 /// The name of the detector.
 pub const DETECTOR: &str = "main";
-/// The marker is looked at twice so far apart to know how it moves in the image, in seconds.
+/// Time step for the marker's velocity in the image, in seconds.
 const BLUR_STEP_S: f64 = 1e-3;
 
 /// Camera and detector of one flight.
@@ -35,20 +35,20 @@ enum Seer {
     Modelled(Box<Vision>),
 }
 
-/// A message and when it arrives, in seconds of the world.
+/// A message with its time of arrival.
 #[derive(Clone, Debug)]
 pub struct Arrival {
-    /// When.
+    /// Time of arrival, in seconds of the world.
     pub at_s: f64,
-    /// What.
+    /// The message.
     pub message: Detections,
 }
 
 impl Eyes {
-    /// The eyes of a simulator's configuration.
+    /// The vision of a simulator's configuration.
     ///
     /// # Errors
-    /// When the scene or the marker makes no sense.
+    /// When the scene or the marker is invalid.
     pub fn new(
         config: &simulator::Config,
         how: plan::Vision,
@@ -76,17 +76,17 @@ impl Eyes {
         Ok(Self { camera, seer, info, model, faults, family: marker.family.name() })
     }
 
-    /// The camera as the controller is told of it.
+    /// The camera information for the controller.
     pub fn info(&self) -> &CameraInfo {
         &self.info
     }
 
-    /// How long the shutter is open, in seconds.
+    /// Exposure time, in seconds.
     pub fn exposure_s(&self) -> f64 {
         self.camera.settings().exposure_s
     }
 
-    /// Takes the frame of a request and looks for the marker. `stamp_ns` tells the stamp of a time of the world.
+    /// Takes a frame and finds the marker. `stamp_ns` converts the time of the world to a stamp.
     ///
     /// # Errors
     /// When a frame cannot be rendered.
@@ -188,8 +188,7 @@ fn detection(family: &str, found: &Found) -> Detection {
     }
 }
 
-/// What the detector's error is for a pose that is known, for those who fit the model: centre in pixels along the image's
-/// axes, range as a part of it, tilt in radians.
+/// The detector's error for a known pose, to fit the model: centre x and y in pixels, relative range, tilt in radians.
 pub fn errors(
     model: &CameraModel,
     found: &Transform<Camera, Marker>,

@@ -1,11 +1,11 @@
-//! What goes wrong in a flight, and other circumstances with a name.
+//! Faults and other named circumstances of a flight.
 
 use std::f64::consts::TAU;
 use std::str::FromStr;
 
 use world::vision::VisionFaults;
 
-/// A circumstance beside wind, height, offset and latency.
+/// A circumstance besides wind, height, offset and latency.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub struct Fault(usize);
 
@@ -16,12 +16,11 @@ pub struct Change {
     pub simulator: Vec<String>,
     /// Settings of the controller.
     pub controller: Vec<String>,
-    /// What the modelled detector does wrong; a rendered frame shows what it shows.
+    /// Faults of the modelled detector; they do not apply to rendered frames.
     pub vision: VisionFaults,
 }
 
-/// A row of the table of faults: its name, what it is, and what it changes for the number (from 0 to 1) that a flight's seed
-/// draws.
+/// A row of the table of faults: its name, its description, and its changes for a random number from 0 to 1.
 type Row = (&'static str, &'static str, fn(f64) -> Change);
 
 const TABLE: [Row; 23] = [
@@ -46,7 +45,7 @@ const TABLE: [Row; 23] = [
             ..simulator(&["pad.wrong_marker=aruco-4x4-50:7:0.15", "pad.wrong_east_m=1"])
         }
     }),
-    ("lie", "detections lie by 0.5 m for 1 s, at any time", |part| {
+    ("lie", "detections are off by 0.5 m for 1 s, at any time", |part| {
         let from_s = 1.0 + 9.0 * part;
         let lie = Some((from_s, from_s + 1.0, 0.5));
         Change { vision: VisionFaults { lie, ..VisionFaults::default() }, ..Change::default() }
@@ -115,12 +114,12 @@ fn occluder(kind: &str, part: f64) -> Change {
     simulator(&[&kind, &at, "occluder.strength=0.33", "occluder.for_s=2"])
 }
 
-/// A pad that moves, seen twice as often, and a controller that is told to expect it.
+/// A moving pad, at twice the frame rate, with a controller configured for it.
 fn moving(speed_m_s: f64, heave_m: f64) -> Change {
     let speed = format!("pad.speed_m_s={speed_m_s}");
     let heave = format!("pad.heave_m={heave_m}");
     let simulated = ["pad.marker=rings:0.23", "camera.rate_hz=30", &speed, &heave];
-    let told: &[&str] = if heave_m > 0.0 {
+    let settings: &[&str] = if heave_m > 0.0 {
         &["estimator.pad_heave_m_s=0.4", "metric.setpoint_loss_s=1.2"]
     } else {
         &[
@@ -134,7 +133,7 @@ fn moving(speed_m_s: f64, heave_m: f64) -> Change {
         ]
     };
     Change {
-        controller: told.iter().map(|setting| (*setting).to_owned()).collect(),
+        controller: settings.iter().map(|setting| (*setting).to_owned()).collect(),
         ..simulator(&simulated)
     }
 }
@@ -143,7 +142,7 @@ impl Fault {
     /// No fault.
     pub const NONE: Self = Self(0);
 
-    /// All of them.
+    /// All faults.
     pub fn all() -> impl Iterator<Item = Self> {
         (0..TABLE.len()).map(Self)
     }
@@ -153,17 +152,17 @@ impl Fault {
         TABLE.get(self.0).map_or("none", |row| row.0)
     }
 
-    /// What it is, in words.
+    /// Its description.
     pub fn words(self) -> &'static str {
         TABLE.get(self.0).map_or("", |row| row.1)
     }
 
-    /// What it changes in the flight of a seed.
+    /// Its changes in the flight of a seed.
     pub fn change(self, seed: u64) -> Change {
         let mut change =
             TABLE.get(self.0).map_or_else(Change::default, |row| row.2(drawn(seed, 9)));
         if change.simulator.iter().any(|setting| setting.starts_with("pad.speed_m_s")) {
-            // Towards the vehicle, within 45 degrees: a pad that runs away unseen is nobody's to find.
+            // Towards the vehicle within 45 degrees, so that it comes into view.
             let course = drawn_angle(seed, START_ANGLE).to_degrees() + 90.0 * drawn(seed, 9) - 45.0;
             change.simulator.push(format!("pad.course_deg={:.1}", course.rem_euclid(360.0)));
         }
@@ -183,17 +182,17 @@ impl FromStr for Fault {
     }
 }
 
-/// The number of the angle from the pad to where the vehicle starts.
+/// The index of the random angle from the pad to the start.
 pub const START_ANGLE: u32 = 6;
 
-/// A number from 0 to 1 that belongs to the seed, another one for each `which`.
+/// A random number from 0 to 1 for a seed and an index.
 pub fn drawn(seed: u64, which: u32) -> f64 {
     let mixed =
         (seed.wrapping_add(1)).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(17 * which + 5);
     (mixed.wrapping_mul(0xd6e8_feb8_6659_fd93) >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// An angle that belongs to the seed, in radians.
+/// A random angle for a seed and an index, in radians.
 pub fn drawn_angle(seed: u64, which: u32) -> f64 {
     TAU * drawn(seed, which)
 }
@@ -204,7 +203,7 @@ mod tests {
     use node::Layers;
 
     #[test]
-    fn every_fault_has_a_name_of_its_own_and_changes_what_there_is() {
+    fn every_fault_has_a_unique_name_and_valid_settings() {
         for fault in Fault::all() {
             assert_eq!(fault.name().parse(), Ok(fault));
             let Change { simulator, controller, .. } = fault.change(3);

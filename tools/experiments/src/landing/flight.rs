@@ -1,5 +1,5 @@
-//! One flight in lock-step: the world's autopilot and the controller exchange MAVLink packets, the eyes' detections arrive
-//! when they are due, and nothing waits for a clock.
+//! One flight in lock-step: the simulated autopilot and the controller exchange MAVLink packets, detections arrive after
+//! their latency, and nothing waits for a clock.
 
 use std::collections::VecDeque;
 
@@ -17,31 +17,31 @@ use super::eyes::{Arrival, DETECTOR, Eyes};
 use super::outcome::{Ending, Outcome};
 use super::plan::Planned;
 
-/// The controller's own pace: a tick in so many steps of the world, 25 ms.
+/// Steps of the world per tick of the controller: 25 ms.
 const TICK_STEPS: u64 = 10;
-/// A landing that has not begun by then never will, in seconds.
-const MOST_WAIT_S: f64 = 30.0;
-/// The end of patience, in seconds from the start of the landing: a little more than the controller's own.
-const MOST_S: f64 = 320.0;
-/// How long it is watched after the controller's end, in seconds.
+/// Timeout for the start of the landing, in seconds.
+const START_TIMEOUT_S: f64 = 30.0;
+/// Timeout for the landing, in seconds: a little more than the controller's.
+const LANDING_TIMEOUT_S: f64 = 320.0;
+/// Time recorded after the controller has finished, in seconds.
 const AFTER_S: f64 = 0.5;
-/// How long it is watched after the motors stood still: the autopilot tells of it once a second.
+/// Time recorded after disarming, in seconds: the autopilot reports it once per second.
 const AFTER_DISARM_S: f64 = 3.0;
-/// The controller's clock at the world's time 0, in nanoseconds.
+/// The controller's clock at time 0 of the world, in nanoseconds.
 const START_NS: i64 = 1_000_000_000;
-/// Detections on their way at most.
-const MOST_ON_THE_WAY: usize = 256;
+/// Maximum number of detections in transit.
+const MAX_IN_TRANSIT: usize = 256;
 
-/// What happened at one time, for the figures.
+/// A sample of the flight, for the figures.
 #[derive(Clone, Debug)]
 pub struct Sample {
     /// Since the start of the landing, in seconds.
     pub time_s: f64,
-    /// Where the vehicle is, in metres.
+    /// Position of the vehicle, in metres.
     pub position: Point<Ned>,
-    /// Where the pad is, in metres.
+    /// Position of the pad, in metres.
     pub pad: Point<Ned>,
-    /// The velocity asked for, in m/s, while one is.
+    /// The velocity setpoint, if any, in m/s.
     pub command: Option<[f64; 3]>,
     /// The air's velocity, in m/s.
     pub wind: Vector<Ned>,
@@ -49,10 +49,10 @@ pub struct Sample {
     pub phase: Phase,
 }
 
-/// Flies it, and notes its samples 40 times a second if asked to.
+/// Flies it, with an optional trace at 40 Hz.
 ///
 /// # Errors
-/// When a setting is wrong or a frame cannot be rendered.
+/// When a setting is invalid or a frame cannot be rendered.
 pub fn fly(planned: &Planned, trace: Option<&mut Vec<Sample>>) -> anyhow::Result<Outcome> {
     let mut rehearsal = Rehearsal::new(planned)
         .with_context(|| format!("seed {} of {}", planned.seed, planned.cell))?;
@@ -68,7 +68,7 @@ struct Rehearsal {
     to_world: Parser,
     frame_period_s: f64,
     sequence: u64,
-    on_the_way: VecDeque<Arrival>,
+    in_transit: VecDeque<Arrival>,
     start_s: Option<f64>,
     was_in_retry: bool,
     outcome: Outcome,
@@ -79,10 +79,10 @@ impl Rehearsal {
         let layers = |set: &[String]| Layers { file: None, set: set.to_vec() };
         let simulated: simulator::Config =
             layers(&planned.change.simulator).load::<simulator::Config>()?.settings;
-        let told = layers(&planned.change.controller).load::<controller::Config>()?.settings;
+        let controlled = layers(&planned.change.controller).load::<controller::Config>()?.settings;
         let world = World::new(&simulated.world(), simulated.seed);
         let eyes = Eyes::new(&simulated, planned.vision, planned.change.vision)?;
-        let mut controller = Flight::new(told, std::sync::Arc::default())?;
+        let mut controller = Flight::new(controlled, std::sync::Arc::default())?;
         let frame_period_s = 1.0 / simulated.camera.rate_hz;
         controller.presence(stamp_ns(world.now_s()), DETECTOR, true);
         controller.camera(eyes.info().clone());
@@ -94,10 +94,10 @@ impl Rehearsal {
             from_world: Parser::new(),
             to_world: Parser::new(),
             frame_period_s,
-            on_the_way: VecDeque::new(),
+            in_transit: VecDeque::new(),
             start_s: None,
             was_in_retry: false,
-            outcome: Outcome::of(planned),
+            outcome: Outcome::new(planned),
         })
     }
 
@@ -110,28 +110,29 @@ impl Rehearsal {
             let now_s = opened_s + (steps + 1) as f64 * STEP_S;
             steps += 1;
             self.world.advance_to(now_s);
-            self.watch(&before);
-            self.hear();
-            self.see()?;
+            self.record_touchdown(&before);
+            self.pass_to_controller();
+            self.update_vision()?;
             if steps.is_multiple_of(TICK_STEPS) {
                 self.controller.tick(stamp_ns(self.world.now_s()));
-                self.note(trace.as_deref_mut());
+                self.record_status(trace.as_deref_mut());
                 if over_s.is_none() && self.is_over() {
                     over_s = Some(now_s);
                 }
             }
-            self.obey();
+            self.pass_to_autopilot();
             let waited_s = now_s - self.start_s.unwrap_or(opened_s);
-            let patience_s = if self.start_s.is_some() { MOST_S } else { MOST_WAIT_S };
-            if over_s.is_some_and(|at_s| now_s - at_s > AFTER_S) || waited_s > patience_s {
+            let timeout_s =
+                if self.start_s.is_some() { LANDING_TIMEOUT_S } else { START_TIMEOUT_S };
+            if over_s.is_some_and(|at_s| now_s - at_s > AFTER_S) || waited_s > timeout_s {
                 self.finish();
                 return Ok(());
             }
         }
     }
 
-    /// The autopilot's packets reach the controller.
-    fn hear(&mut self) {
+    /// Passes the autopilot's packets to the controller.
+    fn pass_to_controller(&mut self) {
         let now_ns = stamp_ns(self.world.now_s());
         let packets: Vec<Vec<u8>> = self.world.outgoing().collect();
         for frame in packets.iter().flat_map(|packet| self.from_world.push(packet)) {
@@ -139,8 +140,8 @@ impl Rehearsal {
         }
     }
 
-    /// Frames are taken when their exposure is past, and what was found in them arrives when it is due.
-    fn see(&mut self) -> anyhow::Result<()> {
+    /// Takes frames after their exposure, and delivers detections after their latency.
+    fn update_vision(&mut self) -> anyhow::Result<()> {
         let now_s = self.world.now_s();
         let time_s = self.sequence as f64 * self.frame_period_s;
         if now_s >= time_s + 0.5 * self.eyes.exposure_s() + STEP_S {
@@ -148,22 +149,22 @@ impl Rehearsal {
             self.sequence += 1;
             self.outcome.frames += u64::from(!arrivals.is_empty());
             for arrival in arrivals {
-                if self.on_the_way.len() < MOST_ON_THE_WAY {
-                    let place = self.on_the_way.partition_point(|other| other.at_s <= arrival.at_s);
-                    self.on_the_way.insert(place, arrival);
+                if self.in_transit.len() < MAX_IN_TRANSIT {
+                    let place = self.in_transit.partition_point(|other| other.at_s <= arrival.at_s);
+                    self.in_transit.insert(place, arrival);
                 }
             }
         }
-        while self.on_the_way.front().is_some_and(|arrival| arrival.at_s <= now_s) {
-            if let Some(arrival) = self.on_the_way.pop_front() {
+        while self.in_transit.front().is_some_and(|arrival| arrival.at_s <= now_s) {
+            if let Some(arrival) = self.in_transit.pop_front() {
                 self.controller.detections(stamp_ns(now_s), DETECTOR, &arrival.message);
             }
         }
         Ok(())
     }
 
-    /// The controller's packets reach the autopilot.
-    fn obey(&mut self) {
+    /// Passes the controller's packets to the autopilot.
+    fn pass_to_autopilot(&mut self) {
         while let Some(packet) = self.controller.poll_outgoing() {
             for frame in self.to_world.push(&packet) {
                 self.world.handle(&frame);
@@ -171,7 +172,7 @@ impl Rehearsal {
         }
     }
 
-    fn watch(&mut self, before: &VehicleTruth) {
+    fn record_touchdown(&mut self, before: &VehicleTruth) {
         let now = self.world.truth();
         let Some(start_s) = self.start_s else { return };
         if !now.on_ground {
@@ -200,7 +201,7 @@ impl Rehearsal {
         }
     }
 
-    fn note(&mut self, trace: Option<&mut Vec<Sample>>) {
+    fn record_status(&mut self, trace: Option<&mut Vec<Sample>>) {
         let now_s = self.world.now_s();
         let status = self.controller.status(stamp_ns(now_s));
         if status.started_ns.is_some() && self.start_s.is_none() {

@@ -1,9 +1,9 @@
-//! Landings by the hundred: the world of the simulator and the controller as it flies, in lock-step in one process, without
-//! network and clock, so that a seed gives the same flight to the bit.
+//! Hundreds of landings: the simulator's world and the controller in lock-step in one process, without a network or a
+//! clock, so that a seed reproduces a flight to the bit.
 //!
-//! Modules in reading order: [`plan`] says which flights there are, with the faults of [`fault`]; [`flight`] flies one,
-//! [`eyes`] seeing rendered frames or modelling what would be seen; [`outcome`] is what came of it; [`table`] what many have
-//! in common; [`plots`] and [`thesis_figures`] draw; [`report`] writes it all down.
+//! Modules in reading order: [`plan`] has the flights, with the faults of [`fault`]; [`flight`] flies one, with the vision
+//! of [`eyes`], rendered or modelled; [`outcome`] is its result; [`table`] summarises many; [`plots`] and
+//! [`thesis_figures`] draw; [`report`] writes the report.
 
 pub mod eyes;
 pub mod fault;
@@ -15,7 +15,6 @@ pub mod report;
 pub mod table;
 pub mod thesis_figures;
 
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -23,24 +22,13 @@ use anyhow::Context;
 
 use flight::fly;
 use outcome::Outcome;
-use plan::{Plan, Planned};
+use plan::{Planned, Request};
 
-/// What to do.
-#[derive(Clone, Debug)]
-pub struct Request {
-    /// Which flights.
-    pub plan: Plan,
-    /// The folder for results.
-    pub results_in: PathBuf,
-    /// How many flights at once.
-    pub jobs: usize,
-}
-
-/// Flies all, writes results, plots and the report, and returns the report. `progress` hears how many have been flown, of
-/// how many.
+/// Flies all, writes results, plots and the report, and returns the report. `progress` gets the number of finished
+/// flights and of all.
 ///
 /// # Errors
-/// When a setting is wrong or a file cannot be written.
+/// When a setting is invalid or a file cannot be written.
 pub fn run(request: &Request, progress: &(dyn Fn(usize, usize) + Sync)) -> anyhow::Result<String> {
     let flights = request.plan.flights();
     let done = AtomicUsize::new(0);
@@ -57,7 +45,7 @@ pub fn run(request: &Request, progress: &(dyn Fn(usize, usize) + Sync)) -> anyho
 /// Flies on several threads; the outcomes are in the order of the flights.
 ///
 /// # Errors
-/// The first problem.
+/// The first error.
 pub fn in_parallel(
     flights: &[Planned],
     jobs: usize,

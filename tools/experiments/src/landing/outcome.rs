@@ -1,20 +1,20 @@
-//! What came of a flight.
+//! The result of a flight.
 
 use serde::Serialize;
 
 use super::plan::Planned;
 
-/// Declared limits of a touchdown: error and speeds in metres and m/s, tilt in degrees.
+/// Specified limit of the touchdown error, in metres.
 pub const FAR_M: f64 = 0.3;
-/// See [`FAR_M`].
+/// Specified limit of the vertical speed at touchdown, in m/s.
 pub const HARD_M_S: f64 = 0.6;
-/// See [`FAR_M`].
+/// Specified limit of the horizontal speed at touchdown, in m/s.
 pub const SLIDING_M_S: f64 = 0.1;
-/// See [`FAR_M`].
+/// Specified limit of the tilt at touchdown, in degrees.
 pub const TILTED_DEG: f64 = 10.0;
-/// Beyond these the vehicle itself is in danger: it bounces or tips over.
+/// Vertical speed at touchdown above which the vehicle may bounce, in m/s.
 pub const CRASH_SINK_M_S: f64 = 0.8;
-/// See [`CRASH_SINK_M_S`].
+/// Horizontal speed at touchdown above which the vehicle may tip over, in m/s.
 pub const CRASH_SLIDE_M_S: f64 = 0.5;
 
 /// How it ended.
@@ -23,20 +23,20 @@ pub const CRASH_SLIDE_M_S: f64 = 0.5;
 pub enum Ending {
     /// On the ground, disarmed.
     Landed,
-    /// Given up before the ground.
+    /// Aborted in the air.
     Aborted,
-    /// Neither, when patience ended.
+    /// Neither before the timeout.
     Unfinished,
 }
 
 /// The row of one flight. Times are in seconds from the start of the landing.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Outcome {
-    /// What it has in common with others.
+    /// The name of its cell.
     pub cell: String,
     /// Its seed.
     pub seed: u64,
-    /// How the marker was seen.
+    /// The vision.
     pub vision: &'static str,
     /// The fault.
     pub fault: &'static str,
@@ -58,35 +58,35 @@ pub struct Outcome {
     pub why: String,
     /// Horizontal distance from the pad at the touch, in metres.
     pub error_m: Option<f64>,
-    /// Its part northwards.
+    /// Its north component.
     pub error_north_m: Option<f64>,
-    /// Its part eastwards.
+    /// Its east component.
     pub error_east_m: Option<f64>,
-    /// Downward speed at the touch, relative to the pad, in m/s.
+    /// Downward speed at touchdown, relative to the pad, in m/s.
     pub sink_m_s: Option<f64>,
-    /// Horizontal speed at the touch, relative to the pad, in m/s.
+    /// Horizontal speed at touchdown, relative to the pad, in m/s.
     pub slide_m_s: Option<f64>,
-    /// Tilt at the touch, in degrees.
+    /// Tilt at touchdown, in degrees.
     pub touch_tilt_deg: Option<f64>,
-    /// Largest tilt of the landing, in degrees.
+    /// Maximum tilt during the landing, in degrees.
     pub max_tilt_deg: f64,
-    /// Until LAND was flown.
+    /// Time until LAND.
     pub land_s: Option<f64>,
-    /// Until the touch.
+    /// Time until touchdown.
     pub touchdown_s: Option<f64>,
-    /// Until the motors stood still.
+    /// Time until disarmed.
     pub disarm_s: Option<f64>,
-    /// Frames that were taken.
+    /// Number of frames.
     pub frames: u64,
-    /// Detections that were used.
+    /// Number of detections used.
     pub detections: u64,
-    /// How often it climbed to try again.
+    /// Number of retries.
     pub retries: u32,
 }
 
 impl Outcome {
-    /// A flight that has not begun.
-    pub fn of(planned: &Planned) -> Self {
+    /// The outcome before the flight.
+    pub fn new(planned: &Planned) -> Self {
         Self {
             cell: planned.cell.clone(),
             seed: planned.seed,
@@ -116,13 +116,12 @@ impl Outcome {
         }
     }
 
-    /// Landed within this distance of the pad's middle.
+    /// Whether it landed within this distance of the pad's centre.
     pub fn is_within(&self, metres: f64) -> bool {
         self.ending == Ending::Landed && self.error_m.is_some_and(|error| error <= metres)
     }
 
-    /// Touched the ground, without having given up, far from the pad, so hard or so fast sideways that the vehicle is in
-    /// danger.
+    /// Whether it touched down, without an abort, far from the pad or dangerously fast.
     pub fn is_unsafe(&self) -> bool {
         let beyond = |value: Option<f64>, limit: f64| value.is_some_and(|value| value > limit);
         self.ending != Ending::Aborted
@@ -131,7 +130,7 @@ impl Outcome {
                 || beyond(self.slide_m_s, CRASH_SLIDE_M_S))
     }
 
-    /// Something to look at: unsafe, far, unfinished or given up.
+    /// Whether it is unsafe, inaccurate, unfinished or aborted.
     pub fn is_failure(&self) -> bool {
         self.is_unsafe() || !self.is_within(0.1)
     }

@@ -1,15 +1,16 @@
-//! Which flights there are: every combination of what is listed, so many seeds of each.
+//! The flights: every combination of the listed values, with several seeds each.
 
+use std::path::PathBuf;
 use std::str::FromStr;
 
 use super::fault::{Change, Fault, START_ANGLE, drawn, drawn_angle};
 
-/// How the marker is seen.
+/// The vision of a flight.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Vision {
-    /// Frames are rendered and searched by the detector.
+    /// Rendered frames with the real detector.
     Rendered,
-    /// What the detector would find is drawn from a model of its errors.
+    /// A model of the detector's errors.
     Modelled,
 }
 
@@ -23,12 +24,12 @@ impl Vision {
     }
 }
 
-/// Values of one axis of the grid: a list `1,2,3`, or a range `0..8` from which each flight's seed draws one.
+/// Values of one axis of the grid: a list `1,2,3`, or a range `0..8` with a random value for each seed.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Values {
-    /// Each of them.
+    /// Each of these.
     List(Vec<f64>),
-    /// One from this to that.
+    /// A random value of this range.
     Range(f64, f64),
 }
 
@@ -44,7 +45,7 @@ impl Values {
     fn of(&self, seed: u64, which: u32) -> f64 {
         match self {
             Self::List(values) => values.first().copied().unwrap_or_default(),
-            Self::Range(least, most) => least + (most - least) * drawn(seed, which),
+            Self::Range(min, max) => min + (max - min) * drawn(seed, which),
         }
     }
 }
@@ -56,7 +57,7 @@ impl std::fmt::Display for Values {
                 let texts: Vec<String> = values.iter().map(f64::to_string).collect();
                 write!(f, "{}", texts.join(","))
             }
-            Self::Range(least, most) => write!(f, "{least}..{most}"),
+            Self::Range(min, max) => write!(f, "{min}..{max}"),
         }
     }
 }
@@ -67,23 +68,23 @@ impl FromStr for Values {
     fn from_str(text: &str) -> Result<Self, String> {
         let number = |part: &str| {
             let number: Option<f64> = part.trim().parse().ok();
-            number.filter(|n| n.is_finite() && *n >= 0.0).ok_or_else(|| {
-                format!("`{part}` is not a number from 0 on; write 5, or 0,5,8, or 0..8")
-            })
+            number
+                .filter(|n| n.is_finite() && *n >= 0.0)
+                .ok_or_else(|| format!("`{part}` is not a number >= 0; write 5, or 0,5,8, or 0..8"))
         };
         match text.split_once("..") {
-            Some((least, most)) => Ok(Self::Range(number(least)?, number(most)?)),
+            Some((min, max)) => Ok(Self::Range(number(min)?, number(max)?)),
             None => Ok(Self::List(text.split(',').map(number).collect::<Result<_, _>>()?)),
         }
     }
 }
 
-/// What is flown.
+/// A grid of flights.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// How the marker is seen.
+    /// The vision of a flight.
     pub vision: Vision,
-    /// Flights of each combination.
+    /// Number of flights of each combination.
     pub flights: u64,
     /// Seed of the first flight of each combination; the others follow.
     pub seed: u64,
@@ -91,7 +92,7 @@ pub struct Plan {
     pub wind: Values,
     /// Strength of the turbulence.
     pub turbulence: Values,
-    /// From exposure to arrival, in milliseconds.
+    /// Latency from exposure to arrival, in milliseconds.
     pub latency: Values,
     /// Height over the pad at the start, in metres.
     pub height: Values,
@@ -120,30 +121,41 @@ impl Default for Plan {
     }
 }
 
+/// What to run.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// The flights.
+    pub plan: Plan,
+    /// Folder of the results.
+    pub results_in: PathBuf,
+    /// Number of flights in parallel.
+    pub jobs: usize,
+}
+
 /// One flight of a plan.
 #[derive(Clone, Debug)]
 pub struct Planned {
-    /// What it has in common with the others of its cell.
+    /// The name of its cell.
     pub cell: String,
-    /// The options of the command that repeats it.
+    /// The options of its command.
     pub options: String,
-    /// How the marker is seen.
+    /// The vision of a flight.
     pub vision: Vision,
     /// Its seed.
     pub seed: u64,
-    /// In m/s.
+    /// Mean wind, in m/s.
     pub wind_m_s: f64,
-    /// Strength.
+    /// Strength of the turbulence.
     pub turbulence: f64,
-    /// In milliseconds.
+    /// Latency, in milliseconds.
     pub latency_ms: f64,
-    /// In metres.
+    /// Height at the start, in metres.
     pub height_m: f64,
-    /// In metres.
+    /// Horizontal distance at the start, in metres.
     pub offset_m: f64,
     /// The fault.
     pub fault: Fault,
-    /// Settings of all of it, and what the modelled detector does wrong.
+    /// All settings, and the faults of the modelled detector.
     pub change: Change,
 }
 
@@ -209,7 +221,7 @@ impl Plan {
         planned
     }
 
-    /// The settings of a flight: its place and wind, then what the fault changes, then what was asked for.
+    /// The settings of a flight: start and wind, then the fault, then the further settings.
     fn change(&self, planned: &Planned) -> Change {
         let seed = planned.seed;
         let fault = planned.fault.change(seed);
@@ -244,7 +256,7 @@ impl Plan {
 }
 
 impl Planned {
-    /// The command that flies it again and draws it.
+    /// The command that repeats and draws it.
     pub fn command(&self) -> String {
         format!(
             "alight experiment landing -o DIR {} --flights 1 --seed {}",
@@ -258,7 +270,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lists_and_ranges_are_read() {
+    fn lists_and_ranges_are_parsed() {
         assert_eq!("0,5".parse(), Ok(Values::List(vec![0.0, 5.0])));
         assert_eq!("0..8".parse(), Ok(Values::Range(0.0, 8.0)));
         for wrong in ["", "a", "1,", "0..", "-1"] {

@@ -1,13 +1,14 @@
 //! Plots of many flights, as SVG.
 
 use anyhow::anyhow;
+use node::stats::quantile;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
 use super::outcome::{Ending, FAR_M, Outcome};
-use super::table::{Column, cells, median_interval, numbers, quantile, share_interval};
+use super::table::{Column, cells, median_interval, numbers, share_interval};
 
-/// The colours of curves, one after the other.
+/// The colours of curves.
 pub const COLOURS: [RGBColor; 6] = [
     RGBColor(31, 119, 180),
     RGBColor(214, 39, 40),
@@ -18,9 +19,9 @@ pub const COLOURS: [RGBColor; 6] = [
 ];
 const GREY: RGBColor = RGBColor(150, 150, 150);
 
-/// A picture that cannot be drawn.
+/// Why a plot cannot be drawn.
 pub type DrawError = Box<dyn std::error::Error>;
-/// A chart with numbers on both axes.
+/// A chart with numeric axes.
 pub type Chart<'a, 'b> =
     ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
@@ -34,19 +35,19 @@ pub fn all(outcomes: &[Outcome]) -> anyhow::Result<Vec<(&'static str, String)>> 
     Ok(vec![
         (
             "error-against-wind.svg",
-            picture((900, 560), |area| {
-                against_wind(area, outcomes, error, ("Touchdown error", "error, cm"))
+            picture([900, 560], |area| {
+                against_wind(area, outcomes, error, "Touchdown error", "error, cm")
             })?,
         ),
         (
             "time-against-wind.svg",
-            picture((900, 560), |area| {
-                against_wind(area, outcomes, time, ("Time to disarm", "time, s"))
+            picture([900, 560], |area| {
+                against_wind(area, outcomes, time, "Time to disarm", "time, s")
             })?,
         ),
-        ("touchdowns.svg", picture((700, 720), |area| touchdowns(area, outcomes))?),
+        ("touchdowns.svg", picture([700, 720], |area| touchdowns(area, outcomes))?),
         ("success.svg", picture(success_size(outcomes), |area| success(area, outcomes))?),
-        ("worst.svg", picture((900, 560), |area| worst(area, outcomes))?),
+        ("worst.svg", picture([900, 560], |area| worst(area, outcomes))?),
     ])
 }
 
@@ -55,12 +56,12 @@ pub fn all(outcomes: &[Outcome]) -> anyhow::Result<Vec<(&'static str, String)>> 
 /// # Errors
 /// When it cannot be drawn.
 pub fn picture(
-    size: (u32, u32),
+    size: [u32; 2],
     draw: impl FnOnce(&DrawingArea<SVGBackend<'_>, plotters::coord::Shift>) -> Result<(), DrawError>,
 ) -> anyhow::Result<String> {
     let mut svg = String::new();
     {
-        let area = SVGBackend::with_string(&mut svg, size).into_drawing_area();
+        let area = SVGBackend::with_string(&mut svg, size.into()).into_drawing_area();
         area.fill(&WHITE).map_err(|problem| anyhow!("{problem}"))?;
         draw(&area).map_err(|problem| anyhow!("{problem}"))?;
         area.present().map_err(|problem| anyhow!("{problem}"))?;
@@ -70,16 +71,17 @@ pub fn picture(
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
 
-/// Every flight as a dot; for each metre per second of wind the median with its 95 % interval, and the 99th percentile.
+/// Every flight as a dot; for each 1 m/s of wind the median with its 95 % interval, and the 99th percentile.
 fn against_wind(
     area: &Area<'_>,
     outcomes: &[Outcome],
     of: Column,
-    (title, axis): (&str, &str),
+    title: &str,
+    axis: &str,
 ) -> Result<(), DrawError> {
     let landed: Vec<&Outcome> = outcomes.iter().filter(|o| o.ending == Ending::Landed).collect();
     let fastest = outcomes.iter().map(|o| o.wind_m_s).fold(1.0, f64::max);
-    let most = 1.15 * numbers(&landed, of).into_iter().fold(0.1, f64::max);
+    let max = 1.15 * numbers(&landed, of).into_iter().fold(0.1, f64::max);
     let mut chart = ChartBuilder::on(area)
         .caption(
             format!("{title} against mean wind, {} flights", outcomes.len()),
@@ -88,7 +90,7 @@ fn against_wind(
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(56)
-        .build_cartesian_2d(-0.4..fastest + 0.6, 0.0..most)?;
+        .build_cartesian_2d(-0.4..fastest + 0.6, 0.0..max)?;
     chart.configure_mesh().x_desc("mean wind, m/s").y_desc(axis).draw()?;
     let dots = landed.iter().filter_map(|o| Some((o.wind_m_s, of(o)?)));
     chart.draw_series(dots.map(|at| Circle::new(at, 2, GREY.mix(0.5).filled())))?;
@@ -132,7 +134,7 @@ fn error_bar(
     Ok(())
 }
 
-/// The box with the names of the curves.
+/// Draws the legend.
 ///
 /// # Errors
 /// When it cannot be drawn.
@@ -149,7 +151,7 @@ pub fn legend<'a, 'b: 'a>(
     Ok(())
 }
 
-/// Where the vehicles touched, seen from above.
+/// The touchdown points, seen from above.
 fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     let places: Vec<(f64, f64, bool)> = outcomes
         .iter()
@@ -158,7 +160,7 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     let far = places.iter().map(|p| p.0.abs().max(p.1.abs())).fold(0.11, f64::max);
     let reach = if far > FAR_M { 1.1 * far } else { far.max(0.12) * 1.1 };
     let mut chart = ChartBuilder::on(area)
-        .caption("Touchdowns about the pad's middle", ("sans-serif", 20))
+        .caption("Touchdowns relative to the pad's centre", ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(56)
@@ -185,20 +187,20 @@ fn touchdowns(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     legend(&mut chart, SeriesLabelPosition::UpperRight)
 }
 
-fn success_size(outcomes: &[Outcome]) -> (u32, u32) {
-    (1250, 110 + 30 * cells(outcomes).len() as u32)
+fn success_size(outcomes: &[Outcome]) -> [u32; 2] {
+    [1250, 110 + 30 * cells(outcomes).len() as u32]
 }
 
-/// The share within a decimetre, with its interval, for each cell.
+/// The proportion within 0.1 m, with its interval, for each cell.
 fn success(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     let cells = cells(outcomes);
     let count = cells.len() as f64;
     let mut chart = ChartBuilder::on(area)
-        .caption("Share that landed within 0.1 m, with its 95 % interval", ("sans-serif", 20))
+        .caption("Proportion that landed within 0.1 m, with its 95 % interval", ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(40)
         .build_cartesian_2d(0.0..200.0, 0.0..count)?;
-    // Right of 100 % there is room for what the lines are of.
+    // The names of the cells are right of 100 %.
     let percent =
         |share: &f64| if *share > 100.5 { String::new() } else { format!("{share:.0} %") };
     chart
@@ -229,20 +231,20 @@ fn success(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     Ok(())
 }
 
-/// All errors in order: how bad the worst are.
+/// The complementary cumulative distribution of the error.
 fn worst(area: &Area<'_>, outcomes: &[Outcome]) -> Result<(), DrawError> {
     let landed: Vec<&Outcome> = outcomes.iter().filter(|o| o.ending == Ending::Landed).collect();
     let mut errors = numbers(&landed, |o| o.error_m.map(|error| 100.0 * error));
     errors.sort_by(f64::total_cmp);
-    let most = errors.last().copied().unwrap_or(1.0).max(1.0) * 1.1;
+    let max = errors.last().copied().unwrap_or(1.0).max(1.0) * 1.1;
     let count = errors.len().max(1) as f64;
     let mut chart = ChartBuilder::on(area)
-        .caption("The part of the landings that is farther off than so much", ("sans-serif", 20))
+        .caption("Proportion of the landings with a larger error", ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(64)
-        .build_cartesian_2d(0.0..most, (0.5 / count)..1.0)?;
-    drop(chart.configure_mesh().x_desc("touchdown error, cm").y_desc("part").draw());
+        .build_cartesian_2d(0.0..max, (0.5 / count)..1.0)?;
+    drop(chart.configure_mesh().x_desc("touchdown error, cm").y_desc("proportion").draw());
     let curve = errors.iter().enumerate().map(|(i, error)| (*error, 1.0 - i as f64 / count));
     chart.draw_series(LineSeries::new(curve, COLOURS[0].stroke_width(2)))?;
     Ok(())

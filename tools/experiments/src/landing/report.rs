@@ -1,4 +1,4 @@
-//! Results as files: every flight as CSV and JSON lines, the plots, the thesis' figures for one flight, and the report.
+//! The files of results: every flight as CSV and JSON lines, plots, the thesis' figures of one flight, and the report.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -6,17 +6,16 @@ use std::path::Path;
 use anyhow::Context;
 use serde_json::Value;
 
-use super::Request;
 use super::flight::fly;
 use super::outcome::{Ending, Outcome};
-use super::plan::Planned;
+use super::plan::{Planned, Request};
 use super::table::{markdown, share_interval};
 use super::{plots, thesis_figures};
 
-/// Failures that the report lists; all are in the CSV.
-const MOST_LISTED: usize = 50;
+/// Maximum number of failures in the report; the CSV has all.
+const MAX_LISTED: usize = 50;
 
-/// Writes everything and returns the report.
+/// Writes all files and returns the report.
 ///
 /// # Errors
 /// When a file cannot be written.
@@ -69,7 +68,7 @@ fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
         return "\nEvery flight landed within 0.1 m.\n".to_owned();
     }
     let mut text = format!("\n## Farther off than 0.1 m, or not landed: {}\n\n", failed.len());
-    for (planned, outcome) in failed.iter().take(MOST_LISTED) {
+    for (planned, outcome) in failed.iter().take(MAX_LISTED) {
         let error = outcome.error_m.map_or("no touch".to_owned(), |error| format!("{error:.3} m"));
         let ending = match outcome.ending {
             Ending::Landed => "landed",
@@ -82,7 +81,7 @@ fn failures(flights: &[Planned], outcomes: &[Outcome]) -> String {
     text
 }
 
-/// The flight with the largest error again, with the thesis' figures.
+/// Repeats the flight with the largest error and draws the thesis' figures.
 fn one_flight(folder: &Path, flights: &[Planned], outcomes: &[Outcome]) -> anyhow::Result<String> {
     let error = |outcome: &Outcome| outcome.error_m.unwrap_or(-1.0);
     let pairs = flights.iter().zip(outcomes);
@@ -111,7 +110,7 @@ fn json_lines(outcomes: &[Outcome]) -> anyhow::Result<String> {
     Ok(text)
 }
 
-/// The same as comma-separated values, columns in the order of their names.
+/// The flights as comma-separated values, with columns sorted by name.
 fn csv(outcomes: &[Outcome]) -> anyhow::Result<String> {
     let mut text = String::new();
     for (index, outcome) in outcomes.iter().enumerate() {
@@ -139,7 +138,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cells_of_text_are_quoted_and_missing_numbers_empty() {
+    fn texts_are_quoted_and_missing_numbers_empty() {
         assert_eq!(cell(&Value::String("a \"b\", c".into())), "\"a \"\"b\"\", c\"");
         assert_eq!(cell(&Value::Null), "");
         assert_eq!(cell(&serde_json::json!(0.5)), "0.5");

@@ -1,25 +1,19 @@
-//! What many flights have in common, as rows of tables.
+//! Summaries of many flights, as tables.
+
+use node::stats::quantile;
 
 use super::outcome::{Ending, HARD_M_S, Outcome, SLIDING_M_S, TILTED_DEG};
 
-/// A column of numbers; those that are missing are left out.
+/// A column of numbers, without missing ones.
 pub type Column = fn(&Outcome) -> Option<f64>;
 
-/// The value below which the part `part` of the numbers lies; `None` of none.
-pub fn quantile(numbers: &[f64], part: f64) -> Option<f64> {
-    let mut sorted = numbers.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let last = sorted.len().checked_sub(1)?;
-    sorted.get(((last as f64 * part).round() as usize).min(last)).copied()
-}
-
-/// The numbers of those that landed.
+/// The numbers of the flights that landed.
 pub fn numbers(outcomes: &[&Outcome], of: Column) -> Vec<f64> {
     let landed = outcomes.iter().filter(|outcome| outcome.ending == Ending::Landed);
     landed.filter_map(|outcome| of(outcome)).collect()
 }
 
-/// 95 % confidence interval of the median, by its order statistics (the binomial distribution, approximated).
+/// 95 % confidence interval of the median from order statistics (normal approximation of the binomial distribution).
 pub fn median_interval(numbers: &[f64]) -> Option<[f64; 2]> {
     let count = numbers.len() as f64;
     let reach = 0.98 * count.sqrt();
@@ -27,7 +21,7 @@ pub fn median_interval(numbers: &[f64]) -> Option<[f64; 2]> {
     Some([at((0.5 * count - reach - 0.5).floor())?, at((0.5 * count + reach - 0.5).ceil())?])
 }
 
-/// 95 % confidence interval of a share, after Wilson (1927).
+/// 95 % confidence interval of a proportion (Wilson, 1927).
 pub fn share_interval(hits: usize, of: usize) -> [f64; 2] {
     let (z, n) = (1.96_f64, (of as f64).max(1.0));
     let share = hits as f64 / n;
@@ -36,7 +30,7 @@ pub fn share_interval(hits: usize, of: usize) -> [f64; 2] {
     [(middle - reach).max(0.0), (middle + reach).min(1.0)]
 }
 
-/// The cells in their order, with their flights.
+/// The cells with their flights, in order.
 pub fn cells(outcomes: &[Outcome]) -> Vec<(&str, Vec<&Outcome>)> {
     let mut cells: Vec<(&str, Vec<&Outcome>)> = Vec::new();
     for outcome in outcomes {
@@ -50,7 +44,7 @@ pub fn cells(outcomes: &[Outcome]) -> Vec<(&str, Vec<&Outcome>)> {
 
 const HEADER: &str = "| circumstances | flights | landed | given up | within 0.1 m | error: median, 99 %, worst, m | to disarm: median, worst, s | sink worst, m/s | slide median, worst, m/s | tilt at touch worst, deg | beyond 0.6 m/s down, 0.1 m/s aside, 10 deg | unsafe |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n";
 
-/// All cells as a table in Markdown.
+/// The table of all cells in Markdown.
 pub fn markdown(outcomes: &[Outcome]) -> String {
     let rows = cells(outcomes).into_iter().map(|(name, members)| row(name, &members));
     rows.fold(HEADER.to_owned(), |text, row| text + &row)
@@ -97,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn intervals_hold_what_they_are_of_and_shrink_with_the_count() {
+    fn intervals_contain_the_estimate_and_shrink_with_the_count() {
         let numbers: Vec<f64> = (0..101).map(f64::from).collect();
         let [low, high] = median_interval(&numbers).unwrap();
         assert!((38.0..=42.0).contains(&low) && (58.0..=62.0).contains(&high), "{low} {high}");

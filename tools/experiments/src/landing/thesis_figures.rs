@@ -1,4 +1,4 @@
-//! The thesis' Figures 4.10 to 4.16 for one flight: its way, position and command along each axis, and wind and command.
+//! The thesis' Figures 4.10 to 4.16 for one flight: trajectory, position and command per axis, wind and command per axis.
 
 use std::ops::Range;
 
@@ -7,7 +7,7 @@ use plotters::prelude::*;
 use super::flight::Sample;
 use super::plots::{COLOURS, Chart, DrawError, legend, picture};
 
-/// The axes, as the thesis names them, in its order of figures.
+/// The axes with their names in the thesis, in the order of its figures.
 const AXES: [&str; 3] = ["x (north)", "y (east)", "z (down)"];
 
 /// The figures: file names and contents. `title` names the flight.
@@ -50,32 +50,32 @@ fn component(vector: [f64; 3], axis: usize) -> f64 {
     vector.get(axis).copied().unwrap_or_default()
 }
 
-/// What is left free above the curves for the legend, as a part of their height.
-const LEGEND_PART: f64 = 0.32;
+/// Height of the legend above the curves, relative to theirs.
+const LEGEND_RATIO: f64 = 0.32;
 
 fn with_legend(range: Range<f64>) -> Range<f64> {
     let height = range.end - range.start;
-    range.start..range.end + 0.5 * LEGEND_PART * height
+    range.start..range.end + 0.5 * LEGEND_RATIO * height
 }
 
 /// Curves over time.
 fn curves(caption: &str, samples: &[Sample], curves: &[Curve<'_>]) -> anyhow::Result<String> {
     let values = || curves.iter().flat_map(|curve| samples.iter().filter_map(curve.of));
-    let least = values().fold(-0.1, f64::min);
-    let most = values().fold(0.1, f64::max);
+    let min = values().fold(-0.1, f64::min);
+    let max = values().fold(0.1, f64::max);
     let last_s = samples.last().map_or(1.0, |sample| sample.time_s);
-    picture((900, 480), |area| {
-        let rim = 0.08 * (most - least);
+    picture([900, 480], |area| {
+        let margin = 0.08 * (max - min);
         let mut chart = ChartBuilder::on(area)
             .caption(caption, ("sans-serif", 17))
             .margin(12)
             .x_label_area_size(40)
             .y_label_area_size(56)
-            .build_cartesian_2d(0.0..last_s, least - rim..most + LEGEND_PART * (most - least))?;
+            .build_cartesian_2d(0.0..last_s, min - margin..max + LEGEND_RATIO * (max - min))?;
         chart.configure_mesh().x_desc("time, s").draw()?;
         for (index, curve) in curves.iter().enumerate() {
             let points = samples.iter().filter_map(|s| Some((s.time_s, (curve.of)(s)?)));
-            draw_curve(&mut chart, index, curve.name, points.collect())?;
+            draw_curve(&mut chart, index, curve.name, points)?;
         }
         legend(&mut chart, SeriesLabelPosition::UpperRight)
     })
@@ -85,7 +85,7 @@ fn draw_curve(
     chart: &mut Chart<'_, '_>,
     index: usize,
     name: &str,
-    points: Vec<(f64, f64)>,
+    points: impl Iterator<Item = (f64, f64)>,
 ) -> Result<(), DrawError> {
     let colour = COLOURS[index % COLOURS.len()];
     chart
@@ -95,18 +95,18 @@ fn draw_curve(
     Ok(())
 }
 
-/// The way seen from above, and from the south.
+/// The trajectory seen from above and from the south.
 fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
     let place = |s: &Sample| [s.position.y(), s.position.x(), -s.position.z()];
     let pad = |s: &Sample| [s.pad.y(), s.pad.x(), -s.pad.z()];
     let range = |axis: usize| {
         let values = || samples.iter().flat_map(|s| [place(s), pad(s)]).map(|p| component(p, axis));
-        let (least, most) =
+        let (min, max) =
             (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
-        let rim = 0.1 * (most - least).max(0.5);
-        least - rim..most + rim
+        let margin = 0.1 * (max - min).max(0.5);
+        min - margin..max + margin
     };
-    picture((1100, 560), |area| {
+    picture([1100, 560], |area| {
         let (left, right) = area.split_horizontally(550);
         let views = [
             (left, [0, 1], format!("{title}: from above"), "north, m"),
@@ -121,8 +121,8 @@ fn trajectory(title: &str, samples: &[Sample]) -> anyhow::Result<String> {
                 .build_cartesian_2d(range(across), with_legend(range(up)))?;
             chart.configure_mesh().x_desc("east, m").y_desc(axis).draw()?;
             let flat = |p: [f64; 3]| (component(p, across), component(p, up));
-            draw_curve(&mut chart, 0, "vehicle", samples.iter().map(|s| flat(place(s))).collect())?;
-            draw_curve(&mut chart, 1, "pad", samples.iter().map(|s| flat(pad(s))).collect())?;
+            draw_curve(&mut chart, 0, "vehicle", samples.iter().map(|s| flat(place(s))))?;
+            draw_curve(&mut chart, 1, "pad", samples.iter().map(|s| flat(pad(s))))?;
             let pad_end = samples.last().map(|s| flat(pad(s)));
             chart.draw_series(pad_end.map(|at| Cross::new(at, 6, COLOURS[1].stroke_width(2))))?;
             legend(&mut chart, SeriesLabelPosition::UpperLeft)?;

@@ -1,4 +1,4 @@
-//! What makes a marker hard to find that people see at once.
+//! Adverse conditions in which people see the marker at once.
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 
@@ -7,25 +7,26 @@ use markers::Marker;
 use rand::RngExt;
 use rendering::CameraSettings;
 
-use super::{SIZE_M, Set, chance, view, with_id};
-use crate::shot::{Shot, pose};
+use super::scene::{frame_rng, view, with_id};
+use crate::frame_spec::{FrameSpec, Tilt, pose};
+use crate::set::{SIZE_M, Set};
 use rendering::occluder::{Line, Occluder};
 
 const FRAMES: usize = 8;
 
-pub(super) fn shots(marker: Marker) -> Vec<Shot> {
+pub(super) fn frames(marker: Marker) -> Vec<FrameSpec> {
     let kinds = [shadow, glare, occlusion, contrast, noise, defocus, inverted, cut, cut_border];
     let numbered = kinds.iter().enumerate();
     numbered
-        .flat_map(|(kind, shot)| (0..FRAMES).map(move |frame| shot(marker, 100 * kind + frame)))
+        .flat_map(|(kind, spec)| (0..FRAMES).map(move |frame| spec(marker, 100 * kind + frame)))
         .collect()
 }
 
-/// A hard shadow's edge across the marker.
-fn shadow(marker: Marker, frame: usize) -> Shot {
-    let (shot, mut rng) = large(marker, frame);
+/// The edge of a hard shadow across the marker.
+fn shadow(marker: Marker, frame: usize) -> FrameSpec {
+    let (spec, mut rng) = large(marker, frame);
     let edge = Line {
-        through: beside(&shot, rng.random_range(-0.25..0.25), rng.random_range(-0.25..0.25)),
+        through: beside(&spec, rng.random_range(-0.25..0.25), rng.random_range(-0.25..0.25)),
         normal: rng.random_range(0.0..TAU),
     };
     let occluder = Occluder::Shadow {
@@ -33,26 +34,26 @@ fn shadow(marker: Marker, frame: usize) -> Shot {
         penumbra_px: rng.random_range(1.5..4.0),
         transmission: rng.random_range(0.12..0.35),
     };
-    shot.with("shadow", occluder)
+    spec.with("shadow", occluder)
 }
 
 /// A reflection that saturates a part of the marker.
-fn glare(marker: Marker, frame: usize) -> Shot {
-    let (shot, mut rng) = large(marker, frame);
-    let size_px = shot.size_px();
-    let centre = beside(&shot, rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
+fn glare(marker: Marker, frame: usize) -> FrameSpec {
+    let (spec, mut rng) = large(marker, frame);
+    let size_px = spec.size_px();
+    let centre = beside(&spec, rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
     let occluder = Occluder::Glare {
         centre,
         radius_px: (size_px * rng.random_range(0.15..0.3)) as f32,
         levels: rng.random_range(220.0..500.0),
     };
-    shot.with("glare", occluder)
+    spec.with("glare", occluder)
 }
 
-/// A corner of a square, or a third of the outer ring, behind something.
-fn occlusion(marker: Marker, frame: usize) -> Shot {
-    let (shot, mut rng) = large(marker, frame);
-    // From the centre in marker sizes: the chord that hides a third of a circle, or a corner with legs of this part.
+/// An occluded corner of a square, or third of the outer ring.
+fn occlusion(marker: Marker, frame: usize) -> FrameSpec {
+    let (spec, mut rng) = large(marker, frame);
+    // Distance of the edge from the centre in marker sizes: a chord that hides a third of a circle, or a corner.
     let (towards, away) = if marker.family.id_count().is_none() {
         (rng.random_range(0.0..TAU), 0.25)
     } else {
@@ -62,48 +63,47 @@ fn occlusion(marker: Marker, frame: usize) -> Shot {
     };
     let (sin, cos) = towards.sin_cos();
     let level = [20.0, 90.0, 230.0][frame % 3];
-    let (through, centre) = (beside(&shot, away * cos, away * sin), beside(&shot, 0.0, 0.0));
+    let (through, centre) = (beside(&spec, away * cos, away * sin), beside(&spec, 0.0, 0.0));
     let normal = (through.y - centre.y).atan2(through.x - centre.x);
-    shot.with("occlusion", Occluder::Cover { edge: Line { through, normal }, level })
+    spec.with("occlusion", Occluder::Cover { edge: Line { through, normal }, level })
 }
 
-/// Haze that leaves little of the contrast.
-fn contrast(marker: Marker, frame: usize) -> Shot {
-    let (shot, mut rng) = large(marker, frame);
+/// Low contrast by haze.
+fn contrast(marker: Marker, frame: usize) -> FrameSpec {
+    let (spec, mut rng) = large(marker, frame);
     let occluder = Occluder::Haze {
         transmission: rng.random_range(0.07..0.16),
         levels: rng.random_range(40.0..150.0),
     };
-    shot.with("contrast", occluder)
+    spec.with("contrast", occluder)
 }
 
-/// The amplified picture of a dark place.
-fn noise(marker: Marker, frame: usize) -> Shot {
+/// Noise in low light.
+fn noise(marker: Marker, frame: usize) -> FrameSpec {
     let light = 0.002 * (1.0 + (frame % 4) as f64);
     let settings = CameraSettings::thesis().exposed_for(light, 200.0, 0.004);
-    let (mut shot, _) = view(marker, settings, (Set::Adverse, frame), 60.0..140.0, 0.4);
-    shot.light = light;
-    shot.with("noise", Occluder::None)
+    let (mut spec, _) = view(marker, settings, Set::Adverse, frame, 60.0..140.0, 0.4);
+    spec.light = light;
+    spec.with("noise", Occluder::None)
 }
 
 /// Out of focus.
-fn defocus(marker: Marker, frame: usize) -> Shot {
+fn defocus(marker: Marker, frame: usize) -> FrameSpec {
     let blur_px = 2.0 + 0.14 * (frame % FRAMES) as f64;
     let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
-    let (shot, _) = view(marker, settings, (Set::Adverse, frame), 45.0..90.0, 0.4);
-    shot.with("defocus", Occluder::None)
+    let (spec, _) = view(marker, settings, Set::Adverse, frame, 45.0..90.0, 0.4);
+    spec.with("defocus", Occluder::None)
 }
 
 /// White on black.
-fn inverted(marker: Marker, frame: usize) -> Shot {
-    let (mut shot, _) = large(marker, frame);
-    shot.inverted = true;
-    shot.with("inverted", Occluder::None)
+fn inverted(marker: Marker, frame: usize) -> FrameSpec {
+    let (mut spec, _) = large(marker, frame);
+    spec.inverted = true;
+    spec.with("inverted", Occluder::None)
 }
 
 /// A corner beyond the border of the frame.
-fn cut(marker: Marker, frame: usize) -> Shot {
-    // A corner with legs of this part of the edge is missing.
+fn cut(marker: Marker, frame: usize) -> FrameSpec {
     cut_by(marker, frame, |rng| {
         let legs = rng.random_range(0.15..0.32);
         (FRAC_PI_4 + rng.random_range(-0.25..0.25), (1.0 - legs) * 0.68)
@@ -111,8 +111,8 @@ fn cut(marker: Marker, frame: usize) -> Shot {
     .with("cut", Occluder::None)
 }
 
-/// Half of one edge's border beyond the border of the frame; of rings almost half the marker.
-fn cut_border(marker: Marker, frame: usize) -> Shot {
+/// Half of one side's border, or almost half of rings, beyond the border of the frame.
+fn cut_border(marker: Marker, frame: usize) -> FrameSpec {
     let without_ids = marker.family.id_count().is_none();
     cut_by(marker, frame, |rng| {
         let away = if without_ids { 0.1 } else { 0.47 };
@@ -121,13 +121,14 @@ fn cut_border(marker: Marker, frame: usize) -> Shot {
     .with("cut-border", Occluder::None)
 }
 
-/// A marker whose centre is so many of its sizes from a side of the frame, turned by so much against it.
+/// A marker near a side of the frame. `how` returns its rotation relative to that side, and the distance of its centre
+/// from it in marker sizes.
 fn cut_by(
     marker: Marker,
     frame: usize,
     how: impl Fn(&mut rand_chacha::ChaCha8Rng) -> (f64, f64),
-) -> Shot {
-    let (mut rng, seed) = chance(Set::Adverse, frame);
+) -> FrameSpec {
+    let (mut rng, seed) = frame_rng(Set::Adverse, frame);
     let settings = CameraSettings::thesis();
     let model = settings.model;
     let size_px = rng.random_range(80.0..300.0);
@@ -142,19 +143,19 @@ fn cut_by(
         _ => Pixel::new(right * along, bottom - away_px),
     };
     let heading = turned + f64::from(rng.random_range(0..4)) * TAU / 4.0;
-    let pose = pose(&model, at, model.fx * SIZE_M / size_px, (0.0, 0.0), heading);
-    Shot::of(with_id(marker, frame), settings, pose, seed)
+    let pose = pose(&model, at, model.fx * SIZE_M / size_px, Tilt::NONE, heading);
+    FrameSpec::new(with_id(marker, frame), settings, pose, seed)
 }
 
-fn large(marker: Marker, frame: usize) -> (Shot, rand_chacha::ChaCha8Rng) {
-    view(marker, CameraSettings::thesis(), (Set::Adverse, frame), 60.0..160.0, 0.4)
+fn large(marker: Marker, frame: usize) -> (FrameSpec, rand_chacha::ChaCha8Rng) {
+    view(marker, CameraSettings::thesis(), Set::Adverse, frame, 60.0..160.0, 0.4)
 }
 
-/// Where a place on the marker appears, given in marker sizes from its centre.
-fn beside(shot: &Shot, x: f64, y: f64) -> Pixel {
-    let seen = shot.path.first().and_then(|camera_from_marker| {
+/// The pixel of a point on the marker, in marker sizes from its centre.
+fn beside(spec: &FrameSpec, x: f64, y: f64) -> Pixel {
+    let seen = spec.path.first().and_then(|camera_from_marker| {
         let place = *camera_from_marker * Point::new(x * SIZE_M, y * SIZE_M, 0.0);
-        shot.settings.model.project(place)
+        spec.settings.model.project(place)
     });
     seen.unwrap_or(Pixel::new(0.0, 0.0))
 }

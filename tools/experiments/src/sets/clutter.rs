@@ -1,4 +1,4 @@
-//! Scenes without a marker, full of what resembles one.
+//! Scenes without a marker, with shapes that resemble one.
 
 use std::f64::consts::TAU;
 
@@ -9,25 +9,26 @@ use rand_chacha::ChaCha8Rng;
 use rendering::views::Binning;
 use rendering::{PadInScene, Surface};
 
-use super::{Set, chance, middle, near};
-use crate::shot::{Shot, pose};
+use super::scene::{centre, frame_rng, near};
+use crate::frame_spec::{FrameSpec, Tilt, pose};
+use crate::set::Set;
 use rendering::occluder::{Line, Occluder};
 
-/// Scenes; with photographs and their crops there are more than a thousand.
+/// Number of scenes; with the photographs and their crops there are more than a thousand negatives.
 const SCENES: usize = 520;
 
-/// Distance from which the scenes are seen, and half of the square on the ground that holds the clutter, in metres.
+/// Typical distance of the camera, and half the side of the cluttered square on the ground, in metres.
 const DISTANCE_M: f64 = 3.0;
 const HALF_M: f64 = 1.3;
 
-pub(super) fn shots() -> Vec<Shot> {
-    (0..SCENES).map(shot).collect()
+pub(super) fn frames() -> Vec<FrameSpec> {
+    (0..SCENES).map(spec).collect()
 }
 
-/// A name, and a drawing of chance.
+/// A name, and a random drawing.
 type Kind = (&'static str, fn(&mut ChaCha8Rng) -> Drawing);
 
-/// What a scene is full of.
+/// The kinds of clutter.
 const KINDS: [Kind; 10] = [
     ("squares", squares),
     ("circles", circles),
@@ -36,14 +37,14 @@ const KINDS: [Kind; 10] = [
     ("grid", random_grid),
     ("bars", bars),
     ("rings", many_rings),
-    ("frames", frames),
+    ("frames", black_frames),
     ("letter", letter),
     ("dots", dots),
 ];
 
-fn shot(frame: usize) -> Shot {
-    let (mut rng, seed) = chance(Set::Negatives, frame);
-    // A few large pictures cost as much time as many small ones.
+fn spec(frame: usize) -> FrameSpec {
+    let (mut rng, seed) = frame_rng(Set::Negatives, frame);
+    // Large frames take long, so that most are small.
     let binning = if (frame / KINDS.len()).is_multiple_of(4) {
         Binning::TwoByTwo
     } else {
@@ -52,12 +53,12 @@ fn shot(frame: usize) -> Shot {
     let light = 10f64.powf(rng.random_range(-1.5..0.2));
     let settings = binning.settings().exposed_for(light, rng.random_range(120.0..260.0), 0.004);
     let model = settings.model;
-    let tilt = (rng.random_range(0.0..0.7), rng.random_range(0.0..TAU));
+    let tilt = Tilt { angle: rng.random_range(0.0..0.7), about: rng.random_range(0.0..TAU) };
     let distance_m = DISTANCE_M * rng.random_range(0.4..2.0);
-    let at = near(&mut rng, middle(&model), 50.0);
+    let at = near(&mut rng, centre(&model), 50.0);
     let pose = pose(&model, at, distance_m, tilt, 0.0);
     let (group, draw) = KINDS[frame % KINDS.len()];
-    let mut shot = Shot {
+    let mut spec = FrameSpec {
         group: group.to_owned(),
         marker: None,
         clutter: Vec::new(),
@@ -71,7 +72,7 @@ fn shot(frame: usize) -> Shot {
         bayer: frame % 7 == 3,
         seed,
     };
-    let about = shot.place();
+    let pad = spec.place();
     for _ in 0..rng.random_range(8..40) {
         let other = rng.random_bool(0.2);
         let drawing = if other {
@@ -79,24 +80,24 @@ fn shot(frame: usize) -> Shot {
         } else {
             draw(&mut rng)
         };
-        shot.clutter.push(lay(drawing, &about, &mut rng));
+        spec.clutter.push(place(drawing, &pad, &mut rng));
     }
     if frame % 5 == 4 {
         let line = Line { through: near(&mut rng, at, 150.0), normal: rng.random_range(0.0..TAU) };
-        shot.occluder = Occluder::Shadow {
+        spec.occluder = Occluder::Shadow {
             edge: line,
             penumbra_px: 2.0,
             transmission: rng.random_range(0.2..0.6),
         };
     }
-    shot
+    spec
 }
 
-/// A drawing somewhere about a place on the ground.
-fn lay(drawing: Drawing, about: &Point<Ned>, rng: &mut ChaCha8Rng) -> PadInScene {
+/// Places a drawing near a point on the ground.
+fn place(drawing: Drawing, centre: &Point<Ned>, rng: &mut ChaCha8Rng) -> PadInScene {
     let turn = rng.random_range(0.0..TAU);
     let mut offset = || rng.random_range(-HALF_M..HALF_M);
-    let place = Point::new(about.x() + offset(), about.y() + offset(), -1e-4);
+    let place = Point::new(centre.x() + offset(), centre.y() + offset(), -1e-4);
     let up = Rotation::<Ned, MarkerFrame>::from_euler(std::f64::consts::PI, 0.0, turn);
     PadInScene {
         paper_m: 2.0 * drawing.half_extent_m,
@@ -122,7 +123,7 @@ fn drawing(half_extent_m: f64, layers: Vec<Layer>) -> Drawing {
     Drawing { half_extent_m, layers }
 }
 
-/// Black, white, black... shapes in each other.
+/// Concentric shapes, alternately black and white.
 fn nested(rng: &mut ChaCha8Rng, shape: impl Fn(f64, Ink) -> Layer) -> Drawing {
     let outer = rng.random_range(0.02..0.12);
     let mut layers = Vec::new();
@@ -142,7 +143,7 @@ fn circles(rng: &mut ChaCha8Rng) -> Drawing {
     nested(rng, disc)
 }
 
-/// Rings whose radii are not those of the marker.
+/// Rings with other radii than the marker.
 fn many_rings(rng: &mut ChaCha8Rng) -> Drawing {
     let outer = rng.random_range(0.03..0.12);
     let mut layers = Vec::new();
@@ -155,8 +156,8 @@ fn many_rings(rng: &mut ChaCha8Rng) -> Drawing {
     drawing(outer * 1.2, layers)
 }
 
-/// Black frames about nothing or a few bars.
-fn frames(rng: &mut ChaCha8Rng) -> Drawing {
+/// Black frames, empty or with a few bars.
+fn black_frames(rng: &mut ChaCha8Rng) -> Drawing {
     let outer = rng.random_range(0.03..0.12);
     let inner = outer * rng.random_range(0.5..0.85);
     let mut layers = vec![square(outer, Ink::Black), square(inner, Ink::White)];
@@ -168,7 +169,7 @@ fn frames(rng: &mut ChaCha8Rng) -> Drawing {
     drawing(outer * 1.3, layers)
 }
 
-/// Lines of words of upright strokes.
+/// Lines of text of vertical strokes.
 fn text(rng: &mut ChaCha8Rng) -> Drawing {
     let (half, height) = (rng.random_range(0.06..0.15), rng.random_range(0.006..0.03));
     let mut layers = Vec::new();
@@ -214,8 +215,8 @@ fn checkerboard(rng: &mut ChaCha8Rng) -> Drawing {
     drawing(half * rng.random_range(1.02..1.3), layers)
 }
 
-/// A grid of chance, as QR codes have it, now and then with their finder patterns or in a black frame. Grids of the
-/// sizes of markers in a frame would be markers now and then, and are left out.
+/// A random grid as in QR codes, sometimes with their finder patterns or in a black frame. Framed grids of the sizes of
+/// markers are excluded, as some would be markers.
 fn random_grid(rng: &mut ChaCha8Rng) -> Drawing {
     let half = rng.random_range(0.03..0.15);
     let count = [3, 9, 11, 13, 17, 21][rng.random_range(0..6)];
@@ -244,7 +245,7 @@ fn random_grid(rng: &mut ChaCha8Rng) -> Drawing {
     drawing(half * 1.2, layers)
 }
 
-/// Stripes, as barcodes and zebra crossings have them.
+/// Stripes as in barcodes and zebra crossings.
 fn bars(rng: &mut ChaCha8Rng) -> Drawing {
     let half = rng.random_range(0.04..0.2);
     let mut layers = Vec::new();
@@ -261,7 +262,7 @@ fn bars(rng: &mut ChaCha8Rng) -> Drawing {
     drawing(half, layers)
 }
 
-/// The H of a landing place in a circle or a square.
+/// The H of a helipad in a circle or a square.
 fn letter(rng: &mut ChaCha8Rng) -> Drawing {
     let half = rng.random_range(0.05..0.2);
     let shape: fn(f64, Ink) -> Layer = if rng.random_bool(0.5) { disc } else { square };

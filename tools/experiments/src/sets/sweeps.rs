@@ -1,4 +1,4 @@
-//! One thing made worse step by step.
+//! Sweeps of one parameter.
 
 use std::f64::consts::TAU;
 
@@ -7,94 +7,96 @@ use markers::Marker;
 use rand::RngExt;
 use rendering::{CameraSettings, Surface};
 
-use super::{Set, chance, middle, near, view, with_id};
-use crate::shot::{Shot, pose};
+use super::scene::{centre, frame_rng, near, view, with_id};
+use crate::frame_spec::{FrameSpec, Tilt, pose};
+use crate::set::Set;
 use rendering::occluder::Occluder;
 
-pub(super) fn tilt(marker: Marker) -> Vec<Shot> {
-    let mut shots = Vec::new();
+pub(super) fn tilt(marker: Marker) -> Vec<FrameSpec> {
+    let mut frames = Vec::new();
     for tilt_deg in (0..=60).step_by(10) {
         for distance_m in [0.6f64, 1.5, 4.0, 8.0] {
             for frame in 0..3 {
-                let (mut rng, seed) = chance(Set::Tilt, shots.len());
+                let (mut rng, seed) = frame_rng(Set::Tilt, frames.len());
                 let settings = CameraSettings::thesis();
-                let at = near(&mut rng, middle(&settings.model), 150.0);
-                let tilt = (f64::from(tilt_deg).to_radians(), rng.random_range(0.0..TAU));
+                let at = near(&mut rng, centre(&settings.model), 150.0);
+                let tilt = Tilt {
+                    angle: f64::from(tilt_deg).to_radians(),
+                    about: rng.random_range(0.0..TAU),
+                };
                 let heading = rng.random_range(0.0..TAU);
                 let pose = pose(&settings.model, at, distance_m, tilt, heading);
-                let mut shot = Shot::of(with_id(marker, frame), settings, pose, seed);
-                shot.group = format!("{tilt_deg}deg");
-                shots.push(shot);
+                let mut spec = FrameSpec::new(with_id(marker, frame), settings, pose, seed);
+                spec.group = format!("{tilt_deg}deg");
+                frames.push(spec);
             }
         }
     }
-    shots
+    frames
 }
 
-pub(super) fn blur(marker: Marker) -> Vec<Shot> {
-    let mut shots = Vec::new();
+pub(super) fn blur(marker: Marker) -> Vec<FrameSpec> {
+    let mut frames = Vec::new();
     for blur_px in [0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0] {
         for _ in 0..6 {
             let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
-            let (shot, _) = view(marker, settings, (Set::Blur, shots.len()), 35.0..120.0, 0.3);
-            shots.push(shot.with(format!("lens{blur_px}"), Occluder::None));
+            let (spec, _) = view(marker, settings, Set::Blur, frames.len(), 35.0..120.0, 0.3);
+            frames.push(spec.with(format!("lens{blur_px}"), Occluder::None));
         }
     }
     for motion_px in [1.0f64, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0] {
         for _ in 0..6 {
-            let frame = (Set::Blur, shots.len());
             let settings = CameraSettings::thesis();
-            let (mut shot, mut rng) = view(marker, settings, frame, 50.0..150.0, 0.3);
-            let middle = shot.path[0];
+            let (mut spec, mut rng) =
+                view(marker, settings, Set::Blur, frames.len(), 50.0..150.0, 0.3);
+            let middle = spec.path[0];
             let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
             let origin = middle.origin();
-            let per_px = origin.z() / shot.settings.model.fx * motion_px;
+            let per_px = origin.z() / spec.settings.model.fx * motion_px;
             let at = |part: f64| {
                 let offset = geometry::Vector::new(part * per_px * cos, part * per_px * sin, 0.0);
                 Transform::new(middle.rotation(), origin + offset)
             };
-            shot.path = vec![at(-0.5), at(0.0), at(0.5)];
-            shots.push(shot.with(format!("motion{motion_px}"), Occluder::None));
+            spec.path = vec![at(-0.5), at(0.0), at(0.5)];
+            frames.push(spec.with(format!("motion{motion_px}"), Occluder::None));
         }
     }
-    shots
+    frames
 }
 
-pub(super) fn noise(marker: Marker) -> Vec<Shot> {
-    let mut shots = Vec::new();
-    // Light that is left, and about the noise of white in grey levels.
+pub(super) fn noise(marker: Marker) -> Vec<FrameSpec> {
+    let mut frames = Vec::new();
+    // Light on the scene; the gain makes up for it.
     for light in [0.5, 0.1, 0.03, 0.01, 0.004, 0.002, 0.001] {
         for _ in 0..6 {
             let settings = CameraSettings::thesis().exposed_for(light, 200.0, 0.004);
-            let frame = (Set::Noise, shots.len());
-            let (mut shot, _) = view(marker, settings, frame, 40.0..120.0, 0.3);
-            shot.light = light;
-            shots.push(shot.with(format!("light{light}"), Occluder::None));
+            let (mut spec, _) = view(marker, settings, Set::Noise, frames.len(), 40.0..120.0, 0.3);
+            spec.light = light;
+            frames.push(spec.with(format!("light{light}"), Occluder::None));
         }
     }
-    shots
+    frames
 }
 
-pub(super) fn light(marker: Marker) -> Vec<Shot> {
-    let mut shots = Vec::new();
-    // White's grey level if there were no end to the scale.
+pub(super) fn light(marker: Marker) -> Vec<FrameSpec> {
+    let mut frames = Vec::new();
+    // Grey level of white without saturation.
     for white in [8.0, 15.0, 30.0, 60.0, 120.0, 240.0, 400.0, 700.0, 1200.0] {
         for frame in 0..6 {
             let settings = CameraSettings::thesis().exposed_for(1.0, white, 0.1);
-            let place = (Set::Light, shots.len());
-            let (mut shot, _) = view(marker, settings, place, 30.0..120.0, 0.3);
-            shot.surface = [Surface::Asphalt, Surface::Grass][frame % 2];
-            shots.push(shot.with(format!("white{white}"), Occluder::None));
+            let (mut spec, _) = view(marker, settings, Set::Light, frames.len(), 30.0..120.0, 0.3);
+            spec.surface = [Surface::Asphalt, Surface::Grass][frame % 2];
+            frames.push(spec.with(format!("white{white}"), Occluder::None));
         }
     }
-    shots
+    frames
 }
 
-/// How long the shutter takes to roll over the image, in seconds.
+/// Readout time of the rolling shutter, in seconds.
 const READOUT_S: f64 = 0.02;
 
-pub(super) fn rolling(marker: Marker) -> Vec<Shot> {
-    // The camera's velocity to the right, to the bottom and forward in the image in m/s, and its turn about its axis in rad/s.
+pub(super) fn rolling(marker: Marker) -> Vec<FrameSpec> {
+    // The camera's velocity right, down and forward in m/s, and its rate of turn about the optical axis in rad/s.
     let motions = [
         ("still", [0.0, 0.0, 0.0], 0.0),
         ("right0.5", [0.5, 0.0, 0.0], 0.0),
@@ -105,13 +107,14 @@ pub(super) fn rolling(marker: Marker) -> Vec<Shot> {
         ("forward1", [0.0, 0.0, 1.0], 0.0),
         ("turn1", [0.0, 0.0, 0.0], 1.0),
     ];
-    let mut shots = Vec::new();
+    let mut frames = Vec::new();
     for (name, velocity, turn) in motions {
         for _ in 0..6 {
-            let (mut rng, seed) = chance(Set::Rolling, shots.len());
+            let (mut rng, seed) = frame_rng(Set::Rolling, frames.len());
             let settings = CameraSettings { readout_s: READOUT_S, ..CameraSettings::thesis() };
-            let at = near(&mut rng, middle(&settings.model), 250.0);
-            let tilt = (rng.random_range(0.0..0.2), rng.random_range(0.0..TAU));
+            let at = near(&mut rng, centre(&settings.model), 250.0);
+            let tilt =
+                Tilt { angle: rng.random_range(0.0..0.2), about: rng.random_range(0.0..TAU) };
             let heading = rng.random_range(0.0..TAU);
             let still = pose(&settings.model, at, 3.0, tilt, heading);
             let half_s = 0.5 * (settings.readout_s + settings.exposure_s);
@@ -125,11 +128,11 @@ pub(super) fn rolling(marker: Marker) -> Vec<Shot> {
                 Transform::new(turned, Point::origin())
                     * Transform::new(still.rotation(), still.origin() + moved)
             };
-            let mut shot = Shot::of(marker, settings, still, seed);
-            shot.path = vec![seen(-half_s), seen(0.0), seen(half_s)];
-            shot.surface = Surface::ALL[shots.len() % 3];
-            shots.push(shot.with(name, Occluder::None));
+            let mut spec = FrameSpec::new(marker, settings, still, seed);
+            spec.path = vec![seen(-half_s), seen(0.0), seen(half_s)];
+            spec.surface = Surface::ALL[frames.len() % 3];
+            frames.push(spec.with(name, Occluder::None));
         }
     }
-    shots
+    frames
 }

@@ -1,4 +1,4 @@
-//! One frame of a set: what is seen, by which camera, from where, through what; and how it is taken.
+//! The specification of a rendered frame (scene, camera, pose, occlusion), its ground truth, and its rendering.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -15,21 +15,21 @@ use rendering::{CameraSettings, PadInScene, RenderError, Renderer, Scene, Surfac
 
 use rendering::occluder::Occluder;
 
-/// A frame to take.
+/// A frame to render.
 #[derive(Clone, Debug)]
-pub struct Shot {
-    /// The group in its set whose frames are counted together.
+pub struct FrameSpec {
+    /// The group in its set that is scored together.
     pub group: String,
-    /// The marker, with its size; none in a picture without one.
+    /// The marker with its size; `None` in a negative.
     pub marker: Option<Marker>,
     /// Other things on the ground.
     pub clutter: Vec<PadInScene>,
     /// Whether black and white are swapped.
     pub inverted: bool,
-    /// The camera and its setting.
+    /// The camera.
     pub settings: CameraSettings,
-    /// `camera_from_marker` from the opening to the closing of the shutter, of a rolling one from that of the first row to
-    /// that of the last; of one pose when nothing moves. Without a marker, of the place where one would be.
+    /// `camera_from_marker` from the opening to the closing of the shutter (with a rolling shutter from the opening in the
+    /// first row to the closing in the last); one pose without motion. In a negative, of the place of a marker.
     pub path: Vec<Transform<Camera, MarkerFrame>>,
     /// The ground.
     pub surface: Surface,
@@ -37,26 +37,26 @@ pub struct Shot {
     pub painted_marks: u32,
     /// Light on the scene; 1 is full sun.
     pub light: f64,
-    /// What happens to the light on its way.
+    /// What is between scene and camera.
     pub occluder: Occluder,
-    /// Whether the sensor has colour filters, and grey is interpolated from them.
+    /// Whether grey is interpolated from a Bayer mosaic.
     pub bayer: bool,
-    /// Chance.
+    /// Seed of the random generators.
     pub seed: u64,
 }
 
-/// What a shot shows, for whoever measures.
+/// Where the marker of a frame is.
 #[derive(Clone, Copy, Debug)]
-pub struct Shown {
-    /// The marker as seen by the camera half-way through the exposure, of a rolling shutter through that of the centre's row.
+pub struct GroundTruth {
+    /// The marker in the camera frame at mid-exposure (with a rolling shutter, of the row of its centre).
     pub camera_from_marker: Transform<Camera, MarkerFrame>,
-    /// Where its centre appears.
+    /// The pixel of its centre.
     pub centre: Pixel,
-    /// Where the corners of the square of its size appear: its own top left first, then clockwise on the print.
+    /// The pixels of the corners of the square of its size: its own top left first, then clockwise on the print.
     pub corners: [Pixel; 4],
 }
 
-impl Shot {
+impl FrameSpec {
     /// A marker on asphalt in full sun, seen from `camera_from_marker`.
     pub fn of(
         marker: Marker,
@@ -80,19 +80,19 @@ impl Shot {
         }
     }
 
-    /// The place on the ground where the marker lies, or would lie.
+    /// The position of the marker on the ground, in a negative of its place.
     pub fn place(&self) -> Point<Ned> {
         pad(self).ned_from_marker.origin()
     }
 
-    /// Where a place on the marker appears, and the pose by which it does: that half-way through the exposure of its row.
+    /// The pixel of a point on the marker, and the pose at mid-exposure of its row.
     fn seen(&self, place: Point<MarkerFrame>) -> Option<(Pixel, Transform<Camera, MarkerFrame>)> {
         const ROUNDS: usize = 8;
         let settings = &self.settings;
         let mut pose = *self.path.get(self.path.len() / 2)?;
         let mut pixel = settings.model.project(pose * place)?;
         if settings.readout_s > 0.0 {
-            // Its row depends on the time, which depends on its row: a little less each round.
+            // The row depends on the time, and the time on the row: a fixed-point iteration.
             for _ in 0..ROUNDS {
                 pose = between(&self.path, settings.part_at_row(pixel.y, 0.5))?;
                 pixel = settings.model.project(pose * place)?;
@@ -101,8 +101,8 @@ impl Shot {
         Some((pixel, pose))
     }
 
-    /// What it shows; `None` when the marker is not in front of the camera, or there is none.
-    pub fn shown(&self) -> Option<Shown> {
+    /// The ground truth; `None` without a marker, or when it is not in front of the camera.
+    pub fn ground_truth(&self) -> Option<GroundTruth> {
         let half = self.marker?.size_m? / 2.0;
         let project = |x: f64, y: f64| self.seen(Point::new(x, y, 0.0)).map(|(pixel, _)| pixel);
         let (_, camera_from_marker) = self.seen(Point::origin())?;
@@ -112,25 +112,62 @@ impl Shot {
             project(half, -half)?,
             project(-half, -half)?,
         ];
-        Some(Shown { camera_from_marker, centre: project(0.0, 0.0)?, corners })
+        Some(GroundTruth { camera_from_marker, centre: project(0.0, 0.0)?, corners })
+    }
+
+    /// Whether the marker's square (for rings, that about the outer circle) is inside the frame.
+    pub(crate) fn is_whole(&self) -> bool {
+        self.ground_truth().is_some_and(|shown| {
+            shown.corners.iter().all(|corner| self.settings.model.contains(*corner))
+        })
+    }
+
+    /// The longest side of the marker's square in the image, in pixels.
+    pub(crate) fn size_px(&self) -> f64 {
+        self.ground_truth().map_or(0.0, |shown| {
+            let [a, b, c, d] = shown.corners;
+            [a.distance(&b), b.distance(&c), c.distance(&d), d.distance(&a)]
+                .into_iter()
+                .fold(0.0, f64::max)
+        })
+    }
+
+    pub(crate) fn with(mut self, group: impl Into<String>, occluder: Occluder) -> Self {
+        self.group = group.into();
+        self.occluder = occluder;
+        self
     }
 }
 
-/// `camera_from_marker` for a marker whose centre is seen at a pixel, at a distance along the optical axis. The print
-/// is turned by `heading`, and then tilted by `tilt` about the direction `about` in the image (radians).
+/// A tilt of the marker against the image plane.
+#[derive(Clone, Copy, Debug)]
+pub struct Tilt {
+    /// The angle, in radians.
+    pub angle: f64,
+    /// The direction of its axis in the image, in radians.
+    pub about: f64,
+}
+
+impl Tilt {
+    /// No tilt.
+    pub const NONE: Self = Self { angle: 0.0, about: 0.0 };
+}
+
+/// `camera_from_marker` for a marker with its centre at a pixel, at a distance along the optical axis, rotated by
+/// `heading` (radians) in its plane and then tilted.
 pub fn pose(
     model: &CameraModel,
     seen_at: Pixel,
     distance_m: f64,
-    (tilt, about): (f64, f64),
+    tilt: Tilt,
     heading: f64,
 ) -> Transform<Camera, MarkerFrame> {
     let turn = |axis: Vector3<f64>, angle: f64| {
         Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(axis), angle)
     };
     let facing = turn(Vector3::x(), std::f64::consts::PI);
-    let axis = Vector3::new(about.cos(), about.sin(), 0.0);
-    let rotation = turn(axis, tilt) * facing * turn(Vector3::z(), heading);
+    let axis = Vector3::new(tilt.about.cos(), tilt.about.sin(), 0.0);
+    let rotation = turn(axis, tilt.angle) * facing * turn(Vector3::z(), heading);
     let ray = model.unproject(seen_at);
     Transform::new(
         Rotation::from_quaternion(UnitQuaternion::from_rotation_matrix(&rotation)),
@@ -138,7 +175,7 @@ pub fn pose(
     )
 }
 
-/// The pose at a part of a path, from 0 to 1.
+/// The interpolated pose at a fraction of a path.
 fn between(
     path: &[Transform<Camera, MarkerFrame>],
     part: f64,
@@ -151,75 +188,75 @@ fn between(
     Some(Transform::new(from.rotation().interpolate(&to.rotation(), share), origin))
 }
 
-/// Takes shots; it keeps the grounds, which take long to grow.
+/// Renders frames. It keeps the grounds, which take long to generate.
 #[derive(Debug, Default)]
-pub struct Studio {
+pub struct FrameRenderer {
     grounds: HashMap<(&'static str, u64), Arc<Ground>>,
 }
 
-/// Grounds of each kind.
+/// Number of grounds of each surface.
 const GROUNDS: u64 = 2;
 
-impl Studio {
-    /// The pixels of a shot, row by row.
+impl FrameRenderer {
+    /// The pixels of a frame, row by row.
     ///
     /// # Errors
-    /// [`RenderError`] when the shot makes no sense.
-    pub fn take(&mut self, shot: &Shot) -> Result<Vec<u8>, RenderError> {
-        let key = (shot.surface.name(), shot.seed % GROUNDS);
+    /// [`RenderError`] when the specification is invalid.
+    pub fn render(&mut self, spec: &FrameSpec) -> Result<Vec<u8>, RenderError> {
+        let key = (spec.surface.name(), spec.seed % GROUNDS);
         let ground = self.grounds.entry(key);
         let ground =
-            Arc::clone(ground.or_insert_with(|| Arc::new(Ground::new(shot.surface, key.1))));
-        let pad = pad(shot);
+            Arc::clone(ground.or_insert_with(|| Arc::new(Ground::new(spec.surface, key.1))));
+        let pad = pad(spec);
         let (ned_from_marker, body_from_camera) =
-            (pad.ned_from_marker, shot.settings.body_from_camera);
-        let mut pads = shot.clutter.clone();
-        if shot.marker.is_some() {
+            (pad.ned_from_marker, spec.settings.body_from_camera);
+        let mut pads = spec.clutter.clone();
+        if spec.marker.is_some() {
             pads.push(pad);
         }
         let scene = Scene {
-            surface: shot.surface,
+            surface: spec.surface,
             pads,
-            painted_marks: shot.painted_marks,
-            light: shot.light,
+            painted_marks: spec.painted_marks,
+            light: spec.light,
         };
-        let mut renderer = Renderer::with_ground(ground, &scene, shot.settings.clone(), shot.seed)?;
-        let poses: Vec<_> = shot
+        let mut renderer = Renderer::with_ground(ground, &scene, spec.settings.clone(), spec.seed)?;
+        let poses: Vec<_> = spec
             .path
             .iter()
             .map(|pose| ned_from_marker * pose.inverse() * body_from_camera.inverse())
             .collect();
-        let model = shot.settings.model;
+        let model = spec.settings.model;
         let mut pixels = vec![0; model.width as usize * model.height as usize];
         let mut apply = |v: usize, light: &mut [f32]| {
-            shot.occluder.apply(v, light);
-            if shot.bayer {
+            spec.occluder.apply(v, light);
+            if spec.bayer {
                 filter_colours(v, light);
             }
         };
-        renderer.render_through(&mut apply, &poses, shot.seed, &mut pixels)?;
-        Ok(if shot.bayer { interpolated(&pixels, model.width as usize) } else { pixels })
+        renderer.render_through(&mut apply, &poses, spec.seed, &mut pixels)?;
+        Ok(if spec.bayer { interpolated(&pixels, model.width as usize) } else { pixels })
     }
 }
 
-/// Where the pad lies on the ground: anywhere, so that no two frames have the same ground.
-fn pad(shot: &Shot) -> PadInScene {
-    let mut rng = ChaCha8Rng::seed_from_u64(shot.seed ^ 0x70_6164);
+/// The pad at a random position, so that frames have different ground.
+fn pad(spec: &FrameSpec) -> PadInScene {
+    let mut rng = ChaCha8Rng::seed_from_u64(spec.seed ^ 0x70_6164);
     let mut place = || rng.random_range(-20.0..20.0);
     let (north_m, east_m, heading) = (place(), place(), place());
-    let marker = shot.marker.unwrap_or(Marker {
+    let marker = spec.marker.unwrap_or(Marker {
         family: markers::Family::Rings,
         id: None,
         size_m: Some(0.1),
     });
     let mut pad = PadInScene::flat(marker, north_m, east_m, heading);
-    if shot.inverted {
+    if spec.inverted {
         pad.drawing = inverted(&pad.drawing);
     }
     pad
 }
 
-/// A drawing with black and white swapped, that of its paper as well.
+/// A drawing with black and white swapped, including its paper.
 fn inverted(drawing: &Drawing) -> Drawing {
     let half = drawing.half_extent_m;
     let paper =
@@ -234,10 +271,10 @@ fn inverted(drawing: &Drawing) -> Drawing {
     Drawing { half_extent_m: half, layers: std::iter::once(paper).chain(swapped).collect() }
 }
 
-/// What red, green and blue filters let through of white light, before the camera's white balance.
+/// Transmission of white light by the red, green and blue filters, before white balance.
 const FILTERS: [f32; 3] = [0.6, 1.0, 0.75];
 
-/// Red, green or blue (0, 1, 2) of a pixel of an RGGB mosaic.
+/// The colour of a pixel of an RGGB mosaic: red, green or blue (0, 1, 2).
 fn colour(x: usize, y: usize) -> usize {
     match (x % 2, y % 2) {
         (0, 0) => 0,
@@ -252,11 +289,11 @@ fn filter_colours(v: usize, light: &mut [f32]) {
     }
 }
 
-/// Grey (0.299, 0.587, 0.114) from an RGGB mosaic whose colours are balanced and interpolated bilinearly.
+/// Grey (0.299, 0.587, 0.114) from an RGGB mosaic by white balance and bilinear interpolation.
 fn interpolated(mosaic: &[u8], width: usize) -> Vec<u8> {
     let height = mosaic.len() / width.max(1);
     let at = |x: isize, y: isize| {
-        // Mirrored at the border, which keeps the colours' order.
+        // Mirrored at the border, which preserves the pattern.
         let mirror = |place: isize, edge: usize| {
             let last = edge as isize - 1;
             (if place < 0 {
@@ -294,16 +331,16 @@ fn interpolated(mosaic: &[u8], width: usize) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    fn shot() -> Shot {
+    fn spec() -> FrameSpec {
         let settings = rendering::views::Binning::FourByFour.settings();
         let at = Pixel::new(200.0, 300.0);
-        let pose = pose(&settings.model, at, 2.0, (0.3, 1.0), 0.5);
-        Shot::of("apriltag-36h11:3:0.2".parse().unwrap(), settings, pose, 7)
+        let pose = pose(&settings.model, at, 2.0, Tilt { angle: 0.3, about: 1.0 }, 0.5);
+        FrameSpec::new("apriltag-36h11:3:0.2".parse().unwrap(), settings, pose, 7)
     }
 
     #[test]
-    fn a_marker_is_seen_where_it_is_put_and_faces_the_camera() {
-        let shown = shot().shown().unwrap();
+    fn a_marker_is_at_its_pixel_and_faces_the_camera() {
+        let shown = spec().ground_truth().unwrap();
         assert!(shown.centre.distance(&Pixel::new(200.0, 300.0)) < 1e-9);
         assert!((shown.camera_from_marker.origin().z() - 2.0).abs() < 1e-12);
         // Clockwise in the image, whose y axis points down: the area is positive.
@@ -316,15 +353,15 @@ mod tests {
     }
 
     #[test]
-    fn a_shot_is_the_same_each_time_and_an_inverted_one_is_not() {
-        let take = |shot: &Shot| Studio::default().take(shot).unwrap();
-        assert_eq!(take(&shot()), take(&shot()));
-        let swapped = Shot { inverted: true, ..shot() };
-        assert_ne!(take(&shot()), take(&swapped));
+    fn rendering_is_repeatable_and_inverted_frames_differ() {
+        let render = |spec: &FrameSpec| FrameRenderer::default().render(spec).unwrap();
+        assert_eq!(render(&spec()), render(&spec()));
+        let swapped = FrameSpec { inverted: true, ..spec() };
+        assert_ne!(render(&spec()), render(&swapped));
     }
 
     #[test]
-    fn grey_from_a_mosaic_is_the_grey_there_was() {
+    fn a_grey_scene_stays_grey_through_the_mosaic() {
         let mut levels = [120.0f32; 8];
         let mosaic: Vec<u8> = (0..6)
             .flat_map(|v| {

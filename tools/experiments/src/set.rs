@@ -1,0 +1,89 @@
+//! The sets of frames by name, and the markers of the experiment.
+
+/// Size of the thesis' markers, in metres.
+pub const SIZE_M: f64 = rendering::views::SIZE_M;
+
+/// The markers of the experiment: the four of the thesis, and the most widely used one.
+pub const MARKERS: [&str; 5] =
+    ["rings", "apriltag-16h5:0", "aruco-4x4-50:0", "stag-hd23:0", "apriltag-36h11:0"];
+
+/// A set of frames.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Set {
+    /// The thesis' 37 positions (Table 4.1) with both binnings, five frames each.
+    Positions,
+    /// Straight down from 10 to 40 m, five frames each.
+    Far,
+    /// Conditions of a landing: 51 frames.
+    Landing,
+    /// Shadows, glare, occlusion, low contrast, noise, defocus, inverted, cut off by the border.
+    Adverse,
+    /// Tilted by up to 60 degrees at four distances.
+    Tilt,
+    /// Blurred by the lens and by motion.
+    Blur,
+    /// Increasing noise.
+    Noise,
+    /// From underexposed to overexposed.
+    Light,
+    /// Motion with a rolling shutter.
+    Rolling,
+    /// Textured grounds, for timing.
+    Textured,
+    /// A marker 48 px wide that drifts through the image.
+    Tracking,
+    /// Scenes without a marker.
+    Negatives,
+}
+
+impl Set {
+    /// Every set, in the order in which they are rendered.
+    pub const ALL: [Self; 12] = [
+        Self::Textured,
+        Self::Adverse,
+        Self::Landing,
+        Self::Far,
+        Self::Tilt,
+        Self::Blur,
+        Self::Noise,
+        Self::Light,
+        Self::Rolling,
+        Self::Tracking,
+        Self::Negatives,
+        Self::Positions,
+    ];
+
+    /// The name of its folder.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Positions => "positions",
+            Self::Far => "far",
+            Self::Landing => "landing",
+            Self::Adverse => "adverse",
+            Self::Tilt => "tilt",
+            Self::Blur => "blur",
+            Self::Noise => "noise",
+            Self::Light => "light",
+            Self::Rolling => "rolling",
+            Self::Textured => "textured",
+            Self::Tracking => "tracking",
+            Self::Negatives => "negatives",
+        }
+    }
+
+    /// Whether its frames show the marker.
+    pub fn has_marker(self) -> bool {
+        self != Self::Negatives
+    }
+}
+
+impl std::str::FromStr for Set {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        Self::ALL.into_iter().find(|set| set.name() == text).ok_or_else(|| {
+            let known = Self::ALL.map(Self::name).join(", ");
+            format!("there is no set `{text}`; known are {known}")
+        })
+    }
+}

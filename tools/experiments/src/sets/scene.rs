@@ -1,0 +1,55 @@
+//! What the sets share: random generators, positions and views.
+
+use std::f64::consts::TAU;
+
+use geometry::{CameraModel, Pixel};
+use markers::Marker;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rendering::{CameraSettings, Surface};
+
+use crate::frame_spec::{FrameSpec, Tilt, pose};
+use crate::set::{SIZE_M, Set};
+
+/// The random generator and the seed of one frame of a set.
+pub(super) fn frame_rng(set: Set, frame: usize) -> (ChaCha8Rng, u64) {
+    let seed = 1000 * (set.name().bytes().map(u64::from).sum::<u64>()) + frame as u64;
+    (ChaCha8Rng::seed_from_u64(seed), seed)
+}
+
+/// A random pixel at most `by_px` from another, along both axes.
+pub(super) fn near(rng: &mut ChaCha8Rng, pixel: Pixel, by_px: f64) -> Pixel {
+    Pixel::new(pixel.x + rng.random_range(-by_px..by_px), pixel.y + rng.random_range(-by_px..by_px))
+}
+
+/// The principal point.
+pub(super) fn centre(model: &CameraModel) -> Pixel {
+    Pixel::new(model.cx, model.cy)
+}
+
+/// The marker with another id of its family, unless `number` is 0.
+pub(super) fn with_id(marker: Marker, number: usize) -> Marker {
+    let id = marker.family.id_count().map(|count| (number as u32 * 7) % count);
+    Marker { id: if number == 0 { marker.id } else { id }, ..marker }
+}
+
+/// A random view of a marker: its size in the image within `size_px`, tilted by up to `max_tilt`.
+pub(super) fn view(
+    marker: Marker,
+    settings: CameraSettings,
+    set: Set,
+    frame: usize,
+    size_px: std::ops::Range<f64>,
+    max_tilt: f64,
+) -> (FrameSpec, ChaCha8Rng) {
+    let (mut rng, seed) = frame_rng(set, frame);
+    let model = settings.model;
+    let distance_m = model.fx * SIZE_M / rng.random_range(size_px);
+    let at = near(&mut rng, centre(&model), 200.0);
+    let tilt = Tilt { angle: rng.random_range(0.0..=max_tilt), about: rng.random_range(0.0..TAU) };
+    let heading = rng.random_range(0.0..TAU);
+    let pose = pose(&model, at, distance_m, tilt, heading);
+    let mut spec = FrameSpec::new(with_id(marker, frame), settings, pose, seed);
+    spec.surface = Surface::ALL[frame % 3];
+    (spec, rng)
+}
