@@ -58,7 +58,7 @@ pub struct GroundTruth {
 
 impl FrameSpec {
     /// A marker on asphalt in full sun, seen from `camera_from_marker`.
-    pub fn of(
+    pub fn new(
         marker: Marker,
         settings: CameraSettings,
         camera_from_marker: Transform<Camera, MarkerFrame>,
