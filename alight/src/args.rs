@@ -36,15 +36,15 @@ pub(crate) struct ParentArgs {
 #[derive(Args, Clone, Default)]
 #[command(next_help_heading = "Network")]
 pub(crate) struct NetworkArgs {
-    /// The network configuration: `local` (one machine), `ground`, or for the relay `drone` or `relay`; or a JSON5 file
-    /// [default: local].
+    /// The network configuration: `local` (one machine), `ground`, or for the relay `drone` or `relay`; or a
+    /// JSON5 file [default: local].
     #[arg(long, value_name = "ROLE|FILE", env = variable::ZENOH)]
     zenoh: Option<PathBuf>,
     /// Address of the drone, or of the relay to it: HOST or HOST:PORT.
     #[arg(long, value_name = "ADDRESS", env = variable::CONNECT)]
     connect: Option<String>,
-    /// Address at which the relay listens: HOST or HOST:PORT [default: port 7448 of all interfaces, with 7449 and 7450
-    /// for frames].
+    /// Address at which the relay listens: HOST or HOST:PORT [default: port 7448 of all interfaces, with 7449
+    /// and 7450 for frames].
     #[arg(long, value_name = "ADDRESS", env = variable::LISTEN)]
     listen: Option<String>,
     /// Rendezvous port of the processes of this machine, with `local` and `drone` [default: 7447].
@@ -53,7 +53,8 @@ pub(crate) struct NetworkArgs {
     /// The vehicle's name, the first part of all keys [default: drone].
     #[arg(long, value_name = "NAME", env = variable::VEHICLE)]
     vehicle: Option<String>,
-    /// Directory with the keys (`alight keys`). Connections are then encrypted, and each role has its access rights.
+    /// Directory with the keys (`alight keys`). Connections are then encrypted, and each role has its access
+    /// rights.
     #[arg(long, value_name = "DIRECTORY", env = variable::KEYS)]
     keys: Option<PathBuf>,
 }

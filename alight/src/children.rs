@@ -14,7 +14,8 @@ use crate::services::Service;
 
 /// Time that a child gets to stop after SIGTERM.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
-/// Maximum number of queued output lines; further ones are dropped, so that a service never waits for a terminal.
+/// Maximum number of queued output lines; further ones are dropped, so that a service never waits for a
+/// terminal.
 const MAX_QUEUED_LINES: usize = 256;
 
 /// An event of a child.

@@ -41,8 +41,8 @@ pub(crate) struct DoctorArgs {
     network: NetworkArgs,
 }
 
-/// Minimum memlock limit of a reader of frames, in bytes: a camera of 1296 x 972 pixels takes 5 MB, and a reader keeps
-/// the memory of every camera process it has seen.
+/// Minimum memlock limit of a reader of frames, in bytes: a camera of 1296 x 972 pixels takes 5 MB, and a
+/// reader keeps the memory of every camera process it has seen.
 const MIN_MEMLOCK: u64 = 64 << 20;
 /// Certificates that expire within this time are reported, in seconds.
 const EXPIRES_SOON_S: i64 = 30 * 86_400;
@@ -163,7 +163,8 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
             "`alight doctor` uses the operator's key",
         ),
     }
-    // The relay counts a connection to its ports as a denial, so they are tried only when no service was found.
+    // The relay counts a connection to its ports as a denial, so they are tried only when no service was
+    // found.
     if !findings.findings[before..]
         .iter()
         .any(|f| f.about == "services" && f.verdict == Verdict::Good)

@@ -22,33 +22,35 @@ pub(crate) struct ExperimentArgs {
 
 #[derive(Subcommand)]
 enum Experiment {
-    /// Find markers in rendered frames whose truth is known (the thesis' section 4.3, and more), and write tables and
-    /// figures.
+    /// Find markers in rendered frames with ground truth (section 4.3 of the thesis, extended), and write
+    /// tables and figures.
     Markers(MarkersArgs),
-    /// Land by the hundred in lock-step, faster than time: every combination of what is listed, so many seeds of each; with
-    /// tables, plots, and for every failure the command that repeats it (the thesis' section 4.4, and more).
+    /// Fly hundreds of landings in lock-step, faster than real time: every combination of the listed values,
+    /// with several seeds each; write tables, plots, and the command that repeats each failure (section 4.4
+    /// of the thesis, extended).
     Landing(LandingArgs),
 }
 
 #[derive(Args)]
 struct LandingArgs {
-    /// The folder for the report, every flight as CSV and JSON lines, and the plots.
+    /// Output folder: report, every flight as CSV and JSON lines, plots.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-landing")]
     output: PathBuf,
-    /// Flights of each combination.
+    /// Number of flights of each combination.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     flights: u64,
-    /// How the marker is seen: frames rendered and searched by the detector, or a model of the detector's errors.
+    /// Vision: rendered frames with the real detector, or a model of the detector's errors.
     #[arg(long, value_enum, default_value_t = VisionArg::Modelled)]
     vision: VisionArg,
-    /// Mean wind in m/s: one, a list 0,5,8, or a range 0..8 from which each seed draws.
+    /// Mean wind in m/s: a value, a list 0,5,8, or a range 0..8 with a random value for each seed.
     #[arg(long, value_name = "M/S", default_value = "0,2,5,8")]
     wind: Values,
-    /// Strength of the turbulence: 1 disturbs as much as ArduPilot's "turbulence 1". A list or range as well.
+    /// Strength of the turbulence: 1 is that of ArduPilot's simulator with "turbulence 1". A list or range as
+    /// well.
     #[arg(long, value_name = "STRENGTH", default_value = "1")]
     turbulence: Values,
-    /// From a frame's exposure to the arrival of its detections, in milliseconds; a quarter more by chance. A list or range
-    /// as well.
+    /// Latency from exposure to the arrival of detections, in milliseconds, with 25 % random jitter. A list
+    /// or range as well.
     #[arg(long, value_name = "MS", default_value = "80")]
     latency: Values,
     /// Height at the start, in metres. A list or range as well.
@@ -57,13 +59,13 @@ struct LandingArgs {
     /// Horizontal distance from the pad at the start, in metres. A list or range as well.
     #[arg(long, value_name = "M", default_value = "2.12")]
     offset: Values,
-    /// What goes wrong; `all` for each of them. May be repeated. A wrong name lists those there are.
+    /// Fault; `all` for each of them. May be repeated. An unknown name lists all.
     #[arg(long = "fault", value_name = "NAME", default_value = "none")]
     faults: Vec<String>,
     /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
     #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = landing_setting)]
     set: Vec<String>,
-    /// Flights at once; as many as there are cores by default.
+    /// Number of flights in parallel [default: number of cores].
     #[arg(long, value_name = "N")]
     jobs: Option<usize>,
     /// Seed of the first flight of each combination; the others follow.
@@ -73,9 +75,9 @@ struct LandingArgs {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum VisionArg {
-    /// Real pixels.
+    /// Rendered frames.
     Rendered,
-    /// A fitted model.
+    /// A model fitted to the detector.
     Modelled,
 }
 
@@ -90,18 +92,18 @@ fn landing_setting(text: &str) -> Result<String, String> {
 
 #[derive(Args)]
 struct MarkersArgs {
-    /// The folder to work in: frames in `sets`, answers, tables and figures in `results`. Frames that are there are not
+    /// Working folder: frames in `sets`; results, tables and figures in `results`. Existing frames are not
     /// rendered again.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-markers")]
     output: PathBuf,
-    /// Only this set: positions, far, landing, adverse, tilt, blur, noise, light, rolling, textured, tracking or negatives. May
-    /// be repeated.
+    /// Only this set: positions, far, landing, adverse, tilt, blur, noise, light, rolling, textured, tracking
+    /// or negatives. May be repeated.
     #[arg(long = "set", value_name = "NAME")]
     sets: Vec<Set>,
     /// Only this family. May be repeated.
     #[arg(long = "family", value_name = "FAMILY")]
     families: Vec<String>,
-    /// A folder of photographs with `labels.jsonl`, to find markers in as well.
+    /// Folder of photographs with `labels.jsonl`, to test on as well.
     #[arg(long, value_name = "DIR")]
     photographs: Option<PathBuf>,
 }

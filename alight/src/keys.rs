@@ -1,7 +1,8 @@
 //! `alight keys`: a development certificate authority, and a key for each role.
 //!
-//! The common name of a certificate is its role, to which `zenoh-config/secured.json5` grants access rights. The
-//! development authority cannot revoke keys: they expire, and a site that lost a key makes a new authority.
+//! The common name of a certificate is its role, to which `zenoh-config/secured.json5` grants access rights.
+//! The development authority cannot revoke keys: they expire, and a site that lost a key makes a new
+//! authority.
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;
@@ -53,7 +54,8 @@ enum Action {
         /// Directory of the authority [default: the output directory].
         #[arg(long, value_name = "DIRECTORY")]
         authority: Option<PathBuf>,
-        /// Address of the holder: an IP address or a host name. Required for `drone` and `relay`. May be repeated.
+        /// Address of the holder: an IP address or a host name. Required for `drone` and `relay`. May be
+        /// repeated.
         #[arg(long, value_name = "HOST")]
         address: Vec<String>,
         /// Days until it expires.

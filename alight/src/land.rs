@@ -30,7 +30,8 @@ pub(crate) struct LandArgs {
     /// One setting of a service: SERVICE.KEY=VALUE, for example simulator.wind.mean_m_s=5. May be repeated.
     #[arg(long, value_name = "SERVICE.KEY=VALUE")]
     set: Vec<String>,
-    /// Marker to land on, on the simulated pad as well: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family without ids.
+    /// Marker to land on, on the simulated pad as well: FAMILY:ID:SIZE_M, or FAMILY:SIZE_M for a family
+    /// without ids.
     #[arg(long, value_name = "MARKER")]
     marker: Option<Marker>,
     /// Pad of several markers to land on, in the simulator as well: the built-in `a4`, or a TOML file.
@@ -330,8 +331,8 @@ impl Rendezvous {
     }
 }
 
-/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768), so that one that is free now is
-/// still free when its service binds it.
+/// Ports outside of Linux' ephemeral range (`ip_local_port_range` begins at 32768), so that one that is free
+/// now is still free when its service binds it.
 const PORTS: std::ops::Range<u16> = 20_000..32_000;
 
 /// A free port. Each process begins its search at another one, so that two that start at once do not collide.

@@ -1,4 +1,5 @@
-//! The peers on which a supervisor's restarts depend: whether a landing is under way, and which detectors are running.
+//! The peers on which a supervisor's restarts depend: whether a landing is under way, and which detectors are
+//! running.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -185,8 +186,9 @@ impl LandingMonitor {
     }
 }
 
-/// A file that marks a landing under way, for the supervisor that is started after one that was killed. It is in the
-/// directory for runtime files ($RUNTIME_DIRECTORY or $XDG_RUNTIME_DIR), which does not survive a reboot.
+/// A file that marks a landing under way, for the supervisor that is started after one that was killed. It is
+/// in the directory for runtime files ($RUNTIME_DIRECTORY or $XDG_RUNTIME_DIR), which does not survive a
+/// reboot.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct LandingMarkerFile {
     file: Option<PathBuf>,

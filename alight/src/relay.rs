@@ -1,6 +1,7 @@
 //! `alight relay`: relays messages between the processes on the drone and the ground.
 //!
-//! Zenoh forwards the messages; this process keeps the session open, and reports its health and what it denies.
+//! Zenoh forwards the messages; this process keeps the session open, and reports its health and what it
+//! denies.
 
 use std::process::ExitCode;
 use std::time::Duration;

@@ -1,8 +1,8 @@
 //! `alight swap`: replaces the detector in use in flight, without a gap.
 //!
-//! The new detector is started as a process that outlives this one. It runs in shadow until it agrees with the active
-//! one, becomes the active one, and only then the old one is stopped. On any failure before that, the old one stays in
-//! use and the new one is stopped.
+//! The new detector is started as a process that outlives this one. It runs in shadow until it agrees with
+//! the active one, becomes the active one, and only then the old one is stopped. On any failure before that,
+//! the old one stays in use and the new one is stopped.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -41,11 +41,12 @@ const LOG_LINES_SHOWN: usize = 8;
 /// The arguments of a swap.
 #[derive(Args, Clone)]
 pub(crate) struct SwapArgs {
-    /// The new detector: a configuration (a `.toml` file), or a command, which is split into words as by a shell and gets
-    /// the network's options in its environment (ALIGHT_ZENOH, ALIGHT_CONNECT, ...).
+    /// The new detector: a configuration (a `.toml` file), or a command, which is split into words as by a
+    /// shell and gets the network's options in its environment (ALIGHT_ZENOH, ALIGHT_CONNECT, ...).
     #[arg(long, value_name = "FILE|COMMAND")]
     to: String,
-    /// Name of the new detector when a configuration is given [default: that of the file, with a number if it is taken].
+    /// Name of the new detector when a configuration is given [default: that of the file, with a number if it
+    /// is taken].
     #[arg(long, value_name = "ID")]
     id: Option<String>,
     /// Number of frames to compare with the active detector, from 1 to 30.
@@ -60,11 +61,12 @@ pub(crate) struct SwapArgs {
     /// Keep the old detector running, in shadow.
     #[arg(long)]
     keep_old: bool,
-    /// Wait until the new detector exits; Ctrl-C stops it. Without this option it continues in a process group of its
-    /// own, and writes to the log.
+    /// Wait until the new detector exits; Ctrl-C stops it. Without this option it continues in a process
+    /// group of its own, and writes to the log.
     #[arg(long)]
     wait: bool,
-    /// File for the output of the new detector [default: `detector.log` in a new private folder for temporary files].
+    /// File for the output of the new detector [default: `detector.log` in a new private folder for temporary
+    /// files].
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
     /// Format of the result: a sentence, or one JSON object.
@@ -213,8 +215,8 @@ impl NewDetector {
     }
 }
 
-/// A new folder for temporary files that only this user can access: a file of a predictable name in a shared directory
-/// could be a link that somebody else placed there.
+/// A new folder for temporary files that only this user can access: a file of a predictable name in a shared
+/// directory could be a link that somebody else placed there.
 fn private_folder() -> anyhow::Result<PathBuf> {
     let folder = tempfile::Builder::new().prefix("alight-").tempdir();
     Ok(folder.context("making a private folder for the log")?.keep())

@@ -1,4 +1,5 @@
-//! `alight up ROLE`: supervises the processes of one machine: starts them in order, restarts them, stops them in order.
+//! `alight up ROLE`: supervises the processes of one machine: starts them in order, restarts them, stops them
+//! in order.
 
 use std::collections::VecDeque;
 use std::path::PathBuf;
@@ -101,7 +102,8 @@ enum State {
     Running,
     /// To be restarted at this time.
     Waiting(Instant),
-    /// A detector that was stopped in favour of another one in its slot, and is restarted when that one is gone.
+    /// A detector that was stopped in favour of another one in its slot, and is restarted when that one is
+    /// gone.
     Replaced(Slot),
     GivenUp,
 }
@@ -111,8 +113,8 @@ impl Supervised {
         Self { job, pid: 0, exits: VecDeque::new(), state: State::Running }
     }
 
-    /// Handles the regular exit of a detector for which another one was swapped in; returns the message to show, `None`
-    /// for any other process and any other exit.
+    /// Handles the regular exit of a detector for which another one was swapped in; returns the message to
+    /// show, `None` for any other process and any other exit.
     fn on_replaced(&mut self, exit: &Exit, peers: &Peers, own: &[i32]) -> Option<String> {
         let slot = peers.slot_of(self.pid).filter(|_| exit.status == Some(0))?;
         let other = peers.replacement(&slot, own)?;
@@ -173,7 +175,8 @@ async fn supervise(site: &Site, role: Role, jobs: Vec<Job>) -> anyhow::Result<Ex
             say(&format!("{}: stopped", stopped.job.name));
         }
     }
-    // After a regular stop the landing is not resumed. The peers are closed first, as they write the marker file too.
+    // After a regular stop the landing is not resumed. The peers are closed first, as they write the marker
+    // file too.
     peers.close().await;
     marker_file.note(false);
     Ok(ExitCode::from(u8::from(all_given_up)))
@@ -256,8 +259,8 @@ fn restart_unreplaced(supervised: &mut [Supervised], peers: &Peers) {
     }
 }
 
-/// The start mode of a restarted controller. It never takes off a second time, and it resumes only a landing that was
-/// under way: a vehicle that somebody else flies in GUIDED is not landed.
+/// The start mode of a restarted controller. It never takes off a second time, and it resumes only a landing
+/// that was under way: a vehicle that somebody else flies in GUIDED is not landed.
 fn start_mode(job: &Job, landing: bool) -> Option<&'static str> {
     let is_controller = job.service == Some(Service::Controller);
     is_controller.then_some(if landing { "resume" } else { "command" })

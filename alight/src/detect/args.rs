@@ -9,15 +9,16 @@ use markers::Marker;
 /// The arguments of `alight detect`.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct DetectArgs {
-    /// Marker to find: `FAMILY:ID[:SIZE_M]`, or `FAMILY[:SIZE_M]` for a family without ids (rings). May be repeated.
+    /// Marker to find: `FAMILY:ID[:SIZE_M]`, or `FAMILY[:SIZE_M]` for a family without ids (rings). May be
+    /// repeated.
     #[arg(long = "marker", required_unless_present = "pads", value_name = "MARKER")]
     pub(super) markers: Vec<Marker>,
-    /// Pad to find, whose markers are solved together: the built-in `a4`, or a TOML file. It needs a camera, and is
-    /// reported as a marker `pad:ID`. May be repeated.
+    /// Pad to find, whose markers are solved together: the built-in `a4`, or a TOML file. It needs a camera,
+    /// and is reported as a marker `pad:ID`. May be repeated.
     #[arg(long = "pad", value_name = "PAD")]
     pub(super) pads: Vec<String>,
-    /// Calibration of the camera (ROS camera_info, Kalibr camchain or OpenCV FileStorage, as YAML), for the pose of markers
-    /// of known size.
+    /// Calibration of the camera (ROS camera_info, Kalibr camchain or OpenCV FileStorage, as YAML), for the
+    /// pose of markers of known size.
     #[arg(long, value_name = "FILE", conflicts_with = "focal_px")]
     pub(super) camera: Option<PathBuf>,
     /// Focal length in pixels instead of a calibration: an ideal lens with its axis at the image centre.
@@ -38,8 +39,8 @@ pub(crate) struct DetectArgs {
     /// Folder for annotated images: outlines, ids, confidence, and the axes of poses.
     #[arg(long, value_name = "DIR")]
     pub(super) draw: Option<PathBuf>,
-    /// Image files (PNG of 8 or 16 bits, JPEG), videos (Motion JPEG as AVI or stream, H.264 as MP4 or stream), and folders
-    /// of them.
+    /// Image files (PNG of 8 or 16 bits, JPEG), videos (Motion JPEG as AVI or stream, H.264 as MP4 or
+    /// stream), and folders of them.
     #[arg(required = true, value_name = "IMAGE")]
     pub(super) images: Vec<PathBuf>,
 }

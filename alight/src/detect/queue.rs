@@ -19,8 +19,8 @@ pub(super) struct Totals {
     pub(super) unreadable: usize,
 }
 
-/// Processes all images, each worker in a thread of its own, and prints their lines in the order of the images. A closed
-/// pipe ends the work.
+/// Processes all images, each worker in a thread of its own, and prints their lines in the order of the
+/// images. A closed pipe ends the work.
 pub(super) fn process_all<W: Write + Send, T: Send>(
     source: Source,
     workers: Vec<T>,
@@ -43,7 +43,8 @@ pub(super) fn process_all<W: Write + Send, T: Send>(
     printer.end()
 }
 
-/// Hands out the images with their numbers and collects their lines; only few lines ever wait for an earlier one.
+/// Hands out the images with their numbers and collects their lines; only few lines ever wait for an earlier
+/// one.
 struct Queue<W> {
     /// Locked before the printer, never after it.
     source: Mutex<Source>,

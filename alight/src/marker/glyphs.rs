@@ -12,8 +12,8 @@ const ADVANCE: f64 = 6.0;
 
 type Rectangle = ([f64; 2], [f64; 2]);
 
-/// The dots of a text as rectangles (top left and bottom right corner), in millimetres; `at_mm` is the left end of its
-/// baseline. The font has capitals only; unknown characters are blank.
+/// The dots of a text as rectangles (top left and bottom right corner), in millimetres; `at_mm` is the left
+/// end of its baseline. The font has capitals only; unknown characters are blank.
 pub(super) fn rectangles(text: &str, at_mm: [f64; 2]) -> impl Iterator<Item = Rectangle> {
     let dot = TEXT_MM * CAPITAL / ROWS;
     text.chars().zip(0..).flat_map(move |(letter, index)| {

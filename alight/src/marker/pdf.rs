@@ -7,8 +7,8 @@ use super::sheet::{Mark, Sheet, TEXT_MM};
 
 /// Units of a PDF in a millimetre.
 const PER_MM: f64 = 72.0 / 25.4;
-/// Distance of the control points of a quarter circle's Bezier curve along the tangent, in radii; the error is below
-/// 0.03 %.
+/// Distance of the control points of a quarter circle's Bezier curve along the tangent, in radii; the error
+/// is below 0.03 %.
 const QUARTER_CIRCLE: f64 = 0.552_284_749_830_793_4;
 
 const FONT: Name<'static> = Name(b"F1");

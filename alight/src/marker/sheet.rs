@@ -73,7 +73,8 @@ impl Paper {
         }
     }
 
-    /// The largest marker with its quiet zone that fits between the edges and above the ruler, in millimetres.
+    /// The largest marker with its quiet zone that fits between the edges and above the ruler, in
+    /// millimetres.
     fn room_mm(self) -> f64 {
         let [width, height] = self.size_mm();
         (width - 2.0 * MARGIN_MM).min(height - 2.0 * BELOW_MM)
@@ -127,7 +128,8 @@ impl std::fmt::Display for SheetError {
 
 impl std::error::Error for SheetError {}
 
-/// An element on the paper, in millimetres from its top left corner, x right, y down; later marks cover earlier ones.
+/// An element on the paper, in millimetres from its top left corner, x right, y down; later marks cover
+/// earlier ones.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Mark {
     /// A filled circle.

@@ -1,9 +1,10 @@
 //! Frames through Zenoh alone, on one host: written in place into shared memory, read in another process.
 //!
-//! It has the configuration, the quality of service and the threads of the services and nothing else of them, so it shows
-//! which part of a frame's way is Zenoh's. `cargo bench -p tests -- link onehost` runs it in turns with
-//! frames through `node` and with a bare ring, once it is built: `cargo build --release -p node --example bare_zenoh`.
-//! `bare_zenoh PERIOD_US FRAMES WARM_UP BYTES` prints how long each frame took, and the processor time, as JSON.
+//! It has the configuration, the quality of service and the threads of the services and nothing else of them,
+//! so it shows which part of a frame's way is Zenoh's. `cargo test --release -p tests --test link -- table
+//! onehost` runs it in turns with frames through `node` and with a bare ring, once it is built: `cargo build
+//! --release -p node --example bare_zenoh`. `bare_zenoh PERIOD_US FRAMES WARM_UP BYTES` prints how long each
+//! frame took, and the processor time, as JSON.
 
 #![expect(clippy::print_stdout, reason = "what was measured is for the program that started it")]
 

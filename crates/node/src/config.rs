@@ -1,8 +1,8 @@
 //! Layered configuration: defaults, a user's file, and `key=value` settings.
 //!
-//! Each service ships a TOML file with every key, its default, and a comment with meaning, unit and range. A user's
-//! file and single settings override it. An unknown key, a value of another type and a value out of range are rejected
-//! with their source, the key, the value and the limit.
+//! Each service ships a TOML file with every key, its default, and a comment with meaning, unit and range. A
+//! user's file and single settings override it. An unknown key, a value of another type and a value out of
+//! range are rejected with their source, the key, the value and the limit.
 
 use std::fmt::Display;
 use std::ops::RangeInclusive;

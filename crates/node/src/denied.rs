@@ -1,7 +1,8 @@
-//! Counts what Zenoh denies: connections without a valid certificate, and messages that access control rejects.
+//! Counts what Zenoh denies: connections without a valid certificate, and messages that access control
+//! rejects.
 //!
-//! Zenoh 1.10 has no counter for these. It only logs them, below the level that is shown; this module reads those log
-//! messages. `tests/denied.rs` fails when Zenoh words them differently.
+//! Zenoh 1.10 has no counter for these. It only logs them, below the level that is shown; this module reads
+//! those log messages. `tests/denied.rs` fails when Zenoh words them differently.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -97,9 +98,9 @@ thread_local! {
     static CACHED_KEY: RefCell<Option<String>> = const { RefCell::new(None) };
 }
 
-/// Whether a message only reports a permission that Zenoh caches. When a key is first used, Zenoh logs a heading, and
-/// then the permission of every action on it, as if each had been attempted; the liveliness subscription, which is
-/// allowed to all roles, is the last one.
+/// Whether a message only reports a permission that Zenoh caches. When a key is first used, Zenoh logs a
+/// heading, and then the permission of every action on it, as if each had been attempted; the liveliness
+/// subscription, which is allowed to all roles, is the last one.
 fn is_precomputed(message: &str) -> bool {
     CACHED_KEY.with_borrow_mut(|cached| {
         if let Some(rest) = message.strip_prefix("ACL (ingress): caching permissions for `") {
@@ -116,16 +117,16 @@ fn is_precomputed(message: &str) -> bool {
     })
 }
 
-/// Parses `ZID on SUBJECT is unauthorized to Query (ingress) on KEY`, or `ZID is unauthorized ...` from the cache.
-/// Outgoing messages are not counted: their sender is this process.
+/// Parses `ZID on SUBJECT is unauthorized to Query (ingress) on KEY`, or `ZID is unauthorized ...` from the
+/// cache. Outgoing messages are not counted: their sender is this process.
 fn denied_message(message: &str) -> Option<String> {
     let (_who, what) = message.split_once(" is unauthorized to ")?;
     let (action, key) = what.split_once(" (ingress) on ")?;
     Some(format!("denied: {} on {key}", action.to_lowercase()))
 }
 
-/// The listener logs the cause of every connection it rejects, with a hint at the limit on open files, which is the one
-/// cause that is not a denial.
+/// The listener logs the cause of every connection it rejects, with a hint at the limit on open files, which
+/// is the one cause that is not a denial.
 fn is_denied_connection(message: &str) -> bool {
     message.contains("Hint:") && !message.contains("Too many open files")
 }

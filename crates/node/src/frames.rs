@@ -1,8 +1,8 @@
 //! Frames in shared memory, without a copy.
 //!
 //! On one host a frame is never copied between camera and detector: the camera borrows a buffer
-//! ([`FramePublisher::loan`]), writes into it and publishes it; a subscriber reads the same memory. Without shared
-//! memory the buffer is ordinary memory, which Zenoh copies; this is counted.
+//! ([`FramePublisher::loan`]), writes into it and publishes it; a subscriber reads the same memory. Without
+//! shared memory the buffer is ordinary memory, which Zenoh copies; this is counted.
 
 use std::borrow::Cow;
 use std::ops::{Deref, DerefMut};
@@ -29,15 +29,17 @@ use crate::topics::report_refused;
 /// readers. Small, because every subscriber keeps the whole pool mapped and locked.
 const FRAMES_IN_POOL: usize = 4;
 
-/// A pool that is exhausted for this time is replaced: a reader that was killed never returns its frames. Longer than
-/// any reader keeps a frame.
+/// A pool that is exhausted for this time is replaced: a reader that was killed never returns its frames.
+/// Longer than any reader keeps a frame.
 const POOL_EXHAUSTED_TIMEOUT: Duration = Duration::from_secs(1);
-/// Minimum failed allocations, besides, before a pool is replaced: at a low frame rate the time alone says little.
+/// Minimum failed allocations, besides, before a pool is replaced: at a low frame rate the time alone says
+/// little.
 const MIN_FAILED_ALLOCATIONS: u32 = 4;
 /// Maximum number of replacement pools of a publisher, as readers keep the old ones mapped.
 const MAX_NEW_POOLS: u32 = 3;
 
-/// On the air link each priority has a connection of its own (`zenoh-config/README.md`); frames use these two.
+/// On the air link each priority has a connection of its own (`zenoh-config/README.md`); frames use these
+/// two.
 const FIRST_PRIORITY: Priority = Priority::DataLow;
 const SECOND_PRIORITY: Priority = Priority::Background;
 const FRAME_CONNECTIONS: usize = 2;
@@ -178,9 +180,9 @@ impl Pool {
         self.provider.alloc(len).with_policy::<GarbageCollect>().wait().ok()
     }
 
-    /// Whether readers may lock one more pool beside those they keep, and as much again for other locked memory: a
-    /// reader beyond its limit would get no frames, while without a new pool they are copied. Readers are assumed to
-    /// have the limit of this process.
+    /// Whether readers may lock one more pool beside those they keep, and as much again for other locked
+    /// memory: a reader beyond its limit would get no frames, while without a new pool they are copied.
+    /// Readers are assumed to have the limit of this process.
     fn is_replaceable(&self) -> bool {
         let pools = u64::from(self.replaced_pools) + 2;
         let needed = (pools + 1).saturating_mul(self.bytes as u64);
@@ -223,8 +225,8 @@ impl FramePublisher {
         }
     }
 
-    /// A publisher on the same key that uses the second connection for frames on the air link: its frames do not wait
-    /// behind one that the first connection has not delivered yet. It has no shared memory.
+    /// A publisher on the same key that uses the second connection for frames on the air link: its frames do
+    /// not wait behind one that the first connection has not delivered yet. It has no shared memory.
     ///
     /// # Errors
     /// When the session is closed.
@@ -267,8 +269,8 @@ impl Frame {
 }
 
 impl FrameSubscriber {
-    /// The latest frame, or one of the latest two on the air link; `None` once the session is closed. A frame with an
-    /// invalid header, or with a length that does not match its header, is counted, and logged once.
+    /// The latest frame, or one of the latest two on the air link; `None` once the session is closed. A frame
+    /// with an invalid header, or with a length that does not match its header, is counted, and logged once.
     pub async fn next(&self) -> Option<Frame> {
         loop {
             let sample = self.subscriber.recv_async().await.ok()?;

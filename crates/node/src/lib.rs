@@ -1,11 +1,12 @@
-//! What every service needs: configuration, a session, presence, typed topics, health, and an orderly shutdown.
+//! What every service needs: configuration, a session, presence, typed topics, health, and an orderly
+//! shutdown.
 //!
 //! This is the only crate that uses Zenoh. It knows nothing of images, markers or autopilots.
 //!
-//! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a service from
-//! start to shutdown; [`network`] configures the network, and [`session`] joins it under an [`identity`]; [`topics`]
-//! has typed messages and [`frames`] pixels; [`health`] counts, with [`stats`]; [`denied`] counts what access control
-//! denies; [`clock`] is the host's clock.
+//! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
+//! service from start to shutdown; [`network`] configures the network, and [`session`] joins it under an
+//! [`identity`]; [`topics`] has typed messages and [`frames`] pixels; [`health`] counts, with [`stats`];
+//! [`denied`] counts what access control denies; [`clock`] is the host's clock.
 
 pub mod clock;
 pub mod config;

@@ -1,7 +1,7 @@
 //! The network that a process joins: a built-in configuration and the settings of a site.
 //!
-//! The JSON5 file of a role configures how its processes connect; the vehicle's name, addresses and keys differ from
-//! site to site and are filled in here, so that no site needs files of its own.
+//! The JSON5 file of a role configures how its processes connect; the vehicle's name, addresses and keys
+//! differ from site to site and are filled in here, so that no site needs files of its own.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -53,7 +53,8 @@ pub mod variable {
 /// A network to join. The default is local to this machine.
 #[derive(Clone, Debug, Default)]
 pub struct Network {
-    /// A built-in configuration (`local`, `drone`, `ground`, `relay`) or a JSON5 file; `local` if there is none.
+    /// A built-in configuration (`local`, `drone`, `ground`, `relay`) or a JSON5 file; `local` if there is
+    /// none.
     pub config: Option<PathBuf>,
     /// The vehicle's name, the namespace of all keys.
     pub vehicle: Option<String>,
@@ -147,8 +148,8 @@ impl Network {
     }
 }
 
-/// Rejects access control with policies that name undefined rules or subjects: Zenoh would accept them, and then allow
-/// or deny something else than intended.
+/// Rejects access control with policies that name undefined rules or subjects: Zenoh would accept them, and
+/// then allow or deny something else than intended.
 ///
 /// # Errors
 /// Names the policy's entry.

@@ -15,8 +15,9 @@ use crate::denied::{DeniedCounter, DeniedFilter};
 use crate::identity::Identity;
 use crate::session::{Node, ZenohSource};
 
-/// Zenoh's threads: enough that a broken air link cannot block them all, and one pool for everything incoming, so
-/// that a message is not passed from the accepting to the receiving pool (measured: `zenoh-config/README.md`).
+/// Zenoh's threads: enough that a broken air link cannot block them all, and one pool for everything
+/// incoming, so that a message is not passed from the accepting to the receiving pool (measured:
+/// `zenoh-config/README.md`).
 const ZENOH_RUNTIME: &str =
     "(tx:(worker_threads:4),net:(worker_threads:8),rx:(handover:net),acc:(handover:net))";
 const ZENOH_RUNTIME_VARIABLE: &str = "ZENOH_RUNTIME";
@@ -95,10 +96,10 @@ where
 /// Starts logging to standard error, at `default_level` unless `ALIGHT_LOG` sets another.
 pub fn start_logging(default_level: &str) {
     let ours = std::env::var("ALIGHT_LOG").unwrap_or_else(|_| default_level.to_owned());
-    // Zenoh warns about every failed attempt to listen at or connect to the rendezvous, which are expected here.
-    // It also warns about messages in flight when their sender's session closes ("Route data with unknown scope",
-    // "Route query with unknown scope"; eclipse-zenoh/zenoh issues 980 and 1050, pull request 2524). Such a query gets
-    // an empty reply, and a command without a recipient is sent again.
+    // Zenoh warns about every failed attempt to listen at or connect to the rendezvous, which are expected
+    // here. It also warns about messages in flight when their sender's session closes ("Route data with
+    // unknown scope", "Route query with unknown scope"; eclipse-zenoh/zenoh issues 980 and 1050, pull request
+    // 2524). Such a query gets an empty reply, and a command without a recipient is sent again.
     let filter = EnvFilter::try_new(format!(
         "zenoh=error,zenoh::net::routing::dispatcher::pubsub=off,zenoh::net::routing::dispatcher::queries=off,zenoh::api::session=off,zenoh_transport=off,zenoh_link=error,zenoh_link_tls=error,zenoh_shm=error,{ours}"
     ))
@@ -115,9 +116,9 @@ pub fn start_logging(default_level: &str) {
     drop(tracing_subscriber::registry().with(log).with(denied).try_init());
 }
 
-/// Sets the number of Zenoh's threads by re-executing this program with `ZENOH_RUNTIME` in its environment, which
-/// Zenoh reads once, and which a program with threads must not change. Call it first in `main`; returns when the
-/// variable is set already.
+/// Sets the number of Zenoh's threads by re-executing this program with `ZENOH_RUNTIME` in its environment,
+/// which Zenoh reads once, and which a program with threads must not change. Call it first in `main`; returns
+/// when the variable is set already.
 pub fn relaunch_with_zenoh_threads() {
     use std::os::unix::process::CommandExt;
     if std::env::var_os(ZENOH_RUNTIME_VARIABLE).is_some() {

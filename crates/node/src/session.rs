@@ -103,11 +103,11 @@ impl Node {
         Arc::clone(&self.health)
     }
 
-    /// Claims the name of this instance: fails when an instance of this service that `matches` (`*` for any) is
-    /// running, or is starting at the same time and has priority.
+    /// Claims the name of this instance: fails when an instance of this service that `matches` (`*` for any)
+    /// is running, or is starting at the same time and has priority.
     ///
-    /// The claim is declared before the check, so that of two that start at once at least one sees the other; the one
-    /// whose name and session id sort first has priority.
+    /// The claim is declared before the check, so that of two that start at once at least one sees the other;
+    /// the one whose name and session id sort first has priority.
     ///
     /// # Errors
     /// Names the other instance.
@@ -244,7 +244,8 @@ impl Node {
 
     /// Closes the session.
     ///
-    /// A session that still waits for the rendezvous can take long to close; the end of the process then closes it.
+    /// A session that still waits for the rendezvous can take long to close; the end of the process then
+    /// closes it.
     pub async fn close(self) {
         match tokio::time::timeout(CLOSE_TIMEOUT, self.session.close()).await {
             Ok(Ok(())) => {}

@@ -62,9 +62,9 @@ struct Qos {
     depth: usize,
 }
 
-/// Nothing is published with `CongestionControl::Block`: a broken link would block the publisher, and with it the
-/// messages to all others, until Zenoh closes the link. `Drop` waits at most a millisecond, and only when the link's
-/// queue for this priority is full.
+/// Nothing is published with `CongestionControl::Block`: a broken link would block the publisher, and with it
+/// the messages to all others, until Zenoh closes the link. `Drop` waits at most a millisecond, and only when
+/// the link's queue for this priority is full.
 fn qos(delivery: Delivery) -> Qos {
     let (priority, congestion, depth) = match delivery {
         Delivery::Latest => (Priority::Data, CongestionControl::Drop, 4),
@@ -191,8 +191,8 @@ impl Node {
         Ok(Commands { queryable, health: self.shared_health(), message: PhantomData })
     }
 
-    /// Sends a command on a topic's key and waits for its reply. A new session may not be connected to the recipient
-    /// yet, so a command without a recipient is sent again; one that reached a recipient never is.
+    /// Sends a command on a topic's key and waits for its reply. A new session may not be connected to the
+    /// recipient yet, so a command without a recipient is sent again; one that reached a recipient never is.
     ///
     /// # Errors
     /// When there is no reply in time.

@@ -1,5 +1,5 @@
-//! The log texts by which [`node::denied`] recognises denials are those of the Zenoh version in use: a real message
-//! without access rights, and a real connection with the certificate of another authority.
+//! The log texts by which [`node::denied`] recognises denials are those of the Zenoh version in use: a real
+//! message without access rights, and a real connection with the certificate of another authority.
 
 use std::path::Path;
 use std::time::Duration;

@@ -1,9 +1,9 @@
 //! How wrong the detector `rings` is in rendered frames, and how `world::vision::RINGS` says it is:
 //! `cargo run --release -p experiments --example fit_vision [FRAMES [FILE.svg]]`.
 //!
-//! Frames are taken with the simulator's default camera over its default pad from 0.4 to 25 m, at tilts up to 20 degrees,
-//! anywhere in the image, with up to 6 pixels of motion blur. Below the table stand the numbers to put into `RINGS`; the plot
-//! shows the errors and the model's deviation.
+//! Frames are taken with the simulator's default camera over its default pad from 0.4 to 25 m, at tilts up to
+//! 20 degrees, anywhere in the image, with up to 6 pixels of motion blur. Below the table stand the numbers
+//! to put into `RINGS`; the plot shows the errors and the model's deviation.
 
 #![allow(clippy::print_stdout, reason = "a program's output")]
 
@@ -22,7 +22,8 @@ use world::drift::{random_stream, uniform};
 use world::vehicle::{Vehicle, VehicleConfig, VehicleTruth};
 use world::vision::{RINGS, VisionModel};
 
-/// One frame: size and blur in pixels, and what was found: the errors, and the deviations told of centre and range.
+/// One frame: size and blur in pixels, and what was found: the errors, and the deviations told of centre and
+/// range.
 struct Look {
     size_px: f64,
     blur_px: f64,

@@ -1,5 +1,6 @@
-//! The effect of JPEG: `cargo run --release -p experiments --example jpeg -- [MARKER...]` renders frames of the thesis'
-//! camera, compresses them as the air link does, and prints the detection range and the centre error of each marker.
+//! The effect of JPEG: `cargo run --release -p experiments --example jpeg -- [MARKER...]` renders frames of
+//! the thesis' camera, compresses them as the air link does, and prints the detection range and the centre
+//! error of each marker.
 #![allow(clippy::print_stdout, reason = "a program for people at a terminal")]
 
 use anyhow::Context;

@@ -1,5 +1,5 @@
-//! The experiment with markers without the rest of the program:
-//! `cargo run --release -p experiments --example markers -- SETS RESULTS [set=NAME] [family=NAME] [photographs=FOLDER]...`.
+//! The experiment with markers without the rest of the program: `cargo run --release -p experiments --example
+//! markers -- SETS RESULTS [set=NAME] [family=NAME] [photographs=FOLDER]...`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a program for people at a terminal")]
 
 use std::path::PathBuf;

@@ -1,5 +1,5 @@
-//! Prints how long a frame of the thesis' camera takes to render, by height, tilt and motion; with a folder as
-//! argument, writes the pictures there.
+//! Prints how long a frame of the thesis' camera takes to render, by height, tilt and motion; with a folder
+//! as argument, writes the pictures there.
 #![allow(clippy::print_stdout, reason = "a table for people is what this example is for")]
 
 use std::path::PathBuf;

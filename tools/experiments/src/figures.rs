@@ -32,8 +32,8 @@ fn colour_of(family: &str, ours: &[Curve]) -> RGBColor {
     COLOURS[place % COLOURS.len()]
 }
 
-/// The figure of a binning as SVG: the estimated distances with those of the thesis above, their errors below. `None`
-/// without a run of the positions.
+/// The figure of a binning as SVG: the estimated distances with those of the thesis above, their errors
+/// below. `None` without a run of the positions.
 ///
 /// # Errors
 /// When it cannot be drawn.

@@ -1,4 +1,5 @@
-//! The specification of a rendered frame (scene, camera, pose, occlusion), its ground truth, and its rendering.
+//! The specification of a rendered frame (scene, camera, pose, occlusion), its ground truth, and its
+//! rendering.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -28,8 +29,9 @@ pub struct FrameSpec {
     pub inverted: bool,
     /// The camera.
     pub settings: CameraSettings,
-    /// `camera_from_marker` from the opening to the closing of the shutter (with a rolling shutter from the opening in the
-    /// first row to the closing in the last); one pose without motion. In a negative, of the place of a marker.
+    /// `camera_from_marker` from the opening to the closing of the shutter (with a rolling shutter from the
+    /// opening in the first row to the closing in the last); one pose without motion. In a negative, of the
+    /// place of a marker.
     pub path: Vec<Transform<Camera, MarkerFrame>>,
     /// The ground.
     pub surface: Surface,
@@ -52,7 +54,8 @@ pub struct GroundTruth {
     pub camera_from_marker: Transform<Camera, MarkerFrame>,
     /// The pixel of its centre.
     pub centre: Pixel,
-    /// The pixels of the corners of the square of its size: its own top left first, then clockwise on the print.
+    /// The pixels of the corners of the square of its size: its own top left first, then clockwise on the
+    /// print.
     pub corners: [Pixel; 4],
 }
 
@@ -153,8 +156,8 @@ impl Tilt {
     pub const NONE: Self = Self { angle: 0.0, about: 0.0 };
 }
 
-/// `camera_from_marker` for a marker with its centre at a pixel, at a distance along the optical axis, rotated by
-/// `heading` (radians) in its plane and then tilted.
+/// `camera_from_marker` for a marker with its centre at a pixel, at a distance along the optical axis,
+/// rotated by `heading` (radians) in its plane and then tilted.
 pub fn pose(
     model: &CameraModel,
     seen_at: Pixel,

@@ -1,11 +1,13 @@
-//! The thesis' experiments, extended: markers in rendered frames (section 4.3), and hundreds of landings (section 4.4).
+//! The thesis' experiments, extended: markers in rendered frames (section 4.3), and hundreds of landings
+//! (section 4.4).
 //!
 //! This crate is above the services: it calls their pure parts as functions, without a network or a clock.
 //!
-//! Modules in reading order: [`markers`] is the experiment with markers. [`frame_spec`] specifies and renders one frame;
-//! [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`] has a detector's
-//! results, and [`score`] their errors; [`photographs`] has the results on real images; [`report`] is the report, with
-//! the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the experiment with landings.
+//! Modules in reading order: [`markers`] is the experiment with markers. [`frame_spec`] specifies and renders
+//! one frame; [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`]
+//! has a detector's results, and [`score`] their errors; [`photographs`] has the results on real images;
+//! [`report`] is the report, with the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the
+//! experiment with landings.
 
 pub mod figures;
 pub mod frame_spec;

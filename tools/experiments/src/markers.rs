@@ -1,4 +1,5 @@
-//! The experiment with markers: renders missing sets, runs the detector, scores all results, writes the report.
+//! The experiment with markers: renders missing sets, runs the detector, scores all results, writes the
+//! report.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

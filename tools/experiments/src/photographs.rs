@@ -178,8 +178,8 @@ pub fn families_for_negatives() -> [(&'static str, Vec<Family>); 2] {
 /// The number of images, and the false detections by image.
 pub type Negatives = (usize, Vec<(String, Vec<Found>)>);
 
-/// False detections in the photographs without a marker: the whole image, its quarters and its ninths, each at full
-/// resolution.
+/// False detections in the photographs without a marker: the whole image, its quarters and its ninths, each
+/// at full resolution.
 ///
 /// # Errors
 /// When a photograph or the labels cannot be read.

@@ -1,4 +1,5 @@
-//! Scores of results: recall, wrong ids, false detections, errors of centre and range, consistency of the covariances.
+//! Scores of results: recall, wrong ids, false detections, errors of centre and range, consistency of the
+//! covariances.
 
 use node::stats::{interpolated_quantile as quantile, mean};
 use serde::Serialize;
@@ -37,8 +38,8 @@ pub struct Score {
     pub false_in: Vec<String>,
 }
 
-/// A detection is elsewhere if its centre is off by more than this many pixels and by more than this fraction of the
-/// marker's size.
+/// A detection is elsewhere if its centre is off by more than this many pixels and by more than this fraction
+/// of the marker's size.
 const ELSEWHERE_PX: f64 = 3.0;
 const ELSEWHERE_RATIO: f64 = 0.1;
 

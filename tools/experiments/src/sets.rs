@@ -1,6 +1,7 @@
 //! The frames of the sets.
 //!
-//! A set has the same views, grounds and lights for every marker, so that results of different markers are comparable.
+//! A set has the same views, grounds and lights for every marker, so that results of different markers are
+//! comparable.
 
 mod adverse;
 mod clutter;

@@ -63,7 +63,8 @@ pub struct MarkerLine {
     pub size_m: f64,
     /// The pixel of its centre.
     pub centre_px: [f64; 2],
-    /// The pixels of its corners, its own top left first, then clockwise; for rings of the square about the outer circle.
+    /// The pixels of its corners, its own top left first, then clockwise; for rings of the square about the
+    /// outer circle.
     pub corners_px: [[f64; 2]; 4],
     /// Its longest side in the image.
     pub size_px: f64,

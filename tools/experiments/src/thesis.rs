@@ -1,4 +1,5 @@
-//! The measurements of the thesis (Tables A.1 to A.8): mean and standard deviation of the errors at each position.
+//! The measurements of the thesis (Tables A.1 to A.8): mean and standard deviation of the errors at each
+//! position.
 
 #![allow(clippy::approx_constant, reason = "0.318 m is a measurement and not 1 / pi")]
 
@@ -14,14 +15,14 @@ pub struct Table {
     pub rows: &'static [Row],
 }
 
-/// One position: x along the camera's axis and y across, in metres, then the mean errors along x, y and z, and their
-/// standard deviations, in metres.
+/// One position: x along the camera's axis and y across, in metres, then the mean errors along x, y and z,
+/// and their standard deviations, in metres.
 pub struct Row(pub u32, pub i32, pub [f64; 3], pub [f64; 3]);
 
 /// All eight tables.
 ///
-/// The tables have y = -1 and 1 at x = 2 and 3, but Table 4.1 has -0.5 and 0.5; 1 m is outside of the view at 2 m. A row
-/// of zeros (Table A.5 at 10, -2) means no detection, and is omitted.
+/// The tables have y = -1 and 1 at x = 2 and 3, but Table 4.1 has -0.5 and 0.5; 1 m is outside of the view at
+/// 2 m. A row of zeros (Table A.5 at 10, -2) means no detection, and is omitted.
 pub const TABLES: [Table; 8] = [
     Table {
         name: "A.1",

@@ -1,4 +1,5 @@
-//! Errors are consistent with the covariance, for every family at any blur, and for rings with saturated white.
+//! Errors are consistent with the covariance, for every family at any blur, and for rings with saturated
+//! white.
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 

@@ -1,4 +1,5 @@
-//! Landings in lock-step: repeatable to the bit, alike with rendered and with modelled vision, and safe whatever goes wrong.
+//! Landings in lock-step: repeatable to the bit, alike with rendered and with modelled vision, and safe
+//! whatever goes wrong.
 
 use experiments::landing::fault::Fault;
 use experiments::landing::flight::fly;

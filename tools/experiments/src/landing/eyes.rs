@@ -1,4 +1,5 @@
-//! From the simulated world to a detector's message: rendered frames with the real detector, or a model of its errors.
+//! From the simulated world to a detector's message: rendered frames with the real detector, or a model of
+//! its errors.
 
 use anyhow::Context;
 use detector::wire;
@@ -188,7 +189,8 @@ fn detection(family: &str, found: &Found) -> Detection {
     }
 }
 
-/// The detector's error for a known pose, to fit the model: centre x and y in pixels, relative range, tilt in radians.
+/// The detector's error for a known pose, to fit the model: centre x and y in pixels, relative range, tilt in
+/// radians.
 pub fn errors(
     model: &CameraModel,
     found: &Transform<Camera, Marker>,

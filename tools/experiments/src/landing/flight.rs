@@ -1,5 +1,5 @@
-//! One flight in lock-step: the simulated autopilot and the controller exchange MAVLink packets, detections arrive after
-//! their latency, and nothing waits for a clock.
+//! One flight in lock-step: the simulated autopilot and the controller exchange MAVLink packets, detections
+//! arrive after their latency, and nothing waits for a clock.
 
 use std::collections::VecDeque;
 

@@ -1,9 +1,9 @@
-//! Hundreds of landings: the simulator's world and the controller in lock-step in one process, without a network or a
-//! clock, so that a seed reproduces a flight to the bit.
+//! Hundreds of landings: the simulator's world and the controller in lock-step in one process, without a
+//! network or a clock, so that a seed reproduces a flight to the bit.
 //!
-//! Modules in reading order: [`plan`] has the flights, with the faults of [`fault`]; [`flight`] flies one, with the vision
-//! of [`eyes`], rendered or modelled; [`outcome`] is its result; [`table`] summarises many; [`plots`] and
-//! [`thesis_figures`] draw; [`report`] writes the report.
+//! Modules in reading order: [`plan`] has the flights, with the faults of [`fault`]; [`flight`] flies one,
+//! with the vision of [`eyes`], rendered or modelled; [`outcome`] is its result; [`table`] summarises many;
+//! [`plots`] and [`thesis_figures`] draw; [`report`] writes the report.
 
 pub mod eyes;
 pub mod fault;
@@ -24,8 +24,8 @@ use flight::fly;
 use outcome::Outcome;
 use plan::{Planned, Request};
 
-/// Flies all, writes results, plots and the report, and returns the report. `progress` gets the number of finished
-/// flights and of all.
+/// Flies all, writes results, plots and the report, and returns the report. `progress` gets the number of
+/// finished flights and of all.
 ///
 /// # Errors
 /// When a setting is invalid or a file cannot be written.

@@ -1,4 +1,5 @@
-//! The files of results: every flight as CSV and JSON lines, plots, the thesis' figures of one flight, and the report.
+//! The files of results: every flight as CSV and JSON lines, plots, the thesis' figures of one flight, and
+//! the report.
 
 use std::fmt::Write as _;
 use std::path::Path;

@@ -13,7 +13,8 @@ pub fn numbers(outcomes: &[&Outcome], of: Column) -> Vec<f64> {
     landed.filter_map(|outcome| of(outcome)).collect()
 }
 
-/// 95 % confidence interval of the median from order statistics (normal approximation of the binomial distribution).
+/// 95 % confidence interval of the median from order statistics (normal approximation of the binomial
+/// distribution).
 pub fn median_interval(numbers: &[f64]) -> Option<[f64; 2]> {
     let count = numbers.len() as f64;
     let reach = 0.98 * count.sqrt();

@@ -1,4 +1,5 @@
-//! The thesis' Figures 4.10 to 4.16 for one flight: trajectory, position and command per axis, wind and command per axis.
+//! The thesis' Figures 4.10 to 4.16 for one flight: trajectory, position and command per axis, wind and
+//! command per axis.
 
 use std::ops::Range;
 

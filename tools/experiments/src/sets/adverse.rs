@@ -53,7 +53,8 @@ fn glare(marker: Marker, frame: usize) -> FrameSpec {
 /// An occluded corner of a square, or third of the outer ring.
 fn occlusion(marker: Marker, frame: usize) -> FrameSpec {
     let (spec, mut rng) = large(marker, frame);
-    // Distance of the edge from the centre in marker sizes: a chord that hides a third of a circle, or a corner.
+    // Distance of the edge from the centre in marker sizes: a chord that hides a third of a circle, or a
+    // corner.
     let (towards, away) = if marker.family.id_count().is_none() {
         (rng.random_range(0.0..TAU), 0.25)
     } else {
@@ -121,8 +122,8 @@ fn cut_border(marker: Marker, frame: usize) -> FrameSpec {
     .with("cut-border", Occluder::None)
 }
 
-/// A marker near a side of the frame. `how` returns its rotation relative to that side, and the distance of its centre
-/// from it in marker sizes.
+/// A marker near a side of the frame. `how` returns its rotation relative to that side, and the distance of
+/// its centre from it in marker sizes.
 fn cut_by(
     marker: Marker,
     frame: usize,

@@ -215,8 +215,8 @@ fn checkerboard(rng: &mut ChaCha8Rng) -> Drawing {
     drawing(half * rng.random_range(1.02..1.3), layers)
 }
 
-/// A random grid as in QR codes, sometimes with their finder patterns or in a black frame. Framed grids of the sizes of
-/// markers are excluded, as some would be markers.
+/// A random grid as in QR codes, sometimes with their finder patterns or in a black frame. Framed grids of
+/// the sizes of markers are excluded, as some would be markers.
 fn random_grid(rng: &mut ChaCha8Rng) -> Drawing {
     let half = rng.random_range(0.03..0.15);
     let count = [3, 9, 11, 13, 17, 21][rng.random_range(0..6)];

@@ -96,7 +96,8 @@ pub(super) fn light(marker: Marker) -> Vec<FrameSpec> {
 const READOUT_S: f64 = 0.02;
 
 pub(super) fn rolling(marker: Marker) -> Vec<FrameSpec> {
-    // The camera's velocity right, down and forward in m/s, and its rate of turn about the optical axis in rad/s.
+    // The camera's velocity right, down and forward in m/s, and its rate of turn about the optical axis in
+    // rad/s.
     let motions = [
         ("still", [0.0, 0.0, 0.0], 0.0),
         ("right0.5", [0.5, 0.0, 0.0], 0.0),
