@@ -1,12 +1,13 @@
 //! Frames through Zenoh alone, on one host: written in place into shared memory, read in another process.
 //!
-//! It has the configuration, the quality of service and the threads of the services and nothing else of them,
-//! so it shows which part of a frame's way is Zenoh's. `cargo test --release -p tests --test link -- table
-//! onehost` runs it in turns with frames through `node` and with a bare ring, once it is built: `cargo build
-//! --release -p node --example bare_zenoh`. `bare_zenoh PERIOD_US FRAMES WARM_UP BYTES` prints how long each
-//! frame took, and the processor time, as JSON.
+//! It has the configuration, the quality of service and the threads of the services but no other code of theirs,
+//! so it shows the part of Zenoh in a frame's latency. Build it with
+//! `cargo build --release -p node --example bare_zenoh`; then
+//! `cargo test --release -p tests --test link -- table onehost` runs it in turns with frames through `node` and
+//! with a plain ring of buffers. `bare_zenoh PERIOD_US FRAMES WARM_UP BYTES` prints the latency of each frame
+//! and the processor time as JSON.
 
-#![expect(clippy::print_stdout, reason = "what was measured is for the program that started it")]
+#![expect(clippy::print_stdout, reason = "the result is for the program that started it")]
 
 use std::io::Read;
 use std::process::{Child, Command, Stdio};
@@ -23,13 +24,13 @@ use zenoh::shm::{GarbageCollect, ShmProviderBuilder};
 
 const KEY: &str = "camera/bare/frame";
 const BUFFERS: usize = 4;
-/// How often the writer looks for the reader.
+/// Interval at which the writer polls for the reader.
 const POLL: Duration = Duration::from_millis(10);
-/// How often it looks before it gives up, and before it publishes the last frame once more.
+/// Number of polls before it gives up, and before it publishes the last frame again.
 const MAX_POLLS: u32 = 1000;
 const POLLS_BEFORE_ANOTHER: u32 = 100;
 
-/// What is measured.
+/// The parameters of a measurement.
 #[derive(Copy, Clone)]
 struct Trial {
     period: Duration,
@@ -38,12 +39,12 @@ struct Trial {
     bytes: usize,
 }
 
-/// The process that reads; it does not outlive this one's work.
+/// The process that reads; killed on drop.
 struct Reader(Child);
 
 impl Drop for Reader {
     fn drop(&mut self) {
-        // One that has ended needs no end.
+        // Fails when it has exited already.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
@@ -53,11 +54,11 @@ fn main() -> anyhow::Result<()> {
     node::relaunch_with_zenoh_threads();
     let mut numbers = Vec::new();
     for arg in std::env::args().skip(1) {
-        numbers.push(arg.parse::<u64>().with_context(|| format!("`{arg}` is no number"))?);
+        numbers.push(arg.parse::<u64>().with_context(|| format!("`{arg}` is not a number"))?);
     }
-    let (numbers, meet) = numbers.split_at_checked(4).context(
-        "say PERIOD_US FRAMES WARM_UP BYTES; the reader gets the port of the meeting point besides",
-    )?;
+    let (numbers, meet) = numbers
+        .split_at_checked(4)
+        .context("usage: bare_zenoh PERIOD_US FRAMES WARM_UP BYTES [RENDEZVOUS_PORT]")?;
     let [period_us, frames, warm_up, bytes] = *numbers else { return Ok(()) };
     let period = Duration::from_micros(period_us);
     let trial = Trial { period, frames, warm_up, bytes: bytes.try_into()? };
@@ -107,7 +108,7 @@ impl Trial {
             publish(sequence)?;
         }
         let used_ms = (cpu_ms() - before_ms) / self.frames.max(1) as f64;
-        // Zenoh may leave out a frame, also the last one, for which the reader waits.
+        // Zenoh may drop a frame, also the last one, for which the reader waits.
         for polls in 1.. {
             if reader.0.try_wait()?.is_some() {
                 break;
@@ -118,9 +119,9 @@ impl Trial {
                 publish(count.saturating_sub(1))?;
             }
         }
-        let mut said = String::new();
-        reader.0.stdout.take().context("what the reader says")?.read_to_string(&mut said)?;
-        let mut report: Value = serde_json::from_str(&said)?;
+        let mut output = String::new();
+        reader.0.stdout.take().context("the output of the reader")?.read_to_string(&mut output)?;
+        let mut report: Value = serde_json::from_str(&output)?;
         report["writer_cpu_ms"] = json!(used_ms);
         Ok(report)
     }

@@ -1,9 +1,9 @@
-//! How wrong the detector `rings` is in rendered frames, and how `world::vision::RINGS` says it is:
+//! Fits `world::vision::RINGS`, the model of the errors of the detector `rings`, to rendered frames:
 //! `cargo run --release -p experiments --example fit_vision [FRAMES [FILE.svg]]`.
 //!
-//! Frames are taken with the simulator's default camera over its default pad from 0.4 to 25 m, at tilts up to
-//! 20 degrees, anywhere in the image, with up to 6 pixels of motion blur. Below the table stand the numbers
-//! to put into `RINGS`; the plot shows the errors and the model's deviation.
+//! The frames have the simulator's default camera and pad, distances from 0.4 to 25 m, tilts up to 20 degrees,
+//! any position in the image, and up to 6 pixels of motion blur. Below the table are the parameters for
+//! `RINGS`; the plot shows the errors and the standard deviation of the model.
 
 #![allow(clippy::print_stdout, reason = "a program's output")]
 
@@ -16,15 +16,16 @@ use fiducial::Detector;
 use geometry::{Point, Rotation, Transform, Vector};
 use imaging::GrayView;
 use node::Layers;
+use node::stats::quantile;
 use plotters::prelude::*;
 use simulator::camera::{FrameRequest, SimCamera};
 use world::drift::{random_stream, uniform};
 use world::vehicle::{Vehicle, VehicleConfig, VehicleTruth};
 use world::vision::{RINGS, VisionModel};
 
-/// One frame: size and blur in pixels, and what was found: the errors, and the deviations told of centre and
+/// The result of one frame: size and blur in pixels; the errors, and the stated deviations of centre and
 /// range.
-struct Look {
+struct Sample {
     size_px: f64,
     blur_px: f64,
     found: Option<([f64; 4], [f64; 2])>,
@@ -33,19 +34,19 @@ struct Look {
 fn main() -> anyhow::Result<()> {
     let mut arguments = std::env::args().skip(1);
     let frames: u64 = arguments.next().map_or(Ok(1000), |n| n.parse())?;
-    let looks = Mutex::new(Vec::new());
+    let samples = Mutex::new(Vec::new());
     let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get) as u64;
     std::thread::scope(|scope| {
         let workers: Vec<_> = (0..threads)
             .map(|first| {
-                let looks = &looks;
+                let samples = &samples;
                 scope.spawn(move || -> anyhow::Result<()> {
-                    let mut studio = Studio::new()?;
+                    let mut fitter = Fitter::new()?;
                     for seed in (first..frames).step_by(threads as usize) {
-                        if let Some(look) = studio.look(seed)? {
-                            let mut looks =
-                                looks.lock().map_err(|_| anyhow::anyhow!("a thread died"))?;
-                            looks.push((seed, look));
+                        if let Some(sample) = fitter.sample(seed)? {
+                            let mut samples =
+                                samples.lock().map_err(|_| anyhow::anyhow!("a thread panicked"))?;
+                            samples.push((seed, sample));
                         }
                     }
                     Ok(())
@@ -54,20 +55,20 @@ fn main() -> anyhow::Result<()> {
             .collect();
         workers
             .into_iter()
-            .try_for_each(|w| w.join().map_err(|_| anyhow::anyhow!("a thread died"))?)
+            .try_for_each(|w| w.join().map_err(|_| anyhow::anyhow!("a thread panicked"))?)
     })?;
-    let mut looks = looks.into_inner()?;
-    looks.sort_by_key(|(seed, _)| *seed);
-    let looks: Vec<Look> = looks.into_iter().map(|(_, look)| look).collect();
-    table(&looks);
-    suggest(&looks);
+    let mut samples = samples.into_inner()?;
+    samples.sort_by_key(|(seed, _)| *seed);
+    let samples: Vec<Sample> = samples.into_iter().map(|(_, sample)| sample).collect();
+    table(&samples);
+    print_model(&samples);
     if let Some(file) = arguments.next() {
-        std::fs::write(&file, plot(&looks)?).with_context(|| format!("writing {file}"))?;
+        std::fs::write(&file, plot(&samples)?).with_context(|| format!("writing {file}"))?;
     }
     Ok(())
 }
 
-struct Studio {
+struct Fitter {
     camera: SimCamera,
     detector: Detector,
     pixels: Vec<u8>,
@@ -76,7 +77,7 @@ struct Studio {
     marker_m: f64,
 }
 
-impl Studio {
+impl Fitter {
     fn new() -> anyhow::Result<Self> {
         let config = Layers { file: None, set: Vec::new() }.load::<simulator::Config>()?.settings;
         let marker = config.pad_marker().map_err(anyhow::Error::msg)?;
@@ -92,8 +93,8 @@ impl Studio {
         })
     }
 
-    /// The frame of a seed; `None` when the marker is not whole in the image.
-    fn look(&mut self, seed: u64) -> anyhow::Result<Option<Look>> {
+    /// The result for the frame of a seed; `None` when the marker is not completely in the image.
+    fn sample(&mut self, seed: u64) -> anyhow::Result<Option<Sample>> {
         let mut random = random_stream(seed, 77);
         let [depth, tilt, about, u, v, heading, blur, towards] =
             [(); 8].map(|()| uniform(&mut random));
@@ -110,7 +111,7 @@ impl Studio {
         let ned_from_camera =
             Transform::new(ned_from_body, Point::origin()) * settings.body_from_camera;
         let position = self.pad.position - (ned_from_camera * in_camera - Point::origin());
-        // Motion through the exposure that smears the marker by so many pixels.
+        // The velocity that causes this motion blur.
         let blur_px = 6.0 * blur * blur;
         let speed_m_s = blur_px * depth_m / model.fx / settings.exposure_s;
         let (sin, cos) = (turn * towards).sin_cos();
@@ -119,11 +120,11 @@ impl Studio {
         let request = FrameRequest { sequence: seed, time_s: 0.0, begun_s: None, pad: self.pad };
         let right = self.camera.camera_from_marker(&truth, &self.pad);
         let half = 0.5 * self.marker_m;
-        let rim = [(half, half), (half, -half), (-half, half), (-half, -half)];
-        let whole = rim.iter().all(|(x, y)| {
+        let corners = [(half, half), (half, -half), (-half, half), (-half, -half)];
+        let is_whole = corners.iter().all(|(x, y)| {
             model.project(right * Point::new(*x, *y, 0.0)).is_some_and(|p| model.contains(p))
         });
-        if !whole {
+        if !is_whole {
             return Ok(None);
         }
         let truth_at =
@@ -134,13 +135,13 @@ impl Studio {
         let found = self.detector.detect(view, Some(&model), &mut ()).first().and_then(|seen| {
             let pose = seen.pose.as_ref()?;
             let depth_m = pose.camera_from_marker.origin().z();
-            let told = [
+            let stated = [
                 seen.centre_covariance_px2.m11.max(0.0).sqrt(),
                 pose.covariance.m33.max(0.0).sqrt() / depth_m,
             ];
-            Some((errors(&model, &pose.camera_from_marker, &right)?, told))
+            Some((errors(&model, &pose.camera_from_marker, &right)?, stated))
         });
-        Ok(Some(Look { size_px: self.marker_m * model.fx / right.origin().z(), blur_px, found }))
+        Ok(Some(Sample { size_px: self.marker_m * model.fx / right.origin().z(), blur_px, found }))
     }
 }
 
@@ -149,24 +150,23 @@ fn rms(numbers: impl Iterator<Item = f64>) -> f64 {
     if count > 0.0 { (sum / count).sqrt() } else { f64::NAN }
 }
 
-/// A deviation from the middle of the errors, which the few wild ones do not move.
+/// The standard deviation from the median absolute error, which is robust against outliers.
 fn deviation(numbers: impl Iterator<Item = f64>) -> f64 {
-    let mut sizes: Vec<f64> = numbers.map(f64::abs).collect();
-    sizes.sort_by(f64::total_cmp);
-    sizes.get(sizes.len() / 2).map_or(f64::NAN, |median| median / 0.6745)
+    let sizes: Vec<f64> = numbers.map(f64::abs).collect();
+    quantile(&sizes, 0.5).map_or(f64::NAN, |median| median / 0.6745)
 }
 
 const SIZES_PX: [f64; 10] = [8.0, 12.0, 16.0, 20.0, 30.0, 45.0, 70.0, 110.0, 200.0, 400.0];
 const BLURS_PX: [f64; 4] = [0.0, 0.5, 2.0, 6.1];
 
-fn table(looks: &[Look]) {
+fn table(samples: &[Sample]) {
     println!(
         "| size, px | blur, px | frames | found | centre: deviation, rms, px | range: mean, deviation, rms, 1/size px \
-         | tilt: deviation, deg | told centre, range over deviation |\n|---|---|---|---|---|---|---|---|"
+         | tilt: deviation, deg | stated over measured deviation of centre, range |\n|---|---|---|---|---|---|---|---|"
     );
     for sizes in SIZES_PX.windows(2) {
         for blurs in BLURS_PX.windows(2) {
-            let inside: Vec<&Look> = looks
+            let inside: Vec<&Sample> = samples
                 .iter()
                 .filter(|l| (sizes[0]..sizes[1]).contains(&l.size_px))
                 .filter(|l| (blurs[0]..blurs[1]).contains(&l.blur_px))
@@ -186,8 +186,8 @@ fn table(looks: &[Look]) {
             let centre = || found.iter().flat_map(|(_, (e, _))| [e[0], e[1]]);
             let range = || found.iter().map(|(size, (e, _))| e[2] * size);
             let mean = range().sum::<f64>() / found.len() as f64;
-            let told = |i: usize| rms(found.iter().map(|(_, (_, told))| told[i]));
-            let range_part = deviation(found.iter().map(|(_, (e, _))| e[2]));
+            let stated = |i: usize| rms(found.iter().map(|(_, (_, stated))| stated[i]));
+            let range_ratio = deviation(found.iter().map(|(_, (e, _))| e[2]));
             println!(
                 "| {}-{} | {}-{} | {} | {} | {:.3} {:.3} | {mean:+.3} {:.3} {:.3} | {:.2} | {:.2} {:.2} |",
                 sizes[0],
@@ -201,17 +201,17 @@ fn table(looks: &[Look]) {
                 deviation(range()),
                 rms(range()),
                 deviation(found.iter().map(|(_, (e, _))| e[3])).to_degrees(),
-                told(0) / deviation(centre()),
-                told(1) / range_part,
+                stated(0) / deviation(centre()),
+                stated(1) / range_ratio,
             );
         }
     }
 }
 
-/// The numbers of a model, read off the frames.
-fn suggest(looks: &[Look]) {
+/// Prints the parameters of the model.
+fn print_model(samples: &[Sample]) {
     let found = |blur: std::ops::Range<f64>| {
-        looks
+        samples
             .iter()
             .filter(move |l| blur.contains(&l.blur_px) && l.size_px > 14.0)
             .filter_map(|l| Some((l.size_px, l.found?)))
@@ -222,11 +222,11 @@ fn suggest(looks: &[Look]) {
         |of: &dyn Fn(std::ops::Range<f64>) -> f64| ((of(2.0..6.1) - of(0.0..0.5)) / 3.7).max(0.0);
     let (still_centre, still_size) = (centre(0.0..0.5), size(0.0..0.5));
     let all: Vec<_> = found(0.0..6.1).collect();
-    let wild = all
+    let outliers = all
         .iter()
         .filter(|(_, (e, _))| e[0].hypot(e[1]) > 4.0 * 1.25 * still_centre.max(centre(0.0..6.1)))
         .count();
-    let large = looks.iter().filter(|l| l.size_px > 20.0);
+    let large = samples.iter().filter(|l| l.size_px > 20.0);
     let missed = large.clone().filter(|l| l.found.is_none()).count() as f64;
     println!(
         "\ncentre_px {still_centre:.3}, centre_per_blur {:.3}, size_px {still_size:.3}, size_per_blur {:.3}",
@@ -234,24 +234,24 @@ fn suggest(looks: &[Look]) {
         slope(&size)
     );
     println!(
-        "miss {:.4}, outliers {:.4}, tilt_rad_px {:.3}, told {:.2} {:.2}",
+        "miss {:.4}, outliers {:.4}, tilt_rad_px {:.3}, stated over measured {:.2} {:.2}",
         missed / large.count().max(1) as f64,
-        wild as f64 / all.len().max(1) as f64,
+        outliers as f64 / all.len().max(1) as f64,
         deviation(all.iter().map(|(size, (e, _))| e[3] * size)),
-        rms(all.iter().map(|(_, (_, told))| told[0])) / centre(0.0..6.1),
-        rms(all.iter().map(|(size, (_, told))| told[1] * size)) / size(0.0..6.1),
+        rms(all.iter().map(|(_, (_, stated))| stated[0])) / centre(0.0..6.1),
+        rms(all.iter().map(|(size, (_, stated))| stated[1] * size)) / size(0.0..6.1),
     );
     println!("now: {RINGS:?}");
 }
 
-/// Takes what a panel shows from a look's errors and the marker's size in pixels.
+/// Computes the value of a panel from the errors of a sample and the marker's size in pixels.
 type ErrorOf = fn(&[f64; 4], f64) -> f64;
-/// Takes the deviation that a panel compares with from the model.
+/// The model's deviation for a panel.
 type DeviationOf = fn(&VisionModel) -> f64;
 
-/// The errors of centre and range against the size, with the model's deviation without blur.
-fn plot(looks: &[Look]) -> anyhow::Result<String> {
-    picture((1100, 520), |area| {
+/// Plots the errors of centre and range against the size, with the model's deviation without blur.
+fn plot(samples: &[Sample]) -> anyhow::Result<String> {
+    picture([1100, 520], |area| {
         let (left, right) = area.split_horizontally(550);
         let panels: [(_, &str, ErrorOf, DeviationOf); 2] = [
             (left, "centre along an axis, px", |e, _| e[0], |m| m.centre_px),
@@ -268,7 +268,7 @@ fn plot(looks: &[Look]) -> anyhow::Result<String> {
                 .build_cartesian_2d((6.0_f64..700.0).log_scale(), -reach..reach)?;
             chart.configure_mesh().x_desc("size of the marker, px").y_desc("error, px").draw()?;
             for (colour, blurs) in BLURS_PX.windows(2).enumerate() {
-                let dots = looks.iter().filter(|l| (blurs[0]..blurs[1]).contains(&l.blur_px));
+                let dots = samples.iter().filter(|l| (blurs[0]..blurs[1]).contains(&l.blur_px));
                 let dots = dots.filter_map(|l| Some((l.size_px, of(&l.found?.0, l.size_px))));
                 let inside = dots.filter(|(_, error)| error.abs() < reach);
                 let colour = COLOURS[colour];
