@@ -1,5 +1,5 @@
-//! Prints how long a frame of the thesis' camera takes to render, by height, tilt and motion; with a folder
-//! as argument, writes the pictures there.
+//! Measures the rendering time of a frame of the thesis' camera by height, tilt and motion; with a folder
+//! as argument, writes the frames there.
 #![allow(clippy::print_stdout, reason = "a table for people is what this example is for")]
 
 use std::path::PathBuf;
@@ -8,7 +8,7 @@ use experiments::record::processor_ms;
 use geometry::{Body, Ned, Point, Rotation, Transform};
 use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
 
-/// Frames to a mean.
+/// Frames per mean.
 const FRAMES: u64 = 20;
 
 type Failure = Box<dyn std::error::Error>;

@@ -70,15 +70,15 @@ fn with_fault(fault: &str, seeds: &[u64]) -> Vec<Outcome> {
 }
 
 #[test]
-fn a_second_marker_is_not_believed_because_the_first_is_out_of_view() {
-    // In each of these the vehicle leans so that for a while only the wrong marker is in view.
+fn a_second_marker_is_rejected_while_the_first_is_out_of_view() {
+    // With these seeds the vehicle tilts so that for a while only the wrong marker is in view.
     for outcome in with_fault("wrong-marker", &[38, 54, 58, 81, 151, 265]) {
         assert!(outcome.is_within(0.1) || outcome.ending == Ending::Aborted, "{outcome:?}");
     }
 }
 
 #[test]
-fn a_gust_close_to_the_ground_does_not_end_in_a_sliding_touch() {
+fn a_gust_close_to_the_ground_does_not_cause_a_sliding_touchdown() {
     for outcome in with_fault("gust", &[26, 64, 68, 74, 92, 129]) {
         assert!(outcome.is_within(0.3), "{outcome:?}");
         assert!(outcome.slide_m_s.is_some_and(|slide| slide < 0.4), "{outcome:?}");
@@ -86,7 +86,7 @@ fn a_gust_close_to_the_ground_does_not_end_in_a_sliding_touch() {
 }
 
 #[test]
-fn a_pad_that_heaves_is_touched_gently_and_one_that_moves_is_not_left_again() {
+fn heaving_and_moving_pads_are_landed_on() {
     for outcome in with_fault("pad-heaves", &[4, 8, 29, 43]) {
         assert!(outcome.is_within(0.1), "{outcome:?}");
         assert!(outcome.sink_m_s.is_some_and(|sink| sink <= 0.6), "{outcome:?}");
@@ -97,7 +97,7 @@ fn a_pad_that_heaves_is_touched_gently_and_one_that_moves_is_not_left_again() {
 }
 
 #[test]
-fn px4_is_landed_guided_and_by_its_own_precision_landing() {
+fn px4_lands_guided_and_by_its_own_precision_landing() {
     let fly_with = |more: &[&str]| {
         let always = ["simulator.autopilot.firmware=\"px4\"", "controller.start=takeoff"];
         let set = always.iter().chain(more).map(|setting| (*setting).to_owned()).collect();
@@ -121,7 +121,7 @@ fn px4_is_landed_guided_and_by_its_own_precision_landing() {
 }
 
 #[test]
-fn detections_that_are_all_late_are_used() {
+fn late_detections_are_used() {
     for outcome in with_fault("latency-300ms", &[1, 2, 3]) {
         assert!(outcome.is_within(0.1), "{outcome:?}");
     }
