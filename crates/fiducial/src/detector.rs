@@ -6,14 +6,14 @@ use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outlines, outline};
 use markers::{Family, Marker};
 
+use crate::candidates::quad::Quad;
+use crate::candidates::segment_quads::{ImageQuads, Scale};
 use crate::families::rings::Rings;
 use crate::families::rings::circle_pose::CirclePose;
 use crate::families::rings_thesis::RingsThesis;
+use crate::families::square::{MOST_PAPERS, Squares, papers};
+use crate::families::stag::Stags;
 use crate::observation::{Observation, Stages};
-use crate::square::quad::Quad;
-use crate::square::segments::{ImageQuads, Scale};
-use crate::square::{MOST_PAPERS, Squares, papers};
-use crate::stag::Stags;
 use crate::trace::{Trace, TracedMarker};
 
 /// What can be chosen about a detection.

@@ -2,3 +2,5 @@
 
 pub mod rings;
 pub mod rings_thesis;
+pub(crate) mod square;
+pub(crate) mod stag;

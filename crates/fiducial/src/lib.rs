@@ -11,14 +11,14 @@
 
 pub mod bundle;
 mod candidates;
+mod decode;
 pub mod detector;
 pub mod families;
 pub mod observation;
 mod optics;
 pub mod overlay;
 pub mod pose;
-pub mod square;
-mod stag;
+pub mod refine;
 pub mod trace;
 pub mod tracker;
 

@@ -6,8 +6,8 @@ mod scene;
 
 use std::time::Instant;
 
-use fiducial::square::pattern::Pattern;
-use fiducial::square::refine::{Refined, Scratch, refine};
+use fiducial::refine::corners::{Refined, Scratch, refine};
+use fiducial::refine::pattern::Pattern;
 use fiducial::square_pose;
 use geometry::{CameraModel, Distortion, Pixel};
 use imaging::GrayView;

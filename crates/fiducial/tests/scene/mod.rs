@@ -4,7 +4,7 @@
 #![allow(dead_code, reason = "each test uses its own part of it")]
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 
-use fiducial::square::pattern::Pattern;
+use fiducial::refine::pattern::Pattern;
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Transform};
 use imaging::GrayImage;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};

@@ -3,7 +3,7 @@
 use markers::stag_code::{DISC_RADIUS, QUIET_ZONE};
 use markers::{Drawing, Family, Ink, Marker, Shape};
 
-use crate::square::refine::{Design, MOST_ACROSS};
+use crate::refine::corners::{Design, MOST_ACROSS};
 
 /// Small cells across the square and its paper; their borders are the square's outline. What a disc's edge looks like in
 /// them is blurred by their width, which must be well below the blur's: of a small square in the image they are twice as

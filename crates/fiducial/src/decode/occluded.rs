@@ -4,34 +4,34 @@
 use imaging::GrayView;
 use markers::SquareCode;
 
-use super::erasures::{Reading, Seen, has_border, have_same_cells, look};
-use super::quad::{Quad, diagonal_px, middle, sides_px};
+use crate::candidates::quad::{Quad, diagonal_px, middle, sides_px};
+use crate::decode::erasures::{Reading, Seen, has_border, have_same_cells, look};
 
 /// The markers of one family that are looked for.
 #[derive(Copy, Clone, Debug)]
-pub struct Sought<'a> {
+pub(crate) struct Sought<'a> {
     /// What the caller knows the family by.
-    pub index: usize,
+    pub(crate) index: usize,
     /// The family's code.
-    pub code: &'a SquareCode,
+    pub(crate) code: &'a SquareCode,
     /// The ids; `None` stands for all.
-    pub ids: Option<&'a [u32]>,
+    pub(crate) ids: Option<&'a [u32]>,
 }
 
 /// A marker that was found.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct DamagedMarker {
+pub(crate) struct DamagedMarker {
     /// What the caller knows its family by.
-    pub index: usize,
+    pub(crate) index: usize,
     /// Its outline, the marker's own top left corner first.
-    pub quad: Quad,
+    pub(crate) quad: Quad,
     /// What it says.
-    pub reading: Reading,
+    pub(crate) reading: Reading,
 }
 
 /// Finds damaged markers. It keeps its memory from image to image.
 #[derive(Clone, Debug, Default)]
-pub struct Damaged {
+pub(crate) struct Damaged {
     found: Vec<DamagedMarker>,
 }
 
@@ -50,7 +50,7 @@ impl Damaged {
 
     /// The markers in an image among the quads that its segments make, as far as these are open to markers of the code; the
     /// surest first.
-    pub fn find<'a>(
+    pub(crate) fn find<'a>(
         &mut self,
         view: GrayView<'_>,
         quads: &[Quad],
@@ -139,7 +139,7 @@ fn is_same_place(a: &Quad, b: &Quad) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::square::segments::{ImageQuads, Scale};
+    use crate::candidates::segment_quads::{ImageQuads, Scale};
     use geometry::Pixel;
     use imaging::{GrayImage, Pyramid};
     use markers::Family;

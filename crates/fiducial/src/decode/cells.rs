@@ -10,7 +10,7 @@ use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Pyramid, bilinear};
 use markers::SquareCode;
 
-use crate::square::mean_side;
+use crate::families::square::mean_side;
 
 /// Most bits of a code, and with them the two values of known cells.
 const MOST_BITS: usize = 64;

@@ -12,10 +12,10 @@ use geometry::{CameraModel, Distortion, Pixel, Point};
 use imaging::GrayView;
 use nalgebra::{Matrix2, SMatrix, SVector};
 
-use crate::square::pattern::Pattern;
-use crate::square::picture::{self, Picture};
-use crate::square::profiles::{self, Run};
-use crate::square::quad::middle;
+use crate::candidates::quad::middle;
+use crate::refine::edges::{self as profiles, Run};
+use crate::refine::pattern::Pattern;
+use crate::refine::photometric::{self as picture, Picture};
 
 /// A square marker's corners and what else its picture tells.
 #[derive(Clone, Debug, PartialEq)]

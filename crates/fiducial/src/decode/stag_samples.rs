@@ -1,7 +1,7 @@
 //! An STag read place by place: quick where it is plain to see, and able to leave out what is not.
 //!
 //! What is known to be black (the border) and white (the paper, the rim of the disc) tells the light over the whole marker:
-//! one light, two on the sides of a shadow's edge, or one with a reflection ([`crate::square::erasures`]). By it each dot
+//! one light, two on the sides of a shadow's edge, or one with a reflection ([`crate::decode::erasures`]). By it each dot
 //! is black, white or, where something lies on the marker or outshines it, unknown; and words are compared by the dots that
 //! are known.
 
@@ -11,9 +11,9 @@ use imaging::{GrayView, bilinear};
 use markers::Codebook;
 use markers::stag_code::{self, DOT_RADIUS, DOTS};
 
-use crate::square::chance::ways;
-use crate::square::decode::Grid;
-use crate::square::erasures::{Known, Light};
+use crate::decode::cells::Grid;
+use crate::decode::erasures::{Known, Light};
+use crate::decode::false_positive::ways;
 
 /// Units of length across the square: the border is one wide.
 const ACROSS: usize = 10;

@@ -11,8 +11,8 @@ use nalgebra::{SMatrix, SVector};
 
 use crate::optics::edge_response::{EdgeResponse, MAX_SIGMAS, PIXEL_VARIANCE, pixel_kurtosis};
 use crate::optics::exposure::ClippedExposure;
-use crate::square::pattern::Pattern;
-use crate::square::refine::{Design, Fit, Homography, Lens, MOST_ACROSS, Scratch};
+use crate::refine::corners::{Design, Fit, Homography, Lens, MOST_ACROSS, Scratch};
+use crate::refine::pattern::Pattern;
 
 /// Light and blur of a marker's picture.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -353,7 +353,7 @@ impl Grid {
     fn bounds(&self, view: GrayView<'_>, lens: &Lens<'_>, state: &State) -> Option<[usize; 4]> {
         let mut bounds = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
         let reach = self.middle / self.half;
-        for [a, b] in crate::square::refine::CORNERS {
+        for [a, b] in crate::refine::corners::CORNERS {
             let (seen, _) = lens.seen(state.homography.at([a * reach, b * reach]).ideal)?;
             bounds = [
                 bounds[0].min(seen.x),

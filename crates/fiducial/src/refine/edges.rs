@@ -10,9 +10,9 @@ use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
 use crate::optics::edge_response::{EdgeResponse, pixel_kurtosis};
-use crate::square::pattern::Pattern;
-use crate::square::picture::Picture;
-use crate::square::refine::{CORNERS, Fit, Homography, Lens, Scratch};
+use crate::refine::corners::{CORNERS, Fit, Homography, Lens, Scratch};
+use crate::refine::pattern::Pattern;
+use crate::refine::photometric::Picture;
 
 /// A place at which an edge is looked at.
 #[derive(Copy, Clone, Debug)]

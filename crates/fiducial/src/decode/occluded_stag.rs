@@ -1,35 +1,35 @@
 //! Quads that may be STags of which a part is in shadow, washed out, covered or beyond the frame: made of segments of
 //! edges, the slow way, for when closed outlines show nothing.
 
-use super::Reading;
-use crate::square::quad::{Quad, diagonal_px, middle};
+use crate::candidates::quad::{Quad, diagonal_px, middle};
+use crate::families::stag::Reading;
 
 /// The most quads that are kept for a closer look.
 const MOST_FOUND: usize = 64;
 
 /// Reads quads of segments. It keeps its memory from image to image.
 #[derive(Debug, Default)]
-pub(super) struct Damaged {
+pub(crate) struct Damaged {
     found: Vec<Candidate>,
 }
 
 /// A quad, what it says, and how sure that is.
 #[derive(Copy, Clone, Debug)]
-pub(super) struct Candidate {
-    pub(super) quad: Quad,
-    pub(super) reading: Reading,
-    pub(super) sureness: f64,
+pub(crate) struct Candidate {
+    pub(crate) quad: Quad,
+    pub(crate) reading: Reading,
+    pub(crate) sureness: f64,
 }
 
 impl Damaged {
     /// Makes room for what may be found.
-    pub(super) fn make_room(&mut self) {
+    pub(crate) fn make_room(&mut self) {
         self.found.clear();
         self.found.reserve(MOST_FOUND);
     }
 
     /// The quads that `read` reads, each place once, the surest first.
-    pub(super) fn find(
+    pub(crate) fn find(
         &mut self,
         quads: &[Quad],
         mut read: impl FnMut(&Quad) -> Option<(Reading, f64)>,

@@ -6,11 +6,11 @@ use imaging::pyramid::to_level_0;
 
 /// A four-sided outline that may be a square marker's.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct Quad {
+pub(crate) struct Quad {
     /// Its corners, clockwise as seen in the image.
-    pub corners: [Pixel; 4],
+    pub(crate) corners: [Pixel; 4],
     /// Bright within, dark around.
-    pub inverted: bool,
+    pub(crate) inverted: bool,
 }
 
 /// The mean of four corners, in pixels.

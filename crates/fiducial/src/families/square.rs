@@ -1,31 +1,21 @@
-//! Square markers: [`code`] says which cells of which family carry which words, [`quad`] finds four-sided outlines,
-//! `decode` reads their cells. [`pattern`] says which cells of a marker are black and white, [`mod@refine`] where its
-//! corners are. [`Squares`] does it all, for any number of families at once. Where outlines are broken, [`segments`]
-//! makes quads of straight pieces of edges, [`erasures`] reads what is left of a marker, and [`damaged`] does both.
-
-pub(crate) mod chance;
-pub mod damaged;
-pub(crate) mod decode;
-pub mod erasures;
-pub mod pattern;
-mod picture;
-mod profiles;
-pub mod quad;
-pub mod refine;
-pub mod segments;
+//! Square markers: [`code`] says which cells of which family carry which words, `quad` finds four-sided outlines,
+//! `decode` reads their cells. `pattern` says which cells of a marker are black and white, `refine` where its
+//! corners are. [`Squares`] does it all, for any number of families at once. Where outlines are broken, `segments`
+//! makes quads of straight pieces of edges, `erasures` reads what is left of a marker, and `damaged` does both.
 
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outline, Outlines, Pyramid, bilinear};
 use markers::{Family, Marker, Match, SquareCode};
 use nalgebra::{Matrix2, SMatrix};
 
+use crate::candidates::quad::{Quad, diagonal_px, middle, sides_px};
+use crate::decode::cells::{Cells, Layout, Look};
+use crate::decode::false_positive as chance;
+use crate::decode::occluded::{Damaged, Sought};
 use crate::observation::{Observation, Stages};
 use crate::pose::square_pose;
-use crate::square::damaged::{Damaged, Sought};
-use crate::square::decode::{Cells, Layout, Look};
-use crate::square::pattern::Pattern;
-use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
-use crate::square::refine::{Refined, Scratch, refine_from};
+use crate::refine::corners::{Refined, Scratch, refine_from};
+use crate::refine::pattern::Pattern;
 use crate::trace::{Reason, Trace};
 
 /// Bounds on the work in one image, far above what frames with markers need.
@@ -81,7 +71,7 @@ impl Wanted {
 
 /// Finds the square markers of any number of families. It keeps its memory from image to image.
 #[derive(Debug, Default)]
-pub struct Squares {
+pub(crate) struct Squares {
     wanted: Vec<Wanted>,
     layouts: Vec<Layout>,
     quads: Vec<Candidate>,
@@ -122,7 +112,7 @@ impl Squares {
 
     /// Looks for these markers, printed in the other colours as well when `inverted`; those of families without square cells
     /// are left out.
-    pub fn new(markers: &[Marker], inverted: bool) -> Self {
+    pub(crate) fn new(markers: &[Marker], inverted: bool) -> Self {
         let mut squares = Self { inverted, ..Self::default() };
         for marker in markers {
             let Some(code) = SquareCode::for_family(marker.family) else {
@@ -180,7 +170,7 @@ impl Squares {
     }
 
     /// True when there is nothing to look for.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.wanted.is_empty()
     }
 
@@ -190,12 +180,12 @@ impl Squares {
     }
 
     /// Whether families with a white border are among those looked for; their outlines are bright.
-    pub fn has_bright(&self) -> bool {
+    pub(crate) fn has_bright(&self) -> bool {
         self.layouts.iter().any(|layout| layout.reversed)
     }
 
     /// Finds the markers among the outlines of an image.
-    pub fn detect(
+    pub(crate) fn detect(
         &mut self,
         view: GrayView<'_>,
         outlines: &Outlines,
@@ -515,7 +505,7 @@ fn confidence(explained: f64, margin: f64) -> f64 {
     explained * (0.5 + 0.5 * margin.min(1.0))
 }
 
-fn mean_side(corners: &[Pixel; 4]) -> f64 {
+pub(crate) fn mean_side(corners: &[Pixel; 4]) -> f64 {
     sides_px(corners).iter().sum::<f64>() / 4.0
 }
 

@@ -9,8 +9,8 @@ use imaging::GrayView;
 use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};
 use nalgebra::{SMatrix, SVector};
 
+use crate::decode::cells::Grid;
 use crate::optics::edge_response::EdgeResponse;
-use crate::square::decode::Grid;
 
 /// Small cells across the square and its paper; their borders are the square's outline.
 const CELLS: usize = 24;

@@ -6,28 +6,23 @@
 //! with dots left out that are hidden or washed out. Then the whole marker is compared with the image: its outline and the disc's edge where they are wide enough apart, the picture
 //! as a whole where they are not.
 
-mod damaged;
-mod dots;
-mod picture;
-mod samples;
-
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Pyramid, bilinear};
 use markers::{Codebook, Family, Marker, stag_code};
 
+use crate::candidates::quad::{Quad, diagonal_px, middle, sides_px};
+use crate::decode::cells::Grid;
+use crate::families::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, covers, unevenness};
 use crate::observation::{Observation, Stages};
 use crate::pose::square_pose;
-use crate::square::decode::Grid;
-use crate::square::quad::{Quad, diagonal_px, middle, sides_px};
-use crate::square::refine::{Refined, Scratch, refine_design};
-use crate::square::{JOINED_PX, JOINED_SHARE, MOST_UNEVEN, coarse, covers, unevenness};
+use crate::refine::corners::{Refined, Scratch, refine_design};
 use crate::trace::{Reason, Trace};
 
-use damaged::Damaged;
-use dots::Dots;
-use picture::Picture;
-use samples::{Agreement, Sampled, sample};
+use crate::decode::occluded_stag::Damaged;
+use crate::decode::stag_cells::Dots;
+use crate::decode::stag_samples::{Agreement, Sampled, sample};
+use crate::refine::stag_design::Picture;
 
 /// A quad is looked at on the level of the pyramid on which its sides are from this long to twice that, in pixels: at first
 /// and, when it may be a marker, again.
@@ -95,12 +90,12 @@ struct Wanted {
 
 /// What a quad says.
 #[derive(Copy, Clone, Debug)]
-struct Reading {
+pub(crate) struct Reading {
     wanted: usize,
     id: u32,
     turns: u8,
     wrong_bits: u8,
-    explained: f64,
+    pub(crate) explained: f64,
     /// What the second best leaves unexplained, over what this one does.
     ratio: f64,
     /// Whether a reflection moves its edges, so that the refined corners are hardly better.

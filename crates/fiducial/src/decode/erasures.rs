@@ -10,28 +10,28 @@ use geometry::Pixel;
 use imaging::GrayView;
 use markers::SquareCode;
 
-use super::chance;
-use super::quad::Quad;
+use crate::candidates::quad::Quad;
+use crate::decode::false_positive as chance;
 
 /// What a damaged marker says.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct Reading {
+pub(crate) struct Reading {
     /// The id.
-    pub id: u32,
+    pub(crate) id: u32,
     /// The marker's own top left corner is this one of the quad's.
-    pub quarter_turns: u8,
+    pub(crate) quarter_turns: u8,
     /// Known bits that differ from the word's.
-    pub wrong_bits: u8,
+    pub(crate) wrong_bits: u8,
     /// Bits that could be read.
-    pub known_bits: u8,
+    pub(crate) known_bits: u8,
     /// The share of the border and the paper around it that looks as it should.
-    pub intact: f32,
+    pub(crate) intact: f32,
     /// The share of the variance of the known cells' pixels that black and white explain.
-    pub explained: f32,
+    pub(crate) explained: f32,
     /// Whether a reflection adds light to it: its edges are then not where they seem.
-    pub washed_out: bool,
+    pub(crate) washed_out: bool,
     /// By how many bits the agreement exceeds what chance would give among the words looked for.
-    pub evidence: f32,
+    pub(crate) evidence: f32,
 }
 
 /// Least evidence, in bits; and with how much of it a marker may be as badly explained as one ever may. In a thousand

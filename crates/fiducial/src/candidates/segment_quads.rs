@@ -10,25 +10,25 @@ use geometry::Pixel;
 use imaging::pyramid::to_level_0;
 use imaging::{GrayView, Pyramid, Segment, SegmentLimits, Segments};
 
-use super::quad::Quad;
+use crate::candidates::quad::Quad;
 
 /// A quad, and how much of it was seen.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct SegmentQuad {
+pub(crate) struct SegmentQuad {
     /// The outline.
-    pub quad: Quad,
+    pub(crate) quad: Quad,
     /// The share of its perimeter on which there are edges.
-    pub seen: f32,
+    pub(crate) seen: f32,
 }
 
 /// Where a picture of the image lies in the image: a pixel's place is `scale` times that in the picture, plus
 /// `offset`.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub struct Placement {
+pub(crate) struct Placement {
     /// Image pixels per pixel of the picture.
-    pub scale: f32,
+    pub(crate) scale: f32,
     /// The place of the picture's first pixel in the image.
-    pub offset: f32,
+    pub(crate) offset: f32,
 }
 
 /// Segments are taken on the finest level of the pyramid with no more pixels than this, and on the next one.
@@ -135,7 +135,7 @@ const CELL_PX: f32 = 16.0;
 
 /// Joins segments to quads. It keeps its memory from image to image.
 #[derive(Clone, Debug, Default)]
-pub struct SegmentQuads {
+pub(crate) struct SegmentQuads {
     sides: Vec<Side>,
     starts: Grid,
     corners: Vec<Corner>,
@@ -188,7 +188,7 @@ impl SegmentQuads {
 
     /// The quads that these segments of a picture of `size` pixels may belong to, in the image's pixels, best first:
     /// dark ones, or bright ones when `inverted`.
-    pub fn find(
+    pub(crate) fn find(
         &mut self,
         segments: &[Segment],
         size: [usize; 2],

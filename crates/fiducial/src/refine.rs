@@ -1,0 +1,7 @@
+//! Sub-pixel corners with their covariance.
+
+pub mod corners;
+pub(crate) mod edges;
+pub mod pattern;
+pub(crate) mod photometric;
+pub(crate) mod stag_design;
