@@ -6,13 +6,16 @@ use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outlines, outline};
 use markers::{Family, Marker};
 
+use crate::candidates::outline_quads::OutlineQuads;
 use crate::candidates::quad::Quad;
+use crate::candidates::quiet_zone::{MAX_QUIET_ZONES, quiet_zone_quads};
 use crate::candidates::segment_quads::{ImageQuads, Scale};
+use crate::families::query::{ExpectedMarker, ImageInput, Output};
 use crate::families::rings::Rings;
 use crate::families::rings::circle_pose::CirclePose;
 use crate::families::rings_thesis::RingsThesis;
-use crate::families::square::{MOST_PAPERS, Squares, papers};
-use crate::families::stag::Stags;
+use crate::families::square::SquareTagDetector;
+use crate::families::stag::StagDetector;
 use crate::observation::{Observation, Stages};
 use crate::trace::{Trace, TracedMarker};
 
@@ -133,8 +136,9 @@ pub struct Detector {
     markers: Vec<Marker>,
     settings: Settings,
     outlines: Outlines,
-    squares: Squares,
-    stags: Stags,
+    outline_quads: OutlineQuads,
+    squares: SquareTagDetector,
+    stags: StagDetector,
     rings: Rings,
     thesis: RingsThesis,
     broken: ImageQuads,
@@ -161,8 +165,10 @@ impl Detector {
                 return Err(DetectorError::Twice { name: marker.name() });
             }
         }
-        let (squares, stags) =
-            (Squares::new(markers, settings.inverted), Stags::new(markers, settings.inverted));
+        let (squares, stags) = (
+            SquareTagDetector::new(markers, settings.inverted),
+            StagDetector::new(markers, settings.inverted),
+        );
         let has_rings = markers.iter().any(|marker| marker.family == Family::Rings);
         let has_quads = !squares.is_empty() || !stags.is_empty();
         let slow_passes = [
@@ -179,6 +185,7 @@ impl Detector {
             markers: markers.to_vec(),
             settings,
             outlines: Outlines::default(),
+            outline_quads: OutlineQuads::default(),
             squares,
             stags,
             rings: Rings::new(settings.inverted, settings.thorough),
@@ -237,9 +244,10 @@ impl Detector {
         let seen = match (expected.corners, expected.circles, camera) {
             (Some(corners), _, _) => {
                 self.outlines.begin(view);
-                let (quad, seen) = ((family, id?, corners), (view, self.outlines.pyramid()));
-                let seen_again = self.squares.detect_at(seen, quad, camera);
-                seen_again.or_else(|| self.stags.detect_at(seen, quad, camera))?
+                let expected = ExpectedMarker { family, id: id?, corners };
+                let input = ImageInput { view, pyramid: self.outlines.pyramid(), camera };
+                let found = self.squares.detect_at(input, &expected);
+                found.or_else(|| self.stags.detect_at(input, &expected))?
             }
             (None, Some(circles), Some(camera)) => {
                 let marker = self.markers.iter().find(|m| m.family == family && m.id == id)?;
@@ -271,27 +279,28 @@ impl Detector {
         if has_quads {
             // Markers with a white border may be as small as others; others printed white on black are only looked for where
             // they are large.
-            let bright_from = if self.squares.has_bright() { 0 } else { INVERTED_FROM };
-            let bright_from =
-                (self.settings.inverted || self.squares.has_bright()).then_some(bright_from);
+            let bright_from = if self.squares.has_reversed_border() { 0 } else { INVERTED_FROM };
+            let bright_from = (self.settings.inverted || self.squares.has_reversed_border())
+                .then_some(bright_from);
             let mut settings = outline::Settings { bright_from, ..outline::Settings::default() };
             if !self.squares.is_empty() {
-                settings.max_size_px = settings.max_size_px.max(Squares::LARGEST_PX);
+                settings.max_size_px = settings.max_size_px.max(SquareTagDetector::MAX_OUTLINE_PX);
             }
             if !self.stags.is_empty() {
-                settings.max_size_px = settings.max_size_px.max(Stags::LARGEST_PX);
+                settings.max_size_px = settings.max_size_px.max(StagDetector::MAX_OUTLINE_PX);
             }
             self.outlines.find(view, &settings);
             stages.ended("outlines");
         }
         if has_quads {
-            let watch = (&mut self.trace, &mut *stages);
-            self.squares.detect(view, &self.outlines, camera, watch, &mut self.found);
+            self.outline_quads.find(view, &self.outlines, &mut self.trace);
+            stages.ended("quads");
+            let input = ImageInput { view, pyramid: self.outlines.pyramid(), camera };
+            let mut out = Output { trace: &mut self.trace, found: &mut self.found };
+            self.squares.detect(input, self.outline_quads.iter(), stages, &mut out);
             if !self.stags.is_empty() {
-                let watch = (&mut self.trace, &mut *stages);
-                let quads = self.squares.quads().take(MOST_STAG_QUADS);
-                let pyramid = self.outlines.pyramid();
-                self.stags.detect((view, pyramid), quads, camera, watch, &mut self.found);
+                let quads = self.outline_quads.iter().take(MOST_STAG_QUADS);
+                self.stags.detect(input, quads, stages, &mut out);
             }
         }
         for marker in &self.markers {
@@ -320,6 +329,7 @@ impl Detector {
         self.found.reserve(MOST_AT_ONCE);
         self.trace.make_room();
         if !self.squares.is_empty() || !self.stags.is_empty() {
+            self.outline_quads.make_room();
             self.squares.make_room();
             self.stags.make_room();
         }
@@ -330,7 +340,7 @@ impl Detector {
         if is_slow(SlowPass::Papers(Third::Upper)) {
             self.broken.make_room(view);
             self.papers.clear();
-            self.papers.reserve(MOST_PAPERS);
+            self.papers.reserve(MAX_QUIET_ZONES);
         }
     }
 
@@ -352,9 +362,9 @@ impl Detector {
             if self.broken.make(view, self.outlines.pyramid()) {
                 stages.ended("segments");
             }
-            let seen = (view, self.broken.quads());
-            let watch = (&mut self.trace, &mut *stages);
-            self.squares.detect_damaged(seen, camera, watch, &mut self.found);
+            let input = ImageInput { view, pyramid: self.outlines.pyramid(), camera };
+            let mut out = Output { trace: &mut self.trace, found: &mut self.found };
+            self.squares.detect_occluded(input, self.broken.quads(), stages, &mut out);
         }
         let thirds = Third::ALL.map(|third| is_open(SlowPass::Papers(third)).then_some(third));
         if thirds.iter().any(Option::is_some) && is_needed(&self.found) {
@@ -363,12 +373,12 @@ impl Detector {
                 self.outlines.add_rows(view, &PAPERS, third.rows(view.height()));
             }
             self.papers.clear();
-            self.papers.extend(papers(view, &self.outlines, first));
-            let (seen, trace) =
-                ((view, self.outlines.pyramid(), self.papers.as_slice()), &mut self.trace);
-            self.squares.detect_on_paper(seen, camera, trace, &mut self.found);
-            if self.stags.is_missing(is_needed(&self.found), &self.found) {
-                self.stags.detect_on_paper(seen, camera, trace, &mut self.found);
+            self.papers.extend(quiet_zone_quads(view, &self.outlines, first));
+            let input = ImageInput { view, pyramid: self.outlines.pyramid(), camera };
+            let mut out = Output { trace: &mut self.trace, found: &mut self.found };
+            self.squares.detect_in_quiet_zones(input, &self.papers, &mut out);
+            if self.stags.is_missing(is_needed(out.found), out.found) {
+                self.stags.detect_in_quiet_zones(input, &self.papers, &mut out);
             }
             stages.ended("papers");
         }
@@ -377,9 +387,9 @@ impl Detector {
             if self.broken.make(view, pyramid) {
                 stages.ended("segments");
             }
-            let seen = (view, pyramid, self.broken.quads());
-            let watch = (&mut self.trace, &mut *stages);
-            self.stags.detect_damaged(seen, camera, watch, &mut self.found);
+            let input = ImageInput { view, pyramid, camera };
+            let mut out = Output { trace: &mut self.trace, found: &mut self.found };
+            self.stags.detect_occluded(input, self.broken.quads(), stages, &mut out);
         }
     }
 

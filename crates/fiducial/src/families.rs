@@ -1,5 +1,6 @@
 //! The detectors, one for each kind of marker.
 
+pub(crate) mod query;
 pub mod rings;
 pub mod rings_thesis;
 pub(crate) mod square;

@@ -2,5 +2,7 @@
 
 pub(crate) mod edge_response;
 pub(crate) mod exposure;
+pub(crate) mod homography;
 pub(crate) mod least_squares;
 pub(crate) mod normal;
+pub(crate) mod undistort;

@@ -1,9 +1,8 @@
-//! Where a plane is in space, from the image of known points on it.
+//! The pose of a plane from the image of known points on it.
 //!
-//! Four or more points of a plane seen by a camera leave two poses: the plane tilted one way, and the plane tilted the
-//! other way about the line of sight. Both come in closed form (Collins and Bartoli, "Infinitesimal plane-based pose
-//! estimation", IJCV 2014), and both are then moved to where the points' distances in the image, weighted with what is
-//! known of the points' errors, are least (Levenberg-Marquardt).
+//! Four or more points of a plane leave two poses: the plane tilted one way, and tilted the other way about the line of
+//! sight. Both come in closed form (Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014). Both
+//! are then refined: Levenberg-Marquardt minimises the reprojection error, weighted by the points' covariance.
 
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Rotation, Transform};
 use nalgebra::{
@@ -12,21 +11,25 @@ use nalgebra::{
 };
 
 use crate::observation::{MarkerPose, PoseSolution};
+use crate::optics::homography::Homography;
+use crate::optics::least_squares::{
+    Damping, Minimum, NormalEquations, Problem, Schedule, minimise,
+};
 
-/// A point of the marker's plane and where it was seen.
+/// A point of the marker's plane and its image.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct PlanePoint {
     /// Its place in the marker frame (x right, y up), in metres.
     pub place_m: [f64; 2],
-    /// Where it was seen, in the pixels of the image as the lens gave it.
+    /// Its pixel in the image as captured, with lens distortion.
     pub seen: Pixel,
     /// Covariance of `seen`, in square pixels.
     pub covariance_px2: Matrix2<f64>,
 }
 
 /// The pose of the marker frame in which `points` lie, for instance the corners of one marker or of all markers of a
-/// pad. `None` for fewer than four points, for points on a line, and when nothing in front of the camera whose face
-/// can be seen explains them.
+/// pad. `None` for fewer than four points, for points on a line, and when no visible face in front of the camera explains
+/// them.
 pub fn planar_pose(points: &[PlanePoint], camera: &CameraModel) -> Option<MarkerPose> {
     Plane { points, joint: None, camera }.pose()
 }
@@ -55,13 +58,27 @@ pub fn square_pose(
     Plane { points: &points, joint: Some(&information), camera }.pose()
 }
 
-/// Steps of the refinement; from the closed form a handful is enough.
-const MOST_STEPS: usize = 30;
-/// What is known of a turn before the image is seen, in one over square radians: it is no more than half a turn. Seen
-/// squarely from afar the image says nothing about the tilt, and the covariance must stay finite.
-const PRIOR_OF_TURN: f64 = 3.0 / (std::f64::consts::PI * std::f64::consts::PI);
+/// The closed form is so near that a handful of steps is enough.
+const SCHEDULE: Schedule = Schedule {
+    max_steps: 30,
+    damping: Damping {
+        first: 1e-4,
+        min: 1e-10,
+        increase: 20.0,
+        min_after_bad: 0.0,
+        max: 1e6,
+        ridge: 0.0,
+    },
+    settled_ratio: 1e-10,
+    settled_cost: 1e-15,
+    fails_without_step: true,
+    fails_without_equations: false,
+};
+/// Prior information on the rotation about each axis, in 1/rad²: that of a uniform angle within half a turn. Far away and
+/// face on, the image does not determine the tilt, and the covariance must stay finite.
+const ROTATION_PRIOR: f64 = 3.0 / (std::f64::consts::PI * std::f64::consts::PI);
 
-/// What is to be explained.
+/// The points whose pose is looked for.
 struct Plane<'a> {
     points: &'a [PlanePoint],
     /// Inverse of the joint covariance of four points, where it is known.
@@ -69,96 +86,23 @@ struct Plane<'a> {
     camera: &'a CameraModel,
 }
 
-/// A pose with the normal equations about it: translation, then rotation vector.
-#[derive(Copy, Clone, Debug)]
-struct Fit {
-    pose: Isometry3<f64>,
-    matrix: Matrix6<f64>,
-    right: Vector6<f64>,
-    cost: f64,
-    rms_px: f64,
-}
+/// A pose, the normal equations there (translation, then rotation vector) and the reprojection error in pixels.
+type Solution = Minimum<6, Isometry3<f64>, f64>;
 
-impl Plane<'_> {
-    fn pose(&self) -> Option<MarkerPose> {
-        let starts = self.closed_form()?;
-        let [first, second] = starts.map(|start| start.and_then(|start| self.refined(start)));
-        let (best, other) = match (first, second) {
-            (Some(a), Some(b)) if a.cost <= b.cost => (a, Some(b)),
-            (Some(a), Some(b)) => (b, Some(a)),
-            (one, other) => (one.or(other)?, None),
-        };
-        let mut information = best.matrix;
-        for axis in 3..6 {
-            information[(axis, axis)] += PRIOR_OF_TURN;
-        }
-        let covariance = information.cholesky()?.inverse();
-        covariance.iter().all(|c| c.is_finite()).then_some(MarkerPose {
-            camera_from_marker: Transform::from_isometry(best.pose),
-            reprojection_rms_px: best.rms_px,
-            covariance,
-            alternative: other.filter(|other| self.are_apart(&best, other)).map(|other| {
-                PoseSolution {
-                    camera_from_marker: Transform::from_isometry(other.pose),
-                    reprojection_rms_px: other.rms_px,
-                }
-            }),
-        })
-    }
+impl Problem<6> for Plane<'_> {
+    type Place = Isometry3<f64>;
+    type Extra = f64;
 
-    /// Whether something worse lies between two poses.
-    fn are_apart(&self, a: &Fit, b: &Fit) -> bool {
-        let between = Isometry3::from_parts(
-            Translation3::from((a.pose.translation.vector + b.pose.translation.vector) / 2.0),
-            Rotation::<Camera, MarkerFrame>::from_quaternion(a.pose.rotation)
-                .interpolate(&Rotation::from_quaternion(b.pose.rotation), 0.5)
-                .quaternion,
-        );
-        let worst = a.cost.max(b.cost);
-        let middle = self.fit(between).map_or(f64::INFINITY, |fit| fit.cost);
-        middle > worst * (1.0 + 1e-6) + 1e-9
-    }
-
-    /// The pose of least cost near `start`.
-    fn refined(&self, start: Isometry3<f64>) -> Option<Fit> {
-        let mut best = self.fit(start)?;
-        let mut damping = 1e-4;
-        for _ in 0..MOST_STEPS {
-            let mut matrix = best.matrix;
-            for axis in 0..6 {
-                matrix[(axis, axis)] += damping * best.matrix[(axis, axis)];
-            }
-            let step = matrix.cholesky()?.solve(&best.right);
-            match self.fit(moved(&best.pose, &step)) {
-                Some(next) if next.cost <= best.cost => {
-                    let settled = best.cost - next.cost < 1e-10 * best.cost + 1e-15;
-                    best = next;
-                    damping = (damping * 0.1).max(1e-10);
-                    if settled {
-                        break;
-                    }
-                }
-                _ => {
-                    damping *= 20.0;
-                    if damping > 1e6 {
-                        break;
-                    }
-                }
-            }
-        }
-        Some(best)
-    }
-
-    /// The normal equations at a pose; `None` where a point would lie behind the camera, or the face away from it.
-    fn fit(&self, pose: Isometry3<f64>) -> Option<Fit> {
-        let mut fit =
-            Fit { pose, matrix: Matrix6::zeros(), right: Vector6::zeros(), cost: 0.0, rms_px: 0.0 };
+    /// `None` where a point would lie behind the camera, or the face away from it.
+    fn linearised(&mut self, pose: &Isometry3<f64>) -> Option<NormalEquations<6, f64>> {
+        let (mut matrix, mut right, mut cost) = (Matrix6::zeros(), Vector6::zeros(), 0.0);
         let rotation = pose.rotation.to_rotation_matrix();
         let facing = rotation.matrix().column(2).dot(&pose.translation.vector);
         if facing.is_nan() || facing >= 0.0 {
             return None;
         }
-        let mut joint = (SVector::<f64, 8>::zeros(), SMatrix::<f64, 8, 6>::zeros());
+        let mut residuals = SVector::<f64, 8>::zeros();
+        let mut jacobian = SMatrix::<f64, 8, 6>::zeros();
         let mut squares = 0.0;
         for (i, point) in self.points.iter().enumerate() {
             let arm = rotation * Vector3::new(point.place_m[0], point.place_m[1], 0.0);
@@ -170,29 +114,74 @@ impl Plane<'_> {
             slope.fixed_view_mut::<2, 3>(0, 0).copy_from(&by_place);
             slope.fixed_view_mut::<2, 3>(0, 3).copy_from(&(by_place * -arm.cross_matrix()));
             if self.joint.is_some() {
-                joint.0.fixed_rows_mut::<2>(2 * i).copy_from(&residual);
-                joint.1.fixed_view_mut::<2, 6>(2 * i, 0).copy_from(&slope);
+                residuals.fixed_rows_mut::<2>(2 * i).copy_from(&residual);
+                jacobian.fixed_view_mut::<2, 6>(2 * i, 0).copy_from(&slope);
                 continue;
             }
             let weight = point.covariance_px2.cholesky()?.inverse();
-            fit.matrix += slope.transpose() * weight * slope;
-            fit.right += slope.transpose() * weight * residual;
-            fit.cost += residual.dot(&(weight * residual));
+            matrix += slope.transpose() * weight * slope;
+            right += slope.transpose() * weight * residual;
+            cost += residual.dot(&(weight * residual));
         }
         if let Some(information) = self.joint {
-            fit.matrix = joint.1.transpose() * information * joint.1;
-            fit.right = joint.1.transpose() * (information * joint.0);
-            fit.cost = joint.0.dot(&(information * joint.0));
+            matrix = jacobian.transpose() * information * jacobian;
+            right = jacobian.transpose() * (information * residuals);
+            cost = residuals.dot(&(information * residuals));
         }
-        fit.rms_px = (squares / self.points.len() as f64).sqrt();
-        (fit.cost.is_finite() && fit.matrix.iter().all(|m| m.is_finite())).then_some(fit)
+        let rms_px = (squares / self.points.len() as f64).sqrt();
+        let is_finite = cost.is_finite() && matrix.iter().all(|m| m.is_finite());
+        is_finite.then_some(NormalEquations { matrix, right, cost, extra: rms_px })
+    }
+
+    fn moved(&self, from: &Isometry3<f64>, step: &Vector6<f64>) -> Option<Isometry3<f64>> {
+        Some(moved(from, step))
+    }
+}
+
+impl Plane<'_> {
+    fn pose(mut self) -> Option<MarkerPose> {
+        let starts = self.closed_form()?;
+        let [first, second] =
+            starts.map(|start| start.and_then(|start| minimise(&mut self, start, &SCHEDULE)));
+        let (best, other) = match (first, second) {
+            (Some(a), Some(b)) if a.equations.cost <= b.equations.cost => (a, Some(b)),
+            (Some(a), Some(b)) => (b, Some(a)),
+            (one, other) => (one.or(other)?, None),
+        };
+        let mut information = best.equations.matrix;
+        for axis in 3..6 {
+            information[(axis, axis)] += ROTATION_PRIOR;
+        }
+        let covariance = information.cholesky()?.inverse();
+        let other = other.filter(|other| self.is_other_minimum(&best, other));
+        covariance.iter().all(|c| c.is_finite()).then_some(MarkerPose {
+            camera_from_marker: Transform::from_isometry(best.place),
+            reprojection_rms_px: best.equations.extra,
+            covariance,
+            alternative: other.map(|other| PoseSolution {
+                camera_from_marker: Transform::from_isometry(other.place),
+                reprojection_rms_px: other.equations.extra,
+            }),
+        })
+    }
+
+    /// Whether two poses are different minima: the pose between them costs more than both.
+    fn is_other_minimum(&mut self, a: &Solution, b: &Solution) -> bool {
+        let [from, to] = [a.place, b.place];
+        let between = Isometry3::from_parts(
+            Translation3::from((from.translation.vector + to.translation.vector) / 2.0),
+            Rotation::<Camera, MarkerFrame>::from_quaternion(from.rotation)
+                .interpolate(&Rotation::from_quaternion(to.rotation), 0.5)
+                .quaternion,
+        );
+        let worst = a.equations.cost.max(b.equations.cost);
+        let middle = self.linearised(&between).map_or(f64::INFINITY, |fit| fit.cost);
+        middle > worst * (1.0 + 1e-6) + 1e-9
     }
 
     /// The two poses of the plane in closed form.
     fn closed_form(&self) -> Option<[Option<Isometry3<f64>>; 2]> {
-        let middle = self.middle()?;
-        let homography = self.homography(&middle)?;
-        let rotations = rotations_of(&homography)?;
+        let rotations = rotations(&self.homography()?)?;
         Some(rotations.map(|rotation| {
             let translation = self.translation(&rotation)?;
             let quaternion = UnitQuaternion::from_rotation_matrix(&rotation);
@@ -200,48 +189,34 @@ impl Plane<'_> {
         }))
     }
 
-    fn middle(&self) -> Option<[f64; 2]> {
+    /// The homography to normalised image coordinates, from the plane about the points' middle in units of their extent.
+    fn homography(&self) -> Option<Homography> {
         let count = self.points.len();
+        if count < 4 {
+            return None;
+        }
         let sum = self
             .points
             .iter()
             .fold([0.0, 0.0], |sum, point| [sum[0] + point.place_m[0], sum[1] + point.place_m[1]]);
-        (count >= 4).then(|| sum.map(|s| s / count as f64))
-    }
-
-    /// Where the plane about `middle` goes in normalised coordinates, with 1 as its last element.
-    fn homography(&self, middle: &[f64; 2]) -> Option<Matrix3<f64>> {
-        let size = self.points.iter().fold(0.0_f64, |most, point| {
-            let arm = [point.place_m[0] - middle[0], point.place_m[1] - middle[1]];
-            most.max(arm[0].abs()).max(arm[1].abs())
-        });
-        let mut matrix = SMatrix::<f64, 8, 8>::zeros();
-        let mut right = SVector::<f64, 8>::zeros();
+        let middle = sum.map(|s| s / count as f64);
+        let arm = |point: &PlanePoint| [0, 1].map(|axis| point.place_m[axis] - middle[axis]);
+        let extent =
+            self.points.iter().map(arm).fold(0.0_f64, |max, [x, y]| max.max(x.abs()).max(y.abs()));
         let first = self.camera.sight(self.points.first()?.seen)?;
-        for point in self.points {
-            let ray = self.camera.sight(point.seen)?;
-            // About a point nearby: small numbers keep the equations well conditioned.
-            let (u, v) = (ray.x() - first.x(), ray.y() - first.y());
-            let (x, y) =
-                ((point.place_m[0] - middle[0]) / size, (point.place_m[1] - middle[1]) / size);
-            let rows = [
-                (SVector::<f64, 8>::from([x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y]), u),
-                (SVector::<f64, 8>::from([0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y]), v),
-            ];
-            for (row, value) in rows {
-                matrix += row * row.transpose();
-                right += row * value;
-            }
-        }
-        let h = matrix.lu().solve(&right)?;
-        let sound = h.iter().all(|h| h.is_finite());
-        let centred = Matrix3::new(h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], 1.0);
-        let back = Matrix3::new(1.0, 0.0, first.x(), 0.0, 1.0, first.y(), 0.0, 0.0, 1.0);
-        let shrink = Matrix3::from_diagonal(&Vector3::new(1.0 / size, 1.0 / size, 1.0));
-        sound.then(|| back * centred * shrink)
+        let origin = [first.x(), first.y()];
+        let mut is_seen = true;
+        let pairs = self.points.iter().filter_map(|point| {
+            let ray = self.camera.sight(point.seen);
+            is_seen &= ray.is_some();
+            let ray = ray?;
+            Some([arm(point).map(|a| a / extent), [ray.x() - origin[0], ray.y() - origin[1]]])
+        });
+        let homography = Homography::from_points(pairs, origin)?;
+        is_seen.then_some(homography)
     }
 
-    /// The translation that fits the points best, algebraically, once the rotation is known.
+    /// The translation that fits the points best, algebraically, for a rotation.
     fn translation(&self, rotation: &Rotation3<f64>) -> Option<Vector3<f64>> {
         let mut matrix = Matrix3::zeros();
         let mut right = Vector3::zeros();
@@ -261,16 +236,12 @@ impl Plane<'_> {
     }
 }
 
-/// The two rotations of a plane whose image about its origin changes as this homography does.
-fn rotations_of(homography: &Matrix3<f64>) -> Option<[Rotation3<f64>; 2]> {
-    let h = homography / homography[(2, 2)];
-    let seen = Vector2::new(h[(0, 2)], h[(1, 2)]);
-    let jacobian = Matrix2::new(
-        h[(0, 0)] - h[(2, 0)] * seen.x,
-        h[(0, 1)] - h[(2, 1)] * seen.x,
-        h[(1, 0)] - h[(2, 0)] * seen.y,
-        h[(1, 1)] - h[(2, 1)] * seen.y,
-    );
+/// The two rotations of a plane with this homography to normalised image coordinates.
+fn rotations(homography: &Homography) -> Option<[Rotation3<f64>; 2]> {
+    let origin = homography.project([0.0, 0.0]);
+    let seen = Vector2::from(origin.image);
+    let [by_x, by_y] = origin.jacobian(homography);
+    let jacobian = Matrix2::new(by_x[0], by_y[0], by_x[1], by_y[1]);
     let sight = Vector3::new(seen.x, seen.y, 1.0);
     let turn = Rotation3::rotation_between(&Vector3::z(), &sight)?;
     let across = turn.matrix();
@@ -296,7 +267,7 @@ fn rotations_of(homography: &Matrix3<f64>) -> Option<[Rotation3<f64>; 2]> {
     Some([1.0, -1.0].map(|sign| {
         let x = Vector3::new(flat[(0, 0)], flat[(1, 0)], sign * depth.x);
         let y = Vector3::new(flat[(0, 1)], flat[(1, 1)], sign * depth.y);
-        // Rounding leaves the columns not quite upright on each other.
+        // Rounding leaves the columns not quite orthogonal.
         turn * Rotation3::from_matrix_eps(
             &Matrix3::from_columns(&[x, y, x.cross(&y)]),
             1e-9,
@@ -309,7 +280,7 @@ fn rotations_of(homography: &Matrix3<f64>) -> Option<[Rotation3<f64>; 2]> {
 /// The pose after a step: translation, then rotation vector, both in the camera frame.
 fn moved(pose: &Isometry3<f64>, step: &Vector6<f64>) -> Isometry3<f64> {
     let turn = Vector3::new(step[3], step[4], step[5]);
-    // No single step turns the plane over.
+    // No single step may flip the plane.
     let turn = turn * (0.5 / turn.norm().max(0.5));
     Isometry3::from_parts(
         Translation3::from(pose.translation.vector + step.fixed_rows::<3>(0)),

@@ -2,6 +2,7 @@
 
 pub mod corners;
 pub(crate) mod edges;
+pub mod fit;
 pub mod pattern;
 pub(crate) mod photometric;
 pub(crate) mod stag_design;

@@ -6,7 +6,8 @@ mod scene;
 
 use std::time::Instant;
 
-use fiducial::refine::corners::{Refined, Scratch, refine};
+use fiducial::refine::corners::refine;
+use fiducial::refine::fit::{CornerGuess, Refined, Scratch};
 use fiducial::refine::pattern::Pattern;
 use fiducial::square_pose;
 use geometry::{CameraModel, Distortion, Pixel};
@@ -92,6 +93,14 @@ fn share(values: &[f64], share: f64) -> f64 {
     sorted.get(((sorted.len() as f64 - 1.0) * share).round() as usize).copied().unwrap_or(f64::NAN)
 }
 
+fn guess<'a>(
+    view: GrayView<'a>,
+    corners: &'a [Pixel; 4],
+    camera: &'a CameraModel,
+) -> CornerGuess<'a> {
+    CornerGuess { view, corners, camera: Some(camera), is_near: false }
+}
+
 fn errors(scenes: usize, noises: usize, make: impl Fn(u64) -> Scene) -> Errors {
     let mut errors = Errors::default();
     let mut scratch = Scratch::default();
@@ -103,8 +112,11 @@ fn errors(scenes: usize, noises: usize, make: impl Fn(u64) -> Scene) -> Errors {
             let coarse = scene.coarse(1.0_f64.min(0.08 * area(&scene.corners()).sqrt()));
             let pattern = scene.pattern();
             let start = Instant::now();
-            let refined =
-                refine(image.view().unwrap(), &coarse, &pattern, Some(&scene.camera), &mut scratch);
+            let refined = refine(
+                &guess(image.view().unwrap(), &coarse, &scene.camera),
+                &pattern,
+                &mut scratch,
+            );
             errors.micros.push(start.elapsed().as_secs_f64() * 1e6);
             errors.note(&scene, refined.as_ref());
         }
@@ -286,7 +298,7 @@ fn corners_outside_of_the_image_are_found_from_far_off() {
         assert!(hidden >= 1, "{seed}");
         let view = image.view().unwrap();
         let refined =
-            refine(view, &coarse, &scene.pattern(), Some(&scene.camera), &mut scratch).unwrap();
+            refine(&guess(view, &coarse, &scene.camera), &scene.pattern(), &mut scratch).unwrap();
         let off_px = refined.centre.distance(&scene.centre());
         println!("{seed}: {hidden} hidden, {off_px:.4} px");
         assert!(off_px < 0.1, "{seed}: {off_px}");
@@ -337,7 +349,7 @@ fn nonsense_is_survived() {
         let mut camera = CameraModel::pinhole(width as u32, height as u32, 50.0);
         camera.distortion = [Distortion::None, BARREL, Distortion::KannalaBrandt([9.0; 4])][kind];
         for pattern in patterns.iter().flatten() {
-            if let Some(found) = refine(view, &corners, pattern, Some(&camera), &mut scratch) {
+            if let Some(found) = refine(&guess(view, &corners, &camera), pattern, &mut scratch) {
                 assert!(found.corners.iter().all(|c| c.x.is_finite() && c.y.is_finite()));
                 assert!(found.covariance_px2.iter().all(|c| c.is_finite()));
             }
@@ -356,7 +368,7 @@ fn speed() {
     let view = image.view().unwrap();
     let start = Instant::now();
     let found = (0..3000)
-        .filter(|_| refine(view, &coarse, &pattern, Some(&scene.camera), &mut scratch).is_some())
+        .filter(|_| refine(&guess(view, &coarse, &scene.camera), &pattern, &mut scratch).is_some())
         .count();
     println!("{found}: {:.1} us each", start.elapsed().as_secs_f64() * 1e6 / 3000.0);
 }

@@ -1,15 +1,15 @@
-//! A four-sided candidate, and which outlines are one.
+//! Quads, the candidates for square markers, from closed outlines.
 
 use geometry::Pixel;
 use imaging::Outline;
 use imaging::pyramid::to_level_0;
 
-/// A four-sided outline that may be a square marker's.
+/// A quad that may be a square marker's outline.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct Quad {
     /// Its corners, clockwise as seen in the image.
     pub(crate) corners: [Pixel; 4],
-    /// Bright within, dark around.
+    /// Bright inside, dark outside.
     pub(crate) inverted: bool,
 }
 
@@ -19,18 +19,28 @@ pub(crate) fn middle(corners: &[Pixel; 4]) -> Pixel {
     Pixel::new(mean(|c| c.x), mean(|c| c.y))
 }
 
-/// The sides between four corners, in pixels, the one after the first corner first.
+/// The lengths of the four sides, in pixels; the first begins at the first corner.
 pub(crate) fn sides_px(corners: &[Pixel; 4]) -> [f64; 4] {
     [0, 1, 2, 3].map(|i| corners[i].distance(&corners[(i + 1) % 4]))
 }
 
-/// The longer diagonal between four corners, in pixels.
+/// The mean of the four sides, in pixels.
+pub(crate) fn mean_side_px(corners: &[Pixel; 4]) -> f64 {
+    sides_px(corners).iter().sum::<f64>() / 4.0
+}
+
+/// The shortest of the four sides, in pixels.
+pub(crate) fn shortest_side_px(corners: &[Pixel; 4]) -> f64 {
+    sides_px(corners).into_iter().fold(f64::INFINITY, f64::min)
+}
+
+/// The longer diagonal, in pixels.
 pub(crate) fn diagonal_px(corners: &[Pixel; 4]) -> f64 {
     corners[0].distance(&corners[2]).max(corners[1].distance(&corners[3]))
 }
 
 impl Quad {
-    /// The quad drawn together about its middle by this factor.
+    /// The quad scaled about its middle.
     pub(crate) fn scaled(&self, factor: f64) -> Self {
         let centre = middle(&self.corners);
         let inner = |c: Pixel| {
@@ -40,37 +50,37 @@ impl Quad {
         Self { corners: self.corners.map(inner), ..*self }
     }
 
-    /// The quad that an outline is, its sides fitted to the outline's points; `None` when it is none.
-    pub(crate) fn of(outline: &Outline<'_>) -> Option<Self> {
+    /// The quad whose sides fit an outline's points; `None` when the outline is not four-sided.
+    pub(crate) fn from_outline(outline: &Outline<'_>) -> Option<Self> {
         let points = outline.points;
         let indices = Self::corner_points(points)?;
         let [width, height] = [0, 1].map(|i| f32::from(outline.bounds[i + 2] - outline.bounds[i]));
         let size = width.max(height);
         let mut sides = [Side::default(); 4];
         for (i, side) in sides.iter_mut().enumerate() {
-            *side = Side::of(points, indices[i], indices[(i + 1) % 4])?;
+            *side = Side::new(points, indices[i], indices[(i + 1) % 4])?;
         }
         let mut lines = [Line::default(); 4];
         for (i, line) in lines.iter_mut().enumerate() {
-            // From so far away opposite sides are parallel, and together tell their direction better.
+            // Opposite sides of small quads are practically parallel; together they give a better direction.
             let parallel = outline.level == 0 && size <= PARALLEL_PX;
             let opposite = parallel.then_some(&sides[(i + 2) % 4]);
             *line = sides[i].line(opposite)?;
-            if line.rms > LEAST_RMS_PX + RMS_PER_PX * size {
+            if line.rms > MAX_RMS_PX + MAX_RMS_RATIO * size {
                 return None;
             }
         }
         let mut corners = [[0.0; 2]; 4];
         for i in 0..4 {
-            corners[i] = lines[(i + 3) % 4].meets(&lines[i])?;
+            corners[i] = lines[(i + 3) % 4].intersection(&lines[i])?;
             let seen = points[indices[i]];
             let off = (corners[i][0] - seen[0]).hypot(corners[i][1] - seen[1]);
-            if off > MOST_CORNER_PX + MOST_CORNER_PER_PX * size {
+            if off > MAX_CORNER_PX + MAX_CORNER_RATIO * size {
                 return None;
             }
         }
-        let is_sound = is_sound(&corners, outline.area as f32);
-        is_sound.then(|| Self {
+        let is_plausible = is_plausible(&corners, outline.area as f32);
+        is_plausible.then(|| Self {
             corners: corners.map(|[x, y]| {
                 let place = |at: f32| to_level_0(f64::from(at), outline.level);
                 Pixel::new(place(x), place(y))
@@ -79,10 +89,10 @@ impl Quad {
         })
     }
 
-    /// Indices of the points that are likeliest corners, in order: the farthest from the middle, the farthest from that
-    /// one, and the two farthest from the line between these.
+    /// Indices of the likeliest corners, in order: the point farthest from the middle, the one farthest from that one, and
+    /// the two farthest from the line between them.
     fn corner_points(points: &[[f32; 2]]) -> Option<[usize; 4]> {
-        if points.len() < LEAST_POINTS {
+        if points.len() < MIN_POINTS {
             return None;
         }
         let n = points.len() as f32;
@@ -92,7 +102,7 @@ impl Quad {
         let ([ax, ay], [bx, by]) = (points[first], points[third]);
         let (mut second, mut fourth) = ((first, 0.0), (first, 0.0));
         for (index, [x, y]) in points.iter().enumerate() {
-            // Positive to the right of the way from the first to the third, which clockwise is where the fourth lies.
+            // Positive to the right of the line from the first to the third, where, clockwise, the fourth corner lies.
             let across = (bx - ax) * (y - ay) - (by - ay) * (x - ax);
             if across > fourth.1 {
                 fourth = (index, across);
@@ -105,29 +115,30 @@ impl Quad {
         if second.1 == 0.0 || fourth.1 == 0.0 {
             return None;
         }
-        // Two corners at the ends of a short side may not be the farthest; each corner is the point farthest from the line
-        // between its neighbours.
+        // The ends of a short side may not be the farthest points, so each corner is moved to the point farthest from the
+        // line between its neighbours.
         for i in [0, 2, 1, 3] {
             let (before, after) = (indices[(i + 3) % 4], indices[(i + 1) % 4]);
             indices[i] = farthest_from_line(points, before, after)?;
         }
-        let turns = (0..4).filter(|i| indices[(i + 1) % 4] < indices[*i]).count();
-        (turns == 1).then_some(indices)
+        let wraps = (0..4).filter(|i| indices[(i + 1) % 4] < indices[*i]).count();
+        (wraps == 1).then_some(indices)
     }
 }
 
-/// Fewer points are no outline of four sides.
-const LEAST_POINTS: usize = 12;
-/// Root mean square distance of a side's points from its line: so much, and more for each pixel of the outline's size.
-const LEAST_RMS_PX: f32 = 0.3;
-const RMS_PER_PX: f32 = 0.012;
-/// Quads up to this size are parallelograms, in pixels.
+/// Smallest number of points of a four-sided outline.
+const MIN_POINTS: usize = 12;
+/// Largest root mean square distance of a side's points from its line: in pixels, plus a fraction of the outline's size.
+const MAX_RMS_PX: f32 = 0.3;
+const MAX_RMS_RATIO: f32 = 0.012;
+/// Quads up to this size, in pixels, are taken to be parallelograms.
 const PARALLEL_PX: f32 = 20.0;
-/// How far from the outline's extreme points its corners may be; blur rounds corners.
-const MOST_CORNER_PX: f32 = 1.6;
-const MOST_CORNER_PER_PX: f32 = 0.12;
-/// Share of a side, and pixels, at either end that do not count, as corners are rounded.
-const END_SHARE: f32 = 0.1;
+/// Largest distance of a corner from the outline's extreme point, since blur rounds corners: in pixels, plus a fraction
+/// of the outline's size.
+const MAX_CORNER_PX: f32 = 1.6;
+const MAX_CORNER_RATIO: f32 = 0.12;
+/// Part at either end of a side that is left out because corners are rounded: a fraction of the side, plus pixels.
+const END_RATIO: f32 = 0.1;
 const END_PX: f32 = 1.0;
 
 fn farthest(points: &[[f32; 2]], from: [f32; 2]) -> usize {
@@ -179,10 +190,10 @@ impl Line {
         (self.normal[0] * x + self.normal[1] * y - self.offset).abs()
     }
 
-    fn meets(&self, other: &Self) -> Option<[f32; 2]> {
+    fn intersection(&self, other: &Self) -> Option<[f32; 2]> {
         let ([a, b], [c, d]) = (self.normal, other.normal);
         let determinant = a * d - b * c;
-        // Sides at less than about 15 degrees are no corner.
+        // Corners of less than about 15 degrees are refused.
         if determinant.abs() < 0.25 {
             return None;
         }
@@ -191,7 +202,7 @@ impl Line {
     }
 }
 
-/// The points of a side: their mean, and the sums of the squares and products of their distances from it.
+/// The points of a side: their mean, and the sums of the squares and products of their offsets from it.
 #[derive(Copy, Clone, Debug, Default)]
 struct Side {
     count: f32,
@@ -199,16 +210,16 @@ struct Side {
     xx: f32,
     xy: f32,
     yy: f32,
-    /// Root mean square distance of all points of the side from their line, those left out as well.
+    /// Root mean square distance of all points of the side from their line, outliers included.
     rms: f32,
 }
 
 impl Side {
-    /// The points from one index to another without the ends, and without those that lie off the line of the others.
-    fn of(points: &[[f32; 2]], from: usize, to: usize) -> Option<Self> {
+    /// The points from one index to another, without the ends and without outliers.
+    fn new(points: &[[f32; 2]], from: usize, to: usize) -> Option<Self> {
         let ([ax, ay], [bx, by]) = (points[from], points[to]);
         let length = (bx - ax).hypot(by - ay);
-        let end = (END_PX + END_SHARE * length).min(0.3 * length) * length;
+        let end = (END_PX + END_RATIO * length).min(0.3 * length) * length;
         let along = |[x, y]: &[f32; 2]| (x - ax) * (bx - ax) + (y - ay) * (by - ay);
         let inner = || {
             between(points, from, to)
@@ -217,8 +228,9 @@ impl Side {
         };
         let all = Self::sums(inner(), points[from]);
         let line = all.line(None)?;
-        let most = (2.0 * line.rms).max(0.25);
-        let near = Self::sums(inner().filter(|point| line.distance(*point) <= most), points[from]);
+        let max_distance = (2.0 * line.rms).max(0.25);
+        let near =
+            Self::sums(inner().filter(|point| line.distance(*point) <= max_distance), points[from]);
         Some(Self { rms: line.rms, ..near })
     }
 
@@ -238,7 +250,7 @@ impl Side {
         }
     }
 
-    /// The line nearest to the points, or the one of those parallel to the line of a second side.
+    /// The total least-squares line, or the one parallel to the common direction with a second side.
     fn line(&self, parallel_to: Option<&Self>) -> Option<Line> {
         if self.count < 2.0 {
             return None;
@@ -248,7 +260,7 @@ impl Side {
             (xx, xy, yy) = (xx + other.xx, xy + other.xy, yy + other.yy);
         }
         let root = (((xx - yy) / 2.0).powi(2) + xy * xy).sqrt();
-        // The normal belongs to the smaller eigenvalue; the longer one of two ways to write it is the exact one.
+        // The normal is the eigenvector of the smaller eigenvalue; of its two forms, the longer one is more exact.
         let smaller = (xx + yy) / 2.0 - root;
         let [a, b] = if xx > yy { [-xy, xx - smaller] } else { [yy - smaller, -xy] };
         let length = a.hypot(b);
@@ -262,8 +274,8 @@ impl Side {
     }
 }
 
-/// Whether corners are those of a convex quad of about that area that a square may look like.
-fn is_sound(corners: &[[f32; 2]; 4], area: f32) -> bool {
+/// Whether the corners make a convex quad of about this area that may be the image of a square.
+fn is_plausible(corners: &[[f32; 2]; 4], area: f32) -> bool {
     let (mut twice, mut shortest, mut longest) = (0.0, f32::MAX, 0.0_f32);
     for i in 0..4 {
         let [before, at, after] = [(i + 3) % 4, i, (i + 1) % 4].map(|k| corners[k]);
@@ -287,8 +299,8 @@ mod tests {
     use super::*;
     use imaging::{GrayView, Outlines, outline};
 
-    /// A dark shape on white, each pixel's value the mean of 8 x 8 points in it.
-    fn picture(within: impl Fn(f64, f64) -> bool) -> Vec<u8> {
+    /// A dark shape on white; each pixel is the mean of 8 x 8 points.
+    fn render(within: impl Fn(f64, f64) -> bool) -> Vec<u8> {
         let grey = |x: usize, y: usize| {
             let inside = (0..64).filter(|i| {
                 let part = |p: usize, k: usize| p as f64 + (k as f64 + 0.5) / 8.0 - 0.5;
@@ -299,22 +311,26 @@ mod tests {
         (0..96 * 96).map(|i| grey(i % 96, i / 96)).collect()
     }
 
-    /// The quads seen on the first levels; a disc of a few pixels may as well be a square.
+    /// The quads on the first levels; on later ones a disc of a few pixels may be taken for a square.
     fn quads(data: &[u8], levels: usize) -> Vec<Quad> {
         let mut outlines = Outlines::default();
         outlines.find(GrayView::packed(data, 96, 96).unwrap(), &outline::Settings::default());
-        outlines.iter().filter(|o| o.level < levels).filter_map(|o| Quad::of(&o)).collect()
+        outlines
+            .iter()
+            .filter(|o| o.level < levels)
+            .filter_map(|o| Quad::from_outline(&o))
+            .collect()
     }
 
     #[test]
-    fn a_turned_square_has_its_corners_to_a_fraction_of_a_pixel() {
+    fn corners_of_rotated_squares_are_found_to_a_fraction_of_a_pixel() {
         for (half, turn) in [(4.0, 0.3), (6.0, 0.7), (10.0, 0.0), (14.0, 0.4), (30.0, 1.1)] {
             let (sin, cos) = f64::sin_cos(turn);
             let within = |x: f64, y: f64| {
                 let (x, y) = (x - 47.3, y - 48.1);
                 (x * cos + y * sin).abs() < half && (y * cos - x * sin).abs() < half
             };
-            let found = quads(&picture(within), 9);
+            let found = quads(&render(within), 9);
             assert!(!found.is_empty(), "{half} {turn}");
             for quad in found {
                 for corner in quad.corners {
@@ -330,10 +346,10 @@ mod tests {
     }
 
     #[test]
-    fn discs_and_triangles_are_no_quads() {
+    fn discs_and_triangles_are_not_quads() {
         let disc = |x: f64, y: f64| (x - 48.0).hypot(y - 48.0) < 24.0;
-        assert_eq!(quads(&picture(disc), 2), []);
+        assert_eq!(quads(&render(disc), 2), []);
         let triangle = |x: f64, y: f64| y > 20.0 && y < 80.0 && (x - 48.0).abs() < (y - 20.0) / 2.0;
-        assert_eq!(quads(&picture(triangle), 2), []);
+        assert_eq!(quads(&render(triangle), 2), []);
     }
 }

@@ -1,139 +1,162 @@
-//! Finds square markers that are in part in shadow, washed out, covered or beyond the frame: the slow way, for when
-//! closed outlines do not show them.
+//! Markers that are partly in shadow, washed out, covered or beyond the frame, among quads of edge segments.
 
 use imaging::GrayView;
 use markers::SquareCode;
 
-use crate::candidates::quad::{Quad, diagonal_px, middle, sides_px};
-use crate::decode::erasures::{Reading, Seen, has_border, have_same_cells, look};
+use crate::candidates::overlap::{Overlap, suppress_non_maxima};
+use crate::candidates::quad::{Quad, shortest_side_px};
+use crate::decode::erasures::{CellImage, Reading, has_border, have_same_cells};
+
+/// Largest number of readings in one image.
+const MAX_FOUND: usize = 64;
+
+/// A quad with its reading.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) struct OccludedMarker<R> {
+    pub(crate) quad: Quad,
+    pub(crate) reading: R,
+    /// Of conflicting markers, the one with the highest score is kept.
+    pub(crate) score: f64,
+}
+
+/// Collects readings of quads and keeps the best of each place. It keeps its memory from image to image.
+#[derive(Clone, Debug)]
+pub(crate) struct Occluded<R> {
+    found: Vec<OccludedMarker<R>>,
+}
+
+impl<R> Default for Occluded<R> {
+    fn default() -> Self {
+        Self { found: Vec::new() }
+    }
+}
+
+impl<R: Copy> Occluded<R> {
+    /// Makes room for a frame's readings.
+    pub(crate) fn make_room(&mut self) {
+        self.found.clear();
+        self.found.reserve(MAX_FOUND);
+    }
+
+    /// The markers that `read` adds for the quads, each place once, the best first.
+    pub(crate) fn find(
+        &mut self,
+        quads: &[Quad],
+        mut read: impl FnMut(&Quad, &mut Self),
+    ) -> &[OccludedMarker<R>] {
+        self.found.clear();
+        for quad in quads {
+            if self.is_full() {
+                break;
+            }
+            read(quad, self);
+        }
+        suppress_non_maxima(
+            &mut self.found,
+            |marker| marker.score,
+            |better, marker| Overlap::new(&better.quad.corners, &marker.quad.corners).is_conflict(),
+        );
+        &self.found
+    }
+
+    pub(crate) fn push(&mut self, marker: OccludedMarker<R>) {
+        if !self.is_full() {
+            self.found.push(marker);
+        }
+    }
+
+    fn is_full(&self) -> bool {
+        self.found.len() >= MAX_FOUND
+    }
+}
 
 /// The markers of one family that are looked for.
 #[derive(Copy, Clone, Debug)]
-pub(crate) struct Sought<'a> {
-    /// What the caller knows the family by.
-    pub(crate) index: usize,
-    /// The family's code.
+pub(crate) struct OccludedQuery<'a> {
+    /// The caller's index of the family.
+    pub(crate) family: usize,
     pub(crate) code: &'a SquareCode,
     /// The ids; `None` stands for all.
     pub(crate) ids: Option<&'a [u32]>,
 }
 
-/// A marker that was found.
+/// A reading of a square marker.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub(crate) struct DamagedMarker {
-    /// What the caller knows its family by.
-    pub(crate) index: usize,
-    /// Its outline, the marker's own top left corner first.
-    pub(crate) quad: Quad,
-    /// What it says.
+pub(crate) struct SquareReading {
+    /// The caller's index of the family.
+    pub(crate) family: usize,
     pub(crate) reading: Reading,
 }
 
-/// Finds damaged markers. It keeps its memory from image to image.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Damaged {
-    found: Vec<DamagedMarker>,
-}
+/// Smallest cell that can be told from its neighbours, in pixels.
+const MIN_CELL_PX: f64 = 2.5;
+/// Largest number of readings tried in one image.
+const MAX_READ: usize = 100;
+/// A place where this fraction of border and quiet zone is intact is not read again.
+const WELL_INTACT: f32 = 0.9;
 
-/// Cells that are narrower, in pixels, cannot be told apart one by one.
-const LEAST_CELL_PX: f64 = 2.5;
-/// The most quads that are read in an image, and the most markers that are found.
-const MOST_READ: usize = 100;
-const MOST_FOUND: usize = 64;
-
-impl Damaged {
-    /// Makes room for what may be found.
-    pub(crate) fn make_room(&mut self) {
-        self.found.clear();
-        self.found.reserve(MOST_FOUND);
-    }
-
-    /// The markers in an image among the quads that its segments make, as far as these are open to markers of the code; the
-    /// surest first.
-    pub(crate) fn find<'a>(
+impl Occluded<SquareReading> {
+    /// The square markers among quads of segments. `is_open` tells whether a quad may be a marker of a code.
+    pub(crate) fn find_squares<'a>(
         &mut self,
         view: GrayView<'_>,
         quads: &[Quad],
-        sought: impl Iterator<Item = Sought<'a>> + Clone,
+        queries: impl Iterator<Item = OccludedQuery<'a>> + Clone,
         is_open: impl Fn(&Quad, &SquareCode) -> bool,
-    ) -> &[DamagedMarker] {
-        self.found.clear();
-        let mut left = MOST_READ;
-        for quad in quads {
-            let sought = sought.clone().filter(|sought| is_open(quad, sought.code));
-            read(view, quad, sought, &mut left, &mut self.found);
-        }
-        self.choose();
-        &self.found
-    }
-
-    /// Of what was found in one place more than once, keeps the surest.
-    fn choose(&mut self) {
-        let sureness = |marker: &DamagedMarker| {
-            let Reading { intact, explained, evidence, .. } = marker.reading;
-            intact * explained * evidence
-        };
-        self.found.sort_unstable_by(|a, b| sureness(b).total_cmp(&sureness(a)));
-        let mut kept = 0;
-        for index in 0..self.found.len() {
-            let marker = self.found[index];
-            if !self.found[..kept].iter().any(|other| is_same_place(&other.quad, &marker.quad)) {
-                self.found[kept] = marker;
-                kept += 1;
-            }
-        }
-        self.found.truncate(kept);
+    ) -> &[OccludedMarker<SquareReading>] {
+        let mut left = MAX_READ;
+        self.find(quads, |quad, found| {
+            let queries = queries.clone().filter(|query| is_open(quad, query.code));
+            read_square(view, quad, queries, &mut left, found);
+        })
     }
 }
 
 /// Reads a quad as a marker of each family that is looked for.
-fn read<'a>(
+fn read_square<'a>(
     view: GrayView<'_>,
     quad: &Quad,
-    sought: impl Iterator<Item = Sought<'a>>,
+    queries: impl Iterator<Item = OccludedQuery<'a>>,
     left: &mut usize,
-    found: &mut Vec<DamagedMarker>,
+    found: &mut Occluded<SquareReading>,
 ) {
-    // What was read well needs no second reading.
-    let is_known = found.iter().any(|m| m.reading.intact > 0.9 && is_same_place(&m.quad, quad));
+    let is_known = found.found.iter().any(|marker| {
+        marker.reading.reading.intact > WELL_INTACT
+            && Overlap::new(&marker.quad.corners, &quad.corners).is_conflict()
+    });
     if is_known {
         return;
     }
-    let shortest = sides_px(&quad.corners).into_iter().fold(f64::MAX, f64::min);
-    // Families with the same cells see the same.
+    let side_px = shortest_side_px(&quad.corners);
+    // Families with the same cells share their image.
     let mut border: Option<(u8, bool)> = None;
-    let mut looked: Option<(&SquareCode, Option<Seen>)> = None;
-    for family in sought {
-        let code = family.code;
-        if shortest < LEAST_CELL_PX * f64::from(code.cells) {
+    let mut image: Option<(&SquareCode, Option<CellImage>)> = None;
+    for OccludedQuery { family, code, ids } in queries {
+        if side_px < MIN_CELL_PX * f64::from(code.cells) {
             continue;
         }
-        if *left == 0 || found.len() >= MOST_FOUND {
+        if *left == 0 || found.is_full() {
             return;
         }
         let known = border.filter(|(cells, _)| *cells == code.cells);
-        let (_, has_border) =
+        let (_, is_bordered) =
             *border.insert(known.unwrap_or_else(|| (code.cells, has_border(view, quad, code))));
-        if !has_border {
+        if !is_bordered {
             continue;
         }
         *left -= 1;
-        if looked.as_ref().is_none_or(|(other, _)| !have_same_cells(other, code)) {
-            looked = Some((code, look(view, quad, code)));
+        if image.as_ref().is_none_or(|(other, _)| !have_same_cells(other, code)) {
+            image = Some((code, CellImage::read(view, quad, code)));
         }
-        let seen = looked.as_ref().and_then(|(_, seen)| seen.as_ref());
-        if let Some(reading) = seen.and_then(|seen| seen.reading(code, family.ids)) {
+        let cells = image.as_ref().and_then(|(_, cells)| cells.as_ref());
+        if let Some(reading) = cells.and_then(|cells| cells.decode(code, ids)) {
             let mut quad = *quad;
-            quad.corners.rotate_left(usize::from(reading.quarter_turns % 4));
-            found.push(DamagedMarker { index: family.index, quad, reading });
+            quad.corners.rotate_left(usize::from(reading.rotation % 4));
+            let score = f64::from(reading.intact * reading.r_squared * reading.evidence);
+            let reading = SquareReading { family, reading };
+            found.push(OccludedMarker { quad, reading, score });
         }
     }
-}
-
-/// Whether two quads overlap so much that only one of them can be a marker.
-fn is_same_place(a: &Quad, b: &Quad) -> bool {
-    let size = diagonal_px(&a.corners).max(diagonal_px(&b.corners));
-    middle(&a.corners).distance(&middle(&b.corners)) < 0.4 * size
 }
 
 #[cfg(test)]
@@ -147,9 +170,9 @@ mod tests {
     const SIDE: f64 = 80.0;
     const ID: u32 = 7;
 
-    /// A marker on paper on grey ground, turned, with its middle at `centre`; `light` says what becomes of the grey value
-    /// at a place, which is given in sides from the marker's middle and along its edges.
-    fn picture(
+    /// A rotated marker on paper on grey ground. `light` changes the grey value at a place, which is given in sides from the
+    /// marker's middle, along its edges.
+    fn render(
         code: &SquareCode,
         centre: [f64; 2],
         turn: f64,
@@ -185,7 +208,7 @@ mod tests {
                         light([u, v], grey(u, v)).clamp(0.0, 255.0)
                     })
                     .sum();
-                // A texture of a few grey levels, as no surface is even.
+                // A texture of a few grey levels.
                 *pixel = (sum / 9.0 + ((x * 7 + y * 13) % 5) as f64 - 2.0).clamp(0.0, 255.0) as u8;
             }
         }
@@ -196,34 +219,34 @@ mod tests {
         (image, corners)
     }
 
-    fn find(image: &GrayImage, code: &SquareCode, ids: Option<&[u32]>) -> Vec<DamagedMarker> {
+    fn find(
+        image: &GrayImage,
+        code: &SquareCode,
+        ids: Option<&[u32]>,
+    ) -> Vec<OccludedMarker<SquareReading>> {
         let mut pyramid = Pyramid::default();
         let view = image.view().unwrap();
         pyramid.build(view, 4, 16);
-        let sought = std::iter::once(Sought { index: 0, code, ids });
+        let queries = std::iter::once(OccludedQuery { family: 0, code, ids });
         let mut quads = ImageQuads::default();
         quads.begin(Scale::ALL.map(Some));
         quads.make(view, &pyramid);
-        Damaged::default().find(view, quads.quads(), sought, |_, _| true).to_vec()
+        let mut occluded = Occluded::default();
+        occluded.find_squares(view, quads.quads(), queries, |_, _| true).to_vec()
     }
 
-    /// Finds the one marker there is, whatever its turn, with its corners to so many pixels.
-    fn expect(
-        family: Family,
-        centre: [f64; 2],
-        most_px: f64,
-        light: impl Fn([f64; 2], f64) -> f64,
-    ) {
+    /// Asserts that the marker is found in any rotation, with errors of its corners below `max_px`.
+    fn expect(family: Family, centre: [f64; 2], max_px: f64, light: impl Fn([f64; 2], f64) -> f64) {
         let code = SquareCode::for_family(family).unwrap();
         for step in 0..8 {
             let turn = 0.1 + 0.8 * f64::from(step);
-            let (image, corners) = picture(code, centre, turn, &light);
+            let (image, corners) = render(code, centre, turn, &light);
             let found = find(&image, code, Some(&[ID]));
             assert_eq!(found.len(), 1, "{family} {turn}");
-            assert_eq!(found[0].reading.id, ID);
+            assert_eq!(found[0].reading.reading.id, ID);
             for (corner, truth) in found[0].quad.corners.iter().zip(corners) {
                 let off = corner.distance(&truth);
-                assert!(off < most_px, "{family} turned by {turn}: {off} px off");
+                assert!(off < max_px, "{family} turned by {turn}: {off} px off");
             }
         }
     }
@@ -233,7 +256,7 @@ mod tests {
     const MIDDLE: [f64; 2] = [160.3, 120.6];
 
     #[test]
-    fn with_the_edge_of_a_shadow_across_it() {
+    fn a_marker_under_the_edge_of_a_shadow_is_found() {
         for family in FAMILIES {
             expect(
                 family,
@@ -247,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn with_a_corner_covered() {
+    fn a_marker_with_a_covered_corner_is_found() {
         for level in [20.0, 90.0, 230.0] {
             for family in FAMILIES {
                 expect(family, MIDDLE, 1.5, |[u, v], grey| if u + v > 0.75 { level } else { grey });
@@ -256,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn with_a_reflection_on_it() {
+    fn a_marker_with_a_reflection_is_found() {
         expect(Family::AprilTag36h11, MIDDLE, 3.0, |[u, v], grey| {
             let away = (u - 0.35).hypot(v + 0.2) / 0.15;
             grey + 350.0 * (-0.5 * away * away).exp()
@@ -264,30 +287,30 @@ mod tests {
     }
 
     #[test]
-    fn white_on_black() {
+    fn a_marker_in_white_on_black_is_found() {
         for family in FAMILIES {
             expect(family, MIDDLE, 1.5, |_, grey| 235.0 - grey);
         }
     }
 
     #[test]
-    fn cut_by_the_frame() {
+    fn a_marker_cut_by_the_frame_is_found() {
         let code = SquareCode::for_family(Family::AprilTag36h11).unwrap();
         // A corner is beyond the left edge of the frame.
-        let (image, corners) = picture(code, [46.0, 120.0], std::f64::consts::FRAC_PI_4, |_, g| g);
+        let (image, corners) = render(code, [46.0, 120.0], std::f64::consts::FRAC_PI_4, |_, g| g);
         let found = find(&image, code, None);
         assert_eq!(found.len(), 1);
-        assert_eq!(found[0].reading.id, ID);
+        assert_eq!(found[0].reading.reading.id, ID);
         for (corner, truth) in found[0].quad.corners.iter().zip(corners) {
             assert!(corner.distance(&truth) < 1.5);
         }
     }
 
     #[test]
-    fn a_dark_square_and_another_id_are_no_such_marker() {
+    fn dark_squares_and_other_ids_are_not_found() {
         let code = SquareCode::for_family(Family::AprilTag16h5).unwrap();
         let (image, _) =
-            picture(
+            render(
                 code,
                 MIDDLE,
                 0.3,
@@ -296,13 +319,13 @@ mod tests {
                 },
             );
         assert_eq!(find(&image, code, None), []);
-        let (image, _) = picture(code, MIDDLE, 0.3, |_, grey| grey);
+        let (image, _) = render(code, MIDDLE, 0.3, |_, grey| grey);
         assert_eq!(find(&image, code, Some(&[8, 9])), []);
         assert_eq!(find(&image, code, None).len(), 1);
     }
 
     #[test]
-    fn any_image_is_survived() {
+    fn textures_are_not_markers() {
         let code = SquareCode::for_family(Family::AprilTagCircle21h7).unwrap();
         let mut random = 1_u32;
         for (width, height) in [(1, 1), (2, 9), (16, 16), (64, 48), (301, 7), (150, 150)] {

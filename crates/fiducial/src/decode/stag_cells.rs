@@ -1,46 +1,46 @@
-//! What the dots of an STag say.
+//! Reads the dots of an STag.
 //!
-//! Where a dot is hardly wider than a pixel, a pixel shows several. So the picture of the whole marker is solved for: each
-//! pixel is the sum of the dots' values, weighted by how much of each it sees through the lens' blur; all that is known to
-//! be black is one more unknown value, all that is known to be white another. The least squares solution gives the dots;
-//! the same sums tell how well any word explains the pixels, also where no dot can be told from its neighbours.
+//! Where a dot is hardly wider than a pixel, a pixel shows several of them. So all dots are solved for together: a pixel
+//! is the sum of the dots' values, weighted by their shares of it through the blur. All that is always black is one more
+//! unknown, all that is always white another. The least-squares solution gives the dots; the same sums tell how well any
+//! codeword explains the pixels, also where no dot can be told from its neighbours.
 
 use imaging::GrayView;
-use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};
 use nalgebra::{SMatrix, SVector};
 
-use crate::decode::cells::Grid;
-use crate::optics::edge_response::EdgeResponse;
+use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};
 
-/// Small cells across the square and its paper; their borders are the square's outline.
+use crate::decode::cells::{BRIGHT, DARK, Explanation, pixel_bounds};
+use crate::optics::edge_response::EdgeResponse;
+use crate::optics::homography::Homography;
+
+/// Small cells across the square, around it, and in all; the square's outline is a border of cells.
 const CELLS: usize = 24;
 const MARGIN: usize = (CELLS as f64 * QUIET_ZONE) as usize;
 const ACROSS: usize = CELLS + 2 * MARGIN;
 
 const UNKNOWNS: usize = DOTS + 2;
-/// Indices of the values of what is known to be black and of what is known to be white.
-const DARK: usize = 0;
-const BRIGHT: usize = 1;
-/// A dot's value counts for what is nearest to it up to this many radii: black grows together, white is white anyway.
+/// A dot's value holds within this multiple of its radius: neighbouring black dots merge in print, and white ones do not
+/// show.
 const REACH: f64 = 1.2;
 /// Samples of a small cell in each direction.
 const SAMPLES: usize = 8;
 
 /// Standard deviation of the blur of lens and pixel together, in pixels.
 const BLUR_PX: f64 = 0.6;
-/// A pixel sees this far, in standard deviations of the blur.
-const SEEN: f64 = 2.6;
-/// Most small cells that a pixel sees in a row.
-const MOST_SEEN: usize = 20;
-/// How far outside the paper's end pixels are still looked at, in pixels: what lies beyond is unknown.
+/// Reach of the blur, in standard deviations.
+const BLUR_REACH: f64 = 2.6;
+/// Largest number of small cells within the blur's reach in a row.
+const MAX_SEEN: usize = 20;
+/// Pixels count up to this far beyond the quiet zone's end, in pixels; the colour there is unknown.
 const BEYOND_PX: f64 = -0.4;
-/// Pulls dots towards the middle between black and white, as a share of a pixel's weight.
-const PULL: f64 = 0.05;
+/// Prior that pulls dots to the middle of black and white, as a fraction of a pixel's weight.
+const PRIOR: f64 = 0.05;
 
-/// What a small cell belongs to: at most four unknowns and their shares.
+/// The at most four unknowns that a small cell belongs to, with their shares.
 type Parts = [(u8, f32); 4];
 
-/// The sums of a picture's least squares, and its solution.
+/// The normal equations of the dots, and their solution.
 #[derive(Debug)]
 pub(crate) struct Dots {
     parts: Box<[Parts; ACROSS * ACROSS]>,
@@ -90,7 +90,7 @@ fn parts_of(cell: [usize; 2], dots: &[[f64; 2]; DOTS]) -> Parts {
         *part = (unknown as u8, *count as f32 / (SAMPLES * SAMPLES) as f32);
         *count = 0;
     }
-    // What is left out goes to the others.
+    // Smaller shares are given to these.
     let kept: f32 = parts.iter().map(|(_, share)| share).sum();
     parts.map(|(unknown, share)| (unknown, share / kept))
 }
@@ -109,43 +109,28 @@ fn unknown_at([x, y]: [f64; 2], dots: &[[f64; 2]; DOTS]) -> usize {
     }
 }
 
-/// A word as the explanation of a picture.
-#[derive(Copy, Clone, Debug, PartialEq)]
-pub(crate) struct Explanation {
-    /// Share of the pixels' variance that it explains.
-    pub(crate) explained: f64,
-    /// Grey values of black and white.
-    pub(crate) levels: [f64; 2],
-}
-
 impl Dots {
-    /// Adds up what the pixels of a square with these corners say; false when there are too few.
-    pub(crate) fn look(&mut self, view: GrayView<'_>, corners: &[[f64; 2]; 4]) -> bool {
+    /// Adds up the pixels of a square with these corners; false when there are too few.
+    pub(crate) fn add_pixels(&mut self, view: GrayView<'_>, corners: &[[f64; 2]; 4]) -> bool {
         self.normal.fill(0.0);
         self.right.fill(0.0);
         (self.count, self.sum, self.squares) = (0.0, 0.0, 0.0);
-        let Some(grid) = Grid::new(corners, CELLS) else { return false };
         let (n, margin) = (CELLS as f64, MARGIN as f64);
-        let [u, v] = cells_per_pixel(&grid);
+        let Some(homography) = Homography::from_square([0.0, n], corners) else { return false };
+        let inverse = homography.inverse();
+        let [u, v] = inverse.units_per_pixel(homography.project([n / 2.0; 2]).image);
         let reach = [u, v].map(|per_pixel| margin + BEYOND_PX * per_pixel);
         let ends = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
             .map(|end: [f64; 2]| [0, 1].map(|i| end[i] * (n + 2.0 * reach[i]) - reach[i]))
-            .map(|cell| grid.pixel(cell));
-        let bounds = |axis: usize, edge: usize| {
-            let low = ends.iter().map(|p| p[axis]).fold(f64::MAX, f64::min);
-            let high = ends.iter().map(|p| p[axis]).fold(f64::MIN, f64::max);
-            let last = edge as f64 - 1.0;
-            (low.ceil().clamp(0.0, last) as usize, high.floor().clamp(0.0, last) as usize)
-        };
-        let (left, right) = bounds(0, view.width());
-        let (top, bottom) = bounds(1, view.height());
+            .map(|cell| homography.project(cell).image);
+        let [left, top, right, bottom] = pixel_bounds(&ends, view);
         let blur = [u, v].map(|per_pixel| (per_pixel * BLUR_PX).clamp(0.05, 3.5));
-        let step = EdgeResponse::new();
+        let response = EdgeResponse::new();
         for y in top..=bottom {
             for (x, grey) in view.row(y).iter().enumerate().take(right + 1).skip(left) {
-                let cell = grid.cell([x as f64, y as f64]);
+                let cell = inverse.plane([x as f64, y as f64]);
                 if (0..2).all(|i| cell[i] > -reach[i] && cell[i] < n + reach[i]) {
-                    self.add(&step, cell.map(|c| c + margin), blur, f64::from(*grey));
+                    self.add(&response, cell.map(|c| c + margin), blur, f64::from(*grey));
                 }
             }
         }
@@ -153,9 +138,9 @@ impl Dots {
     }
 
     /// Adds a pixel at a place in small cells.
-    fn add(&mut self, step: &EdgeResponse, place: [f64; 2], blur: [f64; 2], grey: f64) {
-        let columns = Shares::new(step, place[0], blur[0]);
-        let rows = Shares::new(step, place[1], blur[1]);
+    fn add(&mut self, response: &EdgeResponse, place: [f64; 2], blur: [f64; 2], grey: f64) {
+        let columns = Shares::new(response, place[0], blur[0]);
+        let rows = Shares::new(response, place[1], blur[1]);
         let mut weights = [0.0_f64; UNKNOWNS];
         let mut seen = [0_u8; UNKNOWNS];
         let mut count = 0;
@@ -187,19 +172,19 @@ impl Dots {
         self.squares += grey * grey;
     }
 
-    /// Solves for the dots; false when the picture does not determine them.
+    /// Solves for the dots; false when the pixels do not determine them.
     pub(crate) fn solve(&mut self) -> bool {
-        let mut pulled = *self.normal;
+        let mut matrix = *self.normal;
         for k in 2..UNKNOWNS {
             // The square of dot - (dark + bright) / 2.
-            pulled[(k, k)] += PULL;
-            pulled[(k, DARK)] -= PULL / 2.0;
-            pulled[(k, BRIGHT)] -= PULL / 2.0;
+            matrix[(k, k)] += PRIOR;
+            matrix[(k, DARK)] -= PRIOR / 2.0;
+            matrix[(k, BRIGHT)] -= PRIOR / 2.0;
         }
         for (row, column) in [(DARK, DARK), (BRIGHT, DARK), (BRIGHT, BRIGHT)] {
-            pulled[(row, column)] += PULL * DOTS as f64 / 4.0;
+            matrix[(row, column)] += PRIOR * DOTS as f64 / 4.0;
         }
-        match pulled.cholesky() {
+        match matrix.cholesky() {
             Some(factor) => {
                 self.solution = factor.solve(&self.right);
                 self.solution.iter().all(|v| v.is_finite())
@@ -208,7 +193,7 @@ impl Dots {
         }
     }
 
-    /// The word that the dots' values are nearest to; what is black in print is bright where the print is inverted.
+    /// The word nearest to the dots' values; black dots are bright where the marker is printed white on black.
     pub(crate) fn word(&self) -> u64 {
         let (dark, bright) = (self.solution[DARK], self.solution[BRIGHT]);
         let (middle, inverted) = ((dark + bright) / 2.0, dark > bright);
@@ -216,13 +201,13 @@ impl Dots {
         self.solution.iter().skip(2).fold(0, |word, value| word << 1 | u64::from(is_black(*value)))
     }
 
-    /// How well a word explains the picture, with levels of its own for black and white.
+    /// How well a word explains the pixels, with the best levels of black and white for it.
     pub(crate) fn explain(&self, word: u64) -> Explanation {
         let is_white = |unknown: usize| match unknown {
             DARK | BRIGHT => unknown == BRIGHT,
             _ => !stag_code::is_black(word, unknown - 2),
         };
-        // Sums over what is white, and over all: the light of all is 1 in each pixel.
+        // Sums over what is white, and over all; in each pixel the shares of all add up to 1.
         let (mut white, mut grey) = (0.0, 0.0);
         let mut whites = [0_usize; UNKNOWNS];
         let mut count = 0;
@@ -241,16 +226,16 @@ impl Dots {
         let determinant = self.count * both - white * white;
         let contrast = (self.count * grey - white * self.sum) / determinant;
         let dark = (self.sum - contrast * white) / self.count;
-        let left = self.squares - dark * self.sum - contrast * grey;
+        let residual = self.squares - dark * self.sum - contrast * grey;
         let variance = self.squares - self.sum * self.sum / self.count;
-        let explained = 1.0 - left / variance;
+        let r_squared = 1.0 - residual / variance;
         Explanation {
-            explained: if explained.is_finite() { explained.clamp(0.0, 1.0) } else { 0.0 },
+            r_squared: if r_squared.is_finite() { r_squared.clamp(0.0, 1.0) } else { 0.0 },
             levels: [dark, dark + contrast],
         }
     }
 
-    /// What an unknown contributes to all pixels together: each pixel's shares add up to one.
+    /// An unknown's share of all pixels together.
     fn light(&self, unknown: usize) -> f64 {
         let row: f64 = (0..=unknown).map(|k| self.normal[(unknown, k)]).sum();
         let column: f64 = (unknown + 1..UNKNOWNS).map(|k| self.normal[(k, unknown)]).sum();
@@ -258,28 +243,29 @@ impl Dots {
     }
 }
 
-/// The shares that small cells in a row have of a pixel's light.
+/// The shares of a pixel's light from small cells in a row.
 struct Shares {
     first: usize,
     count: usize,
-    share: [f64; MOST_SEEN],
+    share: [f64; MAX_SEEN],
 }
 
 impl Shares {
-    fn new(step: &EdgeResponse, place: f64, blur: f64) -> Self {
-        let reach = SEEN * blur;
+    fn new(response: &EdgeResponse, place: f64, blur: f64) -> Self {
+        let reach = BLUR_REACH * blur;
         let last = ACROSS as f64 - 1.0;
         let first = (place - reach).floor().clamp(0.0, last) as usize;
         let end = (place + reach).floor().clamp(0.0, last) as usize + 1;
-        let count = end.saturating_sub(first).clamp(1, MOST_SEEN);
-        let mut share = [0.0; MOST_SEEN];
+        let count = end.saturating_sub(first).clamp(1, MAX_SEEN);
+        let mut share = [0.0; MAX_SEEN];
         let mut before = 0.0;
         for (i, share) in share.iter_mut().enumerate().take(count) {
-            // What lies beyond counts as the last cell on its side.
+            // Light from beyond counts as the last cell's.
             let line = (first + i + 1) as f64;
-            let upto = if i + 1 == count { 1.0 } else { step.at((line - place) / blur, 0.0).0 };
-            *share = upto - before;
-            before = upto;
+            let up_to =
+                if i + 1 == count { 1.0 } else { response.at((line - place) / blur, 0.0).0 };
+            *share = up_to - before;
+            before = up_to;
         }
         Self { first, count, share }
     }
@@ -287,13 +273,4 @@ impl Shares {
     fn each(&self) -> impl Iterator<Item = (usize, f64)> {
         self.share.iter().take(self.count).enumerate().map(|(i, share)| (self.first + i, *share))
     }
-}
-
-/// How many small cells a pixel is wide along their rows and columns, in the middle of the square.
-fn cells_per_pixel(grid: &Grid) -> [f64; 2] {
-    let [x, y] = grid.pixel([CELLS as f64 / 2.0; 2]);
-    let [u0, v0] = grid.cell([x, y]);
-    let [u1, v1] = grid.cell([x + 1.0, y]);
-    let [u2, v2] = grid.cell([x, y + 1.0]);
-    [(u1 - u0).hypot(u2 - u0), (v1 - v0).hypot(v2 - v0)]
 }

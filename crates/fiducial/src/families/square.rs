@@ -1,354 +1,303 @@
-//! Square markers: [`code`] says which cells of which family carry which words, `quad` finds four-sided outlines,
-//! `decode` reads their cells. `pattern` says which cells of a marker are black and white, `refine` where its
-//! corners are. [`Squares`] does it all, for any number of families at once. Where outlines are broken, `segments`
-//! makes quads of straight pieces of edges, `erasures` reads what is left of a marker, and `damaged` does both.
+//! Square markers: AprilTag and ArUco families.
+//!
+//! For each quad the cells are solved for, the codeword is matched, and its false-positive rate is weighed. Then the
+//! corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be hidden, and the quiet
+//! zones of markers so small that blur breaks their border.
 
-use geometry::{CameraModel, Pixel};
-use imaging::{GrayView, Outline, Outlines, Pyramid, bilinear};
-use markers::{Family, Marker, Match, SquareCode};
-use nalgebra::{Matrix2, SMatrix};
+use geometry::Pixel;
+use imaging::GrayView;
+use markers::{Marker, Match, SquareCode};
 
-use crate::candidates::quad::{Quad, diagonal_px, middle, sides_px};
-use crate::decode::cells::{Cells, Layout, Look};
-use crate::decode::false_positive as chance;
-use crate::decode::occluded::{Damaged, Sought};
+use crate::candidates::overlap::Overlap;
+use crate::candidates::quad::{Quad, mean_side_px};
+use crate::candidates::quiet_zone::{MAX_CONTRAST_VARIATION, border_contrast_variation};
+use crate::decode::cells::{Cells, Layout, SquareImage};
+use crate::decode::false_positive;
+use crate::decode::occluded::{Occluded, OccludedQuery, SquareReading};
+use crate::families::query::{ExpectedMarker, FamilyQuery, ImageInput, Output, segment_corner_px};
 use crate::observation::{Observation, Stages};
-use crate::pose::square_pose;
-use crate::refine::corners::{Refined, Scratch, refine_from};
+use crate::refine::corners::refine;
+use crate::refine::fit::{CornerGuess, Refined, Scratch};
 use crate::refine::pattern::Pattern;
 use crate::trace::{Reason, Trace};
 
 /// Bounds on the work in one image, far above what frames with markers need.
-const MOST_QUADS: usize = 4000;
-const MOST_SOLVED: usize = 500;
-const MOST_FOUND: usize = 256;
-pub(crate) const MOST_PAPERS: usize = 64;
+const MAX_SOLVED: usize = 500;
+const MAX_FOUND: usize = 256;
 
-/// Borders are broken by what is in them where cells are not wider, in pixels.
-const MOST_BROKEN_CELL_PX: f64 = 2.0;
+/// Cells up to this width, in pixels, are read by their quiet zone: blur may break their border.
+const MAX_QUIET_ZONE_CELL_PX: f64 = 2.0;
 
-/// How alike the steps from border to paper are all round a marker: the standard deviation as a share of the mean.
-pub(crate) const MOST_UNEVEN: f64 = 0.6;
-/// Share of the variance of its pixels that a marker explains; textures that happen to spell a word explain less. In 565
-/// pictures without markers none did more than 0.75, but for one with a bit that was neither black nor white.
-const LEAST_EXPLAINED: f64 = 0.78;
-/// The same for a word with as much evidence, in bits: chance spells none. Compression spoils the pixels of small ones.
-const LEAST_EXPLAINED_SURE: f64 = 0.68;
-const SURE_BITS: f64 = 14.0;
-/// What a marker is sure to at least: so much, less for each bit of evidence.
-const LEAST_CONFIDENCE: f64 = 0.68;
+/// Smallest R² of a marker; textures with a codeword reach less. In 565 images without markers, the highest R² was 0.75,
+/// but for one with an ambiguous bit.
+const MIN_R_SQUARED: f64 = 0.78;
+/// The same with strong evidence, which chance does not give: compression spoils the pixels of small markers.
+const MIN_R_SQUARED_STRONG: f64 = 0.68;
+const STRONG_EVIDENCE_BITS: f64 = 14.0;
+/// Smallest confidence without evidence, and by how much it falls with each bit of evidence.
+const MIN_CONFIDENCE: f64 = 0.68;
 const CONFIDENCE_PER_BIT: f64 = 0.02;
-/// Where cells are hardly wider than a pixel the doubtful bits of true markers are as doubtful as those of others, but
-/// there are fewer of the latter.
+/// The same falls by this where cells are narrower than a bound in pixels: bits of small markers are uncertain, and few
+/// other things are as small.
 const SMALL_CELL_PX: f64 = 1.5;
 const CONFIDENCE_OF_SMALL: f64 = 0.06;
 
-/// How good corners are before they are refined: of an outline; of joined segments, at least, and as a share of the
-/// diagonal.
-const OUTLINED_PX: f64 = 0.2;
-pub(crate) const JOINED_PX: f64 = 0.5;
-pub(crate) const JOINED_SHARE: f64 = 0.015;
+/// Standard deviation of the corners of an outline, in pixels.
+const OUTLINE_CORNER_PX: f64 = 0.2;
 
-/// One family that is looked for, and which of its ids.
+/// One family that is looked for.
 #[derive(Debug)]
-struct Wanted {
+struct SquareQuery {
+    query: FamilyQuery,
     code: &'static SquareCode,
-    /// Indices of the cells it shares with other families: with its border, and with one that is a cell wider.
+    /// Indices of its layouts: with the code's border, and with one that is a cell wider.
     layouts: [Option<usize>; 2],
-    markers: Vec<Marker>,
-    /// The ids that were not yet found in this image.
+    /// The ids that a fallback looks for.
     missing: Vec<u32>,
     is_missing: bool,
 }
 
-impl Wanted {
-    /// How many markers are looked for.
-    fn words(&self) -> usize {
-        let any_id = self.markers.iter().any(|m| m.id.is_none());
-        if any_id { self.code.codewords.len() } else { self.markers.len() }
+impl SquareQuery {
+    /// How many codewords are looked for.
+    fn codewords(&self) -> usize {
+        if self.query.has_any_id() { self.code.codewords.len() } else { self.query.markers.len() }
     }
 }
 
 /// Finds the square markers of any number of families. It keeps its memory from image to image.
 #[derive(Debug, Default)]
-pub(crate) struct Squares {
-    wanted: Vec<Wanted>,
+pub(crate) struct SquareTagDetector {
+    queries: Vec<SquareQuery>,
     layouts: Vec<Layout>,
-    quads: Vec<Candidate>,
     cells: Cells,
-    found: Vec<Found>,
+    found: Vec<Decoded>,
     scratch: Scratch,
-    damaged: Damaged,
-    /// Whether markers printed in the other colours are looked for.
+    occluded: Occluded<SquareReading>,
+    /// Whether markers printed white on black are looked for as well.
     inverted: bool,
 }
 
+/// A marker that was decoded.
 #[derive(Copy, Clone, Debug)]
-struct Candidate {
-    quad: Quad,
-    unevenness: f64,
-}
-
-#[derive(Copy, Clone, Debug)]
-struct Found {
-    wanted: usize,
+struct Decoded {
+    query: usize,
     id: u32,
-    /// Cells by which its border is wider than the code's.
     extra_border: u8,
     corners: [Pixel; 4],
-    wrong_bits: u8,
-    explained: f64,
-    margin: f64,
-    /// How good the corners are as they were found, in pixels.
+    hamming: u8,
+    r_squared: f64,
+    /// Distance of the most doubtful bit from the middle between black and white, from 0 to 1.
+    decision_margin: f64,
+    /// Standard deviation of the corners, in pixels.
     corner_px: f64,
-    /// Whether a reflection moves its edges, so that the refined corners are hardly better.
-    washed_out: bool,
+    /// Whether a reflection moves its edges, so that refined corners are hardly better.
+    is_washed_out: bool,
 }
 
-impl Squares {
-    /// Outlines on the finest levels up to this size, in pixels of the level, may be a marker's: two levels on, cells of
-    /// markers of ten across would be narrower than two pixels, and a scratch in a border would open it.
-    pub(crate) const LARGEST_PX: u16 = 64;
+impl SquareTagDetector {
+    /// Largest size of outlines on the finest levels, in pixels of the level: two levels on, the cells of markers of ten
+    /// cells would be narrower than two pixels, and a scratch in a border would open it.
+    pub(crate) const MAX_OUTLINE_PX: u16 = 64;
 
-    /// Looks for these markers, printed in the other colours as well when `inverted`; those of families without square cells
-    /// are left out.
+    /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers printed in the
+    /// opposite colours as well.
     pub(crate) fn new(markers: &[Marker], inverted: bool) -> Self {
-        let mut squares = Self { inverted, ..Self::default() };
+        let mut detector = Self { inverted, ..Self::default() };
         for marker in markers {
-            let Some(code) = SquareCode::for_family(marker.family) else {
-                continue;
-            };
-            if let Some(known) = squares.wanted.iter_mut().find(|w| w.code.family == marker.family)
-            {
-                known.markers.push(*marker);
+            let Some(code) = SquareCode::for_family(marker.family) else { continue };
+            let known = detector.queries.iter_mut().find(|q| q.query.family == marker.family);
+            if let Some(known) = known {
+                known.query.markers.push(*marker);
                 continue;
             }
             let mut layouts = [None; 2];
-            for (extra_border, index) in (0..=wider_by(code)).zip(&mut layouts) {
-                *index = squares.layout(code, extra_border);
+            for (extra_border, index) in (0..=extra_border_cells(code)).zip(&mut layouts) {
+                *index = detector.layout(code, extra_border);
             }
-            if layouts[0].is_none() {
-                continue;
+            if layouts[0].is_some() {
+                let query = FamilyQuery::new(*marker);
+                let missing = Vec::new();
+                detector.queries.push(SquareQuery {
+                    query,
+                    code,
+                    layouts,
+                    missing,
+                    is_missing: false,
+                });
             }
-            let markers = vec![*marker];
-            squares.wanted.push(Wanted {
-                code,
-                layouts,
-                markers,
-                missing: Vec::new(),
-                is_missing: false,
-            });
         }
-        squares
+        detector
     }
 
-    /// Index of a code's cells, which other codes may have in common; those with wider borders come last.
+    /// Index of a code's layout, which codes may have in common; those with wider borders come last.
     fn layout(&mut self, code: &SquareCode, extra_border: u8) -> Option<usize> {
         let known = self.layouts.iter().position(|layout| layout.fits(code, extra_border));
         if known.is_none() {
-            self.layouts.push(Layout::of(code, extra_border)?);
+            self.layouts.push(Layout::for_code(code, extra_border)?);
         }
         known.or(Some(self.layouts.len() - 1))
     }
 
-    /// Makes the buffers as large as frames with texture need.
+    /// Makes room for what a frame with texture needs.
     pub(crate) fn make_room(&mut self) {
-        const QUADS: usize = 2000;
-        // STags are looked for among these quads, too.
-        self.quads.clear();
-        self.quads.reserve(QUADS);
-        if !self.is_empty() {
-            self.found.clear();
-            self.found.reserve(MOST_FOUND);
-            self.scratch.make_room();
-            self.damaged.make_room();
-            for wanted in &mut self.wanted {
-                wanted.missing.clear();
-                wanted.missing.reserve(wanted.markers.len());
-            }
+        if self.is_empty() {
+            return;
+        }
+        self.found.clear();
+        self.found.reserve(MAX_FOUND);
+        self.scratch.make_room();
+        self.occluded.make_room();
+        for query in &mut self.queries {
+            query.missing.clear();
+            query.missing.reserve(query.query.markers.len());
         }
     }
 
-    /// True when there is nothing to look for.
+    /// Whether there is nothing to look for.
     pub(crate) fn is_empty(&self) -> bool {
-        self.wanted.is_empty()
+        self.queries.is_empty()
     }
 
-    /// The quads of the last image that have an even border, the evenest first.
-    pub(crate) fn quads(&self) -> impl Iterator<Item = &Quad> {
-        self.quads.iter().map(|candidate| &candidate.quad)
-    }
-
-    /// Whether families with a white border are among those looked for; their outlines are bright.
-    pub(crate) fn has_bright(&self) -> bool {
+    /// Whether a family with a white border is looked for; the outlines of its markers are bright.
+    pub(crate) fn has_reversed_border(&self) -> bool {
         self.layouts.iter().any(|layout| layout.reversed)
     }
 
-    /// Finds the markers among the outlines of an image.
-    pub(crate) fn detect(
+    /// Finds the markers among the quads of an image, given likeliest first.
+    pub(crate) fn detect<'a>(
         &mut self,
-        view: GrayView<'_>,
-        outlines: &Outlines,
-        camera: Option<&CameraModel>,
-        (trace, stages): (&mut Trace, &mut impl Stages),
-        found: &mut Vec<Observation>,
+        input: ImageInput<'_>,
+        quads: impl Iterator<Item = &'a Quad>,
+        stages: &mut impl Stages,
+        out: &mut Output<'_>,
     ) {
-        self.quads.clear();
-        for outline in outlines.iter() {
-            self.consider(view, outlines, &outline, trace);
-            if self.quads.len() >= MOST_QUADS {
-                break;
-            }
-        }
-        stages.ended("quads");
         self.found.clear();
-        self.read(view, outlines, trace);
+        self.decode_all(input, quads, out.trace);
         stages.ended("codes");
-        self.observe_all(view, 0, camera, found);
+        self.observe_all(input, 0, out.found);
         stages.ended("poses");
     }
 
-    /// Finds the marker of this family and id whose corners, its own top left first, should be about here.
+    /// Finds one marker where it is expected.
     pub(crate) fn detect_at(
         &mut self,
-        (view, pyramid): (GrayView<'_>, &Pyramid),
-        (family, id, corners): (Family, u32, [Pixel; 4]),
-        camera: Option<&CameraModel>,
+        input: ImageInput<'_>,
+        expected: &ExpectedMarker,
     ) -> Option<Observation> {
-        let index = self.wanted.iter().position(|wanted| wanted.code.family == family)?;
-        let wanted = self.wanted.get(index)?;
-        let layout = self.layouts.get(wanted.layouts[0]?)?;
-        let quad = Quad { corners, inverted: wanted.code.reversed_border };
-        if unevenness(&quad, view, 0) > MOST_UNEVEN {
+        let index = self.queries.iter().position(|q| q.query.family == expected.family)?;
+        let query = self.queries.get(index)?;
+        let layout = self.layouts.get(query.layouts[0]?)?;
+        let quad = Quad { corners: expected.corners, inverted: query.code.reversed_border };
+        if border_contrast_variation(&quad, input.view, 0) > MAX_CONTRAST_VARIATION {
             return None;
         }
-        let look = Look::at(&corners, layout.cells, view, pyramid)?;
-        if !self.cells.solve_plain(&look, layout) {
+        let image = SquareImage::new(&quad.corners, layout.cells, input.view, input.pyramid)?;
+        if !self.cells.solve_fast(&image, layout) {
             return None;
         }
-        let code = wanted.code;
-        let found = code.nearest(self.cells.word(), most_wrong(code));
-        let found = found.filter(|found| (found.id, found.rotation) == (id, 0))?;
-        let found = self.admit(&quad, (index, 0), found).ok()?;
-        let refined = found.refined((view, true), wanted, camera, &mut self.scratch)?;
-        Some(observed(&found, wanted, refined, camera))
+        let found = query.code.nearest(self.cells.word(), max_hamming(query.code));
+        let found = found.filter(|found| (found.id, found.rotation) == (expected.id, 0))?;
+        let decoded = self.check(&quad, index, 0, found).ok()?;
+        let refined = decoded.refined(query, input, true, &mut self.scratch)?;
+        Some(decoded.observation(query, refined, input))
     }
 
-    /// Finds the markers that closed outlines do not show, as something hides a part of them, among quads of segments, after
-    /// [`Squares::note_missing`] said that some are missing; it comes after [`Squares::detect`].
-    pub(crate) fn detect_damaged(
+    /// Finds partly hidden markers among quads of segments, after [`SquareTagDetector::detect`] and
+    /// [`SquareTagDetector::note_missing`].
+    pub(crate) fn detect_occluded(
         &mut self,
-        (view, quads): (GrayView<'_>, &[Quad]),
-        camera: Option<&CameraModel>,
-        (trace, stages): (&mut Trace, &mut impl Stages),
-        found: &mut Vec<Observation>,
+        input: ImageInput<'_>,
+        quads: &[Quad],
+        stages: &mut impl Stages,
+        out: &mut Output<'_>,
     ) {
-        let whole = self.found.len();
-        self.read_damaged((view, quads), trace);
-        self.observe_all(view, whole, camera, found);
-        stages.ended("damaged");
+        let first = self.found.len();
+        self.decode_occluded(input.view, quads, out.trace);
+        self.observe_all(input, first, out.found);
+        stages.ended("occluded");
     }
 
-    /// Finds markers so small that their border is broken by the outlines of their paper, which is taken to be as wide around
-    /// the border as a cell.
-    pub(crate) fn detect_on_paper(
+    /// Finds markers so small that blur breaks their border, by their quiet zone, which is taken to be one cell wide.
+    pub(crate) fn detect_in_quiet_zones(
         &mut self,
-        (view, pyramid, papers): (GrayView<'_>, &Pyramid, &[Quad]),
-        camera: Option<&CameraModel>,
-        trace: &mut Trace,
-        found: &mut Vec<Observation>,
+        input: ImageInput<'_>,
+        quiet_zones: &[Quad],
+        out: &mut Output<'_>,
     ) {
-        let whole = self.found.len();
-        for paper in papers {
+        let first = self.found.len();
+        for quiet_zone in quiet_zones {
             for layout in 0..self.layouts.len() {
-                self.read_on_paper((view, pyramid), paper, layout, trace);
+                self.decode_in_quiet_zone(input, quiet_zone, layout, out.trace);
             }
         }
-        self.observe_all(view, whole, camera, found);
+        self.observe_all(input, first, out.found);
     }
 
-    fn read_on_paper(
+    fn decode_in_quiet_zone(
         &mut self,
-        (view, pyramid): (GrayView<'_>, &Pyramid),
-        paper: &Quad,
+        input: ImageInput<'_>,
+        quiet_zone: &Quad,
         layout: usize,
         trace: &mut Trace,
     ) {
         let Layout { cells, extra_border, reversed, .. } = self.layouts[layout];
-        let quad = Quad { inverted: false, ..paper.scaled(cells as f64 / (cells + 2) as f64) };
-        let cell_px = mean_side(&quad.corners) / cells as f64;
-        let is_known = self.found.iter().any(|found| covers(&found.corners, &quad.corners));
-        if reversed || extra_border > 0 || cell_px > MOST_BROKEN_CELL_PX || is_known {
+        let factor = cells as f64 / (cells + 2) as f64;
+        let quad = Quad { inverted: false, ..quiet_zone.scaled(factor) };
+        let cell_px = mean_side_px(&quad.corners) / cells as f64;
+        if reversed
+            || extra_border > 0
+            || cell_px > MAX_QUIET_ZONE_CELL_PX
+            || is_covered(&self.found, &quad)
+        {
             return;
         }
-        let Some(look) = Look::at(&quad.corners, cells, view, pyramid) else { return };
-        if self.cells.solve(&look, &self.layouts[layout])
-            && let Ok(found) = self.match_words(&quad, layout)
+        let Some(image) = SquareImage::new(&quad.corners, cells, input.view, input.pyramid) else {
+            return;
+        };
+        if self.cells.solve(&image, &self.layouts[layout])
+            && let Ok(found) = self.match_codewords(&quad, layout)
         {
             trace.accept_quad(quad.corners);
             self.found.push(found);
         }
     }
 
-    /// Observes what was found from the index `from` on.
-    fn observe_all(
-        &mut self,
-        view: GrayView<'_>,
-        from: usize,
-        camera: Option<&CameraModel>,
-        found: &mut Vec<Observation>,
-    ) {
+    /// Adds the observations of what was decoded from the index `from` on, the most confident first.
+    fn observe_all(&mut self, input: ImageInput<'_>, from: usize, found: &mut Vec<Observation>) {
         let first = found.len();
         for marker in self.found.iter().skip(from) {
-            if let Some(wanted) = self.wanted.get(marker.wanted) {
-                found.push(observe(view, marker, wanted, camera, &mut self.scratch));
-            }
+            let Some(query) = self.queries.get(marker.query) else { continue };
+            let refined = marker.refined(query, input, false, &mut self.scratch);
+            let refined =
+                refined.unwrap_or_else(|| Refined::unrefined(&marker.corners, marker.corner_px));
+            found.push(marker.observation(query, refined, input));
         }
         found[first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
     }
 
-    /// Keeps an outline that is a quad with an even border.
-    fn consider(
+    fn decode_all<'a>(
         &mut self,
-        view: GrayView<'_>,
-        outlines: &Outlines,
-        outline: &Outline<'_>,
+        input: ImageInput<'_>,
+        quads: impl Iterator<Item = &'a Quad>,
         trace: &mut Trace,
     ) {
-        let Some(quad) = Quad::of(outline) else {
-            return;
-        };
-        let Some(level) = outlines.pyramid().level(view, outline.level) else {
-            return;
-        };
-        let uneven = unevenness(&quad, level, outline.level);
-        if uneven <= MOST_UNEVEN {
-            self.quads.push(Candidate { quad, unevenness: uneven });
-        } else {
-            trace.refuse_quad(quad.corners, Reason::Border);
-        }
-    }
-
-    fn read(&mut self, view: GrayView<'_>, outlines: &Outlines, trace: &mut Trace) {
-        // The evenest first, so that a bound on the work costs the least likely ones.
-        self.quads.sort_unstable_by(|a, b| a.unevenness.total_cmp(&b.unevenness));
         let mut solved = 0;
-        for index in 0..self.quads.len() {
-            let quad = self.quads[index].quad;
+        for quad in quads {
             for layout in 0..self.layouts.len() {
-                if self.is_known(&quad, layout) {
+                if self.is_known(quad, layout) {
                     continue;
                 }
-                let cells = self.layouts[layout].cells;
-                let Some(look) = Look::at(&quad.corners, cells, view, outlines.pyramid()) else {
-                    continue;
-                };
-                if self.layouts[layout].extra_border > 0 && !look.has_second_ring(cells) {
+                let Layout { cells, extra_border, .. } = self.layouts[layout];
+                let image = SquareImage::new(&quad.corners, cells, input.view, input.pyramid);
+                let Some(image) = image else { continue };
+                if extra_border > 0 && !image.has_second_ring(cells) {
                     continue;
                 }
                 solved += 1;
-                let read = self.cells.solve(&look, &self.layouts[layout]);
-                match if read { self.match_words(&quad, layout) } else { Err(Reason::Small) } {
+                let is_solved = self.cells.solve(&image, &self.layouts[layout]);
+                let found =
+                    if is_solved { self.match_codewords(quad, layout) } else { Err(Reason::Small) };
+                match found {
                     Ok(found) => {
                         trace.accept_quad(quad.corners);
                         self.found.push(found);
@@ -356,161 +305,157 @@ impl Squares {
                     Err(reason) => trace.refuse_quad(quad.corners, reason),
                 }
             }
-            if solved >= MOST_SOLVED || self.found.len() >= MOST_FOUND {
+            if solved >= MAX_SOLVED || self.found.len() >= MAX_FOUND {
                 break;
             }
         }
     }
 
-    /// Notes what is looked for on where closed outlines do not show it; false when nothing is. That is `all` that is missing, or
-    /// else those of any id of families of which two were found: of a board.
+    /// Notes which markers a fallback is to look for, as in [`FamilyQuery::is_missing`]; false when none.
     pub(crate) fn note_missing(&mut self, all: bool) -> bool {
-        let mut is_any_missing = false;
-        for (index, wanted) in self.wanted.iter_mut().enumerate() {
-            wanted.missing.clear();
-            let known = || self.found.iter().filter(|found| found.wanted == index);
-            let any = wanted.markers.iter().any(|marker| marker.id.is_none());
-            let ids = wanted.markers.iter().filter_map(|marker| marker.id);
-            wanted.missing.extend(ids.filter(|id| known().all(|found| found.id != *id)));
-            wanted.is_missing = if any {
-                all || known().nth(1).is_some()
-            } else {
-                all && !wanted.missing.is_empty()
-            };
-            is_any_missing |= wanted.is_missing;
+        for (index, query) in self.queries.iter_mut().enumerate() {
+            let known =
+                self.found.iter().filter(|found| found.query == index).map(|found| found.id);
+            query.is_missing = query.query.is_missing(all, known.clone());
+            query.missing.clear();
+            let ids = query.query.ids();
+            query.missing.extend(ids.filter(|id| known.clone().all(|found| found != *id)));
         }
-        is_any_missing
+        self.queries.iter().any(|query| query.is_missing)
     }
 
-    /// Looks for what is missing.
-    fn read_damaged(&mut self, (view, quads): (GrayView<'_>, &[Quad]), trace: &mut Trace) {
-        let missing = self.wanted.iter().enumerate().filter(|(_, wanted)| wanted.is_missing);
-        let sought = missing.map(|(index, wanted)| {
-            let any = wanted.markers.iter().any(|marker| marker.id.is_none());
-            Sought { index, code: wanted.code, ids: (!any).then_some(wanted.missing.as_slice()) }
+    fn decode_occluded(&mut self, view: GrayView<'_>, quads: &[Quad], trace: &mut Trace) {
+        let missing = self.queries.iter().enumerate().filter(|(_, query)| query.is_missing);
+        let queries = missing.map(|(family, query)| {
+            let ids = (!query.query.has_any_id()).then_some(query.missing.as_slice());
+            OccludedQuery { family, code: query.code, ids }
         });
         let (known, inverted) = (&self.found, self.inverted);
         let is_open = |quad: &Quad, code: &SquareCode| {
-            (inverted || quad.inverted == code.reversed_border)
-                && !known.iter().any(|found| covers(&found.corners, &quad.corners))
+            (inverted || quad.inverted == code.reversed_border) && !is_covered(known, quad)
         };
-        for marker in self.damaged.find(view, quads, sought, is_open) {
+        for marker in self.occluded.find_squares(view, quads, queries, is_open) {
             let corners = marker.quad.corners;
             trace.accept_quad(corners);
-            let reading = marker.reading;
-            // As many bits again as make the reading certain make it as sure as a whole marker's.
-            let margin = f64::from(reading.intact * (reading.evidence / 20.0).min(1.0));
-            self.found.push(Found {
-                wanted: marker.index,
+            let SquareReading { family, reading } = marker.reading;
+            // Evidence of 20 bits gives the confidence of a marker in full view.
+            let decision_margin = f64::from(reading.intact * (reading.evidence / 20.0).min(1.0));
+            self.found.push(Decoded {
+                query: family,
                 id: reading.id,
                 extra_border: 0,
                 corners,
-                wrong_bits: reading.wrong_bits,
-                explained: f64::from(reading.explained),
-                margin,
-                corner_px: (JOINED_SHARE * corners[0].distance(&corners[2])).max(JOINED_PX),
-                washed_out: reading.washed_out,
+                hamming: reading.hamming,
+                r_squared: f64::from(reading.r_squared),
+                decision_margin,
+                corner_px: segment_corner_px(&corners),
+                is_washed_out: reading.is_washed_out,
             });
         }
     }
 
-    /// Whether a marker with these cells was found where the quad is.
+    /// Whether a marker with this layout was found where the quad is.
     fn is_known(&self, quad: &Quad, layout: usize) -> bool {
-        let of_layout = |found: &&Found| self.wanted[found.wanted].layouts.contains(&Some(layout));
-        self.found.iter().filter(of_layout).any(|found| is_same(&found.corners, &quad.corners))
+        let has_layout =
+            |found: &&Decoded| self.queries[found.query].layouts.contains(&Some(layout));
+        self.found
+            .iter()
+            .filter(has_layout)
+            .any(|found| Overlap::new(&found.corners, &quad.corners).is_same_square())
     }
 
-    /// The family and id whose word the cells of a quad carry, or how near to one they are.
-    fn match_words(&self, quad: &Quad, layout: usize) -> Result<Found, Reason> {
+    /// The marker whose codeword is nearest to the cells of a quad.
+    fn match_codewords(&self, quad: &Quad, layout: usize) -> Result<Decoded, Reason> {
         let word = self.cells.word();
         let mut best = Err(Reason::Code);
-        for (index, wanted) in self.wanted.iter().enumerate() {
-            if !wanted.layouts.contains(&Some(layout)) {
+        for (index, query) in self.queries.iter().enumerate() {
+            if !query.layouts.contains(&Some(layout)) {
                 continue;
             }
-            let most = most_wrong(wanted.code);
-            let Some(nearest) = wanted.code.nearest(word, most) else {
-                continue;
-            };
+            let Some(found) = query.code.nearest(word, max_hamming(query.code)) else { continue };
             let is_better = match &best {
-                Ok(Found { wrong_bits: least, .. }) => nearest.hamming < *least,
+                Ok(Decoded { hamming, .. }) => found.hamming < *hamming,
                 Err(_) => true,
             };
             if is_better {
-                let extra_border = self.layouts[layout].extra_border;
-                best = self.admit(quad, (index, extra_border), nearest);
+                best = self.check(quad, index, self.layouts[layout].extra_border, found);
             }
         }
         best
     }
 
-    /// A word that was read as a marker, if that is wanted and explains what is seen.
-    fn admit(
+    /// The marker of a codeword, if it is looked for and explains the pixels.
+    fn check(
         &self,
         quad: &Quad,
-        (index, extra_border): (usize, u8),
-        Match { id, rotation, hamming }: Match,
-    ) -> Result<Found, Reason> {
-        let wanted = self.wanted.get(index).ok_or(Reason::Unwanted)?;
-        if !wanted.markers.iter().any(|m| m.id.is_none_or(|wanted| wanted == id)) {
+        index: usize,
+        extra_border: u8,
+        found: Match,
+    ) -> Result<Decoded, Reason> {
+        let Match { id, rotation, hamming } = found;
+        let query = self.queries.get(index).ok_or(Reason::Unwanted)?;
+        let code = query.code;
+        if !query.query.includes(id) {
             return Err(Reason::Unwanted);
         }
-        if quad.inverted != wanted.code.reversed_border && !self.inverted {
+        if quad.inverted != code.reversed_border && !self.inverted {
             return Err(Reason::Unwanted);
         }
-        let word = wanted.code.codewords.get(id as usize).ok_or(Reason::Unwanted)?;
-        // The word as it stands in the picture.
-        let seen = (0..(4 - rotation) % 4).fold(*word, |word, _| wanted.code.rotated(word));
+        let codeword = *code.codewords.get(id as usize).ok_or(Reason::Unwanted)?;
+        // As it is rotated in the image.
+        let seen = (0..(4 - rotation) % 4).fold(codeword, |word, _| code.rotated(word));
         let explanation = self.cells.explain(seen);
         let [dark, bright] = explanation.levels;
-        // A marker printed in the other colours has them the other way round.
-        if (bright > dark) != (quad.inverted == wanted.code.reversed_border) {
+        if (bright > dark) != (quad.inverted == code.reversed_border) {
             return Err(Reason::Contrast);
         }
-        let explained = explanation.explained;
-        let bits = wanted.code.bits.len();
-        let evidence =
-            chance::evidence(wanted.code, *word, wanted.words(), bits as u32, hamming.into());
-        let is_sure = evidence >= SURE_BITS;
-        if explained < if is_sure { LEAST_EXPLAINED_SURE } else { LEAST_EXPLAINED } {
+        let r_squared = explanation.r_squared;
+        let bits = code.bits.len();
+        let evidence = false_positive::evidence(
+            code,
+            codeword,
+            query.codewords(),
+            bits as u32,
+            hamming.into(),
+        );
+        let is_strong = evidence >= STRONG_EVIDENCE_BITS;
+        if r_squared < if is_strong { MIN_R_SQUARED_STRONG } else { MIN_R_SQUARED } {
             return Err(Reason::Confidence);
         }
-        let margin =
-            (0..bits).map(|bit| (2.0 * self.cells.value(bit) - 1.0).abs()).fold(1.0, f64::min);
-        let cells = wanted.code.cells + 2 * extra_border;
-        let cell_px = mean_side(&quad.corners) / f64::from(cells);
+        let bit_margin = |bit| (2.0 * self.cells.value(bit) - 1.0).abs();
+        let decision_margin = (0..bits).map(bit_margin).fold(1.0, f64::min);
+        let cell_px = mean_side_px(&quad.corners) / f64::from(code.cells + 2 * extra_border);
         let small = if cell_px < SMALL_CELL_PX { CONFIDENCE_OF_SMALL } else { 0.0 };
-        if confidence(explained, margin) < LEAST_CONFIDENCE - CONFIDENCE_PER_BIT * evidence - small
-        {
+        let min_confidence = MIN_CONFIDENCE - CONFIDENCE_PER_BIT * evidence - small;
+        if confidence(r_squared, decision_margin) < min_confidence {
             return Err(Reason::Confidence);
         }
         let mut corners = quad.corners;
         corners.rotate_left(usize::from(rotation) % 4);
-        Ok(Found {
-            wanted: index,
+        Ok(Decoded {
+            query: index,
             id,
             extra_border,
             corners,
-            wrong_bits: hamming,
-            explained,
-            margin,
-            corner_px: OUTLINED_PX,
-            washed_out: false,
+            hamming,
+            r_squared,
+            decision_margin,
+            corner_px: OUTLINE_CORNER_PX,
+            is_washed_out: false,
         })
     }
 }
 
-/// From what a marker explains of its pixels, and from its most doubtful bit.
-fn confidence(explained: f64, margin: f64) -> f64 {
-    explained * (0.5 + 0.5 * margin.min(1.0))
+fn is_covered(found: &[Decoded], quad: &Quad) -> bool {
+    found.iter().any(|found| Overlap::new(&found.corners, &quad.corners).is_covered())
 }
 
-pub(crate) fn mean_side(corners: &[Pixel; 4]) -> f64 {
-    sides_px(corners).iter().sum::<f64>() / 4.0
+fn confidence(r_squared: f64, decision_margin: f64) -> f64 {
+    r_squared * (0.5 + 0.5 * decision_margin.min(1.0))
 }
 
-/// How many wrong bits are mended. Families of few bits have words near most words; theirs must be read as they are.
-fn most_wrong(code: &SquareCode) -> u8 {
+/// Largest Hamming distance that is corrected; short codes get none, since their codewords are too dense.
+fn max_hamming(code: &SquareCode) -> u8 {
     match code.min_hamming {
         0..=6 => 0,
         7..=9 => 1,
@@ -519,168 +464,38 @@ fn most_wrong(code: &SquareCode) -> u8 {
     }
 }
 
-/// How many cells the border of a family's markers may be wider than the code says: grids for calibration have borders of
-/// two cells. Only words that chance does not spell are read so.
-fn wider_by(code: &SquareCode) -> u8 {
+/// By how many cells a border may be wider than the code's: calibration boards have borders of two cells. Only for codes
+/// with a low false-positive rate.
+fn extra_border_cells(code: &SquareCode) -> u8 {
     u8::from(code.min_hamming >= 9 && !code.reversed_border)
 }
 
-/// Whether two quads are of the same square, up to a turn.
-fn is_same(a: &[Pixel; 4], b: &[Pixel; 4]) -> bool {
-    let (size, other) = (diagonal_px(a), diagonal_px(b));
-    middle(a).distance(&middle(b)) < 0.2 * size && other < 1.5 * size && size < 1.5 * other
-}
-
-/// Whether a marker that was found leaves no place for another one there: one around it may be.
-pub(crate) fn covers(known: &[Pixel; 4], other: &[Pixel; 4]) -> bool {
-    let size = diagonal_px(known);
-    middle(known).distance(&middle(other)) < 0.4 * size && diagonal_px(other) < 1.5 * size
-}
-
-/// The quads of bright outlines from the index `first` on that stand out evenly all round, as the paper of a small marker does.
-pub(crate) fn papers<'a>(
-    view: GrayView<'a>,
-    outlines: &'a Outlines,
-    first: usize,
-) -> impl Iterator<Item = Quad> + 'a {
-    outlines
-        .iter()
-        .skip(first)
-        .filter_map(|outline| Quad::of(&outline))
-        .filter(move |paper| unevenness(paper, view, 0) <= MOST_UNEVEN)
-        .take(MOST_PAPERS)
-}
-
-/// Standard deviation of the steps from just within a quad to just outside, all round, as a share of their mean: in grey
-/// levels or, across the edge of a shadow, in their logarithms, whichever is less. Large where the mean is not positive.
-pub(crate) fn unevenness(quad: &Quad, view: GrayView<'_>, level: usize) -> f64 {
-    use imaging::pyramid::from_level_0;
-    const POINTS: usize = 6;
-    let corners = quad.corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
-    let (mut plain, mut logarithms) = (Spread::default(), Spread::default());
-    for side in 0..4 {
-        let ([ax, ay], [bx, by]) = (corners[side], corners[(side + 1) % 4]);
-        let (dx, dy) = (bx - ax, by - ay);
-        let length = dx.hypot(dy);
-        // To the left of a clockwise way is outside.
-        let off = (0.07 * length).max(0.7) / length;
-        let (nx, ny) = (dy * off, -dx * off);
-        for k in 0..POINTS {
-            let t = (k as f64 + 0.75) / (POINTS as f64 + 0.5);
-            let (x, y) = (ax + dx * t, ay + dy * t);
-            if let (Some(outer), Some(inner)) =
-                (bilinear(view, x + nx, y + ny), bilinear(view, x - nx, y - ny))
-            {
-                let (dark, bright) = if quad.inverted { (outer, inner) } else { (inner, outer) };
-                plain.add(bright - dark);
-                logarithms.add(((bright + 4.0) / (dark + 4.0)).ln());
-            }
-        }
-    }
-    plain.relative().min(logarithms.relative())
-}
-
-#[derive(Default)]
-struct Spread {
-    count: f64,
-    sum: f64,
-    squares: f64,
-}
-
-impl Spread {
-    fn add(&mut self, value: f64) {
-        self.count += 1.0;
-        self.sum += value;
-        self.squares += value * value;
-    }
-
-    /// Standard deviation as a share of the mean.
-    fn relative(&self) -> f64 {
-        let mean = self.sum / self.count;
-        let variance = self.squares / self.count - mean * mean;
-        if mean > 0.0 { variance.max(0.0).sqrt() / mean } else { f64::MAX }
-    }
-}
-
-impl Found {
-    /// Its corners between the pixels, when those it has may be near.
+impl Decoded {
+    /// Its refined corners; `is_near` as in [`CornerGuess`].
     fn refined(
         &self,
-        (view, are_near): (GrayView<'_>, bool),
-        wanted: &Wanted,
-        camera: Option<&CameraModel>,
+        query: &SquareQuery,
+        input: ImageInput<'_>,
+        is_near: bool,
         scratch: &mut Scratch,
     ) -> Option<Refined> {
-        let word = wanted.code.codewords.get(self.id as usize)?;
-        let pattern = Pattern::bordered(wanted.code, *word, self.extra_border)?;
-        refine_from((view, &self.corners, are_near), &pattern, camera, scratch)
+        let codeword = query.code.codewords.get(self.id as usize)?;
+        let pattern = Pattern::bordered(query.code, *codeword, self.extra_border)?;
+        let ImageInput { view, camera, .. } = input;
+        let guess = CornerGuess { view, corners: &self.corners, camera, is_near };
+        refine(&guess, &pattern, scratch)
     }
-}
 
-/// The marker with its corners between the pixels and its pose.
-fn observe(
-    view: GrayView<'_>,
-    found: &Found,
-    wanted: &Wanted,
-    camera: Option<&CameraModel>,
-    scratch: &mut Scratch,
-) -> Observation {
-    let refined = found.refined((view, false), wanted, camera, scratch);
-    let refined = refined.unwrap_or_else(|| coarse(&found.corners, found.corner_px));
-    observed(found, wanted, refined, camera)
-}
-
-fn observed(
-    found: &Found,
-    wanted: &Wanted,
-    mut refined: Refined,
-    camera: Option<&CameraModel>,
-) -> Observation {
-    if found.washed_out {
-        let coarse = coarse(&found.corners, found.corner_px);
-        refined.covariance_px2 += coarse.covariance_px2;
-        refined.centre_covariance_px2 += coarse.centre_covariance_px2;
+    fn observation(
+        &self,
+        query: &SquareQuery,
+        mut refined: Refined,
+        input: ImageInput<'_>,
+    ) -> Observation {
+        if self.is_washed_out {
+            refined.add_uncertainty(self.corner_px);
+        }
+        let confidence = confidence(self.r_squared, self.decision_margin);
+        query.query.observation(self.id, self.hamming, confidence, &refined, input.camera)
     }
-    let corners = refined.corners;
-    let named = wanted.markers.iter().find(|m| m.id == Some(found.id));
-    let marker = named.or_else(|| wanted.markers.iter().find(|m| m.id.is_none()));
-    let size_m = marker.and_then(|marker| marker.size_m);
-    let pose = camera.zip(size_m).and_then(|(camera, size_m)| {
-        square_pose(&corners, &refined.covariance_px2, size_m, camera)
-    });
-    Observation {
-        family: wanted.code.family,
-        id: Some(found.id),
-        centre: refined.centre,
-        centre_covariance_px2: refined.centre_covariance_px2,
-        corners: Some(corners),
-        wrong_bits: found.wrong_bits,
-        size_px: diagonal_px(&corners),
-        confidence: confidence(found.explained, found.margin),
-        pose,
-    }
-}
-
-/// Corners that could not be refined, and how good they are in pixels.
-pub(crate) fn coarse(corners: &[Pixel; 4], corner_px: f64) -> Refined {
-    let corner_px2 = corner_px * corner_px;
-    Refined {
-        corners: *corners,
-        covariance_px2: SMatrix::identity() * corner_px2,
-        centre: crossing(corners),
-        centre_covariance_px2: Matrix2::identity() * (corner_px2 / 4.0),
-        blur_px: 0.0,
-        black: 0.0,
-        white: 0.0,
-        residual: 1.0,
-    }
-}
-
-/// Where the diagonals of a quad cross: the image of the square's centre.
-fn crossing(corners: &[Pixel; 4]) -> Pixel {
-    let [a, b, c, d] = corners;
-    let (ux, uy) = (c.x - a.x, c.y - a.y);
-    let (vx, vy) = (d.x - b.x, d.y - b.y);
-    let t = ((b.x - a.x) * vy - (b.y - a.y) * vx) / (ux * vy - uy * vx);
-    Pixel::new(a.x + t * ux, a.y + t * uy)
 }

@@ -1,189 +1,162 @@
-//! The edges of a larger square marker, each compared with the image in light of its own.
+//! Refinement along the edges of a larger marker, each edge in its own light.
 //!
-//! At places along every edge, a run of pixels across it is compared with the profile of a blurred step. Black and white
-//! are the run's own, so that neither a gradient of light nor a shadow's edge across the marker moves anything; the blur
-//! is the marker's. What the runs say of their edges' shifts moves the whole square, less so where they disagree
-//! with the others: something covers the marker there.
+//! At samples along every edge, the pixels across it are compared with the profile of a blurred step. Black and white
+//! belong to the sample, so that neither a gradient of the light nor the edge of a shadow moves anything; the blur
+//! belongs to the marker. The measured shifts of all edges move the square. Samples that contradict the others get less
+//! weight, as something covers the marker there.
 
 use geometry::Pixel;
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
 
 use crate::optics::edge_response::{EdgeResponse, pixel_kurtosis};
-use crate::refine::corners::{CORNERS, Fit, Homography, Lens, Scratch};
+use crate::optics::homography::{CORNERS, Homography};
+use crate::optics::least_squares::NormalEquations;
+use crate::optics::undistort::Undistortion;
+use crate::refine::fit::{EdgeMeasurement, EdgeSample, Fit, PhotometricModel, Scratch, Target};
 use crate::refine::pattern::Pattern;
-use crate::refine::photometric::Picture;
 
-/// A place at which an edge is looked at.
-#[derive(Copy, Clone, Debug)]
-pub(crate) struct Run {
-    /// In the square's coordinates.
-    place: [f64; 2],
-    /// Across the edge, from black to white: one cell, in the square's coordinates.
-    across: [f64; 2],
-    /// What the last comparison said.
-    sight: Option<Sight>,
-}
+/// Parameters of the homography, and the blur.
+const UNKNOWNS: usize = 9;
+/// Number of samples along a marker's edges.
+const MAX_SAMPLES: usize = 210;
+/// Largest number of pixels across an edge.
+const MAX_PIXELS: usize = 24;
+/// Smallest number of measured samples, and smallest fraction of those within the image.
+const MIN_SAMPLES: usize = 16;
+const MIN_SAMPLE_RATIO: f64 = 0.35;
+/// Coarse passes search for the edges, fine ones compare their profiles.
+const COARSE_PASSES: usize = 2;
+const FINE_PASSES: usize = 6;
+/// Distance within which coarse passes search for an edge, in pixels.
+const SEARCH_PX: f64 = 4.5;
+/// The same where the first pass finds less than this fraction of the edges: quads of segments can be far off.
+const WIDE_SEARCH_PX: f64 = 40.0;
+const MIN_FOUND_RATIO: f64 = 0.7;
+/// A coarse pass that moves the corners less than this, in pixels, is the last.
+const COARSE_SETTLED_PX: f64 = 0.5;
+/// The first passes use every third sample, unless there are few; fine ones do so until the corners move less than
+/// this, in pixels.
+const SUBSET_STEP: usize = 3;
+const SUBSET_SETTLED_PX: f64 = 0.1;
+/// A fine pass over all samples that moves the corners less than this, in pixels, is the last; the error that remains
+/// is of the order of its square. It is smaller for the first pass, before which the blur was not fitted.
+const SETTLED_PX: f64 = 0.03;
+const FIRST_PASS_SETTLED_PX: f64 = 0.01;
+/// Smallest contrast of an edge, in grey levels.
+const MIN_CONTRAST: f64 = 5.0;
+/// Shifts beyond this multiple of the median one are weighted down.
+const OUTLIER_SHIFTS: f64 = 2.5;
+/// Above this fraction of saturated pixels, black and white must be common to the whole marker, and this fit fails.
+const MAX_SATURATED_RATIO: f64 = 0.03;
 
-/// What a run of pixels says.
-#[derive(Copy, Clone, Debug)]
-struct Sight {
-    /// How the edge's place changes with the homography.
-    slope: [f64; 8],
-    /// Normal equations of the edge's shift in pixels and of the spread, black and contrast being free.
-    matrix: [f64; 3],
-    right: [f64; 2],
-    /// Squares of the differences that are left, and the pixels there are beyond the unknowns.
-    squares: f64,
-    freedom: f64,
-    black: f64,
-    contrast: f64,
-    weight: f64,
-}
-
-/// What the edge of a run looks like before anything is compared.
-struct Edge {
+/// The edge of a sample as the current homography projects it.
+struct ProjectedEdge {
     pixel: Pixel,
     /// Unit normal in the image, from black to white.
     normal: [f64; 2],
-    slope: [f64; 8],
+    /// Derivatives of the position along the normal by the homography's parameters.
+    gradient: [f64; 8],
     /// Distance to the next cell's edge, in pixels.
     cell_px: f64,
 }
 
-/// Numbers of the homography, and the spread.
-const UNKNOWNS: usize = 9;
-const MOST_RUNS: usize = 210;
-const MOST_PIXELS: usize = 24;
-/// Fewer runs than this, or than this share of those within the image, do not make a square.
-const LEAST_RUNS: usize = 16;
-const LEAST_SHARE: f64 = 0.35;
-/// Rough and fine passes over all runs.
-const ROUGH_PASSES: usize = 2;
-const FINE_PASSES: usize = 6;
-/// How far from their places edges are looked for in rough passes, in pixels; and how far at first where less than a
-/// share of those within the image is found so near: a quad that was put together of pieces can be off by much.
-const REACH_PX: f64 = 4.5;
-const WIDE_REACH_PX: f64 = 40.0;
-const FEW_SEEN: f64 = 0.7;
-/// A rough pass that moves the corners less, in pixels, is the last.
-const NEARBY_PX: f64 = 0.5;
-/// Of the runs every so many-th takes part in the first passes, unless they are few; in fine ones until the corners move
-/// less than this, in pixels.
-const FEW_EVERY: usize = 3;
-const SETTLED_BY_FEW_PX: f64 = 0.1;
-/// A fine pass over all runs that moves the corners less, in pixels, is the last: what is left to be moved after a step is
-/// in its square. When the blur was not fitted before, it takes less.
-const SETTLED_PX: f64 = 0.03;
-const SETTLED_AT_ONCE_PX: f64 = 0.01;
-/// Smaller differences, in grey levels, are no edges.
-const LEAST_CONTRAST: f64 = 5.0;
-/// Runs whose shift is more times its usual size pull no harder.
-const USUAL_SHIFTS: f64 = 2.5;
-/// Where more of the pixels are at the sensor's end, black and white must be common to the whole marker.
-const MOST_CLIPPED: f64 = 0.03;
-
-/// The homography on which the runs agree. `None` when too few of the marker's edges are seen, or they are too
-/// close to each other for their blur.
+/// The homography that the edges of a pattern agree on. From a start that `is_near`, to about half a pixel, no coarse
+/// pass is made. `None` when too few edges are seen, or they are too close to each other for their blur.
 pub(crate) fn fit(
-    view: GrayView<'_>,
-    lens: &Lens<'_>,
-    start: &Homography,
-    (pattern, is_near): (&Pattern, bool),
+    target: Target<'_>,
+    pattern: &Pattern,
+    is_near: bool,
     scratch: &mut Scratch,
 ) -> Option<Fit> {
-    place_runs((view, lens, start), pattern, &mut scratch.runs);
-    fit_runs(view, lens, (start, is_near), scratch)
+    place_samples(target, pattern, &mut scratch.edges);
+    fit_samples(target, is_near, scratch)
 }
 
 /// The same for edges that are given.
 pub(crate) fn fit_edges(
-    view: GrayView<'_>,
-    lens: &Lens<'_>,
-    start: &Homography,
+    target: Target<'_>,
     edges: &[[[f64; 2]; 2]],
     scratch: &mut Scratch,
 ) -> Option<Fit> {
-    scratch.runs.clear();
-    let run = |[place, across]: &[[f64; 2]; 2]| Run { place: *place, across: *across, sight: None };
-    scratch.runs.extend(edges.iter().take(2 * MOST_RUNS).map(run));
-    fit_runs(view, lens, (start, false), scratch)
+    scratch.edges.clear();
+    let sample = |[place, across]: &[[f64; 2]; 2]| EdgeSample {
+        place: *place,
+        across: *across,
+        measurement: None,
+    };
+    scratch.edges.extend(edges.iter().take(2 * MAX_SAMPLES).map(sample));
+    fit_samples(target, false, scratch)
 }
 
-/// From a start that `is_near`, to about half a pixel, fine passes find the edges at once.
-fn fit_runs(
-    view: GrayView<'_>,
-    lens: &Lens<'_>,
-    (start, is_near): (&Homography, bool),
-    scratch: &mut Scratch,
-) -> Option<Fit> {
-    let mut search = Search {
+fn fit_samples(target: Target<'_>, is_near: bool, scratch: &mut Scratch) -> Option<Fit> {
+    let Target { view, lens, start } = target;
+    let mut fit = EdgeFit {
         view,
         lens,
         homography: *start,
         spread_px: 0.75,
-        step: EdgeResponse::new(),
+        response: EdgeResponse::new(),
         inside: 0,
-        clipped: 0,
+        saturated: 0,
         pixels: 0,
     };
-    let mut every = if scratch.runs.len() >= 4 * LEAST_RUNS * FEW_EVERY { FEW_EVERY } else { 1 };
-    for pass in 0..if is_near { 0 } else { ROUGH_PASSES } {
-        let before = search.homography;
-        let seen = search.look(&mut scratch.runs, every, REACH_PX);
-        if pass == 0 && seen < FEW_SEEN {
-            search.look(&mut scratch.runs, every, WIDE_REACH_PX);
+    let has_many = scratch.edges.len() >= 4 * MIN_SAMPLES * SUBSET_STEP;
+    let mut step = if has_many { SUBSET_STEP } else { 1 };
+    for pass in 0..if is_near { 0 } else { COARSE_PASSES } {
+        let before = fit.homography;
+        let found = fit.locate(&mut scratch.edges, step, SEARCH_PX);
+        if pass == 0 && found < MIN_FOUND_RATIO {
+            fit.locate(&mut scratch.edges, step, WIDE_SEARCH_PX);
         }
-        search.agree(scratch)?;
-        if before.distance_px(&search.homography) < NEARBY_PX {
+        fit.align(scratch)?;
+        if before.distance_px(&fit.homography) < COARSE_SETTLED_PX {
             break;
         }
     }
-    let mut system = None;
+    let mut equations = None;
     for pass in 0..FINE_PASSES {
-        search.compare_all(&mut scratch.runs, every)?;
-        if search.clipped as f64 > MOST_CLIPPED * search.pixels as f64 {
+        fit.measure_all(&mut scratch.edges, step);
+        if fit.saturated as f64 > MAX_SATURATED_RATIO * fit.pixels as f64 {
             return None;
         }
-        search.weigh(scratch)?;
-        let next = System::new(&scratch.runs);
-        let moved_px = search.step(&next)?;
-        if every > 1 {
-            if moved_px < SETTLED_BY_FEW_PX || pass + 3 >= FINE_PASSES {
-                every = 1;
+        fit.reweight(scratch)?;
+        let next = normal_equations(&scratch.edges);
+        let moved_px = fit.step(&next)?;
+        if step > 1 {
+            if moved_px < SUBSET_SETTLED_PX || pass + 3 >= FINE_PASSES {
+                step = 1;
             }
             continue;
         }
-        system = Some(next);
-        if moved_px < if pass > 0 { SETTLED_PX } else { SETTLED_AT_ONCE_PX } {
+        equations = Some(next);
+        if moved_px < if pass > 0 { SETTLED_PX } else { FIRST_PASS_SETTLED_PX } {
             break;
         }
     }
-    search.result(system?, &scratch.runs)
+    fit.result(&equations?, &scratch.edges)
 }
 
-/// Places within the image along all edges of the pattern, spread so that their number is bounded.
-fn place_runs(
-    (view, lens, start): (GrayView<'_>, &Lens<'_>, &Homography),
-    pattern: &Pattern,
-    runs: &mut Vec<Run>,
-) {
+/// Spreads a bounded number of samples along the pattern's edges within the image.
+fn place_samples(target: Target<'_>, pattern: &Pattern, samples: &mut Vec<EdgeSample>) {
+    let Target { view, lens, start } = target;
     let mut length_px = 0.0;
     each_edge(pattern, |edge| length_px += edge.usable(start).map_or(0.0, |[from, to]| to - from));
-    runs.clear();
+    samples.clear();
     if !length_px.is_finite() {
         return;
     }
-    let spacing_px = (length_px / MOST_RUNS as f64).max(1.0);
-    spread_runs(start, pattern, (spacing_px, |_| true), runs);
-    let is_seen = |place: [f64; 2]| {
-        lens.seen(start.at(place).ideal).is_some_and(|(pixel, _)| is_inside(view, pixel))
+    let spacing_px = (length_px / MAX_SAMPLES as f64).max(1.0);
+    spread_samples(start, pattern, spacing_px, |_| true, samples);
+    let is_visible = |place: [f64; 2]| {
+        lens.distort(start.project(place).image).is_some_and(|(pixel, _)| is_inside(view, pixel))
     };
-    if !CORNERS.into_iter().all(is_seen) {
-        // Those outside of the image would take the places of others.
-        let inside = runs.iter().filter(|run| is_seen(run.place)).count();
-        let share = inside.max(1) as f64 / runs.len().max(1) as f64;
-        spread_runs(start, pattern, ((share * spacing_px).max(1.0), is_seen), runs);
+    if !CORNERS.into_iter().all(is_visible) {
+        // Samples outside of the image are replaced by more samples within it.
+        let inside = samples.iter().filter(|sample| is_visible(sample.place)).count();
+        let ratio = inside.max(1) as f64 / samples.len().max(1) as f64;
+        let spacing_px = (ratio * spacing_px).max(1.0);
+        spread_samples(start, pattern, spacing_px, is_visible, samples);
     }
 }
 
@@ -192,25 +165,26 @@ fn is_inside(view: GrayView<'_>, pixel: Pixel) -> bool {
     within(pixel.x, view.width()) && within(pixel.y, view.height())
 }
 
-/// Places so far apart along all edges, of which some are kept.
-fn spread_runs(
+/// Places samples at this spacing along all edges, and keeps those that are visible.
+fn spread_samples(
     start: &Homography,
     pattern: &Pattern,
-    (spacing_px, is_kept): (f64, impl Fn([f64; 2]) -> bool),
-    runs: &mut Vec<Run>,
+    spacing_px: f64,
+    is_visible: impl Fn([f64; 2]) -> bool,
+    samples: &mut Vec<EdgeSample>,
 ) {
-    runs.clear();
-    // Lengths are counted through, so that short edges get their share.
+    samples.clear();
+    // The spacing goes on from edge to edge, so that short edges get their share.
     let mut next_px = 0.5 * spacing_px;
     let mut passed_px = 0.0;
     each_edge(pattern, |edge| {
         let Some([from, to]) = edge.usable(start) else { return };
         let end_px = passed_px + to - from;
-        while next_px < end_px && runs.len() < 2 * MOST_RUNS {
+        while next_px < end_px && samples.len() < 2 * MAX_SAMPLES {
             let share = (from + next_px - passed_px) / edge.length_px(start);
             let place = [0, 1].map(|i| edge.from[i] + (edge.to[i] - edge.from[i]) * share);
-            if is_kept(place) {
-                runs.push(Run { place, across: edge.across, sight: None });
+            if is_visible(place) {
+                samples.push(EdgeSample { place, across: edge.across, measurement: None });
             }
             next_px += spacing_px;
         }
@@ -220,15 +194,15 @@ fn spread_runs(
 
 /// A straight edge between cells, in the square's coordinates.
 #[derive(Copy, Clone, Debug)]
-struct Segment {
+struct CellEdge {
     from: [f64; 2],
     to: [f64; 2],
     across: [f64; 2],
 }
 
-impl Segment {
+impl CellEdge {
     fn length_px(&self, homography: &Homography) -> f64 {
-        let [from, to] = [self.from, self.to].map(|place| homography.at(place).ideal);
+        let [from, to] = [self.from, self.to].map(|place| homography.project(place).image);
         (to[0] - from[0]).hypot(to[1] - from[1])
     }
 
@@ -241,7 +215,7 @@ impl Segment {
 }
 
 /// Calls `with` for every straight edge of the pattern.
-fn each_edge(pattern: &Pattern, mut with: impl FnMut(Segment)) {
+fn each_edge(pattern: &Pattern, mut with: impl FnMut(CellEdge)) {
     let across = pattern.across();
     let half = pattern.cells() as f64 / 2.0;
     let margin = pattern.margin() as f64;
@@ -266,7 +240,7 @@ fn each_edge(pattern: &Pattern, mut with: impl FnMut(Segment)) {
                 if towards != 0.0 {
                     let cell = towards / half;
                     let across = if upright { [cell, 0.0] } else { [0.0, cell] };
-                    with(Segment { from: place(first), to: place(first + count), across });
+                    with(CellEdge { from: place(first), to: place(first + count), across });
                 }
                 first += count;
             }
@@ -274,48 +248,52 @@ fn each_edge(pattern: &Pattern, mut with: impl FnMut(Segment)) {
     }
 }
 
-struct Search<'a> {
+struct EdgeFit<'a> {
     view: GrayView<'a>,
-    lens: &'a Lens<'a>,
+    lens: &'a Undistortion<'a>,
     homography: Homography,
     spread_px: f64,
-    step: EdgeResponse,
-    /// Runs within the image in the last pass; pixels at the sensor's end, and all.
+    response: EdgeResponse,
+    /// In the last pass: samples within the image, saturated pixels, and all pixels.
     inside: usize,
-    clipped: usize,
+    saturated: usize,
     pixels: usize,
 }
 
 /// Pixels across an edge: their distance from it towards white, and their grey value.
-type Pixels = [[f64; 2]; MOST_PIXELS];
+type Pixels = [[f64; 2]; MAX_PIXELS];
 
-impl Search<'_> {
-    fn edge(&self, run: &Run) -> Option<Edge> {
-        let place = self.homography.at(run.place);
-        let (pixel, bend) = self.lens.seen(place.ideal)?;
+impl EdgeFit<'_> {
+    fn project(&self, sample: &EdgeSample) -> Option<ProjectedEdge> {
+        let place = self.homography.project(sample.place);
+        let (pixel, distortion) = self.lens.distort(place.image)?;
         let jacobian = place.jacobian(&self.homography);
         let towards = |[a, b]: [f64; 2]| {
             let x = jacobian[0][0] * a + jacobian[1][0] * b;
             let y = jacobian[0][1] * a + jacobian[1][1] * b;
-            [bend[(0, 0)] * x + bend[(0, 1)] * y, bend[(1, 0)] * x + bend[(1, 1)] * y]
+            [
+                distortion[(0, 0)] * x + distortion[(0, 1)] * y,
+                distortion[(1, 0)] * x + distortion[(1, 1)] * y,
+            ]
         };
-        let along = towards([-run.across[1], run.across[0]]);
-        let cell = towards(run.across);
+        let along = towards([-sample.across[1], sample.across[0]]);
+        let cell = towards(sample.across);
         let length = along[0].hypot(along[1]);
         let upright = [along[1] / length, -along[0] / length];
         let cell_px = upright[0] * cell[0] + upright[1] * cell[1];
         let normal = if cell_px < 0.0 { upright.map(|n| -n) } else { upright };
         let ideal_normal = [
-            bend[(0, 0)] * normal[0] + bend[(1, 0)] * normal[1],
-            bend[(0, 1)] * normal[0] + bend[(1, 1)] * normal[1],
+            distortion[(0, 0)] * normal[0] + distortion[(1, 0)] * normal[1],
+            distortion[(0, 1)] * normal[0] + distortion[(1, 1)] * normal[1],
         ];
-        let edge = Edge { pixel, normal, slope: place.along(ideal_normal), cell_px: cell_px.abs() };
+        let gradient = place.parameter_gradient(ideal_normal);
+        let edge = ProjectedEdge { pixel, normal, gradient, cell_px: cell_px.abs() };
         (edge.cell_px.is_finite() && edge.cell_px > 1.0).then_some(edge)
     }
 
-    /// The pixels of the row or column that crosses the edge most steeply, up to `reach_px` away from it; of many, every
-    /// so many-th.
-    fn pixels(&self, edge: &Edge, reach_px: f64, pixels: &mut Pixels) -> usize {
+    /// Reads the pixels of the row or column that crosses the edge most steeply, up to `reach_px` away from the edge;
+    /// every n-th of them where there are many. Returns their number.
+    fn pixels(&self, edge: &ProjectedEdge, reach_px: f64, pixels: &mut Pixels) -> usize {
         let [nx, ny] = edge.normal;
         let level = nx.abs() >= ny.abs();
         let (line, place, steep, flat) = if level {
@@ -339,7 +317,7 @@ impl Search<'_> {
             return 0;
         }
         let (nearest, first, last) = (nearest as usize, first as usize, last as usize);
-        let stride = (last - first) / MOST_PIXELS + 1;
+        let stride = (last - first) / MAX_PIXELS + 1;
         let mut count = 0;
         for (slot, at) in pixels.iter_mut().zip((first..=last).step_by(stride)) {
             let grey = if level { self.view.at(at, nearest) } else { self.view.at(nearest, at) };
@@ -349,18 +327,18 @@ impl Search<'_> {
         count
     }
 
-    /// Looks where grey values cross the middle between black and white, up to so far from every so many-th edge's place;
-    /// returns the share of the edges within the image that were found.
-    fn look(&mut self, runs: &mut [Run], every: usize, reach_px: f64) -> f64 {
-        let mut pixels = [[0.0; 2]; MOST_PIXELS];
-        let mut seen = 0;
+    /// Finds where grey values cross the middle between black and white, within `reach_px` of every `step`-th sample.
+    /// Returns the fraction of the samples within the image at which an edge was found.
+    fn locate(&mut self, samples: &mut [EdgeSample], step: usize, reach_px: f64) -> f64 {
+        let mut pixels = [[0.0; 2]; MAX_PIXELS];
+        let mut found = 0;
         self.inside = 0;
-        for (i, run) in runs.iter_mut().enumerate() {
-            run.sight = None;
-            if i % every != 0 {
+        for (i, sample) in samples.iter_mut().enumerate() {
+            sample.measurement = None;
+            if i % step != 0 {
                 continue;
             }
-            let Some(edge) = self.edge(run) else { continue };
+            let Some(edge) = self.project(sample) else { continue };
             self.inside += usize::from(is_inside(self.view, edge.pixel));
             let reach = reach_px.min(edge.cell_px - 0.5);
             let count = self.pixels(&edge, reach, &mut pixels);
@@ -368,46 +346,46 @@ impl Search<'_> {
             if pixels[0][0] > pixels[count - 1][0] {
                 pixels.reverse();
             }
-            run.sight = crossing(pixels).map(|(shift, black, contrast)| Sight {
-                slope: edge.slope,
-                matrix: [1.0, 0.0, 1.0],
-                right: [shift, 0.0],
-                squares: 0.0,
-                freedom: 1.0,
-                black,
-                contrast,
-                weight: 1.0,
-            });
-            seen += usize::from(run.sight.is_some());
+            sample.measurement =
+                crossing(pixels).map(|Crossing { shift, black, contrast }| EdgeMeasurement {
+                    gradient: edge.gradient,
+                    matrix: [1.0, 0.0, 1.0],
+                    right: [shift, 0.0],
+                    squares: 0.0,
+                    freedom: 1.0,
+                    black,
+                    contrast,
+                    weight: 1.0,
+                });
+            found += usize::from(sample.measurement.is_some());
         }
-        seen as f64 / self.inside.max(1) as f64
+        found as f64 / self.inside.max(1) as f64
     }
 
-    /// Moves the square to where what was looked at says; those far from what the others say are something else's edges.
-    fn agree(&mut self, scratch: &mut Scratch) -> Option<()> {
+    /// Moves the square onto the edges that were located; edges that contradict the others are outliers.
+    fn align(&mut self, scratch: &mut Scratch) -> Option<()> {
         for _ in 0..3 {
-            self.weigh(scratch)?;
-            let system = System::new(&scratch.runs);
-            let step = system.solve()?;
-            self.homography = self.homography.moved(|i| step[i])?;
-            for sight in scratch.runs.iter_mut().filter_map(|run| run.sight.as_mut()) {
-                let moved: f64 = (0..8).map(|i| sight.slope[i] * step[i]).sum();
-                sight.right[0] -= moved;
+            self.reweight(scratch)?;
+            let step = solve(&normal_equations(&scratch.edges))?;
+            self.homography = self.homography.stepped(|i| step[i])?;
+            for measurement in scratch.edges.iter_mut().filter_map(|e| e.measurement.as_mut()) {
+                let moved: f64 = (0..8).map(|i| measurement.gradient[i] * step[i]).sum();
+                measurement.right[0] -= moved;
             }
         }
         Some(())
     }
 
-    /// Compares every so many-th run with the profile of its edge.
-    fn compare_all(&mut self, runs: &mut [Run], every: usize) -> Option<()> {
-        let mut pixels = [[0.0; 2]; MOST_PIXELS];
-        (self.inside, self.clipped, self.pixels) = (0, 0, 0);
-        for (i, run) in runs.iter_mut().enumerate() {
-            run.sight = None;
-            if i % every != 0 {
+    /// Compares every `step`-th sample with the profile of its edge.
+    fn measure_all(&mut self, samples: &mut [EdgeSample], step: usize) {
+        let mut pixels = [[0.0; 2]; MAX_PIXELS];
+        (self.inside, self.saturated, self.pixels) = (0, 0, 0);
+        for (i, sample) in samples.iter_mut().enumerate() {
+            sample.measurement = None;
+            if i % step != 0 {
                 continue;
             }
-            let Some(edge) = self.edge(run) else { continue };
+            let Some(edge) = self.project(sample) else { continue };
             self.inside += usize::from(is_inside(self.view, edge.pixel));
             let reach = (3.0 * self.spread_px + 1.0).min(edge.cell_px - 2.3 * self.spread_px);
             if reach < 1.8 * self.spread_px + 0.5 {
@@ -416,24 +394,23 @@ impl Search<'_> {
             let count = self.pixels(&edge, reach, &mut pixels);
             let Some(pixels) = pixels.get(..count).filter(|p| p.len() >= 5) else { continue };
             self.pixels += count;
-            self.clipped +=
+            self.saturated +=
                 pixels.iter().filter(|[_, grey]| *grey <= 0.0 || *grey >= 255.0).count();
-            run.sight = self.compare(&edge, pixels);
+            sample.measurement = self.measure(&edge, pixels);
         }
-        Some(())
     }
 
-    /// What pixels say of the edge's shift and of the spread.
-    fn compare(&self, edge: &Edge, pixels: &[[f64; 2]]) -> Option<Sight> {
+    /// Fits the profile of a blurred edge to the pixels across it.
+    fn measure(&self, edge: &ProjectedEdge, pixels: &[[f64; 2]]) -> Option<EdgeMeasurement> {
         let pixel_kurtosis = pixel_kurtosis(edge.normal, self.spread_px * self.spread_px);
-        let mut looks = [[0.0; 3]; MOST_PIXELS];
+        let mut model = [[0.0; 3]; MAX_PIXELS];
         let count = pixels.len() as f64;
-        // Sums for the straight line of grey over whiteness, and over both slopes.
+        // Sums for the linear regression of grey values on the share of white, and for its derivatives.
         let (mut sf, mut sff, mut sg, mut sfg) = (0.0, 0.0, 0.0, 0.0);
-        for ([distance, grey], look) in pixels.iter().zip(&mut looks) {
+        for ([distance, grey], point) in pixels.iter().zip(&mut model) {
             let z = distance / self.spread_px;
-            let (white, slope) = self.step.at(z, pixel_kurtosis);
-            *look = [white, -slope, -z * slope];
+            let (white, slope) = self.response.at(z, pixel_kurtosis);
+            *point = [white, -slope, -z * slope];
             sf += white;
             sff += white * white;
             sg += grey;
@@ -446,22 +423,22 @@ impl Search<'_> {
         let contrast = (count * sfg - sf * sg) / determinant;
         let black = (sg - contrast * sf) / count;
         let scale = contrast / self.spread_px;
-        // What the line explains is taken out of both slopes.
+        // Black and contrast are eliminated from both derivatives.
         let line = |index: usize| {
             let (mut s, mut fs) = (0.0, 0.0);
-            for look in looks.iter().take(pixels.len()) {
-                s += look[index];
-                fs += look[0] * look[index];
+            for point in model.iter().take(pixels.len()) {
+                s += point[index];
+                fs += point[0] * point[index];
             }
             let rise = (count * fs - sf * s) / determinant;
             ((s - rise * sf) / count, rise)
         };
         let lines = [line(1), line(2)];
         let (mut matrix, mut right, mut squares) = ([0.0; 3], [0.0; 2], 0.0);
-        for ([_, grey], look) in pixels.iter().zip(&looks) {
-            let difference = grey - black - contrast * look[0];
-            let shift = (look[1] - lines[0].0 - lines[0].1 * look[0]) * scale;
-            let spread = (look[2] - lines[1].0 - lines[1].1 * look[0]) * scale;
+        for ([_, grey], point) in pixels.iter().zip(&model) {
+            let difference = grey - black - contrast * point[0];
+            let shift = (point[1] - lines[0].0 - lines[0].1 * point[0]) * scale;
+            let spread = (point[2] - lines[1].0 - lines[1].1 * point[0]) * scale;
             matrix[0] += shift * shift;
             matrix[1] += shift * spread;
             matrix[2] += spread * spread;
@@ -469,9 +446,9 @@ impl Search<'_> {
             right[1] += spread * difference;
             squares += difference * difference;
         }
-        let seen = contrast > LEAST_CONTRAST && matrix[0] > 0.0;
-        seen.then_some(Sight {
-            slope: edge.slope,
+        let is_edge = contrast > MIN_CONTRAST && matrix[0] > 0.0;
+        is_edge.then_some(EdgeMeasurement {
+            gradient: edge.gradient,
             matrix,
             right,
             squares,
@@ -482,81 +459,90 @@ impl Search<'_> {
         })
     }
 
-    /// Gives each run its weight by how far it is from what the others say.
-    fn weigh(&self, scratch: &mut Scratch) -> Option<()> {
-        let Scratch { runs, shifts, .. } = scratch;
-        let least = LEAST_SHARE * self.inside as f64;
-        let mut median_of = |of: &dyn Fn(&Sight) -> f64| {
-            shifts.clear();
-            shifts.extend(runs.iter().filter_map(|run| run.sight.as_ref()).map(of));
-            let middle = shifts.len() / 2;
-            (shifts.len() > LEAST_RUNS && shifts.len() as f64 > least)
-                .then(|| *shifts.select_nth_unstable_by(middle, f64::total_cmp).1)
+    /// Weights each measurement by its consistency with the others.
+    fn reweight(&self, scratch: &mut Scratch) -> Option<()> {
+        let Scratch { edges, magnitudes, .. } = scratch;
+        let min_count = MIN_SAMPLE_RATIO * self.inside as f64;
+        let mut median_of = |of: &dyn Fn(&EdgeMeasurement) -> f64| {
+            magnitudes.clear();
+            magnitudes.extend(edges.iter().filter_map(|edge| edge.measurement.as_ref()).map(of));
+            let middle = magnitudes.len() / 2;
+            (magnitudes.len() > MIN_SAMPLES && magnitudes.len() as f64 > min_count)
+                .then(|| *magnitudes.select_nth_unstable_by(middle, f64::total_cmp).1)
         };
-        let contrast = median_of(&|sight| sight.contrast)?;
-        let scatter = 1.5 * median_of(&|sight| sight.standing().abs())?;
-        let noise = median_of(&|sight| sight.squares / sight.freedom)?;
-        for sight in runs.iter_mut().filter_map(|run| run.sight.as_mut()) {
-            let limit = USUAL_SHIFTS * scatter.max(1e-9) / sight.standing().abs().max(1e-12);
-            let noisy = 9.0 * noise.max(0.2) / (sight.squares / sight.freedom).max(1e-12);
-            sight.weight = limit.min(1.0).powi(2) * noisy.min(1.0);
-            if sight.contrast < 0.25 * contrast {
-                sight.weight = 0.0;
+        let contrast = median_of(&|m| m.contrast)?;
+        let scatter = 1.5 * median_of(&|m| m.normalised_shift().abs())?;
+        let noise = median_of(&|m| m.squares / m.freedom)?;
+        for measurement in edges.iter_mut().filter_map(|edge| edge.measurement.as_mut()) {
+            let limit = OUTLIER_SHIFTS * scatter.max(1e-9)
+                / measurement.normalised_shift().abs().max(1e-12);
+            let noisy =
+                9.0 * noise.max(0.2) / (measurement.squares / measurement.freedom).max(1e-12);
+            measurement.weight = limit.min(1.0).powi(2) * noisy.min(1.0);
+            if measurement.contrast < 0.25 * contrast {
+                measurement.weight = 0.0;
             }
         }
         Some(())
     }
 
-    /// Moves the square and the spread; returns how far the square moved, in pixels.
-    fn step(&mut self, system: &System) -> Option<f64> {
-        let step = system.solve()?;
+    /// Moves the square and changes the blur; returns how far the square moved, in pixels.
+    fn step(&mut self, equations: &NormalEquations<UNKNOWNS>) -> Option<f64> {
+        let step = solve(equations)?;
         let before = self.homography;
-        self.homography = before.moved(|i| step[i])?;
+        self.homography = before.stepped(|i| step[i])?;
         self.spread_px = (self.spread_px + step[8].clamp(-0.4, 0.6)).clamp(0.29, 4.0);
         Some(before.distance_px(&self.homography))
     }
 
-    fn result(&self, system: System, runs: &[Run]) -> Option<Fit> {
+    fn result(&self, equations: &NormalEquations<UNKNOWNS>, edges: &[EdgeSample]) -> Option<Fit> {
         let (mut weight, mut black, mut contrast) = (0.0, 0.0, 0.0);
         let (mut squares, mut freedom, mut scatter) = (0.0, 0.0, 0.0);
-        for sight in runs.iter().filter_map(|run| run.sight.as_ref()) {
-            weight += sight.weight;
-            black += sight.weight * sight.black;
-            contrast += sight.weight * sight.contrast;
-            squares += sight.weight * sight.squares;
-            freedom += sight.weight * sight.freedom;
-            scatter += sight.weight * sight.standing().powi(2);
+        for measurement in edges.iter().filter_map(|edge| edge.measurement.as_ref()) {
+            weight += measurement.weight;
+            black += measurement.weight * measurement.black;
+            contrast += measurement.weight * measurement.contrast;
+            squares += measurement.weight * measurement.squares;
+            freedom += measurement.weight * measurement.freedom;
+            scatter += measurement.weight * measurement.normalised_shift().powi(2);
         }
-        if weight < LEAST_RUNS as f64 {
+        if weight < MIN_SAMPLES as f64 {
             return None;
         }
         let noise = squares / freedom;
-        // Where the runs scatter more than their pixels' noise explains, the paper or the model is to blame.
+        // Where the shifts scatter more than the pixels' noise explains, the paper is uneven or the model is wrong.
         let scatter = scatter / (weight - UNKNOWNS as f64).max(1.0);
-        let inverse = system.full().cholesky()?.inverse();
+        let inverse = equations.matrix.cholesky()?.inverse();
         let covariance = inverse.fixed_view::<8, 8>(0, 0) * noise.max(scatter);
-        let picture = Picture {
+        let model = PhotometricModel {
             black: black / weight,
             contrast: contrast / weight,
             shade: [0.0; 2],
             beyond: 0.0,
             spread_px: self.spread_px,
         };
-        let residual = noise.sqrt() / picture.contrast;
-        Some(Fit { homography: self.homography, covariance, picture, residual })
+        let residual = noise.sqrt() / model.contrast;
+        Some(Fit { homography: self.homography, covariance, model, residual })
     }
 }
 
-impl Sight {
-    /// The shift it asks for, in units of grey levels of noise.
-    fn standing(&self) -> f64 {
+impl EdgeMeasurement {
+    /// The shift in units of its standard deviation for a noise of one grey level.
+    fn normalised_shift(&self) -> f64 {
         self.right[0] / self.matrix[0].sqrt()
     }
 }
 
-/// Where pixels sorted from black to white cross the middle between both, nearest to the expected place; with black
-/// and contrast.
-fn crossing(pixels: &[[f64; 2]]) -> Option<(f64, f64, f64)> {
+/// An edge between black and white pixels.
+struct Crossing {
+    /// Distance from the expected place, towards white.
+    shift: f64,
+    black: f64,
+    contrast: f64,
+}
+
+/// Where pixels, sorted from black to white, cross the middle grey value; the crossing nearest to the expected place.
+fn crossing(pixels: &[[f64; 2]]) -> Option<Crossing> {
     let count = pixels.len();
     let black = pixels[0][1].min(pixels[1][1]);
     let white = pixels[count - 1][1].max(pixels[count - 2][1]);
@@ -569,53 +555,46 @@ fn crossing(pixels: &[[f64; 2]]) -> Option<(f64, f64, f64)> {
             pair[0][0] + share * (pair[1][0] - pair[0][0])
         })
         .min_by(|a, b| a.abs().total_cmp(&b.abs()))?;
-    (white - black > 2.0 * LEAST_CONTRAST).then_some((place, black, white - black))
+    (white - black > 2.0 * MIN_CONTRAST).then_some(Crossing {
+        shift: place,
+        black,
+        contrast: white - black,
+    })
 }
 
-/// The normal equations of the homography and the spread.
-struct System {
-    matrix: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
-    right: SVector<f64, UNKNOWNS>,
-}
-
-impl System {
-    fn new(runs: &[Run]) -> Self {
-        // All of the rows, though half would do: it takes no longer.
-        let (mut rows, mut mixed_row, mut spread_sum) = ([[0.0; 8]; 8], [0.0; 8], 0.0);
-        let (mut sums, mut right_spread) = ([0.0; 8], 0.0);
-        for sight in runs.iter().filter_map(|run| run.sight.as_ref()) {
-            let [shift, mixed, spread] = sight.matrix.map(|m| sight.weight * m);
-            let right = sight.right.map(|r| sight.weight * r);
-            let slope = &sight.slope;
-            for (row, along) in rows.iter_mut().zip(slope) {
-                let scaled = shift * along;
-                for (entry, other) in row.iter_mut().zip(slope) {
-                    *entry += scaled * other;
-                }
+/// The normal equations of the homography's parameters and the blur.
+fn normal_equations(edges: &[EdgeSample]) -> NormalEquations<UNKNOWNS> {
+    // Filling all of the symmetric matrix takes no longer than half of it.
+    let (mut rows, mut mixed_row, mut spread_sum) = ([[0.0; 8]; 8], [0.0; 8], 0.0);
+    let (mut sums, mut right_spread) = ([0.0; 8], 0.0);
+    for measurement in edges.iter().filter_map(|edge| edge.measurement.as_ref()) {
+        let [shift, mixed, spread] = measurement.matrix.map(|m| measurement.weight * m);
+        let right = measurement.right.map(|r| measurement.weight * r);
+        let gradient = &measurement.gradient;
+        for (row, along) in rows.iter_mut().zip(gradient) {
+            let scaled = shift * along;
+            for (entry, other) in row.iter_mut().zip(gradient) {
+                *entry += scaled * other;
             }
-            for ((entry, sum), along) in mixed_row.iter_mut().zip(&mut sums).zip(slope) {
-                *entry += mixed * along;
-                *sum += right[0] * along;
-            }
-            spread_sum += spread;
-            right_spread += right[1];
         }
-        let matrix = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|i, j| match (i, j) {
-            (8, 8) => spread_sum,
-            (8, other) | (other, 8) => mixed_row[other],
-            _ => rows[i][j],
-        });
-        let right =
-            SVector::<f64, UNKNOWNS>::from_fn(|i, _| if i < 8 { sums[i] } else { right_spread });
-        Self { matrix, right }
+        for ((entry, sum), along) in mixed_row.iter_mut().zip(&mut sums).zip(gradient) {
+            *entry += mixed * along;
+            *sum += right[0] * along;
+        }
+        spread_sum += spread;
+        right_spread += right[1];
     }
+    let matrix = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|i, j| match (i, j) {
+        (8, 8) => spread_sum,
+        (8, other) | (other, 8) => mixed_row[other],
+        _ => rows[i][j],
+    });
+    let right =
+        SVector::<f64, UNKNOWNS>::from_fn(|i, _| if i < 8 { sums[i] } else { right_spread });
+    NormalEquations { matrix, right, cost: 0.0, extra: () }
+}
 
-    fn full(&self) -> SMatrix<f64, UNKNOWNS, UNKNOWNS> {
-        self.matrix
-    }
-
-    fn solve(&self) -> Option<SVector<f64, UNKNOWNS>> {
-        let step = self.matrix.cholesky()?.solve(&self.right);
-        step.iter().all(|s| s.is_finite()).then_some(step)
-    }
+/// The Gauss-Newton step.
+fn solve(equations: &NormalEquations<UNKNOWNS>) -> Option<SVector<f64, UNKNOWNS>> {
+    equations.step(0.0, 0.0).filter(|step| step.iter().all(|s| s.is_finite()))
 }

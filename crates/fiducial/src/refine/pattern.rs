@@ -1,9 +1,9 @@
-//! Which cells of a square marker are black and which are white, as far as it is known.
+//! Which cells of a square marker are black and which are white.
 
 use markers::SquareCode;
 
-/// Most cells across a pattern, its surroundings included.
-pub const MOST_CELLS: usize = 32;
+/// Largest number of cells across a pattern, its surroundings included.
+pub const MAX_CELLS: usize = 32;
 
 /// The cells of a square marker and what is around it.
 #[derive(Clone, Debug, PartialEq)]
@@ -11,24 +11,24 @@ pub struct Pattern {
     across: usize,
     margin: usize,
     /// Bit `x` of row `y`, surroundings included.
-    white: [u32; MOST_CELLS],
-    known: [u32; MOST_CELLS],
+    white: [u32; MAX_CELLS],
+    known: [u32; MAX_CELLS],
 }
 
 impl Pattern {
-    /// A square of `cells` cells across with `margin` cells around it on each side. `is_white` tells of the cell in
-    /// column x and row y, the square's own top left being (0, 0) and what is left of or above it negative; `None`
-    /// for what is not known. `None` when the square has no cells, or all together are too many.
+    /// A square of `cells` cells across with `margin` cells around it on each side. `is_white` gives the colour of the cell
+    /// in column x and row y, or `None` where it is unknown; the square's top left cell is (0, 0). `None` when the square
+    /// has no cells, or too many.
     pub fn new(
         cells: usize,
         margin: usize,
         is_white: impl Fn(i32, i32) -> Option<bool>,
     ) -> Option<Self> {
         let across = margin.checked_mul(2)?.checked_add(cells)?;
-        if cells == 0 || across > MOST_CELLS {
+        if cells == 0 || across > MAX_CELLS {
             return None;
         }
-        let mut pattern = Self { across, margin, white: [0; MOST_CELLS], known: [0; MOST_CELLS] };
+        let mut pattern = Self { across, margin, white: [0; MAX_CELLS], known: [0; MAX_CELLS] };
         for y in 0..across {
             for x in 0..across {
                 let at = |value: usize| value as i32 - margin as i32;
@@ -41,13 +41,13 @@ impl Pattern {
         Some(pattern)
     }
 
-    /// The marker of a family that carries this word. Around a square the paper is white for a cell; what lies beside the
-    /// bits outside of a square is known only where the bits leave no gaps.
-    pub fn of(code: &SquareCode, word: u64) -> Option<Self> {
+    /// The marker of a family with this codeword. The quiet zone is one cell wide; the colour beside bits outside of the
+    /// square is known only where the bits leave no gaps.
+    pub fn for_code(code: &SquareCode, word: u64) -> Option<Self> {
         Self::bordered(code, word, 0)
     }
 
-    /// The same with a border that is `extra` cells wider, as on grids for calibration. These have black squares at the
+    /// The same with a border that is `extra` cells wider, as on calibration boards. These have black squares at the
     /// corners of the paper around each marker.
     pub fn bordered(code: &SquareCode, word: u64, extra: u8) -> Option<Self> {
         let extra = i32::from(extra);
@@ -78,7 +78,7 @@ impl Pattern {
         Some(pattern)
     }
 
-    /// A square of which only the border is known, one of `cells` cells wide: black on white, or white on black.
+    /// A square of `cells` cells across of which only the border, one cell wide, is known.
     pub fn border(cells: usize, white_on_black: bool) -> Option<Self> {
         let last = i32::try_from(cells).ok()? - 1;
         Self::new(cells, 1, |x, y| {
@@ -103,10 +103,9 @@ impl Pattern {
         self.across
     }
 
-    /// Whether the cell in column x and row y, counted from the surroundings' top left, is white; `None` when it is
-    /// not known.
+    /// Whether a cell is white, by column and row from the surroundings' top left; `None` where it is unknown.
     pub(crate) fn is_white(&self, x: usize, y: usize) -> Option<bool> {
-        let bit = |rows: &[u32; MOST_CELLS]| rows.get(y).is_some_and(|row| row >> x & 1 == 1);
+        let bit = |rows: &[u32; MAX_CELLS]| rows.get(y).is_some_and(|row| row >> x & 1 == 1);
         (x < self.across && bit(&self.known)).then(|| bit(&self.white))
     }
 }
@@ -114,8 +113,7 @@ impl Pattern {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use markers::{Drawing, Ink};
-    use markers::{Family, Marker};
+    use markers::{Drawing, Family, Ink, Marker};
 
     #[test]
     fn a_border_is_black_in_white_or_white_in_black() {
@@ -131,14 +129,14 @@ mod tests {
         }
     }
 
-    /// Cell by cell as the marker is drawn, wherever something is known.
+    /// Every known cell has the colour of the drawing.
     #[test]
-    fn every_family_is_as_it_is_drawn() {
+    fn patterns_match_the_drawings() {
         for family in Family::ALL {
             let Some(code) = SquareCode::for_family(family) else { continue };
             let marker = Marker { family, id: Some(3), size_m: None };
             let drawing = Drawing::new(&marker, f64::from(code.cells)).unwrap();
-            let pattern = Pattern::of(code, code.codewords[3]).unwrap();
+            let pattern = Pattern::for_code(code, code.codewords[3]).unwrap();
             let half = pattern.across() as f64 / 2.0 - 0.5;
             let mut known = 0;
             for y in 0..pattern.across() {
@@ -154,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn impossible_sizes_are_refused() {
+    fn invalid_sizes_are_refused() {
         for (cells, margin) in [(0, 1), (31, 1), (5, usize::MAX)] {
             assert_eq!(Pattern::new(cells, margin, |_, _| Some(true)), None);
         }

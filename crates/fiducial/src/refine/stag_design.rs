@@ -1,45 +1,43 @@
-//! What an STag looks like, for the comparison with an image: small cells with their share of white, and edges.
+//! The design of an STag for the refinement: small cells with their share of white, and edges.
 
 use markers::stag_code::{DISC_RADIUS, QUIET_ZONE};
 use markers::{Drawing, Family, Ink, Marker, Shape};
 
-use crate::refine::corners::{Design, MOST_ACROSS};
+use crate::refine::fit::{Design, MAX_ACROSS};
 
-/// Small cells across the square and its paper; their borders are the square's outline. What a disc's edge looks like in
-/// them is blurred by their width, which must be well below the blur's: of a small square in the image they are twice as
-/// wide.
+/// Small cells across the square, around it, and in all; the square's outline is a border of cells. Their width must be
+/// well below that of the blur; for squares with a side below `COARSE_PX` they are twice as wide.
 const CELLS: usize = 48;
 const MARGIN: usize = (CELLS as f64 * QUIET_ZONE) as usize;
 const ACROSS: usize = CELLS + 2 * MARGIN;
-const _: () = assert!(ACROSS <= MOST_ACROSS);
-const SMALL_PX: f64 = 14.0;
+const _: () = assert!(ACROSS <= MAX_ACROSS);
+const COARSE_PX: f64 = 14.0;
 /// Samples of a small cell in each direction.
 const SAMPLES: usize = 8;
 const FINE: usize = ACROSS * SAMPLES;
 /// Places on each side, and on the disc's edge.
-const ON_SIDE: usize = 36;
+const PER_SIDE: usize = 36;
 const ON_DISC: usize = 96;
-/// How far the next edge is, in the square's coordinates, from -1 to 1: from the outline to the disc, and from the disc to
-/// the dots.
+/// Distance from the outline to the disc, and from the disc to the dots, in the square's coordinates (-1 to 1).
 const BORDER: f64 = 0.2;
 const RIM: f64 = 0.1;
 
-/// The picture of one marker.
+/// The design of one marker.
 #[derive(Debug)]
-pub(crate) struct Picture {
+pub(crate) struct StagDesign {
     pub(crate) family: Family,
     pub(crate) id: u32,
-    white: Box<[[f64; MOST_ACROSS]; MOST_ACROSS]>,
+    white: Box<[[f64; MAX_ACROSS]; MAX_ACROSS]>,
     /// The same with cells twice as wide.
-    coarse: Box<[[f64; MOST_ACROSS]; MOST_ACROSS]>,
-    /// Of black on white, and of white on black.
+    coarse: Box<[[f64; MAX_ACROSS]; MAX_ACROSS]>,
+    /// For black on white, and for white on black.
     edges: [Vec<[[f64; 2]; 2]>; 2],
 }
 
-/// Where the rim between disc and dots is narrower than this, in pixels, the disc's edge is not looked at by itself.
-const LEAST_RIM_PX: f64 = 4.0;
+/// Where the rim between disc and dots is narrower than this, in pixels, the disc's edge takes no part of its own.
+const MIN_RIM_PX: f64 = 4.0;
 
-impl Picture {
+impl StagDesign {
     /// `None` for an id that the family does not have.
     pub(crate) fn new(family: Family, id: u32) -> Option<Self> {
         let drawing = Drawing::new(&Marker { family, id: Some(id), size_m: None }, 1.0)?;
@@ -50,13 +48,13 @@ impl Picture {
         Some(Self { family, id, white, coarse, edges: [black, bright] })
     }
 
-    /// For a square with sides of this length, white on black when `inverted`.
+    /// For a square with sides of this length, printed white on black when `inverted`.
     pub(crate) fn design(&self, side_px: f64, inverted: bool) -> Design<'_> {
-        let is_wide = side_px * RIM / 2.0 >= LEAST_RIM_PX;
+        let is_wide = side_px * RIM / 2.0 >= MIN_RIM_PX;
         let edges = &self.edges[usize::from(inverted)];
-        let edges = if is_wide { &edges[..] } else { &edges[..4 * ON_SIDE] };
+        let edges = if is_wide { &edges[..] } else { &edges[..4 * PER_SIDE] };
         let border = BORDER / 2.0;
-        if side_px < SMALL_PX {
+        if side_px < COARSE_PX {
             let (cells, margin) = (CELLS / 2, MARGIN / 2);
             Design { cells, margin, white: &self.coarse, edges, border }
         } else {
@@ -66,11 +64,11 @@ impl Picture {
 }
 
 /// The share of white in each small cell.
-fn white(drawing: &Drawing) -> Box<[[f64; MOST_ACROSS]; MOST_ACROSS]> {
+fn white(drawing: &Drawing) -> Box<[[f64; MAX_ACROSS]; MAX_ACROSS]> {
     let mut fine = vec![true; FINE * FINE];
     let per_unit = (CELLS * SAMPLES) as f64;
     let middle = FINE as f64 / 2.0;
-    // Of the samples whose middles lie between two places.
+    // The samples whose middles lie between two places.
     let range = |low: f64, high: f64| {
         let index = |place: f64| (place * per_unit + middle - 0.5).ceil().clamp(0.0, FINE as f64);
         index(low) as usize..index(high) as usize
@@ -94,7 +92,7 @@ fn white(drawing: &Drawing) -> Box<[[f64; MOST_ACROSS]; MOST_ACROSS]> {
             }
         }
     }
-    let mut white = Box::new([[0.0; MOST_ACROSS]; MOST_ACROSS]);
+    let mut white = Box::new([[0.0; MAX_ACROSS]; MAX_ACROSS]);
     for (index, is_white) in fine.iter().enumerate() {
         let (x, y) = (index % FINE / SAMPLES, index / FINE / SAMPLES);
         white[y][x] += f64::from(u8::from(*is_white)) / (SAMPLES * SAMPLES) as f64;
@@ -103,8 +101,8 @@ fn white(drawing: &Drawing) -> Box<[[f64; MOST_ACROSS]; MOST_ACROSS]> {
 }
 
 /// The same with cells twice as wide.
-fn halved(white: &[[f64; MOST_ACROSS]; MOST_ACROSS]) -> Box<[[f64; MOST_ACROSS]; MOST_ACROSS]> {
-    let mut coarse = Box::new([[0.0; MOST_ACROSS]; MOST_ACROSS]);
+fn halved(white: &[[f64; MAX_ACROSS]; MAX_ACROSS]) -> Box<[[f64; MAX_ACROSS]; MAX_ACROSS]> {
+    let mut coarse = Box::new([[0.0; MAX_ACROSS]; MAX_ACROSS]);
     for (y, row) in white.iter().enumerate() {
         for (x, share) in row.iter().enumerate() {
             coarse[y / 2][x / 2] += share / 4.0;
@@ -113,12 +111,12 @@ fn halved(white: &[[f64; MOST_ACROSS]; MOST_ACROSS]) -> Box<[[f64; MOST_ACROSS];
     coarse
 }
 
-/// Places on the outline and on the disc's edge, in the square's coordinates (x right, y down, -1 to 1), and for each the
-/// way to the next edge on its white side, or as far on it as to the next one on its black side.
+/// Places on the outline and on the disc's edge, in the square's coordinates (x right, y down, -1 to 1), each with the
+/// vector towards white whose length is the distance to the next edge.
 fn edges() -> Vec<[[f64; 2]; 2]> {
-    let mut edges = Vec::with_capacity(4 * ON_SIDE + ON_DISC);
-    for k in 0..ON_SIDE {
-        let along = (k as f64 + 0.5) / ON_SIDE as f64 * 1.9 - 0.95;
+    let mut edges = Vec::with_capacity(4 * PER_SIDE + ON_DISC);
+    for k in 0..PER_SIDE {
+        let along = (k as f64 + 0.5) / PER_SIDE as f64 * 1.9 - 0.95;
         edges.extend([
             [[along, -1.0], [0.0, -BORDER]],
             [[along, 1.0], [0.0, BORDER]],
@@ -139,12 +137,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn small_cells_have_the_share_of_white_that_is_drawn() {
+    fn small_cells_have_the_share_of_white_of_the_drawing() {
         let marker = "stag-hd21:3".parse().unwrap();
         let drawing = Drawing::new(&marker, 1.0).unwrap();
-        let picture = Picture::new(Family::StagHd21, 3).unwrap();
+        let design = StagDesign::new(Family::StagHd21, 3).unwrap();
         let samples = 20;
-        // Every so many-th cell, for the time it takes.
+        // Every seventh cell, to save time.
         for cell in (0..ACROSS * ACROSS).step_by(7) {
             let (x, y) = (cell % ACROSS, cell / ACROSS);
             let place = |cell: usize, k: usize| {
@@ -156,9 +154,9 @@ mod tests {
             let white =
                 all.filter(|(i, j)| drawing.ink_at(place(x, *i), -place(y, *j)) == Ink::White);
             let share = white.count() as f64 / f64::from(samples * samples);
-            assert!((share - picture.white[y][x]).abs() < 0.12, "{x} {y}");
+            assert!((share - design.white[y][x]).abs() < 0.12, "{x} {y}");
         }
-        let sum = |white: &[[f64; MOST_ACROSS]; MOST_ACROSS]| white.iter().flatten().sum::<f64>();
-        assert!((sum(&picture.white) - 4.0 * sum(&picture.coarse)).abs() < 1e-6);
+        let sum = |white: &[[f64; MAX_ACROSS]; MAX_ACROSS]| white.iter().flatten().sum::<f64>();
+        assert!((sum(&design.white) - 4.0 * sum(&design.coarse)).abs() < 1e-6);
     }
 }

@@ -1,0 +1,76 @@
+//! The quiet zone around a marker: quads of its white paper, and how evenly a border stands out from it.
+
+use imaging::pyramid::from_level_0;
+use imaging::{GrayView, Outlines, bilinear};
+
+use crate::candidates::quad::Quad;
+
+/// Largest number of quiet zones in one image.
+pub(crate) const MAX_QUIET_ZONES: usize = 64;
+/// Largest variation of the contrast around a border: standard deviation over mean.
+pub(crate) const MAX_CONTRAST_VARIATION: f64 = 0.6;
+
+/// The quads of bright outlines from the index `first` on whose border has an even contrast, as a small marker's paper has.
+pub(crate) fn quiet_zone_quads<'a>(
+    view: GrayView<'a>,
+    outlines: &'a Outlines,
+    first: usize,
+) -> impl Iterator<Item = Quad> + 'a {
+    outlines
+        .iter()
+        .skip(first)
+        .filter_map(|outline| Quad::from_outline(&outline))
+        .filter(move |quad| border_contrast_variation(quad, view, 0) <= MAX_CONTRAST_VARIATION)
+        .take(MAX_QUIET_ZONES)
+}
+
+/// Standard deviation of the contrast between the outside and the inside of a quad's border, over its mean: of grey
+/// values or, since the edge of a shadow scales both, of their logarithms, whichever is less. Large where the mean is
+/// not positive.
+pub(crate) fn border_contrast_variation(quad: &Quad, view: GrayView<'_>, level: usize) -> f64 {
+    const POINTS: usize = 6;
+    let corners = quad.corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
+    let (mut plain, mut logarithms) = (Statistics::default(), Statistics::default());
+    for side in 0..4 {
+        let ([ax, ay], [bx, by]) = (corners[side], corners[(side + 1) % 4]);
+        let (dx, dy) = (bx - ax, by - ay);
+        let length = dx.hypot(dy);
+        // The corners go clockwise, so that the outside is on the left.
+        let off = (0.07 * length).max(0.7) / length;
+        let (nx, ny) = (dy * off, -dx * off);
+        for k in 0..POINTS {
+            let t = (k as f64 + 0.75) / (POINTS as f64 + 0.5);
+            let (x, y) = (ax + dx * t, ay + dy * t);
+            if let (Some(outer), Some(inner)) =
+                (bilinear(view, x + nx, y + ny), bilinear(view, x - nx, y - ny))
+            {
+                let (dark, bright) = if quad.inverted { (outer, inner) } else { (inner, outer) };
+                plain.add(bright - dark);
+                logarithms.add(((bright + 4.0) / (dark + 4.0)).ln());
+            }
+        }
+    }
+    plain.variation().min(logarithms.variation())
+}
+
+#[derive(Default)]
+struct Statistics {
+    count: f64,
+    sum: f64,
+    squares: f64,
+}
+
+impl Statistics {
+    fn add(&mut self, value: f64) {
+        self.count += 1.0;
+        self.sum += value;
+        self.squares += value * value;
+    }
+
+    /// Standard deviation over mean.
+    fn variation(&self) -> f64 {
+        let mean = self.sum / self.count;
+        let variance = self.squares / self.count - mean * mean;
+        if mean > 0.0 { variance.max(0.0).sqrt() / mean } else { f64::MAX }
+    }
+}

@@ -1,0 +1,112 @@
+//! What every family of square markers is asked for, and what it answers.
+
+use geometry::{CameraModel, Pixel};
+use imaging::{GrayView, Pyramid};
+use markers::{Family, Marker};
+
+use crate::candidates::quad::diagonal_px;
+use crate::observation::Observation;
+use crate::pose::square_pose;
+use crate::refine::fit::Refined;
+use crate::trace::Trace;
+
+/// Standard deviation of corners made of segments: in pixels, and as a fraction of the diagonal.
+const MIN_SEGMENT_CORNER_PX: f64 = 0.5;
+const SEGMENT_CORNER_RATIO: f64 = 0.015;
+
+/// An image in which markers are looked for.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct ImageInput<'a> {
+    pub(crate) view: GrayView<'a>,
+    /// Of `view`.
+    pub(crate) pyramid: &'a Pyramid,
+    /// Without a camera there are no poses.
+    pub(crate) camera: Option<&'a CameraModel>,
+}
+
+/// Where detections go.
+#[derive(Debug)]
+pub(crate) struct Output<'a> {
+    pub(crate) trace: &'a mut Trace,
+    pub(crate) found: &'a mut Vec<Observation>,
+}
+
+/// A marker where it is expected.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct ExpectedMarker {
+    pub(crate) family: Family,
+    pub(crate) id: u32,
+    /// Its own top left corner first.
+    pub(crate) corners: [Pixel; 4],
+}
+
+/// The markers of one family that are looked for.
+#[derive(Debug)]
+pub(crate) struct FamilyQuery {
+    pub(crate) family: Family,
+    pub(crate) markers: Vec<Marker>,
+}
+
+impl FamilyQuery {
+    pub(crate) fn new(marker: Marker) -> Self {
+        Self { family: marker.family, markers: vec![marker] }
+    }
+
+    /// Whether every id is looked for.
+    pub(crate) fn has_any_id(&self) -> bool {
+        self.markers.iter().any(|marker| marker.id.is_none())
+    }
+
+    /// The ids that are looked for by number.
+    pub(crate) fn ids(&self) -> impl Iterator<Item = u32> + Clone {
+        self.markers.iter().filter_map(|marker| marker.id)
+    }
+
+    /// Whether an id is looked for.
+    pub(crate) fn includes(&self, id: u32) -> bool {
+        self.markers.iter().any(|marker| marker.id.is_none_or(|wanted| wanted == id))
+    }
+
+    /// Whether a fallback is to look for markers that were not found. With `all` that is any missing one; otherwise only
+    /// those of any id where two were found, as on a board.
+    pub(crate) fn is_missing(&self, all: bool, found: impl Iterator<Item = u32> + Clone) -> bool {
+        if self.has_any_id() {
+            return all || found.clone().nth(1).is_some();
+        }
+        all && self.ids().any(|id| found.clone().all(|known| known != id))
+    }
+
+    /// The observation of a marker of the family.
+    pub(crate) fn observation(
+        &self,
+        id: u32,
+        hamming: u8,
+        confidence: f64,
+        refined: &Refined,
+        camera: Option<&CameraModel>,
+    ) -> Observation {
+        let corners = refined.corners;
+        let named = self.markers.iter().find(|marker| marker.id == Some(id));
+        let marker = named.or_else(|| self.markers.iter().find(|marker| marker.id.is_none()));
+        let size_m = marker.and_then(|marker| marker.size_m);
+        let pose = camera.zip(size_m).and_then(|(camera, size_m)| {
+            square_pose(&corners, &refined.covariance_px2, size_m, camera)
+        });
+        Observation {
+            family: self.family,
+            id: Some(id),
+            centre: refined.centre,
+            centre_covariance_px2: refined.centre_covariance_px2,
+            corners: Some(corners),
+            wrong_bits: hamming,
+            size_px: diagonal_px(&corners),
+            confidence,
+            pose,
+        }
+    }
+}
+
+/// Standard deviation of corners made of segments, in pixels.
+pub(crate) fn segment_corner_px(corners: &[Pixel; 4]) -> f64 {
+    (SEGMENT_CORNER_RATIO * corners[0].distance(&corners[2])).max(MIN_SEGMENT_CORNER_PX)
+}

@@ -1,0 +1,242 @@
+//! What the two refinements, along the edges and on grey values, share: their input, memory and result.
+
+use geometry::{CameraModel, Pixel};
+use imaging::GrayView;
+use nalgebra::{Matrix2, SMatrix};
+
+use crate::optics::edge_response::PIXEL_VARIANCE;
+use crate::optics::homography::{CORNERS, Homography};
+use crate::optics::undistort::Undistortion;
+
+/// Where a square is about.
+#[derive(Copy, Clone, Debug)]
+pub struct CornerGuess<'a> {
+    /// The image.
+    pub view: GrayView<'a>,
+    /// The corners, clockwise in the image; the first is the top left one of the marker's pattern.
+    pub corners: &'a [Pixel; 4],
+    /// Without a camera, lines are taken to be straight in the image.
+    pub camera: Option<&'a CameraModel>,
+    /// Whether the corners are right to about half a pixel.
+    pub is_near: bool,
+}
+
+/// The corners of a square marker, refined.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Refined {
+    /// The corners of the square, in the order in which they were given.
+    pub corners: [Pixel; 4],
+    /// Joint covariance of the corners (x and y of the first, then of the second, ...), in square pixels.
+    pub covariance_px2: SMatrix<f64, 8, 8>,
+    /// The image of the square's centre.
+    pub centre: Pixel,
+    /// Covariance of `centre`, in square pixels.
+    pub centre_covariance_px2: Matrix2<f64>,
+    /// Standard deviation of the lens' blur, in pixels.
+    pub blur_px: f64,
+    /// Grey value of unblurred black in the marker's middle.
+    pub black: f64,
+    /// Grey value of unblurred white in the marker's middle.
+    pub white: f64,
+    /// Root mean square residual of the pixels, as a fraction of the contrast.
+    pub residual: f64,
+}
+
+impl Refined {
+    /// Corners that were not refined, with this standard deviation.
+    pub(crate) fn unrefined(corners: &[Pixel; 4], corner_px: f64) -> Self {
+        let corner_px2 = corner_px * corner_px;
+        Self {
+            corners: *corners,
+            covariance_px2: SMatrix::identity() * corner_px2,
+            centre: diagonals_crossing(corners),
+            centre_covariance_px2: Matrix2::identity() * (corner_px2 / 4.0),
+            blur_px: 0.0,
+            black: 0.0,
+            white: 0.0,
+            residual: 1.0,
+        }
+    }
+
+    /// Adds the uncertainty of corners with this standard deviation.
+    pub(crate) fn add_uncertainty(&mut self, corner_px: f64) {
+        let corner_px2 = corner_px * corner_px;
+        self.covariance_px2 += SMatrix::<f64, 8, 8>::identity() * corner_px2;
+        self.centre_covariance_px2 += Matrix2::identity() * (corner_px2 / 4.0);
+    }
+}
+
+/// Where the diagonals of a quad cross: the image of the square's centre.
+fn diagonals_crossing(corners: &[Pixel; 4]) -> Pixel {
+    let [a, b, c, d] = corners;
+    let (ux, uy) = (c.x - a.x, c.y - a.y);
+    let (vx, vy) = (d.x - b.x, d.y - b.y);
+    let t = ((b.x - a.x) * vy - (b.y - a.y) * vx) / (ux * vy - uy * vx);
+    Pixel::new(a.x + t * ux, a.y + t * uy)
+}
+
+/// Working memory of the refinements.
+#[derive(Debug, Default)]
+pub struct Scratch {
+    pub(crate) edges: Vec<EdgeSample>,
+    pub(crate) magnitudes: Vec<f64>,
+    pub(crate) pixels: Vec<PixelSample>,
+}
+
+impl Scratch {
+    /// Makes the buffers as large as markers need.
+    pub(crate) fn make_room(&mut self) {
+        const MAX_EDGES: usize = 512;
+        const MAX_PIXELS: usize = 2048;
+        self.edges.clear();
+        self.edges.reserve(MAX_EDGES);
+        self.magnitudes.clear();
+        self.magnitudes.reserve(MAX_EDGES);
+        self.pixels.clear();
+        self.pixels.reserve(MAX_PIXELS);
+    }
+}
+
+/// A place on an edge of the marker.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct EdgeSample {
+    /// In the square's coordinates.
+    pub(crate) place: [f64; 2],
+    /// From black to white across the edge, one cell long, in the square's coordinates.
+    pub(crate) across: [f64; 2],
+    /// The last measurement of the edge.
+    pub(crate) measurement: Option<EdgeMeasurement>,
+}
+
+/// What the pixels across an edge measure.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct EdgeMeasurement {
+    /// Derivatives of the edge's position by the homography's parameters.
+    pub(crate) gradient: [f64; 8],
+    /// Normal equations of the edge's shift in pixels and of the blur; black and contrast are eliminated.
+    pub(crate) matrix: [f64; 3],
+    pub(crate) right: [f64; 2],
+    /// Sum of squared residuals, and their degrees of freedom.
+    pub(crate) squares: f64,
+    pub(crate) freedom: f64,
+    pub(crate) black: f64,
+    pub(crate) contrast: f64,
+    pub(crate) weight: f64,
+}
+
+/// A pixel that takes part in the photometric refinement.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct PixelSample {
+    /// Its ideal image point, relative to the homography's origin.
+    pub(crate) ideal: [f64; 2],
+    pub(crate) grey: f64,
+    /// Grey value less its last prediction; NaN where the sensor is saturated.
+    pub(crate) residual: f64,
+}
+
+/// Largest number of small cells across a [`Design`].
+pub(crate) const MAX_ACROSS: usize = 60;
+
+/// A square marker that does not consist of square cells of one colour.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Design<'a> {
+    /// Small cells across the square, and around it on each side.
+    pub(crate) cells: usize,
+    pub(crate) margin: usize,
+    /// The share of white in each small cell, row by row.
+    pub(crate) white: &'a [[f64; MAX_ACROSS]; MAX_ACROSS],
+    /// Places on edges, in the square's coordinates, and the vector from there towards white up to the next edge.
+    pub(crate) edges: &'a [[[f64; 2]; 2]],
+    /// Distance from the square's outline to the next edge, in sides of the square.
+    pub(crate) border: f64,
+}
+
+/// Light and blur of a marker.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) struct PhotometricModel {
+    /// Grey value of black, and white less black, in the marker's middle.
+    pub(crate) black: f64,
+    pub(crate) contrast: f64,
+    /// Relative gradient of the light to the right and down, per half a marker.
+    pub(crate) shade: [f64; 2],
+    /// Brightness beyond the pattern less white, in grey levels; usually negative.
+    pub(crate) beyond: f64,
+    /// Standard deviation of the blur of lens and pixel together, in pixels.
+    pub(crate) spread_px: f64,
+}
+
+impl PhotometricModel {
+    /// Standard deviation of the lens' blur alone.
+    fn blur_px(&self) -> f64 {
+        (self.spread_px * self.spread_px - PIXEL_VARIANCE).max(0.0).sqrt()
+    }
+}
+
+/// What is fitted: an image, its lens, and the square's first homography.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Target<'a> {
+    pub(crate) view: GrayView<'a>,
+    pub(crate) lens: &'a Undistortion<'a>,
+    pub(crate) start: &'a Homography,
+}
+
+/// The result of either refinement.
+#[derive(Clone, Debug)]
+pub(crate) struct Fit {
+    pub(crate) homography: Homography,
+    /// Of the homography's eight parameters.
+    pub(crate) covariance: SMatrix<f64, 8, 8>,
+    pub(crate) model: PhotometricModel,
+    /// As in [`Refined`].
+    pub(crate) residual: f64,
+}
+
+/// Largest distance by which a corner is moved: in pixels, and as a fraction of the shortest side.
+const MAX_MOVE_PX: f64 = 2.0;
+const MAX_MOVE_RATIO: f64 = 0.12;
+
+impl Fit {
+    /// The corners with their covariance; `None` when one is too far from where it was expected.
+    pub(crate) fn refined(
+        &self,
+        lens: &Undistortion<'_>,
+        guess: &CornerGuess<'_>,
+        side_px: f64,
+    ) -> Option<Refined> {
+        let mut corners = *guess.corners;
+        let mut jacobian = SMatrix::<f64, 8, 8>::zeros();
+        let max_move_px = MAX_MOVE_PX + MAX_MOVE_RATIO * side_px;
+        for (i, place) in CORNERS.into_iter().enumerate() {
+            let (pixel, by_parameters) = self.pixel(lens, place)?;
+            if pixel.distance(&guess.corners[i]) > max_move_px {
+                return None;
+            }
+            corners[i] = pixel;
+            jacobian.fixed_view_mut::<2, 8>(2 * i, 0).copy_from(&by_parameters);
+        }
+        let (centre, by_parameters) = self.pixel(lens, [0.0, 0.0])?;
+        let covariance_px2 = jacobian * self.covariance * jacobian.transpose();
+        let refined = Refined {
+            corners,
+            covariance_px2,
+            centre,
+            centre_covariance_px2: by_parameters * self.covariance * by_parameters.transpose(),
+            blur_px: self.model.blur_px(),
+            black: self.model.black,
+            white: self.model.black + self.model.contrast,
+            residual: self.residual,
+        };
+        refined.covariance_px2.iter().all(|c| c.is_finite()).then_some(refined)
+    }
+
+    /// The pixel of a point of the square, and its derivatives by the homography's parameters.
+    fn pixel(
+        &self,
+        lens: &Undistortion<'_>,
+        place: [f64; 2],
+    ) -> Option<(Pixel, SMatrix<f64, 2, 8>)> {
+        let projected = self.homography.project(place);
+        let (pixel, distortion_jacobian) = lens.distort(projected.image)?;
+        Some((pixel, distortion_jacobian * projected.parameter_jacobian()))
+    }
+}
