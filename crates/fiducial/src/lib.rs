@@ -3,11 +3,12 @@
 //! This crate knows images as borrowed grey views and cameras as models. It knows no network, no file, no
 //! clock and no thread; a stage of a detection that wants to be timed tells a [`Stages`] observer.
 //!
-//! What a marker is stands in the crate `markers`. Modules in reading order: [`square`] finds square markers, `stag` finds
-//! STags among the same quads, [`observation`] is what was found, [`pose`] where it is in space, [`detector`] finds it, [`bundle`] solves the markers of one pad together.
-//! `optics` is what camera and lens do to an edge, `candidates` where a marker may be, [`families`] one detector for each
-//! kind of marker. [`trace`] is what they saw, [`overlay`] draws that on the image. [`tracker`]
-//! searches first where the markers of the last images should be.
+//! What a marker is stands in the crate `markers`. Modules in the order of the data: `optics` is what camera
+//! and lens do to a marker, `candidates` where one may be, `decode` which codeword a candidate carries,
+//! [`refine`] its corners to a fraction of a pixel, [`pose`] its pose; [`families`] has a detector for each
+//! kind of marker, [`detector`] runs them, [`observation`] is their result. [`tracker`] searches first where
+//! the markers of the last images should be, and [`bundle`] solves the markers of one pad together. [`trace`]
+//! tells why candidates were refused, [`overlay`] draws that on the image.
 
 pub mod bundle;
 mod candidates;

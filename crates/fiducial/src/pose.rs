@@ -1,8 +1,9 @@
 //! The pose of a plane from the image of known points on it.
 //!
-//! Four or more points of a plane leave two poses: the plane tilted one way, and tilted the other way about the line of
-//! sight. Both come in closed form (Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014). Both
-//! are then refined: Levenberg-Marquardt minimises the reprojection error, weighted by the points' covariance.
+//! Four or more points of a plane leave two poses: the plane tilted one way, and tilted the other way about
+//! the line of sight. Both come in closed form (Collins and Bartoli, "Infinitesimal plane-based pose
+//! estimation", IJCV 2014). Both are then refined: Levenberg-Marquardt minimises the reprojection error,
+//! weighted by the points' covariance.
 
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Rotation, Transform};
 use nalgebra::{
@@ -27,16 +28,16 @@ pub struct PlanePoint {
     pub covariance_px2: Matrix2<f64>,
 }
 
-/// The pose of the marker frame in which `points` lie, for instance the corners of one marker or of all markers of a
-/// pad. `None` for fewer than four points, for points on a line, and when no visible face in front of the camera explains
-/// them.
+/// The pose of the marker frame in which `points` lie, for instance the corners of one marker or of all
+/// markers of a pad. `None` for fewer than four points, for points on a line, and when no visible face in
+/// front of the camera explains them.
 pub fn planar_pose(points: &[PlanePoint], camera: &CameraModel) -> Option<MarkerPose> {
     Plane { points, joint: None, camera }.pose()
 }
 
-/// The pose of a square marker from its four corners and their joint covariance (x and y of the first corner, then of
-/// the second, ...; in square pixels). The first corner is the marker's own top left; they go clockwise in the image.
-/// `None` as for [`planar_pose`].
+/// The pose of a square marker from its four corners and their joint covariance (x and y of the first corner,
+/// then of the second, ...; in square pixels). The first corner is the marker's own top left; they go
+/// clockwise in the image. `None` as for [`planar_pose`].
 pub fn square_pose(
     corners: &[Pixel; 4],
     covariance_px2: &SMatrix<f64, 8, 8>,
@@ -74,8 +75,8 @@ const SCHEDULE: Schedule = Schedule {
     fails_without_step: true,
     fails_without_equations: false,
 };
-/// Prior information on the rotation about each axis, in 1/rad²: that of a uniform angle within half a turn. Far away and
-/// face on, the image does not determine the tilt, and the covariance must stay finite.
+/// Prior information on the rotation about each axis, in 1/rad²: that of a uniform angle within half a turn.
+/// Far away and face on, the image does not determine the tilt, and the covariance must stay finite.
 const ROTATION_PRIOR: f64 = 3.0 / (std::f64::consts::PI * std::f64::consts::PI);
 
 /// The points whose pose is looked for.
@@ -86,7 +87,8 @@ struct Plane<'a> {
     camera: &'a CameraModel,
 }
 
-/// A pose, the normal equations there (translation, then rotation vector) and the reprojection error in pixels.
+/// A pose, the normal equations there (translation, then rotation vector) and the reprojection error in
+/// pixels.
 type Solution = Minimum<6, Isometry3<f64>, f64>;
 
 impl Problem<6> for Plane<'_> {
@@ -189,7 +191,8 @@ impl Plane<'_> {
         }))
     }
 
-    /// The homography to normalised image coordinates, from the plane about the points' middle in units of their extent.
+    /// The homography to normalised image coordinates, from the plane about the points' middle in units of
+    /// their extent.
     fn homography(&self) -> Option<Homography> {
         let count = self.points.len();
         if count < 4 {

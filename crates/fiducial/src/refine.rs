@@ -5,4 +5,5 @@ pub(crate) mod edges;
 pub mod fit;
 pub mod pattern;
 pub(crate) mod photometric;
+pub(crate) mod prediction;
 pub(crate) mod stag_design;

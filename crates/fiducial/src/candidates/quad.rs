@@ -89,8 +89,8 @@ impl Quad {
         })
     }
 
-    /// Indices of the likeliest corners, in order: the point farthest from the middle, the one farthest from that one, and
-    /// the two farthest from the line between them.
+    /// Indices of the likeliest corners, in order: the point farthest from the middle, the one farthest from
+    /// that one, and the two farthest from the line between them.
     fn corner_points(points: &[[f32; 2]]) -> Option<[usize; 4]> {
         if points.len() < MIN_POINTS {
             return None;
@@ -102,7 +102,8 @@ impl Quad {
         let ([ax, ay], [bx, by]) = (points[first], points[third]);
         let (mut second, mut fourth) = ((first, 0.0), (first, 0.0));
         for (index, [x, y]) in points.iter().enumerate() {
-            // Positive to the right of the line from the first to the third, where, clockwise, the fourth corner lies.
+            // Positive to the right of the line from the first to the third, where, clockwise, the fourth
+            // corner lies.
             let across = (bx - ax) * (y - ay) - (by - ay) * (x - ax);
             if across > fourth.1 {
                 fourth = (index, across);
@@ -115,8 +116,8 @@ impl Quad {
         if second.1 == 0.0 || fourth.1 == 0.0 {
             return None;
         }
-        // The ends of a short side may not be the farthest points, so each corner is moved to the point farthest from the
-        // line between its neighbours.
+        // The ends of a short side may not be the farthest points, so each corner is moved to the point
+        // farthest from the line between its neighbours.
         for i in [0, 2, 1, 3] {
             let (before, after) = (indices[(i + 3) % 4], indices[(i + 1) % 4]);
             indices[i] = farthest_from_line(points, before, after)?;
@@ -128,16 +129,18 @@ impl Quad {
 
 /// Smallest number of points of a four-sided outline.
 const MIN_POINTS: usize = 12;
-/// Largest root mean square distance of a side's points from its line: in pixels, plus a fraction of the outline's size.
+/// Largest root mean square distance of a side's points from its line: in pixels, plus a fraction of the
+/// outline's size.
 const MAX_RMS_PX: f32 = 0.3;
 const MAX_RMS_RATIO: f32 = 0.012;
 /// Quads up to this size, in pixels, are taken to be parallelograms.
 const PARALLEL_PX: f32 = 20.0;
-/// Largest distance of a corner from the outline's extreme point, since blur rounds corners: in pixels, plus a fraction
-/// of the outline's size.
+/// Largest distance of a corner from the outline's extreme point, since blur rounds corners: in pixels, plus
+/// a fraction of the outline's size.
 const MAX_CORNER_PX: f32 = 1.6;
 const MAX_CORNER_RATIO: f32 = 0.12;
-/// Part at either end of a side that is left out because corners are rounded: a fraction of the side, plus pixels.
+/// Part at either end of a side that is left out because corners are rounded: a fraction of the side, plus
+/// pixels.
 const END_RATIO: f32 = 0.1;
 const END_PX: f32 = 1.0;
 
@@ -260,7 +263,8 @@ impl Side {
             (xx, xy, yy) = (xx + other.xx, xy + other.xy, yy + other.yy);
         }
         let root = (((xx - yy) / 2.0).powi(2) + xy * xy).sqrt();
-        // The normal is the eigenvector of the smaller eigenvalue; of its two forms, the longer one is more exact.
+        // The normal is the eigenvector of the smaller eigenvalue; of its two forms, the longer one is more
+        // exact.
         let smaller = (xx + yy) / 2.0 - root;
         let [a, b] = if xx > yy { [-xy, xx - smaller] } else { [yy - smaller, -xy] };
         let length = a.hypot(b);

@@ -10,7 +10,8 @@ pub(crate) const MAX_QUIET_ZONES: usize = 64;
 /// Largest variation of the contrast around a border: standard deviation over mean.
 pub(crate) const MAX_CONTRAST_VARIATION: f64 = 0.6;
 
-/// The quads of bright outlines from the index `first` on whose border has an even contrast, as a small marker's paper has.
+/// The quads of bright outlines from the index `first` on whose border has an even contrast, as a small
+/// marker's paper has.
 pub(crate) fn quiet_zone_quads<'a>(
     view: GrayView<'a>,
     outlines: &'a Outlines,
@@ -24,9 +25,9 @@ pub(crate) fn quiet_zone_quads<'a>(
         .take(MAX_QUIET_ZONES)
 }
 
-/// Standard deviation of the contrast between the outside and the inside of a quad's border, over its mean: of grey
-/// values or, since the edge of a shadow scales both, of their logarithms, whichever is less. Large where the mean is
-/// not positive.
+/// Standard deviation of the contrast between the outside and the inside of a quad's border, over its mean:
+/// of grey values or, since the edge of a shadow scales both, of their logarithms, whichever is less. Large
+/// where the mean is not positive.
 pub(crate) fn border_contrast_variation(quad: &Quad, view: GrayView<'_>, level: usize) -> f64 {
     const POINTS: usize = 6;
     let corners = quad.corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);

@@ -1,9 +1,10 @@
 //! Quads from edge segments, for markers whose outline is not closed.
 //!
-//! The edge of a shadow, glare or an object in front interrupts the outline of a marker, and the frame cuts it. Its sides
-//! are still straight, dark on the inside, and meet at corners. So sides are joined across gaps; a corner is where one
-//! side ends and another begins with a turn to the right; a quad goes around two, three or four sides. A hidden corner
-//! lies where its sides would meet; a hidden side joins the ends of its neighbours.
+//! The edge of a shadow, glare or an object in front interrupts the outline of a marker, and the frame cuts
+//! it. Its sides are still straight, dark on the inside, and meet at corners. So sides are joined across
+//! gaps; a corner is where one side ends and another begins with a turn to the right; a quad goes around two,
+//! three or four sides. A hidden corner lies where its sides would meet; a hidden side joins the ends of its
+//! neighbours.
 
 use geometry::Pixel;
 use imaging::pyramid::to_level_0;
@@ -28,7 +29,8 @@ pub(crate) struct Placement {
     pub(crate) offset: f32,
 }
 
-/// Segments are found on the finest level of the pyramid with at most this number of pixels, and on the next one.
+/// Segments are found on the finest level of the pyramid with at most this number of pixels, and on the next
+/// one.
 const MAX_PIXELS: usize = 400_000;
 
 /// One of the levels on which segments are found.
@@ -42,9 +44,9 @@ impl Scale {
     pub(crate) const ALL: [Self; 2] = [Self::Fine, Self::Coarse];
 }
 
-/// Smallest gradient of a marker's sides, in grey levels per pixel: this fraction of the image's brightest part, within
-/// these bounds. Textures have many weaker edges; so has a marker deep in the shade beside sunlit ground, which is then
-/// found only where it is sharp.
+/// Smallest gradient of a marker's sides, in grey levels per pixel: this fraction of the image's brightest
+/// part, within these bounds. Textures have many weaker edges; so has a marker deep in the shade beside
+/// sunlit ground, which is then found only where it is sharp.
 const BRIGHTEST_PER_GRADIENT: u8 = 12;
 const MIN_GRADIENT: u8 = 6;
 const MAX_MIN_GRADIENT: u8 = 10;
@@ -183,8 +185,8 @@ impl SegmentQuads {
         reserve(&mut self.starts.from, cells + 1);
     }
 
-    /// The quads of these segments of a level of `size` pixels, in the image's pixels, best first: dark ones, or bright
-    /// ones when `inverted`.
+    /// The quads of these segments of a level of `size` pixels, in the image's pixels, best first: dark ones,
+    /// or bright ones when `inverted`.
     pub(crate) fn find(
         &mut self,
         segments: &[Segment],
@@ -472,7 +474,8 @@ impl Side {
         in_line.then_some(along.max(0.0))
     }
 
-    /// One side for this one and one that continues it: the line through both, weighted by their visible lengths.
+    /// One side for this one and one that continues it: the line through both, weighted by their visible
+    /// lengths.
     fn joined(&self, other: &Self) -> Self {
         let middle = |side: &Self| mix(side.start, side.end, 0.5);
         let (a, b) = (middle(self), middle(other));

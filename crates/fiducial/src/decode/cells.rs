@@ -1,9 +1,9 @@
 //! Reads the cells of a quad.
 //!
-//! Where cells are hardly wider than a pixel, a pixel shows several of them. So all cells are solved for together: a
-//! pixel is the sum of the cells' values, weighted by their shares of it through the blur. Border and quiet zone are one
-//! unknown each, every bit is one more. The least-squares solution gives the bits; the same sums tell how well any
-//! codeword explains the pixels.
+//! Where cells are hardly wider than a pixel, a pixel shows several of them. So all cells are solved for
+//! together: a pixel is the sum of the cells' values, weighted by their shares of it through the blur. Border
+//! and quiet zone are one unknown each, every bit is one more. The least-squares solution gives the bits; the
+//! same sums tell how well any codeword explains the pixels.
 
 use geometry::Pixel;
 use imaging::pyramid::from_level_0;
@@ -32,8 +32,8 @@ const CELL_PX: f64 = 1.7;
 const REACH: f64 = -0.45;
 /// Of cells at least this wide, in pixels, half of the pixels suffice.
 const WIDE_CELL_PX: f64 = 2.0;
-/// Prior that pulls bits to the middle of dark and bright, as a fraction of a pixel's weight; it bounds the noise of
-/// cells that are hardly seen.
+/// Prior that pulls bits to the middle of dark and bright, as a fraction of a pixel's weight; it bounds the
+/// noise of cells that are hardly seen.
 const PRIOR: f64 = 0.05;
 
 /// The cells of one or several codes that have them in common.
@@ -212,7 +212,8 @@ impl Cells {
         self.solve_by(image, layout, Pixels::All)
     }
 
-    /// As [`Cells::solve`], by half of the pixels where cells are wide, which suffices for a marker in full view.
+    /// As [`Cells::solve`], by half of the pixels where cells are wide, which suffices for a marker in full
+    /// view.
     pub(crate) fn solve_fast(&mut self, image: &SquareImage<'_>, layout: &Layout) -> bool {
         let is_wide = image.cell_px(layout.cells) >= WIDE_CELL_PX;
         self.solve_by(image, layout, if is_wide { Pixels::Half } else { Pixels::All })

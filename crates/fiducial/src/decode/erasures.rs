@@ -1,8 +1,8 @@
 //! Reads markers of which a part is in shadow, washed out, covered or outside of the image.
 //!
-//! Border and quiet zone determine the illumination. Cells that are neither black nor white by it are erasures, as are
-//! those beside a border cell of the wrong colour. The codeword is matched by the other bits, and counts only with a low
-//! false-positive rate.
+//! Border and quiet zone determine the illumination. Cells that are neither black nor white by it are
+//! erasures, as are those beside a border cell of the wrong colour. The codeword is matched by the other
+//! bits, and counts only with a low false-positive rate.
 
 use imaging::GrayView;
 use markers::SquareCode;
@@ -33,8 +33,8 @@ pub(crate) struct Reading {
     pub(crate) evidence: f32,
 }
 
-/// Smallest evidence, in bits, and the evidence from which on the lower bound on R² holds. In a thousand images without
-/// markers, no reading with the smallest evidence had an R² above 0.6.
+/// Smallest evidence, in bits, and the evidence from which on the lower bound on R² holds. In a thousand
+/// images without markers, no reading with the smallest evidence had an R² above 0.6.
 const MIN_EVIDENCE: f32 = 6.0;
 const STRONG_EVIDENCE: f32 = 7.0;
 /// Smallest R², with strong and with weak evidence.
@@ -101,7 +101,8 @@ pub(crate) fn have_same_cells(a: &SquareCode, b: &SquareCode) -> bool {
     a.cells == b.cells && a.bits.len() == b.bits.len() && has(a.bits, b.bits)
 }
 
-/// Whether a quad has a border that is darker than the quiet zone by nearly the same ratio for most of its cells.
+/// Whether a quad has a border that is darker than the quiet zone by nearly the same ratio for most of its
+/// cells.
 pub(crate) fn has_border(view: GrayView<'_>, quad: &Quad, code: &SquareCode) -> bool {
     let Some(source) = Source::new(view, quad, code) else { return false };
     let mut log_ratios = [0.0_f32; 4 * MAX_ACROSS];
@@ -324,7 +325,8 @@ impl Grid {
         }))
     }
 
-    /// Erases the neighbours of covered border cells, and white ones of glare; returns whether there is glare.
+    /// Erases the neighbours of covered border cells, and white ones of glare; returns whether there is
+    /// glare.
     fn erase_doubtful(&self, colours: &mut [Colour; MAX_CELLS]) -> bool {
         let seen = *colours;
         let mut has_glare = false;
@@ -350,8 +352,8 @@ impl Grid {
         has_glare
     }
 
-    /// Reads unknown bits by the steps at the edges to their neighbours: added light hardly changes across an edge, and
-    /// black and white differ there until both are saturated.
+    /// Reads unknown bits by the steps at the edges to their neighbours: added light hardly changes across an
+    /// edge, and black and white differ there until both are saturated.
     fn fill_by_steps(
         &self,
         source: &Source<'_>,

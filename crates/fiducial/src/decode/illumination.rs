@@ -1,7 +1,7 @@
 //! The illumination of a marker: one light, two on the sides of a shadow's edge, or one with a reflection.
 //!
-//! The cells that are known to be black or white, of the border and the quiet zone, determine it. By it every other grey
-//! value is judged.
+//! The cells that are known to be black or white, of the border and the quiet zone, determine it. By it every
+//! other grey value is judged.
 
 /// Largest number of known cells.
 pub(crate) const MAX_CELLS: usize = 225;
@@ -10,7 +10,8 @@ const MIN_CONTRAST: f32 = 8.0;
 /// Smallest logarithm of the ratio of white to black, and largest multiple of it anywhere on the border.
 const MIN_LOG_RATIO: f32 = 0.08;
 const MAX_LOG_RATIO_VARIATION: f32 = 4.0;
-/// Smallest fraction of the known cells of either colour that must look as they should, among those that are seen, ...
+/// Smallest fraction of the known cells of either colour that must look as they should, among those that are
+/// seen, ...
 const MIN_INTACT: f32 = 0.6;
 /// ... and among all.
 const MIN_SEEN: f32 = 0.35;
@@ -41,8 +42,8 @@ impl Colour {
     }
 }
 
-/// Whether the logarithms of white over black along a border are nearly the same for most of it: a shadow keeps the
-/// ratio. It sorts them.
+/// Whether the logarithms of white over black along a border are nearly the same for most of it: a shadow
+/// keeps the ratio. It sorts them.
 pub(crate) fn is_border(log_ratios: &mut [f32]) -> bool {
     let count = log_ratios.len();
     log_ratios.sort_unstable_by(f32::total_cmp);
@@ -51,8 +52,8 @@ pub(crate) fn is_border(log_ratios: &mut [f32]) -> bool {
     low > MIN_LOG_RATIO && high < MAX_LOG_RATIO_VARIATION * low
 }
 
-/// The fraction of the seen cells that look as they should, the mean of black and white ones; `None` when it, or what is
-/// seen, is too little. Each cell is given by whether it should be white, and what it looks like.
+/// The fraction of the seen cells that look as they should, the mean of black and white ones; `None` when it,
+/// or what is seen, is too little. Each cell is given by whether it should be white, and what it looks like.
 pub(crate) fn intact_fraction(cells: impl Iterator<Item = (bool, Colour)>) -> Option<f32> {
     let mut counts = [[0.0_f32; 3]; 2];
     for (is_white, colour) in cells {
@@ -110,7 +111,8 @@ pub(crate) struct Illumination {
     offset: f32,
     /// Black and white before and beyond the edge.
     levels: [[f32; 2]; 2],
-    /// The logarithm of the light that a reflection adds: constant, by x, by y and by the sum of both squares.
+    /// The logarithm of the light that a reflection adds: constant, by x, by y and by the sum of both
+    /// squares.
     reflection: Option<[f32; 4]>,
 }
 
@@ -118,8 +120,8 @@ pub(crate) struct Illumination {
 const LANES: usize = 8;
 const MAX_KNOWN: usize = MAX_CELLS.next_multiple_of(LANES);
 
-/// The cells that are known to be black or white, with their grey values. The list is padded to a whole number of
-/// [`LANES`] with cells of neither colour, whose logarithm is 0.
+/// The cells that are known to be black or white, with their grey values. The list is padded to a whole
+/// number of [`LANES`] with cells of neither colour, whose logarithm is 0.
 pub(crate) struct ReferenceCells {
     count: usize,
     columns: [f32; MAX_KNOWN],
@@ -206,8 +208,8 @@ impl ReferenceCells {
         projection
     }
 
-    /// Two lights on the sides of a shadow's edge, and their misfit. Edges all over the grid are tried, then edges near the
-    /// best one.
+    /// Two lights on the sides of a shadow's edge, and their misfit. Edges all over the grid are tried, then
+    /// edges near the best one.
     #[inline]
     fn with_shadow(&self, middle: f32) -> Option<(Illumination, f32)> {
         const DIRECTIONS: i32 = 12;
@@ -298,7 +300,8 @@ impl ReferenceCells {
         sums.map(|sums| sums.map(|lanes| lanes.iter().sum()))
     }
 
-    /// Sum of the bounded squared residuals, for these logarithms of black and white before and beyond the edge.
+    /// Sum of the bounded squared residuals, for these logarithms of black and white before and beyond the
+    /// edge.
     #[inline]
     fn misfit(&self, projection: &Projection, offset: f32, levels: [[f32; 2]; 2]) -> f32 {
         let mut sums = [0.0_f32; LANES];
@@ -417,8 +420,8 @@ impl Illumination {
         white < SATURATED - 10.0 && value > SATURATED
     }
 
-    /// Position of a grey value between black (0) and white (1); `None` outside of the image, near the edge of a shadow where
-    /// the two lights disagree, and where a reflection leaves no contrast.
+    /// Position of a grey value between black (0) and white (1); `None` outside of the image, near the edge
+    /// of a shadow where the two lights disagree, and where a reflection leaves no contrast.
     pub(crate) fn white_share(&self, place: [f32; 2], value: f32) -> Option<f32> {
         if !value.is_finite() {
             return None;

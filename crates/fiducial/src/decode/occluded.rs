@@ -170,8 +170,8 @@ mod tests {
     const SIDE: f64 = 80.0;
     const ID: u32 = 7;
 
-    /// A rotated marker on paper on grey ground. `light` changes the grey value at a place, which is given in sides from the
-    /// marker's middle, along its edges.
+    /// A rotated marker on paper on grey ground. `light` changes the grey value at a place, which is given in
+    /// sides from the marker's middle, along its edges.
     fn render(
         code: &SquareCode,
         centre: [f64; 2],

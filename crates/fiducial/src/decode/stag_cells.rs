@@ -1,9 +1,10 @@
 //! Reads the dots of an STag.
 //!
-//! Where a dot is hardly wider than a pixel, a pixel shows several of them. So all dots are solved for together: a pixel
-//! is the sum of the dots' values, weighted by their shares of it through the blur. All that is always black is one more
-//! unknown, all that is always white another. The least-squares solution gives the dots; the same sums tell how well any
-//! codeword explains the pixels, also where no dot can be told from its neighbours.
+//! Where a dot is hardly wider than a pixel, a pixel shows several of them. So all dots are solved for
+//! together: a pixel is the sum of the dots' values, weighted by their shares of it through the blur. All
+//! that is always black is one more unknown, all that is always white another. The least-squares solution
+//! gives the dots; the same sums tell how well any codeword explains the pixels, also where no dot can be
+//! told from its neighbours.
 
 use imaging::GrayView;
 use nalgebra::{SMatrix, SVector};
@@ -20,8 +21,8 @@ const MARGIN: usize = (CELLS as f64 * QUIET_ZONE) as usize;
 const ACROSS: usize = CELLS + 2 * MARGIN;
 
 const UNKNOWNS: usize = DOTS + 2;
-/// A dot's value holds within this multiple of its radius: neighbouring black dots merge in print, and white ones do not
-/// show.
+/// A dot's value holds within this multiple of its radius: neighbouring black dots merge in print, and white
+/// ones do not show.
 const REACH: f64 = 1.2;
 /// Samples of a small cell in each direction.
 const SAMPLES: usize = 8;
@@ -193,7 +194,8 @@ impl Dots {
         }
     }
 
-    /// The word nearest to the dots' values; black dots are bright where the marker is printed white on black.
+    /// The word nearest to the dots' values; black dots are bright where the marker is printed white on
+    /// black.
     pub(crate) fn word(&self) -> u64 {
         let (dark, bright) = (self.solution[DARK], self.solution[BRIGHT]);
         let (middle, inverted) = ((dark + bright) / 2.0, dark > bright);

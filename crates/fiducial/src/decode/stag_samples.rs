@@ -1,7 +1,8 @@
 //! Samples the dots of an STag: fast where the marker is clearly visible, and with erasures where it is not.
 //!
-//! The border, which is black, and the quiet zone and the rim of the disc, which are white, determine the illumination.
-//! By it each dot is black, white or, where it is covered or washed out, erased. Codewords are compared by the known dots.
+//! The border, which is black, and the quiet zone and the rim of the disc, which are white, determine the
+//! illumination. By it each dot is black, white or, where it is covered or washed out, erased. Codewords are
+//! compared by the known dots.
 
 use std::sync::LazyLock;
 
@@ -80,7 +81,8 @@ impl Place {
 
 /// The places that are sampled.
 struct Places {
-    /// Places of known colour, and whether they are white: border and quiet zone in turn, all round; the rim; the corners.
+    /// Places of known colour, and whether they are white: border and quiet zone in turn, all round; the rim;
+    /// the corners.
     known: [(Place, bool); PLACES],
     dots: [[Place; PER_DOT]; DOTS],
 }
@@ -130,7 +132,8 @@ fn places() -> &'static Places {
     &PLACES_
 }
 
-/// Samples a square with these corners, printed white on black when `inverted`; `None` when it is not an STag.
+/// Samples a square with these corners, printed white on black when `inverted`; `None` when it is not an
+/// STag.
 pub(crate) fn sample(
     view: GrayView<'_>,
     corners: &[[f64; 2]; 4],
@@ -255,8 +258,8 @@ fn read_dots(
 }
 
 impl Sampled {
-    /// The codeword of these ids that agrees best with the known dots; `None` when another agrees as well, or more than the
-    /// family's minimum distance allows is wrong.
+    /// The codeword of these ids that agrees best with the known dots; `None` when another agrees as well, or
+    /// more than the family's minimum distance allows is wrong.
     pub(crate) fn decode(
         &self,
         book: &Codebook,

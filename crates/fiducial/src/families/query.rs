@@ -67,8 +67,8 @@ impl FamilyQuery {
         self.markers.iter().any(|marker| marker.id.is_none_or(|wanted| wanted == id))
     }
 
-    /// Whether a fallback is to look for markers that were not found. With `all` that is any missing one; otherwise only
-    /// those of any id where two were found, as on a board.
+    /// Whether a fallback is to look for markers that were not found. With `all` that is any missing one;
+    /// otherwise only those of any id where two were found, as on a board.
     pub(crate) fn is_missing(&self, all: bool, found: impl Iterator<Item = u32> + Clone) -> bool {
         if self.has_any_id() {
             return all || found.clone().nth(1).is_some();

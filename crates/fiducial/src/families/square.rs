@@ -1,8 +1,8 @@
 //! Square markers: AprilTag and ArUco families.
 //!
-//! For each quad the cells are solved for, the codeword is matched, and its false-positive rate is weighed. Then the
-//! corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be hidden, and the quiet
-//! zones of markers so small that blur breaks their border.
+//! For each quad the cells are solved for, the codeword is matched, and its false-positive rate is weighed.
+//! Then the corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be
+//! hidden, and the quiet zones of markers so small that blur breaks their border.
 
 use geometry::Pixel;
 use imaging::GrayView;
@@ -28,8 +28,8 @@ const MAX_FOUND: usize = 256;
 /// Cells up to this width, in pixels, are read by their quiet zone: blur may break their border.
 const MAX_QUIET_ZONE_CELL_PX: f64 = 2.0;
 
-/// Smallest R² of a marker; textures with a codeword reach less. In 565 images without markers, the highest R² was 0.75,
-/// but for one with an ambiguous bit.
+/// Smallest R² of a marker; textures with a codeword reach less. In 565 images without markers, the highest
+/// R² was 0.75, but for one with an ambiguous bit.
 const MIN_R_SQUARED: f64 = 0.78;
 /// The same with strong evidence, which chance does not give: compression spoils the pixels of small markers.
 const MIN_R_SQUARED_STRONG: f64 = 0.68;
@@ -37,8 +37,8 @@ const STRONG_EVIDENCE_BITS: f64 = 14.0;
 /// Smallest confidence without evidence, and by how much it falls with each bit of evidence.
 const MIN_CONFIDENCE: f64 = 0.68;
 const CONFIDENCE_PER_BIT: f64 = 0.02;
-/// The same falls by this where cells are narrower than a bound in pixels: bits of small markers are uncertain, and few
-/// other things are as small.
+/// The same falls by this where cells are narrower than a bound in pixels: bits of small markers are
+/// uncertain, and few other things are as small.
 const SMALL_CELL_PX: f64 = 1.5;
 const CONFIDENCE_OF_SMALL: f64 = 0.06;
 
@@ -95,12 +95,12 @@ struct Decoded {
 }
 
 impl SquareTagDetector {
-    /// Largest size of outlines on the finest levels, in pixels of the level: two levels on, the cells of markers of ten
-    /// cells would be narrower than two pixels, and a scratch in a border would open it.
+    /// Largest size of outlines on the finest levels, in pixels of the level: two levels on, the cells of
+    /// markers of ten cells would be narrower than two pixels, and a scratch in a border would open it.
     pub(crate) const MAX_OUTLINE_PX: u16 = 64;
 
-    /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers printed in the
-    /// opposite colours as well.
+    /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers
+    /// printed in the opposite colours as well.
     pub(crate) fn new(markers: &[Marker], inverted: bool) -> Self {
         let mut detector = Self { inverted, ..Self::default() };
         for marker in markers {
@@ -217,7 +217,8 @@ impl SquareTagDetector {
         stages.ended("occluded");
     }
 
-    /// Finds markers so small that blur breaks their border, by their quiet zone, which is taken to be one cell wide.
+    /// Finds markers so small that blur breaks their border, by their quiet zone, which is taken to be one
+    /// cell wide.
     pub(crate) fn detect_in_quiet_zones(
         &mut self,
         input: ImageInput<'_>,
@@ -464,8 +465,8 @@ fn max_hamming(code: &SquareCode) -> u8 {
     }
 }
 
-/// By how many cells a border may be wider than the code's: calibration boards have borders of two cells. Only for codes
-/// with a low false-positive rate.
+/// By how many cells a border may be wider than the code's: calibration boards have borders of two cells.
+/// Only for codes with a low false-positive rate.
 fn extra_border_cells(code: &SquareCode) -> u8 {
     u8::from(code.min_hamming >= 9 && !code.reversed_border)
 }

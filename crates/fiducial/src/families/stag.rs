@@ -1,10 +1,10 @@
-//! STag markers: a black square with a white disc in it, and 48 dots in the disc (Benligiray, Topal, Akinlar: "STag: A
-//! stable fiducial marker system", Image and Vision Computing 89, 2019).
+//! STag markers: a black square with a white disc in it, and 48 dots in the disc (Benligiray, Topal, Akinlar:
+//! "STag: A stable fiducial marker system", Image and Vision Computing 89, 2019).
 //!
-//! The dots of large and clearly visible quads are sampled one by one. Those of others are solved for together, and the
-//! codeword that explains the pixels best is taken. Fallbacks sample quads of segments, with hidden dots erased, and
-//! squares in quiet zones. Then the whole marker is refined: by its outline and the disc's edge where these are far
-//! enough apart, by all grey values where they are not.
+//! The dots of large and clearly visible quads are sampled one by one. Those of others are solved for
+//! together, and the codeword that explains the pixels best is taken. Fallbacks sample quads of segments,
+//! with hidden dots erased, and squares in quiet zones. Then the whole marker is refined: by its outline and
+//! the disc's edge where these are far enough apart, by all grey values where they are not.
 
 use geometry::Pixel;
 use imaging::bilinear;
@@ -26,8 +26,8 @@ use crate::refine::fit::{CornerGuess, Refined, Scratch};
 use crate::refine::stag_design::StagDesign;
 use crate::trace::Reason;
 
-/// Sides of a quad on the level of the pyramid on which it is read, in pixels: from this to twice this, first with coarse
-/// and then with refined corners.
+/// Sides of a quad on the level of the pyramid on which it is read, in pixels: from this to twice this, first
+/// with coarse and then with refined corners.
 const COARSE_SIDE_PX: f64 = 12.0;
 const FINE_SIDE_PX: f64 = 20.0;
 /// The same for the last attempt: out of focus, the blur is as expected on a coarser level.
@@ -42,22 +42,25 @@ const MAX_FOUND: usize = 64;
 /// Number of designs that are kept.
 const MAX_DESIGNS: usize = 32;
 
-/// Smallest R² of a marker, and smallest ratio of the second best codeword's unexplained variance to the best one's.
+/// Smallest R² of a marker, and smallest ratio of the second best codeword's unexplained variance to the best
+/// one's.
 const MIN_R_SQUARED: f64 = 0.8;
 const MIN_RATIO: f64 = 1.5;
 /// The same with coarse corners, which lower both; with less, refinement is not worth its time.
 const MIN_COARSE_R_SQUARED: f64 = 0.6;
 const MIN_COARSE_RATIO: f64 = 1.25;
 
-/// Quads from this size on, in pixels, must show the disc's white rim before anything is solved for: at this fraction of
-/// the contrast or above. All of 800 markers in light, shadow and glare reached half, of other quads a fifth does.
+/// Quads from this size on, in pixels, must show the disc's white rim before anything is solved for: at this
+/// fraction of the contrast or above. All of 800 markers in light, shadow and glare reached half, of other
+/// quads a fifth does.
 const RIM_SIDE_PX: f64 = 10.0;
 const MIN_RIM: f64 = 0.35;
 
-/// Markers from this size on, in pixels, are sampled dot by dot, on the level on which they are from this size to twice
-/// this.
+/// Markers from this size on, in pixels, are sampled dot by dot, on the level on which they are from this
+/// size to twice this.
 const SAMPLED_SIDE_PX: f64 = 28.0;
-/// Bounds on the intact fraction, the R² and the evidence, in bits, of markers that need no more than samples.
+/// Bounds on the intact fraction, the R² and the evidence, in bits, of markers that need no more than
+/// samples.
 const MIN_SAMPLED_INTACT: f32 = 0.95;
 const MIN_SAMPLED_R_SQUARED: f32 = 0.85;
 const MIN_SAMPLED_EVIDENCE: f32 = 20.0;
@@ -123,12 +126,12 @@ const OCCLUDED: SampleBounds = SampleBounds {
 };
 
 impl StagDetector {
-    /// Largest size of outlines that are followed in the image itself, in pixels: on the next level the border of a
-    /// marker, a tenth of its side, is too thin, and out of focus too bright.
+    /// Largest size of outlines that are followed in the image itself, in pixels: on the next level the
+    /// border of a marker, a tenth of its side, is too thin, and out of focus too bright.
     pub(crate) const MAX_OUTLINE_PX: u16 = 88;
 
-    /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers printed white on
-    /// black as well.
+    /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers
+    /// printed white on black as well.
     pub(crate) fn new(markers: &[Marker], inverted: bool) -> Self {
         let mut detector = Self { inverted, ..Self::default() };
         for marker in markers {
@@ -236,7 +239,8 @@ impl StagDetector {
         }
     }
 
-    /// Finds partly hidden markers among quads of segments; it takes several times as long as [`StagDetector::detect`].
+    /// Finds partly hidden markers among quads of segments; it takes several times as long as
+    /// [`StagDetector::detect`].
     pub(crate) fn detect_occluded(
         &mut self,
         input: ImageInput<'_>,
@@ -281,7 +285,8 @@ impl StagDetector {
         Ok(())
     }
 
-    /// The corners of a partly hidden marker: refined where enough of its edges is seen and it still reads the same.
+    /// The corners of a partly hidden marker: refined where enough of its edges is seen and it still reads
+    /// the same.
     fn refined_occluded(
         &mut self,
         input: ImageInput<'_>,
@@ -552,7 +557,8 @@ fn has_rim(input: ImageInput<'_>, quad: &Quad) -> bool {
     !contrast.is_finite() || contrast > MIN_RIM
 }
 
-/// The level of the pyramid on which a quad's shortest side is between this length and twice this, and its corners there.
+/// The level of the pyramid on which a quad's shortest side is between this length and twice this, and its
+/// corners there.
 fn on_level(corners: &[Pixel; 4], side_px: f64, input: ImageInput<'_>) -> (usize, [[f64; 2]; 4]) {
     let level = ((shortest_side_px(corners) / side_px).log2().floor().max(0.0) as usize)
         .min(input.pyramid.levels().saturating_sub(1));

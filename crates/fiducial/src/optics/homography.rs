@@ -25,8 +25,9 @@ pub(crate) struct Projected {
 }
 
 impl Homography {
-    /// The map of the square from `min` to `max` on both axes to a quad, both clockwise from the top left, in closed
-    /// form (Heckbert, "Fundamentals of texture mapping", 1989). `None` when the corners lie on a line.
+    /// The map of the square from `min` to `max` on both axes to a quad, both clockwise from the top left, in
+    /// closed form (Heckbert, "Fundamentals of texture mapping", 1989). `None` when the corners lie on a
+    /// line.
     pub(crate) fn from_square([min, max]: [f64; 2], corners: &[[f64; 2]; 4]) -> Option<Self> {
         let [[x0, y0], [x1, y1], [x2, y2], [x3, y3]] = *corners;
         let (dx1, dx2, dx3) = (x1 - x2, x3 - x2, x0 - x1 + x2 - x3);
@@ -46,8 +47,8 @@ impl Homography {
         h.iter().all(|h| h.is_finite()).then_some(Self { h, origin: [0.0; 2] })
     }
 
-    /// The map that fits pairs of a plane's point and its image best, algebraically; the image points are relative to
-    /// `origin`. `None` when they do not determine it.
+    /// The map that fits pairs of a plane's point and its image best, algebraically; the image points are
+    /// relative to `origin`. `None` when they do not determine it.
     pub(crate) fn from_points(
         pairs: impl Iterator<Item = [[f64; 2]; 2]>,
         origin: [f64; 2],

@@ -1,4 +1,5 @@
-//! Lens distortion around one marker: between pixels and the ideal image, in which straight lines are straight.
+//! Lens distortion around one marker: between pixels and the ideal image, in which straight lines are
+//! straight.
 
 use geometry::{CameraModel, Distortion, Pixel, Point};
 use nalgebra::Matrix2;
@@ -13,7 +14,8 @@ const MAX_STEPS: usize = 20;
 /// The iteration ends at this distance, in pixels.
 const CONVERGED_PX: f64 = 1e-3;
 
-/// Maps between the pixels near a marker and the ideal image, which has the same focal length and no distortion.
+/// Maps between the pixels near a marker and the ideal image, which has the same focal length and no
+/// distortion.
 #[derive(Debug)]
 pub(crate) struct Undistortion<'a> {
     /// `None` where lines are straight in the image as it is.
@@ -26,7 +28,8 @@ pub(crate) struct Undistortion<'a> {
 }
 
 impl<'a> Undistortion<'a> {
-    /// Around these corners. Without a camera, or where its model is not defined, lines are taken to be straight.
+    /// Around these corners. Without a camera, or where its model is not defined, lines are taken to be
+    /// straight.
     pub(crate) fn new(camera: Option<&'a CameraModel>, corners: &[Pixel; 4]) -> Option<Self> {
         if !corners.iter().all(|c| c.x.abs() < 1e6 && c.y.abs() < 1e6) {
             return None;
@@ -93,7 +96,8 @@ impl<'a> Undistortion<'a> {
         &self.jacobian
     }
 
-    /// The homography from the square to the ideal image by the square's corners; `None` where no square looks so.
+    /// The homography from the square to the ideal image by the square's corners; `None` where no square
+    /// looks so.
     pub(crate) fn homography(&self, corners: &[Pixel; 4]) -> Option<Homography> {
         let origin = self.ideal;
         let mut relative = [[0.0; 2]; CORNERS.len()];

@@ -1,8 +1,8 @@
 //! Sub-pixel corners of a square marker, to a hundredth of a pixel.
 //!
-//! All edges of the marker take part, those between its cells as well. There are two refinements. Where cells are wide,
-//! each edge is compared on its own, with its own black and white (`edges`). Where the blur of one edge reaches the
-//! next, the grey values of the whole marker are predicted (`photometric`).
+//! All edges of the marker take part, those between its cells as well. There are two refinements. Where cells
+//! are wide, each edge is compared on its own, with its own black and white (`edges`). Where the blur of one
+//! edge reaches the next, the grey values of the whole marker are predicted (`photometric`).
 //!
 //! Edges are straight in the ideal image, without lens distortion. The model is made there and its places are
 //! distorted; the image is never resampled.

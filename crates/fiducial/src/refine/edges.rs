@@ -1,9 +1,9 @@
 //! Refinement along the edges of a larger marker, each edge in its own light.
 //!
-//! At samples along every edge, the pixels across it are compared with the profile of a blurred step. Black and white
-//! belong to the sample, so that neither a gradient of the light nor the edge of a shadow moves anything; the blur
-//! belongs to the marker. The measured shifts of all edges move the square. Samples that contradict the others get less
-//! weight, as something covers the marker there.
+//! At samples along every edge, the pixels across it are compared with the profile of a blurred step. Black
+//! and white belong to the sample, so that neither a gradient of the light nor the edge of a shadow moves
+//! anything; the blur belongs to the marker. The measured shifts of all edges move the square. Samples that
+//! contradict the others get less weight, as something covers the marker there.
 
 use geometry::Pixel;
 use imaging::GrayView;
@@ -30,24 +30,27 @@ const COARSE_PASSES: usize = 2;
 const FINE_PASSES: usize = 6;
 /// Distance within which coarse passes search for an edge, in pixels.
 const SEARCH_PX: f64 = 4.5;
-/// The same where the first pass finds less than this fraction of the edges: quads of segments can be far off.
+/// The same where the first pass finds less than this fraction of the edges: quads of segments can be far
+/// off.
 const WIDE_SEARCH_PX: f64 = 40.0;
 const MIN_FOUND_RATIO: f64 = 0.7;
 /// A coarse pass that moves the corners less than this, in pixels, is the last.
 const COARSE_SETTLED_PX: f64 = 0.5;
-/// The first passes use every third sample, unless there are few; fine ones do so until the corners move less than
-/// this, in pixels.
+/// The first passes use every third sample, unless there are few; fine ones do so until the corners move less
+/// than this, in pixels.
 const SUBSET_STEP: usize = 3;
 const SUBSET_SETTLED_PX: f64 = 0.1;
-/// A fine pass over all samples that moves the corners less than this, in pixels, is the last; the error that remains
-/// is of the order of its square. It is smaller for the first pass, before which the blur was not fitted.
+/// A fine pass over all samples that moves the corners less than this, in pixels, is the last; the error that
+/// remains is of the order of its square. It is smaller for the first pass, before which the blur was not
+/// fitted.
 const SETTLED_PX: f64 = 0.03;
 const FIRST_PASS_SETTLED_PX: f64 = 0.01;
 /// Smallest contrast of an edge, in grey levels.
 const MIN_CONTRAST: f64 = 5.0;
 /// Shifts beyond this multiple of the median one are weighted down.
 const OUTLIER_SHIFTS: f64 = 2.5;
-/// Above this fraction of saturated pixels, black and white must be common to the whole marker, and this fit fails.
+/// Above this fraction of saturated pixels, black and white must be common to the whole marker, and this fit
+/// fails.
 const MAX_SATURATED_RATIO: f64 = 0.03;
 
 /// The edge of a sample as the current homography projects it.
@@ -61,8 +64,9 @@ struct ProjectedEdge {
     cell_px: f64,
 }
 
-/// The homography that the edges of a pattern agree on. From a start that `is_near`, to about half a pixel, no coarse
-/// pass is made. `None` when too few edges are seen, or they are too close to each other for their blur.
+/// The homography that the edges of a pattern agree on. From a start that `is_near`, to about half a pixel,
+/// no coarse pass is made. `None` when too few edges are seen, or they are too close to each other for their
+/// blur.
 pub(crate) fn fit(
     target: Target<'_>,
     pattern: &Pattern,
@@ -291,8 +295,8 @@ impl EdgeFit<'_> {
         (edge.cell_px.is_finite() && edge.cell_px > 1.0).then_some(edge)
     }
 
-    /// Reads the pixels of the row or column that crosses the edge most steeply, up to `reach_px` away from the edge;
-    /// every n-th of them where there are many. Returns their number.
+    /// Reads the pixels of the row or column that crosses the edge most steeply, up to `reach_px` away from
+    /// the edge; every n-th of them where there are many. Returns their number.
     fn pixels(&self, edge: &ProjectedEdge, reach_px: f64, pixels: &mut Pixels) -> usize {
         let [nx, ny] = edge.normal;
         let level = nx.abs() >= ny.abs();
@@ -327,8 +331,8 @@ impl EdgeFit<'_> {
         count
     }
 
-    /// Finds where grey values cross the middle between black and white, within `reach_px` of every `step`-th sample.
-    /// Returns the fraction of the samples within the image at which an edge was found.
+    /// Finds where grey values cross the middle between black and white, within `reach_px` of every `step`-th
+    /// sample. Returns the fraction of the samples within the image at which an edge was found.
     fn locate(&mut self, samples: &mut [EdgeSample], step: usize, reach_px: f64) -> f64 {
         let mut pixels = [[0.0; 2]; MAX_PIXELS];
         let mut found = 0;
@@ -510,7 +514,8 @@ impl EdgeFit<'_> {
             return None;
         }
         let noise = squares / freedom;
-        // Where the shifts scatter more than the pixels' noise explains, the paper is uneven or the model is wrong.
+        // Where the shifts scatter more than the pixels' noise explains, the paper is uneven or the model is
+        // wrong.
         let scatter = scatter / (weight - UNKNOWNS as f64).max(1.0);
         let inverse = equations.matrix.cholesky()?.inverse();
         let covariance = inverse.fixed_view::<8, 8>(0, 0) * noise.max(scatter);
@@ -541,7 +546,8 @@ struct Crossing {
     contrast: f64,
 }
 
-/// Where pixels, sorted from black to white, cross the middle grey value; the crossing nearest to the expected place.
+/// Where pixels, sorted from black to white, cross the middle grey value; the crossing nearest to the
+/// expected place.
 fn crossing(pixels: &[[f64; 2]]) -> Option<Crossing> {
     let count = pixels.len();
     let black = pixels[0][1].min(pixels[1][1]);

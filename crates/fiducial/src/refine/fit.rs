@@ -145,7 +145,8 @@ pub(crate) struct Design<'a> {
     pub(crate) margin: usize,
     /// The share of white in each small cell, row by row.
     pub(crate) white: &'a [[f64; MAX_ACROSS]; MAX_ACROSS],
-    /// Places on edges, in the square's coordinates, and the vector from there towards white up to the next edge.
+    /// Places on edges, in the square's coordinates, and the vector from there towards white up to the next
+    /// edge.
     pub(crate) edges: &'a [[[f64; 2]; 2]],
     /// Distance from the square's outline to the next edge, in sides of the square.
     pub(crate) border: f64,

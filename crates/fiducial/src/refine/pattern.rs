@@ -16,9 +16,9 @@ pub struct Pattern {
 }
 
 impl Pattern {
-    /// A square of `cells` cells across with `margin` cells around it on each side. `is_white` gives the colour of the cell
-    /// in column x and row y, or `None` where it is unknown; the square's top left cell is (0, 0). `None` when the square
-    /// has no cells, or too many.
+    /// A square of `cells` cells across with `margin` cells around it on each side. `is_white` gives the
+    /// colour of the cell in column x and row y, or `None` where it is unknown; the square's top left cell is
+    /// (0, 0). `None` when the square has no cells, or too many.
     pub fn new(
         cells: usize,
         margin: usize,
@@ -41,14 +41,14 @@ impl Pattern {
         Some(pattern)
     }
 
-    /// The marker of a family with this codeword. The quiet zone is one cell wide; the colour beside bits outside of the
-    /// square is known only where the bits leave no gaps.
+    /// The marker of a family with this codeword. The quiet zone is one cell wide; the colour beside bits
+    /// outside of the square is known only where the bits leave no gaps.
     pub fn for_code(code: &SquareCode, word: u64) -> Option<Self> {
         Self::bordered(code, word, 0)
     }
 
-    /// The same with a border that is `extra` cells wider, as on calibration boards. These have black squares at the
-    /// corners of the paper around each marker.
+    /// The same with a border that is `extra` cells wider, as on calibration boards. These have black squares
+    /// at the corners of the paper around each marker.
     pub fn bordered(code: &SquareCode, word: u64, extra: u8) -> Option<Self> {
         let extra = i32::from(extra);
         let cells = i32::from(code.cells) + 2 * extra;
@@ -103,7 +103,8 @@ impl Pattern {
         self.across
     }
 
-    /// Whether a cell is white, by column and row from the surroundings' top left; `None` where it is unknown.
+    /// Whether a cell is white, by column and row from the surroundings' top left; `None` where it is
+    /// unknown.
     pub(crate) fn is_white(&self, x: usize, y: usize) -> Option<bool> {
         let bit = |rows: &[u32; MAX_CELLS]| rows.get(y).is_some_and(|row| row >> x & 1 == 1);
         (x < self.across && bit(&self.known)).then(|| bit(&self.white))

@@ -5,8 +5,9 @@ use markers::{Drawing, Family, Ink, Marker, Shape};
 
 use crate::refine::fit::{Design, MAX_ACROSS};
 
-/// Small cells across the square, around it, and in all; the square's outline is a border of cells. Their width must be
-/// well below that of the blur; for squares with a side below `COARSE_PX` they are twice as wide.
+/// Small cells across the square, around it, and in all; the square's outline is a border of cells. Their
+/// width must be well below that of the blur; for squares with a side below `COARSE_PX` they are twice as
+/// wide.
 const CELLS: usize = 48;
 const MARGIN: usize = (CELLS as f64 * QUIET_ZONE) as usize;
 const ACROSS: usize = CELLS + 2 * MARGIN;
@@ -18,7 +19,8 @@ const FINE: usize = ACROSS * SAMPLES;
 /// Places on each side, and on the disc's edge.
 const PER_SIDE: usize = 36;
 const ON_DISC: usize = 96;
-/// Distance from the outline to the disc, and from the disc to the dots, in the square's coordinates (-1 to 1).
+/// Distance from the outline to the disc, and from the disc to the dots, in the square's coordinates (-1 to
+/// 1).
 const BORDER: f64 = 0.2;
 const RIM: f64 = 0.1;
 
@@ -34,7 +36,8 @@ pub(crate) struct StagDesign {
     edges: [Vec<[[f64; 2]; 2]>; 2],
 }
 
-/// Where the rim between disc and dots is narrower than this, in pixels, the disc's edge takes no part of its own.
+/// Where the rim between disc and dots is narrower than this, in pixels, the disc's edge takes no part of its
+/// own.
 const MIN_RIM_PX: f64 = 4.0;
 
 impl StagDesign {
@@ -111,8 +114,8 @@ fn halved(white: &[[f64; MAX_ACROSS]; MAX_ACROSS]) -> Box<[[f64; MAX_ACROSS]; MA
     coarse
 }
 
-/// Places on the outline and on the disc's edge, in the square's coordinates (x right, y down, -1 to 1), each with the
-/// vector towards white whose length is the distance to the next edge.
+/// Places on the outline and on the disc's edge, in the square's coordinates (x right, y down, -1 to 1), each
+/// with the vector towards white whose length is the distance to the next edge.
 fn edges() -> Vec<[[f64; 2]; 2]> {
     let mut edges = Vec::with_capacity(4 * PER_SIDE + ON_DISC);
     for k in 0..PER_SIDE {
