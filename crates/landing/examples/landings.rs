@@ -1,16 +1,16 @@
 //! Many modelled landings, as tables: `cargo run --release -p landing --example landings [FLIGHTS [CASE]]`.
 //!
-//! FLIGHTS is the number of flights of each row (100), ten times as many for the last; CASE is a part of the names of the
-//! rows that are flown. A row's flights are those of the seeds from 0 on.
+//! FLIGHTS is the number of flights of each row (100), ten times as many for the last; CASE is a part of the
+//! names of the rows that are flown. A row's flights are those of the seeds from 0 on.
 
 #![allow(clippy::print_stdout, reason = "a program's output")]
 
-#[path = "../tests/world/mod.rs"]
-mod world;
+#[path = "../tests/scene/mod.rs"]
+mod scene;
 
-use world::cases::{FAULTS, MOVING, WINDS, anything};
-use world::report::{HEADER, row};
-use world::{Flight, Scene};
+use scene::cases::{FAULTS, MOVING, WINDS, anything};
+use scene::report::{HEADER, row};
+use scene::{Flight, Scene};
 
 /// The flights of the seeds from 0 on, on all cores.
 fn fly(flights: u64, scene: fn(u64) -> Scene) -> Vec<Flight> {

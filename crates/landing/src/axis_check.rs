@@ -1,10 +1,11 @@
 //! Are the axes of camera and autopilot consistent? Decided from natural motion, before the descent.
 //!
-//! A pad that does not move has one place whatever the vehicle does, if attitude, position and camera mount are as
-//! configured. If the camera is turned about the vertical, its image is mirrored, or roll or pitch has the wrong sign, the
-//! pad appears to move with every motion of the vehicle, unless the error is undone. So the place of the pad is computed
-//! under each of a few dozen alternatives, and the one with the smallest scatter is compared with the configured one: a
-//! likelihood ratio that needs no motion of its own, only enough of any.
+//! A pad that does not move has one place whatever the vehicle does, if attitude, position and camera mount
+//! are as configured. If the camera is turned about the vertical, its image is mirrored, or roll or pitch has
+//! the wrong sign, the pad appears to move with every motion of the vehicle, unless the error is undone. So
+//! the place of the pad is computed under each of a few dozen alternatives, and the one with the smallest
+//! scatter is compared with the configured one: a likelihood ratio that needs no motion of its own, only
+//! enough of any.
 
 use geometry::{Body, Odometry, Point, Rotation, Vector};
 
@@ -22,13 +23,13 @@ const NOISE_M: f64 = 0.015;
 const NOISE_PER_M: f64 = 0.003;
 /// Minimum number of detections for a verdict.
 const MIN_DETECTIONS: u32 = 8;
-/// One alternative explains the detections much better than another when its sum of squares is smaller by this factor,
-/// and by this difference: to confirm the configured mount, and to reject it.
+/// One alternative explains the detections much better than another when its sum of squares is smaller by
+/// this factor, and by this difference: to confirm the configured mount, and to reject it.
 const MIN_RATIO: f64 = 4.0;
 const CONSISTENT_BY: f64 = 20.0;
 const MISMATCH_BY: f64 = 400.0;
-/// Minimum apparent motion of the pad that rejects the configured mount, as a standard deviation in metres and per metre
-/// of range: the autopilot's drift makes it move a little as well.
+/// Minimum apparent motion of the pad that rejects the configured mount, as a standard deviation in metres
+/// and per metre of range: the autopilot's drift makes it move a little as well.
 const MIN_MOTION_M: f64 = 0.15;
 const MIN_MOTION_PER_M: f64 = 0.02;
 
@@ -207,7 +208,8 @@ mod tests {
     use geometry::Ned;
     use std::f64::consts::{FRAC_PI_2, PI};
 
-    /// Hovers and sways over a pad whose marker is seen through a distortion; returns the last verdict and its time.
+    /// Hovers and sways over a pad whose marker is seen through a distortion; returns the last verdict and
+    /// its time.
     fn sway(
         distort: impl Fn(Vector<Body>, Rotation<Ned, Body>) -> Vector<Body>,
         sway_m: f64,

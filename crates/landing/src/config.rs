@@ -4,8 +4,8 @@ use serde::Deserialize;
 
 use crate::limits::{ConfigError, check, settings};
 
-/// Upper bound of a hypothesis' detection count, so that a place seen for minutes is replaced as fast as one seen for
-/// seconds. Also the largest `estimator.restart_after` that can be reached.
+/// Upper bound of a hypothesis' detection count, so that a place seen for minutes is replaced as fast as one
+/// seen for seconds. Also the largest `estimator.restart_after` that can be reached.
 pub(crate) const MAX_COUNTED_DETECTIONS: u32 = 30;
 
 /// All settings of a landing. Plain data: check it with [`Config::validate`].
@@ -65,7 +65,8 @@ settings! {
         min_confidence: f64 = 0.0, 0.0..=1.0;
         /// Maximum range of a detection, in m (thesis guidance).
         max_range_m: f64 = 40.0, 1.0..=200.0;
-        /// Horizontal distance from the estimate beyond which a detection is an outlier, at height 0, in m (thesis guidance).
+        /// Horizontal distance from the estimate beyond which a detection is an outlier, at height 0, in m
+        /// (thesis guidance).
         gate_m: f64 = 0.15, 0.02..=10.0;
         /// Growth of that distance per metre of height.
         gate_per_height: f64 = 0.1, 0.0..=1.0;
@@ -87,11 +88,13 @@ settings! {
     EstimatorConfig in "estimator" {
         /// Maximum range of a detection, in m.
         max_range_m: f64 = 40.0, 1.0..=200.0;
-        /// Standard deviation of a marker's position in the image where the detector gives no covariance, in px.
+        /// Standard deviation of a marker's position in the image where the detector gives no covariance, in
+        /// px.
         pixel_noise_px: f64 = 0.3, 0.01..=10.0;
         /// The same as an angle, where the focal length is unknown too, in rad.
         direction_noise_rad: f64 = 0.0003, 1e-5..=0.1;
-        /// Standard deviation of the range relative to the range, where the marker's size in the image is unknown.
+        /// Standard deviation of the range relative to the range, where the marker's size in the image is
+        /// unknown.
         range_noise_ratio: f64 = 0.015, 1e-4..=0.5;
         /// Standard deviation of the range relative to the range, added to the detector's covariance.
         range_floor_ratio: f64 = 0.002, 0.0..=0.1;
@@ -105,9 +108,10 @@ settings! {
         drift_m_s: f64 = 0.05, 0.0..=1.0;
         /// Random walk of that drift, in m/s per square root of a second.
         drift_change: f64 = 0.01, 0.0..=1.0;
-        /// Maximum random walk of that drift while detections show that the autopilot's position wanders, in m/s per
-        /// square root of a second. At most 15 times `drift_change`; the random walk of tilts grows in the same
-        /// proportion. Values up to `drift_change`, or a `drift_change` of 0, turn the adaptation off.
+        /// Maximum random walk of that drift while detections show that the autopilot's position wanders, in
+        /// m/s per square root of a second. At most 15 times `drift_change`; the random walk of tilts grows
+        /// in the same proportion. Values up to `drift_change`, or a `drift_change` of 0, turn the adaptation
+        /// off.
         max_drift_change: f64 = 0.15, 0.0..=1.0;
         /// Initial standard deviation of the drift of the autopilot's height, in m/s.
         height_drift_m_s: f64 = 0.1, 0.0..=1.0;
@@ -127,11 +131,11 @@ settings! {
         heading_error_rad: f64 = 0.015, 1e-5..=0.5;
         /// Initial standard deviation of the frames' time offset, in s; 0 trusts the stamps.
         time_offset_s: f64 = 0.02, 0.0..=0.2;
-        /// Normalised innovation squared (NIS) beyond which a detection is an outlier; chi-square with 3 degrees of
-        /// freedom exceeds 16.3 once in a thousand times.
+        /// Normalised innovation squared (NIS) beyond which a detection is an outlier; chi-square with 3
+        /// degrees of freedom exceeds 16.3 once in a thousand times.
         gate: f64 = 16.3, 7.0..=100.0;
-        /// Outliers in agreement that start a new estimate, when the marker is found in a larger share of the frames
-        /// that show their place than of those that show the estimate's place.
+        /// Outliers in agreement that start a new estimate, when the marker is found in a larger share of the
+        /// frames that show their place than of those that show the estimate's place.
         restart_after: u32 = 8, 2.0..=f64::from(MAX_COUNTED_DETECTIONS);
         /// Minimum time over which such outliers must come, in s.
         restart_s: f64 = 1.5, 0.0..=10.0;
@@ -159,7 +163,8 @@ settings! {
     PhaseConfig in "phases" {
         /// Maximum age of the newest detection for the marker to count as visible, in s.
         stale_target_s: f64 = 0.4, 0.1..=5.0;
-        /// Age of the newest detection beyond which the marker is lost and the vehicle holds or retries, in s.
+        /// Age of the newest detection beyond which the marker is lost and the vehicle holds or retries, in
+        /// s.
         lost_target_s: f64 = 1.0, 0.1..=10.0;
         /// Age of the vehicle's state beyond which the vehicle holds, in s.
         stale_vehicle_s: f64 = 0.5, 0.1..=5.0;
@@ -167,7 +172,8 @@ settings! {
         search_timeout_s: f64 = 60.0, 1.0..=600.0;
         /// Hover time before the search moves, in s.
         search_delay_s: f64 = 0.5, 0.0..=60.0;
-        /// Height over the local origin to which the search climbs before it flies its legs, in m; 0 never climbs.
+        /// Height over the local origin to which the search climbs before it flies its legs, in m; 0 never
+        /// climbs.
         search_height_m: f64 = 5.0, 0.0..=50.0;
         /// Speed of that climb, in m/s.
         search_climb_m_s: f64 = 1.0, 0.1..=3.0;
@@ -181,8 +187,8 @@ settings! {
         fence_radius_m: f64 = 0.0, 0.0..=10_000.0;
         /// Height over the local origin that neither search nor retry exceeds, in m; 0 sets none.
         fence_height_m: f64 = 0.0, 0.0..=1_000.0;
-        /// Maximum wait before the descent for natural motion that shows whether the axes of camera and autopilot
-        /// agree, in s; 0 turns the check off.
+        /// Maximum wait before the descent for natural motion that shows whether the axes of camera and
+        /// autopilot agree, in s; 0 turns the check off.
         axis_check_s: f64 = 1.5, 0.0..=60.0;
         /// Maximum duration of an approach, in s; then the vehicle holds.
         approach_timeout_s: f64 = 60.0, 1.0..=600.0;
@@ -194,12 +200,13 @@ settings! {
         operator_hold_timeout_s: f64 = 180.0, 1.0..=3600.0;
         /// Hold time for a lost marker after which the vehicle climbs to `regain_height_m`, in s.
         regain_after_s: f64 = 2.0, 0.0..=60.0;
-        /// Height over the target to which the vehicle climbs to see a lost marker again, in m; 0 never climbs.
+        /// Height over the target to which the vehicle climbs to see a lost marker again, in m; 0 never
+        /// climbs.
         regain_height_m: f64 = 1.5, 0.0..=10.0;
         /// Speed of that climb, in m/s.
         regain_climb_m_s: f64 = 0.3, 0.1..=2.0;
-        /// Maximum number of retries: climbs after which the landing starts again, for a lost marker or a vehicle that
-        /// does not settle.
+        /// Maximum number of retries: climbs after which the landing starts again, for a lost marker or a
+        /// vehicle that does not settle.
         retries: u32 = 5, 0.0..=20.0;
         /// Height gain of a retry, in m, never above the height where the landing started.
         retry_climb_m: f64 = 2.0, 0.0..=20.0;
@@ -295,11 +302,11 @@ settings! {
         funnel_per_height: f64 = 0.25, 0.0..=2.0;
         /// Age of the newest detection up to which the descent is not slowed, in s.
         fresh_target_s: f64 = 0.5, 0.0..=5.0;
-        /// Age of the newest detection beyond which the descent stops, in s, except low over a well-known target
-        /// (`blind_height_m`).
+        /// Age of the newest detection beyond which the descent stops, in s, except low over a well-known
+        /// target (`blind_height_m`).
         stale_target_s: f64 = 0.7, 0.1..=5.0;
-        /// If setpoints stop, the vehicle must not reach the ground faster than `touchdown_descend_m_s` within this
-        /// time, in s.
+        /// If setpoints stop, the vehicle must not reach the ground faster than `touchdown_descend_m_s`
+        /// within this time, in s.
         setpoint_loss_s: f64 = 2.0, 0.1..=10.0;
         /// Height over the target at which LAND takes over, in m.
         land_height_m: f64 = 0.05, 0.02..=5.0;
@@ -367,7 +374,8 @@ settings! {
         wind_sigma_m_s: f64 = 0.1, 0.0..=5.0;
         /// Seed of the wind noise.
         seed: u64 = 0;
-        /// Heading of the image's upper edge relative to the vehicle's nose, in rad, clockwise seen from above.
+        /// Heading of the image's upper edge relative to the vehicle's nose, in rad, clockwise seen from
+        /// above.
         image_up_rad: f64 = 0.0, -7.0..=7.0;
     }
 }

@@ -4,12 +4,12 @@ use std::fmt;
 
 use geometry::{Ned, Point, Vector};
 
-/// What to do now, and why.
+/// What to do, and why.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Decision {
-    /// Where the landing stands.
+    /// The present phase.
     pub phase: Phase,
-    /// What the autopilot must be told.
+    /// The command for the autopilot.
     pub action: Action,
     /// Why this phase and this action.
     pub why: Reason,
@@ -19,7 +19,7 @@ pub struct Decision {
     pub rejected: Option<Rejection>,
 }
 
-/// What the autopilot must be told.
+/// A command for the autopilot.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub enum Action {
     /// Nothing: stop streaming setpoints.
@@ -31,11 +31,12 @@ pub enum Action {
         /// In rad/s, clockwise seen from above.
         yaw_rate: f64,
     },
-    /// Change back to the mode that follows setpoints. Given again, at the configured interval, until the mode changes.
+    /// Change back to the mode that follows setpoints. Repeated at the configured interval until the mode
+    /// changes.
     Guided,
-    /// Stop the motors: the vehicle stands on the ground. Given again until they stand still.
+    /// Stop the motors: the vehicle stands on the ground. Repeated until they stop.
     Disarm,
-    /// Change to the autopilot's own LAND mode. Given again, at the configured interval, until the mode changes.
+    /// Change to the autopilot's own LAND mode. Repeated at the configured interval until the mode changes.
     Land,
 }
 
@@ -61,22 +62,22 @@ pub struct TargetEstimate {
     pub age_s: f64,
     /// Standard deviation of the horizontal position, in metres.
     pub deviation_m: f64,
-    /// Detections used since the estimate was begun.
+    /// Number of detections used since the estimate started.
     pub detections: u32,
-    /// Heading of the marker's upper edge in radians from north to east, when poses tell it.
+    /// Heading of the marker's upper edge in radians from north to east, once known.
     pub heading_rad: Option<f64>,
-    /// By how much exposures are later than their stamps, in seconds.
+    /// Estimated time offset: how much later exposures are than their stamps, in seconds.
     pub time_offset_s: f64,
-    /// The newest detection's squared innovation over its covariance: about 3 when all is as expected.
+    /// Normalised innovation squared (NIS) of the newest detection: about 3 when the model fits.
     pub nis: Option<f64>,
     /// True while the marker is seen more often elsewhere than here: the vehicle does not descend.
     pub ambiguous: bool,
 }
 
-/// Where the landing stands.
+/// The phase of a landing.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Phase {
-    /// Nothing asked for.
+    /// No landing requested.
     Idle,
     /// Flying an expanding square until the marker is seen.
     Search,
@@ -90,11 +91,11 @@ pub enum Phase {
     Final,
     /// On the ground, disarmed.
     Landed,
-    /// Hovering until the reason passes.
+    /// Hovering until the reason is gone.
     Hold,
-    /// Given up.
+    /// The landing was aborted.
     Aborted,
-    /// Somebody else flies; silent until a new start.
+    /// The pilot flies; no setpoints until a new start.
     PilotInCommand,
 }
 
@@ -151,7 +152,7 @@ macro_rules! named {
 named! {
     /// Why the lander does what it does.
     Reason {
-        /// Nobody asked for a landing.
+        /// No landing was requested.
         WaitingForStart = "waiting-for-start", "waiting for the start of a landing";
         /// A start was refused: no vehicle state is known, or it is stale.
         NoVehicleState = "no-vehicle-state", "no recent vehicle state is known";
@@ -167,49 +168,49 @@ named! {
         Searching = "searching", "looking for the marker";
         /// The lateral error is too large for a descent at this height.
         Aligning = "aligning", "moving over the marker before descending";
-        /// All is well.
+        /// Everything is nominal.
         Descending = "descending", "descending over the marker";
         /// The marker left the view low over it, and the estimate is good.
         DescendingUnseen = "descending-unseen", "descending on the estimate, the marker is out of view";
         /// No recent detection: the descent stops until there is one.
         TargetAging = "target-aging", "no recent detection, descent stopped";
-        /// The marker is seen at two places, and which is the pad is not decided.
+        /// The marker is seen at two places, and it is undecided which is the pad.
         Ambiguous = "ambiguous", "the marker is seen at two places, descent stopped until one is seen in most frames";
         /// Low over the marker, waiting for a small error and a small speed.
         Settling = "settling", "settling over the marker before the touchdown";
         /// Low over the marker and settled.
         LowAndAligned = "low-and-aligned", "low and settled over the marker, handing over to LAND";
-        /// The marker left the view when it was already right below.
+        /// The marker left the view right below the vehicle.
         LowAndUnseen = "low-and-unseen", "marker out of view right below, handing over to LAND";
-        /// The vehicle touched the ground before LAND was asked for.
+        /// The vehicle touched the ground before LAND was requested.
         TouchedEarly = "touched-early", "on the ground already, handing over to LAND";
         /// The autopilot is in its LAND mode.
         AutopilotLands = "autopilot-lands", "the autopilot is landing";
         /// On the ground, disarmed.
         TouchedDown = "touched-down", "landed and disarmed";
-        /// The operator asked to wait.
+        /// The operator commanded a hold.
         OperatorHold = "operator-hold", "held by the operator";
-        /// The marker was seen and is no longer.
+        /// The marker was lost.
         TargetLost = "target-lost", "marker lost, holding";
         /// The marker was never seen.
         TargetNotFound = "target-not-found", "marker not found, holding";
-        /// The marker was seen and is no longer; it is looked for from higher up.
+        /// The marker was lost; the vehicle climbs to find it.
         Retrying = "retrying", "marker lost, climbing to see it again";
-        /// Low over the marker for long, never near enough to its centre.
+        /// Low over the marker for too long without reaching its centre.
         NotSettling = "not-settling", "cannot settle over the marker, climbing to try again";
         /// The battery is low.
         BatteryLow = "battery-low", "the battery is low";
         /// The battery is nearly empty.
         BatteryCritical = "battery-critical", "the battery is nearly empty";
-        /// The operator is no longer heard.
-        OperatorLost = "operator-lost", "the operator is no longer heard";
+        /// The link to the operator is lost.
+        OperatorLost = "operator-lost", "operator link lost";
         /// The link to the autopilot is lost.
-        AutopilotLost = "autopilot-lost", "the autopilot is no longer heard, holding until it is";
+        AutopilotLost = "autopilot-lost", "autopilot link lost, holding until it is back";
         /// The autopilot's reports stopped.
         VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
-        /// The vehicle came no nearer in the time allowed.
+        /// No progress in the time allowed.
         NoProgress = "no-progress", "too long in one phase, holding";
-        /// The operator gave up.
+        /// The operator aborted.
         OperatorAbort = "operator-abort", "aborted by the operator";
         /// A hold lasted too long.
         HeldTooLong = "held-too-long", "aborted: held too long";
@@ -217,23 +218,23 @@ named! {
         LandingTooLong = "landing-too-long", "aborted: the landing took too long";
         /// The marker was lost too often.
         RetriesUsed = "retries-used", "aborted: the marker was lost too often";
-        /// The autopilot does not enter LAND, so low that there is only one way.
-        LandingBySetpoints = "landing-by-setpoints", "the autopilot refuses LAND, going down without it: watch it and be ready to disarm";
-        /// Camera and autopilot do not mean the same directions.
+        /// The autopilot does not enter LAND, too low to stay.
+        LandingBySetpoints = "landing-by-setpoints", "the autopilot refuses LAND, descending by setpoints: be ready to disarm";
+        /// The axes of camera and autopilot do not match.
         CameraTurned = "camera-turned", "the camera's image moves as if it were mounted turned about the vertical, holding: check its mount";
-        /// The same.
+        /// As above.
         ImageMirrored = "image-mirrored", "the camera's image moves as if it were mirrored, holding: check the camera's settings";
-        /// The same.
+        /// As above.
         AttitudeSign = "attitude-sign", "the camera's image moves as if roll or pitch had the wrong sign, holding: check mount and autopilot";
-        /// The descent waits for motion that shows whether camera and autopilot mean the same directions.
+        /// The descent waits for motion that shows whether the axes of camera and autopilot match.
         AxisCheck = "axis-check", "checking camera/autopilot axis alignment before descending";
         /// The autopilot did not enter its LAND mode.
         LandRefused = "land-refused", "aborted: the autopilot did not enter LAND";
         /// The autopilot did not reach the ground.
         TouchdownOverdue = "touchdown-overdue", "aborted: no touchdown in the time allowed";
-        /// The motors stopped in the middle of the landing.
+        /// The motors stopped during the landing.
         Disarmed = "disarmed", "aborted: disarmed before the touchdown";
-        /// Somebody changed the flight mode.
+        /// The flight mode was changed by somebody else.
         PilotTookOver = "pilot-took-over", "the flight mode was changed, the pilot flies";
     }
 }
@@ -245,17 +246,17 @@ named! {
         Stale = "stale", "too old when it arrived";
         /// Its stamp lies in the future.
         FromTheFuture = "from-the-future", "its stamp lies in the future";
-        /// Not newer than what was already used.
-        OutOfOrder = "out-of-order", "not newer than what was already used";
+        /// Not newer than an event already used.
+        OutOfOrder = "out-of-order", "not newer than an event already used";
         /// A number is infinite or not a number, or an image has no size.
         NotFinite = "not-finite", "a number in it is not finite";
         /// The vehicle's attitude at the stamp is not known.
         NoAttitude = "no-attitude", "the vehicle's attitude at its stamp is not known";
         /// The guidance needs metres and the detector gave none.
         NoPose = "no-pose", "it has no pose";
-        /// The pose puts the marker beside or above the vehicle, or out of reach.
+        /// The pose puts the marker beside or above the vehicle, or out of range.
         Implausible = "implausible", "its pose is not below the vehicle";
-        /// The detector was not sure enough.
+        /// The detector's confidence is too low.
         LowConfidence = "low-confidence", "its confidence is too low";
         /// A frame of this stamp was used already.
         Duplicate = "duplicate", "a frame of the same stamp was used already";

@@ -4,8 +4,8 @@ use geometry::{Ned, Vector};
 
 use crate::config::EnvelopeConfig;
 
-/// The nearest setpoint that may be sent: finite, within the limits, and downwards only when `may_descend`. A setpoint
-/// that is not finite becomes a stop.
+/// The nearest setpoint that may be sent: finite, within the limits, and downwards only when `may_descend`. A
+/// setpoint that is not finite becomes a stop.
 pub fn clamp_setpoint(
     config: &EnvelopeConfig,
     wanted: Vector<Ned>,

@@ -1,14 +1,15 @@
 //! The estimator: where the landing point is, how it moves, and how well that is known.
 //!
 //! It runs the [`filter`](crate::filter) in the odometry frame, the autopilot's local frame without its jumps
-//! ([`crate::history::Motion::odometry`]). There the autopilot's motion needs no integration between detections, and the
-//! filter estimates what velocity setpoints act on: in 160 recorded flights of ArduPilot the reported position moved
-//! against the truth by 0.010 m over 2 s, the sum of the reported velocity by 0.032 m.
+//! ([`crate::history::Motion::odometry`]). There the autopilot's motion needs no integration between
+//! detections, and the filter estimates what velocity setpoints act on: in 160 recorded flights of ArduPilot
+//! the reported position moved against the truth by 0.010 m over 2 s, the sum of the reported velocity by
+//! 0.032 m.
 //!
-//! A detection is fused at its own stamp: the last [`MEMORY`] detections are kept with the state after each; a late one is
-//! inserted between them, and those after it are fused again. A detection whose normalised innovation squared (NIS)
-//! exceeds the gate is an outlier, and may start a competing hypothesis (`hypotheses.rs`). An estimate without a detection
-//! for `forget_after_s` is discarded.
+//! A detection is fused at its own stamp: the last [`MEMORY`] detections are kept with the state after each;
+//! a late one is inserted between them, and those after it are fused again. A detection whose normalised
+//! innovation squared (NIS) exceeds the gate is an outlier, and may start a competing hypothesis
+//! (`hypotheses.rs`). An estimate without a detection for `forget_after_s` is discarded.
 
 use std::collections::VecDeque;
 
@@ -65,8 +66,8 @@ impl Estimator {
         }
     }
 
-    /// Counts a frame without the marker. It alone never makes the competing hypothesis the estimate: a pad that blinks
-    /// must not lose to a place out of view.
+    /// Counts a frame without the marker. It alone never makes the competing hypothesis the estimate: a pad
+    /// that blinks must not lose to a place out of view.
     pub fn miss(&mut self, frame: &FrameObservation, history: &History) {
         self.hypotheses.set_view(frame);
         if let Some(motion) = history.at(frame.stamp) {

@@ -83,7 +83,7 @@ pub enum Mode {
 /// Contact with the ground, as the autopilot sees it.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Landed {
-    /// Not told yet.
+    /// Not reported yet.
     Unknown,
     /// On the ground.
     OnGround,
@@ -119,7 +119,7 @@ pub struct MarkerInFrame {
     pub body_from_marker: Option<Transform<Body, Marker>>,
     /// The other solution of a flat marker's pose, when there is one.
     pub alternative: Option<Transform<Body, Marker>>,
-    /// Covariance of the pose's origin, in body axes and m^2; `None` when the detector does not tell.
+    /// Covariance of the pose's origin, in body axes and m^2; `None` when the detector gives none.
     pub covariance_m2: Option<Matrix3<f64>>,
     /// Edge or diameter of the marker in the image, in pixels.
     pub size_px: Option<f64>,

@@ -7,14 +7,15 @@
 //! | `θ` | rad | error of mount and attitude together, about the body's axes; observable as the height changes |
 //! | `τ` | s | time offset: how much later exposures are than their stamps; observable as image motion that follows the vehicle's turning |
 //!
-//! A detection of the pad at `r` (north, east, down from the vehicle) by a vehicle that moves with `v` and turns with `ω`
-//! measures `y = q + (R θ) × r + τ (u - v - ω × r)`, linearised (Bar-Shalom, Li, Kirubarajan: Estimation with Applications
-//! to Tracking and Navigation, sections 5.2 and 10.3).
+//! A detection of the pad at `r` (north, east, down from the vehicle) by a vehicle that moves with `v` and
+//! turns with `ω` measures `y = q + (R θ) × r + τ (u - v - ω × r)`, linearised (Bar-Shalom, Li, Kirubarajan:
+//! Estimation with Applications to Tracking and Navigation, sections 5.2 and 10.3).
 //!
-//! The process noise of drift and tilt adapts (the same, section 11.2.1): it grows, within limits, while the normalised
-//! innovation squared (NIS) stays larger than the covariance allows, and shrinks again afterwards. An autopilot whose
-//! velocity errs by decimetres a second for seconds also reports a wrong tilt, and its position wanders; one with a good
-//! estimate keeps the configured noise. The caller updates with inliers only, so an outlier cannot widen its own gate.
+//! The process noise of drift and tilt adapts (the same, section 11.2.1): it grows, within limits, while the
+//! normalised innovation squared (NIS) stays larger than the covariance allows, and shrinks again afterwards.
+//! An autopilot whose velocity errs by decimetres a second for seconds also reports a wrong tilt, and its
+//! position wanders; one with a good estimate keeps the configured noise. The caller updates with inliers
+//! only, so an outlier cannot widen its own gate.
 
 use geometry::{Odometry, Point};
 use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector3};
@@ -32,17 +33,17 @@ const OFFSET: usize = 9;
 /// Initial standard deviation of the position, in metres: larger than any range.
 const UNKNOWN_M: f64 = 100.0;
 
-/// Random walk of a heaving pad's velocity relative to its maximum heave speed, per square root of a second: a wave of
-/// 4 to 8 s.
+/// Random walk of a heaving pad's velocity relative to its maximum heave speed, per square root of a second:
+/// a wave of 4 to 8 s.
 const HEAVE_CHANGE: f64 = 1.0;
 
-/// Change of the logarithm of the process noise per unit of excess NIS (per degree of freedom), and the NIS per degree of
-/// freedom, above its mean of one, that counts as no excess.
+/// Change of the logarithm of the process noise per unit of excess NIS (per degree of freedom), and the NIS
+/// per degree of freedom, above its mean of one, that counts as no excess.
 const NOISE_GAIN: f64 = 0.08;
 const NOISE_SLACK: f64 = 0.4;
 
-/// Largest factor on the random walk of drift and tilt: an estimate that takes any tilt for possible accepts any
-/// detection.
+/// Largest factor on the random walk of drift and tilt: an estimate that takes any tilt for possible accepts
+/// any detection.
 const MAX_NOISE_SCALE: f64 = 15.0;
 
 /// Share of the configured time offset by which it walks, per square root of a second.
@@ -167,8 +168,8 @@ impl State {
 
     /// Largest horizontal standard deviation after `ahead_s` without a detection, in metres.
     pub(crate) fn deviation_m(&self, config: &EstimatorConfig, ahead_s: f64) -> f64 {
-        // Of the random walk of the drift only the part above the configured one counts: the configured part is in the
-        // limits for a descent without the marker.
+        // Of the random walk of the drift only the part above the configured one counts: the configured part
+        // is in the limits for a descent without the marker.
         let raised = config.drift_change.powi(2) * ((2.0 * self.log_noise_scale).exp() - 1.0);
         let change = config.pad_acceleration.powi(2) + raised;
         let p = &self.covariance;

@@ -13,8 +13,8 @@ const CAPACITY: usize = 256;
 /// Longest interval between two states over which motion is interpolated, in seconds.
 const MAX_GAP_S: f64 = 0.5;
 
-/// A position further than this from where the velocity leads is a jump of the autopilot's estimate: in metres, plus
-/// metres per second between the two states.
+/// A position further than this from where the velocity leads is a jump of the autopilot's estimate: in
+/// metres, plus metres per second between the two states.
 const JUMP_M: f64 = 0.1;
 const JUMP_M_S: f64 = 0.5;
 
@@ -22,7 +22,8 @@ const JUMP_M_S: f64 = 0.5;
 #[derive(Clone, Debug)]
 pub struct History {
     states: VecDeque<VehicleState>,
-    /// For each state: the origin of the odometry frame, which moves with every jump of the autopilot's position.
+    /// For each state: the origin of the odometry frame, which moves with every jump of the autopilot's
+    /// position.
     odom_origins: VecDeque<Vector<Ned>>,
     max_extrapolation_s: f64,
 }
@@ -90,8 +91,8 @@ impl History {
         self.odom_origins.back().copied().unwrap_or(Vector::zero())
     }
 
-    /// The motion at `stamp`, interpolated between its neighbours; `None` before the oldest state, inside a gap,
-    /// and too far beyond the newest state.
+    /// The motion at `stamp`, interpolated between its neighbours; `None` before the oldest state, inside a
+    /// gap, and too far beyond the newest state.
     pub fn at(&self, stamp: Timestamp) -> Option<Motion> {
         let after = self.states.partition_point(|state| state.stamp < stamp);
         let Some(later) = self.states.get(after) else { return self.extrapolate(stamp) };
@@ -160,8 +161,8 @@ fn turn_rate(earlier: &VehicleState, later: &VehicleState) -> Vector<Body> {
     Vector::new(x, y, z) * (2.0 * w.signum() / gap_s)
 }
 
-/// The jump of the autopilot's position between two states: the part of the displacement that its velocity does not
-/// explain, when that is large.
+/// The jump of the autopilot's position between two states: the part of the displacement that its velocity
+/// does not explain, when that is large.
 pub(crate) fn jump(earlier: &VehicleState, later: &VehicleState) -> Option<Vector<Ned>> {
     let gap_s = later.stamp.seconds_since(earlier.stamp);
     let expected = (earlier.velocity + later.velocity) * (0.5 * gap_s);

@@ -1,12 +1,13 @@
 //! Two hypotheses of where the pad is: the estimate, and a competing place at which outliers agree.
 //!
-//! Detections of one place alone do not decide between the two, because the other may just be out of view: low over the
-//! ground, or while the vehicle tilts into the wind. So support is the share of the frames showing a place in which the
-//! marker was there, and a place out of view keeps its support for a while. The competing place becomes the estimate, and
-//! the estimate the competing place, once its share is clearly larger over a long enough time. A pad that is moved is
-//! found again within seconds where its old place is in view, and a second marker is not accepted just because the first is
-//! out of view. An estimate with few detections is replaced at once. While the marker is elsewhere in most of the frames
-//! that show the estimate's place, the estimate is ambiguous, and the vehicle does not descend.
+//! Detections of one place alone do not decide between the two, because the other may just be out of view:
+//! low over the ground, or while the vehicle tilts into the wind. So support is the share of the frames
+//! showing a place in which the marker was there, and a place out of view keeps its support for a while. The
+//! competing place becomes the estimate, and the estimate the competing place, once its share is clearly
+//! larger over a long enough time. A pad that is moved is found again within seconds where its old place is
+//! in view, and a second marker is not accepted just because the first is out of view. An estimate with few
+//! detections is replaced at once. While the marker is elsewhere in most of the frames that show the
+//! estimate's place, the estimate is ambiguous, and the vehicle does not descend.
 
 use geometry::{Odometry, Point};
 use nalgebra::Vector3;
@@ -30,14 +31,15 @@ const MAX_GAP_S: f64 = 0.2;
 /// Difference of the shares from which one hypothesis is clearly better than the other.
 const MAJORITY: f64 = 0.2;
 
-/// Gate for associating an outlier with the competing hypothesis, in metres, in addition to both uncertainties.
+/// Gate for associating an outlier with the competing hypothesis, in metres, in addition to both
+/// uncertainties.
 const ASSOCIATION_GATE_M: f64 = 0.15;
 
 /// A competing hypothesis with fewer detections than this is replaced by the next outlier.
 const MIN_DETECTIONS: f64 = 0.5;
 
-/// The estimate is ambiguous when the competing hypothesis has this many detections and the estimate's share is below
-/// the second number.
+/// The estimate is ambiguous when the competing hypothesis has this many detections and the estimate's share
+/// is below the second number.
 const AMBIGUOUS_DETECTIONS: f64 = 2.5;
 const AMBIGUOUS_SHARE: f64 = 0.5;
 
@@ -111,7 +113,8 @@ impl Hypotheses {
         }
     }
 
-    /// Counts an outlier: for the competing hypothesis it agrees with, or as a new one where the old has little support.
+    /// Counts an outlier: for the competing hypothesis it agrees with, or as a new one where the old has
+    /// little support.
     pub(crate) fn count_outlier(
         &mut self,
         config: &EstimatorConfig,
@@ -144,8 +147,8 @@ impl Hypotheses {
             && self.estimate.is_some_and(|support| support.share() < AMBIGUOUS_SHARE)
     }
 
-    /// Swaps the hypotheses when the competing one is clearly better; returns the measurement from which the estimate
-    /// starts again. `detections` and `newest` are those of the present estimate.
+    /// Swaps the hypotheses when the competing one is clearly better; returns the measurement from which the
+    /// estimate starts again. `detections` and `newest` are those of the present estimate.
     pub(crate) fn resolve(
         &mut self,
         config: &EstimatorConfig,
@@ -176,7 +179,8 @@ impl HypothesisSupport {
         Self { seen: 1.0, shown: 1.0, detections: 1.0, trust: 1.0, newest: stamp }
     }
 
-    /// Counts a frame. A detection at the image's edge, where the marker is found by chance, only keeps the trust.
+    /// Counts a frame. A detection at the image's edge, where the marker is found by chance, only keeps the
+    /// trust.
     fn count(&mut self, stamp: Timestamp, is_shown: bool, is_seen: bool) {
         let gap_s = stamp.seconds_since(self.newest).clamp(0.0, MAX_GAP_S);
         self.newest = self.newest.max(stamp);

@@ -412,7 +412,8 @@ impl Lander {
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
-    /// Climbs to where the legs overlap in the camera's view, as far as the fence allows, and flies the expanding square.
+    /// Climbs to where the legs overlap in the camera's view, as far as the fence allows, and flies the
+    /// expanding square.
     fn search(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
         let phases = &self.config.phases;
@@ -454,7 +455,8 @@ impl Lander {
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
-    /// Hovers; where the marker was lost so low that it may just have left the view, climbs to `regain_height_m`.
+    /// Hovers; where the marker was lost so low that it may just have left the view, climbs to
+    /// `regain_height_m`.
     fn hold(&self, now: Timestamp) -> Action {
         let phases = &self.config.phases;
         let lost = self.state_machine.reason() == Reason::TargetLost
@@ -490,8 +492,8 @@ impl Lander {
 
     /// True at the interval at which modes and motors are requested again.
     fn is_retry_due(&self, now: Timestamp) -> bool {
-        let again = |asked: Timestamp| now.seconds_since(asked) >= self.config.phases.land_retry_s;
-        self.land_requested.is_none_or(again)
+        let is_due = |sent: Timestamp| now.seconds_since(sent) >= self.config.phases.land_retry_s;
+        self.land_requested.is_none_or(is_due)
     }
 
     fn aborted(&mut self, now: Timestamp) -> Action {

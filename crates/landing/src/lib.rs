@@ -1,9 +1,10 @@
 //! The landing decision, a pure function of time and events.
 //!
-//! [`Lander::step`] takes the time and an event (the vehicle's state, a searched image, an operator's command, an alarm, or
-//! a tick) and returns a phase, an action for the autopilot, and the reasons. It keeps the vehicle's recent motion, joins
-//! every detection with the motion at its exposure, estimates the target's position and motion, and steers by one of two
-//! guidances. The same events give the same decisions, to the bit.
+//! [`Lander::step`] takes the time and an event (the vehicle's state, a searched image, an operator's
+//! command, an alarm, or a tick) and returns a phase, an action for the autopilot, and the reasons. It keeps
+//! the vehicle's recent motion, joins every detection with the motion at its exposure, estimates the target's
+//! position and motion, and steers by one of two guidances. The same events give the same decisions, to the
+//! bit.
 //!
 //! This crate knows no clock, network, file, thread, log or message, and no autopilot protocol.
 //!

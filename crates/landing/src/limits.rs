@@ -36,8 +36,9 @@ pub(crate) fn check(
     Err(ConfigError { key, value, min: *range.start(), max: *range.end() })
 }
 
-/// Declares the struct of a configuration section: `key: type = default` and, where the key has one, `, range`.
-/// The struct deserializes as the section, has the defaults, and its `validate` names the first key out of range.
+/// Declares the struct of a configuration section: `key: type = default` and, where the key has one, `,
+/// range`. The struct deserializes as the section, has the defaults, and its `validate` names the first key
+/// out of range.
 macro_rules! settings {
     (
         $(#[$doc:meta])*

@@ -1,8 +1,10 @@
-//! The target of the thesis' guidance: a mean of detections, each joined with the vehicle's motion at its exposure.
+//! The target of the thesis' guidance: a mean of detections, each joined with the vehicle's motion at its
+//! exposure.
 //!
-//! The mean forgets: high up, where a degree of tilt is 20 cm on the ground, it averages over more detections than close to
-//! the ground, where each one is good to millimetres and the vehicle's own position drifts by more. A detection far from the
-//! mean is an outlier; several consecutive outliers in agreement start a new mean.
+//! The mean forgets: high up, where a degree of tilt is 20 cm on the ground, it averages over more detections
+//! than close to the ground, where each one is good to millimetres and the vehicle's own position drifts by
+//! more. A detection far from the mean is an outlier; several consecutive outliers in agreement start a new
+//! mean.
 
 use geometry::{Ned, Point, Vector};
 

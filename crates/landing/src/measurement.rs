@@ -12,7 +12,8 @@ use crate::time::Timestamp;
 /// Largest horizontal distance of a marker from the vehicle, relative to its depth below.
 const MAX_SLOPE: f64 = 3.0;
 
-/// Two solutions of a flat marker's pose whose normals are equally upright within this angle, in radians, are averaged.
+/// Two solutions of a flat marker's pose whose normals are equally upright within this angle, in radians, are
+/// averaged.
 const UNDECIDED_RAD: f64 = 0.05;
 
 /// A measurement of the pad's position.
@@ -40,8 +41,8 @@ pub(crate) struct MarkerPose {
 }
 
 impl MarkerPose {
-    /// Of two solutions of a flat marker's pose the one whose face looks up; when both do, their mean, with their
-    /// difference as covariance.
+    /// Of two solutions of a flat marker's pose the one whose face looks up; when both do, their mean, with
+    /// their difference as covariance.
     pub(crate) fn resolve(
         motion: &Motion,
         pose: Transform<Body, Marker>,

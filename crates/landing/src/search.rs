@@ -1,7 +1,7 @@
 //! The search for the marker: an expanding square about the place where the search started.
 //!
-//! A camera that is fixed to the vehicle looks downwind, because the vehicle tilts into the wind: a marker right below may
-//! be out of view, upwind of the image. So the first leg goes upwind.
+//! A camera that is fixed to the vehicle looks downwind, because the vehicle tilts into the wind: a marker
+//! right below may be out of view, upwind of the image. So the first leg goes upwind.
 
 use geometry::{Body, Ned, Rotation, Vector};
 
@@ -16,16 +16,16 @@ pub fn first_leg_rad(ned_from_body: Rotation<Ned, Body>) -> f64 {
     if up.horizontal_norm() < MIN_TILT_RAD.sin() { 0.0 } else { up.y().atan2(up.x()) }
 }
 
-/// Distance upwind that the camera must fly to see the ground below the vehicle, in metres: the distance from that ground to
-/// the centre of the image, at most `search_radius_m`.
+/// Distance upwind that the camera must fly to see the ground below the vehicle, in metres: the distance from
+/// that ground to the centre of the image, at most `search_radius_m`.
 pub fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: f64) -> f64 {
     let down = ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
     let offset_m = height_m.max(0.0) * down.horizontal_norm() / down.z().max(0.5);
     if offset_m < MIN_TILT_RAD * height_m { 0.0 } else { offset_m.min(config.search_radius_m) }
 }
 
-/// The velocity at a time after the square started, in m/s: `upwind_m` along the first leg, then legs of 1, 1, 2, 2, 3, 3,
-/// ... spacings, each to the right of the one before; zero once the radius is reached.
+/// The velocity at a time after the square started, in m/s: `upwind_m` along the first leg, then legs of 1,
+/// 1, 2, 2, 3, 3, ... spacings, each to the right of the one before; zero once the radius is reached.
 pub fn velocity(
     config: &PhaseConfig,
     elapsed_s: f64,

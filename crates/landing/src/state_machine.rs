@@ -292,7 +292,8 @@ impl StateMachine {
         None
     }
 
-    /// In LAND only a vehicle that is still high is commanded back, and only if the abort does not land it as well.
+    /// In LAND only a vehicle that is still high is commanded back, and only if the abort does not land it as
+    /// well.
     fn can_abort(&self, inputs: &Inputs) -> bool {
         let is_high =
             inputs.vehicle.is_some_and(|vehicle| vehicle.height_m > self.config.no_return_height_m);

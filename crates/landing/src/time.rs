@@ -5,12 +5,12 @@
 pub struct Timestamp(i64);
 
 impl Timestamp {
-    /// The moment so many nanoseconds after the clock's origin.
+    /// The moment at this many nanoseconds after the clock's origin.
     pub fn from_nanos(nanos: i64) -> Self {
         Self(nanos)
     }
 
-    /// The moment so many seconds after the clock's origin; not a number gives the origin.
+    /// The moment at this many seconds after the clock's origin; NaN gives the origin.
     pub fn from_seconds(seconds: f64) -> Self {
         Self((seconds * 1e9).round() as i64)
     }
@@ -31,7 +31,7 @@ impl Timestamp {
         (i128::from(self.0) - i128::from(earlier.0)) as f64 * 1e-9
     }
 
-    /// The moment so many seconds later, at the ends of time at most.
+    /// The moment this many seconds later, saturating.
     pub fn plus_seconds(self, seconds: f64) -> Self {
         Self(self.0.saturating_add((seconds * 1e9).round() as i64))
     }

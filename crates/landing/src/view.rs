@@ -5,7 +5,8 @@ use geometry::{Body, Camera, Odometry, Point, Rotation, Vector};
 use crate::event::FrameObservation;
 use crate::history::Motion;
 
-/// Margin at the image's edge that does not count as view: an angle in radians, and room for the marker in metres.
+/// Margin at the image's edge that does not count as view: an angle in radians, and room for the marker in
+/// metres.
 const MARGIN_RAD: f64 = 0.01;
 const MARGIN_M: f64 = 0.1;
 
@@ -18,8 +19,8 @@ pub(crate) struct View {
 }
 
 impl View {
-    /// The view of a frame's camera, when it is calibrated. With an unknown mount the camera is assumed to look down, and
-    /// only what is shown whatever its yaw counts.
+    /// The view of a frame's camera, when it is calibrated. With an unknown mount the camera is assumed to
+    /// look down, and only what is shown whatever its yaw counts.
     pub(crate) fn from_frame(frame: &FrameObservation) -> Option<Self> {
         let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0)?;
         let (width, height) = frame.image_size;

@@ -1,5 +1,5 @@
-//! Whatever happens, in whatever order: setpoints stay inside the envelope, nothing descends on a stale target,
-//! nobody who took over is disturbed, and every landing ends.
+//! Random events in random order: setpoints stay inside the envelope, nothing descends on a stale target,
+//! nothing is sent after the pilot took over, and every landing ends.
 
 use geometry::{Body, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
@@ -15,7 +15,7 @@ struct Happening {
     event: Kind,
 }
 
-/// An event whose stamp is an age, because the time is only known when it is told.
+/// An event whose stamp is an age, because its time is known only when it happens.
 #[derive(Clone, Debug)]
 enum Kind {
     Vehicle {
@@ -167,7 +167,7 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
     }
 }
 
-/// What a watcher outside knows.
+/// What an outside observer knows.
 #[derive(Default)]
 struct Watcher {
     newest_marker: Option<Timestamp>,
@@ -180,13 +180,13 @@ impl Watcher {
         config: &Config,
         lander: &mut Lander,
         now: Timestamp,
-        told: Event,
+        event: Event,
     ) -> Result<(), TestCaseError> {
         let before = lander.phase();
-        let decision = lander.step(now, told);
+        let decision = lander.step(now, event);
         prop_assert_eq!(decision.phase, lander.phase());
         if decision.rejected.is_none() {
-            match told {
+            match event {
                 Event::Frame(frame) if frame.marker.is_some() => {
                     self.newest_marker = Some(frame.stamp);
                 }
@@ -277,11 +277,11 @@ fn survives(config: Config, start: f64, happenings: &[Happening]) -> Result<(), 
             watcher.check(&config, &mut lander, latest, event)?;
         }
     }
-    // Left alone with a vehicle that hovers, whatever state it is in ends.
+    // Without further events every state ends, with a vehicle that hovers.
     for i in 0..16_000u32 {
         latest = latest.plus_seconds(0.1);
-        let told = if i.is_multiple_of(2) { good_state(latest) } else { Event::Tick };
-        watcher.check(&config, &mut lander, latest, told)?;
+        let event = if i.is_multiple_of(2) { good_state(latest) } else { Event::Tick };
+        watcher.check(&config, &mut lander, latest, event)?;
         if lander.phase().is_terminal() {
             return Ok(());
         }
@@ -311,11 +311,11 @@ fn stamps_at_the_ends_of_time_are_refused() {
     let mut lander = Lander::new(Config::default()).unwrap();
     let now = Timestamp::from_seconds(10.0);
     for nanos in [i64::MIN, i64::MAX] {
-        let mut told = good_state(now);
-        if let Event::Vehicle(state) = &mut told {
+        let mut event = good_state(now);
+        if let Event::Vehicle(state) = &mut event {
             state.stamp = Timestamp::from_nanos(nanos);
         }
-        assert!(lander.step(now, told).rejected.is_some());
+        assert!(lander.step(now, event).rejected.is_some());
     }
     lander.step(Timestamp::from_nanos(i64::MAX), Event::Tick);
     lander.step(Timestamp::from_nanos(i64::MIN), Event::Operator(OperatorCommand::Start));

@@ -1,13 +1,12 @@
-//! The look at whether camera and autopilot mean the same directions: it finds a wrong mount before the descent, and
-//! never finds one that is right.
+//! The axis check finds a wrong mount before the descent, and never rejects a right one.
 
-mod world;
+mod scene;
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use landing::{Phase, Reason};
-use world::cases::{FAULTS, WINDS, anything};
-use world::{Flight, Sample, Scene};
+use scene::cases::{FAULTS, WINDS, anything};
+use scene::{Flight, Sample, Scene};
 
 fn doubts(sample: &Sample) -> bool {
     use Reason::{AttitudeSign, CameraTurned, ImageMirrored};

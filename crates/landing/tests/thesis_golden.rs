@@ -6,7 +6,7 @@ use landing::{
     MarkerInFrame, Mode, OperatorCommand, ThesisConfig, Timestamp, VehicleState,
 };
 
-/// FNV-1a over what a decision says.
+/// FNV-1a over a decision.
 fn mix(hash: u64, decision: &Decision) -> u64 {
     let numbers = match decision.action {
         Action::None => [1, 0, 0, 0, 0],
@@ -56,9 +56,9 @@ fn events(i: u32) -> (Timestamp, Vec<Event>) {
         events.push(Event::Operator(OperatorCommand::Start));
     }
     if i.is_multiple_of(3) {
-        let beside = if i == 600 { 1.0 } else { 0.0 };
+        let offset = if i == 600 { 1.0 } else { 0.0 };
         let in_body = ned_from_body.inverse()
-            * Vector::new(0.4 + beside - position.x(), -0.3 - position.y(), height_m);
+            * Vector::new(0.4 + offset - position.x(), -0.3 - position.y(), height_m);
         let seen = !i.is_multiple_of(30) && !(900..960).contains(&i);
         let marker = seen.then(|| MarkerInFrame {
             centre: Pixel::new(

@@ -1,15 +1,15 @@
-//! What happens to frames on their way: they come late, not at all, twice, or with a wrong stamp.
+//! Faults of a camera's frames: they arrive late, not at all, twice, or with a wrong stamp.
 
 use rand_chacha::ChaCha8Rng;
 
 use crate::drift::{normal, random_stream, uniform};
 
-/// What can go wrong with a camera. Times count from the world's begin (`World::begin`).
+/// The faults of a camera. Times count from the world's begin (`World::begin`).
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CameraFaults {
-    /// From the exposure to the arrival, in seconds, beside what rendering and detection take.
+    /// Latency from the exposure to the arrival, in seconds, without rendering and detection.
     pub latency_s: f64,
-    /// What chance adds to it at most, in seconds.
+    /// Maximum random addition to the latency, in seconds.
     pub jitter_s: f64,
     /// Part of the frames that never arrive.
     pub drop: f64,
@@ -19,11 +19,11 @@ pub struct CameraFaults {
     pub stamp_early_s: f64,
     /// Part of the stamps that jump.
     pub stamp_jumps: f64,
-    /// By how much they jump at most, either way, in seconds.
+    /// Maximum size of these jumps, in either direction, in seconds.
     pub stamp_jump_s: f64,
-    /// No frame is taken from the first time on, for so long, in seconds.
+    /// Outage of the camera: start and duration, in seconds.
     pub outage_s: Option<(f64, f64)>,
-    /// From the first time below this height over the pad (in metres) on, no frame is taken for so long, in seconds.
+    /// Outage that starts below a height over the pad, in metres, with its duration in seconds.
     pub outage_below_m: Option<(f64, f64)>,
     /// Deviation of the error of the mount's roll and pitch, in radians.
     pub mount_error_rad: f64,
@@ -32,7 +32,7 @@ pub struct CameraFaults {
 /// How a frame travels.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Passage {
-    /// What is added to its stamp, in seconds.
+    /// Error of its stamp, in seconds.
     pub stamp_error_s: f64,
     /// From the exposure to its arrival, in seconds.
     pub arrives_after_s: f64,
@@ -40,7 +40,7 @@ pub struct Passage {
     pub again_after_s: Option<f64>,
 }
 
-/// The way of one camera's frames.
+/// One camera's frames.
 #[derive(Clone, Debug)]
 pub struct Shutter {
     faults: CameraFaults,
@@ -53,19 +53,19 @@ pub struct Shutter {
 const COPY_AFTER_S: f64 = 0.01;
 
 impl Shutter {
-    /// The way of the frames of this seed.
+    /// The frames of this seed.
     pub fn new(faults: CameraFaults, seed: u64) -> Self {
         let mut random = random_stream(seed, 5);
         let mount_error = [(); 2].map(|()| faults.mount_error_rad * normal(&mut random));
         Self { faults, random, mount_error, dark_since_s: None }
     }
 
-    /// By how much the mount's roll and pitch differ from what is told, in radians.
+    /// Error of the configured mount in roll and pitch, in radians.
     pub fn mount_error_rad(&self) -> [f64; 2] {
         self.mount_error
     }
 
-    /// Takes a frame, so many seconds after the world's begin and so high over the pad; `None` for one that is lost.
+    /// Takes a frame at a time after the world's begin and at a height over the pad; `None` when it is lost.
     pub fn take(&mut self, begun_s: Option<f64>, height_m: f64) -> Option<Passage> {
         let [lost, jitter, twice, jumps, jump] = [(); 5].map(|()| uniform(&mut self.random));
         let faults = &self.faults;
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_are_lost_doubled_and_late_as_often_as_told() {
+    fn frames_are_lost_doubled_and_late_as_configured() {
         let faults = CameraFaults {
             latency_s: 0.1,
             jitter_s: 0.05,

@@ -4,8 +4,8 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal, StandardUniform};
 
-/// The random stream number `stream` of a seed: streams of one seed are independent of each other, so a part of the
-/// world that draws more numbers does not change what the others see.
+/// The random stream number `stream` of a seed: streams of one seed are independent of each other, so a part
+/// of the world that draws more numbers does not change what the others see.
 pub fn random_stream(seed: u64, stream: u64) -> ChaCha8Rng {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(stream);

@@ -1,6 +1,6 @@
 //! Small laws of motion that the vehicle and its autopilot share.
 
-/// Share of the way that a first-order lag goes in `dt_s`.
+/// Share of a step that a first-order lag covers in `dt_s`.
 pub(crate) fn lag(dt_s: f64, time_constant_s: f64) -> f64 {
     if time_constant_s > 0.0 { 1.0 - (-dt_s / time_constant_s).exp() } else { 1.0 }
 }
@@ -11,8 +11,8 @@ pub(crate) fn wrap(angle: f64) -> f64 {
     angle - turn * (angle / turn).round()
 }
 
-/// Rate that removes `error`, as ArduPilot's `sqrt_controller`: proportional near nought, farther away the square root
-/// that never needs more than `limit` of the next derivative.
+/// Rate that removes `error`, as ArduPilot's `sqrt_controller`: proportional near zero, farther away the
+/// square root that never needs more than `limit` of the next derivative.
 pub(crate) fn square_root_law(error: f64, gain: f64, limit: f64) -> f64 {
     let linear = limit / (gain * gain);
     if error.abs() > linear {

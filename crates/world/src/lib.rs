@@ -1,10 +1,11 @@
-//! A world to land in, faster than time: a vehicle and its autopilot, wind, a pad that may move, a camera's faults.
+//! A world to land in, faster than time: a vehicle and its autopilot, wind, a pad that may move, a camera's
+//! faults.
 //!
-//! It is pure: a seed, the packets it receives and the times it is asked for decide everything, so the same flight is
-//! the same to the bit. It knows no network, no clock, no image, and nothing of how a landing is decided.
+//! It is pure: seed, received packets and requested times determine everything, so a flight repeats to the
+//! bit. It knows no network, no clock, no image, and nothing of how a landing is decided.
 //!
-//! Modules in reading order: [`world`] joins [`vehicle`], [`wind`], [`pad`] and [`ardupilot`], with [`drift`] for their
-//! slow errors; [`camera`] is what happens to frames on their way; [`vision`] what a detector would find in them.
+//! Modules in reading order: [`world`] joins [`vehicle`], [`wind`], [`pad`] and [`ardupilot`], with [`drift`]
+//! for their slow errors; [`camera`] has the faults of frames, [`vision`] a model of the detector.
 
 pub mod ardupilot;
 pub mod camera;

@@ -11,7 +11,7 @@ pub struct PadConfig {
     pub position: Point<Ned>,
     /// Heading of the marker's upper edge, in radians from north to east.
     pub heading_rad: f64,
-    /// Its straight way, in m/s.
+    /// Its constant velocity, in m/s.
     pub velocity: Vector<Ned>,
     /// Amplitude of its heave, in metres.
     pub heave_m: f64,
@@ -51,7 +51,7 @@ pub struct PadState {
 }
 
 impl PadConfig {
-    /// The pad after it has moved for so long, in seconds; none before it began to.
+    /// The pad after it has moved for this time, in seconds; `None` before it starts.
     pub fn at(&self, moved_s: Option<f64>) -> PadState {
         let Some(moved_s) = moved_s else {
             return PadState {
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_pad_moves_as_fast_as_it_says() {
+    fn a_pads_motion_matches_its_velocity() {
         let pad = PadConfig {
             velocity: Vector::new(3.0, -2.0, 0.0),
             heave_m: 0.3,

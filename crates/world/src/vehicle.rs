@@ -1,8 +1,8 @@
 //! The vehicle: a multirotor with its attitude loops, the air around it and the ground under it.
 //!
-//! Above the attitude loops everything is the autopilot's; below them the measured response of the real vehicle is
-//! kept as lags. The thrust points where the body points, so the vehicle leans exactly as much as it accelerates or
-//! holds against the wind.
+//! Above the attitude loops everything is the autopilot's; below them the measured response of the real
+//! vehicle is kept as lags. The thrust points where the body points, so the vehicle tilts exactly as much as
+//! it accelerates or holds against the wind.
 
 use geometry::{Body, Ned, Point, Rotation, Vector};
 use rand_chacha::ChaCha8Rng;
@@ -13,14 +13,14 @@ use crate::laws::{lag, square_root_law, wrap};
 /// Acceleration of gravity, in m/s^2.
 pub const GRAVITY_M_S2: f64 = 9.806_65;
 
-/// What the vehicle is made of; the defaults give the responses measured on the real one.
+/// The vehicle's physical parameters; the defaults give the responses measured on the real one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VehicleConfig {
     /// Drag per mass at low speed, in 1/s.
     pub linear_drag: f64,
     /// Drag per mass that grows with the square of the speed, in 1/m.
     pub quadratic_drag: f64,
-    /// Time constant with which the demanded lean becomes the attitude loop's target, in seconds.
+    /// Time constant from the demanded tilt to the attitude loop's target, in seconds.
     pub lean_shaping_s: f64,
     /// Time constant with which the body follows that target, in seconds.
     pub lean_lag_s: f64,
@@ -36,7 +36,7 @@ pub struct VehicleConfig {
     pub heading_gain: f64,
     /// Time constant with which the body reaches a turn rate, in seconds.
     pub heading_lag_s: f64,
-    /// Deviation of the lean that the propellers' unsteadiness causes in flight, in radians.
+    /// Standard deviation of the tilt that the propellers' unsteadiness causes in flight, in radians.
     pub unsteadiness_rad: f64,
     /// Radius of the rotors for the ground effect (Cheeseman and Bennett 1955), in metres; 0 is none.
     pub rotor_m: f64,
@@ -53,7 +53,7 @@ pub struct VehicleConfig {
 impl Default for VehicleConfig {
     fn default() -> Self {
         Self {
-            // The lean at 0.5 m/s in calm air (0.73 degrees) and in 5 m/s of wind (11.7 degrees) give the two.
+            // From the tilt at 0.5 m/s in calm air (0.73 degrees) and in 5 m/s of wind (11.7 degrees).
             linear_drag: 0.25,
             quadratic_drag: 0.0314,
             lean_shaping_s: 0.15,
@@ -74,7 +74,7 @@ impl Default for VehicleConfig {
     }
 }
 
-/// What the autopilot asks of the vehicle.
+/// The autopilot's demand on the vehicle.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Demand {
     /// Thrust per mass along the body's up axis, in m/s^2; 0 with the motors off.
@@ -102,7 +102,7 @@ pub enum HeadingDemand {
     Rate(f64),
 }
 
-/// What is below the vehicle and carries it when it stands.
+/// The surface below the vehicle, which supports it when it stands.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Support {
     /// Where its surface is, in metres downwards.
@@ -150,7 +150,8 @@ impl VehicleTruth {
         down.z().clamp(-1.0, 1.0).acos()
     }
 
-    /// The state between this one and `next`, at `time_s`: on the straight line, and on the shortest arc of attitude.
+    /// The state between this one and `next`, at `time_s`: on the straight line, and on the shortest arc of
+    /// attitude.
     pub fn interpolate(&self, next: &Self, time_s: f64) -> Self {
         if time_s >= next.time_s {
             return *next;
@@ -243,7 +244,7 @@ impl Vehicle {
         }
     }
 
-    /// Where the vehicle is, as a way from elsewhere; what it has learnt of its motion stays.
+    /// Moves the vehicle to a position; its velocity and attitude stay.
     pub fn put(&mut self, position: Point<Ned>) {
         self.position = position;
     }
@@ -439,12 +440,12 @@ mod tests {
         let start = 147.2f64.to_radians();
         vehicle.yaw = Axis { target: start, angle: start, rate: 0.0 };
         let demand = Demand { heading: HeadingDemand::Angle(90.0f64.to_radians(), 0.0), ..hover() };
-        let mut least = start;
+        let mut min = start;
         for _ in 0..(8.0 / DT_S) as usize {
             vehicle.step(DT_S, Vector::zero(), &demand);
-            least = least.min(vehicle.yaw.angle);
+            min = min.min(vehicle.yaw.angle);
         }
-        assert!((least.to_degrees() - 80.9).abs() < 1.5, "{}", least.to_degrees());
+        assert!((min.to_degrees() - 80.9).abs() < 1.5, "{}", min.to_degrees());
         assert!((vehicle.yaw.angle.to_degrees() - 90.0).abs() < 0.2);
     }
 

@@ -1,8 +1,8 @@
-//! What a detector would find in a frame, without the frame: a model of the errors that the detector `rings` makes in
-//! rendered frames.
+//! A model of the detector `rings`: detections with the errors that it makes in rendered frames, without the
+//! frames.
 //!
-//! The numbers of [`RINGS`] are fitted by `cargo run --release -p experiments --example fit_vision`, which prints the
-//! table they are read from.
+//! The numbers of [`RINGS`] are fitted by `cargo run --release -p experiments --example fit_vision`, which
+//! prints the table they are read from.
 
 use geometry::{Camera, CameraModel, Marker, Pixel, Point, Rotation, Transform, Vector};
 use nalgebra::Matrix3;
@@ -10,34 +10,35 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::drift::{normal, random_stream, uniform};
 
-/// The errors of a detector, for a marker of so many pixels in the image.
+/// The errors of a detector by the marker's size in the image.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct VisionModel {
     /// Markers up to this size are never found, in pixels, and what it grows by per pixel of motion blur.
     pub never_px: [f64; 2],
-    /// Markers from this size on are always found, but for `miss`, in pixels, and what it grows by per pixel of motion blur.
+    /// Markers from this size on are always found, but for `miss`, in pixels, and what it grows by per pixel
+    /// of motion blur.
     pub always_px: [f64; 2],
     /// Part of the frames in which a large marker is missed.
     pub miss: f64,
     /// Deviation of the centre along either axis of the image, in pixels.
     pub centre_px: f64,
-    /// What the deviation of the centre grows by per pixel of motion blur.
+    /// Growth of the centre's deviation per pixel of motion blur.
     pub centre_per_blur: f64,
     /// Deviation of the size in the image, and with it of the range, in pixels.
     pub size_px: f64,
-    /// What the deviation of the size grows by per pixel of motion blur.
+    /// Growth of the size's deviation per pixel of motion blur.
     pub size_per_blur: f64,
-    /// What the range is wrong by on average, as a part of it.
+    /// Mean error of the range, relative to the range.
     pub range_bias: f64,
     /// Deviation of the tilt, times the size, in radians times pixels.
     pub tilt_rad_px: f64,
     /// Largest deviation of the tilt, in radians.
     pub tilt_rad: f64,
-    /// Deviation that the detector tells, over the true one: of the centre, and of the range.
-    pub told: [f64; 2],
+    /// Reported standard deviation over the true one: of the centre, and of the range.
+    pub reported: [f64; 2],
     /// Part of the detections whose error is `outlier_times` as large.
     pub outliers: f64,
-    /// How much larger the error of those is.
+    /// Factor on the error of those.
     pub outlier_times: f64,
 }
 
@@ -53,12 +54,12 @@ pub const RINGS: VisionModel = VisionModel {
     range_bias: 0.0,
     tilt_rad_px: 0.13,
     tilt_rad: 0.5,
-    told: [1.5, 1.5],
+    reported: [1.5, 1.5],
     outliers: 0.02,
     outlier_times: 5.0,
 };
 
-/// What a model of a detector found.
+/// A detection of the model.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Found {
     /// The projection of the marker's centre.
@@ -71,17 +72,17 @@ pub struct Found {
     pub covariance_m2: Matrix3<f64>,
 }
 
-/// What a detector does wrong beyond its noise.
+/// Faults of a detector beyond its noise.
 #[derive(Copy, Clone, Debug, Default, PartialEq)]
 pub struct VisionFaults {
-    /// Part of the frames in which the marker is missed, beside what the model misses.
+    /// Part of the frames in which the marker is missed, in addition to the model's misses.
     pub miss: f64,
-    /// From the first time on, for the second (in seconds after the world's begin), the marker is reported beside its
-    /// place by so many metres northwards.
-    pub lie: Option<(f64, f64, f64)>,
-    /// In this part of the frames another marker is taken for ours, so many metres to the east.
+    /// Between these times, in seconds after the world's begin, the marker is reported this many metres north
+    /// of its place.
+    pub offset: Option<(f64, f64, f64)>,
+    /// Part of the frames in which a wrong marker is reported, and its distance to the east in metres.
     pub wrong: Option<(f64, f64)>,
-    /// What the size of the marker is wrong by, as a part of it.
+    /// Error of the configured marker size, relative to the size.
     pub size_error: f64,
     /// The marker is not found from below this height over it, in metres.
     pub blind_below_m: f64,
@@ -102,9 +103,9 @@ impl Vision {
         Self { model, camera, marker_m, random: random_stream(seed, 6) }
     }
 
-    /// What is found of a marker that is truly there, and moves by so many pixels while the shutter is open.
+    /// The detection of a marker with this true pose and motion blur.
     pub fn look(&mut self, truth: &Transform<Camera, Marker>, blur_px: f64) -> Option<Found> {
-        // Drawn in any case, so that one frame's luck does not change what the next ones see.
+        // Always drawn, so that one frame does not change the random numbers of the next.
         let luck = [(); 2].map(|()| uniform(&mut self.random));
         let noise = [(); 5].map(|()| normal(&mut self.random));
         let depth_m = truth.origin().z();
@@ -129,8 +130,8 @@ impl Vision {
         let rotation = Rotation::<Camera, Camera>::from_rotation_vector(turned) * truth.rotation();
         let along = ray.coords / ray.z();
         let focal_px = 0.5 * (self.camera.fx + self.camera.fy);
-        let sideways = (model.told[0] * depth_m * centre_px / wild / focal_px).powi(2);
-        let spread = (model.told[1] * depth_m * range_part / wild).powi(2);
+        let sideways = (model.reported[0] * depth_m * centre_px / wild / focal_px).powi(2);
+        let spread = (model.reported[1] * depth_m * range_part / wild).powi(2);
         Some(Found {
             centre,
             size_px,
@@ -182,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_are_as_large_as_the_model_says_and_as_told() {
+    fn errors_are_as_large_as_modelled_and_as_reported() {
         let (mut vision, truth) = (vision(), above(5.0, 0.3));
         let all: Vec<Found> = (0..4000).filter_map(|_| vision.look(&truth, 1.0)).collect();
         assert!(all.len() > 3800, "{}", all.len());
@@ -195,11 +196,11 @@ mod tests {
         assert!((centre / wanted - 1.0).abs() < 0.3, "{centre} px for {wanted}");
         let range = rms(&|f| f.camera_from_marker.origin().z() - 5.0 * (1.0 + RINGS.range_bias));
         let told = rms(&|f| f.covariance_m2.m33.sqrt());
-        assert!((range * RINGS.told[1] / told - 1.0).abs() < 0.3, "{range} m, told {told}");
+        assert!((range * RINGS.reported[1] / told - 1.0).abs() < 0.3, "{range} m, told {told}");
     }
 
     #[test]
-    fn what_is_too_small_or_not_whole_in_the_image_is_not_found() {
+    fn markers_too_small_or_cut_by_the_image_are_not_found() {
         let mut vision = vision();
         assert!(vision.look(&above(60.0, 0.0), 0.0).is_none());
         assert!(vision.look(&above(1.0, 0.34), 0.0).is_none());

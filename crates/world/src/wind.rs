@@ -1,7 +1,8 @@
 //! Wind: a mean, turbulence by the Dryden model, and the thesis' noise.
 //!
-//! The turbulence is that of MIL-F-8785C, section 3.7, at low altitude: lengths and intensities from the height and the
-//! wind at 6 m (20 ft), one coloured noise for each axis. The vehicle hovers, so the air that passes is the wind's own.
+//! The turbulence is that of MIL-F-8785C, section 3.7, at low altitude: lengths and intensities from the
+//! height and the wind at 6 m (20 ft), one coloured noise for each axis. The vehicle hovers, so the air that
+//! passes is the wind's own.
 
 use geometry::{Ned, Vector};
 use rand_chacha::ChaCha8Rng;
@@ -17,15 +18,15 @@ const HIGHEST_FT: f64 = 1000.0;
 /// Part of the Dryden model's intensity that a turbulence of 1 has.
 const DRYDEN_SHARE: f64 = 0.3;
 
-/// What blows.
+/// The parts of the wind.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WindConfig {
     /// Speed of the mean wind, in m/s.
     pub mean_m_s: f64,
     /// Where the mean wind comes from, in radians from north to east.
     pub from_rad: f64,
-    /// Strength of the turbulence: 1 disturbs a landing as much as "turbulence 1" of ArduPilot's simulation does, which
-    /// is three tenths of the intensity that the Dryden model gives for the mean wind; 0 is none.
+    /// Strength of the turbulence: 1 disturbs a landing as much as "turbulence 1" of ArduPilot's simulation
+    /// does, which is three tenths of the intensity that the Dryden model gives for the mean wind; 0 is none.
     pub turbulence: f64,
     /// The thesis' noise, added to the rest.
     pub noise: Option<WindNoise>,
@@ -47,7 +48,7 @@ pub struct Gust {
 }
 
 impl Gust {
-    /// Speed that it adds, in m/s, so long after the world's begin.
+    /// Speed that it adds, in m/s, at a time after the world's begin.
     pub fn speed_m_s(&self, begun_s: f64) -> f64 {
         let since_s = begun_s - self.start_s;
         let since_s =
@@ -104,8 +105,8 @@ impl Wind {
         Self { config, random, along, across, noise: [0.0; 2], noise_age_s: 0.0 }
     }
 
-    /// Lets `dt_s` pass and gives the velocity of the air, in m/s, at this height over the ground and so long after the
-    /// world's begin.
+    /// Advances by `dt_s` and returns the velocity of the air, in m/s, at a height over the ground and a time
+    /// after the world's begin.
     pub fn step(&mut self, dt_s: f64, height_m: f64, begun_s: Option<f64>) -> Vector<Ned> {
         let gust = self.turbulence(dt_s, height_m);
         let noise = self.noise(dt_s);
@@ -167,8 +168,8 @@ impl Lagged {
         Self { first: Drift::new(1.0, 1.0, random), second: 0.0 }
     }
 
-    /// The filter is sqrt(3) times the once lagged noise plus 1 - sqrt(3) times the twice lagged one. With a variance of
-    /// 1 for the first, the second has 1/2, as is their covariance, and the sum has 2.
+    /// The filter is sqrt(3) times the once lagged noise plus 1 - sqrt(3) times the twice lagged one. With a
+    /// variance of 1 for the first, the second has 1/2, as is their covariance, and the sum has 2.
     fn step(&mut self, dt_s: f64, pace_s: f64, random: &mut ChaCha8Rng) -> f64 {
         self.first.set(1.0, pace_s);
         let x = self.first.step(dt_s, random);

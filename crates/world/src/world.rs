@@ -13,10 +13,11 @@ use crate::wind::{Wind, WindConfig};
 /// Length of a step, in seconds: the rate of ArduPilot's main loop.
 pub const STEP_S: f64 = 1.0 / 400.0;
 
-/// A vehicle that starts in the air hovers so long before anything is told of it, in seconds: its loops learn the wind.
+/// Time a vehicle that starts in the air hovers before its first report, in seconds: its loops learn the
+/// wind.
 const WARM_UP_S: f64 = 8.0;
 
-/// What is in the world.
+/// The parts of the world.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WorldConfig {
     /// The vehicle.
@@ -27,10 +28,10 @@ pub struct WorldConfig {
     pub autopilot: AutopilotConfig,
     /// The pad.
     pub pad: PadConfig,
-    /// The autopilot is neither heard nor reached from the first time on, for so long, in seconds after the begin.
+    /// Interruption of the link to the autopilot: start after the world's begin, and duration, in seconds.
     pub link_lost_s: Option<(f64, f64)>,
-    /// The world begins, and with it the pad's way, gusts, drifts and faults, once the vehicle has been so high, in
-    /// metres.
+    /// Height of the vehicle at which the world begins, and with it the pad's motion, gusts, drifts and
+    /// faults, in metres.
     pub begin_height_m: f64,
 }
 
@@ -47,8 +48,8 @@ impl Default for WorldConfig {
     }
 }
 
-/// How long the past is kept for cameras with a long exposure, in steps: one second.
-const MOST_PAST: usize = 400;
+/// Number of past states kept for cameras with a long exposure, in steps: one second.
+const MAX_PAST: usize = 400;
 
 /// Vehicle, wind and autopilot. The same seed and the same packets at the same times give the same flight.
 #[derive(Clone, Debug)]
@@ -98,7 +99,7 @@ impl World {
         self.outgoing().for_each(drop);
     }
 
-    /// Begins the pad's way, gusts, drifts and faults, when that has not been done.
+    /// Begins the pad's motion, gusts, drifts and faults, once.
     pub fn begin(&mut self) {
         if self.begun_s.is_none() {
             self.begun_s = Some(self.now_s());
@@ -136,7 +137,8 @@ impl World {
         }
     }
 
-    fn link_is_lost(&self) -> bool {
+    /// True while the link to the autopilot is interrupted.
+    pub fn link_is_lost(&self) -> bool {
         let lost = self.config.link_lost_s.zip(self.since_begin_s(self.now_s()));
         lost.is_some_and(|((from_s, for_s), now_s)| (from_s..from_s + for_s).contains(&now_s))
     }
@@ -173,6 +175,11 @@ impl World {
         &self.autopilot
     }
 
+    /// The autopilot, for commands without packets.
+    pub fn autopilot_mut(&mut self) -> &mut SimulatedAutopilot {
+        &mut self.autopilot
+    }
+
     fn step(&mut self) {
         self.steps += 1;
         let now_s = self.now_s();
@@ -186,13 +193,13 @@ impl World {
         self.vehicle.step_over(STEP_S, self.air, &self.demand, below);
         let truth = VehicleTruth { time_s: now_s, ..self.vehicle.truth() };
         self.demand = self.autopilot.step(now_s, &truth);
-        if self.past.len() >= MOST_PAST {
+        if self.past.len() >= MAX_PAST {
             self.past.pop_front();
         }
         self.past.push_back(truth);
     }
 
-    /// What carries a vehicle at this place: the deck about the pad, or the ground.
+    /// The support of a vehicle at this place: the deck about the pad, or the ground.
     fn below(&self, now_s: f64, position: Point<Ned>) -> Support {
         let pad = self.pad_at(now_s);
         let from_pad = position - pad.position;

@@ -13,8 +13,8 @@ use bench::{Bench, steady};
 const STEP_S: f64 = 0.02;
 const TOLERANCE: f64 = 0.15;
 
-/// Axis (0 north, 2 down), speed in m/s, times to 10, 50 and 90 % in seconds, as the summary of the measurements
-/// gives them.
+/// Axis (0 north, 2 down), speed in m/s, times to 10, 50 and 90 % in seconds, as the summary of the
+/// measurements gives them.
 const MEASURED: [(usize, f64, [f64; 3]); 8] = [
     (0, 0.1, [0.20, 0.46, 1.12]),
     (0, 0.25, [0.20, 0.46, 1.06]),

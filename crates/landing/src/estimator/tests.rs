@@ -280,7 +280,8 @@ fn the_process_noise_grows_only_for_an_autopilot_that_wanders() {
         let home = scene.pad;
         let (mut refused, mut worst_m) = (0, 0.0f64);
         for i in 0..300 {
-            // The reported position moves away and comes back, and the reported attitude leans as that velocity changes.
+            // The reported position moves away and comes back, and the reported attitude tilts as that
+            // velocity changes.
             let (sin, cos) = (1.2 * scene.seconds).sin_cos();
             scene.pad = home + Vector::new(wander_m_s / 1.2 * sin, 0.0, 0.0);
             scene.tilt_error = [0.0, 0.1 * wander_m_s * cos];
@@ -334,7 +335,8 @@ fn a_pad_that_blinks_does_not_lose_to_a_place_out_of_view() {
     let mut after_blinking_m = 0.0;
     for i in 0..130 {
         scene.advance(0.07);
-        // Four detections where the image ends, long ago, and 3 s without the pad, which is there before and after.
+        // Four detections where the image ends, long ago, and 3 s without the pad, which is there before and
+        // after.
         let is_away = (20..24).contains(&i);
         scene.pad = if is_away { home + Vector::new(4.5, 0.0, 0.0) } else { home };
         if (40..82).contains(&i) {
@@ -356,9 +358,9 @@ fn of_two_poses_the_upright_one_is_used() {
         scene.advance(0.07);
         let (frame, marker) = scene.frame(0.03);
         let pose = marker.body_from_marker.unwrap();
-        let leans = Rotation::<Body, Body>::from_euler(0.5, 0.2, 0.0) * pose.rotation();
-        let beside = pose.origin() + Vector::new(0.1, 0.0, 0.0);
-        let other = Transform::new(leans, beside);
+        let tilted = Rotation::<Body, Body>::from_euler(0.5, 0.2, 0.0) * pose.rotation();
+        let shifted = pose.origin() + Vector::new(0.1, 0.0, 0.0);
+        let other = Transform::new(tilted, shifted);
         let (first, second) = if i % 2 == 0 { (pose, other) } else { (other, pose) };
         let marker =
             MarkerInFrame { body_from_marker: Some(first), alternative: Some(second), ..marker };

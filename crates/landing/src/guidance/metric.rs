@@ -1,22 +1,23 @@
 //! The metric guidance: from the target's position in metres to a velocity.
 //!
-//! Laterally, the commanded closing speed is proportional to the error that will be left when a setpoint takes effect,
-//! limited to the speed from which the vehicle can still brake before the target. The setpoint is not that speed but the one
-//! that makes the autopilot accelerate as needed to reach it. An autopilot smooths a velocity setpoint: ArduPilot's path
-//! approaches it with a time constant of acceleration limit over jerk limit, 0.5 s, and the vehicle follows the path. The
-//! path's velocity depends only on the setpoints sent, so it is computed here too, and the setpoint is that velocity plus
-//! the time constant times the commanded acceleration. Wind that pushes the vehicle off its path is countered at once, and
-//! a lasting error accumulates in the path's velocity, which is the only integrator.
+//! Laterally, the commanded closing speed is proportional to the error that will be left when a setpoint
+//! takes effect, limited to the speed from which the vehicle can still brake before the target. The setpoint
+//! is not that speed but the one that makes the autopilot accelerate as needed to reach it. An autopilot
+//! smooths a velocity setpoint: ArduPilot's path approaches it with a time constant of acceleration limit
+//! over jerk limit, 0.5 s, and the vehicle follows the path. The path's velocity depends only on the
+//! setpoints sent, so it is computed here too, and the setpoint is that velocity plus the time constant times
+//! the commanded acceleration. Wind that pushes the vehicle off its path is countered at once, and a lasting
+//! error accumulates in the path's velocity, which is the only integrator.
 //!
-//! The reported velocity is biased, by 2 to 3 cm/s normally and by decimetres a second when the autopilot's filter has a
-//! wrong tilt; an observer estimates the bias from the displacement of the reported position.
+//! The reported velocity is biased, by 2 to 3 cm/s normally and by decimetres a second when the autopilot's
+//! filter has a wrong tilt; an observer estimates the bias from the displacement of the reported position.
 //!
-//! Vertically, a funnel. Inside it the vehicle descends, as fast as it can still brake, fastest on the axis and not at all
-//! at the edge. The camera of a vehicle that tilts into the wind points past the target; above `view_height_m` the vehicle
-//! stays so far upwind that the marker remains in view.
+//! Vertically, a funnel. Inside it the vehicle descends, as fast as it can still brake, fastest on the axis
+//! and not at all at the edge. The camera of a vehicle that tilts into the wind points past the target; above
+//! `view_height_m` the vehicle stays so far upwind that the marker remains in view.
 //!
-//! Contributions to the error, in 100 modelled flights in 5 m/s of wind with turbulence 3 (`alight experiment landing`),
-//! median and worst, and the largest slide at touchdown:
+//! Contributions to the error, in 100 modelled flights in 5 m/s of wind with turbulence 3 (`alight experiment
+//! landing`), median and worst, and the largest slide at touchdown:
 //!
 //! | change | error, m | slide, m/s |
 //! |---|---|---|
@@ -29,9 +30,9 @@
 //! | the reported velocity without its bias | 0.024, 0.070 | 0.08 |
 //! | an autopilot without estimation errors | 0.014, 0.067 | 0.15 |
 //!
-//! Below `blind_height_m` the vehicle continues down on the estimate when the marker leaves the view. LAND follows no target
-//! and drifts by a decimetre in a second of gusts, so it takes over only at `land_height_m`, and only from a vehicle that
-//! hardly moves sideways.
+//! Below `blind_height_m` the vehicle continues down on the estimate when the marker leaves the view. LAND
+//! follows no target and drifts by a decimetre in a second of gusts, so it takes over only at
+//! `land_height_m`, and only from a vehicle that hardly moves sideways.
 
 use geometry::{Ned, Point, Vector};
 
@@ -48,8 +49,8 @@ const FUNNEL_HYSTERESIS: f64 = 1.2;
 /// Share of the lateral acceleration that is planned for braking before the target.
 const BRAKING: f64 = 0.7;
 
-/// The target's position is known while its standard deviation, in metres, and the age of its newest detection, in
-/// seconds, are below these.
+/// The target's position is known while its standard deviation, in metres, and the age of its newest
+/// detection, in seconds, are below these.
 const KNOWN_M: f64 = 0.5;
 const KNOWN_S: f64 = 20.0;
 
@@ -62,14 +63,16 @@ const TURN_GAIN: f64 = 0.8;
 /// Height below which the vehicle waits for a small error, in metres.
 const LOW_M: f64 = 0.5;
 
-/// A vehicle that waits makes room by climbing to about `LOW_M`; it is no longer low this far above it, in metres.
+/// A vehicle that waits makes room by climbing to about `LOW_M`; it is no longer low this far above it, in
+/// metres.
 const LOW_HYSTERESIS_M: f64 = 0.2;
 
-/// Maximum difference between the velocity of the path and the vehicle's in steady flight, in m/s; more is a gust.
+/// Maximum difference between the velocity of the path and the vehicle's in steady flight, in m/s; more is a
+/// gust.
 const MAX_STEADY_M_S: f64 = 0.3;
 
-/// Maximum lateral speed over the pad at which a low vehicle descends, in m/s: at the ground, what is added per metre of
-/// height, and, after some seconds of waiting, per second; and the limit however long it waits.
+/// Maximum lateral speed over the pad at which a low vehicle descends, in m/s: at the ground, what is added
+/// per metre of height, and, after some seconds of waiting, per second; and the limit however long it waits.
 const TOUCHDOWN_M_S: f64 = 0.2;
 const TOUCHDOWN_PER_HEIGHT: f64 = 0.4;
 const TOUCHDOWN_WAIT_S: f64 = 1.0;
@@ -82,18 +85,19 @@ const MIN_TOUCHDOWN_M_S: f64 = 0.3;
 /// Time ahead for which the error of a low vehicle is predicted, in seconds.
 const LOW_LEAD_S: f64 = 0.4;
 
-/// Maximum climb speed of a low vehicle that is pushed out of its funnel, in m/s, and the gain on the missing height, in
-/// 1/s.
+/// Maximum climb speed of a low vehicle that is pushed out of its funnel, in m/s, and the gain on the missing
+/// height, in 1/s.
 const ROOM_M_S: f64 = 0.5;
 const ROOM_GAIN: f64 = 2.0;
 
-/// A vehicle that is commanded to descend at this speed, in m/s, and stands still this long, in seconds, is on the ground:
-/// the first where it should be near the ground, the second where it may also just be turning from a climb.
+/// A vehicle that is commanded to descend at this speed, in m/s, and stands still this long, in seconds, is
+/// on the ground: the first where it should be near the ground, the second where it may also just be turning
+/// from a climb.
 const PUSHING_M_S: f64 = 0.15;
 const STANDING_S: [f64; 2] = [0.4, 0.9];
 
-/// Height below which the rest of the descent takes less time than another try, in metres, and the factor by which the
-/// allowed deviation grows there.
+/// Height below which the rest of the descent takes less time than another try, in metres, and the factor by
+/// which the allowed deviation grows there.
 const NEAR_M: f64 = 0.3;
 const COMMITTED: f64 = 1.5;
 
@@ -238,8 +242,8 @@ impl Metric {
         })
     }
 
-    /// True while the vehicle follows its path. In a gust it does not, and LAND, which starts a new path, would let the
-    /// vehicle drift: then the touchdown comes before LAND.
+    /// True while the vehicle follows its path. In a gust it does not, and LAND, which starts a new path,
+    /// would let the vehicle drift: then the touchdown comes before LAND.
     fn is_steady(&self, situation: &Situation<'_>) -> bool {
         self.observer.is_none_or(|observer| {
             let difference = observer.path.velocity() - situation.vehicle.velocity;
@@ -269,8 +273,8 @@ impl Metric {
         horizontal(situation.vehicle.velocity) + self.bias() - pad_m_s
     }
 
-    /// Horizontal offset to the point that is aimed at, in metres: high up, where the wind tilts the vehicle, that is not
-    /// the target but the nearest point from which the marker is in view.
+    /// Horizontal offset to the point that is aimed at, in metres: high up, where the wind tilts the vehicle,
+    /// that is not the target but the nearest point from which the marker is in view.
     fn error(&self, situation: &Situation<'_>, target: &TargetEstimate) -> Vector<Ned> {
         self.offset(situation, target) - self.upwind(situation, target)
     }
@@ -314,8 +318,8 @@ impl Metric {
         error.norm().max((error - closing * LOW_LEAD_S).norm()) / radius_m
     }
 
-    /// The lateral speed over the pad relative to the one allowed at this height, which grows with the waiting time: a
-    /// vehicle that touches down while a gust moves it slides.
+    /// The lateral speed over the pad relative to the one allowed at this height, which grows with the
+    /// waiting time: a vehicle that touches down while a gust moves it slides.
     fn lateral_speed_scale(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
         let height_m = self.height_m(target).max(0.0);
         if height_m > LOW_M || self.observer.is_none() {

@@ -1,5 +1,5 @@
-//! What the metric guidance observes of the vehicle's motion: the autopilot's path, the bias of its velocity, and the tilt
-//! against the wind.
+//! What the metric guidance observes of the vehicle's motion: the autopilot's path, the bias of its velocity,
+//! and the tilt against the wind.
 
 use geometry::{Body, Ned, Point, Vector};
 
@@ -82,8 +82,9 @@ impl Observer {
         self
     }
 
-    /// Compares the displacement from state to state with the velocity. Only the stamps of the states count, so neither
-    /// pauses between steps nor old states make a bias; after a gap or a jump there is nothing to compare.
+    /// Compares the displacement from state to state with the velocity. Only the stamps of the states count,
+    /// so neither pauses between steps nor old states make a bias; after a gap or a jump there is nothing to
+    /// compare.
     fn observe_bias(&mut self, config: &MetricConfig, vehicle: &VehicleState, gap_s: f64) {
         let before = std::mem::replace(&mut self.newest, *vehicle);
         let velocity = (before.velocity + vehicle.velocity) * 0.5 + self.bias;

@@ -1,8 +1,8 @@
 //! The path that an autopilot makes of velocity setpoints, horizontally.
 //!
-//! ArduPilot Copter does not hand a setpoint to its loops: it bends a path towards it within limits of acceleration and
-//! jerk (`shape_vel_accel` of `AP_Math/control.cpp`), and the loops of position and velocity follow that path. The path depends on
-//! the setpoints alone, so it can be computed here as well as there.
+//! ArduPilot Copter does not hand a setpoint to its loops: it bends a path towards it within limits of
+//! acceleration and jerk (`shape_vel_accel` of `AP_Math/control.cpp`), and the loops of position and velocity
+//! follow that path. The path depends on the setpoints alone, so it can be computed here as well as there.
 
 use geometry::{Ned, Vector};
 use nalgebra::Vector2;
@@ -30,7 +30,7 @@ pub(super) struct Path {
 }
 
 impl Path {
-    /// The path of a vehicle that moves steadily, as it is asked to.
+    /// The path of a vehicle that moves steadily, as commanded.
     pub(super) fn new(velocity: Vector<Ned>) -> Self {
         let velocity = Level::new(velocity.x(), velocity.y());
         Self { setpoint: velocity, velocity, acceleration: Level::zeros(), remainder_s: 0.0 }
@@ -81,8 +81,8 @@ mod tests {
     }
 
     #[test]
-    fn a_step_takes_as_long_as_measured_less_the_lag_of_the_lean() {
-        // t50 of Copter 4.5.4 in its own simulation is 0.46, 0.52 and 0.60 s; the lean follows after 0.17 s.
+    fn a_step_takes_as_long_as_measured_less_the_lag_of_the_tilt() {
+        // t50 of Copter 4.5.4 in its own simulation is 0.46, 0.52 and 0.60 s; the tilt follows after 0.17 s.
         for (size, half_s) in [(0.25, 0.46), (0.5, 0.52), (1.0, 0.60)] {
             let half = rise_s(size, 0.5) + 0.1;
             assert!((half - half_s).abs() < 0.1, "{size}: {half} not {half_s}");

@@ -62,7 +62,8 @@ pub trait Guidance {
         false
     }
 
-    /// A frame has arrived while the vehicle is guided; heading in radians from north, altitude over the marker in metres.
+    /// A frame has arrived while the vehicle is guided; heading in radians from north, altitude over the
+    /// marker in metres.
     fn observe(&mut self, _frame: &FrameObservation, _heading_rad: f64, _altitude_m: f64) {}
 
     /// How far it has brought the vehicle.

@@ -2,10 +2,10 @@
 //!
 //! # Where the text leaves a choice, and which reading was taken
 //!
-//! The readings were flown on a model of the vehicle (dead time 0.25 s, then first order with 0.43 s; attitude
-//! tilts the camera; 15 frames per second; 80 ms of latency) from 10 m with the pad at (1.5, -1.5) m, and compared with
-//! the thesis' section 4.4: "rapidly converges", "some overshoot ... not severe", stable after about 20 s, within
-//! limits of 0.5 m/s, a landing of 55 s, 0.068 m from the centre.
+//! The readings were flown on a model of the vehicle (dead time 0.25 s, then first order with 0.43 s;
+//! attitude tilts the camera; 15 frames per second; 80 ms of latency) from 10 m with the pad at (1.5, -1.5)
+//! m, and compared with the thesis' section 4.4: "rapidly converges", "some overshoot ... not severe", stable
+//! after about 20 s, within limits of 0.5 m/s, a landing of 55 s, 0.068 m from the centre.
 //!
 //! | question | reading taken | why |
 //! |---|---|---|
@@ -19,16 +19,18 @@
 //! | coordinates | image right and image up are the vehicle's right and forward, turned into the world by its heading | the thesis flew with one heading, where image up was its ENU's y |
 //! | end of the run | LAND at the first frame inside the tolerance below 80 cm | as listed |
 //!
-//! `K_p`: the printed 1e-6 m/s per pixel moves the vehicle by less than 0.7 mm/s at the edge of the image. What is left is an
-//! integrator that steers an integrator, without damping: it passes the pad after half a minute, swings further
-//! in pixels with every metre of descent, and the marker leaves the view; of 12 such flights none had landed after 200 s.
-//! With 1e-4 the LAND mode is reached after 78 s with an overshoot of 0.4 m, with 1e-3 after 50.4 s
-//! (and 2 s more to the ground, 2 s more until disarmed) with an overshoot of 0.1 m and a median error of 0.065 m,
-//! with 2e-3 the loop is unstable near the ground. Only 1e-3 fits all that the thesis reports, so the exponent is taken
-//! for a misprint. `K_i` is as printed. [`ThesisConfig::as_printed`] has the printed gain.
+//! `K_p`: the printed 1e-6 m/s per pixel moves the vehicle by less than 0.7 mm/s at the edge of the image.
+//! What is left is an integrator that steers an integrator, without damping: it passes the pad after half a
+//! minute, swings further in pixels with every metre of descent, and the marker leaves the view; of 12 such
+//! flights none had landed after 200 s. With 1e-4 the LAND mode is reached after 78 s with an overshoot of
+//! 0.4 m, with 1e-3 after 50.4 s (and 2 s more to the ground, 2 s more until disarmed) with an overshoot of
+//! 0.1 m and a median error of 0.065 m, with 2e-3 the loop is unstable near the ground. Only 1e-3 fits all
+//! that the thesis reports, so the exponent is taken for a misprint. `K_i` is as printed.
+//! [`ThesisConfig::as_printed`] has the printed gain.
 //!
-//! Two additions do not show in a flight with the marker in view: the envelope of all guidances applies, so the wind noise
-//! cannot push the vehicle down without a detection, and a marker that stays lost leads to a hold.
+//! Two additions do not show in a flight with the marker in view: the envelope of all guidances applies, so
+//! the wind noise cannot push the vehicle down without a detection, and a marker that stays lost leads to a
+//! hold.
 
 use geometry::{Ned, Vector};
 use rand_chacha::ChaCha8Rng;
@@ -69,7 +71,8 @@ impl Guidance for Thesis {
         situation.age_s <= config.stale_target_s + if is_low { config.low_grace_s } else { 0.0 }
     }
 
-    /// Algorithm 18: one frame, with or without the marker, becomes the velocity command until the next frame.
+    /// Algorithm 18: one frame, with or without the marker, becomes the velocity command until the next
+    /// frame.
     fn observe(&mut self, frame: &FrameObservation, heading_rad: f64, altitude_m: f64) {
         self.step_wind();
         let [wind_right, wind_forward, wind_up] = self.wind_m_s;
@@ -109,7 +112,7 @@ impl Guidance for Thesis {
         (self.command, self.why)
     }
 
-    /// Stops; the sums stay, as the thesis' script knows no pause.
+    /// Stops; the sums stay, as the thesis' script has no pause.
     fn reset(&mut self) {
         self.command = Vector::zero();
         self.progress = Progress::Unchanged;

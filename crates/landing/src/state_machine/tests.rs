@@ -213,14 +213,14 @@ fn nothing_is_sent_during_a_take_off() {
 }
 
 mod every_transition {
-    //! Everything the machine can do: it is driven through every event of an alphabet from every state that it can be
-    //! in, where two states count as the same when phase, reason, flags, retries and the timeouts already over agree.
+    //! Everything the state machine can do: every event of an alphabet in every reachable state, where two
+    //! states are the same when phase, reason, flags, retries and the expired timeouts agree.
 
     use super::*;
     use std::collections::hash_map::Entry;
     use std::collections::{HashMap, VecDeque};
 
-    /// What tells two states apart.
+    /// What distinguishes two states.
     type Key = (Phase, Reason, bool, bool, bool, u32, [bool; 4], bool);
 
     const LONG_S: f64 = 1e6;
@@ -421,7 +421,7 @@ mod every_transition {
         }
     }
 
-    /// Left alone with a vehicle that flies or lands as asked, whatever state it is in ends.
+    /// Without further events every state ends, with a vehicle that flies or lands as commanded.
     fn ends(machine: &StateMachine) -> bool {
         let mut machine = machine.clone();
         for _ in 0..200 {

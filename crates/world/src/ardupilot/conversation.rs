@@ -1,4 +1,4 @@
-//! What the autopilot answers to what it is sent.
+//! The autopilot's reactions to received packets.
 
 use autopilot::dialect::{
     LANDING_TARGET_DATA, MavCmd, MavFrame, MavMessage, MavModeFlag, MavResult, MavSeverity,
@@ -12,8 +12,8 @@ use super::parameters::{Parameter, Parameters, Shown};
 use super::steering::Nose;
 use super::{SimulatedAutopilot, nanoseconds, packet};
 
-/// Setpoints that wait out their latency.
-const MOST_SETPOINTS: usize = 64;
+/// Maximum number of setpoints that wait for their latency.
+const MAX_SETPOINTS: usize = 64;
 /// param2 of the arm command that makes it unconditional.
 const FORCE: f32 = 21196.0;
 /// Number of the command with which SET_MODE is acknowledged: its own message number.
@@ -46,7 +46,7 @@ impl SimulatedAutopilot {
             }
             MavMessage::SET_MODE(m) => {
                 let custom = m.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_CUSTOM_MODE_ENABLED);
-                let result = if custom { self.set_mode(now_s, m.custom_mode) } else { FAILED };
+                let result = if custom { self.change_mode(now_s, m.custom_mode) } else { FAILED };
                 self.acknowledge(SET_MODE, result, from);
             }
             MavMessage::SET_POSITION_TARGET_LOCAL_NED(target) => self.take_setpoint(now_s, target),
@@ -65,11 +65,11 @@ impl SimulatedAutopilot {
                 };
                 self.send(&MavMessage::TIMESYNC(reply));
             }
-            other => self.talk_of_parameters(other),
+            other => self.handle_parameter(other),
         }
     }
 
-    fn talk_of_parameters(&mut self, message: &MavMessage) {
+    fn handle_parameter(&mut self, message: &MavMessage) {
         match message {
             MavMessage::PARAM_REQUEST_LIST(_) => {
                 for index in 0..usize::from(Parameters::COUNT) {
@@ -115,7 +115,7 @@ impl SimulatedAutopilot {
                 }
                 // A number that is none names no mode.
                 let number = if second >= 0.0 { second as u32 } else { u32::MAX };
-                if custom { self.set_mode(now_s, number) } else { FAILED }
+                if custom { self.change_mode(now_s, number) } else { FAILED }
             }
             MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => {
                 self.arm_or_disarm(now_s, first, second == FORCE)
@@ -130,7 +130,7 @@ impl SimulatedAutopilot {
             MavCmd::MAV_CMD_NAV_TAKEOFF => {
                 accepted(self.flight.take_off(now_s, f64::from(values[6]), &self.estimate))
             }
-            MavCmd::MAV_CMD_NAV_LAND => self.set_mode(now_s, Mode::Land as u32),
+            MavCmd::MAV_CMD_NAV_LAND => self.change_mode(now_s, Mode::Land as u32),
             MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => self.set_interval(now_s, first, second),
             MavCmd::MAV_CMD_REQUEST_MESSAGE => {
                 self.acknowledge(command as u16, accepted(self.can_tell(first as u32)), from);
@@ -153,7 +153,7 @@ impl SimulatedAutopilot {
         }
     }
 
-    fn set_mode(&mut self, now_s: f64, number: u32) -> MavResult {
+    fn change_mode(&mut self, now_s: f64, number: u32) -> MavResult {
         let Some(mode) = Mode::from_number(number) else {
             self.text(MavSeverity::MAV_SEVERITY_WARNING, &format!("No such mode {number}"));
             return FAILED;
@@ -167,7 +167,7 @@ impl SimulatedAutopilot {
     }
 
     fn set_px4_mode(&mut self, now_s: f64, main: u8, sub: u8) -> MavResult {
-        let Some(mode) = self.px4.asked(now_s, main, sub) else {
+        let Some(mode) = self.px4.request(now_s, main, sub) else {
             return MavResult::MAV_RESULT_TEMPORARILY_REJECTED;
         };
         if mode == Mode::Guided {
@@ -178,7 +178,7 @@ impl SimulatedAutopilot {
         ACCEPTED
     }
 
-    /// The frames and fields that each firmware takes; ArduPilot says once that it takes no other.
+    /// Accepts the frames and fields of each firmware; ArduPilot reports another frame once.
     fn take_landing_target(&mut self, now_s: f64, target: &LANDING_TARGET_DATA) {
         let place = [target.x, target.y, target.z].map(f64::from);
         let valid = target.position_valid.bits() == 1;
@@ -256,14 +256,18 @@ impl SimulatedAutopilot {
         MavResult::MAV_RESULT_DENIED
     }
 
-    /// Velocities in the frames that ArduPilot takes; everything else it cannot fly is a stop.
+    /// Accepts velocities in the frames that ArduPilot supports; any other setpoint is a stop.
     fn take_setpoint(&mut self, now_s: f64, target: &SET_POSITION_TARGET_LOCAL_NED_DATA) {
         self.px4.setpoint_came(now_s);
         if self.is_px4() && !self.px4.is_offboard() {
             return;
         }
-        let setpoint = self.setpoint(target).unwrap_or(Setpoint::STOP);
-        if self.setpoints.len() >= MOST_SETPOINTS {
+        self.queue_setpoint(now_s, self.setpoint(target).unwrap_or(Setpoint::STOP));
+    }
+
+    /// Queues a setpoint, which takes effect after its latency.
+    pub(super) fn queue_setpoint(&mut self, now_s: f64, setpoint: Setpoint) {
+        if self.setpoints.len() >= MAX_SETPOINTS {
             self.setpoints.pop_front();
         }
         self.setpoints.push_back((now_s + self.config.setpoint_latency_s, setpoint));

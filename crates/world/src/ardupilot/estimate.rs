@@ -1,4 +1,4 @@
-//! What the autopilot believes of its motion: the truth with the errors of a state estimator.
+//! The autopilot's state estimate: the truth with the errors of a state estimator.
 
 use rand_chacha::ChaCha8Rng;
 
@@ -17,11 +17,11 @@ pub struct EstimateConfig {
     pub position_drift_m: f64,
     /// Deviation of the height's slow error (a time constant of 10 s), in metres.
     pub height_drift_m: f64,
-    /// Believed height over true height: the barometer's error.
+    /// Estimated height over true height: the barometer's error.
     pub height_scale: f64,
     /// Time constant with which the estimate takes that error over, in seconds.
     pub height_lag_s: f64,
-    /// Believed vertical speed over the true one.
+    /// Estimated vertical speed over the true one.
     pub climb_scale: f64,
     /// Deviation of the constant error of roll and pitch, in radians.
     pub trim_rad: f64,
@@ -29,14 +29,15 @@ pub struct EstimateConfig {
     pub lean_drift_rad: f64,
     /// Deviation of the constant error of the heading, in radians.
     pub heading_bias_rad: f64,
-    /// Deviation of the horizontal velocity's error as a filter with a wrong tilt makes it, in m/s per axis; 0 is none. The tilt
-    /// wanders, its part of gravity adds up to a velocity, and that to a position, which GNSS holds.
+    /// Deviation of the horizontal velocity's error as a filter with a wrong tilt makes it, in m/s per axis;
+    /// 0 is none. The tilt wanders, its part of gravity adds up to a velocity, and that to a position, which
+    /// GNSS holds.
     pub wander_m_s: f64,
     /// Time constants of that tilt and of that velocity, in seconds.
     pub wander_s: f64,
-    /// Velocity with which the believed position moves away from the true one from the world's begin on, in m/s.
+    /// Drift velocity of the estimated position from the world's begin on, in m/s.
     pub gnss_drift_m_s: [f64; 2],
-    /// By how much the believed position jumps, in metres, and when, in seconds after the world's begin.
+    /// Jump of the estimated position, in metres, and its time, in seconds after the world's begin.
     pub gnss_jump: Option<([f64; 2], f64)>,
 }
 
@@ -62,7 +63,7 @@ impl Default for EstimateConfig {
 }
 
 impl EstimateConfig {
-    /// An estimator that knows the truth.
+    /// An estimator without errors.
     pub fn perfect() -> Self {
         Self {
             velocity_bias_m_s: 0.0,
@@ -82,7 +83,7 @@ impl EstimateConfig {
         }
     }
 
-    /// The same with all errors that the logs show so many times as large; wander, drift and jumps of GNSS stay.
+    /// The same with all errors of the logs scaled by a factor; wander, GNSS drift and jumps stay.
     #[must_use]
     pub fn times(&self, factor: f64) -> Self {
         Self {
@@ -100,7 +101,7 @@ impl EstimateConfig {
     }
 }
 
-/// Believed motion. Arrays are north, east, down, from where the autopilot has its local origin.
+/// The estimated motion. Arrays are north, east, down, from where the autopilot has its local origin.
 #[derive(Copy, Clone, Debug, Default, PartialEq)]
 pub(super) struct Estimate {
     /// In metres.
@@ -117,13 +118,13 @@ pub(super) struct Estimate {
     pub(super) yaw: f64,
     /// About the body's axes, in rad/s.
     pub(super) rates: [f64; 3],
-    /// Believed minus true roll, in radians.
+    /// Estimated minus true roll, in radians.
     pub(super) roll_error: f64,
-    /// Believed minus true pitch, in radians.
+    /// Estimated minus true pitch, in radians.
     pub(super) pitch_error: f64,
-    /// Believed minus true heading, in radians.
+    /// Estimated minus true heading, in radians.
     pub(super) yaw_error: f64,
-    /// By how much the believed position has just been reset, in metres.
+    /// The reset of the estimated position in this step, in metres.
     pub(super) reset: Option<[f64; 2]>,
 }
 
@@ -136,7 +137,7 @@ struct Wander {
     position: f64,
 }
 
-/// Time constant with which GNSS holds the believed position, in seconds.
+/// Time constant with which GNSS corrects the estimated position, in seconds.
 const GNSS_HOLDS_S: f64 = 0.6;
 
 impl Wander {
@@ -228,7 +229,7 @@ impl Estimator {
         jump
     }
 
-    /// Lets `dt_s` pass and gives what is believed of `truth`.
+    /// Advances by `dt_s` and returns the estimate of `truth`.
     pub(super) fn step(&mut self, dt_s: f64, truth: &VehicleTruth) -> Estimate {
         let reset = self.drift(dt_s);
         let drifts = if self.begun_s.is_some() { self.config.gnss_drift_m_s } else { [0.0; 2] };
@@ -245,7 +246,7 @@ impl Estimator {
         self.height_error +=
             (barometer_error - self.height_error) * lag(dt_s, self.config.height_lag_s);
         let (roll, pitch, yaw) = truth.ned_from_body.euler();
-        // Who believes to lean less to the right than is true believes to be pulled to the left.
+        // An estimated roll smaller than the true one looks like an acceleration to the left.
         let (sin, cos) = yaw.sin_cos();
         let [north_m_s2, east_m_s2] = [north.pull.value(), east.pull.value()];
         let ahead_rad = (north_m_s2 * cos + east_m_s2 * sin) / GRAVITY_M_S2;

@@ -1,4 +1,4 @@
-//! What the autopilot does with the vehicle: modes, arming, takeoff, velocity setpoints, landing.
+//! The autopilot's decisions: modes, arming, takeoff, velocity setpoints, landing.
 
 use rand_chacha::ChaCha8Rng;
 
@@ -14,7 +14,7 @@ use crate::vehicle::{Demand, HeadingDemand, VehicleTruth};
 /// A flight mode, with ArduPilot Copter's number.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// Hands of a pilot; nobody touches the sticks here, so the vehicle stays where it is.
+    /// A pilot's mode; the sticks are centred, so the vehicle stays where it is.
     Stabilize = 0,
     /// As above.
     AltHold = 2,
@@ -54,7 +54,7 @@ pub enum Landed {
     OnGround = 1,
     /// Flying.
     InAir = 2,
-    /// On the way up.
+    /// Climbing after a takeoff.
     TakingOff = 3,
     /// In LAND.
     Landing = 4,
@@ -81,7 +81,7 @@ impl Setpoint {
     }
 }
 
-/// What happened, for those who are told in text.
+/// An event that is reported as text.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(super) enum Happening {
     /// The motors were switched off.
@@ -293,7 +293,7 @@ impl Flight {
             steering.shift(by);
         }
         let mut demand = steering.steer(dt_s, now, &wish, &Envelope::new(parameters));
-        // The loops see the believed attitude, so its errors become errors of the true one.
+        // The loops use the estimated attitude, so its errors become errors of the true one.
         demand.roll_rad -= now.roll_error;
         demand.pitch_rad -= now.pitch_error;
         if let HeadingDemand::Angle(angle, _) = &mut demand.heading {

@@ -2,11 +2,13 @@
 //!
 //! It knows no socket: packets go in and come out, and time is an argument.
 //!
-//! Modules in reading order: `estimate` is what it believes of its motion, `flight` decides, `steering` flies by
-//! the smooth paths of `shaping` and to the target of `precision`, `px4` has the rules of the other firmware, `conversation` answers the link, `telemetry` tells, `parameters` and `packet` serve
-//! both.
+//! Modules in reading order: `estimate` is its state estimate, `flight` decides, `steering` follows the
+//! smooth paths of `shaping` and the target of `precision`, `px4` has the rules of the other firmware,
+//! `conversation` handles received packets, `telemetry` sends; `parameters` and `packet` serve both; `direct`
+//! does without packets.
 
 mod conversation;
+mod direct;
 mod estimate;
 mod flight;
 mod packet;
@@ -27,6 +29,7 @@ use autopilot::dialect::{
 use autopilot::packet::encode;
 use geometry::{Ned, Vector};
 
+pub use direct::ReportedMotion;
 pub use estimate::EstimateConfig;
 pub use flight::{Landed, Mode};
 pub use parameters::Parameter;
@@ -84,15 +87,15 @@ impl Default for AutopilotConfig {
 pub enum Firmware {
     /// Those that were measured of ArduPilot.
     ArduPilot,
-    /// Those that PX4's documentation tells: modes, OFFBOARD, takeoff, messages. It flies as the other does.
+    /// Those of PX4's documentation: modes, OFFBOARD, takeoff, messages. It flies as ArduPilot does.
     Px4,
 }
 
-/// What a serial line carries before the first packet of a real autopilot.
+/// Text that a real autopilot sends before its first packet.
 const BOOT_TEXT: &str = "\r\n\r\nInit ArduCopter V4.5.4 (simulated)\r\n\r\nFree RAM: 131072\r\n";
 
-/// Packets that wait to be fetched; the oldest are lost first.
-const MOST_WAITING: usize = 2048;
+/// Maximum number of packets that wait to be fetched; the oldest are dropped first.
+const MAX_WAITING: usize = 2048;
 /// Components: the autopilot, and the ground station whose heartbeats are forwarded.
 const AUTOPILOT: u8 = 1;
 const GROUND_STATION: Sender = Sender { system: 255, component: 190 };
@@ -172,11 +175,6 @@ impl SimulatedAutopilot {
         self.flight.carry([by.x(), by.y(), by.z()]);
     }
 
-    /// Whether there is a parameter of this name.
-    pub fn has_parameter(name: &str) -> bool {
-        Parameters::new().by_name(name).is_some()
-    }
-
     /// The flight mode.
     pub fn mode(&self) -> Mode {
         self.flight.mode()
@@ -187,7 +185,7 @@ impl SimulatedAutopilot {
         self.flight.armed()
     }
 
-    /// Where the vehicle is between ground and air, as the autopilot believes.
+    /// The autopilot's landed state.
     pub fn landed(&self) -> Landed {
         self.flight.landed()
     }
@@ -197,7 +195,7 @@ impl SimulatedAutopilot {
         self.readiness == Readiness::Ready
     }
 
-    /// Lets time pass until `now_s`, in seconds since the boot, and says what the motors shall do from then on.
+    /// Advances to `now_s`, in seconds since the boot, and returns the demand on the vehicle.
     pub fn step(&mut self, now_s: f64, truth: &VehicleTruth) -> Demand {
         let dt_s = (now_s - self.now_s).clamp(1e-4, 0.1);
         self.now_s = now_s;
@@ -327,7 +325,7 @@ impl SimulatedAutopilot {
     }
 
     fn push(&mut self, make: impl FnOnce(u8) -> Vec<u8>) {
-        if self.outgoing.len() >= MOST_WAITING {
+        if self.outgoing.len() >= MAX_WAITING {
             self.outgoing.pop_front();
         }
         self.outgoing.push_back(make(self.sequence));

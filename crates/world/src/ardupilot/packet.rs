@@ -11,7 +11,8 @@ const TEXT: usize = 50;
 /// Where the payload of a MAVLink 2 packet begins.
 const PAYLOAD: usize = 10;
 
-/// The acknowledgement of a command number, which need not be one that the dialect knows, addressed to who sent it.
+/// The acknowledgement of any command number, also one that the dialect does not define, addressed to the
+/// sender.
 pub(super) fn acknowledgement(
     me: Sender,
     sequence: u8,

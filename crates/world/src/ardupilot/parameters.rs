@@ -15,7 +15,7 @@ pub enum Parameter {
     LandSpeed,
     /// First speed of LAND, in cm/s; 0 takes the descent speed of missions.
     LandSpeedHigh,
-    /// Whether it lands on a target that it is told (1) or not (0).
+    /// Whether it lands on a reported target (1) or not (0).
     PrecisionLanding,
     /// Where that target comes from: 1 is MAVLink.
     PrecisionType,
@@ -37,7 +37,7 @@ pub enum Parameter {
     SpeedUp,
 }
 
-/// Name, type, default, least and greatest value.
+/// Name, type, default, minimum and maximum.
 type Row = (Parameter, &'static str, MavParamType, f32, f32, f32);
 
 const REAL: MavParamType = MavParamType::MAV_PARAM_TYPE_REAL32;
@@ -91,12 +91,12 @@ impl Parameters {
         f64::from(found.map_or(0.0, |(_, value)| value))
     }
 
-    /// Takes a value; one out of range becomes the nearest in range, one that is no number changes nothing.
+    /// Sets a value, clamped to its range; NaN and infinity change nothing.
     pub(super) fn set(&mut self, name: &str, value: f32) -> Option<Shown> {
         let index = TABLE.iter().position(|row| row.1 == name)?;
-        let (.., least, most) = *TABLE.get(index)?;
+        let (.., min, max) = *TABLE.get(index)?;
         if value.is_finite() {
-            *self.values.get_mut(index)? = value.clamp(least, most);
+            *self.values.get_mut(index)? = value.clamp(min, max);
         }
         self.by_index(index)
     }

@@ -1,15 +1,15 @@
-//! ArduPilot's precision landing, as far as it was measured: it believes a target after 2 s of reports without gaps, and
-//! moves over it while LAND descends.
+//! ArduPilot's precision landing, as far as it was measured: it accepts a target after 2 s of reports without
+//! gaps, and moves over it while LAND descends.
 
-/// Reports must come for so long, with shorter gaps than this, in seconds.
+/// Minimum time of reports, and the longest gap between them, in seconds.
 const STEADY_S: f64 = 2.0;
-const LONGEST_GAP_S: f64 = 0.5;
-/// A target is forgotten after so long a silence, in seconds.
+const MAX_GAP_S: f64 = 0.5;
+/// Time without a report after which the target is discarded, in seconds.
 const FORGOTTEN_S: f64 = 4.0;
 /// Time constant of its filter, in seconds.
 const FILTER_S: f64 = 0.3;
 
-/// Where the target is believed to be.
+/// The estimated target.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Precision {
     place: [f64; 2],
@@ -22,20 +22,20 @@ impl Precision {
         if !place.iter().all(|metres| metres.is_finite()) {
             return;
         }
-        let lasts = self.steady.filter(|(_, last_s)| now_s - last_s < LONGEST_GAP_S);
+        let lasts = self.steady.filter(|(_, last_s)| now_s - last_s < MAX_GAP_S);
         let Some((since_s, last_s)) = lasts else {
             self.place = place;
             self.steady = Some((now_s, now_s));
             return;
         };
         let share = 1.0 - (-(now_s - last_s) / FILTER_S).exp();
-        for (believed, reported) in self.place.iter_mut().zip(place) {
-            *believed += share * (reported - *believed);
+        for (estimate, reported) in self.place.iter_mut().zip(place) {
+            *estimate += share * (reported - *estimate);
         }
         self.steady = Some((since_s, now_s));
     }
 
-    /// Where to land, once it is known for long enough.
+    /// The target, once it has been reported for long enough.
     pub(super) fn target(&self, now_s: f64) -> Option<[f64; 2]> {
         let (since_s, last_s) = self.steady?;
         (last_s - since_s >= STEADY_S && now_s - last_s < FORGOTTEN_S).then_some(self.place)
@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_target_is_believed_after_two_seconds_and_forgotten_after_four() {
+    fn a_target_is_accepted_after_two_seconds_and_discarded_after_four() {
         let mut precision = Precision::default();
         for step in 0..40 {
             assert_eq!(precision.target(0.05 * f64::from(step)), None);

@@ -1,6 +1,7 @@
-//! The same vehicle under PX4's rules, as its documentation tells them and not measured: modes by two numbers, OFFBOARD
-//! only with a stream of setpoints before and during (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a
-//! takeoff to an altitude over the sea, and a heartbeat that says so once a second.
+//! The same vehicle under PX4's rules, taken from its documentation and not measured: modes by two numbers,
+//! OFFBOARD only with a stream of setpoints before and during
+//! (<https://docs.px4.io/main/en/flight_modes/offboard.html>), a takeoff to an altitude over the sea, and a
+//! heartbeat that says so once a second.
 
 use autopilot::FlightMode;
 use autopilot::dialect::{ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, MavMessage};
@@ -9,11 +10,11 @@ use super::flight::{Landed, Mode};
 
 /// COM_OF_LOSS_T, in seconds.
 const LOSS_S: f64 = 1.0;
-/// Setpoints must have come for so long, at 2 Hz or more, in seconds.
+/// Minimum time for which setpoints must have arrived at 2 Hz or more, in seconds.
 const PROOF_S: f64 = 1.0;
 const PROOF_GAP_S: f64 = 0.5;
 
-/// What a PX4 remembers beside what ArduPilot does.
+/// The state of a PX4 in addition to ArduPilot's.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Px4 {
     /// Since when setpoints have come, and when the last one did.
@@ -28,8 +29,8 @@ impl Px4 {
         self.stream = Some((lasts.map_or(now_s, |(since_s, _)| since_s), now_s));
     }
 
-    /// The mode that a companion asks for, in the terms of this vehicle; `None` when it is refused.
-    pub(super) fn asked(&mut self, now_s: f64, main: u8, sub: u8) -> Option<Mode> {
+    /// The requested mode in ArduPilot's terms; `None` when it is refused.
+    pub(super) fn request(&mut self, now_s: f64, main: u8, sub: u8) -> Option<Mode> {
         let proven = self.stream.is_some_and(|(since_s, last_s)| {
             now_s - since_s >= PROOF_S && now_s - last_s <= PROOF_GAP_S
         });
@@ -60,7 +61,7 @@ impl Px4 {
         lost
     }
 
-    /// What the heartbeat shows.
+    /// The mode that the heartbeat reports.
     pub(super) fn shown(&self, mode: Mode, landed: Landed) -> FlightMode {
         match mode {
             Mode::Guided if self.offboard => FlightMode::OFFBOARD,
@@ -73,7 +74,7 @@ impl Px4 {
     }
 }
 
-/// How PX4 tells of its estimator.
+/// PX4's report of its estimator.
 pub(super) fn estimator_status(has_position: bool) -> MavMessage {
     // Attitude and vertical motion; with a position also horizontal motion and places.
     let bits = if has_position { 831 } else { 1 + 4 + 32 };
@@ -90,25 +91,25 @@ mod tests {
     #[test]
     fn offboard_needs_setpoints_before_and_during() {
         let mut px4 = Px4::default();
-        assert_eq!(px4.asked(0.0, 6, 0), None, "no setpoint yet");
+        assert_eq!(px4.request(0.0, 6, 0), None, "no setpoint yet");
         for step in 0..12 {
             px4.setpoint_came(0.1 * f64::from(step));
         }
-        assert_eq!(px4.asked(1.15, 6, 0), Some(Mode::Guided));
+        assert_eq!(px4.request(1.15, 6, 0), Some(Mode::Guided));
         assert_eq!(px4.shown(Mode::Guided, Landed::InAir), FlightMode::OFFBOARD);
         assert!(!px4.misses_setpoints(2.0));
         assert!(px4.misses_setpoints(2.2), "its failsafe");
         assert_eq!(px4.shown(Mode::Loiter, Landed::InAir), FlightMode::AUTO_HOLD);
         px4.setpoint_came(5.0);
-        assert_eq!(px4.asked(5.1, 6, 0), None, "a gap begins anew");
+        assert_eq!(px4.request(5.1, 6, 0), None, "a gap begins anew");
     }
 
     #[test]
-    fn the_two_ways_to_land_are_told_apart() {
+    fn land_and_precision_land_are_distinguished() {
         let mut px4 = Px4::default();
-        assert_eq!(px4.asked(0.0, 4, 6), Some(Mode::Land));
+        assert_eq!(px4.request(0.0, 4, 6), Some(Mode::Land));
         assert_eq!(px4.shown(Mode::Land, Landed::Landing), FlightMode::AUTO_LAND);
-        assert_eq!(px4.asked(0.0, 4, 9), Some(Mode::Land));
+        assert_eq!(px4.request(0.0, 4, 9), Some(Mode::Land));
         assert_eq!(px4.shown(Mode::Land, Landed::Landing), FlightMode::AUTO_PRECLAND);
         assert_eq!(px4.shown(Mode::Guided, Landed::TakingOff), FlightMode::AUTO_TAKEOFF);
     }

@@ -1,4 +1,5 @@
-//! How ArduPilot smooths what it is asked to do: velocities become accelerations within limits of acceleration and jerk.
+//! ArduPilot's smoothing of setpoints: velocities become accelerations within limits of acceleration and
+//! jerk.
 
 use crate::laws::square_root_law;
 

@@ -1,5 +1,5 @@
-//! From a wanted motion to lean, thrust and heading: ArduPilot's position controller (`AC_PosControl`) with its
-//! default gains.
+//! From a commanded motion to tilt, thrust and heading: ArduPilot's position controller (`AC_PosControl`)
+//! with its default gains.
 
 use std::f64::consts::TAU;
 
@@ -28,7 +28,7 @@ pub struct SteeringConfig {
     pub acceleration_z_i: f64,
     /// Corner frequency of the filters on velocity errors, in Hz.
     pub velocity_filter_hz: f64,
-    /// Largest lean (ANGLE_MAX), in radians.
+    /// Maximum tilt (ANGLE_MAX), in radians.
     pub lean_limit_rad: f64,
 }
 
@@ -75,7 +75,7 @@ impl Envelope {
     }
 }
 
-/// What the vehicle is to do.
+/// The commanded motion.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(super) struct Wish {
     /// North and east, in m/s.
@@ -84,16 +84,16 @@ pub(super) struct Wish {
     pub(super) nose: Nose,
 }
 
-/// What the vertical axis is to do.
+/// The commanded vertical motion.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(super) enum Vertical {
     /// Move at this speed, in m/s downwards.
     Velocity(f64),
-    /// Go to this height (as z, in metres downwards), at this speed at most.
+    /// Go to this height (as z, in metres downwards), with this maximum speed.
     Position(f64, f64),
 }
 
-/// What the nose is to do.
+/// The commanded heading.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(super) enum Nose {
     /// Turn into the direction of travel when it is fast enough.
@@ -205,7 +205,7 @@ impl Steering {
         let right = cos * east - sin * north;
         let pitch = -(forward / GRAVITY_M_S2).atan();
         let roll = (right * pitch.cos() / GRAVITY_M_S2).atan();
-        // The thrust is divided by the lean's cosine, so that the vertical part stays what is asked.
+        // The thrust is divided by the tilt's cosine, so that its vertical part is the commanded one.
         let upright = (now.roll.cos() * now.pitch.cos()).max(0.5);
         Demand {
             thrust_m_s2: (self.lift(dt_s, now, envelope.vertical.acceleration) / upright).max(0.0),

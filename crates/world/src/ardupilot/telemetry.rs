@@ -1,4 +1,4 @@
-//! What the autopilot tells, and when: each message at the interval that was asked for.
+//! The autopilot's telemetry: each message at the requested interval.
 
 use autopilot::FlightMode;
 use autopilot::dialect::{
@@ -17,7 +17,7 @@ use super::estimate::Estimate;
 use super::flight::{Landed, Mode};
 use crate::vehicle::{GRAVITY_M_S2, VehicleTruth};
 
-/// Message numbers that can be asked for, by the stream of REQUEST_DATA_STREAM they belong to (0: none).
+/// Message numbers that can be requested, by the stream of REQUEST_DATA_STREAM they belong to (0: none).
 const MESSAGES: [(u32, u8); 19] = [
     (1, 2),
     (2, 12),
@@ -57,7 +57,8 @@ struct Entry {
 const SHORTEST_S: f64 = 0.0025;
 
 impl Schedule {
-    /// Sends message `id` every `interval_s` from now on, never when `None`; false when there is no such message.
+    /// Sends message `id` every `interval_s` from now on, never when `None`; false when there is no such
+    /// message.
     pub(super) fn set(&mut self, now_s: f64, id: u32, interval_s: Option<f64>) -> bool {
         if !MESSAGES.iter().any(|(known, _)| *known == id) {
             return false;
@@ -114,7 +115,7 @@ impl Default for Origin {
 }
 
 impl Origin {
-    /// Latitude and longitude in 1e-7 degrees at so many metres to the north and east.
+    /// Latitude and longitude in 1e-7 degrees of a point in metres to the north and east.
     fn global(&self, north_m: f64, east_m: f64) -> (i32, i32) {
         // ArduPilot's metres per degree of latitude.
         const METRES_PER_DEGREE: f64 = 111_318.845;
@@ -134,7 +135,7 @@ pub(super) enum Readiness {
     Ready,
 }
 
-/// All that messages are made of.
+/// The contents of all messages.
 #[derive(Copy, Clone, Debug)]
 pub(super) struct Situation<'a> {
     pub(super) now_s: f64,
@@ -184,7 +185,7 @@ impl Situation<'_> {
         })
     }
 
-    /// The message with this number; `None` when there is nothing to tell yet.
+    /// The message with this number; `None` when it is not available yet.
     pub(super) fn message(&self, id: u32) -> Option<MavMessage> {
         let message = match id {
             0 => self.heartbeat(),
@@ -521,7 +522,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stream_overwrites_what_was_asked_before() {
+    fn a_stream_overrides_earlier_requests() {
         let mut schedule = Schedule::default();
         schedule.set(0.0, 30, Some(0.02));
         schedule.set_stream(0.0, 10, None);

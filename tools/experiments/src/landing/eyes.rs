@@ -156,7 +156,7 @@ impl Eyes {
         {
             pad.position = pad.position + Vector::new(0.0, metres, 0.0);
         }
-        if let Some((from_s, to_s, metres)) = faults.lie
+        if let Some((from_s, to_s, metres)) = faults.offset
             && request.begun_s.is_some_and(|now_s| (from_s..to_s).contains(&now_s))
         {
             pad.position = pad.position + Vector::new(metres, 0.0, 0.0);

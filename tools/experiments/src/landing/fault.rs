@@ -47,8 +47,8 @@ const TABLE: [Row; 23] = [
     }),
     ("lie", "detections are off by 0.5 m for 1 s, at any time", |part| {
         let from_s = 1.0 + 9.0 * part;
-        let lie = Some((from_s, from_s + 1.0, 0.5));
-        Change { vision: VisionFaults { lie, ..VisionFaults::default() }, ..Change::default() }
+        let offset = Some((from_s, from_s + 1.0, 0.5));
+        Change { vision: VisionFaults { offset, ..VisionFaults::default() }, ..Change::default() }
     }),
     ("stamp-jumps", "a tenth of the stamps jumps by up to 250 ms", |_| {
         simulator(&["camera.stamp_jumps=0.1", "camera.stamp_jump_ms=250"])

@@ -17,8 +17,8 @@ fn a_velocity_bias_is_observed_within_two_seconds() {
     assert!((bias - Vector::new(0.0, -0.5, 0.0)).norm() < 0.1, "{bias:?}");
 }
 
-/// The largest bias observed of a vehicle that moves and reports to move east at 0.5 m/s, with states and ticks at the given
-/// times, and with a reported position that is shifted north as a function of time.
+/// The largest bias observed of a vehicle that moves and reports to move east at 0.5 m/s, with states and
+/// ticks at the given times, and with a reported position that is shifted north as a function of time.
 fn largest_bias(times: impl Iterator<Item = (f64, f64)>, north: impl Fn(f64) -> f64) -> f64 {
     let mut metric = Metric::new(MetricConfig::default());
     let mut largest_m_s = 0.0f64;

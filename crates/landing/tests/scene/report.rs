@@ -25,15 +25,16 @@ pub(crate) const HEADER: &str = "| case | flights | touched | aborted | within 0
 /// One row about these flights.
 pub(crate) fn row(name: &str, flights: &[Flight]) -> String {
     let touched: Vec<&Flight> =
-        flights.iter().filter(|f| f.touch.is_some() && !f.aborted).collect();
+        flights.iter().filter(|f| f.touchdown.is_some() && !f.aborted).collect();
     let pick = |part: f64, of: &dyn Fn(&Flight) -> f64| {
         let mut values: Vec<f64> = touched.iter().map(|f| of(f)).collect();
         values.sort_by(f64::total_cmp);
         let last = values.len().saturating_sub(1);
         values.get((last as f64 * part).round() as usize).copied().unwrap_or(f64::NAN)
     };
-    let touch =
-        |of: fn(&super::Touch) -> f64| move |f: &Flight| f.touch.as_ref().map_or(f64::NAN, of);
+    let touch = |of: fn(&super::Touchdown) -> f64| {
+        move |f: &Flight| f.touchdown.as_ref().map_or(f64::NAN, of)
+    };
     let error = |f: &Flight| f.error_m;
     let disarm = |f: &Flight| f.disarm_s.unwrap_or(f64::INFINITY);
     format!(

@@ -1,0 +1,356 @@
+//! Landings in the world of `crates/world`, with the lander in the place of the controller: states at 50 Hz,
+//! frames as they arrive, ticks at 20 Hz, setpoints as the controller sends them. One seed gives one flight,
+//! to the bit.
+
+#![allow(dead_code, reason = "each test uses a part of it")]
+
+pub(crate) mod cases;
+pub(crate) mod eyes;
+pub(crate) mod report;
+
+use std::collections::VecDeque;
+
+use geometry::{Ned, Point};
+use landing::{
+    Action, Config, Decision, Event, Landed, Lander, Mode, OperatorCommand, Phase, Timestamp,
+    VehicleState,
+};
+use world::ardupilot::{self, EstimateConfig};
+use world::camera::CameraFaults;
+use world::vehicle::VehicleTruth;
+use world::vision::VisionFaults;
+use world::wind::WindConfig;
+use world::world::STEP_S;
+use world::{World, WorldConfig};
+
+use eyes::Eyes;
+
+/// Minimum interval between setpoints that are not sent with a frame, in seconds.
+const SETPOINT_PERIOD_S: f64 = 0.04;
+/// Age of a state on arrival, in seconds.
+const STATE_AGE_S: f64 = 0.005;
+/// Steps of the world between two states, and between two ticks.
+const STATE_STEPS: u32 = 8;
+const TICK_STEPS: u32 = 20;
+
+/// One flight's circumstances. Times count from the start of the landing.
+#[derive(Clone, Debug)]
+pub(crate) struct Scene {
+    pub(crate) seed: u64,
+    pub(crate) config: Config,
+    pub(crate) world: WorldConfig,
+    pub(crate) camera: CameraFaults,
+    pub(crate) vision: VisionFaults,
+    pub(crate) frames_hz: f64,
+    /// The detector reports a covariance.
+    pub(crate) has_covariance: bool,
+    /// Size of the marker relative to the thesis'.
+    pub(crate) marker_scale: f64,
+    /// The camera is turned about the vertical by this much more than configured, clockwise seen from above.
+    pub(crate) camera_turned_rad: f64,
+    /// Its image is mirrored.
+    pub(crate) mirrored: bool,
+    /// The operator's commands, by time.
+    pub(crate) commands: Vec<(f64, OperatorCommand)>,
+    /// The autopilot ignores the request to land.
+    pub(crate) refuses_land: bool,
+    /// The pilot takes over at this time.
+    pub(crate) pilot_s: Option<f64>,
+    /// Maximum duration, in seconds.
+    pub(crate) limit_s: f64,
+}
+
+/// What happened at one time.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Sample {
+    pub(crate) seconds: f64,
+    pub(crate) position: Point<Ned>,
+    pub(crate) decision: Decision,
+}
+
+/// The moment of the touchdown; velocities are relative to the pad.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Touchdown {
+    /// Horizontal distance from the pad, in metres.
+    pub(crate) error_m: f64,
+    pub(crate) sink_m_s: f64,
+    pub(crate) slide_m_s: f64,
+    pub(crate) tilt_rad: f64,
+    pub(crate) heading_rad: f64,
+}
+
+/// One flight.
+#[derive(Debug)]
+pub(crate) struct Flight {
+    pub(crate) samples: Vec<Sample>,
+    pub(crate) phase: Phase,
+    /// Seconds until LAND, until the ground, and until disarmed.
+    pub(crate) land_s: Option<f64>,
+    pub(crate) touchdown_s: Option<f64>,
+    pub(crate) disarm_s: Option<f64>,
+    pub(crate) touchdown: Option<Touchdown>,
+    /// As in `touchdown`; infinite without one.
+    pub(crate) error_m: f64,
+    /// Largest distance beyond the pad, along the line to it, in metres.
+    pub(crate) overshoot_m: f64,
+    pub(crate) max_tilt_rad: f64,
+    /// The landing was aborted before the touchdown.
+    pub(crate) aborted: bool,
+}
+
+impl Scene {
+    /// The thesis' field in calm air: 10 m over the origin, the pad at (1.5, -1.5).
+    pub(crate) fn new(seed: u64) -> Self {
+        let mut world = WorldConfig::default();
+        world.vehicle.rotor_m = 0.2;
+        world.vehicle.start_height_m = 10.0;
+        world.autopilot.setpoint_latency_s = 0.03;
+        Self {
+            seed,
+            config: Config::default(),
+            world,
+            camera: CameraFaults {
+                latency_s: 0.08,
+                jitter_s: 0.02,
+                mount_error_rad: 0.002,
+                ..CameraFaults::default()
+            },
+            vision: VisionFaults { miss: 0.03, ..VisionFaults::default() },
+            frames_hz: 15.0,
+            has_covariance: true,
+            marker_scale: 1.0,
+            camera_turned_rad: 0.0,
+            mirrored: false,
+            commands: vec![(0.0, OperatorCommand::Start)],
+            refuses_land: false,
+            pilot_s: None,
+            limit_s: 120.0,
+        }
+    }
+
+    /// The same in wind from a direction that the seed draws.
+    pub(crate) fn windy(seed: u64, mean_m_s: f64, turbulence: f64) -> Self {
+        let from_rad = seed as f64 * 2.399;
+        let mut scene = Self::new(seed);
+        scene.world.wind = WindConfig { mean_m_s, from_rad, turbulence, ..WindConfig::default() };
+        scene
+    }
+
+    /// The same with a change.
+    pub(crate) fn with(mut self, change: impl FnOnce(&mut Self)) -> Self {
+        change(&mut self);
+        self
+    }
+
+    /// The same from another start.
+    pub(crate) fn from(self, start: Point<Ned>) -> Self {
+        self.with(|scene| {
+            scene.world.vehicle.start = Point::new(start.x(), start.y(), 0.0);
+            scene.world.vehicle.start_height_m = -start.z();
+        })
+    }
+
+    /// The same with an autopilot and a mount without errors.
+    pub(crate) fn perfect(self) -> Self {
+        self.with(|scene| {
+            scene.world.autopilot.estimate = EstimateConfig::perfect();
+            scene.camera.mount_error_rad = 0.0;
+        })
+    }
+
+    /// Flies until the landing ends or the time is over.
+    pub(crate) fn fly(self) -> Flight {
+        let mut flight = Flight::new();
+        let Ok(mut lander) = Lander::new(self.config) else { return flight };
+        let mut run = Run::new(&self);
+        let mut step = 0u32;
+        while run.seconds() < self.limit_s {
+            let before = run.world.truth();
+            run.advance();
+            for event in run.events(step) {
+                let decision = lander.step(Timestamp::from_seconds(run.seconds()), event);
+                run.obey(decision, matches!(event, Event::Frame(_)));
+                flight.note(&run, decision);
+            }
+            flight.watch(&run, &before);
+            step += 1;
+            let is_over = flight.disarm_s.is_some_and(|at| run.seconds() > at + 1.0);
+            if is_over || lander.phase() == Phase::Landed {
+                break;
+            }
+        }
+        flight.phase = lander.phase();
+        flight
+    }
+}
+
+impl Flight {
+    fn new() -> Self {
+        Self {
+            samples: Vec::new(),
+            phase: Phase::Idle,
+            land_s: None,
+            touchdown_s: None,
+            disarm_s: None,
+            touchdown: None,
+            error_m: f64::INFINITY,
+            overshoot_m: 0.0,
+            max_tilt_rad: 0.0,
+            aborted: false,
+        }
+    }
+
+    fn note(&mut self, run: &Run<'_>, decision: Decision) {
+        self.aborted |= decision.phase == Phase::Aborted && self.touchdown.is_none();
+        let position = run.world.truth().position;
+        self.samples.push(Sample { seconds: run.seconds(), position, decision });
+    }
+
+    fn watch(&mut self, run: &Run<'_>, before: &VehicleTruth) {
+        let (now, seconds) = (run.world.truth(), run.seconds());
+        let pad = run.world.pad_at(run.world.now_s());
+        let away = now.position - pad.position;
+        let start = &run.scene.world.vehicle.start;
+        let line = run.scene.world.pad.position - *start;
+        if line.horizontal_norm() > 0.1 {
+            let beyond = (away.x() * line.x() + away.y() * line.y()) / line.horizontal_norm();
+            self.overshoot_m = self.overshoot_m.max(beyond);
+        }
+        self.max_tilt_rad = self.max_tilt_rad.max(now.tilt_rad());
+        if now.on_ground && self.touchdown.is_none() {
+            let velocity = before.velocity - pad.velocity;
+            self.touchdown_s = Some(seconds);
+            self.error_m = away.horizontal_norm();
+            self.touchdown = Some(Touchdown {
+                error_m: self.error_m,
+                sink_m_s: velocity.z(),
+                slide_m_s: velocity.horizontal_norm(),
+                tilt_rad: before.tilt_rad(),
+                heading_rad: now.ned_from_body.euler().2,
+            });
+        }
+        if run.world.autopilot().mode() == ardupilot::Mode::Land {
+            self.land_s.get_or_insert(seconds);
+        }
+        if !run.world.autopilot().armed() {
+            self.disarm_s.get_or_insert(seconds);
+        }
+    }
+
+    /// The first sample at or after `seconds`.
+    pub(crate) fn at(&self, seconds: f64) -> Option<&Sample> {
+        self.samples.iter().find(|sample| sample.seconds >= seconds)
+    }
+
+    /// True when the vehicle touched down far from the pad, hard or sliding, in a landing that was not
+    /// aborted.
+    pub(crate) fn is_unsafe(&self) -> bool {
+        self.touchdown.is_some_and(|it| {
+            !self.aborted && (it.error_m > 0.3 || it.sink_m_s > 0.8 || it.slide_m_s > 0.5)
+        })
+    }
+}
+
+/// A flight while it is flown.
+struct Run<'a> {
+    scene: &'a Scene,
+    world: World,
+    start_s: f64,
+    eyes: Eyes,
+    commands: VecDeque<(f64, OperatorCommand)>,
+    sent_s: f64,
+}
+
+impl<'a> Run<'a> {
+    fn new(scene: &'a Scene) -> Self {
+        let mut world = World::new(&scene.world, scene.seed);
+        world.begin();
+        Self {
+            start_s: world.now_s(),
+            eyes: Eyes::new(scene),
+            commands: scene.commands.iter().copied().collect(),
+            sent_s: f64::NEG_INFINITY,
+            world,
+            scene,
+        }
+    }
+
+    fn seconds(&self) -> f64 {
+        self.world.now_s() - self.start_s
+    }
+
+    fn advance(&mut self) {
+        self.world.advance_to(self.world.now_s() + STEP_S);
+        if self.scene.pilot_s.is_some_and(|at| self.seconds() >= at) {
+            self.set_mode(ardupilot::Mode::Loiter);
+        }
+        self.eyes.look(self.scene, &self.world, self.seconds());
+    }
+
+    fn set_mode(&mut self, mode: ardupilot::Mode) {
+        let now_s = self.world.now_s();
+        self.world.autopilot_mut().set_mode(now_s, mode);
+    }
+
+    fn events(&mut self, step: u32) -> Vec<Event> {
+        let now_s = self.seconds();
+        let mut events = Vec::new();
+        if step.is_multiple_of(STATE_STEPS) && !self.world.link_is_lost() {
+            events.push(Event::Vehicle(self.state()));
+        }
+        events.extend(self.eyes.arrived(now_s).map(Event::Frame));
+        if step.is_multiple_of(TICK_STEPS) {
+            events.push(Event::Tick);
+        }
+        if self.commands.front().is_some_and(|(at, _)| *at <= now_s) {
+            events.extend(self.commands.pop_front().map(|(_, command)| Event::Operator(command)));
+        }
+        events
+    }
+
+    fn state(&self) -> VehicleState {
+        let autopilot = self.world.autopilot();
+        let reported = autopilot.reported();
+        VehicleState {
+            stamp: Timestamp::from_seconds(self.seconds() - STATE_AGE_S),
+            ned_from_body: reported.ned_from_body,
+            position: reported.position,
+            velocity: reported.velocity,
+            mode: match autopilot.mode() {
+                ardupilot::Mode::Guided => Mode::Guided,
+                ardupilot::Mode::Land => Mode::Land,
+                _ => Mode::Other,
+            },
+            armed: autopilot.armed(),
+            landed: match autopilot.landed() {
+                ardupilot::Landed::OnGround => Landed::OnGround,
+                ardupilot::Landed::InAir => Landed::InAir,
+                ardupilot::Landed::TakingOff => Landed::TakingOff,
+                ardupilot::Landed::Landing => Landed::Landing,
+            },
+        }
+    }
+
+    /// Sends what was decided, as the controller does.
+    fn obey(&mut self, decision: Decision, is_frame: bool) {
+        if self.world.link_is_lost() {
+            return;
+        }
+        let now_s = self.world.now_s();
+        match decision.action {
+            Action::None => {}
+            Action::Land if self.scene.refuses_land => {}
+            Action::Land => self.set_mode(ardupilot::Mode::Land),
+            Action::Guided => self.set_mode(ardupilot::Mode::Guided),
+            Action::Disarm => {
+                self.world.autopilot_mut().disarm();
+            }
+            Action::Velocity { velocity, yaw_rate } => {
+                if is_frame || now_s - self.sent_s >= SETPOINT_PERIOD_S - 1e-6 {
+                    self.sent_s = now_s;
+                    self.world.autopilot_mut().set_velocity(now_s, velocity, yaw_rate);
+                }
+            }
+        }
+    }
+}
