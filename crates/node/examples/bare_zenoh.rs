@@ -3,7 +3,7 @@
 //! It has the configuration, the quality of service and the threads of the services but no other code of theirs,
 //! so it shows the part of Zenoh in a frame's latency. Build it with
 //! `cargo build --release -p node --example bare_zenoh`; then
-//! `cargo test --release -p tests --test link -- table onehost` runs it in turns with frames through `node` and
+//! `cargo bench -p tests -- link onehost` runs it in turns with frames through `node` and
 //! with a plain ring of buffers. `bare_zenoh PERIOD_US FRAMES WARM_UP BYTES` prints the latency of each frame
 //! and the processor time as JSON.
 

@@ -10,8 +10,8 @@
 use std::sync::Mutex;
 
 use anyhow::Context;
-use experiments::landing::eyes::errors;
 use experiments::landing::plots::{COLOURS, picture};
+use experiments::landing::sim_vision::errors;
 use fiducial::Detector;
 use geometry::{Point, Rotation, Transform, Vector};
 use imaging::GrayView;

@@ -13,9 +13,9 @@ use world::World;
 use world::vehicle::VehicleTruth;
 use world::world::STEP_S;
 
-use super::eyes::{Arrival, DETECTOR, Eyes};
 use super::outcome::{Ending, Outcome};
 use super::plan::Planned;
+use super::sim_vision::{Arrival, DETECTOR, SimVision};
 
 /// Steps of the world per tick of the controller: 25 ms.
 const TICK_STEPS: u64 = 10;
@@ -54,15 +54,15 @@ pub struct Sample {
 /// # Errors
 /// When a setting is invalid or a frame cannot be rendered.
 pub fn fly(planned: &Planned, trace: Option<&mut Vec<Sample>>) -> anyhow::Result<Outcome> {
-    let mut rehearsal = Rehearsal::new(planned)
+    let mut flight = LockstepFlight::new(planned)
         .with_context(|| format!("seed {} of {}", planned.seed, planned.cell))?;
-    rehearsal.run(trace)?;
-    Ok(rehearsal.outcome)
+    flight.run(trace)?;
+    Ok(flight.outcome)
 }
 
-struct Rehearsal {
+struct LockstepFlight {
     world: World,
-    eyes: Eyes,
+    vision: SimVision,
     controller: Flight,
     from_world: Parser,
     to_world: Parser,
@@ -74,22 +74,22 @@ struct Rehearsal {
     outcome: Outcome,
 }
 
-impl Rehearsal {
+impl LockstepFlight {
     fn new(planned: &Planned) -> anyhow::Result<Self> {
         let layers = |set: &[String]| Layers { file: None, set: set.to_vec() };
         let simulated: simulator::Config =
             layers(&planned.change.simulator).load::<simulator::Config>()?.settings;
         let controlled = layers(&planned.change.controller).load::<controller::Config>()?.settings;
         let world = World::new(&simulated.world(), simulated.seed);
-        let eyes = Eyes::new(&simulated, planned.vision, planned.change.vision)?;
+        let vision = SimVision::new(&simulated, planned.vision, planned.change.vision)?;
         let mut controller = Flight::new(controlled, std::sync::Arc::default())?;
         let frame_period_s = 1.0 / simulated.camera.rate_hz;
         controller.presence(stamp_ns(world.now_s()), DETECTOR, true);
-        controller.camera(eyes.info().clone());
+        controller.camera(vision.info().clone());
         Ok(Self {
             sequence: (world.now_s() / frame_period_s) as u64 + 1,
             world,
-            eyes,
+            vision,
             controller,
             from_world: Parser::new(),
             to_world: Parser::new(),
@@ -144,8 +144,8 @@ impl Rehearsal {
     fn update_vision(&mut self) -> anyhow::Result<()> {
         let now_s = self.world.now_s();
         let time_s = self.sequence as f64 * self.frame_period_s;
-        if now_s >= time_s + 0.5 * self.eyes.exposure_s() + STEP_S {
-            let arrivals = self.eyes.look(&self.world, self.sequence, time_s, stamp_ns)?;
+        if now_s >= time_s + 0.5 * self.vision.exposure_s() + STEP_S {
+            let arrivals = self.vision.observe(&self.world, self.sequence, time_s, stamp_ns)?;
             self.sequence += 1;
             self.outcome.frames += u64::from(!arrivals.is_empty());
             for arrival in arrivals {

@@ -2,16 +2,16 @@
 //! network or a clock, so that a seed reproduces a flight to the bit.
 //!
 //! Modules in reading order: [`plan`] has the flights, with the faults of [`fault`]; [`flight`] flies one,
-//! with the vision of [`eyes`], rendered or modelled; [`outcome`] is its result; [`table`] summarises many;
+//! with the vision of [`sim_vision`], rendered or modelled; [`outcome`] is its result; [`table`] summarises many;
 //! [`plots`] and [`thesis_figures`] draw; [`report`] writes the report.
 
-pub mod eyes;
 pub mod fault;
 pub mod flight;
 pub mod outcome;
 pub mod plan;
 pub mod plots;
 pub mod report;
+pub mod sim_vision;
 pub mod table;
 pub mod thesis_figures;
 

@@ -22,16 +22,16 @@ pub const DETECTOR: &str = "main";
 const BLUR_STEP_S: f64 = 1e-3;
 
 /// Camera and detector of one flight.
-pub struct Eyes {
+pub struct SimVision {
     camera: SimCamera,
-    seer: Seer,
+    detector: SimDetector,
     info: CameraInfo,
     model: CameraModel,
     faults: VisionFaults,
     family: &'static str,
 }
 
-enum Seer {
+enum SimDetector {
     Rendered { detector: Box<Detector>, pixels: Vec<u8> },
     Modelled(Box<Vision>),
 }
@@ -45,7 +45,7 @@ pub struct Arrival {
     pub message: Detections,
 }
 
-impl Eyes {
+impl SimVision {
     /// The vision of a simulator's configuration.
     ///
     /// # Errors
@@ -59,22 +59,22 @@ impl Eyes {
         let marker = config.pad_marker().map_err(anyhow::Error::msg)?;
         let settings = camera.settings();
         let model = settings.model;
-        let seer = match how {
+        let detector = match how {
             plan::Vision::Rendered => {
                 let set = vec![format!("markers=[\"{}\"]", config.pad.marker)];
                 let detector = Layers { file: None, set }.load::<detector::Config>()?.settings;
-                Seer::Rendered {
+                SimDetector::Rendered {
                     detector: Box::new(detector.detector().map_err(anyhow::Error::msg)?),
                     pixels: vec![0; model.width as usize * model.height as usize],
                 }
             }
             plan::Vision::Modelled => {
                 let size_m = marker.size_m.context("the pad's marker has no size")?;
-                Seer::Modelled(Box::new(Vision::new(RINGS, model, size_m, config.seed)))
+                SimDetector::Modelled(Box::new(Vision::new(RINGS, model, size_m, config.seed)))
             }
         };
         let info = CameraInfo::new(&config.camera.name, &model, &settings.body_from_camera);
-        Ok(Self { camera, seer, info, model, faults, family: marker.family.name() })
+        Ok(Self { camera, detector, info, model, faults, family: marker.family.name() })
     }
 
     /// The camera information for the controller.
@@ -91,7 +91,7 @@ impl Eyes {
     ///
     /// # Errors
     /// When a frame cannot be rendered.
-    pub fn look(
+    pub fn observe(
         &mut self,
         world: &World,
         sequence: u64,
@@ -102,15 +102,15 @@ impl Eyes {
         let begun_s = world.since_begin_s(time_s);
         let request = FrameRequest { sequence, time_s, begun_s, pad: world.pad_at(time_s) };
         let Some(passage) = self.camera.open(&request, &truth) else { return Ok(Vec::new()) };
-        let detections = match &mut self.seer {
-            Seer::Rendered { detector, pixels } => {
+        let detections = match &mut self.detector {
+            SimDetector::Rendered { detector, pixels } => {
                 self.camera.render(&request, |s| world.truth_at(s), pixels)?;
                 let (width, height) = (self.info.width as usize, self.info.height as usize);
                 let view = GrayView::packed(pixels, width, height).context("an image")?;
                 let found = detector.detect(view, Some(&self.model), &mut ());
                 found.iter().map(wire::detection).collect()
             }
-            Seer::Modelled(_) => self.model_detections(world, &request, &truth),
+            SimDetector::Modelled(_) => self.model_detections(world, &request, &truth),
         };
         let header = FrameHeader {
             camera: self.info.camera.clone(),
@@ -139,7 +139,7 @@ impl Eyes {
         request: &FrameRequest,
         truth: &VehicleTruth,
     ) -> Vec<Detection> {
-        let Seer::Modelled(vision) = &mut self.seer else { return Vec::new() };
+        let SimDetector::Modelled(vision) = &mut self.detector else { return Vec::new() };
         let mut pad = request.pad;
         let camera_from_marker = self.camera.camera_from_marker(truth, &pad);
         let before = self.camera.camera_from_marker(
