@@ -1,7 +1,7 @@
 //! Logs of real and simulated flights: every packet is found, and the client reports changes when they
 //! happen.
 //!
-//! The logs are not part of the repository; without them these tests say so and pass.
+//! The recordings are not part of the repository; a short log of our own is.
 
 #![allow(
     clippy::unwrap_used,
@@ -131,7 +131,7 @@ fn changes_of_client(log: &[u8]) -> (Vec<(f64, Change)>, Autopilot) {
     (changes, client)
 }
 
-fn told_by_events(events: &[Value]) -> Vec<(f64, Change)> {
+fn changes_of_events(events: &[Value]) -> Vec<(f64, Change)> {
     let text = |event: &Value| event["name"].as_str().unwrap().to_owned();
     let first =
         events.iter().find(|event| text(event) == "HEARTBEAT").unwrap()["wall"].as_f64().unwrap();
@@ -167,28 +167,41 @@ fn told_by_events(events: &[Value]) -> Vec<(f64, Change)> {
     changes
 }
 
+/// Compares the changes that the client reports with the events of a log; how many they are.
+fn compare_with_events(log: &Path, events: &[u8]) -> usize {
+    let events: Vec<Value> = serde_json::from_slice(events).unwrap();
+    let (changes, client) = changes_of_client(&std::fs::read(log).unwrap());
+    let expected = changes_of_events(&events);
+    assert_eq!(changes.len(), expected.len(), "{changes:?}\n{expected:?}");
+    for ((at, what), (expected_at, expected)) in changes.iter().zip(&expected) {
+        assert_eq!(what, expected, "at {at} s");
+        assert!((at - expected_at).abs() < 0.1, "{what:?} at {at} s, expected at {expected_at} s");
+    }
+    assert!(expected.iter().any(|(_, what)| *what == Change::Mode(FlightMode::Land)));
+    assert_eq!(client.refused_numbers(), 0);
+    assert!(client.state().unwrap().position.is_some());
+    expected.len()
+}
+
+/// The flight that `flight.py` wrote with pymavlink.
+#[test]
+fn a_flight_written_by_pymavlink_is_followed() {
+    let log = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/flight.tlog");
+    let (packets, counters) = parse(&std::fs::read(&log).unwrap());
+    assert_eq!(packets.len(), 352);
+    assert_eq!(counters.bad_bytes, 8 * packets.len() as u64, "only the times are no packets");
+    assert_eq!((counters.undecodable, counters.unknown_ids), (0, 0));
+    let events = std::fs::read(log.with_extension("events.json")).unwrap();
+    assert_eq!(compare_with_events(&log, &events), 9);
+}
+
 #[test]
 fn the_client_reports_changes_when_they_happen() {
     let Some(folder) = testing::recording("ardupilot") else { return };
     let mut compared = 0;
     for path in logs(&folder) {
-        let events = path.with_extension("tlog.events.json");
-        let Ok(events) = std::fs::read(events) else { continue };
-        let events: Vec<Value> = serde_json::from_slice(&events).unwrap();
-        let (changes, client) = changes_of_client(&std::fs::read(&path).unwrap());
-        let expected = told_by_events(&events);
-        assert_eq!(changes.len(), expected.len(), "{changes:?}\n{expected:?}");
-        for ((at, what), (expected_at, expected)) in changes.iter().zip(&expected) {
-            assert_eq!(what, expected, "at {at} s");
-            assert!(
-                (at - expected_at).abs() < 0.1,
-                "{what:?} at {at} s, expected at {expected_at} s"
-            );
-            compared += 1;
-        }
-        assert!(expected.iter().any(|(_, what)| *what == Change::Mode(FlightMode::Land)));
-        assert_eq!(client.refused_numbers(), 0);
-        assert!(client.state().unwrap().position.is_some());
+        let Ok(events) = std::fs::read(path.with_extension("tlog.events.json")) else { continue };
+        compared += compare_with_events(&path, &events);
     }
     println!("{compared} changes reported at the right time");
     assert!(compared > 10);
