@@ -19,11 +19,12 @@ use crate::dialect::{
     COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
     MavType, TIMESYNC_DATA,
 };
+use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
 use crate::packet::{self, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
-use crate::stream::{Notice, Stream, Streams};
+use crate::stream::{Stream, Streams};
 use crate::text::Joiner;
 
 /// The component id of every autopilot.
@@ -100,101 +101,6 @@ pub fn default_streams(rate_hz: f64) -> Vec<Stream> {
         welcome(132, 10.0),    // DISTANCE_SENSOR
         welcome(147, 1.0),     // BATTERY_STATUS
     ]
-}
-
-/// An event of the conversation.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Event {
-    /// The autopilot was found.
-    Found {
-        /// Its system id.
-        system: u8,
-        /// Its firmware.
-        firmware: Firmware,
-    },
-    /// Another vehicle is on the same link; it is ignored. Reported once: pin the right one in the
-    /// configuration.
-    OtherVehicle {
-        /// Its system id.
-        system: u8,
-    },
-    /// Another companion uses our ids, probably a second controller of the same vehicle. Reported once.
-    SameAddress {
-        /// Our ids.
-        sender: Sender,
-    },
-    /// The heartbeat was lost.
-    Lost {
-        /// The silence.
-        silence: Duration,
-    },
-    /// The heartbeat is back.
-    Returned,
-    /// The autopilot restarted: requests are lost, and its origin may have changed.
-    Restarted,
-    /// A new attitude.
-    Attitude(Attitude),
-    /// A new position.
-    Position(Position),
-    /// A new distance measured downwards.
-    Range(Range),
-    /// The whole state, after each attitude and position.
-    State(VehicleState),
-    /// The flight mode changed.
-    ModeChanged {
-        /// The mode before; none at the beginning.
-        from: Option<FlightMode>,
-        /// The mode now.
-        to: FlightMode,
-    },
-    /// The motors were armed (true) or disarmed.
-    ArmedChanged(bool),
-    /// The contact with the ground changed.
-    LandedChanged {
-        /// The state before.
-        from: LandedState,
-        /// The state now.
-        to: LandedState,
-    },
-    /// Its readiness to fly changed.
-    ReadyChanged {
-        /// Whether it is ready.
-        ready: bool,
-        /// What is missing, as texts.
-        reasons: Vec<String>,
-    },
-    /// A text of the autopilot.
-    Text {
-        /// Its severity.
-        severity: MavSeverity,
-        /// The whole text.
-        text: String,
-    },
-    /// A command is finished.
-    Command {
-        /// The request.
-        id: CommandId,
-        /// The command.
-        command: Command,
-        /// The result.
-        result: Result<(), CommandError>,
-    },
-    /// A required message does not stream at the requested rate, in spite of repeated requests.
-    StreamMissing {
-        /// Its name.
-        message: &'static str,
-        /// Requested rate, in Hz.
-        wanted_hz: f64,
-        /// Measured rate, in Hz.
-        measured_hz: f64,
-    },
-    /// A missing message streams again.
-    StreamRestored {
-        /// Its name.
-        message: &'static str,
-        /// Measured rate, in Hz.
-        measured_hz: f64,
-    },
 }
 
 /// The conversation with one autopilot.
@@ -437,7 +343,7 @@ impl Autopilot {
             return Err(SetpointError::NotFlying(state.landed));
         }
         let time_ms = (now_ns / 1_000_000) as u32;
-        let target = (vehicle.system, AUTOPILOT);
+        let target = Sender { system: vehicle.system, component: AUTOPILOT };
         self.send(&compose::velocity(time_ms, velocity, yaw_rate, target));
         Ok(())
     }
@@ -508,7 +414,8 @@ impl Autopilot {
         self.proof_due_ns = now_ns.saturating_add(PROOF_PERIOD_NS);
         let Some(system) = self.system() else { return };
         let time_ms = (now_ns / 1_000_000) as u32;
-        self.send(&compose::velocity(time_ms, Vector::zero(), 0.0, (system, AUTOPILOT)));
+        let target = Sender { system, component: AUTOPILOT };
+        self.send(&compose::velocity(time_ms, Vector::zero(), 0.0, target));
     }
 
     fn take_time(&mut self, now_ns: i64, from: Sender, message: &TIMESYNC_DATA) {
@@ -851,17 +758,4 @@ fn streams_of(firmware: Firmware, streams: &[Stream]) -> Vec<Stream> {
         streams.push(Stream { message_id: GLOBAL_POSITION_INT, rate_hz: 2.0, required: true });
     }
     streams
-}
-
-impl From<Notice> for Event {
-    fn from(notice: Notice) -> Self {
-        match notice {
-            Notice::Missing { message, wanted_hz, measured_hz } => {
-                Self::StreamMissing { message, wanted_hz, measured_hz }
-            }
-            Notice::Restored { message, measured_hz } => {
-                Self::StreamRestored { message, measured_hz }
-            }
-        }
-    }
 }

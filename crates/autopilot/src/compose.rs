@@ -7,6 +7,7 @@ use crate::dialect::{
     MavMessage, MavModeFlag, MavSeverity, MavState, MavType, PositionTargetTypemask,
     SET_POSITION_TARGET_LOCAL_NED_DATA, STATUSTEXT_DATA,
 };
+use crate::packet::Sender;
 
 /// Maximum length of the text in one packet, in bytes.
 const PART: usize = 50;
@@ -49,12 +50,7 @@ pub fn status_text(severity: MavSeverity, text: &str, id: u16) -> Vec<MavMessage
 ///
 /// Type mask 1479: position, acceleration and yaw are ignored. With the yaw rate ignored as well, ArduPilot
 /// would turn the nose into the direction of travel.
-pub fn velocity(
-    time_ms: u32,
-    velocity: Vector<Ned>,
-    yaw_rate: f64,
-    target: (u8, u8),
-) -> MavMessage {
+pub fn velocity(time_ms: u32, velocity: Vector<Ned>, yaw_rate: f64, target: Sender) -> MavMessage {
     MavMessage::SET_POSITION_TARGET_LOCAL_NED(SET_POSITION_TARGET_LOCAL_NED_DATA {
         time_boot_ms: time_ms,
         vx: velocity.x() as f32,
@@ -62,8 +58,8 @@ pub fn velocity(
         vz: velocity.z() as f32,
         yaw_rate: yaw_rate as f32,
         type_mask: PositionTargetTypemask::from_bits_retain(1479),
-        target_system: target.0,
-        target_component: target.1,
+        target_system: target.system,
+        target_component: target.component,
         coordinate_frame: MavFrame::MAV_FRAME_LOCAL_NED,
         ..Default::default()
     })

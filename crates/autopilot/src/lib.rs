@@ -11,15 +11,16 @@
 //!
 //! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it,
 //! [`packet`] finds MAVLink packets in them, [`mode`], [`state`] and [`parameter`] are what the vehicle
-//! reports, [`clock`] converts its time stamps, [`client`] is the conversation with it, [`command`] is what
-//! can be requested and why it may fail, [`takeoff`] arms the vehicle and takes off, [`compose`] makes the
-//! messages that a companion sends.
+//! reports, [`clock`] converts its time stamps, [`client`] is the conversation with it, [`event`] its events,
+//! [`command`] is what can be requested and why it may fail, [`takeoff`] arms the vehicle and takes off,
+//! [`compose`] makes the messages that a companion sends.
 
 pub mod address;
 pub mod client;
 pub mod clock;
 pub mod command;
 pub mod compose;
+pub mod event;
 pub mod link;
 pub mod mode;
 pub mod packet;
@@ -37,8 +38,9 @@ pub mod dialect {
 }
 
 pub use address::Address;
-pub use client::{Autopilot, Config, Event};
+pub use client::{Autopilot, Config};
 pub use command::{Command, CommandError, CommandId, CommandStatus};
+pub use event::Event;
 pub use link::{Link, LinkEvent, LinkSender};
 pub use mode::{Firmware, FlightMode};
 pub use packet::{Packet, Parser, Sender};
