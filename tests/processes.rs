@@ -35,7 +35,7 @@ async fn it_lands_with_other_programs_watching_and_without_the_ground_station() 
         .split("connect: {")
         .nth(1)
         .and_then(|rest| rest.split("127.0.0.1:").nth(1)?.split('"').next().map(str::to_owned))
-        .context("the meeting point's port")?;
+        .context("the rendezvous port")?;
     let client = python("tests/zenoh_client.py", &[&format!("tcp/127.0.0.1:{port}")]);
     if let Some(client) = client {
         tokio::task::block_in_place(|| python_passes(&client.wait_with_output()?))?;

@@ -13,7 +13,7 @@ use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// The local configuration with another meeting point.
+/// The local configuration with another rendezvous port.
 fn local(port: u16) -> ZenohSource {
     let text = include_str!("../../zenoh-config/local.json5");
     ZenohSource::Text(text.replace(":7447", &format!(":{port}")))

@@ -22,7 +22,7 @@ const MARKERS: [(&str, [f64; 2], f64); 3] = [
     ("aruco-4x4-50:3", [480.0, 350.0], 90.0),
 ];
 
-/// The local configuration with another meeting point.
+/// The local configuration with another rendezvous port.
 fn local(port: u16) -> ZenohSource {
     let text = include_str!("../../zenoh-config/local.json5");
     ZenohSource::Text(text.replace(":7447", &format!(":{port}")))

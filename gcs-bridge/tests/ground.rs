@@ -218,7 +218,7 @@ fn free_port() -> anyhow::Result<u16> {
 
 async fn open(service: &'static str, instance: &str, port: u16) -> anyhow::Result<Node> {
     let text = include_str!("../../zenoh-config/local.json5");
-    ensure!(text.contains(":7447"), "the meeting point has moved");
+    ensure!(text.contains(":7447"), "the rendezvous has moved");
     let source = ZenohSource::Text(text.replace(":7447", &format!(":{port}")));
     Node::open(Identity { service, instance: instance.into() }, &source).await
 }

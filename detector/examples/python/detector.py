@@ -390,7 +390,7 @@ def main():
     parser.add_argument("--marker", type=Marker, required=True, help="FAMILY:ID:SIZE_M")
     parser.add_argument("--input", choices=("raw", "jpeg"), default="raw")
     parser.add_argument("--zenoh", default=file if os.path.isfile(file) else "", help="a Zenoh configuration (JSON5)")
-    parser.add_argument("--connect", default=f"tcp/127.0.0.1:{port}", help="the meeting point, without --zenoh")
+    parser.add_argument("--connect", default=f"tcp/127.0.0.1:{port}", help="the rendezvous, without --zenoh")
     parser.add_argument("--vehicle", default=os.environ.get("ALIGHT_VEHICLE", "drone"))
     args = parser.parse_args()
     cv2.setNumThreads(1)
