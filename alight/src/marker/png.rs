@@ -3,7 +3,7 @@
 use anyhow::Context;
 use image::GrayImage;
 use markers::Ink;
-use png::{BitDepth, ColorType, Encoder, PixelDimensions, Unit};
+use png::{BitDepth, ColorType, Compression, Encoder, PixelDimensions, Unit};
 
 use super::glyphs;
 use super::sheet::{Mark, Sheet, SheetError};
@@ -22,6 +22,7 @@ pub(super) fn image(sheet: &Sheet, dpi: u16) -> anyhow::Result<Vec<u8>> {
     let mut encoder = Encoder::new(&mut bytes, pixels.width(), pixels.height());
     encoder.set_color(ColorType::Grayscale);
     encoder.set_depth(BitDepth::Eight);
+    encoder.set_compression(Compression::Fast);
     // Without the size of its pixels a program prints the image at any size.
     let size = PixelDimensions { xppu: per_metre, yppu: per_metre, unit: Unit::Meter };
     encoder.set_pixel_dims(Some(size));
