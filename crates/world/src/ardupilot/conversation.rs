@@ -8,8 +8,8 @@ use autopilot::{Packet, Sender};
 use geometry::{Body, Ned, Rotation, Vector};
 
 use super::flight::{Mode, Setpoint};
-use super::parameters::{Parameter, Parameters, Shown};
-use super::steering::Nose;
+use super::parameters::{Parameter, ParameterValue, Parameters};
+use super::steering::HeadingCommand;
 use super::{SimulatedAutopilot, nanoseconds, packet};
 
 /// Maximum number of setpoints that wait for their latency.
@@ -30,7 +30,7 @@ impl SimulatedAutopilot {
     /// Takes one packet from the link.
     #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
     pub fn handle(&mut self, now_s: f64, packet: &Packet) {
-        let Some(message) = packet.message.as_ref().filter(|message| self.is_for_me(message))
+        let Some(message) = packet.message.as_ref().filter(|message| self.is_addressed(message))
         else {
             return;
         };
@@ -73,13 +73,13 @@ impl SimulatedAutopilot {
         match message {
             MavMessage::PARAM_REQUEST_LIST(_) => {
                 for index in 0..usize::from(Parameters::COUNT) {
-                    self.show(self.parameters.by_index(index), true);
+                    self.send_parameter(self.parameters.by_index(index), true);
                 }
             }
             MavMessage::PARAM_REQUEST_READ(r) => {
                 let by_name = || self.parameters.by_name(r.param_id.to_str().ok()?);
                 let index = usize::try_from(r.param_index);
-                self.show(
+                self.send_parameter(
                     index.map_or_else(|_| by_name(), |index| self.parameters.by_index(index)),
                     true,
                 );
@@ -87,18 +87,19 @@ impl SimulatedAutopilot {
             MavMessage::PARAM_SET(p) => {
                 let shown =
                     self.parameters.set(p.param_id.to_str().unwrap_or_default(), p.param_value);
-                self.show(shown, false);
+                self.send_parameter(shown, false);
             }
             _ => {}
         }
     }
 
     /// Addressed to this autopilot, to all, or to nobody.
-    fn is_for_me(&self, message: &MavMessage) -> bool {
-        let me = self.me();
+    fn is_addressed(&self, message: &MavMessage) -> bool {
+        let sender = self.sender();
         let system = message.target_system_id().unwrap_or(0);
         let component = message.target_component_id().unwrap_or(0);
-        (system == 0 || system == me.system) && (component == 0 || component == me.component)
+        (system == 0 || system == sender.system)
+            && (component == 0 || component == sender.component)
     }
 
     #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
@@ -124,7 +125,7 @@ impl SimulatedAutopilot {
                 // To an altitude over the sea, in a mode of its own.
                 let height_m = f64::from(values[6]) - self.config.origin.altitude_m;
                 self.flight.follow_setpoints(now_s, &self.estimate);
-                self.px4.takes_off();
+                self.px4.on_takeoff();
                 accepted(self.flight.take_off(now_s, height_m, &self.estimate))
             }
             MavCmd::MAV_CMD_NAV_TAKEOFF => {
@@ -133,23 +134,23 @@ impl SimulatedAutopilot {
             MavCmd::MAV_CMD_NAV_LAND => self.change_mode(now_s, Mode::Land as u32),
             MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL => self.set_interval(now_s, first, second),
             MavCmd::MAV_CMD_REQUEST_MESSAGE => {
-                self.acknowledge(command as u16, accepted(self.can_tell(first as u32)), from);
-                self.tell_one(first as u32);
+                self.acknowledge(command as u16, accepted(self.is_available(first as u32)), from);
+                self.send_message(first as u32);
                 return;
             }
             MavCmd::MAV_CMD_GET_HOME_POSITION => {
-                self.tell_one(242);
+                self.send_message(242);
                 ACCEPTED
             }
             MavCmd::MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES => {
-                self.tell_one(148);
+                self.send_message(148);
                 ACCEPTED
             }
             _ => MavResult::MAV_RESULT_UNSUPPORTED,
         };
         self.acknowledge(command as u16, result, from);
         if command == MavCmd::MAV_CMD_COMPONENT_ARM_DISARM && first == 0.0 {
-            self.report_happenings();
+            self.report_events();
         }
     }
 
@@ -161,7 +162,7 @@ impl SimulatedAutopilot {
         let changes = mode != self.flight.mode();
         self.flight.set_mode(now_s, mode, &self.estimate);
         if changes {
-            self.tell_one(0);
+            self.send_message(0);
         }
         ACCEPTED
     }
@@ -235,8 +236,8 @@ impl SimulatedAutopilot {
         match self.flight.arm(now_s) {
             Ok(()) => {
                 self.text(MavSeverity::MAV_SEVERITY_INFO, "Arming motors");
-                self.tell_one(49);
-                self.tell_one(242);
+                self.send_message(49);
+                self.send_message(242);
                 ACCEPTED
             }
             Err(reason) => {
@@ -258,7 +259,7 @@ impl SimulatedAutopilot {
 
     /// Accepts velocities in the frames that ArduPilot supports; any other setpoint is a stop.
     fn take_setpoint(&mut self, now_s: f64, target: &SET_POSITION_TARGET_LOCAL_NED_DATA) {
-        self.px4.setpoint_came(now_s);
+        self.px4.on_setpoint(now_s);
         if self.is_px4() && !self.px4.is_offboard() {
             return;
         }
@@ -295,15 +296,15 @@ impl SimulatedAutopilot {
         let heading = self.estimate.yaw;
         let (sin, cos) = if relative { heading.sin_cos() } else { (0.0, 1.0) };
         let nose = match (mask & YAW == 0, mask & YAW_RATE == 0) {
-            (true, _) => Nose::Angle(if relative { heading + yaw } else { yaw }),
-            (false, true) => Nose::Rate(yaw_rate),
-            (false, false) => Nose::Follow,
+            (true, _) => HeadingCommand::Angle(if relative { heading + yaw } else { yaw }),
+            (false, true) => HeadingCommand::Rate(yaw_rate),
+            (false, false) => HeadingCommand::Follow,
         };
         Some(Setpoint { velocity: [cos * x - sin * y, sin * x + cos * y, down], nose })
     }
 
-    fn show(&mut self, shown: Option<Shown>, indexed: bool) {
-        let Some(Shown { index, name, kind, value }) = shown else { return };
+    fn send_parameter(&mut self, shown: Option<ParameterValue>, indexed: bool) {
+        let Some(ParameterValue { index, name, kind, value }) = shown else { return };
         self.send(&MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
             param_value: value,
             param_count: Parameters::COUNT,
@@ -314,7 +315,7 @@ impl SimulatedAutopilot {
     }
 
     fn acknowledge(&mut self, command: u16, result: MavResult, to: Sender) {
-        let me = self.me();
-        self.push(|sequence| packet::acknowledgement(me, sequence, command, result, to));
+        let sender = self.sender();
+        self.push(|sequence| packet::acknowledgement(sender, sequence, command, result, to));
     }
 }

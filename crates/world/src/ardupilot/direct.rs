@@ -4,7 +4,7 @@ use geometry::{Body, Ned, Point, Rotation, Vector};
 
 use super::SimulatedAutopilot;
 use super::flight::{Mode, Setpoint};
-use super::steering::Nose;
+use super::steering::HeadingCommand;
 
 /// The vehicle's motion as the autopilot estimates it.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -33,7 +33,10 @@ impl SimulatedAutopilot {
     /// Takes a velocity setpoint in m/s with a yaw rate in rad/s.
     pub fn set_velocity(&mut self, now_s: f64, velocity: Vector<Ned>, yaw_rate_rad_s: f64) {
         let velocity = [velocity.x(), velocity.y(), velocity.z()];
-        self.queue_setpoint(now_s, Setpoint { velocity, nose: Nose::Rate(yaw_rate_rad_s) });
+        self.queue_setpoint(
+            now_s,
+            Setpoint { velocity, nose: HeadingCommand::Rate(yaw_rate_rad_s) },
+        );
     }
 
     /// Changes the flight mode.

@@ -6,7 +6,9 @@ use super::estimate::Estimate;
 use super::parameters::{Parameter, Parameters};
 use super::precision::Precision;
 use super::shaping::norm;
-use super::steering::{Envelope, Nose, Steering, SteeringConfig, Vertical, Wish};
+use super::steering::{
+    Envelope, HeadingCommand, MotionCommand, Steering, SteeringConfig, VerticalCommand,
+};
 use crate::drift::{random_stream, uniform};
 use crate::laws::square_root_law;
 use crate::vehicle::{Demand, HeadingDemand, VehicleTruth};
@@ -65,17 +67,17 @@ pub enum Landed {
 pub(super) struct Setpoint {
     /// In m/s.
     pub(super) velocity: [f64; 3],
-    pub(super) nose: Nose,
+    pub(super) nose: HeadingCommand,
 }
 
 impl Setpoint {
     /// Stop.
-    pub(super) const STOP: Self = Self { velocity: [0.0; 3], nose: Nose::Rate(0.0) };
+    pub(super) const STOP: Self = Self { velocity: [0.0; 3], nose: HeadingCommand::Rate(0.0) };
 
     /// Stops moving and turning; an ordered heading stays.
     fn stop(&mut self) {
         self.velocity = [0.0; 3];
-        if let Nose::Rate(rate) = &mut self.nose {
+        if let HeadingCommand::Rate(rate) = &mut self.nose {
             *rate = 0.0;
         }
     }
@@ -83,7 +85,7 @@ impl Setpoint {
 
 /// An event that is reported as text.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub(super) enum Happening {
+pub(super) enum FlightEvent {
     /// The motors were switched off.
     Disarmed,
     /// The vehicle touched the ground at this speed, in m/s.
@@ -106,9 +108,9 @@ enum Guided {
 const ARMING_DELAY_S: f64 = 2.0;
 const SPOOL_S: f64 = 1.36;
 /// From the touch to the certainty of it, in seconds: in LAND and in GUIDED, and what chance adds.
-const SURE_IN_LAND_S: f64 = 1.6;
-const SURE_IN_GUIDED_S: f64 = 2.0;
-const SURE_SPREAD_S: f64 = 0.1;
+const CONFIRM_IN_LAND_S: f64 = 1.6;
+const CONFIRM_IN_GUIDED_S: f64 = 2.0;
+const CONFIRM_SPREAD_S: f64 = 0.1;
 /// From the certainty of the touch to still motors, in seconds, and what chance adds.
 const STILL_S: f64 = 0.35;
 const STILL_SPREAD_S: f64 = 0.15;
@@ -126,12 +128,12 @@ pub(super) struct Flight {
     guided: Guided,
     steering: Option<Steering>,
     touched_s: Option<f64>,
-    sure_after_s: f64,
+    confirm_after_s: f64,
     idle_since_s: f64,
     was_down: bool,
     /// The target of a precision landing.
     pub(super) precision: Precision,
-    happenings: Vec<Happening>,
+    events: Vec<FlightEvent>,
 }
 
 impl Flight {
@@ -145,11 +147,11 @@ impl Flight {
             guided: Guided::Velocity(Setpoint::STOP, 0.0),
             steering: None,
             touched_s: None,
-            sure_after_s: 0.0,
+            confirm_after_s: 0.0,
             idle_since_s: 0.0,
             was_down: true,
             precision: Precision::default(),
-            happenings: Vec::new(),
+            events: Vec::new(),
         }
     }
 
@@ -180,8 +182,8 @@ impl Flight {
         }
     }
 
-    pub(super) fn take_happenings(&mut self) -> Vec<Happening> {
-        std::mem::take(&mut self.happenings)
+    pub(super) fn take_events(&mut self) -> Vec<FlightEvent> {
+        std::mem::take(&mut self.events)
     }
 
     pub(super) fn set_mode(&mut self, now_s: f64, mode: Mode, now: &Estimate) {
@@ -236,7 +238,7 @@ impl Flight {
 
     fn stop(&mut self) {
         if self.armed_s.take().is_some() {
-            self.happenings.push(Happening::Disarmed);
+            self.events.push(FlightEvent::Disarmed);
         }
         self.on_ground = true;
         self.steering = None;
@@ -277,7 +279,7 @@ impl Flight {
         truth: &VehicleTruth,
         parameters: &Parameters,
     ) -> Demand {
-        self.feel(now_s, truth, parameters);
+        self.detect_ground(now_s, truth, parameters);
         if !self.armed() {
             return Demand::IDLE;
         }
@@ -286,13 +288,13 @@ impl Flight {
             self.steering = None;
             return Demand::IDLE;
         }
-        let wish = self.wish(now_s, now, parameters);
+        let motion = self.motion(now_s, now, parameters);
         let config = &self.steering_config;
         let steering = self.steering.get_or_insert_with(|| Steering::start(config.clone(), now));
         if let Some(by) = now.reset {
             steering.shift(by);
         }
-        let mut demand = steering.steer(dt_s, now, &wish, &Envelope::new(parameters));
+        let mut demand = steering.steer(dt_s, now, &motion, &Envelope::new(parameters));
         // The loops use the estimated attitude, so its errors become errors of the true one.
         demand.roll_rad -= now.roll_error;
         demand.pitch_rad -= now.pitch_error;
@@ -303,9 +305,9 @@ impl Flight {
     }
 
     /// Notices the ground, and switches off.
-    fn feel(&mut self, now_s: f64, truth: &VehicleTruth, parameters: &Parameters) {
+    fn detect_ground(&mut self, now_s: f64, truth: &VehicleTruth, parameters: &Parameters) {
         if truth.on_ground && !self.was_down {
-            self.happenings.push(Happening::Hit(truth.impact_m_s.unwrap_or(0.0)));
+            self.events.push(FlightEvent::Hit(truth.impact_m_s.unwrap_or(0.0)));
         }
         self.was_down = truth.on_ground;
         if !self.armed() {
@@ -317,12 +319,13 @@ impl Flight {
             self.touched_s = None;
         } else {
             let touched_s = *self.touched_s.get_or_insert_with(|| {
-                let spread = SURE_SPREAD_S * uniform(&mut self.random);
+                let spread = CONFIRM_SPREAD_S * uniform(&mut self.random);
                 let guided = self.mode != Mode::Land;
-                self.sure_after_s = if guided { SURE_IN_GUIDED_S } else { SURE_IN_LAND_S + spread };
+                self.confirm_after_s =
+                    if guided { CONFIRM_IN_GUIDED_S } else { CONFIRM_IN_LAND_S + spread };
                 now_s
             });
-            if now_s - touched_s >= self.sure_after_s {
+            if now_s - touched_s >= self.confirm_after_s {
                 self.on_ground = true;
                 self.touched_s = None;
                 self.idle_since_s = now_s + STILL_S + STILL_SPREAD_S * uniform(&mut self.random);
@@ -373,17 +376,20 @@ impl Flight {
         }
     }
 
-    fn wish(&mut self, now_s: f64, now: &Estimate, parameters: &Parameters) -> Wish {
-        let stay =
-            Wish { velocity: [0.0; 2], vertical: Vertical::Velocity(0.0), nose: Nose::Rate(0.0) };
+    fn motion(&mut self, now_s: f64, now: &Estimate, parameters: &Parameters) -> MotionCommand {
+        let stay = MotionCommand {
+            velocity: [0.0; 2],
+            vertical: VerticalCommand::Velocity(0.0),
+            nose: HeadingCommand::Rate(0.0),
+        };
         match (self.mode, &mut self.guided) {
             (Mode::Land, _) => {
                 let down = descent(-now.position[2], parameters);
                 match self.precision.target(now_s) {
-                    None => Wish { vertical: Vertical::Velocity(down), ..stay },
+                    None => MotionCommand { vertical: VerticalCommand::Velocity(down), ..stay },
                     Some([north, east]) => {
                         let way = [north - now.position[0], east - now.position[1]];
-                        precision_wish(way, -now.position[2], down, stay)
+                        precision_command(way, -now.position[2], down, stay)
                     }
                 }
             }
@@ -392,9 +398,9 @@ impl Flight {
                     setpoint.stop();
                 }
                 let [north, east, down] = setpoint.velocity;
-                Wish {
+                MotionCommand {
                     velocity: [north, east],
-                    vertical: Vertical::Velocity(down),
+                    vertical: VerticalCommand::Velocity(down),
                     nose: setpoint.nose,
                 }
             }
@@ -403,7 +409,7 @@ impl Flight {
                 Guided::Spooling { z, .. } | Guided::Climbing { z } | Guided::Holding { z },
             ) => {
                 let climb = parameters.get(Parameter::SpeedUp) / 100.0;
-                Wish { vertical: Vertical::Position(*z, climb), ..stay }
+                MotionCommand { vertical: VerticalCommand::Position(*z, climb), ..stay }
             }
             _ => stay,
         }
@@ -411,13 +417,18 @@ impl Flight {
 }
 
 /// Over the target first, and slowly through the last metres, as the real one was measured to do.
-fn precision_wish(way: [f64; 2], height_m: f64, down: f64, stay: Wish) -> Wish {
+fn precision_command(
+    way: [f64; 2],
+    height_m: f64,
+    down: f64,
+    stay: MotionCommand,
+) -> MotionCommand {
     let size = norm(way);
     let speed = square_root_law(size, 1.0, 0.5).min(2.0);
     let slow = (0.35..2.0).contains(&height_m);
-    Wish {
+    MotionCommand {
         velocity: way.map(|metres| if size > 0.0 { metres * speed / size } else { 0.0 }),
-        vertical: Vertical::Velocity(if slow { down.min(0.2) } else { down }),
+        vertical: VerticalCommand::Velocity(if slow { down.min(0.2) } else { down }),
         ..stay
     }
 }

@@ -38,10 +38,10 @@ pub use telemetry::Origin;
 
 use crate::vehicle::{Demand, VehicleTruth};
 use estimate::{Estimate, Estimator};
-use flight::{Flight, Happening, Setpoint};
+use flight::{Flight, FlightEvent, Setpoint};
 use parameters::Parameters;
 use px4::Px4;
-use telemetry::{Readiness, Schedule, Situation};
+use telemetry::{Readiness, Schedule, Telemetry};
 
 /// The simulated autopilot's settings.
 #[derive(Clone, Debug, PartialEq)]
@@ -201,18 +201,18 @@ impl SimulatedAutopilot {
         self.now_s = now_s;
         self.truth = Some(*truth);
         self.estimate = self.estimator.step(dt_s, truth);
-        self.get_ready();
+        self.advance_readiness();
         while self.setpoints.front().is_some_and(|(due_s, _)| *due_s <= now_s) {
             if let Some((due_s, setpoint)) = self.setpoints.pop_front() {
                 self.flight.follow(due_s, setpoint);
             }
         }
-        if self.is_px4() && self.px4.misses_setpoints(now_s) {
+        if self.is_px4() && self.px4.has_lost_setpoints(now_s) {
             self.flight.set_mode(now_s, Mode::Loiter, &self.estimate);
         }
         let demand = self.flight.step(now_s, dt_s, &self.estimate, truth, &self.parameters);
-        self.report_happenings();
-        self.tell();
+        self.report_events();
+        self.send_due();
         demand
     }
 
@@ -225,13 +225,13 @@ impl SimulatedAutopilot {
         self.config.firmware == Firmware::Px4
     }
 
-    fn me(&self) -> Sender {
+    fn sender(&self) -> Sender {
         let system = self.parameters.get(Parameter::SystemId) as u8;
         Sender { system, component: AUTOPILOT }
     }
 
     /// The start-up, with its texts.
-    fn get_ready(&mut self) {
+    fn advance_readiness(&mut self) {
         let part = self.now_s / self.config.ready_after_s.max(1e-3);
         let info = MavSeverity::MAV_SEVERITY_INFO;
         if self.readiness == Readiness::Booting && part >= ALIGNED {
@@ -245,8 +245,8 @@ impl SimulatedAutopilot {
         if self.readiness == Readiness::Aligned && part >= ORIGIN_SET {
             self.readiness = Readiness::OriginSet;
             self.text(info, "EKF3 IMU0 origin set");
-            self.tell_one(49);
-            self.tell_one(242);
+            self.send_message(49);
+            self.send_message(242);
         }
         if self.readiness == Readiness::OriginSet && part >= 1.0 {
             self.readiness = Readiness::Ready;
@@ -254,21 +254,21 @@ impl SimulatedAutopilot {
         }
     }
 
-    fn report_happenings(&mut self) {
-        for happening in self.flight.take_happenings() {
-            let text = match happening {
-                Happening::Disarmed => "Disarming motors".to_owned(),
-                Happening::Hit(speed) => format!("SIM Hit ground at {speed:.6} m/s"),
+    fn report_events(&mut self) {
+        for event in self.flight.take_events() {
+            let text = match event {
+                FlightEvent::Disarmed => "Disarming motors".to_owned(),
+                FlightEvent::Hit(speed) => format!("SIM Hit ground at {speed:.6} m/s"),
             };
             self.text(MavSeverity::MAV_SEVERITY_INFO, &text);
         }
     }
 
     /// Sends what is due.
-    fn tell(&mut self) {
+    fn send_due(&mut self) {
         if self.now_s + 5e-7 >= self.heartbeat_due_s {
             self.heartbeat_due_s += HEARTBEAT_S;
-            self.tell_one(0);
+            self.send_message(0);
             if self.config.forward_ground_station {
                 self.push(|sequence| encode(GROUND_STATION, sequence, &ground_station()));
             }
@@ -280,12 +280,12 @@ impl SimulatedAutopilot {
             self.send(&MavMessage::TIMESYNC(request));
         }
         for id in self.schedule.due(self.now_s) {
-            self.tell_one(id);
+            self.send_message(id);
         }
     }
 
-    fn situation<'a>(&'a self, truth: &'a VehicleTruth) -> Situation<'a> {
-        Situation {
+    fn telemetry<'a>(&'a self, truth: &'a VehicleTruth) -> Telemetry<'a> {
+        Telemetry {
             now_s: self.now_s,
             estimate: &self.estimate,
             truth,
@@ -300,14 +300,14 @@ impl SimulatedAutopilot {
         }
     }
 
-    fn can_tell(&self, id: u32) -> bool {
+    fn is_available(&self, id: u32) -> bool {
         let Some(truth) = &self.truth else { return false };
-        self.situation(truth).message(id).is_some()
+        self.telemetry(truth).message(id).is_some()
     }
 
-    fn tell_one(&mut self, id: u32) {
+    fn send_message(&mut self, id: u32) {
         let Some(truth) = self.truth else { return };
-        if let Some(message) = self.situation(&truth).message(id) {
+        if let Some(message) = self.telemetry(&truth).message(id) {
             self.send(&message);
         }
     }
@@ -320,8 +320,8 @@ impl SimulatedAutopilot {
     }
 
     fn send(&mut self, message: &MavMessage) {
-        let me = self.me();
-        self.push(|sequence| encode(me, sequence, message));
+        let sender = self.sender();
+        self.push(|sequence| encode(sender, sequence, message));
     }
 
     fn push(&mut self, make: impl FnOnce(u8) -> Vec<u8>) {

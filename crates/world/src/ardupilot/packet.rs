@@ -14,7 +14,7 @@ const PAYLOAD: usize = 10;
 /// The acknowledgement of any command number, also one that the dialect does not define, addressed to the
 /// sender.
 pub(super) fn acknowledgement(
-    me: Sender,
+    sender: Sender,
     sequence: u8,
     command: u16,
     result: MavResult,
@@ -26,7 +26,7 @@ pub(super) fn acknowledgement(
         target_component: to.component,
         ..COMMAND_ACK_DATA::default()
     });
-    let mut raw = encode(me, sequence, &message);
+    let mut raw = encode(sender, sequence, &message);
     let end = raw.len().saturating_sub(2);
     raw.truncate(end);
     for (byte, number) in raw.iter_mut().skip(PAYLOAD).zip(command.to_le_bytes()) {

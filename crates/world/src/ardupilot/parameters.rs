@@ -64,7 +64,7 @@ const TABLE: [Row; 15] = [
 
 /// One parameter as the link shows it.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub(super) struct Shown {
+pub(super) struct ParameterValue {
     pub(super) index: u16,
     pub(super) name: &'static str,
     pub(super) kind: MavParamType,
@@ -92,7 +92,7 @@ impl Parameters {
     }
 
     /// Sets a value, clamped to its range; NaN and infinity change nothing.
-    pub(super) fn set(&mut self, name: &str, value: f32) -> Option<Shown> {
+    pub(super) fn set(&mut self, name: &str, value: f32) -> Option<ParameterValue> {
         let index = TABLE.iter().position(|row| row.1 == name)?;
         let (.., min, max) = *TABLE.get(index)?;
         if value.is_finite() {
@@ -101,13 +101,13 @@ impl Parameters {
         self.by_index(index)
     }
 
-    pub(super) fn by_name(&self, name: &str) -> Option<Shown> {
+    pub(super) fn by_name(&self, name: &str) -> Option<ParameterValue> {
         self.by_index(TABLE.iter().position(|row| row.1 == name)?)
     }
 
-    pub(super) fn by_index(&self, index: usize) -> Option<Shown> {
+    pub(super) fn by_index(&self, index: usize) -> Option<ParameterValue> {
         let (_, name, kind, ..) = *TABLE.get(index)?;
-        Some(Shown { index: index as u16, name, kind, value: *self.values.get(index)? })
+        Some(ParameterValue { index: index as u16, name, kind, value: *self.values.get(index)? })
     }
 }
 

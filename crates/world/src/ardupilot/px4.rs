@@ -11,8 +11,8 @@ use super::flight::{Landed, Mode};
 /// COM_OF_LOSS_T, in seconds.
 const LOSS_S: f64 = 1.0;
 /// Minimum time for which setpoints must have arrived at 2 Hz or more, in seconds.
-const PROOF_S: f64 = 1.0;
-const PROOF_GAP_S: f64 = 0.5;
+const STREAM_S: f64 = 1.0;
+const STREAM_GAP_S: f64 = 0.5;
 
 /// The state of a PX4 in addition to ArduPilot's.
 #[derive(Clone, Debug, Default)]
@@ -24,18 +24,18 @@ pub(super) struct Px4 {
 }
 
 impl Px4 {
-    pub(super) fn setpoint_came(&mut self, now_s: f64) {
-        let lasts = self.stream.filter(|(_, last_s)| now_s - last_s <= PROOF_GAP_S);
+    pub(super) fn on_setpoint(&mut self, now_s: f64) {
+        let lasts = self.stream.filter(|(_, last_s)| now_s - last_s <= STREAM_GAP_S);
         self.stream = Some((lasts.map_or(now_s, |(since_s, _)| since_s), now_s));
     }
 
     /// The requested mode in ArduPilot's terms; `None` when it is refused.
     pub(super) fn request(&mut self, now_s: f64, main: u8, sub: u8) -> Option<Mode> {
-        let proven = self.stream.is_some_and(|(since_s, last_s)| {
-            now_s - since_s >= PROOF_S && now_s - last_s <= PROOF_GAP_S
+        let is_streaming = self.stream.is_some_and(|(since_s, last_s)| {
+            now_s - since_s >= STREAM_S && now_s - last_s <= STREAM_GAP_S
         });
         let mode = match (main, sub) {
-            (6, _) if proven => Mode::Guided,
+            (6, _) if is_streaming => Mode::Guided,
             (4, 6 | 9) => Mode::Land,
             (4, 3) => Mode::Loiter,
             (3, _) => Mode::PosHold,
@@ -46,7 +46,7 @@ impl Px4 {
         Some(mode)
     }
 
-    pub(super) fn takes_off(&mut self) {
+    pub(super) fn on_takeoff(&mut self) {
         self.offboard = false;
     }
 
@@ -55,7 +55,7 @@ impl Px4 {
     }
 
     /// True when the setpoints of OFFBOARD have just been missed for too long.
-    pub(super) fn misses_setpoints(&mut self, now_s: f64) -> bool {
+    pub(super) fn has_lost_setpoints(&mut self, now_s: f64) -> bool {
         let lost = self.offboard && self.stream.is_none_or(|(_, last_s)| now_s - last_s > LOSS_S);
         self.offboard &= !lost;
         lost
@@ -93,14 +93,14 @@ mod tests {
         let mut px4 = Px4::default();
         assert_eq!(px4.request(0.0, 6, 0), None, "no setpoint yet");
         for step in 0..12 {
-            px4.setpoint_came(0.1 * f64::from(step));
+            px4.on_setpoint(0.1 * f64::from(step));
         }
         assert_eq!(px4.request(1.15, 6, 0), Some(Mode::Guided));
         assert_eq!(px4.shown(Mode::Guided, Landed::InAir), FlightMode::OFFBOARD);
-        assert!(!px4.misses_setpoints(2.0));
-        assert!(px4.misses_setpoints(2.2), "its failsafe");
+        assert!(!px4.has_lost_setpoints(2.0));
+        assert!(px4.has_lost_setpoints(2.2), "its failsafe");
         assert_eq!(px4.shown(Mode::Loiter, Landed::InAir), FlightMode::AUTO_HOLD);
-        px4.setpoint_came(5.0);
+        px4.on_setpoint(5.0);
         assert_eq!(px4.request(5.1, 6, 0), None, "a gap begins anew");
     }
 

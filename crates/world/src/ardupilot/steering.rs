@@ -77,16 +77,16 @@ impl Envelope {
 
 /// The commanded motion.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub(super) struct Wish {
+pub(super) struct MotionCommand {
     /// North and east, in m/s.
     pub(super) velocity: [f64; 2],
-    pub(super) vertical: Vertical,
-    pub(super) nose: Nose,
+    pub(super) vertical: VerticalCommand,
+    pub(super) nose: HeadingCommand,
 }
 
 /// The commanded vertical motion.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub(super) enum Vertical {
+pub(super) enum VerticalCommand {
     /// Move at this speed, in m/s downwards.
     Velocity(f64),
     /// Go to this height (as z, in metres downwards), with this maximum speed.
@@ -95,7 +95,7 @@ pub(super) enum Vertical {
 
 /// The commanded heading.
 #[derive(Copy, Clone, Debug, PartialEq)]
-pub(super) enum Nose {
+pub(super) enum HeadingCommand {
     /// Turn into the direction of travel when it is fast enough.
     Follow,
     /// Point there, in radians from north to east.
@@ -187,15 +187,15 @@ impl Steering {
         &mut self,
         dt_s: f64,
         now: &Estimate,
-        wish: &Wish,
+        motion: &MotionCommand,
         envelope: &Envelope,
     ) -> Demand {
-        self.level.towards_velocity(dt_s, wish.velocity, envelope.level);
-        match wish.vertical {
-            Vertical::Velocity(down) => {
+        self.level.towards_velocity(dt_s, motion.velocity, envelope.level);
+        match motion.vertical {
+            VerticalCommand::Velocity(down) => {
                 self.depth.towards_velocity(dt_s, [down], envelope.vertical);
             }
-            Vertical::Position(z, speed) => {
+            VerticalCommand::Position(z, speed) => {
                 self.depth.towards_position(dt_s, [z], speed, envelope.vertical);
             }
         }
@@ -211,7 +211,7 @@ impl Steering {
             thrust_m_s2: (self.lift(dt_s, now, envelope.vertical.acceleration) / upright).max(0.0),
             roll_rad: roll,
             pitch_rad: pitch,
-            heading: self.nose(dt_s, wish.nose, envelope.follow_m_s),
+            heading: self.nose(dt_s, motion.nose, envelope.follow_m_s),
         }
     }
 
@@ -242,17 +242,17 @@ impl Steering {
         GRAVITY_M_S2 - c.acceleration_z_p * error - self.thrust_integral
     }
 
-    fn nose(&mut self, dt_s: f64, nose: Nose, follow_m_s: f64) -> HeadingDemand {
+    fn nose(&mut self, dt_s: f64, nose: HeadingCommand, follow_m_s: f64) -> HeadingDemand {
         match nose {
-            Nose::Rate(rate) => {
+            HeadingCommand::Rate(rate) => {
                 self.heading = wrap(self.heading + rate * dt_s);
                 HeadingDemand::Rate(rate)
             }
-            Nose::Angle(angle) => {
+            HeadingCommand::Angle(angle) => {
                 self.heading = angle;
                 HeadingDemand::Angle(angle, 0.0)
             }
-            Nose::Follow => {
+            HeadingCommand::Follow => {
                 let [north, east] = self.level.velocity;
                 let speed = north.hypot(east);
                 if speed <= follow_m_s {

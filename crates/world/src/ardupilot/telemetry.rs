@@ -54,7 +54,7 @@ struct Entry {
 }
 
 /// Two steps of the simulation are the shortest interval.
-const SHORTEST_S: f64 = 0.0025;
+const MIN_INTERVAL_S: f64 = 0.0025;
 
 impl Schedule {
     /// Sends message `id` every `interval_s` from now on, never when `None`; false when there is no such
@@ -65,7 +65,11 @@ impl Schedule {
         }
         self.entries.retain(|entry| entry.id != id);
         if let Some(interval_s) = interval_s.filter(|interval_s| interval_s.is_finite()) {
-            self.entries.push(Entry { id, interval_s: interval_s.max(SHORTEST_S), due_s: now_s });
+            self.entries.push(Entry {
+                id,
+                interval_s: interval_s.max(MIN_INTERVAL_S),
+                due_s: now_s,
+            });
         }
         true
     }
@@ -137,7 +141,7 @@ pub(super) enum Readiness {
 
 /// The contents of all messages.
 #[derive(Copy, Clone, Debug)]
-pub(super) struct Situation<'a> {
+pub(super) struct Telemetry<'a> {
     pub(super) now_s: f64,
     pub(super) estimate: &'a Estimate,
     pub(super) truth: &'a VehicleTruth,
@@ -152,7 +156,7 @@ pub(super) struct Situation<'a> {
     pub(super) px4: Option<FlightMode>,
 }
 
-impl Situation<'_> {
+impl Telemetry<'_> {
     fn time_boot_ms(&self) -> u32 {
         (self.now_s * 1000.0).round().max(0.0) as u32
     }
