@@ -179,7 +179,7 @@ fn a_frame_from_the_future_does_not_shut_out_those_of_now() {
     }
     assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("no-pose"), "it was looked at");
     assert_eq!(flight.status(now_ns).active_detector.as_deref(), Some("main"));
-    // Another one's name is no way into the flight.
+    // Detections under another detector's name are refused.
     flight.detections(now_ns, "intruder", &seen(now_ns));
     assert_eq!(flight.target(now_ns).rejected.as_deref(), Some("another-detectors-name"));
     assert_eq!(flight.status(now_ns).candidates.len(), 1);
@@ -287,8 +287,8 @@ fn precision_landing_gets_the_target_and_no_setpoint() {
 #[test]
 fn a_precision_landing_that_is_off_is_reported_with_what_to_set() {
     let mut flight = landing_target("command");
-    let asked = hover(&mut flight, 1000, 1500, 4).requested;
-    assert!(asked.iter().any(|name| name == "PLND_ENABLED"), "{asked:?}");
+    let requested = hover(&mut flight, 1000, 1500, 4).requested;
+    assert!(requested.iter().any(|name| name == "PLND_ENABLED"), "{requested:?}");
     for (name, value, word) in [
         ("PLND_ENABLED", 0.0, "set PLND_ENABLED to 1"),
         ("PLND_ENABLED", 1.0, "PLND_TYPE"),

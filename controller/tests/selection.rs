@@ -183,7 +183,7 @@ fn a_lost_frame_and_a_camera_that_pauses_change_nothing() {
     for i in 20..60 {
         bench.frame(i * PERIOD, &[]);
     }
-    // The spare one is heard first after the pause.
+    // The spare one is faster after the pause.
     bench.frames(60..80, &[("main", 35 * MS), ("spare", 20 * MS)]);
     assert_eq!(bench.changes.len(), 1, "{:?}", bench.changes);
 }

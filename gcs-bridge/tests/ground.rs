@@ -94,7 +94,7 @@ async fn only_the_grounds_own_packets_go_up_unchanged() -> anyhow::Result<()> {
     damaged[12] ^= 0x40;
     let last = encode(GROUND, 3, &param_request(3));
     for bytes in [
-        b"PX4 boot text \xfd\xfe\x03 and more of it, which is no MAVLink at all".to_vec(),
+        b"PX4 boot text \xfd\xfe\x03 and more of it, which is not MAVLink at all".to_vec(),
         damaged,
         last[..last.len() / 2].to_vec(),
         encode(COMPANION, 4, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default())),

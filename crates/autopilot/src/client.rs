@@ -2,8 +2,8 @@
 //!
 //! Feed it every packet ([`Autopilot::handle`]) and the time ([`Autopilot::tick`], 20 times a second or
 //! more); send what [`Autopilot::poll_outgoing`] returns and act on what [`Autopilot::poll_event`] returns.
-//! Only the heartbeat says what is true: an acknowledgement is a promise, and the pilot may have changed the
-//! mode in between.
+//! Only the heartbeat shows the state: an acknowledgement is a promise, and the pilot may have changed the mode
+//! since.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -391,7 +391,7 @@ impl Autopilot {
         vehicle.amsl_m
     }
 
-    /// Asks for the time and for parameters, when it is time to.
+    /// Requests the time and parameters when they are due.
     fn send_requests(&mut self, now_ns: i64) {
         let Some(system) = self.system() else { return };
         if self.config.timesync

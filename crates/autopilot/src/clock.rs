@@ -144,7 +144,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Makes `count` round trips whose two ways last as told by turns, with their clock so far ahead.
+    /// Makes `count` round trips with these delays in turn, with their clock this far ahead.
     fn synchronised(ways_ms: &[(i64, i64)], count: usize, ahead_ns: i64) -> (Clock, i64) {
         let (mut clock, mut now_ns) = (Clock::default(), 1_000 * MS);
         for i in 0..count {
@@ -183,11 +183,11 @@ mod tests {
 
         #[test]
         fn nothing_that_is_told_can_harm(
-            told in prop::collection::vec((any::<i64>(), any::<i64>(), any::<i64>()), 0..40),
+            replies in prop::collection::vec((any::<i64>(), any::<i64>(), any::<i64>()), 0..40),
             boot_ms: u32,
         ) {
             let mut clock = Clock::default();
-            for (now_ns, theirs_ns, ts1_ns) in told {
+            for (now_ns, theirs_ns, ts1_ns) in replies {
                 clock.request(now_ns);
                 clock.answered(now_ns, theirs_ns, ts1_ns);
                 clock.answered(now_ns, theirs_ns, now_ns);

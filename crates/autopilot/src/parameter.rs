@@ -131,8 +131,8 @@ mod tests {
     #[test]
     fn px4_tells_whole_numbers_by_their_bits() {
         let mut parameters = Parameters::new(&["PLD_SRCH_TOUT"]);
-        let told = value("PLD_SRCH_TOUT", f32::from_bits(7), MavParamType::MAV_PARAM_TYPE_INT32);
-        parameters.take(Firmware::Px4, &told);
+        let integer = value("PLD_SRCH_TOUT", f32::from_bits(7), MavParamType::MAV_PARAM_TYPE_INT32);
+        parameters.take(Firmware::Px4, &integer);
         assert_eq!(parameters.get("PLD_SRCH_TOUT"), Parameter::Value(7.0));
     }
 }

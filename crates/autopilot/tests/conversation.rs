@@ -42,7 +42,7 @@ struct Fake {
     /// Commands as they were received.
     received: Vec<MavCmd>,
     velocities: Vec<[f32; 3]>,
-    /// So many commands are lost on the way here, and so many acknowledgements on the way back.
+    /// Numbers of commands and of acknowledgements that are lost.
     lose_commands: u32,
     lose_acks: u32,
     /// A command that is refused a number of times, with a text about it.

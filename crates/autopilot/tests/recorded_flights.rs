@@ -8,7 +8,7 @@
     clippy::expect_used,
     clippy::panic,
     clippy::print_stdout,
-    reason = "helpers of tests may fail and tell like tests"
+    reason = "helpers of tests may fail and print like tests"
 )]
 
 use std::collections::BTreeMap;
