@@ -2,9 +2,9 @@
 
 use std::ops::Range;
 
+use markers::{Family, Marker};
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Outlines, outline};
-use markers::{Family, Marker};
 
 use crate::candidates::outline_quads::OutlineQuads;
 use crate::candidates::quad::Quad;

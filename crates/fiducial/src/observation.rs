@@ -1,7 +1,7 @@
 //! What the detector reports of a marker.
 
-use geometry::{Camera, Marker as MarkerFrame, Pixel, Roi, Transform};
 use markers::Family;
+use geometry::{Camera, Marker as MarkerFrame, Pixel, Roi, Transform};
 use nalgebra::{Matrix2, Matrix6};
 
 /// A marker found in an image.

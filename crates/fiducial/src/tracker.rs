@@ -6,9 +6,9 @@
 //! A marker that is visible right at its predicted place is read there, and the rest of its region is not searched. While
 //! nothing is tracked, the fallback passes take turns ([`Detector::detect_in_turn`]).
 
+use markers::Family;
 use geometry::{CameraModel, Pixel, Roi};
 use imaging::GrayView;
-use markers::Family;
 use nalgebra::Vector3;
 
 use crate::detector::{Detector, Expected};

@@ -1,35 +1,35 @@
-//! Which outlines of regions are circles seen aslant, whole or in part.
+//! Ellipses among the outlines of regions, complete or in arcs: circles seen at an angle.
 
 use std::f64::consts::TAU;
 
 use imaging::pyramid::to_level_0;
-use imaging::{Ellipse, fit_ellipse};
+use imaging::{Ellipse, Outline, fit_ellipse};
 
 /// An ellipse along which dark meets bright, in pixels of the image.
 #[derive(Copy, Clone, Debug)]
-pub(crate) struct Border {
+pub(crate) struct EllipseCandidate {
     pub(crate) ellipse: Ellipse,
-    pub(crate) dark_within: bool,
+    pub(crate) dark_inside: bool,
     /// Whether it was seen all round.
-    pub(crate) whole: bool,
+    pub(crate) complete: bool,
 }
 
-/// Points that take part in a fit.
+/// Points used in one fit.
 const FIT_POINTS: usize = 32;
-/// Ellipses that are flatter are circles seen from 72 degrees aside.
-const LEAST_FLATNESS: f64 = 0.3;
-/// Shorter outlines show no arc that says which ellipse it belongs to.
-const LEAST_ARC_POINTS: usize = 28;
-/// An arc of less than a quarter of an ellipse may belong to many.
-const LEAST_SECTORS: u32 = 8;
+/// Minimum ratio of the axes: a circle seen at 72 degrees.
+const MIN_AXIS_RATIO: f64 = 0.3;
+/// Shorter outlines do not determine an arc's ellipse.
+const MIN_ARC_POINTS: usize = 28;
+/// Minimum number of the 32 sectors of an ellipse that an arc covers; less than a quarter fits many ellipses.
+const MIN_SECTORS: u32 = 8;
 
-/// The ellipse that an outline is.
-pub(crate) fn whole_border(outline: &imaging::Outline<'_>) -> Option<Border> {
+/// The ellipse that a closed outline is.
+pub(crate) fn complete_ellipse(outline: &Outline<'_>) -> Option<EllipseCandidate> {
     let [left, top, right, bottom] = outline.bounds.map(f64::from);
     let (width, height) = (right - left, bottom - top);
     let fill = f64::from(outline.area) / (width * height);
     let around = outline.points.len() as f64 / (2.0 * (width + height));
-    // Cheap first: an ellipse fills 0.79 of its bounds, less where it lies aslant.
+    // Cheap checks first: an ellipse fills 0.79 of its bounds, less when oblique.
     let flat = width.max(height) > 3.3 * width.min(height);
     if outline.cut || flat || !(0.45..0.93).contains(&fill) || around > 1.3 {
         return None;
@@ -42,26 +42,30 @@ pub(crate) fn whole_border(outline: &imaging::Outline<'_>) -> Option<Border> {
     let squares: f64 =
         points.map(|p| ((axes.radius_of(p) - 1.0) * ellipse.minor / 2.0).powi(2)).sum();
     let tolerance = 0.35 + 0.012 * ellipse.minor;
-    let round = squares <= tolerance * tolerance * count
-        && ellipse.minor > LEAST_FLATNESS * ellipse.major
+    let fits = squares <= tolerance * tolerance * count
+        && ellipse.minor > MIN_AXIS_RATIO * ellipse.major
         && ellipse.minor > 2.0;
-    let border = |ellipse| Border { ellipse, dark_within: outline.dark, whole: true };
-    round.then(|| border(in_image(&ellipse, outline.level)))
+    let dark_inside = outline.dark;
+    fits.then(|| in_image(&ellipse, outline.level)).map(|ellipse| EllipseCandidate {
+        ellipse,
+        dark_inside,
+        complete: true,
+    })
 }
 
-/// Adds the ellipses of which an outline shows arcs: the image's border cuts a ring, something lies on it, or it runs
-/// into something dark. `size` is that of the outline's level. Each fit takes one from `budget`.
-pub(crate) fn add_arcs(
-    outline: &imaging::Outline<'_>,
+/// Adds the ellipses of which an outline shows arcs: the image's edge cuts a ring, something covers it, or it
+/// merges with something dark. `size` is that of the outline's level. Each fit takes one from `budget`.
+pub(crate) fn add_arc_ellipses(
+    outline: &Outline<'_>,
     size: [usize; 2],
     budget: &mut usize,
-    borders: &mut Vec<Border>,
+    found: &mut Vec<EllipseCandidate>,
 ) {
     let points = outline.points;
-    if points.len() < LEAST_ARC_POINTS {
+    if points.len() < MIN_ARC_POINTS {
         return;
     }
-    let mut arcs = Arcs { outline, found: [None; MOST_ARCS] };
+    let mut arcs = Arcs { outline, found: [None; MAX_ARCS] };
     if !outline.cut {
         arcs.search(0, points.len(), true, budget);
     } else {
@@ -69,7 +73,7 @@ pub(crate) fn add_arcs(
         let ends = |[x, y]: &[f32; 2]| *x < 0.6 || *y < 0.6 || *x > limits[0] || *y > limits[1];
         let Some(first) = points.iter().position(ends) else { return };
         let mut start = 0;
-        // Once round, from an end to the next.
+        // Once round, from one end at the image's edge to the next.
         while start < points.len() {
             let onwards = points.iter().cycle().skip(first + start + 1);
             let length = onwards.take(points.len()).take_while(|p| !ends(p)).count();
@@ -77,19 +81,19 @@ pub(crate) fn add_arcs(
             start += length + 1;
         }
     }
-    for (ellipse, dark_within) in arcs.found.into_iter().flatten() {
+    for (ellipse, dark_inside) in arcs.found.into_iter().flatten() {
         let ellipse = in_image(&ellipse, outline.level);
-        borders.push(Border { ellipse, dark_within, whole: false });
+        found.push(EllipseCandidate { ellipse, dark_inside, complete: false });
     }
 }
 
-/// Of one outline no more arcs are taken.
-const MOST_ARCS: usize = 4;
+/// Maximum number of arcs of one outline.
+const MAX_ARCS: usize = 4;
 
 struct Arcs<'a> {
-    outline: &'a imaging::Outline<'a>,
-    /// Ellipses in pixels of the level, and whether dark lies within.
-    found: [Option<(Ellipse, bool)>; MOST_ARCS],
+    outline: &'a Outline<'a>,
+    /// Ellipses in pixels of the level, and whether they are dark inside.
+    found: [Option<(Ellipse, bool)>; MAX_ARCS],
 }
 
 impl Arcs<'_> {
@@ -103,7 +107,7 @@ impl Arcs<'_> {
         let parts: &[f64] = if closed { &[0.45, 0.27] } else { &[1.0, 0.5, 0.28] };
         for part in parts {
             let window = (length as f64 * part) as usize;
-            if window < LEAST_ARC_POINTS {
+            if window < MIN_ARC_POINTS {
                 return;
             }
             let last = if closed { length } else { length - window + 1 };
@@ -119,33 +123,35 @@ impl Arcs<'_> {
     fn try_part(&mut self, start: usize, length: usize, budget: &mut usize) {
         let Some(slot) = self.found.iter().position(Option::is_none) else { return };
         let ends = [start, start + length / 2, start + length - 1].map(|i| self.at(i));
-        let known =
-            |(ellipse, _): &(Ellipse, bool)| ends.iter().all(|p| off_px(ellipse, *p).abs() < 1.5);
-        if self.found.iter().flatten().any(known) {
+        let is_known = |(ellipse, _): &(Ellipse, bool)| {
+            ends.iter().all(|p| distance_px(ellipse, *p).abs() < 1.5)
+        };
+        if self.found.iter().flatten().any(is_known) {
             return;
         }
-        let Some(dark_within) = self.turns(start, length) else { return };
+        let Some(region_inside) = self.bend(start, length) else { return };
         *budget -= 1;
         let arc = (0..length).step_by(1 + length / FIT_POINTS).map(|i| self.at(start + i));
-        let Some(rough) = fit_ellipse(arc.clone()).filter(sound) else { return };
+        let Some(rough) = fit_ellipse(arc.clone()).filter(is_plausible) else { return };
         let count = arc.clone().count() as f64;
-        let squares: f64 = arc.map(|p| off_px(&rough, p).powi(2)).sum();
+        let squares: f64 = arc.map(|p| distance_px(&rough, p).powi(2)).sum();
         if squares > 0.5 * count {
             return;
         }
-        // What else of the outline lies on it.
-        let near = |p: &[f64; 2]| off_px(&rough, *p).abs() < 1.0;
+        // Refit with every point of the outline that lies on it.
+        let is_near = |p: &[f64; 2]| distance_px(&rough, *p).abs() < 1.0;
         let total = self.outline.points.len();
-        let all = (0..total).step_by(1 + total / 160).map(|i| self.at(i)).filter(near);
-        let Some(ellipse) = fit_ellipse(all.clone()).filter(sound) else { return };
+        let all = (0..total).step_by(1 + total / 160).map(|i| self.at(i)).filter(is_near);
+        let Some(ellipse) = fit_ellipse(all.clone()).filter(is_plausible) else { return };
         let sectors = all.fold(0_u32, |seen, p| seen | 1 << sector(&ellipse, p));
-        if sectors.count_ones() >= LEAST_SECTORS {
-            self.found[slot] = Some((ellipse, dark_within == self.outline.dark));
+        if sectors.count_ones() >= MIN_SECTORS {
+            self.found[slot] = Some((ellipse, region_inside == self.outline.dark));
         }
     }
 
-    /// Whether a part of the outline turns steadily one way, and if so whether the region lies within the bend.
-    fn turns(&self, start: usize, length: usize) -> Option<bool> {
+    /// Whether the region lies inside the bend of a part of the outline; `None` when the part does not turn
+    /// steadily in one direction.
+    fn bend(&self, start: usize, length: usize) -> Option<bool> {
         const CHORDS: usize = 6;
         let place = |i: usize| self.at(start + i * (length - 1) / CHORDS);
         let chord = |i: usize| {
@@ -167,14 +173,14 @@ impl Arcs<'_> {
     }
 }
 
-fn sound(ellipse: &Ellipse) -> bool {
+fn is_plausible(ellipse: &Ellipse) -> bool {
     ellipse.minor > 9.0
-        && ellipse.minor > LEAST_FLATNESS * ellipse.major
+        && ellipse.minor > MIN_AXIS_RATIO * ellipse.major
         && ellipse.major < 20_000.0
 }
 
-/// Distance of a point from an ellipse in pixels, roughly; positive outside.
-fn off_px(ellipse: &Ellipse, point: [f64; 2]) -> f64 {
+/// Approximate distance of a point from an ellipse in pixels; positive outside.
+fn distance_px(ellipse: &Ellipse, point: [f64; 2]) -> f64 {
     (ellipse.radius_of(point) - 1.0) * ellipse.minor / 2.0
 }
 

@@ -1,8 +1,8 @@
 //! The rings a marker is made of.
 
+use markers::RingKind;
 use geometry::Pixel;
 use imaging::Ellipse;
-use markers::RingKind;
 
 /// A black ring in an image: two ellipses about one another.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -27,7 +27,8 @@ impl Ring {
         Self { kind, centre, angle: (inner.angle + outer.angle) / 2.0, inner, outer }
     }
 
-    /// The marker's diameter in the image, in pixels along the major axis, that this ring's outer edge speaks of.
+    /// The marker's diameter in the image, in pixels along the major axis, that this ring's outer edge speaks
+    /// of.
     pub fn marker_size_px(&self) -> f64 {
         self.outer.major / (2.0 * self.kind.radii().1)
     }

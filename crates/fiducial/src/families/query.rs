@@ -1,8 +1,8 @@
 //! What every family of square markers is asked for, and what it answers.
 
+use markers::{Family, Marker};
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Pyramid};
-use markers::{Family, Marker};
 
 use crate::candidates::quad::diagonal_px;
 use crate::observation::Observation;

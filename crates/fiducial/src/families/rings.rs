@@ -1,56 +1,58 @@
-//! The detector of the three-ring marker, second generation.
+//! The detector of the three-ring marker.
 //!
-//! The outlines of dark regions ([`imaging::Outlines`], which need no threshold) that are ellipses, or show arcs of such, may
-//! be any of the marker's circles (`outline`). Whether one is, the bands about it say
-//! (`profile`): a lone ring is not enough. From the circle follows where in space the marker would be; all
-//! its edges are looked for where that pose puts them, between the pixels of the image as the camera gave it
-//! (`search`), or, of a small marker, the whole picture is fitted to its grey values
-//! (`photometry`). That refines the pose, whose centre is the true projection of the
-//! marker's, and decides whether it is believed.
+//! Ellipses among the outlines of dark regions ([`imaging::Outlines`], no threshold needed), complete or in
+//! arcs, may be any of the marker's circles. The radial profile around an ellipse decides: a single ring is
+//! not enough. From the circle follows a pose of the marker; its edges are located where that pose predicts
+//! them (`edges`) or, for a small marker, a model is fitted to the grey values (`photometric`). That refines
+//! the pose (`circle_pose`), whose centre is the true projection of the marker's, and decides whether it is
+//! one (`measure`).
 
 pub(crate) mod circle_pose;
 mod edges;
 mod focal_guess;
+mod measure;
 mod photometric;
 
+use std::ops::Range;
+
+use markers::{Family, Marker};
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::{from_level_0, to_level_0};
 use imaging::{Ellipse, GrayView, Outlines, Pyramid, outline};
-use markers::{Family, Marker, RingKind};
 
-use crate::candidates::ellipses::{Border, add_arcs, whole_border};
+use crate::candidates::ellipses::{EllipseCandidate, add_arc_ellipses, complete_ellipse};
 use crate::candidates::ring::Ring;
-use crate::candidates::ring_profile::{Candidate, candidates, speck};
+use crate::candidates::ring_profile::{RingCandidate, add_ring_candidates, blob};
 use crate::detector::{Allowed, SlowPass};
-use crate::families::rings::circle_pose::{CirclePose, EdgePoint, pixel_covariance, project};
-use crate::families::rings::edges::{Search, Seen};
-use crate::families::rings::focal_guess::{guess_lens, nominal_camera};
-use crate::families::rings::photometric::PixelSample;
 use crate::observation::{MarkerPose, Observation, PoseSolution, Stages};
 use crate::trace::{Reason, Trace};
+use circle_pose::{CirclePose, pixel_covariance, project};
+use edges::EdgeSearch;
+use focal_guess::{guess_focal_length, nominal_camera};
+use measure::{Buffers, MeasuredMarker, ring_with_circle};
 
-/// Where the marker is looked for; what comes later only when it was not found before.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
-enum Stage {
-    /// Outlines that are ellipses, on levels of the image's pyramid from this one on up to the other.
-    Whole(usize, usize),
-    /// Outlines that show arcs of ellipses.
-    Parts,
-    /// Bright specks, which may be the paper of a marker far away.
-    Specks,
+/// A search of the image; later passes run only when earlier ones found nothing.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum RingPass {
+    /// Complete ellipses, on these levels of the pyramid.
+    Ellipses(Range<usize>),
+    /// Arcs of ellipses.
+    Arcs,
+    /// Bright blobs, which may be the paper of a marker far away.
+    Blobs,
 }
 
-/// The largest markers first, which take the least time to find.
-const STAGES: [Stage; 5] = [
-    Stage::Whole(2, usize::MAX),
-    Stage::Whole(1, 2),
-    Stage::Whole(0, 1),
-    Stage::Parts,
-    Stage::Specks,
+/// The largest markers first, which are found fastest.
+const PASSES: [RingPass; 5] = [
+    RingPass::Ellipses(2..usize::MAX),
+    RingPass::Ellipses(1..2),
+    RingPass::Ellipses(0..1),
+    RingPass::Arcs,
+    RingPass::Blobs,
 ];
 
 /// Regions of any shape that are large enough to show arcs.
-const PARTS: outline::Settings = outline::Settings {
+const ARC_REGIONS: outline::Settings = outline::Settings {
     dark_from: Some(2),
     bright_from: None,
     whole_level: 2,
@@ -64,7 +66,7 @@ const PARTS: outline::Settings = outline::Settings {
 };
 
 /// Regions as small as the paper of a marker far away.
-const SPECKS: outline::Settings = outline::Settings {
+const BLOB_REGIONS: outline::Settings = outline::Settings {
     dark_from: None,
     bright_from: Some(1),
     whole_level: usize::MAX,
@@ -73,105 +75,133 @@ const SPECKS: outline::Settings = outline::Settings {
     steep: false,
     min_fill: 0.5,
     max_raggedness: 1.3,
-    ..PARTS
+    ..ARC_REGIONS
 };
 
-impl Stage {
-    /// What it is of the detector's slow passes, for markers that are cut or hidden in part, or very far.
-    fn slow_pass(self) -> Option<SlowPass> {
+impl RingPass {
+    /// The fallback pass of the detector to which it belongs.
+    fn slow_pass(&self) -> Option<SlowPass> {
         match self {
-            Self::Whole(..) => None,
-            Self::Parts => Some(SlowPass::Arcs),
-            Self::Specks => Some(SlowPass::Specks),
+            Self::Ellipses(_) => None,
+            Self::Arcs => Some(SlowPass::Arcs),
+            Self::Blobs => Some(SlowPass::Specks),
         }
     }
 
-    fn name(self) -> &'static str {
+    fn name(&self) -> &'static str {
         match self {
-            Self::Whole(..) => "ellipses",
-            Self::Parts => "arcs",
-            Self::Specks => "specks",
+            Self::Ellipses(_) => "ellipses",
+            Self::Arcs => "arcs",
+            Self::Blobs => "specks",
         }
     }
 }
 
-/// Bounds, far above what a frame with a marker needs, so that no image takes long.
-const MOST_BORDERS: usize = 4000;
-const MOST_ARC_FITS: usize = 3000;
-const MOST_CANDIDATES: usize = 400;
-const MOST_LOOKED_INTO: usize = 20;
-/// The same of candidates with a lower score than this, which hardly any marker has.
-const MOST_DOUBTFUL: usize = 6;
-const DOUBTFUL: f64 = 0.75;
-const MOST_MARKERS: usize = 8;
-/// Levels of the pyramid on which what noise hides is looked for, and the least diameter there, in pixels.
-const COARSER: [usize; 2] = [1, 2];
-const LEAST_FROM_AFAR_PX: f64 = 16.0;
-/// Confidence that is believed there: every edge of the pattern is seen, or a ring that is not quite ours passes too.
-const LEAST_FROM_AFAR: f64 = 0.75;
-/// What a followed marker's dark rings lack of the light beside them at least, as a share.
-const LEAST_CONTRAST: f64 = 0.15;
-/// What looks like the marker less than this share of how much one does that was found is no other one.
-const LEAST_OF_BEST: f64 = 0.8;
+/// Bounds on the time for any image, far above what a frame with a marker needs.
+const MAX_ELLIPSES: usize = 4000;
+const MAX_ARC_FITS: usize = 3000;
+const MAX_CANDIDATES: usize = 400;
+const MAX_EVALUATED: usize = 20;
+/// Maximum number of evaluated candidates with a score below `DOUBTFUL_SCORE`, which hardly any marker has.
+const MAX_DOUBTFUL: usize = 6;
+const DOUBTFUL_SCORE: f64 = 0.75;
+const MAX_MARKERS: usize = 8;
+/// Levels of the pyramid on which noisy candidates are evaluated again, and the minimum diameter there, in
+/// pixels.
+const COARSE_LEVELS: [usize; 2] = [1, 2];
+const MIN_COARSE_PX: f64 = 16.0;
+/// Minimum confidence there: with fewer edges, rings that are not the marker's pass too.
+const MIN_COARSE_CONFIDENCE: f64 = 0.75;
+/// Minimum relative contrast of a tracked marker's dark rings.
+const MIN_TRACKED_CONTRAST: f64 = 0.15;
+/// Candidates whose score is below this fraction of a detected marker's are dropped.
+const MIN_SCORE_RATIO: f64 = 0.8;
 
-/// The detector's working memory.
+/// Detects three-ring markers. Its buffers are reused from image to image.
 #[derive(Debug, Default)]
-pub struct Rings {
-    /// Whether white rings on black are looked for.
-    inverted: bool,
-    /// Whether everything is looked at, whatever was found.
+pub struct RingDetector {
+    /// Whether white rings on black are searched.
+    white_on_black: bool,
+    /// Whether all passes run, whatever was found.
     thorough: bool,
-    borders: Vec<Border>,
-    candidates: Vec<Candidate>,
-    edges: Vec<EdgePoint>,
-    spots: Vec<PixelSample>,
+    ellipses: Vec<EllipseCandidate>,
+    candidates: Vec<RingCandidate>,
+    buffers: Buffers,
 }
 
-impl Rings {
-    /// Looks for white rings on black as well when `inverted`, and on where some were found when `thorough`.
-    pub fn new(inverted: bool, thorough: bool) -> Self {
-        Self { inverted, thorough, ..Self::default() }
+/// An image to be searched for rings.
+pub(crate) struct RingInput<'a, S> {
+    pub(crate) view: GrayView<'a>,
+    /// The outlines of the image, or only its pyramid; more outlines are added to it.
+    pub(crate) outlines: &'a mut Outlines,
+    /// Whether the outlines of dark regions are already there, made for other families.
+    pub(crate) has_outlines: bool,
+    pub(crate) marker: &'a Marker,
+    pub(crate) camera: Option<&'a CameraModel>,
+    pub(crate) allowed: Allowed,
+    pub(crate) trace: &'a mut Trace,
+    pub(crate) stages: &'a mut S,
+}
+
+/// What candidates are evaluated on.
+#[derive(Copy, Clone)]
+struct Evaluation<'a> {
+    view: GrayView<'a>,
+    marker: &'a Marker,
+    /// The camera, if it is known, and the one to compute with.
+    known_camera: Option<&'a CameraModel>,
+    camera: &'a CameraModel,
+}
+
+impl RingDetector {
+    /// Searches also white rings on black when `white_on_black`, and continues after a detection when
+    /// `thorough`.
+    pub fn new(white_on_black: bool, thorough: bool) -> Self {
+        Self { white_on_black, thorough, ..Self::default() }
     }
 
-    /// Makes the buffers as large as frames with texture need.
+    /// Reserves what textured frames need.
     pub(crate) fn make_room(&mut self) {
-        const MOST: usize = 1024;
-        self.borders.clear();
-        self.borders.reserve(MOST);
+        const ROOM: usize = 1024;
+        self.ellipses.clear();
+        self.ellipses.reserve(ROOM);
         self.candidates.clear();
-        self.candidates.reserve(MOST);
-        self.edges.clear();
-        self.edges.reserve(MOST);
-        self.spots.clear();
-        self.spots.reserve(MOST);
+        self.candidates.reserve(ROOM);
+        self.buffers.edges.clear();
+        self.buffers.edges.reserve(ROOM);
+        self.buffers.samples.clear();
+        self.buffers.samples.reserve(ROOM);
     }
 
-    /// Finds the markers in an image; the surest comes first. `outlines` has the outlines of that image as other families
-    /// share them, or, when it is told to be empty, only its pyramid; what else is looked at is added to it. When markers of
-    /// other families are among `found`, only those that are whole are looked for.
-    pub(crate) fn detect(
+    /// Adds the markers in an image to `found`, the most confident first. When markers of other families were
+    /// found, only complete ellipses are searched.
+    pub(crate) fn detect<S: Stages>(
         &mut self,
-        (view, outlines, is_empty): (GrayView<'_>, &mut Outlines, bool),
-        marker: &Marker,
-        (camera, allowed): (Option<&CameraModel>, Allowed),
-        (trace, stages): (&mut Trace, &mut impl Stages),
+        input: RingInput<'_, S>,
         found: &mut Vec<Observation>,
     ) {
+        let RingInput { view, outlines, has_outlines, marker, camera, allowed, trace, stages } =
+            input;
         let nominal = nominal_camera(view);
+        let evaluation =
+            Evaluation { view, marker, known_camera: camera, camera: camera.unwrap_or(&nominal) };
         let first = found.len();
-        for stage in STAGES {
-            // Who has something to land on need not look harder.
-            let is_closed = |pass| first > 0 && !self.thorough || !allowed.has(pass);
-            if stage.slow_pass().is_some_and(is_closed) {
+        for pass in PASSES {
+            let is_closed = |slow| first > 0 && !self.thorough || !allowed.has(slow);
+            if pass.slow_pass().is_some_and(is_closed) {
                 continue;
             }
-            self.find_candidates((view, outlines, is_empty), stage);
-            trace.ellipses.extend(self.borders.iter().map(|b| b.ellipse));
+            if let RingPass::Ellipses(levels) = &pass
+                && !has_outlines
+            {
+                outlines.add(view, &outline::Settings::default(), levels.clone());
+            }
+            self.find_candidates(view, outlines, &pass);
+            trace.ellipses.extend(self.ellipses.iter().map(|e| e.ellipse));
             trace.rings.extend(self.candidates.iter().map(ring));
-            stages.ended(stage.name());
-            let seen = (view, outlines.pyramid());
-            let lens = (camera, &nominal, allowed.has(SlowPass::Arcs));
-            self.look_into_all(seen, marker, lens, trace, (found, first));
+            stages.ended(pass.name());
+            let coarse = allowed.has(SlowPass::Arcs).then_some(outlines.pyramid());
+            self.evaluate_candidates(&evaluation, coarse, trace, found, first);
             stages.ended("matching");
             if found.len() > first && !self.thorough {
                 break;
@@ -180,61 +210,56 @@ impl Rings {
         found[first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
     }
 
-    /// Finds the marker that should be about here.
+    /// Detects the marker near a predicted pose.
     pub(crate) fn detect_at(
         &mut self,
         view: GrayView<'_>,
         marker: &Marker,
         camera: &CameraModel,
-        expected: &CirclePose,
+        predicted: &CirclePose,
     ) -> Option<Observation> {
         let size_m = marker.size_m?;
-        let search = Search { view, camera, size_m, min_contrast: LEAST_CONTRAST, inverted: false };
-        let seen = search.again(expected, &mut self.edges, &mut self.spots)?;
-        observed(&seen, (seen.circles, camera), (Some(size_m), Some(camera)), camera).ok()
+        let min_contrast = MIN_TRACKED_CONTRAST;
+        let search = EdgeSearch { view, camera, size_m, min_contrast, white_on_black: false };
+        let measured = search.measure_tracked(predicted, &mut self.buffers)?;
+        let evaluation = Evaluation { view, marker, known_camera: Some(camera), camera };
+        evaluation.observation(&measured, measured.pose, camera).ok()
     }
 
-    /// The circles that may be the marker's, those that look most like it first.
-    fn find_candidates(
-        &mut self,
-        (view, outlines, is_empty): (GrayView<'_>, &mut Outlines, bool),
-        stage: Stage,
-    ) {
-        self.borders.clear();
+    /// Finds the circles that may be the marker's, best first.
+    fn find_candidates(&mut self, view: GrayView<'_>, outlines: &mut Outlines, pass: &RingPass) {
+        self.ellipses.clear();
         self.candidates.clear();
-        match stage {
-            Stage::Whole(finest, end) => {
-                if is_empty {
-                    outlines.add(view, &outline::Settings::default(), finest..end);
-                }
-                let dark = outlines.iter().filter(|o| o.dark && (finest..end).contains(&o.level));
-                let whole = dark.filter_map(|o| whole_border(&o));
-                self.borders.extend(whole.take(MOST_BORDERS));
+        match pass {
+            RingPass::Ellipses(levels) => {
+                let dark = outlines.iter().filter(|o| o.dark && levels.contains(&o.level));
+                let ellipses = dark.filter_map(|o| complete_ellipse(&o));
+                self.ellipses.extend(ellipses.take(MAX_ELLIPSES));
             }
-            Stage::Parts => {
+            RingPass::Arcs => {
                 let first = outlines.len();
-                outlines.add(view, &PARTS, 0..usize::MAX);
+                outlines.add(view, &ARC_REGIONS, 0..usize::MAX);
                 self.find_arcs(view, outlines, first);
             }
-            Stage::Specks => {
+            RingPass::Blobs => {
                 let first = outlines.len();
-                outlines.add(view, &SPECKS, 0..usize::MAX);
-                let specks = outlines.iter().skip(first).take(MOST_BORDERS);
-                let specks = specks.filter_map(|o| speck(view, &o));
-                self.candidates.extend(specks.take(MOST_CANDIDATES));
+                outlines.add(view, &BLOB_REGIONS, 0..usize::MAX);
+                let blobs = outlines.iter().skip(first).take(MAX_ELLIPSES);
+                let blobs = blobs.filter_map(|o| blob(view, &o));
+                self.candidates.extend(blobs.take(MAX_CANDIDATES));
             }
         }
-        for border in &self.borders {
-            candidates(view, border, &mut self.candidates);
-            if self.candidates.len() >= MOST_CANDIDATES {
+        for ellipse in &self.ellipses {
+            add_ring_candidates(view, ellipse, &mut self.candidates);
+            if self.candidates.len() >= MAX_CANDIDATES {
                 break;
             }
         }
-        let inverted = self.inverted;
-        self.candidates.retain(|candidate| inverted || !candidate.inverted);
-        let worth = |c: &Candidate| c.score + if c.border.whole { 0.1 } else { 0.0 };
-        self.candidates.sort_unstable_by(|a, b| worth(b).total_cmp(&worth(a)));
-        // The same circle is seen on several levels.
+        let white_on_black = self.white_on_black;
+        self.candidates.retain(|candidate| white_on_black || !candidate.white_on_black);
+        let score = |c: &RingCandidate| c.score + if c.border.complete { 0.1 } else { 0.0 };
+        self.candidates.sort_unstable_by(|a, b| score(b).total_cmp(&score(a)));
+        // The same circle is found on several levels.
         let mut kept = 0;
         for index in 0..self.candidates.len() {
             let candidate = self.candidates[index];
@@ -246,97 +271,97 @@ impl Rings {
         self.candidates.truncate(kept);
     }
 
-    /// Takes the arcs of the outlines from the index `first` on.
+    /// Adds the arcs of the outlines from the index `first` on.
     fn find_arcs(&mut self, view: GrayView<'_>, outlines: &Outlines, first: usize) {
-        let mut budget = MOST_ARC_FITS;
+        let mut budget = MAX_ARC_FITS;
         for outline in outlines.iter().skip(first) {
-            if whole_border(&outline).is_some() {
+            if complete_ellipse(&outline).is_some() {
                 continue;
             }
             let level = outlines.pyramid().level(view, outline.level);
             let Some(size) = level.map(|v| [v.width(), v.height()]) else { continue };
-            add_arcs(&outline, size, &mut budget, &mut self.borders);
-            if budget == 0 || self.borders.len() >= MOST_BORDERS {
+            add_arc_ellipses(&outline, size, &mut budget, &mut self.ellipses);
+            if budget == 0 || self.ellipses.len() >= MAX_ELLIPSES {
                 return;
             }
         }
     }
 
-    /// Adds the markers among the candidates to those found from the index `first` on, looking on coarser levels as well when
-    /// `from_afar`.
-    fn look_into_all(
+    /// Adds the markers among the candidates to those found from the index `first` on; on `coarse` levels as
+    /// well, if there are any.
+    fn evaluate_candidates(
         &mut self,
-        (view, pyramid): (GrayView<'_>, &Pyramid),
-        marker: &Marker,
-        (camera, nominal, from_afar): (Option<&CameraModel>, &CameraModel, bool),
+        evaluation: &Evaluation<'_>,
+        coarse: Option<&Pyramid>,
         trace: &mut Trace,
-        (found, first): (&mut Vec<Observation>, usize),
+        found: &mut Vec<Observation>,
+        first: usize,
     ) {
-        let (mut least_score, mut doubtful) = (0.0_f64, 0);
-        for index in 0..self.candidates.len().min(MOST_LOOKED_INTO) {
+        let (mut min_score, mut doubtful) = (0.0_f64, 0);
+        for index in 0..self.candidates.len().min(MAX_EVALUATED) {
             let candidate = self.candidates[index];
-            if candidate.score < least_score {
+            if candidate.score < min_score {
                 continue;
             }
-            if candidate.score < DOUBTFUL {
+            if candidate.score < DOUBTFUL_SCORE {
                 doubtful += 1;
-                if doubtful > MOST_DOUBTFUL {
+                if doubtful > MAX_DOUBTFUL {
                     break;
                 }
             }
             let [x, y] = candidate.border.ellipse.centre;
-            let taken = |o: &Observation| (o.centre.x - x).hypot(o.centre.y - y) < o.size_px / 2.0;
-            let outcome = if found[first..].iter().any(taken) {
+            let covers = |o: &Observation| (o.centre.x - x).hypot(o.centre.y - y) < o.size_px / 2.0;
+            let outcome = if found[first..].iter().any(covers) {
                 Err(Reason::Repeated)
             } else {
-                let seen = self.look_into(view, &candidate, marker, camera, nominal);
-                if seen.is_err() && from_afar && found.len() == first {
-                    let eyes = (view, pyramid, camera.unwrap_or(nominal));
-                    self.look_from_afar(eyes, &candidate, marker, camera.is_some()).or(seen)
-                } else {
-                    seen
+                let outcome = evaluation.evaluate(&candidate, &mut self.buffers);
+                match coarse.filter(|_| outcome.is_err() && found.len() == first) {
+                    Some(pyramid) => {
+                        self.detect_coarse(evaluation, pyramid, &candidate).or(outcome)
+                    }
+                    None => outcome,
                 }
             };
             match outcome {
                 Ok(observation) => {
                     found.push(observation);
-                    least_score = least_score.max(LEAST_OF_BEST * candidate.score);
+                    min_score = min_score.max(MIN_SCORE_RATIO * candidate.score);
                 }
                 Err(reason) => {
                     let Ring { inner, outer, .. } = ring(&candidate);
                     trace.refuse(inner, outer, reason);
                 }
             }
-            if found.len() - first >= MOST_MARKERS {
+            if found.len() - first >= MAX_MARKERS {
                 break;
             }
         }
     }
 
-    /// As [`Rings::look_into`] on coarser levels of the pyramid, where noise has averaged out.
-    fn look_from_afar(
+    /// Evaluates a candidate on coarser levels of the pyramid, where noise averages out.
+    fn detect_coarse(
         &mut self,
-        (view, pyramid, camera): (GrayView<'_>, &Pyramid, &CameraModel),
-        candidate: &Candidate,
-        marker: &Marker,
-        is_known: bool,
+        evaluation: &Evaluation<'_>,
+        pyramid: &Pyramid,
+        candidate: &RingCandidate,
     ) -> Result<Observation, Reason> {
         let mut last = Err(Reason::Edges);
-        for level in COARSER {
+        for level in COARSE_LEVELS {
             let scale = to_level_0(1.0, level) - to_level_0(0.0, level);
-            if candidate.diameter_px() < LEAST_FROM_AFAR_PX * scale {
+            if candidate.diameter_px() < MIN_COARSE_PX * scale {
                 break;
             }
-            let Some(coarse) = pyramid.level(view, level) else { break };
-            let lens = camera_on_level(camera, coarse, level);
+            let Some(view) = pyramid.level(evaluation.view, level) else { break };
+            let camera = camera_on_level(evaluation.camera, view, level);
             let mut smaller = *candidate;
             let Ellipse { centre, minor, major, .. } = &mut smaller.border.ellipse;
             *centre = centre.map(|c| from_level_0(c, level));
             (*minor, *major) = (*minor / scale, *major / scale);
-            let camera = is_known.then_some(&lens);
-            last = self.look_into(coarse, &smaller, marker, camera, &lens);
+            let known_camera = evaluation.known_camera.map(|_| &camera);
+            let coarse = Evaluation { view, known_camera, camera: &camera, ..*evaluation };
+            last = coarse.evaluate(&smaller, &mut self.buffers);
             if let Ok(observation) = last {
-                if observation.confidence >= LEAST_FROM_AFAR {
+                if observation.confidence >= MIN_COARSE_CONFIDENCE {
                     return Ok(in_image(observation, level));
                 }
                 last = Err(Reason::Edges);
@@ -344,36 +369,68 @@ impl Rings {
         }
         last
     }
+}
 
-    /// Whether a candidate is part of a marker, and where that marker is.
-    fn look_into(
-        &mut self,
-        view: GrayView<'_>,
-        candidate: &Candidate,
-        marker: &Marker,
-        camera: Option<&CameraModel>,
-        nominal: &CameraModel,
+impl Evaluation<'_> {
+    /// The marker of which a candidate is part.
+    fn evaluate(
+        &self,
+        candidate: &RingCandidate,
+        buffers: &mut Buffers,
     ) -> Result<Observation, Reason> {
-        let size_m = marker.size_m.unwrap_or(1.0);
-        let lens = camera.unwrap_or(nominal);
-        let search = Search {
-            view,
-            camera: lens,
-            size_m,
+        let search = EdgeSearch {
+            view: self.view,
+            camera: self.camera,
+            size_m: self.marker.size_m.unwrap_or(1.0),
             min_contrast: 0.35 * candidate.contrast,
-            inverted: candidate.inverted,
+            white_on_black: candidate.white_on_black,
         };
-        let seen = search.marker(candidate, &mut self.edges, &mut self.spots)?;
-        let guessed = match camera {
+        let measured = search.measure(candidate, buffers)?;
+        let guessed = match self.known_camera {
             Some(_) => None,
-            None => guess_lens(&seen.circles, lens, &mut self.edges),
+            None => guess_focal_length(&measured.pose, self.camera, &mut buffers.edges),
         };
-        let (circles, lens) = guessed.unwrap_or((seen.circles, *lens));
-        observed(&seen, (circles, &lens), (marker.size_m, camera), search.camera)
+        let (pose, camera) = guessed.unwrap_or((measured.pose, *self.camera));
+        self.observation(&measured, pose, &camera)
+    }
+
+    /// A measured marker as an observation; `pose` is its pose with a `camera` that may be guessed.
+    fn observation(
+        &self,
+        measured: &MeasuredMarker,
+        pose: CirclePose,
+        camera: &CameraModel,
+    ) -> Result<Observation, Reason> {
+        let size_m = self.marker.size_m;
+        let marker_pose = size_m.and(self.known_camera).map(|_| MarkerPose {
+            camera_from_marker: pose.camera_from_marker(),
+            reprojection_rms_px: measured.rms_px,
+            covariance: measured.covariance,
+            alternative: measured.alternative.map(|other| PoseSolution {
+                camera_from_marker: other.pose.camera_from_marker(),
+                reprojection_rms_px: other.rms_px,
+            }),
+        });
+        let of_centre = measured.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        let centre_covariance_px2 =
+            pixel_covariance(measured.pose.centre, &of_centre, self.camera).ok_or(Reason::Pose)?;
+        let centre = project(pose.centre, camera).ok_or(Reason::Pose)?;
+        let outline = pose.projected(size_m.unwrap_or(1.0) / 2.0, camera).ok_or(Reason::Pose)?;
+        Ok(Observation {
+            family: Family::Rings,
+            id: None,
+            centre,
+            centre_covariance_px2,
+            corners: None,
+            wrong_bits: 0,
+            size_px: outline.major,
+            confidence: measured.confidence,
+            pose: marker_pose,
+        })
     }
 }
 
-/// The camera whose image a level of the pyramid is.
+/// The camera model of a level of the pyramid.
 fn camera_on_level(camera: &CameraModel, view: GrayView<'_>, level: usize) -> CameraModel {
     let scale = to_level_0(1.0, level) - to_level_0(0.0, level);
     CameraModel {
@@ -387,7 +444,7 @@ fn camera_on_level(camera: &CameraModel, view: GrayView<'_>, level: usize) -> Ca
     }
 }
 
-/// What was observed on a level of the pyramid, in pixels of the image.
+/// An observation on a level of the pyramid, in pixels of the image.
 fn in_image(mut observation: Observation, level: usize) -> Observation {
     let scale = to_level_0(1.0, level) - to_level_0(0.0, level);
     let Pixel { x, y } = observation.centre;
@@ -403,54 +460,19 @@ fn in_image(mut observation: Observation, level: usize) -> Observation {
     observation
 }
 
-/// A marker that was seen, its circles through a lens that may be guessed.
-fn observed(
-    seen: &Seen,
-    (circles, lens): (CirclePose, &CameraModel),
-    (size_m, camera): (Option<f64>, Option<&CameraModel>),
-    nominal: &CameraModel,
-) -> Result<Observation, Reason> {
-    let pose = size_m.and(camera).map(|_| MarkerPose {
-        camera_from_marker: circles.camera_from_marker(),
-        reprojection_rms_px: seen.rms_px,
-        covariance: seen.covariance,
-        alternative: seen.other.map(|(other, reprojection_rms_px)| PoseSolution {
-            camera_from_marker: other.camera_from_marker(),
-            reprojection_rms_px,
-        }),
-    });
-    let of_centre = seen.covariance.fixed_view::<3, 3>(0, 0).into_owned();
-    let centre_covariance_px2 =
-        pixel_covariance(seen.circles.centre, &of_centre, nominal).ok_or(Reason::Pose)?;
-    let centre = project(circles.centre, lens).ok_or(Reason::Pose)?;
-    let outline = circles.projected(size_m.unwrap_or(1.0) / 2.0, lens).ok_or(Reason::Pose)?;
-    Ok(Observation {
-        family: Family::Rings,
-        id: None,
-        centre,
-        centre_covariance_px2,
-        corners: None,
-        wrong_bits: 0,
-        size_px: outline.major,
-        confidence: seen.confidence,
-        pose,
-    })
-}
-
-/// Whether two candidates are one circle.
-fn is_same(a: &Candidate, b: &Candidate) -> bool {
+/// Whether two candidates are the same circle.
+fn is_same(a: &RingCandidate, b: &RingCandidate) -> bool {
     let [first, second] = [a, b].map(|c| c.border.ellipse);
-    let off = (first.centre[0] - second.centre[0]).hypot(first.centre[1] - second.centre[1]);
+    let distance = (first.centre[0] - second.centre[0]).hypot(first.centre[1] - second.centre[1]);
     a.radius == b.radius
-        && off < 0.1 * first.minor
+        && distance < 0.1 * first.minor
         && (first.minor / second.minor - 1.0).abs() < 0.15
 }
 
 /// The ring of which a candidate is one edge.
-fn ring(candidate: &Candidate) -> Ring {
-    let Candidate { border, radius, .. } = *candidate;
-    let of = |kind: &RingKind| kind.radii().0 - 1e-6 <= radius && radius <= kind.radii().1 + 1e-6;
-    let kind = RingKind::ALL.into_iter().find(of).unwrap_or(RingKind::Outer);
+fn ring(candidate: &RingCandidate) -> Ring {
+    let RingCandidate { border, radius, .. } = *candidate;
+    let kind = ring_with_circle(radius);
     let scaled = |to: f64| {
         let factor = to / radius;
         let Ellipse { minor, major, .. } = border.ellipse;

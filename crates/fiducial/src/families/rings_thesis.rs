@@ -1,16 +1,17 @@
-//! The detector of the three-ring marker as the thesis has it: section 3.1, Algorithms 1 to 15, to the letter.
+//! The detector of the three-ring marker as the thesis has it: section 3.1, Algorithms 1 to 15, to the
+//! letter.
 //!
-//! Kept as a yardstick. Its weakness is [`two_have_equal_orientation`]: seen head-on the ellipses are circles, whose
-//! orientation is noise. What the thesis leaves open is said where it is decided.
+//! Kept as a yardstick. Its weakness is [`two_have_equal_orientation`]: seen head-on the ellipses are
+//! circles, whose orientation is noise. What the thesis leaves open is said where it is decided.
 
 use std::f64::consts::PI;
 
+use markers::{Family, Marker, RingKind};
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Rotation, Transform};
 use imaging::{
     BilateralRows, Contours, Ellipse, GrayImage, GrayView, Limits, bilateral_5x5, contour_area,
     fit_ellipse, threshold,
 };
-use markers::{Family, Marker, RingKind};
 use nalgebra::{Matrix2, Matrix3, Matrix6};
 
 use crate::candidates::ring::Ring;
@@ -167,8 +168,9 @@ pub fn eccentricity_is_equal(first: &Ellipse, second: &Ellipse) -> bool {
     (first.eccentricity() - second.eccentricity()).abs() <= T_ECCENTRICITY
 }
 
-/// Equation 3.9 by `atan2`: the difference of two angles, from -pi to pi. An ellipse's angle is the same after half
-/// a turn; the thesis takes the result to lie within a quarter turn, which `atan2` does not see to.
+/// Equation 3.9 by `atan2`: the difference of two angles, from -pi to pi. An ellipse's angle is the same
+/// after half a turn; the thesis takes the result to lie within a quarter turn, which `atan2` does not see
+/// to.
 pub fn orientation_difference(angle_1: f64, angle_2: f64) -> f64 {
     let difference = angle_1 - angle_2;
     difference.sin().atan2(difference.cos())
@@ -201,8 +203,9 @@ pub fn black_threshold(view: GrayView<'_>) -> f64 {
     0.3 * (f64::from(max) - f64::from(min)) + f64::from(min)
 }
 
-/// Algorithm 6: whether more than [`T_BLACK`] of the ring's pixels are darker than `black`. The pixels are those
-/// of the filled outer contour without those of the filled inner one, in the image as the camera gave it.
+/// Algorithm 6: whether more than [`T_BLACK`] of the ring's pixels are darker than `black`. The pixels are
+/// those of the filled outer contour without those of the filled inner one, in the image as the camera gave
+/// it.
 pub fn is_black(view: GrayView<'_>, black: f64, outer: &[[i32; 2]], inner: &[[i32; 2]]) -> bool {
     let (outer, inner) = (Extents::of(outer), Extents::of(inner));
     let (mut points, mut black_points) = (0_u64, 0_u64);
@@ -227,8 +230,8 @@ pub fn is_black(view: GrayView<'_>, black: f64, outer: &[[i32; 2]], inner: &[[i3
     points > 0 && black_points as f64 / points as f64 > T_BLACK
 }
 
-/// First and last column of a contour in each row: what it encloses, since a contour that passed Algorithm 1 is
-/// nearly an ellipse.
+/// First and last column of a contour in each row: what it encloses, since a contour that passed Algorithm 1
+/// is nearly an ellipse.
 struct Extents {
     top: i32,
     columns: Vec<(i32, i32)>,
@@ -323,8 +326,8 @@ pub fn centre_one_ring(ring: &Ring) -> Option<Matched> {
     Some(vec![*ring])
 }
 
-/// Algorithm 12: two rings are the marker when their kinds differ, they are concentric and equally oriented, and
-/// (so the text) are not the inner and the outer one, which have nothing in common to be mistaken about.
+/// Algorithm 12: two rings are the marker when their kinds differ, they are concentric and equally oriented,
+/// and (so the text) are not the inner and the outer one, which have nothing in common to be mistaken about.
 pub fn centre_two_rings(rings: [&Ring; 2]) -> Option<Matched> {
     let [first, second] = rings;
     let valid = first.kind != second.kind
@@ -342,7 +345,8 @@ pub fn centre_three_rings(rings: [&Ring; 3]) -> Option<Matched> {
     valid.then(|| rings.map(|r| *r).to_vec())
 }
 
-/// Algorithm 14: of four or more rings, the first pair that is a marker, and without one the first three that are.
+/// Algorithm 14: of four or more rings, the first pair that is a marker, and without one the first three that
+/// are.
 pub fn centre_four_or_more_rings(rings: &[Ring]) -> Option<Matched> {
     let pairs =
         rings.iter().enumerate().flat_map(|(i, a)| rings[i + 1..].iter().map(move |b| [a, b]));
@@ -398,8 +402,9 @@ fn observe(rings: &[Ring], marker: &Marker, camera: Option<&CameraModel>) -> Obs
     }
 }
 
-/// Standard deviation of the centre in pixels, and what the perspective of tilted rings adds, as a share of their size:
-/// the thesis' method has no estimate of its own, and these are no less than the errors measured in renderings.
+/// Standard deviation of the centre in pixels, and what the perspective of tilted rings adds, as a share of
+/// their size: the thesis' method has no estimate of its own, and these are no less than the errors measured
+/// in renderings.
 const CENTRE_ERROR_PX: f64 = 0.1;
 const CENTRE_ERROR_OF_SIZE: f64 = 0.02;
 /// Standard deviation of the range, as a share of it.

@@ -4,9 +4,9 @@
 //! Then the corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be
 //! hidden, and the quiet zones of markers so small that blur breaks their border.
 
+use markers::{Marker, Match, SquareCode};
 use geometry::Pixel;
 use imaging::GrayView;
-use markers::{Marker, Match, SquareCode};
 
 use crate::candidates::overlap::Overlap;
 use crate::candidates::quad::{Quad, mean_side_px};

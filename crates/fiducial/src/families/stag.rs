@@ -6,11 +6,11 @@
 //! with hidden dots erased, and squares in quiet zones. Then the whole marker is refined: by its outline and
 //! the disc's edge where these are far enough apart, by all grey values where they are not.
 
+use markers::{Codebook, Family, Marker};
+use markers::stag_code::{self, DOTS, QUIET_ZONE};
 use geometry::Pixel;
 use imaging::bilinear;
 use imaging::pyramid::from_level_0;
-use markers::stag_code::{self, DOTS, QUIET_ZONE};
-use markers::{Codebook, Family, Marker};
 
 use crate::candidates::overlap::Overlap;
 use crate::candidates::quad::{Quad, shortest_side_px};

@@ -12,8 +12,8 @@ const FIRST: f64 = -(MAX_SIGMAS as usize as f64 + 1.0);
 
 /// A straight edge through a Gaussian blur, averaged over the area of a pixel.
 ///
-/// The variance is that of the blur plus that of a pixel on every axis. That a pixel is a box and not a Gaussian shows in
-/// the fourth cumulant, which depends on the edge's direction (Edgeworth series).
+/// The variance is that of the blur plus that of a pixel on every axis. That a pixel is a box and not a
+/// Gaussian shows in the fourth cumulant, which depends on the edge's direction (Edgeworth series).
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct EdgeResponse {
     /// The normal distribution and its density, tabulated.
@@ -23,7 +23,8 @@ pub(crate) struct EdgeResponse {
 /// Variance of a pixel's own extent, in square pixels.
 pub(crate) const PIXEL_VARIANCE: f64 = 1.0 / 12.0;
 
-/// Fourth cumulant of a pixel's extent along the unit vector `normal`, over 24 times the square of the whole variance.
+/// Fourth cumulant of a pixel's extent along the unit vector `normal`, over 24 times the square of the whole
+/// variance.
 #[inline]
 pub(crate) fn pixel_kurtosis(normal: [f64; 2], variance: f64) -> f64 {
     let [x, y] = normal.map(|n| n * n);
@@ -41,8 +42,8 @@ impl EdgeResponse {
         Self { nodes: &NORMAL }
     }
 
-    /// The response, from 0 to 1, at `z` standard deviations on the bright side of an edge of this [`pixel_kurtosis`],
-    /// and its derivative by `z`.
+    /// The response, from 0 to 1, at `z` standard deviations on the bright side of an edge of this
+    /// [`pixel_kurtosis`], and its derivative by `z`.
     #[inline]
     pub(crate) fn at(&self, z: f64, pixel_kurtosis: f64) -> (f64, f64) {
         if z.is_nan() || z.abs() >= MAX_SIGMAS {

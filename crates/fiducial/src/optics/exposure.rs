@@ -28,7 +28,8 @@ impl Exposure {
     }
 }
 
-/// The same for pixels that saturate: when white is brighter than the saturation level, only the darker pixels count.
+/// The same for pixels that saturate: when white is brighter than the saturation level, only the darker
+/// pixels count.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct ClippedExposure {
     saturation: f64,

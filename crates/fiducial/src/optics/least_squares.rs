@@ -1,8 +1,8 @@
 //! Levenberg-Marquardt for a few unknowns, on the stack.
 //!
-//! A [`Problem`] gives the normal equations at a place and the place after a step; [`minimise`] solves, damps and
-//! compares. When to stop, how to damp and what to do about a step that leads nowhere are a [`Schedule`]. A problem that
-//! needs Gauss-Newton only takes [`NormalEquations::step`] with no damping.
+//! A [`Problem`] gives the normal equations at a place and the place after a step; [`minimise`] solves, damps
+//! and compares. When to stop, how to damp and what to do about a step that leads nowhere are a [`Schedule`].
+//! A problem that needs Gauss-Newton only takes [`NormalEquations::step`] with no damping.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -19,8 +19,8 @@ pub(crate) struct NormalEquations<const N: usize, E = ()> {
 }
 
 impl<const N: usize, E> NormalEquations<N, E> {
-    /// The step to the minimum of the quadratic model. The diagonal is increased by `damping` of itself and by `ridge`.
-    /// `None` when the matrix is not positive definite.
+    /// The step to the minimum of the quadratic model. The diagonal is increased by `damping` of itself and
+    /// by `ridge`. `None` when the matrix is not positive definite.
     #[inline]
     pub(crate) fn step(&self, damping: f64, ridge: f64) -> Option<SVector<f64, N>> {
         let mut matrix = self.matrix;
@@ -76,7 +76,8 @@ pub(crate) struct Schedule {
     pub(crate) settled_ratio: f64,
     /// ... and this.
     pub(crate) settled_cost: f64,
-    /// Without a solution of the equations, or a place after the step, the whole fit fails; else the damping grows.
+    /// Without a solution of the equations, or a place after the step, the whole fit fails; else the damping
+    /// grows.
     pub(crate) fails_without_step: bool,
     /// Where the place after a step has no equations, the whole fit fails; else the damping grows.
     pub(crate) fails_without_equations: bool,
@@ -133,7 +134,8 @@ pub(crate) trait Problem<const N: usize> {
         Review::Compare
     }
 
-    /// Called after each step that was taken, with the number of steps tried before it. The equations may be made anew.
+    /// Called after each step that was taken, with the number of steps tried before it. The equations may be
+    /// made anew.
     #[inline]
     fn after_step(
         &mut self,

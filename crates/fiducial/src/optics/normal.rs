@@ -2,7 +2,8 @@
 
 use std::f64::consts::TAU;
 
-/// Share of the standard normal distribution below `z`, by its power series, which converges for every argument.
+/// Share of the standard normal distribution below `z`, by its power series, which converges for every
+/// argument.
 pub(crate) fn cumulative(z: f64) -> f64 {
     let (mut term, mut sum) = (z, z);
     for k in 1..200 {

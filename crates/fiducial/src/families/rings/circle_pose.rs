@@ -33,8 +33,8 @@ pub(crate) struct EdgePoint {
 const ELLIPSE_POINTS: u32 = 24;
 /// Huber limit of edge residuals, in pixels.
 const HUBER_PX: f64 = 0.3;
-/// Lower bound of the edges' standard deviation, in pixels. Errors common to all edges, such as the blur of thin rings,
-/// do not show in their scatter.
+/// Lower bound of the edges' standard deviation, in pixels. Errors common to all edges, such as the blur of
+/// thin rings, do not show in their scatter.
 const MIN_EDGE_ERROR_PX: f64 = 0.05;
 /// Fewer edge points do not determine a pose.
 const MIN_EDGE_POINTS: usize = 8;
@@ -58,8 +58,8 @@ const SCHEDULE: Schedule = Schedule {
 };
 
 impl CirclePose {
-    /// The two poses of a circle of `radius` metres whose image is this ellipse (Chen, Wu and Wada, "Camera calibration
-    /// with two arbitrary coplanar circles", ECCV 2004).
+    /// The two poses of a circle of `radius` metres whose image is this ellipse (Chen, Wu and Wada, "Camera
+    /// calibration with two arbitrary coplanar circles", ECCV 2004).
     pub(crate) fn from_ellipse(
         ellipse: &Ellipse,
         radius: f64,
@@ -108,7 +108,8 @@ impl CirclePose {
         self.normal.angle(&-self.centre)
     }
 
-    /// The same centre and tilt, with the direction of the tilt rotated by 90 degrees about the line of sight.
+    /// The same centre and tilt, with the direction of the tilt rotated by 90 degrees about the line of
+    /// sight.
     pub(crate) fn with_tilt_rotated(&self) -> Self {
         let sight = self.centre.normalize();
         let along = sight * self.normal.dot(&sight);
@@ -134,8 +135,8 @@ impl CirclePose {
         fit_ellipse(points.iter().copied())
     }
 
-    /// The pose that fits the edge points best, with the remaining root mean square distance in pixels. `None` with too
-    /// few points, or when a step leaves the valid poses.
+    /// The pose that fits the edge points best, with the remaining root mean square distance in pixels.
+    /// `None` with too few points, or when a step leaves the valid poses.
     pub(crate) fn refined(
         &self,
         points: &[EdgePoint],
@@ -148,8 +149,8 @@ impl CirclePose {
         Some((best, best.rms_px(points, camera)?))
     }
 
-    /// The pose in the project's conventions. Rings do not determine the rotation about their normal: the marker's y
-    /// axis is chosen as close to the image's upward direction as the normal allows.
+    /// The pose in the project's conventions. Rings do not determine the rotation about their normal: the
+    /// marker's y axis is chosen as close to the image's upward direction as the normal allows.
     pub(crate) fn camera_from_marker(&self) -> Transform<Camera, MarkerFrame> {
         let z = self.normal;
         let up = -Vector3::y();
@@ -190,8 +191,8 @@ impl CirclePose {
         Some((squares? / points.len().max(1) as f64).sqrt())
     }
 
-    /// Covariance of the pose fitted to these edge points: centre (m), then rotation vector (rad), in the camera frame.
-    /// The rotation about the normal is unobservable and gets [`UNKNOWN_ANGLE_VARIANCE`].
+    /// Covariance of the pose fitted to these edge points: centre (m), then rotation vector (rad), in the
+    /// camera frame. The rotation about the normal is unobservable and gets [`UNKNOWN_ANGLE_VARIANCE`].
     pub(crate) fn covariance(
         &self,
         points: &[EdgePoint],
@@ -219,8 +220,8 @@ impl CirclePose {
         covariance
     }
 
-    /// The largest median residual of one circle's edge points, in pixels. It is large when the radii are not the
-    /// marker's.
+    /// The largest median residual of one circle's edge points, in pixels. It is large when the radii are not
+    /// the marker's.
     pub(crate) fn max_bias_px(&self, points: &[EdgePoint], camera: &CameraModel) -> f64 {
         const MAX_POINTS: usize = 128;
         let plane = self.plane(camera);
@@ -254,7 +255,8 @@ impl CirclePose {
         points.retain(|point| size(point) <= limit);
     }
 
-    /// The pose after a step of the centre (three numbers, metres) and of the normal along [`CirclePose::basis`].
+    /// The pose after a step of the centre (three numbers, metres) and of the normal along
+    /// [`CirclePose::basis`].
     pub(crate) fn moved(&self, step: &SVector<f64, 5>) -> Option<Self> {
         let (u, v) = self.basis();
         let turn = (step[3].hypot(step[4]) / MAX_TURN).max(1.0);
@@ -335,7 +337,8 @@ impl RayPlaneIntersection {
 }
 
 impl CirclePlane {
-    /// Intersects a ray with the plane; check [`RayPlaneIntersection::is_valid`]. Free of branches, for vectorisation.
+    /// Intersects a ray with the plane; check [`RayPlaneIntersection::is_valid`]. Free of branches, for
+    /// vectorisation.
     #[inline(always)]
     pub(crate) fn intersect(&self, ray: &Vector3<f64>) -> RayPlaneIntersection {
         let facing = self.normal.dot(ray);

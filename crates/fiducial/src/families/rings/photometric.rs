@@ -1,9 +1,9 @@
 //! Pose of a marker from its grey values.
 //!
-//! Where rings are a few pixels wide, the blur of one edge reaches the next, and edges located one by one come out too far
-//! apart. Here pose, blur and exposure are fitted together, to minimise the difference between the image predicted by the
-//! model and the image observed. `scene` selects the pixels, `blur` is the model of one pixel, `solve` fits the model,
-//! `score` rates the result.
+//! Where rings are a few pixels wide, the blur of one edge reaches the next, and edges located one by one
+//! come out too far apart. Here pose, blur and exposure are fitted together, to minimise the difference
+//! between the image predicted by the model and the image observed. `scene` selects the pixels, `blur` is the
+//! model of one pixel, `solve` fits the model, `score` rates the result.
 
 mod blur;
 mod scene;
@@ -22,15 +22,16 @@ use solve::{Effort, ModelFit, Start};
 
 pub(crate) use scene::MAX_DIAMETER_PX;
 
-/// With this many samples or more, every third is enough for the first steps and for the choice between poses.
+/// With this many samples or more, every third is enough for the first steps and for the choice between
+/// poses.
 const MANY_SAMPLES: usize = 200;
 const SPARSE_STRIDE: usize = 3;
 /// Grey values above this are saturated: the light may be of any brightness.
 const MAX_GREY: f64 = 254.5;
 /// A root mean square residual above this, in units of the contrast, is not a marker's.
 const MAX_RESIDUAL: f64 = 0.2;
-/// Largest residual before each of the first steps: about a third above the largest of 800 markers in a thousand images.
-/// Nine of ten small candidates that are no marker, and half of the larger ones, end here.
+/// Largest residual before each of the first steps: about a third above the largest of 800 markers in a
+/// thousand images. Nine of ten small candidates that are no marker, and half of the larger ones, end here.
 const EARLY_REJECT_RESIDUAL_SMALL: [f64; 3] = [0.27, 0.22, 0.17];
 const EARLY_REJECT_RESIDUAL: [f64; 3] = [0.45, 0.4, 0.35];
 /// Above this residual, in units of the contrast, motion blur is tried, ...
@@ -168,8 +169,8 @@ impl PhotometricInput<'_> {
         Some(PhotometricPoses { best, alternative: (!same).then_some(other) })
     }
 
-    /// As [`PhotometricInput::fit`] for a tracked marker near its predicted pose: most steps use the sparse samples, one
-    /// uses all. `None` for a marker so small that all of its pixels are needed anyway.
+    /// As [`PhotometricInput::fit`] for a tracked marker near its predicted pose: most steps use the sparse
+    /// samples, one uses all. `None` for a marker so small that all of its pixels are needed anyway.
     pub(crate) fn fit_tracked(
         &self,
         predicted: &CirclePose,

@@ -57,22 +57,24 @@ impl Blur {
 
 /// Distribution of the distance from the centre over the blur about a pixel.
 ///
-/// The squared distance is a quadratic form in normal variables. Raised to `power` it is nearly normal, also for circles no
-/// larger than the blur (Jensen and Solomon, "A Gaussian approximation to the distribution of a definite quadratic form",
-/// JASA 1972).
+/// The squared distance is a quadratic form in normal variables. Raised to `power` it is nearly normal, also
+/// for circles no larger than the blur (Jensen and Solomon, "A Gaussian approximation to the distribution of
+/// a definite quadratic form", JASA 1972).
 #[derive(Copy, Clone)]
 pub(super) struct RadiusDistribution {
     pub(super) at: RayPlaneIntersection,
     /// The logarithm of the mean of the squared distance.
     log_mean_square: f64,
     power: f64,
-    /// Of the squared distance over its mean, to that power: its mean and the inverse of its standard deviation.
+    /// Of the squared distance over its mean, to that power: its mean and the inverse of its standard
+    /// deviation.
     mean: f64,
     inverse_deviation: f64,
     /// Derivative of the share inside a circle by the pixel's distance from the centre.
     by_distance: f64,
     pixel_kurtosis: f64,
-    /// Inverse of an upper bound of the blur, in metres: near the centre, tangential blur changes the distance as well.
+    /// Inverse of an upper bound of the blur, in metres: near the centre, tangential blur changes the
+    /// distance as well.
     inverse_max_blur: f64,
     /// Derivatives of the logarithm of the deviation by the blur and by the motion.
     by_blur: f64,

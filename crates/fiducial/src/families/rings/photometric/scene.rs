@@ -2,8 +2,8 @@
 
 use std::f64::consts::TAU;
 
-use geometry::{CameraModel, Pixel};
 use markers::RingKind;
+use geometry::{CameraModel, Pixel};
 use nalgebra::Vector3;
 
 use super::PhotometricInput;
@@ -85,8 +85,8 @@ impl<'a> Scene<'a> {
 pub(super) struct SampleSource<'a>(pub(super) PhotometricInput<'a>);
 
 impl SampleSource<'_> {
-    /// Takes the pixels in and just around the marker, of a large one those about its edges. False when they would be the
-    /// ones that were already taken for a lens in focus.
+    /// Takes the pixels in and just around the marker, of a large one those about its edges. False when they
+    /// would be the ones that were already taken for a lens in focus.
     pub(super) fn gather(
         &self,
         pose: &CirclePose,

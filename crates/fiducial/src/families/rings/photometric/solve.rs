@@ -63,8 +63,8 @@ pub(super) struct RingModel {
     pub(super) pose: CirclePose,
     /// Blur of lens and pixel, averaged over all directions, as a standard deviation in pixels.
     pub(super) blur_px: f64,
-    /// Motion blur, in square pixels: half of the difference between the blur's variances to the right and down, and
-    /// their covariance.
+    /// Motion blur, in square pixels: half of the difference between the blur's variances to the right and
+    /// down, and their covariance.
     pub(super) motion: [f64; 2],
     pub(super) black: f64,
     pub(super) white: f64,
@@ -78,7 +78,8 @@ impl RingModel {
         self.white - self.black
     }
 
-    /// Calls `visit` with each sample that counts and the model's response there; `None` when a ray misses the plane.
+    /// Calls `visit` with each sample that counts and the model's response there; `None` when a ray misses
+    /// the plane.
     #[inline]
     pub(super) fn for_each_response(
         &self,
@@ -210,7 +211,8 @@ pub(super) struct Sums {
 
 type Equations = NormalEquations<UNKNOWNS_WITH_MOTION, Sums>;
 
-/// The normal equations with the rows of the motion; a motion that is not fitted gets a prior that keeps it at zero.
+/// The normal equations with the rows of the motion; a motion that is not fitted gets a prior that keeps it
+/// at zero.
 fn with_motion(
     (matrix, right): &([[f64; UNKNOWNS]; UNKNOWNS], [f64; UNKNOWNS]),
     motion: &[[f64; UNKNOWNS_WITH_MOTION + 1]; 2],
@@ -254,7 +256,8 @@ impl ModelFit {
 pub(super) enum Start<'a> {
     /// From a pose, with nothing known of blur and light.
     Pose(&'a CirclePose),
-    /// From a pose, with blur and light of another fit. The result costs no more than `max_cost`, if there is one.
+    /// From a pose, with blur and light of another fit. The result costs no more than `max_cost`, if there is
+    /// one.
     Other { pose: &'a CirclePose, other: &'a ModelFit, max_cost: Option<f64> },
 }
 
@@ -273,7 +276,8 @@ struct Solver<'a> {
     scene: &'a Scene<'a>,
     huber_limit: f64,
     min_steps: usize,
-    /// Without another fit to start from: residuals too large are rejected early, and the limit is tightened once.
+    /// Without another fit to start from: residuals too large are rejected early, and the limit is tightened
+    /// once.
     is_first: bool,
     max_cost: Option<f64>,
 }
@@ -325,7 +329,8 @@ impl Problem<UNKNOWNS_WITH_MOTION> for Solver<'_> {
 }
 
 impl Scene<'_> {
-    /// The model of least cost near the start. `None` when it is rejected early or its cost exceeds the start's bound.
+    /// The model of least cost near the start. `None` when it is rejected early or its cost exceeds the
+    /// start's bound.
     pub(super) fn fitted(&self, start: Start<'_>) -> Option<ModelFit> {
         let Effort { min_steps, max_steps, max_steps_from_other, min_gain, .. } = self.effort;
         let (model, mut solver, max_steps) = match start {

@@ -1,0 +1,372 @@
+//! From one circle to the marker: its pose, and whether it is one.
+
+use markers::RingKind;
+use nalgebra::Matrix6;
+
+use super::edges::{Completeness, EdgeSearch, EdgeSupport, Reach, confidence};
+use super::photometric::{
+    MAX_DIAMETER_PX, PhotometricFit, PhotometricInput, PhotometricPoses, PixelSample,
+};
+use crate::candidates::ring_profile::{MIN_SCORE, MIN_STEP, RingCandidate, SMALL_PX};
+use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
+use crate::trace::Reason;
+
+/// Maximum photometric residual, as a share of the contrast. Something else in the image, such as a shadow's
+/// edge, exceeds it.
+const MAX_RESIDUAL: f64 = 0.074;
+/// Minimum share of the variance that the model explains, by the marker's diameter. Inside a small marker's
+/// rim it is higher; with a tiny one, light from beyond the paper counts.
+const MIN_R_SQUARED: f64 = 0.95;
+const MIN_R_SQUARED_SMALL: f64 = 0.99;
+const MIN_R_SQUARED_TINY: f64 = 0.975;
+const TINY_PX: f64 = 11.8;
+/// The same for a faint small marker, whose residuals are below this many grey levels.
+const MIN_R_SQUARED_FAINT: f64 = 0.85;
+const MAX_FAINT_NOISE: f64 = 4.0;
+/// Minimum diameter in pixels of a marker that is recognised by one ring.
+const MIN_SINGLE_RING_PX: f64 = 90.0;
+/// Factor of the covariance when something disturbs the marker's image.
+const DISTURBED: f64 = 16.0;
+/// Poses whose normals differ by less, in radians, are the same.
+const DISTINCT_TILT: f64 = 0.01;
+
+/// Working memory of a measurement.
+#[derive(Debug, Default)]
+pub(super) struct Buffers {
+    pub(super) edges: Vec<EdgePoint>,
+    pub(super) samples: Vec<PixelSample>,
+}
+
+/// The mirrored pose.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct MirroredPose {
+    pub(super) pose: CirclePose,
+    pub(super) rms_px: f64,
+}
+
+/// A marker with its pose.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct MeasuredMarker {
+    pub(super) pose: CirclePose,
+    /// Root mean square distance between the edges in the image and those of the pose, in pixels.
+    pub(super) rms_px: f64,
+    /// Covariance of centre (m) and rotation vector (rad), in the camera frame.
+    pub(super) covariance: Matrix6<f64>,
+    /// Where it is distinct.
+    pub(super) alternative: Option<MirroredPose>,
+    /// From 0 to 1.
+    pub(super) confidence: f64,
+}
+
+/// A pose fitted to edges.
+struct EdgePose {
+    pose: CirclePose,
+    rms_px: f64,
+    support: [EdgeSupport; 6],
+}
+
+impl EdgeSearch<'_> {
+    /// The marker of which a candidate is one circle.
+    pub(super) fn measure(
+        &self,
+        candidate: &RingCandidate,
+        buffers: &mut Buffers,
+    ) -> Result<MeasuredMarker, Reason> {
+        buffers.edges.clear();
+        let radius_m = candidate.radius * self.size_m;
+        let both = CirclePose::from_ellipse(&candidate.border.ellipse, radius_m, self.camera)
+            .ok_or(Reason::Pose)?;
+        if candidate.diameter_px() < SMALL_PX {
+            return self.measure_small(&both[0], candidate.diameter_px(), &mut buffers.samples);
+        }
+        let kind = ring_with_circle(candidate.radius);
+        if candidate.score < MIN_SCORE {
+            let single = self.measure_single_ring(&both[0], kind, &mut buffers.edges);
+            return single.ok_or(Reason::Edges);
+        }
+        let rough = self.rough_pose(&both[0], &mut buffers.edges);
+        if let Some(rough) = &rough
+            && let Some(measured) = self.measure_photometric(rough, buffers)
+        {
+            return Ok(measured);
+        }
+        let EdgePose { pose, rms_px, support } =
+            self.edge_pose(rough, &both[1], &mut buffers.edges)?;
+        let diameter_px = self.diameter_px(&pose).ok_or(Reason::Pose)?;
+        let completeness = Completeness::from_support(&support);
+        if completeness != Completeness::Insufficient
+            && let Some(fit) = self.photometric_poses(&pose, diameter_px, &mut buffers.samples)
+        {
+            return from_photometric(&fit, confidence(&support)).ok_or(Reason::Pose);
+        }
+        let edges = &mut buffers.edges;
+        self.locate(&pose, Reach::Near, edges);
+        let bias_px = pose.max_bias_px(edges, self.camera);
+        pose.remove_outliers(edges, self.camera);
+        let large = diameter_px > MAX_DIAMETER_PX;
+        // Curved paper and lens errors grow with the diameter.
+        let bias_ratio = if large { 2e-3 } else { 6e-4 };
+        let is_within = |max_rms_px: f64, max_bias_px: f64| {
+            rms_px < (max_rms_px + 3e-3 * diameter_px).min(0.9)
+                && bias_px < max_bias_px * (diameter_px / 60.0).min(1.0) + bias_ratio * diameter_px
+        };
+        let fits = match completeness {
+            Completeness::Insufficient => false,
+            Completeness::Partial => is_within(0.1, 0.05),
+            Completeness::Full => is_within(0.3, 0.12),
+        };
+        if !fits {
+            return self.measure_single_ring(&pose, kind, edges).ok_or(Reason::Edges);
+        }
+        let mut measured =
+            self.at_edge_pose(pose, rms_px, edges, confidence(&support)).ok_or(Reason::Pose)?;
+        if !large {
+            // The grey values were not a marker's: light or an occluder shifts the edges of one side
+            // together.
+            measured.covariance *= DISTURBED;
+        }
+        Ok(measured)
+    }
+
+    /// The marker near a predicted pose, when it is neither too small nor too large nor disturbed.
+    pub(super) fn measure_tracked(
+        &self,
+        predicted: &CirclePose,
+        buffers: &mut Buffers,
+    ) -> Option<MeasuredMarker> {
+        let diameter_px = self.diameter_px(predicted)?;
+        if diameter_px < SMALL_PX {
+            return None;
+        }
+        if let Some(measured) = self.measure_at_prediction(predicted, diameter_px, buffers) {
+            return Some(measured);
+        }
+        let rough = self.rough_pose(predicted, &mut buffers.edges)?;
+        self.measure_photometric(&rough, buffers)
+    }
+
+    /// The marker right at the predicted pose, when its grey values and its edges are a marker's.
+    fn measure_at_prediction(
+        &self,
+        predicted: &CirclePose,
+        diameter_px: f64,
+        buffers: &mut Buffers,
+    ) -> Option<MeasuredMarker> {
+        let fit = self.photometric().fit_tracked(predicted, &mut buffers.samples)?;
+        let is_near = self.is_near(predicted, &fit.best.pose, 1.0 + 0.03 * diameter_px, 0.1);
+        if !is_near || !is_undisturbed(&fit.best) {
+            return None;
+        }
+        let support = self.locate(&fit.best.pose, Reach::Sparse, &mut buffers.edges);
+        let measured = from_photometric(&fit, confidence(&support))?;
+        (Completeness::from_support(&support) == Completeness::Full).then_some(measured)
+    }
+
+    /// A marker too small for edges: its grey values decide.
+    fn measure_small(
+        &self,
+        start: &CirclePose,
+        candidate_px: f64,
+        samples: &mut Vec<PixelSample>,
+    ) -> Result<MeasuredMarker, Reason> {
+        let poses = self.photometric().fit(start, samples).ok_or(Reason::Pose)?;
+        let fit = &poses.best;
+        // Noise may be a large part of a faint marker.
+        let faint = fit.r_squared > MIN_R_SQUARED_FAINT
+            && fit.residual * fit.contrast < MAX_FAINT_NOISE
+            && fit.residual < 1.5 * MAX_RESIDUAL;
+        let tiny = candidate_px < TINY_PX;
+        let min_r_squared = if tiny { MIN_R_SQUARED_TINY } else { MIN_R_SQUARED_SMALL };
+        let clear = fit.r_squared > min_r_squared && fit.residual < MAX_RESIDUAL;
+        let is_marker = (clear || faint)
+            && fit.contrast > 2.0 * MIN_STEP
+            // Other things blurred beyond recognition fit rings that are blacker than black.
+            && (!tiny || fit.contrast < 260.0)
+            && fit.has_rings()
+            && self.is_near(start, &fit.pose, 1.5, 0.3);
+        if !is_marker {
+            return Err(Reason::Edges);
+        }
+        from_photometric(&poses, fit.r_squared).ok_or(Reason::Pose)
+    }
+
+    /// Whether a pose has its centre within `max_px` of another's, at nearly its distance.
+    fn is_near(&self, start: &CirclePose, found: &CirclePose, max_px: f64, ratio: f64) -> bool {
+        let centres = project(start.centre, self.camera).zip(project(found.centre, self.camera));
+        centres.is_some_and(|(a, b)| a.distance(&b) < max_px)
+            && (found.centre.z / start.centre.z - 1.0).abs() < ratio
+    }
+
+    fn diameter_px(&self, pose: &CirclePose) -> Option<f64> {
+        pose.projected(self.size_m / 2.0, self.camera).map(|outline| outline.major)
+    }
+
+    fn photometric(&self) -> PhotometricInput<'_> {
+        let Self { view, camera, size_m, white_on_black, .. } = *self;
+        PhotometricInput { view, camera, size_m, white_on_black }
+    }
+
+    /// The pose of the edges found far around a start; `None` when too few are.
+    fn rough_pose(&self, start: &CirclePose, edges: &mut Vec<EdgePoint>) -> Option<CirclePose> {
+        let support = self.locate(start, Reach::Far, edges);
+        let is_found = |s: &&EdgeSupport| s.share().is_some_and(|share| share > 0.4);
+        let inner_only = support[..4].iter().all(|s| s.share().is_none());
+        if support.iter().filter(is_found).count() < if inner_only { 2 } else { 3 } {
+            return None;
+        }
+        start.refined(edges, self.camera).map(|(rough, _)| rough)
+    }
+
+    /// The marker near a rough pose, when it is not too large and its grey values are a marker's.
+    fn measure_photometric(
+        &self,
+        rough: &CirclePose,
+        buffers: &mut Buffers,
+    ) -> Option<MeasuredMarker> {
+        let diameter_px = self.diameter_px(rough)?;
+        let fit = self.photometric_poses(rough, diameter_px, &mut buffers.samples)?;
+        let support = self.locate(&fit.best.pose, Reach::Near, &mut buffers.edges);
+        let measured = from_photometric(&fit, confidence(&support))?;
+        (Completeness::from_support(&support) != Completeness::Insufficient).then_some(measured)
+    }
+
+    /// The pose of all edges, from a rough pose or from another start.
+    fn edge_pose(
+        &self,
+        rough: Option<CirclePose>,
+        start: &CirclePose,
+        edges: &mut Vec<EdgePoint>,
+    ) -> Result<EdgePose, Reason> {
+        let mut best: Option<(CirclePose, f64)> = None;
+        for is_first in [true, false] {
+            let rough = if is_first { rough } else { self.rough_pose(start, edges) };
+            let Some(rough) = rough else { continue };
+            let near = self.locate(&rough, Reach::Near, edges);
+            let Some((pose, rms)) = rough.refined(edges, self.camera) else { continue };
+            // Per edge point found: a wrong pose finds few.
+            let cost = (rms + 0.1) / edges.len() as f64;
+            if best.is_none_or(|(_, min)| cost < min) {
+                best = Some((pose, cost));
+            }
+            let visible: u32 = near.iter().map(|s| s.visible).sum();
+            if rms < 0.3 && 10 * edges.len() > 9 * visible as usize {
+                break;
+            }
+        }
+        let (mut pose, _) = best.ok_or(Reason::Edges)?;
+        let support = self.locate(&pose, Reach::Near, edges);
+        pose.remove_outliers(edges, self.camera);
+        let mut rms_px;
+        (pose, rms_px) = pose.refined(edges, self.camera).ok_or(Reason::Edges)?;
+        // The mirrored pose has nearly the same image.
+        if let Some((other, other_rms)) = pose.mirrored().refined(edges, self.camera)
+            && other_rms < rms_px
+        {
+            (pose, rms_px) = (other, other_rms);
+        }
+        Ok(EdgePose { pose, rms_px, support })
+    }
+
+    /// The poses from the grey values; `None` for a large marker, and when the grey values are not a marker's
+    /// or disagree with its edges.
+    fn photometric_poses(
+        &self,
+        pose: &CirclePose,
+        diameter_px: f64,
+        samples: &mut Vec<PixelSample>,
+    ) -> Option<PhotometricPoses> {
+        let fit = self.photometric().fit(pose, samples)?;
+        let agrees = is_undisturbed(&fit.best)
+            && self.is_near(pose, &fit.best.pose, 0.3 + 0.01 * diameter_px, 0.1);
+        agrees.then_some(fit)
+    }
+
+    /// The marker of which only one ring is visible, because its neighbour is covered.
+    fn measure_single_ring(
+        &self,
+        start: &CirclePose,
+        kind: RingKind,
+        edges: &mut Vec<EdgePoint>,
+    ) -> Option<MeasuredMarker> {
+        if kind == RingKind::Inner
+            || self.white_on_black
+            || !self.is_neighbour_covered(start, kind)?
+        {
+            return None;
+        }
+        // A single middle ring has the dot in it.
+        edges.clear();
+        let dot = self.locate_edge(start, 4, Reach::Near, edges).share();
+        if kind == RingKind::Middle && dot.is_none_or(|share| share < 0.9) {
+            return None;
+        }
+        edges.clear();
+        let own = kind as usize * 2;
+        let mut support = [EdgeSupport::default(); 6];
+        for (index, support) in support.iter_mut().enumerate().skip(own).take(2) {
+            *support = self.locate_edge(start, index, Reach::Near, edges);
+        }
+        let is_complete =
+            support.iter().skip(own).take(2).all(|s| s.share().is_some_and(|s| s >= 0.95));
+        let (pose, rms_px) = start.refined(edges, self.camera)?;
+        let diameter_px = self.diameter_px(&pose)?;
+        // With two circles only, the radii must be right.
+        let limit_px = 0.06 + 4e-4 * diameter_px;
+        let fits = diameter_px > MIN_SINGLE_RING_PX
+            && rms_px < 2.0 * limit_px
+            && pose.max_bias_px(edges, self.camera) < limit_px;
+        let is_marker = is_complete && fits && self.is_neighbour_covered(&pose, kind)?;
+        is_marker
+            .then(|| self.at_edge_pose(pose, rms_px, edges, 0.5 * confidence(&support)))
+            .flatten()
+    }
+
+    /// The marker at a pose fitted to edges.
+    fn at_edge_pose(
+        &self,
+        pose: CirclePose,
+        rms_px: f64,
+        edges: &[EdgePoint],
+        confidence: f64,
+    ) -> Option<MeasuredMarker> {
+        let covariance = pose.covariance(edges, self.camera)?;
+        let alternative = pose
+            .mirrored()
+            .refined(edges, self.camera)
+            .filter(|(other, _)| other.normal.angle(&pose.normal) > DISTINCT_TILT)
+            .map(|(pose, rms_px)| MirroredPose { pose, rms_px });
+        Some(MeasuredMarker { pose, rms_px, covariance, alternative, confidence })
+    }
+}
+
+/// The marker at a pose fitted to grey values.
+fn from_photometric(fit: &PhotometricPoses, confidence: f64) -> Option<MeasuredMarker> {
+    // An edge as high as the contrast rises within two and a half times the blur.
+    let rms_px = |blur_px: f64, residual: f64| 2.5 * blur_px * residual;
+    let PhotometricPoses { best, alternative } = fit;
+    let covariance = best.pose.full_covariance(&best.covariance);
+    Some(MeasuredMarker {
+        pose: best.pose,
+        rms_px: rms_px(best.blur_px, best.residual),
+        covariance: covariance.iter().all(|c| c.is_finite()).then_some(covariance)?,
+        alternative: alternative.map(|other| MirroredPose {
+            pose: other.pose,
+            rms_px: rms_px(other.blur_px, other.residual),
+        }),
+        confidence,
+    })
+}
+
+/// Whether a fit is a marker's with nothing on it.
+fn is_undisturbed(fit: &PhotometricFit) -> bool {
+    fit.residual < MAX_RESIDUAL && fit.has_rings() && fit.r_squared > MIN_R_SQUARED
+}
+
+/// The ring to which a circle of this radius (in marker sizes) belongs.
+pub(super) fn ring_with_circle(radius: f64) -> RingKind {
+    let belongs = |kind: &RingKind| {
+        let (inner, outer) = kind.radii();
+        (inner - 1e-6..=outer + 1e-6).contains(&radius)
+    };
+    RingKind::ALL.into_iter().find(belongs).unwrap_or(RingKind::Inner)
+}
