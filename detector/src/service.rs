@@ -10,7 +10,7 @@ use airlink::Unpacker;
 use anyhow::Context;
 use fiducial::overlay::canvas::RgbImageBuf;
 use fiducial::overlay::debug;
-use fiducial::{Detector, Observation, Stages, Tracker};
+use fiducial::{Detector, Observation, StageObserver, Tracker};
 use geometry::CameraModel;
 use imaging::{Converter, GrayImage, GrayView};
 use markers::Pad;
@@ -468,7 +468,7 @@ impl StageClock {
     }
 }
 
-impl Stages for StageClock {
+impl StageObserver for StageClock {
     fn ended(&mut self, stage: &'static str) {
         let now = Instant::now();
         let micros = u32::try_from(now.duration_since(self.last).as_micros()).unwrap_or(u32::MAX);

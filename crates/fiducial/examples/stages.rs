@@ -9,7 +9,7 @@ use std::time::Instant;
 use fiducial::families::rings_thesis::{ContourEllipse, ellipse_filter};
 use fiducial::overlay::canvas::RgbImageBuf;
 use fiducial::overlay::debug::{ALIGNMENT_RADIUS_PX, draw_ellipses, draw_rings, draw_target};
-use fiducial::{Detector, Settings, Stages};
+use fiducial::{Detector, Settings, StageObserver};
 use geometry::CameraModel;
 use imaging::{
     BilateralRows, Contours, GrayImage, GrayView, Limits, bilateral_5x5, contour_area, fit_ellipse,
@@ -26,7 +26,7 @@ struct Clock {
     stages: Vec<(&'static str, f64)>,
 }
 
-impl Stages for Clock {
+impl StageObserver for Clock {
     fn ended(&mut self, stage: &'static str) {
         let now = Instant::now();
         let spent_ms = self.last.replace(now).map_or(0.0, |l| (now - l).as_secs_f64() * 1e3);

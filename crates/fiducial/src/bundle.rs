@@ -4,11 +4,11 @@
 //! changes when one of them leaves the view. Rings look the same in any rotation: beside other markers their centre is a
 //! point of the plane; alone they give the pad's pose only when they lie at the landing point.
 
-use markers::{Pad, PlacedMarker};
 use geometry::{
     Camera, CameraModel, Marker as MarkerFrame, Pad as PadFrame, Pixel, Point, Rotation, Transform,
     Vector,
 };
+use markers::{Pad, PlacedMarker};
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix6, SMatrix, Vector2};
 
 use crate::observation::{MarkerPose, Observation, PoseSolution};

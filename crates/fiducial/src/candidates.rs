@@ -1,6 +1,7 @@
 //! Where in an image a marker may be.
 
 pub(crate) mod ellipses;
+pub(crate) mod evidence;
 pub(crate) mod outline_quads;
 pub(crate) mod overlap;
 pub(crate) mod quad;

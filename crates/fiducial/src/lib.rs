@@ -1,12 +1,12 @@
 //! Detects markers and estimates their pose.
 //!
 //! This crate knows images as borrowed grey views and cameras as models. It knows no network, no file, no
-//! clock and no thread; a stage of a detection that wants to be timed tells a [`Stages`] observer.
+//! clock and no thread; a [`StageObserver`] can time the stages of a detection.
 //!
 //! What a marker is stands in the crate `markers`. Modules in the order of the data: `optics` is what camera
 //! and lens do to a marker, `candidates` where one may be, `decode` which codeword a candidate carries,
 //! [`refine`] its corners to a fraction of a pixel, [`pose`] its pose; [`families`] has a detector for each
-//! kind of marker, [`detector`] runs them, [`observation`] is their result. [`tracker`] searches first where
+//! kind of marker, [`schedule`] says which fallback passes an image gets, [`detector`] runs them, [`observation`] is their result. [`tracker`] searches first where
 //! the markers of the last images should be, and [`bundle`] solves the markers of one pad together. [`trace`]
 //! tells why candidates were refused, [`overlay`] draws that on the image.
 
@@ -20,13 +20,17 @@ mod optics;
 pub mod overlay;
 pub mod pose;
 pub mod refine;
+pub mod schedule;
+mod settings;
 pub mod trace;
 pub mod tracker;
 
 pub use bundle::{PadObservation, observe_pad};
 pub use candidates::ring::Ring;
-pub use detector::{Detector, DetectorError, Settings};
-pub use observation::{MarkerPose, Observation, PoseSolution, Stages};
+pub use detector::{Detector, DetectorError};
+pub use observation::{MarkerPose, Observation, PoseSolution, StageObserver};
 pub use pose::{PlanePoint, planar_pose, square_pose};
+pub use schedule::{FallbackPass, ImageStrip, PassSchedule};
+pub use settings::Settings;
 pub use trace::{Candidate, Reason, Refusal, Trace, TracedMarker};
 pub use tracker::{Tracker, TrackingSettings};

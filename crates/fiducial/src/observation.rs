@@ -1,7 +1,7 @@
 //! What the detector reports of a marker.
 
-use markers::Family;
 use geometry::{Camera, Marker as MarkerFrame, Pixel, Roi, Transform};
+use markers::Family;
 use nalgebra::{Matrix2, Matrix6};
 
 /// A marker found in an image.
@@ -70,12 +70,12 @@ pub struct PoseSolution {
 }
 
 /// Observes the stages of a detection, for timing by a caller that has a clock.
-pub trait Stages {
+pub trait StageObserver {
     /// Called when `stage` has ended.
     fn ended(&mut self, stage: &'static str);
 }
 
 /// Ignores the stages.
-impl Stages for () {
+impl StageObserver for () {
     fn ended(&mut self, _stage: &'static str) {}
 }

@@ -6,14 +6,15 @@
 //! A marker that is visible right at its predicted place is read there, and the rest of its region is not searched. While
 //! nothing is tracked, the fallback passes take turns ([`Detector::detect_in_turn`]).
 
-use markers::Family;
 use geometry::{CameraModel, Pixel, Roi};
 use imaging::GrayView;
+use markers::Family;
 use nalgebra::Vector3;
 
-use crate::detector::{Detector, Expected};
+use crate::detector::Detector;
+use crate::families::family::{PredictedShape, Prediction};
 use crate::families::rings::circle_pose::CirclePose;
-use crate::observation::{Observation, Stages};
+use crate::observation::{Observation, StageObserver};
 use crate::trace::Trace;
 
 /// Settings of tracking.
@@ -135,7 +136,7 @@ impl Tracker {
         view: GrayView<'_>,
         camera: Option<&CameraModel>,
         time_s: f64,
-        stages: &mut impl Stages,
+        stages: &mut impl StageObserver,
     ) -> &[Observation] {
         self.found.clear();
         self.trace.clear();
@@ -215,7 +216,7 @@ impl Tracker {
         view: GrayView<'_>,
         camera: Option<&CameraModel>,
         (region, time_s): (Region, f64),
-        stages: &mut impl Stages,
+        stages: &mut impl StageObserver,
     ) {
         let [left, top] = region.from;
         let [width, height] = region.edges();
@@ -223,8 +224,8 @@ impl Tracker {
         let roi = Roi::cropped(left as f64, top as f64, width as u32, height as u32);
         let camera = camera.map(|camera| roi.camera(camera));
         let expected = self.only_track(&region, time_s).and_then(|track| {
-            let expected = track.expected(time_s, roi.origin)?;
-            detector.detect_at(part, camera.as_ref(), &expected, stages)
+            let at = track.prediction(time_s, roi.origin)?;
+            detector.detect_at(part, camera.as_ref(), &at, stages)
         });
         match expected {
             Some(seen) => self.found.push(seen.mapped(&roi)),
@@ -301,20 +302,19 @@ impl Track {
         Self { motion: Some(motion), error_px, period_s, change, ..next }
     }
 
-    /// Its predicted shape in a region.
-    fn expected(&self, time_s: f64, origin: Pixel) -> Option<Expected> {
+    /// Its prediction in a region whose first pixel is `origin`; `None` after a first observation.
+    fn prediction(&self, time_s: f64, origin: Pixel) -> Option<Prediction> {
         let shape = self.shape.plus(&self.change?, time_s - self.time_s);
         let corner = |[x, y]: [f64; 2]| Pixel::new(x - origin.x, y - origin.y);
-        let circles = || {
+        let shape = if self.shape.has_corners {
+            PredictedShape::Corners(shape.corners.map(corner))
+        } else if self.shape.has_circles {
             let [centre, normal] = [shape.centre, shape.normal].map(Vector3::from);
-            Some(CirclePose { centre, normal: normal.try_normalize(0.1)? })
+            PredictedShape::Circles(CirclePose { centre, normal: normal.try_normalize(0.1)? })
+        } else {
+            return None;
         };
-        Some(Expected {
-            family: self.family,
-            id: self.id,
-            corners: self.shape.has_corners.then(|| shape.corners.map(corner)),
-            circles: if self.shape.has_circles { circles() } else { None },
-        })
+        Some(Prediction { family: self.family, id: self.id, shape })
     }
 
     fn is_sound(&self) -> bool {

@@ -31,7 +31,7 @@ struct Stages {
     searches: usize,
 }
 
-impl fiducial::Stages for Stages {
+impl fiducial::StageObserver for Stages {
     fn ended(&mut self, stage: &'static str) {
         let first = *self.first.get_or_insert(stage);
         self.searches += usize::from(stage == first);
@@ -75,9 +75,9 @@ fn a_marker_that_moves_jumps_and_vanishes_is_followed() {
 #[derive(Default)]
 struct SlowPasses(Vec<&'static str>);
 
-impl fiducial::Stages for SlowPasses {
+impl fiducial::StageObserver for SlowPasses {
     fn ended(&mut self, stage: &'static str) {
-        if ["arcs", "specks", "segments", "papers"].contains(&stage) {
+        if ["arcs", "blobs", "segments", "quiet zones"].contains(&stage) {
             self.0.push(stage);
         }
     }
@@ -108,7 +108,7 @@ fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
         let found =
             !tracker.detect(&mut detector, view, Some(&camera), time_s, &mut slow).is_empty();
         if i == 0 {
-            assert_eq!(slow.0, ["arcs", "specks", "segments", "papers"]);
+            assert_eq!(slow.0, ["arcs", "blobs", "segments", "quiet zones"]);
         } else {
             assert_eq!(slow.0.len(), 1, "{i}: {:?}", slow.0);
             passes.append(&mut slow.0);
@@ -118,7 +118,8 @@ fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
             break;
         }
     }
-    let in_turn = ["arcs", "papers", "segments", "specks", "papers", "segments", "papers"];
+    let in_turn =
+        ["arcs", "quiet zones", "segments", "blobs", "quiet zones", "segments", "quiet zones"];
     assert_eq!(passes[..7], in_turn);
     assert!(found_after.is_some_and(|images| images < 7), "{found_after:?}");
 }

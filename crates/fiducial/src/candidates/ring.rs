@@ -1,8 +1,8 @@
 //! The rings a marker is made of.
 
-use markers::RingKind;
 use geometry::Pixel;
 use imaging::Ellipse;
+use markers::RingKind;
 
 /// A black ring in an image: two ellipses about one another.
 #[derive(Copy, Clone, Debug, PartialEq)]

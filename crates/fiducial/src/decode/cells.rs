@@ -5,11 +5,10 @@
 //! and quiet zone are one unknown each, every bit is one more. The least-squares solution gives the bits; the
 //! same sums tell how well any codeword explains the pixels.
 
-use markers::SquareCode;
 use geometry::Pixel;
 use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Pyramid, bilinear};
-
+use markers::SquareCode;
 
 use crate::candidates::quad::mean_side_px;
 use crate::optics::homography::{Homography, Inverse};

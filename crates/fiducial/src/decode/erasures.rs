@@ -4,8 +4,8 @@
 //! erasures, as are those beside a border cell of the wrong colour. The codeword is matched by the other
 //! bits, and counts only with a low false-positive rate.
 
-use markers::SquareCode;
 use imaging::GrayView;
+use markers::SquareCode;
 
 use crate::candidates::quad::Quad;
 use crate::decode::false_positive;

@@ -1,7 +1,7 @@
 //! Markers that are partly in shadow, washed out, covered or beyond the frame, among quads of edge segments.
 
-use markers::SquareCode;
 use imaging::GrayView;
+use markers::SquareCode;
 
 use crate::candidates::overlap::{Overlap, suppress_non_maxima};
 use crate::candidates::quad::{Quad, shortest_side_px};

@@ -6,10 +6,9 @@
 //! gives the dots; the same sums tell how well any codeword explains the pixels, also where no dot can be
 //! told from its neighbours.
 
-use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};
 use imaging::GrayView;
+use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};
 use nalgebra::{SMatrix, SVector};
-
 
 use crate::decode::cells::{BRIGHT, DARK, Explanation, pixel_bounds};
 use crate::optics::edge_response::EdgeResponse;

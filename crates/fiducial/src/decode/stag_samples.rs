@@ -6,10 +6,9 @@
 
 use std::sync::LazyLock;
 
+use imaging::{GrayView, bilinear};
 use markers::Codebook;
 use markers::stag_code::{self, DOT_RADIUS, DOTS};
-use imaging::{GrayView, bilinear};
-
 
 use crate::decode::erasures::ErasedWord;
 use crate::decode::false_positive::words_within;

@@ -1,14 +1,15 @@
 //! What every family of square markers is asked for, and what it answers.
 
-use markers::{Family, Marker};
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Pyramid};
+use markers::{Family, Marker};
 
+use crate::candidates::evidence::Evidence;
 use crate::candidates::quad::diagonal_px;
+use crate::families::family::{PredictedShape, Prediction};
 use crate::observation::Observation;
 use crate::pose::square_pose;
 use crate::refine::fit::Refined;
-use crate::trace::Trace;
 
 /// Standard deviation of corners made of segments: in pixels, and as a fraction of the diagonal.
 const MIN_SEGMENT_CORNER_PX: f64 = 0.5;
@@ -24,20 +25,36 @@ pub(crate) struct ImageInput<'a> {
     pub(crate) camera: Option<&'a CameraModel>,
 }
 
-/// Where detections go.
-#[derive(Debug)]
-pub(crate) struct Output<'a> {
-    pub(crate) trace: &'a mut Trace,
-    pub(crate) found: &'a mut Vec<Observation>,
+impl<'a> ImageInput<'a> {
+    /// The image of a frame.
+    pub(crate) fn new(
+        view: GrayView<'a>,
+        camera: Option<&'a CameraModel>,
+        evidence: &'a Evidence,
+    ) -> Self {
+        Self { view, pyramid: evidence.outlines.pyramid(), camera }
+    }
 }
 
-/// A marker where it is expected.
+/// A square marker at its prediction.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct ExpectedMarker {
     pub(crate) family: Family,
     pub(crate) id: u32,
     /// Its own top left corner first.
     pub(crate) corners: [Pixel; 4],
+}
+
+impl ExpectedMarker {
+    /// The square marker of a prediction; `None` of other markers.
+    pub(crate) fn new(at: &Prediction) -> Option<Self> {
+        match at.shape {
+            PredictedShape::Corners(corners) => {
+                Some(Self { family: at.family, id: at.id?, corners })
+            }
+            PredictedShape::Circles(_) => None,
+        }
+    }
 }
 
 /// The markers of one family that are looked for.

@@ -15,23 +15,26 @@ mod photometric;
 
 use std::ops::Range;
 
-use markers::{Family, Marker};
 use geometry::{CameraModel, Pixel};
 use imaging::pyramid::{from_level_0, to_level_0};
 use imaging::{Ellipse, GrayView, Outlines, Pyramid, outline};
+use markers::{Family, Marker};
 
 use crate::candidates::ellipses::{EllipseCandidate, add_arc_ellipses, complete_ellipse};
+use crate::candidates::evidence::Needs;
 use crate::candidates::ring::Ring;
 use crate::candidates::ring_profile::{RingCandidate, add_ring_candidates, blob};
-use crate::detector::{Allowed, SlowPass};
-use crate::observation::{MarkerPose, Observation, PoseSolution, Stages};
+use crate::families::family::{FamilyDetector, FrameInput, Output, PredictedShape, Prediction};
+use crate::observation::{MarkerPose, Observation, PoseSolution};
+use crate::schedule::{FallbackPass, FallbackStep};
+use crate::settings::Settings;
 use crate::trace::{Reason, Trace};
 use circle_pose::{CirclePose, pixel_covariance, project};
 use edges::EdgeSearch;
 use focal_guess::{guess_focal_length, nominal_camera};
 use measure::{Buffers, MeasuredMarker, ring_with_circle};
 
-/// A search of the image; later passes run only when earlier ones found nothing.
+/// A search of the image; each runs only when those before found nothing.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum RingPass {
     /// Complete ellipses, on these levels of the pyramid.
@@ -43,13 +46,8 @@ enum RingPass {
 }
 
 /// The largest markers first, which are found fastest.
-const PASSES: [RingPass; 5] = [
-    RingPass::Ellipses(2..usize::MAX),
-    RingPass::Ellipses(1..2),
-    RingPass::Ellipses(0..1),
-    RingPass::Arcs,
-    RingPass::Blobs,
-];
+const PASSES: [RingPass; 3] =
+    [RingPass::Ellipses(2..usize::MAX), RingPass::Ellipses(1..2), RingPass::Ellipses(0..1)];
 
 /// Regions of any shape that are large enough to show arcs.
 const ARC_REGIONS: outline::Settings = outline::Settings {
@@ -79,20 +77,11 @@ const BLOB_REGIONS: outline::Settings = outline::Settings {
 };
 
 impl RingPass {
-    /// The fallback pass of the detector to which it belongs.
-    fn slow_pass(&self) -> Option<SlowPass> {
-        match self {
-            Self::Ellipses(_) => None,
-            Self::Arcs => Some(SlowPass::Arcs),
-            Self::Blobs => Some(SlowPass::Specks),
-        }
-    }
-
     fn name(&self) -> &'static str {
         match self {
             Self::Ellipses(_) => "ellipses",
             Self::Arcs => "arcs",
-            Self::Blobs => "specks",
+            Self::Blobs => "blobs",
         }
     }
 }
@@ -118,8 +107,11 @@ const MIN_TRACKED_CONTRAST: f64 = 0.15;
 const MIN_SCORE_RATIO: f64 = 0.8;
 
 /// Detects three-ring markers. Its buffers are reused from image to image.
-#[derive(Debug, Default)]
-pub struct RingDetector {
+#[derive(Debug)]
+pub(crate) struct RingDetector {
+    marker: Marker,
+    /// Number of observations in the image before those of this detector.
+    first: usize,
     /// Whether white rings on black are searched.
     white_on_black: bool,
     /// Whether all passes run, whatever was found.
@@ -127,20 +119,6 @@ pub struct RingDetector {
     ellipses: Vec<EllipseCandidate>,
     candidates: Vec<RingCandidate>,
     buffers: Buffers,
-}
-
-/// An image to be searched for rings.
-pub(crate) struct RingInput<'a, S> {
-    pub(crate) view: GrayView<'a>,
-    /// The outlines of the image, or only its pyramid; more outlines are added to it.
-    pub(crate) outlines: &'a mut Outlines,
-    /// Whether the outlines of dark regions are already there, made for other families.
-    pub(crate) has_outlines: bool,
-    pub(crate) marker: &'a Marker,
-    pub(crate) camera: Option<&'a CameraModel>,
-    pub(crate) allowed: Allowed,
-    pub(crate) trace: &'a mut Trace,
-    pub(crate) stages: &'a mut S,
 }
 
 /// What candidates are evaluated on.
@@ -154,14 +132,20 @@ struct Evaluation<'a> {
 }
 
 impl RingDetector {
-    /// Searches also white rings on black when `white_on_black`, and continues after a detection when
-    /// `thorough`.
-    pub fn new(white_on_black: bool, thorough: bool) -> Self {
-        Self { white_on_black, thorough, ..Self::default() }
+    /// Detects this marker.
+    pub(crate) fn new(marker: Marker, settings: Settings) -> Self {
+        Self {
+            marker,
+            first: 0,
+            white_on_black: settings.inverted,
+            thorough: settings.thorough,
+            ellipses: Vec::new(),
+            candidates: Vec::new(),
+            buffers: Buffers::default(),
+        }
     }
 
-    /// Reserves what textured frames need.
-    pub(crate) fn make_room(&mut self) {
+    fn reserve(&mut self) {
         const ROOM: usize = 1024;
         self.ellipses.clear();
         self.ellipses.reserve(ROOM);
@@ -173,57 +157,32 @@ impl RingDetector {
         self.buffers.samples.reserve(ROOM);
     }
 
-    /// Adds the markers in an image to `found`, the most confident first. When markers of other families were
-    /// found, only complete ellipses are searched.
-    pub(crate) fn detect<S: Stages>(
-        &mut self,
-        input: RingInput<'_, S>,
-        found: &mut Vec<Observation>,
-    ) {
-        let RingInput { view, outlines, has_outlines, marker, camera, allowed, trace, stages } =
-            input;
-        let nominal = nominal_camera(view);
-        let evaluation =
-            Evaluation { view, marker, known_camera: camera, camera: camera.unwrap_or(&nominal) };
-        let first = found.len();
-        for pass in PASSES {
-            let is_closed = |slow| first > 0 && !self.thorough || !allowed.has(slow);
-            if pass.slow_pass().is_some_and(is_closed) {
-                continue;
-            }
-            if let RingPass::Ellipses(levels) = &pass
-                && !has_outlines
-            {
-                outlines.add(view, &outline::Settings::default(), levels.clone());
-            }
-            self.find_candidates(view, outlines, &pass);
-            trace.ellipses.extend(self.ellipses.iter().map(|e| e.ellipse));
-            trace.rings.extend(self.candidates.iter().map(ring));
-            stages.ended(pass.name());
-            let coarse = allowed.has(SlowPass::Arcs).then_some(outlines.pyramid());
-            self.evaluate_candidates(&evaluation, coarse, trace, found, first);
-            stages.ended("matching");
-            if found.len() > first && !self.thorough {
-                break;
-            }
+    /// Runs one pass, and adds the markers it finds to those from the index `self.first` on.
+    fn run(&mut self, pass: &RingPass, input: FrameInput<'_>, out: &mut Output<'_>) {
+        let FrameInput { view, camera, evidence, schedule } = input;
+        let has_outlines = evidence.has_outlines;
+        let outlines = &mut evidence.outlines;
+        if let RingPass::Ellipses(levels) = pass
+            && !has_outlines
+        {
+            outlines.add(view, &outline::Settings::default(), levels.clone());
         }
-        found[first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
-    }
-
-    /// Detects the marker near a predicted pose.
-    pub(crate) fn detect_at(
-        &mut self,
-        view: GrayView<'_>,
-        marker: &Marker,
-        camera: &CameraModel,
-        predicted: &CirclePose,
-    ) -> Option<Observation> {
-        let size_m = marker.size_m?;
-        let min_contrast = MIN_TRACKED_CONTRAST;
-        let search = EdgeSearch { view, camera, size_m, min_contrast, white_on_black: false };
-        let measured = search.measure_tracked(predicted, &mut self.buffers)?;
-        let evaluation = Evaluation { view, marker, known_camera: Some(camera), camera };
-        evaluation.observation(&measured, measured.pose, camera).ok()
+        self.find_candidates(view, outlines, pass);
+        out.trace.ellipses.extend(self.ellipses.iter().map(|e| e.ellipse));
+        out.trace.rings.extend(self.candidates.iter().map(ring));
+        out.stages.ended(pass.name());
+        let nominal = nominal_camera(view);
+        let marker = self.marker;
+        let evaluation = Evaluation {
+            view,
+            marker: &marker,
+            known_camera: camera,
+            camera: camera.unwrap_or(&nominal),
+        };
+        let coarse = schedule.allows(FallbackPass::Arcs).then_some(outlines.pyramid());
+        self.evaluate_candidates(&evaluation, coarse, out.trace, out.found, self.first);
+        out.stages.ended("matching");
+        out.found[self.first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
     }
 
     /// Finds the circles that may be the marker's, best first.
@@ -368,6 +327,55 @@ impl RingDetector {
             }
         }
         last
+    }
+}
+
+impl FamilyDetector for RingDetector {
+    fn needs(&self) -> Needs {
+        Needs { pyramid: true, quads: None }
+    }
+
+    fn fallback_steps(&self) -> &'static [FallbackStep] {
+        &[FallbackStep::Arcs, FallbackStep::Blobs]
+    }
+
+    fn make_room(&mut self) {
+        self.reserve();
+    }
+
+    fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
+        let FrameInput { view, camera, evidence, schedule } = input;
+        self.first = out.found.len();
+        for pass in &PASSES {
+            let input = FrameInput { view, camera, evidence: &mut *evidence, schedule };
+            self.run(pass, input, out);
+            if out.found.len() > self.first && !self.thorough {
+                break;
+            }
+        }
+    }
+
+    fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
+        let FrameInput { view, camera, .. } = input;
+        let PredictedShape::Circles(pose) = at.shape else { return None };
+        let (camera, size_m) = (camera?, self.marker.size_m?);
+        if !self.marker.includes(at.family, at.id) {
+            return None;
+        }
+        let min_contrast = MIN_TRACKED_CONTRAST;
+        let search = EdgeSearch { view, camera, size_m, min_contrast, white_on_black: false };
+        let measured = search.measure_tracked(&pose, &mut self.buffers)?;
+        let marker = self.marker;
+        let evaluation = Evaluation { view, marker: &marker, known_camera: Some(camera), camera };
+        evaluation.observation(&measured, measured.pose, camera).ok()
+    }
+
+    fn fallback(&mut self, step: FallbackStep, input: FrameInput<'_>, out: &mut Output<'_>) {
+        match step {
+            FallbackStep::Arcs => self.run(&RingPass::Arcs, input, out),
+            FallbackStep::Blobs => self.run(&RingPass::Blobs, input, out),
+            _ => {}
+        }
     }
 }
 

@@ -6,17 +6,21 @@
 
 use std::f64::consts::PI;
 
-use markers::{Family, Marker, RingKind};
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Rotation, Transform};
 use imaging::{
     BilateralRows, Contours, Ellipse, GrayImage, GrayView, Limits, bilateral_5x5, contour_area,
     fit_ellipse, threshold,
 };
+use markers::{Family, Marker, RingKind};
 use nalgebra::{Matrix2, Matrix3, Matrix6};
 
+use crate::candidates::evidence::Needs;
 use crate::candidates::ring::Ring;
+use crate::families::family::{FamilyDetector, FrameInput, Output};
 use crate::families::rings::circle_pose::UNKNOWN_ANGLE_VARIANCE;
-use crate::observation::{MarkerPose, Observation, Stages};
+use crate::observation::{MarkerPose, Observation, StageObserver};
+use crate::schedule::FallbackStep;
+use crate::settings::Settings;
 use crate::trace::{Reason, Trace};
 
 /// Relative area tolerance of Algorithm 1.
@@ -47,9 +51,12 @@ pub struct ContourEllipse {
     pub contour: usize,
 }
 
-/// The detector's working memory, and what its stages made of the last image.
-#[derive(Debug, Default)]
-pub struct RingsThesis {
+/// Detects the three-ring marker by the thesis' algorithms. It keeps its memory from image to image.
+#[derive(Debug)]
+pub(crate) struct RingsThesis {
+    marker: Marker,
+    /// T of Equation 3.3, in grey levels.
+    threshold: u8,
     rows: BilateralRows,
     filtered: GrayImage,
     binary: GrayImage,
@@ -60,29 +67,55 @@ pub struct RingsThesis {
     rings: Vec<Ring>,
 }
 
+impl FamilyDetector for RingsThesis {
+    fn needs(&self) -> Needs {
+        Needs::default()
+    }
+
+    fn fallback_steps(&self) -> &'static [FallbackStep] {
+        &[]
+    }
+
+    fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
+        self.detect_in(input.view, input.camera, out);
+    }
+}
+
 impl RingsThesis {
-    /// Finds the marker; `threshold` is T of Equation 3.3.
-    pub fn detect(
+    /// Detects this marker.
+    pub(crate) fn new(marker: Marker, settings: Settings) -> Self {
+        Self {
+            marker,
+            threshold: settings.thesis_threshold,
+            rows: BilateralRows::default(),
+            filtered: GrayImage::default(),
+            binary: GrayImage::default(),
+            contours: Contours::default(),
+            ellipses: Vec::new(),
+            pairs: Vec::new(),
+            by_x: Vec::new(),
+            rings: Vec::new(),
+        }
+    }
+
+    fn detect_in(
         &mut self,
         view: GrayView<'_>,
-        marker: &Marker,
-        threshold: u8,
         camera: Option<&CameraModel>,
-        (trace, stages): (&mut Trace, &mut impl Stages),
-    ) -> Option<Observation> {
-        self.find_ellipses(view, threshold, stages);
-        trace.ellipses.extend(self.ellipses.iter().map(|e| e.ellipse));
-        self.detect_rings(view, trace);
-        trace.rings.extend(&self.rings);
-        stages.ended("rings");
+        out: &mut Output<'_>,
+    ) {
+        self.find_ellipses(view, self.threshold, out.stages);
+        out.trace.ellipses.extend(self.ellipses.iter().map(|e| e.ellipse));
+        self.detect_rings(view, out.trace);
+        out.trace.rings.extend(&self.rings);
+        out.stages.ended("rings");
         let found = match_rings(&self.rings);
-        let observation = found.map(|rings| observe(&rings, marker, camera));
-        stages.ended("matching");
-        observation
+        out.found.extend(found.map(|rings| observe(&rings, &self.marker, camera)));
+        out.stages.ended("matching");
     }
 
     /// Pre-processing and Algorithm 1.
-    fn find_ellipses(&mut self, view: GrayView<'_>, level: u8, stages: &mut impl Stages) {
+    fn find_ellipses(&mut self, view: GrayView<'_>, level: u8, stages: &mut dyn StageObserver) {
         bilateral_5x5(view, &mut self.rows, &mut self.filtered);
         stages.ended("filter");
         if let Some(filtered) = self.filtered.view() {

@@ -4,21 +4,24 @@
 //! Then the corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be
 //! hidden, and the quiet zones of markers so small that blur breaks their border.
 
-use markers::{Marker, Match, SquareCode};
 use geometry::Pixel;
 use imaging::GrayView;
+use markers::{Marker, Match, SquareCode};
 
+use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
 use crate::candidates::quad::{Quad, mean_side_px};
 use crate::candidates::quiet_zone::{MAX_CONTRAST_VARIATION, border_contrast_variation};
 use crate::decode::cells::{Cells, Layout, SquareImage};
 use crate::decode::false_positive;
 use crate::decode::occluded::{Occluded, OccludedQuery, SquareReading};
-use crate::families::query::{ExpectedMarker, FamilyQuery, ImageInput, Output, segment_corner_px};
-use crate::observation::{Observation, Stages};
+use crate::families::family::{FamilyDetector, FrameInput, Output, Prediction};
+use crate::families::query::{ExpectedMarker, FamilyQuery, ImageInput, segment_corner_px};
+use crate::observation::Observation;
 use crate::refine::corners::refine;
 use crate::refine::fit::{CornerGuess, Refined, Scratch};
 use crate::refine::pattern::Pattern;
+use crate::schedule::FallbackStep;
 use crate::trace::{Reason, Trace};
 
 /// Bounds on the work in one image, far above what frames with markers need.
@@ -41,6 +44,9 @@ const CONFIDENCE_PER_BIT: f64 = 0.02;
 /// uncertain, and few other things are as small.
 const SMALL_CELL_PX: f64 = 1.5;
 const CONFIDENCE_OF_SMALL: f64 = 0.06;
+
+/// The level of the pyramid from which on bright outlines are followed for markers printed white on black.
+pub(crate) const INVERTED_FROM: usize = 2;
 
 /// Standard deviation of the corners of an outline, in pixels.
 const OUTLINE_CORNER_PX: f64 = 0.2;
@@ -97,7 +103,7 @@ struct Decoded {
 impl SquareTagDetector {
     /// Largest size of outlines on the finest levels, in pixels of the level: two levels on, the cells of
     /// markers of ten cells would be narrower than two pixels, and a scratch in a border would open it.
-    pub(crate) const MAX_OUTLINE_PX: u16 = 64;
+    const MAX_OUTLINE_PX: u16 = 64;
 
     /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers
     /// printed in the opposite colours as well.
@@ -139,7 +145,7 @@ impl SquareTagDetector {
     }
 
     /// Makes room for what a frame with texture needs.
-    pub(crate) fn make_room(&mut self) {
+    fn reserve(&mut self) {
         if self.is_empty() {
             return;
         }
@@ -159,27 +165,26 @@ impl SquareTagDetector {
     }
 
     /// Whether a family with a white border is looked for; the outlines of its markers are bright.
-    pub(crate) fn has_reversed_border(&self) -> bool {
+    fn has_reversed_border(&self) -> bool {
         self.layouts.iter().any(|layout| layout.reversed)
     }
 
     /// Finds the markers among the quads of an image, given likeliest first.
-    pub(crate) fn detect<'a>(
+    fn detect_whole<'a>(
         &mut self,
         input: ImageInput<'_>,
         quads: impl Iterator<Item = &'a Quad>,
-        stages: &mut impl Stages,
         out: &mut Output<'_>,
     ) {
         self.found.clear();
         self.decode_all(input, quads, out.trace);
-        stages.ended("codes");
+        out.stages.ended("codes");
         self.observe_all(input, 0, out.found);
-        stages.ended("poses");
+        out.stages.ended("poses");
     }
 
     /// Finds one marker where it is expected.
-    pub(crate) fn detect_at(
+    fn detect_expected(
         &mut self,
         input: ImageInput<'_>,
         expected: &ExpectedMarker,
@@ -202,24 +207,17 @@ impl SquareTagDetector {
         Some(decoded.observation(query, refined, input))
     }
 
-    /// Finds partly hidden markers among quads of segments, after [`SquareTagDetector::detect`] and
+    /// Finds partly hidden markers among quads of segments, after [`SquareTagDetector::detect_whole`] and
     /// [`SquareTagDetector::note_missing`].
-    pub(crate) fn detect_occluded(
-        &mut self,
-        input: ImageInput<'_>,
-        quads: &[Quad],
-        stages: &mut impl Stages,
-        out: &mut Output<'_>,
-    ) {
+    fn detect_occluded(&mut self, input: ImageInput<'_>, quads: &[Quad], out: &mut Output<'_>) {
         let first = self.found.len();
         self.decode_occluded(input.view, quads, out.trace);
         self.observe_all(input, first, out.found);
-        stages.ended("occluded");
     }
 
     /// Finds markers so small that blur breaks their border, by their quiet zone, which is taken to be one
     /// cell wide.
-    pub(crate) fn detect_in_quiet_zones(
+    fn detect_in_quiet_zones(
         &mut self,
         input: ImageInput<'_>,
         quiet_zones: &[Quad],
@@ -313,7 +311,7 @@ impl SquareTagDetector {
     }
 
     /// Notes which markers a fallback is to look for, as in [`FamilyQuery::is_missing`]; false when none.
-    pub(crate) fn note_missing(&mut self, all: bool) -> bool {
+    fn note_missing(&mut self, all: bool) -> bool {
         for (index, query) in self.queries.iter_mut().enumerate() {
             let known =
                 self.found.iter().filter(|found| found.query == index).map(|found| found.id);
@@ -444,6 +442,57 @@ impl SquareTagDetector {
             corner_px: OUTLINE_CORNER_PX,
             is_washed_out: false,
         })
+    }
+}
+
+impl FamilyDetector for SquareTagDetector {
+    fn needs(&self) -> Needs {
+        // Markers with a white border may be as small as others; others printed white on black are searched where they are
+        // large.
+        let bright_from = match self.has_reversed_border() {
+            true => Some(0),
+            false => self.inverted.then_some(INVERTED_FROM),
+        };
+        let quads = OutlineNeeds { bright_from, max_size_px: Self::MAX_OUTLINE_PX };
+        Needs { pyramid: true, quads: Some(quads) }
+    }
+
+    fn fallback_steps(&self) -> &'static [FallbackStep] {
+        &[FallbackStep::Segments, FallbackStep::QuietZones]
+    }
+
+    fn make_room(&mut self) {
+        self.reserve();
+    }
+
+    fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
+        let FrameInput { view, camera, evidence, .. } = input;
+        let image = ImageInput::new(view, camera, evidence);
+        self.detect_whole(image, evidence.outline_quads.iter(), out);
+    }
+
+    fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
+        let image = ImageInput::new(input.view, input.camera, input.evidence);
+        self.detect_expected(image, &ExpectedMarker::new(at)?)
+    }
+
+    fn wants_fallback(&mut self, step: FallbackStep, all: bool, _found: &[Observation]) -> bool {
+        match step {
+            FallbackStep::Segments => self.note_missing(all),
+            _ => all,
+        }
+    }
+
+    fn fallback(&mut self, step: FallbackStep, input: FrameInput<'_>, out: &mut Output<'_>) {
+        let FrameInput { view, camera, evidence, .. } = input;
+        let image = ImageInput::new(view, camera, evidence);
+        match step {
+            FallbackStep::Segments => self.detect_occluded(image, evidence.segment_quads(), out),
+            FallbackStep::QuietZones => {
+                self.detect_in_quiet_zones(image, &evidence.quiet_zones, out);
+            }
+            _ => {}
+        }
     }
 }
 

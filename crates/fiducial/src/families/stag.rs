@@ -6,24 +6,28 @@
 //! with hidden dots erased, and squares in quiet zones. Then the whole marker is refined: by its outline and
 //! the disc's edge where these are far enough apart, by all grey values where they are not.
 
-use markers::{Codebook, Family, Marker};
-use markers::stag_code::{self, DOTS, QUIET_ZONE};
 use geometry::Pixel;
 use imaging::bilinear;
 use imaging::pyramid::from_level_0;
+use markers::stag_code::{self, DOTS, QUIET_ZONE};
+use markers::{Codebook, Family, Marker};
 
+use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
 use crate::candidates::quad::{Quad, shortest_side_px};
 use crate::candidates::quiet_zone::{MAX_CONTRAST_VARIATION, border_contrast_variation};
 use crate::decode::occluded::{Occluded, OccludedMarker};
 use crate::decode::stag_cells::Dots;
 use crate::decode::stag_samples::{Sampled, SampledMatch, sample};
-use crate::families::query::{ExpectedMarker, FamilyQuery, ImageInput, Output, segment_corner_px};
-use crate::observation::{Observation, Stages};
+use crate::families::family::{FamilyDetector, FrameInput, Output, Prediction};
+use crate::families::query::{ExpectedMarker, FamilyQuery, ImageInput, segment_corner_px};
+use crate::families::square::INVERTED_FROM;
+use crate::observation::Observation;
 use crate::optics::homography::Homography;
 use crate::refine::corners::refine_design;
 use crate::refine::fit::{CornerGuess, Refined, Scratch};
 use crate::refine::stag_design::StagDesign;
+use crate::schedule::FallbackStep;
 use crate::trace::Reason;
 
 /// Sides of a quad on the level of the pyramid on which it is read, in pixels: from this to twice this, first
@@ -67,6 +71,9 @@ const MIN_SAMPLED_EVIDENCE: f32 = 20.0;
 /// The same for partly hidden markers.
 const MIN_OCCLUDED_R_SQUARED: f32 = 0.7;
 const MIN_OCCLUDED_EVIDENCE: f32 = 14.0;
+
+/// Largest number of outline quads whose dots are read, above that of frames with markers.
+const MAX_QUADS: usize = 128;
 
 /// Finds STags among quads. It keeps its memory from image to image.
 #[derive(Debug, Default)]
@@ -128,7 +135,7 @@ const OCCLUDED: SampleBounds = SampleBounds {
 impl StagDetector {
     /// Largest size of outlines that are followed in the image itself, in pixels: on the next level the
     /// border of a marker, a tenth of its side, is too thin, and out of focus too bright.
-    pub(crate) const MAX_OUTLINE_PX: u16 = 88;
+    const MAX_OUTLINE_PX: u16 = 88;
 
     /// Looks for these markers; those of other families are left out. With `inverted` it looks for markers
     /// printed white on black as well.
@@ -158,7 +165,7 @@ impl StagDetector {
     }
 
     /// Makes room for what a frame with texture needs.
-    pub(crate) fn make_room(&mut self) {
+    fn reserve(&mut self) {
         if !self.is_empty() {
             self.known.clear();
             self.known.reserve(MAX_FOUND);
@@ -173,7 +180,7 @@ impl StagDetector {
     }
 
     /// Whether a fallback is to look for markers, as in [`FamilyQuery::is_missing`].
-    pub(crate) fn is_missing(&self, all: bool, found: &[Observation]) -> bool {
+    fn is_missing(&self, all: bool, found: &[Observation]) -> bool {
         self.queries.iter().any(|StagQuery { query, .. }| {
             let known = found.iter().filter(|o| o.family == query.family).filter_map(|o| o.id);
             query.is_missing(all, known)
@@ -181,11 +188,10 @@ impl StagDetector {
     }
 
     /// Finds the markers among the quads of an image, given likeliest first.
-    pub(crate) fn detect<'a>(
+    fn detect_whole<'a>(
         &mut self,
         input: ImageInput<'_>,
         quads: impl Iterator<Item = &'a Quad>,
-        stages: &mut impl Stages,
         out: &mut Output<'_>,
     ) {
         self.known.clear();
@@ -201,11 +207,11 @@ impl StagDetector {
                 out.trace.refuse_quad(quad.corners, reason);
             }
         }
-        stages.ended("stags");
+        out.stages.ended("stags");
     }
 
     /// Finds one marker where it is expected.
-    pub(crate) fn detect_at(
+    fn detect_expected(
         &mut self,
         input: ImageInput<'_>,
         expected: &ExpectedMarker,
@@ -223,7 +229,7 @@ impl StagDetector {
     }
 
     /// Finds small markers by their quiet zone.
-    pub(crate) fn detect_in_quiet_zones(
+    fn detect_in_quiet_zones(
         &mut self,
         input: ImageInput<'_>,
         quiet_zones: &[Quad],
@@ -240,14 +246,8 @@ impl StagDetector {
     }
 
     /// Finds partly hidden markers among quads of segments; it takes several times as long as
-    /// [`StagDetector::detect`].
-    pub(crate) fn detect_occluded(
-        &mut self,
-        input: ImageInput<'_>,
-        quads: &[Quad],
-        stages: &mut impl Stages,
-        out: &mut Output<'_>,
-    ) {
+    /// [`StagDetector::detect_whole`].
+    fn detect_occluded(&mut self, input: ImageInput<'_>, quads: &[Quad], out: &mut Output<'_>) {
         let mut occluded = std::mem::take(&mut self.occluded);
         let markers = occluded.find(quads, |quad, found| {
             if self.is_covered(quad) || quad.inverted && !self.inverted {
@@ -264,7 +264,6 @@ impl StagDetector {
             out.found.push(self.observation(reading, &refined, input));
         }
         self.occluded = occluded;
-        stages.ended("occluded");
     }
 
     fn is_covered(&self, quad: &Quad) -> bool {
@@ -430,6 +429,51 @@ impl StagDetector {
         let confidence = reading.r_squared * (1.0 - 0.5 / reading.ratio);
         let query = &self.queries[reading.query].query;
         query.observation(id, hamming, confidence, refined, input.camera)
+    }
+}
+
+impl FamilyDetector for StagDetector {
+    fn needs(&self) -> Needs {
+        let bright_from = self.inverted.then_some(INVERTED_FROM);
+        let quads = OutlineNeeds { bright_from, max_size_px: Self::MAX_OUTLINE_PX };
+        Needs { pyramid: true, quads: Some(quads) }
+    }
+
+    fn fallback_steps(&self) -> &'static [FallbackStep] {
+        &[FallbackStep::QuietZones, FallbackStep::LateSegments]
+    }
+
+    fn make_room(&mut self) {
+        self.reserve();
+    }
+
+    fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
+        let FrameInput { view, camera, evidence, .. } = input;
+        let image = ImageInput::new(view, camera, evidence);
+        self.detect_whole(image, evidence.outline_quads.iter().take(MAX_QUADS), out);
+    }
+
+    fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
+        let image = ImageInput::new(input.view, input.camera, input.evidence);
+        self.detect_expected(image, &ExpectedMarker::new(at)?)
+    }
+
+    fn wants_fallback(&mut self, _step: FallbackStep, all: bool, found: &[Observation]) -> bool {
+        self.is_missing(all, found)
+    }
+
+    fn fallback(&mut self, step: FallbackStep, input: FrameInput<'_>, out: &mut Output<'_>) {
+        let FrameInput { view, camera, evidence, .. } = input;
+        let image = ImageInput::new(view, camera, evidence);
+        match step {
+            FallbackStep::QuietZones => {
+                self.detect_in_quiet_zones(image, &evidence.quiet_zones, out);
+            }
+            FallbackStep::LateSegments => {
+                self.detect_occluded(image, evidence.segment_quads(), out);
+            }
+            _ => {}
+        }
     }
 }
 

@@ -1,8 +1,8 @@
 //! Debug images: the three of the thesis (valid ellipses, rings, the marker with the alignment circle), and the quads.
 
-use markers::RingKind;
 use geometry::Pixel;
 use imaging::GrayView;
+use markers::RingKind;
 
 use crate::overlay::canvas::{Colour, RgbImageBuf};
 use crate::trace::{Candidate, Trace};

@@ -1,8 +1,7 @@
 //! The design of an STag for the refinement: small cells with their share of white, and edges.
 
-
-use markers::{Drawing, Family, Ink, Marker, Shape};
 use markers::stag_code::{DISC_RADIUS, QUIET_ZONE};
+use markers::{Drawing, Family, Ink, Marker, Shape};
 
 use crate::refine::fit::{Design, MAX_ACROSS};
 

@@ -2,9 +2,9 @@
 
 use std::f64::consts::{PI, TAU};
 
-use markers::{RING_RADII, RingKind};
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, bilinear};
+use markers::{RING_RADII, RingKind};
 
 use crate::candidates::ring_profile::MIN_STEP;
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};

@@ -2,8 +2,8 @@
 
 use std::f64::consts::TAU;
 
-use markers::RingKind;
 use geometry::{CameraModel, Pixel};
+use markers::RingKind;
 use nalgebra::Vector3;
 
 use super::PhotometricInput;

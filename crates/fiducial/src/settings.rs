@@ -1,0 +1,20 @@
+//! Settings of the detector.
+
+/// Settings of a detector.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Settings {
+    /// T of Equation 3.3, in grey levels, for `rings-thesis`. The thesis does not state it; with 70 most markers are found in
+    /// renderings of its camera.
+    pub thesis_threshold: u8,
+    /// Whether markers printed white on black are detected as well; `rings-thesis` has none.
+    pub inverted: bool,
+    /// Whether the fallback passes also run in images in which markers were found. Otherwise they run where none was found
+    /// and, for families of any id, where two were found, as on boards.
+    pub thorough: bool,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { thesis_threshold: 70, inverted: true, thorough: false }
+    }
+}
