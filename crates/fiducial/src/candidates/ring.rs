@@ -1,10 +1,10 @@
-//! The rings a marker is made of.
+//! Rings in an image.
 
 use geometry::Pixel;
 use imaging::Ellipse;
 use markers::RingKind;
 
-/// A black ring in an image: two ellipses about one another.
+/// A black ring in an image: two concentric ellipses.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Ring {
     /// Which ring it is by the ratio of its axes.
@@ -27,8 +27,7 @@ impl Ring {
         Self { kind, centre, angle: (inner.angle + outer.angle) / 2.0, inner, outer }
     }
 
-    /// The marker's diameter in the image, in pixels along the major axis, that this ring's outer edge speaks
-    /// of.
+    /// The marker's diameter in pixels along the major axis, from this ring's outer edge.
     pub fn marker_size_px(&self) -> f64 {
         self.outer.major / (2.0 * self.kind.radii().1)
     }

@@ -15,13 +15,14 @@ mod photometric;
 
 use std::ops::Range;
 
-use geometry::{CameraModel, Pixel};
+use geometry::{CameraModel, Roi};
 use imaging::pyramid::{from_level_0, to_level_0};
 use imaging::{Ellipse, GrayView, Outlines, Pyramid, outline};
 use markers::{Family, Marker};
 
 use crate::candidates::ellipses::{EllipseCandidate, add_arc_ellipses, complete_ellipse};
 use crate::candidates::evidence::Needs;
+use crate::candidates::overlap::suppress_non_maxima;
 use crate::candidates::ring::Ring;
 use crate::candidates::ring_profile::{RingCandidate, add_ring_candidates, blob};
 use crate::families::family::{FamilyDetector, FrameInput, Output, PredictedShape, Prediction};
@@ -217,17 +218,8 @@ impl RingDetector {
         let white_on_black = self.white_on_black;
         self.candidates.retain(|candidate| white_on_black || !candidate.white_on_black);
         let score = |c: &RingCandidate| c.score + if c.border.complete { 0.1 } else { 0.0 };
-        self.candidates.sort_unstable_by(|a, b| score(b).total_cmp(&score(a)));
         // The same circle is found on several levels.
-        let mut kept = 0;
-        for index in 0..self.candidates.len() {
-            let candidate = self.candidates[index];
-            if !self.candidates[..kept].iter().any(|c| is_same(c, &candidate)) {
-                self.candidates[kept] = candidate;
-                kept += 1;
-            }
-        }
-        self.candidates.truncate(kept);
+        suppress_non_maxima(&mut self.candidates, score, is_same);
     }
 
     /// Adds the arcs of the outlines from the index `first` on.
@@ -311,7 +303,8 @@ impl RingDetector {
                 break;
             }
             let Some(view) = pyramid.level(evaluation.view, level) else { break };
-            let camera = camera_on_level(evaluation.camera, view, level);
+            let roi = Roi::binned(0.0, 0.0, view.width() as u32, view.height() as u32, scale);
+            let camera = roi.camera(evaluation.camera);
             let mut smaller = *candidate;
             let Ellipse { centre, minor, major, .. } = &mut smaller.border.ellipse;
             *centre = centre.map(|c| from_level_0(c, level));
@@ -321,7 +314,7 @@ impl RingDetector {
             last = coarse.evaluate(&smaller, &mut self.buffers);
             if let Ok(observation) = last {
                 if observation.confidence >= MIN_COARSE_CONFIDENCE {
-                    return Ok(in_image(observation, level));
+                    return Ok(observation.mapped(&roi));
                 }
                 last = Err(Reason::Edges);
             }
@@ -436,36 +429,6 @@ impl Evaluation<'_> {
             pose: marker_pose,
         })
     }
-}
-
-/// The camera model of a level of the pyramid.
-fn camera_on_level(camera: &CameraModel, view: GrayView<'_>, level: usize) -> CameraModel {
-    let scale = to_level_0(1.0, level) - to_level_0(0.0, level);
-    CameraModel {
-        width: view.width() as u32,
-        height: view.height() as u32,
-        fx: camera.fx / scale,
-        fy: camera.fy / scale,
-        cx: from_level_0(camera.cx, level),
-        cy: from_level_0(camera.cy, level),
-        ..*camera
-    }
-}
-
-/// An observation on a level of the pyramid, in pixels of the image.
-fn in_image(mut observation: Observation, level: usize) -> Observation {
-    let scale = to_level_0(1.0, level) - to_level_0(0.0, level);
-    let Pixel { x, y } = observation.centre;
-    observation.centre = Pixel::new(to_level_0(x, level), to_level_0(y, level));
-    observation.centre_covariance_px2 *= scale * scale;
-    observation.size_px *= scale;
-    if let Some(pose) = &mut observation.pose {
-        pose.reprojection_rms_px *= scale;
-        if let Some(other) = &mut pose.alternative {
-            other.reprojection_rms_px *= scale;
-        }
-    }
-    observation
 }
 
 /// Whether two candidates are the same circle.

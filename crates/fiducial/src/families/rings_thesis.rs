@@ -1,8 +1,7 @@
-//! The detector of the three-ring marker as the thesis has it: section 3.1, Algorithms 1 to 15, to the
-//! letter.
+//! The thesis' detector of the three-ring marker: section 3.1, Algorithms 1 to 15, to the letter.
 //!
-//! Kept as a yardstick. Its weakness is [`two_have_equal_orientation`]: seen head-on the ellipses are
-//! circles, whose orientation is noise. What the thesis leaves open is said where it is decided.
+//! Kept as a baseline. Its weakness is [`two_have_equal_orientation`]: seen head-on the ellipses are circles,
+//! whose orientation is noise. Choices that the thesis leaves open are documented where they are made.
 
 use std::f64::consts::PI;
 
@@ -25,22 +24,22 @@ use crate::trace::{Reason, Trace};
 
 /// Relative area tolerance of Algorithm 1.
 pub const T_AREA: f64 = 0.05;
-/// Largest distance between concentric ellipses' centres, in pixels (Algorithm 2).
+/// Maximum distance between concentric ellipses' centres, in pixels (Algorithm 2).
 pub const T_CONCENTRIC_PX: f64 = 10.0;
-/// Largest difference of eccentricities (Algorithm 3).
+/// Maximum difference of eccentricities (Algorithm 3).
 pub const T_ECCENTRICITY: f64 = 0.2;
-/// Largest difference of orientations, in radians: 20 degrees (Algorithm 4).
+/// Maximum difference of orientations, in radians: 20 degrees (Algorithm 4).
 pub const T_ORIENTATION: f64 = 20.0 * PI / 180.0;
 /// Tolerance of the ratio of axes (Algorithm 5).
 pub const T_TYPE: f64 = 0.1;
-/// Least share of black pixels in a ring (Algorithm 6).
+/// Minimum share of black pixels in a ring (Algorithm 6).
 pub const T_BLACK: f64 = 0.8;
 
-/// Bounds that the thesis does not have, far above what a frame of it needs, so that no image takes long.
-const MOST_CONTOUR_POINTS: usize = 4_000_000;
-const MOST_ELLIPSES: usize = 20_000;
-const MOST_PAIRS: usize = 50_000;
-const MOST_RINGS: usize = 60;
+/// Bounds on the time for any image, which the thesis does not have; far above what its frames need.
+const MAX_CONTOUR_POINTS: usize = 4_000_000;
+const MAX_ELLIPSES: usize = 20_000;
+const MAX_PAIRS: usize = 50_000;
+const MAX_RINGS: usize = 60;
 
 /// A valid ellipse (Algorithm 1) and the index of its contour.
 #[derive(Copy, Clone, Debug, PartialEq)]
@@ -51,7 +50,7 @@ pub struct ContourEllipse {
     pub contour: usize,
 }
 
-/// Detects the three-ring marker by the thesis' algorithms. It keeps its memory from image to image.
+/// Detects the three-ring marker by the thesis' algorithms. Its buffers are reused from image to image.
 #[derive(Debug)]
 pub(crate) struct RingsThesis {
     marker: Marker,
@@ -123,7 +122,7 @@ impl RingsThesis {
         }
         stages.ended("threshold");
         if let Some(binary) = self.binary.view() {
-            let limits = Limits { min_points: 5, max_points: MOST_CONTOUR_POINTS };
+            let limits = Limits { min_points: 5, max_points: MAX_CONTOUR_POINTS };
             self.contours.find(binary, limits);
         }
         stages.ended("contours");
@@ -142,13 +141,14 @@ impl RingsThesis {
                 Ok(ring) => self.rings.push(ring),
                 Err(reason) => trace.refuse(first.ellipse, second.ellipse, reason),
             }
-            if self.rings.len() >= MOST_RINGS {
+            if self.rings.len() >= MAX_RINGS {
                 break;
             }
         }
     }
 
-    /// The pairs that pass Algorithm 2, in the order of all combinations, without looking at all of them.
+    /// The pairs that pass Algorithm 2, in the order of all combinations; sorting by x avoids testing all of
+    /// them.
     fn concentric_pairs(&mut self) {
         self.pairs.clear();
         self.by_x.clear();
@@ -159,7 +159,7 @@ impl RingsThesis {
             let near = self.by_x[place + 1..].iter().take_while(|j| x(j) - x(i) <= T_CONCENTRIC_PX);
             for j in near {
                 let (a, b) = (self.ellipses[*i].ellipse, self.ellipses[*j].ellipse);
-                if two_are_concentric(a.centre, b.centre) && self.pairs.len() < MOST_PAIRS {
+                if two_are_concentric(a.centre, b.centre) && self.pairs.len() < MAX_PAIRS {
                     self.pairs.push((*i.min(j), *i.max(j)));
                 }
             }
@@ -168,11 +168,11 @@ impl RingsThesis {
     }
 }
 
-/// Algorithm 1: the contours that are ellipses. Its last condition tests the ellipse's area against its own
-/// limits, plainly a slip; the text above it says that the contour's area is meant, and so it is done here.
+/// Algorithm 1: the contours that are ellipses. Its last condition tests the ellipse's area against the
+/// ellipse's own limits, an obvious slip; its text means the contour's area, as here.
 pub fn ellipse_filter(contours: &Contours, valid: &mut Vec<ContourEllipse>) {
     valid.clear();
-    // OpenCV lists the contours in this order, and the first marker found is the one taken.
+    // The order of OpenCV: the first marker found is the result.
     for index in (0..contours.len()).rev() {
         let Some(contour) = contours.get(index).filter(|c| c.points.len() > 4) else {
             continue;
@@ -181,17 +181,17 @@ pub fn ellipse_filter(contours: &Contours, valid: &mut Vec<ContourEllipse>) {
         let Some(ellipse) = fit_ellipse(points) else {
             continue;
         };
-        let (least, most) = (ellipse.area() * (1.0 - T_AREA), ellipse.area() * (1.0 + T_AREA));
-        if (least..=most).contains(&contour_area(contour.points)) {
+        let (min, max) = (ellipse.area() * (1.0 - T_AREA), ellipse.area() * (1.0 + T_AREA));
+        if (min..=max).contains(&contour_area(contour.points)) {
             valid.push(ContourEllipse { ellipse, contour: index });
         }
-        if valid.len() >= MOST_ELLIPSES {
+        if valid.len() >= MAX_ELLIPSES {
             return;
         }
     }
 }
 
-/// Algorithm 2: whether two centres are no further apart than [`T_CONCENTRIC_PX`].
+/// Algorithm 2: whether two centres are within [`T_CONCENTRIC_PX`].
 pub fn two_are_concentric(centre_1: [f64; 2], centre_2: [f64; 2]) -> bool {
     (centre_1[0] - centre_2[0]).hypot(centre_1[1] - centre_2[1]) <= T_CONCENTRIC_PX
 }
@@ -201,9 +201,8 @@ pub fn eccentricity_is_equal(first: &Ellipse, second: &Ellipse) -> bool {
     (first.eccentricity() - second.eccentricity()).abs() <= T_ECCENTRICITY
 }
 
-/// Equation 3.9 by `atan2`: the difference of two angles, from -pi to pi. An ellipse's angle is the same
-/// after half a turn; the thesis takes the result to lie within a quarter turn, which `atan2` does not see
-/// to.
+/// Equation 3.9 by `atan2`: the difference of two angles, from -pi to pi. An ellipse's angle is the same after
+/// half a turn; the thesis assumes a result within a quarter turn, which `atan2` does not ensure.
 pub fn orientation_difference(angle_1: f64, angle_2: f64) -> f64 {
     let difference = angle_1 - angle_2;
     difference.sin().atan2(difference.cos())
@@ -214,7 +213,7 @@ pub fn two_have_equal_orientation(angle_1: f64, angle_2: f64) -> bool {
     orientation_difference(angle_1, angle_2).abs() <= T_ORIENTATION
 }
 
-/// Algorithm 5: the kind of ring whose ratio of radii both the minor and the major axes have.
+/// Algorithm 5: the kind of ring whose ratio of radii matches both the minor and the major axes.
 pub fn ring_type(first: &Ellipse, second: &Ellipse) -> Option<RingKind> {
     let ratio = |a: f64, b: f64| a.min(b) / a.max(b);
     let ratio_minor = ratio(first.minor, second.minor);
@@ -236,11 +235,10 @@ pub fn black_threshold(view: GrayView<'_>) -> f64 {
     0.3 * (f64::from(max) - f64::from(min)) + f64::from(min)
 }
 
-/// Algorithm 6: whether more than [`T_BLACK`] of the ring's pixels are darker than `black`. The pixels are
-/// those of the filled outer contour without those of the filled inner one, in the image as the camera gave
-/// it.
+/// Algorithm 6: whether more than [`T_BLACK`] of the ring's pixels are darker than `black`: those inside the
+/// outer contour but not the inner one, in the unfiltered image.
 pub fn is_black(view: GrayView<'_>, black: f64, outer: &[[i32; 2]], inner: &[[i32; 2]]) -> bool {
-    let (outer, inner) = (Extents::of(outer), Extents::of(inner));
+    let (outer, inner) = (Extents::from_contour(outer), Extents::from_contour(inner));
     let (mut points, mut black_points) = (0_u64, 0_u64);
     for (y, from, to) in outer.rows() {
         let Some(row) = usize::try_from(y).ok().filter(|y| *y < view.height()).map(|y| view.row(y))
@@ -263,31 +261,31 @@ pub fn is_black(view: GrayView<'_>, black: f64, outer: &[[i32; 2]], inner: &[[i3
     points > 0 && black_points as f64 / points as f64 > T_BLACK
 }
 
-/// First and last column of a contour in each row: what it encloses, since a contour that passed Algorithm 1
-/// is nearly an ellipse.
+/// First and last column of a contour in each row: its interior, as a contour that passed Algorithm 1 is
+/// nearly an ellipse.
 struct Extents {
     top: i32,
     columns: Vec<(i32, i32)>,
 }
 
 impl Extents {
-    fn of(points: &[[i32; 2]]) -> Self {
+    fn from_contour(points: &[[i32; 2]]) -> Self {
         let top = points.iter().map(|p| p[1]).min().unwrap_or(0);
         let bottom = points.iter().map(|p| p[1]).max().unwrap_or(-1);
         let mut columns =
             vec![(i32::MAX, i32::MIN); usize::try_from(bottom - top + 1).unwrap_or(0)];
-        let mut note = |x: i32, y: i32| {
+        let mut include = |x: i32, y: i32| {
             let row = usize::try_from(y - top).ok().and_then(|row| columns.get_mut(row));
             if let Some((from, to)) = row {
                 (*from, *to) = ((*from).min(x), (*to).max(x));
             }
         };
         for (point, next) in points.iter().zip(points.iter().cycle().skip(1)) {
-            // A run is level, upright or diagonal.
+            // A run is horizontal, vertical or diagonal.
             let (dx, dy) = ((next[0] - point[0]).signum(), (next[1] - point[1]).signum());
             let steps = (next[0] - point[0]).abs().max((next[1] - point[1]).abs());
             for step in 0..=steps {
-                note(point[0] + dx * step, point[1] + dy * step);
+                include(point[0] + dx * step, point[1] + dy * step);
             }
         }
         Self { top, columns }
@@ -330,28 +328,28 @@ fn ring_of(
     Ok(Ring::new(kind, inner.ellipse, outer.ellipse))
 }
 
-/// Algorithm 8: whether no two of three centres are further apart than [`T_CONCENTRIC_PX`].
+/// Algorithm 8: whether all of three centres are within [`T_CONCENTRIC_PX`] of each other.
 pub fn three_are_concentric(centres: [Pixel; 3]) -> bool {
     let [c1, c2, c3] = centres;
     let (d12, d13, d23) = (c1.distance(&c2), c1.distance(&c3), c2.distance(&c3));
     d12.max(d13).max(d23) <= T_CONCENTRIC_PX
 }
 
-/// Algorithm 9: whether three rings have the same orientation. Unlike Algorithm 4 it does not take the
-/// differences' absolute values.
+/// Algorithm 9: whether three rings have the same orientation. Unlike Algorithm 4 it does not take absolute
+/// values.
 pub fn three_have_equal_orientation(angles: [f64; 3]) -> bool {
     let [a1, a2, a3] = angles;
     let differences = [(a1, a2), (a1, a3), (a2, a3)].map(|(a, b)| orientation_difference(a, b));
     differences.into_iter().fold(f64::NEG_INFINITY, f64::max) <= T_ORIENTATION
 }
 
-/// Algorithm 10: whether three rings are of three kinds.
+/// Algorithm 10: whether three rings are of different kinds.
 pub fn three_are_of_different_types(kinds: [RingKind; 3]) -> bool {
     let [k1, k2, k3] = kinds;
     k1 != k2 && k1 != k3 && k2 != k3
 }
 
-/// The rings that make up the marker: their mean centre is c_m.
+/// The rings of the marker; the mean of their centres is c_m.
 pub type Matched = Vec<Ring>;
 
 /// Algorithm 11: one ring is the marker.
@@ -360,7 +358,7 @@ pub fn centre_one_ring(ring: &Ring) -> Option<Matched> {
 }
 
 /// Algorithm 12: two rings are the marker when their kinds differ, they are concentric and equally oriented,
-/// and (so the text) are not the inner and the outer one, which have nothing in common to be mistaken about.
+/// and (according to the text) they are not the inner and the outer one.
 pub fn centre_two_rings(rings: [&Ring; 2]) -> Option<Matched> {
     let [first, second] = rings;
     let valid = first.kind != second.kind
@@ -378,8 +376,7 @@ pub fn centre_three_rings(rings: [&Ring; 3]) -> Option<Matched> {
     valid.then(|| rings.map(|r| *r).to_vec())
 }
 
-/// Algorithm 14: of four or more rings, the first pair that is a marker, and without one the first three that
-/// are.
+/// Algorithm 14: of four or more rings, the first pair that is a marker, else the first three that are.
 pub fn centre_four_or_more_rings(rings: &[Ring]) -> Option<Matched> {
     let pairs =
         rings.iter().enumerate().flat_map(|(i, a)| rings[i + 1..].iter().map(move |b| [a, b]));
@@ -404,12 +401,12 @@ pub fn match_rings(rings: &[Ring]) -> Option<Matched> {
     }
 }
 
-/// The marker's centre as the thesis has it: the mean of the rings' centres; its pose from its size alone.
+/// The marker with the thesis' centre, the mean of the rings' centres, and a pose from its size alone.
 fn observe(rings: &[Ring], marker: &Marker, camera: Option<&CameraModel>) -> Observation {
     let count = rings.len() as f64;
     let mean = |of: fn(&Ring) -> f64| rings.iter().map(of).sum::<f64>() / count;
     let centre = Pixel::new(mean(|r| r.centre.x), mean(|r| r.centre.y));
-    // The largest ring says most about the size.
+    // The largest ring gives the most accurate size.
     let size_px = rings
         .iter()
         .max_by(|a, b| a.outer.major.total_cmp(&b.outer.major))
@@ -420,7 +417,7 @@ fn observe(rings: &[Ring], marker: &Marker, camera: Option<&CameraModel>) -> Obs
         covariance: facing_covariance(centre, size_m, size_px, camera),
         alternative: None,
     });
-    let centre_error_px = CENTRE_ERROR_PX + CENTRE_ERROR_OF_SIZE * size_px;
+    let centre_error_px = CENTRE_ERROR_PX + CENTRE_ERROR_RATIO * size_px;
     let confidence = count / RingKind::ALL.len() as f64;
     Observation {
         family: Family::RingsThesis,
@@ -435,14 +432,14 @@ fn observe(rings: &[Ring], marker: &Marker, camera: Option<&CameraModel>) -> Obs
     }
 }
 
-/// Standard deviation of the centre in pixels, and what the perspective of tilted rings adds, as a share of
-/// their size: the thesis' method has no estimate of its own, and these are no less than the errors measured
-/// in renderings.
+/// Standard deviation of the centre in pixels, and the part from the perspective of tilted rings, as a share
+/// of their size. The thesis' method estimates neither; these are upper bounds of the errors measured in
+/// renderings.
 const CENTRE_ERROR_PX: f64 = 0.1;
-const CENTRE_ERROR_OF_SIZE: f64 = 0.02;
-/// Standard deviation of the range, as a share of it.
-const RANGE_ERROR: f64 = 0.03;
-/// Standard deviation of the tilt, in radians, when all markers are said to face the camera.
+const CENTRE_ERROR_RATIO: f64 = 0.02;
+/// Standard deviation of the range, relative.
+const RANGE_ERROR_RATIO: f64 = 0.03;
+/// Standard deviation of the tilt, in radians, as every marker is assumed to face the camera.
 const TILT_ERROR: f64 = 0.35;
 
 /// Covariance of [`facing`]: translation (m), then rotation vector (rad), in the camera frame.
@@ -455,19 +452,19 @@ fn facing_covariance(
     let metres_per_px = size_m / size_px;
     let range_m = (camera.fx + camera.fy) / 2.0 * metres_per_px;
     let ray = camera.unproject(centre).coords;
-    let aside_m = CENTRE_ERROR_PX * metres_per_px + CENTRE_ERROR_OF_SIZE * size_m;
-    let along = ray * ray.transpose() * (range_m * RANGE_ERROR).powi(2);
+    let lateral_m = CENTRE_ERROR_PX * metres_per_px + CENTRE_ERROR_RATIO * size_m;
+    let along = ray * ray.transpose() * (range_m * RANGE_ERROR_RATIO).powi(2);
     let sight = ray.normalize();
     let turn = sight * sight.transpose() * (UNKNOWN_ANGLE_VARIANCE - TILT_ERROR * TILT_ERROR);
     let mut covariance = Matrix6::zeros();
-    let place = along + Matrix3::identity() * (aside_m * aside_m);
+    let place = along + Matrix3::identity() * (lateral_m * lateral_m);
     covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&place);
     let turned = turn + Matrix3::identity() * (TILT_ERROR * TILT_ERROR);
     covariance.fixed_view_mut::<3, 3>(3, 3).copy_from(&turned);
     covariance
 }
 
-/// A marker that faces the camera squarely, at the range at which a pixel covers `metres_per_px`.
+/// A marker that faces the camera, at the range at which a pixel covers `metres_per_px`.
 fn facing(
     centre: Pixel,
     metres_per_px: f64,
@@ -479,7 +476,7 @@ fn facing(
     Transform::new(rotation, Point::new(ray.x(), ray.y(), ray.z()))
 }
 
-/// How far the rings' edges lie from where the size puts them, in pixels.
+/// Root mean square distance of the rings' radii from those that follow from the size, in pixels.
 fn rms_px(rings: &[Ring], size_px: f64) -> f64 {
     let squares = rings.iter().flat_map(|ring| {
         let (inner, outer) = ring.kind.radii();
@@ -503,7 +500,7 @@ mod tests {
     }
 
     #[test]
-    fn tolerances_are_the_thesis() {
+    fn tolerances_match_the_thesis() {
         assert!(two_are_concentric([0.0, 0.0], [6.0, 8.0]));
         assert!(!two_are_concentric([0.0, 0.0], [6.0, 8.01]));
         assert!(eccentricity_is_equal(
@@ -516,7 +513,7 @@ mod tests {
         ));
         assert!(two_have_equal_orientation(0.0, 19.9_f64.to_radians()));
         assert!(!two_have_equal_orientation(0.0, 20.1_f64.to_radians()));
-        // The same direction, written as 1 and 179 degrees: refused to the letter.
+        // The same direction, as 1 and 179 degrees: refused, to the letter.
         assert!(!two_have_equal_orientation(1_f64.to_radians(), 179_f64.to_radians()));
     }
 
@@ -552,7 +549,7 @@ mod tests {
     }
 
     #[test]
-    fn black_is_counted_between_the_contours() {
+    fn black_pixels_are_counted_between_the_contours() {
         // Black columns 2..8 of 10, white inside 4..6.
         let data: Vec<u8> = (0..100)
             .map(|i| {
