@@ -12,7 +12,7 @@ use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
 use crate::set::Set;
-use crate::store::{self, Frame};
+use crate::store::{self, StoredFrame};
 
 /// The name of this detector's results.
 pub const OURS: &str = "alight";
@@ -130,7 +130,11 @@ pub fn answer(
 ///
 /// # Errors
 /// When a frame cannot be read or the markers are invalid.
-pub fn run(folder: &Path, markers: &[Marker], runs: usize) -> anyhow::Result<Vec<(Frame, Record)>> {
+pub fn run(
+    folder: &Path,
+    markers: &[Marker],
+    runs: usize,
+) -> anyhow::Result<Vec<(StoredFrame, Record)>> {
     let mut detector = Detector::new(markers, Settings::default())?;
     store::frames(folder)?
         .into_iter()
@@ -200,7 +204,7 @@ pub fn write<'a>(path: &Path, records: impl IntoIterator<Item = &'a Record>) -> 
 ///
 /// # Errors
 /// When the results are damaged or of other frames.
-pub fn join(path: &Path, folder: &Path) -> anyhow::Result<Option<Vec<(Frame, Record)>>> {
+pub fn join(path: &Path, folder: &Path) -> anyhow::Result<Option<Vec<(StoredFrame, Record)>>> {
     let Ok(text) = std::fs::read_to_string(path) else { return Ok(None) };
     let mut records = std::collections::HashMap::new();
     for line in text.lines() {

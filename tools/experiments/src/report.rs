@@ -11,7 +11,7 @@ use serde::Serialize;
 use crate::record::{self, OURS, Record};
 use crate::score::{Score, Summary};
 use crate::set::Set;
-use crate::store::Frame;
+use crate::store::StoredFrame;
 
 /// The results of one detector on one family in one set.
 #[derive(Debug)]
@@ -23,7 +23,7 @@ pub struct Run {
     /// The detector.
     pub detector: String,
     /// The results by frame.
-    pub answers: Vec<(Frame, Record)>,
+    pub answers: Vec<(StoredFrame, Record)>,
 }
 
 /// A line of `summary.jsonl`.
@@ -121,7 +121,7 @@ pub fn json_lines(runs: &[Run]) -> anyhow::Result<String> {
 
 /// Scores by group.
 pub fn groups(run: &Run) -> BTreeMap<String, Score> {
-    let mut groups: BTreeMap<&str, Vec<&(Frame, Record)>> = BTreeMap::new();
+    let mut groups: BTreeMap<&str, Vec<&(StoredFrame, Record)>> = BTreeMap::new();
     for answer in &run.answers {
         groups.entry(&answer.0.group).or_default().push(answer);
     }

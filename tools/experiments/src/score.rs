@@ -5,7 +5,7 @@ use node::stats::{interpolated_quantile as quantile, mean};
 use serde::Serialize;
 
 use crate::record::{Found, Record};
-use crate::store::{Frame, MarkerLine};
+use crate::store::{MarkerLine, StoredFrame};
 
 /// The score of some frames.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -45,7 +45,7 @@ const ELSEWHERE_RATIO: f64 = 0.1;
 
 impl Score {
     /// The score of frames with their results.
-    pub fn new<'a>(answers: impl IntoIterator<Item = &'a (Frame, Record)>) -> Self {
+    pub fn new<'a>(answers: impl IntoIterator<Item = &'a (StoredFrame, Record)>) -> Self {
         let mut score = Self::default();
         for (frame, record) in answers {
             score.add(frame, record);
@@ -53,7 +53,7 @@ impl Score {
         score
     }
 
-    fn add(&mut self, frame: &Frame, record: &Record) {
+    fn add(&mut self, frame: &StoredFrame, record: &Record) {
         self.ms.push(record.ms);
         let Some(truth) = &frame.marker else {
             self.frames += 1;

@@ -20,7 +20,7 @@ pub const TRUTH: &str = "truth.jsonl";
 
 /// A frame with its ground truth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Frame {
+pub struct StoredFrame {
     /// Its file, in the same folder.
     pub image: String,
     /// The set.
@@ -153,7 +153,7 @@ pub fn make(
         let pixels = renderer.render(spec)?;
         let camera = CameraLine::new(&spec.settings.model);
         write_png(&folder.join(&image), &pixels, &camera)?;
-        let frame = Frame {
+        let frame = StoredFrame {
             image,
             set: set.name().to_owned(),
             group: spec.group.clone(),
@@ -179,7 +179,7 @@ fn write_png(path: &Path, pixels: &[u8], camera: &CameraLine) -> anyhow::Result<
 ///
 /// # Errors
 /// When the truth is missing or damaged.
-pub fn frames(folder: &Path) -> anyhow::Result<Vec<Frame>> {
+pub fn frames(folder: &Path) -> anyhow::Result<Vec<StoredFrame>> {
     let path = folder.join(TRUTH);
     let text =
         std::fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?;

@@ -8,7 +8,7 @@ use node::stats::{mean, standard_deviation};
 use crate::record::{OURS, Record};
 use crate::report::Run;
 use crate::set::Set;
-use crate::store::{Frame, MarkerLine};
+use crate::store::{MarkerLine, StoredFrame};
 use crate::thesis::{TABLES, Table};
 
 /// A table as Markdown and as comma-separated values.
@@ -75,7 +75,7 @@ fn place(group: &str, binning: &str) -> Option<(u32, f64)> {
 }
 
 /// The estimate of the marker itself.
-fn estimate(frame: &Frame, record: &Record, truth: &MarkerLine) -> Option<[f64; 3]> {
+fn estimate(frame: &StoredFrame, record: &Record, truth: &MarkerLine) -> Option<[f64; 3]> {
     let reach_px = 0.5 * truth.size_px;
     record
         .found
