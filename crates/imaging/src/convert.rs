@@ -64,15 +64,15 @@ const BINS: usize = 4096;
 /// Share of the pixels, at either end, that count as defects of the sensor and do not set the range.
 const OUTLIERS: f64 = 2e-5;
 /// Minimum range of levels mapped to 8 bits, so that noise is not amplified.
-const LEAST_RANGE: u32 = 255;
+const MIN_RANGE: u32 = 255;
 
 impl Converter {
     /// An image in 8-bit grey; the image itself when it is that already.
     ///
     /// More than 8 bits are scaled linearly, which leaves edges where they are, so that all levels but for
-    /// outliers fit. Behind a Bayer pattern, missing green is interpolated along edges with the other colour's curvature
-    /// as a correction (Hamilton and Adams, US patent 5629734, expired); black and white stay sharp and
-    /// colours make no pattern.
+    /// outliers fit. Behind a Bayer pattern, missing green is interpolated along edges with the other
+    /// colour's curvature as a correction (Hamilton and Adams, US patent 5629734, expired); black and white
+    /// stay sharp and colours make no pattern.
     ///
     /// # Errors
     /// [`ViewError`] when the size is zero or too large, or there are too few bytes.
@@ -110,7 +110,7 @@ impl Converter {
     /// Scales samples of two bytes so that their range fills 8 bits.
     fn scale(&mut self, pairs: &[[u8; 2]], width: usize, height: usize, bits: u32) {
         let [low, high] = self.range(pairs, bits);
-        let span = (high - low).max(LEAST_RANGE);
+        let span = (high - low).max(MIN_RANGE);
         // 255 / span with 16 fractional bits, rounded.
         let factor = ((255 << 16) + span / 2) / span;
         self.samples.resize(width, height);
@@ -322,8 +322,8 @@ mod tests {
         }
     }
 
-    /// A slanted black edge on white paper through a Bayer pattern whose red is half, and whose blue a third as
-    /// bright.
+    /// A slanted black edge on white paper through a Bayer pattern whose red is half, and whose blue a third
+    /// as bright.
     fn slanted(x: usize, y: usize) -> f64 {
         let distance = (x as f64 - 20.0) * 0.94 + (y as f64 - 16.0) * 0.34;
         20.0 + 200.0 / (1.0 + (-2.5 * distance).exp())

@@ -201,8 +201,8 @@ pub fn eccentricity_is_equal(first: &Ellipse, second: &Ellipse) -> bool {
     (first.eccentricity() - second.eccentricity()).abs() <= T_ECCENTRICITY
 }
 
-/// Equation 3.9 by `atan2`: the difference of two angles, from -pi to pi. An ellipse's angle is the same after
-/// half a turn; the thesis assumes a result within a quarter turn, which `atan2` does not ensure.
+/// Equation 3.9 by `atan2`: the difference of two angles, from -pi to pi. An ellipse's angle is the same
+/// after half a turn; the thesis assumes a result within a quarter turn, which `atan2` does not ensure.
 pub fn orientation_difference(angle_1: f64, angle_2: f64) -> f64 {
     let difference = angle_1 - angle_2;
     difference.sin().atan2(difference.cos())

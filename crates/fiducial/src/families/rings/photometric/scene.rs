@@ -13,7 +13,7 @@ use crate::optics::edge_response::EdgeResponse;
 
 /// Larger markers have edges far enough apart to be located one by one.
 pub(crate) const MAX_DIAMETER_PX: f64 = 180.0;
-/// With fewer pixels across, rings cannot be told from a disc.
+/// With fewer pixels across, rings look like a disc.
 const MIN_DIAMETER_PX: f64 = 5.0;
 /// Up to this diameter all pixels are used, above it those about the edges.
 pub(super) const ALL_PIXELS_PX: f64 = 22.0;

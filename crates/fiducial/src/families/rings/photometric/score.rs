@@ -9,7 +9,7 @@ use super::{Alternative, MAX_GREY, PhotometricFit};
 /// Prior standard deviation of the normal, in radians.
 const PRIOR_NORMAL: f64 = 0.6;
 
-/// The figures by which a marker is told from other things.
+/// The figures that distinguish a marker from other things.
 pub(super) struct Score {
     disc_ratio: f64,
     ring_balance: f64,
