@@ -188,7 +188,7 @@ mod tests {
         check(&["rings", "--size", "0.1"], "--output");
         check(&["rings", "-o", "a.pdf"], "--size");
         check(&["rings:0.2", "--size", "0.1", "-o", "a.pdf"], "two sizes");
-        check(&["apriltag-16h5", "--size", "0.1", "-o", "a.pdf"], "which id?");
+        check(&["apriltag-16h5", "--size", "0.1", "-o", "a.pdf"], "missing id");
         check(&["rings", "--size", "0", "-o", "a.pdf"], "from 0.001 to 100");
         check(&["ring", "--size", "0.1", "-o", "a.pdf"], "known are");
         check(&["rings", "--size", "0.1", "--paper", "b5", "-o", "a.pdf"], "a4");
