@@ -301,9 +301,9 @@ mod tests {
         check("mode=magic", &["magic", "landing-target"]);
         check("alarms.battery_low=30", &["`alarms.battery_low` = 30", "from 0 to 1"]);
         check("metric.gain=1", &["no key `metric.gain`"]);
-        let stale = ["`alarms.autopilot_lost_s` = 0.3", "`phases.stale_vehicle_s` = 0.5"];
+        let stale = ["`alarms.autopilot_lost_s` = 0.3", "`phases.stale_vehicle_s` (0.5)"];
         check("alarms.autopilot_lost_s=0.3", &stale);
-        check("phases.stale_vehicle_s=1.5", &["`alarms.autopilot_lost_s` = 1", "= 1.5"]);
+        check("phases.stale_vehicle_s=1.5", &["`alarms.autopilot_lost_s` = 1", "(1.5)"]);
         assert!(load(&["alarms.autopilot_lost_s=0"]).is_ok(), "the alarm is off");
     }
 }
