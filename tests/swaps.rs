@@ -71,7 +71,7 @@ fn pad_and_detectors(directory: &Path) -> anyhow::Result<(PathBuf, Vec<PathBuf>)
     let pad = write("pad.toml", format!("id = 5\n{RINGS}{TAG}"))?;
     let mut detectors = Vec::new();
     for (version, settings) in
-        [("a", "[tracking]\nenabled = true\n"), ("b", "least_confidence = 0.05\n")]
+        [("a", "[tracking]\nenabled = true\n"), ("b", "min_confidence = 0.05\n")]
     {
         for (family, marker) in [("rings", RINGS), ("tag", TAG)] {
             let part = write(&format!("{family}.toml"), format!("id = 5\n{marker}"))?;

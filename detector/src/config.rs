@@ -23,7 +23,7 @@ pub struct Config {
     /// Pads whose markers are solved together.
     pub pads: Vec<String>,
     /// Detections less sure than this are not published.
-    pub least_confidence: f64,
+    pub min_confidence: f64,
     /// Whether markers printed white on black are looked for as well.
     pub inverted: bool,
     /// Whether damaged markers are looked for where others were found, too.
@@ -64,7 +64,7 @@ impl Settings for Config {
         check.name("camera", &self.camera);
         check.parses("pads", self.parsed_pads());
         check.parses("markers", self.detector());
-        check.range("least_confidence", self.least_confidence, 0.0..=1.0);
+        check.range("min_confidence", self.min_confidence, 0.0..=1.0);
         check.range("thesis_threshold", self.thesis_threshold, 1..=255);
         check.range("debug_jpeg_quality", self.debug_jpeg_quality, 1..=100);
         check.range("tracking.full_search_period", self.tracking.full_search_period, 1..=1000);
@@ -187,7 +187,7 @@ mod tests {
         assert!(refused("place", "ground").contains("--set place=ground"));
         assert!(refused("input", "jpeg").contains("start another detector"));
         assert!(refused("input", "video").contains("video"));
-        assert!(refused("least_confidence", "2").contains("from 0 to 1"));
+        assert!(refused("min_confidence", "2").contains("from 0 to 1"));
         assert!(refused("markers", "[]").contains("at least one marker"));
         assert!(refused("tracking", "7").contains("a table is needed"));
         assert!(refused("x=1\ny", "2").contains("x"));

@@ -331,7 +331,7 @@ impl Work {
             parts::add_finer(&mut found, seen.iter().map(|seen| seen.mapped(&roi)));
         }
         found.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
-        told(&found, &self.pads, whole.as_ref(), self.config.least_confidence)
+        told(&found, &self.pads, whole.as_ref(), self.config.min_confidence)
     }
 
     fn ack(&self, frame: &Frame) -> FrameAck {
@@ -363,7 +363,7 @@ impl Work {
         let camera = self.camera_model(header);
         let time_s = header.stamp_ns as f64 * 1e-9;
         let found = self.tracker.detect(&mut self.detector, view, camera.as_ref(), time_s, clock);
-        told(found, &self.pads, camera.as_ref(), self.config.least_confidence)
+        told(found, &self.pads, camera.as_ref(), self.config.min_confidence)
     }
 
     async fn publish(&self, header: &FrameHeader, found: Vec<Detection>, clock: StageClock) {

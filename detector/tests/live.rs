@@ -168,17 +168,17 @@ async fn check_live_changes(
 
     for (key, value, part) in [
         ("markers", "[\"hexagons:1\"]", "no family `hexagons`"),
-        ("least_confidence", "1.5", "from 0 to 1"),
-        ("leest_confidence", "0.5", "did you mean `least_confidence`"),
+        ("min_confidence", "1.5", "from 0 to 1"),
+        ("mn_confidence", "0.5", "did you mean `min_confidence`"),
         ("camera", "other", "start the detector again"),
     ] {
         let reply = set(operator, key, value).await?;
         ensure!(!reply.accepted && reply.reason.contains(part), "{reply:?}");
     }
     until(detections, "only ArUco is still found", |m| names(m) == only).await?;
-    accept(operator, "least_confidence", "1").await?;
+    accept(operator, "min_confidence", "1").await?;
     until(detections, "nothing is sure enough", |m| m.detections.is_empty()).await?;
-    accept(operator, "least_confidence", "0").await?;
+    accept(operator, "min_confidence", "0").await?;
     accept(operator, "markers", ALL).await?;
     until(detections, "all families are found again", |m| names(m) == all).await?;
     Ok(())

@@ -246,7 +246,7 @@ fn on_plane(
     camera: &CameraModel,
     pixel: Pixel,
 ) -> Option<(f64, f64)> {
-    let ray = camera.unproject(pixel);
+    let ray = camera.unproject_clamped(pixel);
     let marker_from_camera = camera_from_marker.inverse();
     let origin = marker_from_camera.origin();
     let direction = marker_from_camera.rotation() * ray;

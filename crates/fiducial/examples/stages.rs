@@ -114,9 +114,9 @@ fn detect(view: GrayView<'_>, family: &str, folder: &Path) -> Outcome<()> {
         );
     }
     let mut total = 0.0;
-    for (stage, least_ms) in &clock.stages {
-        println!("  {stage:10} {least_ms:7.3} ms");
-        total += least_ms;
+    for (stage, min_ms) in &clock.stages {
+        println!("  {stage:10} {min_ms:7.3} ms");
+        total += min_ms;
     }
     println!("  {:10} {total:7.3} ms", "all");
     let trace = detector.trace();

@@ -206,11 +206,11 @@ impl Plane<'_> {
         let arm = |point: &PlanePoint| [0, 1].map(|axis| point.place_m[axis] - middle[axis]);
         let extent =
             self.points.iter().map(arm).fold(0.0_f64, |max, [x, y]| max.max(x.abs()).max(y.abs()));
-        let first = self.camera.sight(self.points.first()?.seen)?;
+        let first = self.camera.unproject(self.points.first()?.seen)?;
         let origin = [first.x(), first.y()];
         let mut is_seen = true;
         let pairs = self.points.iter().filter_map(|point| {
-            let ray = self.camera.sight(point.seen);
+            let ray = self.camera.unproject(point.seen);
             is_seen &= ray.is_some();
             let ray = ray?;
             Some([arm(point).map(|a| a / extent), [ray.x() - origin[0], ray.y() - origin[1]]])
@@ -224,7 +224,7 @@ impl Plane<'_> {
         let mut matrix = Matrix3::zeros();
         let mut right = Vector3::zeros();
         for point in self.points {
-            let ray = self.camera.sight(point.seen)?.coords;
+            let ray = self.camera.unproject(point.seen)?.coords;
             let arm = rotation * Vector3::new(point.place_m[0], point.place_m[1], 0.0);
             for (axis, along) in [(0, ray.x), (1, ray.y)] {
                 let mut row = Vector3::zeros();

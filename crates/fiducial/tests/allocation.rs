@@ -10,7 +10,7 @@ use markers::Marker;
 use rendering::views::{Binning, TestScene, View};
 
 /// What a detector may allocate at first, in frames.
-const MOST_FRAMES: f64 = 8.0;
+const MAX_FRAMES: f64 = 8.0;
 
 /// A marker on painted asphalt, from several heights.
 fn frames(binning: Binning) -> [Vec<u8>; 4] {
@@ -48,7 +48,7 @@ fn nothing_is_allocated_per_frame() {
         println!(
             "{name}: at first {in_frames:.1} frames' worth; allocations for the same frame {again}, for others {others}, for those again {later}"
         );
-        assert!(in_frames <= MOST_FRAMES, "{name}: {in_frames} frames' worth");
+        assert!(in_frames <= MAX_FRAMES, "{name}: {in_frames} frames' worth");
         assert_eq!((again, others, later), (0, 0, 0), "{name}");
     }
 }

@@ -133,8 +133,8 @@ fn a_marker_that_is_not_looked_for_is_not_found() {
     assert_eq!(detect(&mut detector("stag-hd23:2"), &image).len(), 1);
 }
 
-/// Asserts that markers of several families and turns are found with their corners to `most_px` in spite of the veil.
-fn expect(name: &str, centre: [f64; 2], most_px: f64, veil: impl Fn([f64; 2], f64) -> f64) {
+/// Asserts that markers of several families and turns are found with their corners to `max_px` in spite of the veil.
+fn expect(name: &str, centre: [f64; 2], max_px: f64, veil: impl Fn([f64; 2], f64) -> f64) {
     for (family, id) in [(Family::StagHd23, 3), (Family::StagHd21, 7), (Family::StagHd11, 12_345)] {
         let mut detector = detector(&format!("{family}:*:0.1"));
         for turn in [0.8, 4.3] {
@@ -146,7 +146,7 @@ fn expect(name: &str, centre: [f64; 2], most_px: f64, veil: impl Fn([f64; 2], f6
             let corners = found[0].corners.unwrap();
             for (corner, truth) in corners.iter().zip(shot.corners()) {
                 let off_px = corner.distance(&truth);
-                assert!(off_px < most_px, "{name}: {off_px} px");
+                assert!(off_px < max_px, "{name}: {off_px} px");
             }
         }
     }

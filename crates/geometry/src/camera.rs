@@ -104,26 +104,26 @@ impl CameraModel {
         jacobian.iter().all(|j| j.is_finite()).then_some((pixel, jacobian))
     }
 
-    /// The direction in which a pixel looks, with z = 1; `None` where no direction in front of the camera that the
+    /// The direction of a pixel's ray, with z = 1; `None` where no direction in front of the camera that the
     /// lens model describes gives this pixel, and for a fisheye's pixels from 90 degrees off axis on.
-    pub fn sight(&self, pixel: Pixel) -> Option<Vector<Camera>> {
+    pub fn unproject(&self, pixel: Pixel) -> Option<Vector<Camera>> {
         let (u, v) = ((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
         let (x, y) = self.distortion.undistort(u, v)?;
         Some(Vector::new(x, y, 1.0))
     }
 
-    /// As [`CameraModel::sight`]; where there is none, the outermost direction on the way to the pixel.
-    pub fn unproject(&self, pixel: Pixel) -> Vector<Camera> {
-        if let Some(sight) = self.sight(pixel) {
-            return sight;
+    /// As [`CameraModel::unproject`]; where there is none, the outermost direction on the line to the pixel.
+    pub fn unproject_clamped(&self, pixel: Pixel) -> Vector<Camera> {
+        if let Some(ray) = self.unproject(pixel) {
+            return ray;
         }
         let mut outermost = Vector::new(0.0, 0.0, 1.0);
         let (mut within, mut beyond) = (0.0, 1.0);
         for _ in 0..24 {
             let share = (within + beyond) / 2.0;
             let between = |middle: f64, end: f64| middle + (end - middle) * share;
-            match self.sight(Pixel::new(between(self.cx, pixel.x), between(self.cy, pixel.y))) {
-                Some(sight) => (within, outermost) = (share, sight),
+            match self.unproject(Pixel::new(between(self.cx, pixel.x), between(self.cy, pixel.y))) {
+                Some(ray) => (within, outermost) = (share, ray),
                 None => beyond = share,
             }
         }
@@ -324,7 +324,7 @@ mod tests {
         #[test]
         fn a_pixel_comes_back_from_its_direction(x in 0.0..1295.0f64, y in 0.0..971.0f64) {
             for model in models() {
-                let ray = model.unproject(Pixel::new(x, y));
+                let ray = model.unproject_clamped(Pixel::new(x, y));
                 let pixel = model.project(Point::new(ray.x() * 3.0, ray.y() * 3.0, 3.0)).unwrap();
                 prop_assert!(pixel.distance(&Pixel::new(x, y)) < 1e-6, "{model:?} {pixel:?}");
             }
@@ -423,8 +423,8 @@ mod tests {
                 let expected = Pixel::new(u, v);
                 let found = camera.project(Point::new(x, y, z)).unwrap();
                 assert!(found.distance(&expected) < 1e-7, "{found:?} {expected:?}");
-                let sight = camera.sight(expected).unwrap();
-                assert!((sight.x() - x / z).hypot(sight.y() - y / z) < 1e-8, "{sight:?}");
+                let ray = camera.unproject(expected).unwrap();
+                assert!((ray.x() - x / z).hypot(ray.y() - y / z) < 1e-8, "{ray:?}");
             }
         }
     }
@@ -441,17 +441,17 @@ mod tests {
             distortion,
             ..CameraModel::pinhole(816, 612, 770.0)
         };
-        assert!(camera.sight(Pixel::new(700.0, 305.0)).is_some());
-        assert_eq!(camera.sight(Pixel::new(1500.0, 305.0)), None);
+        assert!(camera.unproject(Pixel::new(700.0, 305.0)).is_some());
+        assert_eq!(camera.unproject(Pixel::new(1500.0, 305.0)), None);
         assert_eq!(camera.project(Point::new(0.7, 0.0, 1.0)), None);
-        let outermost = camera.unproject(Pixel::new(1500.0, 305.0));
+        let outermost = camera.unproject_clamped(Pixel::new(1500.0, 305.0));
         assert!((0.4..0.7).contains(&outermost.x()), "{outermost:?}");
         assert!(outermost.y().abs() < 0.1);
         let fisheye = CameraModel { distortion: Distortion::KannalaBrandt([0.0; 4]), ..camera };
-        assert_eq!(fisheye.sight(Pixel::new(408.0 + 770.5 * 1.6, 305.0)), None);
+        assert_eq!(fisheye.unproject(Pixel::new(408.0 + 770.5 * 1.6, 305.0)), None);
         for model in [camera, fisheye] {
-            assert_eq!(model.sight(Pixel::new(f64::NAN, 3.0)), None);
-            assert!(model.unproject(Pixel::new(f64::INFINITY, 3.0)).is_finite());
+            assert_eq!(model.unproject(Pixel::new(f64::NAN, 3.0)), None);
+            assert!(model.unproject_clamped(Pixel::new(f64::INFINITY, 3.0)).is_finite());
         }
     }
 

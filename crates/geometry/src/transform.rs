@@ -82,7 +82,7 @@ impl<F: Frame> Vector<F> {
         Self::from_coords(Vector3::new(x, y, z))
     }
 
-    /// The vector of length nought.
+    /// The zero vector.
     pub fn zero() -> Self {
         Self::new(0.0, 0.0, 0.0)
     }
@@ -129,7 +129,7 @@ impl<To: Frame, From: Frame> Rotation<To, From> {
         Self { quaternion, frames: PhantomData }
     }
 
-    /// From w, x, y, z, normalised; `None` when the length is nought or not finite.
+    /// From w, x, y, z, normalised; `None` when the length is zero or not finite.
     pub fn from_wxyz(wxyz: [f64; 4]) -> Option<Self> {
         let [w, x, y, z] = wxyz;
         let quaternion = Quaternion::new(w, x, y, z);

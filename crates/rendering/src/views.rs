@@ -155,7 +155,7 @@ impl View {
         let lateral_px = camera.fx * self.lateral_m / f64::from(self.height_m);
         let jitter_px = |i| MAX_JITTER_PX * (2.0 * spread.fraction(i) - 1.0);
         let seen_at = Pixel::new(camera.cx + lateral_px + jitter_px(3), camera.cy + jitter_px(4));
-        let sight = ned_from_camera * camera.unproject(seen_at);
+        let sight = ned_from_camera * camera.unproject_clamped(seen_at);
         let place = ned_from_marker.origin() - sight * (f64::from(self.height_m) / sight.z());
         let ned_from_camera: Transform<Ned, Camera> = Transform::new(ned_from_camera, place);
         ned_from_camera * settings.body_from_camera.inverse()

@@ -54,7 +54,7 @@ fn pose(height_m: f64, roll: f64, pitch: f64, yaw: f64, off_px: [f64; 2]) -> Tra
     let settings = exact_settings();
     let middle = Pixel::new(settings.model.cx + off_px[0], settings.model.cy + off_px[1]);
     let ray: Vector<Ned> =
-        rotation * (settings.body_from_camera * settings.model.unproject(middle));
+        rotation * (settings.body_from_camera * settings.model.unproject_clamped(middle));
     let face = Point::<Ned>::new(0.4, -0.3, -0.01);
     Transform::new(rotation, face - ray * (height_m / ray.z()))
 }
@@ -146,7 +146,7 @@ fn brute_force(
             };
             let (x, y) = (index % edge, index / edge);
             let pixel = Pixel::new(place(centre[0], x, y), place(centre[1], y, x));
-            let ray = settings.model.unproject(pixel);
+            let ray = settings.model.unproject_clamped(pixel);
             *value += reflectance(pad, drawing, &marker_from_camera, ray) / instants.len() as f64;
         }
     }

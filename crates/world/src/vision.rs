@@ -125,7 +125,7 @@ impl Vision {
         let centre =
             Pixel::new(true_centre.x + centre_px * noise[0], true_centre.y + centre_px * noise[1]);
         let range_m = depth_m * (1.0 + model.range_bias + range_part * noise[2]);
-        let ray = self.camera.unproject(centre);
+        let ray = self.camera.unproject_clamped(centre);
         let turned = Vector::<Camera>::new(tilt_rad * noise[3], tilt_rad * noise[4], 0.0);
         let rotation = Rotation::<Camera, Camera>::from_rotation_vector(turned) * truth.rotation();
         let along = ray.coords / ray.z();

@@ -106,7 +106,7 @@ impl Fitter {
         let ned_from_body =
             Rotation::from_euler(tilt * about.cos(), tilt * about.sin(), turn * heading);
         let pixel = geometry::Pixel::new(u * f64::from(model.width), v * f64::from(model.height));
-        let ray = model.unproject(pixel);
+        let ray = model.unproject_clamped(pixel);
         let in_camera = Point::origin() + ray * (depth_m / ray.z());
         let ned_from_camera =
             Transform::new(ned_from_body, Point::origin()) * settings.body_from_camera;

@@ -171,7 +171,7 @@ pub fn pose(
     let facing = turn(Vector3::x(), std::f64::consts::PI);
     let axis = Vector3::new(tilt.about.cos(), tilt.about.sin(), 0.0);
     let rotation = turn(axis, tilt.angle) * facing * turn(Vector3::z(), heading);
-    let ray = model.unproject(seen_at);
+    let ray = model.unproject_clamped(seen_at);
     Transform::new(
         Rotation::from_quaternion(UnitQuaternion::from_rotation_matrix(&rotation)),
         Point::new(ray.x() * distance_m, ray.y() * distance_m, distance_m),

@@ -451,7 +451,7 @@ fn facing_covariance(
 ) -> Matrix6<f64> {
     let metres_per_px = size_m / size_px;
     let range_m = (camera.fx + camera.fy) / 2.0 * metres_per_px;
-    let ray = camera.unproject(centre).coords;
+    let ray = camera.unproject_clamped(centre).coords;
     let lateral_m = CENTRE_ERROR_PX * metres_per_px + CENTRE_ERROR_RATIO * size_m;
     let along = ray * ray.transpose() * (range_m * RANGE_ERROR_RATIO).powi(2);
     let sight = ray.normalize();
@@ -471,7 +471,7 @@ fn facing(
     camera: &CameraModel,
 ) -> Transform<Camera, MarkerFrame> {
     let range_m = (camera.fx + camera.fy) / 2.0 * metres_per_px;
-    let ray = camera.unproject(centre) * range_m;
+    let ray = camera.unproject_clamped(centre) * range_m;
     let rotation = Rotation::from_euler(PI, 0.0, 0.0);
     Transform::new(rotation, Point::new(ray.x(), ray.y(), ray.z()))
 }

@@ -37,12 +37,12 @@ impl<'a> Undistortion<'a> {
         let pixel = middle(corners);
         let camera = camera.filter(|camera| {
             camera.distortion != Distortion::None
-                && corners.iter().all(|corner| camera.sight(*corner).is_some())
+                && corners.iter().all(|corner| camera.unproject(*corner).is_some())
         });
         let ideal = [pixel.x, pixel.y];
         let mut this = Self { camera, pixel, ideal, jacobian: Matrix2::identity() };
         if let Some(camera) = camera {
-            let ray = camera.sight(pixel)?;
+            let ray = camera.unproject(pixel)?;
             this.ideal = [camera.fx * ray.x() + camera.cx, camera.fy * ray.y() + camera.cy];
             let (_, jacobian) = this.distort(this.ideal)?;
             this.jacobian = jacobian.try_inverse()?;

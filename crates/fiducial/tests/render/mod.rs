@@ -102,7 +102,7 @@ impl Scene {
                         (y - camera.cy) / camera.fy,
                         1.0,
                     ),
-                    _ => camera.unproject(Pixel::new(x, y)).coords,
+                    _ => camera.unproject_clamped(Pixel::new(x, y)).coords,
                 };
             let along = -from.z / direction.z;
             (from.x + along * direction.x, from.y + along * direction.y)

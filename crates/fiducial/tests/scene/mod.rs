@@ -97,20 +97,20 @@ impl Scene {
         self.project(0.0, 0.0)
     }
 
-    /// The corners as something coarse would give them, off by up to `most_px` in x and in y.
-    pub(crate) fn coarse(&self, most_px: f64) -> [Pixel; 4] {
+    /// The corners as something coarse would give them, off by up to `max_px` in x and in y.
+    pub(crate) fn coarse(&self, max_px: f64) -> [Pixel; 4] {
         let mut random = Random::new(self.seed ^ 0xabcd);
         self.corners().map(|corner| {
             Pixel::new(
-                corner.x + random.between(-most_px, most_px),
-                corner.y + random.between(-most_px, most_px),
+                corner.x + random.between(-max_px, max_px),
+                corner.y + random.between(-max_px, max_px),
             )
         })
     }
 
     /// Light at a place of the image before the lens blurs it.
     fn light(&self, marker_from_camera: &Transform<MarkerFrame, Camera>, x: f64, y: f64) -> f64 {
-        let ray = *marker_from_camera * self.camera.unproject(Pixel::new(x, y));
+        let ray = *marker_from_camera * self.camera.unproject_clamped(Pixel::new(x, y));
         let from = marker_from_camera.origin();
         let along = -from.z() / ray.z();
         let cell = self.size_m / self.cells as f64;

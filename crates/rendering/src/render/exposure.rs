@@ -128,7 +128,7 @@ fn seen_by(
     pixel: Pixel,
 ) -> Point<Ned> {
     let origin = ned_from_camera.origin();
-    let direction = *ned_from_camera * model.unproject(pixel);
+    let direction = *ned_from_camera * model.unproject_clamped(pixel);
     let reach = -origin.z() / direction.z();
     let reach = if reach > 0.0 && reach < 1e3 { reach } else { 1e3 };
     origin + direction * reach

@@ -47,7 +47,7 @@ impl Lens {
 
     /// Ideal coordinates of a pixel; where the lens model has no solution, those of a pinhole.
     fn exact(&self, u: f64, v: f64) -> [f64; 2] {
-        let ray = self.model.unproject(Pixel::new(u, v));
+        let ray = self.model.unproject_clamped(Pixel::new(u, v));
         if ray.is_finite() { [ray.x(), ray.y()] } else { self.pinhole(u, v) }
     }
 

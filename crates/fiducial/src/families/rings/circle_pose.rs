@@ -406,7 +406,7 @@ pub(crate) fn project(point: Vector3<f64>, camera: &CameraModel) -> Option<Pixel
 fn cone(ellipse: &Ellipse, camera: &CameraModel) -> Option<Matrix3<f64>> {
     let rays = (0..ELLIPSE_POINTS).map(|i| {
         let [x, y] = ellipse.at(f64::from(i) * TAU / f64::from(ELLIPSE_POINTS));
-        let ray = camera.unproject(Pixel::new(x, y));
+        let ray = camera.unproject_clamped(Pixel::new(x, y));
         [ray.x(), ray.y()]
     });
     let ellipse = fit_ellipse(rays)?;

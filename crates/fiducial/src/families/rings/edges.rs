@@ -125,7 +125,7 @@ impl EdgeSearch<'_> {
                     support.visible += 1;
                     support.found += 1;
                     let at = offset(at, direction, shift_px);
-                    let ray = self.camera.unproject(at);
+                    let ray = self.camera.unproject_clamped(at);
                     edges.push(EdgePoint { ray: ray.coords, radius });
                 }
             }

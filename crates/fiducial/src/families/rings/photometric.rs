@@ -277,7 +277,7 @@ mod tests {
         let data: Vec<u8> = (0..8000)
             .map(|i| {
                 let (x, y) = (f64::from(i % 100), f64::from(i / 100));
-                let ray = camera.unproject(Pixel::new(x, y)).coords;
+                let ray = camera.unproject_clamped(Pixel::new(x, y)).coords;
                 let offset = [x - middle.x, y - middle.y];
                 let samples = [PixelSample { ray, offset, grey: 0.0, inside: true }];
                 let scene = Scene::new(&samples, size_m, &camera, EARLY_REJECT_RESIDUAL);

@@ -112,7 +112,7 @@ impl SampleSource<'_> {
             let place = [x as f64, y as f64];
             let grey = f64::from(view.at(x, y));
             samples.push(PixelSample {
-                ray: camera.unproject(Pixel::new(place[0], place[1])).coords,
+                ray: camera.unproject_clamped(Pixel::new(place[0], place[1])).coords,
                 offset: [place[0] - middle.x, place[1] - middle.y],
                 grey: if white_on_black { 255.0 - grey } else { grey },
                 inside,
