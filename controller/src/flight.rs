@@ -146,7 +146,7 @@ impl Flight {
 
     /// Gives the lander the next frame, if there is one, and reports a change of the active detector.
     fn use_newest(&mut self, now_ns: i64) -> bool {
-        let next = self.frames.next();
+        let next = self.frames.take_next();
         if let Some(frame) = next.frame {
             self.frame(now_ns, frame);
         }

@@ -33,6 +33,7 @@ pub struct Frames {
 
 /// What becomes of detections on arrival.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "returned and matched at once, never stored")]
 pub enum Arrival {
     /// They are kept until they are used.
     Kept,
@@ -122,7 +123,7 @@ impl Frames {
     }
 
     /// The frame to be used now: the active detector's newest, if it is newer than all that were used.
-    pub fn next(&mut self) -> Next {
+    pub fn take_next(&mut self) -> Next {
         let next = self.selection.next_frame();
         let frame = next.and_then(|(name, _stamp)| self.newest.get(&name).copied());
         let is_handover = self.selection.changes() != self.known_changes;

@@ -25,7 +25,7 @@ fn frame() -> Vec<u8> {
         let radius = (x as f32 - 648.0).hypot(y as f32 - 486.0);
         let grain = [i, i + 1, i + width, i + width + 1];
         let grain: f32 = grain.iter().map(|at| grains.get(*at).copied().unwrap_or(0.0)).sum();
-        let ink = (radius / 6.0) as u32 % 2 == 0;
+        let ink = ((radius / 6.0) as u32).is_multiple_of(2);
         let light = match (radius < 40.0, ink) {
             (true, true) => 30.0,
             (true, false) => 200.0,

@@ -47,8 +47,11 @@ fn every_file_has_its_codewords_and_its_checksum() {
     assert_eq!(tables.count(), FILES.len());
 }
 
-/// The codewords of a family, and the Hamming distance that it states.
-fn stated(family: Family) -> Option<(&'static [u64], u32, Box<dyn Fn(u64) -> u64>)> {
+/// A codeword, turned by a quarter.
+type Rotate = Box<dyn Fn(u64) -> u64>;
+
+/// The codewords of a family, the minimum Hamming distance that it states, and how its codewords rotate.
+fn stated(family: Family) -> Option<(&'static [u64], u32, Rotate)> {
     if let Some(code) = SquareCode::for_family(family) {
         let min_hamming = u32::from(code.min_hamming);
         return Some((code.codewords, min_hamming, Box::new(|word| code.rotated(word))));
@@ -66,7 +69,7 @@ fn every_family_has_as_many_codewords_as_ids() {
     }
 }
 
-/// Comparisons that a family may take; of larger families every so many-th codeword is compared with all.
+/// Comparisons that a family may take; of larger families an even sample of the codewords is compared with all.
 const MAX_COMPARED: usize = 12_000_000;
 
 #[test]

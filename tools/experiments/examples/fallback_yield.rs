@@ -63,7 +63,7 @@ fn main() -> anyhow::Result<()> {
 
 fn print(name: &str, sums: &Sums) {
     let Sums { shown, found, without_any, searched, .. } = *sums;
-    println!("| {name} | all | {} of {shown} | | without any {without_any} | |", found);
+    println!("| {name} | all | {found} of {shown} | | without any {without_any} | |");
     for (pass, result) in FallbackPass::ALL.iter().zip(&sums.passes) {
         let share = 100.0 * result.only as f64 / found.max(1) as f64;
         let ms = 1e3 * result.seconds / searched.max(1) as f64;
