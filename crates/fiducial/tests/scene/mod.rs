@@ -3,6 +3,9 @@
 //! form.
 #![allow(dead_code, reason = "each test uses its own part of it")]
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
+#![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
+
+pub(crate) mod errors;
 
 use fiducial::refine::pattern::Pattern;
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Transform};
