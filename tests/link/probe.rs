@@ -56,7 +56,7 @@ impl Times {
 
     pub(crate) fn report(&self) -> Value {
         json!({
-            "p50_ms": self.at(0.5), "p99_ms": self.at(0.99), "most_ms": self.at(1.0),
+            "p50_ms": self.at(0.5), "p99_ms": self.at(0.99), "max_ms": self.at(1.0),
             "count": self.ms.len(), "lost": self.lost(),
         })
     }

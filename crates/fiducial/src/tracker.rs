@@ -42,7 +42,9 @@ pub struct Tracker {
     trace: Trace,
     /// Images since the last search of a whole image.
     since_full: u32,
-    size: (usize, usize),
+    /// Width and height of the image, in pixels, and its time in seconds.
+    size: [usize; 2],
+    time_s: f64,
     /// Whether an image was searched.
     has_begun: bool,
     /// Whether regions were requested for this image.
@@ -140,11 +142,11 @@ impl Tracker {
     ) -> &[Observation] {
         self.found.clear();
         self.trace.clear();
-        self.begin((view.width(), view.height()), time_s);
+        self.begin([view.width(), view.height()], time_s);
         if self.choose_regions(time_s) {
             for index in 0..self.regions.len() {
                 if let Some(region) = self.regions.get(index).copied() {
-                    self.search(detector, view, camera, (region, time_s), stages);
+                    self.search(detector, view, camera, region, stages);
                 }
             }
             self.found.sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
@@ -175,7 +177,8 @@ impl Tracker {
     }
 
     /// Drops tracks that can no longer be predicted.
-    fn begin(&mut self, size: (usize, usize), time_s: f64) {
+    fn begin(&mut self, size: [usize; 2], time_s: f64) {
+        self.time_s = time_s;
         if size != self.size {
             self.size = size;
             self.tracks.clear();
@@ -203,7 +206,7 @@ impl Tracker {
         self.regions.append(&mut self.requested);
         merge(&mut self.regions);
         let area: usize = self.regions.iter().map(Region::area).sum();
-        let whole = (self.size.0 * self.size.1) as f64;
+        let whole = (self.size[0] * self.size[1]) as f64;
         if area as f64 > MAX_COVERED * whole {
             self.regions.clear();
         }
@@ -215,7 +218,7 @@ impl Tracker {
         detector: &mut Detector,
         view: GrayView<'_>,
         camera: Option<&CameraModel>,
-        (region, time_s): (Region, f64),
+        region: Region,
         stages: &mut impl StageObserver,
     ) {
         let [left, top] = region.from;
@@ -223,8 +226,8 @@ impl Tracker {
         let Some(part) = view.crop(left, top, width, height) else { return };
         let roi = Roi::cropped(left as f64, top as f64, width as u32, height as u32);
         let camera = camera.map(|camera| roi.camera(camera));
-        let expected = self.only_track(&region, time_s).and_then(|track| {
-            let at = track.prediction(time_s, roi.origin)?;
+        let expected = self.only_track(&region, self.time_s).and_then(|track| {
+            let at = track.prediction(self.time_s, roi.origin)?;
             detector.detect_at(part, camera.as_ref(), &at, stages)
         });
         match expected {
@@ -349,11 +352,11 @@ impl Track {
     }
 
     /// The region to search for it; `None` when it should have left the image.
-    fn region(&self, time_s: f64, size: (usize, usize)) -> Option<Region> {
+    fn region(&self, time_s: f64, size: [usize; 2]) -> Option<Region> {
         let (centre, size_px) = self.predicted(time_s);
         let inside = |at: f64, edge: usize| at >= -0.5 && at <= edge as f64 - 0.5;
         let half = size_px * (0.5 + MARGIN) + self.uncertainty_px(time_s, size_px);
-        (inside(centre.x, size.0) && inside(centre.y, size.1))
+        (inside(centre.x, size[0]) && inside(centre.y, size[1]))
             .then(|| Region::around(centre, half, size))
             .flatten()
     }
@@ -411,7 +414,7 @@ impl Shape {
 
 impl Region {
     /// The square around a pixel, in whole tiles, cut to an image of this size.
-    fn around(centre: Pixel, half: f64, (width, height): (usize, usize)) -> Option<Self> {
+    fn around(centre: Pixel, half: f64, [width, height]: [usize; 2]) -> Option<Self> {
         let finite = centre.x.is_finite() && centre.y.is_finite() && half.is_finite() && half > 0.0;
         let span = |at: f64, edge: usize| {
             let from = (at - half).max(0.0) as usize / TILE * TILE;
@@ -475,7 +478,7 @@ mod tests {
     use nalgebra::Matrix2;
     use proptest::prelude::*;
 
-    const SIZE: (usize, usize) = (1296, 972);
+    const SIZE: [usize; 2] = [1296, 972];
 
     fn seen(x: f64, y: f64, size_px: f64, id: u32) -> Observation {
         Observation {
@@ -619,7 +622,7 @@ mod tests {
             tracker.begin(SIZE, 0.3);
             tracker.choose_regions(0.3);
             for (i, region) in tracker.regions.iter().enumerate() {
-                prop_assert!(region.area() > 0 && region.to[0] <= SIZE.0 && region.to[1] <= SIZE.1);
+                prop_assert!(region.area() > 0 && region.to[0] <= SIZE[0] && region.to[1] <= SIZE[1]);
                 prop_assert!(!tracker.regions[..i].iter().any(|other| other.overlaps(region)));
             }
         }

@@ -13,6 +13,7 @@
 //! quarter_turns = 0       # counter-clockwise, as seen by who reads the sheet
 //! ```
 
+use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 use serde::Deserialize;
@@ -232,15 +233,15 @@ impl FromStr for Pad {
         let described: Description =
             toml::from_str(text).map_err(|e| PadError::Toml(e.to_string()))?;
         let tolerance_m = described.tolerance_m.unwrap_or(PRINTED_TOLERANCE_M);
-        within("tolerance_m", tolerance_m, (0.0, MAX_TOLERANCE_M))?;
-        within("number of markers", described.markers.len() as f64, (1.0, MAX_MARKERS as f64))?;
+        within("tolerance_m", tolerance_m, 0.0..=MAX_TOLERANCE_M)?;
+        within("number of markers", described.markers.len() as f64, 1.0..=MAX_MARKERS as f64)?;
         let mut markers: Vec<PlacedMarker> = Vec::with_capacity(described.markers.len());
         for (i, placed) in described.markers.iter().enumerate() {
             let number = i + 1;
-            within(&format!("x_m of marker {number}"), placed.x_m, (-MAX_OFFSET_M, MAX_OFFSET_M))?;
-            within(&format!("y_m of marker {number}"), placed.y_m, (-MAX_OFFSET_M, MAX_OFFSET_M))?;
+            within(&format!("x_m of marker {number}"), placed.x_m, -MAX_OFFSET_M..=MAX_OFFSET_M)?;
+            within(&format!("y_m of marker {number}"), placed.y_m, -MAX_OFFSET_M..=MAX_OFFSET_M)?;
             let turns = f64::from(placed.quarter_turns);
-            within(&format!("quarter_turns of marker {number}"), turns, (0.0, 3.0))?;
+            within(&format!("quarter_turns of marker {number}"), turns, 0.0..=3.0)?;
             let placed = placed.checked(&markers).map_err(|problem| PadError::Marker {
                 number,
                 text: placed.marker.clone(),
@@ -269,8 +270,9 @@ impl Placed {
     }
 }
 
-fn within(key: &str, value: f64, (min, max): (f64, f64)) -> Result<(), PadError> {
-    match (min..=max).contains(&value) {
+fn within(key: &str, value: f64, bounds: RangeInclusive<f64>) -> Result<(), PadError> {
+    let (min, max) = (*bounds.start(), *bounds.end());
+    match bounds.contains(&value) {
         true => Ok(()),
         false => Err(PadError::Range { key: key.to_owned(), value, min, max }),
     }

@@ -115,10 +115,10 @@ impl Bench {
     }
 
     /// Lets time pass until something holds, and says how long it took.
-    pub(crate) fn wait(&mut self, most_s: f64, what: &str, holds: impl Fn(&Self) -> bool) -> f64 {
+    pub(crate) fn wait(&mut self, max_s: f64, what: &str, holds: impl Fn(&Self) -> bool) -> f64 {
         let start_s = self.now_s();
         while !holds(self) {
-            assert!(self.now_s() - start_s < most_s, "no {what} within {most_s} s");
+            assert!(self.now_s() - start_s < max_s, "no {what} within {max_s} s");
             self.step();
         }
         self.now_s() - start_s

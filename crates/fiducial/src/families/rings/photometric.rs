@@ -2,23 +2,22 @@
 //!
 //! Where rings are a few pixels wide, the blur of one edge reaches the next, and edges located one by one
 //! come out too far apart. Here pose, blur and exposure are fitted together, to minimise the difference
-//! between the image predicted by the model and the image observed. `scene` selects the pixels, `blur` is the
-//! model of one pixel, `solve` fits the model, `score` rates the result.
+//! between the image predicted by the model and the image observed. `model` has what is fitted, `scene` selects the pixels,
+//! `blur` is the model of one pixel, `solve` fits the model, `score` rates the result.
 
 mod blur;
+mod model;
 mod scene;
 mod score;
 mod solve;
 
-use geometry::CameraModel;
-use imaging::GrayView;
-use nalgebra::SMatrix;
-
 use crate::families::rings::circle_pose::CirclePose;
 
+use model::{Effort, MAX_GREY, MAX_RESIDUAL};
+pub(crate) use model::{PhotometricFit, PhotometricInput, PhotometricPoses};
 pub(crate) use scene::PixelSample;
 use scene::{ALL_PIXELS_PX, FOCUSED_PX, SampleSource, Scene};
-use solve::{Effort, ModelFit, Start};
+use solve::{ModelFit, Start};
 
 pub(crate) use scene::MAX_DIAMETER_PX;
 
@@ -26,10 +25,6 @@ pub(crate) use scene::MAX_DIAMETER_PX;
 /// poses.
 const MANY_SAMPLES: usize = 200;
 const SPARSE_STRIDE: usize = 3;
-/// Grey values above this are saturated: the light may be of any brightness.
-const MAX_GREY: f64 = 254.5;
-/// A root mean square residual above this, in units of the contrast, is not a marker's.
-const MAX_RESIDUAL: f64 = 0.2;
 /// Largest residual before each of the first steps: about a third above the largest of 800 markers in a
 /// thousand images. Nine of ten small candidates that are no marker, and half of the larger ones, end here.
 const EARLY_REJECT_RESIDUAL_SMALL: [f64; 3] = [0.27, 0.22, 0.17];
@@ -46,60 +41,6 @@ const MAX_ALTERNATIVE_COST: f64 = 4.0;
 const DISTINCT_TILT: f64 = 0.02;
 /// Above this ratio of costs on the sparse samples the better pose is certain.
 const CLOSE_COST: f64 = 1.15;
-
-/// A marker's model fitted to an image.
-#[derive(Copy, Clone, Debug)]
-pub(crate) struct PhotometricFit {
-    pub(crate) pose: CirclePose,
-    /// Covariance of the centre (m) and of the normal along [`CirclePose::basis`] (rad).
-    pub(crate) covariance: SMatrix<f64, 5, 5>,
-    /// Root mean square residual, in units of the contrast.
-    pub(crate) residual: f64,
-    /// The share of the variance inside the marker that the model explains.
-    pub(crate) r_squared: f64,
-    /// Squared residuals of free rings over those of a plain disc.
-    pub(crate) disc_ratio: f64,
-    /// Darkness of the middle ring in units of the outer one, each fitted on its own.
-    pub(crate) ring_balance: f64,
-    /// White minus black, in grey levels.
-    pub(crate) contrast: f64,
-    /// Standard deviation of the blur, in pixels.
-    pub(crate) blur_px: f64,
-}
-
-impl PhotometricFit {
-    /// Whether the rings are there: much closer to the image than a plain disc, with two equally dark rings.
-    pub(crate) fn has_rings(&self) -> bool {
-        const MAX_DISC_RATIO: f64 = 0.12;
-        self.disc_ratio < MAX_DISC_RATIO && (0.8..1.25).contains(&self.ring_balance)
-    }
-}
-
-/// The mirrored pose.
-#[derive(Copy, Clone, Debug)]
-pub(crate) struct Alternative {
-    pub(crate) pose: CirclePose,
-    /// As of [`PhotometricFit`].
-    pub(crate) residual: f64,
-    pub(crate) blur_px: f64,
-}
-
-/// The better of the two poses that fit, and the other one where it is distinct.
-#[derive(Copy, Clone, Debug)]
-pub(crate) struct PhotometricPoses {
-    pub(crate) best: PhotometricFit,
-    pub(crate) alternative: Option<Alternative>,
-}
-
-/// What is fitted, and where.
-#[derive(Copy, Clone)]
-pub(crate) struct PhotometricInput<'a> {
-    pub(crate) view: GrayView<'a>,
-    pub(crate) camera: &'a CameraModel,
-    /// The marker's size in metres.
-    pub(crate) size_m: f64,
-    pub(crate) white_on_black: bool,
-}
 
 impl PhotometricInput<'_> {
     /// Fits the marker from a start that is nearly right. `samples` is working memory.
@@ -238,7 +179,8 @@ fn sparse_stride(samples: &[PixelSample]) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use geometry::Pixel;
+    use geometry::{CameraModel, Pixel};
+    use imaging::GrayView;
     use nalgebra::Vector3;
 
     use super::solve::RingModel;

@@ -6,8 +6,7 @@ use geometry::{CameraModel, Pixel};
 use markers::RingKind;
 use nalgebra::Vector3;
 
-use super::PhotometricInput;
-use super::solve::{Effort, UNKNOWNS};
+use super::model::{Effort, PhotometricInput, UNKNOWNS};
 use crate::families::rings::circle_pose::{CirclePose, project};
 use crate::optics::edge_response::EdgeResponse;
 

@@ -2,9 +2,9 @@
 
 use nalgebra::{SMatrix, SVector};
 
+use super::model::{Alternative, MAX_GREY, PhotometricFit, UNKNOWNS, UNKNOWNS_WITH_MOTION};
 use super::scene::Scene;
-use super::solve::{ModelFit, RingModel, Sums, UNKNOWNS, UNKNOWNS_WITH_MOTION};
-use super::{Alternative, MAX_GREY, PhotometricFit};
+use super::solve::{ModelFit, RingModel, Sums};
 
 /// Prior standard deviation of the normal, in radians.
 const PRIOR_NORMAL: f64 = 0.6;

@@ -3,18 +3,14 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::blur::{Blur, PixelResponse, RadiusDistribution};
+use super::model::{Effort, MAX_GREY, MAX_RESIDUAL, UNKNOWNS, UNKNOWNS_WITH_MOTION};
 use super::scene::{FOCUSED_PX, PixelSample, Scene};
-use super::{MAX_GREY, MAX_RESIDUAL};
 use crate::families::rings::circle_pose::CirclePose;
 use crate::optics::exposure::ClippedExposure;
 use crate::optics::least_squares::{
     Damping, Influence, Next, NormalEquations, Problem, Schedule, huber, minimise,
 };
 
-/// Pose (5), blur, black, white, and the gradient of white to the right and down.
-pub(super) const UNKNOWNS: usize = 10;
-/// The same and the two numbers of the motion.
-pub(super) const UNKNOWNS_WITH_MOTION: usize = 12;
 /// Bounds of the blur in any direction, as a standard deviation in pixels.
 const MIN_BLUR_PX: f64 = 0.3;
 const MAX_BLUR_PX: f64 = 6.0;
@@ -24,38 +20,6 @@ const MAX_BLUR_STEP_PX: f64 = 0.3;
 const MAX_GAIN: f64 = 0.5;
 /// Added to the diagonal of the normal equations.
 const RIDGE: f64 = 1e-9;
-
-/// When a fit ends.
-#[derive(Copy, Clone, Debug)]
-pub(super) struct Effort {
-    /// The first steps may hardly improve anything.
-    min_steps: usize,
-    max_steps: usize,
-    /// Steps of a fit that starts from another one.
-    max_steps_from_other: usize,
-    /// After this many steps the Huber limit follows the residuals.
-    rough_steps: Option<usize>,
-    /// A step that lowers the cost by a smaller share is the last one.
-    min_gain: f64,
-}
-
-impl Effort {
-    pub(super) const FULL: Self = Self {
-        min_steps: 3,
-        max_steps: 22,
-        max_steps_from_other: 10,
-        rough_steps: Some(3),
-        min_gain: 3e-4,
-    };
-    /// For a tracked marker near its predicted pose.
-    pub(super) const TRACKED: Self = Self {
-        min_steps: 1,
-        max_steps: 6,
-        max_steps_from_other: 1,
-        rough_steps: None,
-        min_gain: 3e-2,
-    };
-}
 
 /// Everything that is fitted.
 #[derive(Copy, Clone, Debug)]

@@ -1,0 +1,102 @@
+//! What a photometric fit takes and returns, and its limits.
+
+use geometry::CameraModel;
+use imaging::GrayView;
+use nalgebra::SMatrix;
+
+use crate::families::rings::circle_pose::CirclePose;
+
+/// Grey values above this are saturated: the light may be of any brightness.
+pub(super) const MAX_GREY: f64 = 254.5;
+/// A root mean square residual above this, in units of the contrast, is not a marker's.
+pub(super) const MAX_RESIDUAL: f64 = 0.2;
+/// Pose (5), blur, black, white, and the gradient of white to the right and down.
+pub(super) const UNKNOWNS: usize = 10;
+/// The same and the two numbers of the motion.
+pub(super) const UNKNOWNS_WITH_MOTION: usize = 12;
+
+/// When a fit ends.
+#[derive(Copy, Clone, Debug)]
+pub(super) struct Effort {
+    /// The first steps may hardly improve anything.
+    pub(super) min_steps: usize,
+    pub(super) max_steps: usize,
+    /// Steps of a fit that starts from another one.
+    pub(super) max_steps_from_other: usize,
+    /// After this many steps the Huber limit follows the residuals.
+    pub(super) rough_steps: Option<usize>,
+    /// A step that lowers the cost by a smaller share is the last one.
+    pub(super) min_gain: f64,
+}
+
+impl Effort {
+    pub(super) const FULL: Self = Self {
+        min_steps: 3,
+        max_steps: 22,
+        max_steps_from_other: 10,
+        rough_steps: Some(3),
+        min_gain: 3e-4,
+    };
+    /// For a tracked marker near its predicted pose.
+    pub(super) const TRACKED: Self = Self {
+        min_steps: 1,
+        max_steps: 6,
+        max_steps_from_other: 1,
+        rough_steps: None,
+        min_gain: 3e-2,
+    };
+}
+
+/// A marker's model fitted to an image.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct PhotometricFit {
+    pub(crate) pose: CirclePose,
+    /// Covariance of the centre (m) and of the normal along [`CirclePose::basis`] (rad).
+    pub(crate) covariance: SMatrix<f64, 5, 5>,
+    /// Root mean square residual, in units of the contrast.
+    pub(crate) residual: f64,
+    /// The share of the variance inside the marker that the model explains.
+    pub(crate) r_squared: f64,
+    /// Squared residuals of free rings over those of a plain disc.
+    pub(crate) disc_ratio: f64,
+    /// Darkness of the middle ring in units of the outer one, each fitted on its own.
+    pub(crate) ring_balance: f64,
+    /// White minus black, in grey levels.
+    pub(crate) contrast: f64,
+    /// Standard deviation of the blur, in pixels.
+    pub(crate) blur_px: f64,
+}
+
+impl PhotometricFit {
+    /// Whether the rings are there: much closer to the image than a plain disc, with two equally dark rings.
+    pub(crate) fn has_rings(&self) -> bool {
+        const MAX_DISC_RATIO: f64 = 0.12;
+        self.disc_ratio < MAX_DISC_RATIO && (0.8..1.25).contains(&self.ring_balance)
+    }
+}
+
+/// The mirrored pose.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Alternative {
+    pub(crate) pose: CirclePose,
+    /// As of [`PhotometricFit`].
+    pub(crate) residual: f64,
+    pub(crate) blur_px: f64,
+}
+
+/// The better of the two poses that fit, and the other one where it is distinct.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct PhotometricPoses {
+    pub(crate) best: PhotometricFit,
+    pub(crate) alternative: Option<Alternative>,
+}
+
+/// What is fitted, and where.
+#[derive(Copy, Clone)]
+pub(crate) struct PhotometricInput<'a> {
+    pub(crate) view: GrayView<'a>,
+    pub(crate) camera: &'a CameraModel,
+    /// The marker's size in metres.
+    pub(crate) size_m: f64,
+    pub(crate) white_on_black: bool,
+}
