@@ -371,18 +371,25 @@ proptest! {
         steps in prop::collection::vec(step(), 1..400),
     ) {
         let mut bench = Bench::new(preferring(None, None));
+        // Those that may be there: heard of since they were last reported as gone.
+        let mut present = [false; NAMES.len()];
         for (wait_ms, what) in steps {
             bench.now_ns += wait_ms * MS;
             let now = bench.now_ns;
             match what {
                 Step::Received { who, stamp_ago_ms, seen } => {
+                    present[who] = true;
                     let sight = seen.then_some(Sight { position_m: Some([0.0, 0.0, 3.0]) });
                     bench.selection.received(now, NAMES[who], now - stamp_ago_ms * MS, sight);
                 }
-                Step::Presence { who, alive } => bench.selection.presence(now, NAMES[who], alive),
+                Step::Presence { who, alive } => {
+                    present[who] = alive;
+                    bench.selection.presence(now, NAMES[who], alive);
+                }
                 Step::Prefer { who } => drop(bench.selection.prefer(now, NAMES[who])),
                 Step::Place { ground } => {
                     let place = if ground { Place::Ground } else { Place::Onboard };
+                    present[who_of(place)] = true;
                     bench.selection.set_place(now, NAMES[who_of(place)], place);
                     bench.selection.prefer_place(now, place);
                 }
@@ -393,6 +400,7 @@ proptest! {
             prop_assert!(active.is_none_or(|name| bench.selection.knows(name)));
             let is_blind = bench.selection.is_blind();
             prop_assert!(!is_blind || bench.selection.candidates(now).iter().all(|c| !c.alive));
+            prop_assert!(is_blind || present.contains(&true), "all are gone");
         }
     }
 

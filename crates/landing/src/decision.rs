@@ -105,7 +105,7 @@ impl Phase {
         matches!(self, Self::Idle | Self::Landed | Self::Aborted | Self::PilotInCommand)
     }
 
-    /// A short name for machines, in kebab-case; it does not change between versions.
+    /// A short name for machines, in kebab-case.
     pub fn name(self) -> &'static str {
         match self {
             Self::Idle => "idle",
@@ -135,7 +135,7 @@ macro_rules! named {
         pub enum $name { $($(#[$variant_doc])* $variant,)* }
 
         impl $name {
-            /// A short name for machines, in kebab-case; it does not change between versions.
+            /// A short name for machines, in kebab-case.
             pub fn name(self) -> &'static str {
                 match self { $(Self::$variant => $key,)* }
             }

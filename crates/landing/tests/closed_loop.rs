@@ -270,6 +270,9 @@ fn land_is_asked_for_again_and_done_without_when_refused() {
     let pressed_s = flight.touchdown_s.unwrap().max(descends_s);
     let stopped_s = flight.disarm_s.unwrap();
     assert!(stopped_s - pressed_s < 6.0, "{} s", stopped_s - pressed_s);
+    // LAND is asked for during 5 s.
+    let stood_s = stopped_s - flight.touchdown_s.unwrap();
+    assert!(stood_s < 5.0 + 6.0, "{stood_s} s");
 }
 
 #[test]
