@@ -145,8 +145,11 @@ fn a_swap_that_fails_keeps_the_old_one_and_says_why(landing: &Landing) -> anyhow
         "'{ALIGHT}' detector --set id=blind --set 'markers=[\"apriltag-36h11:5:0.2\"]' --zenoh '{zenoh}'"
     );
     for (to, parts) in [
-        (blind.as_str(), &["main stays in use", "agrees in 0 of", "does not see the marker"][..]),
-        ("false", &["main stays in use", "the new detector ended"]),
+        (
+            blind.as_str(),
+            &["main stays in use", "agrees in only 0 of", "does not see the marker"][..],
+        ),
+        ("false", &["main stays in use", "the new detector exited"]),
         ("no-such-program --x", &["no-such-program"]),
         ("detector 'x", &["a quote is missing"]),
     ] {

@@ -189,12 +189,12 @@ async fn two_roles_meet_what_dies_comes_back_and_the_end_is_orderly() -> anyhow:
     kill_process(on_the_ground, Signal::KILL)?;
     change("ground", false).await?;
     change("ground", true).await?;
-    ground.says("detector", "again in").await?;
+    ground.says("detector", "restarting in").await?;
     processes.push(ground.process("detector").await?);
     kill_process(relay, Signal::KILL)?;
     change("ground", false).await?;
     change("ground", true).await?;
-    drone.says("relay", "again in").await?;
+    drone.says("relay", "restarting in").await?;
     processes.push(drone.process("relay").await?);
 
     // A detector that was swapped stays stopped while its replacement runs, and no longer.
