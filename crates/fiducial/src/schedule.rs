@@ -2,7 +2,8 @@
 //!
 //! Fallback passes find markers that are occluded, cut by the frame, or far away; each takes about as long as the rest of
 //! a detection. They run in images in which nothing else was found. In a stream of images without markers they take turns,
-//! one in each image, in the order of [`FallbackPass::ALL`]; in one image they run in the order of [`FallbackStep::ALL`].
+//! one in each image, in the order of [`FallbackPass::ALL`]; in one image they run in the order of
+//! `FallbackStep::ALL`.
 //!
 //! | pass | finds | families |
 //! |---|---|---|
