@@ -1,6 +1,6 @@
 //! The estimator: where the landing point is, how it moves, and how well that is known.
 //!
-//! It runs the [`filter`](crate::filter) in the odometry frame, the autopilot's local frame without its jumps
+//! It runs the `filter` in the odometry frame, the autopilot's local frame without its jumps
 //! ([`crate::history::Motion::odometry`]). There the autopilot's motion needs no integration between
 //! detections, and the filter estimates what velocity setpoints act on: in 160 recorded flights of ArduPilot
 //! the reported position moved against the truth by 0.010 m over 2 s, the sum of the reported velocity by
