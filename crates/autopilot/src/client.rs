@@ -28,7 +28,7 @@ use crate::stream::{Stream, Streams};
 use crate::text::Joiner;
 
 /// The component id of every autopilot.
-const AUTOPILOT: u8 = 1;
+pub const AUTOPILOT: u8 = 1;
 /// Maximum number of events and packets that wait; the oldest are dropped.
 const MAX_QUEUED: usize = 1024;
 /// Maximum number of finished commands whose outcome is kept.
@@ -255,6 +255,29 @@ impl Autopilot {
     /// The state of a parameter of [`Config::parameters`].
     pub fn parameter(&self, name: &str) -> Parameter {
         self.parameters.get(name)
+    }
+
+    /// Reads more parameters than [`Config::parameters`], as the firmware decides which there are.
+    pub fn read_parameters(&mut self, names: &[&'static str]) {
+        self.parameters.add(names);
+    }
+
+    /// Sets a parameter that is read, which must be a 32-bit float; it is sent again until the
+    /// autopilot reports the value, a bounded number of times.
+    pub fn set_parameter(&mut self, name: &str, value: f64) {
+        self.parameters.set(name, value);
+    }
+
+    /// True while a parameter is being set.
+    pub fn is_setting(&self, name: &str) -> bool {
+        self.parameters.is_setting(name)
+    }
+
+    /// Sends a velocity of zero to a vehicle of which only the system id is known, before its heartbeat says
+    /// more: outside of GUIDED or OFFBOARD an autopilot ignores it.
+    pub fn send_stop(&mut self, now_ns: i64, system: u8) {
+        let target = Sender { system, component: AUTOPILOT };
+        self.send(&compose::velocity((now_ns / 1_000_000) as u32, Vector::zero(), 0.0, target));
     }
 
     /// The shortest round trip to the autopilot; `None` while its clock is not known and measurements are

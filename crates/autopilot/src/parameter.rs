@@ -1,11 +1,14 @@
-//! Reads parameters of the autopilot, one after the other, with a bounded number of requests; never writes
-//! them.
+//! Reads parameters of the autopilot and sets them, one after the other, with a bounded number of requests.
 
-use crate::dialect::{MavMessage, MavParamType, PARAM_REQUEST_READ_DATA, PARAM_VALUE_DATA};
+use crate::dialect::{
+    MavMessage, MavParamType, PARAM_REQUEST_READ_DATA, PARAM_SET_DATA, PARAM_VALUE_DATA,
+};
 use crate::mode::Firmware;
 
 /// Timeout of a reply, in nanoseconds.
 const REPLY_TIMEOUT_NS: i64 = 500_000_000;
+/// Maximum number of parameters that are read.
+const MAX_PARAMETERS: usize = 64;
 /// Maximum number of requests for each parameter.
 const ATTEMPTS: u32 = 6;
 
@@ -20,6 +23,9 @@ pub enum Parameter {
     Value(f64),
 }
 
+/// Relative difference up to which a value is the one that was set: the link carries 32-bit floats.
+const TOLERANCE: f64 = 1e-5;
+
 /// The requested parameters.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Parameters {
@@ -32,12 +38,51 @@ struct Wanted {
     name: &'static str,
     attempts: u32,
     value: Option<f64>,
+    /// The value to set, until the autopilot reports it or the attempts are used up.
+    set: Option<f64>,
+}
+
+impl Wanted {
+    fn new(name: &'static str) -> Self {
+        Self { name, attempts: 0, value: None, set: None }
+    }
+
+    fn is_pending(&self) -> bool {
+        self.attempts <= ATTEMPTS && (self.value.is_none() || self.set.is_some())
+    }
+
+    fn request(&self, system: u8, component: u8) -> MavMessage {
+        match self.set {
+            Some(value) => MavMessage::PARAM_SET(PARAM_SET_DATA {
+                param_value: value as f32,
+                target_system: system,
+                target_component: component,
+                param_id: self.name.into(),
+                param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
+            }),
+            None => MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
+                param_index: -1,
+                target_system: system,
+                target_component: component,
+                param_id: self.name.into(),
+            }),
+        }
+    }
 }
 
 impl Parameters {
     pub(crate) fn new(names: &[&'static str]) -> Self {
-        let wanted = |name: &&'static str| Wanted { name, attempts: 0, value: None };
-        Self { list: names.iter().map(wanted).collect(), due_ns: i64::MIN }
+        Self { list: names.iter().map(|name| Wanted::new(name)).collect(), due_ns: i64::MIN }
+    }
+
+    /// Adds parameters to read; those that are known already stay as they are.
+    pub(crate) fn add(&mut self, names: &[&'static str]) {
+        for name in names {
+            if self.list.len() < MAX_PARAMETERS && self.list.iter().all(|known| known.name != *name)
+            {
+                self.list.push(Wanted::new(name));
+            }
+        }
     }
 
     /// Requests everything again.
@@ -54,24 +99,43 @@ impl Parameters {
         }
     }
 
+    /// Sets one of the parameters that are read; it must be a 32-bit float. Until the autopilot reports the
+    /// value it is sent again, a bounded number of times.
+    pub(crate) fn set(&mut self, name: &str, value: f64) {
+        if let Some(wanted) = self.list.iter_mut().find(|wanted| wanted.name == name)
+            && wanted.set.is_none_or(|set| !is_same(set, value))
+        {
+            wanted.set = Some(value);
+            wanted.attempts = 0;
+            self.due_ns = i64::MIN;
+        }
+    }
+
+    /// True while a value is being set.
+    pub(crate) fn is_setting(&self, name: &str) -> bool {
+        let is_it = |wanted: &&Wanted| wanted.name == name;
+        self.list
+            .iter()
+            .find(is_it)
+            .is_some_and(|wanted| wanted.set.is_some() && wanted.is_pending())
+    }
+
     /// The next request, if one is due.
     pub(crate) fn request(&mut self, now_ns: i64, system: u8, component: u8) -> Option<MavMessage> {
         if now_ns < self.due_ns {
             return None;
         }
-        let waits = |wanted: &&mut Wanted| wanted.value.is_none() && wanted.attempts <= ATTEMPTS;
-        // The one with the fewest requests, so that a silent one does not delay the others.
-        let wanted = self.list.iter_mut().filter(waits).min_by_key(|wanted| wanted.attempts)?;
+        // A value to set comes first; then the one with the fewest requests, so that a silent one does not
+        // delay the others.
+        let pending = self.list.iter_mut().filter(|wanted| wanted.is_pending());
+        let wanted = pending.min_by_key(|wanted| (wanted.set.is_none(), wanted.attempts))?;
         wanted.attempts += 1;
         self.due_ns = now_ns.saturating_add(REPLY_TIMEOUT_NS);
-        (wanted.attempts <= ATTEMPTS).then(|| {
-            MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
-                param_index: -1,
-                target_system: system,
-                target_component: component,
-                param_id: wanted.name.into(),
-            })
-        })
+        if wanted.attempts > ATTEMPTS {
+            wanted.set = None;
+            return None;
+        }
+        Some(wanted.request(system, component))
     }
 
     /// Handles a value, whoever requested it.
@@ -86,9 +150,14 @@ impl Parameters {
         };
         if value.is_finite() {
             wanted.value = Some(value);
+            wanted.set = wanted.set.filter(|set| !is_same(*set, value));
             self.due_ns = i64::MIN;
         }
     }
+}
+
+fn is_same(a: f64, b: f64) -> bool {
+    (a - b).abs() <= TOLERANCE * a.abs().max(b.abs())
 }
 
 #[cfg(test)]
@@ -134,5 +203,34 @@ mod tests {
         let integer = value("PLD_SRCH_TOUT", f32::from_bits(7), MavParamType::MAV_PARAM_TYPE_INT32);
         parameters.take(Firmware::Px4, &integer);
         assert_eq!(parameters.get("PLD_SRCH_TOUT"), Parameter::Value(7.0));
+    }
+
+    #[test]
+    fn a_value_is_set_until_it_is_reported_and_not_for_ever() {
+        let mut parameters = Parameters::new(&["GUID_TIMEOUT"]);
+        let real = |x| value("GUID_TIMEOUT", x, MavParamType::MAV_PARAM_TYPE_REAL32);
+        parameters.take(Firmware::Copter, &real(3.0));
+        parameters.set("GUID_TIMEOUT", 0.5);
+        parameters.set("OTHER", 0.5);
+        let Some(MavMessage::PARAM_SET(set)) = parameters.request(0, 1, 1) else { panic!() };
+        assert_eq!((set.param_value, set.param_id.to_str()), (0.5, Ok("GUID_TIMEOUT")));
+        // A report of the old value, as after a lost packet, does not end it; the new one does.
+        parameters.take(Firmware::Copter, &real(3.0));
+        assert!(parameters.is_setting("GUID_TIMEOUT"));
+        parameters.take(Firmware::Copter, &real(0.5));
+        assert!(!parameters.is_setting("GUID_TIMEOUT"));
+        assert_eq!(parameters.get("GUID_TIMEOUT"), Parameter::Value(0.5));
+        // An autopilot that refuses reports the old value again and again.
+        parameters.set("GUID_TIMEOUT", 0.2);
+        let mut sent = 0;
+        for now_ns in (0..20_000_000_000).step_by(100_000_000) {
+            if parameters.request(now_ns, 1, 1).is_some() {
+                sent += 1;
+                parameters.take(Firmware::Copter, &real(0.5));
+            }
+        }
+        assert_eq!(sent, ATTEMPTS as usize);
+        assert!(!parameters.is_setting("GUID_TIMEOUT"));
+        assert_eq!(parameters.get("GUID_TIMEOUT"), Parameter::Value(0.5));
     }
 }
