@@ -207,7 +207,8 @@ impl SimulatedAutopilot {
                 self.flight.follow(due_s, setpoint);
             }
         }
-        if self.is_px4() && self.px4.has_lost_setpoints(now_s) {
+        let timeout_s = self.parameters.get(Parameter::OffboardLoss);
+        if self.is_px4() && self.px4.has_lost_setpoints(now_s, timeout_s) {
             self.flight.set_mode(now_s, Mode::Loiter, &self.estimate);
         }
         let demand = self.flight.step(now_s, dt_s, &self.estimate, truth, &self.parameters);

@@ -1,4 +1,5 @@
-//! The few parameters that the simulated autopilot obeys, under ArduPilot's names, units and defaults.
+//! The few parameters that the simulated autopilot obeys, under the names, units and defaults of ArduPilot, and
+//! one of PX4.
 
 use autopilot::dialect::MavParamType;
 
@@ -9,6 +10,8 @@ pub enum Parameter {
     DisarmDelay,
     /// Seconds without a setpoint until the vehicle brakes.
     GuidedTimeout,
+    /// PX4's seconds without a setpoint until it leaves OFFBOARD.
+    OffboardLoss,
     /// Height below which LAND descends slowly, in cm.
     LandAltLow,
     /// Final speed of LAND, in cm/s.
@@ -44,9 +47,10 @@ const REAL: MavParamType = MavParamType::MAV_PARAM_TYPE_REAL32;
 const INT8: MavParamType = MavParamType::MAV_PARAM_TYPE_INT8;
 const INT16: MavParamType = MavParamType::MAV_PARAM_TYPE_INT16;
 
-const TABLE: [Row; 15] = [
+const TABLE: [Row; 16] = [
     (Parameter::DisarmDelay, "DISARM_DELAY", INT8, 10.0, 0.0, 127.0),
     (Parameter::GuidedTimeout, "GUID_TIMEOUT", REAL, 3.0, 0.1, 5.0),
+    (Parameter::OffboardLoss, "COM_OF_LOSS_T", REAL, 1.0, 0.0, 60.0),
     (Parameter::LandAltLow, "LAND_ALT_LOW", INT16, 1000.0, 100.0, 10_000.0),
     (Parameter::LandSpeed, "LAND_SPEED", INT16, 50.0, 30.0, 200.0),
     (Parameter::LandSpeedHigh, "LAND_SPEED_HIGH", INT16, 0.0, 0.0, 500.0),

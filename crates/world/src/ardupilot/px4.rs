@@ -8,8 +8,6 @@ use autopilot::dialect::{ESTIMATOR_STATUS_DATA, EstimatorStatusFlags, MavMessage
 
 use super::flight::{Landed, Mode};
 
-/// COM_OF_LOSS_T, in seconds.
-const LOSS_S: f64 = 1.0;
 /// Minimum time for which setpoints must have arrived at 2 Hz or more, in seconds.
 const STREAM_S: f64 = 1.0;
 const STREAM_GAP_S: f64 = 0.5;
@@ -54,9 +52,10 @@ impl Px4 {
         self.offboard
     }
 
-    /// True when the setpoints of OFFBOARD have just been missed for too long.
-    pub(super) fn has_lost_setpoints(&mut self, now_s: f64) -> bool {
-        let lost = self.offboard && self.stream.is_none_or(|(_, last_s)| now_s - last_s > LOSS_S);
+    /// True when the setpoints of OFFBOARD have just been missed for longer than `timeout_s`.
+    pub(super) fn has_lost_setpoints(&mut self, now_s: f64, timeout_s: f64) -> bool {
+        let lost =
+            self.offboard && self.stream.is_none_or(|(_, last_s)| now_s - last_s > timeout_s);
         self.offboard &= !lost;
         lost
     }
@@ -97,8 +96,8 @@ mod tests {
         }
         assert_eq!(px4.request(1.15, 6, 0), Some(Mode::Guided));
         assert_eq!(px4.shown(Mode::Guided, Landed::InAir), FlightMode::OFFBOARD);
-        assert!(!px4.has_lost_setpoints(2.0));
-        assert!(px4.has_lost_setpoints(2.2), "its failsafe");
+        assert!(!px4.has_lost_setpoints(2.0, 1.0));
+        assert!(px4.has_lost_setpoints(2.2, 1.0), "its failsafe");
         assert_eq!(px4.shown(Mode::Loiter, Landed::InAir), FlightMode::AUTO_HOLD);
         px4.on_setpoint(5.0);
         assert_eq!(px4.request(5.1, 6, 0), None, "a gap begins anew");
