@@ -305,9 +305,9 @@ settings! {
         /// Age of the newest detection beyond which the descent stops, in s, except low over a well-known
         /// target (`blind_height_m`).
         stale_target_s: f64 = 0.7, 0.1..=5.0;
-        /// If setpoints stop, the vehicle must not reach the ground faster than `touchdown_descend_m_s`
-        /// within this time, in s.
-        setpoint_loss_s: f64 = 2.0, 0.1..=10.0;
+        /// Time for which the autopilot is assumed to follow the last setpoint where it does not say so, in s.
+        /// The descent is so slow that the vehicle, should setpoints stop, still brakes before the ground.
+        setpoint_loss_s: f64 = 3.0, 0.1..=60.0;
         /// Height over the target at which LAND takes over, in m.
         land_height_m: f64 = 0.05, 0.02..=5.0;
         /// Height of the body's origin over the pad when the vehicle stands on it, in m.

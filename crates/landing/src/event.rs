@@ -20,6 +20,8 @@ pub enum Event {
     Operator(OperatorCommand),
     /// A limit was reached.
     Alarm(Alarm),
+    /// How the autopilot follows setpoints has become known.
+    Limits(AutopilotLimits),
     /// Time has passed.
     Tick,
 }
@@ -48,6 +50,54 @@ pub enum Alarm {
     OperatorLost,
     /// The link to the autopilot is lost.
     AutopilotLost,
+}
+
+/// How the autopilot follows velocity setpoints. The defaults are those of ArduPilot Copter 4.5.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct AutopilotLimits {
+    /// Time for which it follows the last setpoint before it stops, in s (ArduPilot's GUID_TIMEOUT, PX4's
+    /// COM_OF_LOSS_T); `None` while it is not known.
+    pub setpoint_timeout_s: Option<f64>,
+    /// Maximum horizontal acceleration, in m/s^2 (WPNAV_ACCEL).
+    pub acceleration_m_s2: f64,
+    /// Maximum horizontal jerk, in m/s^3 (PSC_JERK_XY).
+    pub jerk_m_s3: f64,
+    /// Maximum vertical acceleration, in m/s^2 (WPNAV_ACCEL_Z).
+    pub vertical_acceleration_m_s2: f64,
+}
+
+impl Default for AutopilotLimits {
+    fn default() -> Self {
+        Self {
+            setpoint_timeout_s: None,
+            acceleration_m_s2: 2.5,
+            jerk_m_s3: 5.0,
+            vertical_acceleration_m_s2: 1.0,
+        }
+    }
+}
+
+impl AutopilotLimits {
+    /// Smallest and largest value that is believed of each limit; ArduPilot's own ranges are narrower.
+    const BELIEVED: std::ops::RangeInclusive<f64> = 0.05..=60.0;
+
+    /// The limits, with the defaults in place of values that no vehicle has.
+    #[must_use]
+    pub fn plausible(self) -> Self {
+        let or = |value: f64, default: f64| {
+            if Self::BELIEVED.contains(&value) { value } else { default }
+        };
+        let default = Self::default();
+        Self {
+            setpoint_timeout_s: self.setpoint_timeout_s.filter(|s| (0.0..=3600.0).contains(s)),
+            acceleration_m_s2: or(self.acceleration_m_s2, default.acceleration_m_s2),
+            jerk_m_s3: or(self.jerk_m_s3, default.jerk_m_s3),
+            vertical_acceleration_m_s2: or(
+                self.vertical_acceleration_m_s2,
+                default.vertical_acceleration_m_s2,
+            ),
+        }
+    }
 }
 
 /// The vehicle as the autopilot estimates it at one moment.

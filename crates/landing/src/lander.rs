@@ -7,7 +7,9 @@ use crate::config::{AlarmAction, Config, GuidanceConfig, OnAbort, PhaseConfig};
 use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 use crate::envelope;
 use crate::estimator::Estimator;
-use crate::event::{Alarm, Event, FrameObservation, Landed, MarkerInFrame, Mode, VehicleState};
+use crate::event::{
+    Alarm, AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, VehicleState,
+};
 use crate::guidance::ActiveGuidance;
 use crate::guidance::situation::{Progress, Situation};
 use crate::history::History;
@@ -52,6 +54,8 @@ pub struct Lander {
     half_view_rad: Option<f64>,
     /// The expanding square that is being flown.
     square: Option<Square>,
+    /// How the autopilot follows setpoints.
+    limits: AutopilotLimits,
 }
 
 /// An expanding square that is being flown.
@@ -100,6 +104,7 @@ impl Lander {
             retry_to_m: None,
             half_view_rad: None,
             square: None,
+            limits: AutopilotLimits::default(),
         })
     }
 
@@ -110,6 +115,10 @@ impl Lander {
         let result = match event {
             Event::Vehicle(state) => self.vehicle(now, state),
             Event::Frame(frame) => self.frame(now, &frame),
+            Event::Limits(limits) => {
+                self.limits = limits.plausible();
+                Ok(())
+            }
             Event::Operator(_) | Event::Alarm(_) | Event::Tick => Ok(()),
         };
         let operator = if let Event::Operator(command) = event { Some(command) } else { None };
@@ -325,6 +334,7 @@ impl Lander {
             half_view_rad: self.half_view_rad,
             pad_moves: self.pad_moves(),
             pad_heave_m_s: self.config.estimator.pad_heave_m_s,
+            limits: self.limits,
         }
     }
 

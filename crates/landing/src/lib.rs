@@ -44,7 +44,8 @@ pub use config::{
 };
 pub use decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 pub use event::{
-    Alarm, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand, VehicleState,
+    Alarm, AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
+    VehicleState,
 };
 pub use lander::Lander;
 pub use limits::ConfigError;

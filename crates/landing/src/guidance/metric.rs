@@ -39,7 +39,7 @@ use geometry::{Ned, Point, Vector};
 use crate::config::MetricConfig;
 use crate::decision::{Reason, TargetEstimate};
 use crate::guidance::observer::{Observer, horizontal, limited};
-use crate::guidance::path::{JERK, PATH_TIME_S};
+use crate::guidance::path::time_constant_s;
 use crate::guidance::situation::{Guidance, Progress, Situation};
 use crate::time::Timestamp;
 
@@ -100,6 +100,9 @@ const STANDING_S: [f64; 2] = [0.4, 0.9];
 /// which the allowed deviation grows there.
 const NEAR_M: f64 = 0.3;
 const COMMITTED: f64 = 1.5;
+
+/// Share of the autopilot's vertical acceleration with which it is expected to brake when setpoints stop.
+const UNATTENDED_BRAKING: f64 = 0.9;
 
 /// Longest interval between two steps that is counted, in seconds.
 const MAX_STEP_S: f64 = 0.1;
@@ -373,8 +376,9 @@ impl Metric {
             - observer.acceleration * (0.5 * lead_s.powi(2));
         // While the autopilot reduces its acceleration, within its jerk, the speed still grows.
         let fading = observer.path.acceleration();
-        let closing =
-            closing + observer.acceleration * lead_s + fading * (fading.norm() / (2.0 * JERK));
+        let closing = closing
+            + observer.acceleration * lead_s
+            + fading * (fading.norm() / (2.0 * situation.limits.jerk_m_s3));
         let left_m = left.norm();
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
         let speed_m_s = (config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
@@ -382,7 +386,7 @@ impl Metric {
         let acceleration =
             limited((wanted - closing) * config.velocity_gain, config.lateral_acceleration_m_s2);
         limited(
-            observer.path.velocity() + acceleration * PATH_TIME_S,
+            observer.path.velocity() + acceleration * time_constant_s(&situation.limits),
             config.max_lateral_m_s + config.max_pad_m_s,
         )
     }
@@ -424,9 +428,23 @@ impl Metric {
         let min_m_s = MIN_TOUCHDOWN_M_S.min(config.touchdown_descend_m_s);
         let end_m_s = (config.touchdown_descend_m_s - 0.5 * situation.pad_heave_m_s).max(min_m_s);
         let braking = end_m_s.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);
-        let unattended_m_s = (height_m / config.setpoint_loss_s).max(end_m_s);
+        let unattended_m_s = self.unattended_m_s(situation, height_m, end_m_s);
         let max_m_s = braking.sqrt().min(unattended_m_s).min(config.max_descend_m_s);
         (max_m_s * centred * fresh, why)
+    }
+
+    /// The fastest descent from which the vehicle, should no setpoint follow, reaches the ground no faster than
+    /// `end_m_s`: for the autopilot's setpoint timeout it goes on as it is, then it brakes.
+    fn unattended_m_s(&self, situation: &Situation<'_>, height_m: f64, end_m_s: f64) -> f64 {
+        let limits = &situation.limits;
+        let timeout_s = limits.setpoint_timeout_s.unwrap_or(self.config.setpoint_loss_s);
+        let braking_m_s2 = UNATTENDED_BRAKING * limits.vertical_acceleration_m_s2;
+        // Solves speed * delay + (speed^2 - end^2) / (2 * braking) = height.
+        let delay_m_s = braking_m_s2 * (timeout_s + self.config.descend_lag_s);
+        let end = end_m_s.powi(2);
+        let speed_m_s =
+            (delay_m_s.powi(2) + end + 2.0 * braking_m_s2 * height_m.max(0.0)).sqrt() - delay_m_s;
+        speed_m_s.max(end_m_s)
     }
 
     /// From 1 for a fresh target to 0 for a stale one; 1 low above a well-known target.

@@ -75,7 +75,7 @@ impl Observer {
                 + (acceleration - self.acceleration) * (gap_s / (ACCELERATION_S + gap_s));
             self.observe_bias(config, situation.vehicle, gap_s);
         }
-        self.path.advance(step_s, self.setpoint);
+        self.path.advance(step_s, self.setpoint, &situation.limits);
         // The tilt that does not accelerate the vehicle along its path holds it against the wind.
         let against_wind = tilt(situation) + self.path.acceleration() * (1.0 / GRAVITY);
         self.tilt = self.tilt + (against_wind - self.tilt) * (step_s / TILT_S).min(1.0);

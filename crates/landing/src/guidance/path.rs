@@ -7,18 +7,18 @@
 use geometry::{Ned, Vector};
 use nalgebra::Vector2;
 
+use crate::event::AutopilotLimits;
+
 /// The path is computed in steps of this length, in seconds.
 const STEP_S: f64 = 0.005;
 /// From a setpoint to its effect, in seconds: half of the interval at which they are sent, and the link.
 const SETPOINT_LAG_S: f64 = 0.06;
-/// Limits of the path: WPNAV_ACCEL in m/s^2 and PSC_JERK_XY in m/s^3.
-const ACCELERATION: f64 = 2.5;
-pub(super) const JERK: f64 = 5.0;
+type Level = Vector2<f64>;
 
 /// Time constant with which the path goes towards a setpoint, in seconds.
-pub(super) const PATH_TIME_S: f64 = ACCELERATION / JERK;
-
-type Level = Vector2<f64>;
+pub(super) fn time_constant_s(limits: &AutopilotLimits) -> f64 {
+    limits.acceleration_m_s2 / limits.jerk_m_s3
+}
 
 /// The autopilot's path.
 #[derive(Copy, Clone, Debug)]
@@ -46,15 +46,16 @@ impl Path {
         Vector::new(self.acceleration.x, self.acceleration.y, 0.0)
     }
 
-    /// Advances the path by `dt_s` towards this setpoint.
-    pub(super) fn advance(&mut self, dt_s: f64, setpoint: Vector<Ned>) {
+    /// Advances the path by `dt_s` towards this setpoint, within the autopilot's limits.
+    pub(super) fn advance(&mut self, dt_s: f64, setpoint: Vector<Ned>, limits: &AutopilotLimits) {
         let setpoint = Level::new(setpoint.x(), setpoint.y());
         self.remainder_s += dt_s;
         while self.remainder_s >= STEP_S {
             self.remainder_s -= STEP_S;
             self.setpoint += (setpoint - self.setpoint) * (STEP_S / SETPOINT_LAG_S);
-            let wanted = limited((self.setpoint - self.velocity) / PATH_TIME_S, ACCELERATION);
-            self.acceleration += limited(wanted - self.acceleration, JERK * STEP_S);
+            let wanted = (self.setpoint - self.velocity) / time_constant_s(limits);
+            let wanted = limited(wanted, limits.acceleration_m_s2);
+            self.acceleration += limited(wanted - self.acceleration, limits.jerk_m_s3 * STEP_S);
             self.velocity += self.acceleration * STEP_S;
         }
     }
@@ -74,7 +75,7 @@ mod tests {
         let mut path = Path::new(Vector::zero());
         (1..1000)
             .find_map(|i| {
-                path.advance(0.01, Vector::new(size, 0.0, 0.0));
+                path.advance(0.01, Vector::new(size, 0.0, 0.0), &AutopilotLimits::default());
                 (path.velocity().x() >= part * size).then_some(f64::from(i) * 0.01)
             })
             .unwrap_or(f64::NAN)
@@ -93,12 +94,13 @@ mod tests {
     fn a_steady_motion_goes_on_and_limits_hold() {
         let steady = Vector::new(0.4, -0.2, 0.0);
         let mut path = Path::new(steady);
-        path.advance(5.0, steady);
+        let limits = AutopilotLimits::default();
+        path.advance(5.0, steady, &limits);
         assert!((path.velocity() - steady).norm() < 1e-9);
         let mut before = path.velocity();
         for _ in 0..1200 {
-            path.advance(STEP_S, Vector::new(-5.0, 5.0, 0.0));
-            assert!((path.velocity() - before).norm() <= 1.01 * ACCELERATION * STEP_S);
+            path.advance(STEP_S, Vector::new(-5.0, 5.0, 0.0), &limits);
+            assert!((path.velocity() - before).norm() <= 1.01 * limits.acceleration_m_s2 * STEP_S);
             before = path.velocity();
         }
         assert!((path.velocity() - Vector::new(-5.0, 5.0, 0.0)).norm() < 0.5);

@@ -3,7 +3,7 @@
 use geometry::{Ned, Vector};
 
 use crate::decision::{Reason, TargetEstimate};
-use crate::event::{FrameObservation, VehicleState};
+use crate::event::{AutopilotLimits, FrameObservation, VehicleState};
 use crate::time::Timestamp;
 
 /// The input of a guidance.
@@ -23,6 +23,8 @@ pub struct Situation<'a> {
     pub pad_moves: bool,
     /// Maximum heave speed of the pad, in m/s.
     pub pad_heave_m_s: f64,
+    /// How the autopilot follows setpoints.
+    pub limits: AutopilotLimits,
 }
 
 /// The progress of a guidance.

@@ -12,8 +12,8 @@ use std::collections::VecDeque;
 
 use geometry::{Ned, Point};
 use landing::{
-    Action, Config, Decision, Event, Landed, Lander, Mode, OperatorCommand, Phase, Timestamp,
-    VehicleState,
+    Action, AutopilotLimits, Config, Decision, Event, Landed, Lander, Mode, OperatorCommand, Phase,
+    Timestamp, VehicleState,
 };
 use world::ardupilot::{self, EstimateConfig};
 use world::camera::CameraFaults;
@@ -56,8 +56,22 @@ pub(crate) struct Scene {
     pub(crate) refuses_land: bool,
     /// The pilot takes over at this time.
     pub(crate) pilot_s: Option<f64>,
+    /// The lander falls silent in the descent.
+    pub(crate) silence: Option<Silence>,
+    /// The autopilot's setpoint timeout, in seconds, and whether the lander knows it.
+    pub(crate) setpoint_timeout_s: f64,
+    pub(crate) is_timeout_known: bool,
     /// Maximum duration, in seconds.
     pub(crate) limit_s: f64,
+}
+
+/// A lander that neither gets nor sends anything, as one that is killed or stopped.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Silence {
+    /// Height over the pad at which it begins, in metres.
+    pub(crate) below_m: f64,
+    /// Its duration, in seconds.
+    pub(crate) for_s: f64,
 }
 
 /// What happened at one time.
@@ -124,6 +138,9 @@ impl Scene {
             commands: vec![(0.0, OperatorCommand::Start)],
             refuses_land: false,
             pilot_s: None,
+            silence: None,
+            setpoint_timeout_s: 0.5,
+            is_timeout_known: true,
             limit_s: 120.0,
         }
     }
@@ -163,11 +180,17 @@ impl Scene {
         let mut flight = Flight::new();
         let Ok(mut lander) = Lander::new(self.config) else { return flight };
         let mut run = Run::new(&self);
+        if self.is_timeout_known {
+            let setpoint_timeout_s = Some(self.setpoint_timeout_s);
+            let limits = AutopilotLimits { setpoint_timeout_s, ..AutopilotLimits::default() };
+            lander.step(Timestamp::from_seconds(run.seconds()), Event::Limits(limits));
+        }
         let mut step = 0u32;
         while run.seconds() < self.limit_s {
             let before = run.world.truth();
             run.advance();
-            for event in run.events(step) {
+            let is_silent = run.is_silent();
+            for event in run.events(step).into_iter().filter(|_| !is_silent) {
                 let decision = lander.step(Timestamp::from_seconds(run.seconds()), event);
                 run.obey(decision, matches!(event, Event::Frame(_)));
                 flight.note(&run, decision);
@@ -259,17 +282,23 @@ struct Run<'a> {
     eyes: Eyes,
     commands: VecDeque<(f64, OperatorCommand)>,
     sent_s: f64,
+    /// When the silence began.
+    silent_s: Option<f64>,
 }
 
 impl<'a> Run<'a> {
     fn new(scene: &'a Scene) -> Self {
-        let mut world = World::new(&scene.world, scene.seed);
+        let mut config = scene.world.clone();
+        let timeout = ("GUID_TIMEOUT".to_owned(), scene.setpoint_timeout_s as f32);
+        config.autopilot.parameters.push(timeout);
+        let mut world = World::new(&config, scene.seed);
         world.begin();
         Self {
             start_s: world.now_s(),
             eyes: Eyes::new(scene),
             commands: scene.commands.iter().copied().collect(),
             sent_s: f64::NEG_INFINITY,
+            silent_s: None,
             world,
             scene,
         }
@@ -285,6 +314,16 @@ impl<'a> Run<'a> {
             self.set_mode(ardupilot::Mode::Loiter);
         }
         self.eyes.look(self.scene, &self.world, self.seconds());
+    }
+
+    fn is_silent(&mut self) -> bool {
+        let Some(silence) = self.scene.silence else { return false };
+        let pad = self.world.pad_at(self.world.now_s());
+        let height_m = pad.position.z() - self.world.truth().position.z();
+        if height_m <= silence.below_m && !self.world.truth().on_ground {
+            self.silent_s.get_or_insert(self.seconds());
+        }
+        self.silent_s.is_some_and(|since_s| self.seconds() < since_s + silence.for_s)
     }
 
     fn set_mode(&mut self, mode: ardupilot::Mode) {

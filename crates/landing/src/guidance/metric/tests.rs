@@ -110,6 +110,7 @@ fn situation(vehicle: &VehicleState) -> Situation<'_> {
         half_view_rad: None,
         pad_moves: false,
         pad_heave_m_s: 0.0,
+        limits: crate::event::AutopilotLimits::default(),
     }
 }
 

@@ -1,0 +1,78 @@
+//! A lander that falls silent at any height, for ever or for a while: how the vehicle touches the ground then.
+
+mod scene;
+
+use scene::{Flight, Scene, Silence};
+
+/// Heights over the pad at which the silence begins, in metres.
+const HEIGHTS_M: [f64; 9] = [0.3, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0];
+
+/// Hardest touchdown that is safe, downwards and sideways, in m/s.
+const MAX_SINK_M_S: f64 = 0.8;
+const MAX_SLIDE_M_S: f64 = 0.3;
+
+/// A flight in the wind of this speed whose lander falls silent.
+fn silent(seed: u64, wind_m_s: f64, silence: Silence) -> Scene {
+    let scene = if wind_m_s > 0.0 { Scene::windy(seed, wind_m_s, 1.0) } else { Scene::new(seed) };
+    scene.with(|scene| {
+        scene.silence = Some(silence);
+        scene.limit_s = if silence.for_s.is_finite() { 120.0 } else { 40.0 };
+    })
+}
+
+/// The hardest touchdowns of some flights, in m/s: downwards and sideways; zero without one.
+fn worst(flights: impl Iterator<Item = Flight>) -> [f64; 2] {
+    flights.filter_map(|flight| flight.touchdown).fold([0.0, 0.0], |[sink, slide], touchdown| {
+        [touchdown.sink_m_s.max(sink), touchdown.slide_m_s.max(slide)]
+    })
+}
+
+/// The worst touchdown for each height, as a table; fails when one is unsafe.
+fn check(winds_m_s: &[f64], durations_s: &[f64], change: impl Fn(&mut Scene)) {
+    let mut table = String::new();
+    let mut is_safe = true;
+    for wind_m_s in winds_m_s {
+        for for_s in durations_s {
+            table += &format!("\nwind {wind_m_s} m/s, silent for {for_s} s:");
+            for below_m in HEIGHTS_M {
+                let silence = Silence { below_m, for_s: *for_s };
+                let [sink, slide] =
+                    worst((0..4).map(|seed| silent(seed, *wind_m_s, silence).with(&change).fly()));
+                is_safe &= sink <= MAX_SINK_M_S && slide <= MAX_SLIDE_M_S;
+                table += &format!(" {below_m} m: {sink:.2} {slide:.2};");
+            }
+        }
+    }
+    println!("{table}");
+    assert!(is_safe, "{table}");
+}
+
+#[test]
+fn silence_at_any_height_ends_in_a_soft_touchdown_or_in_none() {
+    check(&[0.0, 5.0], &[f64::INFINITY, 0.5, 2.0, 5.0], |_| {});
+}
+
+#[test]
+fn an_autopilot_with_a_long_timeout_is_descended_with_slowly() {
+    check(&[0.0], &[f64::INFINITY, 2.0], |scene| scene.setpoint_timeout_s = 3.0);
+}
+
+#[test]
+fn an_autopilot_that_does_not_say_its_timeout_is_taken_for_the_slowest() {
+    check(&[0.0], &[f64::INFINITY], |scene| {
+        scene.setpoint_timeout_s = 3.0;
+        scene.is_timeout_known = false;
+    });
+}
+
+#[test]
+fn a_short_timeout_costs_no_time() {
+    let time_s = |seed: u64, timeout_s: f64| {
+        let scene = Scene::new(seed).with(|scene| scene.setpoint_timeout_s = timeout_s);
+        scene.fly().touchdown_s.unwrap_or(f64::INFINITY)
+    };
+    let mean_s = |timeout_s: f64| (0..10).map(|seed| time_s(seed, timeout_s)).sum::<f64>() / 10.0;
+    let (short_s, long_s) = (mean_s(0.5), mean_s(3.0));
+    println!("until the touchdown: {short_s:.2} s, with a timeout of 3 s {long_s:.2} s");
+    assert!(short_s < 13.0 && short_s < long_s - 2.0, "{short_s} {long_s}");
+}
