@@ -94,6 +94,41 @@ async fn without_controller_or_detector_it_stops_and_lands_with_the_next_one() -
     Ok(())
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_controller_killed_at_any_height_lets_nothing_hit_the_ground() -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    let mut landing = Landing::start(&["--seed", "6"]).await?;
+    let mut resumed: Option<Pid> = None;
+    for height_m in [5.0, 3.0, 1.5] {
+        landing.descends_below(height_m).await?;
+        let killed_ns = match resumed {
+            None => landing.kill("controller")?,
+            Some(pid) => {
+                kill_process(pid, Signal::KILL)?;
+                now_ns()
+            }
+        };
+        let stopped = landing
+            .truth("the vehicle has stopped or stands", |t| {
+                seconds(t.stamp_ns - killed_ns) > 0.3 && (t.on_ground || speed_m_s(t) < 0.1)
+            })
+            .await?;
+        println!(
+            "killed below {height_m} m: stopped after {:.1} s at {:.1} m",
+            seconds(stopped.stamp_ns - killed_ns),
+            -stopped.position_ned_m[2]
+        );
+        if let Some(touchdown) = stopped.touchdown {
+            let is_soft = touchdown.vertical_speed_m_s <= 0.8 && touchdown.lateral_speed_m_s <= 0.3;
+            ensure!(is_soft, "it hit the ground: {touchdown:?}");
+            return Ok(());
+        }
+        resumed = Some(landing.start_by_hand("controller", &[])?);
+    }
+    landing.lands().await?;
+    Ok(())
+}
+
 async fn without_a_controller_the_autopilot_stops_it(landing: &Landing) -> anyhow::Result<()> {
     let killed_ns = landing.kill("controller")?;
     let stopped = landing

@@ -594,6 +594,17 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
     let Some(status) = &seen.status else { return };
     let text = format!("{} ({}); autopilot: {}", status.phase, status.why, status.autopilot);
     findings.good("controller", text);
+    match status.setpoint_timeout_s {
+        Some(seconds) => findings.good(
+            "setpoint timeout",
+            format!("without setpoints the autopilot stops after {seconds:.1} s; a landing shortens this to `autopilot.setpoint_timeout_s`"),
+        ),
+        None => findings.doubtful(
+            "setpoint timeout",
+            "the autopilot has not told its GUID_TIMEOUT or COM_OF_LOSS_T; landings are slower for it".to_owned(),
+            "check that it answers parameter requests on this link",
+        ),
+    }
     match &status.active_detector {
         Some(detector) => findings.good("detector", format!("`{detector}` is in use")),
         None => findings.doubtful(

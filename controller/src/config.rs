@@ -134,6 +134,8 @@ pub struct AutopilotSettings {
     pub state_rate_hz: f64,
     /// Rate of setpoints, in Hz.
     pub setpoint_rate_hz: f64,
+    /// Setpoint timeout that the autopilot gets for a landing, in seconds; 0 leaves its own.
+    pub setpoint_timeout_s: f64,
     /// Whether to synchronise with the autopilot's clock.
     pub timesync: bool,
     /// The vehicle's drag, for the estimate of the wind, in 1/s; 0 turns it off.
@@ -183,6 +185,13 @@ impl Settings for Config {
         check.range("autopilot.component_id", self.autopilot.component_id, 1..=255);
         check.range("autopilot.state_rate_hz", self.autopilot.state_rate_hz, 10.0..=200.0);
         check.range("autopilot.setpoint_rate_hz", self.autopilot.setpoint_rate_hz, 5.0..=100.0);
+        if self.autopilot.setpoint_timeout_s != 0.0 {
+            check.range(
+                "autopilot.setpoint_timeout_s",
+                self.autopilot.setpoint_timeout_s,
+                0.2..=5.0,
+            );
+        }
         if !self.detectors.preferred.is_empty() {
             check.name("detectors.preferred", &self.detectors.preferred);
         }

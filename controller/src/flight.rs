@@ -17,10 +17,11 @@ use messages::{
 use node::HealthCounters;
 
 use crate::alarms::Alarms;
-use crate::config::{Config, Mode};
+use crate::config::{Config, Mode, Start};
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
+use crate::limits::{Limits, Note};
 use crate::mission::{Mission, Trigger, is_flying_guided};
 use crate::setpoints::{Setpoints, without_detector};
 use crate::status::{Used, View};
@@ -39,9 +40,12 @@ pub struct Flight {
     setpoints: Setpoints,
     /// The autopilot's own precision landing, where that steers.
     landing_target: Option<LandingTargetMode>,
+    limits: Limits,
     alarms: Alarms,
     wind: WindEstimate,
     journal: Journal,
+    /// The service ends: nothing but a stop is sent any more.
+    is_ending: bool,
 }
 
 impl Flight {
@@ -73,9 +77,11 @@ impl Flight {
             landing_target: is_autopilots.then(|| {
                 LandingTargetMode::new(config.landing_target, config.phases.search_timeout_s)
             }),
+            limits: Limits::new(settings.address.clone(), settings.setpoint_timeout_s),
             alarms: Alarms::new(config.alarms),
             wind: WindEstimate::default(),
             journal: Journal::new(health),
+            is_ending: false,
             config,
         })
     }
@@ -83,8 +89,21 @@ impl Flight {
     /// Handles a packet from the autopilot's link.
     pub fn packet(&mut self, now_ns: i64, packet: &Packet) {
         self.ground_packet(now_ns, packet);
+        self.stop_before_resuming(now_ns, packet);
         self.autopilot.handle(now_ns, packet);
         self.handle_autopilot_events(now_ns);
+    }
+
+    /// Stops a vehicle whose landing is to be resumed, from the first packet of its autopilot on: the heartbeat that
+    /// tells the rest may be a second away.
+    fn stop_before_resuming(&mut self, now_ns: i64, packet: &Packet) {
+        let pinned = self.config.autopilot.system_id;
+        let is_vehicle = packet.sender.component == autopilot::client::AUTOPILOT
+            && packet.message.is_some()
+            && (pinned == 0 || packet.sender.system == pinned);
+        if self.config.start == Start::Resume && is_vehicle && self.autopilot.state().is_none() {
+            self.setpoints.stop_unknown(now_ns, packet.sender.system, &mut self.autopilot);
+        }
     }
 
     /// Handles a packet that the ground station sends to the autopilot through us.
@@ -107,8 +126,27 @@ impl Flight {
             self.journal.tick(is_fresh, self.frames.selection.has_newer());
         }
         self.advance_mission(now_ns);
+        self.follow_limits(now_ns);
         self.check_alarms(now_ns);
         self.decide(now_ns, LanderEvent::Tick);
+    }
+
+    /// Reads the autopilot's limits, and has its setpoint timeout shortened while our setpoints land it.
+    fn follow_limits(&mut self, now_ns: i64) {
+        let is_landing = self.is_landing() && self.landing_target.is_none();
+        if let Some(limits) = self.limits.step(now_ns, is_landing, &mut self.autopilot) {
+            self.decide(now_ns, LanderEvent::Limits(limits));
+        }
+    }
+
+    /// What must be put back in the autopilot's parameters; `None` when nothing must.
+    pub fn note(&self) -> Option<&Note> {
+        self.limits.note()
+    }
+
+    /// Takes over what an earlier controller left to put back.
+    pub fn take_over(&mut self, note: Note) {
+        self.limits.take_over(note);
     }
 
     /// Passes alarms to the lander while it lands.
@@ -227,12 +265,16 @@ impl Flight {
         }
     }
 
-    /// Stops the vehicle where it is, with the last packet: without one it would stop only after 3 s.
-    pub fn shutdown(&mut self, now_ns: i64) {
-        if self.is_landing() {
+    /// Stops the vehicle where it is: without a last setpoint it would stop only after its setpoint timeout, which
+    /// is put back. True while the autopilot has not confirmed that.
+    pub fn shutdown(&mut self, now_ns: i64) -> bool {
+        if !std::mem::replace(&mut self.is_ending, true) && self.is_landing() {
             let result = self.setpoints.stop(now_ns, &mut self.autopilot);
             self.log_setpoint(result);
         }
+        let is_pending = self.limits.restore(&mut self.autopilot);
+        self.autopilot.tick(now_ns);
+        is_pending
     }
 
     /// The next packet for the autopilot.
@@ -410,6 +452,7 @@ impl Flight {
                         self.decide(now_ns, LanderEvent::Vehicle(vehicle));
                     }
                 }
+                Event::Found { .. } => self.limits.found(&mut self.autopilot),
                 Event::ArmedChanged(armed) => {
                     let is_finished = self.view().is_finished();
                     self.mission.armed_changed(now_ns, armed, is_finished);
@@ -432,7 +475,7 @@ impl Flight {
             self.autopilot.withdraw();
         }
         self.decision = Some(decision);
-        if !self.mission.is_landing() {
+        if !self.mission.is_landing() || self.is_ending {
             return;
         }
         let action = match self.frames.selection.is_blind() {

@@ -8,7 +8,8 @@
 //! [`flight`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
 //! of the detector), [`mission`] (when a landing begins), [`setpoints`] (the lander's actions to the
 //! autopilot), [`landing_target`] (the other way to land, by the autopilot's own precision landing),
-//! [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and counted, [`wire`]
+//! [`limits`] (the autopilot's parameters for setpoints), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and counted, [`note_file`] what must survive a
+//! crash, [`wire`]
 //! converts messages into the lander's types and back.
 
 pub mod alarms;
@@ -17,7 +18,9 @@ pub mod flight;
 pub mod frames;
 pub mod journal;
 pub mod landing_target;
+pub mod limits;
 pub mod mission;
+pub mod note_file;
 pub mod selection;
 pub mod service;
 pub mod setpoints;

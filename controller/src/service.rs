@@ -8,13 +8,16 @@ use autopilot::{Address, Link, LinkEvent, Parser};
 use messages::{ControllerStatus, MavlinkBytes, VehicleState, topic};
 use node::{Node, Publisher, Shutdown, now_ns};
 use tokio::sync::mpsc;
-use tokio::time::{MissedTickBehavior, interval};
+use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use crate::config::Config;
 use crate::flight::Flight;
+use crate::note_file::NoteFile;
 
 /// Period of the flight's ticks.
 const TICK: Duration = Duration::from_millis(25);
+/// Longest wait at shutdown for the autopilot to confirm that its parameter is put back.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(500);
 /// Period of the status while nothing changes, in nanoseconds.
 const STATUS_PERIOD_NS: i64 = 200_000_000;
 /// Period of the check whether the status has changed, in nanoseconds.
@@ -33,7 +36,11 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
     let mut link = Link::open(address).await.context("opening the link to the autopilot")?;
+    let mut note_file = NoteFile::new(&config.id);
     let mut flight = Flight::new(config, node.shared_health())?;
+    if let Some(note) = note_file.read() {
+        flight.take_over(note);
+    }
 
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
     let cameras = node.subscriber(topic::CAMERA_INFO, &[]).await?;
@@ -93,10 +100,19 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                 }
             }
         }
+        // Written before the packet that changes the parameter is sent.
+        note_file.keep(flight.note());
         send(&node, &link, &mut flight);
         reports.publish(&flight).await;
     }
-    flight.shutdown(now_ns());
+    let deadline = tokio::time::Instant::now() + SHUTDOWN_TIMEOUT;
+    while flight.shutdown(now_ns()) && tokio::time::Instant::now() < deadline {
+        send(&node, &link, &mut flight);
+        if let Ok(LinkEvent::Packet { packet, .. }) = timeout(TICK, link.recv()).await {
+            flight.packet(now_ns(), &packet);
+        }
+    }
+    note_file.keep(flight.note());
     send(&node, &link, &mut flight);
     // The link's own task needs a moment to put the last packet on the wire.
     tokio::time::sleep(TICK).await;

@@ -65,13 +65,21 @@ impl Setpoints {
         None
     }
 
-    /// Stops the vehicle, if setpoints are being sent: without one it would stop only after 3 s.
+    /// Stops the vehicle, if setpoints are being sent: without one it would stop only after its setpoint timeout.
     pub fn stop(
         &mut self,
         now_ns: i64,
         autopilot: &mut Autopilot,
     ) -> Option<Result<(), SetpointError>> {
         self.last.map(|_| self.send(now_ns, Vector::zero(), 0.0, autopilot))
+    }
+
+    /// Stops a vehicle of which only the system id is known.
+    pub fn stop_unknown(&mut self, now_ns: i64, system: u8, autopilot: &mut Autopilot) {
+        if now_ns.saturating_sub(self.sent_ns) >= self.period_ns {
+            self.sent_ns = now_ns;
+            autopilot.send_stop(now_ns, system);
+        }
     }
 
     fn send(

@@ -8,6 +8,7 @@ use crate::config::{Config, Mode};
 use crate::frames::Frames;
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
+use crate::limits;
 use crate::mission::{Mission, State};
 use crate::wire;
 
@@ -97,6 +98,7 @@ impl View<'_> {
             finished: self.is_finished(),
             detections_used: self.used.count,
             latency_ms: self.journal.latency_ms(),
+            setpoint_timeout_s: limits::timeout_s(self.autopilot),
         }
     }
 

@@ -9,7 +9,7 @@ use crate::detector::Place;
 
 wire! {
     TargetEstimate = 6 v 2;
-    ControllerStatus = 7 v 3;
+    ControllerStatus = 7 v 4;
     ControllerCommand = 8 v 3;
     CommandReply = 9 v 1;
 }
@@ -189,6 +189,8 @@ pub struct ControllerStatus {
     pub detections_used: u64,
     /// Median and 99th percentile from a frame's stamp to the setpoint that used it, in milliseconds.
     pub latency_ms: Option<[f64; 2]>,
+    /// Time after which the autopilot stops when setpoints stop, in seconds; none while it is not known.
+    pub setpoint_timeout_s: Option<f64>,
 }
 
 /// A command to the controller.

@@ -1,0 +1,220 @@
+//! How the autopilot follows setpoints: its parameters are read, and its setpoint timeout is shortened for the
+//! landing.
+//!
+//! An autopilot follows the last velocity for a while when setpoints stop, 3 s by ArduPilot's default, also
+//! downwards. The shorter this timeout is, the faster a vehicle may descend that must not hit the ground should its
+//! controller die. So it is set for the landing and put back afterwards; after a crash by the controller that is
+//! started next, from a [`Note`].
+
+use autopilot::{Autopilot, Firmware, Parameter};
+use landing::AutopilotLimits;
+use serde::{Deserialize, Serialize};
+
+/// ArduPilot's parameters: setpoint timeout in s, horizontal acceleration in cm/s^2, jerk in m/s^3, and vertical
+/// acceleration in cm/s^2.
+const GUID_TIMEOUT: &str = "GUID_TIMEOUT";
+const WPNAV_ACCEL: &str = "WPNAV_ACCEL";
+const PSC_JERK_XY: &str = "PSC_JERK_XY";
+const WPNAV_ACCEL_Z: &str = "WPNAV_ACCEL_Z";
+/// PX4's time without setpoints until it leaves OFFBOARD, in s.
+const COM_OF_LOSS_T: &str = "COM_OF_LOSS_T";
+
+/// Difference of two timeouts that count as the same, in seconds.
+const SAME_S: f64 = 1e-3;
+/// Time for which no landing was active before the timeout is put back, in nanoseconds: a controller that is
+/// started again needs as long to see that it has one to resume.
+const QUIET_NS: i64 = 2_000_000_000;
+
+/// What must be put back, kept outside of the process for the time after a crash.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Note {
+    /// The link's address, which tells vehicles with the same system id apart.
+    pub address: String,
+    /// The vehicle's MAVLink system id.
+    pub system: u8,
+    /// Name of the parameter.
+    pub parameter: String,
+    /// Its value before the landing, in seconds.
+    pub original_s: f64,
+    /// Its value for the landing, in seconds.
+    pub set_s: f64,
+}
+
+/// The limits of one autopilot.
+#[derive(Debug)]
+pub struct Limits {
+    address: String,
+    /// The setpoint timeout for a landing, in seconds; 0 leaves the autopilot's.
+    wanted_s: f64,
+    /// What an earlier controller left.
+    left: Option<Note>,
+    note: Option<Note>,
+    /// The autopilot did not take the timeout in this landing.
+    is_refused: bool,
+    active_ns: Option<i64>,
+    known: Option<AutopilotLimits>,
+}
+
+impl Limits {
+    /// Nothing is known of the autopilot at this address.
+    pub fn new(address: String, wanted_s: f64) -> Self {
+        Self {
+            address,
+            wanted_s,
+            left: None,
+            note: None,
+            is_refused: false,
+            active_ns: None,
+            known: None,
+        }
+    }
+
+    /// Takes over the note of an earlier controller, for a vehicle that still has its value.
+    pub fn take_over(&mut self, note: Note) {
+        self.left = Some(note);
+    }
+
+    /// The autopilot was found: its parameters are requested.
+    pub fn found(&self, autopilot: &mut Autopilot) {
+        match autopilot.firmware() {
+            Some(Firmware::Copter) => {
+                autopilot.read_parameters(&[GUID_TIMEOUT, WPNAV_ACCEL_Z, WPNAV_ACCEL, PSC_JERK_XY])
+            }
+            Some(Firmware::Px4) => autopilot.read_parameters(&[COM_OF_LOSS_T]),
+            _ => {}
+        }
+    }
+
+    /// Sets the timeout while a landing is active, and puts it back afterwards; returns the limits when they
+    /// have changed.
+    pub fn step(
+        &mut self,
+        now_ns: i64,
+        is_landing: bool,
+        autopilot: &mut Autopilot,
+    ) -> Option<AutopilotLimits> {
+        if let (Some(name), Some(timeout_s)) = (name(autopilot), timeout_s(autopilot)) {
+            self.check_left(name, timeout_s, autopilot);
+            if is_landing {
+                self.active_ns = Some(now_ns);
+                self.shorten(name, timeout_s, autopilot);
+            } else {
+                self.is_refused = false;
+                let since_ns = *self.active_ns.get_or_insert(now_ns);
+                if now_ns.saturating_sub(since_ns) >= QUIET_NS {
+                    self.restore(autopilot);
+                }
+            }
+        }
+        let limits = read(autopilot);
+        let is_new = self.known != Some(limits);
+        self.known = Some(limits);
+        is_new.then_some(limits)
+    }
+
+    /// What must be put back; `None` when nothing must.
+    pub fn note(&self) -> Option<&Note> {
+        self.note.as_ref().or(self.left.as_ref())
+    }
+
+    /// Puts the timeout back, if it was changed; true while the autopilot has not confirmed it.
+    pub fn restore(&mut self, autopilot: &mut Autopilot) -> bool {
+        let Some(note) = &self.note else { return false };
+        let Some(timeout_s) = timeout_s(autopilot) else { return false };
+        let is_ours = (timeout_s - note.set_s).abs() < SAME_S;
+        if is_ours && name(autopilot) == Some(note.parameter.as_str()) {
+            autopilot.set_parameter(&note.parameter, note.original_s);
+            return true;
+        }
+        if (timeout_s - note.original_s).abs() < SAME_S {
+            tracing::info!(
+                parameter = note.parameter,
+                seconds = timeout_s,
+                "Setpoint timeout is put back"
+            );
+        } else {
+            tracing::warn!(
+                parameter = note.parameter,
+                seconds = timeout_s,
+                "Setpoint timeout was changed by somebody else; it stays so"
+            );
+        }
+        self.note = None;
+        false
+    }
+
+    /// The note of an earlier controller becomes ours, where the vehicle still has its value.
+    fn check_left(&mut self, name: &str, timeout_s: f64, autopilot: &Autopilot) {
+        let Some(left) = self.left.take() else { return };
+        if left.address == self.address
+            && Some(left.system) == autopilot.system()
+            && left.parameter == name
+            && (timeout_s - left.set_s).abs() < SAME_S
+        {
+            self.note = Some(left);
+        }
+    }
+
+    fn shorten(&mut self, name: &'static str, timeout_s: f64, autopilot: &mut Autopilot) {
+        if self.wanted_s <= 0.0 || timeout_s <= self.wanted_s + SAME_S || self.is_refused {
+            return;
+        }
+        let Some(system) = autopilot.system() else { return };
+        let is_begun = self.note.as_ref().is_some_and(|note| note.set_s == self.wanted_s);
+        if !is_begun {
+            self.note = Some(Note {
+                address: self.address.clone(),
+                system,
+                parameter: name.to_owned(),
+                original_s: timeout_s,
+                set_s: self.wanted_s,
+            });
+            tracing::info!(
+                parameter = name,
+                from_s = timeout_s,
+                to_s = self.wanted_s,
+                "Setpoint timeout is shortened for the landing"
+            );
+            autopilot.set_parameter(name, self.wanted_s);
+        } else if !autopilot.is_setting(name) {
+            self.is_refused = true;
+            tracing::warn!(
+                parameter = name,
+                seconds = timeout_s,
+                "The autopilot does not take a shorter setpoint timeout; the descent is slower for it"
+            );
+        }
+    }
+}
+
+/// The parameter that holds the setpoint timeout.
+fn name(autopilot: &Autopilot) -> Option<&'static str> {
+    match autopilot.firmware()? {
+        Firmware::Copter => Some(GUID_TIMEOUT),
+        Firmware::Px4 => Some(COM_OF_LOSS_T),
+        _ => None,
+    }
+}
+
+/// The setpoint timeout in seconds; `None` while it is not known.
+pub fn timeout_s(autopilot: &Autopilot) -> Option<f64> {
+    value(autopilot, name(autopilot)?)
+}
+
+fn read(autopilot: &Autopilot) -> AutopilotLimits {
+    let default = AutopilotLimits::default();
+    let or = |name, scale: f64, default| value(autopilot, name).map_or(default, |v| v * scale);
+    AutopilotLimits {
+        setpoint_timeout_s: timeout_s(autopilot),
+        acceleration_m_s2: or(WPNAV_ACCEL, 0.01, default.acceleration_m_s2),
+        jerk_m_s3: or(PSC_JERK_XY, 1.0, default.jerk_m_s3),
+        vertical_acceleration_m_s2: or(WPNAV_ACCEL_Z, 0.01, default.vertical_acceleration_m_s2),
+    }
+}
+
+fn value(autopilot: &Autopilot, name: &str) -> Option<f64> {
+    match autopilot.parameter(name) {
+        Parameter::Value(value) => Some(value),
+        Parameter::Unknown | Parameter::Silent => None,
+    }
+}

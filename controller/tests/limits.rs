@@ -1,0 +1,211 @@
+//! The autopilot's setpoint timeout: shortened for a landing and put back, also after a crash.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
+
+use std::sync::Arc;
+
+use autopilot::dialect::{
+    ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot,
+    MavLandedState, MavMessage, MavModeFlag, MavParamType, MavType, PARAM_VALUE_DATA,
+};
+use autopilot::{Parser, Sender};
+use controller::Config;
+use controller::flight::Flight;
+use controller::limits::Note;
+use node::Layers;
+
+const MS: i64 = 1_000_000;
+const GUIDED: u32 = 4;
+const LOITER: u32 = 5;
+
+/// A flight and an autopilot with one parameter.
+struct Conversation {
+    flight: Flight,
+    /// The autopilot's GUID_TIMEOUT, in seconds.
+    timeout_s: f32,
+    /// It refuses to change the parameter.
+    refuses: bool,
+    /// The values to which the parameter was set.
+    set_s: Vec<f32>,
+    /// The downward velocities of all setpoints, in m/s.
+    down_m_s: Vec<f32>,
+    now_ns: i64,
+}
+
+impl Conversation {
+    fn new(start: &str, timeout_s: f32) -> Self {
+        let layers = Layers { file: None, set: vec![format!("start={start}")] };
+        let config = layers.load::<Config>().unwrap().settings;
+        Self {
+            flight: Flight::new(config, Arc::default()).unwrap(),
+            timeout_s,
+            refuses: false,
+            set_s: Vec::new(),
+            down_m_s: Vec::new(),
+            now_ns: 0,
+        }
+    }
+
+    fn receive(&mut self, message: &MavMessage) {
+        let sender = Sender { system: 1, component: 1 };
+        for packet in Parser::new().push(&autopilot::packet::encode(sender, 0, message)) {
+            self.flight.packet(self.now_ns, &packet);
+        }
+    }
+
+    fn attitude(&self) -> MavMessage {
+        let time_boot_ms = (self.now_ns / MS) as u32;
+        MavMessage::ATTITUDE(ATTITUDE_DATA { time_boot_ms, ..Default::default() })
+    }
+
+    /// Hovers 5 m over the ground in a mode for some seconds.
+    fn fly(&mut self, seconds: i64, mode: u32) {
+        for step in 0..seconds * 40 {
+            self.now_ns += 25 * MS;
+            if step % 20 == 0 {
+                self.receive(&MavMessage::HEARTBEAT(HEARTBEAT_DATA {
+                    custom_mode: mode,
+                    mavtype: MavType::MAV_TYPE_QUADROTOR,
+                    autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
+                    base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
+                    ..Default::default()
+                }));
+                self.receive(&MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA {
+                    landed_state: MavLandedState::MAV_LANDED_STATE_IN_AIR,
+                    ..Default::default()
+                }));
+            }
+            self.receive(&self.attitude());
+            let time_boot_ms = (self.now_ns / MS) as u32;
+            self.receive(&MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
+                time_boot_ms,
+                z: -5.0,
+                ..Default::default()
+            }));
+            self.flight.tick(self.now_ns);
+            self.answer();
+        }
+    }
+
+    /// The autopilot handles what was sent to it.
+    fn answer(&mut self) {
+        let mut reports = false;
+        while let Some(packet) = self.flight.poll_outgoing() {
+            for packet in Parser::new().push(&packet) {
+                match packet.message {
+                    Some(MavMessage::PARAM_SET(set)) => {
+                        assert_eq!(set.param_id.to_str(), Ok("GUID_TIMEOUT"));
+                        self.set_s.push(set.param_value);
+                        if !self.refuses {
+                            self.timeout_s = set.param_value;
+                        }
+                        reports = true;
+                    }
+                    Some(MavMessage::PARAM_REQUEST_READ(request)) => {
+                        reports |= request.param_id.to_str() == Ok("GUID_TIMEOUT");
+                    }
+                    Some(MavMessage::SET_POSITION_TARGET_LOCAL_NED(setpoint)) => {
+                        self.down_m_s.push(setpoint.vz);
+                    }
+                    _ => {}
+                }
+            }
+        }
+        if reports {
+            self.receive(&MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
+                param_value: self.timeout_s,
+                param_id: "GUID_TIMEOUT".into(),
+                param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
+                ..Default::default()
+            }));
+        }
+    }
+
+    fn shown_s(&self) -> Option<f64> {
+        self.flight.status(self.now_ns).setpoint_timeout_s
+    }
+}
+
+#[test]
+fn the_timeout_is_shortened_for_a_landing_and_put_back() {
+    let mut it = Conversation::new("airborne", 3.0);
+    it.fly(3, GUIDED);
+    assert_eq!((it.timeout_s, it.shown_s()), (0.5, Some(0.5)));
+    assert_eq!(it.flight.note().map(|note| note.original_s), Some(3.0));
+    // The pilot takes over.
+    it.fly(4, LOITER);
+    assert_eq!((it.timeout_s, it.shown_s()), (3.0, Some(3.0)));
+    assert_eq!(it.set_s, [0.5, 3.0]);
+    assert_eq!(it.flight.note(), None);
+}
+
+#[test]
+fn a_shorter_timeout_stays() {
+    let mut it = Conversation::new("airborne", 0.3);
+    it.fly(3, GUIDED);
+    it.fly(4, LOITER);
+    assert_eq!((it.timeout_s, it.set_s), (0.3, vec![]));
+}
+
+#[test]
+fn an_autopilot_that_refuses_is_asked_a_few_times_only() {
+    let mut it = Conversation::new("airborne", 3.0);
+    it.refuses = true;
+    it.fly(8, GUIDED);
+    assert!((1..=10).contains(&it.set_s.len()), "{:?}", it.set_s);
+    assert_eq!(it.shown_s(), Some(3.0), "the descent knows");
+}
+
+#[test]
+fn what_a_killed_controller_left_is_put_back() {
+    let mut killed = Conversation::new("airborne", 3.0);
+    killed.fly(3, GUIDED);
+    let note = killed.flight.note().cloned().unwrap();
+    assert_eq!(killed.timeout_s, 0.5);
+    // The next one has no landing to resume.
+    let mut next = Conversation::new("command", 0.5);
+    next.flight.take_over(note.clone());
+    next.fly(4, LOITER);
+    assert_eq!((next.timeout_s, next.flight.note()), (3.0, None));
+    // Or it has one, and puts it back at its end.
+    let mut resumed = Conversation::new("resume", 0.5);
+    resumed.flight.take_over(note.clone());
+    resumed.fly(3, GUIDED);
+    assert_eq!((resumed.timeout_s, resumed.set_s.len()), (0.5, 0));
+    resumed.fly(4, LOITER);
+    assert_eq!(resumed.timeout_s, 3.0);
+    // A value that somebody else chose meanwhile stays, as does that of another vehicle.
+    for (timeout_s, note) in [(1.0, note.clone()), (0.5, Note { system: 7, ..note })] {
+        let mut other = Conversation::new("command", timeout_s);
+        other.flight.take_over(note);
+        other.fly(4, LOITER);
+        assert_eq!((other.timeout_s, other.flight.note()), (timeout_s, None));
+    }
+}
+
+#[test]
+fn an_orderly_end_puts_it_back_at_once_and_sends_no_descent() {
+    let mut it = Conversation::new("airborne", 3.0);
+    it.fly(3, GUIDED);
+    it.down_m_s.clear();
+    let mut steps = 0;
+    while it.flight.shutdown(it.now_ns) {
+        it.now_ns += 25 * MS;
+        it.answer();
+        it.receive(&it.attitude());
+        steps += 1;
+        assert!(steps < 10);
+    }
+    assert_eq!((it.timeout_s, it.flight.note()), (3.0, None));
+    assert_eq!(it.down_m_s, [0.0]);
+}
+
+#[test]
+fn a_resuming_controller_stops_the_vehicle_with_its_first_packet() {
+    for (start, setpoints) in [("resume", vec![0.0]), ("airborne", vec![])] {
+        let mut it = Conversation::new(start, 3.0);
+        it.receive(&it.attitude());
+        it.answer();
+        assert_eq!(it.down_m_s, setpoints, "{start}");
+    }
+}
