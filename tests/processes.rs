@@ -76,7 +76,7 @@ fn says_how_well(result: &serde_json::Value) -> anyhow::Result<()> {
 async fn without_controller_or_detector_it_stops_and_lands_with_the_next_one() -> anyhow::Result<()>
 {
     let _alone = ONE_AT_A_TIME.lock().await;
-    // Slowly: the autopilot goes on with the last setpoint for three seconds, and this process may be late as well.
+    // Slowly: this process may be late.
     let slowly = "controller.metric.max_descend_m_s=0.8";
     let mut landing = Landing::start(&["--seed", "4", "--set", slowly]).await?;
     landing.descends_below(9.0).await?;
