@@ -3,6 +3,7 @@
 #![expect(clippy::print_stdout, reason = "what was said helps when a test fails")]
 
 use std::io::{BufRead, BufReader};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
@@ -43,9 +44,10 @@ impl Drone {
         let home = text(folder.path())?;
         keys(&["init", "-o", home])?;
         keys(&["issue", "--role", "drone", "--address", "127.0.0.1", "-o", home])?;
-        for role in ["detector", "operator", "observer"] {
+        for role in ["operator", "observer"] {
             keys(&["issue", "--role", role, "-o", home])?;
         }
+        keys(&["issue", "--role", "detector", "--name", "ground", "-o", home])?;
         let ([meet], air, _) = ports::free()?;
         let air = format!("127.0.0.1:{air}");
         let mut relay = Command::new(ALIGHT)
@@ -75,10 +77,10 @@ impl Drone {
         Network { config: Some("ground".into()), connect, keys, ..Network::default() }
     }
 
-    async fn on_the_ground(&self, service: &'static str, role: &str) -> anyhow::Result<Node> {
+    async fn on_the_ground(&self, service: &'static str, key: &str) -> anyhow::Result<Node> {
         let network = self.network(Some(self.folder.path().to_owned()));
         let identity = Identity { service, instance: "ground".into() };
-        Node::open(identity, &network.source(role)?).await
+        Node::open(identity, &network.source(key)?).await
     }
 
     /// `alight command hold` from the ground, with the keys of a directory.
@@ -154,7 +156,7 @@ async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<(
     };
 
     // A detector is heard as such, and as nothing else.
-    let detector = drone.on_the_ground("detector", "detector").await?;
+    let detector = drone.on_the_ground("detector", "detector.ground").await?;
     detector.announce().await?;
     is_heard(&detector, &drone.controller).await?;
     ensure!(drone.controller.alive("detector", "*").await? == ["ground"]);
@@ -192,5 +194,113 @@ async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<(
     ensure!(commanded.recv().await == Some(ControllerCommand::Hold));
     is_heard(&detector, &drone.controller).await?;
     answering.abort();
+    Ok(())
+}
+
+/// Runs `alight relay` until it ends by itself.
+fn relay(arguments: &[&str]) -> anyhow::Result<String> {
+    let output = output_of(&[&["relay", "--zenoh", "drone"], arguments].concat())?;
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    ensure!(!output.status.success(), "it has started: {said}");
+    Ok(said)
+}
+
+#[test]
+fn a_relay_without_keys_does_not_start_unless_told_and_keys_are_private() -> anyhow::Result<()> {
+    let ([meet], air, _) = ports::free()?;
+    let (meet, air) = (meet.to_string(), format!("0.0.0.0:{air}"));
+    let said = relay(&["--listen", &air, "--meet", &meet])?;
+    ensure!(said.contains("without keys") && said.contains("--insecure"), "{said}");
+
+    let folder = tempfile::tempdir()?;
+    let home = text(folder.path())?;
+    keys(&["init", "-o", home])?;
+    keys(&["issue", "--role", "drone", "--address", "127.0.0.1", "-o", home])?;
+    let key = folder.path().join("drone.key");
+    std::fs::set_permissions(&key, std::fs::Permissions::from_mode(0o644))?;
+    let said = relay(&["--listen", &air, "--meet", &meet, "--keys", home])?;
+    ensure!(said.contains("chmod 600"), "{said}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_insecure_says_so() -> anyhow::Result<()> {
+    let ([meet], air, _) = ports::free()?;
+    let (port, air) = (meet.to_string(), format!("0.0.0.0:{air}"));
+    let mut relay = Command::new(ALIGHT)
+        .args(["relay", "--zenoh", "drone", "--listen", &air, "--meet", &port, "--insecure"])
+        .stdin(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()?;
+    let local = Network { meet: Some(meet), ..Network::default() };
+    let identity = Identity { service: "controller", instance: "main".into() };
+    let inside = Node::open(identity, &local.source("controller")?).await?;
+    let healths = inside.subscriber(topic::HEALTH, &["relay", "drone"]).await?;
+    let told = health(&healths, "its health says so", |h| {
+        h.errors.iter().any(|error| error.reason == node::INSECURE)
+    })
+    .await;
+    let output = output_of(&["doctor", "--meet", &port, "--seconds", "2"]);
+    relay.kill()?;
+    let said = relay.wait_with_output()?;
+    told?;
+    let said = String::from_utf8_lossy(&said.stderr).into_owned();
+    ensure!(said.contains("INSECURE"), "{said}");
+    let output = output?;
+    let found = String::from_utf8_lossy(&output.stdout).into_owned();
+    ensure!(found.contains("anyone in reach can command the vehicle"), "{found}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_vehicle_that_may_be_real_is_left_on_the_ground() -> anyhow::Result<()> {
+    let ([meet], _, mavlink) = ports::free()?;
+    let vehicle = format!("autopilot.address=udpout:127.0.0.1:{mavlink}");
+    let mut simulator = Command::new(ALIGHT)
+        .args(["simulator", "--meet", &meet.to_string(), "--set", &vehicle])
+        // As a real one.
+        .args(["--set", "autopilot.says_simulated=false"])
+        .stdin(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()?;
+    let local = Network { meet: Some(meet), ..Network::default() };
+    let identity = Identity { service: "alight", instance: "test".into() };
+    let watching = Node::open(identity, &local.source("observer")?).await?;
+    let truths = watching.subscriber(topic::TRUTH, &[]).await?;
+    let address = format!("udpin:127.0.0.1:{mavlink}");
+    let land = [
+        "land",
+        "--autopilot",
+        &address,
+        "--timeout-s",
+        "60",
+        "--set",
+        "gcs-bridge.ground=udpout:127.0.0.1:9",
+    ];
+    let asked = output_of(&[&land[..], &["--real-vehicle"]].concat());
+    let refused = tokio::task::block_in_place(|| output_of(&land));
+    let mut seen = 0;
+    let mut flown = false;
+    while let Ok(Some(truth)) = timeout(Duration::from_millis(100), truths.next()).await {
+        seen += 1;
+        flown |= !truth.on_ground;
+        if seen >= 4 {
+            break;
+        }
+    }
+    simulator.kill()?;
+    simulator.wait()?;
+    let asked = asked?;
+    let said = String::from_utf8_lossy(&asked.stderr).into_owned();
+    ensure!(!asked.status.success() && said.contains("--real-vehicle --yes"), "{said}");
+    let refused = refused?;
+    let said = format!(
+        "{}{}",
+        String::from_utf8_lossy(&refused.stdout),
+        String::from_utf8_lossy(&refused.stderr)
+    );
+    println!("{said}");
+    ensure!(!refused.status.success() && said.contains("--real-vehicle"), "{said}");
+    ensure!(seen > 0 && !flown, "{seen} states, flown: {flown}");
     Ok(())
 }

@@ -25,6 +25,7 @@ fn write_site(folder: &Path) -> anyhow::Result<u16> {
         r#"
 vehicle = "tested"
 address = "127.0.0.1:{air}"
+insecure = true
 meet = {meet}
 
 [[drone]]

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clap::builder::FalseyValueParser;
 use clap::{Args, ValueEnum};
 use node::network::variable;
 use node::{Network, ZenohSource};
@@ -57,17 +58,20 @@ pub(crate) struct NetworkArgs {
     /// rights.
     #[arg(long, value_name = "DIRECTORY", env = variable::KEYS)]
     keys: Option<PathBuf>,
+    /// Listen beyond this machine without keys: anyone in reach can then command the vehicle.
+    #[arg(long, env = variable::INSECURE, value_parser = FalseyValueParser::new())]
+    insecure: bool,
 }
 
 impl NetworkArgs {
-    /// The session's configuration for a process with the certificate of `role`.
-    pub(crate) fn source(&self, role: &str) -> anyhow::Result<ZenohSource> {
-        self.network().source(role)
+    /// The session's configuration for a process with this key.
+    pub(crate) fn source(&self, key_name: &str) -> anyhow::Result<ZenohSource> {
+        self.network().source(key_name)
     }
 
     pub(crate) fn network(&self) -> Network {
-        let Self { zenoh, connect, listen, meet, vehicle, keys } = self.clone();
-        Network { config: zenoh, vehicle, connect, listen, meet, keys }
+        let Self { zenoh, connect, listen, meet, vehicle, keys, insecure } = self.clone();
+        Network { config: zenoh, vehicle, connect, listen, meet, keys, insecure }
     }
 }
 

@@ -9,8 +9,9 @@ use std::time::Duration;
 
 use clap::Args;
 use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, topic};
-use node::network::{AIR_PORT, AUTHORITY, Address};
-use node::{Network, Node, clock_name, now_ns, stats};
+use node::access::Holder;
+use node::network::{AIR_PORT, AUTHORITY, Address, check_private};
+use node::{INSECURE, Network, Node, clock_name, now_ns, stats};
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 use tokio::time::timeout;
@@ -50,6 +51,8 @@ const EXPIRES_SOON_S: i64 = 30 * 86_400;
 const ROUND_TRIPS: u32 = 10;
 const REPLY_TIMEOUT: Duration = Duration::from_millis(300);
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
+/// What to do about a network that is open to all.
+const MAKE_KEYS: &str = "make keys (`alight keys`, docs/deploy.md), and remove `insecure`";
 const OPEN_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The severity of a finding.
@@ -220,6 +223,9 @@ fn check_site(findings: &mut Findings, role: Role, jobs: &[Job]) {
     findings.good("site", format!("{} runs {}", role.name(), names.join(", ")));
     let mut checked = Vec::new();
     for job in jobs {
+        if job.network.is_open().unwrap_or(false) {
+            findings.doubtful("security", format!("{}: {INSECURE}", job.name), MAKE_KEYS);
+        }
         if let Some(keys) = job.network.keys.as_deref().filter(|_| job.needs_key())
             && !checked.contains(&job.key)
         {
@@ -263,9 +269,9 @@ fn check_certificate(findings: &mut Findings, keys: &Path, role: &str) {
         let again = "make a new one with `alight keys`, in a new directory";
         match keys::certificate(&path) {
             Err(problem) => findings.wrong("keys", format!("{problem:#}"), again),
-            Ok(read) if name == role && read.role != role => findings.wrong(
+            Ok(read) if name == role && key_name_of(&read) != role => findings.wrong(
                 "keys",
-                format!("{path:?} is for the role `{}`", read.role),
+                format!("{path:?} is for `{}`", read.common_name),
                 "keep the file names of `alight keys issue`",
             ),
             Ok(read) if read.expires_in_s < 0 => {
@@ -280,15 +286,17 @@ fn check_certificate(findings: &mut Findings, keys: &Path, role: &str) {
                 .good("keys", format!("{path:?} is valid for {} days", read.expires_in_s / 86_400)),
         }
     }
-    use std::os::unix::fs::PermissionsExt;
     let key = keys.join(format!("{role}.key"));
-    if std::fs::metadata(&key).is_ok_and(|file| file.permissions().mode() & 0o077 != 0) {
-        findings.wrong(
-            "keys",
-            format!("{key:?} is readable by other users"),
-            "chmod 600; if somebody may have read it, make a new authority",
-        );
+    if key.is_file()
+        && let Err(problem) = check_private(&key)
+    {
+        findings.wrong("keys", format!("{problem:#}"), "run the command, then this again");
     }
+}
+
+/// The file name for which a certificate was made.
+fn key_name_of(certificate: &keys::Certificate) -> String {
+    certificate.common_name.parse().map_or_else(|_| String::new(), |h: Holder| h.key_name())
 }
 
 /// Checks whether the ports of the other side accept connections.
@@ -485,8 +493,11 @@ fn check_healths(findings: &mut Findings, seen: &Seen) {
                 "install the same version on all machines",
             );
         }
-        let errors: Vec<_> =
-            health.errors.iter().map(|e| format!("{} ({} times)", e.reason, e.count)).collect();
+        if health.errors.iter().any(|error| error.reason == INSECURE) {
+            findings.doubtful("security", format!("{who}: {INSECURE}"), MAKE_KEYS);
+        }
+        let others = health.errors.iter().filter(|error| error.reason != INSECURE);
+        let errors: Vec<_> = others.map(|e| format!("{} ({} times)", e.reason, e.count)).collect();
         if !errors.is_empty() {
             findings.doubtful(
                 "services",

@@ -1,8 +1,8 @@
 //! `alight keys`: a development certificate authority, and a key for each role.
 //!
-//! The common name of a certificate is its role, to which `zenoh-config/secured.json5` grants access rights.
-//! The development authority cannot revoke keys: they expire, and a site that lost a key makes a new
-//! authority.
+//! The common name of a certificate is its role with its vehicle, and of a detector its name
+//! (`crates/node/src/access.rs`); `zenoh-config/secured.json5` has the rights of each role. The list of holders
+//! beside the authority's key says who may connect; who is revoked there stays out.
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;
@@ -13,7 +13,8 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow, ensure};
 use clap::{Args, Subcommand, ValueEnum};
-use node::network::AUTHORITY;
+use node::access::{HOLDERS, Holder, Holders};
+use node::network::{AUTHORITY, check_private};
 use rcgen::{
     BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
     KeyUsagePurpose,
@@ -43,11 +44,19 @@ enum Action {
         #[arg(long, value_name = "DAYS", default_value_t = 3650, value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
     },
-    /// Make a key and its certificate: `ROLE.key` and `ROLE.pem`, with `authority.pem` beside them.
+    /// Make a key and its certificate: `ROLE.key` and `ROLE.pem`, of a detector `detector.NAME`; with `authority.pem`
+    /// and the list of holders, `holders.txt`, beside them.
     Issue {
         /// Role of the holder, which has its access rights.
         #[arg(long, value_enum)]
         role: Role,
+        /// Name of the holder, to revoke its key alone; of a detector its id, the only one it may publish as
+        /// [default for a detector: main].
+        #[arg(long, value_name = "NAME")]
+        name: Option<String>,
+        /// The vehicle's name; the key is worth nothing at another one.
+        #[arg(long, value_name = "NAME", default_value = "drone")]
+        vehicle: String,
         /// Output directory.
         #[arg(short, long, value_name = "DIRECTORY")]
         output: PathBuf,
@@ -61,6 +70,16 @@ enum Action {
         /// Days until it expires.
         #[arg(long, value_name = "DAYS", default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
+    },
+    /// Shut the holder of a key out, for good: copy the list of holders that this writes to the keys of every relay
+    /// (`alight up drone`, `alight up relay`), and restart them.
+    Revoke {
+        /// The holder as the list names it: ROLE@VEHICLE or ROLE.NAME@VEHICLE.
+        #[arg(value_name = "HOLDER")]
+        holder: Holder,
+        /// Directory of the authority.
+        #[arg(long, value_name = "DIRECTORY")]
+        authority: PathBuf,
     },
 }
 
@@ -102,7 +121,7 @@ impl Role {
 /// A certificate, as far as it is of interest.
 pub(crate) struct Certificate {
     /// The common name.
-    pub(crate) role: String,
+    pub(crate) common_name: String,
     /// Seconds until it ends; negative when it has.
     pub(crate) expires_in_s: i64,
 }
@@ -111,9 +130,13 @@ pub(crate) struct Certificate {
 pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
     let written = match &args.action {
         Action::Init { output, days } => init(output, *days)?,
-        Action::Issue { role, output, authority, address, days } => {
-            issue(*role, output, authority.as_deref().unwrap_or(output), address, *days)?
+        Action::Issue { role, name, vehicle, output, authority, address, days } => {
+            let default = (*role == Role::Detector).then_some("main");
+            let holder = Holder::new(&role.name(), name.as_deref().or(default), vehicle)?;
+            let authority = authority.as_deref().unwrap_or(output);
+            issue(*role, &holder, output, authority, address, *days)?
         }
+        Action::Revoke { holder, authority } => vec![revoke(holder, authority)?],
     };
     let mut out = std::io::stdout().lock();
     for path in written {
@@ -129,11 +152,11 @@ pub(crate) fn certificate(path: &Path) -> anyhow::Result<Certificate> {
         .map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))?;
     let certificate =
         pem.parse_x509().map_err(|cause| anyhow!("{path:?} is not a certificate: {cause}"))?;
-    let role = certificate.subject().iter_common_name().next();
-    let role = role.and_then(|name| name.as_str().ok()).unwrap_or_default().to_owned();
+    let name = certificate.subject().iter_common_name().next();
+    let common_name = name.and_then(|name| name.as_str().ok()).unwrap_or_default().to_owned();
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
     let expires_in_s = certificate.validity().not_after.timestamp() - now.cast_signed();
-    Ok(Certificate { role, expires_in_s })
+    Ok(Certificate { common_name, expires_in_s })
 }
 
 fn init(output: &Path, days: u32) -> anyhow::Result<Vec<PathBuf>> {
@@ -152,12 +175,13 @@ fn init(output: &Path, days: u32) -> anyhow::Result<Vec<PathBuf>> {
 
 fn issue(
     role: Role,
+    holder: &Holder,
     output: &Path,
     authority: &Path,
     addresses: &[String],
     days: u32,
 ) -> anyhow::Result<Vec<PathBuf>> {
-    let name = role.name();
+    let name = holder.key_name();
     ensure!(
         !role.is_found_by_others() || !addresses.is_empty(),
         "the key of `{name}` needs the address to which others connect: add `--address HOST`"
@@ -174,6 +198,9 @@ fn issue(
         })
     };
     let authority_certificate = read(AUTHORITY)?;
+    check_private(&authority.join(AUTHORITY_KEY))?;
+    let mut holders = read_holders(authority)?;
+    holders.admit(holder)?;
     let signing_key = KeyPair::from_pem(&read(AUTHORITY_KEY)?)
         .with_context(|| format!("{:?} is not a key", authority.join(AUTHORITY_KEY)))?;
     let issuer =
@@ -187,7 +214,7 @@ fn issue(
             names.push(here.to_owned());
         }
     }
-    let mut params = parameters(&name, &names, days)?;
+    let mut params = parameters(&holder.to_string(), &names, days)?;
     params.use_authority_key_identifier_extension = true;
     params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
     params.extended_key_usages =
@@ -198,7 +225,53 @@ fn issue(
     put_authority(&output.join(AUTHORITY), &authority_certificate)?;
     write_new(&files[0], &key.serialize_pem())?;
     write_new(&files[1], &certificate.pem())?;
+    write_holders(authority, &holders)?;
+    if output != authority {
+        write_holders(output, &holders)?;
+    }
     Ok(files.into())
+}
+
+/// Shuts a holder out; returns the list, which is to be copied to the relays.
+fn revoke(holder: &Holder, authority: &Path) -> anyhow::Result<PathBuf> {
+    let mut holders = read_holders(authority)?;
+    holders.revoke(holder)?;
+    write_holders(authority, &holders)
+}
+
+/// The holders of an authority's keys; none before the first.
+fn read_holders(authority: &Path) -> anyhow::Result<Holders> {
+    let path = authority.join(HOLDERS);
+    match fs::read_to_string(&path) {
+        Ok(text) => text.parse().with_context(|| format!("{path:?}")),
+        Err(cause) if cause.kind() == std::io::ErrorKind::NotFound => Ok(Holders::default()),
+        Err(cause) => Err(cause).with_context(|| format!("reading {path:?}")),
+    }
+}
+
+/// Replaces the list in a directory, at once: a relay never reads half of it.
+fn write_holders(directory: &Path, holders: &Holders) -> anyhow::Result<PathBuf> {
+    let path = directory.join(HOLDERS);
+    let written = tempfile::NamedTempFile::new_in(directory).and_then(|mut file| {
+        file.write_all(holders.to_string().as_bytes())?;
+        file.persist(&path).map_err(|failed| failed.error)
+    });
+    written.with_context(|| format!("writing {path:?}"))?;
+    Ok(path)
+}
+
+/// The keys of all roles in one directory, with those of these detectors.
+#[cfg(test)]
+pub(crate) fn make_for_tests(directory: &Path, detectors: &[&str]) -> anyhow::Result<()> {
+    init(directory, 30)?;
+    let make = |role: Role, name: Option<&str>| {
+        let holder = Holder::new(&role.name(), name, "drone")?;
+        issue(role, &holder, directory, directory, &["127.0.0.1".into()], 30).map(drop)
+    };
+    for role in Role::value_variants().iter().filter(|role| **role != Role::Detector) {
+        make(*role, None)?;
+    }
+    detectors.iter().try_for_each(|name| make(Role::Detector, Some(name)))
 }
 
 fn parameters(name: &str, addresses: &[String], days: u32) -> anyhow::Result<CertificateParams> {
@@ -261,20 +334,36 @@ mod tests {
 
     use super::*;
 
+    fn issue_for(
+        role: Role,
+        name: Option<&str>,
+        output: &Path,
+        authority: &Path,
+    ) -> anyhow::Result<Vec<PathBuf>> {
+        let holder = Holder::new(&role.name(), name, "drone")?;
+        let addresses: &[String] = if role == Role::Drone { &["10.0.0.1".into()] } else { &[] };
+        issue(role, &holder, output, authority, addresses, 7)
+    }
+
     #[test]
     fn a_key_has_a_role_expires_and_is_private() {
         let home = tempfile::tempdir().unwrap();
         let drone = home.path().join("drone");
         init(home.path(), 30).unwrap();
-        let files = issue(Role::Drone, &drone, home.path(), &["10.0.0.1".into()], 7).unwrap();
+        let files = issue_for(Role::Drone, None, &drone, home.path()).unwrap();
         let read = certificate(&files[1]).unwrap();
-        assert_eq!(read.role, "drone");
+        assert_eq!(read.common_name, "drone@drone");
         assert!((read.expires_in_s - 7 * 86_400).abs() < 120, "{} s", read.expires_in_s);
-        for file in files.iter().chain([&drone.join(AUTHORITY)]) {
+        for file in files.iter().chain([&drone.join(AUTHORITY), &drone.join(HOLDERS)]) {
             let mode = fs::metadata(file).unwrap().permissions().mode();
             assert_eq!(mode & 0o777, 0o600, "{file:?}");
         }
         assert!(!drone.join(AUTHORITY_KEY).exists(), "the authority's key is not copied");
+    }
+
+    fn refused<T: std::fmt::Debug>(result: anyhow::Result<T>, part: &str) {
+        let problem = format!("{:#}", result.unwrap_err());
+        assert!(problem.contains(part), "`{part}` is not in: {problem}");
     }
 
     #[test]
@@ -283,16 +372,34 @@ mod tests {
         let other = tempfile::tempdir().unwrap();
         init(home.path(), 30).unwrap();
         init(other.path(), 30).unwrap();
-        let refused = |result: anyhow::Result<Vec<PathBuf>>, part: &str| {
-            let problem = format!("{:#}", result.unwrap_err());
-            assert!(problem.contains(part), "`{part}` is not in: {problem}");
-        };
         refused(init(home.path(), 30), "never overwritten");
         let here = home.path();
-        issue(Role::Detector, here, here, &[], 30).unwrap();
-        refused(issue(Role::Detector, here, here, &[], 30), "never overwritten");
-        refused(issue(Role::Operator, here, other.path(), &[], 30), "another authority");
-        refused(issue(Role::Relay, here, here, &[], 30), "--address HOST");
-        refused(issue(Role::Operator, here, &here.join("none"), &[], 30), "alight keys init");
+        issue_for(Role::Detector, Some("ground"), here, here).unwrap();
+        refused(issue_for(Role::Detector, Some("ground"), here, here), "never overwritten");
+        issue_for(Role::Detector, Some("spare"), here, here).unwrap();
+        refused(issue_for(Role::Detector, None, here, here), "--name ID");
+        refused(issue_for(Role::Operator, None, here, other.path()), "another authority");
+        refused(issue_for(Role::Relay, None, here, here), "--address HOST");
+        refused(issue_for(Role::Operator, None, here, &here.join("none")), "alight keys init");
+        let key = here.join(AUTHORITY_KEY);
+        fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
+        refused(issue_for(Role::Observer, None, here, here), "chmod 600");
+    }
+
+    #[test]
+    fn a_revoked_holder_stays_out() {
+        let home = tempfile::tempdir().unwrap();
+        let (here, laptop) = (home.path(), home.path().join("laptop"));
+        init(here, 30).unwrap();
+        issue_for(Role::Operator, Some("bob"), &laptop, here).unwrap();
+        let bob: Holder = "operator.bob@drone".parse().unwrap();
+        let list = fs::read_to_string(revoke(&bob, here).unwrap()).unwrap();
+        assert!(list.contains("\nrevoked operator.bob@drone\n"), "{list}");
+        let again = home.path().join("again");
+        refused(issue_for(Role::Operator, Some("bob"), &again, here), "was revoked");
+        refused(revoke(&"operator.eve@drone".parse().unwrap(), here), "no key was issued");
+        issue_for(Role::Operator, Some("bobby"), &again, here).unwrap();
+        let copied = fs::read_to_string(again.join(HOLDERS)).unwrap();
+        assert!(copied.contains("\nrevoked operator.bob@drone\n"), "{copied}");
     }
 }

@@ -2,7 +2,8 @@
 //! running.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use messages::{ControllerStatus, DetectorInfo, Place, topic};
@@ -194,6 +195,13 @@ pub(crate) struct LandingMarkerFile {
     file: Option<PathBuf>,
 }
 
+/// Whether only this user (and root) can write to a directory: whoever can may have a landing resumed.
+fn is_ours_alone(directory: &Path) -> bool {
+    let Ok(found) = std::fs::metadata(directory) else { return true };
+    let user = rustix::process::geteuid();
+    (found.uid() == user.as_raw() || user.is_root()) && found.mode() & 0o022 == 0
+}
+
 /// The contents of the file.
 #[derive(Serialize, Deserialize)]
 struct LandingMarker {
@@ -205,8 +213,17 @@ impl LandingMarkerFile {
     /// The file of the supervisor with this name.
     pub(crate) fn for_supervisor(name: &str) -> Self {
         let directory = ["RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"].iter().find_map(std::env::var_os);
-        let file = format!("alight-{name}.landing");
-        Self { file: directory.map(|directory| PathBuf::from(directory).join(file)) }
+        let directory = directory.map(PathBuf::from).filter(|directory| {
+            let is_ours = is_ours_alone(directory);
+            if !is_ours {
+                tracing::warn!(
+                    ?directory,
+                    "Other users can write there, so no landing is resumed after a crash"
+                );
+            }
+            is_ours
+        });
+        Self { file: directory.map(|it| it.join(format!("alight-{name}.landing"))) }
     }
 
     /// Notes whether a landing is under way.
@@ -300,6 +317,17 @@ mod tests {
         assert!(monitor.update(&status(Some(1), false), now));
         assert!(!monitor.update(&status(Some(1), true), now));
         assert!(!monitor.update(&status(None, false), now));
+    }
+
+    #[test]
+    fn a_directory_in_which_others_write_has_no_marker_file() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        for (mode, is_ours) in [(0o700, true), (0o755, true), (0o775, false), (0o1777, false)] {
+            let permissions = std::fs::Permissions::from_mode(mode);
+            std::fs::set_permissions(folder.path(), permissions).unwrap();
+            assert_eq!(is_ours_alone(folder.path()), is_ours, "{mode:o}");
+        }
     }
 
     #[test]

@@ -11,7 +11,7 @@ use node::{Identity, Node, Shutdown, denied};
 
 use crate::args::{NetworkArgs, ParentArgs};
 use crate::runtime::runtime;
-use crate::services::RELAY;
+use crate::services::{RELAY, tell_if_open};
 
 /// The arguments of the relay.
 #[derive(Args, Clone)]
@@ -37,7 +37,10 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
     let role = if config.as_os_str() == "drone" { "drone" } else { RELAY };
     let identity = Identity { service: RELAY, instance: args.id.clone() };
     let zenoh = network.source(role)?;
-    runtime()?.block_on(node::run(identity, &zenoh, relay))?;
+    runtime()?.block_on(node::run(identity, &zenoh, |node, shutdown| {
+        tell_if_open(&node, &network);
+        relay(node, shutdown)
+    }))?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -5,7 +5,8 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::ValueEnum;
-use node::{Identity, Layers, Node, Settings, Shutdown};
+use node::access::key_name;
+use node::{INSECURE, Identity, Layers, Network, Node, Settings, Shutdown};
 
 use crate::args::ServiceArgs;
 use crate::runtime::runtime;
@@ -77,6 +78,15 @@ pub(crate) fn run(service: Service, args: &ServiceArgs) -> anyhow::Result<ExitCo
     }
 }
 
+/// Says in the log and in the health report that anyone in reach can command the vehicle.
+pub(crate) fn tell_if_open(node: &Node, network: &Network) {
+    if network.is_open().unwrap_or(false) && node.health().failed(INSECURE) {
+        tracing::warn!(
+            "INSECURE: this process listens beyond this machine without keys, so anyone in reach can command the vehicle; see `alight keys`"
+        );
+    }
+}
+
 fn serve<C, F, Fut>(
     service: Service,
     args: &ServiceArgs,
@@ -91,9 +101,13 @@ where
     let layers = Layers { file: args.config.clone(), set: args.set.clone() };
     let config = layers.load::<C>()?.settings;
     let identity = Identity { service: service.name(), instance: instance(&config) };
-    let zenoh = args.network.source(service.name())?;
+    let network = args.network.network();
+    let zenoh = network.source(&key_name(service.name(), &identity.instance))?;
     runtime()?
-        .block_on(node::run(identity, &zenoh, |node, shutdown| run(node, config, shutdown)))
+        .block_on(node::run(identity, &zenoh, |node, shutdown| {
+            tell_if_open(&node, &network);
+            run(node, config, shutdown)
+        }))
         .with_context(|| format!("running {}", service.name()))?;
     Ok(ExitCode::SUCCESS)
 }

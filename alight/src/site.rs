@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use clap::ValueEnum;
+use node::access::key_name;
 use node::network::Address;
 use node::{ConfigError, Layers, Network};
 use serde::Deserialize;
@@ -47,6 +48,8 @@ pub(crate) struct Site {
     relay_address: Option<String>,
     /// The directory with the keys.
     keys: Option<PathBuf>,
+    /// Whether the relay may listen without keys.
+    insecure: bool,
     /// The rendezvous port of the processes of one machine.
     meet: Option<u16>,
     drone: Vec<Entry>,
@@ -86,7 +89,7 @@ pub(crate) struct Job {
     pub(crate) command: Vec<String>,
     /// The network that it joins.
     pub(crate) network: Network,
-    /// The role whose key it uses.
+    /// The name of its key's files.
     pub(crate) key: String,
     /// The settings over the service's defaults.
     pub(crate) layers: Layers,
@@ -132,6 +135,7 @@ impl Site {
             listen: None,
             meet: self.meet,
             keys: self.keys.as_ref().map(|keys| self.folder.join(keys)),
+            insecure: self.insecure,
         }
     }
 
@@ -239,13 +243,17 @@ impl Site {
             // The controller can prefer detectors by their place.
             layers.set.insert(0, "place=ground".to_owned());
         }
-        if let Some(service) = service {
-            service.effective_config(&layers)?;
-        }
+        let config = match service {
+            Some(service) => Some(service.effective_config(&layers)?),
+            None => None,
+        };
         let program = command.last().filter(|_| service.is_some()).or(command.first());
         let own_name = program.map(|p| p.rsplit('/').next().unwrap_or(p).to_owned());
         let name = entry.name.clone().or(own_name).unwrap_or_default();
-        let key = service.map_or("detector", Service::name).to_owned();
+        // Another program is a detector of its own name.
+        let instance = config.as_ref().and_then(|config| config.get("id")?.as_str());
+        let role = service.map_or(Service::Detector.name(), Service::name);
+        let key = key_name(role, instance.unwrap_or(&name));
         Ok(Job { name, service, command, network, key, layers })
     }
 }
@@ -253,6 +261,7 @@ impl Site {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::keys;
 
     fn site(text: &str) -> Site {
         toml::from_str(text).unwrap()
@@ -265,6 +274,7 @@ mod tests {
     const SITE: &str = "
         vehicle = 'kestrel'
         address = '10.42.0.1:8000'
+        insecure = true
         drone = [{ run = 'detector' }, { run = 'controller', set = ['marker=\"rings\"'] }]
         ground = [{ run = 'detector', set = ['id=\"ground\"'] }, { run = 'detector' }, { command = ['/usr/bin/python3', 'x.py'] }]";
 
@@ -295,13 +305,46 @@ mod tests {
         assert!(jobs[0].network.environment().contains(&("ALIGHT_CONNECT", "base.local".into())));
     }
 
+    /// The example beside the keys that `docs/deploy.md` has made for it.
+    fn example_with_keys(change: impl Fn(String) -> String) -> (tempfile::TempDir, Site) {
+        let home = tempfile::tempdir().unwrap();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
+        std::fs::copy(folder.join("camera.toml"), home.path().join("camera.toml")).unwrap();
+        let text = std::fs::read_to_string(folder.join("site.toml")).unwrap();
+        let path = home.path().join("site.toml");
+        std::fs::write(&path, change(text)).unwrap();
+        keys::make_for_tests(&home.path().join("keys"), &["ground"]).unwrap();
+        let site = Site::read(&path).unwrap();
+        (home, site)
+    }
+
     #[test]
     fn the_example_is_valid() {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/site.toml");
-        let example = Site::read(&path).unwrap();
+        let (_home, example) = example_with_keys(|text| text);
         for role in [Role::Drone, Role::Ground, Role::Relay] {
             example.jobs(role).unwrap();
         }
+    }
+
+    #[test]
+    fn without_keys_the_example_runs_only_when_it_says_that_it_is_insecure() {
+        let (_home, without) = example_with_keys(|text| text.replace("\nkeys = ", "\n# keys = "));
+        for role in [Role::Drone, Role::Relay] {
+            let problem = format!("{:#}", without.jobs(role).unwrap_err());
+            assert!(problem.contains("insecure = true"), "{problem}");
+        }
+        let (_home, told) =
+            example_with_keys(|text| text.replace("\nkeys = \"keys\"", "\ninsecure = true"));
+        let jobs = told.jobs(Role::Drone).unwrap();
+        let relay = jobs[0].network.environment();
+        assert!(relay.contains(&("ALIGHT_INSECURE", "true".into())), "{relay:?}");
+    }
+
+    #[test]
+    fn a_detector_on_the_ground_needs_the_key_of_its_name() {
+        let (_home, other) = example_with_keys(|text| text.replace("id=ground", "id=laptop"));
+        let problem = format!("{:#}", other.jobs(Role::Ground).unwrap_err());
+        assert!(problem.contains("--role detector --name laptop"), "{problem}");
     }
 
     #[test]

@@ -18,6 +18,7 @@ use messages::{
 use node::{Layers, Node, Presence, Shutdown, Subscriber};
 use rustix::process::{Pid, Signal, kill_process_group};
 use serde::Serialize;
+use tempfile::TempDir;
 use tokio::process::{Child, Command};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
@@ -117,11 +118,10 @@ async fn swap(args: &SwapArgs, node: &Node, shutdown: &Shutdown) -> anyhow::Resu
     let mut report = Report {
         from: first.active_detector.clone(),
         to: new_detector.id.clone(),
-        log: new_detector.log.clone(),
         ..Report::default()
     };
-    let child = new_detector.start(args)?;
-    report.pid = child.id();
+    let (child, log) = new_detector.start(args)?;
+    (report.pid, report.log) = (child.id(), log);
     let mut swap = Swap {
         args,
         node,
@@ -166,17 +166,11 @@ struct NewDetector {
     args: Vec<String>,
     /// Its name, if known beforehand.
     id: Option<String>,
-    log: Option<PathBuf>,
 }
 
 impl NewDetector {
     fn new(args: &SwapArgs, existing: &BTreeSet<String>) -> anyhow::Result<Self> {
         let file = Path::new(&args.to);
-        let log = match (&args.log, args.wait) {
-            (Some(log), _) => Some(log.clone()),
-            (None, true) => None,
-            (None, false) => Some(private_folder()?.join("detector.log")),
-        };
         if file.extension().is_some_and(|extension| extension == "toml") {
             let layers = Layers { file: Some(file.to_owned()), set: Vec::new() };
             let wanted = match &args.id {
@@ -190,7 +184,6 @@ impl NewDetector {
             return Ok(Self {
                 program: std::env::current_exe().context("finding this program's own file")?,
                 args: words.map(str::to_owned).into(),
-                log,
                 id: Some(id),
             });
         }
@@ -199,27 +192,39 @@ impl NewDetector {
             .with_context(|| format!("`{}` is not a command: a quote is missing", args.to))?
             .into_iter();
         let program = words.next().unwrap_or_default().into();
-        Ok(Self { program, args: words.collect(), id: args.id.clone(), log })
+        Ok(Self { program, args: words.collect(), id: args.id.clone() })
     }
 
-    fn start(&self, args: &SwapArgs) -> anyhow::Result<Child> {
+    /// Starts it; returns its process and its log.
+    fn start(&self, args: &SwapArgs) -> anyhow::Result<(Child, Option<PathBuf>)> {
+        // Removed again when the start fails.
+        let mut folder = None;
+        let log = match (&args.log, args.wait) {
+            (Some(log), _) => Some(log.clone()),
+            (None, true) => None,
+            (None, false) => Some(folder.insert(private_folder()?).path().join("detector.log")),
+        };
         let mut command = Command::new(&self.program);
         command.args(&self.args).envs(args.network.network().environment()).stdin(Stdio::null());
-        if let Some(log) = &self.log {
+        if let Some(log) = &log {
             let file = File::create(log).with_context(|| format!("writing the log {log:?}"))?;
             command.stdout(file.try_clone()?).stderr(file);
         }
         // The detector outlives this program, also after Ctrl-C in its terminal.
         command.process_group(0);
-        command.spawn().with_context(|| format!("starting {}", self.program.display()))
+        let child =
+            command.spawn().with_context(|| format!("starting {}", self.program.display()))?;
+        // The log stays, as the detector does.
+        drop(folder.map(TempDir::keep));
+        Ok((child, log))
     }
 }
 
 /// A new folder for temporary files that only this user can access: a file of a predictable name in a shared
 /// directory could be a link that somebody else placed there.
-fn private_folder() -> anyhow::Result<PathBuf> {
+fn private_folder() -> anyhow::Result<TempDir> {
     let folder = tempfile::Builder::new().prefix("alight-").tempdir();
-    Ok(folder.context("making a private folder for the log")?.keep())
+    folder.context("making a private folder for the log")
 }
 
 /// The name itself, or the first free one with a number.

@@ -171,7 +171,7 @@ impl Site {
     /// Starts the drone's end of the air link.
     pub(crate) fn relay(&mut self) -> anyhow::Result<()> {
         let address = self.drone_address();
-        self.drone("relay", &["--zenoh", "drone", "--listen", &address])
+        self.drone("relay", &["--zenoh", "drone", "--listen", &address, "--insecure"])
     }
 
     /// Starts a simulated flight: world, camera, autopilot and controller.

@@ -4,10 +4,12 @@
 //! This is the only crate that uses Zenoh. It knows nothing of images, markers or autopilots.
 //!
 //! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
-//! service from start to shutdown; [`network`] configures the network, and [`session`] joins it under an
-//! [`identity`]; [`topics`] has typed messages and [`frames`] pixels; [`health`] counts, with [`stats`];
-//! [`denied`] counts what access control denies; [`clock`] is the host's clock.
+//! service from start to shutdown; [`network`] configures the network, with the rights of others from
+//! [`access`], and [`session`] joins it under an [`identity`]; [`topics`] has typed messages and [`frames`]
+//! pixels; [`health`] counts, with [`stats`]; [`denied`] counts what access control denies; [`clock`] is the
+//! host's clock.
 
+pub mod access;
 pub mod clock;
 pub mod config;
 pub mod denied;
@@ -25,7 +27,7 @@ pub use config::{Check, ConfigError, Effective, Layers, Settings, changed};
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
 pub use identity::Identity;
-pub use network::Network;
+pub use network::{INSECURE, Network};
 pub use service::{Options, Shutdown, relaunch_with_zenoh_threads, run, start_logging};
 pub use session::{Node, Presence, ZenohSource};
 pub use topics::{Commands, Publisher, Request, Subscriber};

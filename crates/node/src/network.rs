@@ -4,11 +4,14 @@
 //! differ from site to site and are filled in here, so that no site needs files of its own.
 
 use std::ffi::OsString;
+use std::net::IpAddr;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, bail, ensure};
 use serde_json::{Value, json};
 
+use crate::access::{HOLDERS, access_control};
 use crate::config::{NAME_RULE, is_name};
 use crate::session::{LOCAL_CONFIG, LOCAL_PORT, ZenohSource};
 
@@ -23,6 +26,9 @@ pub const SECURED_CONFIG: &str = include_str!("../../../zenoh-config/secured.jso
 
 /// The port of the air link for control; the next two are for frames.
 pub const AIR_PORT: u16 = 7448;
+
+/// The reason for which a process that everybody in reach may command counts an error in its health.
+pub const INSECURE: &str = "insecure: without keys anyone in reach can command the vehicle";
 
 /// The file name of the authority's certificate in a directory of keys.
 pub const AUTHORITY: &str = "authority.pem";
@@ -48,6 +54,8 @@ pub mod variable {
     pub const VEHICLE: &str = "ALIGHT_VEHICLE";
     /// [`Network::keys`](super::Network::keys).
     pub const KEYS: &str = "ALIGHT_KEYS";
+    /// [`Network::insecure`](super::Network::insecure).
+    pub const INSECURE: &str = "ALIGHT_INSECURE";
 }
 
 /// A network to join. The default is local to this machine.
@@ -66,15 +74,27 @@ pub struct Network {
     pub meet: Option<u16>,
     /// The directory with the keys; enables TLS and access control.
     pub keys: Option<PathBuf>,
+    /// Whether it may listen beyond this machine without keys.
+    pub insecure: bool,
 }
 
 impl Network {
-    /// The session's configuration for a process with the certificate of `role`.
+    /// The session's configuration for a process with the key `key_name` ([`crate::access::key_name`]).
     ///
     /// # Errors
     /// When a file cannot be read or is not a configuration, or when an address is missing or invalid.
-    pub fn source(&self, role: &str) -> anyhow::Result<ZenohSource> {
-        Ok(ZenohSource::Text(serde_json::to_string(&self.configuration(role)?)?))
+    pub fn source(&self, key_name: &str) -> anyhow::Result<ZenohSource> {
+        Ok(ZenohSource::Text(serde_json::to_string(&self.configuration(key_name)?)?))
+    }
+
+    /// Whether it is allowed to listen beyond this machine without keys, and does.
+    ///
+    /// # Errors
+    /// As [`Network::source`].
+    pub fn is_open(&self) -> anyhow::Result<bool> {
+        Ok(self.insecure
+            && self.keys.is_none()
+            && open_endpoint(&self.configuration("")?).is_some())
     }
 
     /// This network as environment variables, for a child process.
@@ -88,6 +108,7 @@ impl Network {
             (variable::MEET, self.meet.map(|port| port.to_string().into())),
             (variable::VEHICLE, text(&self.vehicle)),
             (variable::KEYS, path(&self.keys)),
+            (variable::INSECURE, self.insecure.then(|| "true".into())),
         ];
         all.into_iter().filter_map(|(name, value)| Some((name, value?))).collect()
     }
@@ -96,7 +117,7 @@ impl Network {
     ///
     /// # Errors
     /// As [`Network::source`].
-    pub fn configuration(&self, role: &str) -> anyhow::Result<Value> {
+    pub fn configuration(&self, key_name: &str) -> anyhow::Result<Value> {
         let (name, text) = self.text()?;
         let mut config = parse(&name, &text)?;
         if let Some(vehicle) = &self.vehicle {
@@ -104,7 +125,7 @@ impl Network {
             config["namespace"] = json!(vehicle);
         }
         if let Some(keys) = &self.keys {
-            secure(&mut config, keys, role).with_context(|| format!("securing {name}"))?;
+            secure(&mut config, keys, key_name).with_context(|| format!("securing {name}"))?;
         }
         if let Some(port) = self.meet {
             each_endpoint(&mut config, &["connect", "listen"], |e| e.move_rendezvous(port));
@@ -122,6 +143,13 @@ impl Network {
             !missing,
             "{name} needs the address of the drone: `--connect ADDRESS`, or ALIGHT_CONNECT in the environment"
         );
+        if let Some(endpoint) = open_endpoint(&config).filter(|_| !self.insecure) {
+            bail!(
+                "{name} listens beyond this machine ({endpoint}) without keys, so anyone in reach could command the \
+                 vehicle. Make keys (`alight keys`, docs/deploy.md) and give them with `--keys DIRECTORY` (`keys` in \
+                 the site), or allow it with `--insecure` (`insecure = true` in the site)"
+            );
+        }
         check_access(&config).with_context(|| name.clone())?;
         Ok(config)
     }
@@ -179,22 +207,25 @@ fn parse(name: &str, text: &str) -> anyhow::Result<Value> {
     json5::from_str(text).map_err(|cause| anyhow!("{name} is not JSON5: {cause}"))
 }
 
-/// Adds TLS and access control to a configuration.
-fn secure(config: &mut Value, keys: &Path, role: &str) -> anyhow::Result<()> {
+/// Adds TLS to a configuration, and access control where others connect.
+fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()> {
     // The services on the drone use its loopback interface, where everybody with a login is trusted.
     let connects_locally = endpoints(config, "connect").any(|e| e.contains(LOOPBACK));
     let listens_locally = endpoints(config, "listen").all(|e| e.contains(LOOPBACK));
     if connects_locally && listens_locally {
         return Ok(());
     }
-    for file in [AUTHORITY.to_owned(), format!("{role}.pem"), format!("{role}.key")] {
-        let path = keys.join(&file);
+    let key_file = format!("{key_name}.key");
+    for file in [AUTHORITY, &format!("{key_name}.pem"), &key_file] {
+        let path = keys.join(file);
         ensure!(
             path.is_file(),
-            "missing key file {path:?}; make it with `alight keys issue --role {role} -o {}`",
+            "missing key file {path:?}; make it with `alight keys issue {} -o {}`",
+            issue_arguments(key_name),
             keys.display()
         );
     }
+    check_private(&keys.join(key_file))?;
     each_endpoint(config, &["connect", "listen"], |e| {
         if !(connects_locally && e.host == LOOPBACK) {
             e.protocol = "tls".to_owned();
@@ -204,11 +235,71 @@ fn secure(config: &mut Value, keys: &Path, role: &str) -> anyhow::Result<()> {
     let directory = keys.to_str().context("the path of the key directory is not valid UTF-8")?;
     for value in layer["transport"]["link"]["tls"].as_object_mut().into_iter().flatten() {
         if let Some(file) = value.1.as_str() {
-            *value.1 = json!(file.replace("DIRECTORY", directory).replace("NAME", role));
+            *value.1 = json!(file.replace("DIRECTORY", directory).replace("NAME", key_name));
         }
+    }
+    if listens_locally {
+        // Only this machine connects here; what is said across the air link is judged by the relay.
+        layer.as_object_mut().and_then(|layer| layer.remove("access_control"));
+    } else {
+        let path = keys.join(HOLDERS);
+        let text = std::fs::read_to_string(&path).with_context(|| {
+            format!("reading {path:?}, the list of those who may connect; copy it from the authority's directory")
+        })?;
+        let holders = text.parse().with_context(|| format!("{path:?}"))?;
+        let vehicle =
+            config["namespace"].as_str().context("the configuration has no `namespace`")?;
+        layer["access_control"] = access_control(&layer["access_control"], &holders, vehicle)?;
     }
     merge(config, layer);
     Ok(())
+}
+
+/// The arguments with which `alight keys issue` makes a key.
+fn issue_arguments(key_name: &str) -> String {
+    match key_name.split_once('.') {
+        Some((role, name)) => format!("--role {role} --name {name}"),
+        None => format!("--role {key_name}"),
+    }
+}
+
+/// Refuses a private key that other users can read.
+///
+/// # Errors
+/// Says how to mend it.
+pub fn check_private(path: &Path) -> anyhow::Result<()> {
+    let file = std::fs::metadata(path).with_context(|| format!("reading {path:?}"))?;
+    let mode = file.permissions().mode() & 0o777;
+    ensure!(
+        mode & 0o077 == 0,
+        "the private key {path:?} is open to other users (mode {mode:o}): `chmod 600 {}`; if somebody may have read \
+         it, revoke it (`alight keys revoke`) and make another",
+        path.display()
+    );
+    Ok(())
+}
+
+/// An endpoint at which everybody in reach may connect to this configuration; `None` if only this machine or
+/// holders of a certificate may.
+fn open_endpoint(config: &Value) -> Option<String> {
+    let asks_for_certificates = config["transport"]["link"]["tls"]["enable_mtls"] == true;
+    let is_open = |endpoint: &str| {
+        let protocol = endpoint.split('/').next().unwrap_or_default();
+        match protocol {
+            "unixsock-stream" | "unixpipe" | "serial" => false,
+            "tls" | "quic" if asks_for_certificates => false,
+            _ => Endpoint::parse(endpoint).is_none_or(|endpoint| !endpoint.is_local()),
+        }
+    };
+    let listen = &config["listen"]["endpoints"];
+    if listen.is_null() {
+        // Zenoh then listens on every interface, unless it is a client.
+        return (config["mode"] != "client").then(|| "Zenoh's default endpoint".to_owned());
+    }
+    // A list, or one for each mode.
+    let lists = listen.as_object().into_iter().flat_map(|modes| modes.values());
+    let all = lists.chain([listen]).filter_map(Value::as_array).flatten();
+    all.filter_map(Value::as_str).find(|endpoint| is_open(endpoint)).map(str::to_owned)
 }
 
 fn merge(below: &mut Value, above: Value) {
@@ -287,6 +378,12 @@ impl Endpoint {
         format!("{}/{}:{}{}", self.protocol, self.host, self.port, self.rest)
     }
 
+    /// Whether only processes of this machine can connect there.
+    fn is_local(&self) -> bool {
+        let host = self.host.trim_matches(['[', ']']);
+        host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+    }
+
     /// Replaces a host; the ports keep their offsets from the first one.
     fn redirect(&mut self, replaced: &str, address: &Address) {
         if self.host == replaced {
@@ -334,7 +431,8 @@ mod tests {
     #[test]
     fn zenoh_takes_every_built_in_configuration() {
         for name in ["local", "drone", "ground", "relay"] {
-            let network = Network { connect: Some("10.0.0.1".into()), ..built_in(name) };
+            let connect = Some("10.0.0.1".into());
+            let network = Network { connect, insecure: true, ..built_in(name) };
             let config = configured(&network).unwrap();
             zenoh::Config::from_json5(&config.to_string()).unwrap();
             assert_eq!(config["namespace"], "drone");
@@ -357,7 +455,8 @@ mod tests {
         );
         assert_eq!(ends("uav.local:9000")[1], "tcp/uav.local:9001?prio=5-6");
         assert_eq!(ends("fe80::1")[0], "tcp/[fe80::1]:7448?prio=1-4#dscp=0xb8");
-        let network = Network { listen: Some("10.0.0.7:9000".into()), ..built_in("drone") };
+        let listen = Some("10.0.0.7:9000".into());
+        let network = Network { listen, insecure: true, ..built_in("drone") };
         let listens: Vec<_> =
             endpoints(&configured(&network).unwrap(), "listen").map(str::to_owned).collect();
         assert_eq!(
@@ -390,6 +489,67 @@ mod tests {
             Network { keys, connect, ..built_in("ground") },
             "alight keys issue --role detector",
         );
+    }
+
+    #[test]
+    fn nobody_listens_beyond_this_machine_without_keys_unless_told() {
+        let open = |network: &Network| configured(network).err();
+        for name in ["drone", "relay"] {
+            let network = Network { connect: Some("10.0.0.1".into()), ..built_in(name) };
+            let problem = open(&network).unwrap();
+            assert!(
+                problem.contains("0.0.0.0:7448") && problem.contains("--insecure"),
+                "{problem}"
+            );
+            assert!(!network.is_open().is_ok_and(|is_open| is_open));
+            let allowed = Network { insecure: true, ..network.clone() };
+            assert!(open(&allowed).is_none() && allowed.is_open().unwrap());
+            let local = Network { listen: Some("127.0.0.1:9000".into()), ..network };
+            assert!(open(&local).is_none());
+            let local = Network { insecure: true, ..local };
+            assert!(!local.is_open().unwrap(), "nobody outside reaches it");
+        }
+        for (text, is_open) in [
+            ("{}", true),
+            ("{ mode: 'client' }", false),
+            ("{ listen: { endpoints: ['tcp/[::]:7447'] } }", true),
+            ("{ listen: { endpoints: ['tcp/[::1]:7447', 'tcp/localhost:1'] } }", false),
+            ("{ listen: { endpoints: { peer: ['tcp/10.0.0.1:0'] } } }", true),
+            ("{ listen: { endpoints: ['tls/0.0.0.0:7447'] } }", true),
+            (
+                "{ listen: { endpoints: ['tls/0.0.0.0:7447'] },
+                   transport: { link: { tls: { enable_mtls: true } } } }",
+                false,
+            ),
+            ("{ listen: { endpoints: ['udp/0.0.0.0:7447'] } }", true),
+        ] {
+            let config = parse("a test", text).unwrap();
+            assert_eq!(open_endpoint(&config).is_some(), is_open, "{text}");
+        }
+    }
+
+    #[test]
+    fn keys_that_others_can_read_are_refused() {
+        let keys = tempfile::tempdir().unwrap();
+        for file in [AUTHORITY, "operator.pem", "operator.key"] {
+            std::fs::write(keys.path().join(file), "").unwrap();
+        }
+        let network = Network {
+            keys: Some(keys.path().to_owned()),
+            connect: Some("10.0.0.1".into()),
+            ..built_in("ground")
+        };
+        let key = keys.path().join("operator.key");
+        for (mode, is_private) in [(0o644, false), (0o640, false), (0o600, true), (0o400, true)] {
+            std::fs::set_permissions(&key, std::fs::Permissions::from_mode(mode)).unwrap();
+            let result = network.configuration("operator").map_err(|cause| format!("{cause:#}"));
+            match result {
+                Ok(_) => assert!(is_private, "{mode:o}"),
+                Err(problem) => {
+                    assert!(!is_private && problem.contains("chmod 600"), "{mode:o}: {problem}");
+                }
+            }
+        }
     }
 
     #[test]

@@ -1,11 +1,15 @@
 //! The log texts by which [`node::denied`] recognises denials are those of the Zenoh version in use: a real
 //! message without access rights, and a real connection with the certificate of another authority.
 
+use std::fs::{OpenOptions, Permissions};
+use std::io::Write;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::time::Duration;
 
 use anyhow::Context;
 use messages::{Wind, topic};
+use node::access::{HOLDERS, Holder};
 use node::denied::{self, ACCESS_TARGET, CONNECTION_TARGET};
 use node::network::AUTHORITY;
 use node::{Identity, Network, Node};
@@ -35,11 +39,12 @@ impl Authority {
         Ok(Self { pem, issuer })
     }
 
-    /// Writes the key of a role, its certificate and that of the authority.
-    fn issue(&self, folder: &Path, role: &str) -> anyhow::Result<()> {
+    /// Writes the key of a holder, its certificate and that of the authority, and lists it.
+    fn issue(&self, folder: &Path, holder: &str) -> anyhow::Result<()> {
+        let holder: Holder = holder.parse()?;
         let mut params = CertificateParams::new(vec!["127.0.0.1".to_owned()])?;
         params.distinguished_name = DistinguishedName::new();
-        params.distinguished_name.push(DnType::CommonName, role);
+        params.distinguished_name.push(DnType::CommonName, holder.to_string());
         params.use_authority_key_identifier_extension = true;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages =
@@ -47,8 +52,13 @@ impl Authority {
         let key = KeyPair::generate()?;
         let certificate = params.signed_by(&key, &self.issuer)?;
         std::fs::write(folder.join(AUTHORITY), &self.pem)?;
-        std::fs::write(folder.join(format!("{role}.key")), key.serialize_pem())?;
-        std::fs::write(folder.join(format!("{role}.pem")), certificate.pem())?;
+        let name = holder.key_name();
+        let private = folder.join(format!("{name}.key"));
+        std::fs::write(&private, key.serialize_pem())?;
+        std::fs::set_permissions(private, Permissions::from_mode(0o600))?;
+        std::fs::write(folder.join(format!("{name}.pem")), certificate.pem())?;
+        let mut list = OpenOptions::new().create(true).append(true).open(folder.join(HOLDERS))?;
+        writeln!(list, "{holder}")?;
         Ok(())
     }
 }
@@ -89,9 +99,9 @@ async fn real_denials_are_counted() -> anyhow::Result<()> {
     node::start_logging("off");
     let (keys, foreign_keys) = (tempfile::tempdir()?, tempfile::tempdir()?);
     let authority = Authority::new()?;
-    authority.issue(keys.path(), "drone")?;
-    authority.issue(keys.path(), "detector")?;
-    Authority::new()?.issue(foreign_keys.path(), "detector")?;
+    authority.issue(keys.path(), "drone@drone")?;
+    authority.issue(keys.path(), "detector.main@drone")?;
+    Authority::new()?.issue(foreign_keys.path(), "detector.main@drone")?;
     let ([meet], air, _) = ports::free()?;
     let air = format!("127.0.0.1:{air}");
     let drone = Network {
@@ -106,13 +116,13 @@ async fn real_denials_are_counted() -> anyhow::Result<()> {
     let _winds = relay.subscriber(topic::WIND, &[]).await?;
 
     // A detector has no right to publish the wind.
-    let detector = open("detector", "detector", keys.path(), ground.clone()).await?;
+    let detector = open("detector", "detector.main", keys.path(), ground.clone()).await?;
     let publisher = detector.publisher(topic::WIND, &[]).await?;
     let wind = Wind { velocity_ned_m_s: [1.0, 2.0, 3.0], stamp_ns: 7 };
     until_denied("put on drone/wind", ACCESS_TARGET, async || publisher.publish(&wind).await)
         .await?;
 
     // The session opens without a connection, and retries it.
-    let _stranger = open("detector", "detector", foreign_keys.path(), ground).await?;
+    let _stranger = open("detector", "detector.main", foreign_keys.path(), ground).await?;
     until_denied("connection", CONNECTION_TARGET, async || {}).await
 }

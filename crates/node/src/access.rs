@@ -1,0 +1,320 @@
+//! Who may connect to a relay, and what each may say.
+//!
+//! The common name of a certificate is `ROLE@VEHICLE` or `ROLE.NAME@VEHICLE`. A relay lets in whom its list of
+//! holders names, of its own vehicle and not revoked; a detector may publish as itself only. Zenoh compares
+//! common names as they are, so each holder becomes a subject of its access control.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::str::FromStr;
+
+use anyhow::{Context, anyhow, ensure};
+use serde_json::{Value, json};
+
+use crate::config::{NAME_RULE, is_name};
+
+/// The file name of the list of holders in a directory of keys.
+pub const HOLDERS: &str = "holders.txt";
+
+/// The role whose rights are bound to a name.
+const DETECTOR: &str = "detector";
+/// The beginning of all keys in the rules: any vehicle.
+const ANY_VEHICLE: &str = "*/";
+/// What a line of a revoked holder begins with.
+const REVOKED: &str = "revoked ";
+const HEADING: &str = "\
+# Who may connect to a relay: the common names of the certificates, one a line; `revoked` before a name shuts it out.
+# `alight keys` keeps this list in the directory of the authority; every relay needs a copy of it among its keys.
+";
+
+/// The holder of a certificate.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Holder {
+    role: String,
+    name: Option<String>,
+    vehicle: String,
+}
+
+impl Holder {
+    /// A holder; a detector has the name of its instance.
+    ///
+    /// # Errors
+    /// When a part is not a name, or a detector has none.
+    pub fn new(role: &str, name: Option<&str>, vehicle: &str) -> anyhow::Result<Self> {
+        for part in [Some(role), name, Some(vehicle)].into_iter().flatten() {
+            ensure!(is_name(part), "invalid name `{part}`: {NAME_RULE}");
+        }
+        ensure!(
+            role != DETECTOR || name.is_some(),
+            "the key of a detector needs the detector's name: add `--name ID`"
+        );
+        let (role, name) = (role.to_owned(), name.map(str::to_owned));
+        Ok(Self { role, name, vehicle: vehicle.to_owned() })
+    }
+
+    /// The role.
+    pub fn role(&self) -> &str {
+        &self.role
+    }
+
+    /// The vehicle.
+    pub fn vehicle(&self) -> &str {
+        &self.vehicle
+    }
+
+    /// The name of its files, without the extension: a machine may have the keys of several detectors.
+    pub fn key_name(&self) -> String {
+        key_name(&self.role, self.name.as_deref().unwrap_or_default())
+    }
+}
+
+/// The name of the files of a key, without the extension: the role, and of a detector also its name.
+pub fn key_name(role: &str, instance: &str) -> String {
+    if role == DETECTOR { format!("{role}.{instance}") } else { role.to_owned() }
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.role)?;
+        if let Some(name) = &self.name {
+            write!(f, ".{name}")?;
+        }
+        write!(f, "@{}", self.vehicle)
+    }
+}
+
+impl FromStr for Holder {
+    type Err = anyhow::Error;
+
+    fn from_str(text: &str) -> anyhow::Result<Self> {
+        let (who, vehicle) = text
+            .split_once('@')
+            .with_context(|| format!("`{text}` is not ROLE@VEHICLE or ROLE.NAME@VEHICLE"))?;
+        match who.split_once('.') {
+            Some((role, name)) => Self::new(role, Some(name), vehicle),
+            None => Self::new(who, None, vehicle),
+        }
+    }
+}
+
+/// The list of holders.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Holders {
+    admitted: BTreeSet<Holder>,
+    revoked: BTreeSet<Holder>,
+}
+
+impl Holders {
+    /// Adds a holder.
+    ///
+    /// # Errors
+    /// When it was revoked: the old certificate has the same name.
+    pub fn admit(&mut self, holder: &Holder) -> anyhow::Result<()> {
+        ensure!(
+            !self.revoked.contains(holder),
+            "`{holder}` was revoked, and a new key of this name would let the old one in again; give another `--name`"
+        );
+        self.admitted.insert(holder.clone());
+        Ok(())
+    }
+
+    /// Shuts a holder out for good.
+    ///
+    /// # Errors
+    /// When it is not in the list.
+    pub fn revoke(&mut self, holder: &Holder) -> anyhow::Result<()> {
+        ensure!(
+            self.admitted.remove(holder) || self.revoked.contains(holder),
+            "no key was issued to `{holder}`; {HOLDERS} beside the authority's key lists all"
+        );
+        self.revoked.insert(holder.clone());
+        Ok(())
+    }
+
+    /// The holders of a vehicle's keys in a role.
+    fn of<'a>(&'a self, role: &'a str, vehicle: &'a str) -> impl Iterator<Item = &'a Holder> {
+        let of_both = move |holder: &&Holder| holder.role == role && holder.vehicle == vehicle;
+        self.admitted.iter().filter(of_both)
+    }
+}
+
+impl fmt::Display for Holders {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(HEADING)?;
+        self.admitted.iter().try_for_each(|holder| writeln!(f, "{holder}"))?;
+        self.revoked.iter().try_for_each(|holder| writeln!(f, "{REVOKED}{holder}"))
+    }
+}
+
+impl FromStr for Holders {
+    type Err = anyhow::Error;
+
+    fn from_str(text: &str) -> anyhow::Result<Self> {
+        let mut holders = Self::default();
+        for line in text.lines().map(str::trim).filter(|l| !l.is_empty() && !l.starts_with('#')) {
+            match line.strip_prefix(REVOKED) {
+                Some(name) => drop(holders.revoked.insert(name.trim().parse()?)),
+                None => drop(holders.admitted.insert(line.parse()?)),
+            }
+        }
+        // Of two lines about one holder the stricter holds.
+        holders.admitted.retain(|holder| !holders.revoked.contains(holder));
+        Ok(holders)
+    }
+}
+
+/// The access control of a vehicle's relay: the rules of all roles, for these holders and this vehicle.
+///
+/// # Errors
+/// When the rules are not as expected.
+pub fn access_control(rules: &Value, holders: &Holders, vehicle: &str) -> anyhow::Result<Value> {
+    let list = |key: &str| -> anyhow::Result<&Vec<Value>> {
+        rules[key].as_array().ok_or_else(|| anyhow!("`access_control.{key}` is not a list"))
+    };
+    let detectors: Vec<&Holder> = holders.of(DETECTOR, vehicle).collect();
+    let mut subjects = Vec::new();
+    for subject in list("subjects")? {
+        let Some(roles) = subject["cert_common_names"].as_array() else {
+            subjects.push(subject.clone());
+            continue;
+        };
+        let roles: Vec<&str> = roles.iter().filter_map(Value::as_str).collect();
+        let of_roles = roles.iter().flat_map(|role| holders.of(role, vehicle));
+        let mut named = subject.clone();
+        if roles == [DETECTOR] {
+            for holder in of_roles {
+                named["id"] = json!(holder.to_string());
+                named["cert_common_names"] = json!([holder.to_string()]);
+                subjects.push(named.clone());
+            }
+        } else {
+            let names: Vec<String> = of_roles.map(ToString::to_string).collect();
+            // Without a name the subject would be everybody.
+            if !names.is_empty() {
+                named["cert_common_names"] = json!(names);
+                subjects.push(named);
+            }
+        }
+    }
+    let known: BTreeSet<&str> = subjects.iter().filter_map(|s| s["id"].as_str()).collect();
+    let mut policies = Vec::new();
+    for policy in list("policies")? {
+        let names = policy["subjects"].as_array().into_iter().flatten().filter_map(Value::as_str);
+        for subject in names {
+            if subject == DETECTOR {
+                policies.extend(detectors.iter().map(|holder| {
+                    let rules = policy["rules"].as_array().into_iter().flatten();
+                    let rules = rules.filter_map(Value::as_str).map(|rule| bound_id(rule, holder));
+                    json!({ "rules": rules.collect::<Vec<_>>(), "subjects": [holder.to_string()] })
+                }));
+            } else if known.contains(subject) {
+                policies.push(json!({ "rules": policy["rules"], "subjects": [subject] }));
+            }
+        }
+    }
+    let mut bound = Vec::new();
+    for rule in list("rules")? {
+        let id = rule["id"].as_str().unwrap_or_default();
+        if is_of_detectors(id) {
+            bound.extend(detectors.iter().map(|holder| {
+                let mut own = with_keys(rule, |key| bound_key(key, holder));
+                own["id"] = json!(bound_id(id, holder));
+                own
+            }));
+        } else {
+            bound.push(with_keys(rule, |key| of_vehicle(key, vehicle)));
+        }
+    }
+    bound.retain(|rule| policies.iter().any(|policy| names_rule(policy, &rule["id"])));
+    let mut access = rules.clone();
+    access["rules"] = json!(bound);
+    access["subjects"] = json!(subjects);
+    access["policies"] = json!(policies);
+    Ok(access)
+}
+
+fn names_rule(policy: &Value, id: &Value) -> bool {
+    policy["rules"].as_array().is_some_and(|rules| rules.contains(id))
+}
+
+fn is_of_detectors(rule: &str) -> bool {
+    rule.starts_with(DETECTOR)
+}
+
+/// The id of a rule for one holder; the rules of detectors are bound to it.
+fn bound_id(rule: &str, holder: &Holder) -> String {
+    if is_of_detectors(rule) { format!("{rule} of {holder}") } else { rule.to_owned() }
+}
+
+fn with_keys(rule: &Value, change: impl Fn(&str) -> String) -> Value {
+    let keys = rule["key_exprs"].as_array().into_iter().flatten().filter_map(Value::as_str);
+    let keys: Vec<String> = keys.map(change).collect();
+    let mut changed = rule.clone();
+    changed["key_exprs"] = json!(keys);
+    changed
+}
+
+fn of_vehicle(key: &str, vehicle: &str) -> String {
+    match key.strip_prefix(ANY_VEHICLE) {
+        Some(rest) => format!("{vehicle}/{rest}"),
+        None => key.to_owned(),
+    }
+}
+
+/// A key in the rules of detectors, for one detector: its name is behind the chunk `detector`.
+fn bound_key(key: &str, holder: &Holder) -> String {
+    let name = holder.name.as_deref().unwrap_or_default();
+    let key = of_vehicle(key, &holder.vehicle);
+    match key.strip_suffix(&format!("/{DETECTOR}/**")) {
+        Some(front) => format!("{front}/{DETECTOR}/{name}/**"),
+        None => key.replacen(&format!("/{DETECTOR}/*"), &format!("/{DETECTOR}/{name}"), 1),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn holders(text: &str) -> Holders {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn names_are_read_as_they_are_written() {
+        for text in ["operator@drone", "detector.ground@kestrel", "operator.alice@drone"] {
+            assert_eq!(text.parse::<Holder>().unwrap().to_string(), text);
+        }
+        for text in ["", "operator", "detector@drone", "operator@", "a b@drone", "x.y.z@drone"] {
+            assert!(text.parse::<Holder>().is_err(), "{text}");
+        }
+        let list = holders("operator@drone\n# x\n\nrevoked detector.old@drone\n");
+        assert_eq!(list.to_string().parse::<Holders>().unwrap(), list);
+    }
+
+    #[test]
+    fn the_revoked_stay_out() {
+        let mut list = holders("operator@drone\nrevoked operator@drone\n");
+        assert_eq!(list.of("operator", "drone").count(), 0);
+        let operator: Holder = "operator@drone".parse().unwrap();
+        let problem = list.admit(&operator).unwrap_err().to_string();
+        assert!(problem.contains("another `--name`"), "{problem}");
+        let unknown = "operator.bob@drone".parse().unwrap();
+        assert!(list.revoke(&unknown).is_err());
+        list.admit(&unknown).unwrap();
+        list.revoke(&unknown).unwrap();
+        assert_eq!(list.of("operator", "drone").count(), 0);
+    }
+
+    #[test]
+    fn a_detectors_keys_are_bound_to_its_name_and_vehicle() {
+        let holder: Holder = "detector.ground@kestrel".parse().unwrap();
+        for (key, bound) in [
+            ("*/detector/*/detections", "kestrel/detector/ground/detections"),
+            ("*/detector/*/debug/*", "kestrel/detector/ground/debug/*"),
+            ("*/health/detector/*", "kestrel/health/detector/ground"),
+            ("*/alive/detector/**", "kestrel/alive/detector/ground/**"),
+        ] {
+            assert_eq!(bound_key(key, &holder), bound);
+        }
+    }
+}
