@@ -9,9 +9,10 @@ use autopilot::compose::heartbeat;
 use autopilot::dialect::{MavMessage, MavSeverity, MavState};
 use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
-use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Sender};
-use messages::{ControllerStatus, MavlinkBytes, Phase, TargetEstimate, topic};
-use node::{HealthCounters, Node, Shutdown, now_ns};
+use autopilot::permission::Refusal;
+use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Permission, Sender};
+use messages::{ControllerStatus, Health, MavlinkBytes, Phase, TargetEstimate, topic};
+use node::{HealthCounters, INSECURE, Node, Shutdown, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::config::Config;
@@ -34,15 +35,19 @@ const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     let address: Address = config.ground.parse()?;
     node.claim_unique_name(&node.identity().instance).await?;
-    let mut ground = Link::open(address).await.context("opening the link to the ground station")?;
+    let mut ground = Link::open_for(address, config.peering())
+        .await
+        .context("opening the link to the ground station")?;
     let from_autopilot = node.subscriber(topic::FROM_AUTOPILOT, &[]).await?;
     let to_autopilot = node.publisher(topic::TO_AUTOPILOT, &[]).await?;
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let targets = node.subscriber(topic::TARGET, &[]).await?;
     let controllers = node.presence("controller").await?;
+    // A relay that takes anybody's commands says so in its health.
+    let relays = node.subscriber(topic::HEALTH, &["relay", "*"]).await?;
     let mut second = interval(HEARTBEAT);
     second.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut bridge = Bridge::new(&config, ground.sender(), node.shared_health());
+    let mut bridge = Bridge::new(&config, ground.sender(), node.shared_health())?;
     node.announce().await?;
     tracing::info!(ground = config.ground, "Ready");
     loop {
@@ -62,20 +67,29 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                 let (controller, is_there) = change.context(CLOSED)?;
                 bridge.controller(now_ns(), controller, is_there);
             }
+            health = relays.next() => bridge.relay(now_ns(), &health.context(CLOSED)?),
             _ = second.tick() => {
                 bridge.count_losses(ground.counters(), ground.dropped());
+                bridge.count_strangers(ground.strangers());
                 bridge.every_second(now_ns());
             }
         }
     }
 }
 
+/// Maximum number of controllers that are followed; there is one, and another while it is replaced.
+const MAX_CONTROLLERS: usize = 16;
+/// Minimum pause between two texts about refused packets, in nanoseconds.
+const REFUSAL_PAUSE_NS: i64 = 5_000_000_000;
+
 const CLOSED: &str = "the network session was closed";
 
 /// The bridge between two packets.
 struct Bridge {
     component: u8,
-    forwards: bool,
+    permission: Permission,
+    /// When the ground station was told of a refusal.
+    refusal_ns: Option<i64>,
     ground: LinkSender,
     health: Arc<HealthCounters>,
     vehicle: Vehicle,
@@ -87,22 +101,32 @@ struct Bridge {
     controllers: BTreeSet<String>,
     /// True once the last controller has gone.
     is_abandoned: bool,
+    /// A relay says that it takes anybody's commands.
+    is_insecure: bool,
+    /// The ground station has been told so.
+    insecure_told: bool,
     ground_ns: Option<i64>,
     /// Bytes that are not packets, and packets not read in time, as counted so far.
     bad_bytes: u64,
     unread: u64,
+    strangers: u64,
     /// Sequence number of our next packet.
     sequence: u8,
 }
 
 impl Bridge {
-    fn new(config: &Config, ground: LinkSender, health: Arc<HealthCounters>) -> Self {
+    fn new(
+        config: &Config,
+        ground: LinkSender,
+        health: Arc<HealthCounters>,
+    ) -> anyhow::Result<Self> {
         let now_ns = now_ns();
         let assume_at_ns =
             now_ns.saturating_add((config.assume_system_after_s * 1e9).round() as i64);
-        Self {
+        Ok(Self {
             component: config.component_id,
-            forwards: config.forward_to_autopilot,
+            permission: config.ground_may.parse()?,
+            refusal_ns: None,
             ground,
             health,
             vehicle: Vehicle::new(config.system_id, assume_at_ns),
@@ -112,11 +136,14 @@ impl Bridge {
             status: None,
             controllers: BTreeSet::new(),
             is_abandoned: false,
+            is_insecure: false,
+            insecure_told: false,
             ground_ns: None,
             bad_bytes: 0,
             unread: 0,
+            strangers: 0,
             sequence: 0,
-        }
+        })
     }
 
     /// Our system and component id, once the vehicle's system id is known.
@@ -170,14 +197,52 @@ impl Bridge {
             }
             Route::Pass => {
                 self.ground_active(now_ns, packet.sender);
-                if self.forwards {
+                let Some(refusal) = self.permission.refusal(&packet) else {
                     self.health.count("to autopilot");
                     return Some(packet.raw);
-                }
-                self.health.dropped("from ground: forward_to_autopilot is off");
+                };
+                self.refuse(now_ns, packet.sender, refusal);
             }
         }
         None
+    }
+
+    /// Counts a packet that the ground station may not send, and tells it.
+    fn refuse(&mut self, now_ns: i64, to: Sender, refusal: Refusal) {
+        if self.health.failed(&format!("from ground: refused: {}", refusal.name)) {
+            let Sender { system, component } = to;
+            tracing::warn!(
+                system,
+                component,
+                permission = %self.permission,
+                "Packet refused: {} (`ground_may`; further ones are only counted)",
+                refusal.name
+            );
+        }
+        if let Some(command) = refusal.command {
+            self.send_own(now_ns, &route::denied(command, to));
+        }
+        let is_due =
+            self.refusal_ns.is_none_or(|last| now_ns.saturating_sub(last) > REFUSAL_PAUSE_NS);
+        if is_due {
+            self.refusal_ns = Some(now_ns);
+            let text = format!("Alight: refused ({}): {}", self.permission, refusal.name);
+            self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
+        }
+    }
+
+    /// Handles the health of a relay.
+    fn relay(&mut self, now_ns: i64, health: &Health) {
+        self.is_insecure |= health.errors.iter().any(|error| error.reason == INSECURE);
+        self.tell_insecure(now_ns);
+    }
+
+    /// Tells each ground station once that anybody may command the vehicle.
+    fn tell_insecure(&mut self, now_ns: i64) {
+        if self.is_insecure && !self.insecure_told && self.me(now_ns).is_some() {
+            let text = "Alight: insecure: anyone in reach can command the vehicle";
+            self.insecure_told = self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, text);
+        }
     }
 
     fn ground_active(&mut self, now_ns: i64, sender: Sender) {
@@ -186,7 +251,9 @@ impl Bridge {
             let Sender { system, component } = sender;
             tracing::info!(system, component, "Ground station found");
             self.texts.reset();
+            self.insecure_told = false;
             self.send_texts(now_ns);
+            self.tell_insecure(now_ns);
         }
     }
 
@@ -222,10 +289,12 @@ impl Bridge {
 
     /// Reports when the last controller leaves, and when one is back.
     fn controller(&mut self, now_ns: i64, controller: String, is_there: bool) {
-        if is_there {
+        if !is_there {
+            self.controllers.remove(&controller);
+        } else if self.controllers.len() < MAX_CONTROLLERS {
             self.controllers.insert(controller);
         } else {
-            self.controllers.remove(&controller);
+            self.health.dropped("controllers: too many");
         }
         let is_abandoned = self.controllers.is_empty() && !is_there;
         if is_abandoned == self.is_abandoned {
@@ -240,13 +309,33 @@ impl Bridge {
         } else {
             (MavSeverity::MAV_SEVERITY_NOTICE, "Alight: the controller is back")
         };
+        self.send_text(now_ns, severity, text);
+    }
+
+    /// Sends a text, if we have a system id and it does not exceed the rate; whether it was sent.
+    fn send_text(&mut self, now_ns: i64, severity: MavSeverity, text: &str) -> bool {
         if self.me(now_ns).is_none() {
-            return;
+            return false;
         }
         match self.texts.text(now_ns, severity, text) {
-            Some(packets) => packets.iter().for_each(|packet| self.send_own(now_ns, packet)),
-            None => self.health.dropped("texts: too many"),
+            Some(packets) => {
+                packets.iter().for_each(|packet| self.send_own(now_ns, packet));
+                true
+            }
+            None => {
+                self.health.dropped("texts: too many");
+                false
+            }
         }
+    }
+
+    /// Counts what others than the ground station have sent since the last second.
+    fn count_strangers(&mut self, strangers: u64) {
+        let more = strangers.saturating_sub(self.strangers);
+        if more > 0 {
+            self.health.failed_times("from ground: packets or connections of a stranger", more);
+        }
+        self.strangers = strangers;
     }
 
     /// Counts losses on the ground station's link since the last second.
@@ -265,6 +354,7 @@ impl Bridge {
     fn every_second(&mut self, now_ns: i64) {
         self.send_own(now_ns, &self.heartbeat());
         self.send_texts(now_ns);
+        self.tell_insecure(now_ns);
     }
 
     fn heartbeat(&self) -> MavMessage {

@@ -1,6 +1,9 @@
 //! The bridge's configuration.
 
-use autopilot::Address;
+use std::net::IpAddr;
+use std::time::Duration;
+
+use autopilot::{Address, Peering, Permission};
 use serde::Deserialize;
 
 /// The keys of `gcs-bridge.toml`, which has their meanings, units and ranges.
@@ -17,8 +20,12 @@ pub struct Config {
     pub assume_system_after_s: f64,
     /// MAVLink component id of this companion.
     pub component_id: u8,
-    /// Whether the ground station's packets reach the autopilot.
-    pub forward_to_autopilot: bool,
+    /// IP addresses of the ground stations; any if there are none.
+    pub ground_stations: Vec<String>,
+    /// Silence after which another ground station is heard, in seconds.
+    pub ground_silence_s: f64,
+    /// What the ground station may send to the autopilot, a [`Permission`].
+    pub ground_may: String,
     /// Rate of the landing target, in Hz.
     pub target_rate_hz: f64,
     /// Maximum age of the landing target, in milliseconds.
@@ -33,8 +40,23 @@ impl node::Settings for Config {
         check.parses("ground", self.ground.parse::<Address>());
         check.range("assume_system_after_s", self.assume_system_after_s, 0.0..=3600.0);
         check.range("component_id", self.component_id, 2..=255);
+        for address in &self.ground_stations {
+            check.parses("ground_stations", address.parse::<IpAddr>());
+        }
+        check.range("ground_silence_s", self.ground_silence_s, 1.0..=600.0);
+        check.parses("ground_may", self.ground_may.parse::<Permission>());
         check.range("target_rate_hz", self.target_rate_hz, 0.1..=50.0);
         check.range("target_max_age_ms", self.target_max_age_ms, 1.0..=60_000.0);
+    }
+}
+
+impl Config {
+    /// Whom the link to the ground station talks to.
+    pub(crate) fn peering(&self) -> Peering {
+        Peering::GroundStation {
+            known: self.ground_stations.iter().filter_map(|text| text.parse().ok()).collect(),
+            silence: Duration::from_secs_f64(self.ground_silence_s),
+        }
     }
 }
 
@@ -63,6 +85,9 @@ mod tests {
             ("component_id=1", "from 2 to 255"),
             ("component_id=256", "component_id"),
             ("system_id=-1", "system_id"),
+            ("ground_stations=['10.0.0.x']", "`ground_stations`"),
+            ("ground_silence_s=0", "from 1 to 600"),
+            ("ground_may=all", "no-arming"),
             ("target_rate_hz=0", "from 0.1 to 50"),
             ("target_max_age_ms=inf", "`target_max_age_ms`"),
             ("id=a/b", "letters, digits"),

@@ -62,9 +62,18 @@ fn answer(packet: &Packet) -> Option<MavMessage> {
 }
 
 fn unsupported(command: MavCmd, to: Sender) -> MavMessage {
+    acknowledgement(command, MavResult::MAV_RESULT_UNSUPPORTED, to)
+}
+
+/// The acknowledgement of a command that the sender may not give.
+pub(crate) fn denied(command: MavCmd, to: Sender) -> MavMessage {
+    acknowledgement(command, MavResult::MAV_RESULT_DENIED, to)
+}
+
+fn acknowledgement(command: MavCmd, result: MavResult, to: Sender) -> MavMessage {
     MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
         command,
-        result: MavResult::MAV_RESULT_UNSUPPORTED,
+        result,
         target_system: to.system,
         target_component: to.component,
         ..COMMAND_ACK_DATA::default()

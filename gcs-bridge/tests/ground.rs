@@ -12,10 +12,10 @@ use autopilot::dialect::{
 use autopilot::packet::encode;
 use autopilot::{Packet, Parser, Sender};
 use gcs_bridge::Config;
-use messages::{ControllerStatus, MavlinkBytes, Phase, TargetEstimate, topic};
-use node::{Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
+use messages::{ControllerStatus, Health, MavlinkBytes, Phase, TargetEstimate, topic};
+use node::{INSECURE, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
 use testing::ports;
-use tokio::net::UdpSocket;
+use tokio::net::{TcpStream, UdpSocket};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::{interval, sleep, timeout};
@@ -122,6 +122,160 @@ async fn only_the_grounds_own_packets_go_up_unchanged() -> anyhow::Result<()> {
     assert_eq!((ack.sender, answer.result), (COMPANION, MavResult::MAV_RESULT_UNSUPPORTED));
     bridge.abort();
     Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_ground_station_that_was_heard_first_is_held_and_strangers_are_counted()
+-> anyhow::Result<()> {
+    let port = free_port()?;
+    let ([], _, listening) = ports::free()?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let health = vehicle.node.subscriber(topic::HEALTH, &["gcs-bridge", "main"]).await?;
+    let mut ground = Ground::open().await?;
+    let stranger = UdpSocket::bind("127.0.0.1:0").await?;
+    let setting = format!("ground=udpin:127.0.0.1:{listening}");
+    let bridge = start_bridge(port, &ground, &[&setting]).await?;
+    let to = SocketAddr::from(([127, 0, 0, 1], listening));
+    ground.bridge = Some(to);
+    let first = encode(GROUND, 1, &param_request(1));
+    let heard = async {
+        loop {
+            ground.send(&first).await?;
+            if timeout(Duration::from_millis(50), vehicle.next_packet()).await.is_ok() {
+                return anyhow::Ok(());
+            }
+        }
+    };
+    timeout(PATIENCE, heard).await??;
+    // Disarming in the air, by force; and the heartbeat of an autopilot, as if the stranger were one.
+    let disarm = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+        param2: 21196.0,
+        target_system: AUTOPILOT.system,
+        target_component: AUTOPILOT.component,
+        ..COMMAND_LONG_DATA::default()
+    });
+    let disarm = encode(GROUND, 2, &disarm);
+    for _ in 0..20 {
+        stranger.send_to(&autopilot_heartbeat(), to).await?;
+        stranger.send_to(&disarm, to).await?;
+    }
+    let counted = until_error(&health, "stranger", 40).await?;
+    ensure!(counted == 40, "{counted} of 40 packets counted");
+    ground.send(&encode(GROUND, 3, &param_request(3))).await?;
+    loop {
+        let packet = timeout(PATIENCE, vehicle.next_packet()).await??;
+        ensure!(packet != disarm, "the stranger was heard");
+        if packet == encode(GROUND, 3, &param_request(3)) {
+            break;
+        }
+    }
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn only_the_known_ground_stations_are_heard() -> anyhow::Result<()> {
+    for kind in ["udpin", "tcpin"] {
+        let port = free_port()?;
+        let ([tcp], _, udp) = ports::free()?;
+        let listening = if kind == "udpin" { udp } else { tcp };
+        let vehicle = FakeVehicle::start(port).await?;
+        let health = vehicle.node.subscriber(topic::HEALTH, &["gcs-bridge", "main"]).await?;
+        let ground = Ground::open().await?;
+        let setting = format!("ground={kind}:127.0.0.1:{listening}");
+        let known = "ground_stations=['10.255.255.1']";
+        let bridge = start_bridge(port, &ground, &[&setting, known]).await?;
+        let to = SocketAddr::from(([127, 0, 0, 1], listening));
+        let knocking = async {
+            for _ in 0..400 {
+                match kind {
+                    "udpin" => drop(ground.socket.send_to(&autopilot_heartbeat(), to).await),
+                    _ => drop(TcpStream::connect(to).await),
+                }
+                sleep(Duration::from_millis(50)).await;
+            }
+        };
+        let counted = tokio::select! {
+            counted = until_error(&health, "stranger", 3) => counted?,
+            () = knocking => bail!("{kind}: nothing was counted"),
+        };
+        ensure!(counted >= 3, "{kind}: {counted}");
+        bridge.abort();
+        vehicle.stop().await;
+    }
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_ground_station_that_may_not_arm_is_told_so() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let mut ground = Ground::open().await?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let health = vehicle.node.subscriber(topic::HEALTH, &["gcs-bridge", "main"]).await?;
+    let bridge = start_bridge(port, &ground, &["ground_may=no-arming"]).await?;
+    ground.expect(|f| f.sender == COMPANION).await?;
+    let arm = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
+        param1: 1.0,
+        target_system: AUTOPILOT.system,
+        target_component: AUTOPILOT.component,
+        ..COMMAND_LONG_DATA::default()
+    });
+    let arm = encode(GROUND, 1, &arm);
+    ground.send(&arm).await?;
+    ground.expect_text("Alight: refused (no-arming): arming or stopping motors").await?;
+    until_error(&health, "refused: arming", 1).await?;
+    ground.send(&arm).await?;
+    let answer = ground.expect(|f| matches!(f.message, Some(MavMessage::COMMAND_ACK(_)))).await?;
+    let Some(MavMessage::COMMAND_ACK(answer)) = answer.message else { bail!("no answer") };
+    assert_eq!(answer.result, MavResult::MAV_RESULT_DENIED);
+    let allowed = encode(GROUND, 2, &param_request(2));
+    let passed = async {
+        loop {
+            ground.send(&allowed).await?;
+            if let Ok(packet) = timeout(Duration::from_millis(50), vehicle.next_packet()).await {
+                return packet;
+            }
+        }
+    };
+    ensure!(timeout(PATIENCE, passed).await?? == allowed, "the autopilot was armed");
+    bridge.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_ground_station_is_told_when_anyone_may_command() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let mut ground = Ground::open().await?;
+    let _vehicle = FakeVehicle::start(port).await?;
+    let relay = open("relay", "drone", port).await?;
+    relay.health().failed(INSECURE);
+    let publishing = tokio::spawn(async move { relay.publish_health().await });
+    let bridge = start_bridge(port, &ground, &[]).await?;
+    let text = "Alight: insecure: anyone in reach can command the vehicle";
+    ground.expect_text(text).await?;
+    bridge.abort();
+    publishing.abort();
+    Ok(())
+}
+
+/// Waits until the bridge has counted so many errors of a reason.
+async fn until_error(
+    healths: &Subscriber<Health>,
+    reason: &str,
+    times: u64,
+) -> anyhow::Result<u64> {
+    let counted = async {
+        loop {
+            let health = healths.next().await.context("health")?;
+            let found = health.errors.iter().find(|error| error.reason.contains(reason));
+            if let Some(found) = found.filter(|error| error.count >= times) {
+                return anyhow::Ok(found.count);
+            }
+        }
+    };
+    timeout(PATIENCE, counted).await.with_context(|| format!("`{reason}` was not counted"))?
 }
 
 #[tokio::test(flavor = "multi_thread")]
