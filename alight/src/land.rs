@@ -1,11 +1,12 @@
 //! `alight land`: all services as processes, watched until the vehicle has landed.
 
+use std::io::IsTerminal;
 use std::net::{TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use markers::{Marker, Pad};
 use messages::topic;
@@ -41,9 +42,17 @@ pub(crate) struct LandArgs {
     #[arg(long, value_name = "GUIDANCE")]
     guidance: Option<String>,
     /// Fly this autopilot instead of the simulated one: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or
-    /// serial:DEVICE:BAUD. The simulated camera then follows the pose it reports.
+    /// serial:DEVICE:BAUD. The simulated camera then follows the pose it reports. Only a vehicle that says that
+    /// it is a simulation takes off.
     #[arg(long, value_name = "ADDRESS")]
     autopilot: Option<String>,
+    /// Allow the take-off of a vehicle that does not say that it is a simulation. THE MOTORS START, and the pad
+    /// is one that exists in the simulated camera only. Asks first.
+    #[arg(long, requires = "autopilot")]
+    real_vehicle: bool,
+    /// Answer the question of `--real-vehicle` with yes, where there is no terminal.
+    #[arg(long, requires = "real_vehicle")]
+    yes: bool,
     /// Zenoh configuration (JSON5) [default: the built-in `local.json5`].
     #[arg(long, value_name = "FILE")]
     zenoh: Option<PathBuf>,
@@ -84,6 +93,7 @@ const AFTER_LANDING: Duration = Duration::from_millis(1200);
 pub(crate) fn run(args: &LandArgs) -> anyhow::Result<ExitCode> {
     node::start_logging("warn");
     let settings = ServiceSettings::new(args)?;
+    confirm_real_vehicle(args, &settings)?;
     let outcome = runtime()?.block_on(fly(args, &settings))?.outcome();
     print(&match args.format {
         Format::Text => outcome.table(),
@@ -91,6 +101,27 @@ pub(crate) fn run(args: &LandArgs) -> anyhow::Result<ExitCode> {
     })
     .context("printing the result")?;
     Ok(ExitCode::from(u8::from(!outcome.landed)))
+}
+
+/// Asks before the motors of a vehicle may start that may be a real one.
+fn confirm_real_vehicle(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<()> {
+    let layers = Layers { file: None, set: settings.of(Service::Controller).to_vec() };
+    if !layers.load::<controller::Config>()?.settings.takeoff_real_vehicle || args.yes {
+        return Ok(());
+    }
+    let warning = format!(
+        "The vehicle at {} need not be a simulation: its motors start, it takes off, and it lands where the simulated \
+         camera shows a pad that is not there. Propellers off, or nobody near?",
+        args.autopilot.as_deref().unwrap_or("the autopilot's address")
+    );
+    if !std::io::stdin().is_terminal() {
+        bail!("{warning} There is no terminal to ask on; if so, say `--real-vehicle --yes`");
+    }
+    write_error(&format!("{warning} Type `yes` to start the motors:"));
+    let mut answer = String::new();
+    std::io::stdin().read_line(&mut answer).context("reading the answer")?;
+    ensure!(answer.trim() == "yes", "not confirmed, nothing was started");
+    Ok(())
 }
 
 /// The settings of each service.
@@ -120,6 +151,9 @@ impl ServiceSettings {
             "start=\"takeoff\"".to_owned(),
             format!("thesis.seed={}", args.seed),
         ];
+        if args.real_vehicle {
+            controller.push("takeoff_real_vehicle=true".to_owned());
+        }
         if let Some(guidance) = &args.guidance {
             controller.push(format!("guidance=\"{guidance}\""));
         }

@@ -1,6 +1,6 @@
 //! The controller's configuration.
 
-use autopilot::Address;
+use autopilot::{Address, Permission, Takeoff};
 use landing::{
     EnvelopeConfig, EstimatorConfig, GuidanceConfig, MetricConfig, PhaseConfig, TargetConfig,
     ThesisConfig,
@@ -18,6 +18,8 @@ pub struct Config {
     pub start: Start,
     /// Height of the take-off in metres.
     pub takeoff_height_m: f64,
+    /// Whether the take-off may arm a vehicle that does not say that it is a simulation.
+    pub takeoff_real_vehicle: bool,
     /// Who controls the landing.
     pub mode: Mode,
     /// Which guidance is used.
@@ -136,6 +138,8 @@ pub struct AutopilotSettings {
     pub setpoint_rate_hz: f64,
     /// Setpoint timeout that the autopilot gets for a landing, in seconds; 0 leaves its own.
     pub setpoint_timeout_s: f64,
+    /// What a ground station may send to the autopilot.
+    pub ground_may: String,
     /// Whether to synchronise with the autopilot's clock.
     pub timesync: bool,
     /// The vehicle's drag, for the estimate of the wind, in 1/s; 0 turns it off.
@@ -182,6 +186,7 @@ impl Settings for Config {
         check.range("takeoff_height_m", self.takeoff_height_m, 1.0..=100.0);
         check.parses("marker", crate::wire::marker_name(&self.marker));
         check.parses("autopilot.address", self.autopilot.address.parse::<Address>());
+        check.parses("autopilot.ground_may", self.autopilot.ground_may.parse::<Permission>());
         check.range("autopilot.component_id", self.autopilot.component_id, 1..=255);
         check.range("autopilot.state_rate_hz", self.autopilot.state_rate_hz, 10.0..=200.0);
         check.range("autopilot.setpoint_rate_hz", self.autopilot.setpoint_rate_hz, 5.0..=100.0);
@@ -237,6 +242,12 @@ impl DetectorSettings {
 }
 
 impl Config {
+    /// The take-off of `start = "takeoff"`.
+    pub(crate) fn takeoff(&self) -> Takeoff {
+        let takeoff = Takeoff::new(self.takeoff_height_m);
+        if self.takeoff_real_vehicle { takeoff } else { takeoff.only_simulated() }
+    }
+
     /// The lander's settings.
     pub fn lander(&self) -> landing::Config {
         self.landing(match self.guidance {

@@ -70,7 +70,7 @@ impl Flight {
             autopilot,
             lander: Lander::new(config.lander())?,
             decision: None,
-            mission: Mission::new(config.start, config.takeoff_height_m),
+            mission: Mission::new(config.start, config.takeoff()),
             frames: Frames::new(&config),
             used: Used::default(),
             setpoints: Setpoints::new(settings.setpoint_rate_hz),

@@ -51,12 +51,12 @@ pub enum Trigger {
 
 impl Mission {
     /// A mission that has not begun.
-    pub fn new(start: Start, takeoff_height_m: f64) -> Self {
+    pub fn new(start: Start, takeoff: Takeoff) -> Self {
         let state = match start {
             Start::Command => State::Idle,
             Start::Airborne | Start::Resume => State::AwaitingTakeoff,
             Start::Takeoff => State::TakingOff {
-                takeoff: Takeoff::new(takeoff_height_m),
+                takeoff,
                 why: "waiting for the autopilot's heartbeat".to_owned(),
             },
         };

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use autopilot::packet::MAX_PACKET;
-use autopilot::{Address, Link, LinkEvent, Parser};
+use autopilot::{Address, Link, LinkEvent, Parser, Permission};
 use messages::{ControllerStatus, MavlinkBytes, VehicleState, topic};
 use node::{Node, Publisher, Shutdown, now_ns};
 use tokio::sync::mpsc;
@@ -35,6 +35,7 @@ const MAX_WAITING_PACKETS: usize = 512;
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
+    let permission: Permission = config.autopilot.ground_may.parse()?;
     let mut link = Link::open(address).await.context("opening the link to the autopilot")?;
     let mut note_file = NoteFile::new(&config.id);
     let mut flight = Flight::new(config, node.shared_health())?;
@@ -52,6 +53,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let mut reports = Reports::new(&node).await?;
     node.announce().await?;
 
+    let mut strangers = 0;
     let mut ticks = interval(TICK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
@@ -78,7 +80,14 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                     targets.publish(&flight.target(now_ns())).await;
                 }
             }
-            _ = ticks.tick() => flight.tick(now_ns()),
+            _ = ticks.tick() => {
+                flight.tick(now_ns());
+                let more = link.strangers().saturating_sub(strangers);
+                if more > 0 {
+                    strangers += more;
+                    node.health().failed_times("packets of a stranger at the autopilot's port", more);
+                }
+            }
             Some((detector, alive)) = presence.next() => flight.presence(now_ns(), &detector, alive),
             Some((key, info)) = infos.next_with_key() => {
                 let publisher = topic::DETECTOR_INFO.first_name(&key).unwrap_or_default();
@@ -91,11 +100,9 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             }
             Some(info) = cameras.next() => flight.camera(info),
             Some(message) = to_autopilot.next() => {
-                let is_packet = (1..=MAX_PACKET).contains(&message.packet.len());
-                for packet in Parser::new().push(&message.packet) {
-                    flight.ground_packet(now_ns(), &packet);
-                }
-                if !is_packet || link.send_spare(&message.packet).is_err() {
+                if pass_up(&node, &mut flight, permission, &message.packet)
+                    && link.send_spare(&message.packet).is_err()
+                {
                     node.health().dropped("packets of the ground station");
                 }
             }
@@ -117,6 +124,34 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     // The link's own task needs a moment to put the last packet on the wire.
     tokio::time::sleep(TICK).await;
     Ok(())
+}
+
+/// Whether a packet of a ground station goes to the autopilot; the flight hears it before.
+fn pass_up(node: &Node, flight: &mut Flight, permission: Permission, bytes: &[u8]) -> bool {
+    if !(1..=MAX_PACKET).contains(&bytes.len()) {
+        node.health().dropped("packets of the ground station");
+        return false;
+    }
+    let mut parser = Parser::new();
+    let mut packets = parser.push(bytes);
+    packets.extend(parser.finish());
+    for packet in &packets {
+        flight.ground_packet(now_ns(), packet);
+    }
+    // Bytes in which no packet is recognised could be any message.
+    let parsed: usize = packets.iter().map(|packet| packet.raw.len()).sum();
+    let is_read = parsed == bytes.len() || permission == Permission::Everything;
+    let refusal = packets.iter().find_map(|packet| permission.refusal(packet));
+    let Some(name) = refusal.map(|r| r.name).or((!is_read).then_some("unknown message")) else {
+        return true;
+    };
+    if node.health().failed(&format!("packets of the ground station refused: {name}")) {
+        tracing::warn!(
+            %permission,
+            "Packet of a ground station refused: {name} (`autopilot.ground_may`; further ones are only counted)"
+        );
+    }
+    false
 }
 
 /// Sends the flight's packets.

@@ -22,7 +22,7 @@ fn flight(start: &str) -> Flight {
 }
 
 fn flight_with(start: &str, set: &[&str]) -> Flight {
-    let mut all = vec![format!("start={start}")];
+    let mut all = vec![format!("start={start}"), "takeoff_real_vehicle=true".to_owned()];
     all.extend(set.iter().map(|s| (*s).to_owned()));
     let layers = Layers { file: None, set: all };
     Flight::new(layers.load::<Config>().unwrap().settings, Arc::default()).unwrap()

@@ -23,6 +23,7 @@ use crate::event::Event;
 use crate::mode::{Firmware, FlightMode};
 use crate::packet::{self, Packet, Sender};
 use crate::parameter::{Parameter, Parameters};
+use crate::simulation::Simulation;
 use crate::state::{Attitude, Battery, LandedState, Position, Range, Readiness, VehicleState};
 use crate::stream::{Stream, Streams};
 use crate::text::Joiner;
@@ -130,6 +131,7 @@ struct Vehicle {
     firmware: Firmware,
     state: VehicleState,
     readiness: Readiness,
+    simulation: Simulation,
     heartbeat_ns: i64,
     boot_ms: u32,
     /// Altitude above mean sea level, in m.
@@ -250,6 +252,22 @@ impl Autopilot {
     /// Whether heartbeats are received.
     pub fn is_connected(&self) -> bool {
         self.vehicle.as_ref().is_some_and(|vehicle| vehicle.state.connected)
+    }
+
+    /// Whether the vehicle has said that it is a simulation; it is asked by
+    /// [`Autopilot::ask_whether_simulated`].
+    pub fn is_simulated(&self) -> bool {
+        self.vehicle.as_ref().is_some_and(|vehicle| vehicle.simulation.is_said())
+    }
+
+    /// Asks the vehicle whether it is a simulation, once a second until it has said so.
+    pub fn ask_whether_simulated(&mut self, now_ns: i64) {
+        let Some(vehicle) = self.vehicle.as_mut().filter(|vehicle| vehicle.state.connected) else {
+            return;
+        };
+        if let Some(question) = vehicle.simulation.question(now_ns, vehicle.firmware) {
+            self.send_to_vehicle(question);
+        }
     }
 
     /// The state of a parameter of [`Config::parameters`].
@@ -504,6 +522,7 @@ impl Autopilot {
                 connected: true,
             },
             readiness: Readiness::default(),
+            simulation: Simulation::default(),
             heartbeat_ns: now_ns,
             boot_ms: 0,
             amsl_m: None,
@@ -520,6 +539,7 @@ impl Autopilot {
         let mode = FlightMode::of(vehicle.firmware, heartbeat.custom_mode);
         let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
         vehicle.heartbeat_ns = now_ns;
+        vehicle.simulation.take_mode(heartbeat.base_mode);
         state.stamp_ns = now_ns;
         let before = state.mode;
         let returned = !std::mem::replace(&mut state.connected, true);
@@ -543,8 +563,9 @@ impl Autopilot {
         let silence_ns = now_ns.saturating_sub(vehicle.heartbeat_ns);
         if vehicle.state.connected && silence_ns > limit_ns {
             vehicle.state.connected = false;
-            // It may have restarted when it returns, so its readiness is unknown.
+            // It may have restarted when it returns, or be another one, so what it said does not hold.
             vehicle.readiness = Readiness::default();
+            vehicle.simulation = Simulation::default();
             vehicle.state.ready = false;
             let silence = Duration::from_nanos(silence_ns.max(0) as u64);
             self.push(Event::Lost { silence });
@@ -587,6 +608,7 @@ impl Autopilot {
 
     fn take_state(&mut self, now_ns: i64, message: &MavMessage) {
         let Some(vehicle) = &mut self.vehicle else { return };
+        vehicle.simulation.take(message);
         let state = &mut vehicle.state;
         match message {
             MavMessage::ATTITUDE(message) => {

@@ -3,9 +3,9 @@
 use geometry::{Body, Ned, Point, Vector};
 
 use crate::dialect::{
-    HEARTBEAT_DATA, LANDING_TARGET_DATA, LandingTargetType, MavAutopilot, MavBool, MavFrame,
-    MavMessage, MavModeFlag, MavSeverity, MavState, MavType, PositionTargetTypemask,
-    SET_POSITION_TARGET_LOCAL_NED_DATA, STATUSTEXT_DATA,
+    COMMAND_LONG_DATA, HEARTBEAT_DATA, LANDING_TARGET_DATA, LandingTargetType, MavAutopilot,
+    MavBool, MavCmd, MavFrame, MavMessage, MavModeFlag, MavSeverity, MavState, MavType,
+    PositionTargetTypemask, SET_POSITION_TARGET_LOCAL_NED_DATA, STATUSTEXT_DATA,
 };
 use crate::packet::Sender;
 
@@ -23,6 +23,15 @@ pub fn heartbeat() -> MavMessage {
         base_mode: MavModeFlag::empty(),
         system_status: MavState::MAV_STATE_ACTIVE,
         mavlink_version: 3,
+    })
+}
+
+/// Asks for one message, by its number; the recipient is added when it is sent.
+pub fn request_message(id: u32) -> MavMessage {
+    MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+        command: MavCmd::MAV_CMD_REQUEST_MESSAGE,
+        param1: id as f32,
+        ..Default::default()
     })
 }
 

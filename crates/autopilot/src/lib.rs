@@ -9,11 +9,12 @@
 //! monotonic clock) and does no input or output. The crate knows nothing of markers, of landing or of other
 //! processes.
 //!
-//! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it,
-//! [`packet`] finds MAVLink packets in them, [`mode`], [`state`] and [`parameter`] are what the vehicle
-//! reports, [`clock`] converts its time stamps, [`client`] is the conversation with it, [`event`] its events,
-//! [`command`] is what can be requested and why it may fail, [`takeoff`] arms the vehicle and takes off,
-//! [`compose`] makes the messages that a companion sends.
+//! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it and
+//! [`peers`] chooses whom a listening one talks to, [`packet`] finds MAVLink packets in them, [`mode`],
+//! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `simulation`
+//! asks whether it is simulated, [`client`] is the conversation with it, [`event`] its events, [`command`] is
+//! what can be requested and why it may fail, [`takeoff`] arms the vehicle and takes off, [`permission`] is what
+//! a ground station may send, [`compose`] makes the messages that a companion sends.
 
 pub mod address;
 pub mod client;
@@ -25,6 +26,9 @@ pub mod link;
 pub mod mode;
 pub mod packet;
 pub mod parameter;
+pub mod peers;
+pub mod permission;
+mod simulation;
 pub mod state;
 mod stream;
 pub mod takeoff;
@@ -45,5 +49,7 @@ pub use link::{Link, LinkEvent, LinkSender};
 pub use mode::{Firmware, FlightMode};
 pub use packet::{Packet, Parser, Sender};
 pub use parameter::Parameter;
+pub use peers::Peering;
+pub use permission::Permission;
 pub use state::{Attitude, Battery, LandedState, Position, Range, VehicleState};
 pub use takeoff::{Takeoff, TakeoffError, TakeoffProgress};

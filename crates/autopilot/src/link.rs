@@ -20,8 +20,8 @@ use tokio::time::{sleep, sleep_until, timeout};
 use tokio_serial::{SerialPortBuilderExt, SerialStream};
 
 use crate::address::{Address, Endpoint};
-use crate::dialect::{MavAutopilot, MavMessage};
 use crate::packet::{Counters, Packet, Parser};
+use crate::peers::{PACKET_GAP, Peering, Peers};
 
 /// Maximum number of packets received and not yet read, about 4 s of an autopilot's traffic.
 const INCOMING: usize = 1024;
@@ -37,14 +37,8 @@ const LAST_RETRY: Duration = Duration::from_secs(2);
 const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 /// Timeout of writing one packet.
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
-/// Silence after which an incomplete packet is discarded.
-const PACKET_GAP: Duration = Duration::from_millis(200);
 /// Silence after which a TCP connection counts as dead.
 const TCP_SILENCE: Duration = Duration::from_secs(10);
-/// Silence after which a peer is replaced by another one.
-const PEER_SILENCE: Duration = Duration::from_secs(3);
-/// Maximum number of known UDP peers.
-const MAX_PEERS: usize = 8;
 
 /// A connection to an autopilot that reconnects by itself.
 #[derive(Debug)]
@@ -134,6 +128,11 @@ pub enum SendError {
 impl Link {
     /// Opens the link; needs a tokio runtime with network and time, and ends when it is dropped.
     pub async fn open(address: Address) -> Result<Self, LinkError> {
+        Self::open_for(address, Peering::Autopilot).await
+    }
+
+    /// The same, for the peers of a kind where it listens; all others are dropped and counted.
+    pub async fn open_for(address: Address, peering: Peering) -> Result<Self, LinkError> {
         let listener = listen(&address).await?;
         let local = match &listener {
             Listener::Udp(socket) => socket.local_addr().ok(),
@@ -142,7 +141,7 @@ impl Link {
         };
         let (queue, outgoing) = mpsc::channel(OUTGOING);
         let shared = Arc::new(Shared::new());
-        let port = Port { shared: Arc::clone(&shared), outgoing };
+        let port = Port { shared: Arc::clone(&shared), outgoing, peering };
         let task = tokio::spawn(run(address, listener, port));
         let sender = LinkSender { shared: Arc::clone(&shared), queue };
         Ok(Self { shared, sender, task, local })
@@ -188,6 +187,11 @@ impl Link {
         *self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Number of packets and connections of others than the peer, which were dropped.
+    pub fn strangers(&self) -> u64 {
+        self.shared.strangers.load(Ordering::Relaxed)
+    }
+
     /// Number of received packets that were dropped because they were not read in time.
     pub fn dropped(&self) -> u64 {
         self.shared.dropped.load(Ordering::Relaxed)
@@ -229,6 +233,7 @@ struct Shared {
     arrived: Notify,
     connected: AtomicBool,
     dropped: AtomicU64,
+    strangers: AtomicU64,
     counters: Mutex<Counters>,
     opened: Instant,
     /// When bytes came last, in milliseconds since the link was opened.
@@ -242,6 +247,7 @@ impl Shared {
             arrived: Notify::new(),
             connected: AtomicBool::new(false),
             dropped: AtomicU64::new(0),
+            strangers: AtomicU64::new(0),
             counters: Mutex::new(Counters::default()),
             opened: Instant::now(),
             active_ms: AtomicU64::new(0),
@@ -265,6 +271,11 @@ impl Shared {
         self.arrived.notify_one();
     }
 
+    /// Counts dropped packets and connections of strangers; true for the first, which is the one to log.
+    fn count_strangers(&self, count: u64) -> bool {
+        self.strangers.fetch_add(count, Ordering::Relaxed) == 0
+    }
+
     fn mark_active(&self) {
         let now = self.opened.elapsed().as_millis().try_into().unwrap_or(u64::MAX);
         self.active_ms.store(now, Ordering::Relaxed);
@@ -280,6 +291,7 @@ impl Shared {
 struct Port {
     shared: Arc<Shared>,
     outgoing: mpsc::Receiver<Vec<u8>>,
+    peering: Peering,
 }
 
 impl Port {
@@ -442,33 +454,50 @@ fn explain_serial(device: &str, error: &tokio_serial::Error) -> String {
 
 /// One connection at a time; a new one replaces one that has been silent.
 async fn serve_tcp_in(listener: &TcpListener, port: &mut Port) -> (bool, String) {
-    let mut next = match listener.accept().await {
-        Ok(next) => next,
-        Err(error) => return (false, format!("cannot accept a connection: {error}")),
+    let (shared, peering) = (Arc::clone(&port.shared), port.peering.clone());
+    let mut next = loop {
+        match listener.accept().await {
+            Ok(next) if peering.admits(next.1.ip()) => break next,
+            Ok((_, peer)) => refuse(&shared, peer, "it is not one of the known ground stations"),
+            Err(error) => return (false, format!("cannot accept a connection: {error}")),
+        }
     };
     loop {
         let (stream, peer) = next;
         // A connection without this works too, only later.
         let _ = stream.set_nodelay(true);
         port.connected(peer.to_string());
-        let shared = Arc::clone(&port.shared);
         tokio::select! {
             reason = serve_stream(stream, port, None) => return (true, reason),
-            newcomer = accept_when_silent(listener, &shared) => next = newcomer,
+            newcomer = accept_when_silent(listener, &shared, &peering) => next = newcomer,
         }
     }
 }
 
-async fn accept_when_silent(listener: &TcpListener, shared: &Shared) -> (TcpStream, SocketAddr) {
+async fn accept_when_silent(
+    listener: &TcpListener,
+    shared: &Shared,
+    peering: &Peering,
+) -> (TcpStream, SocketAddr) {
     loop {
         match listener.accept().await {
-            Ok(newcomer) if shared.silence() > PEER_SILENCE => return newcomer,
-            Ok((_, peer)) => tracing::warn!(%peer, "Connection refused: another one is in use"),
+            Ok((_, peer)) if !peering.admits(peer.ip()) => {
+                refuse(shared, peer, "it is not one of the known ground stations");
+            }
+            Ok(newcomer) if shared.silence() > peering.silence() => return newcomer,
+            Ok((_, peer)) => refuse(shared, peer, "another one is in use"),
             Err(error) => {
                 tracing::warn!(%error, "Cannot accept a connection");
                 sleep(LAST_RETRY).await;
             }
         }
+    }
+}
+
+/// Counts a refused connection, and logs the first.
+fn refuse(shared: &Shared, peer: SocketAddr, reason: &str) {
+    if shared.count_strangers(1) {
+        tracing::warn!(%peer, reason, "Connection refused (further ones are only counted)");
     }
 }
 
@@ -516,7 +545,7 @@ where
 /// Moves datagrams in both directions until the socket breaks; returns why. Without a `fixed` peer, the peer
 /// is the sender of the autopilot's heartbeat.
 async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr>) -> String {
-    let mut peers = Peers::new(fixed);
+    let mut peers = Peers::new(fixed, port.peering.clone());
     if let Some(peer) = fixed {
         port.connected(peer.to_string());
     }
@@ -527,11 +556,14 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                 Ok((count, from)) => {
                     let before = peers.chosen;
                     let datagram = bytes.get(..count).unwrap_or(&[]);
-                    let (packets, counted) = peers.take(from, datagram, Instant::now());
+                    let taken = peers.take(from, datagram, Instant::now());
                     if let Some(peer) = peers.chosen.filter(|_| peers.chosen != before) {
                         port.connected(peer.to_string());
                     }
-                    port.received(packets, counted);
+                    if taken.strangers > 0 && port.shared.count_strangers(taken.strangers) {
+                        tracing::warn!(%from, "Packets of a stranger dropped (further ones are only counted)");
+                    }
+                    port.received(taken.packets, taken.counted);
                 }
                 // A datagram of ours had no receiver: the other side is not running.
                 Err(error) if is_refusal(&error) => {}
@@ -555,98 +587,6 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
 
 fn is_refusal(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::ConnectionRefused | io::ErrorKind::ConnectionReset)
-}
-
-/// The senders to a UDP port, each with its own stream of packets.
-struct Peers {
-    known: Vec<Peer>,
-    chosen: Option<SocketAddr>,
-}
-
-struct Peer {
-    address: SocketAddr,
-    parser: Parser,
-    active: Instant,
-    /// Time of the last autopilot heartbeat from there.
-    autopilot: Option<Instant>,
-}
-
-impl Peers {
-    fn new(chosen: Option<SocketAddr>) -> Self {
-        Self { known: Vec::new(), chosen }
-    }
-
-    /// Parses a datagram and returns its packets if they come from the chosen peer.
-    fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> (Vec<Packet>, Counters) {
-        let peer = self.peer(from, now);
-        if now.duration_since(peer.active) > PACKET_GAP {
-            // The rest of an incomplete packet is lost.
-            peer.parser.finish();
-        }
-        peer.active = now;
-        let packets = peer.parser.push(bytes);
-        let counted = peer.parser.take_counters();
-        let is_autopilot = packets.iter().any(is_autopilot_heartbeat);
-        if is_autopilot {
-            peer.autopilot = Some(now);
-        }
-        if !packets.is_empty() && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
-            self.chosen = Some(from);
-        }
-        (if self.chosen == Some(from) { packets } else { Vec::new() }, counted)
-    }
-
-    /// Whether the chosen peer is replaced by one that just sent a packet.
-    fn is_replaced(&self, to_autopilot: bool, now: Instant) -> bool {
-        let recent = |at: Instant| now.duration_since(at) <= PEER_SILENCE;
-        let Some(chosen) = self.chosen else { return true };
-        let Some(chosen) = self.known.iter().find(|peer| peer.address == chosen) else {
-            return true;
-        };
-        match chosen.autopilot {
-            Some(at) => to_autopilot && !recent(at),
-            None => to_autopilot || !recent(chosen.active),
-        }
-    }
-
-    fn peer(&mut self, address: SocketAddr, now: Instant) -> &mut Peer {
-        let index = match self.known.iter().position(|peer| peer.address == address) {
-            Some(index) => index,
-            None => {
-                self.forget_one();
-                self.known.push(Peer {
-                    address,
-                    parser: Parser::new(),
-                    active: now,
-                    autopilot: None,
-                });
-                self.known.len() - 1
-            }
-        };
-        &mut self.known[index]
-    }
-
-    /// Forgets the peer with the longest silence, never the chosen one.
-    fn forget_one(&mut self) {
-        if self.known.len() < MAX_PEERS {
-            return;
-        }
-        let others = self.known.iter().enumerate().filter(|(_, p)| Some(p.address) != self.chosen);
-        if let Some((oldest, _)) = others.min_by_key(|(_, peer)| peer.active) {
-            self.known.swap_remove(oldest);
-        }
-    }
-}
-
-/// True for the heartbeat of an autopilot, as opposed to a ground station, camera or companion.
-fn is_autopilot_heartbeat(packet: &Packet) -> bool {
-    match &packet.message {
-        Some(MavMessage::HEARTBEAT(heartbeat)) => {
-            heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
-                && packet.sender.component == 1
-        }
-        _ => false,
-    }
 }
 
 #[cfg(test)]

@@ -15,6 +15,8 @@ const MAX_HEIGHT_ERROR_M: f64 = 0.5;
 const MAX_CLIMB_M_S: f64 = 0.3;
 /// Pause between two attempts to arm.
 const ARM_RETRY: Duration = Duration::from_secs(2);
+/// Time within which a simulated vehicle says that it is one.
+const SIMULATION_LIMIT: Duration = Duration::from_secs(10);
 
 /// Timeouts of the parts of a takeoff.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -52,6 +54,10 @@ pub struct Takeoff {
     risen: bool,
     /// Its motors were armed before the first request.
     found_armed: bool,
+    /// It is asked only of a vehicle that says that it is a simulation.
+    only_simulated: bool,
+    /// The timeout of that question.
+    simulation_until_ns: Option<i64>,
 }
 
 /// The progress of a takeoff.
@@ -90,6 +96,15 @@ pub enum TakeoffError {
         /// Contact with the ground.
         landed: LandedState,
     },
+    /// The vehicle may be a real one, which was not allowed.
+    #[error(
+        "no takeoff: within {} s the vehicle did not say that it is a simulation (no SIM_STATE, SIMSTATE or \
+         HIL_STATE_QUATERNION, and no HIL flag in its heartbeat), so it may be a real one. Check the address of \
+         the autopilot; `alight land --real-vehicle` (`takeoff_real_vehicle = true` of the controller) starts \
+         the motors of any vehicle",
+        SIMULATION_LIMIT.as_secs()
+    )]
+    NotSimulated,
     /// It did not become ready.
     #[error("no takeoff: not ready after {} s: {}", after.as_secs(), reasons.join("; "))]
     NotReady {
@@ -157,7 +172,15 @@ impl Takeoff {
             guided: false,
             risen: false,
             found_armed: false,
+            only_simulated: false,
+            simulation_until_ns: None,
         }
+    }
+
+    /// The same, of a vehicle that says that it is a simulation; no other one is armed, moved or landed.
+    #[must_use]
+    pub fn only_simulated(self) -> Self {
+        Self { only_simulated: true, ..self }
     }
 
     /// Advances the takeoff and returns its progress.
@@ -224,6 +247,9 @@ impl Takeoff {
         state: Option<&VehicleState>,
     ) -> Result<(), TakeoffError> {
         let connected = state.filter(|state| state.connected);
+        if connected.is_some() && !self.may_be_flown(now_ns, autopilot)? {
+            return Ok(());
+        }
         match connected {
             Some(state) if state.armed && state.landed == LandedState::InAir => {
                 self.part = Part::Done;
@@ -252,6 +278,23 @@ impl Takeoff {
             }
         }
         Ok(())
+    }
+
+    /// Whether it may be flown as far as it is known: any vehicle, or one that says that it is a simulation.
+    fn may_be_flown(
+        &mut self,
+        now_ns: i64,
+        autopilot: &mut Autopilot,
+    ) -> Result<bool, TakeoffError> {
+        if !self.only_simulated || autopilot.is_simulated() {
+            return Ok(true);
+        }
+        autopilot.ask_whether_simulated(now_ns);
+        let limit_ns = now_ns.saturating_add(ns(SIMULATION_LIMIT));
+        if now_ns >= *self.simulation_until_ns.get_or_insert(limit_ns) {
+            return Err(TakeoffError::NotSimulated);
+        }
+        Ok(false)
     }
 
     fn wait_for_mode(
@@ -365,7 +408,13 @@ impl Takeoff {
 
     fn progress(&self, autopilot: &Autopilot) -> TakeoffProgress {
         match &self.part {
-            Part::Ready => TakeoffProgress::Waiting(reasons(autopilot)),
+            Part::Ready => {
+                let mut reasons = reasons(autopilot);
+                if self.only_simulated && autopilot.is_connected() && !autopilot.is_simulated() {
+                    reasons.insert(0, "waiting for it to say that it is a simulation".to_owned());
+                }
+                TakeoffProgress::Waiting(reasons)
+            }
             Part::Mode(_) => TakeoffProgress::ChangingMode,
             Part::Arm(Arming { refused, .. }) => {
                 TakeoffProgress::Arming { refused: refused.as_ref().map(ToString::to_string) }

@@ -7,9 +7,11 @@
 )]
 
 use autopilot::{
-    Autopilot, Command, CommandStatus, Config, Event, FlightMode, Parser, Takeoff, TakeoffProgress,
+    Autopilot, Command, CommandStatus, Config, Event, FlightMode, Parser, Takeoff, TakeoffError,
+    TakeoffProgress,
 };
 use geometry::Vector;
+use world::ardupilot::Firmware;
 use world::wind::WindConfig;
 use world::world::{World, WorldConfig};
 
@@ -116,4 +118,44 @@ fn the_client_waits_for_an_autopilot_that_starts_slowly() {
     let mut pair = Pair::new(&config, 4);
     pair.take_off(3.0);
     assert!(pair.world.now_s() > 42.0 && pair.world.now_s() < 65.0, "{}", pair.world.now_s());
+}
+
+/// The end of a take-off that is only for simulations.
+fn take_off_if_simulated(firmware: Firmware, says_simulated: bool) -> (TakeoffProgress, Pair) {
+    let mut config = WorldConfig::default();
+    config.autopilot.firmware = firmware;
+    config.autopilot.says_simulated = says_simulated;
+    let mut pair = Pair::new(&config, 4);
+    let mut takeoff = Takeoff::new(10.0).only_simulated();
+    for _ in 0..6000 {
+        pair.tick();
+        let now_ns = pair.now_ns();
+        let progress = takeoff.step(now_ns, &mut pair.client);
+        if takeoff.is_finished() {
+            return (progress, pair);
+        }
+    }
+    unreachable!("no end: {:?}", pair.events);
+}
+
+#[test]
+fn a_simulated_vehicle_says_so_and_takes_off() {
+    for firmware in [Firmware::ArduPilot, Firmware::Px4] {
+        let (end, pair) = take_off_if_simulated(firmware, true);
+        assert_eq!(end, TakeoffProgress::Done, "{firmware:?}");
+        assert!(pair.client.is_simulated());
+    }
+}
+
+#[test]
+fn a_vehicle_that_may_be_real_is_never_armed() {
+    for firmware in [Firmware::ArduPilot, Firmware::Px4] {
+        let (end, pair) = take_off_if_simulated(firmware, false);
+        assert_eq!(end, TakeoffProgress::Failed(TakeoffError::NotSimulated), "{firmware:?}");
+        assert!(end.to_string().contains("--real-vehicle"), "{end}");
+        let commands = pair.events.iter().filter(|event| matches!(event, Event::Command { .. }));
+        assert_eq!(commands.count(), 0, "{firmware:?}");
+        assert!(!pair.client.state().is_some_and(|state| state.armed));
+        assert!(pair.world.truth().on_ground);
+    }
 }

@@ -125,6 +125,7 @@ table! {
         address: String,
         ready_after_s: f64 = 0.5..=600.0,
         firmware: FirmwareName,
+        says_simulated: bool,
         precision_landing: bool,
         land_speed_cm_s: f64 = 30.0..=200.0,
         errors: f64 = 0.0..=10.0,
@@ -345,6 +346,7 @@ impl AutopilotSettings {
         let precision = f32::from(u8::from(self.precision_landing));
         AutopilotConfig {
             ready_after_s: self.ready_after_s,
+            says_simulated: self.says_simulated,
             firmware: match self.firmware {
                 FirmwareName::ArduPilot => Firmware::ArduPilot,
                 FirmwareName::Px4 => Firmware::Px4,

@@ -60,6 +60,8 @@ pub struct AutopilotConfig {
     pub rangefinder: bool,
     /// True to forward the heartbeats of a ground station (255/190), as a real one with two links does.
     pub forward_ground_station: bool,
+    /// True when it says that it is a simulation, as simulated autopilots do and real ones do not.
+    pub says_simulated: bool,
     /// Whose rules it keeps.
     pub firmware: Firmware,
     /// Parameters that differ from the defaults, by ArduPilot's names and in its units.
@@ -76,6 +78,7 @@ impl Default for AutopilotConfig {
             origin: Origin::default(),
             rangefinder: false,
             forward_ground_station: false,
+            says_simulated: true,
             firmware: Firmware::ArduPilot,
             parameters: Vec::new(),
         }
@@ -297,6 +300,7 @@ impl SimulatedAutopilot {
             landed: self.flight.landed(),
             target_velocity: self.flight.target_velocity(),
             rangefinder: self.config.rangefinder,
+            says_simulated: self.config.says_simulated,
             px4: self.is_px4().then(|| self.px4.shown(self.flight.mode(), self.flight.landed())),
         }
     }

@@ -5,11 +5,11 @@ use autopilot::dialect::{
     ATTITUDE_DATA, ATTITUDE_QUATERNION_DATA, AUTOPILOT_VERSION_DATA, BATTERY_STATUS_DATA,
     DISTANCE_SENSOR_DATA, EKF_STATUS_REPORT_DATA, EXTENDED_SYS_STATE_DATA, EkfStatusFlags,
     GLOBAL_POSITION_INT_DATA, GPS_GLOBAL_ORIGIN_DATA, GPS_RAW_INT_DATA, GpsFixType, HEARTBEAT_DATA,
-    HOME_POSITION_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot, MavDistanceSensor, MavFrame,
-    MavLandedState, MavMessage, MavModeFlag, MavSensorOrientation, MavState, MavSysStatusSensor,
-    MavType, MavVtolState, POSITION_TARGET_LOCAL_NED_DATA, PositionTargetTypemask,
-    RANGEFINDER_DATA, SIM_STATE_DATA, SIMSTATE_DATA, SYS_STATUS_DATA, SYSTEM_TIME_DATA,
-    VFR_HUD_DATA,
+    HIL_STATE_QUATERNION_DATA, HOME_POSITION_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot,
+    MavDistanceSensor, MavFrame, MavLandedState, MavMessage, MavModeFlag, MavSensorOrientation,
+    MavState, MavSysStatusSensor, MavType, MavVtolState, POSITION_TARGET_LOCAL_NED_DATA,
+    PositionTargetTypemask, RANGEFINDER_DATA, SIM_STATE_DATA, SIMSTATE_DATA, SYS_STATUS_DATA,
+    SYSTEM_TIME_DATA, VFR_HUD_DATA,
 };
 use geometry::{Body, Ned, Vector};
 
@@ -18,7 +18,7 @@ use super::flight::{Landed, Mode};
 use crate::vehicle::{GRAVITY_M_S2, VehicleTruth};
 
 /// Message numbers that can be requested, by the stream of REQUEST_DATA_STREAM they belong to (0: none).
-const MESSAGES: [(u32, u8); 19] = [
+const MESSAGES: [(u32, u8); 20] = [
     (1, 2),
     (2, 12),
     (24, 2),
@@ -30,6 +30,7 @@ const MESSAGES: [(u32, u8); 19] = [
     (74, 11),
     (85, 2),
     (108, 0),
+    (115, 0),
     (132, 12),
     (147, 12),
     (164, 10),
@@ -152,6 +153,7 @@ pub(super) struct Telemetry<'a> {
     pub(super) landed: Landed,
     pub(super) target_velocity: Option<[f64; 3]>,
     pub(super) rangefinder: bool,
+    pub(super) says_simulated: bool,
     /// The mode in PX4's terms, if it is one.
     pub(super) px4: Option<FlightMode>,
 }
@@ -206,11 +208,12 @@ impl Telemetry<'_> {
             49 if self.readiness >= Readiness::OriginSet => self.gps_global_origin(),
             74 => self.vfr_hud(),
             85 => self.position_target_local_ned()?,
-            108 => self.sim_state(),
+            108 if self.says_simulated && self.px4.is_none() => self.sim_state(),
+            115 if self.says_simulated && self.px4.is_some() => self.hil_state_quaternion(),
             132 if self.rangefinder => self.distance_sensor(),
             147 => battery_status(),
             148 => autopilot_version(),
-            164 => self.simstate(),
+            164 if self.says_simulated && self.px4.is_none() => self.simstate(),
             173 if self.rangefinder => MavMessage::RANGEFINDER(RANGEFINDER_DATA {
                 distance: self.range_m() as f32,
                 voltage: 0.0,
@@ -450,6 +453,27 @@ impl Telemetry<'_> {
             zgyro: rate.z() as f32,
             lat,
             lng,
+        })
+    }
+
+    /// The truth in PX4's message: position in 1e-7 degrees, velocity in cm/s.
+    fn hil_state_quaternion(&self) -> MavMessage {
+        let (p, v, rate) = (self.truth.position, self.truth.velocity, self.truth.angular_rate);
+        let (lat, lon) = self.origin.global(p.x(), p.y());
+        let centimetres = |metres: f64| (metres * 100.0).round() as i16;
+        MavMessage::HIL_STATE_QUATERNION(HIL_STATE_QUATERNION_DATA {
+            time_usec: self.time_usec(),
+            attitude_quaternion: self.truth.ned_from_body.wxyz().map(|part| part as f32),
+            rollspeed: rate.x() as f32,
+            pitchspeed: rate.y() as f32,
+            yawspeed: rate.z() as f32,
+            lat,
+            lon,
+            alt: millimetres(self.origin.altitude_m - p.z()),
+            vx: centimetres(v.x()),
+            vy: centimetres(v.y()),
+            vz: centimetres(v.z()),
+            ..HIL_STATE_QUATERNION_DATA::default()
         })
     }
 

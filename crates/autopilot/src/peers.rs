@@ -1,0 +1,230 @@
+//! Whom a listening link talks to, of all that send to its port.
+
+use std::net::{IpAddr, SocketAddr};
+use std::time::{Duration, Instant};
+
+use crate::dialect::{MavAutopilot, MavMessage};
+use crate::packet::{Counters, Packet, Parser};
+
+/// Silence after which an incomplete packet is discarded.
+pub(crate) const PACKET_GAP: Duration = Duration::from_millis(200);
+/// Silence after which an autopilot is replaced by another one.
+const PEER_SILENCE: Duration = Duration::from_secs(3);
+/// Maximum number of known UDP peers.
+const MAX_PEERS: usize = 8;
+
+/// Whom a listening link talks to.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Peering {
+    /// An autopilot: the sender of its heartbeat, until that is silent for 3 s.
+    #[default]
+    Autopilot,
+    /// A ground station: the first one heard, until that is silent.
+    GroundStation {
+        /// The addresses of the ground stations; any address if there are none.
+        known: Vec<IpAddr>,
+        /// Silence after which another one takes its place.
+        silence: Duration,
+    },
+}
+
+impl Peering {
+    /// Whether packets from this address are taken at all.
+    pub(crate) fn admits(&self, from: IpAddr) -> bool {
+        match self {
+            Self::Autopilot => true,
+            Self::GroundStation { known, .. } => {
+                known.is_empty() || known.iter().any(|k| k.to_canonical() == from.to_canonical())
+            }
+        }
+    }
+
+    /// Silence after which a peer is replaced.
+    pub(crate) fn silence(&self) -> Duration {
+        match self {
+            Self::Autopilot => PEER_SILENCE,
+            Self::GroundStation { silence, .. } => *silence,
+        }
+    }
+}
+
+/// The senders to a UDP port, each with its own stream of packets.
+pub(crate) struct Peers {
+    known: Vec<Peer>,
+    pub(crate) chosen: Option<SocketAddr>,
+    peering: Peering,
+}
+
+/// What was in a datagram.
+pub(crate) struct Taken {
+    /// The packets of the chosen peer.
+    pub(crate) packets: Vec<Packet>,
+    /// Number of packets of others, which were dropped.
+    pub(crate) strangers: u64,
+    pub(crate) counted: Counters,
+}
+
+struct Peer {
+    address: SocketAddr,
+    parser: Parser,
+    /// Time of the last bytes.
+    heard: Instant,
+    /// Time of the last packet.
+    active: Instant,
+    /// Time of the last autopilot heartbeat from there.
+    autopilot: Option<Instant>,
+}
+
+impl Peers {
+    pub(crate) fn new(chosen: Option<SocketAddr>, peering: Peering) -> Self {
+        Self { known: Vec::new(), chosen, peering }
+    }
+
+    /// Parses a datagram and returns its packets if they come from the chosen peer.
+    pub(crate) fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> Taken {
+        if !self.peering.admits(from.ip()) {
+            // One datagram is one packet, of almost everyone; a stranger's is not worth parsing.
+            return Taken { packets: Vec::new(), strangers: 1, counted: Counters::default() };
+        }
+        let peer = self.peer(from, now);
+        if now.duration_since(peer.heard) > PACKET_GAP {
+            // The rest of an incomplete packet is lost.
+            peer.parser.finish();
+        }
+        peer.heard = now;
+        let packets = peer.parser.push(bytes);
+        if !packets.is_empty() {
+            peer.active = now;
+        }
+        let counted = peer.parser.take_counters();
+        let is_autopilot = packets.iter().any(is_autopilot_heartbeat);
+        if is_autopilot {
+            peer.autopilot = Some(now);
+        }
+        if !packets.is_empty() && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
+            self.chosen = Some(from);
+        }
+        match self.chosen == Some(from) {
+            true => Taken { packets, strangers: 0, counted },
+            false => Taken { strangers: packets.len() as u64, packets: Vec::new(), counted },
+        }
+    }
+
+    /// Whether the chosen peer is replaced by one that just sent a packet.
+    fn is_replaced(&self, to_autopilot: bool, now: Instant) -> bool {
+        let recent = |at: Instant| now.duration_since(at) <= self.peering.silence();
+        let Some(chosen) = self.chosen else { return true };
+        let Some(chosen) = self.known.iter().find(|peer| peer.address == chosen) else {
+            return true;
+        };
+        match (&self.peering, chosen.autopilot) {
+            (Peering::Autopilot, Some(at)) => to_autopilot && !recent(at),
+            (Peering::Autopilot, None) => to_autopilot || !recent(chosen.active),
+            (Peering::GroundStation { .. }, _) => !recent(chosen.active),
+        }
+    }
+
+    fn peer(&mut self, address: SocketAddr, now: Instant) -> &mut Peer {
+        let index = match self.known.iter().position(|peer| peer.address == address) {
+            Some(index) => index,
+            None => {
+                self.forget_one();
+                self.known.push(Peer {
+                    address,
+                    parser: Parser::new(),
+                    heard: now,
+                    active: now,
+                    autopilot: None,
+                });
+                self.known.len() - 1
+            }
+        };
+        &mut self.known[index]
+    }
+
+    /// Forgets the peer with the longest silence, never the chosen one.
+    fn forget_one(&mut self) {
+        if self.known.len() < MAX_PEERS {
+            return;
+        }
+        let others = self.known.iter().enumerate().filter(|(_, p)| Some(p.address) != self.chosen);
+        if let Some((oldest, _)) = others.min_by_key(|(_, peer)| peer.heard) {
+            self.known.swap_remove(oldest);
+        }
+    }
+}
+
+/// True for the heartbeat of an autopilot, as opposed to a ground station, camera or companion.
+fn is_autopilot_heartbeat(packet: &Packet) -> bool {
+    match &packet.message {
+        Some(MavMessage::HEARTBEAT(heartbeat)) => {
+            heartbeat.autopilot != MavAutopilot::MAV_AUTOPILOT_INVALID
+                && packet.sender.component == 1
+        }
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dialect::HEARTBEAT_DATA;
+    use crate::packet::{Sender, encode};
+
+    const GROUND: Sender = Sender { system: 255, component: 190 };
+
+    fn at(host: u8) -> SocketAddr {
+        SocketAddr::from(([10, 0, 0, host], 14_550))
+    }
+
+    fn station(known: Vec<IpAddr>) -> Peers {
+        let silence = Duration::from_secs(10);
+        Peers::new(None, Peering::GroundStation { known, silence })
+    }
+
+    fn heartbeat(autopilot: MavAutopilot, sender: Sender) -> Vec<u8> {
+        let data = HEARTBEAT_DATA { autopilot, ..Default::default() };
+        encode(sender, 0, &MavMessage::HEARTBEAT(data))
+    }
+
+    #[test]
+    fn the_first_ground_station_is_held_until_it_is_silent() {
+        let mut peers = station(Vec::new());
+        let began = Instant::now();
+        let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
+        assert_eq!(peers.take(at(1), &bytes, began).packets.len(), 1);
+        // What a stranger says it is does not matter.
+        let autopilot = Sender { system: 1, component: 1 };
+        let lie = heartbeat(MavAutopilot::MAV_AUTOPILOT_PX4, autopilot);
+        for second in 1..=10 {
+            let now = began + Duration::from_secs(second);
+            let taken = peers.take(at(2), &lie, now);
+            assert_eq!((taken.packets.len(), taken.strangers), (0, 1), "after {second} s");
+        }
+        assert_eq!(peers.chosen, Some(at(1)));
+        let later = began + Duration::from_secs(11);
+        assert_eq!(peers.take(at(2), &bytes, later).packets.len(), 1, "the first one is silent");
+        assert_eq!(peers.take(at(1), &bytes, later).strangers, 1);
+    }
+
+    #[test]
+    fn only_known_ground_stations_are_heard() {
+        let mut peers = station(vec![at(3).ip()]);
+        let now = Instant::now();
+        let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
+        assert_eq!(peers.take(at(1), &bytes, now).strangers, 1);
+        assert_eq!(peers.chosen, None);
+        assert_eq!(peers.take(at(3), &bytes, now).packets.len(), 1);
+    }
+
+    #[test]
+    fn bytes_that_are_no_packets_hold_nobodys_place() {
+        let mut peers = station(Vec::new());
+        let began = Instant::now();
+        let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
+        peers.take(at(1), &bytes, began);
+        let later = began + Duration::from_secs(11);
+        peers.take(at(1), b"noise", later);
+        assert_eq!(peers.take(at(2), &bytes, later).packets.len(), 1);
+    }
+}

@@ -1,0 +1,214 @@
+//! What a ground station may send to the autopilot.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::dialect::{MavCmd, MavMessage};
+use crate::packet::Packet;
+
+/// What a ground station may send to the autopilot.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+pub enum Permission {
+    /// Everything.
+    #[default]
+    Everything,
+    /// Everything but what starts or stops motors: arming, disarming, ending the flight, restarting.
+    NoArming,
+    /// Only what changes nothing: heartbeats, the time, questions for parameters, missions and messages.
+    Monitor,
+}
+
+/// Why a packet was refused.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Refusal {
+    /// A short name for counters.
+    pub name: &'static str,
+    /// The command in the packet, if it is one.
+    pub command: Option<MavCmd>,
+}
+
+/// A permission with an unknown name.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("unknown permission `{0}`: expected everything, no-arming or monitor")]
+pub struct UnknownPermission(String);
+
+impl Permission {
+    const ALL: [Self; 3] = [Self::Everything, Self::NoArming, Self::Monitor];
+
+    /// Its name in a configuration.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Everything => "everything",
+            Self::NoArming => "no-arming",
+            Self::Monitor => "monitor",
+        }
+    }
+
+    /// Why a packet may not be sent; `None` when it may.
+    ///
+    /// What the dialect does not know may only be sent with [`Permission::Everything`]: it could be anything.
+    pub fn refusal(self, packet: &Packet) -> Option<Refusal> {
+        if self == Self::Everything {
+            return None;
+        }
+        let Some(message) = &packet.message else {
+            return Some(Refusal { name: "unknown message", command: None });
+        };
+        let command = command(message);
+        let name = match self {
+            Self::Everything => None,
+            Self::NoArming => {
+                (starts_or_stops_motors(message, command)).then_some("arming or stopping motors")
+            }
+            Self::Monitor => (!changes_nothing(message, command)).then_some("only monitoring"),
+        };
+        name.map(|name| Refusal { name, command })
+    }
+}
+
+impl fmt::Display for Permission {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Permission {
+    type Err = UnknownPermission;
+
+    fn from_str(text: &str) -> Result<Self, UnknownPermission> {
+        let found = Self::ALL.into_iter().find(|permission| permission.name() == text);
+        found.ok_or_else(|| UnknownPermission(text.to_owned()))
+    }
+}
+
+/// The command in a message.
+fn command(message: &MavMessage) -> Option<MavCmd> {
+    match message {
+        MavMessage::COMMAND_LONG(command) => Some(command.command),
+        MavMessage::COMMAND_INT(command) => Some(command.command),
+        _ => None,
+    }
+}
+
+/// SET_MODE counts as well: its flags can arm older autopilots. So do a script or a file that the autopilot
+/// would run, and mavlink packets for another of its links.
+#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+fn starts_or_stops_motors(message: &MavMessage, command: Option<MavCmd>) -> bool {
+    let by_command = matches!(
+        command,
+        Some(
+            MavCmd::MAV_CMD_COMPONENT_ARM_DISARM
+                | MavCmd::MAV_CMD_DO_FLIGHTTERMINATION
+                | MavCmd::MAV_CMD_DO_MOTOR_TEST
+                | MavCmd::MAV_CMD_DO_PARACHUTE
+                | MavCmd::MAV_CMD_DO_SET_ACTUATOR
+                | MavCmd::MAV_CMD_DO_SET_SERVO
+                | MavCmd::MAV_CMD_DO_REPEAT_SERVO
+                | MavCmd::MAV_CMD_ACTUATOR_TEST
+                | MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+        )
+    );
+    by_command
+        || matches!(
+            message,
+            MavMessage::SET_MODE(_)
+                | MavMessage::SET_ACTUATOR_CONTROL_TARGET(_)
+                | MavMessage::SERIAL_CONTROL(_)
+                | MavMessage::FILE_TRANSFER_PROTOCOL(_)
+                | MavMessage::TUNNEL(_)
+        )
+}
+
+/// Requests for streams are not among them: they would take the rates away that the controller has asked for.
+#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+fn changes_nothing(message: &MavMessage, command: Option<MavCmd>) -> bool {
+    match command {
+        Some(command) => matches!(
+            command,
+            MavCmd::MAV_CMD_REQUEST_MESSAGE
+                | MavCmd::MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
+                | MavCmd::MAV_CMD_REQUEST_PROTOCOL_VERSION
+                | MavCmd::MAV_CMD_GET_HOME_POSITION
+                | MavCmd::MAV_CMD_GET_MESSAGE_INTERVAL
+        ),
+        None => matches!(
+            message,
+            MavMessage::HEARTBEAT(_)
+                | MavMessage::SYSTEM_TIME(_)
+                | MavMessage::PING(_)
+                | MavMessage::TIMESYNC(_)
+                | MavMessage::PARAM_REQUEST_READ(_)
+                | MavMessage::PARAM_REQUEST_LIST(_)
+                | MavMessage::MISSION_REQUEST_LIST(_)
+                | MavMessage::MISSION_REQUEST_INT(_)
+                | MavMessage::MISSION_REQUEST(_)
+                | MavMessage::MISSION_ACK(_)
+        ),
+    }
+}
+
+#[cfg(test)]
+#[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
+mod tests {
+    use super::*;
+    use crate::dialect::{
+        COMMAND_INT_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, PARAM_REQUEST_LIST_DATA,
+        PARAM_SET_DATA, RC_CHANNELS_OVERRIDE_DATA, REQUEST_DATA_STREAM_DATA, SET_MODE_DATA,
+    };
+    use crate::packet::{Parser, Sender, encode};
+
+    fn packet(message: &MavMessage) -> Packet {
+        Parser::new().push(&encode(Sender { system: 255, component: 190 }, 0, message)).remove(0)
+    }
+
+    fn long(command: MavCmd) -> MavMessage {
+        MavMessage::COMMAND_LONG(COMMAND_LONG_DATA { command, ..Default::default() })
+    }
+
+    fn int(command: MavCmd) -> MavMessage {
+        MavMessage::COMMAND_INT(COMMAND_INT_DATA { command, ..Default::default() })
+    }
+
+    #[test]
+    fn each_permission_refuses_what_its_name_says() {
+        let arming = MavCmd::MAV_CMD_COMPONENT_ARM_DISARM;
+        for (message, no_arming, monitor) in [
+            (MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()), true, true),
+            (MavMessage::PARAM_REQUEST_LIST(PARAM_REQUEST_LIST_DATA::default()), true, true),
+            (long(MavCmd::MAV_CMD_REQUEST_MESSAGE), true, true),
+            (long(MavCmd::MAV_CMD_NAV_LAND), true, false),
+            (long(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL), true, false),
+            (MavMessage::PARAM_SET(PARAM_SET_DATA::default()), true, false),
+            (MavMessage::REQUEST_DATA_STREAM(REQUEST_DATA_STREAM_DATA::default()), true, false),
+            (MavMessage::RC_CHANNELS_OVERRIDE(RC_CHANNELS_OVERRIDE_DATA::default()), true, false),
+            (long(arming), false, false),
+            (int(arming), false, false),
+            (long(MavCmd::MAV_CMD_DO_FLIGHTTERMINATION), false, false),
+            (int(MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN), false, false),
+            (MavMessage::SET_MODE(SET_MODE_DATA::default()), false, false),
+        ] {
+            let packet = packet(&message);
+            assert_eq!(Permission::Everything.refusal(&packet), None);
+            assert_eq!(Permission::NoArming.refusal(&packet).is_none(), no_arming, "{message:?}");
+            assert_eq!(Permission::Monitor.refusal(&packet).is_none(), monitor, "{message:?}");
+        }
+        let refusal = Permission::NoArming.refusal(&packet(&long(arming))).map(|r| r.command);
+        assert_eq!(refusal, Some(Some(arming)), "the command is answered with a refusal");
+    }
+
+    #[test]
+    fn what_is_not_known_passes_only_with_everything() {
+        let packet = Packet { message: None, ..packet(&long(MavCmd::MAV_CMD_NAV_LAND)) };
+        assert_eq!(Permission::Everything.refusal(&packet), None);
+        assert!(Permission::NoArming.refusal(&packet).is_some());
+        assert!(Permission::Monitor.refusal(&packet).is_some());
+    }
+
+    #[test]
+    fn names_are_read_as_they_are_written() {
+        for permission in Permission::ALL {
+            assert_eq!(permission.to_string().parse(), Ok(permission));
+        }
+        assert!("all".parse::<Permission>().unwrap_err().to_string().contains("no-arming"));
+    }
+}
