@@ -78,7 +78,7 @@ impl Limits {
     pub fn found(&self, autopilot: &mut Autopilot) {
         match autopilot.firmware() {
             Some(Firmware::Copter) => {
-                autopilot.read_parameters(&[GUID_TIMEOUT, WPNAV_ACCEL_Z, WPNAV_ACCEL, PSC_JERK_XY])
+                autopilot.read_parameters(&[GUID_TIMEOUT, WPNAV_ACCEL_Z, WPNAV_ACCEL, PSC_JERK_XY]);
             }
             Some(Firmware::Px4) => autopilot.read_parameters(&[COM_OF_LOSS_T]),
             _ => {}
