@@ -10,20 +10,32 @@ use autopilot::{Autopilot, Firmware, Parameter};
 use landing::AutopilotLimits;
 use serde::{Deserialize, Serialize};
 
-/// ArduPilot's parameters: setpoint timeout in s, horizontal acceleration in cm/s^2, jerk in m/s^3, and vertical
-/// acceleration in cm/s^2.
+/// ArduPilot's setpoint timeout, in s.
 const GUID_TIMEOUT: &str = "GUID_TIMEOUT";
-const WPNAV_ACCEL: &str = "WPNAV_ACCEL";
-const PSC_JERK_XY: &str = "PSC_JERK_XY";
-const WPNAV_ACCEL_Z: &str = "WPNAV_ACCEL_Z";
+/// ArduPilot's vertical and horizontal acceleration and horizontal jerk, by their names up to 4.6 (the accelerations in
+/// cm/s^2) and from 4.7 on, with their scale to m/s^2 and m/s^3.
+const VERTICAL_ACCELERATION: [Scaled; 2] = [scaled("WPNAV_ACCEL_Z", 0.01), scaled("WP_ACC_Z", 1.0)];
+const ACCELERATION: [Scaled; 2] = [scaled("WPNAV_ACCEL", 0.01), scaled("WP_ACC", 1.0)];
+const JERK: [Scaled; 2] = [scaled("PSC_JERK_XY", 1.0), scaled("PSC_JERK_NE", 1.0)];
 /// PX4's time without setpoints until it leaves OFFBOARD, in s.
 const COM_OF_LOSS_T: &str = "COM_OF_LOSS_T";
 
 /// Difference of two timeouts that count as the same, in seconds.
 const SAME_S: f64 = 1e-3;
-/// Time for which no landing was active before the timeout is put back, in nanoseconds: a controller that is
-/// started again needs as long to see that it has one to resume.
+/// Time for which no landing was active before the timeout of an armed vehicle is put back, in nanoseconds: a
+/// controller that is started again needs as long to see that it has one to resume.
 const QUIET_NS: i64 = 2_000_000_000;
+
+/// A parameter and the factor to SI units.
+#[derive(Copy, Clone, Debug)]
+struct Scaled {
+    name: &'static str,
+    scale: f64,
+}
+
+const fn scaled(name: &'static str, scale: f64) -> Scaled {
+    Scaled { name, scale }
+}
 
 /// What must be put back, kept outside of the process for the time after a crash.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -78,7 +90,10 @@ impl Limits {
     pub fn found(&self, autopilot: &mut Autopilot) {
         match autopilot.firmware() {
             Some(Firmware::Copter) => {
-                autopilot.read_parameters(&[GUID_TIMEOUT, WPNAV_ACCEL_Z, WPNAV_ACCEL, PSC_JERK_XY]);
+                autopilot.read_parameters(&[GUID_TIMEOUT]);
+                for [old, new] in [VERTICAL_ACCELERATION, ACCELERATION, JERK] {
+                    autopilot.read_parameters(&[old.name, new.name]);
+                }
             }
             Some(Firmware::Px4) => autopilot.read_parameters(&[COM_OF_LOSS_T]),
             _ => {}
@@ -101,7 +116,8 @@ impl Limits {
             } else {
                 self.is_refused = false;
                 let since_ns = *self.active_ns.get_or_insert(now_ns);
-                if now_ns.saturating_sub(since_ns) >= QUIET_NS {
+                let is_disarmed = autopilot.state().is_some_and(|state| !state.armed);
+                if is_disarmed || now_ns.saturating_sub(since_ns) >= QUIET_NS {
                     self.restore(autopilot);
                 }
             }
@@ -203,12 +219,15 @@ pub fn timeout_s(autopilot: &Autopilot) -> Option<f64> {
 
 fn read(autopilot: &Autopilot) -> AutopilotLimits {
     let default = AutopilotLimits::default();
-    let or = |name, scale: f64, default| value(autopilot, name).map_or(default, |v| v * scale);
+    let or = |names: [Scaled; 2], default| {
+        let read = |it: Scaled| Some(value(autopilot, it.name)? * it.scale);
+        names.into_iter().find_map(read).unwrap_or(default)
+    };
     AutopilotLimits {
         setpoint_timeout_s: timeout_s(autopilot),
-        acceleration_m_s2: or(WPNAV_ACCEL, 0.01, default.acceleration_m_s2),
-        jerk_m_s3: or(PSC_JERK_XY, 1.0, default.jerk_m_s3),
-        vertical_acceleration_m_s2: or(WPNAV_ACCEL_Z, 0.01, default.vertical_acceleration_m_s2),
+        acceleration_m_s2: or(ACCELERATION, default.acceleration_m_s2),
+        jerk_m_s3: or(JERK, default.jerk_m_s3),
+        vertical_acceleration_m_s2: or(VERTICAL_ACCELERATION, default.vertical_acceleration_m_s2),
     }
 }
 
