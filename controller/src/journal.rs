@@ -141,7 +141,11 @@ impl Journal {
             Event::StreamRestored { message, measured_hz } => {
                 tracing::info!(message, measured_hz, "A MAVLink message is streaming again");
             }
-            Event::State(_) | Event::Attitude(_) | Event::Position(_) | Event::Range(_) => {}
+            Event::State(_)
+            | Event::Status(_)
+            | Event::Attitude(_)
+            | Event::Position(_)
+            | Event::Range(_) => {}
         }
     }
 }

@@ -10,11 +10,13 @@ use std::time::Duration;
 
 use geometry::{Body, Ned, Point, Vector};
 
+use crate::boot::{BootClock, BootTime};
 use crate::clock::Clock;
 use crate::command::{
     Command, CommandError, CommandId, CommandStatus, Request, SetpointError, Step, Timeouts, ns,
 };
 use crate::compose;
+use crate::contact::Contact;
 use crate::dialect::{
     COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
     MavType, TIMESYNC_DATA,
@@ -36,8 +38,8 @@ const MAX_QUEUED: usize = 1024;
 const MAX_OUTCOMES: usize = 32;
 /// Period of our heartbeat, in nanoseconds.
 const HEARTBEAT_NS: i64 = 1_000_000_000;
-/// Backward step of the autopilot's clock that counts as a restart, in milliseconds.
-const RESTART_MS: u32 = 1_000;
+/// Maximum age of a position whose vertical speed says whether the vehicle stands, in nanoseconds.
+const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 /// Time for which setpoints are sent before OFFBOARD is requested, in nanoseconds: PX4 enters it only after a
 /// second of setpoints at 2 Hz or more (<https://docs.px4.io/main/en/flight_modes/offboard.html>).
 const PROOF_NS: i64 = 1_300_000_000;
@@ -123,6 +125,7 @@ pub struct Autopilot {
     other_vehicle: bool,
     same_address: bool,
     refused_numbers: u64,
+    late: u64,
 }
 
 #[derive(Clone, Debug)]
@@ -133,7 +136,12 @@ struct Vehicle {
     readiness: Readiness,
     simulation: Simulation,
     heartbeat_ns: i64,
-    boot_ms: u32,
+    /// When its last packet was received.
+    heard_ns: i64,
+    boot: BootClock,
+    contact: Contact,
+    /// What SYS_STATUS and BATTERY_STATUS say of the battery.
+    batteries: [Battery; 2],
     /// Altitude above mean sea level, in m.
     amsl_m: Option<f64>,
     joiner: Joiner,
@@ -159,6 +167,7 @@ impl Autopilot {
             other_vehicle: false,
             same_address: false,
             refused_numbers: 0,
+            late: 0,
         }
     }
 
@@ -177,6 +186,9 @@ impl Autopilot {
         }
         if self.vehicle.as_ref().is_none_or(|vehicle| vehicle.system != packet.sender.system) {
             return;
+        }
+        if let Some(vehicle) = &mut self.vehicle {
+            vehicle.heard_ns = now_ns;
         }
         self.streams.received(now_ns, packet.message_id);
         match message {
@@ -317,6 +329,12 @@ impl Autopilot {
         self.refused_numbers
     }
 
+    /// Number of measurements left out because they came after newer ones, or because their time since the
+    /// autopilot's start contradicted that of the others.
+    pub fn late_measurements(&self) -> u64 {
+        self.late
+    }
+
     /// Requests a command. It is sent with the next [`Autopilot::tick`], and replaces an earlier request of
     /// the same kind; [`Autopilot::status`] and [`Event::Command`] report its result.
     pub fn request(&mut self, now_ns: i64, command: Command) -> CommandId {
@@ -358,6 +376,9 @@ impl Autopilot {
 
     /// Sends a velocity in m/s, with a yaw rate in rad/s (0 holds the heading): at least twice a second,
     /// because the autopilot flies on with the last one for 3 s. Zeros stop the vehicle.
+    ///
+    /// Also sent while only the heartbeat is missing and other packets arrive: in another mode than ours the
+    /// autopilot takes no setpoint, and without any it would fly on with the last one, downwards maybe.
     pub fn set_velocity(
         &mut self,
         now_ns: i64,
@@ -370,7 +391,8 @@ impl Autopilot {
         if !velocity.coords.iter().copied().all(fits) || !fits(yaw_rate) {
             return Err(SetpointError::NotFinite(velocity.coords.into(), yaw_rate));
         }
-        if !state.connected {
+        let silence_ns = now_ns.saturating_sub(vehicle.heard_ns);
+        if silence_ns > ns(self.config.heartbeat_timeout) {
             return Err(SetpointError::NoAutopilot);
         }
         if vehicle.firmware.guided().is_none() {
@@ -524,7 +546,10 @@ impl Autopilot {
             readiness: Readiness::default(),
             simulation: Simulation::default(),
             heartbeat_ns: now_ns,
-            boot_ms: 0,
+            heard_ns: now_ns,
+            boot: BootClock::default(),
+            contact: Contact::default(),
+            batteries: [Battery::default(); 2],
             amsl_m: None,
             joiner: Joiner::default(),
         });
@@ -540,11 +565,14 @@ impl Autopilot {
         let armed = heartbeat.base_mode.contains(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
         vehicle.heartbeat_ns = now_ns;
         vehicle.simulation.take_mode(heartbeat.base_mode);
+        vehicle.heard_ns = now_ns;
         state.stamp_ns = now_ns;
         let before = state.mode;
         let returned = !std::mem::replace(&mut state.connected, true);
         let mode_changed = std::mem::replace(&mut state.mode, mode) != mode;
         let armed_changed = std::mem::replace(&mut state.armed, armed) != armed;
+        let landed = if armed { state.landed } else { vehicle.contact.disarmed() };
+        let landed_before = std::mem::replace(&mut state.landed, landed);
         if returned {
             self.streams.restart();
             self.push(Event::Returned);
@@ -555,6 +583,16 @@ impl Autopilot {
         if armed_changed {
             self.push(Event::ArmedChanged(armed));
         }
+        self.report_contact(landed_before);
+    }
+
+    /// Reports mode, motors and contact with the ground, and the contact's change from `before`.
+    fn report_contact(&mut self, before: LandedState) {
+        let Some(state) = self.state().copied() else { return };
+        if before != state.landed {
+            self.push(Event::LandedChanged { from: before, to: state.landed });
+        }
+        self.push(Event::Status(state));
     }
 
     fn check_silence(&mut self, now_ns: i64) {
@@ -568,7 +606,9 @@ impl Autopilot {
             vehicle.simulation = Simulation::default();
             vehicle.state.ready = false;
             let silence = Duration::from_nanos(silence_ns.max(0) as u64);
+            let state = vehicle.state;
             self.push(Event::Lost { silence });
+            self.push(Event::Status(state));
             self.fail_requests(|command| CommandError::NoAutopilot { command });
         }
     }
@@ -630,19 +670,26 @@ impl Autopilot {
                 }
             }
             MavMessage::EXTENDED_SYS_STATE(message) => {
-                let to = LandedState::from(message.landed_state);
-                let from = std::mem::replace(&mut state.landed, to);
-                if from != to {
-                    self.push(Event::LandedChanged { from, to });
-                }
+                let reported = LandedState::from(message.landed_state);
+                let recent = state.position.filter(|position| {
+                    now_ns.saturating_sub(position.stamp_ns) <= MAX_SPEED_AGE_NS
+                });
+                let sinks_m_s = recent.map(|position| position.velocity.z());
+                let to = vehicle.contact.report(now_ns, reported, state.armed, sinks_m_s);
+                let before = std::mem::replace(&mut state.landed, to);
+                self.report_contact(before);
             }
             MavMessage::SYS_STATUS(message) => {
-                state.battery = Battery::from_status(message);
+                let [status, details] = &mut vehicle.batteries;
+                *status = Battery::from_status(message);
+                state.battery = status.joined_with(details);
                 vehicle.readiness.take_status(message);
                 self.check_readiness();
             }
             MavMessage::BATTERY_STATUS(message) if message.id == 0 => {
-                state.battery = state.battery.with_details(message);
+                let [status, details] = &mut vehicle.batteries;
+                *details = Battery::from_details(message);
+                state.battery = status.joined_with(details);
             }
             MavMessage::EKF_STATUS_REPORT(message) => {
                 vehicle.readiness.take_ekf(message.flags);
@@ -664,7 +711,10 @@ impl Autopilot {
             self.refused_numbers += 1;
             return;
         };
-        self.take_boot_time(attitude.boot_ms);
+        let newest = self.state().and_then(|state| state.attitude).map(|known| known.boot_ms);
+        if !self.is_present(now_ns, attitude.boot_ms, newest) {
+            return;
+        }
         if let Some(stamp_ns) = self.clock.stamp_ns(now_ns, attitude.boot_ms) {
             attitude.stamp_ns = stamp_ns;
         }
@@ -682,7 +732,10 @@ impl Autopilot {
             self.refused_numbers += 1;
             return;
         };
-        self.take_boot_time(position.boot_ms);
+        let newest = self.state().and_then(|state| state.position).map(|known| known.boot_ms);
+        if !self.is_present(now_ns, position.boot_ms, newest) {
+            return;
+        }
         if let Some(stamp_ns) = self.clock.stamp_ns(now_ns, position.boot_ms) {
             position.stamp_ns = stamp_ns;
         }
@@ -697,25 +750,40 @@ impl Autopilot {
         }
     }
 
-    /// Detects a restart by the autopilot's clock, which may be quicker than by a lost heartbeat.
-    fn take_boot_time(&mut self, boot_ms: u32) {
+    /// False for a measurement that is older than the `newest` of its kind, or whose time contradicts the
+    /// others. Detects a restart by the autopilot's clock, which may be quicker than by a lost heartbeat.
+    fn is_present(&mut self, now_ns: i64, boot_ms: u32, newest: Option<u32>) -> bool {
+        let Some(vehicle) = &mut self.vehicle else { return false };
+        let is_present = match vehicle.boot.take(now_ns, boot_ms) {
+            BootTime::Present => {
+                newest.is_none_or(|newest| boot_ms.wrapping_sub(newest).cast_signed() >= 0)
+            }
+            BootTime::Contradicts => false,
+            BootTime::Restarted => {
+                self.restarted();
+                true
+            }
+        };
+        self.late += u64::from(!is_present);
+        is_present
+    }
+
+    fn restarted(&mut self) {
         let Some(vehicle) = &mut self.vehicle else { return };
-        let restarted = boot_ms.saturating_add(RESTART_MS) < vehicle.boot_ms;
-        vehicle.boot_ms = boot_ms;
-        if restarted {
-            vehicle.readiness = Readiness::default();
-            vehicle.state.attitude = None;
-            vehicle.state.position = None;
-            vehicle.state.range = None;
-            vehicle.state.ready = false;
-            vehicle.state.landed = LandedState::Unknown;
-            vehicle.amsl_m = None;
-            self.clock.restart();
-            self.parameters.restart();
-            self.streams.restart();
-            self.push(Event::Restarted);
-            self.fail_requests(|command| CommandError::Restarted { command });
-        }
+        vehicle.readiness = Readiness::default();
+        vehicle.contact = Contact::default();
+        vehicle.state.attitude = None;
+        vehicle.state.position = None;
+        vehicle.state.range = None;
+        vehicle.state.ready = false;
+        let before = std::mem::replace(&mut vehicle.state.landed, LandedState::Unknown);
+        vehicle.amsl_m = None;
+        self.clock.restart();
+        self.parameters.restart();
+        self.streams.restart();
+        self.push(Event::Restarted);
+        self.report_contact(before);
+        self.fail_requests(|command| CommandError::Restarted { command });
     }
 
     fn check_readiness(&mut self) {

@@ -21,16 +21,18 @@ const MAX_TRIPS: usize = 64;
 const WINDOW_NS: i64 = 30_000 * MS;
 /// Maximum number of requests without a reply.
 const MAX_REQUESTS: usize = 16;
-/// Maximum length of a round trip that is used, in nanoseconds.
-const MAX_TRIP_NS: i64 = 200 * MS;
+/// Maximum length of a round trip that is used, in nanoseconds. Also a long one tells more than the time of the
+/// reception, which is wrong by the whole way here.
+const MAX_TRIP_NS: i64 = 1_500 * MS;
 /// Maximum drift between two clocks: 100 ppm.
 const DRIFT: f64 = 1e-4;
 /// Error of reading a clock, in nanoseconds.
 const SLACK_NS: i64 = 2 * MS;
 /// Consecutive contradictions after which a clock counts as reset.
 const CONTRADICTIONS: u32 = 3;
-/// Maximum age of a measurement on arrival over a live link, in nanoseconds.
-const MAX_AGE_NS: i64 = 1_000 * MS;
+/// Maximum age of a measurement on arrival over a live link, in nanoseconds: an old one must not pass for one of
+/// now.
+const MAX_AGE_NS: i64 = 3_000 * MS;
 
 /// The offset of the two clocks.
 #[derive(Clone, Debug, Default)]
@@ -173,7 +175,7 @@ mod tests {
             let boot_ms = ((measured_ns + ahead_ns) / MS) as u32;
             let Some(stamp_ns) = clock.stamp_ns(now_ns, boot_ms) else {
                 // Only times in the future, or too long ago, are unknown.
-                prop_assert!(age_ms * 2 <= shortest_ms || age_ms * 2 + shortest_ms > 1_990);
+                prop_assert!(age_ms * 2 <= shortest_ms || age_ms * 2 + shortest_ms > 5_990);
                 return Ok(());
             };
             let wrong_ns = (stamp_ns - measured_ns).abs();
@@ -192,7 +194,7 @@ mod tests {
                 clock.answered(now_ns, theirs_ns, ts1_ns);
                 clock.answered(now_ns, theirs_ns, now_ns);
                 if let Some(stamp_ns) = clock.stamp_ns(1_000 * MS, boot_ms) {
-                    prop_assert!((0..=1_000 * MS).contains(&stamp_ns));
+                    prop_assert!((-2_000 * MS..=1_000 * MS).contains(&stamp_ns));
                 }
             }
         }

@@ -47,6 +47,9 @@ pub enum Event {
     Range(Range),
     /// The whole state, after each attitude and position.
     State(VehicleState),
+    /// The whole state, after each heartbeat and each report of the contact with the ground, and when the
+    /// heartbeat is lost: mode, motors and contact are known also where attitude or position stopped.
+    Status(VehicleState),
     /// The flight mode changed.
     ModeChanged {
         /// The mode before; none at the beginning.

@@ -91,13 +91,13 @@ pub struct VehicleState {
     pub mode: FlightMode,
     /// Whether the motors are armed.
     pub armed: bool,
-    /// Contact with the ground.
+    /// Contact with the ground, as far as its reports are believed: what contradicts a flight is not.
     pub landed: LandedState,
     /// Whether it can be armed and flown: pre-arm checks passed and a position known.
     pub ready: bool,
     /// The battery.
     pub battery: Battery,
-    /// Whether heartbeats are received.
+    /// Whether heartbeats are received, and with them the mode and the motors known.
     pub connected: bool,
 }
 
@@ -206,12 +206,26 @@ impl Battery {
         }
     }
 
-    /// The same battery with the details of BATTERY_STATUS.
-    pub fn with_details(self, message: &BATTERY_STATUS_DATA) -> Self {
+    /// From BATTERY_STATUS, which may know the charge where SYS_STATUS does not.
+    pub fn from_details(message: &BATTERY_STATUS_DATA) -> Self {
         Self {
-            current_a: amperes(message.current_battery).or(self.current_a),
-            remaining: fraction(message.battery_remaining).or(self.remaining),
-            ..self
+            voltage_v: None,
+            current_a: amperes(message.current_battery),
+            remaining: fraction(message.battery_remaining),
+        }
+    }
+
+    /// What both say together: neither forgets what the other knows, and of two charges the lower one counts.
+    pub fn joined_with(&self, details: &Self) -> Self {
+        let lower = |a: f64, b: f64| if b < a { b } else { a };
+        let remaining = match (self.remaining, details.remaining) {
+            (Some(a), Some(b)) => Some(lower(a, b)),
+            (a, b) => a.or(b),
+        };
+        Self {
+            voltage_v: self.voltage_v.or(details.voltage_v),
+            current_a: details.current_a.or(self.current_a),
+            remaining,
         }
     }
 }
@@ -376,5 +390,19 @@ mod tests {
             ..Default::default()
         };
         assert_eq!(Battery::from_status(&message), Battery::default());
+    }
+
+    #[test]
+    fn a_charge_that_only_one_message_knows_is_kept_and_of_two_the_lower_one() {
+        let (unknown, low) = (
+            Battery::default(),
+            BATTERY_STATUS_DATA { battery_remaining: 8, ..Default::default() },
+        );
+        let low = Battery::from_details(&low);
+        assert_eq!(unknown.joined_with(&low).remaining, Some(0.08));
+        let half = Battery { remaining: Some(0.5), ..unknown };
+        assert_eq!(half.joined_with(&low).remaining, Some(0.08));
+        assert_eq!(low.joined_with(&half).remaining, Some(0.08));
+        assert_eq!(half.joined_with(&unknown).remaining, Some(0.5));
     }
 }

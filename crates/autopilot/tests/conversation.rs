@@ -48,6 +48,8 @@ struct Fake {
     /// A command that is refused a number of times, with a text about it.
     refuse: Option<(MavCmd, MavResult, &'static str, u32)>,
     silent: bool,
+    /// Only the heartbeat is missing.
+    has_no_heartbeat: bool,
     ignores_modes: bool,
     queue: Vec<MavMessage>,
     /// Questions for the time, to be answered at the next step.
@@ -75,6 +77,7 @@ impl Fake {
             lose_acks: 0,
             refuse: None,
             silent: false,
+            has_no_heartbeat: false,
             ignores_modes: false,
             queue: Vec::new(),
             questions: Vec::new(),
@@ -196,7 +199,7 @@ impl Fake {
                 .drain(..)
                 .map(|ts1| MavMessage::TIMESYNC(TIMESYNC_DATA { tc1, ts1, ..Default::default() })),
         );
-        if now % SECOND == 0 {
+        if now % SECOND == 0 && !self.has_no_heartbeat {
             sent.push(self.heartbeat());
         }
         for (&id, &interval) in &self.intervals {
@@ -644,12 +647,83 @@ fn velocities_are_sent_only_in_flight_in_guided() {
     world.run(2);
     let refused = world.client.set_velocity(world.now, forward, 0.0);
     assert_eq!(refused, Err(SetpointError::NotGuided(FlightMode::Other(5))));
-    world.fake.mode = 4;
-    world.fake.landed = MavLandedState::MAV_LANDED_STATE_TAKEOFF;
+    assert_eq!(world.fake.velocities.len(), 1);
+    let rising = Fake {
+        mode: 4,
+        armed: true,
+        landed: MavLandedState::MAV_LANDED_STATE_TAKEOFF,
+        ..Fake::new()
+    };
+    let mut world = World::with(rising, Config::default());
     world.run(2);
     let refused = world.client.set_velocity(world.now, forward, 0.0);
     assert_eq!(refused, Err(SetpointError::NotFlying(LandedState::TakingOff)));
-    assert_eq!(world.fake.velocities.len(), 1);
+}
+
+#[test]
+fn a_flying_vehicle_gets_setpoints_whatever_is_said_of_the_ground() {
+    let still = Vector::zero();
+    let mut world = World::flying();
+    for report in [
+        MavLandedState::MAV_LANDED_STATE_UNDEFINED,
+        MavLandedState::MAV_LANDED_STATE_TAKEOFF,
+        MavLandedState::MAV_LANDED_STATE_LANDING,
+    ] {
+        world.fake.landed = report;
+        world.run(6);
+        assert_eq!(world.client.set_velocity(world.now, still, 0.0), Ok(()), "{report:?}");
+    }
+    world.fake.landed = MavLandedState::MAV_LANDED_STATE_IN_AIR;
+    world.run(1);
+    let on_ground = EXTENDED_SYS_STATE_DATA {
+        landed_state: MavLandedState::MAV_LANDED_STATE_ON_GROUND,
+        ..Default::default()
+    };
+    world.receive(AUTOPILOT, &MavMessage::EXTENDED_SYS_STATE(on_ground));
+    assert_eq!(world.client.state().unwrap().landed, LandedState::InAir, "one report");
+    world.fake.landed = MavLandedState::MAV_LANDED_STATE_ON_GROUND;
+    world.run(1);
+    assert_eq!(world.client.state().unwrap().landed, LandedState::OnGround, "five of them");
+}
+
+#[test]
+fn without_the_heartbeat_alone_setpoints_go_on_and_commands_do_not() {
+    let mut world = World::flying();
+    world.fake.has_no_heartbeat = true;
+    world.run(5);
+    assert!(!world.client.is_connected(), "the mode is not known");
+    assert_eq!(world.client.set_velocity(world.now, Vector::zero(), 0.0), Ok(()));
+    let refused = world.request(Command::SetMode(FlightMode::Land));
+    assert!(matches!(refused, Err(CommandError::NoAutopilot { .. })), "{refused:?}");
+    world.fake.silent = true;
+    world.run(4);
+    let refused = world.client.set_velocity(world.now, Vector::zero(), 0.0);
+    assert_eq!(refused, Err(SetpointError::NoAutopilot));
+}
+
+#[test]
+fn a_measurement_of_another_time_is_neither_used_nor_a_restart() {
+    let mut world = World::flying();
+    let known = world.client.state().unwrap().attitude.unwrap();
+    for time_boot_ms in [0, known.boot_ms - 100, known.boot_ms + 1_000_000] {
+        let message = ATTITUDE_DATA { time_boot_ms, yaw: -2.0, ..Default::default() };
+        world.receive(AUTOPILOT, &MavMessage::ATTITUDE(message));
+        assert_eq!(world.client.state().unwrap().attitude, Some(known), "{time_boot_ms} ms");
+    }
+    world.run(2);
+    assert_eq!(world.count(|event| *event == Event::Restarted), 0);
+    assert!(world.client.state().unwrap().attitude.unwrap().boot_ms > known.boot_ms);
+    assert_eq!(world.client.late_measurements(), 3);
+}
+
+#[test]
+fn mode_motors_and_contact_are_told_after_every_heartbeat() {
+    let mut world = World::flying();
+    let told = |world: &World| world.count(|event| matches!(event, Event::Status(_)));
+    let before = told(&world);
+    // Of 3 heartbeats and 15 reports of the contact.
+    world.run(3);
+    assert!(told(&world) >= before + 17, "{}", told(&world) - before);
 }
 
 #[test]
