@@ -335,6 +335,21 @@ fn a_lander_started_low_and_out_of_sight_of_the_pad_climbs_to_find_it() {
 }
 
 #[test]
+fn a_heading_that_the_autopilot_resets_in_the_descent_is_survived() {
+    for degrees in [-20.0f64, -8.0, 8.0, 20.0] {
+        let flights = fly(0..4, |seed| {
+            Scene::windy(seed, 3.0, 1.0).with(|scene| {
+                let reset = (degrees.to_radians(), 4.0);
+                scene.world.autopilot.estimate.heading_reset = Some(reset);
+            })
+        });
+        println!("metric, heading reset by {degrees} degrees: {}", summary(&flights));
+        assert!(flights.iter().all(|f| f.phase == Phase::Landed && !f.is_unsafe()));
+        assert!(flights.iter().all(|f| f.error_m < 0.15));
+    }
+}
+
+#[test]
 fn the_thesis_landing_takes_about_its_55_seconds() {
     let flights = fly(0..20, |seed| thesis(seed, ThesisConfig::default()).perfect());
     println!("thesis: {}", summary(&flights));

@@ -39,6 +39,9 @@ pub struct EstimateConfig {
     pub gnss_drift_m_s: [f64; 2],
     /// Jump of the estimated position, in metres, and its time, in seconds after the world's begin.
     pub gnss_jump: Option<([f64; 2], f64)>,
+    /// Error of the heading until the filter resets it, in radians, and the time of that reset, in seconds after
+    /// the world's begin.
+    pub heading_reset: Option<(f64, f64)>,
 }
 
 impl Default for EstimateConfig {
@@ -58,6 +61,7 @@ impl Default for EstimateConfig {
             wander_s: 4.0,
             gnss_drift_m_s: [0.0; 2],
             gnss_jump: None,
+            heading_reset: None,
         }
     }
 }
@@ -80,6 +84,7 @@ impl EstimateConfig {
             wander_s: 4.0,
             gnss_drift_m_s: [0.0; 2],
             gnss_jump: None,
+            heading_reset: None,
         }
     }
 
@@ -205,6 +210,13 @@ impl Estimator {
         }
     }
 
+    /// Error of the heading, in radians.
+    fn yaw_error(&self) -> f64 {
+        let is_before = |at_s: f64| self.begun_s.is_none_or(|now_s| now_s < at_s);
+        let error = self.config.heading_reset.filter(|(_, at_s)| is_before(*at_s));
+        self.yaw_error + error.map_or(0.0, |(error, _)| error)
+    }
+
     /// From now on GNSS drifts and jumps as configured.
     pub(super) fn begin(&mut self) {
         self.begun_s = Some(0.0);
@@ -253,6 +265,7 @@ impl Estimator {
         let aside_rad = (east_m_s2 * cos - north_m_s2 * sin) / GRAVITY_M_S2;
         let roll_error = self.trim[0] + lean[0] + aside_rad;
         let pitch_error = self.trim[1] + lean[1] - ahead_rad;
+        let yaw_error = self.yaw_error();
         Estimate {
             position: [
                 p.x() + position[0] + self.gnss[0] + north.position,
@@ -267,11 +280,11 @@ impl Estimator {
             acceleration_z: truth.acceleration.z(),
             roll: roll + roll_error,
             pitch: pitch + pitch_error,
-            yaw: wrap(yaw + self.yaw_error),
+            yaw: wrap(yaw + yaw_error),
             rates: [truth.angular_rate.x(), truth.angular_rate.y(), truth.angular_rate.z()],
             roll_error,
             pitch_error,
-            yaw_error: self.yaw_error,
+            yaw_error,
             reset,
         }
     }
