@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use autopilot::dialect::{MavMessage, MavType};
-use autopilot::{Autopilot, Event, LandedState, Packet};
+use autopilot::{Autopilot, Event, FlightMode, LandedState, Packet};
 use landing::{
     Decision, Event as LanderEvent, FrameObservation, Lander, OperatorCommand, Phase, Timestamp,
 };
@@ -23,7 +23,7 @@ use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits::{Limits, Note};
 use crate::mission::{Mission, Trigger, is_flying_guided};
-use crate::setpoints::{Setpoints, without_detector};
+use crate::setpoints::Setpoints;
 use crate::status::{Used, View};
 use crate::wind::WindEstimate;
 use crate::wire;
@@ -34,6 +34,8 @@ pub struct Flight {
     autopilot: Autopilot,
     lander: Lander,
     decision: Option<Decision>,
+    /// What the lander was told of the detectors last.
+    detectors_alive: bool,
     mission: Mission,
     frames: Frames,
     used: Used,
@@ -70,6 +72,7 @@ impl Flight {
             autopilot,
             lander: Lander::new(config.lander())?,
             decision: None,
+            detectors_alive: true,
             mission: Mission::new(config.start, config.takeoff()),
             frames: Frames::new(&config),
             used: Used::default(),
@@ -453,6 +456,11 @@ impl Flight {
                     }
                 }
                 Event::Found { .. } => self.limits.found(&mut self.autopilot),
+                Event::Status(state) => {
+                    let status = wire::vehicle_status(&state);
+                    self.decide(now_ns, LanderEvent::Status(status));
+                }
+                Event::ModeChanged { to, .. } => self.withdraw_from(to),
                 Event::ArmedChanged(armed) => {
                     let is_finished = self.view().is_finished();
                     self.mission.armed_changed(now_ns, armed, is_finished);
@@ -466,7 +474,23 @@ impl Flight {
         }
     }
 
+    /// The pilot has taken over: what was requested before is not repeated against the pilot. A take-off passes
+    /// through modes of its own, and looks after its requests itself.
+    fn withdraw_from(&mut self, mode: FlightMode) {
+        if !mode.is_guided() && !mode.is_landing() && !self.mission.is_taking_off() {
+            self.autopilot.withdraw();
+        }
+    }
+
     fn decide(&mut self, now_ns: i64, event: LanderEvent) {
+        let alive = !self.frames.selection.is_blind();
+        if std::mem::replace(&mut self.detectors_alive, alive) != alive {
+            self.step(now_ns, LanderEvent::DetectorsAlive(alive));
+        }
+        self.step(now_ns, event);
+    }
+
+    fn step(&mut self, now_ns: i64, event: LanderEvent) {
         let before = self.lander.phase();
         let decision = self.lander.step(Timestamp::from_nanos(now_ns), event);
         if decision.phase != before {
@@ -478,12 +502,9 @@ impl Flight {
         if !self.mission.is_landing() || self.is_ending {
             return;
         }
-        let action = match self.frames.selection.is_blind() {
-            true => without_detector(&decision),
-            false => decision.action,
-        };
-        let is_frame = matches!(event, LanderEvent::Frame(_));
-        let result = self.setpoints.carry_out(now_ns, action, is_frame, &mut self.autopilot);
+        let is_urgent = matches!(event, LanderEvent::Frame(_) | LanderEvent::DetectorsAlive(_));
+        let result =
+            self.setpoints.carry_out(now_ns, decision.action, is_urgent, &mut self.autopilot);
         self.log_setpoint(result);
     }
 

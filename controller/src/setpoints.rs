@@ -1,9 +1,9 @@
-//! The lander's actions, sent to the autopilot.
+//! The lander's actions, sent to the autopilot as they are: what guidance believes is what was sent.
 
 use autopilot::command::SetpointError;
 use autopilot::{Autopilot, Command, CommandId, CommandStatus, Firmware, FlightMode};
 use geometry::{Ned, Vector};
-use landing::{Action, Decision, Phase};
+use landing::Action;
 use messages::Setpoint;
 
 /// Sends setpoints at their rate, mode changes and disarming.
@@ -43,6 +43,10 @@ impl Setpoints {
     ) -> Option<Result<(), SetpointError>> {
         match action {
             Action::None => self.last = None,
+            Action::Guided | Action::Disarm | Action::Land if !is_ours(autopilot) => {
+                self.last = None;
+                autopilot.withdraw();
+            }
             Action::Guided => {
                 self.last = None;
                 if let Some(mode) = autopilot.firmware().and_then(Firmware::guided) {
@@ -109,22 +113,9 @@ impl Setpoints {
     }
 }
 
-/// The action of a decision while no detector is alive: nothing descends, and no search moves. A crash of the
-/// last detector is known at once, so this does not wait until the target is stale.
-pub fn without_detector(decision: &Decision) -> Action {
-    match decision.action {
-        // A search without a detector finds nothing.
-        Action::Velocity { yaw_rate, .. } if decision.phase == Phase::Search => {
-            Action::Velocity { velocity: Vector::zero(), yaw_rate }
-        }
-        Action::Velocity { velocity, yaw_rate } => {
-            Action::Velocity { velocity: level(velocity), yaw_rate }
-        }
-        other => other,
-    }
-}
-
-/// The same velocity without its downward part.
-fn level(velocity: Vector<Ned>) -> Vector<Ned> {
-    Vector::new(velocity.x(), velocity.y(), velocity.z().min(0.0))
+/// True while the autopilot's own mode is known and is ours: another one is the pilot's, and nothing is asked of it.
+fn is_ours(autopilot: &Autopilot) -> bool {
+    autopilot
+        .state()
+        .is_some_and(|state| state.connected && (state.mode.is_guided() || state.mode.is_landing()))
 }

@@ -2,7 +2,7 @@
 
 use autopilot::VehicleState;
 use geometry::{Body, Camera, Marker, Pixel, Rotation, Transform, Vector};
-use landing::{Landed, MarkerInFrame, Mode, Timestamp};
+use landing::{Landed, MarkerInFrame, Mode, Timestamp, VehicleStatus};
 use messages::{CameraInfo, Detection, Detections, MarkerPose, Phase, Transform3};
 use nalgebra::Matrix3;
 
@@ -93,12 +93,23 @@ pub fn vehicle(state: &VehicleState) -> Option<landing::VehicleState> {
     let stamp_ns = attitude.stamp_ns.max(position.stamp_ns);
     let since = |ns: i64| (stamp_ns - ns) as f64 * 1e-9;
     let turned = Rotation::from_rotation_vector(attitude.rate_in_body * since(attitude.stamp_ns));
+    let VehicleStatus { mode, armed, landed } = vehicle_status(state);
     Some(landing::VehicleState {
         stamp: Timestamp::from_nanos(stamp_ns),
         ned_from_body: attitude.ned_from_body * turned,
         position: position.position + position.velocity * since(position.stamp_ns),
         velocity: position.velocity,
+        mode,
+        armed,
+        landed,
+    })
+}
+
+/// Mode, motors and contact with the ground for the lander. The mode is known as long as heartbeats come.
+pub fn vehicle_status(state: &VehicleState) -> VehicleStatus {
+    VehicleStatus {
         mode: match state.mode {
+            _ if !state.connected => Mode::Unknown,
             mode if mode.is_guided() => Mode::Guided,
             mode if mode.is_landing() => Mode::Land,
             _ => Mode::Other,
@@ -111,7 +122,7 @@ pub fn vehicle(state: &VehicleState) -> Option<landing::VehicleState> {
             autopilot::LandedState::InAir => Landed::InAir,
             autopilot::LandedState::Landing => Landed::Landing,
         },
-    })
+    }
 }
 
 /// The vehicle as it is published.

@@ -119,6 +119,132 @@ fn the_pilots_mode_change_stops_the_setpoints_for_good() {
     assert_eq!(sent(&mut flight), (0, vec![]));
 }
 
+/// Attitude alone, as an autopilot sends it whose position is lost.
+fn turn(flight: &mut Flight, now_ns: i64) {
+    let time_boot_ms = (now_ns / MS) as u32;
+    let attitude = ATTITUDE_DATA { time_boot_ms, ..Default::default() };
+    receive(flight, now_ns, &MavMessage::ATTITUDE(attitude));
+}
+
+#[test]
+fn the_pilots_switch_is_seen_while_the_position_is_missing() {
+    for pilots in [2, 5, 9] {
+        let mut flight = in_flight("airborne");
+        pose(&mut flight, 30 * MS);
+        flight.tick(31 * MS);
+        sent(&mut flight);
+        for i in 0..40 {
+            let now_ns = (60 + i * 25) * MS;
+            turn(&mut flight, now_ns);
+            if i == 35 {
+                assert_eq!(flight.status(now_ns).phase, Phase::Hold);
+                receive(&mut flight, now_ns, &heartbeat(pilots, true));
+            }
+            flight.tick(now_ns + 2);
+        }
+        assert_eq!(flight.status(1100 * MS).phase, Phase::PilotInCommand, "in mode {pilots}");
+        sent(&mut flight);
+        // The battery is nearly empty, for longer than the alarm waits.
+        for i in 0..240 {
+            let now_ns = (1100 + i * 25) * MS;
+            if i % 40 == 0 {
+                receive(&mut flight, now_ns, &heartbeat(pilots, true));
+                let battery = SYS_STATUS_DATA { battery_remaining: 5, ..Default::default() };
+                receive(&mut flight, now_ns, &MavMessage::SYS_STATUS(battery));
+            }
+            turn(&mut flight, now_ns);
+            flight.tick(now_ns + 2);
+        }
+        assert_eq!(sent(&mut flight), (0, vec![]));
+        // Position and GUIDED are back.
+        receive(&mut flight, 7200 * MS, &heartbeat(4, true));
+        hover(&mut flight, 7220, 9000, 4);
+        assert_eq!(flight.status(9000 * MS).phase, Phase::PilotInCommand);
+    }
+}
+
+#[test]
+fn a_request_that_is_pending_is_not_repeated_against_the_pilot() {
+    let mut flight =
+        flight_with("airborne", &["phases.on_battery_low=\"land\"", "alarms.battery_s=0.1"]);
+    receive(&mut flight, 0, &heartbeat(4, true));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    hover(&mut flight, 20, 1000, 4);
+    let battery = SYS_STATUS_DATA { battery_remaining: 15, ..Default::default() };
+    receive(&mut flight, 1000 * MS, &MavMessage::SYS_STATUS(battery));
+    // No acknowledgement comes.
+    let asked = hover(&mut flight, 1020, 2000, 4);
+    assert!(asked.modes.contains(&9.0), "{:?}", asked.modes);
+    receive(&mut flight, 2000 * MS, &heartbeat(5, true));
+    let after = hover(&mut flight, 2020, 9000, 5);
+    assert!(after.modes.is_empty(), "{:?}", after.modes);
+}
+
+#[test]
+fn reports_of_the_ground_that_contradict_the_flight_change_nothing() {
+    for report in [
+        MavLandedState::MAV_LANDED_STATE_UNDEFINED,
+        MavLandedState::MAV_LANDED_STATE_TAKEOFF,
+        MavLandedState::MAV_LANDED_STATE_ON_GROUND,
+    ] {
+        let mut flight = in_flight("airborne");
+        flight.presence(0, "main", true);
+        flight.camera(CameraInfo::sample());
+        hover(&mut flight, 20, 3000, 4);
+        let before = flight.status(3000 * MS);
+        assert!(matches!(before.phase, Phase::Approach | Phase::Descend), "{before:?}");
+        let mut setpoints = 0;
+        for ms in (3000..9000).step_by(200) {
+            receive(&mut flight, ms * MS, &contact(report));
+            let sent = hover(&mut flight, ms + 20, ms + 200, 4);
+            assert!(sent.modes.is_empty(), "{report:?}");
+            setpoints += sent.setpoints;
+        }
+        let is_ground = report == MavLandedState::MAV_LANDED_STATE_ON_GROUND;
+        assert!(setpoints > 100 || is_ground, "{report:?}: {setpoints} setpoints");
+        let after = flight.status(9000 * MS).phase;
+        assert!(matches!(after, Phase::Approach | Phase::Descend), "{report:?}: {after:?}");
+    }
+}
+
+#[test]
+fn without_the_heartbeat_alone_it_hovers_and_then_goes_on() {
+    let mut flight = in_flight("airborne");
+    flight.presence(0, "main", true);
+    flight.camera(CameraInfo::sample());
+    hover(&mut flight, 20, 3000, 4);
+    // Without any heartbeat for 5 s.
+    let mut setpoints = 0;
+    for ms in (3020..8000).step_by(20) {
+        pose(&mut flight, ms * MS);
+        if ms % 60 == 0 {
+            flight.detections(ms * MS + 2, "main", &seen(ms * MS - 40 * MS));
+        }
+        flight.tick(ms * MS + 3);
+        setpoints += sent(&mut flight).0;
+    }
+    assert!(setpoints > 100, "{setpoints}");
+    let status = flight.status(8000 * MS);
+    assert_eq!(status.phase, Phase::Hold);
+    assert!(status.why.contains("heartbeat"), "{}", status.why);
+    assert!(status.setpoint.unwrap().velocity_ned_m_s[2] <= 0.0);
+    hover(&mut flight, 8000, 9000, 4);
+    assert!(matches!(flight.status(9000 * MS).phase, Phase::Approach | Phase::Descend));
+}
+
+#[test]
+fn the_end_of_the_last_detector_levels_the_next_setpoint() {
+    let mut flight = in_flight("airborne");
+    flight.presence(0, "main", true);
+    flight.camera(CameraInfo::sample());
+    hover(&mut flight, 20, 5000, 4);
+    let down = |flight: &Flight| flight.status(0).setpoint.unwrap().velocity_ned_m_s[2];
+    assert!(down(&flight) > 0.1, "{}", down(&flight));
+    flight.presence(5000 * MS, "main", false);
+    flight.tick(5001 * MS);
+    assert!(down(&flight) <= 0.0, "{}", down(&flight));
+}
+
 #[test]
 fn the_search_waits_for_a_detector_and_climbs_before_it_goes_sideways() {
     let searched = |height_m: f32, has_detector: bool| {

@@ -172,8 +172,9 @@ settings! {
         search_timeout_s: f64 = 60.0, 1.0..=600.0;
         /// Hover time before the search moves, in s.
         search_delay_s: f64 = 0.5, 0.0..=60.0;
-        /// Height over the local origin to which the search climbs before it flies its legs, in m; 0 never
-        /// climbs.
+        /// Height to which the search climbs before it flies its legs, in m: over the pad once it was seen, else
+        /// over the ground that the vehicle took off from. A lander that began in the air takes the local origin
+        /// for the ground, and climbs at most this far over the start of the landing. 0 never climbs.
         search_height_m: f64 = 5.0, 0.0..=50.0;
         /// Speed of that climb, in m/s.
         search_climb_m_s: f64 = 1.0, 0.1..=3.0;
@@ -185,7 +186,8 @@ settings! {
         search_radius_m: f64 = 5.0, 0.0..=50.0;
         /// Radius about the local origin that the search does not leave, in m; 0 sets none.
         fence_radius_m: f64 = 0.0, 0.0..=10_000.0;
-        /// Height over the local origin that neither search nor retry exceeds, in m; 0 sets none.
+        /// Height over the local origin that neither search nor retry nor the climb of an aborted landing
+        /// exceeds, in m; 0 sets none.
         fence_height_m: f64 = 0.0, 0.0..=1_000.0;
         /// Maximum wait before the descent for natural motion that shows whether the axes of camera and
         /// autopilot agree, in s; 0 turns the check off.
@@ -226,11 +228,13 @@ settings! {
         no_return_height_m: f64 = 1.0, 0.0..=20.0;
         /// Maximum duration of a landing, from start to LAND, in s; then it is aborted.
         landing_timeout_s: f64 = 300.0, 10.0..=3600.0;
-        /// Height over the local origin below which a start in LAND mode only monitors the touchdown, in m.
+        /// Height below which a start in LAND mode only monitors the touchdown, in m, over the same as
+        /// `search_height_m`.
         watch_height_m: f64 = 2.0, 0.0..=20.0;
         /// What an aborted landing does.
         on_abort: OnAbort = OnAbort::Hover;
-        /// Height over the local origin to which an aborted landing climbs with `on_abort = "climb"`, in m.
+        /// Height to which an aborted landing climbs with `on_abort = "climb"`, in m, over the same as
+        /// `search_height_m`.
         abort_height_m: f64 = 10.0, 0.0..=100.0;
         /// Hover time of an aborted landing before setpoints stop, in s.
         release_after_s: f64 = 5.0, 0.0..=60.0;

@@ -208,6 +208,10 @@ named! {
         AutopilotLost = "autopilot-lost", "autopilot link lost, holding until it is back";
         /// The autopilot's reports stopped.
         VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
+        /// The autopilot's heartbeat, and with it the mode, is missing.
+        ModeUnknown = "mode-unknown", "no heartbeat of the autopilot for seconds, so its mode is not known, holding";
+        /// No detector is alive.
+        NoDetector = "no-detector", "no detector is alive, nothing descends";
         /// No progress in the time allowed.
         NoProgress = "no-progress", "too long in one phase, holding";
         /// The operator aborted.
@@ -256,6 +260,8 @@ named! {
         NoPose = "no-pose", "it has no pose";
         /// The pose puts the marker beside or above the vehicle, or out of range.
         Implausible = "implausible", "its pose is not below the vehicle";
+        /// The covariance is not one: not symmetric, not positive semi-definite, or huge.
+        BadCovariance = "bad-covariance", "its covariance is none: not symmetric, not positive semi-definite or larger than any range";
         /// The detector's confidence is too low.
         LowConfidence = "low-confidence", "its confidence is too low";
         /// A frame of this stamp was used already.

@@ -164,7 +164,9 @@ impl Estimator {
         state.predict(&self.config, stamp.seconds_since(before.measurement.stamp));
         let nis = state.nis(&measurement);
         self.nis = Some(nis);
-        if nis > self.config.gate {
+        // Also an outlier: what is not a number, and what a covariance that is none makes negative.
+        let is_inlier = (0.0..=self.config.gate).contains(&nis);
+        if !is_inlier {
             let place = self.place_at(stamp);
             self.hypotheses.count_outlier(&self.config, &measurement, motion, place);
             return if self.resolve(stamp) { Ok(()) } else { Err(Rejection::Outlier) };

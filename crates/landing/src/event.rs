@@ -14,6 +14,11 @@ use crate::time::Timestamp;
 pub enum Event {
     /// The autopilot reported the vehicle's state.
     Vehicle(VehicleState),
+    /// The autopilot reported mode, motors or contact with the ground, which are known also while position or
+    /// attitude is missing.
+    Status(VehicleStatus),
+    /// The last detector has gone (false), or one has come.
+    DetectorsAlive(bool),
     /// A detector has searched an image.
     Frame(FrameObservation),
     /// The operator gave a command.
@@ -119,6 +124,17 @@ pub struct VehicleState {
     pub landed: Landed,
 }
 
+/// What holds of the vehicle wherever it is.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct VehicleStatus {
+    /// The flight mode.
+    pub mode: Mode,
+    /// True when the motors may turn.
+    pub armed: bool,
+    /// The autopilot's landed state.
+    pub landed: Landed,
+}
+
 /// A flight mode, as far as a landing cares.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub enum Mode {
@@ -128,6 +144,8 @@ pub enum Mode {
     Land,
     /// Somebody else flies.
     Other,
+    /// Not reported for seconds: somebody else may fly.
+    Unknown,
 }
 
 /// Contact with the ground, as the autopilot sees it.
@@ -177,7 +195,19 @@ pub struct MarkerInFrame {
     pub confidence: f64,
 }
 
+/// Maximum distance of a marker from the vehicle in a pose that is looked at, in metres.
+const MAX_POSE_M: f64 = 1e3;
+/// Maximum sum of a covariance's diagonal, in m^2: 100 m in each direction.
+const MAX_VARIANCE_M2: f64 = 3e4;
+/// Rounding error of a covariance relative to its diagonal.
+const COVARIANCE_ERROR: f64 = 1e-6;
+
 impl VehicleState {
+    /// Mode, motors and contact with the ground.
+    pub fn status(&self) -> VehicleStatus {
+        VehicleStatus { mode: self.mode, armed: self.armed, landed: self.landed }
+    }
+
     /// True when no number is infinite or not a number.
     pub fn is_finite(&self) -> bool {
         self.position.is_finite()
@@ -202,8 +232,82 @@ impl MarkerInFrame {
             && self.covariance_m2.is_none_or(|m| m.iter().all(|c| c.is_finite()))
             && self.size_px.is_none_or(f64::is_finite)
     }
+
+    /// True when its poses are near enough to be those of a pad.
+    pub fn is_near(&self) -> bool {
+        let is_near =
+            |pose: Transform<Body, Marker>| (pose.origin() - Point::origin()).norm() <= MAX_POSE_M;
+        self.body_from_marker.is_none_or(is_near) && self.alternative.is_none_or(is_near)
+    }
+
+    /// True when its covariance, if it has one, can be that of a position: symmetric, positive semi-definite
+    /// and not larger than any range.
+    pub fn has_sound_covariance(&self) -> bool {
+        self.covariance_m2.is_none_or(|covariance| is_covariance(&covariance))
+    }
+}
+
+/// A symmetric matrix is positive semi-definite when no principal minor is negative.
+fn is_covariance(m: &Matrix3<f64>) -> bool {
+    let trace = m.trace();
+    if !(0.0..=MAX_VARIANCE_M2).contains(&trace) {
+        return false;
+    }
+    // Scaled, so that small covariances are not judged by their rounding errors and products do not vanish.
+    let scale = trace.max(f64::MIN_POSITIVE);
+    let m = m / scale;
+    let is_symmetric = (m - m.transpose()).amax() <= COVARIANCE_ERROR;
+    let minor = |i: usize, j: usize| m[(i, i)] * m[(j, j)] - m[(i, j)] * m[(j, i)];
+    let minors =
+        [m[(0, 0)], m[(1, 1)], m[(2, 2)], minor(0, 1), minor(0, 2), minor(1, 2), m.determinant()];
+    is_symmetric && minors.iter().all(|minor| *minor >= -COVARIANCE_ERROR)
 }
 
 fn is_finite(pose: &Transform<Body, Marker>) -> bool {
     pose.origin().is_finite() && pose.rotation().wxyz().iter().all(|c| c.is_finite())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_can_be_a_covariance_is_one() {
+        let diagonal = |x, y, z| Matrix3::from_diagonal(&nalgebra::Vector3::new(x, y, z));
+        let with = |row, column, value: f64| {
+            let mut m = diagonal(1e-4, 1e-4, 1e-4);
+            m[(row, column)] = value;
+            m[(column, row)] = value;
+            m
+        };
+        let tiny = f64::from_bits(1);
+        for sound in [
+            diagonal(0.0, 0.0, 0.0),
+            diagonal(tiny, tiny, tiny),
+            diagonal(1e-300, 0.0, 1e-300),
+            diagonal(1e-4, 1e-4, 1e-2),
+            diagonal(1e4, 1e4, 1e4),
+            with(0, 1, 0.99e-4),
+            with(0, 2, -1e-4),
+        ] {
+            assert!(is_covariance(&sound), "{sound}");
+        }
+        let mut crooked = diagonal(1e-4, 1e-4, 1e-4);
+        crooked[(0, 1)] = 5e-5;
+        for unsound in [
+            diagonal(-1e-4, 1e-4, 1e-4),
+            diagonal(1e-4, 1e-4, -1e-9),
+            diagonal(-1.0, -1.0, -1.0),
+            with(0, 1, 2e-4),
+            with(1, 2, -1.01e-4),
+            diagonal(1e5, 1e-4, 1e-4),
+            diagonal(f64::MAX, f64::MAX, 1.0),
+            diagonal(f64::NAN, 1.0, 1.0),
+            diagonal(f64::INFINITY, 1.0, 1.0),
+            with(0, 1, f64::NAN),
+            crooked,
+        ] {
+            assert!(!is_covariance(&unsound), "{unsound}");
+        }
+    }
 }

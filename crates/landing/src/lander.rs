@@ -1,6 +1,6 @@
 //! The landing decision as one function of time and events.
 
-use geometry::{Ned, Point, Vector};
+use geometry::{Ned, Odometry, Point, Vector};
 
 use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
 use crate::config::{AlarmAction, Config, GuidanceConfig, OnAbort, PhaseConfig};
@@ -8,7 +8,8 @@ use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate
 use crate::envelope;
 use crate::estimator::Estimator;
 use crate::event::{
-    Alarm, AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, VehicleState,
+    Alarm, AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
+    VehicleState, VehicleStatus,
 };
 use crate::guidance::ActiveGuidance;
 use crate::guidance::situation::{Progress, Situation};
@@ -31,12 +32,32 @@ const FENCE_LEAD_S: f64 = 1.0;
 /// Time an aborted landing climbs and holds before it stops sending setpoints, in seconds.
 const CLIMB_AWAY_S: f64 = 60.0;
 
+/// Maximum height over the target or the ground, in metres, at which the autopilot's report of the ground is
+/// believed: estimates of the height err by decimetres.
+const MAX_CONTACT_M: f64 = 1.0;
+
+/// Maximum vertical speed at which that report is believed, in m/s, in addition to the pad's heave.
+const MAX_CONTACT_M_S: f64 = 0.5;
+
+/// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
+const MAX_TARGET_AGE_S: f64 = 20.0;
+
+/// Maximum speed of a vehicle that stands, in m/s.
+const MAX_STANDING_M_S: f64 = 0.2;
+
 /// One landing after the other: each event leads to a decision.
 #[derive(Clone, Debug)]
 pub struct Lander {
     config: Config,
     now: Option<Timestamp>,
     history: History,
+    /// Mode, motors and contact with the ground, as they were reported last.
+    status: Option<VehicleStatus>,
+    detectors_alive: bool,
+    /// Where the vehicle last stood on the ground.
+    ground: Option<Point<Odometry>>,
+    /// Where the landing started.
+    start: Point<Odometry>,
     target_filter: TargetFilter,
     sightings: Sightings,
     newest_frame: Option<Timestamp>,
@@ -46,8 +67,6 @@ pub struct Lander {
     first_seen: Option<Timestamp>,
     state_machine: StateMachine,
     land_requested: Option<Timestamp>,
-    /// Height over the local origin at which the landing started, in metres.
-    ceiling_m: f64,
     /// Height over the local origin to which a retry climbs, in metres.
     retry_to_m: Option<f64>,
     /// Smallest angle from the image's centre to its edge, in radians.
@@ -92,6 +111,10 @@ impl Lander {
             config,
             now: None,
             history: History::new(config.target.max_extrapolation_s),
+            status: None,
+            detectors_alive: true,
+            ground: None,
+            start: Point::origin(),
             target_filter: TargetFilter::new(&config),
             sightings: Sightings::default(),
             newest_frame: None,
@@ -100,7 +123,6 @@ impl Lander {
             first_seen: None,
             state_machine: StateMachine::new(config.phases),
             land_requested: None,
-            ceiling_m: 0.0,
             retry_to_m: None,
             half_view_rad: None,
             square: None,
@@ -114,6 +136,14 @@ impl Lander {
         self.now = Some(now);
         let result = match event {
             Event::Vehicle(state) => self.vehicle(now, state),
+            Event::Status(status) => {
+                self.status = Some(status);
+                Ok(())
+            }
+            Event::DetectorsAlive(alive) => {
+                self.detectors_alive = alive;
+                Ok(())
+            }
             Event::Frame(frame) => self.frame(now, &frame),
             Event::Limits(limits) => {
                 self.limits = limits.plausible();
@@ -123,6 +153,9 @@ impl Lander {
         };
         let operator = if let Event::Operator(command) = event { Some(command) } else { None };
         let alarm = if let Event::Alarm(alarm) = event { Some(self.reaction(alarm)) } else { None };
+        if operator == Some(OperatorCommand::Resume) {
+            self.repeat_axis_check();
+        }
         let inputs = Inputs {
             now,
             operator,
@@ -141,7 +174,7 @@ impl Lander {
             if self.axis_mismatch().is_some() {
                 self.axis_check = AxisConsistencyCheck::default();
             }
-            self.ceiling_m = self.history.newest().map_or(0.0, |state| -state.position.z());
+            self.start = self.place().unwrap_or(Point::origin());
         }
         let (action, why) = self.act(now);
         Decision {
@@ -168,7 +201,69 @@ impl Lander {
             return Err(Rejection::Implausible);
         }
         self.check_stamp(now, state.stamp, self.config.phases.stale_vehicle_s)?;
-        if self.history.push(state) { Ok(()) } else { Err(Rejection::OutOfOrder) }
+        if !self.history.push(state) {
+            return Err(Rejection::OutOfOrder);
+        }
+        self.status = Some(state.status());
+        let is_standing =
+            self.landed(now) == Landed::OnGround && state.velocity.norm() <= MAX_STANDING_M_S;
+        if is_standing {
+            self.ground = self.place();
+        }
+        Ok(())
+    }
+
+    /// Where the vehicle is, apart from the jumps of the autopilot's position.
+    fn place(&self) -> Option<Point<Odometry>> {
+        Some(self.history.ned_from_odometry().inverse() * self.history.newest()?.position)
+    }
+
+    /// Height over the local origin of a place, in metres.
+    fn altitude_of(&self, place: Point<Odometry>) -> f64 {
+        -(self.history.ned_from_odometry() * place).z()
+    }
+
+    fn recent_target(&self, now: Timestamp) -> Option<TargetEstimate> {
+        self.target(now).filter(|target| target.age_s <= MAX_TARGET_AGE_S)
+    }
+
+    /// Height over the target, else over the ground that the vehicle stood on, in metres; `None` when neither
+    /// is known.
+    fn known_height_m(&self, now: Timestamp) -> Option<f64> {
+        let vehicle = self.history.newest()?;
+        let over_ground =
+            self.ground.map(|ground| -vehicle.position.z() - self.altitude_of(ground));
+        self.recent_target(now).map(|target| target.height_m).or(over_ground)
+    }
+
+    /// The same; over the local origin when neither is known.
+    fn height_m(&self, now: Timestamp) -> f64 {
+        let altitude_m = self.history.newest().map_or(0.0, |vehicle| -vehicle.position.z());
+        self.known_height_m(now).unwrap_or(altitude_m)
+    }
+
+    /// The height over the local origin that is this far over the target, else over the ground that the vehicle
+    /// stood on. Where neither is known the local origin stands for the ground, but the height is at most that
+    /// far over the start of the landing: the origin may be far above it.
+    fn altitude_m(&self, now: Timestamp, height_m: f64) -> f64 {
+        let pad_m = self.recent_target(now).map(|target| -target.position.z());
+        let ground_m = pad_m.or_else(|| self.ground.map(|ground| self.altitude_of(ground)));
+        ground_m.unwrap_or_else(|| self.altitude_of(self.start).min(0.0)) + height_m
+    }
+
+    /// The contact with the ground. A vehicle that flies high, or moves up or down, does not stand on it.
+    fn landed(&self, now: Timestamp) -> Landed {
+        let Some(status) = self.status else { return Landed::Unknown };
+        if status.landed != Landed::OnGround || !status.armed {
+            return status.landed;
+        }
+        let max_m_s = MAX_CONTACT_M_S + self.config.estimator.pad_heave_m_s;
+        let moves = self.history.newest().is_some_and(|vehicle| {
+            let is_recent = now.seconds_since(vehicle.stamp) <= self.config.phases.stale_vehicle_s;
+            is_recent && vehicle.velocity.z().abs() > max_m_s
+        });
+        let is_high = self.known_height_m(now).is_some_and(|height_m| height_m > MAX_CONTACT_M);
+        if moves || is_high { Landed::InAir } else { Landed::OnGround }
     }
 
     fn frame(&mut self, now: Timestamp, frame: &FrameObservation) -> Result<(), Rejection> {
@@ -177,6 +272,12 @@ impl Lander {
             || frame.marker.is_some_and(|m| !m.is_finite())
         {
             return Err(Rejection::NotFinite);
+        }
+        if frame.marker.is_some_and(|marker| !marker.is_near()) {
+            return Err(Rejection::Implausible);
+        }
+        if frame.marker.is_some_and(|marker| !marker.has_sound_covariance()) {
+            return Err(Rejection::BadCovariance);
         }
         self.check_stamp(now, frame.stamp, self.config.target.max_latency_s)?;
         let is_late = self.newest_frame.is_some_and(|newest| frame.stamp <= newest);
@@ -230,8 +331,7 @@ impl Lander {
         let motion = self.history.at(frame.stamp);
         let heading_rad =
             motion.map_or(state.heading_rad(), |motion| motion.ned_from_body.euler().2);
-        let altitude_m = self.target(frame.stamp);
-        let altitude_m = altitude_m.map_or(-state.position.z(), |target| target.height_m);
+        let altitude_m = self.height_m(frame.stamp);
         let marker = frame.marker.filter(|_| used);
         self.guidance.observe(&FrameObservation { marker, ..*frame }, heading_rad, altitude_m);
     }
@@ -248,16 +348,19 @@ impl Lander {
     }
 
     fn vehicle_inputs(&self, now: Timestamp) -> Option<VehicleInputs> {
-        let state = self.history.newest()?;
-        let altitude_m = -state.position.z();
+        let (state, status) = (self.history.newest()?, self.status?);
         Some(VehicleInputs {
             age_s: now.seconds_since(state.stamp),
-            mode: state.mode,
-            armed: state.armed,
-            landed: state.landed,
-            altitude_m,
-            height_m: self.target(now).map_or(altitude_m, |target| target.height_m),
+            mode: status.mode,
+            armed: status.armed,
+            landed: self.landed(now),
+            height_m: self.height_m(now),
         })
+    }
+
+    /// What is asked of the autopilot changes its mode or its motors: only in our own mode.
+    fn is_ours(&self) -> bool {
+        self.status.is_some_and(|status| matches!(status.mode, Mode::Guided | Mode::Land))
     }
 
     fn pad_moves(&self) -> bool {
@@ -282,6 +385,14 @@ impl Lander {
                 AxisError::RollSign | AxisError::PitchSign => Reason::AttitudeSign,
             }),
             _ => None,
+        }
+    }
+
+    /// A vehicle that holds because of the axes and is told to go on looks at them again.
+    fn repeat_axis_check(&mut self) {
+        if self.axis_mismatch().is_some() {
+            self.axis_check = AxisConsistencyCheck::default();
+            self.first_seen = None;
         }
     }
 
@@ -335,7 +446,17 @@ impl Lander {
             pad_moves: self.pad_moves(),
             pad_heave_m_s: self.config.estimator.pad_heave_m_s,
             limits: self.limits,
+            level_because: self.level_because(now),
         }
+    }
+
+    /// Why the vehicle must not descend now.
+    fn level_because(&self, now: Timestamp) -> Option<Reason> {
+        let is_checking =
+            self.state_machine.phase() == Phase::Approach && !self.is_axis_check_done(now);
+        // The end of the last detector is known at once, so this does not wait until the target is stale.
+        let alone = (!self.detectors_alive).then_some(Reason::NoDetector);
+        alone.or_else(|| is_checking.then_some(Reason::AxisCheck))
     }
 
     fn progress(&mut self, now: Timestamp) -> Progress {
@@ -393,11 +514,10 @@ impl Lander {
         };
         let situation = self.situation(now, &vehicle);
         let (wanted, mut why) = self.guidance.velocity(&situation);
-        let is_axis_check_done =
-            self.is_axis_check_done(now) || self.state_machine.phase() != Phase::Approach;
-        let may_descend = self.guidance.may_descend(&situation) && is_axis_check_done;
-        if !is_axis_check_done && wanted.z() > 0.0 {
-            why = Reason::AxisCheck;
+        let may_descend =
+            self.guidance.may_descend(&situation) && situation.level_because.is_none();
+        if let Some(reason) = situation.level_because.filter(|_| wanted.z() > 0.0) {
+            why = reason;
         }
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, may_descend);
         let yaw_rate = self.guidance.yaw_rate(&situation);
@@ -410,13 +530,15 @@ impl Lander {
         let Some(vehicle) = self.history.newest().copied() else { return Action::hover() };
         let phases = self.config.phases;
         let altitude_m = -vehicle.position.z();
+        let ceiling_m = self.altitude_of(self.start);
         let to_m =
-            *self.retry_to_m.get_or_insert((altitude_m + phases.retry_climb_m).min(self.ceiling_m));
+            *self.retry_to_m.get_or_insert((altitude_m + phases.retry_climb_m).min(ceiling_m));
         let situation = self.situation(now, &vehicle);
         let (wanted, _) = self.guidance.velocity(&situation);
         // Over the last half metre the climb slows down.
         let climb_m_s = (2.0 * (to_m - altitude_m)).clamp(0.0, phases.retry_climb_m_s);
         let wanted = Vector::new(wanted.x(), wanted.y(), -climb_m_s);
+        let wanted = below_fence(&phases, vehicle.position, wanted);
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
         self.guidance.on_setpoint_sent(velocity);
         Action::Velocity { velocity, yaw_rate: 0.0 }
@@ -427,7 +549,8 @@ impl Lander {
     fn search(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
         let phases = &self.config.phases;
-        if self.state_machine.elapsed_s(now) < phases.search_delay_s {
+        // A search without a detector finds nothing.
+        if self.state_machine.elapsed_s(now) < phases.search_delay_s || !self.detectors_alive {
             return Action::hover();
         }
         let altitude_m = -vehicle.position.z();
@@ -436,14 +559,15 @@ impl Lander {
             vehicle.position,
             Vector::new(0.0, 0.0, -phases.search_climb_m_s),
         );
-        let wanted = if self.square.is_none() && altitude_m < phases.search_height_m && up.z() < 0.0
-        {
+        let is_low = altitude_m < self.altitude_m(now, phases.search_height_m);
+        let height_m = self.height_m(now);
+        let wanted = if self.square.is_none() && is_low && up.z() < 0.0 {
             up
         } else {
             let square = self.square.get_or_insert_with(|| Square {
                 started: now,
                 first_leg_rad: search::first_leg_rad(vehicle.ned_from_body),
-                upwind_m: search::upwind_m(phases, vehicle.ned_from_body, altitude_m),
+                upwind_m: search::upwind_m(phases, vehicle.ned_from_body, height_m),
             });
             let elapsed_s = now.seconds_since(square.started);
             let legs = search::velocity(phases, elapsed_s, square.first_leg_rad, square.upwind_m);
@@ -455,10 +579,17 @@ impl Lander {
 
     /// Descends vertically where LAND is refused, and disarms on the ground.
     fn descend_vertically(&mut self, now: Timestamp) -> Action {
-        let down = self.history.newest().is_some_and(|state| state.landed == Landed::OnGround);
-        if down && self.is_retry_due(now) {
+        let down = self.landed(now) == Landed::OnGround;
+        if down && self.is_ours() && self.is_retry_due(now) {
             self.land_requested = Some(now);
             return Action::Disarm;
+        }
+        // Where it is going is not known without a state.
+        let is_recent = self.history.newest().is_some_and(|vehicle| {
+            now.seconds_since(vehicle.stamp) <= self.config.phases.stale_vehicle_s
+        });
+        if !is_recent {
+            return Action::hover();
         }
         let wanted = Vector::new(0.0, 0.0, self.config.phases.refused_descend_m_s);
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, true);
@@ -480,16 +611,21 @@ impl Lander {
         if !(lost && low) {
             return Action::hover();
         }
-        let wanted = Vector::new(0.0, 0.0, -phases.regain_climb_m_s);
-        Action::Velocity {
-            velocity: envelope::clamp_setpoint(&self.config.envelope, wanted, false),
-            yaw_rate: 0.0,
-        }
+        self.climb(phases.regain_climb_m_s)
+    }
+
+    /// Climbs, as far as the fence allows.
+    fn climb(&self, climb_m_s: f64) -> Action {
+        let Some(vehicle) = self.history.newest() else { return Action::hover() };
+        let wanted = Vector::new(0.0, 0.0, -climb_m_s);
+        let wanted = below_fence(&self.config.phases, vehicle.position, wanted);
+        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
+        Action::Velocity { velocity, yaw_rate: 0.0 }
     }
 
     /// Requests LAND at once and at intervals, and hovers in between.
     fn request_land(&mut self, now: Timestamp) -> Action {
-        if self.is_land_request_due(now) {
+        if self.is_ours() && self.is_land_request_due(now) {
             self.land_requested = Some(now);
             return Action::Land;
         }
@@ -511,10 +647,11 @@ impl Lander {
         if self.state_machine.is_recalling() {
             return self.recall(now);
         }
-        let follows = self.history.newest().is_some_and(|state| {
-            let fresh = now.seconds_since(state.stamp) <= phases.stale_vehicle_s;
-            fresh && state.armed && state.mode == Mode::Guided
-        });
+        let follows = self
+            .history
+            .newest()
+            .is_some_and(|state| now.seconds_since(state.stamp) <= phases.stale_vehicle_s)
+            && self.status.is_some_and(|status| status.armed && status.mode == Mode::Guided);
         if self.state_machine.is_released() || !follows {
             return Action::None;
         }
@@ -522,14 +659,14 @@ impl Lander {
         match phases.on_abort {
             OnAbort::Hover if elapsed_s <= phases.release_after_s => Action::hover(),
             OnAbort::Land if elapsed_s <= phases.land_timeout_s => self.request_land(now),
-            OnAbort::Climb if elapsed_s <= CLIMB_AWAY_S => self.climb_away(),
+            OnAbort::Climb if elapsed_s <= CLIMB_AWAY_S => self.climb_away(now),
             OnAbort::Hover | OnAbort::Land | OnAbort::Climb => Action::None,
         }
     }
 
     /// Requests the mode that follows setpoints, at once and at intervals.
     fn recall(&mut self, now: Timestamp) -> Action {
-        if !self.is_land_request_due(now) {
+        if !self.is_ours() || !self.is_land_request_due(now) {
             return Action::None;
         }
         self.land_requested = Some(now);
@@ -537,14 +674,10 @@ impl Lander {
     }
 
     /// Climbs to `abort_height_m` and stays there.
-    fn climb_away(&self) -> Action {
-        let phases = &self.config.phases;
+    fn climb_away(&self, now: Timestamp) -> Action {
         let altitude_m = self.history.newest().map_or(f64::MAX, |state| -state.position.z());
-        let climb_m_s =
-            (phases.abort_height_m - altitude_m).clamp(0.0, self.config.envelope.climb_m_s);
-        let wanted = Vector::new(0.0, 0.0, -climb_m_s);
-        let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
-        Action::Velocity { velocity, yaw_rate: 0.0 }
+        let to_m = self.altitude_m(now, self.config.phases.abort_height_m);
+        self.climb((to_m - altitude_m).clamp(0.0, self.config.envelope.climb_m_s))
     }
 }
 
@@ -600,7 +733,14 @@ fn clamp_to_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) 
     let far = |p: Point<Ned>| p.x().hypot(p.y());
     let radius_m = phases.fence_radius_m;
     let leaves = radius_m > 0.0 && far(ahead) > radius_m && far(ahead) > far(place);
-    let too_high = phases.fence_height_m > 0.0 && -ahead.z() > phases.fence_height_m;
     let (x, y) = if leaves { (0.0, 0.0) } else { (wanted.x(), wanted.y()) };
-    Vector::new(x, y, if too_high { wanted.z().max(0.0) } else { wanted.z() })
+    below_fence(phases, place, Vector::new(x, y, wanted.z()))
+}
+
+/// The velocity without a climb that leads over the fence.
+fn below_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
+    let ahead = place + wanted * FENCE_LEAD_S;
+    let is_high = phases.fence_height_m > 0.0 && -ahead.z() > phases.fence_height_m;
+    let z = if is_high { wanted.z().max(0.0) } else { wanted.z() };
+    Vector::new(wanted.x(), wanted.y(), z)
 }

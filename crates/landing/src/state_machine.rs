@@ -33,10 +33,10 @@
 //! | the operator's abort, `landing_timeout_s` over | Aborted; in LAND only above `no_return_height_m`, back to GUIDED |
 //! | the operator's hold | Hold; ignored in LAND |
 //! | the axes of camera and autopilot do not match | Hold |
-//! | the vehicle's state is stale | Hold; Final waits |
+//! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | a mode that is neither GUIDED nor the requested LAND | PilotInCommand |
 //! | on the ground | Final |
-//! | disarmed | Landed on the ground or in LAND, else Aborted |
+//! | disarmed | Landed on the ground or in LAND, else, half a second later, Aborted |
 //! | an alarm | as configured for it |
 //!
 //! Idle, Landed, Aborted and PilotInCommand are terminal: only a new start leaves them.
@@ -58,6 +58,9 @@ use crate::time::Timestamp;
 
 /// Minimum climb time of a vehicle that could not settle before it tries again, in seconds.
 const MIN_RETRY_S: f64 = 2.0;
+
+/// Wait for the report of the ground after the motors have stopped, in seconds: it may come later.
+const MAX_CONTACT_WAIT_S: f64 = 0.5;
 
 /// The inputs of one step.
 #[derive(Copy, Clone, Debug)]
@@ -93,11 +96,9 @@ pub struct VehicleInputs {
     pub mode: Mode,
     /// True when the motors may turn.
     pub armed: bool,
-    /// Contact with the ground.
+    /// Contact with the ground, where it agrees with height and motion.
     pub landed: Landed,
-    /// Height over the autopilot's local origin, in metres.
-    pub altitude_m: f64,
-    /// Height over the target, or over the local origin while no target is known, in metres.
+    /// Height over the target, else over the ground that it stood on, in metres.
     pub height_m: f64,
 }
 
@@ -117,6 +118,8 @@ pub struct StateMachine {
     is_recalling: bool,
     /// Retries of this landing so far.
     retries: u32,
+    /// When the motors were first seen to be off.
+    disarmed: Option<Timestamp>,
 }
 
 impl StateMachine {
@@ -132,6 +135,7 @@ impl StateMachine {
             released: false,
             is_recalling: false,
             retries: 0,
+            disarmed: None,
         }
     }
 
@@ -183,6 +187,8 @@ impl StateMachine {
             self.entered = inputs.now;
             self.reason = Reason::AutopilotLands;
         }
+        let is_disarmed = inputs.vehicle.is_some_and(|vehicle| !vehicle.armed);
+        self.disarmed = is_disarmed.then(|| self.disarmed.unwrap_or(inputs.now));
         if let Some((phase, reason)) = self.interruption(inputs).or_else(|| self.next(inputs)) {
             self.enter(phase, reason, inputs.now);
         }
@@ -197,7 +203,7 @@ impl StateMachine {
             return false;
         };
         let is_landing =
-            vehicle.mode == Mode::Land && vehicle.altitude_m <= self.config.watch_height_m;
+            vehicle.mode == Mode::Land && vehicle.height_m <= self.config.watch_height_m;
         if !vehicle.armed {
             self.reason = Reason::NotArmed;
         } else if is_landing {
@@ -234,7 +240,8 @@ impl StateMachine {
         let Some(vehicle) = inputs.vehicle else { return };
         let in_time = !self.timed_out(inputs, self.config.land_timeout_s);
         self.is_recalling &= vehicle.mode == Mode::Land && in_time;
-        self.released |= vehicle.mode != Mode::Guided && !self.is_recalling;
+        let is_foreign = matches!(vehicle.mode, Mode::Land | Mode::Other);
+        self.released |= is_foreign && !self.is_recalling;
     }
 
     /// The transitions that any phase can take.
@@ -242,15 +249,21 @@ impl StateMachine {
         if let Some(vehicle) = inputs.vehicle {
             // PX4 leaves LAND as it stops the motors (seen with 1.17); that is not the pilot.
             if self.landing && !vehicle.armed {
-                return Some(self.disarmed(vehicle));
+                return Some((Phase::Landed, Reason::TouchedDown));
             }
-            let is_ours = vehicle.mode == Mode::Guided && !self.landing
-                || vehicle.mode == Mode::Land && self.phase == Phase::Final;
+            let is_ours = match vehicle.mode {
+                Mode::Guided => !self.landing,
+                Mode::Land => self.phase == Phase::Final,
+                Mode::Other => false,
+                // Undecided: nothing is asked for, and the vehicle hovers.
+                Mode::Unknown => true,
+            };
             if !is_ours {
                 return Some((Phase::PilotInCommand, Reason::PilotTookOver));
             }
-            if !vehicle.armed {
-                return Some(self.disarmed(vehicle));
+            let disarmed = self.disarmed(inputs.now, vehicle);
+            if disarmed.is_some() {
+                return disarmed;
             }
         }
         if inputs.operator == Some(OperatorCommand::Abort) && self.can_abort(inputs) {
@@ -300,28 +313,33 @@ impl StateMachine {
         !self.landing || is_high && self.config.on_abort != OnAbort::Land
     }
 
-    fn disarmed(&self, vehicle: VehicleInputs) -> (Phase, Reason) {
-        if self.landing || vehicle.landed == Landed::OnGround {
-            (Phase::Landed, Reason::TouchedDown)
-        } else {
-            (Phase::Aborted, Reason::Disarmed)
+    /// The end of a landing whose motors are off.
+    fn disarmed(&self, now: Timestamp, vehicle: VehicleInputs) -> Option<(Phase, Reason)> {
+        if !vehicle.armed && vehicle.landed == Landed::OnGround {
+            return Some((Phase::Landed, Reason::TouchedDown));
         }
+        let waited_s = now.seconds_since(self.disarmed?);
+        (waited_s >= MAX_CONTACT_WAIT_S).then_some((Phase::Aborted, Reason::Disarmed))
     }
 
     /// The transitions of the present phase.
     fn next(&mut self, inputs: &Inputs) -> Option<(Phase, Reason)> {
         let is_stale =
             inputs.vehicle.is_none_or(|vehicle| vehicle.age_s > self.config.stale_vehicle_s);
+        let is_unknown = inputs.vehicle.is_some_and(|vehicle| vehicle.mode == Mode::Unknown);
         match self.phase {
             Phase::Idle | Phase::Landed | Phase::Aborted | Phase::PilotInCommand => None,
             Phase::Search | Phase::Approach | Phase::Descend | Phase::Retry if is_stale => {
                 Some((Phase::Hold, Reason::VehicleStale))
             }
+            Phase::Search | Phase::Approach | Phase::Descend | Phase::Retry if is_unknown => {
+                Some((Phase::Hold, Reason::ModeUnknown))
+            }
             Phase::Search => self.after_search(inputs),
             Phase::Approach => self.after_approach(inputs),
             Phase::Descend => self.after_descend(inputs),
             Phase::Retry => self.after_retry(inputs),
-            Phase::Hold => self.after_hold(inputs, is_stale),
+            Phase::Hold => self.after_hold(inputs, is_stale || is_unknown),
             Phase::Final => self.after_final(inputs),
         }
     }
@@ -343,15 +361,18 @@ impl StateMachine {
     fn after_approach(&mut self, inputs: &Inputs) -> Option<(Phase, Reason)> {
         match inputs.progress {
             Progress::Ready(reason) => Some((Phase::Final, reason)),
-            Progress::Blind => Some((Phase::Descend, Reason::DescendingUnseen)),
+            Progress::Blind if inputs.may_descend => {
+                Some((Phase::Descend, Reason::DescendingUnseen))
+            }
             _ if self.target_lost(inputs) => Some(self.retry_or_abort(inputs, Reason::Retrying)),
             Progress::Stuck => Some(self.retry_or_abort(inputs, Reason::NotSettling)),
             Progress::Descending if inputs.may_descend => {
                 Some((Phase::Descend, Reason::Descending))
             }
-            Progress::Descending | Progress::Aligning | Progress::Unchanged => self
-                .timed_out(inputs, self.config.approach_timeout_s)
-                .then_some((Phase::Hold, Reason::NoProgress)),
+            Progress::Descending | Progress::Blind | Progress::Aligning | Progress::Unchanged => {
+                self.timed_out(inputs, self.config.approach_timeout_s)
+                    .then_some((Phase::Hold, Reason::NoProgress))
+            }
         }
     }
 
@@ -413,7 +434,7 @@ impl StateMachine {
         }
         let resumes = match self.reason {
             Reason::TargetLost | Reason::TargetNotFound => self.target_visible(inputs) && !is_stale,
-            Reason::VehicleStale | Reason::AutopilotLost => !is_stale,
+            Reason::VehicleStale | Reason::ModeUnknown | Reason::AutopilotLost => !is_stale,
             _ => false,
         };
         resumes.then_some((Phase::Search, Reason::Searching))
@@ -426,11 +447,17 @@ impl StateMachine {
                 .then_some((Phase::Aborted, Reason::LandRefused));
         }
         if !self.landing {
+            let is_unknown = inputs.vehicle.is_some_and(|vehicle| vehicle.mode == Mode::Unknown);
             // This close to the ground the descent by setpoints is the only way down.
             let low = matches!(
                 self.reason,
                 Reason::LowAndAligned | Reason::LowAndUnseen | Reason::TouchedEarly
             );
+            if is_unknown && !low {
+                // LAND cannot be asked for; a vehicle that hovers waits for the heartbeat.
+                self.entered = inputs.now;
+                return None;
+            }
             return self.timed_out(inputs, self.config.land_timeout_s).then_some(if low {
                 (Phase::Final, Reason::LandingBySetpoints)
             } else {

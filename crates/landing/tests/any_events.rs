@@ -4,8 +4,9 @@
 use geometry::{Body, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
     Action, Alarm, Config, Event, FrameObservation, GuidanceConfig, Landed, Lander, MarkerInFrame,
-    Mode, OperatorCommand, Phase, Reason, ThesisConfig, Timestamp, VehicleState,
+    Mode, OperatorCommand, Phase, Reason, ThesisConfig, Timestamp, VehicleState, VehicleStatus,
 };
+use nalgebra::Matrix3;
 use proptest::prelude::*;
 
 /// An event and the seconds that pass before it.
@@ -30,8 +31,12 @@ enum Kind {
         age_s: f64,
         centre: Option<[f64; 2]>,
         origin: Option<[f64; 3]>,
+        alternative: Option<[f64; 3]>,
+        covariance_m2: Option<[f64; 9]>,
         width: u32,
     },
+    Status(VehicleStatus),
+    DetectorsAlive(bool),
     Operator(OperatorCommand),
     Alarm(Alarm),
     Tick,
@@ -52,7 +57,9 @@ fn age() -> impl Strategy<Value = f64> {
 }
 
 fn mode() -> impl Strategy<Value = Mode> {
-    prop_oneof![90 => Just(Mode::Guided), 2 => Just(Mode::Land), 1 => Just(Mode::Other)]
+    prop_oneof![
+        90 => Just(Mode::Guided), 2 => Just(Mode::Land), 1 => Just(Mode::Other), 2 => Just(Mode::Unknown)
+    ]
 }
 
 fn landed() -> impl Strategy<Value = Landed> {
@@ -84,8 +91,47 @@ fn frame() -> impl Strategy<Value = Kind> {
     let origin =
         (number(0.0, 0.3), number(0.0, 0.3), number(1.5, 1.0)).prop_map(|(x, y, z)| [x, y, z]);
     let width = prop_oneof![20 => Just(1296u32), 1 => Just(0), 1 => any::<u32>()];
-    (age(), prop::option::weighted(0.8, centre), prop::option::weighted(0.95, origin), width)
-        .prop_map(|(age_s, centre, origin, width)| Kind::Frame { age_s, centre, origin, width })
+    let marker = (
+        prop::option::weighted(0.8, centre),
+        prop::option::weighted(0.95, origin),
+        prop::option::weighted(0.3, alternative()),
+        prop::option::weighted(0.5, covariance()),
+    );
+    (age(), marker, width).prop_map(|(age_s, marker, width)| {
+        let (centre, origin, alternative, covariance_m2) = marker;
+        Kind::Frame { age_s, centre, origin, alternative, covariance_m2, width }
+    })
+}
+
+/// Another pose, near or anywhere.
+fn alternative() -> impl Strategy<Value = [f64; 3]> {
+    let near =
+        (number(0.0, 0.3), number(0.0, 0.3), number(1.5, 1.0)).prop_map(|(x, y, z)| [x, y, z]);
+    let any = prop::array::uniform3(prop::num::f64::ANY);
+    prop_oneof![5 => near, 1 => any, 1 => Just([1e160; 3])]
+}
+
+/// A covariance as detectors tell it, or nine numbers that are none: negative, not a number, huge, denormal.
+fn covariance() -> impl Strategy<Value = [f64; 9]> {
+    let diagonal = |x: f64, y: f64, z: f64| [x, 0.0, 0.0, 0.0, y, 0.0, 0.0, 0.0, z];
+    let usual = (1e-8..1e-2f64, 1e-8..1e-2f64, 1e-8..1e-1f64);
+    let usual = usual.prop_map(move |(x, y, z)| diagonal(x, y, z));
+    let strange = prop_oneof![
+        Just(f64::NAN),
+        Just(f64::MAX),
+        Just(f64::MIN),
+        Just(f64::MIN_POSITIVE / 8.0),
+        Just(0.0),
+        -1.0..1.0f64
+    ];
+    let one = strange.prop_map(move |v| diagonal(v, v, v));
+    let any = prop::array::uniform9(prop::num::f64::ANY);
+    prop_oneof![6 => usual, 2 => one, 1 => any]
+}
+
+fn status() -> impl Strategy<Value = Kind> {
+    (mode(), prop::bool::weighted(0.99), landed())
+        .prop_map(|(mode, armed, landed)| Kind::Status(VehicleStatus { mode, armed, landed }))
 }
 
 fn operator() -> impl Strategy<Value = Kind> {
@@ -111,7 +157,8 @@ fn happening() -> impl Strategy<Value = Happening> {
     let usual =
         (-0.3..0.3f64, 0.3..6.0f64).prop_map(|(north, height_m)| Kind::Usual { north, height_m });
     let event = prop_oneof![
-        200 => usual, 15 => vehicle(), 10 => frame(), 1 => operator(), 1 => alarm(), 20 => Just(Kind::Tick)
+        200 => usual, 15 => vehicle(), 10 => frame(), 1 => operator(), 1 => alarm(), 20 => Just(Kind::Tick),
+        10 => status(), 2 => prop::bool::weighted(0.7).prop_map(Kind::DetectorsAlive)
     ];
     (after_s, event).prop_map(|(after_s, event)| Happening { after_s, event })
 }
@@ -129,7 +176,14 @@ fn events(kind: &Kind, now: Timestamp) -> [Event; 2] {
         landed: Landed::InAir,
     };
     let origin = Some([in_body.x(), in_body.y(), in_body.z()]);
-    let frame = Kind::Frame { age_s: 0.0, centre: Some([650.0, 500.0]), origin, width: 1296 };
+    let frame = Kind::Frame {
+        age_s: 0.0,
+        centre: Some([650.0, 500.0]),
+        origin,
+        alternative: None,
+        covariance_m2: None,
+        width: 1296,
+    };
     [event(&vehicle, now), event(&frame, now)]
 }
 
@@ -138,6 +192,8 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
         Kind::Tick | Kind::Usual { .. } => Event::Tick,
         Kind::Operator(command) => Event::Operator(command),
         Kind::Alarm(alarm) => Event::Alarm(alarm),
+        Kind::Status(status) => Event::Status(status),
+        Kind::DetectorsAlive(alive) => Event::DetectorsAlive(alive),
         Kind::Vehicle { age_s, position: p, velocity: v, mode, armed, landed } => {
             Event::Vehicle(VehicleState {
                 stamp: now.plus_seconds(-age_s),
@@ -149,21 +205,26 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
                 landed,
             })
         }
-        Kind::Frame { age_s, centre, origin, width } => Event::Frame(FrameObservation {
-            stamp: now.plus_seconds(-age_s),
-            image_size: (width, 972),
-            focal_px: Some(1818.0),
-            body_from_camera: None,
-            marker: centre.map(|c| MarkerInFrame {
-                centre: Pixel::new(c[0], c[1]),
-                body_from_marker: origin
-                    .map(|o| Transform::new(Rotation::identity(), Point::new(o[0], o[1], o[2]))),
-                alternative: None,
-                covariance_m2: None,
-                size_px: None,
-                confidence: 0.8,
-            }),
-        }),
+        Kind::Frame { age_s, centre, origin, alternative, covariance_m2, width } => {
+            Event::Frame(FrameObservation {
+                stamp: now.plus_seconds(-age_s),
+                image_size: (width, 972),
+                focal_px: Some(1818.0),
+                body_from_camera: None,
+                marker: centre.map(|c| MarkerInFrame {
+                    centre: Pixel::new(c[0], c[1]),
+                    body_from_marker: origin.map(|o| {
+                        Transform::new(Rotation::identity(), Point::new(o[0], o[1], o[2]))
+                    }),
+                    alternative: alternative.map(|o| {
+                        Transform::new(Rotation::identity(), Point::new(o[0], o[1], o[2]))
+                    }),
+                    covariance_m2: covariance_m2.map(|m| Matrix3::from_row_slice(&m)),
+                    size_px: None,
+                    confidence: 0.8,
+                }),
+            })
+        }
     }
 }
 
@@ -172,6 +233,9 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
 struct Watcher {
     newest_marker: Option<Timestamp>,
     pilot_flies: bool,
+    /// The mode that was told last is ours.
+    is_ours: bool,
+    no_detector: bool,
 }
 
 impl Watcher {
@@ -190,9 +254,9 @@ impl Watcher {
                 Event::Frame(frame) if frame.marker.is_some() => {
                     self.newest_marker = Some(frame.stamp);
                 }
-                Event::Vehicle(state) if state.mode == Mode::Other => {
-                    self.pilot_flies = !before.is_terminal();
-                }
+                Event::Vehicle(state) => self.hear(before, state.mode),
+                Event::Status(status) => self.hear(before, status.mode),
+                Event::DetectorsAlive(alive) => self.no_detector = !alive,
                 Event::Operator(OperatorCommand::Start) => self.pilot_flies = false,
                 _ => {}
             }
@@ -200,8 +264,14 @@ impl Watcher {
         prop_assert!(!self.pilot_flies || decision.action == Action::None);
         match decision.action {
             Action::None => {}
-            Action::Land | Action::Disarm => prop_assert_eq!(decision.phase, Phase::Final),
-            Action::Guided => prop_assert_eq!(decision.phase, Phase::Aborted),
+            Action::Land | Action::Disarm => {
+                prop_assert!(self.is_ours, "asked for against the pilot");
+                prop_assert_eq!(decision.phase, Phase::Final);
+            }
+            Action::Guided => {
+                prop_assert!(self.is_ours, "asked for against the pilot");
+                prop_assert_eq!(decision.phase, Phase::Aborted);
+            }
             Action::Velocity { velocity, yaw_rate } => {
                 prop_assert!(velocity.is_finite() && yaw_rate == 0.0);
                 prop_assert!(velocity.horizontal_norm() <= config.envelope.horizontal_m_s + 1e-9);
@@ -218,11 +288,19 @@ impl Watcher {
                         prop_assert!(velocity.z() <= config.phases.refused_descend_m_s);
                         return Ok(());
                     }
+                    prop_assert!(!self.no_detector, "descends without a detector");
                     self.may_descend(config, now, decision.target.map(|t| t.height_m))?;
                 }
             }
         }
         Ok(())
+    }
+
+    fn hear(&mut self, before: Phase, mode: Mode) {
+        self.is_ours = matches!(mode, Mode::Guided | Mode::Land);
+        if mode == Mode::Other {
+            self.pilot_flies |= !before.is_terminal();
+        }
     }
 
     fn may_descend(

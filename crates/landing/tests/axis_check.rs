@@ -4,7 +4,7 @@ mod scene;
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use landing::{Phase, Reason};
+use landing::{OperatorCommand, Phase, Reason};
 use scene::cases::{FAULTS, WINDS, anything};
 use scene::{Flight, Sample, Scene};
 
@@ -45,6 +45,19 @@ fn a_wrong_mount_is_found_before_the_descent() {
             }
         }
     }
+}
+
+#[test]
+fn a_resumed_landing_looks_at_the_axes_again() {
+    let turned = || Scene { camera_turned_rad: PI, limit_s: 20.0, ..Scene::new(1) };
+    let (doubted_s, ..) = doubt(&turned().fly());
+    let resumed_s = doubted_s + 1.0;
+    let commands = vec![(0.0, OperatorCommand::Start), (resumed_s, OperatorCommand::Resume)];
+    let flight = Scene { commands, ..turned() }.fly();
+    let after = flight.at(resumed_s + 0.1).unwrap();
+    assert_ne!(after.decision.phase, Phase::Hold, "as was answered");
+    let (_, _, deepest_m) = doubt(&flight);
+    assert!(deepest_m < 2.5, "{deepest_m} m");
 }
 
 #[test]

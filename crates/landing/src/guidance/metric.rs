@@ -120,7 +120,7 @@ impl Guidance for Metric {
     /// True when the target is recent, or low below and well known, and no other place may be the pad.
     fn may_descend(&self, situation: &Situation<'_>) -> bool {
         let is_ambiguous = situation.target.is_some_and(|target| target.ambiguous);
-        !is_ambiguous && (self.is_visible(situation) || self.may_descend_blind(situation))
+        situation.level_because.is_none() && !is_ambiguous && self.knows_target(situation)
     }
 
     fn has_target(&self, situation: &Situation<'_>) -> bool {
@@ -227,6 +227,10 @@ impl Metric {
     /// A guidance without memory.
     pub fn new(config: MetricConfig) -> Self {
         Self { config, observer: None, waiting_since: None, standing_since: None }
+    }
+
+    fn knows_target(&self, situation: &Situation<'_>) -> bool {
+        self.is_visible(situation) || self.may_descend_blind(situation)
     }
 
     fn is_visible(&self, situation: &Situation<'_>) -> bool {
@@ -397,7 +401,7 @@ impl Metric {
         if target.ambiguous {
             return (0.0, Reason::Ambiguous);
         }
-        if !self.may_descend(situation) {
+        if !self.knows_target(situation) {
             return (0.0, Reason::TargetAging);
         }
         let error = self.funnel_error(situation, target);
@@ -430,7 +434,10 @@ impl Metric {
         let braking = end_m_s.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);
         let unattended_m_s = self.unattended_m_s(situation, height_m, end_m_s);
         let max_m_s = braking.sqrt().min(unattended_m_s).min(config.max_descend_m_s);
-        (max_m_s * centred * fresh, why)
+        match situation.level_because {
+            Some(reason) if centred * fresh > 0.0 => (0.0, reason),
+            _ => (max_m_s * centred * fresh, why),
+        }
     }
 
     /// The fastest descent from which the vehicle, should no setpoint follow, reaches the ground no faster than

@@ -25,6 +25,8 @@ pub struct Situation<'a> {
     pub pad_heave_m_s: f64,
     /// How the autopilot follows setpoints.
     pub limits: AutopilotLimits,
+    /// Why the vehicle must not descend now, whatever the guidance sees; `None` when it may.
+    pub level_because: Option<Reason>,
 }
 
 /// The progress of a guidance.
@@ -87,8 +89,8 @@ pub trait Guidance {
 }
 
 impl Situation<'_> {
-    /// Height over the target in metres: by the detections' poses, else over the autopilot's local origin.
+    /// Height over the target in metres by the detections' poses; infinite before the first of them.
     pub fn height_m(&self) -> f64 {
-        self.target.map_or(-self.vehicle.position.z(), |target| target.height_m)
+        self.target.map_or(f64::INFINITY, |target| target.height_m)
     }
 }

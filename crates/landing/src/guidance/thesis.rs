@@ -68,7 +68,8 @@ impl Guidance for Thesis {
     fn may_descend(&self, situation: &Situation<'_>) -> bool {
         let config = &self.config;
         let is_low = situation.height_m() <= config.low_height_m;
-        situation.age_s <= config.stale_target_s + if is_low { config.low_grace_s } else { 0.0 }
+        let stale_s = config.stale_target_s + if is_low { config.low_grace_s } else { 0.0 };
+        situation.level_because.is_none() && situation.age_s <= stale_s
     }
 
     /// Algorithm 18: one frame, with or without the marker, becomes the velocity command until the next

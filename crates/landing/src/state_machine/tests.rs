@@ -7,7 +7,6 @@ const FLYING: VehicleInputs = VehicleInputs {
     mode: Mode::Guided,
     armed: true,
     landed: Landed::InAir,
-    altitude_m: 5.0,
     height_m: 5.0,
 };
 
@@ -70,7 +69,7 @@ fn a_start_is_refused_with_the_reason() {
 
 #[test]
 fn a_start_low_in_land_mode_monitors_the_touchdown() {
-    let low = |v: &mut VehicleInputs| (v.mode, v.altitude_m) = (Mode::Land, 0.4);
+    let low = |v: &mut VehicleInputs| (v.mode, v.height_m) = (Mode::Land, 0.4);
     let starting = Inputs { operator: start().operator, ..flown(0.0, low) };
     check(&[starting], Phase::Final, Reason::AutopilotLands);
     let down = flown(3.0, |v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround));
@@ -194,14 +193,38 @@ fn the_pilot_and_only_the_pilot_takes_over() {
 
 #[test]
 fn disarmed_motors_end_the_landing() {
-    check(&[start(), flown(1.0, |v| v.armed = false)], Phase::Aborted, Reason::Disarmed);
+    let stopped = |seconds| flown(seconds, |v| v.armed = false);
+    check(&[start(), stopped(1.0), stopped(1.4)], Phase::Search, Reason::Searching);
+    check(&[start(), stopped(1.0), stopped(1.5)], Phase::Aborted, Reason::Disarmed);
     let down = |v: &mut VehicleInputs| (v.armed, v.landed) = (false, Landed::OnGround);
     check(&[start(), flown(1.0, down)], Phase::Landed, Reason::TouchedDown);
+    check(&[start(), stopped(1.0), flown(1.2, down)], Phase::Landed, Reason::TouchedDown);
     check(
         &[start(), flown(1.0, |v| v.landed = Landed::OnGround)],
         Phase::Final,
         Reason::TouchedEarly,
     );
+}
+
+#[test]
+fn an_unknown_mode_holds_until_it_is_known_and_is_no_takeover() {
+    let unknown = |seconds| flown(seconds, |v| v.mode = Mode::Unknown);
+    let flying = [start(), seen(1.0, Progress::Unchanged), seen(2.0, Progress::Descending)];
+    let [a, b, c] = flying;
+    check(&[a, b, c, unknown(3.0), unknown(9.0)], Phase::Hold, Reason::ModeUnknown);
+    check(&[a, b, c, unknown(3.0), at(5.0)], Phase::Search, Reason::Searching);
+    let taken = flown(5.0, |v| v.mode = Mode::Other);
+    check(&[a, b, c, unknown(3.0), taken], Phase::PilotInCommand, Reason::PilotTookOver);
+    check(&[a, b, c, unknown(3.0), unknown(63.1)], Phase::Aborted, Reason::HeldTooLong);
+    // A landing for the battery's sake waits for the heartbeat.
+    let alarm = Inputs { alarm: Some((AlarmAction::Land, Reason::BatteryCritical)), ..at(1.0) };
+    check(&[a, alarm, unknown(2.0), unknown(20.0)], Phase::Final, Reason::BatteryCritical);
+}
+
+#[test]
+fn a_running_axis_check_also_delays_a_descent_without_the_marker() {
+    let blind = Inputs { may_descend: false, ..seen(2.0, Progress::Blind) };
+    check(&[start(), seen(1.0, Progress::Unchanged), blind], Phase::Approach, Reason::Aligning);
 }
 
 #[test]
@@ -221,7 +244,7 @@ mod every_transition {
     use std::collections::{HashMap, VecDeque};
 
     /// What distinguishes two states.
-    type Key = (Phase, Reason, bool, bool, bool, u32, [bool; 4], bool);
+    type Key = (Phase, Reason, [bool; 5], u32, [bool; 4], bool);
 
     const LONG_S: f64 = 1e6;
 
@@ -247,17 +270,15 @@ mod every_transition {
         let (over, late) = if terminal { ([false; 4], false) } else { (over, late) };
         let released = machine.phase == Phase::Aborted && machine.released;
         let retries = if terminal { 0 } else { machine.retries };
-        let is_recalling = machine.is_recalling;
-        (
-            machine.phase,
-            machine.reason,
+        let waited_s = machine.disarmed.map(|since| now().seconds_since(since));
+        let flags = [
             machine.landing,
             released,
-            is_recalling,
-            retries,
-            over,
-            late,
-        )
+            machine.is_recalling,
+            waited_s.is_some() && !terminal,
+            waited_s.is_some_and(|s| s >= MAX_CONTACT_WAIT_S) && !terminal,
+        ];
+        (machine.phase, machine.reason, flags, retries, over, late)
     }
 
     /// The same machine, so much later, with its moments moved so that it is always the same time.
@@ -269,6 +290,7 @@ mod every_transition {
         StateMachine {
             entered: earlier(machine.entered),
             started: earlier(machine.started),
+            disarmed: machine.disarmed.map(earlier),
             ..machine.clone()
         }
     }
@@ -284,8 +306,9 @@ mod every_transition {
             Some(FLYING),
             change(|v| v.age_s = 1.0),
             change(|v| v.mode = Mode::Land),
-            change(|v| (v.mode, v.altitude_m, v.height_m) = (Mode::Land, 0.4, 0.4)),
+            change(|v| (v.mode, v.height_m) = (Mode::Land, 0.4)),
             change(|v| v.mode = Mode::Other),
+            change(|v| v.mode = Mode::Unknown),
             change(|v| v.armed = false),
             change(|v| (v.armed, v.landed) = (false, Landed::OnGround)),
             change(|v| (v.mode, v.armed, v.landed) = (Mode::Land, false, Landed::OnGround)),
@@ -369,6 +392,7 @@ mod every_transition {
             let seen = inputs.target_age_s <= before.config.lost_target_s;
             assert!(seen || inputs.progress == Progress::Blind, "descends blindly: {step}");
             assert!(vehicle.is_some_and(|v| v.age_s < 0.5), "descends stale: {step}");
+            assert!(vehicle.is_some_and(|v| v.mode == Mode::Guided), "descends unknown: {step}");
         }
         if to == Phase::Landed {
             assert!(vehicle.is_some_and(|v| !v.armed || v.landed == Landed::OnGround), "{step}");

@@ -111,6 +111,7 @@ fn situation(vehicle: &VehicleState) -> Situation<'_> {
         pad_moves: false,
         pad_heave_m_s: 0.0,
         limits: crate::event::AutopilotLimits::default(),
+        level_because: None,
     }
 }
 

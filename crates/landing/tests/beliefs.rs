@@ -1,0 +1,337 @@
+//! What a lander believes of the autopilot's reports, of the ground and of its own setpoints.
+
+use geometry::{Body, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
+use landing::{
+    Action, Alarm, Config, Decision, Event, FrameObservation, Landed, Lander, MarkerInFrame, Mode,
+    OnAbort, OperatorCommand, Phase, Reason, Rejection, Timestamp, VehicleState, VehicleStatus,
+};
+use nalgebra::Matrix3;
+
+const FLYING: VehicleStatus =
+    VehicleStatus { mode: Mode::Guided, armed: true, landed: Landed::InAir };
+const STEP_S: f64 = 0.025;
+
+/// A lander that is told of a vehicle 40 times a second.
+struct Told {
+    lander: Lander,
+    seconds: f64,
+    status: VehicleStatus,
+    position: Point<Ned>,
+    velocity: Vector<Ned>,
+    /// The pad that the camera sees, at 20 Hz.
+    pad: Option<Point<Ned>>,
+    decisions: Vec<(f64, Decision)>,
+}
+
+impl Told {
+    fn new(config: Config, height_m: f64) -> Self {
+        Self {
+            lander: Lander::new(config).unwrap(),
+            seconds: 1.0,
+            status: FLYING,
+            position: Point::new(0.0, 0.0, -height_m),
+            velocity: Vector::zero(),
+            pad: None,
+            decisions: Vec::new(),
+        }
+    }
+
+    fn started(config: Config, height_m: f64) -> Self {
+        let mut told = Self::new(config, height_m);
+        told.run(0.5, true);
+        told.tell(Event::Operator(OperatorCommand::Start));
+        told
+    }
+
+    fn now(&self) -> Timestamp {
+        Timestamp::from_seconds(self.seconds)
+    }
+
+    fn tell(&mut self, event: Event) -> Decision {
+        let decision = self.lander.step(self.now(), event);
+        self.decisions.push((self.seconds, decision));
+        decision
+    }
+
+    fn state(&self) -> VehicleState {
+        let VehicleStatus { mode, armed, landed } = self.status;
+        VehicleState {
+            stamp: self.now(),
+            ned_from_body: Rotation::identity(),
+            position: self.position,
+            velocity: self.velocity,
+            mode,
+            armed,
+            landed,
+        }
+    }
+
+    fn frame(&self, pad: Point<Ned>) -> FrameObservation {
+        let offset = pad - self.position;
+        let place = Point::new(offset.x(), offset.y(), offset.z());
+        FrameObservation {
+            stamp: self.now(),
+            image_size: (1296, 972),
+            focal_px: Some(1818.0),
+            body_from_camera: None,
+            marker: Some(MarkerInFrame {
+                centre: Pixel::new(648.0, 486.0),
+                body_from_marker: Some(Transform::<Body, Marker>::new(
+                    Rotation::from_euler(std::f64::consts::PI, 0.0, 0.0),
+                    place,
+                )),
+                alternative: None,
+                covariance_m2: Some(Matrix3::identity() * 1e-6),
+                size_px: Some(100.0),
+                confidence: 1.0,
+            }),
+        }
+    }
+
+    /// Lets time pass; without positions where `is_known` is false.
+    fn run(&mut self, seconds: f64, is_known: bool) {
+        for i in 0..(seconds / STEP_S).round() as u32 {
+            self.seconds += STEP_S;
+            if is_known {
+                self.tell(Event::Vehicle(self.state()));
+            } else {
+                self.tell(Event::Status(self.status));
+            }
+            if let Some(pad) = self.pad.filter(|_| i.is_multiple_of(2)) {
+                self.tell(Event::Frame(self.frame(pad)));
+            }
+            self.tell(Event::Tick);
+        }
+    }
+
+    /// The vehicle takes off.
+    fn rise(&mut self, metres: f64) {
+        self.velocity = Vector::new(0.0, 0.0, -1.0);
+        for _ in 0..(metres / STEP_S).round() as u32 {
+            self.position = self.position + self.velocity * STEP_S;
+            self.run(STEP_S, true);
+        }
+        self.velocity = Vector::zero();
+        self.run(0.5, true);
+    }
+
+    /// The vehicle flies what it is told.
+    fn fly(&mut self, seconds: f64) {
+        for _ in 0..(seconds / STEP_S).round() as u32 {
+            self.run(STEP_S, true);
+            let last = self.decisions.last().unwrap().1;
+            if let Action::Velocity { velocity, .. } = last.action {
+                self.velocity = velocity;
+            }
+            self.position = self.position + self.velocity * STEP_S;
+        }
+    }
+
+    fn phase(&self) -> Phase {
+        self.lander.phase()
+    }
+
+    fn has_asked_for_land(&self) -> bool {
+        self.decisions.iter().any(|(_, decision)| decision.action == Action::Land)
+    }
+}
+
+#[test]
+fn the_pilot_is_seen_without_a_position_and_keeps_the_vehicle() {
+    for mode in [Mode::Other, Mode::Land] {
+        let mut told = Told::started(Config::default(), 5.0);
+        told.run(1.0, true);
+        told.run(1.0, false);
+        assert_eq!(told.phase(), Phase::Hold);
+        told.status.mode = mode;
+        told.run(0.1, false);
+        assert_eq!(told.phase(), Phase::PilotInCommand, "{mode:?}");
+        told.tell(Event::Alarm(Alarm::BatteryCritical));
+        told.run(5.0, false);
+        assert!(!told.has_asked_for_land());
+        told.status.mode = Mode::Guided;
+        told.run(5.0, true);
+        assert_eq!(told.phase(), Phase::PilotInCommand);
+        let after = told.decisions.iter().filter(|(seconds, _)| *seconds > 3.6);
+        assert!(after.clone().count() > 100);
+        assert!(after.clone().all(|(_, decision)| decision.action == Action::None));
+    }
+}
+
+#[test]
+fn land_is_not_asked_for_while_the_mode_is_unknown() {
+    let mut told = Told::started(Config::default(), 5.0);
+    told.run(1.0, true);
+    told.status.mode = Mode::Unknown;
+    told.run(0.5, true);
+    assert_eq!(told.decisions.last().unwrap().1.why, Reason::ModeUnknown);
+    told.tell(Event::Alarm(Alarm::BatteryCritical));
+    told.run(10.0, true);
+    assert!(!told.has_asked_for_land());
+    assert_eq!(told.decisions.last().unwrap().1.action, Action::hover());
+    told.status.mode = Mode::Guided;
+    told.run(0.5, true);
+    assert!(told.has_asked_for_land(), "the heartbeat is back");
+}
+
+#[test]
+fn a_report_of_the_ground_is_not_believed_high_over_the_pad_or_in_motion() {
+    let on_ground = VehicleStatus { landed: Landed::OnGround, ..FLYING };
+    // High over the pad.
+    let mut told = Told::started(Config::default(), 6.0);
+    told.pad = Some(Point::origin());
+    told.run(3.0, true);
+    told.tell(Event::Status(on_ground));
+    told.status = on_ground;
+    told.run(6.0, true);
+    assert!(!told.has_asked_for_land());
+    // High over the ground that it took off from.
+    let mut told = Told::new(Config::default(), 0.0);
+    told.status = on_ground;
+    told.run(1.0, true);
+    told.status = FLYING;
+    told.rise(6.0);
+    told.tell(Event::Operator(OperatorCommand::Start));
+    told.status = on_ground;
+    told.run(3.0, true);
+    assert!(!told.has_asked_for_land() && told.phase() == Phase::Search);
+    // In motion, with no height known.
+    let mut told = Told::started(Config::default(), 6.0);
+    told.velocity = Vector::new(0.0, 0.0, 1.0);
+    told.status = on_ground;
+    told.run(0.5, true);
+    assert!(!told.has_asked_for_land());
+    // Right over the pad it is.
+    let mut told = Told::started(Config::default(), 0.1);
+    told.pad = Some(Point::origin());
+    told.status = on_ground;
+    told.run(0.5, true);
+    assert!(told.has_asked_for_land());
+}
+
+#[test]
+fn a_vehicle_that_hovers_because_no_detector_is_left_does_not_stand() {
+    let mut told = Told::started(Config::default(), 3.0);
+    told.pad = Some(Point::origin());
+    told.fly(2.0);
+    for _ in 0..400 {
+        if told.position.z() > -0.35 {
+            break;
+        }
+        told.fly(STEP_S);
+    }
+    assert!(told.phase() == Phase::Descend && told.position.z() < -0.1, "{:?}", told.position);
+    told.pad = None;
+    told.tell(Event::DetectorsAlive(false));
+    let from_s = told.seconds;
+    told.velocity = Vector::zero();
+    told.run(5.0, true);
+    for (_, decision) in told.decisions.iter().filter(|(seconds, _)| *seconds > from_s) {
+        assert_ne!(decision.phase, Phase::Final, "{decision:?}");
+        if let Action::Velocity { velocity, .. } = decision.action {
+            assert!(velocity.z() <= 0.0, "{decision:?}");
+        }
+    }
+    let why = told.decisions.iter().find(|(seconds, _)| *seconds > from_s).unwrap().1.why;
+    assert_eq!(why, Reason::NoDetector);
+}
+
+#[test]
+fn a_search_climbs_over_the_ground_and_not_over_the_origin() {
+    let config = Config::default();
+    let climbed_m = |took_off: bool, ground_z_m: f64, height_m: f64| {
+        let mut told = Told::new(config, height_m - ground_z_m);
+        if took_off {
+            told.position = Point::new(0.0, 0.0, ground_z_m);
+            told.status.landed = Landed::OnGround;
+            told.run(0.5, true);
+            told.status = FLYING;
+            told.rise(height_m);
+        }
+        told.run(0.5, true);
+        told.tell(Event::Operator(OperatorCommand::Start));
+        told.fly(25.0);
+        ground_z_m - told.position.z() - height_m
+    };
+    for ground_z_m in [-20.0, 0.0, 20.0] {
+        let known_m = climbed_m(true, ground_z_m, 2.0);
+        assert!((known_m - 3.0).abs() < 0.2, "{ground_z_m}: {known_m} m");
+    }
+    // A lander that begins in the air does not know the ground.
+    assert!((climbed_m(false, 0.0, 2.0) - 3.0).abs() < 0.2);
+    assert!(climbed_m(false, -20.0, 2.0).abs() < 0.2);
+    assert!((climbed_m(false, 20.0, 2.0) - 5.0).abs() < 0.2, "at most that far over the start");
+}
+
+#[test]
+fn an_abort_climbs_over_the_pad() {
+    let mut config = Config::default();
+    config.phases.on_abort = OnAbort::Climb;
+    config.phases.abort_height_m = 8.0;
+    let mut told = Told::started(config, 9.0);
+    // The pad lies 5 m over the origin.
+    told.pad = Some(Point::new(0.0, 0.0, -5.0));
+    told.run(2.0, true);
+    told.tell(Event::Operator(OperatorCommand::Abort));
+    told.fly(20.0);
+    assert!((told.position.z() + 13.0).abs() < 0.2, "{:?}", told.position);
+    config.phases.fence_height_m = 10.0;
+    let mut told = Told::started(config, 9.0);
+    told.pad = Some(Point::new(0.0, 0.0, -5.0));
+    told.run(2.0, true);
+    told.tell(Event::Operator(OperatorCommand::Abort));
+    told.fly(20.0);
+    assert!(told.position.z() > -10.2, "{:?}", told.position);
+}
+
+#[test]
+fn a_retry_stays_below_the_fence() {
+    let mut config = Config::default();
+    config.phases.fence_height_m = 4.0;
+    let mut told = Told::started(config, 6.0);
+    told.pad = Some(Point::origin());
+    told.fly(2.0);
+    for _ in 0..800 {
+        if told.position.z() > -3.5 {
+            break;
+        }
+        told.fly(STEP_S);
+    }
+    told.pad = None;
+    let mut highest_m = 0.0f64;
+    let mut has_retried = false;
+    for _ in 0..400 {
+        told.fly(STEP_S);
+        has_retried |= told.phase() == Phase::Retry;
+        highest_m = highest_m.max(-told.position.z());
+    }
+    assert!(has_retried && highest_m < 4.3, "{has_retried} {highest_m}");
+}
+
+#[test]
+fn numbers_of_a_detector_that_make_no_sense_are_refused() {
+    let mut told = Told::started(Config::default(), 5.0);
+    let mut refused = |change: fn(&mut MarkerInFrame)| {
+        told.run(0.1, true);
+        let mut frame = told.frame(Point::origin());
+        frame.marker.iter_mut().for_each(change);
+        told.tell(Event::Frame(frame)).rejected
+    };
+    assert_eq!(refused(|_| {}), None);
+    assert_eq!(
+        refused(|marker| marker.covariance_m2 = Some(Matrix3::identity() * -1e-4)),
+        Some(Rejection::BadCovariance)
+    );
+    assert_eq!(
+        refused(|marker| marker.covariance_m2 = Some(Matrix3::identity() * 1e200)),
+        Some(Rejection::BadCovariance)
+    );
+    assert_eq!(
+        refused(|marker| {
+            let place = Point::new(0.0, 1e160, 5.0);
+            marker.alternative = Some(Transform::new(Rotation::identity(), place));
+        }),
+        Some(Rejection::Implausible)
+    );
+    assert_eq!(refused(|_| {}), None, "the next one is looked at");
+}
