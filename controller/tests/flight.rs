@@ -195,6 +195,7 @@ fn reports_of_the_ground_that_contradict_the_flight_change_nothing() {
         assert!(matches!(before.phase, Phase::Approach | Phase::Descend), "{before:?}");
         let mut setpoints = 0;
         for ms in (3000..9000).step_by(200) {
+            receive(&mut flight, ms * MS, &heartbeat(4, true));
             receive(&mut flight, ms * MS, &contact(report));
             let sent = hover(&mut flight, ms + 20, ms + 200, 4);
             assert!(sent.modes.is_empty(), "{report:?}");
