@@ -52,6 +52,8 @@ const TRUTH: [&str; 2] = ["rendering", "world"];
 const TESTING: &str = "testing";
 /// The tests of the whole system.
 const TESTS: &str = "tests";
+/// The fuzz targets: they call whatever reads from outside.
+const FUZZ: &str = "fuzz";
 /// The tool that stands above others: it calls their pure parts in lock-step.
 const EXPERIMENTS: (&str, [&str; 3]) = ("experiments", ["controller", "detector", "simulator"]);
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
@@ -234,7 +236,7 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
     for package in &workspace {
         let allowed: BTreeSet<&str> = match crates.get(package.name.as_str()) {
             Some(allowed) => allowed.iter().copied().collect(),
-            None if package.name == TESTS => continue,
+            None if [TESTS, FUZZ].contains(&package.name.as_str()) => continue,
             None if package.name == TESTING => BTreeSet::new(),
             None if package.name == "alight" => {
                 let tools = workspace.iter().filter(|p| p.is_tool()).map(|p| p.name.as_str());

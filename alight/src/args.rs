@@ -75,6 +75,16 @@ impl NetworkArgs {
     }
 }
 
+/// A setting of the simulator or the controller.
+pub(crate) fn flight_setting(text: &str) -> Result<String, String> {
+    let is_known = ["simulator.", "controller."].iter().any(|service| text.starts_with(service));
+    if is_known && text.contains('=') {
+        Ok(text.to_owned())
+    } else {
+        Err("write simulator.KEY=VALUE or controller.KEY=VALUE".to_owned())
+    }
+}
+
 /// The format of a result.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Format {

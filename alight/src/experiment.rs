@@ -12,6 +12,10 @@ use experiments::markers::{self, Request};
 use experiments::set::Set;
 use indicatif::ProgressBar;
 
+use crate::args::flight_setting;
+use crate::faults::{self, FaultsArgs};
+use crate::progress::flights_bar;
+use crate::runtime::cores;
 use crate::terminal::{print, write_error};
 
 #[derive(Args)]
@@ -29,6 +33,9 @@ enum Experiment {
     /// with several seeds each; write tables, plots, and the command that repeats each failure (section 4.4
     /// of the thesis, extended).
     Landing(LandingArgs),
+    /// Fly landings in which a process dies or stands still, a link fails, or somebody lies; write a table of
+    /// the worst touchdowns, and the command that repeats each. Fails when one was unsafe.
+    Faults(FaultsArgs),
 }
 
 #[derive(Args)]
@@ -63,7 +70,7 @@ struct LandingArgs {
     #[arg(long = "fault", value_name = "NAME", default_value = "none")]
     faults: Vec<String>,
     /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
-    #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = landing_setting)]
+    #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = flight_setting)]
     set: Vec<String>,
     /// Number of flights in parallel [default: number of cores].
     #[arg(long, value_name = "N")]
@@ -79,15 +86,6 @@ enum VisionArg {
     Rendered,
     /// A model fitted to the detector.
     Modelled,
-}
-
-fn landing_setting(text: &str) -> Result<String, String> {
-    let is_known = ["simulator.", "controller."].iter().any(|service| text.starts_with(service));
-    if is_known && text.contains('=') {
-        Ok(text.to_owned())
-    } else {
-        Err("write simulator.KEY=VALUE or controller.KEY=VALUE".to_owned())
-    }
 }
 
 #[derive(Args)]
@@ -113,6 +111,7 @@ pub(crate) fn run(args: ExperimentArgs) -> anyhow::Result<ExitCode> {
     match args.experiment {
         Experiment::Markers(args) => run_markers(args),
         Experiment::Landing(args) => run_landing(args),
+        Experiment::Faults(args) => faults::run(args),
     }
 }
 
@@ -124,7 +123,6 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
             name => faults.push(name.parse::<Fault>().map_err(anyhow::Error::msg)?),
         }
     }
-    let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let request = plan::Request {
         plan: Plan {
             vision: match args.vision {
@@ -142,14 +140,9 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
             set: args.set,
         },
         results_in: args.output,
-        jobs: args.jobs.unwrap_or(cores),
+        jobs: args.jobs.unwrap_or_else(cores),
     };
-    let bar = ProgressBar::no_length().with_style(
-        indicatif::ProgressStyle::with_template(
-            "{bar:40} {pos} of {len} flights, {elapsed}, {eta} left",
-        )
-        .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar()),
-    );
+    let bar = flights_bar();
     let report = landing::run(&request, &|done, of| {
         bar.set_length(of as u64);
         bar.set_position(done as u64);

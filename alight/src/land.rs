@@ -78,7 +78,7 @@ const SERVICES: [Service; 4] =
     [Service::Simulator, Service::Detector, Service::Controller, Service::GcsBridge];
 
 /// The loopback interface.
-const LOOPBACK: &str = "127.0.0.1";
+pub(crate) const LOOPBACK: &str = "127.0.0.1";
 
 /// The UDP port at which ground stations such as QGroundControl listen.
 const GROUND_PORT: u16 = 14_550;
@@ -370,7 +370,7 @@ impl Rendezvous {
 const PORTS: std::ops::Range<u16> = 20_000..32_000;
 
 /// A free port. Each process begins its search at another one, so that two that start at once do not collide.
-fn free_port<T>(bind: impl Fn(u16) -> std::io::Result<T>) -> anyhow::Result<u16> {
+pub(crate) fn free_port<T>(bind: impl Fn(u16) -> std::io::Result<T>) -> anyhow::Result<u16> {
     let first = std::process::id().wrapping_mul(97);
     let port = |offset| PORTS.start + (first.wrapping_add(offset) % PORTS.len() as u32) as u16;
     (0..100)

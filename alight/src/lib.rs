@@ -5,7 +5,8 @@
 //! this machine and follows its `peers`, `keys` makes the site's keys, `doctor` diagnoses it; `land`
 //! runs all services as processes and watches the landing, with `children` for the processes, `progress`
 //! for the display and `outcome` for the result; `command` sends a command, `detectors` lists the
-//! running detectors and `swap` replaces one; `detect`, `marker` and `experiment` are tools.
+//! running detectors and `swap` replaces one; `detect`, `marker` and `experiment` with
+//! its campaign of `faults`, flown in `real_time` over a `fault_link` as well, are tools.
 //! `runtime` and `terminal` serve all of them.
 
 mod args;
@@ -16,12 +17,15 @@ mod detect;
 mod detectors;
 mod doctor;
 mod experiment;
+mod fault_link;
+mod faults;
 mod keys;
 mod land;
 mod marker;
 mod outcome;
 mod peers;
 mod progress;
+mod real_time;
 mod relay;
 mod runtime;
 mod services;

@@ -104,6 +104,14 @@ fn live_lines(status: &ControllerStatus, frame_rate_hz: Option<f64>) -> String {
     )
 }
 
+/// The progress of many flights.
+pub(crate) fn flights_bar() -> ProgressBar {
+    ProgressBar::no_length().with_style(
+        ProgressStyle::with_template("{bar:40} {pos} of {len} flights, {elapsed}, {eta} left")
+            .unwrap_or_else(|_| ProgressStyle::default_bar()),
+    )
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -54,3 +54,8 @@ fn stop_with_parent(parent: u32) -> bool {
 fn stop_with_parent(_parent: u32) -> bool {
     true
 }
+
+/// The number of cores of this machine.
+pub(crate) fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
+}

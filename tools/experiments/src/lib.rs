@@ -7,8 +7,9 @@
 //! one frame; [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`]
 //! has a detector's results, and [`score`] their errors; [`photographs`] has the results on real images;
 //! [`report`] is the report, with the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the
-//! experiment with landings.
+//! experiment with landings, [`faults`] the campaign in which something dies, lies or falls silent.
 
+pub mod faults;
 pub mod figures;
 pub mod frame_spec;
 pub mod landing;

@@ -21,8 +21,7 @@ use std::sync::{Mutex, PoisonError};
 use anyhow::Context;
 
 use flight::fly;
-use outcome::Outcome;
-use plan::{Planned, Request};
+use plan::Request;
 
 /// Flies all, writes results, plots and the report, and returns the report. `progress` gets the number of
 /// finished flights and of all.
@@ -46,13 +45,13 @@ pub fn run(request: &Request, progress: &(dyn Fn(usize, usize) + Sync)) -> anyho
 ///
 /// # Errors
 /// The first error.
-pub fn in_parallel(
-    flights: &[Planned],
+pub fn in_parallel<P: Sync, O: Send>(
+    flights: &[P],
     jobs: usize,
-    fly: impl Fn(&Planned) -> anyhow::Result<Outcome> + Sync,
-) -> anyhow::Result<Vec<Outcome>> {
+    fly: impl Fn(&P) -> anyhow::Result<O> + Sync,
+) -> anyhow::Result<Vec<O>> {
     let next = AtomicUsize::new(0);
-    let results: Mutex<Vec<(usize, anyhow::Result<Outcome>)>> = Mutex::default();
+    let results: Mutex<Vec<(usize, anyhow::Result<O>)>> = Mutex::default();
     std::thread::scope(|scope| {
         for _ in 0..jobs.clamp(1, flights.len().max(1)) {
             scope.spawn(|| {

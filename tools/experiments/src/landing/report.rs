@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::Context;
+use serde::Serialize;
 use serde_json::Value;
 
 use super::flight::fly;
@@ -39,7 +40,11 @@ pub fn write(
     Ok(text)
 }
 
-fn put(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
+/// Writes a file into the folder of the results.
+///
+/// # Errors
+/// When it cannot be written.
+pub fn put(folder: &Path, name: &str, text: &str) -> anyhow::Result<()> {
     let path = folder.join(name);
     std::fs::write(&path, text).with_context(|| format!("writing {}", path.display()))
 }
@@ -102,7 +107,11 @@ fn one_flight(folder: &Path, flights: &[Planned], outcomes: &[Outcome]) -> anyho
     ))
 }
 
-fn json_lines(outcomes: &[Outcome]) -> anyhow::Result<String> {
+/// The flights as JSON, one per line.
+///
+/// # Errors
+/// When one cannot be written as JSON.
+pub fn json_lines(outcomes: &[impl Serialize]) -> anyhow::Result<String> {
     let mut text = String::new();
     for outcome in outcomes {
         text.push_str(&serde_json::to_string(outcome)?);
@@ -112,7 +121,10 @@ fn json_lines(outcomes: &[Outcome]) -> anyhow::Result<String> {
 }
 
 /// The flights as comma-separated values, with columns sorted by name.
-fn csv(outcomes: &[Outcome]) -> anyhow::Result<String> {
+///
+/// # Errors
+/// When one cannot be written as JSON.
+pub fn csv(outcomes: &[impl Serialize]) -> anyhow::Result<String> {
     let mut text = String::new();
     for (index, outcome) in outcomes.iter().enumerate() {
         let Value::Object(row) = serde_json::to_value(outcome)? else { continue };
@@ -130,6 +142,10 @@ fn cell(value: &Value) -> String {
     match value {
         Value::Null => String::new(),
         Value::String(text) => format!("\"{}\"", text.replace('"', "\"\"")),
+        Value::Array(values) => {
+            let texts: Vec<String> = values.iter().map(cell).collect();
+            format!("\"{}\"", texts.join(" ").replace('"', "\"\""))
+        }
         other => other.to_string(),
     }
 }

@@ -1,0 +1,173 @@
+//! `alight experiment faults`: landings in which something dies, lies or falls silent.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::Args;
+use experiments::faults::kind::Kind;
+use experiments::faults::plan::{Plan, Request, Second};
+use experiments::faults::report;
+use experiments::faults::{self, Findings};
+use experiments::landing::plan::Values;
+
+use crate::args::flight_setting;
+use crate::progress::flights_bar;
+use crate::real_time;
+use crate::runtime::{cores, runtime};
+use crate::terminal::{print, write_error};
+
+/// Numbers of flights.
+const LOCKSTEP_FLIGHTS: u64 = 1000;
+const REAL_TIME_FLIGHTS: u64 = 25;
+
+#[derive(Args)]
+pub(crate) struct FaultsArgs {
+    /// Output folder: report, every flight as CSV and JSON lines.
+    #[arg(short, long, value_name = "DIR", default_value = "experiment-faults")]
+    output: PathBuf,
+    /// Number of flights [default: 1000, in real time 25].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    flights: Option<u64>,
+    /// Seed of the first flight; the others follow. A seed draws the fault's begin and duration, and the wind.
+    #[arg(long, value_name = "S", default_value_t = 1)]
+    seed: u64,
+    /// Only this kind of fault. May be repeated. An unknown name lists all.
+    #[arg(long = "kind", value_name = "NAME")]
+    kinds: Vec<Kind>,
+    /// Height over the pad at which it begins, in metres: a value, a list 0.3,2,5, or a range.
+    #[arg(long, value_name = "M", default_value = "0.2..9")]
+    height: Values,
+    /// How long it lasts, in seconds, or `ever`; a list as well [default: one of 0.5, 2, 5 and ever].
+    #[arg(long = "for", value_name = "S", value_delimiter = ',', value_parser = duration_s)]
+    durations_s: Vec<f64>,
+    /// Mean wind, in m/s; a list as well [default: 0 or 5].
+    #[arg(long, value_name = "M/S", value_delimiter = ',', value_parser = wind_m_s)]
+    wind: Vec<f64>,
+    /// A second fault at the same time: a kind, or `none` [default: any, in a fifth of the flights].
+    #[arg(long, value_name = "NAME")]
+    with: Option<String>,
+    /// One further setting: simulator.KEY=VALUE or controller.KEY=VALUE. May be repeated.
+    #[arg(long, value_name = "SERVICE.KEY=VALUE", value_parser = flight_setting)]
+    set: Vec<String>,
+    /// Number of flights in parallel [default: number of cores].
+    #[arg(long, value_name = "N")]
+    jobs: Option<usize>,
+    /// Fly in real time, with the services as processes that are killed and stopped (SIGKILL, SIGSTOP), one
+    /// flight after the other.
+    #[arg(long)]
+    real_time: bool,
+}
+
+fn duration_s(text: &str) -> Result<f64, String> {
+    if text == "ever" {
+        return Ok(f64::INFINITY);
+    }
+    let number: Option<f64> = text.parse().ok();
+    number
+        .filter(|seconds| (0.01..=300.0).contains(seconds))
+        .ok_or_else(|| format!("`{text}` is neither from 0.01 to 300 nor `ever`"))
+}
+
+fn wind_m_s(text: &str) -> Result<f64, String> {
+    let number: Option<f64> = text.parse().ok();
+    number
+        .filter(|speed| (0.0..=20.0).contains(speed))
+        .ok_or_else(|| format!("`{text}` is not from 0 to 20"))
+}
+
+impl FaultsArgs {
+    fn plan(self) -> Result<Plan, String> {
+        let second = match self.with.as_deref() {
+            None if self.real_time => Second::None,
+            None => Second::Drawn,
+            Some("none") => Second::None,
+            Some(name) => Second::Always(name.parse()?),
+        };
+        let possible: Vec<Kind> = match self.real_time {
+            true => Kind::in_real_time().collect(),
+            false => Kind::in_lockstep().collect(),
+        };
+        let kinds = if self.kinds.is_empty() { possible.clone() } else { self.kinds };
+        let second_kind = match second {
+            Second::Always(kind) => Some(kind),
+            _ => None,
+        };
+        if let Some(kind) = kinds.iter().chain(&second_kind).find(|kind| !possible.contains(kind)) {
+            let how = if self.real_time { "without" } else { "with" };
+            return Err(format!("`{}` is flown {how} --real-time only", kind.name()));
+        }
+        let usual = if self.real_time { REAL_TIME_FLIGHTS } else { LOCKSTEP_FLIGHTS };
+        Ok(Plan {
+            flights: self.flights.unwrap_or(usual),
+            seed: self.seed,
+            kinds,
+            height: self.height,
+            durations_s: self.durations_s,
+            winds_m_s: self.wind,
+            second,
+            set: self.set,
+            real_time: self.real_time,
+        })
+    }
+}
+
+/// Flies the campaign in real time, one flight after the other.
+fn run_in_real_time(request: &Request) -> anyhow::Result<Findings> {
+    node::start_logging("error");
+    let flights = request.plan.flights();
+    let bar = flights_bar();
+    bar.set_length(flights.len() as u64);
+    let mut outcomes = Vec::new();
+    for planned in &flights {
+        let folder = request.results_in.join(format!("logs-{}", planned.seed));
+        let outcome = runtime()?.block_on(real_time::fly(planned, &folder))?;
+        write_error(&format!(
+            "{} ({}) at {:.1} m: {:?}, {} m/s down, {} {}",
+            outcome.kinds,
+            outcome.seed,
+            outcome.height_m,
+            outcome.ending,
+            outcome.sink_m_s.map_or("no touch,".to_owned(), |sink| format!("{sink:.2}")),
+            outcome.phase,
+            outcome.why,
+        ));
+        outcomes.push(outcome);
+        bar.inc(1);
+        // What there is, should the next one be interrupted.
+        report::write(&request.results_in, "In real time, unfinished", &outcomes)?;
+    }
+    bar.finish_and_clear();
+    let title = format!("{} flights in real time, seeds from {}", flights.len(), request.plan.seed);
+    let report = report::write(&request.results_in, &title, &outcomes)?;
+    Ok(Findings { report, outcomes })
+}
+
+/// Flies the campaign in lock-step, several flights at once.
+fn run_in_lockstep(request: &Request) -> anyhow::Result<Findings> {
+    let bar = flights_bar();
+    let findings = faults::run(request, &|done, of| {
+        bar.set_length(of as u64);
+        bar.set_position(done as u64);
+    })?;
+    bar.finish_and_clear();
+    Ok(findings)
+}
+
+/// Flies the campaign and prints its report; a failure when a touchdown was unsafe or a flight did not end.
+pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
+    let (results_in, jobs) = (args.output.clone(), args.jobs.unwrap_or_else(cores));
+    let real_time = args.real_time;
+    let plan = args.plan().map_err(anyhow::Error::msg)?;
+    let request = Request { plan, results_in, jobs };
+    let findings = match real_time {
+        true => run_in_real_time(&request),
+        false => run_in_lockstep(&request),
+    }
+    .with_context(|| format!("working in {}", request.results_in.display()))?;
+    print(&findings.report)?;
+    write_error(&format!("flights and this report: {}", request.results_in.display()));
+    let is_bad =
+        findings.outcomes.iter().any(|outcome| outcome.is_unsafe() || outcome.is_unended());
+    Ok(ExitCode::from(u8::from(is_bad)))
+}

@@ -1,0 +1,427 @@
+//! One flight with faults in real time: the services as processes that are killed and stopped for true, and
+//! their link to the simulated autopilot through a proxy that fails.
+
+use std::fs::{File, OpenOptions};
+use std::net::{TcpListener, UdpSocket as BlockingSocket};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use anyhow::Context;
+use experiments::faults::kind::Kind;
+use experiments::faults::outcome::{Ending, Outcome};
+use experiments::faults::plan::{Fault, Planned};
+use messages::{ControllerStatus, Phase, Truth, topic};
+use node::{Network, Node, now_ns};
+use rustix::process::{Pid, Resource, Rlimit, Signal, kill_process, prlimit};
+use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
+
+use crate::fault_link::Proxy;
+use crate::land::{LOOPBACK, free_port};
+use crate::runtime::tool_identity;
+
+/// Timeout of a flight, in seconds.
+const TIMEOUT_S: f64 = 240.0;
+/// Timeout for the start of the landing, in seconds.
+const START_TIMEOUT_S: f64 = 60.0;
+/// Speed below which the vehicle is at rest in the air, in m/s.
+const REST_M_S: f64 = 0.6;
+/// Time at rest after which a flight is over, in seconds: on the ground and in the air.
+const LANDED_S: f64 = 6.0;
+const HOVERS_S: f64 = 10.0;
+/// Time after the begin of the last fault before which a hover counts for nothing, in seconds.
+const AFTER_FAULT_S: f64 = 15.0;
+/// What a process may use beyond what it has when its memory is limited, in bytes.
+const SPARE_BYTES: u64 = 1 << 20;
+/// Period of the campaign's own look at the flight.
+const LOOK: Duration = Duration::from_millis(5);
+/// The vehicle's name in the network of its services, and in that of its world.
+const VEHICLE: &str = "tried";
+const WORLD: &str = "world";
+/// A start without much shared memory, of the program in the arguments.
+const SMALL_MEMORY: &str = "mount -t tmpfs -o size=64k tmpfs /dev/shm && exec \"$@\"";
+
+/// A process that can be killed and stopped.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Part {
+    World,
+    Camera,
+    Detector,
+    Controller,
+    Bridge,
+}
+
+impl Part {
+    fn service(self) -> &'static str {
+        match self {
+            Self::World | Self::Camera => "simulator",
+            Self::Detector => "detector",
+            Self::Controller => "controller",
+            Self::Bridge => "gcs-bridge",
+        }
+    }
+
+    fn of(kind: Kind) -> Option<Self> {
+        Some(match kind {
+            Kind::ControllerKilled | Kind::ControllerStopped | Kind::ControllerMemory => {
+                Self::Controller
+            }
+            Kind::DetectorKilled | Kind::DetectorStopped | Kind::DetectorMemory => Self::Detector,
+            Kind::CameraKilled | Kind::CameraStopped => Self::Camera,
+            Kind::BridgeKilled | Kind::BridgeStopped => Self::Bridge,
+            _ => return None,
+        })
+    }
+}
+
+/// Flies it. `folder` gets the logs of the processes.
+///
+/// # Errors
+/// When a process does not start, or the landing does not begin.
+pub(crate) async fn fly(planned: &Planned, folder: &Path) -> anyhow::Result<Outcome> {
+    let mut flight = RealFlight::begin(planned, folder).await?;
+    flight.run().await.with_context(|| planned.command())?;
+    Ok(flight.outcome.clone())
+}
+
+/// A fault that has begun.
+struct Begun {
+    fault: Fault,
+    at: Instant,
+    ended: bool,
+}
+
+struct RealFlight<'a> {
+    planned: &'a Planned,
+    folder: &'a Path,
+    meet: u16,
+    apart: u16,
+    /// The port at which the controller awaits the autopilot.
+    port: u16,
+    parts: Vec<(Part, Child)>,
+    proxy: Proxy,
+    status: Option<ControllerStatus>,
+    truth: Option<Truth>,
+    started: Option<Instant>,
+    reached: Option<Instant>,
+    rest_since: Option<Instant>,
+    begun: Vec<Begun>,
+    outcome: Outcome,
+}
+
+impl<'a> RealFlight<'a> {
+    async fn begin(planned: &'a Planned, folder: &'a Path) -> anyhow::Result<Self> {
+        std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
+        let port = |skip: u16| {
+            free_port(|port| {
+                TcpListener::bind((LOOPBACK, port)).and_then(|listener| {
+                    let socket = BlockingSocket::bind((LOOPBACK, port))?;
+                    match port % 4 == skip {
+                        true => Ok((listener, socket)),
+                        false => Err(std::io::Error::other("kept for another use")),
+                    }
+                })
+            })
+        };
+        let (meet, apart, world_port, port) = (port(0)?, port(1)?, port(2)?, port(3)?);
+        let seed = planned.seed;
+        let proxy = Proxy::start(seed, world_port, port).await?;
+        let mut flight = Self {
+            planned,
+            folder,
+            meet,
+            apart,
+            port,
+            parts: Vec::new(),
+            proxy,
+            status: None,
+            truth: None,
+            started: None,
+            reached: None,
+            rest_since: None,
+            begun: Vec::new(),
+            outcome: Outcome::new(planned),
+        };
+        let mut world: Vec<String> = planned.simulator.clone();
+        world.retain(|setting| !setting.starts_with("camera.") && !setting.starts_with("begin_"));
+        world.push(format!("autopilot.address=udpout:127.0.0.1:{world_port}"));
+        if flight.has_own_camera() {
+            // The camera follows what the autopilot reports; the world's own would only take time.
+            world.extend(["autopilot.errors=0", "camera.rate_hz=0.1"].map(str::to_owned));
+        }
+        flight.start(Part::World, &world)?;
+        for part in [Part::Camera, Part::Detector, Part::Controller, Part::Bridge] {
+            if part != Part::Camera || flight.has_own_camera() {
+                flight.start(part, &flight.settings(part, false))?;
+            }
+        }
+        Ok(flight)
+    }
+
+    /// True when the camera is a process apart from the world's.
+    fn has_own_camera(&self) -> bool {
+        self.has(|kind| Part::of(kind) == Some(Part::Camera))
+    }
+
+    fn has(&self, is_it: impl Fn(Kind) -> bool) -> bool {
+        self.planned.faults.iter().any(|fault| is_it(fault.kind))
+    }
+
+    fn settings(&self, part: Part, again: bool) -> Vec<String> {
+        let text = |settings: &[&str]| settings.iter().map(|&s| s.to_owned()).collect();
+        match part {
+            Part::World => Vec::new(),
+            Part::Camera => {
+                let seed = format!("seed={}", self.planned.seed);
+                text(&["id=camera", "vehicle=reported", &seed])
+            }
+            Part::Detector => Vec::new(),
+            Part::Controller => {
+                let mut settings = self.planned.controller.clone();
+                settings.push(format!("autopilot.address=udpin:127.0.0.1:{}", self.port));
+                settings.extend(again.then(|| "start=resume".to_owned()));
+                settings
+            }
+            Part::Bridge => text(&["ground=udpout:127.0.0.1:9"]),
+        }
+    }
+
+    fn start(&mut self, part: Part, settings: &[String]) -> anyhow::Result<()> {
+        let program = std::env::current_exe().context("finding this program's own file")?;
+        let is_apart = part == Part::World && self.has_own_camera();
+        let (meet, vehicle) = if is_apart { (self.apart, WORLD) } else { (self.meet, VEHICLE) };
+        let mut command = if self.has(|kind| kind == Kind::FullSharedMemory) {
+            let mut command = Command::new("unshare");
+            command.args(["-rm", "sh", "-c", SMALL_MEMORY, "sh"]).arg(&program);
+            command
+        } else {
+            Command::new(&program)
+        };
+        command.arg(part.service()).args(["--meet", &meet.to_string(), "--vehicle", vehicle]);
+        command.arg("--stop-with-parent").arg(std::process::id().to_string());
+        for setting in settings {
+            command.args(["--set", setting]);
+        }
+        let log = if self.has(|kind| kind == Kind::FullDisk) && part != Part::World {
+            command.env("ALIGHT_LOG", "debug");
+            File::create("/dev/full").context("opening /dev/full")?
+        } else {
+            let path = self.folder.join(format!("{part:?}.log").to_lowercase());
+            OpenOptions::new().create(true).append(true).open(path)?
+        };
+        let child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log).spawn();
+        let child = child.with_context(|| format!("starting {}", part.service()))?;
+        self.parts.push((part, child));
+        Ok(())
+    }
+
+    async fn run(&mut self) -> anyhow::Result<()> {
+        let node = open(self.meet, VEHICLE).await?;
+        let world_meet = if self.has_own_camera() { self.apart } else { self.meet };
+        let world_vehicle = if self.has_own_camera() { WORLD } else { VEHICLE };
+        let aside = open(world_meet, world_vehicle).await?;
+        let statuses = node.subscriber(topic::STATUS, &[]).await?;
+        let truths = aside.subscriber(topic::TRUTH, &[]).await?;
+        let opened = Instant::now();
+        let mut looks = interval(LOOK);
+        looks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        loop {
+            tokio::select! {
+                Some(status) = statuses.next() => self.status = Some(status),
+                Some(truth) = truths.next() => self.see(truth),
+                _ = looks.tick() => {}
+            }
+            self.begin_and_end_faults()?;
+            self.describe();
+            let (since, patience_s) = match self.started {
+                Some(started) => (started, TIMEOUT_S),
+                None => (opened, START_TIMEOUT_S),
+            };
+            if self.is_over() || since.elapsed().as_secs_f64() > patience_s {
+                break;
+            }
+        }
+        for node in [node, aside] {
+            // A peer that was killed may leave a session that does not end in good order.
+            let _ = timeout(Duration::from_secs(2), node.close()).await;
+        }
+        Ok(())
+    }
+
+    fn see(&mut self, truth: Truth) {
+        let is_first = self.truth.as_ref().is_none_or(|before| before.touchdown.is_none());
+        if let Some(touch) = truth.touchdown.filter(|_| is_first) {
+            self.outcome.touch(touch.vertical_speed_m_s, touch.lateral_speed_m_s, touch.error_m);
+        }
+        self.outcome.max_tilt_deg = truth.max_tilt_rad.to_degrees();
+        let speed_m_s = truth.velocity_ned_m_s.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let was_on_ground = self.truth.as_ref().is_some_and(|before| before.on_ground);
+        if !(truth.on_ground || speed_m_s < REST_M_S) {
+            self.rest_since = None;
+        } else if self.rest_since.is_none() || was_on_ground != truth.on_ground {
+            self.rest_since = Some(Instant::now());
+        }
+        let height_m = truth.pad_ned_m[2] - truth.position_ned_m[2];
+        let has_begun = self.status.as_ref().is_some_and(|status| status.started_ns.is_some());
+        if has_begun {
+            self.started.get_or_insert_with(Instant::now);
+        }
+        if self.started.is_some() && height_m <= self.planned.height_m {
+            self.reached.get_or_insert_with(Instant::now);
+            self.outcome.began = true;
+        }
+        self.truth = Some(truth);
+    }
+
+    fn begin_and_end_faults(&mut self) -> anyhow::Result<()> {
+        let Some(reached) = self.reached else { return Ok(()) };
+        while let Some(fault) = self.planned.faults.get(self.begun.len()).copied()
+            && reached.elapsed().as_secs_f64() >= fault.after_s
+        {
+            self.begin_fault(fault)?;
+            self.begun.push(Begun { fault, at: Instant::now(), ended: false });
+        }
+        for index in 0..self.begun.len() {
+            let Some(begun) = self.begun.get_mut(index) else { break };
+            if !begun.ended && begun.at.elapsed().as_secs_f64() >= begun.fault.for_s {
+                begun.ended = true;
+                let fault = begun.fault;
+                self.end_fault(fault)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn begin_fault(&mut self, fault: Fault) -> anyhow::Result<()> {
+        self.proxy.begin(fault);
+        let Some(part) = Part::of(fault.kind) else { return Ok(()) };
+        match fault.kind {
+            Kind::ControllerMemory | Kind::DetectorMemory => self.limit_memory(part),
+            Kind::ControllerStopped
+            | Kind::DetectorStopped
+            | Kind::CameraStopped
+            | Kind::BridgeStopped => self.signal(part, Signal::STOP),
+            _ => {
+                self.signal(part, Signal::KILL)?;
+                self.bury(part);
+                Ok(())
+            }
+        }
+    }
+
+    fn end_fault(&mut self, fault: Fault) -> anyhow::Result<()> {
+        let Some(part) = Part::of(fault.kind) else { return Ok(()) };
+        match fault.kind {
+            Kind::ControllerMemory | Kind::DetectorMemory => Ok(()),
+            Kind::ControllerStopped
+            | Kind::DetectorStopped
+            | Kind::CameraStopped
+            | Kind::BridgeStopped => self.signal(part, Signal::CONT),
+            _ => self.start(part, &self.settings(part, true)),
+        }
+    }
+
+    fn pid(&self, part: Part) -> Option<Pid> {
+        let (_, child) = self.parts.iter().find(|(running, _)| *running == part)?;
+        i32::try_from(child.id()).ok().and_then(Pid::from_raw)
+    }
+
+    fn signal(&self, part: Part, signal: Signal) -> anyhow::Result<()> {
+        let Some(pid) = self.pid(part) else { return Ok(()) };
+        kill_process(pid, signal).with_context(|| format!("signalling {}", part.service()))
+    }
+
+    /// Takes the exit of a killed process.
+    fn bury(&mut self, part: Part) {
+        if let Some(at) = self.parts.iter().position(|(running, _)| *running == part) {
+            let (_, mut child) = self.parts.remove(at);
+            // Its status is known: it was killed.
+            let _ = child.wait();
+        }
+    }
+
+    /// Lets a process have hardly more memory than it has.
+    fn limit_memory(&self, part: Part) -> anyhow::Result<()> {
+        let Some(pid) = self.pid(part) else { return Ok(()) };
+        let path = format!("/proc/{}/status", pid.as_raw_nonzero());
+        let status = std::fs::read_to_string(&path).with_context(|| path.clone())?;
+        let line = status.lines().find_map(|line| line.strip_prefix("VmSize:"));
+        let size = line.and_then(|line| line.split_whitespace().next());
+        let size: u64 = size.with_context(|| format!("VmSize in {path}"))?.parse()?;
+        let bytes = 1024 * size + SPARE_BYTES;
+        let limit = Rlimit { current: Some(bytes), maximum: Some(bytes) };
+        prlimit(Some(pid), Resource::As, limit).context("limiting memory")?;
+        Ok(())
+    }
+
+    /// Whether the controller is gone or stands still, for ever.
+    fn is_without_controller(&self) -> bool {
+        let gone = |begun: &Begun| {
+            matches!(
+                begun.fault.kind,
+                Kind::ControllerKilled | Kind::ControllerStopped | Kind::ControllerMemory
+            ) && !begun.ended
+        };
+        let status_age_ns =
+            self.status.as_ref().map_or(i64::MAX, |status| now_ns() - status.stamp_ns);
+        self.begun.iter().any(gone) && status_age_ns > 1_000_000_000
+    }
+
+    fn describe(&mut self) {
+        if let Some(started) = self.started {
+            self.outcome.time_s = started.elapsed().as_secs_f64();
+        }
+        let outcome = &mut self.outcome;
+        if let Some(status) = &self.status {
+            outcome.phase = status.phase.name().to_owned();
+            outcome.why.clone_from(&status.why);
+            outcome.is_over = matches!(
+                status.phase,
+                Phase::Landed | Phase::Aborted | Phase::PilotInCommand | Phase::Failed
+            );
+        }
+        if self.is_without_controller() {
+            self.outcome.is_over = true;
+            self.outcome.phase.clear();
+            self.outcome.why = "the controller is gone".to_owned();
+        }
+    }
+
+    fn is_over(&mut self) -> bool {
+        let (Some(truth), Some(since)) = (&self.truth, self.rest_since) else { return false };
+        let rests_s = since.elapsed().as_secs_f64();
+        let waits = self.begun.iter().any(|begun| {
+            begun.at.elapsed().as_secs_f64() < AFTER_FAULT_S
+                || begun.fault.for_s.is_finite() && !begun.ended
+        });
+        let is_over = self.outcome.is_over;
+        let touched = truth.on_ground && truth.touchdown.is_some();
+        let ending = if touched && rests_s > LANDED_S && is_over {
+            Ending::Landed
+        } else if touched && rests_s > 3.0 * LANDED_S {
+            Ending::Grounded
+        } else if !truth.on_ground && rests_s > HOVERS_S && is_over && !waits {
+            Ending::Hovers
+        } else {
+            return false;
+        };
+        self.outcome.ending = ending;
+        true
+    }
+}
+
+impl Drop for RealFlight<'_> {
+    fn drop(&mut self) {
+        for (_, child) in &mut self.parts {
+            // One that stands still ends as well.
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+async fn open(meet: u16, vehicle: &str) -> anyhow::Result<Node> {
+    let network =
+        Network { vehicle: Some(vehicle.to_owned()), meet: Some(meet), ..Network::default() };
+    Node::open(tool_identity("faults"), &network.source(crate::args::OPERATOR)?).await
+}

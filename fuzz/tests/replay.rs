@@ -1,0 +1,36 @@
+//! What fuzzing has found and kept is read again, by every run of the tests.
+
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Context, ensure};
+use fuzz::{MAX_MEMORY_MB, MAX_TIME_S, TARGETS};
+
+/// The most that the corpus may take in the repository, in bytes.
+const MAX_CORPUS_BYTES: u64 = 200_000;
+
+#[test]
+fn every_kept_input_is_read_without_a_panic_in_bounded_time_and_memory() -> anyhow::Result<()> {
+    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
+    let mut bytes = 0;
+    for target in TARGETS {
+        let folder = corpus.join(target.name);
+        let mut count = 0;
+        for entry in std::fs::read_dir(&folder).with_context(|| format!("{folder:?}"))? {
+            let path = entry?.path();
+            let input = std::fs::read(&path)?;
+            bytes += input.len() as u64;
+            count += 1;
+            let begun = Instant::now();
+            let memory = allocation_counter::measure(|| (target.read)(&input));
+            let took_s = begun.elapsed().as_secs_f64();
+            ensure!(took_s < MAX_TIME_S as f64, "{path:?} took {took_s:.1} s");
+            let used_mb = memory.bytes_max >> 20;
+            ensure!(used_mb < MAX_MEMORY_MB, "{path:?} used {used_mb} MB");
+        }
+        ensure!(count > 0, "{folder:?} is empty");
+        println!("{}: {count} inputs", target.name);
+    }
+    ensure!(bytes <= MAX_CORPUS_BYTES, "the corpus has {bytes} bytes");
+    Ok(())
+}

@@ -1,0 +1,144 @@
+//! What a lying autopilot says: its own packets, changed.
+
+use autopilot::Packet;
+use autopilot::dialect::{LOCAL_POSITION_NED_DATA, MavLandedState, MavMessage, MavModeFlag};
+use autopilot::packet::encode;
+
+use super::kind::Kind;
+
+/// The number of the mode that is claimed: LOITER, in which a pilot flies.
+const LOITER: u32 = 5;
+/// How old the one old boot time is, in milliseconds.
+const OLD_MS: u32 = 60_000;
+
+/// The memory of a lying autopilot.
+#[derive(Clone, Debug, Default)]
+pub struct Lies {
+    frozen: Option<LOCAL_POSITION_NED_DATA>,
+    told_old_time: bool,
+}
+
+impl Lies {
+    /// The bytes in place of a packet; `None` when it is kept back. `tells` says which lies are told now.
+    pub fn apply(&mut self, packet: &Packet, tells: impl Fn(Kind) -> bool) -> Option<Vec<u8>> {
+        if !tells(Kind::PositionFrozen) {
+            self.frozen = None;
+        }
+        if !tells(Kind::OldBootTime) {
+            self.told_old_time = false;
+        }
+        let message = match &packet.message {
+            Some(MavMessage::HEARTBEAT(_)) if tells(Kind::HeartbeatMissing) => return None,
+            Some(MavMessage::LOCAL_POSITION_NED(_)) if tells(Kind::PositionMissing) => return None,
+            Some(MavMessage::ATTITUDE(_)) if tells(Kind::AttitudeMissing) => return None,
+            Some(message) => self.change(message.clone(), tells),
+            None => return Some(packet.raw.clone()),
+        };
+        Some(match message {
+            Some(message) => encode(packet.sender, packet.sequence, &message),
+            None => packet.raw.clone(),
+        })
+    }
+
+    /// The changed message; `None` when it stays as it is.
+    fn change(&mut self, message: MavMessage, tells: impl Fn(Kind) -> bool) -> Option<MavMessage> {
+        match message {
+            MavMessage::EXTENDED_SYS_STATE(mut state) => {
+                state.landed_state = if tells(Kind::LandedUndefined) {
+                    MavLandedState::MAV_LANDED_STATE_UNDEFINED
+                } else if tells(Kind::LandedTakingOff) {
+                    MavLandedState::MAV_LANDED_STATE_TAKEOFF
+                } else if tells(Kind::LandedOnGround) {
+                    MavLandedState::MAV_LANDED_STATE_ON_GROUND
+                } else {
+                    return None;
+                };
+                Some(MavMessage::EXTENDED_SYS_STATE(state))
+            }
+            MavMessage::HEARTBEAT(mut heartbeat) => {
+                if tells(Kind::ModeLie) {
+                    heartbeat.custom_mode = LOITER;
+                } else if tells(Kind::DisarmedLie) {
+                    heartbeat.base_mode.remove(MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED);
+                } else {
+                    return None;
+                }
+                Some(MavMessage::HEARTBEAT(heartbeat))
+            }
+            MavMessage::LOCAL_POSITION_NED(position) => {
+                self.change_position(position, tells).map(MavMessage::LOCAL_POSITION_NED)
+            }
+            _ => None,
+        }
+    }
+
+    fn change_position(
+        &mut self,
+        mut position: LOCAL_POSITION_NED_DATA,
+        tells: impl Fn(Kind) -> bool,
+    ) -> Option<LOCAL_POSITION_NED_DATA> {
+        if tells(Kind::PositionNan) {
+            (position.x, position.y, position.z) = (f32::NAN, f32::NAN, f32::NAN);
+        } else if tells(Kind::PositionFrozen) {
+            let time_boot_ms = position.time_boot_ms;
+            let frozen = self.frozen.get_or_insert(position);
+            position = LOCAL_POSITION_NED_DATA { time_boot_ms, ..frozen.clone() };
+        } else if tells(Kind::OldBootTime) && !self.told_old_time {
+            self.told_old_time = true;
+            position.time_boot_ms = position.time_boot_ms.saturating_sub(OLD_MS);
+        } else {
+            return None;
+        }
+        Some(position)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autopilot::dialect::{EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA};
+    use autopilot::{Parser, Sender};
+
+    const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
+
+    fn told(lies: &mut Lies, kind: Kind, message: &MavMessage) -> Option<MavMessage> {
+        let packet = Parser::new().push(&encode(AUTOPILOT, 7, message)).remove(0);
+        let raw = lies.apply(&packet, |asked| asked == kind)?;
+        let packet = Parser::new().push(&raw).remove(0);
+        assert_eq!((packet.sender, packet.sequence), (AUTOPILOT, 7));
+        packet.message
+    }
+
+    #[test]
+    fn each_lie_changes_its_message_only() {
+        let mut lies = Lies::default();
+        let position = |time_boot_ms, x| {
+            MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
+                time_boot_ms,
+                x,
+                ..Default::default()
+            })
+        };
+        let state = MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA::default());
+        let heartbeat = MavMessage::HEARTBEAT(HEARTBEAT_DATA::default());
+        assert_eq!(told(&mut lies, Kind::HeartbeatMissing, &heartbeat), None);
+        assert_eq!(told(&mut lies, Kind::HeartbeatMissing, &state), Some(state.clone()));
+        assert_ne!(told(&mut lies, Kind::LandedOnGround, &state), Some(state));
+        assert_eq!(
+            told(&mut lies, Kind::PositionFrozen, &position(90_000, 1.0)),
+            Some(position(90_000, 1.0))
+        );
+        assert_eq!(
+            told(&mut lies, Kind::PositionFrozen, &position(90_020, 2.0)),
+            Some(position(90_020, 1.0))
+        );
+        assert_eq!(
+            told(&mut lies, Kind::OldBootTime, &position(90_040, 3.0)),
+            Some(position(30_040, 3.0))
+        );
+        assert_eq!(
+            told(&mut lies, Kind::OldBootTime, &position(90_060, 3.0)),
+            Some(position(90_060, 3.0))
+        );
+    }
+}

@@ -1,0 +1,60 @@
+//! Flights in which something dies, lies or falls silent, by the hundred and in lock-step, so that a seed
+//! reproduces a flight to the bit.
+//!
+//! Modules in reading order: [`kind`] has the kinds of faults, [`plan`] draws those of a flight; [`flight`]
+//! flies it with the faults that have [`begun`], the process of [`controller`], the autopilot's [`link`] over
+//! the connections of [`channel`] with its [`lies`], and the [`peers`]; [`outcome`] is its result and the bar; [`report`] writes the table.
+
+pub mod begun;
+pub mod channel;
+pub mod controller;
+pub mod flight;
+pub mod kind;
+pub mod lies;
+pub mod link;
+pub mod outcome;
+pub mod peers;
+pub mod plan;
+pub mod report;
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use anyhow::Context;
+
+use crate::landing::in_parallel;
+use flight::fly;
+use outcome::Outcome;
+use plan::Request;
+
+/// What a campaign found.
+#[derive(Clone, Debug)]
+pub struct Findings {
+    /// The report, in Markdown.
+    pub report: String,
+    /// Every flight.
+    pub outcomes: Vec<Outcome>,
+}
+
+/// Flies all, and writes every flight and the report. `progress` gets the number of finished flights and of
+/// all.
+///
+/// # Errors
+/// When a setting is invalid or a file cannot be written.
+pub fn run(
+    request: &Request,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> anyhow::Result<Findings> {
+    let flights = request.plan.flights();
+    let done = AtomicUsize::new(0);
+    let outcomes = in_parallel(&flights, request.jobs, |planned| {
+        let outcome = fly(planned)?;
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, flights.len());
+        Ok(outcome)
+    })?;
+    std::fs::create_dir_all(&request.results_in)
+        .with_context(|| format!("making {}", request.results_in.display()))?;
+    let title =
+        format!("{} flights in lock-step, seeds from {}", outcomes.len(), request.plan.seed);
+    let report = report::write(&request.results_in, &title, &outcomes)?;
+    Ok(Findings { report, outcomes })
+}

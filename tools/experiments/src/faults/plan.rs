@@ -1,0 +1,288 @@
+//! What is flown: each seed draws its faults, the height at which they begin, how long they last, and the wind.
+
+use std::path::PathBuf;
+
+use super::kind::{Kind, LIAR};
+use crate::landing::fault::{START_ANGLE, drawn, drawn_angle};
+use crate::landing::plan::Values;
+
+/// Durations that are drawn, in seconds; infinity is for ever.
+pub const DURATIONS_S: [f64; 4] = [0.5, 2.0, 5.0, f64::INFINITY];
+/// Winds that are drawn, in m/s.
+const WINDS_M_S: [f64; 2] = [0.0, 5.0];
+/// Part of the flights that have a second fault.
+const PART_WITH_TWO: f64 = 0.2;
+/// Maximum time from the first fault to the second, in seconds.
+const MAX_BETWEEN_S: f64 = 1.5;
+/// Height over the pad at the start, in metres.
+pub const START_HEIGHT_M: f64 = 10.0;
+
+/// The choice of flights.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// Number of flights.
+    pub flights: u64,
+    /// Seed of the first flight; the others follow.
+    pub seed: u64,
+    /// Kinds, of which each flight has the next one.
+    pub kinds: Vec<Kind>,
+    /// Height over the pad at which the fault begins, in metres.
+    pub height: Values,
+    /// Durations in seconds; empty for those that are drawn.
+    pub durations_s: Vec<f64>,
+    /// Winds in m/s; empty for those that are drawn.
+    pub winds_m_s: Vec<f64>,
+    /// The second fault.
+    pub second: Second,
+    /// Further settings, `simulator.KEY=VALUE` or `controller.KEY=VALUE`.
+    pub set: Vec<String>,
+    /// True when it is flown with real processes.
+    pub real_time: bool,
+}
+
+/// Which flights have a second fault.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Second {
+    /// A fifth of them, of any kind.
+    Drawn,
+    /// None.
+    None,
+    /// All, of this kind.
+    Always(Kind),
+}
+
+impl Default for Plan {
+    fn default() -> Self {
+        Self {
+            flights: 1000,
+            seed: 1,
+            kinds: Kind::in_lockstep().collect(),
+            height: Values::Range(0.2, 9.0),
+            durations_s: Vec::new(),
+            winds_m_s: Vec::new(),
+            second: Second::Drawn,
+            set: Vec::new(),
+            real_time: false,
+        }
+    }
+}
+
+/// What to run.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// The flights.
+    pub plan: Plan,
+    /// Folder of the results.
+    pub results_in: PathBuf,
+    /// Number of flights in parallel.
+    pub jobs: usize,
+}
+
+/// A fault of one flight.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Fault {
+    /// Its kind.
+    pub kind: Kind,
+    /// From the moment the height is reached to its begin, in seconds.
+    pub after_s: f64,
+    /// How long it lasts, in seconds; infinity is for ever.
+    pub for_s: f64,
+    /// How large it is, from 0 to 1; what that is depends on the kind.
+    pub size: f64,
+}
+
+/// One flight.
+#[derive(Clone, Debug)]
+pub struct Planned {
+    /// Its seed.
+    pub seed: u64,
+    /// Height over the pad at which the faults begin, in metres.
+    pub height_m: f64,
+    /// Mean wind, in m/s.
+    pub wind_m_s: f64,
+    /// Its faults, one or two.
+    pub faults: Vec<Fault>,
+    /// Settings of the simulator.
+    pub simulator: Vec<String>,
+    /// Settings of the controller.
+    pub controller: Vec<String>,
+    /// Further settings.
+    set: Vec<String>,
+    /// What its command needs beside what is drawn.
+    options: String,
+}
+
+impl Plan {
+    /// Its flights.
+    pub fn flights(&self) -> Vec<Planned> {
+        (0..self.flights).map(|i| self.flight(self.seed.wrapping_add(i))).collect()
+    }
+
+    fn flight(&self, seed: u64) -> Planned {
+        let kind = pick_in_turn(&self.kinds, seed).unwrap_or(Kind::ControllerKilled);
+        let all: Vec<Kind> = Kind::in_lockstep().collect();
+        let second = match self.second {
+            Second::None => None,
+            Second::Always(kind) => Some(kind),
+            Second::Drawn if drawn(seed, 20) < PART_WITH_TWO => pick(&all, drawn(seed, 21)),
+            Second::Drawn => None,
+        };
+        let or_drawn = |given: &[f64], usual: &[f64], which| {
+            let values = if given.is_empty() { usual } else { given };
+            pick(values, drawn(seed, which)).unwrap_or_default()
+        };
+        let first = Fault {
+            kind,
+            after_s: 0.0,
+            for_s: or_drawn(&self.durations_s, &DURATIONS_S, 22),
+            size: drawn(seed, 23),
+        };
+        let second = second.filter(|second| *second != kind).map(|kind| Fault {
+            kind,
+            after_s: MAX_BETWEEN_S * drawn(seed, 24),
+            for_s: or_drawn(&self.durations_s, &DURATIONS_S, 25),
+            size: drawn(seed, 26),
+        });
+        let mut planned = Planned {
+            seed,
+            height_m: match &self.height {
+                Values::Range(min, max) => min + (max - min) * drawn(seed, 27),
+                Values::List(values) => pick(values, drawn(seed, 27)).unwrap_or_default(),
+            },
+            wind_m_s: or_drawn(&self.winds_m_s, &WINDS_M_S, 28),
+            faults: std::iter::once(first).chain(second).collect(),
+            simulator: Vec::new(),
+            controller: Vec::new(),
+            set: self.set.clone(),
+            options: self.options(),
+        };
+        planned.add_settings();
+        planned
+    }
+}
+
+impl Plan {
+    fn options(&self) -> String {
+        let mut options = String::new();
+        if !self.durations_s.is_empty() {
+            let text = |s: &f64| if s.is_finite() { s.to_string() } else { "ever".to_owned() };
+            let durations: Vec<String> = self.durations_s.iter().map(text).collect();
+            options.push_str(&format!(" --for {}", durations.join(",")));
+        }
+        for setting in &self.set {
+            options.push_str(&format!(" --set {setting}"));
+        }
+        if self.real_time {
+            options.push_str(" --real-time");
+        }
+        options
+    }
+}
+
+impl Planned {
+    fn add_settings(&mut self) {
+        let seed = self.seed;
+        let (east, north) = drawn_angle(seed, START_ANGLE).sin_cos();
+        let (pad_north, pad_east) = (1.5, -1.5);
+        let turbulence = if self.wind_m_s > 0.0 { 1.0 } else { 0.0 };
+        self.simulator = vec![
+            format!("seed={}", seed & (i64::MAX as u64)),
+            format!("wind.mean_m_s={:.4}", self.wind_m_s),
+            format!("wind.turbulence={turbulence}"),
+            format!("wind.from_deg={:.2}", drawn_angle(seed, 7).to_degrees()),
+            "wind.thesis_noise=false".to_owned(),
+            "camera.latency_ms=80".to_owned(),
+            "camera.jitter_ms=20".to_owned(),
+            format!("start.height_m={START_HEIGHT_M}"),
+            format!("start.north_m={:.4}", pad_north + 0.5 * north),
+            format!("start.east_m={:.4}", pad_east + 0.5 * east),
+            format!("start.heading_deg={:.2}", drawn_angle(seed, 8).to_degrees()),
+            "begin_height_m=1000".to_owned(),
+        ];
+        self.controller = vec!["start=airborne".to_owned()];
+        if self.faults.iter().any(|fault| fault.kind.is_preferred_liar()) {
+            self.controller.push(format!("detectors.preferred=\"{LIAR}\""));
+        }
+        for setting in &self.set {
+            match setting.split_once('.') {
+                Some(("simulator", rest)) => self.simulator.push(rest.to_owned()),
+                Some(("controller", rest)) => self.controller.push(rest.to_owned()),
+                _ => {}
+            }
+        }
+    }
+
+    /// Names of its faults.
+    pub fn kinds(&self) -> String {
+        let names: Vec<&str> = self.faults.iter().map(|fault| fault.kind.name()).collect();
+        names.join(" + ")
+    }
+
+    /// The command that repeats it.
+    pub fn command(&self) -> String {
+        let mut command = format!(
+            "alight experiment faults --flights 1 --seed {} --height {} --wind {}",
+            self.seed, self.height_m, self.wind_m_s
+        );
+        if let Some(first) = self.faults.first() {
+            command.push_str(&format!(" --kind {}", first.kind.name()));
+        }
+        match self.faults.get(1) {
+            Some(second) => command.push_str(&format!(" --with {}", second.kind.name())),
+            None => command.push_str(" --with none"),
+        }
+        command + &self.options
+    }
+}
+
+/// A value by a random number from 0 to 1.
+fn pick<T: Copy>(values: &[T], part: f64) -> Option<T> {
+    values.get((part * values.len() as f64) as usize).or(values.last()).copied()
+}
+
+/// The kind of a seed: neighbours have different ones.
+fn pick_in_turn(kinds: &[Kind], seed: u64) -> Option<Kind> {
+    let count = u64::try_from(kinds.len()).ok().filter(|count| *count > 0)?;
+    usize::try_from(seed % count).ok().and_then(|at| kinds.get(at)).copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_flight_alone_is_the_same_as_among_others() {
+        let flights = Plan { flights: 200, seed: 5, ..Plan::default() }.flights();
+        for planned in &flights {
+            let alone = Plan {
+                flights: 1,
+                seed: planned.seed,
+                kinds: vec![planned.faults[0].kind],
+                height: Values::List(vec![planned.height_m]),
+                winds_m_s: vec![planned.wind_m_s],
+                second: planned
+                    .faults
+                    .get(1)
+                    .map_or(Second::None, |second| Second::Always(second.kind)),
+                ..Plan::default()
+            };
+            let alone = alone.flights().remove(0);
+            assert_eq!(alone.faults, planned.faults);
+            assert_eq!(
+                (alone.simulator, alone.controller),
+                (planned.simulator.clone(), planned.controller.clone())
+            );
+        }
+        let twice = flights.iter().filter(|planned| planned.faults.len() == 2).count();
+        assert!((20..60).contains(&twice), "{twice}");
+    }
+
+    #[test]
+    fn every_kind_is_flown_before_one_is_flown_again() {
+        let flights = Plan { flights: 39, ..Plan::default() }.flights();
+        let mut names: Vec<&str> = flights.iter().map(|f| f.faults[0].kind.name()).collect();
+        names.sort_unstable();
+        names.dedup();
+        assert_eq!(names.len(), 39);
+    }
+}

@@ -1,0 +1,48 @@
+//! Flights with faults: repeatable to the bit, and each kind does what it says.
+
+use experiments::faults::flight::fly;
+use experiments::faults::kind::Kind;
+use experiments::faults::outcome::{Ending, Outcome};
+use experiments::faults::plan::{Plan, Second};
+use experiments::landing::in_parallel;
+use experiments::landing::plan::Values;
+
+fn fly_all(plan: &Plan) -> Vec<Outcome> {
+    in_parallel(&plan.flights(), 2, fly).unwrap()
+}
+
+fn one(kind: Kind, height_m: f64, for_s: f64) -> Plan {
+    Plan {
+        flights: 1,
+        kinds: vec![kind],
+        height: Values::List(vec![height_m]),
+        durations_s: vec![for_s],
+        winds_m_s: vec![0.0],
+        second: Second::None,
+        ..Plan::default()
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_flight_to_the_bit() {
+    let plan = Plan { flights: 4, seed: 11, ..Plan::default() };
+    assert_eq!(fly_all(&plan), fly_all(&plan));
+}
+
+#[test]
+fn a_fault_that_is_over_leaves_a_landing() {
+    for kind in
+        [Kind::ControllerKilled, Kind::ControllerStopped, Kind::SilenceBoth, Kind::CameraStopped]
+    {
+        let outcome = &fly_all(&one(kind, 8.0, 0.5))[0];
+        assert_eq!(outcome.ending, Ending::Landed, "{outcome:?}");
+        assert!(outcome.began && outcome.error_m.is_some_and(|error| error < 0.1), "{outcome:?}");
+    }
+}
+
+#[test]
+fn without_a_controller_the_vehicle_is_followed_to_its_rest() {
+    let outcome = &fly_all(&one(Kind::ControllerKilled, 8.0, f64::INFINITY))[0];
+    assert_eq!((outcome.ending, outcome.touches), (Ending::Hovers, 0), "{outcome:?}");
+    assert!(outcome.is_over && outcome.why.contains("gone"), "{outcome:?}");
+}
