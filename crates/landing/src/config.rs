@@ -309,6 +309,8 @@ settings! {
         /// Age of the newest detection beyond which the descent stops, in s, except low over a well-known
         /// target (`blind_height_m`).
         stale_target_s: f64 = 0.7, 0.1..=5.0;
+        /// Minimum time left until the ground at the present speed, in s, for gusts to be seen and countered.
+        gust_time_s: f64 = 2.0, 0.1..=10.0;
         /// Time for which the autopilot is assumed to follow the last setpoint where it does not say so, in s.
         /// The descent is so slow that the vehicle, should setpoints stop, still brakes before the ground.
         setpoint_loss_s: f64 = 3.0, 0.1..=60.0;

@@ -433,7 +433,8 @@ impl Metric {
         let end_m_s = (config.touchdown_descend_m_s - 0.5 * situation.pad_heave_m_s).max(min_m_s);
         let braking = end_m_s.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);
         let unattended_m_s = self.unattended_m_s(situation, height_m, end_m_s);
-        let max_m_s = braking.sqrt().min(unattended_m_s).min(config.max_descend_m_s);
+        let gust_m_s = (height_m / config.gust_time_s).max(end_m_s);
+        let max_m_s = braking.sqrt().min(unattended_m_s).min(gust_m_s).min(config.max_descend_m_s);
         match situation.level_because {
             Some(reason) if centred * fresh > 0.0 => (0.0, reason),
             _ => (max_m_s * centred * fresh, why),

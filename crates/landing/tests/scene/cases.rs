@@ -98,7 +98,7 @@ fn moving(seed: u64, speed_m_s: f64, heave_m: f64) -> Scene {
     scene.config.guidance = GuidanceConfig::Metric(MetricConfig {
         max_lateral_m_s: 2.5,
         lateral_acceleration_m_s2: 2.0,
-        setpoint_loss_s: 1.2,
+        gust_time_s: 1.2,
         blind_deviation_m: 0.2,
         ..MetricConfig::default()
     });

@@ -120,7 +120,7 @@ fn moving(speed_m_s: f64, heave_m: f64) -> Change {
     let heave = format!("pad.heave_m={heave_m}");
     let simulated = ["pad.marker=rings:0.23", "camera.rate_hz=30", &speed, &heave];
     let settings: &[&str] = if heave_m > 0.0 {
-        &["estimator.pad_heave_m_s=0.4", "metric.setpoint_loss_s=1.2"]
+        &["estimator.pad_heave_m_s=0.4", "metric.gust_time_s=1.2"]
     } else {
         &[
             "estimator.pad_speed_m_s=4.5",
@@ -128,7 +128,7 @@ fn moving(speed_m_s: f64, heave_m: f64) -> Change {
             "envelope.horizontal_m_s=7",
             "metric.max_lateral_m_s=2.5",
             "metric.lateral_acceleration_m_s2=2",
-            "metric.setpoint_loss_s=1.2",
+            "metric.gust_time_s=1.2",
             "metric.blind_deviation_m=0.2",
         ]
     };
