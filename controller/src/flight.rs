@@ -28,6 +28,9 @@ use crate::status::{Used, View};
 use crate::wind::WindEstimate;
 use crate::wire;
 
+/// Change of the link's delay that the lander is told of, in seconds.
+const LINK_DELAY_STEP_S: f64 = 0.01;
+
 /// A flight.
 pub struct Flight {
     config: Config,
@@ -36,6 +39,8 @@ pub struct Flight {
     decision: Option<Decision>,
     /// What the lander was told of the detectors last.
     detectors_alive: bool,
+    /// The link's delay that the lander was told last, in seconds.
+    link_delay_s: f64,
     mission: Mission,
     frames: Frames,
     used: Used,
@@ -73,6 +78,7 @@ impl Flight {
             lander: Lander::new(config.lander())?,
             decision: None,
             detectors_alive: true,
+            link_delay_s: 0.0,
             mission: Mission::new(config.start, config.takeoff()),
             frames: Frames::new(&config),
             used: Used::default(),
@@ -131,6 +137,11 @@ impl Flight {
         self.advance_mission(now_ns);
         self.follow_limits(now_ns);
         self.check_alarms(now_ns);
+        let delay_s = self.autopilot.link_delay(now_ns).map_or(0.0, |delay| delay.as_secs_f64());
+        if (delay_s - self.link_delay_s).abs() > LINK_DELAY_STEP_S {
+            self.link_delay_s = delay_s;
+            self.decide(now_ns, LanderEvent::LinkDelay(delay_s));
+        }
         self.decide(now_ns, LanderEvent::Tick);
     }
 

@@ -332,7 +332,7 @@ fn packets_that_are_replayed_are_no_restart() {
 
 #[test]
 fn a_delayed_link_ends_safely_with_its_reason() {
-    for delay_s in [0.02, 0.05] {
+    for delay_s in [0.02, 0.05, 0.1, 0.15, 0.25, 0.5] {
         let late = |packet: &Passing| vec![(packet.now_s + delay_s, packet.bytes.clone())];
         let ended = fly(&mut { late }, &mut |now_s, _| now_s + delay_s);
         show(&format!("{:.0} ms each way", delay_s * 1e3), &ended);
@@ -342,7 +342,7 @@ fn a_delayed_link_ends_safely_with_its_reason() {
 
 #[test]
 fn a_link_with_jitter_ends_safely_with_its_reason() {
-    for jitter_s in [0.05, 0.1] {
+    for jitter_s in [0.05, 0.1, 0.3, 1.5] {
         let (mut there, mut back) = (luck(), luck());
         let ended = fly(
             &mut |packet: &Passing| {

@@ -316,6 +316,11 @@ impl Autopilot {
         self.clock.round_trip_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
     }
 
+    /// How slow the link is now, both ways together; `None` while it is not known.
+    pub fn link_delay(&self, now_ns: i64) -> Option<Duration> {
+        self.clock.link_delay_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
+    }
+
     /// Why the vehicle cannot be armed and flown yet, as texts; empty when it can.
     pub fn not_ready_because(&self) -> Vec<String> {
         match &self.vehicle {

@@ -24,6 +24,9 @@ const MAX_REQUESTS: usize = 16;
 /// Maximum length of a round trip that is used, in nanoseconds. Also a long one tells more than the time of the
 /// reception, which is wrong by the whole way here.
 const MAX_TRIP_NS: i64 = 1_500 * MS;
+/// Maximum number and age of the round trips that say how slow the link is now.
+const MAX_LENGTHS: usize = 16;
+const MAX_LENGTH_AGE_NS: i64 = 6_000 * MS;
 /// Maximum drift between two clocks: 100 ppm.
 const DRIFT: f64 = 1e-4;
 /// Error of reading a clock, in nanoseconds.
@@ -40,7 +43,16 @@ pub struct Clock {
     requests: VecDeque<i64>,
     due_ns: i64,
     trips: VecDeque<Trip>,
+    /// All round trips, also those too long to be used.
+    lengths: VecDeque<Length>,
     contradictions: u32,
+}
+
+/// When a reply came, and after which time.
+#[derive(Copy, Clone, Debug)]
+struct Length {
+    at_ns: i64,
+    length_ns: i64,
 }
 
 /// One request and its reply.
@@ -75,6 +87,10 @@ impl Clock {
         };
         self.requests.remove(index);
         let length_ns = now_ns.saturating_sub(ts1_ns);
+        if self.lengths.len() >= MAX_LENGTHS {
+            self.lengths.pop_front();
+        }
+        self.lengths.push_back(Length { at_ns: now_ns, length_ns: length_ns.max(0) });
         if !(0..=MAX_TRIP_NS).contains(&length_ns) || theirs_ns <= 0 {
             return false;
         }
@@ -103,6 +119,21 @@ impl Clock {
     /// The length of the round trip in use, in ns; `None` while there is none.
     pub fn round_trip_ns(&self, now_ns: i64) -> Option<i64> {
         self.best(now_ns).map(|trip| trip.length_ns)
+    }
+
+    /// How slow the link is now, both ways together, in ns: the second longest of the last round trips, as a
+    /// single one may have waited elsewhere. `None` while there were no two.
+    pub fn link_delay_ns(&self, now_ns: i64) -> Option<i64> {
+        let recent = |at: &&Length| now_ns.saturating_sub(at.at_ns) <= MAX_LENGTH_AGE_NS;
+        let (mut longest_ns, mut second_ns) = (None, None);
+        for Length { length_ns, .. } in self.lengths.iter().filter(recent) {
+            if longest_ns.is_none_or(|longest_ns| *length_ns > longest_ns) {
+                second_ns = longest_ns.replace(*length_ns);
+            } else if second_ns.is_none_or(|second_ns| *length_ns > second_ns) {
+                second_ns = Some(*length_ns);
+            }
+        }
+        second_ns
     }
 
     /// The time by our clock at which the autopilot's showed `boot_ms` milliseconds, for a message received
@@ -198,6 +229,16 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn the_links_delay_is_that_of_slow_round_trips_but_not_of_one() {
+        assert_eq!(Clock::default().link_delay_ns(0), None);
+        let (clock, now_ns) = synchronised(&[(1, 1), (1, 1), (250, 250), (1, 1)], 4, 0);
+        assert_eq!(clock.link_delay_ns(now_ns), Some(2 * MS), "of one");
+        let (clock, now_ns) = synchronised(&[(1, 1), (250, 250), (900, 900)], 12, 0);
+        assert_eq!(clock.link_delay_ns(now_ns), Some(1_800 * MS));
+        assert_eq!(clock.link_delay_ns(now_ns + 7_000 * MS), None);
     }
 
     #[test]

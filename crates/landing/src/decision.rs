@@ -210,6 +210,8 @@ named! {
         VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
         /// The autopilot's heartbeat, and with it the mode, is missing.
         ModeUnknown = "mode-unknown", "no heartbeat of the autopilot for seconds, so its mode is not known, holding";
+        /// Over the link to the autopilot setpoints come too late to steer by.
+        LinkSlow = "link-slow", "the link to the autopilot takes more than 0.7 s both ways, too slow to steer, holding";
         /// No detector is alive.
         NoDetector = "no-detector", "no detector is alive, nothing descends";
         /// No progress in the time allowed.

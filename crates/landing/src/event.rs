@@ -25,6 +25,8 @@ pub enum Event {
     Operator(OperatorCommand),
     /// A limit was reached.
     Alarm(Alarm),
+    /// The delay of the link to the autopilot, both ways together, in seconds.
+    LinkDelay(f64),
     /// How the autopilot follows setpoints has become known.
     Limits(AutopilotLimits),
     /// Time has passed.

@@ -39,6 +39,11 @@ const MAX_CONTACT_M: f64 = 1.0;
 /// Maximum vertical speed at which that report is believed, in m/s, in addition to the pad's heave.
 const MAX_CONTACT_M_S: f64 = 0.5;
 
+/// Maximum delay of the link to the autopilot, both ways together, in seconds, at which the vehicle is steered;
+/// and the one at which it is steered again.
+const MAX_LINK_DELAY_S: f64 = 0.7;
+const MAX_QUICK_DELAY_S: f64 = 0.5;
+
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;
 
@@ -54,6 +59,8 @@ pub struct Lander {
     /// Mode, motors and contact with the ground, as they were reported last.
     status: Option<VehicleStatus>,
     detectors_alive: bool,
+    link_delay_s: f64,
+    is_link_slow: bool,
     /// Where the vehicle last stood on the ground.
     ground: Option<Point<Odometry>>,
     /// Where the landing started.
@@ -113,6 +120,8 @@ impl Lander {
             history: History::new(config.target.max_extrapolation_s),
             status: None,
             detectors_alive: true,
+            link_delay_s: 0.0,
+            is_link_slow: false,
             ground: None,
             start: Point::origin(),
             target_filter: TargetFilter::new(&config),
@@ -145,6 +154,10 @@ impl Lander {
                 Ok(())
             }
             Event::Frame(frame) => self.frame(now, &frame),
+            Event::LinkDelay(seconds) => {
+                self.set_link_delay(seconds);
+                Ok(())
+            }
             Event::Limits(limits) => {
                 self.limits = limits.plausible();
                 Ok(())
@@ -167,6 +180,7 @@ impl Lander {
             progress: self.progress(now),
             axis_mismatch: self.axis_mismatch(),
             may_descend: self.is_axis_check_done(now),
+            is_link_slow: self.is_link_slow,
         };
         if self.state_machine.advance(&inputs) {
             self.guidance = ActiveGuidance::new(self.config.guidance);
@@ -358,6 +372,12 @@ impl Lander {
         })
     }
 
+    fn set_link_delay(&mut self, seconds: f64) {
+        self.link_delay_s = if seconds >= 0.0 { seconds.min(10.0) } else { 0.0 };
+        let limit_s = if self.is_link_slow { MAX_QUICK_DELAY_S } else { MAX_LINK_DELAY_S };
+        self.is_link_slow = self.link_delay_s > limit_s;
+    }
+
     /// What is asked of the autopilot changes its mode or its motors: only in our own mode.
     fn is_ours(&self) -> bool {
         self.status.is_some_and(|status| matches!(status.mode, Mode::Guided | Mode::Land))
@@ -447,6 +467,7 @@ impl Lander {
             pad_heave_m_s: self.config.estimator.pad_heave_m_s,
             limits: self.limits,
             level_because: self.level_because(now),
+            link_delay_s: self.link_delay_s,
         }
     }
 

@@ -34,6 +34,7 @@
 //! | the operator's hold | Hold; ignored in LAND |
 //! | the axes of camera and autopilot do not match | Hold |
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
+//! | the link to the autopilot is slow | Hold |
 //! | a mode that is neither GUIDED nor the requested LAND | PilotInCommand |
 //! | on the ground | Final |
 //! | disarmed | Landed on the ground or in LAND, else, half a second later, Aborted |
@@ -85,6 +86,8 @@ pub struct Inputs {
     pub axis_mismatch: Option<Reason>,
     /// False while that check is still running.
     pub may_descend: bool,
+    /// The link to the autopilot is too slow to steer over it.
+    pub is_link_slow: bool,
 }
 
 /// The vehicle as far as the phases need it.
@@ -335,6 +338,11 @@ impl StateMachine {
             Phase::Search | Phase::Approach | Phase::Descend | Phase::Retry if is_unknown => {
                 Some((Phase::Hold, Reason::ModeUnknown))
             }
+            Phase::Search | Phase::Approach | Phase::Descend | Phase::Retry
+                if inputs.is_link_slow =>
+            {
+                Some((Phase::Hold, Reason::LinkSlow))
+            }
             Phase::Search => self.after_search(inputs),
             Phase::Approach => self.after_approach(inputs),
             Phase::Descend => self.after_descend(inputs),
@@ -435,6 +443,7 @@ impl StateMachine {
         let resumes = match self.reason {
             Reason::TargetLost | Reason::TargetNotFound => self.target_visible(inputs) && !is_stale,
             Reason::VehicleStale | Reason::ModeUnknown | Reason::AutopilotLost => !is_stale,
+            Reason::LinkSlow => !is_stale && !inputs.is_link_slow,
             _ => false,
         };
         resumes.then_some((Phase::Search, Reason::Searching))

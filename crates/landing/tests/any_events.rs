@@ -37,6 +37,7 @@ enum Kind {
     },
     Status(VehicleStatus),
     DetectorsAlive(bool),
+    LinkDelay(f64),
     Operator(OperatorCommand),
     Alarm(Alarm),
     Tick,
@@ -158,7 +159,8 @@ fn happening() -> impl Strategy<Value = Happening> {
         (-0.3..0.3f64, 0.3..6.0f64).prop_map(|(north, height_m)| Kind::Usual { north, height_m });
     let event = prop_oneof![
         200 => usual, 15 => vehicle(), 10 => frame(), 1 => operator(), 1 => alarm(), 20 => Just(Kind::Tick),
-        10 => status(), 2 => prop::bool::weighted(0.7).prop_map(Kind::DetectorsAlive)
+        10 => status(), 2 => prop::bool::weighted(0.7).prop_map(Kind::DetectorsAlive),
+        2 => number(0.3, 0.3).prop_map(Kind::LinkDelay)
     ];
     (after_s, event).prop_map(|(after_s, event)| Happening { after_s, event })
 }
@@ -194,6 +196,7 @@ fn event(kind: &Kind, now: Timestamp) -> Event {
         Kind::Alarm(alarm) => Event::Alarm(alarm),
         Kind::Status(status) => Event::Status(status),
         Kind::DetectorsAlive(alive) => Event::DetectorsAlive(alive),
+        Kind::LinkDelay(seconds) => Event::LinkDelay(seconds),
         Kind::Vehicle { age_s, position: p, velocity: v, mode, armed, landed } => {
             Event::Vehicle(VehicleState {
                 stamp: now.plus_seconds(-age_s),

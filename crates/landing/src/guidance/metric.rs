@@ -104,6 +104,11 @@ const COMMITTED: f64 = 1.5;
 /// Share of the autopilot's vertical acceleration with which it is expected to brake when setpoints stop.
 const UNATTENDED_BRAKING: f64 = 0.9;
 
+/// Delay of the link, both ways together, in seconds, that is part of `dead_time_s`; and the delay beyond it at
+/// which the gains are halved: what is seen later must be answered more gently, or the vehicle sways.
+const USUAL_LINK_S: f64 = 0.05;
+const HALF_GAIN_S: f64 = 0.15;
+
 /// Longest interval between two steps that is counted, in seconds.
 const MAX_STEP_S: f64 = 0.1;
 
@@ -265,7 +270,8 @@ impl Metric {
 
     /// The vehicle's position extrapolated from its newest state.
     fn position_now(&self, situation: &Situation<'_>) -> Point<Ned> {
-        let age_s = situation.now.seconds_since(situation.vehicle.stamp).clamp(0.0, MAX_STEP_S);
+        let max_s = MAX_STEP_S.max(situation.link_delay_s);
+        let age_s = situation.now.seconds_since(situation.vehicle.stamp).clamp(0.0, max_s);
         let velocity = horizontal(situation.vehicle.velocity) + self.bias();
         situation.vehicle.position + velocity * age_s
     }
@@ -373,10 +379,12 @@ impl Metric {
         target: &TargetEstimate,
     ) -> Vector<Ned> {
         let config = &self.config;
+        let delay_s = extra_delay_s(situation);
+        let gentle = HALF_GAIN_S / (HALF_GAIN_S + delay_s);
         let closing = self.closing(situation, target);
         let lead_s = config.acceleration_lead_s;
         let left = self.error(situation, target)
-            - closing * config.dead_time_s
+            - closing * (config.dead_time_s + delay_s)
             - observer.acceleration * (0.5 * lead_s.powi(2));
         // While the autopilot reduces its acceleration, within its jerk, the speed still grows.
         let fading = observer.path.acceleration();
@@ -385,10 +393,13 @@ impl Metric {
             + fading * (fading.norm() / (2.0 * situation.limits.jerk_m_s3));
         let left_m = left.norm();
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
-        let speed_m_s = (config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
+        let speed_m_s =
+            (gentle * config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
         let wanted = if left_m > 1e-9 { left * (speed_m_s / left_m) } else { Vector::zero() };
-        let acceleration =
-            limited((wanted - closing) * config.velocity_gain, config.lateral_acceleration_m_s2);
+        let acceleration = limited(
+            (wanted - closing) * (gentle * config.velocity_gain),
+            config.lateral_acceleration_m_s2,
+        );
         limited(
             observer.path.velocity() + acceleration * time_constant_s(&situation.limits),
             config.max_lateral_m_s + config.max_pad_m_s,
@@ -425,6 +436,8 @@ impl Metric {
             return (-(ROOM_GAIN * (LOW_M - height_m)).min(ROOM_M_S), Reason::Settling);
         }
         let sinking_m_s = (situation.vehicle.velocity.z() - target.velocity.z()).max(0.0);
+        // Over a slow link it is already lower, and lower still when the setpoint arrives.
+        let height_m = height_m - sinking_m_s * extra_delay_s(situation);
         let ahead_m = height_m
             - config.land_height_m
             - (sinking_m_s - config.touchdown_descend_m_s).max(0.0) * config.descend_lag_s;
@@ -463,6 +476,11 @@ impl Metric {
         }
         ((stale_s - situation.age_s) / (stale_s - fresh_s)).clamp(0.0, 1.0)
     }
+}
+
+/// The part of the link's delay that `dead_time_s` does not contain, in seconds.
+fn extra_delay_s(situation: &Situation<'_>) -> f64 {
+    (situation.link_delay_s - USUAL_LINK_S).max(0.0)
 }
 
 /// From `last` towards `wanted` by at most `step`; a descent ends at once, because the autopilot smooths it.

@@ -25,6 +25,8 @@ pub struct Situation<'a> {
     pub pad_heave_m_s: f64,
     /// How the autopilot follows setpoints.
     pub limits: AutopilotLimits,
+    /// Delay of the link to the autopilot, both ways together, in seconds.
+    pub link_delay_s: f64,
     /// Why the vehicle must not descend now, whatever the guidance sees; `None` when it may.
     pub level_because: Option<Reason>,
 }

@@ -22,6 +22,7 @@ fn at(seconds: f64) -> Inputs {
         progress: Progress::Unchanged,
         axis_mismatch: None,
         may_descend: true,
+        is_link_slow: false,
     }
 }
 
@@ -222,6 +223,14 @@ fn an_unknown_mode_holds_until_it_is_known_and_is_no_takeover() {
 }
 
 #[test]
+fn a_slow_link_holds_until_it_is_quick_again() {
+    let slow = |seconds| Inputs { is_link_slow: true, ..at(seconds) };
+    let flying = [start(), seen(1.0, Progress::Unchanged), slow(2.0), slow(9.0), at(10.0)];
+    check(&flying[..4], Phase::Hold, Reason::LinkSlow);
+    check(&flying, Phase::Search, Reason::Searching);
+}
+
+#[test]
 fn a_running_axis_check_also_delays_a_descent_without_the_marker() {
     let blind = Inputs { may_descend: false, ..seen(2.0, Progress::Blind) };
     check(&[start(), seen(1.0, Progress::Unchanged), blind], Phase::Approach, Reason::Aligning);
@@ -363,6 +372,7 @@ mod every_transition {
                                 progress,
                                 axis_mismatch: None,
                                 may_descend: true,
+                                is_link_slow: false,
                             });
                         }
                     }
@@ -370,6 +380,7 @@ mod every_transition {
             }
         }
         let turned = Some(Reason::CameraTurned);
+        all.push(Inputs { is_link_slow: true, now: now(), ..at(0.0) });
         all.push(Inputs { axis_mismatch: turned, may_descend: false, now: now(), ..at(0.0) });
         all
     }

@@ -112,6 +112,7 @@ fn situation(vehicle: &VehicleState) -> Situation<'_> {
         pad_heave_m_s: 0.0,
         limits: crate::event::AutopilotLimits::default(),
         level_because: None,
+        link_delay_s: 0.0,
     }
 }
 
