@@ -30,6 +30,8 @@ pub(crate) struct BootClock {
     newest: Option<Reading>,
     /// Packets that contradict the newest and agree with each other.
     other: Option<Contradiction>,
+    /// Share of the packets that come later than the quickest ones.
+    late_share: f64,
 }
 
 /// A time since the start, and when it was received.
@@ -45,6 +47,13 @@ struct Contradiction {
     last: Reading,
     packets: u32,
 }
+
+/// Share of late packets, and its smoothing per packet, at which the link counts as unsteady. Of a link that
+/// repeats every packet later half of them are late, and it is as quick as before.
+const MAX_LATE_SHARE: f64 = 0.65;
+const LATE_SMOOTHING: f64 = 0.03;
+/// How late such a packet is, in milliseconds.
+const MIN_LATE_MS: i64 = 350;
 
 /// What a packet's time since the start says.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -67,8 +76,12 @@ impl BootClock {
         };
         let ahead_ms = reading.ahead_ms(newest);
         let passed_ms = reading.passed_ms(newest);
+        let is_late = passed_ms - ahead_ms > MIN_LATE_MS;
+        let late_share =
+            self.late_share + LATE_SMOOTHING * (f64::from(u8::from(is_late)) - self.late_share);
+        self.late_share = late_share;
         if (0..=passed_ms + MAX_AHEAD_MS).contains(&ahead_ms) {
-            *self = Self { newest: Some(reading), other: None };
+            *self = Self { newest: Some(reading), other: None, late_share };
             return BootTime::Present;
         }
         if (-MAX_LATE_MS..0).contains(&ahead_ms) {
@@ -87,8 +100,15 @@ impl BootClock {
         if !is_restarted && !other.is_shown_by(&CLOCK_SET) {
             return BootTime::Contradicts;
         }
-        *self = Self { newest: Some(reading), other: None };
+        *self = Self { newest: Some(reading), other: None, late_share: 0.0 };
         if ahead_ms < 0 { BootTime::Restarted } else { BootTime::Present }
+    }
+}
+
+impl BootClock {
+    /// True while most packets come much later than the quickest ones: so may what is sent.
+    pub(crate) fn is_unsteady(&self) -> bool {
+        self.late_share > MAX_LATE_SHARE
     }
 }
 
@@ -150,6 +170,21 @@ mod tests {
         assert_eq!(count(&replayed, Restarted), 0);
         let delayed_from_5_s = seen(|ms| if ms > 5_000 { (ms - 5_000).min(2_000) } else { 0 });
         assert_eq!(count(&delayed_from_5_s, Present), 500);
+    }
+
+    #[test]
+    fn only_a_link_that_delays_most_packets_is_unsteady() {
+        let is_unsteady = |age_ms: fn(i64) -> i64| {
+            let mut clock = BootClock::default();
+            for ms in (0..10_000).step_by(20) {
+                clock.take(ms * MS, (BOOTED_MS + ms - age_ms(ms)) as u32);
+            }
+            clock.is_unsteady()
+        };
+        assert!(is_unsteady(|ms| (ms * 7919) % 1_500));
+        assert!(!is_unsteady(|ms| (ms * 7919) % 300));
+        assert!(!is_unsteady(|ms| if ms % 40 == 0 { 2_000 } else { 0 }), "repeated");
+        assert!(!is_unsteady(|ms| if ms > 5_000 { 2_000 } else { 0 }), "evenly late");
     }
 
     #[test]

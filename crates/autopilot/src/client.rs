@@ -38,6 +38,8 @@ const MAX_QUEUED: usize = 1024;
 const MAX_OUTCOMES: usize = 32;
 /// Period of our heartbeat, in nanoseconds.
 const HEARTBEAT_NS: i64 = 1_000_000_000;
+/// What an unsteady link counts as.
+const UNSTEADY: Duration = Duration::from_secs(1);
 /// Maximum age of a position whose vertical speed says whether the vehicle stands, in nanoseconds.
 const MAX_SPEED_AGE_NS: i64 = 500_000_000;
 /// Time for which setpoints are sent before OFFBOARD is requested, in nanoseconds: PX4 enters it only after a
@@ -316,8 +318,12 @@ impl Autopilot {
         self.clock.round_trip_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
     }
 
-    /// How slow the link is now, both ways together; `None` while it is not known.
+    /// How slow the link is now, both ways together; `None` while it is not known. A link that delays most packets
+    /// by a time of their own is as slow as what comes late over it.
     pub fn link_delay(&self, now_ns: i64) -> Option<Duration> {
+        if self.vehicle.as_ref().is_some_and(|vehicle| vehicle.boot.is_unsteady()) {
+            return Some(UNSTEADY);
+        }
         self.clock.link_delay_ns(now_ns).map(|ns| Duration::from_nanos(ns.max(0).unsigned_abs()))
     }
 

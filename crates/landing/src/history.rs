@@ -60,6 +60,11 @@ impl History {
         }
     }
 
+    /// Extrapolates at most this long from now on.
+    pub fn set_max_extrapolation(&mut self, seconds: f64) {
+        self.max_extrapolation_s = seconds;
+    }
+
     /// Adds a state; false when it is not newer than the newest.
     pub fn push(&mut self, state: VehicleState) -> bool {
         if self.newest().is_some_and(|newest| state.stamp <= newest.stamp) {

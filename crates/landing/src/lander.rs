@@ -376,6 +376,10 @@ impl Lander {
         self.link_delay_s = if seconds >= 0.0 { seconds.min(10.0) } else { 0.0 };
         let limit_s = if self.is_link_slow { MAX_QUICK_DELAY_S } else { MAX_LINK_DELAY_S };
         self.is_link_slow = self.link_delay_s > limit_s;
+        // A frame may come long before the vehicle's state of its time.
+        let one_way_s = 0.5 * self.link_delay_s.min(MAX_LINK_DELAY_S);
+        let usual_s = self.config.target.max_extrapolation_s;
+        self.history.set_max_extrapolation(usual_s + one_way_s);
     }
 
     /// What is asked of the autopilot changes its mode or its motors: only in our own mode.
