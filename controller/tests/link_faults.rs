@@ -337,6 +337,7 @@ fn a_delayed_link_ends_safely_with_its_reason() {
         let ended = fly(&mut { late }, &mut |now_s, _| now_s + delay_s);
         show(&format!("{:.0} ms each way", delay_s * 1e3), &ended);
         assert!(ended.is_safe(), "{ended:?}");
+        assert_eq!(ended.is_on_the_pad(), delay_s <= 0.25, "{ended:?}");
     }
 }
 
@@ -357,5 +358,6 @@ fn a_link_with_jitter_ends_safely_with_its_reason() {
         );
         show(&format!("{:.0} ms of jitter", jitter_s * 1e3), &ended);
         assert!(ended.is_safe(), "{ended:?}");
+        assert!(ended.is_on_the_pad() || jitter_s > 0.2, "{ended:?}");
     }
 }

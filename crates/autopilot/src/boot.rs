@@ -32,6 +32,7 @@ pub(crate) struct BootClock {
     other: Option<Contradiction>,
     /// Share of the packets that come later than the quickest ones.
     late_share: f64,
+    is_unsteady: bool,
 }
 
 /// A time since the start, and when it was received.
@@ -48,12 +49,14 @@ struct Contradiction {
     packets: u32,
 }
 
-/// Share of late packets, and its smoothing per packet, at which the link counts as unsteady. Of a link that
-/// repeats every packet later half of them are late, and it is as quick as before.
-const MAX_LATE_SHARE: f64 = 0.65;
-const LATE_SMOOTHING: f64 = 0.03;
+/// Share of late packets at which the link counts as unsteady, the one at which it is steady again, and the
+/// smoothing per packet. Of a link that repeats every packet later half of them are late, and it is as quick as
+/// before.
+const MAX_LATE_SHARE: f64 = 0.6;
+const MAX_STEADY_SHARE: f64 = 0.3;
+const LATE_SMOOTHING: f64 = 0.06;
 /// How late such a packet is, in milliseconds.
-const MIN_LATE_MS: i64 = 350;
+const MIN_LATE_MS: i64 = 300;
 
 /// What a packet's time since the start says.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -80,8 +83,10 @@ impl BootClock {
         let late_share =
             self.late_share + LATE_SMOOTHING * (f64::from(u8::from(is_late)) - self.late_share);
         self.late_share = late_share;
+        let limit = if self.is_unsteady { MAX_STEADY_SHARE } else { MAX_LATE_SHARE };
+        self.is_unsteady = late_share > limit;
         if (0..=passed_ms + MAX_AHEAD_MS).contains(&ahead_ms) {
-            *self = Self { newest: Some(reading), other: None, late_share };
+            (self.newest, self.other) = (Some(reading), None);
             return BootTime::Present;
         }
         if (-MAX_LATE_MS..0).contains(&ahead_ms) {
@@ -100,7 +105,7 @@ impl BootClock {
         if !is_restarted && !other.is_shown_by(&CLOCK_SET) {
             return BootTime::Contradicts;
         }
-        *self = Self { newest: Some(reading), other: None, late_share: 0.0 };
+        *self = Self { newest: Some(reading), ..Self::default() };
         if ahead_ms < 0 { BootTime::Restarted } else { BootTime::Present }
     }
 }
@@ -108,7 +113,7 @@ impl BootClock {
 impl BootClock {
     /// True while most packets come much later than the quickest ones: so may what is sent.
     pub(crate) fn is_unsteady(&self) -> bool {
-        self.late_share > MAX_LATE_SHARE
+        self.is_unsteady
     }
 }
 

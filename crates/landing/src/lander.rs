@@ -44,6 +44,9 @@ const MAX_CONTACT_M_S: f64 = 0.5;
 const MAX_LINK_DELAY_S: f64 = 0.7;
 const MAX_QUICK_DELAY_S: f64 = 0.5;
 
+/// Vertical speed of a vehicle that hovers, in m/s.
+const MAX_HOVER_M_S: f64 = 0.3;
+
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;
 
@@ -633,10 +636,24 @@ impl Lander {
             age_s <= phases.stale_vehicle_s
                 && target.is_some_and(|target| target.height_m < phases.regain_height_m)
         });
+        if self.sinks_over_slow_link(now) {
+            return self.climb(self.config.envelope.climb_m_s);
+        }
         if !(lost && low) {
             return Action::hover();
         }
         self.climb(phases.regain_climb_m_s)
+    }
+
+    /// True while the vehicle still goes down although it holds because of its slow link: setpoints that were sent
+    /// before arrive after those that stop it, so it is told to climb until it no longer sinks.
+    fn sinks_over_slow_link(&self, now: Timestamp) -> bool {
+        self.state_machine.reason() == Reason::LinkSlow
+            && self.history.newest().is_some_and(|vehicle| {
+                let is_recent =
+                    now.seconds_since(vehicle.stamp) <= self.config.phases.stale_vehicle_s;
+                is_recent && vehicle.velocity.z() > MAX_HOVER_M_S
+            })
     }
 
     /// Climbs, as far as the fence allows.
