@@ -1,5 +1,7 @@
 //! What a lander believes of the autopilot's reports, of the ground and of its own setpoints.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
+
 use geometry::{Body, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
 use landing::{
     Action, Alarm, Config, Decision, Event, FrameObservation, Landed, Lander, MarkerInFrame, Mode,
