@@ -68,7 +68,7 @@ impl Flight {
         let autopilot = Autopilot::new(autopilot::Config {
             system_id: Some(settings.system_id).filter(|id| *id != 0),
             our_component: settings.component_id,
-            streams: autopilot::client::default_streams(settings.state_rate_hz),
+            streams: autopilot::config::default_streams(settings.state_rate_hz),
             parameters,
             timesync: settings.timesync,
             ..autopilot::Config::default()

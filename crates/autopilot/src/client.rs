@@ -13,9 +13,10 @@ use geometry::{Body, Ned, Point, Vector};
 use crate::boot::{BootClock, BootTime};
 use crate::clock::Clock;
 use crate::command::{
-    Command, CommandError, CommandId, CommandStatus, Request, SetpointError, Step, Timeouts, ns,
+    Command, CommandError, CommandId, CommandStatus, Request, SetpointError, Step, ns,
 };
 use crate::compose;
+use crate::config::Config;
 use crate::contact::Contact;
 use crate::dialect::{
     COMMAND_ACK_DATA, HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavModeFlag, MavSeverity,
@@ -52,61 +53,6 @@ const PROOF_PERIOD_NS: i64 = 50_000_000;
 const EKF_STATUS_REPORT: u32 = 193;
 const ESTIMATOR_STATUS: u32 = 230;
 const GLOBAL_POSITION_INT: u32 = 33;
-
-/// Settings of the conversation with the autopilot.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Config {
-    /// The vehicle's system id; `None` takes the first autopilot found, and keeps it.
-    pub system_id: Option<u8>,
-    /// Our own system id; `None` takes the vehicle's.
-    pub our_system: Option<u8>,
-    /// Our own component id.
-    pub our_component: u8,
-    /// Whether to send our own heartbeat once a second.
-    pub heartbeat: bool,
-    /// Silence after which the autopilot counts as lost.
-    pub heartbeat_timeout: Duration,
-    /// The messages to request; ArduPilot's own are replaced by their equivalents on PX4.
-    pub streams: Vec<Stream>,
-    /// The parameters to read.
-    pub parameters: Vec<&'static str>,
-    /// Whether to synchronise with the autopilot's clock, so that measurements are stamped with their own
-    /// time.
-    pub timesync: bool,
-    /// Timeouts of commands.
-    pub timeouts: Timeouts,
-}
-
-impl Default for Config {
-    fn default() -> Self {
-        Self {
-            system_id: None,
-            our_system: None,
-            our_component: 191,
-            heartbeat: true,
-            heartbeat_timeout: Duration::from_secs(3),
-            streams: default_streams(50.0),
-            parameters: Vec::new(),
-            timesync: true,
-            timeouts: Timeouts::default(),
-        }
-    }
-}
-
-/// The messages that landing needs, with attitude and position at this rate in Hz.
-pub fn default_streams(rate_hz: f64) -> Vec<Stream> {
-    let required = |message_id, rate_hz| Stream { message_id, rate_hz, required: true };
-    let welcome = |message_id, rate_hz| Stream { message_id, rate_hz, required: false };
-    vec![
-        required(30, rate_hz), // ATTITUDE
-        required(32, rate_hz), // LOCAL_POSITION_NED
-        required(245, 5.0),    // EXTENDED_SYS_STATE
-        required(1, 2.0),      // SYS_STATUS
-        required(193, 2.0),    // EKF_STATUS_REPORT
-        welcome(132, 10.0),    // DISTANCE_SENSOR
-        welcome(147, 1.0),     // BATTERY_STATUS
-    ]
-}
 
 /// The conversation with one autopilot.
 #[derive(Clone, Debug)]

@@ -12,7 +12,8 @@
 //! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it and
 //! [`peers`] chooses whom a listening one talks to, [`packet`] finds MAVLink packets in them, [`mode`],
 //! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
-//! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the conversation with it, [`event`] its events, [`command`] is
+//! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the conversation with it with the
+//! settings of [`config`], [`event`] its events, [`command`] is
 //! what can be requested and why it may fail, [`takeoff`] arms the vehicle and takes off, [`permission`] is what
 //! a ground station may send, [`compose`] makes the messages that a companion sends.
 
@@ -22,6 +23,7 @@ pub mod client;
 pub mod clock;
 pub mod command;
 pub mod compose;
+pub mod config;
 mod contact;
 pub mod event;
 pub mod link;
@@ -44,8 +46,9 @@ pub mod dialect {
 }
 
 pub use address::Address;
-pub use client::{Autopilot, Config};
+pub use client::Autopilot;
 pub use command::{Command, CommandError, CommandId, CommandStatus};
+pub use config::Config;
 pub use event::Event;
 pub use link::{Link, LinkEvent, LinkSender};
 pub use mode::{Firmware, FlightMode};
