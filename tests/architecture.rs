@@ -61,7 +61,8 @@ const ALIGHT: [&str; 7] =
     ["fiducial", "geometry", "imaging", "markers", "media", "messages", "node"];
 
 /// Crates of algorithms but for these modules, which have the threads, the clock and the network.
-const WITH_THREADS: [(&str, &[&str]); 2] = [("autopilot", &["link"]), ("airlink", &["sender"])];
+const WITH_THREADS: [(&str, &[&str]); 2] =
+    [("autopilot", &["link", "peers"]), ("airlink", &["sender"])];
 
 /// What an algorithm does without.
 const OUTSIDE: [&str; 17] = [

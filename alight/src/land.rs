@@ -10,11 +10,11 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use markers::{Marker, Pad};
 use messages::topic;
-use node::{Layers, Node, Shutdown, ZenohSource};
+use node::{Layers, Network, Node, Shutdown};
 use tempfile::TempDir;
 use tokio::time::Instant;
 
-use crate::args::Format;
+use crate::args::{Format, OPERATOR};
 use crate::children::{ChildEvent, Children};
 use crate::outcome::LandingSummary;
 use crate::progress::Progress;
@@ -222,7 +222,9 @@ fn ground_station(autopilot: Option<&str>) -> Vec<String> {
 async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<LandingSummary> {
     let shutdown = Shutdown::on_signals()?;
     let rendezvous = Rendezvous::new(args.zenoh.as_deref())?;
-    let zenoh = ZenohSource::File(rendezvous.file.clone());
+    // Its own file is checked as those of the services are: nothing listens beyond this machine by accident.
+    let network = Network { config: Some(rendezvous.file.clone()), ..Network::default() };
+    let zenoh = network.source(OPERATOR)?;
     let node = Node::open(tool_identity("land"), &zenoh).await?;
     let mut progress = Progress::new(args.format);
     progress.say(&format!(

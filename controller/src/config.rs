@@ -244,8 +244,7 @@ impl DetectorSettings {
 impl Config {
     /// The take-off of `start = "takeoff"`.
     pub(crate) fn takeoff(&self) -> Takeoff {
-        let takeoff = Takeoff::new(self.takeoff_height_m);
-        if self.takeoff_real_vehicle { takeoff } else { takeoff.only_simulated() }
+        Takeoff::new(self.takeoff_height_m).of_real_vehicle(self.takeoff_real_vehicle)
     }
 
     /// The lander's settings.

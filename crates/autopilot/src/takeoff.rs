@@ -177,10 +177,11 @@ impl Takeoff {
         }
     }
 
-    /// The same, of a vehicle that says that it is a simulation; no other one is armed, moved or landed.
+    /// The same, with or without real vehicles: without them one that does not say that it is a simulation is not
+    /// armed, moved or landed.
     #[must_use]
-    pub fn only_simulated(self) -> Self {
-        Self { only_simulated: true, ..self }
+    pub fn of_real_vehicle(self, may_be_real: bool) -> Self {
+        Self { only_simulated: !may_be_real, ..self }
     }
 
     /// Advances the takeoff and returns its progress.

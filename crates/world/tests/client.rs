@@ -126,7 +126,7 @@ fn take_off_if_simulated(firmware: Firmware, says_simulated: bool) -> (TakeoffPr
     config.autopilot.firmware = firmware;
     config.autopilot.says_simulated = says_simulated;
     let mut pair = Pair::new(&config, 4);
-    let mut takeoff = Takeoff::new(10.0).only_simulated();
+    let mut takeoff = Takeoff::new(10.0).of_real_vehicle(false);
     for _ in 0..6000 {
         pair.tick();
         let now_ns = pair.now_ns();
