@@ -4,14 +4,22 @@
 //! denies.
 
 use std::process::ExitCode;
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use clap::Args;
 use node::{Identity, Node, Shutdown, denied};
+use tokio::time::MissedTickBehavior;
 
 use crate::args::{NetworkArgs, ParentArgs};
 use crate::runtime::runtime;
 use crate::services::{RELAY, tell_if_open};
+
+/// Period at which the process notices that it goes on.
+const BEAT: Duration = Duration::from_millis(100);
+/// Gap between two beats after which the process was frozen: a little less than the lease of
+/// `zenoh-config/drone.json5`.
+const FROZEN: Duration = Duration::from_millis(1200);
 
 /// The arguments of the relay.
 #[derive(Args, Clone)]
@@ -37,21 +45,37 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
     let role = if config.as_os_str() == "drone" { "drone" } else { RELAY };
     let identity = Identity { service: RELAY, instance: args.id.clone() };
     let zenoh = network.source(role)?;
-    runtime()?.block_on(node::run(identity, &zenoh, |node, shutdown| {
-        tell_if_open(&node, &network);
-        relay(node, shutdown)
-    }))?;
+    let runtime = runtime()?;
+    let was_frozen = AtomicBool::new(true);
+    while was_frozen.swap(false, Ordering::Relaxed) {
+        let serve = async |node, shutdown| {
+            tell_if_open(&node, &network);
+            relay(node, shutdown, &was_frozen).await
+        };
+        runtime.block_on(node::run(identity.clone(), &zenoh, serve))?;
+    }
     Ok(ExitCode::SUCCESS)
 }
 
-async fn relay(node: Node, shutdown: Shutdown) -> anyhow::Result<()> {
+async fn relay(node: Node, shutdown: Shutdown, was_frozen: &AtomicBool) -> anyhow::Result<()> {
     node.announce().await?;
     let mut second = tokio::time::interval(Duration::from_secs(1));
+    let mut beat = tokio::time::interval(BEAT);
+    beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut last = Instant::now();
     loop {
         tokio::select! {
             _ = second.tick() => report(&node),
+            _ = beat.tick() => {}
             () = shutdown.requested() => return Ok(()),
         }
+        // The others have given some of the connections up, and nobody opens those again that gossip made.
+        if last.elapsed() > FROZEN {
+            tracing::warn!(gap = ?last.elapsed(), "This process was frozen; joining the network anew");
+            was_frozen.store(true, Ordering::Relaxed);
+            return Ok(());
+        }
+        last = Instant::now();
     }
 }
 
