@@ -7,12 +7,13 @@ use detector::Config;
 use imaging::GrayImage;
 use markers::{Drawing, Ink};
 use messages::{
-    BayerPattern, CommandReply, Detections, DetectorCommand, FrameHeader, PixelFormat, topic,
+    BayerPattern, CameraInfo, CommandReply, Detections, DetectorCommand, FrameHeader, PixelFormat,
+    topic,
 };
 use node::{
     FramePublisher, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, clock_name, now_ns,
 };
-use testing::ports;
+use testing::{ports, python, python_passes};
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -208,4 +209,63 @@ async fn several_families_are_found_and_parameters_change_while_it_runs() -> any
     }
     service.abort();
     Ok(())
+}
+
+/// The distance of the marker `rings` along the camera's axis, in metres.
+fn rings_m(message: &Detections) -> Option<f64> {
+    let rings = message.detections.iter().find(|seen| seen.family == "rings")?;
+    Some(rings.pose.as_ref()?.camera_from_marker.translation_m[2])
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_camera_in_python_is_searched_and_nobody_else_gives_its_calibration() -> anyhow::Result<()>
+{
+    let script = "camera-pub/examples/python/camera.py";
+    let Some(probe) = python(script, &["--help"]) else { return Ok(()) };
+    if !python_passes(&probe.wait_with_output()?)? {
+        return Ok(());
+    }
+    let ([port], _, _) = ports::free()?;
+    let node = open("detector", "main", port).await?;
+    let other = open("camera-pub", "stranger", port).await?;
+    let layers = Layers { file: None, set: vec![format!("markers={ALL}")] };
+    let service = tokio::spawn(detector::run(
+        node,
+        layers.load::<Config>()?.settings,
+        Shutdown::on_signals()?,
+    ));
+    let detections = other.subscriber(topic::DETECTIONS, &["main"]).await?;
+    let infos = other.subscriber(topic::CAMERA_INFO, &["down"]).await?;
+    let image = picture()?;
+    let picture = std::env::temp_dir().join(format!("alight-camera-{}.pgm", std::process::id()));
+    let header = format!("P5 {} {} 255\n", image.width(), image.height());
+    std::fs::write(&picture, [header.as_bytes(), image.pixels()].concat())?;
+    let path = picture.to_str().context("a path")?;
+    let connect = format!("tcp/127.0.0.1:{port}");
+    let args = ["--picture", path, "--focal-px", "1000", "--connect", &connect];
+    let mut camera = python(script, &args).context("it started a moment ago")?;
+    let watched = async {
+        let seen = until(&detections, "it has a pose", |m| rings_m(m).is_some()).await?;
+        ensure!(seen.header.clock == clock_name(), "{seen:?}");
+        // 180 pixels of 0.2 m, seen with 1000 pixels.
+        let distance_m = rings_m(&seen).context("a pose")?;
+        ensure!((distance_m - 1.11).abs() < 0.06, "{distance_m} m");
+        let info = timeout(PATIENCE, infos.next()).await?.context("its calibration")?;
+        ensure!(info.body_from_camera == CameraInfo::sample().body_from_camera, "{info:?}");
+        let lies = other.publisher(topic::CAMERA_INFO, &["down"]).await?;
+        for focal_px in [f64::NAN, 500.0, 2000.0].repeat(5) {
+            lies.publish(&CameraInfo { focal_px: Some([focal_px; 2]), ..info.clone() }).await;
+            for _ in 0..2 {
+                let seen = timeout(PATIENCE, detections.next()).await?.context("detections")?;
+                ensure!(rings_m(&seen).is_none_or(|m| (m - 1.11).abs() < 0.06), "{seen:?}");
+            }
+        }
+        anyhow::Ok(())
+    };
+    let watched = watched.await;
+    camera.kill()?;
+    camera.wait()?;
+    std::fs::remove_file(&picture)?;
+    service.abort();
+    watched
 }
