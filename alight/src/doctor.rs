@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, topic};
+use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, PixelFormat, topic};
 use node::access::Holder;
 use node::network::{AIR_PORT, AUTHORITY, Address, check_private};
 use node::{INSECURE, Network, Node, clock_name, now_ns, stats};
@@ -151,7 +151,14 @@ pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<ExitCode> {
     match network.source(OPERATOR) {
         Ok(zenoh) => runtime()?.block_on(async {
             match timeout(OPEN_TIMEOUT, Node::open(tool_identity("doctor"), &zenoh)).await {
-                Ok(Ok(node)) => check_network(&mut findings, node, args.seconds, &expected).await,
+                Ok(Ok(node)) => {
+                    let watched = Watched {
+                        duration: Duration::from_secs(args.seconds),
+                        // They do not fit an air link.
+                        has_raw_frames: network.connect.is_none(),
+                    };
+                    check_network(&mut findings, node, watched, &expected).await;
+                }
                 Ok(Err(problem)) => findings.wrong("network", format!("{problem:#}"), "see above"),
                 Err(_) => findings.wrong(
                     "network",
@@ -330,6 +337,13 @@ fn check_ports(findings: &mut Findings, network: &Network) {
     }
 }
 
+/// What to watch of the network.
+#[derive(Clone, Copy)]
+struct Watched {
+    duration: Duration,
+    has_raw_frames: bool,
+}
+
 /// What was received from the network.
 #[derive(Default)]
 struct Seen {
@@ -337,7 +351,9 @@ struct Seen {
     healths: Vec<Health>,
     cameras: Vec<CameraInfo>,
     status: Option<ControllerStatus>,
+    /// As JPEG.
     frames: Vec<ReceivedFrame>,
+    raw_frames: Vec<ReceivedFrame>,
 }
 
 struct ReceivedFrame {
@@ -346,14 +362,14 @@ struct ReceivedFrame {
     received_ns: i64,
 }
 
-async fn check_network(findings: &mut Findings, node: Node, seconds: u64, expected: &[Job]) {
+async fn check_network(findings: &mut Findings, node: Node, watched: Watched, expected: &[Job]) {
     let mut seen = Seen::default();
-    match watch(&node, &mut seen, Duration::from_secs(seconds)).await {
+    match watch(&node, &mut seen, watched).await {
         Ok(()) => {
             check_presence(findings, &seen, expected);
             check_replies(findings, &node, &seen).await;
             check_healths(findings, &seen);
-            check_cameras(findings, &seen, seconds);
+            check_cameras(findings, &seen, watched.duration.as_secs());
             check_landing(findings, &seen);
         }
         Err(problem) => findings.wrong("network", format!("{problem:#}"), "start it again"),
@@ -361,15 +377,23 @@ async fn check_network(findings: &mut Findings, node: Node, seconds: u64, expect
     node.close().await;
 }
 
-async fn watch(node: &Node, seen: &mut Seen, duration: Duration) -> anyhow::Result<()> {
+async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result<()> {
     seen.peers = node.list_peers().await?;
     let (healths, cameras, statuses) = tokio::try_join!(
         node.subscriber(topic::HEALTH, &[]),
         node.subscriber(topic::CAMERA_INFO, &[]),
         node.subscriber(topic::STATUS, &[]),
     )?;
-    // JPEG frames, which fit every link; the camera makes them while there is a subscriber.
+    // JPEG frames fit every link; our cameras make them while there is a subscriber, others may not.
     let frames = node.frame_subscriber(topic::JPEG, &[]).await?;
+    let raw = match watched.has_raw_frames {
+        true => Some(node.frame_subscriber(topic::FRAME, &[]).await?),
+        false => None,
+    };
+    let next_raw = async || match &raw {
+        Some(raw) => raw.next().await,
+        None => std::future::pending().await,
+    };
     let watching = async {
         loop {
             tokio::select! {
@@ -385,10 +409,15 @@ async fn watch(node: &Node, seen: &mut Seen, duration: Duration) -> anyhow::Resu
                     let received_ns = now_ns();
                     seen.frames.push(ReceivedFrame { header: frame.header, bytes, received_ns });
                 }
+                Some(frame) = next_raw() => {
+                    let bytes = frame.bytes().len();
+                    let received_ns = now_ns();
+                    seen.raw_frames.push(ReceivedFrame { header: frame.header, bytes, received_ns });
+                }
             }
         }
     };
-    let _: Result<(), _> = timeout(duration, watching).await;
+    let _: Result<(), _> = timeout(watched.duration, watching).await;
     // Peers that joined meanwhile.
     seen.peers.extend(node.list_peers().await?);
     seen.peers.sort();
@@ -536,13 +565,17 @@ fn check_cameras(findings: &mut Findings, seen: &Seen, seconds: u64) {
         }
     }
     let clocks: Vec<_> = seen.healths.iter().filter(|h| h.service == "controller").collect();
-    let mut names: Vec<&str> =
-        seen.frames.iter().map(|frame| frame.header.camera.as_str()).collect();
+    let raw_only = |frame: &&ReceivedFrame| {
+        !seen.frames.iter().any(|jpeg| jpeg.header.camera == frame.header.camera)
+    };
+    let all: Vec<&ReceivedFrame> =
+        seen.frames.iter().chain(seen.raw_frames.iter().filter(raw_only)).collect();
+    let mut names: Vec<&str> = all.iter().map(|frame| frame.header.camera.as_str()).collect();
     names.sort_unstable();
     names.dedup();
     for camera in names {
-        let frames: Vec<_> =
-            seen.frames.iter().filter(|frame| frame.header.camera == camera).collect();
+        let frames: Vec<&ReceivedFrame> =
+            all.iter().copied().filter(|frame| frame.header.camera == camera).collect();
         findings.good("camera", describe_frames(camera, &frames, seconds));
         if let Some(ReceivedFrame { header, .. }) = frames.first()
             && let Some(controller) = clocks.iter().find(|health| health.clock != header.clock)
@@ -553,11 +586,18 @@ fn check_cameras(findings: &mut Findings, seen: &Seen, seconds: u64) {
                     "camera `{camera}` stamps with the clock {}, the controller has {}, so it rejects all frames",
                     header.clock, controller.clock
                 ),
-                "run camera and controller on one machine",
+                "run camera and controller on one machine; a camera of your own must use that clock's name",
+            );
+        }
+        if !seen.cameras.iter().any(|info| info.camera == camera) {
+            findings.wrong(
+                "calibration",
+                format!("camera `{camera}` sends frames, but not its calibration and mount"),
+                "publish them on `camera/CAMERA/info` every second",
             );
         }
     }
-    if seen.frames.is_empty() && !seen.peers.is_empty() {
+    if all.is_empty() && !seen.peers.is_empty() {
         findings.doubtful(
             "camera",
             format!("no frame arrived within {seconds} s"),
@@ -583,9 +623,11 @@ fn implausible(info: &CameraInfo, focal_px: [f64; 2]) -> Option<String> {
 
 fn describe_frames(camera: &str, frames: &[&ReceivedFrame], seconds: u64) -> String {
     let rate_hz = frames.len() as f64 / seconds as f64;
+    let is_raw = frames.iter().any(|frame| frame.header.format != PixelFormat::Jpeg);
     let bytes: usize = frames.iter().map(|frame| frame.bytes).sum();
     let megabits_s = bytes as f64 * 8e-6 / seconds as f64;
-    let mut text = format!("camera `{camera}`: {rate_hz:.1} frames/s, {megabits_s:.2} Mbit/s");
+    let kind = if is_raw { "raw frames" } else { "frames" };
+    let mut text = format!("camera `{camera}`: {rate_hz:.1} {kind}/s, {megabits_s:.2} Mbit/s");
     let ages_ms: Vec<f64> = frames
         .iter()
         .filter(|frame| frame.header.clock == clock_name())
@@ -615,6 +657,13 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
             "the autopilot has not told its GUID_TIMEOUT or COM_OF_LOSS_T; landings are slower for it".to_owned(),
             "check that it answers parameter requests on this link",
         ),
+    }
+    for warning in &status.warnings {
+        findings.wrong(
+            "controller",
+            warning.clone(),
+            "a landing is not started, or not finished, until then",
+        );
     }
     match &status.active_detector {
         Some(detector) => findings.good("detector", format!("`{detector}` is in use")),
