@@ -117,6 +117,8 @@ struct Overview {
     preference: String,
     changes: u64,
     detectors: Vec<Entry>,
+    /// What the controller refuses, and which detectors disagree.
+    warnings: Vec<String>,
 }
 
 /// A detector in the list.
@@ -160,6 +162,7 @@ impl Overview {
             preference: status.preference.clone(),
             changes: status.detector_changes,
             detectors,
+            warnings: status.warnings,
         }
     }
 
@@ -210,6 +213,10 @@ impl Overview {
             }
         };
         text.push_str(&summary);
+        for warning in &self.warnings {
+            text.push_str("\nWarning: ");
+            text.push_str(warning);
+        }
         text
     }
 }
@@ -264,6 +271,7 @@ mod tests {
                 candidate("first", DetectorState::Shadow),
                 candidate("main", DetectorState::Active),
             ],
+            warnings: vec!["detections of `late` are refused".into()],
             ..ControllerStatus::default()
         };
         let info = DetectorInfo {
@@ -283,6 +291,7 @@ mod tests {
         assert!(lines[2].contains("shadow") && lines[2].contains("29 of 30, 0.012 m"), "{table}");
         assert!(lines[3].starts_with("late") && lines[3].contains("waiting"), "{table}");
         assert!(lines[4].contains("preferred: ground; 3 changes"), "{table}");
+        assert!(lines[5].starts_with("Warning: detections of `late`"), "{table}");
         let nobody = Overview::new(None, &announced, BTreeSet::new()).table();
         assert!(nobody.contains("No controller"), "{nobody}");
     }

@@ -15,6 +15,8 @@ pub(crate) struct Progress {
     live: Option<ProgressBar>,
     phase: Option<Phase>,
     active_detector: Option<String>,
+    /// The warnings that were shown and still hold, without digits.
+    warnings: Vec<String>,
 }
 
 impl Progress {
@@ -31,7 +33,7 @@ impl Progress {
             bar.enable_steady_tick(Duration::from_millis(200));
             bar
         });
-        Self { live, phase: None, active_detector: None }
+        Self { live, phase: None, active_detector: None, warnings: Vec::new() }
     }
 
     /// Shows a line that stays.
@@ -59,6 +61,15 @@ impl Progress {
             let name = status.active_detector.as_deref().unwrap_or("none");
             self.say(&format!("active detector: {name}: {}", status.detector_why));
         }
+        // A change of numbers alone, as of a distance, is not shown.
+        let matter = |text: &String| text.chars().filter(|c| !c.is_ascii_digit()).collect();
+        let matters: Vec<String> = status.warnings.iter().map(matter).collect();
+        for (text, matter) in status.warnings.iter().zip(&matters) {
+            if !self.warnings.contains(matter) {
+                self.say(&format!("warning: {text}"));
+            }
+        }
+        self.warnings = matters;
     }
 
     /// Redraws the live view.

@@ -17,6 +17,7 @@ use messages::{
 use node::HealthCounters;
 
 use crate::alarms::Alarms;
+use crate::cameras::Reception;
 use crate::config::{Config, Mode, Start};
 use crate::frames::{Arrival, Frames};
 use crate::journal::Journal;
@@ -53,6 +54,8 @@ pub struct Flight {
     journal: Journal,
     /// The service ends: nothing but a stop is sent any more.
     is_ending: bool,
+    /// Two detectors see the marker at two places.
+    is_disputed: bool,
 }
 
 impl Flight {
@@ -91,6 +94,7 @@ impl Flight {
             wind: WindEstimate::default(),
             journal: Journal::new(health),
             is_ending: false,
+            is_disputed: false,
             config,
         })
     }
@@ -130,6 +134,7 @@ impl Flight {
         self.handle_autopilot_events(now_ns);
         self.frames.tick(now_ns);
         self.use_newest(now_ns);
+        self.follow_warnings(now_ns);
         if self.is_landing() {
             let is_fresh = self.frames.age_s(now_ns) <= self.config.detectors.max_age_s;
             self.journal.tick(is_fresh, self.frames.selection.has_newer());
@@ -161,6 +166,19 @@ impl Flight {
     /// Takes over what an earlier controller left to put back.
     pub fn take_over(&mut self, note: Note) {
         self.limits.take_over(note);
+    }
+
+    /// Logs what the operator should know, and tells the lander of a dispute between detectors.
+    fn follow_warnings(&mut self, now_ns: i64) {
+        if self.journal.has_refused_versions() {
+            self.frames.refused_version(now_ns);
+        }
+        self.journal.warnings(&self.frames.warnings(now_ns));
+        let is_disputed = self.frames.selection.dispute().is_some();
+        if is_disputed != self.is_disputed {
+            self.is_disputed = is_disputed;
+            self.decide(now_ns, LanderEvent::Dispute(is_disputed));
+        }
     }
 
     /// Passes alarms to the lander while it lands.
@@ -240,8 +258,13 @@ impl Flight {
     }
 
     /// Handles a camera's calibration and mount.
-    pub fn camera(&mut self, info: CameraInfo) {
-        self.frames.add_camera(info);
+    pub fn camera(&mut self, now_ns: i64, info: CameraInfo) {
+        let camera = info.camera.clone();
+        match self.frames.add_camera(now_ns, info, self.is_landing()) {
+            Reception::Known => {}
+            Reception::Replaced(difference) => self.journal.camera_replaced(&camera, &difference),
+            Reception::Refused(reason, _) => self.journal.reject_camera(reason),
+        }
     }
 
     /// A detector came or went.
@@ -347,6 +370,9 @@ impl Flight {
         if self.autopilot.state().and_then(wire::vehicle).is_none() {
             return Err("attitude and position of the vehicle are not known".to_owned());
         }
+        if let Some(obstacle) = self.frames.obstacle(now_ns) {
+            return Err(format!("no landing was started: {obstacle}"));
+        }
         if self.landing_target.is_some() {
             return self.start_landing_target(now_ns);
         }
@@ -436,6 +462,8 @@ impl Flight {
             let age_s = Timestamp::from_nanos(now_ns).seconds_since(state.stamp);
             age_s <= self.config.phases.stale_vehicle_s
         });
+        // A landing that would see nothing waits; what it waits for stands in the status.
+        let is_known = is_known && self.frames.obstacle(now_ns).is_none();
         let steers = self.landing_target.is_none();
         let Some(trigger) = self.mission.step(now_ns, &mut self.autopilot, is_known, steers) else {
             return;

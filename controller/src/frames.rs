@@ -6,12 +6,16 @@ use landing::{FrameObservation, Timestamp};
 use messages::{CameraInfo, Detections, Place};
 use node::clock_name;
 
+use crate::agreement::Sight;
+use crate::cameras::{Cameras, Reception};
 use crate::config::{Config, DetectorSettings, PreferredPlace};
-use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection, Sight};
+use crate::refusals::{Refusals, Warning};
+use crate::selection::{Limits, MAX_DETECTORS, Preference, Selection};
 use crate::wire;
 
-/// Maximum number of cameras whose calibration is kept; more are a mistake in the network.
-const MAX_CAMERAS: usize = 16;
+/// Time without detections that can be used after which a refusal is taken for their absence, in
+/// nanoseconds.
+const UNUSABLE_NS: i64 = 1_000_000_000;
 
 /// The newest frame of each detector, and the choice among them.
 #[derive(Debug)]
@@ -22,7 +26,10 @@ pub struct Frames {
     pub selection: Selection,
     /// The newest frame of each detector, to be used when it becomes the active one.
     newest: BTreeMap<String, FrameObservation>,
-    cameras: BTreeMap<String, CameraInfo>,
+    cameras: Cameras,
+    refusals: Refusals,
+    /// When detections were last kept.
+    kept_ns: i64,
     known_changes: u64,
     /// Stamp of the newest frame that was used, with a marker in it or without.
     used_stamp_ns: i64,
@@ -61,18 +68,22 @@ impl Frames {
             max_future_s: config.target.max_future_s,
             selection: selection(&config.detectors),
             newest: BTreeMap::new(),
-            cameras: BTreeMap::new(),
+            cameras: Cameras::default(),
+            refusals: Refusals::default(),
+            kept_ns: i64::MIN,
             known_changes: 0,
             used_stamp_ns: i64::MIN,
             handover_stamp_ns: i64::MIN,
         }
     }
 
-    /// Adds a camera's calibration and mount.
-    pub fn add_camera(&mut self, info: CameraInfo) {
-        if self.cameras.len() < MAX_CAMERAS || self.cameras.contains_key(&info.camera) {
-            self.cameras.insert(info.camera.clone(), info);
+    /// Adds a camera's calibration and mount, or refuses them; `is_flying` says that a landing is active.
+    pub fn add_camera(&mut self, now_ns: i64, info: CameraInfo, is_flying: bool) -> Reception {
+        let reception = self.cameras.add(now_ns, info, is_flying);
+        if let Reception::Refused(reason, text) = &reception {
+            self.refusals.add(now_ns, reason, || text.clone());
         }
+        reception
     }
 
     /// Adds the detections that were published on the key of the detector `publisher`.
@@ -80,19 +91,44 @@ impl Frames {
         let header = &message.header;
         // Who may publish is decided by the key; the name in the message is only a claim.
         if message.detector != publisher {
-            return Arrival::Refused("another-detectors-name");
+            return self.refuse(now_ns, "another-detectors-name", || {
+                format!(
+                    "detections are refused: `{publisher}` gives them the name of `{}`",
+                    message.detector
+                )
+            });
         }
         if header.clock != clock_name() {
-            return Arrival::Refused("another-clock");
+            return self.refuse(now_ns, "another-clock", || {
+                format!(
+                    "detections of `{publisher}` are refused: camera `{}` stamps its frames with the clock `{}`, the controller has `{}`; run both on one machine, or correct the clock's name",
+                    header.camera, header.clock, clock_name()
+                )
+            });
         }
         // Refused here, because later stamps are compared with the newest: one from the future would block
         // them all.
-        let ahead_ns = header.stamp_ns.saturating_sub(now_ns);
-        if ahead_ns as f64 * 1e-9 > self.max_future_s {
-            return Arrival::Refused("from-the-future");
+        let ahead_s = header.stamp_ns.saturating_sub(now_ns) as f64 * 1e-9;
+        if ahead_s > self.max_future_s {
+            return self.refuse(now_ns, "from-the-future", || {
+                format!(
+                    "detections of `{publisher}` are refused: the stamps of camera `{}` lie {ahead_s:.1} s in the future",
+                    header.camera
+                )
+            });
         }
-        let camera = self.cameras.get(&header.camera);
+        let camera = self.cameras.of_frame(now_ns, &header.camera);
         let mount = camera.and_then(wire::body_from_camera);
+        if mount.is_none() && message.detections.iter().any(|detection| detection.pose.is_some()) {
+            self.refusals.add(now_ns, "unknown-camera", || {
+                format!(
+                    "markers seen by `{publisher}` have no place: nothing is known of the mount of camera `{}`",
+                    header.camera
+                )
+            });
+        } else {
+            self.kept_ns = now_ns;
+        }
         let marker = wire::wanted(message, &self.marker)
             .map(|detection| wire::marker_in_frame(detection, mount));
         let sight = marker.as_ref().map(|marker| Sight {
@@ -111,6 +147,10 @@ impl Frames {
                 info.focal_px.map(|[fx, fy]| 0.5 * (fx + fy) * scale)
             });
             frame.body_from_camera = mount.map(|mount| mount.rotation());
+            // A better name may have taken the place of one that was known.
+            if self.newest.len() >= MAX_DETECTORS {
+                self.newest.retain(|name, _| self.selection.knows(name));
+            }
             self.newest.insert(publisher.to_owned(), frame);
             debug_assert!(self.newest.len() <= MAX_DETECTORS);
         } else if self.selection.active() == Some(publisher)
@@ -120,6 +160,39 @@ impl Frames {
             return Arrival::Late(frame);
         }
         Arrival::Kept
+    }
+
+    fn refuse(
+        &mut self,
+        now_ns: i64,
+        reason: &'static str,
+        text: impl FnOnce() -> String,
+    ) -> Arrival {
+        self.refusals.add(now_ns, reason, text);
+        Arrival::Refused(reason)
+    }
+
+    /// Messages of another version were refused.
+    pub fn refused_version(&mut self, now_ns: i64) {
+        self.refusals.add(now_ns, "another-version", || {
+            "messages of another version are refused; run the same version of alight everywhere (`alight doctor`)".to_owned()
+        });
+    }
+
+    /// What the operator should know.
+    pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
+        let mut warnings: Vec<_> = self.refusals.lasting(now_ns).collect();
+        warnings.extend(self.selection.warnings(now_ns));
+        warnings
+    }
+
+    /// Why a landing would see nothing, or not what it should: all that arrives is refused, or two programs
+    /// give one camera different calibrations.
+    pub fn obstacle(&self, now_ns: i64) -> Option<String> {
+        let has_none = now_ns.saturating_sub(self.kept_ns) > UNUSABLE_NS;
+        let mut lasting = self.refusals.lasting(now_ns);
+        let blocks = |reason: &str| has_none || reason == "another-camera-info";
+        lasting.find(|warning| blocks(&warning.matter)).map(|warning| warning.text)
     }
 
     /// The frame to be used now: the active detector's newest, if it is newer than all that were used.

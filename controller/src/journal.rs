@@ -8,6 +8,8 @@ use autopilot::command::SetpointError;
 use landing::{Alarm, Decision, Phase};
 use node::HealthCounters;
 
+use crate::refusals::Warning;
+
 /// The latency from a frame's stamp to the setpoint that used it, as health and status name it.
 const STAMP_TO_SETPOINT: &str = "stamp to setpoint";
 
@@ -17,12 +19,47 @@ pub struct Journal {
     health: Arc<HealthCounters>,
     /// Why the latest detection was rejected, if it was.
     rejection: Option<String>,
+    /// The matters of which the log has told.
+    told: Vec<String>,
+    /// Messages of another version so far.
+    other_versions: u64,
 }
 
 impl Journal {
     /// A journal that counts into `health`.
     pub fn new(health: Arc<HealthCounters>) -> Self {
-        Self { health, rejection: None }
+        Self { health, rejection: None, told: Vec::new(), other_versions: 0 }
+    }
+
+    /// Logs what the operator should know when it begins and when it ends.
+    pub fn warnings(&mut self, warnings: &[Warning]) {
+        for Warning { matter, text } in warnings {
+            if !self.told.contains(matter) {
+                tracing::warn!("{text}");
+            }
+        }
+        let over = |told: &String| !warnings.iter().any(|warning| warning.matter == *told);
+        for matter in self.told.iter().filter(|told| over(told)) {
+            tracing::info!(matter, "Over");
+        }
+        self.told.clear();
+        self.told.extend(warnings.iter().map(|warning| warning.matter.clone()));
+    }
+
+    /// True when messages of another version were refused since the last call.
+    pub fn has_refused_versions(&mut self) -> bool {
+        let refused = self.health.failures("payload: wrong version");
+        std::mem::replace(&mut self.other_versions, refused) < refused
+    }
+
+    /// Counts a camera's information that was refused, for a reason that is a short name for programs.
+    pub fn reject_camera(&self, reason: &str) {
+        self.health.dropped(&format!("camera info: {reason}"));
+    }
+
+    /// Logs that a camera has another calibration than before.
+    pub fn camera_replaced(&self, camera: &str, difference: &str) {
+        tracing::warn!(camera, difference, "Camera started again with another calibration");
     }
 
     /// Counts an event.

@@ -6,13 +6,16 @@
 //!
 //! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the
 //! [`flight`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
-//! of the detector), [`mission`] (when a landing begins), [`setpoints`] (the lander's actions to the
-//! autopilot), [`landing_target`] (the other way to land, by the autopilot's own precision landing),
-//! [`limits`] (the autopilot's parameters for setpoints), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and counted, [`note_file`] what must survive a
-//! crash, [`wire`]
-//! converts messages into the lander's types and back.
+//! of the detector by health and [`agreement`], the [`cameras`], and the [`refusals`] that last), [`mission`]
+//! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`landing_target`] (the
+//! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
+//! setpoints), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and
+//! counted, [`note_file`] what must survive a crash, [`wire`] converts messages into the lander's types and
+//! back.
 
+pub mod agreement;
 pub mod alarms;
+pub mod cameras;
 pub mod config;
 pub mod flight;
 pub mod frames;
@@ -21,6 +24,7 @@ pub mod landing_target;
 pub mod limits;
 pub mod mission;
 pub mod note_file;
+pub mod refusals;
 pub mod selection;
 pub mod service;
 pub mod setpoints;

@@ -10,6 +10,9 @@ use std::collections::VecDeque;
 
 use messages::{Candidate, DetectorState, Place};
 
+use crate::agreement::{self, Dispute, Fault, Sight, Sights, Tolerance, Voter, distance, within};
+use crate::refusals::Warning;
+
 /// Silence after which a detector that has gone is forgotten, in nanoseconds.
 const GONE_TIMEOUT_NS: i64 = 10_000_000_000;
 /// Silence after which a detector whose presence was not withdrawn is forgotten, until its next message, in
@@ -17,10 +20,16 @@ const GONE_TIMEOUT_NS: i64 = 10_000_000_000;
 const SILENT_TIMEOUT_NS: i64 = 60_000_000_000;
 /// Maximum length of a service's name, in bytes.
 const MAX_NAME_BYTES: usize = 64;
-/// Maximum number of detectors; more are a mistake in the network.
+/// Maximum number of detectors; of more, the better ones are kept.
 pub const MAX_DETECTORS: usize = 64;
 /// Maximum number of frames and intervals kept for each detector.
 const MAX_SAMPLES: usize = 16;
+/// Maximum number of frames whose markers are kept for each detector: some search only every other frame.
+const MAX_SIGHTS: usize = 32;
+/// Maximum number of detectors that are warned of.
+const MAX_WARNINGS: usize = 4;
+/// Time for which it is told that there is no room for a name, in nanoseconds.
+const CROWDED_NS: i64 = 5_000_000_000;
 /// Maximum number of comparisons with the active detector kept for each detector.
 pub const MAX_VERDICTS: usize = 30;
 /// Minimum number of comparisons, or of frame intervals, for a conclusion.
@@ -54,6 +63,27 @@ pub struct Limits {
     pub tolerance_per_m: f64,
 }
 
+impl Limits {
+    fn tolerance(&self) -> Tolerance {
+        Tolerance { base_m: self.tolerance_m, per_m: self.tolerance_per_m }
+    }
+}
+
+/// What a detector is worth when there is no room for all; a better one takes the place of a worse one.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Worth {
+    /// It has gone.
+    Nothing,
+    /// It is there.
+    Present,
+    /// It searches frames.
+    Answers,
+    /// It sees the marker.
+    Sees,
+    /// It is used, or preferred.
+    Preferred,
+}
+
 /// The operator's preference.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Preference {
@@ -61,13 +91,6 @@ pub struct Preference {
     pub detector: Option<String>,
     /// Then those that run there.
     pub place: Option<Place>,
-}
-
-/// The marker as a detector sees it.
-#[derive(Copy, Clone, Debug, PartialEq)]
-pub struct Sight {
-    /// Its position in the vehicle's body frame, in metres; `None` without a pose.
-    pub position_m: Option<[f64; 3]>,
 }
 
 /// The known detectors and the active one.
@@ -82,6 +105,12 @@ pub struct Selection {
     newest_used_ns: i64,
     changes: u64,
     why: String,
+    /// Another detector that sees the marker elsewhere.
+    dispute: Option<Dispute>,
+    /// Detectors against which the operator has chosen the preferred one.
+    overruled: Vec<String>,
+    /// When there was no room for a further name.
+    crowded_ns: Option<i64>,
 }
 
 #[derive(Debug)]
@@ -102,9 +131,11 @@ struct Known {
     failed_ns: i64,
     intervals_ns: VecDeque<i64>,
     latencies_ns: VecDeque<i64>,
-    sights: VecDeque<(i64, Option<Sight>)>,
+    sights: Sights,
     verdicts: VecDeque<bool>,
     disagreement_m: Option<f64>,
+    /// Why it is not believed although it answers.
+    fault: Option<Fault>,
 }
 
 impl Selection {
@@ -119,6 +150,9 @@ impl Selection {
             newest_used_ns: i64::MIN,
             changes: 0,
             why: "no detector yet".to_owned(),
+            dispute: None,
+            overruled: Vec::new(),
+            crowded_ns: None,
         }
     }
 
@@ -132,7 +166,8 @@ impl Selection {
         sight: Option<Sight>,
     ) -> bool {
         let others_ns = self.newest_of_others_ns(name);
-        let Some(known) = self.known_mut(now_ns, name) else { return false };
+        let worth = if sight.is_some() { Worth::Sees } else { Worth::Answers };
+        let Some(known) = self.known_mut(now_ns, name, worth) else { return false };
         let is_newer = stamp_ns > known.stamp_ns;
         if is_newer {
             known.take(now_ns, stamp_ns, sight, others_ns);
@@ -149,7 +184,8 @@ impl Selection {
 
     /// A detector came or went.
     pub fn presence(&mut self, now_ns: i64, name: &str, alive: bool) {
-        if let Some(known) = self.known_mut(now_ns, name) {
+        let worth = if alive { Worth::Present } else { Worth::Nothing };
+        if let Some(known) = self.known_mut(now_ns, name, worth) {
             known.alive = alive;
             known.gone_ns = if alive { i64::MIN } else { now_ns };
         }
@@ -158,7 +194,7 @@ impl Selection {
 
     /// Sets where a detector runs.
     pub fn set_place(&mut self, now_ns: i64, name: &str, place: Place) {
-        if let Some(known) = self.known_mut(now_ns, name) {
+        if let Some(known) = self.known_mut(now_ns, name, Worth::Present) {
             known.place = Some(place);
         }
         self.choose(now_ns);
@@ -181,6 +217,8 @@ impl Selection {
         let doubt = known.doubt();
         self.preference.detector = Some(name.to_owned());
         self.is_requested = true;
+        // Who names one while two disagree has decided.
+        self.overruled = self.in_dispute().filter(|other| other != name).collect();
         self.choose(now_ns);
         Ok(match (trouble, doubt) {
             (Some(trouble), _) => {
@@ -196,6 +234,7 @@ impl Selection {
     /// Prefers detectors that run at a place while they are healthy; the answer says what that means now.
     pub fn prefer_place(&mut self, now_ns: i64, place: Place) -> String {
         self.preference = Preference { detector: None, place: Some(place) };
+        self.overruled.clear();
         self.is_requested = true;
         self.choose(now_ns);
         let there: Vec<_> = self.known.iter().filter(|known| known.place == Some(place)).collect();
@@ -214,6 +253,7 @@ impl Selection {
             let timeout_ns = if known.alive { SILENT_TIMEOUT_NS } else { GONE_TIMEOUT_NS };
             now_ns.saturating_sub(known.received_ns) < timeout_ns
         });
+        self.compare_all(now_ns);
         self.choose(now_ns);
     }
 
@@ -252,6 +292,47 @@ impl Selection {
     /// True when no detector is alive: there will be no detections until one comes.
     pub fn is_blind(&self) -> bool {
         !self.known.iter().any(|known| known.alive)
+    }
+
+    /// A detector that sees the marker elsewhere than the active one, while nobody says which is right.
+    pub fn dispute(&self) -> Option<&Dispute> {
+        self.dispute.as_ref()
+    }
+
+    /// What the operator should know of the detectors.
+    pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
+        let mut warnings = Vec::new();
+        let mut warn = |matter: String, text: String| warnings.push(Warning { matter, text });
+        if let Some(Dispute { active, other, apart_m }) = &self.dispute {
+            warn(
+                format!("dispute {other}"),
+                format!(
+                    "detectors `{active}` (used) and `{other}` see the marker {apart_m:.2} m apart; stop the wrong one, or name the right one (`alight detectors use`)"
+                ),
+            );
+        }
+        let faulty = self.known.iter().filter_map(|known| Some((known, known.fault.as_ref()?)));
+        for (known, fault) in faulty.take(MAX_WARNINGS) {
+            let (name, is_preferred) = (&known.name, self.rank(known) == 2);
+            match fault {
+                Fault::Outvoted { .. } => {
+                    let text = format!("detector `{name}` is not used: {}", said(fault));
+                    warn(format!("outvoted {name}"), text);
+                }
+                Fault::Blind { .. } if is_preferred => {
+                    let text =
+                        format!("the preferred detector `{name}` is passed over: {}", said(fault));
+                    warn(format!("blind {name}"), text);
+                }
+                Fault::Blind { .. } => {}
+            }
+        }
+        if self.crowded_ns.is_some_and(|at| now_ns.saturating_sub(at) < CROWDED_NS) {
+            let text =
+                format!("more than {MAX_DETECTORS} detectors are heard; somebody invents them");
+            warn("crowded".to_owned(), text);
+        }
+        warnings
     }
 
     /// True for a known detector.
@@ -295,15 +376,86 @@ impl Selection {
         others.map(|known| known.stamp_ns).max().unwrap_or(i64::MIN)
     }
 
-    fn known_mut(&mut self, now_ns: i64, name: &str) -> Option<&mut Known> {
+    fn known_mut(&mut self, now_ns: i64, name: &str, worth: Worth) -> Option<&mut Known> {
         if let Some(index) = self.known.iter().position(|known| known.name == name) {
             return self.known.get_mut(index);
         }
-        if self.known.len() >= MAX_DETECTORS || name.is_empty() || name.len() > MAX_NAME_BYTES {
+        if name.is_empty() || name.len() > MAX_NAME_BYTES {
             return None;
+        }
+        if self.known.len() >= MAX_DETECTORS {
+            self.crowded_ns = Some(now_ns);
+            let is_preferred = self.preference.detector.as_deref() == Some(name);
+            let worth = if is_preferred { Worth::Preferred } else { worth };
+            let worths = self.known.iter().map(|known| self.worth(now_ns, known)).enumerate();
+            let (index, _) =
+                worths.min_by_key(|(_, worth)| *worth).filter(|(_, it)| *it < worth)?;
+            self.known.swap_remove(index);
         }
         self.known.push(Known::new(now_ns, name));
         self.known.last_mut()
+    }
+
+    /// What a known detector is worth when there is no room for another.
+    fn worth(&self, now_ns: i64, known: &Known) -> Worth {
+        let is_recent = now_ns.saturating_sub(known.received_ns) <= MAX_SILENCE_NS;
+        if self.active.as_ref() == Some(&known.name)
+            || self.preference.detector.as_ref() == Some(&known.name)
+        {
+            Worth::Preferred
+        } else if known.alive && is_recent && known.sights.iter().any(|(_, sight)| sight.is_some())
+        {
+            Worth::Sees
+        } else if known.alive && is_recent && known.has_frame() {
+            Worth::Answers
+        } else if known.alive {
+            Worth::Present
+        } else {
+            Worth::Nothing
+        }
+    }
+
+    /// Compares what all detectors that answer saw in the same frames.
+    fn compare_all(&mut self, now_ns: i64) {
+        let tolerance = self.limits.tolerance();
+        let answers: Vec<bool> =
+            self.known.iter().map(|known| self.ailment(now_ns, known).is_none()).collect();
+        let voters: Vec<Voter<'_>> = self
+            .known
+            .iter()
+            .zip(&answers)
+            .filter_map(|(known, answers)| answers.then(|| known.voter()))
+            .collect();
+        let mut faults = agreement::faults(&voters, tolerance).into_iter();
+        let found: Vec<Option<Fault>> = answers
+            .iter()
+            .map(|answers| if *answers { faults.next().flatten() } else { None })
+            .collect();
+        for (known, fault) in self.known.iter_mut().zip(found) {
+            known.fault = fault;
+        }
+        self.dispute =
+            self.known_active().filter(|active| active.fault.is_none()).and_then(|active| {
+                let others: Vec<Voter<'_>> = self
+                    .known
+                    .iter()
+                    .zip(&answers)
+                    .filter(|(known, answers)| {
+                        let is_other =
+                            known.name != active.name && !self.overruled.contains(&known.name);
+                        let is_outvoted = matches!(known.fault, Some(Fault::Outvoted { .. }));
+                        **answers && is_other && !is_outvoted
+                    })
+                    .map(|(known, _)| known.voter())
+                    .collect();
+                agreement::dispute(active.voter(), &others, tolerance)
+            });
+    }
+
+    /// Both detectors of a dispute.
+    fn in_dispute(&self) -> impl Iterator<Item = String> + use<> {
+        let names = self.dispute.as_ref().map(|it| [it.active.clone(), it.other.clone()]);
+        names.into_iter().flatten()
     }
 
     /// Compares the marker positions in one frame: the active detector's with all others', or another's with
@@ -324,8 +476,13 @@ impl Selection {
         }
     }
 
-    /// Why a detector is not healthy.
+    /// Why a detector is not healthy, or not believed.
     fn trouble(&self, now_ns: i64, known: &Known) -> Option<String> {
+        self.ailment(now_ns, known).or_else(|| known.fault.as_ref().map(said))
+    }
+
+    /// Why a detector is not healthy.
+    fn ailment(&self, now_ns: i64, known: &Known) -> Option<String> {
         if !known.alive {
             return Some("it has gone".to_owned());
         }
@@ -435,8 +592,11 @@ impl Selection {
             return Some((first.name.clone(), "it is the first".to_owned()));
         };
         if let Some(failure) = self.failure(now_ns, active) {
-            let order =
-                |known: &&Known| (known.doubt().is_none(), self.rank(known), known.stamp_ns);
+            // Whoever agreed with one that is not believed is no better.
+            let is_believed = active.fault.is_none();
+            let order = |known: &&Known| {
+                (!is_believed || known.doubt().is_none(), self.rank(known), known.stamp_ns)
+            };
             // A silent or late one stays while none is better; one that has gone is replaced by any live one.
             let next = healthy().max_by_key(order).or_else(|| {
                 let alive = others().filter(|known| known.alive && !active.alive);
@@ -478,7 +638,12 @@ impl Known {
             sights: VecDeque::new(),
             verdicts: VecDeque::new(),
             disagreement_m: None,
+            fault: None,
         }
+    }
+
+    fn voter(&self) -> Voter<'_> {
+        Voter { name: &self.name, sights: &self.sights }
     }
 
     /// Registers a newer frame.
@@ -487,7 +652,7 @@ impl Known {
             keep(&mut self.intervals_ns, now_ns.saturating_sub(self.received_ns), MAX_SAMPLES);
         }
         keep(&mut self.latencies_ns, now_ns.saturating_sub(stamp_ns).max(0), MAX_SAMPLES / 2);
-        keep(&mut self.sights, (stamp_ns, sight), MAX_SAMPLES);
+        keep(&mut self.sights, (stamp_ns, sight), MAX_SIGHTS);
         self.received_ns = now_ns;
         self.stamp_ns = stamp_ns;
         self.overtaken_ns = (others_ns > stamp_ns).then_some(now_ns);
@@ -524,8 +689,7 @@ impl Known {
             (Some(active_m), Some(Some(ours_m))) => {
                 let apart_m = distance(active_m, ours_m);
                 self.disagreement_m = Some(apart_m);
-                let range_m = distance(active_m, [0.0; 3]);
-                apart_m <= limits.tolerance_m + limits.tolerance_per_m * range_m
+                within(limits.tolerance(), active_m, apart_m)
             }
             // Without poses there is no distance; both see the marker.
             (None, Some(None)) => true,
@@ -560,6 +724,12 @@ fn median(values: &VecDeque<i64>) -> Option<i64> {
     sorted.get(sorted.len() / 2).copied()
 }
 
-fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+/// A fault as text.
+fn said(fault: &Fault) -> String {
+    match fault {
+        Fault::Outvoted { by, apart_m } => {
+            format!("{by} others see the marker {apart_m:.2} m from where it does")
+        }
+        Fault::Blind { seeing } => format!("it sees no marker where `{seeing}` sees one"),
+    }
 }

@@ -98,7 +98,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                 // The requester may be gone, and the setpoints do not wait for it.
                 tokio::spawn(async move { request.answer(&reply).await });
             }
-            Some(info) = cameras.next() => flight.camera(info),
+            Some(info) = cameras.next() => flight.camera(now_ns(), info),
             Some(message) = to_autopilot.next() => {
                 if pass_up(&node, &mut flight, permission, &message.packet)
                     && link.send_spare(&message.packet).is_err()

@@ -99,6 +99,12 @@ impl View<'_> {
             detections_used: self.used.count,
             latency_ms: self.journal.latency_ms(),
             setpoint_timeout_s: limits::timeout_s(self.autopilot),
+            warnings: self
+                .frames
+                .warnings(now_ns)
+                .into_iter()
+                .map(|warning| warning.text)
+                .collect(),
         }
     }
 

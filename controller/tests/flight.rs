@@ -376,7 +376,7 @@ fn parameter(flight: &mut Flight, now_ns: i64, name: &str, value: f32) {
 
 fn landing_target(start: &str) -> Flight {
     let mut flight = flight_with(start, &["mode=landing-target"]);
-    flight.camera(CameraInfo::sample());
+    flight.camera(0, CameraInfo::sample());
     flight.presence(0, "main", true);
     receive(&mut flight, 0, &heartbeat(4, true));
     receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
@@ -443,6 +443,85 @@ fn the_pilots_landing_gets_the_target_and_is_recalled_from_high_up() {
     let sent = hover(&mut flight, 5020, 5500, 9);
     assert_eq!(sent.modes, [4.0], "GUIDED");
     assert_eq!(flight.status(5500 * MS).phase, Phase::Aborted);
+}
+
+#[test]
+fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
+    let mut flight = in_flight("command");
+    flight.camera(0, CameraInfo::sample());
+    let foreign = |stamp_ns| Detections {
+        header: FrameHeader { clock: "monotonic/myhost".into(), ..header(stamp_ns) },
+        ..Detections::sample()
+    };
+    for ms in (20..1600).step_by(20) {
+        pose(&mut flight, ms * MS);
+        if ms % 60 == 0 {
+            flight.detections(ms * MS, "main", &foreign(ms * MS));
+        }
+        flight.tick(ms * MS + 3);
+    }
+    let status = flight.status(1600 * MS);
+    let told = status.warnings.join("; ");
+    assert!(told.contains("monotonic/myhost") && told.contains(clock_name()), "{told}");
+    let reply = flight.command(1600 * MS, &ControllerCommand::Start);
+    assert!(!reply.accepted && reply.reason.contains("monotonic/myhost"), "{reply:?}");
+    // With the right clock nothing is in the way any more.
+    hover(&mut flight, 1600, 4000, 4);
+    assert_eq!(flight.status(4000 * MS).warnings, Vec::<String>::new());
+    let reply = flight.command(4000 * MS, &ControllerCommand::Start);
+    assert!(reply.accepted, "{reply:?}");
+}
+
+#[test]
+fn a_strangers_calibration_is_refused_in_flight_and_told() {
+    let mut flight = in_flight("airborne");
+    flight.camera(0, CameraInfo::sample());
+    flight.presence(0, "main", true);
+    hover(&mut flight, 20, 1000, 4);
+    for ms in (1000..2500).step_by(20) {
+        let focal_px = Some([400.0; 2]);
+        flight.camera(ms * MS, CameraInfo { focal_px, ..CameraInfo::sample() });
+        flight.camera(ms * MS + 1, CameraInfo::sample());
+        hover(&mut flight, ms, ms + 20, 4);
+    }
+    let status = flight.status(2500 * MS);
+    assert!(status.warnings.iter().any(|text| text.contains("400.0")), "{status:?}");
+    assert!(matches!(status.phase, Phase::Approach | Phase::Descend), "{status:?}");
+}
+
+#[test]
+fn while_two_detectors_see_the_marker_at_two_places_nothing_descends_near_the_ground() {
+    let descent = |height_m: f32, lie_m: f64| {
+        let mut flight = flight("airborne");
+        flight.camera(0, CameraInfo::sample());
+        flight.presence(0, "main", true);
+        receive(&mut flight, 0, &heartbeat(4, true));
+        receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        for ms in (20..4000).step_by(20) {
+            if ms % 1000 == 0 {
+                receive(&mut flight, ms * MS, &heartbeat(4, true));
+            }
+            pose_at(&mut flight, ms * MS, height_m);
+            if ms % 60 == 0 {
+                for (name, lie_m) in [("main", 0.0), ("other", lie_m)] {
+                    let mut seen = Detections { detector: name.into(), ..seen(ms * MS - 40 * MS) };
+                    let pose = seen.detections[0].pose.as_mut().unwrap();
+                    pose.camera_from_marker.translation_m = [lie_m, 0.0, f64::from(height_m)];
+                    flight.detections(ms * MS + 2, name, &seen);
+                }
+            }
+            flight.tick(ms * MS + 3);
+        }
+        let status = flight.status(4000 * MS);
+        (status.setpoint.unwrap().velocity_ned_m_s[2], status)
+    };
+    let (down_m_s, status) = descent(2.0, 0.0);
+    assert!(down_m_s > 0.0, "{status:?}");
+    let (down_m_s, status) = descent(2.0, 1.0);
+    assert!(down_m_s < 0.0 && status.why.contains("at two places"), "{status:?}");
+    assert!(status.warnings[0].contains("1.00 m apart"), "{status:?}");
+    let (down_m_s, status) = descent(6.0, 1.0);
+    assert!(down_m_s > 0.0, "high up it goes on: {status:?}");
 }
 
 #[test]

@@ -2,9 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
+use controller::agreement::Sight;
 use controller::selection::{
     Limits, MAX_DETECTORS, MAX_SILENCE_NS, MAX_VERDICTS, MIN_SILENCE_NS, Preference, Selection,
-    Sight,
 };
 use messages::{DetectorState, Place};
 use proptest::prelude::*;
@@ -292,7 +292,10 @@ fn where_the_active_one_sees_nothing_agreement_is_not_concluded() {
     let mut bench = Bench::new(preferring(None, None));
     let seen = Some(Sight { position_m: None });
     for i in 0..20 {
-        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, None), ("spare", 35 * MS, seen)]);
+        // Rarely enough that the active one is not passed over for it.
+        let spare = seen.filter(|_| i % 4 == 0);
+        let main = seen.filter(|_| false);
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, main), ("spare", 35 * MS, spare)]);
     }
     let compared = |bench: &Bench| {
         let spare = bench.selection.candidates(bench.now_ns).pop().unwrap();
@@ -339,6 +342,144 @@ fn those_that_left_are_forgotten_and_a_flood_of_names_is_bounded() {
     selection.tick(later);
     assert!(!selection.received(later, &"d".repeat(65), later, None), "no name of a service");
     assert!(selection.received(later, "main", later, None));
+}
+
+/// The marker 5 m below, displaced to the north.
+fn at(north_m: f64) -> Option<Sight> {
+    Some(Sight { position_m: Some([north_m, 0.0, 5.0]) })
+}
+
+/// The first time at which a warning of the detectors has this word, in milliseconds.
+fn warned_ms(
+    bench: &mut Bench,
+    frames: std::ops::Range<i64>,
+    answers: &[(&str, i64, Option<Sight>)],
+    word: &str,
+) -> Option<i64> {
+    let began_ns = frames.start * PERIOD;
+    for i in frames {
+        bench.frame_seen(i * PERIOD, answers);
+        if bench.selection.warnings(bench.now_ns).iter().any(|warning| warning.text.contains(word))
+        {
+            return Some((bench.now_ns - began_ns) / MS);
+        }
+    }
+    None
+}
+
+#[test]
+fn two_that_disagree_are_told_within_a_second_and_until_they_agree_again() {
+    let mut bench = Bench::new(preferring(Some("liar"), None));
+    let honest = ("main", 30 * MS, at(0.0));
+    for i in 0..60 {
+        bench.frame_seen(i * PERIOD, &[honest, ("liar", 35 * MS, at(0.02))]);
+    }
+    assert_eq!(bench.selection.active(), Some("liar"));
+    assert_eq!(bench.selection.dispute(), None);
+    let lie = ("liar", 35 * MS, at(1.0));
+    let took_ms = warned_ms(&mut bench, 60..90, &[honest, lie], "1.00 m apart").unwrap();
+    assert!(took_ms < 1000, "{took_ms} ms");
+    let dispute = bench.selection.dispute().unwrap().clone();
+    assert_eq!((dispute.active.as_str(), dispute.other.as_str()), ("liar", "main"));
+    // One that only sees the marker more rarely, or less precisely, disputes nothing.
+    for i in 100..140 {
+        let rarely = at(0.1).filter(|_| i % 3 == 0);
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, rarely), ("liar", 35 * MS, at(0.0))]);
+    }
+    assert_eq!(bench.selection.dispute(), None);
+    assert!(bench.selection.warnings(bench.now_ns).is_empty());
+}
+
+#[test]
+fn who_names_a_detector_in_a_dispute_has_decided_it() {
+    let mut bench = Bench::new(preferring(None, None));
+    let answers = [("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))];
+    for i in 0..20 {
+        bench.frame_seen(i * PERIOD, &answers);
+    }
+    assert!(bench.selection.dispute().is_some());
+    bench.selection.prefer(bench.now_ns, "spare").unwrap();
+    for i in 20..40 {
+        bench.frame_seen(i * PERIOD, &answers);
+    }
+    assert_eq!((bench.selection.active(), bench.selection.dispute()), (Some("spare"), None));
+}
+
+#[test]
+fn of_three_the_one_that_sees_the_marker_elsewhere_is_outvoted_even_if_it_is_preferred() {
+    let mut bench = Bench::new(preferring(Some("liar"), None));
+    let [first, second] = [("first", 30 * MS, at(0.0)), ("second", 25 * MS, at(0.03))];
+    for i in 0..60 {
+        bench.frame_seen(i * PERIOD, &[first, second, ("liar", 35 * MS, at(0.01))]);
+    }
+    assert_eq!(bench.selection.active(), Some("liar"));
+    let lie = ("liar", 35 * MS, at(1.0));
+    let took_ms =
+        warned_ms(&mut bench, 60..90, &[first, second, lie], "2 others see the marker").unwrap();
+    assert!(took_ms < 1000, "{took_ms} ms");
+    for i in 90..150 {
+        bench.frame_seen(i * PERIOD, &[first, second, lie]);
+    }
+    let active = bench.selection.active().unwrap().to_owned();
+    assert_ne!(active, "liar");
+    assert!(bench.selection.why().contains("liar: 2 others see"), "{}", bench.selection.why());
+    assert_eq!((bench.selection.dispute(), bench.state("liar")), (None, DetectorState::Stale));
+}
+
+#[test]
+fn a_preferred_one_that_sees_nothing_is_passed_over_and_told() {
+    let mut bench = Bench::new(preferring(Some("blind"), None));
+    let answers = [("main", 30 * MS, at(0.0)), ("blind", 20 * MS, None)];
+    let took_ms = warned_ms(&mut bench, 0..40, &answers, "`blind` is passed over").unwrap();
+    assert!(took_ms < 1500, "{took_ms} ms");
+    for i in 40..120 {
+        bench.frame_seen(i * PERIOD, &answers);
+    }
+    assert_eq!((bench.selection.active(), bench.selection.dispute()), (Some("main"), None));
+    // Where nobody sees the marker, nobody is blind.
+    for i in 120..240 {
+        bench.frame_seen(i * PERIOD, &[("main", 30 * MS, None), ("blind", 20 * MS, None)]);
+    }
+    assert!(bench.selection.warnings(bench.now_ns).is_empty());
+    assert_eq!(bench.selection.active(), Some("blind"));
+}
+
+#[test]
+fn names_are_crowded_out_by_better_ones_only() {
+    let mut bench = Bench::new(preferring(Some("preferred"), None));
+    let names: Vec<String> = (0..70).map(|i| format!("invented{i}")).collect();
+    for name in &names {
+        bench.selection.presence(0, name, true);
+    }
+    let invented: Vec<_> = names.iter().map(|name| (name.as_str(), 10 * MS, None)).collect();
+    let mut all = invented.clone();
+    all.push(("main", 30 * MS, at(0.0)));
+    for i in 0..40 {
+        bench.frame_seen(i * PERIOD, &all);
+    }
+    assert_eq!(
+        bench.selection.active(),
+        Some("main"),
+        "it sees the marker, the invented ones do not"
+    );
+    assert!(
+        bench
+            .selection
+            .warnings(bench.now_ns)
+            .iter()
+            .any(|warning| warning.text.contains("invents"))
+    );
+    // It starts again, and the preferred one comes.
+    bench.gone("main");
+    for i in 40..70 {
+        bench.frame_seen(i * PERIOD, &invented);
+    }
+    assert!(bench.selection.candidates(bench.now_ns).len() <= MAX_DETECTORS);
+    all.push(("preferred", 35 * MS, at(0.0)));
+    for i in 70..120 {
+        bench.frame_seen(i * PERIOD, &all);
+    }
+    assert_eq!(bench.selection.active(), Some("preferred"));
 }
 
 /// What can happen, after some time.

@@ -34,6 +34,8 @@ const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
 const INFO_PERIOD: Duration = Duration::from_secs(1);
 /// A frame that is older than the newest by more than this belongs to a camera that began anew, in nanoseconds.
 const OVERTAKEN_NS: i64 = 1_000_000_000;
+/// Silence after which a camera's calibration may be replaced: cameras repeat it every second.
+const CAMERA_SILENT: Duration = Duration::from_millis(3500);
 /// Time for the answer to a last command to leave.
 const FAREWELL: Duration = Duration::from_millis(100);
 
@@ -54,8 +56,12 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let (stopped, thread) = work.start()?;
     node.announce().await?;
     let follow_camera = async {
+        let mut heard = Instant::now();
         while let Some(info) = infos.next().await {
-            *lock(&camera) = Some(info);
+            if accept(&node, lock(&camera).as_ref(), &info, heard.elapsed()) {
+                heard = Instant::now();
+                *lock(&camera) = Some(info);
+            }
         }
     };
     let obey = async {
@@ -89,6 +95,35 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
 // What a thread that panicked has left is still one whole value.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Whether a camera's information is used: not what no camera can have, and not another calibration while the
+/// present one is still repeated, which was heard `silence` ago. Who publishes it is not known here.
+fn accept(node: &Node, known: Option<&CameraInfo>, info: &CameraInfo, silence: Duration) -> bool {
+    let camera = &info.camera;
+    if let Some(problem) = info.problem() {
+        if node.health().failed("camera info that cannot be") {
+            tracing::warn!(
+                camera,
+                problem,
+                "Camera information refused (further ones are counted)"
+            );
+        }
+        return false;
+    }
+    let Some(difference) = known.and_then(|known| known.difference(info)) else { return true };
+    if silence >= CAMERA_SILENT {
+        tracing::warn!(camera, difference, "Camera started again with another calibration");
+        return true;
+    }
+    if node.health().failed("another camera info") {
+        tracing::warn!(
+            camera,
+            difference,
+            "Two programs give this camera different calibrations; the first is used (further ones are counted)"
+        );
+    }
+    false
 }
 
 /// What this detector says about itself.

@@ -8,6 +8,8 @@ use messages::{ControllerStatus, Phase};
 const MAX_TEXT: usize = 199;
 /// Maximum number of texts sent at once.
 const MAX_BURST: u32 = 6;
+/// Maximum number of warnings that are followed.
+const MAX_WARNINGS: usize = 16;
 /// Time after which one more text may be sent, in nanoseconds.
 const REFILL_NS: i64 = 500_000_000;
 
@@ -18,6 +20,8 @@ pub(crate) struct StatusTextSender {
     last: Option<String>,
     /// The last active detector; none before the first.
     detector: Option<String>,
+    /// The warnings that were sent and still hold, without digits.
+    warnings: Vec<String>,
     tokens: u32,
     refilled_ns: i64,
     next_id: u16,
@@ -26,7 +30,14 @@ pub(crate) struct StatusTextSender {
 impl StatusTextSender {
     /// A sender that has sent nothing.
     pub(crate) fn new(now_ns: i64) -> Self {
-        Self { last: None, detector: None, tokens: MAX_BURST, refilled_ns: now_ns, next_id: 1 }
+        Self {
+            last: None,
+            detector: None,
+            warnings: Vec::new(),
+            tokens: MAX_BURST,
+            refilled_ns: now_ns,
+            next_id: 1,
+        }
     }
 
     /// The texts for what is new in a status. What exceeds the rate is sent with a later status, if it still
@@ -38,7 +49,7 @@ impl StatusTextSender {
             false => format!("Alight: {}: {}", status.phase, status.why),
         };
         // A change of digits alone, as of a height, is not sent.
-        let change: String = text.chars().filter(|c| !c.is_ascii_digit()).collect();
+        let change = without_digits(&text);
         if self.last.as_ref() != Some(&change)
             && let Some(text) = self.text(now_ns, severity(status.phase), &text)
         {
@@ -61,7 +72,23 @@ impl StatusTextSender {
                 self.detector.clone_from(&status.active_detector);
             }
         }
+        self.warnings(now_ns, &status.warnings, &mut packets);
         packets
+    }
+
+    /// Adds the packets of new warnings.
+    fn warnings(&mut self, now_ns: i64, warnings: &[String], packets: &mut Vec<MavMessage>) {
+        let matters: Vec<String> = warnings.iter().map(|text| without_digits(text)).collect();
+        self.warnings.retain(|sent| matters.contains(sent));
+        for (text, matter) in warnings.iter().zip(matters).take(MAX_WARNINGS) {
+            if !self.warnings.contains(&matter)
+                && let Some(text) =
+                    self.text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {text}"))
+            {
+                packets.extend(text);
+                self.warnings.push(matter);
+            }
+        }
     }
 
     /// The packets of a text; none when it exceeds the rate.
@@ -86,7 +113,13 @@ impl StatusTextSender {
     pub(crate) fn reset(&mut self) {
         self.last = None;
         self.detector = None;
+        self.warnings.clear();
     }
+}
+
+/// What stays of a text while only numbers change in it.
+fn without_digits(text: &str) -> String {
+    text.chars().filter(|c| !c.is_ascii_digit()).collect()
 }
 
 /// The severity of a phase's text; a ground station reads warnings and worse aloud.
@@ -177,6 +210,21 @@ mod tests {
         assert_eq!(sent[0].1, "Alight: detector main: spare has gone");
         let sent = join(&sender.status(0, &status(Phase::Search, "", None)));
         assert_eq!(sent, [(MavSeverity::MAV_SEVERITY_WARNING, "Alight: no detector".to_owned())]);
+    }
+
+    #[test]
+    fn a_warning_is_sent_once_while_it_holds() {
+        let mut sender = StatusTextSender::new(0);
+        let warned = |apart: &str| ControllerStatus {
+            warnings: vec![format!("`a` and `b` see the marker {apart} m apart")],
+            ..status(Phase::Descend, "", None)
+        };
+        let sent = join(&sender.status(0, &warned("0.82")));
+        let text = "Alight: `a` and `b` see the marker 0.82 m apart".to_owned();
+        assert_eq!(sent[1], (MavSeverity::MAV_SEVERITY_WARNING, text));
+        assert!(sender.status(0, &warned("0.97")).is_empty());
+        assert!(sender.status(0, &status(Phase::Descend, "", None)).is_empty());
+        assert_eq!(sender.status(0, &warned("0.90")).len(), 1, "it has come again");
     }
 
     #[test]

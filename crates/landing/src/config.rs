@@ -216,6 +216,11 @@ settings! {
         retry_climb_m_s: f64 = 0.8, 0.1..=3.0;
         /// Maximum duration of a retry, in s; then the search starts.
         retry_timeout_s: f64 = 8.0, 1.0..=60.0;
+        /// Height over the target above which the vehicle stays while two detectors see the marker at two
+        /// places, in m; 0 lets it descend.
+        dispute_height_m: f64 = 2.5, 0.0..=50.0;
+        /// Maximum time there until the vehicle holds, in s.
+        dispute_timeout_s: f64 = 15.0, 1.0..=600.0;
         /// Interval at which LAND is requested again, in s.
         land_retry_s: f64 = 0.5, 0.1..=5.0;
         /// Maximum wait for the LAND mode, in s; then the landing is aborted.

@@ -29,6 +29,8 @@ pub enum Event {
     LinkDelay(f64),
     /// How the autopilot follows setpoints has become known.
     Limits(AutopilotLimits),
+    /// Two detectors see the marker at two places, and nobody says which is right; or no longer.
+    Dispute(bool),
     /// Time has passed.
     Tick,
 }

@@ -29,6 +29,10 @@ const HAND_OVER_S: f64 = 1.0;
 /// Time ahead for which the position is predicted against the fence, in seconds.
 const FENCE_LEAD_S: f64 = 1.0;
 
+/// Height over the one at which it waits for detectors to agree, at which the vehicle counts as waiting, in
+/// metres.
+const DISPUTE_MARGIN_M: f64 = 0.5;
+
 /// Time an aborted landing climbs and holds before it stops sending setpoints, in seconds.
 const CLIMB_AWAY_S: f64 = 60.0;
 
@@ -85,6 +89,8 @@ pub struct Lander {
     square: Option<Square>,
     /// How the autopilot follows setpoints.
     limits: AutopilotLimits,
+    /// Since when two detectors see the marker at two places.
+    disputed: Option<Timestamp>,
 }
 
 /// An expanding square that is being flown.
@@ -139,6 +145,7 @@ impl Lander {
             half_view_rad: None,
             square: None,
             limits: AutopilotLimits::default(),
+            disputed: None,
         })
     }
 
@@ -165,10 +172,17 @@ impl Lander {
                 self.limits = limits.plausible();
                 Ok(())
             }
+            Event::Dispute(is_disputed) => {
+                self.disputed = is_disputed.then(|| self.disputed.unwrap_or(now));
+                Ok(())
+            }
             Event::Operator(_) | Event::Alarm(_) | Event::Tick => Ok(()),
         };
         let operator = if let Event::Operator(command) = event { Some(command) } else { None };
+        let operator =
+            operator.or_else(|| self.is_dispute_over().then_some(OperatorCommand::Resume));
         let alarm = if let Event::Alarm(alarm) = event { Some(self.reaction(alarm)) } else { None };
+        let alarm = alarm.or_else(|| self.dispute_alarm(now));
         if operator == Some(OperatorCommand::Resume) {
             self.repeat_axis_check();
         }
@@ -536,12 +550,49 @@ impl Lander {
         }
     }
 
+    /// True in a hold for a dispute that is over.
+    fn is_dispute_over(&self) -> bool {
+        let is_held = self.state_machine.phase() == Phase::Hold
+            && self.state_machine.reason() == Reason::Disputed;
+        is_held && self.disputed.is_none()
+    }
+
+    /// The hold after too long a wait over the target while detectors see the marker at two places.
+    fn dispute_alarm(&self, now: Timestamp) -> Option<(AlarmAction, Reason)> {
+        let phases = &self.config.phases;
+        let is_low = self.target(now)?.height_m <= phases.dispute_height_m + DISPUTE_MARGIN_M;
+        let is_steered = matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend);
+        let is_long =
+            self.disputed.is_some_and(|since| now.seconds_since(since) > phases.dispute_timeout_s);
+        (is_low && is_steered && is_long).then_some((AlarmAction::Hold, Reason::Disputed))
+    }
+
+    /// The velocity while detectors see the marker at two places: not below a height from which the vehicle
+    /// can still be led to either, and back up to it.
+    fn disputed_velocity(&self, height_m: f64, wanted: Vector<Ned>) -> Vector<Ned> {
+        let phases = &self.config.phases;
+        let above_m = height_m - phases.dispute_height_m;
+        let down_m_s = above_m.clamp(-phases.retry_climb_m_s, f64::MAX);
+        Vector::new(wanted.x(), wanted.y(), wanted.z().min(down_m_s))
+    }
+
     fn guided(&mut self, now: Timestamp) -> (Action, Reason) {
         let Some(vehicle) = self.history.newest().copied() else {
             return (Action::hover(), Reason::VehicleStale);
         };
         let situation = self.situation(now, &vehicle);
-        let (wanted, mut why) = self.guidance.velocity(&situation);
+        let (mut wanted, mut why) = self.guidance.velocity(&situation);
+        let is_steered = matches!(self.state_machine.phase(), Phase::Approach | Phase::Descend);
+        if self.disputed.is_some()
+            && is_steered
+            && self.config.phases.dispute_height_m > 0.0
+            && let Some(target) = situation.target
+        {
+            let level = self.disputed_velocity(target.height_m, wanted);
+            if level.z() < wanted.z() {
+                (wanted, why) = (level, Reason::Disputed);
+            }
+        }
         let may_descend =
             self.guidance.may_descend(&situation) && situation.level_because.is_none();
         if let Some(reason) = situation.level_because.filter(|_| wanted.z() > 0.0) {

@@ -431,6 +431,7 @@ impl StateMachine {
                 | Reason::BatteryLow
                 | Reason::BatteryCritical
                 | Reason::OperatorLost
+                | Reason::Disputed
         );
         let timeout_s = if by_operator {
             self.config.operator_hold_timeout_s

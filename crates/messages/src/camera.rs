@@ -162,3 +162,91 @@ pub struct CameraInfo {
     /// The mount: the camera frame in the vehicle's body frame (FRD).
     pub body_from_camera: Transform3,
 }
+
+/// Minimum and maximum focal length relative to the image's width.
+const FOCAL_PER_WIDTH: std::ops::RangeInclusive<f64> = 0.05..=50.0;
+/// Maximum width and height of a frame, in pixels.
+const MAX_PIXELS: u32 = 65_535;
+/// Maximum distance of a camera from the body's origin, in metres.
+const MAX_MOUNT_M: f64 = 100.0;
+/// Maximum difference of two numbers of one calibration, relative to their size: they may have been rounded.
+const MAX_DIFFERENCE: f64 = 1e-6;
+
+impl CameraInfo {
+    /// What no camera can have, as text; `None` for what may be one's calibration and mount.
+    pub fn problem(&self) -> Option<String> {
+        let (width, height) = (self.width, self.height);
+        if !(1..=MAX_PIXELS).contains(&width) || !(1..=MAX_PIXELS).contains(&height) {
+            return Some(format!("{width} x {height} pixels"));
+        }
+        if let Some([fx, fy]) = self.focal_px {
+            let is_possible = |f: f64| FOCAL_PER_WIDTH.contains(&(f / f64::from(width)));
+            if !is_possible(fx) || !is_possible(fy) {
+                return Some(format!("focal lengths of {fx} and {fy} pixels"));
+            }
+        }
+        if !self.principal_px.iter().all(|c| c.is_finite()) {
+            return Some(format!("a principal point of {:?}", self.principal_px));
+        }
+        if !self.lens_numbers().iter().all(|k| k.is_finite()) {
+            return Some(format!("a distortion of {:?}", self.lens));
+        }
+        let Transform3 { translation_m, rotation_wxyz } = self.body_from_camera;
+        if !translation_m.iter().all(|m| m.abs() <= MAX_MOUNT_M) {
+            return Some(format!("a mount at {translation_m:?} m"));
+        }
+        let norm = rotation_wxyz.iter().map(|q| q * q).sum::<f64>().sqrt();
+        (!(0.99..=1.01).contains(&norm)).then(|| {
+            format!("a mount of the rotation {rotation_wxyz:?}, which is no unit quaternion")
+        })
+    }
+
+    /// How another calibration of the same camera differs, as text; `None` when it does not.
+    pub fn difference(&self, other: &Self) -> Option<String> {
+        if (self.width, self.height) != (other.width, other.height) {
+            let size = |info: &Self| format!("{} x {}", info.width, info.height);
+            return Some(format!("{} and {} pixels", size(self), size(other)));
+        }
+        let focal = |info: &Self| info.focal_px.unwrap_or_default();
+        if self.focal_px.is_some() != other.focal_px.is_some()
+            || differ(&focal(self), &focal(other))
+        {
+            let text = |info: &Self| match info.focal_px {
+                Some([fx, fy]) => format!("{fx:.1} x {fy:.1}"),
+                None => "none".to_owned(),
+            };
+            return Some(format!("focal lengths {} and {} pixels", text(self), text(other)));
+        }
+        if differ(&self.principal_px, &other.principal_px) {
+            let [ours, theirs] = [self.principal_px, other.principal_px];
+            return Some(format!("principal points {ours:?} and {theirs:?}"));
+        }
+        let is_kind = std::mem::discriminant(&self.lens) == std::mem::discriminant(&other.lens);
+        if !is_kind || differ(&self.lens_numbers(), &other.lens_numbers()) {
+            return Some(format!("distortions {:?} and {:?}", self.lens, other.lens));
+        }
+        let mount = |info: &Self| {
+            let Transform3 { translation_m: [x, y, z], rotation_wxyz: [qw, qx, qy, qz] } =
+                info.body_from_camera;
+            // A rotation has two quaternions.
+            let sign = if qw < 0.0 { -1.0 } else { 1.0 };
+            [x, y, z, sign * qw, sign * qx, sign * qy, sign * qz]
+        };
+        let [ours, theirs] = [mount(self), mount(other)];
+        differ(&ours, &theirs).then(|| format!("mounts {ours:?} and {theirs:?}"))
+    }
+
+    fn lens_numbers(&self) -> Vec<f64> {
+        match self.lens {
+            LensModel::Pinhole => Vec::new(),
+            LensModel::BrownConrady(k) => k.to_vec(),
+            LensModel::KannalaBrandt(k) => k.to_vec(),
+        }
+    }
+}
+
+fn differ(ours: &[f64], theirs: &[f64]) -> bool {
+    let apart =
+        |(a, b): (&f64, &f64)| (a - b).abs() > MAX_DIFFERENCE * a.abs().max(b.abs()).max(1.0);
+    ours.len() != theirs.len() || ours.iter().zip(theirs).any(apart)
+}

@@ -9,7 +9,7 @@ use crate::detector::Place;
 
 wire! {
     TargetEstimate = 6 v 2;
-    ControllerStatus = 7 v 4;
+    ControllerStatus = 7 v 5;
     ControllerCommand = 8 v 3;
     CommandReply = 9 v 1;
 }
@@ -191,6 +191,8 @@ pub struct ControllerStatus {
     pub latency_ms: Option<[f64; 2]>,
     /// Time after which the autopilot stops when setpoints stop, in seconds; none while it is not known.
     pub setpoint_timeout_s: Option<f64>,
+    /// What the operator should know, as sentences: what is refused, and detectors that disagree.
+    pub warnings: Vec<String>,
 }
 
 /// A command to the controller.

@@ -236,10 +236,11 @@ fn controller_status() {
         detections_used: 9,
         latency_ms: Some([1.0, 2.0]),
         setpoint_timeout_s: Some(0.5),
+        warnings: vec!["x".into()],
     };
     check(
         &message,
-        "41070402040177066d6574726963026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e0000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f000000000000004001000000000000e03f",
+        "41070502040177066d6574726963026f6b01046d61696e01790667726f756e640201046d61696e000100000000000000f03f00000000000000400000000000002e4001000f0e0000000100000000000000000000000000000000000000000000000000000000000000000000000901000000000000f03f000000000000004001000000000000e03f010178",
     );
 }
 
@@ -411,6 +412,62 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         clock,
         bytes: 20_000,
     };
+    let status = ControllerStatus {
+        stamp_ns: 1_000_000_000,
+        phase: Phase::Descend,
+        why: "w".into(),
+        guidance: "metric".into(),
+        autopilot: "a".into(),
+        active_detector: Some("main".into()),
+        detector_why: "d".into(),
+        preference: String::new(),
+        detector_changes: 0,
+        candidates: vec![Candidate {
+            state: DetectorState::Active,
+            age_ms: 64.0,
+            latency_ms: 32.0,
+            rate_hz: 16.0,
+            ..Candidate::sample()
+        }],
+        detection_age_ms: Some(64.0),
+        height_m: Some(4.0),
+        lateral_error_m: Some(0.25),
+        setpoint: Some(Setpoint { velocity_ned_m_s: [0.0, 0.0, 1.0], yaw_rate_rad_s: 0.0 }),
+        started_ns: Some(300),
+        disarmed_ns: None,
+        finished: false,
+        detections_used: 300,
+        latency_ms: Some([32.0, 64.0]),
+        setpoint_timeout_s: Some(0.5),
+        warnings: vec!["x".into()],
+    };
+    let target = TargetEstimate { stamp_ns: 1_000_000_000, ..TargetEstimate::sample() };
+    let vehicle = VehicleState {
+        stamp_ns: 1_000_000_000,
+        ned_from_body_wxyz: [1.0, 0.0, 0.0, 0.0],
+        position_ned_m: [0.0, 0.0, -4.0],
+        velocity_ned_m_s: [0.0, 0.0, 1.0],
+        mode: "GUIDED".into(),
+        armed: true,
+        landed: LandedState::InAir,
+        battery: Some(0.5),
+    };
+    let health = Health {
+        service: "detector".into(),
+        instance: "main".into(),
+        host: "pi".into(),
+        version: "0.1.0".into(),
+        clock: header.clock.clone(),
+        stamp_ns: 1_000_000_000,
+        pid: 300,
+        cpu_s: 1.0,
+        uptime_s: 2.0,
+        rates: vec![Rate { name: "frames".into(), count: 30, hz: 15.0 }],
+        latencies: vec![Latency { name: "detect".into(), p50_ms: 2.0, p99_ms: 4.0 }],
+        drops: vec![Count { reason: "x".into(), count: 1 }],
+        errors: Vec::new(),
+    };
+    let named = ControllerCommand::UseDetector("main".into());
     vec![
         ("FrameHeader", encode(&header)),
         ("CameraInfo", encode(&camera)),
@@ -420,6 +477,11 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         ("DetectorCommand Stop", encode(&DetectorCommand::Stop)),
         ("CommandReply", encode(&reply)),
         ("FrameAck", encode(&ack)),
+        ("ControllerStatus", encode(&status)),
+        ("ControllerCommand UseDetector", encode(&named)),
+        ("TargetEstimate", encode(&target)),
+        ("VehicleState", encode(&vehicle)),
+        ("Health", encode(&health)),
     ]
 }
 

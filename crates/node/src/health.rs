@@ -70,6 +70,11 @@ impl HealthCounters {
         }
     }
 
+    /// Failures of this reason so far.
+    pub fn failures(&self, reason: &str) -> u64 {
+        self.lock().errors.get(reason).copied().unwrap_or(0)
+    }
+
     /// Median and 99th percentile of a latency, in milliseconds.
     pub fn percentiles(&self, name: &'static str) -> Option<[f64; 2]> {
         self.lock().latencies.get(name).and_then(percentiles)

@@ -85,7 +85,7 @@ impl LockstepFlight {
         let mut controller = Flight::new(controlled, std::sync::Arc::default())?;
         let frame_period_s = 1.0 / simulated.camera.rate_hz;
         controller.presence(stamp_ns(world.now_s()), DETECTOR, true);
-        controller.camera(vision.info().clone());
+        controller.camera(stamp_ns(world.now_s()), vision.info().clone());
         Ok(Self {
             sequence: (world.now_s() / frame_period_s) as u64 + 1,
             world,

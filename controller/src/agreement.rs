@@ -1,0 +1,195 @@
+//! Whether detectors see the marker at one place, judged on the frames that they have all searched.
+//!
+//! Two positions in one frame need no vehicle state and no estimate. Of two detectors that differ nobody can
+//! say which is right; of three or more the majority is believed.
+
+use std::collections::VecDeque;
+
+/// Frames that two detectors must both have searched for a conclusion.
+const MIN_COMMON: u32 = 8;
+/// Latest frames with a marker from another detector in which one is looked for that sees nothing.
+const MAX_SEEN: u32 = 12;
+
+/// The marker as a detector sees it.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Sight {
+    /// Its position in the vehicle's body frame, in metres; `None` without a pose.
+    pub position_m: Option<[f64; 3]>,
+}
+
+/// What a detector saw in its latest frames, by stamp, newest last.
+pub type Sights = VecDeque<(i64, Option<Sight>)>;
+
+/// A detector that answers, and what it saw.
+#[derive(Copy, Clone, Debug)]
+pub struct Voter<'a> {
+    /// Its name.
+    pub name: &'a str,
+    /// What it saw.
+    pub sights: &'a Sights,
+}
+
+/// The distance up to which two positions agree.
+#[derive(Copy, Clone, Debug)]
+pub struct Tolerance {
+    /// At range 0, in metres.
+    pub base_m: f64,
+    /// Growth per metre of range.
+    pub per_m: f64,
+}
+
+/// Why a detector is not believed although it answers.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Fault {
+    /// More detectors see the marker elsewhere, and at one place.
+    Outvoted {
+        /// How many.
+        by: usize,
+        /// Its distance from one of them, in metres.
+        apart_m: f64,
+    },
+    /// It sees no marker in frames in which another one does.
+    Blind {
+        /// The other one.
+        seeing: String,
+    },
+}
+
+/// Another detector that sees the marker elsewhere, while nobody says which of the two is right.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Dispute {
+    /// The active detector.
+    pub active: String,
+    /// The other one.
+    pub other: String,
+    /// The distance between both positions in the latest frame with both, in metres.
+    pub apart_m: f64,
+}
+
+/// The latest frames that two detectors have both searched.
+#[derive(Copy, Clone, Debug, Default)]
+struct Common {
+    /// Latest frames with a position from both; at most `MIN_COMMON`.
+    both: u32,
+    /// Those in which the positions differ.
+    apart: u32,
+    /// The distance in the latest of them, in metres.
+    apart_m: f64,
+    /// Latest frames in which the second saw a marker; at most `MAX_SEEN`.
+    second_saw: u32,
+    /// Those in which the first saw none.
+    first_missed: u32,
+}
+
+impl Common {
+    fn of(first: &Sights, second: &Sights, tolerance: Tolerance) -> Self {
+        let mut common = Self::default();
+        let mut theirs = second.iter().rev().peekable();
+        for (stamp, ours) in first.iter().rev() {
+            while theirs.next_if(|(other, _)| other > stamp).is_some() {}
+            let Some((_, theirs)) = theirs.next_if(|(other, _)| other == stamp) else { continue };
+            common.add(*ours, *theirs, tolerance);
+        }
+        common
+    }
+
+    /// Counts a frame; the newest first.
+    fn add(&mut self, first: Option<Sight>, second: Option<Sight>, tolerance: Tolerance) {
+        if second.is_some() && self.second_saw < MAX_SEEN {
+            self.second_saw += 1;
+            self.first_missed += u32::from(first.is_none());
+        }
+        let positions = first.and_then(|s| s.position_m).zip(second.and_then(|s| s.position_m));
+        if let Some((first_m, second_m)) = positions
+            && self.both < MIN_COMMON
+        {
+            let apart_m = distance(first_m, second_m);
+            if self.both == 0 {
+                self.apart_m = apart_m;
+            }
+            self.both += 1;
+            self.apart += u32::from(!within(tolerance, first_m, apart_m));
+        }
+    }
+
+    fn differ(&self) -> bool {
+        self.both >= MIN_COMMON && self.apart * 2 > self.both
+    }
+
+    fn agree(&self) -> bool {
+        self.both >= MIN_COMMON && self.apart * 2 <= self.both
+    }
+
+    /// The first saw nothing in at least three of four frames in which the second saw the marker.
+    fn first_is_blind(&self) -> bool {
+        self.second_saw >= MIN_COMMON && self.first_missed * 4 >= self.second_saw * 3
+    }
+}
+
+/// The fault of each of the detectors that answer.
+pub fn faults(voters: &[Voter<'_>], tolerance: Tolerance) -> Vec<Option<Fault>> {
+    // Most of very many see nothing, and nothing follows from that.
+    let sees: Vec<bool> =
+        voters.iter().map(|voter| voter.sights.iter().any(|(_, sight)| sight.is_some())).collect();
+    let row = |first: &Voter<'_>| -> Vec<Common> {
+        let pair = |(second, sees): (&Voter<'_>, &bool)| match sees {
+            true => Common::of(first.sights, second.sights, tolerance),
+            false => Common::default(),
+        };
+        voters.iter().zip(&sees).map(pair).collect()
+    };
+    let all: Vec<Vec<Common>> = voters.iter().map(row).collect();
+    // A detector agrees with itself.
+    let group = |row: &Vec<Common>, own: usize| {
+        1 + row.iter().enumerate().filter(|(i, c)| *i != own && c.agree()).count()
+    };
+    let groups: Vec<usize> = all.iter().enumerate().map(|(own, row)| group(row, own)).collect();
+    let outvoted: Vec<_> =
+        all.iter().zip(&groups).map(|(row, ours)| outvoted(row, *ours, &groups)).collect();
+    let seeing = |own: usize, row: &Vec<Common>| {
+        let others = row.iter().zip(voters).zip(&outvoted).enumerate();
+        let mut believed = others.filter(|(i, (_, fault))| *i != own && fault.is_none());
+        let seeing = believed.find(|(_, ((common, _), _))| common.first_is_blind())?;
+        let (_, ((_, voter), _)) = seeing;
+        Some(Fault::Blind { seeing: voter.name.to_owned() })
+    };
+    all.iter()
+        .zip(&outvoted)
+        .enumerate()
+        .map(|(own, (row, outvoted))| outvoted.clone().or_else(|| seeing(own, row)))
+        .collect()
+}
+
+/// The majority against a detector with `ours` of its opinion.
+fn outvoted(row: &[Common], ours: usize, groups: &[usize]) -> Option<Fault> {
+    let differing = row.iter().filter(|c| c.differ()).count();
+    let larger = row.iter().zip(groups).filter(|(common, theirs)| {
+        common.differ() && **theirs > ours && **theirs * 2 > ours + differing
+    });
+    let (common, by) = larger.max_by_key(|(_, theirs)| **theirs)?;
+    Some(Fault::Outvoted { by: *by, apart_m: common.apart_m })
+}
+
+/// The detector that sees the marker farthest from where the active one does.
+pub fn dispute(active: Voter<'_>, others: &[Voter<'_>], tolerance: Tolerance) -> Option<Dispute> {
+    others
+        .iter()
+        .map(|other| (other.name, Common::of(active.sights, other.sights, tolerance)))
+        .filter(|(_, common)| common.differ())
+        .max_by(|(_, a), (_, b)| a.apart_m.total_cmp(&b.apart_m))
+        .map(|(other, common)| Dispute {
+            active: active.name.to_owned(),
+            other: other.to_owned(),
+            apart_m: common.apart_m,
+        })
+}
+
+/// True when positions so far apart agree, at the range of one of them.
+pub fn within(tolerance: Tolerance, position_m: [f64; 3], apart_m: f64) -> bool {
+    apart_m <= tolerance.base_m + tolerance.per_m * distance(position_m, [0.0; 3])
+}
+
+/// The distance of two points, in their unit.
+pub fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}

@@ -1,0 +1,83 @@
+//! What is refused again and again, so that the operator hears of it.
+
+/// Time for which something must be refused before it is told, in nanoseconds: a single one means little.
+const MIN_LASTING_NS: i64 = 1_000_000_000;
+/// Time without a refusal after which a matter is over, in nanoseconds.
+const OVER_NS: i64 = 1_500_000_000;
+/// Maximum number of matters; further ones are counted in the health only.
+const MAX_MATTERS: usize = 16;
+
+/// Something that the operator should know.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Warning {
+    /// A short name, the same while it lasts.
+    pub matter: String,
+    /// A sentence.
+    pub text: String,
+}
+
+/// The matters in which something is being refused.
+#[derive(Debug, Default)]
+pub struct Refusals {
+    matters: Vec<Matter>,
+}
+
+#[derive(Debug)]
+struct Matter {
+    reason: &'static str,
+    text: String,
+    since_ns: i64,
+    last_ns: i64,
+}
+
+impl Refusals {
+    /// Something was refused, for a reason (a short name for programs) that `text` explains.
+    pub fn add(&mut self, now_ns: i64, reason: &'static str, text: impl FnOnce() -> String) {
+        self.forget(now_ns);
+        if let Some(matter) = self.matters.iter_mut().find(|matter| matter.reason == reason) {
+            matter.last_ns = now_ns;
+        } else if self.matters.len() < MAX_MATTERS {
+            let text = text();
+            self.matters.push(Matter { reason, text, since_ns: now_ns, last_ns: now_ns });
+        }
+    }
+
+    /// What has been refused for a while and still is.
+    pub fn lasting(&self, now_ns: i64) -> impl Iterator<Item = Warning> {
+        let lasting = self.matters.iter().filter(move |matter| matter.is_lasting(now_ns));
+        lasting
+            .map(|matter| Warning { matter: matter.reason.to_owned(), text: matter.text.clone() })
+    }
+
+    fn forget(&mut self, now_ns: i64) {
+        self.matters.retain(|matter| now_ns.saturating_sub(matter.last_ns) < OVER_NS);
+    }
+}
+
+impl Matter {
+    fn is_lasting(&self, now_ns: i64) -> bool {
+        self.last_ns.saturating_sub(self.since_ns) >= MIN_LASTING_NS
+            && now_ns.saturating_sub(self.last_ns) < OVER_NS
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const S: i64 = 1_000_000_000;
+
+    #[test]
+    fn only_what_lasts_is_told_and_only_while_it_lasts() {
+        let mut refusals = Refusals::default();
+        refusals.add(0, "another-clock", || "a".to_owned());
+        assert_eq!(refusals.lasting(0).count(), 0);
+        refusals.add(S / 2, "another-clock", || "b".to_owned());
+        refusals.add(S, "another-clock", || "c".to_owned());
+        let warning = Warning { matter: "another-clock".to_owned(), text: "a".to_owned() };
+        assert_eq!(refusals.lasting(S).collect::<Vec<_>>(), [warning]);
+        assert_eq!(refusals.lasting(3 * S).count(), 0);
+        refusals.add(3 * S, "another-clock", || "d".to_owned());
+        assert_eq!(refusals.lasting(3 * S).count(), 0, "it begins anew");
+    }
+}
