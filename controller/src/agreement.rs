@@ -184,6 +184,11 @@ pub fn dispute(active: Voter<'_>, others: &[Voter<'_>], tolerance: Tolerance) ->
         })
 }
 
+/// True when two detectors have seen the marker at one place in enough frames.
+pub fn agree(first: Voter<'_>, second: Voter<'_>, tolerance: Tolerance) -> bool {
+    Common::of(first.sights, second.sights, tolerance).agree()
+}
+
 /// True when positions so far apart agree, at the range of one of them.
 pub fn within(tolerance: Tolerance, position_m: [f64; 3], apart_m: f64) -> bool {
     apart_m <= tolerance.base_m + tolerance.per_m * distance(position_m, [0.0; 3])

@@ -418,8 +418,7 @@ impl Selection {
     /// Compares what all detectors that answer saw in the same frames.
     fn compare_all(&mut self, now_ns: i64) {
         let tolerance = self.limits.tolerance();
-        let answers: Vec<bool> =
-            self.known.iter().map(|known| self.ailment(now_ns, known).is_none()).collect();
+        let answers: Vec<bool> = self.known.iter().map(|known| known.has_opinion(now_ns)).collect();
         let voters: Vec<Voter<'_>> = self
             .known
             .iter()
@@ -434,22 +433,35 @@ impl Selection {
         for (known, fault) in self.known.iter_mut().zip(found) {
             known.fault = fault;
         }
-        self.dispute =
-            self.known_active().filter(|active| active.fault.is_none()).and_then(|active| {
-                let others: Vec<Voter<'_>> = self
-                    .known
-                    .iter()
-                    .zip(&answers)
-                    .filter(|(known, answers)| {
-                        let is_other =
-                            known.name != active.name && !self.overruled.contains(&known.name);
-                        let is_outvoted = matches!(known.fault, Some(Fault::Outvoted { .. }));
-                        **answers && is_other && !is_outvoted
-                    })
-                    .map(|(known, _)| known.voter())
-                    .collect();
-                agreement::dispute(active.voter(), &others, tolerance)
-            });
+        self.dispute = self.present_dispute(now_ns, tolerance);
+    }
+
+    /// The dispute between the active detector and another one. It lasts until they agree: where neither sees
+    /// the marker nothing is decided.
+    fn present_dispute(&self, now_ns: i64, tolerance: Tolerance) -> Option<Dispute> {
+        let active = self.known_active().filter(|active| active.fault.is_none())?;
+        let is_opponent = |known: &&Known| {
+            known.name != active.name
+                && known.has_opinion(now_ns)
+                && !self.overruled.contains(&known.name)
+                && !matches!(known.fault, Some(Fault::Outvoted { .. }))
+        };
+        let others: Vec<Voter<'_>> =
+            self.known.iter().filter(is_opponent).map(Known::voter).collect();
+        if let Some(dispute) = agreement::dispute(active.voter(), &others, tolerance) {
+            return Some(dispute);
+        }
+        let last = self.dispute.as_ref()?;
+        let other = if last.active == active.name { &last.other } else { &last.active };
+        let opponent = self.known.iter().filter(is_opponent).find(|known| known.name == *other)?;
+        let is_over = opponent.fault.is_some()
+            || agreement::agree(active.voter(), opponent.voter(), tolerance)
+            || ![&last.active, &last.other].contains(&&active.name);
+        (!is_over).then(|| Dispute {
+            active: active.name.clone(),
+            other: opponent.name.clone(),
+            apart_m: last.apart_m,
+        })
     }
 
     /// Both detectors of a dispute.
@@ -640,6 +652,11 @@ impl Known {
             disagreement_m: None,
             fault: None,
         }
+    }
+
+    /// True while it searches frames: what it saw in one counts also when it was told late.
+    fn has_opinion(&self, now_ns: i64) -> bool {
+        self.alive && self.has_frame() && now_ns.saturating_sub(self.received_ns) <= MAX_SILENCE_NS
     }
 
     fn voter(&self) -> Voter<'_> {

@@ -391,6 +391,30 @@ fn two_that_disagree_are_told_within_a_second_and_until_they_agree_again() {
 }
 
 #[test]
+fn a_dispute_lasts_while_both_are_late_or_see_nothing() {
+    let mut bench = Bench::new(preferring(None, None));
+    for i in 0..20 {
+        let answers = [("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))];
+        bench.frame_seen(i * PERIOD, &answers);
+    }
+    assert!(bench.selection.dispute().is_some());
+    // On a busy machine both are late by turns, and each is the active one for a while.
+    for i in 20..80 {
+        let late = |is_late: bool| if is_late { 250 * MS } else { 60 * MS };
+        let sight = |north_m: f64| at(north_m).filter(|_| i < 50);
+        let main = ("main", late(i / 10 % 2 == 0), sight(0.0));
+        let spare = ("spare", late(i / 10 % 2 == 1), sight(1.0));
+        bench.frame_seen(i * PERIOD, &[main, spare]);
+        assert!(bench.selection.dispute().is_some(), "frame {i}");
+    }
+    for i in 80..120 {
+        let answers = [("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(0.02))];
+        bench.frame_seen(i * PERIOD, &answers);
+    }
+    assert_eq!(bench.selection.dispute(), None);
+}
+
+#[test]
 fn who_names_a_detector_in_a_dispute_has_decided_it() {
     let mut bench = Bench::new(preferring(None, None));
     let answers = [("main", 30 * MS, at(0.0)), ("spare", 35 * MS, at(1.0))];
