@@ -157,7 +157,7 @@ impl Controller {
         for news in self.news.drain(..) {
             match news {
                 News::Presence(detector, alive) => flight.presence(now_ns, &detector, alive),
-                News::Camera(info) => flight.camera(info),
+                News::Camera(info) => flight.camera(now_ns, info),
             }
         }
     }
