@@ -189,7 +189,7 @@ fn reports_of_the_ground_that_contradict_the_flight_change_nothing() {
     ] {
         let mut flight = in_flight("airborne");
         flight.presence(0, "main", true);
-        flight.camera(CameraInfo::sample());
+        flight.camera(0, CameraInfo::sample());
         hover(&mut flight, 20, 3000, 4);
         let before = flight.status(3000 * MS);
         assert!(matches!(before.phase, Phase::Approach | Phase::Descend), "{before:?}");
@@ -212,7 +212,7 @@ fn reports_of_the_ground_that_contradict_the_flight_change_nothing() {
 fn without_the_heartbeat_alone_it_hovers_and_then_goes_on() {
     let mut flight = in_flight("airborne");
     flight.presence(0, "main", true);
-    flight.camera(CameraInfo::sample());
+    flight.camera(0, CameraInfo::sample());
     hover(&mut flight, 20, 3000, 4);
     // Without any heartbeat for 5 s.
     let mut setpoints = 0;
@@ -237,7 +237,7 @@ fn without_the_heartbeat_alone_it_hovers_and_then_goes_on() {
 fn the_end_of_the_last_detector_levels_the_next_setpoint() {
     let mut flight = in_flight("airborne");
     flight.presence(0, "main", true);
-    flight.camera(CameraInfo::sample());
+    flight.camera(0, CameraInfo::sample());
     hover(&mut flight, 20, 5000, 4);
     let down = |flight: &Flight| flight.status(0).setpoint.unwrap().velocity_ned_m_s[2];
     assert!(down(&flight) > 0.1, "{}", down(&flight));

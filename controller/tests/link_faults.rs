@@ -116,7 +116,7 @@ fn fly(from_autopilot: &mut Way<'_>, to_autopilot_s: &mut dyn FnMut(f64, f64) ->
     let model = CameraModel::pinhole(IMAGE.0, IMAGE.1, FOCAL_PX);
     let camera = CameraInfo::sample().camera;
     flight.presence(START_NS, "main", true);
-    flight.camera(CameraInfo::new(&camera, &model, &body_from_camera()));
+    flight.camera(0, CameraInfo::new(&camera, &model, &body_from_camera()));
     let (mut to_us, mut to_it) = (VecDeque::new(), VecDeque::new());
     let mut frames = VecDeque::new();
     let mut parsers = [Parser::new(), Parser::new()];
