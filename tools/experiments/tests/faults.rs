@@ -48,3 +48,30 @@ fn without_a_controller_the_vehicle_is_followed_to_its_rest() {
     assert_eq!((outcome.ending, outcome.touches), (Ending::Hovers, 0), "{outcome:?}");
     assert!(outcome.is_over && outcome.why.contains("gone"), "{outcome:?}");
 }
+
+#[test]
+fn what_dies_lies_or_falls_silent_lets_the_vehicle_touch_slowly_or_not_at_all() {
+    let kinds = vec![
+        Kind::ControllerKilled,
+        Kind::ControllerStopped,
+        Kind::DetectorKilled,
+        Kind::DetectorStopped,
+        Kind::CameraKilled,
+        Kind::CameraStopped,
+        Kind::SilenceFrom,
+        Kind::SilenceTo,
+        Kind::SilenceBoth,
+        Kind::LandedUndefined,
+        Kind::LandedTakingOff,
+        Kind::LandedOnGround,
+        Kind::HeartbeatMissing,
+        Kind::ModeLie,
+        Kind::DisarmedLie,
+        Kind::OldBootTime,
+    ];
+    let height = Values::List(vec![0.3, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0]);
+    let plan = Plan { flights: 96, kinds, height, second: Second::None, ..Plan::default() };
+    for outcome in fly_all(&plan) {
+        assert!(!outcome.is_unsafe() && !outcome.is_unended(), "{outcome:?}");
+    }
+}
