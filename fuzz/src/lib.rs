@@ -24,7 +24,7 @@ pub struct Target {
 /// The most memory that a process may use for one input, in MB: images are limited to [`files::MAX_PIXELS`].
 pub const MAX_MEMORY_MB: u64 = 512;
 /// The most time for one input, in seconds.
-pub const MAX_TIME_S: u64 = 5;
+pub const MAX_TIME_S: u64 = 20;
 
 /// All targets.
 pub const TARGETS: [Target; 11] = [
