@@ -12,10 +12,10 @@
 //! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it and
 //! [`peers`] chooses whom a listening one talks to, [`packet`] finds MAVLink packets in them, [`mode`],
 //! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
-//! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the conversation with it with the
-//! settings of [`config`], [`event`] its events, [`command`] is
-//! what can be requested and why it may fail, [`takeoff`] arms the vehicle and takes off, [`permission`] is what
-//! a ground station may send, [`compose`] makes the messages that a companion sends.
+//! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the
+//! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
+//! and why it may fail, [`takeoff`] arms the vehicle and takes off, [`permission`] is what a ground station may send,
+//! [`compose`] makes the messages that a companion sends.
 
 pub mod address;
 mod boot;
