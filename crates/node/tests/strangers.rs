@@ -1,0 +1,355 @@
+//! Strangers at the drone's relay: what they say on every topic is refused. Connections and messages that reach the relay
+//! are counted as denied.
+//!
+//! Prints the table of `docs/results.md`:
+//! `cargo test -p node --test strangers -- --nocapture`.
+
+#![expect(clippy::print_stdout, reason = "the table is for people to read")]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{OpenOptions, Permissions};
+use std::io::Write;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use anyhow::{Context, anyhow, ensure};
+use messages::{Delivery, TOPICS};
+use node::access::{HOLDERS, Holder};
+use node::network::AUTHORITY;
+use node::{Identity, Network, Node, denied};
+use rcgen::{
+    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
+    Issuer, KeyPair, KeyUsagePurpose,
+};
+use testing::ports;
+use tokio::time::{sleep, timeout};
+use zenoh::Session;
+use zenoh::query::Query;
+use zenoh::sample::Sample;
+
+const PATIENCE: Duration = Duration::from_secs(30);
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// A peer's session opens without a connection.
+const PEER: &str = "peer";
+/// A client sends to the relay whatever it knows of subscribers; of those on the drone the relay says nothing to who
+/// has no rights.
+const CLIENT: &str = "client";
+
+/// The authority of the site, or another one.
+struct Authority {
+    pem: String,
+    issuer: Issuer<'static, KeyPair>,
+}
+
+impl Authority {
+    fn new() -> anyhow::Result<Self> {
+        let mut params = CertificateParams::default();
+        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+        params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        let key = KeyPair::generate()?;
+        let pem = params.self_signed(&key)?.pem();
+        Ok(Self { issuer: Issuer::from_ca_cert_pem(&pem, key)?, pem })
+    }
+
+    /// Writes a holder's key and its certificate.
+    fn issue(&self, folder: &Path, holder: &str) -> anyhow::Result<()> {
+        let holder: Holder = holder.parse()?;
+        let mut params = CertificateParams::new(vec!["127.0.0.1".to_owned()])?;
+        params.distinguished_name = DistinguishedName::new();
+        params.distinguished_name.push(DnType::CommonName, holder.to_string());
+        params.use_authority_key_identifier_extension = true;
+        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        params.extended_key_usages =
+            vec![ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth];
+        let key = KeyPair::generate()?;
+        let certificate = params.signed_by(&key, &self.issuer)?;
+        std::fs::write(folder.join(AUTHORITY), &self.pem)?;
+        let name = holder.key_name();
+        let private = folder.join(format!("{name}.key"));
+        std::fs::write(&private, key.serialize_pem())?;
+        std::fs::set_permissions(private, Permissions::from_mode(0o600))?;
+        std::fs::write(folder.join(format!("{name}.pem")), certificate.pem())?;
+        Ok(())
+    }
+}
+
+/// What was heard on the drone: by whom, on which key.
+type Heard = Arc<Mutex<BTreeSet<(String, String)>>>;
+
+fn note(heard: &Heard, payload: &[u8], key: &str) {
+    let who = String::from_utf8_lossy(payload).into_owned();
+    let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+    heard.insert((who, key.to_owned()));
+}
+
+fn has_heard(heard: &Heard, who: &str, key: &str) -> bool {
+    let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+    heard.contains(&(who.to_owned(), key.to_owned()))
+}
+
+/// The drone: its relay, and a process on it that hears everything.
+struct Drone {
+    _relay: Node,
+    inside: Session,
+    published: Heard,
+    queried: Heard,
+    air: String,
+}
+
+async fn open(network: &Network, key_name: &str) -> anyhow::Result<Session> {
+    opened(network.configuration(key_name)?).await
+}
+
+async fn opened(config: serde_json::Value) -> anyhow::Result<Session> {
+    let config =
+        zenoh::Config::from_json5(&config.to_string()).map_err(|cause| anyhow!("{cause}"))?;
+    zenoh::open(config).await.map_err(|cause| anyhow!("{cause}"))
+}
+
+impl Drone {
+    async fn start(keys: &Path) -> anyhow::Result<Self> {
+        let ([meet], air, _) = ports::free()?;
+        let air = format!("127.0.0.1:{air}");
+        let network = Network {
+            config: Some("drone".into()),
+            listen: Some(air.clone()),
+            meet: Some(meet),
+            keys: Some(keys.to_owned()),
+            ..Network::default()
+        };
+        let identity = Identity { service: "relay", instance: "drone".into() };
+        let relay = Node::open(identity, &network.source("drone")?).await?;
+        let local = Network { meet: Some(meet), ..Network::default() };
+        let inside = open(&local, "controller").await?;
+        let (published, queried) = (Heard::default(), Heard::default());
+        let notes = Arc::clone(&published);
+        inside
+            .declare_subscriber("**")
+            .callback(move |sample: Sample| {
+                note(&notes, &sample.payload().to_bytes(), sample.key_expr().as_str());
+            })
+            .background()
+            .await
+            .map_err(|cause| anyhow!("{cause}"))?;
+        let notes = Arc::clone(&queried);
+        inside
+            .declare_queryable("**")
+            .callback(move |query: Query| {
+                let payload = query.payload().map(|p| p.to_bytes().into_owned());
+                note(&notes, &payload.unwrap_or_default(), query.key_expr().as_str());
+            })
+            .background()
+            .await
+            .map_err(|cause| anyhow!("{cause}"))?;
+        Ok(Self { _relay: relay, inside, published, queried, air })
+    }
+
+    /// Somebody on the ground.
+    async fn stranger(
+        &self,
+        keys: Option<&Path>,
+        key_name: &str,
+        mode: &str,
+    ) -> anyhow::Result<Stranger> {
+        let network = Network {
+            config: Some("ground".into()),
+            connect: Some(self.air.clone()),
+            keys: keys.map(Path::to_owned),
+            ..Network::default()
+        };
+        let mut config = network.configuration(key_name)?;
+        config["mode"] = mode.into();
+        if mode == CLIENT {
+            config["listen"]["endpoints"] = serde_json::json!([]);
+        }
+        let session = opened(config).await?;
+        let received = Heard::default();
+        let notes = Arc::clone(&received);
+        session
+            .declare_subscriber("**")
+            .callback(move |sample: Sample| {
+                note(&notes, &sample.payload().to_bytes(), sample.key_expr().as_str());
+            })
+            .background()
+            .await
+            .map_err(|cause| anyhow!("{cause}"))?;
+        Ok(Stranger { session, received })
+    }
+}
+
+struct Stranger {
+    session: Session,
+    received: Heard,
+}
+
+impl Stranger {
+    /// Publishes and queries on a key, with its name.
+    async fn says(&self, name: &str, key: &str) {
+        drop(self.session.put(key, name).await);
+        let get = self.session.get(key).payload(name).timeout(Duration::from_millis(200));
+        drop(get.await);
+    }
+}
+
+/// Every key of the topic table, of a detector `ground` and any other name `main`, with its publishers.
+fn keys() -> BTreeMap<String, (&'static [&'static str], bool)> {
+    let filled = |row: &messages::Row| {
+        let service = row.publishers.first().copied().unwrap_or_default();
+        row.key
+            .replace("{detector}", "ground")
+            .replace("{service}", service)
+            .replace("{camera}", "down")
+            .replace("{instance}", if service == "detector" { "ground" } else { "main" })
+            .replace("{image}", "rings")
+    };
+    let is_query = |row: &messages::Row| row.delivery == Delivery::Query;
+    TOPICS
+        .iter()
+        .filter(|row| row.message != "CommandReply")
+        .map(|row| (filled(row), (row.publishers, is_query(row))))
+        .collect()
+}
+
+/// The role in a certificate of a publisher in the topic table.
+fn role_of(publisher: &str) -> &str {
+    if publisher == "alight" { "operator" } else { publisher }
+}
+
+fn file_of(role: &str) -> String {
+    node::access::key_name(role, "ground")
+}
+
+const ROLES: [&str; 8] = [
+    "drone",
+    "operator",
+    "observer",
+    "camera-pub",
+    "detector.ground",
+    "controller",
+    "gcs-bridge",
+    "simulator",
+];
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
+    node::start_logging("off");
+    let folders: Vec<_> = (0..5).map(|_| tempfile::tempdir()).collect::<Result<_, _>>()?;
+    let [home, foreign, kestrel, revoked, spare] =
+        [0, 1, 2, 3, 4].map(|index| folders[index].path());
+    let authority = Authority::new()?;
+    let mut list = OpenOptions::new().create(true).append(true).open(home.join(HOLDERS))?;
+    for role in ROLES {
+        authority.issue(home, &format!("{role}@drone"))?;
+        writeln!(list, "{role}@drone")?;
+    }
+    for (folder, holder, line) in [
+        (kestrel, "operator@kestrel", "operator@kestrel"),
+        (kestrel, "detector.ground@kestrel", "detector.ground@kestrel"),
+        (revoked, "operator.bob@drone", "revoked operator.bob@drone"),
+        (spare, "detector.spare@drone", "detector.spare@drone"),
+    ] {
+        authority.issue(folder, holder)?;
+        writeln!(list, "{line}")?;
+    }
+    Authority::new()?.issue(foreign, "operator@drone")?;
+    let drone = Drone::start(home).await?;
+    denied::take();
+
+    // Those whose connection is refused.
+    let mut counted = BTreeMap::new();
+    let no_key = drone.stranger(None, "operator", PEER).await?;
+    let wrong_key = drone.stranger(Some(foreign), "operator", PEER).await?;
+    let connection = "denied: a connection without a valid certificate";
+    until(&mut counted, "two refused connections", async |counted| {
+        counted.get(connection).is_some_and(|times| *times >= 2)
+    })
+    .await?;
+
+    // Those who come in, and have no rights, or others.
+    let other_vehicle = drone.stranger(Some(kestrel), "operator", CLIENT).await?;
+    let revoked = drone.stranger(Some(revoked), "operator", CLIENT).await?;
+    // Neither has any rights, so the relay tells them of nobody to talk to: what they say stays with them, and there is
+    // nothing to count.
+    let observer = drone.stranger(Some(home), "observer", CLIENT).await?;
+    let other_name = drone.stranger(Some(spare), "detector.spare", CLIENT).await?;
+    let strangers = [
+        ("no key", &no_key),
+        ("wrong key", &wrong_key),
+        ("another vehicle's", &other_vehicle),
+        ("revoked", &revoked),
+        ("another role's", &observer),
+        ("another detector's", &other_name),
+    ];
+    let keys = keys();
+    let mut rows = Vec::new();
+    for (key, (publishers, is_query)) in &keys {
+        // Who may is heard, so that the silence of the others says something.
+        let role = role_of(publishers.first().context("a publisher")?);
+        let rightful = drone.stranger(Some(home), &file_of(role), CLIENT).await?;
+        let heard = if *is_query { &drone.queried } else { &drone.published };
+        until(&mut counted, &format!("{role} is heard on {key}"), async |_| {
+            rightful.says("rightful", key).await;
+            has_heard(heard, "rightful", key)
+        })
+        .await?;
+        let action = if *is_query { "query" } else { "put" };
+        let reason = format!("denied: {action} on drone/{key}");
+        denied::take();
+        let mut refusals = BTreeMap::new();
+        for (name, stranger) in strangers {
+            let has_rights = ["another role's", "another detector's"].contains(&name);
+            until(&mut refusals, &format!("{name} is refused on {key}"), async |refusals| {
+                stranger.says(name, key).await;
+                // Only who has some rights is told of somebody to talk to.
+                !has_rights || refusals.remove(&reason).is_some()
+            })
+            .await?;
+        }
+        // They are not heard later either, and only holders of this vehicle's keys listen.
+        until(&mut counted, &format!("the observer hears {key}"), async |_| {
+            drop(drone.inside.put(key.as_str(), "inside").await);
+            has_heard(&observer.received, "inside", key)
+                && has_heard(&other_name.received, "inside", key)
+        })
+        .await?;
+        let mut cells = Vec::new();
+        for (name, stranger) in strangers {
+            let is_heard = has_heard(heard, name, key);
+            ensure!(!is_heard, "{name}: {action} on {key} was heard");
+            let listens = has_heard(&stranger.received, "inside", key);
+            let may_listen = ["another role's", "another detector's"].contains(&name);
+            ensure!(listens == may_listen, "{name} on {key}: listens: {listens}");
+            cells.push(if listens { "refused; hears" } else { "refused; hears nothing" });
+        }
+        rows.push(format!("| `{key}` | {action} | {} |", cells.join(" | ")));
+    }
+    let names: Vec<&str> = strangers.iter().map(|(name, _)| *name).collect();
+    println!("| key | what | {} |", names.join(" | "));
+    println!("|---|---|{}", "---|".repeat(names.len()));
+    rows.iter().for_each(|row| println!("{row}"));
+    Ok(())
+}
+
+/// Repeats an attempt until it succeeds; what is denied meanwhile is counted.
+async fn until(
+    counted: &mut BTreeMap<String, u64>,
+    what: &str,
+    mut attempt: impl AsyncFnMut(&mut BTreeMap<String, u64>) -> bool,
+) -> anyhow::Result<()> {
+    let succeeded = async {
+        loop {
+            for (reason, times) in denied::take() {
+                *counted.entry(reason).or_insert(0) += times;
+            }
+            if attempt(counted).await {
+                return;
+            }
+            sleep(PAUSE).await;
+        }
+    };
+    let outcome = timeout(PATIENCE, succeeded).await;
+    outcome.with_context(|| format!("waiting until {what}; denied so far: {counted:?}"))
+}
