@@ -5,6 +5,7 @@
 //! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, [`image`] reads image files,
 //! [`video`] reads videos frame by frame, [`calibration`] reads the calibration files of other programs.
 
+mod budget;
 pub mod calibration;
 pub mod image;
 pub mod jpeg;

@@ -10,6 +10,7 @@ use imaging::{Converter, GrayImage, SampleFormat};
 use rust_h264::decoder::OrderedDecoder;
 use rust_h264::nal::{NalUnit, NalUnitType, parse_annex_b, parse_avcc, parse_sps_info};
 
+use crate::budget::{Budget, BudgetReader};
 use crate::image::{ImageError, decode_image, has_extension};
 use crate::jpeg::next_jpeg;
 
@@ -23,6 +24,8 @@ pub const VIDEO_EXTENSIONS: &[&str] = &[
 const MAX_STREAM_BYTES: u64 = 1 << 30;
 /// Maximum bytes of one coded frame.
 const MAX_FRAME_BYTES: u64 = 256 << 20;
+/// Bytes of an MP4 file's tables that may be read beyond twice the file's size.
+const TABLE_BYTES: u64 = 64 << 10;
 /// Frame rate of streams that do not state theirs, in hertz.
 const DEFAULT_RATE_HZ: f64 = 25.0;
 
@@ -383,8 +386,16 @@ struct H264 {
 }
 
 enum Source {
-    Mp4 { reader: Box<mp4::Mp4Reader<BufReader<File>>>, track: u32, next: u32, length_bytes: usize },
-    Stream { bytes: Vec<u8>, at: usize },
+    Mp4 {
+        reader: Box<mp4::Mp4Reader<BudgetReader<BufReader<File>>>>,
+        track: u32,
+        next: u32,
+        length_bytes: usize,
+    },
+    Stream {
+        bytes: Vec<u8>,
+        at: usize,
+    },
 }
 
 impl H264 {
@@ -394,7 +405,11 @@ impl H264 {
         max_pixels: u64,
     ) -> Result<(Self, f64), VideoError> {
         let size = file.get_ref().metadata().map_err(|e| problems.unreadable(e))?.len();
+        // The tables are read about once; in a damaged file they may refer to each other for ever.
+        let budget = Budget::new(size.saturating_mul(2).saturating_add(TABLE_BYTES));
+        let file = BudgetReader::new(file, budget.clone());
         let reader = mp4::Mp4Reader::read_header(file, size).map_err(|e| problems.damaged(e))?;
+        budget.lift();
         let is_video = |track: &&mp4::Mp4Track| {
             track.track_type().is_ok_and(|kind| kind == mp4::TrackType::Video)
         };
