@@ -423,7 +423,8 @@ impl Selection {
             .known
             .iter()
             .zip(&answers)
-            .filter_map(|(known, answers)| answers.then(|| known.voter()))
+            .filter(|(_, answers)| **answers)
+            .map(|(known, _)| known.voter())
             .collect();
         let mut faults = agreement::faults(&voters, tolerance).into_iter();
         let found: Vec<Option<Fault>> = answers

@@ -4,8 +4,6 @@
 //! Prints the table of `docs/results.md`:
 //! `cargo test -p node --test strangers -- --nocapture`.
 
-#![expect(clippy::print_stdout, reason = "the table is for people to read")]
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{OpenOptions, Permissions};
 use std::io::Write;
