@@ -105,6 +105,7 @@ fn site(seed: u64, [meet, air, autopilot]: [u16; 3]) -> String {
         r#"
 vehicle = "tried"
 address = "127.0.0.1:{air}"
+insecure = true
 meet = {meet}
 
 [[drone]]
