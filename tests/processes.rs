@@ -78,7 +78,8 @@ async fn without_controller_or_detector_it_stops_and_lands_with_the_next_one() -
     let _alone = ONE_AT_A_TIME.lock().await;
     // Slowly: this process may be late.
     let slowly = "controller.metric.max_descend_m_s=0.8";
-    let mut landing = Landing::start(&["--seed", "4", "--set", slowly]).await?;
+    let mut landing =
+        Landing::start(&["--seed", "4", "--set", slowly, "--timeout-s", "200"]).await?;
     landing.descends_below(9.0).await?;
     without_a_controller_the_autopilot_stops_it(&landing).await?;
     landing.start_by_hand("controller", &["metric.max_descend_m_s=0.8"])?;

@@ -50,7 +50,6 @@ const INT16: MavParamType = MavParamType::MAV_PARAM_TYPE_INT16;
 const TABLE: [Row; 16] = [
     (Parameter::DisarmDelay, "DISARM_DELAY", INT8, 10.0, 0.0, 127.0),
     (Parameter::GuidedTimeout, "GUID_TIMEOUT", REAL, 3.0, 0.1, 5.0),
-    (Parameter::OffboardLoss, "COM_OF_LOSS_T", REAL, 1.0, 0.0, 60.0),
     (Parameter::LandAltLow, "LAND_ALT_LOW", INT16, 1000.0, 100.0, 10_000.0),
     (Parameter::LandSpeed, "LAND_SPEED", INT16, 50.0, 30.0, 200.0),
     (Parameter::LandSpeedHigh, "LAND_SPEED_HIGH", INT16, 0.0, 0.0, 500.0),
@@ -64,6 +63,7 @@ const TABLE: [Row; 16] = [
     (Parameter::Speed, "WPNAV_SPEED", REAL, 1000.0, 10.0, 2000.0),
     (Parameter::SpeedDown, "WPNAV_SPEED_DN", REAL, 150.0, 10.0, 500.0),
     (Parameter::SpeedUp, "WPNAV_SPEED_UP", REAL, 250.0, 10.0, 1000.0),
+    (Parameter::OffboardLoss, "COM_OF_LOSS_T", REAL, 1.0, 0.0, 60.0),
 ];
 
 /// One parameter as the link shows it.
