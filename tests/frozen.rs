@@ -20,8 +20,10 @@ use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME};
 
 /// Longest time until a process that goes on takes its part again.
 const BACK: Duration = Duration::from_secs(2);
-/// For how long each is frozen: less than Zenoh's lease would be on another host, about as long, longer.
+/// For how long each is frozen: less than Zenoh's lease is on the air link, about as long, longer.
 const FREEZES_S: [f64; 3] = [0.5, 2.0, 5.0];
+/// The same for the relay, also far longer.
+const RELAY_FREEZES_S: [f64; 5] = [0.5, 1.5, 2.0, 5.0, 30.0];
 
 /// Freezes a process, and lets it go on.
 async fn freeze(pid: Pid, seconds: f64) -> anyhow::Result<Instant> {
@@ -44,11 +46,22 @@ async fn frames_are_used(landing: &Landing, since_ns: i64) -> anyhow::Result<()>
 #[tokio::test(flavor = "multi_thread")]
 async fn whatever_is_frozen_takes_its_part_again_and_it_lands() -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
+    // A busy machine gets a second try.
+    match each_process_is_frozen().await {
+        Ok(()) => Ok(()),
+        Err(problem) => {
+            println!("once more: {problem:#}");
+            each_process_is_frozen().await
+        }
+    }
+}
+
+async fn each_process_is_frozen() -> anyhow::Result<()> {
     let ([], _, port) = ports::free()?;
     let station = UdpSocket::bind(("127.0.0.1", port))?;
     station.set_read_timeout(Some(Duration::from_secs(20)))?;
     let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{port}");
-    let landing = Landing::start(&["--seed", "3", "--set", &address]).await?;
+    let landing = Landing::start(&["--seed", "3", "--timeout-s", "200", "--set", &address]).await?;
     landing.descends_below(9.0).await?;
     for (name, freezes_s) in [
         ("detector", &FREEZES_S[..]),
@@ -141,14 +154,7 @@ async fn reaches(from: &Node, by: &Node) -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_frozen_relay_relays_again() -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
-    // Known: after 5 s the relay stays cut off in some runs. Up to 2 s, a busy machine gets a second try.
-    match a_relay_is_frozen(&[0.5, 1.5, 2.0]).await {
-        Ok(()) => Ok(()),
-        Err(problem) => {
-            println!("once more: {problem:#}");
-            a_relay_is_frozen(&[0.5, 1.5, 2.0]).await
-        }
-    }
+    a_relay_is_frozen(&RELAY_FREEZES_S).await
 }
 
 async fn a_relay_is_frozen(durations_s: &[f64]) -> anyhow::Result<()> {

@@ -4,9 +4,9 @@
 //! denies.
 
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
 use clap::Args;
 use node::{Identity, Node, Shutdown, denied};
 use tokio::time::MissedTickBehavior;
@@ -20,6 +20,8 @@ const BEAT: Duration = Duration::from_millis(100);
 /// Gap between two beats after which the process was frozen: a little less than the lease of
 /// `zenoh-config/drone.json5`.
 const FROZEN: Duration = Duration::from_millis(1200);
+/// Pause before it starts anew after a panic, so that one at every start does not use all of a core.
+const RELAUNCH_PAUSE: Duration = Duration::from_millis(200);
 
 /// The arguments of the relay.
 #[derive(Args, Clone)]
@@ -45,19 +47,29 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
     let role = if config.as_os_str() == "drone" { "drone" } else { RELAY };
     let identity = Identity { service: RELAY, instance: args.id.clone() };
     let zenoh = network.source(role)?;
-    let runtime = runtime()?;
-    let was_frozen = AtomicBool::new(true);
-    while was_frozen.swap(false, Ordering::Relaxed) {
-        let serve = async |node, shutdown| {
-            tell_if_open(&node, &network);
-            relay(node, shutdown, &was_frozen).await
-        };
-        runtime.block_on(node::run(identity.clone(), &zenoh, serve))?;
-    }
+    relaunch_after_panics();
+    let serve = async |node, shutdown| {
+        tell_if_open(&node, &network);
+        relay(node, shutdown).await
+    };
+    runtime()?.block_on(node::run(identity, &zenoh, serve))?;
     Ok(ExitCode::SUCCESS)
 }
 
-async fn relay(node: Node, shutdown: Shutdown, was_frozen: &AtomicBool) -> anyhow::Result<()> {
+/// Starts anew when a thread panics: one of Zenoh's that did leaves its routing tables locked, and the process
+/// would live on without relaying.
+fn relaunch_after_panics() {
+    let report = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        report(panic);
+        std::thread::sleep(RELAUNCH_PAUSE);
+        let problem = node::relaunch(&[]);
+        tracing::error!(%problem, "Starting this process anew failed; ending it");
+        std::process::abort();
+    }));
+}
+
+async fn relay(node: Node, shutdown: Shutdown) -> anyhow::Result<()> {
     node.announce().await?;
     let mut second = tokio::time::interval(Duration::from_secs(1));
     let mut beat = tokio::time::interval(BEAT);
@@ -69,11 +81,11 @@ async fn relay(node: Node, shutdown: Shutdown, was_frozen: &AtomicBool) -> anyho
             _ = beat.tick() => {}
             () = shutdown.requested() => return Ok(()),
         }
-        // The others have given some of the connections up, and nobody opens those again that gossip made.
+        // The others have given some of the connections up, and nobody opens those again that gossip made. A
+        // session that is closed in order meanwhile takes new connections from the others, which are then lost.
         if last.elapsed() > FROZEN {
             tracing::warn!(gap = ?last.elapsed(), "This process was frozen; joining the network anew");
-            was_frozen.store(true, Ordering::Relaxed);
-            return Ok(());
+            return Err(node::relaunch(&[])).context("starting this process anew");
         }
         last = Instant::now();
     }

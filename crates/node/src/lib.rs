@@ -28,6 +28,6 @@ pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
 pub use identity::Identity;
 pub use network::{INSECURE, Network};
-pub use service::{Options, Shutdown, relaunch_with_zenoh_threads, run, start_logging};
+pub use service::{Options, Shutdown, relaunch, relaunch_with_zenoh_threads, run, start_logging};
 pub use session::{Node, Presence, ZenohSource};
 pub use topics::{Commands, Publisher, Request, Subscriber};

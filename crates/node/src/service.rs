@@ -120,15 +120,23 @@ pub fn start_logging(default_level: &str) {
 /// which Zenoh reads once, and which a program with threads must not change. Call it first in `main`; returns
 /// when the variable is set already.
 pub fn relaunch_with_zenoh_threads() {
-    use std::os::unix::process::CommandExt;
     if std::env::var_os(ZENOH_RUNTIME_VARIABLE).is_some() {
         return;
     }
-    let Ok(program) = std::env::current_exe() else { return };
-    let problem = std::process::Command::new(program)
-        .args(std::env::args_os().skip(1))
-        .env(ZENOH_RUNTIME_VARIABLE, ZENOH_RUNTIME)
-        .exec();
+    let problem = relaunch(&[(ZENOH_RUNTIME_VARIABLE, ZENOH_RUNTIME)]);
     // The default is enough on one machine; only a broken air link needs more.
     tracing::warn!(%problem, "Zenoh runs with its default threads");
+}
+
+/// Replaces this process by a new one of the same program with the same arguments; process id, parent and
+/// standard streams stay, and every connection is closed at once. Returns only if that fails.
+pub fn relaunch(environment: &[(&str, &str)]) -> std::io::Error {
+    use std::os::unix::process::CommandExt;
+    match std::env::current_exe() {
+        Ok(program) => std::process::Command::new(program)
+            .args(std::env::args_os().skip(1))
+            .envs(environment.iter().copied())
+            .exec(),
+        Err(problem) => problem,
+    }
 }
