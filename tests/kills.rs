@@ -221,8 +221,9 @@ impl Flight {
         let truth = seen.context("waiting for the touchdown")??.clone();
         let truth = truth.context("the truth")?;
         let touchdown = truth.touchdown.context("a touchdown")?;
-        ensure!(touchdown.error_m < 0.4, "unsafe: {touchdown:?}");
-        ensure!(touchdown.vertical_speed_m_s.abs() < 1.0, "unsafe: {touchdown:?}");
+        ensure!(touchdown.error_m < 0.1, "far from the pad: {touchdown:?}");
+        ensure!(touchdown.vertical_speed_m_s.abs() <= 0.8, "unsafe: {touchdown:?}");
+        ensure!(touchdown.lateral_speed_m_s <= 0.3, "unsafe: {touchdown:?}");
         ensure!(truth.max_tilt_rad < 0.6, "unsafe: tilted by {} rad", truth.max_tilt_rad);
         Ok(truth)
     }

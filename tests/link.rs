@@ -29,7 +29,7 @@ fn main() -> ExitCode {
 async fn test() -> anyhow::Result<()> {
     let Some(trial) = flight::ground(LOSSY, 1, &[]).await? else { return Ok(()) };
     println!("ground detector, 2 % loss: {trial}");
-    ensure!(trial.landed && trial.error_m < 0.3, "it did not land on the pad");
+    ensure!(trial.landed && trial.error_m < 0.1, "it did not land on the pad");
     ensure!(trial.frames_received > 40, "only {} frames arrived", trial.frames_received);
     let Some(trial) = saturation::run(GOOD, 4.0).await? else { return Ok(()) };
     println!("frames offered at twice the link's rate: {trial}");
@@ -41,6 +41,6 @@ async fn test() -> anyhow::Result<()> {
     }
     let Some(trial) = flight::cut(GOOD, 2, 3.0).await? else { return Ok(()) };
     println!("link cut for 3 s: {trial}");
-    ensure!(trial.landed && trial.error_m < 0.3, "it did not land on the pad");
+    ensure!(trial.landed && trial.error_m < 0.1, "it did not land on the pad");
     Ok(())
 }

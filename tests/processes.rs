@@ -63,7 +63,9 @@ fn says_how_well(result: &serde_json::Value) -> anyhow::Result<()> {
         ensure!(result[key].is_number(), "`{key}` is {}", result[key]);
     }
     ensure!(result["outcome"] == "landed");
-    ensure!(result["latency_ms"]["p50"].as_f64() < result["latency_ms"]["p99"].as_f64());
+    // Later than that a detection is too old to be steered by.
+    let latency_ms = result["latency_ms"]["p50"].as_f64().context("latency_ms.p50")?;
+    ensure!(latency_ms > 0.0 && latency_ms < 500.0, "{latency_ms} ms from frame to command");
     let processes = result["processes"].as_array().context("processes")?;
     for service in ["simulator", "detector", "controller"] {
         let cost = processes.iter().find(|p| p["service"] == service).context(service)?;
@@ -148,19 +150,20 @@ async fn without_a_controller_the_autopilot_stops_it(landing: &Landing) -> anyho
 
 async fn without_a_detector_it_stops_descending(landing: &Landing) -> anyhow::Result<()> {
     let killed_ns = landing.kill("detector")?;
-    // The status is published five times a second, and the news of the end takes its way.
-    let mut descending = 0;
+    let mut descended_s: f64 = 0.0;
     let stopped = landing
         .status("no descent is asked for", |s| {
             let is_later = s.stamp_ns > killed_ns;
             let descends = s.setpoint.is_some_and(|s| s.velocity_ned_m_s[2] > 0.0);
-            descending += usize::from(is_later && descends);
+            if is_later && descends {
+                descended_s = descended_s.max(seconds(s.stamp_ns - killed_ns));
+            }
             is_later && !descends
         })
         .await?;
     let after_s = seconds(stopped.stamp_ns - killed_ns);
-    println!("descent no longer asked for after {after_s:.2} s and {descending} statuses");
-    ensure!(descending <= 3, "descent asked for in {descending} statuses after the kill");
+    println!("descent last asked for after {descended_s:.2} s, no longer after {after_s:.2} s");
+    ensure!(descended_s <= 0.5, "descent still asked for {descended_s:.2} s after the kill");
     let still = landing
         .truth("it stands still", |t| t.stamp_ns > killed_ns && descent_m_s(t).abs() < 0.1)
         .await?;
@@ -213,17 +216,19 @@ async fn of_two_detectors_the_chosen_one_is_active_and_the_other_takes_over() ->
     landing.descends_below(8.0).await?;
     kill_process(third, Signal::KILL)?;
     let killed_ns = now_ns();
-    let mut without = 0;
+    let mut named_s: f64 = 0.0;
     let handed_over = landing
         .status("the spare one is active", |s| {
             let is_active = s.active_detector.as_deref() == Some("spare");
-            without += usize::from(s.stamp_ns > killed_ns && !is_active);
+            if s.stamp_ns > killed_ns && !is_active {
+                named_s = named_s.max(seconds(s.stamp_ns - killed_ns));
+            }
             is_active
         })
         .await?;
     let after_s = seconds(handed_over.stamp_ns - killed_ns);
-    println!("handed over after {after_s:.3} s and {without} statuses");
-    ensure!(without <= 3, "the killed one was named in {without} statuses, for {after_s:.3} s");
+    println!("the killed one last named after {named_s:.3} s, handed over after {after_s:.3} s");
+    ensure!(named_s <= 0.5, "the killed one was still active {named_s:.3} s after its end");
     let result = landing.lands().await?;
     println!("{result}");
     Ok(())

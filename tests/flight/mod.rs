@@ -16,6 +16,9 @@ use tokio::time::timeout;
 
 /// Longest wait for anything; a landing takes a fifth of it.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
+/// Furthest from the pad's centre that a landing may end, whatever happened on the way; 0.05 m is the worst
+/// that `docs/results.md` tells of landings without a fault.
+const MAX_ERROR_M: f64 = 0.1;
 pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
 /// Two landings at once would share the processor.
@@ -186,7 +189,7 @@ impl Landing {
         ensure!(result["landed"] == true, "{result}");
         ensure!(self.land.wait()?.success(), "exit status");
         let error_m = result["touchdown_error_m"].as_f64().context("touchdown_error_m")?;
-        ensure!(error_m < 0.3, "landed {error_m} m from the pad");
+        ensure!(error_m < MAX_ERROR_M, "landed {error_m} m from the pad");
         Ok(result)
     }
 }
