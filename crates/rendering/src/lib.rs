@@ -4,16 +4,18 @@
 //! detector. All randomness comes from a seed.
 //!
 //! Modules in reading order: [`scene`] has what is rendered and the camera, [`render`] renders it,
-//! [`occluder`] has effects between scene and sensor, [`ground`] the textures around the pads, [`views`] the
-//! frames of the thesis' experiment.
+//! [`occluder`] has effects between scene and sensor, [`processing`] what a camera makes of the light on its
+//! sensor, [`ground`] the textures around the pads, [`views`] the frames of the thesis' experiment.
 
 pub mod ground;
 pub mod occluder;
+pub mod processing;
 pub mod render;
 pub mod scene;
 pub mod views;
 
 pub use ground::Surface;
 pub use occluder::Occluder;
+pub use processing::{Preset, Processing};
 pub use render::Renderer;
 pub use scene::{CameraSettings, PadInScene, RenderError, Scene};

@@ -7,7 +7,7 @@
 //! Modules in reading order: `exposure` has the camera's poses while the shutter is open, `lens` the
 //! direction of each pixel, `painting` what a tile of the image shows of a marker, `scenery` the paintings of
 //! a scene, `painter` the edges of markers, `band` a row of tiles, `ground_row` the ground along a row,
-//! `sensor` turns light into grey levels.
+//! `sensor` turns light into grey levels, or for a camera that processes its frames into what it develops.
 
 mod band;
 mod exposure;
@@ -23,6 +23,7 @@ use std::sync::Arc;
 use geometry::{Body, Marker as MarkerFrame, Ned, Transform};
 
 use crate::ground::Ground;
+use crate::processing::{Developer, Processing};
 use crate::scene::{CameraSettings, RenderError, Scene};
 use band::{Band, TileState};
 use exposure::{Exposure, MAX_INSTANTS, between};
@@ -43,6 +44,8 @@ pub struct Renderer {
     lens: Lens,
     ground: Arc<Ground>,
     sensor: Sensor,
+    /// For a camera that processes its frames.
+    developer: Option<Developer>,
     levels_per_reflectance: f32,
     paintings: Vec<Painting>,
     /// Number of pads, which are the last paintings, in the scene's order.
@@ -96,6 +99,11 @@ impl Renderer {
         Ok(Self {
             ground,
             sensor: Sensor::new(&settings, seed),
+            developer: if settings.processing == Processing::LINEAR {
+                None
+            } else {
+                Some(Developer::new(&settings.processing, settings.model.width as usize)?)
+            },
             levels_per_reflectance: settings.levels_per_reflectance(scene.light) as f32,
             views: paintings.iter().map(|_| view()).collect(),
             paintings,
@@ -173,11 +181,21 @@ impl Renderer {
                     self.paint_band(index);
                 }
                 self.fill_row(v);
-                occluder(v, self.band.light.get_mut(..width).unwrap_or(&mut []));
-                self.sensor.expose(frame_index, v, &self.band.light, row);
+                let light = self.band.light.get_mut(..width).unwrap_or(&mut []);
+                occluder(v, light);
+                let Some(developer) = &mut self.developer else {
+                    self.sensor.expose(frame_index, v, light, row);
+                    continue;
+                };
+                developer.filter(v, light);
+                let raw = developer.raw(width * height).chunks_mut(width).nth(v);
+                self.sensor.expose_raw(frame_index, v, light, raw.unwrap_or(&mut []));
             }
         }
-        Ok(())
+        match &mut self.developer {
+            Some(developer) => developer.develop(out),
+            None => Ok(()),
+        }
     }
 
     /// Sets the exposure to that of one row of a rolling shutter.

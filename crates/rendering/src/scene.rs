@@ -5,6 +5,7 @@ use markers::{Drawing, Marker};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::ground::Surface;
+use crate::processing::Processing;
 
 /// Reflectance of paper.
 pub(crate) const PAPER: f32 = 0.88;
@@ -60,6 +61,8 @@ pub struct CameraSettings {
     pub blur_px: f64,
     /// Vignetting: 0 none, 1 the fourth power of the cosine.
     pub vignetting: f64,
+    /// What becomes of the light on the sensor.
+    pub processing: Processing,
 }
 
 /// Why a frame cannot be rendered.
@@ -151,6 +154,7 @@ impl CameraSettings {
             noise: true,
             blur_px: 0.6,
             vignetting: 0.5,
+            processing: Processing::LINEAR,
         }
     }
 
@@ -202,6 +206,7 @@ impl CameraSettings {
         checks
             .iter()
             .find(|(holds, _)| !holds)
-            .map_or(Ok(()), |(_, why)| Err(RenderError::Setting(why)))
+            .map_or(Ok(()), |(_, why)| Err(RenderError::Setting(why)))?;
+        self.processing.check()
     }
 }

@@ -1,11 +1,13 @@
 //! The experiment with markers without the rest of the program: `cargo run --release -p experiments --example
-//! markers -- SETS RESULTS [set=NAME] [family=NAME] [photographs=FOLDER]...`.
+//! markers -- SETS RESULTS [set=NAME] [family=NAME]
+//! [photographs=FOLDER] [processing=NAME] [seed=N] [every=N]...`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a program for people at a terminal")]
 
 use std::path::PathBuf;
 
 use experiments::markers::{Request, run};
 use experiments::set::Set;
+use experiments::sets::Variant;
 
 fn main() -> anyhow::Result<()> {
     let mut arguments = std::env::args().skip(1);
@@ -16,12 +18,18 @@ fn main() -> anyhow::Result<()> {
         sets: Vec::new(),
         families: Vec::new(),
         photographs: None,
+        variant: Variant::default(),
     };
     for argument in arguments {
         match argument.split_once('=') {
             Some(("set", name)) => request.sets.push(name.parse().map_err(anyhow::Error::msg)?),
             Some(("family", name)) => request.families.push(name.to_owned()),
             Some(("photographs", folder)) => request.photographs = Some(folder.into()),
+            Some(("processing", name)) => {
+                request.variant.processing = name.parse().map_err(anyhow::Error::msg)?;
+            }
+            Some(("seed", seed)) => request.variant.seed = seed.parse()?,
+            Some(("every", every)) => request.variant.every = every.parse()?,
             _ => return Err(usage()),
         }
     }
@@ -34,5 +42,7 @@ fn main() -> anyhow::Result<()> {
 }
 
 fn usage() -> anyhow::Error {
-    anyhow::anyhow!("usage: markers SETS RESULTS [set=NAME] [family=NAME] [photographs=FOLDER]...")
+    anyhow::anyhow!(
+        "usage: markers SETS RESULTS [set=NAME] [family=NAME] [photographs=FOLDER] [processing=NAME] [seed=N] [every=N]..."
+    )
 }

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use experiments::frame_spec::FrameRenderer;
 use experiments::set::{MARKERS, SIZE_M, Set};
+use experiments::sets::Variant;
 use experiments::store;
 
 fn main() -> anyhow::Result<()> {
@@ -28,7 +29,7 @@ fn main() -> anyhow::Result<()> {
                 continue;
             };
             let start = Instant::now();
-            let frames = store::make(&root, set, marker, &mut renderer)?;
+            let frames = store::make(&root, set, marker, Variant::default(), &mut renderer)?;
             println!(
                 "{} {name}: {frames} frames, {:.1} s",
                 set.name(),

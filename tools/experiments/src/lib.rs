@@ -23,3 +23,5 @@ pub mod sets;
 pub mod store;
 pub mod tables;
 pub mod thesis;
+
+pub use rendering::Preset;

@@ -13,6 +13,7 @@ use crate::photographs;
 use crate::record::{self, ALL_AT_ONCE, FOLLOWING, OURS, Record};
 use crate::report;
 use crate::set::{MARKERS, SIZE_M, Set};
+use crate::sets::Variant;
 use crate::store;
 use crate::tables;
 
@@ -29,6 +30,27 @@ pub struct Request {
     pub families: Vec<String>,
     /// Folder of labelled photographs.
     pub photographs: Option<PathBuf>,
+    /// Which frames of the sets.
+    pub variant: Variant,
+}
+
+impl Request {
+    /// All sets and families of the experiment in one working folder, which has a folder for each variant but
+    /// the default.
+    pub fn within(folder: &Path, variant: Variant) -> Self {
+        let folder = match variant.name() {
+            Some(name) => folder.join(name),
+            None => folder.to_owned(),
+        };
+        Self {
+            sets_in: folder.join("sets"),
+            results_in: folder.join("results"),
+            sets: Set::ALL.to_vec(),
+            families: Vec::new(),
+            photographs: None,
+            variant,
+        }
+    }
 }
 
 /// Number of runs of timed sets; the shortest time of each frame counts.
@@ -52,7 +74,7 @@ pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<
         for marker in markers(request, *set)? {
             let name = marker.family.name();
             progress(&format!("{} {name}", set.name()));
-            store::make(sets_in, *set, marker, &mut renderer)?;
+            store::make(sets_in, *set, marker, request.variant, &mut renderer)?;
             let folder = store::folder(sets_in, *set, marker);
             if set.has_marker() {
                 let any = Marker { id: None, ..marker };
@@ -83,6 +105,26 @@ pub fn run(request: &Request, progress: &mut dyn FnMut(&str)) -> anyhow::Result<
     }
     std::fs::write(results_in.join("report.md"), &text)?;
     std::fs::write(results_in.join("scores.jsonl"), report::json_lines(&runs)?)?;
+    Ok(text)
+}
+
+/// Our recall and accuracy in several requests that were run, by processing, family and set.
+///
+/// # Errors
+/// When results are damaged.
+pub fn compared(requests: &[Request]) -> anyhow::Result<String> {
+    let mut text = report::processing_head();
+    for request in requests {
+        let runs = report::runs(&request.sets_in, &request.results_in)?;
+        let wanted = |run: &&report::Run| {
+            run.detector == OURS
+                && request.sets.contains(&run.set)
+                && (request.families.is_empty() || request.families.contains(&run.family))
+        };
+        for run in runs.iter().filter(wanted) {
+            report::append_processing(&mut text, &request.variant, run);
+        }
+    }
     Ok(text)
 }
 

@@ -11,6 +11,7 @@ use serde::Serialize;
 use crate::record::{self, OURS, Record};
 use crate::score::{Score, Summary};
 use crate::set::Set;
+use crate::sets::Variant;
 use crate::store::StoredFrame;
 
 /// The results of one detector on one family in one set.
@@ -126,6 +127,33 @@ pub fn groups(run: &Run) -> BTreeMap<String, Score> {
         groups.entry(&answer.0.group).or_default().push(answer);
     }
     groups.into_iter().map(|(group, list)| (group.to_owned(), Score::new(list))).collect()
+}
+
+/// The head of the table of [`append_processing`].
+pub fn processing_head() -> String {
+    "\n## By processing\n\n| processing | seed | set | marker | found % | centre px median | p95 | range % median | centre chi2 | range chi2 | wrong ids | elsewhere | ms |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|\n".to_owned()
+}
+
+/// Appends a row of the table by processing.
+pub fn append_processing(text: &mut String, variant: &Variant, run: &Run) {
+    let s = Score::new(&run.answers).summary();
+    let _ = writeln!(
+        text,
+        "| {} | {} | {} | {} | {:.1} | {} | {} | {} | {} | {} | {} | {} | {} |",
+        variant.processing,
+        variant.seed,
+        run.set.name(),
+        run.family,
+        100.0 * s.found as f64 / s.frames.max(1) as f64,
+        number(s.centre_median_px, 4),
+        number(s.centre_p95_px, 3),
+        number(s.range_median_percent, 3),
+        number(s.centre_chi2, 2),
+        number(s.range_chi2, 2),
+        s.wrong_ids,
+        s.elsewhere,
+        number(s.ms, 2),
+    );
 }
 
 /// A number, or a dash where there is none.

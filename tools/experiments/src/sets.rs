@@ -10,26 +10,72 @@ mod sweeps;
 mod views;
 
 use markers::Marker;
+use rendering::Preset;
 
 use crate::frame_spec::FrameSpec;
 use crate::set::Set;
+use scene::Draw;
+
+/// Which frames of a set are meant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Variant {
+    /// Seed of poses, ids, lights, grounds and noise. With 0 they are those on which the detector was
+    /// developed; figures to report come from others.
+    pub seed: u64,
+    /// The camera's processing.
+    pub processing: Preset,
+    /// Only every such frame; 1 for all.
+    pub every: usize,
+}
+
+impl Default for Variant {
+    fn default() -> Self {
+        Self { seed: 0, processing: Preset::Linear, every: 1 }
+    }
+}
+
+impl Variant {
+    /// The name of its folder; `None` for all frames on which the detector was developed.
+    pub fn name(&self) -> Option<String> {
+        let Self { seed, processing, every } = *self;
+        let part = if every > 1 { format!("-every{every}") } else { String::new() };
+        (*self != Self::default()).then(|| format!("{processing}-seed{seed}{part}"))
+    }
+}
 
 /// The frames of a set with a marker, which is ignored for negatives.
 pub fn frames(set: Set, marker: Marker) -> Vec<FrameSpec> {
-    match set {
-        Set::Positions => views::positions(marker),
-        Set::Far => views::far(marker),
-        Set::Landing => views::landing(marker),
-        Set::Adverse => adverse::frames(marker),
-        Set::Tilt => sweeps::tilt(marker),
-        Set::Blur => sweeps::blur(marker),
-        Set::Noise => sweeps::noise(marker),
-        Set::Light => sweeps::light(marker),
-        Set::Rolling => sweeps::rolling(marker),
-        Set::Textured => views::textured(marker),
-        Set::Tracking => views::tracking(marker),
-        Set::Negatives => clutter::frames(),
-    }
+    frames_of(set, marker, Variant::default())
+}
+
+/// Like [`frames`], of a variant.
+pub fn frames_of(set: Set, marker: Marker, variant: Variant) -> Vec<FrameSpec> {
+    let draw = Draw { seed: variant.seed };
+    let frames = match set {
+        Set::Positions => views::positions(draw, marker),
+        Set::Far => views::far(draw, marker),
+        Set::Landing => views::landing(draw, marker),
+        Set::Adverse => adverse::frames(draw, marker),
+        Set::Tilt => sweeps::tilt(draw, marker),
+        Set::Blur => sweeps::blur(draw, marker),
+        Set::Noise => sweeps::noise(draw, marker),
+        Set::Light => sweeps::light(draw, marker),
+        Set::Rolling => sweeps::rolling(draw, marker),
+        Set::Textured => views::textured(draw, marker),
+        Set::Tracking => views::tracking(draw, marker),
+        Set::Negatives => clutter::frames(draw),
+    };
+    let processing = variant.processing.processing();
+    frames
+        .into_iter()
+        .step_by(variant.every.max(1))
+        .map(|mut spec| {
+            spec.settings.processing = processing;
+            // A camera has one mosaic.
+            spec.bayer &= !processing.mosaic;
+            spec
+        })
+        .collect()
 }
 
 #[cfg(test)]
@@ -73,6 +119,20 @@ mod tests {
                 );
             }
         }
+    }
+
+    #[test]
+    fn another_seed_has_other_poses_and_a_preset_the_same_ones() {
+        let marker = "stag-hd23:0:0.15341".parse().unwrap();
+        let of = |seed, processing| {
+            frames_of(Set::Landing, marker, Variant { seed, processing, every: 2 })
+        };
+        let [first, usb, other] =
+            [of(0, Preset::Linear), of(0, Preset::Usb), of(7, Preset::Linear)];
+        assert_eq!([first.len(), usb.len(), other.len()], [26; 3]);
+        assert!(first.iter().zip(&usb).all(|(a, b)| a.path == b.path && a.seed == b.seed));
+        assert!(first.iter().zip(&other).all(|(a, b)| a.path != b.path && a.seed != b.seed));
+        assert!(usb.iter().all(|spec| spec.settings.processing == Preset::Usb.processing()));
     }
 
     #[test]

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::frame_spec::{FrameRenderer, FrameSpec};
 use crate::set::Set;
-use crate::sets;
+use crate::sets::{self, Variant};
 
 /// The file with the ground truth of the frames beside it.
 pub const TRUTH: &str = "truth.jsonl";
@@ -136,6 +136,7 @@ pub fn make(
     root: &Path,
     set: Set,
     marker: Marker,
+    variant: Variant,
     renderer: &mut FrameRenderer,
 ) -> anyhow::Result<usize> {
     let folder = folder(root, set, marker);
@@ -147,7 +148,7 @@ pub fn make(
     // Renamed when it is complete.
     let unfinished = folder.join("truth.unfinished");
     let mut lines = BufWriter::new(File::create(&unfinished)?);
-    let specs = sets::frames(set, marker);
+    let specs = sets::frames_of(set, marker, variant);
     for (index, spec) in specs.iter().enumerate() {
         let image = format!("{index:04}-{}.png", spec.group);
         let pixels = renderer.render(spec)?;

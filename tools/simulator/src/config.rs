@@ -5,7 +5,7 @@ use autopilot::Address;
 use geometry::{CameraModel, Point, Transform, Vector};
 use markers::{Drawing, Marker, Pad};
 use node::{Check, Settings};
-use rendering::{CameraSettings, PadInScene, Scene, Surface};
+use rendering::{CameraSettings, PadInScene, Preset, Scene, Surface};
 use serde::Deserialize;
 use world::ardupilot::{AutopilotConfig, EstimateConfig, Firmware};
 use world::camera::CameraFaults;
@@ -197,6 +197,7 @@ table! {
         white_level: f64 = 20.0..=255.0,
         max_exposure_ms: f64 = 0.01..=100.0,
         noise: bool,
+        processing: String,
         mount_error_deg: f64 = 0.0..=10.0,
         latency_ms: f64 = 0.0..=2000.0,
         jitter_ms: f64 = 0.0..=2000.0,
@@ -230,6 +231,7 @@ impl Settings for Config {
         self.ground.check_ranges(check);
         self.occluder.check_ranges(check);
         check.name("camera.name", &self.camera.name);
+        check.parses("camera.processing", self.camera.processing.parse::<Preset>());
         self.camera.check_ranges(check);
         for (key, value, range) in self.air.ranges() {
             check.range(key, value, range);
@@ -325,6 +327,8 @@ impl Config {
             body_from_camera: Transform::new(thesis.body_from_camera.rotation(), mount),
             blur_px: camera.blur_px,
             noise: camera.noise,
+            // The configuration was checked when it was loaded.
+            processing: camera.processing.parse::<Preset>().unwrap_or_default().processing(),
             ..thesis
         }
         .exposed_for(self.ground.light, camera.white_level, camera.max_exposure_ms * 1e-3)
@@ -448,6 +452,7 @@ mod tests {
             ("camera.rate_hz=0", "`camera.rate_hz`"),
             ("camera.rate_hz=0", "from 0.1 to 120"),
             ("vehicle=pigeon", "pigeon"),
+            ("camera.processing=webcam", "raspberry-pi"),
             ("seed=-1", "-1"),
         ] {
             let problem = load(set).unwrap_err();

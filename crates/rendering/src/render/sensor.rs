@@ -61,6 +61,24 @@ impl Sensor {
 
     /// Exposes row `v` of frame `frame_index`: `light` in grey levels before vignetting.
     pub(super) fn expose(&self, frame_index: u64, v: usize, light: &[f32], out: &mut [u8]) {
+        self.expose_as(frame_index, v, light, out, quantise);
+    }
+
+    /// Like [`Sensor::expose`], with the steps of a raw file: a sixteenth of a grey level.
+    pub(super) fn expose_raw(&self, frame_index: u64, v: usize, light: &[f32], out: &mut [f32]) {
+        const STEPS: f32 = 16.0;
+        let level = |level: f32| (level.clamp(0.0, 255.0) * STEPS).round() / STEPS;
+        self.expose_as(frame_index, v, light, out, level);
+    }
+
+    fn expose_as<T>(
+        &self,
+        frame_index: u64,
+        v: usize,
+        light: &[f32],
+        out: &mut [T],
+        quantised: impl Fn(f32) -> T,
+    ) {
         let row_gain = 1.0 - self.row_loss.get(v).copied().unwrap_or(0.0);
         let frame_seed = mix(self.seed ^ mix(frame_index)).wrapping_add((v as u64) << 16);
         let stretches = light
@@ -75,7 +93,7 @@ impl Sensor {
             {
                 let signal = light * (row_gain - loss).max(0.0);
                 let noise = (signal * self.shot + self.read).sqrt() * (a + b);
-                *level = quantise(signal + noise);
+                *level = quantised(signal + noise);
             }
         }
     }

@@ -7,24 +7,26 @@ use markers::Marker;
 use rand::RngExt;
 use rendering::CameraSettings;
 
-use super::scene::{frame_rng, view, with_id};
+use super::scene::{Draw, view, with_id};
 use crate::frame_spec::{FrameSpec, Tilt, pose};
 use crate::set::{SIZE_M, Set};
 use rendering::occluder::{Line, Occluder};
 
 const FRAMES: usize = 8;
 
-pub(super) fn frames(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     let kinds = [shadow, glare, occlusion, contrast, noise, defocus, inverted, cut, cut_border];
     let numbered = kinds.iter().enumerate();
     numbered
-        .flat_map(|(kind, spec)| (0..FRAMES).map(move |frame| spec(marker, 100 * kind + frame)))
+        .flat_map(|(kind, spec)| {
+            (0..FRAMES).map(move |frame| spec(draw, marker, 100 * kind + frame))
+        })
         .collect()
 }
 
 /// The edge of a hard shadow across the marker.
-fn shadow(marker: Marker, frame: usize) -> FrameSpec {
-    let (spec, mut rng) = large(marker, frame);
+fn shadow(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
+    let (spec, mut rng) = large(draw, marker, frame);
     let edge = Line {
         through: beside(&spec, rng.random_range(-0.25..0.25), rng.random_range(-0.25..0.25)),
         normal: rng.random_range(0.0..TAU),
@@ -38,8 +40,8 @@ fn shadow(marker: Marker, frame: usize) -> FrameSpec {
 }
 
 /// A reflection that saturates a part of the marker.
-fn glare(marker: Marker, frame: usize) -> FrameSpec {
-    let (spec, mut rng) = large(marker, frame);
+fn glare(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
+    let (spec, mut rng) = large(draw, marker, frame);
     let size_px = spec.size_px();
     let centre = beside(&spec, rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
     let occluder = Occluder::Glare {
@@ -51,8 +53,8 @@ fn glare(marker: Marker, frame: usize) -> FrameSpec {
 }
 
 /// An occluded corner of a square, or third of the outer ring.
-fn occlusion(marker: Marker, frame: usize) -> FrameSpec {
-    let (spec, mut rng) = large(marker, frame);
+fn occlusion(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
+    let (spec, mut rng) = large(draw, marker, frame);
     // Distance of the edge from the centre in marker sizes: a chord that hides a third of a circle, or a
     // corner.
     let (towards, away) = if marker.family.id_count().is_none() {
@@ -70,8 +72,8 @@ fn occlusion(marker: Marker, frame: usize) -> FrameSpec {
 }
 
 /// Low contrast by haze.
-fn contrast(marker: Marker, frame: usize) -> FrameSpec {
-    let (spec, mut rng) = large(marker, frame);
+fn contrast(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
+    let (spec, mut rng) = large(draw, marker, frame);
     let occluder = Occluder::Haze {
         transmission: rng.random_range(0.07..0.16),
         levels: rng.random_range(40.0..150.0),
@@ -80,32 +82,32 @@ fn contrast(marker: Marker, frame: usize) -> FrameSpec {
 }
 
 /// Noise in low light.
-fn noise(marker: Marker, frame: usize) -> FrameSpec {
+fn noise(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     let light = 0.002 * (1.0 + (frame % 4) as f64);
     let settings = CameraSettings::thesis().exposed_for(light, 200.0, 0.004);
-    let (mut spec, _) = view(marker, settings, Set::Adverse, frame, 60.0..140.0, 0.4);
+    let (mut spec, _) = view(draw, marker, settings, Set::Adverse, frame, 60.0..140.0, 0.4);
     spec.light = light;
     spec.with("noise", Occluder::None)
 }
 
 /// Out of focus.
-fn defocus(marker: Marker, frame: usize) -> FrameSpec {
+fn defocus(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     let blur_px = 2.0 + 0.14 * (frame % FRAMES) as f64;
     let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
-    let (spec, _) = view(marker, settings, Set::Adverse, frame, 45.0..90.0, 0.4);
+    let (spec, _) = view(draw, marker, settings, Set::Adverse, frame, 45.0..90.0, 0.4);
     spec.with("defocus", Occluder::None)
 }
 
 /// White on black.
-fn inverted(marker: Marker, frame: usize) -> FrameSpec {
-    let (mut spec, _) = large(marker, frame);
+fn inverted(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
+    let (mut spec, _) = large(draw, marker, frame);
     spec.inverted = true;
     spec.with("inverted", Occluder::None)
 }
 
 /// A corner beyond the border of the frame.
-fn cut(marker: Marker, frame: usize) -> FrameSpec {
-    cut_by(marker, frame, |rng| {
+fn cut(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
+    cut_by(draw, marker, frame, |rng| {
         let legs = rng.random_range(0.15..0.32);
         (FRAC_PI_4 + rng.random_range(-0.25..0.25), (1.0 - legs) * 0.68)
     })
@@ -113,9 +115,9 @@ fn cut(marker: Marker, frame: usize) -> FrameSpec {
 }
 
 /// Half of one side's border, or almost half of rings, beyond the border of the frame.
-fn cut_border(marker: Marker, frame: usize) -> FrameSpec {
+fn cut_border(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     let without_ids = marker.family.id_count().is_none();
-    cut_by(marker, frame, |rng| {
+    cut_by(draw, marker, frame, |rng| {
         let away = if without_ids { 0.1 } else { 0.47 };
         (rng.random_range(-0.02..0.02), away)
     })
@@ -125,11 +127,12 @@ fn cut_border(marker: Marker, frame: usize) -> FrameSpec {
 /// A marker near a side of the frame. `how` returns its rotation relative to that side, and the distance of
 /// its centre from it in marker sizes.
 fn cut_by(
+    draw: Draw,
     marker: Marker,
     frame: usize,
     how: impl Fn(&mut rand_chacha::ChaCha8Rng) -> (f64, f64),
 ) -> FrameSpec {
-    let (mut rng, seed) = frame_rng(Set::Adverse, frame);
+    let (mut rng, seed) = draw.frame_rng(Set::Adverse, frame);
     let settings = CameraSettings::thesis();
     let model = settings.model;
     let size_px = rng.random_range(80.0..300.0);
@@ -148,8 +151,8 @@ fn cut_by(
     FrameSpec::new(with_id(marker, frame), settings, pose, seed)
 }
 
-fn large(marker: Marker, frame: usize) -> (FrameSpec, rand_chacha::ChaCha8Rng) {
-    view(marker, CameraSettings::thesis(), Set::Adverse, frame, 60.0..160.0, 0.4)
+fn large(draw: Draw, marker: Marker, frame: usize) -> (FrameSpec, rand_chacha::ChaCha8Rng) {
+    view(draw, marker, CameraSettings::thesis(), Set::Adverse, frame, 60.0..160.0, 0.4)
 }
 
 /// The pixel of a point on the marker, in marker sizes from its centre.

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rendering::views::Binning;
 use rendering::{PadInScene, Surface};
 
-use super::scene::{centre, frame_rng, near};
+use super::scene::{Draw, centre, near};
 use crate::frame_spec::{FrameSpec, Tilt, pose};
 use crate::set::Set;
 use rendering::occluder::{Line, Occluder};
@@ -21,8 +21,8 @@ const SCENES: usize = 520;
 const DISTANCE_M: f64 = 3.0;
 const HALF_M: f64 = 1.3;
 
-pub(super) fn frames() -> Vec<FrameSpec> {
-    (0..SCENES).map(spec).collect()
+pub(super) fn frames(draw: Draw) -> Vec<FrameSpec> {
+    (0..SCENES).map(|frame| spec(draw, frame)).collect()
 }
 
 /// A name, and a random drawing.
@@ -42,8 +42,8 @@ const KINDS: [Kind; 10] = [
     ("dots", dots),
 ];
 
-fn spec(frame: usize) -> FrameSpec {
-    let (mut rng, seed) = frame_rng(Set::Negatives, frame);
+fn spec(draw: Draw, frame: usize) -> FrameSpec {
+    let (mut rng, seed) = draw.frame_rng(Set::Negatives, frame);
     // Large frames take long, so that most are small.
     let binning = if (frame / KINDS.len()).is_multiple_of(4) {
         Binning::TwoByTwo
@@ -57,7 +57,7 @@ fn spec(frame: usize) -> FrameSpec {
     let distance_m = DISTANCE_M * rng.random_range(0.4..2.0);
     let at = near(&mut rng, centre(&model), 50.0);
     let pose = pose(&model, at, distance_m, tilt, 0.0);
-    let (group, draw) = KINDS[frame % KINDS.len()];
+    let (group, drawn) = KINDS[frame % KINDS.len()];
     let mut spec = FrameSpec {
         group: group.to_owned(),
         marker: None,
@@ -78,7 +78,7 @@ fn spec(frame: usize) -> FrameSpec {
         let drawing = if other {
             KINDS[rng.random_range(0..KINDS.len())].1(&mut rng)
         } else {
-            draw(&mut rng)
+            drawn(&mut rng)
         };
         spec.clutter.push(place(drawing, &pad, &mut rng));
     }

@@ -11,10 +11,22 @@ use rendering::{CameraSettings, Surface};
 use crate::frame_spec::{FrameSpec, Tilt, pose};
 use crate::set::{SIZE_M, Set};
 
-/// The random generator and the seed of one frame of a set.
-pub(super) fn frame_rng(set: Set, frame: usize) -> (ChaCha8Rng, u64) {
-    let seed = 1000 * (set.name().bytes().map(u64::from).sum::<u64>()) + frame as u64;
-    (ChaCha8Rng::seed_from_u64(seed), seed)
+/// One draw of all sets.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Draw {
+    /// Its seed; 0 has the frames on which the detector was developed.
+    pub(super) seed: u64,
+}
+
+impl Draw {
+    /// The random generator and the seed of one frame of a set.
+    pub(super) fn frame_rng(self, set: Set, frame: usize) -> (ChaCha8Rng, u64) {
+        /// Further than any two frames of one draw are apart.
+        const APART: u64 = 1 << 32;
+        let in_draw = 1000 * (set.name().bytes().map(u64::from).sum::<u64>()) + frame as u64;
+        let seed = in_draw.wrapping_add(self.seed.wrapping_mul(APART));
+        (ChaCha8Rng::seed_from_u64(seed), seed)
+    }
 }
 
 /// A random pixel at most `by_px` from another, along both axes.
@@ -35,6 +47,7 @@ pub(super) fn with_id(marker: Marker, number: usize) -> Marker {
 
 /// A random view of a marker: its size in the image within `size_px`, tilted by up to `max_tilt`.
 pub(super) fn view(
+    draw: Draw,
     marker: Marker,
     settings: CameraSettings,
     set: Set,
@@ -42,7 +55,7 @@ pub(super) fn view(
     size_px: std::ops::Range<f64>,
     max_tilt: f64,
 ) -> (FrameSpec, ChaCha8Rng) {
-    let (mut rng, seed) = frame_rng(set, frame);
+    let (mut rng, seed) = draw.frame_rng(set, frame);
     let model = settings.model;
     let distance_m = model.fx * SIZE_M / rng.random_range(size_px);
     let at = near(&mut rng, centre(&model), 200.0);

@@ -7,17 +7,17 @@ use markers::Marker;
 use rand::RngExt;
 use rendering::{CameraSettings, Surface};
 
-use super::scene::{centre, frame_rng, near, view, with_id};
+use super::scene::{Draw, centre, near, view, with_id};
 use crate::frame_spec::{FrameSpec, Tilt, pose};
 use crate::set::Set;
 use rendering::occluder::Occluder;
 
-pub(super) fn tilt(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn tilt(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     let mut frames = Vec::new();
     for tilt_deg in (0..=60).step_by(10) {
         for distance_m in [0.6f64, 1.5, 4.0, 8.0] {
             for frame in 0..3 {
-                let (mut rng, seed) = frame_rng(Set::Tilt, frames.len());
+                let (mut rng, seed) = draw.frame_rng(Set::Tilt, frames.len());
                 let settings = CameraSettings::thesis();
                 let at = near(&mut rng, centre(&settings.model), 150.0);
                 let tilt = Tilt {
@@ -35,12 +35,12 @@ pub(super) fn tilt(marker: Marker) -> Vec<FrameSpec> {
     frames
 }
 
-pub(super) fn blur(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn blur(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     let mut frames = Vec::new();
     for blur_px in [0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0] {
         for _ in 0..6 {
             let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
-            let (spec, _) = view(marker, settings, Set::Blur, frames.len(), 35.0..120.0, 0.3);
+            let (spec, _) = view(draw, marker, settings, Set::Blur, frames.len(), 35.0..120.0, 0.3);
             frames.push(spec.with(format!("lens{blur_px}"), Occluder::None));
         }
     }
@@ -48,7 +48,7 @@ pub(super) fn blur(marker: Marker) -> Vec<FrameSpec> {
         for _ in 0..6 {
             let settings = CameraSettings::thesis();
             let (mut spec, mut rng) =
-                view(marker, settings, Set::Blur, frames.len(), 50.0..150.0, 0.3);
+                view(draw, marker, settings, Set::Blur, frames.len(), 50.0..150.0, 0.3);
             let middle = spec.path[0];
             let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
             let origin = middle.origin();
@@ -64,13 +64,14 @@ pub(super) fn blur(marker: Marker) -> Vec<FrameSpec> {
     frames
 }
 
-pub(super) fn noise(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn noise(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     let mut frames = Vec::new();
     // Light on the scene; the gain makes up for it.
     for light in [0.5, 0.1, 0.03, 0.01, 0.004, 0.002, 0.001] {
         for _ in 0..6 {
             let settings = CameraSettings::thesis().exposed_for(light, 200.0, 0.004);
-            let (mut spec, _) = view(marker, settings, Set::Noise, frames.len(), 40.0..120.0, 0.3);
+            let (mut spec, _) =
+                view(draw, marker, settings, Set::Noise, frames.len(), 40.0..120.0, 0.3);
             spec.light = light;
             frames.push(spec.with(format!("light{light}"), Occluder::None));
         }
@@ -78,13 +79,14 @@ pub(super) fn noise(marker: Marker) -> Vec<FrameSpec> {
     frames
 }
 
-pub(super) fn light(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn light(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     let mut frames = Vec::new();
     // Grey level of white without saturation.
     for white in [8.0, 15.0, 30.0, 60.0, 120.0, 240.0, 400.0, 700.0, 1200.0] {
         for frame in 0..6 {
             let settings = CameraSettings::thesis().exposed_for(1.0, white, 0.1);
-            let (mut spec, _) = view(marker, settings, Set::Light, frames.len(), 30.0..120.0, 0.3);
+            let (mut spec, _) =
+                view(draw, marker, settings, Set::Light, frames.len(), 30.0..120.0, 0.3);
             spec.surface = [Surface::Asphalt, Surface::Grass][frame % 2];
             frames.push(spec.with(format!("white{white}"), Occluder::None));
         }
@@ -95,7 +97,7 @@ pub(super) fn light(marker: Marker) -> Vec<FrameSpec> {
 /// Readout time of the rolling shutter, in seconds.
 const READOUT_S: f64 = 0.02;
 
-pub(super) fn rolling(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn rolling(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     // The camera's velocity right, down and forward in m/s, and its rate of turn about the optical axis in
     // rad/s.
     let motions = [
@@ -111,7 +113,7 @@ pub(super) fn rolling(marker: Marker) -> Vec<FrameSpec> {
     let mut frames = Vec::new();
     for (name, velocity, turn) in motions {
         for _ in 0..6 {
-            let (mut rng, seed) = frame_rng(Set::Rolling, frames.len());
+            let (mut rng, seed) = draw.frame_rng(Set::Rolling, frames.len());
             let settings = CameraSettings { readout_s: READOUT_S, ..CameraSettings::thesis() };
             let at = near(&mut rng, centre(&settings.model), 250.0);
             let tilt =

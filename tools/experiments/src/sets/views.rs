@@ -8,20 +8,20 @@ use rand::RngExt;
 use rendering::views::{Binning, MAX_HEIGHT_M, laterals_m};
 use rendering::{CameraSettings, Surface};
 
-use super::scene::{centre, frame_rng, near, with_id};
+use super::scene::{Draw, centre, near, with_id};
 use crate::frame_spec::{FrameSpec, Tilt, pose};
 use crate::set::{SIZE_M, Set};
 
 /// Frames of each position.
 const FRAMES_PER_POSITION: usize = 5;
 
-pub(super) fn positions(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn positions(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     let mut frames = Vec::new();
     for binning in [Binning::TwoByTwo, Binning::FourByFour] {
         for height_m in 1..=MAX_HEIGHT_M {
             for lateral_m in laterals_m(height_m) {
                 for _ in 0..FRAMES_PER_POSITION {
-                    let (mut rng, seed) = frame_rng(Set::Positions, frames.len());
+                    let (mut rng, seed) = draw.frame_rng(Set::Positions, frames.len());
                     let settings = binning.settings();
                     let model = settings.model;
                     let right_px = model.fx * lateral_m / f64::from(height_m);
@@ -39,11 +39,11 @@ pub(super) fn positions(marker: Marker) -> Vec<FrameSpec> {
     frames
 }
 
-pub(super) fn far(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn far(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     let mut frames = Vec::new();
     for height_m in (10..=40).step_by(2) {
         for frame in 0..5 {
-            let (mut rng, seed) = frame_rng(Set::Far, frames.len());
+            let (mut rng, seed) = draw.frame_rng(Set::Far, frames.len());
             let settings = CameraSettings::thesis();
             let at = near(&mut rng, centre(&settings.model), 100.0);
             let tilt =
@@ -59,11 +59,11 @@ pub(super) fn far(marker: Marker) -> Vec<FrameSpec> {
     frames
 }
 
-pub(super) fn landing(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn landing(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     const FRAMES: usize = 51;
     (0..FRAMES)
         .map(|frame| {
-            let (mut rng, seed) = frame_rng(Set::Landing, frame);
+            let (mut rng, seed) = draw.frame_rng(Set::Landing, frame);
             let light = 10f64.powf(rng.random_range(-0.8..0.1));
             let mut settings = CameraSettings::thesis().exposed_for(light, 190.0, 0.004);
             if frame % 2 == 1 {
@@ -104,11 +104,11 @@ pub(super) fn landing(marker: Marker) -> Vec<FrameSpec> {
         .collect()
 }
 
-pub(super) fn textured(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn textured(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     const FRAMES: usize = 15;
     (0..FRAMES)
         .map(|frame| {
-            let (mut rng, seed) = frame_rng(Set::Textured, frame);
+            let (mut rng, seed) = draw.frame_rng(Set::Textured, frame);
             let settings = CameraSettings::thesis();
             let at = near(&mut rng, centre(&settings.model), 200.0);
             let distance_m = 1.5 + 0.6 * frame as f64;
@@ -124,15 +124,15 @@ pub(super) fn textured(marker: Marker) -> Vec<FrameSpec> {
         .collect()
 }
 
-pub(super) fn tracking(marker: Marker) -> Vec<FrameSpec> {
+pub(super) fn tracking(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     const FRAMES: usize = 30;
     const SIZE_PX: f64 = 48.0;
     let settings = CameraSettings::thesis();
-    let (mut rng, _) = frame_rng(Set::Tracking, 0);
+    let (mut rng, _) = draw.frame_rng(Set::Tracking, 0);
     let heading = rng.random_range(0.0..PI);
     (0..FRAMES)
         .map(|frame| {
-            let (_, seed) = frame_rng(Set::Tracking, frame);
+            let (_, seed) = draw.frame_rng(Set::Tracking, frame);
             let model = settings.model;
             let along = frame as f64;
             let at = Pixel::new(300.0 + 9.3 * along, 300.0 + 5.7 * along);

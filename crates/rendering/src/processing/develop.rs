@@ -1,0 +1,125 @@
+//! From the light on the sensor, with its noise, to the camera's frame.
+
+use jpeg_encoder::{ColorType, Encoder};
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
+
+use super::filters::{self, Gaussian};
+use super::tone::{Table, ToneCurve};
+use super::{Denoise, Processing, Sharpen, local, mosaic};
+use crate::scene::RenderError;
+
+/// A camera's processing with its tables and buffers.
+#[derive(Debug)]
+pub(crate) struct Developer {
+    processing: Processing,
+    width: usize,
+    table: Option<Table>,
+    mask: Option<(Gaussian, Sharpen)>,
+    /// Light on the sensor in levels from 0 to 255, row by row.
+    raw: Vec<f32>,
+    padded: Vec<f32>,
+    work: Vec<f32>,
+    blurred: Vec<f32>,
+    jpeg: Vec<u8>,
+}
+
+impl Developer {
+    pub(crate) fn new(processing: &Processing, width: usize) -> Result<Self, RenderError> {
+        processing.check()?;
+        let tone = processing.tone;
+        Ok(Self {
+            processing: *processing,
+            width,
+            table: (tone != ToneCurve::Linear).then(|| Table::new(tone)),
+            mask: processing.sharpen.map(|sharpen| (Gaussian::new(sharpen.radius_px), sharpen)),
+            raw: Vec::new(),
+            padded: Vec::new(),
+            work: Vec::new(),
+            blurred: Vec::new(),
+            jpeg: Vec::new(),
+        })
+    }
+
+    /// The sensor, for its light to be written: `len` pixels, with colour filters if it has a mosaic.
+    pub(crate) fn raw(&mut self, len: usize) -> &mut [f32] {
+        self.raw.resize(len, 0.0);
+        &mut self.raw
+    }
+
+    /// The row of the light of which a sensor with a mosaic sees what its filters let through.
+    pub(crate) fn filter(&self, v: usize, light: &mut [f32]) {
+        if self.processing.mosaic {
+            mosaic::filter(v, light);
+        }
+    }
+
+    /// Develops what was written to the sensor.
+    pub(crate) fn develop(&mut self, out: &mut [u8]) -> Result<(), RenderError> {
+        let width = self.width;
+        if width == 0 || out.len() != self.raw.len() || !out.len().is_multiple_of(width) {
+            return Err(RenderError::Size { len: out.len(), needed: self.raw.len() });
+        }
+        let Self { raw, padded, .. } = self;
+        if self.processing.mosaic {
+            filters::pad(raw, width, true, padded);
+            mosaic::interpolate(padded, width, raw);
+        }
+        match self.processing.denoise {
+            Denoise::None => {}
+            Denoise::Median => {
+                filters::pad(raw, width, false, padded);
+                filters::median(padded, width, raw);
+            }
+            Denoise::Bilateral { sigma_px, range_levels } => {
+                filters::pad(raw, width, false, padded);
+                filters::bilateral(padded, width, sigma_px, range_levels, raw);
+            }
+        }
+        if let Some(local) = &self.processing.local_tone {
+            local::adapt(local, raw, width);
+        }
+        if let Some(table) = &self.table {
+            table.apply(raw);
+        }
+        if let Some((gaussian, sharpen)) = &self.mask {
+            gaussian.blur(raw, width, &mut self.work, &mut self.blurred);
+            let limit = sharpen.limit_levels;
+            for (level, soft) in raw.iter_mut().zip(&self.blurred) {
+                *level += (sharpen.amount * (*level - soft)).clamp(-limit, limit);
+            }
+        }
+        for (pixel, level) in out.iter_mut().zip(&*raw) {
+            *pixel = (level + 0.5).clamp(0.0, 255.0) as u8;
+        }
+        match self.processing.jpeg_quality {
+            Some(quality) => through_jpeg(quality, width, &mut self.jpeg, out),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Encodes and decodes a frame.
+fn through_jpeg(
+    quality: u8,
+    width: usize,
+    bytes: &mut Vec<u8>,
+    pixels: &mut [u8],
+) -> Result<(), RenderError> {
+    const LARGE: RenderError = RenderError::Setting("a JPEG has at most 65535 pixels on an edge");
+    let edge = |pixels: usize| u16::try_from(pixels).map_err(|_| LARGE);
+    let (columns, rows) = (edge(width)?, edge(pixels.len() / width.max(1))?);
+    bytes.clear();
+    Encoder::new(&mut *bytes, quality)
+        .encode(pixels, columns, rows, ColorType::Luma)
+        .map_err(|_| RenderError::Setting("the frame could not be compressed as JPEG"))?;
+    let options = DecoderOptions::default()
+        .jpeg_set_out_colorspace(ColorSpace::Luma)
+        .set_max_width(columns.into())
+        .set_max_height(rows.into());
+    JpegDecoder::new_with_options(ZCursor::new(bytes.as_slice()), options)
+        .decode_into(pixels)
+        .map_err(|_| RenderError::Setting("the frame's JPEG could not be read again"))
+}
