@@ -22,6 +22,8 @@ const COM_OF_LOSS_T: &str = "COM_OF_LOSS_T";
 
 /// Difference of two timeouts that count as the same, in seconds.
 const SAME_S: f64 = 1e-3;
+/// Longest timeout that is put back from a note: PX4 takes up to 60 s, ArduPilot 5 s.
+const MAX_ORIGINAL_S: f64 = 60.0;
 /// Time for which no landing was active before the timeout of an armed vehicle is put back, in nanoseconds: a
 /// controller that is started again needs as long to see that it has one to resume.
 const QUIET_NS: i64 = 2_000_000_000;
@@ -166,6 +168,7 @@ impl Limits {
             && Some(left.system) == autopilot.system()
             && left.parameter == name
             && (timeout_s - left.set_s).abs() < SAME_S
+            && (0.0..=MAX_ORIGINAL_S).contains(&left.original_s)
         {
             self.note = Some(left);
         }

@@ -175,7 +175,10 @@ fn what_a_killed_controller_left_is_put_back() {
     resumed.fly(4, LOITER);
     assert_eq!(resumed.timeout_s, 3.0);
     // A value that somebody else chose meanwhile stays, as does that of another vehicle.
-    for (timeout_s, note) in [(1.0, note.clone()), (0.5, Note { system: 7, ..note })] {
+    let impossible = Note { original_s: 1e9, ..note.clone() };
+    for (timeout_s, note) in
+        [(1.0, note.clone()), (0.5, Note { system: 7, ..note }), (0.5, impossible)]
+    {
         let mut other = Conversation::new("command", timeout_s);
         other.flight.take_over(note);
         other.fly(4, LOITER);
