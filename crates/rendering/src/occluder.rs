@@ -32,6 +32,22 @@ pub enum Occluder {
         /// Its grey level.
         level: f32,
     },
+    /// Shade with discs of sun in it, as under a tree.
+    Dapple {
+        /// The discs.
+        suns: Vec<Disc>,
+        /// Width of their edges, in pixels.
+        penumbra_px: f32,
+        /// Fraction of the light that remains in the shade.
+        transmission: f32,
+    },
+    /// Discs in front of the scene.
+    Leaves {
+        /// The discs.
+        leaves: Vec<Disc>,
+        /// Their grey level.
+        level: f32,
+    },
     /// Low contrast: less light, and added grey levels.
     Haze {
         /// Fraction of the light that remains.
@@ -39,6 +55,28 @@ pub enum Occluder {
         /// Grey levels added everywhere.
         levels: f32,
     },
+}
+
+/// A disc in the image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Disc {
+    /// Its centre.
+    pub centre: Pixel,
+    /// Its radius, in pixels.
+    pub radius_px: f32,
+}
+
+impl Disc {
+    /// How much of a pixel it covers, from 0 to 1, with an edge of some width.
+    fn cover(&self, x: f64, y: f64, edge_px: f32) -> f32 {
+        let away_px = Pixel::new(x, y).distance(&self.centre) as f32;
+        rise((self.radius_px - away_px) / edge_px)
+    }
+}
+
+/// How much of a pixel the nearest of some discs covers.
+fn covered(discs: &[Disc], x: f64, y: f64, edge_px: f32) -> f32 {
+    discs.iter().map(|disc| disc.cover(x, y, edge_px)).fold(0.0, f32::max)
 }
 
 /// A directed line in the image.
@@ -81,6 +119,14 @@ impl Occluder {
                     let cover = rise(edge.distance(x, y) as f32 / EDGE_PX);
                     *level += cover * (own - *level);
                 }
+                Self::Dapple { suns, penumbra_px, transmission } => {
+                    let shade = 1.0 - covered(suns, x, y, *penumbra_px);
+                    *level *= 1.0 - shade * (1.0 - transmission);
+                }
+                Self::Leaves { leaves, level: own } => {
+                    let cover = covered(leaves, x, y, EDGE_PX);
+                    *level += cover * (own - *level);
+                }
                 Self::Haze { transmission, levels } => *level = *level * transmission + levels,
             }
         }
@@ -91,4 +137,23 @@ impl Occluder {
 fn rise(place: f32) -> f32 {
     let t = (place + 0.5).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dapples_let_the_sun_through_and_leaves_cover() {
+        let disc = Disc { centre: Pixel::new(20.0, 3.0), radius_px: 6.0 };
+        let mut row = [200.0f32; 40];
+        let dapple = Occluder::Dapple { suns: vec![disc], penumbra_px: 2.0, transmission: 0.25 };
+        dapple.apply(3, &mut row);
+        assert_eq!([row[20], row[2], row[38]], [200.0, 50.0, 50.0]);
+        // Half-way at the disc's edge.
+        assert!((row[26] - 125.0).abs() < 1.0);
+        let mut row = [200.0f32; 40];
+        Occluder::Leaves { leaves: vec![disc], level: 30.0 }.apply(3, &mut row);
+        assert_eq!([row[20], row[2]], [30.0, 200.0]);
+    }
 }

@@ -1,14 +1,15 @@
-//! What a camera does to the light on its sensor before anybody sees a frame: colour mosaic, denoising, tone
-//! curve, sharpening, compression.
+//! What a camera does to light before anybody sees a frame: lens, colour mosaic, denoising, tone curve,
+//! sharpening, compression.
 //!
-//! The stages are those of an ordinary image signal processor, in its order: optics, exposure and noise come
-//! before (`render`), then `mosaic` (colour filters, interpolation), `denoise`, `local_tone`, `tone` (from
+//! The stages are those of an ordinary camera, in its order: `lens` and `unsteady` (on the light behind the
+//! Gaussian blur that the renderer draws with), vignetting, exposure and noise (the sensor's), then `mosaic` (colour filters, interpolation), `denoise`, `local_tone`, `tone` (from
 //! linear to the grey levels of the file), `sharpen`, `jpeg_quality`. Everything is grey: a neutral scene is
 //! grey behind white balance, and the luma of a JPEG with subsampled chroma (YCbCr 4:2:0) is the JPEG of its
 //! luma.
 
 mod develop;
 mod filters;
+mod lens;
 mod local;
 mod mosaic;
 mod preset;
@@ -19,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use crate::scene::RenderError;
 
 pub(crate) use develop::Developer;
+pub use lens::{Lens, Unsteady};
 pub use preset::Preset;
 pub use tone::ToneCurve;
 
@@ -26,6 +28,10 @@ pub use tone::ToneCurve;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Processing {
+    /// The flaws of the lens.
+    pub lens: Lens,
+    /// What changes from frame to frame.
+    pub unsteady: Unsteady,
     /// Whether the sensor has an RGGB mosaic of colour filters, from which grey is interpolated; else it is
     /// monochrome.
     pub mosaic: bool,
@@ -90,6 +96,8 @@ pub struct Sharpen {
 impl Processing {
     /// No processing.
     pub const LINEAR: Self = Self {
+        lens: Lens { curvature_px: 0.0, fringe_px: 0.0, flare: 0.0 },
+        unsteady: Unsteady { flicker: 0.0, bands: 0.0, exposure_stops: 0.0 },
         mosaic: false,
         denoise: Denoise::None,
         local_tone: None,
@@ -98,8 +106,8 @@ impl Processing {
         jpeg_quality: None,
     };
 
-    /// Processes a grey frame that is linear in light, given row by row; returns its grey levels. A mosaic is
-    /// made of the finished frame, without noise of its own.
+    /// Processes a grey frame that is linear in light, given row by row; returns its grey levels. Lens and
+    /// mosaic come after the frame's own noise.
     ///
     /// # Errors
     /// [`RenderError`] when a setting is out of range, or the frame does not have full rows.
@@ -110,9 +118,7 @@ impl Processing {
         for (level, pixel) in raw.iter_mut().zip(pixels) {
             *level = f32::from(*pixel);
         }
-        if self.mosaic {
-            raw.chunks_mut(width.max(1)).enumerate().for_each(|(v, row)| mosaic::filter(v, row));
-        }
+        developer.pass_lens(0);
         developer.develop(&mut out)?;
         Ok(out)
     }
@@ -131,6 +137,14 @@ impl Processing {
             _ => true,
         };
         let checks = [
+            (
+                self.lens.is_sound(),
+                "processing.lens: curvature_px is not from 0 to 5, fringe_px not from -3 to 3, or flare not from 0 to 0.5",
+            ),
+            (
+                self.unsteady.is_sound(),
+                "processing.unsteady: flicker is not from 0 to 1, bands not from 0 to 20, or exposure_stops not from 0 to 2",
+            ),
             (
                 denoise,
                 "processing.denoise: sigma_px is not from 0.1 to 3, or range_levels not from 0.1 to 255",

@@ -187,15 +187,16 @@ impl Renderer {
                     self.sensor.expose(frame_index, v, light, row);
                     continue;
                 };
-                developer.filter(v, light);
-                let raw = developer.raw(width * height).chunks_mut(width).nth(v);
-                self.sensor.expose_raw(frame_index, v, light, raw.unwrap_or(&mut []));
+                let row = developer.raw(width * height).chunks_mut(width).nth(v);
+                row.unwrap_or(&mut []).copy_from_slice(light);
             }
         }
-        match &mut self.developer {
-            Some(developer) => developer.develop(out),
-            None => Ok(()),
+        let Some(developer) = &mut self.developer else { return Ok(()) };
+        developer.pass_lens(frame_index);
+        for (v, row) in developer.raw(width * height).chunks_mut(width).enumerate() {
+            self.sensor.expose_raw(frame_index, v, row);
         }
+        developer.develop(out)
     }
 
     /// Sets the exposure to that of one row of a rolling shutter.

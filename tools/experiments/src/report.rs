@@ -270,8 +270,16 @@ fn append_farthest(text: &mut String, runs: &[Run]) {
 
 fn append_groups(text: &mut String, runs: &[Run]) {
     let _ = writeln!(text, "\n## Groups: found of all, median centre px");
-    let with_groups =
-        [Set::Adverse, Set::Landing, Set::Tilt, Set::Blur, Set::Noise, Set::Light, Set::Rolling];
+    let with_groups = [
+        Set::Adverse,
+        Set::Shade,
+        Set::Landing,
+        Set::Tilt,
+        Set::Blur,
+        Set::Noise,
+        Set::Light,
+        Set::Rolling,
+    ];
     for set in with_groups {
         let of_set: Vec<_> = runs.iter().filter(|run| run.set == set).collect();
         let Some(first) = of_set.first() else { continue };

@@ -28,6 +28,8 @@ pub enum Set {
     Light,
     /// Motion with a rolling shutter.
     Rolling,
+    /// Edges of hard shadows with contrasts from 2 to 10, dappled shade, leaves.
+    Shade,
     /// Textured grounds, for timing.
     Textured,
     /// A marker 48 px wide that drifts through the image.
@@ -38,7 +40,7 @@ pub enum Set {
 
 impl Set {
     /// Every set, in the order in which they are rendered.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Textured,
         Self::Adverse,
         Self::Landing,
@@ -48,6 +50,7 @@ impl Set {
         Self::Noise,
         Self::Light,
         Self::Rolling,
+        Self::Shade,
         Self::Tracking,
         Self::Negatives,
         Self::Positions,
@@ -65,6 +68,7 @@ impl Set {
             Self::Noise => "noise",
             Self::Light => "light",
             Self::Rolling => "rolling",
+            Self::Shade => "shade",
             Self::Textured => "textured",
             Self::Tracking => "tracking",
             Self::Negatives => "negatives",

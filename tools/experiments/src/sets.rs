@@ -6,6 +6,7 @@
 mod adverse;
 mod clutter;
 mod scene;
+mod shade;
 mod sweeps;
 mod views;
 
@@ -61,6 +62,7 @@ pub fn frames_of(set: Set, marker: Marker, variant: Variant) -> Vec<FrameSpec> {
         Set::Noise => sweeps::noise(draw, marker),
         Set::Light => sweeps::light(draw, marker),
         Set::Rolling => sweeps::rolling(draw, marker),
+        Set::Shade => shade::frames(draw, marker),
         Set::Textured => views::textured(draw, marker),
         Set::Tracking => views::tracking(draw, marker),
         Set::Negatives => clutter::frames(draw),
@@ -97,6 +99,7 @@ mod tests {
             ("noise", 42),
             ("light", 54),
             ("rolling", 48),
+            ("shade", 120),
             ("tracking", 30),
             ("negatives", 520),
             ("positions", 37 * 2 * 5),

@@ -15,6 +15,10 @@ use crate::config::{Config, OccluderKind, OccluderSettings};
 const POSES: usize = 5;
 /// Grey level of an object that covers the marker.
 const COVER_LEVEL: f32 = 40.0;
+/// Direction of the normal of a shadow's edge in the image, in radians.
+const SHADOW_NORMAL: f64 = 0.5;
+/// Width of a shadow's edge, in pixels.
+const SHADOW_PENUMBRA_PX: f32 = 2.0;
 /// Grey levels that glare of strength 1 adds.
 const GLARE_LEVELS: f64 = 400.0;
 
@@ -167,6 +171,12 @@ impl SimCamera {
                 let through = Pixel::new(centre.x + size_px * (0.5 - strength), centre.y);
                 Occluder::Cover { edge: Line { through, normal: 0.0 }, level: COVER_LEVEL }
             }
+            OccluderKind::Shadow => Occluder::Shadow {
+                // Through the centre, turned against the marker's sides.
+                edge: Line { through: centre, normal: SHADOW_NORMAL },
+                penumbra_px: SHADOW_PENUMBRA_PX,
+                transmission: 1.0 - strength as f32,
+            },
             OccluderKind::Haze => Occluder::Haze {
                 transmission: 1.0 - strength as f32,
                 levels: 120.0 * strength as f32,

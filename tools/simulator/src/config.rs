@@ -117,6 +117,8 @@ pub enum OccluderKind {
     Cover,
     /// Low contrast.
     Haze,
+    /// The edge of a hard shadow across the marker.
+    Shadow,
 }
 
 table! {

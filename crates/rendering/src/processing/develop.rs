@@ -43,16 +43,31 @@ impl Developer {
         })
     }
 
-    /// The sensor, for its light to be written: `len` pixels, with colour filters if it has a mosaic.
+    /// The light of `len` pixels, to be written, then what the sensor makes of it.
     pub(crate) fn raw(&mut self, len: usize) -> &mut [f32] {
         self.raw.resize(len, 0.0);
         &mut self.raw
     }
 
-    /// The row of the light of which a sensor with a mosaic sees what its filters let through.
-    pub(crate) fn filter(&self, v: usize, light: &mut [f32]) {
-        if self.processing.mosaic {
-            mosaic::filter(v, light);
+    /// Takes the light of frame `frame_index` through the lens and, for a sensor with a mosaic, its colour
+    /// filters.
+    pub(crate) fn pass_lens(&mut self, frame_index: u64) {
+        let width = self.width.max(1);
+        let Processing { lens, unsteady, mosaic, .. } = self.processing;
+        lens.spread(&mut self.raw, width, &mut self.work, &mut self.blurred);
+        if mosaic && lens.fringe_px != 0.0 {
+            self.work.clone_from(&self.raw);
+            lens.fringe(&self.work, &mut self.raw, width);
+        }
+        let height = self.raw.len() / width;
+        for (v, row) in self.raw.chunks_mut(width).enumerate() {
+            let gain = unsteady.gain(frame_index, v, height);
+            if gain != 1.0 {
+                row.iter_mut().for_each(|level| *level *= gain);
+            }
+            if mosaic {
+                mosaic::filter(v, row);
+            }
         }
     }
 

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use super::{Denoise, LocalTone, Processing, Sharpen, ToneCurve};
+use super::{Denoise, Lens, LocalTone, Processing, Sharpen, ToneCurve};
 
 /// A kind of camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -53,23 +53,24 @@ impl Preset {
             // UVC cameras stand at gamma 100 (no curve beside that of the video standard) and at sharpness 2
             // or 3 of 7; on pictures of real ones unsharp masks of up to 0.5 were measured.
             Self::Usb => Processing {
+                lens: Lens { curvature_px: 0.8, fringe_px: 0.5, flare: 0.01 },
                 mosaic: true,
                 denoise: Denoise::Bilateral { sigma_px: 0.7, range_levels: 6.0 },
-                local_tone: None,
                 tone: ToneCurve::Srgb,
                 sharpen: Some(Sharpen { radius_px: 1.0, amount: 0.5, limit_levels: 255.0 }),
                 jpeg_quality: Some(85),
+                ..Processing::LINEAR
             },
             // The gamma curve of libcamera's tuning of the imx219 (`rpi.contrast` in
             // src/ipa/rpi/vc4/data/imx219.json) is that of this knee to within 0.03; `rpi.sharpen` limits its
             // halos.
             Self::RaspberryPi => Processing {
+                lens: Lens { curvature_px: 0.8, fringe_px: 0.4, flare: 0.01 },
                 mosaic: true,
                 denoise: Denoise::Bilateral { sigma_px: 0.7, range_levels: 4.0 },
-                local_tone: None,
                 tone: ToneCurve::Shoulder { knee: 0.25 },
                 sharpen: Some(Sharpen { radius_px: 0.8, amount: 0.4, limit_levels: 32.0 }),
-                jpeg_quality: None,
+                ..Processing::LINEAR
             },
             // Gamma is on by default in some, with 1.25 (an exponent of 0.8); nothing else is.
             Self::Industrial => {
@@ -78,22 +79,26 @@ impl Preset {
             // Video of high contrast and strong sharpening; its compression between key frames is not
             // modelled, that of a single one is about this JPEG.
             Self::ActionCamera => Processing {
+                lens: Lens { curvature_px: 1.0, fringe_px: 0.8, flare: 0.02 },
                 mosaic: true,
                 denoise: Denoise::Bilateral { sigma_px: 0.9, range_levels: 8.0 },
                 local_tone: Some(LocalTone { strength: 0.2, max_gain: 2.0, neighbourhood: 0.15 }),
                 tone: ToneCurve::Filmic,
                 sharpen: Some(Sharpen { radius_px: 1.0, amount: 0.8, limit_levels: 64.0 }),
                 jpeg_quality: Some(75),
+                ..Processing::LINEAR
             },
             // A burst of exposures, merged, denoised and made even (Hasinoff et al., "Burst photography for
             // high dynamic range and low-light imaging on mobile cameras", 2016).
             Self::Phone => Processing {
+                lens: Lens { curvature_px: 0.5, fringe_px: 0.3, flare: 0.02 },
                 mosaic: true,
                 denoise: Denoise::Bilateral { sigma_px: 0.9, range_levels: 6.0 },
                 local_tone: Some(LocalTone { strength: 0.35, max_gain: 4.0, neighbourhood: 0.1 }),
                 tone: ToneCurve::Srgb,
                 sharpen: Some(Sharpen { radius_px: 0.8, amount: 0.6, limit_levels: 48.0 }),
                 jpeg_quality: Some(92),
+                ..Processing::LINEAR
             },
         }
     }

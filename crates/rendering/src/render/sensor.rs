@@ -61,41 +61,45 @@ impl Sensor {
 
     /// Exposes row `v` of frame `frame_index`: `light` in grey levels before vignetting.
     pub(super) fn expose(&self, frame_index: u64, v: usize, light: &[f32], out: &mut [u8]) {
-        self.expose_as(frame_index, v, light, out, quantise);
-    }
-
-    /// Like [`Sensor::expose`], with the steps of a raw file: a sixteenth of a grey level.
-    pub(super) fn expose_raw(&self, frame_index: u64, v: usize, light: &[f32], out: &mut [f32]) {
-        const STEPS: f32 = 16.0;
-        let level = |level: f32| (level.clamp(0.0, 255.0) * STEPS).round() / STEPS;
-        self.expose_as(frame_index, v, light, out, level);
-    }
-
-    fn expose_as<T>(
-        &self,
-        frame_index: u64,
-        v: usize,
-        light: &[f32],
-        out: &mut [T],
-        quantised: impl Fn(f32) -> T,
-    ) {
-        let row_gain = 1.0 - self.row_loss.get(v).copied().unwrap_or(0.0);
-        let frame_seed = mix(self.seed ^ mix(frame_index)).wrapping_add((v as u64) << 16);
+        let row = self.row(frame_index, v);
         let stretches = light
             .chunks(STRETCH)
             .zip(self.column_loss.chunks(STRETCH))
             .zip(out.chunks_mut(STRETCH))
             .enumerate();
         for (index, ((light, loss), out)) in stretches {
-            let (a, b) = self.pair(frame_seed.wrapping_add(index as u64));
+            let (a, b) = self.pair(row.seed.wrapping_add(index as u64));
             for ((((level, light), loss), a), b) in
                 out.iter_mut().zip(light).zip(loss).zip(a).zip(b)
             {
-                let signal = light * (row_gain - loss).max(0.0);
-                let noise = (signal * self.shot + self.read).sqrt() * (a + b);
-                *level = quantised(signal + noise);
+                *level = quantise(self.noisy(light * (row.gain - loss).max(0.0), a + b));
             }
         }
+    }
+
+    /// Like [`Sensor::expose`], in place, with the steps of a raw file: a sixteenth of a grey level.
+    pub(super) fn expose_raw(&self, frame_index: u64, v: usize, light: &mut [f32]) {
+        const STEPS: f32 = 16.0;
+        let row = self.row(frame_index, v);
+        let stretches = light.chunks_mut(STRETCH).zip(self.column_loss.chunks(STRETCH)).enumerate();
+        for (index, (light, loss)) in stretches {
+            let (a, b) = self.pair(row.seed.wrapping_add(index as u64));
+            for (((level, loss), a), b) in light.iter_mut().zip(loss).zip(a).zip(b) {
+                let exposed = self.noisy(*level * (row.gain - loss).max(0.0), a + b);
+                *level = (exposed.clamp(0.0, 255.0) * STEPS).round() / STEPS;
+            }
+        }
+    }
+
+    fn row(&self, frame_index: u64, v: usize) -> Row {
+        Row {
+            gain: 1.0 - self.row_loss.get(v).copied().unwrap_or(0.0),
+            seed: mix(self.seed ^ mix(frame_index)).wrapping_add((v as u64) << 16),
+        }
+    }
+
+    fn noisy(&self, signal: f32, deviate: f32) -> f32 {
+        signal + (signal * self.shot + self.read).sqrt() * deviate
     }
 
     /// Two stretches of deviates.
@@ -104,6 +108,13 @@ impl Sensor {
         let stretch = |start: usize| self.deviates.get(start..start + STRETCH).unwrap_or(&[]);
         (stretch(bits % STARTS), stretch((bits / STARTS) % STARTS))
     }
+}
+
+/// What the pixels of a row share.
+struct Row {
+    /// What vignetting leaves in the middle column.
+    gain: f32,
+    seed: u64,
 }
 
 /// The nearest grey level.

@@ -1,0 +1,222 @@
+//! What a lens adds to a Gaussian blur: a field that is not flat, colours of different size, veiling glare,
+//! and what changes from frame to frame: flicker of lamps, steps of the exposure.
+
+use serde::{Deserialize, Serialize};
+
+use super::filters::Gaussian;
+
+/// The flaws of a lens; by default none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Lens {
+    /// Standard deviation of the blur that the corners of the image have more than its middle, in pixels,
+    /// from 0 to 5; it grows with the square of the distance from the middle (field curvature).
+    pub curvature_px: f32,
+    /// Distance of blue from green in the corners, in pixels outwards, from -3 to 3 (lateral colour). Red lies
+    /// on the other side, so that grey is where a calibration has it. Only with a mosaic.
+    pub fringe_px: f32,
+    /// Part of the light that is spread over the whole image, from 0 to 0.5 (veiling glare).
+    pub flare: f32,
+}
+
+/// What changes from frame to frame; by default nothing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Unsteady {
+    /// Part of the light that comes and goes with the mains, from 0 to 1, which a rolling shutter shows as
+    /// bands.
+    pub flicker: f32,
+    /// Number of such bands in the image, from 0 to 20: twice the mains' frequency times the readout time.
+    pub bands: f32,
+    /// Maximum step of the automatic exposure from frame to frame, in stops, from 0 to 2.
+    pub exposure_stops: f32,
+}
+
+/// Weights of red and blue in grey.
+const RED_OVER_BLUE: f32 = 0.114 / 0.299;
+
+impl Lens {
+    pub(super) fn is_sound(&self) -> bool {
+        (0.0..=5.0).contains(&self.curvature_px)
+            && (-3.0..=3.0).contains(&self.fringe_px)
+            && (0.0..=0.5).contains(&self.flare)
+    }
+
+    /// Blurs and veils the light of a whole frame.
+    pub(super) fn spread(
+        &self,
+        light: &mut [f32],
+        width: usize,
+        work: &mut Vec<f32>,
+        blurred: &mut Vec<f32>,
+    ) {
+        if self.curvature_px > 0.0 {
+            Gaussian::new(self.curvature_px.max(0.3)).blur(light, width, work, blurred);
+            let field = Field::new(light.len(), width);
+            let rows = light.chunks_mut(width).zip(blurred.chunks(width)).enumerate();
+            for (v, (row, soft)) in rows {
+                for (u, (level, soft)) in row.iter_mut().zip(soft).enumerate() {
+                    // A core and a skirt whose variance grows with the fourth power of the distance.
+                    let part = field.part2(u, v).powi(2).min(1.0);
+                    *level += part * (soft - *level);
+                }
+            }
+        }
+        if self.flare > 0.0 {
+            let mean = light.iter().sum::<f32>() / light.len().max(1) as f32;
+            for level in light {
+                *level += self.flare * (mean - *level);
+            }
+        }
+    }
+
+    /// Moves red and blue of an RGGB mosaic's light, of which `source` has all colours alike.
+    pub(super) fn fringe(&self, source: &[f32], light: &mut [f32], width: usize) {
+        let field = Field::new(light.len(), width);
+        let height = light.len() / width.max(1);
+        for (v, row) in light.chunks_mut(width.max(1)).enumerate() {
+            let outwards =
+                if v % 2 == 0 { -self.fringe_px * RED_OVER_BLUE } else { self.fringe_px };
+            for u in (v % 2..row.len()).step_by(2) {
+                let [x, y] = field.from_middle(u, v);
+                // What lies outwards in the image comes from nearer the middle.
+                let scale = -outwards / field.half_diagonal;
+                let place = [u as f32 + x * scale, v as f32 + y * scale];
+                row[u] = at(source, width, height, place);
+            }
+        }
+    }
+}
+
+impl Unsteady {
+    pub(super) fn is_sound(&self) -> bool {
+        (0.0..=1.0).contains(&self.flicker)
+            && (0.0..=20.0).contains(&self.bands)
+            && (0.0..=2.0).contains(&self.exposure_stops)
+    }
+
+    /// The factor of row `v`'s light in a frame.
+    pub(super) fn gain(&self, frame_index: u64, v: usize, height: usize) -> f32 {
+        // The golden ratio spreads phases and steps evenly over the frames.
+        const RATIO: f64 = 0.618_033_988_749_894_9;
+        let spread = |by: f64| (frame_index as f64 * RATIO * by).fract() as f32;
+        let place = v as f32 / height.max(1) as f32;
+        let phase = std::f32::consts::TAU * (self.bands * place + spread(1.0));
+        let lamp = 1.0 - self.flicker * 0.5 * (1.0 + phase.sin());
+        lamp * (self.exposure_stops * (spread(RATIO) - 0.5)).exp2()
+    }
+}
+
+/// Places relative to the middle of an image.
+struct Field {
+    middle: [f32; 2],
+    half_diagonal: f32,
+}
+
+impl Field {
+    fn new(len: usize, width: usize) -> Self {
+        let edges = [width, len / width.max(1)].map(|edge| edge.saturating_sub(1) as f32);
+        let middle = edges.map(|edge| 0.5 * edge);
+        Self { middle, half_diagonal: middle[0].hypot(middle[1]).max(1.0) }
+    }
+
+    fn from_middle(&self, u: usize, v: usize) -> [f32; 2] {
+        [u as f32 - self.middle[0], v as f32 - self.middle[1]]
+    }
+
+    /// The squared distance from the middle; 1 in the corners.
+    fn part2(&self, u: usize, v: usize) -> f32 {
+        let [x, y] = self.from_middle(u, v);
+        (x * x + y * y) / (self.half_diagonal * self.half_diagonal)
+    }
+}
+
+/// An image between its pixels (Keys, "Cubic convolution interpolation for digital image processing", 1981).
+fn at(image: &[f32], width: usize, height: usize, place: [f32; 2]) -> f32 {
+    let split = |along: f32, edge: usize| {
+        let low = along.floor();
+        let t = along - low;
+        let weights = [
+            ((-0.5 * t + 1.0) * t - 0.5) * t,
+            (1.5 * t - 2.5) * t * t + 1.0,
+            ((-1.5 * t + 2.0) * t + 0.5) * t,
+            (0.5 * t - 0.5) * t * t,
+        ];
+        let last = edge.saturating_sub(1) as isize;
+        let taps = [-1, 0, 1, 2].map(|k| (low as isize + k).clamp(0, last) as usize);
+        (taps, weights)
+    };
+    let (columns, across) = split(place[0], width);
+    let (rows, down) = split(place[1], height);
+    let mut sum = 0.0;
+    for (v, weight) in rows.into_iter().zip(down) {
+        let row = image.get(v * width..(v + 1) * width).unwrap_or(&[]);
+        for (u, across) in columns.into_iter().zip(across) {
+            sum += weight * across * row.get(u).copied().unwrap_or(0.0);
+        }
+    }
+    sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WIDTH: usize = 65;
+    const HEIGHT: usize = 49;
+
+    /// A wave along the rows, which is slow against a pixel.
+    fn wave(phase_px: f32) -> Vec<f32> {
+        (0..WIDTH * HEIGHT)
+            .map(|i| 100.0 + 50.0 * (0.3 * ((i % WIDTH) as f32 - phase_px)).sin())
+            .collect()
+    }
+
+    #[test]
+    fn blue_moves_outwards_by_its_fringe_and_green_stays() {
+        let source = wave(0.0);
+        let mut light = source.clone();
+        let lens = Lens { fringe_px: 0.5, ..Lens::default() };
+        lens.fringe(&source, &mut light, WIDTH);
+        // Blue (odd column, odd row) right of the middle, almost half-way to the corner.
+        let (u, v) = (51, 25);
+        let by_px = 0.5 * (51.0 - 32.0) / 32f32.hypot(24.0);
+        let expected = wave(by_px)[v * WIDTH + u];
+        assert!((light[v * WIDTH + u] - expected).abs() < 0.05);
+        let green = v * WIDTH + u + 1;
+        assert_eq!(light[green], source[green]);
+    }
+
+    #[test]
+    fn corners_are_blurred_and_the_middle_is_not() {
+        let mut light = wave(0.0);
+        light.iter_mut().enumerate().for_each(|(i, level)| *level += (i % 2) as f32 * 40.0);
+        let before = light.clone();
+        let lens = Lens { curvature_px: 1.5, ..Lens::default() };
+        lens.spread(&mut light, WIDTH, &mut Vec::new(), &mut Vec::new());
+        let middle = 24 * WIDTH + 32;
+        assert!((light[middle] - before[middle]).abs() < 0.1);
+        assert!((light[0] - before[0]).abs() > 5.0);
+    }
+
+    #[test]
+    fn flare_lifts_black_and_keeps_the_mean() {
+        let mut light: Vec<f32> = (0..WIDTH * HEIGHT).map(|i| (i % 2) as f32 * 200.0).collect();
+        let lens = Lens { flare: 0.1, ..Lens::default() };
+        lens.spread(&mut light, WIDTH, &mut Vec::new(), &mut Vec::new());
+        assert!((light[0] - 10.0).abs() < 0.1 && (light[1] - 190.0).abs() < 0.1);
+    }
+
+    #[test]
+    fn flicker_makes_bands_and_the_exposure_stays_within_its_steps() {
+        let unsteady = Unsteady { flicker: 0.4, bands: 2.0, exposure_stops: 0.0 };
+        let gains: Vec<f32> = (0..480).map(|v| unsteady.gain(3, v, 480)).collect();
+        let [low, high] = [f32::min as fn(f32, f32) -> f32, f32::max]
+            .map(|pick| gains.iter().copied().reduce(pick).unwrap());
+        assert!((low - 0.6).abs() < 0.01 && (high - 1.0).abs() < 0.01);
+        assert!((gains[10] - gains[250]).abs() < 0.02);
+        let unsteady = Unsteady { exposure_stops: 1.0, ..Unsteady::default() };
+        assert!((0..100).all(|k| (0.70..=1.42).contains(&unsteady.gain(k, 0, 480))));
+        assert_eq!(Unsteady::default().gain(9, 7, 480), 1.0);
+    }
+}

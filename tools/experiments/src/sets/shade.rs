@@ -1,0 +1,80 @@
+//! Light and cover as they are outdoors: edges of hard shadows of any contrast, dappled shade, leaves.
+
+use std::f64::consts::TAU;
+
+use geometry::Pixel;
+use markers::Marker;
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use rendering::CameraSettings;
+use rendering::occluder::{Disc, Line, Occluder};
+
+use super::scene::{Draw, near, view};
+use crate::frame_spec::FrameSpec;
+use crate::set::Set;
+
+/// Frames of each group.
+const FRAMES: usize = 20;
+
+/// Light in the sun over light in the shade.
+const CONTRASTS: [f64; 4] = [2.0, 4.0, 6.0, 10.0];
+
+pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
+    let mut frames = Vec::new();
+    for contrast in CONTRASTS {
+        for _ in 0..FRAMES {
+            let (spec, mut rng) = large(draw, marker, frames.len());
+            let occluder = Occluder::Shadow {
+                edge: Line {
+                    through: on_marker(&spec, &mut rng, 0.4),
+                    normal: rng.random_range(0.0..TAU),
+                },
+                penumbra_px: rng.random_range(1.0..4.0),
+                transmission: (1.0 / contrast) as f32,
+            };
+            frames.push(spec.with(format!("edge1:{contrast}"), occluder));
+        }
+    }
+    for _ in 0..FRAMES {
+        let (spec, mut rng) = large(draw, marker, frames.len());
+        let size_px = spec.size_px();
+        let suns = (0..rng.random_range(6..16))
+            .map(|_| Disc {
+                centre: on_marker(&spec, &mut rng, 0.8),
+                radius_px: (size_px * rng.random_range(0.08..0.3)) as f32,
+            })
+            .collect();
+        let occluder = Occluder::Dapple {
+            suns,
+            // Suns seen through leaves are discs of half a degree: soft over the height of the tree.
+            penumbra_px: (size_px * rng.random_range(0.02..0.1)) as f32,
+            transmission: (1.0 / rng.random_range(3.0..8.0)) as f32,
+        };
+        frames.push(spec.with("dapple", occluder));
+    }
+    for _ in 0..FRAMES {
+        let (spec, mut rng) = large(draw, marker, frames.len());
+        let size_px = spec.size_px();
+        // Together at most a quarter of the marker.
+        let leaves = (0..rng.random_range(2..6))
+            .map(|_| Disc {
+                centre: on_marker(&spec, &mut rng, 0.6),
+                radius_px: (size_px * rng.random_range(0.04..0.12)) as f32,
+            })
+            .collect();
+        let level = [25.0, 60.0, 110.0][frames.len() % 3];
+        frames.push(spec.with("leaves", Occluder::Leaves { leaves, level }));
+    }
+    frames
+}
+
+fn large(draw: Draw, marker: Marker, frame: usize) -> (FrameSpec, ChaCha8Rng) {
+    view(draw, marker, CameraSettings::thesis(), Set::Shade, frame, 40.0..160.0, 0.4)
+}
+
+/// A random pixel on or near the marker: up to `reach` of its size from its centre along both axes.
+fn on_marker(spec: &FrameSpec, rng: &mut ChaCha8Rng, reach: f64) -> Pixel {
+    let by_px = reach * spec.size_px();
+    let centre = spec.ground_truth().map_or(Pixel::new(0.0, 0.0), |shown| shown.centre);
+    near(rng, centre, by_px)
+}
