@@ -7,10 +7,13 @@
     reason = "helpers of tests may fail like tests, and a measurement shows what it found"
 )]
 
+use std::cell::Cell;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use autopilot::dialect::{EXTENDED_SYS_STATE_DATA, MavLandedState, MavMessage};
+use autopilot::dialect::{
+    EXTENDED_SYS_STATE_DATA, LOCAL_POSITION_NED_DATA, MavLandedState, MavMessage,
+};
 use autopilot::{Parser, Sender};
 use controller::Config;
 use controller::flight::Flight;
@@ -223,6 +226,7 @@ fn unchanged(packet: &Passing) -> Vec<(f64, Vec<u8>)> {
 
 const HEARTBEAT: u32 = 0;
 const ATTITUDE: u32 = 30;
+const LOCAL_POSITION_NED: u32 = 32;
 const EXTENDED_SYS_STATE: u32 = 245;
 
 /// The same packet with another landed state.
@@ -290,6 +294,51 @@ fn a_heartbeat_that_is_missing_alone_costs_time_only() {
             if packet.message_id == HEARTBEAT && is_on { Vec::new() } else { unchanged(packet) }
         });
         assert!(ended.is_on_the_pad() && ended.is_safe(), "{ended:?}");
+    }
+}
+
+#[test]
+fn a_position_that_freezes_is_no_position() {
+    for from_m in [4.0, 1.9, 0.7] {
+        let mut is_on = lasting(5.0);
+        let mut frozen: Option<LOCAL_POSITION_NED_DATA> = None;
+        let ended = falsified(&format!("frozen for 5 s from {from_m} m on"), |packet| {
+            let is_on = is_on(packet.now_s, packet.height_m < from_m);
+            if packet.message_id == LOCAL_POSITION_NED
+                && is_on
+                && let Some(MavMessage::LOCAL_POSITION_NED(position)) =
+                    Parser::new().push(&packet.bytes).remove(0).message
+            {
+                let time_boot_ms = position.time_boot_ms;
+                let kept = frozen.get_or_insert(position).clone();
+                let message = LOCAL_POSITION_NED_DATA { time_boot_ms, ..kept };
+                let message = MavMessage::LOCAL_POSITION_NED(message);
+                let sender = Sender { system: 1, component: 1 };
+                return vec![(packet.now_s, autopilot::packet::encode(sender, 0, &message))];
+            }
+            unchanged(packet)
+        });
+        assert!(ended.is_on_the_pad() && ended.is_safe(), "{ended:?}");
+    }
+}
+
+#[test]
+fn a_link_that_becomes_slow_in_the_descent_stops_it() {
+    for (delay_s, from_m) in [(0.48, 4.0), (0.48, 2.6), (0.4, 1.5), (0.3, 1.0)] {
+        let is_slow = Cell::new(false);
+        let late_s = |height_m: f64| {
+            is_slow.set(is_slow.get() || height_m < from_m);
+            if is_slow.get() { delay_s } else { 0.0 }
+        };
+        let ended = fly(
+            &mut |packet: &Passing| {
+                vec![(packet.now_s + late_s(packet.height_m), packet.bytes.clone())]
+            },
+            &mut |now_s, height_m| now_s + late_s(height_m),
+        );
+        show(&format!("{:.0} ms each way from {from_m} m on", delay_s * 1e3), &ended);
+        assert!(ended.is_safe(), "{ended:?}");
+        assert!(matches!(ended.phase, Phase::Landed | Phase::Aborted), "{ended:?}");
     }
 }
 

@@ -286,8 +286,8 @@ impl Autopilot {
         self.refused_numbers
     }
 
-    /// Number of measurements left out because they came after newer ones, or because their time since the
-    /// autopilot's start contradicted that of the others.
+    /// Number of measurements left out because they came after newer ones, because their time since the
+    /// autopilot's start contradicted that of the others, or because a moving vehicle's position stayed the same.
     pub fn late_measurements(&self) -> u64 {
         self.late
     }
@@ -672,7 +672,7 @@ impl Autopilot {
         if !self.is_present(now_ns, attitude.boot_ms, newest) {
             return;
         }
-        if let Some(stamp_ns) = self.clock.stamp_ns(now_ns, attitude.boot_ms) {
+        if let Some(stamp_ns) = self.clock.arrived(now_ns, attitude.boot_ms) {
             attitude.stamp_ns = stamp_ns;
         }
         if let Some(vehicle) = &mut self.vehicle {
@@ -689,11 +689,16 @@ impl Autopilot {
             self.refused_numbers += 1;
             return;
         };
-        let newest = self.state().and_then(|state| state.position).map(|known| known.boot_ms);
-        if !self.is_present(now_ns, position.boot_ms, newest) {
+        let newest = self.state().and_then(|state| state.position);
+        if !self.is_present(now_ns, position.boot_ms, newest.map(|known| known.boot_ms)) {
             return;
         }
-        if let Some(stamp_ns) = self.clock.stamp_ns(now_ns, position.boot_ms) {
+        if newest.is_some_and(|known| position.repeats(&known)) {
+            // It is as old as the first of its kind.
+            self.late += 1;
+            return;
+        }
+        if let Some(stamp_ns) = self.clock.arrived(now_ns, position.boot_ms) {
             position.stamp_ns = stamp_ns;
         }
         if let Some(vehicle) = &mut self.vehicle {

@@ -27,6 +27,10 @@ const MAX_TRIP_NS: i64 = 1_500 * MS;
 /// Maximum number and age of the round trips that say how slow the link is now.
 const MAX_LENGTHS: usize = 16;
 const MAX_LENGTH_AGE_NS: i64 = 6_000 * MS;
+/// Number of measurements whose age on arrival says the same sooner: the youngest of them, as one may have waited
+/// elsewhere. And the time after which they say nothing any more.
+const AGES: usize = 6;
+const MAX_ARRIVED_NS: i64 = 1_000 * MS;
 /// Maximum drift between two clocks: 100 ppm.
 const DRIFT: f64 = 1e-4;
 /// Error of reading a clock, in nanoseconds.
@@ -45,10 +49,12 @@ pub struct Clock {
     trips: VecDeque<Trip>,
     /// All round trips, also those too long to be used.
     lengths: VecDeque<Length>,
+    /// How old the newest measurements were when they came.
+    ages: VecDeque<Length>,
     contradictions: u32,
 }
 
-/// When a reply came, and after which time.
+/// When a reply or a measurement came, and after which time.
 #[derive(Copy, Clone, Debug)]
 struct Length {
     at_ns: i64,
@@ -121,9 +127,35 @@ impl Clock {
         self.best(now_ns).map(|trip| trip.length_ns)
     }
 
-    /// How slow the link is now, both ways together, in ns: the second longest of the last round trips, as a
-    /// single one may have waited elsewhere. `None` while there were no two.
+    /// As [`Clock::stamp_ns`], and notes how long the measurement was under way.
+    pub fn arrived(&mut self, now_ns: i64, boot_ms: u32) -> Option<i64> {
+        let stamp_ns = self.stamp_ns(now_ns, boot_ms)?;
+        if self.ages.len() >= AGES {
+            self.ages.pop_front();
+        }
+        let length_ns = now_ns.saturating_sub(stamp_ns).max(0);
+        self.ages.push_back(Length { at_ns: now_ns, length_ns });
+        Some(stamp_ns)
+    }
+
+    /// How slow the link is now, both ways together, in ns: by its round trips or, where that is more, twice the
+    /// age with which measurements come. Round trips are a second apart; a vehicle that descends is metres lower
+    /// before they tell. `None` while neither is known.
     pub fn link_delay_ns(&self, now_ns: i64) -> Option<i64> {
+        self.slow_trip_ns(now_ns).max(self.two_ways_ns(now_ns))
+    }
+
+    /// Twice the age of the youngest of the last measurements on arrival.
+    fn two_ways_ns(&self, now_ns: i64) -> Option<i64> {
+        let recent = |at: &&Length| now_ns.saturating_sub(at.at_ns) <= MAX_ARRIVED_NS;
+        let ages = self.ages.iter().filter(recent);
+        let youngest_ns = ages.clone().map(|age| age.length_ns).min()?;
+        (ages.count() >= AGES).then(|| youngest_ns.saturating_mul(2))
+    }
+
+    /// The second longest of the last round trips, as a single one may have waited elsewhere. `None` while there
+    /// were no two.
+    fn slow_trip_ns(&self, now_ns: i64) -> Option<i64> {
         let recent = |at: &&Length| now_ns.saturating_sub(at.at_ns) <= MAX_LENGTH_AGE_NS;
         let (mut longest_ns, mut second_ns) = (None, None);
         for Length { length_ns, .. } in self.lengths.iter().filter(recent) {
@@ -239,6 +271,24 @@ mod tests {
         let (clock, now_ns) = synchronised(&[(1, 1), (250, 250), (900, 900)], 12, 0);
         assert_eq!(clock.link_delay_ns(now_ns), Some(1_800 * MS));
         assert_eq!(clock.link_delay_ns(now_ns + 7_000 * MS), None);
+    }
+
+    #[test]
+    fn measurements_that_come_late_tell_of_a_slow_link_at_once() {
+        let (mut clock, now_ns) = synchronised(&[(1, 1)], 20, 0);
+        let mut arrive = |ages_ms: &[i64]| {
+            for (at_ms, age_ms) in (0..).step_by(10).zip(ages_ms) {
+                clock.arrived(now_ns + at_ms * MS, (now_ns / MS + at_ms - age_ms) as u32);
+            }
+            let delay_ns = clock.link_delay_ns(now_ns + 60 * MS);
+            delay_ns.map(|delay_ns| (delay_ns as f64 / MS as f64).round() as i64)
+        };
+        assert_eq!(arrive(&[400; 5]), Some(2), "too few");
+        assert!(
+            arrive(&[400, 300, 350, 400, 400, 400]).is_some_and(|ms| (595..=605).contains(&ms))
+        );
+        assert_eq!(arrive(&[1, 400, 400, 400, 400, 400]), Some(2), "one came at once");
+        assert_eq!(clock.link_delay_ns(now_ns + 2_000 * MS), Some(2 * MS), "no longer");
     }
 
     #[test]

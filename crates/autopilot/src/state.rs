@@ -182,6 +182,14 @@ impl Position {
         let finite = position.is_finite() && velocity.is_finite();
         finite.then_some(Self { stamp_ns, boot_ms: message.time_boot_ms, position, velocity })
     }
+
+    /// True for the numbers of an `earlier` one to the last bit although they say that the vehicle moves: nothing new
+    /// was estimated. An estimator's numbers change always, also on the ground; only a simulated vehicle is still.
+    pub(crate) fn repeats(&self, earlier: &Self) -> bool {
+        self.position == earlier.position
+            && self.velocity == earlier.velocity
+            && self.velocity != Vector::zero()
+    }
 }
 
 impl Range {

@@ -56,6 +56,8 @@ struct Fake {
     questions: Vec<i64>,
     /// What it measures is sent so many steps later.
     late_steps: i64,
+    /// The speed to the north that it tells, in m/s; it stays where it is.
+    told_m_s: f32,
     parser: Parser,
 }
 
@@ -82,6 +84,7 @@ impl Fake {
             queue: Vec::new(),
             questions: Vec::new(),
             late_steps: 0,
+            told_m_s: 0.0,
             parser: Parser::new(),
         }
     }
@@ -222,6 +225,7 @@ impl Fake {
                 time_boot_ms,
                 // The origin lies 2 m below the ground.
                 z: (-2.0 - self.height) as f32,
+                vx: self.told_m_s,
                 vz,
                 ..Default::default()
             }),
@@ -355,6 +359,21 @@ impl World {
     fn commands(&self, command: MavCmd) -> usize {
         self.fake.received.iter().filter(|&&received| received == command).count()
     }
+}
+
+#[test]
+fn a_position_that_stays_the_same_although_the_vehicle_moves_grows_old() {
+    let mut world = World::standing();
+    let age_s = |world: &World| {
+        let position = world.client.state().unwrap().position.unwrap();
+        (world.now - position.stamp_ns) as f64 * 1e-9
+    };
+    world.run(3);
+    assert!(age_s(&world) < 0.1, "a simulated vehicle stands quite still");
+    world.fake.told_m_s = 0.3;
+    world.run(3);
+    assert!(age_s(&world) > 2.5, "{} s", age_s(&world));
+    assert!(world.client.late_measurements() > 100, "they are counted");
 }
 
 #[test]

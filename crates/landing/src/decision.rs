@@ -208,6 +208,8 @@ named! {
         OperatorLost = "operator-lost", "operator link lost";
         /// The link to the autopilot is lost.
         AutopilotLost = "autopilot-lost", "autopilot link lost, holding until it is back";
+        /// The autopilot's reports have not come for a moment.
+        VehicleAging = "vehicle-aging", "no vehicle state just now, descent stopped";
         /// The autopilot's reports stopped.
         VehicleStale = "vehicle-stale", "no recent vehicle state, holding";
         /// The autopilot's heartbeat, and with it the mode, is missing.

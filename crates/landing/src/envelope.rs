@@ -1,8 +1,11 @@
-//! The last check of every setpoint.
+//! The last check of every setpoint, and the fence.
 
-use geometry::{Ned, Vector};
+use geometry::{Ned, Point, Vector};
 
-use crate::config::EnvelopeConfig;
+use crate::config::{EnvelopeConfig, PhaseConfig};
+
+/// Time ahead for which the position is predicted against the fence, in seconds.
+const FENCE_LEAD_S: f64 = 1.0;
 
 /// The nearest setpoint that may be sent: finite, within the limits, and downwards only when `may_descend`. A
 /// setpoint that is not finite becomes a stop.
@@ -24,6 +27,24 @@ pub fn clamp_setpoint(
     );
     // Finite components can have an infinite length.
     if clamped.is_finite() { clamped } else { Vector::zero() }
+}
+
+/// The velocity without its components that lead out of the fence; the way back stays open.
+pub fn clamp_to_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
+    let ahead = place + wanted * FENCE_LEAD_S;
+    let far = |p: Point<Ned>| p.x().hypot(p.y());
+    let radius_m = phases.fence_radius_m;
+    let leaves = radius_m > 0.0 && far(ahead) > radius_m && far(ahead) > far(place);
+    let (x, y) = if leaves { (0.0, 0.0) } else { (wanted.x(), wanted.y()) };
+    below_fence(phases, place, Vector::new(x, y, wanted.z()))
+}
+
+/// The velocity without a climb that leads over the fence.
+pub fn below_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
+    let ahead = place + wanted * FENCE_LEAD_S;
+    let is_high = phases.fence_height_m > 0.0 && -ahead.z() > phases.fence_height_m;
+    let z = if is_high { wanted.z().max(0.0) } else { wanted.z() };
+    Vector::new(wanted.x(), wanted.y(), z)
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use geometry::{Ned, Odometry, Point, Vector};
 
 use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
-use crate::config::{AlarmAction, Config, GuidanceConfig, OnAbort, PhaseConfig};
+use crate::config::{AlarmAction, Config, GuidanceConfig, OnAbort};
 use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 use crate::envelope;
 use crate::estimator::Estimator;
@@ -26,9 +26,6 @@ const MAX_PLAUSIBLE: f64 = 1e6;
 /// Time for which the guidance still steers while LAND is awaited, in seconds.
 const HAND_OVER_S: f64 = 1.0;
 
-/// Time ahead for which the position is predicted against the fence, in seconds.
-const FENCE_LEAD_S: f64 = 1.0;
-
 /// Height over the one at which it waits for detectors to agree, at which the vehicle counts as waiting, in
 /// metres.
 const DISPUTE_MARGIN_M: f64 = 0.5;
@@ -47,6 +44,10 @@ const MAX_CONTACT_M_S: f64 = 0.5;
 /// and the one at which it is steered again.
 const MAX_LINK_DELAY_S: f64 = 0.7;
 const MAX_QUICK_DELAY_S: f64 = 0.5;
+
+/// Maximum age of the vehicle's state at which it descends, in seconds, beside the link's delay: what is late now
+/// comes over a link that has become slow, and setpoints will take as long.
+const MAX_DESCEND_AGE_S: f64 = 0.2;
 
 /// Vertical speed of a vehicle that hovers, in m/s.
 const MAX_HOVER_M_S: f64 = 0.3;
@@ -498,7 +499,13 @@ impl Lander {
             self.state_machine.phase() == Phase::Approach && !self.is_axis_check_done(now);
         // The end of the last detector is known at once, so this does not wait until the target is stale.
         let alone = (!self.detectors_alive).then_some(Reason::NoDetector);
-        alone.or_else(|| is_checking.then_some(Reason::AxisCheck))
+        let is_aging = self.history.newest().is_some_and(|vehicle| {
+            let max_s = MAX_DESCEND_AGE_S + 0.5 * self.link_delay_s;
+            now.seconds_since(vehicle.stamp) > max_s
+        });
+        alone
+            .or_else(|| is_aging.then_some(Reason::VehicleAging))
+            .or_else(|| is_checking.then_some(Reason::AxisCheck))
     }
 
     fn progress(&mut self, now: Timestamp) -> Progress {
@@ -617,7 +624,7 @@ impl Lander {
         // Over the last half metre the climb slows down.
         let climb_m_s = (2.0 * (to_m - altitude_m)).clamp(0.0, phases.retry_climb_m_s);
         let wanted = Vector::new(wanted.x(), wanted.y(), -climb_m_s);
-        let wanted = below_fence(&phases, vehicle.position, wanted);
+        let wanted = envelope::below_fence(&phases, vehicle.position, wanted);
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
         self.guidance.on_setpoint_sent(velocity);
         Action::Velocity { velocity, yaw_rate: 0.0 }
@@ -633,7 +640,7 @@ impl Lander {
             return Action::hover();
         }
         let altitude_m = -vehicle.position.z();
-        let up = clamp_to_fence(
+        let up = envelope::clamp_to_fence(
             phases,
             vehicle.position,
             Vector::new(0.0, 0.0, -phases.search_climb_m_s),
@@ -650,7 +657,7 @@ impl Lander {
             });
             let elapsed_s = now.seconds_since(square.started);
             let legs = search::velocity(phases, elapsed_s, square.first_leg_rad, square.upwind_m);
-            clamp_to_fence(phases, vehicle.position, legs)
+            envelope::clamp_to_fence(phases, vehicle.position, legs)
         };
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
         Action::Velocity { velocity, yaw_rate: 0.0 }
@@ -676,7 +683,7 @@ impl Lander {
     }
 
     /// Hovers; where the marker was lost so low that it may just have left the view, climbs to
-    /// `regain_height_m`.
+    /// `regain_height_m`. So it does where the link has become slow, or a sway would touch the ground.
     fn hold(&self, now: Timestamp) -> Action {
         let phases = &self.config.phases;
         let lost = self.state_machine.reason() == Reason::TargetLost
@@ -690,7 +697,8 @@ impl Lander {
         if self.sinks_over_slow_link(now) {
             return self.climb(self.config.envelope.climb_m_s);
         }
-        if !(lost && low) {
+        let is_slow = self.state_machine.reason() == Reason::LinkSlow;
+        if !(low && (lost || is_slow)) {
             return Action::hover();
         }
         self.climb(phases.regain_climb_m_s)
@@ -711,7 +719,7 @@ impl Lander {
     fn climb(&self, climb_m_s: f64) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
         let wanted = Vector::new(0.0, 0.0, -climb_m_s);
-        let wanted = below_fence(&self.config.phases, vehicle.position, wanted);
+        let wanted = envelope::below_fence(&self.config.phases, vehicle.position, wanted);
         let velocity = envelope::clamp_setpoint(&self.config.envelope, wanted, false);
         Action::Velocity { velocity, yaw_rate: 0.0 }
     }
@@ -818,22 +826,4 @@ impl Sightings {
     fn age_s(&self, now: Timestamp) -> f64 {
         self.newest.map_or(f64::INFINITY, |newest| now.seconds_since(newest))
     }
-}
-
-/// The velocity without its components that lead out of the fence; the way back stays open.
-fn clamp_to_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
-    let ahead = place + wanted * FENCE_LEAD_S;
-    let far = |p: Point<Ned>| p.x().hypot(p.y());
-    let radius_m = phases.fence_radius_m;
-    let leaves = radius_m > 0.0 && far(ahead) > radius_m && far(ahead) > far(place);
-    let (x, y) = if leaves { (0.0, 0.0) } else { (wanted.x(), wanted.y()) };
-    below_fence(phases, place, Vector::new(x, y, wanted.z()))
-}
-
-/// The velocity without a climb that leads over the fence.
-fn below_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
-    let ahead = place + wanted * FENCE_LEAD_S;
-    let is_high = phases.fence_height_m > 0.0 && -ahead.z() > phases.fence_height_m;
-    let z = if is_high { wanted.z().max(0.0) } else { wanted.z() };
-    Vector::new(wanted.x(), wanted.y(), z)
 }
