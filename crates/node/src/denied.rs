@@ -1,5 +1,5 @@
-//! Counts what Zenoh denies: connections without a valid certificate, and messages that access control
-//! rejects.
+//! Counts what Zenoh denies: connections without a valid certificate or without any rights, and messages that access
+//! control rejects.
 //!
 //! Zenoh 1.10 has no counter for these. It only logs them, below the level that is shown; this module reads
 //! those log messages. `tests/denied.rs` fails when Zenoh words them differently.
@@ -86,6 +86,11 @@ impl Visit for Message {
 
 fn reason(metadata: &Metadata<'_>, message: &str) -> Option<String> {
     if metadata.target() == ACCESS_TARGET {
+        if is_without_rights(message) {
+            return Some(
+                "denied: a connection without rights, of another vehicle or revoked".into(),
+            );
+        }
         if is_precomputed(message) { None } else { denied_message(message) }
     } else {
         is_denied_connection(message)
@@ -125,6 +130,12 @@ fn denied_message(message: &str) -> Option<String> {
     Some(format!("denied: {} on {key}", action.to_lowercase()))
 }
 
+/// Whether a connection has a valid certificate, but of a holder that is not in the relay's list: the relay then tells
+/// it of nobody, and of what it says nothing arrives that could be counted.
+fn is_without_rights(message: &str) -> bool {
+    message.contains(" did not match any configured ACL subject")
+}
+
 /// The listener logs the cause of every connection it rejects, with a hint at the limit on open files, which
 /// is the one cause that is not a denial.
 fn is_denied_connection(message: &str) -> bool {
@@ -142,6 +153,13 @@ mod tests {
         assert!(is_denied_connection(&unknown));
         assert!(!is_denied_connection(&format!("Too many open files (os error 24). {hint}")));
         assert!(!is_denied_connection("Unable to set LINGER option"));
+    }
+
+    #[test]
+    fn a_connection_of_somebody_who_is_not_in_the_list_is_denied() {
+        let message = "d480 did not match any configured ACL subject. Default permission `Deny` will be applied on all messages";
+        assert!(is_without_rights(message));
+        assert!(!is_without_rights("Access control is enabled"));
     }
 
     #[test]

@@ -1,67 +1,20 @@
 //! The log texts by which [`node::denied`] recognises denials are those of the Zenoh version in use: a real
 //! message without access rights, and a real connection with the certificate of another authority.
 
-use std::fs::{OpenOptions, Permissions};
-use std::io::Write;
-use std::os::unix::fs::PermissionsExt;
+mod common;
+
 use std::path::Path;
 use std::time::Duration;
 
 use anyhow::Context;
+use common::Authority;
 use messages::{Wind, topic};
-use node::access::{HOLDERS, Holder};
 use node::denied::{self, ACCESS_TARGET, CONNECTION_TARGET};
-use node::network::AUTHORITY;
 use node::{Identity, Network, Node};
-use rcgen::{
-    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
-    Issuer, KeyPair, KeyUsagePurpose,
-};
 use testing::ports;
 use tokio::time::{sleep, timeout};
 
 const TIMEOUT: Duration = Duration::from_secs(20);
-
-/// A certificate authority.
-struct Authority {
-    pem: String,
-    issuer: Issuer<'static, KeyPair>,
-}
-
-impl Authority {
-    fn new() -> anyhow::Result<Self> {
-        let mut params = CertificateParams::default();
-        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
-        params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
-        let key = KeyPair::generate()?;
-        let pem = params.self_signed(&key)?.pem();
-        let issuer = Issuer::from_ca_cert_pem(&pem, key)?;
-        Ok(Self { pem, issuer })
-    }
-
-    /// Writes the key of a holder, its certificate and that of the authority, and lists it.
-    fn issue(&self, folder: &Path, holder: &str) -> anyhow::Result<()> {
-        let holder: Holder = holder.parse()?;
-        let mut params = CertificateParams::new(vec!["127.0.0.1".to_owned()])?;
-        params.distinguished_name = DistinguishedName::new();
-        params.distinguished_name.push(DnType::CommonName, holder.to_string());
-        params.use_authority_key_identifier_extension = true;
-        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        params.extended_key_usages =
-            vec![ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth];
-        let key = KeyPair::generate()?;
-        let certificate = params.signed_by(&key, &self.issuer)?;
-        std::fs::write(folder.join(AUTHORITY), &self.pem)?;
-        let name = holder.key_name();
-        let private = folder.join(format!("{name}.key"));
-        std::fs::write(&private, key.serialize_pem())?;
-        std::fs::set_permissions(private, Permissions::from_mode(0o600))?;
-        std::fs::write(folder.join(format!("{name}.pem")), certificate.pem())?;
-        let mut list = OpenOptions::new().create(true).append(true).open(folder.join(HOLDERS))?;
-        writeln!(list, "{holder}")?;
-        Ok(())
-    }
-}
 
 async fn open(
     service: &'static str,
@@ -99,8 +52,10 @@ async fn real_denials_are_counted() -> anyhow::Result<()> {
     node::start_logging("off");
     let (keys, foreign_keys) = (tempfile::tempdir()?, tempfile::tempdir()?);
     let authority = Authority::new()?;
-    authority.issue(keys.path(), "drone@drone")?;
-    authority.issue(keys.path(), "detector.main@drone")?;
+    for holder in ["drone@drone", "detector.main@drone"] {
+        authority.issue(keys.path(), holder)?;
+        common::list(keys.path(), holder)?;
+    }
     Authority::new()?.issue(foreign_keys.path(), "detector.main@drone")?;
     let ([meet], air, _) = ports::free()?;
     let air = format!("127.0.0.1:{air}");

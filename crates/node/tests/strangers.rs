@@ -4,23 +4,17 @@
 //! Prints the table of `docs/results.md`:
 //! `cargo test -p node --test strangers -- --nocapture`.
 
+mod common;
+
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{OpenOptions, Permissions};
-use std::io::Write;
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, ensure};
+use common::Authority;
 use messages::{Delivery, TOPICS};
-use node::access::{HOLDERS, Holder};
-use node::network::AUTHORITY;
 use node::{Identity, Network, Node, denied};
-use rcgen::{
-    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
-    Issuer, KeyPair, KeyUsagePurpose,
-};
 use testing::ports;
 use tokio::time::{sleep, timeout};
 use zenoh::Session;
@@ -35,44 +29,6 @@ const PEER: &str = "peer";
 /// A client sends to the relay whatever it knows of subscribers; of those on the drone the relay says nothing to who
 /// has no rights.
 const CLIENT: &str = "client";
-
-/// The authority of the site, or another one.
-struct Authority {
-    pem: String,
-    issuer: Issuer<'static, KeyPair>,
-}
-
-impl Authority {
-    fn new() -> anyhow::Result<Self> {
-        let mut params = CertificateParams::default();
-        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
-        params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
-        let key = KeyPair::generate()?;
-        let pem = params.self_signed(&key)?.pem();
-        Ok(Self { issuer: Issuer::from_ca_cert_pem(&pem, key)?, pem })
-    }
-
-    /// Writes a holder's key and its certificate.
-    fn issue(&self, folder: &Path, holder: &str) -> anyhow::Result<()> {
-        let holder: Holder = holder.parse()?;
-        let mut params = CertificateParams::new(vec!["127.0.0.1".to_owned()])?;
-        params.distinguished_name = DistinguishedName::new();
-        params.distinguished_name.push(DnType::CommonName, holder.to_string());
-        params.use_authority_key_identifier_extension = true;
-        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        params.extended_key_usages =
-            vec![ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth];
-        let key = KeyPair::generate()?;
-        let certificate = params.signed_by(&key, &self.issuer)?;
-        std::fs::write(folder.join(AUTHORITY), &self.pem)?;
-        let name = holder.key_name();
-        let private = folder.join(format!("{name}.key"));
-        std::fs::write(&private, key.serialize_pem())?;
-        std::fs::set_permissions(private, Permissions::from_mode(0o600))?;
-        std::fs::write(folder.join(format!("{name}.pem")), certificate.pem())?;
-        Ok(())
-    }
-}
 
 /// What was heard on the drone: by whom, on which key.
 type Heard = Arc<Mutex<BTreeSet<(String, String)>>>;
@@ -238,10 +194,9 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
     let [home, foreign, kestrel, revoked, spare] =
         [0, 1, 2, 3, 4].map(|index| folders[index].path());
     let authority = Authority::new()?;
-    let mut list = OpenOptions::new().create(true).append(true).open(home.join(HOLDERS))?;
     for role in ROLES {
         authority.issue(home, &format!("{role}@drone"))?;
-        writeln!(list, "{role}@drone")?;
+        common::list(home, &format!("{role}@drone"))?;
     }
     for (folder, holder, line) in [
         (kestrel, "operator@kestrel", "operator@kestrel"),
@@ -250,7 +205,7 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
         (spare, "detector.spare@drone", "detector.spare@drone"),
     ] {
         authority.issue(folder, holder)?;
-        writeln!(list, "{line}")?;
+        common::list(home, line)?;
     }
     Authority::new()?.issue(foreign, "operator@drone")?;
     let drone = Drone::start(home).await?;
@@ -267,10 +222,21 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
     .await?;
 
     // Those who come in, and have no rights, or others.
-    let other_vehicle = drone.stranger(Some(kestrel), "operator", CLIENT).await?;
-    let revoked = drone.stranger(Some(revoked), "operator", CLIENT).await?;
-    // Neither has any rights, so the relay tells them of nobody to talk to: what they say stays with them, and there is
-    // nothing to count.
+    // The first two have no rights, so the relay tells them of nobody to talk to: what they say stays with them, and
+    // their connections are counted.
+    let without_rights = "denied: a connection without rights, of another vehicle or revoked";
+    let mut connected = Vec::new();
+    for keys in [kestrel, revoked] {
+        let mut counted = BTreeMap::new();
+        denied::take();
+        connected.push(drone.stranger(Some(keys), "operator", CLIENT).await?);
+        until(&mut counted, "a connection without rights", async |counted| {
+            counted.contains_key(without_rights)
+        })
+        .await?;
+    }
+    let [other_vehicle, revoked] = <[Stranger; 2]>::try_from(connected)
+        .map_err(|_| anyhow!("two strangers were connected"))?;
     let observer = drone.stranger(Some(home), "observer", CLIENT).await?;
     let other_name = drone.stranger(Some(spare), "detector.spare", CLIENT).await?;
     let strangers = [
