@@ -2,20 +2,20 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
+mod packets;
+
 use std::sync::Arc;
 
+use autopilot::Parser;
 use autopilot::dialect::{
-    ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LANDING_TARGET_DATA,
-    LOCAL_POSITION_NED_DATA, MavAutopilot, MavCmd, MavLandedState, MavMessage, MavModeFlag,
-    MavType, PARAM_VALUE_DATA, SYS_STATUS_DATA,
+    ATTITUDE_DATA, LANDING_TARGET_DATA, MavCmd, MavLandedState, MavMessage, PARAM_VALUE_DATA,
+    SYS_STATUS_DATA,
 };
-use autopilot::{Parser, Sender};
 use controller::Config;
 use controller::flight::Flight;
 use messages::{CameraInfo, ControllerCommand, Detection, Detections, FrameHeader, Phase};
 use node::{Layers, clock_name};
-
-const MS: i64 = 1_000_000;
+use packets::{MS, attitude, contact, heartbeat, position, receive};
 
 fn flight(start: &str) -> Flight {
     flight_with(start, &[])
@@ -28,39 +28,14 @@ fn flight_with(start: &str, set: &[&str]) -> Flight {
     Flight::new(layers.load::<Config>().unwrap().settings, Arc::default()).unwrap()
 }
 
-fn receive(flight: &mut Flight, now_ns: i64, message: &MavMessage) {
-    let sender = Sender { system: 1, component: 1 };
-    for packet in Parser::new().push(&autopilot::packet::encode(sender, 0, message)) {
-        flight.packet(now_ns, &packet);
-    }
-}
-
-fn heartbeat(mode: u32, armed: bool) -> MavMessage {
-    let armed = if armed { MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED } else { MavModeFlag::empty() };
-    MavMessage::HEARTBEAT(HEARTBEAT_DATA {
-        custom_mode: mode,
-        mavtype: MavType::MAV_TYPE_QUADROTOR,
-        autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
-        base_mode: armed,
-        ..Default::default()
-    })
-}
-
-fn contact(landed_state: MavLandedState) -> MavMessage {
-    MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA { landed_state, ..Default::default() })
-}
-
 /// Attitude and position 5 m over the origin.
 fn pose(flight: &mut Flight, now_ns: i64) {
     pose_at(flight, now_ns, 5.0);
 }
 
 fn pose_at(flight: &mut Flight, now_ns: i64, height_m: f32) {
-    let time_boot_ms = (now_ns / MS) as u32;
-    let attitude = ATTITUDE_DATA { time_boot_ms, ..Default::default() };
-    receive(flight, now_ns, &MavMessage::ATTITUDE(attitude));
-    let position = LOCAL_POSITION_NED_DATA { time_boot_ms, z: -height_m, ..Default::default() };
-    receive(flight, now_ns + 1, &MavMessage::LOCAL_POSITION_NED(position));
+    receive(flight, now_ns, &attitude(now_ns));
+    receive(flight, now_ns + 1, &position(now_ns, height_m));
 }
 
 /// Setpoints, and commands other than for messages, since the last call.

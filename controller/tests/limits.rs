@@ -2,19 +2,18 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
 
+mod packets;
+
 use std::sync::Arc;
 
-use autopilot::dialect::{
-    ATTITUDE_DATA, EXTENDED_SYS_STATE_DATA, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot,
-    MavLandedState, MavMessage, MavModeFlag, MavParamType, MavType, PARAM_VALUE_DATA,
-};
-use autopilot::{Parser, Sender};
+use autopilot::Parser;
+use autopilot::dialect::{MavLandedState, MavMessage, MavParamType, PARAM_VALUE_DATA};
 use controller::Config;
 use controller::flight::Flight;
 use controller::limits::Note;
 use node::Layers;
+use packets::{MS, attitude, contact, heartbeat, position};
 
-const MS: i64 = 1_000_000;
 const GUIDED: u32 = 4;
 const LOITER: u32 = 5;
 
@@ -47,15 +46,7 @@ impl Conversation {
     }
 
     fn receive(&mut self, message: &MavMessage) {
-        let sender = Sender { system: 1, component: 1 };
-        for packet in Parser::new().push(&autopilot::packet::encode(sender, 0, message)) {
-            self.flight.packet(self.now_ns, &packet);
-        }
-    }
-
-    fn attitude(&self) -> MavMessage {
-        let time_boot_ms = (self.now_ns / MS) as u32;
-        MavMessage::ATTITUDE(ATTITUDE_DATA { time_boot_ms, ..Default::default() })
+        packets::receive(&mut self.flight, self.now_ns, message);
     }
 
     /// Hovers 5 m over the ground in a mode for some seconds.
@@ -63,25 +54,11 @@ impl Conversation {
         for step in 0..seconds * 40 {
             self.now_ns += 25 * MS;
             if step % 20 == 0 {
-                self.receive(&MavMessage::HEARTBEAT(HEARTBEAT_DATA {
-                    custom_mode: mode,
-                    mavtype: MavType::MAV_TYPE_QUADROTOR,
-                    autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
-                    base_mode: MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED,
-                    ..Default::default()
-                }));
-                self.receive(&MavMessage::EXTENDED_SYS_STATE(EXTENDED_SYS_STATE_DATA {
-                    landed_state: MavLandedState::MAV_LANDED_STATE_IN_AIR,
-                    ..Default::default()
-                }));
+                self.receive(&heartbeat(mode, true));
+                self.receive(&contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
             }
-            self.receive(&self.attitude());
-            let time_boot_ms = (self.now_ns / MS) as u32;
-            self.receive(&MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
-                time_boot_ms,
-                z: -5.0,
-                ..Default::default()
-            }));
+            self.receive(&attitude(self.now_ns));
+            self.receive(&position(self.now_ns, 5.0));
             self.flight.tick(self.now_ns);
             self.answer();
         }
@@ -195,7 +172,7 @@ fn an_orderly_end_puts_it_back_at_once_and_sends_no_descent() {
     while it.flight.shutdown(it.now_ns) {
         it.now_ns += 25 * MS;
         it.answer();
-        it.receive(&it.attitude());
+        it.receive(&attitude(it.now_ns));
         steps += 1;
         assert!(steps < 10);
     }
@@ -207,7 +184,7 @@ fn an_orderly_end_puts_it_back_at_once_and_sends_no_descent() {
 fn a_resuming_controller_stops_the_vehicle_with_its_first_packet() {
     for (start, setpoints) in [("resume", vec![0.0]), ("airborne", vec![])] {
         let mut it = Conversation::new(start, 3.0);
-        it.receive(&it.attitude());
+        it.receive(&attitude(it.now_ns));
         it.answer();
         assert_eq!(it.down_m_s, setpoints, "{start}");
     }

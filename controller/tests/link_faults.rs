@@ -7,19 +7,20 @@
     reason = "helpers of tests may fail like tests, and a measurement shows what it found"
 )]
 
+mod packets;
+
 use std::cell::Cell;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use autopilot::dialect::{
-    EXTENDED_SYS_STATE_DATA, LOCAL_POSITION_NED_DATA, MavLandedState, MavMessage,
-};
-use autopilot::{Parser, Sender};
+use autopilot::Parser;
+use autopilot::dialect::{LOCAL_POSITION_NED_DATA, MavLandedState, MavMessage};
 use controller::Config;
 use controller::flight::Flight;
 use geometry::{Body, Camera, CameraModel, Point, Rotation, Transform};
 use messages::{CameraInfo, Detection, Detections, FrameHeader, MarkerPose, Phase};
 use node::{Layers, clock_name};
+use packets::{bytes, contact};
 use world::vehicle::VehicleTruth;
 use world::world::STEP_S;
 use world::{World, WorldConfig};
@@ -229,13 +230,6 @@ const ATTITUDE: u32 = 30;
 const LOCAL_POSITION_NED: u32 = 32;
 const EXTENDED_SYS_STATE: u32 = 245;
 
-/// The same packet with another landed state.
-fn contact(state: MavLandedState) -> Vec<u8> {
-    let message = EXTENDED_SYS_STATE_DATA { landed_state: state, ..Default::default() };
-    let sender = Sender { system: 1, component: 1 };
-    autopilot::packet::encode(sender, 0, &MavMessage::EXTENDED_SYS_STATE(message))
-}
-
 /// True from the first time that something holds until so many seconds later.
 fn lasting(seconds: f64) -> impl FnMut(f64, bool) -> bool {
     let mut since_s = None;
@@ -264,7 +258,7 @@ fn a_landed_state_that_contradicts_the_flight_is_landed_over() {
         let ended = falsified(&format!("{state:?} for 6 s from 5 m on"), |packet| {
             let is_on = is_on(packet.now_s, packet.height_m < 5.0);
             if packet.message_id == EXTENDED_SYS_STATE && is_on {
-                return vec![(packet.now_s, contact(state))];
+                return vec![(packet.now_s, bytes(&contact(state)))];
             }
             unchanged(packet)
         });
@@ -278,7 +272,8 @@ fn one_report_of_the_ground_at_six_metres_is_not_believed() {
     let ended = falsified("one report of the ground at 6 m", |packet| {
         let mut arrivals = unchanged(packet);
         if packet.height_m < 6.0 && !std::mem::replace(&mut is_said, true) {
-            arrivals.push((packet.now_s, contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND)));
+            let ground = contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND);
+            arrivals.push((packet.now_s, bytes(&ground)));
         }
         arrivals
     });
@@ -313,8 +308,7 @@ fn a_position_that_freezes_is_no_position() {
                 let kept = frozen.get_or_insert(position).clone();
                 let message = LOCAL_POSITION_NED_DATA { time_boot_ms, ..kept };
                 let message = MavMessage::LOCAL_POSITION_NED(message);
-                let sender = Sender { system: 1, component: 1 };
-                return vec![(packet.now_s, autopilot::packet::encode(sender, 0, &message))];
+                return vec![(packet.now_s, bytes(&message))];
             }
             unchanged(packet)
         });
@@ -355,9 +349,8 @@ fn one_packet_of_another_time_is_no_restart() {
                     Parser::new().push(&packet.bytes).remove(0).message
             {
                 attitude.time_boot_ms = boot_ms;
-                let sender = Sender { system: 1, component: 1 };
                 let message = MavMessage::ATTITUDE(attitude);
-                arrivals.push((packet.now_s, autopilot::packet::encode(sender, 0, &message)));
+                arrivals.push((packet.now_s, bytes(&message)));
             }
             arrivals
         });
