@@ -662,7 +662,7 @@ fn check_landing(findings: &mut Findings, seen: &Seen) {
         findings.wrong(
             "controller",
             warning.clone(),
-            "a landing is not started, or not finished, until then",
+            "until then a landing may not be started or finished, or ends further from the marker",
         );
     }
     match &status.active_detector {

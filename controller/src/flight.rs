@@ -173,7 +173,8 @@ impl Flight {
         if self.journal.has_refused_versions() {
             self.frames.refused_version(now_ns);
         }
-        self.journal.warnings(&self.frames.warnings(now_ns));
+        let warnings = self.view().warnings(now_ns);
+        self.journal.warnings(&warnings);
         let is_disputed = self.frames.selection.dispute().is_some();
         if is_disputed != self.is_disputed {
             self.is_disputed = is_disputed;

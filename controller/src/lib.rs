@@ -6,7 +6,7 @@
 //!
 //! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the
 //! [`flight`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
-//! of the detector by health and [`agreement`], the [`cameras`], and the [`refusals`] that last), [`mission`]
+//! of the detector by health and [`agreement`], the [`cameras`], and the [`refusals`] that last), [`mount`] (what is said of a camera that is not as configured), [`mission`]
 //! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`landing_target`] (the
 //! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
 //! setpoints), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and
@@ -23,6 +23,7 @@ pub mod journal;
 pub mod landing_target;
 pub mod limits;
 pub mod mission;
+pub mod mount;
 pub mod note_file;
 pub mod refusals;
 pub mod selection;

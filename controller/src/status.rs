@@ -10,6 +10,8 @@ use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits;
 use crate::mission::{Mission, State};
+use crate::mount;
+use crate::refusals::Warning;
 use crate::wire;
 
 /// The parts of a flight that its status shows.
@@ -99,13 +101,15 @@ impl View<'_> {
             detections_used: self.used.count,
             latency_ms: self.journal.latency_ms(),
             setpoint_timeout_s: limits::timeout_s(self.autopilot),
-            warnings: self
-                .frames
-                .warnings(now_ns)
-                .into_iter()
-                .map(|warning| warning.text)
-                .collect(),
+            warnings: self.warnings(now_ns).into_iter().map(|warning| warning.text).collect(),
         }
+    }
+
+    /// What the operator should know.
+    pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
+        let mut warnings = self.frames.warnings(now_ns);
+        warnings.extend(mount::warnings(&self.lander.mount_findings()));
+        warnings
     }
 
     /// The phase and the reason for it.

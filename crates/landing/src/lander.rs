@@ -16,6 +16,7 @@ use crate::guidance::situation::{Progress, Situation};
 use crate::history::History;
 use crate::limits::ConfigError;
 use crate::mean_target::MeanTarget;
+use crate::mount_check::{MountCheck, MountFindings};
 use crate::search;
 use crate::state_machine::{Inputs, StateMachine, VehicleInputs};
 use crate::time::Timestamp;
@@ -78,6 +79,7 @@ pub struct Lander {
     newest_frame: Option<Timestamp>,
     guidance: ActiveGuidance,
     axis_check: AxisConsistencyCheck,
+    mount_check: MountCheck,
     /// Stamp of the landing's first marker.
     first_seen: Option<Timestamp>,
     state_machine: StateMachine,
@@ -139,6 +141,7 @@ impl Lander {
             newest_frame: None,
             guidance: ActiveGuidance::new(config.guidance),
             axis_check: AxisConsistencyCheck::default(),
+            mount_check: MountCheck::default(),
             first_seen: None,
             state_machine: StateMachine::new(config.phases),
             land_requested: None,
@@ -221,6 +224,11 @@ impl Lander {
     /// The present phase.
     pub fn phase(&self) -> Phase {
         self.state_machine.phase()
+    }
+
+    /// By how much the camera's mount and focal length are certainly off.
+    pub fn mount_findings(&self) -> MountFindings {
+        self.mount_check.findings()
     }
 
     fn vehicle(&mut self, now: Timestamp, state: VehicleState) -> Result<(), Rejection> {
@@ -344,6 +352,7 @@ impl Lander {
         {
             self.axis_check.add(frame.stamp, &motion, pose.origin());
         }
+        self.mount_check.observe(&self.config.estimator, frame, marker, &self.history);
         self.first_seen.get_or_insert(frame.stamp);
         match self.target_filter.observe(frame, marker, &self.history) {
             Err(Rejection::NoPose) if !self.guidance.needs_pose() => {}
@@ -470,12 +479,13 @@ impl Lander {
     /// The landing point relative to the vehicle's newest state.
     fn target(&self, now: Timestamp) -> Option<TargetEstimate> {
         let vehicle = self.history.newest()?.position;
-        match &self.target_filter {
+        let target = match &self.target_filter {
             TargetFilter::Mean(target) => target.estimate(vehicle, now),
             TargetFilter::Kalman(estimator) => {
                 estimator.estimate(vehicle, self.history.ned_from_odometry(), now)
             }
-        }
+        }?;
+        Some(self.mount_check.widen(target))
     }
 
     fn situation<'a>(&self, now: Timestamp, vehicle: &'a VehicleState) -> Situation<'a> {

@@ -15,7 +15,7 @@
 //! - `measurement`, `filter`, `view`, `hypotheses`, [`estimator`]: from detections to the landing point; [`mean_target`] for
 //!   the thesis' guidance.
 //! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker.
-//! - [`axis_check`]: are the axes of camera and autopilot consistent?
+//! - [`axis_check`]: are the axes of camera and autopilot consistent? [`mount_check`]: by how much are they off?
 //! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
 //! - [`lander`] joins them.
 
@@ -33,6 +33,7 @@ pub mod lander;
 mod limits;
 pub mod mean_target;
 mod measurement;
+pub mod mount_check;
 pub mod search;
 pub mod state_machine;
 pub mod time;
@@ -49,4 +50,5 @@ pub use event::{
 };
 pub use lander::Lander;
 pub use limits::ConfigError;
+pub use mount_check::{Measured, MountFindings};
 pub use time::Timestamp;

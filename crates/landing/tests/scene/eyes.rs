@@ -107,13 +107,15 @@ impl Eyes {
         {
             pad.position = pad.position + Vector::new(metres, 0.0, 0.0);
         }
-        let camera_from_marker = self.camera_from_marker(truth, &pad);
+        let camera_from_marker = self.camera_from_marker(scene, truth, &pad);
         let is_blind = camera_from_marker.origin().z() < faults.blind_below_m;
         let found = self.vision.look(&camera_from_marker, 0.0);
         let found = found.filter(|_| miss >= faults.miss && !is_blind)?;
         let seen = found.camera_from_marker;
         let range = 1.0 + faults.size_error;
-        let in_body = mount() * ((seen.origin() - Point::origin()) * range);
+        let in_camera = (seen.origin() - Point::origin()) * range;
+        let depth_m = in_camera.z() / scene.focal_ratio;
+        let in_body = mount() * Vector::new(in_camera.x(), in_camera.y(), depth_m);
         let origin = Point::new(0.0, 0.0, -MOUNT_M) + misread(scene, in_body);
         let to_body = mount().quaternion.to_rotation_matrix().into_inner();
         let covariance_m2 = to_body * found.covariance_m2 * to_body.transpose();
@@ -131,12 +133,15 @@ impl Eyes {
     /// know.
     fn camera_from_marker(
         &self,
+        scene: &Scene,
         truth: &VehicleTruth,
         pad: &PadState,
     ) -> Transform<Camera, Marker> {
         let [roll, pitch] = self.shutter.mount_error_rad();
         let error = Rotation::<Body, Body>::from_euler(roll, pitch, 0.0);
-        let camera_from_body = mount().inverse() * error;
+        let [roll, pitch] = scene.mount_off_rad;
+        let off = Rotation::<Body, Body>::from_euler(roll, pitch, 0.0);
+        let camera_from_body = mount().inverse() * off.inverse() * error;
         let lens = truth.position + truth.ned_from_body * Vector::new(0.0, 0.0, -MOUNT_M);
         let ned_from_marker = pad.ned_from_marker();
         let camera_from_ned: Rotation<Camera, Ned> =

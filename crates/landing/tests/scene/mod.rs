@@ -12,8 +12,8 @@ use std::collections::VecDeque;
 
 use geometry::{Ned, Point};
 use landing::{
-    Action, AutopilotLimits, Config, Decision, Event, Landed, Lander, Mode, OperatorCommand, Phase,
-    Timestamp, VehicleState,
+    Action, AutopilotLimits, Config, Decision, Event, Landed, Lander, Mode, MountFindings,
+    OperatorCommand, Phase, Timestamp, VehicleState,
 };
 use world::ardupilot::{self, EstimateConfig};
 use world::camera::CameraFaults;
@@ -50,6 +50,11 @@ pub(crate) struct Scene {
     pub(crate) camera_turned_rad: f64,
     /// Its image is mirrored.
     pub(crate) mirrored: bool,
+    /// The camera is turned about the vehicle's forward axis and that to the right by these angles more than
+    /// configured, in addition to the error that the seed draws.
+    pub(crate) mount_off_rad: [f64; 2],
+    /// Its focal length over the configured one.
+    pub(crate) focal_ratio: f64,
     /// The operator's commands, by time.
     pub(crate) commands: Vec<(f64, OperatorCommand)>,
     /// The autopilot ignores the request to land.
@@ -80,6 +85,10 @@ pub(crate) struct Sample {
     pub(crate) seconds: f64,
     pub(crate) position: Point<Ned>,
     pub(crate) decision: Decision,
+    /// Position of the pad.
+    pub(crate) pad: Point<Ned>,
+    /// What is certain of the camera's mount.
+    pub(crate) mount: MountFindings,
 }
 
 /// The moment of the touchdown; velocities are relative to the pad.
@@ -135,6 +144,8 @@ impl Scene {
             marker_scale: 1.0,
             camera_turned_rad: 0.0,
             mirrored: false,
+            mount_off_rad: [0.0; 2],
+            focal_ratio: 1.0,
             commands: vec![(0.0, OperatorCommand::Start)],
             refuses_land: false,
             pilot_s: None,
@@ -193,7 +204,7 @@ impl Scene {
             for event in run.events(step).into_iter().filter(|_| !is_silent) {
                 let decision = lander.step(Timestamp::from_seconds(run.seconds()), event);
                 run.obey(decision, matches!(event, Event::Frame(_)));
-                flight.note(&run, decision);
+                flight.note(&run, decision, lander.mount_findings());
             }
             flight.watch(&run, &before);
             step += 1;
@@ -223,10 +234,11 @@ impl Flight {
         }
     }
 
-    fn note(&mut self, run: &Run<'_>, decision: Decision) {
+    fn note(&mut self, run: &Run<'_>, decision: Decision, mount: MountFindings) {
         self.aborted |= decision.phase == Phase::Aborted && self.touchdown.is_none();
         let position = run.world.truth().position;
-        self.samples.push(Sample { seconds: run.seconds(), position, decision });
+        let pad = run.world.pad_at(run.world.now_s()).position;
+        self.samples.push(Sample { seconds: run.seconds(), position, decision, pad, mount });
     }
 
     fn watch(&mut self, run: &Run<'_>, before: &VehicleTruth) {

@@ -1,0 +1,72 @@
+//! What is said of a camera whose mount, focal length or marker is not as configured.
+
+use landing::{Measured, MountFindings};
+
+use crate::refusals::Warning;
+
+/// The warnings of what was measured in flight.
+pub fn warnings(found: &MountFindings) -> Vec<Warning> {
+    let degrees = |angle: Measured| {
+        let [value, deviation] = [angle.value.abs(), angle.deviation].map(f64::to_degrees);
+        format!("{value:.1} +- {deviation:.1} degrees")
+    };
+    let percent = |ratio: Measured| {
+        let [value, deviation] = [ratio.value.abs(), ratio.deviation].map(|part| 100.0 * part);
+        format!("{value:.1} +- {deviation:.1} %")
+    };
+    let turned = |axis: &str, angle: Measured, [positive, negative]: [&str; 2]| {
+        let where_to = if angle.value > 0.0 { positive } else { negative };
+        let text = format!(
+            "the camera's mount is {} off in {axis}, it looks further {where_to} than configured: check `mount`, and the autopilot's level",
+            degrees(angle)
+        );
+        Warning { matter: format!("mount-{axis}"), text }
+    };
+    let larger = |ratio: Measured| if ratio.value > 0.0 { "larger" } else { "smaller" };
+    let focal = |ratio: Measured| Warning {
+        matter: "focal-length".to_owned(),
+        text: format!(
+            "the camera's focal length is {} {} than configured: check its calibration and its zoom",
+            percent(ratio),
+            larger(ratio)
+        ),
+    };
+    let size = |ratio: Measured| Warning {
+        matter: "marker-size".to_owned(),
+        text: format!(
+            "the marker is {} {} than configured: measure the printed one",
+            percent(ratio),
+            larger(ratio)
+        ),
+    };
+    [
+        found.roll_rad.map(|angle| turned("roll", angle, ["to the left", "to the right"])),
+        found.pitch_rad.map(|angle| turned("pitch", angle, ["forward", "backward"])),
+        found.focal_ratio.map(focal),
+        found.size_ratio.map(size),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn angles_are_told_in_degrees_and_ratios_in_percent() {
+        assert!(warnings(&MountFindings::default()).is_empty());
+        let found = MountFindings {
+            pitch_rad: Some(Measured { value: -0.0541, deviation: 0.007 }),
+            focal_ratio: Some(Measured { value: 0.05, deviation: 0.004 }),
+            ..MountFindings::default()
+        };
+        let texts: Vec<String> = warnings(&found).into_iter().map(|warning| warning.text).collect();
+        assert!(
+            texts[0].contains("3.1 +- 0.4 degrees off in pitch, it looks further backward"),
+            "{texts:?}"
+        );
+        assert!(texts[1].contains("5.0 +- 0.4 % larger"), "{texts:?}");
+    }
+}

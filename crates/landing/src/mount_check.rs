@@ -1,0 +1,472 @@
+//! How far are the camera's mount and focal length from what is configured? Measured from natural motion, all
+//! the flight.
+//!
+//! A pad that does not move has one place. Under a mount that is off by `θ` it moves by `θ` times the height as
+//! the height changes; under a focal length that is off it moves as the vehicle tilts, under a marker of another
+//! size as the vehicle moves sideways. A Kalman filter of parameters that hardly change (Bar-Shalom, Li,
+//! Kirubarajan: Estimation with Applications to Tracking and Navigation, section 7) explains the apparent
+//! horizontal motion by them and by what else makes it:
+//!
+//! | state | unit | what |
+//! |---|---|---|
+//! | `q`, `u` | m, m/s | the pad's place and the autopilot's drift, north and east |
+//! | `θ` | rad | error of mount and attitude about the body's axes |
+//! | `f`, `s` | | error of the focal length and of the marker's size, relative |
+//! | `τ` | s | how much later exposures are than their stamps |
+//!
+//! Heights are left out: a barometer errs by as much as a focal length that is 4 % off. The random walks grow
+//! while detections show that the autopilot's position wanders, as in `filter.rs`, and with them the deviations.
+
+use geometry::{Body, Camera, Rotation, Vector};
+use nalgebra::{Matrix2, Matrix2x3, SMatrix, SVector, Vector2};
+
+use crate::config::EstimatorConfig;
+use crate::decision::TargetEstimate;
+use crate::event::{FrameObservation, MarkerInFrame};
+use crate::history::{History, Motion};
+use crate::measurement::{MarkerPose, Measurement};
+use crate::time::Timestamp;
+
+/// Size of the state, and the indices of its parts.
+const STATES: usize = 10;
+const Q: usize = 0;
+const U: usize = 2;
+const TILT: usize = 4;
+const FOCAL: usize = 7;
+const SIZE: usize = 8;
+const OFFSET: usize = 9;
+
+/// Initial standard deviations, in the units of the states.
+const UNKNOWN: [f64; STATES] = [100.0, 100.0, 0.08, 0.08, 0.1, 0.1, 0.05, 0.1, 0.05, 0.05];
+
+/// Random walks in calm flight, in the units of the states per square root of a second.
+const WALK: [f64; STATES] = [0.008, 0.008, 0.004, 0.004, 5e-4, 5e-4, 1e-3, 0.0, 0.0, 1e-3];
+
+/// Change of the logarithm of the random walks per unit of excess NIS, the NIS per degree of freedom, above its
+/// mean of one, that counts as no excess, and the largest factor on them.
+const NOISE_GAIN: f64 = 0.08;
+const NOISE_SLACK: f64 = 0.4;
+const MAX_NOISE_SCALE: f64 = 30.0;
+
+/// Normalised innovation squared beyond which a detection is an outlier, and the number of those in a row after
+/// which the pad is elsewhere.
+const GATE: f64 = 12.0;
+const MAX_OUTLIERS: u32 = 8;
+
+/// Time constants with which the marker's depths are smoothed, in seconds, the number of detections after which they
+/// count, and the shortest time between two from which a velocity is taken, in seconds.
+const DEPTH_S: f64 = 1.0;
+const MEAN_S: f64 = 10.0;
+const MAX_DEPTHS: u32 = 1000;
+const MIN_STEP_S: f64 = 1e-3;
+
+/// Longest time without a detection over which place and drift are carried on, in seconds.
+const MAX_GAP_S: f64 = 3.0;
+
+/// Largest time offset that is believed, in seconds.
+const MAX_OFFSET_S: f64 = 0.15;
+
+/// Minimum height over the marker of a detection that is used, in metres: near the ground the air and the ground
+/// itself move the vehicle otherwise than the autopilot knows.
+const MIN_HEIGHT_M: f64 = 0.5;
+
+/// An error is told when it is larger than this many standard deviations and than a minimum, and its standard deviation
+/// is smaller than a part of that minimum, in this many detections in a row; and no longer when it is smaller than a part
+/// of both.
+const MIN_DEVIATIONS: f64 = 3.0;
+const MIN_ANGLE_RAD: f64 = 1.5 * std::f64::consts::PI / 180.0;
+const MIN_RATIO: f64 = 0.03;
+const MAX_DEVIATION: f64 = 0.5;
+const MIN_IN_A_ROW: u32 = 15;
+/// Factor on the random walks above which nothing new is told: what moves the pad then is something else.
+const MAX_TOLD_NOISE_SCALE: f64 = 3.0;
+const STILL_TOLD: f64 = 0.7;
+
+type Mean = SVector<f64, STATES>;
+type Covariance = SMatrix<f64, STATES, STATES>;
+
+/// A measured error with its standard deviation.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Measured {
+    /// The error: what is true over what is configured.
+    pub value: f64,
+    /// Its standard deviation.
+    pub deviation: f64,
+}
+
+/// The errors that are certain; `None` for what may be as configured.
+#[derive(Copy, Clone, Debug, Default, PartialEq)]
+pub struct MountFindings {
+    /// The camera is turned about the vehicle's forward axis by this much more than configured, in radians: it
+    /// looks further to the left.
+    pub roll_rad: Option<Measured>,
+    /// The same about the axis to the right: it looks further forward.
+    pub pitch_rad: Option<Measured>,
+    /// The focal length is larger than configured by this share.
+    pub focal_ratio: Option<Measured>,
+    /// The marker is larger than configured by this share.
+    pub size_ratio: Option<Measured>,
+}
+
+impl MountFindings {
+    /// The angle by which the camera's mount is off, in radians; 0 while it may be as configured.
+    pub fn angle_rad(&self) -> f64 {
+        let value = |measured: Option<Measured>| measured.map_or(0.0, |it| it.value);
+        value(self.roll_rad).hypot(value(self.pitch_rad))
+    }
+}
+
+/// The filter; nothing is allocated.
+#[derive(Clone, Debug)]
+pub struct MountCheck {
+    mean: Mean,
+    covariance: Covariance,
+    log_noise_scale: f64,
+    /// The pad's place downwards, in metres, its velocity there, in m/s, and the number of detections in both.
+    pad_z: f64,
+    pad_sinks_m_s: f64,
+    depths: u32,
+    /// The mean of that place over a longer time, in metres.
+    mean_pad_z: f64,
+    newest: Option<Timestamp>,
+    mount: Option<Rotation<Body, Camera>>,
+    outliers: u32,
+    roll: Suspicion,
+    pitch: Suspicion,
+    focal: Suspicion,
+    size: Suspicion,
+}
+
+/// Whether one error is told.
+#[derive(Copy, Clone, Debug, Default)]
+struct Suspicion {
+    in_a_row: u32,
+    is_told: bool,
+}
+
+impl Default for MountCheck {
+    fn default() -> Self {
+        Self {
+            mean: Mean::zeros(),
+            covariance: Covariance::from_diagonal(&Mean::from(UNKNOWN.map(|d| d * d))),
+            log_noise_scale: 0.0,
+            pad_z: 0.0,
+            pad_sinks_m_s: 0.0,
+            depths: 0,
+            mean_pad_z: 0.0,
+            newest: None,
+            mount: None,
+            outliers: 0,
+            roll: Suspicion::default(),
+            pitch: Suspicion::default(),
+            focal: Suspicion::default(),
+            size: Suspicion::default(),
+        }
+    }
+}
+
+impl MountCheck {
+    /// Adds a marker of a pad that does not move sideways.
+    pub(crate) fn observe(
+        &mut self,
+        config: &EstimatorConfig,
+        frame: &FrameObservation,
+        marker: &MarkerInFrame,
+        history: &History,
+    ) {
+        let exposed = frame.stamp.plus_seconds(self.mean[OFFSET]);
+        let (Some(pose), Some(motion)) = (marker.body_from_marker, history.at(exposed)) else {
+            return;
+        };
+        let pose = MarkerPose::resolve(&motion, pose, marker.alternative);
+        if config.pad_speed_m_s == 0.0
+            && let Ok(seen) = pose.measurement(config, frame, marker, &motion)
+        {
+            self.add(frame, &motion, &seen);
+        }
+    }
+
+    /// The estimate with the angle by which the mount is off as part of its deviation.
+    pub(crate) fn widen(&self, target: TargetEstimate) -> TargetEstimate {
+        let off_m = self.findings().angle_rad() * target.height_m.max(0.0);
+        TargetEstimate { deviation_m: target.deviation_m.hypot(off_m), ..target }
+    }
+
+    /// Adds a marker's place with the vehicle's motion at the exposure.
+    fn add(&mut self, frame: &FrameObservation, motion: &Motion, measurement: &Measurement) {
+        // Another camera, or the same with another mount.
+        if self.mount != frame.body_from_camera {
+            *self = Self { mount: frame.body_from_camera, ..Self::default() };
+        }
+        let seen = measurement.position - motion.odometry.coords.coords;
+        if seen.z < MIN_HEIGHT_M {
+            return;
+        }
+        let after_s = self.newest.map_or(0.0, |newest| measurement.stamp.seconds_since(newest));
+        if after_s < 0.0 {
+            return;
+        }
+        if self.newest.is_none() || after_s > MAX_GAP_S {
+            self.place_anew(measurement);
+        }
+        self.newest = Some(measurement.stamp);
+        self.predict(after_s.min(MAX_GAP_S));
+        self.smooth_depth(measurement.position.z, after_s);
+        let height_m = (self.pad_z - motion.odometry.z()).max(MIN_HEIGHT_M);
+        // What errors are multiplied with is another height than that of the place: an error that both had would
+        // look like a mount that is off towards the marker.
+        let lever = (self.mean_pad_z - motion.odometry.z()).max(MIN_HEIGHT_M) / seen.z;
+        // Of the detection only the direction counts; its derivative at that height.
+        let slope = seen.xy() / seen.z;
+        let scale = height_m / seen.z;
+        let direction = Matrix2x3::new(scale, 0.0, -scale * slope.x, 0.0, scale, -scale * slope.y);
+        let axis = frame.body_from_camera.map_or(Vector::<Body>::new(0.0, 0.0, 1.0), |mount| {
+            mount * Vector::<Camera>::new(0.0, 0.0, 1.0)
+        });
+        let axis = (motion.ned_from_body * axis).coords;
+        let depth = axis * axis.dot(&seen) * lever;
+        let slip = direction * measurement.slip;
+        let mut h = SMatrix::<f64, 2, STATES>::zeros();
+        for i in 0..2 {
+            h[(i, Q + i)] = 1.0;
+            for j in 0..3 {
+                h[(i, TILT + j)] = measurement.tilt[(i, j)] * lever;
+            }
+            h[(i, FOCAL)] = depth[i];
+            h[(i, SIZE)] = seen[i] * lever;
+            h[(i, OFFSET)] = slip[i] + self.mean[U + i];
+        }
+        let place = motion.odometry.coords.coords.xy() + slope * height_m;
+        let noise = direction * measurement.noise * direction.transpose()
+            + slope * slope.transpose() * measurement.noise[(2, 2)];
+        // The motion is that of the estimated time already.
+        let expected = h * self.mean - h.column(OFFSET) * self.mean[OFFSET];
+        self.update(&h, place - expected, noise, measurement);
+    }
+
+    /// Smooths the marker's depths. A line is fitted to those of the last second (the fading memory of Morrison:
+    /// Introduction to Sequential Smoothing and Prediction, section 13), as the autopilot's height drifts in a
+    /// descent.
+    fn smooth_depth(&mut self, measured_z: f64, after_s: f64) {
+        self.depths = (self.depths + 1).min(MAX_DEPTHS);
+        if self.depths == 1 {
+            (self.pad_z, self.mean_pad_z, self.pad_sinks_m_s) = (measured_z, measured_z, 0.0);
+            return;
+        }
+        let n = f64::from(self.depths);
+        let keep = (-after_s / DEPTH_S).exp();
+        let level = (1.0 - keep * keep).max(2.0 * (2.0 * n - 1.0) / (n * (n + 1.0)));
+        let trend = (1.0 - keep).powi(2).max(6.0 / (n * (n + 1.0)));
+        let expected = self.pad_z + self.pad_sinks_m_s * after_s;
+        let difference = measured_z - expected;
+        self.pad_z = expected + level.min(1.0) * difference;
+        if after_s > MIN_STEP_S {
+            self.pad_sinks_m_s += trend.min(1.0) * difference / after_s;
+        }
+        let share = (1.0 / n).max((after_s / MEAN_S).min(1.0));
+        self.mean_pad_z += share * (measured_z - self.mean_pad_z);
+    }
+
+    /// The errors that are certain.
+    pub fn findings(&self) -> MountFindings {
+        // The configured value is what the filter's errors are relative to.
+        let of = |index: usize, suspicion: Suspicion| {
+            suspicion
+                .is_told
+                .then(|| Measured { value: -self.mean[index], deviation: self.deviation(index) })
+        };
+        MountFindings {
+            roll_rad: of(TILT, self.roll),
+            pitch_rad: of(TILT + 1, self.pitch),
+            focal_ratio: of(FOCAL, self.focal),
+            size_ratio: of(SIZE, self.size),
+        }
+    }
+
+    fn deviation(&self, index: usize) -> f64 {
+        self.covariance[(index, index)].max(0.0).sqrt()
+    }
+
+    /// Begins with another place of the pad, and keeps what is known of the camera.
+    fn place_anew(&mut self, measurement: &Measurement) {
+        for i in Q..TILT {
+            self.covariance.row_mut(i).fill(0.0);
+            self.covariance.column_mut(i).fill(0.0);
+            self.covariance[(i, i)] = UNKNOWN[i] * UNKNOWN[i];
+            self.mean[i] = 0.0;
+        }
+        self.mean.fixed_rows_mut::<2>(Q).copy_from(&measurement.position.xy());
+        (self.outliers, self.depths) = (0, 0);
+    }
+
+    fn predict(&mut self, dt_s: f64) {
+        let p = &mut self.covariance;
+        for i in 0..2 {
+            self.mean[Q + i] += self.mean[U + i] * dt_s;
+            for j in 0..STATES {
+                p[(Q + i, j)] += dt_s * p[(U + i, j)];
+            }
+        }
+        for i in 0..2 {
+            for j in 0..STATES {
+                p[(j, Q + i)] += dt_s * p[(j, U + i)];
+            }
+        }
+        let scale = (2.0 * self.log_noise_scale).exp();
+        for (i, walk) in WALK.iter().enumerate() {
+            p[(i, i)] += scale * walk * walk * dt_s;
+        }
+    }
+
+    fn update(
+        &mut self,
+        h: &SMatrix<f64, 2, STATES>,
+        innovation: Vector2<f64>,
+        noise: Matrix2<f64>,
+        measurement: &Measurement,
+    ) {
+        let ph = self.covariance * h.transpose();
+        let Some(inverse) = (h * ph + noise).try_inverse() else { return };
+        let nis = innovation.dot(&(inverse * innovation));
+        let excess = 0.5 * nis.clamp(0.0, GATE) - 1.0 - NOISE_SLACK;
+        let scale = self.log_noise_scale + NOISE_GAIN * excess;
+        self.log_noise_scale =
+            if nis.is_finite() { scale.clamp(0.0, MAX_NOISE_SCALE.ln()) } else { 0.0 };
+        if !(0.0..=GATE).contains(&nis) {
+            self.outliers = self.outliers.saturating_add(1);
+            if self.outliers > MAX_OUTLIERS {
+                self.place_anew(measurement);
+            }
+            return;
+        }
+        self.outliers = 0;
+        let gain = ph * inverse;
+        let mean = self.mean + gain * innovation;
+        let less = gain * ph.transpose();
+        let p = self.covariance - (less + less.transpose()) * 0.5;
+        let p = (p + p.transpose()) * 0.5;
+        if !mean.iter().chain(p.iter()).all(|number| number.is_finite()) {
+            *self = Self::default();
+            return;
+        }
+        (self.mean, self.covariance) = (mean, p);
+        self.mean[OFFSET] = self.mean[OFFSET].clamp(-MAX_OFFSET_S, MAX_OFFSET_S);
+        self.suspect();
+    }
+
+    fn suspect(&mut self) {
+        let [roll, pitch, focal, size] = [TILT, TILT + 1, FOCAL, SIZE]
+            .map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) });
+        let is_calm = self.log_noise_scale < MAX_TOLD_NOISE_SCALE.ln();
+        self.roll.follow(roll, MIN_ANGLE_RAD, is_calm);
+        self.pitch.follow(pitch, MIN_ANGLE_RAD, is_calm);
+        self.focal.follow(focal, MIN_RATIO, is_calm);
+        self.size.follow(size, MIN_RATIO, is_calm);
+    }
+}
+
+impl Suspicion {
+    fn follow(&mut self, error: Measured, min: f64, is_calm: bool) {
+        let share = if self.is_told { STILL_TOLD } else { 1.0 };
+        let limit = (MIN_DEVIATIONS * error.deviation).max(min) * share;
+        let is_known = error.deviation < MAX_DEVIATION * min;
+        if error.value.abs() > limit && (self.is_told || is_known && is_calm) {
+            self.in_a_row = self.in_a_row.saturating_add(1);
+            self.is_told |= self.in_a_row >= MIN_IN_A_ROW;
+        } else {
+            *self = Self::default();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use geometry::{Ned, Pixel, Point, Transform};
+
+    fn frame(seconds: f64, body_from_camera: Rotation<Body, Camera>) -> FrameObservation {
+        FrameObservation {
+            stamp: Timestamp::from_seconds(seconds),
+            image_size: (1296, 972),
+            focal_px: Some(1818.0),
+            body_from_camera: Some(body_from_camera),
+            marker: None,
+        }
+    }
+
+    /// Moves down and up again over a pad whose marker is seen by a camera that is pitched by this much more than
+    /// configured.
+    fn descend(check: &mut MountCheck, from_s: f64, mount: Rotation<Body, Camera>, pitch: f64) {
+        let off = Rotation::<Body, Body>::from_euler(0.0, pitch, 0.0);
+        for i in 0..150 {
+            let t = f64::from(i) / 15.0;
+            let position =
+                Point::new((0.7 * t).sin(), (0.5 * t).cos(), -7.0 - 3.0 * (0.6 * t).cos());
+            let attitude = Rotation::<Ned, Body>::from_euler(0.05 * t.sin(), 0.05 * t.cos(), 0.3);
+            let in_body = off.inverse() * (attitude.inverse() * (Point::origin() - position));
+            let motion = Motion {
+                ned_from_body: attitude,
+                position,
+                velocity: Vector::zero(),
+                odometry: Point::from_coords(position.coords),
+                rate: Vector::zero(),
+            };
+            let pose = Transform::new(Rotation::identity(), Point::origin() + in_body);
+            let marker = MarkerInFrame {
+                centre: Pixel::new(0.0, 0.0),
+                body_from_marker: Some(pose),
+                alternative: None,
+                covariance_m2: None,
+                size_px: Some(40.0),
+                confidence: 1.0,
+            };
+            let frame = frame(from_s + t, mount);
+            let pose = MarkerPose::resolve(&motion, pose, None);
+            let config = EstimatorConfig::default();
+            if let Ok(seen) = pose.measurement(&config, &frame, &marker, &motion) {
+                check.add(&frame, &motion, &seen);
+            }
+        }
+    }
+
+    #[test]
+    fn another_mount_is_measured_anew() {
+        let mut check = MountCheck::default();
+        let mount = Rotation::identity();
+        descend(&mut check, 0.0, mount, 0.05);
+        let found = check.findings().pitch_rad.unwrap();
+        assert!((found.value - 0.05).abs() < 0.01, "{found:?}");
+        descend(&mut check, 20.0, Rotation::from_euler(0.0, 0.05, 0.0), 0.0);
+        assert_eq!(check.findings(), MountFindings::default());
+    }
+
+    #[test]
+    fn what_is_not_a_number_is_forgotten() {
+        let mut check = MountCheck::default();
+        let mount = Rotation::identity();
+        for (i, wild) in
+            [1e300, f64::INFINITY, f64::NAN, -1e300].into_iter().cycle().take(40).enumerate()
+        {
+            let place = Point::new(0.0, 0.0, -8.0);
+            let motion = Motion {
+                ned_from_body: Rotation::identity(),
+                position: place,
+                velocity: Vector::zero(),
+                odometry: Point::from_coords(place.coords),
+                rate: Vector::zero(),
+            };
+            let frame = frame(0.01 * i as f64, mount);
+            let seen = Measurement {
+                stamp: frame.stamp,
+                position: nalgebra::Vector3::new(wild, 1.0, if i % 3 == 0 { wild } else { 0.0 }),
+                noise: nalgebra::Matrix3::identity(),
+                tilt: nalgebra::Matrix3::zeros(),
+                slip: nalgebra::Vector3::zeros(),
+            };
+            check.add(&frame, &motion, &seen);
+        }
+        descend(&mut check, 10.0, mount, 0.05);
+        let found = check.findings().pitch_rad.unwrap();
+        assert!((found.value - 0.05).abs() < 0.01, "{found:?}");
+    }
+}

@@ -1,0 +1,82 @@
+//! Camera mounts and focal lengths that are off are measured in flight and told, and right ones never are.
+
+mod scene;
+
+use landing::{Measured, MountFindings, Phase};
+use scene::cases::{Case, FAULTS, MOVING, WINDS, anything};
+use scene::{Flight, Scene};
+
+const OFF_RAD: f64 = 3.0 * std::f64::consts::PI / 180.0;
+const SEEDS: std::ops::Range<u64> = 1000..1006;
+const CASES: [Case; 3] = [
+    ("calm", Scene::new),
+    ("wind 5 m/s", |seed| Scene::windy(seed, 5.0, 1.0)),
+    ("anything", anything),
+];
+
+/// The last that a flight found, if it did before the touchdown.
+fn found(flight: &Flight, which: impl Fn(&MountFindings) -> Option<Measured>) -> Option<Measured> {
+    let touchdown_s = flight.touchdown_s?;
+    let in_flight = flight.samples.iter().take_while(|sample| sample.seconds < touchdown_s);
+    in_flight.filter_map(|sample| which(&sample.mount)).last()
+}
+
+#[test]
+fn a_mount_that_is_off_is_told_in_flight_and_widens_the_estimate() {
+    for (name, scene) in CASES {
+        for seed in SEEDS {
+            for (axis, off_rad) in [(0, OFF_RAD), (1, OFF_RAD), (1, -OFF_RAD)] {
+                let mut mount_off_rad = [0.0; 2];
+                mount_off_rad[axis] = off_rad;
+                let flight = Scene { mount_off_rad, ..scene(seed) }.fly();
+                let error = found(&flight, |f| [f.roll_rad, f.pitch_rad][axis]);
+                let told = flight.samples.iter().find(|sample| sample.mount.angle_rad() > 0.0);
+                let told = told.map(|sample| (sample.seconds, -sample.position.z()));
+                println!("{name}, seed {seed}, axis {axis}: {error:.4?} told at {told:.1?}");
+                assert_eq!(flight.phase, Phase::Landed, "{name}, seed {seed}");
+                let degrees_off = error.map(|error| (error.value - off_rad).to_degrees());
+                let is_right = degrees_off.is_some_and(|degrees| degrees.abs() < 1.0);
+                assert!(is_right, "{name}, seed {seed}: off by {degrees_off:?} degrees");
+                for sample in flight.samples.iter().filter(|s| s.mount.angle_rad() > 0.0) {
+                    let Some(target) = sample.decision.target else { continue };
+                    let truth = sample.pad - sample.position;
+                    let height_m = truth.z();
+                    let error_m = (OFF_RAD * height_m).max(0.0);
+                    assert!(3.0 * target.deviation_m > error_m, "{target:?} at {height_m} m");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_focal_length_that_is_off_is_told_in_flight() {
+    for (name, scene) in CASES {
+        for seed in SEEDS {
+            let flight = Scene { focal_ratio: 1.05, ..scene(seed) }.fly();
+            let error = found(&flight, |findings| findings.focal_ratio);
+            println!("{name}, seed {seed}: {error:.4?}");
+            let off = error.map(|error| error.value - 0.05);
+            let is_right = off.is_some_and(|off| off.abs() < 0.015);
+            assert!(is_right, "{name}, seed {seed}: off by {off:?}");
+        }
+    }
+}
+
+#[test]
+fn what_is_as_configured_is_never_told() {
+    let cases = FAULTS.into_iter().filter(|(name, _)| !name.contains("larger"));
+    let cases = cases.map(|case| (case, 6)).chain(WINDS.map(|case| (case, 20)));
+    let mut flights = 0;
+    let others = [(("anything", anything as fn(u64) -> Scene), 40), (MOVING[3], 6), (MOVING[4], 6)];
+    for ((name, scene), seeds) in cases.chain(others) {
+        for seed in 1000..1000 + seeds {
+            let flight = scene(seed).fly();
+            let told = flight.samples.iter().find(|s| s.mount != MountFindings::default());
+            let told = told.map(|sample| (sample.seconds, sample.mount));
+            assert!(told.is_none(), "{name}, seed {seed}: {told:?}");
+            flights += 1;
+        }
+    }
+    println!("{flights} flights");
+}
