@@ -444,6 +444,15 @@ mod tests {
         assert!((origin.x() - 1.5).abs() < 1e-12 && (origin.y() + 1.5).abs() < 1e-12);
         let model = config.camera_settings().model;
         assert_eq!((model.width, model.height, model.fx.round()), (1296, 972, 1818.0));
+        assert_eq!(config.camera_settings().processing, Preset::Linear.processing());
+    }
+
+    #[test]
+    fn a_kind_of_camera_is_chosen_by_name() {
+        for preset in Preset::ALL {
+            let config = load(&format!("camera.processing={preset}")).unwrap();
+            assert_eq!(config.camera_settings().processing, preset.processing());
+        }
     }
 
     #[test]

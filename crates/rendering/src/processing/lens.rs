@@ -78,7 +78,7 @@ impl Lens {
             let outwards =
                 if v % 2 == 0 { -self.fringe_px * RED_OVER_BLUE } else { self.fringe_px };
             for u in (v % 2..row.len()).step_by(2) {
-                let [x, y] = field.from_middle(u, v);
+                let [x, y] = field.offset(u, v);
                 // What lies outwards in the image comes from nearer the middle.
                 let scale = -outwards / field.half_diagonal;
                 let place = [u as f32 + x * scale, v as f32 + y * scale];
@@ -120,13 +120,13 @@ impl Field {
         Self { middle, half_diagonal: middle[0].hypot(middle[1]).max(1.0) }
     }
 
-    fn from_middle(&self, u: usize, v: usize) -> [f32; 2] {
+    fn offset(&self, u: usize, v: usize) -> [f32; 2] {
         [u as f32 - self.middle[0], v as f32 - self.middle[1]]
     }
 
     /// The squared distance from the middle; 1 in the corners.
     fn part2(&self, u: usize, v: usize) -> f32 {
-        let [x, y] = self.from_middle(u, v);
+        let [x, y] = self.offset(u, v);
         (x * x + y * y) / (self.half_diagonal * self.half_diagonal)
     }
 }

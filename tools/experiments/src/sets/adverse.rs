@@ -85,7 +85,7 @@ fn contrast(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
 fn noise(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     let light = 0.002 * (1.0 + (frame % 4) as f64);
     let settings = CameraSettings::thesis().exposed_for(light, 200.0, 0.004);
-    let (mut spec, _) = view(draw, marker, settings, Set::Adverse, frame, 60.0..140.0, 0.4);
+    let (mut spec, _) = view(draw.frame(Set::Adverse, frame), marker, settings, 60.0..140.0, 0.4);
     spec.light = light;
     spec.with("noise", Occluder::None)
 }
@@ -94,7 +94,7 @@ fn noise(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
 fn defocus(draw: Draw, marker: Marker, frame: usize) -> FrameSpec {
     let blur_px = 2.0 + 0.14 * (frame % FRAMES) as f64;
     let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
-    let (spec, _) = view(draw, marker, settings, Set::Adverse, frame, 45.0..90.0, 0.4);
+    let (spec, _) = view(draw.frame(Set::Adverse, frame), marker, settings, 45.0..90.0, 0.4);
     spec.with("defocus", Occluder::None)
 }
 
@@ -152,7 +152,7 @@ fn cut_by(
 }
 
 fn large(draw: Draw, marker: Marker, frame: usize) -> (FrameSpec, rand_chacha::ChaCha8Rng) {
-    view(draw, marker, CameraSettings::thesis(), Set::Adverse, frame, 60.0..160.0, 0.4)
+    view(draw.frame(Set::Adverse, frame), marker, CameraSettings::thesis(), 60.0..160.0, 0.4)
 }
 
 /// The pixel of a point on the marker, in marker sizes from its centre.

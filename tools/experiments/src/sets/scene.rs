@@ -18,7 +18,20 @@ pub(super) struct Draw {
     pub(super) seed: u64,
 }
 
+/// One frame of a set.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct DrawnFrame {
+    draw: Draw,
+    set: Set,
+    frame: usize,
+}
+
 impl Draw {
+    /// A frame of a set.
+    pub(super) fn frame(self, set: Set, frame: usize) -> DrawnFrame {
+        DrawnFrame { draw: self, set, frame }
+    }
+
     /// The random generator and the seed of one frame of a set.
     pub(super) fn frame_rng(self, set: Set, frame: usize) -> (ChaCha8Rng, u64) {
         /// Further than any two frames of one draw are apart.
@@ -47,15 +60,14 @@ pub(super) fn with_id(marker: Marker, number: usize) -> Marker {
 
 /// A random view of a marker: its size in the image within `size_px`, tilted by up to `max_tilt`.
 pub(super) fn view(
-    draw: Draw,
+    drawn: DrawnFrame,
     marker: Marker,
     settings: CameraSettings,
-    set: Set,
-    frame: usize,
     size_px: std::ops::Range<f64>,
     max_tilt: f64,
 ) -> (FrameSpec, ChaCha8Rng) {
-    let (mut rng, seed) = draw.frame_rng(set, frame);
+    let frame = drawn.frame;
+    let (mut rng, seed) = drawn.draw.frame_rng(drawn.set, frame);
     let model = settings.model;
     let distance_m = model.fx * SIZE_M / rng.random_range(size_px);
     let at = near(&mut rng, centre(&model), 200.0);

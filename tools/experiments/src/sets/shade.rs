@@ -69,7 +69,7 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
 }
 
 fn large(draw: Draw, marker: Marker, frame: usize) -> (FrameSpec, ChaCha8Rng) {
-    view(draw, marker, CameraSettings::thesis(), Set::Shade, frame, 40.0..160.0, 0.4)
+    view(draw.frame(Set::Shade, frame), marker, CameraSettings::thesis(), 40.0..160.0, 0.4)
 }
 
 /// A random pixel on or near the marker: up to `reach` of its size from its centre along both axes.

@@ -40,7 +40,8 @@ pub(super) fn blur(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     for blur_px in [0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0] {
         for _ in 0..6 {
             let settings = CameraSettings { blur_px, ..CameraSettings::thesis() };
-            let (spec, _) = view(draw, marker, settings, Set::Blur, frames.len(), 35.0..120.0, 0.3);
+            let (spec, _) =
+                view(draw.frame(Set::Blur, frames.len()), marker, settings, 35.0..120.0, 0.3);
             frames.push(spec.with(format!("lens{blur_px}"), Occluder::None));
         }
     }
@@ -48,7 +49,7 @@ pub(super) fn blur(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
         for _ in 0..6 {
             let settings = CameraSettings::thesis();
             let (mut spec, mut rng) =
-                view(draw, marker, settings, Set::Blur, frames.len(), 50.0..150.0, 0.3);
+                view(draw.frame(Set::Blur, frames.len()), marker, settings, 50.0..150.0, 0.3);
             let middle = spec.path[0];
             let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
             let origin = middle.origin();
@@ -71,7 +72,7 @@ pub(super) fn noise(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
         for _ in 0..6 {
             let settings = CameraSettings::thesis().exposed_for(light, 200.0, 0.004);
             let (mut spec, _) =
-                view(draw, marker, settings, Set::Noise, frames.len(), 40.0..120.0, 0.3);
+                view(draw.frame(Set::Noise, frames.len()), marker, settings, 40.0..120.0, 0.3);
             spec.light = light;
             frames.push(spec.with(format!("light{light}"), Occluder::None));
         }
@@ -86,7 +87,7 @@ pub(super) fn light(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
         for frame in 0..6 {
             let settings = CameraSettings::thesis().exposed_for(1.0, white, 0.1);
             let (mut spec, _) =
-                view(draw, marker, settings, Set::Light, frames.len(), 30.0..120.0, 0.3);
+                view(draw.frame(Set::Light, frames.len()), marker, settings, 30.0..120.0, 0.3);
             spec.surface = [Surface::Asphalt, Surface::Grass][frame % 2];
             frames.push(spec.with(format!("white{white}"), Occluder::None));
         }
