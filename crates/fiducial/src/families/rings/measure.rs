@@ -180,8 +180,9 @@ impl EdgeSearch<'_> {
         let clear = fit.r_squared > min_r_squared && fit.residual < MAX_RESIDUAL;
         let is_marker = (clear || faint)
             && fit.contrast > 2.0 * MIN_STEP
-            // Other things blurred beyond recognition fit rings that are blacker than black.
-            && (!tiny || fit.contrast < 260.0)
+            // Other things blurred beyond recognition fit rings that are blacker than black, though less well
+            // than sharpening makes a marker's.
+            && (!tiny || fit.contrast < 260.0 || is_sharpened(fit))
             && fit.has_rings()
             && self.is_near(start, &fit.pose, 1.5, 0.3);
         if !is_marker {
@@ -360,6 +361,15 @@ fn from_photometric(fit: &PhotometricPoses, confidence: f64) -> Option<MeasuredM
 /// Whether a fit is a marker's with nothing on it.
 fn is_undisturbed(fit: &PhotometricFit) -> bool {
     fit.residual < MAX_RESIDUAL && fit.has_rings() && fit.r_squared > MIN_R_SQUARED
+}
+
+/// Whether a small fit is so good that a contrast beyond the grey values may be a sharpened marker's.
+fn is_sharpened(fit: &PhotometricFit) -> bool {
+    const MAX_CONTRAST: f64 = 600.0;
+    const MAX_DISC_RATIO: f64 = 0.02;
+    fit.contrast < MAX_CONTRAST
+        && fit.r_squared > MIN_R_SQUARED_SMALL
+        && fit.disc_ratio < MAX_DISC_RATIO
 }
 
 /// The ring to which a circle of this radius (in marker sizes) belongs.

@@ -13,7 +13,7 @@ mod solve;
 
 use crate::families::rings::circle_pose::CirclePose;
 
-use model::{Effort, MAX_GREY, MAX_RESIDUAL};
+use model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL};
 pub(crate) use model::{PhotometricFit, PhotometricInput, PhotometricPoses};
 pub(crate) use scene::PixelSample;
 use scene::{ALL_PIXELS_PX, FOCUSED_PX, SampleSource, Scene};
@@ -29,10 +29,14 @@ const SPARSE_STRIDE: usize = 3;
 /// thousand images. Nine of ten small candidates that are no marker, and half of the larger ones, end here.
 const EARLY_REJECT_RESIDUAL_SMALL: [f64; 3] = [0.27, 0.22, 0.17];
 const EARLY_REJECT_RESIDUAL: [f64; 3] = [0.45, 0.4, 0.35];
-/// Above this residual, in units of the contrast, motion blur is tried, ...
-const MIN_MOTION_RESIDUAL: f64 = 0.03;
-/// ... and kept when it lowers the cost to this share or less.
-const MAX_MOTION_COST: f64 = 0.5;
+/// Above this residual, in units of the contrast, motion blur and a camera's processing are tried, ...
+const MIN_EXTRAS_RESIDUAL: f64 = 0.03;
+/// ... and kept when they lower the cost to this share or less.
+const MAX_EXTRAS_COST: f64 = 0.5;
+/// Between this residual and that, a camera's processing is tried when one step lowers the cost by this share, and kept when
+/// the fit does.
+const MIN_RESPONSE_RESIDUAL: f64 = 0.008;
+const MIN_RESPONSE_GAIN: f64 = 0.2;
 /// Start tilt in radians. Seen face on, every tilt looks the same to first order: a saddle of the cost.
 const MIN_START_TILT: f64 = 0.2;
 /// The mirrored pose is dropped above this ratio of costs.
@@ -70,13 +74,34 @@ impl PhotometricInput<'_> {
         }
         let mut all = Scene::new(samples, size_m, camera, early_reject);
         let mut sparse = Scene { stride, ..Scene::new(samples, size_m, camera, early_reject) };
-        if (MIN_MOTION_RESIDUAL..MAX_RESIDUAL).contains(&first.residual(&sparse)) {
-            sparse.has_motion = true;
-            let moving = sparse.fitted(Start::like(&first.model.pose, &first));
-            match moving.filter(|moving| moving.cost() < MAX_MOTION_COST * first.cost()) {
-                Some(moving) => (first, all.has_motion) = (moving, true),
-                None => sparse.has_motion = false,
+        let residual = first.residual(&sparse);
+        let is_processed = MIN_RESPONSE_RESIDUAL < residual
+            && residual < MIN_EXTRAS_RESIDUAL
+            && sparse.response_gain(&first).is_some_and(|gain| gain > MIN_RESPONSE_GAIN);
+        if is_processed {
+            sparse.extras = Extras::Response;
+            let plain = first.model.pose;
+            match sparse.fitted(Start::like(&plain, &first)) {
+                Some(fit) if fit.cost() < (1.0 - MIN_RESPONSE_GAIN) * first.cost() => {
+                    (first, all.extras) = (fit, Extras::Response);
+                }
+                _ => sparse.extras = Extras::Nothing,
             }
+        }
+        if (MIN_EXTRAS_RESIDUAL..MAX_RESIDUAL).contains(&residual) {
+            let mut max_cost = MAX_EXTRAS_COST * first.cost();
+            let plain = (first.model.pose, first);
+            let (mut best, mut extras) = (None, Extras::Nothing);
+            for tried in [Extras::Response, Extras::Motion] {
+                sparse.extras = tried;
+                let fit = sparse.fitted(Start::like(&plain.0, &plain.1));
+                if let Some(fit) = fit.filter(|fit| fit.cost() < max_cost) {
+                    max_cost = fit.cost();
+                    (best, extras) = (Some(fit), tried);
+                }
+            }
+            (sparse.extras, all.extras) = (extras, extras);
+            first = best.unwrap_or(plain.1);
         }
         let fit_all = |fit: ModelFit| match stride {
             1 => Some(fit),
@@ -183,6 +208,7 @@ mod tests {
     use imaging::GrayView;
     use nalgebra::Vector3;
 
+    use super::model::CameraResponse;
     use super::solve::RingModel;
     use super::*;
     use crate::families::rings::circle_pose::project;
@@ -214,7 +240,9 @@ mod tests {
             normal: Vector3::new(0.3, 0.2, -0.9).normalize(),
         };
         let gradient = [0.5, -0.3];
-        let model = RingModel { pose: truth, blur_px, motion, black: 30.0, white, gradient };
+        let response = CameraResponse::LINEAR;
+        let model =
+            RingModel { pose: truth, blur_px, motion, black: 30.0, white, gradient, response };
         let middle = project(truth.centre, &camera).unwrap();
         let data: Vec<u8> = (0..8000)
             .map(|i| {

@@ -2,6 +2,7 @@
 
 use nalgebra::Vector3;
 
+use super::model::CameraResponse;
 use super::scene::Scene;
 use crate::families::rings::circle_pose::{CirclePlane, RayPlaneIntersection};
 use crate::optics::edge_response::pixel_kurtosis;
@@ -13,20 +14,81 @@ const MAX_BLUR_SIGMAS: f64 = 4.0;
 pub(super) struct PixelResponse {
     /// The shares of the pixel's light from inside each circle, the outermost first.
     pub(super) inside: [f64; 6],
+    /// How white the camera shows the pixel, from 0 (black) to 1; sharpened beyond them.
+    pub(super) shown: f64,
     /// Gradient of the distance from the centre, in pixels, by the pose.
     pub(super) distance_by_pose: [f64; 5],
-    /// Derivatives of the whiteness by that distance, by the blur and by the motion.
+    /// Derivatives of `shown` by that distance, by the blur, by the motion and by the camera's response.
     pub(super) by_distance: f64,
     pub(super) by_blur: f64,
     pub(super) by_motion: [f64; 2],
+    pub(super) by_response: [f64; 2],
 }
 
 impl PixelResponse {
-    /// How white the pixel is, from 0 (black) to 1.
+    /// How white the pixel would be in an image linear in light, from 0 (black) to 1.
     #[inline]
     pub(super) fn white(&self) -> f64 {
         let [a, b, c, d, e, f] = self.inside;
         1.0 - a + b - c + d - e + f
+    }
+
+    /// As a camera of this response shows it. `blurred` is the same pixel blurred further by the sharpening's
+    /// kernel, to `1 / blur_ratio` times the blur, and `ratio_by_blur` the derivative of the ratio.
+    pub(super) fn processed(
+        &self,
+        response: CameraResponse,
+        blurred: &Self,
+        blur_ratio: f64,
+        ratio_by_blur: f64,
+    ) -> Self {
+        let CameraResponse { curve, sharpening } = response;
+        let (own, wide) = (tone(self.white(), curve), tone(blurred.white(), curve));
+        // What the curve adds at an edge has a width that is that of the blur: blurred by the kernel, its
+        // integral across the edge is as before.
+        let wide_shown = wide.linear + blur_ratio * wide.added;
+        let of_own = (1.0 + sharpening) * own.slope;
+        let of_wide = -sharpening * (1.0 + blur_ratio * (wide.slope - 1.0));
+        let both = |own: f64, wide: f64| of_own * own + of_wide * wide;
+        Self {
+            inside: self.inside,
+            shown: (1.0 + sharpening) * (own.linear + own.added) - sharpening * wide_shown,
+            distance_by_pose: self.distance_by_pose,
+            by_distance: both(self.by_distance, blurred.by_distance),
+            by_blur: both(self.by_blur, blurred.by_blur * blur_ratio)
+                - sharpening * wide.added * ratio_by_blur,
+            by_motion: [
+                both(self.by_motion[0], blurred.by_motion[0]),
+                both(self.by_motion[1], blurred.by_motion[1]),
+            ],
+            by_response: [
+                (1.0 + sharpening) * own.by_curve - sharpening * blur_ratio * wide.by_curve,
+                own.linear + own.added - wide_shown,
+            ],
+        }
+    }
+}
+
+/// A tone curve at one whiteness.
+struct Tone {
+    /// The whiteness without the curve, and what the curve adds to it.
+    linear: f64,
+    added: f64,
+    /// Derivatives by the whiteness and by the curve.
+    slope: f64,
+    by_curve: f64,
+}
+
+/// The curve `(1 + c) w / (1 + c w)`: monotonic, and with `c` about 1 nearly that of sRGB.
+#[inline]
+fn tone(white: f64, curve: f64) -> Tone {
+    let per = 1.0 / (1.0 + curve * white);
+    let mixed = white * (1.0 - white) * per;
+    Tone {
+        linear: white,
+        added: curve * mixed,
+        slope: (1.0 + curve) * per * per,
+        by_curve: mixed * per,
     }
 }
 
@@ -145,12 +207,15 @@ impl RadiusDistribution {
             by_distance += sign * density * self.by_distance * ratio;
             by_deviation -= sign * density * z;
         }
+        let [a, b, c, d, e, f] = inside;
         PixelResponse {
             inside,
+            shown: 1.0 - a + b - c + d - e + f,
             distance_by_pose: by_pose,
             by_distance,
             by_blur: by_deviation * self.by_blur,
             by_motion: self.by_motion.map(|by| by_deviation * by),
+            by_response: [0.0; 2],
         }
     }
 }

@@ -12,8 +12,40 @@ pub(super) const MAX_GREY: f64 = 254.5;
 pub(super) const MAX_RESIDUAL: f64 = 0.2;
 /// Pose (5), blur, black, white, and the gradient of white to the right and down.
 pub(super) const UNKNOWNS: usize = 10;
-/// The same and the two numbers of the motion.
-pub(super) const UNKNOWNS_WITH_MOTION: usize = 12;
+/// The same and two numbers of the motion or of the camera's response.
+pub(super) const UNKNOWNS_WITH_EXTRAS: usize = 12;
+
+/// What is fitted beside pose, blur and light.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(super) enum Extras {
+    Nothing,
+    Motion,
+    Response,
+}
+
+/// How a camera shows light: in proportion to it, or processed for people.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) struct CameraResponse {
+    /// The tone curve: 0 is linear, about 1 is sRGB.
+    pub(crate) curve: f64,
+    /// Amount of an unsharp mask with a kernel of [`SHARPENING_PX`].
+    pub(crate) sharpening: f64,
+}
+
+/// Standard deviation of the kernel with which cameras sharpen, in pixels.
+pub(super) const SHARPENING_PX: f64 = 1.0;
+
+impl CameraResponse {
+    pub(crate) const LINEAR: Self = Self { curve: 0.0, sharpening: 0.0 };
+
+    /// After a step of a fit, within what cameras do.
+    pub(super) fn moved(&self, by: [f64; 2]) -> Self {
+        Self {
+            curve: (self.curve + by[0]).clamp(-0.4, 3.0),
+            sharpening: (self.sharpening + by[1]).clamp(-0.2, 2.0),
+        }
+    }
+}
 
 /// When a fit ends.
 #[derive(Copy, Clone, Debug)]
@@ -65,6 +97,7 @@ pub(crate) struct PhotometricFit {
     pub(crate) contrast: f64,
     /// Standard deviation of the blur, in pixels.
     pub(crate) blur_px: f64,
+    pub(crate) response: CameraResponse,
 }
 
 impl PhotometricFit {

@@ -6,7 +6,7 @@ use geometry::{CameraModel, Pixel};
 use markers::RingKind;
 use nalgebra::Vector3;
 
-use super::model::{Effort, PhotometricInput, UNKNOWNS};
+use super::model::{Effort, Extras, PhotometricInput, UNKNOWNS};
 use crate::families::rings::circle_pose::{CirclePose, project};
 use crate::optics::edge_response::EdgeResponse;
 
@@ -33,6 +33,7 @@ pub(crate) struct PixelSample {
 }
 
 /// What a model is fitted to.
+#[derive(Clone, Copy)]
 pub(super) struct Scene<'a> {
     pub(super) samples: &'a [PixelSample],
     /// One of this many samples counts.
@@ -44,8 +45,7 @@ pub(super) struct Scene<'a> {
     /// Largest residual before each of the first steps.
     pub(super) early_reject: [f64; 3],
     pub(super) effort: Effort,
-    /// Whether motion blur is fitted.
-    pub(super) has_motion: bool,
+    pub(super) extras: Extras,
 }
 
 impl<'a> Scene<'a> {
@@ -70,7 +70,7 @@ impl<'a> Scene<'a> {
             edge: EdgeResponse::new(),
             early_reject,
             effort: Effort::FULL,
-            has_motion: false,
+            extras: Extras::Nothing,
         }
     }
 

@@ -2,7 +2,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::model::{Alternative, MAX_GREY, PhotometricFit, UNKNOWNS, UNKNOWNS_WITH_MOTION};
+use super::model::{Alternative, Extras, MAX_GREY, PhotometricFit, UNKNOWNS, UNKNOWNS_WITH_EXTRAS};
 use super::scene::Scene;
 use super::solve::{ModelFit, RingModel, Sums};
 
@@ -25,7 +25,7 @@ impl RingModel {
         self.for_each_response(scene, |sample, response| {
             let [a, b, c, d, e, f] = response.inside;
             let white = response.white();
-            let (grey, _) = self.grey(sample, white);
+            let (grey, _) = self.grey(sample, response.shown);
             let seen = if sample.grey > MAX_GREY { sample.grey.max(grey) } else { sample.grey };
             if sample.inside {
                 n += 1.0;
@@ -33,7 +33,7 @@ impl RingModel {
                 squares += seen * seen;
                 unexplained += (grey - seen).powi(2);
             }
-            // Without the fitted gradient of the light.
+            // Without the fitted gradient of the light and the camera's response.
             let flat = seen - grey + self.black + (self.white - self.black) * white;
             let of_disc = SVector::<f64, 3>::new(1.0, a, flat);
             disc.syger(1.0, &of_disc, &of_disc, 1.0);
@@ -91,18 +91,22 @@ impl Scene<'_> {
             ring_balance: score.ring_balance,
             contrast: fit.model.contrast(),
             blur_px: fit.model.blur_px,
+            response: fit.model.response,
         })
     }
 
     /// Covariance of the pose, from the remaining residuals: noise and errors of the model.
     fn covariance(&self, fit: &ModelFit) -> Option<SMatrix<f64, 5, 5>> {
         let Sums { count, pose_variance } = fit.equations.extra;
-        let unknowns = if self.has_motion { UNKNOWNS_WITH_MOTION } else { UNKNOWNS };
+        let unknowns = match self.extras {
+            Extras::Nothing => UNKNOWNS,
+            Extras::Motion | Extras::Response => UNKNOWNS_WITH_EXTRAS,
+        };
         // Where the pixels that depend on the pose are noisier than the others, their noise counts.
         let mean = (fit.cost() / count).max(pose_variance);
         let variance = mean * count / (count - unknowns as f64).max(1.0) + 1.0 / 12.0;
         let mut information = fit.equations.matrix / variance;
-        for i in 0..UNKNOWNS_WITH_MOTION {
+        for i in 0..UNKNOWNS_WITH_EXTRAS {
             information[(i, i)] += 1e-9;
         }
         for i in 3..5 {

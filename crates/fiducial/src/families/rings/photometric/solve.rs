@@ -3,7 +3,8 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::blur::{Blur, PixelResponse, RadiusDistribution};
-use super::model::{Effort, MAX_GREY, MAX_RESIDUAL, UNKNOWNS, UNKNOWNS_WITH_MOTION};
+use super::model::{
+    CameraResponse, Effort, Extras, MAX_GREY, MAX_RESIDUAL, SHARPENING_PX, UNKNOWNS, UNKNOWNS_WITH_EXTRAS};
 use super::scene::{FOCUSED_PX, PixelSample, Scene};
 use crate::families::rings::circle_pose::CirclePose;
 use crate::optics::exposure::ClippedExposure;
@@ -34,6 +35,7 @@ pub(super) struct RingModel {
     pub(super) white: f64,
     /// Change of white per pixel to the right and down.
     pub(super) gradient: [f64; 2],
+    pub(super) response: CameraResponse,
 }
 
 impl RingModel {
@@ -54,6 +56,12 @@ impl RingModel {
         const BATCH: usize = 8;
         let plane = self.pose.plane(scene.camera);
         let blur = Blur::new(self.blur_px, self.motion);
+        let wide_px = self.blur_px.hypot(SHARPENING_PX);
+        let is_linear =
+            self.response == CameraResponse::LINEAR && scene.extras != Extras::Response;
+        let wide = (!is_linear).then(|| Blur::new(wide_px, self.motion));
+        let ratio = self.blur_px / wide_px;
+        let ratio_by_blur = (1.0 - ratio * ratio) / wide_px;
         for samples in scene.samples.chunks(BATCH * scene.stride) {
             let mut counted = samples.iter().step_by(scene.stride);
             let last = samples.last()?;
@@ -65,7 +73,17 @@ impl RingModel {
                 if !radius.at.is_valid() {
                     return None;
                 }
-                visit(sample, &radius.response(scene));
+                let response = radius.response(scene);
+                match &wide {
+                    None => visit(sample, &response),
+                    Some(wide) => {
+                        let blurred = RadiusDistribution::about(&sample.ray, &plane, wide);
+                        let blurred = blurred.response(scene);
+                        let shown =
+                            response.processed(self.response, &blurred, ratio, ratio_by_blur);
+                        visit(sample, &shown);
+                    }
+                }
             }
         }
         Some(())
@@ -83,7 +101,7 @@ impl RingModel {
     fn expose(&mut self, scene: &Scene<'_>) -> Option<()> {
         let mut exposure = ClippedExposure::new(MAX_GREY);
         self.for_each_response(scene, |sample, response| {
-            exposure.add(response.white(), sample.grey);
+            exposure.add(response.shown, sample.grey);
         })?;
         let [black, contrast] = exposure.black_and_contrast();
         (self.black, self.white) = (black, black + contrast);
@@ -94,10 +112,10 @@ impl RingModel {
     fn linearised(&self, scene: &Scene<'_>, limit: f64) -> Option<Equations> {
         let mut fixed = ([[0.0; UNKNOWNS]; UNKNOWNS], [0.0; UNKNOWNS]);
         let (matrix, right) = (&mut fixed.0, &mut fixed.1);
-        let mut motion = [[0.0; UNKNOWNS_WITH_MOTION + 1]; 2];
+        let mut extras = [[0.0; UNKNOWNS_WITH_EXTRAS + 1]; 2];
         let (mut total, mut count, mut pose_weight, mut pose_squares) = (0.0, 0.0, 0.0, 0.0);
         self.for_each_response(scene, |sample, response| {
-            let white = response.white();
+            let white = response.shown;
             let [x, y] = sample.offset;
             let (grey, contrast) = self.grey(sample, white);
             // Both saturated: no information.
@@ -132,25 +150,33 @@ impl RingModel {
                     *entry += scaled * other;
                 }
             }
-            if scene.has_motion {
-                let by_motion = response.by_motion.map(|by| by * contrast);
-                let others = gradient.iter().chain(&by_motion).copied().chain([-residual]);
-                for (index, other) in others.enumerate() {
-                    motion[0][index] += weight * by_motion[0] * other;
-                    motion[1][index] += weight * by_motion[1] * other;
-                }
+            let by_extras = match scene.extras {
+                Extras::Nothing => return,
+                Extras::Motion => response.by_motion,
+                Extras::Response => response.by_response,
+            };
+            let by_extras = by_extras.map(|by| by * contrast);
+            let others = gradient.iter().chain(&by_extras).copied().chain([-residual]);
+            for (index, other) in others.enumerate() {
+                extras[0][index] += weight * by_extras[0] * other;
+                extras[1][index] += weight * by_extras[1] * other;
             }
         })?;
         let pose_variance = if pose_weight > 0.0 { pose_squares / pose_weight } else { 0.0 };
-        let (matrix, right) = with_motion(&fixed, &motion, scene.has_motion);
+        let (matrix, right) = with_extras(&fixed, &extras, scene.extras != Extras::Nothing);
         let extra = Sums { count, pose_variance };
         total.is_finite().then_some(NormalEquations { matrix, right, cost: total, extra })
     }
 
-    fn moved(&self, step: &SVector<f64, UNKNOWNS_WITH_MOTION>) -> Option<Self> {
+    fn moved(&self, step: &SVector<f64, UNKNOWNS_WITH_EXTRAS>, extras: Extras) -> Option<Self> {
         let blur_px = self.blur_px + step[5].clamp(-MAX_BLUR_STEP_PX, MAX_BLUR_STEP_PX);
         let blur_px = blur_px.clamp(MIN_BLUR_PX, MAX_BLUR_PX);
-        let motion = [self.motion[0] + step[10], self.motion[1] + step[11]];
+        let by = [step[10], step[11]];
+        let (motion, response) = match extras {
+            Extras::Nothing => (self.motion, self.response),
+            Extras::Motion => ([self.motion[0] + by[0], self.motion[1] + by[1]], self.response),
+            Extras::Response => (self.motion, self.response.moved(by)),
+        };
         let most = blur_px * blur_px - MIN_BLUR_PX * MIN_BLUR_PX;
         let scale = (most / motion[0].hypot(motion[1]).max(1e-12)).min(1.0);
         Some(Self {
@@ -160,6 +186,7 @@ impl RingModel {
             black: self.black + step[6],
             white: self.white + step[7],
             gradient: [self.gradient[0] + step[8], self.gradient[1] + step[9]],
+            response,
         })
     }
 }
@@ -173,28 +200,27 @@ pub(super) struct Sums {
     pub(super) pose_variance: f64,
 }
 
-type Equations = NormalEquations<UNKNOWNS_WITH_MOTION, Sums>;
+type Equations = NormalEquations<UNKNOWNS_WITH_EXTRAS, Sums>;
 
-/// The normal equations with the rows of the motion; a motion that is not fitted gets a prior that keeps it
-/// at zero.
-fn with_motion(
+/// The normal equations with the rows of the extras; those that are not fitted get a prior that keeps them.
+fn with_extras(
     (matrix, right): &([[f64; UNKNOWNS]; UNKNOWNS], [f64; UNKNOWNS]),
-    motion: &[[f64; UNKNOWNS_WITH_MOTION + 1]; 2],
-    has_motion: bool,
-) -> (SMatrix<f64, UNKNOWNS_WITH_MOTION, UNKNOWNS_WITH_MOTION>, SVector<f64, UNKNOWNS_WITH_MOTION>)
+    extras: &[[f64; UNKNOWNS_WITH_EXTRAS + 1]; 2],
+    are_fitted: bool,
+) -> (SMatrix<f64, UNKNOWNS_WITH_EXTRAS, UNKNOWNS_WITH_EXTRAS>, SVector<f64, UNKNOWNS_WITH_EXTRAS>)
 {
     const FIXED: f64 = 1e12;
-    let mut all = SMatrix::<f64, UNKNOWNS_WITH_MOTION, UNKNOWNS_WITH_MOTION>::zeros();
-    let mut all_right = SVector::<f64, UNKNOWNS_WITH_MOTION>::zeros();
+    let mut all = SMatrix::<f64, UNKNOWNS_WITH_EXTRAS, UNKNOWNS_WITH_EXTRAS>::zeros();
+    let mut all_right = SVector::<f64, UNKNOWNS_WITH_EXTRAS>::zeros();
     all.fixed_view_mut::<UNKNOWNS, UNKNOWNS>(0, 0).copy_from(&SMatrix::from(*matrix));
     all_right.fixed_rows_mut::<UNKNOWNS>(0).copy_from(&SVector::from(*right));
-    for (row, sums) in (UNKNOWNS..).zip(motion) {
+    for (row, sums) in (UNKNOWNS..).zip(extras) {
         let Some((right, sums)) = sums.split_last() else { continue };
         all_right[row] = *right;
         for (column, sum) in sums.iter().enumerate() {
             (all[(row, column)], all[(column, row)]) = (*sum, *sum);
         }
-        if !has_motion {
+        if !are_fitted {
             all[(row, row)] = FIXED;
         }
     }
@@ -246,7 +272,7 @@ struct Solver<'a> {
     max_cost: Option<f64>,
 }
 
-impl Problem<UNKNOWNS_WITH_MOTION> for Solver<'_> {
+impl Problem<UNKNOWNS_WITH_EXTRAS> for Solver<'_> {
     type Place = RingModel;
     type Extra = Sums;
 
@@ -259,9 +285,9 @@ impl Problem<UNKNOWNS_WITH_MOTION> for Solver<'_> {
     fn moved(
         &self,
         from: &RingModel,
-        step: &SVector<f64, UNKNOWNS_WITH_MOTION>,
+        step: &SVector<f64, UNKNOWNS_WITH_EXTRAS>,
     ) -> Option<RingModel> {
-        from.moved(step)
+        from.moved(step, self.scene.extras)
     }
 
     fn before_step(&mut self, tried: usize, best: &RingModel, equations: &Equations) -> Next {
@@ -306,6 +332,7 @@ impl Scene<'_> {
                     black: 0.0,
                     white: 255.0,
                     gradient: [0.0; 2],
+                    response: CameraResponse::LINEAR,
                 };
                 model.expose(self)?;
                 // About three times the residuals of a good fit.
@@ -348,11 +375,19 @@ impl Scene<'_> {
         let huber_limit = fit.huber_limit;
         let mut equations = fit.model.linearised(self, huber_limit)?;
         let step = equations.step(DAMPING, RIDGE)?;
-        let model = fit.model.moved(&step)?;
+        let model = fit.model.moved(&step, self.extras)?;
         let gain = step.dot(&equations.right);
         let is_small = gain < MAX_GAIN * equations.cost;
         equations.cost -= gain;
         is_small.then_some(ModelFit { model, equations, huber_limit })
+    }
+
+    /// The share of a linear fit's cost that a camera's processing would explain, by the quadratic model.
+    pub(super) fn response_gain(&self, fit: &ModelFit) -> Option<f64> {
+        let processed = Scene { extras: Extras::Response, ..*self };
+        let equations = fit.model.linearised(&processed, fit.huber_limit)?;
+        let step = equations.step(1e-6, RIDGE)?;
+        Some(step.dot(&equations.right) / equations.cost)
     }
 
     /// A limit that residuals of a good fit hardly exceed, but no more than before.
