@@ -1,5 +1,6 @@
 //! What a camera and its lens do to an edge, and the numerics that fit a model to pixels.
 
+pub(crate) mod camera_response;
 pub(crate) mod edge_response;
 pub(crate) mod exposure;
 pub(crate) mod homography;

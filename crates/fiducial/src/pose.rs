@@ -154,7 +154,8 @@ impl Plane<'_> {
         for axis in 3..6 {
             information[(axis, axis)] += ROTATION_PRIOR;
         }
-        let covariance = information.cholesky()?.inverse();
+        let mut covariance = information.cholesky()?.inverse();
+        covariance *= self.misfit(best.equations.cost);
         let other = other.filter(|other| self.is_other_minimum(&best, other));
         covariance.iter().all(|c| c.is_finite()).then_some(MarkerPose {
             camera_from_marker: Transform::from_isometry(best.place),
@@ -165,6 +166,15 @@ impl Plane<'_> {
                 reprojection_rms_px: other.equations.extra,
             }),
         })
+    }
+
+    /// The factor by which a pose is less sure than its points' covariances say, because they contradict each
+    /// other by more: 1 unless that is no chance.
+    fn misfit(&self, cost: f64) -> f64 {
+        const MAX_CHANCE: f64 = 6.0;
+        let freedom = (2 * self.points.len()).saturating_sub(6).max(1) as f64;
+        let ratio = cost / freedom;
+        if ratio > MAX_CHANCE { ratio } else { 1.0 }
     }
 
     /// Whether two poses are different minima: the pose between them costs more than both.

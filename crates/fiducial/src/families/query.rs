@@ -3,6 +3,7 @@
 use geometry::{CameraModel, Pixel};
 use imaging::{GrayView, Pyramid};
 use markers::{Family, Marker};
+use nalgebra::Matrix2;
 
 use crate::candidates::evidence::Evidence;
 use crate::candidates::quad::diagonal_px;
@@ -14,6 +15,9 @@ use crate::refine::fit::Refined;
 /// Standard deviation of corners made of segments: in pixels, and as a fraction of the diagonal.
 const MIN_SEGMENT_CORNER_PX: f64 = 0.5;
 const SEGMENT_CORNER_RATIO: f64 = 0.015;
+
+/// Corners are no square in space when their mean squared reprojection error is this multiple of their mean variance.
+const MIN_MISFIT: f64 = 9.0;
 
 /// An image in which markers are looked for.
 #[derive(Copy, Clone, Debug)]
@@ -109,11 +113,15 @@ impl FamilyQuery {
         let pose = camera.zip(size_m).and_then(|(camera, size_m)| {
             square_pose(&corners, &refined.covariance_px2, size_m, camera)
         });
+        // Corners that are no square in space, as where one was guessed beyond the frame: the centre is no better.
+        let misfit_px2 = pose.map_or(0.0, |pose| pose.reprojection_rms_px.powi(2));
+        let is_misfit = misfit_px2 > MIN_MISFIT * refined.covariance_px2.trace() / 8.0;
+        let added_px2 = if is_misfit { misfit_px2 } else { 0.0 };
         Observation {
             family: self.family,
             id: Some(id),
             centre: refined.centre,
-            centre_covariance_px2: refined.centre_covariance_px2,
+            centre_covariance_px2: refined.centre_covariance_px2 + Matrix2::identity() * added_px2,
             corners: Some(corners),
             wrong_bits: hamming,
             size_px: diagonal_px(&corners),

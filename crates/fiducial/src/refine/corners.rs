@@ -50,7 +50,11 @@ pub(crate) fn refine_design(
         .then(|| edges::fit_edges(target, design.edges, scratch))
         .flatten();
     let fit = match along_edges {
-        Some(fit) => fit,
+        Some(fit) if fit.is_shift_known => fit,
+        Some(fit) => {
+            let processed = photometric::fit_processed_design(target, design, &fit, scratch);
+            processed.unwrap_or(fit)
+        }
         None => photometric::fit_design(target, design, scratch)?,
     };
     fit.refined(&lens, guess, side_px)

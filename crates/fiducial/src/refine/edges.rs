@@ -119,6 +119,7 @@ fn fit_samples(target: Target<'_>, is_near: bool, scratch: &mut Scratch) -> Opti
         }
     }
     let mut equations = None;
+    let mut measured_at = fit.homography;
     for pass in 0..FINE_PASSES {
         fit.measure_all(&mut scratch.edges, step);
         if fit.saturated as f64 > MAX_SATURATED_RATIO * fit.pixels as f64 {
@@ -126,6 +127,7 @@ fn fit_samples(target: Target<'_>, is_near: bool, scratch: &mut Scratch) -> Opti
         }
         fit.reweight(scratch)?;
         let next = normal_equations(&scratch.edges);
+        measured_at = fit.homography;
         let moved_px = fit.step(&next)?;
         if step > 1 {
             if moved_px < SUBSET_SETTLED_PX || pass + 3 >= FINE_PASSES {
@@ -138,7 +140,63 @@ fn fit_samples(target: Target<'_>, is_near: bool, scratch: &mut Scratch) -> Opti
             break;
         }
     }
-    fit.result(&equations?, &scratch.edges)
+    let plain = fit.result(&equations?, &scratch.edges)?;
+    Some(with_common_shift(&equations?, plain, &measured_at, &scratch.edges))
+}
+
+/// The fit with a shift of all edges towards black by the same distance, when there is one: a tone curve makes white
+/// wider. Edges that have black outside and others that have it inside tell it from the square's size.
+fn with_common_shift(
+    equations: &NormalEquations<UNKNOWNS>,
+    plain: Fit,
+    measured_at: &Homography,
+    edges: &[EdgeSample],
+) -> Fit {
+    const SHIFTED: usize = UNKNOWNS + 1;
+    // A shift is one when it is this many standard deviations from none, and this many pixels.
+    const MIN_SIGMAS: f64 = 4.0;
+    const MIN_SHIFT_PX: f64 = 0.01;
+    // With a larger standard deviation the shift is not known.
+    const MAX_SIGMA_PX: f64 = 0.02;
+    let mut matrix = SMatrix::<f64, SHIFTED, SHIFTED>::zeros();
+    let mut right = SVector::<f64, SHIFTED>::zeros();
+    matrix.fixed_view_mut::<UNKNOWNS, UNKNOWNS>(0, 0).copy_from(&equations.matrix);
+    right.fixed_rows_mut::<UNKNOWNS>(0).copy_from(&equations.right);
+    let all = || edges.iter().filter_map(|edge| edge.measurement.as_ref());
+    for measurement in all() {
+        let [shift, mixed, _] = measurement.matrix.map(|m| measurement.weight * m);
+        for (i, along) in measurement.gradient.iter().enumerate() {
+            matrix[(UNKNOWNS, i)] += shift * along;
+        }
+        matrix[(UNKNOWNS, 8)] += mixed;
+        matrix[(UNKNOWNS, UNKNOWNS)] += shift;
+        right[UNKNOWNS] += measurement.weight * measurement.right[0];
+    }
+    let Some(cholesky) = matrix.cholesky() else { return plain };
+    let inverse = cholesky.inverse();
+    let step = inverse * right;
+    let (mut squares, mut weight, mut noise, mut freedom) = (0.0, 0.0, 0.0, 0.0);
+    for measurement in all() {
+        let along = measurement.gradient.iter().zip(step.iter());
+        let moved = along.map(|(by, step)| by * step).sum::<f64>() + step[UNKNOWNS];
+        let [shift, mixed, _] = measurement.matrix;
+        let left = measurement.right[0] - shift * moved - mixed * step[8];
+        squares += measurement.weight * left * left / shift;
+        weight += measurement.weight;
+        noise += measurement.weight * measurement.squares;
+        freedom += measurement.weight * measurement.freedom;
+    }
+    let variance = (squares / (weight - SHIFTED as f64).max(1.0)).max(noise / freedom);
+    let sigma_px = (inverse[(UNKNOWNS, UNKNOWNS)] * variance).sqrt();
+    let is_shift_known = sigma_px < MAX_SIGMA_PX;
+    let is_shifted = step[UNKNOWNS].abs() > (MIN_SIGMAS * sigma_px).max(MIN_SHIFT_PX);
+    match measured_at.stepped(|i| step[i]).filter(|_| is_shifted) {
+        Some(homography) => {
+            let covariance = inverse.fixed_view::<8, 8>(0, 0) * variance;
+            Fit { homography, covariance, is_shift_known, ..plain }
+        }
+        None => Fit { is_shift_known, ..plain },
+    }
 }
 
 /// Spreads a bounded number of samples along the pattern's edges within the image.
@@ -527,7 +585,8 @@ impl EdgeFit<'_> {
             spread_px: self.spread_px,
         };
         let residual = noise.sqrt() / model.contrast;
-        Some(Fit { homography: self.homography, covariance, model, residual })
+        let is_shift_known = false;
+        Some(Fit { homography: self.homography, covariance, model, residual, is_shift_known })
     }
 }
 

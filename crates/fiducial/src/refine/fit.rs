@@ -190,6 +190,8 @@ pub(crate) struct Fit {
     pub(crate) model: PhotometricModel,
     /// As in [`Refined`].
     pub(crate) residual: f64,
+    /// Whether a shift of all edges towards black, as by a tone curve, can be told from the square's size.
+    pub(crate) is_shift_known: bool,
 }
 
 /// Largest distance by which a corner is moved: in pixels, and as a fraction of the shortest side.

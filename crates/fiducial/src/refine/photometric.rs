@@ -3,6 +3,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
+use crate::optics::camera_response::{CameraResponse, SHARPENING_PX};
 use crate::optics::exposure::ClippedExposure;
 use crate::optics::homography::Homography;
 use crate::optics::least_squares::{
@@ -14,6 +15,16 @@ use crate::refine::prediction::{Bands, PatternGrid};
 
 /// Homography (8), blur, black, contrast, shade (2), brightness beyond the pattern.
 const UNKNOWNS: usize = 14;
+/// The same with the camera's tone curve and sharpening.
+const UNKNOWNS_PROCESSED: usize = 16;
+/// A camera's processing is fitted when one step towards it lowers the cost by this share, and kept when the fit does.
+const MIN_RESPONSE_GAIN: f64 = 0.15;
+/// What is smaller is an error of the model.
+const MIN_RESPONSE: f64 = 0.2;
+/// The same where a fit along the edges takes the place of this one.
+const MIN_RESPONSE_ALONE: f64 = 0.5;
+/// One of this many pixels tells.
+const RESPONSE_STRIDE: usize = 4;
 /// Prior information on the brightness beyond the pattern, in units of one pixel's: it is that of white, give
 /// or take the contrast.
 const BEYOND_PRIOR: f64 = 1e-4;
@@ -62,6 +73,29 @@ pub(crate) fn fit_design(
     fit_grid(target, &PatternGrid::from_design(design, target.lens), 0.7, scratch)
 }
 
+/// The fit of a design with a camera's processing, near a fit along its outline alone, of which a tone curve changes the
+/// size; `None` where the image is linear in light.
+pub(crate) fn fit_processed_design(
+    target: Target<'_>,
+    design: &Design<'_>,
+    near: &Fit,
+    scratch: &mut Scratch,
+) -> Option<Fit> {
+    let grid = PatternGrid::from_design(design, target.lens);
+    let homography = near.homography;
+    let light = PhotometricModel { beyond: 0.0, shade: [0.0; 2], ..near.model };
+    let half_px = homography.shortest_side_px() / 2.0;
+    let loss = Loss { limit: f64::INFINITY, is_huber: true };
+    let response = CameraResponse::LINEAR;
+    let mut state = State { homography, light, response, half_px, loss };
+    let pixels = &mut scratch.pixels;
+    grid.gather(target, &homography, light.spread_px, MAX_PIXELS[1], pixels)?;
+    state.expose(&grid, pixels)?;
+    let (state, equations) = processed(&state, &grid, scratch)?;
+    let CameraResponse { curve, sharpening } = state.response;
+    (curve.max(sharpening) > MIN_RESPONSE_ALONE).then(|| state.result(&equations))?
+}
+
 fn fit_grid(
     target: Target<'_>,
     grid: &PatternGrid,
@@ -73,7 +107,8 @@ fn fit_grid(
         PhotometricModel { black: 0.0, contrast: 1.0, shade: [0.0; 2], beyond: 0.0, spread_px };
     let loss = Loss { limit: f64::INFINITY, is_huber: true };
     let half_px = start.shortest_side_px() / 2.0;
-    let mut state = State { homography: *start, light, half_px, loss };
+    let response = CameraResponse::LINEAR;
+    let mut state = State { homography: *start, light, response, half_px, loss };
     let mut solved: Option<NormalEquations<UNKNOWNS, Residuals>> = None;
     for (max_pixels, settled_px) in MAX_PIXELS.into_iter().zip(SETTLED_PX) {
         let is_complete = grid.gather(
@@ -89,7 +124,7 @@ fn fit_grid(
         }
         let settled_px = if is_complete { SETTLED_PX[1] } else { settled_px };
         let Scratch { pixels, magnitudes, .. } = &mut *scratch;
-        let mut problem = Photometric { grid, pixels, magnitudes, settled_px };
+        let mut problem = Photometric::<UNKNOWNS> { grid, pixels, magnitudes, settled_px };
         let minimum = minimise(&mut problem, state, &SCHEDULE)?;
         let has_stayed = minimum.place.homography.distance_px(start) < SAME_PIXELS_PX;
         state = minimum.place;
@@ -99,21 +134,42 @@ fn fit_grid(
             break;
         }
     }
-    let equations = solved?;
-    let residuals = &equations.extra;
-    let contrast = state.light.contrast.abs();
-    let freedom = residuals.weight - UNKNOWNS as f64;
-    if contrast < MIN_CONTRAST || freedom < 1.0 {
+    match processed(&state, grid, scratch) {
+        Some((state, equations)) => state.result(&equations),
+        None => state.result(&solved?),
+    }
+}
+
+/// The fit with a camera's processing, from one without; `None` where that explains the pixels as well.
+fn processed(
+    plain: &State,
+    grid: &PatternGrid,
+    scratch: &mut Scratch,
+) -> Option<(State, NormalEquations<UNKNOWNS_PROCESSED, Residuals>)> {
+    // What the narrow loss takes for outliers may be the processing.
+    let wide = Loss { limit: 0.25 * plain.light.contrast.abs(), is_huber: true };
+    let start = State { loss: wide, ..*plain };
+    let Scratch { pixels, magnitudes, .. } = &mut *scratch;
+    let first = start.equations::<UNKNOWNS_PROCESSED>(grid, pixels, RESPONSE_STRIDE)?;
+    let gain = first.step(1e-6, 1e-9)?.dot(&first.right);
+    // What a step without the processing would gain.
+    let of_plain = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|i, j| first.matrix[(i, j)]);
+    let right = SVector::<f64, UNKNOWNS>::from_fn(|i, _| first.right[i]);
+    let plain_gain = right.dot(&of_plain.cholesky()?.solve(&right));
+    if gain - plain_gain < MIN_RESPONSE_GAIN * (first.cost - plain_gain) {
         return None;
     }
-    let variance = residuals.variance() * residuals.weight / freedom;
-    let inverse = equations.matrix.cholesky()?.inverse();
-    Some(Fit {
-        homography: state.homography,
-        covariance: inverse.fixed_view::<8, 8>(0, 0) * variance,
-        model: state.light,
-        residual: variance.sqrt() / contrast,
-    })
+    let settled_px = SETTLED_PX[1];
+    let mut problem = Photometric::<UNKNOWNS_PROCESSED> { grid, pixels, magnitudes, settled_px };
+    let minimum = minimise(&mut problem, start, &SCHEDULE)?;
+    let found = State { loss: wide, ..minimum.place };
+    let [before, after] = [start, found].map(|state| {
+        state.equations::<UNKNOWNS_PROCESSED>(grid, pixels, RESPONSE_STRIDE).map(|e| e.cost)
+    });
+    let CameraResponse { curve, sharpening } = found.response;
+    let is_processed =
+        curve.abs().max(sharpening) > MIN_RESPONSE && after? < (1.0 - MIN_RESPONSE_GAIN) * before?;
+    is_processed.then_some((minimum.place, minimum.equations))
 }
 
 /// Everything that is fitted.
@@ -121,6 +177,7 @@ fn fit_grid(
 struct State {
     homography: Homography,
     light: PhotometricModel,
+    response: CameraResponse,
     /// Half the marker, the unit of `shade`.
     half_px: f64,
     loss: Loss,
@@ -187,22 +244,22 @@ impl Residuals {
 }
 
 /// The least-squares problem of one round.
-struct Photometric<'a> {
+struct Photometric<'a, const N: usize> {
     grid: &'a PatternGrid,
     pixels: &'a mut [PixelSample],
     magnitudes: &'a mut Vec<f64>,
     settled_px: f64,
 }
 
-impl Problem<UNKNOWNS> for Photometric<'_> {
+impl<const N: usize> Problem<N> for Photometric<'_, N> {
     type Place = State;
     type Extra = Residuals;
 
-    fn linearised(&mut self, at: &State) -> Option<NormalEquations<UNKNOWNS, Residuals>> {
-        at.equations(self.grid, self.pixels)
+    fn linearised(&mut self, at: &State) -> Option<NormalEquations<N, Residuals>> {
+        at.equations(self.grid, self.pixels, 1)
     }
 
-    fn moved(&self, from: &State, step: &SVector<f64, UNKNOWNS>) -> Option<State> {
+    fn moved(&self, from: &State, step: &SVector<f64, N>) -> Option<State> {
         let light = &from.light;
         let spread_px = light.spread_px + step[8].clamp(-0.3, 0.3);
         Some(State {
@@ -214,6 +271,10 @@ impl Problem<UNKNOWNS> for Photometric<'_> {
                     .map(|s| s.clamp(-0.9, 0.9)),
                 beyond: light.beyond + step[13],
                 spread_px: spread_px.clamp(MIN_SPREAD_PX, MAX_SPREAD_PX),
+            },
+            response: match N {
+                UNKNOWNS_PROCESSED => from.response.moved([step[14], step[15]]),
+                _ => from.response,
             },
             ..*from
         })
@@ -238,7 +299,7 @@ impl Problem<UNKNOWNS> for Photometric<'_> {
         _tried: usize,
         _has_settled: bool,
         _best: &State,
-        _equations: &mut NormalEquations<UNKNOWNS, Residuals>,
+        _equations: &mut NormalEquations<N, Residuals>,
     ) -> Next {
         Next::Continue
     }
@@ -260,23 +321,61 @@ impl State {
         (contrast.is_finite() && contrast.abs() > MIN_CONTRAST).then_some(())
     }
 
-    fn equations(
+    /// The fit at these equations' minimum.
+    fn result<const N: usize>(&self, equations: &NormalEquations<N, Residuals>) -> Option<Fit> {
+        let residuals = &equations.extra;
+        let contrast = self.light.contrast.abs();
+        let freedom = residuals.weight - N as f64;
+        if contrast < MIN_CONTRAST || freedom < 1.0 {
+            return None;
+        }
+        let variance = residuals.variance() * residuals.weight / freedom;
+        let inverse = inverse(&equations.matrix)?;
+        Some(Fit {
+            homography: self.homography,
+            covariance: SMatrix::<f64, 8, 8>::from_fn(|i, j| inverse[(i, j)]) * variance,
+            model: self.light,
+            residual: variance.sqrt() / contrast,
+            is_shift_known: true,
+        })
+    }
+
+    /// The normal equations over one of `stride` pixels.
+    fn equations<const N: usize>(
         &self,
         grid: &PatternGrid,
         pixels: &mut [PixelSample],
-    ) -> Option<NormalEquations<UNKNOWNS, Residuals>> {
+        stride: usize,
+    ) -> Option<NormalEquations<N, Residuals>> {
         // The upper half.
-        let mut matrix = [[0.0; UNKNOWNS]; UNKNOWNS];
-        let mut right = [0.0; UNKNOWNS];
+        let mut matrix = [[0.0; N]; N];
+        let mut right = [0.0; N];
         let mut total_cost = 0.0;
         let mut residuals = Residuals::default();
         let mut work = [Bands::NONE; 2];
         let map = grid.map(&self.homography, self.light.spread_px);
         let light = &self.light;
+        let wide_px = light.spread_px.hypot(SHARPENING_PX);
+        let ratio = light.spread_px / wide_px;
+        let wide_map = (N == UNKNOWNS_PROCESSED).then(|| grid.map(&self.homography, wide_px));
         let unit = 1.0 / self.half_px;
-        for pixel in pixels {
+        for pixel in pixels.iter_mut().step_by(stride) {
             let point = grid.point(&map, pixel.ideal)?;
-            let prediction = grid.predict(&point, light.spread_px, &mut work);
+            let mut prediction = grid.predict(&point, light.spread_px, &mut work);
+            let mut by_response = [0.0; 2];
+            if let Some(wide_map) = &wide_map {
+                let wide_point = grid.point(wide_map, pixel.ideal)?;
+                let wide = grid.predict(&wide_point, wide_px, &mut work);
+                let shown = self.response.shown(prediction.white, wide.white, ratio);
+                let both = |own: f64, wide: f64| shown.by_own * own + shown.by_blurred * wide;
+                prediction.white = shown.white;
+                for (own, wide) in prediction.by_place.iter_mut().zip(wide.by_place) {
+                    *own = both(*own, wide);
+                }
+                prediction.by_spread = both(prediction.by_spread, wide.by_spread * ratio)
+                    + shown.by_ratio * (1.0 - ratio * ratio) / wide_px;
+                by_response = shown.by_response;
+            }
             let (x, y) = (pixel.ideal[0] * unit, pixel.ideal[1] * unit);
             let shade = 1.0 + light.shade[0] * x + light.shade[1] * y;
             let flat =
@@ -300,7 +399,7 @@ impl State {
             let information = weight * (slope[0] * slope[0] + slope[1] * slope[1]);
             residuals.informative_squares += information * residual * residual;
             residuals.information += information;
-            let mut gradient = [0.0; UNKNOWNS];
+            let mut gradient = [0.0; N];
             gradient[..8].copy_from_slice(&place.parameter_gradient(slope));
             gradient[8] = shade * light.contrast * prediction.by_spread;
             gradient[9] = shade;
@@ -308,6 +407,9 @@ impl State {
             gradient[11] = flat * x;
             gradient[12] = flat * y;
             gradient[13] = shade * prediction.beyond;
+            for (entry, by) in gradient.iter_mut().skip(UNKNOWNS).zip(by_response) {
+                *entry = shade * light.contrast * by;
+            }
             for (i, row) in matrix.iter_mut().enumerate() {
                 let scaled = weight * gradient[i];
                 right[i] += scaled * residual;
@@ -318,13 +420,18 @@ impl State {
         }
         matrix[13][13] += BEYOND_PRIOR;
         right[13] -= BEYOND_PRIOR * light.beyond;
-        (total_cost.is_finite() && residuals.weight > UNKNOWNS as f64).then(|| NormalEquations {
+        (total_cost.is_finite() && residuals.weight > N as f64).then(|| NormalEquations {
             matrix: SMatrix::from_fn(|i, j| matrix[i.min(j)][i.max(j)]),
             right: SVector::from(right),
             cost: total_cost,
             extra: residuals,
         })
     }
+}
+
+/// The inverse of a positive definite matrix.
+fn inverse<const N: usize>(matrix: &SMatrix<f64, N, N>) -> Option<SMatrix<f64, N, N>> {
+    Some(matrix.cholesky()?.inverse())
 }
 
 #[cfg(test)]

@@ -13,6 +13,8 @@ use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
 const MIN_EDGE_SHARE: f64 = 0.5;
 /// Grey values from here on are saturated.
 const SATURATED: f64 = 252.0;
+/// Largest share of white in what covers a ring.
+const MAX_COVERED_SHARE: f64 = 0.25;
 /// Blur shifts a curved edge towards the centre by this over the radius, all in pixels: half the variance of
 /// the blur of a lens in focus and of the pixels.
 const CURVATURE_SHIFT_PX2: f64 = 0.2;
@@ -180,7 +182,10 @@ impl EdgeSearch<'_> {
         let (inside, outside) =
             (self.median_at(pose, inner - beside)?, self.median_at(pose, outer + beside)?);
         let black = median_of(kind.radii())?;
-        Some(median_of(neighbour.radii())? < (black * inside.min(outside)).sqrt())
+        let (white, seen) = (inside.min(outside), median_of(neighbour.radii())?);
+        // A tone curve lifts grey more than black, so that the geometric mean is not enough.
+        let share = MAX_COVERED_SHARE * (white - black);
+        Some(seen < (black * white).sqrt().min(black + share))
     }
 
     /// The median grey value on a circle of this radius (in marker sizes).

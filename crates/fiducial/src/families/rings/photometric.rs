@@ -208,10 +208,10 @@ mod tests {
     use imaging::GrayView;
     use nalgebra::Vector3;
 
-    use super::model::CameraResponse;
     use super::solve::RingModel;
     use super::*;
     use crate::families::rings::circle_pose::project;
+    use crate::optics::camera_response::CameraResponse;
 
     /// Also where white is saturated or motion blurs the image.
     #[test]

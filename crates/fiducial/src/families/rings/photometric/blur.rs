@@ -2,9 +2,9 @@
 
 use nalgebra::Vector3;
 
-use super::model::CameraResponse;
 use super::scene::Scene;
 use crate::families::rings::circle_pose::{CirclePlane, RayPlaneIntersection};
+use crate::optics::camera_response::CameraResponse;
 use crate::optics::edge_response::pixel_kurtosis;
 
 /// An edge further away than this many standard deviations of the blur does not show.
@@ -37,58 +37,26 @@ impl PixelResponse {
     /// kernel, to `1 / blur_ratio` times the blur, and `ratio_by_blur` the derivative of the ratio.
     pub(super) fn processed(
         &self,
-        response: CameraResponse,
+        response: &CameraResponse,
         blurred: &Self,
         blur_ratio: f64,
         ratio_by_blur: f64,
     ) -> Self {
-        let CameraResponse { curve, sharpening } = response;
-        let (own, wide) = (tone(self.white(), curve), tone(blurred.white(), curve));
-        // What the curve adds at an edge has a width that is that of the blur: blurred by the kernel, its
-        // integral across the edge is as before.
-        let wide_shown = wide.linear + blur_ratio * wide.added;
-        let of_own = (1.0 + sharpening) * own.slope;
-        let of_wide = -sharpening * (1.0 + blur_ratio * (wide.slope - 1.0));
-        let both = |own: f64, wide: f64| of_own * own + of_wide * wide;
+        let seen = response.shown(self.white(), blurred.white(), blur_ratio);
+        let both = |own: f64, wide: f64| seen.by_own * own + seen.by_blurred * wide;
         Self {
             inside: self.inside,
-            shown: (1.0 + sharpening) * (own.linear + own.added) - sharpening * wide_shown,
+            shown: seen.white,
             distance_by_pose: self.distance_by_pose,
             by_distance: both(self.by_distance, blurred.by_distance),
             by_blur: both(self.by_blur, blurred.by_blur * blur_ratio)
-                - sharpening * wide.added * ratio_by_blur,
+                + seen.by_ratio * ratio_by_blur,
             by_motion: [
                 both(self.by_motion[0], blurred.by_motion[0]),
                 both(self.by_motion[1], blurred.by_motion[1]),
             ],
-            by_response: [
-                (1.0 + sharpening) * own.by_curve - sharpening * blur_ratio * wide.by_curve,
-                own.linear + own.added - wide_shown,
-            ],
+            by_response: seen.by_response,
         }
-    }
-}
-
-/// A tone curve at one whiteness.
-struct Tone {
-    /// The whiteness without the curve, and what the curve adds to it.
-    linear: f64,
-    added: f64,
-    /// Derivatives by the whiteness and by the curve.
-    slope: f64,
-    by_curve: f64,
-}
-
-/// The curve `(1 + c) w / (1 + c w)`: monotonic, and with `c` about 1 nearly that of sRGB.
-#[inline]
-fn tone(white: f64, curve: f64) -> Tone {
-    let per = 1.0 / (1.0 + curve * white);
-    let mixed = white * (1.0 - white) * per;
-    Tone {
-        linear: white,
-        added: curve * mixed,
-        slope: (1.0 + curve) * per * per,
-        by_curve: mixed * per,
     }
 }
 

@@ -5,6 +5,7 @@ use imaging::GrayView;
 use nalgebra::SMatrix;
 
 use crate::families::rings::circle_pose::CirclePose;
+use crate::optics::camera_response::CameraResponse;
 
 /// Grey values above this are saturated: the light may be of any brightness.
 pub(super) const MAX_GREY: f64 = 254.5;
@@ -21,30 +22,6 @@ pub(super) enum Extras {
     Nothing,
     Motion,
     Response,
-}
-
-/// How a camera shows light: in proportion to it, or processed for people.
-#[derive(Copy, Clone, Debug, PartialEq)]
-pub(crate) struct CameraResponse {
-    /// The tone curve: 0 is linear, about 1 is sRGB.
-    pub(crate) curve: f64,
-    /// Amount of an unsharp mask with a kernel of [`SHARPENING_PX`].
-    pub(crate) sharpening: f64,
-}
-
-/// Standard deviation of the kernel with which cameras sharpen, in pixels.
-pub(super) const SHARPENING_PX: f64 = 1.0;
-
-impl CameraResponse {
-    pub(crate) const LINEAR: Self = Self { curve: 0.0, sharpening: 0.0 };
-
-    /// After a step of a fit, within what cameras do.
-    pub(super) fn moved(&self, by: [f64; 2]) -> Self {
-        Self {
-            curve: (self.curve + by[0]).clamp(-0.4, 3.0),
-            sharpening: (self.sharpening + by[1]).clamp(-0.2, 2.0),
-        }
-    }
 }
 
 /// When a fit ends.

@@ -3,10 +3,10 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::blur::{Blur, PixelResponse, RadiusDistribution};
-use super::model::{
-    CameraResponse, Effort, Extras, MAX_GREY, MAX_RESIDUAL, SHARPENING_PX, UNKNOWNS, UNKNOWNS_WITH_EXTRAS};
+use super::model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL, UNKNOWNS, UNKNOWNS_WITH_EXTRAS};
 use super::scene::{FOCUSED_PX, PixelSample, Scene};
 use crate::families::rings::circle_pose::CirclePose;
+use crate::optics::camera_response::{CameraResponse, SHARPENING_PX};
 use crate::optics::exposure::ClippedExposure;
 use crate::optics::least_squares::{
     Damping, Influence, Next, NormalEquations, Problem, Schedule, huber, minimise,
@@ -57,8 +57,7 @@ impl RingModel {
         let plane = self.pose.plane(scene.camera);
         let blur = Blur::new(self.blur_px, self.motion);
         let wide_px = self.blur_px.hypot(SHARPENING_PX);
-        let is_linear =
-            self.response == CameraResponse::LINEAR && scene.extras != Extras::Response;
+        let is_linear = self.response == CameraResponse::LINEAR && scene.extras != Extras::Response;
         let wide = (!is_linear).then(|| Blur::new(wide_px, self.motion));
         let ratio = self.blur_px / wide_px;
         let ratio_by_blur = (1.0 - ratio * ratio) / wide_px;
@@ -80,7 +79,7 @@ impl RingModel {
                         let blurred = RadiusDistribution::about(&sample.ray, &plane, wide);
                         let blurred = blurred.response(scene);
                         let shown =
-                            response.processed(self.response, &blurred, ratio, ratio_by_blur);
+                            response.processed(&self.response, &blurred, ratio, ratio_by_blur);
                         visit(sample, &shown);
                     }
                 }
