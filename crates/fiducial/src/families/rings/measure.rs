@@ -372,7 +372,8 @@ fn is_undisturbed(fit: &PhotometricFit) -> bool {
 }
 
 /// Whether a fit needs no camera's processing, or is so close with it that rings of other radii are not: a tone curve
-/// makes all dark rings narrower. Of a thousand processed markers the worst had 0.99 and 0.98.
+/// makes all dark rings narrower. Of 222 processed markers at all positions of the
+/// thesis the worst explained 0.995, with balances from 0.98 to 1.02.
 fn is_plain_or_close(fit: &PhotometricFit, min_r_squared: f64) -> bool {
     const BALANCE: std::ops::Range<f64> = 0.95..1.05;
     fit.response == CameraResponse::LINEAR
