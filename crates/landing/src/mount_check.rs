@@ -289,10 +289,10 @@ impl MountCheck {
 
     /// Begins with another place of the pad, and keeps what is known of the camera.
     fn place_anew(&mut self, measurement: &Measurement) {
-        for i in Q..TILT {
+        for (i, unknown) in UNKNOWN.iter().enumerate().take(TILT) {
             self.covariance.row_mut(i).fill(0.0);
             self.covariance.column_mut(i).fill(0.0);
-            self.covariance[(i, i)] = UNKNOWN[i] * UNKNOWN[i];
+            self.covariance[(i, i)] = unknown * unknown;
             self.mean[i] = 0.0;
         }
         self.mean.fixed_rows_mut::<2>(Q).copy_from(&measurement.position.xy());
