@@ -6,7 +6,7 @@
 //! controller die. So it is set for the landing and put back afterwards; after a crash by the controller that is
 //! started next, from a [`Note`].
 
-use autopilot::{Autopilot, Firmware, Parameter};
+use autopilot::{Autopilot, Firmware, LandedState, Parameter};
 use landing::AutopilotLimits;
 use serde::{Deserialize, Serialize};
 
@@ -24,8 +24,9 @@ const COM_OF_LOSS_T: &str = "COM_OF_LOSS_T";
 const SAME_S: f64 = 1e-3;
 /// Longest timeout that is put back from a note: PX4 takes up to 60 s, ArduPilot 5 s.
 const MAX_ORIGINAL_S: f64 = 60.0;
-/// Time for which no landing was active before the timeout of an armed vehicle is put back, in nanoseconds: a
-/// controller that is started again needs as long to see that it has one to resume.
+/// Time for which no landing was active before the timeout of a vehicle is put back that does not stand on the ground
+/// with its motors off, in nanoseconds: a controller that is started again needs as long to see that it has one to
+/// resume, and a vehicle that flies on with the last setpoint must have stopped.
 const QUIET_NS: i64 = 2_000_000_000;
 
 /// A parameter and the factor to SI units.
@@ -118,8 +119,11 @@ impl Limits {
             } else {
                 self.is_refused = false;
                 let since_ns = *self.active_ns.get_or_insert(now_ns);
-                let is_disarmed = autopilot.state().is_some_and(|state| !state.armed);
-                if is_disarmed || now_ns.saturating_sub(since_ns) >= QUIET_NS {
+                // Motors that are said to be off in the air may run: then it still flies our last setpoint.
+                let is_down = autopilot
+                    .state()
+                    .is_some_and(|state| !state.armed && state.landed == LandedState::OnGround);
+                if is_down || now_ns.saturating_sub(since_ns) >= QUIET_NS {
                     self.restore(autopilot);
                 }
             }
