@@ -5,8 +5,10 @@
 //!
 //! Modules in reading order: [`scene`] has what is rendered and the camera, [`render`] renders it,
 //! [`occluder`] has effects between scene and sensor, [`processing`] what a camera makes of the light on its
-//! sensor, [`ground`] the textures around the pads, [`views`] the frames of the thesis' experiment.
+//! sensor, [`ground`] the textures around the pads, [`views`] the frames of the thesis' experiment; `error` says why
+//! something cannot be drawn.
 
+mod error;
 pub mod ground;
 pub mod occluder;
 pub mod processing;
@@ -14,8 +16,9 @@ pub mod render;
 pub mod scene;
 pub mod views;
 
+pub use error::RenderError;
 pub use ground::Surface;
 pub use occluder::Occluder;
 pub use processing::{Preset, Processing};
 pub use render::Renderer;
-pub use scene::{CameraSettings, PadInScene, RenderError, Scene};
+pub use scene::{CameraSettings, PadInScene, Scene};

@@ -17,7 +17,7 @@ mod tone;
 
 use serde::{Deserialize, Serialize};
 
-use crate::scene::RenderError;
+use crate::error::RenderError;
 
 pub(crate) use develop::Developer;
 pub use lens::{Lens, Unsteady};

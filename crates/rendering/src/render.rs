@@ -22,9 +22,10 @@ use std::sync::Arc;
 
 use geometry::{Body, Marker as MarkerFrame, Ned, Transform};
 
+use crate::error::RenderError;
 use crate::ground::Ground;
 use crate::processing::{Developer, Processing};
-use crate::scene::{CameraSettings, RenderError, Scene};
+use crate::scene::{CameraSettings, Scene};
 use band::{Band, TileState};
 use exposure::{Exposure, MAX_INSTANTS, between};
 use ground_row::GroundRow;

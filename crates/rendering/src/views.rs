@@ -4,9 +4,10 @@
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 
+use crate::error::RenderError;
 use crate::ground::Surface;
 use crate::render::Renderer;
-use crate::scene::{CameraSettings, PadInScene, RenderError, Scene};
+use crate::scene::{CameraSettings, PadInScene, Scene};
 use geometry::{Body, Camera, CameraModel, Marker, Ned, Pixel, Rotation, Transform, Vector};
 
 /// Outer diameter of the thesis' marker, in metres.

@@ -9,7 +9,7 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 use super::filters::{self, Gaussian};
 use super::tone::{Table, ToneCurve};
 use super::{Denoise, Processing, Sharpen, local, mosaic};
-use crate::scene::RenderError;
+use crate::error::RenderError;
 
 /// A camera's processing with its tables and buffers.
 #[derive(Debug)]

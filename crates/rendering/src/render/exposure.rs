@@ -2,7 +2,7 @@
 
 use geometry::{Body, Camera, CameraModel, Ned, Pixel, Point, Transform};
 
-use crate::scene::RenderError;
+use crate::error::RenderError;
 
 /// The camera's poses during one exposure.
 #[derive(Debug)]

@@ -6,7 +6,8 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::painting::{Area, BARE, Coat, Paint, Painting};
-use crate::scene::{PAPER, PadInScene, RenderError, Scene};
+use crate::error::RenderError;
+use crate::scene::{PAPER, PadInScene, Scene};
 
 /// Reflectance of printer's ink.
 const BLACK: f32 = 0.05;
