@@ -16,7 +16,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use testing::ports;
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME};
+use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, with_second_try};
 
 /// Longest time until a process that goes on takes its part again.
 const BACK: Duration = Duration::from_secs(2);
@@ -46,14 +46,7 @@ async fn frames_are_used(landing: &Landing, since_ns: i64) -> anyhow::Result<()>
 #[tokio::test(flavor = "multi_thread")]
 async fn whatever_is_frozen_takes_its_part_again_and_it_lands() -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
-    // A busy machine gets a second try.
-    match each_process_is_frozen().await {
-        Ok(()) => Ok(()),
-        Err(problem) => {
-            println!("once more: {problem:#}");
-            each_process_is_frozen().await
-        }
-    }
+    with_second_try(each_process_is_frozen).await
 }
 
 async fn each_process_is_frozen() -> anyhow::Result<()> {
@@ -154,10 +147,10 @@ async fn reaches(from: &Node, by: &Node) -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_frozen_relay_relays_again() -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
-    a_relay_is_frozen(&RELAY_FREEZES_S).await
+    with_second_try(a_relay_is_frozen).await
 }
 
-async fn a_relay_is_frozen(durations_s: &[f64]) -> anyhow::Result<()> {
+async fn a_relay_is_frozen() -> anyhow::Result<()> {
     let ([meet], air, _) = ports::free()?;
     let (meet_text, air) = (meet.to_string(), format!("127.0.0.1:{air}"));
     let open = async |role: &str, service: &'static str, name: &str| -> anyhow::Result<Node> {
@@ -175,7 +168,7 @@ async fn a_relay_is_frozen(durations_s: &[f64]) -> anyhow::Result<()> {
     let relay =
         Running::start(&["relay", "--zenoh", "drone", "--listen", &air, "--meet", &meet_text])?;
     let ground = open("ground", "detector", "ground").await?;
-    for seconds in durations_s.iter().copied() {
+    for seconds in RELAY_FREEZES_S {
         for node in [&first, &second] {
             reaches(node, &ground).await?;
             reaches(&ground, node).await?;

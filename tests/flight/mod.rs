@@ -24,6 +24,19 @@ pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 /// Two landings at once would share the processor.
 pub(crate) static ONE_AT_A_TIME: Mutex<()> = Mutex::const_new(());
 
+/// Runs a test, and once more if it fails: a machine that is busy with something else may disturb what takes its time.
+pub(crate) async fn with_second_try<F: Future<Output = anyhow::Result<()>>>(
+    test: impl Fn() -> F,
+) -> anyhow::Result<()> {
+    match test().await {
+        Ok(()) => Ok(()),
+        Err(problem) => {
+            println!("once more: {problem:#}");
+            test().await
+        }
+    }
+}
+
 /// What a command that should end by itself says; one that goes on is ended.
 pub(crate) fn output_of(command: &mut Command) -> anyhow::Result<Output> {
     let mut child =
