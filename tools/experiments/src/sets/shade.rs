@@ -1,6 +1,7 @@
 //! Light and cover as they are outdoors: edges of hard shadows of any contrast, dappled shade, leaves.
 
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 use geometry::Pixel;
 use markers::Marker;
@@ -38,12 +39,7 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     for _ in 0..FRAMES {
         let (spec, mut rng) = large(draw, marker, frames.len());
         let size_px = spec.size_px();
-        let suns = (0..rng.random_range(6..16))
-            .map(|_| Disc {
-                centre: on_marker(&spec, &mut rng, 0.8),
-                radius_px: (size_px * rng.random_range(0.08..0.3)) as f32,
-            })
-            .collect();
+        let suns = discs(&spec, &mut rng, 6..16, 0.8, 0.08..0.3);
         let occluder = Occluder::Dapple {
             suns,
             // Suns seen through leaves are discs of half a degree: soft over the height of the tree.
@@ -54,14 +50,8 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     }
     for _ in 0..FRAMES {
         let (spec, mut rng) = large(draw, marker, frames.len());
-        let size_px = spec.size_px();
         // Together at most a quarter of the marker.
-        let leaves = (0..rng.random_range(2..6))
-            .map(|_| Disc {
-                centre: on_marker(&spec, &mut rng, 0.6),
-                radius_px: (size_px * rng.random_range(0.04..0.12)) as f32,
-            })
-            .collect();
+        let leaves = discs(&spec, &mut rng, 2..6, 0.6, 0.04..0.12);
         let level = [25.0, 60.0, 110.0][frames.len() % 3];
         frames.push(spec.with("leaves", Occluder::Leaves { leaves, level }));
     }
@@ -77,4 +67,20 @@ fn on_marker(spec: &FrameSpec, rng: &mut ChaCha8Rng, reach: f64) -> Pixel {
     let by_px = reach * spec.size_px();
     let centre = spec.ground_truth().map_or(Pixel::new(0.0, 0.0), |shown| shown.centre);
     near(rng, centre, by_px)
+}
+
+/// Discs at random pixels on or near the marker, with radii in its sizes.
+fn discs(
+    spec: &FrameSpec,
+    rng: &mut ChaCha8Rng,
+    count: Range<i32>,
+    reach: f64,
+    radius: Range<f64>,
+) -> Vec<Disc> {
+    (0..rng.random_range(count))
+        .map(|_| Disc {
+            centre: on_marker(spec, rng, reach),
+            radius_px: (spec.size_px() * rng.random_range(radius.clone())) as f32,
+        })
+        .collect()
 }
