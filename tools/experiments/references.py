@@ -43,7 +43,8 @@ except ImportError:
 cv2.setNumThreads(1)
 
 SETS = [
-    "textured", "adverse", "landing", "far", "tilt", "blur", "noise", "light", "rolling", "tracking", "negatives", "positions",
+    "textured", "adverse", "landing", "far", "tilt", "blur", "noise", "light", "rolling", "cut", "tracking", "negatives", "circles",
+    "positions",
 ]  # fmt: skip
 # Families of the labelled photographs, as the labels name them.
 LABELS = {
@@ -329,7 +330,7 @@ def main():
     for name in wanted["set"] or (SETS if not wanted["photographs"] else []):
         folders = sorted(folder for folder in (sets / name).glob("*/") if (folder / "truth.jsonl").is_file())
         families = {folder.name: folder for folder in folders}
-        if name == "negatives":
+        if name in ("negatives", "circles"):
             kinds = ("rings", "apriltag-16h5", "aruco-4x4-50", "stag-hd23", "apriltag-36h11")
             families = {family: sets / name for family in kinds}
         for family, folder in families.items():

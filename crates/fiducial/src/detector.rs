@@ -38,6 +38,8 @@ pub struct Detector {
     /// The fallback passes of these families, in the order in which they take turns, and the number of turns.
     passes: Vec<FallbackPass>,
     turns: usize,
+    /// Where markers that are followed should be in the next image.
+    followed: Vec<Prediction>,
 }
 
 impl Detector {
@@ -68,6 +70,7 @@ impl Detector {
             found: Vec::new(),
             trace: Trace::default(),
             turns: 0,
+            followed: Vec::new(),
         })
     }
 
@@ -102,6 +105,19 @@ impl Detector {
         self.detect_with(view, camera, schedule, stages)
     }
 
+    /// Tells where markers that are followed should be in the next image: there a part of one is enough.
+    pub(crate) fn follow(&mut self, markers: impl Iterator<Item = Prediction>) {
+        const MAX_FOLLOWED: usize = 16;
+        self.followed.clear();
+        self.followed.reserve(MAX_FOLLOWED);
+        self.followed.extend(markers.take(MAX_FOLLOWED));
+    }
+
+    /// Ends what [`Detector::follow`] began: images that come next are searched as single ones.
+    pub(crate) fn follow_none(&mut self) {
+        self.followed.clear();
+    }
+
     /// As [`Detector::detect`], with some of the fallback passes.
     pub fn detect_with(
         &mut self,
@@ -113,12 +129,13 @@ impl Detector {
         self.found.clear();
         self.trace.clear();
         self.make_room(view);
-        let Self { families, evidence, found, trace, .. } = self;
+        let Self { families, evidence, found, trace, followed, .. } = self;
+        let followed = followed.as_slice();
         let stages: &mut dyn StageObserver = stages;
         evidence.find(view, &self.needs, trace, stages);
         let mut out = Output { found, trace, stages };
         for family in families.iter_mut() {
-            family.detect(FrameInput { view, camera, evidence, schedule }, &mut out);
+            family.detect(FrameInput { view, camera, evidence, schedule, followed }, &mut out);
         }
         evidence.begin_fallbacks(schedule);
         for step in FallbackStep::ALL.into_iter().filter(|step| schedule.allows_step(*step)) {
@@ -133,7 +150,8 @@ impl Detector {
                 if !std::mem::replace(&mut is_prepared, true) {
                     evidence.prepare(view, step, schedule, out.stages);
                 }
-                family.fallback(step, FrameInput { view, camera, evidence, schedule }, &mut out);
+                let input = FrameInput { view, camera, evidence, schedule, followed };
+                family.fallback(step, input, &mut out);
             }
             if let Some(stage) = step.stage().filter(|_| is_prepared) {
                 out.stages.ended(stage);
@@ -163,7 +181,8 @@ impl Detector {
         }
         let schedule = PassSchedule::NONE;
         let seen = families.iter_mut().find_map(|family| {
-            family.detect_at(FrameInput { view, camera, evidence, schedule }, at)
+            let followed = std::slice::from_ref(at);
+            family.detect_at(FrameInput { view, camera, evidence, schedule, followed }, at)
         })?;
         self.trace.markers.push(TracedMarker::from(&seen));
         stages.ended("following");

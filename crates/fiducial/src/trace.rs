@@ -48,7 +48,8 @@ pub enum Reason {
     Orientation,
     /// The ratio of two ellipses' axes is not that of a ring (Algorithm 5).
     Type,
-    /// The area between two ellipses is not black (Algorithm 6), or the area around them is not white.
+    /// The area between two ellipses is not black (Algorithm 6), or the area around them or
+    /// within not white.
     Blackness,
     /// No circle or square in space has this projection.
     Pose,

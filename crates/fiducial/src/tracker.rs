@@ -143,6 +143,7 @@ impl Tracker {
         self.found.clear();
         self.trace.clear();
         self.begin([view.width(), view.height()], time_s);
+        detector.follow(self.tracks.iter().filter_map(|track| track.circles(time_s)));
         if self.choose_regions(time_s) {
             for index in 0..self.regions.len() {
                 if let Some(region) = self.regions.get(index).copied() {
@@ -167,6 +168,7 @@ impl Tracker {
             self.trace.add_roi(detector.trace(), &whole);
             self.since_full = 0;
         }
+        detector.follow_none();
         self.update_tracks(time_s);
         &self.found
     }
@@ -307,7 +309,13 @@ impl Track {
 
     /// Its prediction in a region whose first pixel is `origin`; `None` after a first observation.
     fn prediction(&self, time_s: f64, origin: Pixel) -> Option<Prediction> {
-        let shape = self.shape.plus(&self.change?, time_s - self.time_s);
+        self.change?;
+        self.expected(time_s, origin)
+    }
+
+    fn expected(&self, time_s: f64, origin: Pixel) -> Option<Prediction> {
+        let change = self.change.unwrap_or_default();
+        let shape = self.shape.plus(&change, time_s - self.time_s);
         let corner = |[x, y]: [f64; 2]| Pixel::new(x - origin.x, y - origin.y);
         let shape = if self.shape.has_corners {
             PredictedShape::Corners(shape.corners.map(corner))
@@ -318,6 +326,13 @@ impl Track {
             return None;
         };
         Some(Prediction { family: self.family, id: self.id, shape })
+    }
+
+    /// Its prediction if it is a marker of rings, whose shape does not depend on the region; after a first observation
+    /// that it stays.
+    fn circles(&self, time_s: f64) -> Option<Prediction> {
+        let has_circles = self.shape.has_circles;
+        has_circles.then(|| self.expected(time_s, Pixel::new(0.0, 0.0)))?
     }
 
     fn is_sound(&self) -> bool {

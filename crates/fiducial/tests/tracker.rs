@@ -71,6 +71,33 @@ fn a_marker_that_moves_jumps_and_vanishes_is_followed() {
     }
 }
 
+#[test]
+fn the_innermost_ring_alone_is_a_marker_only_where_one_is_followed() {
+    let camera = CameraModel::pinhole(648, 486, 909.0);
+    let marker = format!("rings:{SIZE_M}").parse().unwrap();
+    let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+    let mut whole = Detector::new(&[marker], Settings::default()).unwrap();
+    let mut tracker = Tracker::default();
+    let mut alone = 0;
+    for i in 0..15_u32 {
+        // Down to where the next ring is out of sight.
+        let range_m = 0.19 - 0.01 * f64::from(i);
+        let mut scene = Scene::new(camera, [0.001, -0.002, range_m], 0.05, 0.3);
+        scene.seed = u64::from(i) + 1;
+        let image = scene.render();
+        let view = image.view().unwrap();
+        let time_s = f64::from(i) / 15.0;
+        let found = tracker.detect(&mut detector, view, Some(&camera), time_s, &mut ()).to_vec();
+        assert_eq!(found.len(), 1, "{range_m}");
+        assert!(found[0].centre.distance(&scene.centre()) < 0.5, "{range_m}");
+        if whole.detect(view, Some(&camera), &mut ()).is_empty() {
+            alone += 1;
+        }
+    }
+    // In a single image it may be any circle.
+    assert!(alone >= 2, "{alone}");
+}
+
 /// Keeps the names of the slow passes' stages.
 #[derive(Default)]
 struct SlowPasses(Vec<&'static str>);

@@ -170,7 +170,7 @@ fn append_summary(text: &mut String, runs: &[Run]) {
     );
     let _ = writeln!(
         text,
-        "| set | marker | detector | found | wrong ids | elsewhere | centre px median | p95 | worst | corner px | range % median | p95 | bias % | centre chi2 | range chi2 | ms | p95 |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+        "| set | marker | detector | found | wrong ids | elsewhere | centre px median | p95 | worst | corner px | range % median | p95 | bias % | centre chi2 | range chi2 | worst sigmas, centre | range | ms | p95 |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
     );
     for run in runs {
         let s = Score::new(&run.answers).summary();
@@ -181,7 +181,7 @@ fn append_summary(text: &mut String, runs: &[Run]) {
         };
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {found} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+            "| {} | {} | {} | {found} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
             run.set.name(),
             run.family,
             run.detector,
@@ -196,6 +196,8 @@ fn append_summary(text: &mut String, runs: &[Run]) {
             number(s.range_bias_percent, 4),
             number(s.centre_chi2, 2),
             number(s.range_chi2, 2),
+            number(s.centre_worst_sigmas, 1),
+            number(s.range_worst_sigmas, 1),
             number(s.ms, 2),
             number(s.ms_p95, 2),
         );
@@ -273,6 +275,7 @@ fn append_groups(text: &mut String, runs: &[Run]) {
     let with_groups = [
         Set::Adverse,
         Set::Shade,
+        Set::Cut,
         Set::Landing,
         Set::Tilt,
         Set::Blur,

@@ -130,6 +130,8 @@ impl Score {
             range_bias_percent: mean(&self.range_ratio).map(|part| 100.0 * part),
             range_bias_mm: mean(&self.range_m).map(|m| 1e3 * m),
             centre_chi2: quantile(&self.centre_chi2, 0.5),
+            centre_worst_sigmas: quantile(&self.centre_chi2, 1.0).map(f64::sqrt),
+            range_worst_sigmas: quantile(&self.range_chi2, 1.0).map(f64::sqrt),
             range_chi2: quantile(&self.range_chi2, 0.5),
             ms: quantile(&self.ms, 0.5),
             ms_p95: quantile(&self.ms, 0.95),
@@ -166,6 +168,10 @@ pub struct Summary {
     pub range_bias_mm: Option<f64>,
     /// Median normalised squared centre error: 1.39 for a consistent covariance.
     pub centre_chi2: Option<f64>,
+    /// Largest centre error over its standard deviation.
+    pub centre_worst_sigmas: Option<f64>,
+    /// Largest range error over its standard deviation.
+    pub range_worst_sigmas: Option<f64>,
     /// Median normalised squared range error: 0.45 for a consistent variance.
     pub range_chi2: Option<f64>,
     /// Median processor time in milliseconds.

@@ -30,17 +30,21 @@ pub enum Set {
     Rolling,
     /// Edges of hard shadows with contrasts from 2 to 10, dappled shade, leaves.
     Shade,
+    /// Cut off by the frame at 0.5 to 1.5 m, tilted as by wind: 200 frames.
+    Cut,
     /// Textured grounds, for timing.
     Textured,
     /// A marker 48 px wide that drifts through the image.
     Tracking,
     /// Scenes without a marker.
     Negatives,
+    /// Circles that people make, without a marker: manholes, washers, wheels, targets, other people's markers.
+    Circles,
 }
 
 impl Set {
     /// Every set, in the order in which they are rendered.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 15] = [
         Self::Textured,
         Self::Adverse,
         Self::Landing,
@@ -51,8 +55,10 @@ impl Set {
         Self::Light,
         Self::Rolling,
         Self::Shade,
+        Self::Cut,
         Self::Tracking,
         Self::Negatives,
+        Self::Circles,
         Self::Positions,
     ];
 
@@ -69,15 +75,17 @@ impl Set {
             Self::Light => "light",
             Self::Rolling => "rolling",
             Self::Shade => "shade",
+            Self::Cut => "cut",
             Self::Textured => "textured",
             Self::Tracking => "tracking",
             Self::Negatives => "negatives",
+            Self::Circles => "circles",
         }
     }
 
     /// Whether its frames show the marker.
     pub fn has_marker(self) -> bool {
-        self != Self::Negatives
+        !matches!(self, Self::Negatives | Self::Circles)
     }
 }
 

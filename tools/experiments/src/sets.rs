@@ -4,7 +4,9 @@
 //! comparable.
 
 mod adverse;
+mod circles;
 mod clutter;
+mod cut;
 mod scene;
 mod shade;
 mod sweeps;
@@ -63,16 +65,21 @@ pub fn frames_of(set: Set, marker: Marker, variant: Variant) -> Vec<FrameSpec> {
         Set::Light => sweeps::light(draw, marker),
         Set::Rolling => sweeps::rolling(draw, marker),
         Set::Shade => shade::frames(draw, marker),
+        Set::Cut => cut::frames(draw, marker),
         Set::Textured => views::textured(draw, marker),
         Set::Tracking => views::tracking(draw, marker),
         Set::Negatives => clutter::frames(draw),
+        Set::Circles => circles::frames(draw),
     };
     let processing = variant.processing.processing();
     frames
         .into_iter()
         .step_by(variant.every.max(1))
         .map(|mut spec| {
-            spec.settings.processing = processing;
+            // Those of the circles are of all cameras.
+            if set != Set::Circles || variant.processing != Preset::Linear {
+                spec.settings.processing = processing;
+            }
             // A camera has one mosaic.
             spec.bayer &= !processing.mosaic;
             spec
@@ -100,8 +107,10 @@ mod tests {
             ("light", 54),
             ("rolling", 48),
             ("shade", 120),
+            ("cut", cut::FRAMES),
             ("tracking", 30),
             ("negatives", 520),
+            ("circles", circles::SCENES),
             ("positions", 37 * 2 * 5),
         ];
         assert_eq!(counts, expected);
@@ -140,10 +149,23 @@ mod tests {
 
     #[test]
     fn negatives_have_clutter_and_no_marker() {
-        assert!(
-            frames(Set::Negatives, "rings:0.1".parse().unwrap())
-                .iter()
-                .all(|frame| frame.marker.is_none() && !frame.clutter.is_empty())
-        );
+        for set in [Set::Negatives, Set::Circles] {
+            let frames = frames(set, "rings:0.1".parse().unwrap());
+            assert!(
+                frames.iter().all(|frame| frame.marker.is_none() && !frame.clutter.is_empty()),
+                "{}",
+                set.name()
+            );
+        }
+    }
+
+    #[test]
+    fn cut_markers_have_a_corner_beyond_the_frame_and_their_centre_within() {
+        let frames = frames(Set::Cut, "aruco-4x4-50:0:0.15341".parse().unwrap());
+        let is_within = |spec: &&FrameSpec| {
+            spec.ground_truth().is_some_and(|truth| spec.settings.model.contains(truth.centre))
+        };
+        assert!(frames.iter().all(|spec| !spec.is_whole()));
+        assert_eq!(frames.iter().filter(is_within).count(), frames.len());
     }
 }

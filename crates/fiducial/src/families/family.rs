@@ -54,6 +54,8 @@ pub(crate) struct FrameInput<'a> {
     pub(crate) evidence: &'a mut Evidence,
     /// The fallback passes that may run in this image.
     pub(crate) schedule: PassSchedule,
+    /// Where markers that are followed should be; none in a single image.
+    pub(crate) followed: &'a [Prediction],
 }
 
 /// Where detections go.

@@ -19,6 +19,12 @@ const SEGMENT_CORNER_RATIO: f64 = 0.015;
 /// Corners are no square in space when their mean squared reprojection error is this multiple of their mean variance.
 const MIN_MISFIT: f64 = 9.0;
 
+/// Largest reprojection error of a square as a share of its diagonal; bent paper and rolling shutters stay below.
+const MAX_MISFIT_RATIO: f64 = 0.02;
+/// Largest standard deviation of the centre, in pixels, of a marker that the frame cuts: where its edges do not agree on a
+/// place, a corner is a guess that may be off by any distance.
+const MAX_CUT_PX: f64 = 0.25;
+
 /// An image in which markers are looked for.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct ImageInput<'a> {
@@ -97,15 +103,17 @@ impl FamilyQuery {
         all && self.ids().any(|id| found.clone().all(|known| known != id))
     }
 
-    /// The observation of a marker of the family.
+    /// The observation of a marker of the family; `None` of one that is no square in space, or that the frame
+    /// cuts so that its place is a guess.
     pub(crate) fn observation(
         &self,
         id: u32,
         hamming: u8,
         confidence: f64,
         refined: &Refined,
-        camera: Option<&CameraModel>,
-    ) -> Observation {
+        input: ImageInput<'_>,
+    ) -> Option<Observation> {
+        let ImageInput { view, camera, .. } = input;
         let corners = refined.corners;
         let named = self.markers.iter().find(|marker| marker.id == Some(id));
         let marker = named.or_else(|| self.markers.iter().find(|marker| marker.id.is_none()));
@@ -115,20 +123,34 @@ impl FamilyQuery {
         });
         // Corners that are no square in space, as where one was guessed beyond the frame: the centre is no better.
         let misfit_px2 = pose.map_or(0.0, |pose| pose.reprojection_rms_px.powi(2));
+        if misfit_px2 > (MAX_MISFIT_RATIO * diagonal_px(&corners)).powi(2) {
+            return None;
+        }
         let is_misfit = misfit_px2 > MIN_MISFIT * refined.covariance_px2.trace() / 8.0;
         let added_px2 = if is_misfit { misfit_px2 } else { 0.0 };
-        Observation {
+        let centre_covariance_px2 = refined.centre_covariance_px2 + Matrix2::identity() * added_px2;
+        if is_cut(&corners, view) && 0.5 * centre_covariance_px2.trace() > MAX_CUT_PX * MAX_CUT_PX {
+            return None;
+        }
+        Some(Observation {
             family: self.family,
             id: Some(id),
             centre: refined.centre,
-            centre_covariance_px2: refined.centre_covariance_px2 + Matrix2::identity() * added_px2,
+            centre_covariance_px2,
             corners: Some(corners),
             wrong_bits: hamming,
             size_px: diagonal_px(&corners),
             confidence,
             pose,
-        }
+        })
     }
+}
+
+/// Whether a corner is at the border of the image, where an outline that the frame cuts has one, or beyond it.
+fn is_cut(corners: &[Pixel; 4], view: GrayView<'_>) -> bool {
+    const BORDER_PX: f64 = 3.0;
+    let inside = |at: f64, size: usize| at >= BORDER_PX && at <= size as f64 - 1.0 - BORDER_PX;
+    !corners.iter().all(|c| inside(c.x, view.width()) && inside(c.y, view.height()))
 }
 
 /// Standard deviation of corners made of segments, in pixels.

@@ -8,6 +8,7 @@
 //! one (`measure`).
 
 pub(crate) mod circle_pose;
+mod dot;
 mod edges;
 mod focal_guess;
 mod measure;
@@ -130,6 +131,8 @@ struct Evaluation<'a> {
     /// The camera, if it is known, and the one to compute with.
     known_camera: Option<&'a CameraModel>,
     camera: &'a CameraModel,
+    /// Where markers that are followed should be.
+    followed: &'a [Prediction],
 }
 
 impl RingDetector {
@@ -160,7 +163,7 @@ impl RingDetector {
 
     /// Runs one pass, and adds the markers it finds to those from the index `self.first` on.
     fn run(&mut self, pass: &RingPass, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, schedule } = input;
+        let FrameInput { view, camera, evidence, schedule, followed } = input;
         let has_outlines = evidence.has_outlines;
         let outlines = &mut evidence.outlines;
         if let RingPass::Ellipses(levels) = pass
@@ -179,6 +182,7 @@ impl RingDetector {
             marker: &marker,
             known_camera: camera,
             camera: camera.unwrap_or(&nominal),
+            followed,
         };
         let coarse = schedule.allows(FallbackPass::Arcs).then_some(outlines.pyramid());
         self.evaluate_candidates(&evaluation, coarse, out.trace, out.found, self.first);
@@ -266,7 +270,8 @@ impl RingDetector {
                 Err(Reason::Repeated)
             } else {
                 let outcome = evaluation.evaluate(&candidate, &mut self.buffers);
-                match coarse.filter(|_| outcome.is_err() && found.len() == first) {
+                let is_open = matches!(outcome, Err(reason) if reason != Reason::Blackness);
+                match coarse.filter(|_| is_open && found.len() == first) {
                     Some(pyramid) => {
                         self.detect_coarse(evaluation, pyramid, &candidate).or(outcome)
                     }
@@ -337,10 +342,11 @@ impl FamilyDetector for RingDetector {
     }
 
     fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, schedule } = input;
+        let FrameInput { view, camera, evidence, schedule, followed } = input;
         self.first = out.found.len();
         for pass in &PASSES {
-            let input = FrameInput { view, camera, evidence: &mut *evidence, schedule };
+            let evidence = &mut *evidence;
+            let input = FrameInput { view, camera, evidence, schedule, followed };
             self.run(pass, input, out);
             if out.found.len() > self.first && !self.thorough {
                 break;
@@ -349,17 +355,19 @@ impl FamilyDetector for RingDetector {
     }
 
     fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
-        let FrameInput { view, camera, .. } = input;
+        let FrameInput { view, camera, followed, .. } = input;
         let PredictedShape::Circles(pose) = at.shape else { return None };
         let (camera, size_m) = (camera?, self.marker.size_m?);
         if !self.marker.includes(at.family, at.id) {
             return None;
         }
         let min_contrast = MIN_TRACKED_CONTRAST;
-        let search = EdgeSearch { view, camera, size_m, min_contrast, white_on_black: false };
+        let search =
+            EdgeSearch { view, camera, size_m, min_contrast, white_on_black: false, followed };
         let measured = search.measure_tracked(&pose, &mut self.buffers)?;
         let marker = self.marker;
-        let evaluation = Evaluation { view, marker: &marker, known_camera: Some(camera), camera };
+        let evaluation =
+            Evaluation { view, marker: &marker, known_camera: Some(camera), camera, followed };
         evaluation.observation(&measured, measured.pose, camera).ok()
     }
 
@@ -385,8 +393,12 @@ impl Evaluation<'_> {
             size_m: self.marker.size_m.unwrap_or(1.0),
             min_contrast: 0.35 * candidate.contrast,
             white_on_black: candidate.white_on_black,
+            followed: self.followed,
         };
         let measured = search.measure(candidate, buffers)?;
+        if search.is_target(&measured.pose) && !search.is_followed(&measured.pose) {
+            return Err(Reason::Blackness);
+        }
         let guessed = match self.known_camera {
             Some(_) => None,
             None => guess_focal_length(&measured.pose, self.camera, &mut buffers.edges),

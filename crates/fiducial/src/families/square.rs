@@ -204,7 +204,7 @@ impl SquareTagDetector {
         let found = found.filter(|found| (found.id, found.rotation) == (expected.id, 0))?;
         let decoded = self.check(&quad, index, 0, found).ok()?;
         let refined = decoded.refined(query, input, true, &mut self.scratch)?;
-        Some(decoded.observation(query, refined, input))
+        decoded.observation(query, refined, input)
     }
 
     /// Finds partly hidden markers among quads of segments, after [`SquareTagDetector::detect_whole`] and
@@ -264,12 +264,22 @@ impl SquareTagDetector {
     /// Adds the observations of what was decoded from the index `from` on, the most confident first.
     fn observe_all(&mut self, input: ImageInput<'_>, from: usize, found: &mut Vec<Observation>) {
         let first = found.len();
-        for marker in self.found.iter().skip(from) {
-            let Some(query) = self.queries.get(marker.query) else { continue };
+        let mut index = from;
+        while let Some(marker) = self.found.get(index) {
+            let Some(query) = self.queries.get(marker.query) else { break };
             let refined = marker.refined(query, input, false, &mut self.scratch);
             let refined =
                 refined.unwrap_or_else(|| Refined::unrefined(&marker.corners, marker.corner_px));
-            found.push(marker.observation(query, refined, input));
+            match marker.observation(query, refined, input) {
+                Some(seen) => {
+                    found.push(seen);
+                    index += 1;
+                }
+                // A fallback may find more of it.
+                None => {
+                    self.found.swap_remove(index);
+                }
+            }
         }
         found[first..].sort_unstable_by(|a, b| b.confidence.total_cmp(&a.confidence));
     }
@@ -541,11 +551,11 @@ impl Decoded {
         query: &SquareQuery,
         mut refined: Refined,
         input: ImageInput<'_>,
-    ) -> Observation {
+    ) -> Option<Observation> {
         if self.is_washed_out {
             refined.add_uncertainty(self.corner_px);
         }
         let confidence = confidence(self.r_squared, self.decision_margin);
-        query.query.observation(self.id, self.hamming, confidence, &refined, input.camera)
+        query.query.observation(self.id, self.hamming, confidence, &refined, input)
     }
 }

@@ -225,7 +225,9 @@ impl StagDetector {
         let (reading, refined) = self.read(input, &quad).ok()?;
         let family = self.queries.get(reading.query)?.query.family;
         let is_expected = (family, reading.id) == (expected.family, expected.id);
-        (is_expected && reading.rotation == 0).then(|| self.observation(&reading, &refined, input))
+        (is_expected && reading.rotation == 0)
+            .then(|| self.observation(&reading, &refined, input))
+            .flatten()
     }
 
     /// Finds small markers by their quiet zone.
@@ -260,8 +262,10 @@ impl StagDetector {
         });
         for OccludedMarker { quad, reading, .. } in markers {
             let refined = self.refined_occluded(input, quad, reading);
-            out.trace.accept_quad(refined.corners);
-            out.found.push(self.observation(reading, &refined, input));
+            if let Some(seen) = self.observation(reading, &refined, input) {
+                out.trace.accept_quad(refined.corners);
+                out.found.push(seen);
+            }
         }
         self.occluded = occluded;
     }
@@ -278,9 +282,10 @@ impl StagDetector {
         out: &mut Output<'_>,
     ) -> Result<(), Reason> {
         let (reading, refined) = self.read(input, quad)?;
+        let seen = self.observation(&reading, &refined, input).ok_or(Reason::Edges)?;
         out.trace.accept_quad(refined.corners);
         self.known.push(refined.corners);
-        out.found.push(self.observation(&reading, &refined, input));
+        out.found.push(seen);
         Ok(())
     }
 
@@ -424,11 +429,11 @@ impl StagDetector {
         reading: &Reading,
         refined: &Refined,
         input: ImageInput<'_>,
-    ) -> Observation {
+    ) -> Option<Observation> {
         let Reading { id, hamming, .. } = *reading;
         let confidence = reading.r_squared * (1.0 - 0.5 / reading.ratio);
         let query = &self.queries[reading.query].query;
-        query.observation(id, hamming, confidence, refined, input.camera)
+        query.observation(id, hamming, confidence, refined, input)
     }
 }
 

@@ -22,29 +22,44 @@ pub(super) fn pad(image: &[f32], width: usize, mirror: bool, padded: &mut Vec<f3
     }
 }
 
+/// The rows above, at and below row `v` of an image, of which `padded` has one pixel more on each side; `None` of a
+/// `padded` that is too small.
+pub(super) fn three_rows(padded: &[f32], width: usize, v: usize) -> Option<[&[f32]; 3]> {
+    let stride = width + 2;
+    let row = |i: usize| padded.get((v + i) * stride..(v + i + 1) * stride);
+    Some([row(0)?, row(1)?, row(2)?])
+}
+
+/// The pixels to the left of, at and to the right of those of a row with one pixel more on each side.
+pub(super) fn beside(row: &[f32]) -> [&[f32]; 3] {
+    let width = row.len().saturating_sub(2);
+    [0, 1, 2].map(|i| row.get(i..i + width).unwrap_or(&[]))
+}
+
 /// Calls `filter` with the 3 x 3 pixels about each pixel of an image, of which `padded` has one more on each
 /// side.
+#[inline]
 fn each_nine(
     padded: &[f32],
     width: usize,
     image: &mut [f32],
     filter: impl Fn([[f32; 3]; 3]) -> f32,
 ) {
-    let stride = width + 2;
-    for (v, row) in image.chunks_mut(width.max(1)).enumerate() {
-        let [above, own, below] = [0, 1, 2].map(|i| {
-            let from = (v + i) * stride;
-            padded.get(from..from + row.len() + 2).unwrap_or(&[])
-        });
-        if own.len() != row.len() + 2 || above.len() != own.len() || below.len() != own.len() {
+    for (v, row) in image.chunks_exact_mut(width.max(1)).enumerate() {
+        let Some(rows) = three_rows(padded, width, v) else { continue };
+        // All of one length, so that the loop below needs no test of its indices and takes several pixels at once.
+        let [[a, b, c], [d, e, f], [g, h, i]] = rows.map(beside);
+        let all = [a, b, c, d, e, f, g, h, i];
+        if all.iter().any(|part| part.len() != row.len()) {
             continue;
         }
-        for x in 0..row.len() {
-            row[x] = filter([
-                [above[x], above[x + 1], above[x + 2]],
-                [own[x], own[x + 1], own[x + 2]],
-                [below[x], below[x + 1], below[x + 2]],
-            ]);
+        let up = a.iter().zip(b).zip(c);
+        let own = d.iter().zip(e).zip(f);
+        let down = g.iter().zip(h).zip(i);
+        for (((pixel, ((a, b), c)), ((d, e), f)), ((g, h), i)) in
+            row.iter_mut().zip(up).zip(own).zip(down)
+        {
+            *pixel = filter([[*a, *b, *c], [*d, *e, *f], [*g, *h, *i]]);
         }
     }
 }
@@ -75,19 +90,19 @@ pub(super) fn bilateral(
     image: &mut [f32],
 ) {
     let beside = (-0.5 / (sigma_px * sigma_px)).exp();
+    let across = beside * beside;
     let scale = 1.0 / (range * range);
-    each_nine(padded, width, image, |rows| {
-        let middle = rows[1][1];
-        let (mut sum, mut total) = (0.0, 0.0);
-        for (row, down) in rows.iter().zip([beside, 1.0, beside]) {
-            for (value, across) in row.iter().zip([beside, 1.0, beside]) {
-                let off = value - middle;
-                let weight = down * across / (1.0 + off * off * scale);
-                sum += weight * value;
-                total += weight;
-            }
-        }
-        sum / total
+    each_nine(padded, width, image, |[[a, b, c], [d, middle, f], [g, h, i]]| {
+        let weight = |value: f32, near: f32| {
+            let off = value - middle;
+            near / (1.0 + off * off * scale)
+        };
+        let [wa, wb, wc] = [weight(a, across), weight(b, beside), weight(c, across)];
+        let [wd, wf] = [weight(d, beside), weight(f, beside)];
+        let [wg, wh, wi] = [weight(g, across), weight(h, beside), weight(i, across)];
+        let sum = (wa * a + wb * b + wc * c) + (wd * d + wf * f) + (wg * g + wh * h + wi * i);
+        let total = (wa + wb + wc) + (wd + wf) + (wg + wh + wi);
+        (middle + sum) / (1.0 + total)
     });
 }
 

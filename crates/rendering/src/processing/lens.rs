@@ -53,17 +53,20 @@ impl Lens {
         if self.curvature_px > 0.0 {
             Gaussian::new(self.curvature_px.max(0.3)).blur(light, width, work, blurred);
             let field = Field::new(light.len(), width);
+            let across: Vec<f32> =
+                (0..width).map(|u| field.part2([u as f32 - field.middle[0], 0.0])).collect();
             let rows = light.chunks_mut(width).zip(blurred.chunks(width)).enumerate();
             for (v, (row, soft)) in rows {
-                for (u, (level, soft)) in row.iter_mut().zip(soft).enumerate() {
+                let down = field.part2([0.0, v as f32 - field.middle[1]]);
+                for ((level, soft), across) in row.iter_mut().zip(soft).zip(&across) {
                     // A core and a skirt whose variance grows with the fourth power of the distance.
-                    let part = field.part2(u, v).powi(2).min(1.0);
-                    *level += part * (soft - *level);
+                    let part2 = across + down;
+                    *level += (part2 * part2).min(1.0) * (soft - *level);
                 }
             }
         }
         if self.flare > 0.0 {
-            let mean = light.iter().sum::<f32>() / light.len().max(1) as f32;
+            let mean = sum(light) / light.len().max(1) as f32;
             for level in light {
                 *level += self.flare * (mean - *level);
             }
@@ -72,17 +75,31 @@ impl Lens {
 
     /// Moves red and blue of an RGGB mosaic's light, of which `source` has all colours alike.
     pub(super) fn fringe(&self, source: &[f32], light: &mut [f32], width: usize) {
+        let width = width.max(1);
         let field = Field::new(light.len(), width);
-        let height = light.len() / width.max(1);
-        for (v, row) in light.chunks_mut(width.max(1)).enumerate() {
-            let outwards =
-                if v % 2 == 0 { -self.fringe_px * RED_OVER_BLUE } else { self.fringe_px };
-            for u in (v % 2..row.len()).step_by(2) {
-                let [x, y] = field.offset(u, v);
-                // What lies outwards in the image comes from nearer the middle.
-                let scale = -outwards / field.half_diagonal;
-                let place = [u as f32 + x * scale, v as f32 + y * scale];
-                row[u] = at(source, width, height, place);
+        let height = light.len() / width;
+        // Of red and of blue: what lies outwards in the image comes from nearer the middle, by a part of the distance
+        // that is the same everywhere. So each column and each row has its own taps.
+        let scales = [-self.fringe_px * RED_OVER_BLUE, self.fringe_px]
+            .map(|outwards| -outwards / field.half_diagonal);
+        let taps = |at: usize, middle: f32, scale: f32, edge: usize| {
+            Taps::new(at as f32 + (at as f32 - middle) * scale, edge)
+        };
+        let columns = [0, 1].map(|first| -> Vec<Taps> {
+            let own = (first..width).step_by(2);
+            own.map(|u| taps(u, field.middle[0], scales[first], width)).collect()
+        });
+        let mut line = vec![0.0; width];
+        for (v, row) in light.chunks_exact_mut(width).enumerate() {
+            let Taps { places, weights } = taps(v, field.middle[1], scales[v % 2], height);
+            line.fill(0.0);
+            for (place, weight) in places.into_iter().zip(weights) {
+                let from = source.get(place * width..(place + 1) * width).unwrap_or(&[]);
+                line.iter_mut().zip(from).for_each(|(sum, level)| *sum += weight * level);
+            }
+            let own = row.iter_mut().skip(v % 2).step_by(2);
+            for (level, taps) in own.zip(&columns[v % 2]) {
+                *level = taps.of(&line);
             }
         }
     }
@@ -120,42 +137,52 @@ impl Field {
         Self { middle, half_diagonal: middle[0].hypot(middle[1]).max(1.0) }
     }
 
-    fn offset(&self, u: usize, v: usize) -> [f32; 2] {
-        [u as f32 - self.middle[0], v as f32 - self.middle[1]]
-    }
-
-    /// The squared distance from the middle; 1 in the corners.
-    fn part2(&self, u: usize, v: usize) -> f32 {
-        let [x, y] = self.offset(u, v);
+    /// The squared length of an offset; 1 from the middle to a corner.
+    fn part2(&self, [x, y]: [f32; 2]) -> f32 {
         (x * x + y * y) / (self.half_diagonal * self.half_diagonal)
     }
 }
 
-/// An image between its pixels (Keys, "Cubic convolution interpolation for digital image processing", 1981).
-fn at(image: &[f32], width: usize, height: usize, place: [f32; 2]) -> f32 {
-    let split = |along: f32, edge: usize| {
+/// The pixels along a line that make the value between two of them, and their weights (Keys, "Cubic convolution
+/// interpolation for digital image processing", 1981). Beyond the ends the last ones count again.
+#[derive(Copy, Clone, Debug)]
+struct Taps {
+    places: [usize; 4],
+    weights: [f32; 4],
+}
+
+impl Taps {
+    fn new(along: f32, edge: usize) -> Self {
         let low = along.floor();
         let t = along - low;
-        let weights = [
-            ((-0.5 * t + 1.0) * t - 0.5) * t,
-            (1.5 * t - 2.5) * t * t + 1.0,
-            ((-1.5 * t + 2.0) * t + 0.5) * t,
-            (0.5 * t - 0.5) * t * t,
-        ];
         let last = edge.saturating_sub(1) as isize;
-        let taps = [-1, 0, 1, 2].map(|k| (low as isize + k).clamp(0, last) as usize);
-        (taps, weights)
-    };
-    let (columns, across) = split(place[0], width);
-    let (rows, down) = split(place[1], height);
-    let mut sum = 0.0;
-    for (v, weight) in rows.into_iter().zip(down) {
-        let row = image.get(v * width..(v + 1) * width).unwrap_or(&[]);
-        for (u, across) in columns.into_iter().zip(across) {
-            sum += weight * across * row.get(u).copied().unwrap_or(0.0);
+        Self {
+            places: [-1, 0, 1, 2].map(|k| (low as isize + k).clamp(0, last) as usize),
+            weights: [
+                ((-0.5 * t + 1.0) * t - 0.5) * t,
+                (1.5 * t - 2.5) * t * t + 1.0,
+                ((-1.5 * t + 2.0) * t + 0.5) * t,
+                (0.5 * t - 0.5) * t * t,
+            ],
         }
     }
-    sum
+
+    fn of(&self, line: &[f32]) -> f32 {
+        let value = |(place, weight): (&usize, &f32)| weight * line.get(*place).unwrap_or(&0.0);
+        self.places.iter().zip(&self.weights).map(value).sum()
+    }
+}
+
+/// The sum of an image, several pixels at once.
+fn sum(image: &[f32]) -> f32 {
+    const LANES: usize = 16;
+    let mut sums = [0.0f32; LANES];
+    let parts = image.chunks_exact(LANES);
+    let rest: f32 = parts.remainder().iter().sum();
+    for part in parts {
+        sums.iter_mut().zip(part).for_each(|(sum, level)| *sum += level);
+    }
+    sums.iter().sum::<f32>() + rest
 }
 
 #[cfg(test)]

@@ -1,5 +1,7 @@
 //! The colour filters of a sensor, and grey from what they let through.
 
+use super::filters::{beside, three_rows};
+
 /// Transmission of white light by the red, green and blue filters, before white balance.
 const FILTERS: [f32; 3] = [0.6, 1.0, 0.75];
 
@@ -17,31 +19,40 @@ fn colour(x: usize, y: usize) -> usize {
 
 /// The light of row `v` behind the filters.
 pub(crate) fn filter(v: usize, light: &mut [f32]) {
-    for (x, level) in light.iter_mut().enumerate() {
-        *level *= FILTERS[colour(x, v)];
+    let [even, odd] = [0, 1].map(|x| FILTERS[colour(x, v)]);
+    for pair in light.chunks_mut(2) {
+        for (level, transmission) in pair.iter_mut().zip([even, odd]) {
+            *level *= transmission;
+        }
     }
 }
 
 /// Balances a mosaic, of which `padded` has one pixel more on each side, and interpolates its grey
 /// bilinearly.
 pub(super) fn interpolate(padded: &[f32], width: usize, grey: &mut [f32]) {
-    let stride = width + 2;
-    for (v, row) in grey.chunks_mut(width.max(1)).enumerate() {
-        let rows = [0, 1, 2].map(|i| padded.get((v + i) * stride..).unwrap_or(&[]));
-        let [above, own, below] = rows;
-        let places = above.windows(3).zip(own.windows(3)).zip(below.windows(3));
-        for ((x, level), ((a, o), b)) in row.iter_mut().enumerate().zip(places) {
-            let at = colour(x, v);
-            let (sides, ends) = ((o[0] + o[2]) / 2.0, (a[1] + b[1]) / 2.0);
-            let cross = (sides + ends) / 2.0;
-            let diagonal = (a[0] + a[2] + b[0] + b[2]) / 4.0;
-            let colours = match at {
-                0 => [o[1], cross, diagonal],
-                2 => [diagonal, cross, o[1]],
-                _ if v % 2 == 0 => [sides, o[1], ends],
-                _ => [ends, o[1], sides],
-            };
-            *level = (0..3).map(|c| GREY[c] * (colours[c] / FILTERS[c]).min(255.0)).sum();
+    // A colour's light behind its white balance, with its weight in grey.
+    let part = |colour: usize| {
+        let balance = 1.0 / FILTERS[colour];
+        move |light: f32| GREY[colour] * (light * balance).min(255.0)
+    };
+    let green = part(1);
+    for (v, row) in grey.chunks_exact_mut(width.max(1)).enumerate() {
+        let Some(rows) = three_rows(padded, width, v) else { continue };
+        let [[a, b, c], [d, e, f], [g, h, i]] = rows.map(beside);
+        // Every other pixel of a row is red, or blue in odd rows; those between are green, with that colour beside them
+        // and the third one above and below.
+        let first = v % 2;
+        let (own, other) = if first == 0 { (part(0), part(2)) } else { (part(2), part(0)) };
+        let up = a.iter().zip(b).zip(c);
+        let level = d.iter().zip(e).zip(f);
+        let down = g.iter().zip(h).zip(i);
+        for (x, (((grey, ((a, b), c)), ((d, e), f)), ((g, h), i))) in
+            row.iter_mut().zip(up).zip(level).zip(down).enumerate()
+        {
+            let (sides, ends) = ((d + f) / 2.0, (b + h) / 2.0);
+            let coloured = own(*e) + green((sides + ends) / 2.0) + other((a + c + g + i) / 4.0);
+            let between = own(sides) + green(*e) + other(ends);
+            *grey = if x % 2 == first { coloured } else { between };
         }
     }
 }

@@ -79,14 +79,15 @@ impl Sensor {
 
     /// Like [`Sensor::expose`], in place, with the steps of a raw file: a sixteenth of a grey level.
     pub(super) fn expose_raw(&self, frame_index: u64, v: usize, light: &mut [f32]) {
-        const STEPS: f32 = 16.0;
+        // Numbers of this size are a sixteenth apart, so that adding it rounds.
+        const ROUNDING: f32 = 524_288.0;
         let row = self.row(frame_index, v);
         let stretches = light.chunks_mut(STRETCH).zip(self.column_loss.chunks(STRETCH)).enumerate();
         for (index, (light, loss)) in stretches {
             let (a, b) = self.pair(row.seed.wrapping_add(index as u64));
             for (((level, loss), a), b) in light.iter_mut().zip(loss).zip(a).zip(b) {
                 let exposed = self.noisy(*level * (row.gain - loss).max(0.0), a + b);
-                *level = (exposed.clamp(0.0, 255.0) * STEPS).round() / STEPS;
+                *level = (exposed.clamp(0.0, 255.0) + ROUNDING) - ROUNDING;
             }
         }
     }

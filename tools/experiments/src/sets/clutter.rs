@@ -94,7 +94,7 @@ fn spec(draw: Draw, frame: usize) -> FrameSpec {
 }
 
 /// Places a drawing near a point on the ground.
-fn place(drawing: Drawing, centre: &Point<Ned>, rng: &mut ChaCha8Rng) -> PadInScene {
+pub(super) fn place(drawing: Drawing, centre: &Point<Ned>, rng: &mut ChaCha8Rng) -> PadInScene {
     let turn = rng.random_range(0.0..TAU);
     let mut offset = || rng.random_range(-HALF_M..HALF_M);
     let place = Point::new(centre.x() + offset(), centre.y() + offset(), -1e-4);
@@ -107,7 +107,7 @@ fn place(drawing: Drawing, centre: &Point<Ned>, rng: &mut ChaCha8Rng) -> PadInSc
     }
 }
 
-fn rectangle(min_m: [f64; 2], max_m: [f64; 2], ink: Ink) -> Layer {
+pub(super) fn rectangle(min_m: [f64; 2], max_m: [f64; 2], ink: Ink) -> Layer {
     Layer { shape: Shape::Rectangle { min_m, max_m }, ink }
 }
 
@@ -115,11 +115,11 @@ fn square(half_m: f64, ink: Ink) -> Layer {
     rectangle([-half_m; 2], [half_m; 2], ink)
 }
 
-fn disc(radius_m: f64, ink: Ink) -> Layer {
+pub(super) fn disc(radius_m: f64, ink: Ink) -> Layer {
     Layer { shape: Shape::Disc { centre_m: [0.0; 2], radius_m }, ink }
 }
 
-fn drawing(half_extent_m: f64, layers: Vec<Layer>) -> Drawing {
+pub(super) fn drawing(half_extent_m: f64, layers: Vec<Layer>) -> Drawing {
     Drawing { half_extent_m, layers }
 }
 

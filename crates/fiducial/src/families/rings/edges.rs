@@ -7,12 +7,13 @@ use imaging::{GrayView, bilinear};
 use markers::{RING_RADII, RingKind};
 
 use crate::candidates::ring_profile::MIN_STEP;
+use crate::families::family::{PredictedShape, Prediction};
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
 
 /// Minimum share of the visible places of an edge at which it is found: a third may be hidden.
 const MIN_EDGE_SHARE: f64 = 0.5;
 /// Grey values from here on are saturated.
-const SATURATED: f64 = 252.0;
+pub(super) const SATURATED: f64 = 252.0;
 /// Largest share of white in what covers a ring.
 const MAX_COVERED_SHARE: f64 = 0.25;
 /// Blur shifts a curved edge towards the centre by this over the radius, all in pixels: half the variance of
@@ -28,6 +29,8 @@ pub(super) struct EdgeSearch<'a> {
     /// Minimum contrast across an edge, as a share of the brighter side.
     pub(super) min_contrast: f64,
     pub(super) white_on_black: bool,
+    /// Where markers that are followed should be.
+    pub(super) followed: &'a [Prediction],
 }
 
 /// How far from its predicted place an edge is searched.
@@ -133,6 +136,37 @@ impl EdgeSearch<'_> {
             }
         }
         support
+    }
+
+    /// Which edges are there at a pose, of which one circle is too few unless a marker is followed there.
+    pub(super) fn completeness(
+        &self,
+        pose: &CirclePose,
+        support: &[EdgeSupport; 6],
+    ) -> Completeness {
+        match Completeness::from_support(support) {
+            Completeness::Innermost if self.is_followed(pose) => Completeness::Full,
+            Completeness::Innermost => Completeness::Insufficient,
+            other => other,
+        }
+    }
+
+    /// Whether a marker is followed that should be near this pose.
+    pub(super) fn is_followed(&self, pose: &CirclePose) -> bool {
+        /// Maximum distance of the centre in marker sizes, and bounds on the ratio of the distances from the camera: what
+        /// a vehicle may do from one frame to the next beyond going on as before.
+        const MAX_AWAY: f64 = 0.1;
+        const RATIO: std::ops::Range<f64> = 0.7..1.4;
+        let is_near = |followed: &CirclePose| {
+            let ratio = pose.centre.z / followed.centre.z;
+            let [own, others] = [pose, followed].map(|p| p.centre / p.centre.z);
+            let away_m = (own - others).norm() * pose.centre.z;
+            RATIO.contains(&ratio) && away_m < MAX_AWAY * self.size_m
+        };
+        self.followed.iter().any(|marker| match &marker.shape {
+            PredictedShape::Circles(circles) => is_near(circles),
+            PredictedShape::Corners(_) => false,
+        })
     }
 
     /// Where the grey values cross the middle between those of the line's two ends.
@@ -263,14 +297,16 @@ const fn edges() -> [RingEdge; 6] {
 pub(super) enum Completeness {
     /// Too few for a marker.
     Insufficient,
+    /// The innermost ring where the camera is too near to see any other: one circle is a marker only where one is
+    /// followed.
+    Innermost,
     /// One or two are missing.
     Partial,
     Full,
 }
 
 impl Completeness {
-    /// A marker needs most of the visible edges, of at least two rings; or the innermost ring alone where the
-    /// camera is too near to see any other.
+    /// A marker needs most of the visible edges, of at least two rings.
     pub(super) fn from_support(support: &[EdgeSupport; 6]) -> Self {
         let shares = support.map(|s| s.share());
         let seen = shares.iter().flatten().filter(|s| **s >= MIN_EDGE_SHARE).count();
@@ -283,7 +319,8 @@ impl Completeness {
             return Self::Insufficient;
         }
         match missed {
-            0 if seen >= 4 || clear >= 3 || clear >= 2 && inner_only => Self::Full,
+            0 if clear >= 2 && inner_only => Self::Innermost,
+            0 if seen >= 4 || clear >= 3 => Self::Full,
             1 | 2 if seen >= 4 => Self::Partial,
             _ => Self::Insufficient,
         }

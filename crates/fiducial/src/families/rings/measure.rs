@@ -97,7 +97,7 @@ impl EdgeSearch<'_> {
         let EdgePose { pose, rms_px, support } =
             self.edge_pose(rough, &both[1], &mut buffers.edges)?;
         let diameter_px = self.diameter_px(&pose).ok_or(Reason::Pose)?;
-        let completeness = Completeness::from_support(&support);
+        let completeness = self.completeness(&pose, &support);
         if completeness != Completeness::Insufficient
             && let Some(fit) = self.photometric_poses(&pose, diameter_px, &mut buffers.samples)
         {
@@ -115,7 +115,7 @@ impl EdgeSearch<'_> {
                 && bias_px < max_bias_px * (diameter_px / 60.0).min(1.0) + bias_ratio * diameter_px
         };
         let fits = match completeness {
-            Completeness::Insufficient => false,
+            Completeness::Insufficient | Completeness::Innermost => false,
             Completeness::Partial => is_within(0.1, 0.05),
             Completeness::Full => is_within(0.3, 0.12),
         };
@@ -163,7 +163,7 @@ impl EdgeSearch<'_> {
         }
         let support = self.locate(&fit.best.pose, Reach::Sparse, &mut buffers.edges);
         let measured = from_photometric(&fit, confidence(&support))?;
-        (Completeness::from_support(&support) == Completeness::Full).then_some(measured)
+        (self.completeness(&fit.best.pose, &support) == Completeness::Full).then_some(measured)
     }
 
     /// A marker too small for edges: its grey values decide.
@@ -233,7 +233,8 @@ impl EdgeSearch<'_> {
         let fit = self.photometric_poses(rough, diameter_px, &mut buffers.samples)?;
         let support = self.locate(&fit.best.pose, Reach::Near, &mut buffers.edges);
         let measured = from_photometric(&fit, confidence(&support))?;
-        (Completeness::from_support(&support) != Completeness::Insufficient).then_some(measured)
+        let completeness = self.completeness(&fit.best.pose, &support);
+        (completeness != Completeness::Insufficient).then_some(measured)
     }
 
     /// The pose of all edges, from a rough pose or from another start.

@@ -1,0 +1,85 @@
+//! The middle of a marker, which tells it from targets: rings that are evenly wide, as people like to draw them, are
+//! nearly as far apart as the marker's, but have something else where the marker has its dot.
+
+use imaging::bilinear;
+
+use super::circle_pose::{CirclePose, project};
+use super::edges::{EdgeSearch, SATURATED};
+
+/// Diameters in pixels at which the dot decides: below it is too faint, above the rings' radii are exact enough.
+const DIAMETERS_PX: std::ops::Range<f64> = 24.0..120.0;
+/// Radii of the dot, in marker sizes.
+const DOT: [f64; 2] = [0.01, 0.03];
+/// Standard deviation of the blur of a lens in focus and the pixels, in pixels.
+const BLUR_PX: f64 = 0.8;
+/// Minimum depth of the dot as a share of a sharp image's. Out of focus it is a quarter; a white middle has none.
+const MIN_DEPTH: f64 = 0.15;
+
+impl EdgeSearch<'_> {
+    /// Whether the middle is plain to see and not the marker's: white, or a disc much wider than the dot.
+    pub(super) fn is_target(&self, pose: &CirclePose) -> bool {
+        self.has_other_middle(pose).unwrap_or(false)
+    }
+
+    fn has_other_middle(&self, pose: &CirclePose) -> Option<bool> {
+        let diameter_px = pose.projected(self.size_m / 2.0, self.camera)?.minor;
+        if !DIAMETERS_PX.contains(&diameter_px) {
+            return Some(false);
+        }
+        let [outer, gap, middle] = [0.45, 0.325, 0.2].map(|radius| self.on_circle(pose, radius));
+        let black = 0.5 * (outer?.median() + middle?.median());
+        let contrast = gap?.median() - black;
+        let whiteness = |grey: f64| (grey - black) / contrast;
+        let beside = self.on_circle(pose, 0.085)?.median();
+        if beside.abs() >= SATURATED {
+            return Some(false);
+        }
+        let [centre, ring] = [0.0, 0.02].map(|radius| self.on_circle(pose, radius));
+        let depth = whiteness(beside) - whiteness(centre?.median().min(ring?.median()));
+        let fading = |radius: f64| (-0.5 * (radius * diameter_px / BLUR_PX).powi(2)).exp();
+        let expected = (fading(DOT[0]) - fading(DOT[1])).max(0.3);
+        let is_white = whiteness(beside) > 0.6 && depth < MIN_DEPTH * expected;
+        // A leaf on the middle covers more on one side.
+        let [within, around] = [0.07, 0.12].map(|radius| self.on_circle(pose, radius));
+        let is_wide =
+            whiteness(around?.quartile()) > 0.45 && whiteness(within?.upper_quartile()) < 0.4;
+        Some(is_white || is_wide)
+    }
+
+    /// The grey values on a circle of this radius (in marker sizes), of a marker in white on black with the sign changed;
+    /// `None` where a part is outside the image.
+    fn on_circle(&self, pose: &CirclePose, radius: f64) -> Option<CircleValues> {
+        let (u, v) = pose.basis();
+        let mut values = [0.0; PLACES];
+        for (i, value) in values.iter_mut().enumerate() {
+            let (sin, cos) = (i as f64 * std::f64::consts::TAU / PLACES as f64).sin_cos();
+            let place = pose.centre + (u * cos + v * sin) * (radius * self.size_m);
+            let at = project(place, self.camera)?;
+            let grey = bilinear(self.view, at.x, at.y)?;
+            *value = if self.white_on_black { -grey } else { grey };
+        }
+        values.sort_unstable_by(f64::total_cmp);
+        Some(CircleValues(values))
+    }
+}
+
+/// Number of places on a circle.
+const PLACES: usize = 16;
+
+/// Grey values on a circle, the darkest first.
+#[derive(Copy, Clone)]
+struct CircleValues([f64; PLACES]);
+
+impl CircleValues {
+    fn median(&self) -> f64 {
+        0.5 * (self.0[PLACES / 2 - 1] + self.0[PLACES / 2])
+    }
+
+    fn quartile(&self) -> f64 {
+        self.0[PLACES / 4]
+    }
+
+    fn upper_quartile(&self) -> f64 {
+        self.0[PLACES - 1 - PLACES / 4]
+    }
+}
