@@ -6,12 +6,13 @@
 //! Modules in reading order: [`scene`] has what is rendered and the camera, [`render`] renders it,
 //! [`occluder`] has effects between scene and sensor, [`processing`] what a camera makes of the light on its
 //! sensor, [`ground`] the textures around the pads, [`views`] the frames of the thesis' experiment; `error` says why
-//! something cannot be drawn.
+//! something cannot be drawn, `quantise` makes grey levels whole.
 
 mod error;
 pub mod ground;
 pub mod occluder;
 pub mod processing;
+mod quantise;
 pub mod render;
 pub mod scene;
 pub mod views;

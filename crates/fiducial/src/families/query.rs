@@ -19,7 +19,9 @@ const SEGMENT_CORNER_RATIO: f64 = 0.015;
 /// Corners are no square in space when their mean squared reprojection error is this multiple of their mean variance.
 const MIN_MISFIT: f64 = 9.0;
 
-/// Largest reprojection error of a square as a share of its diagonal; bent paper and rolling shutters stay below.
+/// Largest reprojection error of a square, in pixels or as a share of its diagonal, whichever is larger: bent paper and
+/// rolling shutters stay below.
+const MAX_MISFIT_PX: f64 = 1.0;
 const MAX_MISFIT_RATIO: f64 = 0.02;
 /// Largest standard deviation of the centre, in pixels, of a marker that the frame cuts: where its edges do not agree on a
 /// place, a corner is a guess that may be off by any distance.
@@ -123,7 +125,8 @@ impl FamilyQuery {
         });
         // Corners that are no square in space, as where one was guessed beyond the frame: the centre is no better.
         let misfit_px2 = pose.map_or(0.0, |pose| pose.reprojection_rms_px.powi(2));
-        if misfit_px2 > (MAX_MISFIT_RATIO * diagonal_px(&corners)).powi(2) {
+        let max_misfit_px = MAX_MISFIT_PX.max(MAX_MISFIT_RATIO * diagonal_px(&corners));
+        if misfit_px2 > max_misfit_px * max_misfit_px {
             return None;
         }
         let is_misfit = misfit_px2 > MIN_MISFIT * refined.covariance_px2.trace() / 8.0;

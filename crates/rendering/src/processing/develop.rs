@@ -10,6 +10,7 @@ use super::filters::{self, Gaussian};
 use super::tone::{Table, ToneCurve};
 use super::{Denoise, Processing, Sharpen, local, mosaic};
 use crate::error::RenderError;
+use crate::quantise::quantise;
 
 /// A camera's processing with its tables and buffers.
 #[derive(Debug)]
@@ -107,7 +108,7 @@ impl Developer {
             }
         }
         for (pixel, level) in out.iter_mut().zip(&*raw) {
-            *pixel = (level + 0.5).clamp(0.0, 255.0) as u8;
+            *pixel = quantise(*level);
         }
         match self.processing.jpeg_quality {
             Some(quality) => through_jpeg(quality, width, &mut self.jpeg, out),

@@ -52,7 +52,8 @@ fn filmic(light: f32) -> f32 {
 /// A curve as a table over light from 0 to 255, for interpolation.
 #[derive(Debug)]
 pub(super) struct Table {
-    levels: Vec<f32>,
+    /// Grey levels, and how far it is to the next.
+    levels: Vec<[f32; 2]>,
 }
 
 /// Entries of the table per grey level of linear light: the steepest curve is straight between them to a
@@ -63,17 +64,20 @@ impl Table {
     pub(super) fn new(curve: ToneCurve) -> Self {
         let last = 255 * PER_LEVEL;
         let level = |k: usize| 255.0 * curve.level(k as f32 / last as f32);
-        // One more, so that white has a right neighbour.
-        Self { levels: (0..=last + 1).map(|k| level(k.min(last))).collect() }
+        let rise = |k: usize| level((k + 1).min(last)) - level(k);
+        Self { levels: (0..=last).map(|k| [level(k), rise(k)]).collect() }
     }
 
     /// Replaces light from 0 to 255 by grey levels.
     pub(super) fn apply(&self, light: &mut [f32]) {
         for value in light {
             let place = value.clamp(0.0, 255.0) * PER_LEVEL as f32;
-            let index = place as usize;
-            if let Some([low, high]) = self.levels.get(index..index + 2) {
-                *value = low + (high - low) * (place - index as f32);
+            // Adding 2^23 leaves the rounded integer in the lowest bits; unlike a cast it needs no test for NaN. Half
+            // more is the next integer, or the place itself where it is one.
+            let next = ((place + 0.5) + 8_388_608.0).to_bits() & 0xffff;
+            let index = next.saturating_sub(1);
+            if let Some([low, rise]) = self.levels.get(index as usize) {
+                *value = low + rise * (place - index as f32);
             }
         }
     }

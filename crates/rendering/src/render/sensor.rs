@@ -4,6 +4,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+use crate::quantise::quantise;
 use crate::scene::CameraSettings;
 
 /// Converts the light on rows of pixels into grey levels.
@@ -116,13 +117,6 @@ struct Row {
     /// What vignetting leaves in the middle column.
     gain: f32,
     seed: u64,
-}
-
-/// The nearest grey level.
-fn quantise(level: f32) -> u8 {
-    // Adding 2^23 leaves the rounded integer in the lowest bits; unlike a cast from float it needs no test
-    // for NaN.
-    (level.clamp(0.0, 255.0) + 8_388_608.0).to_bits() as u8
 }
 
 /// A bijection that scatters (splitmix64's finaliser).
