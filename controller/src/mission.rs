@@ -4,6 +4,10 @@ use autopilot::{Autopilot, FlightMode, LandedState, Takeoff, TakeoffError, Takeo
 
 use crate::config::Start;
 
+/// Time within which motors that run again mean that a landing had not ended, in nanoseconds: nobody prepares the next
+/// flight so soon, and the autopilot's heartbeat may have been wrong.
+const MAX_REARMED_NS: i64 = 10_000_000_000;
+
 /// The mission of a flight.
 #[derive(Debug)]
 pub struct Mission {
@@ -11,6 +15,8 @@ pub struct Mission {
     state: State,
     started_ns: Option<i64>,
     disarmed_ns: Option<i64>,
+    /// Until when the landing that seemed to have ended goes on.
+    goes_on_until_ns: Option<i64>,
 }
 
 /// The state of a mission.
@@ -43,6 +49,8 @@ pub enum State {
 pub enum Trigger {
     /// The vehicle was found in flight.
     InFlight,
+    /// The motors of a vehicle that seemed to have landed run.
+    ArmedAgain,
     /// The take-off is done.
     TakenOff,
     /// The vehicle was found in LAND instead: the end of a landing that an earlier controller began.
@@ -60,7 +68,7 @@ impl Mission {
                 why: "waiting for the autopilot's heartbeat".to_owned(),
             },
         };
-        Self { start, state, started_ns: None, disarmed_ns: None }
+        Self { start, state, started_ns: None, disarmed_ns: None, goes_on_until_ns: None }
     }
 
     /// The state.
@@ -102,6 +110,7 @@ impl Mission {
     pub fn begin(&mut self, now_ns: i64, is_autopilots: bool) {
         self.started_ns = Some(now_ns);
         self.disarmed_ns = None;
+        self.goes_on_until_ns = None;
         self.state = if is_autopilots { State::SendingLandingTarget } else { State::Landing };
     }
 
@@ -133,6 +142,16 @@ impl Mission {
         is_known: bool,
         steers: bool,
     ) -> Option<Trigger> {
+        if let Some(until_ns) = self.goes_on_until_ns {
+            let is_ours = autopilot
+                .state()
+                .is_some_and(|s| s.armed && (s.mode.is_guided() || s.mode.is_landing()));
+            if now_ns > until_ns {
+                self.goes_on_until_ns = None;
+            } else if is_known && steers && is_ours {
+                return Some(Trigger::ArmedAgain);
+            }
+        }
         match &mut self.state {
             State::AwaitingTakeoff if is_known => {
                 let lands = autopilot.state().is_some_and(|state| {
@@ -193,8 +212,12 @@ impl Mission {
             self.state = State::Idle;
         }
         let is_over = is_finished && !matches!(self.state, State::Failed { .. });
-        if armed && is_over && self.start == Start::Airborne {
-            self.stand_down(true);
+        if armed && is_over {
+            let until_ns = self.disarmed_ns.map(|at_ns| at_ns.saturating_add(MAX_REARMED_NS));
+            self.goes_on_until_ns = until_ns.filter(|until_ns| now_ns <= *until_ns);
+            if self.start == Start::Airborne {
+                self.stand_down(true);
+            }
         }
     }
 }

@@ -184,6 +184,24 @@ fn reports_of_the_ground_that_contradict_the_flight_change_nothing() {
 }
 
 #[test]
+fn motors_said_to_be_off_high_up_are_no_touchdown() {
+    let mut flight = in_flight("resume");
+    flight.presence(0, "main", true);
+    flight.camera(0, CameraInfo::sample());
+    hover(&mut flight, 20, 3000, 4);
+    receive(&mut flight, 3000 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    for ms in (3000..4000).step_by(200) {
+        receive(&mut flight, ms * MS, &heartbeat(4, false));
+        pose(&mut flight, ms * MS + 1);
+        flight.tick(ms * MS + 2);
+        assert_ne!(flight.status(ms * MS + 3).phase, Phase::Landed, "after {ms} ms");
+    }
+    let status = flight.status(4000 * MS);
+    assert_eq!(status.phase, Phase::Aborted);
+    assert!(status.why.contains("disarmed"), "{}", status.why);
+}
+
+#[test]
 fn without_the_heartbeat_alone_it_hovers_and_then_goes_on() {
     let mut flight = in_flight("airborne");
     flight.presence(0, "main", true);
@@ -531,7 +549,7 @@ fn after_a_pilots_landing_the_next_flight_is_landed() {
 
 #[test]
 fn only_a_resumed_landing_begins_by_itself() {
-    let next_flight = |start: &str, mode: u32, contact_at_start: MavLandedState| {
+    let next_flight = |start: &str, mode: u32, contact_at_start: MavLandedState, armed_ms: i64| {
         let mut flight = flight(start);
         flight.presence(0, "main", true);
         receive(&mut flight, 0, &heartbeat(mode, true));
@@ -542,22 +560,26 @@ fn only_a_resumed_landing_begins_by_itself() {
         receive(&mut flight, 1001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
         pose(&mut flight, 1010 * MS);
         flight.tick(1011 * MS);
-        receive(&mut flight, 5000 * MS, &heartbeat(4, true));
-        receive(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
-        hover(&mut flight, 5020, 5500, 4);
-        (first, flight.status(5500 * MS).phase)
+        receive(&mut flight, armed_ms * MS, &heartbeat(4, true));
+        let now_ns = (armed_ms + 1) * MS;
+        receive(&mut flight, now_ns, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+        hover(&mut flight, armed_ms + 20, armed_ms + 500, 4);
+        (first, flight.status((armed_ms + 500) * MS).phase)
     };
     let (flying, landing) =
         (MavLandedState::MAV_LANDED_STATE_IN_AIR, MavLandedState::MAV_LANDED_STATE_LANDING);
-    for (start, mode, contact, first, next) in [
-        ("resume", 4, flying, Phase::Search, Phase::Landed),
-        ("resume", 5, flying, Phase::Idle, Phase::Idle),
-        ("resume", 9, landing, Phase::Idle, Phase::Idle),
-        ("airborne", 4, flying, Phase::Search, Phase::Search),
-        ("airborne", 5, flying, Phase::Idle, Phase::Search),
+    for (start, mode, contact, first, armed_ms, next) in [
+        ("resume", 4, flying, Phase::Search, 20_000, Phase::Landed),
+        ("resume", 5, flying, Phase::Idle, 20_000, Phase::Idle),
+        ("resume", 9, landing, Phase::Idle, 20_000, Phase::Idle),
+        ("airborne", 4, flying, Phase::Search, 20_000, Phase::Search),
+        ("airborne", 5, flying, Phase::Idle, 20_000, Phase::Search),
+        // Motors that run again so soon were not off: the landing goes on.
+        ("resume", 4, flying, Phase::Search, 5000, Phase::Search),
+        ("resume", 5, flying, Phase::Idle, 5000, Phase::Idle),
     ] {
-        let phases = next_flight(start, mode, contact);
-        assert_eq!(phases, (first, next), "{start} in {mode}");
+        let phases = next_flight(start, mode, contact, armed_ms);
+        assert_eq!(phases, (first, next), "{start} in {mode}, armed after {armed_ms} ms");
     }
 }
 

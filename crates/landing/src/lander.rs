@@ -291,10 +291,11 @@ impl Lander {
         ground_m.unwrap_or_else(|| self.altitude_of(self.start).min(0.0)) + height_m
     }
 
-    /// The contact with the ground. A vehicle that flies high, or moves up or down, does not stand on it.
+    /// The contact with the ground. A vehicle that flies high, or moves up or down, does not stand on it, whatever is
+    /// said of its motors.
     fn landed(&self, now: Timestamp) -> Landed {
         let Some(status) = self.status else { return Landed::Unknown };
-        if status.landed != Landed::OnGround || !status.armed {
+        if status.landed != Landed::OnGround {
             return status.landed;
         }
         let max_m_s = MAX_CONTACT_M_S + self.config.estimator.pad_heave_m_s;

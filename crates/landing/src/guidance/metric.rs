@@ -77,7 +77,7 @@ const TOUCHDOWN_M_S: f64 = 0.2;
 const TOUCHDOWN_PER_HEIGHT: f64 = 0.4;
 const TOUCHDOWN_WAIT_S: f64 = 1.0;
 const TOUCHDOWN_PATIENCE_M_S2: f64 = 0.1;
-const MAX_TOUCHDOWN_M_S: f64 = 0.45;
+const MAX_TOUCHDOWN_M_S: f64 = 0.3;
 
 /// Minimum descent speed at touchdown on a heaving pad, in m/s.
 const MIN_TOUCHDOWN_M_S: f64 = 0.3;

@@ -52,7 +52,7 @@ fn jumps_pauses_and_old_states_make_no_bias() {
 
 #[test]
 fn waiting_never_allows_a_fast_slide_and_ends() {
-    for (speed_m_s, ready) in [(0.4, true), (0.5, false)] {
+    for (speed_m_s, ready) in [(0.25, true), (0.35, false)] {
         let mut metric = Metric::new(MetricConfig::default());
         let mut ends = Vec::new();
         for i in 0..600u32 {
