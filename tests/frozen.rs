@@ -13,10 +13,10 @@ use anyhow::{Context, ensure};
 use messages::{ControllerCommand, Phase, Wind, topic};
 use node::{Identity, Network, Node, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
-use testing::ports;
+use testing::{ports, with_second_try};
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, with_second_try};
+use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME};
 
 /// Longest time until a process that goes on takes its part again.
 const BACK: Duration = Duration::from_secs(2);

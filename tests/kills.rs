@@ -15,6 +15,8 @@ use testing::ports;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
+use crate::flight::small_camera;
+
 const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 /// Longest wait for anything.
 const PATIENCE: Duration = Duration::from_secs(90);
@@ -101,6 +103,7 @@ struct Flight {
 
 /// The site: the drone's camera follows what the world's autopilot reports, as beside a real autopilot.
 fn site(seed: u64, [meet, air, autopilot]: [u16; 3]) -> String {
+    let small = small_camera();
     format!(
         r#"
 vehicle = "tried"
@@ -111,7 +114,7 @@ meet = {meet}
 [[drone]]
 run = "simulator"
 name = "camera"
-set = ["id=camera", "vehicle=reported", "seed={seed}"]
+set = ["id=camera", "vehicle=reported", "seed={seed}", {small}]
 [[drone]]
 run = "detector"
 set = ["id=onboard"]

@@ -21,7 +21,7 @@ mod swaps;
 
 use std::process::ExitCode;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 
 use crate::link::site::Radio;
 use crate::link::{GOOD, LOSSY, POOR, flight as trial, saturation};
@@ -31,7 +31,13 @@ fn main() -> ExitCode {
         let times = |default: usize| args.get(1).map_or(Ok(default), |text| text.parse());
         match args.first().map(String::as_str) {
             Some("kills") => kills::kill_each(times(20)?).await,
-            Some("swaps") => swaps::swaps(times(100)?).await,
+            Some("swaps") => {
+                ensure!(
+                    swaps::swaps(times(100)?).await?,
+                    "frames were late whoever found the marker in them"
+                );
+                Ok(())
+            }
             Some("link") => table(&args[1..]).await,
             Some("reader") => {
                 println!("{}", onehost::reader(args.get(1).context("reader PORT")?).await?);

@@ -2,9 +2,12 @@
 
 #![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
 
+mod flight;
 mod kills;
+
+use testing::with_second_try;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn whatever_is_killed_comes_back_and_it_lands() -> anyhow::Result<()> {
-    kills::kill_each(1).await
+    with_second_try(|| kills::kill_each(1)).await
 }

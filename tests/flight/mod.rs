@@ -19,22 +19,18 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 /// Furthest from the pad's centre that a landing may end, whatever happened on the way; 0.05 m is the worst
 /// that `docs/results.md` tells of landings without a fault.
 const MAX_ERROR_M: f64 = 0.1;
+/// The simulated camera with a quarter of its pixels: what is tested is how processes fit together, on machines that
+/// may have no time for the rest.
+const SMALL_CAMERA: [&str; 3] =
+    ["camera.width=648", "camera.height=486", "camera.focal_px=909.0909090909091"];
 pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
 /// Two landings at once would share the processor.
 pub(crate) static ONE_AT_A_TIME: Mutex<()> = Mutex::const_new(());
 
-/// Runs a test, and once more if it fails: a machine that is busy with something else may disturb what takes its time.
-pub(crate) async fn with_second_try<F: Future<Output = anyhow::Result<()>>>(
-    test: impl Fn() -> F,
-) -> anyhow::Result<()> {
-    match test().await {
-        Ok(()) => Ok(()),
-        Err(problem) => {
-            println!("once more: {problem:#}");
-            test().await
-        }
-    }
+/// The small camera as items of the `set` of a site's file.
+pub(crate) fn small_camera() -> String {
+    SMALL_CAMERA.map(|key| format!("{key:?}")).join(", ")
 }
 
 /// What a command that should end by itself says; one that goes on is ended.
@@ -80,6 +76,7 @@ impl Landing {
             .args(patience)
             // A ground station of the machine's own must not join the flight.
             .args(["--set", "gcs-bridge.ground=udpout:127.0.0.1:9"])
+            .args(SMALL_CAMERA.iter().flat_map(|key| ["--set".into(), format!("simulator.{key}")]))
             .args(args)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
