@@ -1,186 +1,42 @@
-//! A process that is frozen for a while (SIGSTOP) and goes on takes its full part again within 2 s.
-//!
-//! Nothing stands beside it that could take its place: no second detector, no supervisor.
+//! A process that is frozen for a while (SIGSTOP) and goes on takes its full part again within 2 s. `measure.rs` freezes
+//! each for longer.
 
 #![expect(clippy::print_stdout, reason = "what a test measured is for people to read")]
 
 mod flight;
-use std::net::UdpSocket;
-use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
+mod freezes;
 
-use anyhow::{Context, ensure};
-use messages::{ControllerCommand, Phase, Wind, topic};
-use node::{Identity, Network, Node, now_ns};
-use rustix::process::{Pid, Signal, kill_process};
-use testing::{ports, with_second_try};
-use tokio::time::{sleep, timeout};
+use testing::with_second_try;
 
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME};
-
-/// Longest time until a process that goes on takes its part again.
-const BACK: Duration = Duration::from_secs(2);
-/// For how long each is frozen: less than Zenoh's lease is on the air link, about as long, longer.
+/// For how long each is frozen, in seconds: less than Zenoh's lease is on the air link, about as long, longer.
 const FREEZES_S: [f64; 3] = [0.5, 2.0, 5.0];
-/// The same for the relay, also far longer.
-const RELAY_FREEZES_S: [f64; 5] = [0.5, 1.5, 2.0, 5.0, 30.0];
 
-/// Freezes a process, and lets it go on.
-async fn freeze(pid: Pid, seconds: f64) -> anyhow::Result<Instant> {
-    kill_process(pid, Signal::STOP)?;
-    sleep(Duration::from_secs_f64(seconds)).await;
-    kill_process(pid, Signal::CONT)?;
-    Ok(Instant::now())
-}
-
-/// Waits until the controller uses frames that were taken after this time.
-async fn frames_are_used(landing: &Landing, since_ns: i64) -> anyhow::Result<()> {
-    let what = "new frames are used";
-    let is_used = |s: &messages::ControllerStatus| {
-        s.stamp_ns > since_ns
-            && s.detection_age_ms.is_some_and(|ms| s.stamp_ns - (ms * 1e6) as i64 > since_ns)
-    };
-    landing.status(what, is_used).await.map(drop)
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frozen_detector_detects_again_and_it_lands() -> anyhow::Result<()> {
+    with_second_try(|| freezes::of_a_landing("detector", &FREEZES_S)).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn whatever_is_frozen_takes_its_part_again_and_it_lands() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
-    with_second_try(each_process_is_frozen).await
+async fn a_frozen_bridge_is_heard_again_and_it_lands() -> anyhow::Result<()> {
+    with_second_try(|| freezes::of_a_landing("gcs-bridge", &FREEZES_S[1..])).await
 }
 
-async fn each_process_is_frozen() -> anyhow::Result<()> {
-    let ([], _, port) = ports::free()?;
-    let station = UdpSocket::bind(("127.0.0.1", port))?;
-    station.set_read_timeout(Some(Duration::from_secs(20)))?;
-    let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{port}");
-    let landing = Landing::start(&["--seed", "3", "--timeout-s", "200", "--set", &address]).await?;
-    landing.descends_below(9.0).await?;
-    for (name, freezes_s) in [
-        ("detector", &FREEZES_S[..]),
-        ("gcs-bridge", &FREEZES_S[1..]),
-        ("simulator", &FREEZES_S[1..]),
-        ("controller", &FREEZES_S[1..2]),
-    ] {
-        for seconds in freezes_s {
-            hold(&landing).await?;
-            let pid = landing.service(name)?.pid;
-            let since = freeze(pid, *seconds).await?;
-            let since_ns = now_ns();
-            if name == "gcs-bridge" {
-                tokio::task::block_in_place(|| hears_the_vehicle(&station, since))?;
-            } else {
-                frames_are_used(&landing, since_ns).await?;
-            }
-            let took = since.elapsed();
-            println!("{name} frozen for {seconds} s: back after {took:?}");
-            ensure!(took < BACK, "{name}, frozen for {seconds} s, was back after {took:?}");
-            command(&landing, ControllerCommand::Resume).await?;
-            landing.status("it goes on", |s| s.phase != Phase::Hold).await?;
-        }
-    }
-    landing.lands().await.map(drop)
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frozen_simulation_goes_on_and_lands() -> anyhow::Result<()> {
+    with_second_try(|| freezes::of_a_landing("simulator", &FREEZES_S[1..])).await
 }
 
-async fn hold(landing: &Landing) -> anyhow::Result<()> {
-    command(landing, ControllerCommand::Hold).await?;
-    landing.status("it holds", |s| s.phase == Phase::Hold).await.map(drop)
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frozen_controller_goes_on_and_lands() -> anyhow::Result<()> {
+    with_second_try(|| freezes::of_a_landing("controller", &FREEZES_S[1..2])).await
 }
 
-async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Result<()> {
-    let reply = landing.node.command(topic::COMMAND, &[], &command).await?;
-    ensure!(reply.accepted, "{command:?}: {reply:?}");
-    Ok(())
-}
-
-/// Waits for the autopilot's packets at the ground station: many, as a few may have waited.
-fn hears_the_vehicle(station: &UdpSocket, since: Instant) -> anyhow::Result<()> {
-    station.set_nonblocking(true)?;
-    let mut bytes = [0; 2048];
-    while station.recv(&mut bytes).is_ok() {}
-    station.set_nonblocking(false)?;
-    for _ in 0..20 {
-        station.recv(&mut bytes).with_context(|| format!("nothing since {:?}", since.elapsed()))?;
-    }
-    Ok(())
-}
-
-/// A process that is ended with its owner.
-struct Running(Child);
-
-impl Running {
-    fn start(args: &[&str]) -> anyhow::Result<Self> {
-        let mut command = Command::new(ALIGHT);
-        command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
-        Ok(Self(command.spawn()?))
-    }
-
-    fn pid(&self) -> anyhow::Result<Pid> {
-        Pid::from_raw(i32::try_from(self.0.id())?).context("a process id")
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// Waits until what one publishes reaches the other.
-async fn reaches(from: &Node, by: &Node) -> anyhow::Result<()> {
-    let publisher = from.publisher(topic::WIND, &[]).await?;
-    let subscriber = by.subscriber(topic::WIND, &[]).await?;
-    let wind = Wind { velocity_ned_m_s: [1.0, 2.0, 3.0], stamp_ns: now_ns() };
-    let received = async {
-        loop {
-            publisher.publish(&wind).await;
-            let next = timeout(Duration::from_millis(20), subscriber.next()).await;
-            if next.is_ok_and(|next| next == Some(wind)) {
-                return;
-            }
-        }
-    };
-    timeout(Duration::from_secs(20), received).await.context("nothing is received")
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frozen_camera_publishes_again() -> anyhow::Result<()> {
+    with_second_try(|| freezes::of_a_camera(&FREEZES_S)).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_frozen_relay_relays_again() -> anyhow::Result<()> {
-    let _alone = ONE_AT_A_TIME.lock().await;
-    with_second_try(a_relay_is_frozen).await
-}
-
-async fn a_relay_is_frozen() -> anyhow::Result<()> {
-    let ([meet], air, _) = ports::free()?;
-    let (meet_text, air) = (meet.to_string(), format!("127.0.0.1:{air}"));
-    let open = async |role: &str, service: &'static str, name: &str| -> anyhow::Result<Node> {
-        let network = Network {
-            config: Some(role.into()),
-            connect: (role == "ground").then(|| air.clone()),
-            meet: (role == "local").then_some(meet),
-            ..Network::default()
-        };
-        let identity = Identity { service, instance: name.into() };
-        Node::open(identity, &network.source(service)?).await
-    };
-    let first = open("local", "simulator", "main").await?;
-    let second = open("local", "controller", "main").await?;
-    let relay =
-        Running::start(&["relay", "--zenoh", "drone", "--listen", &air, "--meet", &meet_text])?;
-    let ground = open("ground", "detector", "ground").await?;
-    for seconds in RELAY_FREEZES_S {
-        for node in [&first, &second] {
-            reaches(node, &ground).await?;
-            reaches(&ground, node).await?;
-        }
-        let since = freeze(relay.pid()?, seconds).await?;
-        for node in [&first, &second] {
-            reaches(node, &ground).await?;
-            reaches(&ground, node).await?;
-        }
-        let took = since.elapsed();
-        println!("relay frozen for {seconds} s: back after {took:?}");
-        ensure!(took < BACK, "the relay, frozen for {seconds} s, was back after {took:?}");
-    }
-    Ok(())
+    with_second_try(|| freezes::of_a_relay(&[0.5, 1.5, 2.0, 5.0, 30.0])).await
 }

@@ -4,12 +4,14 @@
 //! ```text
 //! cargo bench -p tests -- kills [TIMES]       kill each process so often (20)
 //! cargo bench -p tests -- swaps [TIMES]       swap detectors so often in one flight (100)
+//! cargo bench -p tests -- freezes             freeze each process (SIGSTOP) for 0.5, 2, 5 and 30 s
 //! cargo bench -p tests -- link [NAME...]      the trials on a bad radio link, or some of them
 //! ```
 
 #![expect(clippy::print_stdout, reason = "what was measured is for people to read")]
 
 mod flight;
+mod freezes;
 mod kills;
 #[path = "link/mod.rs"]
 mod link;
@@ -38,18 +40,27 @@ fn main() -> ExitCode {
                 );
                 Ok(())
             }
+            Some("freezes") => freeze_each(&[0.5, 2.0, 5.0, 30.0]).await,
             Some("link") => table(&args[1..]).await,
             Some("reader") => {
                 println!("{}", onehost::reader(args.get(1).context("reader PORT")?).await?);
                 Ok(())
             }
-            Some(other) => bail!("`{other}` is not measured: kills, swaps and link are"),
+            Some(other) => bail!("`{other}` is not measured: kills, swaps, freezes and link are"),
             None => {
-                println!("Nothing is measured: say kills, swaps or link");
+                println!("Nothing is measured: say kills, swaps, freezes or link");
                 Ok(())
             }
         }
     })
+}
+
+async fn freeze_each(freezes_s: &[f64]) -> anyhow::Result<()> {
+    for name in ["detector", "gcs-bridge", "simulator", "controller"] {
+        freezes::of_a_landing(name, freezes_s).await.context(name)?;
+    }
+    freezes::of_a_camera(freezes_s).await.context("camera-pub")?;
+    freezes::of_a_relay(freezes_s).await.context("relay")
 }
 
 /// The long trials.

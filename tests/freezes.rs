@@ -1,0 +1,197 @@
+//! Processes that are frozen for a while (SIGSTOP) and go on; nothing stands beside them that could take their place: no
+//! second detector, no supervisor.
+
+use std::net::UdpSocket;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use messages::{ControllerCommand, Phase, Wind, topic};
+use node::{Identity, Network, Node, now_ns};
+use rustix::process::{Pid, Signal, kill_process};
+use testing::ports;
+use tokio::time::{sleep, timeout};
+
+use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME};
+
+/// Longest time until a process that goes on takes its part again.
+const BACK: Duration = Duration::from_secs(2);
+/// Freezes a process, and lets it go on.
+async fn freeze(pid: Pid, seconds: f64) -> anyhow::Result<Instant> {
+    kill_process(pid, Signal::STOP)?;
+    sleep(Duration::from_secs_f64(seconds)).await;
+    kill_process(pid, Signal::CONT)?;
+    Ok(Instant::now())
+}
+
+/// Waits until the controller uses frames that were taken after this time.
+async fn frames_are_used(landing: &Landing, since_ns: i64) -> anyhow::Result<()> {
+    let what = "new frames are used";
+    let is_used = |s: &messages::ControllerStatus| {
+        s.stamp_ns > since_ns
+            && s.detection_age_ms.is_some_and(|ms| s.stamp_ns - (ms * 1e6) as i64 > since_ns)
+    };
+    landing.status(what, is_used).await.map(drop)
+}
+
+/// Freezes a process of a landing for each of these times, and lands.
+pub(crate) async fn of_a_landing(name: &str, freezes_s: &[f64]) -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    let ([], _, port) = ports::free()?;
+    let station = UdpSocket::bind(("127.0.0.1", port))?;
+    station.set_read_timeout(Some(Duration::from_secs(20)))?;
+    let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{port}");
+    let long = "controller.phases.landing_timeout_s=600";
+    let args = ["--seed", "3", "--timeout-s", "300", "--set", &address, "--set", long];
+    let landing = Landing::start(&args).await?;
+    landing.descends_below(9.0).await?;
+    for seconds in freezes_s {
+        hold(&landing).await?;
+        let pid = landing.service(name)?.pid;
+        let since = freeze(pid, *seconds).await?;
+        let since_ns = now_ns();
+        if name == "gcs-bridge" {
+            tokio::task::block_in_place(|| hears_the_vehicle(&station, since))?;
+        } else {
+            frames_are_used(&landing, since_ns).await?;
+        }
+        is_back(name, *seconds, since)?;
+        command(&landing, ControllerCommand::Resume).await?;
+        landing.status("it goes on", |s| s.phase != Phase::Hold).await?;
+    }
+    landing.lands().await.map(drop)
+}
+
+fn is_back(name: &str, seconds: f64, since: Instant) -> anyhow::Result<()> {
+    let took = since.elapsed();
+    println!("{name} frozen for {seconds} s: back after {took:?}");
+    ensure!(took < BACK, "{name}, frozen for {seconds} s, was back after {took:?}");
+    Ok(())
+}
+
+/// Freezes a camera's process that publishes images.
+pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    let folder = tempfile::tempdir()?;
+    image::GrayImage::new(64, 48).save(folder.path().join("1.png"))?;
+    let paths = format!("source.paths=[{:?}]", folder.path());
+    let ([meet], _, _) = ports::free()?;
+    let meet_text = meet.to_string();
+    let set = ["--set", &paths, "--set", "calibration.focal_px=[100, 100]"];
+    let camera = Running::start(&[&["camera-pub", "--meet", &meet_text], &set[..]].concat())?;
+    let detector = open("local", "detector", "main", None, Some(meet)).await?;
+    let frames = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let is_received = async |since_ns: i64| {
+        let fresh = async {
+            while frames.next().await.context("frames end")?.header.stamp_ns < since_ns {}
+            anyhow::Ok(())
+        };
+        timeout(Duration::from_secs(20), fresh).await.context("no frame is received")?
+    };
+    for seconds in freezes_s {
+        is_received(now_ns()).await?;
+        let since = freeze(camera.pid()?, *seconds).await?;
+        is_received(now_ns()).await?;
+        is_back("camera-pub", *seconds, since)?;
+    }
+    Ok(())
+}
+
+async fn hold(landing: &Landing) -> anyhow::Result<()> {
+    command(landing, ControllerCommand::Hold).await?;
+    landing.status("it holds", |s| s.phase == Phase::Hold).await.map(drop)
+}
+
+async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Result<()> {
+    let reply = landing.node.command(topic::COMMAND, &[], &command).await?;
+    ensure!(reply.accepted, "{command:?}: {reply:?}");
+    Ok(())
+}
+
+/// Waits for the autopilot's packets at the ground station: many, as a few may have waited.
+fn hears_the_vehicle(station: &UdpSocket, since: Instant) -> anyhow::Result<()> {
+    station.set_nonblocking(true)?;
+    let mut bytes = [0; 2048];
+    while station.recv(&mut bytes).is_ok() {}
+    station.set_nonblocking(false)?;
+    for _ in 0..20 {
+        station.recv(&mut bytes).with_context(|| format!("nothing since {:?}", since.elapsed()))?;
+    }
+    Ok(())
+}
+
+/// A process that is ended with its owner.
+struct Running(Child);
+
+impl Running {
+    fn start(args: &[&str]) -> anyhow::Result<Self> {
+        let mut command = Command::new(ALIGHT);
+        command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        Ok(Self(command.spawn()?))
+    }
+
+    fn pid(&self) -> anyhow::Result<Pid> {
+        Pid::from_raw(i32::try_from(self.0.id())?).context("a process id")
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Waits until what one publishes reaches the other.
+async fn reaches(from: &Node, by: &Node) -> anyhow::Result<()> {
+    let publisher = from.publisher(topic::WIND, &[]).await?;
+    let subscriber = by.subscriber(topic::WIND, &[]).await?;
+    let wind = Wind { velocity_ned_m_s: [1.0, 2.0, 3.0], stamp_ns: now_ns() };
+    let received = async {
+        loop {
+            publisher.publish(&wind).await;
+            let next = timeout(Duration::from_millis(20), subscriber.next()).await;
+            if next.is_ok_and(|next| next == Some(wind)) {
+                return;
+            }
+        }
+    };
+    timeout(Duration::from_secs(20), received).await.context("nothing is received")
+}
+
+async fn open(
+    role: &str,
+    service: &'static str,
+    name: &str,
+    connect: Option<String>,
+    meet: Option<u16>,
+) -> anyhow::Result<Node> {
+    let network = Network { config: Some(role.into()), connect, meet, ..Network::default() };
+    let identity = Identity { service, instance: name.into() };
+    Node::open(identity, &network.source(service)?).await
+}
+
+/// Freezes a relay between two processes on board and one on the ground.
+pub(crate) async fn of_a_relay(freezes_s: &[f64]) -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    let ([meet], air, _) = ports::free()?;
+    let (meet_text, air) = (meet.to_string(), format!("127.0.0.1:{air}"));
+    let first = open("local", "simulator", "main", None, Some(meet)).await?;
+    let second = open("local", "controller", "main", None, Some(meet)).await?;
+    let relay =
+        Running::start(&["relay", "--zenoh", "drone", "--listen", &air, "--meet", &meet_text])?;
+    let ground = open("ground", "detector", "ground", Some(air), None).await?;
+    for seconds in freezes_s {
+        for node in [&first, &second] {
+            reaches(node, &ground).await?;
+            reaches(&ground, node).await?;
+        }
+        let since = freeze(relay.pid()?, *seconds).await?;
+        for node in [&first, &second] {
+            reaches(node, &ground).await?;
+            reaches(&ground, node).await?;
+        }
+        is_back("relay", *seconds, since)?;
+    }
+    Ok(())
+}
