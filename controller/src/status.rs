@@ -123,6 +123,9 @@ impl View<'_> {
                 (Phase::Failed, "no landing target is sent in this mode".to_owned())
             }
             (State::Idle, None) => (Phase::Idle, "waiting for the start of a landing".to_owned()),
+            (State::AwaitingTakeoff, None) if self.autopilot.state().is_none() => {
+                (Phase::Idle, "waiting for the autopilot's heartbeat".to_owned())
+            }
             (State::AwaitingTakeoff, None) => {
                 (Phase::Idle, "waiting for the vehicle to fly in GUIDED".to_owned())
             }

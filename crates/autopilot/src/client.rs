@@ -698,6 +698,7 @@ impl Autopilot {
             self.late += 1;
             return;
         }
+        self.clock.position_arrived(now_ns);
         if let Some(stamp_ns) = self.clock.arrived(now_ns, position.boot_ms) {
             position.stamp_ns = stamp_ns;
         }

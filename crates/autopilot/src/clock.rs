@@ -31,6 +31,14 @@ const MAX_LENGTH_AGE_NS: i64 = 6_000 * MS;
 /// elsewhere. And the time after which they say nothing any more.
 const AGES: usize = 6;
 const MAX_ARRIVED_NS: i64 = 1_000 * MS;
+/// Time over which the pauses between positions are counted, and their maximum number.
+const PAUSES_NS: i64 = 2_000 * MS;
+const MAX_ARRIVALS: usize = 128;
+/// Mean age of the newest position at 20 Hz without losses, in nanoseconds, beside the link's delay.
+const USUAL_WAIT_NS: i64 = 25 * MS;
+/// What losses delay both ways together, per nanosecond of the positions' mean age beyond that: setpoints go out half as
+/// often as positions come, so theirs is twice as long, and a control loop must bear the long waits, not the mean one.
+const WAITS_PER_AGE: i64 = 5;
 /// Maximum drift between two clocks: 100 ppm.
 const DRIFT: f64 = 1e-4;
 /// Error of reading a clock, in nanoseconds.
@@ -51,6 +59,8 @@ pub struct Clock {
     lengths: VecDeque<Length>,
     /// How old the newest measurements were when they came.
     ages: VecDeque<Length>,
+    /// When the last positions came.
+    arrivals: VecDeque<i64>,
     contradictions: u32,
 }
 
@@ -138,11 +148,41 @@ impl Clock {
         Some(stamp_ns)
     }
 
+    /// A position came.
+    pub fn position_arrived(&mut self, now_ns: i64) {
+        if self.arrivals.len() >= MAX_ARRIVALS {
+            self.arrivals.pop_front();
+        }
+        self.arrivals.push_back(now_ns);
+    }
+
     /// How slow the link is now, both ways together, in ns: by its round trips or, where that is more, twice the
-    /// age with which measurements come. Round trips are a second apart; a vehicle that descends is metres lower
-    /// before they tell. `None` while neither is known.
+    /// age with which measurements come; and by what it loses, as the next packet comes later. Round trips are a
+    /// second apart; a vehicle that descends is metres lower before they tell. `None` while neither is known.
     pub fn link_delay_ns(&self, now_ns: i64) -> Option<i64> {
-        self.slow_trip_ns(now_ns).max(self.two_ways_ns(now_ns))
+        let delay_ns = self.slow_trip_ns(now_ns).max(self.two_ways_ns(now_ns))?;
+        Some(delay_ns.saturating_add(self.losses_ns(now_ns)))
+    }
+
+    /// By how much losses delay what passes the link, both ways together: known by the pauses between positions. They
+    /// count with their squares, as in the mean age of the newest position.
+    fn losses_ns(&self, now_ns: i64) -> i64 {
+        let since_ns = now_ns.saturating_sub(PAUSES_NS);
+        let recent = self.arrivals.iter().copied().filter(|at_ns| *at_ns >= since_ns);
+        let mut last_ns = None;
+        let (mut sum_s, mut squares_s2) = (0.0, 0.0);
+        for at_ns in recent.chain([now_ns]) {
+            if let Some(last_ns) = last_ns.replace(at_ns) {
+                let pause_s = at_ns.saturating_sub(last_ns).max(0) as f64 * 1e-9;
+                sum_s += pause_s;
+                squares_s2 += pause_s * pause_s;
+            }
+        }
+        if sum_s <= 0.0 {
+            return 0;
+        }
+        let wait_ns = (0.5e9 * squares_s2 / sum_s) as i64;
+        wait_ns.saturating_sub(USUAL_WAIT_NS).max(0).saturating_mul(WAITS_PER_AGE)
     }
 
     /// Twice the age of the youngest of the last measurements on arrival.
@@ -261,6 +301,27 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn losses_count_as_a_delay_and_a_steady_stream_does_not() {
+        let delay_ms = |period_ms: i64, keeps: fn(i64) -> bool| {
+            let (mut clock, start_ns) = synchronised(&[(1, 1)], FIRST, 0);
+            let end_ms = 3000;
+            for ms in (0..end_ms).step_by(period_ms as usize) {
+                if keeps(ms / period_ms) {
+                    clock.position_arrived(start_ns + ms * MS);
+                }
+            }
+            clock.link_delay_ns(start_ns + end_ms * MS).unwrap() / MS
+        };
+        assert_eq!(delay_ms(20, |_| true), 2);
+        assert_eq!(delay_ms(50, |_| true), 2);
+        // Four of five are lost: one after the other, and sixteen in a row.
+        let lossy_ms = delay_ms(20, |i| i % 5 == 0);
+        let bursty_ms = delay_ms(20, |i| i % 20 < 4);
+        assert!((100..300).contains(&lossy_ms), "{lossy_ms} ms");
+        assert!(bursty_ms > 2 * lossy_ms, "{bursty_ms} and {lossy_ms} ms");
     }
 
     #[test]

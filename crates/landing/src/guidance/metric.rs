@@ -109,6 +109,10 @@ const UNATTENDED_BRAKING: f64 = 0.9;
 const USUAL_LINK_S: f64 = 0.05;
 const HALF_GAIN_S: f64 = 0.15;
 
+/// Least share of the lateral speed that is allowed at the touchdown over a slow link: what is not seen in time must be
+/// slower beforehand, but it has to land.
+const MIN_TOUCHDOWN_SHARE: f64 = 0.5;
+
 /// Longest interval between two steps that is counted, in seconds.
 const MAX_STEP_S: f64 = 0.1;
 
@@ -341,7 +345,8 @@ impl Metric {
         let max_m_s = TOUCHDOWN_M_S
             + TOUCHDOWN_PER_HEIGHT * height_m
             + TOUCHDOWN_PATIENCE_M_S2 * (self.waited_s(situation) - TOUCHDOWN_WAIT_S).max(0.0);
-        self.closing(situation, target).norm() / max_m_s.min(MAX_TOUCHDOWN_M_S)
+        let share = gentleness(extra_delay_s(situation)).max(MIN_TOUCHDOWN_SHARE);
+        self.closing(situation, target).norm() / (max_m_s.min(MAX_TOUCHDOWN_M_S) * share)
     }
 
     /// Notes since when the vehicle is low, and since when it stands still although commanded down.
@@ -380,7 +385,7 @@ impl Metric {
     ) -> Vector<Ned> {
         let config = &self.config;
         let delay_s = extra_delay_s(situation);
-        let gentle = HALF_GAIN_S / (HALF_GAIN_S + delay_s);
+        let gentle = gentleness(delay_s);
         let closing = self.closing(situation, target);
         let lead_s = config.acceleration_lead_s;
         let left = self.error(situation, target)
@@ -481,6 +486,11 @@ impl Metric {
 /// The part of the link's delay that `dead_time_s` does not contain, in seconds.
 fn extra_delay_s(situation: &Situation<'_>) -> f64 {
     (situation.link_delay_s - USUAL_LINK_S).max(0.0)
+}
+
+/// The factor of the gains over a link that is slower than usual by `delay_s`.
+fn gentleness(delay_s: f64) -> f64 {
+    HALF_GAIN_S / (HALF_GAIN_S + delay_s)
 }
 
 /// From `last` towards `wanted` by at most `step`; a descent ends at once, because the autopilot smooths it.

@@ -3,7 +3,7 @@
 
 use anyhow::Context;
 use autopilot::Parser;
-use messages::Detections;
+use messages::{Detections, Phase};
 use node::Layers;
 use world::World;
 use world::vehicle::VehicleTruth;
@@ -404,7 +404,10 @@ impl<'a> FaultyFlight<'a> {
                     self.start_s = Some(now_s);
                     self.world.begin();
                 }
-                (status.phase.name().to_owned(), status.why, is_terminal(status.phase))
+                // A controller that was started anew and hears no autopilot can do no more.
+                let is_deaf = self.is_on(Kind::SilenceFrom) || self.is_on(Kind::SilenceBoth);
+                let is_over = is_terminal(status.phase) || is_deaf && status.phase == Phase::Idle;
+                (status.phase.name().to_owned(), status.why, is_over)
             }
             None if self.is_on(Kind::ControllerKilled) => gone("gone"),
             None => gone("stopped"),
