@@ -27,59 +27,54 @@ impl EdgeSearch<'_> {
             return Some(false);
         }
         let [outer, gap, middle] = [0.45, 0.325, 0.2].map(|radius| self.on_circle(pose, radius));
-        let black = 0.5 * (outer?.median() + middle?.median());
-        let contrast = gap?.median() - black;
+        let black = 0.5 * (outer?.median + middle?.median);
+        let contrast = gap?.median - black;
         let whiteness = |grey: f64| (grey - black) / contrast;
-        let beside = self.on_circle(pose, 0.085)?.median();
+        let beside = self.on_circle(pose, 0.085)?.median;
         if beside.abs() >= SATURATED {
             return Some(false);
         }
         let [centre, ring] = [0.0, 0.02].map(|radius| self.on_circle(pose, radius));
-        let depth = whiteness(beside) - whiteness(centre?.median().min(ring?.median()));
+        let depth = whiteness(beside) - whiteness(centre?.median.min(ring?.median));
         let fading = |radius: f64| (-0.5 * (radius * diameter_px / BLUR_PX).powi(2)).exp();
         let expected = (fading(DOT[0]) - fading(DOT[1])).max(0.3);
         let is_white = whiteness(beside) > 0.6 && depth < MIN_DEPTH * expected;
         // A leaf on the middle covers more on one side.
         let [within, around] = [0.07, 0.12].map(|radius| self.on_circle(pose, radius));
-        let is_wide =
-            whiteness(around?.quartile()) > 0.45 && whiteness(within?.upper_quartile()) < 0.4;
+        let is_wide = whiteness(around?.quartile) > 0.45 && whiteness(within?.upper_quartile) < 0.4;
         Some(is_white || is_wide)
     }
 
     /// The grey values on a circle of this radius (in marker sizes), of a marker in white on black with the sign changed;
-    /// `None` where a part is outside the image.
+    /// `None` where half of it is outside the image.
     fn on_circle(&self, pose: &CirclePose, radius: f64) -> Option<CircleValues> {
         let (u, v) = pose.basis();
         let mut values = [0.0; PLACES];
-        for (i, value) in values.iter_mut().enumerate() {
+        let mut count = 0;
+        for i in 0..PLACES {
             let (sin, cos) = (i as f64 * std::f64::consts::TAU / PLACES as f64).sin_cos();
             let place = pose.centre + (u * cos + v * sin) * (radius * self.size_m);
             let at = project(place, self.camera)?;
-            let grey = bilinear(self.view, at.x, at.y)?;
-            *value = if self.white_on_black { -grey } else { grey };
+            if let Some((value, grey)) = values.get_mut(count).zip(bilinear(self.view, at.x, at.y))
+            {
+                *value = if self.white_on_black { -grey } else { grey };
+                count += 1;
+            }
         }
-        values.sort_unstable_by(f64::total_cmp);
-        Some(CircleValues(values))
+        let seen = values.get_mut(..count).filter(|seen| 2 * seen.len() >= PLACES)?;
+        seen.sort_unstable_by(f64::total_cmp);
+        let at = |part: f64| seen[((count - 1) as f64 * part).round() as usize];
+        Some(CircleValues { quartile: at(0.25), median: at(0.5), upper_quartile: at(0.75) })
     }
 }
 
 /// Number of places on a circle.
 const PLACES: usize = 16;
 
-/// Grey values on a circle, the darkest first.
+/// Grey values on a circle.
 #[derive(Copy, Clone)]
-struct CircleValues([f64; PLACES]);
-
-impl CircleValues {
-    fn median(&self) -> f64 {
-        0.5 * (self.0[PLACES / 2 - 1] + self.0[PLACES / 2])
-    }
-
-    fn quartile(&self) -> f64 {
-        self.0[PLACES / 4]
-    }
-
-    fn upper_quartile(&self) -> f64 {
-        self.0[PLACES - 1 - PLACES / 4]
-    }
+struct CircleValues {
+    quartile: f64,
+    median: f64,
+    upper_quartile: f64,
 }
