@@ -153,11 +153,11 @@ impl Mission {
             }
         }
         match &mut self.state {
-            State::AwaitingTakeoff if is_known => {
+            State::AwaitingTakeoff => {
                 let lands = autopilot.state().is_some_and(|state| {
                     state.armed && state.mode.is_landing() && state.landed.is_flying()
                 });
-                if is_flying_guided(autopilot) || lands && steers {
+                if is_known && (is_flying_guided(autopilot) || lands && steers) {
                     return Some(Trigger::InFlight);
                 }
                 if self.start == Start::Resume && has_no_landing(autopilot) {
@@ -193,11 +193,9 @@ impl Mission {
                     None
                 }
             },
-            State::Idle
-            | State::AwaitingTakeoff
-            | State::Landing
-            | State::SendingLandingTarget
-            | State::Failed { .. } => None,
+            State::Idle | State::Landing | State::SendingLandingTarget | State::Failed { .. } => {
+                None
+            }
         }
     }
 
@@ -207,8 +205,9 @@ impl Mission {
             self.disarmed_ns = self.disarmed_ns.or(Some(now_ns));
         }
         // Only `airborne` lands flight after flight; others wait for a command once the pilot has ended the
-        // flight.
-        if !armed && self.start != Start::Airborne && self.is_awaiting_takeoff() {
+        // flight. `resume` believes that only of a vehicle that does not fly.
+        let is_believed = !matches!(self.start, Start::Airborne | Start::Resume);
+        if !armed && is_believed && self.is_awaiting_takeoff() {
             self.state = State::Idle;
         }
         let is_over = is_finished && !matches!(self.state, State::Failed { .. });
@@ -227,11 +226,10 @@ pub fn is_flying_guided(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| s.armed && s.mode.is_guided() && s.landed.is_flying())
 }
 
-/// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot
-/// flies.
+/// True when there is no landing to resume: it has ended, though the motors may still run, or the pilot flies. A vehicle
+/// whose motors are said to be off, and not that it stands, may fly all the same.
 fn has_no_landing(autopilot: &Autopilot) -> bool {
     autopilot.state().is_some_and(|s| {
-        let stands = s.landed == LandedState::OnGround;
-        !s.armed || stands || !s.mode.is_guided() && !s.mode.is_landing()
+        s.landed == LandedState::OnGround || !s.mode.is_guided() && !s.mode.is_landing()
     })
 }

@@ -608,6 +608,22 @@ fn a_controller_restarted_after_touchdown_lands_no_later_flight() {
 }
 
 #[test]
+fn a_restarted_controller_does_not_believe_a_flying_vehicle_that_its_motors_are_off() {
+    let mut flight = flight("resume");
+    flight.presence(0, "main", true);
+    receive(&mut flight, 0, &heartbeat(4, false));
+    receive(&mut flight, MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    for ms in (20..2000).step_by(20) {
+        pose(&mut flight, ms * MS);
+        flight.tick(ms * MS + 1);
+    }
+    assert_eq!(flight.status(2000 * MS).phase, Phase::Idle);
+    receive(&mut flight, 2000 * MS, &heartbeat(4, true));
+    hover(&mut flight, 2020, 2500, 4);
+    assert_eq!(flight.status(2500 * MS).phase, Phase::Search);
+}
+
+#[test]
 fn a_controller_restarted_in_the_last_metre_of_land_resumes_the_landing() {
     for contact_at_start in
         [MavLandedState::MAV_LANDED_STATE_LANDING, MavLandedState::MAV_LANDED_STATE_IN_AIR]

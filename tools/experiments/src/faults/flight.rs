@@ -404,8 +404,10 @@ impl<'a> FaultyFlight<'a> {
                     self.start_s = Some(now_s);
                     self.world.begin();
                 }
-                // A controller that was started anew and hears no autopilot can do no more.
-                let is_deaf = self.is_on(Kind::SilenceFrom) || self.is_on(Kind::SilenceBoth);
+                // A controller that was started anew and hears no heartbeat can do no more.
+                let is_deaf = [Kind::SilenceFrom, Kind::SilenceBoth, Kind::HeartbeatMissing]
+                    .into_iter()
+                    .any(|kind| self.is_on(kind));
                 let is_over = is_terminal(status.phase) || is_deaf && status.phase == Phase::Idle;
                 (status.phase.name().to_owned(), status.why, is_over)
             }
