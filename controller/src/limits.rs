@@ -29,6 +29,9 @@ const MAX_ORIGINAL_S: f64 = 60.0;
 /// resume, and a vehicle that flies on with the last setpoint must have stopped.
 const QUIET_NS: i64 = 2_000_000_000;
 
+/// Steps in which late packets lengthen the setpoint timeout, in seconds.
+const BEHIND_STEP_S: f64 = 0.1;
+
 /// A parameter and the factor to SI units.
 #[derive(Copy, Clone, Debug)]
 struct Scaled {
@@ -128,7 +131,12 @@ impl Limits {
                 }
             }
         }
-        let limits = read(autopilot);
+        let mut limits = read(autopilot);
+        // A setpoint that arrives once more, late, makes the autopilot wait once more.
+        let behind_s = autopilot.packets_come_behind(now_ns).as_secs_f64();
+        limits.setpoint_timeout_s = limits
+            .setpoint_timeout_s
+            .map(|timeout_s| timeout_s + (behind_s / BEHIND_STEP_S).ceil() * BEHIND_STEP_S);
         let is_new = self.known != Some(limits);
         self.known = Some(limits);
         is_new.then_some(limits)

@@ -126,6 +126,13 @@ impl Mission {
         self.stand_down(self.start != Start::Resume);
     }
 
+    /// After a landing: `airborne` lands flight after flight.
+    fn await_next_flight(&mut self) {
+        if self.start == Start::Airborne {
+            self.stand_down(true);
+        }
+    }
+
     /// Ends the mission: nothing is sent any more, and no pending command is repeated.
     pub fn fail(&mut self, autopilot: &mut Autopilot, why: String) {
         autopilot.withdraw();
@@ -146,10 +153,12 @@ impl Mission {
             let is_ours = autopilot
                 .state()
                 .is_some_and(|s| s.armed && (s.mode.is_guided() || s.mode.is_landing()));
-            if now_ns > until_ns {
-                self.goes_on_until_ns = None;
-            } else if is_known && steers && is_ours {
+            if now_ns <= until_ns && is_known && steers && is_ours {
                 return Some(Trigger::ArmedAgain);
+            }
+            if now_ns > until_ns && is_known {
+                self.goes_on_until_ns = None;
+                self.await_next_flight();
             }
         }
         match &mut self.state {
@@ -214,8 +223,8 @@ impl Mission {
         if armed && is_over {
             let until_ns = self.disarmed_ns.map(|at_ns| at_ns.saturating_add(MAX_REARMED_NS));
             self.goes_on_until_ns = until_ns.filter(|until_ns| now_ns <= *until_ns);
-            if self.start == Start::Airborne {
-                self.stand_down(true);
+            if self.goes_on_until_ns.is_none() {
+                self.await_next_flight();
             }
         }
     }

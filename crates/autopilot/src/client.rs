@@ -292,6 +292,12 @@ impl Autopilot {
         self.late
     }
 
+    /// How far behind newer ones the autopilot's measurements came in the last seconds: over a link that repeats or
+    /// reorders packets an old setpoint may reach the autopilot as late.
+    pub fn packets_come_behind(&self, now_ns: i64) -> Duration {
+        Duration::from_nanos(self.clock.behind_ns(now_ns).unsigned_abs())
+    }
+
     /// Requests a command. It is sent with the next [`Autopilot::tick`], and replaces an earlier request of
     /// the same kind; [`Autopilot::status`] and [`Event::Command`] report its result.
     pub fn request(&mut self, now_ns: i64, command: Command) -> CommandId {
@@ -719,7 +725,11 @@ impl Autopilot {
         let Some(vehicle) = &mut self.vehicle else { return false };
         let is_present = match vehicle.boot.take(now_ns, boot_ms) {
             BootTime::Present => {
-                newest.is_none_or(|newest| boot_ms.wrapping_sub(newest).cast_signed() >= 0)
+                let ahead_ms =
+                    newest.map_or(0, |newest| boot_ms.wrapping_sub(newest).cast_signed());
+                let behind_ns = i64::from(ahead_ms).saturating_mul(-1_000_000);
+                self.clock.came_behind(now_ns, behind_ns);
+                ahead_ms >= 0
             }
             BootTime::Contradicts => false,
             BootTime::Restarted => {

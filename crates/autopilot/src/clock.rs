@@ -39,6 +39,8 @@ const USUAL_WAIT_NS: i64 = 25 * MS;
 /// What losses delay both ways together, per nanosecond of the positions' mean age beyond that: setpoints go out half as
 /// often as positions come, so theirs is twice as long, and a control loop must bear the long waits, not the mean one.
 const WAITS_PER_AGE: i64 = 5;
+/// Time for which what came behind newer measurements says how the link is, in nanoseconds.
+const MAX_BEHIND_AGE_NS: i64 = 10_000 * MS;
 /// Maximum drift between two clocks: 100 ppm.
 const DRIFT: f64 = 1e-4;
 /// Error of reading a clock, in nanoseconds.
@@ -61,6 +63,8 @@ pub struct Clock {
     ages: VecDeque<Length>,
     /// When the last positions came.
     arrivals: VecDeque<i64>,
+    /// What came latest behind newer measurements.
+    latest: Option<Length>,
     contradictions: u32,
 }
 
@@ -162,6 +166,19 @@ impl Clock {
     pub fn link_delay_ns(&self, now_ns: i64) -> Option<i64> {
         let delay_ns = self.slow_trip_ns(now_ns).max(self.two_ways_ns(now_ns))?;
         Some(delay_ns.saturating_add(self.losses_ns(now_ns)))
+    }
+
+    /// A measurement came behind one that is newer by `length_ns`: the link repeats or reorders packets.
+    pub fn came_behind(&mut self, now_ns: i64, length_ns: i64) {
+        if (1..=MAX_AGE_NS).contains(&length_ns) && length_ns >= self.behind_ns(now_ns) {
+            self.latest = Some(Length { at_ns: now_ns, length_ns });
+        }
+    }
+
+    /// How far behind newer ones packets have come in the last seconds, in ns.
+    pub fn behind_ns(&self, now_ns: i64) -> i64 {
+        let recent = |at: &Length| now_ns.saturating_sub(at.at_ns) <= MAX_BEHIND_AGE_NS;
+        self.latest.filter(recent).map_or(0, |at| at.length_ns)
     }
 
     /// By how much losses delay what passes the link, both ways together: known by the pauses between positions. They
@@ -301,6 +318,19 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn packets_that_come_again_tell_how_late_they_are_for_some_seconds() {
+        let mut clock = Clock::default();
+        assert_eq!(clock.behind_ns(0), 0);
+        for (at_ms, behind_ms) in [(0, 300), (100, 800), (200, 20), (300, 60_000), (400, -5)] {
+            clock.came_behind(at_ms * MS, behind_ms * MS);
+        }
+        assert_eq!(clock.behind_ns(10_100 * MS), 800 * MS);
+        assert_eq!(clock.behind_ns(10_101 * MS), 0);
+        clock.came_behind(10_200 * MS, 20 * MS);
+        assert_eq!(clock.behind_ns(10_200 * MS), 20 * MS);
     }
 
     #[test]
