@@ -215,6 +215,8 @@ async fn twenty_detectors_and_ten_dashboards_leave_the_latency_as_it_was(
         }
     };
     let targets = landing.node.subscriber(topic::TARGET, &[]).await?;
+    // Frames may be late while so many begin at once; then it is used again.
+    command(landing, ControllerCommand::UseDetector("main".into())).await?;
     let mut ratio = f64::INFINITY;
     // What else the machine does comes and goes.
     for _ in 0..3 {
@@ -226,8 +228,11 @@ async fn twenty_detectors_and_ten_dashboards_leave_the_latency_as_it_was(
         for i in 0..10 {
             tasks.push(tokio::spawn(dashboard(open(format!("dashboard-{i}")).await?)));
         }
-        let many = landing.status("all are known", |s| s.candidates.len() == 21).await?;
-        ensure!(many.active_detector.as_deref() == Some("main"), "{:?}", many.active_detector);
+        landing
+            .status("all are known, and the chosen one is used", |s| {
+                s.candidates.len() == 21 && s.active_detector.as_deref() == Some("main")
+            })
+            .await?;
         let [many_ms, many_99_ms] = ages(&targets, Duration::from_secs(8)).await?;
         ratio = many_ms / alone_ms;
         println!(
