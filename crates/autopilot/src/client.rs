@@ -724,13 +724,7 @@ impl Autopilot {
     fn is_present(&mut self, now_ns: i64, boot_ms: u32, newest: Option<u32>) -> bool {
         let Some(vehicle) = &mut self.vehicle else { return false };
         let is_present = match vehicle.boot.take(now_ns, boot_ms) {
-            BootTime::Present => {
-                let ahead_ms =
-                    newest.map_or(0, |newest| boot_ms.wrapping_sub(newest).cast_signed());
-                let behind_ns = i64::from(ahead_ms).saturating_mul(-1_000_000);
-                self.clock.came_behind(now_ns, behind_ns);
-                ahead_ms >= 0
-            }
+            BootTime::Present => self.clock.is_newest(now_ns, boot_ms, newest),
             BootTime::Contradicts => false,
             BootTime::Restarted => {
                 self.restarted();

@@ -168,8 +168,15 @@ impl Clock {
         Some(delay_ns.saturating_add(self.losses_ns(now_ns)))
     }
 
-    /// A measurement came behind one that is newer by `length_ns`: the link repeats or reorders packets.
-    pub fn came_behind(&mut self, now_ns: i64, length_ns: i64) {
+    /// True for a measurement that is at least as new as the newest before, by their times since the autopilot's start. How
+    /// far it comes behind is noted: the link repeats or reorders packets.
+    pub fn is_newest(&mut self, now_ns: i64, boot_ms: u32, newest_ms: Option<u32>) -> bool {
+        let ahead_ms = newest_ms.map_or(0, |newest| boot_ms.wrapping_sub(newest).cast_signed());
+        self.came_behind(now_ns, i64::from(ahead_ms).saturating_mul(-MS));
+        ahead_ms >= 0
+    }
+
+    fn came_behind(&mut self, now_ns: i64, length_ns: i64) {
         if (1..=MAX_AGE_NS).contains(&length_ns) && length_ns >= self.behind_ns(now_ns) {
             self.latest = Some(Length { at_ns: now_ns, length_ns });
         }
