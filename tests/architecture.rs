@@ -32,12 +32,15 @@ const NODE: (&str, &[&str]) = ("node", &["messages"]);
 const AIRLINK: (&str, &[&str]) = ("airlink", &["imaging", "messages", "node"]);
 /// Files that people bring: images, videos, calibrations.
 const MEDIA: (&str, &[&str]) = ("media", &["geometry", "imaging"]);
-const SERVICES: [&str; 4] = ["camera-pub", "controller", "detector", "gcs-bridge"];
+const SERVICES: [&str; 5] = ["camera-pub", "controller", "detector", "gcs-bridge", "recorder"];
+/// What a recording is.
+const FLIGHTLOG: (&str, &[&str]) = ("flightlog", &["autopilot", "messages"]);
 /// What a service or a tool may know.
-const ROOMS: [&str; 10] = [
+const ROOMS: [&str; 11] = [
     "airlink",
     "autopilot",
     "fiducial",
+    "flightlog",
     "geometry",
     "imaging",
     "landing",
@@ -57,8 +60,8 @@ const FUZZ: &str = "fuzz";
 /// The tool that stands above others: it calls their pure parts in lock-step.
 const EXPERIMENTS: (&str, [&str; 3]) = ("experiments", ["controller", "detector", "simulator"]);
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
-const ALIGHT: [&str; 7] =
-    ["fiducial", "geometry", "imaging", "markers", "media", "messages", "node"];
+const ALIGHT: [&str; 8] =
+    ["fiducial", "flightlog", "geometry", "imaging", "markers", "media", "messages", "node"];
 
 /// Crates of algorithms but for these modules, which have the threads, the clock and the network.
 const WITH_THREADS: [(&str, &[&str]); 2] =
@@ -233,7 +236,7 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let names: BTreeSet<&str> = workspace.iter().map(|p| p.name.as_str()).collect();
     let crates: BTreeMap<_, _> =
-        ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK, MEDIA]).collect();
+        ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK, MEDIA, FLIGHTLOG]).collect();
     for package in &workspace {
         let allowed: BTreeSet<&str> = match crates.get(package.name.as_str()) {
             Some(allowed) => allowed.iter().copied().collect(),
@@ -470,12 +473,13 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
             }
         }
     }
-    // All that have a configuration are services of the network, and `node` publishes the health of each; of the
-    // relay as well, which has nothing to configure.
+    // All that have a configuration are services of the network, and `node` publishes health and configuration of each;
+    // the health of the relay as well, which has nothing to configure.
     let with_defaults = workspace.iter().filter(|p| defaults(p).is_file());
-    let services = with_defaults.map(|p| p.name.as_str()).chain(["relay"]);
-    let health = "health/{service}/{instance}";
-    publishers.insert(("HEALTH".to_owned(), health), services.collect());
+    let configured: BTreeSet<&str> = with_defaults.map(|p| p.name.as_str()).collect();
+    let services = configured.iter().copied().chain(["relay"]).collect();
+    publishers.insert(("HEALTH".to_owned(), "health/{service}/{instance}"), services);
+    publishers.insert(("CONFIGURATION".to_owned(), "config/{service}/{instance}"), configured);
     for ((name, key), found) in &publishers {
         let replies = name.ends_with("_REPLY");
         let of_row =

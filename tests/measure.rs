@@ -5,6 +5,7 @@
 //! cargo bench -p tests -- kills [TIMES]       kill each process so often (20)
 //! cargo bench -p tests -- swaps [TIMES]       swap detectors so often in one flight (100)
 //! cargo bench -p tests -- freezes             freeze each process (SIGSTOP) for 0.5, 2, 5 and 30 s
+//! cargo bench -p tests -- recorder [TIMES]    kill the recorder so often in one flight at 30 frames a second (50)
 //! cargo bench -p tests -- link [NAME...]      the trials on a bad radio link, or some of them
 //! ```
 
@@ -17,6 +18,8 @@ mod kills;
 mod link;
 #[path = "link/onehost.rs"]
 mod onehost;
+#[path = "recording/recorders.rs"]
+mod recorders;
 #[path = "link/setpoint.rs"]
 mod setpoint;
 mod swaps;
@@ -41,14 +44,20 @@ fn main() -> ExitCode {
                 Ok(())
             }
             Some("freezes") => freeze_each(&[0.5, 2.0, 5.0, 30.0]).await,
+            Some("recorder") => {
+                let fast = ["--set", "simulator.camera.rate_hz=30"];
+                recorders::kills(times(50)?, &fast).await
+            }
             Some("link") => table(&args[1..]).await,
             Some("reader") => {
                 println!("{}", onehost::reader(args.get(1).context("reader PORT")?).await?);
                 Ok(())
             }
-            Some(other) => bail!("`{other}` is not measured: kills, swaps, freezes and link are"),
+            Some(other) => {
+                bail!("`{other}` is not measured: kills, swaps, freezes, recorder and link are")
+            }
             None => {
-                println!("Nothing is measured: say kills, swaps, freezes or link");
+                println!("Nothing is measured: say kills, swaps, freezes, recorder or link");
                 Ok(())
             }
         }

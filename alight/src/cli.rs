@@ -9,7 +9,9 @@ use node::{ConfigError, Layers};
 use crate::args::ServiceArgs;
 use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
-use crate::{command, detect, detectors, doctor, experiment, keys, land, marker, relay, swap, up};
+use crate::{
+    command, detect, detectors, doctor, experiment, keys, land, marker, record, relay, swap, up,
+};
 
 /// Exit status for an invalid command line or configuration.
 const WRONG_USE: u8 = 2;
@@ -39,6 +41,9 @@ enum Command {
     Controller(ServiceArgs),
     /// Talk to the ground station.
     GcsBridge(ServiceArgs),
+    /// Record all topics to a file, or end a file properly whose recorder was killed.
+    #[command(alias = "recorder")]
+    Record(record::RecordArgs),
     /// Simulate a world with wind, a pad, a vehicle, an autopilot and a camera.
     Simulator(ServiceArgs),
     /// Relay messages between the processes on the drone and the ground.
@@ -86,6 +91,7 @@ pub(crate) fn run() -> ExitCode {
         Command::Detector(args) => services::run(Service::Detector, &args),
         Command::Controller(args) => services::run(Service::Controller, &args),
         Command::GcsBridge(args) => services::run(Service::GcsBridge, &args),
+        Command::Record(args) => record::run(&args),
         Command::Simulator(args) => services::run(Service::Simulator, &args),
         Command::Relay(args) => relay::run(&args),
         Command::Keys(args) => keys::run(&args),

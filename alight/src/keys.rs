@@ -102,6 +102,8 @@ pub(crate) enum Role {
     Controller,
     /// Forwards MAVLink between the autopilot and the ground station.
     GcsBridge,
+    /// Subscribes, and publishes what it has recorded.
+    Recorder,
     /// Simulates camera and vehicle.
     Simulator,
 }

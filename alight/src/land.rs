@@ -18,6 +18,7 @@ use crate::args::{Format, OPERATOR};
 use crate::children::{ChildEvent, Children};
 use crate::outcome::LandingSummary;
 use crate::progress::Progress;
+use crate::record::file_setting;
 use crate::runtime::{runtime, tool_identity};
 use crate::services::Service;
 use crate::terminal::{print, write_error};
@@ -59,6 +60,10 @@ pub(crate) struct LandArgs {
     /// Give up after this many seconds, from 1 to 86400.
     #[arg(long, default_value_t = 300.0, value_name = "SECONDS", value_parser = timeout_s)]
     timeout_s: f64,
+    /// Record the landing to this file (MCAP, `docs/recording.md`); one that is there is kept, and the new one gets a
+    /// number.
+    #[arg(long, value_name = "FILE.mcap")]
+    record: Option<PathBuf>,
     /// Format of the result: a table, or one JSON object on the last line.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
@@ -72,10 +77,6 @@ fn timeout_s(text: &str) -> Result<f64, String> {
         Err("must be from 1 to 86400".to_owned())
     }
 }
-
-/// The services of a landing, in starting order.
-const SERVICES: [Service; 4] =
-    [Service::Simulator, Service::Detector, Service::Controller, Service::GcsBridge];
 
 /// The loopback interface.
 pub(crate) const LOOPBACK: &str = "127.0.0.1";
@@ -124,7 +125,7 @@ fn confirm_real_vehicle(args: &LandArgs, settings: &ServiceSettings) -> anyhow::
     Ok(())
 }
 
-/// The settings of each service.
+/// The settings of each service, in starting order.
 struct ServiceSettings {
     by_service: Vec<(Service, Vec<String>)>,
 }
@@ -178,6 +179,9 @@ impl ServiceSettings {
             (Service::Controller, controller),
             (Service::GcsBridge, ground_station(args.autopilot.as_deref())),
         ];
+        if let Some(file) = &args.record {
+            by_service.insert(0, (Service::Recorder, vec![file_setting(file)]));
+        }
         for setting in &args.set {
             let named = by_service.iter_mut().find_map(|(service, settings)| {
                 let key = setting.strip_prefix(service.name())?.strip_prefix('.')?;
@@ -187,7 +191,7 @@ impl ServiceSettings {
                 return Err(node::ConfigError::UnknownKey {
                     source_name: format!("--set {setting}"),
                     key: setting.split('=').next().unwrap_or_default().to_owned(),
-                    hint: "; a setting begins with its service: simulator., detector., controller. or gcs-bridge.".to_owned(),
+                    hint: "; a setting begins with its service: simulator., detector., controller., gcs-bridge., or with `--record` recorder.".to_owned(),
                 }
                 .into());
             };
@@ -233,8 +237,8 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         rendezvous.file.display()
     ));
     let mut children = Children::new();
-    for service in SERVICES {
-        let started = children.start(service, &rendezvous.file, settings.of(service))?;
+    for (service, settings) in &settings.by_service {
+        let started = children.start(*service, &rendezvous.file, settings)?;
         progress.debug(&started);
     }
     let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s);
@@ -257,6 +261,7 @@ async fn watch(
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let truths = node.subscriber(topic::TRUTH, &[]).await?;
     let healths = node.subscriber(topic::HEALTH, &[]).await?;
+    let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
     let mut landing = LandingSummary::default();
     let mut over: Option<Instant> = None;
     let mut redraw = tokio::time::interval(Duration::from_millis(200));
@@ -271,6 +276,7 @@ async fn watch(
             }
             Some(truth) = truths.next() => landing.truth(truth),
             Some(health) = healths.next() => landing.health(health),
+            Some(recorder) = recorders.next() => landing.recorder(recorder),
             Some(event) = children.next() => match event {
                 ChildEvent::Line(service, line) => {
                     progress.say(&format!("{}: {line}", service.name()));
@@ -283,10 +289,10 @@ async fn watch(
                         return Ok(landing);
                     }
                     progress.say(&format!("{} exited: {exit}{}", service.name(), consequence(service)));
-                    // The landing does not need the ground station.
+                    // The landing needs neither ground station nor recording.
                     let is_needed = landing.never_flew()
                         && match service {
-                            Service::GcsBridge => false,
+                            Service::GcsBridge | Service::Recorder => false,
                             // Not needed if it was swapped, or another one runs.
                             Service::Detector => {
                                 !another_detector(node, settings).await.unwrap_or(false)
@@ -328,6 +334,7 @@ fn consequence(service: Service) -> &'static str {
             "; the autopilot stops the vehicle, and a restarted controller resumes the landing"
         }
         Service::GcsBridge => "; the landing continues without the ground station",
+        Service::Recorder => "; the landing continues, and is recorded no more",
         Service::Simulator | Service::CameraPub => "",
     }
 }

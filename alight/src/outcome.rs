@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
-use messages::{ControllerStatus, Health, Truth};
+use messages::{ControllerStatus, Health, RecorderStatus, Truth};
 use serde::Serialize;
 
 /// The thesis' one simulated flight (section 4.4.3).
@@ -23,6 +23,7 @@ pub(crate) struct LandingSummary {
     interrupted: Option<String>,
     /// Detections used by earlier controllers.
     detections_before: u64,
+    recorder: Option<RecorderStatus>,
 }
 
 /// The result of a landing.
@@ -41,6 +42,17 @@ pub(crate) struct Outcome {
     latency_ms: Option<Percentiles>,
     guidance: String,
     processes: Vec<Process>,
+    recording: Option<Recording>,
+}
+
+/// What was recorded of it.
+#[derive(Serialize)]
+struct Recording {
+    /// The last file.
+    file: String,
+    kept: u64,
+    dropped: u64,
+    problem: Option<String>,
 }
 
 /// Median and 99th percentile.
@@ -82,6 +94,10 @@ impl LandingSummary {
         let key = (health.service.clone(), health.pid);
         let span = self.healths.entry(key).or_insert_with(|| (health.clone(), health.clone()));
         span.1 = health;
+    }
+
+    pub(crate) fn recorder(&mut self, recorder: RecorderStatus) {
+        self.recorder = Some(recorder);
     }
 
     /// Notes why the landing was not watched to its end.
@@ -136,6 +152,12 @@ impl LandingSummary {
                 .map(|[p50, p99]| Percentiles { p50, p99 }),
             guidance: status.map_or_else(String::new, |s| s.guidance.clone()),
             processes: self.processes(),
+            recording: self.recorder.as_ref().map(|recorder| Recording {
+                file: recorder.file.clone(),
+                kept: recorder.kept,
+                dropped: recorder.dropped.iter().map(|loss| loss.count).sum(),
+                problem: recorder.problem.clone(),
+            }),
         }
     }
 
@@ -188,6 +210,10 @@ impl Outcome {
                 "{name:34} {:>14}",
                 format!("{:.0} % of a core", process.cpu_percent)
             ));
+        }
+        if let Some(Recording { file, kept, dropped, problem }) = &self.recording {
+            let problem = problem.as_ref().map_or_else(String::new, |it| format!("; {it}"));
+            line(format_args!("recorded {kept} messages, lost {dropped}: {file}{problem}"));
         }
         text.truncate(text.trim_end().len());
         text

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::ValueEnum;
 use node::access::key_name;
-use node::{INSECURE, Identity, Layers, Network, Node, Settings, Shutdown};
+use node::{Effective, INSECURE, Identity, Layers, Network, Node, Settings, Shutdown};
 
 use crate::args::ServiceArgs;
 use crate::runtime::runtime;
@@ -25,18 +25,21 @@ pub(crate) enum Service {
     Controller,
     /// Topics to and from the ground station.
     GcsBridge,
+    /// Topics to a file.
+    Recorder,
     /// A simulated world: vehicle, autopilot, camera.
     Simulator,
 }
 
 impl Service {
-    /// The name of the service: of its subcommand, its package, and its topic keys.
+    /// The name of the service: of its subcommand (the recorder's is also `record`), its package, and its topic keys.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::CameraPub => "camera-pub",
             Self::Detector => "detector",
             Self::Controller => "controller",
             Self::GcsBridge => "gcs-bridge",
+            Self::Recorder => "recorder",
             Self::Simulator => "simulator",
         }
     }
@@ -48,6 +51,7 @@ impl Service {
             Self::Detector => layers.load::<detector::Config>()?.table,
             Self::Controller => layers.load::<controller::Config>()?.table,
             Self::GcsBridge => layers.load::<gcs_bridge::Config>()?.table,
+            Self::Recorder => layers.load::<recorder::Config>()?.table,
             Self::Simulator => layers.load::<simulator::Config>()?.table,
         })
     }
@@ -71,6 +75,9 @@ pub(crate) fn run(service: Service, args: &ServiceArgs) -> anyhow::Result<ExitCo
         }
         Service::GcsBridge => {
             serve(service, args, |c: &gcs_bridge::Config| c.id.clone(), gcs_bridge::run)
+        }
+        Service::Recorder => {
+            serve(service, args, |c: &recorder::Config| c.id.clone(), recorder::run)
         }
         Service::Simulator => {
             serve(service, args, |c: &simulator::Config| c.id.clone(), simulator::run)
@@ -99,14 +106,18 @@ where
     Fut: Future<Output = anyhow::Result<()>>,
 {
     let layers = Layers { file: args.config.clone(), set: args.set.clone() };
-    let config = layers.load::<C>()?.settings;
+    let Effective { settings: config, table } = layers.load::<C>()?;
     let identity = Identity { service: service.name(), instance: instance(&config) };
     let network = args.network.network();
     let zenoh = network.source(&key_name(service.name(), &identity.instance))?;
     runtime()?
-        .block_on(node::run(identity, &zenoh, |node, shutdown| {
+        .block_on(node::run(identity, &zenoh, async |node, shutdown| {
             tell_if_open(&node, &network);
-            run(node, config, shutdown)
+            let told = node.clone();
+            tokio::select! {
+                result = run(node, config, shutdown) => result,
+                result = told.publish_configuration(table.to_string()) => result,
+            }
         }))
         .with_context(|| format!("running {}", service.name()))?;
     Ok(ExitCode::SUCCESS)

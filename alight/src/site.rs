@@ -65,7 +65,7 @@ pub(crate) struct Site {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Entry {
-    /// A service: camera-pub, detector, controller, gcs-bridge, simulator.
+    /// A service: camera-pub, detector, controller, gcs-bridge, recorder, simulator.
     run: Option<String>,
     /// Or another program with its arguments.
     command: Option<Vec<String>>,
@@ -219,7 +219,7 @@ impl Site {
                     source_name: "the site".to_owned(),
                     key: "run".to_owned(),
                     value: run.clone(),
-                    limit: "must be camera-pub, detector, controller, gcs-bridge or simulator"
+                    limit: "must be camera-pub, detector, controller, gcs-bridge, recorder or simulator"
                         .to_owned(),
                 })?;
                 (Some(service), vec!["alight".to_owned(), service.name().to_owned()])

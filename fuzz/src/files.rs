@@ -1,4 +1,4 @@
-//! What a person brings as files: images, videos, calibrations.
+//! What a person brings as files: images, videos, calibrations, recordings.
 
 use std::path::{Path, PathBuf};
 
@@ -49,6 +49,15 @@ pub fn calibration(input: &[u8]) {
     if let Ok(model) = read_calibration(&path) {
         let pixel = model.project(geometry::Point::new(0.1, -0.2, 1.0));
         assert!(pixel.is_none_or(|pixel| !pixel.x.is_nan() && !pixel.y.is_nan()));
+    }
+}
+
+/// A recording to repair: what is kept of it is whole.
+pub fn recording(input: &[u8]) {
+    let mut mended = Vec::new();
+    if let Ok(found) = flightlog::repair(input, &mut mended) {
+        let again = flightlog::repair(&mended, std::io::sink());
+        assert!(again.is_ok_and(|it| it.damage.is_empty() && it.messages == found.messages));
     }
 }
 

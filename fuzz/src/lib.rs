@@ -27,7 +27,7 @@ pub const MAX_MEMORY_MB: u64 = 512;
 pub const MAX_TIME_S: u64 = 20;
 
 /// All targets.
-pub const TARGETS: [Target; 11] = [
+pub const TARGETS: [Target; 12] = [
     Target { name: "codec", read: payloads::codec, max_len: 4096 },
     Target { name: "mavlink", read: payloads::mavlink, max_len: 4096 },
     Target { name: "airlink", read: payloads::airlink, max_len: 16_384 },
@@ -36,6 +36,7 @@ pub const TARGETS: [Target; 11] = [
     Target { name: "mp4", read: files::mp4, max_len: 16_384 },
     Target { name: "h264", read: files::h264, max_len: 16_384 },
     Target { name: "calibration", read: files::calibration, max_len: 4096 },
+    Target { name: "recording", read: files::recording, max_len: 16_384 },
     Target { name: "pad", read: texts::pad, max_len: 4096 },
     Target { name: "configuration", read: texts::configuration, max_len: 4096 },
     Target { name: "marker", read: texts::marker, max_len: 256 },

@@ -32,6 +32,7 @@ pub fn configuration(input: &[u8]) {
         load::<detector::Config>(&layers);
         load::<camera_pub::Config>(&layers);
         load::<gcs_bridge::Config>(&layers);
+        load::<recorder::Config>(&layers);
         load::<simulator::Config>(&layers);
     }
 }

@@ -11,7 +11,9 @@ use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
 use autopilot::permission::Refusal;
 use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Permission, Sender};
-use messages::{ControllerStatus, Health, MavlinkBytes, Phase, TargetEstimate, topic};
+use messages::{
+    ControllerStatus, Health, MavlinkBytes, Phase, RecorderStatus, TargetEstimate, topic,
+};
 use node::{HealthCounters, INSECURE, Node, Shutdown, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
 
@@ -45,6 +47,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let controllers = node.presence("controller").await?;
     // A relay that takes anybody's commands says so in its health.
     let relays = node.subscriber(topic::HEALTH, &["relay", "*"]).await?;
+    let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
     let mut second = interval(HEARTBEAT);
     second.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut bridge = Bridge::new(&config, ground.sender(), node.shared_health())?;
@@ -68,6 +71,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                 bridge.controller(now_ns(), controller, is_there);
             }
             health = relays.next() => bridge.relay(now_ns(), &health.context(CLOSED)?),
+            status = recorders.next() => bridge.recorder(now_ns(), &status.context(CLOSED)?),
             _ = second.tick() => {
                 bridge.count_losses(ground.counters(), ground.dropped());
                 bridge.count_strangers(ground.strangers());
@@ -79,6 +83,9 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
 
 /// Maximum number of controllers that are followed; there is one, and another while it is replaced.
 const MAX_CONTROLLERS: usize = 16;
+/// Maximum number of recorders whose problems are told, and of characters of a problem.
+const MAX_RECORDERS: usize = 16;
+const MAX_PROBLEM_CHARS: usize = 120;
 /// Minimum pause between two texts about refused packets, in nanoseconds.
 const REFUSAL_PAUSE_NS: i64 = 5_000_000_000;
 
@@ -105,6 +112,8 @@ struct Bridge {
     is_insecure: bool,
     /// The ground station has been told so.
     insecure_told: bool,
+    /// Recorders of which the ground station has been told that they keep nothing.
+    not_recording: BTreeSet<String>,
     ground_ns: Option<i64>,
     /// Bytes that are not packets, and packets not read in time, as counted so far.
     bad_bytes: u64,
@@ -138,6 +147,7 @@ impl Bridge {
             is_abandoned: false,
             is_insecure: false,
             insecure_told: false,
+            not_recording: BTreeSet::new(),
             ground_ns: None,
             bad_bytes: 0,
             unread: 0,
@@ -235,6 +245,27 @@ impl Bridge {
     fn relay(&mut self, now_ns: i64, health: &Health) {
         self.is_insecure |= health.errors.iter().any(|error| error.reason == INSECURE);
         self.tell_insecure(now_ns);
+    }
+
+    /// Tells that a recorder keeps nothing, and when it does again.
+    fn recorder(&mut self, now_ns: i64, status: &RecorderStatus) {
+        let was_told = self.not_recording.contains(&status.recorder);
+        match &status.problem {
+            Some(problem) if !was_told && self.not_recording.len() < MAX_RECORDERS => {
+                let short: String = problem.chars().take(MAX_PROBLEM_CHARS).collect();
+                let text = format!("Alight: not recording: {short}");
+                if self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text) {
+                    self.not_recording.insert(status.recorder.clone());
+                }
+            }
+            None if was_told => {
+                let text = "Alight: recording again";
+                if self.send_text(now_ns, MavSeverity::MAV_SEVERITY_INFO, text) {
+                    self.not_recording.remove(&status.recorder);
+                }
+            }
+            Some(_) | None => {}
+        }
     }
 
     /// Tells each ground station once that anybody may command the vehicle.

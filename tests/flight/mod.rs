@@ -85,7 +85,8 @@ impl Landing {
         let mut lines = BufReader::new(land.stderr.take().context("standard error")?).lines();
         let mut services = Vec::new();
         let mut zenoh = None;
-        while services.len() < 4 {
+        let number = if args.contains(&"--record") { 5 } else { 4 };
+        while services.len() < number {
             let line = lines.next().context("alight land said nothing")??;
             if let Some(rest) = line.split("--zenoh ").nth(1).filter(|_| zenoh.is_none()) {
                 zenoh = rest.split_whitespace().next().map(PathBuf::from);

@@ -1,4 +1,4 @@
-//! Health of a service.
+//! What every service publishes: its health and its configuration.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,6 +6,22 @@ use crate::codec::wire;
 
 wire! {
     Health = 12 v 2;
+    Configuration = 17 v 1;
+}
+
+/// The configuration that a service started with.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Configuration {
+    /// The service.
+    pub service: String,
+    /// Name of this instance.
+    pub instance: String,
+    /// The host's name.
+    pub host: String,
+    /// The program's version.
+    pub version: String,
+    /// All keys with their values, as TOML.
+    pub toml: String,
 }
 
 /// A service's health over the last second.

@@ -14,6 +14,7 @@ pub mod controller;
 pub mod convert;
 pub mod detector;
 pub mod health;
+pub mod recorder;
 pub mod sample;
 pub mod simulation;
 pub mod topic;
@@ -31,7 +32,8 @@ pub use detector::{
     AlternativePose, Detection, Detections, DetectorCommand, DetectorInfo, MarkerPose, Place,
     StageTime,
 };
-pub use health::{Count, Health, Latency, Rate};
+pub use health::{Configuration, Count, Health, Latency, Rate};
+pub use recorder::{RecorderLoss, RecorderStatus};
 pub use simulation::{Touchdown, Truth, Wind};
 pub use topic::{Delivery, Row, TOPICS, Topic};
 pub use vehicle::{LandedState, MavlinkBytes, VehicleState};

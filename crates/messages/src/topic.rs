@@ -8,7 +8,8 @@ use crate::camera::{CameraInfo, FrameAck, FrameHeader};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
 use crate::detector::{Detections, DetectorCommand, DetectorInfo};
-use crate::health::Health;
+use crate::health::{Configuration, Health};
+use crate::recorder::RecorderStatus;
 use crate::simulation::{Truth, Wind};
 use crate::vehicle::{MavlinkBytes, VehicleState};
 
@@ -156,11 +157,20 @@ pub const FROM_AUTOPILOT: Topic<MavlinkBytes> =
 /// Packets for the autopilot.
 pub const TO_AUTOPILOT: Topic<MavlinkBytes> =
     Topic::new("mavlink/to-autopilot", Delivery::Reliable, &["gcs-bridge", "simulator"]);
+/// What a recorder has kept, and what not.
+pub const RECORDER_STATUS: Topic<RecorderStatus> =
+    Topic::new("recorder/{recorder}/status", Delivery::LastValue, &["recorder"]);
 /// Health of a service.
 pub const HEALTH: Topic<Health> = Topic::new(
     "health/{service}/{instance}",
     Delivery::LastValue,
-    &["camera-pub", "controller", "detector", "gcs-bridge", "relay", "simulator"],
+    &["camera-pub", "controller", "detector", "gcs-bridge", "recorder", "relay", "simulator"],
+);
+/// The configuration that a service started with.
+pub const CONFIGURATION: Topic<Configuration> = Topic::new(
+    "config/{service}/{instance}",
+    Delivery::LastValue,
+    &["camera-pub", "controller", "detector", "gcs-bridge", "recorder", "simulator"],
 );
 
 /// Key of the liveliness token a service declares when it is ready.
@@ -193,7 +203,9 @@ pub const TOPICS: &[Row] = &[
     TRUTH.row,
     FROM_AUTOPILOT.row,
     TO_AUTOPILOT.row,
+    RECORDER_STATUS.row,
     HEALTH.row,
+    CONFIGURATION.row,
 ];
 
 #[cfg(test)]

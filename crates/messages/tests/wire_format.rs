@@ -1,11 +1,12 @@
 //! The bytes on the wire: they change only with a version.
 
 use messages::{
-    AlternativePose, BayerPattern, CameraInfo, Candidate, CommandReply, ControllerCommand,
-    ControllerStatus, Count, DecodeError, Detection, Detections, DetectorCommand, DetectorInfo,
-    DetectorState, FrameAck, FrameHeader, FramePart, Health, LandedState, Latency, LensModel,
-    MarkerPose, MavlinkBytes, Message, Phase, PixelFormat, Place, Rate, Setpoint, StageTime,
-    TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind, decode, encode,
+    AlternativePose, BayerPattern, CameraInfo, Candidate, CommandReply, Configuration,
+    ControllerCommand, ControllerStatus, Count, DecodeError, Detection, Detections,
+    DetectorCommand, DetectorInfo, DetectorState, FrameAck, FrameHeader, FramePart, Health,
+    LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, Phase, PixelFormat, Place,
+    Rate, RecorderLoss, RecorderStatus, Setpoint, StageTime, TargetEstimate, Touchdown, Transform3,
+    Truth, VehicleState, Wind, decode, encode,
 };
 use proptest::prelude::*;
 
@@ -100,6 +101,33 @@ fn detections() {
         &message,
         "410303046d61696e04646f776eac0201016302900acc070000010572696e677300000000000000f03f00000000000000400000803f000000000000004000000000000000084001000000000000f03f0100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000e03f000000000000803f0000004000004040000080400000a0400000c0400000e0400000004100001041000020410000304100004041000050410000604100007041000080410000884100009041000098410000a0410100000000000000000000000000000000000000000000f03f000000000000f03f000000000000000000000000000000000000000000000000000000000000f03f01097468726573686f6c6407",
     );
+}
+
+#[test]
+fn configuration() {
+    let message = Configuration {
+        service: "detector".into(),
+        instance: "main".into(),
+        host: "h".into(),
+        version: "0.1.0".into(),
+        toml: "a = 1".into(),
+    };
+    check(&message, "411101086465746563746f72046d61696e016805302e312e300561203d2031");
+}
+
+#[test]
+fn recorder_status() {
+    let message = RecorderStatus {
+        recorder: "main".into(),
+        stamp_ns: -1,
+        file: "f".into(),
+        bytes: 300,
+        waiting_bytes: 1,
+        kept: 2,
+        dropped: vec![RecorderLoss { key: "wind".into(), count: 3 }],
+        problem: Some("x".into()),
+    };
+    check(&message, "411201046d61696e010166ac020102010477696e6403010178");
 }
 
 #[test]

@@ -5,9 +5,9 @@
 //!
 //! Modules in reading order: [`config`] merges a user's settings into the defaults; [`service`] runs a
 //! service from start to shutdown; [`network`] configures the network, with the rights of others from
-//! [`access`], and [`session`] joins it under an [`identity`]; [`topics`] has typed messages and [`frames`]
-//! pixels; [`health`] counts, with [`stats`]; [`denied`] counts what access control denies; [`clock`] is the
-//! host's clock.
+//! [`access`], and [`session`] joins it under an [`identity`]; [`topics`] has typed messages, [`frames`] pixels,
+//! and [`tap`] everything as it came; [`health`] counts, with [`stats`]; [`denied`] counts what access control
+//! denies; [`clock`] is the host's clock.
 
 pub mod access;
 pub mod clock;
@@ -20,6 +20,7 @@ pub mod network;
 pub mod service;
 pub mod session;
 pub mod stats;
+pub mod tap;
 pub mod topics;
 
 pub use clock::{clock_name, host_name, now_ns};
@@ -30,4 +31,5 @@ pub use identity::Identity;
 pub use network::{INSECURE, Network};
 pub use service::{Options, Shutdown, relaunch, relaunch_with_zenoh_threads, run, start_logging};
 pub use session::{Node, Presence, ZenohSource};
+pub use tap::{Tap, Tapped};
 pub use topics::{Commands, Publisher, Request, Subscriber};

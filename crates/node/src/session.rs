@@ -5,12 +5,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail};
-use messages::topic;
+use messages::{Configuration, topic};
 use zenoh::handlers::RingChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::sample::{Sample, SampleKind};
 
-use crate::clock::now_ns;
+use crate::clock::{host_name, now_ns};
 use crate::health::HealthCounters;
 use crate::identity::Identity;
 
@@ -35,6 +35,9 @@ const PRESENCE_TIMEOUT: Duration = Duration::from_millis(500);
 /// rendezvous, so that a single early check would miss some.
 const CLAIM_CHECK_DELAYS: [Duration; 3] =
     [Duration::ZERO, Duration::from_millis(200), Duration::from_millis(500)];
+
+/// Period of a service's configuration.
+const CONFIGURATION_PERIOD: Duration = Duration::from_secs(3);
 
 /// Timeout for closing the session.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(300);
@@ -239,6 +242,27 @@ impl Node {
         loop {
             second.tick().await;
             publisher.publish(&self.health.report(&self.identity, self.started_ns)).await;
+        }
+    }
+
+    /// Publishes the service's configuration, every few seconds for those that come late, until it fails.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub async fn publish_configuration(&self, toml: String) -> anyhow::Result<()> {
+        let names = [self.identity.service, self.identity.instance.as_str()];
+        let publisher = self.publisher(topic::CONFIGURATION, &names).await?;
+        let configuration = Configuration {
+            service: self.identity.service.to_owned(),
+            instance: self.identity.instance.clone(),
+            host: host_name(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            toml,
+        };
+        let mut due = tokio::time::interval(CONFIGURATION_PERIOD);
+        loop {
+            due.tick().await;
+            publisher.publish(&configuration).await;
         }
     }
 

@@ -9,12 +9,13 @@ use serde_json::Value;
 use zenoh::key_expr::KeyExpr;
 
 /// The roles of the certificates, and their names in the topic table.
-const ROLES: [(&str, &str); 7] = [
+const ROLES: [(&str, &str); 8] = [
     ("camera-pub", "camera-pub"),
     ("controller", "controller"),
     ("detector", "detector"),
     ("gcs-bridge", "gcs-bridge"),
     ("operator", "alight"),
+    ("recorder", "recorder"),
     ("simulator", "simulator"),
     ("observer", "nobody"),
 ];

@@ -176,7 +176,7 @@ fn file_of(role: &str) -> String {
     node::access::key_name(role, "ground")
 }
 
-const ROLES: [&str; 8] = [
+const ROLES: [&str; 9] = [
     "drone",
     "operator",
     "observer",
@@ -184,6 +184,7 @@ const ROLES: [&str; 8] = [
     "detector.ground",
     "controller",
     "gcs-bridge",
+    "recorder",
     "simulator",
 ];
 

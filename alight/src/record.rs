@@ -1,0 +1,82 @@
+//! `alight record`: the recorder, and the repair of a file whose recorder was killed.
+
+use std::fs::{File, OpenOptions};
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, ensure};
+use clap::Args;
+
+use crate::args::ServiceArgs;
+use crate::services::{self, Service};
+use crate::terminal::print;
+
+/// How far a recorder stands back when the processor is short.
+const NICENESS: i32 = 5;
+
+/// The arguments of a recorder.
+#[derive(Args, Clone)]
+pub(crate) struct RecordArgs {
+    /// The recording, an MCAP file: short for `--set file=FILE`. With `--repair`: the repaired copy [default:
+    /// NAME-repaired.mcap beside it].
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// End a recording properly whose recorder was killed, or save what is whole of a damaged one, as a copy. Exit status
+    /// 0 when it was whole, 1 when something is missing.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["config", "set"])]
+    repair: Option<PathBuf>,
+    #[command(flatten)]
+    service: ServiceArgs,
+}
+
+/// Records, or repairs.
+pub(crate) fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
+    if let Some(file) = &args.repair {
+        return repair(file, args.output.as_deref());
+    }
+    // Behind the flight: a recorder may be late, the others may not.
+    let _ = rustix::process::nice(NICENESS);
+    let mut service = args.service.clone();
+    service.set.extend(args.output.as_deref().map(file_setting));
+    services::run(Service::Recorder, &service)
+}
+
+/// The setting of a recorder's file.
+pub(crate) fn file_setting(file: &Path) -> String {
+    format!("file={}", toml::Value::from(&*file.to_string_lossy()))
+}
+
+fn repair(file: &Path, output: Option<&Path>) -> anyhow::Result<ExitCode> {
+    let recording = std::fs::read(file).with_context(|| format!("reading {file:?}"))?;
+    let found = flightlog::repair(&recording, std::io::sink())
+        .with_context(|| format!("{file:?} is no recording (MCAP file) that could be repaired"))?;
+    if found.damage.is_empty() {
+        print(&format!("{} is whole: {} messages", file.display(), found.messages))?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let stem = file.file_stem().unwrap_or_default().to_string_lossy();
+    let beside = file.with_file_name(format!("{stem}-repaired.mcap"));
+    let output = output.unwrap_or(&beside);
+    let doing = || format!("writing {output:?}; name another file with `-o`");
+    ensure!(!output.exists(), "{output:?} is there already; name another file with `-o`");
+    let copy: File =
+        OpenOptions::new().write(true).create_new(true).open(output).with_context(doing)?;
+    let mut buffered = BufWriter::new(copy);
+    let found = flightlog::repair(&recording, &mut buffered).with_context(doing)?;
+    buffered
+        .into_inner()
+        .map_err(std::io::IntoInnerError::into_error)
+        .and_then(|f| f.sync_all())
+        .with_context(doing)?;
+    for damage in &found.damage {
+        print(&format!("{}: {damage}", file.display()))?;
+    }
+    print(&format!(
+        "{}: {} messages in {} chunks",
+        output.display(),
+        found.messages,
+        found.chunks
+    ))?;
+    Ok(ExitCode::FAILURE)
+}

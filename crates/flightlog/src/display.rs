@@ -1,0 +1,438 @@
+//! What Foxglove shows of messages: pictures and what was found in them, poses, a map, a log; and what is kept as files
+//! within the recording.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::f64::consts::FRAC_1_SQRT_2;
+
+use autopilot::Parser;
+use autopilot::dialect::MavMessage;
+use messages::{
+    BayerPattern, CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo,
+    FrameHeader, Health, LensModel, MavlinkBytes, Phase, PixelFormat, TargetEstimate, Truth,
+    VehicleState, decode, topic,
+};
+
+use crate::channel::{Received, Record, Schema, matches};
+use crate::foxglove::{self, Calibration, FrameTransform, Level, Outline, Pixels, Place, Pose};
+use crate::protobuf::MessageType;
+
+/// Name of the world's coordinate frame as viewers have it: x east, y north, z up.
+const MAP: &str = "map";
+/// Name of the autopilot's local frame: x north, y east, z down.
+const WORLD: &str = "local_ned";
+/// Name of the vehicle's coordinate frame.
+const BODY: &str = "body";
+/// The local frame in the map.
+const MAP_FROM_NED: FrameTransform<'static> = FrameTransform {
+    parent: MAP,
+    child: WORLD,
+    translation_m: [0.0; 3],
+    rotation_wxyz: [0.0, FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0.0],
+};
+/// Maximum number of lines and files that are remembered in order not to repeat them; further ones are left out.
+const MAX_REMEMBERED: usize = 4096;
+
+/// What is kept of a frame.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Picture {
+    /// Its header.
+    None,
+    /// A JPEG file beside its header.
+    Jpeg(Vec<u8>),
+    /// Its pixels beside its header.
+    Pixels,
+}
+
+/// A file within the recording.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct File {
+    /// Its name.
+    pub name: String,
+    /// What it holds, as a media type.
+    pub media_type: &'static str,
+    /// Its contents.
+    pub data: Vec<u8>,
+}
+
+/// Turns messages into what is shown; remembers what was said.
+#[derive(Debug, Default)]
+pub struct Display {
+    /// Added to stamps, so that they count from 1970.
+    utc_offset_ns: i64,
+    status: Option<(Phase, String)>,
+    warnings: Vec<String>,
+    said: BTreeSet<String>,
+    files: BTreeMap<String, Vec<u8>>,
+}
+
+impl Display {
+    /// Nothing was shown yet; `utc_offset_ns` is the time since 1970 less that of the clock of all stamps.
+    pub fn new(utc_offset_ns: i64) -> Self {
+        Self { utc_offset_ns, ..Self::default() }
+    }
+
+    /// What is shown of a message.
+    pub(crate) fn records(&mut self, message: Received<'_>) -> Vec<Record> {
+        let Received { key, payload, received_ns, .. } = message;
+        let is = |pattern: String| matches(&pattern, key);
+        let records = if is(topic::DETECTIONS.key(&[])) {
+            decode(payload).ok().map(|found| self.detections(&found))
+        } else if is(topic::VEHICLE_STATE.key(&[])) {
+            decode(payload).ok().map(|state| self.vehicle(&state))
+        } else if is(topic::TARGET.key(&[])) {
+            decode(payload).ok().map(|target| self.target(&target))
+        } else if is(topic::STATUS.key(&[])) {
+            decode(payload).ok().map(|status| self.log(&status))
+        } else if is(topic::TRUTH.key(&[])) {
+            decode(payload).ok().map(|truth| self.truth(&truth))
+        } else if is(topic::CAMERA_INFO.key(&[])) {
+            decode(payload).ok().map(|info| self.camera(received_ns, &info))
+        } else if is(topic::DETECTOR_INFO.key(&[])) {
+            decode(payload).ok().map(|info| self.detector(received_ns, &info))
+        } else if is(topic::HEALTH.key(&[])) {
+            decode(payload).ok().map(|health| self.health(received_ns, &health))
+        } else if is(topic::FROM_AUTOPILOT.key(&[])) {
+            decode(payload).ok().map(|bytes| self.packet(received_ns, &bytes))
+        } else {
+            None
+        };
+        records.unwrap_or_default()
+    }
+
+    /// What is kept of a message as a file, when it is new.
+    pub(crate) fn file(&mut self, message: Received<'_>) -> Option<File> {
+        let file = if matches(&topic::CONFIGURATION.key(&[]), message.key) {
+            let Configuration { service, instance, toml, .. } = decode(message.payload).ok()?;
+            let name = format!("configuration/{service}-{instance}.toml");
+            File { name, media_type: "application/toml", data: toml.into_bytes() }
+        } else if matches(&topic::CAMERA_INFO.key(&[]), message.key) {
+            let info: CameraInfo = decode(message.payload).ok()?;
+            let name = format!("calibration/{}.json", info.camera);
+            let data = serde_json::to_vec_pretty(&info).ok()?;
+            File { name, media_type: "application/json", data }
+        } else {
+            return None;
+        };
+        let is_full = self.files.len() >= MAX_REMEMBERED && !self.files.contains_key(&file.name);
+        let is_known = self.files.get(&file.name) == Some(&file.data);
+        if is_full || is_known {
+            return None;
+        }
+        self.files.insert(file.name.clone(), file.data.clone());
+        Some(file)
+    }
+
+    /// A frame as a picture.
+    pub(crate) fn picture(
+        &self,
+        header: &FrameHeader,
+        pixels: &[u8],
+        picture: &Picture,
+    ) -> Option<Record> {
+        let (at_ns, frame_id) = (self.utc(header.stamp_ns), frame_name(&header.camera));
+        let (schema, data) = match picture {
+            Picture::None => return None,
+            Picture::Jpeg(file) => {
+                (&foxglove::COMPRESSED_IMAGE, foxglove::compressed_image(at_ns, &frame_id, file))
+            }
+            Picture::Pixels if header.format == PixelFormat::Jpeg => {
+                (&foxglove::COMPRESSED_IMAGE, foxglove::compressed_image(at_ns, &frame_id, pixels))
+            }
+            Picture::Pixels => {
+                let row_bytes = pixels.len() / header.height.max(1) as usize;
+                let image = Pixels {
+                    width: header.width,
+                    height: header.height,
+                    encoding: encoding(header.format),
+                    row_bytes: u32::try_from(row_bytes).ok()?,
+                    bytes: pixels,
+                };
+                (&foxglove::RAW_IMAGE, foxglove::raw_image(at_ns, &frame_id, &image))
+            }
+        };
+        let channel = format!("camera/{}/picture", header.camera);
+        Some(shown(channel, schema, header.stamp_ns, data))
+    }
+
+    fn utc(&self, stamp_ns: i64) -> i64 {
+        stamp_ns.saturating_add(self.utc_offset_ns)
+    }
+
+    /// What a detector found, with the stamp of the frame.
+    fn detections(&self, found: &Detections) -> Vec<Record> {
+        let outlines: Vec<Outline> = found
+            .detections
+            .iter()
+            .map(|it| Outline {
+                centre_px: it.centre_px,
+                corners_px: it.corners_px,
+                size_px: it.size_px,
+                text: it.id.map_or_else(|| it.family.clone(), |id| format!("{}:{id}", it.family)),
+            })
+            .collect();
+        let poses: Vec<Pose> = found
+            .detections
+            .iter()
+            .filter_map(|it| it.pose)
+            .map(|it| Pose {
+                position_m: it.camera_from_marker.translation_m,
+                orientation_wxyz: it.camera_from_marker.rotation_wxyz,
+            })
+            .collect();
+        let (stamp_ns, name) = (found.header.stamp_ns, &found.detector);
+        let at_ns = self.utc(stamp_ns);
+        let overlay = foxglove::image_annotations(at_ns, &outlines);
+        let poses = foxglove::poses_in_frame(at_ns, &frame_name(&found.header.camera), &poses);
+        vec![
+            shown(
+                format!("detector/{name}/overlay"),
+                &foxglove::IMAGE_ANNOTATIONS,
+                stamp_ns,
+                overlay,
+            ),
+            shown(format!("detector/{name}/poses"), &foxglove::POSES_IN_FRAME, stamp_ns, poses),
+        ]
+    }
+
+    fn vehicle(&self, state: &VehicleState) -> Vec<Record> {
+        let body = FrameTransform {
+            parent: WORLD,
+            child: BODY,
+            translation_m: state.position_ned_m,
+            rotation_wxyz: state.ned_from_body_wxyz,
+        };
+        vec![self.transforms(state.stamp_ns, &[MAP_FROM_NED, body])]
+    }
+
+    fn target(&self, target: &TargetEstimate) -> Vec<Record> {
+        let Some(position_m) = target.position_ned_m else { return Vec::new() };
+        let (sin, cos) = (0.5 * target.heading_rad.unwrap_or(0.0)).sin_cos();
+        let pose = Pose { position_m, orientation_wxyz: [cos, 0.0, 0.0, sin] };
+        let data = foxglove::poses_in_frame(self.utc(target.stamp_ns), WORLD, &[pose]);
+        let channel = "controller/target/pose".to_owned();
+        vec![shown(channel, &foxglove::POSE_IN_FRAME, target.stamp_ns, data)]
+    }
+
+    fn truth(&mut self, truth: &Truth) -> Vec<Record> {
+        let body = FrameTransform {
+            parent: WORLD,
+            child: "true_body",
+            translation_m: truth.position_ned_m,
+            rotation_wxyz: truth.ned_from_body_wxyz,
+        };
+        let pad = FrameTransform {
+            parent: WORLD,
+            child: "true_pad",
+            translation_m: truth.pad_ned_m,
+            rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+        };
+        let mut records = vec![self.transforms(truth.stamp_ns, &[body, pad])];
+        if let Some(touchdown) = truth.touchdown {
+            let text = format!(
+                "touchdown {:.3} m from the pad's centre, {:.2} m/s down, {:.2} m/s sideways",
+                touchdown.error_m, touchdown.vertical_speed_m_s, touchdown.lateral_speed_m_s
+            );
+            records.extend(self.once(truth.stamp_ns, Level::Info, "world", &text));
+        }
+        records
+    }
+
+    fn camera(&self, stamp_ns: i64, info: &CameraInfo) -> Vec<Record> {
+        let frame_id = frame_name(&info.camera);
+        let mount = FrameTransform {
+            parent: BODY,
+            child: &frame_id,
+            translation_m: info.body_from_camera.translation_m,
+            rotation_wxyz: info.body_from_camera.rotation_wxyz,
+        };
+        let mut records = vec![self.transforms(stamp_ns, &[mount])];
+        if let Some(focal_px) = info.focal_px {
+            let (model, distortion) = match &info.lens {
+                LensModel::Pinhole => ("", &[][..]),
+                LensModel::BrownConrady(numbers) => ("rational_polynomial", &numbers[..]),
+                LensModel::KannalaBrandt(numbers) => ("kannala_brandt", &numbers[..]),
+            };
+            let calibration = Calibration {
+                frame_id: &frame_id,
+                width: info.width,
+                height: info.height,
+                model,
+                distortion,
+                focal_px,
+                centre_px: info.principal_px,
+            };
+            let channel = format!("camera/{}/calibration", info.camera);
+            let data = foxglove::camera_calibration(self.utc(stamp_ns), &calibration);
+            records.push(shown(channel, &foxglove::CAMERA_CALIBRATION, stamp_ns, data));
+        }
+        records
+    }
+
+    /// Lines for what has changed: the phase and its reason, and warnings.
+    fn log(&mut self, status: &ControllerStatus) -> Vec<Record> {
+        let mut lines = Vec::new();
+        let now = (status.phase, status.why.clone());
+        if self.status.as_ref() != Some(&now) {
+            lines.push((Level::Info, format!("{}: {}", status.phase.name(), status.why)));
+            self.status = Some(now);
+        }
+        let new = status.warnings.iter().filter(|warning| !self.warnings.contains(warning));
+        lines.extend(new.map(|warning| (Level::Warning, warning.clone())));
+        self.warnings.clone_from(&status.warnings);
+        lines
+            .iter()
+            .map(|(level, text)| self.line(status.stamp_ns, *level, "controller", text))
+            .collect()
+    }
+
+    fn detector(&mut self, stamp_ns: i64, info: &DetectorInfo) -> Vec<Record> {
+        let DetectorInfo { detector, host, markers, version, pid, .. } = info;
+        let markers = markers.join(", ");
+        let text = format!(
+            "detector {detector} is process {pid} on {host}, looks for {markers} ({version})"
+        );
+        self.once(stamp_ns, Level::Info, "detector", &text).into_iter().collect()
+    }
+
+    /// A line for each process, and one for each kind of failure.
+    fn health(&mut self, stamp_ns: i64, health: &Health) -> Vec<Record> {
+        let Health { service, instance, host, version, pid, .. } = health;
+        let process = format!("{service} {instance} is process {pid} on {host}, alight {version}");
+        let mut records: Vec<Record> =
+            self.once(stamp_ns, Level::Info, service, &process).into_iter().collect();
+        for error in &health.errors {
+            let text = format!("{service} {instance}, process {pid}: {}", error.reason);
+            records.extend(self.once(stamp_ns, Level::Warning, service, &text));
+        }
+        records
+    }
+
+    /// The place that an autopilot reports.
+    fn packet(&self, stamp_ns: i64, bytes: &MavlinkBytes) -> Vec<Record> {
+        let packets = Parser::new().push(&bytes.packet);
+        let places = packets.iter().filter_map(|packet| match packet.message.as_ref()? {
+            // Zero is what it says before it knows.
+            MavMessage::GLOBAL_POSITION_INT(at) if at.lat != 0 || at.lon != 0 => Some(Place {
+                latitude_deg: f64::from(at.lat) * 1e-7,
+                longitude_deg: f64::from(at.lon) * 1e-7,
+                altitude_m: f64::from(at.alt) * 1e-3,
+            }),
+            _ => None,
+        });
+        places
+            .map(|place| {
+                let data = foxglove::location_fix(self.utc(stamp_ns), BODY, place);
+                shown("vehicle/location".to_owned(), &foxglove::LOCATION_FIX, stamp_ns, data)
+            })
+            .collect()
+    }
+
+    fn transforms(&self, stamp_ns: i64, transforms: &[FrameTransform<'_>]) -> Record {
+        let data = foxglove::frame_transforms(self.utc(stamp_ns), transforms);
+        shown("tf".to_owned(), &foxglove::FRAME_TRANSFORMS, stamp_ns, data)
+    }
+
+    /// A line that is not repeated.
+    fn once(&mut self, stamp_ns: i64, level: Level, name: &str, text: &str) -> Option<Record> {
+        if self.said.len() >= MAX_REMEMBERED || !self.said.insert(text.to_owned()) {
+            return None;
+        }
+        Some(self.line(stamp_ns, level, name, text))
+    }
+
+    fn line(&self, stamp_ns: i64, level: Level, name: &str, text: &str) -> Record {
+        let data = foxglove::log(self.utc(stamp_ns), level, name, text);
+        shown("log".to_owned(), &foxglove::LOG, stamp_ns, data)
+    }
+}
+
+fn shown(channel: String, schema: &'static MessageType, stamp_ns: i64, data: Vec<u8>) -> Record {
+    Record { channel, schema: Schema::Protobuf(schema), stamp_ns, data }
+}
+
+/// Name of a camera's coordinate frame.
+fn frame_name(camera: &str) -> String {
+    format!("camera_{camera}")
+}
+
+/// Foxglove's name for the layout of a frame's pixels.
+fn encoding(format: PixelFormat) -> &'static str {
+    match format {
+        PixelFormat::Mono8 => "mono8",
+        PixelFormat::Bayer8(BayerPattern::Rggb) => "bayer_rggb8",
+        PixelFormat::Bayer8(BayerPattern::Grbg) => "bayer_grbg8",
+        PixelFormat::Bayer8(BayerPattern::Gbrg) => "bayer_gbrg8",
+        PixelFormat::Bayer8(BayerPattern::Bggr) => "bayer_bggr8",
+        PixelFormat::Jpeg => "jpeg",
+        // It has no name for Bayer patterns of more than 8 bits: shown as they are, grey.
+        PixelFormat::Mono10
+        | PixelFormat::Mono12
+        | PixelFormat::Mono16
+        | PixelFormat::Bayer10(_)
+        | PixelFormat::Bayer12(_)
+        | PixelFormat::Bayer16(_) => "mono16",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use autopilot::dialect::GLOBAL_POSITION_INT_DATA;
+    use autopilot::{Sender, packet};
+    use messages::{Message, encode};
+
+    use super::*;
+
+    fn records(display: &mut Display, key: &str, message: &impl Message) -> Vec<Record> {
+        let payload = encode(message);
+        display.records(Received { key, payload: &payload, attachment: b"", received_ns: 9 })
+    }
+
+    fn has(record: &Record, bytes: &[u8]) -> bool {
+        record.data.windows(bytes.len()).any(|window| window == bytes)
+    }
+
+    #[test]
+    fn picture_and_overlay_have_the_same_stamp() {
+        let mut display = Display::new(1_700_000_000_000_000_000);
+        let header = FrameHeader { stamp_ns: 123_456_789, ..FrameHeader::sample() };
+        let picture = display.picture(&header, b"", &Picture::Jpeg(vec![1])).unwrap();
+        let found = Detections { header, ..Detections::sample() };
+        let overlay = &records(&mut display, "detector/main/detections", &found)[0];
+        assert_eq!(overlay.stamp_ns, picture.stamp_ns);
+        // 1 700 000 000 s and 123 456 789 ns.
+        let stamp = [0x08, 0x80, 0xe2, 0xcf, 0xaa, 0x06, 0x10, 0x95, 0x9a, 0xef, 0x3a];
+        assert!(has(overlay, &stamp) && has(&picture, &stamp));
+    }
+
+    #[test]
+    fn a_place_comes_from_the_autopilots_own_position() {
+        let message = MavMessage::GLOBAL_POSITION_INT(GLOBAL_POSITION_INT_DATA {
+            lat: 473_977_418,
+            lon: 85_455_938,
+            alt: 488_000,
+            ..GLOBAL_POSITION_INT_DATA::default()
+        });
+        let packet = packet::encode(Sender { system: 1, component: 1 }, 0, &message);
+        let bytes = MavlinkBytes { packet };
+        let records = records(&mut Display::default(), "mavlink/from-autopilot", &bytes);
+        assert_eq!(records[0].channel, "vehicle/location");
+        assert!(has(&records[0], &(473_977_418.0 * 1e-7_f64).to_le_bytes()));
+    }
+
+    #[test]
+    fn lines_and_files_are_not_repeated() {
+        let mut display = Display::default();
+        let status = ControllerStatus { why: "no marker".into(), ..ControllerStatus::default() };
+        assert_eq!(records(&mut display, "controller/status", &status).len(), 1);
+        assert_eq!(records(&mut display, "controller/status", &status).len(), 0);
+        let payload = encode(&CameraInfo::sample());
+        let info = Received {
+            key: "camera/down/info",
+            payload: &payload,
+            attachment: b"",
+            received_ns: 9,
+        };
+        assert_eq!(display.file(info).unwrap().name, "calibration/down.json");
+        assert_eq!(display.file(info), None);
+    }
+}

@@ -1,0 +1,21 @@
+//! What a recording is: its channels, their schemas, and the MCAP file.
+//!
+//! A recording keeps every message twice: byte for byte ([`channel::RAW`]), and as JSON or as one of Foxglove's
+//! well-known types, for programs that know nothing of Alight. This crate knows no network and no clock, and writes to
+//! whatever is given.
+//!
+//! Modules in reading order: [`protobuf`] describes and encodes messages, [`foxglove`] has those of Foxglove,
+//! [`channel`] says what a record is and keeps messages as they came and as JSON, [`display`] as Foxglove shows them;
+//! [`writer`] puts both into a file, [`repair`] ends a file properly whose writer was killed.
+
+pub mod channel;
+pub mod display;
+pub mod foxglove;
+pub mod protobuf;
+pub mod repair;
+pub mod writer;
+
+pub use channel::{Received, Record, Schema};
+pub use display::Picture;
+pub use repair::{Repaired, repair};
+pub use writer::{About, Problem, Writer};

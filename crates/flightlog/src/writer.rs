@@ -1,0 +1,198 @@
+//! A recording's file: MCAP, append-only.
+//!
+//! Chunks are gathered in memory and written whole, so a killed writer loses what came after the last
+//! [`Writer::flush`] and nothing before it.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::io::Write;
+
+use mcap::Attachment;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::write::{NoSeek, WriteOptions};
+use messages::FrameHeader;
+
+use crate::channel::{self, RAW, Received, Record, Schema};
+use crate::display::{Display, Picture};
+use crate::protobuf::descriptor_set;
+
+/// Size at which a chunk is written, in bytes.
+const CHUNK_BYTES: u64 = 1 << 20;
+/// Name of the channel that counts what could not be kept.
+pub const DROPPED_CHANNEL: &str = "recorder/dropped";
+/// Name of the metadata about a recording.
+pub const METADATA: &str = "alight";
+/// A JSON schema that allows any object: the messages' own types say more, and are in the documents.
+const ANY_OBJECT: &[u8] = br#"{"type":"object"}"#;
+
+/// Why a recording cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum Problem {
+    /// The file did not take it, or is none.
+    #[error("{0}")]
+    Mcap(#[from] mcap::McapError),
+}
+
+/// What a recording is of.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct About {
+    /// The program and its version.
+    pub program: String,
+    /// Facts by name: the host, the clock.
+    pub facts: BTreeMap<String, String>,
+    /// Time since 1970 less that of the clock of all stamps, in nanoseconds: the file's own times count from 1970.
+    pub utc_offset_ns: i64,
+}
+
+/// Writes a recording.
+pub struct Writer<W: Write> {
+    mcap: mcap::Writer<NoSeek<W>>,
+    open: BTreeMap<String, Open>,
+    display: Display,
+    utc_offset_ns: i64,
+}
+
+/// A channel in the file.
+#[derive(Copy, Clone, Debug)]
+struct Open {
+    id: u16,
+    sequence: u32,
+}
+
+impl<W: Write> Writer<W> {
+    /// Begins a recording.
+    ///
+    /// # Errors
+    /// When the output does not take it.
+    pub fn new(output: W, about: &About) -> Result<Self, Problem> {
+        let options = WriteOptions::new()
+            .compression(None)
+            .chunk_size(Some(CHUNK_BYTES))
+            .disable_seeking(true)
+            .profile("")
+            .library(about.program.clone());
+        let mut mcap = options.create(NoSeek::new(output))?;
+        let mut metadata = about.facts.clone();
+        metadata.insert("program".to_owned(), about.program.clone());
+        metadata.insert("utc_offset_ns".to_owned(), about.utc_offset_ns.to_string());
+        mcap.write_metadata(&Metadata { name: METADATA.to_owned(), metadata })?;
+        let utc_offset_ns = about.utc_offset_ns;
+        Ok(Self {
+            mcap,
+            open: BTreeMap::new(),
+            display: Display::new(utc_offset_ns),
+            utc_offset_ns,
+        })
+    }
+
+    /// Adds a message: as it came, as JSON, and as Foxglove shows it. One that cannot be decoded is kept as it came.
+    ///
+    /// # Errors
+    /// When the output does not take it; the recording is then at its end.
+    pub fn receive(&mut self, message: Received<'_>) -> Result<(), Problem> {
+        if let Some(file) = self.display.file(message) {
+            let log_time = self.utc(message.received_ns);
+            self.mcap.attach(&Attachment {
+                log_time,
+                create_time: log_time,
+                name: file.name,
+                media_type: file.media_type.to_owned(),
+                data: Cow::Owned(file.data),
+            })?;
+        }
+        self.write(message.received_ns, &channel::raw(message))?;
+        if let Some(record) = channel::as_json(message) {
+            self.write(message.received_ns, &record)?;
+        }
+        for record in self.display.records(message) {
+            self.write(message.received_ns, &record)?;
+        }
+        Ok(())
+    }
+
+    /// Adds a frame: its header as it came and as JSON, and the picture.
+    ///
+    /// # Errors
+    /// As [`Writer::receive`].
+    pub fn frame(
+        &mut self,
+        message: Received<'_>,
+        header: &FrameHeader,
+        picture: &Picture,
+    ) -> Result<(), Problem> {
+        self.write(message.received_ns, &channel::raw(Received { payload: b"", ..message }))?;
+        self.write(message.received_ns, &channel::header_as_json(message, header))?;
+        if let Some(record) = self.display.picture(header, message.payload, picture) {
+            self.write(message.received_ns, &record)?;
+        }
+        Ok(())
+    }
+
+    /// Writes how many messages of each key could not be kept so far, on [`DROPPED_CHANNEL`].
+    ///
+    /// # Errors
+    /// As [`Writer::receive`].
+    pub fn dropped(&mut self, now_ns: i64, so_far: &BTreeMap<String, u64>) -> Result<(), Problem> {
+        let record = Record {
+            channel: DROPPED_CHANNEL.to_owned(),
+            schema: Schema::Json("Dropped"),
+            stamp_ns: now_ns,
+            data: serde_json::to_vec(so_far).unwrap_or_default(),
+        };
+        self.write(now_ns, &record)
+    }
+
+    /// Hands everything so far to the output.
+    ///
+    /// # Errors
+    /// As [`Writer::receive`].
+    pub fn flush(&mut self) -> Result<(), Problem> {
+        Ok(self.mcap.flush()?)
+    }
+
+    /// Ends the recording with its index.
+    ///
+    /// # Errors
+    /// As [`Writer::receive`].
+    pub fn finish(mut self) -> Result<(), Problem> {
+        self.mcap.finish()?;
+        Ok(())
+    }
+
+    /// Adds a record that came at `received_ns`.
+    fn write(&mut self, received_ns: i64, record: &Record) -> Result<(), Problem> {
+        let (log_time, publish_time) = (self.utc(received_ns), self.utc(record.stamp_ns));
+        let channel = self.channel(record)?;
+        channel.sequence = channel.sequence.wrapping_add(1);
+        let header = MessageHeader {
+            channel_id: channel.id,
+            sequence: channel.sequence,
+            log_time,
+            publish_time,
+        };
+        Ok(self.mcap.write_to_known_channel(&header, &record.data)?)
+    }
+
+    fn utc(&self, stamp_ns: i64) -> u64 {
+        u64::try_from(stamp_ns.saturating_add(self.utc_offset_ns)).unwrap_or(0)
+    }
+
+    fn channel(&mut self, record: &Record) -> Result<&mut Open, Problem> {
+        if !self.open.contains_key(&record.channel) {
+            let (schema, encoding) = match record.schema {
+                Schema::Raw => (0, RAW),
+                Schema::Json(name) => {
+                    let name = format!("alight.{name}");
+                    (self.mcap.add_schema(&name, "jsonschema", ANY_OBJECT)?, "json")
+                }
+                Schema::Protobuf(message) => {
+                    let types = descriptor_set(message);
+                    (self.mcap.add_schema(message.name, "protobuf", &types)?, "protobuf")
+                }
+            };
+            let id = self.mcap.add_channel(schema, &record.channel, encoding, &BTreeMap::new())?;
+            self.open.insert(record.channel.clone(), Open { id, sequence: 0 });
+        }
+        Ok(self.open.entry(record.channel.clone()).or_insert(Open { id: 0, sequence: 0 }))
+    }
+}

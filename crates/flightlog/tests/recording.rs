@@ -1,0 +1,118 @@
+//! A recording is written, cut, damaged, repaired and read again.
+
+#![expect(clippy::unwrap_used, reason = "a test fails by a panic")]
+
+use flightlog::channel::{RAW_PREFIX, Received, split_raw};
+use flightlog::{About, Writer, repair};
+use messages::{Wind, encode};
+
+const MESSAGES: usize = 60;
+
+fn wind(number: usize) -> Wind {
+    Wind { velocity_ned_m_s: [number as f64, 0.0, 0.0], stamp_ns: number as i64 }
+}
+
+/// A recording with a chunk for every ten messages; without an end when `is_killed`.
+fn recording(is_killed: bool) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let about = About { program: "alight".into(), ..About::default() };
+    let mut writer = Writer::new(&mut bytes, &about).unwrap();
+    for number in 0..MESSAGES {
+        let payload = encode(&wind(number));
+        let received_ns = number as i64;
+        writer
+            .receive(Received { key: "wind", payload: &payload, attachment: b"", received_ns })
+            .unwrap();
+        if number % 10 == 9 {
+            writer.flush().unwrap();
+        }
+    }
+    if is_killed {
+        std::mem::forget(writer);
+    } else {
+        writer.finish().unwrap();
+    }
+    bytes
+}
+
+/// The numbers of the messages in a recording, as they came.
+fn numbers(recording: &[u8]) -> Vec<usize> {
+    let messages = mcap::MessageStream::new(recording).unwrap().map(Result::unwrap);
+    let raw = messages.filter(|message| message.channel.topic.starts_with(RAW_PREFIX));
+    raw.map(|message| {
+        let (_, payload) = split_raw(&message.data).unwrap();
+        messages::decode::<Wind>(payload).unwrap().stamp_ns as usize
+    })
+    .collect()
+}
+
+#[test]
+fn what_was_flushed_survives_a_kill_and_is_ended_by_a_repair() {
+    let killed = recording(true);
+    assert!(mcap::Summary::read(&killed).map_or(true, |summary| summary.is_none()));
+    let mut mended = Vec::new();
+    let found = repair(&killed, &mut mended).unwrap();
+    assert_eq!(numbers(&mended), (0..MESSAGES).collect::<Vec<_>>());
+    assert_eq!(found.messages, 2 * MESSAGES as u64);
+    assert!(found.damage[0].contains("not ended"), "{found:?}");
+    // A second time there is nothing to mend.
+    let mut again = Vec::new();
+    assert_eq!(repair(&mended, &mut again).unwrap().damage, Vec::<String>::new());
+    assert_eq!(numbers(&again).len(), MESSAGES);
+}
+
+#[test]
+fn whatever_is_cut_the_whole_chunks_before_it_are_recovered() {
+    let whole = recording(false);
+    let ends = chunk_ends(&whole);
+    assert_eq!(ends.len(), MESSAGES / 10);
+    for length in mcap::MAGIC.len()..whole.len() {
+        let mut mended = Vec::new();
+        let found = repair(&whole[..length], &mut mended).unwrap();
+        let chunks = ends.iter().filter(|end| **end <= length).count();
+        assert!(found.chunks as usize >= chunks, "{length}: {found:?}, {chunks} chunks are whole");
+        assert_eq!(numbers(&mended).len(), 10 * found.chunks as usize, "{length}");
+    }
+    assert!(repair(&whole[..4], &mut Vec::new()).is_err());
+}
+
+#[test]
+fn flipped_bits_are_named_and_lose_no_chunk_before_them() {
+    let whole = recording(false);
+    let ends = chunk_ends(&whole);
+    let mut random = 1_u64;
+    let mut named = 0;
+    for _ in 0..10_000 {
+        // Numerical Recipes' generator: any will do.
+        random =
+            random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        let bit = (random >> 16) as usize % (8 * whole.len());
+        let mut damaged = whole.clone();
+        damaged[bit / 8] ^= 1 << (bit % 8);
+        let mut mended = Vec::new();
+        let Ok(found) = repair(&damaged, &mut mended) else { continue };
+        named += usize::from(!found.damage.is_empty());
+        let before = ends.iter().filter(|end| **end <= bit / 8).count();
+        let kept = numbers(&mended);
+        assert!(
+            kept.len() >= 10 * before.saturating_sub(usize::from(before > 0)),
+            "bit {bit}: {found:?}"
+        );
+    }
+    assert!(named > 5000, "{named}");
+}
+
+/// Where each chunk ends.
+fn chunk_ends(recording: &[u8]) -> Vec<usize> {
+    const CHUNK: u8 = 6;
+    let mut ends = Vec::new();
+    let mut at = mcap::MAGIC.len();
+    while let Some((opcode, rest)) = recording.get(at..).and_then(<[u8]>::split_first) {
+        let Some((length, _)) = rest.split_first_chunk::<8>() else { break };
+        at += 9 + u64::from_le_bytes(*length) as usize;
+        if *opcode == CHUNK {
+            ends.push(at);
+        }
+    }
+    ends
+}

@@ -1,0 +1,167 @@
+//! Messages of many topics as they came, for who keeps them all.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use anyhow::anyhow;
+use messages::{Delivery, Row};
+use zenoh::sample::Sample;
+
+use crate::clock::now_ns;
+use crate::health::HealthCounters;
+use crate::session::Node;
+
+/// Maximum number of messages that wait.
+const MAX_WAITING: usize = 16_384;
+/// Maximum number of keys whose losses are counted one by one.
+const MAX_KEYS: usize = 1024;
+/// The name under which the losses of further keys are counted.
+const OTHER_KEYS: &str = "other keys";
+
+/// A message as it came.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Tapped {
+    /// Its key, without the vehicle.
+    pub key: String,
+    /// Its payload.
+    pub payload: Vec<u8>,
+    /// Its attachment; empty without.
+    pub attachment: Vec<u8>,
+    /// When it came, in nanoseconds of this process' clock.
+    pub received_ns: i64,
+    /// Whether it is a state, of which the last value holds.
+    pub is_state: bool,
+}
+
+/// Receives the messages of several topics. A reader that is too slow loses the newest, and they are counted.
+pub struct Tap {
+    shared: Arc<Shared>,
+    _subscribers: Vec<zenoh::pubsub::Subscriber<()>>,
+}
+
+struct Shared {
+    queue: Mutex<Queue>,
+    arrived: Condvar,
+    max_bytes: usize,
+    health: Arc<HealthCounters>,
+}
+
+#[derive(Default)]
+struct Queue {
+    messages: VecDeque<Tapped>,
+    /// Bytes that wait, and of messages that are being copied.
+    bytes: usize,
+    dropped: BTreeMap<String, u64>,
+}
+
+impl Tapped {
+    fn bytes(&self) -> usize {
+        self.key.len() + self.payload.len() + self.attachment.len()
+    }
+}
+
+impl Node {
+    /// Receives all messages of some topics, of which up to `max_bytes` may wait. Frames are copied as they arrive,
+    /// so that none of the shared memory is held.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub async fn tap(&self, topics: &[Row], max_bytes: usize) -> anyhow::Result<Tap> {
+        let shared = Arc::new(Shared {
+            queue: Mutex::default(),
+            arrived: Condvar::new(),
+            max_bytes,
+            health: self.shared_health(),
+        });
+        let mut subscribers = Vec::new();
+        for row in topics {
+            let key = pattern(row.key);
+            let is_state = row.delivery == Delivery::LastValue;
+            let taken = Arc::clone(&shared);
+            let subscriber = self
+                .session
+                .declare_subscriber(key.clone())
+                .callback(move |sample| taken.take(&sample, is_state))
+                .await
+                .map_err(|cause| anyhow!("subscribing to {key}: {cause}"))?;
+            subscribers.push(subscriber);
+            if is_state {
+                let taken = Arc::clone(&shared);
+                let reply = move |reply: zenoh::query::Reply| {
+                    if let Ok(sample) = reply.result() {
+                        taken.take(sample, is_state);
+                    }
+                };
+                // At the start of a system there is no publisher yet, which is not an error.
+                drop(self.session.get(&key).callback(reply).await);
+            }
+        }
+        Ok(Tap { shared, _subscribers: subscribers })
+    }
+}
+
+/// The key with `*` for each of its placeholders.
+fn pattern(key: &str) -> String {
+    let parts = key.split('/').map(|part| if part.starts_with('{') { "*" } else { part });
+    parts.collect::<Vec<_>>().join("/")
+}
+
+impl Shared {
+    /// Copies a message, unless too much waits already.
+    fn take(&self, sample: &Sample, is_state: bool) {
+        let key = sample.key_expr().as_str();
+        let attachment = sample.attachment().map(|it| it.to_bytes().into_owned());
+        let attachment = attachment.unwrap_or_default();
+        let bytes = key.len() + sample.payload().len() + attachment.len();
+        if !self.reserve(key, bytes) {
+            return;
+        }
+        let message = Tapped {
+            key: key.to_owned(),
+            payload: sample.payload().to_bytes().into_owned(),
+            attachment,
+            received_ns: now_ns(),
+            is_state,
+        };
+        self.lock().messages.push_back(message);
+        self.arrived.notify_one();
+    }
+
+    /// Whether there is room; if not, the loss is counted.
+    fn reserve(&self, key: &str, bytes: usize) -> bool {
+        let mut queue = self.lock();
+        if queue.messages.len() < MAX_WAITING && queue.bytes + bytes <= self.max_bytes {
+            queue.bytes += bytes;
+            return true;
+        }
+        let is_known = queue.dropped.contains_key(key) || queue.dropped.len() < MAX_KEYS;
+        let name = if is_known { key } else { OTHER_KEYS };
+        *queue.dropped.entry(name.to_owned()).or_default() += 1;
+        drop(queue);
+        self.health.dropped("not taken in time");
+        false
+    }
+
+    // A message is either in the queue or not, also when a thread panics.
+    fn lock(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Tap {
+    /// The next message; `None` when there is none within `patience`.
+    pub fn next(&self, patience: Duration) -> Option<Tapped> {
+        let is_empty = |queue: &mut Queue| queue.messages.is_empty();
+        let waited = self.shared.arrived.wait_timeout_while(self.shared.lock(), patience, is_empty);
+        let (mut queue, _timeout) = waited.unwrap_or_else(PoisonError::into_inner);
+        let message = queue.messages.pop_front()?;
+        queue.bytes = queue.bytes.saturating_sub(message.bytes());
+        Some(message)
+    }
+
+    /// How many messages were lost since the last call, by key.
+    pub fn take_dropped(&self) -> BTreeMap<String, u64> {
+        std::mem::take(&mut self.shared.lock().dropped)
+    }
+}

@@ -1,0 +1,49 @@
+//! Pictures of frames, for people.
+
+use messages::{FrameHeader, PixelFormat};
+
+/// A frame as a JPEG file; `None` for one that is no whole grey or Bayer image. A Bayer image is shown as it is, grey.
+pub(crate) fn jpeg(header: &FrameHeader, pixels: &[u8], quality: u8) -> Option<Vec<u8>> {
+    let (width, height) = (u16::try_from(header.width).ok()?, u16::try_from(header.height).ok()?);
+    let bits = match header.format {
+        PixelFormat::Jpeg => return Some(pixels.to_vec()),
+        PixelFormat::Mono8 | PixelFormat::Bayer8(_) => 8,
+        PixelFormat::Mono10 | PixelFormat::Bayer10(_) => 10,
+        PixelFormat::Mono12 | PixelFormat::Bayer12(_) => 12,
+        PixelFormat::Mono16 | PixelFormat::Bayer16(_) => 16,
+    };
+    let samples = usize::from(width) * usize::from(height);
+    if pixels.len() != samples * header.format.bytes_per_pixel()? {
+        return None;
+    }
+    let narrowed: Vec<u8>;
+    let grey = if bits == 8 {
+        pixels
+    } else {
+        let eight = |pair: &[u8; 2]| (u16::from_le_bytes(*pair) >> (bits - 8)).min(255) as u8;
+        narrowed = pixels.as_chunks::<2>().0.iter().map(eight).collect();
+        &narrowed
+    };
+    let mut file = Vec::new();
+    let encoder = jpeg_encoder::Encoder::new(&mut file, quality);
+    encoder.encode(grey, width, height, jpeg_encoder::ColorType::Luma).ok()?;
+    Some(file)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header(format: PixelFormat) -> FrameHeader {
+        FrameHeader { width: 16, height: 8, format, parts: Vec::new(), ..FrameHeader::sample() }
+    }
+
+    #[test]
+    fn grey_of_any_depth_becomes_a_picture() {
+        for (format, bytes) in [(PixelFormat::Mono8, 128), (PixelFormat::Mono12, 256)] {
+            let file = jpeg(&header(format), &vec![7; bytes], 90).unwrap();
+            assert!(file.starts_with(&[0xff, 0xd8]), "{format:?}");
+            assert_eq!(jpeg(&header(format), &vec![7; bytes - 1], 90), None);
+        }
+    }
+}

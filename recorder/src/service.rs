@@ -1,0 +1,349 @@
+//! The service: takes messages from the network, and writes them on threads of its own.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use anyhow::{Context, bail, ensure};
+use flightlog::{About, Picture, Received};
+use messages::{Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS, decode, topic};
+use node::{HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
+
+use crate::config::{Config, Frames};
+use crate::disk::Disk;
+use crate::name::named;
+use crate::picture::jpeg;
+use crate::recording::Recording;
+
+/// Longest wait for a message, after which the file is looked after.
+const MAX_WAIT: Duration = Duration::from_millis(50);
+/// Period in which the file is looked after while messages come.
+const LOOK_PERIOD: Duration = Duration::from_millis(20);
+/// Pause after a file that could not be opened or written, before another one is tried.
+const RETRY_PAUSE: Duration = Duration::from_secs(2);
+/// A disk that takes nothing for this time is told.
+const STALLED: Duration = Duration::from_secs(1);
+/// Time for the messages that wait at the end.
+const LAST_MESSAGES: Duration = Duration::from_millis(300);
+/// Time that the disk gets for the rest at the end; `alight land` kills after 2 s.
+const END_PATIENCE: Duration = Duration::from_millis(1300);
+/// Period of the status.
+const STATUS_PERIOD: Duration = Duration::from_millis(500);
+/// Maximum number of keys whose last values, losses or pictures are remembered.
+const MAX_KEYS: usize = 1024;
+
+/// Records until shutdown. A disk that fails ends nothing: it is told, what is lost is counted, and another file is tried.
+///
+/// # Errors
+/// When another recorder has this name, the network session cannot be used, or the last file could not be ended.
+pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+    node.claim_unique_name(&config.id).await?;
+    let frames = config.frames.parse::<Frames>().map_err(anyhow::Error::msg)?;
+    let wanted: Vec<Row> = TOPICS.iter().copied().filter(|row| is_wanted(row, frames)).collect();
+    let max_waiting_bytes = config.max_waiting_mb as usize * 1_000_000 / 2;
+    let tap = node.tap(&wanted, max_waiting_bytes).await?;
+    let publisher = node.publisher(topic::RECORDER_STATUS, &[&config.id]).await?;
+    node.announce().await?;
+    let status = RecorderStatus { recorder: config.id.clone(), ..RecorderStatus::default() };
+    let recorder = Recorder {
+        frames,
+        max_waiting_bytes,
+        about: about(&node),
+        health: node.shared_health(),
+        status: Arc::new(Mutex::new(status)),
+        config,
+        recording: None,
+        ending: None,
+        retry: None,
+        kept: 0,
+        lost: BTreeMap::new(),
+        lost_in_file: None,
+        states: BTreeMap::new(),
+        pictures: BTreeMap::new(),
+    };
+    let status = Arc::clone(&recorder.status);
+    let is_over = Arc::new(AtomicBool::new(false));
+    let stop = Arc::clone(&is_over);
+    let thread = std::thread::Builder::new()
+        .name("recorder".to_owned())
+        .spawn(move || recorder.run(&tap, &stop))
+        .context("starting the thread of the recorder")?;
+    let mut due = tokio::time::interval(STATUS_PERIOD);
+    loop {
+        tokio::select! {
+            _ = due.tick() => {
+                let now = status.lock().unwrap_or_else(PoisonError::into_inner).clone();
+                publisher.publish(&RecorderStatus { stamp_ns: now_ns(), ..now }).await;
+                ensure!(!thread.is_finished(), "the thread of the recorder ended; see the log above");
+            }
+            () = shutdown.requested() => break,
+        }
+    }
+    is_over.store(true, Ordering::Relaxed);
+    let ended = tokio::task::spawn_blocking(move || thread.join()).await?;
+    ended.unwrap_or_else(|_panic| bail!("the thread of the recorder panicked"))
+}
+
+/// Whether a topic is subscribed to. JPEG frames and a detector's debug images are made only while somebody subscribes,
+/// and would cost those time.
+fn is_wanted(row: &Row, frames: Frames) -> bool {
+    let is_frame = row.key == topic::FRAME.key(&["{camera}"]);
+    let is_made_on_demand =
+        [topic::JPEG.key(&["{camera}"]), topic::DEBUG_IMAGE.key(&["{detector}", "{image}"])];
+    row.delivery != Delivery::Query
+        && !is_made_on_demand.iter().any(|key| key == row.key)
+        && (frames != Frames::None || !is_frame)
+}
+
+fn about(node: &Node) -> About {
+    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    let utc_ns = since_1970.map_or(0, |it| i64::try_from(it.as_nanos()).unwrap_or(0));
+    let facts = [
+        ("recorder".to_owned(), node.identity().instance.clone()),
+        ("host".to_owned(), node::host_name()),
+        ("clock".to_owned(), node::clock_name().to_owned()),
+    ];
+    About {
+        program: format!("alight {}", env!("CARGO_PKG_VERSION")),
+        facts: facts.into(),
+        utc_offset_ns: utc_ns - now_ns(),
+    }
+}
+
+/// The thread's state.
+struct Recorder {
+    config: Config,
+    frames: Frames,
+    /// What may wait for the disk; as much may wait before it is looked at.
+    max_waiting_bytes: usize,
+    about: About,
+    health: Arc<HealthCounters>,
+    status: Arc<Mutex<RecorderStatus>>,
+    recording: Option<Recording>,
+    /// The file before, while the disk takes its rest.
+    ending: Option<Disk>,
+    /// When a file that failed is tried again.
+    retry: Option<Instant>,
+    kept: u64,
+    /// Messages that were lost, by key.
+    lost: BTreeMap<String, u64>,
+    /// How many the file says.
+    lost_in_file: Option<u64>,
+    /// The last value of each state: every file begins with them.
+    states: BTreeMap<String, Tapped>,
+    /// When the last picture of each camera was taken, in nanoseconds.
+    pictures: BTreeMap<String, i64>,
+}
+
+impl Recorder {
+    fn run(mut self, tap: &Tap, is_over: &AtomicBool) -> anyhow::Result<()> {
+        let mut looked = Instant::now();
+        let mut last = None;
+        loop {
+            let is_last = is_over.load(Ordering::Relaxed);
+            if is_last {
+                last.get_or_insert_with(|| Instant::now() + LAST_MESSAGES);
+            }
+            let message = tap.next(if is_last { Duration::ZERO } else { MAX_WAIT });
+            let is_empty = message.is_none();
+            if let Some(message) = message {
+                self.take(message);
+            }
+            if is_empty || looked.elapsed() >= LOOK_PERIOD {
+                looked = Instant::now();
+                for (key, count) in tap.take_dropped() {
+                    self.lose(key, count);
+                }
+                self.look_after_file();
+            }
+            if last.is_some_and(|last| is_empty || Instant::now() >= last) {
+                return self.end();
+            }
+        }
+    }
+
+    /// Keeps a message, or counts it as lost.
+    fn take(&mut self, message: Tapped) {
+        let waiting_bytes = self.recording.as_ref().map(|it| it.status().waiting_bytes);
+        let has_room = waiting_bytes.is_some_and(|bytes| bytes <= self.max_waiting_bytes);
+        if let Some(recording) = self.recording.as_mut().filter(|_| has_room) {
+            match keep(recording, &message, self.frames, &self.config, &mut self.pictures) {
+                Ok(()) => {
+                    recording.count(&message.key);
+                    self.kept += 1;
+                    self.health.count("messages");
+                }
+                Err(problem) => self.give_up(&format!("{problem:#}")),
+            }
+        } else {
+            let is_slow = self.recording.is_some();
+            self.health.dropped(if is_slow { "the disk is too slow" } else { "no file" });
+            self.lose(message.key.clone(), 1);
+        }
+        if message.is_state
+            && (self.states.len() < MAX_KEYS || self.states.contains_key(&message.key))
+        {
+            self.states.insert(message.key.clone(), message);
+        }
+    }
+
+    fn lose(&mut self, key: String, count: u64) {
+        if self.lost.len() < MAX_KEYS || self.lost.contains_key(&key) {
+            *self.lost.entry(key).or_default() += count;
+        }
+    }
+
+    /// Opens, flushes, ends and replaces the file, and says how it is doing.
+    fn look_after_file(&mut self) {
+        let is_due = self.retry.is_none_or(|retry| Instant::now() >= retry);
+        if self.recording.is_none() && is_due {
+            match self.begin() {
+                Ok(recording) => self.recording = Some(recording),
+                Err(problem) => self.give_up(&format!("{problem:#}")),
+            }
+        }
+        match self.write_out() {
+            Ok(()) => {}
+            Err(problem) => self.give_up(&format!("{problem:#}")),
+        }
+        let ended = self.ending.as_ref().map(Disk::status).filter(|disk| disk.has_ended);
+        if let Some(disk) = ended {
+            self.ending = None;
+            if let Some(problem) = disk.problem {
+                self.health.failed("the file failed");
+                tracing::error!(problem, "The end of a recording is missing");
+            }
+        }
+    }
+
+    fn begin(&mut self) -> anyhow::Result<Recording> {
+        let utc_ns = now_ns().saturating_add(self.about.utc_offset_ns);
+        let mut recording = Recording::begin(named(&self.config.file, utc_ns), &self.about)?;
+        for state in self.states.values() {
+            recording.writer.receive(received(state))?;
+        }
+        self.lost_in_file = None;
+        Ok(recording)
+    }
+
+    fn write_out(&mut self) -> anyhow::Result<()> {
+        let Some(recording) = &mut self.recording else { return Ok(()) };
+        let lost = self.lost.values().sum();
+        if recording.hand_over()? && self.lost_in_file != Some(lost) {
+            // On the disk with the next flush; the sums of a file that is not flushed again are those of the one before.
+            recording.writer.dropped(now_ns(), &self.lost)?;
+            self.lost_in_file = Some(lost);
+        }
+        let disk = recording.status();
+        if let Some(problem) = disk.problem {
+            bail!("{problem}");
+        }
+        if disk.bytes > 0 && self.retry.take().is_some() {
+            tracing::warn!(file = ?disk.path, "Recording again");
+        }
+        let stall_s = disk.stalled.as_secs();
+        let stalls = disk.stalled >= STALLED;
+        let problem = stalls.then(|| format!("the disk has taken nothing for {stall_s} s"));
+        let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        if stalls && status.problem.is_none() && self.health.failed("the disk takes nothing") {
+            tracing::error!(file = ?disk.path, "The disk takes nothing; waiting for it");
+        }
+        status.file = disk.path.map_or_else(String::new, |path| path.display().to_string());
+        status.bytes = disk.bytes;
+        status.waiting_bytes = disk.waiting_bytes as u64;
+        status.kept = self.kept;
+        let losses = self.lost.iter().map(|(key, count)| (key.clone(), *count));
+        status.dropped = losses.map(|(key, count)| RecorderLoss { key, count }).collect();
+        if self.retry.is_none() {
+            status.problem = problem;
+        }
+        drop(status);
+        let max_bytes = u64::from(self.config.max_file_mb) * 1_000_000;
+        let max_age = Duration::from_secs_f64(60.0 * self.config.max_file_minutes);
+        if self.ending.is_none()
+            && recording.is_full(max_bytes, max_age)
+            && let Some(full) = self.recording.take()
+        {
+            self.ending = Some(full.end()?);
+        }
+        Ok(())
+    }
+
+    /// The file failed: it stays as it is, for `alight record --repair`, and another one is tried later.
+    fn give_up(&mut self, problem: &str) {
+        if self.health.failed("the file failed") || self.retry.is_none() {
+            tracing::error!(problem, "Not recording; trying again, and the flight goes on");
+        }
+        let unsynced = self.recording.take().map(Recording::unsynced).unwrap_or_default();
+        for (key, count) in unsynced {
+            self.kept = self.kept.saturating_sub(count);
+            self.lose(key, count);
+        }
+        self.retry = Some(Instant::now() + RETRY_PAUSE);
+        let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
+        status.problem = Some(problem.to_owned());
+        status.file.clear();
+        status.waiting_bytes = 0;
+    }
+
+    /// Ends the file, and waits for the disk a moment.
+    fn end(self) -> anyhow::Result<()> {
+        let began = Instant::now();
+        let Some(mut recording) = self.recording else { return Ok(()) };
+        recording.writer.dropped(now_ns(), &self.lost)?;
+        let disk = recording.end()?.wait(END_PATIENCE);
+        let name = disk.path.unwrap_or(self.config.file);
+        if let Some(before) = self.ending {
+            before.wait(END_PATIENCE.saturating_sub(began.elapsed()));
+        }
+        if let Some(problem) = disk.problem {
+            bail!("the end of the recording is missing: {problem}");
+        }
+        ensure!(
+            disk.has_ended,
+            "the disk did not take the end of {name:?} within {END_PATIENCE:?}; `alight record --repair` ends it"
+        );
+        tracing::info!(file = ?name, bytes = disk.bytes, messages = self.kept, "Recorded");
+        Ok(())
+    }
+}
+
+fn received(message: &Tapped) -> Received<'_> {
+    Received {
+        key: &message.key,
+        payload: &message.payload,
+        attachment: &message.attachment,
+        received_ns: message.received_ns,
+    }
+}
+
+/// Writes a message: frames as configured, everything else as it came.
+fn keep(
+    recording: &mut Recording,
+    message: &Tapped,
+    frames: Frames,
+    config: &Config,
+    pictures: &mut BTreeMap<String, i64>,
+) -> anyhow::Result<()> {
+    let is_frame = topic::FRAME.first_name(&message.key).is_some();
+    let header = decode::<FrameHeader>(&message.attachment).ok().filter(|_| is_frame);
+    let Some(header) = header else { return Ok(recording.writer.receive(received(message))?) };
+    let period_ns = (1e9 / config.max_picture_hz) as i64;
+    // A camera that begins anew may have other stamps.
+    let last_ns = pictures.get(&header.camera).copied();
+    let is_due = last_ns.is_none_or(|last_ns| {
+        header.stamp_ns.saturating_sub(last_ns).saturating_abs() >= period_ns
+    });
+    let picture = match frames {
+        Frames::Jpeg if is_due => {
+            jpeg(&header, &message.payload, config.jpeg_quality).map(Picture::Jpeg)
+        }
+        Frames::Raw if is_due => Some(Picture::Pixels),
+        Frames::Jpeg | Frames::Raw | Frames::None => None,
+    };
+    if picture.is_some() && (pictures.len() < MAX_KEYS || last_ns.is_some()) {
+        pictures.insert(header.camera.clone(), header.stamp_ns);
+    }
+    Ok(recording.writer.frame(received(message), &header, &picture.unwrap_or(Picture::None))?)
+}
