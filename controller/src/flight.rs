@@ -476,6 +476,7 @@ impl Flight {
         match (trigger, self.lander.phase()) {
             // The pilot's own landing is not ours while it is high; the next flight may be.
             (Trigger::InFlight, phase) if phase.is_terminal() => self.mission.skip(),
+            (Trigger::ArmedAgain, phase) if phase.is_terminal() => self.mission.stay_landed(),
             // The mode may be newer than the state that the lander has.
             (Trigger::TakenOff, Phase::Idle) => self.mission.stand_down(true),
             _ => {}

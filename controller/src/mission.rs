@@ -17,6 +17,8 @@ pub struct Mission {
     disarmed_ns: Option<i64>,
     /// Until when the landing that seemed to have ended goes on.
     goes_on_until_ns: Option<i64>,
+    /// The landing that was to go on is over: the next one begins once the vehicle flies.
+    awaits_next_flight: bool,
 }
 
 /// The state of a mission.
@@ -68,7 +70,14 @@ impl Mission {
                 why: "waiting for the autopilot's heartbeat".to_owned(),
             },
         };
-        Self { start, state, started_ns: None, disarmed_ns: None, goes_on_until_ns: None }
+        Self {
+            start,
+            state,
+            started_ns: None,
+            disarmed_ns: None,
+            goes_on_until_ns: None,
+            awaits_next_flight: false,
+        }
     }
 
     /// The state.
@@ -111,6 +120,7 @@ impl Mission {
         self.started_ns = Some(now_ns);
         self.disarmed_ns = None;
         self.goes_on_until_ns = None;
+        self.awaits_next_flight = false;
         self.state = if is_autopilots { State::SendingLandingTarget } else { State::Landing };
     }
 
@@ -124,6 +134,12 @@ impl Mission {
     /// nothing begins without a command any more; otherwise the next flight may be landed.
     pub fn skip(&mut self) {
         self.stand_down(self.start != Start::Resume);
+    }
+
+    /// The landing that was to go on had ended: the vehicle stands with its motors armed. It stays landed until it
+    /// flies; `airborne` lands that flight too.
+    pub fn stay_landed(&mut self) {
+        self.awaits_next_flight = self.start == Start::Airborne;
     }
 
     /// After a landing: `airborne` lands flight after flight.
@@ -160,6 +176,9 @@ impl Mission {
                 self.goes_on_until_ns = None;
                 self.await_next_flight();
             }
+        }
+        if self.awaits_next_flight && is_known && is_flying_guided(autopilot) {
+            return Some(Trigger::InFlight);
         }
         match &mut self.state {
             State::AwaitingTakeoff => {

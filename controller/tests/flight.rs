@@ -584,6 +584,26 @@ fn only_a_resumed_landing_begins_by_itself() {
 }
 
 #[test]
+fn a_pilot_who_arms_again_at_once_after_a_landing_has_the_next_flight_landed() {
+    let mut flight = in_flight("airborne");
+    let phase_at = |flight: &mut Flight, from_ms: i64, to_ms: i64| {
+        for ms in (from_ms..to_ms).step_by(20) {
+            pose(flight, ms * MS);
+            flight.tick(ms * MS + 3);
+        }
+        flight.status(to_ms * MS).phase
+    };
+    assert_eq!(phase_at(&mut flight, 20, 500), Phase::Search);
+    receive(&mut flight, 500 * MS, &heartbeat(4, false));
+    receive(&mut flight, 501 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    assert_eq!(phase_at(&mut flight, 520, 1000), Phase::Landed);
+    receive(&mut flight, 1000 * MS, &heartbeat(4, true));
+    assert_eq!(phase_at(&mut flight, 1020, 2000), Phase::Landed, "it stands, armed");
+    receive(&mut flight, 2000 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    assert_eq!(phase_at(&mut flight, 2020, 2500), Phase::Search);
+}
+
+#[test]
 fn a_controller_restarted_after_touchdown_lands_no_later_flight() {
     let first_and_next = |mode: u32, contact_at_start: MavLandedState| {
         let mut flight = flight("resume");
