@@ -16,6 +16,7 @@ use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME};
 
 /// Longest time until a process that goes on takes its part again.
 const BACK: Duration = Duration::from_secs(2);
+
 /// Freezes a process, and lets it go on.
 async fn freeze(pid: Pid, seconds: f64) -> anyhow::Result<Instant> {
     kill_process(pid, Signal::STOP)?;
@@ -79,7 +80,7 @@ pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
     let meet_text = meet.to_string();
     let set = ["--set", &paths, "--set", "calibration.focal_px=[100, 100]"];
     let camera = Running::start(&[&["camera-pub", "--meet", &meet_text], &set[..]].concat())?;
-    let detector = open("local", "detector", "main", None, Some(meet)).await?;
+    let detector = open("detector", "main", on_board(meet)).await?;
     let frames = detector.frame_subscriber(topic::FRAME, &["down"]).await?;
     let is_received = async |since_ns: i64| {
         let fresh = async {
@@ -159,16 +160,14 @@ async fn reaches(from: &Node, by: &Node) -> anyhow::Result<()> {
     timeout(Duration::from_secs(20), received).await.context("nothing is received")
 }
 
-async fn open(
-    role: &str,
-    service: &'static str,
-    name: &str,
-    connect: Option<String>,
-    meet: Option<u16>,
-) -> anyhow::Result<Node> {
-    let network = Network { config: Some(role.into()), connect, meet, ..Network::default() };
+async fn open(service: &'static str, name: &str, network: Network) -> anyhow::Result<Node> {
     let identity = Identity { service, instance: name.into() };
     Node::open(identity, &network.source(service)?).await
+}
+
+/// The network of a process on board whose peers meet at this port.
+fn on_board(meet: u16) -> Network {
+    Network { config: Some("local".into()), meet: Some(meet), ..Network::default() }
 }
 
 /// Freezes a relay between two processes on board and one on the ground.
@@ -176,11 +175,13 @@ pub(crate) async fn of_a_relay(freezes_s: &[f64]) -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
     let ([meet], air, _) = ports::free()?;
     let (meet_text, air) = (meet.to_string(), format!("127.0.0.1:{air}"));
-    let first = open("local", "simulator", "main", None, Some(meet)).await?;
-    let second = open("local", "controller", "main", None, Some(meet)).await?;
+    let first = open("simulator", "main", on_board(meet)).await?;
+    let second = open("controller", "main", on_board(meet)).await?;
     let relay =
         Running::start(&["relay", "--zenoh", "drone", "--listen", &air, "--meet", &meet_text])?;
-    let ground = open("ground", "detector", "ground", Some(air), None).await?;
+    let network =
+        Network { config: Some("ground".into()), connect: Some(air), ..Network::default() };
+    let ground = open("detector", "ground", network).await?;
     for seconds in freezes_s {
         for node in [&first, &second] {
             reaches(node, &ground).await?;

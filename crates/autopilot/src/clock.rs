@@ -63,8 +63,8 @@ pub struct Clock {
     ages: VecDeque<Length>,
     /// When the last positions came.
     arrivals: VecDeque<i64>,
-    /// What came latest behind newer measurements.
-    latest: Option<Length>,
+    /// What came farthest behind newer measurements.
+    behind: Option<Length>,
     contradictions: u32,
 }
 
@@ -160,14 +160,6 @@ impl Clock {
         self.arrivals.push_back(now_ns);
     }
 
-    /// How slow the link is now, both ways together, in ns: by its round trips or, where that is more, twice the
-    /// age with which measurements come; and by what it loses, as the next packet comes later. Round trips are a
-    /// second apart; a vehicle that descends is metres lower before they tell. `None` while neither is known.
-    pub fn link_delay_ns(&self, now_ns: i64) -> Option<i64> {
-        let delay_ns = self.slow_trip_ns(now_ns).max(self.two_ways_ns(now_ns))?;
-        Some(delay_ns.saturating_add(self.losses_ns(now_ns)))
-    }
-
     /// True for a measurement that is at least as new as the newest before, by their times since the autopilot's start. How
     /// far it comes behind is noted: the link repeats or reorders packets.
     pub fn is_newest(&mut self, now_ns: i64, boot_ms: u32, newest_ms: Option<u32>) -> bool {
@@ -178,14 +170,22 @@ impl Clock {
 
     fn came_behind(&mut self, now_ns: i64, length_ns: i64) {
         if (1..=MAX_AGE_NS).contains(&length_ns) && length_ns >= self.behind_ns(now_ns) {
-            self.latest = Some(Length { at_ns: now_ns, length_ns });
+            self.behind = Some(Length { at_ns: now_ns, length_ns });
         }
     }
 
     /// How far behind newer ones packets have come in the last seconds, in ns.
     pub fn behind_ns(&self, now_ns: i64) -> i64 {
-        let recent = |at: &Length| now_ns.saturating_sub(at.at_ns) <= MAX_BEHIND_AGE_NS;
-        self.latest.filter(recent).map_or(0, |at| at.length_ns)
+        let recent = self.behind.filter(|it| it.is_recent(now_ns, MAX_BEHIND_AGE_NS));
+        recent.map_or(0, |it| it.length_ns)
+    }
+
+    /// How slow the link is now, both ways together, in ns: by its round trips or, where that is more, twice the
+    /// age with which measurements come; and by what it loses, as the next packet comes later. Round trips are a
+    /// second apart; a vehicle that descends is metres lower before they tell. `None` while neither is known.
+    pub fn link_delay_ns(&self, now_ns: i64) -> Option<i64> {
+        let delay_ns = self.slow_trip_ns(now_ns).max(self.two_ways_ns(now_ns))?;
+        Some(delay_ns.saturating_add(self.losses_ns(now_ns)))
     }
 
     /// By how much losses delay what passes the link, both ways together: known by the pauses between positions. They
@@ -211,8 +211,7 @@ impl Clock {
 
     /// Twice the age of the youngest of the last measurements on arrival.
     fn two_ways_ns(&self, now_ns: i64) -> Option<i64> {
-        let recent = |at: &&Length| now_ns.saturating_sub(at.at_ns) <= MAX_ARRIVED_NS;
-        let ages = self.ages.iter().filter(recent);
+        let ages = self.ages.iter().filter(|age| age.is_recent(now_ns, MAX_ARRIVED_NS));
         let youngest_ns = ages.clone().map(|age| age.length_ns).min()?;
         (ages.count() >= AGES).then(|| youngest_ns.saturating_mul(2))
     }
@@ -220,9 +219,9 @@ impl Clock {
     /// The second longest of the last round trips, as a single one may have waited elsewhere. `None` while there
     /// were no two.
     fn slow_trip_ns(&self, now_ns: i64) -> Option<i64> {
-        let recent = |at: &&Length| now_ns.saturating_sub(at.at_ns) <= MAX_LENGTH_AGE_NS;
+        let recent = self.lengths.iter().filter(|trip| trip.is_recent(now_ns, MAX_LENGTH_AGE_NS));
         let (mut longest_ns, mut second_ns) = (None, None);
-        for Length { length_ns, .. } in self.lengths.iter().filter(recent) {
+        for Length { length_ns, .. } in recent {
             if longest_ns.is_none_or(|longest_ns| *length_ns > longest_ns) {
                 second_ns = longest_ns.replace(*length_ns);
             } else if second_ns.is_none_or(|second_ns| *length_ns > second_ns) {
@@ -250,6 +249,12 @@ impl Clock {
         let recent =
             self.trips.iter().filter(|trip| now_ns.saturating_sub(trip.at_ns) <= WINDOW_NS);
         recent.min_by_key(|trip| trip.worth_ns(now_ns)).copied()
+    }
+}
+
+impl Length {
+    fn is_recent(&self, now_ns: i64, max_age_ns: i64) -> bool {
+        now_ns.saturating_sub(self.at_ns) <= max_age_ns
     }
 }
 

@@ -229,13 +229,7 @@ mod tests {
             let noise = Vector::new((37.0 * t).sin(), (53.0 * t).cos(), 0.0) * 0.01;
             let in_body = attitude.inverse() * (pad - position) + noise;
             let seen = distort(in_body, attitude);
-            let motion = Motion {
-                ned_from_body: attitude,
-                position,
-                velocity: Vector::zero(),
-                odometry: Point::from_coords(position.coords),
-                rate: Vector::zero(),
-            };
+            let motion = Motion::still(attitude, position);
             check.add(
                 Timestamp::from_seconds(t),
                 &motion,
@@ -289,13 +283,7 @@ mod tests {
     #[test]
     fn huge_numbers_change_nothing() {
         let mut check = AxisConsistencyCheck::default();
-        let motion = Motion {
-            ned_from_body: Rotation::identity(),
-            position: Point::origin(),
-            velocity: Vector::zero(),
-            odometry: Point::origin(),
-            rate: Vector::zero(),
-        };
+        let motion = Motion::still(Rotation::identity(), Point::origin());
         for i in 0..50 {
             check.add(Timestamp::from_seconds(f64::from(i)), &motion, Point::new(1e200, 0.0, 1.0));
         }

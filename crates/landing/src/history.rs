@@ -48,6 +48,18 @@ impl Motion {
     pub fn odometry_from_body(&self) -> Rotation<Odometry, Body> {
         Rotation::from_quaternion(self.ned_from_body.quaternion)
     }
+
+    /// At rest, its odometry that of the position.
+    #[cfg(test)]
+    pub(crate) fn still(ned_from_body: Rotation<Ned, Body>, position: Point<Ned>) -> Self {
+        Self {
+            ned_from_body,
+            position,
+            velocity: Vector::zero(),
+            odometry: Point::from_coords(position.coords),
+            rate: Vector::zero(),
+        }
+    }
 }
 
 impl History {

@@ -404,13 +404,7 @@ mod tests {
                 Point::new((0.7 * t).sin(), (0.5 * t).cos(), -7.0 - 3.0 * (0.6 * t).cos());
             let attitude = Rotation::<Ned, Body>::from_euler(0.05 * t.sin(), 0.05 * t.cos(), 0.3);
             let in_body = off.inverse() * (attitude.inverse() * (Point::origin() - position));
-            let motion = Motion {
-                ned_from_body: attitude,
-                position,
-                velocity: Vector::zero(),
-                odometry: Point::from_coords(position.coords),
-                rate: Vector::zero(),
-            };
+            let motion = Motion::still(attitude, position);
             let pose = Transform::new(Rotation::identity(), Point::origin() + in_body);
             let marker = MarkerInFrame {
                 centre: Pixel::new(0.0, 0.0),
@@ -448,13 +442,7 @@ mod tests {
             [1e300, f64::INFINITY, f64::NAN, -1e300].into_iter().cycle().take(40).enumerate()
         {
             let place = Point::new(0.0, 0.0, -8.0);
-            let motion = Motion {
-                ned_from_body: Rotation::identity(),
-                position: place,
-                velocity: Vector::zero(),
-                odometry: Point::from_coords(place.coords),
-                rate: Vector::zero(),
-            };
+            let motion = Motion::still(Rotation::identity(), place);
             let frame = frame(0.01 * i as f64, mount);
             let seen = Measurement {
                 stamp: frame.stamp,

@@ -1,3 +1,5 @@
+//! A second try for tests that take real time.
+
 /// Runs a test, and once more if it fails: a machine that is busy with something else may disturb what takes its time.
 ///
 /// # Errors
