@@ -57,8 +57,12 @@ const TESTING: &str = "testing";
 const TESTS: &str = "tests";
 /// The fuzz targets: they call whatever reads from outside.
 const FUZZ: &str = "fuzz";
-/// The tool that stands above others: it calls their pure parts in lock-step.
-const EXPERIMENTS: (&str, [&str; 3]) = ("experiments", ["controller", "detector", "simulator"]);
+/// The tools that stand above others: they call their pure parts in lock-step, or with what was recorded; the tests of
+/// replay take flights of the experiments.
+const ABOVE: [(&str, &[&str]); 2] = [
+    ("experiments", &["controller", "detector", "simulator"]),
+    ("replay", &["controller", "experiments"]),
+];
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
 const ALIGHT: [&str; 8] =
     ["fiducial", "flightlog", "geometry", "imaging", "markers", "media", "messages", "node"];
@@ -250,8 +254,8 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
                 let is_known = package.is_tool() || SERVICES.contains(&package.name.as_str());
                 ensure!(is_known, "{}: name what it may depend on in this test", package.name);
                 let truth = TRUTH.into_iter().filter(|_| package.is_tool());
-                let (above, below) = EXPERIMENTS;
-                let below = below.into_iter().filter(|_| package.name == above);
+                let below = ABOVE.into_iter().filter(|(above, _)| package.name == *above);
+                let below = below.flat_map(|(_, below)| below.iter().copied());
                 ROOMS.into_iter().chain(truth).chain(below).collect()
             }
         };

@@ -68,6 +68,10 @@ async fn a_landing_is_recorded_and_read_by_other_programs() -> anyhow::Result<()
     let repair = output_of(Command::new(flight::ALIGHT).args(["record", "--repair", name]))?;
     let said = String::from_utf8_lossy(&repair.stdout).into_owned();
     ensure!(repair.status.success() && said.contains("is whole"), "{said}");
+    let replay = output_of(Command::new(flight::ALIGHT).args(["replay", name, "--verify"]))?;
+    let said = String::from_utf8_lossy(&replay.stdout).into_owned();
+    println!("{said}");
+    ensure!(replay.status.success() && said.contains("verified"), "{said}");
     let Some(reader) = python("tests/recording/read.py", &[name]) else { return Ok(()) };
     let output = tokio::task::block_in_place(|| reader.wait_with_output())?;
     if !python_passes(&output)? {

@@ -10,7 +10,8 @@ use crate::args::ServiceArgs;
 use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
 use crate::{
-    command, detect, detectors, doctor, experiment, keys, land, marker, record, relay, swap, up,
+    command, detect, detectors, doctor, experiment, keys, land, marker, record, relay, replay,
+    swap, up,
 };
 
 /// Exit status for an invalid command line or configuration.
@@ -44,6 +45,9 @@ enum Command {
     /// Record all topics to a file, or end a file properly whose recorder was killed.
     #[command(alias = "recorder")]
     Record(record::RecordArgs),
+    /// Fly a recorded flight again, from the events that the controller handled: verify it to the bit, or try other
+    /// settings on it.
+    Replay(replay::ReplayArgs),
     /// Simulate a world with wind, a pad, a vehicle, an autopilot and a camera.
     Simulator(ServiceArgs),
     /// Relay messages between the processes on the drone and the ground.
@@ -92,6 +96,7 @@ pub(crate) fn run() -> ExitCode {
         Command::Controller(args) => services::run(Service::Controller, &args),
         Command::GcsBridge(args) => services::run(Service::GcsBridge, &args),
         Command::Record(args) => record::run(&args),
+        Command::Replay(args) => replay::run(&args),
         Command::Simulator(args) => services::run(Service::Simulator, &args),
         Command::Relay(args) => relay::run(&args),
         Command::Keys(args) => keys::run(&args),

@@ -53,6 +53,9 @@ pub(crate) struct FaultsArgs {
     /// Number of flights in parallel [default: number of cores].
     #[arg(long, value_name = "N")]
     jobs: Option<usize>,
+    /// Folder for a recording of each flight with its controller's tape, for `alight replay`; in lock-step only.
+    #[arg(long, value_name = "DIR", conflicts_with = "real_time")]
+    record_tapes: Option<PathBuf>,
     /// Fly in real time, with the services as processes that are killed and stopped (SIGKILL, SIGSTOP), one
     /// flight after the other.
     #[arg(long)]
@@ -157,9 +160,9 @@ fn run_in_lockstep(request: &Request) -> anyhow::Result<Findings> {
 /// Flies the campaign and prints its report; a failure when a touchdown was unsafe or a flight did not end.
 pub(crate) fn run(args: FaultsArgs) -> anyhow::Result<ExitCode> {
     let (results_in, jobs) = (args.output.clone(), args.jobs.unwrap_or_else(cores));
-    let real_time = args.real_time;
+    let (real_time, tapes_in) = (args.real_time, args.record_tapes.clone());
     let plan = args.plan().map_err(anyhow::Error::msg)?;
-    let request = Request { plan, results_in, jobs };
+    let request = Request { plan, results_in, tapes_in, jobs };
     let findings = match real_time {
         true => run_in_real_time(&request),
         false => run_in_lockstep(&request),

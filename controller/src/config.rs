@@ -6,10 +6,10 @@ use landing::{
     ThesisConfig,
 };
 use node::{Check, Settings};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 /// The keys of `controller.toml`, which has their meanings, units and ranges.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Name of this controller.
@@ -49,7 +49,7 @@ pub struct Config {
 }
 
 /// Who controls the landing.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
     /// This controller, by velocity setpoints.
@@ -59,7 +59,7 @@ pub enum Mode {
 }
 
 /// The landing targets for the autopilot's own precision landing.
-#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct LandingTargetSettings {
     /// Which position is sent.
@@ -69,7 +69,7 @@ pub struct LandingTargetSettings {
 }
 
 /// Which position is sent as the landing target.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LandingTargetSource {
     /// The estimate, relative to the vehicle's newest state.
@@ -79,7 +79,7 @@ pub enum LandingTargetSource {
 }
 
 /// Limits of battery, operator and link.
-#[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AlarmSettings {
     /// Charge below which the battery is low, from 0 to 1.
@@ -99,7 +99,7 @@ pub struct AlarmSettings {
 }
 
 /// When the landing begins.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Start {
     /// On the operator's command.
@@ -113,7 +113,7 @@ pub enum Start {
 }
 
 /// Which guidance is used.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GuidanceName {
     /// The metric guidance.
@@ -123,7 +123,7 @@ pub enum GuidanceName {
 }
 
 /// The link to the autopilot.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct AutopilotSettings {
     /// Where it is.
@@ -147,7 +147,7 @@ pub struct AutopilotSettings {
 }
 
 /// The choice of the detector.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct DetectorSettings {
     /// The preferred detector, or nothing.
@@ -167,7 +167,7 @@ pub struct DetectorSettings {
 }
 
 /// Where the preferred detectors run.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PreferredPlace {
     /// Anywhere.

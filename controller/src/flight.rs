@@ -170,9 +170,6 @@ impl Flight {
 
     /// Logs what the operator should know, and tells the lander of a dispute between detectors.
     fn follow_warnings(&mut self, now_ns: i64) {
-        if self.journal.has_refused_versions() {
-            self.frames.refused_version(now_ns);
-        }
         let warnings = self.view().warnings(now_ns);
         self.journal.warnings(&warnings);
         let is_disputed = self.frames.selection.dispute().is_some();
@@ -268,6 +265,11 @@ impl Flight {
         }
     }
 
+    /// Messages of another version were refused.
+    pub fn refused_version(&mut self, now_ns: i64) {
+        self.frames.refused_version(now_ns);
+    }
+
     /// A detector came or went.
     pub fn presence(&mut self, now_ns: i64, detector: &str, alive: bool) {
         self.frames.selection.presence(now_ns, detector, alive);
@@ -318,6 +320,16 @@ impl Flight {
     /// The next packet for the autopilot.
     pub fn poll_outgoing(&mut self) -> Option<Vec<u8>> {
         self.autopilot.poll_outgoing()
+    }
+
+    /// The lander's latest decision.
+    pub fn decision(&self) -> Option<&Decision> {
+        self.decision.as_ref()
+    }
+
+    /// The detector in use.
+    pub fn active_detector(&self) -> Option<&str> {
+        self.frames.selection.active()
     }
 
     /// The vehicle's state, once attitude and position are known.

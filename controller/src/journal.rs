@@ -21,14 +21,12 @@ pub struct Journal {
     rejection: Option<String>,
     /// The matters of which the log has told.
     told: Vec<String>,
-    /// Messages of another version so far.
-    other_versions: u64,
 }
 
 impl Journal {
     /// A journal that counts into `health`.
     pub fn new(health: Arc<HealthCounters>) -> Self {
-        Self { health, rejection: None, told: Vec::new(), other_versions: 0 }
+        Self { health, rejection: None, told: Vec::new() }
     }
 
     /// Logs what the operator should know when it begins and when it ends.
@@ -44,12 +42,6 @@ impl Journal {
         }
         self.told.clear();
         self.told.extend(warnings.iter().map(|warning| warning.matter.clone()));
-    }
-
-    /// True when messages of another version were refused since the last call.
-    pub fn has_refused_versions(&mut self) -> bool {
-        let refused = self.health.failures("payload: wrong version");
-        std::mem::replace(&mut self.other_versions, refused) < refused
     }
 
     /// Counts a camera's information that was refused, for a reason that is a short name for programs.

@@ -5,7 +5,7 @@
 //! to do) and `autopilot` (how to do it).
 //!
 //! Modules in reading order: [`config`] has the settings; [`service`] joins network and link to the
-//! [`flight`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
+//! [`flight`] with its [`tape`], an event loop over [`frames`] (detections in, the lander's next frame out, with [`selection`]
 //! of the detector by health and [`agreement`], the [`cameras`], and the [`refusals`] that last), [`mount`] (what is said of a camera that is not as configured), [`mission`]
 //! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`landing_target`] (the
 //! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
@@ -30,6 +30,7 @@ pub mod selection;
 pub mod service;
 pub mod setpoints;
 pub mod status;
+pub mod tape;
 pub mod wind;
 pub mod wire;
 

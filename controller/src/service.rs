@@ -5,14 +5,16 @@ use std::time::Duration;
 use anyhow::Context;
 use autopilot::packet::MAX_PACKET;
 use autopilot::{Address, Link, LinkEvent, Parser, Permission};
-use messages::{ControllerStatus, MavlinkBytes, VehicleState, topic};
-use node::{Node, Publisher, Shutdown, now_ns};
+use messages::{ControllerStatus, MavlinkBytes, Tape, VehicleState, topic};
+use node::{HealthCounters, Node, Publisher, Shutdown, now_ns};
 use tokio::sync::mpsc;
-use tokio::time::{MissedTickBehavior, interval, timeout};
+use tokio::task::JoinHandle;
+use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use crate::config::Config;
 use crate::flight::Flight;
 use crate::note_file::NoteFile;
+use crate::tape::TapedFlight;
 
 /// Period of the flight's ticks.
 const TICK: Duration = Duration::from_millis(25);
@@ -27,6 +29,18 @@ const VEHICLE_PERIOD_NS: i64 = 18_000_000;
 /// Maximum number of the autopilot's packets that wait for the network; more are dropped, as the flight never
 /// waits.
 const MAX_WAITING_PACKETS: usize = 512;
+/// Period in which the tape is handed over, in nanoseconds; it is earlier when this much of it waits, in bytes.
+const TAPE_PERIOD_NS: i64 = 100_000_000;
+const TAPE_BYTES: usize = 16_000;
+/// Maximum number of parts of the tape that wait until somebody listens, as a recorder may start after the controller:
+/// almost seven minutes.
+const MAX_WAITING_TAPES: usize = 4096;
+/// Pause before it is asked again whether somebody listens to the tape.
+const TAPE_PATIENCE: Duration = Duration::from_millis(100);
+/// Pause between two parts of the tape while further ones wait: sent all at once, some would be dropped.
+const TAPE_PAUSE: Duration = Duration::from_millis(2);
+/// Time for what waits of the tape at the end.
+const TAPE_END: Duration = Duration::from_millis(200);
 
 /// Runs the service until shutdown.
 ///
@@ -38,9 +52,9 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let permission: Permission = config.autopilot.ground_may.parse()?;
     let mut link = Link::open(address).await.context("opening the link to the autopilot")?;
     let mut note_file = NoteFile::new(&config.id);
-    let mut flight = Flight::new(config, node.shared_health())?;
+    let mut flight = TapedFlight::new(now_ns(), config, node.shared_health())?;
     if let Some(note) = note_file.read() {
-        flight.take_over(note);
+        flight.take_over(now_ns(), note);
     }
 
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
@@ -51,9 +65,11 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let to_autopilot = node.subscriber(topic::TO_AUTOPILOT, &[]).await?;
     let targets = node.publisher(topic::TARGET, &[]).await?;
     let mut reports = Reports::new(&node).await?;
+    let mut tapes = Tapes::new(&node).await?;
     node.announce().await?;
 
     let mut strangers = 0;
+    let mut other_versions = 0;
     let mut ticks = interval(TICK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
@@ -77,10 +93,13 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                 let publisher = topic::DETECTIONS.first_name(&key).unwrap_or_default();
                 if flight.detections(now_ns(), publisher, &message) {
                     send(&node, &link, &mut flight);
-                    targets.publish(&flight.target(now_ns())).await;
+                    targets.publish(&flight.flight().target(now_ns())).await;
                 }
             }
             _ = ticks.tick() => {
+                if has_more_other_versions(node.health(), &mut other_versions) {
+                    flight.refused_version(now_ns());
+                }
                 flight.tick(now_ns());
                 let more = link.strangers().saturating_sub(strangers);
                 if more > 0 {
@@ -108,9 +127,10 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             }
         }
         // Written before the packet that changes the parameter is sent.
-        note_file.keep(flight.note());
+        note_file.keep(flight.flight().note());
         send(&node, &link, &mut flight);
-        reports.publish(&flight).await;
+        tapes.pass_on(&mut flight);
+        reports.publish(flight.flight()).await;
     }
     let deadline = tokio::time::Instant::now() + SHUTDOWN_TIMEOUT;
     while flight.shutdown(now_ns()) && tokio::time::Instant::now() < deadline {
@@ -119,15 +139,16 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             flight.packet(now_ns(), &packet);
         }
     }
-    note_file.keep(flight.note());
+    note_file.keep(flight.flight().note());
     send(&node, &link, &mut flight);
+    tapes.end(&mut flight).await;
     // The link's own task needs a moment to put the last packet on the wire.
-    tokio::time::sleep(TICK).await;
+    sleep(TICK).await;
     Ok(())
 }
 
 /// Whether a packet of a ground station goes to the autopilot; the flight hears it before.
-fn pass_up(node: &Node, flight: &mut Flight, permission: Permission, bytes: &[u8]) -> bool {
+fn pass_up(node: &Node, flight: &mut TapedFlight, permission: Permission, bytes: &[u8]) -> bool {
     if !(1..=MAX_PACKET).contains(&bytes.len()) {
         node.health().dropped("packets of the ground station");
         return false;
@@ -155,10 +176,73 @@ fn pass_up(node: &Node, flight: &mut Flight, permission: Permission, bytes: &[u8
 }
 
 /// Sends the flight's packets.
-fn send(node: &Node, link: &Link, flight: &mut Flight) {
+fn send(node: &Node, link: &Link, flight: &mut TapedFlight) {
     while let Some(packet) = flight.poll_outgoing() {
         if link.send(&packet).is_err() {
             node.health().dropped("packets for the autopilot");
+        }
+    }
+}
+
+/// Whether messages of another version were refused since the last call.
+fn has_more_other_versions(health: &HealthCounters, so_far: &mut u64) -> bool {
+    let refused = health.failures("payload: wrong version");
+    std::mem::replace(so_far, refused) < refused
+}
+
+/// Publishes the tape, once somebody listens.
+struct Tapes {
+    waiting: mpsc::Sender<Tape>,
+    publishing: JoinHandle<()>,
+    passed_on_ns: i64,
+    /// Whether a part found no room.
+    is_cut: bool,
+}
+
+impl Tapes {
+    async fn new(node: &Node) -> anyhow::Result<Self> {
+        let (waiting, mut tapes) = mpsc::channel::<Tape>(MAX_WAITING_TAPES);
+        let publisher = node.publisher(topic::TAPE, &[]).await?;
+        let publishing = tokio::spawn(async move {
+            while let Some(tape) = tapes.recv().await {
+                while !publisher.has_subscribers().await {
+                    sleep(TAPE_PATIENCE).await;
+                }
+                publisher.publish(&tape).await;
+                if !tapes.is_empty() {
+                    sleep(TAPE_PAUSE).await;
+                }
+            }
+        });
+        Ok(Self { waiting, publishing, passed_on_ns: now_ns(), is_cut: false })
+    }
+
+    /// Hands the tape over at its period. What finds no room is missing, which the numbers of what follows tell.
+    fn pass_on(&mut self, flight: &mut TapedFlight) {
+        let now = now_ns();
+        let is_due = now.saturating_sub(self.passed_on_ns) >= TAPE_PERIOD_NS;
+        if !is_due && flight.waiting_bytes() < TAPE_BYTES {
+            return;
+        }
+        self.passed_on_ns = now;
+        if let Some(tape) = flight.take_tape()
+            && self.waiting.try_send(tape).is_err()
+            && !std::mem::replace(&mut self.is_cut, true)
+        {
+            tracing::info!(
+                "Nobody records: what is recorded from now on cannot be replayed from the start"
+            );
+        }
+    }
+
+    /// Publishes what waits, if somebody listens.
+    async fn end(mut self, flight: &mut TapedFlight) {
+        self.passed_on_ns = i64::MIN;
+        self.pass_on(flight);
+        drop(self.waiting);
+        let publishing = self.publishing.abort_handle();
+        if timeout(TAPE_END, self.publishing).await.is_err() {
+            publishing.abort();
         }
     }
 }

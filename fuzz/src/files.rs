@@ -52,8 +52,15 @@ pub fn calibration(input: &[u8]) {
     }
 }
 
-/// A recording to repair: what is kept of it is whole.
+/// A recording to repair, of which what is kept is whole, and to replay.
 pub fn recording(input: &[u8]) {
+    let mut reader = flightlog::TapeReader::default();
+    if reader.read(input).is_ok() {
+        for part in reader.tapes().iter().flat_map(|tape| &tape.parts) {
+            let records = part.records().take_while(Result::is_ok).count();
+            assert!(records <= part.records.len());
+        }
+    }
     let mut mended = Vec::new();
     if let Ok(found) = flightlog::repair(input, &mut mended) {
         let again = flightlog::repair(&mended, std::io::sink());

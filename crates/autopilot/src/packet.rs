@@ -162,6 +162,12 @@ impl Parser {
 }
 
 impl Packet {
+    /// The packet that is all of these bytes, which a [`Parser`] has found before; its checksum is not looked at again.
+    pub fn from_raw(raw: &[u8]) -> Option<Self> {
+        let shape = shape(raw).ok().filter(|shape| shape.length == raw.len())?;
+        Some(decode(raw, &shape))
+    }
+
     /// The payload as it was sent; MAVLink 2 leaves out zero bytes at its end.
     pub fn payload(&self) -> &[u8] {
         let header = if self.is_v2() { HEADER_V2 } else { HEADER_V1 };
@@ -452,6 +458,8 @@ mod tests {
             assert_eq!(packets[0].sequence, 200);
             assert_eq!(packets[0].raw, raw);
             assert_eq!(packets[0].message, Some(message(kind)));
+            assert_eq!(Packet::from_raw(&raw).as_ref(), packets.first());
+            assert_eq!(Packet::from_raw(&raw[1..]), None);
         }
     }
 

@@ -1,6 +1,6 @@
 //! Every number the lander uses, with its default, unit and range.
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::limits::{ConfigError, check, settings};
 
@@ -255,7 +255,7 @@ settings! {
 }
 
 /// What an aborted landing does.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OnAbort {
     /// Hover for `release_after_s`, then stop sending setpoints: the autopilot holds its position by itself.
@@ -267,7 +267,7 @@ pub enum OnAbort {
 }
 
 /// Reaction to an alarm.
-#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum AlarmAction {
     /// The landing continues.

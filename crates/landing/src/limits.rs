@@ -47,7 +47,7 @@ macro_rules! settings {
         }
     ) => {
         $(#[$doc])*
-        #[derive(Copy, Clone, Debug, PartialEq, Deserialize)]
+        #[derive(Copy, Clone, Debug, PartialEq, Deserialize, Serialize)]
         #[serde(deny_unknown_fields)]
         pub struct $name {
             $(

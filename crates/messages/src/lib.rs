@@ -6,7 +6,7 @@
 //!
 //! Modules in reading order: [`topic`] is the table of everything that is published, [`codec`] turns it into
 //! bytes and back, [`convert`] into the types of `geometry` and `imaging` and back; [`sample`] has messages
-//! for tests, and the others are the types by publisher.
+//! for tests, [`tape`] what a controller handled in order, and the others are the types by publisher.
 
 pub mod camera;
 pub mod codec;
@@ -17,6 +17,7 @@ pub mod health;
 pub mod recorder;
 pub mod sample;
 pub mod simulation;
+pub mod tape;
 pub mod topic;
 pub mod vehicle;
 
@@ -35,5 +36,9 @@ pub use detector::{
 pub use health::{Configuration, Count, Health, Latency, Rate};
 pub use recorder::{RecorderLoss, RecorderStatus};
 pub use simulation::{Touchdown, Truth, Wind};
+pub use tape::{
+    Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapeRecord, TapeTarget,
+    TapeWriter,
+};
 pub use topic::{Delivery, Row, TOPICS, Topic};
 pub use vehicle::{LandedState, MavlinkBytes, VehicleState};

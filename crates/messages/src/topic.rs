@@ -11,6 +11,7 @@ use crate::detector::{Detections, DetectorCommand, DetectorInfo};
 use crate::health::{Configuration, Health};
 use crate::recorder::RecorderStatus;
 use crate::simulation::{Truth, Wind};
+use crate::tape::Tape;
 use crate::vehicle::{MavlinkBytes, VehicleState};
 
 /// How the messages of a topic are delivered.
@@ -147,6 +148,8 @@ pub const COMMAND: Topic<ControllerCommand> =
 /// The answer to a command; travels as the reply, on the command's key.
 pub const COMMAND_REPLY: Topic<CommandReply> =
     Topic::new("controller/command", Delivery::Query, CONTROLLER);
+/// What the controller handled and what came out of it, in order; published only while somebody subscribes.
+pub const TAPE: Topic<Tape> = Topic::new("controller/tape", Delivery::Reliable, CONTROLLER);
 /// The true wind.
 pub const WIND: Topic<Wind> = Topic::new("wind", Delivery::Latest, SIMULATOR);
 /// The true state of vehicle and pad.
@@ -199,6 +202,7 @@ pub const TOPICS: &[Row] = &[
     STATUS.row,
     COMMAND.row,
     COMMAND_REPLY.row,
+    TAPE.row,
     WIND.row,
     TRUTH.row,
     FROM_AUTOPILOT.row,

@@ -1,11 +1,14 @@
 //! The bytes on the wire: they change only with a version.
 
+use std::borrow::Cow;
+
 use messages::{
     AlternativePose, BayerPattern, CameraInfo, Candidate, CommandReply, Configuration,
     ControllerCommand, ControllerStatus, Count, DecodeError, Detection, Detections,
     DetectorCommand, DetectorInfo, DetectorState, FrameAck, FrameHeader, FramePart, Health,
     LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, Phase, PixelFormat, Place,
-    Rate, RecorderLoss, RecorderStatus, Setpoint, StageTime, TargetEstimate, Touchdown, Transform3,
+    Rate, RecorderLoss, RecorderStatus, Setpoint, StageTime, Tape, TapeAction, TapeDecision,
+    TapeEvent, TapeNote, TapeOutput, TapeTarget, TapeWriter, TargetEstimate, Touchdown, Transform3,
     Truth, VehicleState, Wind, decode, encode,
 };
 use proptest::prelude::*;
@@ -329,6 +332,127 @@ fn truth() {
         &message,
         "410a0102000000000000f03f000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000f83f000000000000f8bf0000000000000000010102000000000000e03f000000000000d03f0000000000000000000000000000000003",
     );
+}
+
+#[test]
+fn tape() {
+    let message = Tape { begun_ns: 1, first: 300, count: 2, records: vec![7, 0] };
+    check(&message, "41130102ac0202020700");
+}
+
+/// A record with one event: its bytes without the hash, which the bytes give.
+fn record(event: &TapeEvent<'_>, output: &TapeOutput<'_>) -> String {
+    let mut tape = TapeWriter::new(0);
+    tape.write(1, event, output);
+    let records = tape.take().unwrap_or_default().records;
+    let (bytes, _hash) = records.split_at(records.len() - 8);
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+#[test]
+fn records_of_a_tape() {
+    let note = TapeNote {
+        address: "a".into(),
+        system: 1,
+        parameter: "p".into(),
+        original_s: 0.5,
+        set_s: 1.0,
+    };
+    let text = |text: &'static str| Cow::Borrowed(text);
+    let raw = || Cow::Borrowed(&[0xfd, 7][..]);
+    let detections = Detections {
+        detector: "main".into(),
+        header: header(),
+        detections: vec![],
+        stages: vec![],
+    };
+    let info = DetectorInfo {
+        detector: "d".into(),
+        host: "h".into(),
+        place: Place::Onboard,
+        camera: "c".into(),
+        markers: vec![],
+        version: "v".into(),
+        pid: 1,
+    };
+    let camera = CameraInfo {
+        camera: "down".into(),
+        width: 2,
+        height: 1,
+        focal_px: None,
+        principal_px: [0.5, 0.0],
+        lens: LensModel::BrownConrady([0.0; 8]),
+        body_from_camera: transform(),
+    };
+    let camera_bytes: String = encode(&camera)[3..].iter().map(|b| format!("{b:02x}")).collect();
+    let command = ControllerCommand::Start;
+    let reply = CommandReply { accepted: true, reason: "r".into() };
+    let nothing = TapeOutput::default();
+    let begin = TapeEvent::Begin { program: text("a"), build: text("b"), configuration: text("c") };
+    assert_eq!(record(&begin, &nothing), "0200016101620163000000");
+    assert_eq!(
+        record(&TapeEvent::TakeOver(note), &nothing),
+        "02010161010170000000000000e03f000000000000f03f000000"
+    );
+    assert_eq!(record(&TapeEvent::Packet { raw: raw() }, &nothing), "020202fd07000000");
+    assert_eq!(record(&TapeEvent::GroundPacket { raw: raw() }, &nothing), "020302fd07000000");
+    let tick = TapeOutput { packets: b"ab", ..nothing };
+    assert_eq!(record(&TapeEvent::Tick, &tick), "02040002616200");
+    let event = TapeEvent::Detections { publisher: text("m"), message: Cow::Owned(detections) };
+    assert_eq!(
+        record(&event, &nothing),
+        "0205016d046d61696e04646f776eac0201016302900acc0700000000000000"
+    );
+    let event = TapeEvent::Camera(Cow::Owned(camera));
+    assert_eq!(record(&event, &nothing), format!("0206{camera_bytes}000000"));
+    let event = TapeEvent::Presence { detector: text("m"), alive: true };
+    assert_eq!(record(&event, &nothing), "0207016d01000000");
+    let event = TapeEvent::DetectorInfo { publisher: text("d"), info: Cow::Owned(info) };
+    assert_eq!(record(&event, &nothing), "020801640164016800016300017601000000");
+    let answered = TapeOutput { reply: Some(&reply), ..nothing };
+    assert_eq!(record(&TapeEvent::Command(Cow::Owned(command)), &answered), "020900000001010172");
+    assert_eq!(record(&TapeEvent::RefusedVersion, &nothing), "020a000000");
+    assert_eq!(record(&TapeEvent::Shutdown, &nothing), "020b000000");
+    let decision = TapeDecision {
+        phase: "p",
+        action: TapeAction::Velocity { velocity_ned_m_s: [1.0, 0.0, -1.0], yaw_rate_rad_s: 0.5 },
+        why: "w",
+        target: Some(TapeTarget {
+            position_ned_m: [1.0, 0.0, 0.0],
+            velocity_ned_m_s: [0.0; 3],
+            lateral_error_m: 1.0,
+            height_m: 2.0,
+            age_s: 0.5,
+            deviation_m: 0.25,
+            detections: 300,
+            heading_rad: None,
+            time_offset_s: 0.0,
+            nis: Some(2.0),
+            ambiguous: false,
+        }),
+        rejected: None,
+        detector: Some("m"),
+    };
+    let decided = TapeOutput { decision: Some(decision), ..nothing };
+    assert_eq!(
+        record(&TapeEvent::Tick, &decided),
+        "02048f01017001000000000000f03f0000000000000000000000000000f0bf000000000000e03f017701000000000000f03f00000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000f03f0000000000000040000000000000e03f000000000000d03fac02000000000000000000010000000000000040000001016d0000"
+    );
+    for (number, action) in [
+        (0, TapeAction::None),
+        (2, TapeAction::Guided),
+        (3, TapeAction::Disarm),
+        (4, TapeAction::Land),
+    ] {
+        let decided = TapeOutput {
+            decision: Some(TapeDecision { action, target: None, ..decision }),
+            ..nothing
+        };
+        assert_eq!(
+            record(&TapeEvent::Tick, &decided),
+            format!("02040a0170{number:02x}0177000001016d0000")
+        );
+    }
 }
 
 #[test]

@@ -142,6 +142,29 @@ pub fn changed<T: Settings + Serialize>(current: &T, setting: &str) -> Result<T,
     Ok(effective(table, &[layer])?.settings)
 }
 
+/// A configuration as TOML, with every key.
+pub fn to_toml<T: Serialize>(settings: &T) -> String {
+    // A configuration is a table of values that TOML has.
+    Table::try_from(settings).map(|table| table.to_string()).unwrap_or_default()
+}
+
+/// The configuration that TOML text from `name` makes of the defaults, with further settings `key=value`.
+///
+/// # Errors
+/// As [`Layers::load`].
+pub fn from_toml<T: Settings>(
+    name: &str,
+    text: &str,
+    set: &[String],
+) -> Result<Effective<T>, ConfigError> {
+    let defaults = parse("the defaults", T::DEFAULTS)?;
+    let mut layers = vec![Layer { name: name.to_owned(), table: parse(name, text)? }];
+    for text in set {
+        layers.push(setting_layer(text, &defaults)?);
+    }
+    effective(defaults, &layers)
+}
+
 /// The configuration that results from layers over a table.
 fn effective<T: Settings>(mut table: Table, layers: &[Layer]) -> Result<Effective<T>, ConfigError> {
     for layer in layers {

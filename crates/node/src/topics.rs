@@ -290,6 +290,13 @@ impl<M: Message> Publisher<M> {
     }
 }
 
+impl<M> Publisher<M> {
+    /// Whether there is a subscriber.
+    pub async fn has_subscribers(&self) -> bool {
+        self.publisher.matching_status().await.is_ok_and(|status| status.matching())
+    }
+}
+
 impl<M: Message> Subscriber<M> {
     /// The next valid message; `None` once the session is closed. Others are counted, and logged once.
     pub async fn next(&self) -> Option<M> {

@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 
 use autopilot::Parser;
-use controller::flight::Flight;
-use messages::{CameraInfo, ControllerStatus, Detections, Phase};
+use controller::tape::TapedFlight;
+use messages::{CameraInfo, ControllerStatus, Detections, Phase, Tape};
 use node::Layers;
 
 /// Packets that a socket keeps for a process that does not read them; newer ones are lost.
@@ -47,9 +47,11 @@ pub struct Order {
 pub struct Controller {
     settings: Vec<String>,
     order: Order,
-    flight: Option<Flight>,
+    flight: Option<TapedFlight>,
     life: Life,
     parser: Parser,
+    /// What the flights have handled, when it is wanted.
+    tapes: Option<Vec<Tape>>,
     packets: VecDeque<Vec<u8>>,
     detections: VecDeque<(String, Vec<u8>)>,
     news: VecDeque<News>,
@@ -60,25 +62,44 @@ impl Controller {
     ///
     /// # Errors
     /// When a setting is invalid.
-    pub fn new(settings: &[String], order: Order) -> anyhow::Result<Self> {
+    pub fn new(now_ns: i64, settings: &[String], order: Order) -> anyhow::Result<Self> {
         let mut controller = Self {
             settings: settings.to_vec(),
             order,
             flight: None,
             life: Life::Dead,
             parser: Parser::new(),
+            tapes: None,
             packets: VecDeque::new(),
             detections: VecDeque::new(),
             news: VecDeque::new(),
         };
-        controller.start(None)?;
+        controller.start(now_ns, None)?;
         Ok(controller)
     }
 
-    fn start(&mut self, more: Option<&str>) -> anyhow::Result<()> {
+    /// Keeps what is handled from now on.
+    pub fn keep_tapes(&mut self) {
+        self.tapes.get_or_insert_default();
+    }
+
+    /// What was handled since [`Controller::keep_tapes`], of each life.
+    pub fn into_tapes(mut self) -> Vec<Tape> {
+        self.take_tape();
+        self.tapes.unwrap_or_default()
+    }
+
+    fn take_tape(&mut self) {
+        let tape = self.flight.as_mut().and_then(TapedFlight::take_tape);
+        if let Some(tapes) = &mut self.tapes {
+            tapes.extend(tape);
+        }
+    }
+
+    fn start(&mut self, now_ns: i64, more: Option<&str>) -> anyhow::Result<()> {
         let set = self.settings.iter().cloned().chain(more.map(str::to_owned)).collect();
         let config = Layers { file: None, set }.load::<controller::Config>()?.settings;
-        self.flight = Some(Flight::new(config, std::sync::Arc::default())?);
+        self.flight = Some(TapedFlight::new(now_ns, config, std::sync::Arc::default())?);
         self.life = Life::Runs;
         Ok(())
     }
@@ -96,6 +117,7 @@ impl Controller {
     pub fn set_life(&mut self, now_ns: i64, life: Life) -> anyhow::Result<bool> {
         let before = std::mem::replace(&mut self.life, life);
         if life == Life::Dead {
+            self.take_tape();
             self.flight = None;
             self.parser = Parser::new();
             self.packets.clear();
@@ -103,7 +125,7 @@ impl Controller {
             self.news.clear();
         }
         if life == Life::Runs && before == Life::Dead {
-            self.start(Some("start=resume"))?;
+            self.start(now_ns, Some("start=resume"))?;
             return Ok(true);
         }
         if life == Life::Runs && before == Life::Stopped && self.order.tick_first {
@@ -190,12 +212,13 @@ impl Controller {
             && let Some(flight) = &mut self.flight
         {
             flight.tick(now_ns);
+            self.take_tape();
         }
     }
 
     /// What it says of itself, if it runs.
     pub fn status(&self, now_ns: i64) -> Option<ControllerStatus> {
-        self.flight.as_ref().filter(|_| self.runs()).map(|flight| flight.status(now_ns))
+        self.flight.as_ref().filter(|_| self.runs()).map(|flight| flight.flight().status(now_ns))
     }
 
     /// The next packet to the autopilot.

@@ -3,7 +3,7 @@
 
 use anyhow::Context;
 use autopilot::Parser;
-use messages::{Detections, Phase};
+use messages::{Detections, Phase, Tape};
 use node::Layers;
 use world::World;
 use world::vehicle::VehicleTruth;
@@ -65,6 +65,20 @@ pub fn fly(planned: &Planned) -> anyhow::Result<Outcome> {
     run().with_context(|| planned.command())
 }
 
+/// Flies it, and returns the tape of the controller as well; of one that was started again, those of each life.
+///
+/// # Errors
+/// As [`fly`].
+pub fn fly_with_tape(planned: &Planned) -> anyhow::Result<(Outcome, Vec<Tape>)> {
+    let run = || {
+        let mut flight = FaultyFlight::new(planned)?;
+        flight.controller.keep_tapes();
+        flight.run()?;
+        Ok::<_, anyhow::Error>((flight.outcome, flight.controller.into_tapes()))
+    };
+    run().with_context(|| planned.command())
+}
+
 struct FaultyFlight<'a> {
     planned: &'a Planned,
     world: World,
@@ -104,9 +118,9 @@ impl<'a> FaultyFlight<'a> {
         let mut flight = Self {
             planned,
             sequence: (world.now_s() / frame_period_s) as u64 + 1,
+            controller: Controller::new(stamp_ns(world.now_s()), &planned.controller, order)?,
             world,
             vision,
-            controller: Controller::new(&planned.controller, order)?,
             link: FaultyLink::new(planned.seed),
             to_world: Parser::new(),
             detections: channel(3),

@@ -3,7 +3,8 @@
 //!
 //! Modules in reading order: [`kind`] has the kinds of faults, [`plan`] draws those of a flight; [`flight`]
 //! flies it with the faults that have [`begun`], the process of [`controller`], the autopilot's [`link`] over
-//! the connections of [`channel`] with its [`lies`], and the [`peers`]; [`outcome`] is its result and the bar; [`report`] writes the table.
+//! the connections of [`channel`] with its [`lies`], and the [`peers`]; [`outcome`] is its result and the bar; [`report`] writes the table,
+//! [`tape_file`] a recording with the controller's tape.
 
 pub mod begun;
 pub mod channel;
@@ -16,13 +17,14 @@ pub mod outcome;
 pub mod peers;
 pub mod plan;
 pub mod report;
+pub mod tape_file;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::Context;
 
 use crate::landing::in_parallel;
-use flight::fly;
+use flight::{fly, fly_with_tape};
 use outcome::Outcome;
 use plan::Request;
 
@@ -47,7 +49,15 @@ pub fn run(
     let flights = request.plan.flights();
     let done = AtomicUsize::new(0);
     let outcomes = in_parallel(&flights, request.jobs, |planned| {
-        let outcome = fly(planned)?;
+        let outcome = match &request.tapes_in {
+            None => fly(planned)?,
+            Some(folder) => {
+                let (outcome, tapes) = fly_with_tape(planned)?;
+                let name = format!("{}-{}.mcap", outcome.kinds.replace(' ', "-"), planned.seed);
+                tape_file::write(&folder.join(name), &tapes, &planned.command())?;
+                outcome
+            }
+        };
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, flights.len());
         Ok(outcome)
     })?;

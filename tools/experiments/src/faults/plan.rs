@@ -74,6 +74,8 @@ pub struct Request {
     pub plan: Plan,
     /// Folder of the results.
     pub results_in: PathBuf,
+    /// Folder of the recordings with the controllers' tapes, where they are wanted.
+    pub tapes_in: Option<PathBuf>,
     /// Number of flights in parallel.
     pub jobs: usize,
 }

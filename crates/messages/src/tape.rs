@@ -1,0 +1,521 @@
+//! The controller's tape: what it handled, in the order in which it did, and what came out of it.
+//!
+//! A [`Tape`] holds some records. Each record is an event with the time at which it was handled, what came out of it,
+//! and a running hash over all of this and the hash before: a bit that was flipped, and a record that is missing, is
+//! found at once. What a tape says is enough to fly the same flight again.
+
+use std::borrow::Cow;
+
+use postcard::ser_flavors::Flavor;
+use serde::{Deserialize, Serialize, Serializer};
+use siphasher::sip::SipHasher13;
+
+use crate::camera::CameraInfo;
+use crate::codec::wire;
+use crate::controller::{CommandReply, ControllerCommand};
+use crate::detector::{Detections, DetectorInfo};
+
+wire! {
+    Tape = 19 v 1;
+}
+
+/// Length of the hash at the end of each record, in bytes.
+const HASH_LEN: usize = size_of::<u64>();
+/// Maximum size of the records that wait to be taken from a [`TapeWriter`], in bytes. Beyond it they are dropped, and the
+/// numbers of those after them tell.
+const MAX_WAITING_BYTES: usize = 1 << 20;
+
+/// Some records of a controller's tape, in order.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Tape {
+    /// When the controller began its tape, in nanoseconds of its clock: it tells the tapes of two controllers apart.
+    pub begun_ns: i64,
+    /// Number of the first of these records; the first of all has 0.
+    pub first: u64,
+    /// How many records these are.
+    pub count: u32,
+    /// The records, one after the other, each with its hash; [`Tape::records`] reads them.
+    pub records: Vec<u8>,
+}
+
+/// What a controller handled.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum TapeEvent<'a> {
+    /// It started; always the first.
+    Begin {
+        /// The program with its version.
+        #[serde(borrow)]
+        program: Cow<'a, str>,
+        /// For what it was built.
+        #[serde(borrow)]
+        build: Cow<'a, str>,
+        /// Its effective configuration, as TOML.
+        #[serde(borrow)]
+        configuration: Cow<'a, str>,
+    },
+    /// It took over what an earlier controller left to put back.
+    TakeOver(TapeNote),
+    /// A packet of the autopilot's link.
+    Packet {
+        /// As it came.
+        #[serde(borrow, serialize_with = "as_bytes")]
+        raw: Cow<'a, [u8]>,
+    },
+    /// A packet of the ground station for the autopilot.
+    GroundPacket {
+        /// As it came.
+        #[serde(borrow, serialize_with = "as_bytes")]
+        raw: Cow<'a, [u8]>,
+    },
+    /// Time passed.
+    Tick,
+    /// Detections.
+    Detections {
+        /// The detector on whose key they came.
+        #[serde(borrow)]
+        publisher: Cow<'a, str>,
+        /// What came.
+        message: Cow<'a, Detections>,
+    },
+    /// A camera's calibration and mount.
+    Camera(Cow<'a, CameraInfo>),
+    /// A detector came or went.
+    Presence {
+        /// Its name.
+        #[serde(borrow)]
+        detector: Cow<'a, str>,
+        /// Whether it came.
+        alive: bool,
+    },
+    /// A detector's information.
+    DetectorInfo {
+        /// The detector on whose key it came.
+        #[serde(borrow)]
+        publisher: Cow<'a, str>,
+        /// What came.
+        info: Cow<'a, DetectorInfo>,
+    },
+    /// An operator's command.
+    Command(Cow<'a, ControllerCommand>),
+    /// Messages of another version were refused.
+    RefusedVersion,
+    /// It ends.
+    Shutdown,
+}
+
+/// A parameter of the autopilot that an earlier controller left to put back.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TapeNote {
+    /// The link's address.
+    pub address: String,
+    /// The vehicle's MAVLink system id.
+    pub system: u8,
+    /// Name of the parameter.
+    pub parameter: String,
+    /// Its value before the landing, in seconds.
+    pub original_s: f64,
+    /// Its value for the landing, in seconds.
+    pub set_s: f64,
+}
+
+/// What the lander decided, with the detector in use.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TapeDecision<'a> {
+    /// The phase, by its short name.
+    pub phase: &'a str,
+    /// The command for the autopilot.
+    pub action: TapeAction,
+    /// Why this phase and this action, by its short name.
+    pub why: &'a str,
+    /// The landing point, as estimated.
+    pub target: Option<TapeTarget>,
+    /// Why the event was not used, by its short name.
+    pub rejected: Option<&'a str>,
+    /// The detector in use.
+    pub detector: Option<&'a str>,
+}
+
+/// A command for the autopilot.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum TapeAction {
+    /// Nothing.
+    None,
+    /// A velocity setpoint.
+    Velocity {
+        /// In local NED, in m/s.
+        velocity_ned_m_s: [f64; 3],
+        /// Clockwise seen from above, in rad/s.
+        yaw_rate_rad_s: f64,
+    },
+    /// The mode that follows setpoints.
+    Guided,
+    /// Stop the motors.
+    Disarm,
+    /// The autopilot's LAND mode.
+    Land,
+}
+
+/// The landing point, as estimated.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TapeTarget {
+    /// In local NED, in metres.
+    pub position_ned_m: [f64; 3],
+    /// In local NED, in m/s.
+    pub velocity_ned_m_s: [f64; 3],
+    /// Horizontal distance from the vehicle, in metres.
+    pub lateral_error_m: f64,
+    /// Height of the vehicle above it, in metres.
+    pub height_m: f64,
+    /// Age of the newest detection used, since its exposure, in seconds.
+    pub age_s: f64,
+    /// Standard deviation of its horizontal position, in metres.
+    pub deviation_m: f64,
+    /// Number of detections used.
+    pub detections: u32,
+    /// Heading of the marker's upper edge, from north to east, in radians.
+    pub heading_rad: Option<f64>,
+    /// Delay of exposures after their stamps, in seconds.
+    pub time_offset_s: f64,
+    /// Normalised innovation squared of the newest detection.
+    pub nis: Option<f64>,
+    /// True while the marker is seen more often elsewhere.
+    pub ambiguous: bool,
+}
+
+/// What came out of an event.
+#[derive(Copy, Clone, Debug, Default)]
+pub struct TapeOutput<'a> {
+    /// The decision; `None` when it is the one before.
+    pub decision: Option<TapeDecision<'a>>,
+    /// The packets for the autopilot, one after the other.
+    pub packets: &'a [u8],
+    /// The answer to a command.
+    pub reply: Option<&'a CommandReply>,
+}
+
+/// A record as it stands on the tape, before its hash.
+#[derive(Serialize, Deserialize)]
+struct Step<'a> {
+    now_ns: i64,
+    #[serde(borrow)]
+    event: TapeEvent<'a>,
+    #[serde(borrow, serialize_with = "as_bytes")]
+    decision: Cow<'a, [u8]>,
+    #[serde(borrow, serialize_with = "as_bytes")]
+    packets: Cow<'a, [u8]>,
+    reply: Option<Cow<'a, CommandReply>>,
+}
+
+/// The same with the event borrowed.
+#[derive(Serialize)]
+struct StepRef<'a> {
+    now_ns: i64,
+    event: &'a TapeEvent<'a>,
+    #[serde(serialize_with = "as_bytes")]
+    decision: &'a [u8],
+    #[serde(serialize_with = "as_bytes")]
+    packets: &'a [u8],
+    reply: Option<&'a CommandReply>,
+}
+
+/// A record that was read from a tape.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TapeRecord<'a> {
+    /// Its number; the first has 0.
+    pub number: u64,
+    /// When it was handled, in nanoseconds of the controller's clock.
+    pub now_ns: i64,
+    /// What was handled.
+    pub event: TapeEvent<'a>,
+    /// The packets for the autopilot that came out, one after the other.
+    pub packets: Cow<'a, [u8]>,
+    /// The answer to a command.
+    pub reply: Option<CommandReply>,
+    /// The decision as bytes, read by [`TapeRecord::decision`]; empty when it is the one before.
+    pub decision: Cow<'a, [u8]>,
+    /// The running hash.
+    pub hash: u64,
+    /// What the hash is of, beside the hash before.
+    bytes: &'a [u8],
+}
+
+/// Why a record cannot be read.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("record {number} of the tape is cut or damaged")]
+pub struct TapeDamage {
+    /// Number of the record.
+    pub number: u64,
+}
+
+/// Writes a tape: records in, [`Tape`]s out.
+#[derive(Clone, Debug)]
+pub struct TapeWriter {
+    begun_ns: i64,
+    /// Number of the next record.
+    next: u64,
+    hash: u64,
+    /// The decision of the record before, as bytes.
+    decision: Vec<u8>,
+    /// That of this record.
+    new_decision: Vec<u8>,
+    records: Vec<u8>,
+    count: u32,
+}
+
+fn as_bytes<S: Serializer>(bytes: impl AsRef<[u8]>, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_bytes(bytes.as_ref())
+}
+
+/// Appends what postcard writes to a buffer that is kept.
+struct Appending<'a>(&'a mut Vec<u8>);
+
+impl Flavor for Appending<'_> {
+    type Output = ();
+
+    fn try_push(&mut self, byte: u8) -> postcard::Result<()> {
+        self.0.push(byte);
+        Ok(())
+    }
+
+    fn try_extend(&mut self, bytes: &[u8]) -> postcard::Result<()> {
+        self.0.extend_from_slice(bytes);
+        Ok(())
+    }
+
+    fn finalize(self) -> postcard::Result<()> {
+        Ok(())
+    }
+}
+
+/// Appends a value.
+fn append<T: Serialize>(value: &T, to: &mut Vec<u8>) {
+    // Postcard fails only on sequences of unknown length, which no record has.
+    drop(postcard::serialize_with_flavor(value, Appending(to)));
+}
+
+fn running_hash(before: u64, bytes: &[u8]) -> u64 {
+    SipHasher13::new_with_keys(before, 0).hash(bytes)
+}
+
+impl TapeWriter {
+    /// An empty tape that begins at `now_ns`.
+    pub fn new(now_ns: i64) -> Self {
+        Self {
+            begun_ns: now_ns,
+            next: 0,
+            hash: 0,
+            decision: Vec::new(),
+            new_decision: Vec::new(),
+            records: Vec::new(),
+            count: 0,
+        }
+    }
+
+    /// Adds an event that was handled at `now_ns`, and what came out of it.
+    pub fn write(&mut self, now_ns: i64, event: &TapeEvent<'_>, output: &TapeOutput<'_>) {
+        if self.records.len() > MAX_WAITING_BYTES {
+            self.records.clear();
+            self.count = 0;
+        }
+        self.new_decision.clear();
+        if let Some(new) = &output.decision {
+            append(new, &mut self.new_decision);
+        }
+        let is_as_before = self.new_decision == self.decision;
+        let start = self.records.len();
+        let step = StepRef {
+            now_ns,
+            event,
+            decision: if is_as_before { &[] } else { &self.new_decision },
+            packets: output.packets,
+            reply: output.reply,
+        };
+        append(&step, &mut self.records);
+        self.hash = running_hash(self.hash, self.records.get(start..).unwrap_or_default());
+        self.records.extend_from_slice(&self.hash.to_le_bytes());
+        self.next += 1;
+        self.count += 1;
+        if output.decision.is_some() {
+            std::mem::swap(&mut self.decision, &mut self.new_decision);
+        }
+    }
+
+    /// Size of the records that wait to be taken, in bytes.
+    pub fn waiting_bytes(&self) -> usize {
+        self.records.len()
+    }
+
+    /// The records since the last call; `None` when there are none.
+    pub fn take(&mut self) -> Option<Tape> {
+        if self.count == 0 {
+            return None;
+        }
+        let count = std::mem::take(&mut self.count);
+        let records = self.records.clone();
+        self.records.clear();
+        Some(Tape { begun_ns: self.begun_ns, first: self.next - u64::from(count), count, records })
+    }
+}
+
+impl Tape {
+    /// Its records, up to the first that cannot be read.
+    pub fn records(&self) -> impl Iterator<Item = Result<TapeRecord<'_>, TapeDamage>> {
+        let mut rest = Some(self.records.as_slice());
+        let mut number = self.first;
+        let end = self.first.saturating_add(u64::from(self.count));
+        std::iter::from_fn(move || {
+            let bytes = rest.take()?;
+            if number == end {
+                return (!bytes.is_empty()).then_some(Err(TapeDamage { number }));
+            }
+            match TapeRecord::read(number, bytes) {
+                Some((record, after)) => {
+                    number += 1;
+                    rest = Some(after);
+                    Some(Ok(record))
+                }
+                None => Some(Err(TapeDamage { number })),
+            }
+        })
+    }
+}
+
+impl<'a> TapeRecord<'a> {
+    fn read(number: u64, bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
+        let (step, rest) = postcard::take_from_bytes::<Step<'a>>(bytes).ok()?;
+        let covered = bytes.get(..bytes.len().checked_sub(rest.len())?)?;
+        let (hash, rest) = rest.split_first_chunk::<HASH_LEN>()?;
+        let record = Self {
+            number,
+            now_ns: step.now_ns,
+            event: step.event,
+            packets: step.packets,
+            reply: step.reply.map(Cow::into_owned),
+            decision: step.decision,
+            hash: u64::from_le_bytes(*hash),
+            bytes: covered,
+        };
+        Some((record, rest))
+    }
+
+    /// Whether its hash is the one after `before`, that of the record before; before the first it is 0.
+    pub fn follows(&self, before: u64) -> bool {
+        running_hash(before, self.bytes) == self.hash
+    }
+
+    /// The decision; `None` when it is the one before, or cannot be read.
+    pub fn decision(&self) -> Option<TapeDecision<'_>> {
+        TapeDecision::from_bytes(&self.decision)
+    }
+}
+
+impl<'a> TapeDecision<'a> {
+    /// The decision in the bytes of a [`TapeRecord`]; `None` when they are none.
+    pub fn from_bytes(bytes: &'a [u8]) -> Option<Self> {
+        postcard::from_bytes(bytes).ok()
+    }
+}
+
+impl TapeEvent<'_> {
+    /// What it is, for people.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Begin { .. } => "begin",
+            Self::TakeOver(_) => "take-over",
+            Self::Packet { .. } => "packet",
+            Self::GroundPacket { .. } => "ground-packet",
+            Self::Tick => "tick",
+            Self::Detections { .. } => "detections",
+            Self::Camera(_) => "camera",
+            Self::Presence { .. } => "presence",
+            Self::DetectorInfo { .. } => "detector-info",
+            Self::Command(_) => "command",
+            Self::RefusedVersion => "refused-version",
+            Self::Shutdown => "shutdown",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn decision() -> TapeDecision<'static> {
+        TapeDecision {
+            phase: "descend",
+            action: TapeAction::Velocity {
+                velocity_ned_m_s: [0.5, -0.25, 0.75],
+                yaw_rate_rad_s: 0.0,
+            },
+            why: "descending",
+            target: None,
+            rejected: None,
+            detector: Some("main"),
+        }
+    }
+
+    fn written() -> Tape {
+        let mut writer = TapeWriter::new(5);
+        let output = TapeOutput { decision: Some(decision()), packets: b"abc", reply: None };
+        writer.write(7, &TapeEvent::Tick, &output);
+        writer.write(8, &TapeEvent::Tick, &output);
+        let packet = TapeEvent::Packet { raw: Cow::Borrowed(b"packet") };
+        writer.write(9, &packet, &TapeOutput::default());
+        writer.take().unwrap()
+    }
+
+    fn hashes_fit(tape: &Tape) -> bool {
+        let mut before = 0;
+        let mut count = 0;
+        for record in tape.records() {
+            let Ok(record) = record else { return false };
+            if !record.follows(before) {
+                return false;
+            }
+            before = record.hash;
+            count += 1;
+        }
+        count == tape.count
+    }
+
+    #[test]
+    fn what_is_written_is_read_and_the_same_decision_is_kept_once() {
+        let tape = written();
+        assert_eq!((tape.begun_ns, tape.first, tape.count), (5, 0, 3));
+        assert!(hashes_fit(&tape));
+        let records: Vec<_> = tape.records().map(Result::unwrap).collect();
+        assert_eq!(records[0].decision(), Some(decision()));
+        assert_eq!(records[0].packets.as_ref(), b"abc");
+        assert_eq!((records[1].now_ns, records[1].decision()), (8, None));
+        assert_eq!(records[2].event, TapeEvent::Packet { raw: Cow::Borrowed(b"packet") });
+    }
+
+    #[test]
+    fn every_flipped_bit_and_every_cut_is_found() {
+        let tape = written();
+        for bit in 0..8 * tape.records.len() {
+            let mut flipped = tape.clone();
+            flipped.records[bit / 8] ^= 1 << (bit % 8);
+            assert!(!hashes_fit(&flipped), "bit {bit}");
+        }
+        for length in 0..tape.records.len() {
+            let mut cut = tape.clone();
+            cut.records.truncate(length);
+            assert!(!hashes_fit(&cut), "cut to {length} bytes");
+        }
+    }
+
+    #[test]
+    fn a_tape_that_nobody_takes_is_bounded_and_its_numbers_tell_what_is_missing() {
+        let mut writer = TapeWriter::new(0);
+        let packet = TapeEvent::Packet { raw: Cow::Owned(vec![0; 1000]) };
+        for now_ns in 0..2000 {
+            writer.write(now_ns, &packet, &TapeOutput::default());
+            assert!(writer.waiting_bytes() < MAX_WAITING_BYTES + 2000);
+        }
+        let tape = writer.take().unwrap();
+        assert!(tape.first > 0);
+        assert_eq!(tape.first + u64::from(tape.count), 2000);
+        assert_eq!(writer.take(), None);
+    }
+}

@@ -1,0 +1,192 @@
+//! Gives a tape to a flight that begins anew.
+
+use std::fmt;
+use std::ops::ControlFlow;
+use std::sync::Arc;
+
+use anyhow::Context;
+use controller::flight::Flight;
+use controller::tape::TapedFlight;
+use flightlog::RecordedTape;
+use messages::{TapeEvent, TapeRecord};
+use node::from_toml;
+
+/// An event that was replayed.
+#[derive(Copy, Clone)]
+pub struct Replayed<'a> {
+    /// What the tape says of it.
+    pub recorded: &'a TapeRecord<'a>,
+    /// What came out now.
+    pub replayed: &'a TapeRecord<'a>,
+    /// The flight after it.
+    pub flight: &'a Flight,
+    /// Time since the tape began, in seconds.
+    pub time_s: f64,
+}
+
+/// Why a tape was not replayed to its end.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Stop {
+    /// It does not begin with its beginning.
+    NoBeginning {
+        /// Number of its first event.
+        first: u64,
+    },
+    /// Events are missing.
+    Gap {
+        /// Number of the first that is missing.
+        from: u64,
+        /// How many are missing.
+        missing: u64,
+        /// When, since the begin, in seconds.
+        time_s: f64,
+    },
+    /// An event was changed after it was recorded.
+    Damaged {
+        /// Its number.
+        number: u64,
+        /// What it is, as far as it can be read.
+        event: Option<&'static str>,
+        /// When, since the begin, in seconds.
+        time_s: f64,
+    },
+    /// An event gives another result than then.
+    Different {
+        /// Its number.
+        number: u64,
+        /// What it is.
+        event: &'static str,
+        /// When, since the begin, in seconds.
+        time_s: f64,
+        /// The value that differs.
+        field: String,
+        /// Its value then.
+        recorded: String,
+        /// Its value now.
+        replayed: String,
+    },
+}
+
+/// How far a tape was replayed.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct End {
+    /// The program that wrote it, with its version.
+    pub program: String,
+    /// For what that was built.
+    pub build: String,
+    /// Events that were replayed, the beginning included.
+    pub events: u64,
+    /// The time from the first to the last of them, in seconds.
+    pub flight_s: f64,
+    /// Why it went no further; `None` at the end of the tape.
+    pub stop: Option<Stop>,
+}
+
+impl fmt::Display for Stop {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoBeginning { first } => write!(
+                f,
+                "not replayable: the tape begins with event {first}, what came before is missing; name the earlier files of this recording as well, or record from the start"
+            ),
+            Self::Gap { from, missing, time_s } => write!(
+                f,
+                "not replayable from {time_s:.3} s on: {missing} events are missing, from number {from}"
+            ),
+            Self::Damaged { number, event, time_s } => {
+                let event = event.unwrap_or("unreadable");
+                write!(
+                    f,
+                    "event {number} ({event}) at {time_s:.3} s is damaged: it does not fit its hash"
+                )
+            }
+            Self::Different { number, event, time_s, field, recorded, replayed } => write!(
+                f,
+                "event {number} ({event}) at {time_s:.3} s gives another result: {field} was {recorded}, now it is {replayed}"
+            ),
+        }
+    }
+}
+
+/// Replays a tape, under its configuration with some settings `key=value` over it. `each` sees every event after the
+/// beginning, and may end it.
+///
+/// # Errors
+/// When the configuration cannot be used.
+pub fn run(
+    tape: &RecordedTape,
+    set: &[String],
+    mut each: impl FnMut(Replayed<'_>) -> ControlFlow<Stop>,
+) -> anyhow::Result<End> {
+    let mut end = End::default();
+    let mut flight = None;
+    let mut hash = 0;
+    for part in &tape.parts {
+        if part.first != end.events {
+            end.stop = Some(match end.events {
+                0 => Stop::NoBeginning { first: part.first },
+                from => {
+                    let missing = part.first.saturating_sub(from);
+                    Stop::Gap { from, missing, time_s: end.flight_s }
+                }
+            });
+            return Ok(end);
+        }
+        for record in part.records() {
+            let damaged =
+                |event| Some(Stop::Damaged { number: end.events, event, time_s: end.flight_s });
+            let record = match record {
+                Ok(record) if record.follows(hash) => record,
+                Ok(record) => {
+                    end.stop = damaged(Some(record.event.name()));
+                    return Ok(end);
+                }
+                Err(_damage) => {
+                    end.stop = damaged(None);
+                    return Ok(end);
+                }
+            };
+            hash = record.hash;
+            let Some(flight) = &mut flight else {
+                let TapeEvent::Begin { program, build, configuration } = &record.event else {
+                    end.stop = damaged(Some(record.event.name()));
+                    return Ok(end);
+                };
+                let config = from_toml("the recorded configuration", configuration, set)
+                    .with_context(|| {
+                        format!("of {program}; this is {}", controller::tape::program())
+                    })?;
+                let mut new = TapedFlight::new(record.now_ns, config.settings, Arc::default())?;
+                drop(new.take_tape());
+                flight = Some(new);
+                (end.program, end.build) = (program.to_string(), build.to_string());
+                end.events += 1;
+                continue;
+            };
+            if !flight.replay(record.now_ns, &record.event) {
+                end.stop = damaged(Some(record.event.name()));
+                return Ok(end);
+            }
+            while flight.poll_outgoing().is_some() {}
+            let now = flight.take_tape();
+            let replayed = now.as_ref().and_then(|now| now.records().next()).and_then(Result::ok);
+            let replayed = replayed.context("a replayed event has no result")?;
+            end.flight_s = record.now_ns.saturating_sub(tape.begun_ns) as f64 * 1e-9;
+            let step = Replayed {
+                recorded: &record,
+                replayed: &replayed,
+                flight: flight.flight(),
+                time_s: end.flight_s,
+            };
+            if let ControlFlow::Break(stop) = each(step) {
+                end.stop = Some(stop);
+                return Ok(end);
+            }
+            end.events += 1;
+        }
+    }
+    if end.events == 0 {
+        end.stop = Some(Stop::NoBeginning { first: 0 });
+    }
+    Ok(end)
+}
