@@ -102,7 +102,7 @@ impl Mission {
 
     /// True while a landing begins by itself once the vehicle flies.
     pub fn is_awaiting_takeoff(&self) -> bool {
-        matches!(self.state, State::AwaitingTakeoff)
+        matches!(self.state, State::AwaitingTakeoff) || self.awaits_next_flight
     }
 
     /// True once the lander decides.
@@ -152,6 +152,8 @@ impl Mission {
     /// Ends the mission: nothing is sent any more, and no pending command is repeated.
     pub fn fail(&mut self, autopilot: &mut Autopilot, why: String) {
         autopilot.withdraw();
+        self.goes_on_until_ns = None;
+        self.awaits_next_flight = false;
         self.state = State::Failed { why };
     }
 
@@ -177,15 +179,14 @@ impl Mission {
                 self.await_next_flight();
             }
         }
-        if self.awaits_next_flight && is_known && is_flying_guided(autopilot) {
-            return Some(Trigger::InFlight);
-        }
+        let lands = autopilot.state().is_some_and(|state| {
+            state.armed && state.mode.is_landing() && state.landed.is_flying()
+        });
+        let is_flying = is_known && (is_flying_guided(autopilot) || lands && steers);
         match &mut self.state {
+            State::Landing if self.awaits_next_flight && is_flying => Some(Trigger::InFlight),
             State::AwaitingTakeoff => {
-                let lands = autopilot.state().is_some_and(|state| {
-                    state.armed && state.mode.is_landing() && state.landed.is_flying()
-                });
-                if is_known && (is_flying_guided(autopilot) || lands && steers) {
+                if is_flying {
                     return Some(Trigger::InFlight);
                 }
                 if self.start == Start::Resume && has_no_landing(autopilot) {

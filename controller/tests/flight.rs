@@ -604,6 +604,29 @@ fn a_pilot_who_arms_again_at_once_after_a_landing_has_the_next_flight_landed() {
 }
 
 #[test]
+fn after_a_restart_of_the_autopilot_nothing_begins_by_itself() {
+    let mut flight = in_flight("airborne");
+    let poses = |flight: &mut Flight, from_ms: i64, to_ms: i64, booted_ms: i64| {
+        for ms in (from_ms..to_ms).step_by(20) {
+            receive(flight, ms * MS, &attitude((ms - booted_ms) * MS));
+            receive(flight, ms * MS + 1, &position((ms - booted_ms) * MS, 5.0));
+            flight.tick(ms * MS + 3);
+        }
+        flight.status(to_ms * MS).phase
+    };
+    poses(&mut flight, 20, 500, 0);
+    receive(&mut flight, 500 * MS, &heartbeat(4, false));
+    receive(&mut flight, 501 * MS, &contact(MavLandedState::MAV_LANDED_STATE_ON_GROUND));
+    assert_eq!(poses(&mut flight, 520, 8000, 0), Phase::Landed);
+    receive(&mut flight, 8000 * MS, &heartbeat(4, true));
+    assert_eq!(poses(&mut flight, 8020, 9000, 0), Phase::Landed);
+    assert_eq!(poses(&mut flight, 13_000, 14_000, 10_000), Phase::Failed);
+    receive(&mut flight, 14_000 * MS, &heartbeat(4, true));
+    receive(&mut flight, 14_001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+    assert_eq!(poses(&mut flight, 14_020, 16_000, 10_000), Phase::Failed);
+}
+
+#[test]
 fn a_controller_restarted_after_touchdown_lands_no_later_flight() {
     let first_and_next = |mode: u32, contact_at_start: MavLandedState| {
         let mut flight = flight("resume");
