@@ -38,6 +38,8 @@ const CLAIM_CHECK_DELAYS: [Duration; 3] =
 
 /// Period of a service's configuration.
 const CONFIGURATION_PERIOD: Duration = Duration::from_secs(3);
+/// Period in which a service that will publish it looks whether it is announced.
+const ANNOUNCED_PERIOD: Duration = Duration::from_millis(100);
 
 /// Timeout for closing the session.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(300);
@@ -245,11 +247,15 @@ impl Node {
         }
     }
 
-    /// Publishes the service's configuration, every few seconds for those that come late, until it fails.
+    /// Publishes the service's configuration once it is announced, and every few seconds for those that come late, until
+    /// it fails. One that is refused its name publishes none.
     ///
     /// # Errors
     /// When the session is closed.
     pub async fn publish_configuration(&self, toml: String) -> anyhow::Result<()> {
+        while self.token.lock().unwrap_or_else(PoisonError::into_inner).is_none() {
+            tokio::time::sleep(ANNOUNCED_PERIOD).await;
+        }
         let names = [self.identity.service, self.identity.instance.as_str()];
         let publisher = self.publisher(topic::CONFIGURATION, &names).await?;
         let configuration = Configuration {

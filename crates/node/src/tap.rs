@@ -11,6 +11,7 @@ use zenoh::sample::Sample;
 use crate::clock::now_ns;
 use crate::health::HealthCounters;
 use crate::session::Node;
+use crate::topics::{REPLY_TIMEOUT, with_query_qos};
 
 /// Maximum number of messages that wait.
 const MAX_WAITING: usize = 16_384;
@@ -68,12 +69,7 @@ impl Node {
     /// # Errors
     /// When the session is closed.
     pub async fn tap(&self, topics: &[Row], max_bytes: usize) -> anyhow::Result<Tap> {
-        let shared = Arc::new(Shared {
-            queue: Mutex::default(),
-            arrived: Condvar::new(),
-            max_bytes,
-            health: self.shared_health(),
-        });
+        let shared = Arc::new(Shared::new(max_bytes, self.shared_health()));
         let mut subscribers = Vec::new();
         for row in topics {
             let key = pattern(row.key);
@@ -94,7 +90,8 @@ impl Node {
                     }
                 };
                 // At the start of a system there is no publisher yet, which is not an error.
-                drop(self.session.get(&key).callback(reply).await);
+                let query = with_query_qos(self.session.get(&key)).timeout(REPLY_TIMEOUT);
+                drop(query.callback(reply).await);
             }
         }
         Ok(Tap { shared, _subscribers: subscribers })
@@ -108,6 +105,10 @@ fn pattern(key: &str) -> String {
 }
 
 impl Shared {
+    fn new(max_bytes: usize, health: Arc<HealthCounters>) -> Self {
+        Self { queue: Mutex::default(), arrived: Condvar::new(), max_bytes, health }
+    }
+
     /// Copies a message, unless too much waits already.
     fn take(&self, sample: &Sample, is_state: bool) {
         let key = sample.key_expr().as_str();
@@ -163,5 +164,39 @@ impl Tap {
     /// How many messages were lost since the last call, by key.
     pub fn take_dropped(&self) -> BTreeMap<String, u64> {
         std::mem::take(&mut self.shared.lock().dropped)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_has_no_room_is_counted_by_key() {
+        let shared = Shared::new(100, Arc::default());
+        assert!(shared.reserve("wind", 60));
+        assert!(!shared.reserve("wind", 41) && !shared.reserve("truth", 41));
+        assert!(!shared.reserve("wind", 41));
+        assert!(shared.reserve("wind", 40));
+        let dropped = std::mem::take(&mut shared.lock().dropped);
+        assert_eq!(dropped, [("truth".to_owned(), 1), ("wind".to_owned(), 2)].into());
+        for key in 0..MAX_KEYS + 3 {
+            assert!(!shared.reserve(&key.to_string(), 1));
+        }
+        let dropped = &shared.lock().dropped;
+        assert_eq!((dropped.len(), dropped[OTHER_KEYS]), (MAX_KEYS + 1, 3));
+    }
+
+    #[test]
+    fn a_read_message_makes_room() {
+        let tap = Tap { shared: Arc::new(Shared::new(8, Arc::default())), _subscribers: vec![] };
+        let message = Tapped { key: "wind".into(), payload: vec![1; 4], ..Tapped::default() };
+        for _ in 0..3 {
+            assert!(tap.shared.reserve("wind", message.bytes()));
+            tap.shared.lock().messages.push_back(message.clone());
+            assert!(!tap.shared.reserve("wind", 1));
+            assert_eq!(tap.next(Duration::ZERO), Some(message.clone()));
+            assert_eq!(tap.next(Duration::ZERO), None);
+        }
     }
 }

@@ -19,7 +19,7 @@ use crate::health::HealthCounters;
 use crate::session::Node;
 
 /// Timeout of the reply to a query.
-const REPLY_TIMEOUT: Duration = Duration::from_secs(2);
+pub(crate) const REPLY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Pause before a command without a recipient is sent again.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
 
@@ -234,7 +234,9 @@ impl Node {
 }
 
 /// A query with the quality of service of commands; its replies get the same.
-fn with_query_qos<'a, 'b, H>(get: SessionGetBuilder<'a, 'b, H>) -> SessionGetBuilder<'a, 'b, H> {
+pub(crate) fn with_query_qos<'a, 'b, H>(
+    get: SessionGetBuilder<'a, 'b, H>,
+) -> SessionGetBuilder<'a, 'b, H> {
     let Qos { priority, congestion, .. } = qos(Delivery::Query);
     get.priority(priority).congestion_control(congestion)
 }
