@@ -1,11 +1,13 @@
 //! Ends a recording properly whose writer was killed, and says what is lost.
 
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::Write;
+use std::sync::Arc;
 
-use mcap::Attachment;
 use mcap::read::{ChunkReader, LinearReader, Options};
 use mcap::records::Record;
 use mcap::write::{NoSeek, WriteOptions};
+use mcap::{Attachment, Channel, McapError, Summary};
 
 use crate::writer::Problem;
 
@@ -22,42 +24,46 @@ pub struct Repaired {
 
 /// Copies every whole chunk of a recording into `output`, and ends it.
 ///
+/// A channel is described once, in the first chunk that has messages of it, and again in the index of a recording that
+/// was ended. Where both are damaged or missing, the messages of the channel are lost, and counted.
+///
 /// # Errors
 /// When `recording` is no MCAP file at all, or the output does not take it.
 pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem> {
-    let options = WriteOptions::new().compression(None).disable_seeking(true);
-    let mut mcap = options.create(NoSeek::new(output))?;
-    let mut repaired = Repaired::default();
-    let mut is_ended = false;
     if !recording.starts_with(mcap::MAGIC) {
-        return Err(mcap::McapError::BadMagic.into());
+        return Err(McapError::BadMagic.into());
     }
+    let index = Summary::read(recording).ok().flatten();
+    let options = WriteOptions::new().compression(None).disable_seeking(true);
+    let mut copy = Copy {
+        mcap: options.create(NoSeek::new(output))?,
+        in_index: index.as_ref().map(|it| &it.channels),
+        channels: BTreeSet::new(),
+        lost: BTreeMap::new(),
+        found: Repaired::default(),
+    };
+    let mut is_ended = false;
     let reader = LinearReader::new_with_options(recording, Options::IgnoreEndMagic.into())?;
     for record in reader {
+        let chunks = copy.found.chunks;
         match record {
             Ok(Record::Chunk { header, data }) => {
                 let records = ChunkReader::new(header, &data)
                     .and_then(Iterator::collect::<Result<Vec<_>, _>>);
                 match records {
-                    Ok(records) => {
-                        repaired.chunks += 1;
-                        for record in records {
-                            repaired.messages += copy(&mut mcap, record, &mut repaired.damage)?;
-                        }
-                        mcap.flush()?;
-                    }
-                    Err(problem) => {
-                        let number = repaired.chunks + 1;
-                        repaired.damage.push(format!("chunk {number} is damaged: {problem}"));
-                    }
+                    Ok(records) => copy.chunk(records)?,
+                    Err(problem) => copy
+                        .found
+                        .damage
+                        .push(format!("the chunk after {chunks} whole ones is damaged: {problem}")),
                 }
             }
             Ok(Record::DataEnd(_)) => {
                 is_ended = true;
                 break;
             }
-            Ok(Record::Metadata(metadata)) => mcap.write_metadata(&metadata)?,
-            Ok(Record::Attachment { header, data, .. }) => mcap.attach(&Attachment {
+            Ok(Record::Metadata(metadata)) => copy.mcap.write_metadata(&metadata)?,
+            Ok(Record::Attachment { header, data, .. }) => copy.mcap.attach(&Attachment {
                 log_time: header.log_time,
                 create_time: header.create_time,
                 name: header.name,
@@ -68,59 +74,121 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
             Ok(Record::Header(_) | Record::MessageIndex(_)) => {}
             // Everything else is inside of chunks.
             Ok(record) => {
-                let (opcode, chunks) = (record.opcode(), repaired.chunks);
-                repaired
-                    .damage
-                    .push(format!("an unexpected record ({opcode}) after chunk {chunks}"));
+                let opcode = record.opcode();
+                let text = format!("an unexpected record ({opcode}) after {chunks} whole chunks");
+                copy.found.damage.push(text);
+            }
+            Err(problem @ (McapError::BadAttachmentCrc { .. } | McapError::Parse(_))) => {
+                let text = format!("a record after {chunks} whole chunks is damaged: {problem}");
+                copy.found.damage.push(text);
             }
             Err(problem) => {
-                let chunks = repaired.chunks;
-                repaired.damage.push(format!("unreadable after {chunks} chunks: {problem}"));
+                let text = format!("unreadable after {chunks} whole chunks: {problem}");
+                copy.found.damage.push(text);
                 break;
             }
         }
     }
-    if !is_ended && repaired.damage.is_empty() {
-        repaired
-            .damage
-            .push("it was not ended: its last chunk, up to half a second, is missing".to_owned());
+    let Copy { mut mcap, lost, mut found, .. } = copy;
+    found.damage.extend(lost.into_iter().map(|(channel, messages)| {
+        format!("{messages} messages of channel {channel} are lost: what describes it is damaged")
+    }));
+    if found.damage.is_empty() {
+        let missing = match (is_ended, &index) {
+            (false, _) => Some("it was not ended: its last chunk, up to half a second, is missing"),
+            (true, None) => Some("its index is damaged or missing"),
+            (true, Some(_)) => None,
+        };
+        found.damage.extend(missing.map(str::to_owned));
     }
     mcap.finish()?;
-    Ok(repaired)
+    Ok(found)
 }
 
-/// Copies a record; the number of messages that it was.
-fn copy<W: Write>(
-    mcap: &mut mcap::Writer<NoSeek<W>>,
-    record: Record<'_>,
-    damage: &mut Vec<String>,
-) -> Result<u64, Problem> {
-    let taken = match record {
-        Record::Schema { header, data } => {
-            mcap.add_schema_with_id(header.id, &header.name, &header.encoding, &data).map(|_id| 0)
-        }
-        Record::Channel(channel) => mcap
-            .add_channel_with_id(
-                channel.id,
-                channel.schema_id,
-                &channel.topic,
-                &channel.message_encoding,
-                &channel.metadata,
-            )
-            .map(|_id| 0),
-        Record::Message { header, data } => mcap.write_to_known_channel(&header, &data).map(|()| 1),
-        _ => Ok(0),
-    };
-    match taken {
-        Ok(messages) => Ok(messages),
-        Err(mcap::McapError::Io(problem)) => Err(mcap::McapError::Io(problem).into()),
-        // Its channel was in a damaged chunk.
-        Err(problem) => {
-            let text = format!("a record is lost: {problem}");
-            if !damage.contains(&text) {
-                damage.push(text);
+/// A copy that is being made.
+struct Copy<'a, W: Write> {
+    mcap: mcap::Writer<NoSeek<W>>,
+    /// The channels that the index of the recording describes.
+    in_index: Option<&'a HashMap<u16, Arc<Channel<'static>>>>,
+    /// The channels that the copy has.
+    channels: BTreeSet<u16>,
+    /// Messages of channels that nothing describes.
+    lost: BTreeMap<u16, u64>,
+    found: Repaired,
+}
+
+impl<W: Write> Copy<'_, W> {
+    fn chunk(&mut self, records: Vec<Record<'_>>) -> Result<(), McapError> {
+        self.found.chunks += 1;
+        for record in records {
+            match self.record(record) {
+                Err(problem @ McapError::Io(_)) => return Err(problem),
+                // It contradicts what came before.
+                Err(problem) => {
+                    let text = format!("a description of a channel is damaged: {problem}");
+                    if !self.found.damage.contains(&text) {
+                        self.found.damage.push(text);
+                    }
+                }
+                Ok(()) => {}
             }
-            Ok(0)
         }
+        self.mcap.flush()
+    }
+
+    fn record(&mut self, record: Record<'_>) -> Result<(), McapError> {
+        match record {
+            Record::Schema { header, data } => {
+                self.mcap.add_schema_with_id(header.id, &header.name, &header.encoding, &data)?;
+            }
+            Record::Channel(channel) => {
+                self.mcap.add_channel_with_id(
+                    channel.id,
+                    channel.schema_id,
+                    &channel.topic,
+                    &channel.message_encoding,
+                    &channel.metadata,
+                )?;
+                self.channels.insert(channel.id);
+            }
+            Record::Message { header, data } => {
+                let id = header.channel_id;
+                if self.is_described(id)? {
+                    self.mcap.write_to_known_channel(&header, &data)?;
+                    self.found.messages += 1;
+                } else {
+                    *self.lost.entry(id).or_default() += 1;
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Whether the copy has this channel, if need be from the index.
+    fn is_described(&mut self, id: u16) -> Result<bool, McapError> {
+        if self.channels.contains(&id) {
+            return Ok(true);
+        }
+        let Some(channel) = self.in_index.and_then(|channels| channels.get(&id)) else {
+            return Ok(false);
+        };
+        let schema = channel.schema.as_ref();
+        if let Some(schema) = schema {
+            self.mcap.add_schema_with_id(
+                schema.id,
+                &schema.name,
+                &schema.encoding,
+                &schema.data,
+            )?;
+        }
+        self.mcap.add_channel_with_id(
+            id,
+            schema.map_or(0, |schema| schema.id),
+            &channel.topic,
+            &channel.message_encoding,
+            &channel.metadata,
+        )?;
+        Ok(self.channels.insert(id))
     }
 }
