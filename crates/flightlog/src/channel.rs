@@ -122,12 +122,12 @@ pub(crate) fn as_json(message: Received<'_>) -> Option<Record> {
     Some(Record { channel: message.key.to_owned(), schema, stamp_ns: message.received_ns, data })
 }
 
-/// The header of a frame as JSON.
-pub(crate) fn header_as_json(message: Received<'_>, header: &FrameHeader) -> Record {
+/// The header of a frame as JSON, taken at `stamp_ns` by our clock.
+pub(crate) fn header_as_json(message: Received<'_>, stamp_ns: i64, header: &FrameHeader) -> Record {
     Record {
         channel: message.key.to_owned(),
         schema: Schema::Json(FrameHeader::NAME),
-        stamp_ns: header.stamp_ns,
+        stamp_ns,
         data: serde_json::to_vec(header).unwrap_or_default(),
     }
 }

@@ -29,6 +29,9 @@ const MAP_FROM_NED: FrameTransform<'static> = FrameTransform {
     translation_m: [0.0; 3],
     rotation_wxyz: [0.0, FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0.0],
 };
+/// Maximum time between a stamp and the reception of its message by one clock, in nanoseconds: stamps farther away are
+/// another clock's.
+const MAX_AGE_NS: i64 = 60_000_000_000;
 /// Maximum number of lines and files that are remembered in order not to repeat them; further ones are left out.
 const MAX_REMEMBERED: usize = 4096;
 
@@ -59,6 +62,8 @@ pub struct File {
 pub struct Display {
     /// Added to stamps, so that they count from 1970.
     utc_offset_ns: i64,
+    /// Added to stamps of the vehicle's clock, where that is another one, so that they are of ours.
+    vehicle_offset_ns: Option<i64>,
     status: Option<(Phase, String)>,
     warnings: Vec<String>,
     said: BTreeSet<String>,
@@ -75,18 +80,33 @@ impl Display {
     pub(crate) fn records(&mut self, message: Received<'_>) -> Vec<Record> {
         let Received { key, payload, received_ns, .. } = message;
         let is = |pattern: String| matches(&pattern, key);
-        let records = if is(topic::DETECTIONS.key(&[])) {
-            decode(payload).ok().map(|found| self.detections(&found))
+        let records = if let Some(detector) = topic::DETECTIONS.first_name(key) {
+            decode(payload).ok().map(|found: Detections| {
+                let at_ns = self.our_clock(received_ns, found.header.stamp_ns);
+                self.detections(detector, at_ns, &found)
+            })
         } else if is(topic::VEHICLE_STATE.key(&[])) {
-            decode(payload).ok().map(|state| self.vehicle(&state))
+            decode(payload).ok().map(|state: VehicleState| {
+                let at_ns = self.our_clock(received_ns, state.stamp_ns);
+                self.vehicle(at_ns, &state)
+            })
         } else if is(topic::TARGET.key(&[])) {
-            decode(payload).ok().map(|target| self.target(&target))
+            decode(payload).ok().map(|target: TargetEstimate| {
+                let at_ns = self.our_clock(received_ns, target.stamp_ns);
+                self.target(at_ns, &target)
+            })
         } else if is(topic::STATUS.key(&[])) {
-            decode(payload).ok().map(|status| self.log(&status))
+            decode(payload).ok().map(|status: ControllerStatus| {
+                let at_ns = self.our_clock(received_ns, status.stamp_ns);
+                self.log(at_ns, &status)
+            })
         } else if is(topic::TRUTH.key(&[])) {
-            decode(payload).ok().map(|truth| self.truth(&truth))
-        } else if is(topic::CAMERA_INFO.key(&[])) {
-            decode(payload).ok().map(|info| self.camera(received_ns, &info))
+            decode(payload).ok().map(|truth: Truth| {
+                let at_ns = self.our_clock(received_ns, truth.stamp_ns);
+                self.truth(at_ns, &truth)
+            })
+        } else if let Some(camera) = topic::CAMERA_INFO.first_name(key) {
+            decode(payload).ok().map(|info| self.camera(camera, received_ns, &info))
         } else if is(topic::DETECTOR_INFO.key(&[])) {
             decode(payload).ok().map(|info| self.detector(received_ns, &info))
         } else if is(topic::HEALTH.key(&[])) {
@@ -102,12 +122,14 @@ impl Display {
     /// What is kept of a message as a file, when it is new.
     pub(crate) fn file(&mut self, message: Received<'_>) -> Option<File> {
         let file = if matches(&topic::CONFIGURATION.key(&[]), message.key) {
-            let Configuration { service, instance, toml, .. } = decode(message.payload).ok()?;
+            let Configuration { toml, .. } = decode(message.payload).ok()?;
+            let service = topic::CONFIGURATION.first_name(message.key)?;
+            let (_, instance) = message.key.rsplit_once('/')?;
             let name = format!("configuration/{service}-{instance}.toml");
             File { name, media_type: "application/toml", data: toml.into_bytes() }
-        } else if matches(&topic::CAMERA_INFO.key(&[]), message.key) {
+        } else if let Some(camera) = topic::CAMERA_INFO.first_name(message.key) {
             let info: CameraInfo = decode(message.payload).ok()?;
-            let name = format!("calibration/{}.json", info.camera);
+            let name = format!("calibration/{camera}.json");
             let data = serde_json::to_vec_pretty(&info).ok()?;
             File { name, media_type: "application/json", data }
         } else {
@@ -122,14 +144,26 @@ impl Display {
         Some(file)
     }
 
-    /// A frame as a picture.
+    /// A stamp by our clock: one of the vehicle's, where that is another one, by the age of its first message.
+    pub(crate) fn our_clock(&mut self, received_ns: i64, stamp_ns: i64) -> i64 {
+        let apart_ns = received_ns.saturating_sub(stamp_ns);
+        if apart_ns.unsigned_abs() <= MAX_AGE_NS.unsigned_abs() {
+            return stamp_ns;
+        }
+        let known = self.vehicle_offset_ns.filter(|it| it.abs_diff(apart_ns) <= MAX_AGE_NS as u64);
+        stamp_ns.saturating_add(*self.vehicle_offset_ns.insert(known.unwrap_or(apart_ns)))
+    }
+
+    /// A frame of a camera as a picture, taken at `stamp_ns` by our clock.
     pub(crate) fn picture(
         &self,
+        camera: &str,
+        stamp_ns: i64,
         header: &FrameHeader,
         pixels: &[u8],
         picture: &Picture,
     ) -> Option<Record> {
-        let (at_ns, frame_id) = (self.utc(header.stamp_ns), frame_name(&header.camera));
+        let (at_ns, frame_id) = (self.utc(stamp_ns), frame_name(camera));
         let (schema, data) = match picture {
             Picture::None => return None,
             Picture::Jpeg(file) => {
@@ -150,8 +184,7 @@ impl Display {
                 (&foxglove::RAW_IMAGE, foxglove::raw_image(at_ns, &frame_id, &image))
             }
         };
-        let channel = format!("camera/{}/picture", header.camera);
-        Some(shown(channel, schema, header.stamp_ns, data))
+        Some(shown(format!("camera/{camera}/picture"), schema, stamp_ns, data))
     }
 
     fn utc(&self, stamp_ns: i64) -> i64 {
@@ -159,7 +192,7 @@ impl Display {
     }
 
     /// What a detector found, with the stamp of the frame.
-    fn detections(&self, found: &Detections) -> Vec<Record> {
+    fn detections(&self, name: &str, stamp_ns: i64, found: &Detections) -> Vec<Record> {
         let outlines: Vec<Outline> = found
             .detections
             .iter()
@@ -179,7 +212,6 @@ impl Display {
                 orientation_wxyz: it.camera_from_marker.rotation_wxyz,
             })
             .collect();
-        let (stamp_ns, name) = (found.header.stamp_ns, &found.detector);
         let at_ns = self.utc(stamp_ns);
         let overlay = foxglove::image_annotations(at_ns, &outlines);
         let poses = foxglove::poses_in_frame(at_ns, &frame_name(&found.header.camera), &poses);
@@ -194,26 +226,26 @@ impl Display {
         ]
     }
 
-    fn vehicle(&self, state: &VehicleState) -> Vec<Record> {
+    fn vehicle(&self, stamp_ns: i64, state: &VehicleState) -> Vec<Record> {
         let body = FrameTransform {
             parent: WORLD,
             child: BODY,
             translation_m: state.position_ned_m,
             rotation_wxyz: state.ned_from_body_wxyz,
         };
-        vec![self.transforms(state.stamp_ns, &[MAP_FROM_NED, body])]
+        vec![self.transforms(stamp_ns, &[MAP_FROM_NED, body])]
     }
 
-    fn target(&self, target: &TargetEstimate) -> Vec<Record> {
+    fn target(&self, stamp_ns: i64, target: &TargetEstimate) -> Vec<Record> {
         let Some(position_m) = target.position_ned_m else { return Vec::new() };
         let (sin, cos) = (0.5 * target.heading_rad.unwrap_or(0.0)).sin_cos();
         let pose = Pose { position_m, orientation_wxyz: [cos, 0.0, 0.0, sin] };
-        let data = foxglove::poses_in_frame(self.utc(target.stamp_ns), WORLD, &[pose]);
+        let data = foxglove::poses_in_frame(self.utc(stamp_ns), WORLD, &[pose]);
         let channel = "controller/target/pose".to_owned();
-        vec![shown(channel, &foxglove::POSE_IN_FRAME, target.stamp_ns, data)]
+        vec![shown(channel, &foxglove::POSE_IN_FRAME, stamp_ns, data)]
     }
 
-    fn truth(&mut self, truth: &Truth) -> Vec<Record> {
+    fn truth(&mut self, stamp_ns: i64, truth: &Truth) -> Vec<Record> {
         let body = FrameTransform {
             parent: WORLD,
             child: "true_body",
@@ -226,19 +258,19 @@ impl Display {
             translation_m: truth.pad_ned_m,
             rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
         };
-        let mut records = vec![self.transforms(truth.stamp_ns, &[body, pad])];
+        let mut records = vec![self.transforms(stamp_ns, &[body, pad])];
         if let Some(touchdown) = truth.touchdown {
             let text = format!(
                 "touchdown {:.3} m from the pad's centre, {:.2} m/s down, {:.2} m/s sideways",
                 touchdown.error_m, touchdown.vertical_speed_m_s, touchdown.lateral_speed_m_s
             );
-            records.extend(self.once(truth.stamp_ns, Level::Info, "world", &text));
+            records.extend(self.once(stamp_ns, Level::Info, "world", &text));
         }
         records
     }
 
-    fn camera(&self, stamp_ns: i64, info: &CameraInfo) -> Vec<Record> {
-        let frame_id = frame_name(&info.camera);
+    fn camera(&self, camera: &str, stamp_ns: i64, info: &CameraInfo) -> Vec<Record> {
+        let frame_id = frame_name(camera);
         let mount = FrameTransform {
             parent: BODY,
             child: &frame_id,
@@ -261,7 +293,7 @@ impl Display {
                 focal_px,
                 centre_px: info.principal_px,
             };
-            let channel = format!("camera/{}/calibration", info.camera);
+            let channel = format!("camera/{camera}/calibration");
             let data = foxglove::camera_calibration(self.utc(stamp_ns), &calibration);
             records.push(shown(channel, &foxglove::CAMERA_CALIBRATION, stamp_ns, data));
         }
@@ -269,7 +301,7 @@ impl Display {
     }
 
     /// Lines for what has changed: the phase and its reason, and warnings.
-    fn log(&mut self, status: &ControllerStatus) -> Vec<Record> {
+    fn log(&mut self, stamp_ns: i64, status: &ControllerStatus) -> Vec<Record> {
         let mut lines = Vec::new();
         let now = (status.phase, status.why.clone());
         if self.status.as_ref() != Some(&now) {
@@ -279,10 +311,7 @@ impl Display {
         let new = status.warnings.iter().filter(|warning| !self.warnings.contains(warning));
         lines.extend(new.map(|warning| (Level::Warning, warning.clone())));
         self.warnings.clone_from(&status.warnings);
-        lines
-            .iter()
-            .map(|(level, text)| self.line(status.stamp_ns, *level, "controller", text))
-            .collect()
+        lines.iter().map(|(level, text)| self.line(stamp_ns, *level, "controller", text)).collect()
     }
 
     fn detector(&mut self, stamp_ns: i64, info: &DetectorInfo) -> Vec<Record> {
@@ -395,13 +424,29 @@ mod tests {
     fn picture_and_overlay_have_the_same_stamp() {
         let mut display = Display::new(1_700_000_000_000_000_000);
         let header = FrameHeader { stamp_ns: 123_456_789, ..FrameHeader::sample() };
-        let picture = display.picture(&header, b"", &Picture::Jpeg(vec![1])).unwrap();
+        let jpeg = Picture::Jpeg(vec![1]);
+        let picture = display.picture("down", 123_456_789, &header, b"", &jpeg).unwrap();
         let found = Detections { header, ..Detections::sample() };
         let overlay = &records(&mut display, "detector/main/detections", &found)[0];
         assert_eq!(overlay.stamp_ns, picture.stamp_ns);
         // 1 700 000 000 s and 123 456 789 ns.
         let stamp = [0x08, 0x80, 0xe2, 0xcf, 0xaa, 0x06, 0x10, 0x95, 0x9a, 0xef, 0x3a];
         assert!(has(overlay, &stamp) && has(&picture, &stamp));
+    }
+
+    #[test]
+    fn stamps_of_another_clock_are_as_old_as_its_first_message() {
+        const S: i64 = 1_000_000_000;
+        let mut display = Display::default();
+        assert_eq!(display.our_clock(90 * S, 50 * S), 50 * S, "its own");
+        // The vehicle has run for 5 minutes, this machine for ten days.
+        let days = 864_000 * S;
+        assert_eq!(display.our_clock(days, 300 * S), days);
+        assert_eq!(display.our_clock(days + 3 * S, 302 * S), days + 2 * S);
+        assert_eq!(display.our_clock(days + 9 * S, days + 8 * S), days + 8 * S, "its own");
+        // It was started again.
+        assert_eq!(display.our_clock(days + 100 * S, 20 * S), days + 100 * S);
+        assert_eq!(display.our_clock(i64::MAX, i64::MIN), -1, "saturates");
     }
 
     #[test]

@@ -10,7 +10,7 @@ use std::io::Write;
 use mcap::Attachment;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::{NoSeek, WriteOptions};
-use messages::FrameHeader;
+use messages::{FrameHeader, topic};
 
 use crate::channel::{self, RAW, Received, Record, Schema};
 use crate::display::{Display, Picture};
@@ -121,8 +121,11 @@ impl<W: Write> Writer<W> {
         picture: &Picture,
     ) -> Result<(), Problem> {
         self.write(message.received_ns, &channel::raw(Received { payload: b"", ..message }))?;
-        self.write(message.received_ns, &channel::header_as_json(message, header))?;
-        if let Some(record) = self.display.picture(header, message.payload, picture) {
+        let stamp_ns = self.display.our_clock(message.received_ns, header.stamp_ns);
+        self.write(message.received_ns, &channel::header_as_json(message, stamp_ns, header))?;
+        let camera = topic::FRAME.first_name(message.key).unwrap_or(&header.camera);
+        let shown = self.display.picture(camera, stamp_ns, header, message.payload, picture);
+        if let Some(record) = shown {
             self.write(message.received_ns, &record)?;
         }
         Ok(())
