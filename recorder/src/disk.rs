@@ -246,8 +246,8 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_is_named_and_leaves_no_empty_files() {
-        // Every write to it fails for want of room; it is no regular file, so nothing is removed from it.
+    fn a_full_disk_is_named() {
+        // Every write to it fails for want of room.
         let mut file = OpenOptions::new().write(true).open("/dev/full").unwrap();
         let shared = Shared::default();
         shared.lock().waiting.push_back(b"ab".to_vec());

@@ -27,6 +27,12 @@ pub(crate) struct Recording {
     unsynced: VecDeque<Batch>,
 }
 
+/// A recording whose rest is handed to the disk.
+pub(crate) struct Ending {
+    disk: Disk,
+    unsynced: VecDeque<Batch>,
+}
+
 /// The messages up to a place in the file, by key.
 struct Batch {
     end_bytes: u64,
@@ -96,8 +102,7 @@ impl Recording {
             self.disk.append(bytes);
         }
         if is_due {
-            let written = std::mem::take(&mut self.written);
-            self.unsynced.push_back(Batch { end_bytes: self.handed_bytes, written });
+            self.close_batch();
             let synced_bytes = self.disk.status().bytes;
             while self.unsynced.front().is_some_and(|batch| batch.end_bytes <= synced_bytes) {
                 self.unsynced.pop_front();
@@ -106,20 +111,20 @@ impl Recording {
         Ok(is_due)
     }
 
+    fn close_batch(&mut self) {
+        let written = std::mem::take(&mut self.written);
+        self.unsynced.push_back(Batch { end_bytes: self.handed_bytes, written });
+    }
+
     /// How its file is doing.
     pub(crate) fn status(&self) -> DiskStatus {
         self.disk.status()
     }
 
     /// The messages that are not on the disk, by key, of a file that is given up.
-    pub(crate) fn unsynced(self) -> BTreeMap<String, u64> {
-        let synced_bytes = self.disk.status().bytes;
-        let missing = self.unsynced.into_iter().filter(|batch| batch.end_bytes > synced_bytes);
-        let mut lost = self.written;
-        for (key, count) in missing.flat_map(|batch| batch.written) {
-            *lost.entry(key).or_default() += count;
-        }
-        lost
+    pub(crate) fn unsynced(mut self) -> BTreeMap<String, u64> {
+        self.close_batch();
+        Ending { disk: self.disk, unsynced: self.unsynced }.unsynced()
     }
 
     /// Whether another file is to be begun.
@@ -128,11 +133,39 @@ impl Recording {
     }
 
     /// Ends the file with its index; the disk takes the rest in the background.
-    pub(crate) fn end(self) -> anyhow::Result<Disk> {
-        let Self { writer, buffer, disk, .. } = self;
+    pub(crate) fn end(mut self) -> anyhow::Result<Ending> {
+        self.close_batch();
+        let Self { writer, buffer, disk, mut unsynced, handed_bytes, .. } = self;
         writer.finish()?;
-        disk.append(buffer.take());
+        let rest = buffer.take();
+        if let Some(last) = unsynced.back_mut() {
+            last.end_bytes = handed_bytes + rest.len() as u64;
+        }
+        disk.append(rest);
         disk.complete();
-        Ok(disk)
+        Ok(Ending { disk, unsynced })
+    }
+}
+
+impl Ending {
+    /// How its file is doing.
+    pub(crate) fn status(&self) -> DiskStatus {
+        self.disk.status()
+    }
+
+    /// Waits until it has ended; how it is doing then.
+    pub(crate) fn wait(&self, patience: Duration) -> DiskStatus {
+        self.disk.wait(patience)
+    }
+
+    /// The messages that are not on the disk, by key.
+    pub(crate) fn unsynced(self) -> BTreeMap<String, u64> {
+        let synced_bytes = self.disk.status().bytes;
+        let missing = self.unsynced.into_iter().filter(|batch| batch.end_bytes > synced_bytes);
+        let mut lost = BTreeMap::new();
+        for (key, count) in missing.flat_map(|batch| batch.written) {
+            *lost.entry(key).or_default() += count;
+        }
+        lost
     }
 }

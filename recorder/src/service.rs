@@ -11,10 +11,9 @@ use messages::{Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS,
 use node::{HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
 
 use crate::config::{Config, Frames};
-use crate::disk::Disk;
 use crate::name::named;
 use crate::picture::jpeg;
-use crate::recording::Recording;
+use crate::recording::{Ending, Recording};
 
 /// Longest wait for a message, after which the file is looked after.
 const MAX_WAIT: Duration = Duration::from_millis(50);
@@ -32,6 +31,8 @@ const END_PATIENCE: Duration = Duration::from_millis(1300);
 const STATUS_PERIOD: Duration = Duration::from_millis(500);
 /// Maximum number of keys whose last values, losses or pictures are remembered.
 const MAX_KEYS: usize = 1024;
+/// The name under which the losses of further keys are counted.
+const OTHER_KEYS: &str = "other keys";
 
 /// Records until shutdown. A disk that fails ends nothing: it is told, what is lost is counted, and another file is tried.
 ///
@@ -96,9 +97,13 @@ fn is_wanted(row: &Row, frames: Frames) -> bool {
         && (frames != Frames::None || !is_frame)
 }
 
-fn about(node: &Node) -> About {
+/// Time since 1970 less that of the clock of this host, in nanoseconds; it changes when the time is set.
+fn utc_offset_ns() -> i64 {
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-    let utc_ns = since_1970.map_or(0, |it| i64::try_from(it.as_nanos()).unwrap_or(0));
+    since_1970.map_or(0, |it| i64::try_from(it.as_nanos()).unwrap_or(0)) - now_ns()
+}
+
+fn about(node: &Node) -> About {
     let facts = [
         ("recorder".to_owned(), node.identity().instance.clone()),
         ("host".to_owned(), node::host_name()),
@@ -107,7 +112,7 @@ fn about(node: &Node) -> About {
     About {
         program: format!("alight {}", env!("CARGO_PKG_VERSION")),
         facts: facts.into(),
-        utc_offset_ns: utc_ns - now_ns(),
+        utc_offset_ns: utc_offset_ns(),
     }
 }
 
@@ -122,7 +127,7 @@ struct Recorder {
     status: Arc<Mutex<RecorderStatus>>,
     recording: Option<Recording>,
     /// The file before, while the disk takes its rest.
-    ending: Option<Disk>,
+    ending: Option<Ending>,
     /// When a file that failed is tried again.
     retry: Option<Instant>,
     kept: u64,
@@ -152,14 +157,22 @@ impl Recorder {
             }
             if is_empty || looked.elapsed() >= LOOK_PERIOD {
                 looked = Instant::now();
-                for (key, count) in tap.take_dropped() {
-                    self.lose(key, count);
-                }
+                self.count_dropped(tap);
                 self.look_after_file();
             }
             if last.is_some_and(|last| is_empty || Instant::now() >= last) {
+                while let Some(message) = tap.next(Duration::ZERO) {
+                    self.lose(message.key, 1);
+                }
+                self.count_dropped(tap);
                 return self.end();
             }
+        }
+    }
+
+    fn count_dropped(&mut self, tap: &Tap) {
+        for (key, count) in tap.take_dropped() {
+            self.lose(key, count);
         }
     }
 
@@ -169,10 +182,15 @@ impl Recorder {
         let has_room = waiting_bytes.is_some_and(|bytes| bytes <= self.max_waiting_bytes);
         if let Some(recording) = self.recording.as_mut().filter(|_| has_room) {
             match keep(recording, &message, self.frames, &self.config, &mut self.pictures) {
-                Ok(()) => {
+                Ok(Kept::Whole) => {
                     recording.count(&message.key);
                     self.kept += 1;
                     self.health.count("messages");
+                }
+                Ok(Kept::HeaderOnly) => {
+                    recording.count(&message.key);
+                    self.kept += 1;
+                    self.health.dropped("a picture that is no whole image");
                 }
                 Err(problem) => self.give_up(&format!("{problem:#}")),
             }
@@ -189,9 +207,9 @@ impl Recorder {
     }
 
     fn lose(&mut self, key: String, count: u64) {
-        if self.lost.len() < MAX_KEYS || self.lost.contains_key(&key) {
-            *self.lost.entry(key).or_default() += count;
-        }
+        let is_known = self.lost.len() < MAX_KEYS || self.lost.contains_key(&key);
+        let key = if is_known { key } else { OTHER_KEYS.to_owned() };
+        *self.lost.entry(key).or_default() += count;
     }
 
     /// Opens, flushes, ends and replaces the file, and says how it is doing.
@@ -207,17 +225,27 @@ impl Recorder {
             Ok(()) => {}
             Err(problem) => self.give_up(&format!("{problem:#}")),
         }
-        let ended = self.ending.as_ref().map(Disk::status).filter(|disk| disk.has_ended);
-        if let Some(disk) = ended {
-            self.ending = None;
-            if let Some(problem) = disk.problem {
+        if let Some(ended) = self.ending.take_if(|ending| ending.status().has_ended) {
+            let problem = ended.status().problem;
+            self.count_unsynced(ended.unsynced());
+            if let Some(problem) = problem {
                 self.health.failed("the file failed");
                 tracing::error!(problem, "The end of a recording is missing");
             }
         }
     }
 
+    /// Messages that were kept and are not on the disk are lost.
+    fn count_unsynced(&mut self, unsynced: BTreeMap<String, u64>) {
+        for (key, count) in unsynced {
+            self.kept = self.kept.saturating_sub(count);
+            self.lose(key, count);
+        }
+    }
+
     fn begin(&mut self) -> anyhow::Result<Recording> {
+        // The clock of a computer without a battery is set once it has found the time.
+        self.about.utc_offset_ns = utc_offset_ns();
         let utc_ns = now_ns().saturating_add(self.about.utc_offset_ns);
         let mut recording = Recording::begin(named(&self.config.file, utc_ns), &self.about)?;
         for state in self.states.values() {
@@ -230,7 +258,8 @@ impl Recorder {
     fn write_out(&mut self) -> anyhow::Result<()> {
         let Some(recording) = &mut self.recording else { return Ok(()) };
         let lost = self.lost.values().sum();
-        if recording.hand_over()? && self.lost_in_file != Some(lost) {
+        let has_room = recording.status().waiting_bytes <= self.max_waiting_bytes;
+        if recording.hand_over()? && has_room && self.lost_in_file != Some(lost) {
             // On the disk with the next flush; the sums of a file that is not flushed again are those of the one before.
             recording.writer.dropped(now_ns(), &self.lost)?;
             self.lost_in_file = Some(lost);
@@ -261,7 +290,9 @@ impl Recorder {
         drop(status);
         let max_bytes = u64::from(self.config.max_file_mb) * 1_000_000;
         let max_age = Duration::from_secs_f64(60.0 * self.config.max_file_minutes);
+        // A second file would not be written sooner, and wait beside the first.
         if self.ending.is_none()
+            && !stalls
             && recording.is_full(max_bytes, max_age)
             && let Some(full) = self.recording.take()
         {
@@ -276,10 +307,7 @@ impl Recorder {
             tracing::error!(problem, "Not recording; trying again, and the flight goes on");
         }
         let unsynced = self.recording.take().map(Recording::unsynced).unwrap_or_default();
-        for (key, count) in unsynced {
-            self.kept = self.kept.saturating_sub(count);
-            self.lose(key, count);
-        }
+        self.count_unsynced(unsynced);
         self.retry = Some(Instant::now() + RETRY_PAUSE);
         let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         status.problem = Some(problem.to_owned());
@@ -289,22 +317,28 @@ impl Recorder {
 
     /// Ends the file, and waits for the disk a moment.
     fn end(self) -> anyhow::Result<()> {
-        let began = Instant::now();
-        let Some(mut recording) = self.recording else { return Ok(()) };
-        recording.writer.dropped(now_ns(), &self.lost)?;
-        let disk = recording.end()?.wait(END_PATIENCE);
-        let name = disk.path.unwrap_or(self.config.file);
-        if let Some(before) = self.ending {
-            before.wait(END_PATIENCE.saturating_sub(began.elapsed()));
+        let until = Instant::now() + END_PATIENCE;
+        let last = match self.recording {
+            Some(mut recording) => {
+                recording.writer.dropped(now_ns(), &self.lost)?;
+                Some(recording.end()?)
+            }
+            None => None,
+        };
+        let is_missing = last.is_none() && self.ending.is_none();
+        for ending in self.ending.into_iter().chain(last) {
+            let disk = ending.wait(until.saturating_duration_since(Instant::now()));
+            let name = disk.path.as_ref().unwrap_or(&self.config.file);
+            if let Some(problem) = disk.problem {
+                bail!("the end of the recording is missing: {problem}");
+            }
+            ensure!(
+                disk.has_ended,
+                "the disk did not take the end of {name:?} within {END_PATIENCE:?}; `alight record --repair` ends it"
+            );
+            tracing::info!(file = ?name, bytes = disk.bytes, messages = self.kept, "Recorded");
         }
-        if let Some(problem) = disk.problem {
-            bail!("the end of the recording is missing: {problem}");
-        }
-        ensure!(
-            disk.has_ended,
-            "the disk did not take the end of {name:?} within {END_PATIENCE:?}; `alight record --repair` ends it"
-        );
-        tracing::info!(file = ?name, bytes = disk.bytes, messages = self.kept, "Recorded");
+        ensure!(!is_missing, "nothing could be recorded at the end; see the log above");
         Ok(())
     }
 }
@@ -318,6 +352,14 @@ fn received(message: &Tapped) -> Received<'_> {
     }
 }
 
+/// What was kept of a message.
+enum Kept {
+    /// All that is configured.
+    Whole,
+    /// The header of a frame whose pixels make no picture.
+    HeaderOnly,
+}
+
 /// Writes a message: frames as configured, everything else as it came.
 fn keep(
     recording: &mut Recording,
@@ -325,13 +367,16 @@ fn keep(
     frames: Frames,
     config: &Config,
     pictures: &mut BTreeMap<String, i64>,
-) -> anyhow::Result<()> {
-    let is_frame = topic::FRAME.first_name(&message.key).is_some();
-    let header = decode::<FrameHeader>(&message.attachment).ok().filter(|_| is_frame);
-    let Some(header) = header else { return Ok(recording.writer.receive(received(message))?) };
+) -> anyhow::Result<Kept> {
+    let camera = topic::FRAME.first_name(&message.key);
+    let header = camera.zip(decode::<FrameHeader>(&message.attachment).ok());
+    let Some((camera, header)) = header else {
+        recording.writer.receive(received(message))?;
+        return Ok(Kept::Whole);
+    };
     let period_ns = (1e9 / config.max_picture_hz) as i64;
     // A camera that begins anew may have other stamps.
-    let last_ns = pictures.get(&header.camera).copied();
+    let last_ns = pictures.get(camera).copied();
     let is_due = last_ns.is_none_or(|last_ns| {
         header.stamp_ns.saturating_sub(last_ns).saturating_abs() >= period_ns
     });
@@ -340,10 +385,13 @@ fn keep(
             jpeg(&header, &message.payload, config.jpeg_quality).map(Picture::Jpeg)
         }
         Frames::Raw if is_due => Some(Picture::Pixels),
-        Frames::Jpeg | Frames::Raw | Frames::None => None,
+        Frames::Jpeg | Frames::Raw | Frames::None => Some(Picture::None),
     };
-    if picture.is_some() && (pictures.len() < MAX_KEYS || last_ns.is_some()) {
-        pictures.insert(header.camera.clone(), header.stamp_ns);
+    let kept = if picture.is_some() { Kept::Whole } else { Kept::HeaderOnly };
+    let picture = picture.unwrap_or(Picture::None);
+    if picture != Picture::None && (pictures.len() < MAX_KEYS || last_ns.is_some()) {
+        pictures.insert(camera.to_owned(), header.stamp_ns);
     }
-    Ok(recording.writer.frame(received(message), &header, &picture.unwrap_or(Picture::None))?)
+    recording.writer.frame(received(message), &header, &picture)?;
+    Ok(kept)
 }
