@@ -138,8 +138,8 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
         }
     }
 
-    /// Stops all children, by SIGKILL those that ignore SIGTERM.
-    pub(crate) async fn stop(mut self) {
+    /// Stops all children, by SIGKILL those that ignore SIGTERM; events until then go to `on_event`.
+    pub(crate) async fn stop(mut self, mut on_event: impl FnMut(&ChildEvent<K>)) {
         for signal in [Signal::TERM, Signal::KILL] {
             for (_, pid) in &self.pids {
                 // Fails when the child has exited already.
@@ -147,10 +147,10 @@ impl<K: Clone + PartialEq + Send + 'static> Children<K> {
             }
             let all_exited = async {
                 while !self.pids.is_empty() {
-                    match self.events.recv().await {
-                        Some(ChildEvent::Exited(ended, _)) => self.remove(&ended),
-                        Some(ChildEvent::Line(..)) => {}
-                        None => return,
+                    let Some(event) = self.events.recv().await else { return };
+                    on_event(&event);
+                    if let ChildEvent::Exited(ended, _) = event {
+                        self.remove(&ended);
                     }
                 }
             };

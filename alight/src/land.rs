@@ -244,9 +244,20 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
     let deadline = Instant::now() + Duration::from_secs_f64(args.timeout_s);
     let watched = watch(&node, settings, &mut children, &mut progress, shutdown, deadline).await;
     progress.finish();
-    children.stop().await;
+    let mut recorders_end = None;
+    let note_end = |event: &ChildEvent<Service>| match event {
+        ChildEvent::Exited(Service::Recorder, exit) if exit.status != Some(0) => {
+            recorders_end = Some(exit.to_string());
+        }
+        ChildEvent::Exited(..) | ChildEvent::Line(..) => {}
+    };
+    children.stop(note_end).await;
     node.close().await;
-    watched
+    let mut landing = watched?;
+    if let Some(exit) = recorders_end {
+        landing.recording_without_end(&exit);
+    }
+    Ok(landing)
 }
 
 /// Follows the landing until it is over.

@@ -100,6 +100,14 @@ impl LandingSummary {
         self.recorder = Some(recorder);
     }
 
+    /// Notes that the recorder failed when it was to end its file.
+    pub(crate) fn recording_without_end(&mut self, exit: &str) {
+        let recorder = self.recorder.get_or_insert_default();
+        recorder.problem.get_or_insert_with(|| {
+            format!("the recorder exited: {exit}; `alight record --repair` ends its file")
+        });
+    }
+
     /// Notes why the landing was not watched to its end.
     pub(crate) fn interrupted(&mut self, why: &str) {
         self.interrupted = Some(why.to_owned());
