@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::Write;
 use std::sync::Arc;
 
-use mcap::read::{ChunkReader, LinearReader, Options};
+use mcap::read::{ChunkReader, parse_record};
 use mcap::records::Record;
 use mcap::write::{NoSeek, WriteOptions};
 use mcap::{Attachment, Channel, McapError, Summary};
@@ -43,10 +43,11 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
         found: Repaired::default(),
     };
     let mut is_ended = false;
-    let reader = LinearReader::new_with_options(recording, Options::IgnoreEndMagic.into())?;
-    for record in reader {
+    let mut rest = &recording[mcap::MAGIC.len()..];
+    while let Some((opcode, body, after)) = next_record(rest) {
+        rest = after;
         let chunks = copy.found.chunks;
-        match record {
+        match parse_record(opcode, body) {
             Ok(Record::Chunk { header, data }) => {
                 let records = ChunkReader::new(header, &data)
                     .and_then(Iterator::collect::<Result<Vec<_>, _>>);
@@ -73,19 +74,13 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
             // The index is made anew.
             Ok(Record::Header(_) | Record::MessageIndex(_)) => {}
             // Everything else is inside of chunks.
-            Ok(record) => {
-                let opcode = record.opcode();
+            Ok(_) => {
                 let text = format!("an unexpected record ({opcode}) after {chunks} whole chunks");
                 copy.found.damage.push(text);
             }
-            Err(problem @ (McapError::BadAttachmentCrc { .. } | McapError::Parse(_))) => {
+            Err(problem) => {
                 let text = format!("a record after {chunks} whole chunks is damaged: {problem}");
                 copy.found.damage.push(text);
-            }
-            Err(problem) => {
-                let text = format!("unreadable after {chunks} whole chunks: {problem}");
-                copy.found.damage.push(text);
-                break;
             }
         }
     }
@@ -93,16 +88,24 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
     found.damage.extend(lost.into_iter().map(|(channel, messages)| {
         format!("{messages} messages of channel {channel} are lost: what describes it is damaged")
     }));
-    if found.damage.is_empty() {
-        let missing = match (is_ended, &index) {
-            (false, _) => Some("it was not ended: its last chunk, up to half a second, is missing"),
-            (true, None) => Some("its index is damaged or missing"),
-            (true, Some(_)) => None,
-        };
-        found.damage.extend(missing.map(str::to_owned));
+    if !is_ended {
+        let chunks = found.chunks;
+        found.damage.push(format!(
+            "not ended: what came after {chunks} whole chunks is missing; of a recorder that was killed that is half a second"
+        ));
+    } else if index.is_none() {
+        found.damage.push("its index is damaged or missing".to_owned());
     }
     mcap.finish()?;
     Ok(found)
+}
+
+/// The next record's kind and bytes, and what comes after it; `None` where it does not end.
+fn next_record(bytes: &[u8]) -> Option<(u8, &[u8], &[u8])> {
+    let (opcode, rest) = bytes.split_first()?;
+    let (length, rest) = rest.split_first_chunk::<8>()?;
+    let (body, after) = rest.split_at_checked(u64::from_le_bytes(*length).try_into().ok()?)?;
+    Some((*opcode, body, after))
 }
 
 /// A copy that is being made.
