@@ -32,7 +32,8 @@ const NODE: (&str, &[&str]) = ("node", &["messages"]);
 const AIRLINK: (&str, &[&str]) = ("airlink", &["imaging", "messages", "node"]);
 /// Files that people bring: images, videos, calibrations.
 const MEDIA: (&str, &[&str]) = ("media", &["geometry", "imaging"]);
-const SERVICES: [&str; 5] = ["camera-pub", "controller", "detector", "gcs-bridge", "recorder"];
+const SERVICES: [&str; 6] =
+    ["camera-pub", "controller", "dashboard", "detector", "gcs-bridge", "recorder"];
 /// What a recording is.
 const FLIGHTLOG: (&str, &[&str]) = ("flightlog", &["autopilot", "messages"]);
 /// What a service or a tool may know.

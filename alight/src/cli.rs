@@ -10,8 +10,8 @@ use crate::args::ServiceArgs;
 use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
 use crate::{
-    command, detect, detectors, doctor, experiment, keys, land, marker, record, relay, replay,
-    swap, up,
+    command, dashboard, detect, detectors, doctor, experiment, keys, land, marker, record, relay,
+    replay, swap, up,
 };
 
 /// Exit status for an invalid command line or configuration.
@@ -48,6 +48,8 @@ enum Command {
     /// Fly a recorded flight again, from the events that the controller handled: verify it to the bit, or try other
     /// settings on it.
     Replay(replay::ReplayArgs),
+    /// Show the landing in a browser, or make a token for one.
+    Dashboard(dashboard::DashboardArgs),
     /// Simulate a world with wind, a pad, a vehicle, an autopilot and a camera.
     Simulator(ServiceArgs),
     /// Relay messages between the processes on the drone and the ground.
@@ -97,6 +99,7 @@ pub(crate) fn run() -> ExitCode {
         Command::GcsBridge(args) => services::run(Service::GcsBridge, &args),
         Command::Record(args) => record::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Dashboard(args) => dashboard::run(&args),
         Command::Simulator(args) => services::run(Service::Simulator, &args),
         Command::Relay(args) => relay::run(&args),
         Command::Keys(args) => keys::run(&args),

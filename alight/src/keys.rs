@@ -104,6 +104,8 @@ pub(crate) enum Role {
     GcsBridge,
     /// Subscribes, and publishes what it has recorded.
     Recorder,
+    /// Shows a landing in browsers, and commands as its configuration allows.
+    Dashboard,
     /// Simulates camera and vehicle.
     Simulator,
 }

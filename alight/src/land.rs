@@ -1,7 +1,7 @@
 //! `alight land`: all services as processes, watched until the vehicle has landed.
 
 use std::io::IsTerminal;
-use std::net::{TcpListener, UdpSocket};
+use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
@@ -64,6 +64,9 @@ pub(crate) struct LandArgs {
     /// number.
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
+    /// Show the landing on a page at this address, such as 127.0.0.1:8080, which also commands (`docs/dashboard.md`).
+    #[arg(long, value_name = "IP:PORT")]
+    dashboard: Option<SocketAddr>,
     /// Format of the result: a table, or one JSON object on the last line.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
@@ -182,6 +185,10 @@ impl ServiceSettings {
         if let Some(file) = &args.record {
             by_service.insert(0, (Service::Recorder, vec![file_setting(file)]));
         }
+        if let Some(address) = args.dashboard {
+            let settings = vec![format!("listen=\"{address}\""), "commands=here".to_owned()];
+            by_service.insert(0, (Service::Dashboard, settings));
+        }
         for setting in &args.set {
             let named = by_service.iter_mut().find_map(|(service, settings)| {
                 let key = setting.strip_prefix(service.name())?.strip_prefix('.')?;
@@ -191,7 +198,7 @@ impl ServiceSettings {
                 return Err(node::ConfigError::UnknownKey {
                     source_name: format!("--set {setting}"),
                     key: setting.split('=').next().unwrap_or_default().to_owned(),
-                    hint: "; a setting begins with its service: simulator., detector., controller., gcs-bridge., or with `--record` recorder.".to_owned(),
+                    hint: "; a setting begins with its service: simulator., detector., controller., gcs-bridge., or with `--record` recorder., with `--dashboard` dashboard.".to_owned(),
                 }
                 .into());
             };
@@ -236,6 +243,9 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         rendezvous.description,
         rendezvous.file.display()
     ));
+    if let Some(address) = args.dashboard {
+        progress.say(&format!("The page is at http://{address}/"));
+    }
     let mut children = Children::new();
     for (service, settings) in &settings.by_service {
         let started = children.start(*service, &rendezvous.file, settings)?;
@@ -300,10 +310,10 @@ async fn watch(
                         return Ok(landing);
                     }
                     progress.say(&format!("{} exited: {exit}{}", service.name(), consequence(service)));
-                    // The landing needs neither ground station nor recording.
+                    // The landing needs no ground station, recording or page.
                     let is_needed = landing.never_flew()
                         && match service {
-                            Service::GcsBridge | Service::Recorder => false,
+                            Service::GcsBridge | Service::Recorder | Service::Dashboard => false,
                             // Not needed if it was swapped, or another one runs.
                             Service::Detector => {
                                 !another_detector(node, settings).await.unwrap_or(false)
@@ -346,6 +356,7 @@ fn consequence(service: Service) -> &'static str {
         }
         Service::GcsBridge => "; the landing continues without the ground station",
         Service::Recorder => "; the landing continues, and is recorded no more",
+        Service::Dashboard => "; the landing continues without the page",
         Service::Simulator | Service::CameraPub => "",
     }
 }

@@ -27,6 +27,8 @@ pub(crate) enum Service {
     GcsBridge,
     /// Topics to a file.
     Recorder,
+    /// Topics to a browser.
+    Dashboard,
     /// A simulated world: vehicle, autopilot, camera.
     Simulator,
 }
@@ -40,6 +42,7 @@ impl Service {
             Self::Controller => "controller",
             Self::GcsBridge => "gcs-bridge",
             Self::Recorder => "recorder",
+            Self::Dashboard => "dashboard",
             Self::Simulator => "simulator",
         }
     }
@@ -52,6 +55,7 @@ impl Service {
             Self::Controller => layers.load::<controller::Config>()?.table,
             Self::GcsBridge => layers.load::<gcs_bridge::Config>()?.table,
             Self::Recorder => layers.load::<recorder::Config>()?.table,
+            Self::Dashboard => layers.load::<dashboard::Config>()?.table,
             Self::Simulator => layers.load::<simulator::Config>()?.table,
         })
     }
@@ -78,6 +82,9 @@ pub(crate) fn run(service: Service, args: &ServiceArgs) -> anyhow::Result<ExitCo
         }
         Service::Recorder => {
             serve(service, args, |c: &recorder::Config| c.id.clone(), recorder::run)
+        }
+        Service::Dashboard => {
+            serve(service, args, |c: &dashboard::Config| c.id.clone(), dashboard::run)
         }
         Service::Simulator => {
             serve(service, args, |c: &simulator::Config| c.id.clone(), simulator::run)

@@ -65,7 +65,7 @@ pub(crate) struct Site {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Entry {
-    /// A service: camera-pub, detector, controller, gcs-bridge, recorder, simulator.
+    /// A service: camera-pub, detector, controller, gcs-bridge, recorder, dashboard, simulator.
     run: Option<String>,
     /// Or another program with its arguments.
     command: Option<Vec<String>>,
@@ -219,7 +219,7 @@ impl Site {
                     source_name: "the site".to_owned(),
                     key: "run".to_owned(),
                     value: run.clone(),
-                    limit: "must be camera-pub, detector, controller, gcs-bridge, recorder or simulator"
+                    limit: "must be camera-pub, detector, controller, gcs-bridge, recorder, dashboard or simulator"
                         .to_owned(),
                 })?;
                 (Some(service), vec!["alight".to_owned(), service.name().to_owned()])
@@ -242,6 +242,10 @@ impl Site {
         if service == Some(Service::Detector) && role == Role::Ground {
             // The controller can prefer detectors by their place.
             layers.set.insert(0, "place=ground".to_owned());
+        }
+        if service == Some(Service::Dashboard) && role != Role::Local && role != Role::Drone {
+            // Raw frames exceed the bandwidth of any radio.
+            layers.set.insert(0, "video.input=jpeg".to_owned());
         }
         let config = match service {
             Some(service) => Some(service.effective_config(&layers)?),
@@ -276,7 +280,7 @@ mod tests {
         address = '10.42.0.1:8000'
         insecure = true
         drone = [{ run = 'detector' }, { run = 'controller', set = ['marker=\"rings\"'] }]
-        ground = [{ run = 'detector', set = ['id=\"ground\"'] }, { run = 'detector' }, { command = ['/usr/bin/python3', 'x.py'] }]";
+        ground = [{ run = 'detector', set = ['id=\"ground\"'] }, { run = 'detector' }, { run = 'dashboard' }, { command = ['/usr/bin/python3', 'x.py'] }]";
 
     #[test]
     fn the_drone_has_a_relay_and_local_services() {
@@ -295,7 +299,12 @@ mod tests {
     fn the_ground_connects_to_the_drone_or_to_the_relay() {
         let jobs = site(SITE).jobs(Role::Ground).unwrap();
         let names: Vec<_> = jobs.iter().map(|job| job.name.as_str()).collect();
-        assert_eq!(names, ["detector", "detector-2", "python3"]);
+        assert_eq!(names, ["detector", "detector-2", "dashboard", "python3"]);
+        assert!(
+            jobs[2].layers.set.contains(&"video.input=jpeg".to_owned()),
+            "{:?}",
+            jobs[2].layers
+        );
         assert!(jobs[0].layers.set.contains(&"place=ground".to_owned()), "{:?}", jobs[0].layers);
         let environment = jobs[0].network.environment();
         assert!(environment.contains(&("ALIGHT_CONNECT", "10.42.0.1:8000".into())));

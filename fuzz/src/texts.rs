@@ -33,6 +33,7 @@ pub fn configuration(input: &[u8]) {
         load::<camera_pub::Config>(&layers);
         load::<gcs_bridge::Config>(&layers);
         load::<recorder::Config>(&layers);
+        load::<dashboard::Config>(&layers);
         load::<simulator::Config>(&layers);
     }
 }

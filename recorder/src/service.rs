@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
+use airlink::picture::jpeg;
 use anyhow::{Context, bail, ensure};
 use flightlog::{About, Picture, Received};
 use messages::{Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS, decode, topic};
@@ -12,7 +13,6 @@ use node::{HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
 
 use crate::config::{Config, Frames};
 use crate::name::named;
-use crate::picture::jpeg;
 use crate::recording::{Ending, Recording};
 
 /// Longest wait for a message, after which the file is looked after.

@@ -85,7 +85,7 @@ impl Landing {
         let mut lines = BufReader::new(land.stderr.take().context("standard error")?).lines();
         let mut services = Vec::new();
         let mut zenoh = None;
-        let number = if args.contains(&"--record") { 5 } else { 4 };
+        let number = 4 + ["--record", "--dashboard"].iter().filter(|it| args.contains(it)).count();
         while services.len() < number {
             let line = lines.next().context("alight land said nothing")??;
             if let Some(rest) = line.split("--zenoh ").nth(1).filter(|_| zenoh.is_none()) {

@@ -7,11 +7,13 @@
 //!
 //! Modules in reading order: [`config`] has the keys, [`window`] decides when the next frame may be sent and
 //! how large it may be, [`prediction`] where the markers should be in it, [`plan`] which parts are sent at
-//! which scale and quality, [`payload`] encodes and decodes the bytes. These are algorithms, without clock,
+//! which scale and quality, [`payload`] encodes and decodes the bytes; [`picture`] makes one of a
+//! whole frame for people. These are algorithms, without clock,
 //! thread and network; [`sender`] is the camera's side, which has all three.
 
 pub mod config;
 pub mod payload;
+pub mod picture;
 pub mod plan;
 pub mod prediction;
 pub mod sender;

@@ -144,7 +144,7 @@ pub const STATUS: Topic<ControllerStatus> =
     Topic::new("controller/status", Delivery::LastValue, CONTROLLER);
 /// A command to the controller; answered with a [`CommandReply`].
 pub const COMMAND: Topic<ControllerCommand> =
-    Topic::new("controller/command", Delivery::Query, &["alight"]);
+    Topic::new("controller/command", Delivery::Query, &["alight", "dashboard"]);
 /// The answer to a command; travels as the reply, on the command's key.
 pub const COMMAND_REPLY: Topic<CommandReply> =
     Topic::new("controller/command", Delivery::Query, CONTROLLER);
@@ -167,13 +167,22 @@ pub const RECORDER_STATUS: Topic<RecorderStatus> =
 pub const HEALTH: Topic<Health> = Topic::new(
     "health/{service}/{instance}",
     Delivery::LastValue,
-    &["camera-pub", "controller", "detector", "gcs-bridge", "recorder", "relay", "simulator"],
+    &[
+        "camera-pub",
+        "controller",
+        "dashboard",
+        "detector",
+        "gcs-bridge",
+        "recorder",
+        "relay",
+        "simulator",
+    ],
 );
 /// The configuration that a service started with.
 pub const CONFIGURATION: Topic<Configuration> = Topic::new(
     "config/{service}/{instance}",
     Delivery::LastValue,
-    &["camera-pub", "controller", "detector", "gcs-bridge", "recorder", "simulator"],
+    &["camera-pub", "controller", "dashboard", "detector", "gcs-bridge", "recorder", "simulator"],
 );
 
 /// Key of the liveliness token a service declares when it is ready.

@@ -9,9 +9,10 @@ use serde_json::Value;
 use zenoh::key_expr::KeyExpr;
 
 /// The roles of the certificates, and their names in the topic table.
-const ROLES: [(&str, &str); 8] = [
+const ROLES: [(&str, &str); 9] = [
     ("camera-pub", "camera-pub"),
     ("controller", "controller"),
+    ("dashboard", "dashboard"),
     ("detector", "detector"),
     ("gcs-bridge", "gcs-bridge"),
     ("operator", "alight"),

@@ -176,13 +176,14 @@ fn file_of(role: &str) -> String {
     node::access::key_name(role, "ground")
 }
 
-const ROLES: [&str; 9] = [
+const ROLES: [&str; 10] = [
     "drone",
     "operator",
     "observer",
     "camera-pub",
     "detector.ground",
     "controller",
+    "dashboard",
     "gcs-bridge",
     "recorder",
     "simulator",

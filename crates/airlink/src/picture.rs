@@ -3,7 +3,7 @@
 use messages::{FrameHeader, PixelFormat};
 
 /// A frame as a JPEG file; `None` for one that is no whole grey or Bayer image. A Bayer image is shown as it is, grey.
-pub(crate) fn jpeg(header: &FrameHeader, pixels: &[u8], quality: u8) -> Option<Vec<u8>> {
+pub fn jpeg(header: &FrameHeader, pixels: &[u8], quality: u8) -> Option<Vec<u8>> {
     let (width, height) = (u16::try_from(header.width).ok()?, u16::try_from(header.height).ok()?);
     let bits = match header.format {
         PixelFormat::Jpeg => return Some(pixels.to_vec()),

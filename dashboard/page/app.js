@@ -1,0 +1,434 @@
+// @ts-check
+// The page: takes what the server tells, shows it, and greys what is no longer current.
+import { connectionLost, holdable, isHeld, nonceCame } from './hold.js';
+import { Map2 } from './map.js';
+import { follow } from './picture.js';
+import { Strip } from './strips.js';
+
+/** A number older than this is no longer current, in milliseconds. */
+const STALE_MS = 700;
+/** What comes once a second is stale after this, in milliseconds. */
+const SLOW_STALE_MS = 2600;
+const RECONNECT_MS = 400;
+const MAX_RECONNECT_MS = 1500;
+/** Without a word for this time the connection is given up, in milliseconds. */
+const SILENCE_MS = 3000;
+
+/** @param {string} id */
+const element = (id) => {
+  const found = document.getElementById(id);
+  if (!found) throw new Error(`there is no element ${id}`);
+  return found;
+};
+
+/** Sets a text where it changes. @param {string | HTMLElement} where @param {string} text */
+const put = (where, text) => {
+  const node = typeof where === 'string' ? element(where) : where;
+  if (node.textContent !== text) node.textContent = text;
+};
+
+/** @param {number | null | undefined} value @param {number} digits @param {string} unit */
+const number = (value, digits, unit) => (value == null ? '-' : `${value.toFixed(digits)} ${unit}`);
+
+/** @param {number} ms */
+const age = (ms) => (ms < 9950 ? `${(ms / 1000).toFixed(1)} s` : `${Math.round(ms / 1000)} s`);
+
+const degrees = (/** @type {number} */ radians) => (radians * 180) / Math.PI;
+
+/** What was told last, and when it came.
+ * @type {{ now: any, nowAt: number, slow: any, slowAt: number, heardAt: number, hello: any, offset: number | null, bestTrip: number, trip: number | null }} */
+const known = { now: null, nowAt: 0, slow: null, slowAt: 0, heardAt: 0, hello: null, offset: null, bestTrip: Infinity, trip: null };
+/** The picture that was drawn last. @type {{ header: any, at: number, drawn: number } | null} */
+let picture = null;
+let hasVideo = false;
+/** @type {WebSocket | null} */
+let socket = null;
+let pause = RECONNECT_MS;
+const map = new Map2();
+
+const link = {
+  /** @param {object} message */
+  send(message) {
+    if (!socket || socket.readyState !== WebSocket.OPEN) return false;
+    socket.send(JSON.stringify(message));
+    return true;
+  },
+  /** @param {string} text @param {string} mood */
+  tell(text, mood) {
+    put('reply', text);
+    element('reply').className = mood;
+  },
+};
+
+const strips = {
+  height: new Strip(element('strips'), 'Height', 'm', 2, 1),
+  lateral: new Strip(element('strips'), 'Beside the pad', 'm', 3, 0.1),
+  age: new Strip(element('strips'), 'Age of detection', 'ms', 0, 100),
+  picture: new Strip(element('strips'), 'Picture, light to screen', 'ms', 0, 100),
+  trip: new Strip(element('strips'), 'Page to server and back', 'ms', 1, 10),
+};
+
+/** @param {string} path */
+const address = (path) => `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}${path}`;
+
+async function begin() {
+  try {
+    const answer = await fetch('/session');
+    if (answer.ok) {
+      element('login').hidden = true;
+      connect();
+      startVideo();
+      return;
+    }
+    const why = await answer.json();
+    element('login').hidden = answer.status !== 401;
+    put('connection', why.reason ?? `refused (${answer.status})`);
+    if (answer.status === 401) return;
+  } catch {
+    put('connection', 'no connection');
+  }
+  setTimeout(begin, pause);
+  pause = Math.min(2 * pause, MAX_RECONNECT_MS);
+}
+
+function connect() {
+  const mine = new WebSocket(address('/ws'));
+  socket = mine;
+  known.heardAt = performance.now();
+  mine.onopen = () => { pause = RECONNECT_MS; };
+  mine.onmessage = (event) => take(JSON.parse(event.data));
+  mine.onclose = () => { if (socket === mine) disconnect(); };
+}
+
+/** Gives a connection up, and tries another one. */
+function disconnect() {
+  // One that hangs would take long to close.
+  const old = socket;
+  socket = null;
+  old?.close();
+  connectionLost(link);
+  setTimeout(begin, pause);
+  pause = Math.min(2 * pause, MAX_RECONNECT_MS);
+}
+
+/** @param {any} message */
+function take(message) {
+  const at = performance.now();
+  known.heardAt = at;
+  if (message.kind === 'now') {
+    [known.now, known.nowAt] = [message, at];
+    showNow(message, at);
+  } else if (message.kind === 'slow') {
+    [known.slow, known.slowAt] = [message, at];
+    showSlow(message);
+  } else if (message.kind === 'log') {
+    showLog(message);
+  } else if (message.kind === 'hello') {
+    known.hello = message;
+    showHello(message);
+  } else if (message.kind === 'pong') {
+    const trip = at - message.at_ms;
+    known.trip = trip;
+    strips.trip.add(at, trip);
+    // The quickest answer tells the difference of the clocks best; others may have waited.
+    known.bestTrip *= 1.02;
+    if (trip <= known.bestTrip) [known.bestTrip, known.offset] = [trip, message.now_ms - (message.at_ms + trip / 2)];
+  } else if (message.kind === 'nonce') {
+    nonceCame(link, message);
+  } else if (message.kind === 'reply') {
+    link.tell(`${message.command}: ${message.accepted ? 'accepted' : 'refused'} by the ${message.who}: ${message.why}`, message.accepted ? 'good' : 'bad');
+  }
+}
+
+/** @param {any} hello */
+function showHello(hello) {
+  put('host', `${hello.host}, version ${hello.version}`);
+  put('commands-note', hello.no_commands ? `No commands: ${hello.no_commands}.` : 'Hold a button, or the space bar on it, for one second.');
+  enable();
+}
+
+/** Buttons that cannot be used say so. */
+function enable() {
+  const may = known.hello && !known.hello.no_commands && isConnected();
+  for (const button of document.querySelectorAll('button.hold')) {
+    /** @type {HTMLButtonElement} */ (button).disabled = !may;
+  }
+}
+
+const isConnected = () => socket !== null && socket.readyState === WebSocket.OPEN && performance.now() - known.heardAt < STALE_MS;
+
+/** @param {any} message @param {number} at */
+function showNow({ status, target, vehicle }, at) {
+  if (status) {
+    put('title', status.title);
+    element('title').className = `title ${status.mood}`;
+    put('why', status.why);
+    put('next', status.next);
+    put('height', number(status.height_m, 2, 'm'));
+    put('lateral', number(status.lateral_error_m, 3, 'm'));
+    put('detection-age', number(status.detection_age_ms, 0, 'ms'));
+    put('latency', status.latency_ms ? `${status.latency_ms[0].toFixed(0)} to ${status.latency_ms[1].toFixed(0)} ms` : '-');
+    const [vn, ve, vd] = status.setpoint_m_s ?? [];
+    put('setpoint', status.setpoint_m_s ? `${Math.hypot(vn, ve).toFixed(2)} m/s, down ${vd.toFixed(2)}` : '-');
+    put('since', number(status.since_start_s, 1, 's'));
+    put('autopilot', `${status.autopilot}${status.setpoint_timeout_s == null ? '' : `; stops ${status.setpoint_timeout_s} s after the last setpoint`}`);
+    put('detector-why', `${status.detector ? `In use: ${status.detector}` : 'None is in use'} (${status.detector_why}); preferred: ${status.preference || 'none'}; ${status.detector_changes} changes.`);
+    rows(element('warnings'), status.warnings.map((/** @type {string} */ text) => ['li', text]));
+    strips.height.add(at, status.age_ms < STALE_MS ? status.height_m : null);
+    strips.lateral.add(at, status.age_ms < STALE_MS ? status.lateral_error_m : null);
+    strips.age.add(at, status.age_ms < STALE_MS ? status.detection_age_ms : null);
+  }
+  if (vehicle) {
+    put('mode', vehicle.mode);
+    put('armed', vehicle.armed ? 'armed' : 'off');
+    element('armed').className = vehicle.armed ? 'warn' : '';
+    put('landed', vehicle.landed);
+    put('battery', vehicle.battery == null ? 'not told' : `${Math.round(vehicle.battery * 100)} %`);
+    const [vn, ve, vd] = vehicle.velocity_m_s;
+    put('down', number(vd, 2, 'm/s'));
+    put('sideways', number(Math.hypot(vn, ve), 2, 'm/s'));
+    put('tilt', `${degrees(Math.acos(Math.min(1, Math.cos(vehicle.roll_rad) * Math.cos(vehicle.pitch_rad)))).toFixed(1)}°`);
+    put('heading', `${Math.round((degrees(vehicle.heading_rad) + 360) % 360)}°`);
+  }
+  if (target) {
+    const refused = target.rejected ? `latest detection refused: ${target.decided ?? target.rejected}` : target.decided ?? '';
+    put('target-text', `${target.deviation_m == null ? '' : `Known to ${(3 * target.deviation_m).toFixed(3)} m (dashed, three deviations). `}${refused}`);
+  }
+  map.take(vehicle, target && target.position_m ? target : null);
+}
+
+/** Makes the children of a list or table be these; those that stay are kept.
+ * @param {HTMLElement} parent @param {[string, string, string?][]} wanted */
+function rows(parent, wanted) {
+  while (parent.children.length > wanted.length) parent.lastElementChild?.remove();
+  wanted.forEach(([tag, text, mood = ''], n) => {
+    let child = /** @type {HTMLElement | undefined} */ (parent.children[n]);
+    if (!child) {
+      child = document.createElement(tag);
+      parent.append(child);
+    }
+    put(child, text);
+    if (child.className !== mood) child.className = mood;
+  });
+}
+
+/** A row of a table by its key, made where it is missing.
+ * @param {HTMLElement} body @param {string} key @param {number} cells */
+function row(body, key, cells) {
+  let found = /** @type {HTMLTableRowElement | undefined} */ ([...body.children].find((it) => /** @type {HTMLElement} */ (it).dataset.key === key));
+  if (!found) {
+    found = document.createElement('tr');
+    found.dataset.key = key;
+    for (let n = 0; n < cells; n += 1) found.append(document.createElement('td'));
+    body.append(found);
+  }
+  return found;
+}
+
+/** @param {HTMLElement} body @param {string[]} keys */
+function forget(body, keys) {
+  for (const child of [...body.children]) {
+    if (!keys.includes(/** @type {HTMLElement} */ (child).dataset.key ?? '')) child.remove();
+  }
+}
+
+/** @param {any} slow */
+function showSlow({ detectors, services, recorders, checks }) {
+  const table = /** @type {HTMLElement} */ (element('detectors').querySelector('tbody'));
+  for (const it of detectors) {
+    const line = row(table, it.name, 9);
+    const texts = [
+      it.name, it.state, [it.place, it.host].filter(Boolean).join(', ') || '-', number(it.rate_hz, 1, 'Hz'), number(it.latency_ms, 0, 'ms'),
+      it.age_ms == null ? '-' : age(it.age_ms),
+      it.compared ? `${it.agreed} of ${it.compared}${it.disagreement_m == null ? '' : `, ${it.disagreement_m.toFixed(3)} m`}` : '-',
+      it.sees ?? (it.seen === 0 ? 'no marker' : '-'),
+    ];
+    texts.forEach((text, n) => put(/** @type {HTMLElement} */ (line.children[n]), text));
+    line.children[1].className = it.in_use ? 'good' : it.state === 'standby' ? '' : 'bad';
+    line.dataset.age = it.age_ms == null ? '' : String(it.age_ms);
+    if (!line.querySelector('button')) {
+      const button = document.createElement('button');
+      button.type = 'button';
+      button.className = 'hold';
+      button.textContent = 'Use';
+      button.setAttribute('aria-label', `Use the detector ${it.name}`);
+      button.dataset.command = 'use-detector';
+      button.dataset.argument = it.name;
+      holdable(link, button);
+      line.children[8].append(button);
+      enable();
+    }
+  }
+  // A button that is held stays.
+  const held = [...table.querySelectorAll('button')].find((button) => isHeld(button));
+  forget(table, [...detectors.map((/** @type {any} */ it) => it.name), held?.dataset.argument ?? '']);
+
+  const processes = /** @type {HTMLElement} */ (element('services').querySelector('tbody'));
+  const keys = services.map((/** @type {any} */ it) => `${it.service} ${it.instance}`);
+  for (const it of services) {
+    const line = row(processes, `${it.service} ${it.instance}`, 7);
+    const rates = Object.entries(it.rates).map(([name, hz]) => `${name} ${Number(hz).toFixed(1)} Hz`);
+    const faults = [...Object.entries(it.drops), ...Object.entries(it.errors)].map(([name, count]) => `${name}: ${count}`);
+    const texts = [
+      `${it.service} ${it.instance}`, it.host, `${it.silent ? 'silent, ' : ''}${age(it.age_ms)} ago`,
+      it.round_trip_ms == null ? 'no answer' : `${it.round_trip_ms.toFixed(1)} ms`,
+      it.cpu_percent == null ? '-' : `${it.cpu_percent.toFixed(0)} %`, rates.join(', ') || '-', faults.join('; ') || 'none',
+    ];
+    texts.forEach((text, n) => put(/** @type {HTMLElement} */ (line.children[n]), text));
+    line.children[2].className = it.silent ? 'bad' : '';
+    line.children[6].className = Object.keys(it.errors).length > 0 ? 'warn' : '';
+    line.dataset.age = String(it.age_ms);
+  }
+  forget(processes, keys);
+  put('recorders', recorders.length === 0 ? 'Nothing records.' : recorders.map((/** @type {any} */ it) => `Recorder ${it.name}: ${it.problem ?? `${it.file}, ${(it.bytes / 1e6).toFixed(1)} MB, ${it.kept} messages, ${it.lost} lost`} (${age(it.age_ms)} ago)`).join(' '));
+
+  const list = element('checks');
+  const signs = /** @type {any} */ ({ good: '✓', open: '·', bad: '✗' });
+  checks.forEach((/** @type {any} */ it, /** @type {number} */ n) => {
+    let line = /** @type {HTMLElement | undefined} */ (list.children[n]);
+    if (!line) {
+      line = document.createElement('li');
+      for (const name of ['sign', 'name', 'text', 'todo']) {
+        const part = document.createElement('span');
+        part.className = name;
+        line.append(part);
+      }
+      list.append(line);
+    }
+    const [sign, name, text, todo] = /** @type {HTMLElement[]} */ ([...line.children]);
+    put(sign, signs[it.verdict]);
+    sign.className = `sign ${it.verdict === 'open' ? 'calm' : it.verdict}`;
+    sign.setAttribute('aria-label', it.verdict);
+    put(name, it.name);
+    put(text, it.text);
+    put(todo, it.verdict === 'bad' ? it.todo : '');
+  });
+}
+
+/** @param {any} log */
+function showLog({ now_ms: now, entries }) {
+  const list = element('log');
+  const isAtEnd = list.scrollTop + list.clientHeight >= list.scrollHeight - 20;
+  list.replaceChildren(...entries.map((/** @type {any} */ it) => {
+    const line = document.createElement('li');
+    const at = document.createElement('time');
+    at.textContent = new Date(Date.now() - (now - it.at_ms)).toLocaleTimeString();
+    at.className = 'quiet';
+    const text = document.createElement('span');
+    text.textContent = it.text;
+    text.className = it.level === 'info' ? '' : it.level;
+    line.append(at, text);
+    return line;
+  }));
+  if (isAtEnd) list.scrollTop = list.scrollHeight;
+}
+
+/** Greys what is old, and says how old. */
+function lookAtAges() {
+  const at = performance.now();
+  const connected = isConnected();
+  put('connection', connected ? 'connected' : `no connection for ${age(at - known.heardAt)}`);
+  element('connection').className = `badge ${connected ? 'good' : 'lost'}`;
+  if (socket && at - known.heardAt > SILENCE_MS) disconnect();
+  for (const panel of document.querySelectorAll('[data-group]')) {
+    const group = known.now?.[/** @type {HTMLElement} */ (panel).dataset.group ?? ''];
+    const old = group ? group.age_ms + (at - known.nowAt) : null;
+    const isStale = old === null || old > STALE_MS;
+    panel.classList.toggle('stale', isStale);
+    const label = panel.querySelector('.age');
+    if (label) put(/** @type {HTMLElement} */ (label), old === null ? 'not heard' : isStale ? `${age(old)} old` : '');
+  }
+  const status = known.now?.status;
+  const phaseOld = status ? status.age_ms + (at - known.nowAt) : Infinity;
+  const badge = element('phase');
+  if (phaseOld <= STALE_MS) {
+    put(badge, status.title);
+    badge.className = `badge ${status.mood}`;
+  } else {
+    put(badge, status ? `was: ${status.title}, ${age(phaseOld)} ago` : 'No controller');
+    badge.className = 'badge lost';
+  }
+  for (const line of document.querySelectorAll('tbody tr')) {
+    const told = /** @type {HTMLElement} */ (line).dataset.age;
+    const limit = line.closest('#detectors') ? SLOW_STALE_MS - 1000 : SLOW_STALE_MS + 1000;
+    line.classList.toggle('old', !told || Number(told) + (at - known.slowAt) > limit);
+  }
+  element('checks').classList.toggle('old', at - known.slowAt > SLOW_STALE_MS);
+  if (picture) {
+    const old = at - picture.at;
+    const isOld = old > STALE_MS;
+    element('video-panel').classList.toggle('stale', isOld);
+    put('video-age', isOld ? `${age(old)} old` : '');
+    element('video-age').className = isOld ? 'lost' : 'quiet';
+  }
+  const trip = known.trip === null ? '-' : `${known.trip.toFixed(1)} ms`;
+  put('page-link', `This page: ${trip} to the server and back; ${picture ? `${picture.drawn} pictures drawn` : 'no pictures'}.`);
+  enable();
+}
+
+/** @param {any} message */
+function pictureTold(message) {
+  if (message.kind !== 'drawn') return;
+  const at = performance.now();
+  const { header } = message;
+  picture = { header, at, drawn: message.drawn };
+  const light = known.offset === null ? null : at + known.offset - header.taken_ms;
+  strips.picture.add(at, light);
+  const seen = header.markers === null ? 'nobody has told in time what is in it' : `${header.detector}${header.is_used ? '' : ' (not in use)'} found ${header.markers.length} in it`;
+  put('video-text', `${header.camera} ${header.sequence}, ${header.width} x ${header.height}: ${seen}${light === null ? '' : `; ${light.toFixed(0)} ms after the light`}.`);
+}
+
+function startVideo() {
+  // A canvas is handed over once; the connection comes back by itself.
+  if (hasVideo) return;
+  hasVideo = true;
+  const canvas = /** @type {HTMLCanvasElement} */ (element('video'));
+  const url = address('/video');
+  if ('transferControlToOffscreen' in canvas && 'Worker' in window) {
+    const offscreen = canvas.transferControlToOffscreen();
+    const worker = new Worker('/worker.js', { type: 'module' });
+    worker.onmessage = (event) => pictureTold(event.data);
+    worker.postMessage({ canvas: offscreen, address: url }, [offscreen]);
+  } else {
+    follow(canvas, url, pictureTold);
+  }
+}
+
+function redraw() {
+  const now = performance.now();
+  for (const strip of Object.values(strips)) strip.draw(now);
+  map.drawAbove(/** @type {HTMLCanvasElement} */ (element('map')));
+  map.drawSide(/** @type {HTMLCanvasElement} */ (element('side')));
+}
+
+element('login').addEventListener('submit', async (event) => {
+  event.preventDefault();
+  const token = /** @type {HTMLInputElement} */ (element('token'));
+  const answer = await fetch('/login', { method: 'POST', body: token.value });
+  token.value = '';
+  if (answer.ok) {
+    put('login-problem', '');
+    begin();
+  } else {
+    put('login-problem', 'This token is not valid.');
+  }
+});
+
+/** @param {string} theme */
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+  element('theme').setAttribute('aria-pressed', String(theme === 'sun'));
+}
+element('theme').addEventListener('click', () => {
+  const theme = document.documentElement.dataset.theme === 'sun' ? 'dark' : 'sun';
+  localStorage.setItem('theme', theme);
+  setTheme(theme);
+});
+setTheme(localStorage.getItem('theme') === 'sun' ? 'sun' : 'dark');
+
+for (const button of document.querySelectorAll('button.hold')) holdable(link, /** @type {HTMLButtonElement} */ (button));
+enable();
+begin();
+setInterval(lookAtAges, 100);
+setInterval(redraw, 200);
+setInterval(() => link.send({ kind: 'ping', at_ms: performance.now() }), 1000);

@@ -1,0 +1,115 @@
+// @ts-check
+// Pictures with what was found in them, drawn in one step. Runs in a worker, or on the page where there are none.
+
+const RECONNECT_MS = 500;
+const MAX_RECONNECT_MS = 2000;
+
+/** Follows the pictures and draws each; `told` hears of each, and of the connection.
+ * @param {HTMLCanvasElement | OffscreenCanvas} canvas @param {string} address @param {(message: any) => void} told */
+export function follow(canvas, address, told) {
+  const context = /** @type {any} */ (canvas.getContext('2d', { alpha: false }));
+  let pause = RECONNECT_MS;
+  let drawn = 0;
+  const connect = () => {
+    const socket = new WebSocket(address);
+    socket.binaryType = 'arraybuffer';
+    socket.onopen = () => { pause = RECONNECT_MS; };
+    /** @param {ArrayBuffer} message */
+    const show = async (message) => {
+      const { header, bitmaps } = await decode(message);
+      draw(canvas, context, header, bitmaps);
+      drawn += 1;
+      // Only what was drawn is acknowledged: at most two pictures are on their way.
+      if (socket.readyState === WebSocket.OPEN) socket.send(String(header.number));
+      told({ kind: 'drawn', header, drawn });
+    };
+    // One after the other, so that no picture is drawn over a newer one.
+    let last = Promise.resolve();
+    socket.onmessage = (event) => { last = last.then(() => show(event.data)).catch(() => socket.close()); };
+    socket.onclose = () => {
+      told({ kind: 'closed' });
+      setTimeout(connect, pause);
+      pause = Math.min(2 * pause, MAX_RECONNECT_MS);
+    };
+  };
+  connect();
+}
+
+/** Header and bitmaps of a message. @param {ArrayBuffer} message */
+async function decode(message) {
+  const length = new DataView(message).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
+  let at = 4 + length;
+  const whole = { x: 0, y: 0, width: header.width, height: header.height, scale: 1, bytes: message.byteLength - at };
+  const parts = header.parts.length > 0 ? header.parts : [whole];
+  const bitmaps = [];
+  for (const part of parts) {
+    const file = new Blob([new Uint8Array(message, at, part.bytes)], { type: 'image/jpeg' });
+    at += part.bytes;
+    try {
+      bitmaps.push({ part, bitmap: await createImageBitmap(file) });
+    } catch {
+      // A damaged part leaves its place black.
+    }
+  }
+  return { header, bitmaps };
+}
+
+/** Draws the parts, the finest on top, and what was found.
+ * @param {HTMLCanvasElement | OffscreenCanvas} canvas @param {any} context @param {any} header @param {any[]} bitmaps */
+function draw(canvas, context, header, bitmaps) {
+  if (canvas.width !== header.width || canvas.height !== header.height) {
+    canvas.width = header.width;
+    canvas.height = header.height;
+  }
+  if (header.parts.length > 0) {
+    context.fillStyle = '#000';
+    context.fillRect(0, 0, canvas.width, canvas.height);
+  }
+  for (const { part, bitmap } of bitmaps.reverse()) {
+    context.drawImage(bitmap, part.x, part.y, part.width * part.scale, part.height * part.scale);
+    bitmap.close();
+  }
+  // The middle of the first pixel is (0, 0) in detections, and (0.5, 0.5) on a canvas.
+  context.save();
+  context.translate(0.5, 0.5);
+  const unit = header.width / 650;
+  for (const marker of header.markers ?? []) {
+    overlay(context, marker, unit, header.is_used ? '#59ff8b' : '#ffd166');
+  }
+  context.restore();
+}
+
+/** Outline, centre and name of a marker.
+ * @param {any} context @param {any} marker @param {number} unit @param {string} colour */
+function overlay(context, marker, unit, colour) {
+  const [u, v] = marker.centre;
+  context.lineWidth = 1.6 * unit;
+  context.strokeStyle = colour;
+  context.beginPath();
+  if (marker.corners) {
+    const [first, ...rest] = marker.corners;
+    context.moveTo(first[0], first[1]);
+    for (const corner of rest) context.lineTo(corner[0], corner[1]);
+    context.closePath();
+  } else {
+    context.arc(u, v, marker.size / 2, 0, 2 * Math.PI);
+  }
+  context.stroke();
+  context.beginPath();
+  context.moveTo(u - 6 * unit, v);
+  context.lineTo(u + 6 * unit, v);
+  context.moveTo(u, v - 6 * unit);
+  context.lineTo(u, v + 6 * unit);
+  context.stroke();
+  const distance = marker.distance_m === null ? '' : ` ${marker.distance_m.toFixed(2)} m`;
+  const text = `${marker.name}${distance}`;
+  context.font = `${Math.round(12 * unit)}px sans-serif`;
+  const width = context.measureText(text).width;
+  const x = Math.max(0, Math.min(u + marker.size / 2 + 4 * unit, context.canvas.width - width - 8 * unit));
+  const y = Math.max(14 * unit, Math.min(v, context.canvas.height - 4 * unit));
+  context.fillStyle = 'rgba(0, 0, 0, 0.7)';
+  context.fillRect(x, y - 13 * unit, width + 8 * unit, 17 * unit);
+  context.fillStyle = colour;
+  context.fillText(text, x + 4 * unit, y);
+}

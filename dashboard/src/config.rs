@@ -1,0 +1,148 @@
+//! The dashboard's configuration.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use serde::Deserialize;
+
+/// Maximum number of names of the page.
+const MAX_NAMES: usize = 16;
+
+/// The keys of `dashboard.toml`, which has their meanings, units and ranges.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Name of this instance.
+    pub id: String,
+    /// Address of the page.
+    pub listen: String,
+    /// Further names of the page.
+    pub names: Vec<String>,
+    /// Who commands, a [`Commands`].
+    pub commands: String,
+    /// The file of the tokens' hashes; empty for the usual one.
+    pub tokens: PathBuf,
+    /// Maximum number of browsers.
+    pub max_clients: u32,
+    /// Pictures.
+    pub video: VideoConfig,
+}
+
+/// The keys of pictures.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VideoConfig {
+    /// Where pictures come from, an [`Input`].
+    pub input: String,
+    /// Maximum rate of pictures, in Hz.
+    pub max_hz: f64,
+    /// Quality of pictures made from frames.
+    pub jpeg_quality: u8,
+    /// How long a picture waits for its detections, in milliseconds.
+    pub hold_ms: u32,
+}
+
+/// Who commands by the page.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Commands {
+    /// Nobody.
+    Never,
+    /// Whoever opens it on this machine.
+    Here,
+    /// On this machine, holders of a token for commands.
+    Token,
+}
+
+impl FromStr for Commands {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "never" => Ok(Self::Never),
+            "here" => Ok(Self::Here),
+            "token" => Ok(Self::Token),
+            _ => Err(format!("`{text}` is none of `never`, `here`, `token`")),
+        }
+    }
+}
+
+/// Where pictures come from.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Input {
+    /// The camera's frames.
+    Frames,
+    /// The JPEG frames of the air link.
+    Jpeg,
+    /// There are none.
+    None,
+}
+
+impl FromStr for Input {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "frames" => Ok(Self::Frames),
+            "jpeg" => Ok(Self::Jpeg),
+            "none" => Ok(Self::None),
+            _ => Err(format!("`{text}` is none of `frames`, `jpeg`, `none`")),
+        }
+    }
+}
+
+impl node::Settings for Config {
+    const DEFAULTS: &'static str = include_str!("../dashboard.toml");
+
+    fn check(&self, check: &mut node::Check<'_>) {
+        check.name("id", &self.id);
+        let listen = self.listen.parse::<SocketAddr>();
+        check.parses("listen", listen.map_err(|_| "it must be IP:PORT, such as 127.0.0.1:8080"));
+        check.parses("names", check_names(&self.names));
+        check.parses("commands", self.commands.parse::<Commands>());
+        check.range("max_clients", self.max_clients, 1..=64);
+        check.parses("video.input", self.video.input.parse::<Input>());
+        check.range("video.max_hz", self.video.max_hz, 0.5..=120.0);
+        check.range("video.jpeg_quality", self.video.jpeg_quality, 1..=100);
+        check.range("video.hold_ms", self.video.hold_ms, 0..=1000);
+    }
+}
+
+fn check_names(names: &[String]) -> Result<(), String> {
+    let is_part = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '.';
+    let is_host =
+        |name: &&String| !name.is_empty() && name.len() < 254 && name.chars().all(is_part);
+    match names.iter().find(|name| !is_host(name)) {
+        Some(name) => Err(format!("`{name}` is no host name")),
+        None if names.len() > MAX_NAMES => Err(format!("there may be {MAX_NAMES} names at most")),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(set: &str) -> Result<Config, String> {
+        let layers = node::Layers { file: None, set: vec![set.to_owned()] };
+        layers.load::<Config>().map(|c| c.settings).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused_by_name() {
+        for (setting, part) in [
+            ("listen=localhost:80", "IP:PORT"),
+            ("names=[\"a b\"]", "no host name"),
+            ("commands=always", "`never`"),
+            ("max_clients=0", "from 1 to 64"),
+            ("video.input=raw", "`frames`"),
+            ("video.max_hz=0", "max_hz"),
+            ("video.hold_ms=5000", "hold_ms"),
+            ("id=a/b", "letters, digits"),
+        ] {
+            let problem = load(setting).unwrap_err();
+            assert!(problem.contains(part), "{setting}: {problem}");
+        }
+        assert!(load("listen=0.0.0.0:9000").is_ok());
+    }
+}

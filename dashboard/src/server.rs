@@ -1,0 +1,515 @@
+//! Answers browsers: the page, its data, its pictures, its commands.
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use anyhow::Context;
+use axum::Router;
+use axum::body::Body;
+use axum::extract::ws::{Message, Utf8Bytes, WebSocket, WebSocketUpgrade};
+use axum::extract::{ConnectInfo, DefaultBodyLimit, Request, State as Shared};
+use axum::http::header::{
+    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, COOKIE, HOST, ORIGIN, REFERRER_POLICY,
+    SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
+};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::Response;
+use axum::routing::{get, post};
+use axum::serve::ListenerExt;
+use messages::{ControllerCommand, Place, topic};
+use node::{Node, host_name, now_ns};
+use serde::Deserialize;
+use serde_json::json;
+use tokio::net::TcpListener;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
+use tokio::time::{interval, timeout};
+
+use crate::config::{Commands, Config};
+use crate::guard::{Access, Guard, Refusal};
+use crate::log::Level;
+use crate::nonce::Nonce;
+use crate::state::State;
+use crate::tokens::{Kind, SESSION_S, Sessions, Tokens, secret, usual_file};
+use crate::video::Shown;
+use crate::window::Window;
+
+/// The files of the page: path, type, contents.
+const FILES: [(&str, &str, &str); 9] = [
+    ("/", HTML, include_str!("../page/index.html")),
+    ("/style.css", "text/css; charset=utf-8", include_str!("../page/style.css")),
+    ("/icon.svg", "image/svg+xml", include_str!("../page/icon.svg")),
+    ("/app.js", JAVASCRIPT, include_str!("../page/app.js")),
+    ("/hold.js", JAVASCRIPT, include_str!("../page/hold.js")),
+    ("/map.js", JAVASCRIPT, include_str!("../page/map.js")),
+    ("/picture.js", JAVASCRIPT, include_str!("../page/picture.js")),
+    ("/strips.js", JAVASCRIPT, include_str!("../page/strips.js")),
+    ("/worker.js", JAVASCRIPT, include_str!("../page/worker.js")),
+];
+const HTML: &str = "text/html; charset=utf-8";
+const JAVASCRIPT: &str = "text/javascript; charset=utf-8";
+const JSON: &str = "application/json";
+
+/// The page takes everything from its own origin, and nothing inside of the page's text is run.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
+/// Maximum size of what a browser sends, in bytes.
+const MAX_REQUEST_BYTES: usize = 4096;
+/// What a browser does not take within this time is given up with its connection.
+const SEND_TIMEOUT: Duration = Duration::from_secs(5);
+/// Period in which a browser is looked after that gets pictures.
+const LOOK_PERIOD: Duration = Duration::from_millis(500);
+/// Replies to commands that wait to be sent to a browser, and its commands under way.
+const MAX_COMMANDS: usize = 4;
+/// Time that a button is held, in milliseconds.
+const HOLD_MS: u32 = 1000;
+
+/// What all browsers are told, each as JSON.
+#[derive(Clone, Default)]
+pub(crate) struct Texts {
+    pub(crate) now: Arc<watch::Sender<Utf8Bytes>>,
+    pub(crate) slow: Arc<watch::Sender<Utf8Bytes>>,
+    pub(crate) log: Arc<watch::Sender<Utf8Bytes>>,
+}
+
+/// What the answers need.
+pub(crate) struct App {
+    node: Node,
+    guard: Guard,
+    config: Config,
+    cookie: String,
+    sessions: Mutex<Sessions>,
+    state: Arc<Mutex<State>>,
+    texts: Texts,
+    shown: Arc<watch::Sender<Option<Shown>>>,
+    clients: Arc<Semaphore>,
+    viewers: Arc<Semaphore>,
+}
+
+/// What a browser asks for.
+#[derive(Deserialize)]
+#[serde(rename_all = "kebab-case", tag = "kind")]
+enum Ask {
+    /// A nonce for a command.
+    Nonce { command: String, argument: Option<String> },
+    /// To carry out a command.
+    Command { command: String, argument: Option<String>, nonce: String },
+    /// The time.
+    Ping { at_ms: f64 },
+}
+
+impl App {
+    pub(crate) fn new(
+        node: Node,
+        config: &Config,
+        address: SocketAddr,
+        state: Arc<Mutex<State>>,
+        texts: Texts,
+        shown: Arc<watch::Sender<Option<Shown>>>,
+    ) -> anyhow::Result<Arc<Self>> {
+        let commands = config.commands.parse::<Commands>().map_err(anyhow::Error::msg)?;
+        let max_clients = config.max_clients as usize;
+        Ok(Arc::new(Self {
+            node,
+            guard: Guard::new(address, config.names.clone(), commands),
+            config: config.clone(),
+            // Cookies are shared by the ports of a machine.
+            cookie: format!("alight-{}", address.port()),
+            sessions: Mutex::default(),
+            state,
+            texts,
+            shown,
+            clients: Arc::new(Semaphore::new(max_clients)),
+            viewers: Arc::new(Semaphore::new(max_clients)),
+        }))
+    }
+
+    /// The value of our cookie in a request.
+    fn cookie<'a>(&self, headers: &'a HeaderMap) -> Option<&'a str> {
+        let cookies = headers.get_all(COOKIE).iter().filter_map(|value| value.to_str().ok());
+        let mut cookies = cookies.flat_map(|text| text.split(';'));
+        cookies.find_map(|it| it.trim().strip_prefix(&self.cookie)?.strip_prefix('='))
+    }
+
+    fn access(&self, peer: SocketAddr, headers: &HeaderMap) -> Result<Access, Refusal> {
+        let cookie = self.cookie(headers);
+        let session = cookie.and_then(|cookie| self.sessions().kind(cookie, now_s()));
+        self.guard.access(peer.ip(), session)
+    }
+
+    fn sessions(&self) -> MutexGuard<'_, Sessions> {
+        self.sessions.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn log(&self, level: Level, text: &str) {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.log.add(now_ns(), level, text);
+    }
+
+    /// Counts a refusal, and says why.
+    fn refuse(&self, refusal: Refusal) -> Response {
+        self.node.health().dropped(refusal.reason());
+        let status = match refusal {
+            Refusal::Host => StatusCode::MISDIRECTED_REQUEST,
+            Refusal::Origin => StatusCode::FORBIDDEN,
+            Refusal::Token => StatusCode::UNAUTHORIZED,
+            Refusal::Full => StatusCode::SERVICE_UNAVAILABLE,
+        };
+        let why = json!({ "reason": refusal.reason(), "why": refusal.sentence() });
+        answer(status, JSON, why.to_string())
+    }
+
+    fn tokens(&self) -> anyhow::Result<Tokens> {
+        let named = &self.config.tokens;
+        let file = if named.as_os_str().is_empty() { usual_file()? } else { named.clone() };
+        Tokens::read(&file)
+    }
+}
+
+/// Seconds since 1970, in which tokens and sessions end.
+fn now_s() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
+}
+
+fn answer(status: StatusCode, kind: &'static str, body: impl Into<Body>) -> Response {
+    let mut response = Response::new(body.into());
+    *response.status_mut() = status;
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(kind));
+    response
+}
+
+/// Answers until the listener fails.
+pub(crate) async fn serve(listener: TcpListener, app: Arc<App>) -> anyhow::Result<()> {
+    let mut router = Router::new();
+    for (path, kind, contents) in FILES {
+        router = router.route(path, get(async move || answer(StatusCode::OK, kind, contents)));
+    }
+    let router = router
+        .route("/session", get(session))
+        .route("/login", post(login))
+        .route("/logout", post(logout))
+        .route("/ws", get(data))
+        .route("/video", get(video))
+        .layer(DefaultBodyLimit::max(MAX_REQUEST_BYTES))
+        .layer(from_fn_with_state(Arc::clone(&app), protect))
+        .with_state(app);
+    // Small messages go at once.
+    let listener = listener.tap_io(|stream| drop(stream.set_nodelay(true)));
+    let service = router.into_make_service_with_connect_info::<SocketAddr>();
+    axum::serve(listener, service).await.context("serving the page")
+}
+
+/// Checks every request before anything else, and says to the browser what the page may do.
+async fn protect(Shared(app): Shared<Arc<App>>, request: Request, next: Next) -> Response {
+    let checked = {
+        // What is no text is no address of ours.
+        let text = |value: &'_ HeaderValue| value.to_str().unwrap_or("?").to_owned();
+        let [host, origin] = [HOST, ORIGIN].map(|name| request.headers().get(name).map(text));
+        app.guard.check_headers(host.as_deref(), origin.as_deref())
+    };
+    let mut response = match checked {
+        Ok(()) => next.run(request).await,
+        Err(refusal) => app.refuse(refusal),
+    };
+    let headers = response.headers_mut();
+    for (name, value) in [
+        (CONTENT_SECURITY_POLICY, POLICY),
+        (X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (REFERRER_POLICY, "no-referrer"),
+        (CACHE_CONTROL, "no-store"),
+        (HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
+        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+    ] {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+/// What this browser may do.
+async fn session(
+    Shared(app): Shared<Arc<App>>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    headers: HeaderMap,
+) -> Response {
+    std::future::ready(match app.access(peer, &headers) {
+        Ok(access) => {
+            let text = json!({ "no_commands": access.no_commands }).to_string();
+            answer(StatusCode::OK, JSON, text)
+        }
+        Err(refusal) => app.refuse(refusal),
+    })
+    .await
+}
+
+/// Changes a token into a session.
+async fn login(Shared(app): Shared<Arc<App>>, token: String) -> Response {
+    let tokens = tokio::task::block_in_place(|| app.tokens());
+    let tokens = tokens.unwrap_or_else(|problem| {
+        app.node.health().failed("tokens");
+        tracing::warn!(problem = format!("{problem:#}"), "No token is accepted");
+        Tokens::default()
+    });
+    let begun = tokens.kind(&token, now_s()).and_then(|kind| Some((kind, secret().ok()?)));
+    let Some((kind, cookie)) = begun else { return app.refuse(Refusal::Token) };
+    app.sessions().begin(&cookie, kind, now_s());
+    app.log(Level::Info, &format!("a browser has shown a token of the kind `{kind}`"));
+    let cookie =
+        format!("{}={cookie}; HttpOnly; SameSite=Strict; Path=/; Max-Age={SESSION_S}", app.cookie);
+    let is_command = kind == Kind::Command;
+    let mut response = answer(StatusCode::OK, JSON, json!({ "command": is_command }).to_string());
+    if let Ok(value) = HeaderValue::from_str(&cookie) {
+        response.headers_mut().insert(SET_COOKIE, value);
+    }
+    response
+}
+
+/// Ends a session.
+async fn logout(Shared(app): Shared<Arc<App>>, headers: HeaderMap) -> Response {
+    if let Some(cookie) = app.cookie(&headers) {
+        app.sessions().end(cookie);
+    }
+    std::future::ready(answer(StatusCode::OK, JSON, "{}")).await
+}
+
+async fn data(
+    Shared(app): Shared<Arc<App>>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    headers: HeaderMap,
+    upgrade: WebSocketUpgrade,
+) -> Response {
+    let permit = Arc::clone(&app.clients).try_acquire_owned().map_err(|_| Refusal::Full);
+    match std::future::ready(app.access(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
+        Ok((access, permit)) => {
+            bounded(upgrade).on_upgrade(move |socket| Client::new(app, access).run(socket, permit))
+        }
+        Err(refusal) => app.refuse(refusal),
+    }
+}
+
+async fn video(
+    Shared(app): Shared<Arc<App>>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    headers: HeaderMap,
+    upgrade: WebSocketUpgrade,
+) -> Response {
+    let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
+    match std::future::ready(app.access(peer, &headers).and_then(|_| permit)).await {
+        Ok(permit) => bounded(upgrade).on_upgrade(move |socket| pictures(app, socket, permit)),
+        Err(refusal) => app.refuse(refusal),
+    }
+}
+
+fn bounded(upgrade: WebSocketUpgrade) -> WebSocketUpgrade {
+    upgrade.max_message_size(MAX_REQUEST_BYTES).max_frame_size(MAX_REQUEST_BYTES)
+}
+
+/// Sends, or fails when the browser takes too long.
+async fn send(socket: &mut WebSocket, message: Message) -> anyhow::Result<()> {
+    timeout(SEND_TIMEOUT, socket.send(message)).await.context("the browser takes nothing")??;
+    Ok(())
+}
+
+/// Sends pictures, the newest that there is whenever the browser has drawn one.
+async fn pictures(app: Arc<App>, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
+    let mut shown = app.shown.subscribe();
+    shown.mark_changed();
+    let mut window = Window::default();
+    let mut look = interval(LOOK_PERIOD);
+    loop {
+        tokio::select! {
+            // It never ends while `app` is there.
+            changed = shown.changed(), if window.has_room() => {
+                if changed.is_err() {
+                    return;
+                }
+                let Some(Shown { number, message }) = shown.borrow_and_update().clone() else { continue };
+                window.sent(now_ns(), number);
+                if send(&mut socket, Message::Binary(message)).await.is_err() {
+                    return;
+                }
+            }
+            received = socket.recv() => match received {
+                // An acknowledgement: the number of the picture that was drawn.
+                Some(Ok(Message::Text(text))) => {
+                    if !text.parse().is_ok_and(|number| window.acknowledged(number)) {
+                        app.node.health().dropped("wrong acknowledgement");
+                    }
+                }
+                Some(Ok(Message::Close(_)) | Err(_)) | None => return,
+                Some(Ok(_)) => {}
+            },
+            _ = look.tick() => {
+                if window.is_stuck(now_ns()) {
+                    app.node.health().dropped("browser draws nothing");
+                    return;
+                }
+            }
+        }
+    }
+}
+
+/// A browser that shows the page.
+struct Client {
+    app: Arc<App>,
+    access: Access,
+    nonce: Nonce,
+    replies: mpsc::Sender<Utf8Bytes>,
+    waiting: mpsc::Receiver<Utf8Bytes>,
+}
+
+impl Client {
+    fn new(app: Arc<App>, access: Access) -> Self {
+        let (replies, waiting) = mpsc::channel(MAX_COMMANDS);
+        Self { app, access, nonce: Nonce::default(), replies, waiting }
+    }
+
+    async fn run(mut self, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
+        // A browser that goes is no failure.
+        if let Err(problem) = self.talk(&mut socket).await {
+            tracing::debug!(%problem, "A browser has gone");
+        }
+    }
+
+    async fn talk(&mut self, socket: &mut WebSocket) -> anyhow::Result<()> {
+        let hello = json!({
+            "kind": "hello", "version": env!("CARGO_PKG_VERSION"), "host": host_name(),
+            "no_commands": self.access.no_commands, "hold_ms": HOLD_MS, "video": self.app.config.video.input,
+        });
+        send(socket, Message::Text(hello.to_string().into())).await?;
+        let texts = self.app.texts.clone();
+        let [mut now, mut slow, mut log] = [texts.now, texts.slow, texts.log].map(|text| {
+            let mut text = text.subscribe();
+            text.mark_changed();
+            text
+        });
+        loop {
+            let text = tokio::select! {
+                changed = log.changed() => { changed?; log.borrow_and_update().clone() }
+                changed = slow.changed() => { changed?; slow.borrow_and_update().clone() }
+                changed = now.changed() => { changed?; now.borrow_and_update().clone() }
+                Some(reply) = self.waiting.recv() => reply,
+                received = socket.recv() => match received {
+                    Some(Ok(Message::Text(text))) => match self.asked(&text) {
+                        Some(answer) => answer,
+                        None => continue,
+                    },
+                    Some(Ok(Message::Close(_))) | None => return Ok(()),
+                    Some(Ok(_)) => continue,
+                    Some(Err(problem)) => return Err(problem.into()),
+                },
+            };
+            if !text.as_str().is_empty() {
+                send(socket, Message::Text(text)).await?;
+            }
+        }
+    }
+
+    /// The answer to what a browser asks; of a command that is sent it comes later.
+    fn asked(&mut self, text: &str) -> Option<Utf8Bytes> {
+        let Ok(ask) = serde_json::from_str(text) else {
+            self.app.node.health().dropped("unreadable request");
+            return Some(
+                json!({ "kind": "problem", "why": "unreadable request" }).to_string().into(),
+            );
+        };
+        match ask {
+            Ask::Ping { at_ms } => {
+                let pong =
+                    json!({ "kind": "pong", "at_ms": at_ms, "now_ms": now_ns() as f64 * 1e-6 });
+                Some(pong.to_string().into())
+            }
+            Ask::Nonce { command, argument } => {
+                let mut random = [0; 16];
+                if getrandom::fill(&mut random).is_err() {
+                    return Some(refused(
+                        &command,
+                        "dashboard",
+                        "the system has no random numbers",
+                    ));
+                }
+                let nonce =
+                    self.nonce.open(now_ns(), random, &whole(&command, argument.as_deref()));
+                let answer = json!({ "kind": "nonce", "command": command, "argument": argument, "nonce": nonce });
+                Some(answer.to_string().into())
+            }
+            Ask::Command { command, argument, nonce } => {
+                let whole = whole(&command, argument.as_deref());
+                let checked = self.nonce.spend(now_ns(), &nonce, &whole);
+                if let Some(why) = self.access.no_commands {
+                    self.app.node.health().dropped("command without the right");
+                    return Some(refused(&whole, "dashboard", why));
+                }
+                if let Err(problem) = checked {
+                    self.app.node.health().dropped(problem.reason());
+                    self.app.log(
+                        Level::Warn,
+                        &format!("{whole}: refused here: {}", problem.sentence()),
+                    );
+                    return Some(refused(&whole, "dashboard", problem.sentence()));
+                }
+                let Some(parsed) = parse(&command, argument) else {
+                    return Some(refused(&whole, "dashboard", "there is no such command"));
+                };
+                self.carry_out(whole, parsed);
+                None
+            }
+        }
+    }
+
+    fn carry_out(&self, whole: String, command: ControllerCommand) {
+        let (app, replies) = (Arc::clone(&self.app), self.replies.clone());
+        tokio::spawn(async move {
+            let reply = app.node.command(topic::COMMAND, &[], &command).await;
+            let (accepted, reason) = match reply {
+                Ok(reply) => (reply.accepted, reply.reason),
+                Err(problem) => (false, format!("{problem:#}")),
+            };
+            app.node.health().count("commands");
+            let (verdict, level) =
+                if accepted { ("accepted", Level::Info) } else { ("refused", Level::Warn) };
+            tracing::info!(command = whole, verdict, reason, "A browser's command");
+            app.log(level, &format!("operator: {whole}: {verdict} by the controller: {reason}"));
+            let text = reply_json(&whole, accepted, "controller", &reason);
+            // The browser may have gone.
+            drop(replies.send(text).await);
+        });
+    }
+}
+
+/// A command with its argument, as it is compared and shown.
+fn whole(command: &str, argument: Option<&str>) -> String {
+    match argument {
+        Some(argument) => format!("{command} {argument}"),
+        None => command.to_owned(),
+    }
+}
+
+fn refused(command: &str, who: &str, why: &str) -> Utf8Bytes {
+    reply_json(command, false, who, why)
+}
+
+fn reply_json(command: &str, accepted: bool, who: &str, why: &str) -> Utf8Bytes {
+    let reply = json!({ "kind": "reply", "command": command, "accepted": accepted, "who": who, "why": why });
+    reply.to_string().into()
+}
+
+/// The controller's command.
+fn parse(command: &str, argument: Option<String>) -> Option<ControllerCommand> {
+    Some(match (command, argument) {
+        ("start", None) => ControllerCommand::Start,
+        ("hold", None) => ControllerCommand::Hold,
+        ("resume", None) => ControllerCommand::Resume,
+        ("abort", None) => ControllerCommand::Abort,
+        ("use-detector", Some(name)) if node::config::is_name(&name) => {
+            ControllerCommand::UseDetector(name)
+        }
+        ("prefer", Some(place)) if place == Place::Onboard.name() => {
+            ControllerCommand::PreferDetectors(Place::Onboard)
+        }
+        ("prefer", Some(place)) if place == Place::Ground.name() => {
+            ControllerCommand::PreferDetectors(Place::Ground)
+        }
+        _ => return None,
+    })
+}

@@ -1,0 +1,150 @@
+//! The service: follows the topics, and serves the page.
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use anyhow::Context;
+use messages::topic;
+use node::{Node, Shutdown, clock_name, now_ns};
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::time::{MissedTickBehavior, interval};
+
+use crate::config::Config;
+use crate::server::{App, Texts, serve};
+use crate::state::{Input, State};
+use crate::video::Video;
+
+/// Period of what changes with each frame.
+const NOW_PERIOD: Duration = Duration::from_millis(100);
+/// Period of what changes slowly, and of the round trips.
+const SLOW_PERIOD: Duration = Duration::from_secs(1);
+/// Longest wait for the reply of a service.
+const ROUND_TRIP_TIMEOUT: Duration = Duration::from_millis(1000);
+
+const CLOSED: &str = "the network session was closed";
+
+/// Serves the page until shutdown.
+///
+/// # Errors
+/// When another dashboard has this name, the address is taken, or the network session cannot be used.
+pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
+    node.claim_unique_name(&config.id).await?;
+    let address: SocketAddr = config.listen.parse().context("`listen`")?;
+    let listener = TcpListener::bind(address).await.with_context(|| {
+        format!("listening at {address} for browsers; another program has the port, or the address is of another machine: choose another with `--set listen=IP:PORT`")
+    })?;
+    let state = Arc::new(Mutex::new(State::new(clock_name())));
+    let texts = Texts::default();
+    let shown = Arc::new(watch::Sender::new(None));
+    let video =
+        Video::new(node.clone(), config.video.clone(), Arc::clone(&state), Arc::clone(&shown));
+    let address = listener.local_addr().context("the address of the page")?;
+    let app = App::new(node.clone(), &config, address, Arc::clone(&state), texts.clone(), shown)?;
+    node.announce().await?;
+    tracing::info!("The page is at http://{address}/");
+    if !address.ip().is_loopback() {
+        tracing::warn!(
+            "The page is open to the network, for holders of a token, and is not encrypted"
+        );
+    }
+    tokio::select! {
+        result = follow(&node, &state) => result,
+        result = tell(&state, &texts) => result,
+        result = measure(&node, &state) => result,
+        result = video.run() => result,
+        result = serve(listener, app) => result,
+        () = shutdown.requested() => Ok(()),
+    }
+}
+
+// What is known is whole after each message, also when a thread panics.
+fn lock(state: &Mutex<State>) -> MutexGuard<'_, State> {
+    state.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Takes the messages of all topics that the page shows.
+async fn follow(node: &Node, state: &Mutex<State>) -> anyhow::Result<()> {
+    let statuses = node.subscriber(topic::STATUS, &[]).await?;
+    let targets = node.subscriber(topic::TARGET, &[]).await?;
+    let vehicles = node.subscriber(topic::VEHICLE_STATE, &[]).await?;
+    let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
+    let detectors = node.subscriber(topic::DETECTOR_INFO, &[]).await?;
+    let cameras = node.subscriber(topic::CAMERA_INFO, &[]).await?;
+    let healths = node.subscriber(topic::HEALTH, &[]).await?;
+    let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
+    loop {
+        let input = tokio::select! {
+            it = statuses.next() => Input::Status(Box::new(it.context(CLOSED)?)),
+            it = targets.next() => Input::Target(Box::new(it.context(CLOSED)?)),
+            it = vehicles.next() => Input::Vehicle(Box::new(it.context(CLOSED)?)),
+            it = detections.next_with_key() => {
+                let (key, told) = it.context(CLOSED)?;
+                Input::Detections(name(topic::DETECTIONS.first_name(&key)), Box::new(told))
+            }
+            it = detectors.next_with_key() => {
+                let (key, info) = it.context(CLOSED)?;
+                Input::Detector(name(topic::DETECTOR_INFO.first_name(&key)), Box::new(info))
+            }
+            it = cameras.next_with_key() => {
+                let (key, info) = it.context(CLOSED)?;
+                Input::Camera(name(topic::CAMERA_INFO.first_name(&key)), Box::new(info))
+            }
+            it = healths.next_with_key() => {
+                let (key, health) = it.context(CLOSED)?;
+                let instance = key.rsplit('/').next().unwrap_or_default().to_owned();
+                Input::Health(name(topic::HEALTH.first_name(&key)), instance, Box::new(health))
+            }
+            it = recorders.next_with_key() => {
+                let (key, status) = it.context(CLOSED)?;
+                Input::Recorder(name(topic::RECORDER_STATUS.first_name(&key)), Box::new(status))
+            }
+        };
+        lock(state).take(now_ns(), input);
+    }
+}
+
+fn name(name: Option<&str>) -> String {
+    name.unwrap_or_default().to_owned()
+}
+
+/// Makes the texts for all browsers.
+async fn tell(state: &Mutex<State>, texts: &Texts) -> anyhow::Result<()> {
+    let mut now = interval(NOW_PERIOD);
+    now.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut slow = interval(SLOW_PERIOD);
+    slow.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut version = None;
+    loop {
+        tokio::select! {
+            _ = now.tick() => {
+                let state = lock(state);
+                texts.now.send_replace(state.now(now_ns()).to_string().into());
+                if version.replace(state.log.version()) != Some(state.log.version()) {
+                    texts.log.send_replace(state.log_json(now_ns()).to_string().into());
+                }
+            }
+            _ = slow.tick() => {
+                let mut state = lock(state);
+                state.every_second(now_ns());
+                texts.slow.send_replace(state.slow(now_ns()).to_string().into());
+            }
+        }
+    }
+}
+
+/// Measures how long a query to each service and its reply take.
+async fn measure(node: &Node, state: &Mutex<State>) -> anyhow::Result<()> {
+    let mut due = interval(SLOW_PERIOD);
+    due.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        due.tick().await;
+        let heard = lock(state).heard();
+        for (service, instance) in heard {
+            let took = node.round_trip(&service, &instance, ROUND_TRIP_TIMEOUT).await;
+            let took_ms = took.map(|took| took.as_secs_f64() * 1e3);
+            lock(state).round_trip(now_ns(), &service, &instance, took_ms);
+        }
+    }
+}

@@ -1,0 +1,283 @@
+//! Tokens, which are stored as hashes only, and the sessions of browsers that have shown one.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::io::Write;
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use anyhow::{Context, ensure};
+use sha2::{Digest, Sha256};
+
+/// Random bytes of a token and of a session.
+const RANDOM_BYTES: usize = 32;
+/// Maximum number of tokens in a file; the oldest goes.
+const MAX_TOKENS: usize = 64;
+/// Maximum size of the file, in bytes.
+const MAX_FILE_BYTES: u64 = 65_536;
+/// Maximum number of sessions; the one that ends first goes.
+const MAX_SESSIONS: usize = 64;
+/// Duration of a session, in seconds.
+pub const SESSION_S: u64 = 12 * 3600;
+
+/// What a token is for.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// To look.
+    Monitor,
+    /// To command.
+    Command,
+}
+
+impl FromStr for Kind {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "monitor" => Ok(Self::Monitor),
+            "command" => Ok(Self::Command),
+            _ => Err(format!("`{text}` is none of `monitor`, `command`")),
+        }
+    }
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Monitor => "monitor",
+            Self::Command => "command",
+        })
+    }
+}
+
+/// A secret that cannot be guessed, as text.
+///
+/// # Errors
+/// When the system has no random numbers.
+pub fn secret() -> anyhow::Result<String> {
+    let mut bytes = [0; RANDOM_BYTES];
+    getrandom::fill(&mut bytes).context("asking the system for random numbers")?;
+    Ok(hex(&bytes))
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// The hash of a secret. One round is enough, as nobody guesses 256 random bits.
+fn hash(secret: &str) -> String {
+    hex(&Sha256::digest(secret.as_bytes()))
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Token {
+    kind: Kind,
+    hash: String,
+    /// In seconds since 1970.
+    expires_s: u64,
+}
+
+/// The tokens of a file.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Tokens {
+    tokens: Vec<Token>,
+}
+
+impl Tokens {
+    /// Reads a file; there are none before it exists.
+    ///
+    /// # Errors
+    /// When others may read it, or it is damaged.
+    pub fn read(path: &Path) -> anyhow::Result<Self> {
+        let file = match std::fs::metadata(path) {
+            Ok(file) => file,
+            Err(cause) if cause.kind() == std::io::ErrorKind::NotFound => {
+                return Ok(Self::default());
+            }
+            Err(cause) => return Err(cause).with_context(|| format!("reading {path:?}")),
+        };
+        let mode = file.permissions().mode() & 0o777;
+        ensure!(
+            mode & 0o077 == 0,
+            "the tokens {path:?} are open to other users (mode {mode:o}): remove the file, and make new tokens"
+        );
+        ensure!(file.len() <= MAX_FILE_BYTES, "{path:?} is larger than {MAX_FILE_BYTES} bytes");
+        let text = std::fs::read_to_string(path).with_context(|| format!("reading {path:?}"))?;
+        text.parse().map_err(anyhow::Error::msg).with_context(|| format!("reading {path:?}"))
+    }
+
+    /// Writes them to a file that only its owner reads, at once: nobody reads half of it.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write(&self, path: &Path) -> anyhow::Result<()> {
+        let folder = path.parent().filter(|folder| *folder != Path::new(""));
+        if let Some(folder) = folder {
+            let mut builder = std::fs::DirBuilder::new();
+            builder.recursive(true).mode(0o700);
+            builder.create(folder).with_context(|| format!("making the directory {folder:?}"))?;
+        }
+        let new = path.with_extension(format!("new-{}", std::process::id()));
+        let mut options = std::fs::OpenOptions::new();
+        let mut file = options
+            .write(true)
+            .create_new(true)
+            .mode(0o600)
+            .open(&new)
+            .with_context(|| format!("making {new:?}"))?;
+        let written = file.write_all(self.to_string().as_bytes());
+        written
+            .and_then(|()| std::fs::rename(&new, path))
+            .with_context(|| format!("writing {path:?}"))
+    }
+
+    /// Adds a token until a time in seconds since 1970, and forgets those that have expired.
+    pub fn add(&mut self, secret: &str, kind: Kind, now_s: u64, expires_s: u64) {
+        self.tokens.retain(|token| token.expires_s > now_s);
+        let surplus = (self.tokens.len() + 1).saturating_sub(MAX_TOKENS);
+        self.tokens.drain(..surplus);
+        self.tokens.push(Token { kind, hash: hash(secret), expires_s });
+    }
+
+    /// What a secret is a token for; `None` for one that is wrong or has expired.
+    pub fn kind(&self, secret: &str, now_s: u64) -> Option<Kind> {
+        let hash = hash(secret.trim());
+        // Comparing hashes tells nothing of the secret by its duration.
+        let token = self.tokens.iter().find(|token| token.hash == hash);
+        token.filter(|token| token.expires_s > now_s).map(|token| token.kind)
+    }
+}
+
+impl fmt::Display for Tokens {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "# Tokens of the dashboard: kind, SHA-256, end in seconds since 1970. Remove a line to end one."
+        )?;
+        let mut tokens = self.tokens.iter();
+        tokens.try_for_each(|t| writeln!(f, "{} {} {}", t.kind, t.hash, t.expires_s))
+    }
+}
+
+impl FromStr for Tokens {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let mut tokens = Vec::new();
+        let lines = text.lines().map(str::trim).filter(|l| !l.is_empty() && !l.starts_with('#'));
+        for line in lines.take(MAX_TOKENS) {
+            let parts: Vec<&str> = line.split_whitespace().collect();
+            let [kind, hash, expires_s] = parts[..] else {
+                return Err("a line is not KIND HASH END".to_owned());
+            };
+            let expires_s = expires_s.parse().map_err(|_| "an end is no number".to_owned())?;
+            tokens.push(Token { kind: kind.parse()?, hash: hash.to_owned(), expires_s });
+        }
+        Ok(Self { tokens })
+    }
+}
+
+/// The usual file: in the user's state folder (`XDG_STATE_HOME`, or .local/state at home).
+///
+/// # Errors
+/// When the environment names neither.
+pub fn usual_file() -> anyhow::Result<PathBuf> {
+    let named = |variable| std::env::var_os(variable).map(PathBuf::from);
+    let state = named("XDG_STATE_HOME").filter(|path| path.is_absolute());
+    let state = state.or_else(|| named("HOME").map(|home| home.join(".local").join("state")));
+    let state = state.context("neither XDG_STATE_HOME nor HOME is set; set `tokens` in the configuration of the dashboard")?;
+    Ok(state.join("alight").join("dashboard-tokens"))
+}
+
+/// Browsers that have shown a token, in memory only. They are known by the hash of their cookie.
+#[derive(Clone, Debug, Default)]
+pub struct Sessions {
+    by_hash: BTreeMap<String, Session>,
+}
+
+#[derive(Clone, Debug)]
+struct Session {
+    kind: Kind,
+    expires_s: u64,
+}
+
+impl Sessions {
+    /// Begins a session with this cookie.
+    pub fn begin(&mut self, cookie: &str, kind: Kind, now_s: u64) {
+        self.by_hash.retain(|_, session| session.expires_s > now_s);
+        if self.by_hash.len() >= MAX_SESSIONS {
+            let first = self.by_hash.iter().min_by_key(|(_, session)| session.expires_s);
+            let first = first.map(|(hash, _)| hash.clone());
+            first.and_then(|hash| self.by_hash.remove(&hash));
+        }
+        self.by_hash.insert(hash(cookie), Session { kind, expires_s: now_s + SESSION_S });
+    }
+
+    /// The kind of the session of a cookie, while it lasts.
+    pub fn kind(&self, cookie: &str, now_s: u64) -> Option<Kind> {
+        let session = self.by_hash.get(&hash(cookie))?;
+        (session.expires_s > now_s).then_some(session.kind)
+    }
+
+    /// Ends a session.
+    pub fn end(&mut self, cookie: &str) {
+        self.by_hash.remove(&hash(cookie));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_token_is_kept_as_a_hash_and_expires() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("state/tokens");
+        assert_eq!(Tokens::read(&path).unwrap(), Tokens::default());
+        let [look, fly] = [secret().unwrap(), secret().unwrap()];
+        assert_ne!(look, fly);
+        let mut tokens = Tokens::default();
+        tokens.add(&look, Kind::Monitor, 10, 20);
+        tokens.add(&fly, Kind::Command, 10, 30);
+        tokens.write(&path).unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(!text.contains(&look) && !text.contains(&fly), "{text}");
+        let read = Tokens::read(&path).unwrap();
+        assert_eq!(read, tokens);
+        assert_eq!(read.kind(&look, 19), Some(Kind::Monitor));
+        assert_eq!(read.kind(&format!("{fly}\n"), 19), Some(Kind::Command));
+        assert_eq!(read.kind(&look, 20), None);
+        assert_eq!(read.kind("wrong", 10), None);
+        assert_eq!(read.kind("", 10), None);
+        tokens.write(&path).unwrap();
+    }
+
+    #[test]
+    fn a_file_that_others_read_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens");
+        Tokens::default().write(&path).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).unwrap();
+        assert!(Tokens::read(&path).unwrap_err().to_string().contains("other users"));
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
+        std::fs::write(&path, "monitor only\n").unwrap();
+        assert!(Tokens::read(&path).is_err());
+    }
+
+    #[test]
+    fn sessions_end_and_are_bounded() {
+        let mut sessions = Sessions::default();
+        sessions.begin("a", Kind::Monitor, 0);
+        assert_eq!(sessions.kind("a", SESSION_S - 1), Some(Kind::Monitor));
+        assert_eq!(sessions.kind("a", SESSION_S), None);
+        assert_eq!(sessions.kind("b", 0), None);
+        for number in 0..200 {
+            sessions.begin(&number.to_string(), Kind::Command, number);
+        }
+        assert_eq!(sessions.by_hash.len(), MAX_SESSIONS);
+        assert_eq!(sessions.kind("199", 200), Some(Kind::Command));
+        sessions.end("199");
+        assert_eq!(sessions.kind("199", 200), None);
+    }
+}

@@ -1,0 +1,243 @@
+//! Pictures for the browsers that look, and for nobody else.
+
+use std::borrow::Cow;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use airlink::picture::jpeg;
+use anyhow::Context;
+use axum::body::Bytes;
+use messages::{Detection, Detections, FrameHeader, topic};
+use node::{Frame, Node, now_ns};
+use serde_json::{Value, json};
+use tokio::sync::watch;
+use tokio::time::{Instant, interval, sleep, sleep_until};
+
+use crate::config::{Input, VideoConfig};
+use crate::pairing::{Pairing, Picture};
+use crate::state::State;
+
+/// Period in which somebody who begins to look is noticed.
+const LOOK_PERIOD: Duration = Duration::from_millis(100);
+/// Frames are received for this time after the last browser has gone: one that loads the page again needs no new start.
+const LINGER: Duration = Duration::from_secs(2);
+/// Share of the period of pictures by which a frame may be early, as frames come unevenly.
+const MAX_EARLY: f64 = 0.3;
+/// Maximum size of a picture, in bytes.
+const MAX_BYTES: usize = 16_000_000;
+/// Maximum number of markers that are drawn.
+const MAX_MARKERS: usize = 32;
+
+/// A picture as browsers get it.
+#[derive(Clone, Debug)]
+pub(crate) struct Shown {
+    /// Its number since the start of this process.
+    pub(crate) number: u64,
+    /// The length of the header (4 bytes, lowest first), the header as JSON, the JPEG files.
+    pub(crate) message: Bytes,
+}
+
+/// Makes pictures while somebody looks.
+pub(crate) struct Video {
+    node: Node,
+    config: VideoConfig,
+    state: Arc<Mutex<State>>,
+    shown: Arc<watch::Sender<Option<Shown>>>,
+    number: u64,
+}
+
+impl Video {
+    pub(crate) fn new(
+        node: Node,
+        config: VideoConfig,
+        state: Arc<Mutex<State>>,
+        shown: Arc<watch::Sender<Option<Shown>>>,
+    ) -> Self {
+        Self { node, config, state, shown, number: 0 }
+    }
+
+    /// Makes pictures until the session is closed.
+    pub(crate) async fn run(mut self) -> anyhow::Result<()> {
+        let input = self.config.input.parse::<Input>().map_err(anyhow::Error::msg)?;
+        let topic = match input {
+            Input::Frames => topic::FRAME,
+            Input::Jpeg => topic::JPEG,
+            Input::None => return std::future::pending().await,
+        };
+        loop {
+            while self.shown.receiver_count() == 0 {
+                sleep(LOOK_PERIOD).await;
+            }
+            self.while_watched(topic).await?;
+            self.shown.send_replace(None);
+        }
+    }
+
+    async fn while_watched(&mut self, topic: messages::Topic<FrameHeader>) -> anyhow::Result<()> {
+        let frames = self.node.frame_subscriber(topic, &[]).await?;
+        let told = self.node.subscriber(topic::DETECTIONS, &[]).await?;
+        let mut pairing = Pairing::new(i64::from(self.config.hold_ms) * 1_000_000);
+        let min_period_ns = ((1.0 - MAX_EARLY) * 1e9 / self.config.max_hz) as i64;
+        let mut last_ns = None;
+        let mut look = interval(LOOK_PERIOD);
+        let mut watched = Instant::now();
+        loop {
+            let wait_ns = pairing.deadline_ns().map(|at_ns| at_ns.saturating_sub(now_ns()).max(0));
+            let due = wait_ns.map(|ns| Instant::now() + Duration::from_nanos(ns.cast_unsigned()));
+            tokio::select! {
+                frame = frames.next() => {
+                    let frame = frame.context("the network session was closed")?;
+                    let is_due = last_ns.is_none_or(|last_ns| now_ns() - last_ns >= min_period_ns);
+                    if is_due && self.is_wanted(&frame.header) {
+                        last_ns = Some(now_ns());
+                        self.add(frame, &mut pairing).await?;
+                    }
+                }
+                told = told.next_with_key() => {
+                    let (key, told) = told.context("the network session was closed")?;
+                    // A detector is known by its key.
+                    let detector = topic::DETECTIONS.first_name(&key).unwrap_or_default().to_owned();
+                    pairing.detections(Detections { detector, ..told });
+                }
+                () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {}
+                _ = look.tick() => {
+                    if self.shown.receiver_count() > 0 {
+                        watched = Instant::now();
+                    } else if watched.elapsed() > LINGER {
+                        return Ok(());
+                    }
+                }
+            }
+            let in_use = self.lock().in_use().map(str::to_owned);
+            while let Some(picture) = pairing.ready(now_ns(), in_use.as_deref()) {
+                self.show(&picture);
+            }
+        }
+    }
+
+    /// Of several cameras that of the detector in use is shown.
+    fn is_wanted(&self, header: &FrameHeader) -> bool {
+        self.lock().camera().is_none_or(|camera| camera == header.camera)
+    }
+
+    /// Makes the picture of a frame, on a thread for such work.
+    async fn add(&self, frame: Frame, pairing: &mut Pairing) -> anyhow::Result<()> {
+        let began = Instant::now();
+        let quality = self.config.jpeg_quality;
+        let make = move || {
+            let files = files(&frame.header, &frame.bytes(), quality);
+            (frame.header, files)
+        };
+        let (header, files) = tokio::task::spawn_blocking(make).await?;
+        match files.filter(|files| files.len() <= MAX_BYTES) {
+            Some(files) => {
+                self.node.health().latency("picture", began.elapsed());
+                if pairing.picture(now_ns(), header, files) {
+                    self.node.health().dropped("too many pictures wait");
+                }
+            }
+            None => {
+                if self.node.health().failed("no picture of a frame") {
+                    tracing::warn!(
+                        ?header,
+                        "A frame cannot be shown: it is no whole grey or Bayer image"
+                    );
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn show(&mut self, picture: &Picture) {
+        self.number += 1;
+        let header = header_json(self.number, picture, node::clock_name()).to_string();
+        let mut message = Vec::with_capacity(4 + header.len() + picture.files.len());
+        message.extend_from_slice(&(header.len() as u32).to_le_bytes());
+        message.extend_from_slice(header.as_bytes());
+        message.extend_from_slice(&picture.files);
+        self.node.health().count("pictures");
+        if picture.found.is_none() {
+            self.node.health().dropped("picture without detections in time");
+        }
+        self.shown.send_replace(Some(Shown { number: self.number, message: message.into() }));
+    }
+
+    // What is known is whole after each message, also when a thread panics.
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The JPEG files of a frame: those that came, or one that is made; `None` when they do not match the header.
+fn files(header: &FrameHeader, bytes: &Cow<'_, [u8]>, quality: u8) -> Option<Vec<u8>> {
+    let told: u64 = header.parts.iter().map(|part| u64::from(part.bytes)).sum();
+    let is_whole = header.parts.is_empty() || told == bytes.len() as u64;
+    is_whole.then(|| jpeg(header, bytes, quality)).flatten()
+}
+
+fn header_json(number: u64, picture: &Picture, clock: &str) -> Value {
+    let header = &picture.header;
+    let parts: Vec<Value> = header
+        .parts
+        .iter()
+        .map(|it| {
+            json!({ "x": it.x, "y": it.y, "width": it.width, "height": it.height, "scale": it.scale, "bytes": it.bytes })
+        })
+        .collect();
+    // Of another host's clock only the arrival can be compared with ours.
+    let taken_ns = if header.clock == clock { header.stamp_ns } else { picture.received_ns };
+    let found = picture.found.as_ref();
+    json!({
+        "number": number,
+        "camera": header.camera, "sequence": header.sequence, "stamp_ns": header.stamp_ns.to_string(),
+        "taken_ms": taken_ns as f64 * 1e-6, "shown_ms": now_ns() as f64 * 1e-6,
+        "width": header.width, "height": header.height, "parts": parts,
+        "detector": found.map(|it| &it.detector), "is_used": picture.is_used,
+        "found_sequence": found.map(|it| it.header.sequence),
+        "markers": found.map(|it| it.detections.iter().take(MAX_MARKERS).map(marker).collect::<Vec<_>>()),
+    })
+}
+
+fn marker(it: &Detection) -> Value {
+    let distance_m = it.pose.map(|pose| {
+        let [x, y, z] = pose.camera_from_marker.translation_m;
+        (x * x + y * y + z * z).sqrt()
+    });
+    let name = it.id.map_or_else(|| it.family.clone(), |id| format!("{}:{id}", it.family));
+    json!({
+        "name": name, "centre": it.centre_px, "covariance": it.centre_covariance_px2, "corners": it.corners_px,
+        "size": it.size_px, "confidence": it.confidence, "distance_m": distance_m,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use messages::FramePart;
+
+    #[test]
+    fn parts_that_do_not_match_their_bytes_are_no_picture() {
+        let part = FramePart { x: 0, y: 0, width: 8, height: 8, scale: 1, bytes: 5 };
+        let format = messages::PixelFormat::Jpeg;
+        let header = FrameHeader { parts: vec![part], format, ..FrameHeader::sample() };
+        assert!(files(&header, &Cow::Borrowed(&[0; 5]), 80).is_some());
+        assert!(files(&header, &Cow::Borrowed(&[0; 6]), 80).is_none());
+    }
+
+    #[test]
+    fn the_header_has_the_frame_and_what_was_found_in_it() {
+        let picture = Picture {
+            header: FrameHeader { sequence: 7, stamp_ns: 2_000_000, ..FrameHeader::sample() },
+            files: Arc::default(),
+            received_ns: 5_000_000,
+            found: Some(Detections::sample()),
+            is_used: true,
+        };
+        let json = header_json(3, &picture, "clock");
+        assert_eq!((&json["sequence"], &json["taken_ms"]), (&json!(7), &json!(2.0)));
+        assert_eq!(json["markers"][0]["centre"], json!([720.0, 522.0]));
+        assert_eq!(header_json(3, &picture, "another")["taken_ms"], 5.0);
+        let bare = header_json(3, &Picture { found: None, ..picture }, "clock");
+        assert_eq!(bare["markers"], Value::Null);
+    }
+}

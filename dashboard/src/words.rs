@@ -1,0 +1,75 @@
+//! Phases, states and places in words for an operator.
+
+use messages::{DetectorState, LandedState, Phase};
+
+/// A phase as an operator reads it.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Words {
+    /// What the vehicle does.
+    pub title: &'static str,
+    /// What changes it.
+    pub next: &'static str,
+    /// How it is shown: `calm`, `busy`, `good`, `warn` or `bad`.
+    pub mood: &'static str,
+}
+
+/// A phase in words.
+pub fn phase(phase: Phase) -> Words {
+    let (title, next, mood) = match phase {
+        Phase::Idle => ("Waiting", "An operator's start begins the landing.", "calm"),
+        Phase::Takeoff => ("Taking off", "The search begins at the take-off height.", "busy"),
+        Phase::Search => (
+            "Searching for the marker",
+            "The first detections of the marker end the search.",
+            "busy",
+        ),
+        Phase::Approach => (
+            "Flying above the marker",
+            "The descent begins once the vehicle is over the marker.",
+            "busy",
+        ),
+        Phase::Descend => (
+            "Descending",
+            "Close to the ground the autopilot takes over; without the marker it stops and climbs.",
+            "busy",
+        ),
+        Phase::Retry => (
+            "Climbing for another attempt",
+            "Seeing the marker again begins the next approach.",
+            "warn",
+        ),
+        Phase::Final => ("Touching down", "The autopilot stops the motors on the ground.", "busy"),
+        Phase::Landed => ("Landed", "Only a new start does anything further.", "good"),
+        Phase::Hold => (
+            "Holding the position",
+            "Resume goes on, unless the reason still holds; abort ends the landing.",
+            "warn",
+        ),
+        Phase::Aborted => ("Aborted", "The pilot or a new start takes the vehicle on.", "bad"),
+        Phase::PilotInCommand => {
+            ("The pilot flies", "Nothing is sent to the vehicle until a new start.", "warn")
+        }
+        Phase::Failed => ("Failed", "Nothing is sent any more; the pilot must take over.", "bad"),
+    };
+    Words { title, next, mood }
+}
+
+/// Whether a detector is used.
+pub fn detector(state: DetectorState) -> &'static str {
+    match state {
+        DetectorState::Active => "in use",
+        DetectorState::Shadow => "standby",
+        DetectorState::Stale => "silent or late",
+    }
+}
+
+/// Contact with the ground.
+pub fn landed(state: LandedState) -> &'static str {
+    match state {
+        LandedState::Unknown => "not told",
+        LandedState::OnGround => "on the ground",
+        LandedState::TakingOff => "taking off",
+        LandedState::InAir => "in the air",
+        LandedState::Landing => "landing",
+    }
+}

@@ -1,0 +1,433 @@
+//! The page's server, asked by programs that are no browser, with a controller and a camera that are made up here.
+
+use std::net::{IpAddr, SocketAddr, UdpSocket};
+use std::time::Duration;
+
+use anyhow::{Context, bail, ensure};
+use dashboard::Config;
+use dashboard::tokens::{Kind, Tokens, secret};
+use futures_util::{SinkExt, StreamExt};
+use messages::{
+    CommandReply, ControllerCommand, ControllerStatus, Detections, FrameHeader, Phase, PixelFormat,
+    topic,
+};
+use node::{Identity, Layers, Node, Shutdown, ZenohSource};
+use serde_json::{Value, json};
+use testing::ports;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::task::JoinHandle;
+use tokio::time::{sleep, timeout};
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::http::{HeaderValue, Request};
+use tokio_tungstenite::tungstenite::{Error, Message};
+use tokio_tungstenite::{WebSocketStream, client_async};
+
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Longer than a button is held.
+const HELD: Duration = Duration::from_millis(1050);
+
+type Socket = WebSocketStream<TcpStream>;
+
+/// A dashboard with its network.
+struct Page {
+    meet: u16,
+    address: SocketAddr,
+    node: Node,
+    task: JoinHandle<anyhow::Result<()>>,
+}
+
+impl Page {
+    async fn start(set: &[&str]) -> anyhow::Result<Self> {
+        Self::start_at("127.0.0.1", set).await
+    }
+
+    async fn start_at(host: &str, set: &[&str]) -> anyhow::Result<Self> {
+        let ([meet, port], _, _) = ports::free()?;
+        let listen = format!("listen={host}:{port}");
+        let set = [listen.as_str()].iter().chain(set).map(|text| (*text).to_owned()).collect();
+        let config = Layers { file: None, set }.load::<Config>()?.settings;
+        let node = open("dashboard", meet).await?;
+        let shutdown = Shutdown::on_signals()?;
+        let task = tokio::spawn(dashboard::run(node.clone(), config, shutdown));
+        let address = SocketAddr::new("127.0.0.1".parse()?, port);
+        let reached = timeout(PATIENCE, async {
+            while TcpStream::connect(address).await.is_err() {
+                sleep(Duration::from_millis(20)).await;
+            }
+        });
+        reached.await.context("the page does not listen")?;
+        Ok(Self { meet, address, node, task })
+    }
+
+    /// What was refused for this reason.
+    fn refused(&self, reason: &str) -> u64 {
+        let drops = self.node.health().report(self.node.identity(), 0).drops;
+        drops.iter().find(|it| it.reason == reason).map_or(0, |it| it.count)
+    }
+
+    async fn socket(&self, path: &str) -> anyhow::Result<Socket> {
+        let request = self.request(self.address, path)?;
+        Ok(connected(self.address, request).await?)
+    }
+
+    fn request(&self, address: SocketAddr, path: &str) -> anyhow::Result<Request<()>> {
+        let mut request = format!("ws://{address}{path}").into_client_request()?;
+        let origin = HeaderValue::from_str(&format!("http://{address}"))?;
+        request.headers_mut().insert("origin", origin);
+        Ok(request)
+    }
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+async fn open(service: &'static str, meet: u16) -> anyhow::Result<Node> {
+    let source = ZenohSource::Text(node::session::local_config(meet));
+    Node::open(Identity { service, instance: "main".into() }, &source).await
+}
+
+async fn connected(address: SocketAddr, request: Request<()>) -> Result<Socket, Error> {
+    let stream = TcpStream::connect(address).await.map_err(Error::Io)?;
+    Ok(client_async(request, stream).await?.0)
+}
+
+/// The status with which a WebSocket is refused.
+async fn refusal(address: SocketAddr, request: Request<()>) -> anyhow::Result<u16> {
+    match connected(address, request).await {
+        Err(Error::Http(response)) => Ok(response.status().as_u16()),
+        Err(problem) => Err(problem.into()),
+        Ok(_) => bail!("it was not refused"),
+    }
+}
+
+/// An answer to a plain request: status line, headers, body.
+async fn ask(address: SocketAddr, request: &str) -> anyhow::Result<String> {
+    let mut stream = TcpStream::connect(address).await?;
+    stream.write_all(request.as_bytes()).await?;
+    let mut answer = Vec::new();
+    timeout(PATIENCE, stream.read_to_end(&mut answer)).await??;
+    Ok(String::from_utf8_lossy(&answer).into_owned())
+}
+
+fn get(path: &str, host: &str, more: &str) -> String {
+    format!("GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n{more}\r\n")
+}
+
+async fn next(socket: &mut Socket) -> anyhow::Result<Message> {
+    Ok(timeout(PATIENCE, socket.next()).await?.context("the connection was closed")??)
+}
+
+/// The next message for which something holds.
+async fn told(socket: &mut Socket, holds: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
+    let found = timeout(PATIENCE, async {
+        loop {
+            if let Message::Text(text) = next(socket).await? {
+                let value: Value = serde_json::from_str(&text)?;
+                if holds(&value) {
+                    return anyhow::Ok(value);
+                }
+            }
+        }
+    });
+    found.await.context("waiting to be told")?
+}
+
+async fn say(socket: &mut Socket, value: Value) -> anyhow::Result<()> {
+    Ok(socket.send(Message::text(value.to_string())).await?)
+}
+
+fn status() -> ControllerStatus {
+    ControllerStatus {
+        phase: Phase::Descend,
+        why: "descending over the marker".into(),
+        active_detector: Some("main".into()),
+        height_m: Some(4.2),
+        ..ControllerStatus::default()
+    }
+}
+
+/// A controller that publishes, and that takes every command but a resume.
+fn controller(node: Node) -> JoinHandle<anyhow::Result<()>> {
+    tokio::spawn(async move {
+        let statuses = node.publisher(topic::STATUS, &[]).await?;
+        let commands = node.commands(topic::COMMAND, &[]).await?;
+        let mut due = tokio::time::interval(Duration::from_millis(50));
+        loop {
+            tokio::select! {
+                _ = due.tick() => statuses.publish(&status()).await,
+                request = commands.next() => {
+                    let request = request.context("closed")?;
+                    let accepted = request.message != ControllerCommand::Resume;
+                    let reason = format!("{:?} was heard", request.message);
+                    request.answer(&CommandReply { accepted, reason }).await;
+                }
+            }
+        }
+    })
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_not_of_the_page_is_refused_and_counted() -> anyhow::Result<()> {
+    let page = Page::start(&["max_clients=2"]).await?;
+    let own = page.address.to_string();
+    let answer = ask(page.address, &get("/", &own, "")).await?.to_lowercase();
+    ensure!(
+        answer.starts_with("http/1.1 200") && answer.contains("<title>alight</title>"),
+        "{answer}"
+    );
+    ensure!(
+        answer.contains("content-security-policy: default-src 'none'; script-src 'self'"),
+        "{answer}"
+    );
+    ensure!(!answer.contains("unsafe-inline") && answer.contains("nosniff"), "{answer}");
+
+    for path in ["/", "/session", "/app.js", "/nothing"] {
+        let answer = ask(page.address, &get(path, "rebound.example", "")).await?;
+        ensure!(answer.starts_with("HTTP/1.1 421") && answer.contains("not served"), "{answer}");
+    }
+    ensure!(page.refused("wrong Host") == 4, "{}", page.refused("wrong Host"));
+    let foreign = "Origin: http://evil.example\r\n";
+    let answer = ask(page.address, &get("/session", &own, foreign)).await?;
+    ensure!(answer.starts_with("HTTP/1.1 403"), "{answer}");
+
+    for path in ["/ws", "/video"] {
+        let mut request = page.request(page.address, path)?;
+        request.headers_mut().insert("origin", HeaderValue::from_static("http://evil.example"));
+        ensure!(refusal(page.address, request).await? == 403, "{path}");
+        let mut request = page.request(page.address, path)?;
+        request.headers_mut().insert("host", HeaderValue::from_static("rebound.example"));
+        ensure!(refusal(page.address, request).await? == 421, "{path}");
+    }
+    ensure!(page.refused("wrong Origin") == 3, "{}", page.refused("wrong Origin"));
+
+    let _two = [page.socket("/ws").await?, page.socket("/ws").await?];
+    let third = refusal(page.address, page.request(page.address, "/ws")?).await?;
+    ensure!(third == 503 && page.refused("too many browsers") == 1, "{third}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_state_is_told_with_its_age() -> anyhow::Result<()> {
+    let page = Page::start(&[]).await?;
+    let controller = controller(open("controller", page.meet).await?);
+    let mut socket = page.socket("/ws").await?;
+    let hello = told(&mut socket, |it| it["kind"] == "hello").await?;
+    ensure!(hello["no_commands"].as_str().is_some_and(|why| why.contains("only shows")), "{hello}");
+    let now = told(&mut socket, |it| it["status"]["phase"] == "descend").await?;
+    ensure!(now["status"]["title"] == "Descending" && now["status"]["height_m"] == 4.2, "{now}");
+    ensure!(now["status"]["age_ms"].as_f64().is_some_and(|age| age < 700.0), "{now}");
+    let is_entry = |it: &Value| it["text"] == "descend: descending over the marker";
+    let has_entry =
+        |it: &Value| it["entries"].as_array().is_some_and(|list| list.iter().any(is_entry));
+    told(&mut socket, has_entry).await?;
+    let slow = told(&mut socket, |it| it["kind"] == "slow").await?;
+    ensure!(slow["checks"].as_array().is_some_and(|list| list.len() > 10), "{slow}");
+    controller.abort();
+    told(&mut socket, |it| it["status"]["age_ms"].as_f64().is_some_and(|age| age > 1500.0)).await?;
+    Ok(())
+}
+
+async fn nonce(socket: &mut Socket, command: &str) -> anyhow::Result<String> {
+    say(socket, json!({ "kind": "nonce", "command": command })).await?;
+    let answer = told(socket, |it| it["kind"] == "nonce").await?;
+    Ok(answer["nonce"].as_str().context("a nonce")?.to_owned())
+}
+
+async fn command(socket: &mut Socket, command: &str, nonce: &str) -> anyhow::Result<Value> {
+    say(socket, json!({ "kind": "command", "command": command, "nonce": nonce })).await?;
+    told(socket, |it| it["kind"] == "reply").await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_command_is_held_for_a_second_and_given_once() -> anyhow::Result<()> {
+    let page = Page::start(&["commands=here"]).await?;
+    let _controller = controller(open("controller", page.meet).await?);
+    let mut socket = page.socket("/ws").await?;
+    told(&mut socket, |it| it["status"]["phase"] == "descend").await?;
+
+    let without = command(&mut socket, "abort", "").await?;
+    ensure!(without["accepted"] == false && without["who"] == "dashboard", "{without}");
+    let first = nonce(&mut socket, "hold").await?;
+    let early = command(&mut socket, "hold", &first).await?;
+    ensure!(early["why"].as_str().is_some_and(|why| why.contains("not held for 1 s")), "{early}");
+    let second = nonce(&mut socket, "hold").await?;
+    sleep(HELD).await;
+    let held = command(&mut socket, "hold", &second).await?;
+    ensure!(held["accepted"] == true && held["who"] == "controller", "{held}");
+    ensure!(held["why"] == "Hold was heard", "{held}");
+    let again = command(&mut socket, "hold", &second).await?;
+    ensure!(again["accepted"] == false && again["who"] == "dashboard", "{again}");
+    // A nonce of another browser is none.
+    let mut other = page.socket("/ws").await?;
+    let foreign = nonce(&mut other, "abort").await?;
+    let third = nonce(&mut socket, "resume").await?;
+    sleep(HELD).await;
+    let swapped = command(&mut socket, "abort", &foreign).await?;
+    ensure!(swapped["accepted"] == false && swapped["who"] == "dashboard", "{swapped}");
+    let spent = command(&mut socket, "resume", &third).await?;
+    ensure!(spent["accepted"] == false, "{spent}");
+    let fourth = nonce(&mut socket, "resume").await?;
+    sleep(HELD).await;
+    let refused = command(&mut socket, "resume", &fourth).await?;
+    ensure!(refused["accepted"] == false && refused["who"] == "controller", "{refused}");
+    let late = nonce(&mut socket, "abort").await?;
+    sleep(Duration::from_millis(3100)).await;
+    let late = command(&mut socket, "abort", &late).await?;
+    ensure!(late["why"].as_str().is_some_and(|why| why.contains("more than 3 s")), "{late}");
+    for (reason, count) in [
+        ("command without a valid nonce", 4),
+        ("command not held for a second", 1),
+        ("late command", 1),
+    ] {
+        ensure!(page.refused(reason) == count, "{reason}: {}", page.refused(reason));
+    }
+    Ok(())
+}
+
+/// A camera and a detector: frames at 20 Hz, each with what was found in it 30 ms later.
+fn camera(node: Node) -> JoinHandle<anyhow::Result<()>> {
+    tokio::spawn(async move {
+        let frames = node.frame_publisher(topic::FRAME, &["down"], 64 * 48).await?;
+        let detections = node.publisher(topic::DETECTIONS, &["main"]).await?;
+        for number in 0.. {
+            let header = FrameHeader {
+                sequence: number,
+                stamp_ns: number as i64 * 50_000_000,
+                width: 64,
+                height: 48,
+                format: PixelFormat::Mono8,
+                ..FrameHeader::sample()
+            };
+            let mut loan = frames.loan(64 * 48);
+            loan.fill(100);
+            frames.publish(&header, loan).await;
+            sleep(Duration::from_millis(30)).await;
+            detections.publish(&Detections { header, ..Detections::sample() }).await;
+            sleep(Duration::from_millis(20)).await;
+        }
+        Ok(())
+    })
+}
+
+/// The header and the file of a picture.
+async fn picture(socket: &mut Socket) -> anyhow::Result<Option<(Value, Vec<u8>)>> {
+    let Ok(message) = timeout(Duration::from_millis(1500), socket.next()).await else {
+        return Ok(None);
+    };
+    let Some(Ok(Message::Binary(bytes))) = message else { bail!("no picture: {message:?}") };
+    let length = u32::from_le_bytes(bytes.get(..4).context("a length")?.try_into()?) as usize;
+    let header = serde_json::from_slice(bytes.get(4..4 + length).context("a header")?)?;
+    Ok(Some((header, bytes[4 + length..].to_vec())))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_pictures_are_on_their_way_at_most_each_with_its_own_detections() -> anyhow::Result<()>
+{
+    let page = Page::start(&["video.max_hz=30"]).await?;
+    let _camera = camera(open("detector", page.meet).await?);
+    let mut socket = page.socket("/video").await?;
+    let mut shown = Vec::new();
+    let first = timeout(PATIENCE, async {
+        loop {
+            if let Some(first) = picture(&mut socket).await? {
+                return anyhow::Ok(first);
+            }
+        }
+    });
+    shown.push(first.await??);
+    while let Some(further) = picture(&mut socket).await? {
+        shown.push(further);
+    }
+    ensure!(shown.len() == 2, "{} pictures without an acknowledgement", shown.len());
+    // A wrong acknowledgement makes no room.
+    socket.send(Message::text("999999")).await?;
+    ensure!(picture(&mut socket).await?.is_none() && page.refused("wrong acknowledgement") == 1);
+    for _ in 0..20 {
+        let number = shown.last().context("a picture")?.0["number"].to_string();
+        socket.send(Message::text(number)).await?;
+        shown.push(picture(&mut socket).await?.context("the next picture")?);
+    }
+    let mut bare = 0;
+    for (header, file) in &shown {
+        ensure!(file.starts_with(&[0xff, 0xd8]), "{header}");
+        bare += usize::from(header["found_sequence"].is_null());
+        let is_own = header["found_sequence"] == header["sequence"];
+        ensure!(is_own || header["found_sequence"].is_null(), "{header}");
+    }
+    ensure!(bare <= 3, "{bare} of {} pictures had no detections", shown.len());
+    let sequence = |at: usize| shown[at].0["sequence"].as_u64().context("a number");
+    // What came meanwhile was left out: the third is much newer than the second.
+    ensure!(sequence(2)? > sequence(1)? + 20, "{} after {}", sequence(2)?, sequence(1)?);
+    Ok(())
+}
+
+/// An address of this machine beside loopback.
+fn outward() -> Option<IpAddr> {
+    let socket = UdpSocket::bind("0.0.0.0:0").ok()?;
+    // Nothing is sent.
+    socket.connect("192.0.2.1:9").ok()?;
+    let address = socket.local_addr().ok()?.ip();
+    (!address.is_loopback() && !address.is_unspecified()).then_some(address)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::Result<()> {
+    let Some(outward) = outward() else {
+        testing::skip("network", "this machine has no address but loopback");
+        return Ok(());
+    };
+    let folder = tempfile::tempdir()?;
+    let file = folder.path().join("tokens");
+    let [good, old] = [secret()?, secret()?];
+    let mut tokens = Tokens::default();
+    tokens.add(&old, Kind::Command, 0, 1);
+    tokens.add(&good, Kind::Command, 0, u64::MAX);
+    tokens.write(&file)?;
+    let named = format!("tokens={:?}", file.display().to_string());
+    let page = Page::start_at("0.0.0.0", &["commands=here", &named]).await?;
+    let from = SocketAddr::new(outward, page.address.port());
+
+    // What the page is made of tells nothing.
+    ensure!(ask(from, &get("/", &from.to_string(), "")).await?.starts_with("HTTP/1.1 200"));
+    for path in ["/ws", "/video"] {
+        ensure!(refusal(from, page.request(from, path)?).await? == 401, "{path}");
+    }
+    let log_in = |token: &str| {
+        let length = token.len();
+        format!(
+            "POST /login HTTP/1.1\r\nHost: {from}\r\nOrigin: http://{from}\r\nConnection: close\r\nContent-Length: {length}\r\n\r\n{token}"
+        )
+    };
+    for wrong in ["", "wrong", old.as_str()] {
+        let answer = ask(from, &log_in(wrong)).await?;
+        ensure!(answer.starts_with("HTTP/1.1 401"), "{answer}");
+    }
+    ensure!(page.refused("no valid token") == 5, "{}", page.refused("no valid token"));
+    let answer = ask(from, &log_in(&good)).await?;
+    let cookie = answer.lines().find_map(|line| line.strip_prefix("set-cookie: "));
+    let cookie = cookie.with_context(|| answer.clone())?;
+    ensure!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Strict"), "{cookie}");
+    let cookie = cookie.split(';').next().context("a cookie")?;
+    let mut foreign = page.request(from, "/ws")?;
+    foreign.headers_mut().insert("cookie", HeaderValue::from_static("alight-80=1; other=2"));
+    ensure!(refusal(from, foreign).await? == 401);
+
+    let mut request = page.request(from, "/ws")?;
+    request.headers_mut().insert("cookie", HeaderValue::from_str(cookie)?);
+    let mut socket = connected(from, request).await?;
+    let hello = told(&mut socket, |it| it["kind"] == "hello").await?;
+    ensure!(
+        hello["no_commands"].as_str().is_some_and(|why| why.contains("not encrypted")),
+        "{hello}"
+    );
+    let held = nonce(&mut socket, "abort").await?;
+    sleep(HELD).await;
+    let refused = command(&mut socket, "abort", &held).await?;
+    ensure!(refused["accepted"] == false && refused["who"] == "dashboard", "{refused}");
+    ensure!(page.refused("command without the right") == 1);
+    Ok(())
+}

@@ -1,0 +1,144 @@
+//! The page of a landing: what it tells, how it looks in a real browser, and that nothing depends on it.
+
+#![expect(
+    clippy::print_stdout,
+    reason = "what a test measured, or why it is skipped, is for people to read"
+)]
+
+mod flight;
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use futures_util::{SinkExt, StreamExt};
+use serde_json::Value;
+use testing::{interpreter, ports, skip, with_second_try};
+use tokio::net::TcpStream;
+use tokio::time::{sleep, timeout};
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::{WebSocketStream, client_async};
+
+use crate::flight::{Landing, ONE_AT_A_TIME, PATIENCE};
+
+/// Exit status of a script that lacks a browser or a package.
+const LACKS: i32 = 77;
+/// Longest time in which a page that is cut off strikes through what it shows, and in which it is connected again.
+const MAX_GREY_S: f64 = 1.0;
+const MAX_BACK_S: f64 = 2.0;
+/// A descent of twenty seconds.
+const SLOWLY: [&str; 2] = ["--set", "controller.metric.max_descend_m_s=0.5"];
+
+async fn socket(page: &str, path: &str) -> anyhow::Result<WebSocketStream<TcpStream>> {
+    let found = timeout(PATIENCE / 4, async {
+        loop {
+            if let Ok(stream) = TcpStream::connect(page).await {
+                return stream;
+            }
+            sleep(Duration::from_millis(50)).await;
+        }
+    });
+    Ok(client_async(format!("ws://{page}{path}"), found.await?).await?.0)
+}
+
+async fn next(socket: &mut WebSocketStream<TcpStream>) -> anyhow::Result<Message> {
+    Ok(timeout(PATIENCE, socket.next()).await?.context("the page closed the connection")??)
+}
+
+fn free_page() -> anyhow::Result<String> {
+    let ([port], _, _) = ports::free()?;
+    Ok(format!("127.0.0.1:{port}"))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_landing_is_shown_and_goes_on_when_the_page_is_killed() -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(async || {
+        let page = free_page()?;
+        let landing = Landing::start(&["--seed", "4", "--dashboard", &page]).await?;
+        let mut data = socket(&page, "/ws").await?;
+        let mut video = socket(&page, "/video").await?;
+        let (mut pictures, mut with_detections) = (0, 0);
+        let descends = |it: &Value| it["status"]["phase"] == "descend" && it["target"]["position_m"].is_array();
+        let mut shown = Value::Null;
+        while pictures < 30 || !descends(&shown) {
+            tokio::select! {
+                message = next(&mut video) => {
+                    let bytes = message?.into_data();
+                    let length = u32::from_le_bytes(bytes.get(..4).context("a length")?.try_into()?) as usize;
+                    let header: Value = serde_json::from_slice(bytes.get(4..4 + length).context("a header")?)?;
+                    let is_told = !header["found_sequence"].is_null();
+                    ensure!(!is_told || header["found_sequence"] == header["sequence"], "{header}");
+                    with_detections += usize::from(is_told);
+                    pictures += 1;
+                    video.send(Message::text(header["number"].to_string())).await?;
+                }
+                message = next(&mut data) => {
+                    let it: Value = serde_json::from_str(message?.to_text()?)?;
+                    if it["kind"] == "now" {
+                        shown = it;
+                    }
+                }
+            }
+        }
+        println!("{with_detections} of {pictures} pictures with their detections; {shown}");
+        ensure!(with_detections * 10 >= pictures * 8, "{with_detections} of {pictures}");
+        landing.kill("dashboard")?;
+        landing.lands().await?;
+        Ok(())
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_browser_shows_a_landing_and_commands_it() -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(in_a_browser).await
+}
+
+async fn in_a_browser() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let pictures = std::env::var_os("ALIGHT_PICTURES").map_or(folder.path().into(), PathBuf::from);
+    let page = free_page()?;
+    let args = [["--seed", "4"], ["--dashboard", &page], SLOWLY].concat();
+    let mut landing = Landing::start(&args).await?;
+    drop(socket(&page, "/ws").await?);
+    let script = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("dashboard/browser.py");
+    let started = std::process::Command::new(interpreter())
+        .arg(script)
+        .arg(format!("http://{page}/"))
+        .arg(pictures)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn();
+    let Ok(mut browser) = started else {
+        skip("browser", "there is no Python");
+        return Ok(());
+    };
+    let mut answers = browser.stdin.take().context("standard input")?;
+    let lines = BufReader::new(browser.stdout.take().context("standard output")?).lines();
+    let mut last = String::new();
+    for line in lines {
+        last = tokio::task::block_in_place(|| line)?;
+        println!("{last}");
+        match last.as_str() {
+            "KILL" => drop(landing.kill("dashboard")?),
+            "START" => drop(landing.start_by_hand("dashboard", &[])?),
+            _ => continue,
+        }
+        writeln!(answers, "done")?;
+    }
+    let status = tokio::task::block_in_place(|| browser.wait())?;
+    if status.code() == Some(LACKS) {
+        skip("browser", last);
+        return Ok(());
+    }
+    ensure!(status.success(), "the browser's script ended with {status}: {last}");
+    let measured: Value = serde_json::from_str(&last)?;
+    let within = |name: &str, max_s: f64| measured[name].as_f64().is_some_and(|it| it <= max_s);
+    ensure!(within("grey_s", MAX_GREY_S) && within("back_s", MAX_BACK_S), "{measured}");
+    landing.lands().await?;
+    Ok(())
+}

@@ -1,0 +1,125 @@
+"""Looks at a landing in a real browser, and commands it: browser.py URL FOLDER
+
+Says `KILL` and `START` when the page's server is to be killed and started again, and waits for a line after each. Prints what
+was measured as JSON on its last line. Exit status 77: no browser, or no package to drive one.
+"""
+
+import json
+import shutil
+import sys
+import time
+from pathlib import Path
+
+try:
+    from playwright.sync_api import sync_playwright
+except ImportError as problem:
+    print(f"no package playwright: {problem}")
+    sys.exit(77)
+
+CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+if CHROMIUM is None:
+    print("no chromium")
+    sys.exit(77)
+
+PATIENCE_S = 60
+URL, FOLDER = sys.argv[1], Path(sys.argv[2])
+
+# How different the picture's pixels are, read from the canvas as it is shown.
+SPREAD = """() => {
+  const copy = document.createElement('canvas');
+  [copy.width, copy.height] = [64, 48];
+  const context = copy.getContext('2d');
+  context.drawImage(document.getElementById('video'), 0, 0, 64, 48);
+  const grey = [...context.getImageData(0, 0, 64, 48).data].filter((_, n) => n % 4 === 0);
+  return Math.max(...grey) - Math.min(...grey);
+}"""
+
+
+def asked(what):
+    print(what, flush=True)
+    sys.stdin.readline()
+
+
+def text(page, selector):
+    return page.locator(selector).inner_text()
+
+
+def wait(page, condition, limit_s=PATIENCE_S):
+    """Seconds until a condition holds on the page. The page forbids to evaluate texts, also for `wait_for_function`."""
+    began = time.monotonic()
+    while not page.evaluate(condition):
+        assert time.monotonic() - began < limit_s, f"{condition} does not hold within {limit_s} s"
+        time.sleep(0.02)
+    return time.monotonic() - began
+
+
+def main():
+    measured = {}
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1440, "height": 1150})
+        requests, problems = [], []
+        page.on("request", lambda request: requests.append(request.url))
+        page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda problem: problems.append(str(problem)))
+        page.goto(URL)
+        wait(page, "document.getElementById('connection').textContent === 'connected'")
+        wait(page, "document.getElementById('phase').textContent === 'Descending'")
+        wait(page, "/found 1 in it/.test(document.getElementById('video-text').textContent)")
+        assert page.evaluate(SPREAD) > 50, "the picture is empty"
+        page.screenshot(path=FOLDER / "descending.png", full_page=True)
+
+        # By the keyboard alone.
+        page.locator("button[data-command=hold]").focus()
+        page.keyboard.down("Space")
+        time.sleep(0.4)
+        page.keyboard.up("Space")
+        assert "too early" in text(page, "#reply"), text(page, "#reply")
+        page.keyboard.down("Space")
+        time.sleep(1.4)
+        page.keyboard.up("Space")
+        wait(page, "/accepted by the controller/.test(document.getElementById('reply').textContent)")
+        wait(page, "document.getElementById('phase').textContent === 'Holding the position'")
+        page.screenshot(path=FOLDER / "holding.png", full_page=True)
+
+        page.set_viewport_size({"width": 360, "height": 740})
+        time.sleep(0.5)
+        width = page.evaluate("document.documentElement.scrollWidth")
+        assert width <= 360, f"a telephone would have to scroll sideways: {width} px"
+        page.screenshot(path=FOLDER / "telephone.png", full_page=True)
+        page.set_viewport_size({"width": 1440, "height": 1150})
+        page.locator("#theme").click()
+        page.screenshot(path=FOLDER / "sunlight.png", full_page=True)
+        page.locator("#theme").click()
+
+        asked("KILL")
+        stale = "[...document.querySelectorAll('[data-group], #video-panel')].every((it) => it.classList.contains('stale'))"
+        measured["grey_s"] = wait(page, stale, 5)
+        assert page.locator("button[data-command=abort]").is_disabled(), "a button can be used without a connection"
+        assert "was:" in text(page, "#phase"), text(page, "#phase")
+        time.sleep(1.5)
+        page.screenshot(path=FOLDER / "cut-off.png", full_page=True)
+        asked("START")
+        measured["back_s"] = wait(page, "document.getElementById('connection').textContent === 'connected'", 10)
+        wait(page, "!document.getElementById('video-panel').classList.contains('stale')", 10)
+
+        # By the pointer.
+        box = page.locator("button[data-command=resume]").bounding_box()
+        page.mouse.move(box["x"] + 9, box["y"] + 9)
+        wait(page, "!document.querySelector('button[data-command=resume]').disabled")
+        page.mouse.down()
+        time.sleep(1.4)
+        page.mouse.up()
+        wait(page, "/resume: accepted/.test(document.getElementById('reply').textContent)")
+        wait(page, "['Touching down', 'Landed'].includes(document.getElementById('phase').textContent)")
+        page.screenshot(path=FOLDER / "landed.png", full_page=True)
+        browser.close()
+    foreign = [url for url in requests if not url.startswith(URL)]
+    assert not foreign, f"asked of others: {foreign}"
+    # What fails while the server is away is no problem of the page.
+    problems = [it for it in problems if "ERR_CONNECTION" not in it and "WebSocket connection" not in it]
+    assert not problems, problems
+    print(json.dumps(measured))
+
+
+main()
