@@ -85,26 +85,28 @@ impl Video {
             let wait_ns = pairing.deadline_ns().map(|at_ns| at_ns.saturating_sub(now_ns()).max(0));
             let due = wait_ns.map(|ns| Instant::now() + Duration::from_nanos(ns.cast_unsigned()));
             tokio::select! {
-                frame = frames.next() => {
-                    let frame = frame.context("the network session was closed")?;
-                    let is_due = last_ns.is_none_or(|last_ns| now_ns() - last_ns >= min_period_ns);
-                    if is_due && self.is_wanted(&frame.header) {
-                        last_ns = Some(now_ns());
-                        self.add(frame, &mut pairing).await?;
-                    }
-                }
+                // In this order: what was found is there before a further picture is made, which takes its time.
+                biased;
                 told = told.next_with_key() => {
                     let (key, told) = told.context("the network session was closed")?;
                     // A detector is known by its key.
                     let detector = topic::DETECTIONS.first_name(&key).unwrap_or_default().to_owned();
                     pairing.detections(Detections { detector, ..told });
                 }
-                () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {}
                 _ = look.tick() => {
                     if self.shown.receiver_count() > 0 {
                         watched = Instant::now();
                     } else if watched.elapsed() > LINGER {
                         return Ok(());
+                    }
+                }
+                () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {}
+                frame = frames.next() => {
+                    let frame = frame.context("the network session was closed")?;
+                    let is_due = last_ns.is_none_or(|last_ns| now_ns() - last_ns >= min_period_ns);
+                    if is_due && self.is_wanted(&frame.header) {
+                        last_ns = Some(now_ns());
+                        self.add(frame, &mut pairing).await?;
                     }
                 }
             }
