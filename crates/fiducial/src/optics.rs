@@ -5,5 +5,6 @@ pub(crate) mod edge_response;
 pub(crate) mod exposure;
 pub(crate) mod homography;
 pub(crate) mod least_squares;
+pub(crate) mod mosaic;
 pub(crate) mod normal;
 pub(crate) mod undistort;

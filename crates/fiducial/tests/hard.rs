@@ -8,6 +8,7 @@ use fiducial::{Detector, Observation, Settings};
 use geometry::{CameraModel, Distortion};
 use imaging::GrayImage;
 use render::{SIZE_M, Scene};
+use rendering::Preset;
 
 fn camera() -> CameraModel {
     CameraModel::pinhole(1296, 972, 1818.0)
@@ -267,28 +268,50 @@ fn rings_of_other_radii_are_no_marker() {
     }
 }
 
+/// A target of evenly wide rings, white in the middle, seen slightly from the side.
+fn target(rings: u32, radius_px: f64) -> GrayImage {
+    let count = f64::from(2 * rings);
+    let mut image = GrayImage::filled(1000, 800, 190);
+    for y in 0..800 {
+        for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
+            let from_centre = (x as f64 - 500.3).hypot(1.15 * (y as f64 - 400.6));
+            let black: f64 = (0..2 * rings)
+                .map(|k| {
+                    let edge = radius_px * (1.0 - f64::from(k) / count) - from_centre;
+                    let within = (0.6 * edge + 0.5).clamp(0.0, 1.0);
+                    if k % 2 == 0 { within } else { -within }
+                })
+                .sum();
+            *pixel = (190.0 - 150.0 * black).round() as u8;
+        }
+    }
+    image
+}
+
 #[test]
 fn targets_of_evenly_wide_rings_are_no_marker() {
     let camera = CameraModel::pinhole(1000, 800, 909.0);
     for rings in [2, 3] {
         for radius_px in [13.0, 16.0, 20.0, 24.0, 30.0, 60.0] {
-            let count = f64::from(2 * rings);
-            let mut image = GrayImage::filled(1000, 800, 190);
-            for y in 0..800 {
-                for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
-                    let from_centre = (x as f64 - 500.3).hypot(1.15 * (y as f64 - 400.6));
-                    // White in the middle.
-                    let black: f64 = (0..2 * rings)
-                        .map(|k| {
-                            let edge = radius_px * (1.0 - f64::from(k) / count) - from_centre;
-                            let within = (0.6 * edge + 0.5).clamp(0.0, 1.0);
-                            if k % 2 == 0 { within } else { -within }
-                        })
-                        .sum();
-                    *pixel = (190.0 - 150.0 * black).round() as u8;
-                }
+            let found = find(&target(rings, radius_px), &camera);
+            assert_eq!(found, None, "{rings} rings of {radius_px} px");
+        }
+    }
+}
+
+#[test]
+fn small_targets_of_evenly_wide_rings_are_no_marker_to_ordinary_cameras() {
+    let camera = CameraModel::pinhole(1000, 800, 909.0);
+    for preset in [Preset::Usb, Preset::RaspberryPi, Preset::ActionCamera, Preset::Phone] {
+        for rings in [2, 3] {
+            for radius_px in [7.0, 8.5, 10.0, 11.5] {
+                let light = target(rings, radius_px);
+                let shown = preset.processing().apply(light.pixels(), 1000).unwrap();
+                let mut image = GrayImage::filled(1000, 800, 0);
+                image.pixels_mut().copy_from_slice(&shown);
+                let found = find(&image, &camera);
+                assert_eq!(found, None, "{preset}: {rings} rings of {radius_px} px");
             }
-            assert_eq!(find(&image, &camera), None, "{rings} rings of {radius_px} px");
         }
     }
 }

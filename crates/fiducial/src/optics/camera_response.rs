@@ -6,6 +6,10 @@
 /// Standard deviation of the kernel with which cameras sharpen, in pixels.
 pub(crate) const SHARPENING_PX: f64 = 1.0;
 
+/// Steepest tone curve at black, less 1: that of a camera module of the Raspberry Pi is 3 between black ink and white
+/// paper.
+const MAX_CURVE: f64 = 4.0;
+
 /// What a camera makes of an image that is linear in light.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct CameraResponse {
@@ -30,11 +34,13 @@ pub(crate) struct ShownWhiteness {
 
 impl CameraResponse {
     pub(crate) const LINEAR: Self = Self { curve: 0.0, sharpening: 0.0 };
+    /// What most cameras do: a start for a fit.
+    pub(crate) const ORDINARY: Self = Self { curve: 1.0, sharpening: 0.0 };
 
     /// After a step of a fit, within what cameras do.
     pub(crate) fn moved(&self, [curve, sharpening]: [f64; 2]) -> Self {
         Self {
-            curve: (self.curve + curve).clamp(-0.25, 2.0),
+            curve: (self.curve + curve).clamp(-0.25, MAX_CURVE),
             sharpening: (self.sharpening + sharpening).clamp(0.0, 2.0),
         }
     }

@@ -27,6 +27,19 @@ const MAX_FAINT_NOISE: f64 = 4.0;
 /// The same where a camera's processing takes part, which explains more.
 const MIN_R_SQUARED_PROCESSED: f64 = 0.985;
 const MIN_R_SQUARED_PROCESSED_SMALL: f64 = 0.993;
+/// Darkness of the middle ring in units of the outer one where a camera's processing takes part.
+const BALANCE: std::ops::Range<f64> = 0.95..1.05;
+/// Minimum share that is explained of a small marker whose pixels were interpolated from a colour mosaic, up to this diameter in pixels and above
+/// it, ...
+const MIN_R_SQUARED_INTERPOLATED: f64 = 0.93;
+const INTERPOLATED_PX: f64 = 20.0;
+const R_SQUARED_INTERPOLATED_PER_PX: f64 = 0.01;
+/// ... where ink is no blacker than this grey level, the tone curve no flatter than this, ...
+const MIN_BLACK: f64 = 0.0;
+const MIN_CURVE: f64 = -0.1;
+/// ... and the radii differ from the marker's by no more than this share of its radius, with this standard deviation.
+const MAX_RADII_OFF: f64 = 0.028;
+const MAX_RADII_DEVIATION: f64 = 0.03;
 /// Minimum diameter in pixels of a marker that is recognised by one ring.
 const MIN_SINGLE_RING_PX: f64 = 90.0;
 /// Factor of the covariance when something disturbs the marker's image.
@@ -175,20 +188,10 @@ impl EdgeSearch<'_> {
     ) -> Result<MeasuredMarker, Reason> {
         let poses = self.photometric().fit(start, samples).ok_or(Reason::Pose)?;
         let fit = &poses.best;
-        // Noise may be a large part of a faint marker.
-        let faint = fit.r_squared > MIN_R_SQUARED_FAINT
-            && fit.residual * fit.contrast < MAX_FAINT_NOISE
-            && fit.residual < 1.5 * MAX_RESIDUAL;
-        let tiny = candidate_px < TINY_PX;
-        let min_r_squared = if tiny { MIN_R_SQUARED_TINY } else { MIN_R_SQUARED_SMALL };
-        let clear = fit.r_squared > min_r_squared && fit.residual < MAX_RESIDUAL;
-        let is_marker = (clear || faint)
+        let is_marker = (is_small_marker(fit, candidate_px)
+            || is_interpolated_marker(fit, candidate_px))
             && fit.contrast > 2.0 * MIN_STEP
-            // Other things blurred beyond recognition fit rings that are blacker than black, though less well
-            // than sharpening makes a marker's.
-            && (!tiny || fit.contrast < 260.0 || is_sharpened(fit))
             && fit.has_rings()
-            && is_plain_or_close(fit, MIN_R_SQUARED_PROCESSED_SMALL)
             && self.is_near(start, &fit.pose, 1.5, 0.3);
         if !is_marker {
             return Err(Reason::Edges);
@@ -370,13 +373,52 @@ fn is_undisturbed(fit: &PhotometricFit) -> bool {
         && fit.has_rings()
         && fit.r_squared > MIN_R_SQUARED
         && is_plain_or_close(fit, MIN_R_SQUARED_PROCESSED)
+        && (fit.mosaic.is_none() || has_marker_radii(fit))
+}
+
+/// Whether a fit to a marker too small for edges is a marker's.
+fn is_small_marker(fit: &PhotometricFit, candidate_px: f64) -> bool {
+    // Noise may be a large part of a faint marker.
+    let faint = fit.r_squared > MIN_R_SQUARED_FAINT
+        && fit.residual * fit.contrast < MAX_FAINT_NOISE
+        && fit.residual < 1.5 * MAX_RESIDUAL;
+    let tiny = candidate_px < TINY_PX;
+    let min_r_squared = if tiny { MIN_R_SQUARED_TINY } else { MIN_R_SQUARED_SMALL };
+    let clear = fit.r_squared > min_r_squared && fit.residual < MAX_RESIDUAL;
+    (clear || faint)
+        // Other things blurred beyond recognition fit rings that are blacker than black, though less well
+        // than sharpening makes a marker's.
+        && (!tiny || fit.contrast < 260.0 || is_sharpened(fit))
+        && is_plain_or_close(fit, MIN_R_SQUARED_PROCESSED_SMALL)
+}
+
+/// Whether a fit to pixels interpolated from a colour mosaic is a small marker's. Compression is a large part of what it
+/// leaves, so that the radii that would fit best decide: evenly wide rings are 0.05 off, fit only with ink that is blacker
+/// than black or a blur that leaves the radii open.
+fn is_interpolated_marker(fit: &PhotometricFit, diameter_px: f64) -> bool {
+    let min_r_squared = MIN_R_SQUARED_INTERPOLATED
+        + R_SQUARED_INTERPOLATED_PER_PX * (diameter_px - INTERPOLATED_PX).max(0.0);
+    fit.mosaic.is_some()
+        && fit.r_squared > min_r_squared
+        && fit.residual < MAX_RESIDUAL
+        && fit.black > MIN_BLACK
+        && fit.response.curve > MIN_CURVE
+        && has_marker_radii(fit)
+}
+
+/// Whether the radii that would fit best are the marker's, as far as they can be told.
+fn has_marker_radii(fit: &PhotometricFit) -> bool {
+    const BALANCE: std::ops::Range<f64> = 0.975..1.05;
+    BALANCE.contains(&fit.ring_balance)
+        && fit
+            .radii
+            .is_none_or(|radii| radii.off < MAX_RADII_OFF && radii.deviation < MAX_RADII_DEVIATION)
 }
 
 /// Whether a fit needs no camera's processing, or is so close with it that rings of other radii are not: a tone curve
 /// makes all dark rings narrower. Of 222 processed markers at all positions of the
 /// thesis the worst explained 0.995, with balances from 0.98 to 1.02.
 fn is_plain_or_close(fit: &PhotometricFit, min_r_squared: f64) -> bool {
-    const BALANCE: std::ops::Range<f64> = 0.95..1.05;
     fit.response == CameraResponse::LINEAR
         || fit.r_squared > min_r_squared && BALANCE.contains(&fit.ring_balance)
 }

@@ -12,11 +12,12 @@ mod score;
 mod solve;
 
 use crate::families::rings::circle_pose::CirclePose;
+use crate::optics::mosaic::Mosaic;
 
 use model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL};
 pub(crate) use model::{PhotometricFit, PhotometricInput, PhotometricPoses};
 pub(crate) use scene::PixelSample;
-use scene::{ALL_PIXELS_PX, FOCUSED_PX, SampleSource, Scene};
+use scene::{ALL_PIXELS_PX, FOCUSED_PX, MAX_RADII_PX, SampleSource, Scene};
 use solve::{ModelFit, Start};
 
 pub(crate) use scene::MAX_DIAMETER_PX;
@@ -37,6 +38,13 @@ const MAX_EXTRAS_COST: f64 = 0.5;
 /// the fit does.
 const MIN_RESPONSE_RESIDUAL: f64 = 0.008;
 const MIN_RESPONSE_GAIN: f64 = 0.2;
+/// Above this residual a colour mosaic is tried, and kept when it lowers the cost to this share.
+const MIN_MOSAIC_RESIDUAL: f64 = 0.015;
+const MAX_MOSAIC_COST: f64 = 0.8;
+/// It is tried when one step with it costs less than this share of one without it, or, where a tone curve hides that, than
+/// this share of what was before.
+const MAX_MOSAIC_STEP: f64 = 0.85;
+const MAX_PROCESSED_STEP: f64 = 0.25;
 /// Start tilt in radians. Seen face on, every tilt looks the same to first order: a saddle of the cost.
 const MIN_START_TILT: f64 = 0.2;
 /// The mirrored pose is dropped above this ratio of costs.
@@ -56,53 +64,45 @@ impl PhotometricInput<'_> {
         let Self { camera, size_m, .. } = *self;
         samples.clear();
         let source = SampleSource(*self);
-        let is_small = start.projected(size_m / 2.0, camera)?.major < ALL_PIXELS_PX;
+        let outline = start.projected(size_m / 2.0, camera)?;
+        let diameter_px = outline.major;
+        let is_small = diameter_px < ALL_PIXELS_PX;
         let early_reject =
             if is_small { EARLY_REJECT_RESIDUAL_SMALL } else { EARLY_REJECT_RESIDUAL };
         source.gather(start, FOCUSED_PX, samples)?;
         let tilted = |pose: &CirclePose| pose.with_min_tilt(MIN_START_TILT);
         let stride = sparse_stride(samples);
-        let sparse = Scene { stride, ..Scene::new(samples, size_m, camera, early_reject) };
-        let mut first = sparse.fitted(Start::Pose(&tilted(start)))?;
+        let mut sparse = Scene { stride, ..Scene::new(samples, size_m, camera, early_reject) };
+        let mut first = match sparse.fitted(Start::Pose(&tilted(start))) {
+            Some(fit) => fit,
+            None => {
+                let mosaics = source.mosaics(&outline).filter(|_| is_small)?;
+                sparse.fitted_to_mosaic(&tilted(start), mosaics)?
+            }
+        };
+        let (extras, mosaic) = (sparse.extras, sparse.mosaic);
+        let scene = |samples, stride| Scene {
+            stride,
+            extras,
+            mosaic,
+            ..Scene::new(samples, size_m, camera, early_reject)
+        };
         // With the blur known, pixels reached by light from beyond the paper are left out.
         let pose = first.model.pose;
         if first.residual(&sparse) < MAX_RESIDUAL
             && source.gather(&pose, first.model.blur_px, samples)?
         {
-            let scene = Scene { stride, ..Scene::new(samples, size_m, camera, early_reject) };
-            first = scene.fitted(Start::Pose(&tilted(&pose)))?;
+            first = scene(samples, stride).fitted(Start::Pose(&tilted(&pose)))?;
         }
-        let mut all = Scene::new(samples, size_m, camera, early_reject);
-        let mut sparse = Scene { stride, ..Scene::new(samples, size_m, camera, early_reject) };
-        let residual = first.residual(&sparse);
-        let is_processed = MIN_RESPONSE_RESIDUAL < residual
-            && residual < MIN_EXTRAS_RESIDUAL
-            && sparse.response_gain(&first).is_some_and(|gain| gain > MIN_RESPONSE_GAIN);
-        if is_processed {
-            sparse.extras = Extras::Response;
-            let plain = first.model.pose;
-            match sparse.fitted(Start::like(&plain, &first)) {
-                Some(fit) if fit.cost() < (1.0 - MIN_RESPONSE_GAIN) * first.cost() => {
-                    (first, all.extras) = (fit, Extras::Response);
-                }
-                _ => sparse.extras = Extras::Nothing,
-            }
+        let mut all = scene(samples, 1);
+        let mut sparse = scene(samples, stride);
+        if mosaic.is_none() {
+            let plain = first;
+            first = sparse.with_extras(plain);
+            first = sparse.with_mosaic(plain, first);
+            (all.extras, all.mosaic) = (sparse.extras, sparse.mosaic);
         }
-        if (MIN_EXTRAS_RESIDUAL..MAX_RESIDUAL).contains(&residual) {
-            let mut max_cost = MAX_EXTRAS_COST * first.cost();
-            let plain = (first.model.pose, first);
-            let (mut best, mut extras) = (None, Extras::Nothing);
-            for tried in [Extras::Response, Extras::Motion] {
-                sparse.extras = tried;
-                let fit = sparse.fitted(Start::like(&plain.0, &plain.1));
-                if let Some(fit) = fit.filter(|fit| fit.cost() < max_cost) {
-                    max_cost = fit.cost();
-                    (best, extras) = (Some(fit), tried);
-                }
-            }
-            (sparse.extras, all.extras) = (extras, extras);
-            first = best.unwrap_or(plain.1);
-        }
+        all.radii_count = all.mosaic.is_some() && diameter_px < MAX_RADII_PX;
         let fit_all = |fit: ModelFit| match stride {
             1 => Some(fit),
             _ => all.fitted(Start::like(&fit.model.pose, &fit)),
@@ -190,6 +190,68 @@ impl PhotometricInput<'_> {
     }
 }
 
+impl Scene<'_> {
+    /// A fit with motion blur or a camera's processing where they explain much more; they are then the scene's extras.
+    fn with_extras(&mut self, plain: ModelFit) -> ModelFit {
+        let residual = plain.residual(self);
+        let start = Start::like(&plain.model.pose, &plain);
+        if (MIN_RESPONSE_RESIDUAL..MIN_EXTRAS_RESIDUAL).contains(&residual)
+            && self.response_gain(&plain).is_some_and(|gain| gain > MIN_RESPONSE_GAIN)
+        {
+            self.extras = Extras::Response;
+            match self.fitted(start) {
+                Some(fit) if fit.cost() < (1.0 - MIN_RESPONSE_GAIN) * plain.cost() => return fit,
+                _ => self.extras = Extras::Nothing,
+            }
+        }
+        if !(MIN_EXTRAS_RESIDUAL..MAX_RESIDUAL).contains(&residual) {
+            return plain;
+        }
+        let mut max_cost = MAX_EXTRAS_COST * plain.cost();
+        let (mut best, mut extras) = (None, Extras::Nothing);
+        for tried in [Extras::Response, Extras::Motion] {
+            self.extras = tried;
+            let fit = self.fitted(start);
+            if let Some(fit) = fit.filter(|fit| fit.cost() < max_cost) {
+                max_cost = fit.cost();
+                (best, extras) = (Some(fit), tried);
+            }
+        }
+        self.extras = extras;
+        best.unwrap_or(plain)
+    }
+
+    /// The better fit to pixels interpolated from one of these mosaics, which is then the scene's.
+    fn fitted_to_mosaic(&mut self, start: &CirclePose, mosaics: [Mosaic; 2]) -> Option<ModelFit> {
+        let fits = mosaics.into_iter().filter_map(|mosaic| {
+            let scene = Scene { mosaic: Some(mosaic), extras: Extras::Response, ..*self };
+            Some((mosaic, scene.fitted(Start::Pose(start))?))
+        });
+        let (mosaic, fit) = fits.min_by(|a, b| a.1.cost().total_cmp(&b.1.cost()))?;
+        (self.mosaic, self.extras) = (Some(mosaic), Extras::Response);
+        Some(fit)
+    }
+
+    /// A fit to pixels interpolated from a colour mosaic where that explains more than the best without it; the mosaic, and
+    /// the processing of a camera that has one, are then the scene's.
+    fn with_mosaic(&mut self, plain: ModelFit, best: ModelFit) -> ModelFit {
+        if !(MIN_MOSAIC_RESIDUAL..MAX_RESIDUAL).contains(&best.residual(self)) {
+            return best;
+        }
+        let processed = Scene { extras: Extras::Response, ..*self };
+        let Some(mosaic) = processed.likely_mosaic(&plain) else { return best };
+        let processed = Scene { mosaic: Some(mosaic), ..processed };
+        let start = ModelFit { model: plain.model.sharper(), ..plain };
+        match processed.fitted(Start::like(&plain.model.pose, &start)) {
+            Some(fit) if fit.cost() < MAX_MOSAIC_COST * best.cost() => {
+                (self.extras, self.mosaic) = (processed.extras, processed.mosaic);
+                fit
+            }
+            _ => best,
+        }
+    }
+}
+
 impl PhotometricFit {
     fn alone(self) -> PhotometricPoses {
         PhotometricPoses { best: self, alternative: None }
@@ -249,7 +311,7 @@ mod tests {
                 let (x, y) = (f64::from(i % 100), f64::from(i / 100));
                 let ray = camera.unproject_clamped(Pixel::new(x, y)).coords;
                 let offset = [x - middle.x, y - middle.y];
-                let samples = [PixelSample { ray, offset, grey: 0.0, inside: true }];
+                let samples = [PixelSample { ray, offset, grey: 0.0, phase: 0, inside: true }];
                 let scene = Scene::new(&samples, size_m, &camera, EARLY_REJECT_RESIDUAL);
                 let mut grey = 0.0;
                 model

@@ -6,9 +6,13 @@ use super::scene::Scene;
 use crate::families::rings::circle_pose::{CirclePlane, RayPlaneIntersection};
 use crate::optics::camera_response::CameraResponse;
 use crate::optics::edge_response::pixel_kurtosis;
+use crate::optics::mosaic::{Kernel, Mosaic, PHASES};
 
 /// An edge further away than this many standard deviations of the blur does not show.
 const MAX_BLUR_SIGMAS: f64 = 4.0;
+
+/// Number of circles between the outermost and the dot.
+pub(super) const FREE_RADII: usize = 3;
 
 /// The model's response at one pixel, with its derivatives.
 pub(super) struct PixelResponse {
@@ -83,6 +87,34 @@ impl Blur {
             inverse_max: 1.0 / (variance + p.hypot(q)).sqrt(),
         }
     }
+
+    /// The blur with this variance added to the right and down, in square pixels.
+    fn widened(self, [x, y]: [f64; 2]) -> Self {
+        let [xx, xy, yy] = self.covariance;
+        let max_variance = self.inverse_max.powi(-2) + x.max(y);
+        Self {
+            covariance: [xx + x, xy, yy + y],
+            min_variance: self.min_variance + x.min(y),
+            inverse_max: 1.0 / max_variance.sqrt(),
+            ..self
+        }
+    }
+}
+
+/// The blur of one kind of pixel of a colour mosaic.
+pub(super) struct InterpolatedBlur {
+    blur: Blur,
+    kernel: Kernel,
+}
+
+impl InterpolatedBlur {
+    /// By [`phase`](crate::optics::mosaic::phase), of a lens with this blur.
+    pub(super) fn by_phase(mosaic: Mosaic, blur_px: f64, motion: [f64; 2]) -> [Self; PHASES] {
+        mosaic.kernels().map(|kernel| Self {
+            blur: Blur::new(blur_px, motion).widened(kernel.variances()),
+            kernel,
+        })
+    }
 }
 
 /// Distribution of the distance from the centre over the blur about a pixel.
@@ -154,6 +186,45 @@ impl RadiusDistribution {
         }
     }
 
+    /// As [`RadiusDistribution::about`] for a pixel of a colour mosaic.
+    #[inline]
+    pub(super) fn interpolated(
+        ray: &Vector3<f64>,
+        plane: &CirclePlane,
+        InterpolatedBlur { blur, kernel }: &InterpolatedBlur,
+    ) -> Self {
+        let all = Self::about(ray, plane, blur);
+        let RayPlaneIntersection { radial, px_per_metre, .. } = all.at;
+        let normal = radial.map(|part| part * px_per_metre);
+        let variance = blur.blur_px / all.by_blur;
+        let kurtosis = pixel_kurtosis(normal, variance) + kernel.kurtosis(normal, variance);
+        Self { pixel_kurtosis: kurtosis, ..all }
+    }
+
+    /// The square of a circle's radius over the mean square of the distance, to the power of the distribution, and how
+    /// many deviations the circle is from the mean.
+    #[inline(always)]
+    fn beside_circle(&self, log_radius: f64) -> (f64, f64) {
+        let ratio = exp(self.power * (2.0 * log_radius - self.log_mean_square));
+        (ratio, (ratio - self.mean) * self.inverse_deviation)
+    }
+
+    /// Derivatives of the whiteness by the logarithms of the radii of the circles between the outermost and the dot.
+    pub(super) fn by_log_radii(&self, scene: &Scene<'_>) -> [f64; FREE_RADII] {
+        std::array::from_fn(|index| {
+            // The first of them is the inner edge of a dark ring.
+            let sign = if index % 2 == 0 { 1.0 } else { -1.0 };
+            let Some((radius, log_radius)) = scene.radii.get(index + 1) else { return 0.0 };
+            let sigmas = (radius - self.at.rho) * self.inverse_max_blur;
+            if sigmas.abs() > MAX_BLUR_SIGMAS {
+                return 0.0;
+            }
+            let (ratio, z) = self.beside_circle(*log_radius);
+            let (_, density) = scene.edge.at(z, self.pixel_kurtosis);
+            sign * density * ratio * 2.0 * self.power * self.inverse_deviation
+        })
+    }
+
     #[inline]
     pub(super) fn response(&self, scene: &Scene<'_>) -> PixelResponse {
         let RayPlaneIntersection { rho, by_pose, .. } = self.at;
@@ -168,8 +239,7 @@ impl RadiusDistribution {
                 *inside = if sigmas > 0.0 { 1.0 } else { 0.0 };
                 continue;
             }
-            let ratio = exp(self.power * (2.0 * log_radius - self.log_mean_square));
-            let z = (ratio - self.mean) * self.inverse_deviation;
+            let (ratio, z) = self.beside_circle(log_radius);
             let (share, density) = scene.edge.at(z, self.pixel_kurtosis);
             *inside = share;
             by_distance += sign * density * self.by_distance * ratio;

@@ -4,8 +4,10 @@ use geometry::CameraModel;
 use imaging::GrayView;
 use nalgebra::SMatrix;
 
+use super::score::Radii;
 use crate::families::rings::circle_pose::CirclePose;
 use crate::optics::camera_response::CameraResponse;
+use crate::optics::mosaic::Mosaic;
 
 /// Grey values above this are saturated: the light may be of any brightness.
 pub(super) const MAX_GREY: f64 = 254.5;
@@ -72,9 +74,15 @@ pub(crate) struct PhotometricFit {
     pub(crate) ring_balance: f64,
     /// White minus black, in grey levels.
     pub(crate) contrast: f64,
+    /// The grey level of black.
+    pub(crate) black: f64,
     /// Standard deviation of the blur, in pixels.
     pub(crate) blur_px: f64,
     pub(crate) response: CameraResponse,
+    /// The mosaic from which the pixels were interpolated.
+    pub(crate) mosaic: Option<Mosaic>,
+    /// Of a small marker: how far the radii that fit best are from its own.
+    pub(crate) radii: Option<Radii>,
 }
 
 impl PhotometricFit {

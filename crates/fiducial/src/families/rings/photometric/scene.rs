@@ -3,12 +3,14 @@
 use std::f64::consts::TAU;
 
 use geometry::{CameraModel, Pixel};
+use imaging::Ellipse;
 use markers::RingKind;
 use nalgebra::Vector3;
 
 use super::model::{Effort, Extras, PhotometricInput, UNKNOWNS};
 use crate::families::rings::circle_pose::{CirclePose, project};
 use crate::optics::edge_response::EdgeResponse;
+use crate::optics::mosaic::{Mosaic, phase};
 
 /// Larger markers have edges far enough apart to be located one by one.
 pub(crate) const MAX_DIAMETER_PX: f64 = 180.0;
@@ -16,6 +18,8 @@ pub(crate) const MAX_DIAMETER_PX: f64 = 180.0;
 const MIN_DIAMETER_PX: f64 = 5.0;
 /// Up to this diameter all pixels are used, above it those about the edges.
 pub(super) const ALL_PIXELS_PX: f64 = 22.0;
+/// Up to this diameter the radii are compared with other rings'.
+pub(super) const MAX_RADII_PX: f64 = 36.0;
 /// Approximate number of pixels used of a larger marker.
 const EDGE_SAMPLES: f64 = 260.0;
 /// Blur of a lens in focus together with the pixel's own extent, as a standard deviation in pixels.
@@ -28,6 +32,8 @@ pub(crate) struct PixelSample {
     /// Offset from the marker's centre, in pixels.
     pub(super) offset: [f64; 2],
     pub(super) grey: f64,
+    /// Which pixel of a colour mosaic it would be ([`phase`]).
+    pub(super) phase: u8,
     /// Whether it lies well inside the marker's rim.
     pub(super) inside: bool,
 }
@@ -46,6 +52,10 @@ pub(super) struct Scene<'a> {
     pub(super) early_reject: [f64; 3],
     pub(super) effort: Effort,
     pub(super) extras: Extras,
+    /// The mosaic from which the pixels were interpolated.
+    pub(super) mosaic: Option<Mosaic>,
+    /// Whether the radii that fit best are asked for.
+    pub(super) radii_count: bool,
 }
 
 impl<'a> Scene<'a> {
@@ -71,6 +81,8 @@ impl<'a> Scene<'a> {
             early_reject,
             effort: Effort::FULL,
             extras: Extras::Nothing,
+            mosaic: None,
+            radii_count: false,
         }
     }
 
@@ -84,6 +96,37 @@ impl<'a> Scene<'a> {
 pub(super) struct SampleSource<'a>(pub(super) PhotometricInput<'a>);
 
 impl SampleSource<'_> {
+    /// The two colour mosaics from which the pixels in an outline may be interpolated: by those every other pixel, a green
+    /// one, differs more from its neighbours than the others do.
+    pub(super) fn mosaics(&self, outline: &Ellipse) -> Option<[Mosaic; 2]> {
+        const MIN_RATIO: f64 = 1.5;
+        let view = self.0.view;
+        let half = outline.major / 2.0;
+        let range = |axis: usize, size: usize| {
+            let [from, to] = [-half, half].map(|by| (outline.centre[axis] + by).max(1.0) as usize);
+            from..to.min(size.saturating_sub(2)) + 1
+        };
+        let mut squares = [0_i64; 2];
+        for y in range(1, view.height()) {
+            for x in range(0, view.width()) {
+                let at = |x: usize, y: usize| i64::from(view.at(x, y));
+                let around = at(x - 1, y) + at(x + 1, y) + at(x, y - 1) + at(x, y + 1);
+                let parity = (x + y) % 2;
+                if let Some(sum) = squares.get_mut(parity) {
+                    *sum += (4 * at(x, y) - around).pow(2);
+                }
+            }
+        }
+        let [even, odd] = squares.map(|sum| sum as f64);
+        if odd > MIN_RATIO * even {
+            Some([Mosaic { red: 0 }, Mosaic { red: 3 }])
+        } else if even > MIN_RATIO * odd {
+            Some([Mosaic { red: 1 }, Mosaic { red: 2 }])
+        } else {
+            None
+        }
+    }
+
     /// Takes the pixels in and just around the marker, of a large one those about its edges. False when they
     /// would be the ones that were already taken for a lens in focus.
     pub(super) fn gather(
@@ -114,6 +157,7 @@ impl SampleSource<'_> {
                 ray: camera.unproject_clamped(Pixel::new(place[0], place[1])).coords,
                 offset: [place[0] - middle.x, place[1] - middle.y],
                 grey: if white_on_black { 255.0 - grey } else { grey },
+                phase: phase(x, y),
                 inside,
             });
         };

@@ -2,9 +2,11 @@
 
 use nalgebra::{SMatrix, SVector};
 
+use super::blur::FREE_RADII;
 use super::model::{Alternative, Extras, MAX_GREY, PhotometricFit, UNKNOWNS, UNKNOWNS_WITH_EXTRAS};
 use super::scene::Scene;
 use super::solve::{ModelFit, RingModel, Sums};
+use crate::optics::least_squares::huber;
 
 /// Prior standard deviation of the normal, in radians.
 const PRIOR_NORMAL: f64 = 0.6;
@@ -59,6 +61,84 @@ impl RingModel {
     }
 }
 
+/// The unknowns of a fit in which radii are free as well.
+const UNKNOWNS_WITH_RADII: usize = UNKNOWNS_WITH_EXTRAS + FREE_RADII;
+
+/// How far the radii that would fit best are from the marker's: the three circles between the outermost and the dot.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Radii {
+    /// The largest difference, as a share of the marker's radius.
+    pub(crate) off: f64,
+    /// The largest standard deviation of a difference.
+    pub(crate) deviation: f64,
+}
+
+impl RingModel {
+    /// One step of a fit in which the radii of the circles between the outermost and the dot are free.
+    pub(super) fn radii(&self, scene: &Scene<'_>, huber_limit: f64) -> Option<Radii> {
+        let mut matrix = SMatrix::<f64, UNKNOWNS_WITH_RADII, UNKNOWNS_WITH_RADII>::zeros();
+        let mut right = SVector::<f64, UNKNOWNS_WITH_RADII>::zeros();
+        let (mut count, mut squares) = (0.0, 0.0);
+        self.for_each_place(scene, |sample, radius, wide| {
+            let mut shown = radius.response(scene);
+            let mut by_radii = radius.by_log_radii(scene);
+            if let Some(wide) = wide {
+                let own = shown.white();
+                let blurred = wide.radius.response(scene);
+                let seen = self.response.shown(own, blurred.white(), wide.ratio);
+                let by_wide = wide.radius.by_log_radii(scene);
+                for (own, wide) in by_radii.iter_mut().zip(by_wide) {
+                    *own = seen.by_own * *own + seen.by_blurred * wide;
+                }
+                shown = wide.processed(&shown, &blurred, &self.response);
+            }
+            let (grey, contrast) = self.grey(sample, shown.shown);
+            if sample.grey > MAX_GREY && grey > MAX_GREY {
+                return;
+            }
+            let residual = sample.grey - grey;
+            let weight = huber(residual, huber_limit).weight;
+            count += 1.0;
+            squares += weight * residual * residual;
+            let [x, y] = sample.offset;
+            let white = shown.shown;
+            let mut gradient = SVector::<f64, UNKNOWNS_WITH_RADII>::zeros();
+            let by_distance = contrast * shown.by_distance;
+            let by_extras = match scene.extras {
+                Extras::Nothing => [0.0; 2],
+                Extras::Motion => shown.by_motion,
+                Extras::Response => shown.by_response,
+            };
+            let parts = shown
+                .distance_by_pose
+                .map(|by| by * by_distance)
+                .into_iter()
+                .chain([contrast * shown.by_blur, 1.0 - white, white, white * x, white * y])
+                .chain(by_extras.map(|by| by * contrast))
+                .chain(by_radii.map(|by| by * contrast));
+            for (slot, part) in gradient.iter_mut().zip(parts) {
+                *slot = part;
+            }
+            matrix.syger(weight, &gradient, &gradient, 1.0);
+            right += gradient * (weight * residual);
+        })?;
+        for i in 0..UNKNOWNS_WITH_RADII {
+            matrix[(i, i)] += 1e-9;
+        }
+        let inverse = matrix.cholesky()?.inverse();
+        let step = inverse * right;
+        let free = (count - UNKNOWNS_WITH_RADII as f64).max(1.0);
+        let variance = (squares - step.dot(&right)).max(0.0) / free + 1.0 / 12.0;
+        let [(outer, _), free @ .., _dot, _middle] = scene.radii;
+        let (mut off, mut deviation) = (0.0_f64, 0.0_f64);
+        for (index, (radius, _)) in (UNKNOWNS_WITH_EXTRAS..).zip(free) {
+            off = off.max(radius / outer * step[index].abs());
+            deviation = deviation.max(radius / outer * (variance * inverse[(index, index)]).sqrt());
+        }
+        Some(Radii { off, deviation })
+    }
+}
+
 impl ModelFit {
     /// Root mean square residual, in units of the contrast.
     pub(super) fn residual(&self, scene: &Scene<'_>) -> f64 {
@@ -90,8 +170,11 @@ impl Scene<'_> {
             disc_ratio: score.disc_ratio,
             ring_balance: score.ring_balance,
             contrast: fit.model.contrast(),
+            black: fit.model.black,
             blur_px: fit.model.blur_px,
             response: fit.model.response,
+            mosaic: self.mosaic,
+            radii: self.radii_count.then(|| fit.model.radii(self, fit.huber_limit)).flatten(),
         })
     }
 

@@ -2,15 +2,17 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::blur::{Blur, PixelResponse, RadiusDistribution};
+use super::blur::{Blur, InterpolatedBlur, PixelResponse, RadiusDistribution};
 use super::model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL, UNKNOWNS, UNKNOWNS_WITH_EXTRAS};
 use super::scene::{FOCUSED_PX, PixelSample, Scene};
+use super::{MAX_MOSAIC_STEP, MAX_PROCESSED_STEP};
 use crate::families::rings::circle_pose::CirclePose;
 use crate::optics::camera_response::{CameraResponse, SHARPENING_PX};
 use crate::optics::exposure::ClippedExposure;
 use crate::optics::least_squares::{
     Damping, Influence, Next, NormalEquations, Problem, Schedule, huber, minimise,
 };
+use crate::optics::mosaic::Mosaic;
 
 /// Bounds of the blur in any direction, as a standard deviation in pixels.
 const MIN_BLUR_PX: f64 = 0.3;
@@ -38,6 +40,27 @@ pub(super) struct RingModel {
     pub(super) response: CameraResponse,
 }
 
+/// A pixel as blurred by the sharpening's kernel.
+pub(super) struct Sharpened {
+    pub(super) radius: RadiusDistribution,
+    /// The blur over that with the kernel, and its derivative by the blur.
+    pub(super) ratio: f64,
+    ratio_by_blur: f64,
+}
+
+impl Sharpened {
+    /// What a camera of this response shows of a pixel and of what surrounds it.
+    #[inline]
+    pub(super) fn processed(
+        &self,
+        own: &PixelResponse,
+        blurred: &PixelResponse,
+        response: &CameraResponse,
+    ) -> PixelResponse {
+        own.processed(response, blurred, self.ratio, self.ratio_by_blur)
+    }
+}
+
 impl RingModel {
     /// White minus black, in grey levels.
     pub(super) fn contrast(&self) -> f64 {
@@ -52,37 +75,67 @@ impl RingModel {
         scene: &Scene<'_>,
         mut visit: impl FnMut(&PixelSample, &PixelResponse),
     ) -> Option<()> {
+        self.for_each_place(scene, |sample, radius, wide| {
+            let response = radius.response(scene);
+            match wide {
+                None => visit(sample, &response),
+                Some(wide) => {
+                    let blurred = wide.radius.response(scene);
+                    visit(sample, &wide.processed(&response, &blurred, &self.response));
+                }
+            }
+        })
+    }
+
+    /// Calls `visit` with each sample that counts and its distance from the centre, and with that as blurred by the
+    /// sharpening's kernel where the camera's processing takes part.
+    #[inline]
+    pub(super) fn for_each_place(
+        &self,
+        scene: &Scene<'_>,
+        mut visit: impl FnMut(&PixelSample, &RadiusDistribution, Option<&Sharpened>),
+    ) -> Option<()> {
         // Large enough to hide the latency of divisions and roots.
         const BATCH: usize = 8;
         let plane = self.pose.plane(scene.camera);
         let blur = Blur::new(self.blur_px, self.motion);
-        let wide_px = self.blur_px.hypot(SHARPENING_PX);
+        let phases = scene.mosaic.map(|m| InterpolatedBlur::by_phase(m, self.blur_px, self.motion));
+        // Sharpening spreads pixels of all phases.
+        let blur_px = match scene.mosaic {
+            None => self.blur_px,
+            Some(_) => (self.blur_px * self.blur_px + Mosaic::MEAN_VARIANCE).sqrt(),
+        };
+        let wide_px = blur_px.hypot(SHARPENING_PX);
         let is_linear = self.response == CameraResponse::LINEAR && scene.extras != Extras::Response;
         let wide = (!is_linear).then(|| Blur::new(wide_px, self.motion));
-        let ratio = self.blur_px / wide_px;
-        let ratio_by_blur = (1.0 - ratio * ratio) / wide_px;
+        let ratio = blur_px / wide_px;
+        let ratio_by_blur = (1.0 - ratio * ratio) / wide_px * (self.blur_px / blur_px);
         for samples in scene.samples.chunks(BATCH * scene.stride) {
             let mut counted = samples.iter().step_by(scene.stride);
             let last = samples.last()?;
             let batch: [&PixelSample; BATCH] =
                 std::array::from_fn(|_| counted.next().unwrap_or(last));
-            let radii = batch.map(|sample| RadiusDistribution::about(&sample.ray, &plane, &blur));
+            let radii = match &phases {
+                None => batch.map(|sample| RadiusDistribution::about(&sample.ray, &plane, &blur)),
+                Some(blurs) => batch.map(|sample| {
+                    let [first, others @ ..] = blurs;
+                    let blur = match usize::from(sample.phase).checked_sub(1) {
+                        None => first,
+                        Some(other) => others.get(other).unwrap_or(first),
+                    };
+                    RadiusDistribution::interpolated(&sample.ray, &plane, blur)
+                }),
+            };
             let count = samples.len().div_ceil(scene.stride);
             for (sample, radius) in batch.iter().zip(&radii).take(count) {
                 if !radius.at.is_valid() {
                     return None;
                 }
-                let response = radius.response(scene);
-                match &wide {
-                    None => visit(sample, &response),
-                    Some(wide) => {
-                        let blurred = RadiusDistribution::about(&sample.ray, &plane, wide);
-                        let blurred = blurred.response(scene);
-                        let shown =
-                            response.processed(&self.response, &blurred, ratio, ratio_by_blur);
-                        visit(sample, &shown);
-                    }
-                }
+                let wide = wide.as_ref().map(|wide| {
+                    let radius = RadiusDistribution::about(&sample.ray, &plane, wide);
+                    Sharpened { radius, ratio, ratio_by_blur }
+                });
+                visit(sample, radius, wide.as_ref());
             }
         }
         Some(())
@@ -167,6 +220,13 @@ impl RingModel {
         total.is_finite().then_some(NormalEquations { matrix, right, cost: total, extra })
     }
 
+    /// The same with a lens as sharp as it is when a part of the blur is that of a mosaic.
+    pub(super) fn sharper(&self) -> Self {
+        let variance = self.blur_px * self.blur_px - Mosaic::MEAN_VARIANCE;
+        let blur_px = variance.max(FOCUSED_PX * FOCUSED_PX / 2.0).sqrt();
+        Self { blur_px, ..*self }
+    }
+
     fn moved(&self, step: &SVector<f64, UNKNOWNS_WITH_EXTRAS>, extras: Extras) -> Option<Self> {
         let blur_px = self.blur_px + step[5].clamp(-MAX_BLUR_STEP_PX, MAX_BLUR_STEP_PX);
         let blur_px = blur_px.clamp(MIN_BLUR_PX, MAX_BLUR_PX);
@@ -227,6 +287,7 @@ fn with_extras(
 }
 
 /// A model at its least cost.
+#[derive(Copy, Clone)]
 pub(super) struct ModelFit {
     pub(super) model: RingModel,
     pub(super) equations: Equations,
@@ -331,7 +392,10 @@ impl Scene<'_> {
                     black: 0.0,
                     white: 255.0,
                     gradient: [0.0; 2],
-                    response: CameraResponse::LINEAR,
+                    response: match self.extras {
+                        Extras::Response => CameraResponse::ORDINARY,
+                        _ => CameraResponse::LINEAR,
+                    },
                 };
                 model.expose(self)?;
                 // About three times the residuals of a good fit.
@@ -379,6 +443,22 @@ impl Scene<'_> {
         let is_small = gain < MAX_GAIN * equations.cost;
         equations.cost -= gain;
         is_small.then_some(ModelFit { model, equations, huber_limit })
+    }
+
+    /// The mosaic of which one step from a linear fit explains most, where that is more than without one.
+    pub(super) fn likely_mosaic(&self, fit: &ModelFit) -> Option<Mosaic> {
+        let cost = |model: &RingModel, mosaic: Option<Mosaic>| {
+            let scene = Scene { mosaic, ..*self };
+            let equations = model.linearised(&scene, fit.huber_limit)?;
+            let step = equations.step(1e-6, RIDGE)?;
+            Some(equations.cost - step.dot(&equations.right))
+        };
+        let sharper = fit.model.sharper();
+        let costs = Mosaic::ALL.iter().filter_map(|m| Some((*m, cost(&sharper, Some(*m))?)));
+        let (mosaic, least) = costs.min_by(|a, b| a.1.total_cmp(&b.1))?;
+        let is_likely = least < MAX_PROCESSED_STEP * fit.cost()
+            || least < MAX_MOSAIC_STEP * cost(&fit.model, None)?;
+        is_likely.then_some(mosaic)
     }
 
     /// The share of a linear fit's cost that a camera's processing would explain, by the quadratic model.
