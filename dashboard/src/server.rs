@@ -294,7 +294,7 @@ async fn video(
     upgrade: WebSocketUpgrade,
 ) -> Response {
     let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
-    match std::future::ready(app.access(peer, &headers).and_then(|_| permit)).await {
+    match std::future::ready(app.access(peer, &headers).and(permit)).await {
         Ok(permit) => bounded(upgrade).on_upgrade(move |socket| pictures(app, socket, permit)),
         Err(refusal) => app.refuse(refusal),
     }

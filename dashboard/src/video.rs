@@ -1,6 +1,5 @@
 //! Pictures for the browsers that look, and for nobody else.
 
-use std::borrow::Cow;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -171,7 +170,7 @@ impl Video {
 }
 
 /// The JPEG files of a frame: those that came, or one that is made; `None` when they do not match the header.
-fn files(header: &FrameHeader, bytes: &Cow<'_, [u8]>, quality: u8) -> Option<Vec<u8>> {
+fn files(header: &FrameHeader, bytes: &[u8], quality: u8) -> Option<Vec<u8>> {
     let told: u64 = header.parts.iter().map(|part| u64::from(part.bytes)).sum();
     let is_whole = header.parts.is_empty() || told == bytes.len() as u64;
     is_whole.then(|| jpeg(header, bytes, quality)).flatten()
@@ -222,8 +221,8 @@ mod tests {
         let part = FramePart { x: 0, y: 0, width: 8, height: 8, scale: 1, bytes: 5 };
         let format = messages::PixelFormat::Jpeg;
         let header = FrameHeader { parts: vec![part], format, ..FrameHeader::sample() };
-        assert!(files(&header, &Cow::Borrowed(&[0; 5]), 80).is_some());
-        assert!(files(&header, &Cow::Borrowed(&[0; 6]), 80).is_none());
+        assert!(files(&header, &[0; 5], 80).is_some());
+        assert!(files(&header, &[0; 6], 80).is_none());
     }
 
     #[test]
