@@ -1,10 +1,10 @@
 //! What the controller publishes about a flight.
 
-use autopilot::Autopilot;
+use autopilot::{Autopilot, LandedState};
 use landing::{Action, Decision, Lander};
 use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
 
-use crate::config::{Config, Mode};
+use crate::config::{Config, Mode, Start};
 use crate::frames::Frames;
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
@@ -122,6 +122,10 @@ impl View<'_> {
             (State::SendingLandingTarget, None) => {
                 (Phase::Failed, "no landing target is sent in this mode".to_owned())
             }
+            (State::Idle, None) if self.is_said_to_stand() => {
+                let why = "no landing is resumed, as the autopilot says that the vehicle stands on the ground; waiting for the start of one";
+                (Phase::Idle, why.to_owned())
+            }
             (State::Idle, None) => (Phase::Idle, "waiting for the start of a landing".to_owned()),
             (State::AwaitingTakeoff, None) if self.autopilot.state().is_none() => {
                 (Phase::Idle, "waiting for the autopilot's heartbeat".to_owned())
@@ -133,6 +137,12 @@ impl View<'_> {
             (State::Failed { why }, _) => (Phase::Failed, why.clone()),
             (State::Landing, _) => (wire::phase(self.lander.phase()), self.reason()),
         }
+    }
+
+    /// Whether a landing was to be resumed, and the motors of a vehicle run that is said to stand.
+    fn is_said_to_stand(&self) -> bool {
+        self.config.start == Start::Resume
+            && self.autopilot.state().is_some_and(|s| s.armed && s.landed == LandedState::OnGround)
     }
 
     /// The reason for the lander's phase.

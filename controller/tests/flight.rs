@@ -636,7 +636,13 @@ fn a_controller_restarted_after_touchdown_lands_no_later_flight() {
         hover(&mut flight, 20, 500, mode);
         receive(&mut flight, 500 * MS, &contact(contact_at_start));
         hover(&mut flight, 520, 1000, mode);
-        let first = flight.status(1000 * MS).phase;
+        let status = flight.status(1000 * MS);
+        let is_said_to_stand = status.why.contains("stands on the ground");
+        assert_eq!(
+            is_said_to_stand,
+            contact_at_start == MavLandedState::MAV_LANDED_STATE_ON_GROUND
+        );
+        let first = status.phase;
         receive(&mut flight, 5001 * MS, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
         hover(&mut flight, 5020, 5500, 4);
         (first, flight.status(5500 * MS).phase)

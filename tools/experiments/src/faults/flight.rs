@@ -418,11 +418,17 @@ impl<'a> FaultyFlight<'a> {
                     self.start_s = Some(now_s);
                     self.world.begin();
                 }
-                // A controller that was started anew and hears no heartbeat can do no more.
-                let is_deaf = [Kind::SilenceFrom, Kind::SilenceBoth, Kind::HeartbeatMissing]
-                    .into_iter()
-                    .any(|kind| self.is_on(kind));
-                let is_over = is_terminal(status.phase) || is_deaf && status.phase == Phase::Idle;
+                // A controller that was started anew and hears no heartbeat, or that the vehicle stands, can do no more.
+                let is_deceived = [
+                    Kind::SilenceFrom,
+                    Kind::SilenceBoth,
+                    Kind::HeartbeatMissing,
+                    Kind::LandedOnGround,
+                ]
+                .into_iter()
+                .any(|kind| self.is_on(kind));
+                let is_idle = is_deceived && status.phase == Phase::Idle;
+                let is_over = is_terminal(status.phase) || is_idle;
                 (status.phase.name().to_owned(), status.why, is_over)
             }
             None if self.is_on(Kind::ControllerKilled) => gone("gone"),
