@@ -2,6 +2,8 @@
 
 #[path = "architecture/circles.rs"]
 mod circles;
+#[path = "architecture/files.rs"]
+mod files;
 #[path = "architecture/source.rs"]
 mod source;
 
@@ -617,6 +619,23 @@ fn the_architecture_has_the_topic_table() -> anyhow::Result<()> {
         ensure!(table.contains(&line.as_str()), "ARCHITECTURE.md lacks the row\n{line}");
     }
     ensure!(table.len() == TOPICS.len() + 1, "rows without a topic in {table:#?}");
+    Ok(())
+}
+
+#[test]
+fn the_architecture_lists_every_source_file() -> anyhow::Result<()> {
+    let markdown = text(root().join("ARCHITECTURE.md"))?;
+    let (_, list) = markdown.split_once("\n## The files\n").context("no list of the files")?;
+    let files = tracked("rs")?;
+    if files.is_empty() {
+        return Ok(());
+    }
+    let expected = files::rows(files.iter().map(Path::new));
+    for row in &expected {
+        ensure!(list.lines().any(|line| line == row), "ARCHITECTURE.md lacks the row\n{row}");
+    }
+    let rows = list.lines().filter(|line| line.starts_with("| `")).count();
+    ensure!(rows == expected.len(), "ARCHITECTURE.md lists {rows} rooms of {}", expected.len());
     Ok(())
 }
 
