@@ -10,8 +10,10 @@ const HOLD_MS = 1000;
  * @typedef {{ send: (message: object) => boolean, tell: (text: string, mood: string) => void }} Link */
 
 /** The press under way; there is one at most.
- * @type {{ button: HTMLButtonElement, nonce: string | null, timer: number } | null} */
+ * @type {{ button: HTMLButtonElement, number: number, nonce: string | null, timer: number } | null} */
 let press = null;
+/** Presses so far: the nonce of an earlier one is good for nothing once the next was asked for. */
+let presses = 0;
 
 /** @param {HTMLButtonElement} button */
 function named(button) {
@@ -22,9 +24,10 @@ function named(button) {
 /** @param {Link} link @param {HTMLButtonElement} button */
 function begin(link, button) {
   if (press || button.disabled) return;
-  press = { button, nonce: null, timer: 0 };
+  presses += 1;
+  press = { button, number: presses, nonce: null, timer: 0 };
   link.tell('Keep holding ...', 'busy');
-  if (!link.send({ kind: 'nonce', ...named(button) })) {
+  if (!link.send({ kind: 'nonce', ...named(button), press: presses })) {
     cancel(link, 'No connection.');
   }
 }
@@ -39,11 +42,9 @@ function cancel(link, why) {
 }
 
 /** A nonce has come: the second begins.
- * @param {Link} link @param {{ command: string, argument: string | null, nonce: string }} message */
+ * @param {Link} link @param {{ press: number | null, nonce: string }} message */
 export function nonceCame(link, message) {
-  if (!press || press.nonce) return;
-  const { command, argument } = named(press.button);
-  if (command !== message.command || (argument ?? null) !== (message.argument ?? null)) return;
+  if (!press || press.nonce || press.number !== message.press) return;
   press.nonce = message.nonce;
   press.button.classList.add('holding');
   press.timer = setTimeout(() => {

@@ -91,8 +91,8 @@ pub(crate) struct App {
 #[derive(Deserialize)]
 #[serde(rename_all = "kebab-case", tag = "kind")]
 enum Ask {
-    /// A nonce for a command.
-    Nonce { command: String, argument: Option<String> },
+    /// A nonce for a command; the answer names the press of the button that it is for.
+    Nonce { command: String, argument: Option<String>, press: Option<u64> },
     /// To carry out a command.
     Command { command: String, argument: Option<String>, nonce: String },
     /// The time.
@@ -419,7 +419,7 @@ impl Client {
                     json!({ "kind": "pong", "at_ms": at_ms, "now_ms": now_ns() as f64 * 1e-6 });
                 Some(pong.to_string().into())
             }
-            Ask::Nonce { command, argument } => {
+            Ask::Nonce { command, argument, press } => {
                 let mut random = [0; 16];
                 if getrandom::fill(&mut random).is_err() {
                     return Some(refused(
@@ -430,7 +430,7 @@ impl Client {
                 }
                 let nonce =
                     self.nonce.open(now_ns(), random, &whole(&command, argument.as_deref()));
-                let answer = json!({ "kind": "nonce", "command": command, "argument": argument, "nonce": nonce });
+                let answer = json!({ "kind": "nonce", "command": command, "argument": argument, "press": press, "nonce": nonce });
                 Some(answer.to_string().into())
             }
             Ask::Command { command, argument, nonce } => {
