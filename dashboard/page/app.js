@@ -35,9 +35,9 @@ const age = (ms) => (ms < 9950 ? `${(ms / 1000).toFixed(1)} s` : `${Math.round(m
 
 const degrees = (/** @type {number} */ radians) => (radians * 180) / Math.PI;
 
-/** What was told last, and when it came.
- * @type {{ now: any, nowAt: number, slow: any, slowAt: number, heardAt: number, hello: any, offset: number | null, bestTrip: number, trip: number | null }} */
-const known = { now: null, nowAt: 0, slow: null, slowAt: 0, heardAt: 0, hello: null, offset: null, bestTrip: Infinity, trip: null };
+/** What was told last, and when it came; `toldMs` is the newest stamp of the server.
+ * @type {{ now: any, nowAt: number, slow: any, slowAt: number, heardAt: number, toldMs: number | null, hello: any, offset: number | null, bestTrip: number, trip: number | null }} */
+const known = { now: null, nowAt: 0, slow: null, slowAt: 0, heardAt: 0, toldMs: null, hello: null, offset: null, bestTrip: Infinity, trip: null };
 /** The picture that was drawn last. @type {{ header: any, at: number, drawn: number } | null} */
 let picture = null;
 let hasVideo = false;
@@ -45,6 +45,12 @@ let hasVideo = false;
 let socket = null;
 let pause = RECONNECT_MS;
 const map = new Map2();
+/** Makes the pictures come over a new connection where none come. @type {(() => void) | null} */
+let videoAgain = null;
+
+/** Time since the server told something, at least: since it came, or by the server's stamp, so that a slow way counts as well.
+ * @param {number} at @param {number} cameAt @param {number | null} stampMs */
+const since = (at, cameAt, stampMs) => Math.max(at - cameAt, known.offset === null || stampMs === null ? 0 : at + known.offset - stampMs);
 
 const link = {
   /** @param {object} message */
@@ -61,11 +67,11 @@ const link = {
 };
 
 const strips = {
-  height: new Strip(element('strips'), 'Height', 'm', 2, 1),
-  lateral: new Strip(element('strips'), 'Beside the pad', 'm', 3, 0.1),
-  age: new Strip(element('strips'), 'Age of detection', 'ms', 0, 100),
-  picture: new Strip(element('strips'), 'Picture, light to screen', 'ms', 0, 100),
-  trip: new Strip(element('strips'), 'Page to server and back', 'ms', 1, 10),
+  height: new Strip(element('strips'), 'Height', 'm', 2, 1, STALE_MS),
+  lateral: new Strip(element('strips'), 'Beside the pad', 'm', 3, 0.1, STALE_MS),
+  age: new Strip(element('strips'), 'Age of detection', 'ms', 0, 100, STALE_MS),
+  picture: new Strip(element('strips'), 'Picture, light to screen', 'ms', 0, 100, STALE_MS),
+  trip: new Strip(element('strips'), 'Page to server and back', 'ms', 1, 10, SLOW_STALE_MS),
 };
 
 /** @param {string} path */
@@ -94,8 +100,13 @@ async function begin() {
 function connect() {
   const mine = new WebSocket(address('/ws'));
   socket = mine;
-  known.heardAt = performance.now();
-  mine.onopen = () => { pause = RECONNECT_MS; };
+  [known.heardAt, known.toldMs] = [performance.now(), null];
+  // Another way, perhaps another server: its clock is compared anew.
+  known.bestTrip = Infinity;
+  mine.onopen = () => {
+    pause = RECONNECT_MS;
+    ping();
+  };
   mine.onmessage = (event) => take(JSON.parse(event.data));
   mine.onclose = () => { if (socket === mine) disconnect(); };
 }
@@ -115,6 +126,7 @@ function disconnect() {
 function take(message) {
   const at = performance.now();
   known.heardAt = at;
+  if (message.now_ms != null) known.toldMs = Math.max(known.toldMs ?? message.now_ms, message.now_ms);
   if (message.kind === 'now') {
     [known.now, known.nowAt] = [message, at];
     showNow(message, at);
@@ -155,11 +167,15 @@ function enable() {
   }
 }
 
-const isConnected = () => socket !== null && socket.readyState === WebSocket.OPEN && performance.now() - known.heardAt < STALE_MS;
+const isConnected = () => socket !== null && socket.readyState === WebSocket.OPEN && since(performance.now(), known.heardAt, known.toldMs) < STALE_MS;
+
+/** Asks for the server's time. */
+const ping = () => link.send({ kind: 'ping', at_ms: performance.now() });
 
 /** @param {any} message @param {number} at */
-function showNow({ status, target, vehicle }, at) {
+function showNow({ status, target, vehicle, now_ms: stampMs }, at) {
   if (status) {
+    const isCurrent = status.age_ms + since(at, at, stampMs) < STALE_MS;
     put('title', status.title);
     element('title').className = `title ${status.mood}`;
     put('why', status.why);
@@ -174,9 +190,9 @@ function showNow({ status, target, vehicle }, at) {
     put('autopilot', `${status.autopilot}${status.setpoint_timeout_s == null ? '' : `; stops ${status.setpoint_timeout_s} s after the last setpoint`}`);
     put('detector-why', `${status.detector ? `In use: ${status.detector}` : 'None is in use'} (${status.detector_why}); preferred: ${status.preference || 'none'}; ${status.detector_changes} changes.`);
     rows(element('warnings'), status.warnings.map((/** @type {string} */ text) => ['li', text]));
-    strips.height.add(at, status.age_ms < STALE_MS ? status.height_m : null);
-    strips.lateral.add(at, status.age_ms < STALE_MS ? status.lateral_error_m : null);
-    strips.age.add(at, status.age_ms < STALE_MS ? status.detection_age_ms : null);
+    strips.height.add(at, isCurrent ? status.height_m : null);
+    strips.lateral.add(at, isCurrent ? status.lateral_error_m : null);
+    strips.age.add(at, isCurrent ? status.detection_age_ms : null);
   }
   if (vehicle) {
     put('mode', vehicle.mode);
@@ -327,19 +343,27 @@ function showLog({ now_ms: now, entries }) {
 function lookAtAges() {
   const at = performance.now();
   const connected = isConnected();
-  put('connection', connected ? 'connected' : `no connection for ${age(at - known.heardAt)}`);
+  // What comes late is no connection either.
+  const silent = at - known.heardAt;
+  const lost = silent < STALE_MS && socket?.readyState === WebSocket.OPEN ? `${age(since(at, known.heardAt, known.toldMs))} behind` : `no connection for ${age(silent)}`;
+  put('connection', connected ? 'connected' : lost);
   element('connection').className = `badge ${connected ? 'good' : 'lost'}`;
-  if (socket && at - known.heardAt > SILENCE_MS) disconnect();
+  document.querySelector('main')?.classList.toggle('cut-off', !connected);
+  if (socket && silent > SILENCE_MS) disconnect();
+  const nowOld = known.now ? since(at, known.nowAt, known.now.now_ms) : Infinity;
+  const slowOld = known.slow ? since(at, known.slowAt, known.slow.now_ms) : Infinity;
   for (const panel of document.querySelectorAll('[data-group]')) {
     const group = known.now?.[/** @type {HTMLElement} */ (panel).dataset.group ?? ''];
-    const old = group ? group.age_ms + (at - known.nowAt) : null;
+    const old = group ? group.age_ms + nowOld : null;
     const isStale = old === null || old > STALE_MS;
     panel.classList.toggle('stale', isStale);
     const label = panel.querySelector('.age');
     if (label) put(/** @type {HTMLElement} */ (label), old === null ? 'not heard' : isStale ? `${age(old)} old` : '');
   }
   const status = known.now?.status;
-  const phaseOld = status ? status.age_ms + (at - known.nowAt) : Infinity;
+  const phaseOld = status ? status.age_ms + nowOld : Infinity;
+  // These are told with the status, and shown in other panels.
+  for (const id of ['autopilot', 'detector-why']) element(id).classList.toggle('old', phaseOld > STALE_MS);
   const badge = element('phase');
   if (phaseOld <= STALE_MS) {
     put(badge, status.title);
@@ -351,9 +375,9 @@ function lookAtAges() {
   for (const line of document.querySelectorAll('tbody tr')) {
     const told = /** @type {HTMLElement} */ (line).dataset.age;
     const limit = line.closest('#detectors') ? SLOW_STALE_MS - 1000 : SLOW_STALE_MS + 1000;
-    line.classList.toggle('old', !told || Number(told) + (at - known.slowAt) > limit);
+    line.classList.toggle('old', !told || Number(told) + slowOld > limit);
   }
-  element('checks').classList.toggle('old', at - known.slowAt > SLOW_STALE_MS);
+  for (const id of ['checks', 'recorders']) element(id).classList.toggle('old', slowOld > SLOW_STALE_MS);
   if (picture) {
     const old = at - picture.at;
     const isOld = old > STALE_MS;
@@ -431,4 +455,4 @@ enable();
 begin();
 setInterval(lookAtAges, 100);
 setInterval(redraw, 200);
-setInterval(() => link.send({ kind: 'ping', at_ms: performance.now() }), 1000);
+setInterval(ping, 1000);

@@ -9,13 +9,14 @@ const colour = (name) => getComputedStyle(document.documentElement).getPropertyV
 
 /** A strip of one number over time. */
 export class Strip {
-  /** @param {HTMLElement} parent @param {string} title @param {string} unit @param {number} digits @param {number} minMax */
-  constructor(parent, title, unit, digits, minMax) {
+  /** @param {HTMLElement} parent @param {string} title @param {string} unit @param {number} digits @param {number} minMax @param {number} staleMs */
+  constructor(parent, title, unit, digits, minMax, staleMs) {
     /** @type {{ at: number, value: number | null }[]} */
     this.points = [];
     this.unit = unit;
     this.digits = digits;
     this.minMax = minMax;
+    this.staleMs = staleMs;
     const box = document.createElement('div');
     box.className = 'strip';
     const line = document.createElement('p');
@@ -47,7 +48,9 @@ export class Strip {
     context.clearRect(0, 0, width, height);
     const values = this.points.flatMap((point) => (point.value === null ? [] : [point.value]));
     const max = values.reduce((a, b) => Math.max(a, b), this.minMax);
-    const last = this.points.at(-1)?.value;
+    // A number that no newer one has followed in time is none.
+    const newest = this.points.at(-1);
+    const last = newest && now - newest.at <= this.staleMs ? newest.value : null;
     this.text.textContent = `${last == null ? '-' : last.toFixed(this.digits)} ${this.unit} (to ${max.toFixed(this.digits)})`;
     context.strokeStyle = colour('--grid');
     context.lineWidth = 1;

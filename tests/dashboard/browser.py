@@ -35,6 +35,17 @@ SPREAD = """() => {
 }"""
 
 
+# How the lines of elements go: `line-through` where they are struck through.
+LINES = "(selector) => [...document.querySelectorAll(selector)].map((it) => getComputedStyle(it).textDecorationLine)"
+# What tells of the landing, each in its own way, and has something to tell throughout.
+TELLING = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span", "#video-text"]
+# A button that is pressed shortly and then held, before the server has answered the first press.
+TWICE = """(button) => {
+  const key = (kind) => button.dispatchEvent(new KeyboardEvent(kind, { key: ' ', bubbles: true }));
+  ['keydown', 'keyup', 'keydown'].forEach(key);
+}"""
+
+
 def asked(what):
     print(what, flush=True)
     sys.stdin.readline()
@@ -81,6 +92,13 @@ def main():
         wait(page, "/accepted by the controller/.test(document.getElementById('reply').textContent)")
         wait(page, "document.getElementById('phase').textContent === 'Holding the position'")
         page.screenshot(path=FOLDER / "holding.png", full_page=True)
+        for selector in TELLING:
+            wait(page, f"/^none(,none)*$/.test(({LINES})({json.dumps(selector)}))", 10)
+
+        page.locator("button[data-command=hold]").evaluate(TWICE)
+        time.sleep(1.4)
+        page.locator("button[data-command=hold]").dispatch_event("keyup", {"key": " "})
+        wait(page, "/by the controller/.test(document.getElementById('reply').textContent)", 10)
 
         page.set_viewport_size({"width": 360, "height": 740})
         time.sleep(0.5)
@@ -97,11 +115,17 @@ def main():
         measured["grey_s"] = wait(page, stale, 5)
         assert page.locator("button[data-command=abort]").is_disabled(), "a button can be used without a connection"
         assert "was:" in text(page, "#phase"), text(page, "#phase")
+        for selector in TELLING:
+            lines = page.evaluate(LINES, selector)
+            assert lines and set(lines) == {"line-through"}, f"{selector} is not struck through: {lines}"
         time.sleep(1.5)
+        for strip in page.locator(".strip:not(:last-child) p span:last-child").all_inner_texts():
+            assert strip.startswith("- "), f"a number of long ago: {strip}"
         page.screenshot(path=FOLDER / "cut-off.png", full_page=True)
         asked("START")
         measured["back_s"] = wait(page, "document.getElementById('connection').textContent === 'connected'", 10)
         wait(page, "!document.getElementById('video-panel').classList.contains('stale')", 10)
+        wait(page, "!document.querySelector('main').classList.contains('cut-off')", 2)
 
         # By the pointer.
         box = page.locator("button[data-command=resume]").bounding_box()
