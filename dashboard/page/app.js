@@ -379,7 +379,7 @@ function lookAtAges() {
   }
   for (const id of ['checks', 'recorders']) element(id).classList.toggle('old', slowOld > SLOW_STALE_MS);
   if (picture) {
-    const old = at - picture.at;
+    const old = since(at, picture.at, picture.header.shown_ms);
     const isOld = old > STALE_MS;
     element('video-panel').classList.toggle('stale', isOld);
     put('video-age', isOld ? `${age(old)} old` : '');
@@ -397,9 +397,10 @@ function pictureTold(message) {
   const { header } = message;
   picture = { header, at, drawn: message.drawn };
   const light = known.offset === null ? null : at + known.offset - header.taken_ms;
-  strips.picture.add(at, light);
+  // Of another host's clock nobody knows here when the light came.
+  strips.picture.add(at, header.is_own_clock ? light : null);
   const seen = header.markers === null ? 'nobody has told in time what is in it' : `${header.detector}${header.is_used ? '' : ' (not in use)'} found ${header.markers.length} in it`;
-  put('video-text', `${header.camera} ${header.sequence}, ${header.width} x ${header.height}: ${seen}${light === null ? '' : `; ${light.toFixed(0)} ms after the light`}.`);
+  put('video-text', `${header.camera} ${header.sequence}, ${header.width} x ${header.height}: ${seen}${light === null ? '' : `; ${light.toFixed(0)} ms after ${header.is_own_clock ? 'the light' : 'it came'}`}.`);
 }
 
 function startVideo() {

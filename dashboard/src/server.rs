@@ -60,6 +60,8 @@ const MAX_REQUEST_BYTES: usize = 4096;
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
 /// Period in which a browser is looked after that gets pictures.
 const LOOK_PERIOD: Duration = Duration::from_millis(500);
+/// Maximum age of the picture that a browser gets at first, in nanoseconds.
+const MAX_FIRST_AGE_NS: i64 = 1_000_000_000;
 /// Replies to commands that wait to be sent to a browser, and its commands under way.
 const MAX_COMMANDS: usize = 4;
 /// Time that a button is held, in milliseconds.
@@ -313,7 +315,11 @@ async fn send(socket: &mut WebSocket, message: Message) -> anyhow::Result<()> {
 /// Sends pictures, the newest that there is whenever the browser has drawn one.
 async fn pictures(app: Arc<App>, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
     let mut shown = app.shown.subscribe();
-    shown.mark_changed();
+    // The newest picture is an old one when the camera stands still.
+    let newest_ns = shown.borrow().as_ref().map(|it| it.at_ns);
+    if newest_ns.is_some_and(|at_ns| now_ns() - at_ns <= MAX_FIRST_AGE_NS) {
+        shown.mark_changed();
+    }
     let mut window = Window::default();
     let mut look = interval(LOOK_PERIOD);
     loop {
@@ -323,7 +329,7 @@ async fn pictures(app: Arc<App>, mut socket: WebSocket, _permit: OwnedSemaphoreP
                 if changed.is_err() {
                     return;
                 }
-                let Some(Shown { number, message }) = shown.borrow_and_update().clone() else { continue };
+                let Some(Shown { number, message, .. }) = shown.borrow_and_update().clone() else { continue };
                 window.sent(now_ns(), number);
                 if send(&mut socket, Message::Binary(message)).await.is_err() {
                     return;

@@ -10,7 +10,7 @@ use messages::{Detection, Detections, FrameHeader, topic};
 use node::{Frame, Node, now_ns};
 use serde_json::{Value, json};
 use tokio::sync::watch;
-use tokio::time::{Instant, interval, sleep, sleep_until};
+use tokio::time::{Instant, interval, sleep, sleep_until, timeout};
 
 use crate::config::{Input, VideoConfig};
 use crate::pairing::{Pairing, Picture};
@@ -32,6 +32,8 @@ const MAX_MARKERS: usize = 32;
 pub(crate) struct Shown {
     /// Its number since the start of this process.
     pub(crate) number: u64,
+    /// When it was made, in nanoseconds of this process' clock.
+    pub(crate) at_ns: i64,
     /// The length of the header (4 bytes, lowest first), the header as JSON, the JPEG files.
     pub(crate) message: Bytes,
 }
@@ -88,9 +90,7 @@ impl Video {
                 biased;
                 told = told.next_with_key() => {
                     let (key, told) = told.context("the network session was closed")?;
-                    // A detector is known by its key.
-                    let detector = topic::DETECTIONS.first_name(&key).unwrap_or_default().to_owned();
-                    pairing.detections(Detections { detector, ..told });
+                    hear(&mut pairing, &key, told);
                 }
                 _ = look.tick() => {
                     if self.shown.receiver_count() > 0 {
@@ -106,6 +106,11 @@ impl Video {
                     if is_due && self.is_wanted(&frame.header) {
                         last_ns = Some(now_ns());
                         self.add(frame, &mut pairing).await?;
+                        // What was told while the picture was made is there before the picture's wait ends.
+                        while let Ok(found) = timeout(Duration::ZERO, told.next_with_key()).await {
+                            let (key, found) = found.context("the network session was closed")?;
+                            hear(&mut pairing, &key, found);
+                        }
                     }
                 }
             }
@@ -123,7 +128,8 @@ impl Video {
 
     /// Makes the picture of a frame, on a thread for such work.
     async fn add(&self, frame: Frame, pairing: &mut Pairing) -> anyhow::Result<()> {
-        let began = Instant::now();
+        // Making it takes its time, and counts.
+        let (began, received_ns) = (Instant::now(), now_ns());
         let quality = self.config.jpeg_quality;
         let make = move || {
             let files = files(&frame.header, &frame.bytes(), quality);
@@ -133,7 +139,7 @@ impl Video {
         match files.filter(|files| files.len() <= MAX_BYTES) {
             Some(files) => {
                 self.node.health().latency("picture", began.elapsed());
-                if pairing.picture(now_ns(), header, files) {
+                if pairing.picture(received_ns, header, files) {
                     self.node.health().dropped("too many pictures wait");
                 }
             }
@@ -151,7 +157,8 @@ impl Video {
 
     fn show(&mut self, picture: &Picture) {
         self.number += 1;
-        let header = header_json(self.number, picture, node::clock_name()).to_string();
+        let at_ns = now_ns();
+        let header = header_json(self.number, at_ns, picture, node::clock_name()).to_string();
         let mut message = Vec::with_capacity(4 + header.len() + picture.files.len());
         message.extend_from_slice(&(header.len() as u32).to_le_bytes());
         message.extend_from_slice(header.as_bytes());
@@ -160,13 +167,23 @@ impl Video {
         if picture.found.is_none() {
             self.node.health().dropped("picture without detections in time");
         }
-        self.shown.send_replace(Some(Shown { number: self.number, message: message.into() }));
+        self.shown.send_replace(Some(Shown {
+            number: self.number,
+            at_ns,
+            message: message.into(),
+        }));
     }
 
     // What is known is whole after each message, also when a thread panics.
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// Notes what a detector told; it is known by its key.
+fn hear(pairing: &mut Pairing, key: &str, told: Detections) {
+    let detector = topic::DETECTIONS.first_name(key).unwrap_or_default().to_owned();
+    pairing.detections(Detections { detector, ..told });
 }
 
 /// The JPEG files of a frame: those that came, or one that is made; `None` when they do not match the header.
@@ -176,7 +193,7 @@ fn files(header: &FrameHeader, bytes: &[u8], quality: u8) -> Option<Vec<u8>> {
     is_whole.then(|| jpeg(header, bytes, quality)).flatten()
 }
 
-fn header_json(number: u64, picture: &Picture, clock: &str) -> Value {
+fn header_json(number: u64, at_ns: i64, picture: &Picture, clock: &str) -> Value {
     let header = &picture.header;
     let parts: Vec<Value> = header
         .parts
@@ -186,12 +203,13 @@ fn header_json(number: u64, picture: &Picture, clock: &str) -> Value {
         })
         .collect();
     // Of another host's clock only the arrival can be compared with ours.
-    let taken_ns = if header.clock == clock { header.stamp_ns } else { picture.received_ns };
+    let is_own_clock = header.clock == clock;
+    let taken_ns = if is_own_clock { header.stamp_ns } else { picture.received_ns };
     let found = picture.found.as_ref();
     json!({
         "number": number,
         "camera": header.camera, "sequence": header.sequence, "stamp_ns": header.stamp_ns.to_string(),
-        "taken_ms": taken_ns as f64 * 1e-6, "shown_ms": now_ns() as f64 * 1e-6,
+        "taken_ms": taken_ns as f64 * 1e-6, "is_own_clock": is_own_clock, "shown_ms": at_ns as f64 * 1e-6,
         "width": header.width, "height": header.height, "parts": parts,
         "detector": found.map(|it| &it.detector), "is_used": picture.is_used,
         "found_sequence": found.map(|it| it.header.sequence),
@@ -234,11 +252,13 @@ mod tests {
             found: Some(Detections::sample()),
             is_used: true,
         };
-        let json = header_json(3, &picture, "clock");
+        let json = header_json(3, 9_000_000, &picture, "clock");
         assert_eq!((&json["sequence"], &json["taken_ms"]), (&json!(7), &json!(2.0)));
+        assert_eq!((&json["is_own_clock"], &json["shown_ms"]), (&json!(true), &json!(9.0)));
         assert_eq!(json["markers"][0]["centre"], json!([720.0, 522.0]));
-        assert_eq!(header_json(3, &picture, "another")["taken_ms"], 5.0);
-        let bare = header_json(3, &Picture { found: None, ..picture }, "clock");
+        let other = header_json(3, 9_000_000, &picture, "another");
+        assert_eq!((&other["is_own_clock"], &other["taken_ms"]), (&json!(false), &json!(5.0)));
+        let bare = header_json(3, 9_000_000, &Picture { found: None, ..picture }, "clock");
         assert_eq!(bare["markers"], Value::Null);
     }
 }
