@@ -404,8 +404,11 @@ function pictureTold(message) {
 }
 
 function startVideo() {
-  // A canvas is handed over once; the connection comes back by itself.
-  if (hasVideo) return;
+  // A canvas is handed over once. Its connection comes back by itself where it ends; one that hangs does not tell.
+  if (hasVideo) {
+    videoAgain?.();
+    return;
+  }
   hasVideo = true;
   const canvas = /** @type {HTMLCanvasElement} */ (element('video'));
   const url = address('/video');
@@ -414,8 +417,9 @@ function startVideo() {
     const worker = new Worker('/worker.js', { type: 'module' });
     worker.onmessage = (event) => pictureTold(event.data);
     worker.postMessage({ canvas: offscreen, address: url }, [offscreen]);
+    videoAgain = () => worker.postMessage({ again: true });
   } else {
-    follow(canvas, url, pictureTold);
+    videoAgain = follow(canvas, url, pictureTold);
   }
 }
 

@@ -3,20 +3,29 @@
 
 const RECONNECT_MS = 500;
 const MAX_RECONNECT_MS = 2000;
+/** A connection that brought something within this time does not hang, in milliseconds. */
+const LIVELY_MS = 1000;
 
-/** Follows the pictures and draws each; `told` hears of each, and of the connection.
+/** Follows the pictures and draws each; `told` hears of each, and of the connection. Gives what connects anew where nothing comes.
  * @param {HTMLCanvasElement | OffscreenCanvas} canvas @param {string} address @param {(message: any) => void} told */
 export function follow(canvas, address, told) {
   const context = /** @type {any} */ (canvas.getContext('2d', { alpha: false }));
   let pause = RECONNECT_MS;
   let drawn = 0;
+  let heardAt = -Infinity;
+  let timer = 0;
+  /** @type {WebSocket | null} */
+  let current = null;
   const connect = () => {
     const socket = new WebSocket(address);
+    current = socket;
     socket.binaryType = 'arraybuffer';
     socket.onopen = () => { pause = RECONNECT_MS; };
     /** @param {ArrayBuffer} message */
     const show = async (message) => {
       const { header, bitmaps } = await decode(message);
+      // Of a connection that was given up nothing is drawn over what is newer.
+      if (socket !== current) return;
       draw(canvas, context, header, bitmaps);
       drawn += 1;
       // Only what was drawn is acknowledged: at most two pictures are on their way.
@@ -25,14 +34,25 @@ export function follow(canvas, address, told) {
     };
     // One after the other, so that no picture is drawn over a newer one.
     let last = Promise.resolve();
-    socket.onmessage = (event) => { last = last.then(() => show(event.data)).catch(() => socket.close()); };
+    socket.onmessage = (event) => {
+      heardAt = performance.now();
+      last = last.then(() => show(event.data)).catch(() => socket.close());
+    };
     socket.onclose = () => {
+      if (socket !== current) return;
       told({ kind: 'closed' });
-      setTimeout(connect, pause);
+      timer = Number(setTimeout(connect, pause));
       pause = Math.min(2 * pause, MAX_RECONNECT_MS);
     };
   };
   connect();
+  return () => {
+    if (performance.now() - heardAt < LIVELY_MS) return;
+    clearTimeout(timer);
+    const old = current;
+    connect();
+    old?.close();
+  };
 }
 
 /** Header and bitmaps of a message. @param {ArrayBuffer} message */
@@ -62,10 +82,9 @@ function draw(canvas, context, header, bitmaps) {
     canvas.width = header.width;
     canvas.height = header.height;
   }
-  if (header.parts.length > 0) {
-    context.fillStyle = '#000';
-    context.fillRect(0, 0, canvas.width, canvas.height);
-  }
+  // What was found is never drawn over another picture, also where this one is damaged.
+  context.fillStyle = '#000';
+  context.fillRect(0, 0, canvas.width, canvas.height);
   for (const { part, bitmap } of bitmaps.reverse()) {
     context.drawImage(bitmap, part.x, part.y, part.width * part.scale, part.height * part.scale);
     bitmap.close();
