@@ -38,7 +38,7 @@ SPREAD = """() => {
 # How the lines of elements go: `line-through` where they are struck through.
 LINES = "(selector) => [...document.querySelectorAll(selector)].map((it) => getComputedStyle(it).textDecorationLine)"
 # What tells of the landing, each in its own way, and has something to tell throughout.
-TELLING = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span", "#video-text"]
+TELLING = ["#height", "#why", "#mode", "#detector-why", "#detectors td", "#services td", "#recorders", "#checks span", "#strips span:last-child", "#video-text"]
 # A button that is pressed shortly and then held, before the server has answered the first press.
 TWICE = """(button) => {
   const key = (kind) => button.dispatchEvent(new KeyboardEvent(kind, { key: ' ', bubbles: true }));
