@@ -66,8 +66,8 @@ pub struct Facts<'a> {
     pub round_trip_ms: Option<Option<f64>>,
     /// A recorder that is heard.
     pub recorder: Option<&'a RecorderStatus>,
-    /// Whether a process listens beyond its machine without keys.
-    pub is_insecure: bool,
+    /// Whether a process listens beyond its machine without keys; `None` while no process is heard.
+    pub is_insecure: Option<bool>,
     /// Services that have fallen silent.
     pub silent: Vec<String>,
 }
@@ -83,7 +83,8 @@ fn finding(verdict: Verdict, text: impl Into<String>, todo: &'static str) -> Fin
     Finding { verdict, text: text.into(), todo }
 }
 
-fn is_current(age_ms: Option<f64>) -> bool {
+/// Whether what is so old counts as of now.
+pub(crate) fn is_current(age_ms: Option<f64>) -> bool {
     age_ms.is_some_and(|age_ms| age_ms < MAX_AGE_MS)
 }
 
@@ -262,10 +263,12 @@ fn recording(facts: &Facts<'_>) -> Finding {
 fn keys(facts: &Facts<'_>) -> Finding {
     let todo =
         "Make keys (`alight keys`, docs/deploy.md): anyone in reach can command the vehicle.";
-    if facts.is_insecure {
-        finding(Verdict::Bad, "a process listens beyond its machine without keys", todo)
-    } else {
-        finding(Verdict::Good, "nobody listens to strangers", todo)
+    match facts.is_insecure {
+        Some(true) => {
+            finding(Verdict::Bad, "a process listens beyond its machine without keys", todo)
+        }
+        Some(false) => finding(Verdict::Good, "nobody listens to strangers", todo),
+        None => finding(Verdict::Open, "no process is heard", todo),
     }
 }
 
@@ -278,6 +281,7 @@ fn warnings(facts: &Facts<'_>) -> Finding {
         texts.push(&silent);
     }
     match texts.as_slice() {
+        [] if facts.status.is_none() => finding(Verdict::Open, "no controller is heard", todo),
         [] => finding(Verdict::Good, "none", todo),
         texts => finding(Verdict::Bad, texts.join("; "), todo),
     }
@@ -340,7 +344,7 @@ mod tests {
             controller_clock: Some("clock"),
             round_trip_ms: Some(Some(1.0)),
             recorder: Some(&recorder),
-            is_insecure: false,
+            is_insecure: Some(false),
             silent: Vec::new(),
         };
         for check in checks(&facts) {
@@ -352,7 +356,7 @@ mod tests {
         assert_eq!(verdict(&old, "marker"), Verdict::Bad);
         let foreign = Facts { controller_clock: Some("other"), ..facts.clone() };
         assert_eq!(verdict(&foreign, "clock"), Verdict::Bad);
-        let open = Facts { is_insecure: true, silent: vec!["detector main".into()], ..facts };
+        let open = Facts { is_insecure: Some(true), silent: vec!["detector main".into()], ..facts };
         assert_eq!(verdict(&open, "keys"), Verdict::Bad);
         assert_eq!(verdict(&open, "warnings"), Verdict::Bad);
     }

@@ -135,8 +135,12 @@ impl App {
     }
 
     fn access(&self, peer: SocketAddr, headers: &HeaderMap) -> Result<Access, Refusal> {
-        let cookie = self.cookie(headers);
-        let session = cookie.and_then(|cookie| self.sessions().kind(cookie, now_s()));
+        let session = self.cookie(headers).and_then(|cookie| {
+            let tokens = tokio::task::block_in_place(|| self.tokens()).unwrap_or_default();
+            let mut sessions = self.sessions();
+            sessions.keep(&tokens);
+            sessions.kind(cookie, now_s())
+        });
         self.guard.access(peer.ip(), session)
     }
 
@@ -252,9 +256,11 @@ async fn login(Shared(app): Shared<Arc<App>>, token: String) -> Response {
         tracing::warn!(problem = format!("{problem:#}"), "No token is accepted");
         Tokens::default()
     });
-    let begun = tokens.kind(&token, now_s()).and_then(|kind| Some((kind, secret().ok()?)));
-    let Some((kind, cookie)) = begun else { return app.refuse(Refusal::Token) };
-    app.sessions().begin(&cookie, kind, now_s());
+    let token = tokens.of(&token, now_s()).cloned();
+    let begun = token.and_then(|token| Some((token, secret().ok()?)));
+    let Some((token, cookie)) = begun else { return app.refuse(Refusal::Token) };
+    let kind = token.kind;
+    app.sessions().begin(&cookie, token, now_s());
     app.log(Level::Info, &format!("a browser has shown a token of the kind `{kind}`"));
     let cookie =
         format!("{}={cookie}; HttpOnly; SameSite=Strict; Path=/; Max-Age={SESSION_S}", app.cookie);

@@ -11,7 +11,7 @@ use messages::{
 };
 use serde_json::{Value, json};
 
-use crate::checks::{Facts, checks};
+use crate::checks::{Facts, checks, is_current};
 use crate::found::Found;
 use crate::log::{Level, Log};
 use crate::words;
@@ -377,8 +377,13 @@ impl State {
 
     fn facts(&self, now_ns: i64) -> Facts<'_> {
         let status = self.status.as_ref();
+        let status_age_ms = status.map(|it| self.age_of(now_ns, it.received_ns, it.value.stamp_ns));
+        let vehicle = self.vehicle.as_ref();
+        let vehicle_age_ms =
+            vehicle.map(|it| self.age_of(now_ns, it.received_ns, it.value.stamp_ns));
         let in_use = self.in_use();
         let found = in_use.and_then(|name| self.found.get(name));
+        let found = found.filter(|it| is_current(Some(age_ms(now_ns, it.received_ns))));
         let camera = found.map(|it| it.value.header.camera.as_str());
         let controller = self.services.iter().find(|(key, _)| key.0 == "controller");
         let frames = self.services.values().filter(|it| !it.is_silent).find_map(|it| {
@@ -390,13 +395,10 @@ impl State {
                 .any(|it| it.health.errors.iter().any(|fault| fault.reason == name))
         };
         Facts {
-            status: status.map(|seen| &seen.value),
-            status_age_ms: status.map(|it| self.age_of(now_ns, it.received_ns, it.value.stamp_ns)),
-            vehicle: self.vehicle.as_ref().map(|seen| &seen.value),
-            vehicle_age_ms: self
-                .vehicle
-                .as_ref()
-                .map(|it| self.age_of(now_ns, it.received_ns, it.value.stamp_ns)),
+            status: status.map(|seen| &seen.value).filter(|_| is_current(status_age_ms)),
+            status_age_ms,
+            vehicle: vehicle.map(|seen| &seen.value).filter(|_| is_current(vehicle_age_ms)),
+            vehicle_age_ms,
             found: found.map(|it| &it.value),
             found_age_ms: found.map(|it| age_ms(now_ns, it.received_ns)),
             frames_hz: frames,
@@ -410,7 +412,11 @@ impl State {
                 .values()
                 .find(|it| age_ms(now_ns, it.received_ns) < ms(SILENT_NS))
                 .map(|it| &it.value),
-            is_insecure: has_fault(node::INSECURE),
+            is_insecure: self
+                .services
+                .values()
+                .any(|it| !it.is_silent)
+                .then(|| has_fault(node::INSECURE)),
             silent: self
                 .services
                 .iter()

@@ -70,9 +70,11 @@ fn hash(secret: &str) -> String {
     hex(&Sha256::digest(secret.as_bytes()))
 }
 
+/// A token, without its secret.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Token {
-    kind: Kind,
+pub struct Token {
+    /// What it is for.
+    pub kind: Kind,
     hash: String,
     /// In seconds since 1970.
     expires_s: u64,
@@ -140,12 +142,12 @@ impl Tokens {
         self.tokens.push(Token { kind, hash: hash(secret), expires_s });
     }
 
-    /// What a secret is a token for; `None` for one that is wrong or has expired.
-    pub fn kind(&self, secret: &str, now_s: u64) -> Option<Kind> {
+    /// The token of a secret; `None` for one that is wrong or has expired.
+    pub fn of(&self, secret: &str, now_s: u64) -> Option<&Token> {
         let hash = hash(secret.trim());
         // Comparing hashes tells nothing of the secret by its duration.
         let token = self.tokens.iter().find(|token| token.hash == hash);
-        token.filter(|token| token.expires_s > now_s).map(|token| token.kind)
+        token.filter(|token| token.expires_s > now_s)
     }
 }
 
@@ -198,26 +200,32 @@ pub struct Sessions {
 
 #[derive(Clone, Debug)]
 struct Session {
-    kind: Kind,
+    token: Token,
     expires_s: u64,
 }
 
 impl Sessions {
-    /// Begins a session with this cookie.
-    pub fn begin(&mut self, cookie: &str, kind: Kind, now_s: u64) {
+    /// Begins a session with this cookie, no longer than its token lasts.
+    pub fn begin(&mut self, cookie: &str, token: Token, now_s: u64) {
         self.by_hash.retain(|_, session| session.expires_s > now_s);
         if self.by_hash.len() >= MAX_SESSIONS {
             let first = self.by_hash.iter().min_by_key(|(_, session)| session.expires_s);
             let first = first.map(|(hash, _)| hash.clone());
             first.and_then(|hash| self.by_hash.remove(&hash));
         }
-        self.by_hash.insert(hash(cookie), Session { kind, expires_s: now_s + SESSION_S });
+        let expires_s = token.expires_s.min(now_s + SESSION_S);
+        self.by_hash.insert(hash(cookie), Session { token, expires_s });
     }
 
     /// The kind of the session of a cookie, while it lasts.
     pub fn kind(&self, cookie: &str, now_s: u64) -> Option<Kind> {
         let session = self.by_hash.get(&hash(cookie))?;
-        (session.expires_s > now_s).then_some(session.kind)
+        (session.expires_s > now_s).then_some(session.token.kind)
+    }
+
+    /// Ends the sessions of tokens that are no longer there.
+    pub fn keep(&mut self, tokens: &Tokens) {
+        self.by_hash.retain(|_, session| tokens.tokens.contains(&session.token));
     }
 
     /// Ends a session.
@@ -245,11 +253,12 @@ mod tests {
         assert!(!text.contains(&look) && !text.contains(&fly), "{text}");
         let read = Tokens::read(&path).unwrap();
         assert_eq!(read, tokens);
-        assert_eq!(read.kind(&look, 19), Some(Kind::Monitor));
-        assert_eq!(read.kind(&format!("{fly}\n"), 19), Some(Kind::Command));
-        assert_eq!(read.kind(&look, 20), None);
-        assert_eq!(read.kind("wrong", 10), None);
-        assert_eq!(read.kind("", 10), None);
+        let kind = |secret: &str, now_s| read.of(secret, now_s).map(|token| token.kind);
+        assert_eq!(kind(&look, 19), Some(Kind::Monitor));
+        assert_eq!(kind(&format!("{fly}\n"), 19), Some(Kind::Command));
+        assert_eq!(kind(&look, 20), None);
+        assert_eq!(kind("wrong", 10), None);
+        assert_eq!(kind("", 10), None);
         tokens.write(&path).unwrap();
     }
 
@@ -267,17 +276,25 @@ mod tests {
 
     #[test]
     fn sessions_end_and_are_bounded() {
+        let token = |kind, expires_s: u64| Token { kind, hash: expires_s.to_string(), expires_s };
         let mut sessions = Sessions::default();
-        sessions.begin("a", Kind::Monitor, 0);
+        sessions.begin("short", token(Kind::Monitor, 60), 0);
+        assert_eq!(sessions.kind("short", 59), Some(Kind::Monitor));
+        assert_eq!(sessions.kind("short", 60), None, "as its token");
+        sessions.begin("a", token(Kind::Monitor, u64::MAX), 0);
         assert_eq!(sessions.kind("a", SESSION_S - 1), Some(Kind::Monitor));
         assert_eq!(sessions.kind("a", SESSION_S), None);
         assert_eq!(sessions.kind("b", 0), None);
         for number in 0..200 {
-            sessions.begin(&number.to_string(), Kind::Command, number);
+            sessions.begin(&number.to_string(), token(Kind::Command, u64::MAX), number);
         }
         assert_eq!(sessions.by_hash.len(), MAX_SESSIONS);
         assert_eq!(sessions.kind("199", 200), Some(Kind::Command));
         sessions.end("199");
         assert_eq!(sessions.kind("199", 200), None);
+        sessions.keep(&Tokens { tokens: vec![token(Kind::Command, u64::MAX)] });
+        assert_eq!(sessions.kind("198", 200), Some(Kind::Command));
+        sessions.keep(&Tokens::default());
+        assert_eq!(sessions.kind("198", 200), None, "its line was removed");
     }
 }
