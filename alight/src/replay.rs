@@ -89,6 +89,8 @@ fn one(tape: &RecordedTape, args: &ReplayArgs) -> anyhow::Result<bool> {
     ))?;
     if let Some(stop) = &end.stop {
         print(&stop.to_string())?;
+    } else if !end.is_ended {
+        print("the tape has no end: the controller was killed, or the end was not recorded")?;
     }
     Ok(end.stop.is_none())
 }

@@ -5,7 +5,7 @@ use landing::{
     EnvelopeConfig, EstimatorConfig, GuidanceConfig, MetricConfig, PhaseConfig, TargetConfig,
     ThesisConfig,
 };
-use node::{Check, Settings};
+use node::{Check, Settings, clock_name};
 use serde::{Deserialize, Serialize};
 
 /// The keys of `controller.toml`, which has their meanings, units and ranges.
@@ -26,6 +26,8 @@ pub struct Config {
     pub guidance: GuidanceName,
     /// The marker to land on.
     pub marker: String,
+    /// Name of the clock whose frames are used; empty: this machine's.
+    pub clock: String,
     /// The link to the autopilot.
     pub autopilot: AutopilotSettings,
     /// The landing targets for the autopilot's own precision landing.
@@ -242,6 +244,11 @@ impl DetectorSettings {
 }
 
 impl Config {
+    /// The clock whose frames are used.
+    pub(crate) fn clock(&self) -> &str {
+        if self.clock.is_empty() { clock_name() } else { &self.clock }
+    }
+
     /// The take-off of `start = "takeoff"`.
     pub(crate) fn takeoff(&self) -> Takeoff {
         Takeoff::new(self.takeoff_height_m).of_real_vehicle(self.takeoff_real_vehicle)

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use landing::{FrameObservation, Timestamp};
 use messages::{CameraInfo, Detections, Place};
-use node::clock_name;
 
 use crate::agreement::Sight;
 use crate::cameras::{Cameras, Reception};
@@ -21,6 +20,8 @@ const UNUSABLE_NS: i64 = 1_000_000_000;
 #[derive(Debug)]
 pub struct Frames {
     marker: String,
+    /// The clock whose frames are used.
+    clock: String,
     max_future_s: f64,
     /// The detectors and the active one.
     pub selection: Selection,
@@ -65,6 +66,7 @@ impl Frames {
     pub fn new(config: &Config) -> Self {
         Self {
             marker: config.marker.clone(),
+            clock: config.clock().to_owned(),
             max_future_s: config.target.max_future_s,
             selection: selection(&config.detectors),
             newest: BTreeMap::new(),
@@ -98,11 +100,12 @@ impl Frames {
                 )
             });
         }
-        if header.clock != clock_name() {
+        if header.clock != self.clock {
+            let ours = self.clock.clone();
             return self.refuse(now_ns, "another-clock", || {
                 format!(
                     "detections of `{publisher}` are refused: camera `{}` stamps its frames with the clock `{}`, the controller has `{}`; run both on one machine, or correct the clock's name",
-                    header.camera, header.clock, clock_name()
+                    header.camera, header.clock, ours
                 )
             });
         }

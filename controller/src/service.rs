@@ -1,5 +1,6 @@
 //! The service: detectors, autopilot and operator in, setpoints and reports out.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -197,6 +198,7 @@ struct Tapes {
     passed_on_ns: i64,
     /// Whether a part found no room.
     is_cut: bool,
+    health: Arc<HealthCounters>,
 }
 
 impl Tapes {
@@ -214,7 +216,8 @@ impl Tapes {
                 }
             }
         });
-        Ok(Self { waiting, publishing, passed_on_ns: now_ns(), is_cut: false })
+        let health = node.shared_health();
+        Ok(Self { waiting, publishing, passed_on_ns: now_ns(), is_cut: false, health })
     }
 
     /// Hands the tape over at its period. What finds no room is missing, which the numbers of what follows tell.
@@ -225,13 +228,14 @@ impl Tapes {
             return;
         }
         self.passed_on_ns = now;
-        if let Some(tape) = flight.take_tape()
-            && self.waiting.try_send(tape).is_err()
-            && !std::mem::replace(&mut self.is_cut, true)
-        {
-            tracing::info!(
-                "Nobody records: what is recorded from now on cannot be replayed from the start"
-            );
+        let Some(tape) = flight.take_tape() else { return };
+        if self.waiting.try_send(tape).is_err() {
+            self.health.dropped("parts of the tape");
+            if !std::mem::replace(&mut self.is_cut, true) {
+                tracing::info!(
+                    "Nobody records, or not quickly enough: what is recorded from now on cannot be replayed from the start"
+                );
+            }
         }
     }
 

@@ -51,7 +51,12 @@ impl TapedFlight {
     ///
     /// # Errors
     /// When the lander refuses its settings.
-    pub fn new(now_ns: i64, config: Config, health: Arc<HealthCounters>) -> anyhow::Result<Self> {
+    pub fn new(
+        now_ns: i64,
+        mut config: Config,
+        health: Arc<HealthCounters>,
+    ) -> anyhow::Result<Self> {
+        config.clock = config.clock().to_owned();
         let configuration = to_toml(&config);
         let mut flight = Self {
             flight: Flight::new(config, health)?,

@@ -23,10 +23,10 @@ const LOOK_PERIOD: Duration = Duration::from_millis(20);
 const RETRY_PAUSE: Duration = Duration::from_secs(2);
 /// A disk that takes nothing for this time is told.
 const STALLED: Duration = Duration::from_secs(1);
-/// Time for the messages that wait at the end.
-const LAST_MESSAGES: Duration = Duration::from_millis(300);
+/// Time for the last messages of others that end at the same time, as a controller does that puts parameters back.
+const LAST_MESSAGES: Duration = Duration::from_millis(600);
 /// Time that the disk gets for the rest at the end; `alight land` kills after 2 s.
-const END_PATIENCE: Duration = Duration::from_millis(1300);
+const END_PATIENCE: Duration = Duration::from_millis(1100);
 /// Period of the status.
 const STATUS_PERIOD: Duration = Duration::from_millis(500);
 /// Maximum number of keys whose last values, losses or pictures are remembered.
@@ -150,7 +150,7 @@ impl Recorder {
             if is_last {
                 last.get_or_insert_with(|| Instant::now() + LAST_MESSAGES);
             }
-            let message = tap.next(if is_last { Duration::ZERO } else { MAX_WAIT });
+            let message = tap.next(MAX_WAIT);
             let is_empty = message.is_none();
             if let Some(message) = message {
                 self.take(message);
@@ -160,7 +160,7 @@ impl Recorder {
                 self.count_dropped(tap);
                 self.look_after_file();
             }
-            if last.is_some_and(|last| is_empty || Instant::now() >= last) {
+            if last.is_some_and(|last| Instant::now() >= last) {
                 while let Some(message) = tap.next(Duration::ZERO) {
                     self.lose(message.key, 1);
                 }

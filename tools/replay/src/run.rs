@@ -78,6 +78,8 @@ pub struct End {
     pub events: u64,
     /// The time from the first to the last of them, in seconds.
     pub flight_s: f64,
+    /// Whether the last of them is the controller's end.
+    pub is_ended: bool,
     /// Why it went no further; `None` at the end of the tape.
     pub stop: Option<Stop>,
 }
@@ -163,6 +165,7 @@ pub fn run(
                 end.events += 1;
                 continue;
             };
+            end.is_ended = record.event == TapeEvent::Shutdown;
             if !flight.replay(record.now_ns, &record.event) {
                 end.stop = damaged(Some(record.event.name()));
                 return Ok(end);

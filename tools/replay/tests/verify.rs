@@ -6,6 +6,7 @@ use experiments::faults::flight::fly_with_tape;
 use experiments::faults::plan::{Plan, Planned};
 use experiments::landing::in_parallel;
 use flightlog::{RecordedTape, TapeReader};
+use messages::TapeEvent;
 use replay::{Stop, Verdict, change, verify};
 
 fn tapes_of(planned: &Planned) -> anyhow::Result<Vec<RecordedTape>> {
@@ -63,6 +64,18 @@ fn a_flipped_bit_in_any_event_is_found_and_its_event_named() {
             ..=flipped.parts[part].first + u64::from(flipped.parts[part].count);
         assert!(within.contains(&number), "{number} is not in {within:?}");
     }
+}
+
+#[test]
+fn a_tape_names_the_clock_whose_frames_its_flight_used() {
+    let tape = one(12);
+    assert!(verified(&tape).is_verified());
+    let first = tape.parts[0].records().next().unwrap().unwrap();
+    let TapeEvent::Begin { configuration, .. } = &first.event else { panic!("{first:?}") };
+    assert!(configuration.contains(node::clock_name()), "{configuration}");
+    // On a machine with another clock the frames would be refused, if the tape did not say whose they are.
+    let verdict = verify(&tape, &["clock=another".into()]).unwrap();
+    assert!(matches!(verdict.end.stop, Some(Stop::Different { .. })), "{verdict:?}");
 }
 
 #[test]
