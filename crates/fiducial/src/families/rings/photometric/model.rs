@@ -4,7 +4,6 @@ use geometry::CameraModel;
 use imaging::GrayView;
 use nalgebra::SMatrix;
 
-use super::score::Radii;
 use crate::families::rings::circle_pose::CirclePose;
 use crate::optics::camera_response::CameraResponse;
 use crate::optics::mosaic::Mosaic;
@@ -117,4 +116,13 @@ pub(crate) struct PhotometricInput<'a> {
     /// The marker's size in metres.
     pub(crate) size_m: f64,
     pub(crate) white_on_black: bool,
+}
+
+/// How far the radii that would fit best are from the marker's: the three circles between the outermost and the dot.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Radii {
+    /// The largest difference, as a share of the marker's radius.
+    pub(crate) off: f64,
+    /// The largest standard deviation of a difference.
+    pub(crate) deviation: f64,
 }

@@ -3,7 +3,9 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::blur::FREE_RADII;
-use super::model::{Alternative, Extras, MAX_GREY, PhotometricFit, UNKNOWNS, UNKNOWNS_WITH_EXTRAS};
+use super::model::{
+    Alternative, Extras, MAX_GREY, PhotometricFit, Radii, UNKNOWNS, UNKNOWNS_WITH_EXTRAS,
+};
 use super::scene::Scene;
 use super::solve::{ModelFit, RingModel, Sums};
 use crate::optics::least_squares::huber;
@@ -63,15 +65,6 @@ impl RingModel {
 
 /// The unknowns of a fit in which radii are free as well.
 const UNKNOWNS_WITH_RADII: usize = UNKNOWNS_WITH_EXTRAS + FREE_RADII;
-
-/// How far the radii that would fit best are from the marker's: the three circles between the outermost and the dot.
-#[derive(Copy, Clone, Debug)]
-pub(crate) struct Radii {
-    /// The largest difference, as a share of the marker's radius.
-    pub(crate) off: f64,
-    /// The largest standard deviation of a difference.
-    pub(crate) deviation: f64,
-}
 
 impl RingModel {
     /// One step of a fit in which the radii of the circles between the outermost and the dot are free.
