@@ -6,7 +6,7 @@
 //!
 //! Modules in reading order: [`protobuf`] describes and encodes messages, [`foxglove`] has those of Foxglove,
 //! [`channel`] says what a record is and keeps messages as they came and as JSON, [`display`] as Foxglove shows them;
-//! [`writer`] puts both into a file, [`repair`] ends a file properly whose writer was killed, and
+//! [`writer`] puts both into a file, [`mod@repair`] ends a file properly whose writer was killed, and
 //! [`tape`] reads the controllers' tapes.
 
 pub mod channel;

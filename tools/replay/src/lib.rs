@@ -3,8 +3,8 @@
 //! The controller's tape has each event in the order in which it was handled. Here they are given to a flight that
 //! begins anew, without network and clock. What comes out of it is compared with what came out then.
 //!
-//! Modules in reading order: [`run`] gives a tape to a flight, [`difference`] names what two results differ in,
-//! [`verify`] finds the first difference, and [`change`] sums up what another configuration would have done.
+//! Modules in reading order: [`mod@run`] gives a tape to a flight, [`difference`] names what two results differ in,
+//! [`mod@verify`] finds the first difference, and [`mod@change`] sums up what another configuration would have done.
 
 pub mod change;
 pub mod difference;
