@@ -6,19 +6,21 @@
 //!
 //! Modules in reading order: [`protobuf`] describes and encodes messages, [`foxglove`] has those of Foxglove,
 //! [`channel`] says what a record is and keeps messages as they came and as JSON, [`display`] as Foxglove shows them;
-//! [`writer`] puts both into a file, [`mod@repair`] ends a file properly whose writer was killed, and
-//! [`tape`] reads the controllers' tapes.
+//! [`writer`] puts both into a file, [`mod@repair`] ends a file properly whose writer was killed,
+//! [`reader`] reads one as far as it is whole, and [`tape`] the controllers' tapes.
 
 pub mod channel;
 pub mod display;
 pub mod foxglove;
 pub mod protobuf;
+pub mod reader;
 pub mod repair;
 pub mod tape;
 pub mod writer;
 
 pub use channel::{Received, Record, Schema};
 pub use display::Picture;
+pub use reader::{Entry, Reading, read};
 pub use repair::{Repaired, repair};
 pub use tape::{RecordedTape, TapeReader};
 pub use writer::{About, Problem, Writer};

@@ -1,0 +1,219 @@
+//! Reads a recording as far as it is whole.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+
+use mcap::read::{ChunkReader, LinearReader, Options};
+use mcap::records::{MessageHeader, Record};
+use mcap::{Channel, McapError, Summary};
+
+use crate::channel::{RAW_PREFIX, Received, split_raw};
+use crate::writer::{DROPPED_CHANNEL, METADATA, Problem};
+
+/// Something that a recording has.
+#[derive(Clone, Debug)]
+pub enum Entry<'a> {
+    /// Facts about the recording, by name; before everything else.
+    About(BTreeMap<String, String>),
+    /// A message as it came. Of a frame only the attachment, which is its header.
+    Message(Received<'a>),
+    /// Messages that the recorder could not keep, since its start, by key.
+    Dropped(BTreeMap<String, u64>),
+}
+
+/// How much of a recording was read.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Reading {
+    /// Whether it has its end: without, its recorder was killed, or the rest is missing.
+    pub is_ended: bool,
+    /// Messages that were read as they came.
+    pub messages: u64,
+    /// What could not be read, as sentences.
+    pub damage: Vec<String>,
+}
+
+/// Reads a recording; `each` gets what is in it, in order.
+///
+/// # Errors
+/// When it is no MCAP file at all.
+pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Problem> {
+    if !recording.starts_with(mcap::MAGIC) {
+        return Err(McapError::BadMagic.into());
+    }
+    let summary = Summary::read(recording).ok().flatten();
+    let mut found = Found {
+        keys: BTreeMap::new(),
+        in_index: summary.map(|summary| summary.channels).unwrap_or_default(),
+        utc_offset_ns: 0,
+        reading: Reading::default(),
+        lost: 0,
+        each,
+    };
+    let mut chunks = 0;
+    for record in LinearReader::new_with_options(recording, Options::IgnoreEndMagic.into())? {
+        match record {
+            Ok(Record::Metadata(metadata)) if metadata.name == METADATA => {
+                found.about(metadata.metadata);
+            }
+            Ok(Record::Chunk { header, data }) => {
+                chunks += 1;
+                let records = ChunkReader::new(header, &data)
+                    .and_then(Iterator::collect::<Result<Vec<_>, _>>);
+                match records {
+                    Ok(records) => records.iter().for_each(|record| found.record(record)),
+                    Err(problem) => {
+                        let text = format!("chunk {chunks} is damaged: {problem}");
+                        found.reading.damage.push(text);
+                    }
+                }
+            }
+            Ok(Record::DataEnd(_)) => {
+                found.reading.is_ended = true;
+                break;
+            }
+            Ok(_) => {}
+            Err(problem) => {
+                let text = format!("unreadable after {chunks} chunks: {problem}");
+                found.reading.damage.push(text);
+                break;
+            }
+        }
+    }
+    if found.lost > 0 {
+        let text =
+            format!("{} messages are lost: what describes their channel is damaged", found.lost);
+        found.reading.damage.push(text);
+    }
+    Ok(found.reading)
+}
+
+/// What was found so far.
+struct Found<F> {
+    /// Keys by channel.
+    keys: BTreeMap<u16, String>,
+    /// The channels that the index describes.
+    in_index: HashMap<u16, Arc<Channel<'static>>>,
+    utc_offset_ns: i64,
+    reading: Reading,
+    /// Messages of channels that nothing describes.
+    lost: u64,
+    each: F,
+}
+
+impl<F: FnMut(Entry<'_>)> Found<F> {
+    fn about(&mut self, facts: BTreeMap<String, String>) {
+        let offset_ns = facts.get("utc_offset_ns").and_then(|text| text.parse().ok());
+        self.utc_offset_ns = offset_ns.unwrap_or(0);
+        (self.each)(Entry::About(facts));
+    }
+
+    fn record(&mut self, record: &Record<'_>) {
+        match record {
+            Record::Channel(channel) => {
+                self.keys.insert(channel.id, channel.topic.clone());
+            }
+            Record::Message { header, data } => self.message(header, data),
+            _ => {}
+        }
+    }
+
+    fn message(&mut self, header: &MessageHeader, data: &[u8]) {
+        let id = header.channel_id;
+        if !self.keys.contains_key(&id)
+            && let Some(channel) = self.in_index.get(&id)
+        {
+            self.keys.insert(id, channel.topic.clone());
+        }
+        let Some(channel) = self.keys.get(&id) else {
+            self.lost += 1;
+            return;
+        };
+        if channel == DROPPED_CHANNEL {
+            if let Ok(counts) = serde_json::from_slice(data) {
+                (self.each)(Entry::Dropped(counts));
+            }
+            return;
+        }
+        let Some(key) = channel.strip_prefix(RAW_PREFIX) else { return };
+        let Some((attachment, payload)) = split_raw(data) else {
+            self.reading.damage.push(format!("a message of {key} is cut"));
+            return;
+        };
+        let log_ns = i64::try_from(header.log_time).unwrap_or(i64::MAX);
+        let received_ns = log_ns.saturating_sub(self.utc_offset_ns);
+        self.reading.messages += 1;
+        (self.each)(Entry::Message(Received { key, payload, attachment, received_ns }));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use messages::{Wind, encode};
+
+    use super::*;
+    use crate::{About, Writer};
+
+    fn recording() -> Vec<u8> {
+        let facts = [("host".to_owned(), "here".to_owned())].into();
+        let about = About { program: "test".to_owned(), facts, utc_offset_ns: 1_000 };
+        let mut file = Vec::new();
+        let mut recording = Writer::new(&mut file, &about).unwrap();
+        for stamp_ns in 0..50 {
+            let wind = Wind { velocity_ned_m_s: [1.0, 0.0, 0.0], stamp_ns };
+            let payload = encode(&wind);
+            let message = Received {
+                key: "wind",
+                payload: &payload,
+                attachment: b"note",
+                received_ns: stamp_ns + 5,
+            };
+            recording.receive(message).unwrap();
+            recording.flush().unwrap();
+        }
+        recording.dropped(60, &[("truth".to_owned(), 3)].into()).unwrap();
+        recording.finish().unwrap();
+        file
+    }
+
+    /// When the messages came, and what else there is.
+    fn times(file: &[u8]) -> (Vec<i64>, usize, Reading) {
+        let (mut times, mut others) = (Vec::new(), 0);
+        let reading = read(file, |entry| match entry {
+            Entry::Message(message) => {
+                assert_eq!((message.key, message.attachment), ("wind", &b"note"[..]));
+                times.push(message.received_ns);
+            }
+            Entry::About(facts) => {
+                assert_eq!(facts.get("host").map(String::as_str), Some("here"));
+                others += 1;
+            }
+            Entry::Dropped(counts) => {
+                assert_eq!(counts.get("truth"), Some(&3));
+                others += 1;
+            }
+        });
+        (times, others, reading.unwrap())
+    }
+
+    #[test]
+    fn messages_are_read_as_they_came_with_their_time() {
+        let (times, others, reading) = times(&recording());
+        assert_eq!(times, (5..55).collect::<Vec<_>>());
+        assert_eq!((others, reading.is_ended, reading.messages), (2, true, 50));
+        assert!(reading.damage.is_empty(), "{:?}", reading.damage);
+    }
+
+    #[test]
+    fn of_a_damaged_recording_the_rest_is_read_and_the_damage_named() {
+        let file = recording();
+        let (cut, _, reading) = times(&file[..file.len() / 2]);
+        assert!(cut.len() > 10 && cut.len() < 40, "{}", cut.len());
+        assert!(!reading.is_ended);
+        let mut flipped = file.clone();
+        flipped[file.len() / 4] ^= 1;
+        let (some, _, reading) = times(&flipped);
+        assert!(some.len() > 40, "{}", some.len());
+        assert!(!reading.damage.is_empty());
+        assert!(read(b"no file", |_| {}).is_err());
+    }
+}
