@@ -77,6 +77,10 @@ struct LandingArgs {
     /// Number of flights in parallel [default: number of cores].
     #[arg(long, value_name = "N")]
     jobs: Option<usize>,
+    /// Number of the worst flights of each combination that are written as recordings (MCAP), for `alight report` and
+    /// `alight replay`; 0 for none.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    recordings: usize,
     /// Seed of the first flight of each combination; the others follow.
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
@@ -153,6 +157,7 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
         },
         results_in: args.output,
         jobs: args.jobs.unwrap_or_else(cores),
+        recordings: args.recordings,
     };
     let bar = flights_bar();
     let report = landing::run(&request, &|done, of| {

@@ -2,10 +2,11 @@
 //! arrive after their latency, and nothing waits for a clock.
 
 use std::collections::VecDeque;
+use std::io::Write;
 
 use anyhow::Context;
 use autopilot::Parser;
-use controller::flight::Flight;
+use controller::tape::TapedFlight;
 use geometry::{Ned, Point, Vector};
 use messages::Phase;
 use node::Layers;
@@ -15,6 +16,7 @@ use world::world::STEP_S;
 
 use super::outcome::{Ending, Outcome};
 use super::plan::Planned;
+use super::recording::Recording;
 use super::sim_vision::{Arrival, DETECTOR, SimVision};
 
 /// Steps of the world per tick of the controller: 25 ms.
@@ -60,10 +62,27 @@ pub fn fly(planned: &Planned, trace: Option<&mut Vec<Sample>>) -> anyhow::Result
     Ok(flight.outcome)
 }
 
-struct LockstepFlight {
+/// Flies it, and writes a recording of it to `output`, with the controller's tape.
+///
+/// # Errors
+/// As [`fly`], and when the output does not take it.
+pub fn fly_recorded<'a>(planned: &Planned, output: impl Write + 'a) -> anyhow::Result<Outcome> {
+    let run = || {
+        let mut flight = LockstepFlight::new(planned)?;
+        flight.record(Recording::begin(Box::new(output), planned)?)?;
+        flight.run(None)?;
+        Ok::<_, anyhow::Error>(flight.outcome)
+    };
+    run().with_context(|| format!("seed {} of {}", planned.seed, planned.cell))
+}
+
+struct LockstepFlight<'a> {
     world: World,
     vision: SimVision,
-    controller: Flight,
+    controller: TapedFlight,
+    recording: Option<Recording<'a>>,
+    /// The configurations as TOML, by service.
+    configurations: [(&'static str, String); 2],
     from_world: Parser,
     to_world: Parser,
     frame_period_s: f64,
@@ -74,15 +93,20 @@ struct LockstepFlight {
     outcome: Outcome,
 }
 
-impl LockstepFlight {
+impl<'a> LockstepFlight<'a> {
     fn new(planned: &Planned) -> anyhow::Result<Self> {
         let layers = |set: &[String]| Layers { file: None, set: set.to_vec() };
-        let simulated: simulator::Config =
-            layers(&planned.change.simulator).load::<simulator::Config>()?.settings;
-        let controlled = layers(&planned.change.controller).load::<controller::Config>()?.settings;
+        let simulated = layers(&planned.change.simulator).load::<simulator::Config>()?;
+        let controlled = layers(&planned.change.controller).load::<controller::Config>()?;
+        let configurations = [
+            ("simulator", simulated.table.to_string()),
+            ("controller", controlled.table.to_string()),
+        ];
+        let (simulated, controlled) = (simulated.settings, controlled.settings);
         let world = World::new(&simulated.world(), simulated.seed);
         let vision = SimVision::new(&simulated, planned.vision, planned.change.vision)?;
-        let mut controller = Flight::new(controlled, std::sync::Arc::default())?;
+        let begun_ns = stamp_ns(world.now_s());
+        let mut controller = TapedFlight::new(begun_ns, controlled, std::sync::Arc::default())?;
         let frame_period_s = 1.0 / simulated.camera.rate_hz;
         controller.presence(stamp_ns(world.now_s()), DETECTOR, true);
         controller.camera(stamp_ns(world.now_s()), vision.info().clone());
@@ -91,6 +115,8 @@ impl LockstepFlight {
             world,
             vision,
             controller,
+            recording: None,
+            configurations,
             from_world: Parser::new(),
             to_world: Parser::new(),
             frame_period_s,
@@ -99,6 +125,14 @@ impl LockstepFlight {
             was_in_retry: false,
             outcome: Outcome::new(planned),
         })
+    }
+
+    fn record(&mut self, mut recording: Recording<'a>) -> anyhow::Result<()> {
+        let now_ns = stamp_ns(self.world.now_s());
+        let camera = self.vision.info();
+        recording.started(now_ns, &self.configurations, camera)?;
+        self.recording = Some(recording);
+        Ok(())
     }
 
     fn run(&mut self, mut trace: Option<&mut Vec<Sample>>) -> anyhow::Result<()> {
@@ -111,11 +145,19 @@ impl LockstepFlight {
             steps += 1;
             self.world.advance_to(now_s);
             self.record_touchdown(&before);
-            self.pass_to_controller();
+            self.pass_to_controller()?;
             self.update_vision()?;
             if steps.is_multiple_of(TICK_STEPS) {
-                self.controller.tick(stamp_ns(self.world.now_s()));
+                let now_ns = stamp_ns(self.world.now_s());
+                self.controller.tick(now_ns);
                 self.record_status(trace.as_deref_mut());
+                match &mut self.recording {
+                    Some(recording) => {
+                        recording.tick(now_ns, &mut self.controller, &self.world, &self.outcome)?;
+                    }
+                    // Nobody reads it.
+                    None => drop(self.controller.take_tape()),
+                }
                 if over_s.is_none() && self.is_over() {
                     over_s = Some(now_s);
                 }
@@ -126,18 +168,24 @@ impl LockstepFlight {
                 if self.start_s.is_some() { LANDING_TIMEOUT_S } else { START_TIMEOUT_S };
             if over_s.is_some_and(|at_s| now_s - at_s > AFTER_S) || waited_s > timeout_s {
                 self.finish();
-                return Ok(());
+                let recording = self.recording.take();
+                let end_ns = stamp_ns(self.world.now_s());
+                return recording.map_or(Ok(()), |it| it.end(end_ns, &mut self.controller));
             }
         }
     }
 
     /// Passes the autopilot's packets to the controller.
-    fn pass_to_controller(&mut self) {
+    fn pass_to_controller(&mut self) -> anyhow::Result<()> {
         let now_ns = stamp_ns(self.world.now_s());
         let packets: Vec<Vec<u8>> = self.world.outgoing().collect();
         for frame in packets.iter().flat_map(|packet| self.from_world.push(packet)) {
             self.controller.packet(now_ns, &frame);
+            if let Some(recording) = &mut self.recording {
+                recording.packet(now_ns, &frame.raw)?;
+            }
         }
+        Ok(())
     }
 
     /// Takes frames after their exposure, and delivers detections after their latency.
@@ -157,7 +205,11 @@ impl LockstepFlight {
         }
         while self.in_transit.front().is_some_and(|arrival| arrival.at_s <= now_s) {
             if let Some(arrival) = self.in_transit.pop_front() {
-                self.controller.detections(stamp_ns(now_s), DETECTOR, &arrival.message);
+                let (now_ns, message) = (stamp_ns(now_s), &arrival.message);
+                let is_used = self.controller.detections(now_ns, DETECTOR, message);
+                if let Some(recording) = &mut self.recording {
+                    recording.detections(now_ns, message, self.controller.flight(), is_used)?;
+                }
             }
         }
         Ok(())
@@ -203,7 +255,7 @@ impl LockstepFlight {
 
     fn record_status(&mut self, trace: Option<&mut Vec<Sample>>) {
         let now_s = self.world.now_s();
-        let status = self.controller.status(stamp_ns(now_s));
+        let status = self.controller.flight().status(stamp_ns(now_s));
         if status.started_ns.is_some() && self.start_s.is_none() {
             self.start_s = Some(now_s);
             self.world.begin();

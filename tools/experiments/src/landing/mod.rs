@@ -3,13 +3,14 @@
 //!
 //! Modules in reading order: [`plan`] has the flights, with the faults of [`fault`]; [`flight`] flies one,
 //! with the vision of [`sim_vision`], rendered or modelled; [`outcome`] is its result; [`table`] summarises many;
-//! [`plots`] and [`thesis_figures`] draw; [`report`] writes the report.
+//! [`plots`] and [`thesis_figures`] draw; [`report`] writes the report, and `recording` a flight as a recorder would.
 
 pub mod fault;
 pub mod flight;
 pub mod outcome;
 pub mod plan;
 pub mod plots;
+mod recording;
 pub mod report;
 pub mod sim_vision;
 pub mod table;

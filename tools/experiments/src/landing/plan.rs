@@ -130,6 +130,8 @@ pub struct Request {
     pub results_in: PathBuf,
     /// Number of flights in parallel.
     pub jobs: usize,
+    /// Number of the worst flights of each combination that are written as recordings.
+    pub recordings: usize,
 }
 
 /// One flight of a plan.

@@ -2,17 +2,19 @@
 //! the report.
 
 use std::fmt::Write as _;
+use std::fs::File;
+use std::io::BufWriter;
 use std::path::Path;
 
 use anyhow::Context;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::flight::fly;
+use super::flight::{fly, fly_recorded};
 use super::outcome::{Ending, Outcome};
 use super::plan::{Planned, Request};
 use super::table::{markdown, share_interval};
-use super::{plots, thesis_figures};
+use super::{in_parallel, plots, thesis_figures};
 
 /// Maximum number of failures in the report; the CSV has all.
 const MAX_LISTED: usize = 50;
@@ -36,6 +38,7 @@ pub fn write(
     text.push_str(&markdown(outcomes));
     text.push_str(&failures(flights, outcomes));
     text.push_str(&one_flight(folder, flights, outcomes)?);
+    text.push_str(&recordings(request, flights, outcomes)?);
     put(folder, "report.md", &text)?;
     Ok(text)
 }
@@ -105,6 +108,58 @@ fn one_flight(folder: &Path, flights: &[Planned], outcomes: &[Outcome]) -> anyho
         again.error_m.map_or("no touch".to_owned(), |error| format!("{error:.3} m")),
         planned.command()
     ))
+}
+
+/// The worst flights of each combination, flown again with a recorder.
+fn recordings(
+    request: &Request,
+    flights: &[Planned],
+    outcomes: &[Outcome],
+) -> anyhow::Result<String> {
+    let mut rows: Vec<Vec<(&Planned, &Outcome)>> = Vec::new();
+    for pair in flights.iter().zip(outcomes) {
+        match rows.last_mut() {
+            Some(row) if row.first().is_some_and(|(first, _)| first.cell == pair.0.cell) => {
+                row.push(pair);
+            }
+            _ => rows.push(vec![pair]),
+        }
+    }
+    let badness = |outcome: &Outcome| {
+        let error_m = outcome.error_m.unwrap_or(f64::INFINITY);
+        (outcome.is_unsafe(), outcome.ending != Ending::Landed, error_m)
+    };
+    let mut chosen = Vec::new();
+    for (number, row) in rows.iter_mut().enumerate() {
+        row.sort_by(|(_, one), (_, other)| {
+            let (one, other) = (badness(one), badness(other));
+            other.0.cmp(&one.0).then(other.1.cmp(&one.1)).then(other.2.total_cmp(&one.2))
+        });
+        let worst = row.iter().take(request.recordings).copied();
+        chosen.extend(worst.map(|(planned, outcome)| (number + 1, planned, outcome)));
+    }
+    if chosen.is_empty() {
+        return Ok(String::new());
+    }
+    let folder = request.results_in.join("recordings");
+    std::fs::create_dir_all(&folder).with_context(|| format!("making {}", folder.display()))?;
+    let name = |number: usize, planned: &Planned| {
+        format!("row-{number}-{}-seed-{}.mcap", planned.fault.name(), planned.seed)
+    };
+    in_parallel(&chosen, request.jobs, |(number, planned, _)| {
+        let path = folder.join(name(*number, planned));
+        let doing = || format!("writing {}", path.display());
+        let file = File::create(&path).with_context(doing)?;
+        fly_recorded(planned, BufWriter::new(file)).with_context(doing)
+    })?;
+    let mut text = "\n## Recordings of the worst flights\n\nIn `recordings`, for `alight report FILE`, `alight replay FILE --verify` and Foxglove.\n\n".to_owned();
+    for (number, planned, outcome) in &chosen {
+        let error = outcome.error_m.map_or("no touch".to_owned(), |error| format!("{error:.3} m"));
+        let name = name(*number, planned);
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "- `{name}`: {error}, {}; {}", outcome.why, planned.cell);
+    }
+    Ok(text)
 }
 
 /// The flights as JSON, one per line.
