@@ -61,10 +61,11 @@ const TESTS: &str = "tests";
 /// The fuzz targets: they call whatever reads from outside.
 const FUZZ: &str = "fuzz";
 /// The tools that stand above others: they call their pure parts in lock-step, or with what was recorded; the tests of
-/// replay take flights of the experiments.
-const ABOVE: [(&str, &[&str]); 2] = [
+/// replay and report take flights of the experiments.
+const ABOVE: [(&str, &[&str]); 3] = [
     ("experiments", &["controller", "detector", "simulator"]),
     ("replay", &["controller", "experiments"]),
+    ("report", &["experiments", "replay"]),
 ];
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
 const ALIGHT: [&str; 8] =

@@ -11,7 +11,7 @@ use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
 use crate::{
     command, dashboard, detect, detectors, doctor, experiment, keys, land, marker, record, relay,
-    replay, swap, up,
+    replay, report, swap, up,
 };
 
 /// Exit status for an invalid command line or configuration.
@@ -48,6 +48,8 @@ enum Command {
     /// Fly a recorded flight again, from the events that the controller handled: verify it to the bit, or try other
     /// settings on it.
     Replay(replay::ReplayArgs),
+    /// Explain a recorded flight on one page, or two side by side.
+    Report(report::ReportArgs),
     /// Show the landing in a browser, or make a token for one.
     Dashboard(dashboard::DashboardArgs),
     /// Simulate a world with wind, a pad, a vehicle, an autopilot and a camera.
@@ -99,6 +101,7 @@ pub(crate) fn run() -> ExitCode {
         Command::GcsBridge(args) => services::run(Service::GcsBridge, &args),
         Command::Record(args) => record::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Report(args) => report::run(&args),
         Command::Dashboard(args) => dashboard::run(&args),
         Command::Simulator(args) => services::run(Service::Simulator, &args),
         Command::Relay(args) => relay::run(&args),

@@ -1,7 +1,7 @@
 //! Lands a UAV on a printed marker: every service and tool as a subcommand of one program.
 //!
 //! Modules in reading order: `cli` is the command line, with the shared `args`; `services` runs one
-//! service in this process, `record` a recorder or the repair of its file, `replay` a recording back into decisions, `dashboard` a page or a token for it, `relay` connects drone and ground; `up` runs the processes of a `site` on
+//! service in this process, `record` a recorder or the repair of its file, `replay` a recording back into decisions, `report` one on a page, `dashboard` a page or a token for it, `relay` connects drone and ground; `up` runs the processes of a `site` on
 //! this machine and follows its `peers`, `keys` makes the site's keys, `doctor` diagnoses it; `land`
 //! runs all services as processes and watches the landing, with `children` for the processes, `progress`
 //! for the display and `outcome` for the result; `command` sends a command, `detectors` lists the
@@ -30,6 +30,7 @@ mod real_time;
 mod record;
 mod relay;
 mod replay;
+mod report;
 mod runtime;
 mod services;
 mod site;

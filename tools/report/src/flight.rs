@@ -1,0 +1,389 @@
+//! A flight as its recording has it.
+
+use std::collections::BTreeMap;
+
+use flightlog::{Entry, Reading, Received, RecordedTape, TapeReader};
+use messages::{
+    CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo, FrameHeader, Health,
+    MavlinkBytes, Message, RecorderStatus, TapeEvent, TargetEstimate, Topic, Truth, VehicleState,
+    Wind, decode, topic,
+};
+
+use crate::packets::Packets;
+
+/// Maximum time between a stamp and the reception of its message by one clock, in nanoseconds: stamps farther away are
+/// another clock's.
+const MAX_AGE_NS: i64 = 60_000_000_000;
+/// Longest gap over which a position is interpolated, in nanoseconds.
+const MAX_GAP_NS: i64 = 500_000_000;
+
+/// Detections as they came.
+#[derive(Clone, Debug)]
+pub struct Found {
+    /// The detector on whose key they came.
+    pub detector: String,
+    /// When the recorder got them, in nanoseconds of the recorder's clock.
+    pub received_ns: i64,
+    /// What came.
+    pub message: Detections,
+}
+
+/// A frame of a camera.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Frame {
+    /// Its number.
+    pub sequence: u64,
+    /// Mid-exposure, in nanoseconds of its clock.
+    pub stamp_ns: i64,
+}
+
+/// Messages that could not be read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Unreadable {
+    /// How many.
+    pub count: u64,
+    /// Why the first could not.
+    pub why: String,
+}
+
+/// The first and the last health of a process.
+#[derive(Clone, Debug)]
+pub struct Process {
+    /// The first.
+    pub first: Health,
+    /// The last.
+    pub last: Health,
+}
+
+/// What a replay of its tape found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Replayed {
+    /// Whether every event gives the same result again.
+    pub is_verified: bool,
+    /// The same as a sentence.
+    pub text: String,
+}
+
+/// A flight as its recording has it: what was not recorded is empty.
+#[derive(Clone, Debug, Default)]
+pub struct Flight {
+    /// The name of its file.
+    pub name: String,
+    /// Facts about the recording: program, host, clock.
+    pub facts: BTreeMap<String, String>,
+    /// Whether its files have their end.
+    pub is_ended: bool,
+    /// Messages that were read.
+    pub messages: u64,
+    /// What could not be read of its files, as sentences.
+    pub damage: Vec<String>,
+    /// Messages that could not be read, by key.
+    pub unreadable: BTreeMap<String, Unreadable>,
+    /// Messages that the recorder lost since its start, by key.
+    pub lost: BTreeMap<String, u64>,
+    /// The controller's status.
+    pub statuses: Vec<ControllerStatus>,
+    /// The estimates of the landing point.
+    pub targets: Vec<TargetEstimate>,
+    /// The vehicle as the autopilot says.
+    pub vehicle: Vec<VehicleState>,
+    /// The truth, of a simulation.
+    pub truth: Vec<Truth>,
+    /// The wind, of a simulation.
+    pub wind: Vec<Wind>,
+    /// Detections of all detectors, as they came.
+    pub found: Vec<Found>,
+    /// Frames by camera.
+    pub frames: BTreeMap<String, Vec<Frame>>,
+    /// Processes by service, instance and process id.
+    pub processes: BTreeMap<String, Process>,
+    /// Configurations as TOML, by service and instance.
+    pub configurations: BTreeMap<String, String>,
+    /// Detectors by name.
+    pub detectors: BTreeMap<String, DetectorInfo>,
+    /// Cameras by name.
+    pub cameras: BTreeMap<String, CameraInfo>,
+    /// The recorder's last status.
+    pub recorder: Option<RecorderStatus>,
+    /// What the autopilot's packets say.
+    pub packets: Packets,
+    /// The controllers' tapes.
+    pub tapes: Vec<RecordedTape>,
+    /// What a replay of the tapes found; `None` when none was tried.
+    pub replayed: Option<Replayed>,
+    /// What the recorder's clock is ahead of the vehicle's, in nanoseconds.
+    pub shift_ns: i64,
+}
+
+/// Reads the recording of a flight, which may be several files.
+#[derive(Clone, Debug, Default)]
+pub struct FlightReader {
+    flight: Flight,
+    tapes: TapeReader,
+    files: u64,
+}
+
+impl FlightReader {
+    /// An empty one for a flight of this name.
+    pub fn new(name: &str) -> Self {
+        let flight = Flight { name: name.to_owned(), is_ended: true, ..Flight::default() };
+        Self { flight, ..Self::default() }
+    }
+
+    /// Adds a file of the recording.
+    ///
+    /// # Errors
+    /// When it is no MCAP file at all.
+    pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Problem> {
+        let flight = &mut self.flight;
+        let mut lost = BTreeMap::new();
+        let Reading { is_ended, messages, damage } =
+            flightlog::read(recording, |entry| match entry {
+                Entry::About(facts) => flight.facts.extend(facts),
+                Entry::Dropped(counts) => lost = counts,
+                Entry::Message(message) => flight.take(message),
+            })?;
+        // Counted since the recorder's start: the last file has those before it.
+        for (key, count) in lost {
+            let most = flight.lost.entry(key).or_default();
+            *most = count.max(*most);
+        }
+        flight.is_ended &= is_ended;
+        flight.messages += messages;
+        flight.damage.extend(damage);
+        self.tapes.read(recording)?;
+        self.files += 1;
+        Ok(())
+    }
+
+    /// The flight.
+    pub fn finish(self) -> Flight {
+        let Self { mut flight, tapes, .. } = self;
+        flight.tapes = tapes.tapes();
+        flight.sort();
+        let configuration = flight.tapes.iter().find_map(configuration_of);
+        if let Some(toml) = configuration
+            && !flight.configurations.keys().any(|name| name.starts_with("controller"))
+        {
+            flight.configurations.insert("controller (from its tape)".to_owned(), toml);
+        }
+        flight
+    }
+}
+
+/// The configuration at the begin of a tape.
+fn configuration_of(tape: &RecordedTape) -> Option<String> {
+    let first = tape.parts.first()?.records().next()?.ok()?;
+    match first.event {
+        TapeEvent::Begin { configuration, .. } => Some(configuration.into_owned()),
+        _ => None,
+    }
+}
+
+impl Flight {
+    /// True when a recording has nothing of a flight.
+    pub fn is_empty(&self) -> bool {
+        self.messages == 0 && self.tapes.is_empty()
+    }
+
+    /// A time of the recorder's clock by the vehicle's, in nanoseconds.
+    pub fn vehicle_ns(&self, received_ns: i64) -> i64 {
+        received_ns.saturating_sub(self.shift_ns)
+    }
+
+    /// When the landing began, or else the recording, in nanoseconds of the vehicle's clock.
+    pub fn zero_ns(&self) -> i64 {
+        let started = self.statuses.iter().find_map(|status| status.started_ns);
+        started.unwrap_or_else(|| self.first_ns())
+    }
+
+    /// The first time that anything tells, in nanoseconds of the vehicle's clock.
+    fn first_ns(&self) -> i64 {
+        let firsts = [
+            self.statuses.first().map(|it| it.stamp_ns),
+            self.vehicle.first().map(|it| it.stamp_ns),
+            self.truth.first().map(|it| it.stamp_ns),
+            self.found.first().map(|it| it.message.header.stamp_ns),
+            self.tapes.first().map(|it| it.begun_ns),
+        ];
+        firsts.into_iter().flatten().min().unwrap_or(0)
+    }
+
+    /// A stamp of the vehicle's clock in seconds since [`Flight::zero_ns`].
+    pub fn at_s(&self, stamp_ns: i64) -> f64 {
+        stamp_ns.saturating_sub(self.zero_ns()) as f64 * 1e-9
+    }
+
+    /// Position of the vehicle as the autopilot says, in local NED, in metres.
+    pub fn position_at(&self, stamp_ns: i64) -> Option<[f64; 3]> {
+        interpolated(&self.vehicle, stamp_ns, |it| (it.stamp_ns, it.position_ned_m))
+    }
+
+    /// True position of the vehicle, from the pad's landing point, in metres north, east and down.
+    pub fn true_offset_at(&self, stamp_ns: i64) -> Option<[f64; 3]> {
+        interpolated(&self.truth, stamp_ns, |it| (it.stamp_ns, true_offset(it)))
+    }
+
+    /// The marker that the controller lands on, `FAMILY` or `FAMILY:ID`.
+    pub fn marker(&self) -> Option<String> {
+        let mut all = self.configurations.iter();
+        let (_, text) = all.find(|(name, _)| name.starts_with("controller"))?;
+        let table: toml::Table = text.parse().ok()?;
+        Some(table.get("marker")?.as_str()?.to_owned())
+    }
+
+    fn take(&mut self, message: Received<'_>) {
+        let Received { key, payload, attachment, received_ns } = message;
+        let parts: Vec<&str> = key.split('/').collect();
+        match parts.as_slice() {
+            ["controller", "status"] => {
+                if let Some(status) = self.decoded(topic::STATUS, key, payload) {
+                    self.note_clock(received_ns, status.stamp_ns);
+                    self.statuses.push(status);
+                }
+            }
+            ["controller", "target"] => {
+                let target = self.decoded(topic::TARGET, key, payload);
+                self.targets.extend(target);
+            }
+            ["vehicle", "state"] => {
+                if let Some(state) = self.decoded(topic::VEHICLE_STATE, key, payload) {
+                    self.note_clock(received_ns, state.stamp_ns);
+                    self.vehicle.push(state);
+                }
+            }
+            ["truth"] => {
+                let truth = self.decoded(topic::TRUTH, key, payload);
+                self.truth.extend(truth);
+            }
+            ["wind"] => {
+                let wind = self.decoded(topic::WIND, key, payload);
+                self.wind.extend(wind);
+            }
+            ["detector", detector, "detections"] => {
+                let message = self.decoded(topic::DETECTIONS, key, payload);
+                let detector = (*detector).to_owned();
+                self.found.extend(message.map(|message| Found { detector, received_ns, message }));
+            }
+            ["detector", detector, "info"] => {
+                let info = self.decoded(topic::DETECTOR_INFO, key, payload);
+                self.detectors.extend(info.map(|info| ((*detector).to_owned(), info)));
+            }
+            ["camera", camera, "frame"] => {
+                if let Some(header) = self.decoded_as::<FrameHeader>(key, attachment) {
+                    let FrameHeader { sequence, stamp_ns, .. } = header;
+                    let frames = self.frames.entry((*camera).to_owned()).or_default();
+                    frames.push(Frame { sequence, stamp_ns });
+                }
+            }
+            ["camera", camera, "info"] => {
+                let info = self.decoded(topic::CAMERA_INFO, key, payload);
+                self.cameras.extend(info.map(|info| ((*camera).to_owned(), info)));
+            }
+            ["health", ..] => {
+                let health = self.decoded(topic::HEALTH, key, payload);
+                health.into_iter().for_each(|health| self.add_health(health));
+            }
+            ["config", ..] => {
+                if let Some(configuration) = self.decoded(topic::CONFIGURATION, key, payload) {
+                    let Configuration { service, instance, toml, .. } = configuration;
+                    self.configurations.insert(format!("{service}/{instance}"), toml);
+                }
+            }
+            ["recorder", _, "status"] => {
+                let status = self.decoded(topic::RECORDER_STATUS, key, payload);
+                self.recorder = status.or(self.recorder.take());
+            }
+            ["mavlink", "from-autopilot"] => {
+                if let Some(MavlinkBytes { packet }) =
+                    self.decoded(topic::FROM_AUTOPILOT, key, payload)
+                {
+                    self.packets.take(received_ns, &packet);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn decoded<M: Message>(&mut self, _topic: Topic<M>, key: &str, payload: &[u8]) -> Option<M> {
+        self.decoded_as(key, payload)
+    }
+
+    fn decoded_as<M: Message>(&mut self, key: &str, payload: &[u8]) -> Option<M> {
+        match decode(payload) {
+            Ok(message) => Some(message),
+            Err(problem) => {
+                let unreadable = self
+                    .unreadable
+                    .entry(key.to_owned())
+                    .or_insert_with(|| Unreadable { count: 0, why: problem.to_string() });
+                unreadable.count += 1;
+                None
+            }
+        }
+    }
+
+    fn add_health(&mut self, health: Health) {
+        let name = format!("{}/{} ({})", health.service, health.instance, health.pid);
+        match self.processes.get_mut(&name) {
+            Some(process) => process.last = health,
+            None => {
+                self.processes.insert(name, Process { first: health.clone(), last: health });
+            }
+        }
+    }
+
+    /// Notes what the recorder's clock is ahead of the vehicle's, where it is another one.
+    fn note_clock(&mut self, received_ns: i64, stamp_ns: i64) {
+        let apart_ns = received_ns.saturating_sub(stamp_ns);
+        if self.statuses.is_empty() && self.vehicle.is_empty() && apart_ns.abs() > MAX_AGE_NS {
+            self.shift_ns = apart_ns;
+        }
+    }
+
+    /// Puts everything in order: a second file begins with what the first one had.
+    fn sort(&mut self) {
+        fn order<T>(samples: &mut Vec<T>, stamp_ns: impl Fn(&T) -> i64) {
+            samples.sort_by_key(&stamp_ns);
+            samples.dedup_by_key(|it| stamp_ns(it));
+        }
+        order(&mut self.statuses, |it| it.stamp_ns);
+        order(&mut self.targets, |it| it.stamp_ns);
+        order(&mut self.vehicle, |it| it.stamp_ns);
+        order(&mut self.truth, |it| it.stamp_ns);
+        order(&mut self.wind, |it| it.stamp_ns);
+        self.found.sort_by_key(|it| it.received_ns);
+        for frames in self.frames.values_mut() {
+            order(frames, |it| it.stamp_ns);
+        }
+    }
+}
+
+/// True position of the vehicle from the pad's landing point, in metres north, east and down.
+pub fn true_offset(truth: &Truth) -> [f64; 3] {
+    let [north, east, down] = truth.position_ned_m;
+    let [pad_north, pad_east, pad_down] = truth.pad_ned_m;
+    [north - pad_north, east - pad_east, down - pad_down]
+}
+
+/// A value between two samples; `None` beyond them, and where they are too far apart.
+fn interpolated<T>(
+    samples: &[T],
+    at_ns: i64,
+    of: impl Fn(&T) -> (i64, [f64; 3]),
+) -> Option<[f64; 3]> {
+    let after = samples.partition_point(|sample| of(sample).0 < at_ns);
+    let (next_ns, next) = of(samples.get(after)?);
+    if next_ns == at_ns {
+        return Some(next);
+    }
+    let (last_ns, last) = of(samples.get(after.checked_sub(1)?)?);
+    let gap_ns = next_ns.saturating_sub(last_ns);
+    if gap_ns > MAX_GAP_NS {
+        return None;
+    }
+    let part = at_ns.saturating_sub(last_ns) as f64 / gap_ns as f64;
+    let [x, y, z] = last;
+    let [next_x, next_y, next_z] = next;
+    Some([x + part * (next_x - x), y + part * (next_y - y), z + part * (next_z - z)])
+}

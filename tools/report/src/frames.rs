@@ -1,0 +1,271 @@
+//! What became of each frame that a detector searched: used, refused and why, or without a marker; and when.
+
+use std::collections::BTreeSet;
+
+use autopilot::Parser;
+use autopilot::dialect::MavMessage;
+use flightlog::RecordedTape;
+use messages::{Detections, StageTime, TapeDecision, TapeEvent};
+
+use crate::flight::{Flight, Found};
+
+/// How far stamps of the same frame may be apart that were computed from ages, in nanoseconds.
+const SAME_FRAME_NS: i64 = 2_000;
+/// How much later the recorder may get detections than the controller's estimate from them, in nanoseconds.
+const MAX_LATER_NS: i64 = 30_000_000;
+/// Longest time from detections to the setpoint that uses them, in nanoseconds: the next one later has other reasons.
+const MAX_TO_SETPOINT_NS: i64 = 200_000_000;
+/// Phases in which nothing is landing.
+const OUTSIDE: [&str; 5] = ["idle", "takeoff", "landed", "aborted", "pilot-in-command"];
+
+/// What became of a frame.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Fate {
+    /// The estimate used it.
+    Used,
+    /// The wanted marker was not in it.
+    NoMarker,
+    /// Its marker was refused, for this reason.
+    Refused(String),
+    /// Another detector was in use.
+    Standby,
+    /// No landing was under way, or it was overtaken by another frame.
+    NotNeeded,
+    /// The recording does not say.
+    Unknown,
+}
+
+impl Fate {
+    /// In a few words.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Used => "used",
+            Self::NoMarker => "no marker",
+            Self::Refused(why) => why,
+            Self::Standby => "standby",
+            Self::NotNeeded => "not needed",
+            Self::Unknown => "not known",
+        }
+    }
+
+    /// As a sentence.
+    pub fn meaning(&self) -> String {
+        match self {
+            Self::Used => "the estimate used it".to_owned(),
+            Self::NoMarker => "the wanted marker was not found in it".to_owned(),
+            Self::Refused(why) => refusal(why).to_owned(),
+            Self::Standby => "another detector was in use".to_owned(),
+            Self::NotNeeded => {
+                "no landing was under way, or a newer frame was there already".to_owned()
+            }
+            Self::Unknown => "the recording does not say".to_owned(),
+        }
+    }
+}
+
+/// What a refusal's short name means.
+fn refusal(name: &str) -> &str {
+    match name {
+        "stale" => "refused: too old when it arrived",
+        "from-the-future" => "refused: its stamp lies in the future",
+        "out-of-order" => "refused: not newer than an event already used",
+        "not-finite" => "refused: a number in it is not finite",
+        "no-attitude" => "refused: the vehicle's attitude at its stamp is not known",
+        "no-pose" => "refused: it has no pose",
+        "implausible" => "refused: its pose is not below the vehicle",
+        "bad-covariance" => "refused: its covariance is none",
+        "low-confidence" => "refused: its confidence is too low",
+        "duplicate" => "refused: a frame of the same stamp was used already",
+        "outlier" => "refused: too far from the estimate",
+        _ => "refused by the controller, before the estimate",
+    }
+}
+
+/// A frame that a detector searched.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Handled {
+    /// The detector.
+    pub detector: String,
+    /// Mid-exposure, in nanoseconds of the vehicle's clock.
+    pub exposed_ns: i64,
+    /// When the controller had the detections, in nanoseconds of its clock; without a tape when the recorder had them.
+    pub handled_ns: i64,
+    /// What became of it.
+    pub fate: Fate,
+    /// How long each stage of the detector took.
+    pub stages: Vec<StageTime>,
+    /// When the next setpoint went out, of a frame that was used, in nanoseconds.
+    pub setpoint_ns: Option<i64>,
+}
+
+/// All frames that detectors searched.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Frames {
+    /// Whether they are from the controller's tape, which has each with the time at which it was handled.
+    pub is_from_tape: bool,
+    /// The frames, in the order in which their detections came.
+    pub all: Vec<Handled>,
+}
+
+impl Frames {
+    /// The frames of a flight.
+    pub fn of(flight: &Flight) -> Self {
+        let marker = flight.marker();
+        let mut all: Vec<Handled> = Vec::new();
+        for tape in &flight.tapes {
+            all.extend(of_tape(tape, marker.as_deref()));
+        }
+        match all.is_empty() {
+            false => Self { is_from_tape: true, all },
+            true => Self { is_from_tape: false, all: of_messages(flight, marker.as_deref()) },
+        }
+    }
+
+    /// How many became this.
+    pub fn count(&self, fate: &Fate) -> usize {
+        self.all.iter().filter(|frame| frame.fate == *fate).count()
+    }
+
+    /// What became of frames, the best first.
+    pub fn fates(&self) -> BTreeSet<Fate> {
+        self.all.iter().map(|frame| frame.fate.clone()).collect()
+    }
+
+    /// Those of which the marker was refused.
+    pub fn refused(&self) -> usize {
+        self.all.iter().filter(|frame| matches!(frame.fate, Fate::Refused(_))).count()
+    }
+}
+
+/// Whether the wanted marker is in a frame; without its name, whether any is.
+fn has_marker(message: &Detections, marker: Option<&str>) -> bool {
+    let Some(marker) = marker else { return !message.detections.is_empty() };
+    let (family, id) = match marker.split_once(':') {
+        Some((family, id)) => (family, id.parse().ok()),
+        None => (marker, None),
+    };
+    message.detections.iter().any(|it| it.family == family && (id.is_none() || it.id == id))
+}
+
+/// The decision that a tape has after a record.
+#[derive(Clone, Debug, Default)]
+struct Latest {
+    rejected: Option<String>,
+    detector: Option<String>,
+    used: u32,
+    is_landing: bool,
+}
+
+impl Latest {
+    fn of(decision: &TapeDecision<'_>) -> Self {
+        Self {
+            rejected: decision.rejected.map(str::to_owned),
+            detector: decision.detector.map(str::to_owned),
+            used: decision.target.map_or(0, |target| target.detections),
+            is_landing: !OUTSIDE.contains(&decision.phase),
+        }
+    }
+}
+
+fn of_tape(tape: &RecordedTape, marker: Option<&str>) -> Vec<Handled> {
+    let mut frames: Vec<Handled> = Vec::new();
+    let mut latest = Latest::default();
+    // The first of the frames that wait for a setpoint.
+    let mut waiting = 0;
+    for record in tape.parts.iter().flat_map(messages::Tape::records).flatten() {
+        let before = latest.used;
+        let is_new = record.decision().map(|decision| latest = Latest::of(&decision)).is_some();
+        if let TapeEvent::Detections { publisher, message } = &record.event {
+            let is_active = latest.detector.as_deref().is_none_or(|active| active == publisher);
+            let fate = match &latest.rejected {
+                _ if !is_active => Fate::Standby,
+                _ if !latest.is_landing => Fate::NotNeeded,
+                _ if !has_marker(message, marker) => Fate::NoMarker,
+                Some(why) => Fate::Refused(why.clone()),
+                None if is_new && latest.used > before => Fate::Used,
+                // A landing that begins anew counts anew.
+                None if is_new && latest.used > 0 && latest.used < before => Fate::Used,
+                None => Fate::NotNeeded,
+            };
+            frames.push(Handled {
+                detector: publisher.to_string(),
+                exposed_ns: message.header.stamp_ns,
+                handled_ns: record.now_ns,
+                fate,
+                stages: message.stages.clone(),
+                setpoint_ns: None,
+            });
+        }
+        if waiting < frames.len() && has_setpoint(&record.packets) {
+            let is_soon = |it: &Handled| record.now_ns - it.handled_ns <= MAX_TO_SETPOINT_NS;
+            let used = frames.iter_mut().skip(waiting).filter(|it| it.fate == Fate::Used);
+            for frame in used.filter(|it| is_soon(it)) {
+                frame.setpoint_ns = Some(record.now_ns);
+            }
+            waiting = frames.len();
+        }
+    }
+    frames
+}
+
+/// Whether a velocity setpoint is among packets for the autopilot.
+fn has_setpoint(packets: &[u8]) -> bool {
+    let is_setpoint = |message: &MavMessage| {
+        matches!(
+            message,
+            MavMessage::SET_POSITION_TARGET_LOCAL_NED(_) | MavMessage::LANDING_TARGET(_)
+        )
+    };
+    !packets.is_empty()
+        && Parser::new().push(packets).iter().filter_map(|it| it.message.as_ref()).any(is_setpoint)
+}
+
+/// Without a tape: the estimates tell which frame was used last, and why the newest was refused.
+fn of_messages(flight: &Flight, marker: Option<&str>) -> Vec<Handled> {
+    let age_ns = |age_ms: f64| (age_ms * 1e6).round() as i64;
+    let used: BTreeSet<i64> = flight
+        .targets
+        .iter()
+        .filter(|target| target.rejected.is_none())
+        .filter_map(|target| Some(target.stamp_ns.saturating_sub(age_ns(target.age_ms?))))
+        .collect();
+    let is_used = |stamp_ns: i64| {
+        let near = stamp_ns.saturating_sub(SAME_FRAME_NS)..=stamp_ns.saturating_add(SAME_FRAME_NS);
+        used.range(near).next().is_some()
+    };
+    let fate = |found: &Found, handled_ns: i64| {
+        let before = flight.statuses.partition_point(|it| it.stamp_ns <= handled_ns);
+        let status = before.checked_sub(1).and_then(|at| flight.statuses.get(at));
+        let active = status.and_then(|status| status.active_detector.as_deref());
+        if active.is_some_and(|active| active != found.detector) {
+            return Fate::Standby;
+        }
+        if status.is_some_and(|status| OUTSIDE.contains(&status.phase.name())) {
+            return Fate::NotNeeded;
+        }
+        if is_used(found.message.header.stamp_ns) {
+            return Fate::Used;
+        }
+        if !has_marker(&found.message, marker) {
+            return Fate::NoMarker;
+        }
+        let from = handled_ns.saturating_sub(MAX_LATER_NS);
+        let after = flight.targets.partition_point(|target| target.stamp_ns < from);
+        let near = flight.targets.iter().skip(after);
+        let near = near.take_while(|it| it.stamp_ns <= handled_ns.saturating_add(MAX_LATER_NS));
+        let refusal = near.filter_map(|target| target.rejected.clone()).next();
+        refusal.map_or(Fate::Unknown, Fate::Refused)
+    };
+    let handled = |found: &Found| {
+        let handled_ns = flight.vehicle_ns(found.received_ns);
+        Handled {
+            detector: found.detector.clone(),
+            exposed_ns: found.message.header.stamp_ns,
+            handled_ns,
+            fate: fate(found, handled_ns),
+            stages: found.message.stages.clone(),
+            setpoint_ns: None,
+        }
+    };
+    flight.found.iter().map(handled).collect()
+}

@@ -1,0 +1,161 @@
+//! What was said during a flight, with reasons, in order.
+
+use std::collections::BTreeSet;
+
+use messages::TapeEvent;
+
+use crate::flight::Flight;
+use crate::phases;
+
+/// Maximum number of lines; further ones are counted.
+const MAX_LINES: usize = 2000;
+
+/// A line of the log.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Line {
+    /// When, in seconds since the landing began.
+    pub time_s: f64,
+    /// Who said it.
+    pub who: String,
+    /// Whether it is a warning.
+    pub is_warning: bool,
+    /// What.
+    pub text: String,
+}
+
+/// The log of a flight, and how many lines were left out of it.
+pub fn of(flight: &Flight) -> (Vec<Line>, usize) {
+    let mut lines = controller(flight);
+    lines.extend(commands(flight));
+    lines.extend(autopilot(flight));
+    lines.extend(processes(flight));
+    lines.sort_by(|one, other| one.time_s.total_cmp(&other.time_s));
+    let left_out = lines.len().saturating_sub(MAX_LINES);
+    lines.truncate(MAX_LINES);
+    (lines, left_out)
+}
+
+fn controller(flight: &Flight) -> Vec<Line> {
+    let mut lines = Vec::new();
+    let mut last: Option<&messages::ControllerStatus> = None;
+    let mut touched = false;
+    for status in &flight.statuses {
+        let time_s = flight.at_s(status.stamp_ns);
+        let mut say = |is_warning: bool, text: String| {
+            lines.push(Line { time_s, who: "controller".to_owned(), is_warning, text });
+        };
+        let is_same = |last: &messages::ControllerStatus| {
+            last.phase == status.phase && phases::is_same(&last.why, &status.why)
+        };
+        if !last.is_some_and(is_same) {
+            say(false, format!("{}: {}", status.phase.name(), status.why));
+        }
+        if last.is_none_or(|last| last.autopilot != status.autopilot) {
+            say(false, format!("link to the autopilot: {}", status.autopilot));
+        }
+        if last.is_none_or(|last| last.active_detector != status.active_detector)
+            && let Some(detector) = &status.active_detector
+        {
+            let is_change = last.is_some_and(|last| last.active_detector.is_some());
+            say(is_change, format!("detector in use: {detector} ({})", status.detector_why));
+        }
+        let known = last.map(|last| last.warnings.as_slice()).unwrap_or_default();
+        let is_in = |all: &[String], text: &str| all.iter().any(|it| phases::is_same(it, text));
+        for warning in status.warnings.iter().filter(|warning| !is_in(known, warning)) {
+            say(true, warning.clone());
+        }
+        for over in known.iter().filter(|warning| !is_in(&status.warnings, warning)) {
+            say(false, format!("over: {over}"));
+        }
+        last = Some(status);
+    }
+    for truth in &flight.truth {
+        if let Some(touchdown) = truth.touchdown.filter(|_| !touched) {
+            touched = true;
+            lines.push(Line {
+                time_s: flight.at_s(touchdown.stamp_ns),
+                who: "truth".to_owned(),
+                is_warning: false,
+                text: format!(
+                    "touchdown, {:.3} m from the pad, {:.2} m/s down, {:.2} m/s aside",
+                    touchdown.error_m, touchdown.vertical_speed_m_s, touchdown.lateral_speed_m_s
+                ),
+            });
+        }
+    }
+    lines
+}
+
+/// Commands and detectors that came or went, which only a tape has.
+fn commands(flight: &Flight) -> Vec<Line> {
+    let mut lines = Vec::new();
+    for tape in &flight.tapes {
+        for record in tape.parts.iter().flat_map(messages::Tape::records).flatten() {
+            let (who, is_warning, text) = match &record.event {
+                TapeEvent::Command(command) => {
+                    let reply = record.reply.as_ref();
+                    let accepted = reply.is_some_and(|reply| reply.accepted);
+                    let reason = reply.map(|reply| reply.reason.as_str()).unwrap_or_default();
+                    let answer = if accepted { "accepted" } else { "refused" };
+                    ("operator", !accepted, format!("{command:?}: {answer}, {reason}"))
+                }
+                TapeEvent::Presence { detector, alive: true } => {
+                    ("controller", false, format!("detector {detector} came"))
+                }
+                TapeEvent::Presence { detector, alive: false } => {
+                    ("controller", true, format!("detector {detector} went"))
+                }
+                TapeEvent::Shutdown => ("controller", false, "the controller ends".to_owned()),
+                _ => continue,
+            };
+            let time_s = flight.at_s(record.now_ns);
+            lines.push(Line { time_s, who: who.to_owned(), is_warning, text });
+        }
+    }
+    lines
+}
+
+fn autopilot(flight: &Flight) -> Vec<Line> {
+    let line = |text: &crate::packets::Text| Line {
+        time_s: flight.at_s(flight.vehicle_ns(text.received_ns)),
+        who: "autopilot".to_owned(),
+        is_warning: text.is_warning,
+        text: text.text.clone(),
+    };
+    let mut lines: Vec<Line> = flight.packets.texts.iter().map(line).collect();
+    let mut last: Option<&messages::VehicleState> = None;
+    for state in &flight.vehicle {
+        let time_s = flight.at_s(state.stamp_ns);
+        let mut say = |text: String| {
+            lines.push(Line { time_s, who: "autopilot".to_owned(), is_warning: false, text });
+        };
+        if last.is_none_or(|last| last.mode != state.mode) {
+            say(format!("mode {}", state.mode));
+        }
+        if last.is_none_or(|last| last.armed != state.armed) {
+            say(format!("motors {}", if state.armed { "armed" } else { "disarmed" }));
+        }
+        last = Some(state);
+    }
+    lines
+}
+
+fn processes(flight: &Flight) -> Vec<Line> {
+    let mut said = BTreeSet::new();
+    let mut lines = Vec::new();
+    for (name, process) in &flight.processes {
+        if said.insert(name) {
+            let health = &process.first;
+            lines.push(Line {
+                time_s: flight.at_s(flight.vehicle_ns(health.stamp_ns)),
+                who: health.service.clone(),
+                is_warning: false,
+                text: format!(
+                    "{} is process {} on {}, alight {}",
+                    health.instance, health.pid, health.host, health.version
+                ),
+            });
+        }
+    }
+    lines
+}

@@ -1,0 +1,36 @@
+//! A recorded flight, explained on one page.
+//!
+//! Recordings in, a page out: HTML that needs no network and no other file, with charts as SVG. This crate knows no
+//! files, no clock and no network, and decides nothing: what it says of a flight is in the recording.
+//!
+//! Modules in reading order: [`flight`] has what a recording holds, with the autopilot's [`packets`]; [`frames`] tells
+//! what became of each frame, [`latency`] how long it took, [`track`] where the vehicle was, [`phases`] and [`journal`]
+//! what happened and why, [`losses`] what is missing, and [`summary`] all of it in numbers. [`difference`] compares
+//! configurations. [`view`] joins these for the page: [`plots`] are its charts, drawn by [`chart`], [`sections`] its
+//! parts, in pieces of [`html`], and [`mod@page`] the whole.
+
+pub mod chart;
+pub mod difference;
+pub mod flight;
+pub mod frames;
+pub mod html;
+pub mod journal;
+pub mod latency;
+pub mod losses;
+pub mod packets;
+pub mod page;
+pub mod phases;
+pub mod plots;
+pub mod sections;
+pub mod summary;
+pub mod track;
+pub mod view;
+
+pub use flight::{Flight, FlightReader, Replayed};
+pub use page::{comparison, page};
+pub use summary::Summary;
+
+/// A flight in numbers, as the page has them.
+pub fn summary(flight: &Flight) -> Summary {
+    summary::of(flight, &frames::Frames::of(flight))
+}

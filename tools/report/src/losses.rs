@@ -1,0 +1,142 @@
+//! What was lost on the way: frames, messages, packets; and what the recording itself lacks.
+
+use std::collections::BTreeMap;
+
+use crate::flight::Flight;
+
+/// Something of which a part was lost.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Loss {
+    /// Where.
+    pub place: String,
+    /// What.
+    pub what: String,
+    /// How many.
+    pub count: u64,
+    /// Of how many, where that is known.
+    pub of: Option<u64>,
+}
+
+/// Frames by their numbers.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+struct Numbers {
+    first: u64,
+    last: u64,
+    count: u64,
+}
+
+impl Numbers {
+    fn of(sequences: impl Iterator<Item = u64>) -> Option<Self> {
+        sequences.fold(None, |so_far: Option<Self>, sequence| {
+            let before = so_far.unwrap_or(Self { first: sequence, last: sequence, count: 0 });
+            Some(Self {
+                first: before.first.min(sequence),
+                last: before.last.max(sequence),
+                count: before.count + 1,
+            })
+        })
+    }
+
+    fn all(self) -> u64 {
+        self.last.saturating_sub(self.first) + 1
+    }
+
+    fn missing(self) -> u64 {
+        self.all().saturating_sub(self.count)
+    }
+}
+
+/// Frames whose numbers are missing: in the recording, and among those that a detector searched.
+pub fn frames(flight: &Flight) -> Vec<Loss> {
+    let mut losses = Vec::new();
+    for (camera, frames) in &flight.frames {
+        if let Some(numbers) = Numbers::of(frames.iter().map(|frame| frame.sequence)) {
+            losses.push(Loss {
+                place: format!("camera {camera}"),
+                what: "frames that are not in the recording".to_owned(),
+                count: numbers.missing(),
+                of: Some(numbers.all()),
+            });
+        }
+    }
+    let mut searched: BTreeMap<&str, Vec<u64>> = BTreeMap::new();
+    for found in &flight.found {
+        searched.entry(&found.detector).or_default().push(found.message.header.sequence);
+    }
+    for (detector, sequences) in searched {
+        if let Some(numbers) = Numbers::of(sequences.into_iter()) {
+            losses.push(Loss {
+                place: format!("detector {detector}"),
+                what: "frames without detections: not searched, overtaken, or their message lost"
+                    .to_owned(),
+                count: numbers.missing(),
+                of: Some(numbers.all()),
+            });
+        }
+    }
+    losses
+}
+
+/// What each process counted, but for refused detections.
+pub fn processes(flight: &Flight) -> Vec<Loss> {
+    let mut losses = Vec::new();
+    for (name, process) in &flight.processes {
+        let drops = process.last.drops.iter().chain(&process.last.errors);
+        losses.extend(drops.filter(|drop| drop.count > 0).map(|drop| Loss {
+            place: name.clone(),
+            what: drop.reason.clone(),
+            count: drop.count,
+            of: None,
+        }));
+    }
+    losses
+}
+
+/// What the recorder lost, by key.
+pub fn recorder(flight: &Flight) -> Vec<Loss> {
+    let lost = flight.lost.iter().filter(|(_, count)| **count > 0);
+    lost.map(|(key, count)| Loss {
+        place: "recorder".to_owned(),
+        what: format!("messages of {key}"),
+        count: *count,
+        of: None,
+    })
+    .collect()
+}
+
+/// Events that are missing on the controllers' tapes.
+pub fn tape(flight: &Flight) -> Vec<Loss> {
+    let mut losses = Vec::new();
+    for tape in &flight.tapes {
+        let (mut next, mut missing) = (0, 0);
+        for part in &tape.parts {
+            missing += part.first.saturating_sub(next);
+            next = part.first.saturating_add(u64::from(part.count));
+        }
+        losses.push(Loss {
+            place: "controller's tape".to_owned(),
+            what: "events".to_owned(),
+            count: missing,
+            of: Some(next),
+        });
+    }
+    losses
+}
+
+/// What the recording itself lacks, as sentences.
+pub fn recording(flight: &Flight) -> Vec<String> {
+    let mut lines = flight.damage.clone();
+    if !flight.is_ended {
+        lines.push("the recording has no end: its recorder was killed, or the rest is cut off; `alight record --repair` writes a copy with an end".to_owned());
+    }
+    for (key, unreadable) in &flight.unreadable {
+        lines.push(format!(
+            "{} messages of {key} cannot be read: {}",
+            unreadable.count, unreadable.why
+        ));
+    }
+    if let Some(problem) = flight.recorder.as_ref().and_then(|status| status.problem.as_ref()) {
+        lines.push(format!("the recorder's last word: {problem}"));
+    }
+    lines
+}

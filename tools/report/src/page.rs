@@ -1,0 +1,272 @@
+//! The page: one file of HTML that needs nothing else.
+
+use std::fmt::Write as _;
+
+use crate::difference::{Difference, configurations, parameters, parameters_of_one};
+use crate::flight::Flight;
+use crate::html::{Cell, escaped, missing, number, paragraph, table, text};
+use crate::plots::share_axes;
+use crate::sections::{self, Section};
+use crate::summary::Summary;
+use crate::view::View;
+
+const STYLE: &str = include_str!("style.css");
+
+/// The page of a flight.
+///
+/// # Errors
+/// When a chart cannot be drawn.
+pub fn page(flight: &Flight) -> anyhow::Result<String> {
+    let view = View::new(flight);
+    let mut body = head(&[&view]);
+    let sections = sections::of(&view);
+    body.push_str(&links(&sections, false));
+    for section in &sections {
+        body.push_str(&one(section)?);
+    }
+    Ok(html(&flight.name, &body, "one"))
+}
+
+/// The page of two flights side by side, with what they differ in.
+///
+/// # Errors
+/// When a chart cannot be drawn.
+pub fn comparison(first: &Flight, second: &Flight) -> anyhow::Result<String> {
+    let views = [View::new(first), View::new(second)];
+    let [one, other] = &views;
+    let mut body = head(&[one, other]);
+    let (mut left, mut right) = (sections::of(one), sections::of(other));
+    body.push_str(&links(&left, true));
+    body.push_str(&numbers(&one.summary, &other.summary));
+    body.push_str(&differences(first, second));
+    for (left, right) in left.iter_mut().zip(&mut right) {
+        body.push_str(&pair(left, right)?);
+    }
+    Ok(html(&format!("{} and {}", first.name, second.name), &body, "two"))
+}
+
+fn html(title: &str, body: &str, class: &str) -> String {
+    format!(
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
+         <meta name=\"color-scheme\" content=\"light dark\">\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\
+         <title>{}: flight report</title><style>{STYLE}</style></head>\n\
+         <body class=\"{class}\"><main>{body}</main></body></html>\n",
+        escaped(title)
+    )
+}
+
+/// Title, outcome and the line for a bug report, of each flight.
+fn head(views: &[&View<'_>]) -> String {
+    let mut html = "<header><h1>Flight report</h1><div class=\"heads\">".to_owned();
+    for (index, view) in views.iter().enumerate() {
+        let summary = &view.summary;
+        let letter = match (views.len(), index) {
+            (1, _) => "",
+            (_, 0) => "A: ",
+            _ => "B: ",
+        };
+        let mood = match (summary.landed, summary.phase.as_deref()) {
+            (true, _) => "good",
+            (_, None) => "quiet",
+            _ => "bad",
+        };
+        // Writing to a string cannot fail.
+        let _ = write!(
+            html,
+            "<div class=\"head\"><h2>{letter}{}</h2><p class=\"outcome {mood}\">{}</p>",
+            escaped(&summary.name),
+            escaped(&summary.outcome())
+        );
+        html.push_str(&cards(summary));
+        for problem in &summary.problems {
+            let _ = write!(html, "<p class=\"warning\">{}</p>", escaped(problem));
+        }
+        let _ = write!(
+            html,
+            "<p class=\"label\">For a bug report:</p><p class=\"bug\">{}</p></div>",
+            escaped(&summary.line())
+        );
+    }
+    html.push_str("</div></header>");
+    html
+}
+
+/// A value of a summary, for people.
+struct Figure {
+    name: &'static str,
+    of: fn(&Summary) -> Option<f64>,
+    digits: usize,
+    unit: &'static str,
+}
+
+const fn figure(
+    name: &'static str,
+    of: fn(&Summary) -> Option<f64>,
+    digits: usize,
+    unit: &'static str,
+) -> Figure {
+    Figure { name, of, digits, unit }
+}
+
+/// The numbers that matter most come first.
+static FIGURES: [Figure; 18] = [
+    figure("time to disarm", |s| s.time_to_disarm_s, 1, "s"),
+    figure("time to touchdown", |s| s.time_to_touchdown_s, 1, "s"),
+    figure("touchdown error", |s| s.touchdown_error_m, 3, "m"),
+    figure("speed down at touchdown", |s| s.touchdown_speed_m_s, 2, "m/s"),
+    figure("speed aside at touchdown", |s| s.touchdown_lateral_speed_m_s, 2, "m/s"),
+    figure("largest tilt", |s| s.max_tilt_deg, 1, "deg"),
+    figure("frames used", |s| Some(s.frames_used as f64), 0, ""),
+    figure("frames searched", |s| Some(s.frames as f64), 0, ""),
+    figure("frames refused", |s| Some(s.frames_refused as f64), 0, ""),
+    figure("exposure to setpoint, median", |s| s.latency_p50_ms, 0, "ms"),
+    figure("exposure to setpoint, 99 %", |s| s.latency_p99_ms, 0, "ms"),
+    figure("changes of the detector", |s| s.detector_changes.map(|it| it as f64), 0, ""),
+    figure("retries", |s| Some(s.retries as f64), 0, ""),
+    figure("estimate's error, median", |s| s.estimate_error_p50_m, 3, "m"),
+    figure("estimate's error, 95 %", |s| s.estimate_error_p95_m, 3, "m"),
+    figure("mean wind", |s| s.wind_mean_m_s, 1, "m/s"),
+    figure("lowest charge", |s| s.battery_min.map(|it| 100.0 * it), 0, "%"),
+    figure("messages lost", |s| Some(s.messages_lost as f64), 0, ""),
+];
+
+fn cards(summary: &Summary) -> String {
+    let mut html = "<dl class=\"cards\">".to_owned();
+    for Figure { name, of, digits, unit } in &FIGURES {
+        // What an aborted landing did not come to is not missing in its recording.
+        let none = if summary.landed || summary.phase.is_none() { "not recorded" } else { "-" };
+        let shown = of(summary).map_or_else(
+            || format!("<span class=\"quiet\">{none}</span>"),
+            |value| format!("{value:.digits$} {unit}"),
+        );
+        // Writing to a string cannot fail.
+        let _ = write!(html, "<div><dt>{name}</dt><dd>{shown}</dd></div>");
+    }
+    html.push_str("</dl>");
+    html
+}
+
+/// The numbers of two flights with their difference.
+fn numbers(one: &Summary, other: &Summary) -> String {
+    let rows: Vec<Vec<Cell>> = FIGURES
+        .iter()
+        .map(|Figure { name, of, digits, unit }| {
+            let (first, second) = (of(one), of(other));
+            let apart = first.zip(second).map(|(first, second)| second - first);
+            let apart = apart.map_or("-".to_owned(), |apart| format!("{apart:+.digits$} {unit}"));
+            vec![
+                text(*name),
+                number(first, *digits, unit),
+                number(second, *digits, unit),
+                Cell::Number(apart.trim_end().to_owned()),
+            ]
+        })
+        .collect();
+    let table = table(&["", "A", "B", "B less A"], &rows);
+    format!("<section id=\"numbers\"><h2>In numbers</h2>{table}</section>")
+}
+
+fn differences(first: &Flight, second: &Flight) -> String {
+    let mut html = "<section id=\"differences\"><h2>Differences of configuration</h2>".to_owned();
+    let rows = |differences: Vec<Difference>| -> Vec<Vec<Cell>> {
+        let value = |value: Option<String>| text(value.unwrap_or_else(|| "-".to_owned()));
+        differences
+            .into_iter()
+            .map(|it| vec![text(it.name), value(it.one), value(it.other)])
+            .collect()
+    };
+    if first.configurations.is_empty() || second.configurations.is_empty() {
+        html.push_str(&missing("the configuration of both flights"));
+    } else {
+        let rows = rows(configurations(first, second));
+        if rows.is_empty() {
+            html.push_str(&paragraph("The services are configured the same."));
+        }
+        html.push_str(&table(&["setting", "A", "B"], &rows));
+    }
+    html.push_str("<h3>Parameters of the autopilot</h3>");
+    let [one, other] = [first, second].map(|flight| flight.packets.parameters.len());
+    if one == 0 || other == 0 {
+        html.push_str(&missing(
+            "parameters of both flights; the file has those that somebody asked the autopilot for",
+        ));
+    } else {
+        let rows = rows(parameters(first, second));
+        let alone = parameters_of_one(first, second);
+        html.push_str(&paragraph(&format!(
+            "{} differ of those that both recorded ({one} and {other}).",
+            rows.len()
+        )));
+        html.push_str(&table(&["parameter", "A", "B"], &rows));
+        if !alone.is_empty() {
+            let names = alone.join(", ");
+            html.push_str(&paragraph(&format!("Recorded of one flight only: {names}.")));
+        }
+    }
+    html.push_str("</section>");
+    html
+}
+
+fn links(sections: &[Section], is_comparison: bool) -> String {
+    let mut html = "<nav>".to_owned();
+    let more: &[(&str, &str)] = if is_comparison {
+        &[("numbers", "In numbers"), ("differences", "Differences")]
+    } else {
+        &[]
+    };
+    let all = more.iter().copied().chain(sections.iter().map(|it| (it.id, it.title)));
+    for (id, title) in all {
+        // Writing to a string cannot fail.
+        let _ = write!(html, "<a href=\"#{id}\">{}</a>", escaped(title));
+    }
+    html.push_str("</nav>");
+    html
+}
+
+/// Charts without anything to show are left out: the section says what was not recorded.
+fn one(section: &Section) -> anyhow::Result<String> {
+    let mut html = begin(section);
+    html.push_str(&section.before);
+    html.push_str("<div class=\"charts\">");
+    for chart in section.charts.iter().filter(|chart| !chart.is_empty()) {
+        html.push_str(&chart.figure()?);
+    }
+    html.push_str("</div>");
+    html.push_str(&section.after);
+    html.push_str("</section>");
+    Ok(html)
+}
+
+fn begin(section: &Section) -> String {
+    let Section { id, title, lead, .. } = section;
+    let lead = if lead.is_empty() { String::new() } else { paragraph(lead) };
+    format!("<section id=\"{id}\"><h2>{}</h2>{lead}", escaped(title))
+}
+
+/// A section of two flights, side by side: chart by chart, with the same axes.
+fn pair(left: &mut Section, right: &mut Section) -> anyhow::Result<String> {
+    let mut html = begin(left);
+    let mut row = |one: &str, other: &str| {
+        if !one.is_empty() || !other.is_empty() {
+            // Writing to a string cannot fail.
+            let _ = write!(
+                html,
+                "<div class=\"pair\"><div><b class=\"letter\">A</b>{one}</div><div><b class=\"letter\">B</b>{other}</div></div>"
+            );
+        }
+    };
+    row(&left.before, &right.before);
+    for (one, other) in left.charts.iter_mut().zip(&mut right.charts) {
+        share_axes(one, other);
+        let [one, other] = [&*one, &*other].map(|chart| match chart.is_empty() {
+            true => Ok(String::new()),
+            false => chart.figure(),
+        });
+        row(&one?, &other?);
+    }
+    row(&left.after, &right.after);
+    html.push_str("</section>");
+    Ok(html)
+}

@@ -1,0 +1,430 @@
+//! The charts of a flight. Those of two flights are the same, one by one, so that their axes can be shared.
+
+use std::f64::consts::TAU;
+
+use crate::chart::{At, Axes, Chart, Ink, Layer, Shape, at, layer, span};
+use crate::frames::Fate;
+use crate::latency::between_ms;
+use crate::track::Place;
+use crate::view::{View, component};
+
+/// Height of a chart over time, as shown, in pixels.
+const HEIGHT: u32 = 270;
+/// Number of ellipses of uncertainty in the view from above.
+const CIRCLES: usize = 14;
+/// Names of the axes of local NED.
+const NED: [&str; 3] = ["north", "east", "down"];
+/// The standard deviations that are drawn.
+const SIGMAS: f64 = 2.0;
+
+/// A chart over time.
+fn over_time(view: &View<'_>, title: &str, unit: &str, layers: Vec<Layer>) -> Chart {
+    let values = layers.iter().flat_map(|layer| &layer.points).map(|point| point.y);
+    let y = span(values, 0.0..1e-3);
+    Chart {
+        title: title.to_owned(),
+        axes: Axes {
+            x_name: "time since the landing began, s".to_owned(),
+            y_name: unit.to_owned(),
+            x: view.time.clone(),
+            y,
+            is_equal: false,
+        },
+        bands: view.bands(),
+        layers,
+        rows: Vec::new(),
+        height: HEIGHT,
+        note: String::new(),
+    }
+}
+
+/// The landing in one picture: from above, and from the side.
+pub fn landing(view: &View<'_>) -> Vec<Chart> {
+    // From the begin of the landing on: where the vehicle came from does not matter.
+    let landing = |places: &[Place]| -> Vec<Place> {
+        let shown = places.iter().filter(|it| it.time_s >= 0.0 && view.is_shown(it.time_s));
+        shown.copied().collect()
+    };
+    let (truth, estimated) = (landing(&view.truth), landing(&view.estimated));
+    let places = || truth.iter().chain(&estimated);
+    let away = |it: &Place| at(it.east_m, it.north_m);
+    let mut above = Vec::new();
+    let reach = span(places().flat_map(|it| [it.east_m, it.north_m]), -0.3..0.3);
+    let step = estimated.len().div_ceil(CIRCLES).max(1);
+    let circles = estimated.iter().step_by(step).flat_map(|it| circle(it, &reach));
+    above.push(layer("2 standard deviations", Ink::Blue, Shape::Thin, circles));
+    above.push(layer("truth", Ink::Orange, Shape::Line, truth.iter().map(away)));
+    above.push(layer("estimate", Ink::Blue, Shape::Line, estimated.iter().map(away)));
+    above.push(layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]));
+    let start = truth.first().or(estimated.first());
+    above.push(layer("start", Ink::Green, Shape::Dots, start.map(away)));
+
+    // Seen across the way from the start to the pad.
+    let (toward_north, toward_east) = match start {
+        Some(it) if it.north_m.hypot(it.east_m) > 0.05 => {
+            let away_m = it.north_m.hypot(it.east_m);
+            (-it.north_m / away_m, -it.east_m / away_m)
+        }
+        _ => (1.0, 0.0),
+    };
+    let along = |it: &Place| it.north_m * toward_north + it.east_m * toward_east;
+    let side = |it: &Place| at(along(it), it.height_m);
+    let x = span(places().map(along), -0.3..0.3);
+    let edge = |it: &Place, sign: f64| {
+        let x_m = along(it) + sign * SIGMAS * it.deviation_m;
+        at(x_m.clamp(x.start, x.end), it.height_m)
+    };
+    let left = estimated.iter().map(|it| edge(it, -1.0));
+    let right = estimated.iter().rev().map(|it| edge(it, 1.0));
+    let layers = vec![
+        layer("2 standard deviations", Ink::Blue, Shape::Area, left.chain(right)),
+        layer("truth", Ink::Orange, Shape::Line, truth.iter().map(side)),
+        layer("estimate", Ink::Blue, Shape::Line, estimated.iter().map(side)),
+        layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]),
+    ];
+    let from_above = Chart {
+        title: "From above, relative to the pad".to_owned(),
+        axes: Axes {
+            x_name: "east, m".to_owned(),
+            y_name: "north, m".to_owned(),
+            x: reach.clone(),
+            y: reach,
+            is_equal: true,
+        },
+        bands: Vec::new(),
+        layers: above,
+        rows: Vec::new(),
+        height: 430,
+        note: String::new(),
+    };
+    let from_the_side = Chart {
+        title: "From the side, along the way from the start to the pad".to_owned(),
+        axes: Axes {
+            x_name: "past the pad, m (the two axes have scales of their own)".to_owned(),
+            y_name: "height over the pad, m".to_owned(),
+            x,
+            y: span(places().map(|it| it.height_m), 0.0..1.0),
+            is_equal: false,
+        },
+        layers,
+        ..from_above.clone()
+    };
+    vec![from_above, from_the_side]
+}
+
+/// The circle of a place's uncertainty, as far as it is within reach.
+fn circle(place: &Place, reach: &std::ops::Range<f64>) -> Vec<At> {
+    let radius_m = SIGMAS * place.deviation_m;
+    let around = (0..=24).map(|part| {
+        let (sin, cos) = (TAU * f64::from(part) / 24.0).sin_cos();
+        at(place.east_m + radius_m * sin, place.north_m + radius_m * cos)
+    });
+    let is_within = |point: &At| reach.contains(&point.x) && reach.contains(&point.y);
+    let within = around.map(|point| if is_within(&point) { point } else { at(f64::NAN, f64::NAN) });
+    within.chain([at(f64::NAN, f64::NAN)]).collect()
+}
+
+/// Height, distance from the pad, and the error of the estimate.
+pub fn height(view: &View<'_>) -> Vec<Chart> {
+    let flight = view.flight;
+    let target = |of: fn(&messages::TargetEstimate) -> Option<f64>| {
+        view.curve(&flight.targets, |it| Some(at(flight.at_s(it.stamp_ns), of(it)?)))
+    };
+    let truth = |of: fn(&Place) -> f64| view.curve(&view.truth, |it| Some(at(it.time_s, of(it))));
+    let distance = |it: &Place| it.north_m.hypot(it.east_m);
+    let height = vec![
+        layer("truth", Ink::Orange, Shape::Line, truth(|it| it.height_m)),
+        layer("estimate", Ink::Blue, Shape::Line, target(|it| it.height_m)),
+    ];
+    let lateral = vec![
+        layer("truth", Ink::Orange, Shape::Line, truth(distance)),
+        layer("estimate", Ink::Blue, Shape::Line, target(|it| it.lateral_error_m)),
+    ];
+    let mut deviation = target(|it| it.deviation_m);
+    if let (Some(first), Some(last)) = (deviation.first().copied(), deviation.last().copied()) {
+        deviation.insert(0, at(first.x, 0.0));
+        deviation.push(at(last.x, 0.0));
+    }
+    let error = view.curve(&view.errors, |it| Some(at(it.time_s, it.horizontal_m)));
+    // What the estimate claims before it knows much would flatten the rest.
+    let most = span(error.iter().map(|it| it.y), 0.0..0.05).end;
+    let most = if error.is_empty() { f64::INFINITY } else { 2.0 * most };
+    for point in &mut deviation {
+        point.y = point.y.min(most);
+    }
+    let errors = vec![
+        layer("claimed standard deviation", Ink::Blue, Shape::Area, deviation),
+        layer("error of the estimate against truth", Ink::Red, Shape::Line, error),
+    ];
+    let mut charts = vec![
+        over_time(view, "Height over the pad", "m", height),
+        over_time(view, "Horizontal distance from the pad", "m", lateral),
+        over_time(view, "Horizontal error of the estimate", "m", errors),
+    ];
+    if view.errors.is_empty()
+        && let Some(chart) = charts.last_mut()
+    {
+        chart.note = "truth was not recorded".to_owned();
+    }
+    charts
+}
+
+/// Setpoints against what the vehicle did.
+pub fn velocity(view: &View<'_>) -> Vec<Chart> {
+    let flight = view.flight;
+    let axis = |axis: usize, name: &str| {
+        let response = view.curve(&flight.vehicle, |it| {
+            Some(at(flight.at_s(it.stamp_ns), component(it.velocity_ned_m_s, axis)))
+        });
+        let layers = vec![
+            layer("vehicle", Ink::Orange, Shape::Line, response),
+            layer("setpoint", Ink::Blue, Shape::Steps, view.setpoint_curve(axis)),
+        ];
+        over_time(view, &format!("Velocity to the {name}"), "m/s", layers)
+    };
+    let mut charts: Vec<Chart> =
+        NED.iter().enumerate().take(2).map(|(index, name)| axis(index, name)).collect();
+    let mut down = axis(2, "down");
+    down.title = "Velocity downwards".to_owned();
+    charts.push(down);
+    let tilt = view.curve(&flight.vehicle, |it| {
+        Some(at(flight.at_s(it.stamp_ns), crate::summary::tilt_deg(it.ned_from_body_wxyz)))
+    });
+    charts.push(over_time(
+        view,
+        "Tilt",
+        "deg",
+        vec![layer("vehicle", Ink::Orange, Shape::Line, tilt)],
+    ));
+    charts
+}
+
+/// What became of each frame over time.
+pub fn detections(view: &View<'_>) -> Vec<Chart> {
+    let fates: Vec<Fate> = view.frames.fates().into_iter().rev().collect();
+    let mut layers = Vec::new();
+    for (row, fate) in fates.iter().enumerate() {
+        let ink = match fate {
+            Fate::Used => Ink::Green,
+            Fate::Refused(_) => Ink::Red,
+            Fate::NoMarker => Ink::Orange,
+            Fate::Standby | Fate::NotNeeded | Fate::Unknown => Ink::Grey,
+        };
+        let frames = view.frames.all.iter().filter(|it| it.fate == *fate);
+        let points = frames.map(|it| at(view.flight.at_s(it.exposed_ns), row as f64));
+        let points = points.filter(|it| view.is_shown(it.x));
+        layers.push(layer("", ink, Shape::Dots, points));
+    }
+    let mut chart = over_time(view, "What became of each frame", "", layers);
+    chart.axes.y = -0.6..fates.len().max(1) as f64 - 0.1;
+    chart.rows = fates.iter().map(|fate| fate.name().to_owned()).collect();
+    chart.height = 150 + 26 * fates.len() as u32;
+    let nis = view.curve(&view.flight.targets, |it| {
+        Some(at(view.flight.at_s(it.stamp_ns), it.nis?.min(30.0)))
+    });
+    let mut consistency = over_time(
+        view,
+        "Surprise of each detection (normalised innovation squared)",
+        "",
+        vec![layer("about 3 for a consistent filter; cut at 30", Ink::Blue, Shape::Dots, nis)],
+    );
+    consistency.height = HEIGHT;
+    vec![chart, consistency]
+}
+
+/// How long frames took.
+pub fn latency(view: &View<'_>) -> Vec<Chart> {
+    let flight = view.flight;
+    let in_use = || view.frames.all.iter().filter(|it| it.fate != Fate::Standby);
+    let point = |exposed_ns: i64, to_ns: i64| {
+        let point = at(flight.at_s(exposed_ns), between_ms(exposed_ns, to_ns));
+        (view.is_shown(point.x) && (0.0..60_000.0).contains(&point.y)).then_some(point)
+    };
+    let setpoints = in_use().filter_map(|it| point(it.exposed_ns, it.setpoint_ns?));
+    let detected = in_use().filter_map(|it| point(it.exposed_ns, it.handled_ns));
+    let layers = vec![
+        layer("exposure to setpoint", Ink::Orange, Shape::Dots, setpoints),
+        layer("exposure to detections at the controller", Ink::Blue, Shape::Dots, detected),
+    ];
+    let mut chart = over_time(view, "Age of what is used", "ms", layers);
+    // A single frame, as the first after a start, would flatten the rest.
+    let ages: Vec<f64> =
+        chart.layers.iter().flat_map(|it| &it.points).map(|point| point.y).collect();
+    let high = 2.5 * node::stats::quantile(&ages, 0.95).unwrap_or(0.0).max(10.0);
+    let count = ages.iter().filter(|age| **age > high).count();
+    if count > 0 {
+        chart.axes.y.end = high;
+        chart.layers.iter_mut().for_each(|it| it.points.retain(|point| point.y <= high));
+        chart.note = format!("{count} beyond {high:.0} ms are not shown");
+    }
+    vec![chart]
+}
+
+/// True and estimated wind.
+pub fn wind(view: &View<'_>) -> Vec<Chart> {
+    let flight = view.flight;
+    let axis = |axis: usize| {
+        let truth = view.curve(&flight.wind, |it| {
+            Some(at(flight.at_s(it.stamp_ns), component(it.velocity_ned_m_s, axis)))
+        });
+        let estimate = view.curve(&flight.targets, |it| {
+            Some(at(flight.at_s(it.stamp_ns), *it.wind_ned_m_s?.get(axis)?))
+        });
+        let layers = vec![
+            layer("truth", Ink::Orange, Shape::Line, truth),
+            layer("estimate from the tilt", Ink::Blue, Shape::Line, estimate),
+        ];
+        let name = NED.get(axis).copied().unwrap_or_default();
+        over_time(view, &format!("Air moving to the {name}"), "m/s", layers)
+    };
+    vec![axis(0), axis(1)]
+}
+
+/// Battery and link.
+pub fn battery(view: &View<'_>) -> Vec<Chart> {
+    let flight = view.flight;
+    let charge = view.curve(&flight.vehicle, |it| {
+        Some(at(flight.at_s(it.stamp_ns), 100.0 * f64::from(it.battery?)))
+    });
+    let voltage = view.curve(&flight.packets.power, |it| {
+        Some(at(flight.at_s(flight.vehicle_ns(it.received_ns)), it.voltage_v?))
+    });
+    let mut packets: Vec<At> = Vec::new();
+    for received_ns in &flight.packets.received_ns {
+        let second = flight.at_s(flight.vehicle_ns(*received_ns)).floor() + 0.5;
+        match packets.last_mut() {
+            Some(last) if last.x >= second => last.y += 1.0,
+            _ => packets.push(at(second, 1.0)),
+        }
+    }
+    packets.retain(|point| view.is_shown(point.x));
+    let line = |name: &str, ink, points| vec![layer(name, ink, Shape::Line, points)];
+    let mut voltage =
+        over_time(view, "Battery, voltage", "V", line("voltage", Ink::Purple, voltage));
+    let volts = voltage.layers.iter().flat_map(|it| &it.points).map(|it| it.y);
+    let low = volts.fold(f64::INFINITY, f64::min);
+    if low.is_finite() {
+        voltage.axes.y.start = (low - 0.5).max(0.0);
+    }
+    vec![
+        over_time(view, "Battery, charge", "%", line("charge", Ink::Green, charge)),
+        voltage,
+        over_time(
+            view,
+            "Packets of the autopilot",
+            "1/s",
+            line("packets a second", Ink::Blue, packets),
+        ),
+    ]
+}
+
+/// Figures 4.10 to 4.16 of the thesis.
+pub fn thesis(view: &View<'_>) -> Vec<Chart> {
+    let flight = view.flight;
+    let from_truth = !flight.truth.is_empty();
+    let vehicle = |of: &dyn Fn([f64; 3]) -> f64| -> Vec<At> {
+        match from_truth {
+            true => view.curve(&flight.truth, |it| {
+                Some(at(flight.at_s(it.stamp_ns), of(it.position_ned_m)))
+            }),
+            false => view.curve(&flight.vehicle, |it| {
+                Some(at(flight.at_s(it.stamp_ns), of(it.position_ned_m)))
+            }),
+        }
+    };
+    let pad = |of: &dyn Fn([f64; 3]) -> f64| -> Vec<At> {
+        match from_truth {
+            true => {
+                view.curve(&flight.truth, |it| Some(at(flight.at_s(it.stamp_ns), of(it.pad_ned_m))))
+            }
+            false => view.curve(&flight.targets, |it| {
+                Some(at(flight.at_s(it.stamp_ns), of(it.position_ned_m?)))
+            }),
+        }
+    };
+    let mut charts = trajectories(&vehicle, &pad);
+    for (axis, name) in ["x (north)", "y (east)", "z (down)"].into_iter().enumerate() {
+        let of = |vector: [f64; 3]| component(vector, axis);
+        let layers = vec![
+            layer("position, m", Ink::Orange, Shape::Line, vehicle(&of)),
+            layer("pad, m", Ink::Green, Shape::Thin, pad(&of)),
+            layer("command velocity, m/s", Ink::Blue, Shape::Steps, view.setpoint_curve(axis)),
+        ];
+        let number = 11 + axis;
+        let title = format!("Figure 4.{number}: position and command velocity, {name}");
+        charts.push(over_time(view, &title, "m, m/s", layers));
+    }
+    for (axis, name) in ["x (north)", "y (east)", "z (down)"].into_iter().enumerate() {
+        let wind = view.curve(&flight.wind, |it| {
+            Some(at(flight.at_s(it.stamp_ns), component(it.velocity_ned_m_s, axis)))
+        });
+        let is_there = !wind.is_empty();
+        let layers = vec![
+            layer("wind, m/s", Ink::Orange, Shape::Line, wind),
+            layer("command velocity, m/s", Ink::Blue, Shape::Steps, view.setpoint_curve(axis)),
+        ];
+        let number = 14 + axis;
+        let title = format!("Figure 4.{number}: wind and command velocity, {name}");
+        let mut chart = over_time(view, &title, "m/s", layers);
+        if !is_there {
+            chart.note = "the wind was not recorded".to_owned();
+        }
+        charts.push(chart);
+    }
+    charts
+}
+
+type Curve<'a> = &'a dyn Fn(&dyn Fn([f64; 3]) -> f64) -> Vec<At>;
+
+/// Figure 4.10 from above and from the south.
+fn trajectories(vehicle: Curve<'_>, pad: Curve<'_>) -> Vec<Chart> {
+    let views = [("from above", 1, 0, "north, m"), ("from the south", 1, 2, "height, m")];
+    let trajectory = |name: &str, across: usize, up: usize, y_name: &str| {
+        let sign = if up == 2 { -1.0 } else { 1.0 };
+        let path = |curve: Curve<'_>| -> Vec<At> {
+            let (x, y) = (curve(&|p| component(p, across)), curve(&|p| sign * component(p, up)));
+            x.iter().zip(&y).map(|(x, y)| at(x.y, y.y)).collect()
+        };
+        let (own, pads) = (path(vehicle), path(pad));
+        let all = || own.iter().chain(&pads);
+        let low_x = all().map(|it| it.x).fold(f64::INFINITY, f64::min);
+        let low_y = all().map(|it| it.y).fold(f64::INFINITY, f64::min);
+        let finite = |value: f64| if value.is_finite() { value } else { 0.0 };
+        let (low_x, low_y) = (finite(low_x), finite(low_y));
+        Chart {
+            title: format!("Figure 4.10: trajectory, {name}"),
+            axes: Axes {
+                x_name: "east, m".to_owned(),
+                y_name: y_name.to_owned(),
+                x: span(all().map(|it| it.x), low_x - 0.1..low_x + 0.5),
+                y: span(all().map(|it| it.y), low_y - 0.1..low_y + 0.5),
+                is_equal: true,
+            },
+            bands: Vec::new(),
+            layers: vec![
+                layer("vehicle", Ink::Orange, Shape::Line, own.iter().copied()),
+                layer("pad", Ink::Green, Shape::Crosses, pads.last().copied()),
+            ],
+            rows: Vec::new(),
+            height: 400,
+            note: String::new(),
+        }
+    };
+    views.map(|(name, across, up, y_name)| trajectory(name, across, up, y_name)).into()
+}
+
+/// Gives charts that stand beside each other the same axes.
+pub fn share_axes(one: &mut Chart, other: &mut Chart) {
+    if one.is_empty() || other.is_empty() {
+        return;
+    }
+    let joined =
+        |a: &std::ops::Range<f64>, b: &std::ops::Range<f64>| a.start.min(b.start)..a.end.max(b.end);
+    one.axes.x = joined(&one.axes.x, &other.axes.x);
+    other.axes.x = one.axes.x.clone();
+    // Rows have names of their own.
+    if one.rows.is_empty() {
+        one.axes.y = joined(&one.axes.y, &other.axes.y);
+        other.axes.y = one.axes.y.clone();
+    }
+}

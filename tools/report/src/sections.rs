@@ -1,0 +1,456 @@
+//! The sections of the page: what each says of a flight, and what was not recorded.
+
+use std::collections::BTreeMap;
+
+use crate::chart::Chart;
+use crate::frames::Fate;
+use crate::html::{Cell, count, details, escaped, missing, number, paragraph, table, text};
+use crate::view::View;
+use crate::{journal, losses, plots};
+
+/// A part of the page, for one flight.
+#[derive(Clone, Debug)]
+pub struct Section {
+    /// Its name in links.
+    pub id: &'static str,
+    /// Its title.
+    pub title: &'static str,
+    /// What it shows, for who has not seen one before; may be empty.
+    pub lead: &'static str,
+    /// Its charts.
+    pub charts: Vec<Chart>,
+    /// What comes before the charts, as HTML.
+    pub before: String,
+    /// What comes after the charts, as HTML.
+    pub after: String,
+}
+
+/// The sections of a flight, in order: the same for each flight.
+pub fn of(view: &View<'_>) -> Vec<Section> {
+    vec![
+        landing(view),
+        phases(view),
+        height(view),
+        velocity(view),
+        detections(view),
+        latency(view),
+        lost(view),
+        detectors(view),
+        wind(view),
+        battery(view),
+        log(view),
+        thesis(view),
+        configuration(view),
+        recording(view),
+    ]
+}
+
+fn section(id: &'static str, title: &'static str, lead: &'static str) -> Section {
+    Section { id, title, lead, charts: Vec::new(), before: String::new(), after: String::new() }
+}
+
+fn landing(view: &View<'_>) -> Section {
+    let mut section = section("landing", "The landing in one picture", "");
+    section.charts = plots::landing(view);
+    if view.truth.is_empty() {
+        section.before.push_str(&missing("truth, which only a simulation knows"));
+    }
+    if view.estimated.is_empty() {
+        section
+            .before
+            .push_str(&missing("the estimate of the landing point; or the marker was never seen"));
+    }
+    section
+}
+
+fn phases(view: &View<'_>) -> Section {
+    let mut section = section(
+        "phases",
+        "Phases and reasons",
+        "What the controller did, and why. Times count from the begin of the landing.",
+    );
+    let mut rows = Vec::new();
+    for phase in &view.summary.phases {
+        for (index, reason) in phase.reasons.iter().enumerate() {
+            let name = if index == 0 { phase.name.as_str() } else { "" };
+            let next = phase.reasons.get(index + 1).map_or(phase.to_s, |next| next.from_s);
+            rows.push(vec![
+                number(Some(reason.from_s), 1, "s"),
+                number(Some(next - reason.from_s), 1, "s"),
+                text(name),
+                text(&reason.why),
+            ]);
+        }
+    }
+    section.after = match rows.is_empty() {
+        true => missing("the controller's status"),
+        false => table(&["from", "for", "phase", "reason"], &rows),
+    };
+    section
+}
+
+fn height(view: &View<'_>) -> Section {
+    let mut section = section(
+        "height",
+        "Height, distance and the estimate's error",
+        "The error is that of the vehicle's place relative to the pad: estimated less true, horizontally.",
+    );
+    section.charts = plots::height(view);
+    let summary = &view.summary;
+    if view.errors.is_empty() {
+        section.before = missing("truth, so the estimate's error is not known");
+    } else {
+        let rows = [vec![
+            text("horizontal error of the estimate"),
+            number(summary.estimate_error_p50_m, 3, "m"),
+            number(summary.estimate_error_p95_m, 3, "m"),
+        ]];
+        section.after = table(&["", "median", "95 %"], &rows);
+    }
+    section
+}
+
+fn velocity(view: &View<'_>) -> Section {
+    let mut section = section(
+        "setpoints",
+        "Setpoints and response",
+        "What the controller asked for, and what the vehicle did by its autopilot's word.",
+    );
+    section.charts = plots::velocity(view);
+    if view.flight.vehicle.is_empty() {
+        section.before.push_str(&missing("the vehicle's state"));
+    }
+    if view.setpoints.iter().all(|it| !it.velocity_ned_m_s.iter().all(|v| v.is_finite())) {
+        section.before.push_str(&missing("velocity setpoints; or none were sent"));
+    } else if view.flight.tapes.is_empty() {
+        section.before.push_str(&paragraph(
+            "Setpoints are those of the controller's status, five a second: the tape, which has each, was not recorded.",
+        ));
+    }
+    section
+}
+
+fn detections(view: &View<'_>) -> Section {
+    let mut section = section(
+        "detections",
+        "Detections and refusals",
+        "Every frame that a detector searched, by what became of it.",
+    );
+    if view.frames.all.is_empty() {
+        section.before = missing("detections");
+        return section;
+    }
+    section.charts = plots::detections(view);
+    if !view.frames.is_from_tape {
+        section.before = paragraph(
+            "Without the controller's tape this is what its estimates tell: a frame that is not known may have been refused.",
+        );
+    }
+    let mut counts: BTreeMap<(&Fate, &str), u64> = BTreeMap::new();
+    for frame in &view.frames.all {
+        *counts.entry((&frame.fate, &frame.detector)).or_default() += 1;
+    }
+    let all = view.frames.all.len() as f64;
+    let rows: Vec<Vec<Cell>> = counts
+        .into_iter()
+        .map(|((fate, detector), frames)| {
+            vec![
+                text(fate.name()),
+                text(fate.meaning()),
+                text(detector),
+                count(frames),
+                number(Some(100.0 * frames as f64 / all), 1, "%"),
+            ]
+        })
+        .collect();
+    section.after = table(&["", "meaning", "detector", "frames", "of all"], &rows);
+    section
+}
+
+fn latency(view: &View<'_>) -> Section {
+    let mut section = section(
+        "latency",
+        "Latency budget",
+        "From the middle of a frame's exposure to the setpoint that uses it, stage by stage.",
+    );
+    let stages = &view.summary.latency;
+    if stages.is_empty() {
+        section.before = missing("detections, so no latency is known");
+        return section;
+    }
+    section.charts = plots::latency(view);
+    if !view.frames.is_from_tape {
+        section.before = paragraph(
+            "Without the controller's tape the times are those at which the recorder had the detections; setpoints cannot be told apart.",
+        );
+    }
+    let rows: Vec<Vec<Cell>> = stages
+        .iter()
+        .map(|stage| {
+            let name = if stage.is_part { format!("- {}", stage.name) } else { stage.name.clone() };
+            let ms = |value: f64| number(Some(value), 1, "ms");
+            vec![
+                text(name),
+                count(stage.frames as u64),
+                ms(stage.p50_ms),
+                ms(stage.p90_ms),
+                ms(stage.p99_ms),
+                ms(stage.max_ms),
+            ]
+        })
+        .collect();
+    section.after = table(&["stage", "frames", "median", "90 %", "99 %", "longest"], &rows);
+    section
+}
+
+fn lost(view: &View<'_>) -> Section {
+    let flight = view.flight;
+    let mut section = section(
+        "losses",
+        "Losses",
+        "What is missing, as the file itself counts it. Counts of a process are since its start.",
+    );
+    let rows = |losses: Vec<losses::Loss>| -> Vec<Vec<Cell>> {
+        losses
+            .into_iter()
+            .map(|loss| {
+                let of = loss.of.map_or("-".to_owned(), |of| of.to_string());
+                vec![text(loss.place), text(loss.what), count(loss.count), Cell::Number(of)]
+            })
+            .collect()
+    };
+    let mut counted = rows(losses::frames(flight));
+    if counted.is_empty() {
+        section
+            .before
+            .push_str(&missing("frames and detections, so none can be counted as missing"));
+    }
+    let by_recorder = losses::recorder(flight);
+    if !by_recorder.is_empty() {
+        let all: u64 = by_recorder.iter().map(|loss| loss.count).sum();
+        section.after = details(
+            &format!("{all} messages that the recorder lost, by key"),
+            &table(&["where", "what", "missing", "of"], &rows(by_recorder)),
+        );
+    }
+    counted.extend(rows(losses::tape(flight)));
+    if flight.lost.values().all(|count| *count == 0) {
+        section.before.push_str(&paragraph("The recorder counted no message as lost."));
+    }
+    if flight.tapes.is_empty() {
+        section.before.push_str(&missing("the controller's tape: the flight cannot be replayed"));
+    }
+    let processes = rows(losses::processes(flight));
+    if flight.processes.is_empty() {
+        section.before.push_str(&missing("the health of the processes, with what they dropped"));
+    }
+    section.after.insert_str(0, &table(&["where", "what", "missing", "of"], &counted));
+    section.after.push_str(&table(&["process", "dropped or failed", "times", "of"], &processes));
+    section
+}
+
+fn detectors(view: &View<'_>) -> Section {
+    let flight = view.flight;
+    let mut section = section("detectors", "Detectors", "");
+    let Some(last) = flight.statuses.last() else {
+        section.before = missing("the controller's status, which tells the detector in use");
+        return section;
+    };
+    let mut changes = Vec::new();
+    let mut before: Option<&str> = None;
+    for status in &flight.statuses {
+        let now = status.active_detector.as_deref();
+        if now != before {
+            changes.push(vec![
+                number(Some(flight.at_s(status.stamp_ns)), 1, "s"),
+                text(before.unwrap_or("none")),
+                text(now.unwrap_or("none")),
+                text(&status.detector_why),
+            ]);
+        }
+        before = now;
+    }
+    section.before = paragraph(&format!(
+        "{} changes while the controller ran; preferred at the end: {}.",
+        last.detector_changes,
+        if last.preference.is_empty() { "nothing" } else { &last.preference }
+    ));
+    section.after = table(&["at", "from", "to", "why"], &changes);
+    // Each detector by the last status that knows it.
+    let mut known = BTreeMap::new();
+    for candidate in flight.statuses.iter().flat_map(|status| &status.candidates) {
+        known.insert(candidate.detector.as_str(), candidate);
+    }
+    let rows: Vec<Vec<Cell>> =
+        known
+            .into_values()
+            .map(|it| {
+                let info = flight.detectors.get(&it.detector);
+                vec![
+                    text(&it.detector),
+                    text(it.place.map_or("-", messages::Place::name)),
+                    text(info.map_or("-".to_owned(), |info| info.markers.join(", "))),
+                    number(Some(it.rate_hz), 1, "Hz"),
+                    number(Some(it.latency_ms), 0, "ms"),
+                    Cell::Number(format!("{} of {}", it.agreed, it.compared)),
+                    text(info.map_or("-".to_owned(), |info| {
+                        format!("{} on {}", info.version, info.host)
+                    })),
+                ]
+            })
+            .collect();
+    let head = ["detector", "place", "markers", "rate", "latency", "agrees", "version"];
+    section.after.push_str(&table(&head, &rows));
+    section
+}
+
+fn wind(view: &View<'_>) -> Section {
+    let mut section = section("wind", "Wind", "");
+    let summary = &view.summary;
+    let has_estimate = view.flight.targets.iter().any(|target| target.wind_ned_m_s.is_some());
+    match (summary.wind_mean_m_s, summary.wind_max_m_s) {
+        (Some(mean), Some(max)) => {
+            section.before =
+                paragraph(&format!("{mean:.1} m/s in the mean, {max:.1} m/s at most."));
+        }
+        _ => section.before = missing("the true wind, which only a simulation knows"),
+    }
+    if !has_estimate {
+        section.before.push_str(&missing("the controller's estimate of the wind from the tilt"));
+    }
+    if has_estimate || summary.wind_mean_m_s.is_some() {
+        section.charts = plots::wind(view);
+    }
+    section
+}
+
+fn battery(view: &View<'_>) -> Section {
+    let flight = view.flight;
+    let mut section = section("battery", "Battery and link", "");
+    if flight.packets.count == 0 {
+        section.before.push_str(&missing("the autopilot's packets"));
+    } else {
+        section.before.push_str(&paragraph(&format!(
+            "{} packets of the autopilot, {} bytes.",
+            flight.packets.count, flight.packets.bytes
+        )));
+    }
+    let charts = plots::battery(view).into_iter();
+    let is_there = |chart: &Chart| !chart.is_empty();
+    section.charts = charts.collect();
+    if section.charts.first().is_none_or(|chart| !is_there(chart)) {
+        section
+            .before
+            .push_str(&missing("the charge of the battery: the autopilot did not report it"));
+    }
+    let timeouts = flight.statuses.iter().rev().find_map(|status| status.setpoint_timeout_s);
+    let mut rows =
+        vec![vec![text("the autopilot stops without setpoints after"), number(timeouts, 2, "s")]];
+    for (name, process) in &flight.processes {
+        let is_controller = name.starts_with("controller/");
+        for latency in process.last.latencies.iter().filter(|_| is_controller) {
+            rows.push(vec![
+                text(format!("{}, median and 99 % of the last seconds", latency.name)),
+                Cell::Number(format!("{:.1}, {:.1} ms", latency.p50_ms, latency.p99_ms)),
+            ]);
+        }
+    }
+    section.after = table(&[], &rows);
+    section
+}
+
+fn log(view: &View<'_>) -> Section {
+    let mut section = section("log", "Log", "");
+    let (lines, left_out) = journal::of(view.flight);
+    if lines.is_empty() {
+        section.before = missing("status, packets and health, of which the log is made");
+        return section;
+    }
+    let rows: Vec<Vec<Cell>> = lines
+        .into_iter()
+        .map(|line| {
+            let said = if line.is_warning { Cell::Warning(line.text) } else { text(line.text) };
+            vec![number(Some(line.time_s), 2, "s"), text(line.who), said]
+        })
+        .collect();
+    section.after = table(&["at", "who", "said"], &rows);
+    if left_out > 0 {
+        section.after.push_str(&paragraph(&format!("{left_out} further lines are left out.")));
+    }
+    section
+}
+
+fn thesis(view: &View<'_>) -> Section {
+    let mut section = section(
+        "thesis",
+        "The thesis' figures of this flight",
+        "Figures 4.10 to 4.16: trajectory; position and command velocity; wind and command velocity, along each axis.",
+    );
+    section.charts = plots::thesis(view);
+    let source = if view.flight.truth.is_empty() {
+        "Positions are the autopilot's and the estimate's: truth was not recorded."
+    } else {
+        "Positions are true ones."
+    };
+    section.before = paragraph(source);
+    section
+}
+
+fn configuration(view: &View<'_>) -> Section {
+    let flight = view.flight;
+    let mut section = section("configuration", "Configuration and parameters", "");
+    if flight.configurations.is_empty() {
+        section.before.push_str(&missing("the configuration of the services"));
+    }
+    for (service, toml) in &flight.configurations {
+        let body = format!("<pre>{}</pre>", escaped(toml));
+        section.after.push_str(&details(service, &body));
+    }
+    let parameters = &flight.packets.parameters;
+    if parameters.is_empty() {
+        section.before.push_str(&missing(
+            "parameters of the autopilot: nobody asked for any (a ground station asks for all)",
+        ));
+    } else {
+        let rows: Vec<Vec<Cell>> = parameters
+            .iter()
+            .map(|(name, value)| vec![text(name), Cell::Number(value.to_string())])
+            .collect();
+        let title = format!("{} parameters of the autopilot, as far as asked for", rows.len());
+        section.after.push_str(&details(&title, &table(&["parameter", "value"], &rows)));
+    }
+    for (camera, info) in &flight.cameras {
+        let json = serde_json::to_string_pretty(info).unwrap_or_default();
+        let body = format!("<pre>{}</pre>", escaped(&json));
+        section.after.push_str(&details(&format!("calibration of the camera {camera}"), &body));
+    }
+    section
+}
+
+fn recording(view: &View<'_>) -> Section {
+    let flight = view.flight;
+    let mut section = section("recording", "The recording", "");
+    for problem in &view.summary.problems {
+        section.before.push_str(&format!("<p class=\"warning\">{}</p>", escaped(problem)));
+    }
+    let mut rows = vec![vec![text("file"), text(&flight.name)]];
+    rows.push(vec![text("messages"), text(flight.messages.to_string())]);
+    let tape = match &flight.replayed {
+        Some(replayed) => replayed.text.clone(),
+        None if flight.tapes.is_empty() => "not recorded".to_owned(),
+        None => "recorded, not replayed".to_owned(),
+    };
+    rows.push(vec![text("controller's tape"), text(tape)]);
+    rows.extend(flight.facts.iter().map(|(name, value)| vec![text(name), text(value)]));
+    for (name, process) in &flight.processes {
+        let wall_s = process.last.uptime_s - process.first.uptime_s;
+        let share = (wall_s > 0.0)
+            .then(|| 100.0 * (process.last.cpu_s - process.first.cpu_s) / wall_s)
+            .map_or(String::new(), |share| format!(", {share:.0} % of a core"));
+        let health = &process.last;
+        let said = format!("alight {} on {}{share}", health.version, health.host);
+        rows.push(vec![text(name), text(said)]);
+    }
+    section.after = table(&[], &rows);
+    section
+}

@@ -1,0 +1,201 @@
+//! A flight in numbers, and in one line.
+
+use messages::{LandedState, Phase};
+use node::stats::quantile;
+use serde::Serialize;
+
+use crate::flight::Flight;
+use crate::frames::{Fate, Frames};
+use crate::latency::{Stage, TO_SETPOINT, budget};
+use crate::{losses, phases, track};
+
+/// A flight in numbers. What was not recorded is `None`.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Summary {
+    /// The name of its file.
+    pub name: String,
+    /// The program that flew it, with its version.
+    pub program: Option<String>,
+    /// The guidance law.
+    pub guidance: Option<String>,
+    /// The last phase.
+    pub phase: Option<String>,
+    /// Its reason.
+    pub why: Option<String>,
+    /// Whether it landed and its motors stopped.
+    pub landed: bool,
+    /// From the start of the landing to disarmed motors, in seconds.
+    pub time_to_disarm_s: Option<f64>,
+    /// From the start of the landing to the first contact, in seconds.
+    pub time_to_touchdown_s: Option<f64>,
+    /// True distance from the pad at the touchdown, in metres.
+    pub touchdown_error_m: Option<f64>,
+    /// The controller's last estimate of the distance from the pad, in metres.
+    pub estimated_error_m: Option<f64>,
+    /// Vertical speed at the touchdown, in m/s.
+    pub touchdown_speed_m_s: Option<f64>,
+    /// Horizontal speed at the touchdown, in m/s.
+    pub touchdown_lateral_speed_m_s: Option<f64>,
+    /// Largest tilt, in degrees: the true one, or that which the autopilot reports.
+    pub max_tilt_deg: Option<f64>,
+    /// Median error of the estimated horizontal distance against truth, in metres.
+    pub estimate_error_p50_m: Option<f64>,
+    /// Its 95th percentile, in metres.
+    pub estimate_error_p95_m: Option<f64>,
+    /// Frames that detectors searched.
+    pub frames: usize,
+    /// Frames that the estimate used.
+    pub frames_used: usize,
+    /// Frames without the marker.
+    pub frames_without_marker: usize,
+    /// Frames whose marker was refused.
+    pub frames_refused: usize,
+    /// From exposure to setpoint, median, in milliseconds.
+    pub latency_p50_ms: Option<f64>,
+    /// Its 99th percentile, in milliseconds.
+    pub latency_p99_ms: Option<f64>,
+    /// Changes of the detector in use.
+    pub detector_changes: Option<u64>,
+    /// Messages that the recorder lost.
+    pub messages_lost: u64,
+    /// Mean true wind, in m/s.
+    pub wind_mean_m_s: Option<f64>,
+    /// Strongest true wind, in m/s.
+    pub wind_max_m_s: Option<f64>,
+    /// Lowest charge of the battery, from 0 to 1.
+    pub battery_min: Option<f64>,
+    /// Retries: climbs for another attempt.
+    pub retries: usize,
+    /// Whether the tape gives the same decisions again; `None` when that was not tried.
+    pub tape_verified: Option<bool>,
+    /// The tape's verdict as a sentence.
+    pub tape: Option<String>,
+    /// What the recording lacks, as sentences.
+    pub problems: Vec<String>,
+    /// The latency budget.
+    pub latency: Vec<Stage>,
+    /// The phases with their reasons.
+    pub phases: Vec<phases::Phase>,
+}
+
+/// A flight in numbers.
+pub fn of(flight: &Flight, frames: &Frames) -> Summary {
+    let latency = budget(frames);
+    let last = flight.statuses.last();
+    let since_start_s = |stamp_ns: i64| {
+        flight.statuses.iter().find_map(|status| status.started_ns).map(|_| flight.at_s(stamp_ns))
+    };
+    let disarmed_ns = flight.statuses.iter().find_map(|status| status.disarmed_ns);
+    let touchdown = flight.truth.iter().find_map(|truth| truth.touchdown);
+    let standing = flight.vehicle.iter().skip_while(|it| it.landed != LandedState::InAir);
+    let standing_ns =
+        standing.skip_while(|it| it.landed != LandedState::OnGround).map(|it| it.stamp_ns).next();
+    let errors_m: Vec<f64> =
+        track::estimate_errors(flight).iter().map(|error| error.horizontal_m).collect();
+    let winds: Vec<f64> = flight.wind.iter().map(|wind| norm(wind.velocity_ned_m_s)).collect();
+    let phases = phases::of(flight);
+    let to_setpoint = latency.iter().find(|stage| stage.name == TO_SETPOINT);
+    let told = last.and_then(|status| status.latency_ms);
+    Summary {
+        name: flight.name.clone(),
+        program: flight.facts.get("program").cloned(),
+        guidance: last.map(|status| status.guidance.clone()),
+        phase: last.map(|status| status.phase.name().to_owned()),
+        why: last.map(|status| status.why.clone()),
+        landed: last.is_some_and(|status| status.phase == Phase::Landed) || disarmed_ns.is_some(),
+        time_to_disarm_s: disarmed_ns.and_then(since_start_s),
+        time_to_touchdown_s: touchdown
+            .map(|it| it.stamp_ns)
+            .or(standing_ns)
+            .and_then(since_start_s),
+        touchdown_error_m: touchdown.map(|it| it.error_m),
+        estimated_error_m: flight.targets.iter().rev().find_map(|it| it.lateral_error_m),
+        touchdown_speed_m_s: touchdown.map(|it| it.vertical_speed_m_s),
+        touchdown_lateral_speed_m_s: touchdown.map(|it| it.lateral_speed_m_s),
+        max_tilt_deg: max_tilt_deg(flight),
+        estimate_error_p50_m: quantile(&errors_m, 0.5),
+        estimate_error_p95_m: quantile(&errors_m, 0.95),
+        frames: frames.all.len(),
+        frames_used: frames.count(&Fate::Used),
+        frames_without_marker: frames.count(&Fate::NoMarker),
+        frames_refused: frames.refused(),
+        latency_p50_ms: to_setpoint.map(|it| it.p50_ms).or(told.map(|[p50, _]| p50)),
+        latency_p99_ms: to_setpoint.map(|it| it.p99_ms).or(told.map(|[_, p99]| p99)),
+        detector_changes: last.map(|status| status.detector_changes),
+        messages_lost: flight.lost.values().sum(),
+        wind_mean_m_s: node::stats::mean(&winds),
+        wind_max_m_s: winds.iter().copied().reduce(f64::max),
+        battery_min: battery_min(flight),
+        retries: phases.iter().filter(|phase| phase.name == Phase::Retry.name()).count(),
+        tape_verified: flight.replayed.as_ref().map(|it| it.is_verified),
+        tape: flight.replayed.as_ref().map(|it| it.text.clone()),
+        problems: losses::recording(flight),
+        latency,
+        phases,
+    }
+}
+
+fn norm(vector: [f64; 3]) -> f64 {
+    vector.iter().map(|value| value * value).sum::<f64>().sqrt()
+}
+
+/// Tilt of a body whose attitude is this quaternion, in degrees.
+pub fn tilt_deg(wxyz: [f64; 4]) -> f64 {
+    let [_, x, y, _] = wxyz;
+    (1.0 - 2.0 * (x * x + y * y)).clamp(-1.0, 1.0).acos().to_degrees()
+}
+
+fn max_tilt_deg(flight: &Flight) -> Option<f64> {
+    let true_deg = flight.truth.iter().map(|truth| truth.max_tilt_rad.to_degrees());
+    let told_deg = flight.vehicle.iter().map(|state| tilt_deg(state.ned_from_body_wxyz));
+    true_deg.reduce(f64::max).or(told_deg.reduce(f64::max))
+}
+
+fn battery_min(flight: &Flight) -> Option<f64> {
+    let states = flight.vehicle.iter().filter_map(|state| state.battery).map(f64::from);
+    let packets = flight.packets.power.iter().filter_map(|power| power.remaining);
+    states.chain(packets).reduce(f64::min)
+}
+
+impl Summary {
+    /// How it ended, in a few words.
+    pub fn outcome(&self) -> String {
+        match (&self.phase, &self.why) {
+            _ if self.landed => "landed".to_owned(),
+            (Some(phase), Some(why)) if why.starts_with(phase) => why.clone(),
+            (Some(phase), Some(why)) => format!("{phase}: {why}"),
+            _ => "no status of a controller was recorded".to_owned(),
+        }
+    }
+
+    /// The line for a bug report.
+    pub fn line(&self) -> String {
+        let number = |value: Option<f64>, digits: usize, unit: &str, what: &str| {
+            value.map(|value| format!("{value:.digits$} {unit}{what}"))
+        };
+        let latency = self.latency_p50_ms.zip(self.latency_p99_ms);
+        let parts = [
+            number(self.time_to_disarm_s, 1, "s", " to disarmed"),
+            number(self.touchdown_error_m, 3, "m", " from the pad (truth)"),
+            number(self.touchdown_speed_m_s, 2, "m/s", " down"),
+            number(self.touchdown_lateral_speed_m_s, 2, "m/s", " aside"),
+            number(self.max_tilt_deg, 1, "deg", " tilt at most"),
+            number(self.wind_mean_m_s, 1, "m/s", " mean wind"),
+            Some(format!(
+                "{} of {} frames used, {} refused, {} without the marker",
+                self.frames_used, self.frames, self.frames_refused, self.frames_without_marker
+            )),
+            latency.map(|(p50, p99)| format!("exposure to setpoint {p50:.0} ms, 99 % {p99:.0} ms")),
+            self.detector_changes.map(|changes| format!("{changes} changes of the detector")),
+            Some(format!("{} retries", self.retries)),
+            Some(format!("recorder lost {} messages", self.messages_lost)),
+            self.tape.clone(),
+            (!self.problems.is_empty()).then(|| format!("recording: {}", self.problems.join("; "))),
+        ];
+        let parts: Vec<String> = parts.into_iter().flatten().collect();
+        let program = self.program.as_deref().unwrap_or("unknown program");
+        let guidance = self.guidance.as_deref().unwrap_or("unknown guidance");
+        let Self { name, .. } = self;
+        format!("{name} [{program}, {guidance}] {}; {}", self.outcome(), parts.join("; "))
+    }
+}

@@ -1,0 +1,139 @@
+//! A flight with what is computed from it for the page.
+
+use std::ops::Range;
+
+use messages::{Phase, TapeAction};
+
+use crate::chart::{At, Band, at};
+use crate::flight::Flight;
+use crate::frames::Frames;
+use crate::phases;
+use crate::summary::{self, Summary};
+use crate::track::{self, EstimateError, Place};
+
+/// Time shown before the first phase of a landing, in seconds.
+const BEFORE_S: f64 = 1.0;
+
+/// A flight with what is computed from it.
+#[derive(Clone, Debug)]
+pub struct View<'a> {
+    /// The flight.
+    pub flight: &'a Flight,
+    /// It in numbers.
+    pub summary: Summary,
+    /// What became of each frame.
+    pub frames: Frames,
+    /// Where the vehicle truly was.
+    pub truth: Vec<Place>,
+    /// Where it was by the estimate.
+    pub estimated: Vec<Place>,
+    /// The error of the estimate.
+    pub errors: Vec<EstimateError>,
+    /// The velocity setpoints.
+    pub setpoints: Vec<Setpoint>,
+    /// What is shown of the time, in seconds since the landing began.
+    pub time: Range<f64>,
+}
+
+/// A velocity setpoint.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Setpoint {
+    /// When, in seconds since the landing began.
+    pub time_s: f64,
+    /// In local NED, in m/s; not a number where none is given.
+    pub velocity_ned_m_s: [f64; 3],
+}
+
+impl<'a> View<'a> {
+    /// A flight to show.
+    pub fn new(flight: &'a Flight) -> Self {
+        let frames = Frames::of(flight);
+        let summary = summary::of(flight, &frames);
+        Self {
+            frames,
+            truth: track::truth(flight),
+            estimated: track::estimated(flight),
+            errors: track::estimate_errors(flight),
+            setpoints: setpoints(flight),
+            time: time(flight, &summary.phases),
+            summary,
+            flight,
+        }
+    }
+
+    /// The phases as bands of charts over time.
+    pub fn bands(&self) -> Vec<Band> {
+        let phases = self.summary.phases.iter();
+        phases
+            .map(|phase| Band { name: phase.name.clone(), from: phase.from_s, to: phase.to_s })
+            .collect()
+    }
+
+    /// Whether a time is shown.
+    pub fn is_shown(&self, time_s: f64) -> bool {
+        self.time.contains(&time_s)
+    }
+
+    /// The shown points of a curve over time.
+    pub fn curve<T>(&self, samples: &[T], of: impl Fn(&T) -> Option<At>) -> Vec<At> {
+        samples.iter().filter_map(of).filter(|point| self.is_shown(point.x)).collect()
+    }
+
+    /// A component of the setpoints over time.
+    pub fn setpoint_curve(&self, axis: usize) -> Vec<At> {
+        self.curve(&self.setpoints, |it| Some(at(it.time_s, component(it.velocity_ned_m_s, axis))))
+    }
+}
+
+/// A component of a vector.
+pub fn component(vector: [f64; 3], axis: usize) -> f64 {
+    vector.get(axis).copied().unwrap_or(f64::NAN)
+}
+
+/// From before the first phase of the flight to the end of what is known.
+fn time(flight: &Flight, phases: &[phases::Phase]) -> Range<f64> {
+    let lasts = [
+        flight.statuses.last().map(|it| it.stamp_ns),
+        flight.vehicle.last().map(|it| it.stamp_ns),
+        flight.truth.last().map(|it| it.stamp_ns),
+        flight.found.last().map(|it| it.message.header.stamp_ns),
+    ];
+    let end_s = lasts.into_iter().flatten().max().map_or(1.0, |last_ns| flight.at_s(last_ns));
+    let begun = phases.iter().find(|phase| phase.name != Phase::Idle.name());
+    let from_s = begun.map_or(0.0, |phase| phase.from_s - BEFORE_S);
+    // After the end nothing happens for as long as somebody watches.
+    let finished = flight.statuses.iter().find(|status| status.finished);
+    let end_s = finished.map_or(end_s, |status| end_s.min(flight.at_s(status.stamp_ns) + 2.0));
+    from_s..end_s.max(from_s + 1.0)
+}
+
+/// The setpoints: from the tape each, else those that the status tells.
+fn setpoints(flight: &Flight) -> Vec<Setpoint> {
+    const NONE: [f64; 3] = [f64::NAN; 3];
+    let mut setpoints = Vec::new();
+    for tape in &flight.tapes {
+        for record in tape.parts.iter().flat_map(messages::Tape::records).flatten() {
+            let Some(decision) = record.decision() else { continue };
+            let velocity_ned_m_s = match decision.action {
+                TapeAction::Velocity { velocity_ned_m_s, .. } => velocity_ned_m_s,
+                _ => NONE,
+            };
+            setpoints.push(Setpoint { time_s: flight.at_s(record.now_ns), velocity_ned_m_s });
+        }
+    }
+    if setpoints.is_empty() {
+        let is_flown = |status: &messages::ControllerStatus| {
+            !matches!(status.phase, Phase::Idle | Phase::Final | Phase::Landed)
+        };
+        setpoints.extend(flight.statuses.iter().map(|status| {
+            Setpoint {
+                time_s: flight.at_s(status.stamp_ns),
+                velocity_ned_m_s: status
+                    .setpoint
+                    .filter(|_| is_flown(status))
+                    .map_or(NONE, |setpoint| setpoint.velocity_ned_m_s),
+            }
+        }));
+    }
+    setpoints
+}

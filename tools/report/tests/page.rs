@@ -1,0 +1,262 @@
+//! Pages of recordings of flights in lock-step: whole, damaged, without a tape, and of two side by side.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests may fail like tests")]
+
+use std::collections::BTreeMap;
+use std::sync::OnceLock;
+
+use experiments::landing::flight::fly_recorded;
+use experiments::landing::outcome::Outcome;
+use experiments::landing::plan::{Plan, Planned, Values, Vision};
+use flightlog::{About, Entry, TapeReader, Writer};
+use report::frames::Fate;
+use report::{Flight, FlightReader, comparison, page, summary};
+
+/// The sections that a page has.
+const SECTIONS: [&str; 14] = [
+    "landing",
+    "phases",
+    "height",
+    "setpoints",
+    "detections",
+    "latency",
+    "losses",
+    "detectors",
+    "wind",
+    "battery",
+    "log",
+    "thesis",
+    "configuration",
+    "recording",
+];
+
+fn planned(wind_m_s: f64, fault: &str, set: &[&str]) -> Planned {
+    let one = |value| Values::List(vec![value]);
+    let plan = Plan {
+        vision: Vision::Modelled,
+        flights: 1,
+        seed: 3,
+        wind: one(wind_m_s),
+        height: one(4.0),
+        offset: one(1.0),
+        faults: vec![fault.parse().unwrap()],
+        set: set.iter().map(|setting| (*setting).to_owned()).collect(),
+        ..Plan::default()
+    };
+    plan.flights().swap_remove(0)
+}
+
+/// A flight and its recording.
+struct Flown {
+    outcome: Outcome,
+    recording: Vec<u8>,
+}
+
+fn flown(planned: &Planned) -> Flown {
+    let mut recording = Vec::new();
+    let outcome = fly_recorded(planned, &mut recording).unwrap();
+    Flown { outcome, recording }
+}
+
+/// A landing in wind.
+fn landing() -> &'static Flown {
+    static LANDING: OnceLock<Flown> = OnceLock::new();
+    LANDING.get_or_init(|| flown(&planned(4.0, "none", &[])))
+}
+
+fn read(recording: &[u8]) -> Flight {
+    let mut reader = FlightReader::new("flight.mcap");
+    reader.add(recording).unwrap();
+    reader.finish()
+}
+
+/// The recording without the messages whose key is one of these.
+fn without(recording: &[u8], keys: &[&str]) -> Vec<u8> {
+    let about = About { program: "test".to_owned(), facts: BTreeMap::new(), utc_offset_ns: 0 };
+    let mut copy = Vec::new();
+    let mut writer = Writer::new(&mut copy, &about).unwrap();
+    flightlog::read(recording, |entry| {
+        if let Entry::Message(message) = entry
+            && !keys.contains(&message.key)
+        {
+            writer.receive(message).unwrap();
+        }
+    })
+    .unwrap();
+    writer.finish().unwrap();
+    copy
+}
+
+fn has_all_sections(html: &str) {
+    for id in SECTIONS {
+        assert!(html.contains(&format!("<section id=\"{id}\">")), "no section {id}");
+    }
+}
+
+fn near(one: Option<f64>, other: Option<f64>, within: f64) {
+    let (one, other) = (one.unwrap(), other.unwrap());
+    assert!((one - other).abs() <= within, "{one} is not {other}");
+}
+
+#[test]
+fn a_page_has_every_section_and_needs_nothing_else() {
+    let flight = read(&landing().recording);
+    let html = page(&flight).unwrap();
+    has_all_sections(&html);
+    // The landing, height, velocities, detections, latency, wind, link, and eight of the thesis.
+    assert!(html.matches("<svg ").count() > 20, "{} charts", html.matches("<svg ").count());
+    for number in 10..=16 {
+        assert!(html.contains(&format!("Figure 4.{number}:")), "no figure 4.{number}");
+    }
+    for outside in ["<script", "<img", "<link", "src=", "url(", "@import"] {
+        assert!(!html.contains(outside), "{outside}");
+    }
+    // The only addresses are the name of SVG.
+    assert_eq!(
+        html.matches("http").count(),
+        html.matches("http://www.w3.org/2000/svg").count() + 1
+    );
+    // What lock-step has not got.
+    assert!(html.contains("Not recorded: the health of the processes"), "health");
+    assert!(html.contains("descending over the marker"), "reasons");
+    assert!(html.len() < 2_000_000, "{} bytes", html.len());
+}
+
+#[test]
+fn the_numbers_are_those_of_the_flight_itself() {
+    let Flown { outcome, recording } = landing();
+    let flight = read(recording);
+    let found = summary(&flight);
+    assert!(found.landed, "{}", found.outcome());
+    near(found.touchdown_error_m, outcome.error_m, 1e-12);
+    near(found.touchdown_speed_m_s, outcome.sink_m_s, 1e-12);
+    near(found.touchdown_lateral_speed_m_s, outcome.slide_m_s, 1e-12);
+    near(found.time_to_touchdown_s, outcome.touchdown_s, 0.03);
+    near(found.max_tilt_deg, Some(outcome.max_tilt_deg), 0.01);
+    near(found.wind_mean_m_s, Some(outcome.wind_m_s), 2.0);
+    // The controller counts the same frames as used.
+    assert_eq!(found.frames_used as u64, outcome.detections);
+    assert_eq!(found.frames, flight.found.len());
+    // Latency: each frame's detections came a modelled time after its exposure.
+    let times: Vec<f64> = flight
+        .found
+        .iter()
+        .map(|it| (it.received_ns - it.message.header.stamp_ns) as f64 * 1e-6)
+        .collect();
+    let stage = found.latency.iter().find(|it| it.name == report::latency::TO_CONTROLLER).unwrap();
+    near(Some(stage.p50_ms), node::stats::quantile(&times, 0.5), 1e-6);
+    // The controller's own percentiles are of its last 512 frames.
+    let told = flight.statuses.iter().rev().find_map(|status| status.latency_ms).unwrap();
+    near(found.latency_p50_ms, Some(told[0]), 30.0);
+    // The estimate's error is what its claimed deviation says, within reason.
+    assert!(found.estimate_error_p50_m.unwrap() < 0.1, "{:?}", found.estimate_error_p50_m);
+    let line = found.line();
+    assert!(line.contains("landed; ") && line.contains("frames used"), "{line}");
+    let json = serde_json::to_value(&found).unwrap();
+    assert_eq!(json["frames_used"], outcome.detections);
+}
+
+#[test]
+fn a_recorded_flight_verifies() {
+    let mut tapes = TapeReader::default();
+    tapes.read(&landing().recording).unwrap();
+    let tapes = tapes.tapes();
+    assert_eq!(tapes.len(), 1);
+    let verdict = replay::verify(&tapes[0], &[]).unwrap();
+    assert!(verdict.is_verified() && verdict.end.is_ended, "{verdict:?}");
+}
+
+#[test]
+fn recording_a_flight_changes_nothing_of_it() {
+    let planned = planned(4.0, "none", &[]);
+    let unrecorded = experiments::landing::flight::fly(&planned, None).unwrap();
+    assert_eq!(unrecorded, landing().outcome);
+}
+
+#[test]
+fn without_a_tape_the_estimates_tell_which_frames_were_used() {
+    let recording = without(&landing().recording, &["controller/tape"]);
+    let flight = read(&recording);
+    assert!(flight.tapes.is_empty());
+    let frames = report::frames::Frames::of(&flight);
+    assert!(!frames.is_from_tape);
+    let used = frames.count(&Fate::Used) as i64;
+    let by_tape = summary(&read(&landing().recording)).frames_used as i64;
+    assert!((used - by_tape).abs() <= 2, "{used} without the tape, {by_tape} with it");
+    let html = page(&flight).unwrap();
+    has_all_sections(&html);
+    assert!(html.contains("Not recorded: the controller&#39;s tape"), "tape");
+}
+
+#[test]
+fn what_was_not_recorded_is_said() {
+    let keys = ["truth", "wind", "controller/tape", "mavlink/from-autopilot"];
+    let flight = read(&without(&landing().recording, &keys));
+    let html = page(&flight).unwrap();
+    has_all_sections(&html);
+    for what in ["truth, which only", "the true wind", "packets", "parameters of the autopilot"] {
+        let said = html.contains(&format!("Not recorded: {what}"))
+            || html.contains(&format!("Not recorded: the autopilot&#39;s {what}"));
+        assert!(said, "{what}");
+    }
+    assert_eq!(summary(&flight).touchdown_error_m, None);
+    // Nothing but frames.
+    let keys = ["controller/status", "controller/target", "vehicle/state", "camera/down/info"];
+    let keys: Vec<&str> = keys.into_iter().chain(["truth", "wind", "controller/tape"]).collect();
+    let flight = read(&without(&landing().recording, &keys));
+    let html = page(&flight).unwrap();
+    has_all_sections(&html);
+    assert!(html.contains("Not recorded: the controller&#39;s status"), "status");
+}
+
+#[test]
+fn damaged_recordings_give_what_is_left_of_them() {
+    let recording = &landing().recording;
+    let flight = read(&recording[..recording.len() / 2]);
+    let html = page(&flight).unwrap();
+    has_all_sections(&html);
+    assert!(!flight.is_ended && html.contains("the recording has no end"), "no end");
+    let mut flipped = recording.clone();
+    for place in [1, 2, 3] {
+        flipped[place * recording.len() / 5] ^= 1;
+    }
+    let flight = read(&flipped);
+    assert!(!flight.damage.is_empty());
+    let html = page(&flight).unwrap();
+    assert!(html.contains("is damaged"), "{:?}", flight.damage);
+    for length in (0..recording.len()).step_by(recording.len() / 40 + 1) {
+        let mut reader = FlightReader::new("cut");
+        if reader.add(&recording[..length]).is_ok() {
+            has_all_sections(&page(&reader.finish()).unwrap());
+        }
+    }
+}
+
+#[test]
+fn no_recording_is_refused() {
+    let mut reader = FlightReader::new("text");
+    assert!(reader.add(b"this is no recording at all").is_err());
+    assert!(FlightReader::new("empty").finish().is_empty());
+    assert!(page(&Flight::default()).is_ok(), "an empty flight has a page of what is missing");
+}
+
+#[test]
+fn two_flights_stand_side_by_side_with_what_they_differ_in() {
+    let other = flown(&planned(0.0, "none", &["controller.metric.max_descend_m_s=0.7"]));
+    let (one, other) = (read(&landing().recording), read(&other.recording));
+    let html = comparison(&one, &other).unwrap();
+    has_all_sections(&html);
+    assert!(html.contains("controller/main: metric.max_descend_m_s"), "setting");
+    assert!(html.contains("simulator/main: wind.mean_m_s"), "wind");
+    assert!(!html.contains("controller/main: metric.lateral_gain</td>"), "the same in both");
+    assert!(html.contains("B less A"), "numbers");
+}
+
+#[test]
+fn what_a_text_of_the_autopilot_says_stays_text() {
+    let mut flight = read(&landing().recording);
+    flight.name = "<b>name</b>".to_owned();
+    flight.statuses.iter_mut().for_each(|status| status.why = "<script>alert(1)</script>".into());
+    let html = page(&flight).unwrap();
+    assert!(!html.contains("<script>") && !html.contains("<b>name"), "escaped");
+}
