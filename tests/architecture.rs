@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, ensure};
-use messages::{Delivery, TOPICS};
+use messages::{Delivery, MONITORS, TOPICS};
 
 use crate::circles::{Graph, circles, modules};
 use crate::source::{lines_of_code, tokens, without_tests};
@@ -453,10 +453,9 @@ fn every_queue_has_a_bound() -> anyhow::Result<()> {
     Ok(())
 }
 
-#[test]
-fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
-    let workspace = workspace()?;
-    let table = code(&package(&workspace, "messages")?.folder.join("src/topic.rs"))?;
+/// The constants of the topic table: name and key.
+fn topic_constants(workspace: &[Package]) -> anyhow::Result<Vec<(String, String)>> {
+    let table = code(&package(workspace, "messages")?.folder.join("src/topic.rs"))?;
     let mut constants = Vec::new();
     for part in table.split("pub const ").skip(1) {
         let (name, rest) = part.split_once(": ").context("a constant")?;
@@ -466,10 +465,22 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
         }
     }
     ensure!(constants.len() == TOPICS.len(), "{} constants of topics", constants.len());
+    Ok(constants)
+}
+
+/// The code of a package without its unit tests, each file in one line without spaces.
+fn packed_sources(package: &Package) -> anyhow::Result<Vec<String>> {
+    let sources = package.sources()?;
+    sources.iter().map(|path| Ok(code(path)?.split_whitespace().collect())).collect()
+}
+
+#[test]
+fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    let constants = topic_constants(&workspace)?;
     let mut publishers: BTreeMap<(String, &str), BTreeSet<&str>> = BTreeMap::new();
     for package in workspace.iter().filter(|p| p.name != "node" && p.name != TESTS) {
-        for path in package.sources()? {
-            let code: String = code(&path)?.split_whitespace().collect();
+        for code in packed_sources(package)? {
             for (name, key) in &constants {
                 // A query's row names who asks, its reply's row who answers.
                 for (call, end) in [("publisher", ""), (".command", ""), (".commands", "_REPLY")] {
@@ -497,6 +508,34 @@ fn a_topic_is_published_by_those_its_row_names() -> anyhow::Result<()> {
         ensure!(stated == *found, "{key} is published by {found:?}, its row says {stated:?}");
     }
     ensure!(publishers.len() == TOPICS.len(), "rows that nobody publishes: only {publishers:#?}");
+    Ok(())
+}
+
+#[test]
+fn a_topic_is_subscribed_to_by_those_its_row_names() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    let constants = topic_constants(&workspace)?;
+    let mut rows = 0;
+    for (name, key) in &constants {
+        let row = TOPICS.iter().find(|row| row.key == key).with_context(|| name.clone())?;
+        let mut found: BTreeSet<&str> = BTreeSet::new();
+        for package in workspace.iter().filter(|p| p.name != "node" && p.name != TESTS) {
+            let calls = [format!("subscriber(topic::{name},"), format!("=>topic::{name},")];
+            let sources = packed_sources(package)?;
+            if sources.iter().any(|code| calls.iter().any(|call| code.contains(call))) {
+                match package.name.as_str() {
+                    // The sender of the air link is a part of who publishes frames.
+                    "airlink" => found.extend(["camera-pub", "simulator"]),
+                    other => drop(found.insert(other)),
+                }
+            }
+        }
+        found.retain(|service| !MONITORS.contains(service));
+        let stated: BTreeSet<_> = row.subscribers.iter().copied().collect();
+        ensure!(stated == found, "{key} is subscribed to by {found:?}, its row says {stated:?}");
+        rows += usize::from(!found.is_empty());
+    }
+    ensure!(rows > 10, "only {rows} topics have subscribers");
     Ok(())
 }
 
@@ -613,10 +652,12 @@ fn the_architecture_has_the_topic_table() -> anyhow::Result<()> {
             Delivery::Query => "query",
         };
         let publishers = row.publishers.join(", ");
+        let subscribers = row.subscribers.join(", ");
         let line = format!(
-            "| `{}` | {} v{} | {delivery} | {publishers} |",
+            "| `{}` | {} v{} | {delivery} | {publishers} | {subscribers} |",
             row.key, row.message, row.version
-        );
+        )
+        .replace("|  |", "| |");
         ensure!(table.contains(&line.as_str()), "ARCHITECTURE.md lacks the row\n{line}");
     }
     ensure!(table.len() == TOPICS.len() + 1, "rows without a topic in {table:#?}");

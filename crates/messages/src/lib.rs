@@ -40,5 +40,5 @@ pub use tape::{
     Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapeRecord, TapeTarget,
     TapeWriter,
 };
-pub use topic::{Delivery, Row, TOPICS, Topic};
+pub use topic::{Delivery, MONITORS, Row, TOPICS, Topic};
 pub use vehicle::{LandedState, MavlinkBytes, VehicleState};

@@ -1,4 +1,4 @@
-//! The topic table: every key, its type, how it is delivered and who publishes it.
+//! The topic table: every key, its type, how it is delivered, who publishes it and who may subscribe to it.
 //!
 //! Keys carry no vehicle: that is the Zenoh namespace of the session.
 
@@ -42,6 +42,8 @@ pub struct Row {
     pub delivery: Delivery,
     /// The services that may publish it, or, for a query, send it.
     pub publishers: &'static [&'static str],
+    /// The services that may subscribe to it, besides [`MONITORS`]; to a query's key nobody does.
+    pub subscribers: &'static [&'static str],
 }
 
 /// A row of the table, with its type.
@@ -64,8 +66,10 @@ impl<M: Message> Topic<M> {
         key: &'static str,
         delivery: Delivery,
         publishers: &'static [&'static str],
+        subscribers: &'static [&'static str],
     ) -> Self {
-        let row = Row { key, message: M::NAME, version: M::VERSION, delivery, publishers };
+        let (message, version) = (M::NAME, M::VERSION);
+        let row = Row { key, message, version, delivery, publishers, subscribers };
         Self { row, message: PhantomData }
     }
 
@@ -102,67 +106,92 @@ impl<M: Message> Topic<M> {
     }
 }
 
+/// Those that show or keep what the others do, and may subscribe to every topic; `observer` is whoever has a key to
+/// watch only.
+pub const MONITORS: &[&str] = &["alight", "dashboard", "observer", "recorder"];
+
 const CAMERAS: &[&str] = &["camera-pub", "simulator"];
 const DETECTOR: &[&str] = &["detector"];
 const CONTROLLER: &[&str] = &["controller"];
 const SIMULATOR: &[&str] = &["simulator"];
+const BRIDGE: &[&str] = &["gcs-bridge"];
+/// Monitors only.
+const NO_OTHERS: &[&str] = &[];
 
 /// Pixels as they are; the message is the attachment.
 pub const FRAME: Topic<FrameHeader> =
-    Topic::new("camera/{camera}/frame", Delivery::Latest, CAMERAS);
+    Topic::new("camera/{camera}/frame", Delivery::Latest, CAMERAS, DETECTOR);
 /// JPEG files, of the whole frame or of parts of it; the message is the attachment.
-pub const JPEG: Topic<FrameHeader> = Topic::new("camera/{camera}/jpeg", Delivery::Latest, CAMERAS);
+pub const JPEG: Topic<FrameHeader> =
+    Topic::new("camera/{camera}/jpeg", Delivery::Latest, CAMERAS, DETECTOR);
 /// A camera's calibration and mount.
 pub const CAMERA_INFO: Topic<CameraInfo> =
-    Topic::new("camera/{camera}/info", Delivery::LastValue, CAMERAS);
+    Topic::new("camera/{camera}/info", Delivery::LastValue, CAMERAS, &["controller", "detector"]);
 /// Markers found in a frame.
-pub const DETECTIONS: Topic<Detections> =
-    Topic::new("detector/{detector}/detections", Delivery::LatestPriority, DETECTOR);
+pub const DETECTIONS: Topic<Detections> = Topic::new(
+    "detector/{detector}/detections",
+    Delivery::LatestPriority,
+    DETECTOR,
+    &["camera-pub", "controller", "simulator"],
+);
 /// Acknowledges a frame of `camera/{camera}/jpeg`.
 pub const FRAME_ACK: Topic<FrameAck> =
-    Topic::new("detector/{detector}/ack", Delivery::LatestPriority, DETECTOR);
+    Topic::new("detector/{detector}/ack", Delivery::LatestPriority, DETECTOR, CAMERAS);
 /// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
 pub const DEBUG_IMAGE: Topic<FrameHeader> =
-    Topic::new("detector/{detector}/debug/{image}", Delivery::Latest, DETECTOR);
+    Topic::new("detector/{detector}/debug/{image}", Delivery::Latest, DETECTOR, NO_OTHERS);
 /// A detector's identity and settings.
 pub const DETECTOR_INFO: Topic<DetectorInfo> =
-    Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR);
+    Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR, CONTROLLER);
 /// A command to a detector; answered with a [`CommandReply`].
 pub const DETECTOR_COMMAND: Topic<DetectorCommand> =
-    Topic::new("detector/{detector}/command", Delivery::Query, &["alight"]);
+    Topic::new("detector/{detector}/command", Delivery::Query, &["alight"], NO_OTHERS);
 /// The answer to a detector's command; travels as the reply, on the command's key.
 pub const DETECTOR_COMMAND_REPLY: Topic<CommandReply> =
-    Topic::new("detector/{detector}/command", Delivery::Query, DETECTOR);
+    Topic::new("detector/{detector}/command", Delivery::Query, DETECTOR, NO_OTHERS);
 /// Attitude, position, velocity, mode.
 pub const VEHICLE_STATE: Topic<VehicleState> =
-    Topic::new("vehicle/state", Delivery::LatestPriority, CONTROLLER);
+    Topic::new("vehicle/state", Delivery::LatestPriority, CONTROLLER, NO_OTHERS);
 /// The estimate of the landing point.
 pub const TARGET: Topic<TargetEstimate> =
-    Topic::new("controller/target", Delivery::Latest, CONTROLLER);
+    Topic::new("controller/target", Delivery::Latest, CONTROLLER, BRIDGE);
 /// The controller's phase and the reason for it.
-pub const STATUS: Topic<ControllerStatus> =
-    Topic::new("controller/status", Delivery::LastValue, CONTROLLER);
+pub const STATUS: Topic<ControllerStatus> = Topic::new(
+    "controller/status",
+    Delivery::LastValue,
+    CONTROLLER,
+    &["camera-pub", "gcs-bridge", "simulator"],
+);
 /// A command to the controller; answered with a [`CommandReply`].
 pub const COMMAND: Topic<ControllerCommand> =
-    Topic::new("controller/command", Delivery::Query, &["alight", "dashboard"]);
+    Topic::new("controller/command", Delivery::Query, &["alight", "dashboard"], NO_OTHERS);
 /// The answer to a command; travels as the reply, on the command's key.
 pub const COMMAND_REPLY: Topic<CommandReply> =
-    Topic::new("controller/command", Delivery::Query, CONTROLLER);
+    Topic::new("controller/command", Delivery::Query, CONTROLLER, NO_OTHERS);
 /// What the controller handled and what came out of it, in order; published only while somebody subscribes.
-pub const TAPE: Topic<Tape> = Topic::new("controller/tape", Delivery::Reliable, CONTROLLER);
+pub const TAPE: Topic<Tape> =
+    Topic::new("controller/tape", Delivery::Reliable, CONTROLLER, NO_OTHERS);
 /// The true wind.
-pub const WIND: Topic<Wind> = Topic::new("wind", Delivery::Latest, SIMULATOR);
+pub const WIND: Topic<Wind> = Topic::new("wind", Delivery::Latest, SIMULATOR, NO_OTHERS);
 /// The true state of vehicle and pad.
-pub const TRUTH: Topic<Truth> = Topic::new("truth", Delivery::Latest, SIMULATOR);
+pub const TRUTH: Topic<Truth> = Topic::new("truth", Delivery::Latest, SIMULATOR, NO_OTHERS);
 /// Packets from the autopilot.
-pub const FROM_AUTOPILOT: Topic<MavlinkBytes> =
-    Topic::new("mavlink/from-autopilot", Delivery::Reliable, CONTROLLER);
+pub const FROM_AUTOPILOT: Topic<MavlinkBytes> = Topic::new(
+    "mavlink/from-autopilot",
+    Delivery::Reliable,
+    CONTROLLER,
+    &["gcs-bridge", "simulator"],
+);
 /// Packets for the autopilot.
-pub const TO_AUTOPILOT: Topic<MavlinkBytes> =
-    Topic::new("mavlink/to-autopilot", Delivery::Reliable, &["gcs-bridge", "simulator"]);
+pub const TO_AUTOPILOT: Topic<MavlinkBytes> = Topic::new(
+    "mavlink/to-autopilot",
+    Delivery::Reliable,
+    &["gcs-bridge", "simulator"],
+    CONTROLLER,
+);
 /// What a recorder has kept, and what not.
 pub const RECORDER_STATUS: Topic<RecorderStatus> =
-    Topic::new("recorder/{recorder}/status", Delivery::LastValue, &["recorder"]);
+    Topic::new("recorder/{recorder}/status", Delivery::LastValue, &["recorder"], BRIDGE);
 /// Health of a service.
 pub const HEALTH: Topic<Health> = Topic::new(
     "health/{service}/{instance}",
@@ -177,12 +206,14 @@ pub const HEALTH: Topic<Health> = Topic::new(
         "relay",
         "simulator",
     ],
+    BRIDGE,
 );
 /// The configuration that a service started with.
 pub const CONFIGURATION: Topic<Configuration> = Topic::new(
     "config/{service}/{instance}",
     Delivery::LastValue,
     &["camera-pub", "controller", "dashboard", "detector", "gcs-bridge", "recorder", "simulator"],
+    NO_OTHERS,
 );
 
 /// Key of the liveliness token a service declares when it is ready.

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use anyhow::{Context, ensure};
-use messages::{Delivery, Row, TOPICS, topic};
+use messages::{Delivery, MONITORS, Row, TOPICS, topic};
 use node::network::{SECURED_CONFIG, check_access};
 use serde_json::Value;
 use zenoh::key_expr::KeyExpr;
@@ -18,11 +18,12 @@ const ROLES: [(&str, &str); 9] = [
     ("operator", "alight"),
     ("recorder", "recorder"),
     ("simulator", "simulator"),
-    ("observer", "nobody"),
+    ("observer", "observer"),
 ];
 
-/// The incoming messages by which a role publishes, queries or replies.
-const SENDING: [&str; 5] = ["put", "query", "reply", "declare_queryable", "liveliness_token"];
+/// The incoming messages by which a role subscribes, publishes, queries or replies.
+const MESSAGES: [&str; 6] =
+    ["declare_subscriber", "put", "query", "reply", "declare_queryable", "liveliness_token"];
 
 fn access() -> anyhow::Result<Value> {
     let config: Value = json5::from_str(SECURED_CONFIG)?;
@@ -38,7 +39,7 @@ fn has(value: &Value, key: &str, wanted: &str) -> bool {
     list(value, key).any(|entry| entry == wanted)
 }
 
-/// The rights of a role to send: (message, key expression).
+/// The rights of a role: (message, key expression).
 fn rights(access: &Value, role: &str) -> BTreeSet<(String, String)> {
     let subjects: Vec<_> = list(access, "subjects")
         .filter(|s| has(s, "cert_common_names", role))
@@ -54,7 +55,7 @@ fn rights(access: &Value, role: &str) -> BTreeSet<(String, String)> {
     });
     let mut rights = BTreeSet::new();
     for rule in rules {
-        for message in SENDING.iter().filter(|m| has(rule, "messages", m)) {
+        for message in MESSAGES.iter().filter(|m| has(rule, "messages", m)) {
             for key in list(rule, "key_exprs").filter_map(Value::as_str) {
                 rights.insert(((*message).to_owned(), key.to_owned()));
             }
@@ -80,6 +81,11 @@ fn key_on_the_wire(row: &Row, service: &str) -> String {
     format!("a-drone/{}", row.key.replace("{service}", service)).replace(['{', '}'], "")
 }
 
+/// Whether a service may subscribe to a row's topic.
+fn subscribes(row: &Row, service: &str) -> bool {
+    MONITORS.contains(&service) || row.subscribers.contains(&service)
+}
+
 /// Whether a row is the reply to a command, which has the key of the command.
 fn is_reply(row: &Row) -> bool {
     row.message == "CommandReply"
@@ -99,7 +105,14 @@ fn the_access_rules_allow_what_the_topic_table_says_and_nothing_else() -> anyhow
                 Delivery::LastValue => &["put", "declare_queryable", "reply"],
                 Delivery::Latest | Delivery::LatestPriority | Delivery::Reliable => &["put"],
             };
-            for message in messages {
+            // The last value is asked for by who subscribes.
+            let receiving: &[&str] = match row.delivery {
+                Delivery::LastValue => &["declare_subscriber", "query"],
+                _ => &["declare_subscriber"],
+            };
+            let sending = messages.iter().map(|message| (message, stated));
+            let receiving = receiving.iter().map(|message| (message, subscribes(row, service)));
+            for (message, stated) in sending.chain(receiving) {
                 let allowed = may(&rights, message, &key)?;
                 ensure!(
                     allowed == stated,
@@ -121,8 +134,10 @@ fn every_access_rule_has_a_row_in_the_topic_table() -> anyhow::Result<()> {
             let alive = format!("a-drone/{}", topic::alive_key(service, "name"));
             let mut keys: Vec<String> = TOPICS
                 .iter()
-                .filter(|row| {
-                    row.publishers.contains(&service) || row.delivery == Delivery::LastValue
+                .filter(|row| match message.as_str() {
+                    "declare_subscriber" => subscribes(row, service),
+                    "query" if row.delivery == Delivery::LastValue => subscribes(row, service),
+                    _ => row.publishers.contains(&service),
                 })
                 .map(|row| key_on_the_wire(row, service))
                 .collect();
@@ -139,15 +154,24 @@ fn every_access_rule_has_a_row_in_the_topic_table() -> anyhow::Result<()> {
 #[test]
 fn no_role_has_rights_to_wildcards() -> anyhow::Result<()> {
     let access = access()?;
-    for (role, _) in ROLES {
+    for (role, service) in ROLES {
         for key in ["a-drone/**", "a-drone/*/command", "a-drone/controller/*", "**"] {
             for message in ["put", "query", "declare_queryable", "reply"] {
                 ensure!(!may(&rights(&access, role), message, key)?, "{role}: {message} on {key}");
             }
+            // Monitors subscribe to everything of a vehicle.
+            let subscribes = may(&rights(&access, role), "declare_subscriber", key)?;
+            let is_allowed = MONITORS.contains(&service) && key != "**";
+            ensure!(subscribes == is_allowed, "{role}: subscribes to {key}: {subscribes}");
         }
     }
     // Every service of the table has a role, except the relay, which forwards.
-    let named: BTreeSet<_> = TOPICS.iter().flat_map(|row| row.publishers).copied().collect();
+    let named: BTreeSet<_> = TOPICS
+        .iter()
+        .flat_map(|row| row.publishers.iter().chain(row.subscribers))
+        .chain(MONITORS)
+        .copied()
+        .collect();
     let known: BTreeSet<_> = ROLES.iter().map(|(_, service)| *service).chain(["relay"]).collect();
     ensure!(named.is_subset(&known), "no role for {:?}", named.difference(&known));
     Ok(())

@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use anyhow::{Context, anyhow, ensure};
 use common::Authority;
-use messages::{Delivery, TOPICS};
+use messages::{Delivery, MONITORS, TOPICS};
 use node::{Identity, Network, Node, denied};
 use testing::ports;
 use tokio::time::{sleep, timeout};
@@ -121,19 +121,23 @@ impl Drone {
         }
         let session = opened(config).await?;
         let received = Heard::default();
-        let notes = Arc::clone(&received);
-        session
-            .declare_subscriber("**")
-            .callback(move |sample: Sample| {
-                note(&notes, &sample.payload().to_bytes(), sample.key_expr().as_str());
-            })
-            .background()
-            .await
-            .map_err(|cause| anyhow!("{cause}"))?;
+        // Each key by itself: who may not subscribe to all of them may to some.
+        for key in all_keys().keys() {
+            let notes = Arc::clone(&received);
+            session
+                .declare_subscriber(key.as_str())
+                .callback(move |sample: Sample| {
+                    note(&notes, &sample.payload().to_bytes(), sample.key_expr().as_str());
+                })
+                .background()
+                .await
+                .map_err(|cause| anyhow!("{cause}"))?;
+        }
         Ok(Stranger { session, received })
     }
 }
 
+#[derive(Clone)]
 struct Stranger {
     session: Session,
     received: Heard,
@@ -148,23 +152,20 @@ impl Stranger {
     }
 }
 
-/// Every key of the topic table, of a detector `ground` and any other name `main`, with its publishers.
-fn keys() -> BTreeMap<String, (&'static [&'static str], bool)> {
+/// Every key of the topic table, of a detector `ground` and any other name `main`, with its row.
+fn all_keys() -> BTreeMap<String, &'static messages::Row> {
     let filled = |row: &messages::Row| {
         let service = row.publishers.first().copied().unwrap_or_default();
         row.key
             .replace("{detector}", "ground")
             .replace("{service}", service)
             .replace("{camera}", "down")
+            .replace("{recorder}", "main")
             .replace("{instance}", if service == "detector" { "ground" } else { "main" })
             .replace("{image}", "rings")
     };
-    let is_query = |row: &messages::Row| row.delivery == Delivery::Query;
-    TOPICS
-        .iter()
-        .filter(|row| row.message != "CommandReply")
-        .map(|row| (filled(row), (row.publishers, is_query(row))))
-        .collect()
+    let rows = TOPICS.iter().filter(|row| row.message != "CommandReply");
+    rows.map(|row| (filled(row), row)).collect()
 }
 
 /// The role in a certificate of a publisher in the topic table.
@@ -249,19 +250,33 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
         ("another role's", &observer),
         ("another detector's", &other_name),
     ];
-    let keys = keys();
+    // Those who may subscribe, each to what its role needs.
+    let mut subscribers = Vec::new();
+    for service in ["camera-pub", "controller", "gcs-bridge", "simulator", "recorder"] {
+        let file = file_of(role_of(service));
+        subscribers.push((service, drone.stranger(Some(home), &file, CLIENT).await?));
+    }
+    let mut subscriptions = BTreeMap::new();
+    until(&mut subscriptions, "refused subscriptions are counted", async |counted| {
+        counted.keys().any(|reason| reason.starts_with("denied: declare subscriber"))
+    })
+    .await?;
+    subscribers.push(("observer", observer.clone()));
+    subscribers.push(("detector", other_name.clone()));
     let mut rows = Vec::new();
-    for (key, (publishers, is_query)) in &keys {
+    let mut refused = 0;
+    for (key, row) in &all_keys() {
+        let is_query = row.delivery == Delivery::Query;
         // Who may is heard, so that the silence of the others says something.
-        let role = role_of(publishers.first().context("a publisher")?);
+        let role = role_of(row.publishers.first().context("a publisher")?);
         let rightful = drone.stranger(Some(home), &file_of(role), CLIENT).await?;
-        let heard = if *is_query { &drone.queried } else { &drone.published };
+        let heard = if is_query { &drone.queried } else { &drone.published };
         until(&mut counted, &format!("{role} is heard on {key}"), async |_| {
             rightful.says("rightful", key).await;
             has_heard(heard, "rightful", key)
         })
         .await?;
-        let action = if *is_query { "query" } else { "put" };
+        let action = if is_query { "query" } else { "put" };
         let reason = format!("denied: {action} on drone/{key}");
         denied::take();
         let mut refusals = BTreeMap::new();
@@ -274,27 +289,46 @@ async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
             })
             .await?;
         }
-        // They are not heard later either, and only holders of this vehicle's keys listen.
-        until(&mut counted, &format!("the observer hears {key}"), async |_| {
+        // They are not heard later either, and each listens to what its role may.
+        let may_listen =
+            |service: &str| MONITORS.contains(&service) || row.subscribers.contains(&service);
+        until(&mut counted, &format!("who may hears {key}"), async |_| {
             drop(drone.inside.put(key.as_str(), "inside").await);
-            has_heard(&observer.received, "inside", key)
-                && has_heard(&other_name.received, "inside", key)
+            let mut those = subscribers.iter().filter(|(service, _)| may_listen(service));
+            those.all(|(_, it)| has_heard(&it.received, "inside", key))
         })
         .await?;
+        let listening: Vec<&str> = subscribers
+            .iter()
+            .filter(|(_, it)| has_heard(&it.received, "inside", key))
+            .map(|(service, _)| *service)
+            .collect();
+        for (service, _) in &subscribers {
+            let listens = listening.contains(service);
+            ensure!(listens == may_listen(service), "{service} on {key}: listens: {listens}");
+            refused += usize::from(!listens);
+        }
         let mut cells = Vec::new();
         for (name, stranger) in strangers {
             let is_heard = has_heard(heard, name, key);
             ensure!(!is_heard, "{name}: {action} on {key} was heard");
             let listens = has_heard(&stranger.received, "inside", key);
-            let may_listen = ["another role's", "another detector's"].contains(&name);
-            ensure!(listens == may_listen, "{name} on {key}: listens: {listens}");
+            let has_rights = ["another role's", "another detector's"].contains(&name);
+            ensure!(!listens || has_rights, "{name} on {key}: listens");
             cells.push(if listens { "refused; hears" } else { "refused; hears nothing" });
         }
-        rows.push(format!("| `{key}` | {action} | {} |", cells.join(" | ")));
+        let listening = listening.join(", ");
+        rows.push(format!("| `{key}` | {action} | {} | {listening} |", cells.join(" | ")));
     }
+    ensure!(refused > 50, "only {refused} subscriptions were refused");
+    let denied_subscriptions = subscriptions
+        .iter()
+        .filter(|(reason, _)| reason.starts_with("denied: declare subscriber on drone/"));
+    let denied_subscriptions = denied_subscriptions.count();
+    ensure!(denied_subscriptions > 10, "counted subscriptions: {subscriptions:?}");
     let names: Vec<&str> = strangers.iter().map(|(name, _)| *name).collect();
-    println!("| key | what | {} |", names.join(" | "));
-    println!("|---|---|{}", "---|".repeat(names.len()));
+    println!("| key | what | {} | who subscribes |", names.join(" | "));
+    println!("|---|---|{}---|", "---|".repeat(names.len()));
     rows.iter().for_each(|row| println!("{row}"));
     Ok(())
 }
