@@ -2,14 +2,25 @@
 #![no_main]
 #![allow(unsafe_code, missing_docs, unreachable_pub, reason = "what libFuzzer's macro expands to")]
 
-use std::sync::OnceLock;
+use std::collections::BTreeSet;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use fuzz::{TARGETS, Target, target};
 
 static TARGET: OnceLock<Target> = OnceLock::new();
+/// Where panics began.
+static PANICS: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
 #[expect(clippy::panic, reason = "libFuzzer has no other way to say why it does not begin")]
 fn chosen() -> Target {
+    // libFuzzer's own hook ends the process, also for what is caught, as panics of foreign decoders are. What is not
+    // caught ends it all the same. Each place is told once.
+    std::panic::set_hook(Box::new(|panic| {
+        let place = panic.location().map(ToString::to_string).unwrap_or_default();
+        if PANICS.lock().unwrap_or_else(PoisonError::into_inner).insert(place) {
+            eprintln!("{panic}");
+        }
+    }));
     let name = std::env::var("FUZZ_TARGET").unwrap_or_default();
     target(&name).unwrap_or_else(|| {
         let names = TARGETS.map(|target| target.name).join(", ");

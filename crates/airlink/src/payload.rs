@@ -2,6 +2,8 @@
 //!
 //! Payloads are untrusted: all sizes are checked against the header before anything is decoded.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
 use imaging::{GrayImage, GrayView};
 use jpeg_encoder::{ColorType, Encoder};
 use messages::{FrameHeader, FramePart, PixelFormat};
@@ -135,7 +137,9 @@ impl Unpacker {
             let (file, after) =
                 rest.split_at_checked(part.bytes as usize).ok_or(PayloadError::Misfit)?;
             rest = after;
-            decode(file, part, image)?;
+            // The decoder panics on some damaged files.
+            catch_unwind(AssertUnwindSafe(|| decode(file, part, image)))
+                .unwrap_or_else(|_| Err(PayloadError::Jpeg("the decoder failed".to_owned())))?;
         }
         Ok(parts.into_iter().zip(&self.images).collect())
     }

@@ -2,10 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::Write;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
 use mcap::read::{ChunkReader, parse_record};
-use mcap::records::Record;
+use mcap::records::{ChunkHeader, Record};
 use mcap::write::{NoSeek, WriteOptions};
 use mcap::{Attachment, Channel, McapError, Summary};
 
@@ -33,7 +34,7 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
     if !recording.starts_with(mcap::MAGIC) {
         return Err(McapError::BadMagic.into());
     }
-    let index = Summary::read(recording).ok().flatten();
+    let index = contained(|| Summary::read(recording)).ok().flatten();
     let options = WriteOptions::new().compression(None).disable_seeking(true);
     let mut copy = Copy {
         mcap: options.create(NoSeek::new(output))?,
@@ -48,17 +49,13 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
         rest = after;
         let chunks = copy.found.chunks;
         match parse_record(opcode, body) {
-            Ok(Record::Chunk { header, data }) => {
-                let records = ChunkReader::new(header, &data)
-                    .and_then(Iterator::collect::<Result<Vec<_>, _>>);
-                match records {
-                    Ok(records) => copy.chunk(records)?,
-                    Err(problem) => copy
-                        .found
-                        .damage
-                        .push(format!("the chunk after {chunks} whole ones is damaged: {problem}")),
-                }
-            }
+            Ok(Record::Chunk { header, data }) => match records_of(header, &data) {
+                Ok(records) => copy.chunk(records)?,
+                Err(problem) => copy
+                    .found
+                    .damage
+                    .push(format!("the chunk after {chunks} whole ones is damaged: {problem}")),
+            },
             Ok(Record::DataEnd(_)) => {
                 is_ended = true;
                 break;
@@ -98,6 +95,20 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
     }
     mcap.finish()?;
     Ok(found)
+}
+
+/// The records of a chunk.
+///
+/// # Errors
+/// When it is damaged.
+pub(crate) fn records_of(header: ChunkHeader, data: &[u8]) -> Result<Vec<Record<'_>>, Problem> {
+    contained(|| ChunkReader::new(header, data)?.collect())
+}
+
+/// What `read` returns; an error too when the reader panics, as it does on some damage.
+pub(crate) fn contained<T>(read: impl FnOnce() -> Result<T, McapError>) -> Result<T, Problem> {
+    let read = catch_unwind(AssertUnwindSafe(read));
+    read.map_err(|_| Problem::Senseless)?.map_err(Problem::from)
 }
 
 /// The next record's kind and bytes, and what comes after it; `None` where it does not end.

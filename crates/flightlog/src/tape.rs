@@ -2,11 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use mcap::read::{ChunkReader, LinearReader, Options};
+use mcap::read::{LinearReader, Options};
 use mcap::records::Record;
 use messages::{Tape, decode, topic};
 
 use crate::channel::{RAW_PREFIX, split_raw};
+use crate::repair::{contained, records_of};
 use crate::writer::Problem;
 
 /// The tape of one controller, as far as recordings have it.
@@ -39,14 +40,13 @@ impl TapeReader {
         let key = format!("{RAW_PREFIX}{}", topic::TAPE.key(&[]));
         let mut channels = BTreeSet::new();
         let mut chunks = 0;
-        let reader = LinearReader::new_with_options(recording, Options::IgnoreEndMagic.into())?;
-        for record in reader {
+        let options = Options::IgnoreEndMagic.into();
+        let mut reader = LinearReader::new_with_options(recording, options)?;
+        while let Some(record) = contained(|| reader.next().transpose()).transpose() {
             match record {
                 Ok(Record::Chunk { header, data }) => {
                     chunks += 1;
-                    let read = ChunkReader::new(header, &data)
-                        .and_then(Iterator::collect::<Result<Vec<_>, _>>);
-                    match read {
+                    match records_of(header, &data) {
                         Ok(records) => self.add(&records, &key, &mut channels),
                         Err(problem) => {
                             self.damage.push(format!("chunk {chunks} is damaged: {problem}"));

@@ -31,6 +31,9 @@ pub enum Problem {
     /// The file did not take it, or is none.
     #[error("{0}")]
     Mcap(#[from] mcap::McapError),
+    /// Its reader panicked.
+    #[error("its bytes make no sense to the reader")]
+    Senseless,
 }
 
 /// What a recording is of.

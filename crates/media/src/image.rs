@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use ::image::{ColorType, DynamicImage, ImageDecoder, ImageReader, Limits};
 use imaging::{BayerPattern, Converter, GrayImage, GrayView, SampleFormat};
 
+use crate::contained::contained;
 use crate::jpeg::{is_jpeg, jpeg_len};
 
 /// Default limit for the pixels of an image.
@@ -186,10 +187,13 @@ pub fn decode_image(path: &Path, bytes: &[u8], max_pixels: u64) -> Result<GrayIm
 /// Bytes of the frame that an image file becomes, read from its header.
 pub fn frame_bytes(path: &Path, max_pixels: u64) -> Result<usize, ImageError> {
     let bytes = file_bytes(path, max_pixels)?;
-    let decoder = decoder(path, &bytes, max_pixels)?;
-    let (width, height) = decoder.dimensions();
-    let per_pixel = if decoder.color_type() == ColorType::L16 { 2 } else { 1 };
-    Ok((width as usize).saturating_mul(height as usize).saturating_mul(per_pixel))
+    let read = || {
+        let decoder = decoder(path, &bytes, max_pixels)?;
+        let (width, height) = decoder.dimensions();
+        let per_pixel = if decoder.color_type() == ColorType::L16 { 2 } else { 1 };
+        Ok((width as usize).saturating_mul(height as usize).saturating_mul(per_pixel))
+    };
+    contained(read, |cause| ImageError::Damaged { path: path.to_owned(), cause: cause.to_owned() })
 }
 
 /// A decoded image, in the pixel format of its file.
@@ -211,6 +215,14 @@ impl DecodedImage {
     /// # Errors
     /// As [`read_image`].
     pub fn decode(path: &Path, bytes: &[u8], max_pixels: u64) -> Result<Self, ImageError> {
+        contained(
+            || Self::decode_unchecked(path, bytes, max_pixels),
+            |cause| ImageError::Damaged { path: path.to_owned(), cause: cause.to_owned() },
+        )
+    }
+
+    /// As [`DecodedImage::decode`]; panics where the decoder does.
+    fn decode_unchecked(path: &Path, bytes: &[u8], max_pixels: u64) -> Result<Self, ImageError> {
         let mut decoder = decoder(path, bytes, max_pixels)?;
         // The decoder fills the missing part of a JPEG with grey.
         if is_jpeg(bytes) && jpeg_len(bytes).is_none() {

@@ -7,6 +7,7 @@
 
 mod budget;
 pub mod calibration;
+mod contained;
 pub mod image;
 pub mod jpeg;
 pub mod video;

@@ -11,6 +11,7 @@ use rust_h264::decoder::OrderedDecoder;
 use rust_h264::nal::{NalUnit, NalUnitType, parse_annex_b, parse_avcc, parse_sps_info};
 
 use crate::budget::{Budget, BudgetReader};
+use crate::contained::contained;
 use crate::image::{ImageError, decode_image, has_extension};
 use crate::jpeg::next_jpeg;
 
@@ -121,6 +122,12 @@ impl Video {
     /// # Errors
     /// [`VideoError`] when it cannot be read or is not supported.
     pub fn open(path: &Path, max_pixels: u64) -> Result<Self, VideoError> {
+        let damaged = |cause: &str| Problems { path }.damaged(cause);
+        contained(|| Self::open_unchecked(path, max_pixels), damaged)
+    }
+
+    /// As [`Video::open`]; panics where a decoder does.
+    fn open_unchecked(path: &Path, max_pixels: u64) -> Result<Self, VideoError> {
         let problems = Problems { path };
         let mut file = BufReader::new(File::open(path).map_err(|e| problems.unreadable(e))?);
         let mut start = Vec::new();
@@ -152,14 +159,19 @@ impl Video {
     /// The next frame; `None` after the last. After an error there are no more.
     pub fn next_frame(&mut self) -> Option<Result<VideoFrame, VideoError>> {
         let problems = Problems { path: &self.path };
-        let image = match &mut self.stream {
-            Stream::Avi(reader) => reader.next(&problems),
-            Stream::Jpegs { bytes, at } => {
-                next_jpeg(bytes, at).map(|jpeg| Ok(VideoImage::Jpeg(jpeg.to_vec())))
-            }
-            Stream::H264(decoder) => decoder.next(&problems, self.max_pixels),
-            Stream::Ended => None,
+        let stream = &mut self.stream;
+        let decode = || {
+            let image = match stream {
+                Stream::Avi(reader) => reader.next(&problems),
+                Stream::Jpegs { bytes, at } => {
+                    next_jpeg(bytes, at).map(|jpeg| Ok(VideoImage::Jpeg(jpeg.to_vec())))
+                }
+                Stream::H264(decoder) => decoder.next(&problems, self.max_pixels),
+                Stream::Ended => None,
+            };
+            image.transpose()
         };
+        let image = contained(decode, |cause| problems.damaged(cause)).transpose();
         if !matches!(image, Some(Ok(_))) {
             self.stream = Stream::Ended;
         }
