@@ -4,6 +4,10 @@ use landing::{Measured, MountFindings};
 
 use crate::refusals::Warning;
 
+/// Maximum difference between the configured and the measured standing height that is not told, in metres: the error of
+/// the measurement.
+const MAX_STANDING_ERROR_M: f64 = 0.15;
+
 /// The warnings of what was measured in flight.
 pub fn warnings(found: &MountFindings) -> Vec<Warning> {
     let degrees = |angle: Measured| {
@@ -50,9 +54,26 @@ pub fn warnings(found: &MountFindings) -> Vec<Warning> {
     .collect()
 }
 
+/// What is said of a vehicle that stands higher over the pad than configured; both in metres.
+pub fn standing_warning(measured_m: f64, configured_m: f64) -> Option<Warning> {
+    (measured_m - configured_m > MAX_STANDING_ERROR_M).then(|| Warning {
+        matter: "standing-height".to_owned(),
+        text: format!(
+            "the vehicle stood about {measured_m:.1} m over the pad, not {configured_m:.2} m: measure how high the autopilot sits over the ground, and set `metric.standing_height_m`"
+        ),
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_vehicle_that_stands_higher_than_configured_is_told() {
+        assert!(standing_warning(0.25, 0.2).is_none());
+        let text = standing_warning(0.25, 0.0).unwrap().text;
+        assert!(text.contains("about 0.2 m") && text.contains("0.00 m"), "{text}");
+    }
 
     #[test]
     fn angles_are_told_in_degrees_and_ratios_in_percent() {

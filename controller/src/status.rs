@@ -109,6 +109,9 @@ impl View<'_> {
     pub fn warnings(&self, now_ns: i64) -> Vec<Warning> {
         let mut warnings = self.frames.warnings(now_ns);
         warnings.extend(mount::warnings(&self.lander.mount_findings()));
+        let configured_m = self.config.metric.standing_height_m;
+        let measured_m = self.lander.standing_height_m();
+        warnings.extend(measured_m.and_then(|it| mount::standing_warning(it, configured_m)));
         warnings
     }
 

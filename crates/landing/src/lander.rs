@@ -18,6 +18,7 @@ use crate::limits::ConfigError;
 use crate::mean_target::MeanTarget;
 use crate::mount_check::{MountCheck, MountFindings};
 use crate::search;
+use crate::standing::StandingHeight;
 use crate::state_machine::{Inputs, StateMachine, VehicleInputs};
 use crate::time::Timestamp;
 
@@ -72,6 +73,7 @@ pub struct Lander {
     is_link_slow: bool,
     /// Where the vehicle last stood on the ground.
     ground: Option<Point<Odometry>>,
+    standing_height: StandingHeight,
     /// Where the landing started.
     start: Point<Odometry>,
     target_filter: TargetFilter,
@@ -135,6 +137,7 @@ impl Lander {
             link_delay_s: 0.0,
             is_link_slow: false,
             ground: None,
+            standing_height: StandingHeight::default(),
             start: Point::origin(),
             target_filter: TargetFilter::new(&config),
             sightings: Sightings::default(),
@@ -204,7 +207,8 @@ impl Lander {
             is_link_slow: self.is_link_slow,
         };
         if self.state_machine.advance(&inputs) {
-            self.guidance = ActiveGuidance::new(self.config.guidance);
+            self.guidance = ActiveGuidance::new(self.guidance_config());
+            self.standing_height.begin();
             self.first_seen = None;
             if self.axis_mismatch().is_some() {
                 self.axis_check = AxisConsistencyCheck::default();
@@ -231,6 +235,24 @@ impl Lander {
         self.mount_check.findings()
     }
 
+    /// The height of the body's origin over the pad on which the last landing ended, in metres, once that
+    /// was measured and is not small.
+    pub fn standing_height_m(&self) -> Option<f64> {
+        self.standing_height.measured_m()
+    }
+
+    /// The guidance's settings, with the measured standing height where it is above the configured one: a vehicle that is
+    /// believed to stand higher is slow and asks for LAND earlier.
+    fn guidance_config(&self) -> GuidanceConfig {
+        let mut config = self.config.guidance;
+        if let (GuidanceConfig::Metric(metric), Some(measured_m)) =
+            (&mut config, self.standing_height_m())
+        {
+            metric.standing_height_m = metric.standing_height_m.max(measured_m);
+        }
+        config
+    }
+
     fn vehicle(&mut self, now: Timestamp, state: VehicleState) -> Result<(), Rejection> {
         if !state.is_finite() {
             return Err(Rejection::NotFinite);
@@ -249,6 +271,9 @@ impl Lander {
             self.landed(now) == Landed::OnGround && state.velocity.norm() <= MAX_STANDING_M_S;
         if is_standing {
             self.ground = self.place();
+            if matches!(self.phase(), Phase::Final | Phase::Landed) {
+                self.standing_height.observe(self.target(now));
+            }
         }
         Ok(())
     }

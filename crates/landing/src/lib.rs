@@ -16,6 +16,7 @@
 //!   the thesis' guidance.
 //! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker.
 //! - [`axis_check`]: are the axes of camera and autopilot consistent? [`mount_check`]: by how much are they off?
+//!   `standing`: how high does the vehicle stand?
 //! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
 //! - [`lander`] joins them.
 
@@ -35,6 +36,7 @@ pub mod mean_target;
 mod measurement;
 pub mod mount_check;
 pub mod search;
+mod standing;
 pub mod state_machine;
 pub mod time;
 mod view;

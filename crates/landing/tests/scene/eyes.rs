@@ -116,7 +116,8 @@ impl Eyes {
         let in_camera = (seen.origin() - Point::origin()) * range;
         let depth_m = in_camera.z() / scene.focal_ratio;
         let in_body = mount() * Vector::new(in_camera.x(), in_camera.y(), depth_m);
-        let origin = Point::new(0.0, 0.0, -MOUNT_M) + misread(scene, in_body);
+        let camera = Point::new(0.0, 0.0, scene.standing_m - MOUNT_M);
+        let origin = camera + misread(scene, in_body);
         let to_body = mount().quaternion.to_rotation_matrix().into_inner();
         let covariance_m2 = to_body * found.covariance_m2 * to_body.transpose();
         Some(MarkerInFrame {

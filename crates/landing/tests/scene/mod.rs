@@ -53,6 +53,8 @@ pub(crate) struct Scene {
     /// The camera is turned about the vehicle's forward axis and that to the right by these angles more than
     /// configured, in addition to the error that the seed draws.
     pub(crate) mount_off_rad: [f64; 2],
+    /// Height of the body's origin over the vehicle's lowest point, in metres; the world has none.
+    pub(crate) standing_m: f64,
     /// Its focal length over the configured one.
     pub(crate) focal_ratio: f64,
     /// The operator's commands, by time.
@@ -107,6 +109,8 @@ pub(crate) struct Touchdown {
 pub(crate) struct Flight {
     pub(crate) samples: Vec<Sample>,
     pub(crate) phase: Phase,
+    /// The measured height of the body's origin on the pad, in metres.
+    pub(crate) standing_height_m: Option<f64>,
     /// Seconds until LAND, until the ground, and until disarmed.
     pub(crate) land_s: Option<f64>,
     pub(crate) touchdown_s: Option<f64>,
@@ -145,6 +149,7 @@ impl Scene {
             camera_turned_rad: 0.0,
             mirrored: false,
             mount_off_rad: [0.0; 2],
+            standing_m: 0.0,
             focal_ratio: 1.0,
             commands: vec![(0.0, OperatorCommand::Start)],
             refuses_land: false,
@@ -214,6 +219,7 @@ impl Scene {
             }
         }
         flight.phase = lander.phase();
+        flight.standing_height_m = lander.standing_height_m();
         flight
     }
 }
@@ -223,6 +229,7 @@ impl Flight {
         Self {
             samples: Vec::new(),
             phase: Phase::Idle,
+            standing_height_m: None,
             land_s: None,
             touchdown_s: None,
             disarm_s: None,
