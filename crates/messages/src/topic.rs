@@ -115,6 +115,8 @@ const DETECTOR: &[&str] = &["detector"];
 const CONTROLLER: &[&str] = &["controller"];
 const SIMULATOR: &[&str] = &["simulator"];
 const BRIDGE: &[&str] = &["gcs-bridge"];
+/// Who supervises them, `alight up`, has their keys.
+const SUPERVISED: &[&str] = &["controller", "detector"];
 /// Monitors only.
 const NO_OTHERS: &[&str] = &[];
 
@@ -142,7 +144,7 @@ pub const DEBUG_IMAGE: Topic<FrameHeader> =
     Topic::new("detector/{detector}/debug/{image}", Delivery::Latest, DETECTOR, NO_OTHERS);
 /// A detector's identity and settings.
 pub const DETECTOR_INFO: Topic<DetectorInfo> =
-    Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR, CONTROLLER);
+    Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR, SUPERVISED);
 /// A command to a detector; answered with a [`CommandReply`].
 pub const DETECTOR_COMMAND: Topic<DetectorCommand> =
     Topic::new("detector/{detector}/command", Delivery::Query, &["alight"], NO_OTHERS);
@@ -160,7 +162,7 @@ pub const STATUS: Topic<ControllerStatus> = Topic::new(
     "controller/status",
     Delivery::LastValue,
     CONTROLLER,
-    &["camera-pub", "gcs-bridge", "simulator"],
+    &["camera-pub", "controller", "detector", "gcs-bridge", "simulator"],
 );
 /// A command to the controller; answered with a [`CommandReply`].
 pub const COMMAND: Topic<ControllerCommand> =
