@@ -207,7 +207,8 @@ impl Lander {
             is_link_slow: self.is_link_slow,
         };
         if self.state_machine.advance(&inputs) {
-            self.guidance = ActiveGuidance::new(self.guidance_config());
+            self.guidance =
+                ActiveGuidance::new(self.standing_height.applied_to(self.config.guidance));
             self.standing_height.begin();
             self.first_seen = None;
             if self.axis_mismatch().is_some() {
@@ -241,18 +242,6 @@ impl Lander {
         self.standing_height.measured_m()
     }
 
-    /// The guidance's settings, with the measured standing height where it is above the configured one: a vehicle that is
-    /// believed to stand higher is slow and asks for LAND earlier.
-    fn guidance_config(&self) -> GuidanceConfig {
-        let mut config = self.config.guidance;
-        if let (GuidanceConfig::Metric(metric), Some(measured_m)) =
-            (&mut config, self.standing_height_m())
-        {
-            metric.standing_height_m = metric.standing_height_m.max(measured_m);
-        }
-        config
-    }
-
     fn vehicle(&mut self, now: Timestamp, state: VehicleState) -> Result<(), Rejection> {
         if !state.is_finite() {
             return Err(Rejection::NotFinite);
@@ -271,9 +260,7 @@ impl Lander {
             self.landed(now) == Landed::OnGround && state.velocity.norm() <= MAX_STANDING_M_S;
         if is_standing {
             self.ground = self.place();
-            if matches!(self.phase(), Phase::Final | Phase::Landed) {
-                self.standing_height.observe(self.target(now));
-            }
+            self.standing_height.observe(self.phase(), self.target(now));
         }
         Ok(())
     }

@@ -6,7 +6,8 @@
 
 use std::ops::RangeInclusive;
 
-use crate::decision::TargetEstimate;
+use crate::config::GuidanceConfig;
+use crate::decision::{Phase, TargetEstimate};
 
 /// Heights that a vehicle may have and that are above the error of the measurement, in metres.
 const PLAUSIBLE_M: RangeInclusive<f64> = 0.15..=1.0;
@@ -29,11 +30,12 @@ impl StandingHeight {
         self.is_over = false;
     }
 
-    /// The vehicle stands on the pad, with this estimate of it.
-    pub(crate) fn observe(&mut self, target: Option<TargetEstimate>) {
-        if std::mem::replace(&mut self.is_over, true) {
+    /// The vehicle stands, in this phase and with this estimate of the pad.
+    pub(crate) fn observe(&mut self, phase: Phase, target: Option<TargetEstimate>) {
+        if self.is_over || !matches!(phase, Phase::Final | Phase::Landed) {
             return;
         }
+        self.is_over = true;
         let is_sound = |target: &TargetEstimate| {
             target.age_s <= MAX_AGE_S && target.deviation_m <= MAX_DEVIATION_M
         };
@@ -41,6 +43,15 @@ impl StandingHeight {
             let height_m = target.height_m;
             self.measured_m = PLAUSIBLE_M.contains(&height_m).then_some(height_m);
         }
+    }
+
+    /// The guidance's settings, with the measured height where it is above the configured one: a vehicle that is believed to
+    /// stand higher is slow and asks for LAND earlier.
+    pub(crate) fn applied_to(&self, mut config: GuidanceConfig) -> GuidanceConfig {
+        if let (GuidanceConfig::Metric(metric), Some(measured_m)) = (&mut config, self.measured_m) {
+            metric.standing_height_m = metric.standing_height_m.max(measured_m);
+        }
+        config
     }
 
     /// The height in metres, once it was measured and is not small.
