@@ -15,7 +15,7 @@ use std::process::Command;
 use anyhow::{Context, ensure};
 use messages::{RecorderStatus, topic};
 use node::Subscriber;
-use testing::{python, python_passes, skip, with_second_try};
+use testing::{node, node_passes, python, python_passes, skip, with_second_try};
 use tokio::time::timeout;
 
 use crate::flight::{Landing, ONE_AT_A_TIME, PATIENCE, output_of};
@@ -88,6 +88,66 @@ async fn a_landing_is_recorded_and_read_by_other_programs() -> anyhow::Result<()
     ensure!(overlays > 50 && with_picture * 100 >= overlays * 95, "{with_picture} of {overlays}");
     let log = read["log"].to_string();
     ensure!(log.contains("descend") && log.contains("touchdown"), "{log}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_landing_is_followed_by_a_client_of_foxglove() -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(async || {
+        let folder = tempfile::tempdir()?;
+        let file = folder.path().join("flight.mcap");
+        let ([port], _, _) = testing::ports::free()?;
+        let serve = format!("recorder.serve=\"127.0.0.1:{port}\"");
+        let name = file.to_str().context("a path")?;
+        let slowly = "controller.metric.max_descend_m_s=0.5";
+        let set = ["--seed", "8", "--set", slowly, "--set", &serve, "--record", name];
+        let landing = Landing::start(&set).await?;
+        landing.descends_below(9.0).await?;
+        let address = format!("ws://127.0.0.1:{port}");
+        for subprotocol in flightlog::live::SUBPROTOCOLS {
+            let Some(client) = node("tests/recording/live.cjs", &[&address, subprotocol]) else {
+                return Ok(());
+            };
+            let output = tokio::task::block_in_place(|| client.wait_with_output())?;
+            if !node_passes(&output)? {
+                return Ok(());
+            }
+            follows(&serde_json::from_slice(&output.stdout)?)?;
+        }
+        landing.lands().await?;
+        let dropped = Contents::read(&file)?.dropped;
+        ensure!(dropped.is_empty(), "lost while it was followed: {dropped:?}");
+        Ok(())
+    })
+    .await
+}
+
+/// Whether a client saw what a viewer shows.
+fn follows(seen: &serde_json::Value) -> anyhow::Result<()> {
+    for (topic, schema) in [
+        ("camera/down/picture", "foxglove.CompressedImage"),
+        ("camera/down/calibration", "foxglove.CameraCalibration"),
+        ("detector/main/overlay", "foxglove.ImageAnnotations"),
+        ("tf", "foxglove.FrameTransforms"),
+        ("log", "foxglove.Log"),
+        ("vehicle/state", "alight.VehicleState"),
+        ("health/detector/main", "alight.Health"),
+        ("config/controller/main", "alight.Configuration"),
+        ("recorder/dropped", "alight.Dropped"),
+    ] {
+        ensure!(seen["topics"][topic] == schema, "{topic} in {seen}");
+        // Of a state the last value comes at once.
+        ensure!(seen["counts"][topic].as_u64() >= Some(1), "{topic} in {seen}");
+    }
+    let raw = seen["topics"].as_object().context("topics")?;
+    ensure!(!raw.keys().any(|topic| topic.starts_with("raw/")), "{raw:?}");
+    ensure!(seen["firstBytes"] == "ffd8ff", "no JPEG file: {seen}");
+    let [overlays, paired] =
+        [&seen["overlays"], &seen["paired"]].map(|it| it.as_u64().unwrap_or(0));
+    // The first picture may have come before the client asked.
+    ensure!(overlays >= 20 && paired + 2 >= overlays, "{seen}");
+    ensure!(seen["newestMs"].as_f64().is_some_and(|age| age < 1000.0), "{seen}");
     Ok(())
 }
 

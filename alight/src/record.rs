@@ -2,6 +2,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::BufWriter;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -22,9 +23,16 @@ pub(crate) struct RecordArgs {
     /// NAME-repaired.mcap beside it].
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
+    /// Let Foxglove and Lichtblick follow the flight at this address, such as 127.0.0.1:8765 (`docs/recording.md`): short for
+    /// `--set serve=IP:PORT`. Beyond this machine it needs `--insecure`: anyone in reach can then follow.
+    #[arg(long, value_name = "IP:PORT")]
+    serve: Option<SocketAddr>,
+    /// Only serve, and write no file: short for `--set file=`.
+    #[arg(long, requires = "serve", conflicts_with = "output")]
+    no_file: bool,
     /// End a recording properly whose recorder was killed, or save what is whole of a damaged one, as a copy. Exit status
     /// 0 when it was whole, 1 when something is missing.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["config", "set"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["config", "set", "serve"])]
     repair: Option<PathBuf>,
     #[command(flatten)]
     service: ServiceArgs,
@@ -39,6 +47,13 @@ pub(crate) fn run(args: &RecordArgs) -> anyhow::Result<ExitCode> {
     let _ = rustix::process::nice(NICENESS);
     let mut service = args.service.clone();
     service.set.extend(args.output.as_deref().map(file_setting));
+    if args.no_file {
+        service.set.push(file_setting(Path::new("")));
+    }
+    service.set.extend(args.serve.map(|address| format!("serve=\"{address}\"")));
+    if service.network.network().insecure {
+        service.set.push("insecure=true".to_owned());
+    }
     services::run(Service::Recorder, &service)
 }
 

@@ -5,13 +5,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use airlink::picture::jpeg;
 use anyhow::{Context, bail, ensure};
-use flightlog::{About, Picture, Received};
-use messages::{Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS, decode, topic};
+use flightlog::About;
+use messages::{Delivery, RecorderLoss, RecorderStatus, Row, TOPICS, topic};
 use node::{HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
 
 use crate::config::{Config, Frames};
+use crate::frame::{Frame, Pictures, received};
+use crate::live::Live;
 use crate::name::named;
 use crate::recording::{Ending, Recording};
 
@@ -29,7 +30,7 @@ const LAST_MESSAGES: Duration = Duration::from_millis(600);
 const END_PATIENCE: Duration = Duration::from_millis(1100);
 /// Period of the status.
 const STATUS_PERIOD: Duration = Duration::from_millis(500);
-/// Maximum number of keys whose last values, losses or pictures are remembered.
+/// Maximum number of keys whose last values or losses are remembered.
 const MAX_KEYS: usize = 1024;
 /// The name under which the losses of further keys are counted.
 const OTHER_KEYS: &str = "other keys";
@@ -37,18 +38,21 @@ const OTHER_KEYS: &str = "other keys";
 /// Records until shutdown. A disk that fails ends nothing: it is told, what is lost is counted, and another file is tried.
 ///
 /// # Errors
-/// When another recorder has this name, the network session cannot be used, or the last file could not be ended.
+/// When another recorder has this name, the address for viewers is taken, the network session cannot be used, or the last
+/// file could not be ended.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(&config.id).await?;
     let frames = config.frames.parse::<Frames>().map_err(anyhow::Error::msg)?;
     let wanted: Vec<Row> = TOPICS.iter().copied().filter(|row| is_wanted(row, frames)).collect();
+    let live = Live::listen(&node, &config).await?;
     let max_waiting_bytes = config.max_waiting_mb as usize * 1_000_000 / 2;
     let tap = node.tap(&wanted, max_waiting_bytes).await?;
     let publisher = node.publisher(topic::RECORDER_STATUS, &[&config.id]).await?;
     node.announce().await?;
     let status = RecorderStatus { recorder: config.id.clone(), ..RecorderStatus::default() };
     let recorder = Recorder {
-        frames,
+        pictures: Pictures::new(&config, frames),
+        live,
         max_waiting_bytes,
         about: about(&node),
         health: node.shared_health(),
@@ -61,7 +65,6 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         lost: BTreeMap::new(),
         lost_in_file: None,
         states: BTreeMap::new(),
-        pictures: BTreeMap::new(),
     };
     let status = Arc::clone(&recorder.status);
     let is_over = Arc::new(AtomicBool::new(false));
@@ -119,7 +122,9 @@ fn about(node: &Node) -> About {
 /// The thread's state.
 struct Recorder {
     config: Config,
-    frames: Frames,
+    pictures: Pictures,
+    /// Those who follow, where they are served.
+    live: Option<Live>,
     /// What may wait for the disk; as much may wait before it is looked at.
     max_waiting_bytes: usize,
     about: About,
@@ -137,8 +142,6 @@ struct Recorder {
     lost_in_file: Option<u64>,
     /// The last value of each state: every file begins with them.
     states: BTreeMap<String, Tapped>,
-    /// When the last picture of each camera was taken, in nanoseconds.
-    pictures: BTreeMap<String, i64>,
 }
 
 impl Recorder {
@@ -176,28 +179,35 @@ impl Recorder {
         }
     }
 
-    /// Keeps a message, or counts it as lost.
+    /// Keeps a message, or counts it as lost; offers it to those who follow.
     fn take(&mut self, message: Tapped) {
         let waiting_bytes = self.recording.as_ref().map(|it| it.status().waiting_bytes);
         let has_room = waiting_bytes.is_some_and(|bytes| bytes <= self.max_waiting_bytes);
+        let is_followed = self
+            .live
+            .as_mut()
+            .is_some_and(|live| live.is_followed(utc_offset_ns, self.states.values()));
+        let is_wanted = has_room || is_followed;
+        let frame = is_wanted.then(|| self.pictures.frame(&message)).flatten();
         if let Some(recording) = self.recording.as_mut().filter(|_| has_room) {
-            match keep(recording, &message, self.frames, &self.config, &mut self.pictures) {
-                Ok(Kept::Whole) => {
+            match keep(recording, &message, frame.as_ref()) {
+                Ok(()) => {
                     recording.count(&message.key);
                     self.kept += 1;
                     self.health.count("messages");
                 }
-                Ok(Kept::HeaderOnly) => {
-                    recording.count(&message.key);
-                    self.kept += 1;
-                    self.health.dropped("a picture that is no whole image");
-                }
                 Err(problem) => self.give_up(&format!("{problem:#}")),
             }
-        } else {
+        } else if self.config.has_file() {
             let is_slow = self.recording.is_some();
             self.health.dropped(if is_slow { "the disk is too slow" } else { "no file" });
             self.lose(message.key.clone(), 1);
+        }
+        if frame.as_ref().is_some_and(|frame| !frame.is_whole) {
+            self.health.dropped("a picture that is no whole image");
+        }
+        if let Some(live) = self.live.as_mut().filter(|_| is_followed) {
+            live.take(&message, frame.as_ref());
         }
         if message.is_state
             && (self.states.len() < MAX_KEYS || self.states.contains_key(&message.key))
@@ -214,6 +224,14 @@ impl Recorder {
 
     /// Opens, flushes, ends and replaces the file, and says how it is doing.
     fn look_after_file(&mut self) {
+        if let Some(live) = &mut self.live
+            && live.is_followed(utc_offset_ns, self.states.values())
+        {
+            live.tell_lost(&self.lost);
+        }
+        if !self.config.has_file() {
+            return;
+        }
         let is_due = self.retry.is_none_or(|retry| Instant::now() >= retry);
         if self.recording.is_none() && is_due {
             match self.begin() {
@@ -325,7 +343,7 @@ impl Recorder {
             }
             None => None,
         };
-        let is_missing = last.is_none() && self.ending.is_none();
+        let is_missing = self.config.has_file() && last.is_none() && self.ending.is_none();
         for ending in self.ending.into_iter().chain(last) {
             let disk = ending.wait(until.saturating_duration_since(Instant::now()));
             let name = disk.path.as_ref().unwrap_or(&self.config.file);
@@ -343,55 +361,13 @@ impl Recorder {
     }
 }
 
-fn received(message: &Tapped) -> Received<'_> {
-    Received {
-        key: &message.key,
-        payload: &message.payload,
-        attachment: &message.attachment,
-        received_ns: message.received_ns,
-    }
-}
-
-/// What was kept of a message.
-enum Kept {
-    /// All that is configured.
-    Whole,
-    /// The header of a frame whose pixels make no picture.
-    HeaderOnly,
-}
-
 /// Writes a message: frames as configured, everything else as it came.
-fn keep(
-    recording: &mut Recording,
-    message: &Tapped,
-    frames: Frames,
-    config: &Config,
-    pictures: &mut BTreeMap<String, i64>,
-) -> anyhow::Result<Kept> {
-    let camera = topic::FRAME.first_name(&message.key);
-    let header = camera.zip(decode::<FrameHeader>(&message.attachment).ok());
-    let Some((camera, header)) = header else {
-        recording.writer.receive(received(message))?;
-        return Ok(Kept::Whole);
-    };
-    let period_ns = (1e9 / config.max_picture_hz) as i64;
-    // A camera that begins anew may have other stamps.
-    let last_ns = pictures.get(camera).copied();
-    let is_due = last_ns.is_none_or(|last_ns| {
-        header.stamp_ns.saturating_sub(last_ns).saturating_abs() >= period_ns
-    });
-    let picture = match frames {
-        Frames::Jpeg if is_due => {
-            jpeg(&header, &message.payload, config.jpeg_quality).map(Picture::Jpeg)
+fn keep(recording: &mut Recording, message: &Tapped, frame: Option<&Frame>) -> anyhow::Result<()> {
+    match frame {
+        Some(Frame { header, picture, .. }) => {
+            recording.writer.frame(received(message), header, picture)?;
         }
-        Frames::Raw if is_due => Some(Picture::Pixels),
-        Frames::Jpeg | Frames::Raw | Frames::None => Some(Picture::None),
-    };
-    let kept = if picture.is_some() { Kept::Whole } else { Kept::HeaderOnly };
-    let picture = picture.unwrap_or(Picture::None);
-    if picture != Picture::None && (pictures.len() < MAX_KEYS || last_ns.is_some()) {
-        pictures.insert(camera.to_owned(), header.stamp_ns);
+        None => recording.writer.receive(received(message))?,
     }
-    recording.writer.frame(received(message), &header, &picture)?;
-    Ok(kept)
+    Ok(())
 }

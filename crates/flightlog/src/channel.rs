@@ -6,13 +6,15 @@ use messages::{
     decode, topic,
 };
 
-use crate::protobuf::MessageType;
+use crate::protobuf::{MessageType, descriptor_set};
 
 /// Message encoding of a message as it came: the length of its attachment (four bytes, little-endian), the attachment,
 /// the payload.
 pub const RAW: &str = "alight";
 /// Prefix of the channels with messages as they came.
 pub const RAW_PREFIX: &str = "raw/";
+/// A JSON schema that allows any object: the messages' own types say more, and are in the documents.
+const ANY_OBJECT: &[u8] = br#"{"type":"object"}"#;
 
 /// How a record's bytes are read.
 #[derive(Copy, Clone, Debug)]
@@ -23,6 +25,45 @@ pub enum Schema {
     Json(&'static str),
     /// Protocol buffers of this type.
     Protobuf(&'static MessageType),
+}
+
+/// What a schema says to programs that know nothing of it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Description {
+    /// Its name.
+    pub name: String,
+    /// Its encoding: `jsonschema` or `protobuf`.
+    pub encoding: &'static str,
+    /// The schema: text, or a `FileDescriptorSet`.
+    pub data: Vec<u8>,
+}
+
+impl Schema {
+    /// The encoding of the messages.
+    pub fn message_encoding(self) -> &'static str {
+        match self {
+            Self::Raw => RAW,
+            Self::Json(_) => "json",
+            Self::Protobuf(_) => "protobuf",
+        }
+    }
+
+    /// Its description; `None` for [`Schema::Raw`].
+    pub fn description(self) -> Option<Description> {
+        match self {
+            Self::Raw => None,
+            Self::Json(name) => Some(Description {
+                name: format!("alight.{name}"),
+                encoding: "jsonschema",
+                data: ANY_OBJECT.to_vec(),
+            }),
+            Self::Protobuf(message) => Some(Description {
+                name: message.name.to_owned(),
+                encoding: "protobuf",
+                data: descriptor_set(message),
+            }),
+        }
+    }
 }
 
 /// One message of one channel.

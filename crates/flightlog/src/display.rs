@@ -12,7 +12,7 @@ use messages::{
     VehicleState, decode, topic,
 };
 
-use crate::channel::{Received, Record, Schema, matches};
+use crate::channel::{Received, Record, Schema, as_json, header_as_json, matches};
 use crate::foxglove::{self, Calibration, FrameTransform, Level, Outline, Pixels, Place, Pose};
 use crate::protobuf::MessageType;
 
@@ -76,8 +76,26 @@ impl Display {
         Self { utc_offset_ns, ..Self::default() }
     }
 
+    /// A message for programs that know nothing of Alight: as JSON, and as it is shown.
+    pub(crate) fn message(&mut self, message: Received<'_>) -> Vec<Record> {
+        as_json(message).into_iter().chain(self.records(message)).collect()
+    }
+
+    /// A frame for such programs: its header as JSON, and the picture.
+    pub(crate) fn frame(
+        &mut self,
+        message: Received<'_>,
+        header: &FrameHeader,
+        picture: &Picture,
+    ) -> Vec<Record> {
+        let stamp_ns = self.our_clock(message.received_ns, header.stamp_ns);
+        let camera = topic::FRAME.first_name(message.key).unwrap_or(&header.camera);
+        let shown = self.picture(camera, stamp_ns, header, message.payload, picture);
+        [header_as_json(message, stamp_ns, header)].into_iter().chain(shown).collect()
+    }
+
     /// What is shown of a message.
-    pub(crate) fn records(&mut self, message: Received<'_>) -> Vec<Record> {
+    fn records(&mut self, message: Received<'_>) -> Vec<Record> {
         let Received { key, payload, received_ns, .. } = message;
         let is = |pattern: String| matches(&pattern, key);
         let records = if let Some(detector) = topic::DETECTIONS.first_name(key) {
@@ -145,7 +163,7 @@ impl Display {
     }
 
     /// A stamp by our clock: one of the vehicle's, where that is another one, by the age of its first message.
-    pub(crate) fn our_clock(&mut self, received_ns: i64, stamp_ns: i64) -> i64 {
+    fn our_clock(&mut self, received_ns: i64, stamp_ns: i64) -> i64 {
         let apart_ns = received_ns.saturating_sub(stamp_ns);
         if apart_ns.unsigned_abs() <= MAX_AGE_NS.unsigned_abs() {
             return stamp_ns;
@@ -155,7 +173,7 @@ impl Display {
     }
 
     /// A frame of a camera as a picture, taken at `stamp_ns` by our clock.
-    pub(crate) fn picture(
+    fn picture(
         &self,
         camera: &str,
         stamp_ns: i64,

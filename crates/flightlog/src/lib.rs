@@ -6,12 +6,13 @@
 //!
 //! Modules in reading order: [`protobuf`] describes and encodes messages, [`foxglove`] has those of Foxglove,
 //! [`channel`] says what a record is and keeps messages as they came and as JSON, [`display`] as Foxglove shows them;
-//! [`writer`] puts both into a file, [`mod@repair`] ends a file properly whose writer was killed,
+//! [`live`] offers the latter to programs that follow a flight; [`writer`] puts both into a file, [`mod@repair`] ends a file properly whose writer was killed,
 //! [`reader`] reads one as far as it is whole, and [`tape`] the controllers' tapes.
 
 pub mod channel;
 pub mod display;
 pub mod foxglove;
+pub mod live;
 pub mod protobuf;
 pub mod reader;
 pub mod repair;
@@ -20,6 +21,7 @@ pub mod writer;
 
 pub use channel::{Received, Record, Schema};
 pub use display::Picture;
+pub use live::Live;
 pub use reader::{Entry, Reading, read};
 pub use repair::{Repaired, repair};
 pub use tape::{RecordedTape, TapeReader};

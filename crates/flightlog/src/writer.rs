@@ -10,11 +10,10 @@ use std::io::Write;
 use mcap::Attachment;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::{NoSeek, WriteOptions};
-use messages::{FrameHeader, topic};
+use messages::FrameHeader;
 
-use crate::channel::{self, RAW, Received, Record, Schema};
+use crate::channel::{self, Received, Record, Schema};
 use crate::display::{Display, Picture};
-use crate::protobuf::descriptor_set;
 
 /// Size at which a chunk is written, in bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
@@ -22,8 +21,6 @@ const CHUNK_BYTES: u64 = 1 << 20;
 pub const DROPPED_CHANNEL: &str = "recorder/dropped";
 /// Name of the metadata about a recording.
 pub const METADATA: &str = "alight";
-/// A JSON schema that allows any object: the messages' own types say more, and are in the documents.
-const ANY_OBJECT: &[u8] = br#"{"type":"object"}"#;
 
 /// Why a recording cannot go on.
 #[derive(Debug, thiserror::Error)]
@@ -60,6 +57,16 @@ pub struct Writer<W: Write> {
 struct Open {
     id: u16,
     sequence: u32,
+}
+
+/// How many messages of each key could not be kept so far.
+pub fn dropped(now_ns: i64, so_far: &BTreeMap<String, u64>) -> Record {
+    Record {
+        channel: DROPPED_CHANNEL.to_owned(),
+        schema: Schema::Json("Dropped"),
+        stamp_ns: now_ns,
+        data: serde_json::to_vec(so_far).unwrap_or_default(),
+    }
 }
 
 impl<W: Write> Writer<W> {
@@ -104,10 +111,7 @@ impl<W: Write> Writer<W> {
             })?;
         }
         self.write(message.received_ns, &channel::raw(message))?;
-        if let Some(record) = channel::as_json(message) {
-            self.write(message.received_ns, &record)?;
-        }
-        for record in self.display.records(message) {
+        for record in self.display.message(message) {
             self.write(message.received_ns, &record)?;
         }
         Ok(())
@@ -124,11 +128,7 @@ impl<W: Write> Writer<W> {
         picture: &Picture,
     ) -> Result<(), Problem> {
         self.write(message.received_ns, &channel::raw(Received { payload: b"", ..message }))?;
-        let stamp_ns = self.display.our_clock(message.received_ns, header.stamp_ns);
-        self.write(message.received_ns, &channel::header_as_json(message, stamp_ns, header))?;
-        let camera = topic::FRAME.first_name(message.key).unwrap_or(&header.camera);
-        let shown = self.display.picture(camera, stamp_ns, header, message.payload, picture);
-        if let Some(record) = shown {
+        for record in self.display.frame(message, header, picture) {
             self.write(message.received_ns, &record)?;
         }
         Ok(())
@@ -139,13 +139,7 @@ impl<W: Write> Writer<W> {
     /// # Errors
     /// As [`Writer::receive`].
     pub fn dropped(&mut self, now_ns: i64, so_far: &BTreeMap<String, u64>) -> Result<(), Problem> {
-        let record = Record {
-            channel: DROPPED_CHANNEL.to_owned(),
-            schema: Schema::Json("Dropped"),
-            stamp_ns: now_ns,
-            data: serde_json::to_vec(so_far).unwrap_or_default(),
-        };
-        self.write(now_ns, &record)
+        self.write(now_ns, &dropped(now_ns, so_far))
     }
 
     /// Hands everything so far to the output.
@@ -185,16 +179,10 @@ impl<W: Write> Writer<W> {
 
     fn channel(&mut self, record: &Record) -> Result<&mut Open, Problem> {
         if !self.open.contains_key(&record.channel) {
-            let (schema, encoding) = match record.schema {
-                Schema::Raw => (0, RAW),
-                Schema::Json(name) => {
-                    let name = format!("alight.{name}");
-                    (self.mcap.add_schema(&name, "jsonschema", ANY_OBJECT)?, "json")
-                }
-                Schema::Protobuf(message) => {
-                    let types = descriptor_set(message);
-                    (self.mcap.add_schema(message.name, "protobuf", &types)?, "protobuf")
-                }
+            let encoding = record.schema.message_encoding();
+            let schema = match record.schema.description() {
+                Some(it) => self.mcap.add_schema(&it.name, it.encoding, &it.data)?,
+                None => 0,
             };
             let id = self.mcap.add_channel(schema, &record.channel, encoding, &BTreeMap::new())?;
             self.open.insert(record.channel.clone(), Open { id, sequence: 0 });

@@ -1,0 +1,76 @@
+//! Messages for the file and for those who follow: frames with the picture that is kept of them.
+
+use std::collections::BTreeMap;
+
+use airlink::picture::jpeg;
+use flightlog::{Picture, Received};
+use messages::{FrameHeader, decode, topic};
+use node::Tapped;
+
+use crate::config::{Config, Frames};
+
+/// Maximum number of cameras whose last pictures are remembered.
+const MAX_CAMERAS: usize = 1024;
+
+/// What is kept of a frame.
+#[derive(Clone, Debug)]
+pub(crate) struct Frame {
+    /// Its header.
+    pub(crate) header: FrameHeader,
+    /// Its picture, as configured.
+    pub(crate) picture: Picture,
+    /// Whether that is all that is configured: pixels that are no whole image make no picture.
+    pub(crate) is_whole: bool,
+}
+
+/// Makes the pictures.
+#[derive(Debug)]
+pub(crate) struct Pictures {
+    frames: Frames,
+    jpeg_quality: u8,
+    period_ns: i64,
+    /// When the last picture of each camera was taken, in nanoseconds.
+    last: BTreeMap<String, i64>,
+}
+
+impl Pictures {
+    /// As configured.
+    pub(crate) fn new(config: &Config, frames: Frames) -> Self {
+        let period_ns = (1e9 / config.max_picture_hz) as i64;
+        Self { frames, jpeg_quality: config.jpeg_quality, period_ns, last: BTreeMap::new() }
+    }
+
+    /// The frame that a message is; `None` for any other message.
+    pub(crate) fn frame(&mut self, message: &Tapped) -> Option<Frame> {
+        let camera = topic::FRAME.first_name(&message.key)?;
+        let header: FrameHeader = decode(&message.attachment).ok()?;
+        // A camera that begins anew may have other stamps.
+        let last_ns = self.last.get(camera).copied();
+        let is_due = last_ns.is_none_or(|last_ns| {
+            header.stamp_ns.saturating_sub(last_ns).saturating_abs() >= self.period_ns
+        });
+        let picture = match self.frames {
+            Frames::Jpeg if is_due => {
+                jpeg(&header, &message.payload, self.jpeg_quality).map(Picture::Jpeg)
+            }
+            Frames::Raw if is_due => Some(Picture::Pixels),
+            Frames::Jpeg | Frames::Raw | Frames::None => Some(Picture::None),
+        };
+        let is_whole = picture.is_some();
+        let picture = picture.unwrap_or(Picture::None);
+        if picture != Picture::None && (self.last.len() < MAX_CAMERAS || last_ns.is_some()) {
+            self.last.insert(camera.to_owned(), header.stamp_ns);
+        }
+        Some(Frame { header, picture, is_whole })
+    }
+}
+
+/// A message as it came.
+pub(crate) fn received(message: &Tapped) -> Received<'_> {
+    Received {
+        key: &message.key,
+        payload: &message.payload,
+        attachment: &message.attachment,
+        received_ns: message.received_ns,
+    }
+}

@@ -1,0 +1,121 @@
+//! Messages to those who follow a flight under way.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use anyhow::Context;
+use flightlog::Record;
+use flightlog::writer::dropped;
+use node::{HealthCounters, Node, Tapped, now_ns};
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+
+use crate::config::Config;
+use crate::frame::{Frame, received};
+use crate::hub::Hub;
+use crate::server::{Server, serve};
+
+/// The reason for which a recorder that serves beyond this machine counts an error in its health.
+const INSECURE: &str = "insecure: anyone in reach can follow the flight";
+
+/// Offers messages while somebody follows; without anybody it costs nothing.
+pub(crate) struct Live {
+    hub: Arc<Hub>,
+    health: Arc<HealthCounters>,
+    records: flightlog::Live,
+    /// How many lost messages were told.
+    told_lost: Option<u64>,
+    task: JoinHandle<()>,
+}
+
+impl Live {
+    /// Listens where the configuration says so; `None` when it does not.
+    ///
+    /// # Errors
+    /// When the address is taken or of another machine.
+    pub(crate) async fn listen(node: &Node, config: &Config) -> anyhow::Result<Option<Self>> {
+        if config.serve.is_empty() {
+            return Ok(None);
+        }
+        let address: SocketAddr = config.serve.parse().context("`serve`")?;
+        let listener = TcpListener::bind(address).await.with_context(|| {
+            format!("listening at {address} for viewers; another program has the port, or the address is of another machine: choose another with `--serve IP:PORT`")
+        })?;
+        let address = listener.local_addr().context("the address for viewers")?;
+        tracing::info!("Foxglove and Lichtblick follow the flight at ws://{address}");
+        let health = node.shared_health();
+        if !address.ip().is_loopback() && health.failed(INSECURE) {
+            tracing::warn!(
+                "INSECURE: anyone in reach of {address} can follow the flight, pictures included"
+            );
+        }
+        let hub = Arc::new(Hub::new(config.max_clients as usize));
+        let server = Server {
+            hub: Arc::clone(&hub),
+            health: Arc::clone(&health),
+            name: format!("alight recorder {}", config.id),
+            session: format!("{}-{}", std::process::id(), now_ns()),
+            origins: config.origins.clone(),
+        };
+        let failures = Arc::clone(&health);
+        let task = tokio::spawn(async move {
+            // The recording goes on.
+            if let Err(problem) = serve(listener, server).await {
+                failures.failed("viewers are not served");
+                tracing::error!(problem = format!("{problem:#}"), "No viewer is served any more");
+            }
+        });
+        Ok(Some(Self { hub, health, records: flightlog::Live::new(0), told_lost: None, task }))
+    }
+
+    /// Whether somebody follows; the first one gets the last values of all states.
+    pub(crate) fn is_followed<'a>(
+        &mut self,
+        utc_offset_ns: impl FnOnce() -> i64,
+        states: impl IntoIterator<Item = &'a Tapped>,
+    ) -> bool {
+        if self.hub.take_begun() {
+            self.records = flightlog::Live::new(utc_offset_ns());
+            self.told_lost = None;
+            for state in states {
+                self.take(state, None);
+            }
+        }
+        self.hub.is_followed()
+    }
+
+    /// Offers a message; a frame with its picture.
+    pub(crate) fn take(&mut self, message: &Tapped, frame: Option<&Frame>) {
+        let records = match frame {
+            Some(Frame { header, picture, .. }) => {
+                self.records.frame(received(message), header, picture)
+            }
+            None => self.records.message(received(message)),
+        };
+        for record in records {
+            self.offer(record, message.received_ns, message.is_state);
+        }
+    }
+
+    /// Tells what was lost, when that is news.
+    pub(crate) fn tell_lost(&mut self, lost: &BTreeMap<String, u64>) {
+        let sum = lost.values().sum();
+        if self.told_lost.replace(sum) != Some(sum) {
+            self.offer(dropped(now_ns(), lost), now_ns(), true);
+        }
+    }
+
+    fn offer(&self, record: Record, received_ns: i64, is_state: bool) {
+        let missed = self.hub.offer(record, self.records.utc_ns(received_ns), is_state);
+        for _ in 0..missed {
+            self.health.dropped("a viewer is too slow");
+        }
+    }
+}
+
+impl Drop for Live {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}

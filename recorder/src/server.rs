@@ -1,0 +1,188 @@
+//! Answers those who follow a flight: Foxglove, Lichtblick, and any other client of their protocol.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use axum::Router;
+use axum::extract::State;
+use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
+use axum::http::header::{HOST, ORIGIN};
+use axum::http::{HeaderMap, HeaderName, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::routing::any;
+use axum::serve::ListenerExt;
+use flightlog::live::{Request, SUBPROTOCOLS, message_data, request, server_info, warning};
+use node::HealthCounters;
+use tokio::net::TcpListener;
+use tokio::time::{interval, timeout};
+
+use crate::guard::may_follow;
+use crate::hub::{Hub, Place};
+use crate::outbox::Next;
+use crate::window::Window;
+
+/// Maximum size of what a client sends, in bytes: it subscribes to all channels at once.
+const MAX_REQUEST_BYTES: usize = 100_000;
+/// What a client does not take within this time is given up with its connection.
+const SEND_TIMEOUT: Duration = Duration::from_secs(5);
+/// Period in which a client is looked after: a ping, and what it missed.
+const LOOK_PERIOD: Duration = Duration::from_secs(2);
+
+/// What the answers need.
+pub(crate) struct Server {
+    pub(crate) hub: Arc<Hub>,
+    pub(crate) health: Arc<HealthCounters>,
+    /// The name that viewers show.
+    pub(crate) name: String,
+    /// Names the run of this process.
+    pub(crate) session: String,
+    /// Pages of these origins may follow as well.
+    pub(crate) origins: Vec<String>,
+}
+
+/// Answers until the listener fails.
+pub(crate) async fn serve(listener: TcpListener, server: Server) -> anyhow::Result<()> {
+    let router = Router::new().fallback(any(connect)).with_state(Arc::new(server));
+    // Small messages go at once.
+    let listener = listener.tap_io(|stream| drop(stream.set_nodelay(true)));
+    let service = router.into_make_service_with_connect_info::<SocketAddr>();
+    axum::serve(listener, service).await.context("serving those who follow")
+}
+
+async fn connect(
+    State(server): State<Arc<Server>>,
+    headers: HeaderMap,
+    upgrade: WebSocketUpgrade,
+) -> Response {
+    std::future::ready(()).await;
+    let refuse = |status: StatusCode, reason: &'static str, why: &'static str| {
+        server.health.dropped(reason);
+        (status, why).into_response()
+    };
+    let text = |name: HeaderName| headers.get(name).map(|it| it.to_str().unwrap_or("?"));
+    if !may_follow(text(ORIGIN), text(HOST), &server.origins) {
+        return refuse(
+            StatusCode::FORBIDDEN,
+            "wrong Origin",
+            "Pages of this web site may not follow the flight; `origins` in the configuration of the recorder names those that may.",
+        );
+    }
+    let upgrade = upgrade
+        .protocols(SUBPROTOCOLS)
+        .max_message_size(MAX_REQUEST_BYTES)
+        .max_frame_size(MAX_REQUEST_BYTES);
+    if upgrade.selected_protocol().is_none() {
+        return refuse(
+            StatusCode::BAD_REQUEST,
+            "other protocol",
+            "The Foxglove WebSocket protocol is spoken here: foxglove.sdk.v1 or foxglove.websocket.v1.",
+        );
+    }
+    let Some(place) = server.hub.join() else {
+        return refuse(
+            StatusCode::SERVICE_UNAVAILABLE,
+            "too many clients",
+            "As many as `max_clients` allows follow already; close one of them.",
+        );
+    };
+    upgrade.on_upgrade(async move |mut socket| {
+        // A client that goes is no failure.
+        if let Err(problem) = follow(&server, &place, &mut socket).await {
+            tracing::debug!(%problem, "A client has gone");
+        }
+    })
+}
+
+/// Sends, or fails when the client takes too long.
+async fn send(socket: &mut WebSocket, message: Message) -> anyhow::Result<()> {
+    timeout(SEND_TIMEOUT, socket.send(message)).await.context("the client takes nothing")??;
+    Ok(())
+}
+
+async fn ping(socket: &mut WebSocket, window: &mut Window) -> anyhow::Result<()> {
+    let number = window.ping(Instant::now());
+    send(socket, Message::Ping(number.to_le_bytes().to_vec().into())).await
+}
+
+/// Sends what a client subscribes to, until it goes.
+async fn follow(server: &Server, place: &Place, socket: &mut WebSocket) -> anyhow::Result<()> {
+    send(socket, Message::Text(server_info(&server.name, &server.session).into())).await?;
+    let mut window = Window::default();
+    let mut look = interval(LOOK_PERIOD);
+    let mut told = 0;
+    loop {
+        // A message that finds the window full is sent after the pong.
+        while window.has_room()
+            && let Some(next) = place.next()
+        {
+            let (message, bytes) = match next {
+                Next::Text(text) => (Message::Text(text.into()), 0),
+                Next::Message(subscription, it) => {
+                    let bytes = message_data(subscription, it.log_time_ns, &it.data);
+                    let length = bytes.len();
+                    (Message::Binary(bytes.into()), length)
+                }
+            };
+            send(socket, message).await?;
+            if window.sent(bytes) {
+                ping(socket, &mut window).await?;
+            }
+        }
+        tokio::select! {
+            () = place.changed() => {}
+            received = socket.recv() => match received.context("it closed the connection")?? {
+                Message::Text(text) => answer(server, place, socket, &text).await?,
+                Message::Pong(number) => {
+                    if let Ok(number) = <[u8; 8]>::try_from(&*number) {
+                        window.pong(u64::from_le_bytes(number));
+                    }
+                }
+                Message::Close(_) => return Ok(()),
+                Message::Binary(_) | Message::Ping(_) => {}
+            },
+            _ = look.tick() => {
+                if window.is_stuck(Instant::now()) {
+                    server.health.dropped("client takes nothing");
+                    bail!("it takes nothing");
+                }
+                ping(socket, &mut window).await?;
+                let dropped = place.dropped();
+                if dropped > told {
+                    told = dropped;
+                    let text = format!(
+                        "{dropped} older messages were left out so far, as the connection or the viewer is too slow for all of them"
+                    );
+                    send(socket, Message::Text(warning("dropped", &text).into())).await?;
+                }
+            }
+        }
+    }
+}
+
+/// Does what a client asks for, or says why not.
+async fn answer(
+    server: &Server,
+    place: &Place,
+    socket: &mut WebSocket,
+    text: &str,
+) -> anyhow::Result<()> {
+    let problems: Vec<String> = match request(text) {
+        Ok(Request::Subscribe { subscriptions }) => {
+            subscriptions.into_iter().filter_map(|it| place.subscribe(it).err()).collect()
+        }
+        Ok(Request::Unsubscribe { subscription_ids }) => {
+            subscription_ids.into_iter().for_each(|id| place.unsubscribe(id));
+            Vec::new()
+        }
+        Ok(Request::Other) => vec!["only subscribing and unsubscribing are offered".to_owned()],
+        Err(problem) => vec![problem],
+    };
+    if let Some(problem) = problems.first() {
+        server.health.dropped("wrong request");
+        let text = format!("this was not done: {problem}");
+        send(socket, Message::Text(warning("request", &text).into())).await?;
+    }
+    Ok(())
+}
