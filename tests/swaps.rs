@@ -11,7 +11,7 @@ use node::{Node, Subscriber, now_ns};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::time::{sleep, timeout};
 
-use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, PATIENCE, output_of, seconds};
+use crate::flight::{ALIGHT, LONG, Landing, ONE_AT_A_TIME, PATIENCE, output_of, seconds};
 
 /// Ends processes that outlive those who started them.
 #[derive(Default)]
@@ -182,20 +182,16 @@ pub(crate) async fn swaps(number: usize) -> anyhow::Result<bool> {
     let directory = tempfile::tempdir()?;
     let (pad, detectors) = pad_and_detectors(directory.path())?;
     let mut outliving = Outliving::default();
-    let long = [
-        "--timeout-s",
-        "3000",
-        "--set",
-        "controller.phases.operator_hold_timeout_s=3600",
-        "--set",
-        "controller.phases.landing_timeout_s=3000",
+    let args = [
+        "--seed",
+        "21",
         // Slowly, as the last swap comes on the way down: the tag is in view down to 0.7 m.
         "--set",
         "controller.metric.max_descend_m_s=0.3",
         "--pad",
         pad.to_str().context("a path")?,
     ];
-    let landing = Landing::start(&[&["--seed", "21"], &long[..]].concat()).await?;
+    let landing = Landing::start(&[&LONG[..], &args].concat()).await?;
     let healths = landing.node.subscriber(topic::HEALTH, &["controller", "main"]).await?;
     let heard = listen(&landing.node).await?;
     landing.descends_below(8.0).await?;

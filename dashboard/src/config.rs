@@ -2,7 +2,6 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::str::FromStr;
 
 use serde::Deserialize;
 
@@ -44,7 +43,8 @@ pub struct VideoConfig {
 }
 
 /// Who commands by the page.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Commands {
     /// Nobody.
     Never,
@@ -54,21 +54,9 @@ pub enum Commands {
     Token,
 }
 
-impl FromStr for Commands {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "never" => Ok(Self::Never),
-            "here" => Ok(Self::Here),
-            "token" => Ok(Self::Token),
-            _ => Err(format!("`{text}` is none of `never`, `here`, `token`")),
-        }
-    }
-}
-
 /// Where pictures come from.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Input {
     /// The camera's frames.
     Frames,
@@ -76,19 +64,6 @@ pub enum Input {
     Jpeg,
     /// There are none.
     None,
-}
-
-impl FromStr for Input {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "frames" => Ok(Self::Frames),
-            "jpeg" => Ok(Self::Jpeg),
-            "none" => Ok(Self::None),
-            _ => Err(format!("`{text}` is none of `frames`, `jpeg`, `none`")),
-        }
-    }
 }
 
 impl node::Settings for Config {
@@ -99,9 +74,9 @@ impl node::Settings for Config {
         let listen = self.listen.parse::<SocketAddr>();
         check.parses("listen", listen.map_err(|_| "it must be IP:PORT, such as 127.0.0.1:8080"));
         check.parses("names", check_names(&self.names));
-        check.parses("commands", self.commands.parse::<Commands>());
+        check.parses("commands", node::named::<Commands>(&self.commands));
         check.range("max_clients", self.max_clients, 1..=64);
-        check.parses("video.input", self.video.input.parse::<Input>());
+        check.parses("video.input", node::named::<Input>(&self.video.input));
         check.range("video.max_hz", self.video.max_hz, 0.5..=120.0);
         check.range("video.jpeg_quality", self.video.jpeg_quality, 1..=100);
         check.range("video.hold_ms", self.video.hold_ms, 0..=1000);

@@ -26,7 +26,7 @@ use tokio::net::TcpListener;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tokio::time::{interval, timeout};
 
-use crate::config::{Commands, Config};
+use crate::config::Config;
 use crate::guard::{Access, Guard, Refusal};
 use crate::log::Level;
 use crate::nonce::Nonce;
@@ -110,7 +110,7 @@ impl App {
         texts: Texts,
         shown: Arc<watch::Sender<Option<Shown>>>,
     ) -> anyhow::Result<Arc<Self>> {
-        let commands = config.commands.parse::<Commands>().map_err(anyhow::Error::msg)?;
+        let commands = node::named(&config.commands).map_err(anyhow::Error::msg)?;
         let max_clients = config.max_clients as usize;
         Ok(Arc::new(Self {
             node,

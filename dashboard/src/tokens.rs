@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::{Context, ensure};
+use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 /// Random bytes of a token and of a session.
@@ -22,7 +23,8 @@ const MAX_SESSIONS: usize = 64;
 pub const SESSION_S: u64 = 12 * 3600;
 
 /// What a token is for.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Kind {
     /// To look.
     Monitor,
@@ -34,11 +36,7 @@ impl FromStr for Kind {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "monitor" => Ok(Self::Monitor),
-            "command" => Ok(Self::Command),
-            _ => Err(format!("`{text}` is none of `monitor`, `command`")),
-        }
+        node::named(text)
     }
 }
 

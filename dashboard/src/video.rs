@@ -59,7 +59,7 @@ impl Video {
 
     /// Makes pictures until the session is closed.
     pub(crate) async fn run(mut self) -> anyhow::Result<()> {
-        let input = self.config.input.parse::<Input>().map_err(anyhow::Error::msg)?;
+        let input = node::named(&self.config.input).map_err(anyhow::Error::msg)?;
         let topic = match input {
             Input::Frames => topic::FRAME,
             Input::Jpeg => topic::JPEG,

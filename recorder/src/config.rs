@@ -2,7 +2,6 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::str::FromStr;
 
 use serde::Deserialize;
 
@@ -47,7 +46,8 @@ impl Config {
 }
 
 /// What is kept of frames.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Frames {
     /// Nothing.
     None,
@@ -57,25 +57,12 @@ pub enum Frames {
     Raw,
 }
 
-impl FromStr for Frames {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "none" => Ok(Self::None),
-            "jpeg" => Ok(Self::Jpeg),
-            "raw" => Ok(Self::Raw),
-            _ => Err(format!("`{text}` is none of `none`, `jpeg`, `raw`")),
-        }
-    }
-}
-
 impl node::Settings for Config {
     const DEFAULTS: &'static str = include_str!("../recorder.toml");
 
     fn check(&self, check: &mut node::Check<'_>) {
         check.name("id", &self.id);
-        check.parses("frames", self.frames.parse::<Frames>());
+        check.parses("frames", node::named::<Frames>(&self.frames));
         check.range("jpeg_quality", self.jpeg_quality, 1..=100);
         check.range("max_picture_hz", self.max_picture_hz, 0.1..=1000.0);
         check.range("max_waiting_mb", self.max_waiting_mb, 2..=60);

@@ -42,7 +42,7 @@ const OTHER_KEYS: &str = "other keys";
 /// file could not be ended.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(&config.id).await?;
-    let frames = config.frames.parse::<Frames>().map_err(anyhow::Error::msg)?;
+    let frames = node::named(&config.frames).map_err(anyhow::Error::msg)?;
     let wanted: Vec<Row> = TOPICS.iter().copied().filter(|row| is_wanted(row, frames)).collect();
     let live = Live::listen(&node, &config).await?;
     let max_waiting_bytes = config.max_waiting_mb as usize * 1_000_000 / 2;
@@ -146,6 +146,8 @@ struct Recorder {
 
 impl Recorder {
     fn run(mut self, tap: &Tap, is_over: &AtomicBool) -> anyhow::Result<()> {
+        // Before the first message, which would be lost without a file.
+        self.look_after_file();
         let mut looked = Instant::now();
         let mut last = None;
         loop {

@@ -39,8 +39,9 @@ impl Served {
     async fn start(set: &[&str]) -> anyhow::Result<Self> {
         let ([meet, port], _, _) = ports::free()?;
         let serve = format!("serve=127.0.0.1:{port}");
-        let set = [serve.as_str(), "frames=raw"].iter().chain(set).map(|it| (*it).to_owned());
-        let config = Layers { file: None, set: set.collect() }.load::<Config>()?.settings;
+        let all = [&[serve.as_str(), "frames=raw"], set].concat();
+        let set = all.into_iter().map(str::to_owned).collect();
+        let config = Layers { file: None, set }.load::<Config>()?.settings;
         let node = open("recorder", meet).await?;
         let task = tokio::spawn(recorder::run(node.clone(), config, Shutdown::on_signals()?));
         let address = SocketAddr::new("127.0.0.1".parse()?, port);

@@ -23,6 +23,15 @@ const MAX_ERROR_M: f64 = 0.1;
 /// may have no time for the rest.
 const SMALL_CAMERA: [&str; 3] =
     ["camera.width=648", "camera.height=486", "camera.focal_px=909.0909090909091"];
+/// Options of a flight that stays in the air for as long as a test takes.
+pub(crate) const LONG: [&str; 6] = [
+    "--timeout-s",
+    "3000",
+    "--set",
+    "controller.phases.operator_hold_timeout_s=3600",
+    "--set",
+    "controller.phases.landing_timeout_s=3000",
+];
 pub(crate) const ALIGHT: &str = env!("CARGO_BIN_EXE_alight-under-test");
 
 /// Two landings at once would share the processor.

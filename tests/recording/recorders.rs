@@ -14,7 +14,7 @@ use messages::{ControllerCommand, Phase, topic};
 use rustix::process::{Signal, kill_process};
 use tokio::time::{Instant, sleep};
 
-use crate::flight::{Landing, PATIENCE};
+use crate::flight::{LONG, Landing, PATIENCE};
 
 /// Most that a killed recorder may lose, in seconds.
 const MAX_LOSS_S: f64 = 1.0;
@@ -82,17 +82,8 @@ pub(crate) async fn kills(times: usize, more: &[&str]) -> anyhow::Result<()> {
         1 => first.clone(),
         _ => folder.path().join(format!("flight-{number}.mcap")),
     };
-    let long = [
-        "--timeout-s",
-        "3000",
-        "--set",
-        "controller.phases.operator_hold_timeout_s=3600",
-        "--set",
-        "controller.phases.landing_timeout_s=3000",
-        "--record",
-        first.to_str().context("a path")?,
-    ];
-    let mut landing = Landing::start(&[&["--seed", "7"], &long[..], more].concat()).await?;
+    let args = ["--seed", "7", "--record", first.to_str().context("a path")?];
+    let mut landing = Landing::start(&[&LONG[..], &args, more].concat()).await?;
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
     landing.status("it holds", |s| s.phase == Phase::Hold).await?;

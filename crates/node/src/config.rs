@@ -9,7 +9,8 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use serde::de::DeserializeOwned;
+use serde::de::value::{Error as ValueError, StrDeserializer};
+use serde::de::{DeserializeOwned, IntoDeserializer};
 use toml::{Table, Value};
 
 /// A service's configuration.
@@ -283,6 +284,15 @@ fn similar<'a>(keys: impl Iterator<Item = &'a String>, wanted: &str) -> Option<&
         .filter(|(likeness, _)| *likeness > 0.75)
         .max_by(|a, b| a.0.total_cmp(&b.0))
         .map(|(_, key)| key)
+}
+
+/// The value of an enumeration that a text names.
+///
+/// # Errors
+/// Which names there are.
+pub fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
+    let text: StrDeserializer<'_, ValueError> = text.into_deserializer();
+    T::deserialize(text).map_err(|cause| cause.to_string())
 }
 
 /// The rule of [`is_name`].

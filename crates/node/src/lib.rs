@@ -24,7 +24,9 @@ pub mod tap;
 pub mod topics;
 
 pub use clock::{clock_name, host_name, now_ns};
-pub use config::{Check, ConfigError, Effective, Layers, Settings, changed, from_toml, to_toml};
+pub use config::{
+    Check, ConfigError, Effective, Layers, Settings, changed, from_toml, named, to_toml,
+};
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
 pub use identity::Identity;

@@ -67,13 +67,22 @@ impl FrameSpec {
         camera_from_marker: Transform<Camera, MarkerFrame>,
         seed: u64,
     ) -> Self {
+        Self { marker: Some(marker), ..Self::negative(settings, camera_from_marker, seed) }
+    }
+
+    /// The same without a marker, whose place is seen from `camera_from_place`.
+    pub fn negative(
+        settings: CameraSettings,
+        camera_from_place: Transform<Camera, MarkerFrame>,
+        seed: u64,
+    ) -> Self {
         Self {
             group: String::new(),
-            marker: Some(marker),
+            marker: None,
             clutter: Vec::new(),
             inverted: false,
             settings,
-            path: vec![camera_from_marker],
+            path: vec![camera_from_place],
             surface: Surface::Asphalt,
             painted_marks: 20,
             light: 1.0,

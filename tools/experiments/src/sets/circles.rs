@@ -65,17 +65,10 @@ fn spec(draw: Draw, frame: usize) -> FrameSpec {
     let ((group, _), _) = KINDS[frame % KINDS.len()];
     let mut spec = FrameSpec {
         group: group.to_owned(),
-        marker: None,
-        clutter: Vec::new(),
-        inverted: false,
-        settings,
-        path: vec![pose(&model, at, distance_m, tilt, 0.0)],
         surface: Surface::ALL[round % 4],
         painted_marks: rng.random_range(0..20),
         light,
-        occluder: Occluder::None,
-        bayer: false,
-        seed,
+        ..FrameSpec::negative(settings, pose(&model, at, distance_m, tilt, 0.0), seed)
     };
     let middle = spec.place();
     for number in 0..rng.random_range(5..20) {

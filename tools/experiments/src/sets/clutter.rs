@@ -60,17 +60,11 @@ fn spec(draw: Draw, frame: usize) -> FrameSpec {
     let (group, drawn) = KINDS[frame % KINDS.len()];
     let mut spec = FrameSpec {
         group: group.to_owned(),
-        marker: None,
-        clutter: Vec::new(),
-        inverted: false,
-        settings,
-        path: vec![pose],
         surface: Surface::ALL[frame / KINDS.len() % 4],
         painted_marks: rng.random_range(0..60),
         light,
-        occluder: Occluder::None,
         bayer: frame % 7 == 3,
-        seed,
+        ..FrameSpec::negative(settings, pose, seed)
     };
     let pad = spec.place();
     for _ in 0..rng.random_range(8..40) {
