@@ -5,20 +5,18 @@
     reason = "what a test measured, or why it is skipped, is for people to read"
 )]
 
+#[path = "recording/disks.rs"]
+mod disks;
 mod flight;
 #[path = "recording/recorders.rs"]
 mod recorders;
 
-use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context, ensure};
-use messages::{RecorderStatus, topic};
-use node::Subscriber;
-use testing::{node, node_passes, python, python_passes, skip, with_second_try};
-use tokio::time::timeout;
+use testing::{node, node_passes, python, python_passes, with_second_try};
 
-use crate::flight::{Landing, ONE_AT_A_TIME, PATIENCE, output_of};
+use crate::flight::{Landing, ONE_AT_A_TIME, output_of};
 use crate::recorders::{Contents, kills};
 
 #[tokio::test(flavor = "multi_thread")]
@@ -161,95 +159,12 @@ async fn a_recorder_that_is_killed_leaves_a_file_and_the_landing_goes_on() -> an
 async fn a_disk_that_is_full_read_only_or_removed_is_told_and_the_landing_goes_on()
 -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
-    with_second_try(disks_fail).await
+    with_second_try(disks::fail).await
 }
 
-/// A small disk of its own, until it is dropped.
-struct Disk<'a>(&'a Path);
-
-impl<'a> Disk<'a> {
-    fn mount(path: &'a Path, options: &str) -> anyhow::Result<Option<Self>> {
-        std::fs::create_dir(path)?;
-        let mut command = Command::new("mount");
-        let output = command.args(["-t", "tmpfs", "-o", options, "tmpfs"]).arg(path).output();
-        let is_there = output.as_ref().is_ok_and(|output| output.status.success());
-        if !is_there {
-            skip("namespaces", format_args!("a disk could not be mounted: {output:?}"));
-        }
-        Ok(is_there.then_some(Self(path)))
-    }
-
-    fn change(&self, options: &str) -> anyhow::Result<()> {
-        let options = format!("remount,{options}");
-        let status = Command::new("mount").args(["-o", &options]).arg(self.0).status()?;
-        ensure!(status.success(), "{options}: {status}");
-        Ok(())
-    }
-}
-
-impl Drop for Disk<'_> {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg("-l").arg(self.0).status();
-    }
-}
-
-async fn disks_fail() -> anyhow::Result<()> {
-    let folder = tempfile::tempdir()?;
-    let path = folder.path().join("disk");
-    let Some(disk) = Disk::mount(&path, "ro,size=3m")? else { return Ok(()) };
-    let file = path.join("flights/flight.mcap");
-    let name = file.to_str().context("a path")?;
-    let slowly = "controller.metric.max_descend_m_s=0.5";
-    let landing = Landing::start(&["--seed", "6", "--set", slowly, "--record", name]).await?;
-    let statuses = landing.node.subscriber(topic::RECORDER_STATUS, &[]).await?;
-    let healths = landing.node.subscriber(topic::HEALTH, &["recorder", "main"]).await?;
-    told(&statuses, "the disk is read-only", |s| has_problem(s, "Read-only")).await?;
-    disk.change("rw")?;
-    told(&statuses, "it records", |s| s.problem.is_none() && s.bytes > 0).await?;
-    told(&statuses, "the disk is full", |s| has_problem(s, "No space left")).await?;
-    disk.change("rw,size=400m")?;
-    let again = told(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
-    std::fs::remove_dir_all(path.join("flights"))?;
-    told(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
-    told(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
-    let lost: u64 = again.dropped.iter().map(|loss| loss.count).sum();
-    ensure!(lost > 100, "{again:?}");
-    let in_health = timeout(PATIENCE, async {
-        while let Some(health) = healths.next().await {
-            if health.errors.iter().any(|error| error.reason == "the file failed") {
-                return true;
-            }
-        }
-        false
-    });
-    ensure!(in_health.await?, "nothing in the health report");
-    let result = landing.lands().await?;
-    println!("{}", result["recording"]);
-    let contents = Contents::read(&file)?;
-    let in_file = contents.dropped.get("vehicle/state").copied();
-    ensure!(in_file.is_some_and(|lost| lost > 10), "{:?}", contents.dropped);
-    Ok(())
-}
-
-fn has_problem(status: &RecorderStatus, part: &str) -> bool {
-    status.problem.as_ref().is_some_and(|problem| problem.contains(part))
-}
-
-async fn told(
-    statuses: &Subscriber<RecorderStatus>,
-    what: &str,
-    holds: impl Fn(&RecorderStatus) -> bool,
-) -> anyhow::Result<RecorderStatus> {
-    let mut last = None;
-    let found = timeout(PATIENCE, async {
-        while let Some(status) = statuses.next().await {
-            if holds(&status) {
-                return Some(status);
-            }
-            last = Some(status);
-        }
-        None
-    });
-    let found = found.await.ok().flatten();
-    found.with_context(|| format!("waiting until {what}; last: {last:?}"))
+#[tokio::test(flavor = "multi_thread")]
+async fn decisions_are_the_same_to_the_bit_beside_a_disk_that_stands_still_and_fails()
+-> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(disks::beside_a_flight).await
 }

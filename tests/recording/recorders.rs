@@ -123,7 +123,7 @@ pub(crate) async fn kills(times: usize, more: &[&str]) -> anyhow::Result<()> {
     Ok(())
 }
 
-async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Result<()> {
+pub(crate) async fn command(landing: &Landing, command: ControllerCommand) -> anyhow::Result<()> {
     let reply = landing.node.command(topic::COMMAND, &[], &command).await?;
     ensure!(reply.accepted, "{command:?}: {}", reply.reason);
     Ok(())

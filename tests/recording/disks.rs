@@ -1,0 +1,238 @@
+//! Disks that are full, read-only, removed or stand still, and the flight beside them.
+
+use std::fs::File;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use messages::{ControllerCommand, Health, Phase, RecorderStatus, topic};
+use node::Subscriber;
+use rustix::process::Pid;
+use testing::skip;
+use tokio::time::{Instant, sleep, timeout};
+
+use crate::flight::{ALIGHT, LONG, Landing, PATIENCE, output_of};
+use crate::recorders::{Contents, command};
+
+/// Longest time until a disk that fails is told.
+const MAX_UNTOLD: Duration = Duration::from_secs(2);
+/// How long a disk stands still.
+const STALL: Duration = Duration::from_secs(5);
+/// The most that a recorder may hold for its disk, in MB.
+const MAX_HELD_MB: f64 = 64.0;
+
+/// A small disk of its own, until it is dropped.
+struct Disk<'a>(&'a Path);
+
+impl<'a> Disk<'a> {
+    fn mount(path: &'a Path, options: &str) -> anyhow::Result<Option<Self>> {
+        std::fs::create_dir(path)?;
+        let mut command = Command::new("mount");
+        let output = command.args(["-t", "tmpfs", "-o", options, "tmpfs"]).arg(path).output();
+        let is_there = output.as_ref().is_ok_and(|output| output.status.success());
+        if !is_there {
+            skip("namespaces", format_args!("a disk could not be mounted: {output:?}"));
+        }
+        Ok(is_there.then_some(Self(path)))
+    }
+
+    fn change(&self, options: &str) -> anyhow::Result<()> {
+        let options = format!("remount,{options}");
+        let status = Command::new("mount").args(["-o", &options]).arg(self.0).status()?;
+        ensure!(status.success(), "{options}: {status}");
+        Ok(())
+    }
+}
+
+/// A file as a disk, which can be made to stand still.
+struct Freezing<'a>(&'a Path);
+
+impl<'a> Freezing<'a> {
+    fn mount(path: &'a Path) -> anyhow::Result<Option<Self>> {
+        std::fs::create_dir(path)?;
+        let image = path.with_extension("image");
+        File::create(&image)?.set_len(200_000_000)?;
+        let run = |command: &mut Command| {
+            let output = command.output();
+            let is_done = output.as_ref().is_ok_and(|output| output.status.success());
+            if !is_done {
+                skip("namespaces", format_args!("{command:?}: {output:?}"));
+            }
+            is_done
+        };
+        let is_there = run(Command::new("mkfs.ext4").arg("-q").arg(&image))
+            && run(Command::new("mount").args(["-o", "loop"]).arg(&image).arg(path));
+        Ok(is_there.then_some(Self(path)))
+    }
+
+    fn freeze(&self, option: &str) -> anyhow::Result<()> {
+        let status = Command::new("fsfreeze").arg(option).arg(self.0).status()?;
+        ensure!(status.success(), "fsfreeze {option}: {status}");
+        Ok(())
+    }
+}
+
+impl Drop for Freezing<'_> {
+    fn drop(&mut self) {
+        // One that stands still could not be taken away.
+        let _ = Command::new("fsfreeze").arg("-u").arg(self.0).stderr(Stdio::null()).status();
+        let _ = Command::new("umount").arg("-l").arg(self.0).status();
+    }
+}
+
+impl Drop for Disk<'_> {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("-l").arg(self.0).status();
+    }
+}
+
+/// A landing is recorded to a disk that is read-only, full, and from which the file is removed.
+pub(crate) async fn fail() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("disk");
+    let Some(disk) = Disk::mount(&path, "ro,size=3m")? else { return Ok(()) };
+    let file = path.join("flights/flight.mcap");
+    let name = file.to_str().context("a path")?;
+    let slowly = "controller.metric.max_descend_m_s=0.5";
+    let landing = Landing::start(&["--seed", "6", "--set", slowly, "--record", name]).await?;
+    let statuses = landing.node.subscriber(topic::RECORDER_STATUS, &[]).await?;
+    let healths = landing.node.subscriber(topic::HEALTH, &["recorder", "main"]).await?;
+    told(&statuses, "the disk is read-only", |s| has_problem(s, "Read-only")).await?;
+    disk.change("rw")?;
+    told(&statuses, "it records", |s| s.problem.is_none() && s.bytes > 0).await?;
+    told(&statuses, "the disk is full", |s| has_problem(s, "No space left")).await?;
+    disk.change("rw,size=400m")?;
+    let again = told(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
+    std::fs::remove_dir_all(path.join("flights"))?;
+    told(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
+    told(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
+    let lost: u64 = again.dropped.iter().map(|loss| loss.count).sum();
+    ensure!(lost > 100, "{again:?}");
+    let in_health = timeout(PATIENCE, async {
+        while let Some(health) = healths.next().await {
+            if health.errors.iter().any(|error| error.reason == "the file failed") {
+                return true;
+            }
+        }
+        false
+    });
+    ensure!(in_health.await?, "nothing in the health report");
+    let result = landing.lands().await?;
+    println!("{}", result["recording"]);
+    let contents = Contents::read(&file)?;
+    let in_file = contents.dropped.get("vehicle/state").copied();
+    ensure!(in_file.is_some_and(|lost| lost > 10), "{:?}", contents.dropped);
+    Ok(())
+}
+
+fn has_problem(status: &RecorderStatus, part: &str) -> bool {
+    status.problem.as_ref().is_some_and(|problem| problem.contains(part))
+}
+
+async fn told(
+    statuses: &Subscriber<RecorderStatus>,
+    what: &str,
+    holds: impl Fn(&RecorderStatus) -> bool,
+) -> anyhow::Result<RecorderStatus> {
+    let mut last = None;
+    let found = timeout(PATIENCE, async {
+        while let Some(status) = statuses.next().await {
+            if holds(&status) {
+                return Some(status);
+            }
+            last = Some(status);
+        }
+        None
+    });
+    let found = found.await.ok().flatten();
+    found.with_context(|| format!("waiting until {what}; last: {last:?}"))
+}
+
+/// A landing is recorded twice: to a good disk, and with every pixel at 30 frames a second to one that stands still, is full,
+/// and from which the file is removed. The tape on the good one is verified: what the controller decided is what it would
+/// have decided without the other, to the bit.
+pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("disk");
+    let Some(disk) = Freezing::mount(&path)? else { return Ok(()) };
+    let good = folder.path().join("good.mcap");
+    let name = good.to_str().context("a path")?;
+    let args = ["--seed", "9", "--set", "simulator.camera.rate_hz=30", "--record", name];
+    let mut landing = Landing::start(&[&LONG[..], &args].concat()).await?;
+    let statuses = landing.node.subscriber(topic::RECORDER_STATUS, &["failing"]).await?;
+    let healths = landing.node.subscriber(topic::HEALTH, &["controller", "main"]).await?;
+    let file = format!("file={:?}", path.join("flights/failing.mcap"));
+    let pid = landing.start_by_hand("recorder", &["id=failing", &file, "frames=raw"])?;
+    landing.descends_below(9.0).await?;
+    command(&landing, ControllerCommand::Hold).await?;
+    landing.status("it holds", |s| s.phase == Phase::Hold).await?;
+    let is_well = |s: &RecorderStatus| s.problem.is_none() && s.bytes > 0;
+    told(&statuses, "it records", is_well).await?;
+
+    let before_mb = resident_mb(pid)?;
+    disk.freeze("-f")?;
+    let began = Instant::now();
+    told(&statuses, "it stands still", |s| has_problem(s, "taken nothing")).await?;
+    let still = began.elapsed();
+    let mut max_mb = before_mb;
+    while began.elapsed() < STALL {
+        max_mb = max_mb.max(resident_mb(pid)?);
+        sleep(Duration::from_millis(50)).await;
+    }
+    disk.freeze("-u")?;
+    let after = told(&statuses, "it records again", is_well).await?;
+
+    fill(&path.join("filler"))?;
+    let began = Instant::now();
+    told(&statuses, "the disk is full", |s| has_problem(s, "No space left")).await?;
+    let full = began.elapsed();
+    std::fs::remove_file(path.join("filler"))?;
+    std::fs::remove_dir_all(path.join("flights"))?;
+    told(&statuses, "it records again", is_well).await?;
+
+    let began = Instant::now();
+    std::fs::remove_dir_all(path.join("flights"))?;
+    told(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
+    let removed = began.elapsed();
+
+    let controller = latest(&healths).await?;
+    command(&landing, ControllerCommand::Resume).await?;
+    landing.lands().await?;
+    let lost: u64 = after.dropped.iter().map(|loss| loss.count).sum();
+    println!(
+        "told after {still:.1?} (stands still), {full:.1?} (full), {removed:.1?} (removed); held {:.0} MB more than {before_mb:.0} MB; {lost} messages lost in {STALL:?}; drops of the controller: {:?}",
+        max_mb - before_mb,
+        controller.drops,
+    );
+    for told in [still, full, removed] {
+        ensure!(told < MAX_UNTOLD, "it was told after {told:?}");
+    }
+    ensure!(max_mb - before_mb < MAX_HELD_MB, "{max_mb} MB after {before_mb} MB");
+    ensure!(Contents::read(&good)?.dropped.values().sum::<u64>() == 0, "the good one lost some");
+    let replay = output_of(Command::new(ALIGHT).args(["replay", name, "--verify"]))?;
+    let said = String::from_utf8_lossy(&replay.stdout).into_owned();
+    println!("{said}");
+    ensure!(replay.status.success() && said.contains("verified"), "{said}");
+    Ok(())
+}
+
+/// The resident memory of a process, in MB, without what it shares with others: a camera's pool is mapped whole.
+fn resident_mb(pid: Pid) -> anyhow::Result<f64> {
+    let status = std::fs::read_to_string(format!("/proc/{}/status", pid.as_raw_nonzero()))?;
+    let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:"));
+    let kb: f64 = line.and_then(|it| it.split_whitespace().next()).context("RssAnon")?.parse()?;
+    Ok(kb * 1.024e-3)
+}
+
+/// Writes a file until its disk is full.
+fn fill(path: &Path) -> anyhow::Result<()> {
+    let mut file = File::create(path)?;
+    let megabyte = vec![0; 1 << 20];
+    while std::io::Write::write_all(&mut file, &megabyte).is_ok() {}
+    Ok(())
+}
+
+async fn latest(healths: &Subscriber<Health>) -> anyhow::Result<Health> {
+    timeout(PATIENCE, healths.next()).await?.context("the controller's health")
+}
