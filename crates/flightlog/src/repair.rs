@@ -48,7 +48,7 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
     while let Some((opcode, body, after)) = next_record(rest) {
         rest = after;
         let chunks = copy.found.chunks;
-        match parse_record(opcode, body) {
+        match contained(|| parse_record(opcode, body)) {
             Ok(Record::Chunk { header, data }) => match records_of(header, &data) {
                 Ok(records) => copy.chunk(records)?,
                 Err(problem) => copy
