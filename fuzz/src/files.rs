@@ -52,7 +52,7 @@ pub fn calibration(input: &[u8]) {
     }
 }
 
-/// A recording to repair, of which what is kept is whole, and to replay.
+/// A recording to repair, of which what is kept is whole, to read and to replay.
 pub fn recording(input: &[u8]) {
     let mut reader = flightlog::TapeReader::default();
     if reader.read(input).is_ok() {
@@ -60,6 +60,12 @@ pub fn recording(input: &[u8]) {
             let records = part.records().take_while(Result::is_ok).count();
             assert!(records <= part.records.len());
         }
+    }
+    let mut messages = 0;
+    if let Ok(read) = flightlog::read(input, |entry| {
+        messages += u64::from(matches!(entry, flightlog::Entry::Message(_)));
+    }) {
+        assert_eq!(read.messages, messages);
     }
     let mut mended = Vec::new();
     if let Ok(found) = flightlog::repair(input, &mut mended) {

@@ -3,11 +3,12 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use mcap::read::{ChunkReader, LinearReader, Options};
+use mcap::read::{LinearReader, Options};
 use mcap::records::{MessageHeader, Record};
 use mcap::{Channel, McapError, Summary};
 
 use crate::channel::{RAW_PREFIX, Received, split_raw};
+use crate::repair::{contained, records_of};
 use crate::writer::{DROPPED_CHANNEL, METADATA, Problem};
 
 /// Something that a recording has.
@@ -40,7 +41,7 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
     if !recording.starts_with(mcap::MAGIC) {
         return Err(McapError::BadMagic.into());
     }
-    let summary = Summary::read(recording).ok().flatten();
+    let summary = contained(|| Summary::read(recording)).ok().flatten();
     let mut found = Found {
         keys: BTreeMap::new(),
         in_index: summary.map(|summary| summary.channels).unwrap_or_default(),
@@ -50,16 +51,16 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
         each,
     };
     let mut chunks = 0;
-    for record in LinearReader::new_with_options(recording, Options::IgnoreEndMagic.into())? {
+    let options = Options::IgnoreEndMagic.into();
+    let mut reader = LinearReader::new_with_options(recording, options)?;
+    while let Some(record) = contained(|| reader.next().transpose()).transpose() {
         match record {
             Ok(Record::Metadata(metadata)) if metadata.name == METADATA => {
                 found.about(metadata.metadata);
             }
             Ok(Record::Chunk { header, data }) => {
                 chunks += 1;
-                let records = ChunkReader::new(header, &data)
-                    .and_then(Iterator::collect::<Result<Vec<_>, _>>);
-                match records {
+                match records_of(header, &data) {
                     Ok(records) => records.iter().for_each(|record| found.record(record)),
                     Err(problem) => {
                         let text = format!("chunk {chunks} is damaged: {problem}");
@@ -209,8 +210,10 @@ mod tests {
         let (cut, _, reading) = times(&file[..file.len() / 2]);
         assert!(cut.len() > 10 && cut.len() < 40, "{}", cut.len());
         assert!(!reading.is_ended);
+        // In a message, not in the length of a chunk, behind which nothing is found again.
+        let notes: Vec<_> = (0..file.len()).filter(|at| file[*at..].starts_with(b"note")).collect();
         let mut flipped = file.clone();
-        flipped[file.len() / 4] ^= 1;
+        flipped[notes[notes.len() / 4]] ^= 1;
         let (some, _, reading) = times(&flipped);
         assert!(some.len() > 40, "{}", some.len());
         assert!(!reading.damage.is_empty());
