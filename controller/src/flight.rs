@@ -38,6 +38,8 @@ pub struct Flight {
     autopilot: Autopilot,
     lander: Lander,
     decision: Option<Decision>,
+    /// How many decisions there were.
+    decisions: u64,
     /// What the lander was told of the detectors last.
     detectors_alive: bool,
     /// The link's delay that the lander was told last, in seconds.
@@ -80,6 +82,7 @@ impl Flight {
             autopilot,
             lander: Lander::new(config.lander())?,
             decision: None,
+            decisions: 0,
             detectors_alive: true,
             link_delay_s: 0.0,
             mission: Mission::new(config.start, config.takeoff()),
@@ -327,6 +330,11 @@ impl Flight {
         self.decision.as_ref()
     }
 
+    /// How many decisions there were; another number may come with the same decision.
+    pub(crate) fn decisions(&self) -> u64 {
+        self.decisions
+    }
+
     /// The detector in use.
     pub fn active_detector(&self) -> Option<&str> {
         self.frames.selection.active()
@@ -552,6 +560,7 @@ impl Flight {
             self.autopilot.withdraw();
         }
         self.decision = Some(decision);
+        self.decisions += 1;
         if !self.mission.is_landing() || self.is_ending {
             return;
         }

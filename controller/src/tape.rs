@@ -29,8 +29,8 @@ pub struct TapedFlight {
     outgoing: VecDeque<Vec<u8>>,
     /// The packets of one event, one after the other.
     packets: Vec<u8>,
-    /// The decision and the detector that the tape has.
-    decision: Option<Decision>,
+    /// Number of the decision that the tape has, and the detector.
+    decisions: u64,
     detector: Option<String>,
 }
 
@@ -63,7 +63,7 @@ impl TapedFlight {
             writer: TapeWriter::new(now_ns),
             outgoing: VecDeque::new(),
             packets: Vec::new(),
-            decision: None,
+            decisions: 0,
             detector: None,
         };
         let event = TapeEvent::Begin {
@@ -219,8 +219,8 @@ impl TapedFlight {
             self.outgoing.push_back(packet);
         }
         let detector = self.flight.active_detector();
-        let is_new = self.flight.decision() != self.decision.as_ref()
-            || detector != self.detector.as_deref();
+        let is_other_detector = detector != self.detector.as_deref();
+        let is_new = self.flight.decisions() != self.decisions || is_other_detector;
         let decision = self.flight.decision().filter(|_| is_new);
         let output = TapeOutput {
             decision: decision.map(|decision| on_tape(decision, detector)),
@@ -228,11 +228,9 @@ impl TapedFlight {
             reply,
         };
         self.writer.write(now_ns, event, &output);
-        if is_new {
-            self.decision = self.flight.decision().copied();
-            if detector != self.detector.as_deref() {
-                self.detector = detector.map(str::to_owned);
-            }
+        self.decisions = self.flight.decisions();
+        if is_other_detector {
+            self.detector = detector.map(str::to_owned);
         }
     }
 }

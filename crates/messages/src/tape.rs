@@ -6,7 +6,6 @@
 
 use std::borrow::Cow;
 
-use postcard::ser_flavors::Flavor;
 use serde::{Deserialize, Serialize, Serializer};
 use siphasher::sip::SipHasher13;
 
@@ -255,10 +254,10 @@ pub struct TapeWriter {
     next: u64,
     hash: u64,
     /// The decision of the record before, as bytes.
-    decision: Vec<u8>,
+    decision: Buffer,
     /// That of this record.
-    new_decision: Vec<u8>,
-    records: Vec<u8>,
+    new_decision: Buffer,
+    records: Buffer,
     count: u32,
 }
 
@@ -266,31 +265,45 @@ fn as_bytes<S: Serializer>(bytes: impl AsRef<[u8]>, serializer: S) -> Result<S::
     serializer.serialize_bytes(bytes.as_ref())
 }
 
-/// Appends what postcard writes to a buffer that is kept.
-struct Appending<'a>(&'a mut Vec<u8>);
-
-impl Flavor for Appending<'_> {
-    type Output = ();
-
-    fn try_push(&mut self, byte: u8) -> postcard::Result<()> {
-        self.0.push(byte);
-        Ok(())
-    }
-
-    fn try_extend(&mut self, bytes: &[u8]) -> postcard::Result<()> {
-        self.0.extend_from_slice(bytes);
-        Ok(())
-    }
-
-    fn finalize(self) -> postcard::Result<()> {
-        Ok(())
-    }
+/// Bytes that grow, in memory that is kept: values are written where they stay, without a look at its size for each of
+/// their parts.
+#[derive(Clone, Debug, Default)]
+struct Buffer {
+    /// What is in use, and zeros or older bytes behind it.
+    memory: Vec<u8>,
+    len: usize,
 }
 
-/// Appends a value.
-fn append<T: Serialize>(value: &T, to: &mut Vec<u8>) {
-    // Postcard fails only on sequences of unknown length, which no record has.
-    drop(postcard::serialize_with_flavor(value, Appending(to)));
+impl Buffer {
+    /// Memory that is added at a time, in bytes.
+    const STEP: usize = 4096;
+
+    fn bytes(&self) -> &[u8] {
+        self.memory.get(..self.len).unwrap_or_default()
+    }
+
+    fn clear(&mut self) {
+        self.len = 0;
+    }
+
+    /// Appends a value as postcard writes it.
+    fn append<T: Serialize>(&mut self, value: &T) {
+        loop {
+            let free = self.memory.get_mut(self.len..).unwrap_or_default();
+            match postcard::to_slice(value, free) {
+                Ok(written) => {
+                    self.len += written.len();
+                    return;
+                }
+                Err(postcard::Error::SerializeBufferFull) => {
+                    let more = self.memory.len().max(Self::STEP);
+                    self.memory.resize(self.memory.len() + more, 0);
+                }
+                // Only for sequences of unknown length, which no record has.
+                Err(_) => return,
+            }
+        }
+    }
 }
 
 fn running_hash(before: u64, bytes: &[u8]) -> u64 {
@@ -304,35 +317,36 @@ impl TapeWriter {
             begun_ns: now_ns,
             next: 0,
             hash: 0,
-            decision: Vec::new(),
-            new_decision: Vec::new(),
-            records: Vec::new(),
+            decision: Buffer::default(),
+            new_decision: Buffer::default(),
+            records: Buffer::default(),
             count: 0,
         }
     }
 
     /// Adds an event that was handled at `now_ns`, and what came out of it.
     pub fn write(&mut self, now_ns: i64, event: &TapeEvent<'_>, output: &TapeOutput<'_>) {
-        if self.records.len() > MAX_WAITING_BYTES {
+        if self.records.len > MAX_WAITING_BYTES {
             self.records.clear();
             self.count = 0;
         }
         self.new_decision.clear();
         if let Some(new) = &output.decision {
-            append(new, &mut self.new_decision);
+            self.new_decision.append(new);
         }
-        let is_as_before = self.new_decision == self.decision;
-        let start = self.records.len();
+        let is_as_before = self.new_decision.bytes() == self.decision.bytes();
+        let start = self.records.len;
         let step = StepRef {
             now_ns,
             event,
-            decision: if is_as_before { &[] } else { &self.new_decision },
+            decision: if is_as_before { &[] } else { self.new_decision.bytes() },
             packets: output.packets,
             reply: output.reply,
         };
-        append(&step, &mut self.records);
-        self.hash = running_hash(self.hash, self.records.get(start..).unwrap_or_default());
-        self.records.extend_from_slice(&self.hash.to_le_bytes());
+        self.records.append(&step);
+        self.hash = running_hash(self.hash, self.records.bytes().get(start..).unwrap_or_default());
+        // Postcard writes an array of bytes as it is.
+        self.records.append(&self.hash.to_le_bytes());
         self.next += 1;
         self.count += 1;
         if output.decision.is_some() {
@@ -342,7 +356,7 @@ impl TapeWriter {
 
     /// Size of the records that wait to be taken, in bytes.
     pub fn waiting_bytes(&self) -> usize {
-        self.records.len()
+        self.records.len
     }
 
     /// The records since the last call; `None` when there are none.
@@ -351,7 +365,7 @@ impl TapeWriter {
             return None;
         }
         let count = std::mem::take(&mut self.count);
-        let records = self.records.clone();
+        let records = self.records.bytes().to_vec();
         self.records.clear();
         Some(Tape { begun_ns: self.begun_ns, first: self.next - u64::from(count), count, records })
     }

@@ -15,7 +15,7 @@ use experiments::faults::plan::{Plan, Second};
 use messages::{CameraInfo, Detections, Tape, TapeEvent};
 
 /// How often each is measured; the quickest counts.
-const TIMES: usize = 15;
+const TIMES: usize = 100;
 /// Events after which the tape is taken, about as often as the service does.
 const TAKEN_EVERY: usize = 15;
 
@@ -25,6 +25,22 @@ enum Input {
     Detections(String, Detections),
     Camera(CameraInfo),
     Presence(String, bool),
+}
+
+/// Has a flight handle an input; with a tape or without it has the same functions.
+macro_rules! handle {
+    ($flight:ident, $now_ns:expr, $input:expr) => {
+        match $input {
+            Input::Packet(packet) => $flight.packet($now_ns, packet),
+            Input::Tick => $flight.tick($now_ns),
+            Input::Detections(publisher, message) => {
+                $flight.detections($now_ns, publisher, message);
+            }
+            Input::Camera(info) => $flight.camera($now_ns, info.clone()),
+            Input::Presence(detector, alive) => $flight.presence($now_ns, detector, *alive),
+        }
+        while $flight.poll_outgoing().is_some() {}
+    };
 }
 
 fn main() -> anyhow::Result<()> {
@@ -50,31 +66,13 @@ fn main() -> anyhow::Result<()> {
         let mut flight = Flight::new(config()?, Arc::default())?;
         let began = Instant::now();
         for (now_ns, input) in &inputs {
-            match input {
-                Input::Packet(packet) => flight.packet(*now_ns, packet),
-                Input::Tick => flight.tick(*now_ns),
-                Input::Detections(publisher, message) => {
-                    flight.detections(*now_ns, publisher, message);
-                }
-                Input::Camera(info) => flight.camera(*now_ns, info.clone()),
-                Input::Presence(detector, alive) => flight.presence(*now_ns, detector, *alive),
-            }
-            while flight.poll_outgoing().is_some() {}
+            handle!(flight, *now_ns, input);
         }
         without = without.min(began.elapsed());
         let mut flight = TapedFlight::new(0, config()?, Arc::default())?;
         let began = Instant::now();
         for (number, (now_ns, input)) in inputs.iter().enumerate() {
-            match input {
-                Input::Packet(packet) => flight.packet(*now_ns, packet),
-                Input::Tick => flight.tick(*now_ns),
-                Input::Detections(publisher, message) => {
-                    flight.detections(*now_ns, publisher, message);
-                }
-                Input::Camera(info) => flight.camera(*now_ns, info.clone()),
-                Input::Presence(detector, alive) => flight.presence(*now_ns, detector, *alive),
-            }
-            while flight.poll_outgoing().is_some() {}
+            handle!(flight, *now_ns, input);
             if number % TAKEN_EVERY == 0 {
                 flight.take_tape();
             }
