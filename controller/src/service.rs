@@ -8,7 +8,7 @@ use autopilot::packet::MAX_PACKET;
 use autopilot::{Address, Link, LinkEvent, Parser, Permission};
 use messages::{ControllerStatus, MavlinkBytes, Tape, VehicleState, topic};
 use node::{HealthCounters, Node, Publisher, Shutdown, now_ns};
-use tokio::sync::mpsc;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
@@ -33,13 +33,15 @@ const MAX_WAITING_PACKETS: usize = 512;
 /// Period in which the tape is handed over, in nanoseconds; it is earlier when this much of it waits, in bytes.
 const TAPE_PERIOD_NS: i64 = 100_000_000;
 const TAPE_BYTES: usize = 16_000;
-/// Maximum number of parts of the tape that wait until somebody listens, as a recorder may start after the controller:
-/// almost seven minutes.
-const MAX_WAITING_TAPES: usize = 4096;
+/// Maximum size and number of the parts of the tape that wait until somebody listens, as a recorder may start after the
+/// controller: about ten minutes.
+const MAX_WAITING_TAPE_BYTES: usize = 16 << 20;
+const MAX_WAITING_TAPES: usize = 8192;
 /// Pause before it is asked again whether somebody listens to the tape.
 const TAPE_PATIENCE: Duration = Duration::from_millis(100);
-/// Pause between two parts of the tape while further ones wait: sent all at once, some would be dropped.
-const TAPE_PAUSE: Duration = Duration::from_millis(2);
+/// Pause between two parts of the tape while further ones wait: sent all at once, some would be dropped, and a recorder
+/// beyond an air link would take the room of its frames.
+const TAPE_PAUSE: Duration = Duration::from_millis(8);
 /// Time for what waits of the tape at the end.
 const TAPE_END: Duration = Duration::from_millis(200);
 
@@ -193,7 +195,10 @@ fn has_more_other_versions(health: &HealthCounters, so_far: &mut u64) -> bool {
 
 /// Publishes the tape, once somebody listens.
 struct Tapes {
-    waiting: mpsc::Sender<Tape>,
+    /// Each part with its share of the room.
+    waiting: mpsc::Sender<(Tape, OwnedSemaphorePermit)>,
+    /// Room for what waits, in bytes.
+    room: Arc<Semaphore>,
     publishing: JoinHandle<()>,
     passed_on_ns: i64,
     /// Whether a part found no room.
@@ -203,10 +208,10 @@ struct Tapes {
 
 impl Tapes {
     async fn new(node: &Node) -> anyhow::Result<Self> {
-        let (waiting, mut tapes) = mpsc::channel::<Tape>(MAX_WAITING_TAPES);
+        let (waiting, mut tapes) = mpsc::channel::<(Tape, _)>(MAX_WAITING_TAPES);
         let publisher = node.publisher(topic::TAPE, &[]).await?;
         let publishing = tokio::spawn(async move {
-            while let Some(tape) = tapes.recv().await {
+            while let Some((tape, _share)) = tapes.recv().await {
                 while !publisher.has_subscribers().await {
                     sleep(TAPE_PATIENCE).await;
                 }
@@ -217,7 +222,8 @@ impl Tapes {
             }
         });
         let health = node.shared_health();
-        Ok(Self { waiting, publishing, passed_on_ns: now_ns(), is_cut: false, health })
+        let room = Arc::new(Semaphore::new(MAX_WAITING_TAPE_BYTES));
+        Ok(Self { waiting, room, publishing, passed_on_ns: now_ns(), is_cut: false, health })
     }
 
     /// Hands the tape over at its period. What finds no room is missing, which the numbers of what follows tell.
@@ -229,7 +235,7 @@ impl Tapes {
         }
         self.passed_on_ns = now;
         let Some(tape) = flight.take_tape() else { return };
-        if self.waiting.try_send(tape).is_err() {
+        if !self.has_kept(tape) {
             self.health.dropped("parts of the tape");
             if !std::mem::replace(&mut self.is_cut, true) {
                 tracing::info!(
@@ -237,6 +243,13 @@ impl Tapes {
                 );
             }
         }
+    }
+
+    /// Keeps a part until it is published; false when there is no room.
+    fn has_kept(&self, tape: Tape) -> bool {
+        let bytes = u32::try_from(tape.records.len()).unwrap_or(u32::MAX);
+        let share = Arc::clone(&self.room).try_acquire_many_owned(bytes);
+        share.is_ok_and(|share| self.waiting.try_send((tape, share)).is_ok())
     }
 
     /// Publishes what waits, if somebody listens.

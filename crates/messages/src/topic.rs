@@ -25,6 +25,8 @@ pub enum Delivery {
     LastValue,
     /// A dialogue: every message in order, within the bounds of the queues.
     Reliable,
+    /// A record for later: as `Reliable`, behind all that is needed now.
+    Record,
     /// A request with one reply.
     Query,
 }
@@ -172,7 +174,7 @@ pub const COMMAND_REPLY: Topic<CommandReply> =
     Topic::new("controller/command", Delivery::Query, CONTROLLER, NO_OTHERS);
 /// What the controller handled and what came out of it, in order; published only while somebody subscribes.
 pub const TAPE: Topic<Tape> =
-    Topic::new("controller/tape", Delivery::Reliable, CONTROLLER, NO_OTHERS);
+    Topic::new("controller/tape", Delivery::Record, CONTROLLER, NO_OTHERS);
 /// The true wind.
 pub const WIND: Topic<Wind> = Topic::new("wind", Delivery::Latest, SIMULATOR, NO_OTHERS);
 /// The true state of vehicle and pad.

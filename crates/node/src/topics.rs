@@ -72,6 +72,8 @@ fn qos(delivery: Delivery) -> Qos {
         Delivery::LatestPriority => (Priority::RealTime, CongestionControl::Drop, 64),
         Delivery::LastValue => (Priority::InteractiveHigh, CongestionControl::Drop, 64),
         Delivery::Reliable => (Priority::InteractiveLow, CongestionControl::Drop, 512),
+        // On the air link with the frames, and not with control: what waited for a late recorder is much.
+        Delivery::Record => (Priority::Data, CongestionControl::Drop, 512),
         Delivery::Query => (Priority::InteractiveHigh, CongestionControl::Drop, 16),
     };
     Qos { priority, congestion, depth }
@@ -98,9 +100,11 @@ impl Node {
             .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
         let last_value = match topic.delivery() {
             Delivery::LastValue => Some(self.last_value(&key).await?),
-            Delivery::Latest | Delivery::LatestPriority | Delivery::Reliable | Delivery::Query => {
-                None
-            }
+            Delivery::Latest
+            | Delivery::LatestPriority
+            | Delivery::Reliable
+            | Delivery::Record
+            | Delivery::Query => None,
         };
         Ok(Publisher { publisher, last_value, health: self.shared_health(), message: PhantomData })
     }

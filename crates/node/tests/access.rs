@@ -103,7 +103,10 @@ fn the_access_rules_allow_what_the_topic_table_says_and_nothing_else() -> anyhow
                 Delivery::Query if is_reply(row) => &["declare_queryable", "reply"],
                 Delivery::Query => &["query"],
                 Delivery::LastValue => &["put", "declare_queryable", "reply"],
-                Delivery::Latest | Delivery::LatestPriority | Delivery::Reliable => &["put"],
+                Delivery::Latest
+                | Delivery::LatestPriority
+                | Delivery::Reliable
+                | Delivery::Record => &["put"],
             };
             // The last value is asked for by who subscribes.
             let receiving: &[&str] = match row.delivery {
