@@ -96,6 +96,10 @@ const OUTSIDE: [&str; 17] = [
     "rustix",
 ];
 
+/// The crates whose results a replay compares to the bit, and the lint that forbids them what differs between machines.
+const SAME_EVERYWHERE: [&str; 5] = ["geometry", "messages", "autopilot", "landing", "controller"];
+const SAME_LINT: &str = "#![cfg_attr(not(test), deny(clippy::disallowed_methods))]";
+
 /// Most lines of code in one source file, comments and tests aside.
 const MAX_LINES: usize = 700;
 
@@ -640,6 +644,30 @@ fn documents_name_only_what_exists() -> anyhow::Result<()> {
 }
 
 #[test]
+fn what_decides_computes_the_same_on_every_machine() -> anyhow::Result<()> {
+    let workspace = workspace()?;
+    for name in SAME_EVERYWHERE {
+        let library = package(&workspace, name)?.folder.join("src/lib.rs");
+        ensure!(text(&library)?.contains(SAME_LINT), "{library:?} lacks {SAME_LINT}");
+    }
+    let lint = text(root().join("clippy.toml"))?;
+    for function in ["sin", "atan2", "exp", "hypot", "powi", "max"] {
+        for float in ["f64", "f32"] {
+            let entry = format!("\"{float}::{function}\"");
+            ensure!(lint.contains(&entry), "clippy.toml no longer forbids {entry}");
+        }
+    }
+    // Kernels of matrix products that are chosen when the program runs, for matrices of dynamic size.
+    let lock = text(root().join("Cargo.lock"))?;
+    ensure!(!lock.contains("\"matrixmultiply\""), "matrixmultiply is back: nalgebra has `std`");
+    let manifest = text(root().join("Cargo.toml"))?;
+    let nalgebra = manifest.lines().find(|line| line.starts_with("nalgebra = "));
+    let nalgebra = nalgebra.context("nalgebra is no dependency any more")?;
+    ensure!(nalgebra.contains("\"libm-force\""), "without `libm-force`: {nalgebra}");
+    Ok(())
+}
+
+#[test]
 fn the_architecture_has_the_topic_table() -> anyhow::Result<()> {
     let markdown = text(root().join("ARCHITECTURE.md"))?;
     let is_row = |line: &&str| quoted(line).first().copied().is_some_and(is_topic);
@@ -651,6 +679,7 @@ fn the_architecture_has_the_topic_table() -> anyhow::Result<()> {
             Delivery::LatestPriority => "latest, priority",
             Delivery::LastValue => "last value",
             Delivery::Reliable => "reliable",
+            Delivery::Record => "record",
             Delivery::Query => "query",
         };
         let publishers = row.publishers.join(", ");

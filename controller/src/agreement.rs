@@ -5,6 +5,8 @@
 
 use std::collections::VecDeque;
 
+use geometry::squared;
+
 /// Frames that two detectors must both have searched for a conclusion.
 const MIN_COMMON: u32 = 8;
 /// Latest frames with a marker from another detector in which one is looked for that sees nothing.
@@ -196,5 +198,5 @@ pub fn within(tolerance: Tolerance, position_m: [f64; 3], apart_m: f64) -> bool 
 
 /// The distance of two points, in their unit.
 pub fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+    a.iter().zip(b).map(|(a, b)| squared(a - b)).sum::<f64>().sqrt()
 }

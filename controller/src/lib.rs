@@ -13,6 +13,8 @@
 //! counted, [`note_file`] what must survive a crash, [`wire`] converts messages into the lander's types and
 //! back.
 
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
+
 pub mod agreement;
 pub mod alarms;
 pub mod cameras;

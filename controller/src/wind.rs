@@ -5,6 +5,7 @@
 
 use geometry::{Body, Vector};
 use landing::VehicleState;
+use libm::{exp, fmax};
 
 const GRAVITY_M_S2: f64 = 9.806_65;
 /// Time constant of the mean, in seconds.
@@ -32,7 +33,7 @@ impl WindEstimate {
     /// Updates the estimate with a state of the flying vehicle.
     pub fn update(&mut self, state: &VehicleState) {
         let up = state.ned_from_body * Vector::<Body>::new(0.0, 0.0, -1.0);
-        let scale = GRAVITY_M_S2 / (-up.z()).max(0.5);
+        let scale = GRAVITY_M_S2 / fmax(-up.z(), 0.5);
         let (now_s, velocity) = (state.stamp.seconds(), [state.velocity.x(), state.velocity.y()]);
         let tilt = [up.x() * scale, up.y() * scale];
         let last = self.mean.filter(|mean| (0.0..MAX_GAP_S).contains(&(now_s - mean.stamp_s)));
@@ -41,7 +42,7 @@ impl WindEstimate {
             self.mean = Some(Mean { stamp_s, since_s, newest: velocity, velocity, tilt });
             return;
         };
-        let weight = 1.0 - (-(now_s - mean.stamp_s) / MEAN_S).exp();
+        let weight = 1.0 - exp(-(now_s - mean.stamp_s) / MEAN_S);
         for axis in 0..2 {
             mean.velocity[axis] += weight * (velocity[axis] - mean.velocity[axis]);
             mean.tilt[axis] += weight * (tilt[axis] - mean.tilt[axis]);

@@ -1,6 +1,7 @@
 //! The messages that a companion sends on its own.
 
 use geometry::{Body, Ned, Point, Vector};
+use libm::atan2;
 
 use crate::dialect::{
     COMMAND_LONG_DATA, HEARTBEAT_DATA, LANDING_TARGET_DATA, LandingTargetType, MavAutopilot,
@@ -120,7 +121,7 @@ pub fn landing_target_local(time_usec: u64, target: Point<Ned>) -> Option<MavMes
 /// ArduPilot takes the line of sight to be (-tan `angle_y`, tan `angle_x`, 1).
 fn angles(sight: Vector<Body>) -> Option<(f32, f32)> {
     let below = sight.is_finite() && sight.z() > 1e-6;
-    below.then(|| (sight.y().atan2(sight.z()) as f32, (-sight.x()).atan2(sight.z()) as f32))
+    below.then(|| (atan2(sight.y(), sight.z()) as f32, atan2(-sight.x(), sight.z()) as f32))
 }
 
 #[cfg(test)]

@@ -17,6 +17,8 @@
 //! and why it may fail, [`takeoff`] arms the vehicle and takes off, [`permission`] is what a ground station may send,
 //! [`compose`] makes the messages that a companion sends.
 
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
+
 pub mod address;
 mod boot;
 pub mod client;

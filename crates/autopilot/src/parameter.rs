@@ -1,5 +1,7 @@
 //! Reads parameters of the autopilot and sets them, one after the other, with a bounded number of requests.
 
+use libm::fmax;
+
 use crate::dialect::{
     MavMessage, MavParamType, PARAM_REQUEST_READ_DATA, PARAM_SET_DATA, PARAM_VALUE_DATA,
 };
@@ -157,7 +159,7 @@ impl Parameters {
 }
 
 fn is_same(a: f64, b: f64) -> bool {
-    (a - b).abs() <= TOLERANCE * a.abs().max(b.abs())
+    (a - b).abs() <= TOLERANCE * fmax(a.abs(), b.abs())
 }
 
 #[cfg(test)]

@@ -4,6 +4,8 @@
 use std::fmt;
 use std::time::Duration;
 
+use libm::fmax;
+
 use crate::client::Autopilot;
 use crate::command::{Command, CommandError, CommandId, CommandStatus, ns};
 use crate::mode::{Firmware, FlightMode};
@@ -436,7 +438,7 @@ impl fmt::Display for TakeoffProgress {
             Self::ChangingMode => f.write_str("changing to the mode that follows setpoints"),
             Self::Arming { refused: None } => f.write_str("arming"),
             Self::Arming { refused: Some(reason) } => write!(f, "arming again: {reason}"),
-            Self::Climbing { height_m } => write!(f, "climbing, {:.0} m", height_m.max(0.0)),
+            Self::Climbing { height_m } => write!(f, "climbing, {:.0} m", fmax(*height_m, 0.0)),
             Self::Done => f.write_str("flying"),
             Self::Failed(error) => error.fmt(f),
         }

@@ -2,6 +2,7 @@
 //!
 //! Pixel coordinates: the centre of the top-left pixel is (0, 0), x right, y down.
 
+use libm::{atan, fmax, fmin, hypot, tan};
 use nalgebra::{Matrix2, Matrix2x3};
 
 use crate::frame::Camera;
@@ -24,7 +25,7 @@ impl Pixel {
 
     /// Euclidean distance in pixels.
     pub fn distance(&self, other: &Self) -> f64 {
-        (self.x - other.x).hypot(self.y - other.y)
+        hypot(self.x - other.x, self.y - other.y)
     }
 }
 
@@ -149,11 +150,11 @@ impl Distortion {
                 (x * radial + dx, y * radial + dy)
             }
             Self::KannalaBrandt(k) => {
-                let r = x.hypot(y);
+                let r = hypot(x, y);
                 if r < 1e-12 {
                     return (x, y);
                 }
-                let scale = fisheye_angle(&k, r.atan()) / r;
+                let scale = fisheye_angle(&k, atan(r)) / r;
                 (x * scale, y * scale)
             }
         }
@@ -182,11 +183,11 @@ impl Distortion {
                 )
             }
             Self::KannalaBrandt(k) => {
-                let r = x.hypot(y);
+                let r = hypot(x, y);
                 if r < 1e-9 {
                     return Matrix2::identity();
                 }
-                let (c, s, theta) = (x / r, y / r, r.atan());
+                let (c, s, theta) = (x / r, y / r, atan(r));
                 let along = fisheye_slope(&k, theta) / (1.0 + r * r);
                 let around = fisheye_angle(&k, theta) / r;
                 let mixed = (along - around) * c * s;
@@ -206,11 +207,11 @@ impl Distortion {
             Self::None => (u, v),
             Self::BrownConrady(_) => self.undistort_by_newton(u, v)?,
             Self::KannalaBrandt(k) => {
-                let distorted = u.hypot(v);
+                let distorted = hypot(u, v);
                 if distorted < 1e-12 {
                     return Some((u, v));
                 }
-                let mut theta = distorted.min(WIDEST_ANGLE);
+                let mut theta = fmin(distorted, WIDEST_ANGLE);
                 for _ in 0..UNDISTORT_STEPS {
                     let error = fisheye_angle(&k, theta) - distorted;
                     theta = (theta - error / fisheye_slope(&k, theta)).clamp(0.0, WIDEST_ANGLE);
@@ -221,7 +222,7 @@ impl Distortion {
                 if (fisheye_angle(&k, theta) - distorted).abs() > 10.0 * UNDISTORT_ERROR {
                     return None;
                 }
-                let scale = theta.tan() / distorted;
+                let scale = tan(theta) / distorted;
                 (u * scale, v * scale)
             }
         };
@@ -233,7 +234,7 @@ impl Distortion {
         for _ in 0..UNDISTORT_STEPS {
             let (du, dv) = self.distort(x, y);
             let (eu, ev) = (u - du, v - dv);
-            if eu.abs().max(ev.abs()) < UNDISTORT_ERROR {
+            if fmax(eu.abs(), ev.abs()) < UNDISTORT_ERROR {
                 return Some((x, y));
             }
             let j = self.jacobian(x, y);
@@ -241,8 +242,8 @@ impl Distortion {
             let dx = (j[(1, 1)] * eu - j[(0, 1)] * ev) / determinant;
             let dy = (j[(0, 0)] * ev - j[(1, 0)] * eu) / determinant;
             // Near the end of the model's reach steps become too long.
-            let limit = (0.5 + 0.5 * x.hypot(y)) / dx.hypot(dy).max(1e-12);
-            let share = limit.min(1.0);
+            let limit = (0.5 + 0.5 * hypot(x, y)) / fmax(hypot(dx, dy), 1e-12);
+            let share = fmin(limit, 1.0);
             (x, y) = (x + dx * share, y + dy * share);
         }
         None
@@ -258,7 +259,7 @@ impl Distortion {
                 SHARES.iter().all(|share| brown_conrady_slope(&k, share * r2) > 0.0)
             }
             Self::KannalaBrandt(k) => {
-                let theta = x.hypot(y).atan();
+                let theta = atan(hypot(x, y));
                 SHARES.iter().all(|share| fisheye_slope(&k, share * theta) > 0.0)
             }
         }

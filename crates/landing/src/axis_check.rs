@@ -8,6 +8,7 @@
 //! enough of any.
 
 use geometry::{Body, Odometry, Point, Rotation, Vector};
+use libm::{exp, fmin, sincos};
 
 use crate::history::Motion;
 use crate::time::Timestamp;
@@ -98,7 +99,7 @@ impl AxisConsistencyCheck {
             return;
         }
         self.newest = Some(stamp);
-        let keep = (-after_s / MEMORY_S).exp();
+        let keep = exp(-after_s / MEMORY_S);
         let seen = in_body - Point::origin();
         self.range_m = seen.norm();
         let noise_m = NOISE_M + NOISE_PER_M * self.range_m;
@@ -134,7 +135,7 @@ impl AxisConsistencyCheck {
         };
         // A wrong sign is unlikely and shows in tilt only: it need not be ruled out.
         let mounts = others().take_while(|(index, _)| *index < 2 * YAWS);
-        let nearest = mounts.map(|(_, sum)| sum.squares).fold(f64::INFINITY, f64::min);
+        let nearest = mounts.map(|(_, sum)| sum.squares).fold(f64::INFINITY, fmin);
         if self.detections < MIN_DETECTIONS || !best.squares.is_finite() || !configured.is_finite()
         {
             return;
@@ -192,7 +193,7 @@ impl Alternative {
 
 /// The true place of the marker in the body if the camera is turned by `turn` more than configured.
 fn undone(seen: Vector<Body>, turn: f64, mirrored: bool) -> Vector<Body> {
-    let (sin, cos) = turn.sin_cos();
+    let (sin, cos) = sincos(turn);
     let y = if mirrored { -seen.y() } else { seen.y() };
     Vector::new(cos * seen.x() - sin * y, sin * seen.x() + cos * y, seen.z())
 }

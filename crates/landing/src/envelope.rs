@@ -1,6 +1,7 @@
 //! The last check of every setpoint, and the fence.
 
 use geometry::{Ned, Point, Vector};
+use libm::{fmax, hypot};
 
 use crate::config::{EnvelopeConfig, PhaseConfig};
 
@@ -32,7 +33,7 @@ pub fn clamp_setpoint(
 /// The velocity without its components that lead out of the fence; the way back stays open.
 pub fn clamp_to_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
     let ahead = place + wanted * FENCE_LEAD_S;
-    let far = |p: Point<Ned>| p.x().hypot(p.y());
+    let far = |p: Point<Ned>| hypot(p.x(), p.y());
     let radius_m = phases.fence_radius_m;
     let leaves = radius_m > 0.0 && far(ahead) > radius_m && far(ahead) > far(place);
     let (x, y) = if leaves { (0.0, 0.0) } else { (wanted.x(), wanted.y()) };
@@ -43,7 +44,7 @@ pub fn clamp_to_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ne
 pub fn below_fence(phases: &PhaseConfig, place: Point<Ned>, wanted: Vector<Ned>) -> Vector<Ned> {
     let ahead = place + wanted * FENCE_LEAD_S;
     let is_high = phases.fence_height_m > 0.0 && -ahead.z() > phases.fence_height_m;
-    let z = if is_high { wanted.z().max(0.0) } else { wanted.z() };
+    let z = if is_high { fmax(wanted.z(), 0.0) } else { wanted.z() };
     Vector::new(wanted.x(), wanted.y(), z)
 }
 

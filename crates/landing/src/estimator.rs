@@ -14,6 +14,7 @@
 use std::collections::VecDeque;
 
 use geometry::{Marker, Ned, Odometry, Point, Rotation, Transform, Vector};
+use libm::{atan2, exp};
 
 use crate::config::EstimatorConfig;
 use crate::decision::{Rejection, TargetEstimate};
@@ -105,7 +106,7 @@ impl Estimator {
         let mut moved = velocity * ahead_s;
         if self.config.pad_heave_m_s > 0.0 {
             // A heave reverses, at a time that is unknown without the marker in view.
-            let left = (-ahead_s / HEAVE_S).exp();
+            let left = exp(-ahead_s / HEAVE_S);
             moved.z = velocity.z * HEAVE_S * (1.0 - left);
             velocity.z *= left;
         }
@@ -120,7 +121,7 @@ impl Estimator {
             age_s: now.seconds_since(measurement.stamp),
             deviation_m: state.deviation_m(&self.config, ahead_s),
             detections: self.detections,
-            heading_rad: self.heading.map(|[north, east]| east.atan2(north)),
+            heading_rad: self.heading.map(|[north, east]| atan2(east, north)),
             time_offset_s: state.time_offset_s(),
             nis: self.nis,
             ambiguous: self.hypotheses.is_ambiguous(),

@@ -1,6 +1,7 @@
 //! The events that the lander reacts to.
 
 use geometry::{Body, Camera, Marker, Ned, Pixel, Point, Rotation, Transform, Vector};
+use libm::fmax;
 use nalgebra::Matrix3;
 
 use crate::time::Timestamp;
@@ -258,7 +259,7 @@ fn is_covariance(m: &Matrix3<f64>) -> bool {
         return false;
     }
     // Scaled, so that small covariances are not judged by their rounding errors and products do not vanish.
-    let scale = trace.max(f64::MIN_POSITIVE);
+    let scale = fmax(trace, f64::MIN_POSITIVE);
     let m = m / scale;
     let is_symmetric = (m - m.transpose()).amax() <= COVARIANCE_ERROR;
     let minor = |i: usize, j: usize| m[(i, i)] * m[(j, j)] - m[(i, j)] * m[(j, i)];

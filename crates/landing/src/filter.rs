@@ -17,7 +17,8 @@
 //! position wanders; one with a good estimate keeps the configured noise. The caller updates with inliers
 //! only, so an outlier cannot widen its own gate.
 
-use geometry::{Odometry, Point};
+use geometry::{Odometry, Point, cubed, squared};
+use libm::{exp, fmax, hypot, log};
 use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector3};
 
 use crate::config::EstimatorConfig;
@@ -66,14 +67,14 @@ impl State {
     pub(crate) fn new(config: &EstimatorConfig, position: Vector3<f64>) -> Self {
         let mut mean = Mean::zeros();
         mean.fixed_rows_mut::<3>(Q).copy_from(&position);
-        let level = config.drift_m_s.hypot(config.pad_speed_m_s);
+        let level = hypot(config.drift_m_s, config.pad_speed_m_s);
         let deviations = [
             UNKNOWN_M,
             UNKNOWN_M,
             UNKNOWN_M,
             level,
             level,
-            config.height_drift_m_s.hypot(config.pad_heave_m_s),
+            hypot(config.height_drift_m_s, config.pad_heave_m_s),
             config.mount_error_rad,
             config.mount_error_rad,
             config.heading_error_rad,
@@ -123,23 +124,21 @@ impl State {
                 p[(j, Q + i)] += dt_s * p[(j, U + i)];
             }
         }
-        let noise_scale = self.log_noise_scale.exp();
-        let level = (config.drift_change * noise_scale).hypot(config.pad_acceleration);
-        let vertical = config
-            .height_drift_change
-            .hypot(config.pad_acceleration)
-            .hypot(HEAVE_CHANGE * config.pad_heave_m_s);
+        let noise_scale = exp(self.log_noise_scale);
+        let level = hypot(config.drift_change * noise_scale, config.pad_acceleration);
+        let drift = hypot(config.height_drift_change, config.pad_acceleration);
+        let vertical = hypot(drift, HEAVE_CHANGE * config.pad_heave_m_s);
         for (i, u) in [level, level, vertical].into_iter().enumerate() {
-            let (u, q) = (u * u, config.odometry_noise_m.powi(2));
-            p[(Q + i, Q + i)] += q * dt_s + u * dt_s.powi(3) / 3.0;
-            p[(Q + i, U + i)] += u * dt_s.powi(2) / 2.0;
-            p[(U + i, Q + i)] += u * dt_s.powi(2) / 2.0;
+            let (u, q) = (u * u, squared(config.odometry_noise_m));
+            p[(Q + i, Q + i)] += q * dt_s + u * cubed(dt_s) / 3.0;
+            p[(Q + i, U + i)] += u * squared(dt_s) / 2.0;
+            p[(U + i, Q + i)] += u * squared(dt_s) / 2.0;
             p[(U + i, U + i)] += u * dt_s;
         }
         for i in 0..3 {
-            p[(TILT + i, TILT + i)] += (config.tilt_change * noise_scale).powi(2) * dt_s;
+            p[(TILT + i, TILT + i)] += squared(config.tilt_change * noise_scale) * dt_s;
         }
-        p[(OFFSET, OFFSET)] += (OFFSET_CHANGE * config.time_offset_s).powi(2) * dt_s;
+        p[(OFFSET, OFFSET)] += squared(OFFSET_CHANGE * config.time_offset_s) * dt_s;
     }
 
     /// The normalised innovation squared: chi-square with 3 degrees of freedom.
@@ -170,18 +169,18 @@ impl State {
     pub(crate) fn deviation_m(&self, config: &EstimatorConfig, ahead_s: f64) -> f64 {
         // Of the random walk of the drift only the part above the configured one counts: the configured part
         // is in the limits for a descent without the marker.
-        let raised = config.drift_change.powi(2) * ((2.0 * self.log_noise_scale).exp() - 1.0);
-        let change = config.pad_acceleration.powi(2) + raised;
+        let raised = squared(config.drift_change) * (exp(2.0 * self.log_noise_scale) - 1.0);
+        let change = squared(config.pad_acceleration) + raised;
         let p = &self.covariance;
         let block = |row: usize, column: usize| p.fixed_view::<2, 2>(row, column).into_owned();
         let cross: Matrix2<f64> = block(Q, U);
         let grown = block(Q, Q)
             + (cross + cross.transpose()) * ahead_s
-            + block(U, U) * ahead_s.powi(2)
-            + Matrix2::identity() * (config.odometry_noise_m.powi(2) * ahead_s)
-            + Matrix2::identity() * (change * ahead_s.powi(3) / 3.0);
+            + block(U, U) * squared(ahead_s)
+            + Matrix2::identity() * (squared(config.odometry_noise_m) * ahead_s)
+            + Matrix2::identity() * (change * cubed(ahead_s) / 3.0);
         let (mean, half) = (0.5 * (grown.m11 + grown.m22), 0.5 * (grown.m11 - grown.m22));
-        (mean + half.hypot(grown.m12)).max(0.0).sqrt()
+        fmax(mean + hypot(half, grown.m12), 0.0).sqrt()
     }
 
     fn observation_jacobian(&self, measurement: &Measurement) -> SMatrix<f64, 3, STATES> {
@@ -215,7 +214,7 @@ impl State {
         };
         let excess = 0.5 * level.dot(&(inverse * level)) - 1.0 - NOISE_SLACK;
         let max = if config.drift_change > 0.0 {
-            (config.max_drift_change / config.drift_change).clamp(1.0, MAX_NOISE_SCALE).ln()
+            log((config.max_drift_change / config.drift_change).clamp(1.0, MAX_NOISE_SCALE))
         } else {
             0.0
         };

@@ -10,6 +10,7 @@
 //! estimate's place, the estimate is ambiguous, and the vehicle does not descend.
 
 use geometry::{Odometry, Point};
+use libm::{exp, fmax, fmin};
 use nalgebra::Vector3;
 
 use crate::config::{EstimatorConfig, MAX_COUNTED_DETECTIONS};
@@ -184,9 +185,9 @@ impl HypothesisSupport {
     fn count(&mut self, stamp: Timestamp, is_shown: bool, is_seen: bool) {
         let gap_s = stamp.seconds_since(self.newest).clamp(0.0, MAX_GAP_S);
         self.newest = self.newest.max(stamp);
-        let unshown = (-gap_s / UNSHOWN_S).exp();
+        let unshown = exp(-gap_s / UNSHOWN_S);
         self.detections = if is_seen {
-            (self.detections + 1.0).min(f64::from(MAX_COUNTED_DETECTIONS))
+            fmin(self.detections + 1.0, f64::from(MAX_COUNTED_DETECTIONS))
         } else {
             self.detections * unshown
         };
@@ -194,7 +195,7 @@ impl HypothesisSupport {
             self.trust = if is_seen { 1.0 } else { self.trust * unshown };
             return;
         }
-        let kept = (-gap_s / SHOWN_S).exp();
+        let kept = exp(-gap_s / SHOWN_S);
         self.shown = self.shown * kept + 1.0;
         self.seen = self.seen * kept + f64::from(u8::from(is_seen));
         self.trust = 1.0;
@@ -202,7 +203,7 @@ impl HypothesisSupport {
 
     /// Share of the frames showing the place in which the marker was there, from 0 to 1.
     fn share(&self) -> f64 {
-        self.trust * self.seen / self.shown.max(1.0)
+        self.trust * self.seen / fmax(self.shown, 1.0)
     }
 
     /// True when the marker is clearly more often here than at the other place.

@@ -20,6 +20,8 @@
 //! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
 //! - [`lander`] joins them.
 
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
+
 pub mod axis_check;
 pub mod config;
 pub mod decision;

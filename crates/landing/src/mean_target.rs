@@ -6,7 +6,8 @@
 //! more. A detection far from the mean is an outlier; several consecutive outliers in agreement start a new
 //! mean.
 
-use geometry::{Ned, Point, Vector};
+use geometry::{Ned, Point, Vector, squared};
+use libm::{fmax, fmin};
 
 use crate::config::TargetConfig;
 use crate::decision::{Rejection, TargetEstimate};
@@ -126,13 +127,13 @@ impl Mean {
     }
 
     fn add(&mut self, position: Point<Ned>, stamp: Timestamp, smoothing_s: f64) {
-        let interval_s = stamp.seconds_since(self.stamp).max(0.0);
+        let interval_s = fmax(stamp.seconds_since(self.stamp), 0.0);
         self.detections = self.detections.saturating_add(1);
-        let forgetting = interval_s / (smoothing_s + interval_s).max(1e-6);
-        let weight = forgetting.max(1.0 / f64::from(self.detections)).min(1.0);
+        let forgetting = interval_s / fmax(smoothing_s + interval_s, 1e-6);
+        let weight = fmin(fmax(forgetting, 1.0 / f64::from(self.detections)), 1.0);
         let distance = position - self.position;
         self.position = self.position + distance * weight;
-        self.spread_m2 += (distance.horizontal_norm().powi(2) - self.spread_m2) * weight;
+        self.spread_m2 += (squared(distance.horizontal_norm()) - self.spread_m2) * weight;
         self.stamp = stamp;
     }
 }

@@ -1,6 +1,7 @@
 //! From a detection to a measurement: the marker's pose joined with the vehicle's motion at the exposure.
 
-use geometry::{Body, Marker, Ned, Point, Rotation, Transform, Vector};
+use geometry::{Body, Marker, Ned, Point, Rotation, Transform, Vector, squared};
+use libm::{acos, fmax};
 use nalgebra::{Matrix3, Vector3};
 
 use crate::config::EstimatorConfig;
@@ -59,7 +60,7 @@ impl MarkerPose {
         let tilt = |pose: &Self| {
             let face =
                 motion.ned_from_body * (pose.rotation * Vector::<Marker>::new(0.0, 0.0, 1.0));
-            (-face.z()).clamp(-1.0, 1.0).acos()
+            acos((-face.z()).clamp(-1.0, 1.0))
         };
         let preference = tilt(&second) - tilt(&first);
         if preference > UNDECIDED_RAD {
@@ -98,8 +99,8 @@ impl MarkerPose {
         ]);
         let turning = (motion.ned_from_body * motion.rate).coords;
         let noise = axes * in_body * axes.transpose()
-            + tilt * tilt.transpose() * config.attitude_noise_rad.powi(2)
-            + Matrix3::identity() * config.position_noise_m.powi(2);
+            + tilt * tilt.transpose() * squared(config.attitude_noise_rad)
+            + Matrix3::identity() * squared(config.position_noise_m);
         Ok(Measurement {
             stamp: frame.stamp,
             position: motion.odometry.coords.coords + r,
@@ -132,10 +133,10 @@ fn noise_in_body(
     in_body: Vector<Body>,
 ) -> Matrix3<f64> {
     let range_m = in_body.norm();
-    let along = in_body.coords / range_m.max(1e-6);
+    let along = in_body.coords / fmax(range_m, 1e-6);
     if let Some(covariance) = marker.covariance_m2 {
         // A detector knows its pixels, not how large the marker was printed.
-        let floor = (config.range_floor_ratio * range_m).powi(2);
+        let floor = squared(config.range_floor_ratio * range_m);
         return (covariance + covariance.transpose()) * 0.5 + along * along.transpose() * floor;
     }
     let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0);
@@ -144,7 +145,7 @@ fn noise_in_body(
     let size_px = marker.size_px.filter(|size_px| *size_px > 1.0);
     let range_ratio =
         size_px.map_or(config.range_noise_ratio, |size_px| 2.0 * config.pixel_noise_px / size_px);
-    let across = (range_m * pixel_rad).powi(2);
+    let across = squared(range_m * pixel_rad);
     Matrix3::identity() * across
-        + along * along.transpose() * ((range_m * range_ratio).powi(2) - across)
+        + along * along.transpose() * (squared(range_m * range_ratio) - across)
 }

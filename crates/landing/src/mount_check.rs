@@ -17,7 +17,8 @@
 //! Heights are left out: a barometer errs by as much as a focal length that is 4 % off. The random walks grow
 //! while detections show that the autopilot's position wanders, as in `filter.rs`, and with them the deviations.
 
-use geometry::{Body, Camera, Rotation, Vector};
+use geometry::{Body, Camera, Rotation, Vector, squared};
+use libm::{exp, fmax, fmin, hypot, log};
 use nalgebra::{Matrix2, Matrix2x3, SMatrix, SVector, Vector2};
 
 use crate::config::EstimatorConfig;
@@ -112,7 +113,7 @@ impl MountFindings {
     /// The angle by which the camera's mount is off, in radians; 0 while it may be as configured.
     pub fn angle_rad(&self) -> f64 {
         let value = |measured: Option<Measured>| measured.map_or(0.0, |it| it.value);
-        value(self.roll_rad).hypot(value(self.pitch_rad))
+        hypot(value(self.roll_rad), value(self.pitch_rad))
     }
 }
 
@@ -188,8 +189,8 @@ impl MountCheck {
 
     /// The estimate with the angle by which the mount is off as part of its deviation.
     pub(crate) fn widen(&self, target: TargetEstimate) -> TargetEstimate {
-        let off_m = self.findings().angle_rad() * target.height_m.max(0.0);
-        TargetEstimate { deviation_m: target.deviation_m.hypot(off_m), ..target }
+        let off_m = self.findings().angle_rad() * fmax(target.height_m, 0.0);
+        TargetEstimate { deviation_m: hypot(target.deviation_m, off_m), ..target }
     }
 
     /// Adds a marker's place with the vehicle's motion at the exposure.
@@ -210,12 +211,12 @@ impl MountCheck {
             self.place_anew(measurement);
         }
         self.newest = Some(measurement.stamp);
-        self.predict(after_s.min(MAX_GAP_S));
+        self.predict(fmin(after_s, MAX_GAP_S));
         self.smooth_depth(measurement.position.z, after_s);
-        let height_m = (self.pad_z - motion.odometry.z()).max(MIN_HEIGHT_M);
+        let height_m = fmax(self.pad_z - motion.odometry.z(), MIN_HEIGHT_M);
         // What errors are multiplied with is another height than that of the place: an error that both had would
         // look like a mount that is off towards the marker.
-        let lever = (self.mean_pad_z - motion.odometry.z()).max(MIN_HEIGHT_M) / seen.z;
+        let lever = fmax(self.mean_pad_z - motion.odometry.z(), MIN_HEIGHT_M) / seen.z;
         // Of the detection only the direction counts; its derivative at that height.
         let slope = seen.xy() / seen.z;
         let scale = height_m / seen.z;
@@ -254,16 +255,16 @@ impl MountCheck {
             return;
         }
         let n = f64::from(self.depths);
-        let keep = (-after_s / DEPTH_S).exp();
-        let level = (1.0 - keep * keep).max(2.0 * (2.0 * n - 1.0) / (n * (n + 1.0)));
-        let trend = (1.0 - keep).powi(2).max(6.0 / (n * (n + 1.0)));
+        let keep = exp(-after_s / DEPTH_S);
+        let level = fmax(1.0 - keep * keep, 2.0 * (2.0 * n - 1.0) / (n * (n + 1.0)));
+        let trend = fmax(squared(1.0 - keep), 6.0 / (n * (n + 1.0)));
         let expected = self.pad_z + self.pad_sinks_m_s * after_s;
         let difference = measured_z - expected;
-        self.pad_z = expected + level.min(1.0) * difference;
+        self.pad_z = expected + fmin(level, 1.0) * difference;
         if after_s > MIN_STEP_S {
-            self.pad_sinks_m_s += trend.min(1.0) * difference / after_s;
+            self.pad_sinks_m_s += fmin(trend, 1.0) * difference / after_s;
         }
-        let share = (1.0 / n).max((after_s / MEAN_S).min(1.0));
+        let share = fmax(1.0 / n, fmin(after_s / MEAN_S, 1.0));
         self.mean_pad_z += share * (measured_z - self.mean_pad_z);
     }
 
@@ -284,7 +285,7 @@ impl MountCheck {
     }
 
     fn deviation(&self, index: usize) -> f64 {
-        self.covariance[(index, index)].max(0.0).sqrt()
+        fmax(self.covariance[(index, index)], 0.0).sqrt()
     }
 
     /// Begins with another place of the pad, and keeps what is known of the camera.
@@ -312,7 +313,7 @@ impl MountCheck {
                 p[(j, Q + i)] += dt_s * p[(j, U + i)];
             }
         }
-        let scale = (2.0 * self.log_noise_scale).exp();
+        let scale = exp(2.0 * self.log_noise_scale);
         for (i, walk) in WALK.iter().enumerate() {
             p[(i, i)] += scale * walk * walk * dt_s;
         }
@@ -331,7 +332,7 @@ impl MountCheck {
         let excess = 0.5 * nis.clamp(0.0, GATE) - 1.0 - NOISE_SLACK;
         let scale = self.log_noise_scale + NOISE_GAIN * excess;
         self.log_noise_scale =
-            if nis.is_finite() { scale.clamp(0.0, MAX_NOISE_SCALE.ln()) } else { 0.0 };
+            if nis.is_finite() { scale.clamp(0.0, log(MAX_NOISE_SCALE)) } else { 0.0 };
         if !(0.0..=GATE).contains(&nis) {
             self.outliers = self.outliers.saturating_add(1);
             if self.outliers > MAX_OUTLIERS {
@@ -357,7 +358,7 @@ impl MountCheck {
     fn suspect(&mut self) {
         let [roll, pitch, focal, size] = [TILT, TILT + 1, FOCAL, SIZE]
             .map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) });
-        let is_calm = self.log_noise_scale < MAX_TOLD_NOISE_SCALE.ln();
+        let is_calm = self.log_noise_scale < log(MAX_TOLD_NOISE_SCALE);
         self.roll.follow(roll, MIN_ANGLE_RAD, is_calm);
         self.pitch.follow(pitch, MIN_ANGLE_RAD, is_calm);
         self.focal.follow(focal, MIN_RATIO, is_calm);
@@ -368,7 +369,7 @@ impl MountCheck {
 impl Suspicion {
     fn follow(&mut self, error: Measured, min: f64, is_calm: bool) {
         let share = if self.is_told { STILL_TOLD } else { 1.0 };
-        let limit = (MIN_DEVIATIONS * error.deviation).max(min) * share;
+        let limit = fmax(MIN_DEVIATIONS * error.deviation, min) * share;
         let is_known = error.deviation < MAX_DEVIATION * min;
         if error.value.abs() > limit && (self.is_told || is_known && is_calm) {
             self.in_a_row = self.in_a_row.saturating_add(1);

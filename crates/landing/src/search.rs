@@ -4,6 +4,7 @@
 //! right below may be out of view, upwind of the image. So the first leg goes upwind.
 
 use geometry::{Body, Ned, Rotation, Vector};
+use libm::{atan2, fmax, fmin, sin, sincos};
 
 use crate::config::PhaseConfig;
 
@@ -13,15 +14,15 @@ const MIN_TILT_RAD: f64 = 0.02;
 /// The direction of the first leg, in radians from north to east: the one into which the vehicle tilts.
 pub fn first_leg_rad(ned_from_body: Rotation<Ned, Body>) -> f64 {
     let up = ned_from_body * Vector::<Body>::new(0.0, 0.0, -1.0);
-    if up.horizontal_norm() < MIN_TILT_RAD.sin() { 0.0 } else { up.y().atan2(up.x()) }
+    if up.horizontal_norm() < sin(MIN_TILT_RAD) { 0.0 } else { atan2(up.y(), up.x()) }
 }
 
 /// Distance upwind that the camera must fly to see the ground below the vehicle, in metres: the distance from
 /// that ground to the centre of the image, at most `search_radius_m`.
 pub fn upwind_m(config: &PhaseConfig, ned_from_body: Rotation<Ned, Body>, height_m: f64) -> f64 {
     let down = ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
-    let offset_m = height_m.max(0.0) * down.horizontal_norm() / down.z().max(0.5);
-    if offset_m < MIN_TILT_RAD * height_m { 0.0 } else { offset_m.min(config.search_radius_m) }
+    let offset_m = fmax(height_m, 0.0) * down.horizontal_norm() / fmax(down.z(), 0.5);
+    if offset_m < MIN_TILT_RAD * height_m { 0.0 } else { fmin(offset_m, config.search_radius_m) }
 }
 
 /// The velocity at a time after the square started, in m/s: `upwind_m` along the first leg, then legs of 1,
@@ -36,20 +37,20 @@ pub fn velocity(
     if flown_m.is_nan() || flown_m < 0.0 {
         return Vector::zero();
     }
-    let (east, north) = first_leg_rad.sin_cos();
+    let (east, north) = sincos(first_leg_rad);
     if flown_m < upwind_m {
         return Vector::new(north, east, 0.0) * config.search_speed_m_s;
     }
     flown_m -= upwind_m;
     // Four legs are one round, each round one spacing farther out; one more leg closes the last round.
-    let spacing_m = config.search_spacing_m.min(config.search_radius_m);
+    let spacing_m = fmin(config.search_spacing_m, config.search_radius_m);
     let rounds = (config.search_radius_m / spacing_m).floor() as u32;
     for leg in 1..=4 * rounds + 1 {
         let spacings = if leg > 4 * rounds { 2 * rounds } else { leg.div_ceil(2) };
         let length_m = spacing_m * f64::from(spacings);
         if flown_m < length_m {
             let direction = first_leg_rad + f64::from(leg - 1) * std::f64::consts::FRAC_PI_2;
-            let (east, north) = direction.sin_cos();
+            let (east, north) = sincos(direction);
             return Vector::new(north, east, 0.0) * config.search_speed_m_s;
         }
         flown_m -= length_m;

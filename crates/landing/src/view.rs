@@ -1,6 +1,7 @@
 //! What a camera shows of the ground.
 
 use geometry::{Body, Camera, Odometry, Point, Rotation, Vector};
+use libm::{atan, atan2};
 
 use crate::event::FrameObservation;
 use crate::history::Motion;
@@ -24,7 +25,7 @@ impl View {
     pub(crate) fn from_frame(frame: &FrameObservation) -> Option<Self> {
         let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0)?;
         let (width, height) = frame.image_size;
-        let half = |px: u32| (0.5 * f64::from(px) / focal_px).atan();
+        let half = |px: u32| atan(0.5 * f64::from(px) / focal_px);
         let short = half(width.min(height));
         Some(frame.body_from_camera.map_or(
             Self { body_from_camera: Rotation::identity(), half_rad: [short; 2] },
@@ -38,7 +39,7 @@ impl View {
             motion.odometry_from_body().inverse() * (place - motion.odometry);
         let in_camera = self.body_from_camera.inverse() * in_body;
         let is_inside = |offset_m: f64, half_rad: f64| {
-            (offset_m.abs() + MARGIN_M).atan2(in_camera.z()) < half_rad - MARGIN_RAD
+            atan2(offset_m.abs() + MARGIN_M, in_camera.z()) < half_rad - MARGIN_RAD
         };
         let [right_rad, bottom_rad] = self.half_rad;
         in_camera.z() > 0.0

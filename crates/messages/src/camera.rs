@@ -1,5 +1,6 @@
 //! What a camera publishes: frame headers and its calibration.
 
+use libm::fmax;
 use serde::{Deserialize, Serialize};
 
 use crate::codec::wire;
@@ -247,6 +248,6 @@ impl CameraInfo {
 
 fn differ(ours: &[f64], theirs: &[f64]) -> bool {
     let apart =
-        |(a, b): (&f64, &f64)| (a - b).abs() > MAX_DIFFERENCE * a.abs().max(b.abs()).max(1.0);
+        |(a, b): (&f64, &f64)| (a - b).abs() > MAX_DIFFERENCE * fmax(fmax(a.abs(), b.abs()), 1.0);
     ours.len() != theirs.len() || ours.iter().zip(theirs).any(apart)
 }

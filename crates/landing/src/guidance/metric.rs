@@ -34,7 +34,8 @@
 //! follows no target and drifts by a decimetre in a second of gusts, so it takes over only at
 //! `land_height_m`, and only from a vehicle that hardly moves sideways.
 
-use geometry::{Ned, Point, Vector};
+use geometry::{Ned, Point, Vector, squared};
+use libm::{fmax, fmin, tan};
 
 use crate::config::MetricConfig;
 use crate::decision::{Reason, TargetEstimate};
@@ -274,7 +275,7 @@ impl Metric {
 
     /// The vehicle's position extrapolated from its newest state.
     fn position_now(&self, situation: &Situation<'_>) -> Point<Ned> {
-        let max_s = MAX_STEP_S.max(situation.link_delay_s);
+        let max_s = fmax(MAX_STEP_S, situation.link_delay_s);
         let age_s = situation.now.seconds_since(situation.vehicle.stamp).clamp(0.0, max_s);
         let velocity = horizontal(situation.vehicle.velocity) + self.bias();
         situation.vehicle.position + velocity * age_s
@@ -303,9 +304,9 @@ impl Metric {
         };
         let height_m = self.height_m(target);
         let share = (height_m / config.view_height_m - 1.0).clamp(0.0, 1.0);
-        let seen_m = height_m * (view_rad - config.view_margin_rad).tan() - config.view_margin_m;
+        let seen_m = height_m * tan(view_rad - config.view_margin_rad) - config.view_margin_m;
         let axis = observer.tilt * height_m;
-        let excess_m = axis.norm() - seen_m.max(0.0);
+        let excess_m = axis.norm() - fmax(seen_m, 0.0);
         if excess_m <= 0.0 { Vector::zero() } else { axis * (share * excess_m / axis.norm()) }
     }
 
@@ -320,9 +321,9 @@ impl Metric {
     /// The error relative to the funnel's radius, which near the ground grows with the waiting time.
     fn funnel_error(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
         let config = &self.config;
-        let height_m = self.height_m(target).max(0.0);
+        let height_m = fmax(self.height_m(target), 0.0);
         let patience = (self.waited_s(situation) / config.settle_s).clamp(0.0, 1.0);
-        let widest_m = config.funnel_m.max(config.blind_error_m);
+        let widest_m = fmax(config.funnel_m, config.blind_error_m);
         let radius_m = config.funnel_m
             + (widest_m - config.funnel_m) * patience
             + config.funnel_per_height * height_m;
@@ -332,21 +333,21 @@ impl Metric {
         }
         // A low vehicle touches down before a growing error is seen, so the predicted error counts too.
         let closing = self.closing(situation, target);
-        error.norm().max((error - closing * LOW_LEAD_S).norm()) / radius_m
+        fmax(error.norm(), (error - closing * LOW_LEAD_S).norm()) / radius_m
     }
 
     /// The lateral speed over the pad relative to the one allowed at this height, which grows with the
     /// waiting time: a vehicle that touches down while a gust moves it slides.
     fn lateral_speed_scale(&self, situation: &Situation<'_>, target: &TargetEstimate) -> f64 {
-        let height_m = self.height_m(target).max(0.0);
+        let height_m = fmax(self.height_m(target), 0.0);
         if height_m > LOW_M || self.observer.is_none() {
             return 0.0;
         }
         let max_m_s = TOUCHDOWN_M_S
             + TOUCHDOWN_PER_HEIGHT * height_m
-            + TOUCHDOWN_PATIENCE_M_S2 * (self.waited_s(situation) - TOUCHDOWN_WAIT_S).max(0.0);
-        let share = gentleness(extra_delay_s(situation)).max(MIN_TOUCHDOWN_SHARE);
-        self.closing(situation, target).norm() / (max_m_s.min(MAX_TOUCHDOWN_M_S) * share)
+            + TOUCHDOWN_PATIENCE_M_S2 * fmax(self.waited_s(situation) - TOUCHDOWN_WAIT_S, 0.0);
+        let share = fmax(gentleness(extra_delay_s(situation)), MIN_TOUCHDOWN_SHARE);
+        self.closing(situation, target).norm() / (fmin(max_m_s, MAX_TOUCHDOWN_M_S) * share)
     }
 
     /// Notes since when the vehicle is low, and since when it stands still although commanded down.
@@ -390,7 +391,7 @@ impl Metric {
         let lead_s = config.acceleration_lead_s;
         let left = self.error(situation, target)
             - closing * (config.dead_time_s + delay_s)
-            - observer.acceleration * (0.5 * lead_s.powi(2));
+            - observer.acceleration * (0.5 * squared(lead_s));
         // While the autopilot reduces its acceleration, within its jerk, the speed still grows.
         let fading = observer.path.acceleration();
         let closing = closing
@@ -399,7 +400,7 @@ impl Metric {
         let left_m = left.norm();
         let braking_m_s = (2.0 * BRAKING * config.lateral_acceleration_m_s2 * left_m).sqrt();
         let speed_m_s =
-            (gentle * config.lateral_gain * left_m).min(braking_m_s).min(config.max_lateral_m_s);
+            fmin(fmin(gentle * config.lateral_gain * left_m, braking_m_s), config.max_lateral_m_s);
         let wanted = if left_m > 1e-9 { left * (speed_m_s / left_m) } else { Vector::zero() };
         let acceleration = limited(
             (wanted - closing) * (gentle * config.velocity_gain),
@@ -422,7 +423,7 @@ impl Metric {
         }
         let error = self.funnel_error(situation, target);
         let speed_scale = self.lateral_speed_scale(situation, target);
-        let centred = (1.0 - error * error).max(0.0) * (1.0 - speed_scale * speed_scale).max(0.0);
+        let centred = fmax(1.0 - error * error, 0.0) * fmax(1.0 - speed_scale * speed_scale, 0.0);
         let fresh = self.freshness(situation);
         let height_m = self.height_m(target);
         let why = if centred == 0.0 && height_m <= LOW_M {
@@ -438,21 +439,22 @@ impl Metric {
         };
         if error > FUNNEL_HYSTERESIS && height_m < LOW_M {
             // Tilting against a gust costs height, and the vehicle must not touch down sliding.
-            return (-(ROOM_GAIN * (LOW_M - height_m)).min(ROOM_M_S), Reason::Settling);
+            return (-fmin(ROOM_GAIN * (LOW_M - height_m), ROOM_M_S), Reason::Settling);
         }
-        let sinking_m_s = (situation.vehicle.velocity.z() - target.velocity.z()).max(0.0);
+        let sinking_m_s = fmax(situation.vehicle.velocity.z() - target.velocity.z(), 0.0);
         // Over a slow link it is already lower, and lower still when the setpoint arrives.
         let height_m = height_m - sinking_m_s * extra_delay_s(situation);
         let ahead_m = height_m
             - config.land_height_m
-            - (sinking_m_s - config.touchdown_descend_m_s).max(0.0) * config.descend_lag_s;
+            - fmax(sinking_m_s - config.touchdown_descend_m_s, 0.0) * config.descend_lag_s;
         // The part of a heave that is not estimated adds to the touchdown's speed.
-        let min_m_s = MIN_TOUCHDOWN_M_S.min(config.touchdown_descend_m_s);
-        let end_m_s = (config.touchdown_descend_m_s - 0.5 * situation.pad_heave_m_s).max(min_m_s);
-        let braking = end_m_s.powi(2) + 2.0 * config.descend_braking_m_s2 * ahead_m.max(0.0);
+        let min_m_s = fmin(MIN_TOUCHDOWN_M_S, config.touchdown_descend_m_s);
+        let end_m_s = fmax(config.touchdown_descend_m_s - 0.5 * situation.pad_heave_m_s, min_m_s);
+        let braking = squared(end_m_s) + 2.0 * config.descend_braking_m_s2 * fmax(ahead_m, 0.0);
         let unattended_m_s = self.unattended_m_s(situation, height_m, end_m_s);
-        let gust_m_s = (height_m / config.gust_time_s).max(end_m_s);
-        let max_m_s = braking.sqrt().min(unattended_m_s).min(gust_m_s).min(config.max_descend_m_s);
+        let gust_m_s = fmax(height_m / config.gust_time_s, end_m_s);
+        let max_m_s =
+            fmin(fmin(fmin(braking.sqrt(), unattended_m_s), gust_m_s), config.max_descend_m_s);
         match situation.level_because {
             Some(reason) if centred * fresh > 0.0 => (0.0, reason),
             _ => (max_m_s * centred * fresh, why),
@@ -467,10 +469,11 @@ impl Metric {
         let braking_m_s2 = UNATTENDED_BRAKING * limits.vertical_acceleration_m_s2;
         // Solves speed * delay + (speed^2 - end^2) / (2 * braking) = height.
         let delay_m_s = braking_m_s2 * (timeout_s + self.config.descend_lag_s);
-        let end = end_m_s.powi(2);
-        let speed_m_s =
-            (delay_m_s.powi(2) + end + 2.0 * braking_m_s2 * height_m.max(0.0)).sqrt() - delay_m_s;
-        speed_m_s.max(end_m_s)
+        let end = squared(end_m_s);
+        let speed_m_s = (squared(delay_m_s) + end + 2.0 * braking_m_s2 * fmax(height_m, 0.0))
+            .sqrt()
+            - delay_m_s;
+        fmax(speed_m_s, end_m_s)
     }
 
     /// From 1 for a fresh target to 0 for a stale one; 1 low above a well-known target.
@@ -485,7 +488,7 @@ impl Metric {
 
 /// The part of the link's delay that `dead_time_s` does not contain, in seconds.
 fn extra_delay_s(situation: &Situation<'_>) -> f64 {
-    (situation.link_delay_s - USUAL_LINK_S).max(0.0)
+    fmax(situation.link_delay_s - USUAL_LINK_S, 0.0)
 }
 
 /// The factor of the gains over a link that is slower than usual by `delay_s`.
@@ -495,7 +498,7 @@ fn gentleness(delay_s: f64) -> f64 {
 
 /// From `last` towards `wanted` by at most `step`; a descent ends at once, because the autopilot smooths it.
 fn approach_speed(last: f64, wanted: f64, step: f64) -> f64 {
-    if wanted < last { wanted } else { wanted.min(last + step) }
+    if wanted < last { wanted } else { fmin(wanted, last + step) }
 }
 
 #[cfg(test)]

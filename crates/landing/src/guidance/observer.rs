@@ -1,7 +1,8 @@
 //! What the metric guidance observes of the vehicle's motion: the autopilot's path, the bias of its velocity,
 //! and the tilt against the wind.
 
-use geometry::{Body, Ned, Point, Vector};
+use geometry::{Body, Ned, Point, Vector, squared};
+use libm::{fmax, fmin};
 
 use crate::config::MetricConfig;
 use crate::event::VehicleState;
@@ -78,7 +79,7 @@ impl Observer {
         self.path.advance(step_s, self.setpoint, &situation.limits);
         // The tilt that does not accelerate the vehicle along its path holds it against the wind.
         let against_wind = tilt(situation) + self.path.acceleration() * (1.0 / GRAVITY);
-        self.tilt = self.tilt + (against_wind - self.tilt) * (step_s / TILT_S).min(1.0);
+        self.tilt = self.tilt + (against_wind - self.tilt) * fmin(step_s / TILT_S, 1.0);
         self
     }
 
@@ -97,8 +98,8 @@ impl Observer {
         }
         // A critically damped observer.
         let time_s = config.drift_time_s;
-        self.predicted = predicted + innovation * (2.0 * gap_s / time_s).min(1.0);
-        let bias = self.bias + innovation * (gap_s / time_s.powi(2));
+        self.predicted = predicted + innovation * fmin(2.0 * gap_s / time_s, 1.0);
+        let bias = self.bias + innovation * (gap_s / squared(time_s));
         self.bias = limited(bias, config.max_drift_m_s);
     }
 }
@@ -106,7 +107,7 @@ impl Observer {
 /// Horizontal offset of the body's down axis per metre of height.
 fn tilt(situation: &Situation<'_>) -> Vector<Ned> {
     let down = situation.vehicle.ned_from_body * Vector::<Body>::new(0.0, 0.0, 1.0);
-    horizontal(down) * (1.0 / down.z().max(0.5))
+    horizontal(down) * (1.0 / fmax(down.z(), 0.5))
 }
 
 /// The horizontal part of a vector.

@@ -33,6 +33,7 @@
 //! hold.
 
 use geometry::{Ned, Vector};
+use libm::{fmax, fmin, hypot, sincos};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -41,6 +42,9 @@ use crate::config::ThesisConfig;
 use crate::decision::Reason;
 use crate::event::FrameObservation;
 use crate::guidance::situation::{Guidance, Progress, Situation};
+
+/// Beyond this `rand_distr` draws from the tail of the normal distribution; by its tables at 3.654.
+const NORMAL_TAIL: f64 = 3.65;
 
 impl ThesisConfig {
     /// The constants with the proportional gain as printed, which does not land.
@@ -85,7 +89,7 @@ impl Guidance for Thesis {
         };
         let right_px = marker.centre.x - f64::from(frame.image_size.0) / 2.0;
         let up_px = f64::from(frame.image_size.1) / 2.0 - marker.centre.y;
-        let aligned = right_px.hypot(up_px) < self.config.tolerance_px;
+        let aligned = hypot(right_px, up_px) < self.config.tolerance_px;
         self.progress = if !aligned {
             Progress::Aligning
         } else if altitude_m < self.config.land_altitude_m {
@@ -138,9 +142,8 @@ impl Thesis {
     fn step_wind(&mut self) {
         let ThesisConfig { wind_memory, wind_mean_m_s, wind_sigma_m_s, .. } = self.config;
         for wind in &mut self.wind_m_s {
-            let normal: f64 = StandardNormal.sample(&mut self.random);
-            *wind = wind_memory * *wind
-                + (1.0 - wind_memory) * (wind_mean_m_s + wind_sigma_m_s * normal);
+            let noise_m_s = wind_mean_m_s + wind_sigma_m_s * normal(&mut self.random);
+            *wind = wind_memory * *wind + (1.0 - wind_memory) * noise_m_s;
         }
     }
 
@@ -159,14 +162,21 @@ impl Thesis {
     /// From right, forward (as the image shows them) and up to the world.
     fn ned(&self, heading_rad: f64, velocity: [f64; 3]) -> Vector<Ned> {
         let [right, forward, up] = velocity;
-        let (sin, cos) = (heading_rad + self.config.image_up_rad).sin_cos();
+        let (sin, cos) = sincos(heading_rad + self.config.image_up_rad);
         Vector::new(forward * cos - right * sin, forward * sin + right * cos, -up)
     }
 }
 
+/// A number of the standard normal distribution.
+fn normal(random: &mut ChaCha8Rng) -> f64 {
+    let number: f64 = StandardNormal.sample(random);
+    // One in 4000 is beyond, where `rand_distr` takes the C library's logarithm; rounded it is the same on every machine.
+    if number.abs() > NORMAL_TAIL { f64::from(number as f32) } else { number }
+}
+
 /// Algorithm 17: the value, within its limits.
 fn limited(value: f64, lower: f64, upper: f64) -> f64 {
-    value.min(upper).max(lower)
+    fmax(fmin(value, upper), lower)
 }
 
 #[cfg(test)]
