@@ -61,8 +61,11 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
 /// Replays one controller's tape; true when nothing is wrong with it.
 fn one(tape: &RecordedTape, args: &ReplayArgs) -> anyhow::Result<bool> {
     let began = Instant::now();
+    let mut other_state = None;
     let end = if args.verify {
-        verify(tape, &args.set)?.end
+        let verdict = verify(tape, &args.set)?;
+        other_state = verdict.other_state;
+        verdict.end
     } else {
         let change = change(tape, &args.set)?;
         for begun in &change.phases {
@@ -87,17 +90,26 @@ fn one(tape: &RecordedTape, args: &ReplayArgs) -> anyhow::Result<bool> {
         end.flight_s,
         end.flight_s / took_s
     ))?;
+    if let Some(other_state) = &other_state {
+        print(&other_state.to_string())?;
+    }
     if let Some(stop) = &end.stop {
         print(&stop.to_string())?;
     } else if !end.is_ended {
         print("the tape has no end: the controller was killed, or the end was not recorded")?;
     }
-    Ok(end.stop.is_none())
+    Ok(end.stop.is_none() && other_state.is_none())
 }
 
 fn told(change: &Change) -> String {
     let Some(first_s) = change.first_s else {
-        return "no decision is another one".to_owned();
+        return match change.other_outputs {
+            0 => "no decision is another one".to_owned(),
+            count => format!(
+                "no decision is another one; packets for the autopilot or replies are, after {count} of {} events",
+                change.end.events
+            ),
+        };
     };
     format!(
         "other decisions after {} of {} events, the first at {first_s:.3} s; another phase after {}\n\

@@ -10,8 +10,8 @@ use std::sync::Arc;
 use autopilot::Packet;
 use landing::{Action, Decision};
 use messages::{
-    CameraInfo, CommandReply, ControllerCommand, Detections, DetectorInfo, Tape, TapeAction,
-    TapeDecision, TapeEvent, TapeNote, TapeOutput, TapeTarget, TapeWriter,
+    CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo, Tape,
+    TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapeState, TapeTarget, TapeWriter,
 };
 use node::{HealthCounters, to_toml};
 
@@ -21,6 +21,9 @@ use crate::limits::Note;
 
 /// Maximum number of packets for the autopilot that wait to be taken; the oldest goes.
 const MAX_OUTGOING: usize = 1024;
+
+/// Period in which the state is written, in nanoseconds.
+const STATE_PERIOD_NS: i64 = 10_000_000_000;
 
 /// A flight with its tape.
 pub struct TapedFlight {
@@ -32,6 +35,8 @@ pub struct TapedFlight {
     /// Number of the decision that the tape has, and the detector.
     decisions: u64,
     detector: Option<String>,
+    /// When the state was written last, in nanoseconds.
+    state_ns: i64,
 }
 
 /// The program with its version, as the tape names it.
@@ -65,6 +70,7 @@ impl TapedFlight {
             packets: Vec::new(),
             decisions: 0,
             detector: None,
+            state_ns: now_ns,
         };
         let event = TapeEvent::Begin {
             program: program().into(),
@@ -105,10 +111,24 @@ impl TapedFlight {
         self.write(now_ns, &TapeEvent::GroundPacket { raw: Cow::Borrowed(&packet.raw) }, None);
     }
 
-    /// As [`Flight::tick`].
+    /// As [`Flight::tick`]; the state follows at its period.
     pub fn tick(&mut self, now_ns: i64) {
+        self.tick_only(now_ns);
+        if now_ns.saturating_sub(self.state_ns) >= STATE_PERIOD_NS {
+            self.state_ns = now_ns;
+            self.write_state(now_ns);
+        }
+    }
+
+    fn tick_only(&mut self, now_ns: i64) {
         self.flight.tick(now_ns);
         self.write(now_ns, &TapeEvent::Tick, None);
+    }
+
+    fn write_state(&mut self, now_ns: i64) {
+        let status = ControllerStatus { latency_ms: None, ..self.flight.status(now_ns) };
+        let state = TapeState { status, target: self.flight.target(now_ns) };
+        self.write(now_ns, &TapeEvent::State(Cow::Owned(state)), None);
     }
 
     /// As [`Flight::detections`].
@@ -160,7 +180,7 @@ impl TapedFlight {
         is_pending
     }
 
-    /// Handles an event of a tape as it was handled then. False for what a flight cannot handle: a second beginning,
+    /// Handles an event of a tape as it was handled then, and writes the state where it was written then. False for what a flight cannot handle: a second beginning,
     /// and bytes that are no packet.
     pub fn replay(&mut self, now_ns: i64, event: &TapeEvent<'_>) -> bool {
         match event {
@@ -178,7 +198,7 @@ impl TapedFlight {
                 Some(packet) => self.ground_packet(now_ns, &packet),
                 None => return false,
             },
-            TapeEvent::Tick => self.tick(now_ns),
+            TapeEvent::Tick => self.tick_only(now_ns),
             TapeEvent::Detections { publisher, message } => {
                 self.detections(now_ns, publisher, message);
             }
@@ -190,6 +210,7 @@ impl TapedFlight {
             TapeEvent::Command(command) => drop(self.command(now_ns, command)),
             TapeEvent::RefusedVersion => self.refused_version(now_ns),
             TapeEvent::Shutdown => drop(self.shutdown(now_ns)),
+            TapeEvent::State(_) => self.write_state(now_ns),
         }
         true
     }

@@ -6,6 +6,8 @@
 
 use std::ops::RangeInclusive;
 
+use libm::fmax;
+
 use crate::config::GuidanceConfig;
 use crate::decision::{Phase, TargetEstimate};
 
@@ -49,7 +51,7 @@ impl StandingHeight {
     /// stand higher is slow and asks for LAND earlier.
     pub(crate) fn applied_to(&self, mut config: GuidanceConfig) -> GuidanceConfig {
         if let (GuidanceConfig::Metric(metric), Some(measured_m)) = (&mut config, self.measured_m) {
-            metric.standing_height_m = metric.standing_height_m.max(measured_m);
+            metric.standing_height_m = fmax(metric.standing_height_m, measured_m);
         }
         config
     }

@@ -8,6 +8,8 @@
 //! bytes and back, [`convert`] into the types of `geometry` and `imaging` and back; [`sample`] has messages
 //! for tests, [`tape`] what a controller handled in order, and the others are the types by publisher.
 
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
+
 pub mod camera;
 pub mod codec;
 pub mod controller;
@@ -37,8 +39,8 @@ pub use health::{Configuration, Count, Health, Latency, Rate};
 pub use recorder::{RecorderLoss, RecorderStatus};
 pub use simulation::{Touchdown, Truth, Wind};
 pub use tape::{
-    Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapeRecord, TapeTarget,
-    TapeWriter,
+    Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapeRecord, TapeState,
+    TapeTarget, TapeWriter,
 };
 pub use topic::{Delivery, MONITORS, Row, TOPICS, Topic};
 pub use vehicle::{LandedState, MavlinkBytes, VehicleState};

@@ -11,11 +11,11 @@ use siphasher::sip::SipHasher13;
 
 use crate::camera::CameraInfo;
 use crate::codec::wire;
-use crate::controller::{CommandReply, ControllerCommand};
+use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
 use crate::detector::{Detections, DetectorInfo};
 
 wire! {
-    Tape = 19 v 1;
+    Tape = 19 v 2;
 }
 
 /// Length of the hash at the end of each record, in bytes.
@@ -100,6 +100,18 @@ pub enum TapeEvent<'a> {
     RefusedVersion,
     /// It ends.
     Shutdown,
+    /// Nothing was handled: this is its state, written now and then. It shows where the flight stood after a part that is
+    /// missing, and in a replay where what no decision shows yet became different.
+    State(Cow<'a, TapeState>),
+}
+
+/// What a controller says of itself.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TapeState {
+    /// What it is doing; without latencies, which the health report counts.
+    pub status: ControllerStatus,
+    /// The landing point.
+    pub target: TargetEstimate,
 }
 
 /// A parameter of the autopilot that an earlier controller left to put back.
@@ -446,6 +458,7 @@ impl TapeEvent<'_> {
             Self::Command(_) => "command",
             Self::RefusedVersion => "refused-version",
             Self::Shutdown => "shutdown",
+            Self::State(_) => "state",
         }
     }
 }

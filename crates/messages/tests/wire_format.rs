@@ -8,8 +8,8 @@ use messages::{
     DetectorCommand, DetectorInfo, DetectorState, FrameAck, FrameHeader, FramePart, Health,
     LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, Phase, PixelFormat, Place,
     Rate, RecorderLoss, RecorderStatus, Setpoint, StageTime, Tape, TapeAction, TapeDecision,
-    TapeEvent, TapeNote, TapeOutput, TapeTarget, TapeWriter, TargetEstimate, Touchdown, Transform3,
-    Truth, VehicleState, Wind, decode, encode,
+    TapeEvent, TapeNote, TapeOutput, TapeState, TapeTarget, TapeWriter, TargetEstimate, Touchdown,
+    Transform3, Truth, VehicleState, Wind, decode, encode,
 };
 use proptest::prelude::*;
 
@@ -337,7 +337,7 @@ fn truth() {
 #[test]
 fn tape() {
     let message = Tape { begun_ns: 1, first: 300, count: 2, records: vec![7, 0] };
-    check(&message, "41130102ac0202020700");
+    check(&message, "41130202ac0202020700");
 }
 
 /// A record with one event: its bytes without the hash, which the bytes give.
@@ -413,6 +413,27 @@ fn records_of_a_tape() {
     assert_eq!(record(&TapeEvent::Command(Cow::Owned(command)), &answered), "020900000001010172");
     assert_eq!(record(&TapeEvent::RefusedVersion, &nothing), "020a000000");
     assert_eq!(record(&TapeEvent::Shutdown, &nothing), "020b000000");
+    let status = ControllerStatus { phase: Phase::Hold, ..ControllerStatus::default() };
+    let target = TargetEstimate {
+        stamp_ns: 1,
+        position_ned_m: None,
+        lateral_error_m: None,
+        height_m: Some(1.0),
+        age_ms: None,
+        rejected: None,
+        decided: None,
+        velocity_ned_m_s: None,
+        deviation_m: None,
+        heading_rad: None,
+        nis: None,
+        time_offset_ms: None,
+        wind_ned_m_s: None,
+    };
+    let state = TapeState { status, target };
+    assert_eq!(
+        record(&TapeEvent::State(Cow::Owned(state)), &nothing),
+        "020c00080000000000000000000000000000000000000002000001000000000000f03f000000000000000000000000"
+    );
     let decision = TapeDecision {
         phase: "p",
         action: TapeAction::Velocity { velocity_ned_m_s: [1.0, 0.0, -1.0], yaw_rate_rad_s: 0.5 },

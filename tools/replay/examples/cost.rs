@@ -103,6 +103,7 @@ fn inputs(tapes: &[Tape]) -> anyhow::Result<(String, Vec<(i64, Input)>)> {
                 configuration = text.into_owned();
                 continue;
             }
+            TapeEvent::State(_) => continue,
             TapeEvent::Packet { raw } => Input::Packet(Packet::from_raw(&raw).context("a packet")?),
             TapeEvent::Tick => Input::Tick,
             TapeEvent::Detections { publisher, message } => {

@@ -5,7 +5,7 @@
 use std::ops::ControlFlow;
 
 use flightlog::RecordedTape;
-use messages::{Phase, TapeAction, TapeDecision, TapeTarget};
+use messages::{Phase, TapeAction, TapeDecision, TapeEvent, TapeRecord, TapeTarget};
 
 use crate::difference::Comparison;
 use crate::run::{End, run};
@@ -32,6 +32,8 @@ pub struct Change {
     pub different: u64,
     /// When the first of them was, since the begin, in seconds.
     pub first_s: Option<f64>,
+    /// Events after which the packets for the autopilot or the reply are other ones, and the decision is the same.
+    pub other_outputs: u64,
     /// Events after which the phase is another one.
     pub other_phase: u64,
     /// Greatest difference of the velocity setpoints, where there are both, in m/s.
@@ -63,9 +65,11 @@ pub fn change(tape: &RecordedTape, set: &[String]) -> anyhow::Result<Change> {
         let difference = comparison.next(step.recorded, step.replayed);
         let (then, now) = (comparison.recorded(), comparison.replayed());
         change.other_phase += u64::from(then.map(|it| it.phase) != now.map(|it| it.phase));
-        if difference.is_some() {
+        if !comparison.is_same_decision() {
             change.different += 1;
             change.first_s.get_or_insert(step.time_s);
+        } else if difference.is_some() && !is_state(step.recorded) {
+            change.other_outputs += 1;
         }
         if let (Some(then), Some(now)) = (then.and_then(velocity), now.and_then(velocity)) {
             let away_m_s = distance(&then, &now);
@@ -87,6 +91,11 @@ pub fn change(tape: &RecordedTape, set: &[String]) -> anyhow::Result<Change> {
     change.end = end;
     change.rms_velocity_m_s = if setpoints > 0.0 { f64::sqrt(squares / setpoints) } else { 0.0 };
     Ok(change)
+}
+
+/// Whether it is the controller's state, which goes nowhere.
+fn is_state(record: &TapeRecord<'_>) -> bool {
+    matches!(record.event, TapeEvent::State(_))
 }
 
 fn velocity(decision: TapeDecision<'_>) -> Option<[f64; 3]> {

@@ -1,7 +1,7 @@
 //! Names the first value in which what came out of an event differs from what came out then.
 
 use autopilot::Parser;
-use messages::{TapeDecision, TapeRecord};
+use messages::{TapeDecision, TapeEvent, TapeRecord};
 use serde_json::Value;
 
 /// Longest value that is shown, in characters.
@@ -38,7 +38,7 @@ impl Comparison {
                 latest.extend_from_slice(&record.decision);
             }
         }
-        if self.recorded != self.replayed {
+        if !self.is_same_decision() {
             let (old, new) = (as_json(&self.recorded), as_json(&self.replayed));
             return Some(value("decision", &old, &new).unwrap_or_else(|| Difference {
                 field: "decision".to_owned(),
@@ -49,11 +49,20 @@ impl Comparison {
         if recorded.packets != replayed.packets {
             return Some(packets(&recorded.packets, &replayed.packets));
         }
+        if let (TapeEvent::State(old), TapeEvent::State(new)) = (&recorded.event, &replayed.event) {
+            let json = |state| serde_json::to_value(state).unwrap_or(Value::Null);
+            return value("state", &json(old), &json(new));
+        }
         (recorded.reply != replayed.reply).then(|| Difference {
             field: "reply".to_owned(),
             recorded: format!("{:?}", recorded.reply),
             replayed: format!("{:?}", replayed.reply),
         })
+    }
+
+    /// Whether the decision is the same then and now.
+    pub fn is_same_decision(&self) -> bool {
+        self.recorded == self.replayed
     }
 
     /// The decision that the tape has.

@@ -3,6 +3,7 @@
 use std::ops::ControlFlow;
 
 use flightlog::RecordedTape;
+use messages::TapeEvent;
 
 use crate::difference::{Comparison, Difference};
 use crate::run::{End, Stop, run};
@@ -12,12 +13,14 @@ use crate::run::{End, Stop, run};
 pub struct Verdict {
     /// How far it came, and why it went no further.
     pub end: End,
+    /// The first state of the controller that is another one, a [`Stop::Different`]. What comes out may still be the same.
+    pub other_state: Option<Stop>,
 }
 
 impl Verdict {
-    /// True when every event of the tape gives the same result to the bit.
+    /// True when every event of the tape gives the same result to the bit, and the controller's state is the same.
     pub fn is_verified(&self) -> bool {
-        self.end.stop.is_none()
+        self.end.stop.is_none() && self.other_state.is_none()
     }
 }
 
@@ -27,16 +30,25 @@ impl Verdict {
 /// When the configuration cannot be used.
 pub fn verify(tape: &RecordedTape, set: &[String]) -> anyhow::Result<Verdict> {
     let mut comparison = Comparison::default();
-    let end = run(tape, set, |step| match comparison.next(step.recorded, step.replayed) {
-        None => ControlFlow::Continue(()),
-        Some(Difference { field, recorded, replayed }) => ControlFlow::Break(Stop::Different {
+    let mut other_state = None;
+    let end = run(tape, set, |step| {
+        let Some(difference) = comparison.next(step.recorded, step.replayed) else {
+            return ControlFlow::Continue(());
+        };
+        let Difference { field, recorded, replayed } = difference;
+        let stop = Stop::Different {
             number: step.recorded.number,
             event: step.recorded.event.name(),
             time_s: step.time_s,
             field,
             recorded,
             replayed,
-        }),
+        };
+        if matches!(step.recorded.event, TapeEvent::State(_)) {
+            other_state.get_or_insert(stop);
+            return ControlFlow::Continue(());
+        }
+        ControlFlow::Break(stop)
     })?;
-    Ok(Verdict { end })
+    Ok(Verdict { end, other_state })
 }
