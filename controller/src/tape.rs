@@ -128,7 +128,7 @@ impl TapedFlight {
     fn write_state(&mut self, now_ns: i64) {
         let status = ControllerStatus { latency_ms: None, ..self.flight.status(now_ns) };
         let state = TapeState { status, target: self.flight.target(now_ns) };
-        self.write(now_ns, &TapeEvent::State(Cow::Owned(state)), None);
+        self.write(now_ns, &TapeEvent::State(Box::new(state)), None);
     }
 
     /// As [`Flight::detections`].

@@ -102,7 +102,7 @@ pub enum TapeEvent<'a> {
     Shutdown,
     /// Nothing was handled: this is its state, written now and then. It shows where the flight stood after a part that is
     /// missing, and in a replay where what no decision shows yet became different.
-    State(Cow<'a, TapeState>),
+    State(Box<TapeState>),
 }
 
 /// What a controller says of itself.

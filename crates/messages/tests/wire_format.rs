@@ -431,7 +431,7 @@ fn records_of_a_tape() {
     };
     let state = TapeState { status, target };
     assert_eq!(
-        record(&TapeEvent::State(Cow::Owned(state)), &nothing),
+        record(&TapeEvent::State(Box::new(state)), &nothing),
         "020c00080000000000000000000000000000000000000002000001000000000000f03f000000000000000000000000"
     );
     let decision = TapeDecision {

@@ -14,7 +14,7 @@ use experiments::faults::flight::fly_with_tape;
 use experiments::faults::plan::{Plan, Planned};
 use experiments::landing::in_parallel;
 use flightlog::{RecordedTape, TapeReader};
-use messages::{ControllerCommand, DetectorInfo, Place, TapeEvent};
+use messages::{ControllerCommand, DetectorInfo, Place, Tape, TapeEvent};
 use replay::{Stop, Verdict, change, verify};
 
 fn tapes_of(planned: &Planned) -> anyhow::Result<Vec<RecordedTape>> {
@@ -63,9 +63,9 @@ fn ground_packet() -> autopilot::Packet {
 
 /// The events of a tape, flown again with a note to put back, a ground station, an operator's commands and an end.
 fn with_everything(tape: &RecordedTape) -> RecordedTape {
-    let mut events = tape.parts.iter().flat_map(|part| part.records()).map(Result::unwrap);
+    let mut events = tape.parts.iter().flat_map(Tape::records).map(Result::unwrap);
     let begin = events.next().unwrap();
-    let TapeEvent::Begin { configuration, .. } = &begin.event else { panic!("{begin:?}") };
+    let TapeEvent::Begin { configuration, .. } = &begin.event else { unreachable!("{begin:?}") };
     let config: controller::Config =
         node::from_toml("the tape", configuration, &[]).unwrap().settings;
     let note = Note {
@@ -129,8 +129,7 @@ fn with_everything(tape: &RecordedTape) -> RecordedTape {
 #[test]
 fn every_kind_of_event_is_replayed_to_the_bit() {
     let tape = with_everything(&one(12));
-    let records: Vec<_> =
-        tape.parts.iter().flat_map(|part| part.records()).map(Result::unwrap).collect();
+    let records: Vec<_> = tape.parts.iter().flat_map(Tape::records).map(Result::unwrap).collect();
     let kinds: BTreeSet<_> = records.iter().map(|record| record.event.name()).collect();
     assert_eq!(kinds.len(), 13, "{kinds:?}");
     let replies: Vec<bool> =
