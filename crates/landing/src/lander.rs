@@ -1,7 +1,6 @@
 //! The landing decision as one function of time and events.
 
 use geometry::{Ned, Odometry, Point, Vector};
-use libm::{atan, fmin};
 
 use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
 use crate::config::{AlarmAction, Config, GuidanceConfig, OnAbort};
@@ -301,7 +300,7 @@ impl Lander {
     fn altitude_m(&self, now: Timestamp, height_m: f64) -> f64 {
         let pad_m = self.recent_target(now).map(|target| -target.position.z());
         let ground_m = pad_m.or_else(|| self.ground.map(|ground| self.altitude_of(ground)));
-        ground_m.unwrap_or_else(|| fmin(self.altitude_of(self.start), 0.0)) + height_m
+        ground_m.unwrap_or_else(|| libm::fmin(self.altitude_of(self.start), 0.0)) + height_m
     }
 
     /// The contact with the ground. A vehicle that flies high, or moves up or down, does not stand on it, whatever is
@@ -344,7 +343,7 @@ impl Lander {
         self.newest_frame = Some(frame.stamp);
         let short_px = f64::from(frame.image_size.0.min(frame.image_size.1));
         let focal_px = frame.focal_px.filter(|focal_px| *focal_px > 1.0);
-        self.half_view_rad = focal_px.map(|focal_px| atan(0.5 * short_px / focal_px));
+        self.half_view_rad = focal_px.map(|focal_px| libm::atan(0.5 * short_px / focal_px));
         if frame.marker.is_none() {
             self.target_filter.miss(frame, &self.history);
         }
@@ -414,11 +413,11 @@ impl Lander {
     }
 
     fn set_link_delay(&mut self, seconds: f64) {
-        self.link_delay_s = if seconds >= 0.0 { fmin(seconds, 10.0) } else { 0.0 };
+        self.link_delay_s = if seconds >= 0.0 { libm::fmin(seconds, 10.0) } else { 0.0 };
         let limit_s = if self.is_link_slow { MAX_QUICK_DELAY_S } else { MAX_LINK_DELAY_S };
         self.is_link_slow = self.link_delay_s > limit_s;
         // A frame may come long before the vehicle's state of its time.
-        let one_way_s = 0.5 * fmin(self.link_delay_s, MAX_LINK_DELAY_S);
+        let one_way_s = 0.5 * libm::fmin(self.link_delay_s, MAX_LINK_DELAY_S);
         let usual_s = self.config.target.max_extrapolation_s;
         self.history.set_max_extrapolation(usual_s + one_way_s);
     }
@@ -604,7 +603,7 @@ impl Lander {
         let phases = &self.config.phases;
         let above_m = height_m - phases.dispute_height_m;
         let down_m_s = above_m.clamp(-phases.retry_climb_m_s, f64::MAX);
-        Vector::new(wanted.x(), wanted.y(), fmin(wanted.z(), down_m_s))
+        Vector::new(wanted.x(), wanted.y(), libm::fmin(wanted.z(), down_m_s))
     }
 
     fn guided(&mut self, now: Timestamp) -> (Action, Reason) {
@@ -641,8 +640,8 @@ impl Lander {
         let phases = self.config.phases;
         let altitude_m = -vehicle.position.z();
         let ceiling_m = self.altitude_of(self.start);
-        let to_m =
-            *self.retry_to_m.get_or_insert(fmin(altitude_m + phases.retry_climb_m, ceiling_m));
+        let climbed_m = libm::fmin(altitude_m + phases.retry_climb_m, ceiling_m);
+        let to_m = *self.retry_to_m.get_or_insert(climbed_m);
         let situation = self.situation(now, &vehicle);
         let (wanted, _) = self.guidance.velocity(&situation);
         // Over the last half metre the climb slows down.
