@@ -65,7 +65,7 @@ const FUZZ: &str = "fuzz";
 const ABOVE: [(&str, &[&str]); 3] = [
     ("experiments", &["controller", "detector", "simulator"]),
     ("replay", &["controller", "experiments"]),
-    ("report", &["experiments", "replay"]),
+    ("report", &["controller", "experiments", "replay"]),
 ];
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
 const ALIGHT: [&str; 8] =

@@ -70,6 +70,13 @@ async fn a_landing_is_recorded_and_read_by_other_programs() -> anyhow::Result<()
     let said = String::from_utf8_lossy(&replay.stdout).into_owned();
     println!("{said}");
     ensure!(replay.status.success() && said.contains("verified"), "{said}");
+    let report = output_of(Command::new(flight::ALIGHT).args(["report", name]))?;
+    let said = String::from_utf8_lossy(&report.stdout).into_owned();
+    println!("{said}");
+    ensure!(report.status.success() && said.contains("landed; "), "{said}");
+    ensure!(said.contains("tape verified to the bit"), "{said}");
+    let page = std::fs::read_to_string(file.with_extension("html"))?;
+    ensure!(page.contains("id=\"landing\"") && page.contains("descending over"), "{}", page.len());
     let Some(reader) = python("tests/recording/read.py", &[name]) else { return Ok(()) };
     let output = tokio::task::block_in_place(|| reader.wait_with_output())?;
     if !python_passes(&output)? {

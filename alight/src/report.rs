@@ -5,8 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, ensure};
 use clap::Args;
-use replay::{End, verify};
-use report::{Flight, FlightReader, Replayed, comparison, page, summary};
+use report::{Flight, FlightReader, comparison, page, replay_tapes, summary};
 
 use crate::args::Format;
 use crate::terminal::{print, write_error};
@@ -81,40 +80,65 @@ fn flights(files: &[PathBuf]) -> anyhow::Result<Vec<Flight>> {
             None => readers.push((begins, alone)),
         }
     }
-    Ok(readers.into_iter().map(|(_, reader)| replayed(reader.finish())).collect())
+    let flight = |(_, reader): (_, FlightReader)| {
+        let mut flight = reader.finish();
+        replay_tapes(&mut flight);
+        flight
+    };
+    Ok(readers.into_iter().map(flight).collect())
 }
 
 fn name(file: &Path) -> String {
     file.file_name().unwrap_or(file.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// The flight with the verdict of a replay of its tapes.
-fn replayed(mut flight: Flight) -> Flight {
-    let mut texts = Vec::new();
-    let mut is_verified = true;
-    for tape in &flight.tapes {
-        let (is_whole, text) = match verify(tape, &[]) {
-            Ok(verdict) => (verdict.is_verified(), told(&verdict.end)),
-            Err(problem) => (false, format!("the tape cannot be replayed: {problem:#}")),
-        };
-        is_verified &= is_whole;
-        texts.push(text);
-    }
-    flight.replayed = (!texts.is_empty()).then(|| Replayed { is_verified, text: texts.join("; ") });
-    flight
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-fn told(end: &End) -> String {
-    let theirs = (end.program.as_str(), end.build.as_str());
-    let ours = (controller::tape::program(), controller::tape::build());
-    let other = match theirs == (ours.0.as_str(), ours.1.as_str()) || theirs.0.is_empty() {
-        true => String::new(),
-        false => {
-            format!(" (recorded by {} {}, replayed by {} {})", theirs.0, theirs.1, ours.0, ours.1)
+    fn refusal(contents: Option<&[u8]>) -> String {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("flight.mcap");
+        if let Some(contents) = contents {
+            std::fs::write(&file, contents).unwrap();
         }
-    };
-    match &end.stop {
-        None => format!("tape verified to the bit, {} events{other}", end.events),
-        Some(stop) => format!("tape not verified: {stop}{other}"),
+        format!("{:#}", flights(&[file]).unwrap_err())
+    }
+
+    #[test]
+    fn a_file_that_is_no_recording_is_named_with_what_is_wrong() {
+        assert!(refusal(None).contains("reading \"") && refusal(None).contains("flight.mcap"));
+        assert!(refusal(Some(b"text")).contains("flight.mcap\" is no recording (MCAP file)"));
+        let about = flightlog::About::default();
+        let mut empty = Vec::new();
+        flightlog::Writer::new(&mut empty, &about).unwrap().finish().unwrap();
+        assert!(refusal(Some(&empty)).contains("nothing of a flight is in"));
+    }
+
+    #[test]
+    fn files_that_share_a_tape_are_one_flight_and_others_are_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, begun_ns: i64| {
+            let file = folder.path().join(name);
+            let mut recording = Vec::new();
+            let about = flightlog::About::default();
+            let mut writer = flightlog::Writer::new(&mut recording, &about).unwrap();
+            let tape = messages::Tape { begun_ns, ..messages::Tape::default() };
+            let payload = messages::encode(&tape);
+            let key = messages::topic::TAPE.key(&[]);
+            let message = flightlog::Received {
+                key: &key,
+                payload: &payload,
+                attachment: b"",
+                received_ns: 9,
+            };
+            writer.receive(message).unwrap();
+            writer.finish().unwrap();
+            std::fs::write(&file, recording).unwrap();
+            file
+        };
+        let files = [write("one.mcap", 3), write("one-2.mcap", 3), write("two.mcap", 4)];
+        let names: Vec<String> = flights(&files).unwrap().into_iter().map(|it| it.name).collect();
+        assert_eq!(names, ["one.mcap", "two.mcap"]);
     }
 }

@@ -2,10 +2,14 @@
 //! whatever goes wrong.
 
 use experiments::landing::fault::Fault;
-use experiments::landing::flight::fly;
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::Path;
+
+use experiments::landing::flight::{fly, fly_recorded};
 use experiments::landing::in_parallel;
 use experiments::landing::outcome::{Ending, Outcome};
-use experiments::landing::plan::{Plan, Planned, Values, Vision};
+use experiments::landing::plan::{Plan, Planned, Request, Values, Vision};
 
 fn plan(vision: Vision, flights: u64) -> Plan {
     let one = |value| Values::List(vec![value]);
@@ -14,6 +18,23 @@ fn plan(vision: Vision, flights: u64) -> Plan {
 
 fn fly_all(flights: &[Planned]) -> Vec<Outcome> {
     in_parallel(flights, 2, |planned| fly(planned, None)).unwrap_or_default()
+}
+
+/// Holds what a flight should be; one that is not is flown again for a recording, which the failure names.
+fn expect(planned: &Planned, outcome: &Outcome, holds: bool) {
+    if holds {
+        return;
+    }
+    let name = format!("failed-{}-seed-{}.mcap", planned.fault.name(), planned.seed);
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let recorded = File::create(&path)
+        .map_err(anyhow::Error::from)
+        .and_then(|file| fly_recorded(planned, BufWriter::new(file)));
+    let left = match recorded {
+        Ok(_) => format!("`alight report {}` explains it", path.display()),
+        Err(problem) => format!("no recording of it: {problem:#}"),
+    };
+    panic!("{outcome:?}\n{}\n{left}", planned.command());
 }
 
 #[test]
@@ -52,47 +73,49 @@ fn no_fault_leads_to_an_unsafe_touchdown() {
     let outcomes = fly_all(&flights);
     assert_eq!(outcomes.len(), flights.len());
     for (planned, outcome) in flights.iter().zip(&outcomes) {
-        assert!(!outcome.is_unsafe(), "{outcome:?}: {}", planned.command());
-        assert!(outcome.ending != Ending::Unfinished, "{outcome:?}: {}", planned.command());
+        let is_ended = outcome.ending != Ending::Unfinished;
+        expect(planned, outcome, !outcome.is_unsafe() && is_ended);
     }
 }
 
 /// The flights of these seeds in wind of 4 m/s, from 10 m, as `alight experiment landing` flies them.
-fn with_fault(fault: &str, seeds: &[u64]) -> Vec<Outcome> {
+fn with_fault(fault: &str, seeds: &[u64]) -> Vec<(Planned, Outcome)> {
     let flights = seeds.iter().flat_map(|seed| {
         let faults = vec![fault.parse().unwrap_or(Fault::NONE)];
         let wind = Values::List(vec![4.0]);
         Plan { faults, wind, flights: 1, seed: *seed, ..Plan::default() }.flights()
     });
-    let outcomes = fly_all(&flights.collect::<Vec<_>>());
+    let flights = flights.collect::<Vec<_>>();
+    let outcomes = fly_all(&flights);
     assert_eq!(outcomes.len(), seeds.len());
-    outcomes
+    flights.into_iter().zip(outcomes).collect()
 }
 
 #[test]
 fn a_second_marker_is_rejected_while_the_first_is_out_of_view() {
     // With these seeds the vehicle tilts so that for a while only the wrong marker is in view.
-    for outcome in with_fault("wrong-marker", &[38, 54, 58, 81, 151, 265]) {
-        assert!(outcome.is_within(0.1) || outcome.ending == Ending::Aborted, "{outcome:?}");
+    for (planned, outcome) in with_fault("wrong-marker", &[38, 54, 58, 81, 151, 265]) {
+        let holds = outcome.is_within(0.1) || outcome.ending == Ending::Aborted;
+        expect(&planned, &outcome, holds);
     }
 }
 
 #[test]
 fn a_gust_close_to_the_ground_does_not_cause_a_sliding_touchdown() {
-    for outcome in with_fault("gust", &[26, 64, 68, 74, 92, 129]) {
-        assert!(outcome.is_within(0.3), "{outcome:?}");
-        assert!(outcome.slide_m_s.is_some_and(|slide| slide < 0.4), "{outcome:?}");
+    for (planned, outcome) in with_fault("gust", &[26, 64, 68, 74, 92, 129]) {
+        let is_slow = outcome.slide_m_s.is_some_and(|slide| slide < 0.4);
+        expect(&planned, &outcome, outcome.is_within(0.3) && is_slow);
     }
 }
 
 #[test]
 fn heaving_and_moving_pads_are_landed_on() {
-    for outcome in with_fault("pad-heaves", &[4, 8, 29, 43]) {
-        assert!(outcome.is_within(0.1), "{outcome:?}");
-        assert!(outcome.sink_m_s.is_some_and(|sink| sink <= 0.6), "{outcome:?}");
+    for (planned, outcome) in with_fault("pad-heaves", &[4, 8, 29, 43]) {
+        let is_gentle = outcome.sink_m_s.is_some_and(|sink| sink <= 0.6);
+        expect(&planned, &outcome, outcome.is_within(0.1) && is_gentle);
     }
-    for outcome in with_fault("pad-moves-4.2", &[3, 19, 24, 31]) {
-        assert!(outcome.is_within(0.1), "{outcome:?}");
+    for (planned, outcome) in with_fault("pad-moves-4.2", &[3, 19, 24, 31]) {
+        expect(&planned, &outcome, outcome.is_within(0.1));
     }
 }
 
@@ -122,7 +145,36 @@ fn px4_lands_guided_and_by_its_own_precision_landing() {
 
 #[test]
 fn late_detections_are_used() {
-    for outcome in with_fault("latency-300ms", &[1, 2, 3]) {
-        assert!(outcome.is_within(0.1), "{outcome:?}");
+    for (planned, outcome) in with_fault("latency-300ms", &[1, 2, 3]) {
+        expect(&planned, &outcome, outcome.is_within(0.1));
+    }
+}
+
+#[test]
+fn the_worst_flight_of_each_row_is_written_as_a_recording() {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("worst-flights");
+    let wind = Values::List(vec![0.0, 3.0]);
+    let plan = Plan { wind, ..plan(Vision::Modelled, 2) };
+    let request = Request { plan, results_in: folder.clone(), jobs: 2, recordings: 1 };
+    let report = experiments::landing::run(&request, &|_, _| {}).unwrap();
+    let names: Vec<&str> = report
+        .lines()
+        .filter_map(|line| line.strip_prefix("- `row-")?.split_once('`').map(|(name, _)| name))
+        .collect();
+    assert_eq!(names.len(), 2, "{report}");
+    for name in names {
+        let recording =
+            std::fs::read(folder.join("recordings").join(format!("row-{name}"))).unwrap();
+        let mut statuses = 0;
+        let reading = flightlog::read(&recording, |entry| {
+            statuses += usize::from(
+                matches!(entry, flightlog::Entry::Message(it) if it.key == "controller/status"),
+            );
+        });
+        let reading = reading.unwrap();
+        assert!(reading.is_ended && reading.damage.is_empty() && statuses > 20, "{reading:?}");
+        let mut tapes = flightlog::TapeReader::default();
+        tapes.read(&recording).unwrap();
+        assert_eq!(tapes.tapes().len(), 1, "{name}");
     }
 }

@@ -85,6 +85,8 @@ fn phase_ink(name: &str) -> Ink {
 pub enum Shape {
     /// A line.
     Line,
+    /// A wide line, behind others.
+    Wide,
     /// A thin line.
     Thin,
     /// A line that keeps each value until the next.
@@ -303,7 +305,7 @@ impl Chart {
             let form = match layer.shape {
                 Shape::Area => "area",
                 Shape::Dots | Shape::Crosses => "dot",
-                Shape::Line | Shape::Thin | Shape::Steps => "line",
+                Shape::Line | Shape::Wide | Shape::Thin | Shape::Steps => "line",
             };
             // Writing to a string cannot fail.
             let _ = write!(
@@ -336,8 +338,12 @@ fn draw_layer(
     let ink = layer.ink.rgb();
     let finite = || layer.points.iter().filter(|it| it.x.is_finite() && it.y.is_finite());
     match layer.shape {
-        Shape::Line | Shape::Thin | Shape::Steps => {
-            let width = if layer.shape == Shape::Thin { 2 } else { 4 };
+        Shape::Line | Shape::Wide | Shape::Thin | Shape::Steps => {
+            let width = match layer.shape {
+                Shape::Thin => 2,
+                Shape::Wide => 8,
+                _ => 4,
+            };
             let points = match layer.shape {
                 Shape::Steps => &steps(&layer.points),
                 _ => &layer.points,

@@ -111,6 +111,8 @@ pub struct Flight {
     pub tapes: Vec<RecordedTape>,
     /// What a replay of the tapes found; `None` when none was tried.
     pub replayed: Option<Replayed>,
+    /// Whether status, estimates and the vehicle's state were computed again from the tapes.
+    pub is_rebuilt: bool,
     /// What the recorder's clock is ahead of the vehicle's, in nanoseconds.
     pub shift_ns: i64,
 }

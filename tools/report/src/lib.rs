@@ -5,7 +5,8 @@
 //!
 //! Modules in reading order: [`flight`] has what a recording holds, with the autopilot's [`packets`]; [`frames`] tells
 //! what became of each frame, [`latency`] how long it took, [`track`] where the vehicle was, [`phases`] and [`journal`]
-//! what happened and why, [`losses`] what is missing, and [`summary`] all of it in numbers. [`difference`] compares
+//! what happened and why, [`losses`] what is missing, [`tape`] whether the tape
+//! gives the same again, and [`summary`] all of it in numbers. [`difference`] compares
 //! configurations. [`view`] joins these for the page: [`plots`] are its charts, drawn by [`chart`], [`sections`] its
 //! parts, in pieces of [`html`], and [`mod@page`] the whole.
 
@@ -23,12 +24,14 @@ pub mod phases;
 pub mod plots;
 pub mod sections;
 pub mod summary;
+pub mod tape;
 pub mod track;
 pub mod view;
 
 pub use flight::{Flight, FlightReader, Replayed};
 pub use page::{comparison, page};
 pub use summary::Summary;
+pub use tape::replay_tapes;
 
 /// A flight in numbers, as the page has them.
 pub fn summary(flight: &Flight) -> Summary {

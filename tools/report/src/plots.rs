@@ -52,8 +52,8 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     let reach = span(places().flat_map(|it| [it.east_m, it.north_m]), -0.3..0.3);
     let step = estimated.len().div_ceil(CIRCLES).max(1);
     let circles = estimated.iter().step_by(step).flat_map(|it| circle(it, &reach));
-    above.push(layer("2 standard deviations", Ink::Blue, Shape::Thin, circles));
-    above.push(layer("truth", Ink::Orange, Shape::Line, truth.iter().map(away)));
+    above.push(layer("circles: 2 standard deviations", Ink::Blue, Shape::Thin, circles));
+    above.push(layer("truth", Ink::Orange, Shape::Wide, truth.iter().map(away)));
     above.push(layer("estimate", Ink::Blue, Shape::Line, estimated.iter().map(away)));
     above.push(layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]));
     let start = truth.first().or(estimated.first());
@@ -78,7 +78,7 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     let right = estimated.iter().rev().map(|it| edge(it, 1.0));
     let layers = vec![
         layer("2 standard deviations", Ink::Blue, Shape::Area, left.chain(right)),
-        layer("truth", Ink::Orange, Shape::Line, truth.iter().map(side)),
+        layer("truth", Ink::Orange, Shape::Wide, truth.iter().map(side)),
         layer("estimate", Ink::Blue, Shape::Line, estimated.iter().map(side)),
         layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]),
     ];
@@ -133,11 +133,11 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
     let truth = |of: fn(&Place) -> f64| view.curve(&view.truth, |it| Some(at(it.time_s, of(it))));
     let distance = |it: &Place| it.north_m.hypot(it.east_m);
     let height = vec![
-        layer("truth", Ink::Orange, Shape::Line, truth(|it| it.height_m)),
+        layer("truth", Ink::Orange, Shape::Wide, truth(|it| it.height_m)),
         layer("estimate", Ink::Blue, Shape::Line, target(|it| it.height_m)),
     ];
     let lateral = vec![
-        layer("truth", Ink::Orange, Shape::Line, truth(distance)),
+        layer("truth", Ink::Orange, Shape::Wide, truth(distance)),
         layer("estimate", Ink::Blue, Shape::Line, target(|it| it.lateral_error_m)),
     ];
     let mut deviation = target(|it| it.deviation_m);

@@ -82,6 +82,11 @@ fn phases(view: &View<'_>) -> Section {
             ]);
         }
     }
+    if view.flight.is_rebuilt {
+        section.before = missing(
+            "the controller's status; what stands here and below is what a replay of its tape gives",
+        );
+    }
     section.after = match rows.is_empty() {
         true => missing("the controller's status"),
         false => table(&["from", "for", "phase", "reason"], &rows),
@@ -343,9 +348,14 @@ fn battery(view: &View<'_>) -> Section {
             .before
             .push_str(&missing("the charge of the battery: the autopilot did not report it"));
     }
-    let timeouts = flight.statuses.iter().rev().find_map(|status| status.setpoint_timeout_s);
-    let mut rows =
-        vec![vec![text("the autopilot stops without setpoints after"), number(timeouts, 2, "s")]];
+    let timeouts = || flight.statuses.iter().filter_map(|status| status.setpoint_timeout_s);
+    let mut rows = vec![
+        vec![
+            text("without setpoints the autopilot stops after, in the landing"),
+            number(timeouts().reduce(f64::min), 2, "s"),
+        ],
+        vec![text("the same at the end"), number(timeouts().last(), 2, "s")],
+    ];
     for (name, process) in &flight.processes {
         let is_controller = name.starts_with("controller/");
         for latency in process.last.latencies.iter().filter(|_| is_controller) {

@@ -10,7 +10,7 @@ use experiments::landing::outcome::Outcome;
 use experiments::landing::plan::{Plan, Planned, Values, Vision};
 use flightlog::{About, Entry, TapeReader, Writer};
 use report::frames::Fate;
-use report::{Flight, FlightReader, comparison, page, summary};
+use report::{Flight, FlightReader, comparison, page, replay_tapes, summary};
 
 /// The sections that a page has.
 const SECTIONS: [&str; 14] = [
@@ -186,6 +186,42 @@ fn without_a_tape_the_estimates_tell_which_frames_were_used() {
     let html = page(&flight).unwrap();
     has_all_sections(&html);
     assert!(html.contains("Not recorded: the controller&#39;s tape"), "tape");
+}
+
+#[test]
+fn a_tape_alone_gives_status_and_estimates_again() {
+    let whole = read(&landing().recording);
+    let beside = ["controller/status", "controller/target", "vehicle/state", "truth", "wind"];
+    let mut flight = read(&without(&landing().recording, &beside));
+    assert!(flight.statuses.is_empty() && flight.targets.is_empty());
+    replay_tapes(&mut flight);
+    assert!(flight.is_rebuilt && flight.replayed.as_ref().unwrap().is_verified);
+    let (told, again) = (summary(&whole), summary(&flight));
+    assert_eq!((again.landed, again.frames_used), (true, told.frames_used));
+    near(again.time_to_disarm_s, told.time_to_disarm_s, 1e-9);
+    let names = |summary: &report::Summary| -> Vec<String> {
+        summary.phases.iter().map(|phase| phase.name.clone()).collect()
+    };
+    assert_eq!(names(&again), names(&told));
+    for target in &whole.targets {
+        assert!(flight.targets.contains(target), "{target:?}");
+    }
+    let html = page(&flight).unwrap();
+    has_all_sections(&html);
+    assert!(html.contains("what a replay of its tape gives"), "said");
+    assert!(html.contains("tape verified to the bit"), "verified");
+}
+
+#[test]
+fn a_tape_with_a_gap_is_told() {
+    let mut flight = read(&landing().recording);
+    flight.tapes[0].parts.remove(9);
+    replay_tapes(&mut flight);
+    let replayed = flight.replayed.clone().unwrap();
+    assert!(!replayed.is_verified && replayed.text.contains("not replayable"), "{replayed:?}");
+    assert!(summary(&flight).line().contains("tape not verified"));
+    let losses = report::losses::tape(&flight);
+    assert!(losses[0].count > 0, "{losses:?}");
 }
 
 #[test]
