@@ -1,5 +1,6 @@
 //! A chart as SVG, in colours that the page's style changes for dark and light.
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::ops::Range;
 
@@ -20,6 +21,10 @@ const LEFT: u32 = 92;
 const LEFT_OF_ROWS: u32 = 250;
 const BELOW: u32 = 78;
 const MARGIN: u32 = 16;
+/// Largest number that is drawn.
+const MAX_NUMBER: f64 = 1e7;
+/// Dots closer than this to another are left out, in pixels of the drawing.
+const DOT_STEP: f64 = 3.0;
 
 /// A colour, which has one value in light and one in dark (`style.css`).
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
@@ -171,14 +176,16 @@ pub struct Axes {
     pub is_equal: bool,
 }
 
-/// A layer.
+/// A layer. Numbers beyond all reason are left out of it, as are those that are none.
 pub fn layer(name: &str, ink: Ink, shape: Shape, points: impl IntoIterator<Item = At>) -> Layer {
-    Layer { name: name.to_owned(), ink, shape, points: points.into_iter().collect() }
+    let sane =
+        |it: At| if it.x.abs().max(it.y.abs()) < MAX_NUMBER { it } else { at(f64::NAN, f64::NAN) };
+    Layer { name: name.to_owned(), ink, shape, points: points.into_iter().map(sane).collect() }
 }
 
 /// What values span, with some room; from `at_least` on.
 pub fn span(values: impl Iterator<Item = f64>, at_least: Range<f64>) -> Range<f64> {
-    let all = values.filter(|value| value.is_finite());
+    let all = values.filter(|value| value.abs() < MAX_NUMBER);
     let (low, high) = all.fold((at_least.start, at_least.end), |(low, high), value| {
         (low.min(value), high.max(value))
     });
@@ -219,6 +226,7 @@ impl Chart {
     /// The axes, stretched where both have the same scale.
     fn spans(&self, size: [u32; 2]) -> (Range<f64>, Range<f64>) {
         let Axes { x, y, is_equal, .. } = self.axes.clone();
+        let [x, y] = [x, y].map(drawable);
         if !is_equal {
             return (x, y);
         }
@@ -360,9 +368,9 @@ fn draw_layer(
             }
         }
         Shape::Dots => {
-            chart.draw_series(
-                finite().map(|it| Circle::new((it.x, it.y), 5, ink.mix(0.7).filled())),
-            )?;
+            let style = ink.mix(0.7).filled();
+            let dots = apart(finite().copied(), pixels);
+            chart.draw_series(dots.into_iter().map(|dot| Circle::new(dot, 5, style)))?;
         }
         Shape::Crosses => {
             let style = ink.stroke_width(4);
@@ -370,6 +378,24 @@ fn draw_layer(
         }
     }
     Ok(())
+}
+
+/// A range that can be drawn.
+fn drawable(range: Range<f64>) -> Range<f64> {
+    let reach = range.start.abs().max(range.end.abs());
+    let is_sane = reach < 1e3 * MAX_NUMBER && range.end - range.start > 1e-9 * reach;
+    if is_sane { range } else { 0.0..1.0 }
+}
+
+/// Dots without those that would fall on others.
+fn apart(points: impl Iterator<Item = At>, pixels: [f64; 2]) -> Vec<(f64, f64)> {
+    let [per_x, per_y] = pixels;
+    let cell = |value: f64| (value / DOT_STEP) as i64;
+    let mut taken = BTreeSet::new();
+    points
+        .filter(|it| taken.insert((cell(per_x * it.x), cell(per_y * it.y))))
+        .map(|it| (it.x, it.y))
+        .collect()
 }
 
 /// Each value until the next.

@@ -338,7 +338,10 @@ impl Flight {
     /// Notes what the recorder's clock is ahead of the vehicle's, where it is another one.
     fn note_clock(&mut self, received_ns: i64, stamp_ns: i64) {
         let apart_ns = received_ns.saturating_sub(stamp_ns);
-        if self.statuses.is_empty() && self.vehicle.is_empty() && apart_ns.abs() > MAX_AGE_NS {
+        if self.statuses.is_empty()
+            && self.vehicle.is_empty()
+            && apart_ns.unsigned_abs() > MAX_AGE_NS.unsigned_abs()
+        {
             self.shift_ns = apart_ns;
         }
     }

@@ -197,7 +197,8 @@ fn of_tape(tape: &RecordedTape, marker: Option<&str>) -> Vec<Handled> {
             });
         }
         if waiting < frames.len() && has_setpoint(&record.packets) {
-            let is_soon = |it: &Handled| record.now_ns - it.handled_ns <= MAX_TO_SETPOINT_NS;
+            let is_soon =
+                |it: &Handled| record.now_ns.saturating_sub(it.handled_ns) <= MAX_TO_SETPOINT_NS;
             let used = frames.iter_mut().skip(waiting).filter(|it| it.fate == Fate::Used);
             for frame in used.filter(|it| is_soon(it)) {
                 frame.setpoint_ns = Some(record.now_ns);

@@ -38,7 +38,7 @@ impl Numbers {
     }
 
     fn all(self) -> u64 {
-        self.last.saturating_sub(self.first) + 1
+        self.last.saturating_sub(self.first).saturating_add(1)
     }
 
     fn missing(self) -> u64 {
@@ -110,7 +110,7 @@ pub fn tape(flight: &Flight) -> Vec<Loss> {
     for tape in &flight.tapes {
         let (mut next, mut missing) = (0, 0);
         for part in &tape.parts {
-            missing += part.first.saturating_sub(next);
+            missing = part.first.saturating_sub(next).saturating_add(missing);
             next = part.first.saturating_add(u64::from(part.count));
         }
         losses.push(Loss {

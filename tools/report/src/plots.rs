@@ -389,7 +389,7 @@ fn trajectories(vehicle: Curve<'_>, pad: Curve<'_>) -> Vec<Chart> {
         let all = || own.iter().chain(&pads);
         let low_x = all().map(|it| it.x).fold(f64::INFINITY, f64::min);
         let low_y = all().map(|it| it.y).fold(f64::INFINITY, f64::min);
-        let finite = |value: f64| if value.is_finite() { value } else { 0.0 };
+        let finite = |value: f64| if value.abs() < 1e6 { value } else { 0.0 };
         let (low_x, low_y) = (finite(low_x), finite(low_y));
         Chart {
             title: format!("Figure 4.10: trajectory, {name}"),

@@ -232,7 +232,7 @@ fn lost(view: &View<'_>) -> Section {
     }
     let by_recorder = losses::recorder(flight);
     if !by_recorder.is_empty() {
-        let all: u64 = by_recorder.iter().map(|loss| loss.count).sum();
+        let all: u64 = by_recorder.iter().map(|loss| loss.count).fold(0, u64::saturating_add);
         section.after = details(
             &format!("{all} messages that the recorder lost, by key"),
             &table(&["where", "what", "missing", "of"], &rows(by_recorder)),
@@ -354,7 +354,7 @@ fn battery(view: &View<'_>) -> Section {
             text("without setpoints the autopilot stops after, in the landing"),
             number(timeouts().reduce(f64::min), 2, "s"),
         ],
-        vec![text("the same at the end"), number(timeouts().last(), 2, "s")],
+        vec![text("the same at the end"), number(timeouts().next_back(), 2, "s")],
     ];
     for (name, process) in &flight.processes {
         let is_controller = name.starts_with("controller/");

@@ -122,7 +122,7 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         latency_p50_ms: to_setpoint.map(|it| it.p50_ms).or(told.map(|[p50, _]| p50)),
         latency_p99_ms: to_setpoint.map(|it| it.p99_ms).or(told.map(|[_, p99]| p99)),
         detector_changes: last.map(|status| status.detector_changes),
-        messages_lost: flight.lost.values().sum(),
+        messages_lost: flight.lost.values().copied().fold(0, u64::saturating_add),
         wind_mean_m_s: node::stats::mean(&winds),
         wind_max_m_s: winds.iter().copied().reduce(f64::max),
         battery_min: battery_min(flight),

@@ -1,7 +1,7 @@
 //! One flight in lock-step: the simulated autopilot and the controller exchange MAVLink packets, detections
 //! arrive after their latency, and nothing waits for a clock.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
 
 use anyhow::Context;
@@ -82,7 +82,7 @@ struct LockstepFlight<'a> {
     controller: TapedFlight,
     recording: Option<Recording<'a>>,
     /// The configurations as TOML, by service.
-    configurations: [(&'static str, String); 2],
+    configurations: BTreeMap<&'static str, String>,
     from_world: Parser,
     to_world: Parser,
     frame_period_s: f64,
@@ -98,10 +98,10 @@ impl<'a> LockstepFlight<'a> {
         let layers = |set: &[String]| Layers { file: None, set: set.to_vec() };
         let simulated = layers(&planned.change.simulator).load::<simulator::Config>()?;
         let controlled = layers(&planned.change.controller).load::<controller::Config>()?;
-        let configurations = [
+        let configurations = BTreeMap::from([
             ("simulator", simulated.table.to_string()),
             ("controller", controlled.table.to_string()),
-        ];
+        ]);
         let (simulated, controlled) = (simulated.settings, controlled.settings);
         let world = World::new(&simulated.world(), simulated.seed);
         let vision = SimVision::new(&simulated, planned.vision, planned.change.vision)?;

@@ -52,7 +52,7 @@ impl<'a> Recording<'a> {
     pub(crate) fn started(
         &mut self,
         now_ns: i64,
-        configurations: &[(&str, String)],
+        configurations: &BTreeMap<&str, String>,
         camera: &CameraInfo,
     ) -> anyhow::Result<()> {
         for (service, toml) in configurations {
