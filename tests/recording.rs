@@ -170,7 +170,7 @@ async fn a_disk_that_is_full_read_only_or_removed_is_told_and_the_landing_goes_o
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn decisions_are_the_same_to_the_bit_beside_a_disk_that_stands_still_and_fails()
+async fn what_waits_for_a_disk_that_stands_still_is_bounded_and_what_fails_is_told_soon()
 -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
     with_second_try(disks::beside_a_flight).await

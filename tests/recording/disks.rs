@@ -12,7 +12,7 @@ use rustix::process::Pid;
 use testing::skip;
 use tokio::time::{Instant, sleep, timeout};
 
-use crate::flight::{ALIGHT, LONG, Landing, PATIENCE, output_of};
+use crate::flight::{LONG, Landing, PATIENCE};
 use crate::recorders::{Contents, command};
 
 /// Longest time until a disk that fails is told.
@@ -149,9 +149,8 @@ async fn told(
     found.with_context(|| format!("waiting until {what}; last: {last:?}"))
 }
 
-/// A landing is recorded twice: to a good disk, and with every pixel at 30 frames a second to one that stands still, is full,
-/// and from which the file is removed. The tape on the good one is verified: what the controller decided is what it would
-/// have decided without the other, to the bit.
+/// A landing is recorded twice: as usual, and with every pixel at 30 frames a second to a disk that stands still, is full, and
+/// from which the file is removed.
 pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("disk");
@@ -209,11 +208,6 @@ pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
         ensure!(told < MAX_UNTOLD, "it was told after {told:?}");
     }
     ensure!(max_mb - before_mb < MAX_HELD_MB, "{max_mb} MB after {before_mb} MB");
-    ensure!(Contents::read(&good)?.dropped.values().sum::<u64>() == 0, "the good one lost some");
-    let replay = output_of(Command::new(ALIGHT).args(["replay", name, "--verify"]))?;
-    let said = String::from_utf8_lossy(&replay.stdout).into_owned();
-    println!("{said}");
-    ensure!(replay.status.success() && said.contains("verified"), "{said}");
     Ok(())
 }
 
