@@ -5,7 +5,7 @@ use landing::{Measured, MountFindings};
 use crate::refusals::Warning;
 
 /// Maximum difference between the configured and the measured standing height that is not told, in metres: the error of
-/// the measurement.
+/// the measurement (`landing`'s module `standing`).
 const MAX_STANDING_ERROR_M: f64 = 0.15;
 
 /// The warnings of what was measured in flight.
@@ -59,7 +59,7 @@ pub fn standing_warning(measured_m: f64, configured_m: f64) -> Option<Warning> {
     (measured_m - configured_m > MAX_STANDING_ERROR_M).then(|| Warning {
         matter: "standing-height".to_owned(),
         text: format!(
-            "the vehicle stood about {measured_m:.1} m over the pad, not {configured_m:.2} m: measure how high the autopilot sits over the ground, and set `metric.standing_height_m`"
+            "the vehicle stood about {measured_m:.1} m over the pad, not {configured_m:.2} m: measure how high the autopilot sits over the ground, and write it into `metric.standing_height_m`"
         ),
     })
 }

@@ -4,7 +4,7 @@ use autopilot::{Autopilot, LandedState};
 use landing::{Action, Decision, Lander};
 use messages::{ControllerStatus, Phase, Setpoint, TargetEstimate};
 
-use crate::config::{Config, Mode, Start};
+use crate::config::{Config, GuidanceName, Mode, Start};
 use crate::frames::Frames;
 use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
@@ -110,7 +110,8 @@ impl View<'_> {
         let mut warnings = self.frames.warnings(now_ns);
         warnings.extend(mount::warnings(&self.lander.mount_findings()));
         let configured_m = self.config.metric.standing_height_m;
-        let measured_m = self.lander.standing_height_m();
+        let is_metric = self.config.guidance == GuidanceName::Metric;
+        let measured_m = self.lander.standing_height_m().filter(|_| is_metric);
         warnings.extend(measured_m.and_then(|it| mount::standing_warning(it, configured_m)));
         warnings
     }

@@ -17,8 +17,12 @@ fn chosen() -> Target {
     // caught ends it all the same. Each place is told once.
     std::panic::set_hook(Box::new(|panic| {
         let place = panic.location().map(ToString::to_string).unwrap_or_default();
+        let is_ours = fuzz::is_of_this_workspace(&place);
         if PANICS.lock().unwrap_or_else(PoisonError::into_inner).insert(place) {
             eprintln!("{panic}");
+        }
+        if is_ours {
+            std::process::abort();
         }
     }));
     let name = std::env::var("FUZZ_TARGET").unwrap_or_default();

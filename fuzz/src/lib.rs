@@ -46,3 +46,9 @@ pub const TARGETS: [Target; 12] = [
 pub fn target(name: &str) -> Option<Target> {
     TARGETS.into_iter().find(|target| target.name == name)
 }
+
+/// Whether a panic at this place, `FILE:LINE:COLUMN`, is one of this workspace, and not of a decoder that is contained:
+/// the compiler names the workspace's own files relative to it.
+pub fn is_of_this_workspace(place: &str) -> bool {
+    !std::path::Path::new(place).is_absolute()
+}

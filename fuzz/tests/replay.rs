@@ -1,6 +1,7 @@
 //! What fuzzing has found and kept is read again, by every run of the tests.
 
 use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use anyhow::{Context, ensure};
@@ -9,8 +10,16 @@ use fuzz::{MAX_MEMORY_MB, MAX_TIME_S, TARGETS};
 /// The most that the corpus may take in the repository, in bytes.
 const MAX_CORPUS_BYTES: u64 = 200_000;
 
+static OWN_PANICS: AtomicUsize = AtomicUsize::new(0);
+
 #[test]
 fn every_kept_input_is_read_without_a_panic_in_bounded_time_and_memory() -> anyhow::Result<()> {
+    // What the readers contain is a decoder's panic, never one of their own.
+    std::panic::set_hook(Box::new(|panic| {
+        let place = panic.location().map(ToString::to_string).unwrap_or_default();
+        eprintln!("{panic}");
+        OWN_PANICS.fetch_add(usize::from(fuzz::is_of_this_workspace(&place)), Ordering::Relaxed);
+    }));
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
     let mut bytes = 0;
     for target in TARGETS {
@@ -31,6 +40,8 @@ fn every_kept_input_is_read_without_a_panic_in_bounded_time_and_memory() -> anyh
         ensure!(count > 0, "{folder:?} is empty");
         println!("{}: {count} inputs", target.name);
     }
+    let own_panics = OWN_PANICS.load(Ordering::Relaxed);
+    ensure!(own_panics == 0, "{own_panics} panics of this workspace");
     ensure!(bytes <= MAX_CORPUS_BYTES, "the corpus has {bytes} bytes");
     Ok(())
 }

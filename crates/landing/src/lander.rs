@@ -207,9 +207,8 @@ impl Lander {
             is_link_slow: self.is_link_slow,
         };
         if self.state_machine.advance(&inputs) {
-            self.guidance =
-                ActiveGuidance::new(self.standing_height.applied_to(self.config.guidance));
-            self.standing_height.begin();
+            self.guidance = ActiveGuidance::new(self.config.guidance);
+            self.standing_height = StandingHeight::default();
             self.first_seen = None;
             if self.axis_mismatch().is_some() {
                 self.axis_check = AxisConsistencyCheck::default();
@@ -236,10 +235,9 @@ impl Lander {
         self.mount_check.findings()
     }
 
-    /// The height of the body's origin over the pad on which the last landing ended, in metres, once that
-    /// was measured and is not small.
+    /// The height of the body's origin over the pad in metres, after a landing that measured it and where it is not small.
     pub fn standing_height_m(&self) -> Option<f64> {
-        self.standing_height.measured_m()
+        self.standing_height.measured_m().filter(|_| self.phase() == Phase::Landed)
     }
 
     fn vehicle(&mut self, now: Timestamp, state: VehicleState) -> Result<(), Rejection> {
@@ -260,7 +258,9 @@ impl Lander {
             self.landed(now) == Landed::OnGround && state.velocity.norm() <= MAX_STANDING_M_S;
         if is_standing {
             self.ground = self.place();
-            self.standing_height.observe(self.phase(), self.target(now));
+            if self.phase() == Phase::Final && !self.pad_moves() {
+                self.standing_height.observe(self.target(now));
+            }
         }
         Ok(())
     }

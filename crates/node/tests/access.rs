@@ -21,9 +21,17 @@ const ROLES: [(&str, &str); 9] = [
     ("observer", "observer"),
 ];
 
-/// The incoming messages by which a role subscribes, publishes, queries or replies.
-const MESSAGES: [&str; 6] =
-    ["declare_subscriber", "put", "query", "reply", "declare_queryable", "liveliness_token"];
+/// The incoming messages by which a role subscribes, publishes, queries, replies and sees who is there.
+const MESSAGES: [&str; 8] = [
+    "declare_subscriber",
+    "put",
+    "query",
+    "reply",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+];
 
 fn access() -> anyhow::Result<Value> {
     let config: Value = json5::from_str(SECURED_CONFIG)?;
@@ -177,6 +185,17 @@ fn no_role_has_rights_to_wildcards() -> anyhow::Result<()> {
         .collect();
     let known: BTreeSet<_> = ROLES.iter().map(|(_, service)| *service).chain(["relay"]).collect();
     ensure!(named.is_subset(&known), "no role for {:?}", named.difference(&known));
+    Ok(())
+}
+
+#[test]
+fn every_role_sees_who_is_there() -> anyhow::Result<()> {
+    let access = access()?;
+    for (role, _) in ROLES {
+        for message in ["liveliness_query", "declare_liveliness_subscriber"] {
+            ensure!(may(&rights(&access, role), message, "a-drone/alive/**")?, "{role}: {message}");
+        }
+    }
     Ok(())
 }
 
