@@ -42,7 +42,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     let beside = args.files.first().map(|file| file.with_extension("html")).unwrap_or_default();
     let output = args.output.as_ref().unwrap_or(&beside);
     ensure!(
-        !args.files.contains(output),
+        !args.files.iter().any(|file| is_same_file(file, output)),
         "{output:?} is a recording; name another file for the page with `--output`"
     );
     std::fs::write(output, html)
@@ -56,6 +56,12 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     }
     write_error(&format!("the page: {}", output.display()));
     Ok(ExitCode::SUCCESS)
+}
+
+/// Whether two paths lead to one file that is there.
+fn is_same_file(one: &Path, other: &Path) -> bool {
+    one == other
+        || one.canonicalize().ok().zip(other.canonicalize().ok()).is_some_and(|(a, b)| a == b)
 }
 
 /// The flights in files; a file that shares a tape with one before it goes on with its flight.

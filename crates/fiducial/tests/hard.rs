@@ -300,20 +300,24 @@ fn targets_of_evenly_wide_rings_are_no_marker() {
 }
 
 #[test]
-fn small_targets_of_evenly_wide_rings_are_no_marker_to_ordinary_cameras() {
+fn small_targets_of_evenly_wide_rings_are_no_marker_to_any_camera() {
     let camera = CameraModel::pinhole(1000, 800, 909.0);
-    for preset in [Preset::Usb, Preset::RaspberryPi, Preset::ActionCamera, Preset::Phone] {
+    let mut taken = Vec::new();
+    for preset in Preset::ALL {
         for rings in [2, 3] {
-            for radius_px in [7.0, 8.5, 10.0, 11.5] {
+            for radius_px in [5.5, 7.0, 8.5, 10.0, 11.5, 13.0, 16.0] {
                 let light = target(rings, radius_px);
                 let shown = preset.processing().apply(light.pixels(), 1000).unwrap();
                 let mut image = GrayImage::filled(1000, 800, 0);
                 image.pixels_mut().copy_from_slice(&shown);
-                let found = find(&image, &camera);
-                assert_eq!(found, None, "{preset}: {rings} rings of {radius_px} px");
+                if find(&image, &camera).is_some() {
+                    taken.push(format!("{preset}: {rings} rings of {radius_px} px"));
+                }
             }
         }
     }
+    // The one that is known: its edges decide, and its tone curve narrows its rings to the marker's.
+    assert_eq!(taken, ["action-camera: 2 rings of 16 px"]);
 }
 
 #[test]

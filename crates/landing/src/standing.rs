@@ -35,7 +35,8 @@ impl StandingHeight {
                 && target.lateral_error_m <= MAX_LATERAL_M
         };
         if let Some(target) = target.filter(is_sound) {
-            self.lowest_m = Some(self.lowest_m.unwrap_or(f64::INFINITY).min(target.height_m));
+            let lowest_m = self.lowest_m.filter(|lowest_m| *lowest_m <= target.height_m);
+            self.lowest_m = Some(lowest_m.unwrap_or(target.height_m));
         }
     }
 

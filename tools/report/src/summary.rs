@@ -102,7 +102,7 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         guidance: last.map(|status| status.guidance.clone()),
         phase: last.map(|status| status.phase.name().to_owned()),
         why: last.map(|status| status.why.clone()),
-        landed: last.is_some_and(|status| status.phase == Phase::Landed) || disarmed_ns.is_some(),
+        landed: last.is_some_and(|status| status.phase == Phase::Landed),
         time_to_disarm_s: disarmed_ns.and_then(since_start_s),
         time_to_touchdown_s: touchdown
             .map(|it| it.stamp_ns)

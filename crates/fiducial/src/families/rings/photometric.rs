@@ -102,7 +102,7 @@ impl PhotometricInput<'_> {
             first = sparse.with_mosaic(plain, first);
             (all.extras, all.mosaic) = (sparse.extras, sparse.mosaic);
         }
-        all.radii_count = all.mosaic.is_some() && diameter_px < MAX_RADII_PX;
+        all.radii_count = diameter_px < MAX_RADII_PX;
         let fit_all = |fit: ModelFit| match stride {
             1 => Some(fit),
             _ => all.fitted(Start::like(&fit.model.pose, &fit)),

@@ -38,13 +38,15 @@ impl PixelResponse {
     }
 
     /// As a camera of this response shows it. `blurred` is the same pixel blurred further by the sharpening's
-    /// kernel, to `1 / blur_ratio` times the blur, and `ratio_by_blur` the derivative of the ratio.
+    /// kernel, to `1 / blur_ratio` times the blur; `ratio_by_blur` and `wide_by_blur` are the derivatives of the ratio and of
+    /// that wider blur by the lens'.
     pub(super) fn processed(
         &self,
         response: &CameraResponse,
         blurred: &Self,
         blur_ratio: f64,
         ratio_by_blur: f64,
+        wide_by_blur: f64,
     ) -> Self {
         let seen = response.shown(self.white(), blurred.white(), blur_ratio);
         let both = |own: f64, wide: f64| seen.by_own * own + seen.by_blurred * wide;
@@ -53,7 +55,7 @@ impl PixelResponse {
             shown: seen.white,
             distance_by_pose: self.distance_by_pose,
             by_distance: both(self.by_distance, blurred.by_distance),
-            by_blur: both(self.by_blur, blurred.by_blur * blur_ratio)
+            by_blur: both(self.by_blur, blurred.by_blur * wide_by_blur)
                 + seen.by_ratio * ratio_by_blur,
             by_motion: [
                 both(self.by_motion[0], blurred.by_motion[0]),

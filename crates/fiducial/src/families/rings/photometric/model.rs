@@ -125,4 +125,8 @@ pub(crate) struct Radii {
     pub(crate) off: f64,
     /// The largest standard deviation of a difference.
     pub(crate) deviation: f64,
+    /// Where between the marker (0) and a target of evenly wide rings without a dot (1) the image lies, and the standard
+    /// deviation of that.
+    pub(crate) evenness: f64,
+    pub(crate) evenness_deviation: f64,
 }

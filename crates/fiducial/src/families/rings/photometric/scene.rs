@@ -19,7 +19,7 @@ const MIN_DIAMETER_PX: f64 = 5.0;
 /// Up to this diameter all pixels are used, above it those about the edges.
 pub(super) const ALL_PIXELS_PX: f64 = 22.0;
 /// Up to this diameter the radii are compared with other rings'.
-pub(super) const MAX_RADII_PX: f64 = 36.0;
+pub(super) const MAX_RADII_PX: f64 = 48.0;
 /// Approximate number of pixels used of a larger marker.
 const EDGE_SAMPLES: f64 = 260.0;
 /// Blur of a lens in focus together with the pixel's own extent, as a standard deviation in pixels.

@@ -65,21 +65,41 @@ impl RingModel {
 
 /// The unknowns of a fit in which radii are free as well.
 const UNKNOWNS_WITH_RADII: usize = UNKNOWNS_WITH_EXTRAS + FREE_RADII;
+/// The columns of both: the radii by themselves, and all of them together towards evenly wide rings.
+const COLUMNS: usize = UNKNOWNS_WITH_RADII + 1;
+/// The unknowns of a fit in which the rings may become evenly wide.
+const UNKNOWNS_WITH_EVENNESS: usize = UNKNOWNS_WITH_EXTRAS + 1;
+/// Radii of the circles between the outermost and the dot of a target of evenly wide rings, in units of the outermost.
+const EVEN_RADII: [f64; FREE_RADII] = [0.75, 0.5, 0.25];
 
 impl RingModel {
-    /// One step of a fit in which the radii of the circles between the outermost and the dot are free.
+    /// One step of a fit in which the radii of the circles between the outermost and the dot are free, and one of a fit in
+    /// which all three change together to those of evenly wide rings, and the dot disappears.
     pub(super) fn radii(&self, scene: &Scene<'_>, huber_limit: f64) -> Option<Radii> {
-        let mut matrix = SMatrix::<f64, UNKNOWNS_WITH_RADII, UNKNOWNS_WITH_RADII>::zeros();
-        let mut right = SVector::<f64, UNKNOWNS_WITH_RADII>::zeros();
+        let mut matrix = SMatrix::<f64, COLUMNS, COLUMNS>::zeros();
+        let mut right = SVector::<f64, COLUMNS>::zeros();
         let (mut count, mut squares) = (0.0, 0.0);
+        let [(outer, _), between @ .., _dot, _middle] = scene.radii;
+        let to_even: [f64; FREE_RADII] =
+            std::array::from_fn(|index| match (between.get(index), EVEN_RADII.get(index)) {
+                (Some((radius, _)), Some(even)) => (even * outer / radius).ln(),
+                _ => 0.0,
+            });
+        let towards_even = |by_radii: &[f64; FREE_RADII], inside: &[f64; 6]| {
+            let by: f64 = by_radii.iter().zip(to_even).map(|(by, to)| by * to).sum();
+            by + inside[4] - inside[5]
+        };
         self.for_each_place(scene, |sample, radius, wide| {
             let mut shown = radius.response(scene);
             let mut by_radii = radius.by_log_radii(scene);
+            let mut by_evenness = towards_even(&by_radii, &shown.inside);
             if let Some(wide) = wide {
                 let own = shown.white();
                 let blurred = wide.radius.response(scene);
                 let seen = self.response.shown(own, blurred.white(), wide.ratio);
                 let by_wide = wide.radius.by_log_radii(scene);
+                let wide_by_evenness = towards_even(&by_wide, &blurred.inside);
+                by_evenness = seen.by_own * by_evenness + seen.by_blurred * wide_by_evenness;
                 for (own, wide) in by_radii.iter_mut().zip(by_wide) {
                     *own = seen.by_own * *own + seen.by_blurred * wide;
                 }
@@ -95,7 +115,7 @@ impl RingModel {
             squares += weight * residual * residual;
             let [x, y] = sample.offset;
             let white = shown.shown;
-            let mut gradient = SVector::<f64, UNKNOWNS_WITH_RADII>::zeros();
+            let mut gradient = SVector::<f64, COLUMNS>::zeros();
             let by_distance = contrast * shown.by_distance;
             let by_extras = match scene.extras {
                 Extras::Nothing => [0.0; 2],
@@ -108,27 +128,69 @@ impl RingModel {
                 .into_iter()
                 .chain([contrast * shown.by_blur, 1.0 - white, white, white * x, white * y])
                 .chain(by_extras.map(|by| by * contrast))
-                .chain(by_radii.map(|by| by * contrast));
+                .chain(by_radii.map(|by| by * contrast))
+                .chain([by_evenness * contrast]);
             for (slot, part) in gradient.iter_mut().zip(parts) {
                 *slot = part;
             }
             matrix.syger(weight, &gradient, &gradient, 1.0);
             right += gradient * (weight * residual);
         })?;
-        for i in 0..UNKNOWNS_WITH_RADII {
+        for i in 0..COLUMNS {
             matrix[(i, i)] += 1e-9;
         }
-        let inverse = matrix.cholesky()?.inverse();
-        let step = inverse * right;
-        let free = (count - UNKNOWNS_WITH_RADII as f64).max(1.0);
-        let variance = (squares - step.dot(&right)).max(0.0) / free + 1.0 / 12.0;
-        let [(outer, _), free @ .., _dot, _middle] = scene.radii;
+        matrix.fill_upper_triangle_with_lower_triangle();
+        let information = matrix.remove_fixed_rows::<1>(UNKNOWNS_WITH_RADII);
+        let information = information.remove_fixed_columns::<1>(UNKNOWNS_WITH_RADII);
+        let with_radii = Step::solve(
+            information,
+            right.remove_fixed_rows::<1>(UNKNOWNS_WITH_RADII),
+            count,
+            squares,
+        )?;
         let (mut off, mut deviation) = (0.0_f64, 0.0_f64);
-        for (index, (radius, _)) in (UNKNOWNS_WITH_EXTRAS..).zip(free) {
-            off = off.max(radius / outer * step[index].abs());
-            deviation = deviation.max(radius / outer * (variance * inverse[(index, index)]).sqrt());
+        for (index, (radius, _)) in (UNKNOWNS_WITH_EXTRAS..).zip(between) {
+            off = off.max(radius / outer * with_radii.step[index].abs());
+            deviation = deviation.max(radius / outer * with_radii.variance[index].sqrt());
         }
-        Some(Radii { off, deviation })
+        let information = matrix.remove_fixed_rows::<FREE_RADII>(UNKNOWNS_WITH_EXTRAS);
+        let information = information.remove_fixed_columns::<FREE_RADII>(UNKNOWNS_WITH_EXTRAS);
+        let with_evenness: Step<UNKNOWNS_WITH_EVENNESS> = Step::solve(
+            information,
+            right.remove_fixed_rows::<FREE_RADII>(UNKNOWNS_WITH_EXTRAS),
+            count,
+            squares,
+        )?;
+        Some(Radii {
+            off,
+            deviation,
+            evenness: with_evenness.step[UNKNOWNS_WITH_EXTRAS],
+            evenness_deviation: with_evenness.variance[UNKNOWNS_WITH_EXTRAS].sqrt(),
+        })
+    }
+}
+
+/// A step of linear least squares, and the variances of the unknowns after it.
+struct Step<const N: usize> {
+    step: SVector<f64, N>,
+    variance: SVector<f64, N>,
+}
+
+impl<const N: usize> Step<N> {
+    /// The step of `count` residuals whose weighted squares sum up to `squares`; `None` when an unknown stays open.
+    fn solve(
+        information: SMatrix<f64, N, N>,
+        right: SVector<f64, N>,
+        count: f64,
+        squares: f64,
+    ) -> Option<Self> {
+        let inverse = information.cholesky()?.inverse();
+        let step = inverse * right;
+        let free = (count - N as f64).max(1.0);
+        let variance = (squares - step.dot(&right)).max(0.0) / free + 1.0 / 12.0;
+        let variance = inverse.diagonal() * variance;
+        let is_finite = step.iter().chain(&variance).all(|value| value.is_finite());
+        is_finite.then_some(Self { step, variance })
     }
 }
 

@@ -46,6 +46,8 @@ pub(super) struct Sharpened {
     /// The blur over that with the kernel, and its derivative by the blur.
     pub(super) ratio: f64,
     ratio_by_blur: f64,
+    /// Derivative of the blur with the kernel by the lens' blur.
+    wide_by_blur: f64,
 }
 
 impl Sharpened {
@@ -57,7 +59,7 @@ impl Sharpened {
         blurred: &PixelResponse,
         response: &CameraResponse,
     ) -> PixelResponse {
-        own.processed(response, blurred, self.ratio, self.ratio_by_blur)
+        own.processed(response, blurred, self.ratio, self.ratio_by_blur, self.wide_by_blur)
     }
 }
 
@@ -110,6 +112,7 @@ impl RingModel {
         let wide = (!is_linear).then(|| Blur::new(wide_px, self.motion));
         let ratio = blur_px / wide_px;
         let ratio_by_blur = (1.0 - ratio * ratio) / wide_px * (self.blur_px / blur_px);
+        let wide_by_blur = self.blur_px / wide_px;
         for samples in scene.samples.chunks(BATCH * scene.stride) {
             let mut counted = samples.iter().step_by(scene.stride);
             let last = samples.last()?;
@@ -133,7 +136,7 @@ impl RingModel {
                 }
                 let wide = wide.as_ref().map(|wide| {
                     let radius = RadiusDistribution::about(&sample.ray, &plane, wide);
-                    Sharpened { radius, ratio, ratio_by_blur }
+                    Sharpened { radius, ratio, ratio_by_blur, wide_by_blur }
                 });
                 visit(sample, radius, wide.as_ref());
             }
