@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context;
 use flightlog::Record;
@@ -19,6 +20,11 @@ use crate::server::{Server, serve};
 /// The reason for which a recorder that serves beyond this machine counts an error in its health.
 const INSECURE: &str = "insecure: anyone in reach can follow the flight";
 
+/// The reason for which one is counted whose viewers' address cannot be had.
+const UNSERVED: &str = "viewers are not served";
+/// Period in which an address that cannot be had is tried again.
+const RETRY_PERIOD: Duration = Duration::from_secs(2);
+
 /// Offers messages while somebody follows; without anybody it costs nothing.
 pub(crate) struct Live {
     hub: Arc<Hub>,
@@ -30,26 +36,26 @@ pub(crate) struct Live {
 }
 
 impl Live {
-    /// Listens where the configuration says so; `None` when it does not.
+    /// Listens where the configuration says so; `None` when it does not. A recording does not depend on it: where there is a
+    /// file, an address that cannot be had is tried again.
     ///
     /// # Errors
-    /// When the address is taken or of another machine.
+    /// When the address is taken or of another machine, and there is no file.
     pub(crate) async fn listen(node: &Node, config: &Config) -> anyhow::Result<Option<Self>> {
         if config.serve.is_empty() {
             return Ok(None);
         }
         let address: SocketAddr = config.serve.parse().context("`serve`")?;
-        let listener = TcpListener::bind(address).await.with_context(|| {
-            format!("listening at {address} for viewers; another program has the port, or the address is of another machine: choose another with `--serve IP:PORT`")
-        })?;
-        let address = listener.local_addr().context("the address for viewers")?;
-        tracing::info!("Foxglove and Lichtblick follow the flight at ws://{address}");
         let health = node.shared_health();
-        if !address.ip().is_loopback() && health.failed(INSECURE) {
-            tracing::warn!(
-                "INSECURE: anyone in reach of {address} can follow the flight, pictures included"
-            );
-        }
+        let listener = match bind(address).await {
+            Ok(listener) => Some(listener),
+            Err(problem) if config.has_file() => {
+                health.failed(UNSERVED);
+                tracing::error!(problem = format!("{problem:#}"), "No viewer is served yet");
+                None
+            }
+            Err(problem) => return Err(problem),
+        };
         let hub = Arc::new(Hub::new(config.max_clients as usize));
         let server = Server {
             hub: Arc::clone(&hub),
@@ -61,8 +67,8 @@ impl Live {
         let failures = Arc::clone(&health);
         let task = tokio::spawn(async move {
             // The recording goes on.
-            if let Err(problem) = serve(listener, server).await {
-                failures.failed("viewers are not served");
+            if let Err(problem) = serve_at(address, listener, server, &failures).await {
+                failures.failed(UNSERVED);
                 tracing::error!(problem = format!("{problem:#}"), "No viewer is served any more");
             }
         });
@@ -112,6 +118,38 @@ impl Live {
             self.health.dropped("a viewer is too slow");
         }
     }
+}
+
+async fn bind(address: SocketAddr) -> anyhow::Result<TcpListener> {
+    TcpListener::bind(address).await.with_context(|| {
+        format!("listening at {address} for viewers; another program has the port, or the address is of another machine: choose another with `--serve IP:PORT`")
+    })
+}
+
+/// Serves viewers; without a listener once the address can be had.
+async fn serve_at(
+    address: SocketAddr,
+    listener: Option<TcpListener>,
+    server: Server,
+    health: &HealthCounters,
+) -> anyhow::Result<()> {
+    let listener = match listener {
+        Some(listener) => listener,
+        None => loop {
+            tokio::time::sleep(RETRY_PERIOD).await;
+            if let Ok(listener) = bind(address).await {
+                break listener;
+            }
+        },
+    };
+    let address = listener.local_addr().context("the address for viewers")?;
+    tracing::info!("Foxglove and Lichtblick follow the flight at ws://{address}");
+    if !address.ip().is_loopback() && health.failed(INSECURE) {
+        tracing::warn!(
+            "INSECURE: anyone in reach of {address} can follow the flight, pictures included"
+        );
+    }
+    serve(listener, server).await
 }
 
 impl Drop for Live {

@@ -38,7 +38,7 @@ const OTHER_KEYS: &str = "other keys";
 /// Records until shutdown. A disk that fails ends nothing: it is told, what is lost is counted, and another file is tried.
 ///
 /// # Errors
-/// When another recorder has this name, the address for viewers is taken, the network session cannot be used, or the last
+/// When another recorder has this name, the address for viewers is taken and there is no file, the network session cannot be used, or the last
 /// file could not be ended.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(&config.id).await?;

@@ -213,6 +213,36 @@ fn says(told: &Value, part: &str) -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn an_address_that_is_taken_costs_no_recording_and_is_tried_again() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("flight.mcap");
+    let ([meet, port], _, _) = ports::free()?;
+    let taken = std::net::TcpListener::bind(("127.0.0.1", port))?;
+    let set = vec![format!("serve=127.0.0.1:{port}"), format!("file={path:?}")];
+    let config = Layers { file: None, set }.load::<Config>()?.settings;
+    let node = open("recorder", meet).await?;
+    let task = tokio::spawn(recorder::run(node.clone(), config, Shutdown::on_signals()?));
+    let recorded = timeout(PATIENCE, async {
+        while !path.is_file() {
+            sleep(Duration::from_millis(20)).await;
+        }
+    });
+    recorded.await.context("the recorder makes no file")?;
+    let errors = node.health().report(node.identity(), 0).errors;
+    ensure!(errors.iter().any(|it| it.reason.contains("viewers")), "{errors:?}");
+    drop(taken);
+    let reached = timeout(PATIENCE, async {
+        while TcpStream::connect(("127.0.0.1", port)).await.is_err() {
+            sleep(Duration::from_millis(20)).await;
+        }
+    });
+    reached.await.context("the recorder does not listen")?;
+    ensure!(!task.is_finished(), "the recorder ended");
+    task.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn messages_are_served_without_a_file_under_both_names_of_the_protocol() -> anyhow::Result<()>
 {
     let served = Served::start(&["file="]).await?;

@@ -87,7 +87,9 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
     };
     let disarmed_ns = flight.statuses.iter().find_map(|status| status.disarmed_ns);
     let touchdown = flight.truth.iter().find_map(|truth| truth.touchdown);
-    let standing = flight.vehicle.iter().skip_while(|it| it.landed != LandedState::InAir);
+    let zero_ns = flight.zero_ns();
+    let of_landing = flight.vehicle.iter().filter(|it| it.stamp_ns >= zero_ns);
+    let standing = of_landing.skip_while(|it| it.landed != LandedState::InAir);
     let standing_ns =
         standing.skip_while(|it| it.landed != LandedState::OnGround).map(|it| it.stamp_ns).next();
     let errors_m: Vec<f64> =
