@@ -171,7 +171,8 @@ pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
     let statuses = landing.node.subscriber(topic::RECORDER_STATUS, &["failing"]).await?;
     let healths = landing.node.subscriber(topic::HEALTH, &["controller", "main"]).await?;
     let file = format!("file={:?}", path.join("flights/failing.mcap"));
-    let pid = landing.start_by_hand("recorder", &["id=failing", &file, "frames=raw", "max_waiting_mb=16"])?;
+    let pid = landing
+        .start_by_hand("recorder", &["id=failing", &file, "frames=raw", "max_waiting_mb=16"])?;
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
     landing.status("it holds", |s| s.phase == Phase::Hold).await?;

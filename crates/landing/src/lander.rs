@@ -258,9 +258,8 @@ impl Lander {
             self.landed(now) == Landed::OnGround && state.velocity.norm() <= MAX_STANDING_M_S;
         if is_standing {
             self.ground = self.place();
-            if self.phase() == Phase::Final && !self.pad_moves() {
-                self.standing_height.observe(self.target(now));
-            }
+            let target = self.target(now).filter(|_| self.phase() == Phase::Final);
+            self.standing_height.observe(target.filter(|_| !self.pad_moves()));
         }
         Ok(())
     }
