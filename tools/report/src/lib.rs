@@ -6,7 +6,7 @@
 //! Modules in reading order: [`flight`] has what a recording holds, with the autopilot's [`packets`]; [`frames`] tells
 //! what became of each frame, [`latency`] how long it took, [`track`] where the vehicle was, [`phases`] and [`journal`]
 //! what happened and why, [`losses`] what is missing, [`tape`] whether the tape
-//! gives the same again, and [`summary`] all of it in numbers. [`difference`] compares
+//! gives the same again, and [`mod@summary`] all of it in numbers. [`difference`] compares
 //! configurations. [`view`] joins these for the page: [`plots`] are its charts, drawn by [`chart`], [`sections`] its
 //! parts, in pieces of [`html`], and [`mod@page`] the whole.
 
