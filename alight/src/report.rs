@@ -66,27 +66,21 @@ fn is_same_file(one: &Path, other: &Path) -> bool {
 
 /// The flights in files; a file that shares a tape with one before it goes on with its flight.
 fn flights(files: &[PathBuf]) -> anyhow::Result<Vec<Flight>> {
-    let mut readers: Vec<(Vec<i64>, FlightReader)> = Vec::new();
+    let mut readers: Vec<FlightReader> = Vec::new();
     for file in files {
         let recording = std::fs::read(file).with_context(|| format!("reading {file:?}"))?;
         let mut alone = FlightReader::new(&name(file));
         alone.add(&recording).with_context(|| format!("{file:?} is no recording (MCAP file)"))?;
-        let flight = alone.clone().finish();
         ensure!(
-            !flight.is_empty(),
+            !alone.is_empty(),
             "nothing of a flight is in {file:?}; `alight land --record` and `alight record` write recordings"
         );
-        let begins: Vec<i64> = flight.tapes.iter().map(|tape| tape.begun_ns).collect();
-        let same = readers.iter_mut().find(|(known, _)| begins.iter().any(|it| known.contains(it)));
-        match same {
-            Some((known, reader)) => {
-                reader.add(&recording).with_context(|| format!("reading {file:?}"))?;
-                known.extend(begins);
-            }
-            None => readers.push((begins, alone)),
+        match readers.iter_mut().find(|reader| reader.shares_tape_with(&alone)) {
+            Some(same) => same.add(&recording).with_context(|| format!("reading {file:?}"))?,
+            None => readers.push(alone),
         }
     }
-    let flight = |(_, reader): (_, FlightReader)| {
+    let flight = |reader: FlightReader| {
         let mut flight = reader.finish();
         replay_tapes(&mut flight);
         flight
@@ -124,12 +118,13 @@ mod tests {
     #[test]
     fn files_that_share_a_tape_are_one_flight_and_others_are_not() {
         let folder = tempfile::tempdir().unwrap();
-        let write = |name: &str, begun_ns: i64| {
+        let write = |name: &str, begun_ns: i64, records: &[u8]| {
             let file = folder.path().join(name);
             let mut recording = Vec::new();
             let about = flightlog::About::default();
             let mut writer = flightlog::Writer::new(&mut recording, &about).unwrap();
-            let tape = messages::Tape { begun_ns, ..messages::Tape::default() };
+            let records = records.to_vec();
+            let tape = messages::Tape { begun_ns, records, ..messages::Tape::default() };
             let payload = messages::encode(&tape);
             let key = messages::topic::TAPE.key(&[]);
             let message = flightlog::Received {
@@ -143,8 +138,13 @@ mod tests {
             std::fs::write(&file, recording).unwrap();
             file
         };
-        let files = [write("one.mcap", 3), write("one-2.mcap", 3), write("two.mcap", 4)];
+        let files = [
+            write("one.mcap", 3, b"one"),
+            write("one-2.mcap", 3, b"one"),
+            write("two.mcap", 4, b"one"),
+            write("in-lock-step.mcap", 3, b"two"),
+        ];
         let names: Vec<String> = flights(&files).unwrap().into_iter().map(|it| it.name).collect();
-        assert_eq!(names, ["one.mcap", "two.mcap"]);
+        assert_eq!(names, ["one.mcap", "two.mcap", "in-lock-step.mcap"]);
     }
 }

@@ -1,13 +1,10 @@
 //! The controllers' tapes in recordings.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use mcap::read::{LinearReader, Options};
-use mcap::records::Record;
 use messages::{Tape, decode, topic};
 
-use crate::channel::{RAW_PREFIX, split_raw};
-use crate::repair::{contained, records_of};
+use crate::reader::{Entry, read};
 use crate::writer::Problem;
 
 /// The tape of one controller, as far as recordings have it.
@@ -34,58 +31,41 @@ impl TapeReader {
     /// # Errors
     /// When it is no MCAP file at all.
     pub fn read(&mut self, recording: &[u8]) -> Result<(), Problem> {
-        if !recording.starts_with(mcap::MAGIC) {
-            return Err(mcap::McapError::BadMagic.into());
-        }
-        let key = format!("{RAW_PREFIX}{}", topic::TAPE.key(&[]));
-        let mut channels = BTreeSet::new();
-        let mut chunks = 0;
-        let options = Options::IgnoreEndMagic.into();
-        let mut reader = LinearReader::new_with_options(recording, options)?;
-        while let Some(record) = contained(|| reader.next().transpose()).transpose() {
-            match record {
-                Ok(Record::Chunk { header, data }) => {
-                    chunks += 1;
-                    match records_of(header, &data) {
-                        Ok(records) => self.add(&records, &key, &mut channels),
-                        Err(problem) => {
-                            self.damage.push(format!("chunk {chunks} is damaged: {problem}"));
-                        }
-                    }
-                }
-                Ok(Record::DataEnd(_)) => break,
-                Ok(_) => {}
-                Err(problem) => {
-                    self.damage.push(format!("unreadable after {chunks} chunks: {problem}"));
-                    break;
-                }
-            }
-        }
+        let key = topic::TAPE.key(&[]);
+        let reading = read(recording, |entry| match entry {
+            Entry::Message(message) if message.key == key => self.take(message.payload),
+            _ => {}
+        })?;
+        self.damage.extend(reading.damage);
         Ok(())
     }
 
-    fn add(&mut self, records: &[Record<'_>], key: &str, channels: &mut BTreeSet<u16>) {
-        for record in records {
-            match record {
-                Record::Channel(channel) if channel.topic == key => {
-                    channels.insert(channel.id);
-                }
-                Record::Message { header, data } if channels.contains(&header.channel_id) => {
-                    let message = split_raw(data).map(|(_attachment, payload)| payload);
-                    match message.map(decode::<Tape>) {
-                        Some(Ok(tape)) => self.push(tape),
-                        Some(Err(problem)) => self.damage.push(problem.to_string()),
-                        None => self.damage.push("a part of a tape is cut".to_owned()),
-                    }
-                }
-                _ => {}
-            }
+    /// Adds a message of [`topic::TAPE`].
+    pub fn take(&mut self, payload: &[u8]) {
+        match decode::<Tape>(payload) {
+            Ok(tape) => self.push(tape),
+            Err(problem) => self.damage.push(problem.to_string()),
         }
     }
 
     /// Adds a part of a tape.
     pub fn push(&mut self, tape: Tape) {
         self.parts.entry(tape.begun_ns).or_default().insert(tape.first, tape);
+    }
+
+    /// True when there is no tape.
+    pub fn is_empty(&self) -> bool {
+        self.parts.is_empty()
+    }
+
+    /// True when a tape of the other is one of these: begun at the same time, and the same in each part that both have.
+    /// In lock-step every flight begins at the same time.
+    pub fn shares_tape_with(&self, other: &Self) -> bool {
+        self.parts.iter().any(|(begun_ns, parts)| {
+            other.parts.get(begun_ns).is_some_and(|others| {
+                parts.iter().all(|(first, part)| others.get(first).is_none_or(|it| it == part))
+            })
+        })
     }
 
     /// What could not be read, as sentences.
@@ -138,5 +118,23 @@ mod tests {
         let firsts: Vec<u64> = tapes[0].parts.iter().map(|part| part.first).collect();
         assert_eq!(firsts, [0, 1, 2, 3, 4, 5]);
         assert!(TapeReader::default().read(b"no file").is_err());
+    }
+
+    #[test]
+    fn tapes_that_begin_at_the_same_time_are_the_same_unless_a_part_differs() {
+        let reader = |begun_ns, firsts: &[u64], records: &[u8]| {
+            let mut reader = TapeReader::default();
+            for &first in firsts {
+                let records = records.to_vec();
+                reader.push(Tape { begun_ns, first, records, ..Tape::default() });
+            }
+            reader
+        };
+        let one = reader(3, &[0, 5], b"one");
+        assert!(one.shares_tape_with(&reader(3, &[5, 9], b"one")), "it goes on with it");
+        assert!(one.shares_tape_with(&reader(3, &[9], b"other")), "no part is in both");
+        assert!(!one.shares_tape_with(&reader(3, &[0], b"other")), "another flight");
+        assert!(!one.shares_tape_with(&reader(4, &[0, 5], b"one")));
+        assert!(!one.shares_tape_with(&TapeReader::default()));
     }
 }

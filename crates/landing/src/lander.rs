@@ -258,8 +258,8 @@ impl Lander {
             self.landed(now) == Landed::OnGround && state.velocity.norm() <= MAX_STANDING_M_S;
         if is_standing {
             self.ground = self.place();
-            let target = self.target(now).filter(|_| self.phase() == Phase::Final);
-            self.standing_height.observe(target.filter(|_| !self.pad_moves()));
+            let is_of_landing = self.phase() == Phase::Final && !self.pad_moves();
+            self.standing_height.observe(is_of_landing.then(|| self.target(now)).flatten());
         }
         Ok(())
     }

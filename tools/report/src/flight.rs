@@ -122,7 +122,6 @@ pub struct Flight {
 pub struct FlightReader {
     flight: Flight,
     tapes: TapeReader,
-    files: u64,
 }
 
 impl FlightReader {
@@ -137,12 +136,14 @@ impl FlightReader {
     /// # Errors
     /// When it is no MCAP file at all.
     pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Problem> {
-        let flight = &mut self.flight;
+        let Self { flight, tapes } = self;
+        let tape_key = topic::TAPE.key(&[]);
         let mut lost = BTreeMap::new();
         let Reading { is_ended, messages, damage } =
             flightlog::read(recording, |entry| match entry {
                 Entry::About(facts) => flight.facts.extend(facts),
                 Entry::Dropped(counts) => lost = counts,
+                Entry::Message(message) if message.key == tape_key => tapes.take(message.payload),
                 Entry::Message(message) => flight.take(message),
             })?;
         // Counted since the recorder's start: the last file has those before it.
@@ -153,14 +154,22 @@ impl FlightReader {
         flight.is_ended &= is_ended;
         flight.messages += messages;
         flight.damage.extend(damage);
-        self.tapes.read(recording)?;
-        self.files += 1;
         Ok(())
+    }
+
+    /// True when nothing of a flight was added.
+    pub fn is_empty(&self) -> bool {
+        self.flight.messages == 0 && self.tapes.is_empty()
+    }
+
+    /// True when another is of the same flight: a tape goes on in it.
+    pub fn shares_tape_with(&self, other: &Self) -> bool {
+        self.tapes.shares_tape_with(&other.tapes)
     }
 
     /// The flight.
     pub fn finish(self) -> Flight {
-        let Self { mut flight, tapes, .. } = self;
+        let Self { mut flight, tapes } = self;
         flight.tapes = tapes.tapes();
         flight.sort();
         let configuration = flight.tapes.iter().find_map(configuration_of);
@@ -183,11 +192,6 @@ fn configuration_of(tape: &RecordedTape) -> Option<String> {
 }
 
 impl Flight {
-    /// True when a recording has nothing of a flight.
-    pub fn is_empty(&self) -> bool {
-        self.messages == 0 && self.tapes.is_empty()
-    }
-
     /// A time of the recorder's clock by the vehicle's, in nanoseconds.
     pub fn vehicle_ns(&self, received_ns: i64) -> i64 {
         received_ns.saturating_sub(self.shift_ns)
