@@ -16,6 +16,9 @@ pub(crate) struct ReportArgs {
     /// as a recorder begins a new file when one is large.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
+    /// Which landing of each recording, from 1 on, where it has several [default: the last].
+    #[arg(long, value_name = "N")]
+    landing: Option<usize>,
     /// The page [default: the first recording's name with `.html`, beside it].
     #[arg(short, long, value_name = "FILE.html")]
     output: Option<PathBuf>,
@@ -29,7 +32,13 @@ const MAX_FLIGHTS: usize = 2;
 
 /// Writes the page, and prints the summary.
 pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
-    let flights = flights(&args.files)?;
+    let mut flights = flights(&args.files)?;
+    for flight in &mut flights {
+        let (name, number) = (flight.name.clone(), args.landing.unwrap_or(0));
+        flight.keep_landing(args.landing).map_err(|of| {
+            anyhow::anyhow!("`--landing {number}`: {name} has {of} landings, counted from 1")
+        })?;
+    }
     let html = match flights.as_slice() {
         [one] => page(one)?,
         [one, other] => comparison(one, other)?,

@@ -9,11 +9,9 @@ use messages::{
     Wind, decode, topic,
 };
 
+use crate::landings::Landing;
 use crate::packets::Packets;
 
-/// Maximum time between a stamp and the reception of its message by one clock, in nanoseconds: stamps farther away are
-/// another clock's.
-const MAX_AGE_NS: i64 = 60_000_000_000;
 /// Longest gap over which a position is interpolated, in nanoseconds.
 const MAX_GAP_NS: i64 = 500_000_000;
 
@@ -115,6 +113,12 @@ pub struct Flight {
     pub is_rebuilt: bool,
     /// What the recorder's clock is ahead of the vehicle's, in nanoseconds.
     pub shift_ns: i64,
+    /// When the landing began, or else the recording, in nanoseconds of the vehicle's clock.
+    pub zero_ns: i64,
+    /// Which of the landings in the recording this is; `None` where all of it is.
+    pub landing: Option<Landing>,
+    /// Minimum time from a stamp of the vehicle's clock to the reception of its message, in nanoseconds.
+    min_apart_ns: Option<i64>,
 }
 
 /// Reads the recording of a flight, which may be several files.
@@ -171,7 +175,9 @@ impl FlightReader {
     pub fn finish(self) -> Flight {
         let Self { mut flight, tapes } = self;
         flight.tapes = tapes.tapes();
+        flight.set_shift();
         flight.sort();
+        flight.set_zero();
         let configuration = flight.tapes.iter().find_map(configuration_of);
         if let Some(toml) = configuration
             && !flight.configurations.keys().any(|name| name.starts_with("controller"))
@@ -197,10 +203,10 @@ impl Flight {
         received_ns.saturating_sub(self.shift_ns)
     }
 
-    /// When the landing began, or else the recording, in nanoseconds of the vehicle's clock.
-    pub fn zero_ns(&self) -> i64 {
+    /// Notes when the first landing began, or else the recording.
+    pub(crate) fn set_zero(&mut self) {
         let started = self.statuses.iter().find_map(|status| status.started_ns);
-        started.unwrap_or_else(|| self.first_ns())
+        self.zero_ns = started.unwrap_or_else(|| self.first_ns());
     }
 
     /// The first time that anything tells, in nanoseconds of the vehicle's clock.
@@ -217,7 +223,7 @@ impl Flight {
 
     /// A stamp of the vehicle's clock in seconds since [`Flight::zero_ns`].
     pub fn at_s(&self, stamp_ns: i64) -> f64 {
-        stamp_ns.saturating_sub(self.zero_ns()) as f64 * 1e-9
+        stamp_ns.saturating_sub(self.zero_ns) as f64 * 1e-9
     }
 
     /// Position of the vehicle as the autopilot says, in local NED, in metres.
@@ -244,7 +250,7 @@ impl Flight {
         match parts.as_slice() {
             ["controller", "status"] => {
                 if let Some(status) = self.decoded(topic::STATUS, key, payload) {
-                    self.note_clock(received_ns, status.stamp_ns);
+                    self.note_apart(received_ns, status.stamp_ns);
                     self.statuses.push(status);
                 }
             }
@@ -254,7 +260,7 @@ impl Flight {
             }
             ["vehicle", "state"] => {
                 if let Some(state) = self.decoded(topic::VEHICLE_STATE, key, payload) {
-                    self.note_clock(received_ns, state.stamp_ns);
+                    self.note_apart(received_ns, state.stamp_ns);
                     self.vehicle.push(state);
                 }
             }
@@ -339,15 +345,19 @@ impl Flight {
         }
     }
 
-    /// Notes what the recorder's clock is ahead of the vehicle's, where it is another one.
-    fn note_clock(&mut self, received_ns: i64, stamp_ns: i64) {
+    /// Notes how much later than its stamp a message came.
+    fn note_apart(&mut self, received_ns: i64, stamp_ns: i64) {
         let apart_ns = received_ns.saturating_sub(stamp_ns);
-        if self.statuses.is_empty()
-            && self.vehicle.is_empty()
-            && apart_ns.unsigned_abs() > MAX_AGE_NS.unsigned_abs()
-        {
-            self.shift_ns = apart_ns;
-        }
+        self.min_apart_ns = Some(self.min_apart_ns.map_or(apart_ns, |it| it.min(apart_ns)));
+    }
+
+    /// Notes what the recorder's clock is ahead of the vehicle's: nothing on one machine, and else what the quickest
+    /// message says.
+    fn set_shift(&mut self) {
+        let own = self.facts.get("clock");
+        let vehicles = self.found.first().map(|it| &it.message.header.clock);
+        let is_other = own.zip(vehicles).is_some_and(|(own, vehicles)| own != vehicles);
+        self.shift_ns = self.min_apart_ns.filter(|_| is_other).unwrap_or(0);
     }
 
     /// Puts everything in order: a second file begins with what the first one had.

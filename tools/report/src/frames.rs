@@ -14,7 +14,7 @@ const SAME_FRAME_NS: i64 = 2_000;
 /// How much later the recorder may get detections than the controller's estimate from them, in nanoseconds.
 const MAX_LATER_NS: i64 = 30_000_000;
 /// Longest time from detections to the setpoint that uses them, in nanoseconds: the next one later has other reasons.
-const MAX_TO_SETPOINT_NS: i64 = 200_000_000;
+const MAX_TO_SETPOINT_NS: i64 = 2_000_000_000;
 /// Phases in which nothing is landing.
 const OUTSIDE: [&str; 5] = ["idle", "takeoff", "landed", "aborted", "pilot-in-command"];
 
@@ -29,8 +29,10 @@ pub enum Fate {
     Refused(String),
     /// Another detector was in use.
     Standby,
-    /// No landing was under way, or it was overtaken by another frame.
+    /// No landing was under way.
     NotNeeded,
+    /// The controller refused it before the estimate, or another frame had overtaken it.
+    NotTaken,
     /// The recording does not say.
     Unknown,
 }
@@ -44,6 +46,7 @@ impl Fate {
             Self::Refused(why) => why,
             Self::Standby => "standby",
             Self::NotNeeded => "not needed",
+            Self::NotTaken => "not taken",
             Self::Unknown => "not known",
         }
     }
@@ -55,9 +58,10 @@ impl Fate {
             Self::NoMarker => "the wanted marker was not found in it".to_owned(),
             Self::Refused(why) => refusal(why).to_owned(),
             Self::Standby => "another detector was in use".to_owned(),
-            Self::NotNeeded => {
-                "no landing was under way, or a newer frame was there already".to_owned()
-            }
+            Self::NotNeeded => "no landing was under way".to_owned(),
+            Self::NotTaken => "overtaken by another frame, or refused before the estimate: of another clock or camera, or by \
+                               another detector's name (the controller's losses count those)"
+                .to_owned(),
             Self::Unknown => "the recording does not say".to_owned(),
         }
     }
@@ -114,6 +118,9 @@ impl Frames {
         let mut all: Vec<Handled> = Vec::new();
         for tape in &flight.tapes {
             all.extend(of_tape(tape, marker.as_deref()));
+        }
+        if let Some(landing) = &flight.landing {
+            all.retain(|it| landing.time_ns.contains(&it.handled_ns));
         }
         match all.is_empty() {
             false => Self { is_from_tape: true, all },
@@ -185,7 +192,7 @@ fn of_tape(tape: &RecordedTape, marker: Option<&str>) -> Vec<Handled> {
                 None if is_new && latest.used > before => Fate::Used,
                 // A landing that begins anew counts anew.
                 None if is_new && latest.used > 0 && latest.used < before => Fate::Used,
-                None => Fate::NotNeeded,
+                None => Fate::NotTaken,
             };
             frames.push(Handled {
                 detector: publisher.to_string(),

@@ -3,7 +3,8 @@
 //! Recordings in, a page out: HTML that needs no network and no other file, with charts as SVG. This crate knows no
 //! files, no clock and no network, and decides nothing: what it says of a flight is in the recording.
 //!
-//! Modules in reading order: [`flight`] has what a recording holds, with the autopilot's [`packets`]; [`frames`] tells
+//! Modules in reading order: [`flight`] has what a recording holds, with the autopilot's [`packets`], and [`landings`] keeps
+//! one landing of it; [`frames`] tells
 //! what became of each frame, [`latency`] how long it took, [`track`] where the vehicle was, [`phases`] and [`journal`]
 //! what happened and why, [`losses`] what is missing, [`tape`] whether the tape
 //! gives the same again, and [`mod@summary`] all of it in numbers. [`difference`] compares
@@ -16,6 +17,7 @@ pub mod flight;
 pub mod frames;
 pub mod html;
 pub mod journal;
+pub mod landings;
 pub mod latency;
 pub mod losses;
 pub mod packets;

@@ -17,28 +17,44 @@ pub struct Loss {
     pub of: Option<u64>,
 }
 
+/// Numbers that fall by more than this begin anew, with a publisher that started again; by less they came late.
+const MAX_LATE: u64 = 100;
+
 /// Frames by their numbers.
 #[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
 struct Numbers {
+    /// The first since the publisher started.
     first: u64,
+    /// The largest since then.
     last: u64,
+    /// How many came.
     count: u64,
+    /// How many there were before the publisher started again.
+    before: u64,
 }
 
 impl Numbers {
+    /// Of numbers in the order in which they came.
     fn of(sequences: impl Iterator<Item = u64>) -> Option<Self> {
         sequences.fold(None, |so_far: Option<Self>, sequence| {
-            let before = so_far.unwrap_or(Self { first: sequence, last: sequence, count: 0 });
-            Some(Self {
-                first: before.first.min(sequence),
-                last: before.last.max(sequence),
-                count: before.count + 1,
+            let alone = Self { first: sequence, last: sequence, count: 1, before: 0 };
+            Some(match so_far {
+                None => alone,
+                Some(it) if sequence.saturating_add(MAX_LATE) < it.last => {
+                    Self { count: it.count + 1, before: it.all(), ..alone }
+                }
+                Some(it) => Self {
+                    first: it.first.min(sequence),
+                    last: it.last.max(sequence),
+                    count: it.count + 1,
+                    before: it.before,
+                },
             })
         })
     }
 
     fn all(self) -> u64 {
-        self.last.saturating_sub(self.first).saturating_add(1)
+        self.last.saturating_sub(self.first).saturating_add(1).saturating_add(self.before)
     }
 
     fn missing(self) -> u64 {
@@ -139,4 +155,24 @@ pub fn recording(flight: &Flight) -> Vec<String> {
         lines.push(format!("the recorder's last word: {problem}"));
     }
     lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn counted(sequences: impl IntoIterator<Item = u64>) -> (u64, u64) {
+        let numbers = Numbers::of(sequences.into_iter()).unwrap();
+        (numbers.missing(), numbers.all())
+    }
+
+    #[test]
+    fn missing_numbers_are_counted_across_a_start_of_their_publisher() {
+        assert_eq!(counted(5..10), (0, 5));
+        assert_eq!(counted([5, 6, 9, 8]), (1, 5), "the 8 came late");
+        // 300 and ten of them missing, then a start, and three missing of 50.
+        let before = (0..300).filter(|number| !(100..110).contains(number));
+        let after = (0..50).filter(|number| !(20..23).contains(number));
+        assert_eq!(counted(before.chain(after)), (13, 350));
+    }
 }

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use crate::chart::Chart;
 use crate::difference::{Difference, configurations, parameters, parameters_of_one};
 use crate::flight::Flight;
 use crate::html::{Cell, escaped, missing, number, paragraph, table, text};
@@ -24,7 +25,7 @@ pub fn page(flight: &Flight) -> anyhow::Result<String> {
     for section in &sections {
         body.push_str(&one(section)?);
     }
-    Ok(html(&flight.name, &body, "one"))
+    Ok(html(&view.summary.name, &body, "one"))
 }
 
 /// The page of two flights side by side, with what they differ in.
@@ -42,7 +43,8 @@ pub fn comparison(first: &Flight, second: &Flight) -> anyhow::Result<String> {
     for (left, right) in left.iter_mut().zip(&mut right) {
         body.push_str(&pair(left, right)?);
     }
-    Ok(html(&format!("{} and {}", first.name, second.name), &body, "two"))
+    let title = format!("{} and {}", one.summary.name, other.summary.name);
+    Ok(html(&title, &body, "two"))
 }
 
 fn html(title: &str, body: &str, class: &str) -> String {
@@ -124,7 +126,7 @@ static FIGURES: [Figure; 18] = [
     figure("exposure to setpoint, median", |s| s.latency_p50_ms, 0, "ms"),
     figure("exposure to setpoint, 99 %", |s| s.latency_p99_ms, 0, "ms"),
     figure("changes of the detector", |s| s.detector_changes.map(|it| it as f64), 0, ""),
-    figure("retries", |s| Some(s.retries as f64), 0, ""),
+    figure("retries", |s| s.retries.map(|it| it as f64), 0, ""),
     figure("estimate's error, median", |s| s.estimate_error_p50_m, 3, "m"),
     figure("estimate's error, 95 %", |s| s.estimate_error_p95_m, 3, "m"),
     figure("mean wind", |s| s.wind_mean_m_s, 1, "m/s"),
@@ -258,11 +260,15 @@ fn pair(left: &mut Section, right: &mut Section) -> anyhow::Result<String> {
         }
     };
     row(&left.before, &right.before);
-    for (one, other) in left.charts.iter_mut().zip(&mut right.charts) {
-        share_axes(one, other);
-        let [one, other] = [&*one, &*other].map(|chart| match chart.is_empty() {
-            true => Ok(String::new()),
-            false => chart.figure(),
+    let charts = left.charts.len().max(right.charts.len());
+    for index in 0..charts {
+        let (one, other) = (left.charts.get_mut(index), right.charts.get_mut(index));
+        if let (Some(one), Some(other)) = (one, other) {
+            share_axes(one, other);
+        }
+        let [one, other] = [&left.charts, &right.charts].map(|charts| {
+            let drawn = charts.get(index).filter(|chart| !chart.is_empty());
+            drawn.map_or(Ok(String::new()), Chart::figure)
         });
         row(&one?, &other?);
     }

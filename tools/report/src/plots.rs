@@ -6,7 +6,7 @@ use crate::chart::{At, Axes, Chart, Ink, Layer, Shape, at, layer, span};
 use crate::frames::Fate;
 use crate::latency::between_ms;
 use crate::track::Place;
-use crate::view::{View, component};
+use crate::view::{View, component, unbridged};
 
 /// Height of a chart over time, as shown, in pixels.
 const HEIGHT: u32 = 270;
@@ -53,8 +53,10 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     let step = estimated.len().div_ceil(CIRCLES).max(1);
     let circles = estimated.iter().step_by(step).flat_map(|it| circle(it, &reach));
     above.push(layer("circles: 2 standard deviations", Ink::Blue, Shape::Thin, circles));
-    above.push(layer("truth", Ink::Orange, Shape::Wide, truth.iter().map(away)));
-    above.push(layer("estimate", Ink::Blue, Shape::Line, estimated.iter().map(away)));
+    let from_above =
+        |places: &[Place]| unbridged(places.iter().map(|it| (it.time_s, away(it))).collect());
+    above.push(layer("truth", Ink::Orange, Shape::Wide, from_above(&truth)));
+    above.push(layer("estimate", Ink::Blue, Shape::Line, from_above(&estimated)));
     above.push(layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]));
     let start = truth.first().or(estimated.first());
     above.push(layer("start", Ink::Green, Shape::Dots, start.map(away)));
@@ -69,6 +71,8 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     };
     let along = |it: &Place| it.north_m * toward_north + it.east_m * toward_east;
     let side = |it: &Place| at(along(it), it.height_m);
+    let from_the_side =
+        |places: &[Place]| unbridged(places.iter().map(|it| (it.time_s, side(it))).collect());
     let x = span(places().map(along), -0.3..0.3);
     let edge = |it: &Place, sign: f64| {
         let x_m = along(it) + sign * SIGMAS * it.deviation_m;
@@ -78,8 +82,8 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     let right = estimated.iter().rev().map(|it| edge(it, 1.0));
     let layers = vec![
         layer("2 standard deviations", Ink::Blue, Shape::Area, left.chain(right)),
-        layer("truth", Ink::Orange, Shape::Wide, truth.iter().map(side)),
-        layer("estimate", Ink::Blue, Shape::Line, estimated.iter().map(side)),
+        layer("truth", Ink::Orange, Shape::Wide, from_the_side(&truth)),
+        layer("estimate", Ink::Blue, Shape::Line, from_the_side(&estimated)),
         layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]),
     ];
     let from_above = Chart {
@@ -208,7 +212,7 @@ pub fn detections(view: &View<'_>) -> Vec<Chart> {
             Fate::Used => Ink::Green,
             Fate::Refused(_) => Ink::Red,
             Fate::NoMarker => Ink::Orange,
-            Fate::Standby | Fate::NotNeeded | Fate::Unknown => Ink::Grey,
+            Fate::Standby | Fate::NotNeeded | Fate::NotTaken | Fate::Unknown => Ink::Grey,
         };
         let frames = view.frames.all.iter().filter(|it| it.fate == *fate);
         let points = frames.map(|it| at(view.flight.at_s(it.exposed_ns), row as f64));

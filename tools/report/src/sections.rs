@@ -276,8 +276,8 @@ fn detectors(view: &View<'_>) -> Section {
         before = now;
     }
     section.before = paragraph(&format!(
-        "{} changes while the controller ran; preferred at the end: {}.",
-        last.detector_changes,
+        "{} changes; preferred at the end: {}.",
+        view.summary.detector_changes.unwrap_or(0),
         if last.preference.is_empty() { "nothing" } else { &last.preference }
     ));
     section.after = table(&["at", "from", "to", "why"], &changes);

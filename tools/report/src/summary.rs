@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use crate::flight::Flight;
 use crate::frames::{Fate, Frames};
+use crate::landings::Landing;
 use crate::latency::{Stage, TO_SETPOINT, budget};
 use crate::{losses, phases, track};
 
@@ -65,7 +66,7 @@ pub struct Summary {
     /// Lowest charge of the battery, from 0 to 1.
     pub battery_min: Option<f64>,
     /// Retries: climbs for another attempt.
-    pub retries: usize,
+    pub retries: Option<usize>,
     /// Whether the tape gives the same decisions again; `None` when that was not tried.
     pub tape_verified: Option<bool>,
     /// The tape's verdict as a sentence.
@@ -87,8 +88,7 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
     };
     let disarmed_ns = flight.statuses.iter().find_map(|status| status.disarmed_ns);
     let touchdown = flight.truth.iter().find_map(|truth| truth.touchdown);
-    let zero_ns = flight.zero_ns();
-    let of_landing = flight.vehicle.iter().filter(|it| it.stamp_ns >= zero_ns);
+    let of_landing = flight.vehicle.iter().filter(|it| it.stamp_ns >= flight.zero_ns);
     let standing = of_landing.skip_while(|it| it.landed != LandedState::InAir);
     let standing_ns =
         standing.skip_while(|it| it.landed != LandedState::OnGround).map(|it| it.stamp_ns).next();
@@ -99,7 +99,12 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
     let to_setpoint = latency.iter().find(|stage| stage.name == TO_SETPOINT);
     let told = last.and_then(|status| status.latency_ms);
     Summary {
-        name: flight.name.clone(),
+        name: match &flight.landing {
+            Some(Landing { number, of, .. }) => {
+                format!("{}, landing {number} of {of}", flight.name)
+            }
+            None => flight.name.clone(),
+        },
         program: flight.facts.get("program").cloned(),
         guidance: last.map(|status| status.guidance.clone()),
         phase: last.map(|status| status.phase.name().to_owned()),
@@ -123,12 +128,16 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         frames_refused: frames.refused(),
         latency_p50_ms: to_setpoint.map(|it| it.p50_ms).or(told.map(|[p50, _]| p50)),
         latency_p99_ms: to_setpoint.map(|it| it.p99_ms).or(told.map(|[_, p99]| p99)),
-        detector_changes: last.map(|status| status.detector_changes),
+        detector_changes: last.map(|status| {
+            let before = flight.landing.as_ref().map_or(0, |it| it.detector_changes_before);
+            status.detector_changes.saturating_sub(before)
+        }),
         messages_lost: flight.lost.values().copied().fold(0, u64::saturating_add),
         wind_mean_m_s: node::stats::mean(&winds),
         wind_max_m_s: winds.iter().copied().reduce(f64::max),
         battery_min: battery_min(flight),
-        retries: phases.iter().filter(|phase| phase.name == Phase::Retry.name()).count(),
+        retries: last
+            .map(|_| phases.iter().filter(|phase| phase.name == Phase::Retry.name()).count()),
         tape_verified: flight.replayed.as_ref().map(|it| it.is_verified),
         tape: flight.replayed.as_ref().map(|it| it.text.clone()),
         problems: losses::recording(flight),
@@ -189,7 +198,7 @@ impl Summary {
             )),
             latency.map(|(p50, p99)| format!("exposure to setpoint {p50:.0} ms, 99 % {p99:.0} ms")),
             self.detector_changes.map(|changes| format!("{changes} changes of the detector")),
-            Some(format!("{} retries", self.retries)),
+            self.retries.map(|retries| format!("{retries} retries")),
             Some(format!("recorder lost {} messages", self.messages_lost)),
             self.tape.clone(),
             (!self.problems.is_empty()).then(|| format!("recording: {}", self.problems.join("; "))),

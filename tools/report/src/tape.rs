@@ -40,6 +40,7 @@ pub fn replay_tapes(flight: &mut Flight) {
     if is_alone && !rebuilt.statuses.is_empty() {
         flight.is_rebuilt = true;
         flight.statuses = rebuilt.statuses;
+        flight.set_zero();
         if flight.targets.is_empty() {
             flight.targets = rebuilt.targets;
         }

@@ -11,6 +11,10 @@ use crate::phases;
 use crate::summary::{self, Summary};
 use crate::track::{self, EstimateError, Place};
 
+/// Number of usual periods without a sample over which no line is drawn.
+const MAX_GAP_PERIODS: f64 = 5.0;
+/// Shortest time without a sample over which no line is drawn, in seconds.
+const MIN_GAP_S: f64 = 0.5;
 /// Time shown before the first phase of a landing, in seconds.
 const BEFORE_S: f64 = 1.0;
 
@@ -74,14 +78,38 @@ impl<'a> View<'a> {
         self.time.contains(&time_s)
     }
 
-    /// The shown points of a curve over time.
+    /// The shown points of a curve over time, which ends where samples are missing.
     pub fn curve<T>(&self, samples: &[T], of: impl Fn(&T) -> Option<At>) -> Vec<At> {
-        samples.iter().filter_map(of).filter(|point| self.is_shown(point.x)).collect()
+        let points = samples.iter().filter_map(of).filter(|point| self.is_shown(point.x));
+        unbridged(points.map(|point| (point.x, point)).collect())
     }
 
     /// A component of the setpoints over time.
     pub fn setpoint_curve(&self, axis: usize) -> Vec<At> {
         self.curve(&self.setpoints, |it| Some(at(it.time_s, component(it.velocity_ned_m_s, axis))))
+    }
+}
+
+/// Points by their time in seconds, with one that is not a number where samples are missing: no line is drawn there.
+pub fn unbridged(points: Vec<(f64, At)>) -> Vec<At> {
+    let between: Vec<f64> = points.windows(2).map(|pair| later_s(pair)).collect();
+    let usual_s = node::stats::quantile(&between, 0.5).unwrap_or(0.0);
+    let max_s = (MAX_GAP_PERIODS * usual_s).max(MIN_GAP_S);
+    let mut drawn = Vec::with_capacity(points.len());
+    for (index, (_, point)) in points.iter().enumerate() {
+        drawn.push(*point);
+        if between.get(index).is_some_and(|gap_s| *gap_s > max_s) {
+            drawn.push(at(point.x, f64::NAN));
+        }
+    }
+    drawn
+}
+
+/// How much later the second of two points is, in seconds.
+fn later_s(pair: &[(f64, At)]) -> f64 {
+    match pair {
+        [(first_s, _), (second_s, _)] => second_s - first_s,
+        _ => 0.0,
     }
 }
 

@@ -269,10 +269,88 @@ fn damaged_recordings_give_what_is_left_of_them() {
 }
 
 #[test]
+fn of_a_recording_with_two_landings_each_has_its_own_numbers() {
+    const LATER_NS: i64 = 100_000_000_000;
+    let one = read(&without(&landing().recording, &["controller/tape"]));
+    let mut both = one.clone();
+    let statuses = one.statuses.iter().cloned().map(|mut it| {
+        it.stamp_ns += LATER_NS;
+        it.started_ns = it.started_ns.map(|ns| ns + LATER_NS);
+        it.disarmed_ns = it.disarmed_ns.map(|ns| ns + LATER_NS);
+        it
+    });
+    both.statuses.extend(statuses);
+    let first_touchdown = one.truth.last().unwrap().touchdown;
+    both.truth.extend(one.truth.iter().cloned().map(|mut it| {
+        it.stamp_ns += LATER_NS;
+        // The simulator tells the last touchdown until the next.
+        let own = it.touchdown.map(|mut own| {
+            own.stamp_ns += LATER_NS;
+            own.error_m += 1.0;
+            own
+        });
+        it.touchdown = own.or(first_touchdown);
+        it
+    }));
+    both.found.extend(one.found.iter().cloned().map(|mut it| {
+        it.received_ns += LATER_NS;
+        it.message.header.stamp_ns += LATER_NS;
+        it
+    }));
+    let alone = summary(&one);
+    assert_eq!(
+        (one.clone().keep_landing(Some(2)), one.clone().keep_landing(None)),
+        (Err(1), Ok(()))
+    );
+    for (number, name, more_m) in [(Some(1), "landing 1 of 2", 0.0), (None, "landing 2 of 2", 1.0)]
+    {
+        let mut kept = both.clone();
+        kept.keep_landing(number).unwrap();
+        let found = summary(&kept);
+        assert!(found.name.ends_with(name), "{}", found.name);
+        assert!(found.landed);
+        near(found.time_to_disarm_s, alone.time_to_disarm_s, 1e-9);
+        near(found.time_to_touchdown_s, alone.time_to_touchdown_s, 1e-9);
+        near(found.touchdown_error_m, alone.touchdown_error_m.map(|it| it + more_m), 1e-12);
+        assert_eq!(found.frames, alone.frames);
+    }
+    assert_eq!(both.keep_landing(Some(3)), Err(2));
+}
+
+#[test]
+fn times_of_a_recorder_on_another_machine_are_told_by_the_names_of_the_clocks() {
+    const AHEAD_NS: i64 = 7_000_000_000;
+    let recorded_by = |clock: &str, ahead_ns: i64| {
+        let facts = [("clock".to_owned(), clock.to_owned())].into();
+        let about = About { program: "test".to_owned(), facts, utc_offset_ns: 0 };
+        let mut copy = Vec::new();
+        let mut writer = Writer::new(&mut copy, &about).unwrap();
+        flightlog::read(&landing().recording, |entry| {
+            if let Entry::Message(mut message) = entry {
+                message.received_ns += ahead_ns;
+                writer.receive(message).unwrap();
+            }
+        })
+        .unwrap();
+        writer.finish().unwrap();
+        read(&copy)
+    };
+    let own = landing_clock();
+    assert_eq!(recorded_by(&own, AHEAD_NS).shift_ns, 0, "late, but of the same clock");
+    let apart_ns = recorded_by("ground", AHEAD_NS).shift_ns - AHEAD_NS;
+    assert!((0..100_000_000).contains(&apart_ns), "{apart_ns}");
+}
+
+/// The clock of the landing's frames.
+fn landing_clock() -> String {
+    read(&landing().recording).found[0].message.header.clock.clone()
+}
+
+#[test]
 fn no_recording_is_refused() {
     let mut reader = FlightReader::new("text");
     assert!(reader.add(b"this is no recording at all").is_err());
-    assert!(FlightReader::new("empty").finish().is_empty());
+    assert!(FlightReader::new("empty").is_empty());
     assert!(page(&Flight::default()).is_ok(), "an empty flight has a page of what is missing");
 }
 

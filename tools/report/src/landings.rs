@@ -1,0 +1,84 @@
+//! The landings in a recording, and one of them alone.
+
+use std::ops::Range;
+
+use crate::flight::Flight;
+
+/// What belongs to a landing before its begin, in nanoseconds.
+const BEFORE_NS: i64 = 2_000_000_000;
+
+/// A landing of a recording that has several.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Landing {
+    /// Its number, from 1 on.
+    pub number: usize,
+    /// How many the recording has.
+    pub of: usize,
+    /// What belongs to it, in nanoseconds of the vehicle's clock: until the next one.
+    pub time_ns: Range<i64>,
+    /// How often the controller had changed the detector before it.
+    pub detector_changes_before: u64,
+}
+
+/// When each landing of a recording began, in nanoseconds of the vehicle's clock.
+pub fn begins(flight: &Flight) -> Vec<i64> {
+    let mut begins: Vec<i64> = flight.statuses.iter().filter_map(|it| it.started_ns).collect();
+    begins.sort_unstable();
+    begins.dedup();
+    begins
+}
+
+impl Flight {
+    /// Keeps one of several landings, by its number from 1 on, or the last; of a recording with one everything stays.
+    ///
+    /// # Errors
+    /// How many landings there are, when there is none of this number.
+    pub fn keep_landing(&mut self, number: Option<usize>) -> Result<(), usize> {
+        let begins = begins(self);
+        let of = begins.len();
+        let number = number.unwrap_or(of.max(1));
+        if number == 0 || number > of.max(1) {
+            return Err(of);
+        }
+        if of < 2 {
+            return Ok(());
+        }
+        let at = |number: usize| begins.get(number.wrapping_sub(1)).copied();
+        let begun_ns = at(number).unwrap_or(i64::MIN);
+        let from_ns = if number == 1 { i64::MIN } else { begun_ns.saturating_sub(BEFORE_NS) };
+        let to_ns = at(number + 1).map_or(i64::MAX, |next_ns| next_ns.saturating_sub(BEFORE_NS));
+        self.keep(from_ns..to_ns);
+        let before = self.statuses.first().filter(|_| number > 1);
+        let detector_changes_before = before.map_or(0, |status| status.detector_changes);
+        // A status before the begin still tells of the landing before.
+        for status in &mut self.statuses {
+            if status.started_ns != Some(begun_ns) {
+                (status.started_ns, status.disarmed_ns) = (None, None);
+            }
+        }
+        for truth in &mut self.truth {
+            truth.touchdown = truth.touchdown.filter(|it| it.stamp_ns >= begun_ns);
+        }
+        let time_ns = from_ns..to_ns;
+        self.landing = Some(Landing { number, of, time_ns, detector_changes_before });
+        self.zero_ns = begun_ns;
+        Ok(())
+    }
+
+    fn keep(&mut self, time_ns: Range<i64>) {
+        let shift_ns = self.shift_ns;
+        let is_received = |it_ns: i64| time_ns.contains(&it_ns.saturating_sub(shift_ns));
+        self.statuses.retain(|it| time_ns.contains(&it.stamp_ns));
+        self.targets.retain(|it| time_ns.contains(&it.stamp_ns));
+        self.vehicle.retain(|it| time_ns.contains(&it.stamp_ns));
+        self.truth.retain(|it| time_ns.contains(&it.stamp_ns));
+        self.wind.retain(|it| time_ns.contains(&it.stamp_ns));
+        self.found.retain(|it| is_received(it.received_ns));
+        for frames in self.frames.values_mut() {
+            frames.retain(|it| time_ns.contains(&it.stamp_ns));
+        }
+        self.packets.received_ns.retain(|it| is_received(*it));
+        self.packets.power.retain(|it| is_received(it.received_ns));
+        self.packets.texts.retain(|it| is_received(it.received_ns));
+    }
+}
