@@ -163,7 +163,8 @@ impl FromStr for Holders {
     }
 }
 
-/// The access control of a vehicle's relay: the rules of all roles, for these holders and this vehicle.
+/// The access control of a vehicle's relay: the rules of all roles, for these holders and this vehicle, and with each right
+/// to subscribe that to be sent the messages.
 ///
 /// # Errors
 /// When the rules are not as expected.
@@ -226,11 +227,39 @@ pub fn access_control(rules: &Value, holders: &Holders, vehicle: &str) -> anyhow
         }
     }
     bound.retain(|rule| policies.iter().any(|policy| names_rule(policy, &rule["id"])));
+    let received: Vec<Value> = bound.iter().filter_map(received).collect();
+    for policy in &mut policies {
+        let rules = policy["rules"].as_array().cloned().unwrap_or_default();
+        let added = received.iter().map(|rule| rule["id"].clone());
+        let added = added.filter(|id| rules.iter().any(|rule| *id == json!(received_id(rule))));
+        let all: Vec<Value> = rules.iter().cloned().chain(added).collect();
+        policy["rules"] = json!(all);
+    }
+    bound.extend(received);
     let mut access = rules.clone();
     access["rules"] = json!(bound);
     access["subjects"] = json!(subjects);
     access["policies"] = json!(policies);
     Ok(access)
+}
+
+/// For a rule that allows to subscribe, that by which the messages are sent to who subscribed. A session of a certain kind
+/// would be sent messages that it never subscribed to.
+fn received(rule: &Value) -> Option<Value> {
+    let messages = rule["messages"].as_array()?;
+    messages.iter().any(|message| message == "declare_subscriber").then_some(())?;
+    let flows = rule["flows"].as_array()?;
+    flows.iter().any(|flow| flow == "ingress").then_some(())?;
+    let mut sent = rule.clone();
+    sent["id"] = json!(received_id(&rule["id"]));
+    sent["flows"] = json!(["egress"]);
+    sent["messages"] = json!(["put", "delete"]);
+    Some(sent)
+}
+
+/// The id of the rule by which what was subscribed to is sent.
+fn received_id(rule: &Value) -> String {
+    format!("received by {}", rule.as_str().unwrap_or_default())
 }
 
 fn names_rule(policy: &Value, id: &Value) -> bool {
@@ -303,6 +332,45 @@ mod tests {
         list.admit(&unknown).unwrap();
         list.revoke(&unknown).unwrap();
         assert_eq!(list.of("operator", "drone").count(), 0);
+    }
+
+    #[test]
+    fn messages_are_sent_only_on_keys_to_which_their_receiver_may_subscribe() {
+        let rules: Value = json5::from_str(crate::network::SECURED_CONFIG).unwrap();
+        let roles = "camera-pub controller dashboard gcs-bridge operator observer recorder simulator relay drone";
+        let names: String = roles.split(' ').map(|role| format!("{role}@kestrel\n")).collect();
+        let holders = holders(&format!("{names}detector.one@kestrel\n"));
+        let access = access_control(&rules["access_control"], &holders, "kestrel").unwrap();
+        crate::network::check_access(&json!({ "access_control": access.clone() })).unwrap();
+        let has = |value: &Value, wanted: &str| value.as_array().unwrap().contains(&json!(wanted));
+        let keys = |subject: &Value, flow: &str, message: &str| -> BTreeSet<String> {
+            let policies = access["policies"].as_array().unwrap().iter();
+            let policies =
+                policies.filter(|it| it["subjects"].as_array().unwrap().contains(subject));
+            let ids: Vec<&Value> =
+                policies.flat_map(|it| it["rules"].as_array().unwrap()).collect();
+            let rules = access["rules"].as_array().unwrap().iter();
+            rules
+                .filter(|it| ids.contains(&&it["id"]))
+                .filter(|it| has(&it["flows"], flow) && has(&it["messages"], message))
+                .flat_map(|it| it["key_exprs"].as_array().unwrap())
+                .map(|key| key.as_str().unwrap().to_owned())
+                .collect()
+        };
+        let subjects: Vec<&Value> =
+            access["subjects"].as_array().unwrap().iter().map(|it| &it["id"]).collect();
+        assert!(subjects.len() > 10, "{subjects:?}");
+        for subject in subjects {
+            let subscribed = keys(subject, "ingress", "declare_subscriber");
+            assert!(!subscribed.is_empty(), "{subject}");
+            for message in ["put", "delete"] {
+                assert_eq!(keys(subject, "egress", message), subscribed, "{subject}: {message}");
+            }
+        }
+        let detector = keys(&json!("detector.one@kestrel"), "egress", "put");
+        assert!(detector.contains("kestrel/camera/*/jpeg") && !detector.contains("**"));
+        assert!(!detector.iter().any(|key| key.contains("mavlink")), "{detector:?}");
+        assert_eq!(keys(&json!("own"), "egress", "put"), BTreeSet::from(["**".to_owned()]));
     }
 
     #[test]
