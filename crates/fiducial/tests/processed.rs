@@ -6,6 +6,7 @@ use fiducial::{Detector, Observation, Settings};
 use geometry::{Body, CameraModel, Marker as MarkerFrame, Ned, Pixel, Rotation, Transform};
 use imaging::GrayView;
 use markers::Marker;
+use rendering::occluder::{Line, Occluder};
 use rendering::processing::{Sharpen, ToneCurve};
 use rendering::views::{Binning, SIZE_M, TestScene, View, views};
 use rendering::{PadInScene, Preset, Processing, Renderer, Scene, Surface};
@@ -159,6 +160,43 @@ fn rings_are_found_by_ordinary_cameras_at_all_positions_but_the_farthest() {
         // The strongest compression and the steepest curve leave least of the rings below 16 px.
         let max_missed = if *preset == Preset::ActionCamera { 5 } else { 1 };
         errors.expect(preset.name(), max_missed, [0.02, 0.06], [0.15, 0.5]);
+    }
+}
+
+/// The frame with a hard shadow to one side of a line through a pixel.
+fn shaded(pixels: &[u8], width: usize, edge: Line, transmission: f32) -> Vec<u8> {
+    let shadow = Occluder::Shadow { edge, penumbra_px: 2.0, transmission };
+    let rows = pixels.chunks(width).enumerate();
+    rows.flat_map(|(row, pixels)| {
+        let mut light: Vec<f32> = pixels.iter().map(|pixel| f32::from(*pixel)).collect();
+        shadow.apply(row, &mut light);
+        light.into_iter().map(|level| level.round() as u8)
+    })
+    .collect()
+}
+
+#[test]
+fn rings_under_the_edge_of_a_shadow_are_found_by_ordinary_cameras() {
+    let presets = [Preset::Usb, Preset::RaspberryPi, Preset::ActionCamera, Preset::Phone];
+    let mut errors = presets.map(|_| Errors::default());
+    let mut detector = detector("rings");
+    let binning = Binning::TwoByTwo;
+    let mut scene = TestScene::new(binning).unwrap();
+    let camera = binning.camera();
+    let near = views(binning, 0.0, 1).into_iter().filter(|view| view.height_m <= 6);
+    for (index, view) in near.step_by(2).enumerate() {
+        let (pixels, truth) = scene.render(&view).unwrap();
+        let range_m = truth.camera_from_marker.origin().coords.coords.norm();
+        let edge = Line { through: truth.centre, normal: 1.3 * index as f64 };
+        let transmission = [0.5, 0.25, 0.12][index % 3];
+        let pixels = shaded(&pixels, camera.width as usize, edge, transmission);
+        for (preset, errors) in presets.iter().zip(&mut errors) {
+            let found = detect(&mut detector, &pixels, &preset.processing(), &camera);
+            errors.note(&found, truth.centre, range_m);
+        }
+    }
+    for (preset, errors) in presets.iter().zip(&mut errors) {
+        errors.expect(preset.name(), 1, [0.03, 0.06], [0.06, 0.2]);
     }
 }
 

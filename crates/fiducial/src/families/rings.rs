@@ -362,8 +362,15 @@ impl FamilyDetector for RingDetector {
             return None;
         }
         let min_contrast = MIN_TRACKED_CONTRAST;
-        let search =
-            EdgeSearch { view, camera, size_m, min_contrast, white_on_black: false, followed };
+        let search = EdgeSearch {
+            view,
+            camera,
+            size_m,
+            min_contrast,
+            white_on_black: false,
+            into_black_px: 0.0,
+            followed,
+        };
         let measured = search.measure_tracked(&pose, &mut self.buffers)?;
         let marker = self.marker;
         let evaluation =
@@ -393,6 +400,7 @@ impl Evaluation<'_> {
             size_m: self.marker.size_m.unwrap_or(1.0),
             min_contrast: 0.35 * candidate.contrast,
             white_on_black: candidate.white_on_black,
+            into_black_px: 0.0,
             followed: self.followed,
         };
         let measured = search.measure(candidate, buffers)?;

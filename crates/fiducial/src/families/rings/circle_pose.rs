@@ -5,7 +5,7 @@ use std::ops::AddAssign;
 
 use geometry::{Camera, CameraModel, Marker as MarkerFrame, Pixel, Point, Rotation, Transform};
 use imaging::{Ellipse, fit_ellipse};
-use nalgebra::{Matrix2, Matrix3, Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
+use nalgebra::{Matrix2, Matrix3, Matrix6, SMatrix, SVector, UnitQuaternion, Vector2, Vector3};
 
 use crate::optics::least_squares::{
     Damping, Influence, NormalEquations, Problem, Schedule, huber, minimise,
@@ -27,6 +27,8 @@ pub(crate) struct EdgePoint {
     pub(crate) ray: Vector3<f64>,
     /// The circle's radius in metres.
     pub(crate) radius: f64,
+    /// Whether the black is on the circle's inner side.
+    pub(crate) black_inside: bool,
 }
 
 /// Points sampled on an ellipse to map it through a lens.
@@ -223,20 +225,47 @@ impl CirclePose {
     /// The largest median residual of one circle's edge points, in pixels. It is large when the radii are not
     /// the marker's.
     pub(crate) fn max_bias_px(&self, points: &[EdgePoint], camera: &CameraModel) -> f64 {
+        self.median_residuals(points, camera)
+            .fold(0.0, |worst, (_, median)| worst.max(median.abs()))
+    }
+
+    /// How far all edges lie in the black, in pixels, where else only the size is wrong: least squares over the median
+    /// residuals of the circles. `None` with fewer than three circles.
+    pub(crate) fn shift_into_black_px(
+        &self,
+        points: &[EdgePoint],
+        camera: &CameraModel,
+    ) -> Option<f64> {
+        let (mut matrix, mut right, mut circles) = (Matrix2::zeros(), Vector2::zeros(), 0);
+        for (point, median) in self.median_residuals(points, camera) {
+            let into_black = if point.black_inside { -1.0 } else { 1.0 };
+            let row = Vector2::new(point.radius, into_black);
+            matrix += row * row.transpose();
+            right += row * median;
+            circles += 1;
+        }
+        let solved = matrix.try_inverse()? * right;
+        (circles >= 3 && solved.y.is_finite()).then_some(solved.y)
+    }
+
+    /// A point of each circle with the median residual of the circle's points, in pixels.
+    fn median_residuals<'a>(
+        &self,
+        points: &'a [EdgePoint],
+        camera: &CameraModel,
+    ) -> impl Iterator<Item = (&'a EdgePoint, f64)> {
         const MAX_POINTS: usize = 128;
         let plane = self.plane(camera);
-        let mut worst = 0.0_f64;
-        for circle in points.chunk_by(|a, b| a.radius == b.radius) {
+        points.chunk_by(|a, b| a.radius == b.radius).filter_map(move |circle| {
             let mut residuals = [0.0; MAX_POINTS];
             for (residual, point) in residuals.iter_mut().zip(circle) {
                 *residual = plane.residual(point).map_or(f64::MAX, |(residual, _)| residual);
             }
             let count = circle.len().min(MAX_POINTS);
-            let Some(residuals) = residuals.get_mut(..count) else { continue };
+            let residuals = residuals.get_mut(..count)?;
             let (_, median, _) = residuals.select_nth_unstable_by(count / 2, f64::total_cmp);
-            worst = worst.max(median.abs());
-        }
-        worst
+            Some((circle.first()?, *median))
+        })
     }
 
     /// Removes the edge points whose residual exceeds four times the median.
@@ -458,7 +487,7 @@ mod tests {
                 let radius = if i % 2 == 0 { 0.0767 } else { 0.0614 };
                 let (sin, cos) = (f64::from(i) * TAU / 64.0).sin_cos();
                 let point = truth.centre + (u * cos + v * sin) * radius;
-                EdgePoint { ray: point / point.z, radius }
+                EdgePoint { ray: point / point.z, radius, black_inside: true }
             }).collect();
             let start = CirclePose {
                 centre: truth.centre * 1.02,
@@ -472,6 +501,36 @@ mod tests {
             prop_assert!(rms < 2e-2, "{rms}");
             prop_assert!((found.centre - truth.centre).norm() < 1e-3 * z);
         }
+    }
+
+    #[test]
+    fn edges_that_all_lie_in_the_black_tell_how_far() {
+        let camera = CameraModel::pinhole(1296, 972, 1818.0);
+        let truth = pose(0.1, -0.2, 2.0, 0.2, 0.1);
+        let (u, v) = truth.basis();
+        let points = |into_black_px: f64| -> Vec<EdgePoint> {
+            let circles = [(0.0767, true), (0.0614, false), (0.0384, true), (0.023, false)];
+            let places = circles.iter().flat_map(|circle| (0..40).map(move |i| (*circle, i)));
+            places
+                .map(|((radius, black_inside), i)| {
+                    let (sin, cos) = (f64::from(i) * TAU / 40.0).sin_cos();
+                    let inwards_m = into_black_px * truth.centre.z / camera.fx;
+                    let shown = radius + if black_inside { -inwards_m } else { inwards_m };
+                    let point = truth.centre + (u * cos + v * sin) * shown;
+                    EdgePoint { ray: point / point.z, radius, black_inside }
+                })
+                .collect()
+        };
+        for into_black_px in [-0.2, 0.0, 0.4] {
+            // Also from a pose whose range is wrong.
+            for scale in [1.0, 1.01] {
+                let start = CirclePose { centre: truth.centre * scale, ..truth };
+                let shift_px = start.shift_into_black_px(&points(into_black_px), &camera).unwrap();
+                assert!((shift_px - into_black_px).abs() < 0.03, "{shift_px} {into_black_px}");
+            }
+        }
+        let two = points(0.4).into_iter().take(80).collect::<Vec<_>>();
+        assert_eq!(truth.shift_into_black_px(&two, &camera), None);
     }
 
     #[test]

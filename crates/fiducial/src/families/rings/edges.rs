@@ -21,6 +21,7 @@ const MAX_COVERED_SHARE: f64 = 0.25;
 const CURVATURE_SHIFT_PX2: f64 = 0.2;
 
 /// The image and the marker whose edges are located.
+#[derive(Copy, Clone)]
 pub(super) struct EdgeSearch<'a> {
     pub(super) view: GrayView<'a>,
     pub(super) camera: &'a CameraModel,
@@ -29,6 +30,8 @@ pub(super) struct EdgeSearch<'a> {
     /// Minimum contrast across an edge, as a share of the brighter side.
     pub(super) min_contrast: f64,
     pub(super) white_on_black: bool,
+    /// How far a camera's processing moves edges into the black, in pixels.
+    pub(super) into_black_px: f64,
     /// Where markers that are followed should be.
     pub(super) followed: &'a [Prediction],
 }
@@ -108,7 +111,8 @@ impl EdgeSearch<'_> {
         let count = (PI * radius * px_per_m).clamp(16.0, max_places) as u32;
         let max_reach = if reach == Reach::Far { 0.45 * width_px } else { 5.0 };
         let reach_px = (0.5 * width_px).min(max_reach).max(1.25);
-        let shift_px = CURVATURE_SHIFT_PX2 / (radius * px_per_m);
+        let from_black_px = if black_inside { self.into_black_px } else { -self.into_black_px };
+        let shift_px = CURVATURE_SHIFT_PX2 / (radius * px_per_m) + from_black_px;
         let (u, v) = pose.basis();
         for i in 0..count {
             support.searched += 1;
@@ -131,7 +135,7 @@ impl EdgeSearch<'_> {
                     support.found += 1;
                     let at = offset(at, direction, shift_px);
                     let ray = self.camera.unproject_clamped(at);
-                    edges.push(EdgePoint { ray: ray.coords, radius });
+                    edges.push(EdgePoint { ray: ray.coords, radius, black_inside });
                 }
             }
         }

@@ -45,6 +45,15 @@ const MAX_RADII_DEVIATION: f64 = 0.03;
 const MAX_EVENNESS: f64 = 0.3;
 /// Minimum diameter in pixels of a marker that is recognised by one ring.
 const MIN_SINGLE_RING_PX: f64 = 90.0;
+/// Distance by which a camera's processing moves edges into the black, at least in pixels, and at most in pixels and in widths of
+/// the outer ring: half of sRGB's range between black ink and white paper is a fifth of the light.
+const MIN_SHIFT_PX: f64 = 0.1;
+const MAX_SHIFT_PX: f64 = 1.0;
+const MAX_SHIFT_RATIO: f64 = 0.2;
+/// Width of the outer ring in marker sizes.
+const OUTER_RING_WIDTH: f64 = 0.1;
+/// Steps in which that distance is estimated.
+const SHIFT_STEPS: usize = 2;
 /// Factor of the covariance when something disturbs the marker's image.
 const DISTURBED: f64 = 16.0;
 /// Poses whose normals differ by less, in radians, are the same.
@@ -110,42 +119,87 @@ impl EdgeSearch<'_> {
         {
             return Ok(measured);
         }
-        let EdgePose { pose, rms_px, support } =
-            self.edge_pose(rough, &both[1], &mut buffers.edges)?;
-        let diameter_px = self.diameter_px(&pose).ok_or(Reason::Pose)?;
-        let completeness = self.completeness(&pose, &support);
+        let found = self.edge_pose(rough, &both[1], &mut buffers.edges)?;
+        let diameter_px = self.diameter_px(&found.pose).ok_or(Reason::Pose)?;
+        let completeness = self.completeness(&found.pose, &found.support);
         if completeness != Completeness::Insufficient
-            && let Some(fit) = self.photometric_poses(&pose, diameter_px, &mut buffers.samples)
+            && let Some(fit) =
+                self.photometric_poses(&found.pose, diameter_px, &mut buffers.samples)
         {
-            return from_photometric(&fit, confidence(&support)).ok_or(Reason::Pose);
+            return from_photometric(&fit, confidence(&found.support)).ok_or(Reason::Pose);
         }
         let edges = &mut buffers.edges;
-        self.locate(&pose, Reach::Near, edges);
+        if let Some(measured) = self.measure_shifted_edges(&found, edges) {
+            return Ok(measured);
+        }
+        if let Some(measured) = self.measure_edges(&found, edges)? {
+            return Ok(measured);
+        }
+        self.measure_single_ring(&found.pose, kind, edges).ok_or(Reason::Edges)
+    }
+
+    /// The marker at a pose fitted to edges, when these are where the marker has them: its grey values were not a marker's,
+    /// as light or an occluder changes them.
+    ///
+    /// # Errors
+    /// When the pose has no covariance.
+    fn measure_edges(
+        &self,
+        found: &EdgePose,
+        edges: &mut Vec<EdgePoint>,
+    ) -> Result<Option<MeasuredMarker>, Reason> {
+        let EdgePose { pose, rms_px, support } = found;
+        let diameter_px = self.diameter_px(pose).ok_or(Reason::Pose)?;
+        self.locate(pose, Reach::Near, edges);
         let bias_px = pose.max_bias_px(edges, self.camera);
         pose.remove_outliers(edges, self.camera);
         let large = diameter_px > MAX_DIAMETER_PX;
         // Curved paper and lens errors grow with the diameter.
         let bias_ratio = if large { 2e-3 } else { 6e-4 };
         let is_within = |max_rms_px: f64, max_bias_px: f64| {
-            rms_px < (max_rms_px + 3e-3 * diameter_px).min(0.9)
+            *rms_px < (max_rms_px + 3e-3 * diameter_px).min(0.9)
                 && bias_px < max_bias_px * (diameter_px / 60.0).min(1.0) + bias_ratio * diameter_px
         };
-        let fits = match completeness {
+        let fits = match self.completeness(pose, support) {
             Completeness::Insufficient | Completeness::Innermost => false,
             Completeness::Partial => is_within(0.1, 0.05),
             Completeness::Full => is_within(0.3, 0.12),
         };
         if !fits {
-            return self.measure_single_ring(&pose, kind, edges).ok_or(Reason::Edges);
+            return Ok(None);
         }
         let mut measured =
-            self.at_edge_pose(pose, rms_px, edges, confidence(&support)).ok_or(Reason::Pose)?;
+            self.at_edge_pose(*pose, *rms_px, edges, confidence(support)).ok_or(Reason::Pose)?;
         if !large {
-            // The grey values were not a marker's: light or an occluder shifts the edges of one side
-            // together.
+            // Light or an occluder shifts the edges of one side together.
             measured.covariance *= DISTURBED;
         }
-        Ok(measured)
+        Ok(Some(measured))
+    }
+
+    /// As [`Self::measure_edges`], where a camera's tone curve and sharpening have moved all edges into the black by the same
+    /// number of pixels.
+    fn measure_shifted_edges(
+        &self,
+        found: &EdgePose,
+        edges: &mut Vec<EdgePoint>,
+    ) -> Option<MeasuredMarker> {
+        let width_px = self.diameter_px(&found.pose)? * OUTER_RING_WIDTH;
+        let mut shifted = *self;
+        let mut pose = found.pose;
+        for _ in 0..SHIFT_STEPS {
+            shifted.locate(&pose, Reach::Near, edges);
+            shifted.into_black_px += pose.shift_into_black_px(edges, self.camera)?;
+            let is_likely = shifted.into_black_px > MIN_SHIFT_PX
+                && shifted.into_black_px < MAX_SHIFT_PX.min(MAX_SHIFT_RATIO * width_px);
+            if !is_likely {
+                return None;
+            }
+            shifted.locate(&pose, Reach::Near, edges);
+            pose = pose.refined(edges, self.camera)?.0;
+        }
+        let found = shifted.edge_pose(Some(pose), &pose.mirrored(), edges).ok()?;
+        shifted.measure_edges(&found, edges).ok().flatten()
     }
 
     /// The marker near a predicted pose, when it is neither too small nor too large nor disturbed.
