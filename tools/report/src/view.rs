@@ -92,7 +92,7 @@ impl<'a> View<'a> {
 
 /// Points by their time in seconds, with one that is not a number where samples are missing: no line is drawn there.
 pub fn unbridged(points: Vec<(f64, At)>) -> Vec<At> {
-    let between: Vec<f64> = points.windows(2).map(|pair| later_s(pair)).collect();
+    let between: Vec<f64> = points.windows(2).map(later_s).collect();
     let usual_s = node::stats::quantile(&between, 0.5).unwrap_or(0.0);
     let max_s = (MAX_GAP_PERIODS * usual_s).max(MIN_GAP_S);
     let mut drawn = Vec::with_capacity(points.len());
