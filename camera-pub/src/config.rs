@@ -11,6 +11,9 @@ use media::read_calibration;
 use node::{Check, Settings};
 use serde::Deserialize;
 
+use crate::exposure::{Shutter, StampedAt};
+use crate::side_channel::PLACEHOLDER;
+
 /// The keys of `camera-pub.toml`, which explains them.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -36,6 +39,8 @@ pub(crate) struct SourceConfig {
     size_px: [u32; 2],
     row_bytes: usize,
     delay_ms: f64,
+    stamp_at: String,
+    readout_ms: f64,
     timeout_s: f64,
 }
 
@@ -54,8 +59,17 @@ pub(crate) struct ProgramConfig {
     pub(crate) rate_hz: f64,
     /// Time from the middle of the exposure to a frame's first byte.
     pub(crate) delay_ns: i64,
+    /// What the stamps in its metadata are of.
+    pub(crate) shutter: Shutter,
     /// Maximum time without a frame.
     pub(crate) timeout: Duration,
+}
+
+impl ProgramConfig {
+    /// True when the program writes metadata to a pipe.
+    pub(crate) fn has_metadata(&self) -> bool {
+        self.command.iter().any(|argument| argument.contains(PLACEHOLDER))
+    }
 }
 
 /// The size of a frame, in pixels.
@@ -127,6 +141,8 @@ impl Settings for Config {
         check.range("source.max_megapixels", self.source.max_megapixels, 0.001..=4294.0);
         check.one_of("source.pixels", &self.source.pixels, PIXEL_FORMATS);
         check.range("source.delay_ms", self.source.delay_ms, 0.0..=10_000.0);
+        check.one_of("source.stamp_at", &self.source.stamp_at, STAMP_INSTANTS);
+        check.range("source.readout_ms", self.source.readout_ms, 0.0..=1000.0);
         check.range("source.timeout_s", self.source.timeout_s, 0.1..=3600.0);
         check.parses("source.command", self.source.program());
         for (key, value, range) in self.air.ranges() {
@@ -188,6 +204,9 @@ impl Config {
     }
 }
 
+/// The instants that a camera's stamps may be of.
+const STAMP_INSTANTS: &[&str] = &["auto", "exposure-start", "readout-start", "frame-end"];
+
 /// Pixel formats that a program may write.
 const PIXEL_FORMATS: &[&str] = &["gray8", "gray16", "yuv420", "mjpeg"];
 
@@ -235,8 +254,21 @@ impl SourceConfig {
             bits,
             rate_hz: self.rate_hz,
             delay_ns: (self.delay_ms * 1e6) as i64,
+            // That of libcamera on a Raspberry Pi is when the first pixel arrives (raspberrypi/picamera2, issue 821).
+            shutter: self.shutter(StampedAt::ReadoutStart),
             timeout: Duration::from_secs_f64(self.timeout_s),
         }))
+    }
+
+    /// What the camera's stamps are of, where `driver` is what its driver says.
+    pub(crate) fn shutter(&self, driver: StampedAt) -> Shutter {
+        let stamped_at = match self.stamp_at.as_str() {
+            "exposure-start" => StampedAt::ExposureStart,
+            "readout-start" => StampedAt::ReadoutStart,
+            "frame-end" => StampedAt::FrameEnd,
+            _ => driver,
+        };
+        Shutter { stamped_at, readout_ns: (self.readout_ms * 1e6) as i64 }
     }
 
     /// The sensor's Bayer pattern.
@@ -466,5 +498,7 @@ mod tests {
         camera(&["source.pixels=yuv420", "source.bayer=RGGB"], "gray8 or gray16");
         camera(&["source.delay_ms=-1"], "from 0 to 10000");
         camera(&["source.timeout_s=0"], "from 0.1 to 3600");
+        camera(&["source.stamp_at=middle"], "auto, exposure-start");
+        camera(&["source.readout_ms=-1"], "from 0 to 1000");
     }
 }

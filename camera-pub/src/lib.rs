@@ -4,11 +4,16 @@
 //! and no detector.
 //!
 //! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, `program` reads what
-//! a camera's program writes.
+//! a camera's program writes, `side_channel` what it tells of each frame beside: `metadata` splits that, `pairing`
+//! finds each frame's own, `exposure` says from its stamp when the frame was exposed.
 
 pub mod config;
+mod exposure;
+mod metadata;
+mod pairing;
 mod program;
 pub mod service;
+mod side_channel;
 
 pub use config::Config;
 pub use service::run;

@@ -4,6 +4,7 @@
 //! Any camera with such a program can be used, and none of their libraries is needed here.
 
 use std::io::ErrorKind;
+use std::pin::pin;
 use std::process::Stdio;
 use std::time::Duration;
 
@@ -15,6 +16,8 @@ use tokio::process::{Child, ChildStdout, Command};
 use tokio::time::timeout;
 
 use crate::config::{FrameFormat, ProgramConfig};
+use crate::exposure::Exposure;
+use crate::side_channel::{PLACEHOLDER, SideChannel};
 
 /// Size of the read buffer, in bytes: the capacity of a Linux pipe.
 const BUFFER_BYTES: usize = 1 << 16;
@@ -29,6 +32,8 @@ pub(crate) struct Program {
     timeout: Duration,
     child: Child,
     frames: FrameReader<BufReader<ChildStdout>>,
+    delay_ns: i64,
+    metadata: Option<SideChannel>,
 }
 
 impl Program {
@@ -37,8 +42,13 @@ impl Program {
         let (program, arguments) =
             config.command.split_first().context("`source.command` names no program")?;
         let name = program.clone();
+        let period = Duration::from_secs_f64(1.0 / config.rate_hz);
+        let metadata = config.has_metadata().then(|| SideChannel::open(config.shutter, period));
+        let metadata = metadata.transpose()?;
+        let path = metadata.as_ref().map(|metadata| metadata.path().display().to_string());
+        let path = path.unwrap_or_default();
         let mut child = Command::new(program)
-            .args(arguments)
+            .args(arguments.iter().map(|argument| argument.replace(PLACEHOLDER, &path)))
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .kill_on_drop(true)
@@ -50,9 +60,9 @@ impl Program {
             })?;
         let output = child.stdout.take().with_context(|| format!("`{name}` has no output"))?;
         let input = BufReader::with_capacity(BUFFER_BYTES, output);
-        let period = Duration::from_secs_f64(1.0 / config.rate_hz);
         let frames = FrameReader::new(input, config.format, period);
-        Ok(Self { name, timeout: config.timeout, child, frames })
+        let (timeout, delay_ns) = (config.timeout, config.delay_ns);
+        Ok(Self { name, timeout, child, frames, delay_ns, metadata })
     }
 
     /// Waits for the first byte of the next frame.
@@ -60,8 +70,20 @@ impl Program {
     /// # Errors
     /// When the program writes nothing within the timeout, exits, or writes something else.
     pub(crate) async fn wait(&mut self) -> anyhow::Result<Arrival> {
-        let name = &self.name;
-        match timeout(self.timeout, self.frames.wait()).await {
+        let Self { name, frames, metadata, .. } = self;
+        let waiting = async {
+            let mut frame = pin!(frames.wait());
+            let Some(metadata) = metadata else { return frame.await };
+            loop {
+                tokio::select! {
+                    // Where both are there, the frame was written first.
+                    biased;
+                    arrival = &mut frame => return arrival,
+                    () = metadata.take_before_frame() => {}
+                }
+            }
+        };
+        match timeout(self.timeout, waiting).await {
             Ok(Ok(Some(arrival))) => Ok(arrival),
             Ok(Ok(None)) => Err(self.exit_error().await),
             Ok(Err(cause)) => Err(anyhow!("reading frames from `{name}`: {cause}")),
@@ -91,6 +113,33 @@ impl Program {
                 self.timeout.as_secs_f64()
             ),
         }
+    }
+
+    /// When the frame that was read was exposed: by its metadata, or by its arrival. `None` when it was queued.
+    ///
+    /// # Errors
+    /// The metadata are of another clock.
+    pub(crate) async fn exposure(&mut self, arrival: Arrival) -> anyhow::Result<Option<Exposure>> {
+        if arrival.was_queued {
+            if let Some(metadata) = &mut self.metadata {
+                metadata.skip_frame();
+            }
+            return Ok(None);
+        }
+        let by_metadata = match &mut self.metadata {
+            Some(metadata) => metadata
+                .end_frame(arrival.stamp_ns)
+                .await
+                .with_context(|| format!("reading the metadata of `{}`", self.name))?,
+            None => None,
+        };
+        let by_arrival = Exposure::estimated(arrival.stamp_ns - self.delay_ns);
+        Ok(Some(by_metadata.unwrap_or(by_arrival)))
+    }
+
+    /// True when frames have metadata that say when they were exposed.
+    pub(crate) fn has_metadata(&self) -> bool {
+        self.metadata.as_ref().is_some_and(SideChannel::has_agreed)
     }
 
     /// How the program ended.

@@ -16,6 +16,7 @@ use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, cloc
 use tokio::sync::oneshot;
 
 use crate::config::{Config, FrameFormat, FrameSize, ProgramConfig};
+use crate::exposure::Exposure;
 use crate::program::Program;
 
 /// Maximum number of images whose size is read at the start, to size the shared memory. Larger frames are
@@ -218,7 +219,7 @@ impl Stream {
                 FrameFormat::Jpeg { .. } => Loan::Private(Vec::new()),
             };
             let jpeg = program.read(&mut pixels).await?;
-            if arrival.was_queued {
+            let Some(exposure) = program.exposure(arrival).await? else {
                 self.health.dropped("frames that were queued");
                 ensure!(
                     last_published.elapsed() < config.timeout,
@@ -227,6 +228,9 @@ impl Stream {
                     config.rate_hz
                 );
                 continue;
+            };
+            if program.has_metadata() && !exposure.is_exact() {
+                self.health.failed("frame without metadata of its own");
             }
             last_published = Instant::now();
             let frame = match config.format {
@@ -235,7 +239,7 @@ impl Stream {
             };
             self.health.latency("read", began.elapsed());
             if let Some(frame) = frame {
-                self.publish(frame, arrival.stamp_ns - config.delay_ns).await;
+                self.publish(frame, exposure).await;
             }
         }
     }
@@ -305,7 +309,7 @@ impl Stream {
                 Ok(frame) => {
                     pace.wait().await;
                     // An image file is stamped with its time of publication.
-                    self.publish(frame, now_ns()).await;
+                    self.publish(frame, Exposure::estimated(now_ns())).await;
                 }
                 Err(problem) => {
                     self.health.failed("unreadable image");
@@ -349,13 +353,16 @@ impl Stream {
         format != PixelFormat::Mono8 && self.air.is_wanted()
     }
 
-    async fn publish(&mut self, frame: Prepared, stamp_ns: i64) {
+    async fn publish(&mut self, frame: Prepared, exposure: Exposure) {
+        if exposure.is_exact() {
+            self.health.count("exact stamps");
+        }
         let header = FrameHeader {
             camera: self.config.instance().to_owned(),
             sequence: self.sequence,
-            stamp_ns,
+            stamp_ns: exposure.mid_ns,
             clock: clock_name().to_owned(),
-            exposure_ns: 0,
+            exposure_ns: exposure.exposure_ns,
             width: frame.width as u32,
             height: frame.height as u32,
             format: frame.format,

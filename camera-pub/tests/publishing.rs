@@ -257,6 +257,80 @@ async fn the_error_says_how_a_camera_program_ended() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// A camera program that writes as `rpicam-vid` does; `None` where there is no Python.
+fn rpicam(fault: &str) -> anyhow::Result<Option<Config>> {
+    let python = testing::interpreter();
+    if std::process::Command::new(&python).arg("--version").output().is_err() {
+        testing::skip("python", "it does not start");
+        return Ok(None);
+    }
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/rpicam.py");
+    let set = ["source.rate_hz=25", "source.readout_ms=20", "source.delay_ms=28"];
+    program(&[&python, script, "{metadata}", fault], &set).map(Some)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_programs_metadata_stamp_each_frame_with_the_middle_of_its_own_exposure()
+-> anyhow::Result<()> {
+    tokio::try_join!(
+        stamps_are_exact("none", 20),
+        stamps_are_exact("late", 12),
+        stamps_are_exact("torn", 12),
+        stamps_are_exact("doubled", 15),
+        stamps_are_exact("lost", 12),
+    )?;
+    Ok(())
+}
+
+/// Reads 40 frames of a program with this fault: no stamp is that of another frame, and so many are exact.
+async fn stamps_are_exact(fault: &str, min_exact: u32) -> anyhow::Result<()> {
+    let Some(config) = rpicam(fault)? else { return Ok(()) };
+    let port = free_port()?;
+    let (camera, viewer) = (open("camera-pub", port).await?, open("gcs-bridge", port).await?);
+    let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await?;
+    let service = tokio::spawn(camera_pub::run(camera.clone(), config, Shutdown::on_signals()?));
+    let (mut exact, mut inexact) = (0, 0);
+    let mut worst_ns = 0;
+    while exact + inexact < 40 {
+        let frame = timeout(PATIENCE, frames.next()).await?.context("a frame")?;
+        let bytes = frame.bytes();
+        let number = u16::from_le_bytes([bytes[0], bytes[1]]);
+        let sensor_ns = i64::from_le_bytes(bytes[2..10].try_into()?) - node::boot_ahead_ns();
+        // The first row had been exposed for 4 ms; the middle row is read 10 ms later.
+        let error_ns = frame.header.stamp_ns - (sensor_ns - 2_000_000 + 10_000_000);
+        match frame.header.exposure_ns {
+            0 => inexact += 1,
+            exposure_ns => {
+                ensure!(exposure_ns == 4_000_000, "{fault}, frame {number}: {exposure_ns} ns");
+                ensure!(error_ns.abs() < 1_000_000, "{fault}, frame {number}: {error_ns} ns");
+                worst_ns = worst_ns.max(error_ns.abs());
+                exact += 1;
+            }
+        }
+    }
+    println!("{fault}: {exact} exact, {inexact} by arrival, worst error {worst_ns} ns");
+    ensure!(exact >= min_exact, "{fault}: only {exact} frames have an exact stamp");
+    service.abort();
+    camera.close().await;
+    viewer.close().await;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn metadata_of_another_clock_are_refused() -> anyhow::Result<()> {
+    let Some(config) = rpicam("clock")? else { return Ok(()) };
+    let camera = open("camera-pub", free_port()?).await?;
+    let service = camera_pub::run(camera, config, Shutdown::on_signals()?);
+    let problem = timeout(PATIENCE, service).await?.err().context("an error")?;
+    let problem = format!("{problem:#}");
+    ensure!(problem.contains("SensorTimestamp is not of this machine's clock"), "{problem}");
+    ensure!(
+        problem.contains("CLOCK_BOOTTIME") && problem.contains("`source.delay_ms`"),
+        "{problem}"
+    );
+    Ok(())
+}
+
 /// The pixel formats as `ffmpeg` writes them, from a test picture of its own.
 #[tokio::test(flavor = "multi_thread")]
 async fn ffmpeg_is_a_camera() -> anyhow::Result<()> {

@@ -23,7 +23,7 @@ pub mod stats;
 pub mod tap;
 pub mod topics;
 
-pub use clock::{clock_name, host_name, now_ns};
+pub use clock::{boot_ahead_ns, clock_name, host_name, now_ns};
 pub use config::{
     Check, ConfigError, Effective, Layers, Settings, changed, from_toml, named, to_toml,
 };
