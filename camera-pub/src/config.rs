@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use airlink::AirConfig;
-use anyhow::{bail, ensure};
+use anyhow::{Context, bail, ensure};
 use geometry::{Body, Camera, CameraModel, Distortion, Point, Rotation, Transform};
 use imaging::{BayerPattern, GrayView};
 use media::read_calibration;
@@ -13,6 +13,8 @@ use serde::Deserialize;
 
 use crate::exposure::{Shutter, StampedAt};
 use crate::side_channel::PLACEHOLDER;
+use crate::v4l2::capture::{ControlValue, Wanted};
+use crate::v4l2::pixels::Pixels;
 
 /// The keys of `camera-pub.toml`, which explains them.
 #[derive(Clone, Debug, Deserialize)]
@@ -35,6 +37,9 @@ pub(crate) struct SourceConfig {
     bayer: String,
     max_megapixels: f64,
     command: Vec<String>,
+    device: PathBuf,
+    fourcc: String,
+    controls: Vec<String>,
     pixels: String,
     size_px: [u32; 2],
     row_bytes: usize,
@@ -70,6 +75,17 @@ impl ProgramConfig {
     pub(crate) fn has_metadata(&self) -> bool {
         self.command.iter().any(|argument| argument.contains(PLACEHOLDER))
     }
+}
+
+/// A camera of Video4Linux.
+#[derive(Clone, Debug)]
+pub(crate) struct DeviceConfig {
+    /// Its device.
+    pub(crate) path: PathBuf,
+    /// Size of its frames.
+    pub(crate) size: FrameSize,
+    /// What it is opened for.
+    pub(crate) wanted: Wanted,
 }
 
 /// The size of a frame, in pixels.
@@ -144,7 +160,11 @@ impl Settings for Config {
         check.one_of("source.stamp_at", &self.source.stamp_at, STAMP_INSTANTS);
         check.range("source.readout_ms", self.source.readout_ms, 0.0..=1000.0);
         check.range("source.timeout_s", self.source.timeout_s, 0.1..=3600.0);
+        let fourccs = Pixels::ALL.map(|(fourcc, _)| fourcc);
+        check.one_of("source.fourcc", &self.source.fourcc, &fourccs);
+        check.parses("source.controls", self.source.control_values());
         check.parses("source.command", self.source.program());
+        check.parses("source.device", self.source.device());
         for (key, value, range) in self.air.ranges() {
             check.range(key, value, range);
         }
@@ -217,15 +237,9 @@ impl SourceConfig {
             return Ok(None);
         }
         ensure!(self.paths.is_empty(), "with a program, `source.paths` must be empty");
-        let [width, height] = self.size_px.map(|edge| edge as usize);
-        let pixels = width.saturating_mul(height);
-        let edge = GrayView::MAX_EDGE_PX;
-        ensure!(
-            pixels > 0 && width.max(height) <= edge && pixels as f64 <= self.max_megapixels * 1e6,
-            "`source.size_px` is [{width}, {height}]; it must be the width and height of the program's frames, within \
-             `source.max_megapixels` ({}) and {edge} pixels per edge",
-            self.max_megapixels
-        );
+        let size = self.size("the program's frames")?;
+        let FrameSize { width, height } = size;
+        let pixels = size.pixels();
         let bits = if self.pixels == "gray16" { 16 } else { 8 };
         let row_bytes = width * bits as usize / 8;
         let stride_bytes = if self.row_bytes == 0 { row_bytes } else { self.row_bytes };
@@ -249,26 +263,87 @@ impl SourceConfig {
         };
         Ok(Some(ProgramConfig {
             command: self.command.clone(),
-            size: FrameSize { width, height },
+            size,
             format,
             bits,
             rate_hz: self.rate_hz,
-            delay_ns: (self.delay_ms * 1e6) as i64,
-            // That of libcamera on a Raspberry Pi is when the first pixel arrives (raspberrypi/picamera2, issue 821).
-            shutter: self.shutter(StampedAt::ReadoutStart),
+            delay_ns: self.delay_ns(),
+            shutter: Shutter {
+                // That of libcamera on a Raspberry Pi is when the first pixel arrives (raspberrypi/picamera2, issue 821).
+                stamped_at: self.stamped_at().unwrap_or(StampedAt::ReadoutStart),
+                readout_ns: self.readout_ns(),
+            },
             timeout: Duration::from_secs_f64(self.timeout_s),
         }))
     }
 
-    /// What the camera's stamps are of, where `driver` is what its driver says.
-    pub(crate) fn shutter(&self, driver: StampedAt) -> Shutter {
-        let stamped_at = match self.stamp_at.as_str() {
-            "exposure-start" => StampedAt::ExposureStart,
-            "readout-start" => StampedAt::ReadoutStart,
-            "frame-end" => StampedAt::FrameEnd,
-            _ => driver,
+    /// The camera of Video4Linux; `None` where frames come from elsewhere.
+    pub(crate) fn device(&self) -> anyhow::Result<Option<DeviceConfig>> {
+        if self.device == Path::new("") {
+            return Ok(None);
+        }
+        ensure!(
+            self.paths.is_empty() && self.command.is_empty() && self.bayer.is_empty(),
+            "with a device, `source.paths`, `source.command` and `source.bayer` must be empty"
+        );
+        let size = self.size("the camera's frames; `alight cameras` lists them")?;
+        let [width, height] = self.size_px;
+        let wanted = Wanted {
+            fourcc: self.fourcc.clone(),
+            width,
+            height,
+            rate_hz: self.rate_hz,
+            controls: self.control_values()?,
+            stamped_at: self.stamped_at(),
+            readout_ns: self.readout_ns(),
+            delay_ns: self.delay_ns(),
         };
-        Shutter { stamped_at, readout_ns: (self.readout_ms * 1e6) as i64 }
+        Ok(Some(DeviceConfig { path: self.device.clone(), size, wanted }))
+    }
+
+    /// The size of a camera's frames.
+    fn size(&self, whose: &str) -> anyhow::Result<FrameSize> {
+        let [width, height] = self.size_px.map(|edge| edge as usize);
+        let size = FrameSize { width, height };
+        let (pixels, edge) = (size.pixels(), GrayView::MAX_EDGE_PX);
+        ensure!(
+            pixels > 0 && width.max(height) <= edge && pixels as f64 <= self.max_megapixels * 1e6,
+            "`source.size_px` is [{width}, {height}]; it must be the width and height of {whose}, within \
+             `source.max_megapixels` ({}) and {edge} pixels per edge",
+            self.max_megapixels
+        );
+        Ok(size)
+    }
+
+    /// Names and values of the controls.
+    fn control_values(&self) -> anyhow::Result<Vec<ControlValue>> {
+        let values = self.controls.iter().map(|control| {
+            let (name, value) = control.split_once('=').with_context(|| {
+                format!("`{control}` is not of the form `name=value`, as `gain=10`")
+            })?;
+            let value = value.trim().parse();
+            let value = value.with_context(|| format!("the value of `{control}` is no number"))?;
+            Ok(ControlValue { name: name.trim().to_owned(), value })
+        });
+        values.collect()
+    }
+
+    /// What the camera's stamps are of, if it is configured.
+    fn stamped_at(&self) -> Option<StampedAt> {
+        match self.stamp_at.as_str() {
+            "exposure-start" => Some(StampedAt::ExposureStart),
+            "readout-start" => Some(StampedAt::ReadoutStart),
+            "frame-end" => Some(StampedAt::FrameEnd),
+            _ => None,
+        }
+    }
+
+    fn readout_ns(&self) -> i64 {
+        (self.readout_ms * 1e6) as i64
+    }
+
+    fn delay_ns(&self) -> i64 {
+        (self.delay_ms * 1e6) as i64
     }
 
     /// The sensor's Bayer pattern.
@@ -500,5 +575,10 @@ mod tests {
         camera(&["source.timeout_s=0"], "from 0.1 to 3600");
         camera(&["source.stamp_at=middle"], "auto, exposure-start");
         camera(&["source.readout_ms=-1"], "from 0 to 1000");
+        camera(&["source.device=/dev/video0"], "`source.command`");
+        check(&["source.device=/dev/video0"], "`alight cameras` lists them");
+        check(&["source.fourcc=H264"], "GREY, NV12");
+        check(&["source.controls=['gain']"], "`name=value`");
+        check(&["source.controls=['gain=much']"], "no number");
     }
 }

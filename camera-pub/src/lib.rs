@@ -6,14 +6,21 @@
 //! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, `program` reads what
 //! a camera's program writes, `side_channel` what it tells of each frame beside: `metadata` splits that, `pairing`
 //! finds each frame's own, `exposure` says from its stamp when the frame was exposed.
+//! `v4l2` reads cameras without a program; [`devices`] lists those of this machine.
 
 pub mod config;
+pub mod devices;
 mod exposure;
 mod metadata;
 mod pairing;
 mod program;
 pub mod service;
 mod side_channel;
+mod v4l2;
 
 pub use config::Config;
+pub use devices::{ConnectedDevice, connected_devices, source_table, take_picture};
 pub use service::run;
+pub use v4l2::describe::{
+    ControlDescription, DeviceDescription, FormatDescription, SizeDescription,
+};

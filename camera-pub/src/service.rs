@@ -15,22 +15,30 @@ use messages::{BayerPattern, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
-use crate::config::{Config, FrameFormat, FrameSize, ProgramConfig};
+use crate::config::{Config, DeviceConfig, FrameFormat, FrameSize, ProgramConfig};
 use crate::exposure::Exposure;
 use crate::program::Program;
+use crate::v4l2::capture::{Lost, Taken};
+use crate::v4l2::kernel::DevicePath;
+use crate::v4l2::pixels::Pixels;
+use crate::v4l2::video::{Next, Port, Video};
 
 /// Maximum number of images whose size is read at the start, to size the shared memory. Larger frames are
 /// published by a copy.
 const MAX_MEASURED_IMAGES: usize = 1000;
+/// Maximum number of lost frames that are counted at once.
+const MAX_COUNTED: u64 = 1000;
+/// Number of JPEG files in a row that cannot be read after which a device is opened again.
+const MAX_UNREADABLE: u32 = 10;
 /// Interval at which a service that waits for a subscriber looks for one.
 const SUBSCRIBER_POLL: Duration = Duration::from_millis(20);
 
 /// Publishes frames until the images end, a shutdown is requested, no image can be read, or the camera's
-/// program exits or stops writing.
+/// program exits or stops writing. A device that is lost is opened again.
 ///
 /// # Errors
-/// When there is no image to publish, the program cannot be started or exits, or another camera has this
-/// name.
+/// When there is no image to publish, the program cannot be started or exits, the device cannot do what is configured, or
+/// another camera has this name.
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(config.instance()).await?;
     let found = {
@@ -88,6 +96,8 @@ enum Source {
     Images(Vec<PathBuf>),
     /// A camera's program.
     Program(ProgramConfig),
+    /// A camera of Video4Linux.
+    Device(DeviceConfig),
 }
 
 /// What there is to publish.
@@ -100,6 +110,10 @@ struct Found {
 }
 
 fn find(config: &Config) -> anyhow::Result<Found> {
+    if let Some(device) = config.source.device()? {
+        let (size, max_frame_bytes) = (device.size, device.size.pixels());
+        return Ok(Found { source: Source::Device(device), size, max_frame_bytes });
+    }
     match config.source.program()? {
         Some(program) => {
             let size = program.size;
@@ -114,8 +128,8 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
     let mut images = Vec::new();
     ensure!(
         !config.source.paths.is_empty(),
-        "the camera `{}` has nothing to publish; set image files or folders in `source.paths`, or a camera program in \
-         `source.command`",
+        "the camera `{}` has nothing to publish; set image files or folders in `source.paths`, a camera program in \
+         `source.command`, or a device in `source.device` (`alight cameras` lists them)",
         config.instance()
     );
     for path in &config.source.paths {
@@ -203,6 +217,11 @@ impl Stream {
         match source {
             Source::Images(images) => self.publish_images(&images).await,
             Source::Program(program) => self.publish_program(&program).await,
+            Source::Device(device) => {
+                let port = DevicePath(device.path.clone());
+                let cause = || format!("reading the camera {:?} of `source.device`", device.path);
+                self.publish_device(port, &device).await.with_context(cause)
+            }
         }
     }
 
@@ -244,6 +263,83 @@ impl Stream {
         }
     }
 
+    /// Publishes the frames of a device, whenever it is there.
+    async fn publish_device<P: Port>(
+        &mut self,
+        port: P,
+        config: &DeviceConfig,
+    ) -> anyhow::Result<()> {
+        let mut video = Video::start(port, config.wanted.clone())?;
+        let mut unreadable = 0;
+        loop {
+            match video.next()? {
+                Next::Frame(taken) => {
+                    let exposure = taken.exposure;
+                    let began = Instant::now();
+                    let frame = self.prepare_taken(&mut video, taken, config);
+                    self.health.latency("read", began.elapsed());
+                    unreadable = if frame.is_some() { 0 } else { unreadable + 1 };
+                    if let Some(frame) = frame {
+                        self.publish(frame, exposure).await;
+                    }
+                    if unreadable == MAX_UNREADABLE {
+                        unreadable = 0;
+                        let FrameSize { width, height } = config.size;
+                        let lost = Lost::FormatChanged(format!(
+                            "its frames are no JPEG files of {width} x {height} pixels"
+                        ));
+                        video.lose(&lost);
+                        self.health.failed(lost.reason());
+                    }
+                }
+                Next::Nothing => {}
+                Next::Wait(time) => tokio::time::sleep(time).await,
+                Next::Lost(reason) => drop(self.health.failed(reason)),
+            }
+            // Waiting for a frame blocks this thread, briefly: a shutdown is noticed between.
+            tokio::task::yield_now().await;
+        }
+    }
+
+    /// Takes a frame out of the driver's buffer and gives that back.
+    fn prepare_taken<P: Port>(
+        &self,
+        video: &mut Video<P>,
+        taken: Taken,
+        config: &DeviceConfig,
+    ) -> Option<Prepared> {
+        let FrameSize { width, height } = config.size;
+        let capture = video.capture()?;
+        let frame = if Pixels::of(&config.wanted.fourcc) == Some(Pixels::Mjpeg) {
+            capture.read(&taken, |jpeg| self.prepare_jpeg(jpeg))
+        } else {
+            let mut pixels = self.frames.loan(width * height);
+            let copied = capture.copy_grey(&taken, &mut pixels);
+            let format = PixelFormat::Mono8;
+            (copied == width * height).then_some(Prepared {
+                width,
+                height,
+                format,
+                pixels,
+                grey: None,
+            })
+        };
+        let counts = capture.take_counts();
+        let given_back = capture.give_back(taken);
+        for (reason, count) in [
+            ("frames that the driver could not store", counts.missed),
+            ("frames that the driver marked as damaged", counts.damaged),
+            ("frames of another length", counts.cut),
+        ] {
+            (0..count.min(MAX_COUNTED)).for_each(|_| self.health.dropped(reason));
+        }
+        if let Err(lost) = given_back {
+            video.lose(&lost);
+            self.health.failed(lost.reason());
+        }
+        frame
+    }
+
     fn prepare_samples(
         &self,
         pixels: Loan,
@@ -265,7 +361,7 @@ impl Stream {
             Ok(image) => image,
             Err(problem) => {
                 if self.health.failed("unreadable image") {
-                    tracing::warn!(%problem, "Dropped a frame of the camera program");
+                    tracing::warn!(%problem, "Dropped a frame that is no whole JPEG file");
                 }
                 return None;
             }
@@ -386,5 +482,78 @@ fn pixel_format(raw_bits: Option<u32>, bayer: Option<imaging::BayerPattern>) -> 
         (Some(9..), None) => PixelFormat::Mono16,
         (Some(_), Some(pattern)) => PixelFormat::Bayer8(pattern),
         _ => PixelFormat::Mono8,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::v4l2::fake::{Fake, Happening, MS, Stamps, grey_level};
+    use node::{Frame, Identity, Layers, ZenohSource};
+    use std::rc::Rc;
+
+    async fn open(service: &'static str, port: u16) -> Node {
+        let text = include_str!("../../zenoh-config/local.json5");
+        let local = ZenohSource::Text(text.replace(":7447", &format!(":{port}")));
+        Node::open(Identity { service, instance: "down".into() }, &local).await.unwrap()
+    }
+
+    /// Publishes the frames of a played device that is unplugged at its twentieth, until `see` has seen enough of them.
+    async fn publish(fourcc: &'static str, mut see: impl FnMut(&Fake, &Frame) -> bool) {
+        let fake = Fake::of(fourcc, Stamps::ExposureStart, 0);
+        fake.script(20, Happening::Unplugged(300 * MS));
+        let set = ["source.device=/dev/video0", "source.size_px=[640, 480]", "source.rate_hz=100"];
+        let mut set: Vec<_> = set.map(str::to_owned).into();
+        set.push(format!("source.fourcc={fourcc}"));
+        let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
+        let found = find(&config).unwrap();
+        let ([port], _, _) = testing::ports::free().unwrap();
+        let (camera, viewer) = (open("camera-pub", port).await, open("gcs-bridge", port).await);
+        let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await.unwrap();
+        let mut stream = Stream::new(&camera, &config, &found).await.unwrap();
+        while !stream.frames.has_subscribers().await {
+            tokio::time::sleep(SUBSCRIBER_POLL).await;
+        }
+        let Source::Device(device) = found.source else { panic!("no device") };
+        let seeing = async {
+            loop {
+                let frame = tokio::time::timeout(Duration::from_secs(10), frames.next()).await;
+                if see(&fake, &frame.expect("a frame in time").expect("an open session")) {
+                    break;
+                }
+            }
+        };
+        tokio::select! {
+            result = stream.publish_device(Rc::clone(&fake), &device) => result.unwrap(),
+            () = seeing => {}
+        }
+        assert_eq!(camera.health().failures("camera unplugged"), 1);
+        // A session that is dropped instead of closed may wait ten seconds for the others of its process.
+        drop((stream, frames));
+        camera.close().await;
+        viewer.close().await;
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_devices_frames_carry_their_own_stamps_before_and_after_it_was_unplugged() {
+        for fourcc in ["YUYV", "MJPG"] {
+            let (mut before, mut after) = (0, 0);
+            publish(fourcc, |fake, frame| {
+                let (header, bytes) = (&frame.header, frame.bytes());
+                assert_eq!((header.width, header.height, bytes.len()), (640, 480, 640 * 480));
+                assert_eq!((header.exposure_ns, header.format), (5_000_000, PixelFormat::Mono8));
+                let number = fake.number_at(header.stamp_ns + 1000);
+                let error_ns = header.stamp_ns - fake.mid_exposure_ns(number);
+                assert!(error_ns.abs() <= 1000, "{error_ns} ns");
+                match fourcc {
+                    "MJPG" => assert!(bytes[5000].abs_diff(grey_level(number)) < 3),
+                    _ => assert_eq!(u32::from_le_bytes(bytes[..4].try_into().unwrap()), number),
+                }
+                (before, after) =
+                    if number < 20 { (before + 1, after) } else { (before, after + 1) };
+                before > 0 && after > 4
+            })
+            .await;
+        }
     }
 }

@@ -1,0 +1,257 @@
+//! The video devices of this machine: what they offer, how to configure them, and a picture of one.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use imaging::GrayImage;
+use media::DecodedImage;
+use serde::Serialize;
+
+use crate::config::DeviceConfig;
+use crate::v4l2::abi::{CID_EXPOSURE_ABSOLUTE, CID_EXPOSURE_AUTO, Device, EXPOSURE_MANUAL};
+use crate::v4l2::capture::{Capture, Taken};
+use crate::v4l2::describe::{DeviceDescription, FormatDescription, SizeDescription, describe};
+use crate::v4l2::kernel::{DevicePath, KernelDevice};
+use crate::v4l2::pixels::Pixels;
+use crate::v4l2::video::{Next, Port, Video};
+
+/// A video device of this machine.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ConnectedDevice {
+    /// Its path, as `/dev/video0`.
+    pub path: PathBuf,
+    /// What it offers; `None` when it cannot be asked.
+    pub description: Option<DeviceDescription>,
+    /// Why it cannot be asked.
+    pub problem: Option<String>,
+}
+
+/// Number of frames until a camera has found its exposure.
+const SETTLING_FRAMES: u32 = 15;
+/// Maximum time for a picture.
+const PICTURE_NS: i64 = 8_000_000_000;
+/// Exposure time that is suggested, in 100 us: it blurs by a pixel at a turn of 30 degrees per second and 1000 pixels of
+/// focal length.
+const SUGGESTED_EXPOSURE: i64 = 20;
+/// Minimum frame rate that is suggested.
+const MIN_RATE_HZ: f64 = 25.0;
+/// Maximum pixels of frames that are suggested: more cost the detector more time than they add range.
+const MAX_PIXELS: u64 = 1920 * 1200;
+
+/// The video devices in this folder, which is `/dev`, in the order of their numbers.
+pub fn connected_devices(folder: &Path) -> Vec<ConnectedDevice> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let number = |path: &PathBuf| -> Option<u32> {
+        path.file_name()?.to_str()?.strip_prefix("video")?.parse().ok()
+    };
+    let mut found: Vec<(u32, PathBuf)> =
+        entries.map(|entry| entry.path()).filter_map(|path| Some((number(&path)?, path))).collect();
+    found.sort();
+    found.into_iter().map(|(_number, path)| ask(path)).collect()
+}
+
+fn ask(path: PathBuf) -> ConnectedDevice {
+    match KernelDevice::open(&path).and_then(|device| describe(&device)) {
+        Ok(description) => ConnectedDevice { path, description: Some(description), problem: None },
+        Err(cause) => ConnectedDevice { path, description: None, problem: Some(cause.to_string()) },
+    }
+}
+
+/// The `[source]` table with which camera-pub reads a device; `None` when it reads none of its formats.
+pub fn source_table(path: &Path, description: &DeviceDescription) -> Option<String> {
+    let (format, size) = best_mode(description)?;
+    let rate_hz = suggested_rate_hz(size);
+    let mut table = format!(
+        "[source]\ndevice = {path:?}\nfourcc = \"{}\"\nsize_px = [{}, {}]\nrate_hz = {rate_hz:.1}\n",
+        format.fourcc, size.width, size.height
+    );
+    // By their numbers: their names have changed between versions of Linux.
+    let control = |id| description.controls.iter().find(|control| control.id == id);
+    if let (Some(auto), Some(exposure)) =
+        (control(CID_EXPOSURE_AUTO), control(CID_EXPOSURE_ABSOLUTE))
+    {
+        let value = SUGGESTED_EXPOSURE.clamp(exposure.min, exposure.max.max(exposure.min));
+        let controls =
+            format!("[\"{}={EXPOSURE_MANUAL}\", \"{}={value}\"]", auto.name, exposure.name);
+        let ms = value as f64 * 0.1;
+        table += &format!("# {ms:.1} ms: short, so that nothing blurs, and stamps are exact.\n");
+        table += &format!("controls = {controls}\n");
+    }
+    Some(table)
+}
+
+/// The mode that is suggested: fast enough, then of most pixels, then without loss.
+fn best_mode(description: &DeviceDescription) -> Option<(&FormatDescription, &SizeDescription)> {
+    let readable = description.formats.iter().filter(|format| format.is_readable);
+    let modes = readable.flat_map(|format| format.sizes.iter().map(move |size| (format, size)));
+    modes.max_by_key(|(format, size)| {
+        let pixels = u64::from(size.width) * u64::from(size.height);
+        let is_fast = suggested_rate_hz(size) >= MIN_RATE_HZ;
+        let preference = Pixels::ALL.iter().rev().position(|(fourcc, _)| *fourcc == format.fourcc);
+        // Of those that are all too large the smallest.
+        let order =
+            if pixels <= MAX_PIXELS { pixels } else { MAX_PIXELS / (pixels / MAX_PIXELS + 1) };
+        (is_fast && pixels <= MAX_PIXELS, is_fast, order, preference)
+    })
+}
+
+/// The highest rate up to 60 Hz, beyond which a detector may not follow, or the lowest.
+fn suggested_rate_hz(size: &SizeDescription) -> f64 {
+    let fitting = size.rates_hz.iter().copied().filter(|rate| *rate <= 60.5).reduce(f64::max);
+    fitting.or_else(|| size.rates_hz.iter().copied().reduce(f64::min)).unwrap_or(30.0)
+}
+
+/// Takes a picture with a device as a configuration says it, once its exposure has settled.
+///
+/// # Errors
+/// The configuration has no device, or that gives no picture.
+pub fn take_picture(config: &crate::Config) -> anyhow::Result<GrayImage> {
+    let device = config.source.device()?.context("`source.device` is empty")?;
+    let whose = || format!("taking a picture with {:?}", device.path);
+    picture(DevicePath(device.path.clone()), &device, config.max_pixels()).with_context(whose)
+}
+
+fn picture<P: Port>(port: P, config: &DeviceConfig, max_pixels: u64) -> anyhow::Result<GrayImage> {
+    let mut video = Video::start(port, config.wanted.clone())?;
+    let mut frames = 0;
+    let mut problem = "it gives no frames".to_owned();
+    while video.now_ns() < video.started_ns() + PICTURE_NS {
+        match video.next()? {
+            Next::Frame(taken) => {
+                frames += 1;
+                let Some(capture) = video.capture() else { continue };
+                let image = grey(capture, &taken, config, max_pixels);
+                capture.give_back(taken)?;
+                match image {
+                    Ok(image) if frames >= SETTLING_FRAMES => return Ok(image),
+                    Ok(_) => {}
+                    Err(cause) => problem = format!("{cause:#}"),
+                }
+            }
+            Next::Nothing => {}
+            Next::Wait(time) => std::thread::sleep(time.min(Duration::from_millis(50))),
+            Next::Lost(reason) => problem = reason.to_owned(),
+        }
+    }
+    anyhow::bail!("no picture within {} s: {problem}", PICTURE_NS / 1_000_000_000)
+}
+
+fn grey<D: Device>(
+    capture: &Capture<D>,
+    taken: &Taken,
+    config: &DeviceConfig,
+    max_pixels: u64,
+) -> anyhow::Result<GrayImage> {
+    let size = config.size;
+    let mut image = GrayImage::filled(size.width, size.height, 0);
+    if Pixels::of(&config.wanted.fourcc) == Some(Pixels::Mjpeg) {
+        let decoded = capture
+            .read(taken, |jpeg| DecodedImage::decode(Path::new("its frame"), jpeg, max_pixels))?;
+        let [width, height] = [decoded.width(), decoded.height()];
+        ensure!(
+            (width, height) == (size.width, size.height),
+            "its frames have {width} x {height} pixels"
+        );
+        decoded.write_grey(image.pixels_mut());
+    } else {
+        capture.copy_grey(taken, image.pixels_mut());
+    }
+    Ok(image)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Config;
+    use crate::v4l2::fake::{Fake, Stamps};
+    use node::Layers;
+    use std::rc::Rc;
+
+    /// The configuration with this `[source]` table.
+    fn config(table: &str) -> Config {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), table).unwrap();
+        let layers = Layers { file: Some(file.path().to_owned()), set: Vec::new() };
+        layers.load::<Config>().unwrap().settings
+    }
+
+    fn description(sizes: &[(&str, u32, u32, f64)]) -> DeviceDescription {
+        let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
+        let mut description = describe(&fake.open().unwrap()).unwrap();
+        description.formats = sizes
+            .iter()
+            .map(|(fourcc, width, height, rate_hz)| FormatDescription {
+                fourcc: (*fourcc).to_owned(),
+                name: String::new(),
+                is_readable: Pixels::of(fourcc).is_some(),
+                sizes: vec![SizeDescription {
+                    width: *width,
+                    height: *height,
+                    is_range: false,
+                    rates_hz: vec![*rate_hz],
+                }],
+            })
+            .collect();
+        description
+    }
+
+    #[test]
+    fn the_suggested_table_is_a_configuration() {
+        let description = description(&[
+            ("YUYV", 1280, 720, 10.0),
+            ("H264", 1920, 1080, 60.0),
+            ("MJPG", 1280, 720, 60.0),
+            ("YUYV", 640, 480, 30.0),
+            ("MJPG", 3840, 2160, 30.0),
+        ]);
+        let table = source_table(Path::new("/dev/video2"), &description).unwrap();
+        let device = config(&table).source.device().unwrap().unwrap();
+        assert_eq!(device.path, Path::new("/dev/video2"));
+        let wanted = device.wanted;
+        assert_eq!((&*wanted.fourcc, wanted.width, wanted.rate_hz), ("MJPG", 1280, 60.0));
+        assert_eq!(wanted.controls.len(), 2);
+    }
+
+    #[test]
+    fn the_fastest_without_loss_goes_before_jpeg_of_the_same_size() {
+        let of = |sizes: &[(&str, u32, u32, f64)]| {
+            let description = description(sizes);
+            let mode = best_mode(&description);
+            mode.map(|(format, size)| format!("{} {}", format.fourcc, size.width))
+        };
+        let both = [("MJPG", 1280, 800, 120.0), ("GREY", 1280, 800, 60.0)];
+        assert_eq!(of(&both).unwrap(), "GREY 1280");
+        assert_eq!(
+            of(&[("MJPG", 1280, 720, 30.0), ("GREY", 1280, 720, 5.0)]).unwrap(),
+            "MJPG 1280"
+        );
+        assert_eq!(of(&[("H264", 1280, 720, 30.0)]), None);
+        assert_eq!(of(&[("YUYV", 4000, 3000, 5.0)]).unwrap(), "YUYV 4000");
+    }
+
+    #[test]
+    fn a_picture_shows_what_the_camera_sees() {
+        let fake = Fake::of("YUYV", Stamps::ExposureStart, 0);
+        let config = config(
+            "[source]\ndevice = \"/dev/video0\"\nfourcc = \"YUYV\"\nsize_px = [640, 480]\nrate_hz = 100\n",
+        );
+        let device = config.source.device().unwrap().unwrap();
+        let picture = picture(Rc::clone(&fake), &device, 1 << 20).unwrap();
+        let number = u32::from_le_bytes(picture.pixels()[..4].try_into().unwrap());
+        assert!((15..30).contains(&number), "frame {number}");
+        assert_eq!((fake.open_devices(), fake.mappings()), (0, 0));
+    }
+
+    #[test]
+    fn devices_are_listed_by_their_numbers_with_what_is_wrong() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["video10", "video2", "videodev", "null"] {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        let found = connected_devices(folder.path());
+        let names: Vec<_> = found.iter().filter_map(|device| device.path.file_name()).collect();
+        assert_eq!(names, ["video2", "video10"]);
+        assert!(found.iter().all(|d| d.problem.as_ref().unwrap().contains("ioctl")), "{found:?}");
+    }
+}

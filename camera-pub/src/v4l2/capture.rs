@@ -1,0 +1,442 @@
+//! Frames of a V4L2 device: opened as configured, each with its stamp by the driver.
+
+use std::io;
+use std::time::Duration;
+
+use super::abi::{
+    BUF_FLAG_ERROR, BUF_FLAG_TIMESTAMP_MASK, BUF_FLAG_TIMESTAMP_MONOTONIC,
+    BUF_FLAG_TSTAMP_SRC_MASK, BUF_FLAG_TSTAMP_SRC_SOE, Buffer, CID_EXPOSURE_ABSOLUTE,
+    CID_EXPOSURE_AUTO, Call, Capability, Device, EXPOSURE_MANUAL, ExtControl, FIELD_NONE, Format,
+    Mapping, PixFormat, RequestBuffers, StreamParm, text,
+};
+use super::describe::{ControlDescription, control_value, controls, describe, is_camera};
+use super::pixels::{Pixels, Rows};
+use crate::exposure::{Exposure, Shutter, StampedAt};
+
+/// Number of buffers that the driver fills in turn: one being read, the others for it. Fewer lose frames when the
+/// service is late by a period.
+const BUFFERS: u32 = 4;
+/// Minimum number of buffers that a driver may give instead.
+const MIN_BUFFERS: u32 = 2;
+/// Maximum number of buffers, if the driver gives more.
+const MAX_BUFFERS: u32 = 32;
+/// Maximum time from a frame's stamp to its arrival; a longer one is another clock's.
+const MAX_DELAY_NS: i64 = 1_000_000_000;
+/// Interval at which the exposure time is read again, in case another program sets it: over USB that takes milliseconds.
+const EXPOSURE_READ_NS: i64 = 1_000_000_000;
+/// Number of frames in a row with an impossible stamp at the start after which the clock is refused, and of frames of
+/// another length after which the format has changed.
+const IN_A_ROW: u32 = 10;
+
+/// What a device is opened for.
+#[derive(Clone, Debug)]
+pub(crate) struct Wanted {
+    pub(crate) fourcc: String,
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    pub(crate) rate_hz: f64,
+    /// Controls by name, in the order in which they are set.
+    pub(crate) controls: Vec<ControlValue>,
+    /// What stamps are of, where it is configured; else what the driver says.
+    pub(crate) stamped_at: Option<StampedAt>,
+    pub(crate) readout_ns: i64,
+    /// Time from mid-exposure to arrival, for drivers that do not stamp on the host's clock.
+    pub(crate) delay_ns: i64,
+}
+
+/// A control and the value to set.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct ControlValue {
+    pub(crate) name: String,
+    pub(crate) value: i32,
+}
+
+/// Why there are no frames.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum Lost {
+    /// The device is gone.
+    #[error("it is not connected; `alight cameras` lists those that are")]
+    Unplugged,
+    /// It gives no frames.
+    #[error("it gave no frame for {0:.1?}")]
+    Stalled(Duration),
+    /// Its frames are others than those that were agreed on.
+    #[error("its format changed: {0}")]
+    FormatChanged(String),
+    /// Its stamps are on no clock of this host.
+    #[error(
+        "its driver stamps frames {before_arrival_s:.3} s before they arrive (0 to 1 s are possible), so that its stamps are \
+         not of this machine's clock; for uvcvideo, `modprobe uvcvideo clock=CLOCK_MONOTONIC hwtimestamps=0`"
+    )]
+    ForeignClock {
+        /// Time from the last stamp to the frame's arrival.
+        before_arrival_s: f64,
+    },
+    /// It does not do what is configured.
+    #[error("{0}")]
+    Refused(String),
+    /// It failed in another way.
+    #[error("{call}: {cause}")]
+    Failed {
+        /// What was called.
+        call: &'static str,
+        /// What it answered.
+        cause: io::Error,
+    },
+}
+
+/// What happened between frames.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Counts {
+    /// Frames that the driver could not store, by the gaps of its numbers.
+    pub(crate) missed: u64,
+    /// Frames that the driver marked as damaged.
+    pub(crate) damaged: u64,
+    /// Frames of another length.
+    pub(crate) cut: u64,
+}
+
+/// A device that gives frames.
+pub(crate) struct Capture<D: Device> {
+    buffers: Vec<D::Mapping>,
+    device: D,
+    rows: Rows,
+    rate_hz: f64,
+    stamped_at: Option<StampedAt>,
+    readout_ns: i64,
+    delay_ns: i64,
+    /// The number of the last frame by the driver.
+    last_sequence: Option<u32>,
+    impossible: u32,
+    has_clock: bool,
+    cut_in_a_row: u32,
+    exposure_ns: u32,
+    /// When `exposure_ns` was read, so long ago at first that it is read.
+    exposure_read_ns: i64,
+    counts: Counts,
+}
+
+/// A frame in the driver's buffer, which gets it back by [`Capture::give_back`].
+#[derive(Debug)]
+pub(crate) struct Taken {
+    index: u32,
+    bytes: usize,
+    pub(crate) exposure: Exposure,
+}
+
+impl<D: Device> Capture<D> {
+    /// Opens the device for frames as wanted, and starts them.
+    ///
+    /// # Errors
+    /// It is no camera, cannot do what is wanted, or fails.
+    pub(crate) fn start(device: D, wanted: &Wanted) -> Result<Self, Lost> {
+        let mut capability = Capability::default();
+        failed("VIDIOC_QUERYCAP", device.call(Call::QueryCap(&mut capability)))?;
+        if !is_camera(&capability) {
+            let card = text(&capability.card);
+            return Err(Lost::Refused(format!(
+                "`{card}` gives no frames; a camera has several devices, `alight cameras` says which to take"
+            )));
+        }
+        let rows = set_format(&device, wanted)?;
+        let rate_hz = set_rate(&device, wanted.rate_hz)?;
+        set_controls(&device, &wanted.controls)?;
+        let mut capture = Self {
+            buffers: Vec::new(),
+            device,
+            rows,
+            rate_hz,
+            stamped_at: wanted.stamped_at,
+            readout_ns: wanted.readout_ns,
+            delay_ns: wanted.delay_ns,
+            last_sequence: None,
+            impossible: 0,
+            has_clock: false,
+            cut_in_a_row: 0,
+            exposure_ns: 0,
+            exposure_read_ns: i64::MIN,
+            counts: Counts::default(),
+        };
+        // From here on `drop` gives back what there is.
+        capture.request_buffers()?;
+        failed("VIDIOC_STREAMON", capture.device.call(Call::StreamOn))?;
+        Ok(capture)
+    }
+
+    /// The rate at which the device gives frames.
+    pub(crate) fn rate_hz(&self) -> f64 {
+        self.rate_hz
+    }
+
+    /// What happened since the last call.
+    pub(crate) fn take_counts(&mut self) -> Counts {
+        std::mem::take(&mut self.counts)
+    }
+
+    fn request_buffers(&mut self) -> Result<(), Lost> {
+        let mut request = RequestBuffers::of(BUFFERS);
+        failed("VIDIOC_REQBUFS", self.device.call(Call::ReqBufs(&mut request)))?;
+        if !(MIN_BUFFERS..=MAX_BUFFERS).contains(&request.count) {
+            let count = request.count;
+            return Err(Lost::Refused(format!(
+                "its driver gives {count} buffers, from {MIN_BUFFERS} to {MAX_BUFFERS} are needed; is there memory left?"
+            )));
+        }
+        for index in 0..request.count {
+            let mut buffer = Buffer::of(index);
+            failed("VIDIOC_QUERYBUF", self.device.call(Call::QueryBuf(&mut buffer)))?;
+            self.buffers.push(failed("mmap", self.device.map(&buffer))?);
+            failed("VIDIOC_QBUF", self.device.call(Call::QBuf(&mut Buffer::of(index))))?;
+        }
+        Ok(())
+    }
+
+    /// Takes the next frame that is whole; `None` when there is none within `timeout`, or only damaged ones.
+    ///
+    /// # Errors
+    /// The device is gone, or what it gives is not what was agreed on.
+    pub(crate) fn take(&mut self, timeout: Duration) -> Result<Option<Taken>, Lost> {
+        if !failed("poll", self.device.wait(timeout))? {
+            return Ok(None);
+        }
+        let mut buffer = Buffer::of(0);
+        match self.device.call(Call::DqBuf(&mut buffer)) {
+            Ok(()) => {}
+            // Nothing there after all, or one frame was lost inside the driver, which goes on.
+            Err(cause) if matches!(cause.raw_os_error(), Some(libc::EAGAIN | libc::EIO)) => {
+                self.counts.damaged += u64::from(cause.raw_os_error() == Some(libc::EIO));
+                return Ok(None);
+            }
+            Err(cause) => return failed("VIDIOC_DQBUF", Err(cause)),
+        }
+        let arrival_ns = self.device.now_ns();
+        if let Some(last) = self.last_sequence.replace(buffer.sequence) {
+            self.counts.missed += u64::from(buffer.sequence.wrapping_sub(last).saturating_sub(1));
+        }
+        match self.check(&buffer, arrival_ns) {
+            Ok(Some(exposure)) => {
+                let bytes = buffer.bytesused as usize;
+                Ok(Some(Taken { index: buffer.index, bytes, exposure }))
+            }
+            refused => {
+                self.queue(buffer.index)?;
+                refused.map(|_none| None)
+            }
+        }
+    }
+
+    /// When a buffer's frame was exposed; `None` when it is damaged.
+    fn check(&mut self, buffer: &Buffer, arrival_ns: i64) -> Result<Option<Exposure>, Lost> {
+        if buffer.flags & BUF_FLAG_ERROR != 0 {
+            self.counts.damaged += 1;
+            return Ok(None);
+        }
+        let mapped = self.buffers.get(buffer.index as usize).map_or(0, Mapping::len);
+        let bytes = buffer.bytesused as usize;
+        let is_whole = match self.rows.pixels {
+            Pixels::Mjpeg => (1..=mapped).contains(&bytes),
+            _ => (self.rows.min_bytes()..=mapped).contains(&bytes),
+        };
+        if !is_whole {
+            self.counts.cut += 1;
+            self.cut_in_a_row += 1;
+            if self.cut_in_a_row < IN_A_ROW {
+                return Ok(None);
+            }
+            let needed = self.rows.min_bytes();
+            return Err(Lost::FormatChanged(format!(
+                "its frames have {bytes} bytes, {needed} are needed"
+            )));
+        }
+        self.cut_in_a_row = 0;
+        self.exposure(buffer, arrival_ns).map(Some)
+    }
+
+    fn exposure(&mut self, buffer: &Buffer, arrival_ns: i64) -> Result<Exposure, Lost> {
+        let by_arrival = Exposure::estimated(arrival_ns - self.delay_ns);
+        if buffer.flags & BUF_FLAG_TIMESTAMP_MASK != BUF_FLAG_TIMESTAMP_MONOTONIC {
+            return Ok(by_arrival);
+        }
+        let of_driver = match buffer.flags & BUF_FLAG_TSTAMP_SRC_MASK {
+            BUF_FLAG_TSTAMP_SRC_SOE => StampedAt::ExposureStart,
+            _ => StampedAt::FrameEnd,
+        };
+        let stamped_at = self.stamped_at.unwrap_or(of_driver);
+        let shutter = Shutter { stamped_at, readout_ns: self.readout_ns };
+        let stamp_ns = buffer
+            .seconds
+            .saturating_mul(1_000_000_000)
+            .saturating_add(buffer.microseconds.saturating_mul(1000));
+        if arrival_ns.saturating_sub(self.exposure_read_ns) > EXPOSURE_READ_NS {
+            (self.exposure_ns, self.exposure_read_ns) = (self.exposure_time_ns(), arrival_ns);
+        }
+        let exposure_ns = self.exposure_ns;
+        let delay_ns = arrival_ns.saturating_sub(stamp_ns);
+        if !(shutter.until_read_ns(0)..=MAX_DELAY_NS).contains(&delay_ns) {
+            self.impossible += 1;
+            if !self.has_clock && self.impossible == IN_A_ROW {
+                return Err(Lost::ForeignClock { before_arrival_s: delay_ns as f64 * 1e-9 });
+            }
+            return Ok(by_arrival);
+        }
+        (self.has_clock, self.impossible) = (true, 0);
+        Ok(Exposure { mid_ns: shutter.mid_exposure_ns(stamp_ns, exposure_ns), exposure_ns })
+    }
+
+    /// The exposure time; 0 while the camera meters by itself, as it does not say then what it chose for which frame.
+    fn exposure_time_ns(&self) -> u32 {
+        let is_manual =
+            control_value(&self.device, CID_EXPOSURE_AUTO).is_none_or(|v| v == EXPOSURE_MANUAL);
+        let value = control_value(&self.device, CID_EXPOSURE_ABSOLUTE).filter(|_| is_manual);
+        value.and_then(|value| u32::try_from(value).ok()?.checked_mul(100_000)).unwrap_or(0)
+    }
+
+    /// Reads the bytes of a frame where the driver wrote them.
+    pub(crate) fn read<R>(&self, taken: &Taken, read: impl FnOnce(&[u8]) -> R) -> R {
+        match self.buffers.get(taken.index as usize) {
+            Some(buffer) => buffer.read(|bytes| read(bytes.get(..taken.bytes).unwrap_or_default())),
+            None => read(&[]),
+        }
+    }
+
+    /// Writes the grey levels of a frame of samples, and returns how many bytes that were.
+    pub(crate) fn copy_grey(&self, taken: &Taken, grey: &mut [u8]) -> usize {
+        self.read(taken, |bytes| self.rows.copy_grey(bytes, grey))
+    }
+
+    /// Gives a frame's buffer back to the driver.
+    ///
+    /// # Errors
+    /// The device is gone.
+    #[expect(clippy::needless_pass_by_value, reason = "what is given back cannot be read any more")]
+    pub(crate) fn give_back(&mut self, taken: Taken) -> Result<(), Lost> {
+        self.queue(taken.index)
+    }
+
+    fn queue(&self, index: u32) -> Result<(), Lost> {
+        failed("VIDIOC_QBUF", self.device.call(Call::QBuf(&mut Buffer::of(index))))
+    }
+}
+
+impl Lost {
+    /// What it is counted as.
+    pub(crate) fn reason(&self) -> &'static str {
+        match self {
+            Self::Unplugged => "camera unplugged",
+            Self::Stalled(_) => "camera stalled",
+            Self::FormatChanged(_) => "camera's format changed",
+            Self::ForeignClock { .. } => "camera's stamps of another clock",
+            Self::Refused(_) => "camera refused what is configured",
+            Self::Failed { .. } => "camera failed",
+        }
+    }
+}
+
+impl<D: Device> Drop for Capture<D> {
+    fn drop(&mut self) {
+        // A device that was unplugged refuses; its memory is freed when it is closed.
+        drop(self.device.call(Call::StreamOff));
+        // The driver frees no buffer that is still mapped.
+        self.buffers.clear();
+        drop(self.device.call(Call::ReqBufs(&mut RequestBuffers::of(0))));
+    }
+}
+
+/// The error of a call; that of a device that is gone is told apart.
+fn failed<T>(call: &'static str, result: io::Result<T>) -> Result<T, Lost> {
+    result.map_err(|cause| match cause.raw_os_error() {
+        Some(libc::ENODEV | libc::ENXIO) => Lost::Unplugged,
+        Some(libc::EBUSY) => Lost::Refused(format!("another program uses it ({call}: {cause})")),
+        _ => Lost::Failed { call, cause },
+    })
+}
+
+fn set_format(device: &impl Device, wanted: &Wanted) -> Result<Rows, Lost> {
+    let Wanted { fourcc, width, height, .. } = wanted;
+    let (Some(pixels), Some(pixelformat)) = (Pixels::of(fourcc), Pixels::number(fourcc)) else {
+        return Err(Lost::Refused(format!("`{fourcc}` is no pixel format that is read")));
+    };
+    let pix = PixFormat {
+        width: *width,
+        height: *height,
+        pixelformat,
+        field: FIELD_NONE,
+        ..PixFormat::default()
+    };
+    let mut format = Format { pix, ..Format::default() };
+    failed("VIDIOC_S_FMT", device.call(Call::SetFormat(&mut format)))?;
+    // A driver takes the nearest that it has.
+    let pix = format.pix;
+    if (pix.pixelformat, pix.width, pix.height) != (pixelformat, *width, *height) {
+        let nearest = text(&pix.pixelformat.to_le_bytes());
+        let offered = offered(device);
+        return Err(Lost::Refused(format!(
+            "it has no `{fourcc}` of {width} x {height} pixels, the nearest is `{nearest}` of {} x {}; it has {offered}",
+            pix.width, pix.height
+        )));
+    }
+    let [width, height, stride] = [pix.width, pix.height, pix.bytesperline].map(|n| n as usize);
+    let rows = Rows { pixels, width, height, stride };
+    // Drivers leave it at 0 for JPEG, and some for samples without padding.
+    let stride = if stride == 0 { rows.row_bytes() } else { stride };
+    if pixels != Pixels::Mjpeg && stride < rows.row_bytes() {
+        let needed = rows.row_bytes();
+        return Err(Lost::Refused(format!("its rows have {stride} bytes, {needed} are needed")));
+    }
+    Ok(Rows { stride, ..rows })
+}
+
+/// The formats and sizes that a device has and that are read, as text.
+fn offered(device: &impl Device) -> String {
+    let formats = describe(device).map(|description| description.formats).unwrap_or_default();
+    let readable = formats.iter().filter(|format| format.is_readable);
+    let texts = readable.map(|format| {
+        let sizes = format.sizes.iter().map(|size| format!("{} x {}", size.width, size.height));
+        format!("`{}` of {}", format.fourcc, sizes.collect::<Vec<_>>().join(", "))
+    });
+    let texts: Vec<_> = texts.collect();
+    if texts.is_empty() { "no format that is read".to_owned() } else { texts.join("; ") }
+}
+
+/// Sets the frame rate; returns that which the device has taken.
+fn set_rate(device: &impl Device, rate_hz: f64) -> Result<f64, Lost> {
+    let (numerator, denominator) = (1000, (rate_hz * 1000.0).round() as u32);
+    let mut parm = StreamParm { numerator, denominator, ..StreamParm::default() };
+    match device.call(Call::SetParm(&mut parm)) {
+        Ok(()) if parm.numerator > 0 && parm.denominator > 0 => {
+            Ok(f64::from(parm.denominator) / f64::from(parm.numerator))
+        }
+        // A driver of a single rate has no such call.
+        Ok(()) => Ok(rate_hz),
+        Err(cause) if matches!(cause.raw_os_error(), Some(libc::EINVAL | libc::ENOTTY)) => {
+            Ok(rate_hz)
+        }
+        Err(cause) => failed("VIDIOC_S_PARM", Err(cause)),
+    }
+}
+
+fn set_controls(device: &impl Device, values: &[ControlValue]) -> Result<(), Lost> {
+    if values.is_empty() {
+        return Ok(());
+    }
+    let known = failed("VIDIOC_QUERY_EXT_CTRL", controls(device))?;
+    for ControlValue { name, value } in values {
+        let Some(control) = known.iter().find(|control| control.name == *name) else {
+            let names: Vec<_> = known.iter().map(|control| control.name.as_str()).collect();
+            return Err(Lost::Refused(format!(
+                "it has no control `{name}` of `source.controls`; it has {}",
+                names.join(", ")
+            )));
+        };
+        let ControlDescription { id, min, max, is_writable, .. } = *control;
+        if !(min..=max).contains(&i64::from(*value)) || !is_writable {
+            let may = if is_writable { format!("from {min} to {max}") } else { "only read".into() };
+            return Err(Lost::Refused(format!(
+                "`source.controls` sets `{name}` to {value}, but it can be {may}"
+            )));
+        }
+        let mut set = ExtControl { id, value: *value, ..ExtControl::default() };
+        failed("VIDIOC_S_EXT_CTRLS", device.call(Call::SetControl(&mut set)))?;
+    }
+    Ok(())
+}

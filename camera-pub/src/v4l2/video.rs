@@ -1,0 +1,375 @@
+//! The frames of a camera that may be unplugged, stall or change: it is opened again until it is back.
+
+use std::io;
+use std::time::Duration;
+
+use super::abi::Device;
+use super::capture::{Capture, Lost, Taken, Wanted};
+
+/// Time between attempts to open the camera.
+const RETRY_NS: i64 = 500_000_000;
+/// Maximum time to wait for a frame at once, so that a shutdown is noticed.
+const POLL: Duration = Duration::from_millis(50);
+/// Time without a frame after which the camera has stalled, beside three periods: drivers that recover take less.
+const STALL_NS: i64 = 1_000_000_000;
+
+/// Where a camera is opened.
+pub(crate) trait Port {
+    /// What it opens.
+    type Device: Device;
+
+    /// Opens the device.
+    ///
+    /// # Errors
+    /// It is not there, or may not be used.
+    fn open(&self) -> io::Result<Self::Device>;
+
+    /// The host's clock.
+    fn now_ns(&self) -> i64;
+}
+
+/// A camera, open or lost.
+pub(crate) struct Video<P: Port> {
+    port: P,
+    wanted: Wanted,
+    capture: Option<Capture<P::Device>>,
+    started_ns: i64,
+    last_frame_ns: i64,
+    retry_ns: i64,
+    outage: Option<Outage>,
+}
+
+/// Since when there are no frames, and why.
+struct Outage {
+    since_ns: i64,
+    problem: String,
+}
+
+/// What happened next.
+pub(crate) enum Next {
+    /// A frame, to be given back.
+    Frame(Taken),
+    /// Nothing yet.
+    Nothing,
+    /// Nothing for so long: the camera is lost.
+    Wait(Duration),
+    /// The camera has just been lost, for a reason that is counted.
+    Lost(&'static str),
+}
+
+impl<P: Port> Video<P> {
+    /// Opens the camera.
+    ///
+    /// # Errors
+    /// It is not there, or cannot do what is wanted.
+    pub(crate) fn start(port: P, wanted: Wanted) -> Result<Self, Lost> {
+        let capture = open(&port, &wanted)?;
+        let now_ns = port.now_ns();
+        Ok(Self {
+            port,
+            wanted,
+            capture: Some(capture),
+            started_ns: now_ns,
+            last_frame_ns: now_ns,
+            retry_ns: now_ns,
+            outage: None,
+        })
+    }
+
+    /// The host's clock.
+    pub(crate) fn now_ns(&self) -> i64 {
+        self.port.now_ns()
+    }
+
+    /// When it was opened first.
+    pub(crate) fn started_ns(&self) -> i64 {
+        self.started_ns
+    }
+
+    /// The open camera.
+    pub(crate) fn capture(&mut self) -> Option<&mut Capture<P::Device>> {
+        self.capture.as_mut()
+    }
+
+    /// The next frame, or what there is instead of one.
+    ///
+    /// # Errors
+    /// The camera's stamps have been of another clock from the start.
+    pub(crate) fn next(&mut self) -> Result<Next, Lost> {
+        let now_ns = self.port.now_ns();
+        let Some(capture) = &mut self.capture else {
+            if now_ns < self.retry_ns {
+                return Ok(Next::Wait(POLL));
+            }
+            return Ok(self.reopen());
+        };
+        match capture.take(POLL) {
+            Ok(Some(taken)) => {
+                self.last_frame_ns = self.port.now_ns();
+                if let Some(outage) = self.outage.take() {
+                    let lost_s = (self.last_frame_ns - outage.since_ns) as f64 * 1e-9;
+                    tracing::info!(lost_s, "The camera is back");
+                }
+                Ok(Next::Frame(taken))
+            }
+            Ok(None) => {
+                let silent_ns = self.port.now_ns() - self.last_frame_ns;
+                let period_ns = (1e9 / capture.rate_hz().max(1e-3)) as i64;
+                if silent_ns < STALL_NS.max(3 * period_ns) {
+                    return Ok(Next::Nothing);
+                }
+                let silent = Duration::from_nanos(u64::try_from(silent_ns).unwrap_or(0));
+                Ok(self.lose(&Lost::Stalled(silent)))
+            }
+            Err(foreign @ Lost::ForeignClock { .. }) => Err(foreign),
+            Err(lost) => Ok(self.lose(&lost)),
+        }
+    }
+
+    /// Closes the camera; it is opened again after a while.
+    pub(crate) fn lose(&mut self, lost: &Lost) -> Next {
+        self.capture = None;
+        let now_ns = self.port.now_ns();
+        self.retry_ns = now_ns + RETRY_NS;
+        let problem = lost.to_string();
+        let since_ns = self.outage.as_ref().map_or(now_ns, |outage| outage.since_ns);
+        // What repeats is said once.
+        if self.outage.as_ref().is_none_or(|outage| outage.problem != problem) {
+            tracing::warn!(problem, "The camera is lost; it is opened again until it is back");
+        }
+        self.outage = Some(Outage { since_ns, problem });
+        Next::Lost(lost.reason())
+    }
+
+    fn reopen(&mut self) -> Next {
+        match open(&self.port, &self.wanted) {
+            Ok(capture) => {
+                self.capture = Some(capture);
+                self.last_frame_ns = self.port.now_ns();
+                Next::Nothing
+            }
+            Err(lost) => {
+                self.lose(&lost);
+                Next::Wait(POLL)
+            }
+        }
+    }
+}
+
+fn open<P: Port>(port: &P, wanted: &Wanted) -> Result<Capture<P::Device>, Lost> {
+    let device = port.open().map_err(|cause| match cause.raw_os_error() {
+        Some(libc::ENODEV | libc::ENXIO | libc::ENOENT) => Lost::Unplugged,
+        Some(libc::EACCES | libc::EPERM) => Lost::Refused(
+            "this user may not open it; the group `video` may, in most systems".to_owned(),
+        ),
+        _ => Lost::Failed { call: "open", cause },
+    })?;
+    Capture::start(device, wanted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::exposure::StampedAt;
+    use crate::v4l2::fake::{Fake, Happening, MS, Stamps};
+    use std::rc::Rc;
+
+    fn wanted(fake: &Fake) -> Wanted {
+        Wanted {
+            fourcc: fake.fourcc().to_owned(),
+            width: 640,
+            height: 480,
+            rate_hz: 100.0,
+            controls: Vec::new(),
+            stamped_at: None,
+            readout_ns: 0,
+            delay_ns: 30 * MS,
+        }
+    }
+
+    /// What was seen of a run.
+    #[derive(Default)]
+    struct Seen {
+        frames: u64,
+        exact: u64,
+        worst_ns: i64,
+        copied_bytes: usize,
+        lost: Vec<&'static str>,
+        /// The longest time between two frames.
+        gap_ns: i64,
+    }
+
+    /// Reads frames until the fake's clock says so; each has its number in its pixels.
+    fn run(fake: &Rc<Fake>, video: &mut Video<Rc<Fake>>, until_ns: i64) -> Seen {
+        let mut seen = Seen::default();
+        let mut last_ns = fake.now_ns();
+        let mut grey = vec![0; 640 * 480];
+        while fake.now_ns() < until_ns {
+            match video.next().unwrap() {
+                Next::Frame(taken) => {
+                    let capture = video.capture().unwrap();
+                    seen.copied_bytes += capture.copy_grey(&taken, &mut grey);
+                    let number = u32::from_le_bytes(grey[..4].try_into().unwrap());
+                    let exposure = taken.exposure;
+                    capture.give_back(taken).unwrap();
+                    seen.frames += 1;
+                    let truth_ns = fake.mid_exposure_ns(number);
+                    let error_ns = (exposure.mid_ns - truth_ns).abs();
+                    if exposure.is_exact() {
+                        seen.exact += 1;
+                        seen.worst_ns = seen.worst_ns.max(error_ns);
+                    }
+                    seen.gap_ns = seen.gap_ns.max(fake.now_ns() - last_ns);
+                    last_ns = fake.now_ns();
+                }
+                Next::Nothing => {}
+                Next::Wait(time) => fake.pass(time),
+                Next::Lost(reason) => seen.lost.push(reason),
+            }
+        }
+        seen
+    }
+
+    #[test]
+    fn stamps_are_the_middle_of_the_exposure_whatever_the_driver_stamps() {
+        for fourcc in ["GREY", "YUYV", "NV12", "YU12"] {
+            for stamps in [Stamps::ExposureStart, Stamps::FrameEnd] {
+                for readout_ns in [0, 12 * MS] {
+                    let fake = Fake::of(fourcc, stamps, readout_ns);
+                    let wanted = Wanted { readout_ns, ..wanted(&fake) };
+                    let mut video = Video::start(Rc::clone(&fake), wanted).unwrap();
+                    let seen = run(&fake, &mut video, 1000 * MS);
+                    assert!(seen.frames > 80 && seen.exact == seen.frames, "{}", seen.frames);
+                    // Drivers stamp in microseconds.
+                    assert!(seen.worst_ns <= 1000, "{fourcc} {stamps:?}: {} ns", seen.worst_ns);
+                    // One copy of each frame, and no more.
+                    assert_eq!(seen.copied_bytes as u64, seen.frames * 640 * 480);
+                    assert!(seen.lost.is_empty());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_stamp_that_is_not_exact_is_marked() {
+        let inexact = |fake: Rc<Fake>| {
+            let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+            let seen = run(&fake, &mut video, 1000 * MS);
+            assert!(seen.frames > 80);
+            seen.frames - seen.exact
+        };
+        // A driver that says nothing of its clock, and a camera that meters by itself.
+        assert!(inexact(Fake::of("GREY", Stamps::Unknown, 0)) > 80);
+        let metering = Fake::of("GREY", Stamps::ExposureStart, 0);
+        metering.meter();
+        assert!(inexact(metering) > 80);
+        assert_eq!(inexact(Fake::of("GREY", Stamps::ExposureStart, 0)), 0);
+    }
+
+    #[test]
+    fn the_configured_instant_goes_before_the_drivers() {
+        let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+        let stamped_at = Some(StampedAt::FrameEnd);
+        let mut video =
+            Video::start(Rc::clone(&fake), Wanted { stamped_at, ..wanted(&fake) }).unwrap();
+        // Exposed for 5 ms: half before the stamp instead of half after it.
+        assert_eq!(run(&fake, &mut video, 1000 * MS).worst_ns / MS, 5);
+    }
+
+    #[test]
+    fn damaged_cut_and_missing_frames_are_counted_and_never_delivered() {
+        let fake = Fake::of("YUYV", Stamps::ExposureStart, 0);
+        fake.script(20, Happening::Damaged);
+        fake.script(30, Happening::Cut);
+        fake.script(40, Happening::Skipped(3));
+        fake.script(50, Happening::IoError);
+        let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+        let seen = run(&fake, &mut video, 1000 * MS);
+        let counts = video.capture().unwrap().take_counts();
+        assert_eq!((counts.damaged, counts.cut, counts.missed), (2, 1, 3));
+        assert!(seen.lost.is_empty() && seen.frames > 80 && seen.worst_ns <= 1000);
+    }
+
+    #[test]
+    fn a_camera_that_is_lost_is_named_and_back_within_two_seconds() {
+        let cases = [
+            ("camera unplugged", Happening::Unplugged(2900 * MS), 2000),
+            ("camera stalled", Happening::Stalled, 2000),
+            ("camera's format changed", Happening::Resized, 2000),
+        ];
+        for (reason, happening, max_ms) in cases {
+            let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+            fake.script(100, happening);
+            let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+            let seen = run(&fake, &mut video, 8000 * MS);
+            assert_eq!(seen.lost, [reason]);
+            let away_ns = if let Happening::Unplugged(away_ns) = happening { away_ns } else { 0 };
+            let back_ms = (seen.gap_ns - away_ns) / MS;
+            println!("{reason}: back after {back_ms} ms");
+            assert!((0..=max_ms).contains(&back_ms), "{reason}: {back_ms} ms");
+            assert!(seen.frames > 300 && seen.worst_ns <= 1000);
+        }
+    }
+
+    #[test]
+    fn a_thousand_reopenings_leave_nothing_open() {
+        let fake = Fake::of("GREY", Stamps::ExposureStart, 0);
+        let mut video = Video::start(Rc::clone(&fake), wanted(&fake)).unwrap();
+        for n in 0..1000 {
+            let lost = match n % 3 {
+                0 => Lost::Unplugged,
+                1 => Lost::Stalled(Duration::ZERO),
+                _ => Lost::FormatChanged(String::new()),
+            };
+            if n % 3 == 0 {
+                fake.unplug(200 * MS);
+            }
+            video.lose(&lost);
+            assert_eq!((fake.open_devices(), fake.mappings()), (0, 0), "after {n} reopenings");
+            let until_ns = fake.now_ns() + 700 * MS;
+            assert!(run(&fake, &mut video, until_ns).frames > 0, "not back after {n} reopenings");
+            assert_eq!((fake.open_devices(), fake.mappings()), (1, 4), "after {n} reopenings");
+        }
+        drop(video);
+        assert_eq!((fake.open_devices(), fake.mappings(), fake.opened()), (0, 0, 1001));
+    }
+
+    #[test]
+    fn what_a_device_cannot_do_is_refused_with_what_it_can() {
+        use crate::v4l2::capture::ControlValue;
+        let problem = |wanted: Wanted| {
+            let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
+            Video::start(fake, wanted).err().unwrap().to_string()
+        };
+        let fine = wanted(&Fake::of("MJPG", Stamps::ExposureStart, 0));
+        let size = problem(Wanted { width: 800, ..fine.clone() });
+        assert!(size.contains("nearest is `MJPG` of 640 x 480"), "{size}");
+        assert!(size.contains("`MJPG` of 1280 x 720, 640 x 480"), "{size}");
+        let format = problem(Wanted { fourcc: "NV12".into(), ..fine.clone() });
+        assert!(format.contains("has no `NV12` of 640 x 480"), "{format}");
+        let control = |name: &str, value| {
+            let controls = vec![ControlValue { name: name.into(), value }];
+            problem(Wanted { controls, ..fine.clone() })
+        };
+        let unknown = control("exposure", 3);
+        assert!(unknown.contains("no control `exposure`"), "{unknown}");
+        assert!(
+            unknown.contains("it has gain, auto_exposure, exposure_time_absolute"),
+            "{unknown}"
+        );
+        let range = control("exposure_time_absolute", 9999);
+        assert!(range.contains("to 9999, but it can be from 1 to 2500"), "{range}");
+        let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
+        fake.script(0, Happening::OtherClock);
+        let mut video = Video::start(Rc::clone(&fake), fine).unwrap();
+        let foreign = (0..100).find_map(|_| match video.next() {
+            Ok(Next::Frame(taken)) => {
+                video.capture().unwrap().give_back(taken).unwrap();
+                None
+            }
+            Ok(_) => None,
+            Err(foreign) => Some(foreign.to_string()),
+        });
+        assert!(foreign.unwrap().contains("not of this machine's clock"));
+    }
+}
