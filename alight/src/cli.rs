@@ -60,6 +60,8 @@ enum Command {
     Keys(keys::KeysArgs),
     /// Check this machine, its keys, cameras and links for problems.
     Doctor(doctor::DoctorArgs),
+    /// List the cameras of this machine, or take a picture.
+    Cameras(crate::cameras::CamerasArgs),
     /// Find markers in image files and videos.
     Detect(detect::DetectArgs),
     /// Make a marker to print.
@@ -107,6 +109,7 @@ pub(crate) fn run() -> ExitCode {
         Command::Relay(args) => relay::run(&args),
         Command::Keys(args) => keys::run(&args),
         Command::Doctor(args) => doctor::run(&args),
+        Command::Cameras(args) => crate::cameras::run(&args),
         Command::Detect(args) => detect::run(&args),
         Command::Marker(args) => marker::run(&args),
         Command::Experiment(args) => experiment::run(args),

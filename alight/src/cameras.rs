@@ -1,0 +1,250 @@
+//! `alight cameras`: lists the cameras of this machine, says how to configure each, and takes a picture.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, bail};
+use camera_pub::{
+    Config, ConnectedDevice, DeviceDescription, SizeDescription, connected_devices, source_table,
+    take_picture,
+};
+use clap::Args;
+use node::Layers;
+use serde::Serialize;
+
+use crate::args::Format;
+use crate::terminal::{aligned, print};
+
+/// Where the system has its devices.
+const DEVICES: &str = "/dev";
+/// Programs that write a camera's frames, and what they are for.
+const PROGRAMS: [(&str, &str); 3] = [
+    ("rpicam-vid", "Raspberry Pi cameras, with exact stamps"),
+    ("gst-launch-1.0", "anything GStreamer reads, Jetson cameras among them"),
+    ("ffmpeg", "streams"),
+];
+/// Maximum number of sizes of a format that are listed for people.
+const MAX_SIZES: usize = 6;
+
+/// The arguments of `alight cameras`.
+#[derive(Args)]
+pub(crate) struct CamerasArgs {
+    /// Take a picture (PNG) with the camera that is listed first, or with `--device`.
+    #[arg(long, value_name = "FILE.png")]
+    picture: Option<PathBuf>,
+    /// Only this device.
+    #[arg(long, value_name = "PATH")]
+    device: Option<PathBuf>,
+    /// Format of the list: text, or one JSON object.
+    #[arg(long, value_enum, default_value_t)]
+    format: Format,
+}
+
+/// What there is.
+#[derive(Serialize)]
+struct Listing {
+    devices: Vec<Entry>,
+    /// Programs that are on this machine.
+    programs: Vec<&'static str>,
+}
+
+/// A device, and how to configure it.
+#[derive(Serialize)]
+struct Entry {
+    #[serde(flatten)]
+    device: ConnectedDevice,
+    /// The `[source]` table; `None` when camera-pub cannot read the device.
+    source: Option<String>,
+}
+
+/// Lists the cameras, or takes a picture.
+pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
+    let listing = listing(Path::new(DEVICES), args.device.as_deref());
+    if let Some(file) = &args.picture {
+        return save_picture(&listing, file);
+    }
+    match args.format {
+        Format::Json => print(&serde_json::to_string(&listing)?)?,
+        Format::Text => print(text(&listing).trim_end())?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn listing(folder: &Path, only: Option<&Path>) -> Listing {
+    let mut found = connected_devices(folder);
+    // A path in /dev/v4l/by-id is a link to the device.
+    let only = only.map(|path| path.canonicalize().unwrap_or_else(|_| path.to_owned()));
+    found.retain(|device| only.as_ref().is_none_or(|only| device.path == *only));
+    let entry = |device: ConnectedDevice| {
+        let description = device.description.as_ref();
+        let source = description.and_then(|description| source_table(&device.path, description));
+        Entry { device, source }
+    };
+    let devices = found.into_iter().map(entry).collect();
+    let programs = PROGRAMS.iter().map(|(name, _use)| *name).filter(|name| is_installed(name));
+    Listing { devices, programs: programs.collect() }
+}
+
+/// Whether a program is in one of the folders of `PATH`.
+fn is_installed(program: &str) -> bool {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&path).any(|folder| folder.join(program).is_file())
+}
+
+fn text(listing: &Listing) -> String {
+    let mut text = String::new();
+    for Entry { device, source } in &listing.devices {
+        let path = device.path.display();
+        match (&device.description, &device.problem) {
+            (Some(description), _) if description.is_camera => {
+                text += &format!("{path}: {} ({})\n", description.card, description.driver);
+                text += &modes(description);
+                match source {
+                    Some(source) => text += &format!("\n{source}\n"),
+                    None => text += "  camera-pub reads none of these formats\n\n",
+                }
+            }
+            (Some(description), _) => {
+                text += &format!("{path}: {}, gives no frames\n\n", description.card);
+            }
+            (None, problem) => {
+                let problem = problem.as_deref().unwrap_or("no answer");
+                text += &format!(
+                    "{path}: {problem}; to open a camera, a user must be in the group `video`\n\n"
+                );
+            }
+        }
+    }
+    if listing.devices.is_empty() {
+        text += "No camera: there is no /dev/video*. A USB camera appears there when it is plugged in; a Raspberry Pi \
+                 camera is read by rpicam-vid (docs/camera.md).\n\n";
+    }
+    text += "Programs that camera-pub can read a camera with (`source.command`):\n";
+    let row = |(name, purpose): &(&str, &str)| {
+        let state = if listing.programs.contains(name) { "installed" } else { "not installed" };
+        [format!("  {name}"), state.to_owned(), (*purpose).to_owned()]
+    };
+    text + &aligned(&PROGRAMS.each_ref().map(row))
+}
+
+/// The formats of a device, one a line.
+fn modes(description: &DeviceDescription) -> String {
+    let size = |size: &SizeDescription| {
+        let rates: Vec<_> = size.rates_hz.iter().map(|rate| format!("{rate:.0}")).collect();
+        let up_to = if size.is_range { "up to " } else { "" };
+        format!("{up_to}{} x {} at {} Hz", size.width, size.height, rates.join("/"))
+    };
+    let rows: Vec<_> = description
+        .formats
+        .iter()
+        .map(|format| {
+            let readable = if format.is_readable { "" } else { "(not read)" };
+            let mut sizes: Vec<_> = format.sizes.iter().take(MAX_SIZES).map(size).collect();
+            if format.sizes.len() > MAX_SIZES {
+                sizes.push(format!("{} more", format.sizes.len() - MAX_SIZES));
+            }
+            [format!("  {}", format.fourcc), readable.to_owned(), sizes.join(", ")]
+        })
+        .collect();
+    let controls: Vec<_> = description
+        .controls
+        .iter()
+        .map(|control| format!("{} {} to {}", control.name, control.min, control.max))
+        .collect();
+    format!("{}  controls: {}\n", aligned(&rows), controls.join(", "))
+}
+
+fn save_picture(listing: &Listing, file: &Path) -> anyhow::Result<ExitCode> {
+    let entry = listing.devices.iter().find_map(|entry| Some((entry, entry.source.as_ref()?)));
+    let Some((entry, source)) = entry else {
+        bail!("there is no camera that can be read; `alight cameras` lists what there is");
+    };
+    let folder = tempfile::tempdir().context("making a folder for the configuration")?;
+    let path = folder.path().join("camera.toml");
+    // The camera's own metering is kept for a picture: a table is for flight.
+    let table: String = source
+        .lines()
+        .filter(|line| !line.starts_with("controls"))
+        .map(|line| format!("{line}\n"))
+        .collect();
+    std::fs::write(&path, table).with_context(|| format!("writing {path:?}"))?;
+    let config = Layers { file: Some(path), set: Vec::new() }.load::<Config>()?.settings;
+    let picture = take_picture(&config)?;
+    let [width, height] = [picture.width() as u32, picture.height() as u32];
+    image::save_buffer(file, picture.pixels(), width, height, image::ExtendedColorType::L8)
+        .with_context(|| format!("writing the picture {file:?}"))?;
+    let device = entry.device.path.display();
+    print(&format!("{}: {width} x {height} pixels of {device}", file.display()))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use camera_pub::{ControlDescription, FormatDescription};
+
+    fn entry(formats: &[(&str, bool)], is_camera: bool) -> Entry {
+        let size = SizeDescription {
+            width: 1280,
+            height: 720,
+            is_range: false,
+            rates_hz: vec![60.0, 30.0],
+        };
+        let formats = formats
+            .iter()
+            .map(|(fourcc, is_readable)| FormatDescription {
+                fourcc: (*fourcc).to_owned(),
+                name: String::new(),
+                is_readable: *is_readable,
+                sizes: vec![size.clone()],
+            })
+            .collect();
+        let description = DeviceDescription {
+            driver: "uvcvideo".into(),
+            card: "PTZ Pro Camera".into(),
+            bus: "usb-0000:0e:00.0-2.4".into(),
+            is_camera,
+            formats,
+            controls: Vec::<ControlDescription>::new(),
+        };
+        let path = PathBuf::from("/dev/video0");
+        let source = source_table(&path, &description);
+        let device = ConnectedDevice { path, description: Some(description), problem: None };
+        Entry { device, source }
+    }
+
+    #[test]
+    fn a_camera_is_listed_with_a_table_to_paste() {
+        let formats = [("MJPG", true), ("H264", false)];
+        let listing = Listing { devices: vec![entry(&formats, true)], programs: vec!["ffmpeg"] };
+        let text = text(&listing);
+        assert!(text.contains("/dev/video0: PTZ Pro Camera (uvcvideo)"), "{text}");
+        assert!(text.contains("1280 x 720 at 60/30 Hz") && text.contains("(not read)"), "{text}");
+        assert!(text.contains("[source]\ndevice = \"/dev/video0\"\nfourcc = \"MJPG\""), "{text}");
+        let json = serde_json::to_value(&listing).unwrap();
+        assert_eq!(json["devices"][0]["path"], "/dev/video0");
+        assert_eq!(json["devices"][0]["description"]["formats"][1]["is_readable"], false);
+        assert_eq!(json["programs"][0], "ffmpeg");
+    }
+
+    #[test]
+    fn a_machine_without_cameras_says_so_and_what_would_help() {
+        let folder = tempfile::tempdir().unwrap();
+        let listing = listing(folder.path(), None);
+        let text = text(&listing);
+        assert!(text.contains("No camera: there is no /dev/video*"), "{text}");
+        assert!(text.contains("rpicam-vid") && text.contains("`source.command`"), "{text}");
+        let problem = save_picture(&listing, Path::new("unused.png")).unwrap_err().to_string();
+        assert!(problem.contains("no camera that can be read"), "{problem}");
+    }
+
+    #[test]
+    fn a_device_without_frames_has_no_table() {
+        for other in [entry(&[], false), entry(&[("H264", false)], true)] {
+            assert_eq!(other.source, None);
+            let listing = Listing { devices: vec![other], programs: Vec::new() };
+            let text = text(&listing);
+            assert!(text.contains("gives no frames") || text.contains("none of these"), "{text}");
+        }
+    }
+}
