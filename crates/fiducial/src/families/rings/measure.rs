@@ -129,8 +129,12 @@ impl EdgeSearch<'_> {
             return from_photometric(&fit, confidence(&found.support)).ok_or(Reason::Pose);
         }
         let edges = &mut buffers.edges;
-        if let Some(measured) = self.measure_shifted_edges(&found, edges) {
-            return Ok(measured);
+        self.locate(&found.pose, Reach::Near, edges);
+        if let Some(shift_px) = self.likely_shift_px(&found.pose, 0.0, edges) {
+            if let Some(measured) = self.measure_shifted_edges(found.pose, shift_px, edges) {
+                return Ok(measured);
+            }
+            self.locate(&found.pose, Reach::Near, edges);
         }
         if let Some(measured) = self.measure_edges(&found, edges)? {
             return Ok(measured);
@@ -138,8 +142,8 @@ impl EdgeSearch<'_> {
         self.measure_single_ring(&found.pose, kind, edges).ok_or(Reason::Edges)
     }
 
-    /// The marker at a pose fitted to edges, when these are where the marker has them: its grey values were not a marker's,
-    /// as light or an occluder changes them.
+    /// The marker at a pose fitted to edges, when those that were located near it are where the marker has them: its grey
+    /// values were not a marker's, as light or an occluder changes them.
     ///
     /// # Errors
     /// When the pose has no covariance.
@@ -150,7 +154,6 @@ impl EdgeSearch<'_> {
     ) -> Result<Option<MeasuredMarker>, Reason> {
         let EdgePose { pose, rms_px, support } = found;
         let diameter_px = self.diameter_px(pose).ok_or(Reason::Pose)?;
-        self.locate(pose, Reach::Near, edges);
         let bias_px = pose.max_bias_px(edges, self.camera);
         pose.remove_outliers(edges, self.camera);
         let large = diameter_px > MAX_DIAMETER_PX;
@@ -178,28 +181,39 @@ impl EdgeSearch<'_> {
     }
 
     /// As [`Self::measure_edges`], where a camera's tone curve and sharpening have moved all edges into the black by the same
-    /// number of pixels.
+    /// number of pixels, of which a first estimate is given.
     fn measure_shifted_edges(
         &self,
-        found: &EdgePose,
+        mut pose: CirclePose,
+        mut shift_px: f64,
         edges: &mut Vec<EdgePoint>,
     ) -> Option<MeasuredMarker> {
-        let width_px = self.diameter_px(&found.pose)? * OUTER_RING_WIDTH;
-        let mut shifted = *self;
-        let mut pose = found.pose;
-        for _ in 0..SHIFT_STEPS {
-            shifted.locate(&pose, Reach::Near, edges);
-            shifted.into_black_px += pose.shift_into_black_px(edges, self.camera)?;
-            let is_likely = shifted.into_black_px > MIN_SHIFT_PX
-                && shifted.into_black_px < MAX_SHIFT_PX.min(MAX_SHIFT_RATIO * width_px);
-            if !is_likely {
-                return None;
-            }
-            shifted.locate(&pose, Reach::Near, edges);
+        let shifted = |into_black_px| Self { into_black_px, ..*self };
+        for _ in 1..SHIFT_STEPS {
+            shifted(shift_px).locate(&pose, Reach::Near, edges);
             pose = pose.refined(edges, self.camera)?.0;
+            shifted(shift_px).locate(&pose, Reach::Near, edges);
+            shift_px = self.likely_shift_px(&pose, shift_px, edges)?;
         }
-        let found = shifted.edge_pose(Some(pose), &pose.mirrored(), edges).ok()?;
-        shifted.measure_edges(&found, edges).ok().flatten()
+        let search = shifted(shift_px);
+        search.locate(&pose, Reach::Near, edges);
+        pose = pose.refined(edges, self.camera)?.0;
+        let found = search.edge_pose(Some(pose), &pose.mirrored(), edges).ok()?;
+        search.locate(&found.pose, Reach::Near, edges);
+        search.measure_edges(&found, edges).ok().flatten()
+    }
+
+    /// How far edges lie in the black that were located with a distance known so far; `None` where no camera moves them so.
+    fn likely_shift_px(
+        &self,
+        pose: &CirclePose,
+        so_far_px: f64,
+        edges: &[EdgePoint],
+    ) -> Option<f64> {
+        let width_px = self.diameter_px(pose)? * OUTER_RING_WIDTH;
+        let shift_px = so_far_px + pose.shift_into_black_px(edges, self.camera)?;
+        let max_px = MAX_SHIFT_PX.min(MAX_SHIFT_RATIO * width_px);
+        (shift_px > MIN_SHIFT_PX && shift_px < max_px).then_some(shift_px)
     }
 
     /// The marker near a predicted pose, when it is neither too small nor too large nor disturbed.
