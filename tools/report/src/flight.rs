@@ -1,6 +1,7 @@
 //! A flight as its recording has it.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use flightlog::{Entry, Reading, Received, RecordedTape, TapeReader};
 use messages::{
@@ -9,7 +10,6 @@ use messages::{
     Wind, decode, topic,
 };
 
-use crate::landings::Landing;
 use crate::packets::Packets;
 
 /// Longest gap over which a position is interpolated, in nanoseconds.
@@ -60,6 +60,19 @@ pub struct Replayed {
     pub is_verified: bool,
     /// The same as a sentence.
     pub text: String,
+}
+
+/// A landing of a recording that has several.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Landing {
+    /// Its number, from 1 on.
+    pub number: usize,
+    /// How many the recording has.
+    pub of: usize,
+    /// What belongs to it, in nanoseconds of the vehicle's clock: until the next one.
+    pub time_ns: Range<i64>,
+    /// How often the controller had changed the detector before it.
+    pub detector_changes_before: u64,
 }
 
 /// A flight as its recording has it: what was not recorded is empty.

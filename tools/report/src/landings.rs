@@ -2,23 +2,10 @@
 
 use std::ops::Range;
 
-use crate::flight::Flight;
+use crate::flight::{Flight, Landing};
 
 /// What belongs to a landing before its begin, in nanoseconds.
 const BEFORE_NS: i64 = 2_000_000_000;
-
-/// A landing of a recording that has several.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Landing {
-    /// Its number, from 1 on.
-    pub number: usize,
-    /// How many the recording has.
-    pub of: usize,
-    /// What belongs to it, in nanoseconds of the vehicle's clock: until the next one.
-    pub time_ns: Range<i64>,
-    /// How often the controller had changed the detector before it.
-    pub detector_changes_before: u64,
-}
 
 /// When each landing of a recording began, in nanoseconds of the vehicle's clock.
 pub fn begins(flight: &Flight) -> Vec<i64> {

@@ -53,8 +53,7 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     let step = estimated.len().div_ceil(CIRCLES).max(1);
     let circles = estimated.iter().step_by(step).flat_map(|it| circle(it, &reach));
     above.push(layer("circles: 2 standard deviations", Ink::Blue, Shape::Thin, circles));
-    let from_above =
-        |places: &[Place]| unbridged(places.iter().map(|it| (it.time_s, away(it))).collect());
+    let from_above = |places: &[Place]| unbridged(places, |it| it.time_s, away);
     above.push(layer("truth", Ink::Orange, Shape::Wide, from_above(&truth)));
     above.push(layer("estimate", Ink::Blue, Shape::Line, from_above(&estimated)));
     above.push(layer("pad", Ink::Text, Shape::Crosses, [at(0.0, 0.0)]));
@@ -71,8 +70,7 @@ pub fn landing(view: &View<'_>) -> Vec<Chart> {
     };
     let along = |it: &Place| it.north_m * toward_north + it.east_m * toward_east;
     let side = |it: &Place| at(along(it), it.height_m);
-    let from_the_side =
-        |places: &[Place]| unbridged(places.iter().map(|it| (it.time_s, side(it))).collect());
+    let from_the_side = |places: &[Place]| unbridged(places, |it| it.time_s, side);
     let x = span(places().map(along), -0.3..0.3);
     let edge = |it: &Place, sign: f64| {
         let x_m = along(it) + sign * SIGMAS * it.deviation_m;

@@ -4,9 +4,8 @@ use messages::{LandedState, Phase};
 use node::stats::quantile;
 use serde::Serialize;
 
-use crate::flight::Flight;
+use crate::flight::{Flight, Landing};
 use crate::frames::{Fate, Frames};
-use crate::landings::Landing;
 use crate::latency::{Stage, TO_SETPOINT, budget};
 use crate::{losses, phases, track};
 

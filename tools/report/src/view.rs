@@ -81,7 +81,7 @@ impl<'a> View<'a> {
     /// The shown points of a curve over time, which ends where samples are missing.
     pub fn curve<T>(&self, samples: &[T], of: impl Fn(&T) -> Option<At>) -> Vec<At> {
         let points = samples.iter().filter_map(of).filter(|point| self.is_shown(point.x));
-        unbridged(points.map(|point| (point.x, point)).collect())
+        unbridged(&points.collect::<Vec<_>>(), |point| point.x, |point| *point)
     }
 
     /// A component of the setpoints over time.
@@ -90,27 +90,24 @@ impl<'a> View<'a> {
     }
 }
 
-/// Points by their time in seconds, with one that is not a number where samples are missing: no line is drawn there.
-pub fn unbridged(points: Vec<(f64, At)>) -> Vec<At> {
-    let between: Vec<f64> = points.windows(2).map(later_s).collect();
+/// The points of samples, with one that is not a number where samples are missing: no line is drawn there.
+pub fn unbridged<T>(samples: &[T], time_s: impl Fn(&T) -> f64, of: impl Fn(&T) -> At) -> Vec<At> {
+    let between: Vec<f64> = samples
+        .iter()
+        .zip(samples.iter().skip(1))
+        .map(|(it, next)| time_s(next) - time_s(it))
+        .collect();
     let usual_s = node::stats::quantile(&between, 0.5).unwrap_or(0.0);
     let max_s = (MAX_GAP_PERIODS * usual_s).max(MIN_GAP_S);
-    let mut drawn = Vec::with_capacity(points.len());
-    for (index, (_, point)) in points.iter().enumerate() {
-        drawn.push(*point);
+    let mut drawn = Vec::with_capacity(samples.len());
+    for (index, sample) in samples.iter().enumerate() {
+        let point = of(sample);
+        drawn.push(point);
         if between.get(index).is_some_and(|gap_s| *gap_s > max_s) {
             drawn.push(at(point.x, f64::NAN));
         }
     }
     drawn
-}
-
-/// How much later the second of two points is, in seconds.
-fn later_s(pair: &[(f64, At)]) -> f64 {
-    match pair {
-        [(first_s, _), (second_s, _)] => second_s - first_s,
-        _ => 0.0,
-    }
 }
 
 /// A component of a vector.
