@@ -12,19 +12,24 @@ use autopilot::packet::{Counters, encode};
 use autopilot::permission::Refusal;
 use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Permission, Sender};
 use messages::{
-    ControllerStatus, Health, MavlinkBytes, Phase, RecorderStatus, TargetEstimate, topic,
+    ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus, TargetEstimate,
+    topic,
 };
 use node::{HealthCounters, INSECURE, Node, Shutdown, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
 
+use crate::camera::Camera;
 use crate::config::Config;
-use crate::route::{self, Route};
+use crate::request;
+use crate::route::{self, Own, Route};
 use crate::target::LandingTargetPublisher;
 use crate::text::StatusTextSender;
 use crate::vehicle::Vehicle;
 
 /// Period of heartbeats in MAVLink.
 const HEARTBEAT: Duration = Duration::from_secs(1);
+/// Period at which the camera looks whether the marker's place is due, also when no frame comes.
+const CAMERA_TICK: Duration = Duration::from_millis(50);
 /// Silence of the ground station after which all texts are repeated, in nanoseconds.
 const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
 
@@ -44,12 +49,15 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let to_autopilot = node.publisher(topic::TO_AUTOPILOT, &[]).await?;
     let statuses = node.subscriber(topic::STATUS, &[]).await?;
     let targets = node.subscriber(topic::TARGET, &[]).await?;
+    let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
     let controllers = node.presence("controller").await?;
     // A relay that takes anybody's commands says so in its health.
     let relays = node.subscriber(topic::HEALTH, &["relay", "*"]).await?;
     let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
     let mut second = interval(HEARTBEAT);
     second.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut camera = interval(CAMERA_TICK);
+    camera.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut bridge = Bridge::new(&config, ground.sender(), node.shared_health())?;
     node.announce().await?;
     tracing::info!(ground = config.ground, "Ready");
@@ -66,6 +74,12 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             }
             status = statuses.next() => bridge.status(now_ns(), status.context(CLOSED)?),
             target = targets.next() => bridge.target(now_ns(), &target.context(CLOSED)?),
+            found = detections.next_with_key() => {
+                let (key, found) = found.context(CLOSED)?;
+                let detector = topic::DETECTIONS.first_name(&key).unwrap_or_default();
+                bridge.detections(now_ns(), detector, &found);
+            }
+            _ = camera.tick() => bridge.track(now_ns()),
             change = controllers.next() => {
                 let (controller, is_there) = change.context(CLOSED)?;
                 bridge.controller(now_ns(), controller, is_there);
@@ -94,6 +108,11 @@ const CLOSED: &str = "the network session was closed";
 /// The bridge between two packets.
 struct Bridge {
     component: u8,
+    /// The camera's component id; 0 for none.
+    camera_component: u8,
+    camera: Camera,
+    /// Another component has the camera's id, and that was told.
+    camera_is_taken: bool,
     permission: Permission,
     /// When the ground station was told of a refusal.
     refusal_ns: Option<i64>,
@@ -119,8 +138,9 @@ struct Bridge {
     bad_bytes: u64,
     unread: u64,
     strangers: u64,
-    /// Sequence number of our next packet.
+    /// Sequence numbers of our next packets: the companion's and the camera's.
     sequence: u8,
+    camera_sequence: u8,
 }
 
 impl Bridge {
@@ -134,6 +154,9 @@ impl Bridge {
             now_ns.saturating_add((config.assume_system_after_s * 1e9).round() as i64);
         Ok(Self {
             component: config.component_id,
+            camera_component: config.camera_component_id,
+            camera: Camera::new(now_ns, config.video()),
+            camera_is_taken: false,
             permission: config.ground_may.parse()?,
             refusal_ns: None,
             ground,
@@ -153,6 +176,7 @@ impl Bridge {
             unread: 0,
             strangers: 0,
             sequence: 0,
+            camera_sequence: 0,
         })
     }
 
@@ -160,6 +184,18 @@ impl Bridge {
     fn me(&self, now_ns: i64) -> Option<Sender> {
         let system = self.vehicle.system(now_ns)?;
         Some(Sender { system, component: self.component })
+    }
+
+    /// The camera's system and component id, while no other component has them.
+    fn camera_sender(&self, now_ns: i64) -> Option<Sender> {
+        let system = self.vehicle.system(now_ns)?;
+        let camera = Sender { system, component: self.camera_component };
+        (self.camera_component != 0 && !self.vehicle.is_aboard(camera)).then_some(camera)
+    }
+
+    fn own(&self, now_ns: i64) -> Option<Own> {
+        let companion = self.me(now_ns)?;
+        Some(Own { companion, camera: self.camera_sender(now_ns) })
     }
 
     /// Passes the autopilot's packets to the ground station.
@@ -171,9 +207,9 @@ impl Bridge {
         }
         for packet in packets {
             self.vehicle.received(now_ns, &packet);
-            match route::from_autopilot(&packet, self.me(now_ns)) {
+            match route::from_autopilot(&packet, self.own(now_ns)) {
                 Route::Drop(reason) => self.health.dropped(reason),
-                Route::Pass | Route::Answer(_) => {
+                _ => {
                     self.health.count("from autopilot");
                     self.send(&packet.raw);
                 }
@@ -199,11 +235,20 @@ impl Bridge {
 
     fn packet_from_ground(&mut self, now_ns: i64, packet: Packet) -> Option<Vec<u8>> {
         self.health.count("from ground");
-        match route::from_ground(&packet, self.me(now_ns), &self.vehicle) {
+        match route::from_ground(&packet, self.own(now_ns), &self.vehicle) {
             Route::Drop(reason) => self.health.dropped(reason),
             Route::Answer(message) => {
                 self.ground_active(now_ns, packet.sender);
                 self.send_own(now_ns, &message);
+            }
+            Route::Camera(command) => {
+                self.ground_active(now_ns, packet.sender);
+                self.command_camera(now_ns, packet.sender, command);
+            }
+            Route::Unknown(command) => {
+                self.ground_active(now_ns, packet.sender);
+                self.send(&command.unsupported(self.sequence, packet.sender));
+                self.sequence = self.sequence.wrapping_add(1);
             }
             Route::Pass => {
                 self.ground_active(now_ns, packet.sender);
@@ -215,6 +260,35 @@ impl Bridge {
             }
         }
         None
+    }
+
+    /// Acknowledges a command to the camera, and sends what it asks for.
+    fn command_camera(&mut self, now_ns: i64, from: Sender, command: request::Command) {
+        let answer = request::answer(&mut self.camera, now_ns, command);
+        let acknowledgement = route::acknowledgement(command.command, answer.result, from);
+        self.send_from_camera(now_ns, &acknowledgement);
+        if let Some(message) = &answer.message {
+            self.send_from_camera(now_ns, message);
+        }
+        if let Some(why) = answer.why {
+            let text = format!("Alight: not tracked: {why}");
+            self.send_text(now_ns, MavSeverity::MAV_SEVERITY_NOTICE, &text);
+        }
+    }
+
+    /// Takes what a detector found in a frame.
+    fn detections(&mut self, now_ns: i64, detector: &str, found: &Detections) {
+        let in_use = self.status.as_ref().and_then(|status| status.active_detector.as_deref());
+        self.camera.sees(now_ns, detector, in_use, found);
+        self.track(now_ns);
+    }
+
+    /// Sends the tracked marker's place, when it is due.
+    fn track(&mut self, now_ns: i64) {
+        if let Some(message) = self.camera.due_tracking(now_ns) {
+            self.health.count("tracked markers");
+            self.send_from_camera(now_ns, &message);
+        }
     }
 
     /// Counts a packet that the ground station may not send, and tells it.
@@ -384,8 +458,27 @@ impl Bridge {
     /// Sends the heartbeat, and texts that could not be sent earlier.
     fn every_second(&mut self, now_ns: i64) {
         self.send_own(now_ns, &self.heartbeat());
+        if let Some(heartbeat) = self.camera.heartbeat(now_ns) {
+            self.tell_taken(now_ns);
+            self.send_from_camera(now_ns, &heartbeat);
+        }
         self.send_texts(now_ns);
         self.tell_insecure(now_ns);
+    }
+
+    /// Tells once that the vehicle has another camera with our camera's id, so that ours is not shown.
+    fn tell_taken(&mut self, now_ns: i64) {
+        let component = self.camera_component;
+        let is_taken =
+            component != 0 && self.me(now_ns).is_some() && self.camera_sender(now_ns).is_none();
+        if is_taken && !self.camera_is_taken {
+            tracing::warn!(
+                component,
+                "The vehicle has another component with the camera's id, so the ground station does not see \
+                 this camera; set `camera_component_id` to another one, from 100 to 105"
+            );
+        }
+        self.camera_is_taken = is_taken;
     }
 
     fn heartbeat(&self) -> MavMessage {
@@ -407,6 +500,14 @@ impl Bridge {
         let Some(me) = self.me(now_ns) else { return };
         let packet = encode(me, self.sequence, message);
         self.sequence = self.sequence.wrapping_add(1);
+        self.send(&packet);
+    }
+
+    /// Sends a message of the camera to the ground station, if it has ids of its own.
+    fn send_from_camera(&mut self, now_ns: i64, message: &MavMessage) {
+        let Some(camera) = self.camera_sender(now_ns) else { return };
+        let packet = encode(camera, self.camera_sequence, message);
+        self.camera_sequence = self.camera_sequence.wrapping_add(1);
         self.send(&packet);
     }
 

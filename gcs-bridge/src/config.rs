@@ -6,6 +6,8 @@ use std::time::Duration;
 use autopilot::{Address, Peering, Permission};
 use serde::Deserialize;
 
+use crate::video::Video;
+
 /// The keys of `gcs-bridge.toml`, which has their meanings, units and ranges.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -20,6 +22,10 @@ pub struct Config {
     pub assume_system_after_s: f64,
     /// MAVLink component id of this companion.
     pub component_id: u8,
+    /// MAVLink component id of the camera, from 100 to 105; 0 shows no camera.
+    pub camera_component_id: u8,
+    /// Where the ground station finds the camera's video, which another program serves; nothing without one.
+    pub video: String,
     /// IP addresses of the ground stations; any if there are none.
     pub ground_stations: Vec<String>,
     /// Silence after which another ground station is heard, in seconds.
@@ -40,6 +46,17 @@ impl node::Settings for Config {
         check.parses("ground", self.ground.parse::<Address>());
         check.range("assume_system_after_s", self.assume_system_after_s, 0.0..=3600.0);
         check.range("component_id", self.component_id, 2..=255);
+        if self.camera_component_id != 0 {
+            check.range("camera_component_id", self.camera_component_id, 100..=105);
+            let is_free = self.camera_component_id != self.component_id;
+            check.parses(
+                "camera_component_id",
+                is_free.then_some(()).ok_or("it must differ from `component_id`"),
+            );
+        }
+        if !self.video.is_empty() {
+            check.parses("video", self.video.parse::<Video>());
+        }
         for address in &self.ground_stations {
             check.parses("ground_stations", address.parse::<IpAddr>());
         }
@@ -51,6 +68,11 @@ impl node::Settings for Config {
 }
 
 impl Config {
+    /// Where the camera's video is, when another program serves one.
+    pub(crate) fn video(&self) -> Option<Video> {
+        self.video.parse().ok()
+    }
+
     /// Whom the link to the ground station talks to.
     pub(crate) fn peering(&self) -> Peering {
         Peering::GroundStation {
@@ -88,6 +110,9 @@ mod tests {
             ("ground_stations=['10.0.0.x']", "`ground_stations`"),
             ("ground_silence_s=0", "from 1 to 600"),
             ("ground_may=all", "no-arming"),
+            ("camera_component_id=99", "from 100 to 105"),
+            ("component_id=100", "must differ from `component_id`"),
+            ("video=http://10.0.0.2/", "rtsp://HOST:PORT/PATH"),
             ("target_rate_hz=0", "from 0.1 to 50"),
             ("target_max_age_ms=inf", "`target_max_age_ms`"),
             ("id=a/b", "letters, digits"),

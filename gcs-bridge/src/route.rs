@@ -4,9 +4,19 @@
 //! component, every other packet to all, and none back to where it came from.
 
 use autopilot::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message};
-use autopilot::{Packet, Sender};
+use autopilot::{Packet, Sender, UnknownCommand};
 
+use crate::request::Command;
 use crate::vehicle::Vehicle;
+
+/// Our components, once the vehicle's system id is known.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) struct Own {
+    /// The companion.
+    pub(crate) companion: Sender,
+    /// The camera, while no other component has its id.
+    pub(crate) camera: Option<Sender>,
+}
 
 /// The route of a packet.
 #[derive(Clone, Debug, PartialEq)]
@@ -15,33 +25,58 @@ pub(crate) enum Route {
     Pass,
     /// Answered here.
     Answer(Box<MavMessage>),
+    /// A command to the camera, answered here.
+    Camera(Command),
+    /// A command that nobody here knows.
+    Unknown(UnknownCommand),
     /// Dropped, for this reason.
     Drop(&'static str),
 }
 
-/// The route of a packet from the ground station; `me` is the bridge, once it has a system id.
-pub(crate) fn from_ground(packet: &Packet, me: Option<Sender>, vehicle: &Vehicle) -> Route {
-    if Some(packet.sender) == me || vehicle.is_aboard(packet.sender) {
+/// The route of a packet from the ground station.
+pub(crate) fn from_ground(packet: &Packet, own: Option<Own>, vehicle: &Vehicle) -> Route {
+    let is_own = own.is_some_and(|own| own.is(packet.sender));
+    if is_own || vehicle.is_aboard(packet.sender) {
         // A ground program that repeats everything would otherwise send the vehicle its own packets.
         return Route::Drop("from ground: an echo of the vehicle");
     }
-    match me.filter(|me| is_for(packet, *me)) {
-        Some(_) => match answer(packet) {
+    let Some(own) = own else { return Route::Pass };
+    if let Some(unknown) = UnknownCommand::of(packet).filter(|it| own.is(it.target)) {
+        return Route::Unknown(unknown);
+    }
+    if is_for(packet, own.companion) {
+        return match answer(packet) {
             Some(message) => Route::Answer(Box::new(message)),
             None => Route::Drop("from ground: for the companion, and not supported"),
-        },
-        None => Route::Pass,
+        };
     }
+    if own.camera.is_some_and(|camera| is_for(packet, camera)) {
+        return match packet.message.as_ref().and_then(Command::of) {
+            Some(command) => Route::Camera(command),
+            None => Route::Drop("from ground: for the camera, and not supported"),
+        };
+    }
+    Route::Pass
 }
 
 /// The route of a packet from the autopilot's side.
-pub(crate) fn from_autopilot(packet: &Packet, me: Option<Sender>) -> Route {
-    match me {
-        Some(me) if packet.sender == me => Route::Drop("from autopilot: an echo of the companion"),
+pub(crate) fn from_autopilot(packet: &Packet, own: Option<Own>) -> Route {
+    match own {
+        Some(own) if own.is(packet.sender) => {
+            Route::Drop("from autopilot: an echo of the companion")
+        }
         // The autopilot answers the controller, which uses this companion's ids; a ground station would take
         // such an acknowledgement for that of its own command.
-        Some(me) if is_for(packet, me) => Route::Drop("from autopilot: for the companion"),
+        Some(own) if is_for(packet, own.companion) => {
+            Route::Drop("from autopilot: for the companion")
+        }
         _ => Route::Pass,
+    }
+}
+
+impl Own {
+    fn is(&self, sender: Sender) -> bool {
+        sender == self.companion || Some(sender) == self.camera
     }
 }
 
@@ -70,7 +105,8 @@ pub(crate) fn denied(command: MavCmd, to: Sender) -> MavMessage {
     acknowledgement(command, MavResult::MAV_RESULT_DENIED, to)
 }
 
-fn acknowledgement(command: MavCmd, result: MavResult, to: Sender) -> MavMessage {
+/// The acknowledgement of a command.
+pub(crate) fn acknowledgement(command: MavCmd, result: MavResult, to: Sender) -> MavMessage {
     MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
         command,
         result,
@@ -91,6 +127,8 @@ mod tests {
     use autopilot::packet::encode;
 
     const ME: Sender = Sender { system: 7, component: 191 };
+    const CAMERA: Sender = Sender { system: 7, component: 100 };
+    const OWN: Own = Own { companion: ME, camera: Some(CAMERA) };
     const AUTOPILOT: Sender = Sender { system: 7, component: 1 };
     const GROUND: Sender = Sender { system: 255, component: 190 };
 
@@ -119,7 +157,7 @@ mod tests {
     }
 
     fn up(sender: Sender, message: &MavMessage) -> Route {
-        from_ground(&packet(sender, message), Some(ME), &vehicle())
+        from_ground(&packet(sender, message), Some(OWN), &vehicle())
     }
 
     #[test]
@@ -135,6 +173,7 @@ mod tests {
         let target = MavMessage::LANDING_TARGET(LANDING_TARGET_DATA::default());
         for message in [heartbeat(), target] {
             assert!(matches!(up(ME, &message), Route::Drop(_)));
+            assert!(matches!(up(CAMERA, &message), Route::Drop(_)));
             assert!(matches!(up(AUTOPILOT, &message), Route::Drop(_)));
         }
     }
@@ -153,9 +192,21 @@ mod tests {
     }
 
     #[test]
+    fn commands_to_the_camera_are_its_own() {
+        let asked = command(CAMERA);
+        assert_eq!(Command::of(&asked).map(Route::Camera), Some(up(GROUND, &asked)));
+        let (target_system, target_component) = (CAMERA.system, CAMERA.component);
+        let list = PARAM_REQUEST_LIST_DATA { target_system, target_component };
+        assert!(matches!(up(GROUND, &MavMessage::PARAM_REQUEST_LIST(list)), Route::Drop(_)));
+        // Another camera has that id: what is for it goes to it.
+        let own = Own { camera: None, ..OWN };
+        assert_eq!(from_ground(&packet(GROUND, &asked), Some(own), &vehicle()), Route::Pass);
+    }
+
+    #[test]
     fn the_ground_hears_the_vehicle_but_not_its_talk_with_the_companion() {
         let down =
-            |sender, message: &MavMessage| from_autopilot(&packet(sender, message), Some(ME));
+            |sender, message: &MavMessage| from_autopilot(&packet(sender, message), Some(OWN));
         assert_eq!(down(AUTOPILOT, &heartbeat()), Route::Pass);
         assert_eq!(down(GROUND, &heartbeat()), Route::Pass);
         let to = |to| unsupported(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL, to);

@@ -12,7 +12,7 @@ use autopilot::dialect::{
 use autopilot::packet::encode;
 use autopilot::{Packet, Parser, Sender};
 use gcs_bridge::Config;
-use messages::{ControllerStatus, Health, MavlinkBytes, Phase, TargetEstimate, topic};
+use messages::{ControllerStatus, Detections, Health, MavlinkBytes, Phase, TargetEstimate, topic};
 use node::{INSECURE, Identity, Layers, Node, Shutdown, Subscriber, ZenohSource, now_ns};
 use testing::ports;
 use tokio::net::{TcpStream, UdpSocket};
@@ -362,6 +362,73 @@ async fn pymavlink_agrees() -> anyhow::Result<()> {
             testing::skip("python", format_args!("it does not start: {problem}"));
             Ok(())
         }
+    }
+}
+
+/// The camera as QGroundControl looks for it, where packets are lost and where none is.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let free = Ground::open().await?;
+    let address = free.socket.local_addr()?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let seeing = tokio::spawn(see(vehicle.node.clone()));
+    let bridge = start_bridge(port, &free, &["video='rtsp://10.0.0.2:8554/down'"]).await?;
+    drop(free);
+    for (loss, further) in [("0", &["--commands"][..]), ("0.3", &[])] {
+        let Some(told) = camera_script(address, loss, further).await? else { return Ok(()) };
+        eprintln!("{told}");
+        // The sample's marker: within a hundredth of the width of where it was put.
+        for part in [
+            r#""model": "down""#,
+            r#""size": [1296, 972]"#,
+            r#""uri": "rtsp://10.0.0.2:8554/down""#,
+            r#""tracked": [0.25"#,
+        ] {
+            ensure!(told.contains(part), "{part} is not in {told}");
+        }
+    }
+    seeing.abort();
+    bridge.abort();
+    Ok(())
+}
+
+/// What `tests/gcs/camera.py` says of the camera; none where it cannot run.
+async fn camera_script(
+    address: SocketAddr,
+    loss: &str,
+    further: &[&str],
+) -> anyhow::Result<Option<String>> {
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/gcs/camera.py");
+    let run = tokio::process::Command::new(testing::interpreter())
+        .args([script, "--connect", &format!("udpin:{address}"), "--loss", loss])
+        .args(["--area", "0.2", "0.2", "0.4", "0.4"])
+        .args(further)
+        .kill_on_drop(true)
+        .output();
+    match timeout(Duration::from_secs(120), run).await? {
+        Ok(output) => {
+            let has_run = testing::python_passes(&output)?;
+            Ok(has_run.then(|| String::from_utf8_lossy(&output.stdout).into_owned()))
+        }
+        Err(problem) => {
+            testing::skip("python", format_args!("it does not start: {problem}"));
+            Ok(None)
+        }
+    }
+}
+
+/// Publishes what the detector in use sees: a marker from a quarter to half of the picture.
+async fn see(node: Node) -> anyhow::Result<()> {
+    let detections = node.publisher(topic::DETECTIONS, &["spare"]).await?;
+    let mut found = Detections::sample();
+    let [left, right, top, bottom] = [323.5, 647.5, 242.5, 485.5];
+    found.detections[0].corners_px =
+        Some([[left, top], [right, top], [right, bottom], [left, bottom]]);
+    let mut tick = interval(Duration::from_millis(50));
+    loop {
+        tick.tick().await;
+        detections.publish(&found).await;
     }
 }
 

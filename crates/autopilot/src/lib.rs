@@ -15,7 +15,7 @@
 //! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the
 //! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
 //! and why it may fail, [`takeoff`] arms the vehicle and takes off, [`permission`] is what a ground station may send,
-//! [`compose`] makes the messages that a companion sends.
+//! [`compose`] makes the messages that a companion sends, and `unknown` its answer to commands that no one knows.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
 
@@ -39,6 +39,7 @@ pub mod state;
 mod stream;
 pub mod takeoff;
 mod text;
+mod unknown;
 
 /// The MAVLink messages, enumerations and bit fields of ArduPilot's dialect.
 pub mod dialect {
@@ -60,3 +61,4 @@ pub use peers::Peering;
 pub use permission::Permission;
 pub use state::{Attitude, Battery, LandedState, Position, Range, VehicleState};
 pub use takeoff::{Takeoff, TakeoffError, TakeoffProgress};
+pub use unknown::UnknownCommand;

@@ -136,7 +136,7 @@ pub const DETECTIONS: Topic<Detections> = Topic::new(
     "detector/{detector}/detections",
     Delivery::LatestPriority,
     DETECTOR,
-    &["camera-pub", "controller", "simulator"],
+    &["camera-pub", "controller", "gcs-bridge", "simulator"],
 );
 /// Acknowledges a frame of `camera/{camera}/jpeg`.
 pub const FRAME_ACK: Topic<FrameAck> =
