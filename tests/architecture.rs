@@ -18,12 +18,13 @@ use crate::circles::{Graph, circles, modules};
 use crate::source::{lines_of_code, tokens, without_tests};
 
 /// The algorithm crates, and what each may know of this workspace. `autopilot` is told apart for its link.
-const ALGORITHMS: [(&str, &[&str]); 8] = [
+const ALGORITHMS: [(&str, &[&str]); 9] = [
     ("geometry", &[]),
     ("imaging", &[]),
     ("messages", &["geometry", "imaging"]),
     ("markers", &[]),
     ("fiducial", &["geometry", "imaging", "markers"]),
+    ("calibration", &["geometry"]),
     ("landing", &["geometry"]),
     ("rendering", &["geometry", "markers"]),
     ("world", &["autopilot", "geometry"]),
@@ -39,9 +40,10 @@ const SERVICES: [&str; 6] =
 /// What a recording is.
 const FLIGHTLOG: (&str, &[&str]) = ("flightlog", &["autopilot", "messages"]);
 /// What a service or a tool may know.
-const ROOMS: [&str; 11] = [
+const ROOMS: [&str; 12] = [
     "airlink",
     "autopilot",
+    "calibration",
     "fiducial",
     "flightlog",
     "geometry",
@@ -68,8 +70,17 @@ const ABOVE: [(&str, &[&str]); 3] = [
     ("report", &["controller", "experiments", "replay"]),
 ];
 /// What the program may know beside services and tools: markers to find in files and to print, and the network.
-const ALIGHT: [&str; 8] =
-    ["fiducial", "flightlog", "geometry", "imaging", "markers", "media", "messages", "node"];
+const ALIGHT: [&str; 9] = [
+    "calibration",
+    "fiducial",
+    "flightlog",
+    "geometry",
+    "imaging",
+    "markers",
+    "media",
+    "messages",
+    "node",
+];
 
 /// Crates of algorithms but for these modules, which have the threads, the clock and the network.
 const WITH_THREADS: [(&str, &[&str]); 2] =

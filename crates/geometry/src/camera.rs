@@ -3,7 +3,7 @@
 //! Pixel coordinates: the centre of the top-left pixel is (0, 0), x right, y down.
 
 use libm::{atan, fmax, fmin, hypot, tan};
-use nalgebra::{Matrix2, Matrix2x3};
+use nalgebra::{Matrix2, Matrix2x3, SMatrix};
 
 use crate::frame::Camera;
 use crate::transform::{Point, Vector};
@@ -105,6 +105,21 @@ impl CameraModel {
         jacobian.iter().all(|j| j.is_finite()).then_some((pixel, jacobian))
     }
 
+    /// The derivative of a point's pixel by fx, fy, cx, cy and the lens's numbers in their order (those that it has not are
+    /// zero); `None` where [`CameraModel::project`] gives none.
+    pub fn intrinsics_jacobian(&self, point: Point<Camera>) -> Option<SMatrix<f64, 2, 12>> {
+        self.project(point)?;
+        let (x, y) = (point.x() / point.z(), point.y() / point.z());
+        let (u, v) = self.distortion.distort(x, y);
+        let mut jacobian = SMatrix::zeros();
+        (jacobian[(0, 0)], jacobian[(1, 1)]) = (u, v);
+        (jacobian[(0, 2)], jacobian[(1, 3)]) = (1.0, 1.0);
+        for (i, [by_u, by_v]) in self.distortion.parameter_slopes(x, y).into_iter().enumerate() {
+            (jacobian[(0, 4 + i)], jacobian[(1, 4 + i)]) = (self.fx * by_u, self.fy * by_v);
+        }
+        Some(jacobian)
+    }
+
     /// The direction of a pixel's ray, with z = 1; `None` where no direction in front of the camera that the
     /// lens model describes gives this pixel, and for a fisheye's pixels from 90 degrees off axis on.
     pub fn unproject(&self, pixel: Pixel) -> Option<Vector<Camera>> {
@@ -199,6 +214,42 @@ impl Distortion {
                 )
             }
         }
+    }
+
+    /// Derivatives of the distorted normalised coordinates by each of the lens's numbers.
+    fn parameter_slopes(&self, x: f64, y: f64) -> [[f64; 2]; 8] {
+        let mut slopes = [[0.0; 2]; 8];
+        match *self {
+            Self::None => {}
+            Self::BrownConrady(k) => {
+                let [k1, k2, _, _, k3, k4, k5, k6] = k;
+                let r2 = x * x + y * y;
+                let above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+                let below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6));
+                let powers = [(r2, 0, 5), (r2 * r2, 1, 6), (r2 * r2 * r2, 4, 7)];
+                for (power, numerator, denominator) in powers {
+                    let power = power / below;
+                    slopes[numerator] = [x * power, y * power];
+                    let slope = -power * above / below;
+                    slopes[denominator] = [x * slope, y * slope];
+                }
+                slopes[2] = [2.0 * x * y, r2 + 2.0 * y * y];
+                slopes[3] = [r2 + 2.0 * x * x, 2.0 * x * y];
+            }
+            Self::KannalaBrandt(_) => {
+                let r = hypot(x, y);
+                if r < 1e-12 {
+                    return slopes;
+                }
+                let theta = atan(r);
+                let mut power = theta;
+                for slope in slopes.iter_mut().take(4) {
+                    power *= theta * theta;
+                    *slope = [x / r * power, y / r * power];
+                }
+            }
+        }
+        slopes
     }
 
     /// From distorted to ideal normalised coordinates; `None` for what nothing within the model's reach gives.
@@ -353,6 +404,42 @@ mod tests {
                     for row in 0..2 {
                         let error = (jacobian[(row, axis)] - slope[row]).abs();
                         prop_assert!(error < 1e-4 * model.fx / z, "{model:?} {jacobian} {slope:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn the_jacobian_by_the_intrinsics_is_the_slope_by_each(
+            x in -0.35..0.35f64, y in -0.25..0.25f64, z in 0.3..20.0f64,
+        ) {
+            let rational = Distortion::BrownConrady([0.3, -0.1, 1e-3, -2e-3, 0.02, 0.4, 0.05, 0.01]);
+            let rational = CameraModel { distortion: rational, ..models()[0] };
+            let point = Point::new(x * z, y * z, z);
+            for model in models().into_iter().chain([rational]) {
+                let jacobian = model.intrinsics_jacobian(point).unwrap();
+                for parameter in 0..12 {
+                    let at = |step: f64| {
+                        let mut moved = model;
+                        let step = if parameter < 4 { step * 100.0 } else { step };
+                        match (parameter, &mut moved.distortion) {
+                            (0, _) => moved.fx += step,
+                            (1, _) => moved.fy += step,
+                            (2, _) => moved.cx += step,
+                            (3, _) => moved.cy += step,
+                            (_, Distortion::BrownConrady(k)) => k[parameter - 4] += step,
+                            (4..8, Distortion::KannalaBrandt(k)) => k[parameter - 4] += step,
+                            _ => {}
+                        }
+                        moved.project(point).unwrap()
+                    };
+                    let scale = if parameter < 4 { 2e-4 } else { 2e-6 };
+                    let (ahead, behind) = (at(1e-6), at(-1e-6));
+                    for (row, slope) in [ahead.x - behind.x, ahead.y - behind.y].into_iter().enumerate() {
+                        let error = (jacobian[(row, parameter)] - slope / scale).abs();
+                        prop_assert!(error < 1e-4, "{model:?} {parameter}: {jacobian} {slope}");
                     }
                 }
             }

@@ -24,6 +24,8 @@ frames! {
     Marker = "marker";
     /// Origin at the pad's landing point, x right, y up, z out of the printed face.
     Pad = "pad";
+    /// A calibration board: any origin in its plane, x right, y down, z into the paper.
+    Board = "board";
     /// The vehicle: x forward, y right, z down (FRD).
     Body = "body";
     /// The world: x north, y east, z down, with the autopilot's local origin.

@@ -7,7 +7,8 @@
 //! This crate knows no image, no marker, no clock and no file.
 //!
 //! Modules in reading order: [`frame`] names the coordinate frames, [`transform`] moves between them,
-//! [`camera`] goes from the camera frame to pixels and back, [`roi`] from a region of an image to the whole;
+//! [`camera`] goes from the camera frame to pixels and back, [`roi`] from a region of an image to the whole,
+//! [`homography`] from a plane to its image;
 //! [`arithmetic`] says which functions of numbers may be used.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
@@ -15,11 +16,13 @@
 pub mod arithmetic;
 pub mod camera;
 pub mod frame;
+pub mod homography;
 pub mod roi;
 pub mod transform;
 
 pub use arithmetic::{cubed, squared};
 pub use camera::{CameraModel, Distortion, Pixel};
-pub use frame::{Body, Camera, Frame, Marker, Ned, Odometry, Pad};
+pub use frame::{Board, Body, Camera, Frame, Marker, Ned, Odometry, Pad};
+pub use homography::homography;
 pub use roi::Roi;
 pub use transform::{Point, Rotation, Transform, Vector};

@@ -1,6 +1,7 @@
 //! The homography from a marker's plane to the image, its inverse and its derivatives.
 
-use nalgebra::{SMatrix, SVector};
+use geometry::homography::PlanePair;
+use nalgebra::SMatrix;
 
 /// Corners of a square in its own coordinates: x right, y down, from -1 to 1, clockwise from the top left.
 pub(crate) const CORNERS: [[f64; 2]; 4] = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]];
@@ -53,20 +54,8 @@ impl Homography {
         pairs: impl Iterator<Item = [[f64; 2]; 2]>,
         origin: [f64; 2],
     ) -> Option<Self> {
-        let mut matrix = SMatrix::<f64, 8, 8>::zeros();
-        let mut right = SVector::<f64, 8>::zeros();
-        for [[x, y], [u, v]] in pairs {
-            let rows = [
-                (SVector::<f64, 8>::from([x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y]), u),
-                (SVector::<f64, 8>::from([0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y]), v),
-            ];
-            for (row, value) in rows {
-                matrix += row * row.transpose();
-                right += row * value;
-            }
-        }
-        let h: [f64; 8] = matrix.lu().solve(&right)?.into();
-        h.iter().all(|h| h.is_finite()).then_some(Self { h, origin })
+        let pairs = pairs.map(|[plane, image]| PlanePair { plane, image });
+        geometry::homography(pairs).map(|h| Self { h, origin })
     }
 
     /// The image of a point of the plane.

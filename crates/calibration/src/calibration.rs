@@ -1,0 +1,274 @@
+//! The result: a camera, how sure it is, and what that means.
+
+use geometry::{Board, Camera, CameraModel, Pixel, Point, Transform};
+use libm::fmax;
+use nalgebra::{Isometry3, Matrix2, Matrix6, SMatrix, Translation3, Vector3};
+
+use crate::board::BEND;
+use crate::halves::{CrossValidation, Half};
+use crate::lens::{INTRINSICS, Lens};
+use crate::stages::Solved;
+use crate::view::{ImageSize, View};
+
+/// What may be chosen.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Options {
+    /// Whether the board may be bent; its shape is then solved for. Glass and aluminium are flat, paper never is.
+    pub solve_bend: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { solve_bend: true }
+    }
+}
+
+/// A calibrated camera.
+#[derive(Clone, Debug)]
+pub struct Calibration {
+    /// The camera.
+    pub camera: CameraModel,
+    /// Its kind of lens.
+    pub lens: Lens,
+    /// Covariance of fx, fy, cx, cy (px) and of the lens's numbers in their order, zero for those that it has not.
+    pub covariance: SMatrix<f64, INTRINSICS, INTRINSICS>,
+    /// How much deeper the board's middle lies than its left and right ends, and than its upper and lower ones, in metres.
+    pub bend_m: [f64; 2],
+    /// Standard deviation of the bend, in metres.
+    pub bend_sigma_m: [f64; 2],
+    /// Standard deviation of the points along each axis, in pixels, without outliers.
+    pub noise_px: f64,
+    /// Root mean square of the residuals' lengths, outliers included: what OpenCV reports.
+    pub rms_px: f64,
+    /// The views that were used.
+    pub views: Vec<SolvedView>,
+    /// What two halves of the views say of each other; `None` where a half alone shows no camera.
+    pub cross_validation: Option<CrossValidation>,
+}
+
+/// A view, as the calibration explains it.
+#[derive(Clone, Debug)]
+pub struct SolvedView {
+    /// Its name.
+    pub name: String,
+    /// Where the board was.
+    pub camera_from_board: Transform<Camera, Board>,
+    /// Root mean square of its residuals' lengths, in pixels.
+    pub rms_px: f64,
+    /// What is left of each point.
+    pub residuals: Vec<Residual>,
+}
+
+/// What is left of a point.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Residual {
+    /// The tag that it belongs to.
+    pub tag: u32,
+    /// Where it was seen.
+    pub seen: Pixel,
+    /// By how much farther right and down than expected, in pixels.
+    pub residual_px: [f64; 2],
+}
+
+/// What is left in a part of the image.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct PlaceResidual {
+    /// The part's middle.
+    pub middle: Pixel,
+    /// How many points were seen there.
+    pub points: usize,
+    /// Their mean residual, in pixels: far from zero where the lens model does not fit.
+    pub mean_px: [f64; 2],
+    /// Root mean square of their residuals' lengths, in pixels.
+    pub rms_px: f64,
+}
+
+/// How sure the projection is at a place of the image.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct PlaceUncertainty {
+    /// The place.
+    pub pixel: Pixel,
+    /// One standard deviation along each axis (root mean square of both); `None` where the model says nothing.
+    pub sigma_px: Option<f64>,
+}
+
+/// By how much the pose of a marker is off, one standard deviation, because the camera is not known better.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct PlacementError {
+    /// Across the line of sight, in metres.
+    pub lateral_m: f64,
+    /// Along it, in metres.
+    pub range_m: f64,
+}
+
+/// Half of the side of the marker of [`Calibration::error_at`], by its distance.
+const MARKER_HALF: f64 = 0.05;
+/// Columns and rows of places that stand for the whole image.
+const COLUMNS: usize = 16;
+const ROWS: usize = 12;
+
+impl Calibration {
+    /// What a solved bundle says; `None` where the views do not determine the camera.
+    pub(crate) fn new(solved: &Solved, views: &[&View], middle_m: [f64; 2]) -> Option<Self> {
+        let shared = &solved.place.shared;
+        let camera = solved.bundle().camera(shared);
+        let certainty = solved.certainty(0..0)?;
+        let covariance =
+            certainty.covariance.fixed_view::<INTRINSICS, INTRINSICS>(0, 0).into_owned();
+        let to_middle = Translation3::new(-middle_m[0], -middle_m[1], 0.0);
+        let mut explained = Vec::with_capacity(solved.views.len());
+        for ((points, pose), i) in solved.views.iter().zip(&solved.place.poses).zip(&solved.used) {
+            let residuals: Vec<Residual> = points
+                .iter()
+                .filter_map(|point| {
+                    let residual_px = point.residual(&camera, shared, pose)?;
+                    let seen = Pixel::new(point.seen[0], point.seen[1]);
+                    Some(Residual { tag: point.tag, seen, residual_px })
+                })
+                .collect();
+            let camera_from_board: Isometry3<f64> = pose * to_middle;
+            explained.push(SolvedView {
+                name: views.get(*i)?.name.clone(),
+                camera_from_board: Transform::from_isometry(camera_from_board),
+                rms_px: rms_px(residuals.iter()),
+                residuals,
+            });
+        }
+        Some(Self {
+            camera,
+            lens: solved.lens,
+            covariance,
+            bend_m: [shared[BEND], shared[BEND + 1]],
+            bend_sigma_m: [0, 1]
+                .map(|axis| fmax(certainty.covariance[(BEND + axis, BEND + axis)], 0.0).sqrt()),
+            noise_px: solved.noise_px,
+            rms_px: rms_px(explained.iter().flat_map(|view| &view.residuals)),
+            views: explained,
+            cross_validation: None,
+        })
+    }
+
+    /// What is compared when this is one of two halves.
+    pub(crate) fn half(&self) -> Half {
+        Half { camera: self.camera, covariance: self.covariance }
+    }
+
+    fn size(&self) -> ImageSize {
+        ImageSize { width: self.camera.width, height: self.camera.height }
+    }
+
+    /// The covariance of the pixel at which what is seen at `pixel` would be expected, in square pixels: of the projection of
+    /// a direction that is known in the camera frame. `None` where the lens model says nothing.
+    pub fn projection_covariance(&self, pixel: Pixel) -> Option<Matrix2<f64>> {
+        let ray = self.camera.unproject(pixel)?;
+        let slope = self.camera.intrinsics_jacobian(Point::from_coords(ray.coords.into()))?;
+        Some(slope * self.covariance * slope.transpose())
+    }
+
+    /// One standard deviation of the projection at a place of the image, in pixels along each axis (root mean square of both
+    /// axes); `None` where the lens model says nothing.
+    pub fn uncertainty_px(&self, pixel: Pixel) -> Option<f64> {
+        let covariance = self.projection_covariance(pixel)?;
+        Some(fmax(covariance.trace() / 2.0, 0.0).sqrt())
+    }
+
+    /// The same over the image, row by row, at the middles of equal parts.
+    pub fn uncertainty_map(&self, columns: usize, rows: usize) -> Vec<PlaceUncertainty> {
+        self.size()
+            .middles(columns, rows)
+            .map(|pixel| PlaceUncertainty { pixel, sigma_px: self.uncertainty_px(pixel) })
+            .collect()
+    }
+
+    /// What 95 % of the image do not exceed of [`Calibration::uncertainty_px`].
+    pub fn worst_uncertainty_px(&self) -> f64 {
+        let map = self.uncertainty_map(COLUMNS, ROWS);
+        percentile_95(map.iter().filter_map(|place| place.sigma_px).collect())
+    }
+
+    /// The residuals by place: equal parts of the image, row by row.
+    pub fn residual_map(&self, columns: usize, rows: usize) -> Vec<PlaceResidual> {
+        let mut map: Vec<PlaceResidual> = self
+            .size()
+            .middles(columns, rows)
+            .map(|middle| PlaceResidual { middle, points: 0, mean_px: [0.0; 2], rms_px: 0.0 })
+            .collect();
+        for residual in self.views.iter().flat_map(|view| &view.residuals) {
+            let column = part(residual.seen.x, self.camera.width, columns);
+            let row = part(residual.seen.y, self.camera.height, rows);
+            let Some(place) = map.get_mut(row * columns + column) else { continue };
+            place.points += 1;
+            let [x, y] = residual.residual_px;
+            place.mean_px = [place.mean_px[0] + x, place.mean_px[1] + y];
+            place.rms_px += x * x + y * y;
+        }
+        for place in map.iter_mut().filter(|place| place.points > 0) {
+            let count = place.points as f64;
+            place.mean_px = place.mean_px.map(|sum| sum / count);
+            place.rms_px = (place.rms_px / count).sqrt();
+        }
+        map
+    }
+
+    /// By how much a marker is placed wrongly because the camera is not known better: one standard deviation, which 95 % of
+    /// the image do not exceed. The marker is at this distance along the line of sight, faces the camera, has a side of a
+    /// tenth of the distance, and its corners are seen without any error; its pose is the one that fits them best. Not in it
+    /// is what else makes a landing inexact: the corners' own noise, a wrong marker size, the camera's mount.
+    pub fn error_at(&self, distance_m: f64) -> PlacementError {
+        let [mut lateral_m, mut range_m] = [Vec::new(), Vec::new()];
+        for pixel in self.size().middles(COLUMNS, ROWS) {
+            if let Some(error) = self.marker_error(pixel, distance_m) {
+                lateral_m.push(error.lateral_m);
+                range_m.push(error.range_m);
+            }
+        }
+        PlacementError { lateral_m: percentile_95(lateral_m), range_m: percentile_95(range_m) }
+    }
+
+    fn marker_error(&self, pixel: Pixel, distance_m: f64) -> Option<PlacementError> {
+        let sight = self.camera.unproject(pixel)?.coords.normalize();
+        let across = sight.cross(&Vector3::y()).try_normalize(1e-6)?;
+        let down = sight.cross(&across);
+        let mut matrix = Matrix6::zeros();
+        let mut by_intrinsics = SMatrix::<f64, 6, INTRINSICS>::zeros();
+        for [x, y] in [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]] {
+            let arm = (across * x + down * y) * MARKER_HALF * distance_m;
+            let corner = Point::<Camera>::from_coords((sight * distance_m + arm).into());
+            let (_, by_point) = self.camera.project_with_jacobian(corner)?;
+            let mut by_pose = SMatrix::<f64, 2, 6>::zeros();
+            by_pose.fixed_view_mut::<2, 3>(0, 0).copy_from(&by_point);
+            by_pose.fixed_view_mut::<2, 3>(0, 3).copy_from(&(by_point * -arm.cross_matrix()));
+            matrix += by_pose.transpose() * by_pose;
+            by_intrinsics += by_pose.transpose() * self.camera.intrinsics_jacobian(corner)?;
+        }
+        let slope = matrix.cholesky()?.inverse() * by_intrinsics;
+        let covariance = slope * self.covariance * slope.transpose();
+        let place = covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        let along = fmax(sight.dot(&(place * sight)), 0.0);
+        let across = fmax(place.trace() - along, 0.0);
+        Some(PlacementError { lateral_m: across.sqrt(), range_m: along.sqrt() })
+    }
+}
+
+/// The part of the image's length in which a coordinate lies.
+fn part(at: f64, length: u32, parts: usize) -> usize {
+    let share = (at + 0.5) / f64::from(length) * parts as f64;
+    // The cast takes what is negative to zero.
+    (share as usize).min(parts.saturating_sub(1))
+}
+
+/// The value that 95 of 100 do not exceed.
+fn percentile_95(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let at = (values.len() * 95).div_ceil(100).saturating_sub(1);
+    values.get(at).copied().unwrap_or(f64::INFINITY)
+}
+
+fn rms_px<'a>(residuals: impl Iterator<Item = &'a Residual>) -> f64 {
+    let (mut count, mut sum) = (0.0, 0.0);
+    for Residual { residual_px: [x, y], .. } in residuals {
+        count += 1.0;
+        sum += x * x + y * y;
+    }
+    (sum / fmax(count, 1.0)).sqrt()
+}

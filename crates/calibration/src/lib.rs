@@ -1,0 +1,48 @@
+//! A camera's intrinsics from images of a board, with what they are worth.
+//!
+//! The way through it: one [`View`] for each image, with the board's points that were found in it, goes into
+//! [`calibrate`]. What comes out is a [`Calibration`] (the [`geometry::CameraModel`], its covariance, each view's pose and
+//! residuals, and functions that say what the uncertainty means), or a [`Refusal`] with the reason in a sentence for people.
+//!
+//! ```
+//! use calibration::{calibrate, ImageSize, Lens, Options, Sighting, View};
+//! use geometry::Pixel;
+//!
+//! let size = ImageSize { width: 1280, height: 960 };
+//! // x right and y down on the board, in metres; `tag` names the marker that the point is a corner of.
+//! let sighting = Sighting { tag: 7, place_m: [0.088, 0.0], seen: Pixel::new(311.2, 240.9) };
+//! let view = View { name: "001.png".into(), size, points: vec![sighting] };
+//! let refusal = calibrate(&[view], Lens::BrownConrady5, &Options::default()).unwrap_err();
+//! println!("{refusal}");
+//! ```
+//!
+//! This crate knows no image, no marker, no file and no clock.
+//!
+//! Modules in reading order: [`view`] is what is given, [`lens`] which camera model is looked for; `board` predicts a board's
+//! point with its derivatives, `equations` and `solve` find a minimum, `start` guesses where, `stages` is the way from guess
+//! to result, `covariance` says how sure it is;
+//! [`calibration`] is the result, [`halves`] compares those of two halves, `judge` refuses by [`refusal`].
+
+#![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
+
+mod board;
+pub mod calibration;
+mod covariance;
+mod equations;
+pub mod halves;
+mod judge;
+pub mod lens;
+pub mod refusal;
+mod solve;
+mod stages;
+mod start;
+pub mod view;
+
+pub use calibration::{
+    Calibration, Options, PlaceResidual, PlaceUncertainty, PlacementError, Residual, SolvedView,
+};
+pub use halves::CrossValidation;
+pub use judge::{calibrate, calibrate_unjudged};
+pub use lens::Lens;
+pub use refusal::Refusal;
+pub use view::{ImageSize, Sighting, View};

@@ -1,0 +1,198 @@
+//! Views of a board whose truth is known: what a detector would find in them, with errors that its tags' corners share.
+#![allow(dead_code, unreachable_pub, reason = "each of the tests that share this file uses a part")]
+
+use calibration::{ImageSize, Lens, Sighting, View};
+use geometry::{CameraModel, Distortion, Pixel, Point};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+/// Tags along each side, their side and the gap between two, in metres: the AprilGrid of Kalibr's documentation.
+pub const TAGS: u32 = 6;
+pub const TAG_M: f64 = 0.088;
+pub const GAP_M: f64 = 0.0264;
+pub const BOARD_M: f64 = TAGS as f64 * (TAG_M + GAP_M) - GAP_M;
+pub const SIZE: ImageSize = ImageSize { width: 1280, height: 960 };
+
+/// A camera whose numbers are known, with the model that describes it.
+#[derive(Copy, Clone, Debug)]
+pub struct Truth {
+    pub name: &'static str,
+    pub lens: Lens,
+    pub camera: CameraModel,
+}
+
+fn camera(focal_px: f64, distortion: Distortion) -> CameraModel {
+    CameraModel {
+        width: SIZE.width,
+        height: SIZE.height,
+        fx: focal_px,
+        fy: focal_px * 1.002,
+        cx: 648.3,
+        cy: 471.6,
+        distortion,
+    }
+}
+
+/// Lenses of 60, 120 and 180 degrees across the image's width.
+pub fn lenses() -> [Truth; 4] {
+    let barrel = Distortion::BrownConrady([-0.28, 0.11, 2e-4, -1e-4, -0.02, 0.0, 0.0, 0.0]);
+    let rational = Distortion::BrownConrady([0.35, 0.02, 2e-4, -1e-4, 0.001, 0.62, 0.09, 0.002]);
+    [
+        Truth { name: "60", lens: Lens::BrownConrady5, camera: camera(1105.0, barrel) },
+        Truth { name: "120 rational", lens: Lens::BrownConrady8, camera: camera(520.0, rational) },
+        Truth {
+            name: "120 fisheye",
+            lens: Lens::KannalaBrandt,
+            camera: camera(611.0, Distortion::KannalaBrandt([0.02, -0.01, 0.003, -0.001])),
+        },
+        Truth {
+            name: "180 fisheye",
+            lens: Lens::KannalaBrandt,
+            camera: camera(408.0, Distortion::KannalaBrandt([0.01, -0.008, 0.002, -0.0005])),
+        },
+    ]
+}
+
+/// How the views are taken.
+#[derive(Copy, Clone, Debug)]
+pub struct Taking {
+    pub views: usize,
+    /// Of each corner alone, along each axis.
+    pub noise_px: f64,
+    /// Of all corners of a tag in a view together, along each axis.
+    pub tag_noise_px: f64,
+    /// How much deeper the board's middle lies.
+    pub bend_m: [f64; 2],
+    /// The board's tilt against the line of sight, at most.
+    pub max_tilt: f64,
+    /// Nearest and farthest distance, by that at which the board is as wide as half of the image.
+    pub distances: [f64; 2],
+    /// The part of the image where the board's middle lies: left, right, top, bottom.
+    pub part: [f64; 4],
+    /// Whether the board is always parallel to the image.
+    pub is_parallel: bool,
+    /// The side of the printed tags, in metres: what is said of it is TAG_M.
+    pub tag_m: f64,
+    /// How far the board moves while a picture is read out, row by row, in metres.
+    pub motion_m: f64,
+    /// By how much the bend changes from view to view, one standard deviation.
+    pub floppy_m: f64,
+}
+
+impl Default for Taking {
+    fn default() -> Self {
+        Self {
+            views: 60,
+            noise_px: 0.08,
+            tag_noise_px: 0.06,
+            bend_m: [0.002, 0.001],
+            max_tilt: 0.8,
+            distances: [0.5, 1.5],
+            part: [0.0, 1.0, 0.0, 1.0],
+            is_parallel: false,
+            tag_m: TAG_M,
+            motion_m: 0.0,
+            floppy_m: 0.0,
+        }
+    }
+}
+
+/// The four corners of a tag, from the board's middle, in metres.
+fn corners(tag: u32, side_m: f64) -> [[f64; 2]; 4] {
+    let [column, row] = [tag % TAGS, tag / TAGS].map(f64::from);
+    let middle = |at: f64| at * (TAG_M + GAP_M) + TAG_M / 2.0 - BOARD_M / 2.0;
+    let [x, y, half] = [middle(column), middle(row), side_m / 2.0];
+    [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]]
+}
+
+/// What is seen by this camera, by these rules.
+pub fn views(camera: &CameraModel, taking: &Taking, seed: u64) -> Vec<View> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut views = Vec::new();
+    while views.len() < taking.views {
+        let points = points(camera, taking, &mut random);
+        if points.len() >= 24 {
+            views.push(View { name: format!("{:03}.png", views.len()), size: SIZE, points });
+        }
+    }
+    views
+}
+
+fn normal(random: &mut impl Rng, sigma: f64) -> f64 {
+    let value: f64 = StandardNormal.sample(random);
+    value * sigma
+}
+
+fn points(camera: &CameraModel, taking: &Taking, random: &mut impl Rng) -> Vec<Sighting> {
+    let Some(pose) = pose(camera, taking, random) else { return Vec::new() };
+    let bend_m = taking.bend_m.map(|bend| bend + normal(random, taking.floppy_m));
+    let motion = Vector3::new(normal(random, 1.0), normal(random, 1.0), 0.3 * normal(random, 1.0));
+    let motion = motion.normalize() * taking.motion_m;
+    let mut points = Vec::new();
+    for tag in 0..TAGS * TAGS {
+        let shared = [0, 1].map(|_| normal(random, taking.tag_noise_px));
+        let printed = corners(tag, taking.tag_m);
+        let seen = printed.map(|[x, y]| {
+            let sag = |at: f64| 1.0 - (2.0 * at / BOARD_M) * (2.0 * at / BOARD_M);
+            let depth = bend_m[0] * sag(x) + bend_m[1] * sag(y);
+            let place = pose * Vector3::new(x, y, depth) + pose.translation.vector;
+            let first = seen(camera, place)?;
+            seen(camera, place + motion * (first.y / f64::from(SIZE.height) - 0.5))
+        });
+        let noises =
+            [0; 4].map(|_| [0, 1].map(|axis| shared[axis] + normal(random, taking.noise_px)));
+        if seen.iter().all(Option::is_some) {
+            for ((place_m, seen), [dx, dy]) in corners(tag, TAG_M).into_iter().zip(seen).zip(noises)
+            {
+                let seen = seen.map(|seen| Pixel::new(seen.x + dx, seen.y + dy));
+                points.extend(seen.map(|seen| Sighting { tag, place_m, seen }));
+            }
+        }
+    }
+    points
+}
+
+/// Where a point is seen: within the image, and less than 88 degrees off the axis.
+fn seen(camera: &CameraModel, place: Vector3<f64>) -> Option<Pixel> {
+    let pixel = camera.project(Point::from_coords(place.into()))?;
+    let border = 4.0;
+    let is_inside = (border..f64::from(SIZE.width) - border).contains(&pixel.x)
+        && (border..f64::from(SIZE.height) - border).contains(&pixel.y);
+    (is_inside && place.z > 0.035 * place.norm()).then_some(pixel)
+}
+
+fn pose(camera: &CameraModel, taking: &Taking, random: &mut impl Rng) -> Option<Isometry3<f64>> {
+    let [left, right, top, bottom] = taking.part;
+    let x = random.random_range(left..right) * f64::from(SIZE.width);
+    let y = random.random_range(top..bottom) * f64::from(SIZE.height);
+    let sight = camera.unproject(Pixel::new(x, y))?.coords.normalize();
+    let half_wide = BOARD_M * camera.fx / (0.5 * f64::from(SIZE.width));
+    let [near, far] = taking.distances;
+    let distance = half_wide * if near < far { random.random_range(near..far) } else { near };
+    let facing = UnitQuaternion::rotation_between(&Vector3::z(), &sight)?;
+    let towards = random.random_range(0.0..std::f64::consts::TAU);
+    let axis = Vector3::new(towards.cos(), towards.sin(), 0.0);
+    let tilt =
+        UnitQuaternion::from_scaled_axis(axis * random.random_range(0.0..=1.0) * taking.max_tilt);
+    let roll = UnitQuaternion::from_scaled_axis(Vector3::z() * random.random_range(-0.8..0.8));
+    let rotation = if taking.is_parallel { tilt * roll } else { facing * tilt * roll };
+    Some(Isometry3::from_parts(Translation3::from(sight * distance), rotation))
+}
+
+/// How far the projections of two cameras differ, in pixels: what 95 % of the image that `truth` describes do not exceed.
+pub fn map_error_px(truth: &CameraModel, found: &CameraModel) -> f64 {
+    let mut errors = Vec::new();
+    for row in 0..48 {
+        for column in 0..64 {
+            let pixel = Pixel::new(f64::from(column) * 20.0 + 9.5, f64::from(row) * 20.0 + 9.5);
+            if let Some(ray) = truth.unproject(pixel) {
+                let other = found.project(Point::from_coords(ray.coords.into()));
+                errors.push(other.map_or(f64::INFINITY, |other| other.distance(&pixel)));
+            }
+        }
+    }
+    errors.sort_by(f64::total_cmp);
+    errors[errors.len() * 95 / 100]
+}
