@@ -34,6 +34,8 @@ pub(crate) struct BoardPoint {
     pub(crate) place_m: [f64; 2],
     /// From the middle of its tag, in metres.
     arm_m: [f64; 2],
+    /// From the board's middle, by half of the board's extent along each axis.
+    share: [f64; 2],
     /// How deep it lies for a bend of 1 m along x and along y.
     sag: [f64; 2],
     pub(crate) seen: [f64; 2],
@@ -73,7 +75,7 @@ impl Sheet {
                 let share = [0, 1].map(|axis| place_m[axis] / half_m[axis]);
                 let sag = share.map(|share| 1.0 - share * share);
                 let seen = [sighting.seen.x, sighting.seen.y];
-                BoardPoint { tag: sighting.tag, place_m, arm_m: [0.0; 2], sag, seen }
+                BoardPoint { tag: sighting.tag, place_m, arm_m: [0.0; 2], share, sag, seen }
             })
             .collect();
         points.sort_by_key(|point| point.tag);
@@ -94,6 +96,11 @@ impl BoardPoint {
     fn place(&self, shared: &Shared) -> Vector3<f64> {
         let depth = shared[BEND] * self.sag[0] + shared[BEND + 1] * self.sag[1];
         Vector3::new(self.place_m[0], self.place_m[1], depth)
+    }
+
+    /// Its place from the board's middle, by half of the board's extent along each axis.
+    pub(crate) fn share(&self) -> [f64; 2] {
+        self.share
     }
 
     /// Where it is from the camera.

@@ -5,6 +5,7 @@ use libm::fmax;
 use nalgebra::{Isometry3, Matrix2, Matrix6, SMatrix, Translation3, Vector3};
 
 use crate::board::BEND;
+use crate::evidence::Evidence;
 use crate::halves::{CrossValidation, Half};
 use crate::lens::{INTRINSICS, Lens};
 use crate::stages::Solved;
@@ -42,6 +43,8 @@ pub struct Calibration {
     pub rms_px: f64,
     /// The views that were used.
     pub views: Vec<SolvedView>,
+    /// How the board was shown, and what the fit leaves unexplained.
+    pub evidence: Evidence,
     /// What two halves of the views say of each other; `None` where a half alone shows no camera.
     pub cross_validation: Option<CrossValidation>,
 }
@@ -144,6 +147,7 @@ impl Calibration {
             noise_px: solved.noise_px,
             rms_px: rms_px(explained.iter().flat_map(|view| &view.residuals)),
             views: explained,
+            evidence: Evidence::new(solved),
             cross_validation: None,
         })
     }

@@ -1,7 +1,10 @@
 //! Which sets of views are believed.
 
+use libm::fmax;
+
 use crate::board::Sheet;
 use crate::calibration::{Calibration, Options};
+use crate::evidence::{Estimate, Evidence};
 use crate::halves;
 use crate::lens::Lens;
 use crate::refusal::Refusal;
@@ -23,8 +26,8 @@ const MAX_POINTS: usize = 300_000;
 /// # Errors
 /// Why they do not, in a sentence for people.
 pub fn calibrate(views: &[View], lens: Lens, options: &Options) -> Result<Calibration, Refusal> {
-    let (solved, calibration) = solve(views, lens, options, MIN_VIEWS)?;
-    judge(&solved, &calibration)?;
+    let calibration = solve(views, lens, options, MIN_VIEWS)?;
+    judge(&calibration)?;
     Ok(calibration)
 }
 
@@ -37,7 +40,7 @@ pub fn calibrate_unjudged(
     lens: Lens,
     options: &Options,
 ) -> Result<Calibration, Refusal> {
-    solve(views, lens, options, MIN_UNJUDGED_VIEWS).map(|(_, calibration)| calibration)
+    solve(views, lens, options, MIN_UNJUDGED_VIEWS)
 }
 
 fn solve(
@@ -45,7 +48,7 @@ fn solve(
     lens: Lens,
     options: &Options,
     min_views: usize,
-) -> Result<(Solved, Calibration), Refusal> {
+) -> Result<Calibration, Refusal> {
     let size = common_size(views, min_views)?;
     let used: Vec<&View> = views.iter().filter(|view| view.points.len() >= MIN_POINTS).collect();
     let sheet = Sheet::new(&used);
@@ -62,7 +65,7 @@ fn solve(
     let [even, odd] = [0, 1].map(|half| of(&solved.part(|i| i % 2 == half)));
     calibration.cross_validation =
         even.zip(odd).and_then(|(even, odd)| halves::compare(&even.half(), &odd.half()));
-    Ok((solved, calibration))
+    Ok(calibration)
 }
 
 /// Median misfit, by the image's width, beyond which nothing was found.
@@ -115,6 +118,114 @@ fn refuse_mirrored(sheet: &Sheet, size: ImageSize) -> Result<(), Refusal> {
     if 2 * mirrored > views { Err(Refusal::Mirrored { mirrored, views }) } else { Ok(()) }
 }
 
-fn judge(_solved: &Solved, _calibration: &Calibration) -> Result<(), Refusal> {
+/// What a set of views must show, chosen so that good synthetic sets pass and those of `tests/synthetic/bad.rs` do not.
+mod limit {
+    /// Tilt that one view of ten exceeds, in degrees.
+    pub(super) const MIN_TILT_DEG: f64 = 15.0;
+    /// Distance of the farthest tenth of the views by that of the nearest.
+    pub(super) const MIN_DISTANCE_RATIO: f64 = 1.2;
+    /// Part of the image with points; the circle of a fisheye inscribed in the image covers three quarters.
+    pub(super) const MIN_COVERED: f64 = 0.55;
+    /// Wrong size of the tags against their spacing, and standard deviations that make a flaw of the print believed.
+    pub(super) const MAX_TAG_SCALE: f64 = 0.003;
+    pub(super) const MAX_DISTORTED: f64 = 0.004;
+    pub(super) const BELIEVED: f64 = 10.0;
+    /// Common residuals in pixels, and by the noise: less is harmless, or drowned.
+    pub(super) const MAX_STRUCTURE_PX: f64 = 0.1;
+    pub(super) const MAX_LENS_SHARE: f64 = 0.15;
+    pub(super) const MAX_VIEW_SHARE: f64 = 0.3;
+    /// What the place in the image explains by what the view explains, from which on it is the lens and not motion.
+    pub(super) const MIN_LENS_OF_VIEW: f64 = 0.3;
+    /// Differences of two halves: more than this, and more times what they claim.
+    pub(super) const MAX_DIFFERENCE_PX: f64 = 0.3;
+    pub(super) const MAX_RATIO: f64 = 4.0;
+    /// Noise and uncertainty in pixels, for images of up to 2000 pixels and by their width beyond.
+    pub(super) const MAX_NOISE_PX: f64 = 0.6;
+    pub(super) const MAX_UNCERTAINTY_PX: f64 = 0.6;
+    pub(super) const LARGE_IMAGE: f64 = 2000.0;
+}
+
+/// The first reason not to believe a result: how the board was shown comes first, as what follows may be caused by it.
+fn judge(calibration: &Calibration) -> Result<(), Refusal> {
+    let evidence = &calibration.evidence;
+    shown_well(evidence)?;
+    printed_well(evidence)?;
+    explained_well(calibration)?;
+    let camera = &calibration.camera;
+    let large = fmax(f64::from(camera.width.max(camera.height)) / limit::LARGE_IMAGE, 1.0);
+    let max_px = limit::MAX_NOISE_PX * large;
+    if calibration.noise_px > max_px {
+        return Err(Refusal::Noisy { noise_px: calibration.noise_px, max_px });
+    }
+    let (uncertainty_px, max_px) =
+        (calibration.worst_uncertainty_px(), limit::MAX_UNCERTAINTY_PX * large);
+    if uncertainty_px > max_px {
+        return Err(Refusal::Uncertain { uncertainty_px, max_px });
+    }
+    agreed_well(calibration)
+}
+
+fn shown_well(evidence: &Evidence) -> Result<(), Refusal> {
+    let tilt_deg = evidence.tilt.to_degrees();
+    if tilt_deg < limit::MIN_TILT_DEG {
+        return Err(Refusal::NoTilt { tilt_deg, min_deg: limit::MIN_TILT_DEG });
+    }
+    let (ratio, min_ratio) = (evidence.distance_ratio, limit::MIN_DISTANCE_RATIO);
+    if ratio < min_ratio {
+        return Err(Refusal::OneDistance { ratio, min_ratio });
+    }
+    if evidence.covered < limit::MIN_COVERED {
+        return Err(Refusal::PartOfImage {
+            covered_percent: 100.0 * evidence.covered,
+            min_percent: 100.0 * limit::MIN_COVERED,
+            missing: evidence.emptiest,
+        });
+    }
+    Ok(())
+}
+
+fn printed_well(evidence: &Evidence) -> Result<(), Refusal> {
+    let beyond = |flaw: Option<Estimate>, limit: f64| {
+        let flaw = flaw.filter(|flaw| flaw.value.abs() > limit::BELIEVED * flaw.sigma);
+        flaw.map(|flaw| flaw.value).filter(|value| value.abs() > limit)
+    };
+    if let Some(scale) = beyond(evidence.tag_scale, limit::MAX_TAG_SCALE) {
+        let max_percent = 100.0 * limit::MAX_TAG_SCALE;
+        return Err(Refusal::TagSize { percent: 100.0 * scale, max_percent });
+    }
+    // Of a stretch each direction has half.
+    let stretch = beyond(evidence.stretch, limit::MAX_DISTORTED / 2.0).map(|half| 2.0 * half);
+    match stretch.or(beyond(evidence.shear, limit::MAX_DISTORTED)) {
+        Some(flaw) => Err(Refusal::Distorted {
+            percent: 100.0 * flaw.abs(),
+            max_percent: 100.0 * limit::MAX_DISTORTED,
+        }),
+        None => Ok(()),
+    }
+}
+
+fn explained_well(calibration: &Calibration) -> Result<(), Refusal> {
+    let Evidence { lens_structure_px, view_structure_px, .. } = calibration.evidence;
+    let of_noise = |share: f64| fmax(limit::MAX_STRUCTURE_PX, share * calibration.noise_px);
+    let max_px = of_noise(limit::MAX_LENS_SHARE);
+    let is_lens = lens_structure_px > limit::MIN_LENS_OF_VIEW * view_structure_px;
+    if lens_structure_px > max_px && is_lens {
+        let lens = calibration.lens;
+        return Err(Refusal::WrongLens { lens, structure_px: lens_structure_px, max_px });
+    }
+    let max_px = of_noise(limit::MAX_VIEW_SHARE);
+    if view_structure_px > max_px {
+        return Err(Refusal::Moving { structure_px: view_structure_px, max_px });
+    }
+    Ok(())
+}
+
+fn agreed_well(calibration: &Calibration) -> Result<(), Refusal> {
+    let Some(halves) = calibration.cross_validation else { return Ok(()) };
+    let (difference_px, ratio) = (halves.difference_px, halves.ratio());
+    let (max_px, max_ratio) = (limit::MAX_DIFFERENCE_PX, limit::MAX_RATIO);
+    if difference_px > max_px && ratio > max_ratio {
+        return Err(Refusal::Inconsistent { difference_px, ratio, max_px, max_ratio });
+    }
     Ok(())
 }

@@ -21,7 +21,8 @@
 //! Modules in reading order: [`view`] is what is given, [`lens`] which camera model is looked for; `board` predicts a board's
 //! point with its derivatives, `equations` and `solve` find a minimum, `start` guesses where, `stages` is the way from guess
 //! to result, `covariance` says how sure it is;
-//! [`calibration`] is the result, [`halves`] compares those of two halves, `judge` refuses by [`refusal`].
+//! [`evidence`] is what the fit leaves unexplained, [`halves`] compares two halves of the views; [`calibration`] is the result,
+//! `judge` refuses by [`refusal`].
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
 
@@ -29,6 +30,7 @@ mod board;
 pub mod calibration;
 mod covariance;
 mod equations;
+pub mod evidence;
 pub mod halves;
 mod judge;
 pub mod lens;
@@ -41,6 +43,7 @@ pub mod view;
 pub use calibration::{
     Calibration, Options, PlaceResidual, PlaceUncertainty, PlacementError, Residual, SolvedView,
 };
+pub use evidence::{Estimate, Evidence};
 pub use halves::CrossValidation;
 pub use judge::{calibrate, calibrate_unjudged};
 pub use lens::Lens;

@@ -1,9 +1,11 @@
 //! From points to the minimum: a guess, what matters most, then all, with a loss that narrows to the noise found.
 
-use crate::board::{BEND, BoardPoint, SOLVED, Sheet};
+use geometry::Pixel;
+
+use crate::board::{BEND, BoardPoint, SOLVED, Shared, Sheet};
 use crate::covariance::{Certainty, certainty};
 use crate::equations::{Bundle, Free, Place};
-use crate::lens::Lens;
+use crate::lens::{Lens, brown_conrady_like};
 use crate::solve::{minimise, undistorted};
 use crate::start::{focal_guesses, poses, with_better_poses};
 use crate::view::ImageSize;
@@ -32,6 +34,8 @@ const MEDIAN_LENGTH: f64 = 1.177_410_022_515_474_7;
 const MIN_NOISE_PX: f64 = 0.005;
 /// How far from flat a board is expected to be, by half of its size.
 const BEND_SHARE: f64 = 0.05;
+/// The scale of the loss, by the image's width, as long as little is known.
+const ROUGH_SHARE: f64 = 0.02;
 /// Guesses that are followed when the first leads nowhere.
 const MAX_GUESSES: usize = 3;
 /// Noise, by the image's width, at which a guess has led somewhere.
@@ -46,9 +50,14 @@ pub(crate) fn solve(
     size: ImageSize,
     solve_bend: bool,
 ) -> Option<Solved> {
+    let task = Task { sheet, lens, size, solve_bend };
+    // A fraction of polynomials has many valleys; that of the fisheye that explains the points leads to the right one.
+    if lens == Lens::BrownConrady8 {
+        return task.from_fisheye();
+    }
     let mut best: Option<Solved> = None;
     for focal_px in focal_guesses(lens, size, &sheet.views).into_iter().take(MAX_GUESSES) {
-        let Some(found) = followed(sheet, lens, size, focal_px, solve_bend) else { continue };
+        let Some(found) = task.rough(focal_px).map(Solved::settled) else { continue };
         let is_good = found.noise_px < GOOD_SHARE * f64::from(size.width.max(size.height));
         if best.as_ref().is_none_or(|best| found.noise_px < best.noise_px) {
             best = Some(found);
@@ -60,41 +69,68 @@ pub(crate) fn solve(
     best
 }
 
-fn followed(
-    sheet: &Sheet,
+/// What is to be solved.
+#[derive(Copy, Clone)]
+struct Task<'a> {
+    sheet: &'a Sheet,
     lens: Lens,
     size: ImageSize,
-    focal_px: f64,
     solve_bend: bool,
-) -> Option<Solved> {
-    let wide = f64::from(size.width.max(size.height));
-    let bend_m = BEND_SHARE * libm::fmax(sheet.half_m[0], sheet.half_m[1]);
-    let shared = undistorted(focal_px, size);
-    let whole = Bundle { lens, size, views: &sheet.views, scale_px: 0.02 * wide, bend_m };
-    let (used, poses): (Vec<usize>, Vec<_>) = poses(&whole, &shared)
-        .into_iter()
-        .enumerate()
-        .filter_map(|(i, pose)| Some((i, pose?)))
-        .unzip();
-    if used.len() < MIN_VIEWS {
-        return None;
+}
+
+impl Task<'_> {
+    /// From an undistorted camera, what matters most first.
+    fn rough(&self, focal_px: f64) -> Option<Solved> {
+        let mut solved = self.posed(undistorted(focal_px, self.size))?;
+        solved.minimise(&Free::none().with(0..2).with(4..5), 8);
+        let intrinsics = Free::intrinsics(self.lens.parameters());
+        solved.minimise(&intrinsics, 15);
+        let Solved { lens, size, scale_px, bend_m, .. } = solved;
+        let bundle = Bundle { lens, size, views: &solved.views, scale_px, bend_m };
+        if with_better_poses(&bundle, &mut solved.place) {
+            solved.minimise(&intrinsics, 15);
+        }
+        Some(solved)
     }
-    let views: Vec<Vec<BoardPoint>> = used.iter().map(|i| sheet.views[*i].clone()).collect();
-    let rough = Bundle { views: &views, ..whole };
-    let mut place = Place { shared, poses };
-    place = minimise(&rough, place, &Free::none().with(0..2).with(4..5), 8).place;
-    let intrinsics = Free::intrinsics(lens.parameters());
-    place = minimise(&rough, place, &intrinsics, 15).place;
-    if with_better_poses(&rough, &mut place) {
-        place = minimise(&rough, place, &intrinsics, 15).place;
+
+    /// From the fisheye that explains the points.
+    fn from_fisheye(&self) -> Option<Solved> {
+        let fisheye = solve(self.sheet, Lens::KannalaBrandt, self.size, self.solve_bend)?;
+        let camera = fisheye.bundle().camera(&fisheye.place.shared);
+        let points = fisheye.views.iter().flatten().map(|point| point.seen);
+        let rays = points.filter_map(|[x, y]| camera.unproject(Pixel::new(x, y)));
+        let radii = rays.map(|ray| libm::hypot(ray.x(), ray.y()));
+        let max_radius = radii.fold(0.1, libm::fmax);
+        let numbers = brown_conrady_like(&camera, max_radius)?;
+        let mut shared = Shared::zeros();
+        for (value, number) in shared.iter_mut().zip(numbers) {
+            *value = number;
+        }
+        let mut solved = self.posed(shared)?;
+        solved.minimise(&Free::intrinsics(self.lens.parameters()), 15);
+        Some(solved.settled())
     }
-    let free = if solve_bend { intrinsics.with(BEND..SOLVED) } else { intrinsics };
-    let mut solved =
-        Solved { lens, size, views, used, place, free, scale_px: 0.0, bend_m, noise_px: 0.0 };
-    for _ in 0..3 {
-        solved.settle();
+
+    /// The views' poses for a camera.
+    fn posed(&self, shared: Shared) -> Option<Solved> {
+        let Self { sheet, lens, size, solve_bend } = *self;
+        let scale_px = ROUGH_SHARE * f64::from(size.width.max(size.height));
+        let bend_m = BEND_SHARE * libm::fmax(sheet.half_m[0], sheet.half_m[1]);
+        let whole = Bundle { lens, size, views: &sheet.views, scale_px, bend_m };
+        let (used, poses): (Vec<usize>, Vec<_>) = poses(&whole, &shared)
+            .into_iter()
+            .enumerate()
+            .filter_map(|(i, pose)| Some((i, pose?)))
+            .unzip();
+        if used.len() < MIN_VIEWS {
+            return None;
+        }
+        let views = used.iter().map(|i| sheet.views[*i].clone()).collect();
+        let intrinsics = Free::intrinsics(lens.parameters());
+        let free = if solve_bend { intrinsics.with(BEND..SOLVED) } else { intrinsics };
+        let place = Place { shared, poses };
+        Some(Solved { lens, size, views, used, place, free, scale_px, bend_m, noise_px: 0.0 })
     }
-    Some(solved)
 }
 
 impl Solved {
@@ -104,11 +140,25 @@ impl Solved {
         Bundle { lens, size, views: &self.views, scale_px, bend_m }
     }
 
+    /// Steps with these numbers free.
+    fn minimise(&mut self, free: &Free, max_steps: usize) {
+        self.place = minimise(&self.bundle(), self.place.clone(), free, max_steps).place;
+    }
+
     /// To the minimum of a loss that suits the noise here.
     fn settle(&mut self) {
         self.scale_px = ROBUST * self.measured_noise_px();
-        self.place = minimise(&self.bundle(), self.place.clone(), &self.free, 40).place;
+        let free = self.free;
+        self.minimise(&free, 40);
         self.noise_px = self.measured_noise_px();
+    }
+
+    /// At the minimum of a loss that suits the noise there.
+    fn settled(mut self) -> Self {
+        for _ in 0..3 {
+            self.settle();
+        }
+        self
     }
 
     /// The same from some of the views only, from here on.

@@ -8,6 +8,8 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+pub mod bad;
+
 /// Tags along each side, their side and the gap between two, in metres: the AprilGrid of Kalibr's documentation.
 pub const TAGS: u32 = 6;
 pub const TAG_M: f64 = 0.088;
@@ -65,8 +67,8 @@ pub struct Taking {
     pub tag_noise_px: f64,
     /// How much deeper the board's middle lies.
     pub bend_m: [f64; 2],
-    /// The board's tilt against the line of sight, at most.
-    pub max_tilt: f64,
+    /// The board's tilt against the line of sight, from and to.
+    pub tilts: [f64; 2],
     /// Nearest and farthest distance, by that at which the board is as wide as half of the image.
     pub distances: [f64; 2],
     /// The part of the image where the board's middle lies: left, right, top, bottom.
@@ -79,22 +81,43 @@ pub struct Taking {
     pub motion_m: f64,
     /// By how much the bend changes from view to view, one standard deviation.
     pub floppy_m: f64,
+    /// The share of tags that are found elsewhere, by up to 20 px.
+    pub outliers: f64,
 }
 
 impl Default for Taking {
     fn default() -> Self {
         Self {
             views: 60,
-            noise_px: 0.08,
-            tag_noise_px: 0.06,
+            noise_px: 0.03,
+            tag_noise_px: 0.02,
             bend_m: [0.002, 0.001],
-            max_tilt: 0.8,
-            distances: [0.5, 1.5],
-            part: [0.0, 1.0, 0.0, 1.0],
+            tilts: [0.2, 0.9],
+            distances: [0.45, 1.2],
+            part: [0.1, 0.9, 0.1, 0.9],
             is_parallel: false,
             tag_m: TAG_M,
             motion_m: 0.0,
             floppy_m: 0.0,
+            outliers: 0.0,
+        }
+    }
+}
+
+impl Taking {
+    /// Good sets of many kinds: fewer views, more noise, a flat or a bent board, some tags that are found elsewhere.
+    pub fn good(seed: u64) -> Self {
+        let usual = Self::default();
+        let at = |shift: u32, values: [f64; 3]| {
+            values[(seed / u64::from(3_u32.pow(shift)) % 3) as usize]
+        };
+        Self {
+            views: at(0, [60.0, 40.0, 25.0]) as usize,
+            noise_px: at(1, [0.03, 0.01, 0.08]),
+            tag_noise_px: at(1, [0.02, 0.01, 0.06]),
+            bend_m: [at(2, [0.002, 0.0, -0.004]), at(2, [0.001, 0.0, 0.002])],
+            outliers: at(3, [0.0, 0.01, 0.03]),
+            ..usual
         }
     }
 }
@@ -141,6 +164,9 @@ fn points(camera: &CameraModel, taking: &Taking, random: &mut impl Rng) -> Vec<S
             let first = seen(camera, place)?;
             seen(camera, place + motion * (first.y / f64::from(SIZE.height) - 0.5))
         });
+        let is_outlier = random.random_bool(taking.outliers);
+        let off = [0, 1].map(|_| if is_outlier { random.random_range(-20.0..20.0) } else { 0.0 });
+        let shared = [0, 1].map(|axis| shared[axis] + off[axis]);
         let noises =
             [0; 4].map(|_| [0, 1].map(|axis| shared[axis] + normal(random, taking.noise_px)));
         if seen.iter().all(Option::is_some) {
@@ -174,8 +200,8 @@ fn pose(camera: &CameraModel, taking: &Taking, random: &mut impl Rng) -> Option<
     let facing = UnitQuaternion::rotation_between(&Vector3::z(), &sight)?;
     let towards = random.random_range(0.0..std::f64::consts::TAU);
     let axis = Vector3::new(towards.cos(), towards.sin(), 0.0);
-    let tilt =
-        UnitQuaternion::from_scaled_axis(axis * random.random_range(0.0..=1.0) * taking.max_tilt);
+    let [min, max] = taking.tilts;
+    let tilt = UnitQuaternion::from_scaled_axis(axis * random.random_range(min..=max));
     let roll = UnitQuaternion::from_scaled_axis(Vector3::z() * random.random_range(-0.8..0.8));
     let rotation = if taking.is_parallel { tilt * roll } else { facing * tilt * roll };
     Some(Isometry3::from_parts(Translation3::from(sight * distance), rotation))
