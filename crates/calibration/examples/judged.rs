@@ -19,7 +19,10 @@ fn main() {
     let (sets, first_seed, is_long) = (number(1, 3), number(2, 0), number(3, 0) > 0);
     println!("{:12} {:>5} {:>8} {:>6}  reasons", "kind", "sets", "refused", "named");
     let kinds = std::iter::once(None).chain(Bad::ALL.map(Some));
-    for kind in kinds {
+    let only = std::env::args().nth(4);
+    let is_wanted =
+        |kind: &Option<Bad>| only.as_ref().is_none_or(|only| format!("{kind:?}").contains(only));
+    for kind in kinds.filter(is_wanted) {
         let (mut all, mut refused, mut named) = (0, 0, 0);
         let mut reasons = BTreeMap::<String, usize>::new();
         for truth in lenses() {

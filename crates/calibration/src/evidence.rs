@@ -4,7 +4,7 @@ use geometry::CameraModel;
 use libm::{acos, fmax, fmin, hypot};
 use nalgebra::{Isometry3, SMatrix, SVector};
 
-use crate::board::{BoardPoint, FLAWS, SHARED};
+use crate::board::{BoardPoint, FLAWS};
 use crate::stages::Solved;
 use crate::view::ImageSize;
 
@@ -15,10 +15,8 @@ pub struct Evidence {
     pub tilt: f64,
     /// Distance of the farthest tenth of the views by that of the nearest.
     pub distance_ratio: f64,
-    /// The share of the image in which points were seen, in parts of [`COVERAGE`].
-    pub covered: f64,
-    /// The half or quarter of the image with fewest points.
-    pub emptiest: &'static str,
+    /// Where in the image points were seen.
+    pub coverage: Coverage,
     /// How much larger the tags are than said, against their spacing; `None` where the views do not show it.
     pub tag_scale: Option<Estimate>,
     /// How much wider and lower the board is than said.
@@ -31,6 +29,15 @@ pub struct Evidence {
     pub view_structure_px: f64,
 }
 
+/// Where in the image points were seen.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Coverage {
+    /// The share of the image's parts (8 x 6 of them) in which there are any.
+    pub covered: f64,
+    /// The quarter of the image with fewest, for people.
+    pub emptiest: &'static str,
+}
+
 /// A value and its standard deviation.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Estimate {
@@ -40,8 +47,8 @@ pub struct Estimate {
     pub sigma: f64,
 }
 
-/// Columns and rows of the parts of the image of which [`Evidence::covered`] counts those with points.
-pub const COVERAGE: [usize; 2] = [8, 6];
+/// Columns and rows of the parts of the image of which [`Coverage`] counts those with points.
+const PARTS: [usize; 2] = [8, 6];
 /// The same for the residuals that depend on the place.
 const CELLS: [usize; 2] = [10, 8];
 /// Tags without which a part of the image says nothing about the lens, and a view nothing about motion.
@@ -50,7 +57,6 @@ const MIN_VIEW_TAGS: usize = 12;
 
 impl Evidence {
     pub(crate) fn new(solved: &Solved) -> Self {
-        let size = solved.size;
         let mut tilts: Vec<f64> = solved.place.poses.iter().map(tilt).collect();
         let mut distances: Vec<f64> =
             solved.place.poses.iter().map(|pose| pose.translation.vector.norm()).collect();
@@ -59,8 +65,7 @@ impl Evidence {
         Self {
             tilt: percentile(&mut tilts, 90),
             distance_ratio: percentile(&mut distances, 90) / percentile(&mut distances, 10),
-            covered: covered(solved, size),
-            emptiest: emptiest(solved, size),
+            coverage: Coverage::new(&solved.views, solved.size),
             tag_scale,
             stretch,
             shear,
@@ -92,34 +97,32 @@ fn cell(seen: [f64; 2], size: ImageSize, parts: [usize; 2]) -> usize {
     part(seen[1], height, parts[1]) * parts[0] + part(seen[0], width, parts[0])
 }
 
-fn covered(solved: &Solved, size: ImageSize) -> f64 {
-    let mut is_seen = [false; COVERAGE[0] * COVERAGE[1]];
-    for point in solved.views.iter().flatten() {
-        if let Some(seen) = is_seen.get_mut(cell(point.seen, size, COVERAGE)) {
-            *seen = true;
+impl Coverage {
+    pub(crate) fn new(views: &[Vec<BoardPoint>], size: ImageSize) -> Self {
+        const QUARTERS: [&str; 4] =
+            ["at the upper left", "at the upper right", "at the lower left", "at the lower right"];
+        let mut is_seen = [false; PARTS[0] * PARTS[1]];
+        let mut quarters = [0_usize; 4];
+        for point in views.iter().flatten() {
+            if let Some(seen) = is_seen.get_mut(cell(point.seen, size, PARTS)) {
+                *seen = true;
+            }
+            if let Some(quarter) = quarters.get_mut(cell(point.seen, size, [2, 2])) {
+                *quarter += 1;
+            }
+        }
+        let fewest = quarters.into_iter().zip(QUARTERS).min_by_key(|(count, _)| *count);
+        Self {
+            covered: is_seen.iter().filter(|seen| **seen).count() as f64 / is_seen.len() as f64,
+            emptiest: fewest.map_or("anywhere", |(_, name)| name),
         }
     }
-    is_seen.iter().filter(|seen| **seen).count() as f64 / is_seen.len() as f64
-}
-
-fn emptiest(solved: &Solved, size: ImageSize) -> &'static str {
-    const NAMES: [&str; 4] =
-        ["at the upper left", "at the upper right", "at the lower left", "at the lower right"];
-    let mut counts = [0_usize; 4];
-    for point in solved.views.iter().flatten() {
-        if let Some(count) = counts.get_mut(cell(point.seen, size, [2, 2])) {
-            *count += 1;
-        }
-    }
-    let fewest = counts.into_iter().zip(NAMES).min_by_key(|(count, _)| *count);
-    fewest.map_or("anywhere", |(_, name)| name)
 }
 
 /// The print's flaws, each as if it were the only other unknown: one step from where they are zero.
 fn flaws(solved: &Solved) -> [Option<Estimate>; 3] {
     [0, 1, 2].map(|flaw| {
         let at = FLAWS + flaw;
-        debug_assert!(at < SHARED);
         let certainty = solved.certainty(at..at + 1)?;
         let sigma = fmax(certainty.covariance[(at, at)], 0.0).sqrt();
         (sigma > 0.0).then_some(Estimate { value: certainty.step[at], sigma })

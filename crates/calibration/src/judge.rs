@@ -1,10 +1,10 @@
 //! Which sets of views are believed.
 
-use libm::fmax;
+use libm::{fmax, fmin};
 
 use crate::board::Sheet;
 use crate::calibration::{Calibration, Options};
-use crate::evidence::{Estimate, Evidence};
+use crate::evidence::{Coverage, Estimate, Evidence};
 use crate::halves;
 use crate::lens::Lens;
 use crate::refusal::Refusal;
@@ -26,7 +26,17 @@ const MAX_POINTS: usize = 300_000;
 /// # Errors
 /// Why they do not, in a sentence for people.
 pub fn calibrate(views: &[View], lens: Lens, options: &Options) -> Result<Calibration, Refusal> {
-    let calibration = solve(views, lens, options, MIN_VIEWS)?;
+    let task = Task::new(views, MIN_VIEWS)?;
+    // Where too little was seen a solver may find nothing at all, which would not name the reason.
+    let coverage = Coverage::new(&task.sheet.views, task.size);
+    if coverage.covered < limit::MIN_COVERED {
+        return Err(Refusal::PartOfImage {
+            covered_percent: 100.0 * coverage.covered,
+            min_percent: 100.0 * limit::MIN_COVERED,
+            missing: coverage.emptiest,
+        });
+    }
+    let calibration = task.solve(lens, options)?;
     judge(&calibration)?;
     Ok(calibration)
 }
@@ -40,32 +50,43 @@ pub fn calibrate_unjudged(
     lens: Lens,
     options: &Options,
 ) -> Result<Calibration, Refusal> {
-    solve(views, lens, options, MIN_UNJUDGED_VIEWS)
+    Task::new(views, MIN_UNJUDGED_VIEWS)?.solve(lens, options)
 }
 
-fn solve(
-    views: &[View],
-    lens: Lens,
-    options: &Options,
-    min_views: usize,
-) -> Result<Calibration, Refusal> {
-    let size = common_size(views, min_views)?;
-    let used: Vec<&View> = views.iter().filter(|view| view.points.len() >= MIN_POINTS).collect();
-    let sheet = Sheet::new(&used);
-    refuse_mirrored(&sheet, size)?;
-    let wide = f64::from(size.width.max(size.height));
-    let diverged = |noise_px: f64| Refusal::Diverged { lens, noise_px, max_px: MAX_MISFIT * wide };
-    let solved = stages::solve(&sheet, lens, size, options.solve_bend)
-        .ok_or_else(|| diverged(f64::INFINITY))?;
-    if solved.noise_px > MAX_MISFIT * wide {
-        return Err(diverged(solved.noise_px));
+/// Views that can be solved.
+struct Task<'a> {
+    size: ImageSize,
+    views: Vec<&'a View>,
+    sheet: Sheet,
+}
+
+impl<'a> Task<'a> {
+    fn new(views: &'a [View], min_views: usize) -> Result<Self, Refusal> {
+        let size = common_size(views, min_views)?;
+        let views: Vec<&View> =
+            views.iter().filter(|view| view.points.len() >= MIN_POINTS).collect();
+        let sheet = Sheet::new(&views);
+        refuse_mirrored(&sheet, size)?;
+        Ok(Self { size, views, sheet })
     }
-    let of = |solved: &Solved| Calibration::new(solved, &used, sheet.middle_m);
-    let mut calibration = of(&solved).ok_or_else(|| diverged(solved.noise_px))?;
-    let [even, odd] = [0, 1].map(|half| of(&solved.part(|i| i % 2 == half)));
-    calibration.cross_validation =
-        even.zip(odd).and_then(|(even, odd)| halves::compare(&even.half(), &odd.half()));
-    Ok(calibration)
+
+    fn solve(&self, lens: Lens, options: &Options) -> Result<Calibration, Refusal> {
+        let max_px = MAX_MISFIT * f64::from(self.size.width.max(self.size.height));
+        let solved = stages::solve(&self.sheet, lens, self.size, options.solve_bend);
+        let noise_px = solved.as_ref().map_or(f64::INFINITY, |solved| solved.noise_px);
+        let solved = solved.filter(|_| noise_px < max_px);
+        let solved = solved.ok_or(Refusal::Diverged { lens, noise_px, max_px })?;
+        let undetermined = Refusal::Undetermined { lens, parameters: lens.parameters() };
+        let mut calibration = self.calibration(&solved).ok_or(undetermined)?;
+        let [even, odd] = [0, 1].map(|half| self.calibration(&solved.part(|i| i % 2 == half)));
+        calibration.cross_validation =
+            even.zip(odd).and_then(|(even, odd)| halves::compare(&even.half(), &odd.half()));
+        Ok(calibration)
+    }
+
+    fn calibration(&self, solved: &Solved) -> Option<Calibration> {
+        Calibration::new(solved, &self.views, self.sheet.middle_m)
+    }
 }
 
 /// Median misfit, by the image's width, beyond which nothing was found.
@@ -132,8 +153,11 @@ mod limit {
     pub(super) const BELIEVED: f64 = 10.0;
     /// Common residuals in pixels, and by the noise: less is harmless, or drowned.
     pub(super) const MAX_STRUCTURE_PX: f64 = 0.1;
-    pub(super) const MAX_LENS_SHARE: f64 = 0.15;
+    pub(super) const MAX_LENS_SHARE: f64 = 0.25;
     pub(super) const MAX_VIEW_SHARE: f64 = 0.3;
+    /// Where the points are better than that, residuals that are mostly the lens's show already from here.
+    pub(super) const MAX_CLEAR_STRUCTURE_PX: f64 = 0.05;
+    pub(super) const MAX_CLEAR_LENS_SHARE: f64 = 0.5;
     /// What the place in the image explains by what the view explains, from which on it is the lens and not motion.
     pub(super) const MIN_LENS_OF_VIEW: f64 = 0.3;
     /// Differences of two halves: more than this, and more times what they claim.
@@ -174,13 +198,6 @@ fn shown_well(evidence: &Evidence) -> Result<(), Refusal> {
     if ratio < min_ratio {
         return Err(Refusal::OneDistance { ratio, min_ratio });
     }
-    if evidence.covered < limit::MIN_COVERED {
-        return Err(Refusal::PartOfImage {
-            covered_percent: 100.0 * evidence.covered,
-            min_percent: 100.0 * limit::MIN_COVERED,
-            missing: evidence.emptiest,
-        });
-    }
     Ok(())
 }
 
@@ -207,7 +224,9 @@ fn printed_well(evidence: &Evidence) -> Result<(), Refusal> {
 fn explained_well(calibration: &Calibration) -> Result<(), Refusal> {
     let Evidence { lens_structure_px, view_structure_px, .. } = calibration.evidence;
     let of_noise = |share: f64| fmax(limit::MAX_STRUCTURE_PX, share * calibration.noise_px);
-    let max_px = of_noise(limit::MAX_LENS_SHARE);
+    let clear_px =
+        fmax(limit::MAX_CLEAR_STRUCTURE_PX, limit::MAX_CLEAR_LENS_SHARE * calibration.noise_px);
+    let max_px = fmin(of_noise(limit::MAX_LENS_SHARE), clear_px);
     let is_lens = lens_structure_px > limit::MIN_LENS_OF_VIEW * view_structure_px;
     if lens_structure_px > max_px && is_lens {
         let lens = calibration.lens;

@@ -43,7 +43,7 @@ pub mod view;
 pub use calibration::{
     Calibration, Options, PlaceResidual, PlaceUncertainty, PlacementError, Residual, SolvedView,
 };
-pub use evidence::{Estimate, Evidence};
+pub use evidence::{Coverage, Estimate, Evidence};
 pub use halves::CrossValidation;
 pub use judge::{calibrate, calibrate_unjudged};
 pub use lens::Lens;

@@ -79,6 +79,17 @@ pub enum Refusal {
         /// Its limit.
         max_px: f64,
     },
+    /// Some of the lens's numbers may have any value.
+    #[error(
+        "the views do not show all {parameters} numbers of {lens}: take more views, tilted and at the image's border, or a \
+         model with fewer numbers"
+    )]
+    Undetermined {
+        /// The lens that was tried.
+        lens: Lens,
+        /// How many numbers it has.
+        parameters: usize,
+    },
     /// The board always faced the camera.
     #[error(
         "the board was tilted by {tilt_deg:.0} degrees at most (nine views of ten by less), and at least {min_deg:.0} are \

@@ -1,0 +1,126 @@
+//! The same points calibrated here and by OpenCV: synthetic boards, whose truth is known, and photographs of chessboards.
+#![expect(clippy::print_stdout, reason = "the tables are its purpose")]
+
+use std::time::Instant;
+
+use calibration::{Lens, Options, calibrate, calibrate_unjudged};
+
+#[path = "../tests/opencv/mod.rs"]
+mod opencv;
+#[path = "../tests/synthetic/mod.rs"]
+mod synthetic;
+
+use synthetic::{Taking, Truth, lenses, map_error_px, views};
+
+fn main() {
+    let seed = std::env::args().nth(1).and_then(|arg| arg.parse().ok()).unwrap_or(0);
+    println!("synthetic: f in %, principal point and map in px, against the truth");
+    for truth in lenses() {
+        for bend in [0.0, 1.0] {
+            synthetic(&truth, bend, seed);
+        }
+    }
+    println!(
+        "photographs: RMS in px; f and principal point in px, and their difference in standard deviations"
+    );
+    for set in opencv::photographs() {
+        photographed(&set);
+    }
+}
+
+fn synthetic(truth: &Truth, bend: f64, seed: u64) {
+    let usual = Taking::default();
+    let taking = Taking { bend_m: usual.bend_m.map(|m| m * bend), ..usual };
+    let views = views(&truth.camera, &taking, seed);
+    let begin = Instant::now();
+    let ours = calibrate(&views, truth.lens, &Options::default());
+    let seconds = begin.elapsed().as_secs_f64();
+    let errors = |camera: &geometry::CameraModel| {
+        let t = &truth.camera;
+        format!(
+            "f {:.4} % c {:.3} map {:.3}",
+            100.0 * (camera.fx / t.fx - 1.0).abs().max((camera.fy / t.fy - 1.0).abs()),
+            (camera.cx - t.cx).abs().max((camera.cy - t.cy).abs()),
+            map_error_px(t, camera)
+        )
+    };
+    let head = format!("{:13} bend {:.0} mm", truth.name, taking.bend_m[0] * 1e3);
+    match &ours {
+        Ok(ours) => {
+            println!("{head} here   {} rms {:.4} {seconds:.2} s", errors(&ours.camera), ours.rms_px)
+        }
+        Err(refusal) => println!("{head} here   {refusal}"),
+    }
+    match opencv::solve(&views, truth.lens) {
+        None => {}
+        Some(Err(problem)) => println!("{head} OpenCV {problem}"),
+        Some(Ok(found)) => println!(
+            "{head} OpenCV {} rms {:.4} {:.2} s, {:.1} times ours",
+            errors(&found.camera),
+            found.rms_px,
+            found.seconds,
+            found.seconds / seconds
+        ),
+    }
+}
+
+fn photographed(set: &opencv::Photographs) {
+    for (lens, solve_bend) in [
+        (Lens::BrownConrady5, false),
+        (Lens::BrownConrady5, true),
+        (Lens::BrownConrady4, true),
+        (Lens::KannalaBrandt, true),
+    ] {
+        let options = Options { solve_bend };
+        let bend = if solve_bend { "bent" } else { "flat" };
+        let head = format!("{:36} {:2} {lens:?} {bend}", set.name, set.views.len());
+        match calibrate_unjudged(&set.views, lens, &options) {
+            Err(refusal) => println!("{head}: {refusal}"),
+            Ok(ours) => {
+                let c = ours.camera;
+                let sigma = |i: usize| ours.covariance[(i, i)].sqrt();
+                let e = ours.evidence;
+                println!(
+                    "{head} rms {:.4} noise {:.3} f {:.2} {:.2} +- {:.2} c {:.2} {:.2} +- {:.2} bend {:.1?} lens {:.3} view {:.3} dist {:.2} cov {:.2} tilt {:.0} unc {:.2}",
+                    ours.rms_px,
+                    ours.noise_px,
+                    c.fx,
+                    c.fy,
+                    sigma(0),
+                    c.cx,
+                    c.cy,
+                    sigma(2),
+                    ours.bend_m.map(|b| b * 1e3),
+                    e.lens_structure_px,
+                    e.view_structure_px,
+                    e.distance_ratio,
+                    e.coverage.covered,
+                    e.tilt.to_degrees(),
+                    ours.worst_uncertainty_px()
+                );
+                if lens == Lens::BrownConrady5
+                    && !solve_bend
+                    && let Some(Ok(found)) = opencv::solve(&set.views, lens)
+                {
+                    let d = found.camera;
+                    println!(
+                        "{head} OpenCV rms {:.4} (file {:.4}) f {:.2} {:.2} c {:.2} {:.2}: {:+.2} {:+.2} {:+.2} {:+.2} sigma",
+                        found.rms_px,
+                        set.rms_px,
+                        d.fx,
+                        d.fy,
+                        d.cx,
+                        d.cy,
+                        (d.fx - c.fx) / sigma(0),
+                        (d.fy - c.fy) / sigma(1),
+                        (d.cx - c.cx) / sigma(2),
+                        (d.cy - c.cy) / sigma(3)
+                    );
+                }
+                if let Err(refusal) = calibrate(&set.views, lens, &options) {
+                    println!("    refused: {refusal}");
+                }
+            }
+        }
+    }
+}
