@@ -4,6 +4,7 @@
 use std::time::Instant;
 
 use calibration::{Lens, Options, calibrate, calibrate_unjudged};
+use geometry::CameraModel;
 
 #[path = "../tests/opencv/mod.rs"]
 mod opencv;
@@ -20,9 +21,7 @@ fn main() {
             synthetic(&truth, bend, seed);
         }
     }
-    println!(
-        "photographs: RMS in px; f and principal point in px, and their difference in standard deviations"
-    );
+    println!("photographs of chessboards of 30 mm: RMS, f and principal point in px");
     for set in opencv::photographs() {
         photographed(&set);
     }
@@ -35,7 +34,7 @@ fn synthetic(truth: &Truth, bend: f64, seed: u64) {
     let begin = Instant::now();
     let ours = calibrate(&views, truth.lens, &Options::default());
     let seconds = begin.elapsed().as_secs_f64();
-    let errors = |camera: &geometry::CameraModel| {
+    let errors = |camera: &CameraModel| {
         let t = &truth.camera;
         format!(
             "f {:.4} % c {:.3} map {:.3}",
@@ -47,7 +46,11 @@ fn synthetic(truth: &Truth, bend: f64, seed: u64) {
     let head = format!("{:13} bend {:.0} mm", truth.name, taking.bend_m[0] * 1e3);
     match &ours {
         Ok(ours) => {
-            println!("{head} here   {} rms {:.4} {seconds:.2} s", errors(&ours.camera), ours.rms_px)
+            println!(
+                "{head} here   {} rms {:.4} {seconds:.2} s",
+                errors(&ours.camera),
+                ours.rms_px
+            );
         }
         Err(refusal) => println!("{head} here   {refusal}"),
     }
@@ -65,62 +68,46 @@ fn synthetic(truth: &Truth, bend: f64, seed: u64) {
 }
 
 fn photographed(set: &opencv::Photographs) {
-    for (lens, solve_bend) in [
-        (Lens::BrownConrady5, false),
-        (Lens::BrownConrady5, true),
-        (Lens::BrownConrady4, true),
-        (Lens::KannalaBrandt, true),
-    ] {
-        let options = Options { solve_bend };
-        let bend = if solve_bend { "bent" } else { "flat" };
-        let head = format!("{:36} {:2} {lens:?} {bend}", set.name, set.views.len());
-        match calibrate_unjudged(&set.views, lens, &options) {
-            Err(refusal) => println!("{head}: {refusal}"),
-            Ok(ours) => {
-                let c = ours.camera;
-                let sigma = |i: usize| ours.covariance[(i, i)].sqrt();
-                let e = ours.evidence;
-                println!(
-                    "{head} rms {:.4} noise {:.3} f {:.2} {:.2} +- {:.2} c {:.2} {:.2} +- {:.2} bend {:.1?} lens {:.3} view {:.3} dist {:.2} cov {:.2} tilt {:.0} unc {:.2}",
-                    ours.rms_px,
-                    ours.noise_px,
-                    c.fx,
-                    c.fy,
-                    sigma(0),
-                    c.cx,
-                    c.cy,
-                    sigma(2),
-                    ours.bend_m.map(|b| b * 1e3),
-                    e.lens_structure_px,
-                    e.view_structure_px,
-                    e.distance_ratio,
-                    e.coverage.covered,
-                    e.tilt.to_degrees(),
-                    ours.worst_uncertainty_px()
-                );
-                if lens == Lens::BrownConrady5
-                    && !solve_bend
-                    && let Some(Ok(found)) = opencv::solve(&set.views, lens)
-                {
-                    let d = found.camera;
-                    println!(
-                        "{head} OpenCV rms {:.4} (file {:.4}) f {:.2} {:.2} c {:.2} {:.2}: {:+.2} {:+.2} {:+.2} {:+.2} sigma",
-                        found.rms_px,
-                        set.rms_px,
-                        d.fx,
-                        d.fy,
-                        d.cx,
-                        d.cy,
-                        (d.fx - c.fx) / sigma(0),
-                        (d.fy - c.fy) / sigma(1),
-                        (d.cx - c.cx) / sigma(2),
-                        (d.cy - c.cy) / sigma(3)
-                    );
-                }
-                if let Err(refusal) = calibrate(&set.views, lens, &options) {
-                    println!("    refused: {refusal}");
-                }
+    let lens = Lens::BrownConrady5;
+    let head = format!("{:36} {:2} views", set.name, set.views.len());
+    for solve_bend in [false, true] {
+        let ours = match calibrate_unjudged(&set.views, lens, &Options { solve_bend }) {
+            Ok(ours) => ours,
+            Err(refusal) => {
+                println!("{head} {refusal}");
+                continue;
             }
+        };
+        let (c, sigma) = (ours.camera, |i: usize| ours.covariance[(i, i)].sqrt());
+        println!(
+            "{head} here, {} rms {:.4} f {:.2} {:.2} +- {:.2} c {:.2} {:.2} +- {:.2} bend {:.1?} mm",
+            if solve_bend { "bent" } else { "flat" },
+            ours.rms_px,
+            c.fx,
+            c.fy,
+            sigma(0),
+            c.cx,
+            c.cy,
+            sigma(2),
+            ours.bend_m.map(|m| m * 1e3),
+        );
+        if !solve_bend && let Some(Ok(found)) = opencv::solve(&set.views, lens) {
+            let d = found.camera;
+            let differences = [d.fx - c.fx, d.fy - c.fy, d.cx - c.cx, d.cy - c.cy];
+            let sigmas: Vec<String> =
+                (0..4).map(|i| format!("{:+.2}", differences[i] / sigma(i))).collect();
+            println!(
+                "{head} OpenCV     rms {:.4} f {:.2} {:.2} c {:.2} {:.2}, differences in sigma {}",
+                found.rms_px,
+                d.fx,
+                d.fy,
+                d.cx,
+                d.cy,
+                sigmas.join(" ")
+            );
         }
+    }
+    if let Err(refusal) = calibrate(&set.views, lens, &Options::default()) {
+        println!("{head} refused: {refusal}");
     }
 }

@@ -164,3 +164,118 @@ pub(crate) struct Linearised {
     pub(crate) by_shared: SharedSlope,
     pub(crate) by_pose: PoseSlope,
 }
+
+#[cfg(test)]
+mod tests {
+    use geometry::Pixel;
+    use nalgebra::{UnitQuaternion, Vector6};
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::lens::Lens;
+    use crate::solve::moved;
+    use crate::view::{ImageSize, Sighting};
+
+    const SIZE: ImageSize = ImageSize { width: 1280, height: 960 };
+
+    fn shared(lens: Lens) -> Shared {
+        let mut shared = Shared::zeros();
+        let numbers: &[f64] = match lens {
+            Lens::KannalaBrandt => &[600.0, 610.0, 640.0, 470.0, 0.02, -0.01, 0.003, -0.001],
+            _ => &[900.0, 910.0, 640.0, 470.0, 0.3, -0.1, 1e-3, -2e-3, 0.02, 0.4, 0.05, 0.01],
+        };
+        for (value, number) in shared.iter_mut().zip(numbers) {
+            *value = *number;
+        }
+        (shared[BEND], shared[BEND + 1]) = (0.004, -0.003);
+        shared
+    }
+
+    fn board_point(x: f64, y: f64) -> BoardPoint {
+        let corner = |dx: f64, dy: f64| Sighting {
+            tag: 3,
+            place_m: [x + dx, y + dy],
+            seen: Pixel::new(500.0, 400.0),
+        };
+        let far = |at: f64| Sighting { tag: 9, ..corner(at - x, at - y) };
+        let points = vec![
+            corner(0.0, 0.0),
+            corner(0.05, 0.0),
+            corner(0.05, 0.05),
+            corner(0.0, 0.05),
+            far(-0.4),
+            far(0.4),
+        ];
+        let view = View { name: String::new(), size: SIZE, points };
+        Sheet::new(&[&view]).views[0][0]
+    }
+
+    proptest! {
+        #[test]
+        fn derivatives_are_the_slopes_of_the_expected_pixel(
+            x in -0.3..0.3f64, y in -0.3..0.3f64, z in 0.6..2.0f64, tilt in -0.7..0.7f64, turn in -3.0..3.0f64,
+        ) {
+            for lens in [Lens::BrownConrady8, Lens::KannalaBrandt] {
+                let size = SIZE;
+                let camera = |shared: &Shared| lens.camera(size, &std::array::from_fn(|i| shared[i]));
+                let (point, shared) = (board_point(x, y), shared(lens));
+                let rotation = UnitQuaternion::from_euler_angles(tilt, 0.5 * tilt, turn);
+                let pose = Isometry3::from_parts([0.1, -0.05, z].into(), rotation);
+                let at = point.linearised(&camera(&shared), &shared, &pose).unwrap();
+                for i in 0..SOLVED {
+                    let step = if i < 4 { 1e-4 } else { 1e-7 };
+                    let residual = |step: f64| {
+                        let mut moved = shared;
+                        moved[i] += step;
+                        point.residual(&camera(&moved), &moved, &pose).unwrap()
+                    };
+                    let (ahead, behind) = (residual(step), residual(-step));
+                    for row in 0..2 {
+                        let slope = (behind[row] - ahead[row]) / (2.0 * step);
+                        let error = (at.by_shared[row][i] - slope).abs();
+                        prop_assert!(error < 1e-5 * (1.0 + slope.abs()) + 1e-4, "{lens} {i} {row}: {slope} {error}");
+                    }
+                }
+                for i in 0..6 {
+                    let residual = |step: f64| {
+                        let pose = moved(&pose, &Vector6::from_fn(|j, _| if i == j { step } else { 0.0 })).unwrap();
+                        point.residual(&camera(&shared), &shared, &pose).unwrap()
+                    };
+                    let (ahead, behind) = (residual(1e-6), residual(-1e-6));
+                    for row in 0..2 {
+                        let slope = (behind[row] - ahead[row]) / 2e-6;
+                        let error = (at.by_pose[row][i] - slope).abs();
+                        prop_assert!(error < 1e-5 * (1.0 + slope.abs()), "{lens} pose {i} {row}: {slope} {error}");
+                    }
+                }
+            }
+        }
+
+        #[test]
+        fn a_flaw_of_the_print_moves_the_points_as_its_slope_says(
+            x in -0.3..0.3f64, y in -0.3..0.3f64, z in 0.6..2.0f64, tilt in -0.7..0.7f64,
+        ) {
+            let lens = Lens::BrownConrady8;
+            let mut shared = shared(lens);
+            (shared[BEND], shared[BEND + 1]) = (0.0, 0.0);
+            let camera = lens.camera(SIZE, &std::array::from_fn(|i| shared[i]));
+            let point = board_point(x, y);
+            let pose = Isometry3::from_parts([0.0, 0.0, z].into(), UnitQuaternion::from_euler_angles(tilt, 0.0, 0.3));
+            let at = point.linearised(&camera, &shared, &pose).unwrap();
+            let [px, py] = point.place_m;
+            let [ax, ay] = point.arm_m;
+            let printed = [[ax, ay], [px, -py], [py, 0.0]];
+            for (i, [dx, dy]) in printed.into_iter().enumerate() {
+                let residual = |step: f64| {
+                    let place_m = [px + step * dx, py + step * dy];
+                    BoardPoint { place_m, ..point }.residual(&camera, &shared, &pose).unwrap()
+                };
+                let (ahead, behind) = (residual(1e-6), residual(-1e-6));
+                for row in 0..2 {
+                    let slope = (behind[row] - ahead[row]) / 2e-6;
+                    prop_assert!((at.by_shared[row][FLAWS + i] - slope).abs() < 1e-4, "{i} {row}: {slope}");
+                }
+            }
+        }
+    }
+}

@@ -6,7 +6,7 @@ use nalgebra::{Isometry3, Matrix2, Matrix6, SMatrix, Translation3, Vector3};
 
 use crate::board::BEND;
 use crate::evidence::Evidence;
-use crate::halves::{CrossValidation, Half};
+use crate::halves::CrossValidation;
 use crate::lens::{INTRINSICS, Lens};
 use crate::stages::Solved;
 use crate::view::{ImageSize, View};
@@ -115,7 +115,8 @@ impl Calibration {
     pub(crate) fn new(solved: &Solved, views: &[&View], middle_m: [f64; 2]) -> Option<Self> {
         let shared = &solved.place.shared;
         let camera = solved.bundle().camera(shared);
-        let certainty = solved.certainty(0..0)?;
+        let information = solved.information()?;
+        let certainty = information.certainty(&solved.free)?;
         let covariance =
             certainty.covariance.fixed_view::<INTRINSICS, INTRINSICS>(0, 0).into_owned();
         let to_middle = Translation3::new(-middle_m[0], -middle_m[1], 0.0);
@@ -147,14 +148,9 @@ impl Calibration {
             noise_px: solved.noise_px,
             rms_px: rms_px(explained.iter().flat_map(|view| &view.residuals)),
             views: explained,
-            evidence: Evidence::new(solved),
+            evidence: Evidence::new(solved, &information),
             cross_validation: None,
         })
-    }
-
-    /// What is compared when this is one of two halves.
-    pub(crate) fn half(&self) -> Half {
-        Half { camera: self.camera, covariance: self.covariance }
     }
 
     fn size(&self) -> ImageSize {

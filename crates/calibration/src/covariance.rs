@@ -8,49 +8,62 @@
 use nalgebra::{Matrix6, Vector6};
 
 use crate::board::{Linearised, Shared};
-use crate::equations::{Bundle, Cross, Free, Place, SharedMatrix, ViewSums, inverse};
+use crate::equations::{Bundle, Cross, Free, Place, Reduced, SharedMatrix, ViewSums, inverse};
 
-/// What is known about the solved numbers.
+/// What a minimum says of all shared numbers, whichever are free.
+pub(crate) struct Information {
+    reduced: Reduced,
+    /// The spread of the clusters' sums, with the slope of the loss's weight that the equations leave out.
+    middle: SharedMatrix,
+}
+
+/// What is known about the free numbers.
 pub(crate) struct Certainty {
     pub(crate) covariance: SharedMatrix,
     /// From the place to the minimum: zero but for numbers that were not free there.
     pub(crate) step: Shared,
 }
 
-/// The certainty of the free numbers at a minimum; `None` where the views do not determine them.
-pub(crate) fn certainty(bundle: &Bundle<'_>, place: &Place, free: &Free) -> Option<Certainty> {
-    let reduced = bundle.equations(place).reduced(0.0)?;
-    let bread = inverse(&free.masked(&reduced.matrix))?;
-    let camera = bundle.camera(&place.shared);
-    let mut middle = SharedMatrix::zeros();
-    let (mut weights, mut squared_weights) = (0.0, 0.0);
-    let equations = bundle.equations(place);
-    for (i, (points, pose)) in bundle.views.iter().zip(&place.poses).enumerate() {
-        let (Some(view), Some(own)) = (equations.views.get(i), reduced.inverses.get(i)) else {
-            continue;
-        };
-        for tag in points.chunk_by(|a, b| a.tag == b.tag) {
-            let mut cluster = Cluster::default();
-            for point in tag {
-                let Some(linearised) = point.linearised(&camera, &place.shared, pose) else {
-                    continue;
-                };
-                let [x, y] = linearised.residual;
-                let weight = bundle.weight(x * x + y * y);
-                weights += weight;
-                squared_weights += weight * weight;
-                cluster.add(&linearised, weight);
+impl Information {
+    /// What is known at a place; `None` where the views do not determine their poses.
+    pub(crate) fn new(bundle: &Bundle<'_>, place: &Place) -> Option<Self> {
+        let equations = bundle.equations(place);
+        let reduced = equations.reduced(0.0)?;
+        let camera = bundle.camera(&place.shared);
+        let mut middle = SharedMatrix::zeros();
+        let (mut weights, mut squared_weights) = (0.0, 0.0);
+        let blocks = equations.views.iter().zip(&reduced.inverses);
+        for ((points, pose), (view, own)) in bundle.views.iter().zip(&place.poses).zip(blocks) {
+            for tag in points.chunk_by(|a, b| a.tag == b.tag) {
+                let mut cluster = Cluster::default();
+                for point in tag {
+                    if let Some(linearised) = point.linearised(&camera, &place.shared, pose) {
+                        let [x, y] = linearised.residual;
+                        let weight = bundle.weight(x * x + y * y);
+                        weights += weight;
+                        squared_weights += weight * weight;
+                        cluster.add(&linearised, weight);
+                    }
+                }
+                let [seen, unseen] = cluster.scores(&view.cross, &view.matrix, own);
+                middle += (seen * unseen.transpose() + unseen * seen.transpose()) * 0.5;
             }
-            let [seen, unseen] = cluster.scores(&view.cross, &view.matrix, own);
-            let [seen, unseen] = [seen, unseen].map(|score| free.masked_vector(&score));
-            middle += (seen * unseen.transpose() + unseen * seen.transpose()) * 0.5;
         }
+        let slope = squared_weights / weights;
+        Some(Self { reduced, middle: middle / (slope * slope) })
     }
-    // The slope of the loss's weight, which the equations leave out.
-    let slope = squared_weights / weights;
-    let step = bread * free.masked_vector(&reduced.right);
-    let covariance = bread * middle * bread / (slope * slope);
-    covariance.iter().all(|value| value.is_finite()).then_some(Certainty { covariance, step })
+
+    /// The certainty of the free numbers; `None` where the views do not determine them.
+    pub(crate) fn certainty(&self, free: &Free) -> Option<Certainty> {
+        let bread = inverse(&free.masked(&self.reduced.matrix))?;
+        let bread = bread.map_with_location(|i, j, value| {
+            // Numbers that are not free have no part in the others.
+            if free.0[i] && free.0[j] { value } else { 0.0 }
+        });
+        let covariance = bread * self.middle * bread;
+        let step = bread * self.reduced.right;
+        covariance.iter().all(|value| value.is_finite()).then_some(Certainty { covariance, step })
+    }
 }
 
 /// The sums over the points of one tag in one view.

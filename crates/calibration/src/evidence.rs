@@ -5,6 +5,7 @@ use libm::{acos, fmax, fmin, hypot};
 use nalgebra::{Isometry3, SMatrix, SVector};
 
 use crate::board::{BoardPoint, FLAWS};
+use crate::covariance::Information;
 use crate::stages::Solved;
 use crate::view::ImageSize;
 
@@ -56,12 +57,12 @@ const MIN_CELL_TAGS: usize = 4;
 const MIN_VIEW_TAGS: usize = 12;
 
 impl Evidence {
-    pub(crate) fn new(solved: &Solved) -> Self {
+    pub(crate) fn new(solved: &Solved, information: &Information) -> Self {
         let mut tilts: Vec<f64> = solved.place.poses.iter().map(tilt).collect();
         let mut distances: Vec<f64> =
             solved.place.poses.iter().map(|pose| pose.translation.vector.norm()).collect();
         let [lens_structure_px, view_structure_px] = structures(solved);
-        let [tag_scale, stretch, shear] = flaws(solved);
+        let [tag_scale, stretch, shear] = flaws(solved, information);
         Self {
             tilt: percentile(&mut tilts, 90),
             distance_ratio: percentile(&mut distances, 90) / percentile(&mut distances, 10),
@@ -120,10 +121,10 @@ impl Coverage {
 }
 
 /// The print's flaws, each as if it were the only other unknown: one step from where they are zero.
-fn flaws(solved: &Solved) -> [Option<Estimate>; 3] {
+fn flaws(solved: &Solved, information: &Information) -> [Option<Estimate>; 3] {
     [0, 1, 2].map(|flaw| {
         let at = FLAWS + flaw;
-        let certainty = solved.certainty(at..at + 1)?;
+        let certainty = information.certainty(&solved.free.with(at..at + 1))?;
         let sigma = fmax(certainty.covariance[(at, at)], 0.0).sqrt();
         (sigma > 0.0).then_some(Estimate { value: certainty.step[at], sigma })
     })

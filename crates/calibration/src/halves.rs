@@ -8,6 +8,7 @@ use libm::fmax;
 use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
 
 use crate::lens::INTRINSICS;
+use crate::stages::Solved;
 use crate::view::ImageSize;
 
 /// What two halves of the views say of each other.
@@ -28,9 +29,24 @@ impl CrossValidation {
 
 /// A camera and how sure it is.
 #[derive(Copy, Clone, Debug)]
-pub(crate) struct Half {
-    pub(crate) camera: CameraModel,
-    pub(crate) covariance: SMatrix<f64, INTRINSICS, INTRINSICS>,
+struct Half {
+    camera: CameraModel,
+    covariance: SMatrix<f64, INTRINSICS, INTRINSICS>,
+}
+
+impl Half {
+    fn new(whole: &Solved, remainder: usize) -> Option<Self> {
+        let part = whole.part(|view| view % 2 == remainder);
+        let certainty = part.information()?.certainty(&part.free)?;
+        let covariance =
+            certainty.covariance.fixed_view::<INTRINSICS, INTRINSICS>(0, 0).into_owned();
+        Some(Self { camera: part.bundle().camera(&part.place.shared), covariance })
+    }
+}
+
+/// What every second view says of the others; `None` where a half shows no camera.
+pub(crate) fn cross_validation(whole: &Solved) -> Option<CrossValidation> {
+    compare(&Half::new(whole, 0)?, &Half::new(whole, 1)?)
 }
 
 /// Columns and rows of the places that are compared.
@@ -48,7 +64,7 @@ struct Comparison {
 }
 
 /// The comparison of two halves; `None` where they share too little of the image.
-pub(crate) fn compare(a: &Half, b: &Half) -> Option<CrossValidation> {
+fn compare(a: &Half, b: &Half) -> Option<CrossValidation> {
     let size = ImageSize { width: a.camera.width, height: a.camera.height };
     let places: Vec<Comparison> = size
         .middles(COLUMNS, ROWS)

@@ -8,7 +8,7 @@ use crate::evidence::{Coverage, Estimate, Evidence};
 use crate::halves;
 use crate::lens::Lens;
 use crate::refusal::Refusal;
-use crate::stages::{self, Solved};
+use crate::stages;
 use crate::start::first_pose;
 use crate::view::{ImageSize, View};
 
@@ -77,15 +77,11 @@ impl<'a> Task<'a> {
         let solved = solved.filter(|_| noise_px < max_px);
         let solved = solved.ok_or(Refusal::Diverged { lens, noise_px, max_px })?;
         let undetermined = Refusal::Undetermined { lens, parameters: lens.parameters() };
-        let mut calibration = self.calibration(&solved).ok_or(undetermined)?;
-        let [even, odd] = [0, 1].map(|half| self.calibration(&solved.part(|i| i % 2 == half)));
-        calibration.cross_validation =
-            even.zip(odd).and_then(|(even, odd)| halves::compare(&even.half(), &odd.half()));
+        let middle_m = self.sheet.middle_m;
+        let mut calibration =
+            Calibration::new(&solved, &self.views, middle_m).ok_or(undetermined)?;
+        calibration.cross_validation = halves::cross_validation(&solved);
         Ok(calibration)
-    }
-
-    fn calibration(&self, solved: &Solved) -> Option<Calibration> {
-        Calibration::new(solved, &self.views, self.sheet.middle_m)
     }
 }
 

@@ -46,24 +46,24 @@ impl Lens {
     }
 }
 
-/// Radii at which the lenses are compared, and what keeps numbers near zero that make no difference there.
+/// Radii at which the lenses are compared.
 const RADII: usize = 60;
-const RIDGE: f64 = 1e-9;
 /// Times that the equations are weighted anew.
 const ROUNDS: usize = 5;
 
-/// The numbers of Brown-Conrady that distort most like this fisheye up to `max_radius`, in focal lengths of an ideal image;
-/// `None` where there are none. Multiplied by the fraction's denominator the equations are linear; each is weighted by the
+/// The numbers of Brown-Conrady that distort most like this fisheye up to `max_radius`, in focal lengths of an ideal image, with the
+/// numbers held near zero by `ridge`; `None` where there are none. Multiplied by the fraction's denominator the equations are linear; each is weighted by the
 /// denominator of the round before (Sanathanan and Koerner, "Transfer function synthesis as a ratio of two complex
 /// polynomials", 1963).
 pub(crate) fn brown_conrady_like(
     fisheye: &CameraModel,
     max_radius: f64,
+    ridge: f64,
 ) -> Option<[f64; INTRINSICS]> {
     let flat = CameraModel { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, ..*fisheye };
     let mut k = SVector::<f64, 6>::zeros();
     for _ in 0..ROUNDS {
-        let mut matrix = SMatrix::<f64, 6, 6>::identity() * RIDGE;
+        let mut matrix = SMatrix::<f64, 6, 6>::identity() * ridge;
         let mut right = SVector::<f64, 6>::zeros();
         for i in 1..=RADII {
             let radius = max_radius * i as f64 / RADII as f64;
@@ -109,7 +109,7 @@ mod tests {
                     ..CameraModel::pinhole(1280, 960, 500.0)
                 };
                 let max_radius = degrees.to_radians().tan();
-                let numbers = brown_conrady_like(&fisheye, max_radius).unwrap();
+                let numbers = brown_conrady_like(&fisheye, max_radius, 1e-9).unwrap();
                 let size = ImageSize { width: 1280, height: 960 };
                 let brown = Lens::BrownConrady8.camera(size, &numbers);
                 for i in 0..=20 {

@@ -3,9 +3,9 @@
 use geometry::Pixel;
 
 use crate::board::{BEND, BoardPoint, SOLVED, Shared, Sheet};
-use crate::covariance::{Certainty, certainty};
+use crate::covariance::Information;
 use crate::equations::{Bundle, Free, Place};
-use crate::lens::{Lens, brown_conrady_like};
+use crate::lens::{INTRINSICS, Lens, brown_conrady_like};
 use crate::solve::{minimise, undistorted};
 use crate::start::{focal_guesses, poses, with_better_poses};
 use crate::view::ImageSize;
@@ -36,6 +36,12 @@ const MIN_NOISE_PX: f64 = 0.005;
 const BEND_SHARE: f64 = 0.05;
 /// The scale of the loss, by the image's width, as long as little is known.
 const ROUGH_SHARE: f64 = 0.02;
+/// Distance from the middle of an ideal image, in focal lengths, to which Brown-Conrady is made like a fisheye: 79 degrees.
+const MAX_RADIUS: f64 = 5.0;
+/// How firmly its numbers are then held near zero, one after the other.
+const RIDGES: [f64; 4] = [1e-5, 1e-3, 1e-4, 1e-9];
+/// Times that the loss is fitted to the noise; twice is usually enough.
+const MAX_ROUNDS: usize = 4;
 /// Guesses that are followed when the first leads nowhere.
 const MAX_GUESSES: usize = 3;
 /// Noise, by the image's width, at which a guess has led somewhere.
@@ -53,7 +59,7 @@ pub(crate) fn solve(
     let task = Task { sheet, lens, size, solve_bend };
     // A fraction of polynomials has many valleys; that of the fisheye that explains the points leads to the right one.
     if lens == Lens::BrownConrady8 {
-        return task.from_fisheye();
+        return task.by_fisheye();
     }
     let mut best: Option<Solved> = None;
     for focal_px in focal_guesses(lens, size, &sheet.views).into_iter().take(MAX_GUESSES) {
@@ -82,9 +88,9 @@ impl Task<'_> {
     /// From an undistorted camera, what matters most first.
     fn rough(&self, focal_px: f64) -> Option<Solved> {
         let mut solved = self.posed(undistorted(focal_px, self.size))?;
-        solved.minimise(&Free::none().with(0..2).with(4..5), 8);
+        solved.minimise(&Free::none().with(0..2).with(4..5), 5);
         let intrinsics = Free::intrinsics(self.lens.parameters());
-        solved.minimise(&intrinsics, 15);
+        solved.minimise(&intrinsics, 10);
         let Solved { lens, size, scale_px, bend_m, .. } = solved;
         let bundle = Bundle { lens, size, views: &solved.views, scale_px, bend_m };
         if with_better_poses(&bundle, &mut solved.place) {
@@ -94,14 +100,25 @@ impl Task<'_> {
     }
 
     /// From the fisheye that explains the points.
-    fn from_fisheye(&self) -> Option<Solved> {
+    fn by_fisheye(&self) -> Option<Solved> {
         let fisheye = solve(self.sheet, Lens::KannalaBrandt, self.size, self.solve_bend)?;
         let camera = fisheye.bundle().camera(&fisheye.place.shared);
         let points = fisheye.views.iter().flatten().map(|point| point.seen);
         let rays = points.filter_map(|[x, y]| camera.unproject(Pixel::new(x, y)));
         let radii = rays.map(|ray| libm::hypot(ray.x(), ray.y()));
-        let max_radius = radii.fold(0.1, libm::fmax);
-        let numbers = brown_conrady_like(&camera, max_radius)?;
+        let max_radius = libm::fmin(radii.fold(0.1, libm::fmax), MAX_RADIUS);
+        let starts =
+            RIDGES.iter().filter_map(|ridge| brown_conrady_like(&camera, max_radius, *ridge));
+        let mut found = starts.filter_map(|numbers| self.followed(numbers));
+        let first = found.next()?;
+        // A minimum that leaves numbers undetermined is one where the fraction's poles cancel, beside the right one.
+        if first.is_determined() {
+            return Some(first);
+        }
+        found.find(Solved::is_determined).or(Some(first))
+    }
+
+    fn followed(&self, numbers: [f64; INTRINSICS]) -> Option<Solved> {
         let mut shared = Shared::zeros();
         for (value, number) in shared.iter_mut().zip(numbers) {
             *value = number;
@@ -155,8 +172,11 @@ impl Solved {
 
     /// At the minimum of a loss that suits the noise there.
     fn settled(mut self) -> Self {
-        for _ in 0..3 {
+        for _ in 0..MAX_ROUNDS {
             self.settle();
+            if (ROBUST * self.noise_px - self.scale_px).abs() < 0.02 * self.scale_px {
+                break;
+            }
         }
         self
     }
@@ -177,9 +197,13 @@ impl Solved {
         part
     }
 
-    /// How sure it is, with other numbers free as well.
-    pub(crate) fn certainty(&self, others: std::ops::Range<usize>) -> Option<Certainty> {
-        certainty(&self.bundle(), &self.place, &self.free.with(others))
+    /// What is known at the minimum.
+    pub(crate) fn information(&self) -> Option<Information> {
+        Information::new(&self.bundle(), &self.place)
+    }
+
+    fn is_determined(&self) -> bool {
+        self.information().is_some_and(|information| information.certainty(&self.free).is_some())
     }
 
     /// Standard deviation of the residuals along each axis, by their median length.

@@ -224,3 +224,60 @@ pub(crate) fn with_better_poses(bundle: &Bundle<'_>, place: &mut Place) -> bool 
     }
     has_changed
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::board::Sheet;
+    use crate::view::{Sighting, View};
+
+    const SIZE: ImageSize = ImageSize { width: 1280, height: 960 };
+
+    /// A board of 0.6 m, 1.2 m away, seen around the direction of a pixel; `None` where part of it is not seen.
+    fn seen(camera: &CameraModel, at: [f64; 2], pose: &Isometry3<f64>) -> Option<Vec<BoardPoint>> {
+        let sight = camera.unproject(Pixel::new(at[0], at[1]))?.coords.normalize();
+        let places =
+            (0..25).map(|i| [f64::from(i % 5) * 0.15 - 0.3, f64::from(i / 5) * 0.15 - 0.3]);
+        let points = places.map(|[x, y]| {
+            let place = pose.rotation * Vector3::new(x, y, 0.0) + sight * 1.2;
+            Some(Sighting {
+                tag: 0,
+                place_m: [x, y],
+                seen: camera.project(geometry::Point::from_coords(place.into()))?,
+            })
+        });
+        let view = View { name: String::new(), size: SIZE, points: points.collect::<Option<_>>()? };
+        Sheet::new(&[&view]).views.pop()
+    }
+
+    proptest! {
+        #[test]
+        fn the_first_pose_of_exact_points_is_the_pose(
+            u in 50.0..1230.0f64, v in 50.0..910.0f64, a in -0.6..0.6f64, b in -0.6..0.6f64, turn in -3.0..3.0f64,
+        ) {
+            let fisheye = geometry::Distortion::KannalaBrandt([0.01, -0.008, 0.002, -0.0005]);
+            let pinhole = CameraModel::pinhole(1280, 960, 900.0);
+            for camera in [pinhole, CameraModel { fx: 410.0, fy: 410.0, distortion: fisheye, ..pinhole }] {
+                let rotation = UnitQuaternion::from_euler_angles(a, b, turn);
+                let pose = Isometry3::from_parts(Translation3::identity(), rotation);
+                if let Some(points) = seen(&camera, [u, v], &pose) {
+                    let found = first_pose(&points, &camera).unwrap();
+                    prop_assert!(found.pose.rotation.angle_to(&rotation) < 1e-6);
+                    prop_assert!((found.pose.translation.vector.norm() - 1.2).abs() < 1e-6);
+                    let faces = (rotation * Vector3::z()).dot(&found.pose.translation.vector) > 0.0;
+                    prop_assert_eq!(found.is_mirrored, !faces);
+                }
+            }
+        }
+
+        #[test]
+        fn tilted_back_twice_is_as_before(a in -0.6..0.6f64, b in -0.6..0.6f64, turn in -3.0..3.0f64, x in -1.0..1.0f64) {
+            let rotation = UnitQuaternion::from_euler_angles(a, b, turn);
+            let pose = Isometry3::from_parts(Translation3::new(x, 0.2, 1.5), rotation);
+            let twice = tilted_back(&tilted_back(&pose).unwrap()).unwrap();
+            prop_assert!(twice.rotation.angle_to(&rotation) < 1e-9);
+        }
+    }
+}

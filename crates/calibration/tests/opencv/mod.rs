@@ -1,5 +1,6 @@
 //! OpenCV's calibration of the same points, and the sets of corners in photographs that it found.
 #![allow(dead_code, unreachable_pub, reason = "each of those that share this file uses a part")]
+#![allow(clippy::expect_used, reason = "what is missing fails the test, or the table")]
 
 use calibration::{ImageSize, Lens, Sighting, View};
 use geometry::{CameraModel, Distortion, Pixel};

@@ -51,7 +51,9 @@ impl Bad {
                 let part = [[0.05, 0.3, 0.05, 0.3], [0.7, 0.95, 0.05, 0.3], [0.7, 0.95, 0.7, 0.95]];
                 Taking { part: part[(seed % 3) as usize], distances: [1.2, 2.2], ..usual }
             }
-            Self::Moving if seed % 2 == 0 => Taking { motion_m: 0.004 + 0.004 * degree, ..usual },
+            Self::Moving if seed.is_multiple_of(2) => {
+                Taking { motion_m: 0.004 + 0.004 * degree, ..usual }
+            }
             Self::Moving => Taking { floppy_m: 0.003 + 0.002 * degree, ..usual },
             Self::TagSize => {
                 let share = [0.97, 1.01, 1.05][(seed % 3) as usize];

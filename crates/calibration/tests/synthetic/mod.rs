@@ -3,12 +3,13 @@
 
 use calibration::{ImageSize, Lens, Sighting, View};
 use geometry::{CameraModel, Distortion, Pixel, Point};
-use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 pub mod bad;
+pub mod score;
 
 /// Tags along each side, their side and the gap between two, in metres: the AprilGrid of Kalibr's documentation.
 pub const TAGS: u32 = 6;
@@ -209,16 +210,43 @@ fn pose(camera: &CameraModel, taking: &Taking, random: &mut impl Rng) -> Option<
 
 /// How far the projections of two cameras differ, in pixels: what 95 % of the image that `truth` describes do not exceed.
 pub fn map_error_px(truth: &CameraModel, found: &CameraModel) -> f64 {
-    let mut errors = Vec::new();
-    for row in 0..48 {
-        for column in 0..64 {
-            let pixel = Pixel::new(f64::from(column) * 20.0 + 9.5, f64::from(row) * 20.0 + 9.5);
-            if let Some(ray) = truth.unproject(pixel) {
-                let other = found.project(Point::from_coords(ray.coords.into()));
-                errors.push(other.map_or(f64::INFINITY, |other| other.distance(&pixel)));
-            }
+    turned_error_px(truth, found, &UnitQuaternion::identity())
+}
+
+/// The same after the rotation between the two cameras' frames that brings the projections nearest: a principal point that
+/// is off by a pixel is then little more than a camera that is turned by as much.
+pub fn turned_map_error_px(truth: &CameraModel, found: &CameraModel) -> f64 {
+    let mut turn = UnitQuaternion::identity();
+    for _ in 0..3 {
+        let (mut matrix, mut right) = (Matrix3::zeros(), Vector3::zeros());
+        for pixel in pixels() {
+            let Some(ray) = truth.unproject(pixel).map(|ray| turn * ray.coords) else { continue };
+            let Some((other, slope)) = found.project_with_jacobian(Point::from_coords(ray.into()))
+            else {
+                continue;
+            };
+            let slope = slope * -ray.cross_matrix();
+            matrix += slope.transpose() * slope;
+            right += slope.transpose() * Vector2::new(pixel.x - other.x, pixel.y - other.y);
         }
+        let step = matrix.lu().solve(&right).unwrap_or_default();
+        turn = UnitQuaternion::from_scaled_axis(step) * turn;
     }
+    turned_error_px(truth, found, &turn)
+}
+
+fn pixels() -> impl Iterator<Item = Pixel> {
+    let at = |i: u32, parts: u32| f64::from(i % parts) * 20.0 + 9.5;
+    (0..64 * 48).map(move |i| Pixel::new(at(i, 64), at(i / 64, 48)))
+}
+
+fn turned_error_px(truth: &CameraModel, found: &CameraModel, turn: &UnitQuaternion<f64>) -> f64 {
+    let error = |pixel: Pixel| {
+        let ray = turn * truth.unproject(pixel)?.coords;
+        let other = found.project(Point::from_coords(ray.into()));
+        Some(other.map_or(f64::INFINITY, |other| other.distance(&pixel)))
+    };
+    let mut errors: Vec<f64> = pixels().filter_map(error).collect();
     errors.sort_by(f64::total_cmp);
     errors[errors.len() * 95 / 100]
 }
