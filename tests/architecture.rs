@@ -39,8 +39,10 @@ const SERVICES: [&str; 6] =
     ["camera-pub", "controller", "dashboard", "detector", "gcs-bridge", "recorder"];
 /// What a recording is.
 const FLIGHTLOG: (&str, &[&str]) = ("flightlog", &["autopilot", "messages"]);
+/// Answers over HTTP.
+const WEB: (&str, &[&str]) = ("web", &["node"]);
 /// What a service or a tool may know.
-const ROOMS: [&str; 12] = [
+const ROOMS: [&str; 13] = [
     "airlink",
     "autopilot",
     "calibration",
@@ -53,6 +55,7 @@ const ROOMS: [&str; 12] = [
     "media",
     "messages",
     "node",
+    "web",
 ];
 /// What a tool may know beside: pictures and worlds with truth, which also the tests of any room may use.
 const TRUTH: [&str; 2] = ["rendering", "world"];
@@ -259,7 +262,7 @@ fn dependencies_point_downwards_only() -> anyhow::Result<()> {
     let workspace = workspace()?;
     let names: BTreeSet<&str> = workspace.iter().map(|p| p.name.as_str()).collect();
     let crates: BTreeMap<_, _> =
-        ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK, MEDIA, FLIGHTLOG]).collect();
+        ALGORITHMS.into_iter().chain([AUTOPILOT, NODE, AIRLINK, MEDIA, FLIGHTLOG, WEB]).collect();
     for package in &workspace {
         let allowed: BTreeSet<&str> = match crates.get(package.name.as_str()) {
             Some(allowed) => allowed.iter().copied().collect(),

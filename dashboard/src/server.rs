@@ -1,5 +1,6 @@
 //! Answers browsers: the page, its data, its pictures, its commands.
 
+use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -17,7 +18,6 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::Response;
 use axum::routing::{get, post};
-use axum::serve::ListenerExt;
 use messages::{ControllerCommand, Place, topic};
 use node::{Node, host_name, now_ns};
 use serde::Deserialize;
@@ -185,8 +185,9 @@ fn answer(status: StatusCode, kind: &'static str, body: impl Into<Body>) -> Resp
     response
 }
 
-/// Answers until the listener fails.
-pub(crate) async fn serve(listener: TcpListener, app: Arc<App>) -> anyhow::Result<()> {
+/// Answers whoever connects.
+pub(crate) async fn serve(listener: TcpListener, app: Arc<App>) -> Infallible {
+    let health = app.node.shared_health();
     let mut router = Router::new();
     for (path, kind, contents) in FILES {
         router = router.route(path, get(async move || answer(StatusCode::OK, kind, contents)));
@@ -200,10 +201,7 @@ pub(crate) async fn serve(listener: TcpListener, app: Arc<App>) -> anyhow::Resul
         .layer(DefaultBodyLimit::max(MAX_REQUEST_BYTES))
         .layer(from_fn_with_state(Arc::clone(&app), protect))
         .with_state(app);
-    // Small messages go at once.
-    let listener = listener.tap_io(|stream| drop(stream.set_nodelay(true)));
-    let service = router.into_make_service_with_connect_info::<SocketAddr>();
-    axum::serve(listener, service).await.context("serving the page")
+    web::serve(listener, router, web::Limits::default(), health).await
 }
 
 /// Checks every request before anything else, and says to the browser what the page may do.

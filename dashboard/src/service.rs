@@ -54,7 +54,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         result = tell(&state, &texts) => result,
         result = measure(&node, &state) => result,
         result = video.run() => result,
-        result = serve(listener, app) => result,
+        never = serve(listener, app) => match never {},
         () = shutdown.requested() => Ok(()),
     }
 }

@@ -149,7 +149,7 @@ async fn serve_at(
             "INSECURE: anyone in reach of {address} can follow the flight, pictures included"
         );
     }
-    serve(listener, server).await
+    match serve(listener, server).await {}
 }
 
 impl Drop for Live {

@@ -1,6 +1,6 @@
 //! Answers those who follow a flight: Foxglove, Lichtblick, and any other client of their protocol.
 
-use std::net::SocketAddr;
+use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,6 @@ use axum::http::header::{HOST, ORIGIN};
 use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::routing::any;
-use axum::serve::ListenerExt;
 use flightlog::live::{Request, SUBPROTOCOLS, message_data, request, server_info, warning};
 use node::HealthCounters;
 use tokio::net::TcpListener;
@@ -42,13 +41,11 @@ pub(crate) struct Server {
     pub(crate) origins: Vec<String>,
 }
 
-/// Answers until the listener fails.
-pub(crate) async fn serve(listener: TcpListener, server: Server) -> anyhow::Result<()> {
+/// Answers whoever connects.
+pub(crate) async fn serve(listener: TcpListener, server: Server) -> Infallible {
+    let health = Arc::clone(&server.health);
     let router = Router::new().fallback(any(connect)).with_state(Arc::new(server));
-    // Small messages go at once.
-    let listener = listener.tap_io(|stream| drop(stream.set_nodelay(true)));
-    let service = router.into_make_service_with_connect_info::<SocketAddr>();
-    axum::serve(listener, service).await.context("serving those who follow")
+    web::serve(listener, router, web::Limits::default(), health).await
 }
 
 async fn connect(

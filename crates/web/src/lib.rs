@@ -1,0 +1,96 @@
+//! Answers to browsers and viewers over HTTP, whose connections are bounded in number and time.
+//!
+//! Whoever reaches the address can open connections and say nothing. Each takes a place until its request is there, or its
+//! time is over; a WebSocket gives it back, as those are counted by who answers them.
+
+use std::convert::Infallible;
+use std::io::ErrorKind;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Router;
+use axum::extract::ConnectInfo;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use node::HealthCounters;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::time::{sleep, timeout};
+
+/// Pause after an error of the system, as that there are too many open files.
+const PAUSE: Duration = Duration::from_millis(500);
+/// Maximum size of the lines in front of a request's body, in bytes.
+const MAX_HEAD_BYTES: usize = 16_384;
+
+/// How many connections there may be, and how long each may last.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// Maximum number of connections that are no WebSockets; further ones wait until one ends.
+    pub connections: usize,
+    /// Maximum time until the head of a request is there, also of a further one.
+    pub head: Duration,
+    /// Maximum time of a connection that does not become a WebSocket.
+    pub connection: Duration,
+}
+
+impl Default for Limits {
+    /// 64 connections, 5 s for a head, and a minute for all: a page of 300 kB at 40 kbit/s.
+    fn default() -> Self {
+        Self { connections: 64, head: Duration::from_secs(5), connection: Duration::from_secs(60) }
+    }
+}
+
+/// Answers whoever connects, and counts in the health what took too long. Each request has its peer's address as
+/// `ConnectInfo<SocketAddr>`.
+pub async fn serve(
+    listener: TcpListener,
+    router: Router,
+    limits: Limits,
+    health: Arc<HealthCounters>,
+) -> Infallible {
+    let places = Arc::new(Semaphore::new(limits.connections));
+    loop {
+        // The semaphore is never closed; without a place one waits for the next.
+        let Ok(place) = Arc::clone(&places).acquire_owned().await else { continue };
+        let (stream, peer) = match listener.accept().await {
+            Ok(accepted) => accepted,
+            Err(problem) => {
+                if !is_of_the_peer(problem.kind()) {
+                    health.failed("connections cannot be accepted");
+                    tracing::warn!(%problem, "A connection could not be accepted");
+                    sleep(PAUSE).await;
+                }
+                continue;
+            }
+        };
+        let router = router.clone().layer(axum::Extension(ConnectInfo(peer)));
+        let health = Arc::clone(&health);
+        tokio::spawn(async move {
+            answer(stream, router, limits, &health).await;
+            drop(place);
+        });
+    }
+}
+
+/// Whether an error is one of the connection that was about to be accepted.
+fn is_of_the_peer(kind: ErrorKind) -> bool {
+    use ErrorKind::{ConnectionAborted, ConnectionRefused, ConnectionReset};
+    matches!(kind, ConnectionAborted | ConnectionRefused | ConnectionReset)
+}
+
+async fn answer(stream: TcpStream, router: Router, limits: Limits, health: &HealthCounters) {
+    // Small messages go at once.
+    drop(stream.set_nodelay(true));
+    let connection = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(limits.head)
+        .max_buf_size(MAX_HEAD_BYTES)
+        .serve_connection(TokioIo::new(stream), TowerToHyperService::new(router))
+        .with_upgrades();
+    match timeout(limits.connection, connection).await {
+        Ok(Err(problem)) if problem.is_timeout() => health.dropped("a request took too long"),
+        Err(_) => health.dropped("a connection took too long"),
+        Ok(_) => {}
+    }
+}
