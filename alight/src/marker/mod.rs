@@ -14,8 +14,7 @@ use clap::Args;
 use markers::{Marker, Pad};
 
 use crate::terminal::print;
-pub(crate) use sheet::SheetError;
-use sheet::{Paper, Sheet};
+pub(crate) use sheet::{Paper, Sheet, SheetError};
 
 /// The arguments of `alight marker`.
 #[derive(Args, Clone, Debug)]
@@ -42,7 +41,7 @@ pub(crate) struct MarkerArgs {
 
 /// An output file and its format, from the extension.
 #[derive(Clone, Debug)]
-struct Output {
+pub(crate) struct Output {
     path: PathBuf,
     format: FileFormat,
 }
@@ -67,6 +66,26 @@ impl std::str::FromStr for Output {
             _ => return Err("the name must end in .pdf, .svg or .png".to_owned()),
         };
         Ok(Self { path, format })
+    }
+}
+
+impl Output {
+    /// The file's path.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Writes a sheet, as PNG with `dpi` pixels per inch.
+    ///
+    /// # Errors
+    /// The file cannot be written, or the image is too large.
+    pub(crate) fn write(&self, sheet: &Sheet, dpi: u16) -> anyhow::Result<()> {
+        let bytes = match self.format {
+            FileFormat::Pdf => pdf::document(sheet),
+            FileFormat::Svg => svg::document(sheet).into_bytes(),
+            FileFormat::Png => png::image(sheet, dpi)?,
+        };
+        std::fs::write(&self.path, bytes).with_context(|| format!("writing {:?}", self.path))
     }
 }
 
@@ -95,16 +114,10 @@ pub(crate) fn run(args: &MarkerArgs) -> anyhow::Result<ExitCode> {
             (Sheet::with_pad(&pad, args.paper)?, format!("{}, {count} markers", pad.name()))
         }
     };
-    let bytes = match args.output.format {
-        FileFormat::Pdf => pdf::document(&sheet),
-        FileFormat::Svg => svg::document(&sheet).into_bytes(),
-        FileFormat::Png => png::image(&sheet, args.dpi)?,
-    };
-    let path: &Path = &args.output.path;
-    std::fs::write(path, bytes).with_context(|| format!("writing {path:?}"))?;
+    args.output.write(&sheet, args.dpi)?;
     print(&format!(
         "{}: {what}, on {}. Print it at 100 %, then check that the ruler below it measures 100 mm.",
-        path.display(),
+        args.output.path.display(),
         args.paper.name()
     ))
     .context("writing the result")?;

@@ -1,12 +1,16 @@
 //! The layout of the sheet: the marker, cut marks, a ruler, and text.
 
 use clap::ValueEnum;
-use markers::{Drawing, Ink, Marker, Pad, Shape};
+use markers::{Board, Drawing, Ink, Marker, Pad, Shape};
 
 /// Margin that printers leave blank, in millimetres.
 const MARGIN_MM: f64 = 5.0;
 /// Height of what is below the marker (cut marks, ruler, two lines of text), in millimetres.
 const BELOW_MM: f64 = 33.0;
+/// Around a board, and below it for the ruler and three lines of text, in millimetres.
+const BOARD_TOP_MM: f64 = 12.0;
+const BOARD_BELOW_MM: f64 = 32.0;
+const BOARD_TEXT_LEFT_MM: f64 = 12.0;
 /// Tolerance for rounding errors when fitting to the paper, in millimetres.
 const ROUNDING_MM: f64 = 1e-6;
 /// Length of the ruler, in millimetres.
@@ -152,7 +156,7 @@ impl Mark {
 
 /// A sheet of paper with a marker at its centre.
 #[derive(Clone, Debug)]
-pub(super) struct Sheet {
+pub(crate) struct Sheet {
     pub(super) size_mm: [f64; 2],
     pub(super) marks: Vec<Mark>,
 }
@@ -186,9 +190,50 @@ impl Sheet {
         Ok(Self::from_drawing(&drawing, &format!("{}, {count} markers", pad.name()), paper))
     }
 
+    /// A sheet with a calibration board, and what to do with it.
+    pub(crate) fn with_board(board: &Board, paper: Paper) -> Result<Self, SheetError> {
+        let [width_mm, height_mm] = board.size_m().map(|edge| edge * 1e3);
+        let [page_width, page_height] = paper.size_mm();
+        let room = [page_width - 2.0 * BOARD_TOP_MM, page_height - BOARD_TOP_MM - BOARD_BELOW_MM];
+        if width_mm > room[0] + ROUNDING_MM || height_mm > room[1] + ROUNDING_MM {
+            let share = (room[0] / width_mm).min(room[1] / height_mm);
+            // Rounded down to tenths of millimetres, so that the stated sizes fit.
+            let fitting = |m: f64| (m * share * 1e4).floor() / 1e4;
+            let problem = format!(
+                "the board is {width_mm:.1} x {height_mm:.1} mm, and {} has {:.1} x {:.1} mm; `--tag {} --gap {}` fit",
+                paper.name(),
+                room[0],
+                room[1],
+                fitting(board.tag_m()),
+                fitting(board.gap_m()),
+            );
+            return Err(SheetError::TooLarge { problem });
+        }
+        let mut sheet = Self { size_mm: paper.size_mm(), marks: Vec::new() };
+        sheet.draw(&board.drawing(), [page_width / 2.0, BOARD_TOP_MM + height_mm / 2.0]);
+        sheet.draw_ruler();
+        let [tag_mm, gap_mm] = [board.tag_m(), board.gap_m()].map(|edge| edge * 1e3);
+        let lines = [
+            format!(
+                "{} x {} tags of AprilTag 36h11, side {tag_mm:.1} mm, gap {gap_mm:.1} mm.",
+                board.columns(),
+                board.rows()
+            ),
+            "Print at 100 %: the ruler must measure 100 mm. Glue it flat to glass or a board."
+                .to_owned(),
+            "Measure the side of a tag and the gap, and give both: --tag and --gap, in metres."
+                .to_owned(),
+        ];
+        for (line, text) in lines.into_iter().enumerate() {
+            let below = 12.0 - 3.5 * line as f64;
+            sheet.write([BOARD_TEXT_LEFT_MM, page_height - below], text);
+        }
+        Ok(sheet)
+    }
+
     fn from_drawing(drawing: &Drawing, title: &str, paper: Paper) -> Self {
         let mut sheet = Self { size_mm: paper.size_mm(), marks: Vec::new() };
-        sheet.draw_marker(drawing);
+        sheet.draw(drawing, sheet.centre());
         sheet.draw_cut_marks(drawing.half_extent_m * 1e3);
         sheet.draw_ruler();
         let [width, height] = sheet.size_mm;
@@ -203,8 +248,8 @@ impl Sheet {
         self.size_mm.map(|edge| edge / 2.0)
     }
 
-    fn draw_marker(&mut self, drawing: &Drawing) {
-        let [x, y] = self.centre();
+    /// Draws it with its origin there.
+    fn draw(&mut self, drawing: &Drawing, [x, y]: [f64; 2]) {
         // The marker's y axis points up, the paper's down.
         let place = |[right, up]: [f64; 2]| [x + right * 1e3, y - up * 1e3];
         self.marks.extend(drawing.layers.iter().map(|layer| match layer.shape {
