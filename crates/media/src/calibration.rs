@@ -1,29 +1,32 @@
-//! Calibration files of other programs: their intrinsics as a camera model.
+//! Calibration files of other programs: their intrinsics as a camera model, and back.
 //!
 //! Three formats are read and distinguished by their keys: ROS `camera_info` (`camera_matrix` or `K`, with
-//! `image_width`), Kalibr's camera chain (`cam0` with `intrinsics`), and OpenCV's `FileStorage`
+//! `image_width`), Kalibr's camera chain (`cam0` with `intrinsics`), and OpenCV's `FileStorage` as YAML, XML or JSON
 //! (`camera_matrix` of type `opencv-matrix`). In all of them the centre of the top-left pixel is (0, 0), as
 //! in this project.
+//!
+//! In reading order: `text` makes keys and values of a file, `fields` a camera of those, `mode` is the part of the sensor that
+//! the images show, `writing` is the way back.
+
+mod fields;
+mod mode;
+mod text;
+mod writing;
 
 use std::path::{Path, PathBuf};
 
-use geometry::{CameraModel, Distortion};
+use fields::{Held, Problem};
+use geometry::CameraModel;
 use serde_yaml_ng::Value;
+
+pub use mode::{SensorMode, SensorRegion};
+pub use writing::{
+    CalibrationDetails, CalibrationFormat, CalibrationNote, CalibrationWriteError, OnSensor,
+    write_calibration,
+};
 
 /// Maximum size of a calibration file, in bytes.
 const MAX_FILE_BYTES: u64 = 1 << 20;
-/// Maximum edge of an image, in pixels.
-const MAX_EDGE_PX: f64 = 65_535.0;
-/// Maximum focal length, in pixels.
-const MAX_FOCAL_PX: f64 = 1e6;
-
-/// Keys that different programs use for the same value; messages name the first.
-const MATRIX: &[&str] = &["camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "k"];
-const COEFFICIENTS: &[&str] =
-    &["distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "d"];
-const WIDTH: &[&str] = &["image_width", "image_Width", "width"];
-const HEIGHT: &[&str] = &["image_height", "image_Height", "height"];
-
 /// Why a calibration file was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum CalibrationError {
@@ -38,7 +41,7 @@ pub enum CalibrationError {
     /// Text in none of the three formats.
     #[error(
         "the calibration {path:?} {problem}; it must be ROS camera_info YAML (with `camera_matrix`), a Kalibr \
-         camchain (with `cam0`) or OpenCV FileStorage YAML (with `camera_matrix`)"
+         camchain (with `cam0`) or OpenCV FileStorage as YAML, XML or JSON (with `camera_matrix`)"
     )]
     Form {
         /// The file.
@@ -58,276 +61,158 @@ pub enum CalibrationError {
         /// What it must be.
         expected: &'static str,
     },
+    /// Images of another mode than the calibration is for.
+    #[error("the calibration {path:?} {problem}")]
+    Mode {
+        /// The file.
+        path: PathBuf,
+        /// Which mode, and what to do.
+        problem: String,
+    },
 }
 
-/// A problem with a key, before the file's name is added.
-#[derive(Debug)]
-struct Problem {
-    key: String,
-    problem: String,
-    expected: &'static str,
+/// A camera from a calibration file, and for which of its modes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CalibrationFile {
+    /// The file.
+    pub path: PathBuf,
+    /// The camera of the images in `mode`.
+    pub camera: CameraModel,
+    /// The mode that the file describes; where it says nothing the images are the whole sensor.
+    pub mode: SensorMode,
+    /// Width and height of the sensor.
+    pub sensor_px: [u32; 2],
+    /// The part of the sensor for which the calibration holds.
+    pub calibrated: SensorRegion,
 }
 
-/// The intrinsics in a calibration file: ROS `camera_info` YAML, the first camera of a Kalibr camchain
-/// (pinhole with radtan, equidistant or no distortion), or OpenCV `FileStorage` YAML.
+/// A mode as it is known from elsewhere: of what is not given the file says it.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+pub struct WantedMode {
+    /// What is read of the sensor; what the calibration holds for where it is not given.
+    pub region: Option<SensorRegion>,
+    /// The binning; none where only a region is given.
+    pub binning: Option<u32>,
+}
+
+/// The intrinsics in a calibration file, for images as it describes them: ROS `camera_info` YAML, the first camera of a Kalibr
+/// camchain (pinhole with radtan, equidistant or no distortion), or OpenCV's `FileStorage`.
 ///
 /// # Errors
 /// [`CalibrationError`] names the file, the key and the expected value.
 pub fn read_calibration(path: &Path) -> Result<CameraModel, CalibrationError> {
-    let path = || path.to_owned();
-    let unreadable = |cause| CalibrationError::Unreadable { path: path(), cause };
-    let metadata = std::fs::metadata(path()).map_err(unreadable)?;
-    let form = |problem: String| CalibrationError::Form { path: path(), problem };
+    Ok(CalibrationFile::read(path)?.camera)
+}
+
+impl CalibrationFile {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// [`CalibrationError`] names the file, the key and the expected value.
+    pub fn read(path: &Path) -> Result<Self, CalibrationError> {
+        let root = keys_and_values(path)?;
+        let held = fields::held(&root).ok_or_else(|| CalibrationError::Form {
+            path: path.to_owned(),
+            problem: "has none of the keys of a calibration".to_owned(),
+        })?;
+        let Held { camera, mode, sensor_px, calibrated } =
+            held.map_err(|Problem { key, problem, expected }| CalibrationError::Key {
+                path: path.to_owned(),
+                key,
+                problem,
+                expected,
+            })?;
+        Ok(Self { path: path.to_owned(), camera, mode, sensor_px, calibrated })
+    }
+
+    /// The camera of images of this size, in this mode. Binning and cropping are exact; images that were scaled otherwise, and
+    /// parts of the sensor for which the calibration does not hold, are refused.
+    ///
+    /// # Errors
+    /// [`CalibrationError::Mode`] with both modes, and what to do.
+    pub fn camera_in(
+        &self,
+        image_px: [u32; 2],
+        wanted: WantedMode,
+    ) -> Result<CameraModel, CalibrationError> {
+        let [width, height] = image_px;
+        let refused = |problem: String| CalibrationError::Mode { path: self.path.clone(), problem };
+        if wanted == WantedMode::default() {
+            if [self.camera.width, self.camera.height] == image_px {
+                return Ok(self.camera);
+            }
+            return Err(refused(format!(
+                "is for images of {} x {} pixels, and these have {width} x {height}: {}",
+                self.camera.width,
+                self.camera.height,
+                self.other_size_advice(image_px),
+            )));
+        }
+        let mode = SensorMode {
+            region: wanted.region.unwrap_or(self.calibrated),
+            binning: wanted.binning.unwrap_or(1),
+        };
+        if !(1..=mode::MAX_BINNING).contains(&mode.binning) {
+            let max = mode::MAX_BINNING;
+            return Err(refused(format!(
+                "has no binning by {}: it is from 1 to {max}",
+                mode.binning
+            )));
+        }
+        if !mode.region.lies_in(&self.calibrated) {
+            return Err(refused(format!(
+                "holds for {} of the sensor, and the region of the images is {}: calibrate with images of that region",
+                self.calibrated, mode.region
+            )));
+        }
+        if mode.image_px() != image_px {
+            let [w, h] = mode.image_px();
+            return Err(refused(format!(
+                "gives images of {w} x {h} pixels when {} are binned {} x {}, and these have {width} x {height}: correct region \
+                 and binning, or calibrate with images of this mode",
+                mode.region, mode.binning, mode.binning
+            )));
+        }
+        if mode == self.mode {
+            return Ok(self.camera);
+        }
+        Ok(mode.of_images(&self.mode.of_sensor(&self.camera, self.sensor_px)))
+    }
+
+    /// From the size alone nobody can tell whether the sensor was binned, cropped, or only every second pixel read.
+    fn other_size_advice(&self, [width, height]: [u32; 2]) -> String {
+        let SensorRegion { width: all_width, height: all_height, .. } = self.calibrated;
+        let binning = (2..=8).find(|b| [all_width / b, all_height / b] == [width, height]);
+        match binning {
+            Some(binning) => format!(
+                "if the camera averages {binning} x {binning} pixels, say so (binning {binning}); otherwise calibrate at this size"
+            ),
+            None if width <= all_width && height <= all_height => {
+                "if they are a part of the sensor, say which (a region of left, top, width and height); otherwise calibrate at this \
+                 size"
+                    .to_owned()
+            }
+            None => "calibrate at this size".to_owned(),
+        }
+    }
+}
+
+fn keys_and_values(path: &Path) -> Result<Value, CalibrationError> {
+    let unreadable = |cause| CalibrationError::Unreadable { path: path.to_owned(), cause };
+    let metadata = std::fs::metadata(path).map_err(unreadable)?;
+    let form = |problem: String| CalibrationError::Form { path: path.to_owned(), problem };
     if !metadata.is_file() || metadata.len() > MAX_FILE_BYTES {
         return Err(form(format!("is not a file of at most {MAX_FILE_BYTES} bytes")));
     }
-    let bytes = std::fs::read(path()).map_err(unreadable)?;
+    let bytes = std::fs::read(path).map_err(unreadable)?;
     let text = String::from_utf8(bytes).map_err(|_cause| form("is not text".to_owned()))?;
-    let root = parse(&text).map_err(form)?;
-    let model = if let Some(camera) = root.get("cam0") {
-        kalibr(camera)
-    } else if root.get("intrinsics").is_some() && root.get("camera_model").is_some() {
-        kalibr(&root)
-    } else if find(&root, MATRIX).is_some() {
-        matrix_form(&root)
-    } else {
-        return Err(form("has none of the keys of a calibration".to_owned()));
-    };
-    model.map_err(|Problem { key, problem, expected }| CalibrationError::Key {
-        path: path(),
-        key,
-        problem,
-        expected,
-    })
-}
-
-fn parse(text: &str) -> Result<Value, String> {
-    let text = text.trim_start_matches('\u{feff}');
-    if text.trim_start().starts_with('<') {
-        return Err(
-            "is XML; save it as YAML instead (in OpenCV, by a name that ends in .yaml)".to_owned()
-        );
-    }
-    // OpenCV writes a directive and a type tag that are not valid YAML.
-    let body = match text.strip_prefix("%YAML") {
-        Some(rest) => rest.split_once('\n').map_or("", |(_, body)| body),
-        None => text,
-    };
-    let root: Value = serde_yaml_ng::from_str(&body.replace("!!opencv-matrix", ""))
-        .map_err(|cause| format!("is not valid YAML: {cause}"))?;
-    if root.is_mapping() { Ok(root) } else { Err("is not a list of keys and values".to_owned()) }
-}
-
-/// Kalibr's `camchain.yaml`, one camera.
-fn kalibr(camera: &Value) -> Result<CameraModel, Problem> {
-    if let Some(model) = camera.get("camera_model")
-        && model.as_str() != Some("pinhole")
-    {
-        return Err(Problem {
-            key: "camera_model".to_owned(),
-            problem: format!("is {}", short(model)),
-            expected: "it must be `pinhole`",
-        });
-    }
-    let expected = "it must be the list [fx, fy, cx, cy] in pixels";
-    let (key, value) = required(camera, &["intrinsics"], expected)?;
-    let &[fx, fy, cx, cy] = numbers(key, value, expected)?.as_slice() else {
-        return Err(wrong(key, value, expected));
-    };
-    let expected = "it must be the list [width, height] in pixels";
-    let (key, value) = required(camera, &["resolution"], expected)?;
-    let &[width, height] = numbers(key, value, expected)?.as_slice() else {
-        return Err(wrong(key, value, expected));
-    };
-    let size = [edge("resolution", width)?, edge("resolution", height)?];
-    let coefficients = coefficients(camera, &["distortion_coeffs"])?;
-    let name = camera.get("distortion_model").and_then(Value::as_str).unwrap_or("none");
-    let distortion = distortion("distortion_model", name, "distortion_coeffs", &coefficients)?;
-    checked("intrinsics", size, [fx, fy, cx, cy], distortion)
-}
-
-/// The format of ROS and OpenCV: a 3 x 3 matrix, a list of coefficients, a size.
-fn matrix_form(root: &Value) -> Result<CameraModel, Problem> {
-    let expected = "it must hold the 9 numbers fx, 0, cx, 0, fy, cy, 0, 0, 1";
-    let (key, value) = required(root, MATRIX, expected)?;
-    let &[fx, skew, cx, zero, fy, cy, zero_x, zero_y, one] =
-        numbers(key, value, expected)?.as_slice()
-    else {
-        return Err(wrong(key, value, expected));
-    };
-    let rest = [skew, zero, zero_x, zero_y, one - 1.0];
-    // A skew of less than a millionth of the focal length moves no pixel of any image.
-    if rest.iter().any(|r| r.abs() > 1e-6 * fx.abs().max(1.0)) {
-        return Err(wrong(key, value, expected));
-    }
-    let size = size(root)?;
-    let coefficients = coefficients(root, COEFFICIENTS)?;
-    let distortion_key = find(root, COEFFICIENTS).map_or(COEFFICIENTS[0], |(key, _)| key);
-    let is_fisheye = root.get("fisheye_model").and_then(Value::as_i64) == Some(1);
-    let name = match root.get("distortion_model").and_then(Value::as_str) {
-        Some(name) => name,
-        None if is_fisheye => "fisheye",
-        None if coefficients.is_empty() => "none",
-        None => "plumb_bob",
-    };
-    let distortion = distortion("distortion_model", name, distortion_key, &coefficients)?;
-    checked(key, size, [fx, fy, cx, cy], distortion)
-}
-
-fn size(root: &Value) -> Result<[u32; 2], Problem> {
-    if let Some(value) = root.get("image_size") {
-        let expected = "it must be the list [width, height] in pixels";
-        let &[width, height] = numbers("image_size", value, expected)?.as_slice() else {
-            return Err(wrong("image_size", value, expected));
-        };
-        return Ok([edge("image_size", width)?, edge("image_size", height)?]);
-    }
-    let one = |names: &'static [&'static str]| {
-        let expected = "it must be the image's edge in pixels, from 1 to 65535";
-        let (key, value) = required(root, names, expected)?;
-        edge(key, number(value).ok_or_else(|| wrong(key, value, expected))?)
-    };
-    Ok([one(WIDTH)?, one(HEIGHT)?])
-}
-
-fn edge(key: &str, px: f64) -> Result<u32, Problem> {
-    if px.fract() == 0.0 && (1.0..=MAX_EDGE_PX).contains(&px) {
-        return Ok(px as u32);
-    }
-    Err(Problem {
-        key: key.to_owned(),
-        problem: format!("is {px}"),
-        expected: "it must be whole numbers of pixels from 1 to 65535",
-    })
-}
-
-fn coefficients(root: &Value, names: &'static [&'static str]) -> Result<Vec<f64>, Problem> {
-    match find(root, names) {
-        None | Some((_, Value::Null)) => Ok(Vec::new()),
-        Some((key, value)) => numbers(key, value, "it must be a list of numbers"),
-    }
-}
-
-fn distortion(
-    name_key: &str,
-    name: &str,
-    key: &str,
-    coefficients: &[f64],
-) -> Result<Distortion, Problem> {
-    let all_zero = coefficients.iter().all(|c| *c == 0.0);
-    match name {
-        "none" | "" if all_zero => Ok(Distortion::None),
-        "radtan" | "plumb_bob" | "rational_polynomial" if coefficients.is_empty() => {
-            Ok(Distortion::None)
-        }
-        "radtan" | "plumb_bob" | "rational_polynomial" | "none" | "" => {
-            brown_conrady(key, coefficients)
-        }
-        "equidistant" | "fisheye" => {
-            let k: [f64; 4] = coefficients.try_into().map_err(|_cause| Problem {
-                key: key.to_owned(),
-                problem: format!("has {} numbers", coefficients.len()),
-                expected: "a fisheye lens has the four coefficients k1, k2, k3, k4",
-            })?;
-            Ok(Distortion::KannalaBrandt(k))
-        }
-        other => Err(Problem {
-            key: name_key.to_owned(),
-            problem: format!("is `{other}`"),
-            expected: "it must be one of none, radtan, plumb_bob, rational_polynomial, equidistant, fisheye",
-        }),
-    }
-}
-
-/// OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6. Coefficients of a thin prism or a tilted sensor must be
-/// zero.
-fn brown_conrady(key: &str, coefficients: &[f64]) -> Result<Distortion, Problem> {
-    let beyond = coefficients.iter().skip(8).any(|c| *c != 0.0);
-    if !matches!(coefficients.len(), 4 | 5 | 8 | 12 | 14) || beyond {
-        let problem = format!("has {} numbers", coefficients.len());
-        let expected = "it must be k1, k2, p1, p2, optionally k3, or k3 to k6 (a thin prism or tilted sensor is not modelled)";
-        return Err(Problem { key: key.to_owned(), problem, expected });
-    }
-    let mut k = [0.0; 8];
-    for (slot, value) in k.iter_mut().zip(coefficients) {
-        *slot = *value;
-    }
-    Ok(if k == [0.0; 8] { Distortion::None } else { Distortion::BrownConrady(k) })
-}
-
-fn checked(
-    key: &str,
-    size: [u32; 2],
-    intrinsics: [f64; 4],
-    distortion: Distortion,
-) -> Result<CameraModel, Problem> {
-    let [fx, fy, cx, cy] = intrinsics;
-    for (name, focal) in [("fx", fx), ("fy", fy)] {
-        if !(focal > 0.0 && focal <= MAX_FOCAL_PX) {
-            let problem = format!("has {name} = {focal}");
-            let expected = "focal lengths must be above 0 and at most 1e6 pixels";
-            return Err(Problem { key: key.to_owned(), problem, expected });
-        }
-    }
-    Ok(CameraModel { width: size[0], height: size[1], fx, fy, cx, cy, distortion })
-}
-
-fn find<'a>(root: &'a Value, names: &'static [&'static str]) -> Option<(&'static str, &'a Value)> {
-    names.iter().find_map(|name| root.get(name).map(|value| (*name, value)))
-}
-
-fn required<'a>(
-    root: &'a Value,
-    names: &'static [&'static str],
-    expected: &'static str,
-) -> Result<(&'static str, &'a Value), Problem> {
-    find(root, names).ok_or_else(|| Problem {
-        key: names.first().copied().unwrap_or_default().to_owned(),
-        problem: "is missing".to_owned(),
-        expected,
-    })
-}
-
-/// The finite numbers of a list, of a list of lists, or of the `data` of a matrix.
-fn numbers(key: &str, value: &Value, expected: &'static str) -> Result<Vec<f64>, Problem> {
-    let list = match value.get("data") {
-        Some(data) if value.is_mapping() => data,
-        _ => value,
-    };
-    let mut flat = Vec::new();
-    let items = list.as_sequence().ok_or_else(|| wrong(key, value, expected))?;
-    for item in items {
-        match item.as_sequence() {
-            Some(row) => flat.extend(row),
-            None => flat.push(item),
-        }
-    }
-    let one = |item: &&Value| number(item).filter(|n| n.is_finite());
-    flat.iter().map(one).collect::<Option<Vec<f64>>>().ok_or_else(|| wrong(key, list, expected))
-}
-
-/// A number, also as C programs write it and YAML reads as text (`1.`, `.5e-3`).
-fn number(value: &Value) -> Option<f64> {
-    value.as_f64().or_else(|| value.as_str().and_then(|text| text.parse().ok()))
-}
-
-fn wrong(key: &str, value: &Value, expected: &'static str) -> Problem {
-    Problem { key: key.to_owned(), problem: format!("is {}", short(value)), expected }
-}
-
-/// A value as it stands in the file, cut to 60 characters.
-fn short(value: &Value) -> String {
-    let text = serde_yaml_ng::to_string(value).unwrap_or_default();
-    let line = text.split_whitespace().collect::<Vec<_>>().join(" ");
-    match line.char_indices().nth(60) {
-        Some((end, _)) => format!("{}...", &line[..end]),
-        None => line,
-    }
+    text::parse(&text).map_err(form)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use geometry::Distortion;
 
     const ROS: &str = "
 image_width: 640
@@ -387,6 +272,84 @@ distortion_coefficients: !!opencv-matrix
             assert!(problem.contains(&name), "{name} is not in: {problem}");
             problem
         })
+    }
+
+    #[test]
+    fn the_binning_and_the_region_of_ros_move_pixel_centres() {
+        let mode = "binning_x: 2\nbinning_y: 2\nroi: {x_offset: 40, y_offset: 20, width: 500, height: 400}\n";
+        let camera = read(&format!("{ROS}{mode}")).unwrap();
+        assert_eq!((camera.width, camera.height, camera.fx), (250, 200, 651.2 / 2.0));
+        // The centre of a pair of pixels is half a pixel from that of its first one.
+        assert!((camera.cx - (326.5 - 40.0 - 0.5) / 2.0).abs() < 1e-12);
+        assert!((camera.cy - (239.25 - 20.0 - 0.5) / 2.0).abs() < 1e-12);
+        let whole =
+            "binning_x: 0\nbinning_y: 0\nroi: {x_offset: 0, y_offset: 0, width: 0, height: 0}\n";
+        assert_eq!(read(&format!("{ROS}{whole}")), read(ROS));
+        for wrong in [
+            "binning_x: 2\n",
+            "roi: {x_offset: 1, width: 640}\n",
+            "binning_x: 3.5\nbinning_y: 3.5\n",
+        ] {
+            let problem = read(&format!("{ROS}{wrong}")).unwrap_err();
+            assert!(problem.contains("both binnings the same"), "{problem}");
+        }
+    }
+
+    fn in_mode(text: &str, image_px: [u32; 2], wanted: WantedMode) -> Result<CameraModel, String> {
+        let file = tempfile::Builder::new().suffix(".yaml").tempfile().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        let held = CalibrationFile::read(file.path()).unwrap();
+        held.camera_in(image_px, wanted).map_err(|problem| problem.to_string())
+    }
+
+    #[test]
+    fn another_mode_is_converted_when_it_bins_or_crops() {
+        let as_it_is = WantedMode::default();
+        let whole = in_mode(ROS, [640, 480], as_it_is).unwrap();
+        assert_eq!(Ok(whole), read(ROS));
+        let binned = WantedMode { region: None, binning: Some(2) };
+        let half = in_mode(ROS, [320, 240], binned).unwrap();
+        assert_eq!((half.fx, half.cx, half.cy), (325.6, 163.0, 119.375));
+        assert_eq!(half.distortion, whole.distortion);
+        let region = SensorRegion { left: 40, top: 20, width: 500, height: 400 };
+        let cropped = WantedMode { region: Some(region), binning: None };
+        let part = in_mode(ROS, [500, 400], cropped).unwrap();
+        assert_eq!((part.fx, part.cx, part.cy), (651.2, 286.5, 219.25));
+    }
+
+    #[test]
+    fn a_mode_that_cannot_be_converted_is_refused_with_what_to_do() {
+        let refused = |image_px, region: Option<SensorRegion>, binning| {
+            in_mode(ROS, image_px, WantedMode { region, binning }).unwrap_err()
+        };
+        let check = |problem: String, part: &str| assert!(problem.contains(part), "{problem}");
+        check(
+            refused([320, 240], None, None),
+            "these have 320 x 240: if the camera averages 2 x 2",
+        );
+        check(refused([600, 400], None, None), "if they are a part of the sensor, say which");
+        check(refused([1280, 960], None, None), "these have 1280 x 960: calibrate at this size");
+        check(refused([320, 200], None, Some(2)), "gives images of 320 x 240");
+        check(refused([320, 240], None, Some(0)), "no binning by 0");
+        let beyond = SensorRegion { left: 200, top: 0, width: 500, height: 400 };
+        check(refused([500, 400], Some(beyond), None), "calibrate with images of that region");
+    }
+
+    #[test]
+    fn what_was_calibrated_of_a_sensor_is_the_most_that_is_converted() {
+        let text = format!(
+            "{OPENCV}alight:\n   sensor: [2000, 1500]\n   region: [100, 60, 1280, 960]\n   binning: 2\n"
+        );
+        let whole = WantedMode { region: None, binning: Some(1) };
+        let camera = in_mode(&text, [1280, 960], whole).unwrap();
+        assert_eq!(camera.fx, 900.0);
+        assert!((camera.cx - (2.0 * 317.702_973_173_532_77 + 0.5)).abs() < 1e-9);
+        let all = SensorRegion::whole(2000, 1500);
+        let beyond = WantedMode { region: Some(all), binning: None };
+        let problem = in_mode(&text, [2000, 1500], beyond).unwrap_err();
+        assert!(problem.contains("1280 x 960 from column 100 and row 60"), "{problem}");
+        let wrong = read(&text.replace("binning: 2", "binning: 3")).unwrap_err();
+        assert!(wrong.contains("must give the images' size"), "{wrong}");
     }
 
     #[test]
@@ -481,7 +444,7 @@ distortion_coefficients: !!opencv-matrix
         check("", "not a list of keys");
         check("a: [1", "not valid YAML");
         check("a: 1", "none of the keys");
-        check("<?xml version=\"1.0\"?><opencv_storage/>", "is XML");
+        check("<?xml version=\"1.0\"?><opencv_storage/>", "is not valid XML");
         let missing = read_calibration(Path::new("no/such.yaml")).unwrap_err().to_string();
         assert!(missing.contains("no/such.yaml"), "{missing}");
         let binary = tempfile::NamedTempFile::new().unwrap();

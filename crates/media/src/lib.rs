@@ -1,21 +1,28 @@
-//! Images, videos and calibration files, read into grey images and camera models.
+//! Images, videos and calibration files, read into grey images and camera models; calibration files are written as well.
 //!
-//! The crate reads files. It knows no marker, no camera that is connected, and no other process.
+//! The crate knows no marker, no camera that is connected, and no other process.
 //!
 //! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, [`image`] reads image files,
-//! [`video`] reads videos frame by frame, [`calibration`] reads the calibration files of other programs.
+//! [`video`] reads videos frame by frame, [`calibration`] reads and writes the calibration files of other programs,
+//! [`rectify`] takes a lens's distortion out of images.
 
 mod budget;
 pub mod calibration;
 mod contained;
 pub mod image;
 pub mod jpeg;
+pub mod rectify;
 pub mod video;
 
-pub use calibration::{CalibrationError, read_calibration};
+pub use calibration::{
+    CalibrationDetails, CalibrationError, CalibrationFile, CalibrationFormat, CalibrationNote,
+    CalibrationWriteError, OnSensor, SensorMode, SensorRegion, WantedMode, read_calibration,
+    write_calibration,
+};
 pub use image::{
     DEFAULT_MAX_PIXELS, DecodedImage, IMAGE_EXTENSIONS, ImageError, decode_image, files_in,
     frame_bytes, images_in, read_image, samples_to_grey,
 };
 pub use jpeg::JpegScanner;
+pub use rectify::Rectifier;
 pub use video::{VIDEO_EXTENSIONS, Video, VideoError, VideoFrame, VideoImage, is_video};
