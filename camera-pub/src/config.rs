@@ -7,7 +7,7 @@ use airlink::AirConfig;
 use anyhow::{Context, bail, ensure};
 use geometry::{Body, Camera, CameraModel, Distortion, Point, Rotation, Transform};
 use imaging::{BayerPattern, GrayView};
-use media::read_calibration;
+use media::{CalibrationFile, SensorRegion, WantedMode};
 use node::{Check, Settings};
 use serde::Deserialize;
 
@@ -132,6 +132,8 @@ impl FrameFormat {
 #[serde(deny_unknown_fields)]
 struct CalibrationConfig {
     file: PathBuf,
+    binning: u32,
+    region_px: Vec<u32>,
     focal_px: [f64; 2],
     principal_px: Vec<f64>,
     lens: String,
@@ -189,15 +191,8 @@ impl Config {
         let [width, height] = [size.width, size.height].map(|edge| edge as u32);
         let calibration = &self.calibration;
         if calibration.file != Path::new("") {
-            let camera = read_calibration(&calibration.file)?;
-            ensure!(
-                (camera.width, camera.height) == (width, height),
-                "the calibration {:?} is for images of {} x {} pixels, but the frames have {width} x {height}; \
-                 calibrate the camera at the size it is used at",
-                calibration.file,
-                camera.width,
-                camera.height,
-            );
+            let file = CalibrationFile::read(&calibration.file)?;
+            let camera = file.camera_in([width, height], calibration.wanted_mode())?;
             return Ok(Some(camera));
         }
         let [fx, fy] = calibration.focal_px;
@@ -379,6 +374,23 @@ impl CalibrationConfig {
             &["pinhole", "brown-conrady", "kannala-brandt"],
         );
         check.parses("calibration.distortion", self.lens());
+        check.range("calibration.binning", self.binning, 0..=64);
+        check.parses(
+            "calibration.region_px",
+            holds(
+                matches!(self.region_px.len(), 0 | 4),
+                "it must be [left, top, width, height] in pixels of the sensor, or empty",
+            ),
+        );
+    }
+
+    /// The mode that the frames are taken in, as far as it is said.
+    fn wanted_mode(&self) -> WantedMode {
+        let region = match *self.region_px.as_slice() {
+            [left, top, width, height] => Some(SensorRegion { left, top, width, height }),
+            _ => None,
+        };
+        WantedMode { region, binning: (self.binning > 0).then_some(self.binning) }
     }
 
     fn lens(&self) -> Result<Distortion, &'static str> {
