@@ -10,8 +10,8 @@ use crate::args::ServiceArgs;
 use crate::services::{self, Service};
 use crate::terminal::{print, write_error};
 use crate::{
-    command, dashboard, detect, detectors, doctor, experiment, keys, land, marker, record, relay,
-    replay, report, swap, up,
+    calibrate, command, dashboard, detect, detectors, doctor, experiment, keys, land, marker,
+    record, rectify, relay, replay, report, swap, up,
 };
 
 /// Exit status for an invalid command line or configuration.
@@ -64,6 +64,10 @@ enum Command {
     Cameras(crate::cameras::CamerasArgs),
     /// Find markers in image files and videos.
     Detect(detect::DetectArgs),
+    /// Calibrate a camera: print a board, and make a calibration file from images of it.
+    Calibrate(Box<calibrate::CalibrateArgs>),
+    /// Take the distortion of the lens out of images.
+    Rectify(rectify::RectifyArgs),
     /// Make a marker to print.
     Marker(marker::MarkerArgs),
     /// Repeat the thesis' experiments.
@@ -111,6 +115,8 @@ pub(crate) fn run() -> ExitCode {
         Command::Doctor(args) => doctor::run(&args),
         Command::Cameras(args) => crate::cameras::run(&args),
         Command::Detect(args) => detect::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
+        Command::Rectify(args) => rectify::run(&args),
         Command::Marker(args) => marker::run(&args),
         Command::Experiment(args) => experiment::run(args),
         Command::Config(args) => print_config(args),
@@ -130,7 +136,9 @@ fn is_wrong_use(problem: &anyhow::Error) -> bool {
         || problem.is::<clap::Error>()
         || problem.is::<fiducial::DetectorError>()
         || problem.is::<markers::PadError>()
+        || problem.is::<markers::BoardError>()
         || problem.is::<media::CalibrationError>()
+        || problem.is::<media::CalibrationWriteError>()
         || problem.is::<marker::SheetError>()
 }
 

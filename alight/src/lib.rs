@@ -5,11 +5,12 @@
 //! this machine and follows its `peers`, `keys` makes the site's keys, `doctor` diagnoses it, `cameras` lists what sees; `land`
 //! runs all services as processes and watches the landing, with `children` for the processes, `progress`
 //! for the display and `outcome` for the result; `command` sends a command, `detectors` lists the
-//! running detectors and `swap` replaces one; `detect`, `marker` and `experiment` with
+//! running detectors and `swap` replaces one; `detect`, `calibrate`, `rectify`, `marker` and `experiment` with
 //! its campaign of `faults`, flown in `real_time` over a `fault_link` as well, are tools.
 //! `runtime` and `terminal` serve all of them.
 
 mod args;
+mod calibrate;
 mod cameras;
 mod children;
 mod cli;
@@ -29,6 +30,7 @@ mod peers;
 mod progress;
 mod real_time;
 mod record;
+mod rectify;
 mod relay;
 mod replay;
 mod report;

@@ -17,8 +17,8 @@ pub(crate) struct DetectArgs {
     /// and is reported as a marker `pad:ID`. May be repeated.
     #[arg(long = "pad", value_name = "PAD")]
     pub(super) pads: Vec<String>,
-    /// Calibration of the camera (ROS camera_info, Kalibr camchain or OpenCV FileStorage, as YAML), for the
-    /// pose of markers of known size.
+    /// Calibration of the camera (ROS camera_info, Kalibr camchain or OpenCV FileStorage), for the pose of
+    /// markers of known size.
     #[arg(long, value_name = "FILE", conflicts_with = "focal_px")]
     pub(super) camera: Option<PathBuf>,
     /// Focal length in pixels instead of a calibration: an ideal lens with its axis at the image centre.

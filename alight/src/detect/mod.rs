@@ -20,9 +20,10 @@ use media::read_calibration;
 use crate::terminal::write_error;
 pub(crate) use args::DetectArgs;
 use picture::Gallery;
+pub(crate) use picture::file_name;
 use queue::process_all;
 use report::{Detection, Found, Line};
-use source::{Item, Source};
+pub(crate) use source::{Item, Source};
 
 /// Prints the detections in each image, in the order given. Exit status 1 when an image could not be read.
 ///

@@ -58,7 +58,7 @@ impl Gallery {
 }
 
 /// A file name for an image: folders become parts of it, so that it is unique.
-fn file_name(name: &str) -> String {
+pub(crate) fn file_name(name: &str) -> String {
     let parts = name.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | ".."));
     format!("{}.png", parts.collect::<Vec<_>>().join("_").replace(['#', ':'], "-"))
 }

@@ -12,20 +12,20 @@ use media::{
 const IMAGE_PERIOD_S: f64 = 0.1;
 
 /// Iterates over files, folders and videos.
-pub(super) struct Source {
+pub(crate) struct Source {
     listed: std::vec::IntoIter<Result<PathBuf, (PathBuf, String)>>,
     video: Option<(PathBuf, Video)>,
     images: u32,
 }
 
 /// An image, decoded or not yet.
-pub(super) struct Item {
+pub(crate) struct Item {
     /// Its name: a path, for a video frame with its number.
-    pub(super) name: String,
+    pub(crate) name: String,
     /// Its time, in seconds after the first image.
-    pub(super) time_s: f64,
+    pub(crate) time_s: f64,
     /// Whether it is a frame of a video.
-    pub(super) is_frame: bool,
+    pub(crate) is_frame: bool,
     content: Content,
 }
 
@@ -38,7 +38,7 @@ enum Content {
 
 impl Source {
     /// The images of some paths.
-    pub(super) fn new(paths: &[PathBuf]) -> Self {
+    pub(crate) fn new(paths: &[PathBuf]) -> Self {
         let mut listed = Vec::new();
         for path in paths {
             match files_in(path, &[IMAGE_EXTENSIONS, VIDEO_EXTENSIONS]) {
@@ -50,7 +50,7 @@ impl Source {
     }
 
     /// The next image; frames of a video are decoded here as far as they depend on each other.
-    pub(super) fn next(&mut self) -> Option<Item> {
+    pub(crate) fn next(&mut self) -> Option<Item> {
         if let Some((path, video)) = &mut self.video {
             match video.next_frame() {
                 Some(Ok(frame)) => {
@@ -89,7 +89,7 @@ impl Item {
     }
 
     /// The grey image, or the reason why there is none.
-    pub(super) fn into_image(self, bayer: Option<BayerPattern>) -> Result<GrayImage, String> {
+    pub(crate) fn into_image(self, bayer: Option<BayerPattern>) -> Result<GrayImage, String> {
         let image = match self.content {
             Content::File(path) => read_image(&path, DEFAULT_MAX_PIXELS, bayer),
             Content::Frame(path, image) => image.grey(&path, DEFAULT_MAX_PIXELS),

@@ -1,0 +1,101 @@
+//! Frames of a camera that is running, until enough of them show the board.
+
+use anyhow::{Context, bail, ensure};
+use calibration::calibrate_unjudged;
+use imaging::{Converter, GrayImage};
+use messages::{FrameHeader, topic};
+use node::{Frame, Node, Shutdown};
+
+use super::args::BoardArgs;
+use super::found::{Finder, FoundImages, Origin, Picture};
+use super::guidance::Guidance;
+use crate::args::Format;
+use crate::runtime::with_node;
+use crate::terminal::{print, write_error};
+
+/// Without a frame for so long there is no camera.
+const PATIENCE: std::time::Duration = std::time::Duration::from_secs(10);
+/// After so many more views the first solution is made anew.
+const VIEWS_PER_SOLUTION: usize = 4;
+
+/// Takes frames in which the board has moved and is held still, and says what to show next, until nothing is missing or the
+/// person ends it (Ctrl-C).
+///
+/// # Errors
+/// When no frames come, or the network cannot be joined.
+pub(super) fn watch_camera(
+    finder: &mut Finder<'_>,
+    camera: &str,
+    args: &BoardArgs,
+) -> anyhow::Result<FoundImages> {
+    with_node(&args.network, "calibrate", async |node: &Node| {
+        let mut found = FoundImages::default();
+        let shutdown = Shutdown::on_signals()?;
+        let frames = node.frame_subscriber(topic::FRAME, &[camera]).await?;
+        let mut converter = Converter::default();
+        let mut said = None;
+        write_error("Show the board to the camera; Ctrl-C when it is enough.");
+        loop {
+            let next = tokio::select! {
+                next = tokio::time::timeout(PATIENCE, frames.next()) => next,
+                () = shutdown.requested() => break,
+            };
+            let Ok(next) = next else {
+                ensure!(
+                    found.images > 0,
+                    "no frame of the camera {camera:?} within {} s: is camera-pub running? `alight doctor` tells",
+                    PATIENCE.as_secs()
+                );
+                write_error("The camera sends no more frames.");
+                break;
+            };
+            let frame = next.context("the session is closed")?;
+            let picture = picture(&frame, &mut converter)?;
+            found.add(finder, picture);
+            if say(&found, args, &mut said)? || found.is_full {
+                break;
+            }
+        }
+        Ok(found)
+    })
+}
+
+fn picture(frame: &Frame, converter: &mut Converter) -> anyhow::Result<Picture> {
+    let FrameHeader { width, height, format, sequence, .. } = frame.header;
+    let Some(samples) = format.sample_format() else {
+        bail!("frames of {format:?} cannot be calibrated with: use the camera's own ones");
+    };
+    let bytes = frame.bytes();
+    let view = converter
+        .convert(&bytes, width as usize, height as usize, samples)
+        .context("reading a frame")?;
+    let mut image = GrayImage::filled(view.width(), view.height(), 0);
+    for y in 0..view.height() {
+        image.row_mut(y).copy_from_slice(view.row(y));
+    }
+    Ok(Picture { name: format!("frame {sequence}"), image, origin: Origin::Live })
+}
+
+/// Says what is missing, when there is something new; whether nothing is.
+fn say(found: &FoundImages, args: &BoardArgs, said: &mut Option<Guidance>) -> anyhow::Result<bool> {
+    let views = found.views.len();
+    if said.as_ref().is_some_and(|before| before.views == views) {
+        return Ok(false);
+    }
+    let first = views
+        .is_multiple_of(VIEWS_PER_SOLUTION)
+        .then(|| calibrate_unjudged(&found.views, args.lens.model(), &args.options()).ok())
+        .flatten();
+    let mut guidance = Guidance::new(found, first.as_ref());
+    let is_enough = first.is_some() && guidance.next.is_empty();
+    if let (None, Some(before)) = (&first, said.as_ref()) {
+        (guidance.tilt_deg, guidance.distance_ratio) = (before.tilt_deg, before.distance_ratio);
+        guidance.next = guidance.advice();
+    }
+    match args.format {
+        Format::Text => write_error(&guidance.line()),
+        Format::Json => print(&serde_json::json!({ "guidance": guidance.json() }).to_string())?,
+    }
+    *said = Some(guidance);
+    Ok(is_enough)
+}

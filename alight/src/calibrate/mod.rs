@@ -1,0 +1,133 @@
+//! `alight calibrate`: a camera's calibration file, and what it is worth.
+
+mod args;
+mod found;
+mod guidance;
+mod live;
+mod report;
+mod sharpness;
+
+use std::process::ExitCode;
+use std::time::SystemTime;
+
+use anyhow::Context;
+use calibration::{Calibration, Refusal, calibrate, calibrate_unjudged};
+use clap::{Args, Subcommand};
+use media::{CalibrationDetails, CalibrationNote, write_calibration};
+
+use crate::args::Format;
+use crate::marker::Sheet;
+use crate::terminal::print;
+pub(crate) use args::BoardArgs;
+use found::{Finder, FoundImages, find_boards};
+use guidance::Guidance;
+use live::watch_camera;
+
+/// The arguments of `alight calibrate`.
+#[derive(Args)]
+pub(crate) struct CalibrateArgs {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand)]
+enum What {
+    /// A camera's intrinsics from images of a printed board: print it with --print, take 20 to 60 pictures (tilted by up to
+    /// 45 degrees to all sides, near and far, in every corner of the image), then calibrate.
+    Board(BoardArgs),
+}
+
+/// Prints the board, or calibrates. Exit status 1 when the images show no camera.
+///
+/// # Errors
+/// When arguments contradict each other, a file cannot be read or written.
+pub(crate) fn run(args: &CalibrateArgs) -> anyhow::Result<ExitCode> {
+    let What::Board(args) = &args.what;
+    let board = args.board()?;
+    if let Some(output) = &args.print {
+        let sheet = Sheet::with_board(&board, args.paper)?;
+        output.write(&sheet, args.dpi)?;
+        print(&format!(
+            "{}: {} x {} tags on {}. Print it at 100 %, check that the ruler measures 100 mm, glue it flat to something stiff, \
+             and measure a tag's side and the gap between two.",
+            output.path().display(),
+            board.columns(),
+            board.rows(),
+            args.paper.name()
+        ))?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    args.check()?;
+    let mut finder = Finder::new(&board)?;
+    let mut found = match &args.live {
+        Some(camera) => watch_camera(&mut finder, camera, args)?,
+        None => find_boards(&mut finder, args)?,
+    };
+    if let (Some(sensor), Some(view)) = (args.on_sensor(), found.views.first()) {
+        sensor.check([view.size.width, view.size.height])?;
+    }
+    let (lens, options) = (args.lens.model(), args.options());
+    let first = calibrate_unjudged(&found.views, lens, &options).ok();
+    if let Some(first) = &first {
+        found.look_again(&mut finder, &first.camera);
+    }
+    let guidance = Guidance::new(&found, first.as_ref());
+    match calibrate(&found.views, lens, &options) {
+        Ok(calibration) => accept(args, &found, &guidance, &calibration),
+        Err(refusal) => refuse(args, &found, &guidance, &refusal),
+    }
+}
+
+fn accept(
+    args: &BoardArgs,
+    found: &FoundImages,
+    guidance: &Guidance,
+    calibration: &Calibration,
+) -> anyhow::Result<ExitCode> {
+    let note = CalibrationNote {
+        made: humantime::format_rfc3339_seconds(SystemTime::now()).to_string(),
+        views: calibration.views.len(),
+        noise_px: calibration.noise_px,
+        rms_px: calibration.rms_px,
+        uncertainty_px: calibration.worst_uncertainty_px(),
+    };
+    if let Some(path) = &args.output {
+        let details = CalibrationDetails { sensor: args.on_sensor(), note: Some(note) };
+        write_calibration(path, &calibration.camera, args.file_format.format(), &details)?;
+    }
+    match args.format {
+        Format::Text => {
+            print(report::found_text(found, guidance).trim_end())?;
+            print(report::shown_text(guidance).trim_end())?;
+            print(report::worth_text(calibration).trim_end())?;
+            print(&match &args.output {
+                Some(path) => format!(
+                    "{}: written; name it in camera-pub's configuration as `calibration.file`.",
+                    path.display()
+                ),
+                None => "Nothing was written: pass -o camera.yaml.".to_owned(),
+            })
+        }
+        Format::Json => print(&report::json(found, guidance, Some(calibration), None).to_string()),
+    }
+    .context("writing the result")?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn refuse(
+    args: &BoardArgs,
+    found: &FoundImages,
+    guidance: &Guidance,
+    refusal: &Refusal,
+) -> anyhow::Result<ExitCode> {
+    match args.format {
+        Format::Text => {
+            print(report::found_text(found, guidance).trim_end())?;
+            print(report::shown_text(guidance).trim_end())?;
+            print(&format!("No calibration: {refusal}."))
+        }
+        Format::Json => print(&report::json(found, guidance, None, Some(refusal)).to_string()),
+    }
+    .context("writing the result")?;
+    Ok(ExitCode::FAILURE)
+}

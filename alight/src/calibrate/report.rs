@@ -1,0 +1,248 @@
+//! What is said of a calibration.
+
+use std::fmt::Write as _;
+
+use calibration::{Calibration, Refusal};
+use geometry::{CameraModel, Distortion};
+use serde_json::{Value, json};
+
+use super::found::{BLURRED_PX, FoundImages};
+use super::guidance::Guidance;
+
+/// The distance that errors are told at, in metres.
+const FAR_M: f64 = 5.0;
+/// Columns and rows of the maps of residuals and of uncertainty.
+const MAP: [usize; 2] = [6, 4];
+/// Names that are listed.
+const MAX_NAMES: usize = 5;
+
+/// Which images show the board, and where in the image it was.
+pub(super) fn found_text(found: &FoundImages, guidance: &Guidance) -> String {
+    let points: usize = found.views.iter().map(|view| view.points.len()).sum();
+    let mut text = format!(
+        "images: {}, with the board: {}, its points: {points}\n",
+        found.images,
+        found.views.len()
+    );
+    if found.unmoved > 0 {
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "left out, as the board had not moved: {}", found.unmoved);
+    }
+    if found.shaken > 0 {
+        let _ = writeln!(text, "left out, as the board was not held still: {}", found.shaken);
+    }
+    if found.is_full {
+        text.push_str("further images were left out: these are enough\n");
+    }
+    let blurred: Vec<&str> = blurred(found).collect();
+    for (what, names) in [
+        ("without the board", found.empty.iter().map(String::as_str).collect()),
+        ("not readable", found.unreadable.iter().map(String::as_str).collect()),
+        ("blurred (hold still, more light, focus)", blurred),
+    ] {
+        let names: Vec<&str> = names;
+        if !names.is_empty() {
+            let rest = names.len().saturating_sub(MAX_NAMES);
+            let more = if rest > 0 { format!(" and {rest} more") } else { String::new() };
+            let listed = names[..names.len().min(MAX_NAMES)].join(", ");
+            let _ = writeln!(text, "{what}: {listed}{more}");
+        }
+    }
+    if found.views.is_empty() {
+        return text;
+    }
+    text.push_str("where in the image the points are (#: 20 or more, +: some, .: none, show the board there):\n");
+    for row in guidance.point_counts {
+        let sign = |count: &usize| match count {
+            0 => '.',
+            1..20 => '+',
+            _ => '#',
+        };
+        let _ = writeln!(text, "  {}", row.iter().map(sign).collect::<String>());
+    }
+    text
+}
+
+fn blurred(found: &FoundImages) -> impl Iterator<Item = &str> {
+    found.edges.iter().filter(|edge| edge.width_px > BLURRED_PX).map(|edge| edge.name.as_str())
+}
+
+/// How the board was shown, and what would help.
+pub(super) fn shown_text(guidance: &Guidance) -> String {
+    let mut text = String::new();
+    if let (Some(tilt_deg), Some(ratio)) = (guidance.tilt_deg, guidance.distance_ratio) {
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            text,
+            "tilt: up to {tilt_deg:.0} degrees; the farthest views are {ratio:.1} times as far as the nearest; points in {:.0} % \
+             of the image",
+            100.0 * guidance.covered()
+        );
+    }
+    for next in &guidance.next {
+        let _ = writeln!(text, "would help: {next}");
+    }
+    text
+}
+
+/// The camera, and what it is worth.
+pub(super) fn worth_text(calibration: &Calibration) -> String {
+    let CameraModel { width, height, fx, fy, cx, cy, .. } = calibration.camera;
+    let sigma = |i: usize| calibration.covariance[(i, i)].max(0.0).sqrt();
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = writeln!(text, "{}, {width} x {height} pixels", calibration.lens);
+    let _ = writeln!(
+        text,
+        "  focal lengths  {fx:.2} +- {:.2}, {fy:.2} +- {:.2} px\n  principal point  {cx:.2} +- {:.2}, {cy:.2} +- {:.2} px",
+        sigma(0),
+        sigma(1),
+        sigma(2),
+        sigma(3)
+    );
+    let _ = writeln!(text, "  distortion  {:.5?}", numbers(calibration));
+    let _ = writeln!(
+        text,
+        "the points are found to {:.3} px each way; the residuals are {:.3} px (root mean square)",
+        calibration.noise_px, calibration.rms_px
+    );
+    let [across, down] = calibration.bend_m.map(|bend| bend * 1e3);
+    let _ = writeln!(text, "the board bends by {across:+.2} mm across and {down:+.2} mm down");
+    let _ = writeln!(
+        text,
+        "uncertainty of the projection: {:.3} px or less in 95 % of the image",
+        calibration.worst_uncertainty_px()
+    );
+    match &calibration.cross_validation {
+        Some(halves) => {
+            let _ = writeln!(
+                text,
+                "two halves of the images give cameras that differ by {:.3} px ({:.3} px expected)",
+                halves.difference_px, halves.expected_px
+            );
+        }
+        None => text.push_str("half of the images alone shows no camera: take more\n"),
+    }
+    text.push_str(&maps_text(calibration));
+    let error = calibration.error_at(FAR_M);
+    let _ = writeln!(
+        text,
+        "error at {FAR_M:.0} m because of the calibration: {} cm sideways, {} cm in distance (one standard deviation)",
+        two_digits(100.0 * error.lateral_m),
+        two_digits(100.0 * error.range_m)
+    );
+    text
+}
+
+/// What is left of the points, and how sure the projection is, by place.
+fn maps_text(calibration: &Calibration) -> String {
+    let [columns, rows] = MAP;
+    let residuals = calibration.residual_map(columns, rows);
+    let uncertainty = calibration.uncertainty_map(columns, rows);
+    let cell = |value: Option<f64>| value.map_or("    -".to_owned(), |px| format!("{px:>6.3}"));
+    let mut text = format!(
+        "{:width$}uncertainty by place, px\n",
+        "residuals by place, px",
+        width = 7 * columns + 3
+    );
+    for (left, right) in residuals.chunks(columns).zip(uncertainty.chunks(columns)) {
+        let left = left.iter().map(|it| cell((it.points > 0).then_some(it.rms_px)));
+        let right = right.iter().map(|it| cell(it.sigma_px));
+        let [left, right] =
+            [left.collect::<Vec<_>>(), right.collect()].map(|cells| cells.join(" "));
+        let _ = writeln!(text, "{left}   {right}");
+    }
+    text
+}
+
+/// A number with two digits that say something.
+fn two_digits(value: f64) -> String {
+    let before_point = if value > 0.0 { value.log10().floor() as i32 } else { 0 };
+    let decimals = usize::try_from(1 - before_point).unwrap_or(0).min(4);
+    format!("{value:.decimals$}")
+}
+
+/// The lens's numbers, those that its model has.
+fn numbers(calibration: &Calibration) -> &[f64] {
+    let all: &[f64] = match &calibration.camera.distortion {
+        Distortion::None => &[],
+        Distortion::BrownConrady(k) => k,
+        Distortion::KannalaBrandt(k) => k,
+    };
+    let own = calibration.lens.parameters().saturating_sub(4);
+    &all[..own.min(all.len())]
+}
+
+/// All of it for programs.
+pub(super) fn json(
+    found: &FoundImages,
+    guidance: &Guidance,
+    calibration: Option<&Calibration>,
+    refusal: Option<&Refusal>,
+) -> Value {
+    let edges: Vec<Value> = found
+        .edges
+        .iter()
+        .map(|edge| json!({ "image": edge.name, "edge_width_px": edge.width_px }))
+        .collect();
+    json!({
+        "images": found.images,
+        "with_board": found.views.len(),
+        "without_board": found.empty,
+        "unreadable": found.unreadable,
+        "unmoved": found.unmoved,
+        "blurred": blurred(found).collect::<Vec<_>>(),
+        "edges": edges,
+        "shaken": found.shaken,
+        "guidance": guidance.json(),
+        "refused": refusal.map(ToString::to_string),
+        "calibration": calibration.map(calibration_json),
+    })
+}
+
+fn calibration_json(calibration: &Calibration) -> Value {
+    let CameraModel { width, height, fx, fy, cx, cy, .. } = calibration.camera;
+    let error = calibration.error_at(FAR_M);
+    let views: Vec<Value> = calibration
+        .views
+        .iter()
+        .map(|view| json!({ "image": view.name, "points": view.residuals.len(), "rms_px": view.rms_px }))
+        .collect();
+    let [columns, rows] = MAP;
+    let residuals = calibration.residual_map(columns, rows);
+    let residuals: Vec<Value> = residuals
+        .iter()
+        .map(|it| json!({ "x": it.middle.x, "y": it.middle.y, "points": it.points, "mean_px": it.mean_px, "rms_px": it.rms_px }))
+        .collect();
+    let uncertainty = calibration.uncertainty_map(columns, rows);
+    let uncertainty: Vec<Value> = uncertainty
+        .iter()
+        .map(|it| json!({ "x": it.pixel.x, "y": it.pixel.y, "sigma_px": it.sigma_px }))
+        .collect();
+    let sigma: Vec<f64> = (0..4).map(|i| calibration.covariance[(i, i)].max(0.0).sqrt()).collect();
+    let evidence = &calibration.evidence;
+    json!({
+        "lens": calibration.lens.to_string(),
+        "width": width,
+        "height": height,
+        "fx": fx,
+        "fy": fy,
+        "cx": cx,
+        "cy": cy,
+        "fx_fy_cx_cy_sigma": sigma,
+        "distortion": numbers(calibration),
+        "noise_px": calibration.noise_px,
+        "rms_px": calibration.rms_px,
+        "uncertainty_px": calibration.worst_uncertainty_px(),
+        "bend_m": calibration.bend_m,
+        "tilt_deg": evidence.tilt.to_degrees(),
+        "distance_ratio": evidence.distance_ratio,
+        "covered": evidence.coverage.covered,
+        "halves_differ_px": calibration.cross_validation.map(|halves| halves.difference_px),
+        "halves_expected_px": calibration.cross_validation.map(|halves| halves.expected_px),
+        "error_at_5_m": { "lateral_m": error.lateral_m, "range_m": error.range_m },
+        "residuals_by_place": residuals,
+        "uncertainty_by_place": uncertainty,
+        "views": views,
+    })
+}
