@@ -18,7 +18,7 @@ use crate::circles::{Graph, circles, modules};
 use crate::source::{lines_of_code, tokens, without_tests};
 
 /// The algorithm crates, and what each may know of this workspace. `autopilot` is told apart for its link.
-const ALGORITHMS: [(&str, &[&str]); 9] = [
+const ALGORITHMS: [(&str, &[&str]); 10] = [
     ("geometry", &[]),
     ("imaging", &[]),
     ("messages", &["geometry", "imaging"]),
@@ -26,6 +26,7 @@ const ALGORITHMS: [(&str, &[&str]); 9] = [
     ("fiducial", &["geometry", "imaging", "markers"]),
     ("calibration", &["geometry"]),
     ("landing", &["geometry"]),
+    ("metering", &["imaging", "messages"]),
     ("rendering", &["geometry", "markers"]),
     ("world", &["autopilot", "geometry"]),
 ];
@@ -42,7 +43,7 @@ const FLIGHTLOG: (&str, &[&str]) = ("flightlog", &["autopilot", "messages"]);
 /// Answers over HTTP.
 const WEB: (&str, &[&str]) = ("web", &["node"]);
 /// What a service or a tool may know.
-const ROOMS: [&str; 13] = [
+const ROOMS: [&str; 14] = [
     "airlink",
     "autopilot",
     "calibration",
@@ -54,6 +55,7 @@ const ROOMS: [&str; 13] = [
     "markers",
     "media",
     "messages",
+    "metering",
     "node",
     "web",
 ];

@@ -323,6 +323,20 @@ impl<M: Message> Subscriber<M> {
         }
     }
 
+    /// The next valid message that has arrived already.
+    pub fn waiting(&self) -> Option<M> {
+        let initial = self.initial.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        if let Some((_key, message)) = initial {
+            return Some(message);
+        }
+        loop {
+            let sample = self.subscriber.try_recv().ok()??;
+            if let Some(message) = self.decode(&sample) {
+                return Some(message);
+            }
+        }
+    }
+
     fn decode(&self, sample: &Sample) -> Option<M> {
         decode(&sample.payload().to_bytes())
             .map_err(|problem| report_refused(&self.health, sample.key_expr().as_str(), &problem))

@@ -127,6 +127,22 @@ impl Renderer {
         &self.settings
     }
 
+    /// Takes the next frames with this exposure time, in seconds, and gain, in this light on the scene.
+    ///
+    /// # Errors
+    /// [`RenderError::Setting`] for what no camera or scene has.
+    pub fn expose(&mut self, exposure_s: f64, gain: f64, light: f64) -> Result<(), RenderError> {
+        let settings = CameraSettings { exposure_s, gain, ..self.settings.clone() };
+        settings.check()?;
+        if !(light.is_finite() && light >= 0.0) {
+            return Err(RenderError::Setting("the light is below 0"));
+        }
+        self.settings = settings;
+        self.levels_per_reflectance = self.settings.levels_per_reflectance(light) as f32;
+        self.sensor.amplify(&self.settings);
+        Ok(())
+    }
+
     /// Moves a pad. An invalid index is ignored.
     pub fn move_pad(&mut self, index: usize, ned_from_marker: Transform<Ned, MarkerFrame>) {
         let first = self.paintings.len() - self.pads;

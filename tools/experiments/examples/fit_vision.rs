@@ -117,7 +117,8 @@ impl Fitter {
         let (sin, cos) = (turn * towards).sin_cos();
         let velocity = Vector::new(cos, sin, 0.0) * speed_m_s;
         let truth = VehicleTruth { position, ned_from_body, velocity, ..self.still };
-        let request = FrameRequest { sequence: seed, time_s: 0.0, begun_s: None, pad: self.pad };
+        let request =
+            FrameRequest { sequence: seed, time_s: 0.0, stamp_ns: 0, begun_s: None, pad: self.pad };
         let right = self.camera.camera_from_marker(&truth, &self.pad);
         let half = 0.5 * self.marker_m;
         let corners = [(half, half), (half, -half), (-half, half), (-half, -half)];

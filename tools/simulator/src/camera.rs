@@ -3,6 +3,8 @@
 
 use anyhow::Context;
 use geometry::{Body, Camera, Marker, Ned, Pixel, Rotation, Transform, Vector};
+use imaging::GrayView;
+use messages::Detections;
 use rendering::occluder::Line;
 use rendering::{CameraSettings, Occluder, RenderError, Renderer, Scene};
 use world::camera::{Passage, Shutter};
@@ -10,6 +12,7 @@ use world::pad::PadState;
 use world::vehicle::VehicleTruth;
 
 use crate::config::{Config, OccluderKind, OccluderSettings};
+use crate::exposing::Exposing;
 
 /// Number of poses during an exposure.
 const POSES: usize = 5;
@@ -29,6 +32,8 @@ pub struct FrameRequest {
     pub sequence: u64,
     /// Time of mid-exposure, in seconds of the simulation.
     pub time_s: f64,
+    /// The same as a stamp.
+    pub stamp_ns: i64,
     /// Time since the beginning of the scenario, in seconds.
     pub begun_s: Option<f64>,
     /// The pad at that time.
@@ -46,6 +51,26 @@ pub struct SimCamera {
     shutter: Shutter,
     occluder: OccluderSettings,
     marker_m: f64,
+    exposing: Exposing,
+    light: LightSettings,
+    /// Exposure time times gain times light for which the levels of what lies between camera and pad are stated.
+    nominal: f64,
+}
+
+/// The light on the scene.
+#[derive(Copy, Clone, Debug)]
+struct LightSettings {
+    light: f64,
+    /// By how many stops it changes, and when, in seconds of the scenario.
+    step_stops: f64,
+    step_at_s: f64,
+}
+
+impl LightSettings {
+    fn at(self, begun_s: Option<f64>) -> f64 {
+        let has_changed = begun_s.is_some_and(|now_s| now_s >= self.step_at_s);
+        self.light * if has_changed { self.step_stops.exp2() } else { 1.0 }
+    }
 }
 
 impl SimCamera {
@@ -62,8 +87,18 @@ impl SimCamera {
         let tilt = Rotation::<Body, Body>::from_euler(roll, pitch, 0.0);
         let body_from_camera = Transform::new(tilt * nominal.rotation(), nominal.origin());
         let marker = config.pad_marker().map_err(anyhow::Error::msg)?;
+        let ground = &config.ground;
+        let light = LightSettings {
+            light: ground.light,
+            step_stops: ground.light_step_stops,
+            step_at_s: ground.light_step_at_s,
+        };
+        let usual = config.exposed_for(ground.light);
         Ok(Self {
             true_settings: CameraSettings { body_from_camera, ..settings.clone() },
+            exposing: Exposing::new(config, &settings),
+            light,
+            nominal: usual.exposure_s * usual.gain * ground.light,
             scene,
             settings,
             seed: config.seed,
@@ -74,7 +109,7 @@ impl SimCamera {
         })
     }
 
-    /// The published camera, without the error of its mount.
+    /// The published camera, without the error of its mount; exposure and gain are those of the frame that was opened last.
     pub fn settings(&self) -> &CameraSettings {
         &self.settings
     }
@@ -92,8 +127,20 @@ impl SimCamera {
 
     /// Opens the shutter; `None` when the frame is lost.
     pub fn open(&mut self, request: &FrameRequest, truth: &VehicleTruth) -> Option<Passage> {
+        let setting = self.exposing.open(request.sequence);
+        (self.settings.exposure_s, self.settings.gain) = (setting.exposure_s, setting.gain);
         let height_m = request.pad.position.z() - truth.position.z();
         self.shutter.take(request.begun_s, height_m)
+    }
+
+    /// Takes a detector's message: where the pad is, for the exposure.
+    pub fn detected(&mut self, message: &Detections) {
+        self.exposing.detected(message);
+    }
+
+    /// The detector that the controller uses.
+    pub fn use_detector(&mut self, detector: Option<&str>) {
+        self.exposing.use_detector(detector);
     }
 
     /// Renders a frame into `out`. `truth_at` gives the vehicle's state at a time, in seconds of the
@@ -120,12 +167,18 @@ impl SimCamera {
         let pads: Vec<_> = (0..self.scene.pads.len())
             .filter_map(|i| self.ned_from_marker(i, &request.pad))
             .collect();
+        let light = self.light.at(request.begun_s);
+        let CameraSettings { exposure_s, gain, .. } = self.settings;
         let renderer = self.renderer().context("setting up the simulated camera")?;
+        renderer.expose(exposure_s, gain, light)?;
         for (index, pad) in pads.into_iter().enumerate() {
             renderer.move_pad(index, pad);
         }
         let mut apply = |v: usize, light: &mut [f32]| occluder.apply(v, light);
         renderer.render_through(&mut apply, &poses, request.sequence, out)?;
+        let model = &self.settings.model;
+        let frame = GrayView::packed(out, model.width as usize, model.height as usize)?;
+        self.exposing.taken(request.sequence, request.stamp_ns, frame);
         Ok(())
     }
 
@@ -159,17 +212,23 @@ impl SimCamera {
             return Occluder::None;
         };
         let size_px = self.marker_m * model.fx / camera_from_marker.origin().z();
+        // What adds light is brighter, too, in a frame that is exposed longer.
+        let CameraSettings { exposure_s, gain, .. } = self.settings;
+        let exposed = exposure_s * gain * self.light.at(request.begun_s) / self.nominal;
         match kind {
             _ if !(is_time && is_low) => Occluder::None,
             OccluderKind::None => Occluder::None,
             OccluderKind::Glare => Occluder::Glare {
                 centre: Pixel::new(centre.x + 0.5 * size_px, centre.y),
                 radius_px: (0.5 * size_px) as f32,
-                levels: (GLARE_LEVELS * strength) as f32,
+                levels: (GLARE_LEVELS * strength * exposed) as f32,
             },
             OccluderKind::Cover => {
                 let through = Pixel::new(centre.x + size_px * (0.5 - strength), centre.y);
-                Occluder::Cover { edge: Line { through, normal: 0.0 }, level: COVER_LEVEL }
+                Occluder::Cover {
+                    edge: Line { through, normal: 0.0 },
+                    level: COVER_LEVEL * exposed as f32,
+                }
             }
             OccluderKind::Shadow => Occluder::Shadow {
                 // Through the centre, turned against the marker's sides.
@@ -179,7 +238,7 @@ impl SimCamera {
             },
             OccluderKind::Haze => Occluder::Haze {
                 transmission: 1.0 - strength as f32,
-                levels: 120.0 * strength as f32,
+                levels: (120.0 * strength * exposed) as f32,
             },
         }
     }

@@ -142,6 +142,18 @@ table! {
     }
 }
 
+/// How the camera sets exposure and gain.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ExposureKind {
+    /// Never after the start.
+    Fixed,
+    /// By the mean of its frames, as a camera's own metering.
+    Average,
+    /// For the marker, as camera-pub does; without one by the mean.
+    Marker,
+}
+
 table! {
     /// The wind.
     WindSettings: "wind" {
@@ -182,7 +194,9 @@ table! {
     GroundSettings: "ground" {
         surface: String,
         painted_marks: u32 = 0..=1000,
-        light: f64 = 0.001..=2.0,
+        light: f64 = 0.001..=100.0,
+        light_step_stops: f64 = -10.0..=10.0,
+        light_step_at_s: f64 = 0.0..=3600.0,
     }
 }
 
@@ -198,6 +212,9 @@ table! {
         blur_px: f64 = 0.0..=3.0,
         white_level: f64 = 20.0..=255.0,
         max_exposure_ms: f64 = 0.01..=100.0,
+        exposure: ExposureKind,
+        max_gain: f64 = 1.0..=1000.0,
+        set_for_light: f64 = 0.0..=100.0,
         noise: bool,
         processing: String,
         mount_error_deg: f64 = 0.0..=10.0,
@@ -319,8 +336,14 @@ impl Config {
         })
     }
 
-    /// The camera and its settings.
+    /// The camera and the settings with which it begins.
     pub fn camera_settings(&self) -> CameraSettings {
+        let set_for = self.camera.set_for_light;
+        self.exposed_for(if set_for > 0.0 { set_for } else { self.ground.light })
+    }
+
+    /// The camera, exposed for this light.
+    pub(crate) fn exposed_for(&self, light: f64) -> CameraSettings {
         let camera = &self.camera;
         let thesis = CameraSettings::thesis();
         let mount = Point::new(0.0, 0.0, -camera.mount_height_m);
@@ -333,7 +356,7 @@ impl Config {
             processing: camera.processing.parse::<Preset>().unwrap_or_default().processing(),
             ..thesis
         }
-        .exposed_for(self.ground.light, camera.white_level, camera.max_exposure_ms * 1e-3)
+        .exposed_for(light, camera.white_level, camera.max_exposure_ms * 1e-3)
     }
 }
 

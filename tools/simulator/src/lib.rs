@@ -3,11 +3,12 @@
 //!
 //! It replaces camera-pub and the autopilot by using the same topics and MAVLink; no service knows of it.
 //!
-//! Modules in reading order: [`config`] has the keys, [`camera`] is the camera as a function, [`reported`] a
-//! vehicle that a real autopilot flies, [`service`] runs everything in real time.
+//! Modules in reading order: [`config`] has the keys, [`camera`] is the camera as a function, `exposing` sets its
+//! exposure, [`reported`] is a vehicle that a real autopilot flies, [`service`] runs everything in real time.
 
 pub mod camera;
 pub mod config;
+mod exposing;
 pub mod reported;
 pub mod service;
 

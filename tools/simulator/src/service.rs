@@ -12,8 +12,11 @@ use airlink::AirSender;
 use anyhow::Context;
 use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use autopilot::{Address, Link, LinkEvent, Parser, Sender};
-use messages::{CameraInfo, FrameHeader, MavlinkBytes, PixelFormat, Touchdown, Truth, Wind, topic};
-use node::{FramePublisher, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
+use messages::{
+    CameraInfo, ControllerStatus, Detections, FrameHeader, MavlinkBytes, PixelFormat, Touchdown,
+    Truth, Wind, topic,
+};
+use node::{FramePublisher, Loan, Node, Publisher, Shutdown, Subscriber, clock_name, now_ns};
 use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval};
@@ -23,7 +26,7 @@ use world::vehicle::VehicleTruth;
 use world::world::World;
 
 use crate::camera::{FrameRequest, SimCamera};
-use crate::config::{Config, VehicleKind};
+use crate::config::{Config, ExposureKind, VehicleKind};
 use crate::reported::ReportedVehicle;
 
 /// Interval at which the simulation advances.
@@ -246,7 +249,7 @@ async fn advance(node: &Node, config: &Config, simulation: &Simulation) -> anyho
 enum AutopilotSide {
     Link(Link),
     Topics {
-        packets: node::Subscriber<MavlinkBytes>,
+        packets: Subscriber<MavlinkBytes>,
         requests: Publisher<MavlinkBytes>,
         requested_s: f64,
     },
@@ -349,11 +352,20 @@ struct Delayed {
     pixels: Loan,
 }
 
+/// What tells where the pad is.
+struct Sightings {
+    detections: Subscriber<Detections>,
+    /// Names the detector in use.
+    status: Subscriber<ControllerStatus>,
+}
+
 /// The camera's thread.
 struct Camera {
     node: Node,
     simulation: Arc<Simulation>,
     sensor: SimCamera,
+    /// For an exposure that follows the marker.
+    sightings: Option<Sightings>,
     delayed: VecDeque<Delayed>,
     frames: FramePublisher,
     air: AirSender,
@@ -374,8 +386,16 @@ impl Camera {
         let bytes = config.camera.width as usize * config.camera.height as usize;
         let info = CameraInfo::new(name, &settings.model, &settings.body_from_camera);
         let jpegs = node.frame_publisher(topic::JPEG, &[name], 0).await?;
+        let sightings = match config.camera.exposure {
+            ExposureKind::Marker => Some(Sightings {
+                detections: node.subscriber(topic::DETECTIONS, &[]).await?,
+                status: node.subscriber(topic::STATUS, &[]).await?,
+            }),
+            _ => None,
+        };
         Ok(Self {
             sensor,
+            sightings,
             delayed: VecDeque::new(),
             frames: node.frame_publisher(topic::FRAME, &[name], bytes).await?,
             air: AirSender::start(node, name, jpegs, &config.air).await?,
@@ -418,6 +438,17 @@ impl Camera {
         Ok((stopped, thread))
     }
 
+    /// Tells the sensor where the pad was seen.
+    fn follow_pad(&mut self) {
+        let Some(sightings) = &self.sightings else { return };
+        while let Some(status) = sightings.status.waiting() {
+            self.sensor.use_detector(status.active_detector.as_deref());
+        }
+        while let Some(message) = sightings.detections.waiting() {
+            self.sensor.detected(&message);
+        }
+    }
+
     /// Takes a frame and publishes it.
     async fn take(&mut self, sequence: u64, time_s: f64) {
         if sequence.is_multiple_of((1.0 / self.period_s).ceil() as u64) {
@@ -425,7 +456,9 @@ impl Camera {
         }
         let Some(truth) = self.simulation.truth_at(time_s) else { return };
         let (begun_s, pad) = self.simulation.pad_at(time_s);
-        let request = FrameRequest { sequence, time_s, begun_s, pad };
+        let stamp_ns = self.simulation.stamp_ns(time_s);
+        let request = FrameRequest { sequence, time_s, stamp_ns, begun_s, pad };
+        self.follow_pad();
         let Some(passage) = self.sensor.open(&request, &truth) else { return };
         let started_ns = now_ns();
         let mut frame = self.frames.loan(self.info.width as usize * self.info.height as usize);

@@ -38,7 +38,6 @@ impl Sensor {
                 deviate * std::f32::consts::FRAC_1_SQRT_2
             })
             .collect();
-        let levels_per_electron = 255.0 * settings.gain / settings.full_well_e;
         let model = &settings.model;
         let loss = |count: u32, centre: f64, focal: f64| {
             // cos^4 of the angle off axis is 1 - 2 tan^2 to first order.
@@ -46,17 +45,24 @@ impl Sensor {
                 |i| (settings.vignetting * 2.0 * ((f64::from(i) - centre) / focal).powi(2)) as f32;
             (0..count).map(at).collect()
         };
-        Self {
+        let mut sensor = Self {
             seed: mix(seed),
-            shot: if settings.noise { levels_per_electron as f32 } else { 0.0 },
-            read: if settings.noise {
-                (settings.read_noise_e * levels_per_electron).powi(2) as f32
-            } else {
-                0.0
-            },
+            shot: 0.0,
+            read: 0.0,
             deviates,
             column_loss: loss(model.width, model.cx, model.fx),
             row_loss: loss(model.height, model.cy, model.fy),
+        };
+        sensor.amplify(settings);
+        sensor
+    }
+
+    /// Sets the noise to that of the settings' gain.
+    pub(super) fn amplify(&mut self, settings: &CameraSettings) {
+        let levels_per_electron = 255.0 * settings.gain / settings.full_well_e;
+        if settings.noise {
+            self.shot = levels_per_electron as f32;
+            self.read = (settings.read_noise_e * levels_per_electron).powi(2) as f32;
         }
     }
 

@@ -206,6 +206,7 @@ impl<'a> LockstepFlight<'a> {
         while self.in_transit.front().is_some_and(|arrival| arrival.at_s <= now_s) {
             if let Some(arrival) = self.in_transit.pop_front() {
                 let (now_ns, message) = (stamp_ns(now_s), &arrival.message);
+                self.vision.detected(message);
                 let is_used = self.controller.detections(now_ns, DETECTOR, message);
                 if let Some(recording) = &mut self.recording {
                     recording.detections(now_ns, message, self.controller.flight(), is_used)?;

@@ -87,6 +87,11 @@ impl SimVision {
         self.camera.settings().exposure_s
     }
 
+    /// Tells the camera what a detector found, for its exposure.
+    pub fn detected(&mut self, message: &Detections) {
+        self.camera.detected(message);
+    }
+
     /// Takes a frame and finds the marker. `stamp_ns` converts the time of the world to a stamp.
     ///
     /// # Errors
@@ -100,7 +105,8 @@ impl SimVision {
     ) -> anyhow::Result<Vec<Arrival>> {
         let truth = world.truth_at(time_s);
         let begun_s = world.since_begin_s(time_s);
-        let request = FrameRequest { sequence, time_s, begun_s, pad: world.pad_at(time_s) };
+        let pad = world.pad_at(time_s);
+        let request = FrameRequest { sequence, time_s, stamp_ns: stamp_ns(time_s), begun_s, pad };
         let Some(passage) = self.camera.open(&request, &truth) else { return Ok(Vec::new()) };
         let detections = match &mut self.detector {
             SimDetector::Rendered { detector, pixels } => {

@@ -1,0 +1,233 @@
+//! The next exposure time and gain.
+
+use crate::region::Levels;
+
+/// The grey level that the pad's white shall have, of full scale: in the middle, as factors go, of [`GOOD`].
+const TARGET: f64 = 0.72;
+/// Levels of white at which nothing is changed: within 60 to 85 % of full scale, with room for noise.
+const GOOD: std::ops::RangeInclusive<f64> = 0.63..=0.82;
+/// The level from which on white is clipped, and how much brighter it is remains open.
+const CLIPPED: f64 = 0.98;
+/// How much brighter clipped white is at least taken to be than full scale: halves the light once it is near.
+const MIN_CLIPPED: f64 = 1.4;
+/// White and black that are both clipped: three stops down.
+const ALL_CLIPPED: f64 = 8.0 * TARGET;
+/// How much brighter white is than black when white is clipped. Prints have 10 to 20; haze, and the lens, take from that.
+const WHITE_PER_BLACK: f64 = 8.0;
+/// A region that is lighter than this and has less contrast shows no pad.
+const MAX_FLAT: f64 = 0.1;
+const MIN_CONTRAST: f64 = 1.3;
+/// Maximum change in one step.
+const MAX_STEP: f64 = 64.0;
+/// Maximum blur by motion during the exposure, in pixels.
+const MAX_BLUR_PX: f64 = 1.0;
+/// How much longer than the blur allows an exposure stays as it is, and how much shorter, when gain makes up for it: what
+/// changes with every frame never settles in a camera that needs some frames for a change.
+const LONGER: f64 = 1.1;
+const SHORTER: f64 = 0.6;
+/// Changes below this are none.
+const MIN_CHANGE: f64 = 0.03;
+
+/// An exposure time and a gain.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Setting {
+    /// Exposure time, in seconds.
+    pub exposure_s: f64,
+    /// How much brighter the frame is than at the sensor's smallest gain; from 1.
+    pub gain: f64,
+}
+
+/// What a camera can be set to.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Limits {
+    /// Minimum exposure time, in seconds.
+    pub min_exposure_s: f64,
+    /// Maximum exposure time, in seconds.
+    pub max_exposure_s: f64,
+    /// Maximum gain.
+    pub max_gain: f64,
+}
+
+/// A frame of the pad.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Seen {
+    /// The setting with which this frame was taken, whatever was ordered since.
+    pub setting: Setting,
+    /// The pad's levels in it.
+    pub levels: Levels,
+    /// How fast the pad moves, in pixels per second.
+    pub motion_px_s: f64,
+}
+
+impl Setting {
+    /// How much light it makes of the same scene, relative to others.
+    fn light(self) -> f64 {
+        self.exposure_s * self.gain
+    }
+}
+
+/// The setting for the next frames; `None` when that of this frame is good, or the region shows no pad.
+///
+/// The step follows from the frame's own setting, so that frames which were under way when a setting was ordered are not
+/// counted twice. It takes grey levels to be proportional to light. Tone curves rise more slowly, never faster, so that it
+/// is then too small and never too large: exact after one step for a linear camera, after a few for others. Of clipped
+/// white it is only known that it is too much; black tells how much.
+pub fn next_setting(seen: &Seen, limits: &Limits) -> Option<Setting> {
+    let Levels { white, black } = seen.levels;
+    let is_flat = white < MIN_CONTRAST * black && white < CLIPPED;
+    if black > MAX_FLAT && is_flat {
+        return None;
+    }
+    let step = if GOOD.contains(&white) { 1.0 } else { TARGET / brightness(seen.levels) };
+    let light = seen.setting.light() * step.clamp(1.0 / MAX_STEP, MAX_STEP);
+    let next = share(light, seen.motion_px_s, limits);
+    let is_sharp = seen.setting.exposure_s <= LONGER * next.exposure_s;
+    let is_long = seen.setting.exposure_s >= SHORTER * next.exposure_s;
+    if step == 1.0 && is_sharp && is_long {
+        return None;
+    }
+    let is_same = |now: f64, next: f64| (next / now - 1.0).abs() < MIN_CHANGE;
+    let same =
+        is_same(seen.setting.exposure_s, next.exposure_s) && is_same(seen.setting.gain, next.gain);
+    (!same && next.exposure_s.is_finite() && next.gain.is_finite()).then_some(next)
+}
+
+/// How bright white is, of full scale; estimated where it is clipped, or too dark for a level of its own.
+fn brightness(levels: Levels) -> f64 {
+    let Levels { white, black } = levels;
+    match (white >= CLIPPED, black >= CLIPPED) {
+        (true, true) => ALL_CLIPPED,
+        (true, false) => (WHITE_PER_BLACK * black).max(MIN_CLIPPED),
+        _ => white.max(0.5 / 255.0),
+    }
+}
+
+/// Shares light between exposure, as long as nothing blurs, and gain.
+fn share(light: f64, motion_px_s: f64, limits: &Limits) -> Setting {
+    let sharp_s = if motion_px_s > 0.0 { MAX_BLUR_PX / motion_px_s } else { f64::INFINITY };
+    let max_s = sharp_s.min(limits.max_exposure_s).max(limits.min_exposure_s);
+    let exposure_s = light.min(max_s).max(limits.min_exposure_s);
+    let gain = (light / exposure_s).clamp(1.0, limits.max_gain.max(1.0));
+    Setting { exposure_s, gain }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const LIMITS: Limits = Limits { min_exposure_s: 20e-6, max_exposure_s: 8e-3, max_gain: 64.0 };
+    /// 1/16 of white's reflectance.
+    const BLACK: f64 = 1.0 / 16.0;
+
+    /// A camera in some light, with a tone curve.
+    struct Camera {
+        /// White's level at an exposure of one second and gain 1.
+        light: f64,
+        gamma: f64,
+    }
+
+    impl Camera {
+        fn levels(&self, setting: Setting) -> Levels {
+            let level = |reflectance: f64| {
+                let light: f64 = self.light * setting.light() * reflectance;
+                (light.min(1.0).powf(1.0 / self.gamma) * 255.0).round() / 255.0
+            };
+            Levels { white: level(1.0), black: level(BLACK) }
+        }
+
+        /// Number of settings until nothing is changed any more, and the last one.
+        fn settle(&self, mut setting: Setting, motion_px_s: f64) -> Settled {
+            for steps in 0..30 {
+                let seen = Seen { setting, levels: self.levels(setting), motion_px_s };
+                match next_setting(&seen, &LIMITS) {
+                    Some(next) => setting = next,
+                    None => return Settled { steps, setting, white: seen.levels.white },
+                }
+            }
+            panic!("it never settles: {setting:?}");
+        }
+    }
+
+    #[derive(Debug)]
+    struct Settled {
+        steps: u32,
+        setting: Setting,
+        white: f64,
+    }
+
+    #[test]
+    fn six_stops_of_light_are_made_up_for_in_a_few_steps() {
+        for (gamma, max_steps) in [(1.0, 5), (2.2, 6)] {
+            let day = Camera { light: 200.0, gamma };
+            let before = day.settle(Setting { exposure_s: 1e-3, gain: 1.0 }, 0.0);
+            for stops in -6..=6 {
+                let camera = Camera { light: 200.0 * f64::powi(2.0, stops), gamma };
+                let after = camera.settle(before.setting, 0.0);
+                assert!((0.6..=0.85).contains(&after.white), "{gamma} {stops}: {after:?}");
+                assert!(after.steps <= max_steps, "{gamma} {stops}: {after:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn gain_comes_second_and_an_exposure_never_blurs_by_more_than_a_pixel() {
+        let camera = Camera { light: 200.0, gamma: 1.0 };
+        let still = camera.settle(Setting { exposure_s: 1e-3, gain: 16.0 }, 0.0);
+        assert_eq!(still.setting.gain, 1.0, "{still:?}");
+        let moving = camera.settle(still.setting, 1000.0);
+        assert!(moving.setting.exposure_s <= 1.1e-3 && moving.setting.gain > 3.0, "{moving:?}");
+        assert!((0.6..=0.85).contains(&moving.white), "{moving:?}");
+        let again = camera.settle(moving.setting, 0.0);
+        assert_eq!(again.setting.gain, 1.0, "{again:?}");
+    }
+
+    #[test]
+    fn in_the_dark_it_stays_at_the_limits() {
+        let night = Camera { light: 0.3, gamma: 1.0 };
+        let settled = night.settle(Setting { exposure_s: 1e-3, gain: 1.0 }, 500.0);
+        assert_eq!(settled.setting, Setting { exposure_s: 2e-3, gain: 64.0 });
+    }
+
+    #[test]
+    fn a_region_without_contrast_changes_nothing() {
+        let setting = Setting { exposure_s: 1e-3, gain: 2.0 };
+        let seen =
+            |white, black| Seen { setting, levels: Levels { white, black }, motion_px_s: 0.0 };
+        assert_eq!(next_setting(&seen(0.5, 0.45), &LIMITS), None);
+        assert!(next_setting(&seen(0.5, 0.05), &LIMITS).is_some());
+        // Far too light, and far too dark.
+        assert!(next_setting(&seen(1.0, 1.0), &LIMITS).is_some_and(|next| next.light() < 3e-4));
+        assert!(next_setting(&seen(0.0, 0.0), &LIMITS).is_some_and(|next| next.light() > 0.1));
+    }
+
+    proptest! {
+        /// In any light in which the limits allow it, whatever the curve, white settles, and stays.
+        #[test]
+        fn white_settles_within_its_range(
+            stops in -7.0..7.0f64, gamma in 1.0..2.4f64,
+            exposure_s in 20e-6..8e-3f64, gain in 1.0..64.0f64, motion_px_s in 0.0..1000.0f64,
+        ) {
+            let camera = Camera { light: 200.0 * stops.exp2(), gamma };
+            let needed = 0.72f64.powf(gamma) / camera.light;
+            let fastest = (1.0 / motion_px_s.max(1.0)).min(8e-3);
+            prop_assume!((40e-6..0.8 * 64.0 * fastest).contains(&needed));
+            let settled = camera.settle(Setting { exposure_s, gain }, motion_px_s);
+            prop_assert!((0.6..=0.85).contains(&settled.white), "{settled:?}");
+            prop_assert!(settled.setting.exposure_s * motion_px_s <= 1.1 + 1e-9, "{settled:?}");
+            prop_assert!(settled.steps <= 10, "{settled:?}");
+        }
+
+        #[test]
+        fn whatever_is_seen_a_setting_is_within_the_limits(
+            exposure_s: f64, gain: f64, white: f64, black: f64, motion_px_s: f64,
+        ) {
+            let levels = Levels { white, black };
+            let seen = Seen { setting: Setting { exposure_s, gain }, levels, motion_px_s };
+            if let Some(next) = next_setting(&seen, &LIMITS) {
+                prop_assert!((20e-6..=8e-3).contains(&next.exposure_s), "{next:?}");
+                prop_assert!((1.0..=64.0).contains(&next.gain), "{next:?}");
+            }
+        }
+    }
+}
