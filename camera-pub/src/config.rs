@@ -14,6 +14,7 @@ use serde::Deserialize;
 use crate::exposure::{Shutter, StampedAt};
 use crate::side_channel::PLACEHOLDER;
 use crate::v4l2::capture::{ControlValue, Wanted};
+use crate::v4l2::exposer::ForMarker;
 use crate::v4l2::pixels::Pixels;
 
 /// The keys of `camera-pub.toml`, which explains them.
@@ -22,6 +23,7 @@ use crate::v4l2::pixels::Pixels;
 pub struct Config {
     id: String,
     pub(crate) source: SourceConfig,
+    exposure: ExposureConfig,
     pub(crate) air: AirConfig,
     calibration: CalibrationConfig,
     mount: MountConfig,
@@ -47,6 +49,26 @@ pub(crate) struct SourceConfig {
     stamp_at: String,
     readout_ms: f64,
     timeout_s: f64,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ExposureConfig {
+    control: ExposureControl,
+    max_ms: f64,
+    gain: String,
+    max_gain: f64,
+    settle_frames: u32,
+}
+
+/// Who sets the exposure.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum ExposureControl {
+    /// The camera, as its controls say.
+    Camera,
+    /// This service, for the marker.
+    Marker,
 }
 
 /// A program that writes frames.
@@ -166,7 +188,11 @@ impl Settings for Config {
         check.one_of("source.fourcc", &self.source.fourcc, &fourccs);
         check.parses("source.controls", self.source.control_values());
         check.parses("source.command", self.source.program());
-        check.parses("source.device", self.source.device());
+        check.parses("source.device", self.device());
+        check.parses("exposure.control", self.exposure.needs_device(&self.source));
+        check.range("exposure.max_ms", self.exposure.max_ms, 0.1..=100.0);
+        check.range("exposure.max_gain", self.exposure.max_gain, 1.0..=1000.0);
+        check.range("exposure.settle_frames", self.exposure.settle_frames, 0..=30);
         for (key, value, range) in self.air.ranges() {
             check.range(key, value, range);
         }
@@ -208,6 +234,37 @@ impl Config {
             _ => (middle.cx, middle.cy),
         };
         Ok(Some(CameraModel { fy, cx, cy, distortion, ..middle }))
+    }
+
+    /// True when the exposure follows the marker.
+    pub(crate) fn exposes_for_marker(&self) -> bool {
+        self.exposure.control == ExposureControl::Marker
+    }
+
+    /// The camera of Video4Linux; `None` where frames come from elsewhere.
+    pub(crate) fn device(&self) -> anyhow::Result<Option<DeviceConfig>> {
+        let source = &self.source;
+        if source.device == Path::new("") {
+            return Ok(None);
+        }
+        ensure!(
+            source.paths.is_empty() && source.command.is_empty() && source.bayer.is_empty(),
+            "with a device, `source.paths`, `source.command` and `source.bayer` must be empty"
+        );
+        let size = source.size("the camera's frames; `alight cameras` lists them")?;
+        let [width, height] = source.size_px;
+        let wanted = Wanted {
+            fourcc: source.fourcc.clone(),
+            width,
+            height,
+            rate_hz: source.rate_hz,
+            controls: source.control_values()?,
+            for_marker: self.exposure.for_marker(),
+            stamped_at: source.stamped_at(),
+            readout_ns: source.readout_ns(),
+            delay_ns: source.delay_ns(),
+        };
+        Ok(Some(DeviceConfig { path: source.device.clone(), size, wanted }))
     }
 
     /// The camera's mount on the vehicle.
@@ -272,30 +329,6 @@ impl SourceConfig {
         }))
     }
 
-    /// The camera of Video4Linux; `None` where frames come from elsewhere.
-    pub(crate) fn device(&self) -> anyhow::Result<Option<DeviceConfig>> {
-        if self.device == Path::new("") {
-            return Ok(None);
-        }
-        ensure!(
-            self.paths.is_empty() && self.command.is_empty() && self.bayer.is_empty(),
-            "with a device, `source.paths`, `source.command` and `source.bayer` must be empty"
-        );
-        let size = self.size("the camera's frames; `alight cameras` lists them")?;
-        let [width, height] = self.size_px;
-        let wanted = Wanted {
-            fourcc: self.fourcc.clone(),
-            width,
-            height,
-            rate_hz: self.rate_hz,
-            controls: self.control_values()?,
-            stamped_at: self.stamped_at(),
-            readout_ns: self.readout_ns(),
-            delay_ns: self.delay_ns(),
-        };
-        Ok(Some(DeviceConfig { path: self.device.clone(), size, wanted }))
-    }
-
     /// The size of a camera's frames.
     fn size(&self, whose: &str) -> anyhow::Result<FrameSize> {
         let [width, height] = self.size_px.map(|edge| edge as usize);
@@ -347,6 +380,25 @@ impl SourceConfig {
             "" => None,
             name => Some(name.parse()?),
         })
+    }
+}
+
+impl ExposureConfig {
+    fn for_marker(&self) -> Option<ForMarker> {
+        (self.control == ExposureControl::Marker).then(|| ForMarker {
+            max_exposure_s: self.max_ms * 1e-3,
+            gain: self.gain.clone(),
+            max_gain: self.max_gain,
+            settle_frames: self.settle_frames,
+        })
+    }
+
+    fn needs_device(&self, source: &SourceConfig) -> Result<(), &'static str> {
+        let has_device = source.device != Path::new("");
+        holds(
+            has_device || self.control == ExposureControl::Camera,
+            "`marker` needs `source.device`: the exposure of a program or of files is set elsewhere",
+        )
     }
 }
 

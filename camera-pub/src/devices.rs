@@ -107,7 +107,7 @@ fn suggested_rate_hz(size: &SizeDescription) -> f64 {
 /// # Errors
 /// The configuration has no device, or that gives no picture.
 pub fn take_picture(config: &crate::Config) -> anyhow::Result<GrayImage> {
-    let device = config.source.device()?.context("`source.device` is empty")?;
+    let device = config.device()?.context("`source.device` is empty")?;
     let whose = || format!("taking a picture with {:?}", device.path);
     picture(DevicePath(device.path.clone()), &device, config.max_pixels()).with_context(whose)
 }
@@ -206,7 +206,7 @@ mod tests {
             ("MJPG", 3840, 2160, 30.0),
         ]);
         let table = source_table(Path::new("/dev/video2"), &description).unwrap();
-        let device = config(&table).source.device().unwrap().unwrap();
+        let device = config(&table).device().unwrap().unwrap();
         assert_eq!(device.path, Path::new("/dev/video2"));
         let wanted = device.wanted;
         assert_eq!((&*wanted.fourcc, wanted.width, wanted.rate_hz), ("MJPG", 1280, 60.0));
@@ -236,7 +236,7 @@ mod tests {
         let config = config(
             "[source]\ndevice = \"/dev/video0\"\nfourcc = \"YUYV\"\nsize_px = [640, 480]\nrate_hz = 100\n",
         );
-        let device = config.source.device().unwrap().unwrap();
+        let device = config.device().unwrap().unwrap();
         let picture = picture(Rc::clone(&fake), &device, 1 << 20).unwrap();
         let number = u32::from_le_bytes(picture.pixels()[..4].try_into().unwrap());
         assert!((15..30).contains(&number), "frame {number}");

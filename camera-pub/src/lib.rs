@@ -1,16 +1,17 @@
 //! Light to frames: images are published with their stamp, and with the camera's calibration and mount.
 //!
-//! Frames come from a program that reads a camera, or from image files. The crate knows no marker, no vehicle
-//! and no detector.
+//! Frames come from a program that reads a camera, or from image files. The crate knows no vehicle, and of
+//! detectors only what they have found where, which a camera can be exposed for.
 //!
 //! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, `program` reads what
 //! a camera's program writes, `side_channel` what it tells of each frame beside: `metadata` splits that, `pairing`
 //! finds each frame's own, `exposure` says from its stamp when the frame was exposed.
-//! `v4l2` reads cameras without a program; [`devices`] lists those of this machine.
+//! `v4l2` reads cameras without a program, `marker` says how they are exposed for the marker; [`devices`] lists those of this machine.
 
 pub mod config;
 pub mod devices;
 mod exposure;
+mod marker;
 mod metadata;
 mod pairing;
 mod program;

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use airlink::AirSender;
 use anyhow::{Context, bail, ensure};
 use geometry::CameraModel;
-use imaging::{GrayImage, SampleFormat};
+use imaging::{GrayImage, GrayView, SampleFormat};
 use media::{DecodedImage, frame_bytes, images_in, samples_to_grey};
 use messages::{BayerPattern, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
@@ -17,6 +17,7 @@ use tokio::sync::oneshot;
 
 use crate::config::{Config, DeviceConfig, FrameFormat, FrameSize, ProgramConfig};
 use crate::exposure::Exposure;
+use crate::marker::MarkerExposure;
 use crate::program::Program;
 use crate::v4l2::capture::{Lost, Taken};
 use crate::v4l2::kernel::DevicePath;
@@ -110,7 +111,7 @@ struct Found {
 }
 
 fn find(config: &Config) -> anyhow::Result<Found> {
-    if let Some(device) = config.source.device()? {
+    if let Some(device) = config.device()? {
         let (size, max_frame_bytes) = (device.size, device.size.pixels());
         return Ok(Found { source: Source::Device(device), size, max_frame_bytes });
     }
@@ -173,6 +174,7 @@ struct Stream {
     frames: FramePublisher,
     air: AirSender,
     health: Arc<HealthCounters>,
+    marker: MarkerExposure,
     sequence: u64,
 }
 
@@ -203,12 +205,17 @@ impl Stream {
     async fn new(node: &Node, config: &Config, found: &Found) -> anyhow::Result<Self> {
         let names = [config.instance()];
         let jpegs = node.frame_publisher(topic::JPEG, &names, 0).await?;
+        let mut marker = MarkerExposure::new(config.instance());
+        if config.exposes_for_marker() {
+            marker.listen(node).await?;
+        }
         Ok(Self {
             config: config.clone(),
             size: found.size,
             frames: node.frame_publisher(topic::FRAME, &names, found.max_frame_bytes).await?,
             air: AirSender::start(node, config.instance(), jpegs, &config.air).await?,
             health: node.shared_health(),
+            marker,
             sequence: 0,
         })
     }
@@ -301,9 +308,9 @@ impl Stream {
         }
     }
 
-    /// Takes a frame out of the driver's buffer and gives that back.
+    /// Takes a frame out of the driver's buffer, gives that back, and sets the exposure of later frames.
     fn prepare_taken<P: Port>(
-        &self,
+        &mut self,
         video: &mut Video<P>,
         taken: Taken,
         config: &DeviceConfig,
@@ -325,7 +332,14 @@ impl Stream {
             })
         };
         let counts = capture.take_counts();
-        let given_back = capture.give_back(taken);
+        let stamp_ns = taken.exposure.mid_ns;
+        let given_back = capture.give_back(taken).and_then(|()| {
+            let view = frame
+                .as_ref()
+                .and_then(|frame| GrayView::packed(&frame.pixels, frame.width, frame.height).ok());
+            let Some((exposed, view)) = capture.exposed().zip(view) else { return Ok(()) };
+            capture.expose(self.marker.after(stamp_ns, view, &exposed))
+        });
         for (reason, count) in [
             ("frames that the driver could not store", counts.missed),
             ("frames that the driver marked as damaged", counts.damaged),

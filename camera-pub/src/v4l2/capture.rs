@@ -10,8 +10,10 @@ use super::abi::{
     Mapping, PixFormat, RequestBuffers, StreamParm, text,
 };
 use super::describe::{ControlDescription, control_value, controls, describe, is_camera};
+use super::exposer::{Exposer, ForMarker, Order};
 use super::pixels::{Pixels, Rows};
 use crate::exposure::{Exposure, Shutter, StampedAt};
+use crate::marker::Exposed;
 
 /// Number of buffers that the driver fills in turn: one being read, the others for it. Fewer lose frames when the
 /// service is late by a period.
@@ -27,6 +29,8 @@ const EXPOSURE_READ_NS: i64 = 1_000_000_000;
 /// Number of frames in a row with an impossible stamp at the start after which the clock is refused, and of frames of
 /// another length after which the format has changed.
 const IN_A_ROW: u32 = 10;
+/// Change of the exposure time from which on stamps are not exact while it comes into force.
+const MAX_UNSURE_NS: u32 = 1_000_000;
 
 /// What a device is opened for.
 #[derive(Clone, Debug)]
@@ -37,6 +41,8 @@ pub(crate) struct Wanted {
     pub(crate) rate_hz: f64,
     /// Controls by name, in the order in which they are set.
     pub(crate) controls: Vec<ControlValue>,
+    /// For an exposure that follows the marker.
+    pub(crate) for_marker: Option<ForMarker>,
     /// What stamps are of, where it is configured; else what the driver says.
     pub(crate) stamped_at: Option<StampedAt>,
     pub(crate) readout_ns: i64,
@@ -113,6 +119,7 @@ pub(crate) struct Capture<D: Device> {
     exposure_ns: u32,
     /// When `exposure_ns` was read, so long ago at first that it is read.
     exposure_read_ns: i64,
+    exposer: Option<Exposer>,
     counts: Counts,
 }
 
@@ -141,6 +148,10 @@ impl<D: Device> Capture<D> {
         let rows = set_format(&device, wanted)?;
         let rate_hz = set_rate(&device, wanted.rate_hz)?;
         set_controls(&device, &wanted.controls)?;
+        let exposer = wanted.for_marker.as_ref().map(|wanted| {
+            let known = failed("VIDIOC_QUERY_EXT_CTRL", controls(&device))?;
+            Exposer::of(&known, wanted).map_err(Lost::Refused)
+        });
         let mut capture = Self {
             buffers: Vec::new(),
             device,
@@ -155,6 +166,7 @@ impl<D: Device> Capture<D> {
             cut_in_a_row: 0,
             exposure_ns: 0,
             exposure_read_ns: i64::MIN,
+            exposer: exposer.transpose()?,
             counts: Counts::default(),
         };
         // From here on `drop` gives back what there is.
@@ -166,6 +178,29 @@ impl<D: Device> Capture<D> {
     /// The rate at which the device gives frames.
     pub(crate) fn rate_hz(&self) -> f64 {
         self.rate_hz
+    }
+
+    /// How the newest frame was exposed; `None` where the exposure does not follow the marker.
+    pub(crate) fn exposed(&self) -> Option<Exposed> {
+        let exposer = self.exposer.as_ref()?;
+        Some(Exposed {
+            is_taken_over: exposer.is_taken_over(),
+            setting: exposer.setting(),
+            limits: exposer.limits(),
+        })
+    }
+
+    /// Sets the exposure of later frames.
+    ///
+    /// # Errors
+    /// The device is gone, or refuses.
+    pub(crate) fn expose(&mut self, order: Order) -> Result<(), Lost> {
+        let Some(exposer) = &mut self.exposer else { return Ok(()) };
+        let set = failed("VIDIOC_S_EXT_CTRLS", exposer.follow(&self.device, order))?;
+        if let Some(exposure_ns) = set {
+            (self.exposure_ns, self.exposure_read_ns) = (exposure_ns, self.device.now_ns());
+        }
+        Ok(())
     }
 
     /// What happened since the last call.
@@ -210,6 +245,9 @@ impl<D: Device> Capture<D> {
             Err(cause) => return failed("VIDIOC_DQBUF", Err(cause)),
         }
         let arrival_ns = self.device.now_ns();
+        if let Some(exposer) = &mut self.exposer {
+            exposer.frame();
+        }
         if let Some(last) = self.last_sequence.replace(buffer.sequence) {
             self.counts.missed += u64::from(buffer.sequence.wrapping_sub(last).saturating_sub(1));
         }
@@ -270,7 +308,10 @@ impl<D: Device> Capture<D> {
         if arrival_ns.saturating_sub(self.exposure_read_ns) > EXPOSURE_READ_NS {
             (self.exposure_ns, self.exposure_read_ns) = (self.exposure_time_ns(), arrival_ns);
         }
-        let exposure_ns = self.exposure_ns;
+        let unsure_ns = self.exposer.as_ref().map_or(0, Exposer::unsure_ns);
+        // Half of what is open is the stamp's error.
+        let is_known = unsure_ns < MAX_UNSURE_NS;
+        let exposure_ns = if is_known { self.exposure_ns } else { 0 };
         let delay_ns = arrival_ns.saturating_sub(stamp_ns);
         if !(shutter.until_read_ns(0)..=MAX_DELAY_NS).contains(&delay_ns) {
             self.impossible += 1;

@@ -24,6 +24,12 @@ use super::video::Port;
 pub(crate) const MS: i64 = 1_000_000;
 const PERIOD_NS: i64 = 10 * MS;
 const EXPOSURE_NS: i64 = 5 * MS;
+/// The unit of the exposure's control.
+const UNIT_NS: i64 = 100_000;
+/// Number of frames until a control is in force.
+const CONTROL_FRAMES: u32 = 3;
+/// Gain of its largest value.
+const MAX_GAIN: f64 = 16.0;
 /// From the last row's readout to the frame in the buffer.
 const DELIVERY_NS: i64 = 4 * MS;
 const GAIN: u32 = 0x0098_0913;
@@ -36,6 +42,13 @@ pub(crate) enum Stamps {
     FrameEnd,
     /// It does not say on which clock.
     Unknown,
+}
+
+/// How a frame was exposed.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) struct Exposed {
+    pub(crate) exposure_ns: i64,
+    pub(crate) gain: f64,
 }
 
 /// What happens at a frame.
@@ -64,10 +77,25 @@ pub(crate) struct Fake {
     away_until_ns: Cell<i64>,
     script: RefCell<Vec<(u32, Happening)>>,
     is_metering: Cell<bool>,
+    /// What its controls are set to.
+    exposure: Cell<i32>,
+    gain: Cell<i32>,
+    /// From which frames on they are in force.
+    changes: RefCell<Vec<Change>>,
+    /// The level of white at 1 ms and gain 1, of full scale: it shows a pad in its middle; 0 for none.
+    light: Cell<f64>,
     is_foreign: Cell<bool>,
     open_devices: Cell<u32>,
     mappings: Cell<u32>,
     opened: Cell<u32>,
+}
+
+/// A change of its controls.
+#[derive(Copy, Clone, Debug)]
+struct Change {
+    from: u32,
+    exposure: i32,
+    gain: i32,
 }
 
 /// It, opened.
@@ -107,6 +135,10 @@ impl Fake {
             away_until_ns: Cell::new(0),
             script: RefCell::default(),
             is_metering: Cell::new(false),
+            exposure: Cell::new((EXPOSURE_NS / UNIT_NS) as i32),
+            gain: Cell::new(0),
+            changes: RefCell::default(),
+            light: Cell::new(0.0),
             is_foreign: Cell::new(false),
             open_devices: Cell::new(0),
             mappings: Cell::new(0),
@@ -133,6 +165,37 @@ impl Fake {
         self.is_metering.set(true);
     }
 
+    /// Shows a pad in this light.
+    pub(crate) fn light(&self, light: f64) {
+        self.light.set(light);
+    }
+
+    pub(crate) fn is_metering(&self) -> bool {
+        self.is_metering.get()
+    }
+
+    /// Exposure time and gain of a frame.
+    pub(crate) fn exposed(&self, number: u32) -> Exposed {
+        let usual = Change { from: 0, exposure: (EXPOSURE_NS / UNIT_NS) as i32, gain: 0 };
+        let changes = self.changes.borrow();
+        let change = changes.iter().rev().find(|change| change.from <= number).unwrap_or(&usual);
+        Exposed {
+            exposure_ns: i64::from(change.exposure) * UNIT_NS,
+            gain: 1.0 + f64::from(change.gain) / 255.0 * (MAX_GAIN - 1.0),
+        }
+    }
+
+    fn control(&self, next: u32, id: u32, value: i32) {
+        match id {
+            CID_EXPOSURE_AUTO => self.is_metering.set(value != 1),
+            CID_EXPOSURE_ABSOLUTE => self.exposure.set(value),
+            GAIN => self.gain.set(value),
+            _ => {}
+        }
+        let (exposure, gain) = (self.exposure.get(), self.gain.get());
+        self.changes.borrow_mut().push(Change { from: next + CONTROL_FRAMES, exposure, gain });
+    }
+
     pub(crate) fn pass(&self, time: Duration) {
         self.now_ns.set(self.now_ns.get() + time.as_nanos() as i64);
     }
@@ -155,7 +218,7 @@ impl Fake {
 
     /// When the middle row of a frame was in the middle of its exposure.
     pub(crate) fn mid_exposure_ns(&self, number: u32) -> i64 {
-        self.begins_ns(number) + EXPOSURE_NS / 2 + self.readout_ns / 2
+        self.begins_ns(number) + self.exposed(number).exposure_ns / 2 + self.readout_ns / 2
     }
 
     /// When the first row of a frame begins to be exposed; not a whole microsecond.
@@ -164,7 +227,7 @@ impl Fake {
     }
 
     fn read_ns(&self, number: u32) -> i64 {
-        self.begins_ns(number) + EXPOSURE_NS + self.readout_ns
+        self.begins_ns(number) + self.exposed(number).exposure_ns + self.readout_ns
     }
 
     /// When a frame is in its buffer.
@@ -298,9 +361,10 @@ impl Device for FakeDevice {
                 control.value = if self.fake.is_metering.get() { 3 } else { 1 };
             }
             Call::GetControl(control) if control.id == CID_EXPOSURE_ABSOLUTE => {
-                control.value = (EXPOSURE_NS / 100_000) as i32;
+                control.value = self.fake.exposure.get();
             }
-            Call::SetControl(_) => {}
+            Call::GetControl(control) if control.id == GAIN => control.value = self.fake.gain.get(),
+            Call::SetControl(control) => self.fake.control(state.next, control.id, control.value),
             _ => return Err(errno(libc::EINVAL)),
         }
         Ok(())
@@ -401,7 +465,22 @@ impl FakeDevice {
         for (at, byte) in number.to_le_bytes().into_iter().enumerate() {
             memory[at * step] = byte;
         }
+        if self.fake.light.get() > 0.0 {
+            let stride = self.fake.bytes().0 as usize;
+            self.paint_pad(number, |x, y| y * stride + x * step, &mut memory);
+        }
         state.bytes
+    }
+
+    /// Paints a pad of 80 pixels in the middle: stripes of white, and of black of a sixteenth of it.
+    fn paint_pad(&self, number: u32, at: impl Fn(usize, usize) -> usize, memory: &mut [u8]) {
+        let Exposed { exposure_ns, gain } = self.fake.exposed(number);
+        let light = self.fake.light.get() * exposure_ns as f64 / MS as f64 * gain;
+        let level = |reflectance: f64| (255.0 * (light * reflectance).min(1.0)).round() as u8;
+        let stripes = [level(1.0), level(1.0 / 16.0)];
+        for (x, y) in (280..360).flat_map(|x| (200..280).map(move |y| (x, y))) {
+            memory[at(x, y)] = stripes[x / 4 % 2];
+        }
     }
 
     fn describe(&self, buffer: &mut Buffer, number: u32) {

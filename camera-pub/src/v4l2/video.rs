@@ -181,6 +181,7 @@ mod tests {
             height: 480,
             rate_hz: 100.0,
             controls: Vec::new(),
+            for_marker: None,
             stamped_at: None,
             readout_ns: 0,
             delay_ns: 30 * MS,

@@ -1,0 +1,246 @@
+//! How a camera is exposed for the marker, from where detectors have seen it in earlier frames.
+
+use imaging::GrayView;
+use messages::{ControllerStatus, Detections, topic};
+use metering::{Handover, Limits, PadTrack, Seen, Setting, levels, next_setting};
+use node::{Node, Subscriber};
+
+use crate::v4l2::exposer::Order;
+
+/// Follows the marker, and says how to expose for it.
+pub(crate) struct MarkerExposure {
+    track: PadTrack,
+    handover: Handover,
+    sightings: Option<Sightings>,
+}
+
+/// What tells where the marker is.
+struct Sightings {
+    detections: Subscriber<Detections>,
+    /// Names the detector in use.
+    status: Subscriber<ControllerStatus>,
+}
+
+/// How a frame was exposed, and how the next ones can be.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Exposed {
+    /// True when the camera does not meter by itself.
+    pub(crate) is_taken_over: bool,
+    /// `None` while it is not known.
+    pub(crate) setting: Option<Setting>,
+    pub(crate) limits: Limits,
+}
+
+impl MarkerExposure {
+    /// For a camera of this name, which nothing is heard of yet.
+    pub(crate) fn new(camera: &str) -> Self {
+        Self { track: PadTrack::new(camera), handover: Handover::default(), sightings: None }
+    }
+
+    /// Listens to detectors from now on.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub(crate) async fn listen(&mut self, node: &Node) -> anyhow::Result<()> {
+        self.sightings = Some(Sightings {
+            detections: node.subscriber(topic::DETECTIONS, &[]).await?,
+            status: node.subscriber(topic::STATUS, &[]).await?,
+        });
+        Ok(())
+    }
+
+    /// What to do after a frame with this stamp.
+    pub(crate) fn after(&mut self, stamp_ns: i64, frame: GrayView<'_>, exposed: &Exposed) -> Order {
+        if let Some(sightings) = &self.sightings {
+            while let Some(status) = sightings.status.waiting() {
+                self.track.use_detector(status.active_detector.as_deref());
+            }
+            while let Some(message) = sightings.detections.waiting() {
+                self.track.update(&message);
+            }
+        }
+        let pad = self.track.at(stamp_ns);
+        let is_metered = self.handover.meters_pad(stamp_ns, pad.is_some());
+        let Some(pad) = pad.filter(|_| is_metered) else { return Order::OwnMetering };
+        if !exposed.is_taken_over {
+            return Order::TakeOver;
+        }
+        let next = exposed.setting.zip(levels(frame, &pad)).and_then(|(setting, levels)| {
+            let seen = Seen { setting, levels, motion_px_s: pad.motion_px_s };
+            next_setting(&seen, &exposed.limits)
+        });
+        next.map_or(Order::Keep, Order::Set)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::v4l2::capture::Wanted;
+    use crate::v4l2::exposer::ForMarker;
+    use crate::v4l2::fake::{Exposed as Truth, Fake, MS, Stamps};
+    use crate::v4l2::video::{Next, Port, Video};
+    use messages::{Detection, FrameHeader, PixelFormat};
+    use std::rc::Rc;
+
+    /// A detector's message of the pad that the played camera shows in its middle.
+    fn message(stamp_ns: i64, centre_px: Option<[f64; 2]>) -> Detections {
+        let detection = centre_px.map(|centre_px| Detection {
+            family: "rings".into(),
+            id: None,
+            centre_px,
+            centre_covariance_px2: [0.0; 3],
+            corners_px: None,
+            size_px: 80.0,
+            wrong_bits: 0,
+            confidence: 1.0,
+            pose: None,
+        });
+        let header = FrameHeader {
+            camera: "down".into(),
+            sequence: 0,
+            stamp_ns,
+            clock: String::new(),
+            exposure_ns: 0,
+            width: 640,
+            height: 480,
+            format: PixelFormat::Mono8,
+            parts: Vec::new(),
+        };
+        let detections = detection.into_iter().collect();
+        Detections { detector: "main".into(), header, detections, stages: Vec::new() }
+    }
+
+    /// A played camera that is exposed for the marker.
+    struct Loop {
+        fake: Rc<Fake>,
+        video: Video<Rc<Fake>>,
+        marker: MarkerExposure,
+        /// Of each frame: its number, whether its stamp is exact, and how far that is from the truth.
+        frames: Vec<Frame>,
+    }
+
+    #[derive(Copy, Clone, Debug)]
+    struct Frame {
+        number: u32,
+        is_exact: bool,
+        error_ns: i64,
+        white: f64,
+    }
+
+    impl Loop {
+        fn new(stamps: Stamps) -> Self {
+            let fake = Fake::of("GREY", stamps, 0);
+            fake.meter();
+            let for_marker = ForMarker {
+                max_exposure_s: 5e-3,
+                gain: "gain".into(),
+                max_gain: 16.0,
+                settle_frames: 4,
+            };
+            let wanted = Wanted {
+                fourcc: "GREY".into(),
+                width: 640,
+                height: 480,
+                rate_hz: 100.0,
+                controls: Vec::new(),
+                for_marker: Some(for_marker),
+                stamped_at: None,
+                readout_ns: 0,
+                delay_ns: 9 * MS,
+            };
+            let video = Video::start(Rc::clone(&fake), wanted).unwrap();
+            Self { fake, video, marker: MarkerExposure::new("down"), frames: Vec::new() }
+        }
+
+        /// Reads frames for so long; a detector finds the pad where it says.
+        fn run(&mut self, time_ns: i64, pad_at: impl Fn(i64) -> Option<[f64; 2]>) {
+            let until_ns = self.fake.now_ns() + time_ns;
+            let mut grey = vec![0; 640 * 480];
+            while self.fake.now_ns() < until_ns {
+                let Next::Frame(taken) = self.video.next().unwrap() else { continue };
+                let capture = self.video.capture().unwrap();
+                capture.copy_grey(&taken, &mut grey);
+                let number = u32::from_le_bytes(grey[..4].try_into().unwrap());
+                let exposure = taken.exposure;
+                capture.give_back(taken).unwrap();
+                let exposed = capture.exposed().unwrap();
+                let frame = GrayView::packed(&grey, 640, 480).unwrap();
+                let order = self.marker.after(exposure.mid_ns, frame, &exposed);
+                capture.expose(order).unwrap();
+                self.marker.track.update(&message(exposure.mid_ns, pad_at(exposure.mid_ns)));
+                let error_ns = exposure.mid_ns - self.fake.mid_exposure_ns(number);
+                let white = f64::from(grey[240 * 640 + 320]) / 255.0;
+                self.frames.push(Frame { number, is_exact: exposure.is_exact(), error_ns, white });
+            }
+        }
+
+        fn last(&self) -> Frame {
+            *self.frames.last().unwrap()
+        }
+
+        fn truth(&self) -> Truth {
+            self.fake.exposed(self.last().number)
+        }
+    }
+
+    fn still(_stamp_ns: i64) -> Option<[f64; 2]> {
+        Some([320.0, 240.0])
+    }
+
+    #[test]
+    fn a_devices_controls_follow_the_light_on_the_marker() {
+        let mut exposing = Loop::new(Stamps::ExposureStart);
+        for light in [0.1, 6.4, 0.1, 0.02, 1.0] {
+            exposing.fake.light(light);
+            exposing.run(1500 * MS, still);
+            let (white, truth) = (exposing.last().white, exposing.truth());
+            println!("light {light}: white {white:.2}, {truth:?}");
+            assert!((0.6..=0.85).contains(&white), "{light}: {white} {truth:?}");
+            assert!(truth.gain < 1.1 || truth.exposure_ns == 5 * MS, "gain is second: {truth:?}");
+        }
+    }
+
+    #[test]
+    fn a_marker_that_moves_is_exposed_for_a_shorter_time_and_with_more_gain() {
+        let mut exposing = Loop::new(Stamps::ExposureStart);
+        exposing.fake.light(0.2);
+        exposing.run(1000 * MS, still);
+        let before = exposing.truth();
+        // To and fro by 5 pixels, at 500 pixels per second.
+        exposing.run(1000 * MS, |stamp_ns| {
+            Some([318.0 + 5.0 * f64::from((stamp_ns / (10 * MS) % 2) as u8), 240.0])
+        });
+        let after = exposing.truth();
+        assert!(after.exposure_ns <= 2200 * 1000 && before.exposure_ns > 3 * MS, "{after:?}");
+        assert!(after.gain > before.gain && (0.6..=0.85).contains(&exposing.last().white));
+    }
+
+    #[test]
+    fn without_a_marker_the_camera_meters_by_itself() {
+        let mut exposing = Loop::new(Stamps::ExposureStart);
+        exposing.fake.light(0.2);
+        exposing.run(500 * MS, |_| None);
+        assert!(exposing.fake.is_metering());
+        exposing.run(500 * MS, still);
+        assert!(!exposing.fake.is_metering());
+        exposing.run(1000 * MS, |_| None);
+        assert!(exposing.fake.is_metering());
+    }
+
+    #[test]
+    fn a_stamp_is_exact_to_a_millisecond_or_marked_also_while_the_exposure_changes() {
+        for stamps in [Stamps::ExposureStart, Stamps::FrameEnd] {
+            let mut exposing = Loop::new(stamps);
+            for light in [0.2, 3.0, 0.4, 0.05] {
+                exposing.fake.light(light);
+                exposing.run(1000 * MS, still);
+            }
+            let exact = exposing.frames.iter().filter(|frame| frame.is_exact);
+            let worst_ns = exact.clone().map(|frame| frame.error_ns.abs()).max().unwrap();
+            let (exact, all) = (exact.count(), exposing.frames.len());
+            println!("{stamps:?}: {exact} of {all} exact, worst {worst_ns} ns");
+            assert!(worst_ns <= MS && exact > all * 3 / 4 && exact < all, "{worst_ns} {exact}");
+        }
+    }
+}

@@ -1,0 +1,211 @@
+//! The controls of a device with which its exposure is set for the marker.
+
+use metering::{Limits, Setting};
+
+use super::abi::{
+    CID_EXPOSURE_ABSOLUTE, CID_EXPOSURE_AUTO, Call, Device, EXPOSURE_MANUAL, ExtControl,
+};
+use super::describe::{ControlDescription, control_value};
+
+/// The unit of the exposure's control, in seconds.
+const UNIT_S: f64 = 1e-4;
+/// `V4L2_EXPOSURE_APERTURE_PRIORITY`, with which UVC cameras meter, and `V4L2_EXPOSURE_AUTO` of others.
+const METERING: [i32; 2] = [3, 0];
+
+/// How a device's exposure is to be set for the marker.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct ForMarker {
+    pub(crate) max_exposure_s: f64,
+    /// The gain's control; empty for none.
+    pub(crate) gain: String,
+    /// How much brighter its largest value is than its smallest.
+    pub(crate) max_gain: f64,
+    /// Number of frames until a change shows.
+    pub(crate) settle_frames: u32,
+}
+
+/// What to do with a device's exposure.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) enum Order {
+    Keep,
+    /// The camera meters by itself.
+    OwnMetering,
+    /// It does not any more; exposure and gain stay as it has chosen them.
+    TakeOver,
+    Set(Setting),
+}
+
+/// The controls, and what they are set to.
+pub(crate) struct Exposer {
+    wanted: ForMarker,
+    /// The value of the metering's control with which the camera meters; `None` where it never does.
+    metering: Option<i32>,
+    exposure: Range,
+    gain: Option<Gain>,
+    setting: Option<Setting>,
+    /// Frames since the last change.
+    frames: u32,
+    /// By how much the exposure changed then.
+    changed_ns: u32,
+}
+
+#[derive(Copy, Clone)]
+struct Range {
+    min: i32,
+    max: i32,
+}
+
+#[derive(Copy, Clone)]
+struct Gain {
+    id: u32,
+    range: Range,
+}
+
+impl Exposer {
+    /// The controls of a device.
+    ///
+    /// # Errors
+    /// Which one it lacks.
+    pub(crate) fn of(known: &[ControlDescription], wanted: &ForMarker) -> Result<Self, String> {
+        let writable =
+            |found: &&ControlDescription| found.is_writable && i32::try_from(found.max).is_ok();
+        let range = |found: &ControlDescription| Range {
+            min: found.min.clamp(0, i64::from(i32::MAX)) as i32,
+            max: found.max as i32,
+        };
+        let with = |id| known.iter().filter(writable).find(|control| control.id == id);
+        let exposure = with(CID_EXPOSURE_ABSOLUTE).ok_or(
+            "it has no control for its exposure time, with which `exposure.control` could be `marker`",
+        )?;
+        let named = |name: &String| known.iter().filter(writable).find(|c| c.name == *name);
+        let gain = match &wanted.gain {
+            none if none.is_empty() => None,
+            name => Some(named(name).ok_or_else(|| {
+                let names: Vec<_> = known.iter().map(|control| control.name.as_str()).collect();
+                let names = names.join(", ");
+                format!("it has no control `{name}` of `exposure.gain`; it has {names}; write \"\" for none")
+            })?),
+        };
+        let metering = with(CID_EXPOSURE_AUTO).map(|auto| {
+            let default = auto.default as i32;
+            let [usual, other] = METERING;
+            match default == EXPOSURE_MANUAL {
+                false => default,
+                true if auto.max >= i64::from(usual) => usual,
+                true => other,
+            }
+        });
+        Ok(Self {
+            wanted: wanted.clone(),
+            metering,
+            exposure: range(exposure),
+            gain: gain.map(|gain| Gain { id: gain.id, range: range(gain) }),
+            setting: None,
+            frames: 0,
+            changed_ns: 0,
+        })
+    }
+
+    /// What it can be set to.
+    pub(crate) fn limits(&self) -> Limits {
+        let min_exposure_s = f64::from(self.exposure.min.max(1)) * UNIT_S;
+        let max_exposure_s = f64::from(self.exposure.max) * UNIT_S;
+        Limits {
+            min_exposure_s,
+            max_exposure_s: max_exposure_s.min(self.wanted.max_exposure_s).max(min_exposure_s),
+            max_gain: if self.gain.is_some() { self.wanted.max_gain } else { 1.0 },
+        }
+    }
+
+    /// Counts a frame.
+    pub(crate) fn frame(&mut self) {
+        self.frames = self.frames.saturating_add(1);
+    }
+
+    /// The setting with which the newest frame was taken; `None` while the camera meters, or a change may be under way.
+    pub(crate) fn setting(&self) -> Option<Setting> {
+        self.setting.filter(|_| !self.is_settling())
+    }
+
+    /// True while the camera's exposure is set here.
+    pub(crate) fn is_taken_over(&self) -> bool {
+        self.setting.is_some()
+    }
+
+    /// Within how much the exposure time of the newest frame is known.
+    pub(crate) fn unsure_ns(&self) -> u32 {
+        if self.is_settling() { self.changed_ns } else { 0 }
+    }
+
+    fn is_settling(&self) -> bool {
+        self.frames <= self.wanted.settle_frames
+    }
+
+    /// Carries out an order, and returns the exposure time that is set by it, in nanoseconds.
+    ///
+    /// # Errors
+    /// What the device answers.
+    pub(crate) fn follow(
+        &mut self,
+        device: &impl Device,
+        order: Order,
+    ) -> std::io::Result<Option<u32>> {
+        match order {
+            Order::Keep => Ok(None),
+            Order::OwnMetering => {
+                if let Some(value) = self.metering.filter(|_| self.setting.is_some()) {
+                    set(device, CID_EXPOSURE_AUTO, value)?;
+                    self.setting = None;
+                    return Ok(Some(0));
+                }
+                Ok(None)
+            }
+            Order::TakeOver => {
+                let exposure = control_value(device, CID_EXPOSURE_ABSOLUTE).unwrap_or(1);
+                let gain = self
+                    .gain
+                    .and_then(|gain| Some(self.factor(gain, control_value(device, gain.id)?)));
+                if self.metering.is_some() {
+                    set(device, CID_EXPOSURE_AUTO, EXPOSURE_MANUAL)?;
+                }
+                let exposure_s = f64::from(exposure.max(1)) * UNIT_S;
+                self.set(device, Setting { exposure_s, gain: gain.unwrap_or(1.0) }).map(Some)
+            }
+            Order::Set(setting) => self.set(device, setting).map(Some),
+        }
+    }
+
+    fn set(&mut self, device: &impl Device, setting: Setting) -> std::io::Result<u32> {
+        let Limits { min_exposure_s, max_exposure_s, max_gain } = self.limits();
+        let exposure_s = setting.exposure_s.clamp(min_exposure_s, max_exposure_s);
+        let units = (exposure_s / UNIT_S).round() as i32;
+        set(device, CID_EXPOSURE_ABSOLUTE, units)?;
+        let mut gain = 1.0;
+        if let Some(control) = self.gain {
+            let Range { min, max } = control.range;
+            let part = (setting.gain.clamp(1.0, max_gain) - 1.0) / (max_gain - 1.0).max(1e-9);
+            let value = min + (part * f64::from(max - min)).round() as i32;
+            set(device, control.id, value)?;
+            gain = self.factor(control, value);
+        }
+        let exposure_s = f64::from(units) * UNIT_S;
+        let before_s = self.setting.map_or(0.0, |before| before.exposure_s);
+        self.changed_ns = ((exposure_s - before_s).abs() * 1e9) as u32;
+        self.setting = Some(Setting { exposure_s, gain });
+        self.frames = 0;
+        Ok((exposure_s * 1e9).round() as u32)
+    }
+
+    /// How much brighter a value of the gain's control is than its smallest. Between the ends it is taken to be linear;
+    /// where it is not, the loop needs more steps.
+    fn factor(&self, gain: Gain, value: i32) -> f64 {
+        let Range { min, max } = gain.range;
+        let part = f64::from(value - min) / f64::from((max - min).max(1));
+        1.0 + part.clamp(0.0, 1.0) * (self.wanted.max_gain - 1.0)
+    }
+}
+
+fn set(device: &impl Device, id: u32, value: i32) -> std::io::Result<()> {
+    let mut control = ExtControl { id, value, ..ExtControl::default() };
+    device.call(Call::SetControl(&mut control))
+}
