@@ -1,6 +1,8 @@
 //! `alight doctor`: checks this machine and its network, and says what to do about each problem.
 //!
-//! First the machine, the site, its keys and devices; then the network: services, cameras, clocks, links.
+//! First the machine, the site, its keys and devices; then the network: services, `cameras`, clocks, links.
+
+mod cameras;
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -8,7 +10,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, PixelFormat, topic};
+use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, topic};
 use node::access::Holder;
 use node::network::{AIR_PORT, AUTHORITY, Address, check_private};
 use node::{INSECURE, Network, Node, clock_name, now_ns, stats};
@@ -369,7 +371,7 @@ async fn check_network(findings: &mut Findings, node: Node, watched: Watched, ex
             check_presence(findings, &seen, expected);
             check_replies(findings, &node, &seen).await;
             check_healths(findings, &seen);
-            check_cameras(findings, &seen, watched.duration.as_secs());
+            cameras::check(findings, &seen, watched.duration.as_secs());
             check_landing(findings, &seen);
         }
         Err(problem) => findings.wrong("network", format!("{problem:#}"), "start it again"),
@@ -535,112 +537,6 @@ fn check_healths(findings: &mut Findings, seen: &Seen) {
             );
         }
     }
-}
-
-fn check_cameras(findings: &mut Findings, seen: &Seen, seconds: u64) {
-    for info in &seen.cameras {
-        let camera = &info.camera;
-        let Some([fx, fy]) = info.focal_px else {
-            findings.doubtful(
-                "calibration",
-                format!("camera `{camera}` is not calibrated, so distances are unknown"),
-                "calibrate it, and set `calibration.file` of camera-pub",
-            );
-            continue;
-        };
-        let problem = implausible(info, [fx, fy]);
-        match problem {
-            Some(problem) => findings.wrong(
-                "calibration",
-                format!("camera `{camera}`: {problem}"),
-                "use the calibration of this camera at this resolution",
-            ),
-            None => findings.good(
-                "calibration",
-                format!(
-                    "camera `{camera}`: {} x {} pixels, f = {fx:.0} px",
-                    info.width, info.height
-                ),
-            ),
-        }
-    }
-    let clocks: Vec<_> = seen.healths.iter().filter(|h| h.service == "controller").collect();
-    let raw_only = |frame: &&ReceivedFrame| {
-        !seen.frames.iter().any(|jpeg| jpeg.header.camera == frame.header.camera)
-    };
-    let all: Vec<&ReceivedFrame> =
-        seen.frames.iter().chain(seen.raw_frames.iter().filter(raw_only)).collect();
-    let mut names: Vec<&str> = all.iter().map(|frame| frame.header.camera.as_str()).collect();
-    names.sort_unstable();
-    names.dedup();
-    for camera in names {
-        let frames: Vec<&ReceivedFrame> =
-            all.iter().copied().filter(|frame| frame.header.camera == camera).collect();
-        findings.good("camera", describe_frames(camera, &frames, seconds));
-        if let Some(ReceivedFrame { header, .. }) = frames.first()
-            && let Some(controller) = clocks.iter().find(|health| health.clock != header.clock)
-        {
-            findings.wrong(
-                "clock",
-                format!(
-                    "camera `{camera}` stamps with the clock {}, the controller has {}, so it rejects all frames",
-                    header.clock, controller.clock
-                ),
-                "run camera and controller on one machine; a camera of your own must use that clock's name",
-            );
-        }
-        if !seen.cameras.iter().any(|info| info.camera == camera) {
-            findings.wrong(
-                "calibration",
-                format!("camera `{camera}` sends frames, but not its calibration and mount"),
-                "publish them on `camera/CAMERA/info` every second",
-            );
-        }
-    }
-    if all.is_empty() && !seen.peers.is_empty() {
-        findings.doubtful(
-            "camera",
-            format!("no frame arrived within {seconds} s"),
-            "check that a camera-pub runs, and the bandwidth of the link",
-        );
-    }
-}
-
-fn implausible(info: &CameraInfo, focal_px: [f64; 2]) -> Option<String> {
-    let (width, height) = (f64::from(info.width), f64::from(info.height));
-    let [fx, fy] = focal_px;
-    if !(0.2 * width..=20.0 * width).contains(&fx) || !(0.7..=1.4).contains(&(fy / fx)) {
-        return Some(format!(
-            "f = {fx:.0}, {fy:.0} px for {width} x {height} pixels is not plausible"
-        ));
-    }
-    let [cx, cy] = info.principal_px;
-    let off = ((cx - width / 2.0) / width).abs().max(((cy - height / 2.0) / height).abs());
-    (off > 0.2).then(|| {
-        format!("the principal point ({cx:.0}, {cy:.0}) is far from the centre of {width} x {height} pixels")
-    })
-}
-
-fn describe_frames(camera: &str, frames: &[&ReceivedFrame], seconds: u64) -> String {
-    let rate_hz = frames.len() as f64 / seconds as f64;
-    let is_raw = frames.iter().any(|frame| frame.header.format != PixelFormat::Jpeg);
-    let bytes: usize = frames.iter().map(|frame| frame.bytes).sum();
-    let megabits_s = bytes as f64 * 8e-6 / seconds as f64;
-    let kind = if is_raw { "raw frames" } else { "frames" };
-    let mut text = format!("camera `{camera}`: {rate_hz:.1} {kind}/s, {megabits_s:.2} Mbit/s");
-    let ages_ms: Vec<f64> = frames
-        .iter()
-        .filter(|frame| frame.header.clock == clock_name())
-        .map(|frame| (frame.received_ns - frame.header.stamp_ns) as f64 * 1e-6)
-        .collect();
-    match stats::quantile(&ages_ms, 0.5) {
-        Some(median_ms) => {
-            // Writing to a string cannot fail.
-            let _ = write!(text, ", {median_ms:.0} ms old on arrival");
-        }
-        None => text.push_str(", of unknown age, as their clock is that of another machine"),
-    }
-    text
 }
 
 fn check_landing(findings: &mut Findings, seen: &Seen) {

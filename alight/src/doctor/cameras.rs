@@ -1,0 +1,318 @@
+//! The rows of `alight doctor` about cameras.
+
+use std::fmt::Write;
+
+use messages::{CameraInfo, Health, PixelFormat};
+use node::{clock_name, stats};
+
+use super::{Findings, ReceivedFrame, Seen};
+
+/// Maximum age of a frame on arrival, in milliseconds; a larger one is a wrong clock, or a link that is of no use.
+const MAX_AGE_MS: f64 = 1000.0;
+/// A brisk turn of the vehicle, in radians per second, at which the blur is stated.
+const TURN_RAD_S: f64 = 0.5;
+/// Blur at that turn from which on markers are found less far, in pixels.
+const MAX_BLUR_PX: f64 = 3.0;
+/// Part of the frames that a camera may drop.
+const MAX_DROPPED: f64 = 0.02;
+
+/// Checks the cameras that were seen: calibration, frames, stamps, exposure, and what was dropped.
+pub(super) fn check(findings: &mut Findings, seen: &Seen, seconds: u64) {
+    for info in &seen.cameras {
+        let camera = &info.camera;
+        let Some([fx, fy]) = info.focal_px else {
+            findings.doubtful(
+                "calibration",
+                format!("camera `{camera}` is not calibrated, so distances are unknown"),
+                "calibrate it, and set `calibration.file` of camera-pub",
+            );
+            continue;
+        };
+        let problem = implausible(info, [fx, fy]);
+        match problem {
+            Some(problem) => findings.wrong(
+                "calibration",
+                format!("camera `{camera}`: {problem}"),
+                "use the calibration of this camera at this resolution",
+            ),
+            None => findings.good(
+                "calibration",
+                format!(
+                    "camera `{camera}`: {} x {} pixels, f = {fx:.0} px",
+                    info.width, info.height
+                ),
+            ),
+        }
+    }
+    let clocks: Vec<_> = seen.healths.iter().filter(|h| h.service == "controller").collect();
+    let raw_only = |frame: &&ReceivedFrame| {
+        !seen.frames.iter().any(|jpeg| jpeg.header.camera == frame.header.camera)
+    };
+    let all: Vec<&ReceivedFrame> =
+        seen.frames.iter().chain(seen.raw_frames.iter().filter(raw_only)).collect();
+    let mut names: Vec<&str> = all.iter().map(|frame| frame.header.camera.as_str()).collect();
+    names.sort_unstable();
+    names.dedup();
+    for camera in names {
+        let frames: Vec<&ReceivedFrame> =
+            all.iter().copied().filter(|frame| frame.header.camera == camera).collect();
+        findings.good("camera", describe_frames(camera, &frames, seconds));
+        check_stamps(findings, camera, &frames);
+        check_exposure(findings, camera, &frames, focal_px(seen, camera));
+        check_size(findings, camera, &frames, &seen.cameras);
+        check_drops(findings, camera, &seen.healths);
+        if let Some(ReceivedFrame { header, .. }) = frames.first()
+            && let Some(controller) = clocks.iter().find(|health| health.clock != header.clock)
+        {
+            findings.wrong(
+                "clock",
+                format!(
+                    "camera `{camera}` stamps with the clock {}, the controller has {}, so it rejects all frames",
+                    header.clock, controller.clock
+                ),
+                "run camera and controller on one machine; a camera of your own must use that clock's name",
+            );
+        }
+        if !seen.cameras.iter().any(|info| info.camera == camera) {
+            findings.wrong(
+                "calibration",
+                format!("camera `{camera}` sends frames, but not its calibration and mount"),
+                "publish them on `camera/CAMERA/info` every second",
+            );
+        }
+    }
+    if all.is_empty() && !seen.peers.is_empty() {
+        findings.doubtful(
+            "camera",
+            format!("no frame arrived within {seconds} s"),
+            "check that a camera-pub runs, and the bandwidth of the link",
+        );
+    }
+}
+
+fn implausible(info: &CameraInfo, focal_px: [f64; 2]) -> Option<String> {
+    let (width, height) = (f64::from(info.width), f64::from(info.height));
+    let [fx, fy] = focal_px;
+    if !(0.2 * width..=20.0 * width).contains(&fx) || !(0.7..=1.4).contains(&(fy / fx)) {
+        return Some(format!(
+            "f = {fx:.0}, {fy:.0} px for {width} x {height} pixels is not plausible"
+        ));
+    }
+    let [cx, cy] = info.principal_px;
+    let off = ((cx - width / 2.0) / width).abs().max(((cy - height / 2.0) / height).abs());
+    (off > 0.2).then(|| {
+        format!("the principal point ({cx:.0}, {cy:.0}) is far from the centre of {width} x {height} pixels")
+    })
+}
+
+fn describe_frames(camera: &str, frames: &[&ReceivedFrame], seconds: u64) -> String {
+    let rate_hz = frames.len() as f64 / seconds as f64;
+    let is_raw = frames.iter().any(|frame| frame.header.format != PixelFormat::Jpeg);
+    let bytes: usize = frames.iter().map(|frame| frame.bytes).sum();
+    let megabits_s = bytes as f64 * 8e-6 / seconds as f64;
+    let kind = if is_raw { "raw frames" } else { "frames" };
+    let mut text = format!("camera `{camera}`: {rate_hz:.1} {kind}/s, {megabits_s:.2} Mbit/s");
+    match stats::quantile(&ages_ms(frames), 0.5) {
+        Some(median_ms) => {
+            // Writing to a string cannot fail.
+            let _ = write!(text, ", {median_ms:.0} ms old on arrival");
+        }
+        None => text.push_str(", of unknown age, as their clock is that of another machine"),
+    }
+    text
+}
+
+/// The longer focal length of a camera, if it is calibrated.
+fn focal_px(seen: &Seen, camera: &str) -> Option<f64> {
+    let info = seen.cameras.iter().find(|info| info.camera == camera)?;
+    info.focal_px.map(|[fx, fy]| fx.max(fy))
+}
+
+fn check_stamps(findings: &mut Findings, camera: &str, frames: &[&ReceivedFrame]) {
+    let ages_ms = ages_ms(frames);
+    let wrong = ages_ms.iter().find(|age_ms| !(0.0..=MAX_AGE_MS).contains(*age_ms));
+    if let Some(age_ms) = wrong {
+        findings.wrong(
+            "stamps",
+            format!(
+                "camera `{camera}` stamps a frame {age_ms:.0} ms before it arrives; 0 to {MAX_AGE_MS} ms are possible"
+            ),
+            "set `source.delay_ms` and `source.stamp_at` of camera-pub; stamps are mid-exposure (docs/camera.md)",
+        );
+    }
+    let exact = frames.iter().filter(|frame| frame.header.exposure_ns > 0).count();
+    let text = format!("camera `{camera}`: {exact} of {} are told by the camera", frames.len());
+    if exact * 10 >= frames.len() * 9 {
+        findings.good("stamps", text);
+    } else {
+        findings.doubtful(
+            "stamps",
+            format!("{text}, the others are estimates"),
+            "fix the exposure, or take the camera's metadata (docs/camera.md, Time stamps)",
+        );
+    }
+}
+
+fn check_exposure(
+    findings: &mut Findings,
+    camera: &str,
+    frames: &[&ReceivedFrame],
+    focal_px: Option<f64>,
+) {
+    let exposures_s: Vec<f64> = frames
+        .iter()
+        .filter(|frame| frame.header.exposure_ns > 0)
+        .map(|frame| f64::from(frame.header.exposure_ns) * 1e-9)
+        .collect();
+    let Some(exposure_s) = stats::quantile(&exposures_s, 0.5) else { return };
+    let text = format!("camera `{camera}` exposes for {:.2} ms", exposure_s * 1e3);
+    let Some(focal_px) = focal_px else { return findings.good("exposure", text) };
+    let blur_px = exposure_s * TURN_RAD_S * focal_px;
+    let text = format!(
+        "{text}, which blurs by {blur_px:.1} pixels at a turn of {:.0} degrees per second",
+        TURN_RAD_S.to_degrees()
+    );
+    if blur_px <= MAX_BLUR_PX {
+        findings.good("exposure", text);
+    } else {
+        findings.doubtful(
+            "exposure",
+            text,
+            "expose for a shorter time and with more gain, or for the marker (docs/camera.md, Exposure)",
+        );
+    }
+}
+
+fn check_size(
+    findings: &mut Findings,
+    camera: &str,
+    frames: &[&ReceivedFrame],
+    cameras: &[CameraInfo],
+) {
+    let info = cameras.iter().find(|info| info.camera == camera);
+    let Some((info, frame)) = info.zip(frames.first()) else { return };
+    let (width, height) = (frame.header.width, frame.header.height);
+    if (width, height) != (info.width, info.height) {
+        findings.wrong(
+            "calibration",
+            format!(
+                "camera `{camera}` is calibrated at {} x {} pixels, but its frames have {width} x {height}",
+                info.width, info.height
+            ),
+            "calibrate it at the size that is flown, or fly the size that is calibrated",
+        );
+    }
+}
+
+fn check_drops(findings: &mut Findings, camera: &str, healths: &[Health]) {
+    let is_its = |health: &&Health| health.service == "camera-pub" && health.instance == camera;
+    let Some(health) = healths.iter().find(is_its) else { return };
+    let dropped: u64 = health.drops.iter().map(|drop| drop.count).sum();
+    let frames = health.rates.iter().find(|rate| rate.name == "frames");
+    let frames = frames.map_or(0, |rate| rate.count);
+    if dropped == 0 {
+        return findings
+            .good("camera", format!("camera `{camera}` dropped none of {frames} frames"));
+    }
+    let reasons: Vec<_> =
+        health.drops.iter().map(|drop| format!("{} ({})", drop.reason, drop.count)).collect();
+    let text = format!(
+        "camera `{camera}` dropped {dropped} beside {frames} frames: {}",
+        reasons.join(", ")
+    );
+    if dropped as f64 <= MAX_DROPPED * frames as f64 {
+        findings.good("camera", text);
+    } else {
+        findings.doubtful("camera", text, "docs/camera.md says what each of them comes from");
+    }
+}
+
+/// How old frames were on arrival; of those on this machine's clock.
+fn ages_ms(frames: &[&ReceivedFrame]) -> Vec<f64> {
+    let ours = frames.iter().filter(|frame| frame.header.clock == clock_name());
+    ours.map(|frame| frame.received_ns.saturating_sub(frame.header.stamp_ns) as f64 * 1e-6)
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use messages::{Count, FrameHeader, Rate};
+
+    fn frame(age_ms: i64, exposure_ns: u32) -> ReceivedFrame {
+        let header = FrameHeader {
+            camera: "down".into(),
+            sequence: 0,
+            stamp_ns: 1_000_000_000_000,
+            clock: clock_name().to_owned(),
+            exposure_ns,
+            width: 640,
+            height: 480,
+            format: PixelFormat::Mono8,
+            parts: Vec::new(),
+        };
+        let received_ns = header.stamp_ns + age_ms * 1_000_000;
+        ReceivedFrame { header, bytes: 640 * 480, received_ns }
+    }
+
+    /// What is said about a camera with these frames.
+    fn text(frames: Vec<ReceivedFrame>, width: u32, healths: Vec<Health>) -> String {
+        let model = geometry::CameraModel::pinhole(width, 480, 1800.0);
+        let mount = geometry::Transform::identity();
+        let mut findings = Findings::default();
+        let cameras = vec![CameraInfo::new("down", &model, &mount)];
+        check(&mut findings, &Seen { cameras, healths, raw_frames: frames, ..Seen::default() }, 1);
+        findings.text()
+    }
+
+    fn health(drops: Vec<Count>) -> Health {
+        Health {
+            service: "camera-pub".into(),
+            instance: "down".into(),
+            host: String::new(),
+            version: String::new(),
+            clock: String::new(),
+            stamp_ns: 0,
+            pid: 0,
+            cpu_s: 0.0,
+            uptime_s: 0.0,
+            rates: vec![Rate { name: "frames".into(), count: 1000, hz: 30.0 }],
+            latencies: Vec::new(),
+            drops,
+            errors: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_camera_that_stamps_exactly_and_exposes_briefly_is_well() {
+        let text =
+            text(vec![frame(30, 2_000_000), frame(31, 2_000_000)], 640, vec![health(Vec::new())]);
+        assert!(text.ends_with("Nothing is wrong."), "{text}");
+        assert!(text.contains("2 of 2 are told by the camera"), "{text}");
+        assert!(text.contains("2.00 ms, which blurs by 1.8 pixels"), "{text}");
+        assert!(text.contains("dropped none of 1000 frames"), "{text}");
+    }
+
+    #[test]
+    fn estimated_and_impossible_stamps_long_exposures_and_drops_are_told() {
+        assert!(text(vec![frame(30, 0)], 640, Vec::new()).contains("the others are estimates"));
+        let early = text(vec![frame(30, 1), frame(-5, 1)], 640, Vec::new());
+        assert!(early.contains("stamps a frame -5 ms before it arrives"), "{early}");
+        assert!(early.contains("1 wrong"), "{early}");
+        let long = text(vec![frame(30, 10_000_000)], 640, Vec::new());
+        assert!(long.contains("10.00 ms, which blurs by 9.0 pixels"), "{long}");
+        assert!(long.contains("for the marker"), "{long}");
+        let drops = vec![Count { reason: "frames that were queued".into(), count: 50 }];
+        let dropping = text(vec![frame(30, 1)], 640, vec![health(drops)]);
+        assert!(dropping.contains("dropped 50 beside 1000 frames: frames that were queued (50)"));
+    }
+
+    #[test]
+    fn a_calibration_of_another_size_is_wrong() {
+        let other = text(vec![frame(30, 1)], 1280, Vec::new());
+        assert!(
+            other.contains("calibrated at 1280 x 480 pixels, but its frames have 640 x 480"),
+            "{other}"
+        );
+    }
+}
