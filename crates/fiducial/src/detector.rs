@@ -1,7 +1,7 @@
 //! The detector: markers in, observations out. It runs the families' detectors and knows none of them.
 
 use geometry::CameraModel;
-use imaging::GrayView;
+use imaging::{GrayImage, GrayView};
 use markers::Marker;
 
 use crate::candidates::evidence::{Evidence, Needs};
@@ -33,6 +33,8 @@ pub struct Detector {
     needs: Needs,
     families: Vec<Box<dyn FamilyDetector>>,
     evidence: Evidence,
+    /// The image as an ordinary camera's tone curve shows it.
+    brightened: GrayImage,
     found: Vec<Observation>,
     trace: Trace,
     /// The fallback passes of these families, in the order in which they take turns, and the number of turns.
@@ -67,6 +69,7 @@ impl Detector {
             passes: FallbackPass::ALL.into_iter().filter(has).collect(),
             families,
             evidence: Evidence::default(),
+            brightened: GrayImage::default(),
             found: Vec::new(),
             trace: Trace::default(),
             turns: 0,
@@ -86,8 +89,8 @@ impl Detector {
     }
 
     /// As [`Detector::detect`], in a stream of images in which nothing was found of late: the fallback passes are spread
-    /// over the images. When no marker is found without them, one of up to seven passes runs, in the next image the next
-    /// one; a marker that is occluded or far away is found up to six images later.
+    /// over the images. When no marker is found without them, one of up to eight passes runs, in the next image the next
+    /// one; a marker that is occluded or far away is found up to seven images later.
     pub fn detect_in_turn(
         &mut self,
         view: GrayView<'_>,
@@ -129,7 +132,7 @@ impl Detector {
         self.found.clear();
         self.trace.clear();
         self.make_room(view);
-        let Self { families, evidence, found, trace, followed, .. } = self;
+        let Self { families, evidence, brightened, found, trace, followed, .. } = self;
         let followed = followed.as_slice();
         let stages: &mut dyn StageObserver = stages;
         evidence.find(view, &self.needs, trace, stages);
@@ -147,7 +150,13 @@ impl Detector {
                 {
                     continue;
                 }
-                if !std::mem::replace(&mut is_prepared, true) {
+                let is_first = !std::mem::replace(&mut is_prepared, true);
+                let is_brightened = step == FallbackStep::Brightened;
+                if is_first && is_brightened {
+                    brightened.make_brightened(view);
+                }
+                let view = brightened.view().filter(|_| is_brightened).unwrap_or(view);
+                if is_first {
                     evidence.prepare(view, step, schedule, out.stages);
                 }
                 let input = FrameInput { view, camera, evidence, schedule, followed };
@@ -195,6 +204,9 @@ impl Detector {
         self.found.reserve(MAX_AT_ONCE);
         self.trace.make_room();
         self.evidence.make_room(view, &self.needs);
+        if self.passes.contains(&FallbackPass::Brightened) {
+            self.brightened.resize(view.width(), view.height());
+        }
         self.families.iter_mut().for_each(|family| family.make_room());
     }
 

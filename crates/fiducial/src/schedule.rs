@@ -9,6 +9,7 @@
 //! |---|---|---|
 //! | [`FallbackPass::Arcs`] | rings that are cut or covered, and rings under noise, on coarser levels | rings |
 //! | [`FallbackPass::Blobs`] | bright blobs that may be the paper of rings far away | rings |
+//! | [`FallbackPass::Brightened`] | rings of a camera without a tone curve that lie partly in deep shade | rings |
 //! | [`FallbackPass::FineSegments`], [`FallbackPass::CoarseSegments`] | occluded square markers, by segments of edges on two levels | square, STag |
 //! | [`FallbackPass::QuietZones`] | small square markers, by their paper, in a third of the image | square, STag |
 
@@ -21,6 +22,8 @@ pub enum FallbackPass {
     Arcs,
     /// Rings far away, by bright blobs that may be their paper.
     Blobs,
+    /// Rings that lie partly in deep shade, in the square root of an image that is linear in light.
+    Brightened,
     /// Occluded square markers, by segments of edges on the finer of two levels.
     FineSegments,
     /// The same on the coarser level.
@@ -53,13 +56,14 @@ impl ImageStrip {
 
 impl FallbackPass {
     /// All passes, in the order in which they take turns in a stream.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::Arcs,
         Self::QuietZones(ImageStrip::Upper),
         Self::FineSegments,
         Self::Blobs,
         Self::QuietZones(ImageStrip::Middle),
         Self::CoarseSegments,
+        Self::Brightened,
         Self::QuietZones(ImageStrip::Lower),
     ];
 
@@ -68,6 +72,7 @@ impl FallbackPass {
         match self {
             Self::Arcs => FallbackStep::Arcs,
             Self::Blobs => FallbackStep::Blobs,
+            Self::Brightened => FallbackStep::Brightened,
             Self::FineSegments | Self::CoarseSegments => FallbackStep::Segments,
             Self::QuietZones(_) => FallbackStep::QuietZones,
         }
@@ -87,17 +92,25 @@ pub(crate) enum FallbackStep {
     QuietZones,
     /// Segments for families to which quiet zones are quicker.
     LateSegments,
+    /// The last one: what was made of the image itself is lost to it.
+    Brightened,
 }
 
 impl FallbackStep {
     /// All steps, in the order in which they run in an image.
-    pub(crate) const ALL: [Self; 5] =
-        [Self::Arcs, Self::Blobs, Self::Segments, Self::QuietZones, Self::LateSegments];
+    pub(crate) const ALL: [Self; 6] = [
+        Self::Arcs,
+        Self::Blobs,
+        Self::Segments,
+        Self::QuietZones,
+        Self::LateSegments,
+        Self::Brightened,
+    ];
 
     /// The name of its stage; `None` for steps whose families name their stages.
     pub(crate) fn stage(self) -> Option<&'static str> {
         match self {
-            Self::Arcs | Self::Blobs => None,
+            Self::Arcs | Self::Blobs | Self::Brightened => None,
             Self::Segments | Self::LateSegments => Some("occluded"),
             Self::QuietZones => Some("quiet zones"),
         }
@@ -110,7 +123,7 @@ pub struct PassSchedule(u8);
 
 impl PassSchedule {
     /// Every pass.
-    pub const ALL: Self = Self(0b111_1111);
+    pub const ALL: Self = Self(0b1111_1111);
     /// No pass.
     pub const NONE: Self = Self(0);
 

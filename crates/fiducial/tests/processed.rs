@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
-use fiducial::{Detector, Observation, Settings};
+use fiducial::{Detector, FallbackPass, Observation, PassSchedule, Settings};
 use geometry::{Body, CameraModel, Marker as MarkerFrame, Ned, Pixel, Rotation, Transform};
 use imaging::GrayView;
 use markers::Marker;
@@ -198,6 +198,31 @@ fn rings_under_the_edge_of_a_shadow_are_found_by_ordinary_cameras() {
     for (preset, errors) in presets.iter().zip(&mut errors) {
         errors.expect(preset.name(), 1, [0.03, 0.06], [0.06, 0.2]);
     }
+}
+
+#[test]
+fn rings_under_the_edge_of_deep_shade_are_found_by_a_camera_without_a_tone_curve() {
+    let [mut with, mut without] = [Errors::default(), Errors::default()];
+    let mut detector = detector("rings");
+    let binning = Binning::TwoByTwo;
+    let mut scene = TestScene::new(binning).unwrap();
+    let camera = binning.camera();
+    let near = views(binning, 0.0, 1).into_iter().filter(|view| view.height_m <= 6);
+    for (index, view) in near.step_by(2).enumerate() {
+        let (pixels, truth) = scene.render(&view).unwrap();
+        let range_m = truth.camera_from_marker.origin().coords.coords.norm();
+        let edge = Line { through: truth.centre, normal: 1.3 * index as f64 };
+        let pixels = shaded(&pixels, camera.width as usize, edge, 0.1);
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let view = GrayView::packed(&pixels, width, height).unwrap();
+        let fewer = PassSchedule::ALL.without(FallbackPass::Brightened);
+        for (schedule, errors) in [(PassSchedule::ALL, &mut with), (fewer, &mut without)] {
+            let found = detector.detect_with(view, Some(&camera), schedule, &mut ());
+            errors.note(found, truth.centre, range_m);
+        }
+    }
+    assert!(without.centre_px.len() < with.centre_px.len(), "the pass finds nothing");
+    with.expect("brightened", 1, [0.03, 0.06], [0.06, 0.2]);
 }
 
 #[test]

@@ -98,13 +98,16 @@ fn the_innermost_ring_alone_is_a_marker_only_where_one_is_followed() {
     assert!(alone >= 2, "{alone}");
 }
 
+/// The slow passes' stages, in the order in which they run in one image.
+const ALL: [&str; 5] = ["arcs", "blobs", "segments", "quiet zones", "brightened"];
+
 /// Keeps the names of the slow passes' stages.
 #[derive(Default)]
 struct SlowPasses(Vec<&'static str>);
 
 impl fiducial::StageObserver for SlowPasses {
     fn ended(&mut self, stage: &'static str) {
-        if ["arcs", "blobs", "segments", "quiet zones"].contains(&stage) {
+        if ALL.contains(&stage) {
             self.0.push(stage);
         }
     }
@@ -127,26 +130,34 @@ fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
     let (cut, bare) = (scene.render(), GrayImage::filled(648, 486, 110));
     let mut passes = Vec::new();
     let mut found_after = None;
-    for i in 0..18_u32 {
-        let image = if i < 7 { &bare } else { &cut };
+    for i in 0..20_u32 {
+        let image = if i < 8 { &bare } else { &cut };
         let mut slow = SlowPasses::default();
         let view = image.view().unwrap();
         let time_s = f64::from(i) * 0.05;
         let found =
             !tracker.detect(&mut detector, view, Some(&camera), time_s, &mut slow).is_empty();
         if i == 0 {
-            assert_eq!(slow.0, ["arcs", "blobs", "segments", "quiet zones"]);
+            assert_eq!(slow.0, ALL);
         } else {
             assert_eq!(slow.0.len(), 1, "{i}: {:?}", slow.0);
             passes.append(&mut slow.0);
         }
         if found {
-            found_after = Some(i - 7);
+            found_after = Some(i - 8);
             break;
         }
     }
-    let in_turn =
-        ["arcs", "quiet zones", "segments", "blobs", "quiet zones", "segments", "quiet zones"];
-    assert_eq!(passes[..7], in_turn);
-    assert!(found_after.is_some_and(|images| images < 7), "{found_after:?}");
+    let in_turn = [
+        "arcs",
+        "quiet zones",
+        "segments",
+        "blobs",
+        "quiet zones",
+        "segments",
+        "brightened",
+        "quiet zones",
+    ];
+    assert_eq!(passes[..8], in_turn);
+    assert!(found_after.is_some_and(|images| images < 8), "{found_after:?}");
 }

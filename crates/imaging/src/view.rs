@@ -155,6 +155,21 @@ pub struct GrayImage {
     height: usize,
 }
 
+/// The square root of each grey value, in units of full scale, rounded.
+const SQUARE_ROOTS: [u8; 256] = {
+    let mut roots = [0; 256];
+    let (mut value, mut root) = (0, 0);
+    while value < 256 {
+        // Until the next root's middle, squared, is above the value: (root + 1/2)^2 > 255 value.
+        while root < 255 && 4 * 255 * value > (2 * root + 1) * (2 * root + 1) {
+            root += 1;
+        }
+        roots[value] = root as u8;
+        value += 1;
+    }
+    roots
+};
+
 impl GrayImage {
     /// An image of `width` x `height` pixels, all of value `value`.
     pub fn filled(width: usize, height: usize, value: u8) -> Self {
@@ -165,6 +180,15 @@ impl GrayImage {
     pub fn resize(&mut self, width: usize, height: usize) {
         self.data.resize(width * height, 0);
         (self.width, self.height) = (width, height);
+    }
+
+    /// Becomes the square root of an image, in units of full scale: as the tone curve of an ordinary camera shows it.
+    pub fn make_brightened(&mut self, view: GrayView<'_>) {
+        self.resize(view.width(), view.height());
+        for (y, to) in self.data.chunks_exact_mut(view.width()).enumerate() {
+            let from = view.row(y);
+            to.iter_mut().zip(from).for_each(|(to, from)| *to = SQUARE_ROOTS[usize::from(*from)]);
+        }
     }
 
     /// Width in pixels.
@@ -236,6 +260,18 @@ mod tests {
             [(0, 0, 6, 1), (5, 0, 1, 1), (0, 0, 0, 1), (usize::MAX, 0, 2, 1), (0, 3, 1, 2)]
         {
             assert!(view.crop(x, y, width, height).is_none());
+        }
+    }
+
+    #[test]
+    fn a_brightened_image_is_the_square_root_of_its_light() {
+        let data: Vec<u8> = (0..=255).flat_map(|value| [value, 7]).collect();
+        let view = GrayView::new(&data, 1, 256, 2).unwrap();
+        let mut brightened = GrayImage::default();
+        brightened.make_brightened(view);
+        for (value, root) in (0_u8..=255).zip(brightened.pixels()) {
+            let expected = (255.0 * f64::from(value)).sqrt().round() as u8;
+            assert_eq!(*root, expected, "{value}");
         }
     }
 

@@ -99,7 +99,7 @@ impl Evidence {
             .begin(scales.map(|(scale, pass)| schedule.allows(pass).then_some(scale)));
     }
 
-    /// Makes what a step of the fallbacks needs.
+    /// Makes what a step of the fallbacks needs, of the image that it searches.
     pub(crate) fn prepare(
         &mut self,
         view: GrayView<'_>,
@@ -109,6 +109,11 @@ impl Evidence {
     ) {
         match step {
             FallbackStep::Arcs | FallbackStep::Blobs => {}
+            FallbackStep::Brightened => {
+                self.has_outlines = false;
+                self.outlines.begin(view);
+                stages.ended("brightened");
+            }
             FallbackStep::Segments | FallbackStep::LateSegments => {
                 if self.segment_quads.make(view, self.outlines.pyramid()) {
                     stages.ended("segments");

@@ -161,6 +161,19 @@ impl RingDetector {
         self.buffers.samples.reserve(ROOM);
     }
 
+    /// Searches for complete ellipses, on coarse levels first.
+    fn search(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
+        let FrameInput { view, camera, evidence, schedule, followed } = input;
+        for pass in &PASSES {
+            let evidence = &mut *evidence;
+            let input = FrameInput { view, camera, evidence, schedule, followed };
+            self.run(pass, input, out);
+            if out.found.len() > self.first && !self.thorough {
+                break;
+            }
+        }
+    }
+
     /// Runs one pass, and adds the markers it finds to those from the index `self.first` on.
     fn run(&mut self, pass: &RingPass, input: FrameInput<'_>, out: &mut Output<'_>) {
         let FrameInput { view, camera, evidence, schedule, followed } = input;
@@ -334,7 +347,7 @@ impl FamilyDetector for RingDetector {
     }
 
     fn fallback_steps(&self) -> &'static [FallbackStep] {
-        &[FallbackStep::Arcs, FallbackStep::Blobs]
+        &[FallbackStep::Arcs, FallbackStep::Blobs, FallbackStep::Brightened]
     }
 
     fn make_room(&mut self) {
@@ -342,16 +355,8 @@ impl FamilyDetector for RingDetector {
     }
 
     fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, schedule, followed } = input;
         self.first = out.found.len();
-        for pass in &PASSES {
-            let evidence = &mut *evidence;
-            let input = FrameInput { view, camera, evidence, schedule, followed };
-            self.run(pass, input, out);
-            if out.found.len() > self.first && !self.thorough {
-                break;
-            }
-        }
+        self.search(input, out);
     }
 
     fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
@@ -382,6 +387,7 @@ impl FamilyDetector for RingDetector {
         match step {
             FallbackStep::Arcs => self.run(&RingPass::Arcs, input, out),
             FallbackStep::Blobs => self.run(&RingPass::Blobs, input, out),
+            FallbackStep::Brightened => self.search(input, out),
             _ => {}
         }
     }
