@@ -93,6 +93,8 @@ const MAX_ELLIPSES: usize = 4000;
 const MAX_ARC_FITS: usize = 3000;
 const MAX_CANDIDATES: usize = 400;
 const MAX_EVALUATED: usize = 20;
+/// Maximum number of candidates of an image that is also searched brightened: one with more has no lack of outlines.
+const MAX_BEFORE_BRIGHTENED: usize = 64;
 /// Maximum number of evaluated candidates with a score below `DOUBTFUL_SCORE`, which hardly any marker has.
 const MAX_DOUBTFUL: usize = 6;
 const DOUBTFUL_SCORE: f64 = 0.75;
@@ -118,6 +120,8 @@ pub(crate) struct RingDetector {
     white_on_black: bool,
     /// Whether all passes run, whatever was found.
     thorough: bool,
+    /// Number of candidates among the image's complete ellipses.
+    complete: usize,
     ellipses: Vec<EllipseCandidate>,
     candidates: Vec<RingCandidate>,
     buffers: Buffers,
@@ -143,6 +147,7 @@ impl RingDetector {
             first: 0,
             white_on_black: settings.inverted,
             thorough: settings.thorough,
+            complete: 0,
             ellipses: Vec::new(),
             candidates: Vec::new(),
             buffers: Buffers::default(),
@@ -168,6 +173,7 @@ impl RingDetector {
             let evidence = &mut *evidence;
             let input = FrameInput { view, camera, evidence, schedule, followed };
             self.run(pass, input, out);
+            self.complete += self.candidates.len();
             if out.found.len() > self.first && !self.thorough {
                 break;
             }
@@ -354,8 +360,13 @@ impl FamilyDetector for RingDetector {
         self.reserve();
     }
 
+    fn wants_fallback(&mut self, step: FallbackStep, all: bool, _found: &[Observation]) -> bool {
+        all && (step != FallbackStep::Brightened || self.complete <= MAX_BEFORE_BRIGHTENED)
+    }
+
     fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
         self.first = out.found.len();
+        self.complete = 0;
         self.search(input, out);
     }
 
