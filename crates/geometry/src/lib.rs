@@ -8,7 +8,7 @@
 //!
 //! Modules in reading order: [`frame`] names the coordinate frames, [`transform`] moves between them,
 //! [`camera`] goes from the camera frame to pixels and back, [`roi`] from a region of an image to the whole,
-//! [`homography`] from a plane to its image;
+//! [`mod@homography`] from a plane to its image;
 //! [`arithmetic`] says which functions of numbers may be used.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
