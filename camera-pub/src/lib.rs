@@ -5,7 +5,8 @@
 //!
 //! Modules in reading order: [`config`] says what can be chosen, [`service`] publishes, `program` reads what
 //! a camera's program writes, `side_channel` what it tells of each frame beside: `metadata` splits that, `pairing`
-//! finds each frame's own, `exposure` says from its stamp when the frame was exposed.
+//! finds each frame's own, `exposure` says from its stamp when the frame was exposed. `rect` publishes frames without the lens'
+//! distortion for whoever wants them.
 //! `v4l2` reads cameras without a program, `marker` says how they are exposed for the marker; [`devices`] lists those of this machine.
 
 pub mod config;
@@ -15,6 +16,7 @@ mod marker;
 mod metadata;
 mod pairing;
 mod program;
+mod rect;
 pub mod service;
 mod side_channel;
 mod v4l2;

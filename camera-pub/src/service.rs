@@ -19,6 +19,7 @@ use crate::config::{Config, DeviceConfig, FrameFormat, FrameSize, ProgramConfig}
 use crate::exposure::Exposure;
 use crate::marker::MarkerExposure;
 use crate::program::Program;
+use crate::rect::RectPublisher;
 use crate::v4l2::capture::{Lost, Taken};
 use crate::v4l2::kernel::DevicePath;
 use crate::v4l2::pixels::Pixels;
@@ -173,6 +174,7 @@ struct Stream {
     size: FrameSize,
     frames: FramePublisher,
     air: AirSender,
+    rect: RectPublisher,
     health: Arc<HealthCounters>,
     marker: MarkerExposure,
     sequence: u64,
@@ -197,7 +199,7 @@ struct Prepared {
     height: usize,
     format: PixelFormat,
     pixels: Loan,
-    /// Grey pixels for the air link, when it wants a frame and `pixels` are in another format.
+    /// Grey pixels for the air link and for rectified frames, when one wants them and `pixels` are in another format.
     grey: Option<GrayImage>,
 }
 
@@ -214,6 +216,8 @@ impl Stream {
             size: found.size,
             frames: node.frame_publisher(topic::FRAME, &names, found.max_frame_bytes).await?,
             air: AirSender::start(node, config.instance(), jpegs, &config.air).await?,
+            rect: RectPublisher::start(node, config.instance(), config.intrinsics(found.size)?)
+                .await?,
             health: node.shared_health(),
             marker,
             sequence: 0,
@@ -458,9 +462,9 @@ impl Stream {
         Ok(Prepared { width, height, format, pixels, grey })
     }
 
-    /// True when a frame of this format must be converted to grey for the air link.
+    /// True when a frame of this format must be converted to grey, for the air link or to be rectified.
     fn needs_grey(&self, format: PixelFormat) -> bool {
-        format != PixelFormat::Mono8 && self.air.is_wanted()
+        format != PixelFormat::Mono8 && (self.air.is_wanted() || self.rect.is_wanted())
     }
 
     async fn publish(&mut self, frame: Prepared, exposure: Exposure) {
@@ -478,10 +482,13 @@ impl Stream {
             format: frame.format,
             parts: Vec::new(),
         };
-        match &frame.grey {
-            Some(grey) => self.air.offer(&header, grey.pixels()),
-            None if frame.format == PixelFormat::Mono8 => self.air.offer(&header, &frame.pixels),
-            None => {}
+        let grey = match &frame.grey {
+            Some(grey) => Some(grey.pixels()),
+            None => (frame.format == PixelFormat::Mono8).then_some(&*frame.pixels),
+        };
+        if let Some(grey) = grey {
+            self.air.offer(&header, grey);
+            self.rect.offer(&header, grey);
         }
         self.frames.publish(&header, frame.pixels).await;
         self.sequence += 1;
@@ -569,5 +576,58 @@ mod tests {
             })
             .await;
         }
+    }
+
+    /// Grey levels that differ everywhere, so that no two places of a frame can be taken for each other.
+    fn picture(width: u32, height: u32) -> image::GrayImage {
+        image::GrayImage::from_fn(width, height, |x, y| {
+            image::Luma([((x * 3 + y * 5) % 251) as u8])
+        })
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn rectified_frames_are_made_only_while_somebody_subscribes() {
+        let folder = tempfile::tempdir().unwrap();
+        let picture = picture(320, 240);
+        picture.save(folder.path().join("1.png")).unwrap();
+        let mut set = vec![format!("source.paths=[{:?}]", folder.path())];
+        let lens = ["calibration.lens=brown-conrady", "calibration.distortion=[-0.3, 0.1]"];
+        let stream = ["source.repeat=true", "source.rate_hz=50", "calibration.focal_px=[250, 251]"];
+        set.extend(lens.iter().chain(&stream).map(|&key| key.to_owned()));
+        let config = Layers { file: None, set }.load::<Config>().unwrap().settings;
+        let found = find(&config).unwrap();
+        let camera_model = config.intrinsics(found.size).unwrap().unwrap();
+        let mut straight = vec![0; 320 * 240];
+        let view = GrayView::packed(picture.as_raw(), 320, 240).unwrap();
+        assert!(media::Rectifier::new(&camera_model).rectify(view, &mut straight));
+        assert_ne!(&straight, picture.as_raw());
+
+        let ([port], _, _) = testing::ports::free().unwrap();
+        let (camera, viewer) = (open("camera-pub", port).await, open("gcs-bridge", port).await);
+        let mut stream = Stream::new(&camera, &config, &found).await.unwrap();
+        let Source::Images(images) = found.source else { panic!("no images") };
+        let seeing = async {
+            let frames = viewer.frame_subscriber(topic::FRAME, &["down"]).await.unwrap();
+            for _ in 0..10 {
+                frames.next().await.unwrap();
+            }
+            assert_eq!(camera.health().percentiles("rectify"), None);
+            let rectified = viewer.frame_subscriber(topic::RECT, &["down"]).await.unwrap();
+            for _ in 0..3 {
+                let frame = rectified.next().await.unwrap();
+                let header = &frame.header;
+                assert_eq!((header.width, header.height), (320, 240));
+                assert_eq!((header.format, header.camera.as_str()), (PixelFormat::Mono8, "down"));
+                assert!(frame.bytes()[..] == straight[..]);
+            }
+        };
+        let seen = tokio::time::timeout(Duration::from_secs(20), seeing);
+        tokio::select! {
+            result = stream.publish_images(&images) => result.unwrap(),
+            seen = seen => seen.expect("rectified frames in time"),
+        }
+        drop(stream);
+        camera.close().await;
+        viewer.close().await;
     }
 }

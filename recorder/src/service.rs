@@ -89,12 +89,15 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     ended.unwrap_or_else(|_panic| bail!("the thread of the recorder panicked"))
 }
 
-/// Whether a topic is subscribed to. JPEG frames and a detector's debug images are made only while somebody subscribes,
-/// and would cost those time.
+/// Whether a topic is subscribed to. JPEG and rectified frames and a detector's debug images are made only while somebody
+/// subscribes, and would cost those time.
 fn is_wanted(row: &Row, frames: Frames) -> bool {
     let is_frame = row.key == topic::FRAME.key(&["{camera}"]);
-    let is_made_on_demand =
-        [topic::JPEG.key(&["{camera}"]), topic::DEBUG_IMAGE.key(&["{detector}", "{image}"])];
+    let is_made_on_demand = [
+        topic::JPEG.key(&["{camera}"]),
+        topic::RECT.key(&["{camera}"]),
+        topic::DEBUG_IMAGE.key(&["{detector}", "{image}"]),
+    ];
     row.delivery != Delivery::Query
         && !is_made_on_demand.iter().any(|key| key == row.key)
         && (frames != Frames::None || !is_frame)

@@ -128,6 +128,10 @@ pub const FRAME: Topic<FrameHeader> =
 /// JPEG files, of the whole frame or of parts of it; the message is the attachment.
 pub const JPEG: Topic<FrameHeader> =
     Topic::new("camera/{camera}/jpeg", Delivery::Latest, CAMERAS, DETECTOR);
+/// Grey pixels as the same camera would see them without distortion; made only while somebody subscribes. The message is the
+/// attachment.
+pub const RECT: Topic<FrameHeader> =
+    Topic::new("camera/{camera}/rect", Delivery::Latest, &["camera-pub"], NO_OTHERS);
 /// A camera's calibration and mount.
 pub const CAMERA_INFO: Topic<CameraInfo> =
     Topic::new("camera/{camera}/info", Delivery::LastValue, CAMERAS, &["controller", "detector"]);
@@ -234,6 +238,7 @@ pub fn claim_key(service: &str, instance: &str, session: &str) -> String {
 pub const TOPICS: &[Row] = &[
     FRAME.row,
     JPEG.row,
+    RECT.row,
     CAMERA_INFO.row,
     DETECTIONS.row,
     FRAME_ACK.row,
