@@ -412,7 +412,13 @@ function startVideo() {
   hasVideo = true;
   const canvas = /** @type {HTMLCanvasElement} */ (element('video'));
   const url = address('/video');
-  if ('transferControlToOffscreen' in canvas && 'Worker' in window) {
+  if (!('createImageBitmap' in window)) {
+    const image = document.createElement('img');
+    [image.id, image.alt, image.src] = ['video', "The camera's picture", '/video.mjpeg'];
+    canvas.replaceWith(image);
+    put('video-text', 'This browser cannot draw what was found into its picture, and does not tell how old a picture is.');
+    videoAgain = () => { image.src = `/video.mjpeg?${performance.now()}`; };
+  } else if ('transferControlToOffscreen' in canvas && 'Worker' in window) {
     const offscreen = canvas.transferControlToOffscreen();
     const worker = new Worker('/worker.js', { type: 'module' });
     worker.onmessage = (event) => pictureTold(event.data);

@@ -6,14 +6,15 @@
 //! Modules in reading order: [`config`]; [`state`] is what is known, as JSON with the age of each number, with [`words`] for
 //! people, what was [`found`], the [`checks`] before a flight and the [`log`]; [`pairing`] joins a picture with what was found in it, and
 //! [`window`] bounds what is on its way to a browser; [`guard`] decides who may read and command, with [`nonce`] for each
-//! command and [`tokens`] in a file. These are without network. `server` answers browsers, `video` makes pictures, and
-//! [`service`] follows the topics.
+//! command and [`tokens`] in a file. These are without network. `server` answers browsers, `video` makes pictures,
+//! `motion` gives them to viewers of Motion JPEG, and [`service`] follows the topics.
 
 pub mod checks;
 pub mod config;
 pub mod found;
 pub mod guard;
 pub mod log;
+mod motion;
 pub mod nonce;
 pub mod pairing;
 mod server;

@@ -9,7 +9,7 @@ use anyhow::Context;
 use axum::Router;
 use axum::body::Body;
 use axum::extract::ws::{Message, Utf8Bytes, WebSocket, WebSocketUpgrade};
-use axum::extract::{ConnectInfo, DefaultBodyLimit, Request, State as Shared};
+use axum::extract::{ConnectInfo, DefaultBodyLimit, Extension, Request, State as Shared};
 use axum::http::header::{
     CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, COOKIE, HOST, ORIGIN, REFERRER_POLICY,
     SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
@@ -29,6 +29,7 @@ use tokio::time::{interval, timeout};
 use crate::config::Config;
 use crate::guard::{Access, Guard, Refusal};
 use crate::log::Level;
+use crate::motion;
 use crate::nonce::Nonce;
 use crate::state::State;
 use crate::tokens::{Kind, SESSION_S, Sessions, Tokens, secret, usual_file};
@@ -198,6 +199,7 @@ pub(crate) async fn serve(listener: TcpListener, app: Arc<App>) -> Infallible {
         .route("/logout", post(logout))
         .route("/ws", get(data))
         .route("/video", get(video))
+        .route("/video.mjpeg", get(motion_jpeg))
         .layer(DefaultBodyLimit::max(MAX_REQUEST_BYTES))
         .layer(from_fn_with_state(Arc::clone(&app), protect))
         .with_state(app);
@@ -302,6 +304,21 @@ async fn video(
     let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
     match std::future::ready(app.access(peer, &headers).and(permit)).await {
         Ok(permit) => bounded(upgrade).on_upgrade(move |socket| pictures(app, socket, permit)),
+        Err(refusal) => app.refuse(refusal),
+    }
+}
+
+/// Video for programs that show nothing else, as ground stations, or browsers without bitmaps: without what was found, as that
+/// is drawn by the page.
+async fn motion_jpeg(
+    Shared(app): Shared<Arc<App>>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    Extension(connection): Extension<web::Connection>,
+    headers: HeaderMap,
+) -> Response {
+    let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
+    match std::future::ready(app.access(peer, &headers).and(permit)).await {
+        Ok(permit) => motion::answer(app.shown.subscribe(), connection, permit),
         Err(refusal) => app.refuse(refusal),
     }
 }

@@ -36,6 +36,8 @@ pub(crate) struct Shown {
     pub(crate) at_ns: i64,
     /// The length of the header (4 bytes, lowest first), the header as JSON, the JPEG files.
     pub(crate) message: Bytes,
+    /// The JPEG file of the whole picture; `None` for one that came in several parts.
+    pub(crate) jpeg: Option<Bytes>,
 }
 
 /// Makes pictures while somebody looks.
@@ -167,11 +169,9 @@ impl Video {
         if picture.found.is_none() {
             self.node.health().dropped("picture without detections in time");
         }
-        self.shown.send_replace(Some(Shown {
-            number: self.number,
-            at_ns,
-            message: message.into(),
-        }));
+        let message = Bytes::from(message);
+        let jpeg = is_one_file(&picture.header).then(|| message.slice(4 + header.len()..));
+        self.shown.send_replace(Some(Shown { number: self.number, at_ns, message, jpeg }));
     }
 
     // What is known is whole after each message, also when a thread panics.
@@ -191,6 +191,18 @@ fn files(header: &FrameHeader, bytes: &[u8], quality: u8) -> Option<Vec<u8>> {
     let told: u64 = header.parts.iter().map(|part| u64::from(part.bytes)).sum();
     let is_whole = header.parts.is_empty() || told == bytes.len() as u64;
     is_whole.then(|| jpeg(header, bytes, quality)).flatten()
+}
+
+/// Whether one file shows the whole frame.
+fn is_one_file(header: &FrameHeader) -> bool {
+    match header.parts.as_slice() {
+        [] => true,
+        [part] => {
+            let shown = [part.width, part.height].map(|edge| edge.saturating_mul(part.scale));
+            [part.x, part.y] == [0, 0] && shown[0] >= header.width && shown[1] >= header.height
+        }
+        _ => false,
+    }
 }
 
 fn header_json(number: u64, at_ns: i64, picture: &Picture, clock: &str) -> Value {

@@ -5,6 +5,7 @@ was measured as JSON on its last line. Exit status 77: no browser, or no package
 """
 
 import json
+import os
 import shutil
 import sys
 import time
@@ -44,6 +45,28 @@ TWICE = """(button) => {
   const key = (kind) => button.dispatchEvent(new KeyboardEvent(kind, { key: ' ', bubbles: true }));
   ['keydown', 'keyup', 'keydown'].forEach(key);
 }"""
+
+
+# Deque's axe-core, the rules of accessibility that browsers' own tools check.
+AXE = next((found for folder in os.environ.get("NODE_PATH", "").split(os.pathsep) if (found := Path(folder) / "axe-core/axe.min.js").is_file()), None)
+# In sunlight 7:1 is asked for, which axe-core does by itself for 4.5:1.
+VIOLATIONS = """async () => {
+  const enhanced = document.documentElement.dataset.theme === 'sun';
+  const found = await axe.run(document, { rules: { 'color-contrast-enhanced': { enabled: enhanced } } });
+  const checked = found.passes.map((rule) => rule.id);
+  return { checked, violations: found.violations.map((it) => `${it.impact} ${it.id}: ${it.nodes.map((node) => node.html.slice(0, 80)).join(' | ')}`) };
+}"""
+
+
+def accessibility(page, names):
+    """Asserts that axe-core finds nothing; the rules that were checked."""
+    if AXE is None:
+        return None
+    page.evaluate(AXE.read_text())
+    found = page.evaluate(VIOLATIONS)
+    assert not found["violations"], found["violations"]
+    assert set(names) <= set(found["checked"]), found["checked"]
+    return len(found["checked"])
 
 
 def asked(what):
@@ -103,16 +126,19 @@ def main():
         page.set_viewport_size({"width": 360, "height": 740})
         time.sleep(0.5)
         width = page.evaluate("document.documentElement.scrollWidth")
+        measured["accessibility"] = accessibility(page, ["color-contrast", "button-name"])
         assert width <= 360, f"a telephone would have to scroll sideways: {width} px"
         page.screenshot(path=FOLDER / "telephone.png", full_page=True)
         page.set_viewport_size({"width": 1440, "height": 1150})
         page.locator("#theme").click()
         page.screenshot(path=FOLDER / "sunlight.png", full_page=True)
+        accessibility(page, ["color-contrast-enhanced"])
         page.locator("#theme").click()
 
         asked("KILL")
         stale = "[...document.querySelectorAll('[data-group], #video-panel')].every((it) => it.classList.contains('stale'))"
         measured["grey_s"] = wait(page, stale, 5)
+        accessibility(page, ["button-name"])
         assert page.locator("button[data-command=abort]").is_disabled(), "a button can be used without a connection"
         assert "was:" in text(page, "#phase"), text(page, "#phase")
         for selector in TELLING:

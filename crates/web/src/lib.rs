@@ -1,22 +1,26 @@
 //! Answers to browsers and viewers over HTTP, whose connections are bounded in number and time.
 //!
 //! Whoever reaches the address can open connections and say nothing. Each takes a place until its request is there, or its
-//! time is over; a WebSocket gives it back, as those are counted by who answers them.
+//! time is over; a WebSocket gives it back, as those are counted by who answers them. An answer without end, as a video, says
+//! that its connection lasts, and ends it.
 
 use std::convert::Infallible;
+use std::future::ready;
 use std::io::ErrorKind;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use axum::Router;
-use axum::extract::ConnectInfo;
+use axum::extract::{ConnectInfo, Request};
+use axum::middleware::map_request;
+use axum::{Extension, Router};
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use node::HealthCounters;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
-use tokio::time::{sleep, timeout};
+use tokio::sync::{Notify, Semaphore};
+use tokio::time::sleep;
 
 /// Pause after an error of the system, as that there are too many open files.
 const PAUSE: Duration = Duration::from_millis(500);
@@ -30,8 +34,53 @@ pub struct Limits {
     pub connections: usize,
     /// Maximum time until the head of a request is there, also of a further one.
     pub head: Duration,
-    /// Maximum time of a connection that does not become a WebSocket.
+    /// Maximum time of a connection that does not become a WebSocket and does not last.
     pub connection: Duration,
+}
+
+/// The connection of a request; each request has it as an extension.
+#[derive(Clone, Default)]
+pub struct Connection(Arc<Shared>);
+
+#[derive(Default)]
+struct Shared {
+    /// A request has come.
+    has_asked: AtomicBool,
+    lasts: AtomicBool,
+    over: Notify,
+}
+
+/// As long as this is there, its connection lasts beyond [`Limits::connection`]; with it the connection ends, whatever is still
+/// to be sent.
+pub struct Lasting(Connection);
+
+impl Connection {
+    /// Lets this connection last.
+    #[must_use]
+    pub fn last(self) -> Lasting {
+        self.0.lasts.store(true, Ordering::Relaxed);
+        Lasting(self)
+    }
+
+    fn asked(&self, request: Request) -> Request {
+        self.0.has_asked.store(true, Ordering::Relaxed);
+        request
+    }
+
+    /// Waits for the end of its time.
+    async fn over(&self, limit: Duration) {
+        sleep(limit).await;
+        if self.0.lasts.load(Ordering::Relaxed) {
+            self.0.over.notified().await;
+        }
+    }
+}
+
+impl Drop for Lasting {
+    fn drop(&mut self) {
+        // One permit is kept, also when nobody waits yet.
+        self.0.0.over.notify_one();
+    }
 }
 
 impl Default for Limits {
@@ -64,10 +113,16 @@ pub async fn serve(
                 continue;
             }
         };
-        let router = router.clone().layer(axum::Extension(ConnectInfo(peer)));
+        let connection = Connection::default();
+        let asking = connection.clone();
+        let router = router
+            .clone()
+            .layer(Extension(ConnectInfo(peer)))
+            .layer(Extension(connection.clone()))
+            .layer(map_request(move |request: Request| ready(asking.asked(request))));
         let health = Arc::clone(&health);
         tokio::spawn(async move {
-            answer(stream, router, limits, &health).await;
+            answer(stream, router, limits, &connection, &health).await;
             drop(place);
         });
     }
@@ -79,18 +134,29 @@ fn is_of_the_peer(kind: ErrorKind) -> bool {
     matches!(kind, ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
 
-async fn answer(stream: TcpStream, router: Router, limits: Limits, health: &HealthCounters) {
+async fn answer(
+    stream: TcpStream,
+    router: Router,
+    limits: Limits,
+    connection: &Connection,
+    health: &HealthCounters,
+) {
     // Small messages go at once.
     drop(stream.set_nodelay(true));
-    let connection = http1::Builder::new()
+    let answering = http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(limits.head)
         .max_buf_size(MAX_HEAD_BYTES)
         .serve_connection(TokioIo::new(stream), TowerToHyperService::new(router))
         .with_upgrades();
-    match timeout(limits.connection, connection).await {
-        Ok(Err(problem)) if problem.is_timeout() => health.dropped("a request took too long"),
-        Err(_) => health.dropped("a connection took too long"),
-        Ok(_) => {}
+    tokio::select! {
+        answered = answering => {
+            // A browser keeps its connection for a next request, and lets it end.
+            let has_asked = connection.0.has_asked.load(Ordering::Relaxed);
+            if !has_asked && answered.is_err_and(|problem| problem.is_timeout()) {
+                health.dropped("a request took too long");
+            }
+        }
+        () = connection.over(limits.connection) => health.dropped("a connection took too long"),
     }
 }

@@ -1,22 +1,25 @@
 //! Connections that say nothing, little, or go on.
 
+use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
-use axum::Router;
+use axum::body::{Body, Bytes};
 use axum::extract::ConnectInfo;
 use axum::extract::ws::{Message, WebSocketUpgrade};
 use axum::response::Response;
 use axum::routing::get;
-use futures_util::StreamExt;
+use axum::{Extension, Router};
+use futures_util::{StreamExt, stream};
 use node::HealthCounters;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 use tokio_tungstenite::connect_async;
-use web::{Limits, serve};
+use web::{Connection, Limits, serve};
 
 const PATIENCE: Duration = Duration::from_secs(20);
 const LIMITS: Limits = Limits {
@@ -46,6 +49,25 @@ async fn socket(upgrade: WebSocketUpgrade) -> Response {
     })
 }
 
+/// The connection of an answer without end, which ends when nobody has taken anything for 300 ms; it takes a second to begin.
+async fn video(Extension(connection): Extension<Connection>) -> Body {
+    let (parts, waiting) = mpsc::channel::<Bytes>(1);
+    let lasting = connection.last();
+    tokio::spawn(async move {
+        let part = Bytes::from_static(&[b'x'; 100_000]);
+        for _ in 0..300 {
+            sleep(Duration::from_millis(10)).await;
+            if !timeout(LIMITS.head, parts.send(part.clone())).await.is_ok_and(|it| it.is_ok()) {
+                break;
+            }
+        }
+        drop(lasting);
+    });
+    Body::from_stream(stream::unfold(waiting, async |mut waiting| {
+        waiting.recv().await.map(|part| (Ok::<_, Infallible>(part), waiting))
+    }))
+}
+
 struct Served {
     address: SocketAddr,
     health: Arc<HealthCounters>,
@@ -58,6 +80,7 @@ async fn served() -> anyhow::Result<Served> {
     let router = Router::new()
         .route("/who", get(who))
         .route("/slowly", get(slowly))
+        .route("/video", get(video))
         .route("/socket", get(socket));
     tokio::spawn(serve(listener, router, LIMITS, Arc::clone(&health)));
     Ok(Served { address, health })
@@ -85,6 +108,18 @@ async fn connections_that_say_nothing_or_little_are_closed() -> anyhow::Result<(
         ensure!(!answer.contains("200"), "{said:?}: {answer}");
         ensure!(began.elapsed() >= LIMITS.head, "{said:?}: {:?}", began.elapsed());
     }
+    let told = format!("{:?}", served.health);
+    ensure!(told.contains("a request took too long"), "{told}");
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_connection_that_was_answered_and_waits_for_no_more_is_no_fault() -> anyhow::Result<()> {
+    let served = served().await?;
+    let answer = ask(served.address, "GET /who HTTP/1.1\r\nHost: x\r\n\r\n").await?;
+    ensure!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+    let told = format!("{:?}", served.health);
+    ensure!(!told.contains("took too long"), "{told}");
     Ok(())
 }
 
@@ -126,5 +161,26 @@ async fn a_websocket_lasts_and_takes_no_place() -> anyhow::Result<()> {
         }
         ensure!(messages == 30, "{messages} of 30 messages in 3 s");
     }
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_answer_that_lasts_goes_on_until_who_gives_it_ends_it() -> anyhow::Result<()> {
+    let served = served().await?;
+    let request = b"GET /video HTTP/1.1\r\nHost: x\r\n\r\n";
+    let mut stream = TcpStream::connect(served.address).await?;
+    let began = Instant::now();
+    stream.write_all(request).await?;
+    let answer = rest(&mut stream).await?;
+    // What was not sent at its end is lost.
+    ensure!(answer.len() > 250 * 100_000, "{} bytes", answer.len());
+    ensure!(began.elapsed() > LIMITS.connection, "{:?}", began.elapsed());
+
+    // Who takes nothing has what fits into the buffers of the system, and then a closed connection.
+    let mut stuck = TcpStream::connect(served.address).await?;
+    stuck.write_all(request).await?;
+    sleep(LIMITS.connection + Duration::from_secs(2)).await;
+    let answer = rest(&mut stuck).await.unwrap_or_default();
+    ensure!(answer.len() < 250 * 100_000, "{} bytes", answer.len());
     Ok(())
 }
