@@ -70,14 +70,16 @@ async fn a_landing_is_recorded_and_read_by_other_programs() -> anyhow::Result<()
     let said = String::from_utf8_lossy(&replay.stdout).into_owned();
     println!("{said}");
     ensure!(replay.status.success() && said.contains("verified"), "{said}");
-    let report = output_of(Command::new(flight::ALIGHT).args(["report", name]))?;
+    let figures = file.with_extension("figures").display().to_string();
+    let report =
+        output_of(Command::new(flight::ALIGHT).args(["report", name, "--figures", &figures]))?;
     let said = String::from_utf8_lossy(&report.stdout).into_owned();
     println!("{said}");
     ensure!(report.status.success() && said.contains("landed; "), "{said}");
     ensure!(said.contains("tape verified to the bit"), "{said}");
     let page = std::fs::read_to_string(file.with_extension("html"))?;
     ensure!(page.contains("id=\"landing\"") && page.contains("descending over"), "{}", page.len());
-    let Some(reader) = python("tests/recording/read.py", &[name]) else { return Ok(()) };
+    let Some(reader) = python("tests/recording/read.py", &[name, &figures]) else { return Ok(()) };
     let output = tokio::task::block_in_place(|| reader.wait_with_output())?;
     if !python_passes(&output)? {
         return Ok(());
@@ -85,6 +87,7 @@ async fn a_landing_is_recorded_and_read_by_other_programs() -> anyhow::Result<()
     let text = String::from_utf8_lossy(&output.stdout);
     let read: serde_json::Value = serde_json::from_str(text.lines().last().context("a line")?)?;
     ensure!(read["is_ended"] == true && read["messages"] == contents.messages, "{read}");
+    ensure!(read["figures"].as_u64().is_some_and(|drawn| drawn >= 20), "{}", read["figures"]);
     ensure!(read["indexed"] == contents.messages, "{} of {read}", read["indexed"]);
     let overlays =
         [&read["overlays"], &read["overlays_with_picture"]].map(serde_json::Value::as_u64);

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, ensure};
 use clap::Args;
-use report::{Flight, FlightReader, comparison, page, replay_tapes, summary};
+use report::{Flight, FlightReader, comparison, figures, page, replay_tapes, summary};
 
 use crate::args::Format;
 use crate::terminal::{print, write_error};
@@ -22,6 +22,10 @@ pub(crate) struct ReportArgs {
     /// The page [default: the first recording's name with `.html`, beside it].
     #[arg(short, long, value_name = "FILE.html")]
     output: Option<PathBuf>,
+    /// A folder for the charts as SVG files, with title and legend, for papers and slides; of two flights in
+    /// the folders `1` and `2` in it.
+    #[arg(long, value_name = "FOLDER")]
+    figures: Option<PathBuf>,
     /// What is printed: a line for a bug report, or the flight in numbers as one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
@@ -56,6 +60,12 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     );
     std::fs::write(output, html)
         .with_context(|| format!("writing {output:?}; name another file with `--output`"))?;
+    if let Some(folder) = &args.figures {
+        for (number, flight) in (1..).zip(&flights) {
+            let of_several = folder.join(number.to_string());
+            write_figures(flight, if flights.len() > 1 { &of_several } else { folder })?;
+        }
+    }
     for flight in &flights {
         let summary = summary(flight);
         match args.format {
@@ -65,6 +75,18 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     }
     write_error(&format!("the page: {}", output.display()));
     Ok(ExitCode::SUCCESS)
+}
+
+fn write_figures(flight: &Flight, folder: &Path) -> anyhow::Result<()> {
+    std::fs::create_dir_all(folder)
+        .with_context(|| format!("making the folder {folder:?} of `--figures`"))?;
+    let figures = figures(flight)?;
+    for figure in &figures {
+        let file = folder.join(&figure.name);
+        std::fs::write(&file, &figure.svg).with_context(|| format!("writing {file:?}"))?;
+    }
+    write_error(&format!("{} figures: {}", figures.len(), folder.display()));
+    Ok(())
 }
 
 /// Whether two paths lead to one file that is there.

@@ -2,9 +2,9 @@
 """Reads a recording with programs that are none of ours: the Python packages `mcap` and `mcap-protobuf-support`.
 
 It decodes every message, compares the types with those of Foxglove's own package, looks for a picture with the stamp of
-each overlay, and prints what it found as one JSON object on the last line.
+each overlay, counts the drawings of a report, and prints what it found as one JSON object on the last line.
 
-    python3 tests/recording/read.py FILE.mcap
+    python3 tests/recording/read.py FILE.mcap [FOLDER OF FIGURES]
 
 Exit status: 0 read, 1 something is wrong, 77 a package is missing
 (pip install mcap mcap-protobuf-support foxglove-schemas-protobuf).
@@ -14,6 +14,8 @@ import collections
 import importlib
 import json
 import sys
+import xml.etree.ElementTree
+from pathlib import Path
 
 try:
     from google.protobuf import descriptor_pb2
@@ -55,7 +57,14 @@ def nanoseconds(stamp):
     return stamp.seconds * 10**9 + stamp.nanos
 
 
-def main(path):
+def is_drawing(path):
+    """Whether a file is whole SVG with something drawn in it."""
+    root = xml.etree.ElementTree.parse(path).getroot()
+    svg = "{http://www.w3.org/2000/svg}"
+    return root.tag == f"{svg}svg" and any(root.iter(f"{svg}{kind}") for kind in ("polyline", "polygon", "circle"))
+
+
+def main(path, figures):
     counts, files, metadata = collections.Counter(), {}, {}
     schemas, channels, decoders = {}, {}, {}
     pictures, overlays, lines = set(), [], []
@@ -122,10 +131,11 @@ def main(path):
                 "overlays_with_picture": sum(stamp in pictures for stamp in overlays),
                 "log": lines,
                 "last_ns": last_ns,
+                "figures": sum(is_drawing(path) for folder in figures for path in Path(folder).glob("*.svg")),
             }
         )
     )
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[1], sys.argv[2:])

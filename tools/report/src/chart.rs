@@ -9,7 +9,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 /// A chart is drawn this many times as large as it is shown, because points of SVG are whole pixels here.
-const SCALE: f64 = 2.0;
+pub const SIZE_FACTOR: u32 = 2;
 /// Size of texts, in pixels of the drawing.
 const FONT: u32 = 28;
 /// Points closer than this to the last one are left out of a line, in pixels of the drawing.
@@ -57,6 +57,12 @@ impl Ink {
             Self::Grey => RGBColor(130, 130, 130),
             Self::Text => RGBColor(51, 51, 51),
         }
+    }
+
+    /// The colour in light, as CSS has it.
+    pub fn css(self) -> String {
+        let RGBColor(red, green, blue) = self.rgb();
+        format!("#{red:02x}{green:02x}{blue:02x}")
     }
 
     /// Its name in `style.css`.
@@ -208,7 +214,7 @@ impl Chart {
     pub fn svg(&self) -> anyhow::Result<String> {
         let mut svg = String::new();
         {
-            let size = [WIDTH, self.height].map(|pixels| (f64::from(pixels) * SCALE) as u32);
+            let size = [WIDTH, self.height].map(|pixels| pixels * SIZE_FACTOR);
             let area = SVGBackend::with_string(&mut svg, size.into()).into_drawing_area();
             self.draw(&area, size).map_err(|problem| anyhow!("{}: {problem}", self.title))?;
             area.present().map_err(|problem| anyhow!("{}: {problem}", self.title))?;
