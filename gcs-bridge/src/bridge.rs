@@ -12,14 +12,15 @@ use autopilot::packet::{Counters, encode};
 use autopilot::permission::Refusal;
 use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Permission, Sender};
 use messages::{
-    ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus, TargetEstimate,
-    topic,
+    Configuration, ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus,
+    TargetEstimate, topic,
 };
 use node::{HealthCounters, INSECURE, Node, Shutdown, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::camera::Camera;
 use crate::config::Config;
+use crate::params::{Ask, Parameters};
 use crate::request;
 use crate::route::{self, Own, Route};
 use crate::target::LandingTargetPublisher;
@@ -28,8 +29,8 @@ use crate::vehicle::Vehicle;
 
 /// Period of heartbeats in MAVLink.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Period at which the camera looks whether the marker's place is due, also when no frame comes.
-const CAMERA_TICK: Duration = Duration::from_millis(50);
+/// Period at which what is due is sent: the marker's place, also when no frame comes, and parameters.
+const TICK: Duration = Duration::from_millis(50);
 /// Silence of the ground station after which all texts are repeated, in nanoseconds.
 const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
 
@@ -54,10 +55,11 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     // A relay that takes anybody's commands says so in its health.
     let relays = node.subscriber(topic::HEALTH, &["relay", "*"]).await?;
     let recorders = node.subscriber(topic::RECORDER_STATUS, &[]).await?;
+    let configurations = node.subscriber(topic::CONFIGURATION, &["controller", "*"]).await?;
     let mut second = interval(HEARTBEAT);
     second.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut camera = interval(CAMERA_TICK);
-    camera.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut ticks = interval(TICK);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut bridge = Bridge::new(&config, ground.sender(), node.shared_health())?;
     node.announce().await?;
     tracing::info!(ground = config.ground, "Ready");
@@ -79,7 +81,13 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                 let detector = topic::DETECTIONS.first_name(&key).unwrap_or_default();
                 bridge.detections(now_ns(), detector, &found);
             }
-            _ = camera.tick() => bridge.track(now_ns()),
+            configuration = configurations.next() => {
+                bridge.configuration(now_ns(), &configuration.context(CLOSED)?);
+            }
+            _ = ticks.tick() => {
+                bridge.track(now_ns());
+                bridge.send_parameters(now_ns());
+            }
             change = controllers.next() => {
                 let (controller, is_there) = change.context(CLOSED)?;
                 bridge.controller(now_ns(), controller, is_there);
@@ -113,6 +121,7 @@ struct Bridge {
     camera: Camera,
     /// Another component has the camera's id, and that was told.
     camera_is_taken: bool,
+    parameters: Parameters,
     permission: Permission,
     /// When the ground station was told of a refusal.
     refusal_ns: Option<i64>,
@@ -157,6 +166,7 @@ impl Bridge {
             camera_component: config.camera_component_id,
             camera: Camera::new(now_ns, config.video()),
             camera_is_taken: false,
+            parameters: Parameters::new(&config.parameters),
             permission: config.ground_may.parse()?,
             refusal_ns: None,
             ground,
@@ -235,8 +245,14 @@ impl Bridge {
 
     fn packet_from_ground(&mut self, now_ns: i64, packet: Packet) -> Option<Vec<u8>> {
         self.health.count("from ground");
+        let asked = self.me(now_ns).and_then(|me| Ask::of(&packet, me));
+        if let Some(asked) = asked {
+            self.ground_active(now_ns, packet.sender);
+            self.asked_for_parameters(now_ns, &asked);
+        }
         match route::from_ground(&packet, self.own(now_ns), &self.vehicle) {
             Route::Drop(reason) => self.health.dropped(reason),
+            Route::Parameters => {}
             Route::Answer(message) => {
                 self.ground_active(now_ns, packet.sender);
                 self.send_own(now_ns, &message);
@@ -273,6 +289,34 @@ impl Bridge {
         if let Some(why) = answer.why {
             let text = format!("Alight: not tracked: {why}");
             self.send_text(now_ns, MavSeverity::MAV_SEVERITY_NOTICE, &text);
+        }
+    }
+
+    /// Answers what the ground station asks of our parameters.
+    fn asked_for_parameters(&mut self, now_ns: i64, asked: &Ask) {
+        let answer = self.parameters.answer(asked);
+        if let Some(message) = &answer.message {
+            self.send_own(now_ns, message);
+        }
+        if let Some(why) = answer.why {
+            self.health.failed("from ground: a parameter is not set from there");
+            self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {why}"));
+        }
+    }
+
+    /// Takes the configuration of a controller.
+    fn configuration(&mut self, now_ns: i64, configuration: &Configuration) {
+        if !self.parameters.hear(now_ns, configuration) {
+            self.health.dropped("configuration of a controller: not readable");
+        }
+    }
+
+    /// Sends the next of the parameters that were asked for.
+    fn send_parameters(&mut self, now_ns: i64) {
+        if self.me(now_ns).is_some() {
+            for message in self.parameters.due() {
+                self.send_own(now_ns, &message);
+            }
         }
     }
 

@@ -6,6 +6,7 @@
 use autopilot::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message};
 use autopilot::{Packet, Sender, UnknownCommand};
 
+use crate::params::Ask;
 use crate::request::Command;
 use crate::vehicle::Vehicle;
 
@@ -27,6 +28,8 @@ pub(crate) enum Route {
     Answer(Box<MavMessage>),
     /// A command to the camera, answered here.
     Camera(Command),
+    /// About the companion's parameters, answered already.
+    Parameters,
     /// A command that nobody here knows.
     Unknown(UnknownCommand),
     /// Dropped, for this reason.
@@ -45,6 +48,9 @@ pub(crate) fn from_ground(packet: &Packet, own: Option<Own>, vehicle: &Vehicle) 
         return Route::Unknown(unknown);
     }
     if is_for(packet, own.companion) {
+        if Ask::of(packet, own.companion).is_some() {
+            return Route::Parameters;
+        }
         return match answer(packet) {
             Some(message) => Route::Answer(Box::new(message)),
             None => Route::Drop("from ground: for the companion, and not supported"),
@@ -188,7 +194,10 @@ mod tests {
 
         let (target_system, target_component) = (ME.system, ME.component);
         let list = PARAM_REQUEST_LIST_DATA { target_system, target_component };
-        assert!(matches!(up(GROUND, &MavMessage::PARAM_REQUEST_LIST(list)), Route::Drop(_)));
+        assert_eq!(up(GROUND, &MavMessage::PARAM_REQUEST_LIST(list.clone())), Route::Parameters);
+        // A list that is asked of all is asked of the autopilot as well.
+        let list = PARAM_REQUEST_LIST_DATA { target_component: 0, ..list };
+        assert_eq!(up(GROUND, &MavMessage::PARAM_REQUEST_LIST(list)), Route::Pass);
     }
 
     #[test]

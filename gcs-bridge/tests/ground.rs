@@ -375,8 +375,10 @@ async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow:
     let seeing = tokio::spawn(see(vehicle.node.clone()));
     let bridge = start_bridge(port, &free, &["video='rtsp://10.0.0.2:8554/down'"]).await?;
     drop(free);
+    let area = ["--area", "0.2", "0.2", "0.4", "0.4"];
     for (loss, further) in [("0", &["--commands"][..]), ("0.3", &[])] {
-        let Some(told) = camera_script(address, loss, further).await? else { return Ok(()) };
+        let further = [&area, further].concat();
+        let Some(told) = script("camera.py", address, loss, &further).await? else { return Ok(()) };
         eprintln!("{told}");
         // The sample's marker: within a hundredth of the width of where it was put.
         for part in [
@@ -393,16 +395,42 @@ async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow:
     Ok(())
 }
 
-/// What `tests/gcs/camera.py` says of the camera; none where it cannot run.
-async fn camera_script(
+/// The controller's configuration as QGroundControl loads it, where packets are lost and where none is.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_ground_station_loads_the_companions_parameters_and_changes_none() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let free = Ground::open().await?;
+    let address = free.socket.local_addr()?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let toml = include_str!("../../controller/controller.toml").to_owned();
+    let telling = vehicle.node.clone();
+    let telling = tokio::spawn(async move { telling.publish_configuration(toml).await });
+    let bridge = start_bridge(port, &free, &[]).await?;
+    drop(free);
+    for (loss, seed) in [("0", "1"), ("0.3", "1"), ("0.3", "2")] {
+        let further = ["--seed", seed];
+        let told = script("params.py", address, loss, &further).await?;
+        let Some(told) = told else { return Ok(()) };
+        eprintln!("{told}");
+        for part in [r#""ok": true"#, r#""parameters": 77, "names": 77"#, r#""value": 2.0"#] {
+            ensure!(told.contains(part), "{part} is not in {told}");
+        }
+    }
+    telling.abort();
+    bridge.abort();
+    Ok(())
+}
+
+/// What a script of `tests/gcs` says; none where it cannot run.
+async fn script(
+    name: &str,
     address: SocketAddr,
     loss: &str,
     further: &[&str],
 ) -> anyhow::Result<Option<String>> {
-    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/gcs/camera.py");
+    let script = format!("{}/../tests/gcs/{name}", env!("CARGO_MANIFEST_DIR"));
     let run = tokio::process::Command::new(testing::interpreter())
-        .args([script, "--connect", &format!("udpin:{address}"), "--loss", loss])
-        .args(["--area", "0.2", "0.2", "0.4", "0.4"])
+        .args([&script, "--connect", &format!("udpin:{address}"), "--loss", loss])
         .args(further)
         .kill_on_drop(true)
         .output();

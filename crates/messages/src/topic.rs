@@ -221,7 +221,7 @@ pub const CONFIGURATION: Topic<Configuration> = Topic::new(
     "config/{service}/{instance}",
     Delivery::LastValue,
     &["camera-pub", "controller", "dashboard", "detector", "gcs-bridge", "recorder", "simulator"],
-    NO_OTHERS,
+    BRIDGE,
 );
 
 /// Key of the liveliness token a service declares when it is ready.

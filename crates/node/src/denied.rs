@@ -18,8 +18,8 @@ use tracing_subscriber::layer::{Context, Filter};
 pub const ACCESS_TARGET: &str = "zenoh::net::routing::interceptor::access_control";
 /// The prefix of the log targets of TLS connections.
 pub const CONNECTION_TARGET: &str = "zenoh_link_tls";
-/// Maximum number of reasons that are counted separately, as a peer chooses its keys freely.
-const MAX_REASONS: usize = 64;
+/// Maximum number of reasons that are counted separately, as a peer chooses its keys freely; there are three for each topic.
+const MAX_REASONS: usize = 128;
 /// The reason for all others.
 const OTHER: &str = "denied: others";
 

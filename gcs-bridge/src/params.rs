@@ -1,0 +1,415 @@
+//! The controller's configuration as parameters of the companion (<https://mavlink.io/en/services/parameter.html>).
+//!
+//! They can be read only: a landing is decided with the configuration with which it began. All are REAL32, because ground
+//! stations read other types from the bytes of a float or from its value, depending on the autopilot.
+
+use std::collections::BTreeSet;
+
+use autopilot::dialect::{
+    MavMessage, MavParamType, PARAM_REQUEST_LIST_DATA, PARAM_REQUEST_READ_DATA, PARAM_SET_DATA,
+    PARAM_VALUE_DATA,
+};
+use autopilot::{Packet, Sender};
+use messages::Configuration;
+use toml::Value;
+
+/// Length of a parameter's name in MAVLink, in characters.
+const MAX_NAME: usize = 16;
+/// Maximum number of parameters, and of bytes of a configuration that is read.
+const MAX_PARAMETERS: usize = 256;
+const MAX_TOML: usize = 200_000;
+/// Values sent at once; a list has an autopilot's beside it on the same line.
+const BURST: usize = 3;
+/// Silence of its controller after which another one's configuration is shown, in nanoseconds; it is repeated every 3 s.
+const CONTROLLER_TIMEOUT_NS: i64 = 10_000_000_000;
+
+/// A number or a switch of a configuration.
+#[derive(Clone, Debug, PartialEq)]
+struct Parameter {
+    /// Its name in MAVLink.
+    name: String,
+    /// Its key, as users set it.
+    key: String,
+    value: f32,
+}
+
+/// What a ground station asks of the companion's parameters.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Ask {
+    /// All of them.
+    List,
+    /// One, by its name.
+    Named(String),
+    /// One, by its place.
+    Numbered(u16),
+    /// To change one.
+    Set {
+        /// Its name.
+        name: String,
+        /// The wanted value.
+        value: f32,
+    },
+}
+
+impl Ask {
+    /// What a packet asks of the parameters of the companion; a list is asked of all components at once.
+    pub(crate) fn of(packet: &Packet, companion: Sender) -> Option<Self> {
+        let message = packet.message.as_ref()?;
+        let is_for = |system: u8, component: u8| {
+            (system == 0 || system == companion.system) && component == companion.component
+        };
+        Some(match message {
+            MavMessage::PARAM_REQUEST_LIST(PARAM_REQUEST_LIST_DATA {
+                target_system,
+                target_component,
+            }) if is_for(*target_system, *target_component)
+                || is_for(*target_system, companion.component) && *target_component == 0 =>
+            {
+                Self::List
+            }
+            MavMessage::PARAM_REQUEST_READ(PARAM_REQUEST_READ_DATA {
+                target_system,
+                target_component,
+                param_id,
+                param_index,
+            }) if is_for(*target_system, *target_component) => match u16::try_from(*param_index) {
+                Ok(number) => Self::Numbered(number),
+                Err(_) => Self::Named(param_id.to_str().ok()?.to_owned()),
+            },
+            MavMessage::PARAM_SET(PARAM_SET_DATA {
+                target_system,
+                target_component,
+                param_id,
+                param_value,
+                ..
+            }) if is_for(*target_system, *target_component) => {
+                Self::Set { name: param_id.to_str().ok()?.to_owned(), value: *param_value }
+            }
+            _ => return None,
+        })
+    }
+}
+
+/// The answer to what was asked.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Answer {
+    /// The value as it is, if it was asked for.
+    pub(crate) message: Option<MavMessage>,
+    /// Why nothing was changed, for a person.
+    pub(crate) why: Option<String>,
+}
+
+/// The parameters of the companion.
+#[derive(Debug)]
+pub(crate) struct Parameters {
+    /// The sections of the configuration that are shown.
+    sections: Vec<String>,
+    /// The controller whose configuration it is, and when that was heard.
+    controller: Option<(String, i64)>,
+    /// By name.
+    list: Vec<Parameter>,
+    /// Places of those that are to be sent.
+    due: BTreeSet<u16>,
+    /// A ground station has asked for the list.
+    is_listed: bool,
+}
+
+impl Parameters {
+    /// Those of these sections, once a configuration was heard.
+    pub(crate) fn new(sections: &[String]) -> Self {
+        Self {
+            sections: sections.to_vec(),
+            controller: None,
+            list: Vec::new(),
+            due: BTreeSet::new(),
+            is_listed: false,
+        }
+    }
+
+    /// Takes a controller's configuration. False for one that cannot be read.
+    pub(crate) fn hear(&mut self, now_ns: i64, configuration: &Configuration) -> bool {
+        let is_silent = |heard_ns: i64| now_ns.saturating_sub(heard_ns) > CONTROLLER_TIMEOUT_NS;
+        if let Some((instance, heard_ns)) = &self.controller
+            && *instance != configuration.instance
+            && !is_silent(*heard_ns)
+        {
+            return true;
+        }
+        if configuration.toml.len() > MAX_TOML {
+            return false;
+        }
+        let Ok(table) = configuration.toml.parse::<toml::Table>() else { return false };
+        let list = parameters(&table, &self.sections);
+        self.controller = Some((configuration.instance.clone(), now_ns));
+        if self.is_listed {
+            let is_other = list.len() != self.list.len();
+            let places = (0..).zip(&list).filter(|(place, parameter)| {
+                is_other || self.list.get(usize::from(*place)) != Some(parameter)
+            });
+            let changed: Vec<u16> = places.map(|(place, _)| place).collect();
+            self.due.extend(changed);
+        }
+        self.list = list;
+        true
+    }
+
+    /// Answers what a ground station asks; a list comes bit by bit.
+    pub(crate) fn answer(&mut self, ask: &Ask) -> Answer {
+        let place = match ask {
+            Ask::List => {
+                self.is_listed = true;
+                self.due = (0..).take(self.list.len()).collect();
+                return Answer::default();
+            }
+            Ask::Numbered(place) => Some(*place),
+            Ask::Named(name) | Ask::Set { name, .. } => {
+                (0..).zip(&self.list).find(|(_, it)| it.name == *name).map(|(place, _)| place)
+            }
+        };
+        let found = place.and_then(|place| Some((place, self.list.get(usize::from(place))?)));
+        let why = match (ask, found) {
+            (Ask::Set { name, .. }, None) => Some(format!("there is no parameter {name}")),
+            (Ask::Set { value, .. }, Some((_, it))) if *value != it.value => Some(format!(
+                "{} stays {}: set {} of the controller before the flight",
+                it.name, it.value, it.key
+            )),
+            _ => None,
+        };
+        let message = place.and_then(|place| self.value(place));
+        // Who reads a single one has lost it before, so it is sent once more.
+        self.due.extend(place.filter(|_| message.is_some()));
+        Answer { message, why }
+    }
+
+    /// The next values of a list that was asked for.
+    pub(crate) fn due(&mut self) -> Vec<MavMessage> {
+        let places: Vec<u16> = self.due.iter().take(BURST).copied().collect();
+        for place in &places {
+            self.due.remove(place);
+        }
+        places.into_iter().filter_map(|place| self.value(place)).collect()
+    }
+
+    fn value(&self, place: u16) -> Option<MavMessage> {
+        let parameter = self.list.get(usize::from(place))?;
+        Some(MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
+            param_value: parameter.value,
+            param_count: self.list.len() as u16,
+            param_index: place,
+            param_id: parameter.name.as_str().into(),
+            param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
+        }))
+    }
+}
+
+/// The numbers and switches of the sections, by name.
+fn parameters(table: &toml::Table, sections: &[String]) -> Vec<Parameter> {
+    let mut list: Vec<Parameter> = Vec::new();
+    for section in sections {
+        let Some(Value::Table(keys)) = table.get(section) else { continue };
+        for (key, value) in keys {
+            let value = match value {
+                Value::Float(number) => *number as f32,
+                Value::Integer(number) => *number as f32,
+                Value::Boolean(is_on) => f32::from(u8::from(*is_on)),
+                _ => continue,
+            };
+            let is_free = |name: &String| !list.iter().any(|other| other.name == *name);
+            let Some(name) = names_of(section, key).find(is_free) else { continue };
+            if list.len() < MAX_PARAMETERS {
+                list.push(Parameter { name, key: format!("{section}.{key}"), value });
+            }
+        }
+    }
+    list.sort_by(|one, other| one.name.cmp(&other.name));
+    list
+}
+
+/// The names of a key, the best first: where another key has one, its last letter becomes a digit.
+fn names_of(section: &str, key: &str) -> impl Iterator<Item = String> {
+    let best = name_of(section, key);
+    let shorter = best.char_indices().next_back().map_or(0, |(end, _)| end);
+    let stem = best.get(..shorter).unwrap_or_default().to_owned();
+    std::iter::once(best).chain((2..10).map(move |digit| format!("{stem}{digit}")))
+}
+
+/// A key's name in MAVLink: its words in capitals, of which the longest, or of several the last, loses its last letter until all
+/// fit. `phases.descend_timeout_s` becomes `PHAS_DESC_TIME_S`.
+fn name_of(section: &str, key: &str) -> String {
+    let capitals = format!("{section}_{key}").to_ascii_uppercase();
+    let mut words: Vec<&str> = capitals.split('_').collect();
+    let length = |words: &[&str]| words.iter().map(|word| word.len() + 1).sum::<usize>() - 1;
+    while length(&words) > MAX_NAME {
+        let Some(longest) = words.iter_mut().max_by_key(|word| word.len()) else { break };
+        let Some((end, _)) = longest.char_indices().next_back() else { break };
+        *longest = longest.get(..end).unwrap_or_default();
+    }
+    words.join("_")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autopilot::Parser;
+    use autopilot::packet::encode;
+
+    const COMPANION: Sender = Sender { system: 7, component: 191 };
+    const GROUND: Sender = Sender { system: 255, component: 190 };
+    const CONTROLLER: &str = include_str!("../../controller/controller.toml");
+    const SECTIONS: [&str; 4] = ["alarms", "envelope", "metric", "phases"];
+
+    fn configuration(instance: &str, toml: &str) -> Configuration {
+        let text = String::new();
+        Configuration {
+            service: "controller".into(),
+            instance: instance.into(),
+            host: text.clone(),
+            version: text,
+            toml: toml.into(),
+        }
+    }
+
+    fn heard(toml: &str) -> Parameters {
+        let mut parameters = Parameters::new(&SECTIONS.map(str::to_owned));
+        assert!(parameters.hear(0, &configuration("main", toml)));
+        parameters
+    }
+
+    fn data(message: &MavMessage) -> &PARAM_VALUE_DATA {
+        match message {
+            MavMessage::PARAM_VALUE(data) => data,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn all(parameters: &mut Parameters) -> Vec<PARAM_VALUE_DATA> {
+        let bursts = std::iter::from_fn(|| Some(parameters.due()).filter(|due| !due.is_empty()));
+        bursts
+            .inspect(|due| assert!(due.len() <= BURST))
+            .flatten()
+            .map(|it| data(&it).clone())
+            .collect()
+    }
+
+    #[test]
+    fn every_number_of_the_controllers_sections_has_a_name_of_its_own() {
+        let table: toml::Table = CONTROLLER.parse().unwrap();
+        let numbers = SECTIONS.map(|section| {
+            let keys = table[section].as_table().unwrap().values();
+            keys.filter(|value| !value.is_str() && !value.is_array()).count()
+        });
+        let mut parameters = heard(CONTROLLER);
+        assert_eq!(parameters.list.len(), numbers.iter().sum::<usize>());
+        assert_eq!(parameters.answer(&Ask::List), Answer::default());
+        let listed = all(&mut parameters);
+        for (place, value) in (0..).zip(&listed) {
+            assert_eq!(usize::from(value.param_count), parameters.list.len());
+            assert_eq!(value.param_index, place);
+            assert_eq!(value.param_type, MavParamType::MAV_PARAM_TYPE_REAL32);
+            assert!(value.param_id.to_str().unwrap().len() <= MAX_NAME);
+        }
+        assert_eq!(listed.len(), parameters.list.len());
+        let names = [
+            ("phases", "descend_timeout_s", "PHAS_DESC_TIME_S"),
+            ("metric", "max_descend_m_s", "METR_MAX_DES_M_S"),
+            ("alarms", "battery_s", "ALARMS_BATTERY_S"),
+            ("envelope", "x", "ENVELOPE_X"),
+        ];
+        for (section, key, name) in names {
+            assert_eq!(name_of(section, key), name);
+        }
+        for (name, key) in [
+            ("METR_MAX_DES_M_S", "metric.max_descend_m_s"),
+            ("PHAS_LAND_TIME_S", "phases.land_timeout_s"),
+            ("PHAS_LAND_TIME_2", "phases.landing_timeout_s"),
+        ] {
+            let found = parameters.list.iter().find(|it| it.name == name).unwrap();
+            assert_eq!(found.key, key);
+        }
+    }
+
+    #[test]
+    fn one_is_read_by_name_or_place_and_never_changed() {
+        let mut parameters = heard("[metric]\nmax_descend_m_s = 2.0\nis_on = true\nname = 'x'");
+        let named = parameters.answer(&Ask::Named("METR_MAX_DES_M_S".into())).message.unwrap();
+        let value = data(&named).clone();
+        assert_eq!((value.param_value, value.param_count), (2.0, 2));
+        let numbered = parameters.answer(&Ask::Numbered(value.param_index)).message.unwrap();
+        assert_eq!(numbered, named);
+        assert_eq!(parameters.answer(&Ask::Numbered(2)), Answer::default());
+        assert_eq!(parameters.answer(&Ask::Named("NONE".into())), Answer::default());
+        for (wanted, is_refused) in
+            [(9.0, true), (f32::NAN, true), (f32::INFINITY, true), (2.0, false)]
+        {
+            let set = Ask::Set { name: "METR_MAX_DES_M_S".into(), value: wanted };
+            let answer = parameters.answer(&set);
+            assert_eq!(answer.message.as_ref(), Some(&named), "{wanted}");
+            assert_eq!(answer.why.is_some(), is_refused, "{wanted}");
+            let why = answer.why.unwrap_or_else(|| "metric.max_descend_m_s".into());
+            assert!(why.contains("metric.max_descend_m_s"), "{why}");
+        }
+        let unknown = parameters.answer(&Ask::Set { name: "NONE".into(), value: 1.0 });
+        assert!(unknown.message.is_none() && unknown.why.unwrap().contains("NONE"));
+    }
+
+    #[test]
+    fn what_changes_is_told_to_who_has_the_list() {
+        let mut parameters = heard("[metric]\na = 1.0\nb = 2.0");
+        assert!(parameters.hear(1, &configuration("main", "[metric]\na = 1.0\nb = 3.0")));
+        assert_eq!(parameters.due(), [], "nobody has asked");
+        parameters.answer(&Ask::List);
+        assert_eq!(all(&mut parameters).len(), 2);
+        assert!(parameters.hear(2, &configuration("main", "[metric]\na = 1.0\nb = 4.0")));
+        let changed = all(&mut parameters);
+        assert_eq!(changed.iter().map(|it| it.param_value).collect::<Vec<_>>(), [4.0]);
+        // Another controller beside it is shown only when this one is silent.
+        let other = configuration("spare", "[metric]\na = 7.0\nb = 4.0");
+        assert!(parameters.hear(3, &other) && parameters.due().is_empty());
+        assert!(parameters.hear(3 + CONTROLLER_TIMEOUT_NS, &other));
+        assert_eq!(all(&mut parameters).len(), 1);
+        // What cannot be read changes nothing.
+        assert!(!parameters.hear(4 + CONTROLLER_TIMEOUT_NS, &configuration("spare", "[metric")));
+        let long = " ".repeat(MAX_TOML + 1);
+        assert!(!parameters.hear(4 + CONTROLLER_TIMEOUT_NS, &configuration("spare", &long)));
+        assert_eq!(parameters.list.len(), 2);
+    }
+
+    #[test]
+    fn a_list_is_asked_of_all_components_and_the_rest_of_ours_alone() {
+        let asked = |message: &MavMessage| {
+            let packet = Parser::new().push(&encode(GROUND, 1, message)).remove(0);
+            Ask::of(&packet, COMPANION)
+        };
+        let to = |target_system, target_component| {
+            let list = PARAM_REQUEST_LIST_DATA { target_system, target_component };
+            let read = PARAM_REQUEST_READ_DATA {
+                target_system,
+                target_component,
+                param_index: -1,
+                param_id: "SIXTEEN_LETTERS_".into(),
+            };
+            let set = PARAM_SET_DATA {
+                target_system,
+                target_component,
+                param_id: "A".into(),
+                param_value: 3.0,
+                ..PARAM_SET_DATA::default()
+            };
+            [
+                asked(&MavMessage::PARAM_REQUEST_LIST(list)),
+                asked(&MavMessage::PARAM_REQUEST_READ(read)),
+                asked(&MavMessage::PARAM_SET(set)),
+            ]
+        };
+        let all = [
+            Some(Ask::List),
+            Some(Ask::Named("SIXTEEN_LETTERS_".into())),
+            Some(Ask::Set { name: "A".into(), value: 3.0 }),
+        ];
+        assert_eq!(to(7, 191), all);
+        assert_eq!(to(0, 191), all);
+        assert_eq!(to(7, 0), [Some(Ask::List), None, None]);
+        assert_eq!(to(7, 1), [None, None, None]);
+        assert_eq!(to(8, 191), [None, None, None]);
+    }
+}
