@@ -180,8 +180,8 @@ impl TapedFlight {
         is_pending
     }
 
-    /// Handles an event of a tape as it was handled then, and writes the state where it was written then. False for what a flight cannot handle: a second beginning,
-    /// and bytes that are no packet.
+    /// Handles an event of a tape as it was handled then, and writes the state where it was written then. False for what a
+    /// flight cannot handle: a second beginning, and bytes that are no packet.
     pub fn replay(&mut self, now_ns: i64, event: &TapeEvent<'_>) -> bool {
         match event {
             TapeEvent::Begin { .. } => return false,
