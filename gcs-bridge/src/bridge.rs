@@ -166,7 +166,7 @@ impl Bridge {
             camera_component: config.camera_component_id,
             camera: Camera::new(now_ns, config.video()),
             camera_is_taken: false,
-            parameters: Parameters::new(&config.parameters),
+            parameters: Parameters::default(),
             permission: config.ground_may.parse()?,
             refusal_ns: None,
             ground,

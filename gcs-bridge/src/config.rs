@@ -32,8 +32,6 @@ pub struct Config {
     pub ground_silence_s: f64,
     /// What the ground station may send to the autopilot, a [`Permission`].
     pub ground_may: String,
-    /// Sections of the controller's configuration that the ground station sees as parameters.
-    pub parameters: Vec<String>,
     /// Rate of the landing target, in Hz.
     pub target_rate_hz: f64,
     /// Maximum age of the landing target, in milliseconds.
@@ -64,9 +62,6 @@ impl node::Settings for Config {
         }
         check.range("ground_silence_s", self.ground_silence_s, 1.0..=600.0);
         check.parses("ground_may", self.ground_may.parse::<Permission>());
-        for section in &self.parameters {
-            check.name("parameters", section);
-        }
         check.range("target_rate_hz", self.target_rate_hz, 0.1..=50.0);
         check.range("target_max_age_ms", self.target_max_age_ms, 1.0..=60_000.0);
     }
@@ -118,7 +113,6 @@ mod tests {
             ("camera_component_id=99", "from 100 to 105"),
             ("component_id=100", "must differ from `component_id`"),
             ("video=http://10.0.0.2/", "rtsp://HOST:PORT/PATH"),
-            ("parameters=['a.b']", "`parameters`"),
             ("target_rate_hz=0", "from 0.1 to 50"),
             ("target_max_age_ms=inf", "`target_max_age_ms`"),
             ("id=a/b", "letters, digits"),

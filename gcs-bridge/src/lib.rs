@@ -8,12 +8,14 @@
 //! Modules in reading order: [`config`]; `bridge` is the service; `vehicle` finds the vehicle's system id,
 //! `route` decides which packets pass, `text` and `target` turn the controller's status and estimate into
 //! MAVLink; `camera` shows the detector's camera, whose `video` another program serves, and `request` is what a ground
-//! station asks of it; `params` shows it the controller's configuration.
+//! station asks of it; `params` shows it the keys of the controller's
+//! configuration that are in `parameter_table`.
 
 pub mod config;
 
 mod bridge;
 mod camera;
+mod parameter_table;
 mod params;
 mod request;
 mod route;

@@ -11,25 +11,21 @@ use autopilot::dialect::{
 };
 use autopilot::{Packet, Sender};
 use messages::Configuration;
-use toml::Value;
+use toml::{Table, Value};
 
-/// Length of a parameter's name in MAVLink, in characters.
-const MAX_NAME: usize = 16;
-/// Maximum number of parameters, and of bytes of a configuration that is read.
-const MAX_PARAMETERS: usize = 256;
+use crate::parameter_table::{Parameter, TABLE};
+
+/// Maximum length of a configuration that is read, in bytes.
 const MAX_TOML: usize = 200_000;
 /// Values sent at once; a list has an autopilot's beside it on the same line.
 const BURST: usize = 3;
 /// Silence of its controller after which another one's configuration is shown, in nanoseconds; it is repeated every 3 s.
 const CONTROLLER_TIMEOUT_NS: i64 = 10_000_000_000;
 
-/// A number or a switch of a configuration.
-#[derive(Clone, Debug, PartialEq)]
-struct Parameter {
-    /// Its name in MAVLink.
-    name: String,
-    /// Its key, as users set it.
-    key: String,
+/// A parameter with its value.
+#[derive(Copy, Clone, Debug, PartialEq)]
+struct Entry {
+    parameter: &'static Parameter,
     value: f32,
 }
 
@@ -100,14 +96,12 @@ pub(crate) struct Answer {
 }
 
 /// The parameters of the companion.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Parameters {
-    /// The sections of the configuration that are shown.
-    sections: Vec<String>,
     /// The controller whose configuration it is, and when that was heard.
     controller: Option<(String, i64)>,
-    /// By name.
-    list: Vec<Parameter>,
+    /// Those of the table that the configuration has.
+    list: Vec<Entry>,
     /// Places of those that are to be sent.
     due: BTreeSet<u16>,
     /// A ground station has asked for the list.
@@ -115,17 +109,6 @@ pub(crate) struct Parameters {
 }
 
 impl Parameters {
-    /// Those of these sections, once a configuration was heard.
-    pub(crate) fn new(sections: &[String]) -> Self {
-        Self {
-            sections: sections.to_vec(),
-            controller: None,
-            list: Vec::new(),
-            due: BTreeSet::new(),
-            is_listed: false,
-        }
-    }
-
     /// Takes a controller's configuration. False for one that cannot be read.
     pub(crate) fn hear(&mut self, now_ns: i64, configuration: &Configuration) -> bool {
         let is_silent = |heard_ns: i64| now_ns.saturating_sub(heard_ns) > CONTROLLER_TIMEOUT_NS;
@@ -138,13 +121,14 @@ impl Parameters {
         if configuration.toml.len() > MAX_TOML {
             return false;
         }
-        let Ok(table) = configuration.toml.parse::<toml::Table>() else { return false };
-        let list = parameters(&table, &self.sections);
+        let Ok(table) = configuration.toml.parse::<Table>() else { return false };
+        let entry = |parameter| Some(Entry { parameter, value: value(&table, parameter)? });
+        let list: Vec<Entry> = TABLE.iter().filter_map(entry).collect();
         self.controller = Some((configuration.instance.clone(), now_ns));
         if self.is_listed {
             let is_other = list.len() != self.list.len();
-            let places = (0..).zip(&list).filter(|(place, parameter)| {
-                is_other || self.list.get(usize::from(*place)) != Some(parameter)
+            let places = (0..).zip(&list).filter(|(place, entry)| {
+                is_other || self.list.get(usize::from(*place)) != Some(entry)
             });
             let changed: Vec<u16> = places.map(|(place, _)| place).collect();
             self.due.extend(changed);
@@ -162,16 +146,17 @@ impl Parameters {
                 return Answer::default();
             }
             Ask::Numbered(place) => Some(*place),
-            Ask::Named(name) | Ask::Set { name, .. } => {
-                (0..).zip(&self.list).find(|(_, it)| it.name == *name).map(|(place, _)| place)
-            }
+            Ask::Named(name) | Ask::Set { name, .. } => (0..)
+                .zip(&self.list)
+                .find(|(_, it)| it.parameter.name == name)
+                .map(|(place, _)| place),
         };
         let found = place.and_then(|place| Some((place, self.list.get(usize::from(place))?)));
         let why = match (ask, found) {
             (Ask::Set { name, .. }, None) => Some(format!("there is no parameter {name}")),
             (Ask::Set { value, .. }, Some((_, it))) if *value != it.value => Some(format!(
                 "{} stays {}: set {} of the controller before the flight",
-                it.name, it.value, it.key
+                it.parameter.name, it.value, it.parameter.key
             )),
             _ => None,
         };
@@ -191,60 +176,30 @@ impl Parameters {
     }
 
     fn value(&self, place: u16) -> Option<MavMessage> {
-        let parameter = self.list.get(usize::from(place))?;
+        let Entry { parameter, value } = self.list.get(usize::from(place))?;
         Some(MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
-            param_value: parameter.value,
+            param_value: *value,
             param_count: self.list.len() as u16,
             param_index: place,
-            param_id: parameter.name.as_str().into(),
+            param_id: parameter.name.into(),
             param_type: MavParamType::MAV_PARAM_TYPE_REAL32,
         }))
     }
 }
 
-/// The numbers and switches of the sections, by name.
-fn parameters(table: &toml::Table, sections: &[String]) -> Vec<Parameter> {
-    let mut list: Vec<Parameter> = Vec::new();
-    for section in sections {
-        let Some(Value::Table(keys)) = table.get(section) else { continue };
-        for (key, value) in keys {
-            let value = match value {
-                Value::Float(number) => *number as f32,
-                Value::Integer(number) => *number as f32,
-                Value::Boolean(is_on) => f32::from(u8::from(*is_on)),
-                _ => continue,
-            };
-            let is_free = |name: &String| !list.iter().any(|other| other.name == *name);
-            let Some(name) = names_of(section, key).find(is_free) else { continue };
-            if list.len() < MAX_PARAMETERS {
-                list.push(Parameter { name, key: format!("{section}.{key}"), value });
-            }
+/// A parameter's value in a configuration; none for a key or a word that this configuration does not have.
+fn value(table: &Table, parameter: &Parameter) -> Option<f32> {
+    let mut chunks = parameter.key.split('.');
+    let first = table.get(chunks.next()?)?;
+    match chunks.try_fold(first, |value, chunk| value.get(chunk))? {
+        Value::Float(number) => Some(*number as f32),
+        Value::Integer(number) => Some(*number as f32),
+        Value::Boolean(is_on) => Some(f32::from(u8::from(*is_on))),
+        Value::String(word) => {
+            parameter.words.iter().position(|it| it == word).map(|place| place as f32)
         }
+        _ => None,
     }
-    list.sort_by(|one, other| one.name.cmp(&other.name));
-    list
-}
-
-/// The names of a key, the best first: where another key has one, its last letter becomes a digit.
-fn names_of(section: &str, key: &str) -> impl Iterator<Item = String> {
-    let best = name_of(section, key);
-    let shorter = best.char_indices().next_back().map_or(0, |(end, _)| end);
-    let stem = best.get(..shorter).unwrap_or_default().to_owned();
-    std::iter::once(best).chain((2..10).map(move |digit| format!("{stem}{digit}")))
-}
-
-/// A key's name in MAVLink: its words in capitals, of which the longest, or of several the last, loses its last letter until all
-/// fit. `phases.descend_timeout_s` becomes `PHAS_DESC_TIME_S`.
-fn name_of(section: &str, key: &str) -> String {
-    let capitals = format!("{section}_{key}").to_ascii_uppercase();
-    let mut words: Vec<&str> = capitals.split('_').collect();
-    let length = |words: &[&str]| words.iter().map(|word| word.len() + 1).sum::<usize>() - 1;
-    while length(&words) > MAX_NAME {
-        let Some(longest) = words.iter_mut().max_by_key(|word| word.len()) else { break };
-        let Some((end, _)) = longest.char_indices().next_back() else { break };
-        *longest = longest.get(..end).unwrap_or_default();
-    }
-    words.join("_")
 }
 
 #[cfg(test)]
@@ -256,7 +211,6 @@ mod tests {
     const COMPANION: Sender = Sender { system: 7, component: 191 };
     const GROUND: Sender = Sender { system: 255, component: 190 };
     const CONTROLLER: &str = include_str!("../../controller/controller.toml");
-    const SECTIONS: [&str; 4] = ["alarms", "envelope", "metric", "phases"];
 
     fn configuration(instance: &str, toml: &str) -> Configuration {
         let text = String::new();
@@ -270,7 +224,7 @@ mod tests {
     }
 
     fn heard(toml: &str) -> Parameters {
-        let mut parameters = Parameters::new(&SECTIONS.map(str::to_owned));
+        let mut parameters = Parameters::default();
         assert!(parameters.hear(0, &configuration("main", toml)));
         parameters
     }
@@ -292,46 +246,43 @@ mod tests {
     }
 
     #[test]
-    fn every_number_of_the_controllers_sections_has_a_name_of_its_own() {
-        let table: toml::Table = CONTROLLER.parse().unwrap();
-        let numbers = SECTIONS.map(|section| {
-            let keys = table[section].as_table().unwrap().values();
-            keys.filter(|value| !value.is_str() && !value.is_array()).count()
-        });
+    fn every_parameter_is_a_key_of_the_controller_and_has_a_name_of_its_own() {
         let mut parameters = heard(CONTROLLER);
-        assert_eq!(parameters.list.len(), numbers.iter().sum::<usize>());
+        assert_eq!(parameters.list.len(), TABLE.len());
         assert_eq!(parameters.answer(&Ask::List), Answer::default());
         let listed = all(&mut parameters);
+        assert_eq!(listed.len(), TABLE.len());
+        let mut names = BTreeSet::new();
         for (place, value) in (0..).zip(&listed) {
-            assert_eq!(usize::from(value.param_count), parameters.list.len());
+            assert_eq!(usize::from(value.param_count), TABLE.len());
             assert_eq!(value.param_index, place);
             assert_eq!(value.param_type, MavParamType::MAV_PARAM_TYPE_REAL32);
-            assert!(value.param_id.to_str().unwrap().len() <= MAX_NAME);
+            // Longer ones would be cut.
+            assert_eq!(value.param_id.to_str(), Ok(TABLE[usize::from(place)].name));
+            names.insert(value.param_id.to_str().unwrap());
         }
-        assert_eq!(listed.len(), parameters.list.len());
-        let names = [
-            ("phases", "descend_timeout_s", "PHAS_DESC_TIME_S"),
-            ("metric", "max_descend_m_s", "METR_MAX_DES_M_S"),
-            ("alarms", "battery_s", "ALARMS_BATTERY_S"),
-            ("envelope", "x", "ENVELOPE_X"),
-        ];
-        for (section, key, name) in names {
-            assert_eq!(name_of(section, key), name);
-        }
-        for (name, key) in [
-            ("METR_MAX_DES_M_S", "metric.max_descend_m_s"),
-            ("PHAS_LAND_TIME_S", "phases.land_timeout_s"),
-            ("PHAS_LAND_TIME_2", "phases.landing_timeout_s"),
-        ] {
-            let found = parameters.list.iter().find(|it| it.name == name).unwrap();
-            assert_eq!(found.key, key);
+        assert_eq!(names.len(), TABLE.len());
+    }
+
+    #[test]
+    fn words_are_numbers_in_the_order_in_which_the_controllers_file_explains_them() {
+        for parameter in TABLE.iter().filter(|it| !it.words.is_empty()) {
+            let (section, key) = parameter.key.split_once('.').unwrap_or(("", parameter.key));
+            let header = if section.is_empty() { String::new() } else { format!("[{section}]\n") };
+            for (number, word) in (0_u8..).zip(parameter.words) {
+                let table: Table = format!("{header}{key} = '{word}'").parse().unwrap();
+                assert_eq!(value(&table, parameter), Some(f32::from(number)), "{word}");
+                assert!(CONTROLLER.contains(&format!("\"{word}\"")), "{word}");
+            }
+            let table: Table = format!("{header}{key} = 'another'").parse().unwrap();
+            assert_eq!(value(&table, parameter), None);
         }
     }
 
     #[test]
     fn one_is_read_by_name_or_place_and_never_changed() {
-        let mut parameters = heard("[metric]\nmax_descend_m_s = 2.0\nis_on = true\nname = 'x'");
-        let named = parameters.answer(&Ask::Named("METR_MAX_DES_M_S".into())).message.unwrap();
+        let mut parameters = heard("start = 'resume'\n[metric]\nmax_descend_m_s = 2.0");
+        let named = parameters.answer(&Ask::Named("AL_DESC_SPEED".into())).message.unwrap();
         let value = data(&named).clone();
         assert_eq!((value.param_value, value.param_count), (2.0, 2));
         let numbered = parameters.answer(&Ask::Numbered(value.param_index)).message.unwrap();
@@ -341,7 +292,7 @@ mod tests {
         for (wanted, is_refused) in
             [(9.0, true), (f32::NAN, true), (f32::INFINITY, true), (2.0, false)]
         {
-            let set = Ask::Set { name: "METR_MAX_DES_M_S".into(), value: wanted };
+            let set = Ask::Set { name: "AL_DESC_SPEED".into(), value: wanted };
             let answer = parameters.answer(&set);
             assert_eq!(answer.message.as_ref(), Some(&named), "{wanted}");
             assert_eq!(answer.why.is_some(), is_refused, "{wanted}");
@@ -354,16 +305,20 @@ mod tests {
 
     #[test]
     fn what_changes_is_told_to_who_has_the_list() {
-        let mut parameters = heard("[metric]\na = 1.0\nb = 2.0");
-        assert!(parameters.hear(1, &configuration("main", "[metric]\na = 1.0\nb = 3.0")));
+        let mut parameters = heard("[metric]\nfunnel_m = 1.0\nblind_s = 2.0");
+        assert!(
+            parameters.hear(1, &configuration("main", "[metric]\nfunnel_m = 1.0\nblind_s = 3.0"))
+        );
         assert_eq!(parameters.due(), [], "nobody has asked");
         parameters.answer(&Ask::List);
         assert_eq!(all(&mut parameters).len(), 2);
-        assert!(parameters.hear(2, &configuration("main", "[metric]\na = 1.0\nb = 4.0")));
+        assert!(
+            parameters.hear(2, &configuration("main", "[metric]\nfunnel_m = 1.0\nblind_s = 4.0"))
+        );
         let changed = all(&mut parameters);
         assert_eq!(changed.iter().map(|it| it.param_value).collect::<Vec<_>>(), [4.0]);
         // Another controller beside it is shown only when this one is silent.
-        let other = configuration("spare", "[metric]\na = 7.0\nb = 4.0");
+        let other = configuration("spare", "[metric]\nfunnel_m = 7.0\nblind_s = 4.0");
         assert!(parameters.hear(3, &other) && parameters.due().is_empty());
         assert!(parameters.hear(3 + CONTROLLER_TIMEOUT_NS, &other));
         assert_eq!(all(&mut parameters).len(), 1);

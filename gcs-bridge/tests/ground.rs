@@ -412,7 +412,7 @@ async fn a_ground_station_loads_the_companions_parameters_and_changes_none() -> 
         let told = script("params.py", address, loss, &further).await?;
         let Some(told) = told else { return Ok(()) };
         eprintln!("{told}");
-        for part in [r#""ok": true"#, r#""parameters": 77, "names": 77"#, r#""value": 2.0"#] {
+        for part in [r#""ok": true"#, r#""parameters": 36, "names": 36"#, r#""value": 2.0"#] {
             ensure!(told.contains(part), "{part} is not in {told}");
         }
     }

@@ -113,7 +113,7 @@ def main():
     parser.add_argument("--connect", default="udpin:127.0.0.1:14550", help="where to listen, as pymavlink writes it")
     parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost in each direction")
     parser.add_argument("--seed", type=int, default=1, help="which packets are lost")
-    parser.add_argument("--name", default="METR_MAX_DES_M_S", help="the parameter that is set")
+    parser.add_argument("--name", default="AL_DESC_SPEED", help="the parameter that is set")
     options = parser.parse_args()
 
     connection = mavutil.mavlink_connection(
