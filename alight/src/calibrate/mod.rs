@@ -1,9 +1,12 @@
 //! `alight calibrate`: a camera's calibration file, and what it is worth.
 
 mod args;
+mod corrected;
+mod flight;
 mod found;
 mod guidance;
 mod live;
+mod recorded;
 mod report;
 mod sharpness;
 
@@ -19,6 +22,7 @@ use crate::args::Format;
 use crate::marker::Sheet;
 use crate::terminal::print;
 pub(crate) use args::BoardArgs;
+use flight::FlightArgs;
 use found::{Finder, FoundImages, find_boards};
 use guidance::Guidance;
 use live::watch_camera;
@@ -35,14 +39,24 @@ enum What {
     /// A camera's intrinsics from images of a printed board: print it with --print, take 20 to 60 pictures (tilted by up to
     /// 45 degrees to all sides, near and far, in every corner of the image), then calibrate.
     Board(BoardArgs),
+    /// A camera's time offset, mount and focal length from the recording of a landing (`alight land --record`, `alight record`) on
+    /// a pad of known size that does not move. A landing with turns of the heading and swift moves to all sides shows
+    /// all of it; what a flight does not show stays as it was. Exit status 1 when it shows nothing.
+    Flight(FlightArgs),
 }
 
-/// Prints the board, or calibrates. Exit status 1 when the images show no camera.
+/// Prints the board, or calibrates. Exit status 1 when images or flight show no camera.
 ///
 /// # Errors
 /// When arguments contradict each other, a file cannot be read or written.
 pub(crate) fn run(args: &CalibrateArgs) -> anyhow::Result<ExitCode> {
-    let What::Board(args) = &args.what;
+    match &args.what {
+        What::Board(args) => board(args),
+        What::Flight(args) => flight::run(args),
+    }
+}
+
+fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
     let board = args.board()?;
     if let Some(output) = &args.print {
         let sheet = Sheet::with_board(&board, args.paper)?;

@@ -1,4 +1,4 @@
-//! A camera's intrinsics from images of a board, with what they are worth.
+//! A camera's intrinsics from images of a board, and its mount and time offset from a flight, with what they are worth.
 //!
 //! The way through it: one [`View`] for each image, with the board's points that were found in it, goes into
 //! [`calibrate`]. What comes out is a [`Calibration`] (the [`geometry::CameraModel`], its covariance, each view's pose and
@@ -22,7 +22,8 @@
 //! point with its derivatives, `equations` and `solve` find a minimum, `start` guesses where, `stages` is the way from guess
 //! to result, `covariance` says how sure it is;
 //! [`evidence`] is what the fit leaves unexplained, [`halves`] compares two halves of the views; [`calibration`] is the result,
-//! `judge` refuses by [`refusal`].
+//! `judge` refuses by [`refusal`]. [`flight`] is another way, without a board: [`calibrate_flight`] compares the pad that a
+//! camera sees in flight with where the autopilot says that the vehicle is.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
 
@@ -31,6 +32,7 @@ pub mod calibration;
 mod covariance;
 mod equations;
 pub mod evidence;
+pub mod flight;
 pub mod halves;
 mod judge;
 pub mod lens;
@@ -44,6 +46,10 @@ pub use calibration::{
     Calibration, Options, PlaceResidual, PlaceUncertainty, PlacementError, Residual, SolvedView,
 };
 pub use evidence::{Coverage, Estimate, Evidence};
+pub use flight::{
+    ConfiguredCamera, FlightCalibration, FlightEstimate, FlightRefusal, MarkerSample, Quantity,
+    VehicleSample, calibrate_flight,
+};
 pub use halves::CrossValidation;
 pub use judge::{calibrate, calibrate_unjudged};
 pub use lens::Lens;

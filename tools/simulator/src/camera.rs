@@ -84,7 +84,12 @@ impl SimCamera {
         let shutter = Shutter::new(config.camera.faults(), config.seed);
         let [roll, pitch] = shutter.mount_error_rad();
         let nominal = settings.body_from_camera;
-        let tilt = Rotation::<Body, Body>::from_euler(roll, pitch, 0.0);
+        let camera = &config.camera;
+        let [turned_roll, turned_pitch, turned_yaw] =
+            [camera.mount_roll_deg, camera.mount_pitch_deg, camera.mount_yaw_deg]
+                .map(f64::to_radians);
+        let tilt = Rotation::<Body, Body>::from_euler(turned_roll, turned_pitch, turned_yaw)
+            * Rotation::<Body, Body>::from_euler(roll, pitch, 0.0);
         let body_from_camera = Transform::new(tilt * nominal.rotation(), nominal.origin());
         let marker = config.pad_marker().map_err(anyhow::Error::msg)?;
         let ground = &config.ground;

@@ -1,0 +1,372 @@
+//! `alight calibrate flight`: what a recorded landing says of its camera.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use calibration::{FlightCalibration, FlightEstimate, Quantity, calibrate_flight};
+use clap::Args;
+use serde_json::{Value, json};
+
+use super::corrected;
+use super::recorded::{self, RecordedFlight, Wanted};
+use crate::args::Format;
+use crate::terminal::{print, write_error};
+
+/// The arguments of `alight calibrate flight`.
+#[derive(Args)]
+pub(crate) struct FlightArgs {
+    /// The recording of a landing (MCAP), from `alight land --record` or `alight record`.
+    #[arg(value_name = "FLIGHT.mcap")]
+    file: PathBuf,
+    /// The camera, where there are several [default: the one that saw the marker most].
+    #[arg(long, value_name = "CAMERA")]
+    camera: Option<String>,
+    /// The detector, where there are several [default: the one that saw the marker most].
+    #[arg(long, value_name = "DETECTOR")]
+    detector: Option<String>,
+    /// The marker, FAMILY or FAMILY:ID [default: the one that was landed on].
+    #[arg(long, value_name = "MARKER")]
+    marker: Option<String>,
+    /// Write what changes, as tables of camera-pub's configuration (TOML).
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Format of what is printed: a table, or one JSON object.
+    #[arg(long, value_enum, default_value_t)]
+    format: Format,
+}
+
+/// Calibrates, and prints what was found.
+///
+/// # Errors
+/// When the recording cannot be read, has no detections, telemetry or calibration, or contradicts itself.
+pub(super) fn run(args: &FlightArgs) -> anyhow::Result<ExitCode> {
+    let FlightArgs { file, camera, detector, marker, .. } = args;
+    let wanted = Wanted {
+        camera: camera.as_deref(),
+        detector: detector.as_deref(),
+        marker: marker.as_deref(),
+    };
+    let flight = recorded::read(file, &wanted)?;
+    flight.damage.iter().for_each(|damage| write_error(damage));
+    let result = calibrate_flight(&flight.configured, &flight.vehicle, &flight.markers)
+        .with_context(|| format!("calibrating the camera `{}` from {file:?}", flight.camera))?;
+    match args.format {
+        Format::Text => print(text(&flight, &result).trim_end())?,
+        Format::Json => print(&json(&flight, &result).to_string())?,
+    }
+    let changes = corrected::toml(&flight, &result);
+    match (&args.output, &changes) {
+        (Some(path), Some(changes)) => {
+            std::fs::write(path, changes)
+                .with_context(|| format!("writing {path:?}; name another file with `--output`"))?;
+            write_error(&format!("{}: the keys that change", path.display()));
+        }
+        (Some(path), None) => {
+            write_error(&format!("{}: not written, as no key changes", path.display()));
+        }
+        (None, _) => {}
+    }
+    let is_any = result.estimates.iter().any(FlightEstimate::is_observable);
+    Ok(if is_any { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// A quantity for people: its name, unit, and how many of the unit are one of the estimate's.
+fn name(quantity: Quantity) -> (&'static str, &'static str, f64) {
+    let degrees = 1f64.to_degrees();
+    match quantity {
+        Quantity::TimeOffset => ("time offset", "ms", 1e3),
+        Quantity::MountRoll => ("mount, roll", "deg", degrees),
+        Quantity::MountPitch => ("mount, pitch", "deg", degrees),
+        Quantity::MountYaw => ("mount, yaw", "deg", degrees),
+        Quantity::FocalScale => ("focal length", "%", 100.0),
+        Quantity::K1 => ("lens, k1", "", 1.0),
+    }
+}
+
+/// What is said of an estimate.
+fn verdict(estimate: &FlightEstimate) -> &'static str {
+    match (estimate.is_observable(), estimate.deviation.is_finite()) {
+        (true, _) if estimate.may_be_as_configured() => "stays: it may be as configured",
+        (true, _) => "corrected",
+        (false, true) => "not observable, stays: too uncertain",
+        (false, false) => "not observable, stays: the vehicle did not move so that it shows",
+    }
+}
+
+fn text(flight: &RecordedFlight, result: &FlightCalibration) -> String {
+    let excitation = &result.excitation;
+    let mut lines = vec![
+        format!(
+            "camera {}, marker {}: {} of {} detections; tilt {:.1} deg (standard deviation), distance 1:{:.1}, headings over {:.0} deg",
+            flight.camera,
+            flight.marker,
+            result.markers,
+            flight.markers.len(),
+            excitation.tilt_rad.to_degrees(),
+            excitation.distance_ratio,
+            excitation.turn_rad.to_degrees()
+        ),
+        format!(
+            "{:<14}{:>12}{:>12}{:>12}  {:<4} verdict",
+            "correction", "estimated", "+-3 sigma", "limit", "unit"
+        ),
+    ];
+    for estimate in &result.estimates {
+        let (name, unit, scale) = name(estimate.quantity);
+        let limit = format!("{:.3}", 3.0 * scale * estimate.quantity.max_deviation());
+        let [value, spread] = match estimate.deviation.is_finite() {
+            true => [
+                format!("{:+.3}", scale * estimate.value),
+                format!("{:.3}", 3.0 * scale * estimate.deviation),
+            ],
+            false => ["-".to_owned(), "-".to_owned()],
+        };
+        let verdict = verdict(estimate);
+        lines.push(format!("{name:<14}{value:>12}{spread:>12}{limit:>12}  {unit:<4} {verdict}"));
+    }
+    let [before, after] = [&flight.configured, &result.camera].map(|camera| {
+        let (roll, pitch, yaw) = camera.body_from_camera.rotation().euler();
+        let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_degrees);
+        format!(
+            "mount roll, pitch, yaw {roll:.3}, {pitch:.3}, {yaw:.3} deg; focal length {:.2} px",
+            camera.model.fx
+        )
+    });
+    lines.push(format!("before: {before}\nafter:  {after}"));
+    lines.push(format!(
+        "the mount is meant against the autopilot's level; its position erred by about {:.0} mm, its attitude by {:.2} deg",
+        1e3 * result.drift.position_m,
+        result.drift.lean_rad.to_degrees()
+    ));
+    lines.join("\n")
+}
+
+fn json(flight: &RecordedFlight, result: &FlightCalibration) -> Value {
+    let key = |quantity| match quantity {
+        Quantity::TimeOffset => "time_offset_s",
+        Quantity::MountRoll => "mount_roll_rad",
+        Quantity::MountPitch => "mount_pitch_rad",
+        Quantity::MountYaw => "mount_yaw_rad",
+        Quantity::FocalScale => "focal_scale",
+        Quantity::K1 => "k1",
+    };
+    let estimates = result.estimates.iter().map(|estimate| {
+        let shown = estimate.deviation.is_finite();
+        json!({
+            "quantity": key(estimate.quantity),
+            "value": shown.then_some(estimate.value),
+            "sigma": shown.then_some(estimate.deviation),
+            "max_sigma": estimate.quantity.max_deviation(),
+            "observable": estimate.is_observable(),
+            "correction": estimate.correction(),
+            "verdict": verdict(estimate),
+        })
+    });
+    let camera = |camera: &calibration::ConfiguredCamera| {
+        json!({
+            "focal_px": [camera.model.fx, camera.model.fy],
+            "body_from_camera_wxyz": camera.body_from_camera.rotation().wxyz(),
+        })
+    };
+    let covariance: Vec<Vec<f64>> =
+        result.covariance.row_iter().map(|row| row.iter().copied().collect()).collect();
+    json!({
+        "camera": flight.camera,
+        "marker": flight.marker,
+        "detections": flight.markers.len(),
+        "used": result.markers,
+        "estimates": estimates.collect::<Vec<_>>(),
+        "covariance": covariance,
+        "before": camera(&flight.configured),
+        "after": camera(&result.camera),
+        "tilt_rad": result.excitation.tilt_rad,
+        "distance_ratio": result.excitation.distance_ratio,
+        "turn_rad": result.excitation.turn_rad,
+        "position_drift_m": result.drift.position_m,
+        "lean_drift_rad": result.drift.lean_rad,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use calibration::flight::QUANTITIES;
+    use experiments::landing::flight::{fly, fly_recorded};
+    use experiments::landing::plan::{Plan, Planned, Values};
+    use geometry::{Body, Ned, Rotation, Vector};
+    use report::FlightReader;
+
+    /// How the camera of a landing differs from its configuration.
+    #[derive(Copy, Clone, Debug, Default)]
+    struct Wrong {
+        mount: Rotated,
+        early_ms: f64,
+    }
+
+    /// Roll, pitch and yaw in degrees.
+    #[derive(Copy, Clone, Debug, Default)]
+    struct Rotated([f64; 3]);
+
+    const WRONG: Wrong = Wrong { mount: Rotated([0.0, 2.0, 0.0]), early_ms: 40.0 };
+
+    /// An ordinary landing in wind, with further settings.
+    fn planned(seed: u64, wrong: Wrong, set: &[&str]) -> Planned {
+        let Rotated([roll, pitch, yaw]) = wrong.mount;
+        let mut all = vec![
+            format!("simulator.camera.mount_roll_deg={roll}"),
+            format!("simulator.camera.mount_pitch_deg={pitch}"),
+            format!("simulator.camera.mount_yaw_deg={yaw}"),
+            format!("simulator.camera.stamp_early_ms={}", wrong.early_ms),
+        ];
+        all.extend(set.iter().map(|setting| (*setting).to_owned()));
+        let wind = Values::List(vec![5.0]);
+        let plan = Plan { flights: 1, seed, wind, set: all, ..Plan::default() };
+        plan.flights().remove(0)
+    }
+
+    struct Landed {
+        flight: RecordedFlight,
+        result: FlightCalibration,
+        /// What the autopilot's level errs by: the mount is meant against it.
+        level: Rotation<Body, Body>,
+    }
+
+    fn landed(planned: &Planned) -> anyhow::Result<Landed> {
+        let folder = tempfile::tempdir()?;
+        let path = folder.path().join("flight.mcap");
+        fly_recorded(planned, std::fs::File::create(&path)?)?;
+        let wanted = Wanted { camera: None, detector: None, marker: None };
+        let flight = recorded::read(&path, &wanted)?;
+        let result = calibrate_flight(&flight.configured, &flight.vehicle, &flight.markers)?;
+        let mut reader = FlightReader::new("flight");
+        reader.add(&std::fs::read(&path)?)?;
+        Ok(Landed { flight, result, level: level(&reader.finish()) })
+    }
+
+    /// The mean of the turn from the estimated to the true attitude, in the body.
+    fn level(flight: &report::Flight) -> Rotation<Body, Body> {
+        let attitude =
+            |wxyz| Rotation::<Ned, Body>::from_wxyz(wxyz).unwrap_or(Rotation::identity());
+        let mut sum = nalgebra::Vector3::zeros();
+        let mut count = 0.0;
+        for state in &flight.vehicle {
+            let near =
+                |truth: &&messages::Truth| truth.stamp_ns.abs_diff(state.stamp_ns) < 2_000_000;
+            let Some(truth) = flight.truth.iter().find(near) else { continue };
+            let estimated = attitude(state.ned_from_body_wxyz);
+            let turn = estimated.inverse() * attitude(truth.ned_from_body_wxyz);
+            let tilt = turn.quaternion.scaled_axis();
+            sum += nalgebra::Vector3::new(tilt.x, tilt.y, 0.0);
+            count += 1.0;
+        }
+        Rotation::from_rotation_vector(Vector::from_coords(sum / count))
+    }
+
+    /// Errors of the estimates over their deviations, with the errors in the quantities' units.
+    fn errors(landed: &Landed, wrong: Wrong) -> [f64; 6] {
+        let [roll, pitch, yaw] = wrong.mount.0.map(f64::to_radians);
+        let mount = landed.level * Rotation::<Body, Body>::from_euler(roll, pitch, yaw);
+        let turn = mount.quaternion.scaled_axis();
+        let truth = [1e-3 * wrong.early_ms, turn.x, turn.y, turn.z, 0.0, 0.0];
+        std::array::from_fn(|i| landed.result.estimates[i].value - truth[i])
+    }
+
+    #[test]
+    fn an_ordinary_landing_shows_how_the_camera_is_mounted_and_when_it_looks() {
+        for seed in 0..3 {
+            let landed = landed(&planned(6200 + seed, WRONG, &[])).unwrap();
+            let errors = errors(&landed, WRONG);
+            let row: Vec<String> = errors
+                .iter()
+                .zip(&landed.result.estimates)
+                .map(|(error, estimate)| {
+                    let (name, unit, scale) = name(estimate.quantity);
+                    format!(
+                        "{name} {:+.3} +- {:.3} {unit}",
+                        scale * error,
+                        scale * estimate.deviation
+                    )
+                })
+                .collect();
+            println!("seed {seed}: {}", row.join(", "));
+            for (i, quantity) in QUANTITIES.into_iter().enumerate() {
+                let estimate = landed.result.estimates[i];
+                assert!(errors[i].abs() < 4.0 * estimate.deviation, "{seed}: {quantity:?} {row:?}");
+            }
+            assert!(landed.result.estimates[0].is_observable() && errors[0].abs() < 0.002);
+            assert!(landed.result.estimates[2].is_observable());
+            assert!(text(&landed.flight, &landed.result).contains("corrected"));
+        }
+    }
+
+    #[test]
+    fn a_recording_without_detections_or_telemetry_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("empty.mcap");
+        let wanted = Wanted { camera: None, detector: None, marker: None };
+        let problem = |wanted: &Wanted<'_>| {
+            recorded::read(&path, wanted)
+                .err()
+                .map(|problem| format!("{problem:#}"))
+                .unwrap_or_default()
+        };
+        assert!(problem(&wanted).contains("reading"), "{}", problem(&wanted));
+        std::fs::write(&path, b"no recording").unwrap();
+        assert!(problem(&wanted).contains("is no recording"), "{}", problem(&wanted));
+        let about = flightlog::About {
+            program: "test".to_owned(),
+            facts: std::collections::BTreeMap::new(),
+            utc_offset_ns: 0,
+        };
+        let file = std::fs::File::create(&path).unwrap();
+        flightlog::Writer::new(file, &about).unwrap().finish().unwrap();
+        assert!(problem(&wanted).contains("no detections"), "{}", problem(&wanted));
+        let file = std::fs::File::create(&path).unwrap();
+        fly_recorded(&planned(6200, WRONG, &[]), file).unwrap();
+        let other = Wanted { marker: Some("aruco-4x4-50:3"), ..wanted };
+        assert!(
+            problem(&other).contains("was not seen; the recording has rings"),
+            "{}",
+            problem(&other)
+        );
+    }
+
+    /// The landing error in metres.
+    fn landing_error_m(seed: u64, wrong: Wrong) -> f64 {
+        let error_m =
+            fly(&planned(seed, wrong, &[]), None).ok().and_then(|outcome| outcome.error_m);
+        error_m.unwrap_or(f64::INFINITY)
+    }
+
+    /// What is still wrong after the correction.
+    fn left(wrong: Wrong, result: &FlightCalibration) -> Wrong {
+        let [offset_s, roll, pitch, yaw, ..] =
+            result.estimates.map(|estimate| estimate.correction());
+        let corrected = Rotation::<Body, Body>::from_rotation_vector(Vector::new(roll, pitch, yaw));
+        let [roll, pitch, yaw] = wrong.mount.0.map(f64::to_radians);
+        let (roll, pitch, yaw) =
+            (corrected.inverse() * Rotation::<Body, Body>::from_euler(roll, pitch, yaw)).euler();
+        Wrong {
+            mount: Rotated([roll, pitch, yaw].map(f64::to_degrees)),
+            early_ms: wrong.early_ms - 1e3 * offset_s,
+        }
+    }
+
+    #[test]
+    fn a_landing_with_the_corrected_camera_is_as_good_as_with_the_true_one() {
+        let [mut before, mut after, mut truth] = [0.0; 3];
+        let count = 4;
+        for seed in 6300..6300 + count {
+            let landed = landed(&planned(seed, WRONG, &[])).unwrap();
+            before += landing_error_m(seed, WRONG) / count as f64;
+            after += landing_error_m(seed, left(WRONG, &landed.result)) / count as f64;
+            truth += landing_error_m(seed, Wrong::default()) / count as f64;
+        }
+        println!(
+            "mean landing error: before {before:.4} m, after {after:.4} m, with the truth {truth:.4} m"
+        );
+        // Both are millimetres; a tenth of that is no difference.
+        assert!(after <= 1.1 * truth + 0.001, "{before} {after} {truth}");
+    }
+}

@@ -1,0 +1,263 @@
+//! A camera's time offset, mount and focal length from a flight over a pad that stands still.
+//!
+//! The pad has one place. Where the vehicle's attitude and position put it moves with the vehicle when the camera is not as
+//! configured: with the height and the heading under a mount that is off, with the tilt under a focal length that is off, with
+//! every turn under stamps that are early or late. What the autopilot errs by moves it, too, and slowly; that is solved for
+//! with the camera, and how large it is, is estimated from the flight itself, so that a deviation says what the flight has
+//! shown. Hovering shows nothing (Yang, Geneva, Eckenhoff, Huang, "Degenerate motion analysis for aided INS with online
+//! spatial and temporal sensor calibration", 2019).
+//!
+//! Stages in reading order: `sample` is what is given, `quantity` what is estimated; `motion` is the vehicle's pose at any time, `model` predicts what the camera sees,
+//! [`excitation`] is what the flight can show, `filter` eliminates the drift, of which `scale` finds how large it is (`noise`), `start` finds the
+//! time offset roughly.
+
+pub mod excitation;
+mod filter;
+mod model;
+mod motion;
+mod noise;
+mod quantity;
+mod sample;
+mod scale;
+mod start;
+
+use geometry::squared;
+use nalgebra::SMatrix;
+use thiserror::Error;
+
+use excitation::Excitation;
+use filter::{Filtered, Prior, filtered};
+use model::{Model, PARAMETERS, Parameters};
+use motion::Motion;
+use noise::Noise;
+use quantity::OFFSET;
+pub use quantity::{QUANTITIES, Quantity};
+pub use sample::{ConfiguredCamera, MarkerSample, VehicleSample};
+
+/// An estimated quantity: what is added to what was configured.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct FlightEstimate {
+    /// Which.
+    pub quantity: Quantity,
+    /// The estimate, in the quantity's unit; meaningless where it is not observable.
+    pub value: f64,
+    /// Its standard deviation; infinite where the vehicle did not move so that it shows.
+    pub deviation: f64,
+}
+
+impl FlightEstimate {
+    /// Whether the flight showed it.
+    pub fn is_observable(&self) -> bool {
+        self.deviation <= self.quantity.max_deviation()
+    }
+
+    /// Whether the configured value may be right: an estimate that is no surer would make it worse as often as better.
+    pub fn may_be_as_configured(&self) -> bool {
+        self.value.abs() <= MIN_DEVIATIONS * self.deviation
+    }
+
+    /// What is to be added to the configured value: zero where it is not observable or may be right.
+    pub fn correction(&self) -> f64 {
+        if self.is_observable() && !self.may_be_as_configured() { self.value } else { 0.0 }
+    }
+}
+
+/// What a flight says of its camera.
+#[derive(Clone, Debug)]
+pub struct FlightCalibration {
+    /// The camera with what was observable corrected.
+    pub camera: ConfiguredCamera,
+    /// The estimates, in the order of [`QUANTITIES`].
+    pub estimates: [FlightEstimate; 6],
+    /// Their covariance, in the same order.
+    pub covariance: SMatrix<f64, 6, 6>,
+    /// What the autopilot's estimate seemed to err by.
+    pub drift: Drift,
+    /// How the vehicle moved.
+    pub excitation: Excitation,
+    /// Detections that were used.
+    pub markers: usize,
+}
+
+/// Standard deviations of what was estimated of the autopilot's errors.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct Drift {
+    /// Of the slow error of the horizontal position, in metres.
+    pub position_m: f64,
+    /// Of the slow error of the attitude, in radians.
+    pub lean_rad: f64,
+    /// How long errors of the position last, in seconds.
+    pub position_s: f64,
+    /// How long errors of the attitude last, in seconds.
+    pub lean_s: f64,
+    /// Of a single detection's direction beyond its own covariance, in pixels.
+    pub pixel_px: f64,
+}
+
+/// Why a flight says nothing of its camera.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum FlightRefusal {
+    /// Too few detections at times of which the vehicle's pose is known.
+    #[error(
+        "the flight has {found} detections at times of which the vehicle's pose is known, and at least {MIN_MARKERS} are needed: \
+         record a landing from its begin to its end"
+    )]
+    TooFew {
+        /// How many there are.
+        found: usize,
+    },
+    /// Stamps and poses do not fit together.
+    #[error(
+        "the frames' stamps seem to be {offset_s:+.2} s beside the autopilot's, which is more than {MAX_OFFSET_S} s: camera and \
+         autopilot are not stamped by one clock; `alight doctor` checks the camera's"
+    )]
+    Offset {
+        /// By how much.
+        offset_s: f64,
+    },
+    /// The markers' places contradict each other for any camera.
+    #[error(
+        "no camera explains the flight: after all corrections the pad's place still wanders by {wander_m:.2} m within a second \
+         (more than {MAX_WANDER_M} m), and {share:.0} % of the detections are elsewhere; the pad moved, there were several, the \
+         autopilot's position is poor, or the recording is of another camera",
+        share = 100.0 * .share
+    )]
+    Contradiction {
+        /// How far the pad seems to wander within a second, in metres.
+        wander_m: f64,
+        /// The part of the detections that do not fit.
+        share: f64,
+    },
+    /// Numbers that are no flight.
+    #[error("the flight's numbers have no solution: {why}")]
+    Numbers {
+        /// What went wrong.
+        why: &'static str,
+    },
+}
+
+/// The fewest detections of a flight.
+pub const MIN_MARKERS: usize = 60;
+/// Largest time offset that is believed, in seconds.
+pub const MAX_OFFSET_S: f64 = 1.0;
+/// How many deviations a value must be from the configured one to be changed.
+const MIN_DEVIATIONS: f64 = 3.0;
+/// How far the pad may seem to wander within a second, in metres.
+pub const MAX_WANDER_M: f64 = 0.5;
+/// Largest part of the detections that may be elsewhere.
+const MAX_OUTLIERS: f64 = 0.3;
+/// Iterations of the solution.
+const ITERATIONS: usize = 20;
+/// How often the errors' sizes are estimated anew.
+const NOISE_ROUNDS: usize = 2;
+/// A step that is smaller than this part of the deviations is the last.
+const CONVERGED: f64 = 0.02;
+
+/// Estimates what differs between a camera and its configuration.
+///
+/// # Errors
+/// When the samples are too few or contradict each other.
+pub fn calibrate_flight(
+    configured: &ConfiguredCamera,
+    vehicle: &[VehicleSample],
+    markers: &[MarkerSample],
+) -> Result<FlightCalibration, FlightRefusal> {
+    let motion = Motion::new(vehicle);
+    let model = Model::new(configured, &motion, markers);
+    if model.markers().len() < MIN_MARKERS {
+        return Err(FlightRefusal::TooFew { found: model.markers().len() });
+    }
+    let excitation = Excitation::of(&model);
+    let begin = start::parameters(&model, &excitation)
+        .ok_or(FlightRefusal::Numbers { why: "the marker is never before the camera" })?;
+    if begin[OFFSET].abs() > MAX_OFFSET_S {
+        return Err(FlightRefusal::Offset { offset_s: begin[OFFSET] });
+    }
+    let unknown = Prior::around(&begin);
+    let hidden = QUANTITIES.into_iter().filter(|quantity| !excitation.shows(*quantity));
+    let prior = hidden.fold(unknown, |prior, quantity| prior.with(quantity, 0.0));
+    let mut noise = Noise::default();
+    let (mut parameters, mut result) = minimum(&model, &prior, &noise, begin)?;
+    for _ in 0..NOISE_ROUNDS {
+        noise = scale::noise(&model.linearised(&parameters), &parameters, &prior, noise);
+        (parameters, result) = minimum(&model, &prior, &noise, parameters)?;
+    }
+    if parameters[OFFSET].abs() > MAX_OFFSET_S {
+        return Err(FlightRefusal::Offset { offset_s: parameters[OFFSET] });
+    }
+    let wander_m = noise.wander_m();
+    if result.outliers > MAX_OUTLIERS || wander_m > MAX_WANDER_M {
+        return Err(FlightRefusal::Contradiction { wander_m, share: result.outliers });
+    }
+    let told = Told { configured, markers: model.markers().len(), excitation, noise };
+    Ok(told.calibration(&parameters, &result))
+}
+
+/// The parameters that explain the flight best, for errors of this size: Gauss and Newton's steps, none of which is long.
+fn minimum(
+    model: &Model<'_>,
+    prior: &Prior,
+    noise: &Noise,
+    begin: Parameters,
+) -> Result<(Parameters, Filtered), FlightRefusal> {
+    let mut parameters = begin;
+    let solved = |parameters: &Parameters| {
+        filtered(&model.linearised(parameters), parameters, prior, noise)
+            .ok_or(FlightRefusal::Numbers { why: "the equations are singular" })
+    };
+    for _ in 0..ITERATIONS {
+        let result = solved(&parameters)?;
+        let is_short = |i: usize| {
+            result.step[i].abs() <= CONVERGED * libm::fmax(result.covariance[(i, i)], 0.0).sqrt()
+        };
+        if (0..PARAMETERS).all(is_short) {
+            return Ok((parameters, result));
+        }
+        let too_long =
+            |quantity: Quantity| result.step[quantity.index()].abs() / quantity.max_step();
+        let longest = QUANTITIES.into_iter().map(too_long).fold(1.0, libm::fmax);
+        parameters += result.step / longest;
+    }
+    Ok((parameters, solved(&parameters)?))
+}
+
+/// What is told of a solution.
+struct Told<'a> {
+    configured: &'a ConfiguredCamera,
+    markers: usize,
+    excitation: Excitation,
+    noise: Noise,
+}
+
+impl Told<'_> {
+    fn calibration(&self, parameters: &Parameters, result: &Filtered) -> FlightCalibration {
+        let covariance: SMatrix<f64, 6, 6> = SMatrix::from_fn(|i, j| {
+            let [one, other] = [QUANTITIES[i], QUANTITIES[j]];
+            let model = if i == j { squared(one.model_deviation()) } else { 0.0 };
+            result.covariance[(one.index(), other.index())] + model
+        });
+        let estimates: [FlightEstimate; 6] = std::array::from_fn(|i| {
+            let quantity = QUANTITIES[i];
+            let (value, variance) = (parameters[quantity.index()], covariance[(i, i)]);
+            match self.excitation.shows(quantity) {
+                true => {
+                    FlightEstimate { quantity, value, deviation: libm::fmax(variance, 0.0).sqrt() }
+                }
+                false => FlightEstimate { quantity, value: 0.0, deviation: f64::INFINITY },
+            }
+        });
+        let mut corrected = Parameters::zeros();
+        for estimate in &estimates {
+            corrected[estimate.quantity.index()] = estimate.correction();
+        }
+        let Noise { position_m, lean_rad, position_s, lean_s, pixel_px, .. } = self.noise;
+        FlightCalibration {
+            camera: model::corrected(self.configured, &corrected),
+            estimates,
+            covariance,
+            drift: Drift { position_m, lean_rad, position_s, lean_s, pixel_px },
+            excitation: self.excitation,
+            markers: self.markers,
+        }
+    }
+}
