@@ -61,6 +61,13 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let mut ticks = interval(TICK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut bridge = Bridge::new(&config, ground.sender(), node.shared_health())?;
+    if config.is_open() && node.health().failed(OPEN) {
+        tracing::warn!(
+            ground = config.ground,
+            "OPEN: whoever speaks first may command the vehicle; name the ground stations (`ground_stations`), or \
+             let them only look (`ground_may = \"monitor\"`)"
+        );
+    }
     node.announce().await?;
     tracing::info!(ground = config.ground, "Ready");
     loop {
@@ -110,6 +117,10 @@ const MAX_RECORDERS: usize = 16;
 const MAX_PROBLEM_CHARS: usize = 120;
 /// Minimum pause between two texts about refused packets, in nanoseconds.
 const REFUSAL_PAUSE_NS: i64 = 5_000_000_000;
+
+/// What its health says while it listens for anybody.
+const OPEN: &str =
+    "open: any ground station in reach can command the vehicle; see `ground_stations`";
 
 const CLOSED: &str = "the network session was closed";
 
@@ -260,6 +271,16 @@ impl Bridge {
             Route::Camera(command) => {
                 self.ground_active(now_ns, packet.sender);
                 self.command_camera(now_ns, packet.sender, command);
+            }
+            Route::Key => {
+                self.ground_active(now_ns, packet.sender);
+                if self.health.failed("from ground: refused: SETUP_SIGNING") {
+                    tracing::warn!(
+                        "A key for signed packets was not passed on; set it on the autopilot's own USB port"
+                    );
+                }
+                let text = "Alight: SETUP_SIGNING not passed on; set the key by USB";
+                self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, text);
             }
             Route::Unknown(command) => {
                 self.ground_active(now_ns, packet.sender);

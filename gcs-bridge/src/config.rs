@@ -73,6 +73,17 @@ impl Config {
         self.video.parse().ok()
     }
 
+    /// Whether it listens beyond this machine for any ground station, which may change something.
+    pub(crate) fn is_open(&self) -> bool {
+        let host = match self.ground.parse() {
+            Ok(Address::UdpIn(at) | Address::TcpIn(at)) => at.host,
+            _ => return false,
+        };
+        let is_here = host == "localhost" || host.parse().is_ok_and(|it: IpAddr| it.is_loopback());
+        let changes = self.ground_may.parse() != Ok(Permission::Monitor);
+        !is_here && changes && self.ground_stations.is_empty()
+    }
+
     /// Whom the link to the ground station talks to.
     pub(crate) fn peering(&self) -> Peering {
         Peering::GroundStation {
@@ -97,6 +108,23 @@ mod tests {
         let config = load(&[]).unwrap();
         assert_eq!(config.ground, "udpout:127.0.0.1:14550");
         assert_eq!((config.system_id, config.component_id), (0, 191));
+    }
+
+    #[test]
+    fn a_bridge_that_listens_for_anybody_beyond_this_machine_is_open() {
+        for (ground, further, is_open) in [
+            ("udpin:0.0.0.0:14550", "ground_stations=[]", true),
+            ("tcpin:10.0.0.2:5760", "ground_stations=[]", true),
+            ("udpin:0.0.0.0:14550", "ground_may='no-arming'", true),
+            ("udpin:0.0.0.0:14550", "ground_may='monitor'", false),
+            ("udpin:0.0.0.0:14550", "ground_stations=['10.0.0.3']", false),
+            ("udpin:127.0.0.1:14550", "ground_stations=[]", false),
+            ("tcpin:localhost:5760", "ground_stations=[]", false),
+            ("udpout:10.0.0.2:14550", "ground_stations=[]", false),
+        ] {
+            let config = load(&[&format!("ground={ground}"), further]).unwrap();
+            assert_eq!(config.is_open(), is_open, "{ground} {further}");
+        }
     }
 
     #[test]

@@ -3,7 +3,9 @@
 //! The rules are those of <https://mavlink.io/en/guide/routing.html>: a packet for a component goes to that
 //! component, every other packet to all, and none back to where it came from.
 
-use autopilot::dialect::{COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message};
+use autopilot::dialect::{
+    COMMAND_ACK_DATA, MavCmd, MavMessage, MavResult, Message, MessageData, SETUP_SIGNING_DATA,
+};
 use autopilot::{Packet, Sender, UnknownCommand};
 
 use crate::params::Ask;
@@ -32,6 +34,8 @@ pub(crate) enum Route {
     Parameters,
     /// A command that nobody here knows.
     Unknown(UnknownCommand),
+    /// A key for signed packets, which must not travel further.
+    Key,
     /// Dropped, for this reason.
     Drop(&'static str),
 }
@@ -42,6 +46,9 @@ pub(crate) fn from_ground(packet: &Packet, own: Option<Own>, vehicle: &Vehicle) 
     if is_own || vehicle.is_aboard(packet.sender) {
         // A ground program that repeats everything would otherwise send the vehicle its own packets.
         return Route::Drop("from ground: an echo of the vehicle");
+    }
+    if is_key(packet) {
+        return Route::Key;
     }
     let Some(own) = own else { return Route::Pass };
     if let Some(unknown) = UnknownCommand::of(packet).filter(|it| own.is(it.target)) {
@@ -76,6 +83,7 @@ pub(crate) fn from_autopilot(packet: &Packet, own: Option<Own>) -> Route {
         Some(own) if is_for(packet, own.companion) => {
             Route::Drop("from autopilot: for the companion")
         }
+        _ if is_key(packet) => Route::Drop("from autopilot: SETUP_SIGNING"),
         _ => Route::Pass,
     }
 }
@@ -84,6 +92,12 @@ impl Own {
     fn is(&self, sender: Sender) -> bool {
         sender == self.companion || Some(sender) == self.camera
     }
+}
+
+/// Whether a packet has the secret key of signed packets in clear text: it belongs on the link that it came on, and
+/// beyond would be read, and recorded.
+fn is_key(packet: &Packet) -> bool {
+    packet.message_id == SETUP_SIGNING_DATA::ID
 }
 
 fn is_for(packet: &Packet, me: Sender) -> bool {
@@ -210,6 +224,24 @@ mod tests {
         // Another camera has that id: what is for it goes to it.
         let own = Own { camera: None, ..OWN };
         assert_eq!(from_ground(&packet(GROUND, &asked), Some(own), &vehicle()), Route::Pass);
+    }
+
+    #[test]
+    fn a_key_for_signed_packets_goes_no_further() {
+        for (target_system, target_component) in [(7, 1), (7, 191), (7, 0), (0, 0)] {
+            let key = SETUP_SIGNING_DATA {
+                target_system,
+                target_component,
+                secret_key: [7; 32],
+                ..SETUP_SIGNING_DATA::default()
+            };
+            let key = MavMessage::SETUP_SIGNING(key);
+            for own in [Some(OWN), None] {
+                assert_eq!(from_ground(&packet(GROUND, &key), own, &vehicle()), Route::Key);
+                let down = from_autopilot(&packet(AUTOPILOT, &key), own);
+                assert!(matches!(down, Route::Drop(_)), "{down:?}");
+            }
+        }
     }
 
     #[test]
