@@ -247,6 +247,20 @@ fn check_site(findings: &mut Findings, role: Role, jobs: &[Job]) {
     }
 }
 
+/// Why a service's key for signed MAVLink packets cannot be used, if it has one.
+fn problem_of_key(job: &Job, service: Service) -> Option<String> {
+    let problem = match service {
+        Service::Controller => {
+            job.layers.load::<controller::Config>().ok()?.settings.signing().err()?
+        }
+        Service::GcsBridge => {
+            job.layers.load::<gcs_bridge::Config>().ok()?.settings.signing().err()?
+        }
+        _ => return None,
+    };
+    Some(problem.to_string())
+}
+
 /// Checks the files and devices that a service needs.
 fn check_devices(findings: &mut Findings, job: &Job, service: Service) {
     let Ok(config) = service.effective_config(&job.layers) else { return };
@@ -260,6 +274,13 @@ fn check_devices(findings: &mut Findings, job: &Job, service: Service) {
             "autopilot",
             format!("{device} cannot be opened: {cause}"),
             "connect the autopilot, and add the user to the group that owns the device (often `dialout`)",
+        );
+    }
+    if let Some(problem) = problem_of_key(job, service) {
+        findings.wrong(
+            "signing",
+            problem,
+            "`alight keys signing` makes a key, for the user that runs `alight`",
         );
     }
     if service == Service::CameraPub {

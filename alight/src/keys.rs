@@ -24,6 +24,10 @@ use rcgen::{
 const AUTHORITY_KEY: &str = "authority.key";
 /// Certificates are valid a day early, as a drone's clock may be slow before it is synchronised.
 const BACKDATING: Duration = DAY;
+/// The letters and digits of a passphrase: 32 that are not mistaken for each other.
+const LETTERS: &[u8; 32] = b"abcdefghijkmnpqrstuvwxyz23456789";
+/// Number of letters of a passphrase.
+const PASSPHRASE_LETTERS: usize = 25;
 const DAY: Duration = Duration::from_secs(86_400);
 
 /// The arguments of `alight keys`.
@@ -70,6 +74,13 @@ enum Action {
         /// Days until it expires.
         #[arg(long, value_name = "DAYS", default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
+    },
+    /// Make a passphrase for signed MAVLink packets: the file for `signing_key`, whose text goes into the autopilot or the
+    /// ground station as well (docs/deploy.md).
+    Signing {
+        /// Output file.
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
     },
     /// Shut the holder of a key out, for good: copy the list of holders that this writes to the keys of every relay
     /// (`alight up drone`, `alight up relay`), and restart them.
@@ -140,6 +151,7 @@ pub(crate) fn run(args: &KeysArgs) -> anyhow::Result<ExitCode> {
             let authority = authority.as_deref().unwrap_or(output);
             issue(*role, &holder, output, authority, address, *days)?
         }
+        Action::Signing { output } => vec![passphrase(output)?],
         Action::Revoke { holder, authority } => vec![revoke(holder, authority)?],
     };
     let mut out = std::io::stdout().lock();
@@ -175,6 +187,21 @@ fn init(output: &Path, days: u32) -> anyhow::Result<Vec<PathBuf>> {
     write_new(&files[0], &key.serialize_pem())?;
     write_new(&files[1], &certificate.pem())?;
     Ok(files.into())
+}
+
+/// Writes a passphrase of 125 bits, in groups that a person can copy.
+fn passphrase(output: &Path) -> anyhow::Result<PathBuf> {
+    refuse_existing(&[output.to_owned()])?;
+    let mut random = [0; PASSPHRASE_LETTERS];
+    getrandom::fill(&mut random).context("asking the system for random bytes")?;
+    let letters: Vec<u8> =
+        random.iter().filter_map(|byte| LETTERS.get(usize::from(byte % 32)).copied()).collect();
+    let groups: Vec<_> = letters.chunks(5).map(String::from_utf8_lossy).collect();
+    if let Some(directory) = output.parent().filter(|it| !it.as_os_str().is_empty()) {
+        make_directory(directory)?;
+    }
+    write_new(output, &format!("{}\n", groups.join("-")))?;
+    Ok(output.to_owned())
 }
 
 fn issue(
@@ -388,6 +415,21 @@ mod tests {
         let key = here.join(AUTHORITY_KEY);
         fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
         refused(issue_for(Role::Observer, None, here, here), "chmod 600");
+    }
+
+    #[test]
+    fn a_passphrase_is_random_private_and_a_key() {
+        let home = tempfile::tempdir().unwrap();
+        let files = ["a.key", "further/b.key"].map(|name| home.path().join(name));
+        for file in &files {
+            passphrase(file).unwrap();
+            assert_eq!(fs::metadata(file).unwrap().permissions().mode() & 0o777, 0o600);
+        }
+        let texts = files.each_ref().map(|file| fs::read_to_string(file).unwrap());
+        assert_ne!(texts[0], texts[1]);
+        let groups: Vec<_> = texts[0].trim().split('-').map(str::len).collect();
+        assert_eq!(groups, [5; 5], "{}", texts[0]);
+        refused(passphrase(&files[0]), "never overwritten");
     }
 
     #[test]

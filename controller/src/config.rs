@@ -1,11 +1,11 @@
 //! The controller's configuration.
 
-use autopilot::{Address, Permission, Takeoff};
+use autopilot::{Address, KeyFileError, Permission, SigningConfig, Takeoff};
 use landing::{
     EnvelopeConfig, EstimatorConfig, GuidanceConfig, MetricConfig, PhaseConfig, TargetConfig,
     ThesisConfig,
 };
-use node::{Check, Settings, clock_name};
+use node::{Check, Settings, clock_name, state_directory};
 use serde::{Deserialize, Serialize};
 
 /// The keys of `controller.toml`, which has their meanings, units and ranges.
@@ -140,6 +140,8 @@ pub struct AutopilotSettings {
     pub setpoint_rate_hz: f64,
     /// Setpoint timeout that the autopilot gets for a landing, in seconds; 0 leaves its own.
     pub setpoint_timeout_s: f64,
+    /// File with the key of signed packets, or nothing.
+    pub signing_key: String,
     /// What a ground station may send to the autopilot.
     pub ground_may: String,
     /// Whether to synchronise with the autopilot's clock.
@@ -247,6 +249,19 @@ impl Config {
     /// The clock whose frames are used.
     pub(crate) fn clock(&self) -> &str {
         if self.clock.is_empty() { clock_name() } else { &self.clock }
+    }
+
+    /// The key of the packets between controller and autopilot, if they are signed.
+    ///
+    /// # Errors
+    /// When its file cannot be used.
+    pub fn signing(&self) -> Result<Option<SigningConfig>, KeyFileError> {
+        let AutopilotSettings { signing_key, component_id, .. } = &self.autopilot;
+        if signing_key.is_empty() {
+            return Ok(None);
+        }
+        let name = format!("controller-{}", self.id);
+        SigningConfig::read(signing_key.as_ref(), *component_id, state_directory(), &name).map(Some)
     }
 
     /// The take-off of `start = "takeoff"`.

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use node::state_directory;
+
 use crate::limits::Note;
 
 /// The file of one controller; it exists while there is something to put back.
@@ -12,11 +14,10 @@ pub struct NoteFile {
 }
 
 impl NoteFile {
-    /// The file of the controller with this name, in the directory for state that survives a reboot:
-    /// `$STATE_DIRECTORY` (systemd), `$XDG_STATE_HOME/alight` or `~/.local/state/alight`.
+    /// The file of the controller with this name, in the [`state_directory`].
     pub fn new(name: &str) -> Self {
         Self {
-            path: directory().map(|it| it.join(format!("controller-{name}.json"))),
+            path: state_directory().map(|it| it.join(format!("controller-{name}.json"))),
             written: None,
         }
     }
@@ -42,17 +43,6 @@ impl NoteFile {
             tracing::warn!(%problem, file = ?path, "Note of the autopilot's parameters not written");
         }
     }
-}
-
-fn directory() -> Option<PathBuf> {
-    let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty());
-    // Of several directories systemd separates by colons, the first is meant.
-    if let Some(given) = variable("STATE_DIRECTORY") {
-        return std::env::split_paths(&given).next();
-    }
-    let state = variable("XDG_STATE_HOME").map(PathBuf::from);
-    let home = || Some(PathBuf::from(variable("HOME")?).join(".local/state"));
-    Some(state.or_else(home)?.join("alight"))
 }
 
 fn write(path: &Path, note: Option<&Note>) -> std::io::Result<()> {

@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use anyhow::Context;
 use autopilot::packet::MAX_PACKET;
-use autopilot::{Address, Link, LinkEvent, Parser, Permission};
+use autopilot::signing::Refusals;
+use autopilot::{Address, Link, LinkEvent, Parser, Peering, Permission};
 use messages::{ControllerStatus, MavlinkBytes, Tape, VehicleState, topic};
 use node::{HealthCounters, Node, Publisher, Shutdown, now_ns};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
@@ -53,7 +54,9 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     node.claim_unique_name("*").await?;
     let address: Address = config.autopilot.address.parse()?;
     let permission: Permission = config.autopilot.ground_may.parse()?;
-    let mut link = Link::open(address).await.context("opening the link to the autopilot")?;
+    let mut link = Link::open_for(address, Peering::Autopilot, config.signing()?)
+        .await
+        .context("opening the link to the autopilot")?;
     let mut note_file = NoteFile::new(&config.id);
     let mut flight = TapedFlight::new(now_ns(), config, node.shared_health())?;
     if let Some(note) = note_file.read() {
@@ -72,6 +75,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     node.announce().await?;
 
     let mut strangers = 0;
+    let mut refusals = Refusals::default();
     let mut other_versions = 0;
     let mut ticks = interval(TICK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -109,6 +113,10 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                     strangers += more;
                     node.health().failed_times("packets of a stranger at the autopilot's port", more);
                 }
+                for (reason, more) in link.refusals().since(refusals) {
+                    node.health().failed_times(&format!("from autopilot: refused: {reason}"), more);
+                }
+                refusals = link.refusals();
             }
             Some((detector, alive)) = presence.next() => flight.presence(now_ns(), &detector, alive),
             Some((key, info)) = infos.next_with_key() => {

@@ -10,6 +10,7 @@ use autopilot::dialect::{MavMessage, MavSeverity, MavState};
 use autopilot::link::SendError;
 use autopilot::packet::{Counters, encode};
 use autopilot::permission::Refusal;
+use autopilot::signing::Refusals;
 use autopilot::{Address, Link, LinkEvent, LinkSender, Packet, Parser, Permission, Sender};
 use messages::{
     Configuration, ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus,
@@ -43,7 +44,7 @@ const GROUND_TIMEOUT_NS: i64 = 10_000_000_000;
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     let address: Address = config.ground.parse()?;
     node.claim_unique_name(&node.identity().instance).await?;
-    let mut ground = Link::open_for(address, config.peering())
+    let mut ground = Link::open_for(address, config.peering(), config.signing()?)
         .await
         .context("opening the link to the ground station")?;
     let from_autopilot = node.subscriber(topic::FROM_AUTOPILOT, &[]).await?;
@@ -104,6 +105,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
             _ = second.tick() => {
                 bridge.count_losses(ground.counters(), ground.dropped());
                 bridge.count_strangers(ground.strangers());
+                bridge.count_refusals(now_ns(), ground.refusals());
                 bridge.every_second(now_ns());
             }
         }
@@ -158,6 +160,8 @@ struct Bridge {
     bad_bytes: u64,
     unread: u64,
     strangers: u64,
+    /// Packets refused because of their signatures, as counted so far.
+    refusals: Refusals,
     /// Sequence numbers of our next packets: the companion's and the camera's.
     sequence: u8,
     camera_sequence: u8,
@@ -196,6 +200,7 @@ impl Bridge {
             bad_bytes: 0,
             unread: 0,
             strangers: 0,
+            refusals: Refusals::default(),
             sequence: 0,
             camera_sequence: 0,
         })
@@ -506,6 +511,17 @@ impl Bridge {
             self.health.failed_times("from ground: packets or connections of a stranger", more);
         }
         self.strangers = strangers;
+    }
+
+    /// Counts what was refused because of its signature, and tells the ground station once, which may just have no key.
+    fn count_refusals(&mut self, now_ns: i64, refusals: Refusals) {
+        for (reason, more) in refusals.since(self.refusals) {
+            if self.health.failed_times(&format!("from ground: refused: {reason}"), more) {
+                let text = format!("Alight: packets refused: {reason}");
+                self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
+            }
+        }
+        self.refusals = refusals;
     }
 
     /// Counts losses on the ground station's link since the last second.

@@ -3,7 +3,8 @@
 use std::net::IpAddr;
 use std::time::Duration;
 
-use autopilot::{Address, Peering, Permission};
+use autopilot::{Address, KeyFileError, Peering, Permission, SigningConfig};
+use node::state_directory;
 use serde::Deserialize;
 
 use crate::video::Video;
@@ -30,6 +31,8 @@ pub struct Config {
     pub ground_stations: Vec<String>,
     /// Silence after which another ground station is heard, in seconds.
     pub ground_silence_s: f64,
+    /// File with the key of signed packets, or nothing.
+    pub signing_key: String,
     /// What the ground station may send to the autopilot, a [`Permission`].
     pub ground_may: String,
     /// Rate of the landing target, in Hz.
@@ -81,7 +84,19 @@ impl Config {
         };
         let is_here = host == "localhost" || host.parse().is_ok_and(|it: IpAddr| it.is_loopback());
         let changes = self.ground_may.parse() != Ok(Permission::Monitor);
-        !is_here && changes && self.ground_stations.is_empty()
+        !is_here && changes && self.ground_stations.is_empty() && self.signing_key.is_empty()
+    }
+
+    /// The key of the packets between bridge and ground station, if they are signed.
+    ///
+    /// # Errors
+    /// When its file cannot be used.
+    pub fn signing(&self) -> Result<Option<SigningConfig>, KeyFileError> {
+        if self.signing_key.is_empty() {
+            return Ok(None);
+        }
+        let (path, name) = (self.signing_key.as_ref(), format!("gcs-bridge-{}", self.id));
+        SigningConfig::read(path, self.component_id, state_directory(), &name).map(Some)
     }
 
     /// Whom the link to the ground station talks to.
@@ -118,6 +133,7 @@ mod tests {
             ("udpin:0.0.0.0:14550", "ground_may='no-arming'", true),
             ("udpin:0.0.0.0:14550", "ground_may='monitor'", false),
             ("udpin:0.0.0.0:14550", "ground_stations=['10.0.0.3']", false),
+            ("udpin:0.0.0.0:14550", "signing_key='ground.key'", false),
             ("udpin:127.0.0.1:14550", "ground_stations=[]", false),
             ("tcpin:localhost:5760", "ground_stations=[]", false),
             ("udpout:10.0.0.2:14550", "ground_stations=[]", false),

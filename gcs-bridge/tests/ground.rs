@@ -1,6 +1,9 @@
 //! The bridge between a vehicle that is made up here and a ground station on a plain UDP socket.
 
+use std::fs::Permissions;
+use std::io::Write;
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -377,8 +380,8 @@ async fn a_ground_station_finds_the_camera_its_video_and_the_marker() -> anyhow:
     drop(free);
     let area = ["--area", "0.2", "0.2", "0.4", "0.4"];
     for (loss, further) in [("0", &["--commands"][..]), ("0.3", &[])] {
-        let further = [&area, further].concat();
-        let Some(told) = script("camera.py", address, loss, &further).await? else { return Ok(()) };
+        let further = [&["--loss", loss], &area[..], further].concat();
+        let Some(told) = script("camera.py", address, &further).await? else { return Ok(()) };
         eprintln!("{told}");
         // The sample's marker: within a hundredth of the width of where it was put.
         for part in [
@@ -408,8 +411,8 @@ async fn a_ground_station_loads_the_companions_parameters_and_changes_none() -> 
     let bridge = start_bridge(port, &free, &[]).await?;
     drop(free);
     for (loss, seed) in [("0", "1"), ("0.3", "1"), ("0.3", "2")] {
-        let further = ["--seed", seed];
-        let told = script("params.py", address, loss, &further).await?;
+        let further = ["--loss", loss, "--seed", seed];
+        let told = script("params.py", address, &further).await?;
         let Some(told) = told else { return Ok(()) };
         eprintln!("{told}");
         for part in [r#""ok": true"#, r#""parameters": 36, "names": 36"#, r#""value": 2.0"#] {
@@ -421,16 +424,46 @@ async fn a_ground_station_loads_the_companions_parameters_and_changes_none() -> 
     Ok(())
 }
 
+/// A ground station with a key, with pymavlink as the other side; and what is sent without the key.
+#[tokio::test(flavor = "multi_thread")]
+async fn only_what_the_ground_station_signs_is_answered() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let free = Ground::open().await?;
+    let address = free.socket.local_addr()?;
+    let vehicle = FakeVehicle::start(port).await?;
+    let health = vehicle.node.subscriber(topic::HEALTH, &["gcs-bridge", "main"]).await?;
+    let mut key = tempfile::Builder::new().permissions(Permissions::from_mode(0o600)).tempfile()?;
+    writeln!(key, "correct horse battery")?;
+    let setting = format!("signing_key={}", key.path().display());
+    let bridge = start_bridge(port, &free, &[&setting]).await?;
+    drop(free);
+    let further = ["--passphrase", "correct horse battery", "--flood-s", "3"];
+    let Some(told) = script("signing.py", address, &further).await? else { return Ok(()) };
+    eprintln!("{told}");
+    ensure!(told.contains(r#""ok": true"#), "{told}");
+    for (reason, times) in
+        [("not signed", 1), ("another key", 1000), ("sent before", 1), ("a minute old", 1)]
+    {
+        until_error(&health, reason, times).await?;
+    }
+    // A key that others can read is none.
+    std::fs::set_permissions(key.path(), Permissions::from_mode(0o644))?;
+    let open = start_bridge(free_port()?, &Ground::open().await?, &[&setting]).await?;
+    let problem = timeout(PATIENCE, open).await??.err().context("a key for all to read")?;
+    ensure!(format!("{problem:#}").contains("chmod 600"), "{problem:#}");
+    bridge.abort();
+    Ok(())
+}
+
 /// What a script of `tests/gcs` says; none where it cannot run.
 async fn script(
     name: &str,
     address: SocketAddr,
-    loss: &str,
     further: &[&str],
 ) -> anyhow::Result<Option<String>> {
     let script = format!("{}/../tests/gcs/{name}", env!("CARGO_MANIFEST_DIR"));
     let run = tokio::process::Command::new(testing::interpreter())
-        .args([&script, "--connect", &format!("udpin:{address}"), "--loss", loss])
+        .args([&script, "--connect", &format!("udpin:{address}")])
         .args(further)
         .kill_on_drop(true)
         .output();

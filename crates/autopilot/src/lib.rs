@@ -5,12 +5,13 @@
 //! errors. ArduPilot Copter and PX4 multicopters are supported; both were flown in their own simulators (PX4
 //! 1.17).
 //!
-//! Everything but [`link`] is a pure state machine that takes the time as an argument (nanoseconds of any
+//! Everything but [`link`] and [`key_file`] is a pure state machine that takes the time as an argument (nanoseconds of any
 //! monotonic clock) and does no input or output. The crate knows nothing of markers, of landing or of other
 //! processes.
 //!
 //! Modules in reading order: [`address`] says where the autopilot is, [`link`] moves bytes to and from it and
-//! [`peers`] chooses whom a listening one talks to, [`packet`] finds MAVLink packets in them, [`mode`],
+//! [`peers`] chooses whom a listening one talks to, [`packet`] finds MAVLink packets in them, [`signing`] signs and verifies
+//! them, `gate` is where a link does so, with the files of [`key_file`], [`mode`],
 //! [`state`] and [`parameter`] are what the vehicle reports, [`clock`] converts its time stamps, `boot` and
 //! `contact` say which of its reports are believed, `simulation` asks whether it is simulated, [`client`] is the
 //! conversation with it with the settings of [`config`], [`event`] its events, [`command`] is what can be requested
@@ -28,12 +29,15 @@ pub mod compose;
 pub mod config;
 mod contact;
 pub mod event;
+mod gate;
+pub mod key_file;
 pub mod link;
 pub mod mode;
 pub mod packet;
 pub mod parameter;
 pub mod peers;
 pub mod permission;
+pub mod signing;
 mod simulation;
 pub mod state;
 mod stream;
@@ -53,6 +57,7 @@ pub use client::Autopilot;
 pub use command::{Command, CommandError, CommandId, CommandStatus};
 pub use config::Config;
 pub use event::Event;
+pub use key_file::{KeyFileError, SigningConfig};
 pub use link::{Link, LinkEvent, LinkSender};
 pub use mode::{Firmware, FlightMode};
 pub use packet::{Packet, Parser, Sender};

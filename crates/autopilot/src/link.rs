@@ -10,7 +10,7 @@ use std::io;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream, UdpSocket};
@@ -20,8 +20,11 @@ use tokio::time::{sleep, sleep_until, timeout};
 use tokio_serial::{SerialPortBuilderExt, SerialStream};
 
 use crate::address::{Address, Endpoint};
+use crate::gate::Gate;
+use crate::key_file::{SigningConfig, StampFile};
 use crate::packet::{Counters, Packet, Parser};
 use crate::peers::{PACKET_GAP, Peering, Peers};
+use crate::signing::{Refusals, Signing, stamp};
 
 /// Maximum number of packets received and not yet read, about 4 s of an autopilot's traffic.
 const INCOMING: usize = 1024;
@@ -128,11 +131,16 @@ pub enum SendError {
 impl Link {
     /// Opens the link; needs a tokio runtime with network and time, and ends when it is dropped.
     pub async fn open(address: Address) -> Result<Self, LinkError> {
-        Self::open_for(address, Peering::Autopilot).await
+        Self::open_for(address, Peering::Autopilot, None).await
     }
 
-    /// The same, for the peers of a kind where it listens; all others are dropped and counted.
-    pub async fn open_for(address: Address, peering: Peering) -> Result<Self, LinkError> {
+    /// The same, for the peers of a kind where it listens, and with a key for signed packets only; all others are dropped
+    /// and counted.
+    pub async fn open_for(
+        address: Address,
+        peering: Peering,
+        signing: Option<SigningConfig>,
+    ) -> Result<Self, LinkError> {
         let listener = listen(&address).await?;
         let local = match &listener {
             Listener::Udp(socket) => socket.local_addr().ok(),
@@ -141,7 +149,8 @@ impl Link {
         };
         let (queue, outgoing) = mpsc::channel(OUTGOING);
         let shared = Arc::new(Shared::new());
-        let port = Port { shared: Arc::clone(&shared), outgoing, peering };
+        let (gate, keeping) = signing.map_or((Gate::new(None), None), keyed);
+        let port = Port { shared: Arc::clone(&shared), outgoing, peering, gate, keeping };
         let task = tokio::spawn(run(address, listener, port));
         let sender = LinkSender { shared: Arc::clone(&shared), queue };
         Ok(Self { shared, sender, task, local })
@@ -192,6 +201,11 @@ impl Link {
         self.shared.strangers.load(Ordering::Relaxed)
     }
 
+    /// Numbers of packets that were refused because of their signatures, by reason.
+    pub fn refusals(&self) -> Refusals {
+        *self.shared.refusals.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Number of received packets that were dropped because they were not read in time.
     pub fn dropped(&self) -> u64 {
         self.shared.dropped.load(Ordering::Relaxed)
@@ -235,6 +249,7 @@ struct Shared {
     dropped: AtomicU64,
     strangers: AtomicU64,
     counters: Mutex<Counters>,
+    refusals: Mutex<Refusals>,
     opened: Instant,
     /// When bytes came last, in milliseconds since the link was opened.
     active_ms: AtomicU64,
@@ -249,6 +264,7 @@ impl Shared {
             dropped: AtomicU64::new(0),
             strangers: AtomicU64::new(0),
             counters: Mutex::new(Counters::default()),
+            refusals: Mutex::new(Refusals::default()),
             opened: Instant::now(),
             active_ms: AtomicU64::new(0),
         }
@@ -292,6 +308,22 @@ struct Port {
     shared: Arc<Shared>,
     outgoing: mpsc::Receiver<Vec<u8>>,
     peering: Peering,
+    gate: Gate,
+    keeping: Option<Keeping>,
+}
+
+/// Where a gate's stamps come from, and go to.
+struct Keeping {
+    clock: fn() -> SystemTime,
+    file: Option<StampFile>,
+}
+
+/// The gate for a key.
+fn keyed(config: SigningConfig) -> (Gate, Option<Keeping>) {
+    let file = config.stamp_file.map(StampFile::read);
+    let used = file.as_ref().map_or(0, |file| file.reserved);
+    let signing = Signing::new(config.key, config.link_id, used);
+    (Gate::new(Some(signing)), Some(Keeping { clock: config.clock, file }))
 }
 
 impl Port {
@@ -308,12 +340,55 @@ impl Port {
         self.shared.push(LinkEvent::Disconnected { reason });
     }
 
-    fn received(&self, packets: Vec<Packet>, counted: Counters) {
+    fn received(&mut self, packets: Vec<Packet>, counted: Counters) {
         self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner).add(counted);
+        self.keep_stamps();
+        self.count_refusals();
         let received = Instant::now();
         for packet in packets {
             self.shared.push(LinkEvent::Packet { packet: Box::new(packet), received });
         }
+    }
+}
+
+impl Port {
+    /// The clock's stamp for signed packets.
+    fn stamp(&self) -> u64 {
+        let now = self.keeping.as_ref().map(|keeping| (keeping.clock)());
+        stamp(now.and_then(|it| it.duration_since(SystemTime::UNIX_EPOCH).ok()).unwrap_or_default())
+    }
+
+    /// The packets that are let in.
+    fn admit(&mut self, packets: Vec<Packet>) -> Vec<Packet> {
+        self.gate.admit(self.stamp(), packets).packets
+    }
+
+    /// A packet as it is sent.
+    fn seal(&mut self, raw: Vec<u8>) -> Option<Vec<u8>> {
+        let sealed = self.gate.seal(self.stamp(), raw);
+        self.keep_stamps();
+        sealed
+    }
+
+    fn keep_stamps(&mut self) {
+        let file = self.keeping.as_mut().and_then(|keeping| keeping.file.as_mut());
+        if let (Some(file), Some(newest)) = (file, self.gate.newest()) {
+            file.keep(newest);
+        }
+    }
+
+    /// Hands the numbers of refused packets on, and logs the first of each reason.
+    fn count_refusals(&self) {
+        if self.gate.is_open() {
+            return;
+        }
+        let refusals = self.gate.refusals();
+        let mut before = self.shared.refusals.lock().unwrap_or_else(PoisonError::into_inner);
+        for (reason, _) in refusals.since(*before).filter(|(reason, _)| before.of(*reason) == 0) {
+            let advice = reason.advice();
+            tracing::warn!(%reason, advice, "Packet refused (further ones are only counted)");
+        }
+        *before = refusals;
     }
 }
 
@@ -517,14 +592,19 @@ where
                 Ok(0) => return "the other side closed the connection".into(),
                 Ok(count) => {
                     active = tokio::time::Instant::now();
-                    port.shared.mark_active();
                     let packets = parser.push(bytes.get(..count).unwrap_or(&[]));
+                    let packets = port.admit(packets);
+                    // Who has not the key holds nobody's place.
+                    if port.gate.is_open() || !packets.is_empty() {
+                        port.shared.mark_active();
+                    }
                     port.received(packets, parser.take_counters());
                 }
                 Err(error) => return format!("reading failed: {error}"),
             },
             packet = port.outgoing.recv() => {
                 let Some(packet) = packet else { return "closed".into() };
+                let Some(packet) = port.seal(packet) else { continue };
                 match timeout(WRITE_LIMIT, writer.write_all(&packet)).await {
                     Ok(Ok(())) => {}
                     Ok(Err(error)) => return format!("writing failed: {error}"),
@@ -532,7 +612,7 @@ where
                 }
             }
             () = sleep_until(active + PACKET_GAP), if parser.is_waiting() => {
-                let packets = parser.finish();
+                let packets = port.admit(parser.finish());
                 port.received(packets, parser.take_counters());
             }
             () = sleep_until(active + limit), if silence.is_some() => {
@@ -556,7 +636,8 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
                 Ok((count, from)) => {
                     let before = peers.chosen;
                     let datagram = bytes.get(..count).unwrap_or(&[]);
-                    let taken = peers.take(from, datagram, Instant::now());
+                    let stamp = port.stamp();
+                    let taken = peers.take(from, datagram, Instant::now(), &mut port.gate, stamp);
                     if let Some(peer) = peers.chosen.filter(|_| peers.chosen != before) {
                         port.connected(peer.to_string());
                     }
@@ -571,6 +652,7 @@ async fn serve_udp(socket: &UdpSocket, port: &mut Port, fixed: Option<SocketAddr
             },
             packet = port.outgoing.recv() => {
                 let Some(packet) = packet else { return "closed".into() };
+                let Some(packet) = port.seal(packet) else { continue };
                 let sent = match (fixed, peers.chosen) {
                     (Some(_), _) => socket.send(&packet).await,
                     (None, Some(peer)) => socket.send_to(&packet, peer).await,

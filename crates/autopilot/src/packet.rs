@@ -13,8 +13,10 @@ const START_V2: u8 = 0xFD;
 const HEADER_V1: usize = 6;
 const HEADER_V2: usize = 10;
 const CHECKSUM: usize = 2;
-const SIGNATURE: usize = 13;
-const SIGNED: u8 = 0x01;
+/// Bytes of a signature.
+pub(crate) const SIGNATURE: usize = 13;
+/// The incompatibility flag of packets that are signed.
+pub(crate) const SIGNED: u8 = 0x01;
 /// Length of the longest packet, in bytes: MAVLink 2 with 255 bytes of payload and a signature.
 pub const MAX_PACKET: usize = HEADER_V2 + 255 + CHECKSUM + SIGNATURE;
 
@@ -180,6 +182,17 @@ impl Packet {
         self.raw.first() == Some(&START_V2)
     }
 
+    /// True for MAVLink 2 with a signature, which nothing here has verified.
+    pub fn is_signed(&self) -> bool {
+        matches!(*self.raw, [START_V2, _, flags, ..] if flags & SIGNED != 0)
+    }
+
+    /// The same packet without its signature, if it has one.
+    pub(crate) fn without_signature(self) -> Self {
+        let unsigned = if self.is_signed() { reframe(&self.raw, 0) } else { None };
+        Self { raw: unsigned.unwrap_or(self.raw), ..self }
+    }
+
     /// The message's name; `None` when the dialect does not know it.
     pub fn name(&self) -> Option<&'static str> {
         self.message.as_ref().map(Message::message_name)
@@ -193,6 +206,29 @@ pub fn encode(sender: Sender, sequence: u8, message: &MavMessage) -> Vec<u8> {
     let mut raw = MAVLinkV2MessageRaw::new();
     raw.serialize_message(header, message);
     raw.raw_bytes().to_vec()
+}
+
+/// The packet that is all of these bytes, as MAVLink 2 with these incompatibility flags, from start byte to checksum; `None`
+/// when its checksum is wrong.
+pub(crate) fn reframe(raw: &[u8], flags: u8) -> Option<Vec<u8>> {
+    let shape = shape(raw).ok().filter(|shape| shape.length == raw.len())?;
+    let checked = shape.header + shape.payload;
+    let sent = u16::from_le_bytes(*raw.get(checked..)?.first_chunk()?);
+    let extra = crc_extra(raw.get(1..checked)?, sent)?;
+    if shape.known && extra != MavMessage::extra_crc(shape.id) {
+        return None;
+    }
+    let compatibility = if shape.v2 { *raw.get(3)? } else { 0 };
+    let Sender { system, component } = shape.sender;
+    let [id0, id1, id2, _] = shape.id.to_le_bytes();
+    let length = *raw.get(1)?;
+    let mut framed = Vec::with_capacity(MAX_PACKET);
+    framed.extend([START_V2, length, flags, compatibility, shape.sequence, system, component]);
+    framed.extend([id0, id1, id2]);
+    framed.extend_from_slice(raw.get(shape.header..checked)?);
+    let crc = calculate_crc(framed.get(1..)?, extra);
+    framed.extend_from_slice(&crc.to_le_bytes());
+    Some(framed)
 }
 
 /// The layout of a packet.
@@ -239,15 +275,16 @@ fn look(bytes: &[u8], senders: &[Sender]) -> Verdict {
     // accepted when some value of that byte fits, its sender is known from checked packets, and what follows
     // begins a packet or has not come yet.
     let follows = bytes.get(shape.length).is_none_or(|next| [START_V1, START_V2].contains(next));
-    let is_plausible = follows && senders.contains(&shape.sender) && fits_some_extra(covered, sent);
+    let is_plausible =
+        follows && senders.contains(&shape.sender) && crc_extra(covered, sent).is_some();
     if is_plausible { Verdict::Packet(shape) } else { Verdict::Noise }
 }
 
-/// True when the checksum is right for some value of the byte CRC_EXTRA. The checksum is linear, so this byte
+/// The value of the byte CRC_EXTRA for which the checksum is right, if there is one. The checksum is linear, so this byte
 /// changes it by the same bits whatever comes before.
-fn fits_some_extra(covered: &[u8], sent: u16) -> bool {
+fn crc_extra(covered: &[u8], sent: u16) -> Option<u8> {
     let difference = calculate_crc(covered, 0) ^ sent;
-    (0..=u8::MAX).any(|extra| calculate_crc(&[], extra) ^ calculate_crc(&[], 0) == difference)
+    (0..=u8::MAX).find(|extra| calculate_crc(&[], *extra) ^ calculate_crc(&[], 0) == difference)
 }
 
 /// Reads the header at the first byte.
@@ -492,6 +529,38 @@ mod tests {
         assert_eq!(packets[0].raw, raw);
         assert_eq!(packets[0].message, Some(message(1)));
         assert_eq!(parser.counters().bad_bytes, 0);
+    }
+
+    #[test]
+    fn a_packet_keeps_its_content_in_another_frame() {
+        let sender = AUTOPILOT;
+        let known = encode(sender, 9, &message(1));
+        let mut signed = reframe(&known, SIGNED).unwrap();
+        assert_eq!(signed[2], SIGNED);
+        signed.extend_from_slice(&[0; SIGNATURE]);
+        let packet = Parser::new().push(&signed).remove(0);
+        assert!(packet.is_signed());
+        assert_eq!(packet.without_signature(), Parser::new().push(&known).remove(0));
+
+        // MAVLink 1 becomes MAVLink 2.
+        let old = encode_v1(9, &message(1));
+        let packets = Parser::new().push(&reframe(&old, 0).unwrap());
+        assert_eq!((packets.len(), packets[0].is_v2(), packets[0].is_signed()), (1, true, false));
+        assert_eq!((packets[0].sequence, &packets[0].message), (9, &Some(message(1))));
+
+        // The checksum of a message that is not known has a byte that is found again.
+        let unknown = unknown(9_999_999, sender);
+        assert_eq!(reframe(&unknown, 0), Some(unknown.clone()));
+        let flagged = reframe(&unknown, SIGNED).unwrap();
+        assert_eq!(
+            crc_extra(&flagged[1..13], u16::from_le_bytes([flagged[13], flagged[14]])),
+            Some(77)
+        );
+
+        let mut damaged = known;
+        damaged[12] ^= 1;
+        assert_eq!(reframe(&damaged, SIGNED), None);
+        assert_eq!(reframe(&[], SIGNED), None);
     }
 
     #[test]

@@ -4,6 +4,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
 use crate::dialect::{MavAutopilot, MavMessage};
+use crate::gate::Gate;
 use crate::packet::{Counters, Packet, Parser};
 
 /// Silence after which an incomplete packet is discarded.
@@ -80,8 +81,16 @@ impl Peers {
         Self { known: Vec::new(), chosen, peering }
     }
 
-    /// Parses a datagram and returns its packets if they come from the chosen peer.
-    pub(crate) fn take(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> Taken {
+    /// Parses a datagram and returns its packets if they come from the chosen peer and the gate lets them in;
+    /// `stamp` is the clock's.
+    pub(crate) fn take(
+        &mut self,
+        from: SocketAddr,
+        bytes: &[u8],
+        now: Instant,
+        gate: &mut Gate,
+        stamp: u64,
+    ) -> Taken {
         if !self.peering.admits(from.ip()) {
             // One datagram is one packet, of almost everyone; a stranger's is not worth parsing.
             return Taken { packets: Vec::new(), strangers: 1, counted: Counters::default() };
@@ -92,7 +101,8 @@ impl Peers {
             peer.parser.finish();
         }
         peer.heard = now;
-        let packets = peer.parser.push(bytes);
+        let admitted = gate.admit(stamp, peer.parser.push(bytes));
+        let packets = admitted.packets;
         if !packets.is_empty() {
             peer.active = now;
         }
@@ -102,6 +112,10 @@ impl Peers {
             peer.autopilot = Some(now);
         }
         if !packets.is_empty() && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
+            self.chosen = Some(from);
+        }
+        // Until it has our stamps, which are newer, all that it sends is too old.
+        if admitted.is_behind && self.chosen.is_none() {
             self.chosen = Some(from);
         }
         match self.chosen == Some(from) {
@@ -171,6 +185,12 @@ mod tests {
     use crate::dialect::HEARTBEAT_DATA;
     use crate::packet::{Sender, encode};
 
+    impl Peers {
+        fn take_any(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> Taken {
+            self.take(from, bytes, now, &mut Gate::new(None), 0)
+        }
+    }
+
     const GROUND: Sender = Sender { system: 255, component: 190 };
 
     fn at(host: u8) -> SocketAddr {
@@ -192,19 +212,23 @@ mod tests {
         let mut peers = station(Vec::new());
         let began = Instant::now();
         let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
-        assert_eq!(peers.take(at(1), &bytes, began).packets.len(), 1);
+        assert_eq!(peers.take_any(at(1), &bytes, began).packets.len(), 1);
         // What a stranger says it is does not matter.
         let autopilot = Sender { system: 1, component: 1 };
         let lie = heartbeat(MavAutopilot::MAV_AUTOPILOT_PX4, autopilot);
         for second in 1..=10 {
             let now = began + Duration::from_secs(second);
-            let taken = peers.take(at(2), &lie, now);
+            let taken = peers.take_any(at(2), &lie, now);
             assert_eq!((taken.packets.len(), taken.strangers), (0, 1), "after {second} s");
         }
         assert_eq!(peers.chosen, Some(at(1)));
         let later = began + Duration::from_secs(11);
-        assert_eq!(peers.take(at(2), &bytes, later).packets.len(), 1, "the first one is silent");
-        assert_eq!(peers.take(at(1), &bytes, later).strangers, 1);
+        assert_eq!(
+            peers.take_any(at(2), &bytes, later).packets.len(),
+            1,
+            "the first one is silent"
+        );
+        assert_eq!(peers.take_any(at(1), &bytes, later).strangers, 1);
     }
 
     #[test]
@@ -212,9 +236,9 @@ mod tests {
         let mut peers = station(vec![at(3).ip()]);
         let now = Instant::now();
         let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
-        assert_eq!(peers.take(at(1), &bytes, now).strangers, 1);
+        assert_eq!(peers.take_any(at(1), &bytes, now).strangers, 1);
         assert_eq!(peers.chosen, None);
-        assert_eq!(peers.take(at(3), &bytes, now).packets.len(), 1);
+        assert_eq!(peers.take_any(at(3), &bytes, now).packets.len(), 1);
     }
 
     #[test]
@@ -222,9 +246,9 @@ mod tests {
         let mut peers = station(Vec::new());
         let began = Instant::now();
         let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
-        peers.take(at(1), &bytes, began);
+        peers.take_any(at(1), &bytes, began);
         let later = began + Duration::from_secs(11);
-        peers.take(at(1), b"noise", later);
-        assert_eq!(peers.take(at(2), &bytes, later).packets.len(), 1);
+        peers.take_any(at(1), b"noise", later);
+        assert_eq!(peers.take_any(at(2), &bytes, later).packets.len(), 1);
     }
 }

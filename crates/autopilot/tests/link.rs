@@ -3,17 +3,20 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "helpers of tests may fail like tests")]
 
 use std::net::SocketAddr;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use autopilot::dialect::{
     HEARTBEAT_DATA, MavAutopilot, MavCmd, MavMessage, MavType, SYSTEM_TIME_DATA,
 };
 use autopilot::link::SendError;
 use autopilot::packet::{self, Sender};
-use autopilot::{Address, Autopilot, Config, Event, Firmware, Link, LinkEvent, Parser};
+use autopilot::signing::{Refusal, Refusals, stamp};
+use autopilot::{
+    Address, Autopilot, Config, Event, Firmware, Link, LinkEvent, Parser, Peering, SigningConfig,
+};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, UdpSocket};
-use tokio::time::timeout;
+use tokio::time::{sleep, timeout};
 
 const PATIENCE: Duration = Duration::from_secs(30);
 const AUTOPILOT: Sender = Sender { system: 1, component: 1 };
@@ -287,5 +290,110 @@ async fn a_reader_that_sleeps_gets_the_newest_packets() {
         {
             newest = time.time_boot_ms;
         }
+    }
+}
+
+/// A clock that was never set, as a companion's without a battery is after each start.
+fn never_set() -> SystemTime {
+    SystemTime::UNIX_EPOCH
+}
+
+fn signing(passphrase: &str, link_id: u8) -> SigningConfig {
+    let key = passphrase.parse().unwrap();
+    SigningConfig { key, link_id, stamp_file: None, clock: SystemTime::now }
+}
+
+async fn open_signed(address: String, signing: SigningConfig) -> Link {
+    Link::open_for(address.parse().unwrap(), Peering::Autopilot, Some(signing)).await.unwrap()
+}
+
+#[tokio::test]
+async fn only_holders_of_the_key_are_heard_and_each_refusal_has_its_reason() {
+    let mut vehicle = open_signed("udpin:127.0.0.1:0".into(), signing("correct horse", 191)).await;
+    let at = vehicle.local_address().unwrap();
+    let to = format!("udpout:{at}");
+    // Who has no key does not become the peer, whatever it says it is.
+    let stranger = open(to.clone()).await;
+    let thief = open_signed(to.clone(), signing("another horse", 1)).await;
+    stranger.send_when_connected(&heartbeat(true)).await;
+    thief.send_when_connected(&heartbeat(true)).await;
+    let counted = async {
+        while vehicle.refusals().of(Refusal::WrongKey) == 0
+            || vehicle.refusals().of(Refusal::Unsigned) == 0
+        {
+            sleep(Duration::from_millis(5)).await;
+        }
+    };
+    timeout(PATIENCE, counted).await.expect("both are refused");
+    assert_eq!(vehicle.try_recv(), None);
+
+    let mut holder = open_signed(to, signing("correct horse", 1)).await;
+    holder.send_when_connected(&heartbeat(true)).await;
+    // What is received has no signature any more, so it can go over another leg.
+    assert_eq!(packet(&mut vehicle).await, heartbeat(true));
+    vehicle.send(&time()).unwrap();
+    assert_eq!(packet(&mut holder).await, time());
+    assert_eq!(holder.refusals(), Refusals::default());
+}
+
+/// `Link::send` as soon as there is a connection.
+trait SendWhenConnected {
+    async fn send_when_connected(&self, packet: &[u8]);
+}
+
+impl SendWhenConnected for Link {
+    async fn send_when_connected(&self, packet: &[u8]) {
+        let sending = async {
+            while self.send(packet).is_err() {
+                sleep(Duration::from_millis(5)).await;
+            }
+        };
+        timeout(PATIENCE, sending).await.expect("a connection");
+    }
+}
+
+#[tokio::test]
+async fn after_five_starts_without_a_clock_it_is_still_believed() {
+    let directory = tempfile::tempdir().unwrap();
+    let stamp_file = directory.path().join("state/signing.stamp");
+    let kept =
+        || std::fs::read_to_string(&stamp_file).map_or(0, |text| text.trim().parse().unwrap());
+    let mut vehicle = open_signed("tcpin:127.0.0.1:0".into(), signing("correct horse", 1)).await;
+    let to = format!("tcp:{}", vehicle.local_address().unwrap());
+    let mut refused = 0;
+    for start in 0..5 {
+        let companion = SigningConfig {
+            stamp_file: Some(stamp_file.clone()),
+            clock: never_set,
+            ..signing("correct horse", 191)
+        };
+        let companion = open_signed(to.clone(), companion).await;
+        companion.send_when_connected(&heartbeat(false)).await;
+        let heard = async {
+            loop {
+                if let Some(LinkEvent::Packet { .. }) = vehicle.try_recv() {
+                    return;
+                }
+                // Stamps of 2015 are refused until the companion has seen one of the other side.
+                if start == 0 {
+                    vehicle.send_when_connected(&heartbeat(true)).await;
+                    companion.send_when_connected(&heartbeat(false)).await;
+                }
+                sleep(Duration::from_millis(5)).await;
+            }
+        };
+        timeout(PATIENCE, heard).await.unwrap_or_else(|_| panic!("start {start}"));
+        let refusals = vehicle.refusals().of(Refusal::Old);
+        if start == 0 {
+            refused = refusals;
+            let written = async {
+                while kept() < stamp(SystemTime::UNIX_EPOCH.elapsed().unwrap()) {
+                    sleep(Duration::from_millis(5)).await;
+                }
+            };
+            timeout(PATIENCE, written).await.expect("the stamp is kept");
+        }
+        // From the second start on the first packet is believed already.
+        assert_eq!(refusals, refused, "start {start}");
     }
 }

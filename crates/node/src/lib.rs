@@ -7,7 +7,7 @@
 //! service from start to shutdown; [`network`] configures the network, with the rights of others from
 //! [`access`], and [`session`] joins it under an [`identity`]; [`topics`] has typed messages, [`frames`] pixels,
 //! and [`tap`] everything as it came; [`health`] counts, with [`stats`]; [`denied`] counts what access control
-//! denies; [`clock`] is the host's clock.
+//! denies; [`clock`] is the host's clock, and [`state`] says where a service keeps what survives a reboot.
 
 pub mod access;
 pub mod clock;
@@ -19,6 +19,7 @@ pub mod identity;
 pub mod network;
 pub mod service;
 pub mod session;
+pub mod state;
 pub mod stats;
 pub mod tap;
 pub mod topics;
@@ -33,5 +34,6 @@ pub use identity::Identity;
 pub use network::{INSECURE, Network};
 pub use service::{Options, Shutdown, relaunch, relaunch_with_zenoh_threads, run, start_logging};
 pub use session::{Node, Presence, ZenohSource};
+pub use state::state_directory;
 pub use tap::{Tap, Tapped};
 pub use topics::{Commands, Publisher, Request, Subscriber};

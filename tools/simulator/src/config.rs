@@ -125,6 +125,7 @@ table! {
     /// The simulated autopilot.
     AutopilotSettings: "autopilot" {
         address: String,
+        signing_key: String,
         ready_after_s: f64 = 0.5..=600.0,
         firmware: FirmwareName,
         says_simulated: bool,

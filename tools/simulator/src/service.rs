@@ -11,7 +11,7 @@ use std::time::Duration;
 use airlink::AirSender;
 use anyhow::Context;
 use autopilot::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
-use autopilot::{Address, Link, LinkEvent, Parser, Sender};
+use autopilot::{Address, Link, LinkEvent, Parser, Peering, Sender, SigningConfig};
 use messages::{
     CameraInfo, ControllerStatus, Detections, FrameHeader, MavlinkBytes, PixelFormat, Touchdown,
     Truth, Wind, topic,
@@ -260,7 +260,12 @@ impl AutopilotSide {
         Ok(match config.vehicle {
             VehicleKind::Simulated => {
                 let address: Address = config.autopilot.address.parse()?;
-                let link = Link::open(address).await;
+                let signing = match config.autopilot.signing_key.as_str() {
+                    "" => None,
+                    // No other program listens to the simulated autopilot, so it keeps no stamps.
+                    path => Some(SigningConfig::read(path.as_ref(), 0, None, "simulator")?),
+                };
+                let link = Link::open_for(address, Peering::Autopilot, signing).await;
                 Self::Link(link.context("opening the link of the simulated autopilot")?)
             }
             VehicleKind::Reported => Self::Topics {

@@ -1,0 +1,64 @@
+//! What a link lets through: with a key, only packets of the holders of the same key, and none without a signature goes out.
+
+use crate::packet::Packet;
+use crate::signing::{Refusal, Refusals, Signing};
+
+/// The gate of one link; without a key it is open.
+#[derive(Debug)]
+pub(crate) struct Gate {
+    signing: Option<Signing>,
+    refusals: Refusals,
+}
+
+/// What came through.
+pub(crate) struct Admitted {
+    pub(crate) packets: Vec<Packet>,
+    /// A holder of the key sent something too old: it needs our newer stamps.
+    pub(crate) is_behind: bool,
+}
+
+impl Gate {
+    pub(crate) fn new(signing: Option<Signing>) -> Self {
+        Self { signing, refusals: Refusals::default() }
+    }
+
+    pub(crate) fn is_open(&self) -> bool {
+        self.signing.is_none()
+    }
+
+    pub(crate) fn refusals(&self) -> Refusals {
+        self.refusals
+    }
+
+    /// The newest stamp sent or accepted.
+    pub(crate) fn newest(&self) -> Option<u64> {
+        self.signing.as_ref().map(Signing::newest)
+    }
+
+    /// The packets that are let in, without their signatures; `stamp` is the clock's.
+    pub(crate) fn admit(&mut self, stamp: u64, packets: Vec<Packet>) -> Admitted {
+        let Some(signing) = &mut self.signing else {
+            return Admitted { packets, is_behind: false };
+        };
+        let mut admitted =
+            Admitted { packets: Vec::with_capacity(packets.len()), is_behind: false };
+        for packet in packets {
+            match signing.verify(stamp, &packet) {
+                Ok(()) => admitted.packets.push(packet.without_signature()),
+                Err(reason) => {
+                    admitted.is_behind |= reason == Refusal::Old;
+                    self.refusals.count(reason);
+                }
+            }
+        }
+        admitted
+    }
+
+    /// The packet as it is sent; `None` for what is no packet.
+    pub(crate) fn seal(&mut self, stamp: u64, raw: Vec<u8>) -> Option<Vec<u8>> {
+        match &mut self.signing {
+            Some(signing) => signing.sign(stamp, &raw),
+            None => Some(raw),
+        }
+    }
+}
