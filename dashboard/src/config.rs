@@ -40,6 +40,10 @@ pub struct VideoConfig {
     pub jpeg_quality: u8,
     /// How long a picture waits for its detections, in milliseconds.
     pub hold_ms: u32,
+    /// Where pictures go as H.264 over RTP, an address; empty for nowhere.
+    pub rtp: String,
+    /// Rate of that stream, in kbit/s.
+    pub rtp_kbit_s: u32,
 }
 
 /// Who commands by the page.
@@ -80,7 +84,20 @@ impl node::Settings for Config {
         check.range("video.max_hz", self.video.max_hz, 0.5..=120.0);
         check.range("video.jpeg_quality", self.video.jpeg_quality, 1..=100);
         check.range("video.hold_ms", self.video.hold_ms, 0..=1000);
+        if !self.video.rtp.is_empty() {
+            check.parses("video.rtp", check_rtp(&self.video.rtp));
+        }
+        check.range("video.rtp_kbit_s", self.video.rtp_kbit_s, 100..=50_000);
     }
+}
+
+fn check_rtp(address: &str) -> Result<SocketAddr, &'static str> {
+    if cfg!(not(feature = "h264")) {
+        return Err(
+            "this program makes no H.264: build it with `--features h264`, which needs a C++ compiler",
+        );
+    }
+    address.parse().map_err(|_| "it must be IP:PORT, such as 192.168.4.20:5600")
 }
 
 fn check_names(names: &[String]) -> Result<(), String> {
@@ -113,11 +130,25 @@ mod tests {
             ("video.input=raw", "`frames`"),
             ("video.max_hz=0", "max_hz"),
             ("video.hold_ms=5000", "hold_ms"),
+            ("video.rtp_kbit_s=1", "rtp_kbit_s"),
             ("id=a/b", "letters, digits"),
         ] {
             let problem = load(setting).unwrap_err();
             assert!(problem.contains(part), "{setting}: {problem}");
         }
         assert!(load("listen=0.0.0.0:9000").is_ok());
+    }
+
+    #[test]
+    fn a_stream_needs_an_encoder_and_an_address() {
+        let address = load("video.rtp=127.0.0.1:5600");
+        let name = load("video.rtp=ground").unwrap_err();
+        if cfg!(feature = "h264") {
+            assert!(address.is_ok());
+            assert!(name.contains("IP:PORT"), "{name}");
+        } else {
+            assert!(address.is_err());
+            assert!(name.contains("--features h264"), "{name}");
+        }
     }
 }

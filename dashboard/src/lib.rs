@@ -7,7 +7,7 @@
 //! people, what was [`found`], the [`checks`] before a flight and the [`log`]; [`pairing`] joins a picture with what was found in it, and
 //! [`window`] bounds what is on its way to a browser; [`guard`] decides who may read and command, with [`nonce`] for each
 //! command and [`tokens`] in a file. These are without network. `server` answers browsers, `video` makes pictures,
-//! `motion` gives them to viewers of Motion JPEG, and [`service`] follows the topics.
+//! `motion` gives them to viewers of Motion JPEG, `stream` (with the feature `h264`) sends them as H.264, and [`service`] follows the topics.
 
 pub mod checks;
 pub mod config;
@@ -20,6 +20,8 @@ pub mod pairing;
 mod server;
 pub mod service;
 pub mod state;
+#[cfg(feature = "h264")]
+mod stream;
 pub mod tokens;
 mod video;
 pub mod window;

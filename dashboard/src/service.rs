@@ -54,8 +54,20 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         result = tell(&state, &texts) => result,
         result = measure(&node, &state) => result,
         result = video.run() => result,
+        result = stream(node.clone(), &config, Arc::clone(&state)) => result,
         never = serve(listener, app) => match never {},
         () = shutdown.requested() => Ok(()),
+    }
+}
+
+/// Sends pictures as H.264, where the program can.
+async fn stream(node: Node, config: &Config, state: Arc<Mutex<State>>) -> anyhow::Result<()> {
+    #[cfg(feature = "h264")]
+    return crate::stream::Stream::new(node, config.video.clone(), state).run().await;
+    #[cfg(not(feature = "h264"))]
+    {
+        drop((node, config, state));
+        std::future::pending().await
     }
 }
 

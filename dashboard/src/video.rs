@@ -21,7 +21,7 @@ const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// Frames are received for this time after the last browser has gone: one that loads the page again needs no new start.
 const LINGER: Duration = Duration::from_secs(2);
 /// Share of the period of pictures by which a frame may be early, as frames come unevenly.
-const MAX_EARLY: f64 = 0.3;
+pub(crate) const MAX_EARLY: f64 = 0.3;
 /// Maximum size of a picture, in bytes.
 const MAX_BYTES: usize = 16_000_000;
 /// Maximum number of markers that are drawn.

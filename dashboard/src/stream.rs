@@ -1,0 +1,139 @@
+//! Pictures as H.264 over RTP, for QGroundControl.
+
+mod canvas;
+mod encoder;
+mod rtp;
+
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use anyhow::Context;
+use messages::{FrameHeader, topic};
+use node::{Frame, Node, clock_name, now_ns};
+use tokio::net::UdpSocket;
+
+use crate::config::{Input, VideoConfig};
+use crate::state::State;
+use crate::video::MAX_EARLY;
+
+use canvas::Canvas;
+use encoder::Encoder;
+use rtp::Packetizer;
+
+/// Sends pictures while the service runs.
+pub(crate) struct Stream {
+    node: Node,
+    config: VideoConfig,
+    state: Arc<Mutex<State>>,
+}
+
+/// What makes packets of frames, and goes to another thread for it.
+struct Maker {
+    canvas: Canvas,
+    encoder: Encoder,
+    packetizer: Packetizer,
+    camera: String,
+}
+
+impl Stream {
+    pub(crate) fn new(node: Node, config: VideoConfig, state: Arc<Mutex<State>>) -> Self {
+        Self { node, config, state }
+    }
+
+    /// Sends pictures until the session is closed; nothing without an address or pictures.
+    pub(crate) async fn run(self) -> anyhow::Result<()> {
+        let input = node::named(&self.config.input).map_err(anyhow::Error::msg)?;
+        let topic = match input {
+            Input::Frames => topic::FRAME,
+            Input::Jpeg => topic::JPEG,
+            Input::None => return std::future::pending().await,
+        };
+        if self.config.rtp.is_empty() {
+            return std::future::pending().await;
+        }
+        let to: SocketAddr = self.config.rtp.parse().context("`video.rtp`")?;
+        let any: SocketAddr = match to {
+            SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
+            SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
+        };
+        let socket = UdpSocket::bind(any).await.context("opening a socket for the stream")?;
+        let frames = self.node.frame_subscriber(topic, &[]).await?;
+        tracing::info!(%to, "Pictures are sent as H.264 over RTP");
+        let min_period_ns = ((1.0 - MAX_EARLY) * 1e9 / self.config.max_hz) as i64;
+        let mut last_ns = None;
+        let mut maker = Maker {
+            canvas: Canvas::default(),
+            encoder: Encoder::new(self.config.rtp_kbit_s, self.config.max_hz),
+            packetizer: Packetizer::new()?,
+            camera: String::new(),
+        };
+        loop {
+            let frame = frames.next().await.context("the network session was closed")?;
+            let began_ns = now_ns();
+            let is_due = last_ns.is_none_or(|last_ns| began_ns - last_ns >= min_period_ns);
+            if !is_due || !self.is_wanted(&frame.header) {
+                continue;
+            }
+            last_ns = Some(began_ns);
+            // Another host's clock says nothing here, so that frame's time is its arrival.
+            let is_own_clock = frame.header.clock == clock_name();
+            let taken_ns = if is_own_clock { frame.header.stamp_ns } else { began_ns };
+            let make = move || {
+                let packets = maker.packets(&frame, taken_ns, began_ns);
+                (maker, packets)
+            };
+            let packets;
+            (maker, packets) = tokio::task::spawn_blocking(make).await?;
+            match packets {
+                Ok(packets) if packets.is_empty() => {
+                    self.node.health().dropped("picture left out of the stream, to keep its rate");
+                }
+                Ok(packets) => self.send(&socket, to, &packets, taken_ns).await,
+                Err(problem) => {
+                    if self.node.health().failed("no H.264 of a frame") {
+                        tracing::warn!(%problem, "A frame is not in the stream");
+                    }
+                }
+            }
+        }
+    }
+
+    /// Of several cameras that of the detector in use is shown.
+    fn is_wanted(&self, header: &FrameHeader) -> bool {
+        // What is known is whole after each message, also when a thread panics.
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.camera().is_none_or(|camera| camera == header.camera)
+    }
+
+    async fn send(&self, socket: &UdpSocket, to: SocketAddr, packets: &[Vec<u8>], taken_ns: i64) {
+        for packet in packets {
+            // Nobody may listen yet, or the network may be away for a moment.
+            if socket.send_to(packet, to).await.is_err() {
+                self.node.health().dropped("packets of the stream");
+            }
+        }
+        if let Ok(age_ns) = u64::try_from(now_ns() - taken_ns) {
+            self.node.health().latency("frame to stream", Duration::from_nanos(age_ns));
+        }
+        self.node.health().count("pictures in the stream");
+    }
+}
+
+impl Maker {
+    /// The packets of a frame.
+    fn packets(
+        &mut self,
+        frame: &Frame,
+        taken_ns: i64,
+        now_ns: i64,
+    ) -> Result<Vec<Vec<u8>>, String> {
+        if self.camera != frame.header.camera {
+            self.camera.clone_from(&frame.header.camera);
+            self.canvas = Canvas::default();
+        }
+        let image = self.canvas.draw(&frame.header, &frame.bytes())?;
+        let units = self.encoder.encode(image, now_ns)?;
+        Ok(self.packetizer.packets(rtp::time(taken_ns), &units))
+    }
+}
