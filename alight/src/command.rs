@@ -35,6 +35,8 @@ enum OperatorCommand {
     Resume,
     /// Abort the landing.
     Abort,
+    /// Land straight down where the vehicle is, without the marker.
+    LandHere,
     /// Use a detector from now on.
     UseDetector,
     /// Change a parameter of a running detector.
@@ -63,6 +65,7 @@ pub(crate) fn run(args: &CommandArgs) -> anyhow::Result<ExitCode> {
         (OperatorCommand::Hold, None) => ControllerCommand::Hold,
         (OperatorCommand::Resume, None) => ControllerCommand::Resume,
         (OperatorCommand::Abort, None) => ControllerCommand::Abort,
+        (OperatorCommand::LandHere, None) => ControllerCommand::LandHere,
     };
     send_to_controller(&args.network, "command", &command)
 }

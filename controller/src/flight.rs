@@ -298,6 +298,7 @@ impl Flight {
             ControllerCommand::Hold => self.operator(now_ns, OperatorCommand::Hold),
             ControllerCommand::Resume => self.operator(now_ns, OperatorCommand::Resume),
             ControllerCommand::Abort => self.operator(now_ns, OperatorCommand::Abort),
+            ControllerCommand::LandHere => self.operator(now_ns, OperatorCommand::LandHere),
             ControllerCommand::UseDetector(name) => selection.prefer(now_ns, name),
             ControllerCommand::PreferDetectors(place) => Ok(selection.prefer_place(now_ns, *place)),
         };
@@ -428,6 +429,9 @@ impl Flight {
             if command == OperatorCommand::Resume {
                 return Err("the vehicle is taking off; there is nothing to resume".to_owned());
             }
+            if command == OperatorCommand::LandHere {
+                return Err("the vehicle is taking off; land it once it is up".to_owned());
+            }
             let why = "aborted by the operator; the autopilot completes the take-off".to_owned();
             self.mission.fail(&mut self.autopilot, why.clone());
             return Ok(why);
@@ -442,6 +446,12 @@ impl Flight {
         {
             if command == OperatorCommand::Resume {
                 return Err("the autopilot steers; there is nothing to resume".to_owned());
+            }
+            if command == OperatorCommand::LandHere {
+                return Err(
+                    "the autopilot steers to the marker; abort, and land it by its own mode LAND"
+                        .to_owned(),
+                );
             }
             let height_m = self.decision.and_then(|d| d.target).map(|target| target.height_m);
             return landing_target.abort(now_ns, height_m, no_return_m, &mut self.autopilot);

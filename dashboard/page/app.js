@@ -132,6 +132,7 @@ function take(message) {
     showNow(message, at);
   } else if (message.kind === 'slow') {
     [known.slow, known.slowAt] = [message, at];
+    map.funnel = message.funnel;
     showSlow(message);
   } else if (message.kind === 'log') {
     showLog(message);

@@ -34,6 +34,8 @@ export class Map2 {
     this.vehicle = null;
     /** @type {any} */
     this.target = null;
+    /** @type {{ radius_m: number, per_height: number } | null} */
+    this.funnel = null;
   }
 
   /** @param {any} vehicle @param {any} target */
@@ -136,7 +138,21 @@ export class Map2 {
       context.stroke();
       context.fillText(`${up < 1 && up > 0 ? up.toFixed(1) : up.toFixed(0)}`, 4 * ratio, y + 4 * ratio);
     }
-    context.fillText(`m up; ${far.toFixed(2)} m beside the pad at the right edge`, 34 * ratio, height - 5 * ratio);
+    const said = `m up; ${far.toFixed(2)} m beside the pad at the right edge`;
+    context.fillText(this.funnel ? `${said}; dashed: funnel` : said, 34 * ratio, height - 5 * ratio);
+    if (this.funnel) {
+      // Left of it the vehicle may descend.
+      context.strokeStyle = colour('--quiet');
+      const { radius_m, per_height } = this.funnel;
+      const foot = at({ beside: radius_m, up: 0 });
+      const top = at({ beside: radius_m + per_height * high, up: high });
+      context.setLineDash([4 * ratio, 4 * ratio]);
+      context.beginPath();
+      context.moveTo(...foot);
+      context.lineTo(...top);
+      context.stroke();
+      context.setLineDash([]);
+    }
     context.strokeStyle = colour('--path');
     context.beginPath();
     points.forEach((it, n) => {

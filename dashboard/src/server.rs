@@ -528,6 +528,7 @@ fn parse(command: &str, argument: Option<String>) -> Option<ControllerCommand> {
         ("hold", None) => ControllerCommand::Hold,
         ("resume", None) => ControllerCommand::Resume,
         ("abort", None) => ControllerCommand::Abort,
+        ("land-here", None) => ControllerCommand::LandHere,
         ("use-detector", Some(name)) if node::config::is_name(&name) => {
             ControllerCommand::UseDetector(name)
         }

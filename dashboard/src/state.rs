@@ -6,13 +6,14 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use messages::{
-    CameraInfo, ControllerStatus, Detections, DetectorInfo, Health, Phase, RecorderStatus,
-    TargetEstimate, VehicleState,
+    CameraInfo, Configuration, ControllerStatus, Detections, DetectorInfo, Health, Phase,
+    RecorderStatus, TargetEstimate, VehicleState,
 };
 use serde_json::{Value, json};
 
 use crate::checks::{Facts, checks, is_current};
 use crate::found::Found;
+use crate::funnel::Funnel;
 use crate::log::{Level, Log};
 use crate::words;
 
@@ -53,6 +54,8 @@ pub enum Input {
     Health(String, String, Box<Health>),
     /// What a recorder has kept.
     Recorder(String, Box<RecorderStatus>),
+    /// The controller's configuration.
+    Configuration(Box<Configuration>),
 }
 
 /// A service.
@@ -80,6 +83,7 @@ pub struct State {
     detectors: BTreeMap<String, Seen<DetectorInfo>>,
     cameras: BTreeMap<String, Seen<CameraInfo>>,
     recorders: BTreeMap<String, Seen<RecorderStatus>>,
+    funnel: Option<Funnel>,
     services: BTreeMap<(String, String), Service>,
     faults: BTreeSet<String>,
     warnings: Vec<String>,
@@ -135,6 +139,7 @@ impl State {
                 self.take_health(now_ns, service, instance, *health);
             }
             Input::Recorder(name, status) => self.take_recorder(now_ns, name, *status),
+            Input::Configuration(configuration) => self.funnel = Funnel::of(&configuration),
         }
     }
 
@@ -334,6 +339,7 @@ impl State {
         json!({
             "kind": "slow", "now_ms": ms(now_ns), "detectors": self.detectors_json(now_ns),
             "services": services, "recorders": recorders, "checks": checks,
+            "funnel": self.funnel,
         })
     }
 

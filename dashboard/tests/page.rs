@@ -261,6 +261,10 @@ async fn a_command_is_held_for_a_second_and_given_once() -> anyhow::Result<()> {
     let held = command(&mut socket, "hold", &second).await?;
     ensure!(held["accepted"] == true && held["who"] == "controller", "{held}");
     ensure!(held["why"] == "Hold was heard", "{held}");
+    let third = nonce(&mut socket, "land-here").await?;
+    sleep(HELD).await;
+    let landing = command(&mut socket, "land-here", &third).await?;
+    ensure!(landing["why"] == "LandHere was heard", "{landing}");
     let again = command(&mut socket, "hold", &second).await?;
     ensure!(again["accepted"] == false && again["who"] == "dashboard", "{again}");
     // A nonce of another browser is none.

@@ -222,6 +222,8 @@ named! {
         NoProgress = "no-progress", "too long in one phase, holding";
         /// The operator aborted.
         OperatorAbort = "operator-abort", "aborted by the operator";
+        /// The operator commanded a landing without the marker.
+        OperatorLand = "operator-land", "landing straight down here, as the operator commanded";
         /// A hold lasted too long.
         HeldTooLong = "held-too-long", "aborted: held too long";
         /// The whole landing lasted too long.

@@ -47,6 +47,8 @@ pub enum OperatorCommand {
     Resume,
     /// Abort the landing.
     Abort,
+    /// Land straight down where the vehicle is, without the marker.
+    LandHere,
 }
 
 /// A limit that the caller monitors; the reaction to each is configured.

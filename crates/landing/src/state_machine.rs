@@ -275,6 +275,9 @@ impl StateMachine {
         if self.landing {
             return None;
         }
+        if inputs.operator == Some(OperatorCommand::LandHere) && self.phase != Phase::Final {
+            return Some((Phase::Final, Reason::OperatorLand));
+        }
         if let Some((action, reason)) = inputs.alarm
             && self.phase != Phase::Final
         {

@@ -138,7 +138,7 @@ fn status() -> impl Strategy<Value = Kind> {
 fn operator() -> impl Strategy<Value = Kind> {
     prop_oneof![
         6 => Just(OperatorCommand::Start), 1 => Just(OperatorCommand::Hold), 2 => Just(OperatorCommand::Resume),
-        1 => Just(OperatorCommand::Abort)
+        1 => Just(OperatorCommand::Abort), 1 => Just(OperatorCommand::LandHere)
     ]
     .prop_map(Kind::Operator)
 }

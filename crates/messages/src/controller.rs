@@ -210,6 +210,8 @@ pub enum ControllerCommand {
     UseDetector(String),
     /// Prefer detectors that run there.
     PreferDetectors(Place),
+    /// Land straight down where the vehicle is, without the marker.
+    LandHere,
 }
 
 /// The answer to a command.

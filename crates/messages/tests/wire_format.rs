@@ -302,6 +302,7 @@ fn controller_command() {
     let message = ControllerCommand::UseDetector("spare".into());
     check(&message, "41080304057370617265");
     check(&ControllerCommand::PreferDetectors(Place::Ground), "4108030501");
+    check(&ControllerCommand::LandHere, "41080306");
 }
 
 #[test]

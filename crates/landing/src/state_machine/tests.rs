@@ -160,6 +160,24 @@ fn an_abort_ends_land_only_while_the_vehicle_is_high() {
 }
 
 #[test]
+fn landing_here_needs_no_marker_and_leaves_a_vehicle_that_may_not_in_the_air() {
+    let here = |seconds| commanded(seconds, OperatorCommand::LandHere);
+    let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
+    check(&[start(), here(1.0)], Phase::Final, Reason::OperatorLand);
+    check(&[start(), here(1.0), land(1.2)], Phase::Final, Reason::AutopilotLands);
+    let held = commanded(1.0, OperatorCommand::Hold);
+    check(&[start(), held, here(9.0)], Phase::Final, Reason::OperatorLand);
+    // The autopilot refuses LAND: this high, nothing descends by setpoints.
+    check(&[start(), here(1.0), at(6.1)], Phase::Aborted, Reason::LandRefused);
+    check(
+        &[start(), here(1.0), commanded(1.5, OperatorCommand::Abort)],
+        Phase::Aborted,
+        Reason::OperatorAbort,
+    );
+    check(&[here(1.0)], Phase::Idle, Reason::WaitingForStart);
+}
+
+#[test]
 fn an_axis_mismatch_holds_and_a_running_check_delays_the_descent() {
     let open = Inputs { may_descend: false, ..seen(2.0, Progress::Descending) };
     check(&[start(), seen(1.0, Progress::Unchanged), open], Phase::Approach, Reason::Aligning);
@@ -334,6 +352,7 @@ mod every_transition {
             Some(OperatorCommand::Hold),
             Some(OperatorCommand::Resume),
             Some(OperatorCommand::Abort),
+            Some(OperatorCommand::LandHere),
         ];
         let alarms = [
             None,
@@ -412,6 +431,9 @@ mod every_transition {
             let lands = before.landing || vehicle.is_some_and(|v| v.mode == Mode::Land);
             let too_late = lands && vehicle.is_none_or(|v| v.height_m < 1.0);
             assert!(to.is_terminal() || too_late, "an abort is not obeyed: {step}");
+        }
+        if inputs.operator == Some(OperatorCommand::LandHere) && !to.is_terminal() {
+            assert_eq!(to, Phase::Final, "landing here is not obeyed: {step}");
         }
         assert!(after.retries <= before.config.retries, "too many retries: {step}");
     }
