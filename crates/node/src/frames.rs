@@ -97,7 +97,7 @@ impl Node {
         let key = topic.key(names);
         debug_assert_eq!(topic.delivery(), Delivery::Latest);
         let publisher = self.declare_frames(key, FIRST_PRIORITY).await?;
-        if max_frame_bytes == 0 {
+        if max_frame_bytes == 0 || !self.has_shared_memory {
             return Ok(FramePublisher { publisher, pool: None, health: self.shared_health() });
         }
         let pool_bytes = FRAMES_IN_POOL * max_frame_bytes.next_multiple_of(4096) + 4096;

@@ -13,6 +13,7 @@ use zenoh::sample::{Sample, SampleKind};
 use crate::clock::{host_name, now_ns};
 use crate::health::HealthCounters;
 use crate::identity::Identity;
+use crate::memory::lack_of_shared_memory;
 
 /// The configuration for one machine, the default.
 pub const LOCAL_CONFIG: &str = include_str!("../../../zenoh-config/local.json5");
@@ -60,6 +61,7 @@ pub enum ZenohSource {
 #[derive(Clone)]
 pub struct Node {
     pub(crate) session: zenoh::Session,
+    pub(crate) has_shared_memory: bool,
     identity: Arc<Identity>,
     health: Arc<HealthCounters>,
     token: Arc<Mutex<Option<LivelinessToken>>>,
@@ -79,12 +81,14 @@ impl Node {
     /// # Errors
     /// When the configuration cannot be read or the session cannot be opened.
     pub async fn open(identity: Identity, source: &ZenohSource) -> anyhow::Result<Self> {
-        let config = zenoh_config(source)?;
+        let mut config = zenoh_config(source)?;
+        let has_shared_memory = share_memory(&mut config)?;
         let session = zenoh::open(config)
             .await
             .map_err(|cause| anyhow!("opening the Zenoh session of {identity}: {cause}"))?;
         Ok(Self {
             session,
+            has_shared_memory,
             identity: Arc::new(identity),
             health: Arc::default(),
             token: Arc::default(),
@@ -306,6 +310,20 @@ fn last_two(key: &str) -> Option<(String, String)> {
     let mut chunks = key.rsplit('/');
     let last = chunks.next()?;
     Some((chunks.next()?.to_owned(), last.to_owned()))
+}
+
+/// Whether the session shares memory. It does not where it cannot, and then frames are copied.
+fn share_memory(config: &mut zenoh::Config) -> anyhow::Result<bool> {
+    let enabled = "transport/shared_memory/enabled";
+    let is_wanted = config.get_json(enabled).is_ok_and(|value| value == "true");
+    let Some(lack) = is_wanted.then(lack_of_shared_memory).flatten() else { return Ok(is_wanted) };
+    tracing::warn!("No shared memory; frames are copied instead: {lack}");
+    // It would be set up as the session opens, whether enabled or not.
+    for (key, value) in [(enabled, "false"), ("transport/shared_memory/mode", "\"lazy\"")] {
+        let set = config.insert_json5(key, value);
+        set.map_err(|cause| anyhow!("leaving shared memory out of the session: {cause}"))?;
+    }
+    Ok(false)
 }
 
 fn zenoh_config(source: &ZenohSource) -> anyhow::Result<zenoh::Config> {
