@@ -138,7 +138,7 @@ export class Map2 {
       context.stroke();
       context.fillText(`${up < 1 && up > 0 ? up.toFixed(1) : up.toFixed(0)}`, 4 * ratio, y + 4 * ratio);
     }
-    const said = `m up; ${far.toFixed(2)} m beside the pad at the right edge`;
+    const said = `m up; to ${far.toFixed(2)} m beside`;
     context.fillText(this.funnel ? `${said}; dashed: funnel` : said, 34 * ratio, height - 5 * ratio);
     if (this.funnel) {
       // Left of it the vehicle may descend.
