@@ -13,6 +13,9 @@ pub(crate) struct Gate {
 /// What came through.
 pub(crate) struct Admitted {
     pub(crate) packets: Vec<Packet>,
+    /// Whether the sender may be the one that the link talks to. A radio's own packets need no signature, and so say nothing of
+    /// who sends them.
+    pub(crate) is_peer: bool,
     /// A holder of the key sent something too old: it needs our newer stamps.
     pub(crate) is_behind: bool,
 }
@@ -38,13 +41,15 @@ impl Gate {
     /// The packets that are let in, without their signatures; `stamp` is the clock's.
     pub(crate) fn admit(&mut self, stamp: u64, packets: Vec<Packet>) -> Admitted {
         let Some(signing) = &mut self.signing else {
-            return Admitted { packets, is_behind: false };
+            return Admitted { is_peer: !packets.is_empty(), packets, is_behind: false };
         };
-        let mut admitted =
-            Admitted { packets: Vec::with_capacity(packets.len()), is_behind: false };
+        let mut admitted = Admitted { packets: Vec::new(), is_peer: false, is_behind: false };
         for packet in packets {
             match signing.verify(stamp, &packet) {
-                Ok(()) => admitted.packets.push(packet.without_signature()),
+                Ok(()) => {
+                    admitted.is_peer |= packet.is_signed();
+                    admitted.packets.push(packet.without_signature());
+                }
                 Err(reason) => {
                     admitted.is_behind |= reason == Refusal::Old;
                     self.refusals.count(reason);

@@ -20,7 +20,7 @@ use tokio::time::{sleep, sleep_until, timeout};
 use tokio_serial::{SerialPortBuilderExt, SerialStream};
 
 use crate::address::{Address, Endpoint};
-use crate::gate::Gate;
+use crate::gate::{Admitted, Gate};
 use crate::key_file::{SigningConfig, StampFile};
 use crate::packet::{Counters, Packet, Parser};
 use crate::peers::{PACKET_GAP, Peering, Peers};
@@ -359,8 +359,8 @@ impl Port {
     }
 
     /// The packets that are let in.
-    fn admit(&mut self, packets: Vec<Packet>) -> Vec<Packet> {
-        self.gate.admit(self.stamp(), packets).packets
+    fn admit(&mut self, packets: Vec<Packet>) -> Admitted {
+        self.gate.admit(self.stamp(), packets)
     }
 
     /// A packet as it is sent.
@@ -593,12 +593,12 @@ where
                 Ok(count) => {
                     active = tokio::time::Instant::now();
                     let packets = parser.push(bytes.get(..count).unwrap_or(&[]));
-                    let packets = port.admit(packets);
+                    let admitted = port.admit(packets);
                     // Who has not the key holds nobody's place.
-                    if port.gate.is_open() || !packets.is_empty() {
+                    if port.gate.is_open() || admitted.is_peer {
                         port.shared.mark_active();
                     }
-                    port.received(packets, parser.take_counters());
+                    port.received(admitted.packets, parser.take_counters());
                 }
                 Err(error) => return format!("reading failed: {error}"),
             },
@@ -612,7 +612,7 @@ where
                 }
             }
             () = sleep_until(active + PACKET_GAP), if parser.is_waiting() => {
-                let packets = port.admit(parser.finish());
+                let packets = port.admit(parser.finish()).packets;
                 port.received(packets, parser.take_counters());
             }
             () = sleep_until(active + limit), if silence.is_some() => {

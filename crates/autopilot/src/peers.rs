@@ -103,7 +103,7 @@ impl Peers {
         peer.heard = now;
         let admitted = gate.admit(stamp, peer.parser.push(bytes));
         let packets = admitted.packets;
-        if !packets.is_empty() {
+        if admitted.is_peer {
             peer.active = now;
         }
         let counted = peer.parser.take_counters();
@@ -111,7 +111,7 @@ impl Peers {
         if is_autopilot {
             peer.autopilot = Some(now);
         }
-        if !packets.is_empty() && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
+        if admitted.is_peer && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
             self.chosen = Some(from);
         }
         // Until it has our stamps, which are newer, all that it sends is too old.
