@@ -76,6 +76,7 @@ impl MarkerExposure {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::v4l2::abi::CID_EXPOSURE_ABSOLUTE;
     use crate::v4l2::capture::Wanted;
     use crate::v4l2::exposer::ForMarker;
     use crate::v4l2::fake::{Exposed as Truth, Fake, MS, Stamps};
@@ -118,6 +119,8 @@ mod tests {
         marker: MarkerExposure,
         /// Of each frame: its number, whether its stamp is exact, and how far that is from the truth.
         frames: Vec<Frame>,
+        /// How often a control was refused.
+        refused: u32,
     }
 
     #[derive(Copy, Clone, Debug)]
@@ -130,8 +133,14 @@ mod tests {
 
     impl Loop {
         fn new(stamps: Stamps) -> Self {
+            let exposing = Self::left(stamps);
+            exposing.fake.meter();
+            exposing
+        }
+
+        /// With a camera that does not meter.
+        fn left(stamps: Stamps) -> Self {
             let fake = Fake::of("GREY", stamps, 0);
-            fake.meter();
             let for_marker = ForMarker {
                 max_exposure_s: 5e-3,
                 gain: "gain".into(),
@@ -150,7 +159,8 @@ mod tests {
                 delay_ns: 9 * MS,
             };
             let video = Video::start(Rc::clone(&fake), wanted).unwrap();
-            Self { fake, video, marker: MarkerExposure::new("down"), frames: Vec::new() }
+            let marker = MarkerExposure::new("down");
+            Self { fake, video, marker, frames: Vec::new(), refused: 0 }
         }
 
         /// Reads frames for so long; a detector finds the pad where it says.
@@ -167,7 +177,7 @@ mod tests {
                 let exposed = capture.exposed().unwrap();
                 let frame = GrayView::packed(&grey, 640, 480).unwrap();
                 let order = self.marker.after(exposure.mid_ns, frame, &exposed);
-                capture.expose(order).unwrap();
+                self.refused += u32::from(capture.expose(order).is_err());
                 self.marker.track.update(&message(exposure.mid_ns, pad_at(exposure.mid_ns)));
                 let error_ns = exposure.mid_ns - self.fake.mid_exposure_ns(number);
                 let white = f64::from(grey[240 * 640 + 320]) / 255.0;
@@ -229,8 +239,37 @@ mod tests {
     }
 
     #[test]
+    fn a_camera_that_was_left_without_metering_meters_again() {
+        // As an earlier start or `source.controls` have left it.
+        let mut exposing = Loop::left(Stamps::FirstPacket);
+        assert!(!exposing.fake.is_metering());
+        exposing.run(100 * MS, |_| None);
+        assert!(exposing.fake.is_metering());
+        exposing.fake.light(0.2);
+        exposing.run(500 * MS, still);
+        assert!(!exposing.fake.is_metering());
+        let fake = Rc::clone(&exposing.fake);
+        drop(exposing);
+        assert!(fake.is_metering() && fake.open_devices() == 0, "after its end");
+    }
+
+    #[test]
+    fn a_control_that_is_refused_leaves_the_frames_and_is_tried_again() {
+        let mut exposing = Loop::new(Stamps::FirstPacket);
+        exposing.fake.light(0.2);
+        exposing.fake.refuse(Some(CID_EXPOSURE_ABSOLUTE));
+        exposing.run(3000 * MS, still);
+        assert!(exposing.frames.len() > 250, "{} frames", exposing.frames.len());
+        assert!((2..=4).contains(&exposing.refused), "{} refusals", exposing.refused);
+        assert!(exposing.fake.is_metering(), "neither sets it");
+        exposing.fake.refuse(None);
+        exposing.run(2000 * MS, still);
+        assert!((0.6..=0.85).contains(&exposing.last().white), "{}", exposing.last().white);
+    }
+
+    #[test]
     fn a_stamp_is_exact_to_a_millisecond_or_marked_also_while_the_exposure_changes() {
-        for stamps in [Stamps::ExposureStart, Stamps::FrameEnd] {
+        for stamps in [Stamps::ExposureStart, Stamps::FirstPacket, Stamps::FrameEnd] {
             let mut exposing = Loop::new(stamps);
             for light in [0.2, 3.0, 0.4, 0.05] {
                 exposing.fake.light(light);

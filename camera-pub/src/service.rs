@@ -337,13 +337,22 @@ impl Stream {
         };
         let counts = capture.take_counts();
         let stamp_ns = taken.exposure.mid_ns;
-        let given_back = capture.give_back(taken).and_then(|()| {
-            let view = frame
-                .as_ref()
-                .and_then(|frame| GrayView::packed(&frame.pixels, frame.width, frame.height).ok());
-            let Some((exposed, view)) = capture.exposed().zip(view) else { return Ok(()) };
-            capture.expose(self.marker.after(stamp_ns, view, &exposed))
-        });
+        let mut lost = capture.give_back(taken).err();
+        let view = frame
+            .as_ref()
+            .and_then(|frame| GrayView::packed(&frame.pixels, frame.width, frame.height).ok());
+        if let Some((exposed, view)) = capture.exposed().zip(view).filter(|_| lost.is_none()) {
+            match capture.expose(self.marker.after(stamp_ns, view, &exposed)) {
+                Ok(()) => {}
+                Err(Lost::Unplugged) => lost = Some(Lost::Unplugged),
+                // A refused control is no reason to be without frames.
+                Err(refused) => {
+                    if self.health.failed("camera's exposure could not be set") {
+                        tracing::warn!(%refused, "The exposure cannot be set; it is tried again each second");
+                    }
+                }
+            }
+        }
         for (reason, count) in [
             ("frames that the driver could not store", counts.missed),
             ("frames that the driver marked as damaged", counts.damaged),
@@ -351,7 +360,13 @@ impl Stream {
         ] {
             (0..count.min(MAX_COUNTED)).for_each(|_| self.health.dropped(reason));
         }
-        if let Err(lost) = given_back {
+        let early = "frames sooner after their stamp than `source.readout_ms` allows";
+        if counts.early > 0 && self.health.failed_times(early, counts.early) {
+            tracing::warn!(
+                "{early}: they are stamped by their arrival; correct it, or `source.stamp_at`"
+            );
+        }
+        if let Some(lost) = lost {
             video.lose(&lost);
             self.health.failed(lost.reason());
         }

@@ -29,6 +29,10 @@ const EXPOSURE_READ_NS: i64 = 1_000_000_000;
 /// Number of frames in a row with an impossible stamp at the start after which the clock is refused, and of frames of
 /// another length after which the format has changed.
 const IN_A_ROW: u32 = 10;
+/// Pause after a refused control before the next is set: over USB a refusal may take the time of many frames.
+const EXPOSE_PAUSE_NS: i64 = 1_000_000_000;
+/// The driver of USB cameras.
+const UVC: &str = "uvcvideo";
 /// Change of the exposure time from which on stamps are not exact while it comes into force.
 const MAX_UNSURE_NS: u32 = 1_000_000;
 
@@ -100,6 +104,8 @@ pub(crate) struct Counts {
     pub(crate) damaged: u64,
     /// Frames of another length.
     pub(crate) cut: u64,
+    /// Frames that arrived sooner after their stamp than they can be read.
+    pub(crate) early: u64,
 }
 
 /// A device that gives frames.
@@ -109,6 +115,8 @@ pub(crate) struct Capture<D: Device> {
     rows: Rows,
     rate_hz: f64,
     stamped_at: Option<StampedAt>,
+    /// What stamps are of that the driver calls the start of a frame.
+    start: StampedAt,
     readout_ns: i64,
     delay_ns: i64,
     /// The number of the last frame by the driver.
@@ -120,6 +128,8 @@ pub(crate) struct Capture<D: Device> {
     /// When `exposure_ns` was read, so long ago at first that it is read.
     exposure_read_ns: i64,
     exposer: Option<Exposer>,
+    /// Until when no control is set after a refusal.
+    expose_again_ns: i64,
     counts: Counts,
 }
 
@@ -158,6 +168,11 @@ impl<D: Device> Capture<D> {
             rows,
             rate_hz,
             stamped_at: wanted.stamped_at,
+            // uvcvideo stamps the first packet of a frame, which a camera sends once it reads its first row, or later.
+            start: match text(&capability.driver).as_str() {
+                UVC => StampedAt::ReadoutStart,
+                _ => StampedAt::ExposureStart,
+            },
             readout_ns: wanted.readout_ns,
             delay_ns: wanted.delay_ns,
             last_sequence: None,
@@ -167,6 +182,7 @@ impl<D: Device> Capture<D> {
             exposure_ns: 0,
             exposure_read_ns: i64::MIN,
             exposer: exposer.transpose()?,
+            expose_again_ns: i64::MIN,
             counts: Counts::default(),
         };
         // From here on `drop` gives back what there is.
@@ -190,15 +206,21 @@ impl<D: Device> Capture<D> {
         })
     }
 
-    /// Sets the exposure of later frames.
+    /// Sets the exposure of later frames; after a refusal not for a second.
     ///
     /// # Errors
-    /// The device is gone, or refuses.
+    /// The device is gone, or refuses, and then gives frames all the same.
     pub(crate) fn expose(&mut self, order: Order) -> Result<(), Lost> {
-        let Some(exposer) = &mut self.exposer else { return Ok(()) };
-        let set = failed("VIDIOC_S_EXT_CTRLS", exposer.follow(&self.device, order))?;
-        if let Some(exposure_ns) = set {
-            (self.exposure_ns, self.exposure_read_ns) = (exposure_ns, self.device.now_ns());
+        let now_ns = self.device.now_ns();
+        let Some(exposer) = self.exposer.as_mut().filter(|_| now_ns >= self.expose_again_ns) else {
+            return Ok(());
+        };
+        let set = failed("VIDIOC_S_EXT_CTRLS", exposer.follow(&self.device, order));
+        if set.is_err() {
+            self.expose_again_ns = now_ns.saturating_add(EXPOSE_PAUSE_NS);
+        }
+        if let Some(exposure_ns) = set? {
+            (self.exposure_ns, self.exposure_read_ns) = (exposure_ns, now_ns);
         }
         Ok(())
     }
@@ -296,7 +318,7 @@ impl<D: Device> Capture<D> {
             return Ok(by_arrival);
         }
         let of_driver = match buffer.flags & BUF_FLAG_TSTAMP_SRC_MASK {
-            BUF_FLAG_TSTAMP_SRC_SOE => StampedAt::ExposureStart,
+            BUF_FLAG_TSTAMP_SRC_SOE => self.start,
             _ => StampedAt::FrameEnd,
         };
         let stamped_at = self.stamped_at.unwrap_or(of_driver);
@@ -313,7 +335,12 @@ impl<D: Device> Capture<D> {
         let is_known = unsure_ns < MAX_UNSURE_NS;
         let exposure_ns = if is_known { self.exposure_ns } else { 0 };
         let delay_ns = arrival_ns.saturating_sub(stamp_ns);
-        if !(shutter.until_read_ns(0)..=MAX_DELAY_NS).contains(&delay_ns) {
+        if (0..shutter.until_read_ns(0)).contains(&delay_ns) {
+            // A camera that reads a frame into its own memory sends it sooner than it was read: its stamp is of neither.
+            self.counts.early += 1;
+            return Ok(by_arrival);
+        }
+        if !(0..=MAX_DELAY_NS).contains(&delay_ns) {
             self.impossible += 1;
             if !self.has_clock && self.impossible == IN_A_ROW {
                 return Err(Lost::ForeignClock { before_arrival_s: delay_ns as f64 * 1e-9 });
@@ -375,6 +402,10 @@ impl Lost {
 
 impl<D: Device> Drop for Capture<D> {
     fn drop(&mut self) {
+        // A device keeps its controls beyond this program, which may be started again in another light.
+        if let Some(exposer) = &mut self.exposer {
+            drop(exposer.follow(&self.device, Order::OwnMetering));
+        }
         // A device that was unplugged refuses; its memory is freed when it is closed.
         drop(self.device.call(Call::StreamOff));
         // The driver frees no buffer that is still mapped.

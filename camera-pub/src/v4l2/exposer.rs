@@ -42,6 +42,10 @@ pub(crate) struct Exposer {
     metering: Option<i32>,
     exposure: Range,
     gain: Option<Gain>,
+    /// Whether the camera certainly meters by itself: what another program or an earlier start has set, it keeps.
+    is_metering: bool,
+    /// The gain's value before it was set here.
+    own_gain: Option<i32>,
     setting: Option<Setting>,
     /// Frames since the last change.
     frames: u32,
@@ -100,6 +104,8 @@ impl Exposer {
             metering,
             exposure: range(exposure),
             gain: gain.map(|gain| Gain { id: gain.id, range: range(gain) }),
+            is_metering: false,
+            own_gain: None,
             setting: None,
             frames: 0,
             changed_ns: 0,
@@ -153,23 +159,32 @@ impl Exposer {
         match order {
             Order::Keep => Ok(None),
             Order::OwnMetering => {
-                if let Some(value) = self.metering.filter(|_| self.setting.is_some()) {
-                    set(device, CID_EXPOSURE_AUTO, value)?;
-                    self.setting = None;
-                    return Ok(Some(0));
+                let Some(value) = self.metering.filter(|_| !self.is_metering) else {
+                    return Ok(None);
+                };
+                set(device, CID_EXPOSURE_AUTO, value)?;
+                if let Some((gain, value)) = self.gain.zip(self.own_gain.take()) {
+                    set(device, gain.id, value)?;
                 }
-                Ok(None)
+                (self.is_metering, self.setting) = (true, None);
+                Ok(Some(0))
             }
             Order::TakeOver => {
                 let exposure = control_value(device, CID_EXPOSURE_ABSOLUTE).unwrap_or(1);
-                let gain = self
-                    .gain
-                    .and_then(|gain| Some(self.factor(gain, control_value(device, gain.id)?)));
+                self.own_gain = self.gain.and_then(|gain| control_value(device, gain.id));
+                let gain =
+                    self.gain.zip(self.own_gain).map(|(gain, value)| self.factor(gain, value));
                 if self.metering.is_some() {
                     set(device, CID_EXPOSURE_AUTO, EXPOSURE_MANUAL)?;
+                    self.is_metering = false;
                 }
                 let exposure_s = f64::from(exposure.max(1)) * UNIT_S;
-                self.set(device, Setting { exposure_s, gain: gain.unwrap_or(1.0) }).map(Some)
+                let taken = self.set(device, Setting { exposure_s, gain: gain.unwrap_or(1.0) });
+                if taken.is_err() {
+                    // Neither would set it then. What this answers says no more than the first refusal.
+                    drop(self.follow(device, Order::OwnMetering));
+                }
+                taken.map(Some)
             }
             Order::Set(setting) => self.set(device, setting).map(Some),
         }
@@ -189,8 +204,9 @@ impl Exposer {
             gain = self.factor(control, value);
         }
         let exposure_s = f64::from(units) * UNIT_S;
-        let before_s = self.setting.map_or(0.0, |before| before.exposure_s);
-        self.changed_ns = ((exposure_s - before_s).abs() * 1e9) as u32;
+        // What the camera had chosen before is not known.
+        let change = |before: Setting| ((exposure_s - before.exposure_s).abs() * 1e9) as u32;
+        self.changed_ns = self.setting.map_or(u32::MAX, change);
         self.setting = Some(Setting { exposure_s, gain });
         self.frames = 0;
         Ok((exposure_s * 1e9).round() as u32)

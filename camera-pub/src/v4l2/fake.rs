@@ -39,6 +39,8 @@ const SIZES: [(u32, u32); 3] = [(1280, 720), (640, 480), (320, 240)];
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) enum Stamps {
     ExposureStart,
+    /// As uvcvideo does: the first packet, when the first row is read.
+    FirstPacket,
     FrameEnd,
     /// It does not say on which clock.
     Unknown,
@@ -85,6 +87,8 @@ pub(crate) struct Fake {
     /// The level of white at 1 ms and gain 1, of full scale: it shows a pad in its middle; 0 for none.
     light: Cell<f64>,
     is_foreign: Cell<bool>,
+    /// The control that it does not set.
+    refused: Cell<Option<u32>>,
     open_devices: Cell<u32>,
     mappings: Cell<u32>,
     opened: Cell<u32>,
@@ -140,6 +144,7 @@ impl Fake {
             changes: RefCell::default(),
             light: Cell::new(0.0),
             is_foreign: Cell::new(false),
+            refused: Cell::new(None),
             open_devices: Cell::new(0),
             mappings: Cell::new(0),
             opened: Cell::new(0),
@@ -168,6 +173,11 @@ impl Fake {
     /// Shows a pad in this light.
     pub(crate) fn light(&self, light: f64) {
         self.light.set(light);
+    }
+
+    /// Refuses to set this control from now on, or none.
+    pub(crate) fn refuse(&self, control: Option<u32>) {
+        self.refused.set(control);
     }
 
     pub(crate) fn is_metering(&self) -> bool {
@@ -303,7 +313,9 @@ impl Device for FakeDevice {
         let mut state = self.state.borrow_mut();
         match call {
             Call::QueryCap(capability) => {
-                capability.driver[..8].copy_from_slice(b"uvcvideo");
+                let is_usb = self.fake.stamps == Stamps::FirstPacket;
+                let driver = if is_usb { b"uvcvideo" } else { b"unicam\0\0" };
+                capability.driver[..8].copy_from_slice(driver);
                 capability.card[..14].copy_from_slice(b"PTZ Pro Camera");
                 capability.bus_info[..20].copy_from_slice(b"usb-0000:0e:00.0-2.4");
                 capability.capabilities = 0x04a0_0001 | CAP_DEVICE_CAPS;
@@ -364,6 +376,9 @@ impl Device for FakeDevice {
                 control.value = self.fake.exposure.get();
             }
             Call::GetControl(control) if control.id == GAIN => control.value = self.fake.gain.get(),
+            Call::SetControl(control) if self.fake.refused.get() == Some(control.id) => {
+                return Err(errno(libc::EIO));
+            }
             Call::SetControl(control) => self.fake.control(state.next, control.id, control.value),
             _ => return Err(errno(libc::EINVAL)),
         }
@@ -489,6 +504,10 @@ impl FakeDevice {
                 self.fake.begins_ns(number),
                 BUF_FLAG_TIMESTAMP_MONOTONIC | BUF_FLAG_TSTAMP_SRC_SOE,
             ),
+            Stamps::FirstPacket => (
+                self.fake.read_ns(number) - self.fake.readout_ns,
+                BUF_FLAG_TIMESTAMP_MONOTONIC | BUF_FLAG_TSTAMP_SRC_SOE,
+            ),
             Stamps::FrameEnd => (self.fake.read_ns(number), BUF_FLAG_TIMESTAMP_MONOTONIC),
             Stamps::Unknown => (self.fake.begins_ns(number), 0),
         };
@@ -532,7 +551,7 @@ mod tests {
 
     #[test]
     fn a_device_is_described_as_it_answers() {
-        let fake = Fake::of("MJPG", Stamps::ExposureStart, 0);
+        let fake = Fake::of("MJPG", Stamps::FirstPacket, 0);
         let description = describe(&fake.open().unwrap()).unwrap();
         assert_eq!((&*description.driver, &*description.card), ("uvcvideo", "PTZ Pro Camera"));
         assert!(description.is_camera && description.formats[0].is_readable);

@@ -234,7 +234,7 @@ mod tests {
     #[test]
     fn stamps_are_the_middle_of_the_exposure_whatever_the_driver_stamps() {
         for fourcc in ["GREY", "YUYV", "NV12", "YU12"] {
-            for stamps in [Stamps::ExposureStart, Stamps::FrameEnd] {
+            for stamps in [Stamps::ExposureStart, Stamps::FirstPacket, Stamps::FrameEnd] {
                 for readout_ns in [0, 12 * MS] {
                     let fake = Fake::of(fourcc, stamps, readout_ns);
                     let wanted = Wanted { readout_ns, ..wanted(&fake) };
@@ -265,6 +265,16 @@ mod tests {
         metering.meter();
         assert!(inexact(metering) > 80);
         assert_eq!(inexact(Fake::of("GREY", Stamps::ExposureStart, 0)), 0);
+    }
+
+    #[test]
+    fn a_camera_that_sends_sooner_than_it_reads_gives_frames_by_their_arrival() {
+        let fake = Fake::of("GREY", Stamps::FirstPacket, 0);
+        let wanted = Wanted { readout_ns: 20 * MS, ..wanted(&fake) };
+        let mut video = Video::start(Rc::clone(&fake), wanted).unwrap();
+        let seen = run(&fake, &mut video, 1000 * MS);
+        assert!(seen.frames > 80 && seen.exact == 0 && seen.lost.is_empty(), "{}", seen.frames);
+        assert_eq!(video.capture().unwrap().take_counts().early, seen.frames);
     }
 
     #[test]
