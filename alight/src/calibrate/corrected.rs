@@ -16,7 +16,8 @@ pub(super) fn toml(flight: &RecordedFlight, result: &FlightCalibration) -> Optio
     };
     let mut text = format!(
         "# Found by `alight calibrate flight`: these keys replace those in the configuration of the camera `{}`.\n",
-        flight.camera
+        // The name comes from a file, and ends no comment.
+        flight.camera.escape_debug()
     );
     let mut is_empty = true;
     if let Some(offset_s) = correction(Quantity::TimeOffset) {

@@ -79,7 +79,11 @@ pub(super) fn read(file: &Path, wanted: &Wanted<'_>) -> anyhow::Result<RecordedF
         markers,
         marker,
         vehicle: vehicle(&flight, at_s),
-        is_stamped_by_camera: found.iter().all(|message| message.header.exposure_ns > 0),
+        is_stamped_by_camera: is_device(&flight, &camera) || {
+            // Some frames of such a camera are stamped by their arrival all the same.
+            let exact = found.iter().filter(|message| message.header.exposure_ns > 0).count();
+            2 * exact > found.len()
+        },
         delay_ms: delay_ms(&flight, &camera),
         damage: flight.damage,
         camera,
@@ -109,7 +113,15 @@ fn detections<'a>(flight: &'a Flight, wanted: &Wanted<'_>) -> anyhow::Result<Vec
     let seen = |messages: &[&Detections]| {
         messages.iter().filter(|message| !message.detections.is_empty()).count()
     };
-    let most = chosen.max_by_key(|(_, messages)| seen(messages));
+    // Other detectors may have found other markers, also more of them.
+    let named = named(flight, wanted);
+    let seen_named = |messages: &[&Detections]| {
+        let sees = |name: &String| {
+            messages.iter().filter(|it| controller::wire::wanted(it, name).is_some()).count()
+        };
+        named.as_ref().map_or(0, sees)
+    };
+    let most = chosen.max_by_key(|(_, messages)| (seen_named(messages), seen(messages)));
     let (_, messages) = most.with_context(|| match names.as_slice() {
         [] => "no detector's messages were recorded".to_owned(),
         names => format!("the recording has those of {}", names.join(", ")),
@@ -139,7 +151,13 @@ fn configured(info: &CameraInfo) -> anyhow::Result<ConfiguredCamera> {
     Ok(ConfiguredCamera { model, body_from_camera })
 }
 
-/// The wanted marker, or the one that the controller landed on, or the one that was seen most.
+/// The wanted marker, or the one that the controller landed on, where it is the name of one.
+fn named(flight: &Flight, wanted: &Wanted<'_>) -> Option<String> {
+    let name = wanted.marker.map(str::to_owned).or_else(|| flight.marker())?;
+    controller::wire::marker_name(&name).is_ok().then_some(name)
+}
+
+/// The wanted marker, or the one that the controller landed on, or, without a controller, the one that was seen most.
 fn marker(flight: &Flight, wanted: &Wanted<'_>, found: &[&Detections]) -> anyhow::Result<String> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     for detection in found.iter().flat_map(|message| &message.detections) {
@@ -149,7 +167,7 @@ fn marker(flight: &Flight, wanted: &Wanted<'_>, found: &[&Detections]) -> anyhow
         };
         *counts.entry(name).or_default() += 1;
     }
-    let named = wanted.marker.map(str::to_owned).or_else(|| flight.marker());
+    let named = named(flight, wanted);
     let is_seen = |name: &String| {
         controller::wire::marker_name(name).is_ok()
             && found.iter().any(|message| controller::wire::wanted(message, name).is_some())
@@ -158,6 +176,12 @@ fn marker(flight: &Flight, wanted: &Wanted<'_>, found: &[&Detections]) -> anyhow
         ensure!(
             is_seen(&(*name).to_owned()),
             "`--marker {name}` was not seen; the recording has {}",
+            counts.keys().cloned().collect::<Vec<_>>().join(", ")
+        );
+    }
+    if let Some(name) = named.as_ref().filter(|name| !is_seen(name)) {
+        anyhow::bail!(
+            "the controller landed on `{name}`, which this detector did not see; it saw {}: name one by `--marker`",
             counts.keys().cloned().collect::<Vec<_>>().join(", ")
         );
     }
@@ -179,10 +203,22 @@ fn vehicle(flight: &Flight, at_s: impl Fn(i64) -> f64) -> Vec<VehicleSample> {
     flight.vehicle.iter().filter_map(sample).collect()
 }
 
-/// The delay that camera-pub subtracted from stamps.
-fn delay_ms(flight: &Flight, camera: &str) -> Option<f64> {
+/// The table of the camera's source, if camera-pub's configuration was recorded.
+fn source(flight: &Flight, camera: &str) -> Option<toml::Table> {
     let text = flight.configurations.get(&format!("camera-pub/{camera}"))?;
     let table: toml::Table = text.parse().ok()?;
-    let delay = table.get("source")?.get("delay_ms")?;
+    table.get("source")?.as_table().cloned()
+}
+
+/// The delay that camera-pub subtracted from stamps.
+fn delay_ms(flight: &Flight, camera: &str) -> Option<f64> {
+    let source = source(flight, camera)?;
+    let delay = source.get("delay_ms")?;
     delay.as_float().or_else(|| delay.as_integer().map(|ms| ms as f64))
+}
+
+/// Whether camera-pub read a device, whose driver stamps.
+fn is_device(flight: &Flight, camera: &str) -> bool {
+    let device = |source: toml::Table| Some(!source.get("device")?.as_str()?.is_empty());
+    source(flight, camera).and_then(device).unwrap_or(false)
 }

@@ -154,9 +154,12 @@ fn is_finite(sample: &VehicleSample) -> bool {
         && sample.ned_from_body.wxyz().iter().all(|part| part.is_finite())
 }
 
-/// By how much the autopilot's position jumped between two samples.
+/// By how much the autopilot's position jumped between two samples; none in a gap, in which it may have flown anywhere.
 fn jump(before: &VehicleSample, after: &VehicleSample) -> Vector<Ned> {
     let apart_s = after.stamp_s - before.stamp_s;
+    if apart_s > MAX_GAP_S {
+        return Vector::zero();
+    }
     let velocity = before.velocity * 0.5 + after.velocity * 0.5;
     let beside = after.position - (before.position + velocity * apart_s);
     if beside.norm() > JUMP_M + JUMP_M_S * apart_s { beside } else { Vector::zero() }
@@ -193,6 +196,18 @@ mod tests {
         for t in [0.99, 1.5, 2.0, 2.1, f64::NAN] {
             assert!(motion.at(t).is_none(), "{t}");
         }
+    }
+
+    #[test]
+    fn a_flight_during_a_gap_is_no_jump() {
+        // From one hover to another, unseen.
+        let motion = Motion::new(&[
+            sample(1.0, 0.0, 0.0),
+            sample(1.1, 0.0, 0.0),
+            sample(11.0, 30.0, 0.0),
+            sample(11.1, 30.0, 0.0),
+        ]);
+        assert!((motion.at(11.05).unwrap().position.x() - 30.0).abs() < 1e-9);
     }
 
     #[test]
