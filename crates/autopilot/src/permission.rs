@@ -90,8 +90,9 @@ fn command(message: &MavMessage) -> Option<MavCmd> {
     }
 }
 
-/// SET_MODE counts as well: its flags can arm older autopilots. So do a script or a file that the autopilot
-/// would run, and mavlink packets for another of its links.
+/// SET_MODE counts as well: its flags can arm older autopilots. So do a script or a file that the autopilot would run, mavlink
+/// packets for another of its links, and what a pilot's sticks, switches and buttons would do: sticks arm, and a switch may
+/// stop the motors in the air (ArduPilot's auxiliary functions, `ARMING_RUDDER`).
 #[allow(deprecated, reason = "ground stations still send what the standard calls superseded")]
 fn starts_or_stops_motors(message: &MavMessage, command: Option<MavCmd>) -> bool {
     let by_command = matches!(
@@ -104,6 +105,14 @@ fn starts_or_stops_motors(message: &MavMessage, command: Option<MavCmd>) -> bool
                 | MavCmd::MAV_CMD_DO_SET_ACTUATOR
                 | MavCmd::MAV_CMD_DO_SET_SERVO
                 | MavCmd::MAV_CMD_DO_REPEAT_SERVO
+                | MavCmd::MAV_CMD_DO_SET_RELAY
+                | MavCmd::MAV_CMD_DO_REPEAT_RELAY
+                | MavCmd::MAV_CMD_DO_AUX_FUNCTION
+                | MavCmd::MAV_CMD_DO_ENGINE_CONTROL
+                | MavCmd::MAV_CMD_MISSION_START
+                | MavCmd::MAV_CMD_SOLO_BTN_FLY_CLICK
+                | MavCmd::MAV_CMD_SOLO_BTN_FLY_HOLD
+                | MavCmd::MAV_CMD_SOLO_BTN_PAUSE_CLICK
                 | MavCmd::MAV_CMD_ACTUATOR_TEST
                 | MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
         )
@@ -113,6 +122,8 @@ fn starts_or_stops_motors(message: &MavMessage, command: Option<MavCmd>) -> bool
             message,
             MavMessage::SET_MODE(_)
                 | MavMessage::SET_ACTUATOR_CONTROL_TARGET(_)
+                | MavMessage::RC_CHANNELS_OVERRIDE(_)
+                | MavMessage::MANUAL_CONTROL(_)
                 | MavMessage::SERIAL_CONTROL(_)
                 | MavMessage::FILE_TRANSFER_PROTOCOL(_)
                 | MavMessage::TUNNEL(_)
@@ -152,8 +163,9 @@ fn changes_nothing(message: &MavMessage, command: Option<MavCmd>) -> bool {
 mod tests {
     use super::*;
     use crate::dialect::{
-        COMMAND_INT_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, PARAM_REQUEST_LIST_DATA,
-        PARAM_SET_DATA, RC_CHANNELS_OVERRIDE_DATA, REQUEST_DATA_STREAM_DATA, SET_MODE_DATA,
+        COMMAND_INT_DATA, COMMAND_LONG_DATA, HEARTBEAT_DATA, MANUAL_CONTROL_DATA,
+        PARAM_REQUEST_LIST_DATA, PARAM_SET_DATA, RC_CHANNELS_OVERRIDE_DATA,
+        REQUEST_DATA_STREAM_DATA, SET_MODE_DATA,
     };
     use crate::packet::{Parser, Sender, encode};
 
@@ -180,7 +192,11 @@ mod tests {
             (long(MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL), true, false),
             (MavMessage::PARAM_SET(PARAM_SET_DATA::default()), true, false),
             (MavMessage::REQUEST_DATA_STREAM(REQUEST_DATA_STREAM_DATA::default()), true, false),
-            (MavMessage::RC_CHANNELS_OVERRIDE(RC_CHANNELS_OVERRIDE_DATA::default()), true, false),
+            (MavMessage::RC_CHANNELS_OVERRIDE(RC_CHANNELS_OVERRIDE_DATA::default()), false, false),
+            (MavMessage::MANUAL_CONTROL(MANUAL_CONTROL_DATA::default()), false, false),
+            (long(MavCmd::MAV_CMD_DO_AUX_FUNCTION), false, false),
+            (int(MavCmd::MAV_CMD_MISSION_START), false, false),
+            (long(MavCmd::MAV_CMD_SOLO_BTN_FLY_HOLD), false, false),
             (long(arming), false, false),
             (int(arming), false, false),
             (long(MavCmd::MAV_CMD_DO_FLIGHTTERMINATION), false, false),
