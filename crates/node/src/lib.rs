@@ -32,7 +32,7 @@ pub use config::{
 pub use frames::{Frame, FramePublisher, FrameSubscriber, Loan};
 pub use health::HealthCounters;
 pub use identity::Identity;
-pub use network::{INSECURE, Network};
+pub use network::{INSECURE, Network, OPEN};
 pub use service::{Options, Shutdown, relaunch, relaunch_with_zenoh_threads, run, start_logging};
 pub use session::{Node, Presence, ZenohSource};
 pub use state::state_directory;

@@ -30,6 +30,10 @@ pub const AIR_PORT: u16 = 7448;
 /// The reason for which a process that everybody in reach may command counts an error in its health.
 pub const INSECURE: &str = "insecure: without keys anyone in reach can command the vehicle";
 
+/// The reason for which a bridge that any ground station in reach may command by counts an error in its health.
+pub const OPEN: &str =
+    "open: any ground station in reach can command the vehicle; see `ground_stations`";
+
 /// The file name of the authority's certificate in a directory of keys.
 pub const AUTHORITY: &str = "authority.pem";
 
@@ -296,10 +300,7 @@ fn open_endpoint(config: &Value) -> Option<String> {
         // Zenoh then listens on every interface, unless it is a client.
         return (config["mode"] != "client").then(|| "Zenoh's default endpoint".to_owned());
     }
-    // A list, or one for each mode.
-    let lists = listen.as_object().into_iter().flat_map(|modes| modes.values());
-    let all = lists.chain([listen]).filter_map(Value::as_array).flatten();
-    all.filter_map(Value::as_str).find(|endpoint| is_open(endpoint)).map(str::to_owned)
+    endpoints(config, "listen").find(|endpoint| is_open(endpoint)).map(str::to_owned)
 }
 
 fn merge(below: &mut Value, above: Value) {
@@ -400,14 +401,20 @@ impl Endpoint {
     }
 }
 
+/// The endpoints of a section: a list, or one for each mode.
 fn endpoints<'a>(config: &'a Value, section: &str) -> impl Iterator<Item = &'a str> {
-    config[section]["endpoints"].as_array().into_iter().flatten().filter_map(Value::as_str)
+    let found = &config[section]["endpoints"];
+    let of_modes = found.as_object().into_iter().flat_map(|modes| modes.values());
+    of_modes.chain([found]).filter_map(Value::as_array).flatten().filter_map(Value::as_str)
 }
 
 fn each_endpoint(config: &mut Value, sections: &[&str], change: impl Fn(&mut Endpoint)) {
     for section in sections {
-        let list = config.pointer_mut(&format!("/{section}/endpoints"));
-        for entry in list.and_then(Value::as_array_mut).into_iter().flatten() {
+        let lists: Vec<&mut Value> = match config.pointer_mut(&format!("/{section}/endpoints")) {
+            Some(Value::Object(modes)) => modes.values_mut().collect(),
+            found => found.into_iter().collect(),
+        };
+        for entry in lists.into_iter().filter_map(Value::as_array_mut).flatten() {
             if let Some(mut endpoint) = entry.as_str().and_then(Endpoint::parse) {
                 change(&mut endpoint);
                 *entry = json!(endpoint.text());
@@ -549,6 +556,26 @@ mod tests {
                     assert!(!is_private && problem.contains("chmod 600"), "{mode:o}: {problem}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn endpoints_for_each_mode_are_secured_as_a_list_is() {
+        let keys = tempfile::tempdir().unwrap();
+        for file in [AUTHORITY, "relay.pem", "relay.key", HOLDERS] {
+            std::fs::write(keys.path().join(file), "").unwrap();
+            let path = keys.path().join(file);
+            std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o600)).unwrap();
+        }
+        for listen in ["['tcp/0.0.0.0:7448']", "{ peer: ['tcp/0.0.0.0:7448'] }"] {
+            let text = format!(
+                "{{ mode: 'peer', namespace: 'hawk', connect: {{ endpoints: [] }}, listen: {{ endpoints: {listen} }} }}"
+            );
+            let mut config = parse("a test", &text).unwrap();
+            secure(&mut config, keys.path(), "relay").unwrap();
+            assert_eq!(endpoints(&config, "listen").collect::<Vec<_>>(), ["tls/0.0.0.0:7448"]);
+            assert_eq!(config["access_control"]["enabled"], true, "{listen}");
+            assert_eq!(open_endpoint(&config), None);
         }
     }
 
