@@ -261,8 +261,7 @@ fn recording(facts: &Facts<'_>) -> Finding {
 }
 
 fn keys(facts: &Facts<'_>) -> Finding {
-    let todo =
-        "Make keys (`alight keys`, docs/deploy.md): anyone in reach can command the vehicle.";
+    let todo = "Make keys (`alight keys`, docs/deploy.md), and name the ground stations: anyone in reach can command the vehicle.";
     match facts.is_insecure {
         Some(true) => {
             finding(Verdict::Bad, "a process listens beyond its machine without keys", todo)

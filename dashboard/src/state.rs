@@ -111,11 +111,6 @@ fn age_ms(now_ns: i64, since_ns: i64) -> f64 {
     ms(now_ns.saturating_sub(since_ns).max(0))
 }
 
-/// A text without digits: what a change of numbers alone leaves as it was.
-fn matter(text: &str) -> String {
-    text.chars().filter(|c| !c.is_ascii_digit()).collect()
-}
-
 impl State {
     /// Nothing is known yet; the name is that of this process' clock.
     pub fn new(clock: &str) -> Self {
@@ -158,7 +153,8 @@ impl State {
             let text = format!("detector in use: {name}: {}", status.detector_why);
             self.log.add(now_ns, Level::Info, &text);
         }
-        let matters: Vec<String> = status.warnings.iter().map(|text| matter(text)).collect();
+        let matters: Vec<String> =
+            status.warnings.iter().map(|text| messages::matter(text)).collect();
         for (text, matter) in status.warnings.iter().zip(&matters) {
             if !self.warnings.contains(matter) {
                 self.log.add(now_ns, Level::Warn, text);
@@ -274,7 +270,7 @@ impl State {
         let target = self.target.as_ref().map(|seen| {
             let target = &seen.value;
             json!({
-                "age_ms": self.age_of(now_ns, seen.received_ns, target.stamp_ns),
+                "age_ms": self.age_of(now_ns, seen.received_ns, target.stamp_ns) + target.age_ms.unwrap_or(0.0),
                 "position_m": target.position_ned_m,
                 "velocity_m_s": target.velocity_ned_m_s,
                 "lateral_error_m": target.lateral_error_m,
@@ -381,6 +377,23 @@ impl State {
         names.into_iter().map(row).collect()
     }
 
+    /// The rate of the frames of the camera in use, or of any while it is not known. A camera's service has its name; the
+    /// simulator's has not.
+    fn frames_hz(&self) -> Option<f64> {
+        let camera = self.camera();
+        let makers = || {
+            let heard = self.services.iter().filter(|(_, it)| !it.is_silent);
+            heard.filter(|((service, _), _)| ["camera-pub", "simulator"].contains(&&**service))
+        };
+        let is_in_use = |instance: &str| camera == Some(instance);
+        let is_known =
+            self.services.keys().any(|(service, it)| service == "camera-pub" && is_in_use(it));
+        let mut wanted = makers().filter(|((_, instance), _)| !is_known || is_in_use(instance));
+        wanted.find_map(|(_, it)| {
+            it.health.rates.iter().find(|rate| rate.name == "frames").map(|rate| rate.hz)
+        })
+    }
+
     fn facts(&self, now_ns: i64) -> Facts<'_> {
         let status = self.status.as_ref();
         let status_age_ms = status.map(|it| self.age_of(now_ns, it.received_ns, it.value.stamp_ns));
@@ -392,9 +405,6 @@ impl State {
         let found = found.filter(|it| is_current(Some(age_ms(now_ns, it.received_ns))));
         let camera = found.map(|it| it.value.header.camera.as_str());
         let controller = self.services.iter().find(|(key, _)| key.0 == "controller");
-        let frames = self.services.values().filter(|it| !it.is_silent).find_map(|it| {
-            it.health.rates.iter().find(|rate| rate.name == "frames").map(|rate| rate.hz)
-        });
         let has_fault = |name: &str| {
             self.services
                 .values()
@@ -407,7 +417,7 @@ impl State {
             vehicle_age_ms,
             found: found.map(|it| &it.value),
             found_age_ms: found.map(|it| age_ms(now_ns, it.received_ns)),
-            frames_hz: frames,
+            frames_hz: self.frames_hz(),
             calibration: camera.and_then(|name| self.cameras.get(name)).map(|seen| &seen.value),
             controller_clock: controller.map(|(_, it)| it.health.clock.as_str()),
             round_trip_ms: controller
@@ -422,7 +432,7 @@ impl State {
                 .services
                 .values()
                 .any(|it| !it.is_silent)
-                .then(|| has_fault(node::INSECURE)),
+                .then(|| has_fault(node::INSECURE) || has_fault(node::OPEN)),
             silent: self
                 .services
                 .iter()
@@ -600,6 +610,35 @@ mod tests {
             "{detectors}"
         );
         assert_eq!(detectors[1]["state"], "not heard by the controller");
+    }
+
+    #[test]
+    fn the_rate_of_frames_is_that_of_the_camera_in_use() {
+        let mut state = State::new("ours");
+        let make = |service: &str, name: &str, hz| {
+            let Input::Health(service, _, health) = health(service, 1, "a", 0.0, 1.0) else {
+                unreachable!()
+            };
+            let rates = vec![messages::Rate { name: "frames".into(), count: 9, hz }];
+            Input::Health(service, name.into(), Box::new(Health { rates, ..*health }))
+        };
+        state.take(0, make("detector", "main", 7.0));
+        assert_eq!(state.frames_hz(), None, "what a detector takes is no camera's");
+        state.take(0, make("camera-pub", "aft", 15.0));
+        assert_eq!(state.frames_hz(), Some(15.0));
+        state.take(0, make("camera-pub", "down", 0.0));
+        state.take(0, status(Phase::Search, "looking"));
+        let info = DetectorInfo {
+            detector: "main".into(),
+            host: "pi".into(),
+            place: Place::Onboard,
+            camera: "down".into(),
+            markers: Vec::new(),
+            version: "0.1.0".into(),
+            pid: 1,
+        };
+        state.take(0, Input::Detector("main".into(), Box::new(info)));
+        assert_eq!(state.frames_hz(), Some(0.0));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! The service: one loop over everything that arrives, from either side.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ use messages::{
     Configuration, ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus,
     TargetEstimate, topic,
 };
-use node::{HealthCounters, INSECURE, Node, Shutdown, now_ns};
+use node::{HealthCounters, INSECURE, Node, OPEN, Shutdown, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::camera::Camera;
@@ -120,9 +120,11 @@ const MAX_PROBLEM_CHARS: usize = 120;
 /// Minimum pause between two texts about refused packets, in nanoseconds.
 const REFUSAL_PAUSE_NS: i64 = 5_000_000_000;
 
-/// What its health says while it listens for anybody.
-const OPEN: &str =
-    "open: any ground station in reach can command the vehicle; see `ground_stations`";
+/// Maximum number of texts that wait for their sending.
+const MAX_TO_TELL: usize = 16;
+
+/// A relay that has not said for this time that it is insecure is so no more, in nanoseconds.
+const INSECURE_NS: i64 = 10_000_000_000;
 
 const CLOSED: &str = "the network session was closed";
 
@@ -149,8 +151,8 @@ struct Bridge {
     controllers: BTreeSet<String>,
     /// True once the last controller has gone.
     is_abandoned: bool,
-    /// A relay says that it takes anybody's commands.
-    is_insecure: bool,
+    /// When a relay last said that it takes anybody's commands.
+    insecure_ns: Option<i64>,
     /// The ground station has been told so.
     insecure_told: bool,
     /// Recorders of which the ground station has been told that they keep nothing.
@@ -162,6 +164,8 @@ struct Bridge {
     strangers: u64,
     /// Packets refused because of their signatures, as counted so far.
     refusals: Refusals,
+    /// Texts that could not be sent yet.
+    to_tell: VecDeque<(MavSeverity, String)>,
     /// Sequence numbers of our next packets: the companion's and the camera's.
     sequence: u8,
     camera_sequence: u8,
@@ -193,7 +197,7 @@ impl Bridge {
             status: None,
             controllers: BTreeSet::new(),
             is_abandoned: false,
-            is_insecure: false,
+            insecure_ns: None,
             insecure_told: false,
             not_recording: BTreeSet::new(),
             ground_ns: None,
@@ -201,6 +205,7 @@ impl Bridge {
             unread: 0,
             strangers: 0,
             refusals: Refusals::default(),
+            to_tell: VecDeque::new(),
             sequence: 0,
             camera_sequence: 0,
         })
@@ -285,7 +290,7 @@ impl Bridge {
                     );
                 }
                 let text = "Alight: SETUP_SIGNING not passed on; set the key by USB";
-                self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, text);
+                self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, text);
             }
             Route::Unknown(command) => {
                 self.ground_active(now_ns, packet.sender);
@@ -314,7 +319,7 @@ impl Bridge {
         }
         if let Some(why) = answer.why {
             let text = format!("Alight: not tracked: {why}");
-            self.send_text(now_ns, MavSeverity::MAV_SEVERITY_NOTICE, &text);
+            self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_NOTICE, &text);
         }
     }
 
@@ -326,7 +331,7 @@ impl Bridge {
         }
         if let Some(why) = answer.why {
             self.health.failed("from ground: a parameter is not set from there");
-            self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {why}"));
+            self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &format!("Alight: {why}"));
         }
     }
 
@@ -381,13 +386,15 @@ impl Bridge {
         if is_due {
             self.refusal_ns = Some(now_ns);
             let text = format!("Alight: refused ({}): {}", self.permission, refusal.name);
-            self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
+            self.send_answer(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
         }
     }
 
     /// Handles the health of a relay.
     fn relay(&mut self, now_ns: i64, health: &Health) {
-        self.is_insecure |= health.errors.iter().any(|error| error.reason == INSECURE);
+        if health.errors.iter().any(|error| error.reason == INSECURE) {
+            self.insecure_ns = Some(now_ns);
+        }
         self.tell_insecure(now_ns);
     }
 
@@ -414,7 +421,9 @@ impl Bridge {
 
     /// Tells each ground station once that anybody may command the vehicle.
     fn tell_insecure(&mut self, now_ns: i64) {
-        if self.is_insecure && !self.insecure_told && self.me(now_ns).is_some() {
+        let is_insecure =
+            self.insecure_ns.is_some_and(|last| now_ns.saturating_sub(last) < INSECURE_NS);
+        if is_insecure && !self.insecure_told && self.me(now_ns).is_some() {
             let text = "Alight: insecure: anyone in reach can command the vehicle";
             self.insecure_told = self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, text);
         }
@@ -484,7 +493,39 @@ impl Bridge {
         } else {
             (MavSeverity::MAV_SEVERITY_NOTICE, "Alight: the controller is back")
         };
-        self.send_text(now_ns, severity, text);
+        self.tell(now_ns, severity, text);
+    }
+
+    /// Sends a text now, or as soon as we have a system id and it does not exceed the rate.
+    fn tell(&mut self, now_ns: i64, severity: MavSeverity, text: &str) {
+        let is_new = !self.to_tell.iter().any(|(_, it)| it == text);
+        if is_new && self.to_tell.len() < MAX_TO_TELL {
+            self.to_tell.push_back((severity, text.to_owned()));
+        } else if is_new {
+            self.health.dropped("texts: too many");
+        }
+        self.tell_more(now_ns);
+    }
+
+    /// Sends the texts that could not be sent yet.
+    fn tell_more(&mut self, now_ns: i64) {
+        while let Some((severity, text)) = self.to_tell.pop_front() {
+            if !self.send_text(now_ns, severity, &text) {
+                self.to_tell.push_front((severity, text));
+                return;
+            }
+        }
+    }
+
+    /// Sends the answer to a request, if it does not exceed the rate of such answers.
+    fn send_answer(&mut self, now_ns: i64, severity: MavSeverity, text: &str) {
+        if self.me(now_ns).is_none() {
+            return;
+        }
+        match self.texts.answer(now_ns, severity, text) {
+            Some(packets) => packets.iter().for_each(|packet| self.send_own(now_ns, packet)),
+            None => self.health.dropped("texts: too many"),
+        }
     }
 
     /// Sends a text, if we have a system id and it does not exceed the rate; whether it was sent.
@@ -513,12 +554,13 @@ impl Bridge {
         self.strangers = strangers;
     }
 
-    /// Counts what was refused because of its signature, and tells the ground station once, which may just have no key.
+    /// Counts what was refused because of its signature, and tells the ground station once of each reason: it may just have no
+    /// key.
     fn count_refusals(&mut self, now_ns: i64, refusals: Refusals) {
         for (reason, more) in refusals.since(self.refusals) {
             if self.health.failed_times(&format!("from ground: refused: {reason}"), more) {
                 let text = format!("Alight: packets refused: {reason}");
-                self.send_text(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
+                self.tell(now_ns, MavSeverity::MAV_SEVERITY_WARNING, &text);
             }
         }
         self.refusals = refusals;
@@ -543,6 +585,7 @@ impl Bridge {
             self.tell_taken(now_ns);
             self.send_from_camera(now_ns, &heartbeat);
         }
+        self.tell_more(now_ns);
         self.send_texts(now_ns);
         self.tell_insecure(now_ns);
     }

@@ -2,12 +2,14 @@
 
 use autopilot::compose::status_text;
 use autopilot::dialect::{MavMessage, MavSeverity};
-use messages::{ControllerStatus, Phase};
+use messages::{ControllerStatus, Phase, matter};
 
 /// Maximum length of a text, in characters: it fits four packets. Longer texts are cut.
 const MAX_TEXT: usize = 199;
 /// Maximum number of texts sent at once.
 const MAX_BURST: u32 = 6;
+/// Number of these that are kept for what happens, when answers to requests are sent.
+const KEPT_OF_BURST: u32 = 3;
 /// Maximum number of warnings that are followed.
 const MAX_WARNINGS: usize = 16;
 /// Time after which one more text may be sent, in nanoseconds.
@@ -49,7 +51,7 @@ impl StatusTextSender {
             false => format!("Alight: {}: {}", status.phase, status.why),
         };
         // A change of digits alone, as of a height, is not sent.
-        let change = without_digits(&text);
+        let change = matter(&text);
         if self.last.as_ref() != Some(&change)
             && let Some(text) = self.text(now_ns, severity(status.phase), &text)
         {
@@ -78,7 +80,7 @@ impl StatusTextSender {
 
     /// Adds the packets of new warnings.
     fn warnings(&mut self, now_ns: i64, warnings: &[String], packets: &mut Vec<MavMessage>) {
-        let matters: Vec<String> = warnings.iter().map(|text| without_digits(text)).collect();
+        let matters: Vec<String> = warnings.iter().map(|text| matter(text)).collect();
         self.warnings.retain(|sent| matters.contains(sent));
         for (text, matter) in warnings.iter().zip(matters).take(MAX_WARNINGS) {
             if !self.warnings.contains(&matter)
@@ -98,15 +100,34 @@ impl StatusTextSender {
         severity: MavSeverity,
         text: &str,
     ) -> Option<Vec<MavMessage>> {
-        let earned = now_ns.saturating_sub(self.refilled_ns).max(0) / REFILL_NS;
-        self.refilled_ns = self.refilled_ns.saturating_add(earned.saturating_mul(REFILL_NS));
-        let earned = u32::try_from(earned).unwrap_or(MAX_BURST);
-        self.tokens = self.tokens.saturating_add(earned).min(MAX_BURST);
+        self.refill(now_ns);
         self.tokens = self.tokens.checked_sub(1)?;
         let packets = packets(severity, text, self.next_id);
         // 0 is the id of texts of one packet.
         self.next_id = self.next_id.checked_add(1).unwrap_or(1);
         Some(packets)
+    }
+
+    /// The packets of the answer to a request; none when it exceeds the rate, or leaves too little for what happens: a ground
+    /// station may ask for hundreds of things at once.
+    pub(crate) fn answer(
+        &mut self,
+        now_ns: i64,
+        severity: MavSeverity,
+        text: &str,
+    ) -> Option<Vec<MavMessage>> {
+        self.refill(now_ns);
+        if self.tokens <= KEPT_OF_BURST {
+            return None;
+        }
+        self.text(now_ns, severity, text)
+    }
+
+    fn refill(&mut self, now_ns: i64) {
+        let earned = now_ns.saturating_sub(self.refilled_ns).max(0) / REFILL_NS;
+        self.refilled_ns = self.refilled_ns.saturating_add(earned.saturating_mul(REFILL_NS));
+        let earned = u32::try_from(earned).unwrap_or(MAX_BURST);
+        self.tokens = self.tokens.saturating_add(earned).min(MAX_BURST);
     }
 
     /// Sends everything again: to a new ground station, or of a new controller.
@@ -115,11 +136,6 @@ impl StatusTextSender {
         self.detector = None;
         self.warnings.clear();
     }
-}
-
-/// What stays of a text while only numbers change in it.
-fn without_digits(text: &str) -> String {
-    text.chars().filter(|c| !c.is_ascii_digit()).collect()
 }
 
 /// The severity of a phase's text; a ground station reads warnings and worse aloud.

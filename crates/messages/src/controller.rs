@@ -195,6 +195,18 @@ pub struct ControllerStatus {
     pub warnings: Vec<String>,
 }
 
+/// What a text of a status is about: all but its numbers, which change with each second. Digits within backquotes stay, as
+/// they are part of a name.
+pub fn matter(text: &str) -> String {
+    let mut is_name = false;
+    text.chars()
+        .filter(|c| {
+            is_name ^= *c == '`';
+            is_name || !c.is_ascii_digit()
+        })
+        .collect()
+}
+
 /// A command to the controller.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum ControllerCommand {
@@ -221,4 +233,17 @@ pub struct CommandReply {
     pub accepted: bool,
     /// Why not, or what happens next.
     pub reason: String,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_text_is_about_names_and_not_about_numbers() {
+        let text = "detector `ground1` is 1.2 m beside `air 2`";
+        assert_eq!(matter(text), "detector `ground1` is . m beside `air 2`");
+        assert_eq!(matter(text), matter("detector `ground1` is 30.45 m beside `air 2`"));
+        assert_ne!(matter(text), matter("detector `ground2` is 1.2 m beside `air 2`"));
+    }
 }

@@ -29,7 +29,7 @@ pub use camera::{
 pub use codec::{DecodeError, Message, decode, encode};
 pub use controller::{
     Candidate, CommandReply, ControllerCommand, ControllerStatus, DetectorState, Phase, Setpoint,
-    TargetEstimate,
+    TargetEstimate, matter,
 };
 pub use detector::{
     AlternativePose, Detection, Detections, DetectorCommand, DetectorInfo, MarkerPose, Place,
