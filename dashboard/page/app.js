@@ -354,8 +354,10 @@ function lookAtAges() {
   const nowOld = known.now ? since(at, known.nowAt, known.now.now_ms) : Infinity;
   const slowOld = known.slow ? since(at, known.slowAt, known.slow.now_ms) : Infinity;
   for (const panel of document.querySelectorAll('[data-group]')) {
-    const group = known.now?.[/** @type {HTMLElement} */ (panel).dataset.group ?? ''];
-    const old = group ? group.age_ms + nowOld : null;
+    const names = (/** @type {HTMLElement} */ (panel).dataset.group ?? '').split(' ');
+    const ages = names.map((name) => known.now?.[name]?.age_ms);
+    // A panel that shows several things is as old as the oldest.
+    const old = ages.includes(undefined) ? null : Math.max(...ages) + nowOld;
     const isStale = old === null || old > STALE_MS;
     panel.classList.toggle('stale', isStale);
     const label = panel.querySelector('.age');

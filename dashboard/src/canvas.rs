@@ -13,7 +13,7 @@ const UNSEEN: u8 = 128;
 
 /// The picture of one camera.
 #[derive(Debug, Default)]
-pub(super) struct Canvas {
+pub(crate) struct Canvas {
     image: GrayImage,
     /// The frames' size, and by how much the picture is smaller.
     frame: [u32; 2],
@@ -26,7 +26,7 @@ impl Canvas {
     ///
     /// # Errors
     /// What is wrong with it.
-    pub(super) fn draw(
+    pub(crate) fn draw(
         &mut self,
         header: &FrameHeader,
         bytes: &[u8],

@@ -33,7 +33,7 @@ use crate::motion;
 use crate::nonce::Nonce;
 use crate::state::State;
 use crate::tokens::{Kind, SESSION_S, Sessions, Tokens, secret, usual_file};
-use crate::video::Shown;
+use crate::video::{Pictures, Shown};
 use crate::window::Window;
 
 /// The files of the page: path, type, contents.
@@ -85,7 +85,7 @@ pub(crate) struct App {
     sessions: Mutex<Sessions>,
     state: Arc<Mutex<State>>,
     texts: Texts,
-    shown: Arc<watch::Sender<Option<Shown>>>,
+    pictures: Pictures,
     clients: Arc<Semaphore>,
     viewers: Arc<Semaphore>,
 }
@@ -109,7 +109,7 @@ impl App {
         address: SocketAddr,
         state: Arc<Mutex<State>>,
         texts: Texts,
-        shown: Arc<watch::Sender<Option<Shown>>>,
+        pictures: Pictures,
     ) -> anyhow::Result<Arc<Self>> {
         let commands = node::named(&config.commands).map_err(anyhow::Error::msg)?;
         let max_clients = config.max_clients as usize;
@@ -122,7 +122,7 @@ impl App {
             sessions: Mutex::default(),
             state,
             texts,
-            shown,
+            pictures,
             clients: Arc::new(Semaphore::new(max_clients)),
             viewers: Arc::new(Semaphore::new(max_clients)),
         }))
@@ -318,7 +318,7 @@ async fn motion_jpeg(
 ) -> Response {
     let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
     match std::future::ready(app.access(peer, &headers).and(permit)).await {
-        Ok(permit) => motion::answer(app.shown.subscribe(), connection, permit),
+        Ok(permit) => motion::answer(app.pictures.files.subscribe(), connection, permit),
         Err(refusal) => app.refuse(refusal),
     }
 }
@@ -335,7 +335,7 @@ async fn send(socket: &mut WebSocket, message: Message) -> anyhow::Result<()> {
 
 /// Sends pictures, the newest that there is whenever the browser has drawn one.
 async fn pictures(app: Arc<App>, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
-    let mut shown = app.shown.subscribe();
+    let mut shown = app.pictures.shown.subscribe();
     // The newest picture is an old one when the camera stands still.
     let newest_ns = shown.borrow().as_ref().map(|it| it.at_ns);
     if newest_ns.is_some_and(|at_ns| now_ns() - at_ns <= MAX_FIRST_AGE_NS) {

@@ -8,13 +8,13 @@ use anyhow::Context;
 use messages::topic;
 use node::{Node, Shutdown, clock_name, now_ns};
 use tokio::net::TcpListener;
-use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::config::Config;
+use crate::motion;
 use crate::server::{App, Texts, serve};
 use crate::state::{Input, State};
-use crate::video::Video;
+use crate::video::{Pictures, Video};
 
 /// Period of what changes with each frame.
 const NOW_PERIOD: Duration = Duration::from_millis(100);
@@ -37,11 +37,13 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     })?;
     let state = Arc::new(Mutex::new(State::new(clock_name())));
     let texts = Texts::default();
-    let shown = Arc::new(watch::Sender::new(None));
-    let video =
-        Video::new(node.clone(), config.video.clone(), Arc::clone(&state), Arc::clone(&shown));
+    let pictures = Pictures::default();
+    let shown = Arc::clone(&pictures.shown);
+    let video = Video::new(node.clone(), config.video.clone(), Arc::clone(&state), shown);
+    let motion = motion::run(node.clone(), pictures.clone(), config.video.jpeg_quality);
     let address = listener.local_addr().context("the address of the page")?;
-    let app = App::new(node.clone(), &config, address, Arc::clone(&state), texts.clone(), shown)?;
+    let app =
+        App::new(node.clone(), &config, address, Arc::clone(&state), texts.clone(), pictures)?;
     node.announce().await?;
     tracing::info!("The page is at http://{address}/");
     if !address.ip().is_loopback() {
@@ -54,6 +56,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         result = tell(&state, &texts) => result,
         result = measure(&node, &state) => result,
         result = video.run() => result,
+        result = motion => result,
         result = stream(node.clone(), &config, Arc::clone(&state)) => result,
         never = serve(listener, app) => match never {},
         () = shutdown.requested() => Ok(()),

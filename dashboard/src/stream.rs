@@ -1,6 +1,5 @@
 //! Pictures as H.264 over RTP, for QGroundControl.
 
-mod canvas;
 mod encoder;
 mod rtp;
 
@@ -13,11 +12,11 @@ use messages::{FrameHeader, topic};
 use node::{Frame, Node, clock_name, now_ns};
 use tokio::net::UdpSocket;
 
+use crate::canvas::Canvas;
 use crate::config::{Input, VideoConfig};
+use crate::rate::Rate;
 use crate::state::State;
-use crate::video::MAX_EARLY;
 
-use canvas::Canvas;
 use encoder::Encoder;
 use rtp::Packetizer;
 
@@ -60,8 +59,7 @@ impl Stream {
         let socket = UdpSocket::bind(any).await.context("opening a socket for the stream")?;
         let frames = self.node.frame_subscriber(topic, &[]).await?;
         tracing::info!(%to, "Pictures are sent as H.264 over RTP");
-        let min_period_ns = ((1.0 - MAX_EARLY) * 1e9 / self.config.max_hz) as i64;
-        let mut last_ns = None;
+        let mut rate = Rate::new(self.config.max_hz);
         let mut maker = Maker {
             canvas: Canvas::default(),
             encoder: Encoder::new(self.config.rtp_kbit_s, self.config.max_hz),
@@ -71,11 +69,10 @@ impl Stream {
         loop {
             let frame = frames.next().await.context("the network session was closed")?;
             let began_ns = now_ns();
-            let is_due = last_ns.is_none_or(|last_ns| began_ns - last_ns >= min_period_ns);
-            if !is_due || !self.is_wanted(&frame.header) {
+            if !rate.is_due(began_ns) || !self.is_wanted(&frame.header) {
                 continue;
             }
-            last_ns = Some(began_ns);
+            rate.take(began_ns);
             // Another host's clock says nothing here, so that frame's time is its arrival.
             let is_own_clock = frame.header.clock == clock_name();
             let taken_ns = if is_own_clock { frame.header.stamp_ns } else { began_ns };

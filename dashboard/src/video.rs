@@ -14,14 +14,13 @@ use tokio::time::{Instant, interval, sleep, sleep_until, timeout};
 
 use crate::config::{Input, VideoConfig};
 use crate::pairing::{Pairing, Picture};
+use crate::rate::Rate;
 use crate::state::State;
 
 /// Period in which somebody who begins to look is noticed.
-const LOOK_PERIOD: Duration = Duration::from_millis(100);
+pub(crate) const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// Frames are received for this time after the last browser has gone: one that loads the page again needs no new start.
 const LINGER: Duration = Duration::from_secs(2);
-/// Share of the period of pictures by which a frame may be early, as frames come unevenly.
-pub(crate) const MAX_EARLY: f64 = 0.3;
 /// Maximum size of a picture, in bytes.
 const MAX_BYTES: usize = 16_000_000;
 /// Maximum number of markers that are drawn.
@@ -36,8 +35,19 @@ pub(crate) struct Shown {
     pub(crate) at_ns: i64,
     /// The length of the header (4 bytes, lowest first), the header as JSON, the JPEG files.
     pub(crate) message: Bytes,
-    /// The JPEG file of the whole picture; `None` for one that came in several parts.
-    pub(crate) jpeg: Option<Bytes>,
+    /// The header of its frame.
+    pub(crate) header: FrameHeader,
+    /// The JPEG files, one for each part of the frame.
+    pub(crate) files: Bytes,
+}
+
+/// The newest picture, for all who look.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Pictures {
+    /// For the page.
+    pub(crate) shown: Arc<watch::Sender<Option<Shown>>>,
+    /// As one JPEG file, for programs that know only Motion JPEG.
+    pub(crate) files: Arc<watch::Sender<Option<Bytes>>>,
 }
 
 /// Makes pictures while somebody looks.
@@ -80,8 +90,7 @@ impl Video {
         let frames = self.node.frame_subscriber(topic, &[]).await?;
         let told = self.node.subscriber(topic::DETECTIONS, &[]).await?;
         let mut pairing = Pairing::new(i64::from(self.config.hold_ms) * 1_000_000);
-        let min_period_ns = ((1.0 - MAX_EARLY) * 1e9 / self.config.max_hz) as i64;
-        let mut last_ns = None;
+        let mut rate = Rate::new(self.config.max_hz);
         let mut look = interval(LOOK_PERIOD);
         let mut watched = Instant::now();
         loop {
@@ -104,9 +113,8 @@ impl Video {
                 () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {}
                 frame = frames.next() => {
                     let frame = frame.context("the network session was closed")?;
-                    let is_due = last_ns.is_none_or(|last_ns| now_ns() - last_ns >= min_period_ns);
-                    if is_due && self.is_wanted(&frame.header) {
-                        last_ns = Some(now_ns());
+                    if rate.is_due(now_ns()) && self.is_wanted(&frame.header) {
+                        rate.take(now_ns());
                         self.add(frame, &mut pairing).await?;
                         // What was told while the picture was made is there before the picture's wait ends.
                         while let Ok(found) = timeout(Duration::ZERO, told.next_with_key()).await {
@@ -170,8 +178,9 @@ impl Video {
             self.node.health().dropped("picture without detections in time");
         }
         let message = Bytes::from(message);
-        let jpeg = is_one_file(&picture.header).then(|| message.slice(4 + header.len()..));
-        self.shown.send_replace(Some(Shown { number: self.number, at_ns, message, jpeg }));
+        let files = message.slice(4 + header.len()..);
+        let header = picture.header.clone();
+        self.shown.send_replace(Some(Shown { number: self.number, at_ns, message, header, files }));
     }
 
     // What is known is whole after each message, also when a thread panics.
@@ -191,18 +200,6 @@ fn files(header: &FrameHeader, bytes: &[u8], quality: u8) -> Option<Vec<u8>> {
     let told: u64 = header.parts.iter().map(|part| u64::from(part.bytes)).sum();
     let is_whole = header.parts.is_empty() || told == bytes.len() as u64;
     is_whole.then(|| jpeg(header, bytes, quality)).flatten()
-}
-
-/// Whether one file shows the whole frame.
-fn is_one_file(header: &FrameHeader) -> bool {
-    match header.parts.as_slice() {
-        [] => true,
-        [part] => {
-            let shown = [part.width, part.height].map(|edge| edge.saturating_mul(part.scale));
-            [part.x, part.y] == [0, 0] && shown[0] >= header.width && shown[1] >= header.height
-        }
-        _ => false,
-    }
 }
 
 fn header_json(number: u64, at_ns: i64, picture: &Picture, clock: &str) -> Value {
