@@ -377,18 +377,16 @@ impl State {
         names.into_iter().map(row).collect()
     }
 
-    /// The rate of the frames of the camera in use, or of any while it is not known. A camera's service has its name; the
-    /// simulator's has not.
+    /// The rate of the frames of the camera in use, or of any while it is not known. A camera's service has the camera's name;
+    /// others that make frames need not.
     fn frames_hz(&self) -> Option<f64> {
         let camera = self.camera();
-        let makers = || {
-            let heard = self.services.iter().filter(|(_, it)| !it.is_silent);
-            heard.filter(|((service, _), _)| ["camera-pub", "simulator"].contains(&&**service))
-        };
         let is_in_use = |instance: &str| camera == Some(instance);
-        let is_known =
-            self.services.keys().any(|(service, it)| service == "camera-pub" && is_in_use(it));
-        let mut wanted = makers().filter(|((_, instance), _)| !is_known || is_in_use(instance));
+        // A detector counts the frames that it searched.
+        let makers = || self.services.iter().filter(|((service, _), _)| service != "detector");
+        let is_known = makers().any(|((_, instance), _)| is_in_use(instance));
+        let heard = makers().filter(|(_, it)| !it.is_silent);
+        let mut wanted = heard.filter(|((_, instance), _)| !is_known || is_in_use(instance));
         wanted.find_map(|(_, it)| {
             it.health.rates.iter().find(|rate| rate.name == "frames").map(|rate| rate.hz)
         })
