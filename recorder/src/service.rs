@@ -43,7 +43,9 @@ const OTHER_KEYS: &str = "other keys";
 pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Result<()> {
     node.claim_unique_name(&config.id).await?;
     let frames = node::named(&config.frames).map_err(anyhow::Error::msg)?;
-    let wanted: Vec<Row> = TOPICS.iter().copied().filter(|row| is_wanted(row, frames)).collect();
+    let has_file = config.has_file();
+    let wanted = TOPICS.iter().copied().filter(|row| is_wanted(row, frames, has_file));
+    let wanted: Vec<Row> = wanted.collect();
     let live = Live::listen(&node, &config).await?;
     let max_waiting_bytes = config.max_waiting_mb as usize * 1_000_000 / 2;
     let tap = node.tap(&wanted, max_waiting_bytes).await?;
@@ -90,8 +92,9 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
 }
 
 /// Whether a topic is subscribed to. JPEG and rectified frames and a detector's debug images are made only while somebody
-/// subscribes, and would cost those time.
-fn is_wanted(row: &Row, frames: Frames) -> bool {
+/// subscribes, and would cost those time. The tape, which a controller keeps for the first who asks, is of use in a file only.
+fn is_wanted(row: &Row, frames: Frames, has_file: bool) -> bool {
+    let is_tape = row.key == topic::TAPE.key(&[]);
     let is_frame = row.key == topic::FRAME.key(&["{camera}"]);
     let is_made_on_demand = [
         topic::JPEG.key(&["{camera}"]),
@@ -99,6 +102,7 @@ fn is_wanted(row: &Row, frames: Frames) -> bool {
         topic::DEBUG_IMAGE.key(&["{detector}", "{image}"]),
     ];
     row.delivery != Delivery::Query
+        && (has_file || !is_tape)
         && !is_made_on_demand.iter().any(|key| key == row.key)
         && (frames != Frames::None || !is_frame)
 }
@@ -186,8 +190,10 @@ impl Recorder {
 
     /// Keeps a message, or counts it as lost; offers it to those who follow.
     fn take(&mut self, message: Tapped) {
+        let before_bytes = self.ending_bytes();
         let waiting_bytes = self.recording.as_ref().map(|it| it.status().waiting_bytes);
-        let has_room = waiting_bytes.is_some_and(|bytes| bytes <= self.max_waiting_bytes);
+        let has_room =
+            waiting_bytes.is_some_and(|bytes| bytes + before_bytes <= self.max_waiting_bytes);
         let is_followed = self
             .live
             .as_mut()
@@ -221,6 +227,11 @@ impl Recorder {
         }
     }
 
+    /// What waits of the file before.
+    fn ending_bytes(&self) -> usize {
+        self.ending.as_ref().map_or(0, |ending| ending.status().waiting_bytes)
+    }
+
     fn lose(&mut self, key: String, count: u64) {
         let is_known = self.lost.len() < MAX_KEYS || self.lost.contains_key(&key);
         let key = if is_known { key } else { OTHER_KEYS.to_owned() };
@@ -237,13 +248,6 @@ impl Recorder {
         if !self.config.has_file() {
             return;
         }
-        let is_due = self.retry.is_none_or(|retry| Instant::now() >= retry);
-        if self.recording.is_none() && is_due {
-            match self.begin() {
-                Ok(recording) => self.recording = Some(recording),
-                Err(problem) => self.give_up(&format!("{problem:#}")),
-            }
-        }
         match self.write_out() {
             Ok(()) => {}
             Err(problem) => self.give_up(&format!("{problem:#}")),
@@ -254,6 +258,14 @@ impl Recorder {
             if let Some(problem) = problem {
                 self.health.failed("the file failed");
                 tracing::error!(problem, "The end of a recording is missing");
+            }
+        }
+        // At last, so that a full file is followed by the next before another message comes.
+        let is_due = self.retry.is_none_or(|retry| Instant::now() >= retry);
+        if self.recording.is_none() && is_due {
+            match self.begin() {
+                Ok(recording) => self.recording = Some(recording),
+                Err(problem) => self.give_up(&format!("{problem:#}")),
             }
         }
     }
@@ -279,9 +291,11 @@ impl Recorder {
     }
 
     fn write_out(&mut self) -> anyhow::Result<()> {
+        let before_bytes = self.ending_bytes();
         let Some(recording) = &mut self.recording else { return Ok(()) };
         let lost = self.lost.values().sum();
-        let has_room = recording.status().waiting_bytes <= self.max_waiting_bytes;
+        let waiting_bytes = recording.status().waiting_bytes + before_bytes;
+        let has_room = waiting_bytes <= self.max_waiting_bytes;
         if recording.hand_over()? && has_room && self.lost_in_file != Some(lost) {
             // On the disk with the next flush; the sums of a file that is not flushed again are those of the one before.
             recording.writer.dropped(now_ns(), &self.lost)?;
@@ -303,7 +317,7 @@ impl Recorder {
         }
         status.file = disk.path.map_or_else(String::new, |path| path.display().to_string());
         status.bytes = disk.bytes;
-        status.waiting_bytes = disk.waiting_bytes as u64;
+        status.waiting_bytes = (disk.waiting_bytes + before_bytes) as u64;
         status.kept = self.kept;
         let losses = self.lost.iter().map(|(key, count)| (key.clone(), *count));
         status.dropped = losses.map(|(key, count)| RecorderLoss { key, count }).collect();
