@@ -37,7 +37,9 @@ fn main() -> Result<()> {
     println!("{cuts} cuts: every whole chunk recovered ({:.0} s)", began.elapsed().as_secs_f64());
     let began = Instant::now();
     let mut random = 1_u64;
-    let (mut named, mut refused) = (0, 0);
+    let (mut named, mut refused, mut unchanged) = (0, 0, 0);
+    let mut first = Vec::new();
+    let all = repair(&whole, &mut first)?;
     for _ in 0..flips {
         // Numerical Recipes' generator: any will do.
         random =
@@ -45,19 +47,26 @@ fn main() -> Result<()> {
         let bit = (random >> 16) as usize % (8 * whole.len());
         let mut damaged = whole.clone();
         damaged[bit / 8] ^= 1 << (bit % 8);
-        let Ok(found) = repair(&damaged, std::io::sink()) else {
+        let mut copy = Vec::new();
+        let Ok(found) = repair(&damaged, &mut copy) else {
             refused += 1;
             continue;
         };
-        named += u64::from(!found.damage.is_empty());
+        if !found.damage.is_empty() {
+            named += 1;
+        } else if found == all && copy == first {
+            unchanged += 1;
+        } else {
+            return Err(format!("bit {bit}: {found:?} is not named, and {all:?} was there").into());
+        }
         let before = ends.iter().filter(|end| **end <= bit / 8).count() as u64;
         if found.chunks < before {
             return Err(format!("bit {bit}: {found:?}, {before} are whole").into());
         }
     }
     println!(
-        "{flips} flips: every chunk before them recovered; {named} named, {refused} in the magic bytes, the others in what \
-         is made anew ({:.0} s)",
+        "{flips} flips: every chunk before them recovered; {named} named, {refused} in the magic bytes, {unchanged} not named \
+         and the copy the same byte by byte ({:.0} s)",
         began.elapsed().as_secs_f64()
     );
     Ok(())

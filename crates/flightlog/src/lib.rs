@@ -6,7 +6,8 @@
 //!
 //! Modules in reading order: [`protobuf`] describes and encodes messages, [`foxglove`] has those of Foxglove,
 //! [`channel`] says what a record is and keeps messages as they came and as JSON, [`display`] as Foxglove shows them;
-//! [`live`] offers the latter to programs that follow a flight; [`writer`] puts both into a file, [`mod@repair`] ends a file properly whose writer was killed,
+//! [`live`] offers the latter to programs that follow a flight; [`writer`] puts both into a file; `records` goes through one,
+//! [`mod@repair`] ends a file properly whose writer was killed,
 //! [`reader`] reads one as far as it is whole, and [`tape`] the controllers' tapes.
 
 pub mod channel;
@@ -15,6 +16,7 @@ pub mod foxglove;
 pub mod live;
 pub mod protobuf;
 pub mod reader;
+mod records;
 pub mod repair;
 pub mod tape;
 pub mod writer;

@@ -3,12 +3,12 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use mcap::read::{LinearReader, Options};
 use mcap::records::{MessageHeader, Record};
 use mcap::{Channel, McapError, Summary};
 
 use crate::channel::{RAW_PREFIX, Received, split_raw};
-use crate::repair::{contained, records_of};
+use crate::records::{Records, contained, records_of};
+use crate::repair::DIFFERS;
 use crate::writer::{DROPPED_CHANNEL, METADATA, Problem};
 
 /// Something that a recording has.
@@ -51,9 +51,8 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
         each,
     };
     let mut chunks = 0;
-    let options = Options::IgnoreEndMagic.into();
-    let mut reader = LinearReader::new_with_options(recording, options)?;
-    while let Some(record) = contained(|| reader.next().transpose()).transpose() {
+    let mut records = Records::new(recording);
+    for (opcode, record) in &mut records {
         match record {
             Ok(Record::Metadata(metadata)) if metadata.name == METADATA => {
                 found.about(metadata.metadata);
@@ -68,22 +67,31 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
                     }
                 }
             }
-            Ok(Record::DataEnd(_)) => {
-                found.reading.is_ended = true;
-                break;
-            }
-            Ok(_) => {}
-            Err(problem) => {
-                let text = format!("unreadable after {chunks} chunks: {problem}");
+            Ok(
+                Record::Header(_)
+                | Record::MessageIndex(_)
+                | Record::Metadata(_)
+                | Record::Attachment { .. },
+            ) => {}
+            // Everything else is inside of chunks.
+            Ok(_) => {
+                let text = format!("an unexpected record ({opcode}) after {chunks} chunks");
                 found.reading.damage.push(text);
-                break;
+            }
+            Err(problem) => {
+                let text = format!("a record after {chunks} chunks is damaged: {problem}");
+                found.reading.damage.push(text);
             }
         }
     }
+    found.reading.is_ended = records.is_ended();
     if found.lost > 0 {
         let text =
             format!("{} messages are lost: what describes their channel is damaged", found.lost);
         found.reading.damage.push(text);
+    }
+    if records.differs() && found.reading.damage.is_empty() {
+        found.reading.damage.push(DIFFERS.to_owned());
     }
     Ok(found.reading)
 }
@@ -218,5 +226,37 @@ mod tests {
         assert!(some.len() > 40, "{}", some.len());
         assert!(!reading.damage.is_empty());
         assert!(read(b"no file", |_| {}).is_err());
+    }
+
+    #[test]
+    fn one_flipped_bit_anywhere_before_the_end_is_named() {
+        let file = recording();
+        let (_, _, whole) = times(&file);
+        // Where the record that ends the data begins, which has no checksum itself.
+        let end = mcap::read::footer(&file).unwrap().summary_start as usize - 13;
+        // The magic bytes say what it is; every sixth bit, so that each place of a byte is among them.
+        for bit in (8 * mcap::MAGIC.len()..8 * end).step_by(7) {
+            let mut flipped = file.clone();
+            flipped[bit / 8] ^= 1 << (bit % 8);
+            let reading = read(&flipped, |_| {}).unwrap();
+            assert!(!reading.damage.is_empty() || !reading.is_ended, "bit {bit}: {reading:?}");
+            let repaired = crate::repair(&flipped, std::io::sink()).unwrap();
+            assert!(!repaired.damage.is_empty(), "bit {bit}: {repaired:?}");
+        }
+        // A record of an index that a bit makes an end of the data ends nothing.
+        let mut at = mcap::MAGIC.len();
+        let mut tried = 0;
+        while at < end {
+            let length = u64::from_le_bytes(file[at + 1..at + 9].try_into().unwrap()) as usize;
+            if file[at] == mcap::records::op::MESSAGE_INDEX {
+                let mut flipped = file.clone();
+                flipped[at] = mcap::records::op::DATA_END;
+                let reading = read(&flipped, |_| {}).unwrap();
+                assert_eq!((reading.messages, reading.damage.len()), (whole.messages, 1));
+                tried += 1;
+            }
+            at += 9 + length;
+        }
+        assert!(tried > 20, "{tried}");
     }
 }

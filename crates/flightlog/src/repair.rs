@@ -2,15 +2,18 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::Write;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
-use mcap::read::{ChunkReader, parse_record};
-use mcap::records::{ChunkHeader, Record};
+use mcap::records::Record;
 use mcap::write::{NoSeek, WriteOptions};
 use mcap::{Attachment, Channel, McapError, Summary};
 
+use crate::records::{Records, contained, records_of};
 use crate::writer::Problem;
+
+/// The damage of a file of which nothing else is known to be damaged.
+pub(crate) const DIFFERS: &str =
+    "something before its end is damaged, by its checksum; what it is could not be found";
 
 /// What a repair found.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -43,12 +46,10 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
         lost: BTreeMap::new(),
         found: Repaired::default(),
     };
-    let mut is_ended = false;
-    let mut rest = &recording[mcap::MAGIC.len()..];
-    while let Some((opcode, body, after)) = next_record(rest) {
-        rest = after;
+    let mut records = Records::new(recording);
+    for (opcode, record) in &mut records {
         let chunks = copy.found.chunks;
-        match contained(|| parse_record(opcode, body)) {
+        match record {
             Ok(Record::Chunk { header, data }) => match records_of(header, &data) {
                 Ok(records) => copy.chunk(records)?,
                 Err(problem) => copy
@@ -56,10 +57,6 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
                     .damage
                     .push(format!("the chunk after {chunks} whole ones is damaged: {problem}")),
             },
-            Ok(Record::DataEnd(_)) => {
-                is_ended = true;
-                break;
-            }
             Ok(Record::Metadata(metadata)) => copy.mcap.write_metadata(&metadata)?,
             Ok(Record::Attachment { header, data, .. }) => copy.mcap.attach(&Attachment {
                 log_time: header.log_time,
@@ -85,7 +82,7 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
     found.damage.extend(lost.into_iter().map(|(channel, messages)| {
         format!("{messages} messages of channel {channel} are lost: what describes it is damaged")
     }));
-    if !is_ended {
+    if !records.is_ended() {
         let chunks = found.chunks;
         found.damage.push(format!(
             "not ended: what came after {chunks} whole chunks is missing; of a recorder that was killed that is half a second"
@@ -93,30 +90,11 @@ pub fn repair<W: Write>(recording: &[u8], output: W) -> Result<Repaired, Problem
     } else if index.is_none() {
         found.damage.push("its index is damaged or missing".to_owned());
     }
+    if records.differs() && found.damage.is_empty() {
+        found.damage.push(DIFFERS.to_owned());
+    }
     mcap.finish()?;
     Ok(found)
-}
-
-/// The records of a chunk.
-///
-/// # Errors
-/// When it is damaged.
-pub(crate) fn records_of(header: ChunkHeader, data: &[u8]) -> Result<Vec<Record<'_>>, Problem> {
-    contained(|| ChunkReader::new(header, data)?.collect())
-}
-
-/// What `read` returns; an error too when the reader panics, as it does on some damage.
-pub(crate) fn contained<T>(read: impl FnOnce() -> Result<T, McapError>) -> Result<T, Problem> {
-    let read = catch_unwind(AssertUnwindSafe(read));
-    read.map_err(|_| Problem::Senseless)?.map_err(Problem::from)
-}
-
-/// The next record's kind and bytes, and what comes after it; `None` where it does not end.
-fn next_record(bytes: &[u8]) -> Option<(u8, &[u8], &[u8])> {
-    let (opcode, rest) = bytes.split_first()?;
-    let (length, rest) = rest.split_first_chunk::<8>()?;
-    let (body, after) = rest.split_at_checked(u64::from_le_bytes(*length).try_into().ok()?)?;
-    Some((*opcode, body, after))
 }
 
 /// A copy that is being made.

@@ -44,13 +44,27 @@ impl TapeReader {
     pub fn take(&mut self, payload: &[u8]) {
         match decode::<Tape>(payload) {
             Ok(tape) => self.push(tape),
-            Err(problem) => self.damage.push(problem.to_string()),
+            Err(problem) => self.note(format!("a part of a tape cannot be read: {problem}")),
         }
     }
 
-    /// Adds a part of a tape.
+    /// Adds a part of a tape. Of two that are of the same place in it, and differ, the first is kept.
     pub fn push(&mut self, tape: Tape) {
-        self.parts.entry(tape.begun_ns).or_default().insert(tape.first, tape);
+        let begun_ns = tape.begun_ns;
+        let parts = self.parts.entry(begun_ns).or_default();
+        let known = parts.entry(tape.first).or_insert_with(|| tape.clone());
+        if *known != tape {
+            self.note(format!(
+                "two tapes that began at the same time ({begun_ns} ns) differ: they are of two flights, which are read one by one"
+            ));
+        }
+    }
+
+    /// Notes damage, each once.
+    fn note(&mut self, damage: String) {
+        if !self.damage.contains(&damage) {
+            self.damage.push(damage);
+        }
     }
 
     /// True when there is no tape.
@@ -136,5 +150,16 @@ mod tests {
         assert!(!one.shares_tape_with(&reader(3, &[0], b"other")), "another flight");
         assert!(!one.shares_tape_with(&reader(4, &[0, 5], b"one")));
         assert!(!one.shares_tape_with(&TapeReader::default()));
+        let mut both = reader(3, &[0, 5], b"one");
+        let again = |first, records: &[u8]| {
+            let records = records.to_vec();
+            Tape { begun_ns: 3, first, records, ..Tape::default() }
+        };
+        both.push(again(5, b"one"));
+        assert!(both.damage().is_empty(), "a second file has the same part");
+        both.push(again(5, b"other"));
+        both.push(again(0, b"other"));
+        assert_eq!(both.damage().len(), 1, "{:?}", both.damage());
+        assert!(both.tapes()[0].parts.iter().all(|part| part.records == b"one"));
     }
 }
