@@ -187,6 +187,7 @@ impl FlightReader {
     /// The flight.
     pub fn finish(self) -> Flight {
         let Self { mut flight, tapes } = self;
+        flight.damage.extend_from_slice(tapes.damage());
         flight.tapes = tapes.tapes();
         flight.set_shift();
         flight.sort();
@@ -385,6 +386,9 @@ impl Flight {
         order(&mut self.truth, |it| it.stamp_ns);
         order(&mut self.wind, |it| it.stamp_ns);
         self.found.sort_by_key(|it| it.received_ns);
+        self.packets.received_ns.sort_unstable();
+        self.packets.power.sort_by_key(|it| it.received_ns);
+        self.packets.texts.sort_by_key(|it| it.received_ns);
         for frames in self.frames.values_mut() {
             order(frames, |it| it.stamp_ns);
         }

@@ -1,5 +1,6 @@
 //! The charts of a flight. Those of two flights are the same, one by one, so that their axes can be shared.
 
+use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
 use crate::chart::{At, Axes, Chart, Ink, Layer, Shape, at, layer, span};
@@ -10,6 +11,8 @@ use crate::view::{View, component, unbridged};
 
 /// Height of a chart over time, as shown, in pixels.
 const HEIGHT: u32 = 270;
+/// Times beyond this are of no flight, in seconds.
+const MAX_SECOND: f64 = 1e6;
 /// Number of ellipses of uncertainty in the view from above.
 const CIRCLES: usize = 14;
 /// Names of the axes of local NED.
@@ -151,6 +154,7 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
     // What the estimate claims before it knows much would flatten the rest.
     let most = span(error.iter().map(|it| it.y), 0.0..0.05).end;
     let most = if error.is_empty() { f64::INFINITY } else { 2.0 * most };
+    let is_cut = deviation.iter().any(|point| point.y > most);
     for point in &mut deviation {
         point.y = point.y.min(most);
     }
@@ -163,10 +167,12 @@ pub fn height(view: &View<'_>) -> Vec<Chart> {
         over_time(view, "Horizontal distance from the pad", "m", lateral),
         over_time(view, "Horizontal error of the estimate", "m", errors),
     ];
-    if view.errors.is_empty()
-        && let Some(chart) = charts.last_mut()
-    {
-        chart.note = "truth was not recorded".to_owned();
+    if let Some(chart) = charts.last_mut() {
+        if view.errors.is_empty() {
+            chart.note = "truth was not recorded".to_owned();
+        } else if is_cut {
+            chart.note = format!("the claim is cut at {most:.2} m");
+        }
     }
     charts
 }
@@ -291,14 +297,8 @@ pub fn battery(view: &View<'_>) -> Vec<Chart> {
     let voltage = view.curve(&flight.packets.power, |it| {
         Some(at(flight.at_s(flight.vehicle_ns(it.received_ns)), it.voltage_v?))
     });
-    let mut packets: Vec<At> = Vec::new();
-    for received_ns in &flight.packets.received_ns {
-        let second = flight.at_s(flight.vehicle_ns(*received_ns)).floor() + 0.5;
-        match packets.last_mut() {
-            Some(last) if last.x >= second => last.y += 1.0,
-            _ => packets.push(at(second, 1.0)),
-        }
-    }
+    let received = flight.packets.received_ns.iter();
+    let mut packets = per_second(received.map(|ns| flight.at_s(flight.vehicle_ns(*ns))));
     packets.retain(|point| view.is_shown(point.x));
     let line = |name: &str, ink, points| vec![layer(name, ink, Shape::Line, points)];
     let mut voltage =
@@ -318,6 +318,19 @@ pub fn battery(view: &View<'_>) -> Vec<Chart> {
             line("packets a second", Ink::Blue, packets),
         ),
     ]
+}
+
+/// How many times there are in each second, from that of the first to that of the last: none in a second is 0.
+fn per_second(times_s: impl Iterator<Item = f64>) -> Vec<At> {
+    let mut counts = BTreeMap::new();
+    for second in times_s.filter(|it| it.abs() < MAX_SECOND).map(|it| it.floor() as i64) {
+        *counts.entry(second).or_insert(0_u32) += 1;
+    }
+    let (Some(first), Some(last)) = (counts.keys().next(), counts.keys().next_back()) else {
+        return Vec::new();
+    };
+    let count = |second| counts.get(&second).copied().map_or(0.0, f64::from);
+    (*first..=*last).map(|second| at(second as f64 + 0.5, count(second))).collect()
 }
 
 /// Figures 4.10 to 4.16 of the thesis.

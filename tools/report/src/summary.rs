@@ -86,7 +86,9 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
         flight.statuses.iter().find_map(|status| status.started_ns).map(|_| flight.at_s(stamp_ns))
     };
     let disarmed_ns = flight.statuses.iter().find_map(|status| status.disarmed_ns);
-    let touchdown = flight.truth.iter().find_map(|truth| truth.touchdown);
+    // A simulator tells the last touchdown until the next.
+    let touchdowns = flight.truth.iter().filter_map(|truth| truth.touchdown);
+    let touchdown = touchdowns.into_iter().find(|it| it.stamp_ns >= flight.zero_ns);
     let of_landing = flight.vehicle.iter().filter(|it| it.stamp_ns >= flight.zero_ns);
     let standing = of_landing.skip_while(|it| it.landed != LandedState::InAir);
     let standing_ns =

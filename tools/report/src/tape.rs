@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 
 use messages::{ControllerStatus, TapeEvent, TargetEstimate, VehicleState};
-use replay::{End, run, verify};
+use replay::{Verdict, run, verify};
 
 use crate::flight::{Flight, Replayed};
 
@@ -18,15 +18,16 @@ pub fn replay_tapes(flight: &mut Flight) {
     let mut texts = Vec::new();
     let mut is_verified = true;
     let is_alone = flight.statuses.is_empty();
+    let lacks = is_alone || flight.vehicle.is_empty() || flight.targets.is_empty();
     let mut rebuilt = Rebuilt::default();
     for tape in &flight.tapes {
         let (is_whole, text) = match verify(tape, &[]) {
-            Ok(verdict) => (verdict.is_verified(), told(&verdict.end)),
+            Ok(verdict) => (verdict.is_verified(), told(&verdict)),
             Err(problem) => (false, format!("the tape cannot be replayed: {problem:#}")),
         };
         is_verified &= is_whole;
         texts.push(text);
-        if is_alone {
+        if lacks {
             // What does not verify was told above; what comes before it is rebuilt.
             let _ = run(tape, &[], |step| {
                 rebuilt.take(step.recorded.now_ns, &step.recorded.event, step.flight);
@@ -41,12 +42,12 @@ pub fn replay_tapes(flight: &mut Flight) {
         flight.is_rebuilt = true;
         flight.statuses = rebuilt.statuses;
         flight.set_zero();
-        if flight.targets.is_empty() {
-            flight.targets = rebuilt.targets;
-        }
-        if flight.vehicle.is_empty() {
-            flight.vehicle = rebuilt.vehicle;
-        }
+    }
+    if flight.targets.is_empty() {
+        flight.targets = rebuilt.targets;
+    }
+    if flight.vehicle.is_empty() {
+        flight.vehicle = rebuilt.vehicle;
     }
 }
 
@@ -85,15 +86,37 @@ impl Rebuilt {
 }
 
 /// A verdict as a sentence.
-fn told(end: &End) -> String {
+fn told(verdict: &Verdict) -> String {
+    let Verdict { end, other_state } = verdict;
     let theirs = format!("{} {}", end.program, end.build);
     let ours = format!("{} {}", controller::tape::program(), controller::tape::build());
     let other = match theirs == ours || end.program.is_empty() {
         true => String::new(),
         false => format!(" (recorded by {theirs}, replayed by {ours})"),
     };
-    match &end.stop {
-        None => format!("tape verified to the bit, {} events{other}", end.events),
-        Some(stop) => format!("tape not verified: {stop}{other}"),
+    if let Some(problem) = end.stop.as_ref().or(other_state.as_ref()) {
+        return format!("tape not verified: {problem}{other}");
+    }
+    let no_end = match end.is_ended {
+        true => "",
+        false => ", but it has no end: what came after is not known",
+    };
+    format!("tape verified to the bit, {} events{no_end}{other}", end.events)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use replay::{End, Stop};
+
+    #[test]
+    fn only_what_is_the_same_to_its_end_is_told_without_a_but() {
+        let end = End { events: 7, is_ended: true, ..End::default() };
+        let whole = Verdict { end: end.clone(), other_state: None };
+        assert_eq!(told(&whole), "tape verified to the bit, 7 events");
+        let open = Verdict { end: End { is_ended: false, ..end }, ..whole.clone() };
+        assert!(told(&open).contains("it has no end"), "{}", told(&open));
+        let other = Verdict { other_state: Some(Stop::NoBeginning { first: 3 }), ..whole };
+        assert!(told(&other).starts_with("tape not verified: "), "{}", told(&other));
     }
 }

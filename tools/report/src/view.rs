@@ -18,6 +18,9 @@ const MIN_GAP_S: f64 = 0.5;
 /// Time shown before the first phase of a landing, in seconds.
 const BEFORE_S: f64 = 1.0;
 
+/// Period in which a setpoint that stays is drawn again, in seconds: less than what is drawn as missing.
+const SETPOINT_PERIOD_S: f64 = 0.2;
+
 /// A flight with what is computed from it.
 #[derive(Clone, Debug)]
 pub struct View<'a> {
@@ -127,7 +130,8 @@ fn time(flight: &Flight, phases: &[phases::Phase]) -> Range<f64> {
     let begun = phases.iter().find(|phase| phase.name != Phase::Idle.name());
     let from_s = begun.map_or(0.0, |phase| phase.from_s - BEFORE_S);
     // After the end nothing happens for as long as somebody watches.
-    let finished = flight.statuses.iter().find(|status| status.finished);
+    let mut of_landing = flight.statuses.iter().filter(|it| it.stamp_ns >= flight.zero_ns);
+    let finished = of_landing.find(|status| status.finished);
     let end_s = finished.map_or(end_s, |status| end_s.min(flight.at_s(status.stamp_ns) + 2.0));
     from_s..end_s.max(from_s + 1.0)
 }
@@ -137,13 +141,21 @@ fn setpoints(flight: &Flight) -> Vec<Setpoint> {
     const NONE: [f64; 3] = [f64::NAN; 3];
     let mut setpoints = Vec::new();
     for tape in &flight.tapes {
+        let mut last = None::<Setpoint>;
         for record in tape.parts.iter().flat_map(messages::Tape::records).flatten() {
-            let Some(decision) = record.decision() else { continue };
-            let velocity_ned_m_s = match decision.action {
-                TapeAction::Velocity { velocity_ned_m_s, .. } => velocity_ned_m_s,
-                _ => NONE,
+            let time_s = flight.at_s(record.now_ns);
+            let velocity_ned_m_s = match (record.decision().map(|it| it.action), &last) {
+                (Some(TapeAction::Velocity { velocity_ned_m_s, .. }), _) => velocity_ned_m_s,
+                (Some(_), _) => NONE,
+                // The tape has a decision only where it differs from the one before.
+                (None, Some(last)) if time_s - last.time_s > SETPOINT_PERIOD_S => {
+                    last.velocity_ned_m_s
+                }
+                (None, _) => continue,
             };
-            setpoints.push(Setpoint { time_s: flight.at_s(record.now_ns), velocity_ned_m_s });
+            let setpoint = Setpoint { time_s, velocity_ned_m_s };
+            last = Some(setpoint);
+            setpoints.push(setpoint);
         }
     }
     if setpoints.is_empty() {

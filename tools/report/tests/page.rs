@@ -318,6 +318,26 @@ fn of_a_recording_with_two_landings_each_has_its_own_numbers() {
 }
 
 #[test]
+fn a_landing_that_follows_an_aborted_one_is_shown_whole() {
+    let mut flight = read(&without(&landing().recording, &["controller/tape"]));
+    let started_ns = flight.statuses.iter().find_map(|it| it.started_ns).unwrap();
+    let mut aborted = flight.statuses.iter().find(|it| it.finished).unwrap().clone();
+    (aborted.started_ns, aborted.disarmed_ns) = (None, None);
+    aborted.stamp_ns = started_ns - 1_000_000_000;
+    flight.statuses.insert(0, aborted);
+    let mut before = flight.truth[0].clone();
+    before.stamp_ns = started_ns - 1_000_000_000;
+    let mut earlier = flight.truth.iter().find_map(|it| it.touchdown).unwrap();
+    (earlier.stamp_ns, earlier.error_m) = (started_ns - 5_000_000_000, 7.0);
+    before.touchdown = Some(earlier);
+    flight.truth.insert(0, before);
+    let view = report::view::View::new(&flight);
+    let lasted_s = view.summary.time_to_disarm_s.unwrap();
+    assert!(view.time.end > lasted_s, "{:?} of {lasted_s} s", view.time);
+    assert!(view.summary.touchdown_error_m.unwrap() < 1.0, "that of the landing before");
+}
+
+#[test]
 fn times_of_a_recorder_on_another_machine_are_told_by_the_names_of_the_clocks() {
     const AHEAD_NS: i64 = 7_000_000_000;
     let recorded_by = |clock: &str, ahead_ns: i64| {
