@@ -44,6 +44,9 @@ pub(crate) struct CamerasArgs {
 #[derive(Serialize)]
 struct Listing {
     devices: Vec<Entry>,
+    /// Cameras of GigE Vision and USB3 Vision.
+    #[cfg(feature = "genicam")]
+    genicam: Vec<camera_pub::GenicamCamera>,
     /// Programs that are on this machine.
     programs: Vec<&'static str>,
 }
@@ -60,6 +63,8 @@ struct Entry {
 /// Lists the cameras, or takes a picture.
 pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
     let listing = listing(Path::new(DEVICES), args.device.as_deref());
+    #[cfg(feature = "genicam")]
+    let listing = Listing { genicam: camera_pub::genicam_cameras(), ..listing };
     if let Some(file) = &args.picture {
         return save_picture(&listing, file);
     }
@@ -82,7 +87,12 @@ fn listing(folder: &Path, only: Option<&Path>) -> Listing {
     };
     let devices = found.into_iter().map(entry).collect();
     let programs = PROGRAMS.iter().map(|(name, _use)| *name).filter(|name| is_installed(name));
-    Listing { devices, programs: programs.collect() }
+    Listing {
+        devices,
+        #[cfg(feature = "genicam")]
+        genicam: Vec::new(),
+        programs: programs.collect(),
+    }
 }
 
 /// Whether a program is in one of the folders of `PATH`.
@@ -114,6 +124,11 @@ fn text(listing: &Listing) -> String {
                 );
             }
         }
+    }
+    #[cfg(feature = "genicam")]
+    for camera_pub::GenicamCamera { name, vendor, model, address } in &listing.genicam {
+        text +=
+            &format!("{name}: {vendor} {model} at {address}\n\n[source]\ngenicam = {name:?}\n\n");
     }
     if listing.devices.is_empty() {
         text += "No camera: there is no /dev/video*. A USB camera appears there when it is plugged in; a Raspberry Pi \
@@ -216,7 +231,12 @@ mod tests {
     #[test]
     fn a_camera_is_listed_with_a_table_to_paste() {
         let formats = [("MJPG", true), ("H264", false)];
-        let listing = Listing { devices: vec![entry(&formats, true)], programs: vec!["ffmpeg"] };
+        let listing = Listing {
+            devices: vec![entry(&formats, true)],
+            #[cfg(feature = "genicam")]
+            genicam: Vec::new(),
+            programs: vec!["ffmpeg"],
+        };
         let text = text(&listing);
         assert!(text.contains("/dev/video0: PTZ Pro Camera (uvcvideo)"), "{text}");
         assert!(text.contains("1280 x 720 at 60/30 Hz") && text.contains("(not read)"), "{text}");
@@ -242,7 +262,12 @@ mod tests {
     fn a_device_without_frames_has_no_table() {
         for other in [entry(&[], false), entry(&[("H264", false)], true)] {
             assert_eq!(other.source, None);
-            let listing = Listing { devices: vec![other], programs: Vec::new() };
+            let listing = Listing {
+                devices: vec![other],
+                #[cfg(feature = "genicam")]
+                genicam: Vec::new(),
+                programs: Vec::new(),
+            };
             let text = text(&listing);
             assert!(text.contains("gives no frames") || text.contains("none of these"), "{text}");
         }

@@ -40,6 +40,7 @@ pub(crate) struct SourceConfig {
     max_megapixels: f64,
     command: Vec<String>,
     device: PathBuf,
+    genicam: String,
     fourcc: String,
     controls: Vec<String>,
     pixels: String,
@@ -108,6 +109,26 @@ pub(crate) struct DeviceConfig {
     pub(crate) size: FrameSize,
     /// What it is opened for.
     pub(crate) wanted: Wanted,
+}
+
+/// A camera of GenICam.
+#[derive(Clone, Debug)]
+#[cfg_attr(not(feature = "genicam"), expect(dead_code, reason = "read with the feature only"))]
+pub(crate) struct GenicamConfig {
+    /// Its name or address; `any` for the first that answers.
+    pub(crate) name: String,
+    /// Size of its frames.
+    pub(crate) size: FrameSize,
+    /// Its frame rate.
+    pub(crate) rate_hz: f64,
+    /// Features that are set, as `Name=value`.
+    pub(crate) features: Vec<String>,
+    /// The colours of its pixels; `None` for a grey camera.
+    pub(crate) bayer: Option<BayerPattern>,
+    /// What its stamps are of.
+    pub(crate) shutter: Shutter,
+    /// Time for which a frame is held back before it is sent.
+    pub(crate) delay_ns: i64,
 }
 
 /// The size of a frame, in pixels.
@@ -186,9 +207,12 @@ impl Settings for Config {
         check.range("source.timeout_s", self.source.timeout_s, 0.1..=3600.0);
         let fourccs = Pixels::ALL.map(|(fourcc, _)| fourcc);
         check.one_of("source.fourcc", &self.source.fourcc, &fourccs);
-        check.parses("source.controls", self.source.control_values());
+        if self.source.genicam.is_empty() {
+            check.parses("source.controls", self.source.control_values());
+        }
         check.parses("source.command", self.source.program());
         check.parses("source.device", self.device());
+        check.parses("source.genicam", self.source.genicam());
         check.parses("exposure.control", self.exposure.needs_device(&self.source));
         check.range("exposure.max_ms", self.exposure.max_ms, 0.1..=100.0);
         check.range("exposure.max_gain", self.exposure.max_gain, 1.0..=1000.0);
@@ -326,6 +350,39 @@ impl SourceConfig {
                 readout_ns: self.readout_ns(),
             },
             timeout: Duration::from_secs_f64(self.timeout_s),
+        }))
+    }
+
+    /// The camera of GenICam; `None` where frames come from elsewhere.
+    pub(crate) fn genicam(&self) -> anyhow::Result<Option<GenicamConfig>> {
+        if self.genicam.is_empty() {
+            return Ok(None);
+        }
+        ensure!(
+            cfg!(feature = "genicam"),
+            "this program reads no cameras of GenICam: build it with `--features genicam`, which needs the Aravis library (docs/camera.md)"
+        );
+        ensure!(
+            self.paths.is_empty() && self.command.is_empty() && self.device == Path::new(""),
+            "with a camera of GenICam, `source.paths`, `source.command` and `source.device` must be empty"
+        );
+        let wrong = self.controls.iter().find(|control| !control.contains('='));
+        ensure!(
+            wrong.is_none(),
+            "`{}` of `source.controls` is not of the form `Name=value`",
+            wrong.map_or("", String::as_str)
+        );
+        Ok(Some(GenicamConfig {
+            name: self.genicam.clone(),
+            size: self.size("the camera's frames")?,
+            rate_hz: self.rate_hz,
+            features: self.controls.clone(),
+            bayer: self.bayer_pattern()?,
+            shutter: Shutter {
+                stamped_at: self.stamped_at().unwrap_or(StampedAt::ExposureStart),
+                readout_ns: self.readout_ns(),
+            },
+            delay_ns: self.delay_ns(),
         }))
     }
 

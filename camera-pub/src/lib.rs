@@ -7,11 +7,13 @@
 //! a camera's program writes, `side_channel` what it tells of each frame beside: `metadata` splits that, `pairing`
 //! finds each frame's own, `exposure` says from its stamp when the frame was exposed. `rect` publishes frames without the lens'
 //! distortion for whoever wants them.
-//! `v4l2` reads cameras without a program, `marker` says how they are exposed for the marker; [`devices`] lists those of this machine.
+//! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `marker` says how they are exposed for the marker; [`devices`] lists those of this machine.
 
 pub mod config;
 pub mod devices;
 mod exposure;
+#[cfg(feature = "genicam")]
+mod genicam;
 mod marker;
 mod metadata;
 mod pairing;
@@ -23,6 +25,8 @@ mod v4l2;
 
 pub use config::Config;
 pub use devices::{ConnectedDevice, connected_devices, source_table, take_picture};
+#[cfg(feature = "genicam")]
+pub use genicam::{GenicamCamera, genicam_cameras};
 pub use service::run;
 pub use v4l2::describe::{
     ControlDescription, DeviceDescription, FormatDescription, SizeDescription,

@@ -15,8 +15,10 @@ use messages::{BayerPattern, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
-use crate::config::{Config, DeviceConfig, FrameFormat, FrameSize, ProgramConfig};
+use crate::config::{Config, DeviceConfig, FrameFormat, FrameSize, GenicamConfig, ProgramConfig};
 use crate::exposure::Exposure;
+#[cfg(feature = "genicam")]
+use crate::genicam::{self, feed::Feed};
 use crate::marker::MarkerExposure;
 use crate::program::Program;
 use crate::rect::RectPublisher;
@@ -100,6 +102,8 @@ enum Source {
     Program(ProgramConfig),
     /// A camera of Video4Linux.
     Device(DeviceConfig),
+    /// A camera of GenICam.
+    Genicam(GenicamConfig),
 }
 
 /// What there is to publish.
@@ -116,6 +120,10 @@ fn find(config: &Config) -> anyhow::Result<Found> {
         let (size, max_frame_bytes) = (device.size, device.size.pixels());
         return Ok(Found { source: Source::Device(device), size, max_frame_bytes });
     }
+    if let Some(camera) = config.source.genicam()? {
+        let (size, max_frame_bytes) = (camera.size, camera.size.pixels());
+        return Ok(Found { source: Source::Genicam(camera), size, max_frame_bytes });
+    }
     match config.source.program()? {
         Some(program) => {
             let size = program.size;
@@ -131,7 +139,7 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
     ensure!(
         !config.source.paths.is_empty(),
         "the camera `{}` has nothing to publish; set image files or folders in `source.paths`, a camera program in \
-         `source.command`, or a device in `source.device` (`alight cameras` lists them)",
+         `source.command`, or a camera in `source.device` or `source.genicam` (`alight cameras` lists them)",
         config.instance()
     );
     for path in &config.source.paths {
@@ -233,6 +241,13 @@ impl Stream {
                 let cause = || format!("reading the camera {:?} of `source.device`", device.path);
                 self.publish_device(port, &device).await.with_context(cause)
             }
+            #[cfg(feature = "genicam")]
+            Source::Genicam(camera) => {
+                let cause = || format!("reading the camera `{}` of `source.genicam`", camera.name);
+                self.publish_genicam(&camera).await.with_context(cause)
+            }
+            #[cfg(not(feature = "genicam"))]
+            Source::Genicam(camera) => bail!("no camera of GenICam can be read: {camera:?}"),
         }
     }
 
@@ -264,7 +279,9 @@ impl Stream {
             }
             last_published = Instant::now();
             let frame = match config.format {
-                FrameFormat::Samples { .. } => Some(self.prepare_samples(pixels, config, bayer)),
+                FrameFormat::Samples { .. } => {
+                    Some(self.prepare_samples(pixels, config.size, config.bits, bayer))
+                }
                 FrameFormat::Jpeg { .. } => self.prepare_jpeg(&jpeg),
             };
             self.health.latency("read", began.elapsed());
@@ -306,6 +323,40 @@ impl Stream {
                 Next::Nothing => {}
                 Next::Wait(time) => tokio::time::sleep(time).await,
                 Next::Lost(reason) => drop(self.health.failed(reason)),
+            }
+            // Waiting for a frame blocks this thread, briefly: a shutdown is noticed between.
+            tokio::task::yield_now().await;
+        }
+    }
+
+    /// Publishes the frames of a camera of GenICam, whenever it is there.
+    #[cfg(feature = "genicam")]
+    async fn publish_genicam(&mut self, config: &GenicamConfig) -> anyhow::Result<()> {
+        let mut feed = Feed::start(config)?;
+        loop {
+            match feed.next() {
+                genicam::feed::Next::Frame(taken) => {
+                    let began = Instant::now();
+                    let mut pixels = self.frames.loan(config.size.pixels());
+                    for (to, from) in pixels.iter_mut().zip(taken.pixels()) {
+                        *to = *from;
+                    }
+                    let exposure = taken.exposure;
+                    feed.give_back(taken);
+                    let frame = self.prepare_samples(pixels, config.size, 8, config.bayer);
+                    self.health.latency("read", began.elapsed());
+                    self.publish(frame, exposure).await;
+                }
+                genicam::feed::Next::Nothing => {}
+                genicam::feed::Next::Wait(time) => tokio::time::sleep(time).await,
+                genicam::feed::Next::Lost(reason) => drop(self.health.failed(reason)),
+            }
+            let counts = feed.take_counts();
+            for (reason, count) in [
+                ("frames of which packets were lost", counts.torn),
+                ("frames of another size", counts.other),
+            ] {
+                (0..count.min(MAX_COUNTED)).for_each(|_| self.health.dropped(reason));
             }
             // Waiting for a frame blocks this thread, briefly: a shutdown is noticed between.
             tokio::task::yield_now().await;
@@ -376,12 +427,13 @@ impl Stream {
     fn prepare_samples(
         &self,
         pixels: Loan,
-        config: &ProgramConfig,
+        size: FrameSize,
+        bits: u32,
         bayer: Option<imaging::BayerPattern>,
     ) -> Prepared {
-        let FrameSize { width, height } = config.size;
-        let format = pixel_format(Some(config.bits), bayer);
-        let sample = SampleFormat { bits: config.bits, bayer };
+        let FrameSize { width, height } = size;
+        let format = pixel_format(Some(bits), bayer);
+        let sample = SampleFormat { bits, bayer };
         let is_wanted = self.needs_grey(format);
         let grey = is_wanted.then(|| samples_to_grey(&pixels, width, height, sample)).flatten();
         Prepared { width, height, format, pixels, grey }

@@ -1,0 +1,280 @@
+//! An open camera.
+#![allow(unsafe_code, reason = "the bytes of a buffer are behind a pointer; nothing else is here")]
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context, bail, ensure};
+use aravis::prelude::*;
+use aravis::{Aravis, Auto, Buffer, BufferStatus, Camera, Stream};
+use imaging::BayerPattern;
+use node::now_ns;
+use serde::Serialize;
+
+use super::clock::CameraClock;
+use crate::config::{FrameSize, GenicamConfig};
+use crate::exposure::{Exposure, Shutter, StampedAt};
+
+/// Number of frames that Aravis may hold.
+const BUFFERS: usize = 8;
+/// Bytes of a frame beside its pixels, at most: chunks.
+const MAX_EXTRA_BYTES: usize = 1 << 20;
+/// A frame that has waited longer is not told apart from one of a clock that was set, in nanoseconds.
+const MAX_WAIT_NS: i64 = 1_000_000_000;
+
+/// A camera of GenICam that answers.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct GenicamCamera {
+    /// Its name for `source.genicam`.
+    pub name: String,
+    /// Who made it.
+    pub vendor: String,
+    /// What it is.
+    pub model: String,
+    /// Its address on the network or the bus.
+    pub address: String,
+}
+
+/// The cameras of GenICam in reach. It takes about a second, as they are asked over the network.
+pub fn genicam_cameras() -> Vec<GenicamCamera> {
+    // Aravis' list is one for the whole process.
+    static ARAVIS: OnceLock<Option<Mutex<Aravis>>> = OnceLock::new();
+    let Some(aravis) = ARAVIS.get_or_init(|| Aravis::initialize().ok().map(Mutex::new)) else {
+        return Vec::new();
+    };
+    let devices = aravis.lock().unwrap_or_else(PoisonError::into_inner).get_device_list();
+    let text = |it: std::ffi::CString| it.to_string_lossy().into_owned();
+    devices
+        .into_iter()
+        .filter(|device| device.protocol.as_bytes() != b"Fake")
+        .map(|device| GenicamCamera {
+            name: text(device.id),
+            vendor: text(device.vendor),
+            model: text(device.model),
+            address: text(device.address),
+        })
+        .collect()
+}
+
+/// A camera that sends frames.
+pub(super) struct OpenCamera {
+    camera: Camera,
+    stream: Stream,
+    clock: CameraClock,
+    shutter: Shutter,
+    delay_ns: i64,
+    /// The exposure time, where the camera does not change it by itself.
+    exposure_ns: Option<u32>,
+    size: FrameSize,
+    is_gone: Arc<AtomicBool>,
+    counts: Counts,
+}
+
+/// Frames that were not delivered.
+#[derive(Copy, Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Counts {
+    /// Of which packets were lost.
+    pub(crate) torn: u64,
+    /// Of another size or format.
+    pub(crate) other: u64,
+}
+
+/// A frame.
+pub(crate) struct Taken {
+    buffer: Buffer,
+    /// When it was exposed.
+    pub(crate) exposure: Exposure,
+}
+
+impl Taken {
+    /// Its stamp, by the camera's clock, in nanoseconds.
+    #[cfg(test)]
+    pub(super) fn stamp_ns(&self) -> i64 {
+        self.buffer.timestamp().cast_signed()
+    }
+
+    /// Its pixels.
+    pub(crate) fn pixels(&self) -> &[u8] {
+        let (start, len) = self.buffer.data();
+        if start.is_null() {
+            return &[];
+        }
+        // SAFETY: Aravis' buffers own this many bytes, written before the buffer was taken from the stream, and this one is ours
+        // until it is given back, which takes it.
+        unsafe { std::slice::from_raw_parts(start, len) }
+    }
+}
+
+impl OpenCamera {
+    /// Opens a camera, sets it up, and has it send.
+    ///
+    /// # Errors
+    /// When it does not answer, or cannot do what is wanted.
+    pub(super) fn start(config: &GenicamConfig) -> anyhow::Result<Self> {
+        let name = Some(config.name.as_str()).filter(|name| *name != "any");
+        let camera = Camera::new(name).map_err(|problem| {
+            anyhow::anyhow!(
+                "the camera does not answer ({problem}); `alight cameras` lists those that do"
+            )
+        })?;
+        let device = camera.device().context("the camera has no device")?;
+        let set_features = || {
+            config.features.iter().try_for_each(|feature| {
+                let set = device.set_features_from_string(feature);
+                set.with_context(|| format!("setting `{feature}` of `source.controls`"))
+            })
+        };
+        // Binning changes which sizes there are.
+        set_features()?;
+        set_format(&camera, config.bayer)?;
+        set_region(&camera, config.size)?;
+        camera.set_frame_rate(config.rate_hz).with_context(|| {
+            let bounds = camera.frame_rate_bounds();
+            let bounds =
+                bounds.map(|(min, max)| format!(", which can be from {min:.2} to {max:.2} now"));
+            format!("setting `source.rate_hz` to {}{}", config.rate_hz, bounds.unwrap_or_default())
+        })?;
+        // Setting the rate ends what a trigger was set to.
+        set_features()?;
+        let is_fixed = camera.exposure_time_auto().map_or(true, |auto| auto == Auto::Off);
+        let exposure_us = camera.exposure_time().ok().filter(|_| is_fixed);
+        let payload = camera.payload().context("asking for the size of frames")? as usize;
+        ensure!(
+            (config.size.pixels()..=config.size.pixels() + MAX_EXTRA_BYTES).contains(&payload),
+            "its frames have {payload} bytes, and {} pixels of a byte each are wanted",
+            config.size.pixels()
+        );
+        let stream = camera.create_stream().context("opening the stream of frames")?;
+        for _ in 0..BUFFERS {
+            stream.push_buffer(Buffer::new_allocate(payload));
+        }
+        let is_gone = Arc::new(AtomicBool::new(false));
+        let gone = Arc::clone(&is_gone);
+        device.connect_control_lost(move |_| gone.store(true, Ordering::Relaxed));
+        camera.start_acquisition().context("having the camera send frames")?;
+        Ok(Self {
+            camera,
+            stream,
+            clock: CameraClock::default(),
+            shutter: config.shutter,
+            delay_ns: config.delay_ns,
+            exposure_ns: exposure_us.map(|us| (us * 1e3).clamp(1.0, f64::from(u32::MAX)) as u32),
+            size: config.size,
+            is_gone,
+            counts: Counts::default(),
+        })
+    }
+
+    /// Whether the camera has stopped to answer.
+    pub(super) fn is_gone(&self) -> bool {
+        self.is_gone.load(Ordering::Relaxed)
+    }
+
+    /// The next whole frame within this time.
+    pub(super) fn take(&mut self, patience: Duration) -> Option<Taken> {
+        let buffer = self.stream.timeout_pop_buffer(patience.as_micros() as u64)?;
+        let is_whole = buffer.status() == BufferStatus::Success;
+        let edges = [buffer.image_width(), buffer.image_height()].map(usize::try_from);
+        let is_wanted = edges == [Ok(self.size.width), Ok(self.size.height)]
+            && buffer.data().1 >= self.size.pixels();
+        if is_whole && is_wanted {
+            let exposure = self.exposure(&buffer);
+            return Some(Taken { buffer, exposure });
+        }
+        if is_whole {
+            self.counts.other += 1;
+        } else {
+            self.counts.torn += 1;
+        }
+        self.stream.push_buffer(buffer);
+        None
+    }
+
+    /// Gives a frame back, to be filled again.
+    pub(super) fn give_back(&mut self, taken: Taken) {
+        self.stream.push_buffer(taken.buffer);
+    }
+
+    /// What was not delivered since the last call.
+    pub(super) fn take_counts(&mut self) -> Counts {
+        std::mem::take(&mut self.counts)
+    }
+
+    /// When a frame was exposed: by the camera's stamp, or by its arrival while that is not understood.
+    fn exposure(&mut self, buffer: &Buffer) -> Exposure {
+        let arrival_ns = arrival_ns(buffer);
+        let exposure_ns = self.exposure_ns.unwrap_or(0);
+        let until_sent_ns = self.delay_ns
+            + match self.shutter.stamped_at {
+                StampedAt::ExposureStart => i64::from(exposure_ns),
+                StampedAt::ReadoutStart | StampedAt::FrameEnd => 0,
+            };
+        let stamp_ns = i64::try_from(buffer.timestamp()).ok().filter(|stamp_ns| *stamp_ns > 0);
+        let told_ns =
+            stamp_ns.and_then(|stamp_ns| self.clock.host_ns(stamp_ns, until_sent_ns, arrival_ns));
+        match (told_ns, self.exposure_ns) {
+            (Some(host_ns), Some(exposure_ns)) => {
+                Exposure { mid_ns: self.shutter.mid_exposure_ns(host_ns, exposure_ns), exposure_ns }
+            }
+            _ => Exposure::estimated(arrival_ns - self.delay_ns - i64::from(exposure_ns) / 2),
+        }
+    }
+}
+
+impl Drop for OpenCamera {
+    fn drop(&mut self) {
+        // It may be gone.
+        let _ = self.camera.stop_acquisition();
+    }
+}
+
+/// When a frame's first packet arrived, by the host's clock. Aravis says it by the system's, which may be set.
+fn arrival_ns(buffer: &Buffer) -> i64 {
+    let now_utc_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |it| it.as_nanos());
+    let waited_ns = now_utc_ns.saturating_sub(u128::from(buffer.system_timestamp()));
+    now_ns() - i64::try_from(waited_ns).map_or(0, |ns| if ns > MAX_WAIT_NS { 0 } else { ns })
+}
+
+fn set_format(camera: &Camera, bayer: Option<BayerPattern>) -> anyhow::Result<()> {
+    let format = match bayer {
+        None => "Mono8",
+        Some(BayerPattern::Rggb) => "BayerRG8",
+        Some(BayerPattern::Grbg) => "BayerGR8",
+        Some(BayerPattern::Gbrg) => "BayerGB8",
+        Some(BayerPattern::Bggr) => "BayerBG8",
+    };
+    camera.set_pixel_format_from_string(format).map_err(|problem| {
+        let has = camera.dup_available_pixel_formats_as_strings().unwrap_or_default().join(", ");
+        anyhow::anyhow!(
+            "the camera gives no `{format}` ({problem}); it has {has}. `source.bayer` says which colours its pixels have"
+        )
+    })
+}
+
+/// Sets the size of the frames, from the middle of the sensor.
+fn set_region(camera: &Camera, size: FrameSize) -> anyhow::Result<()> {
+    // Otherwise there is less room. A camera may have no offsets.
+    for offset in ["OffsetX", "OffsetY"] {
+        let _ = camera.set_integer(offset, 0);
+    }
+    let (_, max_width) = camera.width_bounds().context("asking for the largest width")?;
+    let (_, max_height) = camera.height_bounds().context("asking for the largest height")?;
+    let [width, height] = [size.width, size.height].map(|edge| edge as i32);
+    ensure!(
+        width <= max_width && height <= max_height,
+        "`source.size_px` is [{width}, {height}], and the camera gives at most [{max_width}, {max_height}] now; binning makes \
+         it smaller"
+    );
+    let middle = |max: i32, edge: i32, step: i32| (max - edge) / 2 / step.max(1) * step.max(1);
+    let x = middle(max_width, width, camera.x_offset_increment().unwrap_or(1));
+    let y = middle(max_height, height, camera.y_offset_increment().unwrap_or(1));
+    camera.set_region(x, y, width, height).context("setting `source.size_px`")?;
+    let (_, _, set_width, set_height) = camera.region().context("asking for the frames' size")?;
+    if (set_width, set_height) != (width, height) {
+        bail!(
+            "`source.size_px` is [{width}, {height}]; the nearest that the camera gives is [{set_width}, {set_height}]"
+        );
+    }
+    Ok(())
+}

@@ -1,0 +1,119 @@
+//! The frames of a camera that may be unplugged or stall: it is opened again until it is back.
+
+use std::time::Duration;
+
+use node::now_ns;
+
+use super::camera::{Counts, OpenCamera, Taken};
+use crate::config::GenicamConfig;
+
+/// Time between attempts to open the camera.
+const RETRY_NS: i64 = 500_000_000;
+/// Maximum time to wait for a frame at once, so that a shutdown is noticed.
+const POLL: Duration = Duration::from_millis(50);
+/// Time without a whole frame after which the camera has stalled, beside three periods.
+const STALL_NS: i64 = 1_000_000_000;
+
+/// A camera, open or lost.
+pub(crate) struct Feed {
+    config: GenicamConfig,
+    camera: Option<OpenCamera>,
+    last_frame_ns: i64,
+    retry_ns: i64,
+    /// Since when there are no frames, and why.
+    outage: Option<(i64, String)>,
+}
+
+/// What happened next.
+pub(crate) enum Next {
+    /// A frame, to be given back.
+    Frame(Taken),
+    /// Nothing yet.
+    Nothing,
+    /// Nothing for so long: the camera is lost.
+    Wait(Duration),
+    /// The camera has just been lost, for a reason that is counted.
+    Lost(&'static str),
+}
+
+impl Feed {
+    /// Opens the camera.
+    ///
+    /// # Errors
+    /// It does not answer, or cannot do what is wanted.
+    pub(crate) fn start(config: &GenicamConfig) -> anyhow::Result<Self> {
+        let camera = OpenCamera::start(config)?;
+        let now_ns = now_ns();
+        Ok(Self {
+            config: config.clone(),
+            camera: Some(camera),
+            last_frame_ns: now_ns,
+            retry_ns: now_ns,
+            outage: None,
+        })
+    }
+
+    /// The next frame, or what there is instead of one. It waits briefly; while a lost camera is asked, for up to a few
+    /// seconds.
+    pub(crate) fn next(&mut self) -> Next {
+        let Some(camera) = &mut self.camera else {
+            return if now_ns() < self.retry_ns { Next::Wait(POLL) } else { self.reopen() };
+        };
+        if let Some(taken) = camera.take(POLL) {
+            self.last_frame_ns = now_ns();
+            if let Some((since_ns, _)) = self.outage.take() {
+                let lost_s = (self.last_frame_ns - since_ns) as f64 * 1e-9;
+                tracing::info!(lost_s, "The camera is back");
+            }
+            return Next::Frame(taken);
+        }
+        let silent_ns = now_ns() - self.last_frame_ns;
+        let period_ns = (1e9 / self.config.rate_hz.max(1e-3)) as i64;
+        if camera.is_gone() {
+            self.lose("camera unplugged", "it does not answer any more")
+        } else if silent_ns > STALL_NS.max(3 * period_ns) {
+            self.lose("camera stalled", "it has sent no whole frame for a second or more")
+        } else {
+            Next::Nothing
+        }
+    }
+
+    /// Gives a frame back, to be filled again.
+    pub(crate) fn give_back(&mut self, taken: Taken) {
+        if let Some(camera) = &mut self.camera {
+            camera.give_back(taken);
+        }
+    }
+
+    /// What was not delivered since the last call.
+    pub(crate) fn take_counts(&mut self) -> Counts {
+        self.camera.as_mut().map(OpenCamera::take_counts).unwrap_or_default()
+    }
+
+    fn lose(&mut self, reason: &'static str, problem: &str) -> Next {
+        self.camera = None;
+        let now_ns = now_ns();
+        self.retry_ns = now_ns + RETRY_NS;
+        let since_ns = self.outage.as_ref().map_or(now_ns, |(since_ns, _)| *since_ns);
+        // What repeats is said once.
+        if self.outage.as_ref().is_none_or(|(_, before)| before != problem) {
+            tracing::warn!(problem, "The camera is lost; it is opened again until it is back");
+        }
+        self.outage = Some((since_ns, problem.to_owned()));
+        Next::Lost(reason)
+    }
+
+    fn reopen(&mut self) -> Next {
+        match OpenCamera::start(&self.config) {
+            Ok(camera) => {
+                self.camera = Some(camera);
+                self.last_frame_ns = now_ns();
+                Next::Nothing
+            }
+            Err(problem) => {
+                self.lose("camera unplugged", &format!("{problem:#}"));
+                Next::Wait(POLL)
+            }
+        }
+    }
+}
