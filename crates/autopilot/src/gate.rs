@@ -16,7 +16,7 @@ pub(crate) struct Admitted {
     /// Whether the sender may be the one that the link talks to. A radio's own packets need no signature, and so say nothing of
     /// who sends them.
     pub(crate) is_peer: bool,
-    /// A holder of the key sent something too old: it needs our newer stamps.
+    /// A holder of the key may have sent something too old: it needs our newer stamps.
     pub(crate) is_behind: bool,
 }
 
@@ -51,7 +51,7 @@ impl Gate {
                     admitted.packets.push(packet.without_signature());
                 }
                 Err(reason) => {
-                    admitted.is_behind |= reason == Refusal::Old;
+                    admitted.is_behind |= matches!(reason, Refusal::Old | Refusal::Replayed);
                     self.refusals.count(reason);
                 }
             }

@@ -70,8 +70,8 @@ struct Peer {
     parser: Parser,
     /// Time of the last bytes.
     heard: Instant,
-    /// Time of the last packet.
-    active: Instant,
+    /// Time of the last packet that was let in; none before the first.
+    active: Option<Instant>,
     /// Time of the last autopilot heartbeat from there.
     autopilot: Option<Instant>,
 }
@@ -104,7 +104,7 @@ impl Peers {
         let admitted = gate.admit(stamp, peer.parser.push(bytes));
         let packets = admitted.packets;
         if admitted.is_peer {
-            peer.active = now;
+            peer.active = Some(now);
         }
         let counted = peer.parser.take_counters();
         let is_autopilot = packets.iter().any(is_autopilot_heartbeat);
@@ -114,14 +114,21 @@ impl Peers {
         if admitted.is_peer && self.chosen != Some(from) && self.is_replaced(is_autopilot, now) {
             self.chosen = Some(from);
         }
-        // Until it has our stamps, which are newer, all that it sends is too old.
-        if admitted.is_behind && self.chosen.is_none() {
+        // Until it has our stamps, which are newer, all that it sends is too old. Whoever is let in takes its place at once.
+        if admitted.is_behind && self.is_silent(now) {
             self.chosen = Some(from);
         }
         match self.chosen == Some(from) {
             true => Taken { packets, strangers: 0, counted },
             false => Taken { strangers: packets.len() as u64, packets: Vec::new(), counted },
         }
+    }
+
+    /// Whether no packet was let in from the chosen peer lately.
+    fn is_silent(&self, now: Instant) -> bool {
+        let chosen = self.known.iter().find(|peer| Some(peer.address) == self.chosen);
+        let active = chosen.and_then(|peer| peer.active);
+        !active.is_some_and(|at| now.duration_since(at) <= self.peering.silence())
     }
 
     /// Whether the chosen peer is replaced by one that just sent a packet.
@@ -133,8 +140,8 @@ impl Peers {
         };
         match (&self.peering, chosen.autopilot) {
             (Peering::Autopilot, Some(at)) => to_autopilot && !recent(at),
-            (Peering::Autopilot, None) => to_autopilot || !recent(chosen.active),
-            (Peering::GroundStation { .. }, _) => !recent(chosen.active),
+            (Peering::Autopilot, None) => to_autopilot || self.is_silent(now),
+            (Peering::GroundStation { .. }, _) => self.is_silent(now),
         }
     }
 
@@ -147,7 +154,7 @@ impl Peers {
                     address,
                     parser: Parser::new(),
                     heard: now,
-                    active: now,
+                    active: None,
                     autopilot: None,
                 });
                 self.known.len() - 1
@@ -184,6 +191,7 @@ mod tests {
     use super::*;
     use crate::dialect::HEARTBEAT_DATA;
     use crate::packet::{Sender, encode};
+    use crate::signing::Signing;
 
     impl Peers {
         fn take_any(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> Taken {
@@ -229,6 +237,29 @@ mod tests {
             "the first one is silent"
         );
         assert_eq!(peers.take_any(at(1), &bytes, later).strangers, 1);
+    }
+
+    #[test]
+    fn who_is_behind_is_heard_once_the_other_is_silent_and_gives_way_to_whoever_is_let_in() {
+        const NOW: u64 = 34_715_520_000_000;
+        let signing = |link_id| Signing::new("correct horse".parse().unwrap(), link_id, 0);
+        let bytes = heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID, GROUND);
+        let (mut peers, mut gate) = (station(Vec::new()), Gate::new(Some(signing(7))));
+        let (mut ahead, mut right, mut third) = (signing(1), signing(2), signing(3));
+        let began = Instant::now();
+        let early = ahead.sign(NOW + 1_000_000_000, &bytes).unwrap();
+        assert_eq!(peers.take(at(1), &early, began, &mut gate, NOW).packets.len(), 1);
+        let behind = right.sign(NOW, &bytes).unwrap();
+        let taken = peers.take(at(2), &behind, began, &mut gate, NOW);
+        assert!(taken.packets.is_empty() && peers.chosen == Some(at(1)), "it is not silent yet");
+        let later = began + Duration::from_secs(11);
+        peers.take(at(2), &behind, later, &mut gate, NOW);
+        assert_eq!(peers.chosen, Some(at(2)), "it gets our stamps");
+        let fresh = third.sign(NOW + 1_000_000_001, &bytes).unwrap();
+        assert_eq!(peers.take(at(3), &fresh, later, &mut gate, NOW).packets.len(), 1);
+        assert_eq!(peers.chosen, Some(at(3)), "an old packet holds nobody's place");
+        peers.take(at(2), &behind, later, &mut gate, NOW);
+        assert_eq!(peers.chosen, Some(at(3)));
     }
 
     #[test]

@@ -1,5 +1,5 @@
 //! Signed packets of MAVLink 2 (<https://mavlink.io/en/guide/message_signing.html>): who has not the key can neither
-//! make a packet nor send an old one again.
+//! make a packet nor send an old one again, but those of the last minute before this side was started, which the standard allows.
 //!
 //! A signature is 13 bytes behind the checksum: a link id, a stamp of 48 bits in units of 10 µs since 2015, and the first
 //! 48 bits of SHA-256 over the key and the packet. Stamps only grow: a sender takes the later of its clock and the
@@ -95,7 +95,7 @@ pub enum Refusal {
     Unsigned,
     /// Its signature is of another key, or it was changed on the way.
     WrongKey,
-    /// Its stamp is not after that of the stream's last packet: it was sent before.
+    /// Its stamp is not after that of the stream's last packet, or it is our own: it was sent before.
     Replayed,
     /// The first packet of a stream is more than a minute behind.
     Old,
@@ -165,6 +165,8 @@ pub struct Signing {
     /// The newest stamp sent or accepted.
     newest: u64,
     streams: Vec<Stream>,
+    /// Whose packets were signed here, which never come from the other side.
+    signed: Vec<Sender>,
 }
 
 #[derive(Debug)]
@@ -177,7 +179,8 @@ struct Stream {
 impl Signing {
     /// With the id of this link, and the stamp below which all may have been used before.
     pub fn new(key: Key, link_id: u8, used: u64) -> Self {
-        Self { key, link_id, newest: used.min(MAX_STAMP), streams: Vec::new() }
+        let newest = used.min(MAX_STAMP);
+        Self { key, link_id, newest, streams: Vec::new(), signed: Vec::new() }
     }
 
     /// The newest stamp sent or accepted.
@@ -189,12 +192,23 @@ impl Signing {
     /// packet. `now` is the clock's [`stamp`].
     pub fn sign(&mut self, now: u64, raw: &[u8]) -> Option<Vec<u8>> {
         let mut signed = reframe(raw, SIGNED)?;
+        self.note_signed(&signed);
         self.newest = now.max(self.newest + 1).min(MAX_STAMP);
         signed.push(self.link_id);
         signed.extend_from_slice(&self.newest.to_le_bytes()[..6]);
         let signature = signature(&self.key, &signed);
         signed.extend_from_slice(&signature);
         Some(signed)
+    }
+
+    /// Notes whose packet is signed here.
+    fn note_signed(&mut self, raw: &[u8]) {
+        // As `reframe` makes it.
+        let &[_, _, _, _, _, system, component, ..] = raw else { return };
+        let sender = Sender { system, component };
+        if !self.signed.contains(&sender) && self.signed.len() < MAX_STREAMS {
+            self.signed.push(sender);
+        }
     }
 
     /// Whether a received packet is of a holder of the key, and new. `now` is the clock's [`stamp`].
@@ -209,6 +223,10 @@ impl Signing {
             return Err(Refusal::WrongKey);
         }
         let Stamped { link_id, stamp, .. } = stamped;
+        // Somebody sends us what we have sent.
+        if link_id == self.link_id && self.signed.contains(&packet.sender) {
+            return Err(Refusal::Replayed);
+        }
         let is_full = self.streams.len() >= MAX_STREAMS;
         let is_it = |it: &&mut Stream| it.link_id == link_id && it.sender == packet.sender;
         match self.streams.iter_mut().find(is_it) {
@@ -306,6 +324,17 @@ mod tests {
         let again = here.sign(NOW, &forged).unwrap();
         assert_eq!(again.len(), forged.len());
         assert_eq!(there.verify(NOW, &packet(&again)), Ok(()));
+    }
+
+    #[test]
+    fn our_own_packets_are_not_taken_from_others() {
+        let mut here = Signing::new(key("correct horse"), 191, 0);
+        let raw = here.sign(NOW, &heartbeat(AUTOPILOT)).unwrap();
+        assert_eq!(here.verify(NOW, &packet(&raw)), Err(Refusal::Replayed));
+        // Those of another sender on a link of the same id are.
+        let mut there = Signing::new(key("correct horse"), 191, 0);
+        let raw = there.sign(NOW, &heartbeat(Sender { system: 255, component: 190 })).unwrap();
+        assert_eq!(here.verify(NOW, &packet(&raw)), Ok(()));
     }
 
     #[test]
