@@ -2,7 +2,7 @@
 
 /// Time in which the quickest frame is looked for, in nanoseconds. Clocks that go apart by 50 in a million move by half a
 /// millisecond in two of these.
-const WINDOW_NS: i64 = 5_000_000_000;
+const SPAN_NS: i64 = 5_000_000_000;
 /// Number of frames before the quickest is believed.
 const MIN_FRAMES: u32 = 10;
 /// Offsets that differ by more than this are of a camera that was started again, or whose clock was set, in nanoseconds.
@@ -16,8 +16,8 @@ const MAX_JUMP_NS: u64 = 500_000_000;
 pub(super) struct CameraClock {
     frames: u32,
     began_ns: i64,
-    /// The least difference since then, and that of the window before.
-    least_ns: Option<i64>,
+    /// The least difference since then, and that of the span before.
+    min_ns: Option<i64>,
     before_ns: Option<i64>,
 }
 
@@ -34,18 +34,18 @@ impl CameraClock {
         if self.offset_ns().is_some_and(|offset_ns| apart_ns.abs_diff(offset_ns) > MAX_JUMP_NS) {
             *self = Self::default();
         }
-        if arrival_ns.saturating_sub(self.began_ns) > WINDOW_NS {
+        if arrival_ns.saturating_sub(self.began_ns) > SPAN_NS {
             self.began_ns = arrival_ns;
-            self.before_ns = self.least_ns.take();
+            self.before_ns = self.min_ns.take();
         }
-        self.least_ns = Some(self.least_ns.map_or(apart_ns, |least_ns| least_ns.min(apart_ns)));
+        self.min_ns = Some(self.min_ns.map_or(apart_ns, |min_ns| min_ns.min(apart_ns)));
         self.frames = self.frames.saturating_add(1);
         let offset_ns = self.offset_ns().filter(|_| self.frames >= MIN_FRAMES)?;
         Some(stamp_ns.saturating_add(offset_ns))
     }
 
     fn offset_ns(&self) -> Option<i64> {
-        self.least_ns.into_iter().chain(self.before_ns).min()
+        self.min_ns.into_iter().chain(self.before_ns).min()
     }
 }
 
