@@ -128,7 +128,7 @@ impl Peers {
     fn is_silent(&self, now: Instant) -> bool {
         let chosen = self.known.iter().find(|peer| Some(peer.address) == self.chosen);
         let active = chosen.and_then(|peer| peer.active);
-        !active.is_some_and(|at| now.duration_since(at) <= self.peering.silence())
+        active.is_none_or(|at| now.duration_since(at) > self.peering.silence())
     }
 
     /// Whether the chosen peer is replaced by one that just sent a packet.
