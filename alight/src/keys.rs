@@ -19,6 +19,7 @@ use rcgen::{
     BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
     KeyUsagePurpose,
 };
+use sha2::{Digest, Sha256};
 
 /// The authority's private key, which is not copied to other machines.
 const AUTHORITY_KEY: &str = "authority.key";
@@ -187,6 +188,31 @@ fn init(output: &Path, days: u32) -> anyhow::Result<Vec<PathBuf>> {
     write_new(&files[0], &key.serialize_pem())?;
     write_new(&files[1], &certificate.pem())?;
     Ok(files.into())
+}
+
+/// Makes a certificate that signs itself, for a page at these addresses, and its private key. The result is the certificate's
+/// SHA-256 as browsers show it.
+pub(crate) fn self_signed(
+    [certificate, key]: [&Path; 2],
+    addresses: &[String],
+    days: u32,
+) -> anyhow::Result<String> {
+    refuse_existing(&[certificate.to_owned(), key.to_owned()])?;
+    let mut params = parameters("Alight dashboard", addresses, days)?;
+    params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+    params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
+    let pair = KeyPair::generate().context("making the page's key")?;
+    let signed = params.self_signed(&pair).context("signing the page's certificate")?;
+    for folder in [certificate, key].iter().filter_map(|path| path.parent()) {
+        if !folder.as_os_str().is_empty() {
+            make_directory(folder)?;
+        }
+    }
+    write_new(key, &pair.serialize_pem())?;
+    write_new(certificate, &signed.pem())?;
+    let digest: Vec<_> =
+        Sha256::digest(signed.der()).iter().map(|byte| format!("{byte:02X}")).collect();
+    Ok(digest.join(":"))
 }
 
 /// Writes a passphrase of 125 bits, in groups that a person can copy.
@@ -430,6 +456,26 @@ mod tests {
         let groups: Vec<_> = texts[0].trim().split('-').map(str::len).collect();
         assert_eq!(groups, [5; 5], "{}", texts[0]);
         refused(passphrase(&files[0]), "never overwritten");
+    }
+
+    #[test]
+    fn the_certificate_of_a_page_has_its_names_and_a_private_key() {
+        let home = tempfile::tempdir().unwrap();
+        let files = ["further/page.pem", "further/page.key"].map(|name| home.path().join(name));
+        let make = |address: &str| {
+            self_signed([&files[0], &files[1]], &[address.to_owned(), "kestrel.local".into()], 30)
+        };
+        let fingerprint = make("10.0.0.1").unwrap();
+        assert_eq!(fingerprint.split(':').count(), 32, "{fingerprint}");
+        assert_eq!(fs::metadata(&files[1]).unwrap().permissions().mode() & 0o777, 0o600);
+        assert!((certificate(&files[0]).unwrap().expires_in_s - 30 * 86_400).abs() < 120);
+        let text = fs::read(&files[0]).unwrap();
+        let (_, pem) = x509_parser::pem::parse_x509_pem(&text).unwrap();
+        let parsed = pem.parse_x509().unwrap();
+        let names = &parsed.subject_alternative_name().unwrap().unwrap().value.general_names;
+        let names = format!("{names:?}");
+        assert!(names.contains("kestrel.local"), "{names}");
+        refused(make("10.0.0.2"), "never overwritten");
     }
 
     #[test]

@@ -244,7 +244,10 @@ async fn fly(args: &LandArgs, settings: &ServiceSettings) -> anyhow::Result<Land
         rendezvous.file.display()
     ));
     if let Some(address) = args.dashboard {
-        progress.say(&format!("The page is at http://{address}/"));
+        let layers = Layers { file: None, set: settings.of(Service::Dashboard).to_vec() };
+        let is_encrypted = layers.load::<dashboard::Config>()?.settings.certificate().is_some();
+        let scheme = if is_encrypted { "https" } else { "http" };
+        progress.say(&format!("The page is at {scheme}://{address}/"));
     }
     let mut children = Children::new();
     for (service, settings) in &settings.by_service {

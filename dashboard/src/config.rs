@@ -22,6 +22,10 @@ pub struct Config {
     pub commands: String,
     /// The file of the tokens' hashes; empty for the usual one.
     pub tokens: PathBuf,
+    /// The certificate of the page (PEM); empty for no encryption.
+    pub certificate: PathBuf,
+    /// Its private key (PEM); empty for the certificate's name with `.key`, beside it.
+    pub key: PathBuf,
     /// Maximum number of browsers.
     pub max_clients: u32,
     /// Pictures.
@@ -54,8 +58,18 @@ pub enum Commands {
     Never,
     /// Whoever opens it on this machine.
     Here,
-    /// On this machine, holders of a token for commands.
+    /// Holders of a token for commands: on this machine, and on an encrypted page from elsewhere.
     Token,
+}
+
+impl Config {
+    /// The files of the certificate and its private key; `None` without encryption.
+    pub fn certificate(&self) -> Option<[PathBuf; 2]> {
+        let certificate = Some(&self.certificate).filter(|path| !path.as_os_str().is_empty())?;
+        let beside = certificate.with_extension("key");
+        let key = if self.key.as_os_str().is_empty() { beside } else { self.key.clone() };
+        Some([certificate.clone(), key])
+    }
 }
 
 /// Where pictures come from.
@@ -79,6 +93,10 @@ impl node::Settings for Config {
         check.parses("listen", listen.map_err(|_| "it must be IP:PORT, such as 127.0.0.1:8080"));
         check.parses("names", check_names(&self.names));
         check.parses("commands", node::named::<Commands>(&self.commands));
+        if self.certificate.as_os_str().is_empty() && !self.key.as_os_str().is_empty() {
+            let it: Result<(), _> = Err("there is no `certificate` that it belongs to");
+            check.parses("key", it);
+        }
         check.range("max_clients", self.max_clients, 1..=64);
         check.parses("video.input", node::named::<Input>(&self.video.input));
         check.range("video.max_hz", self.video.max_hz, 0.5..=120.0);
@@ -126,6 +144,7 @@ mod tests {
             ("listen=localhost:80", "IP:PORT"),
             ("names=[\"a b\"]", "no host name"),
             ("commands=always", "`never`"),
+            ("key=page.key", "`certificate`"),
             ("max_clients=0", "from 1 to 64"),
             ("video.input=raw", "`frames`"),
             ("video.max_hz=0", "max_hz"),

@@ -20,6 +20,8 @@ pub enum Refusal {
     Token,
     /// There are too many browsers.
     Full,
+    /// The page is encrypted, and the request was not.
+    Plain,
 }
 
 impl Refusal {
@@ -30,6 +32,7 @@ impl Refusal {
             Self::Origin => "wrong Origin",
             Self::Token => "no valid token",
             Self::Full => "too many browsers",
+            Self::Plain => "request without TLS",
         }
     }
 
@@ -46,6 +49,7 @@ impl Refusal {
             Self::Full => {
                 "As many browsers as `max_clients` allows are open already; close one of them."
             }
+            Self::Plain => "This page is encrypted: open its address with https://.",
         }
     }
 }
@@ -56,6 +60,7 @@ pub struct Guard {
     listen: SocketAddr,
     names: Vec<String>,
     commands: Commands,
+    is_encrypted: bool,
 }
 
 /// What a connection may do.
@@ -66,9 +71,19 @@ pub struct Access {
 }
 
 impl Guard {
-    /// A guard of the page at this address, which has these names as well.
-    pub fn new(listen: SocketAddr, names: Vec<String>, commands: Commands) -> Self {
-        Self { listen, names, commands }
+    /// A guard of the page at this address, which has these names as well, and is encrypted or not.
+    pub fn new(
+        listen: SocketAddr,
+        names: Vec<String>,
+        commands: Commands,
+        is_encrypted: bool,
+    ) -> Self {
+        Self { listen, names, commands, is_encrypted }
+    }
+
+    /// How the address of the page begins.
+    pub fn scheme(&self) -> &'static str {
+        if self.is_encrypted { "https://" } else { "http://" }
     }
 
     /// Whether a request is meant for this page, and of no other site.
@@ -80,7 +95,7 @@ impl Guard {
         // Browsers name the origin with every WebSocket and every POST; other programs have none.
         let Some(origin) = origin else { return Ok(()) };
         let is_same =
-            origin.strip_prefix("http://").is_some_and(|it| it.eq_ignore_ascii_case(host));
+            origin.strip_prefix(self.scheme()).is_some_and(|it| it.eq_ignore_ascii_case(host));
         if is_same { Ok(()) } else { Err(Refusal::Origin) }
     }
 
@@ -88,7 +103,7 @@ impl Guard {
         let (name, port) = match host.rsplit_once(':') {
             // The colons of an IPv6 address are inside of brackets.
             Some((name, port)) if !port.contains(']') => (name, port.parse().ok()),
-            _ => (host, Some(80)),
+            _ => (host, Some(if self.is_encrypted { 443 } else { 80 })),
         };
         if port != Some(self.listen.port()) {
             return false;
@@ -116,8 +131,11 @@ impl Guard {
             Commands::Never => Some(
                 "this page only shows; `commands = \"here\"` in its configuration lets it command",
             ),
-            _ if !is_here => Some(
-                "commands are taken on the machine of the dashboard only, as this connection is not encrypted; `ssh -L` brings the page to your machine",
+            _ if !is_here && !self.is_encrypted => Some(
+                "commands are taken on the machine of the dashboard only, as this connection is not encrypted; give the page a certificate (`alight dashboard certificate`), or bring it to your machine with `ssh -L`",
+            ),
+            Commands::Here if !is_here => Some(
+                "commands are taken on the machine of the dashboard only; `commands = \"token\"` in its configuration takes them from elsewhere",
             ),
             Commands::Here => None,
             Commands::Token if session == Some(Kind::Command) => None,
@@ -134,7 +152,7 @@ mod tests {
     use super::*;
 
     fn guard(listen: &str) -> Guard {
-        Guard::new(listen.parse().unwrap(), vec!["kestrel.local".into()], Commands::Here)
+        Guard::new(listen.parse().unwrap(), vec!["kestrel.local".into()], Commands::Here, false)
     }
 
     #[test]
@@ -182,6 +200,28 @@ mod tests {
         // A token for commands that crossed the air in the clear commands nothing.
         let shown = guard.access(away, Some(Kind::Command)).unwrap();
         assert!(shown.no_commands.unwrap().contains("not encrypted"));
+    }
+
+    #[test]
+    fn an_encrypted_page_takes_commands_from_elsewhere_with_a_token() {
+        let open = |commands| Guard { commands, is_encrypted: true, ..guard("0.0.0.0:8080") };
+        let away = "10.0.0.7".parse().unwrap();
+        assert_eq!(open(Commands::Token).access(away, None), Err(Refusal::Token));
+        let may = |commands, kind| open(commands).access(away, Some(kind)).unwrap().no_commands;
+        assert_eq!(may(Commands::Token, Kind::Command), None);
+        for (commands, kind) in [
+            (Commands::Token, Kind::Monitor),
+            (Commands::Here, Kind::Command),
+            (Commands::Never, Kind::Command),
+        ] {
+            assert!(may(commands, kind).is_some(), "{commands:?} {kind}");
+        }
+        let page = open(Commands::Token);
+        let check = |origin| page.check_headers(Some("localhost:8080"), Some(origin));
+        assert_eq!(check("https://localhost:8080"), Ok(()));
+        assert_eq!(check("http://localhost:8080"), Err(Refusal::Origin));
+        let usual = Guard { is_encrypted: true, ..guard("0.0.0.0:443") };
+        assert_eq!(usual.check_headers(Some("10.0.0.1"), None), Ok(()));
     }
 
     #[test]

@@ -103,14 +103,21 @@ fn is_one_file(header: &FrameHeader) -> bool {
     }
 }
 
-/// The answer with the pictures that come, the newest whenever one was taken.
+/// The answer with the pictures that come until the end, the newest whenever one was taken.
 pub(crate) fn answer(
     pictures: watch::Receiver<Option<Bytes>>,
     connection: Connection,
+    end: impl Future<Output = ()> + Send + 'static,
     permit: OwnedSemaphorePermit,
 ) -> Response {
     let (parts, waiting) = mpsc::channel(1);
-    tokio::spawn(follow(pictures, parts, connection.last(), permit));
+    let following = follow(pictures, parts, connection.last(), permit);
+    tokio::spawn(async move {
+        tokio::select! {
+            () = following => {}
+            () = end => {}
+        }
+    });
     let parts = unfold(waiting, async |mut waiting: mpsc::Receiver<Bytes>| {
         waiting.recv().await.map(|part| (Ok::<_, Infallible>(part), waiting))
     });

@@ -1,7 +1,7 @@
 //! Answers browsers: the page, its data, its pictures, its commands.
 
 use std::convert::Infallible;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -11,10 +11,10 @@ use axum::body::Body;
 use axum::extract::ws::{Message, Utf8Bytes, WebSocket, WebSocketUpgrade};
 use axum::extract::{ConnectInfo, DefaultBodyLimit, Extension, Request, State as Shared};
 use axum::http::header::{
-    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, COOKIE, HOST, ORIGIN, REFERRER_POLICY,
-    SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
+    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, COOKIE, HOST, LOCATION, ORIGIN,
+    REFERRER_POLICY, SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
 };
-use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::Response;
 use axum::routing::{get, post};
@@ -25,6 +25,7 @@ use serde_json::json;
 use tokio::net::TcpListener;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tokio::time::{interval, timeout};
+use web::Tls;
 
 use crate::config::Config;
 use crate::guard::{Access, Guard, Refusal};
@@ -59,6 +60,8 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
 const MAX_REQUEST_BYTES: usize = 4096;
 /// What a browser does not take within this time is given up with its connection.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
+/// Period in which it is looked whether a browser may still have what it gets: its token may be gone.
+const ACCESS_PERIOD: Duration = Duration::from_secs(5);
 /// Period in which a browser is looked after that gets pictures.
 const LOOK_PERIOD: Duration = Duration::from_millis(500);
 /// Maximum age of the picture that a browser gets at first, in nanoseconds.
@@ -86,6 +89,7 @@ pub(crate) struct App {
     state: Arc<Mutex<State>>,
     texts: Texts,
     pictures: Pictures,
+    tls: Option<Tls>,
     clients: Arc<Semaphore>,
     viewers: Arc<Semaphore>,
 }
@@ -112,10 +116,13 @@ impl App {
         pictures: Pictures,
     ) -> anyhow::Result<Arc<Self>> {
         let commands = node::named(&config.commands).map_err(anyhow::Error::msg)?;
+        let files = config.certificate();
+        let tls = files.map(|[certificate, key]| Tls::read(&certificate, &key)).transpose();
+        let tls = tls.context("`certificate` of the dashboard, which encrypts the page")?;
         let max_clients = config.max_clients as usize;
         Ok(Arc::new(Self {
             node,
-            guard: Guard::new(address, config.names.clone(), commands),
+            guard: Guard::new(address, config.names.clone(), commands, tls.is_some()),
             config: config.clone(),
             // Cookies are shared by the ports of a machine.
             cookie: format!("alight-{}", address.port()),
@@ -123,9 +130,15 @@ impl App {
             state,
             texts,
             pictures,
+            tls,
             clients: Arc::new(Semaphore::new(max_clients)),
             viewers: Arc::new(Semaphore::new(max_clients)),
         }))
+    }
+
+    /// How the address of the page begins.
+    pub(crate) fn scheme(&self) -> &'static str {
+        self.guard.scheme()
     }
 
     /// The value of our cookie in a request.
@@ -135,14 +148,21 @@ impl App {
         cookies.find_map(|it| it.trim().strip_prefix(&self.cookie)?.strip_prefix('='))
     }
 
-    fn access(&self, peer: SocketAddr, headers: &HeaderMap) -> Result<Access, Refusal> {
-        let session = self.cookie(headers).and_then(|cookie| {
+    /// Who asks, and what they may do.
+    fn admit(self: &Arc<Self>, peer: SocketAddr, headers: &HeaderMap) -> Result<Visitor, Refusal> {
+        let cookie = self.cookie(headers).map(str::to_owned);
+        let access = self.access(peer.ip(), cookie.as_deref())?;
+        Ok(Visitor { app: Arc::clone(self), peer: peer.ip(), cookie, access })
+    }
+
+    fn access(&self, peer: IpAddr, cookie: Option<&str>) -> Result<Access, Refusal> {
+        let session = cookie.and_then(|cookie| {
             let tokens = tokio::task::block_in_place(|| self.tokens()).unwrap_or_default();
             let mut sessions = self.sessions();
             sessions.keep(&tokens);
             sessions.kind(cookie, now_s())
         });
-        self.guard.access(peer.ip(), session)
+        self.guard.access(peer, session)
     }
 
     fn sessions(&self) -> MutexGuard<'_, Sessions> {
@@ -162,6 +182,7 @@ impl App {
             Refusal::Origin => StatusCode::FORBIDDEN,
             Refusal::Token => StatusCode::UNAUTHORIZED,
             Refusal::Full => StatusCode::SERVICE_UNAVAILABLE,
+            Refusal::Plain => StatusCode::UPGRADE_REQUIRED,
         };
         let why = json!({ "reason": refusal.reason(), "why": refusal.sentence() });
         answer(status, JSON, why.to_string())
@@ -171,6 +192,27 @@ impl App {
         let named = &self.config.tokens;
         let file = if named.as_os_str().is_empty() { usual_file()? } else { named.clone() };
         Tokens::read(&file)
+    }
+}
+
+/// Whoever was let in.
+struct Visitor {
+    app: Arc<App>,
+    peer: IpAddr,
+    cookie: Option<String>,
+    access: Access,
+}
+
+impl Visitor {
+    /// Comes back when they may no longer do what they could at first, as their token was removed or has ended.
+    async fn loses_access(&self) {
+        let mut look = interval(ACCESS_PERIOD);
+        loop {
+            look.tick().await;
+            if self.app.access(self.peer, self.cookie.as_deref()).as_ref() != Ok(&self.access) {
+                return;
+            }
+        }
     }
 }
 
@@ -202,8 +244,29 @@ pub(crate) async fn serve(listener: TcpListener, app: Arc<App>) -> Infallible {
         .route("/video.mjpeg", get(motion_jpeg))
         .layer(DefaultBodyLimit::max(MAX_REQUEST_BYTES))
         .layer(from_fn_with_state(Arc::clone(&app), protect))
-        .with_state(app);
-    web::serve(listener, router, web::Limits::default(), health).await
+        .with_state(Arc::clone(&app));
+    let encryption = app.tls.clone().map(|tls| web::Encryption {
+        tls,
+        otherwise: Router::new().fallback(moved).with_state(app),
+    });
+    web::serve(listener, router, encryption, web::Limits::default(), health).await
+}
+
+/// Sends who asks for the page without encryption to the encrypted one; nothing else is answered.
+async fn moved(Shared(app): Shared<Arc<App>>, request: Request) -> Response {
+    std::future::ready(()).await;
+    let host = request.headers().get(HOST).and_then(|host| host.to_str().ok());
+    if request.method() != Method::GET || request.uri().path() != "/" {
+        return app.refuse(Refusal::Plain);
+    }
+    if let Err(refusal) = app.guard.check_headers(host, None) {
+        return app.refuse(refusal);
+    }
+    let page = HeaderValue::from_str(&format!("https://{}/", host.unwrap_or_default()));
+    let Ok(page) = page else { return app.refuse(Refusal::Host) };
+    let mut response = answer(StatusCode::TEMPORARY_REDIRECT, HTML, "");
+    response.headers_mut().insert(LOCATION, page);
+    response
 }
 
 /// Checks every request before anything else, and says to the browser what the page may do.
@@ -238,9 +301,9 @@ async fn session(
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
 ) -> Response {
-    std::future::ready(match app.access(peer, &headers) {
-        Ok(access) => {
-            let text = json!({ "no_commands": access.no_commands }).to_string();
+    std::future::ready(match app.admit(peer, &headers) {
+        Ok(visitor) => {
+            let text = json!({ "no_commands": visitor.access.no_commands }).to_string();
             answer(StatusCode::OK, JSON, text)
         }
         Err(refusal) => app.refuse(refusal),
@@ -262,8 +325,11 @@ async fn login(Shared(app): Shared<Arc<App>>, token: String) -> Response {
     let kind = token.kind;
     app.sessions().begin(&cookie, token, now_s());
     app.log(Level::Info, &format!("a browser has shown a token of the kind `{kind}`"));
-    let cookie =
-        format!("{}={cookie}; HttpOnly; SameSite=Strict; Path=/; Max-Age={SESSION_S}", app.cookie);
+    let secure = if app.tls.is_some() { "; Secure" } else { "" };
+    let cookie = format!(
+        "{}={cookie}; HttpOnly; SameSite=Strict; Path=/; Max-Age={SESSION_S}{secure}",
+        app.cookie
+    );
     let is_command = kind == Kind::Command;
     let mut response = answer(StatusCode::OK, JSON, json!({ "command": is_command }).to_string());
     if let Ok(value) = HeaderValue::from_str(&cookie) {
@@ -287,9 +353,9 @@ async fn data(
     upgrade: WebSocketUpgrade,
 ) -> Response {
     let permit = Arc::clone(&app.clients).try_acquire_owned().map_err(|_| Refusal::Full);
-    match std::future::ready(app.access(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
-        Ok((access, permit)) => {
-            bounded(upgrade).on_upgrade(move |socket| Client::new(app, access).run(socket, permit))
+    match std::future::ready(app.admit(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
+        Ok((visitor, permit)) => {
+            bounded(upgrade).on_upgrade(move |socket| Client::new(visitor).run(socket, permit))
         }
         Err(refusal) => app.refuse(refusal),
     }
@@ -302,8 +368,13 @@ async fn video(
     upgrade: WebSocketUpgrade,
 ) -> Response {
     let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
-    match std::future::ready(app.access(peer, &headers).and(permit)).await {
-        Ok(permit) => bounded(upgrade).on_upgrade(move |socket| pictures(app, socket, permit)),
+    match std::future::ready(app.admit(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
+        Ok((visitor, permit)) => bounded(upgrade).on_upgrade(async move |socket| {
+            tokio::select! {
+                () = pictures(&visitor.app, socket, permit) => {}
+                () = visitor.loses_access() => {}
+            }
+        }),
         Err(refusal) => app.refuse(refusal),
     }
 }
@@ -317,8 +388,11 @@ async fn motion_jpeg(
     headers: HeaderMap,
 ) -> Response {
     let permit = Arc::clone(&app.viewers).try_acquire_owned().map_err(|_| Refusal::Full);
-    match std::future::ready(app.access(peer, &headers).and(permit)).await {
-        Ok(permit) => motion::answer(app.pictures.files.subscribe(), connection, permit),
+    match std::future::ready(app.admit(peer, &headers).and_then(|it| Ok((it, permit?)))).await {
+        Ok((visitor, permit)) => {
+            let end = async move { visitor.loses_access().await };
+            motion::answer(app.pictures.files.subscribe(), connection, end, permit)
+        }
         Err(refusal) => app.refuse(refusal),
     }
 }
@@ -334,7 +408,7 @@ async fn send(socket: &mut WebSocket, message: Message) -> anyhow::Result<()> {
 }
 
 /// Sends pictures, the newest that there is whenever the browser has drawn one.
-async fn pictures(app: Arc<App>, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
+async fn pictures(app: &App, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
     let mut shown = app.pictures.shown.subscribe();
     // The newest picture is an old one when the camera stands still.
     let newest_ns = shown.borrow().as_ref().map(|it| it.at_ns);
@@ -378,33 +452,34 @@ async fn pictures(app: Arc<App>, mut socket: WebSocket, _permit: OwnedSemaphoreP
 
 /// A browser that shows the page.
 struct Client {
-    app: Arc<App>,
-    access: Access,
+    visitor: Arc<Visitor>,
     nonce: Nonce,
     replies: mpsc::Sender<Utf8Bytes>,
     waiting: mpsc::Receiver<Utf8Bytes>,
 }
 
 impl Client {
-    fn new(app: Arc<App>, access: Access) -> Self {
+    fn new(visitor: Visitor) -> Self {
         let (replies, waiting) = mpsc::channel(MAX_COMMANDS);
-        Self { app, access, nonce: Nonce::default(), replies, waiting }
+        Self { visitor: Arc::new(visitor), nonce: Nonce::default(), replies, waiting }
     }
 
     async fn run(mut self, mut socket: WebSocket, _permit: OwnedSemaphorePermit) {
-        // A browser that goes is no failure.
-        if let Err(problem) = self.talk(&mut socket).await {
-            tracing::debug!(%problem, "A browser has gone");
+        let visitor = Arc::clone(&self.visitor);
+        tokio::select! {
+            // A browser that goes is no failure.
+            gone = self.talk(&mut socket) => tracing::debug!(?gone, "A browser has gone"),
+            () = visitor.loses_access() => tracing::debug!("A browser may no longer do what it could"),
         }
     }
 
     async fn talk(&mut self, socket: &mut WebSocket) -> anyhow::Result<()> {
         let hello = json!({
             "kind": "hello", "version": env!("CARGO_PKG_VERSION"), "host": host_name(),
-            "no_commands": self.access.no_commands, "hold_ms": HOLD_MS, "video": self.app.config.video.input,
+            "no_commands": self.visitor.access.no_commands, "hold_ms": HOLD_MS, "video": self.visitor.app.config.video.input,
         });
         send(socket, Message::Text(hello.to_string().into())).await?;
-        let texts = self.app.texts.clone();
+        let texts = self.visitor.app.texts.clone();
         let [mut now, mut slow, mut log] = [texts.now, texts.slow, texts.log].map(|text| {
             let mut text = text.subscribe();
             text.mark_changed();
@@ -435,7 +510,7 @@ impl Client {
     /// The answer to what a browser asks; of a command that is sent it comes later.
     fn asked(&mut self, text: &str) -> Option<Utf8Bytes> {
         let Ok(ask) = serde_json::from_str(text) else {
-            self.app.node.health().dropped("unreadable request");
+            self.visitor.app.node.health().dropped("unreadable request");
             return Some(
                 json!({ "kind": "problem", "why": "unreadable request" }).to_string().into(),
             );
@@ -463,13 +538,13 @@ impl Client {
             Ask::Command { command, argument, nonce } => {
                 let whole = whole(&command, argument.as_deref());
                 let checked = self.nonce.spend(now_ns(), &nonce, &whole);
-                if let Some(why) = self.access.no_commands {
-                    self.app.node.health().dropped("command without the right");
+                if let Some(why) = self.visitor.access.no_commands {
+                    self.visitor.app.node.health().dropped("command without the right");
                     return Some(refused(&whole, "dashboard", why));
                 }
                 if let Err(problem) = checked {
-                    self.app.node.health().dropped(problem.reason());
-                    self.app.log(
+                    self.visitor.app.node.health().dropped(problem.reason());
+                    self.visitor.app.log(
                         Level::Warn,
                         &format!("{whole}: refused here: {}", problem.sentence()),
                     );
@@ -485,7 +560,7 @@ impl Client {
     }
 
     fn carry_out(&self, whole: String, command: ControllerCommand) {
-        let (app, replies) = (Arc::clone(&self.app), self.replies.clone());
+        let (app, replies) = (Arc::clone(&self.visitor.app), self.replies.clone());
         tokio::spawn(async move {
             let reply = app.node.command(topic::COMMAND, &[], &command).await;
             let (accepted, reason) = match reply {

@@ -45,8 +45,8 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let app =
         App::new(node.clone(), &config, address, Arc::clone(&state), texts.clone(), pictures)?;
     node.announce().await?;
-    tracing::info!("The page is at http://{address}/");
-    if !address.ip().is_loopback() {
+    tracing::info!("The page is at {}{address}/", app.scheme());
+    if !address.ip().is_loopback() && config.certificate().is_none() {
         tracing::warn!(
             "The page is open to the network, for holders of a token, and is not encrypted"
         );

@@ -183,11 +183,19 @@ impl FromStr for Tokens {
 /// # Errors
 /// When the environment names neither.
 pub fn usual_file() -> anyhow::Result<PathBuf> {
+    Ok(usual_folder()?.join("dashboard-tokens"))
+}
+
+/// The folder of what a dashboard keeps.
+///
+/// # Errors
+/// When the environment names none.
+pub fn usual_folder() -> anyhow::Result<PathBuf> {
     let named = |variable| std::env::var_os(variable).map(PathBuf::from);
     let state = named("XDG_STATE_HOME").filter(|path| path.is_absolute());
     let state = state.or_else(|| named("HOME").map(|home| home.join(".local").join("state")));
     let state = state.context("neither XDG_STATE_HOME nor HOME is set; set `tokens` in the configuration of the dashboard")?;
-    Ok(state.join("alight").join("dashboard-tokens"))
+    Ok(state.join("alight"))
 }
 
 /// Browsers that have shown a token, in memory only. They are known by the hash of their cookie.

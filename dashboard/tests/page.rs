@@ -1,6 +1,10 @@
 //! The page's server, asked by programs that are no browser, with a controller and a camera that are made up here.
 
+use std::fs::Permissions;
 use std::net::{IpAddr, SocketAddr, UdpSocket};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
@@ -12,12 +16,18 @@ use messages::{
     topic,
 };
 use node::{Identity, Layers, Node, Shutdown, ZenohSource};
+use rustls::crypto::ring;
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, ServerName};
+use rustls::{ClientConfig, RootCertStore};
 use serde_json::{Value, json};
 use testing::ports;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::http::{HeaderValue, Request};
 use tokio_tungstenite::tungstenite::{Error, Message};
@@ -28,6 +38,10 @@ const PATIENCE: Duration = Duration::from_secs(20);
 const HELD: Duration = Duration::from_millis(1050);
 
 type Socket = WebSocketStream<TcpStream>;
+
+/// What a WebSocket runs over.
+trait Stream: AsyncRead + AsyncWrite + Unpin {}
+impl<S: AsyncRead + AsyncWrite + Unpin> Stream for S {}
 
 /// A dashboard with its network.
 struct Page {
@@ -117,12 +131,15 @@ fn get(path: &str, host: &str, more: &str) -> String {
     format!("GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n{more}\r\n")
 }
 
-async fn next(socket: &mut Socket) -> anyhow::Result<Message> {
+async fn next(socket: &mut WebSocketStream<impl Stream>) -> anyhow::Result<Message> {
     Ok(timeout(PATIENCE, socket.next()).await?.context("the connection was closed")??)
 }
 
 /// The next message for which something holds.
-async fn told(socket: &mut Socket, holds: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
+async fn told(
+    socket: &mut WebSocketStream<impl Stream>,
+    holds: impl Fn(&Value) -> bool,
+) -> anyhow::Result<Value> {
     let found = timeout(PATIENCE, async {
         loop {
             if let Message::Text(text) = next(socket).await? {
@@ -136,7 +153,7 @@ async fn told(socket: &mut Socket, holds: impl Fn(&Value) -> bool) -> anyhow::Re
     found.await.context("waiting to be told")?
 }
 
-async fn say(socket: &mut Socket, value: Value) -> anyhow::Result<()> {
+async fn say(socket: &mut WebSocketStream<impl Stream>, value: Value) -> anyhow::Result<()> {
     Ok(socket.send(Message::text(value.to_string())).await?)
 }
 
@@ -233,13 +250,17 @@ async fn the_state_is_told_with_its_age() -> anyhow::Result<()> {
     Ok(())
 }
 
-async fn nonce(socket: &mut Socket, command: &str) -> anyhow::Result<String> {
+async fn nonce(socket: &mut WebSocketStream<impl Stream>, command: &str) -> anyhow::Result<String> {
     say(socket, json!({ "kind": "nonce", "command": command })).await?;
     let answer = told(socket, |it| it["kind"] == "nonce").await?;
     Ok(answer["nonce"].as_str().context("a nonce")?.to_owned())
 }
 
-async fn command(socket: &mut Socket, command: &str, nonce: &str) -> anyhow::Result<Value> {
+async fn command(
+    socket: &mut WebSocketStream<impl Stream>,
+    command: &str,
+    nonce: &str,
+) -> anyhow::Result<Value> {
     say(socket, json!({ "kind": "command", "command": command, "nonce": nonce })).await?;
     told(socket, |it| it["kind"] == "reply").await
 }
@@ -378,6 +399,118 @@ fn outward() -> Option<IpAddr> {
     socket.connect("192.0.2.1:9").ok()?;
     let address = socket.local_addr().ok()?.ip();
     (!address.is_loopback() && !address.is_unspecified()).then_some(address)
+}
+
+/// A certificate for a page, in files.
+fn certificate(folder: &Path, names: &[String]) -> anyhow::Result<[PathBuf; 2]> {
+    let files = [folder.join("page.pem"), folder.join("page.key")];
+    let made = rcgen::generate_simple_self_signed(names)?;
+    std::fs::write(&files[0], made.cert.pem())?;
+    std::fs::write(&files[1], made.signing_key.serialize_pem())?;
+    std::fs::set_permissions(&files[1], Permissions::from_mode(0o600))?;
+    Ok(files)
+}
+
+/// A client that trusts this certificate alone.
+fn trusting(certificate: &Path) -> anyhow::Result<TlsConnector> {
+    let mut roots = RootCertStore::empty();
+    roots.add(CertificateDer::from_pem_file(certificate)?)?;
+    let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_safe_default_protocol_versions()?
+        .with_root_certificates(roots)
+        .with_no_client_auth();
+    Ok(TlsConnector::from(Arc::new(config)))
+}
+
+async fn encrypted(
+    connector: &TlsConnector,
+    address: SocketAddr,
+) -> anyhow::Result<TlsStream<TcpStream>> {
+    let stream = TcpStream::connect(address).await?;
+    Ok(connector.connect(ServerName::from(address.ip()), stream).await?)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there()
+-> anyhow::Result<()> {
+    let Some(outward) = outward() else {
+        testing::skip("network", "this machine has no address but loopback");
+        return Ok(());
+    };
+    let folder = tempfile::tempdir()?;
+    let [pem, key] = certificate(folder.path(), &[outward.to_string()])?;
+    let file = folder.path().join("tokens");
+    let token = secret()?;
+    let mut tokens = Tokens::default();
+    tokens.add(&token, Kind::Command, 0, u64::MAX);
+    tokens.write(&file)?;
+    let set = [("tokens", &file), ("certificate", &pem), ("key", &key)]
+        .map(|(k, p)| format!("{k}={p:?}"));
+    let set = [&["commands=token"], &set.each_ref().map(String::as_str)[..]].concat();
+    let page = Page::start_at("0.0.0.0", &set).await?;
+    let controller = controller(open("controller", page.meet).await?);
+    let from = SocketAddr::new(outward, page.address.port());
+
+    // Without encryption there is only the way to the page.
+    let moved = ask(from, &get("/", &from.to_string(), "")).await?;
+    ensure!(moved.starts_with("HTTP/1.1 307"), "{moved}");
+    ensure!(moved.contains(&format!("location: https://{from}/")), "{moved}");
+    ensure!(ask(from, &get("/", "evil.example", "")).await?.starts_with("HTTP/1.1 421"));
+    let log_in = format!(
+        "POST /login HTTP/1.1\r\nHost: {from}\r\nOrigin: https://{from}\r\nConnection: close\r\nContent-Length: {}\r\n\r\n{token}",
+        token.len()
+    );
+    ensure!(ask(from, &log_in).await?.starts_with("HTTP/1.1 426"));
+    ensure!(refusal(from, page.request(from, "/ws")?).await? == 426);
+    ensure!(page.refused("request without TLS") == 2);
+
+    // Who does not trust the certificate says nothing.
+    let others = tempfile::tempdir()?;
+    let [other, _] = certificate(others.path(), &[outward.to_string()])?;
+    ensure!(encrypted(&trusting(&other)?, from).await.is_err());
+    let counted = timeout(PATIENCE, async {
+        while page.refused("no encrypted connection") != 1 {
+            sleep(Duration::from_millis(20)).await;
+        }
+    });
+    counted.await.context("a handshake that was given up is not counted")?;
+    let connector = trusting(&pem)?;
+    let mut stream = encrypted(&connector, from).await?;
+    stream.write_all(log_in.as_bytes()).await?;
+    let mut answer = Vec::new();
+    timeout(PATIENCE, stream.read_to_end(&mut answer)).await??;
+    let answer = String::from_utf8_lossy(&answer).into_owned();
+    let cookie = answer.lines().find_map(|line| line.strip_prefix("set-cookie: "));
+    let cookie = cookie.with_context(|| answer.clone())?;
+    ensure!(cookie.contains("; Secure"), "{cookie}");
+    let cookie = HeaderValue::from_str(cookie.split(';').next().context("a cookie")?)?;
+
+    let request = |scheme: &str| -> anyhow::Result<Request<()>> {
+        let mut request = page.request(from, "/ws")?;
+        let origin = HeaderValue::from_str(&format!("{scheme}://{from}"))?;
+        request.headers_mut().insert("origin", origin);
+        request.headers_mut().insert("cookie", cookie.clone());
+        Ok(request)
+    };
+    let wrong = client_async(request("http")?, encrypted(&connector, from).await?).await;
+    ensure!(matches!(wrong, Err(Error::Http(response)) if response.status() == 403));
+    let (mut socket, _) =
+        client_async(request("https")?, encrypted(&connector, from).await?).await?;
+    let hello = told(&mut socket, |it| it["kind"] == "hello").await?;
+    ensure!(hello["no_commands"].is_null(), "{hello}");
+    let held = nonce(&mut socket, "hold").await?;
+    sleep(HELD).await;
+    let reply = command(&mut socket, "hold", &held).await?;
+    ensure!(reply["accepted"] == true && reply["who"] == "controller", "{reply}");
+
+    // Without its token the page is closed.
+    Tokens::default().write(&file)?;
+    let closed = timeout(PATIENCE, async { while let Some(Ok(_)) = socket.next().await {} });
+    closed.await.context("the page is still open without its token")?;
+    let again = client_async(request("https")?, encrypted(&connector, from).await?).await;
+    ensure!(matches!(again, Err(Error::Http(response)) if response.status() == 401));
+    controller.abort();
+    Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -45,7 +45,7 @@ pub(crate) struct Server {
 pub(crate) async fn serve(listener: TcpListener, server: Server) -> Infallible {
     let health = Arc::clone(&server.health);
     let router = Router::new().fallback(any(connect)).with_state(Arc::new(server));
-    web::serve(listener, router, web::Limits::default(), health).await
+    web::serve(listener, router, None, web::Limits::default(), health).await
 }
 
 async fn connect(

@@ -4,9 +4,12 @@
 //! time is over; a WebSocket gives it back, as those are counted by who answers them. An answer without end, as a video, says
 //! that its connection lasts, and ends it.
 
+mod tls;
+
 use std::convert::Infallible;
 use std::future::ready;
 use std::io::ErrorKind;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -18,9 +21,13 @@ use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use node::HealthCounters;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Notify, Semaphore};
-use tokio::time::sleep;
+use tokio::time::{sleep, timeout};
+
+use crate::tls::Begun;
+pub use crate::tls::Tls;
 
 /// Pause after an error of the system, as that there are too many open files.
 const PAUSE: Duration = Duration::from_millis(500);
@@ -36,6 +43,15 @@ pub struct Limits {
     pub head: Duration,
     /// Maximum time of a connection that does not become a WebSocket and does not last.
     pub connection: Duration,
+}
+
+/// Encryption, and what is answered without it.
+#[derive(Clone)]
+pub struct Encryption {
+    /// The certificate.
+    pub tls: Tls,
+    /// Answers a connection that is not encrypted: where the encrypted page is.
+    pub otherwise: Router,
 }
 
 /// The connection of a request; each request has it as an extension.
@@ -90,11 +106,12 @@ impl Default for Limits {
     }
 }
 
-/// Answers whoever connects, and counts in the health what took too long. Each request has its peer's address as
-/// `ConnectInfo<SocketAddr>`.
+/// Answers whoever connects, with encryption where there is one, and counts in the health what took too long. Each request has
+/// its peer's address as `ConnectInfo<SocketAddr>`.
 pub async fn serve(
     listener: TcpListener,
     router: Router,
+    encryption: Option<Encryption>,
     limits: Limits,
     health: Arc<HealthCounters>,
 ) -> Infallible {
@@ -113,18 +130,35 @@ pub async fn serve(
                 continue;
             }
         };
-        let connection = Connection::default();
-        let asking = connection.clone();
-        let router = router
-            .clone()
-            .layer(Extension(ConnectInfo(peer)))
-            .layer(Extension(connection.clone()))
-            .layer(map_request(move |request: Request| ready(asking.asked(request))));
-        let health = Arc::clone(&health);
+        // Small messages go at once.
+        drop(stream.set_nodelay(true));
+        let answering =
+            begin(stream, peer, router.clone(), encryption.clone(), limits, Arc::clone(&health));
         tokio::spawn(async move {
-            answer(stream, router, limits, &connection, &health).await;
+            answering.await;
             drop(place);
         });
+    }
+}
+
+/// Answers a connection, after its handshake where it is encrypted.
+async fn begin(
+    stream: TcpStream,
+    peer: SocketAddr,
+    router: Router,
+    encryption: Option<Encryption>,
+    limits: Limits,
+    health: Arc<HealthCounters>,
+) {
+    let Some(Encryption { tls, otherwise }) = encryption else {
+        return answer(stream, peer, router, limits, &health).await;
+    };
+    match timeout(limits.head, tls.begin(stream)).await {
+        Ok(Ok(Begun::Encrypted(stream))) => answer(stream, peer, router, limits, &health).await,
+        Ok(Ok(Begun::Plain(stream))) => answer(stream, peer, otherwise, limits, &health).await,
+        // A browser that does not trust the certificate ends the handshake.
+        Ok(Err(_)) => health.dropped("no encrypted connection"),
+        Err(_) => health.dropped("a request took too long"),
     }
 }
 
@@ -134,15 +168,21 @@ fn is_of_the_peer(kind: ErrorKind) -> bool {
     matches!(kind, ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
 
-async fn answer(
-    stream: TcpStream,
+async fn answer<S>(
+    stream: S,
+    peer: SocketAddr,
     router: Router,
     limits: Limits,
-    connection: &Connection,
     health: &HealthCounters,
-) {
-    // Small messages go at once.
-    drop(stream.set_nodelay(true));
+) where
+    S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+{
+    let connection = Connection::default();
+    let asking = connection.clone();
+    let router = router
+        .layer(Extension(ConnectInfo(peer)))
+        .layer(Extension(connection.clone()))
+        .layer(map_request(move |request: Request| ready(asking.asked(request))));
     let answering = http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(limits.head)

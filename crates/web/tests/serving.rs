@@ -82,7 +82,7 @@ async fn served() -> anyhow::Result<Served> {
         .route("/slowly", get(slowly))
         .route("/video", get(video))
         .route("/socket", get(socket));
-    tokio::spawn(serve(listener, router, LIMITS, Arc::clone(&health)));
+    tokio::spawn(serve(listener, router, None, LIMITS, Arc::clone(&health)));
     Ok(Served { address, health })
 }
 
