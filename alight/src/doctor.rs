@@ -3,6 +3,7 @@
 //! First the machine, the site, its keys and devices; then the network: services, `cameras`, clocks, links.
 
 mod cameras;
+mod focus;
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -13,11 +14,12 @@ use clap::Args;
 use messages::{CameraInfo, ControllerStatus, FrameHeader, Health, topic};
 use node::access::Holder;
 use node::network::{AIR_PORT, AUTHORITY, Address, check_private};
-use node::{INSECURE, Network, Node, clock_name, now_ns, stats};
+use node::{INSECURE, Network, Node, clock_name, stats};
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 use tokio::time::timeout;
 
+use self::focus::Focus;
 use crate::args::{Format, NetworkArgs, OPERATOR};
 use crate::keys;
 use crate::runtime::{runtime, tool_identity};
@@ -383,6 +385,8 @@ struct ReceivedFrame {
     header: FrameHeader,
     bytes: usize,
     received_ns: i64,
+    /// The width of edges in it, where that was looked at.
+    edge_width_px: Option<f64>,
 }
 
 async fn check_network(findings: &mut Findings, node: Node, watched: Watched, expected: &[Job]) {
@@ -417,6 +421,7 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
         Some(raw) => raw.next().await,
         None => std::future::pending().await,
     };
+    let mut focus = Focus::default();
     let watching = async {
         loop {
             tokio::select! {
@@ -427,16 +432,8 @@ async fn watch(node: &Node, seen: &mut Seen, watched: Watched) -> anyhow::Result
                     keep(&mut seen.cameras, camera, |a, b| a.camera == b.camera);
                 }
                 Some(status) = statuses.next() => seen.status = Some(status),
-                Some(frame) = frames.next() => {
-                    let bytes = frame.bytes().len();
-                    let received_ns = now_ns();
-                    seen.frames.push(ReceivedFrame { header: frame.header, bytes, received_ns });
-                }
-                Some(frame) = next_raw() => {
-                    let bytes = frame.bytes().len();
-                    let received_ns = now_ns();
-                    seen.raw_frames.push(ReceivedFrame { header: frame.header, bytes, received_ns });
-                }
+                Some(frame) = frames.next() => seen.frames.push(focus.received(frame)),
+                Some(frame) = next_raw() => seen.raw_frames.push(focus.received(frame)),
             }
         }
     };

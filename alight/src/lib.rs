@@ -22,6 +22,7 @@ mod doctor;
 mod experiment;
 mod fault_link;
 mod faults;
+mod grey;
 mod keys;
 mod land;
 mod marker;

@@ -1,8 +1,8 @@
 //! Frames of a camera that is running, until enough of them show the board.
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use calibration::calibrate_unjudged;
-use imaging::{Converter, GrayImage};
+use imaging::Converter;
 use messages::{FrameHeader, topic};
 use node::{Frame, Node, Shutdown};
 
@@ -10,6 +10,7 @@ use super::args::BoardArgs;
 use super::found::{Finder, FoundImages, Origin, Picture};
 use super::guidance::Guidance;
 use crate::args::Format;
+use crate::grey::grey;
 use crate::runtime::with_node;
 use crate::terminal::{print, write_error};
 
@@ -61,18 +62,12 @@ pub(super) fn watch_camera(
 }
 
 fn picture(frame: &Frame, converter: &mut Converter) -> anyhow::Result<Picture> {
-    let FrameHeader { width, height, format, sequence, .. } = frame.header;
-    let Some(samples) = format.sample_format() else {
-        bail!("frames of {format:?} cannot be calibrated with: use the camera's own ones");
-    };
-    let bytes = frame.bytes();
-    let view = converter
-        .convert(&bytes, width as usize, height as usize, samples)
-        .context("reading a frame")?;
-    let mut image = GrayImage::filled(view.width(), view.height(), 0);
-    for y in 0..view.height() {
-        image.row_mut(y).copy_from_slice(view.row(y));
-    }
+    let FrameHeader { format, sequence, .. } = frame.header;
+    ensure!(
+        format.sample_format().is_some(),
+        "frames of {format:?} cannot be calibrated with: use the camera's own ones"
+    );
+    let image = grey(frame, converter)?;
     Ok(Picture { name: format!("frame {sequence}"), image, origin: Origin::Live })
 }
 

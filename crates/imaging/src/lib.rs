@@ -6,13 +6,14 @@
 //! smooths it, [`mod@threshold`] binarises it, [`contour`] follows the borders, [`ellipse`] fits ellipses to
 //! them, [`sample`] interpolates grey values. The fast path to regions of any size: [`pyramid`] halves an
 //! image again and again, [`binary`] binarises with a local threshold, [`outline`] follows the outlines of
-//! the regions. [`segment`] finds straight edge segments where regions are broken.
+//! the regions. [`segment`] finds straight edge segments where regions are broken. [`focus`] says how sharp an image is.
 
 pub mod binary;
 pub mod contour;
 pub mod convert;
 pub mod ellipse;
 pub mod filter;
+pub mod focus;
 mod kernels;
 pub mod outline;
 pub mod pyramid;
@@ -26,6 +27,7 @@ pub use contour::{Contour, Contours, Limits, contour_area};
 pub use convert::{BayerPattern, Converter, SampleFormat};
 pub use ellipse::{Axes, Ellipse, fit_ellipse};
 pub use filter::{BilateralRows, bilateral_5x5};
+pub use focus::edge_width_px;
 pub use outline::{Outline, Outlines};
 pub use pyramid::Pyramid;
 pub use sample::bilinear;
