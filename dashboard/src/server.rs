@@ -157,9 +157,20 @@ impl App {
 
     fn access(&self, peer: IpAddr, cookie: Option<&str>) -> Result<Access, Refusal> {
         let session = cookie.and_then(|cookie| {
-            let tokens = tokio::task::block_in_place(|| self.tokens()).unwrap_or_default();
+            let tokens = tokio::task::block_in_place(|| self.tokens());
             let mut sessions = self.sessions();
-            sessions.keep(&tokens);
+            match tokens {
+                Ok(tokens) => sessions.keep(&tokens),
+                // Who was let in stays: a system that has no more files to open ends nobody's control of a landing.
+                Err(problem) => {
+                    if self.node.health().failed("tokens") {
+                        tracing::warn!(
+                            problem = format!("{problem:#}"),
+                            "The tokens cannot be read"
+                        );
+                    }
+                }
+            }
             sessions.kind(cookie, now_s())
         });
         self.guard.access(peer, session)

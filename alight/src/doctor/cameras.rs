@@ -193,7 +193,9 @@ fn check_focus(findings: &mut Findings, camera: &str, frames: &[&ReceivedFrame])
     else {
         return findings.good(
             "focus",
-            format!("camera `{camera}`: not judged, as its picture has too few edges"),
+            format!(
+                "camera `{camera}`: not judged, as no picture in full resolution had enough edges"
+            ),
         );
     };
     let text = format!("camera `{camera}`: edges are {width_px:.1} pixels wide");
@@ -345,7 +347,7 @@ mod tests {
         let soft = of([Some(7.0), None, Some(5.5)]);
         assert!(soft.contains("edges are 5.5 pixels wide; 2 to 3 are sharp"), "{soft}");
         assert!(soft.contains("focus the lens"), "{soft}");
-        assert!(of([None; 3]).contains("too few edges"));
+        assert!(of([None; 3]).contains("not judged"));
     }
 
     #[test]
