@@ -115,10 +115,22 @@ impl State {
         (0..).zip(&self.channels).map(|(number, it)| (number, it.topic.as_str(), it.schema))
     }
 
-    /// The number and the schema of a record's channel, of which all are told when it is new.
+    /// The number and the schema of a record's channel, of which all are told when it is new. A channel is of one schema: a
+    /// camera that starts again may send pictures of another kind.
     fn number(&mut self, record: &Record) -> Option<(u32, Schema)> {
-        if let Some(&number) = self.numbers.get(&record.channel) {
-            return Some((number, self.channels.get(number as usize)?.schema));
+        let is_its =
+            |it: &Channel| it.topic == record.channel && it.schema.name() == record.schema.name();
+        let last = self.numbers.get(&record.channel).copied();
+        if let Some(number) = last
+            && let Some(channel) = self.channels.get(number as usize).filter(|it| is_its(it))
+        {
+            return Some((number, channel.schema));
+        }
+        if last.is_some()
+            && let Some(number) = self.channels.iter().position(is_its)
+        {
+            self.numbers.insert(record.channel.clone(), number as u32);
+            return Some((number as u32, record.schema));
         }
         if self.channels.len() >= MAX_CHANNELS {
             return None;

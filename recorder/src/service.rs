@@ -62,6 +62,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         config,
         recording: None,
         ending: None,
+        end_problem: None,
         retry: None,
         kept: 0,
         lost: BTreeMap::new(),
@@ -118,6 +119,8 @@ fn about(node: &Node) -> About {
         ("recorder".to_owned(), node.identity().instance.clone()),
         ("host".to_owned(), node::host_name()),
         ("clock".to_owned(), node::clock_name().to_owned()),
+        // Names the run of this process, since whose start losses are counted.
+        ("run".to_owned(), format!("{}-{}", std::process::id(), now_ns())),
     ];
     About {
         program: format!("alight {}", env!("CARGO_PKG_VERSION")),
@@ -140,6 +143,8 @@ struct Recorder {
     recording: Option<Recording>,
     /// The file before, while the disk takes its rest.
     ending: Option<Ending>,
+    /// Why an earlier file lacks its end.
+    end_problem: Option<String>,
     /// When a file that failed is tried again.
     retry: Option<Instant>,
     kept: u64,
@@ -258,6 +263,7 @@ impl Recorder {
             if let Some(problem) = problem {
                 self.health.failed("the file failed");
                 tracing::error!(problem, "The end of a recording is missing");
+                self.end_problem = Some(format!("the end of a recording is missing: {problem}"));
             }
         }
         // At last, so that a full file is followed by the next before another message comes.
@@ -322,7 +328,7 @@ impl Recorder {
         let losses = self.lost.iter().map(|(key, count)| (key.clone(), *count));
         status.dropped = losses.map(|(key, count)| RecorderLoss { key, count }).collect();
         if self.retry.is_none() {
-            status.problem = problem;
+            status.problem = problem.or_else(|| self.end_problem.clone());
         }
         drop(status);
         let max_bytes = u64::from(self.config.max_file_mb) * 1_000_000;

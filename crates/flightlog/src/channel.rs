@@ -48,6 +48,15 @@ impl Schema {
         }
     }
 
+    /// The name of its type; empty for [`Schema::Raw`].
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Raw => "",
+            Self::Json(name) => name,
+            Self::Protobuf(message) => message.name,
+        }
+    }
+
     /// Its description; `None` for [`Schema::Raw`].
     pub fn description(self) -> Option<Description> {
         match self {

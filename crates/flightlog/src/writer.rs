@@ -52,10 +52,11 @@ pub struct Writer<W: Write> {
     utc_offset_ns: i64,
 }
 
-/// A channel in the file.
+/// A channel in the file, which is of one schema.
 #[derive(Copy, Clone, Debug)]
 struct Open {
     id: u16,
+    schema: &'static str,
     sequence: u32,
 }
 
@@ -178,15 +179,18 @@ impl<W: Write> Writer<W> {
     }
 
     fn channel(&mut self, record: &Record) -> Result<&mut Open, Problem> {
-        if !self.open.contains_key(&record.channel) {
+        let name = record.schema.name();
+        // A camera that starts again may send pictures of another kind: they get a channel of the same name.
+        if self.open.get(&record.channel).is_none_or(|open| open.schema != name) {
             let encoding = record.schema.message_encoding();
             let schema = match record.schema.description() {
                 Some(it) => self.mcap.add_schema(&it.name, it.encoding, &it.data)?,
                 None => 0,
             };
             let id = self.mcap.add_channel(schema, &record.channel, encoding, &BTreeMap::new())?;
-            self.open.insert(record.channel.clone(), Open { id, sequence: 0 });
+            self.open.insert(record.channel.clone(), Open { id, schema: name, sequence: 0 });
         }
-        Ok(self.open.entry(record.channel.clone()).or_insert(Open { id: 0, sequence: 0 }))
+        let none = Open { id: 0, schema: name, sequence: 0 };
+        Ok(self.open.entry(record.channel.clone()).or_insert(none))
     }
 }

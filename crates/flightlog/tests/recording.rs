@@ -5,8 +5,8 @@
 use std::ops::Range;
 
 use flightlog::channel::{RAW_PREFIX, Received, split_raw};
-use flightlog::{About, Writer, repair};
-use messages::{Wind, encode};
+use flightlog::{About, Picture, Writer, repair};
+use messages::{FrameHeader, PixelFormat, Wind, encode};
 
 const MESSAGES: usize = 60;
 
@@ -46,6 +46,31 @@ fn numbers(recording: &[u8]) -> Vec<usize> {
         messages::decode::<Wind>(payload).unwrap().stamp_ns as usize
     })
     .collect()
+}
+
+#[test]
+fn pictures_of_another_kind_get_a_channel_of_their_own() {
+    let mut bytes = Vec::new();
+    let mut writer = Writer::new(&mut bytes, &About::default()).unwrap();
+    // A camera that is started again, twice.
+    for format in [PixelFormat::Jpeg, PixelFormat::Mono8, PixelFormat::Jpeg] {
+        let header = FrameHeader { width: 4, height: 2, format, ..FrameHeader::sample() };
+        let attachment = encode(&header);
+        let message = Received {
+            key: "camera/down/frame",
+            payload: &[7; 8],
+            attachment: &attachment,
+            received_ns: 1,
+        };
+        writer.frame(message, &header, &Picture::Pixels).unwrap();
+    }
+    writer.finish().unwrap();
+    let messages = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap);
+    let pictures = messages.filter(|it| it.channel.topic == "camera/down/picture");
+    let schemas: Vec<String> =
+        pictures.map(|it| it.channel.schema.as_ref().unwrap().name.clone()).collect();
+    let [jpeg, raw] = ["foxglove.CompressedImage", "foxglove.RawImage"];
+    assert_eq!(schemas, [jpeg, raw, jpeg]);
 }
 
 #[test]

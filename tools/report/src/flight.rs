@@ -90,7 +90,7 @@ pub struct Flight {
     pub damage: Vec<String>,
     /// Messages that could not be read, by key.
     pub unreadable: BTreeMap<String, Unreadable>,
-    /// Messages that the recorder lost since its start, by key.
+    /// Messages that the recorders lost since their start, by key.
     pub lost: BTreeMap<String, u64>,
     /// The controller's status.
     pub statuses: Vec<ControllerStatus>,
@@ -139,6 +139,8 @@ pub struct Flight {
 pub struct FlightReader {
     flight: Flight,
     tapes: TapeReader,
+    /// Messages that a recorder lost since its start, by its run and their key.
+    lost_by_run: BTreeMap<String, BTreeMap<String, u64>>,
 }
 
 impl FlightReader {
@@ -153,19 +155,24 @@ impl FlightReader {
     /// # Errors
     /// When it is no MCAP file at all.
     pub fn add(&mut self, recording: &[u8]) -> Result<(), flightlog::Problem> {
-        let Self { flight, tapes } = self;
+        let Self { flight, tapes, lost_by_run } = self;
         let tape_key = topic::TAPE.key(&[]);
         let mut lost = BTreeMap::new();
+        let mut run = String::new();
         let Reading { is_ended, messages, damage } =
             flightlog::read(recording, |entry| match entry {
-                Entry::About(facts) => flight.facts.extend(facts),
+                Entry::About(facts) => {
+                    run = facts.get("run").cloned().unwrap_or_default();
+                    flight.facts.extend(facts);
+                }
                 Entry::Dropped(counts) => lost = counts,
                 Entry::Message(message) if message.key == tape_key => tapes.take(message.payload),
                 Entry::Message(message) => flight.take(message),
             })?;
-        // Counted since the recorder's start: the last file has those before it.
+        // Counted since the recorder's start: of its files the last has those before it.
+        let so_far = lost_by_run.entry(run).or_default();
         for (key, count) in lost {
-            let most = flight.lost.entry(key).or_default();
+            let most = so_far.entry(key).or_default();
             *most = count.max(*most);
         }
         flight.is_ended &= is_ended;
@@ -186,7 +193,10 @@ impl FlightReader {
 
     /// The flight.
     pub fn finish(self) -> Flight {
-        let Self { mut flight, tapes } = self;
+        let Self { mut flight, tapes, lost_by_run } = self;
+        for (key, count) in lost_by_run.into_values().flatten() {
+            *flight.lost.entry(key).or_default() += count;
+        }
         flight.damage.extend_from_slice(tapes.damage());
         flight.tapes = tapes.tapes();
         flight.set_shift();
@@ -369,7 +379,10 @@ impl Flight {
     /// message says.
     fn set_shift(&mut self) {
         let own = self.facts.get("clock");
-        let vehicles = self.found.first().map(|it| &it.message.header.clock);
+        let controllers = self.processes.values().map(|it| &it.last);
+        let controllers = controllers.filter(|it| it.service == "controller").map(|it| &it.clock);
+        let frames = self.found.iter().map(|it| &it.message.header.clock);
+        let vehicles = controllers.chain(frames).next();
         let is_other = own.zip(vehicles).is_some_and(|(own, vehicles)| own != vehicles);
         self.shift_ns = self.min_apart_ns.filter(|_| is_other).unwrap_or(0);
     }

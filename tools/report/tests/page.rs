@@ -8,7 +8,8 @@ use std::sync::OnceLock;
 use experiments::landing::flight::fly_recorded;
 use experiments::landing::outcome::Outcome;
 use experiments::landing::plan::{Plan, Planned, Values, Vision};
-use flightlog::{About, Entry, TapeReader, Writer};
+use flightlog::{About, Entry, Received, TapeReader, Writer};
+use messages::{Health, encode};
 use report::frames::Fate;
 use report::{Flight, FlightReader, comparison, page, replay_tapes, summary};
 
@@ -358,6 +359,67 @@ fn times_of_a_recorder_on_another_machine_are_told_by_the_names_of_the_clocks() 
     let own = landing_clock();
     assert_eq!(recorded_by(&own, AHEAD_NS).shift_ns, 0, "late, but of the same clock");
     let apart_ns = recorded_by("ground", AHEAD_NS).shift_ns - AHEAD_NS;
+    assert!((0..100_000_000).contains(&apart_ns), "{apart_ns}");
+}
+
+#[test]
+fn the_losses_of_recorders_that_ran_one_after_the_other_are_added() {
+    let file = |run: &str, lost: u64| {
+        let facts = [("run".to_owned(), run.to_owned())].into();
+        let about = About { program: "test".to_owned(), facts, utc_offset_ns: 0 };
+        let mut file = Vec::new();
+        let mut writer = Writer::new(&mut file, &about).unwrap();
+        writer.dropped(1, &[("wind".to_owned(), lost)].into()).unwrap();
+        writer.finish().unwrap();
+        file
+    };
+    let lost = |files: &[Vec<u8>]| {
+        let mut reader = FlightReader::new("flight");
+        files.iter().for_each(|file| reader.add(file).unwrap());
+        reader.finish().lost.get("wind").copied()
+    };
+    let [first, second] = [file("1-1", 10), file("1-1", 12)];
+    assert_eq!(lost(&[first.clone(), second.clone()]), Some(12), "counted since the start");
+    assert_eq!(lost(&[second, first, file("2-1", 5)]), Some(17));
+}
+
+#[test]
+fn without_detections_the_controllers_health_names_the_vehicles_clock() {
+    const AHEAD_NS: i64 = 7_000_000_000;
+    let facts = [("clock".to_owned(), "ground".to_owned())].into();
+    let about = About { program: "test".to_owned(), facts, utc_offset_ns: 0 };
+    let mut copy = Vec::new();
+    let mut writer = Writer::new(&mut copy, &about).unwrap();
+    let health = Health {
+        service: "controller".into(),
+        instance: "main".into(),
+        host: String::new(),
+        version: String::new(),
+        clock: landing_clock(),
+        stamp_ns: 0,
+        pid: 0,
+        cpu_s: 0.0,
+        uptime_s: 0.0,
+        rates: Vec::new(),
+        latencies: Vec::new(),
+        drops: Vec::new(),
+        errors: Vec::new(),
+    };
+    let (key, payload) = ("health/controller/main", encode(&health));
+    writer.receive(Received { key, payload: &payload, attachment: b"", received_ns: 1 }).unwrap();
+    flightlog::read(&landing().recording, |entry| {
+        if let Entry::Message(mut message) = entry
+            && !message.key.starts_with("detector/")
+        {
+            message.received_ns += AHEAD_NS;
+            writer.receive(message).unwrap();
+        }
+    })
+    .unwrap();
+    writer.finish().unwrap();
+    let flight = read(&copy);
+    assert!(flight.found.is_empty());
+    let apart_ns = flight.shift_ns - AHEAD_NS;
     assert!((0..100_000_000).contains(&apart_ns), "{apart_ns}");
 }
 
