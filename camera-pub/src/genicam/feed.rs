@@ -11,7 +11,7 @@ use crate::config::GenicamConfig;
 const RETRY_NS: i64 = 500_000_000;
 /// Maximum time to wait for a frame at once, so that a shutdown is noticed.
 const POLL: Duration = Duration::from_millis(50);
-/// Time without a whole frame after which the camera has stalled, beside three periods.
+/// Time without a frame, whole or torn, after which the camera has stalled, beside three periods.
 const STALL_NS: i64 = 1_000_000_000;
 
 /// A camera, open or lost.
@@ -20,6 +20,8 @@ pub(crate) struct Feed {
     camera: Option<OpenCamera>,
     last_frame_ns: i64,
     retry_ns: i64,
+    /// What was not delivered, also of a camera that is lost.
+    counts: Counts,
     /// Since when there are no frames, and why.
     outage: Option<(i64, String)>,
 }
@@ -49,6 +51,7 @@ impl Feed {
             camera: Some(camera),
             last_frame_ns: now_ns,
             retry_ns: now_ns,
+            counts: Counts::default(),
             outage: None,
         })
     }
@@ -59,7 +62,15 @@ impl Feed {
         let Some(camera) = &mut self.camera else {
             return if now_ns() < self.retry_ns { Next::Wait(POLL) } else { self.reopen() };
         };
-        if let Some(taken) = camera.take(POLL) {
+        let taken = camera.take(POLL);
+        let counts = camera.take_counts();
+        self.counts.torn += counts.torn;
+        self.counts.other += counts.other;
+        // To open a camera again whose packets are lost on the way brings none of them back.
+        if counts.torn > 0 {
+            self.last_frame_ns = now_ns();
+        }
+        if let Some(taken) = taken {
             self.last_frame_ns = now_ns();
             if let Some((since_ns, _)) = self.outage.take() {
                 let lost_s = (self.last_frame_ns - since_ns) as f64 * 1e-9;
@@ -72,7 +83,7 @@ impl Feed {
         if camera.is_gone() {
             self.lose("camera unplugged", "it does not answer any more")
         } else if silent_ns > STALL_NS.max(3 * period_ns) {
-            self.lose("camera stalled", "it has sent no whole frame for a second or more")
+            self.lose("camera stalled", "it has sent no frame for a second or more")
         } else {
             Next::Nothing
         }
@@ -87,7 +98,7 @@ impl Feed {
 
     /// What was not delivered since the last call.
     pub(crate) fn take_counts(&mut self) -> Counts {
-        self.camera.as_mut().map(OpenCamera::take_counts).unwrap_or_default()
+        std::mem::take(&mut self.counts)
     }
 
     fn lose(&mut self, reason: &'static str, problem: &str) -> Next {
