@@ -186,6 +186,8 @@ named! {
         LowAndUnseen = "low-and-unseen", "marker out of view right below, handing over to LAND";
         /// The vehicle touched the ground before LAND was requested.
         TouchedEarly = "touched-early", "on the ground already, handing over to LAND";
+        /// The vehicle is still and low over the pad after the marker or the autopilot was lost: it may stand there.
+        MayStand = "may-stand", "still and low over the pad, it may stand there: handing over to LAND";
         /// The autopilot is in its LAND mode.
         AutopilotLands = "autopilot-lands", "the autopilot is landing";
         /// On the ground, disarmed.

@@ -8,7 +8,7 @@ use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate
 use crate::envelope;
 use crate::estimator::Estimator;
 use crate::event::{
-    Alarm, AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
+    AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
     VehicleState, VehicleStatus,
 };
 use crate::guidance::ActiveGuidance;
@@ -18,8 +18,8 @@ use crate::limits::ConfigError;
 use crate::mean_target::MeanTarget;
 use crate::mount_check::{MountCheck, MountFindings};
 use crate::search;
-use crate::standing::StandingHeight;
-use crate::state_machine::{Inputs, StateMachine, VehicleInputs};
+use crate::standing::{MAX_STANDING_M_S, StandingHeight, may_stand};
+use crate::state_machine::{Inputs, StateMachine, VehicleInputs, reaction};
 use crate::time::Timestamp;
 
 /// Largest position and velocity that is plausible, in m and m/s.
@@ -56,9 +56,6 @@ const MAX_HOVER_M_S: f64 = 0.3;
 
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;
-
-/// Maximum speed of a vehicle that stands, in m/s.
-const MAX_STANDING_M_S: f64 = 0.2;
 
 /// One landing after the other: each event leads to a decision.
 #[derive(Clone, Debug)]
@@ -188,8 +185,7 @@ impl Lander {
         let operator = if let Event::Operator(command) = event { Some(command) } else { None };
         let operator =
             operator.or_else(|| self.is_dispute_over().then_some(OperatorCommand::Resume));
-        let alarm = if let Event::Alarm(alarm) = event { Some(self.reaction(alarm)) } else { None };
-        let alarm = alarm.or_else(|| self.dispute_alarm(now));
+        let alarm = reaction(&self.config.phases, event).or_else(|| self.dispute_alarm(now));
         if operator == Some(OperatorCommand::Resume) {
             self.repeat_axis_check();
         }
@@ -205,6 +201,7 @@ impl Lander {
             axis_mismatch: self.axis_mismatch(),
             may_descend: self.is_axis_check_done(now),
             is_link_slow: self.is_link_slow,
+            may_stand: self.may_stand(now),
         };
         if self.state_machine.advance(&inputs) {
             self.guidance = ActiveGuidance::new(self.config.guidance);
@@ -389,17 +386,6 @@ impl Lander {
         self.guidance.observe(&FrameObservation { marker, ..*frame }, heading_rad, altitude_m);
     }
 
-    /// The configured reaction to an alarm.
-    fn reaction(&self, alarm: Alarm) -> (AlarmAction, Reason) {
-        let phases = &self.config.phases;
-        match alarm {
-            Alarm::BatteryLow => (phases.on_battery_low, Reason::BatteryLow),
-            Alarm::BatteryCritical => (phases.on_battery_critical, Reason::BatteryCritical),
-            Alarm::OperatorLost => (phases.on_operator_lost, Reason::OperatorLost),
-            Alarm::AutopilotLost => (phases.on_autopilot_lost, Reason::AutopilotLost),
-        }
-    }
-
     fn vehicle_inputs(&self, now: Timestamp) -> Option<VehicleInputs> {
         let (state, status) = (self.history.newest()?, self.status?);
         Some(VehicleInputs {
@@ -409,6 +395,11 @@ impl Lander {
             landed: self.landed(now),
             height_m: self.height_m(now),
         })
+    }
+
+    fn may_stand(&self, now: Timestamp) -> bool {
+        let vehicle = self.history.newest();
+        vehicle.is_some_and(|vehicle| may_stand(&self.situation(now, vehicle), &self.config))
     }
 
     fn set_link_delay(&mut self, seconds: f64) {

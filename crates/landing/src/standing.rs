@@ -4,10 +4,24 @@
 //! estimate of the target is relative to the same point, so that its height on the ground is `standing_height_m`. The camera
 //! no longer sees the marker then, and the autopilot's height drifts near the ground: the error is 0.15 m at most in the
 //! tests. So it is told, and changes no landing: one that is too large would ask for LAND too high.
+//!
+//! And whether a vehicle may stand on the pad already, although its autopilot does not say so.
 
 use std::ops::RangeInclusive;
 
+use crate::config::{Config, GuidanceConfig};
 use crate::decision::TargetEstimate;
+use crate::guidance::situation::Situation;
+
+/// Maximum speed of a vehicle that stands, in m/s.
+pub(crate) const MAX_STANDING_M_S: f64 = 0.2;
+/// Maximum height over the one it stands with, in metres, distance from the pad, and standard deviation of that, in metres,
+/// at which a still vehicle may stand on the pad. From there LAND is safe if it does not.
+const MAX_STANDING_M: f64 = 0.3;
+const MAX_STANDING_ASIDE_M: f64 = 0.3;
+const MAX_STANDING_DEVIATION_M: f64 = 0.2;
+/// How much more height per second since the newest detection: the autopilot's height drifts, in m/s.
+const STANDING_DRIFT_M_S: f64 = 0.02;
 
 /// Heights that a vehicle may have and that are above the error of the measurement, in metres.
 const PLAUSIBLE_M: RangeInclusive<f64> = 0.15..=1.0;
@@ -44,4 +58,23 @@ impl StandingHeight {
     pub(crate) fn measured_m(&self) -> Option<f64> {
         self.lowest_m.filter(|height_m| PLAUSIBLE_M.contains(height_m))
     }
+}
+
+/// True when the vehicle is still and the pad is known to be right below it: it may have touched down while nothing arrived
+/// from it.
+pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config) -> bool {
+    let (vehicle, Some(target)) = (situation.vehicle, situation.target) else { return false };
+    let standing_height_m = match &config.guidance {
+        GuidanceConfig::Metric(metric) => metric.standing_height_m,
+        GuidanceConfig::Thesis(_) => 0.0,
+    };
+    let is_recent = situation.now.seconds_since(vehicle.stamp) <= config.phases.stale_vehicle_s;
+    let max_m_s = MAX_STANDING_M_S + situation.pad_heave_m_s;
+    let is_still = (vehicle.velocity - target.velocity).norm() <= max_m_s;
+    let max_m = MAX_STANDING_M + STANDING_DRIFT_M_S * target.age_s;
+    let is_low = target.height_m - standing_height_m <= max_m;
+    let is_over_pad = !target.ambiguous
+        && target.lateral_error_m <= MAX_STANDING_ASIDE_M
+        && target.deviation_m <= MAX_STANDING_DEVIATION_M;
+    is_recent && is_still && is_low && is_over_pad
 }

@@ -31,12 +31,12 @@
 //! | event | next phase |
 //! |---|---|
 //! | the operator's abort, `landing_timeout_s` over | Aborted; in LAND only above `no_return_height_m`, back to GUIDED |
-//! | the operator's hold | Hold; ignored in LAND |
+//! | the operator's hold | Hold; ignored in LAND and while it is asked for |
 //! | the axes of camera and autopilot do not match | Hold |
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | the link to the autopilot is slow | Hold |
 //! | a mode that is neither GUIDED nor the requested LAND | PilotInCommand |
-//! | on the ground | Final |
+//! | on the ground; still and low over the pad, where Search or Retry would follow | Final |
 //! | disarmed | Landed on the ground or in LAND, else, half a second later, Aborted |
 //! | an alarm | as configured for it |
 //!
@@ -53,12 +53,16 @@
 
 use crate::config::{AlarmAction, OnAbort, PhaseConfig};
 use crate::decision::{Phase, Reason};
-use crate::event::{Landed, Mode, OperatorCommand};
+use crate::event::{Alarm, Event, Landed, Mode, OperatorCommand};
 use crate::guidance::situation::Progress;
 use crate::time::Timestamp;
 
 /// Minimum climb time of a vehicle that could not settle before it tries again, in seconds.
 const MIN_RETRY_S: f64 = 2.0;
+
+/// Time after an abort in which LAND, asked for before it, may still show, in seconds: heartbeats come each second, and one
+/// may be lost.
+const MAX_LATE_LAND_S: f64 = 2.5;
 
 /// Wait for the report of the ground after the motors have stopped, in seconds: it may come later.
 const MAX_CONTACT_WAIT_S: f64 = 0.5;
@@ -88,6 +92,8 @@ pub struct Inputs {
     pub may_descend: bool,
     /// The link to the autopilot is too slow to steer over it.
     pub is_link_slow: bool,
+    /// The vehicle is still, and so low over the pad that it may stand on it.
+    pub may_stand: bool,
 }
 
 /// The vehicle as far as the phases need it.
@@ -119,10 +125,23 @@ pub struct StateMachine {
     released: bool,
     /// The aborted vehicle is being commanded from LAND back to GUIDED.
     is_recalling: bool,
+    /// LAND was asked for before the abort and the vehicle may still show it: then it is recalled.
+    expects_land: bool,
     /// Retries of this landing so far.
     retries: u32,
     /// When the motors were first seen to be off.
     disarmed: Option<Timestamp>,
+}
+
+/// The configured reaction to an alarm, and the reason; `None` for any other event.
+pub(crate) fn reaction(phases: &PhaseConfig, event: Event) -> Option<(AlarmAction, Reason)> {
+    let Event::Alarm(alarm) = event else { return None };
+    Some(match alarm {
+        Alarm::BatteryLow => (phases.on_battery_low, Reason::BatteryLow),
+        Alarm::BatteryCritical => (phases.on_battery_critical, Reason::BatteryCritical),
+        Alarm::OperatorLost => (phases.on_operator_lost, Reason::OperatorLost),
+        Alarm::AutopilotLost => (phases.on_autopilot_lost, Reason::AutopilotLost),
+    })
 }
 
 impl StateMachine {
@@ -137,6 +156,7 @@ impl StateMachine {
             landing: false,
             released: false,
             is_recalling: false,
+            expects_land: false,
             retries: 0,
             disarmed: None,
         }
@@ -193,7 +213,20 @@ impl StateMachine {
         let is_disarmed = inputs.vehicle.is_some_and(|vehicle| !vehicle.armed);
         self.disarmed = is_disarmed.then(|| self.disarmed.unwrap_or(inputs.now));
         if let Some((phase, reason)) = self.interruption(inputs).or_else(|| self.next(inputs)) {
+            // Search and retry climb. An autopilot reports the ground seconds late: ArduPilot 7 s after the touchdown.
+            let climbs = matches!(phase, Phase::Search | Phase::Retry);
+            let (phase, reason) = if climbs && inputs.may_stand {
+                (Phase::Final, Reason::MayStand)
+            } else {
+                (phase, reason)
+            };
+            let was_landing = self.phase == Phase::Final;
             self.enter(phase, reason, inputs.now);
+            self.expects_land = was_landing
+                && phase == Phase::Aborted
+                && reason == Reason::OperatorAbort
+                && !self.is_recalling
+                && self.can_recall(inputs);
         }
         false
     }
@@ -241,6 +274,11 @@ impl StateMachine {
     /// After an abort, the first foreign mode releases the vehicle.
     fn release_on_takeover(&mut self, inputs: &Inputs) {
         let Some(vehicle) = inputs.vehicle else { return };
+        self.expects_land &= !self.timed_out(inputs, MAX_LATE_LAND_S);
+        if self.expects_land && vehicle.mode == Mode::Land {
+            self.expects_land = false;
+            self.is_recalling = true;
+        }
         let in_time = !self.timed_out(inputs, self.config.land_timeout_s);
         self.is_recalling &= vehicle.mode == Mode::Land && in_time;
         let is_foreign = matches!(vehicle.mode, Mode::Land | Mode::Other);
@@ -293,7 +331,9 @@ impl StateMachine {
                 AlarmAction::Land => return Some((Phase::Final, reason)),
             }
         }
-        if inputs.operator == Some(OperatorCommand::Hold) {
+        // While LAND is asked for a hold would let the vehicle enter it unwatched; an abort calls it back.
+        let asks_for_land = self.phase == Phase::Final && self.reason != Reason::LandingBySetpoints;
+        if inputs.operator == Some(OperatorCommand::Hold) && !asks_for_land {
             return Some((Phase::Hold, Reason::OperatorHold));
         }
         if inputs.now.seconds_since(self.started) > self.config.landing_timeout_s {
@@ -314,9 +354,13 @@ impl StateMachine {
     /// In LAND only a vehicle that is still high is commanded back, and only if the abort does not land it as
     /// well.
     fn can_abort(&self, inputs: &Inputs) -> bool {
+        !self.landing || self.can_recall(inputs)
+    }
+
+    fn can_recall(&self, inputs: &Inputs) -> bool {
         let is_high =
             inputs.vehicle.is_some_and(|vehicle| vehicle.height_m > self.config.no_return_height_m);
-        !self.landing || is_high && self.config.on_abort != OnAbort::Land
+        is_high && self.config.on_abort != OnAbort::Land
     }
 
     /// The end of a landing whose motors are off.
@@ -464,7 +508,10 @@ impl StateMachine {
             // This close to the ground the descent by setpoints is the only way down.
             let low = matches!(
                 self.reason,
-                Reason::LowAndAligned | Reason::LowAndUnseen | Reason::TouchedEarly
+                Reason::LowAndAligned
+                    | Reason::LowAndUnseen
+                    | Reason::TouchedEarly
+                    | Reason::MayStand
             );
             if is_unknown && !low {
                 // LAND cannot be asked for; a vehicle that hovers waits for the heartbeat.

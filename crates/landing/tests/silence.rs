@@ -78,3 +78,36 @@ fn a_short_timeout_costs_no_time() {
     println!("until the touchdown: {short_s:.2} s, with a timeout of 3 s {long_s:.2} s");
     assert!(short_s < 13.0 && short_s < long_s - 1.5, "{short_s} {long_s}");
 }
+
+/// Height over the place of the first touchdown that no flight has left the ground with, in metres.
+const MAX_HOP_M: f64 = 0.15;
+
+#[test]
+fn a_vehicle_that_touched_down_meanwhile_stays_on_the_ground() {
+    let mut table = String::new();
+    let mut is_safe = true;
+    for wind_m_s in [0.0, 5.0] {
+        for for_s in [1.0, 2.0, 3.0, 5.0, 7.0] {
+            for seed in 0..16 {
+                let flight = silent(seed, wind_m_s, Silence { below_m: 0.3, for_s })
+                    .with(|scene| scene.is_ground_told_late = true)
+                    .fly();
+                let Some(touchdown_s) = flight.touchdown_s else { continue };
+                let height_m = |sample: &scene::Sample| sample.pad.z() - sample.position.z();
+                let hop_m = flight
+                    .samples
+                    .iter()
+                    .filter(|sample| sample.seconds > touchdown_s)
+                    .map(height_m)
+                    .fold(0.0, f64::max);
+                is_safe &= hop_m <= MAX_HOP_M && flight.phase == landing::Phase::Landed;
+                table += &format!(
+                    "\nwind {wind_m_s} m/s, silent for {for_s} s, seed {seed}: {hop_m:.2} m, {:?}",
+                    flight.phase
+                );
+            }
+        }
+    }
+    println!("{table}");
+    assert!(is_safe, "{table}");
+}

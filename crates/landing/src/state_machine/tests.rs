@@ -23,6 +23,7 @@ fn at(seconds: f64) -> Inputs {
         axis_mismatch: None,
         may_descend: true,
         is_link_slow: false,
+        may_stand: false,
     }
 }
 
@@ -178,6 +179,37 @@ fn landing_here_needs_no_marker_and_leaves_a_vehicle_that_may_not_in_the_air() {
 }
 
 #[test]
+fn an_abort_before_the_vehicle_shows_land_calls_it_back_all_the_same() {
+    let land =
+        |seconds, height_m| flown(seconds, move |v| (v.mode, v.height_m) = (Mode::Land, height_m));
+    let abort = commanded(1.4, OperatorCommand::Abort);
+    let here = [start(), commanded(1.0, OperatorCommand::LandHere)];
+    let after = |inputs: &[Inputs]| {
+        let mut machine = StateMachine::new(PhaseConfig::default());
+        here.iter().chain(inputs).for_each(|inputs| {
+            machine.advance(inputs);
+        });
+        (machine.phase(), machine.is_recalling(), machine.is_released())
+    };
+    assert_eq!(after(&[abort]), (Phase::Aborted, false, false));
+    assert_eq!(after(&[abort, land(1.8, 5.0)]), (Phase::Aborted, true, false));
+    assert_eq!(after(&[abort, at(1.5), land(1.8, 5.0)]), (Phase::Aborted, true, false));
+    assert_eq!(after(&[abort, land(1.8, 5.0), at(2.5)]), (Phase::Aborted, false, false));
+    // Later, or from a vehicle that was low, LAND is the pilot's; so is it without a request of ours.
+    assert_eq!(after(&[abort, at(2.0), land(4.0, 5.0)]), (Phase::Aborted, false, true));
+    let low = Inputs { operator: abort.operator, ..flown(1.4, |v| v.height_m = 0.5) };
+    assert_eq!(after(&[low, land(1.8, 0.5)]), (Phase::Aborted, false, true));
+    check(&[start(), abort, land(1.8, 5.0)], Phase::Aborted, Reason::OperatorAbort);
+    let mut machine = StateMachine::new(PhaseConfig::default());
+    [start(), abort, land(1.8, 5.0)].iter().for_each(|inputs| {
+        machine.advance(inputs);
+    });
+    assert_eq!((machine.is_recalling(), machine.is_released()), (false, true));
+    let hold = commanded(1.4, OperatorCommand::Hold);
+    check(&[here[0], here[1], hold], Phase::Final, Reason::OperatorLand);
+}
+
+#[test]
 fn an_axis_mismatch_holds_and_a_running_check_delays_the_descent() {
     let open = Inputs { may_descend: false, ..seen(2.0, Progress::Descending) };
     check(&[start(), seen(1.0, Progress::Unchanged), open], Phase::Approach, Reason::Aligning);
@@ -196,6 +228,26 @@ fn a_lost_vehicle_or_target_holds() {
     check(&[approach[0], approach[1], at(2.0)], Phase::Hold, Reason::TargetLost);
     let again = seen(3.0, Progress::Unchanged);
     check(&[approach[0], approach[1], at(2.0), again, again], Phase::Approach, Reason::Aligning);
+}
+
+#[test]
+fn a_vehicle_that_may_stand_on_the_pad_does_not_climb() {
+    let [a, b, c] = [start(), seen(1.0, Progress::Unchanged), seen(2.0, Progress::Descending)];
+    let stale = flown(3.0, |v| v.age_s = 0.6);
+    let low = Inputs { may_stand: true, ..at(4.0) };
+    let known = Inputs { target_known: true, ..low };
+    check(&[a, b, c, stale, at(4.0)], Phase::Search, Reason::Searching);
+    check(&[a, b, c, stale, low], Phase::Final, Reason::MayStand);
+    check(&[a, b, c, Inputs { may_stand: false, ..known }], Phase::Retry, Reason::Retrying);
+    check(&[a, b, c, known], Phase::Final, Reason::MayStand);
+    // It waits for the vehicle's state, and a hold by the operator lasts.
+    check(
+        &[a, b, c, stale, Inputs { may_stand: true, ..stale }],
+        Phase::Hold,
+        Reason::VehicleStale,
+    );
+    let held = commanded(3.0, OperatorCommand::Hold);
+    check(&[a, b, c, held, low], Phase::Hold, Reason::OperatorHold);
 }
 
 #[test]
@@ -392,6 +444,7 @@ mod every_transition {
                                 axis_mismatch: None,
                                 may_descend: true,
                                 is_link_slow: false,
+                                may_stand: false,
                             });
                         }
                     }
@@ -400,6 +453,8 @@ mod every_transition {
         }
         let turned = Some(Reason::CameraTurned);
         all.push(Inputs { is_link_slow: true, now: now(), ..at(0.0) });
+        all.push(Inputs { may_stand: true, now: now(), ..at(0.0) });
+        all.push(Inputs { may_stand: true, target_known: true, now: now(), ..at(0.0) });
         all.push(Inputs { axis_mismatch: turned, may_descend: false, now: now(), ..at(0.0) });
         all
     }

@@ -65,6 +65,8 @@ pub(crate) struct Scene {
     pub(crate) pilot_s: Option<f64>,
     /// The lander falls silent in the descent.
     pub(crate) silence: Option<Silence>,
+    /// The autopilot does not say in GUIDED that it is on the ground, as ArduPilot's for 7 s after the touchdown.
+    pub(crate) is_ground_told_late: bool,
     /// The autopilot's setpoint timeout, in seconds, and whether the lander knows it.
     pub(crate) setpoint_timeout_s: f64,
     pub(crate) is_timeout_known: bool,
@@ -155,6 +157,7 @@ impl Scene {
             refuses_land: false,
             pilot_s: None,
             silence: None,
+            is_ground_told_late: false,
             setpoint_timeout_s: 0.5,
             is_timeout_known: true,
             limit_s: 120.0,
@@ -381,6 +384,12 @@ impl<'a> Run<'a> {
             },
             armed: autopilot.armed(),
             landed: match autopilot.landed() {
+                ardupilot::Landed::OnGround
+                    if self.scene.is_ground_told_late
+                        && autopilot.mode() == ardupilot::Mode::Guided =>
+                {
+                    Landed::InAir
+                }
                 ardupilot::Landed::OnGround => Landed::OnGround,
                 ardupilot::Landed::InAir => Landed::InAir,
                 ardupilot::Landed::TakingOff => Landed::TakingOff,
