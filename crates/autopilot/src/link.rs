@@ -201,6 +201,11 @@ impl Link {
         self.shared.strangers.load(Ordering::Relaxed)
     }
 
+    /// True when packets with a signature arrived and there is no key here: the other side may refuse what is sent.
+    pub fn lacks_key(&self) -> bool {
+        self.shared.peer_signs.load(Ordering::Relaxed)
+    }
+
     /// Numbers of packets that were refused because of their signatures, by reason.
     pub fn refusals(&self) -> Refusals {
         *self.shared.refusals.lock().unwrap_or_else(PoisonError::into_inner)
@@ -250,6 +255,7 @@ struct Shared {
     strangers: AtomicU64,
     counters: Mutex<Counters>,
     refusals: Mutex<Refusals>,
+    peer_signs: AtomicBool,
     opened: Instant,
     /// When bytes came last, in milliseconds since the link was opened.
     active_ms: AtomicU64,
@@ -265,6 +271,7 @@ impl Shared {
             strangers: AtomicU64::new(0),
             counters: Mutex::new(Counters::default()),
             refusals: Mutex::new(Refusals::default()),
+            peer_signs: AtomicBool::new(false),
             opened: Instant::now(),
             active_ms: AtomicU64::new(0),
         }
@@ -344,6 +351,7 @@ impl Port {
         self.shared.counters.lock().unwrap_or_else(PoisonError::into_inner).add(counted);
         self.keep_stamps();
         self.count_refusals();
+        self.note_signatures(&packets);
         let received = Instant::now();
         for packet in packets {
             self.shared.push(LinkEvent::Packet { packet: Box::new(packet), received });
@@ -374,6 +382,19 @@ impl Port {
         let file = self.keeping.as_mut().and_then(|keeping| keeping.file.as_mut());
         if let (Some(file), Some(newest)) = (file, self.gate.newest()) {
             file.keep(newest);
+        }
+    }
+
+    /// Warns once of a peer whose packets are signed while there is no key here.
+    fn note_signatures(&self, packets: &[Packet]) {
+        if self.gate.is_open()
+            && packets.iter().any(Packet::is_signed)
+            && !self.shared.peer_signs.swap(true, Ordering::Relaxed)
+        {
+            tracing::warn!(
+                advice = "give this side the same key (`signing_key`)",
+                "The other side signs its packets and this one has no key: what is sent from here may be refused there"
+            );
         }
     }
 

@@ -338,6 +338,26 @@ async fn only_holders_of_the_key_are_heard_and_each_refusal_has_its_reason() {
     vehicle.send(&time()).unwrap();
     assert_eq!(packet(&mut holder).await, time());
     assert_eq!(holder.refusals(), Refusals::default());
+    assert!(!vehicle.lacks_key() && !holder.lacks_key());
+}
+
+#[tokio::test]
+async fn a_peer_that_signs_is_noticed_without_a_key() {
+    let mut keyless = open("udpin:127.0.0.1:0".into()).await;
+    let to = format!("udpout:{}", keyless.local_address().unwrap());
+    let unsigned = open(to.clone()).await;
+    unsigned.send_when_connected(&heartbeat(true)).await;
+    assert_eq!(packet(&mut keyless).await, heartbeat(true));
+    assert!(!keyless.lacks_key());
+    drop(unsigned);
+    let holder = open_signed(to, signing("correct horse", 1)).await;
+    let noticed = async {
+        while !keyless.lacks_key() {
+            holder.send_when_connected(&heartbeat(true)).await;
+            sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, noticed).await.expect("the signature is noticed");
 }
 
 /// `Link::send` as soon as there is a connection.
