@@ -16,6 +16,8 @@ use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME};
 
 /// Longest time until a process that goes on takes its part again.
 const BACK: Duration = Duration::from_secs(2);
+/// Time within which a command that waited would be carried out.
+const LATE: Duration = Duration::from_secs(3);
 
 /// Freezes a process, and lets it go on.
 async fn freeze(pid: Pid, seconds: f64) -> anyhow::Result<Instant> {
@@ -96,6 +98,26 @@ pub(crate) async fn of_a_camera(freezes_s: &[f64]) -> anyhow::Result<()> {
         is_back("camera-pub", *seconds, since)?;
     }
     Ok(())
+}
+
+/// Commands a controller that is frozen until its operator has given up, lets it go on, and lands.
+pub(crate) async fn of_a_commanded_controller() -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    let landing = Landing::start(&["--seed", "4", "--timeout-s", "300"]).await?;
+    landing.descends_below(9.0).await?;
+    hold(&landing).await?;
+    let pid = landing.service("controller")?.pid;
+    kill_process(pid, Signal::STOP)?;
+    let given_up = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Abort).await;
+    kill_process(pid, Signal::CONT)?;
+    ensure!(given_up.is_err(), "a frozen controller answered: {given_up:?}");
+    let since_ns = now_ns();
+    let later_ns = since_ns + LATE.as_nanos() as i64;
+    let is_later = |s: &messages::ControllerStatus| s.stamp_ns > later_ns;
+    let status = landing.status("it goes on", is_later).await?;
+    ensure!(status.phase == Phase::Hold, "the command was carried out late: {status:?}");
+    command(&landing, ControllerCommand::Resume).await?;
+    landing.lands().await.map(drop)
 }
 
 async fn hold(landing: &Landing) -> anyhow::Result<()> {

@@ -32,6 +32,11 @@ async fn a_frozen_controller_goes_on_and_lands() -> anyhow::Result<()> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_command_to_a_frozen_controller_is_not_carried_out_late() -> anyhow::Result<()> {
+    with_second_try(freezes::of_a_commanded_controller).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_frozen_camera_publishes_again() -> anyhow::Result<()> {
     with_second_try(|| freezes::of_a_camera(&FREEZES_S)).await
 }

@@ -7,8 +7,10 @@ use anyhow::Context;
 use autopilot::packet::MAX_PACKET;
 use autopilot::signing::Refusals;
 use autopilot::{Address, Link, LinkEvent, Parser, Peering, Permission};
-use messages::{ControllerStatus, MavlinkBytes, Tape, VehicleState, topic};
-use node::{HealthCounters, Node, Publisher, Shutdown, now_ns};
+use messages::{
+    CommandReply, ControllerCommand, ControllerStatus, MavlinkBytes, Tape, VehicleState, topic,
+};
+use node::{HealthCounters, Node, Publisher, Request, Shutdown, Standstill, now_ns};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
@@ -77,9 +79,11 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let mut strangers = 0;
     let mut refusals = Refusals::default();
     let mut other_versions = 0;
+    let mut standstill = Standstill::default();
     let mut ticks = interval(TICK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
+        standstill.step(now_ns());
         tokio::select! {
             // Whichever is ready, in random order: a busy source must not starve the others.
             () = shutdown.requested() => break,
@@ -124,13 +128,22 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
                 flight.on_detector_info(now_ns(), publisher, &info);
             }
             Some(request) = commands.next() => {
-                let reply = flight.command(now_ns(), &request.message);
+                let reply = match late_because(&mut standstill, &request) {
+                    Some(reason) => {
+                        node.health().failed("commands: too late");
+                        CommandReply { accepted: false, reason }
+                    }
+                    None => flight.command(now_ns(), &request.message),
+                };
                 // The requester may be gone, and the setpoints do not wait for it.
                 tokio::spawn(async move { request.answer(&reply).await });
             }
             Some(info) = cameras.next() => flight.camera(now_ns(), info),
             Some(message) = to_autopilot.next() => {
-                if pass_up(&node, &mut flight, permission, &message.packet)
+                // An arming or a mode that waited while this process was frozen is not wanted any more.
+                if standstill.step(now_ns()).is_some() {
+                    node.health().dropped("packets of the ground station: too late");
+                } else if pass_up(&node, &mut flight, permission, &message.packet)
                     && link.send_spare(&message.packet).is_err()
                 {
                     node.health().dropped("packets of the ground station");
@@ -156,6 +169,18 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     // The link's own task needs a moment to put the last packet on the wire.
     sleep(TICK).await;
     Ok(())
+}
+
+/// Why a command is not carried out that may have waited while this process was frozen, and does not say when it was sent.
+fn late_because(
+    standstill: &mut Standstill,
+    request: &Request<ControllerCommand>,
+) -> Option<String> {
+    let frozen = standstill.step(now_ns()).filter(|_| request.sent_ns.is_none())?;
+    Some(format!(
+        "the controller stood still for {:.1} s, and the command may have waited as long; give it again if it is still wanted",
+        frozen.as_secs_f64()
+    ))
 }
 
 /// Whether a packet of a ground station goes to the autopilot; the flight hears it before.

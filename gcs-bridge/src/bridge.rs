@@ -16,7 +16,7 @@ use messages::{
     Configuration, ControllerStatus, Detections, Health, MavlinkBytes, Phase, RecorderStatus,
     TargetEstimate, topic,
 };
-use node::{HealthCounters, INSECURE, Node, OPEN, Shutdown, now_ns};
+use node::{HealthCounters, INSECURE, Node, OPEN, Shutdown, Standstill, now_ns};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::camera::Camera;
@@ -71,11 +71,17 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     }
     node.announce().await?;
     tracing::info!(ground = config.ground, "Ready");
+    let mut standstill = Standstill::default();
     loop {
+        standstill.step(now_ns());
         tokio::select! {
             () = shutdown.requested() => return Ok(()),
             event = ground.recv() => {
-                if let Some(packet) = bridge.up(now_ns(), event) {
+                // An arming or a mode that waited while this process was frozen is not wanted any more.
+                let is_late = standstill.step(now_ns()).is_some();
+                if is_late && matches!(event, LinkEvent::Packet { .. }) {
+                    node.health().dropped("packets of the ground station: too late");
+                } else if let Some(packet) = bridge.up(now_ns(), event) {
                     to_autopilot.publish(&MavlinkBytes { packet }).await;
                 }
             }

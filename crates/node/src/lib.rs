@@ -7,7 +7,8 @@
 //! service from start to shutdown; [`network`] configures the network, with the rights of others from
 //! [`access`], and [`session`] joins it under an [`identity`], with shared memory where `memory` says that it can; [`topics`] has typed messages, [`frames`] pixels,
 //! and [`tap`] everything as it came; [`health`] counts, with [`stats`]; [`denied`] counts what access control
-//! denies; [`clock`] is the host's clock, and [`state`] says where a service keeps what survives a reboot.
+//! denies; [`clock`] is the host's clock, [`standstill`] says that a process was frozen, and [`state`] where a service keeps
+//! what survives a reboot.
 
 pub mod access;
 pub mod clock;
@@ -20,6 +21,7 @@ mod memory;
 pub mod network;
 pub mod service;
 pub mod session;
+pub mod standstill;
 pub mod state;
 pub mod stats;
 pub mod tap;
@@ -35,6 +37,7 @@ pub use identity::Identity;
 pub use network::{INSECURE, Network, OPEN};
 pub use service::{Options, Shutdown, relaunch, relaunch_with_zenoh_threads, run, start_logging};
 pub use session::{Node, Presence, ZenohSource};
+pub use standstill::Standstill;
 pub use state::state_directory;
 pub use tap::{Tap, Tapped};
 pub use topics::{Commands, Publisher, Request, Subscriber};

@@ -1,6 +1,10 @@
 //! Typed publishers, subscribers and commands: the topic table on the network.
 //!
 //! Every mailbox is a ring: a slow reader loses the oldest messages, and never blocks a publisher.
+//!
+//! A command is not carried out once its requester has given up. Clocks of two hosts differ, so the requester asks the
+//! recipient for its time first, and tells with the command when that was by the recipient's own clock. A recipient that is
+//! frozen does not answer, and what waited on a link is refused.
 
 use std::marker::PhantomData;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -8,6 +12,7 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use messages::{Delivery, Message, Topic, decode, encode};
+use zenoh::bytes::ZBytes;
 use zenoh::handlers::{RingChannel, RingChannelHandler};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{Query, Queryable};
@@ -22,6 +27,8 @@ use crate::session::Node;
 pub(crate) const REPLY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Pause before a command without a recipient is sent again.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
+/// The attachment of a query that asks for the recipient's time.
+const ASKS_TIME: &[u8] = b"time?";
 
 /// Publishes messages of one type on one key.
 pub struct Publisher<M> {
@@ -51,7 +58,16 @@ pub struct Subscriber<M> {
 pub struct Request<M> {
     /// The command.
     pub message: M,
+    /// When it was sent, in nanoseconds of this recipient's clock; `None` from a requester that has not asked for it.
+    pub sent_ns: Option<i64>,
     query: Query,
+}
+
+/// What was replied to a query.
+enum Reply {
+    Command(messages::CommandReply),
+    /// The recipient's time, in nanoseconds of its clock.
+    Time(i64),
 }
 
 /// Zenoh's quality of service for a delivery.
@@ -196,7 +212,8 @@ impl Node {
     }
 
     /// Sends a command on a topic's key and waits for its reply. A new session may not be connected to the
-    /// recipient yet, so a command without a recipient is sent again; one that reached a recipient never is.
+    /// recipient yet, so it is asked for its time until it answers; the command itself is sent once, and is refused
+    /// when it arrives after this requester has given up.
     ///
     /// # Errors
     /// When there is no reply in time.
@@ -208,33 +225,62 @@ impl Node {
     ) -> anyhow::Result<messages::CommandReply> {
         let key = topic.key(names);
         let until_ns = now_ns() + REPLY_TIMEOUT.as_nanos() as i64;
-        while now_ns() < until_ns {
-            if let Some(reply) = self.query(&key, command).await? {
-                return Ok(reply);
+        let mut told = None;
+        while told.is_none() && now_ns() < until_ns {
+            let left_ns = until_ns.saturating_sub(now_ns());
+            told = self.query(&key, &[], ASKS_TIME, nanoseconds(left_ns)).await?;
+            if told.is_none() {
+                tokio::time::sleep(RETRY_PAUSE).await;
             }
-            tokio::time::sleep(RETRY_PAUSE).await;
         }
-        let who = key.rsplit_once('/').map_or(key.as_str(), |(who, _command)| who);
-        Err(anyhow!("no {who} answered within {REPLY_TIMEOUT:?}; is one running for this vehicle?"))
+        let sent = match told {
+            Some(Reply::Time(time_ns)) => time_ns.to_le_bytes().to_vec(),
+            // A recipient that tells no time.
+            Some(Reply::Command(_)) => Vec::new(),
+            None => return Err(unanswered(&key)),
+        };
+        match self.query(&key, &encode(command), &sent, REPLY_TIMEOUT).await? {
+            Some(Reply::Command(reply)) => Ok(reply),
+            Some(Reply::Time(_)) | None => Err(unanswered(&key)),
+        }
     }
 
-    async fn query<M: Message>(
+    async fn query(
         &self,
         key: &str,
-        command: &M,
-    ) -> anyhow::Result<Option<messages::CommandReply>> {
+        payload: &[u8],
+        attachment: &[u8],
+        patience: Duration,
+    ) -> anyhow::Result<Option<Reply>> {
         let replies = with_query_qos(self.session.get(key))
-            .payload(encode(command))
-            .timeout(REPLY_TIMEOUT)
+            .payload(payload)
+            .attachment(attachment)
+            .timeout(patience)
             .await
             .map_err(|cause| anyhow!("sending a command on {key}: {cause}"))?;
         while let Ok(reply) = replies.recv_async().await {
-            if let Ok(sample) = reply.result() {
-                return Ok(Some(decode(&sample.payload().to_bytes())?));
-            }
+            let Ok(sample) = reply.result() else { continue };
+            return Ok(Some(match sample.attachment().and_then(time) {
+                Some(time_ns) => Reply::Time(time_ns),
+                None => Reply::Command(decode(&sample.payload().to_bytes())?),
+            }));
         }
         Ok(None)
     }
+}
+
+fn unanswered(key: &str) -> anyhow::Error {
+    let who = key.rsplit_once('/').map_or(key, |(who, _command)| who);
+    anyhow!("no {who} answered within {REPLY_TIMEOUT:?}; is one running for this vehicle?")
+}
+
+fn nanoseconds(ns: i64) -> Duration {
+    Duration::from_nanos(u64::try_from(ns).unwrap_or(0))
+}
+
+/// The time in an attachment, in nanoseconds.
+fn time(attachment: &ZBytes) -> Option<i64> {
+    Some(i64::from_le_bytes(attachment.to_bytes().as_ref().try_into().ok()?))
 }
 
 /// A query with the quality of service of commands; its replies get the same.
@@ -253,21 +299,58 @@ pub struct Commands<M> {
 }
 
 impl<M: Message> Commands<M> {
-    /// The next command; `None` once the session is closed. A payload that cannot be decoded is refused.
+    /// The next command; `None` once the session is closed. A payload that cannot be decoded is refused, and so is a
+    /// command whose requester has given up.
     pub async fn next(&self) -> Option<Request<M>> {
         loop {
             let query = self.queryable.recv_async().await.ok()?;
+            let attachment = query.attachment();
+            if attachment.is_some_and(|asks| asks.to_bytes().as_ref() == ASKS_TIME) {
+                tell_time(query).await;
+                continue;
+            }
+            let sent_ns = attachment.and_then(time);
             let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
-            match decode(&payload) {
-                Ok(message) => return Some(Request { message, query }),
+            let reason = match decode(&payload) {
+                Ok(message) => match refusal(sent_ns, now_ns()) {
+                    None => return Some(Request { message, sent_ns, query }),
+                    Some(reason) => {
+                        let key = query.key_expr().as_str();
+                        tracing::warn!(key, reason, "Command refused");
+                        self.health.failed("commands: too late");
+                        reason
+                    }
+                },
                 Err(problem) => {
                     report_refused(&self.health, query.key_expr().as_str(), &problem);
-                    let reply =
-                        messages::CommandReply { accepted: false, reason: problem.to_string() };
-                    Request { message: (), query }.answer(&reply).await;
+                    problem.to_string()
                 }
-            }
+            };
+            let reply = messages::CommandReply { accepted: false, reason };
+            Request { message: (), sent_ns, query }.answer(&reply).await;
         }
+    }
+}
+
+/// Why a command that was sent at this time is not carried out any more.
+fn refusal(sent_ns: Option<i64>, now_ns: i64) -> Option<String> {
+    let age_ns = now_ns.saturating_sub(sent_ns?);
+    let max_ns = REPLY_TIMEOUT.as_nanos() as i64;
+    // A time to come was told by another process, before this host was started again.
+    (!(0..=max_ns).contains(&age_ns)).then(|| {
+        format!(
+            "the command is {:.1} s old and its sender has given up after {REPLY_TIMEOUT:?}: it waited, as a process or a link stood still; give it again if it is still wanted",
+            age_ns as f64 * 1e-9
+        )
+    })
+}
+
+/// Answers a question for the time.
+async fn tell_time(query: Query) {
+    let key = query.key_expr().clone();
+    let reply = query.reply(key, Vec::<u8>::new()).attachment(now_ns().to_le_bytes().to_vec());
+    if let Err(cause) = reply.await {
+        tracing::debug!(%cause, "The reply to a question for the time was not delivered");
     }
 }
 

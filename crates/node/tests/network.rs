@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use messages::{CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, Wind, encode, topic};
+use messages::{
+    CommandReply, ControllerCommand, FrameHeader, MavlinkBytes, Wind, decode, encode, topic,
+};
 use node::{FramePublisher, FrameSubscriber, Identity, Node, ZenohSource, clock_name, now_ns};
 use testing::ports;
 use tokio::time::timeout;
@@ -270,6 +272,59 @@ async fn a_command_is_answered_and_without_a_controller_the_error_says_so() -> a
     Ok(())
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_command_that_waited_until_its_sender_gave_up_is_refused() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let controller = open("controller", "main", port).await?;
+    let commands = controller.commands(topic::COMMAND, &[]).await?;
+    let foreign = Foreign::open(port).await?;
+    let answering = tokio::spawn(async move {
+        while let Some(request) = commands.next().await {
+            let reason = format!("{:?}", request.sent_ns.is_some());
+            request.answer(&CommandReply { accepted: true, reason }).await;
+        }
+    });
+    let start = encode(&ControllerCommand::Start);
+    let told = foreign.ask("drone/controller/command", &[], b"time?").await?;
+    let time_ns = i64::from_le_bytes(told.1.context("no time")?.as_slice().try_into()?);
+    assert!((now_ns() - time_ns).abs() < 5_000_000_000, "the recipient's own clock");
+    for (sent_ns, accepted) in [
+        (time_ns, true),
+        (now_ns() - 2_500_000_000, false),
+        (now_ns() - 3_600_000_000_000, false),
+        // Told before the recipient's host was started again.
+        (now_ns() + 3_600_000_000_000, false),
+    ] {
+        let reply =
+            foreign.ask("drone/controller/command", &start, &sent_ns.to_le_bytes()).await?.0;
+        let reply: CommandReply = decode(&reply)?;
+        assert_eq!(reply.accepted, accepted, "{reply:?}");
+        assert!(accepted || reply.reason.contains("give it again"), "{reply:?}");
+    }
+    let undated: CommandReply =
+        decode(&foreign.ask("drone/controller/command", &start, &[]).await?.0)?;
+    assert_eq!(undated, CommandReply { accepted: true, reason: "false".into() });
+    let errors = controller.health().report(controller.identity(), now_ns()).errors;
+    let late = errors.iter().find(|count| count.reason == "commands: too late");
+    assert_eq!(late.map(|count| count.count), Some(3), "{errors:?}");
+    answering.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recipient_that_does_not_answer_is_sent_no_command() -> anyhow::Result<()> {
+    let port = free_port()?;
+    let controller = open("controller", "main", port).await?;
+    let commands = controller.commands(topic::COMMAND, &[]).await?;
+    let operator = open("alight", "main", port).await?;
+    // It stands still until the sender has given up.
+    let given_up = operator.command(topic::COMMAND, &[], &ControllerCommand::Start).await;
+    assert!(given_up.is_err(), "{given_up:?}");
+    let late = timeout(Duration::from_secs(1), commands.next()).await;
+    assert!(late.is_err(), "carried out late");
+    Ok(())
+}
+
 /// A Zenoh program without this crate.
 struct Foreign {
     session: zenoh::Session,
@@ -283,6 +338,29 @@ impl Foreign {
         let config = zenoh::Config::from_json5(&text).map_err(|cause| anyhow!("{cause}"))?;
         let session = zenoh::open(config).await.map_err(|cause| anyhow!("{cause}"))?;
         Ok(Self { session })
+    }
+
+    /// Payload and attachment of the first reply to a query; asks until there is one.
+    async fn ask(
+        &self,
+        key: &str,
+        payload: &[u8],
+        attachment: &[u8],
+    ) -> anyhow::Result<(Vec<u8>, Option<Vec<u8>>)> {
+        timeout(PATIENCE, async {
+            loop {
+                let query = self.session.get(key).payload(payload).attachment(attachment);
+                let replies = query.await.map_err(|cause| anyhow!("{cause}"))?;
+                if let Ok(reply) = replies.recv_async().await
+                    && let Ok(sample) = reply.result()
+                {
+                    let attachment = sample.attachment().map(|it| it.to_bytes().into_owned());
+                    return Ok((sample.payload().to_bytes().into_owned(), attachment));
+                }
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        })
+        .await?
     }
 
     async fn put(&self, key: &str, bytes: &[u8]) -> anyhow::Result<()> {
