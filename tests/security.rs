@@ -6,7 +6,7 @@ use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail, ensure};
 use messages::{CommandReply, ControllerCommand, FrameAck, Health, topic};
@@ -193,6 +193,39 @@ async fn each_says_what_its_role_may_and_strangers_nothing() -> anyhow::Result<(
     ensure!(output.status.success(), "{output:?}");
     ensure!(commanded.recv().await == Some(ControllerCommand::Hold));
     is_heard(&detector, &drone.controller).await?;
+    answering.abort();
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_running_relay_shuts_out_who_is_revoked_and_goes_on() -> anyhow::Result<()> {
+    let drone = Drone::start().await?;
+    let commands = drone.controller.commands(topic::COMMAND, &[]).await?;
+    let answering = tokio::spawn(async move {
+        while let Some(request) = commands.next().await {
+            request.answer(&CommandReply { accepted: true, reason: "held".into() }).await;
+        }
+    });
+    let detector = drone.on_the_ground("detector", "detector.ground").await?;
+    detector.announce().await?;
+    is_heard(&detector, &drone.controller).await?;
+    let subscriber = drone.controller.subscriber(topic::FRAME_ACK, &["ground"]).await?;
+    let publisher = detector.publisher(topic::FRAME_ACK, &["ground"]).await?;
+    keys(&["revoke", "detector.ground@drone", "--authority", text(drone.folder.path())?])?;
+    let revoked = Instant::now();
+    let mut heard = revoked;
+    while revoked.elapsed() < Duration::from_secs(8) {
+        publisher.publish(&FrameAck::sample()).await;
+        if timeout(Duration::from_millis(50), subscriber.next()).await.is_ok() {
+            heard = Instant::now();
+        }
+    }
+    let took = heard - revoked;
+    println!("heard for {took:?} after it was revoked");
+    ensure!(took < Duration::from_secs(3), "heard for {took:?} after it was revoked");
+    // The relay is there for the others.
+    let output = drone.command(Some(drone.folder.path()))?;
+    ensure!(output.status.success(), "{output:?}");
     answering.abort();
     Ok(())
 }

@@ -1,14 +1,16 @@
 //! `alight relay`: relays messages between the processes on the drone and the ground.
 //!
 //! Zenoh forwards the messages; this process keeps the session open, and reports its health and what it
-//! denies.
+//! denies. When the list of holders among its keys changes, it starts anew with the rights of the new one.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use clap::Args;
-use node::{Identity, Node, Shutdown, denied};
+use node::access::{HOLDERS, Holders};
+use node::{Identity, Network, Node, Shutdown, denied};
 use tokio::time::MissedTickBehavior;
 
 use crate::args::{NetworkArgs, ParentArgs};
@@ -20,6 +22,8 @@ const BEAT: Duration = Duration::from_millis(100);
 /// Gap between two beats after which the process was frozen: a little less than the lease of
 /// `zenoh-config/drone.json5`.
 const FROZEN: Duration = Duration::from_millis(1200);
+/// Period at which the list of holders is read.
+const HOLDERS_PERIOD: Duration = Duration::from_millis(500);
 /// Pause before it starts anew after a panic, so that one at every start does not use all of a core.
 const RELAUNCH_PAUSE: Duration = Duration::from_millis(200);
 
@@ -47,10 +51,11 @@ pub(crate) fn run(args: &RelayArgs) -> anyhow::Result<ExitCode> {
     let role = if config.as_os_str() == "drone" { "drone" } else { RELAY };
     let identity = Identity { service: RELAY, instance: args.id.clone() };
     let zenoh = network.source(role)?;
+    let holders = HoldersFile::new(&network);
     relaunch_after_panics();
     let serve = async |node, shutdown| {
         tell_if_open(&node, &network);
-        relay(node, shutdown).await
+        relay(node, shutdown, holders).await
     };
     runtime()?.block_on(node::run(identity, &zenoh, serve))?;
     Ok(ExitCode::SUCCESS)
@@ -69,8 +74,10 @@ fn relaunch_after_panics() {
     }));
 }
 
-async fn relay(node: Node, shutdown: Shutdown) -> anyhow::Result<()> {
+async fn relay(node: Node, shutdown: Shutdown, holders: HoldersFile) -> anyhow::Result<()> {
     node.announce().await?;
+    let mut reads = tokio::time::interval(HOLDERS_PERIOD);
+    reads.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut second = tokio::time::interval(Duration::from_secs(1));
     let mut beat = tokio::time::interval(BEAT);
     beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -79,6 +86,13 @@ async fn relay(node: Node, shutdown: Shutdown) -> anyhow::Result<()> {
         tokio::select! {
             _ = second.tick() => report(&node),
             _ = beat.tick() => {}
+            _ = reads.tick() => {
+                // Zenoh reads its rights once.
+                if holders.has_changed() {
+                    tracing::info!("The list of holders has changed; joining the network anew");
+                    return Err(node::relaunch(&[])).context("starting this process anew");
+                }
+            }
             () = shutdown.requested() => return Ok(()),
         }
         // The others have given some of the connections up, and nobody opens those again that gossip made. A
@@ -88,6 +102,31 @@ async fn relay(node: Node, shutdown: Shutdown) -> anyhow::Result<()> {
             return Err(node::relaunch(&[])).context("starting this process anew");
         }
         last = Instant::now();
+    }
+}
+
+/// The list of holders among the keys, as it was read at the start.
+struct HoldersFile {
+    path: Option<PathBuf>,
+    holders: Option<Holders>,
+}
+
+impl HoldersFile {
+    fn new(network: &Network) -> Self {
+        let path = network.keys.as_ref().map(|keys| keys.join(HOLDERS));
+        let file = Self { path, holders: None };
+        Self { holders: file.read(), ..file }
+    }
+
+    /// The list; `None` while there is none that can be read, as when it is being replaced.
+    fn read(&self) -> Option<Holders> {
+        std::fs::read_to_string(self.path.as_ref()?).ok()?.parse().ok()
+    }
+
+    /// True when it is another list now. One that cannot be read changes nothing: with it the relay would not start.
+    fn has_changed(&self) -> bool {
+        let read = self.read();
+        read.is_some() && read != self.holders
     }
 }
 

@@ -242,11 +242,11 @@ fn secure(config: &mut Value, keys: &Path, key_name: &str) -> anyhow::Result<()>
             *value.1 = json!(file.replace("DIRECTORY", directory).replace("NAME", key_name));
         }
     }
-    if listens_locally {
+    let path = keys.join(HOLDERS);
+    if listens_locally && !path.is_file() {
         // Only this machine connects here; what is said across the air link is judged by the relay.
         layer.as_object_mut().and_then(|layer| layer.remove("access_control"));
     } else {
-        let path = keys.join(HOLDERS);
         let text = std::fs::read_to_string(&path).with_context(|| {
             format!("reading {path:?}, the list of those who may connect; copy it from the authority's directory")
         })?;

@@ -190,6 +190,60 @@ const ROLES: [&str; 10] = [
     "simulator",
 ];
 
+/// Publishes on the ground what a gcs-bridge may subscribe to and what it may not, until a changed one has heard the former;
+/// returns whether it heard the latter as well.
+async fn is_sent_what_it_may_not(
+    drone: &Drone,
+    home: &Path,
+    ground: &Path,
+) -> anyhow::Result<bool> {
+    let network = Network {
+        config: Some("ground".into()),
+        connect: Some(drone.air.clone()),
+        keys: Some(ground.to_owned()),
+        ..Network::default()
+    };
+    let detector = open(&network, "detector.ground").await?;
+    let changed = drone.stranger(Some(home), "gcs-bridge", PEER).await?;
+    let (may, may_not) = ("detector/ground/detections", "detector/ground/ack");
+    timeout(PATIENCE, async {
+        let mut rounds = 0;
+        // A while longer, as the two may come by two ways.
+        while rounds < 20 {
+            drop(detector.put(may, "ground").await);
+            drop(detector.put(may_not, "ground").await);
+            rounds += i32::from(has_heard(&changed.received, "ground", may));
+            sleep(PAUSE).await;
+        }
+    })
+    .await
+    .context("the changed gcs-bridge does not hear what it may")?;
+    let is_sent = has_heard(&changed.received, "ground", may_not);
+    for session in [detector, changed.session] {
+        session.close().await.map_err(|cause| anyhow!("{cause}"))?;
+    }
+    Ok(is_sent)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_the_ground_publishes_is_sent_to_who_may_subscribe_to_it_where_it_has_the_list()
+-> anyhow::Result<()> {
+    let (home, plain) = (tempfile::tempdir()?, tempfile::tempdir()?);
+    let authority = Authority::new()?;
+    for role in ["drone", "detector.ground", "gcs-bridge"] {
+        for folder in [home.path(), plain.path()] {
+            authority.issue(folder, &format!("{role}@drone"))?;
+        }
+        common::list(home.path(), &format!("{role}@drone"))?;
+    }
+    let drone = Drone::start(home.path()).await?;
+    let without = is_sent_what_it_may_not(&drone, home.path(), plain.path()).await?;
+    let with = is_sent_what_it_may_not(&drone, home.path(), home.path()).await?;
+    println!("sent what it may not subscribe to: without a list {without}, with it {with}");
+    ensure!(!with, "sent although the ground has the list");
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn what_strangers_say_is_refused_on_every_topic() -> anyhow::Result<()> {
     node::start_logging("off");
