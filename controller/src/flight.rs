@@ -24,6 +24,7 @@ use crate::journal::Journal;
 use crate::landing_target::{self, LandingTargetMode};
 use crate::limits::{Limits, Note};
 use crate::mission::{Mission, Trigger, is_flying_guided};
+use crate::pad_note::{PadNote, PadNotes};
 use crate::setpoints::Setpoints;
 use crate::status::{Used, View};
 use crate::wind::WindEstimate;
@@ -51,6 +52,7 @@ pub struct Flight {
     /// The autopilot's own precision landing, where that steers.
     landing_target: Option<LandingTargetMode>,
     limits: Limits,
+    pad_notes: PadNotes,
     alarms: Alarms,
     wind: WindEstimate,
     journal: Journal,
@@ -93,6 +95,7 @@ impl Flight {
                 LandingTargetMode::new(config.landing_target, config.phases.search_timeout_s)
             }),
             limits: Limits::new(settings.address.clone(), settings.setpoint_timeout_s),
+            pad_notes: PadNotes::default(),
             alarms: Alarms::new(config.alarms),
             wind: WindEstimate::default(),
             journal: Journal::new(health),
@@ -144,6 +147,7 @@ impl Flight {
         }
         self.advance_mission(now_ns);
         self.follow_limits(now_ns);
+        self.note_pad();
         self.check_alarms(now_ns);
         let delay_s = self.autopilot.link_delay(now_ns).map_or(0.0, |delay| delay.as_secs_f64());
         if (delay_s - self.link_delay_s).abs() > LINK_DELAY_STEP_S {
@@ -169,6 +173,23 @@ impl Flight {
     /// Takes over what an earlier controller left to put back.
     pub fn take_over(&mut self, note: Note) {
         self.limits.take_over(note);
+    }
+
+    /// Where the pad is, for the controller that is started next; `None` when it need not know.
+    pub fn pad_note(&self) -> Option<&PadNote> {
+        self.pad_notes.note()
+    }
+
+    /// Takes over the pad's place from an earlier controller, for a landing that is resumed.
+    pub fn take_over_pad(&mut self, note: PadNote) {
+        self.pad_notes.take_over(note);
+    }
+
+    fn note_pad(&mut self) {
+        let is_landing = self.is_landing() && self.landing_target.is_none();
+        let seen = self.lander.pad_to_remember();
+        let address = &self.config.autopilot.address;
+        self.pad_notes.step(is_landing, seen, address, self.autopilot.system());
     }
 
     /// Logs what the operator should know, and tells the lander of a dispute between detectors.
@@ -298,7 +319,7 @@ impl Flight {
             ControllerCommand::Hold => self.operator(now_ns, OperatorCommand::Hold),
             ControllerCommand::Resume => self.operator(now_ns, OperatorCommand::Resume),
             ControllerCommand::Abort => self.operator(now_ns, OperatorCommand::Abort),
-            ControllerCommand::LandHere => self.operator(now_ns, OperatorCommand::LandHere),
+            ControllerCommand::LandHere => self.land_here(now_ns),
             ControllerCommand::UseDetector(name) => selection.prefer(now_ns, name),
             ControllerCommand::PreferDetectors(place) => Ok(selection.prefer_place(now_ns, *place)),
         };
@@ -424,13 +445,37 @@ impl Flight {
         Ok(format!("in phase `{phase}`: {why}"))
     }
 
+    /// Lands where the vehicle is. Without a landing, too: it needs no marker and no detector.
+    fn land_here(&mut self, now_ns: i64) -> Result<String, String> {
+        if self.landing_target.is_some() {
+            return Err(
+                "the autopilot steers to the marker; abort, and land it by its own mode LAND"
+                    .to_owned(),
+            );
+        }
+        if self.is_landing() {
+            return self.operator(now_ns, OperatorCommand::LandHere);
+        }
+        // PX4 climbs in a mode of its own.
+        if self.mission.is_taking_off() && !is_flying_guided(&self.autopilot) {
+            return Err("the vehicle is taking off; land it once it is up".to_owned());
+        }
+        let before = self.mission.clone();
+        self.alarms.begin();
+        self.mission.begin(now_ns, false);
+        self.decide(now_ns, LanderEvent::Operator(OperatorCommand::LandHere));
+        let (why, phase) = (self.why(), self.lander.phase());
+        if phase.is_terminal() {
+            self.mission = before;
+            return Err(format!("not landed here: {why}"));
+        }
+        Ok(format!("in phase `{phase}`: {why}"))
+    }
+
     fn operator(&mut self, now_ns: i64, command: OperatorCommand) -> Result<String, String> {
         if self.mission.is_taking_off() {
             if command == OperatorCommand::Resume {
                 return Err("the vehicle is taking off; there is nothing to resume".to_owned());
-            }
-            if command == OperatorCommand::LandHere {
-                return Err("the vehicle is taking off; land it once it is up".to_owned());
             }
             let why = "aborted by the operator; the autopilot completes the take-off".to_owned();
             self.mission.fail(&mut self.autopilot, why.clone());
@@ -446,12 +491,6 @@ impl Flight {
         {
             if command == OperatorCommand::Resume {
                 return Err("the autopilot steers; there is nothing to resume".to_owned());
-            }
-            if command == OperatorCommand::LandHere {
-                return Err(
-                    "the autopilot steers to the marker; abort, and land it by its own mode LAND"
-                        .to_owned(),
-                );
             }
             let height_m = self.decision.and_then(|d| d.target).map(|target| target.height_m);
             return landing_target.abort(now_ns, height_m, no_return_m, &mut self.autopilot);
@@ -494,11 +533,18 @@ impl Flight {
             age_s <= self.config.phases.stale_vehicle_s
         });
         // A landing that would see nothing waits; what it waits for stands in the status.
-        let is_known = is_known && self.frames.obstacle(now_ns).is_none();
-        let steers = self.landing_target.is_none();
-        let Some(trigger) = self.mission.step(now_ns, &mut self.autopilot, is_known, steers) else {
-            return;
+        let obstacle = if is_known {
+            self.frames.obstacle(now_ns)
+        } else {
+            Some("waiting for attitude and position".to_owned())
         };
+        let steers = self.landing_target.is_none();
+        let trigger = self.mission.step(now_ns, &mut self.autopilot, obstacle.as_deref(), steers);
+        let Some(trigger) = trigger else { return };
+        if trigger == Trigger::InFlight && self.config.start == Start::Resume {
+            let address = &self.config.autopilot.address;
+            self.lander.resume(self.pad_notes.pad(address, self.autopilot.system()));
+        }
         self.begin(now_ns);
         if !self.mission.is_landing() {
             return;

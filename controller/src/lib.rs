@@ -10,7 +10,7 @@
 //! (when a landing begins), [`setpoints`] (the lander's actions to the autopilot), [`landing_target`] (the
 //! other way to land, by the autopilot's own precision landing), [`limits`] (the autopilot's parameters for
 //! setpoints), [`alarms`] and [`wind`]; [`status`] is what is published, [`journal`] what is logged and
-//! counted, [`note_file`] what must survive a crash, [`wire`] converts messages into the lander's types and
+//! counted, [`pad_note`] where the pad is, for the controller that is started next, [`note_file`] what must survive a crash, [`wire`] converts messages into the lander's types and
 //! back.
 
 #![cfg_attr(not(test), deny(clippy::disallowed_methods))] // The same results on every machine.
@@ -27,6 +27,7 @@ pub mod limits;
 pub mod mission;
 pub mod mount;
 pub mod note_file;
+pub mod pad_note;
 pub mod refusals;
 pub mod selection;
 pub mod service;

@@ -17,6 +17,13 @@ const GUID_TIMEOUT: &str = "GUID_TIMEOUT";
 const VERTICAL_ACCELERATION: [Scaled; 2] = [scaled("WPNAV_ACCEL_Z", 0.01), scaled("WP_ACC_Z", 1.0)];
 const ACCELERATION: [Scaled; 2] = [scaled("WPNAV_ACCEL", 0.01), scaled("WP_ACC", 1.0)];
 const JERK: [Scaled; 2] = [scaled("PSC_JERK_XY", 1.0), scaled("PSC_JERK_NE", 1.0)];
+/// ArduPilot's speed of LAND near the ground, and high up (0: the one at which it descends anyway), by their names up to 4.6
+/// (in cm/s) and from 4.7 on, with their scale to m/s.
+const LAND_SPEED: [Scaled; 2] = [scaled("LAND_SPEED", 0.01), scaled("LAND_SPD_MS", 1.0)];
+const LAND_SPEED_HIGH: [Scaled; 2] =
+    [scaled("LAND_SPEED_HIGH", 0.01), scaled("LAND_SPD_HIGH_MS", 1.0)];
+/// PX4's speed of LAND near the ground, in m/s.
+const MPC_LAND_SPEED: [Scaled; 1] = [scaled("MPC_LAND_SPEED", 1.0)];
 /// PX4's time without setpoints until it leaves OFFBOARD, in s.
 const COM_OF_LOSS_T: &str = "COM_OF_LOSS_T";
 
@@ -97,11 +104,15 @@ impl Limits {
         match autopilot.firmware() {
             Some(Firmware::Copter) => {
                 autopilot.read_parameters(&[GUID_TIMEOUT]);
-                for [old, new] in [VERTICAL_ACCELERATION, ACCELERATION, JERK] {
+                for [old, new] in
+                    [VERTICAL_ACCELERATION, ACCELERATION, JERK, LAND_SPEED, LAND_SPEED_HIGH]
+                {
                     autopilot.read_parameters(&[old.name, new.name]);
                 }
             }
-            Some(Firmware::Px4) => autopilot.read_parameters(&[COM_OF_LOSS_T]),
+            Some(Firmware::Px4) => {
+                autopilot.read_parameters(&[COM_OF_LOSS_T, MPC_LAND_SPEED[0].name]);
+            }
             _ => {}
         }
     }
@@ -234,15 +245,22 @@ pub fn timeout_s(autopilot: &Autopilot) -> Option<f64> {
 
 fn read(autopilot: &Autopilot) -> AutopilotLimits {
     let default = AutopilotLimits::default();
-    let or = |names: [Scaled; 2], default| {
-        let read = |it: Scaled| Some(value(autopilot, it.name)? * it.scale);
-        names.into_iter().find_map(read).unwrap_or(default)
+    let first =
+        |names: &[Scaled]| names.iter().find_map(|it| Some(value(autopilot, it.name)? * it.scale));
+    let or = |names: [Scaled; 2], default| first(&names).unwrap_or(default);
+    let land_m_s = match autopilot.firmware() {
+        Some(Firmware::Px4) => first(&MPC_LAND_SPEED),
+        _ => first(&LAND_SPEED).map(|low_m_s| {
+            let high_m_s = first(&LAND_SPEED_HIGH).filter(|high_m_s| *high_m_s > 0.0);
+            high_m_s.map_or(low_m_s, |high_m_s| high_m_s.min(low_m_s))
+        }),
     };
     AutopilotLimits {
         setpoint_timeout_s: timeout_s(autopilot),
         acceleration_m_s2: or(ACCELERATION, default.acceleration_m_s2),
         jerk_m_s3: or(JERK, default.jerk_m_s3),
         vertical_acceleration_m_s2: or(VERTICAL_ACCELERATION, default.vertical_acceleration_m_s2),
+        land_m_s: land_m_s.unwrap_or(default.land_m_s),
     }
 }
 

@@ -9,7 +9,7 @@ use crate::config::Start;
 const MAX_REARMED_NS: i64 = 10_000_000_000;
 
 /// The mission of a flight.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Mission {
     start: Start,
     state: State,
@@ -22,7 +22,7 @@ pub struct Mission {
 }
 
 /// The state of a mission.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub enum State {
     /// Waiting for the operator's command.
     Idle,
@@ -157,16 +157,16 @@ impl Mission {
         self.state = State::Failed { why };
     }
 
-    /// Advances take-off and waiting; the trigger when a landing is to begin. `is_known` says that the
-    /// vehicle's state is fresh, without which the lander refuses a start; `steers` that our setpoints
-    /// control the landing.
+    /// Advances take-off and waiting; the trigger when a landing is to begin. An `obstacle` is why none can begin now, such
+    /// as a vehicle's state that is not fresh; `steers` says that our setpoints control the landing.
     pub fn step(
         &mut self,
         now_ns: i64,
         autopilot: &mut Autopilot,
-        is_known: bool,
+        obstacle: Option<&str>,
         steers: bool,
     ) -> Option<Trigger> {
+        let is_known = obstacle.is_none();
         if let Some(until_ns) = self.goes_on_until_ns {
             let is_ours = autopilot
                 .state()
@@ -200,8 +200,8 @@ impl Mission {
                     mode: FlightMode::Land | FlightMode::AUTO_LAND,
                     ..
                 })) => {
-                    if !is_known {
-                        "waiting for attitude and position".clone_into(why);
+                    if let Some(obstacle) = obstacle {
+                        obstacle.clone_into(why);
                         return None;
                     }
                     Some(match end {

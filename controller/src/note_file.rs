@@ -1,29 +1,31 @@
-//! The file that keeps, beyond a crash, what must be put back in the autopilot's parameters.
+//! The files that keep, beyond a crash, what must be put back in the autopilot's parameters, and where the pad is.
 
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use node::state_directory;
+use node::{clock_name, state_directory};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use tokio::task::JoinHandle;
 
 use crate::limits::Note;
+use crate::pad_note::PadNote;
 
-/// The file of one controller; it exists while there is something to put back.
+/// The file of one controller with one kind of note; it exists while there is one.
 #[derive(Debug)]
-pub struct NoteFile {
+pub struct NoteFile<T = Note> {
     path: Option<PathBuf>,
-    written: Option<Note>,
+    written: Option<T>,
 }
 
-impl NoteFile {
-    /// The file of the controller with this name, in the [`state_directory`].
+impl<T: Clone + PartialEq + Serialize + DeserializeOwned> NoteFile<T> {
+    /// The file with this name, without its ending, in the [`state_directory`].
     pub fn new(name: &str) -> Self {
-        Self {
-            path: state_directory().map(|it| it.join(format!("controller-{name}.json"))),
-            written: None,
-        }
+        Self { path: state_directory().map(|it| it.join(format!("{name}.json"))), written: None }
     }
 
     /// What an earlier controller left; a file that cannot be read counts as none.
-    pub fn read(&self) -> Option<Note> {
+    pub fn read(&self) -> Option<T> {
         let text = std::fs::read(self.path.as_ref()?).ok()?;
         let note = serde_json::from_slice(&text);
         if note.is_err() {
@@ -33,19 +35,19 @@ impl NoteFile {
     }
 
     /// Keeps `note`, or removes the file when there is none.
-    pub fn keep(&mut self, note: Option<&Note>) {
+    pub fn keep(&mut self, note: Option<&T>) {
         if self.written.as_ref() == note {
             return;
         }
         self.written = note.cloned();
         let Some(path) = &self.path else { return };
         if let Err(problem) = write(path, note) {
-            tracing::warn!(%problem, file = ?path, "Note of the autopilot's parameters not written");
+            tracing::warn!(%problem, file = ?path, "Note for the next controller not written");
         }
     }
 }
 
-fn write(path: &Path, note: Option<&Note>) -> std::io::Result<()> {
+fn write(path: &Path, note: Option<&impl Serialize>) -> std::io::Result<()> {
     let Some(note) = note else {
         return if path.exists() { std::fs::remove_file(path) } else { Ok(()) };
     };
@@ -56,6 +58,49 @@ fn write(path: &Path, note: Option<&Note>) -> std::io::Result<()> {
     let new = path.with_extension("new");
     std::fs::write(&new, serde_json::to_vec(note)?)?;
     std::fs::rename(&new, path)
+}
+
+/// The file with the pad's place. It is written while the vehicle descends, so nothing waits for it.
+#[derive(Debug)]
+pub struct PadFile {
+    file: Arc<Mutex<NoteFile<Clocked>>>,
+    kept: Option<PadNote>,
+    writing: Option<JoinHandle<()>>,
+}
+
+/// A pad's place with the name of the clock of its stamp: that of another boot tells nothing.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Clocked {
+    clock: String,
+    pad: PadNote,
+}
+
+impl PadFile {
+    /// The file of the controller with this name.
+    pub fn new(name: &str) -> Self {
+        let file = NoteFile::new(&format!("controller-{name}-pad"));
+        Self { file: Arc::new(Mutex::new(file)), kept: None, writing: None }
+    }
+
+    /// What an earlier controller left since this host was started.
+    pub fn read(&self) -> Option<PadNote> {
+        let left = self.file.lock().unwrap_or_else(PoisonError::into_inner).read()?;
+        (left.clock == clock_name()).then_some(left.pad)
+    }
+
+    /// Keeps `note`, or removes the file when there is none; later, while it is still being written.
+    pub fn keep(&mut self, note: Option<&PadNote>) {
+        let is_idle = self.writing.as_ref().is_none_or(JoinHandle::is_finished);
+        if self.kept.as_ref() == note || !is_idle {
+            return;
+        }
+        self.kept = note.cloned();
+        let note = note.map(|pad| Clocked { clock: clock_name().to_owned(), pad: pad.clone() });
+        let file = Arc::clone(&self.file);
+        self.writing = Some(tokio::task::spawn_blocking(move || {
+            file.lock().unwrap_or_else(PoisonError::into_inner).keep(note.as_ref());
+        }));
+    }
 }
 
 #[cfg(test)]

@@ -17,7 +17,8 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 
 use crate::config::Config;
 use crate::flight::Flight;
-use crate::note_file::NoteFile;
+use crate::limits::Note;
+use crate::note_file::{NoteFile, PadFile};
 use crate::tape::TapedFlight;
 
 /// Period of the flight's ticks.
@@ -59,10 +60,14 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let mut link = Link::open_for(address, Peering::Autopilot, config.signing()?)
         .await
         .context("opening the link to the autopilot")?;
-    let mut note_file = NoteFile::new(&config.id);
+    let mut note_file = NoteFile::<Note>::new(&format!("controller-{}", config.id));
+    let mut pad_file = PadFile::new(&config.id);
     let mut flight = TapedFlight::new(now_ns(), config, node.shared_health())?;
     if let Some(note) = note_file.read() {
         flight.take_over(now_ns(), note);
+    }
+    if let Some(note) = pad_file.read() {
+        flight.take_over_pad(now_ns(), note);
     }
 
     let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
@@ -152,6 +157,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         }
         // Written before the packet that changes the parameter is sent.
         note_file.keep(flight.flight().note());
+        pad_file.keep(flight.flight().pad_note());
         send(&node, &link, &mut flight);
         tapes.pass_on(&mut flight);
         reports.publish(flight.flight()).await;

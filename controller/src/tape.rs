@@ -11,13 +11,15 @@ use autopilot::Packet;
 use landing::{Action, Decision};
 use messages::{
     CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorInfo, Tape,
-    TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapeState, TapeTarget, TapeWriter,
+    TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeState, TapeTarget,
+    TapeWriter,
 };
 use node::{HealthCounters, to_toml};
 
 use crate::config::Config;
 use crate::flight::Flight;
 use crate::limits::Note;
+use crate::pad_note::PadNote;
 
 /// Maximum number of packets for the autopilot that wait to be taken; the oldest goes.
 const MAX_OUTGOING: usize = 1024;
@@ -96,6 +98,19 @@ impl TapedFlight {
             set_s: note.set_s,
         });
         self.flight.take_over(note);
+        self.write(now_ns, &event, None);
+    }
+
+    /// As [`Flight::take_over_pad`].
+    pub fn take_over_pad(&mut self, now_ns: i64, note: PadNote) {
+        let event = TapeEvent::TakeOverPad(TapePad {
+            address: note.address.clone(),
+            system: note.system,
+            stamp_ns: note.stamp_ns,
+            position_ned_m: note.position_ned_m,
+            deviation_m: note.deviation_m,
+        });
+        self.flight.take_over_pad(note);
         self.write(now_ns, &event, None);
     }
 
@@ -189,6 +204,12 @@ impl TapedFlight {
                 let TapeNote { address, system, parameter, original_s, set_s } = note.clone();
                 let note = Note { address, system, parameter, original_s, set_s };
                 self.take_over(now_ns, note);
+            }
+            TapeEvent::TakeOverPad(pad) => {
+                let TapePad { address, system, stamp_ns, position_ned_m, deviation_m } =
+                    pad.clone();
+                let note = PadNote { address, system, stamp_ns, position_ned_m, deviation_m };
+                self.take_over_pad(now_ns, note);
             }
             TapeEvent::Packet { raw } => match Packet::from_raw(raw) {
                 Some(packet) => self.packet(now_ns, &packet),

@@ -13,6 +13,7 @@ use autopilot::dialect::{
 };
 use controller::Config;
 use controller::flight::Flight;
+use controller::pad_note::PadNote;
 use messages::{CameraInfo, ControllerCommand, Detection, Detections, FrameHeader, Phase};
 use node::{Layers, clock_name};
 use packets::{MS, attitude, contact, heartbeat, position, receive};
@@ -466,6 +467,57 @@ fn a_start_is_refused_while_all_detections_are_and_the_reason_is_told() {
 }
 
 #[test]
+fn landing_here_needs_neither_detections_nor_a_landing() {
+    let land_here = |flight: &mut Flight, now_ms: i64| {
+        sent(flight);
+        let reply = flight.command(now_ms * MS, &ControllerCommand::LandHere);
+        let asked = hover(flight, now_ms + 20, now_ms + 100, 4).modes;
+        (reply, asked, flight.status((now_ms + 100) * MS).phase)
+    };
+    // After a take-off, while all detections are refused.
+    for start in ["takeoff", "airborne", "command"] {
+        let mut flight = in_flight(start);
+        flight.camera(0, CameraInfo::sample());
+        for ms in (20..1600).step_by(20) {
+            pose(&mut flight, ms * MS);
+            if ms % 60 == 0 {
+                let header = FrameHeader { clock: "monotonic/myhost".into(), ..header(ms * MS) };
+                let foreign = Detections { header, ..Detections::sample() };
+                flight.detections(ms * MS, "main", &foreign);
+            }
+            flight.tick(ms * MS + 3);
+        }
+        let status = flight.status(1600 * MS);
+        assert!(matches!(status.phase, Phase::Takeoff | Phase::Idle | Phase::Search), "{status:?}");
+        if status.phase == Phase::Takeoff {
+            assert!(status.why.contains("monotonic/myhost"), "{}", status.why);
+        }
+        let (reply, asked, phase) = land_here(&mut flight, 1600);
+        assert!(reply.accepted, "{start}: {reply:?}");
+        assert_eq!((asked.contains(&9.0), phase), (true, Phase::Final), "{start}: {asked:?}");
+    }
+    // After an abort.
+    let mut flight = in_flight("airborne");
+    hover(&mut flight, 20, 1000, 4);
+    assert!(flight.command(1000 * MS, &ControllerCommand::Abort).accepted);
+    hover(&mut flight, 1020, 9000, 4);
+    assert_eq!(flight.status(9000 * MS).phase, Phase::Aborted);
+    let (reply, asked, phase) = land_here(&mut flight, 9000);
+    assert!(reply.accepted, "{reply:?}");
+    assert_eq!((asked.contains(&9.0), phase), (true, Phase::Final), "{asked:?}");
+    // Against a pilot it is refused, and what was going on goes on.
+    let mut flight = in_flight("airborne");
+    receive(&mut flight, 2 * MS, &heartbeat(5, true));
+    pose(&mut flight, 20 * MS);
+    flight.tick(21 * MS);
+    let reply = flight.command(30 * MS, &ControllerCommand::LandHere);
+    assert!(!reply.accepted && reply.reason.contains("GUIDED"), "{reply:?}");
+    receive(&mut flight, 1000 * MS, &heartbeat(4, true));
+    hover(&mut flight, 1020, 1500, 4);
+    assert_eq!(flight.status(1500 * MS).phase, Phase::Search);
+}
+
+#[test]
 fn a_strangers_calibration_is_refused_in_flight_and_told() {
     let mut flight = in_flight("airborne");
     flight.camera(0, CameraInfo::sample());
@@ -684,6 +736,54 @@ fn a_controller_restarted_in_the_last_metre_of_land_resumes_the_landing() {
         pose_at(&mut flight, 20 * MS, 0.5);
         flight.tick(21 * MS);
         assert_eq!(flight.status(21 * MS).phase, Phase::Final);
+    }
+}
+
+#[test]
+fn a_restarted_controller_does_not_climb_with_a_vehicle_that_may_stand_on_the_pad() {
+    let note = |down_m: f64, system: u8, stamp_ns: i64| PadNote {
+        address: "udpin:127.0.0.1:14550".into(),
+        system,
+        stamp_ns,
+        position_ned_m: [0.1, 0.0, down_m],
+        deviation_m: 0.02,
+    };
+    let now_ns = 100_000 * MS;
+    for (what, height_m, left, phase) in [
+        ("told", 0.05, Some(note(0.0, 1, now_ns - 5000 * MS)), Phase::Final),
+        ("told, on a pad on a hill", 3.05, Some(note(-3.0, 1, now_ns - 5000 * MS)), Phase::Final),
+        ("told, over it", 1.0, Some(note(0.0, 1, now_ns - 5000 * MS)), Phase::Search),
+        ("told, over a valley", 0.05, Some(note(2.0, 1, now_ns - 5000 * MS)), Phase::Search),
+        ("told long ago", 3.05, Some(note(-3.0, 1, now_ns - 90_000 * MS)), Phase::Search),
+        ("told of another vehicle", 3.05, Some(note(-3.0, 2, now_ns)), Phase::Search),
+        ("not told, still at the height of the origin", 0.05, None, Phase::Final),
+        ("not told, in flight", 5.0, None, Phase::Search),
+    ] {
+        let mut flight = flight_with("resume", &["autopilot.address=\"udpin:127.0.0.1:14550\""]);
+        if let Some(left) = left {
+            flight.take_over_pad(left);
+        }
+        flight.presence(now_ns, "main", true);
+        let (mut highest_m_s, mut land) = (0.0, false);
+        for ms in (0..4000).step_by(20) {
+            let at_ns = now_ns + ms * MS;
+            if ms % 1000 == 0 {
+                receive(&mut flight, at_ns, &heartbeat(4, true));
+                receive(&mut flight, at_ns, &contact(MavLandedState::MAV_LANDED_STATE_IN_AIR));
+            }
+            pose_at(&mut flight, at_ns + 1, height_m);
+            flight.tick(at_ns + 3);
+            let mut sent = Sent::default();
+            sent.take(&mut flight);
+            land |= sent.modes.contains(&9.0);
+            let setpoint = flight.status(at_ns + 3).setpoint;
+            highest_m_s =
+                setpoint.map_or(highest_m_s, |it| f64::max(highest_m_s, -it.velocity_ned_m_s[2]));
+        }
+        let status = flight.status(now_ns + 4000 * MS);
+        assert_eq!(status.phase, phase, "{what}: {status:?}");
+        assert_eq!(land, phase == Phase::Final, "{what}");
+        assert!(!land || highest_m_s <= 0.0, "{what}: it climbed at {highest_m_s} m/s");
     }
 }
 

@@ -225,7 +225,8 @@ settings! {
         land_retry_s: f64 = 0.5, 0.1..=5.0;
         /// Maximum wait for the LAND mode, in s; then the landing is aborted.
         land_timeout_s: f64 = 5.0, 0.5..=60.0;
-        /// Maximum time in LAND, in s; then the landing is aborted.
+        /// Maximum time in LAND, in s, in addition to what the autopilot's landing speed takes from its height; then the
+        /// landing is aborted.
         touchdown_timeout_s: f64 = 60.0, 5.0..=600.0;
         /// Descent speed without LAND, where the autopilot refuses it close to the ground, in m/s.
         refused_descend_m_s: f64 = 0.3, 0.1..=1.0;

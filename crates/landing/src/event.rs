@@ -76,6 +76,9 @@ pub struct AutopilotLimits {
     pub jerk_m_s3: f64,
     /// Maximum vertical acceleration, in m/s^2 (WPNAV_ACCEL_Z).
     pub vertical_acceleration_m_s2: f64,
+    /// Slowest speed of its LAND down to the ground, in m/s (ArduPilot's LAND_SPEED and LAND_SPEED_HIGH, PX4's
+    /// MPC_LAND_SPEED); the default is the slowest that ArduPilot takes.
+    pub land_m_s: f64,
 }
 
 impl Default for AutopilotLimits {
@@ -85,6 +88,7 @@ impl Default for AutopilotLimits {
             acceleration_m_s2: 2.5,
             jerk_m_s3: 5.0,
             vertical_acceleration_m_s2: 1.0,
+            land_m_s: 0.3,
         }
     }
 }
@@ -108,6 +112,7 @@ impl AutopilotLimits {
                 self.vertical_acceleration_m_s2,
                 default.vertical_acceleration_m_s2,
             ),
+            land_m_s: or(self.land_m_s, default.land_m_s),
         }
     }
 }

@@ -6,7 +6,6 @@ use crate::axis_check::{AxisConsistencyCheck, AxisError, Verdict};
 use crate::config::{AlarmAction, Config, GuidanceConfig, OnAbort};
 use crate::decision::{Action, Decision, Phase, Reason, Rejection, TargetEstimate};
 use crate::envelope;
-use crate::estimator::Estimator;
 use crate::event::{
     AutopilotLimits, Event, FrameObservation, Landed, MarkerInFrame, Mode, OperatorCommand,
     VehicleState, VehicleStatus,
@@ -15,11 +14,13 @@ use crate::guidance::ActiveGuidance;
 use crate::guidance::situation::{Progress, Situation};
 use crate::history::History;
 use crate::limits::ConfigError;
-use crate::mean_target::MeanTarget;
 use crate::mount_check::{MountCheck, MountFindings};
 use crate::search;
-use crate::standing::{MAX_STANDING_M_S, StandingHeight, may_stand};
+use crate::standing::{
+    MAX_STANDING_M_S, RememberedPad, Resumed, StandingHeight, may_stand, to_remember,
+};
 use crate::state_machine::{Inputs, StateMachine, VehicleInputs, reaction};
+use crate::target_filter::{Sightings, TargetFilter};
 use crate::time::Timestamp;
 
 /// Largest position and velocity that is plausible, in m and m/s.
@@ -54,6 +55,12 @@ const MAX_DESCEND_AGE_S: f64 = 0.2;
 /// Vertical speed of a vehicle that hovers, in m/s.
 const MAX_HOVER_M_S: f64 = 0.3;
 
+/// Shortest time without a state of the vehicle, in seconds, after which it may have touched down meanwhile.
+const MIN_SILENCE_S: f64 = 0.6;
+
+/// Minimum time of a search by a lander that takes over before it climbs, in seconds: the vehicle may stand.
+const MIN_RESUMED_LOOK_S: f64 = 1.5;
+
 /// Maximum age of the newest detection, in seconds, up to which heights are those over the target.
 const MAX_TARGET_AGE_S: f64 = 20.0;
 
@@ -71,6 +78,9 @@ pub struct Lander {
     /// Where the vehicle last stood on the ground.
     ground: Option<Point<Odometry>>,
     standing_height: StandingHeight,
+    /// What is known of the landing that this lander takes over, or takes up again after a silence, until it has seen the
+    /// marker.
+    resumed: Option<Resumed>,
     /// Where the landing started.
     start: Point<Odometry>,
     target_filter: TargetFilter,
@@ -105,22 +115,6 @@ struct Square {
     upwind_m: f64,
 }
 
-/// The estimate of the landing point, by the filter that the guidance needs.
-#[derive(Clone, Debug)]
-#[expect(clippy::large_enum_variant, reason = "one instance; nothing may be allocated in flight")]
-enum TargetFilter {
-    Mean(MeanTarget),
-    Kalman(Estimator),
-}
-
-/// The stamps of the markers used.
-#[derive(Copy, Clone, Debug, Default)]
-struct Sightings {
-    newest: Option<Timestamp>,
-    /// Number of markers without a long gap.
-    in_a_row: u32,
-}
-
 impl Lander {
     /// A lander that waits for a start; refuses settings out of range.
     pub fn new(config: Config) -> Result<Self, ConfigError> {
@@ -135,6 +129,7 @@ impl Lander {
             is_link_slow: false,
             ground: None,
             standing_height: StandingHeight::default(),
+            resumed: None,
             start: Point::origin(),
             target_filter: TargetFilter::new(&config),
             sightings: Sightings::default(),
@@ -203,7 +198,12 @@ impl Lander {
             is_link_slow: self.is_link_slow,
             may_stand: self.may_stand(now),
         };
-        if self.state_machine.advance(&inputs) {
+        let was_active = !self.phase().is_terminal();
+        let has_started = self.state_machine.advance(&inputs);
+        if was_active && self.phase().is_terminal() {
+            self.resumed = None;
+        }
+        if has_started {
             self.guidance = ActiveGuidance::new(self.config.guidance);
             self.standing_height = StandingHeight::default();
             self.first_seen = None;
@@ -220,6 +220,20 @@ impl Lander {
             target: self.target(now),
             rejected: result.err(),
         }
+    }
+
+    /// The next landing is one that an earlier controller began; with the pad's place as that one knew it.
+    pub fn resume(&mut self, pad: Option<RememberedPad>) {
+        self.resumed = Some(Resumed::new(pad));
+    }
+
+    /// The pad's place and the height over it in metres, for a controller that has to take over this landing; `None`
+    /// where it is not known well.
+    pub fn pad_to_remember(&self) -> Option<(RememberedPad, f64)> {
+        let target = self.target(self.now?)?;
+        let is_active = !self.phase().is_terminal() && !self.pad_moves();
+        let pad = to_remember(self.now?, &target).filter(|_| is_active)?;
+        Some((pad, target.height_m))
     }
 
     /// The present phase.
@@ -247,10 +261,17 @@ impl Lander {
             return Err(Rejection::Implausible);
         }
         self.check_stamp(now, state.stamp, self.config.phases.stale_vehicle_s)?;
+        let silence = self.pad_before_silence(state.stamp);
         if !self.history.push(state) {
             return Err(Rejection::OutOfOrder);
         }
+        if silence.is_some() {
+            self.resumed = Some(Resumed::new(silence));
+        }
         self.status = Some(state.status());
+        if let Some(resumed) = &mut self.resumed {
+            resumed.observe(&state);
+        }
         let is_standing =
             self.landed(now) == Landed::OnGround && state.velocity.norm() <= MAX_STANDING_M_S;
         if is_standing {
@@ -259,6 +280,14 @@ impl Lander {
             self.standing_height.observe(is_of_landing.then(|| self.target(now)).flatten());
         }
         Ok(())
+    }
+
+    /// The pad's place before a silence that ends with a state of this time: what the estimate is after it, is less certain.
+    fn pad_before_silence(&self, stamp: Timestamp) -> Option<RememberedPad> {
+        let last = self.history.newest()?.stamp;
+        let is_silence = stamp.seconds_since(last) > MIN_SILENCE_S;
+        let is_active = is_silence && !self.phase().is_terminal() && !self.pad_moves();
+        to_remember(last, &self.target(last).filter(|_| is_active)?)
     }
 
     /// Where the vehicle is, apart from the jumps of the autopilot's position.
@@ -369,6 +398,9 @@ impl Lander {
             Ok(()) => {}
         }
         self.sightings.add(frame.stamp, self.config.phases.lost_target_s);
+        if self.sightings.in_a_row >= self.config.target.confirm_after {
+            self.resumed = None;
+        }
         Ok(())
     }
 
@@ -388,18 +420,27 @@ impl Lander {
 
     fn vehicle_inputs(&self, now: Timestamp) -> Option<VehicleInputs> {
         let (state, status) = (self.history.newest()?, self.status?);
+        let age_s = now.seconds_since(state.stamp);
         Some(VehicleInputs {
-            age_s: now.seconds_since(state.stamp),
+            age_s,
             mode: status.mode,
             armed: status.armed,
             landed: self.landed(now),
             height_m: self.height_m(now),
+            is_over_target: self.recent_target(now).is_some(),
+            sinks: age_s <= self.config.phases.stale_vehicle_s
+                && state.velocity.z() > MAX_STANDING_M_S + self.config.estimator.pad_heave_m_s,
+            land_m_s: self.limits.land_m_s,
         })
     }
 
     fn may_stand(&self, now: Timestamp) -> bool {
-        let vehicle = self.history.newest();
-        vehicle.is_some_and(|vehicle| may_stand(&self.situation(now, vehicle), &self.config))
+        self.history.newest().is_some_and(|vehicle| {
+            let situation = self.situation(now, vehicle);
+            let resumed = self.resumed;
+            may_stand(&situation, &self.config)
+                || resumed.is_some_and(|resumed| resumed.may_stand(&situation, &self.config))
+        })
     }
 
     fn set_link_delay(&mut self, seconds: f64) {
@@ -482,12 +523,7 @@ impl Lander {
     /// The landing point relative to the vehicle's newest state.
     fn target(&self, now: Timestamp) -> Option<TargetEstimate> {
         let vehicle = self.history.newest()?.position;
-        let target = match &self.target_filter {
-            TargetFilter::Mean(target) => target.estimate(vehicle, now),
-            TargetFilter::Kalman(estimator) => {
-                estimator.estimate(vehicle, self.history.ned_from_odometry(), now)
-            }
-        }?;
+        let target = self.target_filter.estimate(vehicle, &self.history, now)?;
         Some(self.mount_check.widen(target))
     }
 
@@ -648,8 +684,10 @@ impl Lander {
     fn search(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
         let phases = &self.config.phases;
+        let least_s = if self.resumed.is_some() { MIN_RESUMED_LOOK_S } else { 0.0 };
+        let delay_s = libm::fmax(phases.search_delay_s, least_s);
         // A search without a detector finds nothing.
-        if self.state_machine.elapsed_s(now) < phases.search_delay_s || !self.detectors_alive {
+        if self.state_machine.elapsed_s(now) < delay_s || !self.detectors_alive {
             return Action::hover();
         }
         let altitude_m = -vehicle.position.z();
@@ -792,51 +830,5 @@ impl Lander {
         let altitude_m = self.history.newest().map_or(f64::MAX, |state| -state.position.z());
         let to_m = self.altitude_m(now, self.config.phases.abort_height_m);
         self.climb((to_m - altitude_m).clamp(0.0, self.config.envelope.climb_m_s))
-    }
-}
-
-impl TargetFilter {
-    fn new(config: &Config) -> Self {
-        match config.guidance {
-            GuidanceConfig::Thesis(_) => Self::Mean(MeanTarget::new(config.target)),
-            GuidanceConfig::Metric(_) => Self::Kalman(Estimator::new(config.estimator)),
-        }
-    }
-
-    fn takes_late_frames(&self) -> bool {
-        matches!(self, Self::Kalman(_))
-    }
-
-    fn miss(&mut self, frame: &FrameObservation, history: &History) {
-        if let Self::Kalman(estimator) = self {
-            estimator.miss(frame, history);
-        }
-    }
-
-    fn observe(
-        &mut self,
-        frame: &FrameObservation,
-        marker: &MarkerInFrame,
-        history: &History,
-    ) -> Result<(), Rejection> {
-        match self {
-            Self::Mean(target) => target.observe(frame, marker, history),
-            Self::Kalman(estimator) => estimator.observe(frame, marker, history),
-        }
-    }
-}
-
-impl Sightings {
-    fn add(&mut self, stamp: Timestamp, max_gap_s: f64) {
-        let gap_s = self.age_s(stamp);
-        if gap_s < 0.0 {
-            return;
-        }
-        self.in_a_row = if gap_s > max_gap_s { 1 } else { self.in_a_row.saturating_add(1) };
-        self.newest = Some(stamp);
-    }
-
-    fn age_s(&self, now: Timestamp) -> f64 {
-        self.newest.map_or(f64::INFINITY, |newest| now.seconds_since(newest))
     }
 }

@@ -13,10 +13,10 @@
 //! - [`time`], [`event`], [`decision`]: stamps, inputs, outputs; [`config`] has every number.
 //! - [`history`]: the vehicle's recent motion, and the odometry frame.
 //! - `measurement`, `filter`, `view`, `hypotheses`, [`estimator`]: from detections to the landing point; [`mean_target`] for
-//!   the thesis' guidance.
+//!   the thesis' guidance; `target_filter` is the one that is needed.
 //! - [`guidance`]: from the target to a velocity. [`search`]: where to look for the marker.
 //! - [`axis_check`]: are the axes of camera and autopilot consistent? [`mount_check`]: by how much are they off?
-//!   `standing`: how high does the vehicle stand?
+//!   `standing`: how high does the vehicle stand, and does it?
 //! - [`state_machine`]: the phases. [`envelope`]: the last check of a setpoint.
 //! - [`lander`] joins them.
 
@@ -40,6 +40,7 @@ pub mod mount_check;
 pub mod search;
 mod standing;
 pub mod state_machine;
+mod target_filter;
 pub mod time;
 mod view;
 
@@ -55,4 +56,5 @@ pub use event::{
 pub use lander::Lander;
 pub use limits::ConfigError;
 pub use mount_check::{Measured, MountFindings};
+pub use standing::RememberedPad;
 pub use time::Timestamp;

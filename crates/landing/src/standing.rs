@@ -5,13 +5,19 @@
 //! no longer sees the marker then, and the autopilot's height drifts near the ground: the error is 0.15 m at most in the
 //! tests. So it is told, and changes no landing: one that is too large would ask for LAND too high.
 //!
-//! And whether a vehicle may stand on the pad already, although its autopilot does not say so.
+//! And whether a vehicle may stand on the pad already, although its autopilot does not say so. A lander that takes over the
+//! landing of another one has not seen the pad: it is told where that one saw it, or, where nobody knows, a vehicle that is
+//! quite still at the height of the local origin, near which it was armed, may stand.
 
 use std::ops::RangeInclusive;
 
+use geometry::{Ned, Point, Vector};
+
 use crate::config::{Config, GuidanceConfig};
 use crate::decision::TargetEstimate;
+use crate::event::VehicleState;
 use crate::guidance::situation::Situation;
+use crate::time::Timestamp;
 
 /// Maximum speed of a vehicle that stands, in m/s.
 pub(crate) const MAX_STANDING_M_S: f64 = 0.2;
@@ -22,6 +28,18 @@ const MAX_STANDING_ASIDE_M: f64 = 0.3;
 const MAX_STANDING_DEVIATION_M: f64 = 0.2;
 /// How much more height per second since the newest detection: the autopilot's height drifts, in m/s.
 const STANDING_DRIFT_M_S: f64 = 0.02;
+
+/// Maximum age of a pad's place that an earlier lander has left, in seconds: the autopilot's position drifts.
+const MAX_REMEMBERED_S: f64 = 60.0;
+/// Maximum speed of a vehicle that stands where no pad is known, in m/s, its minimum duration, in seconds, and the maximum
+/// height over the local origin, in metres: a barometer drifts by so much in a flight.
+const MAX_STILL_M_S: f64 = 0.1;
+const MIN_STILL_S: f64 = 1.0;
+const MAX_STILL_HEIGHT_M: f64 = 0.5;
+/// Maximum time after taking over within which that is assumed, in seconds: an autopilot says by then that it stands.
+const MAX_UNTOLD_S: f64 = 10.0;
+/// Maximum distance from the pad of such a vehicle that stands beside it, in metres.
+const MAX_BESIDE_M: f64 = 2.0;
 
 /// Heights that a vehicle may have and that are above the error of the measurement, in metres.
 const PLAUSIBLE_M: RangeInclusive<f64> = 0.15..=1.0;
@@ -60,21 +78,122 @@ impl StandingHeight {
     }
 }
 
+/// The place of the pad, as the lander of an earlier controller knew it.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct RememberedPad {
+    /// Its place, in metres from the autopilot's local origin.
+    pub position: Point<Ned>,
+    /// Standard deviation of its horizontal position, in metres.
+    pub deviation_m: f64,
+    /// The time of that.
+    pub stamp: Timestamp,
+}
+
+/// What a lander knows that takes over the landing of another one, or takes its own up again after a silence.
+#[derive(Copy, Clone, Debug, Default)]
+pub(crate) struct Resumed {
+    pad: Option<RememberedPad>,
+    /// The time of the first state, and since when the vehicle is still.
+    first: Option<Timestamp>,
+    still_since: Option<Timestamp>,
+}
+
+impl Resumed {
+    pub(crate) fn new(pad: Option<RememberedPad>) -> Self {
+        Self { pad, first: None, still_since: None }
+    }
+
+    /// The vehicle's newest state.
+    pub(crate) fn observe(&mut self, vehicle: &VehicleState) {
+        self.first.get_or_insert(vehicle.stamp);
+        let is_still = vehicle.velocity.norm() <= MAX_STILL_M_S;
+        self.still_since = is_still.then(|| self.still_since.unwrap_or(vehicle.stamp));
+    }
+
+    /// True when the vehicle may stand although this lander has not seen the pad since.
+    pub(crate) fn may_stand(&self, situation: &Situation<'_>, config: &Config) -> bool {
+        let vehicle = situation.vehicle;
+        let still_s = self.still_since.map_or(0.0, |since| vehicle.stamp.seconds_since(since));
+        let is_still = is_recent(situation, config) && still_s >= MIN_STILL_S;
+        let is_valid = |pad: &RememberedPad| {
+            let age_s = situation.now.seconds_since(pad.stamp);
+            (0.0..=MAX_REMEMBERED_S).contains(&age_s)
+        };
+        let Some(pad) = self.pad.filter(is_valid) else {
+            let height_m = -vehicle.position.z() - standing_height_m(config);
+            let known_s = self.first.map_or(0.0, |first| vehicle.stamp.seconds_since(first));
+            return is_still && height_m.abs() <= MAX_STILL_HEIGHT_M && known_s <= MAX_UNTOLD_S;
+        };
+        let to_pad = pad.position - vehicle.position;
+        let below = Below {
+            height_m: to_pad.z(),
+            lateral_m: to_pad.horizontal_norm(),
+            deviation_m: pad.deviation_m,
+            age_s: situation.now.seconds_since(pad.stamp),
+            velocity: Vector::zero(),
+        };
+        let is_beside = below.lateral_m <= MAX_BESIDE_M
+            && below.height_m >= -MAX_STILL_HEIGHT_M
+            && is_low(config, &below);
+        is_right_over(situation, config, &below) || is_still && is_beside
+    }
+}
+
+/// A pad, as seen from the vehicle.
+struct Below {
+    height_m: f64,
+    lateral_m: f64,
+    deviation_m: f64,
+    age_s: f64,
+    velocity: Vector<Ned>,
+}
+
 /// True when the vehicle is still and the pad is known to be right below it: it may have touched down while nothing arrived
 /// from it.
 pub(crate) fn may_stand(situation: &Situation<'_>, config: &Config) -> bool {
-    let (vehicle, Some(target)) = (situation.vehicle, situation.target) else { return false };
-    let standing_height_m = match &config.guidance {
+    let Some(target) = situation.target else { return false };
+    let below = Below {
+        height_m: target.height_m,
+        lateral_m: target.lateral_error_m,
+        deviation_m: target.deviation_m,
+        age_s: target.age_s,
+        velocity: target.velocity,
+    };
+    !target.ambiguous && is_right_over(situation, config, &below)
+}
+
+/// The pad's place, for a lander that has to take over; `None` where it is not known well.
+pub(crate) fn to_remember(now: Timestamp, target: &TargetEstimate) -> Option<RememberedPad> {
+    let is_sound = !target.ambiguous
+        && target.age_s <= MAX_AGE_S
+        && target.deviation_m <= MAX_STANDING_DEVIATION_M;
+    is_sound.then(|| RememberedPad {
+        position: target.position,
+        deviation_m: target.deviation_m,
+        stamp: now,
+    })
+}
+
+fn is_right_over(situation: &Situation<'_>, config: &Config, below: &Below) -> bool {
+    let max_m_s = MAX_STANDING_M_S + situation.pad_heave_m_s;
+    let is_still = (situation.vehicle.velocity - below.velocity).norm() <= max_m_s;
+    let is_over_pad =
+        below.lateral_m <= MAX_STANDING_ASIDE_M && below.deviation_m <= MAX_STANDING_DEVIATION_M;
+    is_recent(situation, config) && is_still && is_low(config, below) && is_over_pad
+}
+
+fn is_low(config: &Config, below: &Below) -> bool {
+    let max_m = MAX_STANDING_M + STANDING_DRIFT_M_S * below.age_s;
+    below.height_m - standing_height_m(config) <= max_m
+}
+
+fn is_recent(situation: &Situation<'_>, config: &Config) -> bool {
+    situation.now.seconds_since(situation.vehicle.stamp) <= config.phases.stale_vehicle_s
+}
+
+fn standing_height_m(config: &Config) -> f64 {
+    match &config.guidance {
         GuidanceConfig::Metric(metric) => metric.standing_height_m,
         GuidanceConfig::Thesis(_) => 0.0,
-    };
-    let is_recent = situation.now.seconds_since(vehicle.stamp) <= config.phases.stale_vehicle_s;
-    let max_m_s = MAX_STANDING_M_S + situation.pad_heave_m_s;
-    let is_still = (vehicle.velocity - target.velocity).norm() <= max_m_s;
-    let max_m = MAX_STANDING_M + STANDING_DRIFT_M_S * target.age_s;
-    let is_low = target.height_m - standing_height_m <= max_m;
-    let is_over_pad = !target.ambiguous
-        && target.lateral_error_m <= MAX_STANDING_ASIDE_M
-        && target.deviation_m <= MAX_STANDING_DEVIATION_M;
-    is_recent && is_still && is_low && is_over_pad
+    }
 }

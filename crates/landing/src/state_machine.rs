@@ -36,11 +36,12 @@
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | the link to the autopilot is slow | Hold |
 //! | a mode that is neither GUIDED nor the requested LAND | PilotInCommand |
-//! | on the ground; still and low over the pad, where Search or Retry would follow | Final |
+//! | on the ground; still and low over the pad, where Search or Retry would follow, or in Search | Final |
 //! | disarmed | Landed on the ground or in LAND, else, half a second later, Aborted |
 //! | an alarm | as configured for it |
 //!
-//! Idle, Landed, Aborted and PilotInCommand are terminal: only a new start leaves them.
+//! Idle, Landed, Aborted and PilotInCommand are terminal: only a new start leaves them, or the command to land here, which
+//! needs no marker, only an armed vehicle in our mode or in LAND.
 //!
 //! | phase | maximum duration | then |
 //! |---|---|---|
@@ -48,7 +49,7 @@
 //! | Approach, Descend | `approach_timeout_s`, `descend_timeout_s` | Hold |
 //! | Retry | `retry_timeout_s`, and `retries` times | Search |
 //! | Hold | `hold_timeout_s`, by the operator `operator_hold_timeout_s` | Aborted |
-//! | Final | `land_timeout_s` until LAND, `touchdown_timeout_s` until the ground | Aborted, Landed |
+//! | Final | `land_timeout_s` until LAND; until the ground `touchdown_timeout_s` and what the autopilot's landing speed takes from there | Aborted, Landed |
 //! | all together until LAND | `landing_timeout_s` | Aborted |
 
 use crate::config::{AlarmAction, OnAbort, PhaseConfig};
@@ -60,9 +61,17 @@ use crate::time::Timestamp;
 /// Minimum climb time of a vehicle that could not settle before it tries again, in seconds.
 const MIN_RETRY_S: f64 = 2.0;
 
+/// Time in a search that begins low until a vehicle that may stand counts as one that does, in seconds: one that hovers sees
+/// the marker before.
+const MIN_LOOK_S: f64 = 1.0;
+
 /// Time after an abort in which LAND, asked for before it, may still show, in seconds: heartbeats come each second, and one
 /// may be lost.
 const MAX_LATE_LAND_S: f64 = 2.5;
+
+/// Longest time by which LAND may exceed what its speed and the known height take while the vehicle still sinks, in seconds:
+/// the ground may lie far below the place where the vehicle took off.
+const MAX_SINKING_S: f64 = 600.0;
 
 /// Wait for the report of the ground after the motors have stopped, in seconds: it may come later.
 const MAX_CONTACT_WAIT_S: f64 = 0.5;
@@ -109,6 +118,12 @@ pub struct VehicleInputs {
     pub landed: Landed,
     /// Height over the target, else over the ground that it stood on, in metres.
     pub height_m: f64,
+    /// That height is the one over the target.
+    pub is_over_target: bool,
+    /// It goes down: a vehicle that stands does not.
+    pub sinks: bool,
+    /// Speed of the autopilot's LAND near the ground, in m/s.
+    pub land_m_s: f64,
 }
 
 /// The state: a phase, since when, and the reason.
@@ -121,6 +136,8 @@ pub struct StateMachine {
     started: Timestamp,
     /// The autopilot has entered the requested LAND mode.
     landing: bool,
+    /// Time in LAND until the touchdown is overdue, in seconds.
+    touchdown_limit_s: f64,
     /// Somebody has taken over the aborted vehicle, so it gets no setpoint any more.
     released: bool,
     /// The aborted vehicle is being commanded from LAND back to GUIDED.
@@ -154,6 +171,7 @@ impl StateMachine {
             entered: Timestamp::default(),
             started: Timestamp::default(),
             landing: false,
+            touchdown_limit_s: config.touchdown_timeout_s,
             released: false,
             is_recalling: false,
             expects_land: false,
@@ -197,6 +215,9 @@ impl StateMachine {
         if inputs.operator == Some(OperatorCommand::Start) && self.phase.is_terminal() {
             return self.start(inputs);
         }
+        if inputs.operator == Some(OperatorCommand::LandHere) && self.phase.is_terminal() {
+            return self.land_here(inputs);
+        }
         if self.phase.is_terminal() {
             self.release_on_takeover(inputs);
             return false;
@@ -206,9 +227,9 @@ impl StateMachine {
             && vehicle.mode == Mode::Land
             && !self.landing
         {
-            self.landing = true;
             self.entered = inputs.now;
             self.reason = Reason::AutopilotLands;
+            self.follow_land(vehicle);
         }
         let is_disarmed = inputs.vehicle.is_some_and(|vehicle| !vehicle.armed);
         self.disarmed = is_disarmed.then(|| self.disarmed.unwrap_or(inputs.now));
@@ -244,7 +265,7 @@ impl StateMachine {
             self.reason = Reason::NotArmed;
         } else if is_landing {
             self.begin(Phase::Final, Reason::AutopilotLands, inputs.now);
-            self.landing = true;
+            self.follow_land(vehicle);
         } else if vehicle.mode != Mode::Guided {
             self.reason = Reason::NotGuided;
         } else if vehicle.landed == Landed::OnGround {
@@ -253,6 +274,33 @@ impl StateMachine {
             self.begin(Phase::Search, Reason::Searching, inputs.now);
         }
         !self.phase.is_terminal()
+    }
+
+    /// Lands where the vehicle is, or refuses with the reason.
+    fn land_here(&mut self, inputs: &Inputs) -> bool {
+        let Some(vehicle) = inputs.vehicle else {
+            self.reason = Reason::NoVehicleState;
+            return false;
+        };
+        match vehicle.mode {
+            _ if !vehicle.armed => self.reason = Reason::NotArmed,
+            _ if vehicle.landed == Landed::OnGround => self.reason = Reason::OnTheGround,
+            Mode::Guided => self.begin(Phase::Final, Reason::OperatorLand, inputs.now),
+            Mode::Land => {
+                self.begin(Phase::Final, Reason::AutopilotLands, inputs.now);
+                self.follow_land(vehicle);
+            }
+            Mode::Other => self.reason = Reason::NotGuided,
+            Mode::Unknown => self.reason = Reason::NoVehicleState,
+        }
+        !self.phase.is_terminal()
+    }
+
+    /// The autopilot lands from the vehicle's height.
+    fn follow_land(&mut self, vehicle: VehicleInputs) {
+        self.landing = true;
+        self.touchdown_limit_s =
+            self.config.touchdown_timeout_s + libm::fmax(vehicle.height_m, 0.0) / vehicle.land_m_s;
     }
 
     fn begin(&mut self, phase: Phase, reason: Reason, now: Timestamp) {
@@ -358,8 +406,12 @@ impl StateMachine {
     }
 
     fn can_recall(&self, inputs: &Inputs) -> bool {
-        let is_high =
-            inputs.vehicle.is_some_and(|vehicle| vehicle.height_m > self.config.no_return_height_m);
+        let is_high = inputs.vehicle.is_some_and(|vehicle| {
+            // Below the place where it took off nothing is known of the ground; what sinks flies, and what is not in LAND yet.
+            let flies = vehicle.landed != Landed::OnGround && (vehicle.sinks || !self.landing);
+            let is_in_valley = !vehicle.is_over_target && vehicle.height_m < 0.0 && flies;
+            vehicle.height_m > self.config.no_return_height_m || is_in_valley
+        });
         is_high && self.config.on_abort != OnAbort::Land
     }
 
@@ -408,6 +460,10 @@ impl StateMachine {
         self.reason = Reason::Searching;
         if self.target_visible(inputs) {
             return Some((Phase::Approach, Reason::Aligning));
+        }
+        let looked_s = libm::fmin(self.config.search_delay_s, MIN_LOOK_S);
+        if inputs.may_stand && self.elapsed_s(inputs.now) >= looked_s {
+            return Some((Phase::Final, Reason::MayStand));
         }
         self.timed_out(inputs, self.config.search_timeout_s)
             .then_some((Phase::Hold, Reason::TargetNotFound))
@@ -524,7 +580,9 @@ impl StateMachine {
                 (Phase::Aborted, Reason::LandRefused)
             });
         }
-        if !self.timed_out(inputs, self.config.touchdown_timeout_s) {
+        let sinks = inputs.vehicle.is_some_and(|vehicle| vehicle.sinks);
+        let more_s = if sinks { MAX_SINKING_S } else { 0.0 };
+        if !self.timed_out(inputs, self.touchdown_limit_s + more_s) {
             return None;
         }
         // Some autopilots are configured never to disarm by themselves.

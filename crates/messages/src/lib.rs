@@ -39,8 +39,8 @@ pub use health::{Configuration, Count, Health, Latency, Rate};
 pub use recorder::{RecorderLoss, RecorderStatus};
 pub use simulation::{Touchdown, Truth, Wind};
 pub use tape::{
-    Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapeRecord, TapeState,
-    TapeTarget, TapeWriter,
+    Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeRecord,
+    TapeState, TapeTarget, TapeWriter,
 };
 pub use topic::{Delivery, MONITORS, Row, TOPICS, Topic};
 pub use vehicle::{LandedState, MavlinkBytes, VehicleState};

@@ -103,6 +103,8 @@ pub enum TapeEvent<'a> {
     /// Nothing was handled: this is its state, written now and then. It shows where the flight stood after a part that is
     /// missing, and in a replay where what no decision shows yet became different.
     State(Box<TapeState>),
+    /// It took over the place of the pad as an earlier controller knew it.
+    TakeOverPad(TapePad),
 }
 
 /// What a controller says of itself.
@@ -127,6 +129,21 @@ pub struct TapeNote {
     pub original_s: f64,
     /// Its value for the landing, in seconds.
     pub set_s: f64,
+}
+
+/// The place of the pad as an earlier controller knew it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TapePad {
+    /// The link's address.
+    pub address: String,
+    /// The vehicle's MAVLink system id.
+    pub system: u8,
+    /// The time of it, in nanoseconds of the controller's clock.
+    pub stamp_ns: i64,
+    /// North, east and down of the autopilot's local origin, in metres.
+    pub position_ned_m: [f64; 3],
+    /// Standard deviation of the horizontal position, in metres.
+    pub deviation_m: f64,
 }
 
 /// What the lander decided, with the detector in use.
@@ -459,6 +476,7 @@ impl TapeEvent<'_> {
             Self::RefusedVersion => "refused-version",
             Self::Shutdown => "shutdown",
             Self::State(_) => "state",
+            Self::TakeOverPad(_) => "take-over-pad",
         }
     }
 }

@@ -8,8 +8,8 @@ use messages::{
     DetectorCommand, DetectorInfo, DetectorState, FrameAck, FrameHeader, FramePart, Health,
     LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, Phase, PixelFormat, Place,
     Rate, RecorderLoss, RecorderStatus, Setpoint, StageTime, Tape, TapeAction, TapeDecision,
-    TapeEvent, TapeNote, TapeOutput, TapeState, TapeTarget, TapeWriter, TargetEstimate, Touchdown,
-    Transform3, Truth, VehicleState, Wind, decode, encode,
+    TapeEvent, TapeNote, TapeOutput, TapePad, TapeState, TapeTarget, TapeWriter, TargetEstimate,
+    Touchdown, Transform3, Truth, VehicleState, Wind, decode, encode,
 };
 use proptest::prelude::*;
 
@@ -414,6 +414,16 @@ fn records_of_a_tape() {
     assert_eq!(record(&TapeEvent::Command(Cow::Owned(command)), &answered), "020900000001010172");
     assert_eq!(record(&TapeEvent::RefusedVersion, &nothing), "020a000000");
     assert_eq!(record(&TapeEvent::Shutdown, &nothing), "020b000000");
+    let pad = TapePad {
+        address: "a".into(),
+        system: 1,
+        stamp_ns: 1,
+        position_ned_m: [0.0, 0.0, 1.0],
+        deviation_m: 0.5,
+    };
+    let place = "00000000000000000000000000000000000000000000f03f000000000000e03f";
+    let taken_over = record(&TapeEvent::TakeOverPad(pad), &nothing);
+    assert_eq!(taken_over, format!("020d01610102{place}000000"));
     let status = ControllerStatus { phase: Phase::Hold, ..ControllerStatus::default() };
     let target = TargetEstimate {
         stamp_ns: 1,

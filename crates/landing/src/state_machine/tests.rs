@@ -8,6 +8,9 @@ const FLYING: VehicleInputs = VehicleInputs {
     armed: true,
     landed: Landed::InAir,
     height_m: 5.0,
+    is_over_target: true,
+    sinks: false,
+    land_m_s: 0.5,
 };
 
 fn at(seconds: f64) -> Inputs {
@@ -124,7 +127,7 @@ fn every_wait_has_a_timeout() {
     check(&[start(), alarm, at(6.1)], Phase::Aborted, Reason::LandRefused);
     let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
     check(
-        &[approach[0], approach[1], ready, land(9.1), land(69.3)],
+        &[approach[0], approach[1], ready, land(9.1), land(79.3)],
         Phase::Aborted,
         Reason::TouchdownOverdue,
     );
@@ -175,7 +178,90 @@ fn landing_here_needs_no_marker_and_leaves_a_vehicle_that_may_not_in_the_air() {
         Phase::Aborted,
         Reason::OperatorAbort,
     );
-    check(&[here(1.0)], Phase::Idle, Reason::WaitingForStart);
+}
+
+#[test]
+fn landing_here_needs_no_landing_but_a_vehicle_that_flies_in_our_mode() {
+    let here = |inputs| Inputs { operator: Some(OperatorCommand::LandHere), ..inputs };
+    let aborted = [start(), commanded(1.0, OperatorCommand::Abort)];
+    let [a, b] = aborted;
+    check(&[here(at(1.0))], Phase::Final, Reason::OperatorLand);
+    check(&[a, b, here(at(9.0))], Phase::Final, Reason::OperatorLand);
+    check(&[a, b, here(at(9.0)), at(14.1)], Phase::Aborted, Reason::LandRefused);
+    // Where the vehicle is need not be known now.
+    check(&[a, b, here(flown(9.0, |v| v.age_s = 3.0))], Phase::Final, Reason::OperatorLand);
+    let land = |seconds| flown(seconds, |v| v.mode = Mode::Land);
+    check(&[a, b, here(land(9.0))], Phase::Final, Reason::AutopilotLands);
+    let pilot = flown(2.0, |v| v.mode = Mode::Other);
+    check(&[a, pilot, here(at(9.0))], Phase::Final, Reason::OperatorLand);
+    for (change, reason) in [
+        ((|v| v.mode = Mode::Other) as fn(&mut VehicleInputs), Reason::NotGuided),
+        (|v| v.mode = Mode::Unknown, Reason::NoVehicleState),
+        (|v| v.armed = false, Reason::NotArmed),
+        (|v| v.landed = Landed::OnGround, Reason::OnTheGround),
+    ] {
+        check(&[a, b, here(flown(9.0, change))], Phase::Aborted, reason);
+    }
+    check(&[here(Inputs { vehicle: None, ..at(1.0) })], Phase::Idle, Reason::NoVehicleState);
+}
+
+#[test]
+fn land_from_high_up_has_the_time_that_its_speed_takes() {
+    let land = |seconds, height_m: f64, land_m_s: f64, sinks| {
+        flown(seconds, move |v| {
+            *v = VehicleInputs { mode: Mode::Land, height_m, land_m_s, sinks, ..*v };
+        })
+    };
+    let here = [start(), commanded(1.0, OperatorCommand::LandHere)];
+    let [a, b] = here;
+    let overdue = (Phase::Aborted, Reason::TouchdownOverdue);
+    let lands = (Phase::Final, Reason::AutopilotLands);
+    for (height_m, land_m_s, limit_s) in [(70.0, 0.5, 200.0), (70.0, 1.0, 130.0), (3.0, 0.3, 70.0)]
+    {
+        let from = |seconds| land(2.0 + seconds, height_m, land_m_s, false);
+        check(&[a, b, from(0.0), from(limit_s - 0.1)], lands.0, lands.1);
+        check(&[a, b, from(0.0), from(limit_s + 0.1)], overdue.0, overdue.1);
+    }
+    // The ground is far below the place where it took off: while it sinks it lands.
+    let valley = |seconds, sinks| land(2.0 + seconds, -40.0, 0.5, sinks);
+    check(&[a, b, valley(0.0, true), valley(120.0, true)], lands.0, lands.1);
+    check(&[a, b, valley(0.0, true), valley(120.0, false)], overdue.0, overdue.1);
+    check(&[a, b, valley(0.0, true), valley(661.0, true)], overdue.0, overdue.1);
+}
+
+#[test]
+fn below_the_place_of_its_take_off_a_vehicle_that_sinks_is_called_back_from_land() {
+    let here = [start(), commanded(1.0, OperatorCommand::LandHere)];
+    let aborted = |height_m: f64, is_over_target, sinks| {
+        let land = flown(2.0, move |v| {
+            *v = VehicleInputs { mode: Mode::Land, height_m, is_over_target, sinks, ..*v };
+        });
+        let abort = Inputs { operator: Some(OperatorCommand::Abort), ..land };
+        let mut machine = StateMachine::new(PhaseConfig::default());
+        here.iter().chain([&land, &abort]).for_each(|inputs| {
+            machine.advance(inputs);
+        });
+        (machine.phase(), machine.is_recalling())
+    };
+    let (recalled, lands) = ((Phase::Aborted, true), (Phase::Final, false));
+    assert_eq!(aborted(-20.0, false, true), recalled);
+    assert_eq!(aborted(-0.2, false, true), recalled, "a slope");
+    assert_eq!(aborted(-0.2, false, false), lands, "it may stand");
+    assert_eq!(aborted(0.5, false, true), lands);
+    assert_eq!(aborted(-0.2, true, true), lands, "the pad is right below");
+    assert_eq!(aborted(2.0, false, false), recalled);
+    // Before it shows LAND.
+    let valley = |seconds, mode| {
+        flown(seconds, move |v| {
+            *v = VehicleInputs { mode, height_m: -9.0, is_over_target: false, ..*v };
+        })
+    };
+    let abort = Inputs { operator: Some(OperatorCommand::Abort), ..valley(1.4, Mode::Guided) };
+    let mut machine = StateMachine::new(PhaseConfig::default());
+    here.iter().chain([&abort, &valley(1.8, Mode::Land)]).for_each(|inputs| {
+        machine.advance(inputs);
+    });
+    assert_eq!((machine.phase(), machine.is_recalling()), recalled);
 }
 
 #[test]
@@ -386,6 +472,8 @@ mod every_transition {
             change(|v| v.age_s = 1.0),
             change(|v| v.mode = Mode::Land),
             change(|v| (v.mode, v.height_m) = (Mode::Land, 0.4)),
+            change(|v| (v.mode, v.height_m, v.is_over_target) = (Mode::Land, -9.0, false)),
+            change(|v| (v.mode, v.sinks) = (Mode::Land, true)),
             change(|v| v.mode = Mode::Other),
             change(|v| v.mode = Mode::Unknown),
             change(|v| v.armed = false),
@@ -464,7 +552,8 @@ mod every_transition {
         let (from, to) = (before.phase, after.phase);
         let step = format!("{from} to {to} after {inputs:?}");
         if from.is_terminal() {
-            let started = inputs.operator == Some(OperatorCommand::Start);
+            let started =
+                matches!(inputs.operator, Some(OperatorCommand::Start | OperatorCommand::LandHere));
             assert!(from == to || started, "left by itself: {step}");
             return;
         }

@@ -29,6 +29,8 @@ use eyes::Eyes;
 const SETPOINT_PERIOD_S: f64 = 0.04;
 /// Age of a state on arrival, in seconds.
 const STATE_AGE_S: f64 = 0.005;
+/// Time until another lander is told to begin, in seconds: the autopilot is heard and identified first.
+const RESUME_S: f64 = 0.5;
 /// Steps of the world between two states, and between two ticks.
 const STATE_STEPS: u32 = 8;
 const TICK_STEPS: u32 = 20;
@@ -81,6 +83,19 @@ pub(crate) struct Silence {
     pub(crate) below_m: f64,
     /// Its duration, in seconds.
     pub(crate) for_s: f64,
+    /// What comes after it.
+    pub(crate) then: Then,
+}
+
+/// The lander after its silence.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Then {
+    /// The same goes on.
+    GoesOn,
+    /// Another one takes over, which is told where the earlier one knew the pad.
+    AnotherTold,
+    /// Another one takes over, which knows nothing.
+    Another,
 }
 
 /// What happened at one time.
@@ -205,10 +220,22 @@ impl Scene {
             lander.step(Timestamp::from_seconds(run.seconds()), Event::Limits(limits));
         }
         let mut step = 0u32;
+        let mut left = None;
+        let mut was_silent = false;
         while run.seconds() < self.limit_s {
             let before = run.world.truth();
             run.advance();
             let is_silent = run.is_silent();
+            if !is_silent {
+                left = lander.pad_to_remember().map(|(pad, _)| pad).or(left);
+            }
+            let then = self.silence.map_or(Then::GoesOn, |silence| silence.then);
+            if std::mem::replace(&mut was_silent, is_silent) && !is_silent && then != Then::GoesOn {
+                let Ok(another) = Lander::new(self.config) else { return flight };
+                lander = another;
+                lander.resume(left.filter(|_| then == Then::AnotherTold));
+                run.resume_s = Some(run.seconds() + RESUME_S);
+            }
             for event in run.events(step).into_iter().filter(|_| !is_silent) {
                 let decision = lander.step(Timestamp::from_seconds(run.seconds()), event);
                 run.obey(decision, matches!(event, Event::Frame(_)));
@@ -306,6 +333,8 @@ struct Run<'a> {
     sent_s: f64,
     /// When the silence began.
     silent_s: Option<f64>,
+    /// When another lander is told to begin.
+    resume_s: Option<f64>,
 }
 
 impl<'a> Run<'a> {
@@ -321,6 +350,7 @@ impl<'a> Run<'a> {
             commands: scene.commands.iter().copied().collect(),
             sent_s: f64::NEG_INFINITY,
             silent_s: None,
+            resume_s: None,
             world,
             scene,
         }
@@ -365,6 +395,9 @@ impl<'a> Run<'a> {
         }
         if self.commands.front().is_some_and(|(at, _)| *at <= now_s) {
             events.extend(self.commands.pop_front().map(|(_, command)| Event::Operator(command)));
+        }
+        if self.resume_s.take_if(|at| *at <= now_s).is_some() {
+            events.push(Event::Operator(OperatorCommand::Start));
         }
         events
     }

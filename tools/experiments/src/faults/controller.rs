@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 
 use autopilot::Parser;
+use controller::pad_note::PadNote;
 use controller::tape::TapedFlight;
 use messages::{CameraInfo, ControllerStatus, Detections, Phase, Tape};
 use node::Layers;
@@ -48,6 +49,8 @@ pub struct Controller {
     settings: Vec<String>,
     order: Order,
     flight: Option<TapedFlight>,
+    /// Its file with the pad's place.
+    pad_file: Option<PadNote>,
     life: Life,
     parser: Parser,
     /// What the flights have handled, when it is wanted.
@@ -67,6 +70,7 @@ impl Controller {
             settings: settings.to_vec(),
             order,
             flight: None,
+            pad_file: None,
             life: Life::Dead,
             parser: Parser::new(),
             tapes: None,
@@ -99,7 +103,11 @@ impl Controller {
     fn start(&mut self, now_ns: i64, more: Option<&str>) -> anyhow::Result<()> {
         let set = self.settings.iter().cloned().chain(more.map(str::to_owned)).collect();
         let config = Layers { file: None, set }.load::<controller::Config>()?.settings;
-        self.flight = Some(TapedFlight::new(now_ns, config, std::sync::Arc::default())?);
+        let mut flight = TapedFlight::new(now_ns, config, std::sync::Arc::default())?;
+        if let Some(note) = self.pad_file.clone() {
+            flight.take_over_pad(now_ns, note);
+        }
+        self.flight = Some(flight);
         self.life = Life::Runs;
         Ok(())
     }
@@ -212,6 +220,7 @@ impl Controller {
             && let Some(flight) = &mut self.flight
         {
             flight.tick(now_ns);
+            self.pad_file = flight.flight().pad_note().cloned();
             self.take_tape();
         }
     }

@@ -102,6 +102,8 @@ struct FaultyFlight<'a> {
     faults: BegunFaults,
     start_s: Option<f64>,
     rest_since_s: Option<f64>,
+    /// Where it first touched the ground, downwards, in metres.
+    touched_z: Option<f64>,
     outcome: Outcome,
 }
 
@@ -137,6 +139,7 @@ impl<'a> FaultyFlight<'a> {
             faults: BegunFaults::default(),
             start_s: None,
             rest_since_s: None,
+            touched_z: None,
             outcome: Outcome::new(planned),
         };
         flight.tell_all();
@@ -400,6 +403,10 @@ impl<'a> FaultyFlight<'a> {
             let speed = before.velocity - pad.velocity;
             let error_m = (now.position - pad.position).horizontal_norm();
             self.outcome.touch(speed.z(), speed.horizontal_norm(), error_m);
+            self.touched_z.get_or_insert(now.position.z());
+        }
+        if let Some(touched_z) = self.touched_z {
+            self.outcome.hop(touched_z - now.position.z());
         }
         let rests = now.on_ground || now.velocity.norm() < REST_M_S;
         if !rests {

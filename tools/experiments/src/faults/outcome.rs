@@ -8,6 +8,8 @@ use super::plan::Planned;
 pub const MAX_SINK_M_S: f64 = 0.8;
 /// Maximum horizontal speed of a safe touchdown, in m/s.
 pub const MAX_SLIDE_M_S: f64 = 0.3;
+/// Height over the place of the first touch, in metres, beyond which a vehicle has left the ground again.
+pub const MAX_HOP_M: f64 = 0.15;
 
 /// How it ended.
 #[derive(Copy, Clone, Debug, PartialEq, Eq, Serialize)]
@@ -54,6 +56,8 @@ pub struct Outcome {
     pub slide_m_s: Option<f64>,
     /// Horizontal distance from the pad at the last touch, in metres.
     pub error_m: Option<f64>,
+    /// Greatest height over the place of the first touch, after it, in metres.
+    pub hop_m: Option<f64>,
     /// Greatest tilt in flight, in degrees.
     pub max_tilt_deg: f64,
     /// Time from the start of the landing to its end, in seconds.
@@ -81,6 +85,7 @@ impl Outcome {
             sink_m_s: None,
             slide_m_s: None,
             error_m: None,
+            hop_m: None,
             max_tilt_deg: 0.0,
             time_s: 0.0,
             command: planned.command(),
@@ -93,6 +98,16 @@ impl Outcome {
         self.sink_m_s = Some(self.sink_m_s.map_or(sink_m_s, |before| before.max(sink_m_s)));
         self.slide_m_s = Some(self.slide_m_s.map_or(slide_m_s, |before| before.max(slide_m_s)));
         self.error_m = Some(error_m);
+    }
+
+    /// Notes the height over the place of the first touch in metres.
+    pub fn hop(&mut self, height_m: f64) {
+        self.hop_m = Some(self.hop_m.map_or(height_m, |before| before.max(height_m)));
+    }
+
+    /// True when it stood on the ground and flew again.
+    pub fn has_left_ground(&self) -> bool {
+        self.hop_m.is_some_and(|hop_m| hop_m > MAX_HOP_M)
     }
 
     /// True when it touched the ground faster than the bar allows.

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use super::kind::Kind;
-use super::outcome::{Ending, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
+use super::outcome::{Ending, MAX_HOP_M, MAX_SINK_M_S, MAX_SLIDE_M_S, Outcome};
 use crate::landing::report::{csv, json_lines, put};
 
 /// Upper ends of the bands of height, in metres.
@@ -29,7 +29,8 @@ pub fn write(folder: &Path, title: &str, outcomes: &[Outcome]) -> anyhow::Result
 fn head(title: &str, outcomes: &[Outcome]) -> String {
     let count = |of: fn(&Outcome) -> bool| outcomes.iter().filter(|outcome| of(outcome)).count();
     format!(
-        "# Faults\n\n{title}: {} unsafe, {} did not end; {} landed, {} hovered at the end.\n\n\
+        "# Faults\n\n{title}: {} unsafe, {} did not end; {} landed, {} hovered at the end; {} left the \
+         ground again after a touch (by more than {MAX_HOP_M} m).\n\n\
          Unsafe: a touch of the ground faster than {MAX_SINK_M_S} m/s down or {MAX_SLIDE_M_S} m/s sideways. Not ended: \
          neither at rest nor in a terminal phase. A cell has the worst speed down at a touch in m/s, by the height at \
          which the fault began in m, `-` without a touch, empty without a flight.\n\n",
@@ -37,6 +38,7 @@ fn head(title: &str, outcomes: &[Outcome]) -> String {
         count(Outcome::is_unended),
         count(|outcome| outcome.ending == Ending::Landed),
         count(|outcome| outcome.ending == Ending::Hovers),
+        count(Outcome::has_left_ground),
     )
 }
 
@@ -117,6 +119,8 @@ fn lists(outcomes: &[Outcome]) -> String {
     list(&mut text, "Unsafe, the worst first", &beyond);
     let unended: Vec<&Outcome> = outcomes.iter().filter(|o| o.is_unended()).collect();
     list(&mut text, "Not ended", &unended);
+    let hops: Vec<&Outcome> = outcomes.iter().filter(|o| o.has_left_ground()).collect();
+    list(&mut text, "Left the ground again", &hops);
     let names = Kind::all().map(Kind::name).chain([TWO]);
     let worst: Vec<&Outcome> = names
         .filter_map(|name| {
@@ -145,9 +149,11 @@ fn list(text: &mut String, title: &str, outcomes: &[&Outcome]) {
             }
             _ => "no touch".to_owned(),
         };
+        let hop = outcome.hop_m.filter(|_| outcome.has_left_ground());
+        let hop = hop.map_or_else(String::new, |hop_m| format!(", up again to {hop_m:.2} m"));
         let _ = writeln!(
             text,
-            "- {} ({}) at {:.1} m, wind {} m/s: {touch}; {} {}: `{}`",
+            "- {} ({}) at {:.1} m, wind {} m/s: {touch}{hop}; {} {}: `{}`",
             outcome.kinds,
             lasting.join(", "),
             outcome.height_m,
