@@ -5,7 +5,7 @@
 //! [`PadNote`] that the vehicle is right over the pad.
 
 use geometry::Point;
-use landing::{RememberedPad, Timestamp};
+use landing::{RememberedPad, SeenPad, Timestamp};
 use serde::{Deserialize, Serialize};
 
 /// Heights over the pad at which its place is noted in a descent, in metres. Few, as each is written to a file.
@@ -60,20 +60,21 @@ impl PadNotes {
         })
     }
 
-    /// Follows a landing; `seen` is the pad's place, and the height over it in metres.
+    /// Follows a landing, in which the pad was seen.
     pub fn step(
         &mut self,
         is_landing: bool,
-        seen: Option<(RememberedPad, f64)>,
+        seen: Option<SeenPad>,
         address: &str,
         system: Option<u8>,
     ) {
         let is_over = std::mem::replace(&mut self.was_landing, is_landing) && !is_landing;
-        let is_high = seen.is_some_and(|(_, height_m)| height_m > LEVELS_M[0] + CLIMBED_M);
+        let is_high = seen.is_some_and(|seen| seen.height_m > LEVELS_M[0] + CLIMBED_M);
         if is_over || is_high {
             (self.note, self.level) = (None, 0);
         }
-        let (Some((pad, height_m)), Some(system), true) = (seen, system, is_landing) else {
+        let (Some(SeenPad { pad, height_m }), Some(system), true) = (seen, system, is_landing)
+        else {
             return;
         };
         let level = LEVELS_M.iter().filter(|level_m| height_m <= **level_m).count();
@@ -107,7 +108,7 @@ mod tests {
                 deviation_m: 0.02,
                 stamp: Timestamp::from_seconds(50.0 - height_m),
             };
-            notes.step(true, Some((pad, height_m)), ADDRESS, Some(1));
+            notes.step(true, Some(SeenPad { pad, height_m }), ADDRESS, Some(1));
             if notes.note() != kept.last() {
                 kept.extend(notes.note().cloned());
             }

@@ -17,7 +17,7 @@ use crate::limits::ConfigError;
 use crate::mount_check::{MountCheck, MountFindings};
 use crate::search;
 use crate::standing::{
-    MAX_STANDING_M_S, RememberedPad, Resumed, StandingHeight, may_stand, to_remember,
+    MAX_STANDING_M_S, RememberedPad, Resumed, SeenPad, StandingHeight, may_stand, to_remember,
 };
 use crate::state_machine::{Inputs, StateMachine, VehicleInputs, reaction};
 use crate::target_filter::{Sightings, TargetFilter};
@@ -227,13 +227,12 @@ impl Lander {
         self.resumed = Some(Resumed::new(pad));
     }
 
-    /// The pad's place and the height over it in metres, for a controller that has to take over this landing; `None`
-    /// where it is not known well.
-    pub fn pad_to_remember(&self) -> Option<(RememberedPad, f64)> {
+    /// The pad's place for a controller that has to take over this landing; `None` where it is not known well.
+    pub fn pad_to_remember(&self) -> Option<SeenPad> {
         let target = self.target(self.now?)?;
         let is_active = !self.phase().is_terminal() && !self.pad_moves();
         let pad = to_remember(self.now?, &target).filter(|_| is_active)?;
-        Some((pad, target.height_m))
+        Some(SeenPad { pad, height_m: target.height_m })
     }
 
     /// The present phase.
@@ -684,8 +683,8 @@ impl Lander {
     fn search(&mut self, now: Timestamp) -> Action {
         let Some(vehicle) = self.history.newest() else { return Action::hover() };
         let phases = &self.config.phases;
-        let least_s = if self.resumed.is_some() { MIN_RESUMED_LOOK_S } else { 0.0 };
-        let delay_s = libm::fmax(phases.search_delay_s, least_s);
+        let look_s = if self.resumed.is_some() { MIN_RESUMED_LOOK_S } else { 0.0 };
+        let delay_s = libm::fmax(phases.search_delay_s, look_s);
         // A search without a detector finds nothing.
         if self.state_machine.elapsed_s(now) < delay_s || !self.detectors_alive {
             return Action::hover();

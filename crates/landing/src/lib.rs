@@ -56,5 +56,5 @@ pub use event::{
 pub use lander::Lander;
 pub use limits::ConfigError;
 pub use mount_check::{Measured, MountFindings};
-pub use standing::RememberedPad;
+pub use standing::{RememberedPad, SeenPad};
 pub use time::Timestamp;

@@ -14,6 +14,10 @@
 //! | `f`, `s` | | error of the focal length and of the marker's size, relative |
 //! | `τ` | s | how much later exposures are than their stamps |
 //!
+//! What else moves the pad, as an estimator that errs more in wind does, is not as random as the filter believes. An error
+//! of the focal length or the size is the same in each part of a flight, so the estimates of the parts by themselves must agree: by
+//! as much as they scatter more than their deviations say, the deviation is larger (the ratio of Birge: Physical Review 40, 1932).
+//!
 //! Heights are left out: a barometer errs by as much as a focal length that is 4 % off. The random walks grow
 //! while detections show that the autopilot's position wanders, as in `filter.rs`, and with them the deviations.
 
@@ -75,12 +79,20 @@ const MIN_HEIGHT_M: f64 = 0.5;
 /// is smaller than a part of that minimum, in this many detections in a row; and no longer when it is smaller than a part
 /// of both.
 const MIN_DEVIATIONS: f64 = 3.0;
+const MIN_RATIO_DEVIATIONS: f64 = 3.5;
 const MIN_ANGLE_RAD: f64 = 1.5 * std::f64::consts::PI / 180.0;
 const MIN_RATIO: f64 = 0.03;
 const MAX_DEVIATION: f64 = 0.5;
 const MIN_IN_A_ROW: u32 = 15;
-/// Factor on the random walks above which nothing new is told: what moves the pad then is something else.
+/// Length of a part of the flight whose estimate is compared with those of the others, in seconds, the smallest share of what
+/// is known that a part must bring to count, and the number of such parts without which nothing is told.
+const PART_S: f64 = 1.0;
+const MIN_SHARE: f64 = 0.01;
+const MIN_PARTS: u32 = 3;
+/// Factor on the random walks above which nothing new is told: what moves the pad then is something else. It is smaller for
+/// focal length and size, which show in less motion than the mount.
 const MAX_TOLD_NOISE_SCALE: f64 = 3.0;
+const MAX_TOLD_RATIO_NOISE_SCALE: f64 = 1.5;
 const STILL_TOLD: f64 = 0.7;
 
 type Mean = SVector<f64, STATES>;
@@ -136,6 +148,20 @@ pub struct MountCheck {
     pitch: Suspicion,
     focal: Suspicion,
     size: Suspicion,
+    /// Of focal length and size.
+    parts: [Parts; 2],
+}
+
+/// The estimates of one error by the parts of a flight.
+#[derive(Copy, Clone, Debug, Default)]
+struct Parts {
+    /// Since when the present one lasts, and the estimate before it.
+    begin: Option<(Timestamp, Measured)>,
+    count: u32,
+    /// Sums of the weights, the inverse variances, and with them of the estimates and their squares.
+    weight: f64,
+    sum: f64,
+    squares: f64,
 }
 
 /// Whether one error is told.
@@ -162,6 +188,7 @@ impl Default for MountCheck {
             pitch: Suspicion::default(),
             focal: Suspicion::default(),
             size: Suspicion::default(),
+            parts: [Parts::default(); 2],
         }
     }
 }
@@ -270,17 +297,19 @@ impl MountCheck {
 
     /// The errors that are certain.
     pub fn findings(&self) -> MountFindings {
-        // The configured value is what the filter's errors are relative to.
-        let of = |index: usize, suspicion: Suspicion| {
-            suspicion
-                .is_told
-                .then(|| Measured { value: -self.mean[index], deviation: self.deviation(index) })
+        let of = |suspicion: Suspicion, index: usize, scatter: f64| {
+            suspicion.is_told.then(|| Measured {
+                // The configured value is what the filter's errors are relative to.
+                value: -self.mean[index],
+                deviation: self.deviation(index) * scatter,
+            })
         };
+        let [focal, size] = self.parts.map(|parts| parts.scatter());
         MountFindings {
-            roll_rad: of(TILT, self.roll),
-            pitch_rad: of(TILT + 1, self.pitch),
-            focal_ratio: of(FOCAL, self.focal),
-            size_ratio: of(SIZE, self.size),
+            roll_rad: of(self.roll, TILT, 1.0),
+            pitch_rad: of(self.pitch, TILT + 1, 1.0),
+            focal_ratio: of(self.focal, FOCAL, focal),
+            size_ratio: of(self.size, SIZE, size),
         }
     }
 
@@ -352,24 +381,59 @@ impl MountCheck {
         }
         (self.mean, self.covariance) = (mean, p);
         self.mean[OFFSET] = self.mean[OFFSET].clamp(-MAX_OFFSET_S, MAX_OFFSET_S);
-        self.suspect();
+        self.suspect(measurement.stamp);
     }
 
-    fn suspect(&mut self) {
-        let [roll, pitch, focal, size] = [TILT, TILT + 1, FOCAL, SIZE]
+    fn suspect(&mut self, stamp: Timestamp) {
+        let [roll, pitch, mut focal, mut size] = [TILT, TILT + 1, FOCAL, SIZE]
             .map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) });
-        let is_calm = self.log_noise_scale < log(MAX_TOLD_NOISE_SCALE);
-        self.roll.follow(roll, MIN_ANGLE_RAD, is_calm);
-        self.pitch.follow(pitch, MIN_ANGLE_RAD, is_calm);
-        self.focal.follow(focal, MIN_RATIO, is_calm);
-        self.size.follow(size, MIN_RATIO, is_calm);
+        for (error, parts) in [&mut focal, &mut size].into_iter().zip(&mut self.parts) {
+            parts.add(stamp, *error);
+            error.deviation *= parts.scatter();
+        }
+        let is_calm = |max_scale: f64| self.log_noise_scale < log(max_scale);
+        let is_calm_for_ratios = is_calm(MAX_TOLD_RATIO_NOISE_SCALE);
+        let is_calm = is_calm(MAX_TOLD_NOISE_SCALE);
+        self.roll.follow(roll, MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
+        self.pitch.follow(pitch, MIN_DEVIATIONS, MIN_ANGLE_RAD, is_calm);
+        self.focal.follow(focal, MIN_RATIO_DEVIATIONS, MIN_RATIO, is_calm_for_ratios);
+        self.size.follow(size, MIN_RATIO_DEVIATIONS, MIN_RATIO, is_calm_for_ratios);
+    }
+}
+
+impl Parts {
+    /// Follows the estimate over all parts.
+    fn add(&mut self, stamp: Timestamp, all: Measured) {
+        let (since, before) = *self.begin.get_or_insert((stamp, all));
+        if stamp.seconds_since(since) < PART_S {
+            return;
+        }
+        self.begin = Some((stamp, all));
+        let [weight_before, weight_all] = [before, all].map(|it| 1.0 / squared(it.deviation));
+        let weight = weight_all - weight_before;
+        if weight > MIN_SHARE * weight_all && weight.is_finite() {
+            let value = (all.value * weight_all - before.value * weight_before) / weight;
+            self.count = self.count.saturating_add(1);
+            self.weight += weight;
+            self.sum += weight * value;
+            self.squares += weight * value * value;
+        }
+    }
+
+    /// By how much more than their deviations say the estimates of the parts scatter; infinite for too few.
+    fn scatter(&self) -> f64 {
+        if self.count < MIN_PARTS {
+            return f64::INFINITY;
+        }
+        let squares = self.squares - self.sum * self.sum / self.weight;
+        fmax(squares / f64::from(self.count - 1), 1.0).sqrt()
     }
 }
 
 impl Suspicion {
-    fn follow(&mut self, error: Measured, min: f64, is_calm: bool) {
+    fn follow(&mut self, error: Measured, min_deviations: f64, min: f64, is_calm: bool) {
         let share = if self.is_told { STILL_TOLD } else { 1.0 };
-        let limit = fmax(MIN_DEVIATIONS * error.deviation, min) * share;
+        let limit = fmax(min_deviations * error.deviation, min) * share;
         let is_known = error.deviation < MAX_DEVIATION * min;
         if error.value.abs() > limit && (self.is_told || is_known && is_calm) {
             self.in_a_row = self.in_a_row.saturating_add(1);

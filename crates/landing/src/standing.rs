@@ -89,6 +89,15 @@ pub struct RememberedPad {
     pub stamp: Timestamp,
 }
 
+/// The place of the pad, and where the vehicle is over it.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub struct SeenPad {
+    /// The place.
+    pub pad: RememberedPad,
+    /// Height of the vehicle over it, in metres.
+    pub height_m: f64,
+}
+
 /// What a lander knows that takes over the landing of another one, or takes its own up again after a silence.
 #[derive(Copy, Clone, Debug, Default)]
 pub(crate) struct Resumed {

@@ -82,18 +82,18 @@ fn a_short_timeout_costs_no_time() {
 /// Height over the place of the first touchdown that no flight has left the ground with, in metres.
 const MAX_HOP_M: f64 = 0.15;
 
-/// Height over the pad of a vehicle that stands, in metres.
-const MAX_STANDING_M: f64 = 0.02;
+/// Time on the ground after which a vehicle stands, in seconds.
+const MIN_STANDING_S: f64 = 0.3;
 
 fn height_m(sample: &Sample) -> f64 {
     sample.pad.z() - sample.position.z()
 }
 
 /// Flights whose lander is silent below this height: vehicles that stand at its end must stay on the ground. One that hovers so
-/// low that wind lets it touch the ground flies on.
-fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) {
+/// low that wind lets it touch the ground may fly on. Returns how many stood.
+fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) -> u32 {
     let mut table = String::new();
-    let (mut is_safe, mut touched) = (true, 0);
+    let (mut is_safe, mut stood) = (true, 0);
     for wind_m_s in [0.0, 5.0] {
         for for_s in [1.0, 2.0, 3.0, 5.0, 7.0] {
             for seed in seeds.clone() {
@@ -103,12 +103,12 @@ fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) {
                 let mut pairs = flight.samples.windows(2);
                 let end = pairs.find(|pair| pair[1].seconds - pair[0].seconds > 0.5 * for_s);
                 let Some(end) = end.map(|pair| &pair[1]) else { continue };
-                if height_m(end) > MAX_STANDING_M {
+                if end.on_ground_s < MIN_STANDING_S {
                     continue;
                 }
                 let after = flight.samples.iter().filter(|it| it.seconds > end.seconds);
                 let hop_m = after.map(height_m).fold(0.0, f64::max);
-                touched += 1;
+                stood += 1;
                 is_safe &= hop_m <= MAX_HOP_M && flight.phase == landing::Phase::Landed;
                 table += &format!(
                     "\nwind {wind_m_s} m/s, silent below {below_m} m for {for_s} s, seed {seed}: {hop_m:.2} m, {:?}, {:.3} m off",
@@ -118,23 +118,21 @@ fn check_stays_down(below_m: f64, then: Then, seeds: std::ops::Range<u64>) {
         }
     }
     println!("{table}");
-    assert!(touched > 20, "only {touched} vehicles stand");
-    println!("{touched} vehicles stood");
+    println!("{stood} vehicles stood");
     assert!(is_safe, "{table}");
+    stood
 }
 
 #[test]
 fn a_vehicle_that_touched_down_meanwhile_stays_on_the_ground() {
-    for below_m in [0.3, 0.5] {
-        check_stays_down(below_m, Then::GoesOn, 0..16);
-    }
+    let stood = [0.3, 0.4, 0.5].map(|below_m| check_stays_down(below_m, Then::GoesOn, 0..16));
+    assert!(stood.iter().sum::<u32>() > 100, "{stood:?}");
 }
 
 #[test]
 fn a_lander_that_takes_over_leaves_a_vehicle_on_the_ground_that_touched_down_meanwhile() {
-    for below_m in [0.3, 0.5] {
-        for then in [Then::AnotherTold, Then::Another] {
-            check_stays_down(below_m, then, 100..116);
-        }
+    for then in [Then::AnotherTold, Then::Another] {
+        let stood = [0.3, 0.4, 0.5].map(|below_m| check_stays_down(below_m, then, 100..116));
+        assert!(stood.iter().sum::<u32>() > 100, "{then:?}: {stood:?}");
     }
 }

@@ -108,6 +108,8 @@ pub(crate) struct Sample {
     pub(crate) pad: Point<Ned>,
     /// What is certain of the camera's mount.
     pub(crate) mount: MountFindings,
+    /// For how long it has been on the ground, in seconds.
+    pub(crate) on_ground_s: f64,
 }
 
 /// The moment of the touchdown; velocities are relative to the pad.
@@ -140,6 +142,8 @@ pub(crate) struct Flight {
     pub(crate) max_tilt_rad: f64,
     /// The landing was aborted before the touchdown.
     pub(crate) aborted: bool,
+    /// Since when it is on the ground, in seconds.
+    on_ground_since_s: Option<f64>,
 }
 
 impl Scene {
@@ -227,7 +231,7 @@ impl Scene {
             run.advance();
             let is_silent = run.is_silent();
             if !is_silent {
-                left = lander.pad_to_remember().map(|(pad, _)| pad).or(left);
+                left = lander.pad_to_remember().map(|seen| seen.pad).or(left);
             }
             let then = self.silence.map_or(Then::GoesOn, |silence| silence.then);
             if std::mem::replace(&mut was_silent, is_silent) && !is_silent && then != Then::GoesOn {
@@ -268,6 +272,7 @@ impl Flight {
             overshoot_m: 0.0,
             max_tilt_rad: 0.0,
             aborted: false,
+            on_ground_since_s: None,
         }
     }
 
@@ -275,7 +280,9 @@ impl Flight {
         self.aborted |= decision.phase == Phase::Aborted && self.touchdown.is_none();
         let position = run.world.truth().position;
         let pad = run.world.pad_at(run.world.now_s()).position;
-        self.samples.push(Sample { seconds: run.seconds(), position, decision, pad, mount });
+        let seconds = run.seconds();
+        let on_ground_s = self.on_ground_since_s.map_or(0.0, |since_s| seconds - since_s);
+        self.samples.push(Sample { seconds, position, decision, pad, mount, on_ground_s });
     }
 
     fn watch(&mut self, run: &Run<'_>, before: &VehicleTruth) {
@@ -289,6 +296,8 @@ impl Flight {
             self.overshoot_m = self.overshoot_m.max(beyond);
         }
         self.max_tilt_rad = self.max_tilt_rad.max(now.tilt_rad());
+        let since_s = self.on_ground_since_s.unwrap_or(seconds);
+        self.on_ground_since_s = now.on_ground.then_some(since_s);
         if now.on_ground && self.touchdown.is_none() {
             let velocity = before.velocity - pad.velocity;
             self.touchdown_s = Some(seconds);
