@@ -252,7 +252,7 @@ fn read(autopilot: &Autopilot) -> AutopilotLimits {
         Some(Firmware::Px4) => first(&MPC_LAND_SPEED),
         _ => first(&LAND_SPEED).map(|low_m_s| {
             let high_m_s = first(&LAND_SPEED_HIGH).filter(|high_m_s| *high_m_s > 0.0);
-            high_m_s.map_or(low_m_s, |high_m_s| high_m_s.min(low_m_s))
+            high_m_s.map_or(low_m_s, |high_m_s| libm::fmin(high_m_s, low_m_s))
         }),
     };
     AutopilotLimits {
