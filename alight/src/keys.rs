@@ -84,7 +84,7 @@ enum Action {
         output: PathBuf,
     },
     /// Shut the holder of a key out, for good: copy the list of holders that this writes to the keys of every relay
-    /// (`alight up drone`, `alight up relay`), and restart them.
+    /// (`alight up drone`, `alight up relay`), which take it up within a second.
     Revoke {
         /// The holder as the list names it: ROLE@VEHICLE or ROLE.NAME@VEHICLE.
         #[arg(value_name = "HOLDER")]
