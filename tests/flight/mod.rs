@@ -19,10 +19,14 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(120);
 /// Furthest from the pad's centre that a landing may end, whatever happened on the way; 0.05 m is the worst
 /// that `docs/results.md` tells of landings without a fault.
 const MAX_ERROR_M: f64 = 0.1;
-/// The simulated camera with a quarter of its pixels: what is tested is how processes fit together, on machines that
-/// may have no time for the rest.
-const SMALL_CAMERA: [&str; 3] =
-    ["camera.width=648", "camera.height=486", "camera.focal_px=909.0909090909091"];
+/// The simulated camera with a quarter of its pixels and without a camera's processing: what is tested is how processes fit
+/// together, on machines that may have no time for the rest.
+const SMALL_CAMERA: [&str; 4] = [
+    "camera.width=648",
+    "camera.height=486",
+    "camera.focal_px=909.0909090909091",
+    "camera.processing=linear",
+];
 /// Options of a flight that stays in the air for as long as a test takes.
 pub(crate) const LONG: [&str; 6] = [
     "--timeout-s",

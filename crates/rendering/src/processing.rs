@@ -9,6 +9,7 @@
 
 mod develop;
 mod filters;
+mod jpeg;
 mod lens;
 mod local;
 mod mosaic;

@@ -471,7 +471,7 @@ mod tests {
         assert!((origin.x() - 1.5).abs() < 1e-12 && (origin.y() + 1.5).abs() < 1e-12);
         let model = config.camera_settings().model;
         assert_eq!((model.width, model.height, model.fx.round()), (1296, 972, 1818.0));
-        assert_eq!(config.camera_settings().processing, Preset::Linear.processing());
+        assert_eq!(config.camera_settings().processing, Preset::Usb.processing());
     }
 
     #[test]

@@ -146,7 +146,8 @@ mod tests {
 
     #[test]
     fn its_own_metering_brings_the_mean_to_its_level_and_a_fixed_exposure_stays() {
-        let mut average = exposing(&["camera.exposure=average", "camera.max_gain=16"]);
+        let linear = "camera.processing=linear";
+        let mut average = exposing(&["camera.exposure=average", "camera.max_gain=16", linear]);
         let mut fixed = exposing(&["camera.exposure=fixed"]);
         let first = fixed.open(0);
         // Grey of a reflectance of 10 % under a light of which 1 ms makes full scale.

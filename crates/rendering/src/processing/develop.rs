@@ -1,12 +1,7 @@
 //! From the light on the sensor, with its noise, to the camera's frame.
 
-use jpeg_encoder::{ColorType, Encoder};
-use zune_jpeg::JpegDecoder;
-use zune_jpeg::zune_core::bytestream::ZCursor;
-use zune_jpeg::zune_core::colorspace::ColorSpace;
-use zune_jpeg::zune_core::options::DecoderOptions;
-
 use super::filters::{self, Gaussian};
+use super::jpeg::Jpeg;
 use super::tone::{Table, ToneCurve};
 use super::{Denoise, Processing, Sharpen, local, mosaic};
 use crate::error::RenderError;
@@ -19,12 +14,12 @@ pub(crate) struct Developer {
     width: usize,
     table: Option<Table>,
     mask: Option<(Gaussian, Sharpen)>,
+    jpeg: Option<Jpeg>,
     /// Light on the sensor in levels from 0 to 255, row by row.
     raw: Vec<f32>,
     padded: Vec<f32>,
     work: Vec<f32>,
     blurred: Vec<f32>,
-    jpeg: Vec<u8>,
 }
 
 impl Developer {
@@ -36,11 +31,11 @@ impl Developer {
             width,
             table: (tone != ToneCurve::Linear).then(|| Table::new(tone)),
             mask: processing.sharpen.map(|sharpen| (Gaussian::new(sharpen.radius_px), sharpen)),
+            jpeg: processing.jpeg_quality.map(Jpeg::new),
             raw: Vec::new(),
             padded: Vec::new(),
             work: Vec::new(),
             blurred: Vec::new(),
-            jpeg: Vec::new(),
         })
     }
 
@@ -110,32 +105,9 @@ impl Developer {
         for (pixel, level) in out.iter_mut().zip(&*raw) {
             *pixel = quantise(*level);
         }
-        match self.processing.jpeg_quality {
-            Some(quality) => through_jpeg(quality, width, &mut self.jpeg, out),
-            None => Ok(()),
+        if let Some(jpeg) = &self.jpeg {
+            jpeg.apply(out, width);
         }
+        Ok(())
     }
-}
-
-/// Encodes and decodes a frame.
-fn through_jpeg(
-    quality: u8,
-    width: usize,
-    bytes: &mut Vec<u8>,
-    pixels: &mut [u8],
-) -> Result<(), RenderError> {
-    const LARGE: RenderError = RenderError::Setting("a JPEG has at most 65535 pixels on an edge");
-    let edge = |pixels: usize| u16::try_from(pixels).map_err(|_| LARGE);
-    let (columns, rows) = (edge(width)?, edge(pixels.len() / width.max(1))?);
-    bytes.clear();
-    Encoder::new(&mut *bytes, quality)
-        .encode(pixels, columns, rows, ColorType::Luma)
-        .map_err(|_| RenderError::Setting("the frame could not be compressed as JPEG"))?;
-    let options = DecoderOptions::default()
-        .jpeg_set_out_colorspace(ColorSpace::Luma)
-        .set_max_width(columns.into())
-        .set_max_height(rows.into());
-    JpegDecoder::new_with_options(ZCursor::new(bytes.as_slice()), options)
-        .decode_into(pixels)
-        .map_err(|_| RenderError::Setting("the frame's JPEG could not be read again"))
 }
