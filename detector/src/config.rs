@@ -1,6 +1,6 @@
 //! The detector's configuration, at the start and while it runs.
 
-use fiducial::{Detector, TrackingSettings};
+use fiducial::{Detector, ResponseSetting, TrackingSettings};
 use markers::{Marker, Pad};
 use messages::Place;
 use node::{Check, Settings};
@@ -28,6 +28,8 @@ pub struct Config {
     pub inverted: bool,
     /// Whether damaged markers are looked for where others were found, too.
     pub thorough: bool,
+    /// How the camera shows light.
+    pub response: String,
     /// Threshold of `rings-thesis`, in grey levels.
     pub thesis_threshold: u8,
     /// Quality of the debug images.
@@ -63,6 +65,7 @@ impl Settings for Config {
         check.name("id", &self.id);
         check.name("camera", &self.camera);
         check.parses("pads", self.parsed_pads());
+        check.parses("response", self.response());
         check.parses("markers", self.detector());
         check.range("min_confidence", self.min_confidence, 0.0..=1.0);
         check.range("thesis_threshold", self.thesis_threshold, 1..=255);
@@ -87,8 +90,17 @@ impl Config {
             );
         }
         let Self { thesis_threshold, inverted, thorough, .. } = *self;
-        let settings = fiducial::Settings { thesis_threshold, inverted, thorough };
+        let response = self.response()?;
+        let settings = fiducial::Settings { thesis_threshold, inverted, thorough, response };
         Detector::new(&markers, settings).map_err(|problem| problem.to_string())
+    }
+
+    /// How the camera shows light.
+    ///
+    /// # Errors
+    /// Says what a response looks like.
+    pub fn response(&self) -> Result<ResponseSetting, String> {
+        self.response.parse()
     }
 
     /// How markers are followed; when they are not, the whole of each frame is searched.
@@ -160,6 +172,7 @@ mod tests {
         assert!(load("markers=[]").unwrap_err().contains("at least one marker"));
         let twice = "markers=[\"rings:0.1\", \"rings:0.2\"]";
         assert!(load(twice).unwrap_err().contains("listed twice"));
+        assert!(load("response=bright").unwrap_err().contains("srgb"));
         assert!(load("thesis_threshold=0").unwrap_err().contains("from 1 to 255"));
         // A number that does not fit its type is refused too, whatever its range says.
         assert!(load("thesis_threshold=300").is_err());
@@ -182,6 +195,8 @@ mod tests {
         assert!(config.inverted && !config.thorough);
         let changed = changed.with("inverted", "false").unwrap().with("thorough", "true").unwrap();
         assert!(!changed.inverted && changed.thorough && changed.detector().is_ok());
+        let changed = changed.with("response", "\"1.1,0.5\"").unwrap();
+        assert!(matches!(changed.response(), Ok(ResponseSetting::Known(_))));
         let refused = |key, value| config.with(key, value).unwrap_err();
         assert!(refused("id", "other").contains("start the detector again"));
         assert!(refused("place", "ground").contains("--set place=ground"));

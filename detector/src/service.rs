@@ -10,13 +10,13 @@ use airlink::Unpacker;
 use anyhow::Context;
 use fiducial::overlay::canvas::RgbImageBuf;
 use fiducial::overlay::debug;
-use fiducial::{Detector, Observation, StageObserver, Tracker};
+use fiducial::{Detector, Observation, ResponseEstimate, ResponseSetting, StageObserver, Tracker};
 use geometry::CameraModel;
 use imaging::{Converter, GrayImage, GrayView};
 use markers::Pad;
 use messages::{
-    CameraInfo, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo, FrameAck,
-    FrameHeader, FramePart, PixelFormat, StageTime, topic,
+    CameraInfo, CameraResponse, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo,
+    FrameAck, FrameHeader, FramePart, PixelFormat, StageTime, topic,
 };
 use node::{
     Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
@@ -49,7 +49,14 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let infos = node.subscriber(topic::CAMERA_INFO, &[&config.camera]).await?;
     let commands = node.commands(topic::DETECTOR_COMMAND, &[&config.id]).await?;
     let change = Arc::default();
-    let work = Work::new(&node, &config, Arc::clone(&camera), Arc::clone(&change)).await?;
+    let response = Arc::new(Mutex::new(configured_response(&config)));
+    let shared = Shared {
+        camera: Arc::clone(&camera),
+        change: Arc::clone(&change),
+        response: Arc::clone(&response),
+    };
+    let work = Work::new(&node, &config, shared).await?;
+    let responses = node.publisher(topic::CAMERA_RESPONSE, &[&config.id]).await?;
     let infos_of_ours = node.publisher(topic::DETECTOR_INFO, &[&config.id]).await?;
     infos_of_ours.publish(&info(&config)).await;
     let mut live = Live { config, change };
@@ -66,9 +73,17 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     };
     let obey = async {
         let mut introduction = tokio::time::interval(INFO_PERIOD);
+        let mut told = None;
         loop {
             tokio::select! {
-                _ = introduction.tick() => infos_of_ours.publish(&info(&live.config)).await,
+                _ = introduction.tick() => {
+                    infos_of_ours.publish(&info(&live.config)).await;
+                    let now = lock(&response).clone();
+                    if let Some(response) = now.as_ref().filter(|_| now != told) {
+                        responses.publish(response).await;
+                    }
+                    told = now;
+                }
                 request = commands.next() => {
                     let Some(request) = request else { return };
                     let is_last = request.message == DetectorCommand::Stop;
@@ -139,6 +154,40 @@ fn info(config: &Config) -> DetectorInfo {
     }
 }
 
+/// The response that a configuration gives a camera; `None` where it is to be estimated.
+fn configured_response(config: &Config) -> Option<CameraResponse> {
+    match config.response() {
+        Ok(ResponseSetting::Known(known)) => Some(camera_response(config, true, 0, &known)),
+        _ => None,
+    }
+}
+
+fn camera_response(
+    config: &Config,
+    configured: bool,
+    markers: u32,
+    known: &ResponseEstimate,
+) -> CameraResponse {
+    CameraResponse {
+        detector: config.id.clone(),
+        camera: config.camera.clone(),
+        configured,
+        markers,
+        curve: known.curve.value,
+        curve_deviation: known.curve.deviation,
+        sharpening: known.sharpening.value,
+        sharpening_deviation: known.sharpening.deviation,
+    }
+}
+
+/// What the image thread shares with the service's task.
+struct Shared {
+    camera: Arc<Mutex<Option<CameraInfo>>>,
+    change: Arc<Mutex<Option<Change>>>,
+    /// How the camera shows light, to be published.
+    response: Arc<Mutex<Option<CameraResponse>>>,
+}
+
 /// What the image thread changes to before its next frame.
 struct Change {
     config: Config,
@@ -188,8 +237,7 @@ struct Work {
     detections: Publisher<Detections>,
     acks: Publisher<FrameAck>,
     debug: Vec<(&'static str, FramePublisher)>,
-    camera: Arc<Mutex<Option<CameraInfo>>>,
-    change: Arc<Mutex<Option<Change>>>,
+    shared: Shared,
     config: Config,
     converter: Converter,
     unpacker: Unpacker,
@@ -202,12 +250,7 @@ struct Work {
 }
 
 impl Work {
-    async fn new(
-        node: &Node,
-        config: &Config,
-        camera: Arc<Mutex<Option<CameraInfo>>>,
-        change: Arc<Mutex<Option<Change>>>,
-    ) -> anyhow::Result<Self> {
+    async fn new(node: &Node, config: &Config, shared: Shared) -> anyhow::Result<Self> {
         let detector = config.detector().map_err(anyhow::Error::msg)?;
         let pads = config.parsed_pads().map_err(anyhow::Error::msg)?;
         let frames = match config.input {
@@ -227,8 +270,7 @@ impl Work {
             detections: node.publisher(topic::DETECTIONS, &[&config.id]).await?,
             acks: node.publisher(topic::FRAME_ACK, &[&config.id]).await?,
             debug,
-            camera,
-            change,
+            shared,
             config: config.clone(),
             converter: Converter::default(),
             unpacker: Unpacker::default(),
@@ -381,10 +423,11 @@ impl Work {
     }
 
     fn take_change(&mut self) {
-        if let Some(Change { config, detector, pads }) = lock(&self.change).take() {
+        if let Some(Change { config, detector, pads }) = lock(&self.shared.change).take() {
             self.detector = detector;
             self.pads = pads;
             self.tracker = Tracker::new(config.tracking());
+            *lock(&self.shared.response) = configured_response(&config);
             self.config = config;
         }
     }
@@ -398,7 +441,13 @@ impl Work {
         let camera = self.camera_model(header);
         let time_s = header.stamp_ns as f64 * 1e-9;
         let found = self.tracker.detect(&mut self.detector, view, camera.as_ref(), time_s, clock);
-        told(found, &self.pads, camera.as_ref(), self.config.min_confidence)
+        let found = told(found, &self.pads, camera.as_ref(), self.config.min_confidence);
+        let memory = self.tracker.response();
+        if let (Ok(ResponseSetting::Auto), Some(known)) = (self.config.response(), memory.known()) {
+            let response = camera_response(&self.config, false, memory.markers(), &known);
+            *lock(&self.shared.response) = Some(response);
+        }
+        found
     }
 
     async fn publish(&self, header: &FrameHeader, found: Vec<Detection>, clock: StageClock) {
@@ -421,7 +470,7 @@ impl Work {
 
     /// The camera's model, when it is calibrated for frames of this size.
     fn camera_model(&self, header: &FrameHeader) -> Option<CameraModel> {
-        let info = lock(&self.camera);
+        let info = lock(&self.shared.camera);
         let model = info.as_ref()?.model()?;
         if (model.width, model.height) == (header.width, header.height) {
             return Some(model);

@@ -8,6 +8,7 @@ use crate::candidates::evidence::{Evidence, Needs};
 use crate::families;
 use crate::families::family::{FamilyDetector, FrameInput, Output, PredictedShape, Prediction};
 use crate::observation::{Observation, StageObserver};
+use crate::response::{ResponseEstimate, ResponseSetting};
 use crate::schedule::{FallbackPass, FallbackStep, PassSchedule};
 use crate::settings::Settings;
 use crate::trace::{Trace, TracedMarker};
@@ -42,6 +43,8 @@ pub struct Detector {
     turns: usize,
     /// Where markers that are followed should be in the next image.
     followed: Vec<Prediction>,
+    /// How the camera shows light, where that is known.
+    response: Option<ResponseEstimate>,
 }
 
 impl Detector {
@@ -74,6 +77,10 @@ impl Detector {
             trace: Trace::default(),
             turns: 0,
             followed: Vec::new(),
+            response: match settings.response {
+                ResponseSetting::Auto => None,
+                ResponseSetting::Known(known) => Some(known),
+            },
         })
     }
 
@@ -132,13 +139,15 @@ impl Detector {
         self.found.clear();
         self.trace.clear();
         self.make_room(view);
-        let Self { families, evidence, brightened, found, trace, followed, .. } = self;
+        let Self { families, evidence, brightened, found, trace, followed, response, .. } = self;
+        let response = *response;
         let followed = followed.as_slice();
         let stages: &mut dyn StageObserver = stages;
         evidence.find(view, &self.needs, trace, stages);
         let mut out = Output { found, trace, stages };
         for family in families.iter_mut() {
-            family.detect(FrameInput { view, camera, evidence, schedule, followed }, &mut out);
+            let input = FrameInput { view, camera, evidence, schedule, followed, response };
+            family.detect(input, &mut out);
         }
         evidence.begin_fallbacks(schedule);
         for step in FallbackStep::ALL.into_iter().filter(|step| schedule.allows_step(*step)) {
@@ -159,7 +168,7 @@ impl Detector {
                 if is_first {
                     evidence.prepare(view, step, schedule, out.stages);
                 }
-                let input = FrameInput { view, camera, evidence, schedule, followed };
+                let input = FrameInput { view, camera, evidence, schedule, followed, response };
                 family.fallback(step, input, &mut out);
             }
             if let Some(stage) = step.stage().filter(|_| is_prepared) {
@@ -168,6 +177,14 @@ impl Detector {
         }
         self.trace.markers.extend(self.found.iter().map(TracedMarker::from));
         &self.found
+    }
+
+    /// Takes this for how the camera of the next images shows light, unless that is configured. For a stream of images;
+    /// single images may be of any camera.
+    pub fn assume_response(&mut self, response: Option<ResponseEstimate>) {
+        if self.settings.response == ResponseSetting::Auto {
+            self.response = response;
+        }
     }
 
     /// Finds one marker at its prediction and nothing else. `None` when it is not well visible there; a search of the region
@@ -184,14 +201,16 @@ impl Detector {
         if self.settings.thorough {
             return None;
         }
-        let Self { families, evidence, .. } = self;
+        let Self { families, evidence, response, .. } = self;
+        let response = *response;
         if matches!(at.shape, PredictedShape::Corners(_)) {
             evidence.outlines.begin(view);
         }
         let schedule = PassSchedule::NONE;
         let seen = families.iter_mut().find_map(|family| {
             let followed = std::slice::from_ref(at);
-            family.detect_at(FrameInput { view, camera, evidence, schedule, followed }, at)
+            let input = FrameInput { view, camera, evidence, schedule, followed, response };
+            family.detect_at(input, at)
         })?;
         self.trace.markers.push(TracedMarker::from(&seen));
         stages.ended("following");

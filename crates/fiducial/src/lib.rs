@@ -6,8 +6,9 @@
 //! What a marker is stands in the crate `markers`. Modules in the order of the data: `optics` is what camera
 //! and lens do to a marker, `candidates` where one may be, `decode` which codeword a candidate carries,
 //! [`refine`] its corners to a fraction of a pixel, [`pose`] its pose; [`families`] has a detector for each
-//! kind of marker, [`schedule`] says which fallback passes an image gets, [`detector`] runs them, [`observation`] is their result. [`tracker`] searches first where
-//! the markers of the last images should be, and [`bundle`] solves the markers of one pad together. [`trace`]
+//! kind of marker, [`schedule`] says which fallback passes an image gets, [`detector`] runs them,
+//! [`observation`] is their result. [`tracker`] searches first where the markers of the last images should be,
+//! and remembers their camera's [`response`]; [`bundle`] solves the markers of one pad together. [`trace`]
 //! tells why candidates were refused, [`overlay`] draws that on the image.
 
 pub mod bundle;
@@ -20,6 +21,7 @@ mod optics;
 pub mod overlay;
 pub mod pose;
 pub mod refine;
+pub mod response;
 pub mod schedule;
 mod settings;
 pub mod trace;
@@ -30,6 +32,7 @@ pub use candidates::ring::Ring;
 pub use detector::{Detector, DetectorError};
 pub use observation::{MarkerPose, Observation, PoseSolution, StageObserver};
 pub use pose::{PlanePoint, planar_pose, square_pose};
+pub use response::{Measured, ResponseEstimate, ResponseMemory, ResponseSetting};
 pub use schedule::{FallbackPass, ImageStrip, PassSchedule};
 pub use settings::Settings;
 pub use trace::{Candidate, Reason, Refusal, Trace, TracedMarker};

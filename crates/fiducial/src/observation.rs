@@ -4,6 +4,8 @@ use geometry::{Camera, Marker as MarkerFrame, Pixel, Roi, Transform};
 use markers::Family;
 use nalgebra::{Matrix2, Matrix6};
 
+use crate::response::ResponseEstimate;
+
 /// A marker found in an image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Observation {
@@ -25,6 +27,8 @@ pub struct Observation {
     pub confidence: f64,
     /// Its pose, when its size and the camera are known.
     pub pose: Option<MarkerPose>,
+    /// How the camera shows light, where the marker told it.
+    pub response: Option<ResponseEstimate>,
 }
 
 impl Observation {

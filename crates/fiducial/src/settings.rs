@@ -1,7 +1,9 @@
 //! Settings of the detector.
 
+use crate::response::ResponseSetting;
+
 /// Settings of a detector.
-#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+#[derive(Copy, Clone, Debug, PartialEq)]
 pub struct Settings {
     /// T of Equation 3.3, in grey levels, for `rings-thesis`. The thesis does not state it; with 70 most markers are found in
     /// renderings of its camera.
@@ -11,10 +13,17 @@ pub struct Settings {
     /// Whether the fallback passes also run in images in which markers were found. Otherwise they run where none was found
     /// and, for families of any id, where two were found, as on boards.
     pub thorough: bool,
+    /// How the camera shows light.
+    pub response: ResponseSetting,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { thesis_threshold: 70, inverted: true, thorough: false }
+        Self {
+            thesis_threshold: 70,
+            inverted: true,
+            thorough: false,
+            response: ResponseSetting::Auto,
+        }
     }
 }

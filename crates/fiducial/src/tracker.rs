@@ -15,6 +15,7 @@ use crate::detector::Detector;
 use crate::families::family::{PredictedShape, Prediction};
 use crate::families::rings::circle_pose::CirclePose;
 use crate::observation::{Observation, StageObserver};
+use crate::response::ResponseMemory;
 use crate::trace::Trace;
 
 /// Settings of tracking.
@@ -49,6 +50,7 @@ pub struct Tracker {
     has_begun: bool,
     /// Whether regions were requested for this image.
     has_requests: bool,
+    response: ResponseMemory,
 }
 
 /// A tracked marker: its last observation and its motion.
@@ -143,6 +145,7 @@ impl Tracker {
         self.found.clear();
         self.trace.clear();
         self.begin([view.width(), view.height()], time_s);
+        detector.assume_response(self.response.known());
         detector.follow(self.tracks.iter().filter_map(|track| track.circles(time_s)));
         if self.choose_regions(time_s) {
             for index in 0..self.regions.len() {
@@ -170,7 +173,15 @@ impl Tracker {
         }
         detector.follow_none();
         self.update_tracks(time_s);
+        for told in self.found.iter().filter_map(|seen| seen.response.as_ref()) {
+            self.response.add(told);
+        }
         &self.found
+    }
+
+    /// How the camera shows light, as the markers in its images told.
+    pub fn response(&self) -> &ResponseMemory {
+        &self.response
     }
 
     /// The trace of the last detection, in pixels of the whole image.
@@ -506,6 +517,7 @@ mod tests {
             size_px,
             confidence: 1.0,
             pose: None,
+            response: None,
         }
     }
 

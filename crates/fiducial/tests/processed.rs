@@ -2,7 +2,9 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop anywhere")]
 #![allow(clippy::print_stdout, reason = "the figures are what one wants to read")]
 
-use fiducial::{Detector, FallbackPass, Observation, PassSchedule, Settings};
+use fiducial::{
+    Detector, FallbackPass, Observation, PassSchedule, Settings, Tracker, TrackingSettings,
+};
 use geometry::{Body, CameraModel, Marker as MarkerFrame, Ned, Pixel, Rotation, Transform};
 use imaging::GrayView;
 use markers::Marker;
@@ -114,8 +116,11 @@ fn rings_are_found_at_every_position_of_the_thesis() {
     }
 }
 
-/// The frames of a marker on asphalt, squarely from above, and where it is in the camera frame.
-fn square_frames(name: &str) -> Vec<(Vec<u8>, Transform<geometry::Camera, MarkerFrame>)> {
+/// The frames of a marker on asphalt, squarely from above at these heights, and where it is in the camera frame.
+fn square_frames(
+    name: &str,
+    heights_m: &[f64],
+) -> Vec<(Vec<u8>, Transform<geometry::Camera, MarkerFrame>)> {
     let settings = Binning::FourByFour.settings();
     let marker: Marker = format!("{name}:{SIZE_M}").parse().unwrap();
     let pad = PadInScene::flat(marker, 0.0, 0.0, 0.6);
@@ -123,9 +128,8 @@ fn square_frames(name: &str) -> Vec<(Vec<u8>, Transform<geometry::Camera, Marker
     let scene = Scene { surface: Surface::Asphalt, pads: vec![pad], painted_marks: 20, light: 1.0 };
     let mut renderer = Renderer::new(&scene, settings.clone(), 77).unwrap();
     let size = settings.model.width as usize * settings.model.height as usize;
-    let heights_m = [0.8, 1.3, 1.9, 2.6, 3.4, 4.5, 6.2, 8.1, 10.0];
-    let frame = |(index, height_m): (usize, f64)| {
-        let aside = 0.07 * height_m * (index as f64 - 4.0) / 4.0;
+    let frame = |(index, height_m): (usize, &f64)| {
+        let aside = 0.07 * height_m * ((index % 9) as f64 - 4.0) / 4.0;
         let turn = Rotation::<Ned, Body>::from_euler(0.0, 0.0, 0.7 * index as f64);
         let at = geometry::Point::new(aside, 0.5 * aside, ned_from_marker.origin().z() - height_m);
         let ned_from_body = Transform::new(turn, at);
@@ -134,7 +138,7 @@ fn square_frames(name: &str) -> Vec<(Vec<u8>, Transform<geometry::Camera, Marker
         let ned_from_camera = ned_from_body * settings.body_from_camera;
         (pixels, ned_from_camera.inverse() * ned_from_marker)
     };
-    heights_m.into_iter().enumerate().map(frame).collect()
+    heights_m.iter().enumerate().map(frame).collect()
 }
 
 #[test]
@@ -235,7 +239,7 @@ fn squares_and_stags_are_where_they_are_in_processed_frames() {
     ];
     for (name, centre_px, range_percent) in bounds {
         let mut detector = detector(name);
-        let frames = square_frames(name);
+        let frames = square_frames(name, &[0.8, 1.3, 1.9, 2.6, 3.4, 4.5, 6.2, 8.1, 10.0]);
         for (kind, processing) in kinds() {
             let mut errors = Errors::default();
             for (pixels, camera_from_marker) in &frames {
@@ -244,6 +248,53 @@ fn squares_and_stags_are_where_they_are_in_processed_frames() {
                 errors.note(&found, camera.project(place).unwrap(), place.coords.coords.norm());
             }
             errors.expect(&format!("{name}, {kind}"), 0, centre_px, range_percent);
+        }
+    }
+}
+
+/// What many markers told of a camera's response holds the next ones, and makes none of them worse.
+#[test]
+fn the_response_of_a_camera_is_remembered_in_a_stream() {
+    let camera = Binning::FourByFour.camera();
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let heights_m: Vec<f64> = (0..60).map(|k| 9.0 - 0.13 * f64::from(k)).collect();
+    for name in ["apriltag-36h11:3", "aruco-4x4-50:7"] {
+        let frames = square_frames(name, &heights_m);
+        for preset in [Preset::Linear, Preset::Usb, Preset::RaspberryPi] {
+            let processing = preset.processing();
+            let (mut alone, mut in_stream) = (detector(name), detector(name));
+            let mut tracker = Tracker::new(TrackingSettings { full_search_period: 1 });
+            let [mut one_by_one, mut remembered] = [Errors::default(), Errors::default()];
+            for (index, (pixels, camera_from_marker)) in frames.iter().enumerate() {
+                let shown = processing.apply(pixels, width).unwrap();
+                let view = GrayView::packed(&shown, width, height).unwrap();
+                let time_s = index as f64 / 15.0;
+                let place = camera_from_marker.origin();
+                let (centre, range_m) =
+                    (camera.project(place).unwrap(), place.coords.coords.norm());
+                let found =
+                    tracker.detect(&mut in_stream, view, Some(&camera), time_s, &mut ()).to_vec();
+                // The first half of the stream is what it learns from.
+                if index >= 30 {
+                    remembered.note(&found, centre, range_m);
+                    one_by_one.note(alone.detect(view, Some(&camera), &mut ()), centre, range_m);
+                }
+            }
+            let known = tracker.response().known();
+            println!("{name}, {preset}: {known:?}");
+            one_by_one.expect(&format!("{name}, {preset}, alone"), 0, [0.03, 0.1], [0.2, 0.6]);
+            // Much nearer both are off by what the model of the processing lacks.
+            let [median, _] = Errors::shares(&mut one_by_one.range_percent);
+            let most = [1.5 * median, 0.6];
+            remembered.expect(&format!("{name}, {preset}, remembered"), 0, [0.03, 0.1], most);
+            match known {
+                Some(known) => {
+                    assert_ne!(preset, Preset::Linear);
+                    assert!((0.4..3.5).contains(&known.curve.value), "{known:?}");
+                    assert!(known.curve.deviation < 0.5, "{known:?}");
+                }
+                None => assert_eq!(preset, Preset::Linear),
+            }
         }
     }
 }

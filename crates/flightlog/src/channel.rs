@@ -1,9 +1,9 @@
 //! The records of a recording: messages as they came, and as JSON.
 
 use messages::{
-    CameraInfo, Configuration, ControllerStatus, DecodeError, Detections, DetectorInfo, FrameAck,
-    FrameHeader, Health, Message, RecorderStatus, TargetEstimate, Truth, VehicleState, Wind,
-    decode, topic,
+    CameraInfo, CameraResponse, Configuration, ControllerStatus, DecodeError, Detections,
+    DetectorInfo, FrameAck, FrameHeader, Health, Message, RecorderStatus, TargetEstimate, Truth,
+    VehicleState, Wind, decode, topic,
 };
 
 use crate::protobuf::{MessageType, descriptor_set};
@@ -120,11 +120,12 @@ const fn json_topic<M: Message>(key: fn(&[&str]) -> String) -> JsonTopic {
     JsonTopic { key, name: M::NAME, json: json::<M> }
 }
 
-static JSON_TOPICS: [JsonTopic; 12] = [
+static JSON_TOPICS: [JsonTopic; 13] = [
     json_topic::<CameraInfo>(|names| topic::CAMERA_INFO.key(names)),
     json_topic::<Detections>(|names| topic::DETECTIONS.key(names)),
     json_topic::<FrameAck>(|names| topic::FRAME_ACK.key(names)),
     json_topic::<DetectorInfo>(|names| topic::DETECTOR_INFO.key(names)),
+    json_topic::<CameraResponse>(|names| topic::CAMERA_RESPONSE.key(names)),
     json_topic::<VehicleState>(|names| topic::VEHICLE_STATE.key(names)),
     json_topic::<TargetEstimate>(|names| topic::TARGET.key(names)),
     json_topic::<ControllerStatus>(|names| topic::STATUS.key(names)),

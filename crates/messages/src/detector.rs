@@ -9,6 +9,7 @@ wire! {
     Detections = 3 v 3;
     DetectorCommand = 13 v 2;
     DetectorInfo = 15 v 1;
+    CameraResponse = 20 v 1;
 }
 
 /// The markers that a detector found in one frame; also sent when there are none.
@@ -110,6 +111,30 @@ pub struct DetectorInfo {
     pub version: String,
     /// Process id on its host.
     pub pid: u32,
+}
+
+/// How a camera shows light, as a detector estimates it from the markers that it sees, or as it is configured.
+///
+/// Light from 0 (black ink) to 1 (white paper) has the level `(1 + curve) w / (1 + curve w)` between theirs; then
+/// `sharpening` times its difference from a copy blurred by a Gaussian of one pixel is added.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CameraResponse {
+    /// The detector's name.
+    pub detector: String,
+    /// The camera whose frames it searches.
+    pub camera: String,
+    /// Whether it is configured; else it is estimated.
+    pub configured: bool,
+    /// Number of markers that told it.
+    pub markers: u32,
+    /// The tone curve: 0 is linear, 1.1 nearly sRGB.
+    pub curve: f64,
+    /// Standard deviation of the curve from marker to marker.
+    pub curve_deviation: f64,
+    /// The amount of the unsharp mask.
+    pub sharpening: f64,
+    /// Standard deviation of the amount from marker to marker.
+    pub sharpening_deviation: f64,
 }
 
 /// Where a detector runs.

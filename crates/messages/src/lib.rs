@@ -32,8 +32,8 @@ pub use controller::{
     TargetEstimate, matter,
 };
 pub use detector::{
-    AlternativePose, Detection, Detections, DetectorCommand, DetectorInfo, MarkerPose, Place,
-    StageTime,
+    AlternativePose, CameraResponse, Detection, Detections, DetectorCommand, DetectorInfo,
+    MarkerPose, Place, StageTime,
 };
 pub use health::{Configuration, Count, Health, Latency, Rate};
 pub use recorder::{RecorderLoss, RecorderStatus};

@@ -7,7 +7,7 @@ use std::marker::PhantomData;
 use crate::camera::{CameraInfo, FrameAck, FrameHeader};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
-use crate::detector::{Detections, DetectorCommand, DetectorInfo};
+use crate::detector::{CameraResponse, Detections, DetectorCommand, DetectorInfo};
 use crate::health::{Configuration, Health};
 use crate::recorder::RecorderStatus;
 use crate::simulation::{Truth, Wind};
@@ -151,6 +151,9 @@ pub const DEBUG_IMAGE: Topic<FrameHeader> =
 /// A detector's identity and settings.
 pub const DETECTOR_INFO: Topic<DetectorInfo> =
     Topic::new("detector/{detector}/info", Delivery::LastValue, DETECTOR, SUPERVISED);
+/// How the camera shows light, as a detector has it.
+pub const CAMERA_RESPONSE: Topic<CameraResponse> =
+    Topic::new("detector/{detector}/response", Delivery::LastValue, DETECTOR, NO_OTHERS);
 /// A command to a detector; answered with a [`CommandReply`].
 pub const DETECTOR_COMMAND: Topic<DetectorCommand> =
     Topic::new("detector/{detector}/command", Delivery::Query, &["alight"], NO_OTHERS);
@@ -244,6 +247,7 @@ pub const TOPICS: &[Row] = &[
     FRAME_ACK.row,
     DEBUG_IMAGE.row,
     DETECTOR_INFO.row,
+    CAMERA_RESPONSE.row,
     DETECTOR_COMMAND.row,
     DETECTOR_COMMAND_REPLY.row,
     VEHICLE_STATE.row,

@@ -3,8 +3,8 @@
 use std::borrow::Cow;
 
 use messages::{
-    AlternativePose, BayerPattern, CameraInfo, Candidate, CommandReply, Configuration,
-    ControllerCommand, ControllerStatus, Count, DecodeError, Detection, Detections,
+    AlternativePose, BayerPattern, CameraInfo, CameraResponse, Candidate, CommandReply,
+    Configuration, ControllerCommand, ControllerStatus, Count, DecodeError, Detection, Detections,
     DetectorCommand, DetectorInfo, DetectorState, FrameAck, FrameHeader, FramePart, Health,
     LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, Phase, PixelFormat, Place,
     Rate, RecorderLoss, RecorderStatus, Setpoint, StageTime, Tape, TapeAction, TapeDecision,
@@ -168,6 +168,25 @@ fn detector_info() {
         &message,
         "410f01046d61696e0270690104646f776e010d72696e67733a302e31353334310c616c6967687420302e312e30ac02",
     );
+}
+
+#[test]
+fn camera_response() {
+    let bytes = "411401046d61696e04646f776e00ac02000000000000f03f000000000000b03f000000000000e03f000000000000c03f";
+    check(&response(), bytes);
+}
+
+fn response() -> CameraResponse {
+    CameraResponse {
+        detector: "main".into(),
+        camera: "down".into(),
+        configured: false,
+        markers: 300,
+        curve: 1.0,
+        curve_deviation: 0.0625,
+        sharpening: 0.5,
+        sharpening_deviation: 0.125,
+    }
 }
 
 #[test]
@@ -587,6 +606,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         version: "python".into(),
         pid: 300,
     };
+    let response = response();
     let set = DetectorCommand::SetParameter { key: "markers".into(), value: "[]".into() };
     let reply = CommandReply { accepted: true, reason: "it stops".into() };
     let ack = FrameAck {
@@ -657,6 +677,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         ("CameraInfo", encode(&camera)),
         ("Detections", encode(&detections)),
         ("DetectorInfo", encode(&info)),
+        ("CameraResponse", encode(&response)),
         ("DetectorCommand SetParameter", encode(&set)),
         ("DetectorCommand Stop", encode(&DetectorCommand::Stop)),
         ("CommandReply", encode(&reply)),

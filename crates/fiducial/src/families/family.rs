@@ -9,6 +9,7 @@ use markers::Family;
 use crate::candidates::evidence::{Evidence, Needs};
 use crate::families::rings::circle_pose::CirclePose;
 use crate::observation::{Observation, StageObserver};
+use crate::response::ResponseEstimate;
 use crate::schedule::{FallbackStep, PassSchedule};
 use crate::trace::Trace;
 
@@ -56,6 +57,8 @@ pub(crate) struct FrameInput<'a> {
     pub(crate) schedule: PassSchedule,
     /// Where markers that are followed should be; none in a single image.
     pub(crate) followed: &'a [Prediction],
+    /// How the camera shows light, where that is known.
+    pub(crate) response: Option<ResponseEstimate>,
 }
 
 /// Where detections go.

@@ -5,12 +5,12 @@ use imaging::{GrayView, Pyramid};
 use markers::{Family, Marker};
 use nalgebra::Matrix2;
 
-use crate::candidates::evidence::Evidence;
 use crate::candidates::quad::diagonal_px;
-use crate::families::family::{PredictedShape, Prediction};
+use crate::families::family::{FrameInput, PredictedShape, Prediction};
 use crate::observation::Observation;
 use crate::pose::square_pose;
 use crate::refine::fit::Refined;
+use crate::response::ResponseEstimate;
 
 /// Standard deviation of corners made of segments: in pixels, and as a fraction of the diagonal.
 const MIN_SEGMENT_CORNER_PX: f64 = 0.5;
@@ -35,16 +35,15 @@ pub(crate) struct ImageInput<'a> {
     pub(crate) pyramid: &'a Pyramid,
     /// Without a camera there are no poses.
     pub(crate) camera: Option<&'a CameraModel>,
+    /// How the camera shows light, where that is known.
+    pub(crate) response: Option<ResponseEstimate>,
 }
 
 impl<'a> ImageInput<'a> {
     /// The image of a frame.
-    pub(crate) fn new(
-        view: GrayView<'a>,
-        camera: Option<&'a CameraModel>,
-        evidence: &'a Evidence,
-    ) -> Self {
-        Self { view, pyramid: evidence.outlines.pyramid(), camera }
+    pub(crate) fn new(input: &'a FrameInput<'_>) -> Self {
+        let FrameInput { view, camera, ref evidence, response, .. } = *input;
+        Self { view, pyramid: evidence.outlines.pyramid(), camera, response }
     }
 }
 
@@ -145,6 +144,7 @@ impl FamilyQuery {
             size_px: diagonal_px(&corners),
             confidence,
             pose,
+            response: refined.response,
         })
     }
 }

@@ -168,10 +168,10 @@ impl RingDetector {
 
     /// Searches for complete ellipses, on coarse levels first.
     fn search(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, schedule, followed } = input;
+        let FrameInput { view, camera, evidence, schedule, followed, response } = input;
         for pass in &PASSES {
             let evidence = &mut *evidence;
-            let input = FrameInput { view, camera, evidence, schedule, followed };
+            let input = FrameInput { view, camera, evidence, schedule, followed, response };
             self.run(pass, input, out);
             self.complete += self.candidates.len();
             if out.found.len() > self.first && !self.thorough {
@@ -182,7 +182,7 @@ impl RingDetector {
 
     /// Runs one pass, and adds the markers it finds to those from the index `self.first` on.
     fn run(&mut self, pass: &RingPass, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, schedule, followed } = input;
+        let FrameInput { view, camera, evidence, schedule, followed, .. } = input;
         let has_outlines = evidence.has_outlines;
         let outlines = &mut evidence.outlines;
         if let RingPass::Ellipses(levels) = pass
@@ -464,6 +464,7 @@ impl Evaluation<'_> {
             size_px: outline.major,
             confidence: measured.confidence,
             pose: marker_pose,
+            response: measured.response,
         })
     }
 }

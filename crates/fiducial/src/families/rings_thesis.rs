@@ -429,6 +429,7 @@ fn observe(rings: &[Ring], marker: &Marker, camera: Option<&CameraModel>) -> Obs
         size_px,
         confidence,
         pose,
+        response: None,
     }
 }
 

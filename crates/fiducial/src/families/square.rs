@@ -476,13 +476,13 @@ impl FamilyDetector for SquareTagDetector {
     }
 
     fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, .. } = input;
-        let image = ImageInput::new(view, camera, evidence);
+        let image = ImageInput::new(&input);
+        let evidence = &*input.evidence;
         self.detect_whole(image, evidence.outline_quads.iter(), out);
     }
 
     fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
-        let image = ImageInput::new(input.view, input.camera, input.evidence);
+        let image = ImageInput::new(&input);
         self.detect_expected(image, &ExpectedMarker::new(at)?)
     }
 
@@ -494,8 +494,8 @@ impl FamilyDetector for SquareTagDetector {
     }
 
     fn fallback(&mut self, step: FallbackStep, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, .. } = input;
-        let image = ImageInput::new(view, camera, evidence);
+        let image = ImageInput::new(&input);
+        let evidence = &*input.evidence;
         match step {
             FallbackStep::Segments => self.detect_occluded(image, evidence.segment_quads(), out),
             FallbackStep::QuietZones => {
@@ -541,8 +541,8 @@ impl Decoded {
     ) -> Option<Refined> {
         let codeword = query.code.codewords.get(self.id as usize)?;
         let pattern = Pattern::bordered(query.code, *codeword, self.extra_border)?;
-        let ImageInput { view, camera, .. } = input;
-        let guess = CornerGuess { view, corners: &self.corners, camera, is_near };
+        let ImageInput { view, camera, response, .. } = input;
+        let guess = CornerGuess { view, corners: &self.corners, camera, is_near, response };
         refine(&guess, &pattern, scratch)
     }
 

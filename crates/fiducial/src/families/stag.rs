@@ -396,8 +396,8 @@ impl StagDetector {
         }
         let design = self.designs.iter().find(|design| is_it(design))?;
         let design = design.design(shortest_side_px(&corners), quad.inverted);
-        let ImageInput { view, camera, .. } = input;
-        let guess = CornerGuess { view, corners: &corners, camera, is_near: false };
+        let ImageInput { view, camera, response, .. } = input;
+        let guess = CornerGuess { view, corners: &corners, camera, is_near: false, response };
         refine_design(&guess, &design, &mut self.scratch)
     }
 
@@ -453,13 +453,13 @@ impl FamilyDetector for StagDetector {
     }
 
     fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, .. } = input;
-        let image = ImageInput::new(view, camera, evidence);
+        let image = ImageInput::new(&input);
+        let evidence = &*input.evidence;
         self.detect_whole(image, evidence.outline_quads.iter().take(MAX_QUADS), out);
     }
 
     fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
-        let image = ImageInput::new(input.view, input.camera, input.evidence);
+        let image = ImageInput::new(&input);
         self.detect_expected(image, &ExpectedMarker::new(at)?)
     }
 
@@ -468,8 +468,8 @@ impl FamilyDetector for StagDetector {
     }
 
     fn fallback(&mut self, step: FallbackStep, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, .. } = input;
-        let image = ImageInput::new(view, camera, evidence);
+        let image = ImageInput::new(&input);
+        let evidence = &*input.evidence;
         match step {
             FallbackStep::QuietZones => {
                 self.detect_in_quiet_zones(image, &evidence.quiet_zones, out);

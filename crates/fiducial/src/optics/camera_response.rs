@@ -3,6 +3,8 @@
 //! After an unknown monotonic curve and a symmetric kernel a blurred edge has another shape and another place. Both are
 //! those of every other edge between the same black and white, so that the marker itself tells the two numbers.
 
+use crate::response::ResponseEstimate;
+
 /// Standard deviation of the kernel with which cameras sharpen, in pixels.
 pub(crate) const SHARPENING_PX: f64 = 1.0;
 
@@ -36,6 +38,11 @@ impl CameraResponse {
     pub(crate) const LINEAR: Self = Self { curve: 0.0, sharpening: 0.0 };
     /// What most cameras do: a start for a fit.
     pub(crate) const ORDINARY: Self = Self { curve: 1.0, sharpening: 0.0 };
+
+    /// As it is known before a fit.
+    pub(crate) fn known(known: &ResponseEstimate) -> Self {
+        Self::LINEAR.moved([known.curve.value, known.sharpening.value])
+    }
 
     /// After a step of a fit, within what cameras do.
     pub(crate) fn moved(&self, [curve, sharpening]: [f64; 2]) -> Self {

@@ -25,7 +25,8 @@ pub fn refine(
 ) -> Option<Refined> {
     let lens = Undistortion::new(guess.camera, guess.corners)?;
     let start = lens.homography(guess.corners)?;
-    let target = Target { view: guess.view, lens: &lens, start: &start };
+    let CornerGuess { view, response, .. } = *guess;
+    let target = Target { view, lens: &lens, start: &start, response };
     let along_edges = (start.narrowest_cell_px(pattern.cells()) >= MIN_CELL_PX)
         .then(|| edges::fit(target, pattern, guess.is_near, scratch))
         .flatten();
@@ -44,7 +45,8 @@ pub(crate) fn refine_design(
 ) -> Option<Refined> {
     let lens = Undistortion::new(guess.camera, guess.corners)?;
     let start = lens.homography(guess.corners)?;
-    let target = Target { view: guess.view, lens: &lens, start: &start };
+    let CornerGuess { view, response, .. } = *guess;
+    let target = Target { view, lens: &lens, start: &start, response };
     let side_px = start.shortest_side_px();
     let along_edges = (design.border * side_px >= MIN_BORDER_PX)
         .then(|| edges::fit_edges(target, design.edges, scratch))

@@ -94,7 +94,7 @@ pub(crate) fn fit_edges(
 }
 
 fn fit_samples(target: Target<'_>, is_near: bool, scratch: &mut Scratch) -> Option<Fit> {
-    let Target { view, lens, start } = target;
+    let Target { view, lens, start, .. } = target;
     let mut fit = EdgeFit {
         view,
         lens,
@@ -201,7 +201,7 @@ fn with_common_shift(
 
 /// Spreads a bounded number of samples along the pattern's edges within the image.
 fn place_samples(target: Target<'_>, pattern: &Pattern, samples: &mut Vec<EdgeSample>) {
-    let Target { view, lens, start } = target;
+    let Target { view, lens, start, .. } = target;
     let mut length_px = 0.0;
     each_edge(pattern, |edge| length_px += edge.usable(start).map_or(0.0, |[from, to]| to - from));
     samples.clear();
@@ -586,7 +586,8 @@ impl EdgeFit<'_> {
         };
         let residual = noise.sqrt() / model.contrast;
         let is_shift_known = false;
-        Some(Fit { homography: self.homography, covariance, model, residual, is_shift_known })
+        let (homography, response) = (self.homography, None);
+        Some(Fit { homography, covariance, model, residual, is_shift_known, response })
     }
 }
 

@@ -7,6 +7,7 @@ use nalgebra::{Matrix2, SMatrix};
 use crate::optics::edge_response::PIXEL_VARIANCE;
 use crate::optics::homography::{CORNERS, Homography};
 use crate::optics::undistort::Undistortion;
+use crate::response::ResponseEstimate;
 
 /// Where a square is about.
 #[derive(Copy, Clone, Debug)]
@@ -19,6 +20,8 @@ pub struct CornerGuess<'a> {
     pub camera: Option<&'a CameraModel>,
     /// Whether the corners are right to about half a pixel.
     pub is_near: bool,
+    /// How the camera shows light, where that is known.
+    pub response: Option<ResponseEstimate>,
 }
 
 /// The corners of a square marker, refined.
@@ -40,6 +43,8 @@ pub struct Refined {
     pub white: f64,
     /// Root mean square residual of the pixels, as a fraction of the contrast.
     pub residual: f64,
+    /// How the camera shows light, where the marker told it.
+    pub response: Option<ResponseEstimate>,
 }
 
 impl Refined {
@@ -55,6 +60,7 @@ impl Refined {
             black: 0.0,
             white: 0.0,
             residual: 1.0,
+            response: None,
         }
     }
 
@@ -179,6 +185,8 @@ pub(crate) struct Target<'a> {
     pub(crate) view: GrayView<'a>,
     pub(crate) lens: &'a Undistortion<'a>,
     pub(crate) start: &'a Homography,
+    /// How the camera shows light, where that is known.
+    pub(crate) response: Option<ResponseEstimate>,
 }
 
 /// The result of either refinement.
@@ -192,6 +200,8 @@ pub(crate) struct Fit {
     pub(crate) residual: f64,
     /// Whether a shift of all edges towards black, as by a tone curve, can be told from the square's size.
     pub(crate) is_shift_known: bool,
+    /// How the camera shows light, where that was fitted.
+    pub(crate) response: Option<ResponseEstimate>,
 }
 
 /// Largest distance by which a corner is moved: in pixels, and as a fraction of the shortest side.
@@ -228,6 +238,7 @@ impl Fit {
             black: self.model.black,
             white: self.model.black + self.model.contrast,
             residual: self.residual,
+            response: self.response,
         };
         refined.covariance_px2.iter().all(|c| c.is_finite()).then_some(refined)
     }

@@ -12,6 +12,7 @@ use crate::optics::least_squares::{
 use crate::refine::fit::{Design, Fit, PhotometricModel, PixelSample, Scratch, Target};
 use crate::refine::pattern::Pattern;
 use crate::refine::prediction::{Bands, PatternGrid};
+use crate::response::{Measured, ResponseEstimate};
 
 /// Homography (8), blur, black, contrast, shade (2), brightness beyond the pattern.
 const UNKNOWNS: usize = 14;
@@ -19,7 +20,7 @@ const UNKNOWNS: usize = 14;
 const UNKNOWNS_PROCESSED: usize = 16;
 /// A camera's processing is fitted when one step towards it lowers the cost by this share, and kept when the fit does.
 const MIN_RESPONSE_GAIN: f64 = 0.15;
-/// What is smaller is an error of the model.
+/// What is smaller is an error of the model, also of what is known.
 const MIN_RESPONSE: f64 = 0.2;
 /// Smallest tone curve that is better fitted to all grey values than left out along the edges; sharpening moves no edge.
 const MIN_CURVE: f64 = 0.4;
@@ -86,12 +87,12 @@ pub(crate) fn fit_processed_design(
     let light = PhotometricModel { beyond: 0.0, shade: [0.0; 2], ..near.model };
     let half_px = homography.shortest_side_px() / 2.0;
     let loss = Loss { limit: f64::INFINITY, is_huber: true };
-    let response = CameraResponse::LINEAR;
-    let mut state = State { homography, light, response, half_px, loss };
+    let (response, known) = (CameraResponse::LINEAR, None);
+    let mut state = State { homography, light, response, known, half_px, loss };
     let pixels = &mut scratch.pixels;
     grid.gather(target, &homography, light.spread_px, MAX_PIXELS[1], pixels)?;
     state.expose(&grid, pixels)?;
-    let (state, equations) = processed(&state, &grid, scratch)?;
+    let (state, equations) = processed(&state, &grid, target.response, scratch)?;
     (state.response.curve > MIN_CURVE).then(|| state.result(&equations))?
 }
 
@@ -101,13 +102,13 @@ fn fit_grid(
     spread_px: f64,
     scratch: &mut Scratch,
 ) -> Option<Fit> {
-    let Target { start, .. } = target;
+    let Target { start, response: known_response, .. } = target;
     let light =
         PhotometricModel { black: 0.0, contrast: 1.0, shade: [0.0; 2], beyond: 0.0, spread_px };
     let loss = Loss { limit: f64::INFINITY, is_huber: true };
     let half_px = start.shortest_side_px() / 2.0;
-    let response = CameraResponse::LINEAR;
-    let mut state = State { homography: *start, light, response, half_px, loss };
+    let (response, known) = (CameraResponse::LINEAR, None);
+    let mut state = State { homography: *start, light, response, known, half_px, loss };
     let mut solved: Option<NormalEquations<UNKNOWNS, Residuals>> = None;
     for (max_pixels, settled_px) in MAX_PIXELS.into_iter().zip(SETTLED_PX) {
         let is_complete = grid.gather(
@@ -133,22 +134,36 @@ fn fit_grid(
             break;
         }
     }
-    match processed(&state, grid, scratch) {
+    match processed(&state, grid, known_response, scratch) {
         Some((state, equations)) => state.result(&equations),
         None => state.result(&solved?),
     }
 }
 
-/// The fit with a camera's processing, from one without; `None` where that explains the pixels as well.
+/// The fit with a camera's processing, from one without; `None` where that explains the pixels as well, and of a camera
+/// that is `known` to have none.
 fn processed(
     plain: &State,
     grid: &PatternGrid,
+    known: Option<ResponseEstimate>,
     scratch: &mut Scratch,
 ) -> Option<(State, NormalEquations<UNKNOWNS_PROCESSED, Residuals>)> {
     // What the narrow loss takes for outliers may be the processing.
     let wide = Loss { limit: 0.25 * plain.light.contrast.abs(), is_huber: true };
     let start = State { loss: wide, ..*plain };
     let Scratch { pixels, magnitudes, .. } = &mut *scratch;
+    let settled_px = SETTLED_PX[1];
+    if let Some(known) = known {
+        let response = CameraResponse::known(&known);
+        if response.curve.abs().max(response.sharpening) < MIN_RESPONSE {
+            return None;
+        }
+        let start = State { response, known: Some(known), ..start };
+        let mut problem =
+            Photometric::<UNKNOWNS_PROCESSED> { grid, pixels, magnitudes, settled_px };
+        let minimum = minimise(&mut problem, start, &SCHEDULE)?;
+        return Some((minimum.place, minimum.equations));
+    }
     let first = start.equations::<UNKNOWNS_PROCESSED>(grid, pixels, RESPONSE_STRIDE)?;
     let gain = first.step(1e-6, 1e-9)?.dot(&first.right);
     // What a step without the processing would gain.
@@ -158,7 +173,6 @@ fn processed(
     if gain - plain_gain < MIN_RESPONSE_GAIN * (first.cost - plain_gain) {
         return None;
     }
-    let settled_px = SETTLED_PX[1];
     let mut problem = Photometric::<UNKNOWNS_PROCESSED> { grid, pixels, magnitudes, settled_px };
     let minimum = minimise(&mut problem, start, &SCHEDULE)?;
     let found = State { loss: wide, ..minimum.place };
@@ -177,6 +191,8 @@ struct State {
     homography: Homography,
     light: PhotometricModel,
     response: CameraResponse,
+    /// What the response is held to.
+    known: Option<ResponseEstimate>,
     /// Half the marker, the unit of `shade`.
     half_px: f64,
     loss: Loss,
@@ -192,6 +208,11 @@ struct Loss {
 }
 
 impl Loss {
+    /// Standard deviation of a pixel for which the limit is made.
+    fn deviation(&self) -> f64 {
+        self.limit / 3.0
+    }
+
     #[inline]
     fn influence(&self, residual: f64) -> Influence {
         let size = residual.abs();
@@ -330,12 +351,24 @@ impl State {
         }
         let variance = residuals.variance() * residuals.weight / freedom;
         let inverse = inverse(&equations.matrix)?;
+        let told = |index: usize, value: f64, known: Option<Measured>| {
+            let variance = inverse.get((index, index))? * variance;
+            Measured { value, deviation: variance.sqrt() }.without(known)
+        };
+        let CameraResponse { curve, sharpening } = self.response;
+        let response = (N == UNKNOWNS_PROCESSED).then(|| {
+            Some(ResponseEstimate {
+                curve: told(UNKNOWNS, curve, self.known.map(|known| known.curve))?,
+                sharpening: told(UNKNOWNS + 1, sharpening, self.known.map(|k| k.sharpening))?,
+            })
+        });
         Some(Fit {
             homography: self.homography,
             covariance: SMatrix::<f64, 8, 8>::from_fn(|i, j| inverse[(i, j)]) * variance,
             model: self.light,
             residual: variance.sqrt() / contrast,
             is_shift_known: true,
+            response: response.flatten(),
         })
     }
 
@@ -414,6 +447,19 @@ impl State {
                 right[i] += scaled * residual;
                 for (entry, other) in row[i..].iter_mut().zip(&gradient[i..]) {
                     *entry += scaled * other;
+                }
+            }
+        }
+        if let Some(known) = self.known {
+            let CameraResponse { curve, sharpening } = self.response;
+            let held = [(curve, known.curve), (sharpening, known.sharpening)];
+            for (index, (now, known)) in (UNKNOWNS..N).zip(held) {
+                let weight = (self.loss.deviation() / known.deviation).powi(2);
+                let off = known.value - now;
+                if let Some(row) = matrix.get_mut(index) {
+                    row[index] += weight;
+                    right[index] += weight * off;
+                    total_cost += weight * off * off;
                 }
             }
         }

@@ -97,7 +97,7 @@ pub(crate) fn guess<'a>(
     corners: &'a [Pixel; 4],
     camera: &'a CameraModel,
 ) -> CornerGuess<'a> {
-    CornerGuess { view, corners, camera: Some(camera), is_near: false }
+    CornerGuess { view, corners, camera: Some(camera), is_near: false, response: None }
 }
 
 pub(crate) fn errors(scenes: usize, noises: usize, make: impl Fn(u64) -> Scene) -> Errors {

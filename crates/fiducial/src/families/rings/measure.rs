@@ -10,6 +10,7 @@ use super::photometric::{
 use crate::candidates::ring_profile::{MIN_SCORE, MIN_STEP, RingCandidate, SMALL_PX};
 use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
 use crate::optics::camera_response::CameraResponse;
+use crate::response::ResponseEstimate;
 use crate::trace::Reason;
 
 /// Maximum photometric residual, as a share of the contrast. Something else in the image, such as a shadow's
@@ -85,6 +86,8 @@ pub(super) struct MeasuredMarker {
     pub(super) alternative: Option<MirroredPose>,
     /// From 0 to 1.
     pub(super) confidence: f64,
+    /// How the camera shows light, where that was fitted.
+    pub(super) response: Option<ResponseEstimate>,
 }
 
 /// A pose fitted to edges.
@@ -417,7 +420,8 @@ impl EdgeSearch<'_> {
             .refined(edges, self.camera)
             .filter(|(other, _)| other.normal.angle(&pose.normal) > DISTINCT_TILT)
             .map(|(pose, rms_px)| MirroredPose { pose, rms_px });
-        Some(MeasuredMarker { pose, rms_px, covariance, alternative, confidence })
+        let response = None;
+        Some(MeasuredMarker { pose, rms_px, covariance, alternative, confidence, response })
     }
 }
 
@@ -436,6 +440,7 @@ fn from_photometric(fit: &PhotometricPoses, confidence: f64) -> Option<MeasuredM
             rms_px: rms_px(other.blur_px, other.residual),
         }),
         confidence,
+        response: best.told,
     })
 }
 

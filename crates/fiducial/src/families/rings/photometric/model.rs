@@ -7,6 +7,7 @@ use nalgebra::SMatrix;
 use crate::families::rings::circle_pose::CirclePose;
 use crate::optics::camera_response::CameraResponse;
 use crate::optics::mosaic::Mosaic;
+use crate::response::ResponseEstimate;
 
 /// Grey values above this are saturated: the light may be of any brightness.
 pub(super) const MAX_GREY: f64 = 254.5;
@@ -78,6 +79,8 @@ pub(crate) struct PhotometricFit {
     /// Standard deviation of the blur, in pixels.
     pub(crate) blur_px: f64,
     pub(crate) response: CameraResponse,
+    /// The same with its deviations, where it was fitted.
+    pub(crate) told: Option<ResponseEstimate>,
     /// The mosaic from which the pixels were interpolated.
     pub(crate) mosaic: Option<Mosaic>,
     /// Of a small marker: how far the radii that fit best are from its own.

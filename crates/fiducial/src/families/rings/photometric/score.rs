@@ -8,7 +8,9 @@ use super::model::{
 };
 use super::scene::Scene;
 use super::solve::{ModelFit, RingModel, Sums};
+use crate::optics::camera_response::CameraResponse;
 use crate::optics::least_squares::huber;
+use crate::response::{Measured, ResponseEstimate};
 
 /// Prior standard deviation of the normal, in radians.
 const PRIOR_NORMAL: f64 = 0.6;
@@ -217,9 +219,21 @@ impl Scene<'_> {
 
     /// A fit with its covariance and a score that may come from fewer samples.
     pub(super) fn with_score(&self, fit: &ModelFit, score: &Score) -> Option<PhotometricFit> {
+        let all = self.covariance(fit)?;
+        let told = (self.extras == Extras::Response).then(|| {
+            let CameraResponse { curve, sharpening } = fit.model.response;
+            let told = |index: usize, value: f64| Measured {
+                value,
+                deviation: all[(index, index)].sqrt(),
+            };
+            ResponseEstimate {
+                curve: told(UNKNOWNS, curve),
+                sharpening: told(UNKNOWNS + 1, sharpening),
+            }
+        });
         Some(PhotometricFit {
             pose: fit.model.pose,
-            covariance: self.covariance(fit)?,
+            covariance: all.fixed_view::<5, 5>(0, 0).into_owned(),
             residual: fit.residual(self),
             r_squared: score.r_squared,
             disc_ratio: score.disc_ratio,
@@ -228,13 +242,17 @@ impl Scene<'_> {
             black: fit.model.black,
             blur_px: fit.model.blur_px,
             response: fit.model.response,
+            told,
             mosaic: self.mosaic,
             radii: self.radii_count.then(|| fit.model.radii(self, fit.huber_limit)).flatten(),
         })
     }
 
-    /// Covariance of the pose, from the remaining residuals: noise and errors of the model.
-    fn covariance(&self, fit: &ModelFit) -> Option<SMatrix<f64, 5, 5>> {
+    /// Covariance of all that was fitted, from the remaining residuals: noise and errors of the model.
+    fn covariance(
+        &self,
+        fit: &ModelFit,
+    ) -> Option<SMatrix<f64, UNKNOWNS_WITH_EXTRAS, UNKNOWNS_WITH_EXTRAS>> {
         let Sums { count, pose_variance } = fit.equations.extra;
         let unknowns = match self.extras {
             Extras::Nothing => UNKNOWNS,
@@ -250,7 +268,6 @@ impl Scene<'_> {
         for i in 3..5 {
             information[(i, i)] += 1.0 / (PRIOR_NORMAL * PRIOR_NORMAL);
         }
-        let all = information.cholesky()?.inverse();
-        Some(all.fixed_view::<5, 5>(0, 0).into_owned())
+        Some(information.cholesky()?.inverse())
     }
 }
