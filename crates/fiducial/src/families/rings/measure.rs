@@ -38,9 +38,13 @@ const R_SQUARED_INTERPOLATED_PER_PX: f64 = 0.01;
 /// ... where ink is no blacker than this grey level, the tone curve no flatter than this, ...
 const MIN_BLACK: f64 = 0.0;
 const MIN_CURVE: f64 = -0.1;
-/// ... and the radii differ from the marker's by no more than this share of its radius, with this standard deviation.
+/// ... and the radii differ from the marker's by no more than this share of its radius, with this standard deviation, ...
 const MAX_RADII_OFF: f64 = 0.028;
 const MAX_RADII_DEVIATION: f64 = 0.03;
+/// ... or by no more than that, where the image is by so many standard deviations not that of evenly wide rings. A single radius
+/// is hardly seen through compression, how all of them differ together is.
+const MAX_RADII_OFF_CLEAR: f64 = 0.045;
+const EVENNESS_SIGMAS: f64 = 2.0;
 /// Maximum place between the marker (0) and a target of evenly wide rings (1). True markers at the positions of the thesis have
 /// 0.23 at most, in all kinds of cameras; drawn targets 0.39 at least where as much is explained.
 const MAX_EVENNESS: f64 = 0.3;
@@ -494,9 +498,11 @@ fn has_even_rings(fit: &PhotometricFit) -> bool {
 fn has_marker_radii(fit: &PhotometricFit) -> bool {
     const BALANCE: std::ops::Range<f64> = 0.975..1.05;
     BALANCE.contains(&fit.ring_balance)
-        && fit
-            .radii
-            .is_none_or(|radii| radii.off < MAX_RADII_OFF && radii.deviation < MAX_RADII_DEVIATION)
+        && fit.radii.is_none_or(|radii| {
+            let evenness = radii.evenness + EVENNESS_SIGMAS * radii.evenness_deviation;
+            let max_off = if evenness < MAX_EVENNESS { MAX_RADII_OFF_CLEAR } else { MAX_RADII_OFF };
+            radii.off < max_off && radii.deviation < MAX_RADII_DEVIATION
+        })
 }
 
 /// Whether a fit needs no camera's processing, or is so close with it that rings of other radii are not: a tone curve
