@@ -2,11 +2,11 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use super::blur::FREE_RADII;
+use super::blur::{FREE_RADII, PixelResponse};
 use super::model::{
     Alternative, Extras, MAX_GREY, PhotometricFit, Radii, UNKNOWNS, UNKNOWNS_WITH_EXTRAS,
 };
-use super::scene::Scene;
+use super::scene::{PixelSample, Scene};
 use super::solve::{ModelFit, RingModel, Sums};
 use crate::optics::camera_response::CameraResponse;
 use crate::optics::least_squares::huber;
@@ -65,6 +65,8 @@ impl RingModel {
     }
 }
 
+/// Circles of the marker.
+const CIRCLES: usize = 6;
 /// The unknowns of a fit in which radii are free as well.
 const UNKNOWNS_WITH_RADII: usize = UNKNOWNS_WITH_EXTRAS + FREE_RADII;
 /// The columns of both: the radii by themselves, and all of them together towards evenly wide rings.
@@ -115,21 +117,9 @@ impl RingModel {
             let weight = huber(residual, huber_limit).weight;
             count += 1.0;
             squares += weight * residual * residual;
-            let [x, y] = sample.offset;
-            let white = shown.shown;
             let mut gradient = SVector::<f64, COLUMNS>::zeros();
-            let by_distance = contrast * shown.by_distance;
-            let by_extras = match scene.extras {
-                Extras::Nothing => [0.0; 2],
-                Extras::Motion => shown.by_motion,
-                Extras::Response => shown.by_response,
-            };
-            let parts = shown
-                .distance_by_pose
-                .map(|by| by * by_distance)
+            let parts = by_unknowns(scene, sample, &shown, contrast)
                 .into_iter()
-                .chain([contrast * shown.by_blur, 1.0 - white, white, white * x, white * y])
-                .chain(by_extras.map(|by| by * contrast))
                 .chain(by_radii.map(|by| by * contrast))
                 .chain([by_evenness * contrast]);
             for (slot, part) in gradient.iter_mut().zip(parts) {
@@ -169,6 +159,56 @@ impl RingModel {
             evenness: with_evenness.step[UNKNOWNS_WITH_EXTRAS],
             evenness_deviation: with_evenness.variance[UNKNOWNS_WITH_EXTRAS].sqrt(),
         })
+    }
+}
+
+/// The derivatives of a pixel's grey value by all that is fitted.
+fn by_unknowns(
+    scene: &Scene<'_>,
+    sample: &PixelSample,
+    shown: &PixelResponse,
+    contrast: f64,
+) -> [f64; UNKNOWNS_WITH_EXTRAS] {
+    let [x, y] = sample.offset;
+    let white = shown.shown;
+    let [a, b, c, d, e] = shown.distance_by_pose.map(|by| by * contrast * shown.by_distance);
+    let [f, g] = match scene.extras {
+        Extras::Nothing => [0.0; 2],
+        Extras::Motion => shown.by_motion.map(|by| by * contrast),
+        Extras::Response => shown.by_response.map(|by| by * contrast),
+    };
+    let by_blur = contrast * shown.by_blur;
+    [a, b, c, d, e, by_blur, 1.0 - white, white, white * x, white * y, f, g]
+}
+
+impl RingModel {
+    /// How strongly the pixels about each circle pull at all that is fitted; together they are in balance.
+    fn pulls(
+        &self,
+        scene: &Scene<'_>,
+        huber_limit: f64,
+    ) -> Option<[SVector<f64, UNKNOWNS_WITH_EXTRAS>; CIRCLES]> {
+        let mut pulls = [SVector::zeros(); CIRCLES];
+        self.for_each_place(scene, |sample, radius, wide| {
+            let mut shown = radius.response(scene);
+            if let Some(wide) = wide {
+                let blurred = wide.radius.response(scene);
+                shown = wide.processed(&shown, &blurred, &self.response);
+            }
+            let (grey, contrast) = self.grey(sample, shown.shown);
+            if sample.grey > MAX_GREY && grey > MAX_GREY {
+                return;
+            }
+            let residual = sample.grey - grey;
+            let weight = huber(residual, huber_limit).weight;
+            let off = |(circle, _): &(f64, f64)| (circle - radius.at.rho).abs();
+            let beside = pulls.iter_mut().zip(&scene.radii);
+            if let Some((pull, _)) = beside.min_by(|a, b| off(a.1).total_cmp(&off(b.1))) {
+                let gradient = by_unknowns(scene, sample, &shown, contrast);
+                *pull += SVector::from(gradient) * (weight * residual);
+            }
+        })?;
+        Some(pulls)
     }
 }
 
@@ -268,6 +308,23 @@ impl Scene<'_> {
         for i in 3..5 {
             information[(i, i)] += 1.0 / (PRIOR_NORMAL * PRIOR_NORMAL);
         }
-        Some(information.cholesky()?.inverse())
+        let mut all = information.cholesky()?.inverse();
+        if self.extras == Extras::Response {
+            // The model of a camera's processing is not quite the camera's: all edges of a circle are off together, and those of
+            // different circles differently. Then the circles are what is independent, not the pixels (a cluster-robust
+            // covariance).
+            const FEW: f64 = CIRCLES as f64 / (CIRCLES - 1) as f64;
+            let pulls = fit.model.pulls(self, fit.huber_limit)?;
+            let spread = pulls.iter().map(|pull| (all * pull / variance).map(|by| by * by));
+            let spread = spread.sum::<SVector<f64, UNKNOWNS_WITH_EXTRAS>>() * FEW;
+            let wider =
+                spread.zip_map(&all.diagonal(), |clustered, own| (clustered / own).max(1.0).sqrt());
+            for (row, by_row) in wider.iter().enumerate() {
+                for (column, by_column) in wider.iter().enumerate() {
+                    all[(row, column)] *= by_row * by_column;
+                }
+            }
+        }
+        Some(all)
     }
 }
