@@ -45,8 +45,10 @@ let hasVideo = false;
 let socket = null;
 let pause = RECONNECT_MS;
 const map = new Map2();
-/** Makes the pictures come over a new connection where none come. @type {(() => void) | null} */
-let videoAgain = null;
+/** What makes the pictures. @type {import('./picture.js').Follower | null} */
+let video = null;
+/** Whether what was refused is to be shown. */
+let isCurious = false;
 
 /** Time since the server told something, at least: since it came, or by the server's stamp, so that a slow way counts as well.
  * @param {number} at @param {number} cameAt @param {number | null} stampMs */
@@ -403,13 +405,36 @@ function pictureTold(message) {
   // Of another host's clock nobody knows here when the light came.
   strips.picture.add(at, header.is_own_clock ? light : null);
   const seen = header.markers === null ? 'nobody has told in time what is in it' : `${header.detector}${header.is_used ? '' : ' (not in use)'} found ${header.markers.length} in it`;
+  showRefused(header);
   put('video-text', `${header.camera} ${header.sequence}, ${header.width} x ${header.height}: ${seen}${light === null ? '' : `; ${light.toFixed(0)} ms after ${header.is_own_clock ? 'the light' : 'it came'}`}.`);
 }
+
+/** What the detector refused in the picture that is shown, by reason.
+ * @param {any} header */
+function showRefused({ detector, refused, refused_total: total }) {
+  const text = () => {
+    if (!isCurious) return '';
+    if (!refused) return 'The detector has not told in time what it refused.';
+    if (total === 0) return `${detector} refused nothing in it.`;
+    const counts = new Map();
+    for (const { reason } of refused) counts.set(reason, (counts.get(reason) ?? 0) + 1);
+    const reasons = [...counts].sort((a, b) => b[1] - a[1]).map(([reason, count]) => `${count} ${reason}`).join(', ');
+    return `${detector} refused ${total} candidate${total === 1 ? '' : 's'} in it${refused.length < total ? `, of which the ${refused.length} largest are drawn` : ''}: ${reasons}.`;
+  };
+  put('refused-text', text());
+}
+
+element('refused').addEventListener('click', () => {
+  isCurious = !isCurious;
+  element('refused').setAttribute('aria-pressed', String(isCurious));
+  video?.curious(isCurious);
+  if (!isCurious) put('refused-text', '');
+});
 
 function startVideo() {
   // A canvas is handed over once. Its connection comes back by itself where it ends; one that hangs does not tell.
   if (hasVideo) {
-    videoAgain?.();
+    video?.again();
     return;
   }
   hasVideo = true;
@@ -420,15 +445,19 @@ function startVideo() {
     [image.id, image.alt, image.src] = ['video', "The camera's picture", '/video.mjpeg'];
     canvas.replaceWith(image);
     put('video-text', 'This browser cannot draw what was found into its picture, and does not tell how old a picture is.');
-    videoAgain = () => { image.src = `/video.mjpeg?${performance.now()}`; };
+    element('refused').hidden = true;
+    video = { again: () => { image.src = `/video.mjpeg?${performance.now()}`; }, curious: () => {} };
   } else if ('transferControlToOffscreen' in canvas && 'Worker' in window) {
     const offscreen = canvas.transferControlToOffscreen();
     const worker = new Worker('/worker.js', { type: 'module' });
     worker.onmessage = (event) => pictureTold(event.data);
     worker.postMessage({ canvas: offscreen, address: url }, [offscreen]);
-    videoAgain = () => worker.postMessage({ again: true });
+    video = {
+      again: () => worker.postMessage({ again: true }),
+      curious: (is) => worker.postMessage({ curious: is }),
+    };
   } else {
-    videoAgain = follow(canvas, url, pictureTold);
+    video = follow(canvas, url, pictureTold);
   }
 }
 

@@ -5,27 +5,39 @@ const RECONNECT_MS = 500;
 const MAX_RECONNECT_MS = 2000;
 /** A connection that brought something within this time does not hang, in milliseconds. */
 const LIVELY_MS = 1000;
+/** Asks the server for what was refused, and for no more of it. */
+const REFUSED = 'refused';
+const NOTHING_REFUSED = 'nothing refused';
 
-/** Follows the pictures and draws each; `told` hears of each, and of the connection. Gives what connects anew where nothing comes.
- * @param {HTMLCanvasElement | OffscreenCanvas} canvas @param {string} address @param {(message: any) => void} told */
+/** What follows the pictures: `again` connects anew where nothing comes, `curious` says whether to show what was refused.
+ * @typedef {{ again: () => void, curious: (is: boolean) => void }} Follower */
+
+/** Follows the pictures and draws each; `told` hears of each, and of the connection.
+ * @param {HTMLCanvasElement | OffscreenCanvas} canvas @param {string} address @param {(message: any) => void} told @returns {Follower} */
 export function follow(canvas, address, told) {
   const context = /** @type {any} */ (canvas.getContext('2d', { alpha: false }));
   let pause = RECONNECT_MS;
   let drawn = 0;
   let heardAt = -Infinity;
   let timer = 0;
+  let isCurious = false;
   /** @type {WebSocket | null} */
   let current = null;
   const connect = () => {
     const socket = new WebSocket(address);
     current = socket;
     socket.binaryType = 'arraybuffer';
-    socket.onopen = () => { pause = RECONNECT_MS; };
+    socket.onopen = () => {
+      pause = RECONNECT_MS;
+      if (isCurious) socket.send(REFUSED);
+    };
     /** @param {ArrayBuffer} message */
     const show = async (message) => {
       const { header, bitmaps } = await decode(message);
       // Of a connection that was given up nothing is drawn over what is newer.
       if (socket !== current) return;
+      // Another browser may have asked, which is nothing to this one.
+      if (!isCurious) header.refused = null;
       draw(canvas, context, header, bitmaps);
       drawn += 1;
       // Only what was drawn is acknowledged: at most two pictures are on their way.
@@ -46,13 +58,19 @@ export function follow(canvas, address, told) {
     };
   };
   connect();
-  return () => {
+  const again = () => {
     if (performance.now() - heardAt < LIVELY_MS) return;
     clearTimeout(timer);
     const old = current;
     connect();
     old?.close();
   };
+  /** @param {boolean} is */
+  const curious = (is) => {
+    isCurious = is;
+    if (current?.readyState === WebSocket.OPEN) current.send(is ? REFUSED : NOTHING_REFUSED);
+  };
+  return { again, curious };
 }
 
 /** Header and bitmaps of a message. @param {ArrayBuffer} message */
@@ -93,10 +111,44 @@ function draw(canvas, context, header, bitmaps) {
   context.save();
   context.translate(0.5, 0.5);
   const unit = header.width / 650;
+  refusals(context, header.refused ?? [], unit);
   for (const marker of header.markers ?? []) {
     overlay(context, marker, unit, header.is_used ? '#59ff8b' : '#ffd166');
   }
   context.restore();
+}
+
+/** Outlines of candidates that were refused, with the reasons where there is room for them.
+ * @param {any} context @param {any[]} refused @param {number} unit */
+function refusals(context, refused, unit) {
+  context.lineWidth = unit;
+  context.strokeStyle = '#ff8cf0';
+  context.font = `${Math.round(9 * unit)}px sans-serif`;
+  /** @type {number[][]} */
+  const written = [];
+  for (const { reason, corners, edges } of refused) {
+    context.beginPath();
+    for (const { centre: [u, v], axes: [minor, major], angle } of edges ?? []) {
+      context.moveTo(u + (minor / 2) * Math.cos(angle), v + (minor / 2) * Math.sin(angle));
+      context.ellipse(u, v, minor / 2, major / 2, angle, 0, 2 * Math.PI);
+    }
+    for (const [u, v] of corners ?? []) context.lineTo(u, v);
+    context.closePath();
+    context.stroke();
+    const points = corners ?? edges.map((/** @type {any} */ it) => [it.centre[0] - it.axes[1] / 2, it.centre[1] + it.axes[1] / 2]);
+    const x = Math.min(...points.map((/** @type {number[]} */ it) => it[0]));
+    const y = Math.max(...points.map((/** @type {number[]} */ it) => it[1]));
+    const width = context.measureText(reason).width;
+    // The largest come first, and their words are not written over.
+    const isFree = written.every(([left, base, wide]) => Math.abs(base - y) > 11 * unit || x > left + wide || left > x + width);
+    if (isFree) {
+      context.fillStyle = 'rgba(0, 0, 0, 0.7)';
+      context.fillRect(x - unit, y, width + 2 * unit, 11 * unit);
+      context.fillStyle = '#ff8cf0';
+      context.fillText(reason, x, y + 9 * unit);
+      written.push([x, y, width]);
+    }
+  }
 }
 
 /** Outline, centre and name of a marker.

@@ -2,11 +2,12 @@
 // Pictures beside the page's own thread, so that neither waits for the other, also in a hidden tab.
 import { follow } from './picture.js';
 
-/** @type {(() => void) | null} */
-let again = null;
+/** @type {import('./picture.js').Follower | null} */
+let follower = null;
 
 self.onmessage = (event) => {
-  const { canvas, address } = event.data;
-  if (canvas) again = follow(canvas, address, (message) => self.postMessage(message));
-  else again?.();
+  const { canvas, address, again, curious } = event.data;
+  if (canvas) follower = follow(canvas, address, (message) => self.postMessage(message));
+  if (again) follower?.again();
+  if (curious !== undefined) follower?.curious(curious);
 };

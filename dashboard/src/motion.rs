@@ -25,7 +25,7 @@ const SEND_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Makes each picture one file, while somebody follows.
 pub(crate) async fn run(node: Node, pictures: Pictures, quality: u8) -> anyhow::Result<()> {
-    let Pictures { shown, files } = pictures;
+    let Pictures { shown, files, .. } = pictures;
     loop {
         while files.receiver_count() == 0 {
             sleep(LOOK_PERIOD).await;

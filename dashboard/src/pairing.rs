@@ -1,12 +1,12 @@
 //! A picture together with what the detector found in that very picture.
 //!
-//! Pictures wait until the detections of their frame arrive, the same camera, number and stamp, or for a short time. What
-//! was found in one picture is never drawn over another.
+//! Pictures wait until the detections of their frame arrive, the same camera, number and stamp, or for a short time; where somebody
+//! asks what was refused, also for that. What was found in one picture is never drawn over another.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use messages::{Detections, FrameHeader};
+use messages::{Detections, FrameHeader, Refusals};
 
 /// Maximum number of pictures that wait.
 const MAX_WAITING: usize = 8;
@@ -26,6 +26,8 @@ pub struct Picture {
     pub found: Option<Detections>,
     /// Whether that was found by the detector in use.
     pub is_used: bool,
+    /// What the same detector refused in it; `None` when nobody asked, or it has not told in time.
+    pub refused: Option<Refusals>,
 }
 
 /// Joins pictures and detections.
@@ -34,12 +36,19 @@ pub struct Pairing {
     hold_ns: i64,
     waiting: VecDeque<Picture>,
     detections: VecDeque<Detections>,
+    /// As far as somebody asks; those of the newest frames.
+    refusals: VecDeque<Refusals>,
 }
 
 impl Pairing {
     /// Pictures wait this long, in nanoseconds.
     pub fn new(hold_ns: i64) -> Self {
-        Self { hold_ns, waiting: VecDeque::new(), detections: VecDeque::new() }
+        Self {
+            hold_ns,
+            waiting: VecDeque::new(),
+            detections: VecDeque::new(),
+            refusals: VecDeque::new(),
+        }
     }
 
     /// Adds the picture of a frame; true when an older one had to go for it.
@@ -55,6 +64,7 @@ impl Pairing {
             received_ns: now_ns,
             found: None,
             is_used: false,
+            refused: None,
         });
         is_full
     }
@@ -67,16 +77,31 @@ impl Pairing {
         self.detections.push_back(detections);
     }
 
+    /// Adds what a detector refused. From then on pictures wait for that as well.
+    pub fn refusals(&mut self, refusals: Refusals) {
+        if self.refusals.len() >= MAX_DETECTIONS {
+            self.refusals.pop_front();
+        }
+        self.refusals.push_back(refusals);
+    }
+
+    /// Forgets what was refused, as nobody asks any more.
+    pub fn forget_refusals(&mut self) {
+        self.refusals.clear();
+    }
+
     /// The newest picture that is ready; older ones are never shown after it.
     ///
     /// A picture is ready once the detector in use has told what is in it, or any one while none is in use, or when it has
     /// waited long enough.
     pub fn ready(&mut self, now_ns: i64, in_use: Option<&str>) -> Option<Picture> {
-        let (hold_ns, detections) = (self.hold_ns, &self.detections);
+        let (hold_ns, detections, refusals) = (self.hold_ns, &self.detections, &self.refusals);
         let is_ready = |picture: &Picture| {
             let is_late = now_ns.saturating_sub(picture.received_ns) >= hold_ns;
-            let is_told = in_frame(detections, &picture.header)
-                .any(|told| in_use.is_none_or(|in_use| in_use == told.detector));
+            let is_told = in_frame(detections, &picture.header).any(|told| {
+                in_use.is_none_or(|in_use| in_use == told.detector)
+                    && !lacks_refusals(refusals, told)
+            });
             is_late || is_told
         };
         let newest = self.waiting.iter().rposition(is_ready)?;
@@ -86,6 +111,8 @@ impl Pairing {
         picture.is_used = used.is_some();
         picture.found =
             used.or_else(|| in_frame(&self.detections, &picture.header).next()).cloned();
+        let refused = picture.found.as_ref().and_then(|found| refused(&self.refusals, found));
+        picture.refused = refused.cloned();
         Some(picture)
     }
 
@@ -99,12 +126,23 @@ fn in_frame<'a>(
     detections: &'a VecDeque<Detections>,
     header: &'a FrameHeader,
 ) -> impl Iterator<Item = &'a Detections> {
-    let is_of = |told: &&Detections| {
-        let told = &told.header;
-        (&told.camera, told.sequence, told.stamp_ns, &told.clock)
-            == (&header.camera, header.sequence, header.stamp_ns, &header.clock)
-    };
-    detections.iter().rev().filter(is_of)
+    detections.iter().rev().filter(|told| is_same(&told.header, header))
+}
+
+fn is_same(told: &FrameHeader, header: &FrameHeader) -> bool {
+    (&told.camera, told.sequence, told.stamp_ns, &told.clock)
+        == (&header.camera, header.sequence, header.stamp_ns, &header.clock)
+}
+
+/// What the detector that told this refused in the same frame.
+fn refused<'a>(refusals: &'a VecDeque<Refusals>, told: &Detections) -> Option<&'a Refusals> {
+    let mut refusals = refusals.iter().rev();
+    refusals.find(|it| it.detector == told.detector && is_same(&it.header, &told.header))
+}
+
+/// Whether a detector that tells what it refuses has not told it of this frame yet. Others are not waited for.
+fn lacks_refusals(refusals: &VecDeque<Refusals>, told: &Detections) -> bool {
+    refusals.iter().any(|it| it.detector == told.detector) && refused(refusals, told).is_none()
 }
 
 #[cfg(test)]
@@ -169,11 +207,45 @@ mod tests {
     }
 
     #[test]
+    fn what_was_refused_belongs_to_the_very_picture() {
+        let refused = |detector: &str, number: u64| Refusals {
+            detector: detector.into(),
+            header: header(number),
+            ..Refusals::sample()
+        };
+        let mut pairing = Pairing::new(HOLD);
+        pairing.picture(0, header(1), vec![1]);
+        pairing.detections(told("main", 1));
+        assert!(pairing.ready(1, Some("main")).unwrap().refused.is_none(), "nobody asked");
+        // Once it tells what it refuses a picture waits for that, and for nobody else's.
+        pairing.refusals(refused("main", 1));
+        pairing.picture(2, header(2), vec![2]);
+        pairing.detections(told("main", 2));
+        pairing.refusals(refused("spare", 2));
+        assert!(pairing.ready(3, Some("main")).is_none());
+        pairing.refusals(refused("main", 2));
+        let shown = pairing.ready(3, Some("main")).unwrap();
+        assert_eq!(shown.refused.unwrap(), refused("main", 2));
+        // Where it does not tell in time there is none, and never that of another frame.
+        pairing.picture(4, header(3), vec![3]);
+        pairing.detections(told("main", 3));
+        assert!(pairing.ready(5, Some("main")).is_none());
+        let late = pairing.ready(4 + HOLD, Some("main")).unwrap();
+        assert!(late.is_used && late.refused.is_none());
+        pairing.forget_refusals();
+        pairing.picture(200, header(4), vec![4]);
+        pairing.detections(told("main", 4));
+        assert!(pairing.ready(200, Some("main")).is_some());
+    }
+
+    #[test]
     fn what_waits_is_bounded() {
         let mut pairing = Pairing::new(HOLD);
         let lost = (0..20).filter(|number| pairing.picture(0, header(*number), Vec::new())).count();
         assert_eq!((lost, pairing.waiting.len()), (20 - MAX_WAITING, MAX_WAITING));
         (0..100).for_each(|number| pairing.detections(told("main", number)));
         assert_eq!(pairing.detections.len(), MAX_DETECTIONS);
+        (0..100).for_each(|_| pairing.refusals(Refusals::sample()));
+        assert_eq!(pairing.refusals.len(), MAX_DETECTIONS);
     }
 }

@@ -68,6 +68,9 @@ const LOOK_PERIOD: Duration = Duration::from_millis(500);
 const MAX_FIRST_AGE_NS: i64 = 1_000_000_000;
 /// Replies to commands that wait to be sent to a browser, and its commands under way.
 const MAX_COMMANDS: usize = 4;
+/// What a browser says to be told with each picture what was refused in it, and to be told no more.
+const REFUSED: &str = "refused";
+const NOTHING_REFUSED: &str = "nothing refused";
 /// Time that a button is held, in milliseconds.
 const HOLD_MS: u32 = 1000;
 
@@ -427,6 +430,8 @@ async fn pictures(app: &App, mut socket: WebSocket, _permit: OwnedSemaphorePermi
         shown.mark_changed();
     }
     let mut window = Window::default();
+    // While it is held, detectors tell what they refuse.
+    let mut curious: Option<watch::Receiver<()>> = None;
     let mut look = interval(LOOK_PERIOD);
     loop {
         tokio::select! {
@@ -442,12 +447,16 @@ async fn pictures(app: &App, mut socket: WebSocket, _permit: OwnedSemaphorePermi
                 }
             }
             received = socket.recv() => match received {
-                // An acknowledgement: the number of the picture that was drawn.
-                Some(Ok(Message::Text(text))) => {
-                    if !text.parse().is_ok_and(|number| window.acknowledged(number)) {
-                        app.node.health().dropped("wrong acknowledgement");
+                Some(Ok(Message::Text(text))) => match text.as_str() {
+                    REFUSED => drop(curious.replace(app.pictures.curious.subscribe())),
+                    NOTHING_REFUSED => drop(curious.take()),
+                    // An acknowledgement: the number of the picture that was drawn.
+                    number => {
+                        if !number.parse().is_ok_and(|it| window.acknowledged(now_ns(), it)) {
+                            app.node.health().dropped("wrong acknowledgement");
+                        }
                     }
-                }
+                },
                 Some(Ok(Message::Close(_)) | Err(_)) | None => return,
                 Some(Ok(_)) => {}
             },

@@ -38,8 +38,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     let state = Arc::new(Mutex::new(State::new(clock_name())));
     let texts = Texts::default();
     let pictures = Pictures::default();
-    let shown = Arc::clone(&pictures.shown);
-    let video = Video::new(node.clone(), config.video.clone(), Arc::clone(&state), shown);
+    let video = Video::new(node.clone(), config.video.clone(), Arc::clone(&state), &pictures);
     let motion = motion::run(node.clone(), pictures.clone(), config.video.jpeg_quality);
     let address = listener.local_addr().context("the address of the page")?;
     let app =

@@ -6,8 +6,10 @@ use std::time::Duration;
 use airlink::picture::jpeg;
 use anyhow::Context;
 use axum::body::Bytes;
-use messages::{Detection, Detections, FrameHeader, topic};
-use node::{Frame, Node, now_ns};
+use messages::{
+    Detection, Detections, EllipsePx, FrameHeader, Refusal, Refusals, RefusedShape, topic,
+};
+use node::{Frame, Node, Subscriber, now_ns};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 use tokio::time::{Instant, interval, sleep, sleep_until, timeout};
@@ -25,6 +27,8 @@ const LINGER: Duration = Duration::from_secs(2);
 const MAX_BYTES: usize = 16_000_000;
 /// Maximum number of markers that are drawn.
 const MAX_MARKERS: usize = 32;
+/// Maximum number of refused candidates that are drawn.
+const MAX_REFUSALS: usize = 64;
 
 /// A picture as browsers get it.
 #[derive(Clone, Debug)]
@@ -48,6 +52,8 @@ pub(crate) struct Pictures {
     pub(crate) shown: Arc<watch::Sender<Option<Shown>>>,
     /// As one JPEG file, for programs that know only Motion JPEG.
     pub(crate) files: Arc<watch::Sender<Option<Bytes>>>,
+    /// Who wants to see what was refused, as its receivers: detectors tell it only while there is one.
+    pub(crate) curious: Arc<watch::Sender<()>>,
 }
 
 /// Makes pictures while somebody looks.
@@ -56,6 +62,7 @@ pub(crate) struct Video {
     config: VideoConfig,
     state: Arc<Mutex<State>>,
     shown: Arc<watch::Sender<Option<Shown>>>,
+    curious: Arc<watch::Sender<()>>,
     number: u64,
 }
 
@@ -64,9 +71,10 @@ impl Video {
         node: Node,
         config: VideoConfig,
         state: Arc<Mutex<State>>,
-        shown: Arc<watch::Sender<Option<Shown>>>,
+        pictures: &Pictures,
     ) -> Self {
-        Self { node, config, state, shown, number: 0 }
+        let (shown, curious) = (Arc::clone(&pictures.shown), Arc::clone(&pictures.curious));
+        Self { node, config, state, shown, curious, number: 0 }
     }
 
     /// Makes pictures until the session is closed.
@@ -89,6 +97,7 @@ impl Video {
     async fn while_watched(&mut self, topic: messages::Topic<FrameHeader>) -> anyhow::Result<()> {
         let frames = self.node.frame_subscriber(topic, &[]).await?;
         let told = self.node.subscriber(topic::DETECTIONS, &[]).await?;
+        let mut refused: Option<Subscriber<Refusals>> = None;
         let mut pairing = Pairing::new(i64::from(self.config.hold_ms) * 1_000_000);
         let mut rate = Rate::new(self.config.max_hz);
         let mut look = interval(LOOK_PERIOD);
@@ -103,7 +112,22 @@ impl Video {
                     let (key, told) = told.context("the network session was closed")?;
                     hear(&mut pairing, &key, told);
                 }
+                refusals = of_each(refused.as_ref()), if refused.is_some() => {
+                    let (key, refusals) = refusals.context("the network session was closed")?;
+                    let detector = topic::REFUSALS.first_name(&key).unwrap_or_default().to_owned();
+                    pairing.refusals(Refusals { detector, ..refusals });
+                }
                 _ = look.tick() => {
+                    match (self.curious.receiver_count() > 0, refused.is_some()) {
+                        (true, false) => {
+                            refused = Some(self.node.subscriber(topic::REFUSALS, &[]).await?);
+                        }
+                        (false, true) => {
+                            refused = None;
+                            pairing.forget_refusals();
+                        }
+                        _ => {}
+                    }
                     if self.shown.receiver_count() > 0 {
                         watched = Instant::now();
                     } else if watched.elapsed() > LINGER {
@@ -189,6 +213,14 @@ impl Video {
     }
 }
 
+/// What a detector refused next; for ever nothing without a subscriber.
+async fn of_each(refused: Option<&Subscriber<Refusals>>) -> Option<(String, Refusals)> {
+    match refused {
+        Some(refused) => refused.next_with_key().await,
+        None => std::future::pending().await,
+    }
+}
+
 /// Notes what a detector told; it is known by its key.
 fn hear(pairing: &mut Pairing, key: &str, told: Detections) {
     let detector = topic::DETECTIONS.first_name(key).unwrap_or_default().to_owned();
@@ -223,7 +255,19 @@ fn header_json(number: u64, at_ns: i64, picture: &Picture, clock: &str) -> Value
         "detector": found.map(|it| &it.detector), "is_used": picture.is_used,
         "found_sequence": found.map(|it| it.header.sequence),
         "markers": found.map(|it| it.detections.iter().take(MAX_MARKERS).map(marker).collect::<Vec<_>>()),
+        "refused": picture.refused.as_ref().map(|it| it.refusals.iter().take(MAX_REFUSALS).map(refusal).collect::<Vec<_>>()),
+        "refused_total": picture.refused.as_ref().map(|it| it.total),
     })
+}
+
+fn refusal(it: &Refusal) -> Value {
+    let ellipse = |it: &EllipsePx| json!({ "centre": it.centre_px, "axes": it.axes_px, "angle": it.angle_rad });
+    match &it.shape {
+        RefusedShape::Quad(corners) => json!({ "reason": it.reason, "corners": corners }),
+        RefusedShape::Ring(edges) => {
+            json!({ "reason": it.reason, "edges": edges.each_ref().map(ellipse) })
+        }
+    }
 }
 
 fn marker(it: &Detection) -> Value {
@@ -260,6 +304,7 @@ mod tests {
             received_ns: 5_000_000,
             found: Some(Detections::sample()),
             is_used: true,
+            refused: None,
         };
         let json = header_json(3, 9_000_000, &picture, "clock");
         assert_eq!((&json["sequence"], &json["taken_ms"]), (&json!(7), &json!(2.0)));
@@ -267,6 +312,14 @@ mod tests {
         assert_eq!(json["markers"][0]["centre"], json!([720.0, 522.0]));
         let other = header_json(3, 9_000_000, &picture, "another");
         assert_eq!((&other["is_own_clock"], &other["taken_ms"]), (&json!(false), &json!(5.0)));
+        assert_eq!((&json["refused"], &json["refused_total"]), (&Value::Null, &Value::Null));
+        let curious = Picture { refused: Some(Refusals::sample()), ..picture.clone() };
+        let json = header_json(3, 9_000_000, &curious, "clock");
+        assert_eq!(
+            (&json["refused"][0]["reason"], &json["refused_total"]),
+            (&json!("code"), &json!(1))
+        );
+        assert_eq!(json["refused"][0]["corners"][2], json!([140.0, 140.0]));
         let bare = header_json(3, 9_000_000, &Picture { found: None, ..picture }, "clock");
         assert_eq!(bare["markers"], Value::Null);
     }

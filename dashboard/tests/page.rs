@@ -13,7 +13,7 @@ use dashboard::tokens::{Kind, Tokens, secret};
 use futures_util::{SinkExt, StreamExt};
 use messages::{
     CommandReply, ControllerCommand, ControllerStatus, Detections, FrameHeader, Phase, PixelFormat,
-    topic,
+    Refusals, topic,
 };
 use node::{Identity, Layers, Node, Shutdown, ZenohSource};
 use rustls::crypto::ring;
@@ -340,6 +340,52 @@ fn camera(node: Node) -> JoinHandle<anyhow::Result<()>> {
     })
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn what_was_refused_is_told_while_somebody_asks() -> anyhow::Result<()> {
+    let page = Page::start(&["video.max_hz=30"]).await?;
+    let node = open("detector", page.meet).await?;
+    let refusals = node.publisher(topic::REFUSALS, &["main"]).await?;
+    let detections = node.subscriber(topic::DETECTIONS, &[]).await?;
+    let _camera = camera(node);
+    let _refuses = tokio::spawn(async move {
+        while let Some(Detections { header, .. }) = detections.next().await {
+            // As a detector does: for who asks, after what it found.
+            if refusals.has_subscribers().await {
+                let refused = Refusals { header, total: 7, ..Refusals::sample() };
+                refusals.publish(&refused).await;
+            }
+        }
+    });
+    let mut socket = page.socket("/video").await?;
+    let until = async |socket: &mut Socket, is_told: bool| {
+        let found = timeout(PATIENCE, async {
+            loop {
+                let Some((header, _)) = picture(socket).await? else { continue };
+                let number = header["number"].to_string();
+                socket.send(Message::text(number)).await?;
+                if header["refused"].is_null() != is_told {
+                    return anyhow::Ok(header);
+                }
+            }
+        });
+        found.await.with_context(|| format!("what was refused is told: {is_told}"))?
+    };
+    until(&mut socket, false).await?;
+    socket.send(Message::text("refused")).await?;
+    for _ in 0..5 {
+        let header = until(&mut socket, true).await?;
+        ensure!(
+            header["refused"][0]["reason"] == "code" && header["refused_total"] == 7,
+            "{header}"
+        );
+        ensure!(header["found_sequence"] == header["sequence"], "{header}");
+    }
+    socket.send(Message::text("nothing refused")).await?;
+    until(&mut socket, false).await?;
+    ensure!(page.refused("wrong acknowledgement") == 0);
+    Ok(())
+}
+
 /// The header and the file of a picture.
 async fn picture(socket: &mut Socket) -> anyhow::Result<Option<(Value, Vec<u8>)>> {
     let Ok(message) = timeout(Duration::from_millis(1500), socket.next()).await else {
@@ -521,7 +567,8 @@ async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::
     };
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("tokens");
-    let [good, old] = [secret()?, secret()?];
+    let [good, old, look] = [secret()?, secret()?, secret()?];
+    std::fs::set_permissions(&file, Permissions::from_mode(0o644))?;
     let mut tokens = Tokens::default();
     tokens.add(&old, Kind::Command, 0, 1);
     tokens.add(&good, Kind::Command, 0, u64::MAX);

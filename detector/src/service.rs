@@ -10,13 +10,14 @@ use airlink::Unpacker;
 use anyhow::Context;
 use fiducial::overlay::canvas::RgbImageBuf;
 use fiducial::overlay::debug;
+use fiducial::trace::Trace;
 use fiducial::{Detector, Observation, ResponseEstimate, ResponseSetting, StageObserver, Tracker};
 use geometry::CameraModel;
 use imaging::{Converter, GrayImage, GrayView};
 use markers::Pad;
 use messages::{
     CameraInfo, CameraResponse, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo,
-    FrameAck, FrameHeader, FramePart, PixelFormat, StageTime, topic,
+    FrameAck, FrameHeader, FramePart, PixelFormat, Refusals, StageTime, topic,
 };
 use node::{
     Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
@@ -230,12 +231,20 @@ impl Live {
     }
 }
 
+/// How the newest frame was searched: at once, or part by part.
+#[derive(Copy, Clone, Debug)]
+enum Searched {
+    Whole,
+    Parts,
+}
+
 /// Everything the image thread needs.
 struct Work {
     node: Node,
     frames: FrameSubscriber,
     detections: Publisher<Detections>,
     acks: Publisher<FrameAck>,
+    refusals: Publisher<Refusals>,
     debug: Vec<(&'static str, FramePublisher)>,
     shared: Shared,
     config: Config,
@@ -246,6 +255,8 @@ struct Work {
     detector: Detector,
     pads: Vec<Pad>,
     tracker: Tracker,
+    /// Of a frame in parts: all of them, in the whole frame's pixels.
+    parts_trace: Trace,
     overlay: RgbImageBuf,
 }
 
@@ -269,6 +280,7 @@ impl Work {
             frames: node.frame_subscriber(frames, &[&config.camera]).await?,
             detections: node.publisher(topic::DETECTIONS, &[&config.id]).await?,
             acks: node.publisher(topic::FRAME_ACK, &[&config.id]).await?,
+            refusals: node.publisher(topic::REFUSALS, &[&config.id]).await?,
             debug,
             shared,
             config: config.clone(),
@@ -278,6 +290,7 @@ impl Work {
             detector,
             pads,
             tracker: Tracker::new(config.tracking()),
+            parts_trace: Trace::default(),
             overlay: RgbImageBuf::default(),
         })
     }
@@ -347,7 +360,8 @@ impl Work {
                 }
                 let detections = self.detect(view, &frame.header, &mut clock);
                 self.publish(&frame.header, detections, clock).await;
-                self.publish_debug_images(view, &frame.header).await;
+                self.publish_refusals(&frame.header, Searched::Whole).await;
+                self.publish_debug_images(view, &frame.header, Searched::Whole).await;
             }
             Err(_) => health.dropped("frames of an impossible size"),
         }
@@ -372,10 +386,11 @@ impl Work {
         match unpacker.unpack(&frame.header, &frame.bytes()) {
             Ok(parts) => {
                 clock.ended("decode");
-                let found = self.detect_in_parts(&parts, &frame.header, &mut clock);
+                let (found, searched) = self.detect_in_parts(&parts, &frame.header, &mut clock);
                 self.publish(&frame.header, found, clock).await;
+                self.publish_refusals(&frame.header, searched).await;
                 if let Some(view) = parts.first().and_then(|(_, image)| image.view()) {
-                    self.publish_debug_images(view, &frame.header).await;
+                    self.publish_debug_images(view, &frame.header, searched).await;
                 }
             }
             Err(problem) => {
@@ -392,23 +407,26 @@ impl Work {
         parts: &[(FramePart, &GrayImage)],
         header: &FrameHeader,
         clock: &mut StageClock,
-    ) -> Vec<Detection> {
+    ) -> (Vec<Detection>, Searched) {
         if header.parts.is_empty()
             && let Some(view) = parts.first().and_then(|(_, image)| image.view())
         {
-            return self.detect(view, header, clock);
+            return (self.detect(view, header, clock), Searched::Whole);
         }
         let whole = self.camera_model(header);
         let mut found = Vec::new();
+        self.parts_trace.clear();
         for (part, image) in parts.iter().rev() {
             let Some(view) = image.view() else { continue };
             let roi = parts::roi(part);
             let camera = whole.as_ref().map(|camera| roi.camera(camera));
             let seen = self.detector.detect(view, camera.as_ref(), clock);
             parts::add_finer(&mut found, seen.iter().map(|seen| seen.mapped(&roi)));
+            self.parts_trace.add_roi(self.detector.trace(), &roi);
         }
         found.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
-        told(&found, &self.pads, whole.as_ref(), self.config.min_confidence)
+        let told = told(&found, &self.pads, whole.as_ref(), self.config.min_confidence);
+        (told, Searched::Parts)
     }
 
     fn ack(&self, frame: &Frame) -> FrameAck {
@@ -485,12 +503,32 @@ impl Work {
         None
     }
 
-    async fn publish_debug_images(&mut self, view: GrayView<'_>, header: &FrameHeader) {
+    /// What was refused in the frame that was searched last, for who asks.
+    async fn publish_refusals(&self, header: &FrameHeader, searched: Searched) {
+        if self.refusals.has_subscribers().await {
+            let trace = match searched {
+                Searched::Whole => self.tracker.trace(),
+                Searched::Parts => &self.parts_trace,
+            };
+            self.refusals.publish(&wire::refusals(&self.config.id, header, trace)).await;
+        }
+    }
+
+    async fn publish_debug_images(
+        &mut self,
+        view: GrayView<'_>,
+        header: &FrameHeader,
+        searched: Searched,
+    ) {
         for (image, publisher) in &self.debug {
             if !publisher.has_subscribers().await {
                 continue;
             }
-            let trace = self.tracker.trace();
+            let trace = match searched {
+                Searched::Whole => self.tracker.trace(),
+                // The image is that of the finest part, which is searched last.
+                Searched::Parts => self.detector.trace(),
+            };
             match *image {
                 "ellipses" => debug::draw_ellipses(view, trace, &mut self.overlay),
                 "rings" => debug::draw_rings(view, trace, &mut self.overlay),

@@ -1,8 +1,15 @@
 //! Between the algorithm's types and the messages.
 
+use fiducial::trace::{Candidate, Trace};
 use fiducial::{MarkerPose, Observation, PadObservation};
+use imaging::Ellipse;
 use markers::Pad;
-use messages::{AlternativePose, Detection};
+use messages::{
+    AlternativePose, Detection, EllipsePx, FrameHeader, Refusal, Refusals, RefusedShape,
+};
+
+/// Maximum number of refused candidates that are sent: about 3 kB for each frame, which a radio carries as well.
+const MAX_REFUSALS: usize = 64;
 
 /// An observation as it is sent.
 pub fn detection(observation: &Observation) -> Detection {
@@ -36,6 +43,46 @@ pub fn pad_detection(pad: &Pad, seen: &PadObservation) -> Detection {
     }
 }
 
+/// What was refused in a frame, as it is sent: the largest, as a marker that is looked for is larger than most of what
+/// resembles one.
+pub fn refusals(detector: &str, header: &FrameHeader, trace: &Trace) -> Refusals {
+    let mut refused: Vec<_> = trace.refusals.iter().collect();
+    refused.sort_by(|a, b| extent_px(&b.candidate).total_cmp(&extent_px(&a.candidate)));
+    let shown = refused
+        .iter()
+        .take(MAX_REFUSALS)
+        .map(|it| Refusal { reason: it.reason.name().to_owned(), shape: shape(&it.candidate) });
+    Refusals {
+        detector: detector.to_owned(),
+        header: header.clone(),
+        total: u32::try_from(trace.refusals.len()).unwrap_or(u32::MAX),
+        refusals: shown.collect(),
+    }
+}
+
+/// The largest extent of a candidate, in pixels; that of one which is no number is nothing.
+fn extent_px(candidate: &Candidate) -> f64 {
+    let extent_px = match candidate {
+        Candidate::Ring(edges) => edges.iter().map(|it| it.major).fold(0.0, f64::max),
+        Candidate::Quad([a, b, c, d]) => a.distance(c).max(b.distance(d)),
+    };
+    if extent_px.is_finite() { extent_px } else { 0.0 }
+}
+
+fn shape(candidate: &Candidate) -> RefusedShape {
+    let ellipse = |it: &Ellipse| EllipsePx {
+        centre_px: it.centre.map(|at| at as f32),
+        axes_px: [it.minor as f32, it.major as f32],
+        angle_rad: it.angle as f32,
+    };
+    match candidate {
+        Candidate::Ring(edges) => RefusedShape::Ring(edges.each_ref().map(ellipse)),
+        Candidate::Quad(corners) => {
+            RefusedShape::Quad(corners.map(|it| [it.x as f32, it.y as f32]))
+        }
+    }
+}
+
 fn marker_pose(pose: &MarkerPose) -> messages::MarkerPose {
     messages::MarkerPose {
         camera_from_marker: (&pose.camera_from_marker).into(),
@@ -45,5 +92,38 @@ fn marker_pose(pose: &MarkerPose) -> messages::MarkerPose {
             camera_from_marker: (&other.camera_from_marker).into(),
             reprojection_rms_px: other.reprojection_rms_px,
         }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fiducial::trace::Reason;
+    use geometry::Pixel;
+
+    #[test]
+    fn the_largest_refusals_are_sent_with_their_reasons() {
+        let mut trace = Trace::default();
+        let square = |size: f64| {
+            [(0.0, 0.0), (size, 0.0), (size, size), (0.0, size)].map(|(x, y)| Pixel::new(x, y))
+        };
+        for size in 1..=100 {
+            trace.refuse_quad(square(f64::from(size)), Reason::Border);
+        }
+        trace.refuse_quad(square(f64::NAN), Reason::Small);
+        let edge = |major| Ellipse { centre: [5.0, 6.0], minor: 2.0, major, angle: 0.5 };
+        let candidate = Candidate::Ring([edge(300.0), edge(400.0)]);
+        trace.refusals.push(fiducial::Refusal { candidate, reason: Reason::Type });
+        let told = refusals("main", &FrameHeader::sample(), &trace);
+        assert_eq!((told.total, told.refusals.len()), (102, MAX_REFUSALS));
+        assert_eq!((told.detector.as_str(), &told.header), ("main", &FrameHeader::sample()));
+        let axes_px = [2.0, 300.0];
+        let inner = EllipsePx { centre_px: [5.0, 6.0], axes_px, angle_rad: 0.5 };
+        let outer = EllipsePx { axes_px: [2.0, 400.0], ..inner };
+        let ring = Refusal { reason: "type".into(), shape: RefusedShape::Ring([inner, outer]) };
+        assert_eq!(told.refusals[0], ring);
+        let corners = [[0.0, 0.0], [100.0, 0.0], [100.0, 100.0], [0.0, 100.0]];
+        let shape = RefusedShape::Quad(corners);
+        assert_eq!(told.refusals[1], Refusal { reason: "border".into(), shape });
     }
 }

@@ -5,7 +5,7 @@ use autopilot::{Autopilot, Config, Parser};
 use messages::{
     CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorCommand,
     DetectorInfo, FrameAck, FrameHeader, FramePart, Health, MavlinkBytes, Message, PixelFormat,
-    TargetEstimate, Truth, VehicleState, Wind, decode, encode,
+    Refusals, TargetEstimate, Truth, VehicleState, Wind, decode, encode,
 };
 
 /// Edges of the frames that an air-link payload is read for, in pixels.
@@ -17,6 +17,7 @@ pub fn codec(input: &[u8]) {
     again::<FrameAck>(input);
     again::<CameraInfo>(input);
     again::<Detections>(input);
+    again::<Refusals>(input);
     again::<DetectorInfo>(input);
     again::<DetectorCommand>(input);
     again::<TargetEstimate>(input);

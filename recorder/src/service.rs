@@ -92,14 +92,15 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
     ended.unwrap_or_else(|_panic| bail!("the thread of the recorder panicked"))
 }
 
-/// Whether a topic is subscribed to. JPEG and rectified frames and a detector's debug images are made only while somebody
-/// subscribes, and would cost those time. The tape, which a controller keeps for the first who asks, is of use in a file only.
+/// Whether a topic is subscribed to. JPEG and rectified frames, a detector's refusals and its debug images are made only while
+/// somebody subscribes, and would cost those time. The tape, which a controller keeps for the first who asks, is of use in a file only.
 fn is_wanted(row: &Row, frames: Frames, has_file: bool) -> bool {
     let is_tape = row.key == topic::TAPE.key(&[]);
     let is_frame = row.key == topic::FRAME.key(&["{camera}"]);
     let is_made_on_demand = [
         topic::JPEG.key(&["{camera}"]),
         topic::RECT.key(&["{camera}"]),
+        topic::REFUSALS.key(&["{detector}"]),
         topic::DEBUG_IMAGE.key(&["{detector}", "{image}"]),
     ];
     row.delivery != Delivery::Query

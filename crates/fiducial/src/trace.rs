@@ -120,7 +120,8 @@ impl Trace {
     /// Largest number of refusals, and of quads, that are kept.
     pub const MAX_REFUSALS: usize = 256;
 
-    pub(crate) fn clear(&mut self) {
+    /// Forgets everything, and keeps the room.
+    pub fn clear(&mut self) {
         self.ellipses.clear();
         self.rings.clear();
         self.quads.clear();

@@ -2,8 +2,8 @@
 
 use messages::{
     CameraInfo, CameraResponse, Configuration, ControllerStatus, DecodeError, Detections,
-    DetectorInfo, FrameAck, FrameHeader, Health, Message, RecorderStatus, TargetEstimate, Truth,
-    VehicleState, Wind, decode, topic,
+    DetectorInfo, FrameAck, FrameHeader, Health, Message, RecorderStatus, Refusals, TargetEstimate,
+    Truth, VehicleState, Wind, decode, topic,
 };
 
 use crate::protobuf::{MessageType, descriptor_set};
@@ -124,6 +124,7 @@ static JSON_TOPICS: [JsonTopic; 13] = [
     json_topic::<CameraInfo>(|names| topic::CAMERA_INFO.key(names)),
     json_topic::<Detections>(|names| topic::DETECTIONS.key(names)),
     json_topic::<FrameAck>(|names| topic::FRAME_ACK.key(names)),
+    json_topic::<Refusals>(|names| topic::REFUSALS.key(names)),
     json_topic::<DetectorInfo>(|names| topic::DETECTOR_INFO.key(names)),
     json_topic::<CameraResponse>(|names| topic::CAMERA_RESPONSE.key(names)),
     json_topic::<VehicleState>(|names| topic::VEHICLE_STATE.key(names)),

@@ -10,6 +10,7 @@ wire! {
     DetectorCommand = 13 v 2;
     DetectorInfo = 15 v 1;
     CameraResponse = 20 v 1;
+    Refusals = 21 v 1;
 }
 
 /// The markers that a detector found in one frame; also sent when there are none.
@@ -78,6 +79,48 @@ pub struct StageTime {
     pub stage: String,
     /// Its duration in microseconds.
     pub micros: u32,
+}
+
+/// Candidates for markers that a detector refused in one frame; published only while somebody subscribes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Refusals {
+    /// The detector's name.
+    pub detector: String,
+    /// The header of the frame, unchanged.
+    pub header: FrameHeader,
+    /// How many it refused: of very many only some are kept.
+    pub total: u32,
+    /// The largest of them, largest first.
+    pub refusals: Vec<Refusal>,
+}
+
+/// A candidate that was refused.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Refusal {
+    /// The first check that it failed, in one word.
+    pub reason: String,
+    /// Where it is.
+    pub shape: RefusedShape,
+}
+
+/// The outline of a candidate, in pixels.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum RefusedShape {
+    /// The corners of a square, clockwise as seen in the image.
+    Quad([[f32; 2]; 4]),
+    /// The two edges of a ring.
+    Ring([EllipsePx; 2]),
+}
+
+/// An ellipse in an image.
+#[derive(Copy, Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EllipsePx {
+    /// Its centre.
+    pub centre_px: [f32; 2],
+    /// The whole lengths of its minor and its major axis.
+    pub axes_px: [f32; 2],
+    /// From the image's x axis to the minor axis, turning from x to y.
+    pub angle_rad: f32,
 }
 
 /// A command to a detector; answered with a [`crate::CommandReply`].

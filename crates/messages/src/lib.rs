@@ -33,7 +33,7 @@ pub use controller::{
 };
 pub use detector::{
     AlternativePose, CameraResponse, Detection, Detections, DetectorCommand, DetectorInfo,
-    MarkerPose, Place, StageTime,
+    EllipsePx, MarkerPose, Place, Refusal, Refusals, RefusedShape, StageTime,
 };
 pub use health::{Configuration, Count, Health, Latency, Rate};
 pub use recorder::{RecorderLoss, RecorderStatus};

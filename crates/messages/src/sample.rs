@@ -5,7 +5,7 @@ use std::f64::consts::FRAC_1_SQRT_2;
 
 use crate::camera::{CameraInfo, FrameAck, FrameHeader, LensModel, PixelFormat, Transform3};
 use crate::controller::{Candidate, DetectorState, TargetEstimate};
-use crate::detector::{Detection, Detections, MarkerPose};
+use crate::detector::{Detection, Detections, MarkerPose, Refusal, Refusals, RefusedShape};
 
 impl FrameHeader {
     /// A grey frame of the camera `down`, 1296 x 972, stamped 0.
@@ -93,6 +93,20 @@ impl Detections {
             header: FrameHeader::sample(),
             detections: vec![Detection::sample()],
             stages: Vec::new(),
+        }
+    }
+}
+
+impl Refusals {
+    /// One square that the detector `main` refused in [`FrameHeader::sample`].
+    pub fn sample() -> Self {
+        let shape =
+            RefusedShape::Quad([[100.0, 100.0], [140.0, 100.0], [140.0, 140.0], [100.0, 140.0]]);
+        Self {
+            detector: "main".into(),
+            header: FrameHeader::sample(),
+            total: 1,
+            refusals: vec![Refusal { reason: "code".into(), shape }],
         }
     }
 }

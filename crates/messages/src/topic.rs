@@ -7,7 +7,7 @@ use std::marker::PhantomData;
 use crate::camera::{CameraInfo, FrameAck, FrameHeader};
 use crate::codec::Message;
 use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, TargetEstimate};
-use crate::detector::{CameraResponse, Detections, DetectorCommand, DetectorInfo};
+use crate::detector::{CameraResponse, Detections, DetectorCommand, DetectorInfo, Refusals};
 use crate::health::{Configuration, Health};
 use crate::recorder::RecorderStatus;
 use crate::simulation::{Truth, Wind};
@@ -145,6 +145,9 @@ pub const DETECTIONS: Topic<Detections> = Topic::new(
 /// Acknowledges a frame of `camera/{camera}/jpeg`.
 pub const FRAME_ACK: Topic<FrameAck> =
     Topic::new("detector/{detector}/ack", Delivery::LatestPriority, DETECTOR, CAMERAS);
+/// Candidates that were refused in a frame; published only while somebody subscribes.
+pub const REFUSALS: Topic<Refusals> =
+    Topic::new("detector/{detector}/refusals", Delivery::Latest, DETECTOR, NO_OTHERS);
 /// A JPEG overlay, one of `ellipses`, `rings`, `target`; the message is the attachment.
 pub const DEBUG_IMAGE: Topic<FrameHeader> =
     Topic::new("detector/{detector}/debug/{image}", Delivery::Latest, DETECTOR, NO_OTHERS);
@@ -245,6 +248,7 @@ pub const TOPICS: &[Row] = &[
     CAMERA_INFO.row,
     DETECTIONS.row,
     FRAME_ACK.row,
+    REFUSALS.row,
     DEBUG_IMAGE.row,
     DETECTOR_INFO.row,
     CAMERA_RESPONSE.row,

@@ -5,11 +5,12 @@ use std::borrow::Cow;
 use messages::{
     AlternativePose, BayerPattern, CameraInfo, CameraResponse, Candidate, CommandReply,
     Configuration, ControllerCommand, ControllerStatus, Count, DecodeError, Detection, Detections,
-    DetectorCommand, DetectorInfo, DetectorState, FrameAck, FrameHeader, FramePart, Health,
-    LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, Phase, PixelFormat, Place,
-    Rate, RecorderLoss, RecorderStatus, Setpoint, StageTime, Tape, TapeAction, TapeDecision,
-    TapeEvent, TapeNote, TapeOutput, TapePad, TapeState, TapeTarget, TapeWriter, TargetEstimate,
-    Touchdown, Transform3, Truth, VehicleState, Wind, decode, encode,
+    DetectorCommand, DetectorInfo, DetectorState, EllipsePx, FrameAck, FrameHeader, FramePart,
+    Health, LandedState, Latency, LensModel, MarkerPose, MavlinkBytes, Message, Phase, PixelFormat,
+    Place, Rate, RecorderLoss, RecorderStatus, Refusal, Refusals, RefusedShape, Setpoint,
+    StageTime, Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeState,
+    TapeTarget, TapeWriter, TargetEstimate, Touchdown, Transform3, Truth, VehicleState, Wind,
+    decode, encode,
 };
 use proptest::prelude::*;
 
@@ -143,6 +144,28 @@ fn frame_ack() {
         bytes: 300,
     };
     check(&message, "41100104646f776eac02010163ac02");
+}
+
+#[test]
+fn refusals() {
+    let square = [[1.0, 2.0], [3.0, 2.0], [3.0, 4.0], [1.0, 4.0]];
+    let edge = |axes_px| EllipsePx { centre_px: [1.0, 2.0], axes_px, angle_rad: 0.5 };
+    let message = Refusals {
+        detector: "main".into(),
+        header: header(),
+        total: 300,
+        refusals: vec![
+            Refusal { reason: "code".into(), shape: RefusedShape::Quad(square) },
+            Refusal {
+                reason: "type".into(),
+                shape: RefusedShape::Ring([edge([2.0, 4.0]), edge([4.0, 8.0])]),
+            },
+        ],
+    };
+    check(
+        &message,
+        "411501046d61696e04646f776eac0201016302900acc070000ac020204636f6465000000803f00000040000040400000004000004040000080400000803f000080400474797065010000803f0000004000000040000080400000003f0000803f0000004000008040000000410000003f",
+    );
 }
 
 #[test]
@@ -616,6 +639,15 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         clock,
         bytes: 20_000,
     };
+    let refusals = Refusals {
+        detector: "python".into(),
+        header: header.clone(),
+        total: 300,
+        refusals: vec![Refusal {
+            reason: "code".into(),
+            shape: RefusedShape::Quad([[1.0, 2.0], [3.0, 2.0], [3.0, 4.0], [1.0, 4.0]]),
+        }],
+    };
     let status = ControllerStatus {
         stamp_ns: 1_000_000_000,
         phase: Phase::Descend,
@@ -682,6 +714,7 @@ fn documented() -> Vec<(&'static str, Vec<u8>)> {
         ("DetectorCommand Stop", encode(&DetectorCommand::Stop)),
         ("CommandReply", encode(&reply)),
         ("FrameAck", encode(&ack)),
+        ("Refusals", encode(&refusals)),
         ("ControllerStatus", encode(&status)),
         ("ControllerCommand UseDetector", encode(&named)),
         ("TargetEstimate", encode(&target)),
