@@ -2,6 +2,7 @@
 
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -61,7 +62,7 @@ const MAX_REQUEST_BYTES: usize = 4096;
 /// What a browser does not take within this time is given up with its connection.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
 /// Period in which it is looked whether a browser may still have what it gets: its token may be gone.
-const ACCESS_PERIOD: Duration = Duration::from_secs(5);
+const ACCESS_PERIOD: Duration = Duration::from_secs(1);
 /// Period in which a browser is looked after that gets pictures.
 const LOOK_PERIOD: Duration = Duration::from_millis(500);
 /// Maximum age of the picture that a browser gets at first, in nanoseconds.
@@ -160,20 +161,18 @@ impl App {
 
     fn access(&self, peer: IpAddr, cookie: Option<&str>) -> Result<Access, Refusal> {
         let session = cookie.and_then(|cookie| {
-            let tokens = tokio::task::block_in_place(|| self.tokens());
-            let mut sessions = self.sessions();
-            match tokens {
-                Ok(tokens) => sessions.keep(&tokens),
-                // Who was let in stays: a system that has no more files to open ends nobody's control of a landing.
-                Err(problem) => {
-                    if self.node.health().failed("tokens") {
-                        tracing::warn!(
-                            problem = format!("{problem:#}"),
-                            "The tokens cannot be read"
-                        );
-                    }
-                }
+            let tokens = tokio::task::block_in_place(|| Tokens::read_open(&self.token_file()?));
+            if let Err(problem) = &tokens
+                && self.node.health().failed("tokens")
+            {
+                tracing::warn!(
+                    problem = format!("{problem:#}"),
+                    "The tokens cannot be read: after a minute all sessions end"
+                );
+                self.log(Level::Warn, "the tokens cannot be read: after a minute all sessions end");
             }
+            let mut sessions = self.sessions();
+            sessions.keep(tokens.as_ref().ok(), now_ns());
             sessions.kind(cookie, now_s())
         });
         self.guard.access(peer, session)
@@ -202,10 +201,9 @@ impl App {
         answer(status, JSON, why.to_string())
     }
 
-    fn tokens(&self) -> anyhow::Result<Tokens> {
+    fn token_file(&self) -> anyhow::Result<PathBuf> {
         let named = &self.config.tokens;
-        let file = if named.as_os_str().is_empty() { usual_file()? } else { named.clone() };
-        Tokens::read(&file)
+        if named.as_os_str().is_empty() { usual_file() } else { Ok(named.clone()) }
     }
 }
 
@@ -327,7 +325,7 @@ async fn session(
 
 /// Changes a token into a session.
 async fn login(Shared(app): Shared<Arc<App>>, token: String) -> Response {
-    let tokens = tokio::task::block_in_place(|| app.tokens());
+    let tokens = tokio::task::block_in_place(|| Tokens::read(&app.token_file()?));
     let tokens = tokens.unwrap_or_else(|problem| {
         app.node.health().failed("tokens");
         tracing::warn!(problem = format!("{problem:#}"), "No token is accepted");

@@ -17,8 +17,13 @@ const RANDOM_BYTES: usize = 32;
 const MAX_TOKENS: usize = 64;
 /// Maximum size of the file, in bytes.
 const MAX_FILE_BYTES: u64 = 65_536;
-/// Maximum number of sessions; the one that ends first goes.
+/// Maximum number of sessions of one token; the one of them that ends first goes, and none of another token.
 const MAX_SESSIONS: usize = 64;
+/// A token that is missing for this time was removed, in nanoseconds: an editor may write a file anew in two steps.
+const MISSING_NS: i64 = 2_000_000_000;
+/// A file that cannot be read for this time ends all sessions, in nanoseconds: nobody knows any more who was shut out. A system that
+/// has no more files to open for a while ends nobody's control of a landing.
+const UNREADABLE_NS: i64 = 60_000_000_000;
 /// Duration of a session, in seconds.
 pub const SESSION_S: u64 = 12 * 3600;
 
@@ -85,11 +90,24 @@ pub struct Tokens {
 }
 
 impl Tokens {
-    /// Reads a file; there are none before it exists.
+    /// Reads a file from which tokens are accepted; there are none before it exists.
     ///
     /// # Errors
     /// When others may read it, or it is damaged.
     pub fn read(path: &Path) -> anyhow::Result<Self> {
+        let mode = std::fs::metadata(path).map_or(0, |file| file.permissions().mode() & 0o777);
+        ensure!(
+            mode & 0o077 == 0,
+            "the tokens {path:?} are open to other users (mode {mode:o}): remove the file, and make new tokens"
+        );
+        Self::read_open(path)
+    }
+
+    /// Reads a file, also one that others may read: which tokens are no longer in it is known all the same.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is damaged.
+    pub fn read_open(path: &Path) -> anyhow::Result<Self> {
         let file = match std::fs::metadata(path) {
             Ok(file) => file,
             Err(cause) if cause.kind() == std::io::ErrorKind::NotFound => {
@@ -97,11 +115,6 @@ impl Tokens {
             }
             Err(cause) => return Err(cause).with_context(|| format!("reading {path:?}")),
         };
-        let mode = file.permissions().mode() & 0o777;
-        ensure!(
-            mode & 0o077 == 0,
-            "the tokens {path:?} are open to other users (mode {mode:o}): remove the file, and make new tokens"
-        );
         ensure!(file.len() <= MAX_FILE_BYTES, "{path:?} is larger than {MAX_FILE_BYTES} bytes");
         let text = std::fs::read_to_string(path).with_context(|| format!("reading {path:?}"))?;
         text.parse().map_err(anyhow::Error::msg).with_context(|| format!("reading {path:?}"))
@@ -208,19 +221,25 @@ pub struct Sessions {
 struct Session {
     token: Token,
     expires_s: u64,
+    /// Since when its token is not in the file, in nanoseconds of the clock that only grows.
+    missing_ns: Option<i64>,
+    /// Since when nobody knows whether it is.
+    unknown_ns: Option<i64>,
 }
 
 impl Sessions {
     /// Begins a session with this cookie, no longer than its token lasts.
     pub fn begin(&mut self, cookie: &str, token: Token, now_s: u64) {
         self.by_hash.retain(|_, session| session.expires_s > now_s);
-        if self.by_hash.len() >= MAX_SESSIONS {
-            let first = self.by_hash.iter().min_by_key(|(_, session)| session.expires_s);
+        let of_token = self.by_hash.iter().filter(|(_, session)| session.token == token);
+        if of_token.clone().count() >= MAX_SESSIONS {
+            let first = of_token.min_by_key(|(_, session)| session.expires_s);
             let first = first.map(|(hash, _)| hash.clone());
             first.and_then(|hash| self.by_hash.remove(&hash));
         }
         let expires_s = token.expires_s.min(now_s + SESSION_S);
-        self.by_hash.insert(hash(cookie), Session { token, expires_s });
+        let session = Session { token, expires_s, missing_ns: None, unknown_ns: None };
+        self.by_hash.insert(hash(cookie), session);
     }
 
     /// The kind of the session of a cookie, while it lasts.
@@ -229,9 +248,24 @@ impl Sessions {
         (session.expires_s > now_s).then_some(session.token.kind)
     }
 
-    /// Ends the sessions of tokens that are no longer there.
-    pub fn keep(&mut self, tokens: &Tokens) {
-        self.by_hash.retain(|_, session| tokens.tokens.contains(&session.token));
+    /// Ends the sessions of tokens that are no longer in their file, and those of a file that cannot be read (`None`) for long; what
+    /// lasts for a moment ends none. `now_ns` is of a clock that only grows.
+    pub fn keep(&mut self, tokens: Option<&Tokens>, now_ns: i64) {
+        let lasts = |since_ns: Option<i64>, for_ns| {
+            since_ns.is_some_and(|since_ns| now_ns.saturating_sub(since_ns) >= for_ns)
+        };
+        self.by_hash.retain(|_, session| {
+            match tokens.map(|it| it.tokens.contains(&session.token)) {
+                Some(true) => (session.missing_ns, session.unknown_ns) = (None, None),
+                Some(false) => {
+                    session.missing_ns.get_or_insert(now_ns);
+                }
+                None => {
+                    session.unknown_ns.get_or_insert(now_ns);
+                }
+            }
+            !lasts(session.missing_ns, MISSING_NS) && !lasts(session.unknown_ns, UNREADABLE_NS)
+        });
     }
 
     /// Ends a session.
@@ -275,13 +309,14 @@ mod tests {
         Tokens::default().write(&path).unwrap();
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o644)).unwrap();
         assert!(Tokens::read(&path).unwrap_err().to_string().contains("other users"));
+        assert_eq!(Tokens::read_open(&path).unwrap(), Tokens::default());
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
         std::fs::write(&path, "monitor only\n").unwrap();
         assert!(Tokens::read(&path).is_err());
     }
 
     #[test]
-    fn sessions_end_and_are_bounded() {
+    fn sessions_end_with_their_time_and_their_token() {
         let token = |kind, expires_s: u64| Token { kind, hash: expires_s.to_string(), expires_s };
         let mut sessions = Sessions::default();
         sessions.begin("short", token(Kind::Monitor, 60), 0);
@@ -291,16 +326,59 @@ mod tests {
         assert_eq!(sessions.kind("a", SESSION_S - 1), Some(Kind::Monitor));
         assert_eq!(sessions.kind("a", SESSION_S), None);
         assert_eq!(sessions.kind("b", 0), None);
-        for number in 0..200 {
-            sessions.begin(&number.to_string(), token(Kind::Command, u64::MAX), number);
+        sessions.end("a");
+        assert_eq!(sessions.kind("a", 1), None);
+    }
+
+    #[test]
+    fn log_ins_end_sessions_of_their_own_token_only() {
+        let token = |kind, name: &str| Token { kind, hash: name.into(), expires_s: u64::MAX };
+        let mut sessions = Sessions::default();
+        sessions.begin("pilot", token(Kind::Command, "pilot"), 0);
+        sessions.begin("guest", token(Kind::Monitor, "guest"), 0);
+        for number in 0..1000 {
+            sessions.begin(&number.to_string(), token(Kind::Monitor, "crowd"), number);
         }
-        assert_eq!(sessions.by_hash.len(), MAX_SESSIONS);
-        assert_eq!(sessions.kind("199", 200), Some(Kind::Command));
-        sessions.end("199");
-        assert_eq!(sessions.kind("199", 200), None);
-        sessions.keep(&Tokens { tokens: vec![token(Kind::Command, u64::MAX)] });
-        assert_eq!(sessions.kind("198", 200), Some(Kind::Command));
-        sessions.keep(&Tokens::default());
-        assert_eq!(sessions.kind("198", 200), None, "its line was removed");
+        assert_eq!(sessions.by_hash.len(), 2 + MAX_SESSIONS);
+        assert_eq!(sessions.kind("pilot", 1000), Some(Kind::Command));
+        assert_eq!(sessions.kind("guest", 1000), Some(Kind::Monitor));
+        assert_eq!(sessions.kind("999", 1000), Some(Kind::Monitor));
+        assert_eq!(sessions.kind("0", 1000), None);
+    }
+
+    #[test]
+    fn a_removed_token_ends_its_sessions_and_a_file_that_is_away_for_a_moment_none() {
+        let token =
+            |name: &str| Token { kind: Kind::Command, hash: name.into(), expires_s: u64::MAX };
+        let mut begun = Sessions::default();
+        begun.begin("one", token("one"), 0);
+        begun.begin("two", token("two"), 0);
+        let open = |sessions: &Sessions| ["one", "two"].map(|it| sessions.kind(it, 0).is_some());
+        let both = Tokens { tokens: vec![token("one"), token("two")] };
+        let second = Tokens { tokens: vec![token("two")] };
+
+        let mut sessions = begun.clone();
+        sessions.keep(Some(&Tokens::default()), 0);
+        sessions.keep(Some(&both), MISSING_NS);
+        sessions.keep(Some(&second), 2 * MISSING_NS);
+        assert_eq!(open(&sessions), [true; 2]);
+        sessions.keep(Some(&second), 3 * MISSING_NS);
+        assert_eq!(open(&sessions), [false, true]);
+
+        // A token that is known to be removed stays so when the file cannot be read then.
+        let mut sessions = begun.clone();
+        sessions.keep(Some(&second), 0);
+        sessions.keep(None, MISSING_NS);
+        assert_eq!(open(&sessions), [false, true]);
+
+        let mut sessions = begun;
+        sessions.keep(None, 0);
+        sessions.keep(None, UNREADABLE_NS - 1);
+        assert_eq!(open(&sessions), [true; 2]);
+        sessions.keep(Some(&both), UNREADABLE_NS);
+        sessions.keep(None, 2 * UNREADABLE_NS);
+        assert_eq!(open(&sessions), [true; 2]);
+        sessions.keep(None, 3 * UNREADABLE_NS);
+        assert_eq!(open(&sessions), [false; 2]);
     }
 }

@@ -549,8 +549,26 @@ async fn an_encrypted_page_is_commanded_from_elsewhere_while_its_token_is_there(
     let reply = command(&mut socket, "hold", &held).await?;
     ensure!(reply["accepted"] == true && reply["who"] == "controller", "{reply}");
 
-    // Without its token the page is closed.
+    // A file that cannot be read for a moment ends nobody's control, and lets nobody in.
+    let away = folder.path().join("away");
+    std::fs::rename(&file, &away)?;
+    std::fs::create_dir(&file)?;
+    sleep(Duration::from_secs(3)).await;
+    let held = nonce(&mut socket, "hold").await?;
+    sleep(HELD).await;
+    let reply = command(&mut socket, "hold", &held).await?;
+    ensure!(reply["accepted"] == true, "{reply}");
+    let mut stream = encrypted(&connector, from).await?;
+    stream.write_all(log_in.as_bytes()).await?;
+    let mut answer = Vec::new();
+    timeout(PATIENCE, stream.read_to_end(&mut answer)).await??;
+    ensure!(answer.starts_with(b"HTTP/1.1 401"), "{}", String::from_utf8_lossy(&answer));
+    std::fs::remove_dir(&file)?;
+    std::fs::rename(&away, &file)?;
+
+    // Without its token the page is closed, also where the editor left the file open to others.
     Tokens::default().write(&file)?;
+    std::fs::set_permissions(&file, Permissions::from_mode(0o644))?;
     let closed = timeout(PATIENCE, async { while let Some(Ok(_)) = socket.next().await {} });
     closed.await.context("the page is still open without its token")?;
     let again = client_async(request("https")?, encrypted(&connector, from).await?).await;
@@ -568,9 +586,9 @@ async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("tokens");
     let [good, old, look] = [secret()?, secret()?, secret()?];
-    std::fs::set_permissions(&file, Permissions::from_mode(0o644))?;
     let mut tokens = Tokens::default();
     tokens.add(&old, Kind::Command, 0, 1);
+    tokens.add(&look, Kind::Monitor, 0, u64::MAX);
     tokens.add(&good, Kind::Command, 0, u64::MAX);
     tokens.write(&file)?;
     let named = format!("tokens={:?}", file.display().to_string());
@@ -601,6 +619,17 @@ async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::
     let mut foreign = page.request(from, "/ws")?;
     foreign.headers_mut().insert("cookie", HeaderValue::from_static("alight-80=1; other=2"));
     ensure!(refusal(from, foreign).await? == 401);
+    // Nor is one of our name that no session has.
+    let mut made_up = page.request(from, "/ws")?;
+    let cookie_of_none = format!("alight-{}={}", from.port(), secret()?);
+    made_up.headers_mut().insert("cookie", HeaderValue::from_str(&cookie_of_none)?);
+    ensure!(refusal(from, made_up).await? == 401);
+    ensure!(page.refused("no valid token") == 7, "{}", page.refused("no valid token"));
+
+    // Log-ins with another token end no session of this one.
+    for _ in 0..70 {
+        ensure!(ask(from, &log_in(&look)).await?.starts_with("HTTP/1.1 200"));
+    }
 
     let mut request = page.request(from, "/ws")?;
     request.headers_mut().insert("cookie", HeaderValue::from_str(cookie)?);
@@ -615,5 +644,14 @@ async fn from_elsewhere_a_token_is_needed_and_nothing_is_commanded() -> anyhow::
     let refused = command(&mut socket, "abort", &held).await?;
     ensure!(refused["accepted"] == false && refused["who"] == "dashboard", "{refused}");
     ensure!(page.refused("command without the right") == 1);
+
+    // A session that was ended is none any more.
+    let log_out = format!(
+        "POST /logout HTTP/1.1\r\nHost: {from}\r\nOrigin: http://{from}\r\nCookie: {cookie}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+    );
+    ensure!(ask(from, &log_out).await?.starts_with("HTTP/1.1 200"));
+    let mut ended = page.request(from, "/ws")?;
+    ended.headers_mut().insert("cookie", HeaderValue::from_str(cookie)?);
+    ensure!(refusal(from, ended).await? == 401);
     Ok(())
 }
