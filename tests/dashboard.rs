@@ -5,7 +5,14 @@
     reason = "what a test measured, or why it is skipped, is for people to read"
 )]
 
+#[path = "dashboard/crowd.rs"]
+mod crowd;
+#[path = "dashboard/film.rs"]
+mod film;
 mod flight;
+#[allow(dead_code, reason = "the film is also sent over a link elsewhere")]
+#[path = "link/site.rs"]
+mod site;
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
@@ -14,6 +21,7 @@ use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use futures_util::{SinkExt, StreamExt};
+use rustix::process::{Signal, kill_process};
 use serde_json::Value;
 use testing::{interpreter, ports, skip, with_second_try};
 use tokio::net::TcpStream;
@@ -21,13 +29,16 @@ use tokio::time::{sleep, timeout};
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{WebSocketStream, client_async};
 
-use crate::flight::{Landing, ONE_AT_A_TIME, PATIENCE};
+use crate::crowd::{Crowd, memory_mb};
+use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, PATIENCE, output_of};
 
 /// Exit status of a script that lacks a browser or a package.
 const LACKS: i32 = 77;
 /// Longest time in which a page that is cut off strikes through what it shows, and in which it is connected again.
 const MAX_GREY_S: f64 = 1.0;
 const MAX_BACK_S: f64 = 2.0;
+/// Twice two pictures and their texts for each of twenty browsers, with room for what the system keeps.
+const MAX_CROWD_MB: f64 = 60.0;
 /// A descent of twenty seconds.
 const SLOWLY: [&str; 2] = ["--set", "controller.metric.max_descend_m_s=0.5"];
 
@@ -127,6 +138,57 @@ async fn a_program_that_knows_only_motion_jpeg_sees_the_landing() -> anyhow::Res
             "{seen}"
         );
         landing.lands().await?;
+        Ok(())
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_drawn_over_a_picture_was_found_in_that_very_picture() -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(async || {
+        if let Some(read) = film::overlay(200).await? {
+            println!("{read}");
+        }
+        Ok(())
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn twenty_browsers_and_a_page_that_is_stopped_and_killed_change_no_decision()
+-> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(async || {
+        let folder = tempfile::tempdir()?;
+        let file = folder.path().join("flight.mcap");
+        let name = file.to_str().context("a path")?;
+        let page = free_page()?;
+        let args = [["--seed", "4"], ["--dashboard", &page], ["--record", name], SLOWLY].concat();
+        let landing = Landing::start(&args).await?;
+        drop(socket(&page, "/ws").await?);
+        let dashboard = landing.service("dashboard")?.pid;
+        let alone_mb = memory_mb(dashboard)?;
+        let crowd = Crowd::new(&page);
+        landing.descends_below(8.0).await?;
+        sleep(Duration::from_secs(3)).await;
+        let with_mb = memory_mb(dashboard)?;
+        kill_process(dashboard, Signal::STOP)?;
+        sleep(Duration::from_secs(4)).await;
+        kill_process(dashboard, Signal::CONT)?;
+        sleep(Duration::from_secs(3)).await;
+        let after_mb = memory_mb(dashboard)?;
+        println!(
+            "{alone_mb:.0} MB alone, {with_mb:.0} with 20 browsers, {after_mb:.0} after a stop"
+        );
+        ensure!(with_mb.max(after_mb) < alone_mb + MAX_CROWD_MB, "{after_mb} MB");
+        landing.kill("dashboard")?;
+        landing.lands().await?;
+        drop(crowd);
+        let replay =
+            output_of(std::process::Command::new(ALIGHT).args(["replay", name, "--verify"]))?;
+        let said = String::from_utf8_lossy(&replay.stdout).into_owned();
+        ensure!(replay.status.success() && said.contains("verified"), "{said}");
         Ok(())
     })
     .await

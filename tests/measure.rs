@@ -7,10 +7,18 @@
 //! cargo bench -p tests -- freezes             freeze each process (SIGSTOP) for 0.5, 2, 5 and 30 s
 //! cargo bench -p tests -- recorder [TIMES]    kill the recorder so often in one flight at 30 frames a second (50)
 //! cargo bench -p tests -- link [NAME...]      the trials on a bad radio link, or some of them
+//! cargo bench -p tests -- overlay [FRAMES]    read back so many drawn pictures of the page with their overlay (1000)
+//! cargo bench -p tests -- video [SECONDS] [link]  the page's pictures, from sent to drawn: at most a minute on this machine at 15
+//!                                             and at 30 Hz, and for so long (600) over a link of 6 Mbit/s, or that alone
+//! cargo bench -p tests -- crowd [TIMES]       what 20 browsers cost a flight, in so many pairs of 10 s without and with them (6)
 //! ```
 
 #![expect(clippy::print_stdout, reason = "what was measured is for people to read")]
 
+#[path = "dashboard/crowd.rs"]
+mod crowd;
+#[path = "dashboard/film.rs"]
+mod film;
 mod flight;
 mod freezes;
 mod kills;
@@ -28,6 +36,7 @@ use std::process::ExitCode;
 
 use anyhow::{Context, bail, ensure};
 
+use crate::link::site;
 use crate::link::site::Radio;
 use crate::link::{GOOD, LOSSY, POOR, flight as trial, saturation};
 
@@ -49,15 +58,28 @@ fn main() -> ExitCode {
                 recorders::kills(times(50)?, &fast).await
             }
             Some("link") => table(&args[1..]).await,
+            Some("overlay") => {
+                print("drawn with their overlay", film::overlay(times(1000)? as u64).await?);
+                Ok(())
+            }
+            Some("video") => {
+                let is_link_only = args.get(2).is_some_and(|it| it == "link");
+                video(times(600)? as f64, is_link_only).await
+            }
+            Some("crowd") => crowd::cost(times(6)?).await,
             Some("reader") => {
                 println!("{}", onehost::reader(args.get(1).context("reader PORT")?).await?);
                 Ok(())
             }
             Some(other) => {
-                bail!("`{other}` is not measured: kills, swaps, freezes, recorder and link are")
+                bail!(
+                    "`{other}` is not measured: kills, swaps, freezes, recorder, link, overlay, video and crowd are"
+                )
             }
             None => {
-                println!("Nothing is measured: say kills, swaps, freezes, recorder or link");
+                println!(
+                    "Nothing is measured: say kills, swaps, freezes, recorder, link, overlay, video or crowd"
+                );
                 Ok(())
             }
         }
@@ -70,6 +92,17 @@ async fn freeze_each(freezes_s: &[f64]) -> anyhow::Result<()> {
     }
     freezes::of_a_camera(freezes_s).await.context("camera-pub")?;
     freezes::of_a_relay(freezes_s).await.context("relay")
+}
+
+/// The page's pictures, from sent to drawn.
+async fn video(seconds: f64, is_link_only: bool) -> anyhow::Result<()> {
+    for rate_hz in [15.0, 30.0].into_iter().filter(|_| !is_link_only) {
+        let name = format!("loopback, {rate_hz} Hz");
+        print(&name, film::latency(rate_hz, seconds.min(60.0), None).await?);
+    }
+    let radio = Radio { rate_mbit: 6.0, ..GOOD };
+    print("6 Mbit/s, 15 Hz", film::latency(15.0, seconds, Some(radio)).await?);
+    Ok(())
 }
 
 /// The long trials.

@@ -25,12 +25,12 @@ if CHROMIUM is None:
 PATIENCE_S = 60
 URL, FOLDER = sys.argv[1], Path(sys.argv[2])
 
-# How different the picture's pixels are, read from the canvas as it is shown.
-SPREAD = """() => {
+# How different the pixels of a canvas are, as it is shown.
+SPREAD = """(selector) => {
   const copy = document.createElement('canvas');
   [copy.width, copy.height] = [64, 48];
   const context = copy.getContext('2d');
-  context.drawImage(document.getElementById('video'), 0, 0, 64, 48);
+  context.drawImage(document.querySelector(selector), 0, 0, 64, 48);
   const grey = [...context.getImageData(0, 0, 64, 48).data].filter((_, n) => n % 4 === 0);
   return Math.max(...grey) - Math.min(...grey);
 }"""
@@ -69,6 +69,15 @@ def accessibility(page, names):
     return len(found["checked"])
 
 
+def tab_to(page, command):
+    """Goes on with the tabulator until a command's button has the focus."""
+    for _ in range(100):
+        if page.evaluate("document.activeElement?.dataset?.command ?? ''") == command:
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"the button {command} is not reached by the keyboard")
+
+
 def asked(what):
     print(what, flush=True)
     sys.stdin.readline()
@@ -92,28 +101,51 @@ def main():
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1440, "height": 1150})
-        requests, problems = [], []
+        requests, problems, sizes = [], [], []
         page.on("request", lambda request: requests.append(request.url))
+        page.on("response", lambda response: sizes.append(len(response.body())) if response.status == 200 else None)
         page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda problem: problems.append(str(problem)))
         page.goto(URL)
         wait(page, "document.getElementById('connection').textContent === 'connected'")
         wait(page, "document.getElementById('phase').textContent === 'Descending'")
         wait(page, "/found 1 in it/.test(document.getElementById('video-text').textContent)")
-        assert page.evaluate(SPREAD) > 50, "the picture is empty"
+        wait(page, "document.getElementById('log').children.length > 2")
+        for canvas in ["#video", "#map", "#side", "#strips canvas"]:
+            assert page.evaluate(SPREAD, canvas) > 50, f"{canvas} is empty"
+        # All that was fetched by then, WebSockets apart.
+        measured["page_bytes"] = sum(sizes)
+        measured["first_paint_ms"] = page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime")
+        assert 10_000 < measured["page_bytes"] <= 300_000, sizes
         page.screenshot(path=FOLDER / "descending.png", full_page=True)
 
-        # By the keyboard alone.
-        page.locator("button[data-command=hold]").focus()
+        # What the detector refused in that very frame, for as long as it is asked.
+        assert text(page, "#refused-text") == ""
+        page.locator("#refused").click()
+        some = "/^main refused \\d+ candidates? in it.*: \\d+ \\w/.test(document.getElementById('refused-text').textContent)"
+        for _ in range(20):
+            wait(page, some)
+            page.screenshot(path=FOLDER / "refused.png", full_page=True)
+            measured["refused"] = text(page, "#refused-text")
+            if page.evaluate(some):
+                break
+        page.locator("#refused").click()
+        wait(page, "document.getElementById('refused-text').textContent === ''", 2)
+
+        # By the keyboard alone: held, resumed, held.
+        tab_to(page, "hold")
         page.keyboard.down("Space")
         time.sleep(0.4)
         page.keyboard.up("Space")
         assert "too early" in text(page, "#reply"), text(page, "#reply")
-        page.keyboard.down("Space")
-        time.sleep(1.4)
-        page.keyboard.up("Space")
-        wait(page, "/accepted by the controller/.test(document.getElementById('reply').textContent)")
-        wait(page, "document.getElementById('phase').textContent === 'Holding the position'")
+        for command in ["hold", "resume", "hold"]:
+            tab_to(page, command)
+            page.keyboard.down("Space")
+            time.sleep(1.4)
+            page.keyboard.up("Space")
+            wait(page, f"/^{command}: accepted by the controller/.test(document.getElementById('reply').textContent)")
+            holds = "===" if command == "hold" else "!=="
+            wait(page, f"document.getElementById('phase').textContent {holds} 'Holding the position'")
         page.screenshot(path=FOLDER / "holding.png", full_page=True)
         for selector in TELLING:
             wait(page, f"/^none(,none)*$/.test(({LINES})({json.dumps(selector)}))", 10)
@@ -128,6 +160,8 @@ def main():
         width = page.evaluate("document.documentElement.scrollWidth")
         measured["accessibility"] = accessibility(page, ["color-contrast", "button-name"])
         assert width <= 360, f"a telephone would have to scroll sideways: {width} px"
+        boxes = [panel.bounding_box() for panel in page.locator(".panel").all()]
+        assert len(boxes) > 10 and all(box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["height"] > 40 for box in boxes), boxes
         page.screenshot(path=FOLDER / "telephone.png", full_page=True)
         page.set_viewport_size({"width": 1440, "height": 1150})
         page.locator("#theme").click()

@@ -114,6 +114,14 @@ impl Air {
         self.tell(&serde_json::json!({ "cut": is_cut }))
     }
 
+    /// A command that runs on the ground.
+    pub(crate) fn on_the_ground(&self, program: &str) -> Command {
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", &self.namespace, "sh", "-c", WITHOUT_SHARED_MEMORY]);
+        command.args(["sh", program]);
+        command
+    }
+
     fn tell(&mut self, settings: &serde_json::Value) -> anyhow::Result<()> {
         writeln!(self.settings.as_mut().context("the emulator's input")?, "{settings}")?;
         let mut line = String::new();
@@ -185,17 +193,9 @@ impl Site {
         self.drone("controller", &["--set", &address, "--set", "start=\"takeoff\""])
     }
 
-    /// A command that runs on the ground.
-    fn ground_command(&self, program: &str) -> Command {
-        let mut command = Command::new("ip");
-        command.args(["netns", "exec", &self.air.namespace, "sh", "-c", WITHOUT_SHARED_MEMORY]);
-        command.args(["sh", program]);
-        command
-    }
-
     /// Starts a service on the ground.
     pub(crate) fn ground(&mut self, service: &str, args: &[&str]) -> anyhow::Result<()> {
-        let mut command = self.ground_command(ALIGHT);
+        let mut command = self.air.on_the_ground(ALIGHT);
         let address = self.drone_address();
         command.args([service, "--zenoh", "ground", "--connect", &address]).args(args);
         self.spawn(service, command)
@@ -205,7 +205,7 @@ impl Site {
     /// but the drone's end of the probe, it also sends commands.
     pub(crate) fn probe(&mut self, seconds: f64, commands: bool) -> anyhow::Result<Child> {
         let this = std::env::current_exe()?;
-        let mut command = self.ground_command(&this.to_string_lossy());
+        let mut command = self.air.on_the_ground(&this.to_string_lossy());
         command.args(["probe", &self.drone_address(), &seconds.to_string()]);
         command.args(commands.then_some("commands"));
         command.stdin(Stdio::null()).stdout(Stdio::piped());
