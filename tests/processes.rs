@@ -15,9 +15,12 @@ use anyhow::{Context, ensure};
 use messages::{ControllerCommand, DetectorCommand, Phase, topic};
 use node::now_ns;
 use rustix::process::{Pid, Signal, kill_process};
-use testing::{ports, python, python_passes, with_second_try};
+use testing::{ports, python, python_passes, skip, with_second_try};
 
 use crate::flight::{ALIGHT, Landing, ONE_AT_A_TIME, descent_m_s, output_of, seconds, speed_m_s};
+
+/// Exit status of a script that lacks a package.
+const LACKS_MAVSDK: i32 = 77;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn it_lands_with_other_programs_watching_and_without_the_ground_station() -> anyhow::Result<()>
@@ -51,6 +54,42 @@ async fn others_watch_and_the_ground_dies() -> anyhow::Result<()> {
     landing.descends_below(8.0).await?;
     landing.kill("gcs-bridge")?;
     says_how_well(&landing.lands().await?)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_program_of_mavsdk_finds_the_vehicle_its_parameters_and_its_camera() -> anyhow::Result<()>
+{
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(async || {
+        let ([], _, ground) = ports::free()?;
+        let address = format!("gcs-bridge.ground=udpout:127.0.0.1:{ground}");
+        let video = "gcs-bridge.video='rtsp://10.0.0.2:8554/down'";
+        let landing = Landing::start(&["--seed", "2", "--set", &address, "--set", video]).await?;
+        landing.descends_below(9.0).await?;
+        command(&landing, ControllerCommand::Hold).await?;
+        let connect = format!("udpin://127.0.0.1:{ground}");
+        let station = "tests/gcs/mavsdk_station.py";
+        let Some(station) = python(station, &["--camera", "--connect", &connect]) else {
+            return Ok(());
+        };
+        let output = tokio::task::block_in_place(|| station.wait_with_output())?;
+        let said = String::from_utf8_lossy(&output.stdout);
+        println!("{said}");
+        if output.status.code() == Some(LACKS_MAVSDK) {
+            skip("mavsdk", said.trim());
+            return Ok(());
+        }
+        let found: serde_json::Value =
+            serde_json::from_str(said.lines().last().context("nothing was said")?)?;
+        ensure!(found["ok"] == true && output.status.success(), "{found}");
+        ensure!(found["camera"]["model"] == "down", "{found}");
+        ensure!(found["camera"]["size"] == serde_json::json!([648, 486]), "{found}");
+        ensure!(found["video"] == "rtsp://10.0.0.2:8554/down", "{found}");
+        ensure!(found["parameters"].as_u64().is_some_and(|it| it > 5), "{found}");
+        command(&landing, ControllerCommand::Resume).await?;
+        landing.lands().await.map(drop)
+    })
+    .await
 }
 
 /// The result of a landing has all that it should tell.
