@@ -185,6 +185,19 @@ async fn check_live_changes(
     Ok(())
 }
 
+/// The response that was configured is published; whoever comes late gets it as well.
+async fn check_response(operator: &Node) -> anyhow::Result<()> {
+    let responses = operator.subscriber(topic::CAMERA_RESPONSE, &["main"]).await?;
+    let configured = async {
+        while !responses.next().await.context("a response")?.configured {}
+        let late = operator.subscriber(topic::CAMERA_RESPONSE, &["main"]).await?;
+        late.next().await.context("the last response")
+    };
+    let told = timeout(PATIENCE, configured).await.context("waiting for the response")??;
+    ensure!((told.curve, told.sharpening) == (1.1, 0.5) && told.camera == "down", "{told:?}");
+    Ok(())
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn several_families_are_found_and_parameters_change_while_it_runs() -> anyhow::Result<()> {
     let ([port], _, _) = ports::free()?;
@@ -205,6 +218,9 @@ async fn several_families_are_found_and_parameters_change_while_it_runs() -> any
         until(&detections, "its frames are searched", |m| m.header.format == format).await?;
         check_live_changes(&operator, &detections).await.with_context(|| format!("{format:?}"))?;
         accept(&operator, "tracking.enabled", "false").await?;
+        accept(&operator, "response", "\"1.1,0.5\"").await?;
+        check_response(&operator).await?;
+        accept(&operator, "response", "\"auto\"").await?;
         filming.abort();
     }
     service.abort();
