@@ -160,14 +160,14 @@ impl Running {
     /// A measurement counts for about so many of them.
     const MEMORY: f64 = 40.0;
     /// The model is only that good: exposures and blurs differ.
-    const LEAST_DEVIATION: f64 = 0.05;
+    const MIN_DEVIATION: f64 = 0.05;
 
     fn add(&mut self, told: Measured) {
-        let variance = told.deviation.powi(2) + Self::LEAST_DEVIATION.powi(2);
+        let variance = told.deviation.powi(2) + Self::MIN_DEVIATION.powi(2);
         if !(told.value.is_finite() && variance.is_finite()) {
             return;
         }
-        let weight = Self::LEAST_DEVIATION.powi(2) / variance;
+        let weight = Self::MIN_DEVIATION.powi(2) / variance;
         let kept = self.weight * (1.0 - weight / Self::MEMORY);
         let off = told.value - self.mean;
         let share = weight / (kept + weight);
@@ -180,8 +180,8 @@ impl Running {
 
     /// `None` before any measurement.
     fn expected(&self) -> Option<Measured> {
-        let own = Self::LEAST_DEVIATION.powi(2) / self.weight;
-        let deviation = (self.square.max(Self::LEAST_DEVIATION.powi(2)) + own).sqrt();
+        let own = Self::MIN_DEVIATION.powi(2) / self.weight;
+        let deviation = (self.square.max(Self::MIN_DEVIATION.powi(2)) + own).sqrt();
         (self.weight > 0.0).then_some(Measured { value: self.mean, deviation })
     }
 }
