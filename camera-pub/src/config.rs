@@ -41,10 +41,14 @@ pub(crate) struct SourceConfig {
     command: Vec<String>,
     device: PathBuf,
     genicam: String,
+    rtsp: String,
+    rtsp_credentials: PathBuf,
+    rtsp_stamps: RtspStamps,
     fourcc: String,
     controls: Vec<String>,
     pixels: String,
     size_px: [u32; 2],
+    binning: u32,
     row_bytes: usize,
     delay_ms: f64,
     stamp_at: String,
@@ -131,6 +135,36 @@ pub(crate) struct GenicamConfig {
     pub(crate) delay_ns: i64,
 }
 
+/// A camera that streams over RTSP.
+#[derive(Clone, Debug)]
+#[cfg_attr(not(feature = "rtsp"), expect(dead_code, reason = "read with the feature only"))]
+pub(crate) struct RtspConfig {
+    /// The address of its stream.
+    pub(crate) url: String,
+    /// The file with `user:password`, if it wants them.
+    pub(crate) credentials: Option<PathBuf>,
+    /// Size of its pictures.
+    pub(crate) size: FrameSize,
+    /// Nominal rate of them.
+    pub(crate) rate_hz: f64,
+    /// Whose clock stamps them.
+    pub(crate) stamps: RtspStamps,
+    /// Time from the middle of the exposure to the instant that is stamped.
+    pub(crate) delay_ns: i64,
+    /// Maximum pixels of a picture.
+    pub(crate) max_pixels: u64,
+}
+
+/// What the stamps of a stream's pictures are from.
+#[derive(Copy, Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum RtspStamps {
+    /// Their arrival.
+    Arrival,
+    /// The camera's clock, which is set to this host's by NTP.
+    Camera,
+}
+
 /// The size of a frame, in pixels.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) struct FrameSize {
@@ -139,6 +173,11 @@ pub(crate) struct FrameSize {
 }
 
 impl FrameSize {
+    /// The size after blocks of so many samples, across and down, have become a pixel each.
+    pub(crate) fn binned(self, by: usize) -> Self {
+        Self { width: self.width / by.max(1), height: self.height / by.max(1) }
+    }
+
     pub(crate) fn pixels(self) -> usize {
         self.width.saturating_mul(self.height)
     }
@@ -199,6 +238,7 @@ impl Settings for Config {
         check.name("id", &self.id);
         check.range("source.rate_hz", self.source.rate_hz, 0.01..=1000.0);
         check.parses("source.bayer", self.source.bayer_pattern());
+        check.parses("source.binning", self.source.checked_binning());
         check.range("source.max_megapixels", self.source.max_megapixels, 0.001..=4294.0);
         check.one_of("source.pixels", &self.source.pixels, PIXEL_FORMATS);
         check.range("source.delay_ms", self.source.delay_ms, 0.0..=10_000.0);
@@ -213,6 +253,7 @@ impl Settings for Config {
         check.parses("source.command", self.source.program());
         check.parses("source.device", self.device());
         check.parses("source.genicam", self.source.genicam());
+        check.parses("source.rtsp", self.source.rtsp());
         check.parses("exposure.control", self.exposure.needs_device(&self.source));
         check.range("exposure.max_ms", self.exposure.max_ms, 0.1..=100.0);
         check.range("exposure.max_gain", self.exposure.max_gain, 1.0..=1000.0);
@@ -384,6 +425,80 @@ impl SourceConfig {
             },
             delay_ns: self.delay_ns(),
         }))
+    }
+
+    /// The camera that streams over RTSP; `None` where frames come from elsewhere.
+    pub(crate) fn rtsp(&self) -> anyhow::Result<Option<RtspConfig>> {
+        if self.rtsp.is_empty() {
+            return Ok(None);
+        }
+        ensure!(
+            cfg!(feature = "rtsp"),
+            "this program reads no streams of RTSP: build it with `--features rtsp`, or read the camera by `source.command` with \
+             ffmpeg (docs/camera.md)"
+        );
+        ensure!(
+            self.paths.is_empty()
+                && self.command.is_empty()
+                && self.genicam.is_empty()
+                && self.device == Path::new(""),
+            "with a stream of RTSP, `source.paths`, `source.command`, `source.device` and `source.genicam` must be empty"
+        );
+        let host = self.rtsp.strip_prefix("rtsp://").and_then(|rest| rest.split('/').next());
+        let host = host.filter(|host| !host.is_empty()).with_context(|| {
+            format!(
+                "`{}` is no address of the form rtsp://HOST:PORT/STREAM",
+                without_credentials(&self.rtsp)
+            )
+        })?;
+        ensure!(
+            !host.contains('@'),
+            "`source.rtsp` has a name or password in it: write user:password into a file that only you can read, and name \
+             that in `source.rtsp_credentials`"
+        );
+        let credentials = &self.rtsp_credentials;
+        Ok(Some(RtspConfig {
+            url: self.rtsp.clone(),
+            credentials: (credentials != Path::new("")).then(|| credentials.clone()),
+            size: self.size("the stream's pictures")?,
+            rate_hz: self.rate_hz,
+            stamps: self.rtsp_stamps,
+            delay_ns: self.delay_ns(),
+            max_pixels: (self.max_megapixels * 1e6) as u64,
+        }))
+    }
+
+    /// How many samples, across and down, are averaged to a pixel of a frame.
+    pub(crate) fn binning(&self) -> usize {
+        self.binning.max(1) as usize
+    }
+
+    fn checked_binning(&self) -> anyhow::Result<()> {
+        let is_raw = !self.genicam.is_empty()
+            || (!self.command.is_empty() && self.pixels.starts_with("gray"));
+        ensure!(
+            (1..=16).contains(&self.binning),
+            "it is {}; it must be from 1 to 16",
+            self.binning
+        );
+        if self.binning == 1 {
+            return Ok(());
+        }
+        ensure!(
+            is_raw,
+            "raw frames are binned, of a program with `source.pixels` gray8 or gray16, or of a camera of GenICam"
+        );
+        ensure!(
+            self.bayer.is_empty() || self.binning.is_multiple_of(2),
+            "it is {}, and behind a Bayer pattern it must be even: else a pixel has more of one colour than its neighbour",
+            self.binning
+        );
+        ensure!(
+            self.size_px.iter().all(|edge| edge.is_multiple_of(self.binning)),
+            "`source.size_px` is {:?}; both must be multiples of the binning",
+            self.size_px
+        );
+        Ok(())
     }
 
     /// The size of a camera's frames.
@@ -563,6 +678,11 @@ impl MountConfig {
     }
 }
 
+/// An address without what stands before its host, which may be a password.
+fn without_credentials(address: &str) -> &str {
+    address.rsplit('@').next().unwrap_or_default()
+}
+
 fn holds(holds: bool, otherwise: &'static str) -> Result<(), &'static str> {
     if holds { Ok(()) } else { Err(otherwise) }
 }
@@ -693,12 +813,17 @@ mod tests {
         camera(&["source.row_bytes=63"], "a row has 64 bytes");
         camera(&["source.pixels=yuv420", "source.bayer=RGGB"], "gray8 or gray16");
         camera(&["source.delay_ms=-1"], "from 0 to 10000");
+        camera(&["source.binning=0"], "from 1 to 16");
+        camera(&["source.binning=3", "source.bayer=RGGB"], "must be even");
+        camera(&["source.binning=5"], "multiples of the binning");
+        camera(&["source.binning=2", "source.pixels=yuv420"], "raw frames are binned");
         camera(&["source.timeout_s=0"], "from 0.1 to 3600");
         camera(&["source.stamp_at=middle"], "auto, exposure-start");
         camera(&["source.readout_ms=-1"], "from 0 to 1000");
         camera(&["source.device=/dev/video0"], "`source.command`");
         check(&["source.device=/dev/video0"], "`alight cameras` lists them");
         check(&["source.fourcc=H264"], "GREY, NV12");
+        check(&["source.rtsp_stamps=ntp"], "unknown variant");
         check(&["source.controls=['gain']"], "`name=value`");
         check(&["source.controls=['gain=much']"], "no number");
     }

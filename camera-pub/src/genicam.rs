@@ -1,10 +1,8 @@
 //! Cameras of the GenICam standard, GigE Vision and USB3 Vision, read with the Aravis library (feature `genicam`).
 //!
-//! Modules in reading order: `clock` tells the host's time of a stamp of the camera's own clock; `camera` opens and reads a
-//! camera; `feed` goes on when it is lost. All run in tests against the camera that Aravis itself plays.
+//! Modules in reading order: `camera` opens and reads a camera; `feed` goes on when it is lost. All run in tests against the camera that Aravis itself plays.
 
 mod camera;
-mod clock;
 pub(crate) mod feed;
 #[cfg(test)]
 mod tests;

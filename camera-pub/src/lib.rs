@@ -7,8 +7,11 @@
 //! a camera's program writes, `side_channel` what it tells of each frame beside: `metadata` splits that, `pairing`
 //! finds each frame's own, `exposure` says from its stamp when the frame was exposed. `rect` publishes frames without the lens'
 //! distortion for whoever wants them.
-//! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `marker` says how they are exposed for the marker; [`devices`] lists those of this machine.
+//! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `rtsp` (a feature) those that stream over a network; `clock` is the host's time
+//! of a camera's own. `marker` says how cameras are exposed for the marker; [`devices`] lists those of this machine.
 
+#[cfg(any(feature = "genicam", feature = "rtsp"))]
+mod clock;
 pub mod config;
 pub mod devices;
 mod exposure;
@@ -19,6 +22,8 @@ mod metadata;
 mod pairing;
 mod program;
 mod rect;
+#[cfg(feature = "rtsp")]
+mod rtsp;
 pub mod service;
 mod side_channel;
 mod v4l2;

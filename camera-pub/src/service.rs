@@ -15,13 +15,17 @@ use messages::{BayerPattern, CameraInfo, FrameHeader, PixelFormat, topic};
 use node::{FramePublisher, HealthCounters, Loan, Node, Publisher, Shutdown, clock_name, now_ns};
 use tokio::sync::oneshot;
 
-use crate::config::{Config, DeviceConfig, FrameFormat, FrameSize, GenicamConfig, ProgramConfig};
+use crate::config::{
+    Config, DeviceConfig, FrameFormat, FrameSize, GenicamConfig, ProgramConfig, RtspConfig,
+};
 use crate::exposure::Exposure;
 #[cfg(feature = "genicam")]
-use crate::genicam::{self, feed::Feed};
+use crate::genicam;
 use crate::marker::MarkerExposure;
 use crate::program::Program;
 use crate::rect::RectPublisher;
+#[cfg(feature = "rtsp")]
+use crate::rtsp::{self, feed::Image};
 use crate::v4l2::capture::{Lost, Taken};
 use crate::v4l2::kernel::DevicePath;
 use crate::v4l2::pixels::Pixels;
@@ -104,6 +108,8 @@ enum Source {
     Device(DeviceConfig),
     /// A camera of GenICam.
     Genicam(GenicamConfig),
+    /// A camera that streams over RTSP.
+    Rtsp(RtspConfig),
 }
 
 /// What there is to publish.
@@ -116,17 +122,22 @@ struct Found {
 }
 
 fn find(config: &Config) -> anyhow::Result<Found> {
+    let binning = config.source.binning();
     if let Some(device) = config.device()? {
         let (size, max_frame_bytes) = (device.size, device.size.pixels());
         return Ok(Found { source: Source::Device(device), size, max_frame_bytes });
     }
     if let Some(camera) = config.source.genicam()? {
-        let (size, max_frame_bytes) = (camera.size, camera.size.pixels());
+        let (size, max_frame_bytes) = (camera.size.binned(binning), camera.size.pixels());
         return Ok(Found { source: Source::Genicam(camera), size, max_frame_bytes });
+    }
+    if let Some(camera) = config.source.rtsp()? {
+        let (size, max_frame_bytes) = (camera.size, camera.size.pixels());
+        return Ok(Found { source: Source::Rtsp(camera), size, max_frame_bytes });
     }
     match config.source.program()? {
         Some(program) => {
-            let size = program.size;
+            let size = program.size.binned(binning);
             let max_frame_bytes = program.format.frame_bytes().max(size.pixels());
             Ok(Found { source: Source::Program(program), size, max_frame_bytes })
         }
@@ -139,7 +150,7 @@ fn find_images(config: &Config) -> anyhow::Result<Found> {
     ensure!(
         !config.source.paths.is_empty(),
         "the camera `{}` has nothing to publish; set image files or folders in `source.paths`, a camera program in \
-         `source.command`, or a camera in `source.device` or `source.genicam` (`alight cameras` lists them)",
+         `source.command`, a camera in `source.device` or `source.genicam` (`alight cameras` lists them), or a stream in `source.rtsp`",
         config.instance()
     );
     for path in &config.source.paths {
@@ -185,6 +196,8 @@ struct Stream {
     rect: RectPublisher,
     health: Arc<HealthCounters>,
     marker: MarkerExposure,
+    /// Samples of a frame before they are binned.
+    raw: Vec<u8>,
     sequence: u64,
 }
 
@@ -228,6 +241,7 @@ impl Stream {
                 .await?,
             health: node.shared_health(),
             marker,
+            raw: Vec::new(),
             sequence: 0,
         })
     }
@@ -248,6 +262,13 @@ impl Stream {
             }
             #[cfg(not(feature = "genicam"))]
             Source::Genicam(camera) => bail!("no camera of GenICam can be read: {camera:?}"),
+            #[cfg(feature = "rtsp")]
+            Source::Rtsp(camera) => {
+                let cause = || format!("reading the camera `{}` of `source.rtsp`", camera.url);
+                self.publish_rtsp(&camera).await.with_context(cause)
+            }
+            #[cfg(not(feature = "rtsp"))]
+            Source::Rtsp(camera) => bail!("no stream of RTSP can be read: {camera:?}"),
         }
     }
 
@@ -260,6 +281,10 @@ impl Stream {
             let arrival = program.wait().await?;
             let began = Instant::now();
             let mut pixels = match config.format {
+                FrameFormat::Samples { .. } if self.config.source.binning() > 1 => {
+                    self.raw.resize(config.format.frame_bytes(), 0);
+                    Loan::Private(std::mem::take(&mut self.raw))
+                }
                 FrameFormat::Samples { .. } => self.frames.loan(config.format.frame_bytes()),
                 FrameFormat::Jpeg { .. } => Loan::Private(Vec::new()),
             };
@@ -279,6 +304,13 @@ impl Stream {
             }
             last_published = Instant::now();
             let frame = match config.format {
+                FrameFormat::Samples { .. } if self.config.source.binning() > 1 => {
+                    let frame = self.prepare_binned(&pixels, config.size, config.bits);
+                    if let Loan::Private(raw) = pixels {
+                        self.raw = raw;
+                    }
+                    frame
+                }
                 FrameFormat::Samples { .. } => {
                     Some(self.prepare_samples(pixels, config.size, config.bits, bayer))
                 }
@@ -332,20 +364,28 @@ impl Stream {
     /// Publishes the frames of a camera of GenICam, whenever it is there.
     #[cfg(feature = "genicam")]
     async fn publish_genicam(&mut self, config: &GenicamConfig) -> anyhow::Result<()> {
-        let mut feed = Feed::start(config)?;
+        let mut feed = genicam::feed::Feed::start(config)?;
         loop {
             match feed.next() {
                 genicam::feed::Next::Frame(taken) => {
                     let began = Instant::now();
-                    let mut pixels = self.frames.loan(config.size.pixels());
-                    for (to, from) in pixels.iter_mut().zip(taken.pixels()) {
-                        *to = *from;
-                    }
                     let exposure = taken.exposure;
-                    feed.give_back(taken);
-                    let frame = self.prepare_samples(pixels, config.size, 8, config.bayer);
+                    let frame = if self.config.source.binning() > 1 {
+                        let frame = self.prepare_binned(taken.pixels(), config.size, 8);
+                        feed.give_back(taken);
+                        frame
+                    } else {
+                        let mut pixels = self.frames.loan(config.size.pixels());
+                        for (to, from) in pixels.iter_mut().zip(taken.pixels()) {
+                            *to = *from;
+                        }
+                        feed.give_back(taken);
+                        Some(self.prepare_samples(pixels, config.size, 8, config.bayer))
+                    };
                     self.health.latency("read", began.elapsed());
-                    self.publish(frame, exposure).await;
+                    if let Some(frame) = frame {
+                        self.publish(frame, exposure).await;
+                    }
                 }
                 genicam::feed::Next::Nothing => {}
                 genicam::feed::Next::Wait(time) => tokio::time::sleep(time).await,
@@ -361,6 +401,51 @@ impl Stream {
             // Waiting for a frame blocks this thread, briefly: a shutdown is noticed between.
             tokio::task::yield_now().await;
         }
+    }
+
+    /// Publishes the pictures of a stream of RTSP, whenever it is there.
+    #[cfg(feature = "rtsp")]
+    async fn publish_rtsp(&mut self, config: &RtspConfig) -> anyhow::Result<()> {
+        let mut feed = rtsp::feed::Feed::start(config).await?;
+        loop {
+            match feed.next().await? {
+                rtsp::feed::Next::Frame(image, exposure) => {
+                    let began = Instant::now();
+                    let frame = match image {
+                        Image::Jpeg(jpeg) => self.prepare_jpeg(&jpeg),
+                        Image::Grey(image) => self.prepare_grey(&image),
+                    };
+                    self.health.latency("read", began.elapsed());
+                    if let Some(frame) = frame {
+                        self.publish(frame, exposure).await;
+                    }
+                }
+                rtsp::feed::Next::Dropped(reason) => self.health.dropped(reason),
+                rtsp::feed::Next::Lost(reason) => drop(self.health.failed(reason)),
+                rtsp::feed::Next::Nothing => {}
+            }
+        }
+    }
+
+    /// A frame from a picture that was decoded; `None` when it has the wrong size.
+    #[cfg(feature = "rtsp")]
+    fn prepare_grey(&self, image: &GrayImage) -> Option<Prepared> {
+        let (width, height) = (image.width(), image.height());
+        if !self.is_expected(width, height) {
+            return None;
+        }
+        let mut pixels = self.frames.loan(width * height);
+        pixels.copy_from_slice(image.pixels());
+        Some(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
+    }
+
+    /// Whether a frame has the size that is configured; another is told.
+    fn is_expected(&self, width: usize, height: usize) -> bool {
+        let is_expected = (FrameSize { width, height }) == self.size;
+        if !is_expected && self.health.failed("image of another size") {
+            tracing::warn!(width, height, "Dropped a frame whose size is not `source.size_px`");
+        }
+        is_expected
     }
 
     /// Takes a frame out of the driver's buffer, gives that back, and sets the exposure of later frames.
@@ -439,6 +524,15 @@ impl Stream {
         Prepared { width, height, format, pixels, grey }
     }
 
+    /// A grey frame whose pixels are means of blocks of samples; `None` when there are too few samples.
+    fn prepare_binned(&self, samples: &[u8], size: FrameSize, bits: u32) -> Option<Prepared> {
+        let by = self.config.source.binning();
+        let FrameSize { width, height } = size.binned(by);
+        let mut pixels = self.frames.loan(width * height);
+        imaging::bin(samples, [size.width, size.height], bits, by, &mut pixels).ok()?;
+        Some(Prepared { width, height, format: PixelFormat::Mono8, pixels, grey: None })
+    }
+
     /// A frame from a JPEG file of the program; `None` when it cannot be decoded or has the wrong size.
     fn prepare_jpeg(&self, jpeg: &[u8]) -> Option<Prepared> {
         let max_pixels = self.config.max_pixels();
@@ -452,10 +546,7 @@ impl Stream {
             }
         };
         let (width, height) = (image.width(), image.height());
-        if (FrameSize { width, height }) != self.size {
-            if self.health.failed("image of another size") {
-                tracing::warn!(width, height, "Dropped a frame whose size is not `source.size_px`");
-            }
+        if !self.is_expected(width, height) {
             return None;
         }
         let mut pixels = self.frames.loan(width * height);

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use imaging::GrayImage;
-use media::{JpegScanner, Video, VideoImage, decode_image, read_calibration};
+use media::{JpegScanner, LiveH264, Video, VideoImage, decode_image, read_calibration};
 
 /// Maximum size of an image in these targets, in pixels.
 pub const MAX_PIXELS: u64 = 1 << 20;
@@ -38,9 +38,15 @@ pub fn mp4(input: &[u8]) {
     video(input, "mp4");
 }
 
-/// A bare stream of H.264.
+/// A bare stream of H.264, as a file and in pieces as a camera streams it.
 pub fn h264(input: &[u8]) {
     video(input, "h264");
+    let mut decoder = LiveH264::new(MAX_PIXELS);
+    for piece in input.chunks(999).take(MAX_FRAMES) {
+        if let Ok(Some(image)) = decoder.decode(piece) {
+            check(&image);
+        }
+    }
 }
 
 /// A calibration file of another program.

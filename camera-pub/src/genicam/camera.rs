@@ -12,7 +12,7 @@ use imaging::BayerPattern;
 use node::now_ns;
 use serde::Serialize;
 
-use super::clock::CameraClock;
+use crate::clock::{CameraClock, UtcArrivals};
 use crate::config::{FrameSize, GenicamConfig};
 use crate::exposure::{Exposure, Shutter, StampedAt};
 
@@ -20,8 +20,6 @@ use crate::exposure::{Exposure, Shutter, StampedAt};
 const BUFFERS: usize = 8;
 /// Bytes of a frame beside its pixels, at most: chunks.
 const MAX_EXTRA_BYTES: usize = 1 << 20;
-/// A frame that has waited longer is not told apart from one of a clock that was set, in nanoseconds.
-const MAX_WAIT_NS: i64 = 1_000_000_000;
 
 /// A camera of GenICam that answers.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -62,6 +60,7 @@ pub(super) struct OpenCamera {
     camera: Camera,
     stream: Stream,
     clock: CameraClock,
+    arrivals: UtcArrivals,
     shutter: Shutter,
     delay_ns: i64,
     /// The exposure time, where the camera does not change it by itself.
@@ -156,7 +155,8 @@ impl OpenCamera {
         Ok(Self {
             camera,
             stream,
-            clock: CameraClock::default(),
+            clock: CameraClock::direct(),
+            arrivals: UtcArrivals::default(),
             shutter: config.shutter,
             delay_ns: config.delay_ns,
             exposure_ns: exposure_us.map(|us| (us * 1e3).clamp(1.0, f64::from(u32::MAX)) as u32),
@@ -201,9 +201,16 @@ impl OpenCamera {
         std::mem::take(&mut self.counts)
     }
 
+    /// When a frame's first packet arrived, by the host's clock. Aravis says it by the system's, which may be set.
+    fn arrival_ns(&mut self, buffer: &Buffer) -> i64 {
+        let utc = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let utc_ns = i64::try_from(utc.as_nanos()).unwrap_or(i64::MAX);
+        self.arrivals.host_ns(buffer.system_timestamp().cast_signed(), utc_ns, now_ns())
+    }
+
     /// When a frame was exposed: by the camera's stamp, or by its arrival while that is not understood.
     fn exposure(&mut self, buffer: &Buffer) -> Exposure {
-        let arrival_ns = arrival_ns(buffer);
+        let arrival_ns = self.arrival_ns(buffer);
         let exposure_ns = self.exposure_ns.unwrap_or(0);
         let until_sent_ns = self.delay_ns
             + match self.shutter.stamped_at {
@@ -227,13 +234,6 @@ impl Drop for OpenCamera {
         // It may be gone.
         let _ = self.camera.stop_acquisition();
     }
-}
-
-/// When a frame's first packet arrived, by the host's clock. Aravis says it by the system's, which may be set.
-fn arrival_ns(buffer: &Buffer) -> i64 {
-    let now_utc_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |it| it.as_nanos());
-    let waited_ns = now_utc_ns.saturating_sub(u128::from(buffer.system_timestamp()));
-    now_ns() - i64::try_from(waited_ns).map_or(0, |ns| if ns > MAX_WAIT_NS { 0 } else { ns })
 }
 
 fn set_format(camera: &Camera, bayer: Option<BayerPattern>) -> anyhow::Result<()> {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use node::now_ns;
 
-use super::camera::{Counts, OpenCamera, Taken};
+use super::camera::{Counts, OpenCamera, Taken, genicam_cameras};
 use crate::config::GenicamConfig;
 
 /// Time between attempts to open the camera.
@@ -44,10 +44,17 @@ impl Feed {
     /// # Errors
     /// It does not answer, or cannot do what is wanted.
     pub(crate) fn start(config: &GenicamConfig) -> anyhow::Result<Self> {
-        let camera = OpenCamera::start(config)?;
+        let mut config = config.clone();
+        // The same one after a loss: another one has another calibration.
+        if config.name == "any"
+            && let Some(first) = genicam_cameras().into_iter().next()
+        {
+            config.name = first.name;
+        }
+        let camera = OpenCamera::start(&config)?;
         let now_ns = now_ns();
         Ok(Self {
-            config: config.clone(),
+            config,
             camera: Some(camera),
             last_frame_ns: now_ns,
             retry_ns: now_ns,

@@ -2,12 +2,13 @@
 //!
 //! This crate knows no marker, no camera, no file and no thread.
 //!
-//! Modules in reading order: [`view`] is an image, [`convert`] makes one of raw sensor data, [`mod@filter`]
+//! Modules in reading order: [`view`] is an image, [`convert`] makes one of raw sensor data, [`mod@bin`] a smaller one, [`mod@filter`]
 //! smooths it, [`mod@threshold`] binarises it, [`contour`] follows the borders, [`ellipse`] fits ellipses to
 //! them, [`sample`] interpolates grey values. The fast path to regions of any size: [`pyramid`] halves an
 //! image again and again, [`binary`] binarises with a local threshold, [`outline`] follows the outlines of
 //! the regions. [`segment`] finds straight edge segments where regions are broken. [`focus`] says how sharp an image is.
 
+pub mod bin;
 pub mod binary;
 pub mod contour;
 pub mod convert;
@@ -22,6 +23,7 @@ pub mod segment;
 pub mod threshold;
 pub mod view;
 
+pub use bin::bin;
 pub use binary::{Binarizer, BitImage, Contrast, Middle};
 pub use contour::{Contour, Contours, Limits, contour_area};
 pub use convert::{BayerPattern, Converter, SampleFormat};

@@ -3,12 +3,13 @@
 //! The crate knows no marker, no camera that is connected, and no other process.
 //!
 //! Modules in reading order: [`jpeg`] finds JPEG files in a stream of bytes, [`image`] reads image files,
-//! [`video`] reads videos frame by frame, [`calibration`] reads and writes the calibration files of other programs,
+//! [`video`] reads videos frame by frame, [`h264`] decodes what a camera streams, [`calibration`] reads and writes the calibration files of other programs,
 //! [`rectify`] takes a lens's distortion out of images.
 
 mod budget;
 pub mod calibration;
 mod contained;
+pub mod h264;
 pub mod image;
 pub mod jpeg;
 pub mod rectify;
@@ -19,6 +20,7 @@ pub use calibration::{
     CalibrationWriteError, OnSensor, SensorMode, SensorRegion, WantedMode, read_calibration,
     write_calibration,
 };
+pub use h264::{H264Error, LiveH264};
 pub use image::{
     DEFAULT_MAX_PIXELS, DecodedImage, IMAGE_EXTENSIONS, ImageError, decode_image, files_in,
     frame_bytes, images_in, read_image, samples_to_grey,
