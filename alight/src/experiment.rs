@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::{Args, Subcommand, ValueEnum};
 use experiments::Preset;
 use experiments::landing;
@@ -114,6 +114,10 @@ struct MarkersArgs {
     /// action-camera or phone. May be repeated; then a table compares them.
     #[arg(long = "processing", value_name = "NAME", default_value = "linear")]
     processings: Vec<Preset>,
+    /// Bin frames by software, 2 x 2 and 4 x 4, from those of the thesis' sensor with all its pixels and its colours
+    /// (2592 x 1944, RGGB), instead of in the sensor. Only with `--set positions`.
+    #[arg(long)]
+    binned: bool,
     /// Seed of poses, ids, grounds and noise. With 0 they are those on which the detector was developed.
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -172,14 +176,22 @@ fn run_landing(args: LandingArgs) -> anyhow::Result<ExitCode> {
 }
 
 fn run_markers(args: MarkersArgs) -> anyhow::Result<ExitCode> {
+    ensure!(
+        !args.binned || (args.processings == [Preset::Linear] && args.sets == [Set::Positions]),
+        "`--binned` is for `--set positions` and `--processing linear`: the thesis' frames, of a camera that gives out raw ones"
+    );
     let sets = if args.sets.is_empty() { Set::ALL.to_vec() } else { args.sets };
     let mut photographs = args.photographs;
     let requests: Vec<Request> = args
         .processings
         .iter()
         .map(|processing| {
-            let variant =
-                Variant { seed: args.seed, processing: *processing, every: args.every as usize };
+            let variant = Variant {
+                seed: args.seed,
+                processing: *processing,
+                every: args.every as usize,
+                is_binned: args.binned,
+            };
             Request {
                 sets: sets.clone(),
                 families: args.families.clone(),

@@ -4,9 +4,10 @@
 //! decodes them and goes on when the camera is lost. All run in tests against `server`, a camera that is played.
 
 pub(crate) mod feed;
-#[cfg(test)]
-mod server;
 mod session;
 mod stamps;
+
+#[cfg(test)]
+mod server;
 #[cfg(test)]
 mod tests;

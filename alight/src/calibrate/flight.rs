@@ -195,6 +195,7 @@ mod tests {
     use experiments::landing::flight::{fly, fly_recorded};
     use experiments::landing::plan::{Plan, Planned, Values};
     use geometry::{Body, Ned, Rotation, Vector};
+    use nalgebra::Vector3;
     use report::FlightReader;
 
     /// How the camera of a landing differs from its configuration.
@@ -244,26 +245,29 @@ mod tests {
         Ok(Landed { flight, result, level: level(&reader.finish()) })
     }
 
-    /// The mean of the turn from the estimated to the true attitude, in the body.
+    /// The mean of the turn from the estimated to the true attitude, in the body, but for the heading's error: that is a turn
+    /// about the vertical, of which a body that leans has a part in its roll and pitch.
     fn level(flight: &report::Flight) -> Rotation<Body, Body> {
         let attitude =
             |wxyz| Rotation::<Ned, Body>::from_wxyz(wxyz).unwrap_or(Rotation::identity());
-        let mut sum = nalgebra::Vector3::zeros();
-        let mut count = 0.0;
-        for state in &flight.vehicle {
+        let pairs = flight.vehicle.iter().filter_map(|state| {
             let near =
                 |truth: &&messages::Truth| truth.stamp_ns.abs_diff(state.stamp_ns) < 2_000_000;
-            let Some(truth) = flight.truth.iter().find(near) else { continue };
-            let estimated = attitude(state.ned_from_body_wxyz);
-            let turn = estimated.inverse() * attitude(truth.ned_from_body_wxyz);
-            let tilt = turn.quaternion.scaled_axis();
-            sum += nalgebra::Vector3::new(tilt.x, tilt.y, 0.0);
-            count += 1.0;
-        }
-        Rotation::from_rotation_vector(Vector::from_coords(sum / count))
+            let truth = flight.truth.iter().find(near)?;
+            Some((attitude(state.ned_from_body_wxyz), attitude(truth.ned_from_body_wxyz)))
+        });
+        let pairs: Vec<_> = pairs.collect();
+        let mean = |turn: &dyn Fn(&(Rotation<Ned, Body>, Rotation<Ned, Body>)) -> Vector3<f64>| {
+            pairs.iter().map(turn).sum::<Vector3<f64>>() / pairs.len() as f64
+        };
+        let turn = mean(&|(told, truth)| (*truth * told.inverse()).quaternion.scaled_axis());
+        let heading = Rotation::<Ned, Ned>::from_rotation_vector(Vector::new(0.0, 0.0, turn.z));
+        let tilt =
+            mean(&|(told, truth)| ((heading * *told).inverse() * *truth).quaternion.scaled_axis());
+        Rotation::from_rotation_vector(Vector::new(tilt.x, tilt.y, 0.0))
     }
 
-    /// Errors of the estimates over their deviations, with the errors in the quantities' units.
+    /// Errors of the estimates, in the quantities' units.
     fn errors(landed: &Landed, wrong: Wrong) -> [f64; 6] {
         let [roll, pitch, yaw] = wrong.mount.0.map(f64::to_radians);
         let mount = landed.level * Rotation::<Body, Body>::from_euler(roll, pitch, yaw);
@@ -368,5 +372,84 @@ mod tests {
         );
         // Both are millimetres; a tenth of that is no difference.
         assert!(after <= 1.1 * truth + 0.001, "{before} {after} {truth}");
+    }
+
+    /// A number of the environment, for measurements.
+    fn number(name: &str, usual: u64) -> u64 {
+        std::env::var(name).ok().and_then(|text| text.parse().ok()).unwrap_or(usual)
+    }
+
+    /// Settings with which a landing from 10 m takes a minute.
+    const SLOW: [&str; 2] =
+        ["controller.metric.max_descend_m_s=0.2", "controller.metric.touchdown_descend_m_s=0.15"];
+
+    #[test]
+    #[ignore = "a measurement of some minutes"]
+    fn how_exact_many_landings_are() {
+        let (count, first) = (number("ALIGHT_FLIGHTS", 24), number("ALIGHT_SEED", 8100));
+        for (how, set, bars) in [
+            ("as the default is", &[][..], None),
+            ("of a minute", &SLOW[..], Some([1.0, 0.1, 0.1, 0.1, 0.1])),
+        ] {
+            let mut rows = Vec::new();
+            let mut seconds = 0.0;
+            for seed in first..first + count {
+                let landed = landed(&planned(seed, WRONG, set)).unwrap();
+                let times = landed.flight.markers.iter().map(|marker| marker.stamp_s);
+                let (begin, end) = times.fold((f64::MAX, 0.0), |(a, b), t| (t.min(a), t.max(b)));
+                seconds += (end - begin) / count as f64;
+                rows.push((errors(&landed, WRONG), landed.result.estimates));
+            }
+            println!("{count} landings {how}, which see the pad for {seconds:.0} s on average:");
+            for (i, quantity) in QUANTITIES.into_iter().enumerate() {
+                let (name, unit, scale) = name(quantity);
+                let of = |value: &dyn Fn(f64, f64) -> f64| {
+                    let squares = rows.iter().map(|(errors, estimates)| {
+                        let deviation = estimates[i].deviation;
+                        value(errors[i], deviation).powi(2)
+                    });
+                    let squares: Vec<f64> = squares.collect();
+                    let rms = (squares.iter().sum::<f64>() / squares.len() as f64).sqrt();
+                    (rms, squares.into_iter().fold(0.0, f64::max).sqrt())
+                };
+                let (rms, worst) = of(&|error, _| scale * error);
+                let (deviation, _) = of(&|_, deviation| scale * deviation);
+                let (normalised, farthest) = of(&|error, deviation| error / deviation);
+                let bar = bars.and_then(|bars| bars.get(i).copied());
+                let within = bar.map_or(String::new(), |bar| {
+                    let is_within = |(errors, _): &&([f64; 6], _)| (scale * errors[i]).abs() <= bar;
+                    let within = rows.iter().filter(is_within).count();
+                    format!(", {within} of {count} within {bar} {unit}")
+                });
+                println!(
+                    "  {name:<13} error {rms:.4} {unit} rms, {worst:.4} at most; deviation {deviation:.4}; error over \
+                     deviation {normalised:.2} rms, {farthest:.2} at most{within}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    #[ignore = "a measurement of some minutes"]
+    fn how_well_many_landings_with_the_corrected_camera_end() {
+        let (count, first) = (number("ALIGHT_FLIGHTS", 24), number("ALIGHT_SEED", 8300));
+        let mut errors_m = [const { Vec::new() }; 3];
+        for seed in first..first + count {
+            let landed = landed(&planned(seed, WRONG, &[])).unwrap();
+            let cameras = [WRONG, left(WRONG, &landed.result), Wrong::default()];
+            for (errors_m, camera) in errors_m.iter_mut().zip(cameras) {
+                errors_m.push(landing_error_m(seed + 1000, camera));
+            }
+        }
+        for (how, mut errors_m) in ["before", "after", "with the truth"].into_iter().zip(errors_m) {
+            errors_m.sort_by(f64::total_cmp);
+            let mean_m = errors_m.iter().sum::<f64>() / errors_m.len() as f64;
+            println!(
+                "{how}: mean {:.1} mm, median {:.1} mm, worst {:.1} mm",
+                1e3 * mean_m,
+                1e3 * errors_m[errors_m.len() / 2],
+                1e3 * errors_m[errors_m.len() - 1]
+            );
+        }
     }
 }

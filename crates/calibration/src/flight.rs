@@ -128,6 +128,17 @@ pub enum FlightRefusal {
         /// The part of the detections that do not fit.
         share: f64,
     },
+    /// Solutions go back and forth, or on and on.
+    #[error(
+        "the flight has no solution that stands: after {ITERATIONS} steps the {quantity} still changes by {steps:.1} standard \
+         deviations; record a flight with more tilt and turns"
+    )]
+    Unsettled {
+        /// What changes most.
+        quantity: &'static str,
+        /// By how much, over its standard deviation.
+        steps: f64,
+    },
     /// Numbers that are no flight.
     #[error("the flight's numbers have no solution: {why}")]
     Numbers {
@@ -147,11 +158,16 @@ pub const MAX_WANDER_M: f64 = 0.5;
 /// Largest part of the detections that may be elsewhere.
 const MAX_OUTLIERS: f64 = 0.3;
 /// Iterations of the solution.
-const ITERATIONS: usize = 20;
+const ITERATIONS: usize = 30;
+/// From this iteration on only half of each step is taken: around some solutions whole ones go back and forth, as detections at the
+/// flight's ends come and go with the time offset.
+const HALF_FROM: usize = 12;
 /// How often the errors' sizes are estimated anew.
 const NOISE_ROUNDS: usize = 2;
 /// A step that is smaller than this part of the deviations is the last.
 const CONVERGED: f64 = 0.02;
+/// Largest step, in deviations, that may still be ahead when there are no more iterations.
+const MAX_UNSETTLED: f64 = 3.0;
 
 /// Estimates what differs between a camera and its configuration.
 ///
@@ -189,6 +205,7 @@ pub fn calibrate_flight(
     if result.outliers > MAX_OUTLIERS || wander_m > MAX_WANDER_M {
         return Err(FlightRefusal::Contradiction { wander_m, share: result.outliers });
     }
+    is_settled(&result)?;
     let told = Told { configured, markers: model.markers().len(), excitation, noise };
     Ok(told.calibration(&parameters, &result))
 }
@@ -205,20 +222,44 @@ fn minimum(
         filtered(&model.linearised(parameters), parameters, prior, noise)
             .ok_or(FlightRefusal::Numbers { why: "the equations are singular" })
     };
-    for _ in 0..ITERATIONS {
+    for iteration in 0..ITERATIONS {
         let result = solved(&parameters)?;
-        let is_short = |i: usize| {
-            result.step[i].abs() <= CONVERGED * libm::fmax(result.covariance[(i, i)], 0.0).sqrt()
-        };
-        if (0..PARAMETERS).all(is_short) {
+        if (0..PARAMETERS).all(|i| result.step[i].abs() <= CONVERGED * deviation(&result, i)) {
             return Ok((parameters, result));
         }
         let too_long =
             |quantity: Quantity| result.step[quantity.index()].abs() / quantity.max_step();
         let longest = QUANTITIES.into_iter().map(too_long).fold(1.0, libm::fmax);
-        parameters += result.step / longest;
+        let share = if iteration < HALF_FROM { 1.0 } else { 0.5 };
+        parameters += result.step * (share / longest);
     }
     Ok((parameters, solved(&parameters)?))
+}
+
+fn deviation(result: &Filtered, index: usize) -> f64 {
+    libm::fmax(result.covariance[(index, index)], 0.0).sqrt()
+}
+
+/// The variance of an estimate: of the flight's noise, of what no flight averages out, and of the step that is still ahead where
+/// the solution goes back and forth.
+fn variance(result: &Filtered, quantity: Quantity) -> f64 {
+    let i = quantity.index();
+    let noise = libm::fmax(result.covariance[(i, i)], 0.0);
+    noise + squared(quantity.model_deviation()) + squared(result.step[i])
+}
+
+/// Refuses a solution that is still far away.
+fn is_settled(result: &Filtered) -> Result<(), FlightRefusal> {
+    for quantity in QUANTITIES {
+        let i = quantity.index();
+        let step = result.step[i].abs();
+        let deviation = libm::hypot(deviation(result, i), quantity.model_deviation());
+        if step > MAX_UNSETTLED * deviation {
+            let quantity = quantity.name();
+            return Err(FlightRefusal::Unsettled { quantity, steps: step / deviation });
+        }
+    }
+    Ok(())
 }
 
 /// What is told of a solution.
@@ -233,8 +274,10 @@ impl Told<'_> {
     fn calibration(&self, parameters: &Parameters, result: &Filtered) -> FlightCalibration {
         let covariance: SMatrix<f64, 6, 6> = SMatrix::from_fn(|i, j| {
             let [one, other] = [QUANTITIES[i], QUANTITIES[j]];
-            let model = if i == j { squared(one.model_deviation()) } else { 0.0 };
-            result.covariance[(one.index(), other.index())] + model
+            match i == j {
+                true => variance(result, one),
+                false => result.covariance[(one.index(), other.index())],
+            }
         });
         let estimates: [FlightEstimate; 6] = std::array::from_fn(|i| {
             let quantity = QUANTITIES[i];
@@ -259,5 +302,30 @@ impl Told<'_> {
             excitation: self.excitation,
             markers: self.markers,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_solution_that_still_moves_is_refused() {
+        let mut result = Filtered {
+            step: Parameters::zeros(),
+            covariance: SMatrix::identity(),
+            likelihood: 0.0,
+            outliers: 0.0,
+        };
+        assert_eq!(is_settled(&result), Ok(()));
+        assert!((variance(&result, Quantity::FocalScale) - 1.0).abs() < 1e-6);
+        result.step[Quantity::FocalScale.index()] = -2.0;
+        assert_eq!(is_settled(&result), Ok(()));
+        assert!((variance(&result, Quantity::FocalScale) - 5.0).abs() < 1e-6);
+        result.step[Quantity::FocalScale.index()] = -4.0;
+        let refusal = is_settled(&result).unwrap_err();
+        let is_named = matches!(refusal, FlightRefusal::Unsettled { quantity: "focal length", .. });
+        assert!(is_named, "{refusal}");
+        assert!(refusal.to_string().contains("4.0 standard deviations"), "{refusal}");
     }
 }

@@ -392,6 +392,21 @@ distortion_coefficients: !!opencv-matrix
     }
 
     #[test]
+    fn four_coefficients_of_an_unnamed_lens_are_no_guess() {
+        let four = OPENCV.replace(",\n       2. ]", " ]");
+        let problem = read(&four).unwrap_err();
+        assert!(
+            problem.contains("four numbers") && problem.contains("fisheye_model: 1"),
+            "{problem}"
+        );
+        let narrow = read(&four.replace("flags: 0", "fisheye_model: 0")).unwrap();
+        assert!(matches!(narrow.distortion, Distortion::BrownConrady(_)));
+        let none =
+            four.replace(".12, -1., 1.1786843796668460e-04, -4.6240686046485508e-04", "0, 0, 0, 0");
+        assert_eq!(read(&none).unwrap().distortion, Distortion::None);
+    }
+
+    #[test]
     fn lists_of_rows_are_matrices_too() {
         let text = "image_size: [640, 480]\nK: [[500, 0, 320], [0, 500, 240], [0, 0, 1]]\n";
         assert_eq!(read(text).unwrap().distortion, Distortion::None);

@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p experiments --example exposure -- frames [SEED [CHANGE]]` changes the light on a pad in rendered frames, and
 //! prints the level that its white reaches, after how many frames, and in how many the marker was found.
-//! `... -- flights [SEED [NUMBER [WAY]]]` flies landings in light for which the camera was not set, and prints how they end.
+//! `... -- flights [SEED [NUMBER [WAY [LIGHT]]]]` flies landings in light for which the camera was not set, and prints how they end.
 #![allow(clippy::print_stdout, reason = "a program for people at a terminal")]
 
 use anyhow::{Context, bail};
@@ -46,10 +46,12 @@ fn main() -> anyhow::Result<()> {
     match arguments.first().map(String::as_str) {
         Some("frames") => frames(number(1, 1)?, arguments.get(2).map_or("", String::as_str)),
         Some("flights") => {
-            let way = arguments.get(3).map_or("", String::as_str);
-            flights(number(1, 1)?, number(2, 10)?, way)
+            let text = |index: usize| arguments.get(index).map_or("", String::as_str);
+            flights(number(1, 1)?, number(2, 10)?, [text(3), text(4)])
         }
-        _ => bail!("usage: exposure frames [SEED [CHANGE]] | flights [SEED [NUMBER [WAY]]]"),
+        _ => {
+            bail!("usage: exposure frames [SEED [CHANGE]] | flights [SEED [NUMBER [WAY [LIGHT]]]]")
+        }
     }
 }
 
@@ -227,15 +229,16 @@ impl Run {
     }
 }
 
-/// Prints the rows of the ways whose names contain `wanted`.
-fn flights(seed: u64, number: u64, wanted: &str) -> anyhow::Result<()> {
-    let ways = || WAYS.into_iter().filter(|way| way.contains(wanted));
+/// Prints the rows of the ways and lights whose names contain what is wanted.
+fn flights(seed: u64, number: u64, wanted: [&str; 2]) -> anyhow::Result<()> {
+    let ways = || WAYS.into_iter().filter(|way| way.contains(wanted[0]));
+    let is_wanted = |light: &str| light.contains(wanted[1]);
     println!(
         "| light, of that for which the camera was set | way | landed | within 0.1 m | error, median / worst | frames with the marker |"
     );
     println!("|---|---|---|---|---|---|");
     for stops in [-6, -4, -2, 0, 2, 4, 6] {
-        for way in ways() {
+        for way in ways().filter(|_| is_wanted(&format!("{stops:+} stops"))) {
             let light = LIGHT * f64::powi(2.0, stops);
             let set = vec![
                 format!("simulator.camera.set_for_light={LIGHT}"),
@@ -261,7 +264,7 @@ fn flights(seed: u64, number: u64, wanted: &str) -> anyhow::Result<()> {
     for (name, set) in
         [("low sun: +2 stops, and a reflection", low_sun.as_slice()), ("shadow", &shadow)]
     {
-        for way in ways() {
+        for way in ways().filter(|_| is_wanted(name)) {
             let mut set: Vec<String> = set.iter().map(|setting| (*setting).to_owned()).collect();
             set.push("simulator.occluder.at_s=0".to_owned());
             set.push(format!("simulator.camera.exposure={way}"));

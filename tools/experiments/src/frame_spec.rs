@@ -43,6 +43,9 @@ pub struct FrameSpec {
     pub occluder: Occluder,
     /// Whether grey is interpolated from a Bayer mosaic.
     pub bayer: bool,
+    /// The frame is binned by software: each of its pixels is the mean of so many of a sensor with a Bayer mosaic, across and down;
+    /// 1 for a camera that does what it does itself. Camera and truth are those of the binned frame.
+    pub binned: u32,
     /// Seed of the random generators.
     pub seed: u64,
 }
@@ -88,6 +91,7 @@ impl FrameSpec {
             light: 1.0,
             occluder: Occluder::None,
             bayer: false,
+            binned: 1,
             seed,
         }
     }
@@ -232,22 +236,56 @@ impl FrameRenderer {
             painted_marks: spec.painted_marks,
             light: spec.light,
         };
-        let mut renderer = Renderer::with_ground(ground, &scene, spec.settings.clone(), spec.seed)?;
+        let settings = sensor(&spec.settings, spec.binned);
+        let model = settings.model;
+        let is_mosaic = spec.bayer || spec.binned > 1;
+        let mut renderer = Renderer::with_ground(ground, &scene, settings, spec.seed)?;
         let poses: Vec<_> = spec
             .path
             .iter()
             .map(|pose| ned_from_marker * pose.inverse() * body_from_camera.inverse())
             .collect();
-        let model = spec.settings.model;
         let mut pixels = vec![0; model.width as usize * model.height as usize];
         let mut apply = |v: usize, light: &mut [f32]| {
             spec.occluder.apply(v, light);
-            if spec.bayer {
+            if is_mosaic {
                 filter_colours(v, light);
             }
         };
         renderer.render_through(&mut apply, &poses, spec.seed, &mut pixels)?;
+        if spec.binned > 1 {
+            let size = [model.width as usize, model.height as usize];
+            let frame = &spec.settings.model;
+            let mut binned = vec![0; frame.width as usize * frame.height as usize];
+            // The size is a multiple of the binning.
+            imaging::bin(&pixels, size, 8, spec.binned as usize, &mut binned)
+                .map_err(|_cause| RenderError::Setting("a frame without a pixel"))?;
+            return Ok(binned);
+        }
         Ok(if spec.bayer { interpolated(&pixels, model.width as usize) } else { pixels })
+    }
+}
+
+/// The sensor whose pixels make those of a binned frame: as many smaller ones, each with its part of the light and of the well.
+fn sensor(frame: &CameraSettings, binned: u32) -> CameraSettings {
+    let n = f64::from(binned);
+    let CameraModel { width, height, fx, fy, cx, cy, distortion } = frame.model;
+    let middle = |at: f64| n * at + (n - 1.0) / 2.0;
+    CameraSettings {
+        model: CameraModel {
+            width: binned * width,
+            height: binned * height,
+            fx: n * fx,
+            fy: n * fy,
+            cx: middle(cx),
+            cy: middle(cy),
+            distortion,
+        },
+        electrons_per_s: frame.electrons_per_s / (n * n),
+        full_well_e: frame.full_well_e / (n * n),
+        read_noise_e: frame.read_noise_e / n,
+        blur_px: n * frame.blur_px,
+        ..frame.clone()
     }
 }
 
@@ -370,6 +408,29 @@ mod tests {
         assert_eq!(render(&spec()), render(&spec()));
         let swapped = FrameSpec { inverted: true, ..spec() };
         assert_ne!(render(&spec()), render(&swapped));
+    }
+
+    #[test]
+    fn a_binned_frame_shows_the_marker_where_an_unbinned_one_shows_it() {
+        let own = FrameSpec { painted_marks: 0, ..spec() };
+        let size = own.settings.model.width as usize;
+        let centre = |pixels: &[u8]| {
+            // The middle of what is dark around the marker's pixel.
+            let [mut sum, mut x, mut y] = [0.0; 3];
+            for (v, u) in (260..340).flat_map(|v| (160..240).map(move |u| (v, u))) {
+                let dark = (200.0 - f64::from(pixels[v * size + u])).max(0.0);
+                (sum, x, y) = (sum + dark, x + dark * u as f64, y + dark * v as f64);
+            }
+            Pixel::new(x / sum, y / sum)
+        };
+        let raw = FrameSpec { binned: 4, ..own.clone() };
+        let frames = [own, raw].map(|spec| FrameRenderer::default().render(&spec).unwrap());
+        assert_eq!(frames[0].len(), frames[1].len());
+        // The colours' filters take a sixth of the light.
+        let brighter = frames[1].iter().map(|p| (f64::from(*p) / 0.8375).min(255.0) as u8);
+        let brighter: Vec<u8> = brighter.collect();
+        let apart = centre(&frames[0]).distance(&centre(&brighter));
+        assert!(apart < 0.3, "{apart} px");
     }
 
     #[test]

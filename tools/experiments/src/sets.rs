@@ -19,6 +19,9 @@ use crate::frame_spec::FrameSpec;
 use crate::set::Set;
 use scene::Draw;
 
+/// Pixels of the thesis' sensor across.
+const SENSOR_WIDTH: u32 = 2592;
+
 /// Which frames of a set are meant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Variant {
@@ -29,20 +32,23 @@ pub struct Variant {
     pub processing: Preset,
     /// Only every such frame; 1 for all.
     pub every: usize,
+    /// Whether frames are binned by software, from those of the thesis' sensor with all its pixels and colours.
+    pub is_binned: bool,
 }
 
 impl Default for Variant {
     fn default() -> Self {
-        Self { seed: 0, processing: Preset::Linear, every: 1 }
+        Self { seed: 0, processing: Preset::Linear, every: 1, is_binned: false }
     }
 }
 
 impl Variant {
     /// The name of its folder; `None` for all frames on which the detector was developed.
     pub fn name(&self) -> Option<String> {
-        let Self { seed, processing, every } = *self;
+        let Self { seed, processing, every, is_binned } = *self;
         let part = if every > 1 { format!("-every{every}") } else { String::new() };
-        (*self != Self::default()).then(|| format!("{processing}-seed{seed}{part}"))
+        let binned = if is_binned { "-binned" } else { "" };
+        (*self != Self::default()).then(|| format!("{processing}-seed{seed}{part}{binned}"))
     }
 }
 
@@ -82,6 +88,10 @@ pub fn frames_of(set: Set, marker: Marker, variant: Variant) -> Vec<FrameSpec> {
             }
             // A camera has one mosaic.
             spec.bayer &= !processing.mosaic;
+            if variant.is_binned {
+                let pixels = f64::from(SENSOR_WIDTH) / f64::from(spec.settings.model.width.max(1));
+                spec.binned = (pixels.round() as u32).max(1);
+            }
             spec
         })
         .collect()
@@ -137,7 +147,11 @@ mod tests {
     fn another_seed_has_other_poses_and_a_preset_the_same_ones() {
         let marker = "stag-hd23:0:0.15341".parse().unwrap();
         let of = |seed, processing| {
-            frames_of(Set::Landing, marker, Variant { seed, processing, every: 2 })
+            frames_of(
+                Set::Landing,
+                marker,
+                Variant { seed, processing, every: 2, ..Variant::default() },
+            )
         };
         let [first, usb, other] =
             [of(0, Preset::Linear), of(0, Preset::Usb), of(7, Preset::Linear)];

@@ -94,12 +94,19 @@ fn matrix_form(root: &Value) -> Result<CameraModel, Problem> {
     let size = size(root)?;
     let coefficients = coefficients(root, COEFFICIENTS)?;
     let distortion_key = find(root, COEFFICIENTS).map_or(COEFFICIENTS[0], |(key, _)| key);
-    let is_fisheye = root.get("fisheye_model").and_then(Value::as_i64) == Some(1);
-    let name = match root.get("distortion_model").and_then(Value::as_str) {
-        Some(name) => name,
-        None if is_fisheye => "fisheye",
-        None if coefficients.is_empty() => "none",
-        None => "plumb_bob",
+    let is_fisheye = root.get("fisheye_model").and_then(Value::as_i64).map(|model| model == 1);
+    let name = match (root.get("distortion_model").and_then(Value::as_str), is_fisheye) {
+        (Some(name), _) => name,
+        (None, Some(true)) => "fisheye",
+        (None, _) if coefficients.is_empty() => "none",
+        (None, None) if coefficients.len() == 4 && coefficients.iter().any(|k| *k != 0.0) => {
+            return Err(Problem {
+                key: distortion_key.to_owned(),
+                problem: "has four numbers, and nothing says of which lens".to_owned(),
+                expected: "add `fisheye_model: 1` for k1, k2, k3, k4 of OpenCV's fisheye, or `fisheye_model: 0` for k1, k2, p1, p2",
+            });
+        }
+        (None, _) => "plumb_bob",
     };
     let distortion = distortion("distortion_model", name, distortion_key, &coefficients)?;
     checked(key, size, [fx, fy, cx, cy], distortion)
