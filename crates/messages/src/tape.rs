@@ -1,13 +1,13 @@
 //! The controller's tape: what it handled, in the order in which it did, and what came out of it.
 //!
 //! A [`Tape`] holds some records. Each record is an event with the time at which it was handled, what came out of it,
-//! and a running hash over all of this and the hash before: a bit that was flipped, and a record that is missing, is
-//! found at once. What a tape says is enough to fly the same flight again.
+//! and a running hash over all of this and the hash before (XXH3 of 64 bits, seeded with that): a bit that was flipped, and
+//! a record that is missing, is found at once. What a tape says is enough to fly the same flight again.
 
 use std::borrow::Cow;
 
 use serde::{Deserialize, Serialize, Serializer};
-use siphasher::sip::SipHasher13;
+use xxhash_rust::xxh3::xxh3_64_with_seed;
 
 use crate::camera::CameraInfo;
 use crate::codec::wire;
@@ -15,7 +15,7 @@ use crate::controller::{CommandReply, ControllerCommand, ControllerStatus, Targe
 use crate::detector::{Detections, DetectorInfo};
 
 wire! {
-    Tape = 19 v 2;
+    Tape = 19 v 3;
 }
 
 /// Length of the hash at the end of each record, in bytes.
@@ -283,9 +283,9 @@ pub struct TapeWriter {
     next: u64,
     hash: u64,
     /// The decision of the record before, as bytes.
-    decision: Buffer,
+    decision: Vec<u8>,
     /// That of this record.
-    new_decision: Buffer,
+    new_decision: Vec<u8>,
     records: Buffer,
     count: u32,
 }
@@ -336,7 +336,7 @@ impl Buffer {
 }
 
 fn running_hash(before: u64, bytes: &[u8]) -> u64 {
-    SipHasher13::new_with_keys(before, 0).hash(bytes)
+    xxh3_64_with_seed(bytes, before)
 }
 
 impl TapeWriter {
@@ -346,8 +346,8 @@ impl TapeWriter {
             begun_ns: now_ns,
             next: 0,
             hash: 0,
-            decision: Buffer::default(),
-            new_decision: Buffer::default(),
+            decision: Vec::new(),
+            new_decision: Vec::new(),
             records: Buffer::default(),
             count: 0,
         }
@@ -361,14 +361,14 @@ impl TapeWriter {
         }
         self.new_decision.clear();
         if let Some(new) = &output.decision {
-            self.new_decision.append(new);
+            new.write(&mut self.new_decision);
         }
-        let is_as_before = self.new_decision.bytes() == self.decision.bytes();
+        let is_as_before = self.new_decision == self.decision;
         let start = self.records.len;
         let step = StepRef {
             now_ns,
             event,
-            decision: if is_as_before { &[] } else { self.new_decision.bytes() },
+            decision: if is_as_before { &[] } else { &self.new_decision },
             packets: output.packets,
             reply: output.reply,
         };
@@ -452,10 +452,165 @@ impl<'a> TapeRecord<'a> {
     }
 }
 
+/// What follows in the bytes of a decision.
+#[derive(Copy, Clone, Default)]
+struct Contents(u8);
+
+impl Contents {
+    /// The action's number.
+    const ACTION: u8 = 0b111;
+    const TARGET: u8 = 1 << 3;
+    const REJECTED: u8 = 1 << 4;
+    const DETECTOR: u8 = 1 << 5;
+    const HEADING: u8 = 1 << 6;
+    const NIS: u8 = 1 << 7;
+
+    fn with(self, part: u8, is_there: bool) -> Self {
+        Self(if is_there { self.0 | part } else { self.0 })
+    }
+
+    fn has(self, part: u8) -> bool {
+        self.0 & part != 0
+    }
+}
+
+/// Appends numbers: all of them at once, as there is a decision for most events.
+fn write_numbers<const N: usize>(numbers: [f64; N], bytes: &mut Vec<u8>) {
+    let mut all = [[0; 8]; N];
+    for (place, number) in all.iter_mut().zip(numbers) {
+        *place = number.to_le_bytes();
+    }
+    bytes.extend_from_slice(all.as_flattened());
+}
+
+/// Appends a name with its length before it. Names are short; of a longer one than can be the rest is left out.
+fn write_name(name: &str, bytes: &mut Vec<u8>) {
+    let length = u16::try_from(name.len()).unwrap_or(u16::MAX);
+    bytes.extend_from_slice(&length.to_le_bytes());
+    bytes.extend_from_slice(name.as_bytes().get(..usize::from(length)).unwrap_or_default());
+}
+
+fn read_numbers<const N: usize>(bytes: &mut &[u8]) -> Option<[f64; N]> {
+    let mut numbers = [0.0; N];
+    for number in &mut numbers {
+        let (first, rest) = bytes.split_first_chunk()?;
+        (*number, *bytes) = (f64::from_le_bytes(*first), rest);
+    }
+    Some(numbers)
+}
+
+fn read_name<'a>(bytes: &mut &'a [u8]) -> Option<&'a str> {
+    let (length, rest) = bytes.split_first_chunk()?;
+    let (name, rest) = rest.split_at_checked(usize::from(u16::from_le_bytes(*length)))?;
+    *bytes = rest;
+    std::str::from_utf8(name).ok()
+}
+
 impl<'a> TapeDecision<'a> {
+    /// Appends its bytes: [`Contents`], the names, the setpoint and the target, as far as it has them; numbers with the lowest
+    /// byte first.
+    fn write(&self, bytes: &mut Vec<u8>) {
+        let action = match self.action {
+            TapeAction::None => 0,
+            TapeAction::Velocity { .. } => 1,
+            TapeAction::Guided => 2,
+            TapeAction::Disarm => 3,
+            TapeAction::Land => 4,
+        };
+        let target = self.target.as_ref();
+        let contents = Contents(action)
+            .with(Contents::TARGET, target.is_some())
+            .with(Contents::REJECTED, self.rejected.is_some())
+            .with(Contents::DETECTOR, self.detector.is_some())
+            .with(Contents::HEADING, target.is_some_and(|it| it.heading_rad.is_some()))
+            .with(Contents::NIS, target.is_some_and(|it| it.nis.is_some()));
+        bytes.push(contents.0);
+        let names = [Some(self.phase), Some(self.why), self.rejected, self.detector];
+        names.into_iter().flatten().for_each(|name| write_name(name, bytes));
+        if let TapeAction::Velocity { velocity_ned_m_s: [north, east, down], yaw_rate_rad_s } =
+            self.action
+        {
+            write_numbers([north, east, down, yaw_rate_rad_s], bytes);
+        }
+        let Some(target) = target else { return };
+        let [north_m, east_m, down_m] = target.position_ned_m;
+        let [north_m_s, east_m_s, down_m_s] = target.velocity_ned_m_s;
+        let numbers = [
+            north_m,
+            east_m,
+            down_m,
+            north_m_s,
+            east_m_s,
+            down_m_s,
+            target.lateral_error_m,
+            target.height_m,
+            target.age_s,
+            target.deviation_m,
+            target.time_offset_s,
+        ];
+        write_numbers(numbers, bytes);
+        target.heading_rad.into_iter().for_each(|it| write_numbers([it], bytes));
+        target.nis.into_iter().for_each(|it| write_numbers([it], bytes));
+        bytes.extend_from_slice(&target.detections.to_le_bytes());
+        bytes.push(u8::from(target.ambiguous));
+    }
+
     /// The decision in the bytes of a [`TapeRecord`]; `None` when they are none.
-    pub fn from_bytes(bytes: &'a [u8]) -> Option<Self> {
-        postcard::from_bytes(bytes).ok()
+    pub fn from_bytes(mut bytes: &'a [u8]) -> Option<Self> {
+        let (first, rest) = bytes.split_first()?;
+        let contents = Contents(*first);
+        bytes = rest;
+        let (phase, why) = (read_name(&mut bytes)?, read_name(&mut bytes)?);
+        let mut name_if = |part| match contents.has(part) {
+            true => read_name(&mut bytes).map(Some),
+            false => Some(None),
+        };
+        let (rejected, detector) = (name_if(Contents::REJECTED)?, name_if(Contents::DETECTOR)?);
+        let action = match first & Contents::ACTION {
+            0 => TapeAction::None,
+            1 => {
+                let [north, east, down, yaw_rate_rad_s] = read_numbers(&mut bytes)?;
+                TapeAction::Velocity { velocity_ned_m_s: [north, east, down], yaw_rate_rad_s }
+            }
+            2 => TapeAction::Guided,
+            3 => TapeAction::Disarm,
+            4 => TapeAction::Land,
+            _ => return None,
+        };
+        let target = match contents.has(Contents::TARGET) {
+            true => Some(TapeTarget::read(contents, &mut bytes)?),
+            false => None,
+        };
+        bytes.is_empty().then_some(Self { phase, action, why, target, rejected, detector })
+    }
+}
+
+impl TapeTarget {
+    fn read(contents: Contents, bytes: &mut &[u8]) -> Option<Self> {
+        let position_ned_m = read_numbers(bytes)?;
+        let velocity_ned_m_s = read_numbers(bytes)?;
+        let [lateral_error_m, height_m, age_s, deviation_m, time_offset_s] = read_numbers(bytes)?;
+        let mut number_if = |part| match contents.has(part) {
+            true => read_numbers(bytes).map(|[number]| Some(number)),
+            false => Some(None),
+        };
+        let (heading_rad, nis) = (number_if(Contents::HEADING)?, number_if(Contents::NIS)?);
+        let (detections, rest) = bytes.split_first_chunk()?;
+        let (ambiguous, rest) = rest.split_first()?;
+        *bytes = rest;
+        Some(Self {
+            position_ned_m,
+            velocity_ned_m_s,
+            lateral_error_m,
+            height_m,
+            age_s,
+            deviation_m,
+            detections: u32::from_le_bytes(*detections),
+            heading_rad,
+            time_offset_s,
+            nis,
+            ambiguous: *ambiguous != 0,
+        })
     }
 }
 
@@ -507,6 +662,53 @@ mod tests {
         let packet = TapeEvent::Packet { raw: Cow::Borrowed(b"packet") };
         writer.write(9, &packet, &TapeOutput::default());
         writer.take().unwrap()
+    }
+
+    #[test]
+    fn whatever_was_decided_is_read_again_and_what_is_cut_is_no_decision() {
+        let target = TapeTarget {
+            position_ned_m: [1.0, 2.0, 3.0],
+            velocity_ned_m_s: [4.0, 5.0, -0.0],
+            lateral_error_m: 7.0,
+            height_m: 8.0,
+            age_s: 9.0,
+            deviation_m: 10.0,
+            detections: 11,
+            heading_rad: Some(12.0),
+            time_offset_s: 13.0,
+            nis: Some(14.0),
+            ambiguous: true,
+        };
+        let setpoint = decision().action;
+        let actions =
+            [TapeAction::None, setpoint, TapeAction::Guided, TapeAction::Disarm, TapeAction::Land];
+        let targets = [
+            None,
+            Some(target),
+            Some(TapeTarget { heading_rad: None, ..target }),
+            Some(TapeTarget { nis: None, ambiguous: false, ..target }),
+        ];
+        let mut all = std::collections::BTreeSet::new();
+        for action in actions {
+            for target in targets {
+                for rejected in [None, Some("stale")] {
+                    for detector in [None, Some("main"), Some("")] {
+                        let decision =
+                            TapeDecision { action, target, rejected, detector, ..decision() };
+                        let mut bytes = Vec::new();
+                        decision.write(&mut bytes);
+                        assert_eq!(TapeDecision::from_bytes(&bytes), Some(decision));
+                        for length in 0..bytes.len() {
+                            assert_eq!(TapeDecision::from_bytes(&bytes[..length]), None);
+                        }
+                        assert_eq!(TapeDecision::from_bytes(&[&bytes[..], b"?"].concat()), None);
+                        assert!(all.insert(bytes), "the same bytes for two decisions");
+                    }
+                }
+            }
+        }
+        assert_eq!(all.len(), 5 * 4 * 2 * 3);
+        assert_eq!(TapeDecision::from_bytes(&[5, 0, 0, 0, 0]), None);
     }
 
     fn hashes_fit(tape: &Tape) -> bool {

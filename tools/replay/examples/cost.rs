@@ -1,4 +1,7 @@
 //! What the tape costs a flight: the events of a flight with a fault, handled with a tape and without.
+//!
+//! With `with` or `without` and a number it only handles them so, so many times, for a profiler that counts instructions: of
+//! two numbers the difference is that of the flights alone.
 
 #![expect(clippy::print_stdout, reason = "figures are for people to read")]
 
@@ -61,23 +64,30 @@ fn main() -> anyhow::Result<()> {
             node::from_toml::<controller::Config>("the tape", text, &[])?.settings,
         )
     };
+    let mut args = std::env::args().skip(1);
+    let (only, times) = (args.next(), args.next().map_or(Ok(TIMES), |text| text.parse())?);
     let (mut without, mut with) = (Duration::MAX, Duration::MAX);
-    for _ in 0..TIMES {
+    for _ in 0..times {
         let mut flight = Flight::new(config()?, Arc::default())?;
         let began = Instant::now();
-        for (now_ns, input) in &inputs {
+        for (now_ns, input) in inputs.iter().filter(|_| only.as_deref() != Some("with")) {
             handle!(flight, *now_ns, input);
         }
         without = without.min(began.elapsed());
         let mut flight = TapedFlight::new(0, config()?, Arc::default())?;
         let began = Instant::now();
-        for (number, (now_ns, input)) in inputs.iter().enumerate() {
+        let taped = inputs.iter().filter(|_| only.as_deref() != Some("without"));
+        for (number, (now_ns, input)) in taped.enumerate() {
             handle!(flight, *now_ns, input);
             if number % TAKEN_EVERY == 0 {
                 flight.take_tape();
             }
         }
         with = with.min(began.elapsed());
+    }
+    if let Some(only) = only {
+        println!("{} events, {times} times, {only} a tape", inputs.len());
+        return Ok(());
     }
     let events = inputs.len() as f64;
     let (without_us, with_us) = (without.as_secs_f64() * 1e6, with.as_secs_f64() * 1e6);
