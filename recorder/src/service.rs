@@ -28,6 +28,8 @@ const STALLED: Duration = Duration::from_secs(1);
 const LAST_MESSAGES: Duration = Duration::from_millis(600);
 /// Time that the disk gets for the rest at the end; `alight land` kills after 2 s.
 const END_PATIENCE: Duration = Duration::from_millis(1100);
+/// A change of the clock of UTC that is noted in the file, in nanoseconds; corrections of NTP are smaller.
+const TIME_SET_NS: i64 = 100_000_000;
 /// Period of the status.
 const STATUS_PERIOD: Duration = Duration::from_millis(500);
 /// Maximum number of keys whose last values or losses are remembered.
@@ -60,6 +62,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         health: node.shared_health(),
         status: Arc::new(Mutex::new(status)),
         config,
+        utc_offset_ns: utc_offset_ns(),
         recording: None,
         ending: None,
         end_problem: None,
@@ -141,6 +144,8 @@ struct Recorder {
     about: About,
     health: Arc<HealthCounters>,
     status: Arc<Mutex<RecorderStatus>>,
+    /// Time since 1970 less that of the clock of this host when it was looked at last, in nanoseconds.
+    utc_offset_ns: i64,
     recording: Option<Recording>,
     /// The file before, while the disk takes its rest.
     ending: Option<Ending>,
@@ -288,6 +293,7 @@ impl Recorder {
     fn begin(&mut self) -> anyhow::Result<Recording> {
         // The clock of a computer without a battery is set once it has found the time.
         self.about.utc_offset_ns = utc_offset_ns();
+        self.utc_offset_ns = self.about.utc_offset_ns;
         let utc_ns = now_ns().saturating_add(self.about.utc_offset_ns);
         let mut recording = Recording::begin(named(&self.config.file, utc_ns), &self.about)?;
         for state in self.states.values() {
@@ -303,6 +309,15 @@ impl Recorder {
         let lost = self.lost.values().sum();
         let waiting_bytes = recording.status().waiting_bytes + before_bytes;
         let has_room = waiting_bytes <= self.max_waiting_bytes;
+        let utc_offset_ns = utc_offset_ns();
+        if utc_offset_ns.abs_diff(self.utc_offset_ns) > TIME_SET_NS.unsigned_abs() {
+            recording.writer.time_set(now_ns(), utc_offset_ns)?;
+            let set_s = utc_offset_ns.saturating_sub(self.utc_offset_ns) as f64 * 1e-9;
+            tracing::warn!(
+                "The clock was set by {set_s:+.1} s; the times of this recording go on as they began"
+            );
+            self.utc_offset_ns = utc_offset_ns;
+        }
         if recording.hand_over()? && has_room && self.lost_in_file != Some(lost) {
             // On the disk with the next flush; the sums of a file that is not flushed again are those of the one before.
             recording.writer.dropped(now_ns(), &self.lost)?;

@@ -62,12 +62,30 @@ pub struct File {
 pub struct Display {
     /// Added to stamps, so that they count from 1970.
     utc_offset_ns: i64,
-    /// Added to stamps of the vehicle's clock, where that is another one, so that they are of ours.
-    vehicle_offset_ns: Option<i64>,
+    vehicle_clock: VehicleClock,
     status: Option<(Phase, String)>,
     warnings: Vec<String>,
     said: BTreeSet<String>,
     files: BTreeMap<String, Vec<u8>>,
+}
+
+/// The vehicle's clock, as the one who receives its messages knows it.
+#[derive(Clone, Debug, Default)]
+pub struct VehicleClock {
+    /// Added to its stamps, where it is another clock, so that they are of ours.
+    offset_ns: Option<i64>,
+}
+
+impl VehicleClock {
+    /// A stamp by our clock: one of the vehicle's, where that is another one, by the age of its first message.
+    pub fn ours(&mut self, received_ns: i64, stamp_ns: i64) -> i64 {
+        let apart_ns = received_ns.saturating_sub(stamp_ns);
+        if apart_ns.unsigned_abs() <= MAX_AGE_NS.unsigned_abs() {
+            return stamp_ns;
+        }
+        let known = self.offset_ns.filter(|it| it.abs_diff(apart_ns) <= MAX_AGE_NS as u64);
+        stamp_ns.saturating_add(*self.offset_ns.insert(known.unwrap_or(apart_ns)))
+    }
 }
 
 impl Display {
@@ -162,14 +180,9 @@ impl Display {
         Some(file)
     }
 
-    /// A stamp by our clock: one of the vehicle's, where that is another one, by the age of its first message.
+    /// A stamp by our clock.
     fn our_clock(&mut self, received_ns: i64, stamp_ns: i64) -> i64 {
-        let apart_ns = received_ns.saturating_sub(stamp_ns);
-        if apart_ns.unsigned_abs() <= MAX_AGE_NS.unsigned_abs() {
-            return stamp_ns;
-        }
-        let known = self.vehicle_offset_ns.filter(|it| it.abs_diff(apart_ns) <= MAX_AGE_NS as u64);
-        stamp_ns.saturating_add(*self.vehicle_offset_ns.insert(known.unwrap_or(apart_ns)))
+        self.vehicle_clock.ours(received_ns, stamp_ns)
     }
 
     /// A frame of a camera as a picture, taken at `stamp_ns` by our clock.
@@ -202,7 +215,7 @@ impl Display {
                 (&foxglove::RAW_IMAGE, foxglove::raw_image(at_ns, &frame_id, &image))
             }
         };
-        Some(shown(format!("camera/{camera}/picture"), schema, stamp_ns, data))
+        Some(shown(picture_channel(camera), schema, stamp_ns, data))
     }
 
     fn utc(&self, stamp_ns: i64) -> i64 {
@@ -395,6 +408,11 @@ impl Display {
 
 fn shown(channel: String, schema: &'static MessageType, stamp_ns: i64, data: Vec<u8>) -> Record {
     Record { channel, schema: Schema::Protobuf(schema), stamp_ns, data }
+}
+
+/// The channel with a camera's pictures.
+pub(crate) fn picture_channel(camera: &str) -> String {
+    format!("camera/{camera}/picture")
 }
 
 /// Name of a camera's coordinate frame.

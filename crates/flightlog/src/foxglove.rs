@@ -4,7 +4,7 @@
 //! Names and field numbers are those of Foxglove's schemas; `tests/recording/read.py` compares them with its package
 //! `foxglove-schemas-protobuf`.
 
-use crate::protobuf::{Encoder, EnumType, Field, Kind, MessageType, Value};
+use crate::protobuf::{Encoder, EnumType, Field, Kind, MessageType, Value, bytes_of};
 
 const fn one(name: &'static str, number: u32, kind: Kind) -> Field {
     Field { name, number, kind, is_repeated: false }
@@ -84,6 +84,22 @@ pub static RAW_IMAGE: MessageType = MessageType {
     ],
     enums: &[],
 };
+
+/// What a picture of a camera has.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+pub enum Image<'a> {
+    /// A file, of [`COMPRESSED_IMAGE`].
+    File(&'a [u8]),
+    /// Its pixels, of [`RAW_IMAGE`].
+    Pixels(&'a [u8]),
+}
+
+/// What is in a message of [`COMPRESSED_IMAGE`] or [`RAW_IMAGE`]; `None` for another.
+pub fn image(message: &[u8]) -> Option<Image<'_>> {
+    // The second field of pixels is their width, which is no bytes.
+    let file = bytes_of(message, 2).map(Image::File);
+    file.or_else(|| bytes_of(message, 6).map(Image::Pixels))
+}
 
 static POINTS_TYPE: EnumType = EnumType {
     name: "Type",

@@ -22,7 +22,7 @@ pub mod tape;
 pub mod writer;
 
 pub use channel::{Received, Record, Schema};
-pub use display::Picture;
+pub use display::{Picture, VehicleClock};
 pub use live::Live;
 pub use reader::{Entry, Reading, read};
 pub use repair::{Repaired, repair};

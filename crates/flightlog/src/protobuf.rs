@@ -165,6 +165,43 @@ impl Encoder {
     }
 }
 
+/// The contents of the first field of an encoded message that has this number and holds bytes, text or a message; `None` where there
+/// is none before the message ends or is cut.
+pub fn bytes_of(message: &[u8], field: u32) -> Option<&[u8]> {
+    let mut rest = message;
+    loop {
+        let (tag, after) = varint(rest)?;
+        let length = match tag & 7 {
+            0 => after.len() - varint(after)?.1.len(),
+            1 => 8,
+            5 => 4,
+            2 => {
+                let (length, contents) = varint(after)?;
+                let (contents, after) = contents.split_at_checked(usize::try_from(length).ok()?)?;
+                if tag >> 3 == u64::from(field) {
+                    return Some(contents);
+                }
+                rest = after;
+                continue;
+            }
+            _ => return None,
+        };
+        rest = after.get(length..)?;
+    }
+}
+
+/// A number of variable length, and what follows it.
+fn varint(bytes: &[u8]) -> Option<(u64, &[u8])> {
+    let mut value = 0;
+    for (index, byte) in bytes.iter().enumerate().take(10) {
+        value |= u64::from(byte & 0x7f) << (7 * index);
+        if byte & 0x80 == 0 {
+            return Some((value, bytes.get(index + 1..)?));
+        }
+    }
+    None
+}
+
 /// The `FileDescriptorSet` of a message type and of all that it contains.
 pub fn descriptor_set(root: &'static MessageType) -> Vec<u8> {
     let mut types = Vec::new();
@@ -240,5 +277,27 @@ mod tests {
         assert_eq!(Encoder::default().text(2, "testing").finish(), testing);
         let inner = Encoder::default().varint(1, 150);
         assert_eq!(Encoder::default().message(3, inner).finish(), [0x1a, 0x03, 0x08, 0x96, 0x01]);
+    }
+
+    #[test]
+    fn bytes_are_found_behind_fields_of_every_kind_and_cut_messages_have_none() {
+        let message = Encoder::default()
+            .varint(1, 300)
+            .double(2, 1.5)
+            .fixed32(3, 7)
+            .text(4, "no")
+            .bytes(5, &[9; 200])
+            .finish();
+        assert_eq!(bytes_of(&message, 4), Some(&b"no"[..]));
+        assert_eq!(bytes_of(&message, 5), Some(&[9; 200][..]));
+        // Numbers are no bytes.
+        assert_eq!(
+            (bytes_of(&message, 1), bytes_of(&message, 3), bytes_of(&message, 6)),
+            (None, None, None)
+        );
+        for length in 0..message.len() {
+            assert_eq!(bytes_of(&message[..length], 5), None, "cut to {length} bytes");
+        }
+        assert_eq!(bytes_of(&[0xff; 30], 5), None);
     }
 }

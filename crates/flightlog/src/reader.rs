@@ -5,11 +5,14 @@ use std::sync::Arc;
 
 use mcap::records::{MessageHeader, Record};
 use mcap::{Channel, McapError, Summary};
+use messages::{FrameHeader, PixelFormat, decode, topic};
 
 use crate::channel::{RAW_PREFIX, Received, split_raw};
+use crate::display::picture_channel;
+use crate::foxglove::{self, Image};
 use crate::records::{Records, contained, records_of};
 use crate::repair::DIFFERS;
-use crate::writer::{DROPPED_CHANNEL, METADATA, Problem};
+use crate::writer::{DROPPED_CHANNEL, METADATA, Problem, TIME_SET};
 
 /// Something that a recording has.
 #[derive(Clone, Debug)]
@@ -18,8 +21,19 @@ pub enum Entry<'a> {
     About(BTreeMap<String, String>),
     /// A message as it came. Of a frame only the attachment, which is its header.
     Message(Received<'a>),
+    /// What was kept of a frame's picture, after the frame's own message.
+    Picture {
+        /// The frame's header, with the format that these bytes have.
+        header: FrameHeader,
+        /// A JPEG file, or the pixels.
+        bytes: &'a [u8],
+        /// When the frame came, in nanoseconds of the recorder's clock.
+        received_ns: i64,
+    },
     /// Messages that the recorder could not keep, since its start, by key.
     Dropped(BTreeMap<String, u64>),
+    /// The clock of UTC was set while the file was open: to so many nanoseconds more than the file's own times say.
+    TimeSet(i64),
 }
 
 /// How much of a recording was read.
@@ -46,6 +60,7 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
         keys: BTreeMap::new(),
         in_index: summary.map(|summary| summary.channels).unwrap_or_default(),
         utc_offset_ns: 0,
+        frame: None,
         reading: Reading::default(),
         lost: 0,
         each,
@@ -56,6 +71,10 @@ pub fn read(recording: &[u8], each: impl FnMut(Entry<'_>)) -> Result<Reading, Pr
         match record {
             Ok(Record::Metadata(metadata)) if metadata.name == METADATA => {
                 found.about(metadata.metadata);
+            }
+            Ok(Record::Metadata(metadata)) if metadata.name == TIME_SET => {
+                let ahead_ns = metadata.metadata.get("ahead_ns").and_then(|it| it.parse().ok());
+                ahead_ns.into_iter().for_each(|ahead_ns| (found.each)(Entry::TimeSet(ahead_ns)));
             }
             Ok(Record::Chunk { header, data }) => {
                 chunks += 1;
@@ -103,6 +122,8 @@ struct Found<F> {
     /// The channels that the index describes.
     in_index: HashMap<u16, Arc<Channel<'static>>>,
     utc_offset_ns: i64,
+    /// The last frame: its camera by its key, when it came by the file's time, and its header.
+    frame: Option<(String, u64, FrameHeader)>,
     reading: Reading,
     /// Messages of channels that nothing describes.
     lost: u64,
@@ -143,13 +164,31 @@ impl<F: FnMut(Entry<'_>)> Found<F> {
             }
             return;
         }
+        let log_ns = i64::try_from(header.log_time).unwrap_or(i64::MAX);
+        let received_ns = log_ns.saturating_sub(self.utc_offset_ns);
+        if let Some((camera, came, frame)) = &self.frame
+            && *came == header.log_time
+            && picture_channel(camera) == *channel
+        {
+            let Some(image) = foxglove::image(data) else { return };
+            let (bytes, format) = match image {
+                Image::File(bytes) => (bytes, PixelFormat::Jpeg),
+                Image::Pixels(bytes) => (bytes, frame.format),
+            };
+            let header = FrameHeader { format, ..frame.clone() };
+            (self.each)(Entry::Picture { header, bytes, received_ns });
+            return;
+        }
         let Some(key) = channel.strip_prefix(RAW_PREFIX) else { return };
         let Some((attachment, payload)) = split_raw(data) else {
             self.reading.damage.push(format!("a message of {key} is cut"));
             return;
         };
-        let log_ns = i64::try_from(header.log_time).unwrap_or(i64::MAX);
-        let received_ns = log_ns.saturating_sub(self.utc_offset_ns);
+        if let Some(camera) = topic::FRAME.first_name(key) {
+            self.frame = decode(attachment)
+                .ok()
+                .map(|frame: FrameHeader| (camera.to_owned(), header.log_time, frame));
+        }
         self.reading.messages += 1;
         (self.each)(Entry::Message(Received { key, payload, attachment, received_ns }));
     }
@@ -160,7 +199,7 @@ mod tests {
     use messages::{Wind, encode};
 
     use super::*;
-    use crate::{About, Writer};
+    use crate::{About, Picture, Writer};
 
     fn recording() -> Vec<u8> {
         let facts = [("host".to_owned(), "here".to_owned())].into();
@@ -200,6 +239,7 @@ mod tests {
                 assert_eq!(counts.get("truth"), Some(&3));
                 others += 1;
             }
+            Entry::Picture { .. } | Entry::TimeSet(_) => panic!("{entry:?}"),
         });
         (times, others, reading.unwrap())
     }
@@ -210,6 +250,59 @@ mod tests {
         assert_eq!(times, (5..55).collect::<Vec<_>>());
         assert_eq!((others, reading.is_ended, reading.messages), (2, true, 50));
         assert!(reading.damage.is_empty(), "{:?}", reading.damage);
+    }
+
+    #[test]
+    fn a_clock_that_is_set_is_noted_and_moves_no_message() {
+        let mut file = Vec::new();
+        let about = About { utc_offset_ns: 1_000, ..About::default() };
+        let mut recording = Writer::new(&mut file, &about).unwrap();
+        let wind = encode(&Wind { velocity_ned_m_s: [0.0; 3], stamp_ns: 0 });
+        for received_ns in [5, 6] {
+            let message = Received { key: "wind", payload: &wind, attachment: b"", received_ns };
+            recording.receive(message).unwrap();
+            recording.time_set(received_ns, 501_000).unwrap();
+        }
+        recording.finish().unwrap();
+        let (mut set, mut times) = (Vec::new(), Vec::new());
+        let reading = read(&file, |entry| match entry {
+            Entry::TimeSet(ahead_ns) => set.push(ahead_ns),
+            Entry::Message(message) => times.push(message.received_ns),
+            _ => {}
+        });
+        assert!(reading.unwrap().damage.is_empty());
+        assert_eq!((set, times), (vec![500_000; 2], vec![5, 6]));
+    }
+
+    #[test]
+    fn a_picture_follows_its_frame_with_what_was_kept_of_it() {
+        let mut file = Vec::new();
+        let mut recording = Writer::new(&mut file, &About::default()).unwrap();
+        let kept = [Picture::Jpeg(b"file".to_vec()), Picture::None, Picture::Pixels];
+        for (sequence, picture) in (0..).zip(&kept) {
+            let format = PixelFormat::Mono8;
+            let (width, height) = (3, 2);
+            let header = FrameHeader { sequence, width, height, format, ..FrameHeader::sample() };
+            let attachment = encode(&header);
+            let message = Received {
+                key: "camera/down/frame",
+                payload: b"pixels",
+                attachment: &attachment,
+                received_ns: 9,
+            };
+            recording.frame(message, &header, picture).unwrap();
+        }
+        recording.finish().unwrap();
+        let mut pictures = Vec::new();
+        read(&file, |entry| {
+            if let Entry::Picture { header, bytes, received_ns } = entry {
+                assert_eq!(received_ns, 9);
+                pictures.push((header.sequence, header.format, bytes.to_vec()));
+            }
+        })
+        .unwrap();
+        let jpeg = (0, PixelFormat::Jpeg, b"file".to_vec());
+        assert_eq!(pictures, [jpeg, (2, PixelFormat::Mono8, b"pixels".to_vec())]);
     }
 
     #[test]

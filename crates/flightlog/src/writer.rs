@@ -21,6 +21,8 @@ const CHUNK_BYTES: u64 = 1 << 20;
 pub const DROPPED_CHANNEL: &str = "recorder/dropped";
 /// Name of the metadata about a recording.
 pub const METADATA: &str = "alight";
+/// Name of the metadata that tell that the clock of UTC was set.
+pub const TIME_SET: &str = "alight-time-set";
 
 /// Why a recording cannot go on.
 #[derive(Debug, thiserror::Error)]
@@ -141,6 +143,22 @@ impl<W: Write> Writer<W> {
     /// As [`Writer::receive`].
     pub fn dropped(&mut self, now_ns: i64, so_far: &BTreeMap<String, u64>) -> Result<(), Problem> {
         self.write(now_ns, &dropped(now_ns, so_far))
+    }
+
+    /// Notes that the clock of UTC was set while the file is open: from `now_ns` of the stamps' clock on, UTC is ahead of that by
+    /// `utc_offset_ns`. The file's own times go on as before, so that they stay in order.
+    ///
+    /// # Errors
+    /// As [`Writer::receive`].
+    pub fn time_set(&mut self, now_ns: i64, utc_offset_ns: i64) -> Result<(), Problem> {
+        let facts = [
+            ("file_time_ns", self.utc(now_ns).to_string()),
+            ("utc_offset_ns", utc_offset_ns.to_string()),
+            ("ahead_ns", utc_offset_ns.saturating_sub(self.utc_offset_ns).to_string()),
+        ];
+        let metadata = facts.map(|(name, value)| (name.to_owned(), value)).into();
+        self.mcap.write_metadata(&Metadata { name: TIME_SET.to_owned(), metadata })?;
+        Ok(())
     }
 
     /// Hands everything so far to the output.

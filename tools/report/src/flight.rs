@@ -86,6 +86,8 @@ pub struct Flight {
     pub is_ended: bool,
     /// Messages that were read.
     pub messages: u64,
+    /// How far the clock of UTC was set ahead of a file's own times while it was open, each time, in seconds.
+    pub time_set_s: Vec<f64>,
     /// What could not be read of its files, as sentences.
     pub damage: Vec<String>,
     /// Messages that could not be read, by key.
@@ -159,6 +161,7 @@ impl FlightReader {
         let tape_key = topic::TAPE.key(&[]);
         let mut lost = BTreeMap::new();
         let mut run = String::new();
+        let mut set_s = Vec::new();
         let Reading { is_ended, messages, damage } =
             flightlog::read(recording, |entry| match entry {
                 Entry::About(facts) => {
@@ -168,7 +171,10 @@ impl FlightReader {
                 Entry::Dropped(counts) => lost = counts,
                 Entry::Message(message) if message.key == tape_key => tapes.take(message.payload),
                 Entry::Message(message) => flight.take(message),
+                Entry::TimeSet(ahead_ns) => set_s.push(ahead_ns as f64 * 1e-9),
+                Entry::Picture { .. } => {}
             })?;
+        flight.time_set_s.extend(set_s);
         // Counted since the recorder's start: of its files the last has those before it.
         let so_far = lost_by_run.entry(run).or_default();
         for (key, count) in lost {

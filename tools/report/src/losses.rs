@@ -145,6 +145,11 @@ pub fn recording(flight: &Flight) -> Vec<String> {
     if !flight.is_ended {
         lines.push("the recording has no end: its recorder was killed, or the rest is cut off; `alight record --repair` writes a copy with an end".to_owned());
     }
+    for set_s in &flight.time_set_s {
+        lines.push(format!(
+            "the clock was set while the recording went on: UTC is {set_s:+.3} s from what the file's own times say after it"
+        ));
+    }
     for (key, unreadable) in &flight.unreadable {
         lines.push(format!(
             "{} messages of {key} cannot be read: {}",
