@@ -1,4 +1,6 @@
-//! `alight replay`: a recording back into the controller's decisions.
+//! `alight replay`: a recording back into the controller's decisions, into detections, and to services that run.
+
+mod live;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -7,9 +9,11 @@ use std::time::Instant;
 use anyhow::{Context, ensure};
 use clap::{Args, ValueEnum};
 use flightlog::{RecordedTape, TapeReader};
-use replay::{Change, End, change, verify};
+use node::stats::quantile;
+use replay::{Again, Change, End, Searched, change, search, verify};
 
-use crate::terminal::{print, write_error};
+use crate::args::NetworkArgs;
+use crate::terminal::{aligned, print, write_error};
 
 #[derive(Args)]
 pub(crate) struct ReplayArgs {
@@ -20,33 +24,64 @@ pub(crate) struct ReplayArgs {
     /// result is named, with the value. Exit status 0 when there is none, 1 otherwise.
     #[arg(long)]
     verify: bool,
-    /// From where it is flown again: from detections on, with estimator and guidance, to see what `--set` changes. The
-    /// vehicle moves as it was recorded. Without it the phases are listed.
+    /// From where it is flown again, to see what `--set` changes: from detections on, with estimator and guidance, or from
+    /// frames on, which are searched again. The vehicle moves as it was recorded. Without it the phases are listed.
     #[arg(long, value_enum, conflicts_with = "verify")]
     from: Option<From>,
-    /// One setting of the controller over the recorded configuration. May be repeated.
+    /// One setting of the controller over the recorded configuration; with `--from frames` also
+    /// detector.KEY=VALUE, one of the detector. May be repeated.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// With `--from frames`, the detector whose frames are searched again with its recorded configuration, where the
+    /// recording has several.
+    #[arg(long, value_name = "NAME")]
+    detector: Option<String>,
+    /// Publish what was recorded on the network, at the pace at which it was recorded and with stamps of now: to a dashboard, a
+    /// gcs-bridge with its ground station, a viewer, or a detector to try. Nothing is sent to an autopilot.
+    #[arg(long, conflicts_with_all = ["verify", "from", "set", "detector"])]
+    live: bool,
+    /// With `--live`, a service whose messages are left out, as one that runs takes its place. May be repeated.
+    #[arg(long, value_name = "SERVICE", requires = "live")]
+    without: Vec<String>,
+    #[command(flatten)]
+    network: NetworkArgs,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum From {
     /// Detections.
     Detections,
+    /// Frames, as far as their pictures were recorded.
+    Frames,
 }
 
 /// Replays, and prints what came out.
 pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
+    ensure!(
+        args.detector.is_none() || args.from == Some(From::Frames),
+        "`--detector` is for `--from frames`"
+    );
     let mut reader = TapeReader::default();
+    let mut recordings = Vec::new();
     for file in &args.files {
         let recording = std::fs::read(file).with_context(|| format!("reading {file:?}"))?;
         reader.read(&recording).with_context(|| format!("{file:?} is no recording (MCAP file)"))?;
+        if args.live || args.from == Some(From::Frames) {
+            recordings.push(recording);
+        }
+    }
+    if args.live {
+        return live::run(recordings, &args.without, &args.network);
     }
     for damage in reader.damage() {
         write_error(damage);
     }
     let mut is_whole = reader.damage().is_empty();
     let tapes = reader.tapes();
+    if args.from == Some(From::Frames) {
+        from_frames(&recordings, &tapes, args)?;
+        return Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE });
+    }
     ensure!(
         !tapes.is_empty(),
         "there is no tape of a controller in {:?}; `alight land --record` and `alight record` keep it",
@@ -56,6 +91,73 @@ pub(crate) fn run(args: &ReplayArgs) -> anyhow::Result<ExitCode> {
         is_whole &= one(tape, args)?;
     }
     Ok(if is_whole { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Searches the frames again, and prints what is different.
+fn from_frames(
+    recordings: &[Vec<u8>],
+    tapes: &[RecordedTape],
+    args: &ReplayArgs,
+) -> anyhow::Result<()> {
+    let mut again = Again { detector: args.detector.clone(), ..Again::default() };
+    for setting in &args.set {
+        match setting.strip_prefix("detector.") {
+            Some(setting) => again.of_detector.push(setting.to_owned()),
+            None => again.of_controller.push(setting.clone()),
+        }
+    }
+    let searched = search(recordings, tapes, &again)?;
+    print(compared(&searched).trim_end())?;
+    for change in &searched.changes {
+        print(&told(change))?;
+        if let Some(stop) = &change.end.stop {
+            print(&stop.to_string())?;
+        }
+    }
+    Ok(())
+}
+
+/// The difference between two searches of the same frames, for people.
+fn compared(searched: &Searched) -> String {
+    let Searched { then, now, .. } = searched;
+    let lossy = if searched.is_lossy { ", as JPEG files" } else { "" };
+    let mut text = format!(
+        "{} of the {} frames of camera {} that detector {} searched were recorded{lossy}, and searched again\n",
+        searched.searched, searched.searched_then, searched.camera, searched.detector
+    );
+    if searched.unreadable > 0 {
+        text.push_str(&format!("{} pictures cannot be read\n", searched.unreadable));
+    }
+    let share = |part: usize, of: usize| match of {
+        0 => "-".to_owned(),
+        of => format!("{:.1} % ({part} of {of})", 100.0 * part as f64 / of as f64),
+    };
+    let at = |values: &[f64], part: f64, factor: f64, digits: usize, unit: &str| {
+        let value = quantile(values, part).map(|it| it * factor);
+        value.map_or("-".to_owned(), |it| format!("{it:.digits$} {unit}"))
+    };
+    let mut rows = vec![["".into(), "then".into(), "now".into()]];
+    let mut row = |name: &str, of: &dyn Fn(&replay::frames::Found) -> String| {
+        rows.push([name.into(), of(then), of(now)]);
+    };
+    row("marker", &|it| it.marker.clone());
+    row("found", &|it| share(it.frames, searched.searched));
+    if let Some(showing) = searched.showing_the_pad {
+        row("found where the pad is in the picture", &|it| share(it.visible, showing));
+        row("error against truth, median", &|it| at(&it.errors_m, 0.5, 1e3, 1, "mm"));
+        row("error against truth, 95 %", &|it| at(&it.errors_m, 0.95, 1e3, 1, "mm"));
+    }
+    row("time of a search, median", &|it| at(&it.times_ms, 0.5, 1.0, 2, "ms"));
+    row("time of a search, 95 %", &|it| at(&it.times_ms, 0.95, 1.0, 2, "ms"));
+    text.push_str(&aligned(&rows));
+    text.push_str(&format!(
+        "{} found then only, {} now only; where both are, {} apart in the median, {} at most\n",
+        searched.lost,
+        searched.gained,
+        at(&searched.apart_m, 0.5, 1e3, 1, "mm"),
+        at(&searched.apart_m, 1.0, 1e3, 1, "mm")
+    ));
+    text
 }
 
 /// Replays one controller's tape; true when nothing is wrong with it.

@@ -10,14 +10,12 @@ use airlink::Unpacker;
 use anyhow::Context;
 use fiducial::overlay::canvas::RgbImageBuf;
 use fiducial::overlay::debug;
-use fiducial::trace::Trace;
-use fiducial::{Detector, Observation, ResponseEstimate, ResponseSetting, StageObserver, Tracker};
+use fiducial::{ResponseEstimate, ResponseSetting, StageObserver};
 use geometry::CameraModel;
-use imaging::{Converter, GrayImage, GrayView};
-use markers::Pad;
+use imaging::{Converter, GrayView};
 use messages::{
     CameraInfo, CameraResponse, CommandReply, Detection, Detections, DetectorCommand, DetectorInfo,
-    FrameAck, FrameHeader, FramePart, PixelFormat, Refusals, StageTime, topic,
+    FrameAck, FrameHeader, PixelFormat, Refusals, topic,
 };
 use node::{
     Frame, FramePublisher, FrameSubscriber, Loan, Node, Publisher, Shutdown, clock_name, now_ns,
@@ -26,7 +24,8 @@ use tokio::runtime::Handle;
 use tokio::sync::oneshot;
 
 use crate::config::{Config, Input};
-use crate::{parts, wire};
+use crate::search::{Search, StageClock};
+use crate::wire;
 
 /// The debug images, as the topics name them: the thesis' three, and the squares.
 const DEBUG_IMAGES: [&str; 4] = ["ellipses", "rings", "squares", "target"];
@@ -192,8 +191,7 @@ struct Shared {
 /// What the image thread changes to before its next frame.
 struct Change {
     config: Config,
-    detector: Detector,
-    pads: Vec<Pad>,
+    search: Search,
 }
 
 /// The parameters, as they are changed.
@@ -224,18 +222,11 @@ impl Live {
 
     fn set(&mut self, key: &str, value: &str) -> Result<(), String> {
         let config = self.config.with(key, value)?;
-        let (detector, pads) = (config.detector()?, config.parsed_pads()?);
-        *lock(&self.change) = Some(Change { config: config.clone(), detector, pads });
+        let search = Search::new(&config)?;
+        *lock(&self.change) = Some(Change { config: config.clone(), search });
         self.config = config;
         Ok(())
     }
-}
-
-/// How the newest frame was searched: at once, or part by part.
-#[derive(Copy, Clone, Debug)]
-enum Searched {
-    Whole,
-    Parts,
 }
 
 /// Everything the image thread needs.
@@ -252,18 +243,13 @@ struct Work {
     unpacker: Unpacker,
     /// Clock and stamp of the newest frame from the air.
     newest: Option<(String, i64)>,
-    detector: Detector,
-    pads: Vec<Pad>,
-    tracker: Tracker,
-    /// Of a frame in parts: all of them, in the whole frame's pixels.
-    parts_trace: Trace,
+    search: Search,
     overlay: RgbImageBuf,
 }
 
 impl Work {
     async fn new(node: &Node, config: &Config, shared: Shared) -> anyhow::Result<Self> {
-        let detector = config.detector().map_err(anyhow::Error::msg)?;
-        let pads = config.parsed_pads().map_err(anyhow::Error::msg)?;
+        let search = Search::new(config).map_err(anyhow::Error::msg)?;
         let frames = match config.input {
             Input::Raw => topic::FRAME,
             Input::Jpeg => topic::JPEG,
@@ -287,10 +273,7 @@ impl Work {
             converter: Converter::default(),
             unpacker: Unpacker::default(),
             newest: None,
-            detector,
-            pads,
-            tracker: Tracker::new(config.tracking()),
-            parts_trace: Trace::default(),
+            search,
             overlay: RgbImageBuf::default(),
         })
     }
@@ -358,10 +341,13 @@ impl Work {
                 if !std::ptr::eq(view.row(0).as_ptr(), bytes.as_ptr()) {
                     clock.ended("convert");
                 }
-                let detections = self.detect(view, &frame.header, &mut clock);
+                let camera = self.camera_model(&frame.header);
+                let detections =
+                    self.search.whole(view, &frame.header, camera.as_ref(), &mut clock);
                 self.publish(&frame.header, detections, clock).await;
-                self.publish_refusals(&frame.header, Searched::Whole).await;
-                self.publish_debug_images(view, &frame.header, Searched::Whole).await;
+                self.keep_response();
+                self.publish_refusals(&frame.header).await;
+                self.publish_debug_images(view, &frame.header).await;
             }
             Err(_) => health.dropped("frames of an impossible size"),
         }
@@ -386,11 +372,13 @@ impl Work {
         match unpacker.unpack(&frame.header, &frame.bytes()) {
             Ok(parts) => {
                 clock.ended("decode");
-                let (found, searched) = self.detect_in_parts(&parts, &frame.header, &mut clock);
+                let camera = self.camera_model(&frame.header);
+                let found = self.search.parts(&parts, &frame.header, camera.as_ref(), &mut clock);
                 self.publish(&frame.header, found, clock).await;
-                self.publish_refusals(&frame.header, searched).await;
+                self.keep_response();
+                self.publish_refusals(&frame.header).await;
                 if let Some(view) = parts.first().and_then(|(_, image)| image.view()) {
-                    self.publish_debug_images(view, &frame.header, searched).await;
+                    self.publish_debug_images(view, &frame.header).await;
                 }
             }
             Err(problem) => {
@@ -400,33 +388,6 @@ impl Work {
             }
         }
         self.unpacker = unpacker;
-    }
-
-    fn detect_in_parts(
-        &mut self,
-        parts: &[(FramePart, &GrayImage)],
-        header: &FrameHeader,
-        clock: &mut StageClock,
-    ) -> (Vec<Detection>, Searched) {
-        if header.parts.is_empty()
-            && let Some(view) = parts.first().and_then(|(_, image)| image.view())
-        {
-            return (self.detect(view, header, clock), Searched::Whole);
-        }
-        let whole = self.camera_model(header);
-        let mut found = Vec::new();
-        self.parts_trace.clear();
-        for (part, image) in parts.iter().rev() {
-            let Some(view) = image.view() else { continue };
-            let roi = parts::roi(part);
-            let camera = whole.as_ref().map(|camera| roi.camera(camera));
-            let seen = self.detector.detect(view, camera.as_ref(), clock);
-            parts::add_finer(&mut found, seen.iter().map(|seen| seen.mapped(&roi)));
-            self.parts_trace.add_roi(self.detector.trace(), &roi);
-        }
-        found.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
-        let told = told(&found, &self.pads, whole.as_ref(), self.config.min_confidence);
-        (told, Searched::Parts)
     }
 
     fn ack(&self, frame: &Frame) -> FrameAck {
@@ -441,36 +402,25 @@ impl Work {
     }
 
     fn take_change(&mut self) {
-        if let Some(Change { config, detector, pads }) = lock(&self.shared.change).take() {
-            self.detector = detector;
-            self.pads = pads;
-            self.tracker = Tracker::new(config.tracking());
+        if let Some(Change { config, search }) = lock(&self.shared.change).take() {
+            self.search = search;
             *lock(&self.shared.response) = configured_response(&config);
             self.config = config;
         }
     }
 
-    fn detect(
-        &mut self,
-        view: GrayView<'_>,
-        header: &FrameHeader,
-        clock: &mut StageClock,
-    ) -> Vec<Detection> {
-        let camera = self.camera_model(header);
-        let time_s = header.stamp_ns as f64 * 1e-9;
-        let found = self.tracker.detect(&mut self.detector, view, camera.as_ref(), time_s, clock);
-        let found = told(found, &self.pads, camera.as_ref(), self.config.min_confidence);
-        let memory = self.tracker.response();
+    /// Has the response that was remembered of the camera published.
+    fn keep_response(&self) {
+        let memory = self.search.response();
         if let (Ok(ResponseSetting::Auto), Some(known)) = (self.config.response(), memory.known()) {
             let response = camera_response(&self.config, false, memory.markers(), &known);
             *lock(&self.shared.response) = Some(response);
         }
-        found
     }
 
     async fn publish(&self, header: &FrameHeader, found: Vec<Detection>, clock: StageClock) {
         let health = self.node.health();
-        health.latency("detect", clock.started.elapsed());
+        health.latency("detect", clock.elapsed());
         if !found.is_empty() {
             health.count("frames with a marker");
         }
@@ -478,7 +428,7 @@ impl Work {
             detector: self.config.id.clone(),
             header: header.clone(),
             detections: found,
-            stages: clock.stages,
+            stages: clock.into_stages(),
         };
         self.detections.publish(&message).await;
         if header.clock == clock_name() {
@@ -504,31 +454,19 @@ impl Work {
     }
 
     /// What was refused in the frame that was searched last, for who asks.
-    async fn publish_refusals(&self, header: &FrameHeader, searched: Searched) {
+    async fn publish_refusals(&self, header: &FrameHeader) {
         if self.refusals.has_subscribers().await {
-            let trace = match searched {
-                Searched::Whole => self.tracker.trace(),
-                Searched::Parts => &self.parts_trace,
-            };
-            self.refusals.publish(&wire::refusals(&self.config.id, header, trace)).await;
+            let refusals = wire::refusals(&self.config.id, header, self.search.trace());
+            self.refusals.publish(&refusals).await;
         }
     }
 
-    async fn publish_debug_images(
-        &mut self,
-        view: GrayView<'_>,
-        header: &FrameHeader,
-        searched: Searched,
-    ) {
+    async fn publish_debug_images(&mut self, view: GrayView<'_>, header: &FrameHeader) {
         for (image, publisher) in &self.debug {
             if !publisher.has_subscribers().await {
                 continue;
             }
-            let trace = match searched {
-                Searched::Whole => self.tracker.trace(),
-                // The image is that of the finest part, which is searched last.
-                Searched::Parts => self.detector.trace(),
-            };
+            let trace = self.search.trace_of_image();
             match *image {
                 "ellipses" => debug::draw_ellipses(view, trace, &mut self.overlay),
                 "rings" => debug::draw_rings(view, trace, &mut self.overlay),
@@ -547,22 +485,6 @@ impl Work {
     }
 }
 
-/// What is published of the markers that were found, in the whole frame's pixels: those that are sure enough, and the
-/// pads they make up.
-fn told(
-    found: &[Observation],
-    pads: &[Pad],
-    camera: Option<&CameraModel>,
-    least: f64,
-) -> Vec<Detection> {
-    let markers = found.iter().filter(|seen| seen.confidence >= least).map(wire::detection);
-    let pads = pads.iter().filter_map(|pad| {
-        let seen = fiducial::observe_pad(pad, found, camera?)?;
-        (seen.confidence >= least).then(|| wire::pad_detection(pad, &seen))
-    });
-    markers.chain(pads).collect()
-}
-
 /// How old a frame of this host's clock is.
 fn age(header: &FrameHeader) -> Duration {
     Duration::from_nanos(now_ns().saturating_sub(header.stamp_ns).max(0).unsigned_abs())
@@ -574,31 +496,4 @@ fn jpeg(image: &RgbImageBuf, quality: u8) -> anyhow::Result<Vec<u8>> {
     let encoder = jpeg_encoder::Encoder::new(&mut bytes, quality);
     encoder.encode(&image.data, width, height, jpeg_encoder::ColorType::Rgb)?;
     Ok(bytes)
-}
-
-/// Times the stages of a detection.
-struct StageClock {
-    started: Instant,
-    last: Instant,
-    stages: Vec<StageTime>,
-}
-
-impl StageClock {
-    fn start() -> Self {
-        let now = Instant::now();
-        Self { started: now, last: now, stages: Vec::with_capacity(8) }
-    }
-}
-
-impl StageObserver for StageClock {
-    fn ended(&mut self, stage: &'static str) {
-        let now = Instant::now();
-        let micros = u32::try_from(now.duration_since(self.last).as_micros()).unwrap_or(u32::MAX);
-        // Several parts of a frame may be searched one after the other.
-        match self.stages.iter_mut().find(|it| it.stage == stage) {
-            Some(again) => again.micros = again.micros.saturating_add(micros),
-            None => self.stages.push(StageTime { stage: stage.to_owned(), micros }),
-        }
-        self.last = now;
-    }
 }

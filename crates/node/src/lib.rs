@@ -36,7 +36,7 @@ pub use health::HealthCounters;
 pub use identity::Identity;
 pub use network::{INSECURE, Network, OPEN};
 pub use service::{Options, Shutdown, relaunch, relaunch_with_zenoh_threads, run, start_logging};
-pub use session::{Node, Presence, ZenohSource};
+pub use session::{Announcement, Node, Presence, ZenohSource};
 pub use standstill::Standstill;
 pub use state::state_directory;
 pub use tap::{Tap, Tapped};

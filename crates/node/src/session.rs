@@ -70,6 +70,11 @@ pub struct Node {
     started_ns: i64,
 }
 
+/// Another service that is shown as ready.
+pub struct Announcement {
+    _token: LivelinessToken,
+}
+
 /// Follows which instances join and leave.
 pub struct Presence {
     subscriber: zenoh::pubsub::Subscriber<RingChannelHandler<Sample>>,
@@ -213,6 +218,18 @@ impl Node {
         drop(self.claim.lock().unwrap_or_else(PoisonError::into_inner).take());
         tracing::info!(service = self.identity.service, instance = %self.identity.instance, "Ready");
         Ok(())
+    }
+
+    /// Shows another service as ready for as long as the result lives: one of a recording that is published again.
+    ///
+    /// # Errors
+    /// When the session is closed.
+    pub async fn announce_other(
+        &self,
+        service: &str,
+        instance: &str,
+    ) -> anyhow::Result<Announcement> {
+        Ok(Announcement { _token: self.declare(&topic::alive_key(service, instance)).await? })
     }
 
     async fn declare(&self, key: &str) -> anyhow::Result<LivelinessToken> {

@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::anyhow;
-use messages::{Delivery, Message, Topic, decode, encode};
+use messages::{Delivery, Message, Row, Topic, decode, encode};
 use zenoh::bytes::ZBytes;
 use zenoh::handlers::{RingChannel, RingChannelHandler};
 use zenoh::qos::{CongestionControl, Priority};
@@ -105,8 +105,23 @@ impl Node {
         topic: Topic<M>,
         names: &[&str],
     ) -> anyhow::Result<Publisher<M>> {
-        let key = topic.key(names);
-        let Qos { priority, congestion, .. } = qos(topic.delivery());
+        self.declared(topic.key(names), topic.delivery()).await
+    }
+
+    /// A publisher of messages that are encoded already, on a key of the row's topic.
+    ///
+    /// # Errors
+    /// When the session is closed or the key is none.
+    pub async fn encoded_publisher(
+        &self,
+        row: &Row,
+        key: &str,
+    ) -> anyhow::Result<Publisher<Vec<u8>>> {
+        self.declared(key.to_owned(), row.delivery).await
+    }
+
+    async fn declared<M>(&self, key: String, delivery: Delivery) -> anyhow::Result<Publisher<M>> {
+        let Qos { priority, congestion, .. } = qos(delivery);
         let publisher = self
             .session
             .declare_publisher(key.clone())
@@ -114,7 +129,7 @@ impl Node {
             .congestion_control(congestion)
             .await
             .map_err(|cause| anyhow!("declaring a publisher on {key}: {cause}"))?;
-        let last_value = match topic.delivery() {
+        let last_value = match delivery {
             Delivery::LastValue => Some(self.last_value(&key).await?),
             Delivery::Latest
             | Delivery::LatestPriority
@@ -367,7 +382,19 @@ impl<M> Request<M> {
 impl<M: Message> Publisher<M> {
     /// Publishes a message. A failure is counted, and the stream continues with the next message.
     pub async fn publish(&self, message: &M) {
-        let bytes = encode(message);
+        self.put(encode(message)).await;
+    }
+}
+
+impl Publisher<Vec<u8>> {
+    /// As [`Publisher::publish`], for the bytes of an encoded message.
+    pub async fn publish_encoded(&self, bytes: Vec<u8>) {
+        self.put(bytes).await;
+    }
+}
+
+impl<M> Publisher<M> {
+    async fn put(&self, bytes: Vec<u8>) {
         if let Some(last_value) = &self.last_value {
             last_value.bytes.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&bytes);
         }
@@ -377,9 +404,7 @@ impl<M: Message> Publisher<M> {
             tracing::warn!(key = %self.publisher.key_expr(), %cause, "A message could not be published");
         }
     }
-}
 
-impl<M> Publisher<M> {
     /// Whether there is a subscriber.
     pub async fn has_subscribers(&self) -> bool {
         self.publisher.matching_status().await.is_ok_and(|status| status.matching())

@@ -8,7 +8,7 @@ use flightlog::RecordedTape;
 use messages::{Phase, TapeAction, TapeDecision, TapeEvent, TapeRecord, TapeTarget};
 
 use crate::difference::Comparison;
-use crate::run::{End, run};
+use crate::run::{End, run_with};
 
 /// A phase, and when it began.
 #[derive(Clone, Debug, PartialEq)]
@@ -49,10 +49,22 @@ pub struct Change {
 /// # Errors
 /// When the configuration cannot be used.
 pub fn change(tape: &RecordedTape, set: &[String]) -> anyhow::Result<Change> {
+    change_with(tape, set, |_event| None)
+}
+
+/// As [`change()`], with another event in the place of those for which `instead` has one.
+///
+/// # Errors
+/// When the configuration cannot be used.
+pub fn change_with(
+    tape: &RecordedTape,
+    set: &[String],
+    instead: impl FnMut(&TapeEvent<'_>) -> Option<TapeEvent<'static>>,
+) -> anyhow::Result<Change> {
     let mut change = Change::default();
     let mut comparison = Comparison::default();
     let (mut squares, mut setpoints) = (0.0, 0.0);
-    let end = run(tape, set, |step| {
+    let end = run_with(tape, set, instead, |step| {
         let status = step.flight.status(step.recorded.now_ns);
         let is_new = change
             .phases

@@ -118,6 +118,19 @@ impl fmt::Display for Stop {
 pub fn run(
     tape: &RecordedTape,
     set: &[String],
+    each: impl FnMut(Replayed<'_>) -> ControlFlow<Stop>,
+) -> anyhow::Result<End> {
+    run_with(tape, set, |_event| None, each)
+}
+
+/// As [`run`], with another event in the place of those for which `instead` has one.
+///
+/// # Errors
+/// When the configuration cannot be used.
+pub fn run_with(
+    tape: &RecordedTape,
+    set: &[String],
+    mut instead: impl FnMut(&TapeEvent<'_>) -> Option<TapeEvent<'static>>,
     mut each: impl FnMut(Replayed<'_>) -> ControlFlow<Stop>,
 ) -> anyhow::Result<End> {
     let mut end = End::default();
@@ -166,7 +179,8 @@ pub fn run(
                 continue;
             };
             end.is_ended = record.event == TapeEvent::Shutdown;
-            if !flight.replay(record.now_ns, &record.event) {
+            let other = instead(&record.event);
+            if !flight.replay(record.now_ns, other.as_ref().unwrap_or(&record.event)) {
                 end.stop = damaged(Some(record.event.name()));
                 return Ok(end);
             }

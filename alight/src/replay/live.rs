@@ -1,0 +1,350 @@
+//! A recording to services that run: its messages on the network again, each when it is due.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use flightlog::{Entry, Received};
+use messages::{Delivery, FrameHeader, Row, TOPICS, topic};
+use node::{Announcement, FramePublisher, Node, Publisher, clock_name, now_ns};
+use replay::Restamp;
+use tokio::sync::mpsc;
+use tokio::time::sleep;
+
+use crate::args::NetworkArgs;
+use crate::runtime::with_node;
+use crate::terminal::{print, write_error};
+
+/// The services whose messages are published. Who watches and relays is there himself.
+const PLAYED: [&str; 4] = ["camera-pub", "simulator", "detector", "controller"];
+/// Maximum number of messages that were read and are not due yet.
+const MAX_READ_AHEAD: usize = 64;
+/// Time for subscribers to be found before the first message.
+const BEGIN: Duration = Duration::from_millis(500);
+/// A service is shown as ready for this time after its last health report, which comes every second.
+const ALIVE_NS: i64 = 1_500_000_000;
+
+/// What is to be published.
+enum Item {
+    Message { key: String, payload: Vec<u8> },
+    Frame { header: FrameHeader, pixels: Vec<u8> },
+}
+
+/// A message and when it is due.
+struct Due {
+    at_ns: i64,
+    item: Item,
+}
+
+/// A service and its instance.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Name {
+    service: String,
+    instance: String,
+}
+
+impl Name {
+    /// The service whose health is published on a key.
+    fn of_health(key: &str) -> Option<Self> {
+        match key.split('/').collect::<Vec<_>>().as_slice() {
+            ["health", service, instance] => {
+                Some(Self { service: (*service).to_owned(), instance: (*instance).to_owned() })
+            }
+            _ => None,
+        }
+    }
+}
+
+/// What a recording says before it is published.
+#[derive(Default)]
+struct Overview {
+    /// When the first message came that is no state from before, in nanoseconds.
+    first_ns: Option<i64>,
+    last_ns: i64,
+    /// When the last health report of each service and instance came.
+    services: BTreeMap<Name, i64>,
+}
+
+/// The topic of a key, if it is published again. What goes to the autopilot never is, nor what tells of the recording
+/// itself.
+fn played(key: &str, without: &[String]) -> Option<&'static Row> {
+    let is_same = |row: &&Row| {
+        let mut wanted = row.key.split('/');
+        let same = key
+            .split('/')
+            .all(|part| wanted.next().is_some_and(|it| it.starts_with('{') || it == part));
+        same && wanted.next().is_none()
+    };
+    let row = TOPICS.iter().find(is_same)?;
+    let never = [
+        topic::TO_AUTOPILOT.key(&[]),
+        topic::TAPE.key(&[]),
+        topic::RECORDER_STATUS.key(&["{recorder}"]),
+    ];
+    if row.delivery == Delivery::Query || never.iter().any(|it| it == row.key) {
+        return None;
+    }
+    let of_service = topic::HEALTH.first_name(key).or(topic::CONFIGURATION.first_name(key));
+    let is_left_out = match of_service {
+        Some(service) => !is_played(service, without),
+        None => row.publishers.iter().any(|it| without.iter().any(|other| other == it)),
+    };
+    (!is_left_out).then_some(row)
+}
+
+fn is_played(service: &str, without: &[String]) -> bool {
+    PLAYED.contains(&service) && !without.iter().any(|it| it == service)
+}
+
+/// Publishes a recording, in several files or one, at the pace at which it was recorded.
+pub(crate) fn run(
+    files: Vec<Vec<u8>>,
+    without: &[String],
+    network: &NetworkArgs,
+) -> anyhow::Result<ExitCode> {
+    let overview = overview(&files, without)?;
+    let first_ns = overview.first_ns.context("nothing in the recording is to be published")?;
+    with_node(network, "replay", async |node| {
+        nobody_is_doubled(node, &overview).await?;
+        let mut player = Player::new(node, without.to_vec());
+        sleep(BEGIN).await;
+        let length_s = overview.last_ns.saturating_sub(first_ns) as f64 * 1e-9;
+        write_error(&format!("publishing {length_s:.0} s of flight; Ctrl-C ends it"));
+        let mut restamp = Restamp::new(first_ns, now_ns(), clock_name());
+        let alive: BTreeMap<_, _> = overview
+            .services
+            .into_iter()
+            .map(|(name, last_ns)| (name, restamp.due_ns(last_ns).saturating_add(ALIVE_NS)))
+            .collect();
+        let (sender, receiver) = mpsc::channel(MAX_READ_AHEAD);
+        let left_out = without.to_vec();
+        let reading = tokio::task::spawn_blocking(move || {
+            read_all(&files, &left_out, &mut restamp, &sender);
+        });
+        tokio::select! {
+            played = player.play(receiver, alive) => played?,
+            interrupted = tokio::signal::ctrl_c() => interrupted?,
+        }
+        // A channel without its receiver ends it.
+        reading.await?;
+        player.tell()
+    })?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn overview(files: &[Vec<u8>], without: &[String]) -> anyhow::Result<Overview> {
+    let mut overview = Overview::default();
+    for file in files {
+        flightlog::read(file, |entry| {
+            let Entry::Message(Received { key, received_ns, .. }) = entry else { return };
+            let Some(row) = played(key, without) else { return };
+            if row.delivery != Delivery::LastValue {
+                overview.first_ns.get_or_insert(received_ns);
+            }
+            overview.last_ns = overview.last_ns.max(received_ns);
+            if let Some(name) = Name::of_health(key) {
+                overview.services.insert(name, received_ns);
+            }
+        })?;
+    }
+    Ok(overview)
+}
+
+/// A controller that flies now must not be taken for one of a recording, nor the other way round.
+async fn nobody_is_doubled(node: &Node, overview: &Overview) -> anyhow::Result<()> {
+    let running = node.list_peers().await?;
+    let services: BTreeSet<&str> =
+        overview.services.keys().map(|name| name.service.as_str()).collect();
+    let doubled: Vec<String> = running
+        .into_iter()
+        .map(|(service, instance)| Name { service, instance })
+        .filter(|name| {
+            // Detectors may be several, of other names.
+            let is_other = name.service != "detector" && services.contains(name.service.as_str());
+            is_other || overview.services.contains_key(name)
+        })
+        .map(|Name { service, instance }| format!("{service} `{instance}`"))
+        .collect();
+    if doubled.is_empty() {
+        return Ok(());
+    }
+    bail!(
+        "{} run here, and the recording has messages of the same; stop them, leave them out of the recording with `--without SERVICE`, or name another vehicle with `--vehicle`",
+        doubled.join(", ")
+    );
+}
+
+/// Reads the recording as far ahead as there is room, until nobody listens any more.
+fn read_all(files: &[Vec<u8>], without: &[String], restamp: &mut Restamp, due: &mpsc::Sender<Due>) {
+    for file in files {
+        // It was read before.
+        let _ = flightlog::read(file, |entry| {
+            if due.is_closed() {
+                return;
+            }
+            let next = match entry {
+                Entry::Message(message) if is_message(message.key, without) => {
+                    let (key, payload) = (message.key.to_owned(), restamp.payload(message));
+                    let at_ns = restamp.due_ns(message.received_ns);
+                    Some(Due { at_ns, item: Item::Message { key, payload } })
+                }
+                Entry::Picture { header, bytes, received_ns }
+                    if played(&topic::FRAME.key(&[&header.camera]), without).is_some() =>
+                {
+                    let at_ns = restamp.due_ns(received_ns);
+                    restamp
+                        .frame(&header, bytes, received_ns)
+                        .map(|(header, pixels)| Due { at_ns, item: Item::Frame { header, pixels } })
+                }
+                _ => None,
+            };
+            if let Some(next) = next {
+                // Its receiver may have ended.
+                drop(due.blocking_send(next));
+            }
+        });
+    }
+}
+
+/// Whether a message is published as it is: one with an attachment is a frame, whose pixels follow.
+fn is_message(key: &str, without: &[String]) -> bool {
+    played(key, without).is_some() && topic::FRAME.first_name(key).is_none()
+}
+
+/// Publishes what is due.
+struct Player<'a> {
+    node: &'a Node,
+    without: Vec<String>,
+    publishers: BTreeMap<String, Publisher<Vec<u8>>>,
+    cameras: BTreeMap<String, FramePublisher>,
+    alive: BTreeMap<Name, Announcement>,
+    messages: u64,
+    frames: u64,
+    latest: Duration,
+}
+
+impl<'a> Player<'a> {
+    fn new(node: &'a Node, without: Vec<String>) -> Self {
+        Self {
+            node,
+            without,
+            publishers: BTreeMap::new(),
+            cameras: BTreeMap::new(),
+            alive: BTreeMap::new(),
+            messages: 0,
+            frames: 0,
+            latest: Duration::ZERO,
+        }
+    }
+
+    async fn play(
+        &mut self,
+        mut due: mpsc::Receiver<Due>,
+        alive: BTreeMap<Name, i64>,
+    ) -> anyhow::Result<()> {
+        while let Some(Due { at_ns, item }) = due.recv().await {
+            let early_ns = at_ns.saturating_sub(now_ns());
+            if early_ns > 0 {
+                sleep(Duration::from_nanos(early_ns.unsigned_abs())).await;
+            }
+            match item {
+                Item::Message { key, payload } => {
+                    // What is a state from before has no time of its own to keep.
+                    if !self.is_state(&key) {
+                        let late_ns = now_ns().saturating_sub(at_ns).max(0);
+                        self.latest = self.latest.max(Duration::from_nanos(late_ns.unsigned_abs()));
+                    }
+                    self.show_alive(&key).await?;
+                    self.message(&key, payload).await?;
+                }
+                Item::Frame { header, pixels } => self.frame(&header, &pixels).await?,
+            }
+            let now = now_ns();
+            self.alive.retain(|name, _| alive.get(name).is_some_and(|until_ns| now < *until_ns));
+        }
+        Ok(())
+    }
+
+    fn is_state(&self, key: &str) -> bool {
+        played(key, &self.without).is_some_and(|row| row.delivery == Delivery::LastValue)
+    }
+
+    /// Shows a service as ready from its first health report on.
+    async fn show_alive(&mut self, key: &str) -> anyhow::Result<()> {
+        if let Some(name) = Name::of_health(key)
+            && !self.alive.contains_key(&name)
+        {
+            let announcement = self.node.announce_other(&name.service, &name.instance).await?;
+            self.alive.insert(name, announcement);
+        }
+        Ok(())
+    }
+
+    async fn message(&mut self, key: &str, payload: Vec<u8>) -> anyhow::Result<()> {
+        if !self.publishers.contains_key(key) {
+            let row = played(key, &self.without).context("a topic")?;
+            let publisher = self.node.encoded_publisher(row, key).await?;
+            self.publishers.insert(key.to_owned(), publisher);
+        }
+        if let Some(publisher) = self.publishers.get(key) {
+            publisher.publish_encoded(payload).await;
+            self.messages += 1;
+        }
+        Ok(())
+    }
+
+    async fn frame(&mut self, header: &FrameHeader, pixels: &[u8]) -> anyhow::Result<()> {
+        let camera = header.camera.as_str();
+        if !self.cameras.contains_key(camera) {
+            let publisher =
+                self.node.frame_publisher(topic::FRAME, &[camera], pixels.len()).await?;
+            self.cameras.insert(camera.to_owned(), publisher);
+        }
+        if let Some(publisher) = self.cameras.get(camera) {
+            let mut loan = publisher.loan(pixels.len());
+            loan.copy_from_slice(pixels);
+            publisher.publish(header, loan).await;
+            self.frames += 1;
+        }
+        Ok(())
+    }
+
+    fn tell(&self) -> anyhow::Result<()> {
+        print(&format!(
+            "published {} messages and {} frames, at most {:.0} ms late",
+            self.messages,
+            self.frames,
+            self.latest.as_secs_f64() * 1e3
+        ))?;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_goes_to_an_autopilot_again_and_what_is_left_out_is() {
+        for key in ["mavlink/to-autopilot", "controller/tape", "recorder/main/status"] {
+            assert!(played(key, &[]).is_none(), "{key}");
+        }
+        for key in ["controller/command", "health/gcs-bridge/main", "config/dashboard/main", "?"] {
+            assert!(played(key, &[]).is_none(), "{key}");
+        }
+        let keys = [
+            "controller/status",
+            "health/controller/main",
+            "config/controller/main",
+            "vehicle/state",
+            "mavlink/from-autopilot",
+        ];
+        let without = ["controller".to_owned()];
+        for key in keys {
+            assert!(played(key, &[]).is_some() && played(key, &without).is_none(), "{key}");
+        }
+        assert!(played("detector/main/detections", &without).is_some());
+        assert!(played("camera/down/frame", &without).is_some());
+    }
+}

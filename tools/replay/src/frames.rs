@@ -1,0 +1,332 @@
+//! Searches the frames of a recording again, and compares what is found with what was found then.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+
+use airlink::Unpacker;
+use anyhow::{Context, bail, ensure};
+use controller::wire::wanted;
+use detector::{Search, StageClock};
+use flightlog::{Entry, RecordedTape};
+use geometry::Point;
+use imaging::Converter;
+use messages::{
+    CameraInfo, Configuration, Detection, Detections, FrameHeader, PixelFormat, TapeEvent, Truth,
+    decode, topic,
+};
+use node::from_toml;
+
+use crate::change::{Change, change_with};
+use crate::truth::{Truths, is_in_picture};
+
+/// What is searched again, and how.
+#[derive(Clone, Debug, Default)]
+pub struct Again {
+    /// The detector whose frames and configuration are taken; `None` for the only one of the recording.
+    pub detector: Option<String>,
+    /// Settings `key=value` of the detector over the recorded configuration.
+    pub of_detector: Vec<String>,
+    /// Settings `key=value` of the controller over the recorded configuration.
+    pub of_controller: Vec<String>,
+}
+
+/// What was found of the marker that the controller wants, in the frames that were searched then and now.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Found {
+    /// That marker, `FAMILY` or `FAMILY:ID`.
+    pub marker: String,
+    /// Frames in which it was found.
+    pub frames: usize,
+    /// Those of them whose picture shows the pad, by truth.
+    pub visible: usize,
+    /// Distances between the marker as it was found and the true pad, in metres in space, in the order of the frames.
+    pub errors_m: Vec<f64>,
+    /// How long each search took, without decoding the picture, in milliseconds.
+    pub times_ms: Vec<f64>,
+}
+
+/// What a second search of the frames found.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Searched {
+    /// The detector.
+    pub detector: String,
+    /// Its camera.
+    pub camera: String,
+    /// Whether the pictures lost something when they were recorded (JPEG).
+    pub is_lossy: bool,
+    /// Frames that were searched then, as far as the recording has what was found.
+    pub searched_then: usize,
+    /// Frames that were searched now: those of them whose picture was recorded and can be read.
+    pub searched: usize,
+    /// Those of them that show the pad; `None` where the truth is not known.
+    pub showing_the_pad: Option<usize>,
+    /// Frames whose picture cannot be read.
+    pub unreadable: usize,
+    /// What was found then.
+    pub then: Found,
+    /// What is found now.
+    pub now: Found,
+    /// Frames in which the marker was found then and not now.
+    pub lost: usize,
+    /// Frames in which it is found now and was not then.
+    pub gained: usize,
+    /// Distances between both, in metres in space.
+    pub apart_m: Vec<f64>,
+    /// What the controller decides on the new detections, for each tape.
+    pub changes: Vec<Change>,
+}
+
+/// What a recording says of a detector's frames.
+#[derive(Default)]
+struct Facts {
+    detectors: BTreeMap<String, String>,
+    controllers: Vec<String>,
+    cameras: BTreeMap<String, CameraInfo>,
+    /// Detections by detector and the frame's stamp.
+    found: BTreeMap<String, BTreeMap<i64, Detections>>,
+    truths: Vec<Truth>,
+}
+
+impl Facts {
+    fn take(&mut self, key: &str, payload: &[u8]) {
+        if let Some(detector) = topic::DETECTIONS.first_name(key) {
+            if let Ok(message) = decode::<Detections>(payload) {
+                let found = self.found.entry(detector.to_owned()).or_default();
+                found.insert(message.header.stamp_ns, message);
+            }
+        } else if let Some(camera) = topic::CAMERA_INFO.first_name(key) {
+            if let Ok(info) = decode(payload) {
+                self.cameras.insert(camera.to_owned(), info);
+            }
+        } else if topic::CONFIGURATION.first_name(key).is_some() {
+            if let Ok(Configuration { service, instance, toml, .. }) = decode(payload) {
+                match service.as_str() {
+                    "detector" => drop(self.detectors.insert(instance, toml)),
+                    "controller" => self.controllers.push(toml),
+                    _ => {}
+                }
+            }
+        } else if key == topic::TRUTH.key(&[]) {
+            self.truths.extend(decode::<Truth>(payload).ok());
+        }
+    }
+
+    /// The configuration of the detector to search with.
+    fn detector(&self, again: &Again) -> anyhow::Result<detector::Config> {
+        let names = || self.detectors.keys().cloned().collect::<Vec<_>>().join(", ");
+        let toml = match &again.detector {
+            Some(name) => self.detectors.get(name).with_context(|| {
+                format!(
+                    "the recording has no configuration of a detector `{name}`; it has: {}",
+                    names()
+                )
+            })?,
+            None => {
+                ensure!(
+                    self.detectors.len() < 2,
+                    "the recording has several detectors, name one with `--detector`: {}",
+                    names()
+                );
+                let only = self.detectors.values().next();
+                only.context("the recording has no configuration of a detector")?
+            }
+        };
+        let config =
+            from_toml("the recorded configuration of the detector", toml, &again.of_detector)?;
+        Ok(config.settings)
+    }
+
+    /// The marker that the controller wants.
+    fn marker(&self, tapes: &[RecordedTape], set: &[String]) -> anyhow::Result<String> {
+        let of_tape = tapes.first().and_then(configuration);
+        let toml = of_tape.or_else(|| self.controllers.last().cloned());
+        let toml = toml.context("the recording has no configuration of a controller")?;
+        let config = from_toml::<controller::Config>(
+            "the recorded configuration of the controller",
+            &toml,
+            set,
+        )?;
+        Ok(config.settings.marker)
+    }
+}
+
+/// The controller's configuration at the begin of its tape.
+fn configuration(tape: &RecordedTape) -> Option<String> {
+    match tape.parts.first()?.records().next()?.ok()?.event {
+        TapeEvent::Begin { configuration, .. } => Some(configuration.into_owned()),
+        _ => None,
+    }
+}
+
+/// Searches the frames of a recording, which may be several files, again: those that the detector searched then, one
+/// after the other. The tapes, of the same recording, are replayed with what is found.
+///
+/// # Errors
+/// When the recording lacks what it takes, a setting is refused, or a file is no recording.
+pub fn search(
+    files: &[Vec<u8>],
+    tapes: &[RecordedTape],
+    again: &Again,
+) -> anyhow::Result<Searched> {
+    let mut facts = Facts::default();
+    for file in files {
+        flightlog::read(file, |entry| {
+            if let Entry::Message(message) = entry {
+                facts.take(message.key, message.payload);
+            }
+        })?;
+    }
+    let config = facts.detector(again)?;
+    let name = again.detector.clone().or_else(|| facts.detectors.keys().next().cloned());
+    let name = name.unwrap_or_default();
+    let then = facts.found.remove(&name).unwrap_or_default();
+    ensure!(!then.is_empty(), "the recording has no detections of the detector `{name}`");
+    let info = facts.cameras.get(&config.camera).cloned();
+    let mut frames = Frames {
+        camera: config.camera.clone(),
+        search: Search::new(&config).map_err(anyhow::Error::msg)?,
+        info,
+        truths: Truths::new(std::mem::take(&mut facts.truths)),
+        then,
+        now: BTreeMap::new(),
+        converter: Converter::default(),
+        unpacker: Unpacker::default(),
+        searched: Searched {
+            detector: name.clone(),
+            camera: config.camera,
+            then: Found { marker: facts.marker(tapes, &[])?, ..Found::default() },
+            now: Found { marker: facts.marker(tapes, &again.of_controller)?, ..Found::default() },
+            ..Searched::default()
+        },
+    };
+    if !frames.truths.is_empty() && frames.info.is_some() {
+        frames.searched.showing_the_pad = Some(0);
+    }
+    for file in files {
+        flightlog::read(file, |entry| {
+            if let Entry::Picture { header, bytes, .. } = entry {
+                frames.picture(&header, bytes);
+            }
+        })?;
+    }
+    let Frames { mut searched, now, then, .. } = frames;
+    searched.searched_then = then.len();
+    if searched.searched == 0 {
+        bail!(
+            "the recording has no picture of the {} frames of camera `{}` that were searched ({} cannot be read); they are kept with `frames = \"jpeg\"` or \"raw\" of the recorder",
+            then.len(),
+            searched.camera,
+            searched.unreadable
+        );
+    }
+    for tape in tapes {
+        searched.changes.push(change_with(tape, &again.of_controller, |event| match event {
+            TapeEvent::Detections { publisher, message } if *publisher == name => {
+                let message = now.get(&message.header.stamp_ns)?.clone();
+                let publisher = Cow::Owned(name.clone());
+                Some(TapeEvent::Detections { publisher, message: Cow::Owned(message) })
+            }
+            _ => None,
+        })?);
+    }
+    Ok(searched)
+}
+
+/// The frames that are searched again.
+struct Frames {
+    camera: String,
+    search: Search,
+    info: Option<CameraInfo>,
+    truths: Truths,
+    /// What was found then and is found now, by the frame's stamp.
+    then: BTreeMap<i64, Detections>,
+    now: BTreeMap<i64, Detections>,
+    converter: Converter,
+    unpacker: Unpacker,
+    searched: Searched,
+}
+
+impl Frames {
+    /// Takes a picture. Of one that is in two files, as the last of a file may be, the first counts.
+    fn picture(&mut self, header: &FrameHeader, bytes: &[u8]) {
+        let stamp_ns = header.stamp_ns;
+        let is_new = !self.now.contains_key(&stamp_ns);
+        if header.camera != self.camera || !self.then.contains_key(&stamp_ns) || !is_new {
+            return;
+        }
+        let Some((found, clock)) = self.found(header, bytes) else {
+            self.searched.unreadable += 1;
+            return;
+        };
+        let took_ms = clock.elapsed().as_secs_f64() * 1e3;
+        let Some(then) = self.then.get(&stamp_ns) else { return };
+        let now = Detections {
+            detector: then.detector.clone(),
+            header: then.header.clone(),
+            detections: found,
+            stages: clock.into_stages(),
+        };
+        self.searched.is_lossy |= header.format == PixelFormat::Jpeg;
+        self.searched.searched += 1;
+        self.compare(took_ms, &now);
+        self.now.insert(stamp_ns, now);
+    }
+
+    /// What is in a picture, and the clock of its search; `None` when it cannot be read.
+    fn found(
+        &mut self,
+        header: &FrameHeader,
+        bytes: &[u8],
+    ) -> Option<(Vec<Detection>, StageClock)> {
+        let FrameHeader { width, height, format, .. } = *header;
+        let model = self.info.as_ref().and_then(CameraInfo::model);
+        let model = model.filter(|it| (it.width, it.height) == (width, height));
+        if format == PixelFormat::Jpeg {
+            let parts = self.unpacker.unpack(header, bytes).ok()?;
+            let mut clock = StageClock::start();
+            let found = self.search.parts(&parts, header, model.as_ref(), &mut clock);
+            return Some((found, clock));
+        }
+        let mut clock = StageClock::start();
+        let view =
+            self.converter.convert(bytes, width as usize, height as usize, format.sample_format()?);
+        let found = self.search.whole(view.ok()?, header, model.as_ref(), &mut clock);
+        Some((found, clock))
+    }
+
+    fn compare(&mut self, took_ms: f64, now: &Detections) {
+        let Self { then, searched, info, truths, .. } = self;
+        let Some(then) = then.get(&now.header.stamp_ns) else { return };
+        let pad = info.as_ref().and_then(|it| truths.pad_in_camera(now.header.stamp_ns, it));
+        let model = info.as_ref().and_then(CameraInfo::model);
+        let is_visible = pad.zip(model).is_some_and(|(pad, model)| is_in_picture(pad, &model));
+        if let Some(showing) = &mut searched.showing_the_pad {
+            *showing += usize::from(is_visible);
+        }
+        let then_ms = then.stages.iter().map(|it| f64::from(it.micros)).sum::<f64>() * 1e-3;
+        let mut places = [None, None];
+        let sides = [(&mut searched.then, then, then_ms), (&mut searched.now, now, took_ms)];
+        for ((side, message, ms), place) in sides.into_iter().zip(&mut places) {
+            side.times_ms.push(ms);
+            let Some(seen) = wanted(message, &side.marker) else { continue };
+            side.frames += 1;
+            side.visible += usize::from(is_visible);
+            let [x, y, z] = match &seen.pose {
+                Some(pose) => pose.camera_from_marker.translation_m,
+                None => [f64::NAN; 3],
+            };
+            let point = Point::new(x, y, z);
+            side.errors_m.extend(pad.map(|pad| (point - pad).norm()).filter(|it| it.is_finite()));
+            *place = Some(point);
+        }
+        match places {
+            [Some(_), None] => searched.lost += 1,
+            [None, Some(_)] => searched.gained += 1,
+            [Some(one), Some(other)] => {
+                let apart_m = (other - one).norm();
+                searched.apart_m.extend(Some(apart_m).filter(|it| it.is_finite()));
+            }
+            [None, None] => {}
+        }
+    }
+}
