@@ -4,10 +4,9 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, ensure};
-use clap::Args;
-use report::{Flight, FlightReader, comparison, figures, page, replay_tapes, summary};
+use clap::{Args, ValueEnum};
+use report::{Flight, FlightReader, comparison, document, figures, page, replay_tapes, summary};
 
-use crate::args::Format;
 use crate::terminal::{print, write_error};
 
 #[derive(Args)]
@@ -19,16 +18,29 @@ pub(crate) struct ReportArgs {
     /// Which landing of each recording, from 1 on, where it has several [default: the last].
     #[arg(long, value_name = "N")]
     landing: Option<usize>,
-    /// The page [default: the first recording's name with `.html`, beside it].
-    #[arg(short, long, value_name = "FILE.html")]
+    /// The page [default: the first recording's name with `.html` or `.pdf`, beside it]. A name that ends with `.pdf` is
+    /// that of a PDF document.
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// A folder for the charts as SVG files, with title and legend, for papers and slides; of two flights in
     /// the folders `1` and `2` in it.
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
-    /// What is printed: a line for a bug report, or the flight in numbers as one JSON object.
+    /// What is printed: a line for a bug report, or the flight in numbers as one JSON object; or the line, and the page is a
+    /// PDF document.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+enum Format {
+    /// A line of text.
+    #[default]
+    Text,
+    /// One JSON object for each flight.
+    Json,
+    /// A line of text, and a PDF document.
+    Pdf,
 }
 
 /// Maximum number of flights on a page.
@@ -43,22 +55,27 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
             anyhow::anyhow!("`--landing {number}`: {name} has {of} landings, counted from 1")
         })?;
     }
-    let html = match flights.as_slice() {
-        [one] => page(one)?,
-        [one, other] => comparison(one, other)?,
+    let named_pdf = |path: &PathBuf| path.extension().is_some_and(|it| it == "pdf");
+    let is_pdf = args.format == Format::Pdf || args.output.as_ref().is_some_and(named_pdf);
+    let written = match flights.as_slice() {
+        [one] if is_pdf => document(one, None)?,
+        [one, other] if is_pdf => document(one, Some(other))?,
+        [one] => page(one)?.into_bytes(),
+        [one, other] => comparison(one, other)?.into_bytes(),
         all => anyhow::bail!(
             "{} flights in {:?}, a page has one, or {MAX_FLIGHTS} to compare",
             all.len(),
             args.files
         ),
     };
-    let beside = args.files.first().map(|file| file.with_extension("html")).unwrap_or_default();
+    let extension = if is_pdf { "pdf" } else { "html" };
+    let beside = args.files.first().map(|file| file.with_extension(extension)).unwrap_or_default();
     let output = args.output.as_ref().unwrap_or(&beside);
     ensure!(
         !args.files.iter().any(|file| is_same_file(file, output)),
         "{output:?} is a recording; name another file for the page with `--output`"
     );
-    std::fs::write(output, html)
+    std::fs::write(output, written)
         .with_context(|| format!("writing {output:?}; name another file with `--output`"))?;
     if let Some(folder) = &args.figures {
         for (number, flight) in (1..).zip(&flights) {
@@ -69,7 +86,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<ExitCode> {
     for flight in &flights {
         let summary = summary(flight);
         match args.format {
-            Format::Text => print(&summary.line())?,
+            Format::Text | Format::Pdf => print(&summary.line())?,
             Format::Json => print(&serde_json::to_string(&summary)?)?,
         }
     }

@@ -59,6 +59,12 @@ impl Ink {
         }
     }
 
+    /// The colour in light: red, green, blue.
+    pub fn channels(self) -> [u8; 3] {
+        let RGBColor(red, green, blue) = self.rgb();
+        [red, green, blue]
+    }
+
     /// The colour in light, as CSS has it.
     pub fn css(self) -> String {
         let RGBColor(red, green, blue) = self.rgb();
@@ -247,9 +253,13 @@ impl Chart {
         (stretched(x, across), stretched(y, up))
     }
 
-    fn draw(
+    /// Draws it into an area of this size, in pixels of the drawing.
+    ///
+    /// # Errors
+    /// When what it is drawn on fails.
+    pub fn draw<Backend: DrawingBackend<ErrorType: 'static>>(
         &self,
-        area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>,
+        area: &DrawingArea<Backend, plotters::coord::Shift>,
         size: [u32; 2],
     ) -> Result<(), Box<dyn std::error::Error>> {
         let (x, y) = self.spans(size);
@@ -338,14 +348,14 @@ impl Chart {
     }
 }
 
-type Drawn<'a, 'b> = ChartContext<
+type Drawn<'a, Backend> = ChartContext<
     'a,
-    SVGBackend<'b>,
+    Backend,
     Cartesian2d<plotters::coord::types::RangedCoordf64, plotters::coord::types::RangedCoordf64>,
 >;
 
-fn draw_layer(
-    chart: &mut Drawn<'_, '_>,
+fn draw_layer<Backend: DrawingBackend<ErrorType: 'static>>(
+    chart: &mut Drawn<'_, Backend>,
     layer: &Layer,
     pixels: [f64; 2],
 ) -> Result<(), Box<dyn std::error::Error>> {

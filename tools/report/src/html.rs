@@ -1,4 +1,4 @@
-//! Pieces of a page: escaped texts, and tables.
+//! Pieces of a page: escaped texts, and blocks such as tables, which a document shows as well.
 
 use std::fmt::Write as _;
 
@@ -51,8 +51,71 @@ pub fn count(value: u64) -> Cell {
     Cell::Number(value.to_string())
 }
 
-/// A table; empty without rows.
-pub fn table(head: &[&str], rows: &[Vec<Cell>]) -> String {
+impl Cell {
+    /// What it says.
+    pub fn said(&self) -> &str {
+        match self {
+            Self::Text(text) | Self::Number(text) | Self::Warning(text) => text,
+        }
+    }
+}
+
+/// A piece of a section.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Block {
+    /// A paragraph.
+    Paragraph(String),
+    /// What was not recorded.
+    Missing(String),
+    /// A sentence that warns.
+    Warning(String),
+    /// A table, shown unless it has no rows.
+    Table {
+        /// Names of its columns; may be empty.
+        head: Vec<String>,
+        /// Its rows.
+        rows: Vec<Vec<Cell>>,
+    },
+    /// A text as it is, line by line.
+    Lines(String),
+    /// What a page shows once it is opened.
+    Details {
+        /// Its title.
+        title: String,
+        /// What it holds.
+        block: Box<Self>,
+    },
+}
+
+impl Block {
+    /// The block as HTML.
+    pub fn html(&self) -> String {
+        match self {
+            Self::Paragraph(text) => format!("<p>{}</p>", escaped(text)),
+            Self::Missing(what) => {
+                format!("<p class=\"missing\">Not recorded: {}</p>", escaped(what))
+            }
+            Self::Warning(text) => format!("<p class=\"warning\">{}</p>", escaped(text)),
+            Self::Table { head, rows } => table_as_html(head, rows),
+            Self::Lines(text) => format!("<pre>{}</pre>", escaped(text)),
+            Self::Details { title, block } => {
+                format!("<details><summary>{}</summary>{}</details>", escaped(title), block.html())
+            }
+        }
+    }
+}
+
+/// Blocks as HTML, one after the other.
+pub fn all_as_html(blocks: &[Block]) -> String {
+    blocks.iter().map(Block::html).collect()
+}
+
+/// A table.
+pub fn table(head: &[&str], rows: Vec<Vec<Cell>>) -> Block {
+    Block::Table { head: head.iter().map(|&name| name.to_owned()).collect(), rows }
+}
+
+fn table_as_html(head: &[String], rows: &[Vec<Cell>]) -> String {
     if rows.is_empty() {
         return String::new();
     }
@@ -74,12 +137,12 @@ pub fn table(head: &[&str], rows: &[Vec<Cell>]) -> String {
     for row in rows {
         html.push_str("<tr>");
         for cell in row {
-            let (class, text) = match cell {
-                Cell::Text(text) => ("", text),
-                Cell::Number(text) => (" class=\"number\"", text),
-                Cell::Warning(text) => (" class=\"warning\"", text),
+            let class = match cell {
+                Cell::Text(_) => "",
+                Cell::Number(_) => " class=\"number\"",
+                Cell::Warning(_) => " class=\"warning\"",
             };
-            let _ = write!(html, "<td{class}>{}</td>", escaped(text));
+            let _ = write!(html, "<td{class}>{}</td>", escaped(cell.said()));
         }
         html.push_str("</tr>");
     }
@@ -88,18 +151,18 @@ pub fn table(head: &[&str], rows: &[Vec<Cell>]) -> String {
 }
 
 /// A sentence on what was not recorded.
-pub fn missing(what: &str) -> String {
-    format!("<p class=\"missing\">Not recorded: {}</p>", escaped(what))
+pub fn missing(what: &str) -> Block {
+    Block::Missing(what.to_owned())
 }
 
 /// A paragraph.
-pub fn paragraph(text: &str) -> String {
-    format!("<p>{}</p>", escaped(text))
+pub fn paragraph(text: &str) -> Block {
+    Block::Paragraph(text.to_owned())
 }
 
 /// What is shown once it is opened.
-pub fn details(title: &str, body: &str) -> String {
-    format!("<details><summary>{}</summary>{body}</details>", escaped(title))
+pub fn details(title: &str, block: Block) -> Block {
+    Block::Details { title: title.to_owned(), block: Box::new(block) }
 }
 
 #[cfg(test)]
@@ -109,9 +172,9 @@ mod tests {
     #[test]
     fn what_a_recording_says_stays_text() {
         let cells = vec![text("<script>alert('1')</script> & \u{7}"), number(None, 1, "m")];
-        let html = table(&["name", "value"], &[cells]);
+        let html = table(&["name", "value"], vec![cells]).html();
         assert!(!html.contains("<script") && html.contains("&lt;script&gt;"), "{html}");
         assert!(html.contains("&amp;") && !html.contains('\u{7}') && html.contains(">-<"));
-        assert_eq!(table(&["name"], &[]), "");
+        assert_eq!(table(&["name"], Vec::new()).html(), "");
     }
 }

@@ -9,10 +9,11 @@
 //! what happened and why, [`losses`] what is missing, [`tape`] whether the tape
 //! gives the same again, and [`mod@summary`] all of it in numbers. [`difference`] compares
 //! configurations. [`view`] joins these for the page: [`plots`] are its charts, drawn by [`chart`], [`sections`] its
-//! parts, in pieces of [`html`], and [`mod@page`] the whole. [`mod@figures`] are the charts as files of their own.
+//! parts, in pieces of [`html`], and [`mod@page`] the whole, [`mod@document`] the same on the pages of a [`pdf`] file. [`mod@figures`] are the charts as files of their own.
 
 pub mod chart;
 pub mod difference;
+pub mod document;
 pub mod figures;
 pub mod flight;
 pub mod frames;
@@ -23,6 +24,7 @@ pub mod latency;
 pub mod losses;
 pub mod packets;
 pub mod page;
+pub mod pdf;
 pub mod phases;
 pub mod plots;
 pub mod sections;
@@ -31,6 +33,7 @@ pub mod tape;
 pub mod track;
 pub mod view;
 
+pub use document::document;
 pub use figures::{Figure, figures};
 pub use flight::{Flight, FlightReader, Replayed};
 pub use page::{comparison, page};

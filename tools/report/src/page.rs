@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use crate::chart::Chart;
 use crate::difference::{Difference, configurations, parameters, parameters_of_one};
 use crate::flight::Flight;
-use crate::html::{Cell, escaped, missing, number, paragraph, table, text};
+use crate::html::{Block, Cell, all_as_html, escaped, missing, number, paragraph, table, text};
 use crate::plots::share_axes;
 use crate::sections::{self, Section};
 use crate::summary::Summary;
@@ -134,15 +134,22 @@ static FIGURES: [Figure; 18] = [
     figure("messages lost", |s| Some(s.messages_lost as f64), 0, ""),
 ];
 
+/// The numbers of a flight, by name; `Err` with what is said instead of one.
+pub(crate) fn in_numbers(
+    summary: &Summary,
+) -> impl Iterator<Item = (&'static str, Result<String, &'static str>)> {
+    // What an aborted landing did not come to is not missing in its recording.
+    let none = if summary.landed || summary.phase.is_none() { "not recorded" } else { "-" };
+    FIGURES.iter().map(move |Figure { name, of, digits, unit }| {
+        let value = of(summary).map(|value| format!("{value:.digits$} {unit}"));
+        (*name, value.ok_or(none))
+    })
+}
+
 fn cards(summary: &Summary) -> String {
     let mut html = "<dl class=\"cards\">".to_owned();
-    for Figure { name, of, digits, unit } in &FIGURES {
-        // What an aborted landing did not come to is not missing in its recording.
-        let none = if summary.landed || summary.phase.is_none() { "not recorded" } else { "-" };
-        let shown = of(summary).map_or_else(
-            || format!("<span class=\"quiet\">{none}</span>"),
-            |value| format!("{value:.digits$} {unit}"),
-        );
+    for (name, value) in in_numbers(summary) {
+        let shown = value.unwrap_or_else(|none| format!("<span class=\"quiet\">{none}</span>"));
         // Writing to a string cannot fail.
         let _ = write!(html, "<div><dt>{name}</dt><dd>{shown}</dd></div>");
     }
@@ -150,8 +157,13 @@ fn cards(summary: &Summary) -> String {
     html
 }
 
-/// The numbers of two flights with their difference.
 fn numbers(one: &Summary, other: &Summary) -> String {
+    let table = compared(one, other).html();
+    format!("<section id=\"numbers\"><h2>In numbers</h2>{table}</section>")
+}
+
+/// The numbers of two flights with their difference.
+pub(crate) fn compared(one: &Summary, other: &Summary) -> Block {
     let rows: Vec<Vec<Cell>> = FIGURES
         .iter()
         .map(|Figure { name, of, digits, unit }| {
@@ -166,12 +178,11 @@ fn numbers(one: &Summary, other: &Summary) -> String {
             ]
         })
         .collect();
-    let table = table(&["", "A", "B", "B less A"], &rows);
-    format!("<section id=\"numbers\"><h2>In numbers</h2>{table}</section>")
+    table(&["", "A", "B", "B less A"], rows)
 }
 
-fn differences(first: &Flight, second: &Flight) -> String {
-    let mut html = "<section id=\"differences\"><h2>Differences of configuration</h2>".to_owned();
+/// What two flights differ in: the services' configurations, then the autopilot's parameters.
+pub(crate) fn differing(first: &Flight, second: &Flight) -> [Vec<Block>; 2] {
     let rows = |differences: Vec<Difference>| -> Vec<Vec<Cell>> {
         let value = |value: Option<String>| text(value.unwrap_or_else(|| "-".to_owned()));
         differences
@@ -179,36 +190,44 @@ fn differences(first: &Flight, second: &Flight) -> String {
             .map(|it| vec![text(it.name), value(it.one), value(it.other)])
             .collect()
     };
+    let mut of_services = Vec::new();
     if first.configurations.is_empty() || second.configurations.is_empty() {
-        html.push_str(&missing("the configuration of both flights"));
+        of_services.push(missing("the configuration of both flights"));
     } else {
         let rows = rows(configurations(first, second));
         if rows.is_empty() {
-            html.push_str(&paragraph("The services are configured the same."));
+            of_services.push(paragraph("The services are configured the same."));
         }
-        html.push_str(&table(&["setting", "A", "B"], &rows));
+        of_services.push(table(&["setting", "A", "B"], rows));
     }
-    html.push_str("<h3>Parameters of the autopilot</h3>");
+    let mut of_autopilot = Vec::new();
     let [one, other] = [first, second].map(|flight| flight.packets.parameters.len());
     if one == 0 || other == 0 {
-        html.push_str(&missing(
+        of_autopilot.push(missing(
             "parameters of both flights; the file has those that somebody asked the autopilot for",
         ));
     } else {
         let rows = rows(parameters(first, second));
         let alone = parameters_of_one(first, second);
-        html.push_str(&paragraph(&format!(
+        of_autopilot.push(paragraph(&format!(
             "{} differ of those that both recorded ({one} and {other}).",
             rows.len()
         )));
-        html.push_str(&table(&["parameter", "A", "B"], &rows));
+        of_autopilot.push(table(&["parameter", "A", "B"], rows));
         if !alone.is_empty() {
             let names = alone.join(", ");
-            html.push_str(&paragraph(&format!("Recorded of one flight only: {names}.")));
+            of_autopilot.push(paragraph(&format!("Recorded of one flight only: {names}.")));
         }
     }
-    html.push_str("</section>");
-    html
+    [of_services, of_autopilot]
+}
+
+fn differences(first: &Flight, second: &Flight) -> String {
+    let [of_services, of_autopilot] = differing(first, second).map(|blocks| all_as_html(&blocks));
+    format!(
+        "<section id=\"differences\"><h2>Differences of configuration</h2>{of_services}\
+         <h3>Parameters of the autopilot</h3>{of_autopilot}</section>"
+    )
 }
 
 fn links(sections: &[Section], is_comparison: bool) -> String {
@@ -230,20 +249,20 @@ fn links(sections: &[Section], is_comparison: bool) -> String {
 /// Charts without anything to show are left out: the section says what was not recorded.
 fn one(section: &Section) -> anyhow::Result<String> {
     let mut html = begin(section);
-    html.push_str(&section.before);
+    html.push_str(&all_as_html(&section.before));
     html.push_str("<div class=\"charts\">");
     for chart in section.charts.iter().filter(|chart| !chart.is_empty()) {
         html.push_str(&chart.figure()?);
     }
     html.push_str("</div>");
-    html.push_str(&section.after);
+    html.push_str(&all_as_html(&section.after));
     html.push_str("</section>");
     Ok(html)
 }
 
 fn begin(section: &Section) -> String {
     let Section { id, title, lead, .. } = section;
-    let lead = if lead.is_empty() { String::new() } else { paragraph(lead) };
+    let lead = if lead.is_empty() { String::new() } else { paragraph(lead).html() };
     format!("<section id=\"{id}\"><h2>{}</h2>{lead}", escaped(title))
 }
 
@@ -259,7 +278,7 @@ fn pair(left: &mut Section, right: &mut Section) -> anyhow::Result<String> {
             );
         }
     };
-    row(&left.before, &right.before);
+    row(&all_as_html(&left.before), &all_as_html(&right.before));
     let charts = left.charts.len().max(right.charts.len());
     for index in 0..charts {
         let (one, other) = (left.charts.get_mut(index), right.charts.get_mut(index));
@@ -272,7 +291,7 @@ fn pair(left: &mut Section, right: &mut Section) -> anyhow::Result<String> {
         });
         row(&one?, &other?);
     }
-    row(&left.after, &right.after);
+    row(&all_as_html(&left.after), &all_as_html(&right.after));
     html.push_str("</section>");
     Ok(html)
 }

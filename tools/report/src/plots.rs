@@ -255,15 +255,21 @@ pub fn latency(view: &View<'_>) -> Vec<Chart> {
         layer("exposure to detections at the controller", Ink::Blue, Shape::Dots, detected),
     ];
     let mut chart = over_time(view, "Age of what is used", "ms", layers);
-    // A single frame, as the first after a start, would flatten the rest.
+    // A single frame, as the first after a start, would flatten the rest: it stands at the upper edge.
     let ages: Vec<f64> =
         chart.layers.iter().flat_map(|it| &it.points).map(|point| point.y).collect();
     let high = 2.5 * node::stats::quantile(&ages, 0.95).unwrap_or(0.0).max(10.0);
-    let count = ages.iter().filter(|age| **age > high).count();
-    if count > 0 {
+    let oldest = ages.iter().copied().fold(0.0, f64::max);
+    if oldest > high {
         chart.axes.y.end = high;
-        chart.layers.iter_mut().for_each(|it| it.points.retain(|point| point.y <= high));
-        chart.note = format!("{count} beyond {high:.0} ms are not shown");
+        let mut beyond = Vec::new();
+        for layer in &mut chart.layers {
+            beyond.extend(layer.points.iter().filter(|it| it.y > high).map(|it| at(it.x, high)));
+            layer.points.retain(|point| point.y <= high);
+        }
+        let count = beyond.len();
+        let name = format!("older: {count} beyond {high:.0} ms, up to {oldest:.0} ms");
+        chart.layers.push(layer(&name, Ink::Red, Shape::Crosses, beyond));
     }
     vec![chart]
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::chart::Chart;
 use crate::frames::Fate;
-use crate::html::{Cell, count, details, escaped, missing, number, paragraph, table, text};
+use crate::html::{Block, Cell, count, details, missing, number, paragraph, table, text};
 use crate::view::View;
 use crate::{journal, losses, plots};
 
@@ -19,10 +19,10 @@ pub struct Section {
     pub lead: &'static str,
     /// Its charts.
     pub charts: Vec<Chart>,
-    /// What comes before the charts, as HTML.
-    pub before: String,
-    /// What comes after the charts, as HTML.
-    pub after: String,
+    /// What comes before the charts.
+    pub before: Vec<Block>,
+    /// What comes after the charts.
+    pub after: Vec<Block>,
 }
 
 /// The sections of a flight, in order: the same for each flight.
@@ -46,19 +46,19 @@ pub fn of(view: &View<'_>) -> Vec<Section> {
 }
 
 fn section(id: &'static str, title: &'static str, lead: &'static str) -> Section {
-    Section { id, title, lead, charts: Vec::new(), before: String::new(), after: String::new() }
+    Section { id, title, lead, charts: Vec::new(), before: Vec::new(), after: Vec::new() }
 }
 
 fn landing(view: &View<'_>) -> Section {
     let mut section = section("landing", "The landing in one picture", "");
     section.charts = plots::landing(view);
     if view.truth.is_empty() {
-        section.before.push_str(&missing("truth, which only a simulation knows"));
+        section.before.push(missing("truth, which only a simulation knows"));
     }
     if view.estimated.is_empty() {
         section
             .before
-            .push_str(&missing("the estimate of the landing point; or the marker was never seen"));
+            .push(missing("the estimate of the landing point; or the marker was never seen"));
     }
     section
 }
@@ -83,14 +83,14 @@ fn phases(view: &View<'_>) -> Section {
         }
     }
     if view.flight.is_rebuilt {
-        section.before = missing(
+        section.before.push(missing(
             "the controller's status; what stands here and below is what a replay of its tape gives",
-        );
+        ));
     }
-    section.after = match rows.is_empty() {
+    section.after.push(match rows.is_empty() {
         true => missing("the controller's status"),
-        false => table(&["from", "for", "phase", "reason"], &rows),
-    };
+        false => table(&["from", "for", "phase", "reason"], rows),
+    });
     section
 }
 
@@ -103,14 +103,14 @@ fn height(view: &View<'_>) -> Section {
     section.charts = plots::height(view);
     let summary = &view.summary;
     if view.errors.is_empty() {
-        section.before = missing("truth, so the estimate's error is not known");
+        section.before.push(missing("truth, so the estimate's error is not known"));
     } else {
-        let rows = [vec![
+        let rows = vec![vec![
             text("horizontal error of the estimate"),
             number(summary.estimate_error_p50_m, 3, "m"),
             number(summary.estimate_error_p95_m, 3, "m"),
         ]];
-        section.after = table(&["", "median", "95 %"], &rows);
+        section.after.push(table(&["", "median", "95 %"], rows));
     }
     section
 }
@@ -123,12 +123,12 @@ fn velocity(view: &View<'_>) -> Section {
     );
     section.charts = plots::velocity(view);
     if view.flight.vehicle.is_empty() {
-        section.before.push_str(&missing("the vehicle's state"));
+        section.before.push(missing("the vehicle's state"));
     }
     if view.setpoints.iter().all(|it| !it.velocity_ned_m_s.iter().all(|v| v.is_finite())) {
-        section.before.push_str(&missing("velocity setpoints; or none were sent"));
+        section.before.push(missing("velocity setpoints; or none were sent"));
     } else if view.flight.tapes.is_empty() {
-        section.before.push_str(&paragraph(
+        section.before.push(paragraph(
             "Setpoints are those of the controller's status, five a second: the tape, which has each, was not recorded.",
         ));
     }
@@ -142,14 +142,14 @@ fn detections(view: &View<'_>) -> Section {
         "Every frame that a detector searched, by what became of it.",
     );
     if view.frames.all.is_empty() {
-        section.before = missing("detections");
+        section.before.push(missing("detections"));
         return section;
     }
     section.charts = plots::detections(view);
     if !view.frames.is_from_tape {
-        section.before = paragraph(
+        section.before.push(paragraph(
             "Without the controller's tape this is what its estimates tell: a frame that is not known may have been refused.",
-        );
+        ));
     }
     let mut counts: BTreeMap<(&Fate, &str), u64> = BTreeMap::new();
     for frame in &view.frames.all {
@@ -168,7 +168,7 @@ fn detections(view: &View<'_>) -> Section {
             ]
         })
         .collect();
-    section.after = table(&["", "meaning", "detector", "frames", "of all"], &rows);
+    section.after.push(table(&["", "meaning", "detector", "frames", "of all"], rows));
     section
 }
 
@@ -180,14 +180,14 @@ fn latency(view: &View<'_>) -> Section {
     );
     let stages = &view.summary.latency;
     if stages.is_empty() {
-        section.before = missing("detections, so no latency is known");
+        section.before.push(missing("detections, so no latency is known"));
         return section;
     }
     section.charts = plots::latency(view);
     if !view.frames.is_from_tape {
-        section.before = paragraph(
+        section.before.push(paragraph(
             "Without the controller's tape the times are those at which the recorder had the detections; setpoints cannot be told apart.",
-        );
+        ));
     }
     let rows: Vec<Vec<Cell>> = stages
         .iter()
@@ -204,7 +204,7 @@ fn latency(view: &View<'_>) -> Section {
             ]
         })
         .collect();
-    section.after = table(&["stage", "frames", "median", "90 %", "99 %", "longest"], &rows);
+    section.after.push(table(&["stage", "frames", "median", "90 %", "99 %", "longest"], rows));
     section
 }
 
@@ -226,31 +226,29 @@ fn lost(view: &View<'_>) -> Section {
     };
     let mut counted = rows(losses::frames(flight));
     if counted.is_empty() {
-        section
-            .before
-            .push_str(&missing("frames and detections, so none can be counted as missing"));
+        section.before.push(missing("frames and detections, so none can be counted as missing"));
     }
     let by_recorder = losses::recorder(flight);
     if !by_recorder.is_empty() {
         let all: u64 = by_recorder.iter().map(|loss| loss.count).fold(0, u64::saturating_add);
-        section.after = details(
+        section.after.push(details(
             &format!("{all} messages that the recorder lost, by key"),
-            &table(&["where", "what", "missing", "of"], &rows(by_recorder)),
-        );
+            table(&["where", "what", "missing", "of"], rows(by_recorder)),
+        ));
     }
     counted.extend(rows(losses::tape(flight)));
     if flight.lost.values().all(|count| *count == 0) {
-        section.before.push_str(&paragraph("The recorder counted no message as lost."));
+        section.before.push(paragraph("The recorder counted no message as lost."));
     }
     if flight.tapes.is_empty() {
-        section.before.push_str(&missing("the controller's tape: the flight cannot be replayed"));
+        section.before.push(missing("the controller's tape: the flight cannot be replayed"));
     }
     let processes = rows(losses::processes(flight));
     if flight.processes.is_empty() {
-        section.before.push_str(&missing("the health of the processes, with what they dropped"));
+        section.before.push(missing("the health of the processes, with what they dropped"));
     }
-    section.after.insert_str(0, &table(&["where", "what", "missing", "of"], &counted));
-    section.after.push_str(&table(&["process", "dropped or failed", "times", "of"], &processes));
+    section.after.insert(0, table(&["where", "what", "missing", "of"], counted));
+    section.after.push(table(&["process", "dropped or failed", "times", "of"], processes));
     section
 }
 
@@ -258,7 +256,7 @@ fn detectors(view: &View<'_>) -> Section {
     let flight = view.flight;
     let mut section = section("detectors", "Detectors", "");
     let Some(last) = flight.statuses.last() else {
-        section.before = missing("the controller's status, which tells the detector in use");
+        section.before.push(missing("the controller's status, which tells the detector in use"));
         return section;
     };
     let mut changes = Vec::new();
@@ -275,12 +273,12 @@ fn detectors(view: &View<'_>) -> Section {
         }
         before = now;
     }
-    section.before = paragraph(&format!(
+    section.before.push(paragraph(&format!(
         "{} changes; preferred at the end: {}.",
         view.summary.detector_changes.unwrap_or(0),
         if last.preference.is_empty() { "nothing" } else { &last.preference }
-    ));
-    section.after = table(&["at", "from", "to", "why"], &changes);
+    )));
+    section.after.push(table(&["at", "from", "to", "why"], changes));
     // Each detector by the last status that knows it.
     let mut known = BTreeMap::new();
     for candidate in flight.statuses.iter().flat_map(|status| &status.candidates) {
@@ -305,7 +303,7 @@ fn detectors(view: &View<'_>) -> Section {
             })
             .collect();
     let head = ["detector", "place", "markers", "rate", "latency", "agrees", "version"];
-    section.after.push_str(&table(&head, &rows));
+    section.after.push(table(&head, rows));
     section
 }
 
@@ -315,13 +313,14 @@ fn wind(view: &View<'_>) -> Section {
     let has_estimate = view.flight.targets.iter().any(|target| target.wind_ned_m_s.is_some());
     match (summary.wind_mean_m_s, summary.wind_max_m_s) {
         (Some(mean), Some(max)) => {
-            section.before =
-                paragraph(&format!("{mean:.1} m/s in the mean, {max:.1} m/s at most."));
+            section
+                .before
+                .push(paragraph(&format!("{mean:.1} m/s in the mean, {max:.1} m/s at most.")));
         }
-        _ => section.before = missing("the true wind, which only a simulation knows"),
+        _ => section.before.push(missing("the true wind, which only a simulation knows")),
     }
     if !has_estimate {
-        section.before.push_str(&missing("the controller's estimate of the wind from the tilt"));
+        section.before.push(missing("the controller's estimate of the wind from the tilt"));
     }
     if has_estimate || summary.wind_mean_m_s.is_some() {
         section.charts = plots::wind(view);
@@ -333,9 +332,9 @@ fn battery(view: &View<'_>) -> Section {
     let flight = view.flight;
     let mut section = section("battery", "Battery and link", "");
     if flight.packets.count == 0 {
-        section.before.push_str(&missing("the autopilot's packets"));
+        section.before.push(missing("the autopilot's packets"));
     } else {
-        section.before.push_str(&paragraph(&format!(
+        section.before.push(paragraph(&format!(
             "{} packets of the autopilot, {} bytes.",
             flight.packets.count, flight.packets.bytes
         )));
@@ -344,9 +343,7 @@ fn battery(view: &View<'_>) -> Section {
     let is_there = |chart: &Chart| !chart.is_empty();
     section.charts = charts.collect();
     if section.charts.first().is_none_or(|chart| !is_there(chart)) {
-        section
-            .before
-            .push_str(&missing("the charge of the battery: the autopilot did not report it"));
+        section.before.push(missing("the charge of the battery: the autopilot did not report it"));
     }
     let timeouts = || flight.statuses.iter().filter_map(|status| status.setpoint_timeout_s);
     let mut rows = vec![
@@ -365,7 +362,7 @@ fn battery(view: &View<'_>) -> Section {
             ]);
         }
     }
-    section.after = table(&[], &rows);
+    section.after.push(table(&[], rows));
     section
 }
 
@@ -373,7 +370,7 @@ fn log(view: &View<'_>) -> Section {
     let mut section = section("log", "Log", "");
     let (lines, left_out) = journal::of(view.flight);
     if lines.is_empty() {
-        section.before = missing("status, packets and health, of which the log is made");
+        section.before.push(missing("status, packets and health, of which the log is made"));
         return section;
     }
     let rows: Vec<Vec<Cell>> = lines
@@ -383,9 +380,9 @@ fn log(view: &View<'_>) -> Section {
             vec![number(Some(line.time_s), 2, "s"), text(line.who), said]
         })
         .collect();
-    section.after = table(&["at", "who", "said"], &rows);
+    section.after.push(table(&["at", "who", "said"], rows));
     if left_out > 0 {
-        section.after.push_str(&paragraph(&format!("{left_out} further lines are left out.")));
+        section.after.push(paragraph(&format!("{left_out} further lines are left out.")));
     }
     section
 }
@@ -402,7 +399,7 @@ fn thesis(view: &View<'_>) -> Section {
     } else {
         "Positions are true ones."
     };
-    section.before = paragraph(source);
+    section.before.push(paragraph(source));
     section
 }
 
@@ -410,15 +407,14 @@ fn configuration(view: &View<'_>) -> Section {
     let flight = view.flight;
     let mut section = section("configuration", "Configuration and parameters", "");
     if flight.configurations.is_empty() {
-        section.before.push_str(&missing("the configuration of the services"));
+        section.before.push(missing("the configuration of the services"));
     }
     for (service, toml) in &flight.configurations {
-        let body = format!("<pre>{}</pre>", escaped(toml));
-        section.after.push_str(&details(service, &body));
+        section.after.push(details(service, Block::Lines(toml.clone())));
     }
     let parameters = &flight.packets.parameters;
     if parameters.is_empty() {
-        section.before.push_str(&missing(
+        section.before.push(missing(
             "parameters of the autopilot: nobody asked for any (a ground station asks for all)",
         ));
     } else {
@@ -427,12 +423,12 @@ fn configuration(view: &View<'_>) -> Section {
             .map(|(name, value)| vec![text(name), Cell::Number(value.to_string())])
             .collect();
         let title = format!("{} parameters of the autopilot, as far as asked for", rows.len());
-        section.after.push_str(&details(&title, &table(&["parameter", "value"], &rows)));
+        section.after.push(details(&title, table(&["parameter", "value"], rows)));
     }
     for (camera, info) in &flight.cameras {
         let json = serde_json::to_string_pretty(info).unwrap_or_default();
-        let body = format!("<pre>{}</pre>", escaped(&json));
-        section.after.push_str(&details(&format!("calibration of the camera {camera}"), &body));
+        let title = format!("calibration of the camera {camera}");
+        section.after.push(details(&title, Block::Lines(json)));
     }
     section
 }
@@ -441,7 +437,7 @@ fn recording(view: &View<'_>) -> Section {
     let flight = view.flight;
     let mut section = section("recording", "The recording", "");
     for problem in &view.summary.problems {
-        section.before.push_str(&format!("<p class=\"warning\">{}</p>", escaped(problem)));
+        section.before.push(Block::Warning(problem.clone()));
     }
     let mut rows = vec![vec![text("file"), text(&flight.name)]];
     rows.push(vec![text("messages"), text(flight.messages.to_string())]);
@@ -461,6 +457,6 @@ fn recording(view: &View<'_>) -> Section {
         let said = format!("alight {} on {}{share}", health.version, health.host);
         rows.push(vec![text(name), text(said)]);
     }
-    section.after = table(&[], &rows);
+    section.after.push(table(&[], rows));
     section
 }

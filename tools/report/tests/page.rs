@@ -11,7 +11,7 @@ use experiments::landing::plan::{Plan, Planned, Values, Vision};
 use flightlog::{About, Entry, Received, TapeReader, Writer};
 use messages::{Health, encode};
 use report::frames::Fate;
-use report::{Flight, FlightReader, comparison, page, replay_tapes, summary};
+use report::{Flight, FlightReader, comparison, document, page, replay_tapes, summary};
 
 /// The sections that a page has.
 const SECTIONS: [&str; 14] = [
@@ -446,6 +446,42 @@ fn two_flights_stand_side_by_side_with_what_they_differ_in() {
     assert!(html.contains("simulator/main: wind.mean_m_s"), "wind");
     assert!(!html.contains("controller/main: metric.lateral_gain</td>"), "the same in both");
     assert!(html.contains("B less A"), "numbers");
+}
+
+/// The texts of a document, in the order in which they stand in the file.
+fn texts(document: &[u8]) -> Vec<String> {
+    let file: String = document.iter().map(|byte| char::from(*byte)).collect();
+    let shown = file.split(") Tj").filter_map(|before| before.rsplit_once('('));
+    shown.map(|(_, text)| text.to_owned()).collect()
+}
+
+#[test]
+fn a_document_has_every_section_and_chart_on_pages_of_a4() {
+    let flight = read(&landing().recording);
+    let file = document(&flight, None).unwrap();
+    assert!(file.starts_with(b"%PDF-") && file.len() < 4_000_000, "{} bytes", file.len());
+    let texts = texts(&file);
+    let has = |text: &str| texts.iter().any(|it| it == text);
+    for title in ["Flight report", "flight.mcap", "Phases and reasons", "Latency budget", "Log"] {
+        assert!(has(title), "no `{title}` in {texts:?}");
+    }
+    assert!(has("Height over the pad") && has("Velocity downwards") && has("estimate"));
+    assert!(texts.iter().any(|it| it.starts_with("landed")), "{texts:?}");
+    assert!(texts.iter().any(|it| it.contains("health of the processes")));
+    let pages = texts.iter().filter(|it| it.starts_with("flight.mcap, page ")).count();
+    assert!((4..20).contains(&pages), "{pages} pages");
+}
+
+#[test]
+fn a_document_of_two_flights_has_each_chart_twice_and_what_they_differ_in() {
+    let one = read(&landing().recording);
+    let other =
+        read(&flown(&planned(0.0, "none", &["controller.metric.max_descend_m_s=0.7"])).recording);
+    let texts = texts(&document(&one, Some(&other)).unwrap());
+    let has = |text: &str| texts.iter().any(|it| it == text);
+    assert!(has("A: Height over the pad") && has("B: Height over the pad"));
+    assert!(texts.iter().any(|it| it.contains("metric.max_descend_m_s")), "{texts:?}");
+    assert!(has("B less A") && has("In numbers"));
 }
 
 #[test]
