@@ -6,6 +6,7 @@
 //! cargo bench -p tests -- swaps [TIMES]       swap detectors so often in one flight (100)
 //! cargo bench -p tests -- freezes             freeze each process (SIGSTOP) for 0.5, 2, 5 and 30 s
 //! cargo bench -p tests -- recorder [TIMES]    kill the recorder so often in one flight at 30 frames a second (50)
+//! cargo bench -p tests -- recording [KEY=VALUE...] what the recorder costs at 15 and 30 frames a second
 //! cargo bench -p tests -- link [NAME...]      the trials on a bad radio link, or some of them
 //! cargo bench -p tests -- overlay [FRAMES]    read back so many drawn pictures of the page with their overlay (1000)
 //! cargo bench -p tests -- video [SECONDS] [link]  the page's pictures, from sent to drawn: at most a minute on this machine at 15
@@ -57,6 +58,11 @@ fn main() -> ExitCode {
                 let fast = ["--set", "simulator.camera.rate_hz=30"];
                 recorders::kills(times(50)?, &fast).await
             }
+            Some("recording") => {
+                let set: Vec<&str> = args[1..].iter().flat_map(|it| ["--set", it]).collect();
+                recorders::cost(15, &set).await?;
+                recorders::cost(30, &set).await
+            }
             Some("link") => table(&args[1..]).await,
             Some("overlay") => {
                 print("drawn with their overlay", film::overlay(times(1000)? as u64).await?);
@@ -73,12 +79,12 @@ fn main() -> ExitCode {
             }
             Some(other) => {
                 bail!(
-                    "`{other}` is not measured: kills, swaps, freezes, recorder, link, overlay, video and crowd are"
+                    "`{other}` is not measured: kills, swaps, freezes, recorder, recording, link, overlay, video and crowd are"
                 )
             }
             None => {
                 println!(
-                    "Nothing is measured: say kills, swaps, freezes, recorder, link, overlay, video or crowd"
+                    "Nothing is measured: say kills, swaps, freezes, recorder, recording, link, overlay, video or crowd"
                 );
                 Ok(())
             }

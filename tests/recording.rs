@@ -8,6 +8,8 @@
 #[path = "recording/disks.rs"]
 mod disks;
 mod flight;
+#[path = "recording/played.rs"]
+mod played;
 #[path = "recording/recorders.rs"]
 mod recorders;
 
@@ -166,6 +168,12 @@ async fn a_recorder_that_is_killed_leaves_a_file_and_the_landing_goes_on() -> an
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn what_an_overloaded_recorder_loses_is_in_its_file_to_the_frame() -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(recorders::overload).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_disk_that_is_full_read_only_or_removed_is_told_and_the_landing_goes_on()
 -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
@@ -177,4 +185,10 @@ async fn what_waits_for_a_disk_that_stands_still_is_bounded_and_what_fails_is_to
 -> anyhow::Result<()> {
     let _alone = ONE_AT_A_TIME.lock().await;
     with_second_try(disks::beside_a_flight).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_is_published_again_to_services_that_run() -> anyhow::Result<()> {
+    let _alone = ONE_AT_A_TIME.lock().await;
+    with_second_try(played::to_services).await
 }

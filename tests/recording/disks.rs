@@ -12,7 +12,7 @@ use rustix::process::Pid;
 use testing::skip;
 use tokio::time::{Instant, sleep, timeout};
 
-use crate::flight::{LONG, Landing, PATIENCE};
+use crate::flight::{ALIGHT, LONG, Landing, PATIENCE, output_of};
 use crate::recorders::{Contents, command};
 
 /// Longest time until a disk that fails is told.
@@ -39,11 +39,15 @@ impl<'a> Disk<'a> {
     }
 
     fn change(&self, options: &str) -> anyhow::Result<()> {
-        let options = format!("remount,{options}");
-        let status = Command::new("mount").args(["-o", &options]).arg(self.0).status()?;
-        ensure!(status.success(), "{options}: {status}");
-        Ok(())
+        change(self.0, options)
     }
+}
+
+fn change(path: &Path, options: &str) -> anyhow::Result<()> {
+    let options = format!("remount,{options}");
+    let status = Command::new("mount").args(["-o", &options]).arg(path).status()?;
+    ensure!(status.success(), "{options}: {status}");
+    Ok(())
 }
 
 /// A file as a disk, which can be made to stand still.
@@ -65,6 +69,18 @@ impl<'a> Freezing<'a> {
         let is_there = run(Command::new("mkfs.ext4").arg("-q").arg(&image))
             && run(Command::new("mount").args(["-o", "loop"]).arg(&image).arg(path));
         Ok(is_there.then_some(Self(path)))
+    }
+
+    fn change(&self, options: &str) -> anyhow::Result<()> {
+        change(self.0, options)
+    }
+
+    /// Takes it away, though files on it are open.
+    fn unmount(self) -> anyhow::Result<()> {
+        let status = Command::new("umount").arg("-l").arg(self.0).status()?;
+        ensure!(status.success(), "umount -l: {status}");
+        std::mem::forget(self);
+        Ok(())
     }
 
     /// Lets it stand still for as long as the result lives. Who writes to it cannot be ended meanwhile.
@@ -158,8 +174,9 @@ async fn told(
     found.with_context(|| format!("waiting until {what}; last: {last:?}"))
 }
 
-/// A landing is recorded twice: as usual, and with every pixel at 30 frames a second to a disk that stands still, is full, and
-/// from which the file is removed.
+/// A landing is recorded twice: as usual, and with every pixel at 30 frames a second to a disk that is read-only, stands still, is
+/// full, from which the file is removed, and that is taken away. Flown again without any recorder, the same decisions are
+/// made on the same events, to the bit.
 pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("disk");
@@ -171,11 +188,14 @@ pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
     let statuses = landing.node.subscriber(topic::RECORDER_STATUS, &["failing"]).await?;
     let healths = landing.node.subscriber(topic::HEALTH, &["controller", "main"]).await?;
     let file = format!("file={:?}", path.join("flights/failing.mcap"));
+    disk.change("ro")?;
     let pid = landing
         .start_by_hand("recorder", &["id=failing", &file, "frames=raw", "max_waiting_mb=16"])?;
     landing.descends_below(9.0).await?;
     command(&landing, ControllerCommand::Hold).await?;
     landing.status("it holds", |s| s.phase == Phase::Hold).await?;
+    told(&statuses, "the disk is read-only", |s| has_problem(s, "Read-only")).await?;
+    disk.change("rw")?;
     let is_well = |s: &RecorderStatus| s.problem.is_none() && s.bytes > 0;
     told(&statuses, "it records", is_well).await?;
 
@@ -204,21 +224,33 @@ pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
     std::fs::remove_dir_all(path.join("flights"))?;
     told(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
     let removed = began.elapsed();
+    told(&statuses, "it records again", is_well).await?;
+
+    let began = Instant::now();
+    disk.unmount()?;
+    told(&statuses, "the disk is taken away", |s| has_problem(s, "removed")).await?;
+    let taken_away = began.elapsed();
+    told(&statuses, "it records again", is_well).await?;
 
     let controller = latest(&healths).await?;
     command(&landing, ControllerCommand::Resume).await?;
     landing.lands().await?;
     let lost: u64 = after.dropped.iter().map(|loss| loss.count).sum();
     println!(
-        "told after {still:.1?} (stands still), {full:.1?} (full), {removed:.1?} (removed); held {:.0} MB more than {before_mb:.0} MB; {lost} messages lost in {STALL:?}; drops of the controller: {:?}",
+        "told after {still:.1?} (stands still), {full:.1?} (full), {removed:.1?} (removed), {taken_away:.1?} (unmounted); held {:.0} MB more than {before_mb:.0} MB; {lost} messages lost in {STALL:?}; drops of the controller: {:?}",
         max_mb - before_mb,
         controller.drops,
     );
-    for told in [still, full, removed] {
+    for told in [still, full, removed, taken_away] {
         ensure!(told < MAX_UNTOLD, "it was told after {told:?}");
     }
     ensure!(lost > 0, "nothing was lost, so that the bound was not reached");
     ensure!(max_mb - before_mb < MAX_HELD_MB, "{max_mb} MB after {before_mb} MB");
+    let mut again = Command::new(ALIGHT);
+    let output = output_of(again.arg("replay").arg(&good).arg("--verify"))?;
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    println!("{said}");
+    ensure!(output.status.success() && said.contains("verified"), "{said}");
     Ok(())
 }
 

@@ -3,21 +3,26 @@
 #![allow(dead_code, reason = "the test and the measurement use their parts")]
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use anyhow::{Context, bail, ensure};
+use flightlog::Entry;
 use flightlog::writer::DROPPED_CHANNEL;
 use mcap::read::{LinearReader, Options};
 use mcap::records::Record;
-use messages::{ControllerCommand, Phase, topic};
+use messages::{ControllerCommand, Health, Phase, decode, topic};
 use rustix::process::{Signal, kill_process};
+use testing::{python, python_passes};
 use tokio::time::{Instant, sleep};
 
 use crate::flight::{LONG, Landing, PATIENCE};
 
 /// Most that a killed recorder may lose, in seconds.
 const MAX_LOSS_S: f64 = 1.0;
+
+/// Most frames by which those that an overloaded recorder kept and told as lost may differ from those that were published.
+const MAX_UNTOLD_FRAMES: u64 = 5;
 
 /// What is in a recording.
 #[derive(Debug, Default)]
@@ -73,8 +78,8 @@ impl Contents {
     }
 }
 
-/// Holds over the pad while the recorder is killed again and again at random moments, and lands. Every file is read, and
-/// ends at most [`MAX_LOSS_S`] before its recorder did.
+/// Holds over the pad while the recorder is killed again and again at random moments, and lands. Every file is read, by Python's
+/// reader as well, and ends at most [`MAX_LOSS_S`] before its recorder did.
 pub(crate) async fn kills(times: usize, more: &[&str]) -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let first = folder.path().join("flight.mcap");
@@ -89,6 +94,7 @@ pub(crate) async fn kills(times: usize, more: &[&str]) -> anyhow::Result<()> {
     landing.status("it holds", |s| s.phase == Phase::Hold).await?;
     let mut pid = landing.service("recorder")?.pid;
     let mut losses_s = Vec::new();
+    let mut left = Vec::new();
     let mut random = 1_u64;
     for number in 1..=times {
         has_grown(&file(number)).await?;
@@ -110,16 +116,117 @@ pub(crate) async fn kills(times: usize, more: &[&str]) -> anyhow::Result<()> {
         let again = flightlog::repair(&mended, std::io::sink())?;
         ensure!(again.damage.is_empty() && again.messages == found.messages, "{again:?}");
         losses_s.push(loss_s);
+        left.push((file(number), contents));
     }
+    let others = read_by_python(&left)?;
     command(&landing, ControllerCommand::Resume).await?;
     losses_s.sort_by(f64::total_cmp);
     let at = |index: usize| losses_s.get(index).copied().unwrap_or_default();
     println!(
-        "{times} recorders killed, every file read and repaired; lost {:.2} s in the median, {:.2} s at most",
+        "{times} recorders killed, every file read and repaired, {others} of them read the same by Python; lost {:.2} s in the median, {:.2} s at most",
         at(times / 2),
         at(times.saturating_sub(1)),
     );
     println!("{}", landing.lands().await?["processes"]);
+    Ok(())
+}
+
+/// How many files Python's reader reads as we do: all, or none where there is no Python.
+fn read_by_python(files: &[(PathBuf, Contents)]) -> anyhow::Result<usize> {
+    let names: Vec<&str> = files.iter().filter_map(|(path, _)| path.to_str()).collect();
+    let Some(reader) = python("tests/recording/killed.py", &names) else { return Ok(0) };
+    let output = tokio::task::block_in_place(|| reader.wait_with_output())?;
+    if !python_passes(&output)? {
+        return Ok(0);
+    }
+    let text = String::from_utf8_lossy(&output.stdout);
+    for ((path, contents), line) in files.iter().zip(text.lines()) {
+        let read: serde_json::Value = serde_json::from_str(line)?;
+        let is_same = read["messages"] == contents.messages && read["last_ns"] == contents.last_ns;
+        ensure!(is_same, "{path:?}: Python reads {read}, we {contents:?}");
+    }
+    ensure!(text.lines().count() == files.len(), "{} of {}", text.lines().count(), files.len());
+    Ok(files.len())
+}
+
+/// What a recorder costs in a landing at a rate of frames, as its own health says.
+pub(crate) async fn cost(rate_hz: u32, more: &[&str]) -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let file = folder.path().join("flight.mcap");
+    let rate = format!("simulator.camera.rate_hz={rate_hz}");
+    let args = ["--seed", "5", "--set", &rate, "--record", file.to_str().context("a path")?];
+    let slowly = ["--set", "controller.metric.max_descend_m_s=0.5"];
+    Landing::start(&[&args[..], &slowly, more].concat()).await?.lands().await?;
+    let contents = Contents::read(&file)?;
+    let mut healths: Vec<Health> = Vec::new();
+    let (mut stamps_ns, mut picture_bytes, mut pictures) = (Vec::new(), 0, 0);
+    flightlog::read(&std::fs::read(&file)?, |entry| match entry {
+        Entry::Message(it) if it.key == "health/recorder/main" => {
+            healths.extend(decode::<Health>(it.payload).ok());
+        }
+        Entry::Picture { header, bytes, .. } => {
+            stamps_ns.push(header.stamp_ns);
+            picture_bytes += bytes.len();
+            pictures += 1;
+        }
+        _ => {}
+    })?;
+    let [first, .., last] = healths.as_slice() else { bail!("{} health reports", healths.len()) };
+    let share = 100.0 * (last.cpu_s - first.cpu_s) / (last.uptime_s - first.uptime_s);
+    let [first_ns, .., last_ns] = stamps_ns.as_slice() else { bail!("{pictures} pictures") };
+    let seen_hz = f64::from(pictures - 1) / ((last_ns - first_ns) as f64 * 1e-9);
+    println!(
+        "{rate_hz} frames a second: {seen_hz:.1} pictures a second of {:.0} kB kept, {share:.1} % of a core over {:.0} s; lost: {:?}",
+        picture_bytes as f64 / f64::from(pictures) * 1e-3,
+        last.uptime_s - first.uptime_s,
+        contents.dropped
+    );
+    ensure!(contents.dropped.is_empty(), "{:?}", contents.dropped);
+    Ok(())
+}
+
+/// A recorder has no room for what it is to keep: what it loses stands in its file, to the frame.
+pub(crate) async fn overload() -> anyhow::Result<()> {
+    let folder = tempfile::tempdir()?;
+    let file = folder.path().join("flight.mcap");
+    let rate = "simulator.camera.rate_hz=30";
+    let little = ["recorder.frames=raw", "recorder.max_waiting_mb=2"];
+    let args = ["--seed", "5", "--set", rate, "--set", little[0], "--set", little[1]];
+    let record = ["--record", file.to_str().context("a path")?];
+    let landing = Landing::start(&[&args[..], &record].concat()).await?;
+    let statuses = landing.node.subscriber(topic::RECORDER_STATUS, &["main"]).await?;
+    landing.lands().await?;
+    let mut last = None;
+    while let Some(status) = statuses.waiting() {
+        last = Some(status);
+    }
+    let contents = Contents::read(&file)?;
+    let (mut stamps_ns, mut healths) = (Vec::new(), Vec::new());
+    flightlog::read(&std::fs::read(&file)?, |entry| match entry {
+        Entry::Picture { header, .. } => stamps_ns.push(header.stamp_ns),
+        Entry::Message(it) if it.key == "health/simulator/main" => {
+            healths.extend(decode::<Health>(it.payload).ok());
+        }
+        _ => {}
+    })?;
+    let published = |health: &Health| {
+        let of_frames = health.rates.iter().filter(|rate| rate.name == "frames");
+        of_frames.map(|rate| rate.count).sum::<u64>()
+    };
+    let [began, .., ended] = healths.as_slice() else { bail!("{} healths", healths.len()) };
+    let between = published(ended) - published(began);
+    let is_between = |stamp_ns: &&i64| (began.stamp_ns..ended.stamp_ns).contains(*stamp_ns);
+    let kept = stamps_ns.iter().filter(is_between).count() as u64;
+    let lost = contents.dropped.get("camera/down/frame").copied().unwrap_or(0);
+    println!("of {between} frames that were published {kept} are kept and {lost} told as lost");
+    ensure!(lost > 0, "nothing was lost, so nothing was tried: {contents:?}");
+    // Those under way at the two reports, and before and after them.
+    let untold = between.abs_diff(kept + lost);
+    ensure!(untold <= MAX_UNTOLD_FRAMES, "of {between} frames {kept} are kept, {lost} told");
+    let last = last.context("a status of the recorder")?;
+    let told =
+        last.dropped.iter().find(|it| it.key == "camera/down/frame").map_or(0, |it| it.count);
+    ensure!(told <= lost, "the status told {told}, the file tells {lost}");
     Ok(())
 }
 
