@@ -27,6 +27,10 @@ use found::{Finder, FoundImages, find_boards};
 use guidance::Guidance;
 use live::watch_camera;
 
+/// How often images are looked at again with the lens that was found before. Behind a fisheye of 120 degrees the first time leaves
+/// errors of 0.8 px at the border, the second 0.4, the third 0.3.
+const LOOKS: usize = 3;
+
 /// The arguments of `alight calibrate`.
 #[derive(Args)]
 pub(crate) struct CalibrateArgs {
@@ -81,9 +85,11 @@ fn board(args: &BoardArgs) -> anyhow::Result<ExitCode> {
         sensor.check([view.size.width, view.size.height])?;
     }
     let (lens, options) = (args.lens.model(), args.options());
-    let first = calibrate_unjudged(&found.views, lens, &options).ok();
-    if let Some(first) = &first {
-        found.look_again(&mut finder, &first.camera);
+    let mut first = calibrate_unjudged(&found.views, lens, &options).ok();
+    for _ in 0..LOOKS {
+        let Some(camera) = first.as_ref().map(|first| first.camera) else { break };
+        found.look_again(&mut finder, &camera);
+        first = calibrate_unjudged(&found.views, lens, &options).ok().or(first);
     }
     let guidance = Guidance::new(&found, first.as_ref());
     match calibrate(&found.views, lens, &options) {
@@ -145,3 +151,6 @@ fn refuse(
     .context("writing the result")?;
     Ok(ExitCode::FAILURE)
 }
+
+#[cfg(test)]
+mod rendered;

@@ -1,0 +1,129 @@
+//! Boards in rendered images, by lenses whose truth is known, beside OpenCV from the same corners.
+
+use calibration::{Calibration, Lens, Options, Refusal, calibrate};
+use geometry::{Body, CameraModel, Ned, Pixel, Point, Rotation, Transform};
+use imaging::GrayImage;
+use markers::Board;
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rendering::{CameraSettings, PadInScene, Renderer, Scene, Surface};
+
+use super::LOOKS;
+use super::found::{Finder, FoundImages, Origin, Picture};
+
+#[path = "../../../crates/calibration/tests/opencv/mod.rs"]
+mod opencv;
+
+#[path = "../../../crates/calibration/tests/synthetic/mod.rs"]
+mod synthetic;
+
+use synthetic::{Truth, lenses, map_error_px, turned_map_error_px};
+
+const VIEWS: usize = 60;
+
+/// What was found, and the calibration.
+type Judged = (FoundImages, Result<Calibration, Refusal>);
+
+/// The camera before a board on the ground, whose middle it sees anywhere in its image: near and far, tilted to all sides.
+fn pose(camera: &CameraModel, random: &mut ChaCha8Rng) -> Option<Transform<Ned, Body>> {
+    let mut between = |from: f64, to: f64| random.random_range(from..to);
+    let (tilt, side, turn) = (between(0.1, 0.8), between(0.0, 6.3), between(-0.6, 0.6));
+    let distance_m = camera.fx / 1105.0 * between(0.25, 0.55);
+    let seen = Pixel::new(between(0.1, 0.9) * 1280.0, between(0.1, 0.9) * 960.0);
+    let eye = Vector3::new(
+        distance_m * tilt.sin() * side.cos(),
+        distance_m * tilt.sin() * side.sin(),
+        -distance_m * tilt.cos(),
+    );
+    let forward = -eye.normalize();
+    let right = (-Vector3::x()).cross(&forward).normalize();
+    let axes = Matrix3::from_columns(&[right, forward.cross(&right), forward]);
+    let look = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+    let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn);
+    let ray = camera.unproject(seen)?;
+    let aside = UnitQuaternion::rotation_between(&ray.coords, &Vector3::z())?;
+    let rotation = Rotation::from_quaternion(look * roll * aside);
+    Some(Transform::new(rotation, Point::new(eye.x, eye.y, eye.z)))
+}
+
+fn found(board: &Board, lens: Lens, camera: &CameraModel, seed: u64) -> Judged {
+    let scene = Scene {
+        surface: Surface::Plain,
+        pads: vec![PadInScene::printed(board.drawing(), 0.0, 0.0, 0.0)],
+        painted_marks: 0,
+        light: 1.0,
+    };
+    let size = [camera.width as usize, camera.height as usize];
+    let settings = CameraSettings {
+        model: *camera,
+        body_from_camera: Transform::identity(),
+        ..CameraSettings::thesis().exposed_for(1.0, 200.0, 0.002)
+    };
+    let mut renderer = Renderer::new(&scene, settings, seed).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut finder = Finder::new(board).unwrap();
+    let mut found = FoundImages::default();
+    for i in 0..VIEWS {
+        let mut image = GrayImage::filled(size[0], size[1], 0);
+        let pose = pose(camera, &mut random).unwrap();
+        renderer.render(&[pose], i as u64, image.pixels_mut()).unwrap();
+        let name = i.to_string();
+        found.add(&mut finder, Picture { name, image, origin: Origin::File });
+    }
+    let options = Options::default();
+    for _ in 0..LOOKS {
+        let first = calibration::calibrate_unjudged(&found.views, lens, &options).unwrap();
+        found.look_again(&mut finder, &first.camera);
+    }
+    let result = calibrate(&found.views, lens, &options);
+    (found, result)
+}
+
+/// Errors of a camera: of its focal length in %, its principal point in pixels, and of where it shows what, in pixels, over 95 %
+/// of the image, as it is and after the best rotation.
+fn errors(truth: &CameraModel, camera: &CameraModel) -> [f64; 4] {
+    let focal = (camera.fx / truth.fx - 1.0).abs().max((camera.fy / truth.fy - 1.0).abs());
+    let principal = (camera.cx - truth.cx).hypot(camera.cy - truth.cy);
+    [100.0 * focal, principal, map_error_px(truth, camera), turned_map_error_px(truth, camera)]
+}
+
+#[test]
+#[ignore = "a measurement of some minutes"]
+fn how_exact_cameras_from_rendered_boards_are() {
+    let number = |name: &str, usual: u64| {
+        std::env::var(name).ok().and_then(|text| text.parse().ok()).unwrap_or(usual)
+    };
+    let (sets, first) = (number("ALIGHT_SETS", 3), number("ALIGHT_SEED", 900));
+    let shown = lenses().into_iter().filter(|truth| truth.lens != Lens::BrownConrady8);
+    for Truth { name, lens, camera: truth } in shown {
+        for seed in first..first + sets {
+            let (found, result) = found(&Board::A4, lens, &truth, seed);
+            let result = match result {
+                Ok(result) => result,
+                Err(refusal) => {
+                    println!("{name}, seed {seed}: refused, as {refusal}");
+                    continue;
+                }
+            };
+            let told = |[focal, principal, map, turned]: [f64; 4]| {
+                format!(
+                    "focal length {focal:.4} %, principal point {principal:.3} px, map {map:.3} px, turned {turned:.3} px"
+                )
+            };
+            let ours = errors(&truth, &result.camera);
+            let theirs = match opencv::solve(&found.views, lens) {
+                Some(Ok(theirs)) => told(errors(&truth, &theirs.camera)),
+                Some(Err(problem)) => problem,
+                None => "not installed".to_owned(),
+            };
+            println!(
+                "{name}, seed {seed}, {} images: {}, told {:.3} px; OpenCV: {theirs}",
+                found.views.len(),
+                told(ours),
+                result.worst_uncertainty_px()
+            );
+            assert!(ours[0] < 0.02 && ours[1] < 0.1, "{name} {seed}: {ours:?}");
+        }
+    }
+}
