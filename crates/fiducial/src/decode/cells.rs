@@ -4,9 +4,6 @@
 //! together: a pixel is the sum of the cells' values, weighted by their shares of it through the blur. Border
 //! and quiet zone are one unknown each, every bit is one more. The least-squares solution gives the bits; the
 //! same sums tell how well any codeword explains the pixels.
-//!
-//! Shares add up in light. A camera's tone curve makes what is half black look nearly white, so that a lone black cell no wider
-//! than a pixel or two is lost: there the curve is undone first.
 
 use geometry::Pixel;
 use imaging::pyramid::from_level_0;
@@ -147,28 +144,11 @@ pub(crate) struct Explanation {
 }
 
 /// A square on the level of the pyramid on which it is read.
-#[derive(Copy, Clone)]
 pub(crate) struct SquareImage<'a> {
     view: GrayView<'a>,
     /// From the square's cells, whose corners are (0, 0) to (n, n), to pixels of the level, and back.
     homography: Homography,
     inverse: Inverse,
-    /// The camera's tone curve, `(1 + c) w / (1 + c w)` of a whiteness; 0 is none.
-    curve: f64,
-}
-
-/// From grey levels of a tone curve back to levels in proportion to light.
-struct Linearised {
-    black: f64,
-    contrast: f64,
-    curve: f64,
-}
-
-impl Linearised {
-    fn level(&self, grey: f64) -> f64 {
-        let shown = (grey - self.black) / self.contrast;
-        self.black + self.contrast * shown / (1.0 + self.curve * (1.0 - shown))
-    }
 }
 
 impl<'a> SquareImage<'a> {
@@ -185,12 +165,7 @@ impl<'a> SquareImage<'a> {
         let corners = corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
         let homography = Homography::from_square([0.0, cells as f64], &corners)?;
         let view = pyramid.level(view, level)?;
-        Some(Self { view, homography, inverse: homography.inverse(), curve: 0.0 })
-    }
-
-    /// The same of a camera with this tone curve.
-    pub(crate) fn with_curve(&self, curve: f64) -> Self {
-        Self { curve, ..*self }
+        Some(Self { view, homography, inverse: homography.inverse() })
     }
 
     /// About how wide a cell is in the middle of a square of `cells` cells, in pixels of the level.
@@ -314,23 +289,6 @@ impl Cells {
         let middle = image.homography.project([n / 2.0; 2]).image;
         let per_pixel = image.inverse.units_per_pixel(middle);
         let blur = per_pixel.map(|cells| (cells * BLUR_PX).clamp(1e-3, 1.0));
-        let place = |x: usize, y: usize| {
-            let [u, v] = image.inverse.plane([x as f64, y as f64]);
-            (u > -reach && v > -reach && u < n + reach && v < n + reach)
-                .then_some([u + margin, v + margin])
-        };
-        let linearised = (image.curve != 0.0).then(|| {
-            let (mut black, mut white) = (u8::MAX, 0);
-            for y in top..=bottom {
-                for (x, grey) in image.view.row(y).iter().enumerate().take(right + 1).skip(left) {
-                    if place(x, y).is_some() {
-                        (black, white) = (black.min(*grey), white.max(*grey));
-                    }
-                }
-            }
-            let [black, white] = [black, white].map(f64::from);
-            Linearised { black, contrast: (white - black).max(1.0), curve: image.curve }
-        });
         for y in top..=bottom {
             let row = image.view.row(y);
             // Half of them in a checkerboard pattern.
@@ -339,10 +297,9 @@ impl Cells {
                 Pixels::Half => (left + (left + y) % 2, 2),
             };
             for (x, grey) in row.iter().enumerate().take(right + 1).skip(first).step_by(step) {
-                if let Some(place) = place(x, y) {
-                    let grey = f64::from(*grey);
-                    let level = linearised.as_ref().map_or(grey, |it| it.level(grey));
-                    self.add(layout, place, blur, level);
+                let [u, v] = image.inverse.plane([x as f64, y as f64]);
+                if u > -reach && v > -reach && u < n + reach && v < n + reach {
+                    self.add(layout, [u + margin, v + margin], blur, f64::from(*grey));
                 }
             }
         }

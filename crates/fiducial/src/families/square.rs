@@ -21,7 +21,6 @@ use crate::observation::Observation;
 use crate::refine::corners::refine;
 use crate::refine::fit::{CornerGuess, Refined, Scratch};
 use crate::refine::pattern::Pattern;
-use crate::response::ResponseEstimate;
 use crate::schedule::FallbackStep;
 use crate::trace::{Reason, Trace};
 
@@ -31,11 +30,6 @@ const MAX_FOUND: usize = 256;
 
 /// Cells up to this width, in pixels, are read by their quiet zone: blur may break their border.
 const MAX_QUIET_ZONE_CELL_PX: f64 = 2.0;
-
-/// Up to this width of a cell, in pixels, a tone curve hides lone black cells. Curves that are undone where the camera's is not
-/// known: about sRGB's and that of a camera module of the Raspberry Pi.
-const MAX_TONED_CELL_PX: f64 = 2.5;
-const CURVES: [f64; 2] = [1.0, 3.0];
 
 /// Smallest R² of a marker; textures with a codeword reach less. In 565 images without markers, the highest
 /// R² was 0.75, but for one with an ambiguous bit.
@@ -203,8 +197,6 @@ impl SquareTagDetector {
             return None;
         }
         let image = SquareImage::new(&quad.corners, layout.cells, input.view, input.pyramid)?;
-        let cell_px = mean_side_px(&quad.corners) / layout.cells as f64;
-        let image = image.with_curve(known_curve(input.response, cell_px));
         if !self.cells.solve_fast(&image, layout) {
             return None;
         }
@@ -232,12 +224,9 @@ impl SquareTagDetector {
         out: &mut Output<'_>,
     ) {
         let first = self.found.len();
-        // Without a tone curve first: with one, a quad that is a little off is read as well.
-        for curve in [0.0].into_iter().chain(CURVES) {
-            for quiet_zone in quiet_zones {
-                for layout in 0..self.layouts.len() {
-                    self.decode_in_quiet_zone(input, quiet_zone, layout, curve, out.trace);
-                }
+        for quiet_zone in quiet_zones {
+            for layout in 0..self.layouts.len() {
+                self.decode_in_quiet_zone(input, quiet_zone, layout, out.trace);
             }
         }
         self.observe_all(input, first, out.found);
@@ -248,7 +237,6 @@ impl SquareTagDetector {
         input: ImageInput<'_>,
         quiet_zone: &Quad,
         layout: usize,
-        curve: f64,
         trace: &mut Trace,
     ) {
         let Layout { cells, extra_border, reversed, .. } = self.layouts[layout];
@@ -265,7 +253,7 @@ impl SquareTagDetector {
         let Some(image) = SquareImage::new(&quad.corners, cells, input.view, input.pyramid) else {
             return;
         };
-        if self.cells.solve(&image.with_curve(curve), &self.layouts[layout])
+        if self.cells.solve(&image, &self.layouts[layout])
             && let Ok(found) = self.match_codewords(&quad, layout)
         {
             trace.accept_quad(quad.corners);
@@ -311,8 +299,6 @@ impl SquareTagDetector {
                 let Layout { cells, extra_border, .. } = self.layouts[layout];
                 let image = SquareImage::new(&quad.corners, cells, input.view, input.pyramid);
                 let Some(image) = image else { continue };
-                let cell_px = mean_side_px(&quad.corners) / cells as f64;
-                let image = image.with_curve(known_curve(input.response, cell_px));
                 if extra_border > 0 && !image.has_second_ring(cells) {
                     continue;
                 }
@@ -518,12 +504,6 @@ impl FamilyDetector for SquareTagDetector {
             _ => {}
         }
     }
-}
-
-/// The tone curve of a camera whose response is known, where it hides cells of this width.
-fn known_curve(response: Option<ResponseEstimate>, cell_px: f64) -> f64 {
-    let is_hidden = cell_px <= MAX_TONED_CELL_PX;
-    response.filter(|_| is_hidden).map_or(0.0, |known| known.curve.value.max(0.0))
 }
 
 fn is_covered(found: &[Decoded], quad: &Quad) -> bool {
