@@ -61,10 +61,10 @@ impl Restamp {
             self.stamped(message, |now, it: &mut ControllerStatus| {
                 // All three by the age of the status: the landing may have begun long before.
                 let shift_ns = now.stamp_ns(it.stamp_ns).saturating_sub(it.stamp_ns);
-                let moved = |ns: i64| ns.saturating_add(shift_ns);
-                it.stamp_ns = moved(it.stamp_ns);
-                it.started_ns = it.started_ns.map(moved);
-                it.disarmed_ns = it.disarmed_ns.map(moved);
+                it.stamp_ns = it.stamp_ns.saturating_add(shift_ns);
+                for time_ns in [&mut it.started_ns, &mut it.disarmed_ns].into_iter().flatten() {
+                    *time_ns = time_ns.saturating_add(shift_ns);
+                }
             })
         } else if is(topic::TRUTH.key(&[])) {
             self.stamped(message, |now, it: &mut Truth| {
