@@ -99,7 +99,7 @@ pub fn check(folder: &Path) -> anyhow::Result<()> {
 }
 
 /// Any marker of a family, without a size.
-fn any_of(family: Family) -> Marker {
+pub fn any_of(family: Family) -> Marker {
     Marker { family, id: None, size_m: None }
 }
 
@@ -119,6 +119,54 @@ pub fn run(folder: &Path, family: Family) -> anyhow::Result<Vec<Record>> {
         }
     }
     Ok(records)
+}
+
+/// A photograph, and its labels of one family.
+#[derive(Debug)]
+pub struct LabelledImage {
+    /// The photograph.
+    pub image: GrayImage,
+    labels: Vec<Label>,
+}
+
+impl LabelledImage {
+    /// Number of labelled markers.
+    pub fn shown(&self) -> usize {
+        self.labels.len()
+    }
+
+    /// Number of labelled markers among detections.
+    pub fn found(&self, found: &[Found]) -> usize {
+        let is_found = |label: &&Label| {
+            found.iter().any(|seen| label.is_at(seen) && seen.id == Some(label.id))
+        };
+        self.labels.iter().filter(is_found).count()
+    }
+}
+
+/// The photographs with labels of a family.
+///
+/// # Errors
+/// When a photograph or the labels cannot be read.
+pub fn labelled(
+    folder: &Path,
+    family: Family,
+) -> anyhow::Result<impl Iterator<Item = anyhow::Result<LabelledImage>>> {
+    let label = label_of(family.name());
+    Ok(photographs(folder)?.into_iter().filter_map(move |photograph| {
+        let mut labels = photograph.markers;
+        labels.retain(|marker| Some(marker.family.as_str()) == label);
+        (!labels.is_empty()).then(|| {
+            Ok(LabelledImage { image: record::read(&folder.join(&photograph.image))?, labels })
+        })
+    }))
+}
+
+/// The families with labels.
+pub fn labelled_families() -> impl Iterator<Item = Family> {
+    FAMILIES
+        .iter()
+        .filter_map(|(_, name)| Family::ALL.into_iter().find(|family| family.name() == *name))
 }
 
 fn label_of(family: &str) -> Option<&'static str> {
