@@ -16,6 +16,8 @@ use rendering::{CameraSettings, PadInScene, RenderError, Renderer, Scene, Surfac
 
 use rendering::occluder::Occluder;
 
+use crate::print::Print;
+
 /// A frame to render.
 #[derive(Clone, Debug)]
 pub struct FrameSpec {
@@ -41,6 +43,8 @@ pub struct FrameSpec {
     pub light: f64,
     /// What is between scene and camera.
     pub occluder: Occluder,
+    /// How the marker is printed.
+    pub print: Print,
     /// Whether grey is interpolated from a Bayer mosaic.
     pub bayer: bool,
     /// The frame is binned by software: each of its pixels is the mean of so many of a sensor with a Bayer mosaic, across and down;
@@ -90,6 +94,7 @@ impl FrameSpec {
             painted_marks: 20,
             light: 1.0,
             occluder: Occluder::None,
+            print: Print::Sharp,
             bayer: false,
             binned: 1,
             seed,
@@ -228,7 +233,7 @@ impl FrameRenderer {
             (pad.ned_from_marker, spec.settings.body_from_camera);
         let mut pads = spec.clutter.clone();
         if spec.marker.is_some() {
-            pads.push(pad);
+            pads.extend(spec.print.pieces(pad));
         }
         let scene = Scene {
             surface: spec.surface,

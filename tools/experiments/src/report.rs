@@ -275,6 +275,7 @@ fn append_groups(text: &mut String, runs: &[Run]) {
     let with_groups = [
         Set::Adverse,
         Set::Shade,
+        Set::Ground,
         Set::Cut,
         Set::Landing,
         Set::Tilt,

@@ -30,6 +30,9 @@ pub enum Set {
     Rolling,
     /// Edges of hard shadows with contrasts from 2 to 10, dappled shade, leaves.
     Shade,
+    /// Covered by grass, dirt, snow, a rope, a hand; wet, faded, of few dots, bent, behind glass, on cloth; by low sun, by
+    /// night, through a dirty lens: 40 frames each.
+    Ground,
     /// Cut off by the frame at 0.5 to 1.5 m, tilted as by wind: 200 frames.
     Cut,
     /// Textured grounds, for timing.
@@ -44,7 +47,7 @@ pub enum Set {
 
 impl Set {
     /// Every set, in the order in which they are rendered.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::Textured,
         Self::Adverse,
         Self::Landing,
@@ -55,6 +58,7 @@ impl Set {
         Self::Light,
         Self::Rolling,
         Self::Shade,
+        Self::Ground,
         Self::Cut,
         Self::Tracking,
         Self::Negatives,
@@ -75,6 +79,7 @@ impl Set {
             Self::Light => "light",
             Self::Rolling => "rolling",
             Self::Shade => "shade",
+            Self::Ground => "ground",
             Self::Cut => "cut",
             Self::Textured => "textured",
             Self::Tracking => "tracking",

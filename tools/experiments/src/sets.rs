@@ -7,6 +7,7 @@ mod adverse;
 mod circles;
 mod clutter;
 mod cut;
+mod ground;
 mod scene;
 mod shade;
 mod sweeps;
@@ -71,6 +72,7 @@ pub fn frames_of(set: Set, marker: Marker, variant: Variant) -> Vec<FrameSpec> {
         Set::Light => sweeps::light(draw, marker),
         Set::Rolling => sweeps::rolling(draw, marker),
         Set::Shade => shade::frames(draw, marker),
+        Set::Ground => ground::frames(draw, marker),
         Set::Cut => cut::frames(draw, marker),
         Set::Textured => views::textured(draw, marker),
         Set::Tracking => views::tracking(draw, marker),
@@ -117,6 +119,7 @@ mod tests {
             ("light", 54),
             ("rolling", 48),
             ("shade", 120),
+            ("ground", ground::COUNT),
             ("cut", cut::FRAMES),
             ("tracking", 30),
             ("negatives", 520),

@@ -1,11 +1,13 @@
 //! What the sets share: random generators, positions and views.
 
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 use geometry::{CameraModel, Pixel};
 use markers::Marker;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rendering::occluder::Disc;
 use rendering::{CameraSettings, Surface};
 
 use crate::frame_spec::{FrameSpec, Tilt, pose};
@@ -63,7 +65,7 @@ pub(super) fn view(
     drawn: DrawnFrame,
     marker: Marker,
     settings: CameraSettings,
-    size_px: std::ops::Range<f64>,
+    size_px: Range<f64>,
     max_tilt: f64,
 ) -> (FrameSpec, ChaCha8Rng) {
     let frame = drawn.frame;
@@ -77,4 +79,27 @@ pub(super) fn view(
     let mut spec = FrameSpec::new(with_id(marker, frame), settings, pose, seed);
     spec.surface = Surface::ALL[frame % 3];
     (spec, rng)
+}
+
+/// A random pixel on or near the marker: up to `reach` of its size from its centre along both axes.
+pub(super) fn on_marker(spec: &FrameSpec, rng: &mut ChaCha8Rng, reach: f64) -> Pixel {
+    let by_px = reach * spec.size_px();
+    let centre = spec.ground_truth().map_or(Pixel::new(0.0, 0.0), |shown| shown.centre);
+    near(rng, centre, by_px)
+}
+
+/// Discs at random pixels on or near the marker, with radii in its sizes.
+pub(super) fn discs(
+    spec: &FrameSpec,
+    rng: &mut ChaCha8Rng,
+    count: Range<i32>,
+    reach: f64,
+    radius: Range<f64>,
+) -> Vec<Disc> {
+    (0..rng.random_range(count))
+        .map(|_| Disc {
+            centre: on_marker(spec, rng, reach),
+            radius_px: (spec.size_px() * rng.random_range(radius.clone())) as f32,
+        })
+        .collect()
 }

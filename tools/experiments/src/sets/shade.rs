@@ -1,16 +1,14 @@
 //! Light and cover as they are outdoors: edges of hard shadows of any contrast, dappled shade, leaves.
 
 use std::f64::consts::TAU;
-use std::ops::Range;
 
-use geometry::Pixel;
 use markers::Marker;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rendering::CameraSettings;
-use rendering::occluder::{Disc, Line, Occluder};
+use rendering::occluder::{Line, Occluder};
 
-use super::scene::{Draw, near, view};
+use super::scene::{Draw, discs, on_marker, view};
 use crate::frame_spec::FrameSpec;
 use crate::set::Set;
 
@@ -60,27 +58,4 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
 
 fn large(draw: Draw, marker: Marker, frame: usize) -> (FrameSpec, ChaCha8Rng) {
     view(draw.frame(Set::Shade, frame), marker, CameraSettings::thesis(), 40.0..160.0, 0.4)
-}
-
-/// A random pixel on or near the marker: up to `reach` of its size from its centre along both axes.
-fn on_marker(spec: &FrameSpec, rng: &mut ChaCha8Rng, reach: f64) -> Pixel {
-    let by_px = reach * spec.size_px();
-    let centre = spec.ground_truth().map_or(Pixel::new(0.0, 0.0), |shown| shown.centre);
-    near(rng, centre, by_px)
-}
-
-/// Discs at random pixels on or near the marker, with radii in its sizes.
-fn discs(
-    spec: &FrameSpec,
-    rng: &mut ChaCha8Rng,
-    count: Range<i32>,
-    reach: f64,
-    radius: Range<f64>,
-) -> Vec<Disc> {
-    (0..rng.random_range(count))
-        .map(|_| Disc {
-            centre: on_marker(spec, rng, reach),
-            radius_px: (spec.size_px() * rng.random_range(radius.clone())) as f32,
-        })
-        .collect()
 }
