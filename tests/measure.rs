@@ -96,6 +96,7 @@ async fn freeze_each(freezes_s: &[f64]) -> anyhow::Result<()> {
     for name in ["detector", "gcs-bridge", "simulator", "controller"] {
         freezes::of_a_landing(name, freezes_s).await.context(name)?;
     }
+    freezes::of_a_commanded_controller().await.context("a commanded controller")?;
     freezes::of_a_camera(freezes_s).await.context("camera-pub")?;
     freezes::of_a_relay(freezes_s).await.context("relay")
 }

@@ -257,13 +257,17 @@ mod tests {
             Some((attitude(state.ned_from_body_wxyz), attitude(truth.ned_from_body_wxyz)))
         });
         let pairs: Vec<_> = pairs.collect();
-        let mean = |turn: &dyn Fn(&(Rotation<Ned, Body>, Rotation<Ned, Body>)) -> Vector3<f64>| {
-            pairs.iter().map(turn).sum::<Vector3<f64>>() / pairs.len() as f64
-        };
-        let turn = mean(&|(told, truth)| (*truth * told.inverse()).quaternion.scaled_axis());
+        let turn = pairs.iter().map(|(told, truth)| {
+            let turn: Rotation<Ned, Ned> = *truth * told.inverse();
+            turn.quaternion.scaled_axis()
+        });
+        let turn = turn.sum::<Vector3<f64>>() / pairs.len() as f64;
         let heading = Rotation::<Ned, Ned>::from_rotation_vector(Vector::new(0.0, 0.0, turn.z));
-        let tilt =
-            mean(&|(told, truth)| ((heading * *told).inverse() * *truth).quaternion.scaled_axis());
+        let tilt = pairs.iter().map(|(told, truth)| {
+            let tilt: Rotation<Body, Body> = (heading * *told).inverse() * *truth;
+            tilt.quaternion.scaled_axis()
+        });
+        let tilt = tilt.sum::<Vector3<f64>>() / pairs.len() as f64;
         Rotation::from_rotation_vector(Vector::new(tilt.x, tilt.y, 0.0))
     }
 

@@ -176,7 +176,7 @@ pub(crate) fn to_remember(now: Timestamp, target: &TargetEstimate) -> Option<Rem
     let is_sound = !target.ambiguous
         && target.age_s <= MAX_AGE_S
         && target.deviation_m <= MAX_STANDING_DEVIATION_M;
-    is_sound.then(|| RememberedPad {
+    is_sound.then_some(RememberedPad {
         position: target.position,
         deviation_m: target.deviation_m,
         stamp: now,

@@ -118,7 +118,7 @@ fn main() -> anyhow::Result<()> {
             let mut detector = Detector::new(&[any], Settings::default())?;
             let mut sums = Sums::default();
             for set in Set::ALL {
-                let variant = Variant { seed, processing: preset, every };
+                let variant = Variant { seed, processing: preset, every, is_binned: false };
                 for spec in &sets::frames_of(set, marker, variant) {
                     measure(&mut renderer, &mut detector, (set.name(), spec), &mut sums)?;
                 }

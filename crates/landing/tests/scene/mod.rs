@@ -143,7 +143,7 @@ pub(crate) struct Flight {
     /// The landing was aborted before the touchdown.
     pub(crate) aborted: bool,
     /// Since when it is on the ground, in seconds.
-    pub on_ground_since_s: Option<f64>,
+    pub(crate) on_ground_since_s: Option<f64>,
 }
 
 impl Scene {
