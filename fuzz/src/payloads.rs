@@ -3,9 +3,9 @@
 use airlink::Unpacker;
 use autopilot::{Autopilot, Config, Parser};
 use messages::{
-    CameraInfo, CommandReply, ControllerCommand, ControllerStatus, Detections, DetectorCommand,
-    DetectorInfo, FrameAck, FrameHeader, FramePart, Health, MavlinkBytes, Message, PixelFormat,
-    Refusals, TargetEstimate, Truth, VehicleState, Wind, decode, encode,
+    CameraInfo, CameraResponse, CommandReply, ControllerCommand, ControllerStatus, Detections,
+    DetectorCommand, DetectorInfo, FrameAck, FrameHeader, FramePart, Health, MavlinkBytes, Message,
+    PixelFormat, Refusals, TargetEstimate, Truth, VehicleState, Wind, decode, encode,
 };
 
 /// Edges of the frames that an air-link payload is read for, in pixels.
@@ -19,6 +19,7 @@ pub fn codec(input: &[u8]) {
     again::<Detections>(input);
     again::<Refusals>(input);
     again::<DetectorInfo>(input);
+    again::<CameraResponse>(input);
     again::<DetectorCommand>(input);
     again::<TargetEstimate>(input);
     again::<ControllerStatus>(input);
