@@ -65,6 +65,10 @@ const MIN_RETRY_S: f64 = 2.0;
 /// the marker before.
 const MIN_LOOK_S: f64 = 1.0;
 
+/// Time after LAND has shown in which our own mode may show again, in seconds: on a link with jitter an older heartbeat comes
+/// late, and the next one follows in a second. Nothing is sent meanwhile, so a pilot who takes over waits for nothing.
+const MAX_OVERTAKEN_S: f64 = 1.2;
+
 /// Time after an abort in which LAND, asked for before it, may still show, in seconds: heartbeats come each second, and one
 /// may be lost.
 const MAX_LATE_LAND_S: f64 = 2.5;
@@ -341,7 +345,7 @@ impl StateMachine {
                 return Some((Phase::Landed, Reason::TouchedDown));
             }
             let is_ours = match vehicle.mode {
-                Mode::Guided => !self.landing,
+                Mode::Guided => !self.landing || self.elapsed_s(inputs.now) < MAX_OVERTAKEN_S,
                 Mode::Land => self.phase == Phase::Final,
                 Mode::Other => false,
                 // Undecided: nothing is asked for, and the vehicle hovers.
