@@ -320,7 +320,7 @@ impl Bridge {
         let answer = request::answer(&mut self.camera, now_ns, command);
         let acknowledgement = route::acknowledgement(command.command, answer.result, from);
         self.send_from_camera(now_ns, &acknowledgement);
-        if let Some(message) = &answer.message {
+        for message in answer.message.iter().chain(&answer.next) {
             self.send_from_camera(now_ns, message);
         }
         if let Some(why) = answer.why {

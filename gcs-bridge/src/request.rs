@@ -52,18 +52,20 @@ pub(crate) struct Answer {
     pub(crate) result: MavResult,
     /// What was asked for; it follows the acknowledgement.
     pub(crate) message: Option<MavMessage>,
+    /// What follows that without being asked for.
+    pub(crate) next: Option<MavMessage>,
     /// Why it was refused, for a person.
     pub(crate) why: Option<&'static str>,
 }
 
 impl Answer {
     fn only(result: MavResult) -> Self {
-        Self { result, message: None, why: None }
+        Self { result, message: None, next: None, why: None }
     }
 
     fn with(message: Option<MavMessage>) -> Self {
         match message {
-            Some(_) => Self { result: MavResult::MAV_RESULT_ACCEPTED, message, why: None },
+            Some(_) => Self { message, ..Self::only(MavResult::MAV_RESULT_ACCEPTED) },
             None => Self::only(MavResult::MAV_RESULT_UNSUPPORTED),
         }
     }
@@ -85,9 +87,14 @@ pub(crate) fn answer(camera: &mut Camera, now_ns: i64, asked: Command) -> Answer
         MavCmd::MAV_CMD_VIDEO_START_STREAMING if camera.stream_information().is_some() => {
             Answer::only(MavResult::MAV_RESULT_ACCEPTED)
         }
-        _ => Answer::with(
-            message_id(asked).and_then(|(id, which)| message(camera, now_ns, id, which)),
-        ),
+        _ => {
+            let asked = message_id(asked);
+            let message = asked.and_then(|(id, which)| message(camera, now_ns, id, which));
+            // MAVSDK asks for a camera's streams every 20 s only, and takes what it is told.
+            let is_introduction = asked.is_some_and(|(id, _)| id == CAMERA_INFORMATION_DATA::ID);
+            let next = if is_introduction { camera.stream_information() } else { None };
+            Answer { next, ..Answer::with(message) }
+        }
     }
 }
 
@@ -215,6 +222,15 @@ mod tests {
         };
         assert!(!information(None));
         assert!(information(Some("rtp-h264:5600")));
+        let next = |video: Option<&str>| {
+            let asked = [259.0, 0.0, 0.0, 0.0];
+            ask(&mut camera(video), MavCmd::MAV_CMD_REQUEST_MESSAGE, asked).next
+        };
+        assert_eq!(next(None), None);
+        assert!(matches!(
+            next(Some("rtp-h264:5600")),
+            Some(MavMessage::VIDEO_STREAM_INFORMATION(_))
+        ));
         let asked = [269.0, 0.0, 0.0, 0.0];
         let none = ask(&mut camera(None), MavCmd::MAV_CMD_REQUEST_MESSAGE, asked);
         assert_eq!(none.result, MavResult::MAV_RESULT_UNSUPPORTED);
