@@ -260,7 +260,9 @@ impl Watcher {
                 Event::Vehicle(state) => self.hear(before, state.mode),
                 Event::Status(status) => self.hear(before, status.mode),
                 Event::DetectorsAlive(alive) => self.no_detector = !alive,
-                Event::Operator(OperatorCommand::Start) => self.pilot_flies = false,
+                Event::Operator(OperatorCommand::Start | OperatorCommand::LandHere) => {
+                    self.pilot_flies = false;
+                }
                 _ => {}
             }
         }

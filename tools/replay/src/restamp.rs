@@ -3,7 +3,7 @@
 use airlink::Unpacker;
 use flightlog::{Received, VehicleClock};
 use messages::{
-    ControllerStatus, Detections, FrameAck, FrameHeader, Health, Message, PixelFormat,
+    ControllerStatus, Detections, FrameAck, FrameHeader, Health, Message, PixelFormat, Refusals,
     TargetEstimate, Truth, VehicleState, Wind, decode, encode, topic,
 };
 
@@ -39,6 +39,8 @@ impl Restamp {
         let is = |pattern: String| pattern == key;
         let stamped = if topic::DETECTIONS.first_name(key).is_some() {
             self.stamped(message, |now, it: &mut Detections| it.header = now.header(&it.header))
+        } else if topic::REFUSALS.first_name(key).is_some() {
+            self.stamped(message, |now, it: &mut Refusals| it.header = now.header(&it.header))
         } else if topic::FRAME_ACK.first_name(key).is_some() {
             self.stamped(message, |now, it: &mut FrameAck| {
                 it.stamp_ns = now.stamp_ns(it.stamp_ns);
@@ -212,8 +214,9 @@ mod tests {
     #[test]
     fn every_topic_whose_message_has_a_stamp_is_known() {
         // Beside those that are not published again, and those of bytes and of frames.
-        const WITHOUT: [&str; 8] = [
+        const WITHOUT: [&str; 9] = [
             "CameraInfo",
+            "CameraResponse",
             "Configuration",
             "DetectorInfo",
             "FrameHeader",
@@ -224,6 +227,7 @@ mod tests {
         ];
         let known = [
             Detections::NAME,
+            Refusals::NAME,
             FrameAck::NAME,
             Health::NAME,
             VehicleState::NAME,
