@@ -344,7 +344,11 @@ fn the_pilot_and_only_the_pilot_takes_over() {
     check(&[start(), land(1.0)], taken.0, taken.1);
     let ready = seen(9.0, Progress::Ready(Reason::LowAndAligned));
     let finals = [start(), seen(1.0, Progress::Unchanged), ready, land(9.1)];
-    check(&[finals[0], finals[1], finals[2], finals[3], at(10.0)], taken.0, taken.1);
+    let [a, b, c, d] = finals;
+    check(&[a, b, c, d, at(10.4)], taken.0, taken.1);
+    // A heartbeat that LAND has overtaken.
+    check(&[a, b, c, d, at(10.0)], Phase::Final, Reason::AutopilotLands);
+    check(&[a, b, c, d, at(10.0), land(10.1)], Phase::Final, Reason::AutopilotLands);
     check(&[start(), land(1.0), at(2.0), start()], Phase::Search, Reason::Searching);
 }
 
