@@ -20,6 +20,13 @@ use crate::terminal::{print, write_error};
 const PLAYED: [&str; 4] = ["camera-pub", "simulator", "detector", "controller"];
 /// Maximum number of messages that were read and are not due yet.
 const MAX_READ_AHEAD: usize = 64;
+/// Pauses before each look for services that run: a new session hears of them one by one.
+const LOOKS: [Duration; 4] = [
+    Duration::from_millis(200),
+    Duration::from_millis(500),
+    Duration::from_millis(1000),
+    Duration::from_millis(1500),
+];
 /// Time for subscribers to be found before the first message.
 const BEGIN: Duration = Duration::from_millis(500);
 /// A service is shown as ready for this time after its last health report, which comes every second.
@@ -106,7 +113,10 @@ pub(crate) fn run(
     let overview = overview(&files, without)?;
     let first_ns = overview.first_ns.context("nothing in the recording is to be published")?;
     with_node(network, "replay", async |node| {
-        nobody_is_doubled(node, &overview).await?;
+        for pause in LOOKS {
+            sleep(pause).await;
+            nobody_is_doubled(node, &overview).await?;
+        }
         let mut player = Player::new(node, without.to_vec());
         sleep(BEGIN).await;
         let length_s = overview.last_ns.saturating_sub(first_ns) as f64 * 1e-9;
