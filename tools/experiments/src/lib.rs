@@ -4,7 +4,7 @@
 //! This crate is above the services: it calls their pure parts as functions, without a network or a clock.
 //!
 //! Modules in reading order: [`markers`] is the experiment with markers. [`frame_spec`] specifies and renders
-//! one frame, whose marker may be a poor [`print`]; [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`]
+//! one frame, whose marker may be a poor [`mod@print`]; [`set`] names the sets and [`sets`] has their frames; [`store`] keeps them on disk; [`record`]
 //! has a detector's results, and [`score`] their errors; [`photographs`] has the results on real images;
 //! [`report`] is the report, with the [`tables`] and [`figures`] of the [`thesis`]. [`landing`] is the
 //! experiment with landings, [`faults`] the campaign in which something dies, lies or falls silent.
