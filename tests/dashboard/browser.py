@@ -6,21 +6,11 @@ was measured as JSON on its last line. Exit status 77: no browser, or no package
 
 import json
 import os
-import shutil
 import sys
 import time
 from pathlib import Path
 
-try:
-    from playwright.sync_api import sync_playwright
-except ImportError as problem:
-    print(f"no package playwright: {problem}")
-    sys.exit(77)
-
-CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
-if CHROMIUM is None:
-    print("no chromium")
-    sys.exit(77)
+from chromium import CHROMIUM, sync_playwright
 
 PATIENCE_S = 60
 URL, FOLDER = sys.argv[1], Path(sys.argv[2])

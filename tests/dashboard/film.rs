@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use messages::{ControllerStatus, Detection, Detections, FrameHeader, Phase, topic};
@@ -24,6 +24,8 @@ const LACKS: i32 = 77;
 const BLOCK: usize = 24;
 const BLACK: u8 = 20;
 const WHITE: u8 = 230;
+/// Longest wait for the page.
+const PATIENCE: Duration = Duration::from_secs(30);
 /// The square whose place follows from the number, as `tests/dashboard/frames.py` computes it: its edge in pixels, and by how much
 /// the detector that is not in use is wrong.
 const SQUARE: usize = 80;
@@ -176,13 +178,22 @@ impl Shown {
         let source = ZenohSource::Text(node::session::local_config(meet));
         let identity = Identity { service: "simulator", instance: "film".into() };
         let node = Node::open(identity, &source).await?;
-        let dashboard = Command::new(ALIGHT)
+        let mut dashboard = Command::new(ALIGHT)
             .args(["dashboard", "--meet", &meet.to_string(), "--set", "video.max_hz=120"])
             .args(["--set", &tokens, "--set", &format!("listen=\"0.0.0.0:{port}\"")])
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .env("ALIGHT_LOG", "error")
             .spawn()?;
+        let began = Instant::now();
+        while node.alive("dashboard", "*").await?.is_empty() {
+            ensure!(dashboard.try_wait()?.is_none(), "the dashboard ended");
+            if began.elapsed() > PATIENCE {
+                drop(dashboard.kill());
+                bail!("the dashboard is not ready after {PATIENCE:?}");
+            }
+            sleep(Duration::from_millis(50)).await;
+        }
         let player = tokio::spawn(play(node, film));
         Ok(Self { dashboard, player, port, token, _folder: folder })
     }

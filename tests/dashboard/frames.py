@@ -7,21 +7,11 @@ Prints what was measured as JSON on its last line. Exit status 77: no browser, o
 """
 
 import json
-import shutil
 import statistics
 import sys
 import time
 
-try:
-    from playwright.sync_api import sync_playwright
-except ImportError as problem:
-    print(f"no package playwright: {problem}")
-    sys.exit(77)
-
-CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
-if CHROMIUM is None:
-    print("no chromium")
-    sys.exit(77)
+from chromium import CHROMIUM, sync_playwright
 
 URL, SECONDS, FRAMES = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 TOKEN = sys.argv[4] if len(sys.argv) > 4 else None
