@@ -35,7 +35,7 @@
 //! | the axes of camera and autopilot do not match | Hold |
 //! | the vehicle's state is stale, or its mode not known | Hold; Final waits |
 //! | the link to the autopilot is slow | Hold |
-//! | a mode that is neither GUIDED nor the requested LAND | PilotInCommand |
+//! | a mode that is neither GUIDED nor the requested LAND; GUIDED again in LAND, `MAX_OVERTAKEN_S` after it began | PilotInCommand |
 //! | on the ground; still and low over the pad, where Search or Retry would follow, or in Search | Final |
 //! | disarmed | Landed on the ground or in LAND, else, half a second later, Aborted |
 //! | an alarm | as configured for it |

@@ -190,11 +190,7 @@ impl RingModel {
     ) -> Option<[SVector<f64, UNKNOWNS_WITH_EXTRAS>; CIRCLES]> {
         let mut pulls = [SVector::zeros(); CIRCLES];
         self.for_each_place(scene, |sample, radius, wide| {
-            let mut shown = radius.response(scene);
-            if let Some(wide) = wide {
-                let blurred = wide.radius.response(scene);
-                shown = wide.processed(&shown, &blurred, &self.response);
-            }
+            let shown = self.response_at(scene, radius, wide);
             let (grey, contrast) = self.grey(sample, shown.shown);
             if sample.grey > MAX_GREY && grey > MAX_GREY {
                 return;

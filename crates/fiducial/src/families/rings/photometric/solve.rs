@@ -78,15 +78,23 @@ impl RingModel {
         mut visit: impl FnMut(&PixelSample, &PixelResponse),
     ) -> Option<()> {
         self.for_each_place(scene, |sample, radius, wide| {
-            let response = radius.response(scene);
-            match wide {
-                None => visit(sample, &response),
-                Some(wide) => {
-                    let blurred = wide.radius.response(scene);
-                    visit(sample, &wide.processed(&response, &blurred, &self.response));
-                }
-            }
+            visit(sample, &self.response_at(scene, radius, wide));
         })
+    }
+
+    /// The model's response at a distance from the centre, as the camera shows it.
+    #[inline]
+    pub(super) fn response_at(
+        &self,
+        scene: &Scene<'_>,
+        radius: &RadiusDistribution,
+        wide: Option<&Sharpened>,
+    ) -> PixelResponse {
+        let own = radius.response(scene);
+        match wide {
+            None => own,
+            Some(wide) => wide.processed(&own, &wide.radius.response(scene), &self.response),
+        }
     }
 
     /// Calls `visit` with each sample that counts and its distance from the centre, and with that as blurred by the
