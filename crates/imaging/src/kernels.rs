@@ -1,10 +1,10 @@
 //! The loops over all pixels, eight to sixty-four at a time where the processor can.
 //!
-//! Each kernel exists twice, for AVX2 and in plain Rust, with the same result to the bit. The plain one also
-//! serves the ends of rows, and processors without AVX2.
+//! Each kernel exists three times, for AVX2, for NEON and in plain Rust, with the same result to the bit. The plain one
+//! also serves the ends of rows, and processors with neither.
 #![allow(unsafe_code, reason = "vector instructions; each is tested against its plain twin")]
 #![cfg_attr(
-    not(target_arch = "x86_64"),
+    not(any(target_arch = "x86_64", all(target_arch = "aarch64", target_feature = "neon"))),
     allow(unused_mut, reason = "without vectors nothing is done before the plain part")
 )]
 
@@ -21,6 +21,11 @@ pub(crate) fn tile_extremes(rows: &[&[u8]; TILE], low: &mut [u8], high: &mut [u8
         // SAFETY: the processor has AVX2.
         done = unsafe { avx2::tile_extremes(rows, &mut low[..tiles], &mut high[..tiles]) };
     }
+    #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+    {
+        // SAFETY: the target has NEON, as all of AArch64 but bare metal has.
+        done += unsafe { neon::tile_extremes(rows, &mut low[..tiles], &mut high[..tiles]) };
+    }
     plain::tile_extremes(rows, &mut low[..tiles], &mut high[..tiles], done);
 }
 
@@ -31,6 +36,11 @@ pub(crate) fn halve_rows(above: &[u8], below: &[u8], out: &mut [u8]) {
     if is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has AVX2.
         done = unsafe { avx2::halve_rows(above, below, out) };
+    }
+    #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+    {
+        // SAFETY: the target has NEON, as all of AArch64 but bare metal has.
+        done += unsafe { neon::halve_rows(above, below, out) };
     }
     plain::halve_rows(above, below, out, done);
 }
@@ -44,6 +54,11 @@ pub(crate) fn sharpen_row(above: &[u8], here: &[u8], below: &[u8], out: &mut [u8
         // SAFETY: the processor has AVX2.
         done = unsafe { avx2::sharpen_row(above, here, below, out) };
     }
+    #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+    {
+        // SAFETY: the target has NEON, as all of AArch64 but bare metal has.
+        done += unsafe { neon::sharpen_row(above, here, below, out) };
+    }
     plain::sharpen_row(above, here, below, out, 0..done.min(1));
     plain::sharpen_row(above, here, below, out, done..here.len());
 }
@@ -56,6 +71,11 @@ pub(crate) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
         // SAFETY: the processor has AVX2.
         done = unsafe { avx2::below(pixels, thresholds, words) };
     }
+    #[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+    {
+        // SAFETY: the target has NEON, as all of AArch64 but bare metal has.
+        done += unsafe { neon::below(pixels, thresholds, words) };
+    }
     plain::below(pixels, thresholds, words, done);
 }
 
@@ -65,8 +85,8 @@ pub(crate) fn above(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
     below(thresholds, pixels, words);
 }
 
-/// Does some work, with the loops of what is inlined into it compiled for AVX2 where the processor has it. It
-/// is the same code, and none of its arithmetic is fused, so the result is the same.
+/// Does some work, with the loops of what is inlined into it compiled for AVX2 where the processor has it (for NEON all code
+/// is compiled where the target has it). It is the same code, and none of its arithmetic is fused, so the result is the same.
 #[inline]
 pub(crate) fn with_vectors<T>(work: impl FnOnce() -> T) -> T {
     #[cfg(target_arch = "x86_64")]
@@ -296,6 +316,139 @@ mod avx2 {
             };
         }
         words.len()
+    }
+}
+
+#[cfg(all(target_arch = "aarch64", target_feature = "neon"))]
+mod neon {
+    use std::arch::aarch64::{
+        uint8x16_t, vandq_u8, vcltq_u8, vcombine_u8, vgetq_lane_u64, vld1q_u8, vld4_u8, vld4q_u8,
+        vmax_u8, vmaxq_u8, vmin_u8, vminq_u8, vpadalq_u8, vpaddlq_u8, vpaddq_u8, vqaddq_u8,
+        vqsubq_u8, vreinterpretq_u64_u8, vrhaddq_u8, vrshrn_n_u16, vst1_u8, vst1q_u8,
+    };
+
+    use super::TILE;
+
+    /// 16 bytes of `row` from `at` on.
+    #[target_feature(enable = "neon")]
+    fn load(row: &[u8], at: usize) -> uint8x16_t {
+        let bytes = &row[at..at + 16];
+        // SAFETY: `bytes` has 16 bytes, and the load needs no alignment.
+        unsafe { vld1q_u8(bytes.as_ptr()) }
+    }
+
+    /// Writes 16 bytes to `row` from `at` on.
+    #[target_feature(enable = "neon")]
+    fn store(row: &mut [u8], at: usize, value: uint8x16_t) {
+        let bytes = &mut row[at..at + 16];
+        // SAFETY: `bytes` has 16 bytes, and the store needs no alignment.
+        unsafe { vst1q_u8(bytes.as_mut_ptr(), value) }
+    }
+
+    /// Returns how many tiles it did.
+    #[target_feature(enable = "neon")]
+    pub(super) fn tile_extremes(rows: &[&[u8]; TILE], low: &mut [u8], high: &mut [u8]) -> usize {
+        let tiles = (rows[0].len() / TILE).min(low.len()).min(high.len());
+        let mut done = 0;
+        while done + 16 <= tiles {
+            let part = |row: usize| {
+                let bytes = &rows[row][done * TILE..(done + 16) * TILE];
+                // SAFETY: `bytes` has 64 bytes, and the load needs no alignment.
+                let columns = unsafe { vld4q_u8(bytes.as_ptr()) };
+                let (a, b, c, d) = (columns.0, columns.1, columns.2, columns.3);
+                (vminq_u8(vminq_u8(a, b), vminq_u8(c, d)), vmaxq_u8(vmaxq_u8(a, b), vmaxq_u8(c, d)))
+            };
+            let (mut min, mut max) = part(0);
+            for row in 1..TILE {
+                let (lower, higher) = part(row);
+                (min, max) = (vminq_u8(min, lower), vmaxq_u8(max, higher));
+            }
+            store(low, done, min);
+            store(high, done, max);
+            done += 16;
+        }
+        if done + 8 <= tiles {
+            let part = |row: usize| {
+                let bytes = &rows[row][done * TILE..(done + 8) * TILE];
+                // SAFETY: `bytes` has 32 bytes, and the load needs no alignment.
+                let columns = unsafe { vld4_u8(bytes.as_ptr()) };
+                let (a, b, c, d) = (columns.0, columns.1, columns.2, columns.3);
+                (vmin_u8(vmin_u8(a, b), vmin_u8(c, d)), vmax_u8(vmax_u8(a, b), vmax_u8(c, d)))
+            };
+            let (mut min, mut max) = part(0);
+            for row in 1..TILE {
+                let (lower, higher) = part(row);
+                (min, max) = (vmin_u8(min, lower), vmax_u8(max, higher));
+            }
+            let (low, high) = (&mut low[done..done + 8], &mut high[done..done + 8]);
+            // SAFETY: both have 8 bytes, and the stores need no alignment.
+            unsafe {
+                vst1_u8(low.as_mut_ptr(), min);
+                vst1_u8(high.as_mut_ptr(), max);
+            }
+            done += 8;
+        }
+        done
+    }
+
+    /// Returns how many means it did.
+    #[target_feature(enable = "neon")]
+    pub(super) fn halve_rows(above: &[u8], below: &[u8], out: &mut [u8]) -> usize {
+        let count = (above.len().min(below.len()) / 32).min(out.len() / 16);
+        for step in 0..count {
+            let half = |at: usize| {
+                let sums = vpadalq_u8(vpaddlq_u8(load(above, at)), load(below, at));
+                // Shifts and rounds.
+                vrshrn_n_u16::<2>(sums)
+            };
+            store(out, step * 16, vcombine_u8(half(step * 32), half(step * 32 + 16)));
+        }
+        count * 16
+    }
+
+    /// Returns the column up to which it did all but the first.
+    #[target_feature(enable = "neon")]
+    pub(super) fn sharpen_row(above: &[u8], here: &[u8], below: &[u8], out: &mut [u8]) -> usize {
+        let length = here.len().min(above.len()).min(below.len()).min(out.len());
+        let mut one = |at: usize| {
+            let down = |at: usize| {
+                vrhaddq_u8(vrhaddq_u8(load(above, at), load(below, at)), load(here, at))
+            };
+            let smooth = vrhaddq_u8(vrhaddq_u8(down(at - 1), down(at + 1)), down(at));
+            let pixel = load(here, at);
+            let brighter = vqaddq_u8(pixel, vqsubq_u8(pixel, smooth));
+            store(out, at, vqsubq_u8(brighter, vqsubq_u8(smooth, pixel)));
+        };
+        if length < 18 {
+            return 0;
+        }
+        let mut at = 1;
+        while at + 17 <= length {
+            one(at);
+            at += 16;
+        }
+        // Some at the end are done twice rather than one by one.
+        one(length - 17);
+        length - 1
+    }
+
+    /// Returns how many words it did.
+    #[target_feature(enable = "neon")]
+    pub(super) fn below(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) -> usize {
+        const BITS: [u8; 16] = [1, 2, 4, 8, 16, 32, 64, 128, 1, 2, 4, 8, 16, 32, 64, 128];
+        let bits = load(&BITS, 0);
+        let count = (pixels.len().min(thresholds.len()) / 64).min(words.len());
+        for (step, word) in words.iter_mut().take(count).enumerate() {
+            let part = |index: usize| {
+                let at = step * 64 + index * 16;
+                vandq_u8(vcltq_u8(load(pixels, at), load(thresholds, at)), bits)
+            };
+            // Adding neighbours three times makes a byte of the bits of eight pixels.
+            let halves = [vpaddq_u8(part(0), part(1)), vpaddq_u8(part(2), part(3))];
+            let quarters = vpaddq_u8(halves[0], halves[1]);
+            *word = vgetq_lane_u64::<0>(vreinterpretq_u64_u8(vpaddq_u8(quarters, quarters)));
+        }
+        count
     }
 }
 
