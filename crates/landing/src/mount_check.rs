@@ -15,8 +15,9 @@
 //! | `τ` | s | how much later exposures are than their stamps |
 //!
 //! What else moves the pad, as an estimator that errs more in wind does, is not as random as the filter believes. An error
-//! of the focal length or the size is the same in each part of a flight, so the estimates of the parts by themselves must agree: by
-//! as much as they scatter more than their deviations say, the deviation is larger (the ratio of Birge: Physical Review 40, 1932).
+//! of the mount, the focal length or the size is the same in each part of a flight, so the estimates of the parts by themselves
+//! must agree: by as much as they scatter more than their deviations say, the deviation is larger (the ratio of Birge: Physical
+//! Review 40, 1932).
 //!
 //! Heights are left out: a barometer errs by as much as a focal length that is 4 % off. The random walks grow
 //! while detections show that the autopilot's position wanders, as in `filter.rs`, and with them the deviations.
@@ -74,6 +75,11 @@ const MAX_OFFSET_S: f64 = 0.15;
 /// Minimum height over the marker of a detection that is used, in metres: near the ground the air and the ground
 /// itself move the vehicle otherwise than the autopilot knows.
 const MIN_HEIGHT_M: f64 = 0.5;
+
+/// Smallest horizontal speeds of motions that show the marker's size and the focal length, in m/s. The autopilot holds its own estimate of a hover
+/// still, whose drift the vehicle follows: what is seen then moves while the estimate does not, as of a marker of no size.
+const MIN_SIZE_SPEED_M_S: f64 = 0.3;
+const MIN_FOCAL_SPEED_M_S: f64 = 0.1;
 
 /// An error is told when it is larger than this many standard deviations and than a minimum, and its standard deviation
 /// is smaller than a part of that minimum, in this many detections in a row; and no longer when it is smaller than a part
@@ -148,8 +154,8 @@ pub struct MountCheck {
     pitch: Suspicion,
     focal: Suspicion,
     size: Suspicion,
-    /// Of focal length and size.
-    parts: [Parts; 2],
+    /// Of roll, pitch, focal length and size.
+    parts: [Parts; 4],
 }
 
 /// The estimates of one error by the parts of a flight.
@@ -188,7 +194,7 @@ impl Default for MountCheck {
             pitch: Suspicion::default(),
             focal: Suspicion::default(),
             size: Suspicion::default(),
-            parts: [Parts::default(); 2],
+            parts: [Parts::default(); 4],
         }
     }
 }
@@ -269,7 +275,8 @@ impl MountCheck {
             + slope * slope.transpose() * measurement.noise[(2, 2)];
         // The motion is that of the estimated time already.
         let expected = h * self.mean - h.column(OFFSET) * self.mean[OFFSET];
-        self.update(&h, place - expected, noise, measurement);
+        let speed_m_s = motion.velocity.horizontal_norm();
+        self.update(&h, place - expected, noise, measurement, speed_m_s);
     }
 
     /// Smooths the marker's depths. A line is fitted to those of the last second (the fading memory of Morrison:
@@ -304,10 +311,10 @@ impl MountCheck {
                 deviation: self.deviation(index) * scatter,
             })
         };
-        let [focal, size] = self.parts.map(|parts| parts.scatter());
+        let [roll, pitch, focal, size] = self.parts.map(|parts| parts.scatter());
         MountFindings {
-            roll_rad: of(self.roll, TILT, 1.0),
-            pitch_rad: of(self.pitch, TILT + 1, 1.0),
+            roll_rad: of(self.roll, TILT, roll),
+            pitch_rad: of(self.pitch, TILT + 1, pitch),
             focal_ratio: of(self.focal, FOCAL, focal),
             size_ratio: of(self.size, SIZE, size),
         }
@@ -354,9 +361,11 @@ impl MountCheck {
         innovation: Vector2<f64>,
         noise: Matrix2<f64>,
         measurement: &Measurement,
+        speed_m_s: f64,
     ) {
         let ph = self.covariance * h.transpose();
-        let Some(inverse) = (h * ph + noise).try_inverse() else { return };
+        let innovation_covariance = h * ph + noise;
+        let Some(inverse) = innovation_covariance.try_inverse() else { return };
         let nis = innovation.dot(&(inverse * innovation));
         let excess = 0.5 * nis.clamp(0.0, GATE) - 1.0 - NOISE_SLACK;
         let scale = self.log_noise_scale + NOISE_GAIN * excess;
@@ -370,10 +379,18 @@ impl MountCheck {
             return;
         }
         self.outliers = 0;
-        let gain = ph * inverse;
+        let mut gain = ph * inverse;
+        // What is not estimated keeps its part in the uncertainty (Schmidt: Application of State-Space Methods to Navigation
+        // Problems, 1966).
+        for (index, min_m_s) in [(FOCAL, MIN_FOCAL_SPEED_M_S), (SIZE, MIN_SIZE_SPEED_M_S)] {
+            if speed_m_s < min_m_s {
+                gain.row_mut(index).fill(0.0);
+            }
+        }
         let mean = self.mean + gain * innovation;
         let less = gain * ph.transpose();
-        let p = self.covariance - (less + less.transpose()) * 0.5;
+        let p = self.covariance - less - less.transpose()
+            + gain * innovation_covariance * gain.transpose();
         let p = (p + p.transpose()) * 0.5;
         if !mean.iter().chain(p.iter()).all(|number| number.is_finite()) {
             *self = Self::default();
@@ -385,12 +402,13 @@ impl MountCheck {
     }
 
     fn suspect(&mut self, stamp: Timestamp) {
-        let [roll, pitch, mut focal, mut size] = [TILT, TILT + 1, FOCAL, SIZE]
+        let mut errors = [TILT, TILT + 1, FOCAL, SIZE]
             .map(|index| Measured { value: self.mean[index], deviation: self.deviation(index) });
-        for (error, parts) in [&mut focal, &mut size].into_iter().zip(&mut self.parts) {
+        for (error, parts) in errors.iter_mut().zip(&mut self.parts) {
             parts.add(stamp, *error);
             error.deviation *= parts.scatter();
         }
+        let [roll, pitch, focal, size] = errors;
         let is_calm = |max_scale: f64| self.log_noise_scale < log(max_scale);
         let is_calm_for_ratios = is_calm(MAX_TOLD_RATIO_NOISE_SCALE);
         let is_calm = is_calm(MAX_TOLD_NOISE_SCALE);

@@ -2,9 +2,11 @@
 
 mod scene;
 
+use landing::OperatorCommand::{Hold, Resume, Start};
 use landing::{Measured, MountFindings, Phase};
 use scene::cases::{Case, FAULTS, MOVING, WINDS, anything, part};
 use scene::{Flight, Scene};
+use world::wind::WindNoise;
 
 const OFF_RAD: f64 = 3.0 * std::f64::consts::PI / 180.0;
 const SEEDS: std::ops::Range<u64> = 1000..1006;
@@ -51,17 +53,35 @@ fn a_mount_that_is_off_is_told_in_flight_and_widens_the_estimate() {
 
 #[test]
 fn a_focal_length_that_is_off_is_told_in_flight() {
+    let (mut flights, mut told) = (0, 0);
     for (name, scene) in CASES {
         for seed in SEEDS {
             let flight = Scene { focal_ratio: 1.05, ..scene(seed) }.fly();
             let error = found(&flight, |findings| findings.focal_ratio);
             println!("{name}, seed {seed}: {error:.4?}");
-            let off = error.map(|error| error.value - 0.05);
-            let is_right = off.is_some_and(|off| off.abs() < 0.015);
-            assert!(is_right, "{name}, seed {seed}: off by {off:?}");
+            flights += 1;
+            let Some(error) = error else { continue };
+            told += 1;
+            let off = error.value - 0.05;
+            assert!(off.abs() < 0.015, "{name}, seed {seed}: off by {off}");
         }
     }
+    assert!(told >= flights - 1, "{told} of {flights} are told");
 }
+
+/// Held by the operator for a minute and a half.
+fn held(scene: Scene) -> Scene {
+    let commands = [Start, Hold, Resume].into_iter().zip([0.0, 5.0, 95.0]);
+    let commands = commands.map(|(command, at_s)| (at_s, command)).collect();
+    Scene { commands, limit_s: 240.0, ..scene }.with(|scene| {
+        scene.world.wind.noise = Some(WindNoise::default());
+    })
+}
+
+const HELD: [Case; 2] = [
+    ("held in the thesis' wind noise", |seed| held(Scene::new(seed))),
+    ("held in wind of 5 m/s", |seed| held(Scene::windy(seed, 5.0, 1.0))),
+];
 
 #[test]
 fn what_is_as_configured_is_never_told() {
@@ -69,7 +89,8 @@ fn what_is_as_configured_is_never_told() {
     let cases = cases.map(|case| (case, 6)).chain(WINDS.map(|case| (case, 20)));
     let mut flights = 0;
     let others = [(("anything", anything as fn(u64) -> Scene), 40), (MOVING[3], 6), (MOVING[4], 6)];
-    for ((name, scene), seeds) in cases.chain(others) {
+    let held = HELD.map(|case| (case, 20));
+    for ((name, scene), seeds) in cases.chain(others).chain(held) {
         for seed in 1000..1000 + seeds {
             let flight = scene(seed).fly();
             let told = flight.samples.iter().find(|s| s.mount != MountFindings::default());
@@ -132,6 +153,6 @@ fn in_wind_a_wandering_estimate_is_seldom_taken_for_a_wrong_camera() {
             println!("{name}: {counts:?}");
         }
     }
-    let most = as_configured[1].max(as_configured[2]);
-    assert!(f64::from(most) <= 0.04 * seeds().count() as f64, "{as_configured:?}");
+    let share = as_configured.map(|count| f64::from(count) / seeds().count() as f64);
+    assert!(share[0] <= 0.15 && share[1] <= 0.04 && share[2] <= 0.04, "{as_configured:?}");
 }
