@@ -60,7 +60,7 @@ pub struct CameraSettings {
     pub noise: bool,
     /// Standard deviation of the lens blur, in pixels, from 0 to 3.
     pub blur_px: f64,
-    /// Vignetting: 0 none, 1 the fourth power of the cosine.
+    /// Vignetting: 0 none, 1 that of the lens' projection, the fourth power of the cosine for a lens that is no fisheye.
     pub vignetting: f64,
     /// What becomes of the light on the sensor.
     pub processing: Processing,

@@ -1,5 +1,6 @@
 //! From light to grey levels: vignetting, noise, quantisation.
 
+use geometry::Distortion;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -39,10 +40,17 @@ impl Sensor {
             })
             .collect();
         let model = &settings.model;
+        // A pixel's light is as the solid angle that it sees, times the cosine of the angle off axis. Where the image grows as
+        // the tangent of that angle this is cos^4, 1 - 2 tan^2 to first order; where it grows as the angle itself, as a fisheye's,
+        // it is cos sin / angle, 1 - 2/3 angle^2.
+        let slope = match model.distortion {
+            Distortion::KannalaBrandt(_) => 2.0 / 3.0,
+            Distortion::None | Distortion::BrownConrady(_) => 2.0,
+        };
         let loss = |count: u32, centre: f64, focal: f64| {
-            // cos^4 of the angle off axis is 1 - 2 tan^2 to first order.
-            let at =
-                |i| (settings.vignetting * 2.0 * ((f64::from(i) - centre) / focal).powi(2)) as f32;
+            let at = |i| {
+                (settings.vignetting * slope * ((f64::from(i) - centre) / focal).powi(2)) as f32
+            };
             (0..count).map(at).collect()
         };
         let mut sensor = Self {
