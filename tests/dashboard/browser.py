@@ -68,6 +68,31 @@ def tab_to(page, command):
     raise AssertionError(f"the button {command} is not reached by the keyboard")
 
 
+def press_space(page, command):
+    """Gives a command by the keyboard."""
+    wait(page, f"!document.querySelector('button[data-command={command}]').disabled")
+    tab_to(page, command)
+    page.keyboard.down("Space")
+    time.sleep(1.4)
+    page.keyboard.up("Space")
+    accepted(page, command)
+
+
+def point_at(page, command):
+    """Gives a command by the pointer."""
+    wait(page, f"!document.querySelector('button[data-command={command}]').disabled")
+    box = page.locator(f"button[data-command={command}]").bounding_box()
+    page.mouse.move(box["x"] + 9, box["y"] + 9)
+    page.mouse.down()
+    time.sleep(1.4)
+    page.mouse.up()
+    accepted(page, command)
+
+
+def accepted(page, command):
+    wait(page, f"/^{command}: accepted by the controller/.test(document.getElementById('reply').textContent)")
+
+
 def asked(what):
     print(what, flush=True)
     sys.stdin.readline()
@@ -122,18 +147,18 @@ def main():
         page.locator("#refused").click()
         wait(page, "document.getElementById('refused-text').textContent === ''", 2)
 
-        # By the keyboard alone: held, resumed, held.
+        # By the pointer: held.
+        point_at(page, "hold")
+        wait(page, "document.getElementById('phase').textContent === 'Holding the position'")
+
+        # All the rest by the keyboard alone: resumed, held, and landed at the end.
         tab_to(page, "hold")
         page.keyboard.down("Space")
         time.sleep(0.4)
         page.keyboard.up("Space")
         assert "too early" in text(page, "#reply"), text(page, "#reply")
-        for command in ["hold", "resume", "hold"]:
-            tab_to(page, command)
-            page.keyboard.down("Space")
-            time.sleep(1.4)
-            page.keyboard.up("Space")
-            wait(page, f"/^{command}: accepted by the controller/.test(document.getElementById('reply').textContent)")
+        for command in ["resume", "hold"]:
+            press_space(page, command)
             holds = "===" if command == "hold" else "!=="
             wait(page, f"document.getElementById('phase').textContent {holds} 'Holding the position'")
         page.screenshot(path=FOLDER / "holding.png", full_page=True)
@@ -177,14 +202,7 @@ def main():
         wait(page, "!document.getElementById('video-panel').classList.contains('stale')", 10)
         wait(page, "!document.querySelector('main').classList.contains('cut-off')", 2)
 
-        # By the pointer.
-        box = page.locator("button[data-command=resume]").bounding_box()
-        page.mouse.move(box["x"] + 9, box["y"] + 9)
-        wait(page, "!document.querySelector('button[data-command=resume]').disabled")
-        page.mouse.down()
-        time.sleep(1.4)
-        page.mouse.up()
-        wait(page, "/resume: accepted/.test(document.getElementById('reply').textContent)")
+        press_space(page, "resume")
         wait(page, "['Touching down', 'Landed'].includes(document.getElementById('phase').textContent)")
         page.screenshot(path=FOLDER / "landed.png", full_page=True)
         browser.close()
