@@ -14,6 +14,10 @@ use crate::refine::{edges, photometric};
 
 /// Where cells are narrower than this, in pixels, the blurs of neighbouring edges overlap.
 const MIN_CELL_PX: f64 = 5.5;
+/// The same where a camera's processing has moved the edges by so many pixels or more: the halos of sharpening reach farther
+/// than a blur.
+const MIN_SHARPENED_CELL_PX: f64 = 7.5;
+const MIN_SHIFT_PX: f64 = 0.1;
 /// The same for a border without fine detail beside it.
 const MIN_BORDER_PX: f64 = 4.0;
 
@@ -27,11 +31,17 @@ pub fn refine(
     let start = lens.homography(guess.corners)?;
     let CornerGuess { view, response, .. } = *guess;
     let target = Target { view, lens: &lens, start: &start, response };
-    let along_edges = (start.narrowest_cell_px(pattern.cells()) >= MIN_CELL_PX)
+    let cell_px = start.narrowest_cell_px(pattern.cells());
+    let along_edges = (cell_px >= MIN_CELL_PX)
         .then(|| edges::fit(target, pattern, guess.is_near, scratch))
         .flatten();
+    let is_narrow = cell_px < MIN_SHARPENED_CELL_PX;
     let fit = match along_edges {
-        Some(fit) => fit,
+        Some(fit) if !is_narrow || fit.shift_px.abs() < MIN_SHIFT_PX => fit,
+        Some(fit) => {
+            let near = Target { start: &fit.homography, ..target };
+            photometric::fit(near, pattern, scratch).unwrap_or(fit)
+        }
         None => photometric::fit(target, pattern, scratch)?,
     };
     fit.refined(&lens, guess, start.shortest_side_px())

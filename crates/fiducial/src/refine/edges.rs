@@ -13,7 +13,10 @@ use crate::optics::edge_response::{EdgeResponse, pixel_kurtosis};
 use crate::optics::homography::{CORNERS, Homography};
 use crate::optics::least_squares::NormalEquations;
 use crate::optics::undistort::Undistortion;
-use crate::refine::fit::{EdgeMeasurement, EdgeSample, Fit, PhotometricModel, Scratch, Target};
+use crate::refine::fit::{
+    EdgeMeasurement, EdgeSample, Fit, PhotometricModel, Scratch, Target, no_pulls, part,
+    widen_by_parts,
+};
 use crate::refine::pattern::Pattern;
 
 /// Parameters of the homography, and the blur.
@@ -156,8 +159,9 @@ fn with_common_shift(
     // A shift is one when it is this many standard deviations from none, and this many pixels.
     const MIN_SIGMAS: f64 = 4.0;
     const MIN_SHIFT_PX: f64 = 0.01;
-    // With a larger standard deviation the shift is not known.
+    // With a larger standard deviation the shift is not known: where none is found, and where there is one.
     const MAX_SIGMA_PX: f64 = 0.02;
+    const MAX_SIGMA_SHIFTED_PX: f64 = 0.06;
     let mut matrix = SMatrix::<f64, SHIFTED, SHIFTED>::zeros();
     let mut right = SVector::<f64, SHIFTED>::zeros();
     matrix.fixed_view_mut::<UNKNOWNS, UNKNOWNS>(0, 0).copy_from(&equations.matrix);
@@ -188,15 +192,44 @@ fn with_common_shift(
     }
     let variance = (squares / (weight - SHIFTED as f64).max(1.0)).max(noise / freedom);
     let sigma_px = (inverse[(UNKNOWNS, UNKNOWNS)] * variance).sqrt();
-    let is_shift_known = sigma_px < MAX_SIGMA_PX;
     let is_shifted = step[UNKNOWNS].abs() > (MIN_SIGMAS * sigma_px).max(MIN_SHIFT_PX);
+    let is_shift_known = sigma_px < if is_shifted { MAX_SIGMA_SHIFTED_PX } else { MAX_SIGMA_PX };
     match measured_at.stepped(|i| step[i]).filter(|_| is_shifted) {
         Some(homography) => {
-            let covariance = inverse.fixed_view::<8, 8>(0, 0) * variance;
-            Fit { homography, covariance, is_shift_known, ..plain }
+            let mut covariance = inverse.fixed_view::<8, 8>(0, 0) * variance;
+            widen(&mut covariance, &inverse, &step, edges);
+            Fit { homography, covariance, is_shift_known, shift_px: step[UNKNOWNS], ..plain }
         }
         None => Fit { is_shift_known, ..plain },
     }
+}
+
+/// Widens a covariance by what the edges contradict each other after the last step: of the homography, the blur and, where
+/// there is one, the common shift.
+fn widen<const N: usize>(
+    covariance: &mut SMatrix<f64, 8, 8>,
+    inverse: &SMatrix<f64, N, N>,
+    step: &SVector<f64, N>,
+    edges: &[EdgeSample],
+) {
+    let mut pulls = no_pulls();
+    for sample in edges {
+        let Some(measurement) = &sample.measurement else { continue };
+        let [shift, mixed, spread] = measurement.matrix;
+        let along = measurement.gradient.iter().chain([&0.0, &1.0]);
+        let mut pull = SVector::<f64, N>::zeros();
+        pull.iter_mut().zip(along).for_each(|(slot, by)| *slot = *by);
+        let moved = pull.dot(step);
+        let left = |right: f64, by_move: f64, by_spread: f64| {
+            measurement.weight * (right - by_move * moved - by_spread * step[8])
+        };
+        pull *= left(measurement.right[0], shift, mixed);
+        pull[8] = left(measurement.right[1], mixed, spread);
+        if let Some(all) = pulls.get_mut(part(sample.place)) {
+            *all += pull;
+        }
+    }
+    widen_by_parts(covariance, inverse, &pulls);
 }
 
 /// Spreads a bounded number of samples along the pattern's edges within the image.
@@ -316,7 +349,8 @@ struct EdgeFit<'a> {
     homography: Homography,
     spread_px: f64,
     response: EdgeResponse,
-    /// In the last pass: samples within the image, saturated pixels, and all pixels.
+    /// In the last pass: samples within the image, pixels of samples whose black or white is saturated that are so, and all
+    /// pixels.
     inside: usize,
     saturated: usize,
     pixels: usize,
@@ -456,8 +490,11 @@ impl EdgeFit<'_> {
             let count = self.pixels(&edge, reach, &mut pixels);
             let Some(pixels) = pixels.get(..count).filter(|p| p.len() >= 5) else { continue };
             self.pixels += count;
-            self.saturated +=
-                pixels.iter().filter(|[_, grey]| *grey <= 0.0 || *grey >= 255.0).count();
+            let is_saturated = |[_, grey]: &[f64; 2]| *grey <= 0.0 || *grey >= 255.0;
+            // Where only the halos are that sharpening puts beside an edge, black and white are seen beyond them.
+            if pixels.first().is_some_and(is_saturated) || pixels.last().is_some_and(is_saturated) {
+                self.saturated += pixels.iter().filter(|pixel| is_saturated(pixel)).count();
+            }
             sample.measurement = self.measure(&edge, pixels);
         }
     }
@@ -576,7 +613,8 @@ impl EdgeFit<'_> {
         // wrong.
         let scatter = scatter / (weight - UNKNOWNS as f64).max(1.0);
         let inverse = equations.matrix.cholesky()?.inverse();
-        let covariance = inverse.fixed_view::<8, 8>(0, 0) * noise.max(scatter);
+        let mut covariance = inverse.fixed_view::<8, 8>(0, 0) * noise.max(scatter);
+        widen(&mut covariance, &inverse, &(inverse * equations.right), edges);
         let model = PhotometricModel {
             black: black / weight,
             contrast: contrast / weight,
@@ -586,8 +624,8 @@ impl EdgeFit<'_> {
         };
         let residual = noise.sqrt() / model.contrast;
         let is_shift_known = false;
-        let (homography, response) = (self.homography, None);
-        Some(Fit { homography, covariance, model, residual, is_shift_known, response })
+        let (homography, response, shift_px) = (self.homography, None, 0.0);
+        Some(Fit { homography, covariance, model, residual, is_shift_known, shift_px, response })
     }
 }
 

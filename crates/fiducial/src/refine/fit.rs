@@ -2,7 +2,7 @@
 
 use geometry::{CameraModel, Pixel};
 use imaging::GrayView;
-use nalgebra::{Matrix2, SMatrix};
+use nalgebra::{Matrix2, SMatrix, SVector};
 
 use crate::optics::edge_response::PIXEL_VARIANCE;
 use crate::optics::homography::{CORNERS, Homography};
@@ -140,22 +140,34 @@ pub(crate) struct PixelSample {
     pub(crate) residual: f64,
 }
 
-/// Largest number of small cells across a [`Design`].
-pub(crate) const MAX_ACROSS: usize = 60;
+/// A square in small cells.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct SmallCells<'a> {
+    /// Cells across the square, and around it on each side.
+    pub(crate) across: usize,
+    pub(crate) margin: usize,
+    /// The share of white in each, row by row, those around the square included.
+    pub(crate) white: &'a [f64],
+}
 
 /// A square marker that does not consist of square cells of one colour.
 #[derive(Copy, Clone, Debug)]
 pub(crate) struct Design<'a> {
-    /// Small cells across the square, and around it on each side.
-    pub(crate) cells: usize,
-    pub(crate) margin: usize,
-    /// The share of white in each small cell, row by row.
-    pub(crate) white: &'a [[f64; MAX_ACROSS]; MAX_ACROSS],
+    /// In cells for an image that is linear in light, and in such as a camera's processing needs.
+    pub(crate) plain: SmallCells<'a>,
+    pub(crate) processed: SmallCells<'a>,
     /// Places on edges, in the square's coordinates, and the vector from there towards white up to the next
     /// edge.
     pub(crate) edges: &'a [[[f64; 2]; 2]],
     /// Distance from the square's outline to the next edge, in sides of the square.
     pub(crate) border: f64,
+}
+
+impl Design<'_> {
+    /// Whether a camera's processing needs narrower cells.
+    pub(crate) fn is_finer(&self) -> bool {
+        self.processed.across > self.plain.across
+    }
 }
 
 /// Light and blur of a marker.
@@ -189,6 +201,49 @@ pub(crate) struct Target<'a> {
     pub(crate) response: Option<ResponseEstimate>,
 }
 
+/// How strongly each part of a marker pulls at all that is fitted; together they are in balance.
+pub(crate) type Pulls<const N: usize> = [SVector<f64, N>; PARTS];
+
+/// Parts of a square: its outline, its middle and what is between, on each of four sides; those on opposite sides follow
+/// each other.
+const PARTS: usize = 12;
+
+pub(crate) fn no_pulls<const N: usize>() -> Pulls<N> {
+    [SVector::zeros(); PARTS]
+}
+
+/// The part at a place in the square's coordinates.
+pub(crate) fn part([a, b]: [f64; 2]) -> usize {
+    const BANDS: [f64; 2] = [0.55, 0.87];
+    let is_aside = a.abs() > b.abs();
+    let along = if is_aside { a } else { b };
+    let band = BANDS.iter().filter(|end| along.abs() > **end).count();
+    2 * (2 * band + usize::from(is_aside)) + usize::from(along > 0.0)
+}
+
+/// Widens the covariance of the first unknowns where the parts contradict each other by more than their noise, as on bent
+/// paper, or where the model of a camera's processing is not quite the camera's: what is near is off together. Then the
+/// parts, or opposite ones together, are what is independent (a cluster-robust covariance). `inverse` is that of the normal
+/// equations.
+pub(crate) fn widen_by_parts<const N: usize>(
+    covariance: &mut SMatrix<f64, 8, 8>,
+    inverse: &SMatrix<f64, N, N>,
+    pulls: &Pulls<N>,
+) {
+    let opposite: [_; PARTS / 2] = std::array::from_fn(|k| pulls[2 * k] + pulls[2 * k + 1]);
+    let mut wider = SVector::<f64, 8>::repeat(1.0);
+    for pulls in [&pulls[..], &opposite] {
+        let count = pulls.len() as f64;
+        for (i, wider) in wider.iter_mut().enumerate() {
+            let row = inverse.fixed_rows::<1>(i);
+            let squares: f64 = pulls.iter().map(|pull| (row * pull)[0].powi(2)).sum();
+            let variance = squares * count / (count - 1.0);
+            *wider = wider.max((variance / covariance[(i, i)]).sqrt());
+        }
+    }
+    covariance.component_mul_assign(&(wider * wider.transpose()));
+}
+
 /// The result of either refinement.
 #[derive(Clone, Debug)]
 pub(crate) struct Fit {
@@ -200,6 +255,8 @@ pub(crate) struct Fit {
     pub(crate) residual: f64,
     /// Whether a shift of all edges towards black, as by a tone curve, can be told from the square's size.
     pub(crate) is_shift_known: bool,
+    /// That shift, towards white; 0 where it was not fitted as such.
+    pub(crate) shift_px: f64,
     /// How the camera shows light, where that was fitted.
     pub(crate) response: Option<ResponseEstimate>,
 }

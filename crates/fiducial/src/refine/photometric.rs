@@ -9,21 +9,30 @@ use crate::optics::homography::Homography;
 use crate::optics::least_squares::{
     Damping, Influence, Next, NormalEquations, Problem, Review, Schedule, huber, minimise,
 };
-use crate::refine::fit::{Design, Fit, PhotometricModel, PixelSample, Scratch, Target};
+use crate::refine::fit::{
+    Design, Fit, PhotometricModel, PixelSample, Pulls, Scratch, Target, no_pulls, part,
+    widen_by_parts,
+};
 use crate::refine::pattern::Pattern;
-use crate::refine::prediction::{Bands, PatternGrid};
+use crate::refine::prediction::{Bands, PatternCells, PatternGrid};
 use crate::response::{Measured, ResponseEstimate};
 
 /// Homography (8), blur, black, contrast, shade (2), brightness beyond the pattern.
 const UNKNOWNS: usize = 14;
 /// The same with the camera's tone curve and sharpening.
 const UNKNOWNS_PROCESSED: usize = 16;
-/// A camera's processing is fitted when one step towards it lowers the cost by this share, and kept when the fit does.
-const MIN_RESPONSE_GAIN: f64 = 0.15;
-/// What is smaller is an error of the model, also of what is known.
-const MIN_RESPONSE: f64 = 0.2;
-/// Smallest tone curve that is better fitted to all grey values than left out along the edges; sharpening moves no edge.
-const MIN_CURVE: f64 = 0.4;
+/// From when on a camera's processing is fitted.
+#[derive(Copy, Clone, Debug)]
+struct Least {
+    /// One step towards it lowers the cost by this share; it is kept when the fit does.
+    gain: f64,
+    /// What is smaller is an error of the model, also of what is known.
+    response: f64,
+}
+
+const LEAST: Least = Least { gain: 0.15, response: 0.2 };
+/// The same where an outline was fitted alone, of which a weak tone curve changes the size as well; sharpening moves no edge.
+const LEAST_OF_OUTLINE: Least = Least { gain: 0.05, response: 0.1 };
 /// One of this many pixels tells.
 const RESPONSE_STRIDE: usize = 4;
 /// Prior information on the brightness beyond the pattern, in units of one pixel's: it is that of white, give
@@ -57,12 +66,17 @@ const SCHEDULE: Schedule = Schedule {
     fails_without_equations: true,
 };
 
+/// For the last steps with a finer grid.
+const FINER_SCHEDULE: Schedule = Schedule { max_steps: 3, ..SCHEDULE };
+
 /// The homography at which the predicted marker agrees with the image best.
 pub(crate) fn fit(target: Target<'_>, pattern: &Pattern, scratch: &mut Scratch) -> Option<Fit> {
     let cell_px = target.start.shortest_side_px() / pattern.cells() as f64;
     // A wide blur at first attracts cells that are half a cell off.
     let spread_px = (0.4 * cell_px).clamp(0.7, 1.2);
-    fit_grid(target, &PatternGrid::from_pattern(pattern, target.lens), spread_px, scratch)
+    let cells = PatternCells::new(pattern);
+    let grid = PatternGrid::from_pattern(&cells, target.lens);
+    fit_grid(target, &grid, None, spread_px, scratch)
 }
 
 /// The same for a marker of another design.
@@ -71,7 +85,10 @@ pub(crate) fn fit_design(
     design: &Design<'_>,
     scratch: &mut Scratch,
 ) -> Option<Fit> {
-    fit_grid(target, &PatternGrid::from_design(design, target.lens), 0.7, scratch)
+    let grids =
+        [design.plain, design.processed].map(|it| PatternGrid::from_design(it, target.lens));
+    let finer = design.is_finer().then_some(&grids[1]);
+    fit_grid(target, &grids[0], finer, 0.7, scratch)
 }
 
 /// The fit of a design with a camera's processing, near a fit along its outline alone, of which a tone curve changes the
@@ -82,7 +99,7 @@ pub(crate) fn fit_processed_design(
     near: &Fit,
     scratch: &mut Scratch,
 ) -> Option<Fit> {
-    let grid = PatternGrid::from_design(design, target.lens);
+    let grid = PatternGrid::from_design(design.processed, target.lens);
     let homography = near.homography;
     let light = PhotometricModel { beyond: 0.0, shade: [0.0; 2], ..near.model };
     let half_px = homography.shortest_side_px() / 2.0;
@@ -92,13 +109,17 @@ pub(crate) fn fit_processed_design(
     let pixels = &mut scratch.pixels;
     grid.gather(target, &homography, light.spread_px, MAX_PIXELS[1], pixels)?;
     state.expose(&grid, pixels)?;
-    let (state, equations) = processed(&state, &grid, target.response, scratch)?;
-    (state.response.curve > MIN_CURVE).then(|| state.result(&equations))?
+    let (state, equations) = processed(&state, &grid, target.response, LEAST_OF_OUTLINE, scratch)?;
+    let is_curved = state.response.curve > LEAST_OF_OUTLINE.response;
+    is_curved.then(|| state.processed_result(&equations, &grid, &mut scratch.pixels))?
 }
 
+/// The fit without a camera's processing, or, where there is one, with it, and its last steps with a `finer` grid if it
+/// needs one.
 fn fit_grid(
     target: Target<'_>,
-    grid: &PatternGrid,
+    grid: &PatternGrid<'_>,
+    finer: Option<&PatternGrid<'_>>,
     spread_px: f64,
     scratch: &mut Scratch,
 ) -> Option<Fit> {
@@ -134,9 +155,18 @@ fn fit_grid(
             break;
         }
     }
-    match processed(&state, grid, known_response, scratch) {
-        Some((state, equations)) => state.result(&equations),
-        None => state.result(&solved?),
+    let Some((state, equations)) = processed(&state, grid, known_response, LEAST, scratch) else {
+        return state.result(&solved?);
+    };
+    let Some(finer) = finer else {
+        return state.processed_result(&equations, grid, &mut scratch.pixels);
+    };
+    let Scratch { pixels, magnitudes, .. } = &mut *scratch;
+    let settled_px = SETTLED_PX[1];
+    let mut problem = Photometric { grid: finer, pixels, magnitudes, settled_px };
+    match minimise(&mut problem, state, &FINER_SCHEDULE) {
+        Some(last) => last.place.processed_result(&last.equations, finer, &mut scratch.pixels),
+        None => state.processed_result(&equations, grid, &mut scratch.pixels),
     }
 }
 
@@ -144,8 +174,9 @@ fn fit_grid(
 /// that is `known` to have none.
 fn processed(
     plain: &State,
-    grid: &PatternGrid,
+    grid: &PatternGrid<'_>,
     known: Option<ResponseEstimate>,
+    least: Least,
     scratch: &mut Scratch,
 ) -> Option<(State, NormalEquations<UNKNOWNS_PROCESSED, Residuals>)> {
     // What the narrow loss takes for outliers may be the processing.
@@ -155,7 +186,7 @@ fn processed(
     let settled_px = SETTLED_PX[1];
     if let Some(known) = known {
         let response = CameraResponse::known(&known);
-        if response.curve.abs().max(response.sharpening) < MIN_RESPONSE {
+        if response.curve.abs().max(response.sharpening) < least.response {
             return None;
         }
         let start = State { response, known: Some(known), ..start };
@@ -170,7 +201,7 @@ fn processed(
     let of_plain = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|i, j| first.matrix[(i, j)]);
     let right = SVector::<f64, UNKNOWNS>::from_fn(|i, _| first.right[i]);
     let plain_gain = right.dot(&of_plain.cholesky()?.solve(&right));
-    if gain - plain_gain < MIN_RESPONSE_GAIN * (first.cost - plain_gain) {
+    if gain - plain_gain < least.gain * (first.cost - plain_gain) {
         return None;
     }
     let mut problem = Photometric::<UNKNOWNS_PROCESSED> { grid, pixels, magnitudes, settled_px };
@@ -181,7 +212,7 @@ fn processed(
     });
     let CameraResponse { curve, sharpening } = found.response;
     let is_processed =
-        curve.abs().max(sharpening) > MIN_RESPONSE && after? < (1.0 - MIN_RESPONSE_GAIN) * before?;
+        curve.abs().max(sharpening) > least.response && after? < (1.0 - least.gain) * before?;
     is_processed.then_some((minimum.place, minimum.equations))
 }
 
@@ -265,7 +296,7 @@ impl Residuals {
 
 /// The least-squares problem of one round.
 struct Photometric<'a, const N: usize> {
-    grid: &'a PatternGrid,
+    grid: &'a PatternGrid<'a>,
     pixels: &'a mut [PixelSample],
     magnitudes: &'a mut Vec<f64>,
     settled_px: f64,
@@ -327,7 +358,7 @@ impl<const N: usize> Problem<N> for Photometric<'_, N> {
 
 impl State {
     /// Sets black and contrast to those that fit best with everything else as it is.
-    fn expose(&mut self, grid: &PatternGrid, pixels: &[PixelSample]) -> Option<()> {
+    fn expose(&mut self, grid: &PatternGrid<'_>, pixels: &[PixelSample]) -> Option<()> {
         let map = grid.map(&self.homography, self.light.spread_px);
         let mut work = [Bands::NONE; 2];
         let mut exposure = ClippedExposure::new(255.0);
@@ -368,16 +399,43 @@ impl State {
             model: self.light,
             residual: variance.sqrt() / contrast,
             is_shift_known: true,
+            shift_px: 0.0,
             response: response.flatten(),
         })
+    }
+
+    /// The same with a camera's processing, of which the model is not quite the camera's.
+    fn processed_result(
+        &self,
+        equations: &NormalEquations<UNKNOWNS_PROCESSED, Residuals>,
+        grid: &PatternGrid<'_>,
+        pixels: &mut [PixelSample],
+    ) -> Option<Fit> {
+        let mut fit = self.result(equations)?;
+        let mut pulls = no_pulls();
+        self.equations_of(grid, pixels, 1, Some(&mut pulls))?;
+        let inverse = inverse(&equations.matrix)?;
+        widen_by_parts(&mut fit.covariance, &inverse, &pulls);
+        Some(fit)
     }
 
     /// The normal equations over one of `stride` pixels.
     fn equations<const N: usize>(
         &self,
-        grid: &PatternGrid,
+        grid: &PatternGrid<'_>,
         pixels: &mut [PixelSample],
         stride: usize,
+    ) -> Option<NormalEquations<N, Residuals>> {
+        self.equations_of(grid, pixels, stride, None)
+    }
+
+    /// The same, with the pulls of the marker's parts.
+    fn equations_of<const N: usize>(
+        &self,
+        grid: &PatternGrid<'_>,
+        pixels: &mut [PixelSample],
+        stride: usize,
+        mut pulls: Option<&mut Pulls<N>>,
     ) -> Option<NormalEquations<N, Residuals>> {
         // The upper half.
         let mut matrix = [[0.0; N]; N];
@@ -419,6 +477,14 @@ impl State {
                 residuals.saturated += 1;
                 continue;
             }
+            let shown = grey.clamp(0.0, 255.0);
+            if N == UNKNOWNS_PROCESSED && shown != grey {
+                // Compression comes after saturation, so that such pixels differ a little and tell nothing.
+                pixel.residual = f64::NAN;
+                residuals.saturated += 1;
+                total_cost += self.loss.influence(pixel.grey - shown).cost;
+                continue;
+            }
             let residual = pixel.grey - grey;
             pixel.residual = residual;
             let Influence { weight, cost } = self.loss.influence(residual);
@@ -441,6 +507,10 @@ impl State {
             gradient[13] = shade * prediction.beyond;
             for (entry, by) in gradient.iter_mut().skip(UNKNOWNS).zip(by_response) {
                 *entry = shade * light.contrast * by;
+            }
+            if let Some(pull) = pulls.as_mut().and_then(|all| all.get_mut(part(prediction.square)))
+            {
+                *pull += SVector::from(gradient) * (weight * residual);
             }
             for (i, row) in matrix.iter_mut().enumerate() {
                 let scaled = weight * gradient[i];

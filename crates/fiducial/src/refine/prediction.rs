@@ -11,8 +11,8 @@ use imaging::GrayView;
 use crate::optics::edge_response::{EdgeResponse, MAX_SIGMAS, pixel_kurtosis};
 use crate::optics::homography::{CORNERS, Homography, Inverse};
 use crate::optics::undistort::Undistortion;
-use crate::refine::fit::{Design, MAX_ACROSS, PixelSample, Target};
-use crate::refine::pattern::Pattern;
+use crate::refine::fit::{PixelSample, SmallCells, Target};
+use crate::refine::pattern::{MAX_CELLS, Pattern};
 
 /// More pixels than this must be near the marker: twice the number of unknowns.
 const MIN_PIXELS: usize = 28;
@@ -22,15 +22,43 @@ const MAX_BANDS: usize = 28;
 const MAX_UNKNOWN: f64 = 0.03;
 const MAX_BEYOND: f64 = 0.1;
 
+/// The colours of a [`Pattern`]'s cells, row by row.
+pub(crate) struct PatternCells {
+    cells: usize,
+    across: usize,
+    white: [f64; MAX_CELLS * MAX_CELLS],
+    unknown: [f64; MAX_CELLS * MAX_CELLS],
+}
+
+impl PatternCells {
+    pub(crate) fn new(pattern: &Pattern) -> Self {
+        let across = pattern.across();
+        let mut white = [0.0; MAX_CELLS * MAX_CELLS];
+        let mut unknown = [0.0; MAX_CELLS * MAX_CELLS];
+        for (index, (white, unknown)) in
+            white.iter_mut().zip(&mut unknown).enumerate().take(across * across)
+        {
+            match pattern.is_white(index % across, index / across) {
+                Some(is_white) => *white = f64::from(u8::from(is_white)),
+                None => *unknown = 1.0,
+            }
+        }
+        Self { cells: pattern.cells(), across, white, unknown }
+    }
+}
+
 /// The cells of a marker, for look-up.
-pub(crate) struct PatternGrid {
+pub(crate) struct PatternGrid<'a> {
     across: usize,
     /// Cells from the middle to the square's side, and to the pattern's end.
     half: f64,
     middle: f64,
-    white: [[f64; MAX_ACROSS]; MAX_ACROSS],
-    unknown: [[f64; MAX_ACROSS]; MAX_ACROSS],
-    has_unknown: bool,
+    /// The share of white in each cell, row by row.
+    white: &'a [f64],
+    /// The same of unknown colour; empty where all are known.
+    unknown: &'a [f64],
+    /// Whether cells are small parts of shapes: each differs little from the next, also where an edge is near.
+    is_design: bool,
     /// Derivatives of the ideal image by the pixels.
     undistortion: [[f64; 2]; 2],
     response: EdgeResponse,
@@ -82,6 +110,23 @@ struct Blur {
     correlation: f64,
 }
 
+/// One of `interval` places of a plane, evenly spread over it.
+struct Lattice {
+    interval: usize,
+    shift: usize,
+}
+
+impl Lattice {
+    fn new(interval: usize) -> Self {
+        // The golden section: rows are shifted by what is never near a simple fraction of the interval.
+        Self { interval, shift: (0.618 * interval as f64).round() as usize }
+    }
+
+    fn has(&self, column: usize, row: usize) -> bool {
+        (column + row * self.shift) % self.interval == 0
+    }
+}
+
 /// From the ideal image to the pattern.
 pub(crate) struct PatternMap {
     inverse: Inverse,
@@ -90,33 +135,23 @@ pub(crate) struct PatternMap {
     blur: Option<Blur>,
 }
 
-impl PatternGrid {
-    pub(crate) fn from_pattern(pattern: &Pattern, lens: &Undistortion<'_>) -> Self {
-        let across = pattern.across();
-        let mut white = [[0.0; MAX_ACROSS]; MAX_ACROSS];
-        let mut unknown = [[0.0; MAX_ACROSS]; MAX_ACROSS];
-        for y in 0..across {
-            for x in 0..across {
-                match pattern.is_white(x, y) {
-                    Some(is_white) => white[y][x] = f64::from(u8::from(is_white)),
-                    None => unknown[y][x] = 1.0,
-                }
-            }
-        }
-        Self::new(lens, [pattern.cells(), across], white, unknown)
+impl<'a> PatternGrid<'a> {
+    pub(crate) fn from_pattern(pattern: &'a PatternCells, lens: &Undistortion<'_>) -> Self {
+        let PatternCells { cells, across, white, unknown } = pattern;
+        let unknown = if unknown.iter().any(|u| *u > 0.0) { &unknown[..] } else { &[] };
+        Self::new(lens, [*cells, *across], white, unknown)
     }
 
-    pub(crate) fn from_design(design: &Design<'_>, lens: &Undistortion<'_>) -> Self {
-        let across = (design.cells + 2 * design.margin).min(MAX_ACROSS);
-        let known = [[0.0; MAX_ACROSS]; MAX_ACROSS];
-        Self::new(lens, [design.cells, across], *design.white, known)
+    pub(crate) fn from_design(cells: SmallCells<'a>, lens: &Undistortion<'_>) -> Self {
+        let all = cells.across + 2 * cells.margin;
+        Self { is_design: true, ..Self::new(lens, [cells.across, all], cells.white, &[]) }
     }
 
     fn new(
         lens: &Undistortion<'_>,
         [cells, across]: [usize; 2],
-        white: [[f64; MAX_ACROSS]; MAX_ACROSS],
-        unknown: [[f64; MAX_ACROSS]; MAX_ACROSS],
+        white: &'a [f64],
+        unknown: &'a [f64],
     ) -> Self {
         let slope = lens.jacobian();
         Self {
@@ -125,7 +160,7 @@ impl PatternGrid {
             middle: across as f64 / 2.0,
             white,
             unknown,
-            has_unknown: unknown.iter().flatten().any(|u| *u > 0.0),
+            is_design: false,
             undistortion: [[slope[(0, 0)], slope[(0, 1)]], [slope[(1, 0)], slope[(1, 1)]]],
             response: EdgeResponse::new(),
         }
@@ -152,18 +187,18 @@ impl PatternGrid {
         // Of very large ones most pixels are not even mapped.
         let skipped = (every / 8).max(1);
         let thinned = every / skipped;
-        let mut turn = 0;
+        // Lattices that cover both axes evenly: counted along the rows, the pixels taken would be those of a few columns.
+        let [near, far] = [thinned, 4 * thinned].map(|interval| Lattice::new(interval));
         let mut work = [Bands::NONE; 2];
         for y in top..bottom {
             let row = view.row(y);
             let columns = row.iter().enumerate().take(right).skip(left + y * 5 % skipped);
-            for (x, grey) in columns.step_by(skipped) {
+            for (column, (x, grey)) in columns.step_by(skipped).enumerate() {
                 let ideal = lens.undistort(Pixel::new(x as f64, y as f64))?;
                 let ideal = [ideal[0] - origin[0], ideal[1] - origin[1]];
                 let Some(point) = self.point(&map, ideal) else { continue };
-                turn += 1;
-                let interval = if self.is_near_edge(&point) { thinned } else { 4 * thinned };
-                if thinned > 1 && turn % interval != 0
+                let lattice = if self.is_near_edge(&point) { &near } else { &far };
+                if thinned > 1 && !lattice.has(column, y)
                     || self.beyond(&point) > MAX_BEYOND
                     || self.unknown_at(&point, &mut work) > MAX_UNKNOWN
                 {
@@ -176,10 +211,22 @@ impl PatternGrid {
     }
 
     /// Whether the nearest line between columns, or between rows, has black on one side and white on the
-    /// other.
+    /// other; of a design, whether white begins or ends within the blur's reach.
     fn is_near_edge(&self, point: &BlurredPoint) -> bool {
         const REACH: f64 = 1.8;
         let last = self.across - 1;
+        let white = |row: usize, column: usize| self.white.get(row * self.across + column);
+        if self.is_design {
+            let line = |axis: usize| {
+                let (at, reach) = (point.cells[axis], REACH * point.blur.sigma[axis]);
+                [at - reach, at, at + reach].map(|at| (at.max(0.0) as usize).min(last))
+            };
+            let [[left, column, right], [top, row, bottom]] = [line(0), line(1)];
+            return white(row, left) != white(row, right)
+                || white(top, column) != white(bottom, column)
+                || white(row, left) != white(row, column)
+                || white(top, column) != white(row, column);
+        }
         let place = |axis: usize| {
             let at = point.cells[axis].max(0.0);
             let nearest = (at + 0.5) as usize;
@@ -187,8 +234,8 @@ impl PatternGrid {
             ((at as usize).min(last), nearest, is_near && nearest > 0 && nearest <= last)
         };
         let ((column, x, upright), (row, y, level)) = (place(0), place(1));
-        upright && self.white[row][x - 1] != self.white[row][x]
-            || level && self.white[y - 1][column] != self.white[y][column]
+        upright && white(row, x - 1) != white(row, x)
+            || level && white(y - 1, column) != white(y, column)
     }
 
     /// First column and row around the pattern within the image, and those after the last.
@@ -297,7 +344,7 @@ impl PatternGrid {
     }
 
     #[inline]
-    fn both_bands<'a>(&self, point: &BlurredPoint, work: &'a mut [Bands; 2]) -> &'a [Bands; 2] {
+    fn both_bands<'b>(&self, point: &BlurredPoint, work: &'b mut [Bands; 2]) -> &'b [Bands; 2] {
         for (axis, bands) in work.iter_mut().enumerate() {
             self.bands(point.cells[axis], &point.blur, axis, bands);
         }
@@ -306,13 +353,17 @@ impl PatternGrid {
 
     /// The share of a point's light that comes from cells of unknown colour.
     fn unknown_at(&self, point: &BlurredPoint, work: &mut [Bands; 2]) -> f64 {
-        if !self.has_unknown {
+        if self.unknown.is_empty() {
             return 0.0;
         }
         let mut sum = 0.0;
         let [columns, rows] = self.both_bands(point, work);
-        for (row, [share, ..]) in
-            self.unknown.iter().skip(rows.first).zip(&rows.share).take(rows.count)
+        for (row, [share, ..]) in self
+            .unknown
+            .chunks_exact(self.across)
+            .skip(rows.first)
+            .zip(&rows.share)
+            .take(rows.count)
         {
             let cells = row.iter().skip(columns.first).zip(&columns.share).take(columns.count);
             sum += share * cells.map(|(unknown, [share, ..])| unknown * share).sum::<f64>();
@@ -347,7 +398,7 @@ impl PatternGrid {
         let (mut w, mut wx, mut wy, mut wxy, mut wxx, mut wyy, mut wxxyy) =
             (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
         for (row, [share, slope, curve]) in
-            self.white.iter().skip(rows.first).zip(&rows.share).take(rows.count)
+            self.white.chunks_exact(self.across).skip(rows.first).zip(&rows.share).take(rows.count)
         {
             let (mut r, mut rx, mut rxx) = (0.0, 0.0, 0.0);
             for (white, [share, slope, curve]) in

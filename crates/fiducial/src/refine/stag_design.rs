@@ -3,18 +3,19 @@
 use markers::stag_code::{DISC_RADIUS, QUIET_ZONE};
 use markers::{Drawing, Family, Ink, Marker, Shape};
 
-use crate::refine::fit::{Design, MAX_ACROSS};
+use crate::refine::fit::{Design, SmallCells};
 
-/// Small cells across the square, around it, and in all; the square's outline is a border of cells. Their
-/// width must be well below that of the blur; for squares with a side below `COARSE_PX` they are twice as
-/// wide.
-const CELLS: usize = 48;
-const MARGIN: usize = (CELLS as f64 * QUIET_ZONE) as usize;
-const ACROSS: usize = CELLS + 2 * MARGIN;
-const _: () = assert!(ACROSS <= MAX_ACROSS);
-const COARSE_PX: f64 = 14.0;
-/// Samples of a small cell in each direction.
-const SAMPLES: usize = 8;
+/// Small cells across the square; its outline is a border of cells. Their width must be well below that of the blur, or
+/// the edges of disc and dots are softer than the outline. The narrower ones are for squares whose side is so many pixels
+/// or more; a tone curve and sharpening take small differences of blur for their own.
+const CELLS: [usize; SCALES] = [24, 48, 96];
+const FROM_PX: [f64; SCALES] = [0.0, 14.0, 40.0];
+const PROCESSED_FROM_PX: [f64; SCALES] = [0.0, 14.0, 18.0];
+const SCALES: usize = 3;
+const FINEST: usize = CELLS[SCALES - 1];
+/// Samples of one of the narrowest cells in each direction.
+const SAMPLES: usize = 4;
+const ACROSS: usize = FINEST + 2 * margin(FINEST);
 const FINE: usize = ACROSS * SAMPLES;
 /// Places on each side, and on the disc's edge.
 const PER_SIDE: usize = 36;
@@ -29,9 +30,8 @@ const RIM: f64 = 0.1;
 pub(crate) struct StagDesign {
     pub(crate) family: Family,
     pub(crate) id: u32,
-    white: Box<[[f64; MAX_ACROSS]; MAX_ACROSS]>,
-    /// The same with cells twice as wide.
-    coarse: Box<[[f64; MAX_ACROSS]; MAX_ACROSS]>,
+    /// The share of white in each cell, row by row, for each width of the cells.
+    white: [Vec<f64>; SCALES],
     /// For black on white, and for white on black.
     edges: [Vec<[[f64; 2]; 2]>; 2],
 }
@@ -44,11 +44,12 @@ impl StagDesign {
     /// `None` for an id that the family does not have.
     pub(crate) fn new(family: Family, id: u32) -> Option<Self> {
         let drawing = Drawing::new(&Marker { family, id: Some(id), size_m: None }, 1.0)?;
-        let white = white(&drawing);
-        let coarse = halved(&white);
+        let finest = white(&drawing);
+        let fine = halved(&finest);
+        let white = [halved(&fine), fine, finest];
         let black = edges();
         let bright = black.iter().map(|[place, [x, y]]| [*place, [-x, -y]]).collect();
-        Some(Self { family, id, white, coarse, edges: [black, bright] })
+        Some(Self { family, id, white, edges: [black, bright] })
     }
 
     /// For a square with sides of this length, printed white on black when `inverted`.
@@ -57,19 +58,25 @@ impl StagDesign {
         let edges = &self.edges[usize::from(inverted)];
         let edges = if is_wide { &edges[..] } else { &edges[..4 * PER_SIDE] };
         let border = BORDER / 2.0;
-        if side_px < COARSE_PX {
-            let (cells, margin) = (CELLS / 2, MARGIN / 2);
-            Design { cells, margin, white: &self.coarse, edges, border }
-        } else {
-            Design { cells: CELLS, margin: MARGIN, white: &self.white, edges, border }
-        }
+        let cells = |from_px: [f64; SCALES]| {
+            let scale = from_px.iter().rposition(|from_px| side_px >= *from_px).unwrap_or(0);
+            let across = CELLS[scale];
+            SmallCells { across, margin: margin(across), white: &self.white[scale] }
+        };
+        let (plain, processed) = (cells(FROM_PX), cells(PROCESSED_FROM_PX));
+        Design { plain, processed, edges, border }
     }
 }
 
-/// The share of white in each small cell.
-fn white(drawing: &Drawing) -> Box<[[f64; MAX_ACROSS]; MAX_ACROSS]> {
+/// Cells on each side of so many across the square.
+const fn margin(cells: usize) -> usize {
+    (cells as f64 * QUIET_ZONE) as usize
+}
+
+/// The share of white in each of the narrowest cells.
+fn white(drawing: &Drawing) -> Vec<f64> {
     let mut fine = vec![true; FINE * FINE];
-    let per_unit = (CELLS * SAMPLES) as f64;
+    let per_unit = (FINEST * SAMPLES) as f64;
     let middle = FINE as f64 / 2.0;
     // The samples whose middles lie between two places.
     let range = |low: f64, high: f64| {
@@ -95,21 +102,21 @@ fn white(drawing: &Drawing) -> Box<[[f64; MAX_ACROSS]; MAX_ACROSS]> {
             }
         }
     }
-    let mut white = Box::new([[0.0; MAX_ACROSS]; MAX_ACROSS]);
+    let mut white = vec![0.0; ACROSS * ACROSS];
     for (index, is_white) in fine.iter().enumerate() {
         let (x, y) = (index % FINE / SAMPLES, index / FINE / SAMPLES);
-        white[y][x] += f64::from(u8::from(*is_white)) / (SAMPLES * SAMPLES) as f64;
+        white[y * ACROSS + x] += f64::from(u8::from(*is_white)) / (SAMPLES * SAMPLES) as f64;
     }
     white
 }
 
 /// The same with cells twice as wide.
-fn halved(white: &[[f64; MAX_ACROSS]; MAX_ACROSS]) -> Box<[[f64; MAX_ACROSS]; MAX_ACROSS]> {
-    let mut coarse = Box::new([[0.0; MAX_ACROSS]; MAX_ACROSS]);
-    for (y, row) in white.iter().enumerate() {
-        for (x, share) in row.iter().enumerate() {
-            coarse[y / 2][x / 2] += share / 4.0;
-        }
+fn halved(white: &[f64]) -> Vec<f64> {
+    let across = white.len().isqrt();
+    let mut coarse = vec![0.0; white.len() / 4];
+    for (index, share) in white.iter().enumerate() {
+        let (x, y) = (index % across, index / across);
+        coarse[y / 2 * (across / 2) + x / 2] += share / 4.0;
     }
     coarse
 }
@@ -145,21 +152,24 @@ mod tests {
         let drawing = Drawing::new(&marker, 1.0).unwrap();
         let design = StagDesign::new(Family::StagHd21, 3).unwrap();
         let samples = 20;
-        // Every seventh cell, to save time.
-        for cell in (0..ACROSS * ACROSS).step_by(7) {
-            let (x, y) = (cell % ACROSS, cell / ACROSS);
-            let place = |cell: usize, k: usize| {
-                let offset = (k as f64 + 0.5) / f64::from(samples);
-                (cell as f64 + offset - ACROSS as f64 / 2.0) / CELLS as f64
-            };
-            let all =
-                (0..samples as usize).flat_map(|i| (0..samples as usize).map(move |j| (i, j)));
-            let white =
-                all.filter(|(i, j)| drawing.ink_at(place(x, *i), -place(y, *j)) == Ink::White);
-            let share = white.count() as f64 / f64::from(samples * samples);
-            assert!((share - design.white[y][x]).abs() < 0.12, "{x} {y}");
+        for side_px in [10.0, 30.0, 60.0] {
+            let cells = design.design(side_px, false).plain;
+            let across = cells.across + 2 * cells.margin;
+            assert_eq!(cells.white.len(), across * across);
+            // Every seventh cell, to save time.
+            for (index, white) in cells.white.iter().enumerate().step_by(7) {
+                let (x, y) = (index % across, index / across);
+                let place = |cell: usize, k: usize| {
+                    let offset = (k as f64 + 0.5) / f64::from(samples);
+                    (cell as f64 + offset - across as f64 / 2.0) / cells.across as f64
+                };
+                let all =
+                    (0..samples as usize).flat_map(|i| (0..samples as usize).map(move |j| (i, j)));
+                let seen =
+                    all.filter(|(i, j)| drawing.ink_at(place(x, *i), -place(y, *j)) == Ink::White);
+                let share = seen.count() as f64 / f64::from(samples * samples);
+                assert!((share - white).abs() < 0.13, "{side_px} {x} {y}: {share} {white}");
+            }
         }
-        let sum = |white: &[[f64; MAX_ACROSS]; MAX_ACROSS]| white.iter().flatten().sum::<f64>();
-        assert!((sum(&design.white) - 4.0 * sum(&design.coarse)).abs() < 1e-6);
     }
 }
