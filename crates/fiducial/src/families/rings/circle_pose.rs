@@ -38,6 +38,8 @@ const HUBER_PX: f64 = 0.3;
 /// Lower bound of the edges' standard deviation, in pixels. Errors common to all edges, such as the blur of
 /// thin rings, do not show in their scatter.
 const MIN_EDGE_ERROR_PX: f64 = 0.05;
+/// Circles that differ by more, as a ratio of variances, do so by no chance: one of a thousand sets of six does.
+const MAX_CHANCE: f64 = 4.0;
 /// Fewer edge points do not determine a pose.
 const MIN_EDGE_POINTS: usize = 8;
 /// Largest turn of the normal in one step, in radians.
@@ -202,9 +204,27 @@ impl CirclePose {
     ) -> Option<Matrix6<f64>> {
         let equations = EdgeFit { points, camera }.linearised(self)?;
         let error_px = self.rms_px(points, camera)?.max(MIN_EDGE_ERROR_PX);
-        let of_step = equations.matrix.try_inverse()? * (error_px * error_px);
+        let wider = self.disagreement(points, camera, error_px).filter(|it| *it > MAX_CHANCE);
+        let of_step =
+            equations.matrix.try_inverse()? * (error_px * error_px * wider.unwrap_or(1.0));
         let covariance = self.full_covariance(&of_step);
         covariance.iter().all(|c| c.is_finite()).then_some(covariance)
+    }
+
+    /// How much more the circles differ from each other than edge points with this standard deviation let them, as a ratio of
+    /// variances: where light, or a camera's processing, moves all of a circle's edges together.
+    fn disagreement(
+        &self,
+        points: &[EdgePoint],
+        camera: &CameraModel,
+        error_px: f64,
+    ) -> Option<f64> {
+        let [circles, squares] = self
+            .median_residuals(points, camera)
+            .fold([0.0, 0.0], |[circles, squares], (_, off)| [circles + 1.0, squares + off * off]);
+        let per_circle = points.len() as f64 / circles;
+        let ratio = per_circle * squares / (circles - 1.0) / (error_px * error_px);
+        (circles > 1.0 && ratio.is_finite()).then_some(ratio)
     }
 
     /// Covariance of centre (m) and rotation vector (rad), from that of the centre and of the normal along
@@ -529,6 +549,11 @@ mod tests {
                 assert!((shift_px - into_black_px).abs() < 0.03, "{shift_px} {into_black_px}");
             }
         }
+        // Were edges so far off by chance, each by itself, the circles would be far closer to each other.
+        let range_variance =
+            |into_black_px| truth.covariance(&points(into_black_px), &camera).unwrap()[(2, 2)];
+        let by_chance = (0.4f64 / MIN_EDGE_ERROR_PX).powi(2) * range_variance(0.0);
+        assert!(range_variance(0.4) > 10.0 * by_chance);
         let two = points(0.4).into_iter().take(80).collect::<Vec<_>>();
         assert_eq!(truth.shift_into_black_px(&two, &camera), None);
     }
