@@ -12,7 +12,8 @@ pub enum Print {
     Sharp,
     /// In square dots.
     Dots {
-        /// Number of dots along the marker's size.
+        /// Number of dots along the marker's size, rounded: a printer's file has them, so that size and place of the print
+        /// are the marker's, and only what is inside is a little off.
         per_size: f64,
     },
     /// On paper that is bent; its centre stays where it is.
@@ -72,8 +73,7 @@ impl Print {
         match self {
             Self::Sharp => vec![pad],
             Self::Dots { per_size } => {
-                let size_m = crate::set::SIZE_M;
-                let count = (2.0 * half_m / size_m * per_size).round().max(1.0) as usize;
+                let (half_m, count) = dots(half_m, per_size);
                 vec![PadInScene { drawing: dotted(&pad.drawing, [0.0; 2], half_m, count), ..pad }]
             }
             Self::Bent(bend) => {
@@ -87,6 +87,16 @@ impl Print {
             }
         }
     }
+}
+
+/// Half the edge and the number of dots along the edge of a square that covers a drawing, of which the marker has so many.
+fn dots(half_m: f64, per_size: f64) -> (f64, usize) {
+    let size_m = crate::set::SIZE_M;
+    let inside = per_size.round().max(1.0);
+    let dot_m = size_m / inside;
+    let beyond = ((half_m - 0.5 * size_m) / dot_m).ceil().max(0.0);
+    let count = inside + 2.0 * beyond;
+    (0.5 * count * dot_m, count as usize)
 }
 
 /// The square piece about a place of a bent print.
@@ -149,10 +159,13 @@ mod tests {
     fn dots_have_the_ink_of_their_middle() {
         let pad = pad();
         let sharp = pad.drawing.clone();
-        let [dotted] = Print::Dots { per_size: 40.0 }.pieces(pad).try_into().unwrap();
-        let count = (2.0 * sharp.half_extent_m / crate::set::SIZE_M * 40.0).round() as usize;
-        let dot_m = 2.0 * sharp.half_extent_m / count as f64;
-        let middle = |index: usize| -sharp.half_extent_m + (index as f64 + 0.5) * dot_m;
+        let [dotted] = Print::Dots { per_size: 40.3 }.pieces(pad).try_into().unwrap();
+        let (half_m, count) = dots(sharp.half_extent_m, 40.3);
+        let dot_m = 2.0 * half_m / count as f64;
+        // The marker's edge is a dot's.
+        assert!((crate::set::SIZE_M / dot_m - 40.0).abs() < 1e-9 && half_m >= sharp.half_extent_m);
+        assert!((0.5 * crate::set::SIZE_M / dot_m + 0.5 * count as f64).fract().abs() < 1e-9);
+        let middle = |index: usize| -half_m + (index as f64 + 0.5) * dot_m;
         for index in 0..count * count {
             let (x, y) = (middle(index % count), middle(index / count));
             assert_eq!(dotted.drawing.ink_at(x, y), sharp.ink_at(x, y), "{x} {y}");
