@@ -100,8 +100,8 @@ struct MarkersArgs {
     /// rendered again.
     #[arg(short, long, value_name = "DIR", default_value = "experiment-markers")]
     output: PathBuf,
-    /// Only this set: positions, far, landing, adverse, tilt, blur, noise, light, rolling, shade, textured,
-    /// tracking or negatives. May be repeated.
+    /// Only this set: positions, far, landing, adverse, tilt, blur, noise, light, rolling, shade, ground, cut, textured,
+    /// tracking, negatives or circles. May be repeated.
     #[arg(long = "set", value_name = "NAME")]
     sets: Vec<Set>,
     /// Only this family. May be repeated.

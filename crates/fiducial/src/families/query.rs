@@ -16,8 +16,9 @@ use crate::response::ResponseEstimate;
 const MIN_SEGMENT_CORNER_PX: f64 = 0.5;
 const SEGMENT_CORNER_RATIO: f64 = 0.015;
 
-/// Corners are no square in space when their mean squared reprojection error is this multiple of their mean variance.
-const MIN_MISFIT: f64 = 9.0;
+/// Corners are no square in space when their mean squared reprojection error is this multiple of their mean variance: one of
+/// thousands is so by chance.
+const MIN_MISFIT: f64 = 4.0;
 
 /// Largest reprojection error of a square, in pixels or as a share of its diagonal, whichever is larger: bent paper and
 /// rolling shutters stay below.

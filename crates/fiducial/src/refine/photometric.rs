@@ -23,16 +23,16 @@ const UNKNOWNS: usize = 14;
 const UNKNOWNS_PROCESSED: usize = 16;
 /// From when on a camera's processing is fitted.
 #[derive(Copy, Clone, Debug)]
-struct Least {
+struct MinResponse {
     /// One step towards it lowers the cost by this share; it is kept when the fit does.
     gain: f64,
     /// What is smaller is an error of the model, also of what is known.
     response: f64,
 }
 
-const LEAST: Least = Least { gain: 0.15, response: 0.2 };
+const MIN_RESPONSE: MinResponse = MinResponse { gain: 0.15, response: 0.2 };
 /// The same where an outline was fitted alone, of which a weak tone curve changes the size as well; sharpening moves no edge.
-const LEAST_OF_OUTLINE: Least = Least { gain: 0.05, response: 0.1 };
+const MIN_RESPONSE_OF_OUTLINE: MinResponse = MinResponse { gain: 0.05, response: 0.1 };
 /// One of this many pixels tells.
 const RESPONSE_STRIDE: usize = 4;
 /// Prior information on the brightness beyond the pattern, in units of one pixel's: it is that of white, give
@@ -67,7 +67,7 @@ const SCHEDULE: Schedule = Schedule {
 };
 
 /// For the last steps with a finer grid.
-const FINER_SCHEDULE: Schedule = Schedule { max_steps: 3, ..SCHEDULE };
+const FINER_SCHEDULE: Schedule = Schedule { max_steps: 1, ..SCHEDULE };
 
 /// The homography at which the predicted marker agrees with the image best.
 pub(crate) fn fit(target: Target<'_>, pattern: &Pattern, scratch: &mut Scratch) -> Option<Fit> {
@@ -85,10 +85,9 @@ pub(crate) fn fit_design(
     design: &Design<'_>,
     scratch: &mut Scratch,
 ) -> Option<Fit> {
-    let grids =
-        [design.plain, design.processed].map(|it| PatternGrid::from_design(it, target.lens));
-    let finer = design.is_finer().then_some(&grids[1]);
-    fit_grid(target, &grids[0], finer, 0.7, scratch)
+    let grid = PatternGrid::from_design(design.plain, target.lens);
+    let finer = PatternGrid::from_design(design.processed, target.lens).with_wide(&grid);
+    fit_grid(target, &grid, design.is_finer().then_some(&finer), 0.7, scratch)
 }
 
 /// The fit of a design with a camera's processing, near a fit along its outline alone, of which a tone curve changes the
@@ -109,8 +108,9 @@ pub(crate) fn fit_processed_design(
     let pixels = &mut scratch.pixels;
     grid.gather(target, &homography, light.spread_px, MAX_PIXELS[1], pixels)?;
     state.expose(&grid, pixels)?;
-    let (state, equations) = processed(&state, &grid, target.response, LEAST_OF_OUTLINE, scratch)?;
-    let is_curved = state.response.curve > LEAST_OF_OUTLINE.response;
+    let (state, equations) =
+        processed(&state, &grid, target.response, MIN_RESPONSE_OF_OUTLINE, scratch)?;
+    let is_curved = state.response.curve > MIN_RESPONSE_OF_OUTLINE.response;
     is_curved.then(|| state.processed_result(&equations, &grid, &mut scratch.pixels))?
 }
 
@@ -155,7 +155,8 @@ fn fit_grid(
             break;
         }
     }
-    let Some((state, equations)) = processed(&state, grid, known_response, LEAST, scratch) else {
+    let Some((state, equations)) = processed(&state, grid, known_response, MIN_RESPONSE, scratch)
+    else {
         return state.result(&solved?);
     };
     let Some(finer) = finer else {
@@ -176,7 +177,7 @@ fn processed(
     plain: &State,
     grid: &PatternGrid<'_>,
     known: Option<ResponseEstimate>,
-    least: Least,
+    min: MinResponse,
     scratch: &mut Scratch,
 ) -> Option<(State, NormalEquations<UNKNOWNS_PROCESSED, Residuals>)> {
     // What the narrow loss takes for outliers may be the processing.
@@ -186,7 +187,7 @@ fn processed(
     let settled_px = SETTLED_PX[1];
     if let Some(known) = known {
         let response = CameraResponse::known(&known);
-        if response.curve.abs().max(response.sharpening) < least.response {
+        if response.curve.abs().max(response.sharpening) < min.response {
             return None;
         }
         let start = State { response, known: Some(known), ..start };
@@ -201,7 +202,7 @@ fn processed(
     let of_plain = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|i, j| first.matrix[(i, j)]);
     let right = SVector::<f64, UNKNOWNS>::from_fn(|i, _| first.right[i]);
     let plain_gain = right.dot(&of_plain.cholesky()?.solve(&right));
-    if gain - plain_gain < least.gain * (first.cost - plain_gain) {
+    if gain - plain_gain < min.gain * (first.cost - plain_gain) {
         return None;
     }
     let mut problem = Photometric::<UNKNOWNS_PROCESSED> { grid, pixels, magnitudes, settled_px };
@@ -212,7 +213,7 @@ fn processed(
     });
     let CameraResponse { curve, sharpening } = found.response;
     let is_processed =
-        curve.abs().max(sharpening) > least.response && after? < (1.0 - least.gain) * before?;
+        curve.abs().max(sharpening) > min.response && after? < (1.0 - min.gain) * before?;
     is_processed.then_some((minimum.place, minimum.equations))
 }
 
@@ -447,15 +448,16 @@ impl State {
         let light = &self.light;
         let wide_px = light.spread_px.hypot(SHARPENING_PX);
         let ratio = light.spread_px / wide_px;
-        let wide_map = (N == UNKNOWNS_PROCESSED).then(|| grid.map(&self.homography, wide_px));
+        let wide_grid = grid.for_wide_blur();
+        let wide_map = (N == UNKNOWNS_PROCESSED).then(|| wide_grid.map(&self.homography, wide_px));
         let unit = 1.0 / self.half_px;
         for pixel in pixels.iter_mut().step_by(stride) {
             let point = grid.point(&map, pixel.ideal)?;
             let mut prediction = grid.predict(&point, light.spread_px, &mut work);
             let mut by_response = [0.0; 2];
             if let Some(wide_map) = &wide_map {
-                let wide_point = grid.point(wide_map, pixel.ideal)?;
-                let wide = grid.predict(&wide_point, wide_px, &mut work);
+                let wide_point = wide_grid.point(wide_map, pixel.ideal)?;
+                let wide = wide_grid.predict(&wide_point, wide_px, &mut work);
                 let shown = self.response.shown(prediction.white, wide.white, ratio);
                 let both = |own: f64, wide: f64| shown.by_own * own + shown.by_blurred * wide;
                 prediction.white = shown.white;

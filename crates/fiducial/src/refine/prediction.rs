@@ -59,6 +59,8 @@ pub(crate) struct PatternGrid<'a> {
     unknown: &'a [f64],
     /// Whether cells are small parts of shapes: each differs little from the next, also where an edge is near.
     is_design: bool,
+    /// The same in wider cells for a wide blur, where that saves time.
+    wide: Option<&'a Self>,
     /// Derivatives of the ideal image by the pixels.
     undistortion: [[f64; 2]; 2],
     response: EdgeResponse,
@@ -123,7 +125,7 @@ impl Lattice {
     }
 
     fn has(&self, column: usize, row: usize) -> bool {
-        (column + row * self.shift) % self.interval == 0
+        (column + row * self.shift).is_multiple_of(self.interval)
     }
 }
 
@@ -147,6 +149,15 @@ impl<'a> PatternGrid<'a> {
         Self { is_design: true, ..Self::new(lens, [cells.across, all], cells.white, &[]) }
     }
 
+    pub(crate) fn with_wide(self, wide: &'a Self) -> Self {
+        Self { wide: Some(wide), ..self }
+    }
+
+    /// The grid for what a camera blurs before it sharpens.
+    pub(crate) fn for_wide_blur(&self) -> &Self {
+        self.wide.unwrap_or(self)
+    }
+
     fn new(
         lens: &Undistortion<'_>,
         [cells, across]: [usize; 2],
@@ -161,6 +172,7 @@ impl<'a> PatternGrid<'a> {
             white,
             unknown,
             is_design: false,
+            wide: None,
             undistortion: [[slope[(0, 0)], slope[(0, 1)]], [slope[(1, 0)], slope[(1, 1)]]],
             response: EdgeResponse::new(),
         }
@@ -188,7 +200,7 @@ impl<'a> PatternGrid<'a> {
         let skipped = (every / 8).max(1);
         let thinned = every / skipped;
         // Lattices that cover both axes evenly: counted along the rows, the pixels taken would be those of a few columns.
-        let [near, far] = [thinned, 4 * thinned].map(|interval| Lattice::new(interval));
+        let [near, far] = [thinned, 4 * thinned].map(Lattice::new);
         let mut work = [Bands::NONE; 2];
         for y in top..bottom {
             let row = view.row(y);
