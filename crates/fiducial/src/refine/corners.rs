@@ -14,8 +14,8 @@ use crate::refine::{edges, photometric};
 
 /// Where cells are narrower than this, in pixels, the blurs of neighbouring edges overlap.
 const MIN_CELL_PX: f64 = 5.5;
-/// The same where a camera's processing has moved the edges by so many pixels or more: the halos of sharpening reach farther
-/// than a blur.
+/// The same where a camera's processing has moved the edges by so many pixels or more, or may have: the halos of sharpening
+/// reach farther than a blur.
 const MIN_SHARPENED_CELL_PX: f64 = 7.5;
 const MIN_SHIFT_PX: f64 = 0.1;
 /// The same for a border without fine detail beside it.
@@ -37,7 +37,7 @@ pub fn refine(
         .flatten();
     let is_narrow = cell_px < MIN_SHARPENED_CELL_PX;
     let fit = match along_edges {
-        Some(fit) if !is_narrow || fit.shift_px.abs() < MIN_SHIFT_PX => fit,
+        Some(fit) if !is_narrow || fit.is_shift_known && fit.shift_px.abs() < MIN_SHIFT_PX => fit,
         Some(fit) => {
             let near = Target { start: &fit.homography, ..target };
             photometric::fit(near, pattern, scratch).unwrap_or(fit)
