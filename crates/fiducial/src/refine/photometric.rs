@@ -66,7 +66,7 @@ const SCHEDULE: Schedule = Schedule {
     fails_without_equations: true,
 };
 
-/// For the last steps with a finer grid.
+/// For the last step, with a finer grid.
 const FINER_SCHEDULE: Schedule = Schedule { max_steps: 1, ..SCHEDULE };
 
 /// The homography at which the predicted marker agrees with the image best.
@@ -114,7 +114,7 @@ pub(crate) fn fit_processed_design(
     is_curved.then(|| state.processed_result(&equations, &grid, &mut scratch.pixels))?
 }
 
-/// The fit without a camera's processing, or, where there is one, with it, and its last steps with a `finer` grid if it
+/// The fit without a camera's processing, or, where there is one, with it, and its last step with a `finer` grid if it
 /// needs one.
 fn fit_grid(
     target: Target<'_>,
