@@ -4,7 +4,7 @@
 
 mod render;
 
-use fiducial::{Detector, Observation, Settings};
+use fiducial::{Detector, Observation, Settings, Tracker};
 use geometry::{CameraModel, Distortion};
 use imaging::GrayImage;
 use render::{SIZE_M, Scene};
@@ -35,7 +35,14 @@ fn expect(
     range_percent: f64,
 ) -> Observation {
     let Some(marker) = find(image, &scene.camera) else { panic!("{name}: not found") };
-    let range_m = marker.pose.unwrap().camera_from_marker.origin().coords.coords.norm();
+    check(name, scene, &marker, centre_px, range_percent);
+    marker
+}
+
+/// Asserts that what was found is within these bounds.
+fn check(name: &str, scene: &Scene, marker: &Observation, centre_px: f64, range_percent: f64) {
+    let pose = marker.pose.as_ref().unwrap();
+    let range_m = pose.camera_from_marker.origin().coords.coords.norm();
     let range = (range_m / scene.range_m() - 1.0) * 100.0;
     let centre = marker.centre.distance(&scene.centre());
     println!(
@@ -43,7 +50,6 @@ fn expect(
         marker.confidence
     );
     assert!(centre < centre_px && range.abs() < range_percent, "{name}");
-    marker
 }
 
 #[test]
@@ -170,11 +176,13 @@ fn without_a_camera_there_is_a_centre_and_no_pose() {
 }
 
 #[test]
-fn with_its_middle_or_its_rim_covered() {
+fn with_its_middle_or_its_rim_covered_it_is_a_marker_only_where_one_is_followed() {
+    let marker = format!("rings:{SIZE_M}").parse().unwrap();
     for range_m in [0.8, 2.5] {
         for rim in [false, true] {
             let scene = Scene::new(camera(), [0.03, 0.02, range_m], 0.15, 1.0);
-            let mut image = scene.render();
+            let plain = scene.render();
+            let mut image = plain.clone();
             let (middle, size_px) = (scene.centre(), SIZE_M * 1818.0 / range_m);
             for y in 0..image.height() {
                 for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
@@ -191,7 +199,17 @@ fn with_its_middle_or_its_rim_covered() {
                 }
             }
             let name = format!("{} covered at {range_m} m", if rim { "rim" } else { "middle" });
-            expect(&name, &scene, &image, 0.1, 0.3);
+            // In a single image it may be a washer or a lamp beside something dark.
+            assert_eq!(find(&image, &scene.camera), None, "{name}");
+            let mut detector = Detector::new(&[marker], Settings::default()).unwrap();
+            let mut tracker = Tracker::default();
+            for (frame, shown) in [&plain, &plain, &plain, &image, &image].into_iter().enumerate() {
+                let (view, time_s) = (shown.view().unwrap(), 0.05 * frame as f64);
+                let found =
+                    tracker.detect(&mut detector, view, Some(&scene.camera), time_s, &mut ());
+                assert_eq!(found.len(), 1, "{name}, frame {frame}");
+                check(&name, &scene, &found[0], 0.1, 0.3);
+            }
         }
     }
 }
@@ -270,11 +288,16 @@ fn rings_of_other_radii_are_no_marker() {
 
 /// A target of evenly wide rings, white in the middle, seen slightly from the side.
 fn target(rings: u32, radius_px: f64) -> GrayImage {
+    target_at(500.3, 1.15, rings, radius_px)
+}
+
+/// The same with its middle in this column, so many times as wide as high.
+fn target_at(column: f64, flatness: f64, rings: u32, radius_px: f64) -> GrayImage {
     let count = f64::from(2 * rings);
     let mut image = GrayImage::filled(1000, 800, 190);
     for y in 0..800 {
         for (x, pixel) in image.row_mut(y).iter_mut().enumerate() {
-            let from_centre = (x as f64 - 500.3).hypot(1.15 * (y as f64 - 400.6));
+            let from_centre = (x as f64 - column).hypot(flatness * (y as f64 - 400.6));
             let black: f64 = (0..2 * rings)
                 .map(|k| {
                     let edge = radius_px * (1.0 - f64::from(k) / count) - from_centre;
@@ -300,6 +323,18 @@ fn targets_of_evenly_wide_rings_are_no_marker() {
 }
 
 #[test]
+fn targets_whose_middle_is_beyond_the_frame_are_no_marker() {
+    let camera = CameraModel::pinhole(1000, 800, 909.0);
+    for radius_px in [90.0, 120.0, 160.0, 220.0] {
+        for (beyond, flatness) in [(0.2, 1.0), (0.2, 1.3), (0.3, 1.0), (0.3, 1.15), (0.3, 1.3)] {
+            let image = target_at(-beyond * radius_px, flatness, 3, radius_px);
+            let name = format!("{radius_px} px, {beyond} beyond, {flatness}");
+            assert_eq!(find(&image, &camera), None, "{name}");
+        }
+    }
+}
+
+#[test]
 fn small_targets_of_evenly_wide_rings_are_no_marker_to_any_camera() {
     let camera = CameraModel::pinhole(1000, 800, 909.0);
     let mut taken = Vec::new();
@@ -316,8 +351,7 @@ fn small_targets_of_evenly_wide_rings_are_no_marker_to_any_camera() {
             }
         }
     }
-    // The one that is known: its edges decide, and its tone curve narrows its rings to the marker's.
-    assert_eq!(taken, ["action-camera: 2 rings of 16 px"]);
+    assert!(taken.is_empty(), "{taken:?}");
 }
 
 #[test]

@@ -337,7 +337,9 @@ impl RingDetector {
             let coarse = Evaluation { view, known_camera, camera: &camera, ..*evaluation };
             last = coarse.evaluate(&smaller, &mut self.buffers);
             if let Ok(observation) = last {
-                if observation.confidence >= MIN_COARSE_CONFIDENCE {
+                // Where the middle is beyond the frame, radii on coarse pixels are too uncertain.
+                let is_likely = camera.contains(observation.centre) || !coarse.followed.is_empty();
+                if is_likely && observation.confidence >= MIN_COARSE_CONFIDENCE {
                     return Ok(observation.mapped(&roi));
                 }
                 last = Err(Reason::Edges);

@@ -268,6 +268,45 @@ impl CirclePose {
         (circles >= 3 && solved.y.is_finite()).then_some(solved.y)
     }
 
+    /// Where between the marker and a target of evenly wide rings the radii lie that would fit the edge points best, where
+    /// else pose and a camera's processing are as they fit. `None` when the points do not determine it at all.
+    pub(crate) fn evenness(
+        &self,
+        points: &[EdgePoint],
+        size_m: f64,
+        camera: &CameraModel,
+    ) -> Option<Evenness> {
+        const UNKNOWNS: usize = 7;
+        let mut matrix = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::zeros();
+        let mut right = SVector::<f64, UNKNOWNS>::zeros();
+        let plane = self.plane(camera);
+        for circle in points.chunk_by(|a, b| a.radius == b.radius) {
+            let towards_m = circle.first().map_or(0.0, |point| towards_even(point.radius, size_m));
+            // What moves an edge moves all of it, so that many points on a circle are no better than one.
+            let share = 1.0 / circle.len() as f64;
+            for point in circle {
+                let at = plane.intersect(&point.ray);
+                let residual = (at.rho - point.radius) * at.px_per_metre;
+                if !(at.is_valid() && residual.is_finite()) {
+                    return None;
+                }
+                let weight = share * huber(residual, HUBER_PX).weight;
+                let into_black = if point.black_inside { -1.0 } else { 1.0 };
+                let [a, b, c, d, e] = at.by_pose;
+                let row = SVector::from([a, b, c, d, e, -towards_m * at.px_per_metre, -into_black]);
+                matrix.syger(weight, &row, &row, 1.0);
+                right -= row * (weight * residual);
+            }
+        }
+        matrix.fill_upper_triangle_with_lower_triangle();
+        matrix[(UNKNOWNS - 1, UNKNOWNS - 1)] += (EDGE_BIAS_PX / PROCESSING_PX).powi(2);
+        let covariance = matrix.try_inverse()?;
+        let step = covariance * right;
+        let deviation = covariance[(5, 5)].sqrt() * EDGE_BIAS_PX;
+        (step[5].is_finite() && deviation.is_finite())
+            .then_some(Evenness { share: step[5], deviation })
+    }
+
     /// A point of each circle with the median residual of the circle's points, in pixels.
     fn median_residuals<'a>(
         &self,
@@ -314,6 +353,25 @@ impl CirclePose {
             Self { centre: self.centre + step.fixed_rows::<3>(0), normal: normal.normalize() };
         stepped.is_valid().then_some(stepped)
     }
+}
+
+/// Standard deviation of what moves a whole edge in the image of a marker, in pixels: lens, print, light.
+const EDGE_BIAS_PX: f64 = 0.1;
+/// The same of what a camera's processing does to all edges alike, in pixels.
+const PROCESSING_PX: f64 = 0.3;
+
+/// Where between the marker (0) and a target of evenly wide rings (1) radii lie, with its standard deviation.
+#[derive(Copy, Clone, Debug, PartialEq)]
+pub(crate) struct Evenness {
+    pub(crate) share: f64,
+    pub(crate) deviation: f64,
+}
+
+/// From the radius of a circle of a marker to that of a target of evenly wide rings, in metres: its rings are an eighth of its
+/// size wide, and so are the gaps.
+fn towards_even(radius_m: f64, size_m: f64) -> f64 {
+    let width_m = 0.125 * size_m;
+    if radius_m < 0.5 * width_m { 0.0 } else { (radius_m / width_m).round() * width_m - radius_m }
 }
 
 /// Edge points to which a pose is fitted.

@@ -16,6 +16,11 @@ const BLUR_PX: f64 = 0.8;
 const MIN_DEPTH: f64 = 0.15;
 
 impl EdgeSearch<'_> {
+    /// Whether the middle is in the image. Rings without it are a target's as well as the marker's.
+    pub(super) fn shows_middle(&self, pose: &CirclePose) -> bool {
+        project(pose.centre, self.camera).is_some_and(|at| self.camera.contains(at))
+    }
+
     /// Whether the middle is plain to see and not the marker's: white, or a disc much wider than the dot.
     pub(super) fn is_target(&self, pose: &CirclePose) -> bool {
         self.has_other_middle(pose).unwrap_or(false)

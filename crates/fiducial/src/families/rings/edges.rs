@@ -12,6 +12,8 @@ use crate::families::rings::circle_pose::{CirclePose, EdgePoint, project};
 
 /// Minimum share of the visible places of an edge at which it is found: a third may be hidden.
 const MIN_EDGE_SHARE: f64 = 0.5;
+/// The same of an edge that is plain to see.
+const CLEAR_SHARE: f64 = 0.8;
 /// Grey values from here on are saturated.
 pub(super) const SATURATED: f64 = 252.0;
 /// Largest share of white in what covers a ring.
@@ -63,6 +65,12 @@ pub(super) struct EdgeSupport {
 }
 
 impl EdgeSupport {
+    /// Whether some of it is visible, and most of that is not there.
+    fn is_missed(&self) -> bool {
+        const MIN_PLACES: u32 = 8;
+        self.visible >= MIN_PLACES && 2 * self.found < self.visible
+    }
+
     /// Found over visible places; `None` while less than a quarter of the circle is visible.
     pub(super) fn share(&self) -> Option<f64> {
         (self.searched > 0 && 4 * self.visible >= self.searched)
@@ -142,16 +150,32 @@ impl EdgeSearch<'_> {
         support
     }
 
-    /// Which edges are there at a pose, of which one circle is too few unless a marker is followed there.
+    /// Which edges are there at a pose. What clutter shows as well is too little unless a marker is followed there: one ring of
+    /// the two large ones, three circles of which the middle is beyond the frame, white rings on black with gaps.
     pub(super) fn completeness(
         &self,
         pose: &CirclePose,
         support: &[EdgeSupport; 6],
     ) -> Completeness {
-        match Completeness::from_support(support) {
-            Completeness::Innermost if self.is_followed(pose) => Completeness::Full,
-            Completeness::Innermost => Completeness::Insufficient,
-            other => other,
+        let found = Completeness::from_support(support);
+        let shares = support.map(|edge| edge.share());
+        let is_weak = match found {
+            Completeness::Insufficient => return found,
+            Completeness::Innermost => true,
+            Completeness::Partial | Completeness::Full => {
+                let has_gaps = shares.iter().flatten().any(|share| *share < CLEAR_SHARE);
+                let lacks_outer = shares[..4].iter().any(Option::is_none);
+                let lacks_ring =
+                    support[..4].chunks(2).any(|ring| ring.iter().all(EdgeSupport::is_missed));
+                lacks_ring
+                    || self.white_on_black && has_gaps
+                    || (self.white_on_black || lacks_outer) && !self.shows_middle(pose)
+            }
+        };
+        match found {
+            _ if is_weak && !self.is_followed(pose) => Completeness::Insufficient,
+            Completeness::Innermost => Completeness::Full,
+            _ => found,
         }
     }
 
@@ -209,6 +233,57 @@ impl EdgeSearch<'_> {
             Some(crossing) => EdgeSample::Edge(offset(on, direction, crossing * step)),
             None => EdgeSample::NoEdge,
         }
+    }
+
+    /// The blur of the image as the outermost edge shows it: the standard deviation of a Gaussian whose integral rises as
+    /// steeply, in pixels; the median over the circle.
+    pub(super) fn edge_blur_px(&self, pose: &CirclePose) -> Option<f64> {
+        const PLACES: usize = 32;
+        const STEP_PX: f64 = 0.25;
+        const HALF: usize = 12;
+        /// Between the quartiles of a Gaussian, in standard deviations.
+        const QUARTILES: f64 = 1.349;
+        let RingEdge { radius, width, .. } = EDGES[0];
+        let reach_px = 0.5 * width * self.size_m * self.camera.fx / pose.centre.z;
+        let half = ((reach_px / STEP_PX) as usize).clamp(3, HALF);
+        let (u, v) = pose.basis();
+        let mut blurs = [0.0; PLACES];
+        let mut count = 0;
+        for i in 0..PLACES {
+            let (sin, cos) = (i as f64 * TAU / PLACES as f64).sin_cos();
+            let out = (u * cos + v * sin) * (radius * self.size_m);
+            let (Some(on), Some(beyond)) = (
+                project(pose.centre + out, self.camera),
+                project(pose.centre + out * 1.001, self.camera),
+            ) else {
+                continue;
+            };
+            let length = on.distance(&beyond);
+            let direction = [(beyond.x - on.x) / length, (beyond.y - on.y) / length];
+            let grey = |step: usize| {
+                let at = offset(on, direction, (step as f64 - half as f64) * STEP_PX);
+                bilinear(self.view, at.x, at.y)
+                    .map(|grey| if self.white_on_black { -grey } else { grey })
+            };
+            let (Some(black), Some(white)) = (grey(0), grey(2 * half)) else { continue };
+            let crossing = |part: f64| {
+                let level = black + part * (white - black);
+                (0..2 * half).find_map(|step| {
+                    let (from, to) = (grey(step)?, grey(step + 1)?);
+                    (from < level && to >= level)
+                        .then(|| step as f64 + (level - from) / (to - from))
+                })
+            };
+            if let Some((low, high)) = crossing(0.25).zip(crossing(0.75))
+                && let Some(blur) = blurs.get_mut(count)
+            {
+                *blur = (high - low) * STEP_PX / QUARTILES;
+                count += 1;
+            }
+        }
+        let blurs = blurs.get_mut(..count).filter(|blurs| 4 * blurs.len() >= PLACES)?;
+        let (_, median, _) = blurs.select_nth_unstable_by(count / 2, f64::total_cmp);
+        Some(*median)
     }
 
     /// Whether the place of a ring's neighbour is covered: not white, as it is beside other rings.
@@ -314,7 +389,7 @@ impl Completeness {
     pub(super) fn from_support(support: &[EdgeSupport; 6]) -> Self {
         let shares = support.map(|s| s.share());
         let seen = shares.iter().flatten().filter(|s| **s >= MIN_EDGE_SHARE).count();
-        let clear = shares.iter().flatten().filter(|s| **s >= 0.8).count();
+        let clear = shares.iter().flatten().filter(|s| **s >= CLEAR_SHARE).count();
         let missed = shares.iter().flatten().filter(|s| **s < MIN_EDGE_SHARE).count();
         let inner_only = shares[..4].iter().all(Option::is_none);
         let (found, visible) =
