@@ -151,6 +151,9 @@ impl Detector {
         }
         evidence.begin_fallbacks(schedule);
         for step in FallbackStep::ALL.into_iter().filter(|step| schedule.allows_step(*step)) {
+            if !evidence.may_help(view, step) {
+                continue;
+            }
             let mut is_prepared = false;
             for family in families.iter_mut() {
                 let all = self.settings.thorough || out.found.is_empty();

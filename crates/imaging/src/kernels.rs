@@ -88,7 +88,7 @@ pub(crate) fn above(pixels: &[u8], thresholds: &[u8], words: &mut [u64]) {
 /// Does some work, with the loops of what is inlined into it compiled for AVX2 where the processor has it (for NEON all code
 /// is compiled where the target has it). It is the same code, and none of its arithmetic is fused, so the result is the same.
 #[inline]
-pub(crate) fn with_vectors<T>(work: impl FnOnce() -> T) -> T {
+pub fn with_vectors<T>(work: impl FnOnce() -> T) -> T {
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has AVX2.

@@ -6,11 +6,12 @@
 //! smooths it, [`mod@threshold`] binarises it, [`contour`] follows the borders, [`ellipse`] fits ellipses to
 //! them, [`sample`] interpolates grey values. The fast path to regions of any size: [`pyramid`] halves an
 //! image again and again, [`binary`] binarises with a local threshold, [`outline`] follows the outlines of
-//! the regions. [`segment`] finds straight edge segments where regions are broken. [`focus`] says how sharp an image is.
+//! the regions, all or where [`contrast_map`] says that a marker may be. [`segment`] finds straight edge segments where regions are broken. [`focus`] says how sharp an image is.
 
 pub mod bin;
 pub mod binary;
 pub mod contour;
+pub mod contrast_map;
 pub mod convert;
 pub mod ellipse;
 pub mod filter;
@@ -26,10 +27,12 @@ pub mod view;
 pub use bin::bin;
 pub use binary::{Binarizer, BitImage, Contrast, Middle};
 pub use contour::{Contour, Contours, Limits, contour_area};
+pub use contrast_map::{ContrastMap, Places};
 pub use convert::{BayerPattern, Converter, SampleFormat};
 pub use ellipse::{Axes, Ellipse, fit_ellipse};
 pub use filter::{BilateralRows, bilateral_5x5};
 pub use focus::edge_width_px;
+pub use kernels::with_vectors;
 pub use outline::{Outline, Outlines};
 pub use pyramid::Pyramid;
 pub use sample::bilinear;

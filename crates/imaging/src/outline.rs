@@ -5,6 +5,7 @@ mod follow;
 use std::ops::Range;
 
 use crate::binary::{Binarizer, BitImage, Contrast, Middle};
+use crate::contrast_map::Places;
 use crate::kernels::{TILE, sharpen_row};
 use crate::pyramid::Pyramid;
 use crate::view::{GrayImage, GrayView};
@@ -132,23 +133,40 @@ impl Outlines {
 
     /// Adds the outlines on these levels; `view` is the image given to [`Outlines::begin`].
     pub fn add(&mut self, view: GrayView<'_>, settings: &Settings, levels: Range<usize>) {
+        self.add_at(Places::EVERYWHERE, view, settings, levels);
+    }
+
+    /// As [`Outlines::add`], those that begin at these places.
+    pub fn add_at(
+        &mut self,
+        places: Places<'_>,
+        view: GrayView<'_>,
+        settings: &Settings,
+        levels: Range<usize>,
+    ) {
         let finest = settings.dark_from.into_iter().chain(settings.bright_from).min();
         let first = levels.start.max(finest.unwrap_or(MAX_LEVELS));
         for level in first..levels.end.min(self.pyramid.levels()) {
-            self.find_on(view, level, settings, None);
+            self.find_on(places, view, level, settings, None);
         }
     }
 
-    /// Adds the outlines of level 0 that begin in these rows, to spread the work of [`Outlines::add`] over
+    /// Adds the outlines of level 0 that begin at these places and in these rows, to spread the work of [`Outlines::add_at`] over
     /// several images. None is higher than `max_size_px`.
-    pub fn add_rows(&mut self, view: GrayView<'_>, settings: &Settings, rows: Range<usize>) {
+    pub fn add_rows(
+        &mut self,
+        places: Places<'_>,
+        view: GrayView<'_>,
+        settings: &Settings,
+        rows: Range<usize>,
+    ) {
         // The first and last row depend on the tiles next to theirs, and those on the next row.
         const MARGIN: usize = 3 * TILE;
         let top = rows.start.saturating_sub(MARGIN) / TILE * TILE;
         let below = rows.end + usize::from(settings.max_size_px) + MARGIN;
         let bottom = below.next_multiple_of(TILE).min(view.height());
         let first = self.spans.len();
-        self.find_on(view, 0, settings, Some(top..bottom));
+        self.find_on(places, view, 0, settings, Some(top..bottom));
         let mut kept = first;
         for index in first..self.spans.len() {
             let mut span = self.spans[index];
@@ -208,6 +226,7 @@ impl Outlines {
     /// Finds the outlines on a level, or in some rows of it.
     fn find_on(
         &mut self,
+        places: Places<'_>,
         view: GrayView<'_>,
         level: usize,
         settings: &Settings,
@@ -248,6 +267,8 @@ impl Outlines {
                     binarizer: &self.binarizer,
                     dark,
                     level: level as u8,
+                    places,
+                    top: rows.map_or(0, |rows| rows.start),
                     path: &mut self.path,
                     tops: &mut self.tops,
                     points: &mut self.points,
@@ -352,7 +373,7 @@ mod tests {
         {
             whole.add(view, &kind, 0..1);
             for rows in [0..61, 61..130, 130..height] {
-                parts.add_rows(view, &kind, rows);
+                parts.add_rows(Places::EVERYWHERE, view, &kind, rows);
             }
         }
         let (parts, whole) = (list(&parts), list(&whole));

@@ -2,11 +2,11 @@
 //! its time per frame.
 //!
 //! ```text
-//! cargo run --release -p experiments --example fallback_yield -- [--every N] [--seed N] [--processing PRESET]... [MARKER...]
+//! cargo run --release -p experiments --example fallback_yield -- [--every N] [--seed N] [--processing PRESET]... [--set SET]... [MARKER...]
 //! cargo run --release -p experiments --example fallback_yield -- --photographs FOLDER
 //! ```
 //!
-//! Of each set every N-th frame is used, as a camera of each PRESET shows it. FOLDER has photographs with `labels.jsonl`.
+//! Of each SET (all unless named) every N-th frame is used, as a camera of each PRESET shows it. FOLDER has photographs with `labels.jsonl`.
 #![allow(clippy::print_stdout, reason = "a program for people at a terminal")]
 
 use std::path::PathBuf;
@@ -17,7 +17,7 @@ use experiments::frame_spec::{FrameRenderer, FrameSpec};
 use experiments::photographs;
 use experiments::record::Found;
 use experiments::set::{MARKERS, SIZE_M, Set};
-use experiments::sets::{self, Variant};
+use experiments::sets::{Variant, frames_of};
 use fiducial::{Detector, FallbackPass, PassSchedule, Settings};
 use geometry::CameraModel;
 use imaging::GrayView;
@@ -54,6 +54,7 @@ struct Arguments {
     every: usize,
     seed: u64,
     presets: Vec<Preset>,
+    sets: Vec<Set>,
     photographs: Option<PathBuf>,
     markers: Vec<String>,
 }
@@ -69,12 +70,16 @@ fn arguments() -> anyhow::Result<Arguments> {
             "--processing" => {
                 read.presets.push(value()?.parse::<Preset>().map_err(anyhow::Error::msg)?);
             }
+            "--set" => read.sets.push(value()?.parse::<Set>().map_err(anyhow::Error::msg)?),
             "--photographs" => read.photographs = Some(value()?.into()),
             _ => read.markers.push(word),
         }
     }
     if read.presets.is_empty() {
         read.presets.push(Preset::Linear);
+    }
+    if read.sets.is_empty() {
+        read.sets.extend(Set::ALL);
     }
     if read.markers.is_empty() {
         read.markers = MARKERS.iter().map(|name| (*name).to_owned()).collect();
@@ -83,7 +88,7 @@ fn arguments() -> anyhow::Result<Arguments> {
 }
 
 fn main() -> anyhow::Result<()> {
-    let Arguments { every, seed, presets, photographs, markers } = arguments()?;
+    let Arguments { every, seed, presets, sets, photographs, markers } = arguments()?;
     println!("| marker | pass | only this pass | share of found | this pass alone | ms |");
     println!("|---|---|---|---|---|---|");
     if let Some(folder) = photographs {
@@ -117,9 +122,9 @@ fn main() -> anyhow::Result<()> {
             let any = Marker { id: None, ..marker };
             let mut detector = Detector::new(&[any], Settings::default())?;
             let mut sums = Sums::default();
-            for set in Set::ALL {
+            for set in sets.iter().copied() {
                 let variant = Variant { seed, processing: preset, every, is_binned: false };
-                for spec in &sets::frames_of(set, marker, variant) {
+                for spec in &frames_of(set, marker, variant) {
                     measure(&mut renderer, &mut detector, (set.name(), spec), &mut sums)?;
                 }
             }

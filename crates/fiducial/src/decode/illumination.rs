@@ -3,6 +3,8 @@
 //! The cells that are known to be black or white, of the border and the quiet zone, determine it. By it every
 //! other grey value is judged.
 
+use imaging::with_vectors;
+
 /// Largest number of known cells.
 pub(crate) const MAX_CELLS: usize = 225;
 /// Smallest difference of white and black, in grey levels.
@@ -185,7 +187,7 @@ impl ReferenceCells {
         // A small misfit needs no second light.
         if misfit > 0.01 * self.count as f32 {
             let limit = 0.6 * misfit;
-            let others = [self.with_reflection(), self.with_shadow(middle)];
+            let others = [self.with_reflection(), with_vectors(|| self.with_shadow(middle))];
             for (light, here) in others.into_iter().flatten() {
                 if here < limit && here < misfit {
                     (best, misfit) = (light, here);
@@ -197,7 +199,7 @@ impl ReferenceCells {
     }
 
     /// The cells' positions along a direction.
-    #[inline]
+    #[inline(always)]
     fn project(&self, angle: f32) -> Projection {
         let normal = [angle.cos(), angle.sin()];
         let mut projection = Projection { angle, normal, positions: [0.0; MAX_KNOWN] };
@@ -210,7 +212,7 @@ impl ReferenceCells {
 
     /// Two lights on the sides of a shadow's edge, and their misfit. Edges all over the grid are tried, then
     /// edges near the best one.
-    #[inline]
+    #[inline(always)]
     fn with_shadow(&self, middle: f32) -> Option<(Illumination, f32)> {
         const DIRECTIONS: i32 = 12;
         let (mut turn, mut step) = (std::f32::consts::PI / DIRECTIONS as f32, (middle + 1.0) / 5.0);
@@ -245,7 +247,7 @@ impl ReferenceCells {
     }
 
     /// The illumination with a shadow's edge at `offset` along a direction, and its misfit.
-    #[inline]
+    #[inline(always)]
     fn split(&self, projection: &Projection, offset: f32) -> Option<(Illumination, f32)> {
         let beyond = self.beyond(projection, offset);
         let [black, white] = self.sums;
@@ -282,7 +284,7 @@ impl ReferenceCells {
     }
 
     /// Number of black and of white cells beyond the edge, and the sums of their logarithms.
-    #[inline]
+    #[inline(always)]
     fn beyond(&self, projection: &Projection, offset: f32) -> [[f32; 2]; 2] {
         let mut sums = [[[0.0_f32; LANES]; 2]; 2];
         for from in (0..self.count).step_by(LANES) {
@@ -302,7 +304,7 @@ impl ReferenceCells {
 
     /// Sum of the bounded squared residuals, for these logarithms of black and white before and beyond the
     /// edge.
-    #[inline]
+    #[inline(always)]
     fn misfit(&self, projection: &Projection, offset: f32, levels: [[f32; 2]; 2]) -> f32 {
         let mut sums = [0.0_f32; LANES];
         for from in (0..self.count).step_by(LANES) {

@@ -18,7 +18,7 @@ use std::ops::Range;
 
 use geometry::{CameraModel, Roi};
 use imaging::pyramid::{from_level_0, to_level_0};
-use imaging::{Ellipse, GrayView, Outlines, Pyramid, outline};
+use imaging::{Ellipse, GrayView, Outlines, Places, Pyramid, outline};
 use markers::{Family, Marker};
 
 use crate::candidates::ellipses::{EllipseCandidate, add_arc_ellipses, complete_ellipse};
@@ -184,13 +184,13 @@ impl RingDetector {
     fn run(&mut self, pass: &RingPass, input: FrameInput<'_>, out: &mut Output<'_>) {
         let FrameInput { view, camera, evidence, schedule, followed, .. } = input;
         let has_outlines = evidence.has_outlines;
-        let outlines = &mut evidence.outlines;
+        let (outlines, places) = evidence.outlines_at();
         if let RingPass::Ellipses(levels) = pass
             && !has_outlines
         {
-            outlines.add(view, &outline::Settings::default(), levels.clone());
+            outlines.add_at(places, view, &outline::Settings::default(), levels.clone());
         }
-        self.find_candidates(view, outlines, pass);
+        self.find_candidates(view, outlines, places, pass);
         out.trace.ellipses.extend(self.ellipses.iter().map(|e| e.ellipse));
         out.trace.rings.extend(self.candidates.iter().map(ring));
         out.stages.ended(pass.name());
@@ -210,7 +210,13 @@ impl RingDetector {
     }
 
     /// Finds the circles that may be the marker's, best first.
-    fn find_candidates(&mut self, view: GrayView<'_>, outlines: &mut Outlines, pass: &RingPass) {
+    fn find_candidates(
+        &mut self,
+        view: GrayView<'_>,
+        outlines: &mut Outlines,
+        places: Places<'_>,
+        pass: &RingPass,
+    ) {
         self.ellipses.clear();
         self.candidates.clear();
         match pass {
@@ -226,7 +232,7 @@ impl RingDetector {
             }
             RingPass::Blobs => {
                 let first = outlines.len();
-                outlines.add(view, &BLOB_REGIONS, 0..usize::MAX);
+                outlines.add_at(places, view, &BLOB_REGIONS, 0..usize::MAX);
                 let blobs = outlines.iter().skip(first).take(MAX_ELLIPSES);
                 let blobs = blobs.filter_map(|o| blob(view, &o));
                 self.candidates.extend(blobs.take(MAX_CANDIDATES));

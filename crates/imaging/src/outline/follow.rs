@@ -2,6 +2,7 @@
 
 use super::Settings;
 use crate::binary::{Binarizer, BitImage};
+use crate::contrast_map::Places;
 use crate::view::GrayView;
 
 /// Bounds on time and memory of one level: pixel edges followed and points kept, per pixel of the level.
@@ -79,6 +80,9 @@ pub(super) struct Search<'a> {
     pub(super) binarizer: &'a Binarizer,
     pub(super) dark: bool,
     pub(super) level: u8,
+    /// Where outlines may begin, and the row of the level that is the first one here.
+    pub(super) places: Places<'a>,
+    pub(super) top: usize,
     pub(super) path: &'a mut Vec<u8>,
     pub(super) tops: &'a mut Tops,
     pub(super) points: &'a mut Vec<[f32; 2]>,
@@ -206,7 +210,10 @@ impl Search<'_> {
             while word != 0 {
                 let x = index * 64 + word.trailing_zeros() as usize;
                 word &= word - 1;
-                if limits.steep && !self.is_steep(x, y) || self.rises(x, y, tops) {
+                if !self.places.include(x, y + self.top, usize::from(self.level))
+                    || limits.steep && !self.is_steep(x, y)
+                    || self.rises(x, y, tops)
+                {
                     continue;
                 }
                 let (trace, steps) = self.follow(x, y, limits);

@@ -1,0 +1,96 @@
+//! Where the time of a single image without a marker goes: frames of each ground from four heights, searched for the four
+//! families of the thesis, with the shortest of a few times of each stage.
+//!
+//! ```text
+//! cargo run --release -p experiments --example no_marker -- [SEED]
+//! ```
+#![allow(clippy::print_stdout, reason = "a table for people is what this example is for")]
+
+use std::time::Instant;
+
+use anyhow::Context;
+use experiments::frame_spec::{FrameRenderer, FrameSpec, Tilt, pose};
+use experiments::set::{MARKERS, SIZE_M};
+use fiducial::{Detector, Settings, StageObserver};
+use geometry::Pixel;
+use imaging::GrayView;
+use markers::Marker;
+use rendering::{CameraSettings, Surface};
+
+const HEIGHTS_M: [f64; 4] = [2.0, 4.0, 6.0, 8.0];
+const REPEATS: usize = 7;
+
+/// The time of each stage, in milliseconds.
+struct Clock {
+    last: Instant,
+    stages: Vec<(&'static str, f64)>,
+}
+
+impl StageObserver for Clock {
+    fn ended(&mut self, stage: &'static str) {
+        let now = Instant::now();
+        let spent_ms = (now - std::mem::replace(&mut self.last, now)).as_secs_f64() * 1e3;
+        add(&mut self.stages, stage, |ms| *ms += spent_ms);
+    }
+}
+
+fn add(list: &mut Vec<(&'static str, f64)>, stage: &'static str, change: impl FnOnce(&mut f64)) {
+    let index = list.iter().position(|(name, _)| *name == stage).unwrap_or_else(|| {
+        list.push((stage, 0.0));
+        list.len() - 1
+    });
+    if let Some((_, ms)) = list.get_mut(index) {
+        change(ms);
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let seed = std::env::args().nth(1).map_or(Ok(0), |word| word.parse()).context("SEED")?;
+    let markers = MARKERS.iter().filter(|name| !name.starts_with("apriltag-36h11"));
+    let markers: Vec<Marker> =
+        markers.map(|name| format!("{name}:{SIZE_M}").parse()).collect::<Result<_, _>>()?;
+    let mut detector = Detector::new(&markers, Settings::default())?;
+    let mut renderer = FrameRenderer::default();
+    let settings = CameraSettings::thesis();
+    let model = settings.model;
+    let (mut all_ms, mut stages) = (Vec::new(), Vec::new());
+    for (number, surface) in (seed..).step_by(HEIGHTS_M.len()).zip(Surface::ALL) {
+        let mut of_ground = Vec::new();
+        for (number, height_m) in (number..).zip(HEIGHTS_M) {
+            let tilt = Tilt { angle: 0.1, about: 1.0 };
+            let at = pose(&model, Pixel::new(model.cx, model.cy), height_m, tilt, 0.3);
+            let spec = FrameSpec { surface, ..FrameSpec::negative(settings.clone(), at, number) };
+            let pixels = renderer.render(&spec)?;
+            let view = GrayView::packed(&pixels, model.width as usize, model.height as usize)?;
+            let mut fastest: Option<(f64, Vec<(&str, f64)>)> = None;
+            for _ in 0..REPEATS {
+                let begin = Instant::now();
+                let mut clock = Clock { last: begin, stages: Vec::new() };
+                anyhow::ensure!(
+                    detector.detect(view, Some(&model), &mut clock).is_empty(),
+                    "found"
+                );
+                let ms = begin.elapsed().as_secs_f64() * 1e3;
+                if fastest.as_ref().is_none_or(|(least, _)| ms < *least) {
+                    fastest = Some((ms, clock.stages));
+                }
+            }
+            let (ms, parts) = fastest.context("REPEATS is 0")?;
+            of_ground.push(ms);
+            for (stage, ms) in parts {
+                add(&mut stages, stage, |sum| *sum += ms);
+            }
+        }
+        let listed: Vec<String> = of_ground.iter().map(|ms| format!("{ms:.1}")).collect();
+        println!("{:8} {} ms", surface.name(), listed.join(", "));
+        all_ms.extend(of_ground);
+    }
+    all_ms.sort_by(f64::total_cmp);
+    let count = all_ms.len();
+    let median = all_ms.get(count / 2).context("no frame")?;
+    println!("median of {count} frames {median:.2} ms; means of the stages:");
+    for (stage, ms) in stages {
+        println!("{stage:12} {:.2} ms", ms / count as f64);
+    }
+    Ok(())
+}
