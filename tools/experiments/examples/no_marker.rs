@@ -54,7 +54,7 @@ fn main() -> anyhow::Result<()> {
     let settings = CameraSettings::thesis();
     let model = settings.model;
     let (mut all_ms, mut stages) = (Vec::new(), Vec::new());
-    for (number, surface) in (seed..).step_by(HEIGHTS_M.len()).zip(Surface::ALL) {
+    for (number, surface) in (seed..).step_by(10).zip(Surface::ALL) {
         let mut of_ground = Vec::new();
         for (number, height_m) in (number..).zip(HEIGHTS_M) {
             let tilt = Tilt { angle: 0.1, about: 1.0 };

@@ -295,7 +295,9 @@ impl RingDetector {
                 Err(Reason::Repeated)
             } else {
                 let outcome = evaluation.evaluate(&candidate, &mut self.buffers);
-                let is_open = matches!(outcome, Err(reason) if reason != Reason::Blackness);
+                // What is known to be something else is so on coarse levels as well.
+                let is_known = |reason| matches!(reason, Reason::Blackness | Reason::Type);
+                let is_open = outcome.as_ref().is_err_and(|reason| !is_known(*reason));
                 match coarse.filter(|_| is_open && found.len() == first) {
                     Some(pyramid) => {
                         self.detect_coarse(evaluation, pyramid, &candidate).or(outcome)

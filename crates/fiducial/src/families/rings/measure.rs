@@ -160,6 +160,9 @@ impl EdgeSearch<'_> {
         if let Some(measured) = self.measure_edges(&found, edges)? {
             return Ok(measured);
         }
+        if completeness == Completeness::Full && self.is_likely_target(&found.pose, edges) {
+            return Err(Reason::Type);
+        }
         self.measure_single_ring(&found.pose, kind, edges).ok_or(Reason::Edges)
     }
 
@@ -491,7 +494,6 @@ fn from_photometric(fit: &PhotometricPoses, confidence: f64) -> Option<MeasuredM
 fn is_undisturbed(fit: &PhotometricFit) -> bool {
     fit.residual < MAX_RESIDUAL
         && !has_other_widths(fit)
-        && !is_blacker_than_ink(fit)
         && fit.has_rings()
         && fit.r_squared > MIN_R_SQUARED
         && is_plain_or_close(fit, MIN_R_SQUARED_PROCESSED)
@@ -541,9 +543,9 @@ fn has_other_widths(fit: &PhotometricFit) -> bool {
     })
 }
 
-/// Whether a fit needs ink that reflects less than nothing.
+/// Whether a fit needs ink that reflects less than nothing, and not as a sharpened image does.
 fn is_blacker_than_ink(fit: &PhotometricFit) -> bool {
-    fit.black < -MAX_BLACKNESS * fit.contrast
+    fit.black < -MAX_BLACKNESS * fit.contrast && !is_sharpened(fit)
 }
 
 /// Whether a fit to a small marker explains the image by what no camera does, or by what the image does not tell.
