@@ -551,7 +551,6 @@ fn is_blacker_than_ink(fit: &PhotometricFit) -> bool {
 /// Whether a fit to a small marker explains the image by what no camera does, or by what the image does not tell.
 fn is_far_fetched(fit: &PhotometricFit) -> bool {
     is_blacker_than_ink(fit)
-        || fit.response.curve < MIN_CURVE
         || fit.told.is_some_and(|it| it.sharpening.deviation > MAX_SHARPENING_DEVIATION)
 }
 
