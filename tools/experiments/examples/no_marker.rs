@@ -6,43 +6,19 @@
 //! ```
 #![allow(clippy::print_stdout, reason = "a table for people is what this example is for")]
 
-use std::time::Instant;
-
 use anyhow::Context;
+use detector::StageClock;
 use experiments::frame_spec::{FrameRenderer, FrameSpec, Tilt, pose};
 use experiments::set::{MARKERS, SIZE_M};
-use fiducial::{Detector, Settings, StageObserver};
+use fiducial::{Detector, Settings};
 use geometry::Pixel;
 use imaging::GrayView;
 use markers::Marker;
+use messages::StageTime;
 use rendering::{CameraSettings, Surface};
 
 const HEIGHTS_M: [f64; 4] = [2.0, 4.0, 6.0, 8.0];
 const REPEATS: usize = 7;
-
-/// The time of each stage, in milliseconds.
-struct Clock {
-    last: Instant,
-    stages: Vec<(&'static str, f64)>,
-}
-
-impl StageObserver for Clock {
-    fn ended(&mut self, stage: &'static str) {
-        let now = Instant::now();
-        let spent_ms = (now - std::mem::replace(&mut self.last, now)).as_secs_f64() * 1e3;
-        add(&mut self.stages, stage, |ms| *ms += spent_ms);
-    }
-}
-
-fn add(list: &mut Vec<(&'static str, f64)>, stage: &'static str, change: impl FnOnce(&mut f64)) {
-    let index = list.iter().position(|(name, _)| *name == stage).unwrap_or_else(|| {
-        list.push((stage, 0.0));
-        list.len() - 1
-    });
-    if let Some((_, ms)) = list.get_mut(index) {
-        change(ms);
-    }
-}
 
 fn main() -> anyhow::Result<()> {
     let seed = std::env::args().nth(1).map_or(Ok(0), |word| word.parse()).context("SEED")?;
@@ -53,7 +29,7 @@ fn main() -> anyhow::Result<()> {
     let mut renderer = FrameRenderer::default();
     let settings = CameraSettings::thesis();
     let model = settings.model;
-    let (mut all_ms, mut stages) = (Vec::new(), Vec::new());
+    let (mut all_ms, mut stages) = (Vec::new(), Vec::<StageTime>::new());
     for (number, surface) in (seed..).step_by(10).zip(Surface::ALL) {
         let mut of_ground = Vec::new();
         for (number, height_m) in (number..).zip(HEIGHTS_M) {
@@ -62,23 +38,23 @@ fn main() -> anyhow::Result<()> {
             let spec = FrameSpec { surface, ..FrameSpec::negative(settings.clone(), at, number) };
             let pixels = renderer.render(&spec)?;
             let view = GrayView::packed(&pixels, model.width as usize, model.height as usize)?;
-            let mut fastest: Option<(f64, Vec<(&str, f64)>)> = None;
+            let mut fastest: Option<(f64, Vec<StageTime>)> = None;
             for _ in 0..REPEATS {
-                let begin = Instant::now();
-                let mut clock = Clock { last: begin, stages: Vec::new() };
-                anyhow::ensure!(
-                    detector.detect(view, Some(&model), &mut clock).is_empty(),
-                    "found"
-                );
-                let ms = begin.elapsed().as_secs_f64() * 1e3;
+                let mut clock = StageClock::start();
+                let found = detector.detect(view, Some(&model), &mut clock);
+                anyhow::ensure!(found.is_empty(), "found");
+                let ms = clock.elapsed().as_secs_f64() * 1e3;
                 if fastest.as_ref().is_none_or(|(least, _)| ms < *least) {
-                    fastest = Some((ms, clock.stages));
+                    fastest = Some((ms, clock.into_stages()));
                 }
             }
             let (ms, parts) = fastest.context("REPEATS is 0")?;
             of_ground.push(ms);
-            for (stage, ms) in parts {
-                add(&mut stages, stage, |sum| *sum += ms);
+            for part in parts {
+                match stages.iter_mut().find(|sum| sum.stage == part.stage) {
+                    Some(sum) => sum.micros += part.micros,
+                    None => stages.push(part),
+                }
             }
         }
         let listed: Vec<String> = of_ground.iter().map(|ms| format!("{ms:.1}")).collect();
@@ -89,8 +65,8 @@ fn main() -> anyhow::Result<()> {
     let count = all_ms.len();
     let median = all_ms.get(count / 2).context("no frame")?;
     println!("median of {count} frames {median:.2} ms; means of the stages:");
-    for (stage, ms) in stages {
-        println!("{stage:12} {:.2} ms", ms / count as f64);
+    for StageTime { stage, micros } in stages {
+        println!("{stage:12} {:.2} ms", f64::from(micros) * 1e-3 / count as f64);
     }
     Ok(())
 }
