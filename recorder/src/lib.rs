@@ -4,7 +4,8 @@
 //! subscribes like anyone, so no other service knows of it or waits for it; of itself it publishes health, configuration
 //! and what it has kept. A file whose writer is killed is read up to its last half second.
 //!
-//! Modules in reading order: [`config`]; [`service`] takes messages, `frame` makes pictures; `recording` is one
+//! Modules in reading order: [`config`]; [`service`] takes messages, `frame` makes pictures, `unseen` counts the frames
+//! that never came; `recording` is one
 //! file as MCAP with its `name`, and `disk` the thread that writes it. `live` offers messages to those who follow: `hub` has
 //! channels and clients, `outbox` and `window` what waits for one and is on its way to it, `guard` who may be one, and `server`
 //! answers them.
@@ -20,6 +21,7 @@ mod outbox;
 mod recording;
 mod server;
 pub mod service;
+mod unseen;
 mod window;
 
 pub use config::Config;

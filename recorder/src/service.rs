@@ -15,6 +15,7 @@ use crate::frame::{Frame, Pictures, received};
 use crate::live::Live;
 use crate::name::named;
 use crate::recording::{Ending, Recording};
+use crate::unseen::Unseen;
 
 /// Longest wait for a message, after which the file is looked after.
 const MAX_WAIT: Duration = Duration::from_millis(50);
@@ -68,6 +69,7 @@ pub async fn run(node: Node, config: Config, shutdown: Shutdown) -> anyhow::Resu
         end_problem: None,
         retry: None,
         kept: 0,
+        unseen: Unseen::default(),
         lost: BTreeMap::new(),
         lost_in_file: None,
         states: BTreeMap::new(),
@@ -154,6 +156,8 @@ struct Recorder {
     /// When a file that failed is tried again.
     retry: Option<Instant>,
     kept: u64,
+    /// Frames that were lost on their way here.
+    unseen: Unseen,
     /// Messages that were lost, by key.
     lost: BTreeMap<String, u64>,
     /// How many the file says.
@@ -195,12 +199,18 @@ impl Recorder {
 
     fn count_dropped(&mut self, tap: &Tap) {
         for (key, count) in tap.take_dropped() {
+            self.unseen.dropped(&key, count);
+            self.lose(key, count);
+        }
+        for (key, count) in self.unseen.more() {
+            self.health.dropped_times("frames that never came", count);
             self.lose(key, count);
         }
     }
 
     /// Keeps a message, or counts it as lost; offers it to those who follow.
     fn take(&mut self, message: Tapped) {
+        self.unseen.take(&message);
         let before_bytes = self.ending_bytes();
         let waiting_bytes = self.recording.as_ref().map(|it| it.status().waiting_bytes);
         let has_room =

@@ -46,10 +46,15 @@ impl HealthCounters {
 
     /// Counts a drop.
     pub fn dropped(&self, reason: &str) {
+        self.dropped_times(reason, 1);
+    }
+
+    /// Counts several drops.
+    pub fn dropped_times(&self, reason: &str, times: u64) {
         let mut counters = self.lock();
         match counters.drops.get_mut(reason) {
-            Some(count) => *count += 1,
-            None => drop(counters.drops.insert(reason.to_owned(), 1)),
+            Some(count) => *count += times,
+            None => drop(counters.drops.insert(reason.to_owned(), times)),
         }
     }
 

@@ -37,6 +37,8 @@ const TRUTH_EVERY: u64 = 5;
 const WIND_EVERY: u64 = 25;
 /// Maximum number of delayed frames; beyond it the oldest is dropped.
 const MAX_DELAYED: usize = 32;
+/// Why numbers of frames are left out.
+const TOO_LONG: &str = "frames that took too long to render";
 /// Time without the truth after which it is requested again.
 const REQUEST_PERIOD: Duration = Duration::from_secs(1);
 /// Ids of the messages with the truth of a simulated ArduPilot (SIM_STATE) and PX4 (HIL_STATE_QUATERNION).
@@ -433,10 +435,11 @@ impl Camera {
                     self.sleep_until(ready_s);
                     runtime.block_on(self.take(sequence, time_s));
                     let due = (self.simulation.now_s() / self.period_s) as u64;
-                    if due > sequence + 1 {
-                        self.node.health().dropped("frames that took too long to render");
+                    let left_out = due.saturating_sub(sequence + 1);
+                    if left_out > 0 {
+                        self.node.health().dropped_times(TOO_LONG, left_out);
                     }
-                    sequence = (sequence + 1).max(due);
+                    sequence += 1 + left_out;
                 }
             })
             .context("starting the camera's thread")?;

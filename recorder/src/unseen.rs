@@ -1,0 +1,117 @@
+//! Frames that never came, by their numbers: a recorder that had no processor for a while does not see what was lost before
+//! it, as frames that found no shared memory.
+
+use std::collections::BTreeMap;
+
+use messages::{FrameHeader, decode, topic};
+use node::Tapped;
+
+/// Maximum number of cameras whose frames are counted.
+const MAX_CAMERAS: usize = 1024;
+/// Maximum number of frames that one gap is believed to have; a larger one is a camera that numbers them anew.
+const MAX_GAP: u64 = 100_000;
+
+/// Follows the key of frames that no one published, or that were lost on their way to the recorder.
+const NEVER_CAME: &str = "(never came)";
+
+/// The numbers of each camera's frames.
+#[derive(Debug, Default)]
+pub(crate) struct Unseen {
+    cameras: BTreeMap<String, Numbers>,
+}
+
+#[derive(Debug, Default)]
+struct Numbers {
+    /// The number of the last frame.
+    last: u64,
+    /// Numbers that were left out before it.
+    missing: u64,
+    /// Frames that came and were dropped before they were looked at; their numbers are missing as well.
+    dropped: u64,
+    /// Frames that have been returned as unseen.
+    counted: u64,
+}
+
+impl Unseen {
+    /// Takes the number of a frame; other messages have none.
+    pub(crate) fn take(&mut self, message: &Tapped) {
+        if topic::FRAME.first_name(&message.key).is_none() {
+            return;
+        }
+        let Ok(header) = decode::<FrameHeader>(&message.attachment) else { return };
+        if let Some(numbers) = self.cameras.get_mut(&message.key) {
+            let step = header.sequence.saturating_sub(numbers.last);
+            if (1..=MAX_GAP).contains(&step) {
+                numbers.missing += step - 1;
+            }
+            numbers.last = header.sequence;
+        } else if self.cameras.len() < MAX_CAMERAS {
+            let first = Numbers { last: header.sequence, ..Numbers::default() };
+            self.cameras.insert(message.key.clone(), first);
+        }
+    }
+
+    /// Takes how many messages of a key were dropped before they were looked at.
+    pub(crate) fn dropped(&mut self, key: &str, count: u64) {
+        if let Some(numbers) = self.cameras.get_mut(key) {
+            numbers.dropped += count;
+        }
+    }
+
+    /// The frames that never came and were not returned before, by key and reason. One that was dropped is missing only once
+    /// the next has come, so that some are returned later.
+    pub(crate) fn more(&mut self) -> Vec<(String, u64)> {
+        let more = self.cameras.iter_mut().filter_map(|(key, numbers)| {
+            let unseen = numbers.missing.saturating_sub(numbers.dropped);
+            let more = unseen.saturating_sub(numbers.counted);
+            numbers.counted += more;
+            (more > 0).then(|| (format!("{key} {NEVER_CAME}"), more))
+        });
+        more.collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use messages::encode;
+
+    use super::*;
+
+    const KEY: &str = "camera/down/frame";
+    const UNSEEN: &str = "camera/down/frame (never came)";
+
+    fn take(unseen: &mut Unseen, sequence: u64) {
+        let header = FrameHeader { sequence, ..FrameHeader::sample() };
+        let attachment = encode(&header);
+        unseen.take(&Tapped { key: KEY.into(), attachment, ..Tapped::default() });
+    }
+
+    #[test]
+    fn numbers_that_are_left_out_are_frames_that_never_came() {
+        let mut unseen = Unseen::default();
+        for sequence in [7, 8, 12, 13] {
+            take(&mut unseen, sequence);
+        }
+        assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 3)]);
+        assert_eq!(unseen.more(), []);
+        // The next two are dropped before they are looked at, and told by who dropped them.
+        unseen.dropped(KEY, 2);
+        assert_eq!(unseen.more(), []);
+        take(&mut unseen, 16);
+        assert_eq!(unseen.more(), []);
+        take(&mut unseen, 18);
+        assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 1)]);
+    }
+
+    #[test]
+    fn a_camera_that_begins_anew_left_nothing_out() {
+        let mut unseen = Unseen::default();
+        for sequence in [900, 0, 1, u64::MAX, 0, 5] {
+            take(&mut unseen, sequence);
+        }
+        assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 4)]);
+        unseen.take(&Tapped { key: KEY.into(), attachment: vec![1, 2, 3], ..Tapped::default() });
+        unseen.take(&Tapped { key: "health/recorder/main".into(), ..Tapped::default() });
+        assert_eq!(unseen.more(), []);
+    }
+}
