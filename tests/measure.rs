@@ -11,7 +11,7 @@
 //! cargo bench -p tests -- overlay [FRAMES]    read back so many drawn pictures of the page with their overlay (1000)
 //! cargo bench -p tests -- video [SECONDS] [link]  the page's pictures, from sent to drawn: at most a minute on this machine at 15
 //!                                             and at 30 Hz, and for so long (600) over a link of 6 Mbit/s, or that alone
-//! cargo bench -p tests -- crowd [TIMES]       what 20 browsers cost a flight, in so many pairs of 10 s without and with them (6)
+//! cargo bench -p tests -- crowd [TIMES]       what 1 and 20 browsers cost a flight, and other work of that size, in so many rounds (6)
 //! ```
 
 #![expect(clippy::print_stdout, reason = "what was measured is for people to read")]

@@ -2,7 +2,9 @@
 
 #![allow(dead_code, reason = "each program uses its part")]
 
-use std::time::Duration;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use futures_util::{SinkExt, StreamExt};
@@ -36,8 +38,13 @@ pub(crate) struct Crowd {
 
 impl Crowd {
     pub(crate) fn new(page: &str) -> Self {
+        Self::of(page, QUICK + SLOW + SILENT)
+    }
+
+    /// The first so many of them, the quick ones before the others.
+    fn of(page: &str, count: usize) -> Self {
         let mut browsers: JoinSet<()> = JoinSet::new();
-        for number in 0..QUICK + SLOW + SILENT {
+        for number in 0..count {
             let page = page.to_owned();
             browsers.spawn(async move {
                 loop {
@@ -100,7 +107,66 @@ fn processor_s(pid: Pid) -> anyhow::Result<f64> {
     Ok(times.iter().sum::<f64>() / TICKS_PER_S)
 }
 
-/// Processor time of each service in a hover without and with the crowd, in turn, so many times; and the page's memory.
+/// Who uses the machine beside the services that fly.
+#[derive(Copy, Clone, Debug, PartialEq, Eq)]
+enum Beside {
+    /// So many browsers, whose page and they themselves need processors.
+    Browsers(usize),
+    /// Threads that have nothing to do with the flight, and need as much as the last browsers and their page did.
+    Strangers,
+}
+
+/// The flight alone, beside one browser, beside all, and the control: what other work on the same processors costs by itself.
+const BESIDE: [Beside; 4] = [
+    Beside::Browsers(0),
+    Beside::Browsers(1),
+    Beside::Browsers(QUICK + SLOW + SILENT),
+    Beside::Strangers,
+];
+/// How often each stranger works, as a browser takes pictures.
+const STRANGER_HZ: f64 = 15.0;
+/// What a stranger copies at a time, as a picture is.
+const STRANGER_BYTES: usize = 40_000;
+
+/// Threads that use processors by themselves; they end with this.
+struct Strangers {
+    are_over: Arc<AtomicBool>,
+}
+
+impl Strangers {
+    /// As many as the crowd, which together need this share of a core.
+    fn new(share: f64) -> Self {
+        let are_over = Arc::new(AtomicBool::new(false));
+        let count = QUICK + SLOW + SILENT;
+        let period = Duration::from_secs_f64(1.0 / STRANGER_HZ);
+        let work = period.mul_f64(share / count as f64);
+        for number in 0..count {
+            let over = Arc::clone(&are_over);
+            std::thread::spawn(move || {
+                std::thread::sleep(period.mul_f64(number as f64 / count as f64));
+                let (from, mut to) = (vec![7_u8; STRANGER_BYTES], vec![0; STRANGER_BYTES]);
+                while !over.load(Ordering::Relaxed) {
+                    let began = Instant::now();
+                    while began.elapsed() < work {
+                        to.copy_from_slice(std::hint::black_box(&from));
+                        std::hint::black_box(&mut to);
+                    }
+                    std::thread::sleep(period.saturating_sub(began.elapsed()));
+                }
+            });
+        }
+        Self { are_over }
+    }
+}
+
+impl Drop for Strangers {
+    fn drop(&mut self) {
+        self.are_over.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Processor time of each service in a hover alone, beside one browser and twenty, and beside other work of the same size, in turn,
+/// so many times; and the page's memory.
 pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
     let ([port], _, _) = testing::ports::free()?;
     let page = format!("127.0.0.1:{port}");
@@ -110,31 +176,36 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
     let reply = landing.node.command(topic::COMMAND, &[], &ControllerCommand::Hold).await?;
     ensure!(reply.accepted, "{reply:?}");
     landing.status("it holds", |s| s.phase == Phase::Hold).await?;
-    let used = || {
-        FLIGHT
-            .iter()
-            .map(|name| processor_s(landing.service(name)?.pid))
-            .collect::<anyhow::Result<Vec<f64>>>()
-    };
-    let mut windows = [Vec::new(), Vec::new()];
-    let mut memories_mb = Vec::new();
+    let flight: Vec<Pid> =
+        FLIGHT.iter().map(|name| Ok(landing.service(name)?.pid)).collect::<anyhow::Result<_>>()?;
     let dashboard = landing.service("dashboard")?.pid;
+    let page_and_browsers = [dashboard, rustix::process::getpid()];
+    let used = |pids: &[Pid]| {
+        pids.iter().map(|pid| processor_s(*pid)).collect::<anyhow::Result<Vec<f64>>>()
+    };
+    let mut windows = BESIDE.map(|_| Vec::new());
+    let (mut memories_mb, mut shares) = (Vec::new(), Vec::new());
     for _ in 0..times {
-        for (is_crowded, windows) in windows.iter_mut().enumerate() {
-            let crowd = (is_crowded == 1).then(|| Crowd::new(&page));
+        let mut share = 0.0;
+        for (beside, windows) in BESIDE.iter().zip(&mut windows) {
+            let _beside: (Option<Crowd>, Option<Strangers>) = match beside {
+                Beside::Browsers(count) => (Some(Crowd::of(&page, *count)), None),
+                Beside::Strangers => (None, Some(Strangers::new(share))),
+            };
             // Until they are connected, or pictures are no longer made.
             sleep(WINDOW / 2).await;
-            let before = used()?;
+            let before = [used(&flight)?, used(&page_and_browsers)?];
             sleep(WINDOW).await;
-            windows.push(
-                used()?
-                    .iter()
-                    .zip(&before)
-                    .map(|(after, before)| after - before)
-                    .collect::<Vec<f64>>(),
-            );
-            if crowd.is_some() {
+            let after = [used(&flight)?, used(&page_and_browsers)?];
+            let [flown, others] = [0, 1].map(|of: usize| {
+                let pairs = after[of].iter().zip(&before[of]);
+                pairs.map(|(after, before)| after - before).collect::<Vec<f64>>()
+            });
+            windows.push(flown);
+            share = others.iter().sum::<f64>() / WINDOW.as_secs_f64();
+            if *beside == Beside::Browsers(QUICK + SLOW + SILENT) {
                 memories_mb.push(memory_mb(dashboard)?);
+                shares.push(100.0 * share);
             }
         }
     }
@@ -143,13 +214,15 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
         values.sort_by(f64::total_cmp);
         values[values.len() / 2]
     };
-    let [without, with] = &windows;
     let compare = |name: &str, of: &dyn Fn(&[f64]) -> f64| {
-        let [without, with] =
-            [median(without, of), median(with, of)].map(|s| 100.0 * s / WINDOW.as_secs_f64());
+        let [alone, one, all, strangers] =
+            windows.each_ref().map(|it| 100.0 * median(it, of) / WINDOW.as_secs_f64());
+        let more = |with: f64| 100.0 * (with / alone - 1.0);
         println!(
-            "{name}: {without:.1} % of a core without, {with:.1} % with 20 browsers: {:+.1} %",
-            100.0 * (with / without - 1.0)
+            "{name}: {alone:.1} % of a core alone, {one:.1} % with one browser ({:+.1} %), {all:.1} % with 20 ({:+.1} %), {strangers:.1} % beside other work ({:+.1} %)",
+            more(one),
+            more(all),
+            more(strangers)
         );
     };
     for (at, name) in FLIGHT.iter().enumerate() {
@@ -157,6 +230,7 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
     }
     compare("detector, controller and gcs-bridge", &|window| window[..3].iter().sum());
     compare("all four", &|window| window.iter().sum());
+    println!("page and 20 browsers, and the other work, % of a core: {shares:.0?}");
     println!("memory of the dashboard with them, MB: {memories_mb:.0?}");
     landing.node.command(topic::COMMAND, &[], &ControllerCommand::Resume).await?;
     landing.lands().await.map(drop)

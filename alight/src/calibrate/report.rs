@@ -113,6 +113,15 @@ pub(super) fn worth_text(calibration: &Calibration) -> String {
         "uncertainty of the projection: {:.3} px or less in 95 % of the image",
         calibration.worst_uncertainty_px()
     );
+    let unknown = calibration.unknown_share();
+    if unknown > 0.0 {
+        let _ = writeln!(
+            text,
+            "not known: {:.0} % of the image, farther from its middle than the board was seen ({:.0} px): show it nearer to the edges, or use no marker there",
+            (100.0 * unknown).ceil(),
+            calibration.seen_radius_px
+        );
+    }
     match &calibration.cross_validation {
         Some(halves) => {
             let _ = writeln!(
@@ -234,6 +243,8 @@ fn calibration_json(calibration: &Calibration) -> Value {
         "noise_px": calibration.noise_px,
         "rms_px": calibration.rms_px,
         "uncertainty_px": calibration.worst_uncertainty_px(),
+        "seen_radius_px": calibration.seen_radius_px,
+        "unknown": calibration.unknown_share(),
         "bend_m": calibration.bend_m,
         "tilt_deg": evidence.tilt.to_degrees(),
         "distance_ratio": evidence.distance_ratio,
