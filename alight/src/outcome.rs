@@ -52,6 +52,8 @@ struct Recording {
     file: String,
     kept: u64,
     dropped: u64,
+    /// Frames that the camera left out, or that were lost on their way to the recorder.
+    never_came: u64,
     problem: Option<String>,
 }
 
@@ -160,11 +162,15 @@ impl LandingSummary {
                 .map(|[p50, p99]| Percentiles { p50, p99 }),
             guidance: status.map_or_else(String::new, |s| s.guidance.clone()),
             processes: self.processes(),
-            recording: self.recorder.as_ref().map(|recorder| Recording {
-                file: recorder.file.clone(),
-                kept: recorder.kept,
-                dropped: recorder.dropped.iter().map(|loss| loss.count).sum(),
-                problem: recorder.problem.clone(),
+            recording: self.recorder.as_ref().map(|recorder| {
+                let [dropped, never_came] = recorder.lost();
+                Recording {
+                    file: recorder.file.clone(),
+                    kept: recorder.kept,
+                    dropped,
+                    never_came,
+                    problem: recorder.problem.clone(),
+                }
             }),
         }
     }
@@ -219,9 +225,13 @@ impl Outcome {
                 format!("{:.0} % of a core", process.cpu_percent)
             ));
         }
-        if let Some(Recording { file, kept, dropped, problem }) = &self.recording {
+        if let Some(Recording { file, kept, dropped, never_came, problem }) = &self.recording {
+            let unseen = match never_came {
+                0 => String::new(),
+                count => format!("; {count} frames never came"),
+            };
             let problem = problem.as_ref().map_or_else(String::new, |it| format!("; {it}"));
-            line(format_args!("recorded {kept} messages, lost {dropped}: {file}{problem}"));
+            line(format_args!("recorded {kept} messages, lost {dropped}{unseen}: {file}{problem}"));
         }
         text.truncate(text.trim_end().len());
         text

@@ -3,16 +3,13 @@
 
 use std::collections::BTreeMap;
 
-use messages::{FrameHeader, decode, topic};
+use messages::{FrameHeader, NEVER_CAME, decode, topic};
 use node::Tapped;
 
 /// Maximum number of cameras whose frames are counted.
 const MAX_CAMERAS: usize = 1024;
 /// Maximum number of frames that one gap is believed to have; a larger one is a camera that numbers them anew.
 const MAX_GAP: u64 = 100_000;
-
-/// Follows the key of frames that no one published, or that were lost on their way to the recorder.
-const NEVER_CAME: &str = "(never came)";
 
 /// The numbers of each camera's frames.
 #[derive(Debug, Default)]

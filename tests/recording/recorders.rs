@@ -11,7 +11,7 @@ use flightlog::Entry;
 use flightlog::writer::DROPPED_CHANNEL;
 use mcap::read::{LinearReader, Options};
 use mcap::records::Record;
-use messages::{ControllerCommand, Health, Phase, decode, topic};
+use messages::{ControllerCommand, Health, NEVER_CAME, Phase, decode, topic};
 use rustix::process::{Signal, kill_process};
 use testing::{python, python_passes};
 use tokio::time::{Instant, sleep};
@@ -184,7 +184,7 @@ pub(crate) async fn cost(rate_hz: u32, more: &[&str]) -> anyhow::Result<()> {
         last.uptime_s - first.uptime_s,
         contents.dropped
     );
-    let by_recorder = contents.dropped.keys().filter(|key| !key.ends_with("(never came)"));
+    let by_recorder = contents.dropped.keys().filter(|key| !key.ends_with(NEVER_CAME));
     ensure!(by_recorder.count() == 0, "{:?}", contents.dropped);
     Ok(())
 }
@@ -227,8 +227,8 @@ pub(crate) async fn overload() -> anyhow::Result<()> {
     let between = numbered(ended) - numbered(began);
     let is_between = |stamp_ns: &&i64| (began.stamp_ns..ended.stamp_ns).contains(*stamp_ns);
     let kept = stamps_ns.iter().filter(is_between).count() as u64;
-    let told = |key| contents.dropped.get(key).copied().unwrap_or(0);
-    let lost = told("camera/down/frame") + told("camera/down/frame (never came)");
+    let told = |key: &str| contents.dropped.get(key).copied().unwrap_or(0);
+    let lost = told("camera/down/frame") + told(&format!("camera/down/frame {NEVER_CAME}"));
     println!("of {between} frames {kept} are kept, {lost} told: {:?}", contents.dropped);
     ensure!(lost > 0, "nothing was lost, so nothing was tried: {contents:?}");
     // Those under way at the two reports, and before and after them.

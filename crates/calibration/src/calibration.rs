@@ -108,8 +108,7 @@ pub struct PlacementError {
 
 /// Half of the side of the marker of [`Calibration::error_at`], by its distance.
 const MARKER_HALF: f64 = 0.05;
-/// Up to this multiple of the radius at which points were seen a lens's polynomial is believed. Of a rendered fisheye of 180 degrees,
-/// seen up to 75, it was 1.2 px off beyond them, where its covariance says 0.02 px.
+/// Up to this multiple of the radius at which points were seen a lens's polynomial is believed.
 const MAX_BEYOND_SEEN: f64 = 1.05;
 /// Columns and rows of places that stand for the whole image.
 const COLUMNS: usize = 16;

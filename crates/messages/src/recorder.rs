@@ -23,10 +23,22 @@ pub struct RecorderStatus {
     pub waiting_bytes: u64,
     /// Messages that were kept since the start.
     pub kept: u64,
-    /// Messages that were lost since the start, by key.
+    /// Messages that were lost since the start, by key; with [`NEVER_CAME`] after it, frames whose numbers are missing.
     pub dropped: Vec<RecorderLoss>,
     /// Why nothing is being kept, as a sentence.
     pub problem: Option<String>,
+}
+
+/// Follows the key of frames that did not come to the recorder: the camera left them out, or they were lost on the way.
+pub const NEVER_CAME: &str = "(never came)";
+
+impl RecorderStatus {
+    /// How many messages the recorder lost, and how many frames never came to it.
+    pub fn lost(&self) -> [u64; 2] {
+        let (never_came, lost): (Vec<_>, Vec<_>) =
+            self.dropped.iter().partition(|loss| loss.key.ends_with(NEVER_CAME));
+        [lost, never_came].map(|losses| losses.iter().map(|loss| loss.count).sum())
+    }
 }
 
 /// Messages of one key that a recorder lost.
@@ -36,4 +48,21 @@ pub struct RecorderLoss {
     pub key: String,
     /// How many.
     pub count: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_never_came_is_no_loss_of_the_recorder() {
+        let loss = |key: &str, count| RecorderLoss { key: key.into(), count };
+        let dropped = vec![
+            loss("wind", 3),
+            loss("camera/down/frame", 2),
+            loss("camera/down/frame (never came)", 7),
+        ];
+        let status = RecorderStatus { dropped, ..RecorderStatus::default() };
+        assert_eq!(status.lost(), [5, 7]);
+    }
 }
