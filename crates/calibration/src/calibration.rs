@@ -1,7 +1,7 @@
 //! The result: a camera, how sure it is, and what that means.
 
 use geometry::{Board, Camera, CameraModel, Pixel, Point, Transform};
-use libm::fmax;
+use libm::{fmax, hypot};
 use nalgebra::{Isometry3, Matrix2, Matrix6, SMatrix, Translation3, Vector3};
 
 use crate::board::BEND;
@@ -41,7 +41,7 @@ pub struct Calibration {
     pub noise_px: f64,
     /// Root mean square of the residuals' lengths, outliers included: what OpenCV reports.
     pub rms_px: f64,
-    /// How far from the principal point points were seen, in pixels.
+    /// How far from the principal point points were seen that fit, in pixels.
     pub seen_radius_px: f64,
     /// The views that were used.
     pub views: Vec<SolvedView>,
@@ -108,6 +108,8 @@ pub struct PlacementError {
 
 /// Half of the side of the marker of [`Calibration::error_at`], by its distance.
 const MARKER_HALF: f64 = 0.05;
+/// Points that are farther from where they are expected, in deviations along an axis, do not show the lens.
+const MAX_FIT_SIGMAS: f64 = 4.0;
 /// Up to this multiple of the radius at which points were seen a lens's polynomial is believed.
 const MAX_BEYOND_SEEN: f64 = 1.05;
 /// Columns and rows of places that stand for the whole image.
@@ -145,6 +147,10 @@ impl Calibration {
         let seen_radius_px = explained
             .iter()
             .flat_map(|view| &view.residuals)
+            .filter(|residual| {
+                let [x, y] = residual.residual_px;
+                hypot(x, y) <= MAX_FIT_SIGMAS * solved.noise_px
+            })
             .map(|residual| residual.seen.distance(&Pixel::new(camera.cx, camera.cy)))
             .fold(0.0, fmax);
         Some(Self {

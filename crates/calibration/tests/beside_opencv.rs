@@ -3,7 +3,8 @@
 mod opencv;
 mod synthetic;
 
-use calibration::{Lens, Options, calibrate_unjudged};
+use calibration::{Calibration, Lens, Options, calibrate_unjudged};
+use geometry::CameraModel;
 use synthetic::{Taking, lenses, map_error_px, views};
 
 #[test]
@@ -39,6 +40,16 @@ fn photographs_give_the_camera_that_opencv_finds() {
                 .unwrap();
         let bent =
             calibrate_unjudged(&set.views, Lens::BrownConrady5, &Options::default()).unwrap();
+        let told = |name: &str, found: &Calibration| {
+            let CameraModel { fx, fy, cx, cy, .. } = found.camera;
+            let sigma = found.covariance[(0, 0)].sqrt();
+            println!(
+                "{}, {name}: {fx:.2} +- {sigma:.2}, {fy:.2}, {cx:.2}, {cy:.2}, rms {:.3} px",
+                set.name, found.rms_px
+            );
+        };
+        told("flat", &flat);
+        told("bent", &bent);
         // Theirs is the least RMS of a flat board; ours gives single bad corners less weight.
         assert!(
             flat.rms_px < 1.05 * theirs.rms_px,
