@@ -126,8 +126,8 @@ async fn a_landing_is_followed_by_a_client_of_foxglove() -> anyhow::Result<()> {
             follows(&serde_json::from_slice(&output.stdout)?)?;
         }
         landing.lands().await?;
-        let dropped = Contents::read(&file)?.dropped;
-        ensure!(dropped.is_empty(), "lost while it was followed: {dropped:?}");
+        let contents = Contents::read(&file)?;
+        ensure!(contents.is_whole(), "lost while it was followed: {:?}", contents.dropped);
         Ok(())
     })
     .await

@@ -65,7 +65,7 @@ async fn is_whole() -> anyhow::Result<()> {
         wind.publish(&Wind { velocity_ned_m_s, stamp_ns: now_ns() }).await;
         if number % 30 == 0 {
             let header = FrameHeader {
-                sequence: u64::from(number),
+                sequence: u64::from(number / 30),
                 stamp_ns: now_ns(),
                 width: EDGE,
                 height: EDGE,
