@@ -52,7 +52,7 @@ struct Recording {
     file: String,
     kept: u64,
     dropped: u64,
-    /// Frames that the camera left out, or that were lost on their way to the recorder.
+    /// Frames whose numbers are missing.
     never_came: u64,
     problem: Option<String>,
 }
@@ -162,15 +162,12 @@ impl LandingSummary {
                 .map(|[p50, p99]| Percentiles { p50, p99 }),
             guidance: status.map_or_else(String::new, |s| s.guidance.clone()),
             processes: self.processes(),
-            recording: self.recorder.as_ref().map(|recorder| {
-                let [dropped, never_came] = recorder.lost();
-                Recording {
-                    file: recorder.file.clone(),
-                    kept: recorder.kept,
-                    dropped,
-                    never_came,
-                    problem: recorder.problem.clone(),
-                }
+            recording: self.recorder.as_ref().map(|recorder| Recording {
+                file: recorder.file.clone(),
+                kept: recorder.kept,
+                dropped: recorder.lost(),
+                never_came: recorder.never_came(),
+                problem: recorder.problem.clone(),
             }),
         }
     }

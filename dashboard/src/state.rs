@@ -327,7 +327,7 @@ impl State {
             let it = &seen.value;
             json!({
                 "name": name, "age_ms": age_ms(now_ns, seen.received_ns), "file": it.file, "bytes": it.bytes,
-                "kept": it.kept, "lost": it.lost()[0],
+                "kept": it.kept, "lost": it.lost(),
                 "problem": it.problem,
             })
         }).collect();

@@ -156,7 +156,7 @@ struct Recorder {
     /// When a file that failed is tried again.
     retry: Option<Instant>,
     kept: u64,
-    /// Frames that were lost on their way here.
+    /// Frames that never came.
     unseen: Unseen,
     /// Messages that were lost, by key.
     lost: BTreeMap<String, u64>,
@@ -189,6 +189,7 @@ impl Recorder {
             }
             if last.is_some_and(|last| Instant::now() >= last) {
                 while let Some(message) = tap.next(Duration::ZERO) {
+                    self.unseen.take(&message);
                     self.lose(message.key, 1);
                 }
                 self.count_dropped(tap);

@@ -1,5 +1,5 @@
-//! Frames that never came, by their numbers: a recorder that had no processor for a while does not see what was lost before
-//! it, as frames that found no shared memory.
+//! Frames that never came, by their numbers: a recorder that had no processor for a while does not see what was lost on the
+//! way to it.
 
 use std::collections::BTreeMap;
 
@@ -10,6 +10,9 @@ use node::Tapped;
 const MAX_CAMERAS: usize = 1024;
 /// Maximum number of frames that one gap is believed to have; a larger one is a camera that numbers them anew.
 const MAX_GAP: u64 = 100_000;
+/// By so many numbers a frame may come late, as one that a link delayed; one that is further behind is of a camera that began
+/// anew.
+const MAX_LATE: u64 = 64;
 
 /// The numbers of each camera's frames.
 #[derive(Debug, Default)]
@@ -38,8 +41,16 @@ impl Unseen {
         let Ok(header) = decode::<FrameHeader>(&message.attachment) else { return };
         if let Some(numbers) = self.cameras.get_mut(&message.key) {
             let step = header.sequence.saturating_sub(numbers.last);
+            let late = numbers.last.saturating_sub(header.sequence);
             if (1..=MAX_GAP).contains(&step) {
                 numbers.missing += step - 1;
+            } else if (1..=MAX_LATE).contains(&late) && header.sequence > 0 {
+                // Its number was missing.
+                numbers.missing = numbers.missing.saturating_sub(1);
+                return;
+            } else if step != 0 || late != 0 {
+                // Those that were dropped before the new numbers leave no gap in them.
+                numbers.missing = numbers.missing.max(numbers.dropped);
             }
             numbers.last = header.sequence;
         } else if self.cameras.len() < MAX_CAMERAS {
@@ -101,9 +112,28 @@ mod tests {
     }
 
     #[test]
+    fn a_frame_that_comes_late_is_not_missing() {
+        let mut unseen = Unseen::default();
+        for sequence in [10, 12, 11, 13] {
+            take(&mut unseen, sequence);
+        }
+        assert_eq!(unseen.more(), []);
+    }
+
+    #[test]
+    fn drops_before_a_camera_begins_anew_hide_no_gap_after_it() {
+        let mut unseen = Unseen::default();
+        take(&mut unseen, 900);
+        unseen.dropped(KEY, 3);
+        take(&mut unseen, 0);
+        take(&mut unseen, 3);
+        assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 2)]);
+    }
+
+    #[test]
     fn a_camera_that_begins_anew_left_nothing_out() {
         let mut unseen = Unseen::default();
-        for sequence in [900, 0, 1, u64::MAX, 0, 5] {
+        for sequence in [900, 0, 1, u64::MAX, 0, 5, 5] {
             take(&mut unseen, sequence);
         }
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 4)]);

@@ -22,6 +22,7 @@ use crate::flight::{LONG, Landing, PATIENCE};
 const QUICK: usize = 14;
 const SLOW: usize = 3;
 const SILENT: usize = 3;
+const ALL: usize = QUICK + SLOW + SILENT;
 /// A silent one is cut off by the server, and comes again.
 const SILENT_FOR: Duration = Duration::from_secs(8);
 /// How long processors are measured, each time.
@@ -38,7 +39,7 @@ pub(crate) struct Crowd {
 
 impl Crowd {
     pub(crate) fn new(page: &str) -> Self {
-        Self::of(page, QUICK + SLOW + SILENT)
+        Self::of(page, ALL)
     }
 
     /// The first so many of them, the quick ones before the others.
@@ -117,12 +118,8 @@ enum Beside {
 }
 
 /// The flight alone, beside one browser, beside all, and the control: what other work on the same processors costs by itself.
-const BESIDE: [Beside; 4] = [
-    Beside::Browsers(0),
-    Beside::Browsers(1),
-    Beside::Browsers(QUICK + SLOW + SILENT),
-    Beside::Strangers,
-];
+const BESIDE: [Beside; 4] =
+    [Beside::Browsers(0), Beside::Browsers(1), Beside::Browsers(ALL), Beside::Strangers];
 /// How often each stranger works, as a browser takes pictures.
 const STRANGER_HZ: f64 = 15.0;
 /// What a stranger copies at a time, as a picture is.
@@ -137,7 +134,7 @@ impl Strangers {
     /// As many as the crowd, which together need this share of a core.
     fn new(share: f64) -> Self {
         let are_over = Arc::new(AtomicBool::new(false));
-        let count = QUICK + SLOW + SILENT;
+        let count = ALL;
         let period = Duration::from_secs_f64(1.0 / STRANGER_HZ);
         let work = period.mul_f64(share / count as f64);
         for number in 0..count {
@@ -184,7 +181,7 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
         pids.iter().map(|pid| processor_s(*pid)).collect::<anyhow::Result<Vec<f64>>>()
     };
     let mut windows = BESIDE.map(|_| Vec::new());
-    let (mut memories_mb, mut shares) = (Vec::new(), Vec::new());
+    let [mut memories_mb, mut shares, mut strangers] = [const { Vec::new() }; 3];
     for _ in 0..times {
         let mut share = 0.0;
         for (beside, windows) in BESIDE.iter().zip(&mut windows) {
@@ -203,9 +200,13 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
             });
             windows.push(flown);
             share = others.iter().sum::<f64>() / WINDOW.as_secs_f64();
-            if *beside == Beside::Browsers(QUICK + SLOW + SILENT) {
-                memories_mb.push(memory_mb(dashboard)?);
-                shares.push(100.0 * share);
+            match beside {
+                Beside::Browsers(ALL) => {
+                    memories_mb.push(memory_mb(dashboard)?);
+                    shares.push(100.0 * share);
+                }
+                Beside::Strangers => strangers.push(100.0 * share),
+                Beside::Browsers(_) => {}
             }
         }
     }
@@ -230,7 +231,7 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
     }
     compare("detector, controller and gcs-bridge", &|window| window[..3].iter().sum());
     compare("all four", &|window| window.iter().sum());
-    println!("page and 20 browsers, and the other work, % of a core: {shares:.0?}");
+    println!("page and 20 browsers, % of a core: {shares:.0?}; other work: {strangers:.0?}");
     println!("memory of the dashboard with them, MB: {memories_mb:.0?}");
     landing.node.command(topic::COMMAND, &[], &ControllerCommand::Resume).await?;
     landing.lands().await.map(drop)

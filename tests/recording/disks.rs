@@ -132,7 +132,7 @@ pub(crate) async fn fail() -> anyhow::Result<()> {
     std::fs::remove_dir_all(path.join("flights"))?;
     told(&statuses, "the file is removed", |s| has_problem(s, "removed")).await?;
     told(&statuses, "it records again", |s| s.problem.is_none() && s.bytes > 0).await?;
-    let [lost, _] = again.lost();
+    let lost = again.lost();
     ensure!(lost > 100, "{again:?}");
     let in_health = timeout(PATIENCE, async {
         while let Some(health) = healths.next().await {
@@ -235,7 +235,7 @@ pub(crate) async fn beside_a_flight() -> anyhow::Result<()> {
     let controller = latest(&healths).await?;
     command(&landing, ControllerCommand::Resume).await?;
     landing.lands().await?;
-    let [lost, _] = after.lost();
+    let lost = after.lost();
     println!(
         "told after {still:.1?} (stands still), {full:.1?} (full), {removed:.1?} (removed), {taken_away:.1?} (unmounted); held {:.0} MB more than {before_mb:.0} MB; {lost} messages lost in {STALL:?}; drops of the controller: {:?}",
         max_mb - before_mb,

@@ -221,7 +221,7 @@ pub(crate) async fn overload() -> anyhow::Result<()> {
         }
         _ => {}
     })?;
-    // A camera that is late leaves numbers out.
+    // The simulated camera leaves numbers out when it is late.
     let numbered = |health: &Health| {
         let published = health.rates.iter().find(|rate| rate.name == "frames");
         let left_out = health.drops.iter().find(|drop| drop.reason == LEFT_OUT);
@@ -235,6 +235,7 @@ pub(crate) async fn overload() -> anyhow::Result<()> {
     let lost = told("camera/down/frame") + told(&format!("camera/down/frame {NEVER_CAME}"));
     println!("of {between} frames {kept} are kept, {lost} told: {:?}", contents.dropped);
     ensure!(lost > 0, "nothing was lost, so nothing was tried: {contents:?}");
+    // Of what is lost while the recorder is stopped it knows by the numbers only, which then must be those that are missing.
     // Those under way at the two reports, and before and after them.
     let untold = between.abs_diff(kept + lost);
     ensure!(untold <= MAX_UNTOLD_FRAMES, "of {between} frames {kept} are kept, {lost} told");

@@ -110,7 +110,7 @@ pub(super) fn worth_text(calibration: &Calibration) -> String {
     let _ = writeln!(text, "the board bends by {across:+.2} mm across and {down:+.2} mm down");
     let _ = writeln!(
         text,
-        "uncertainty of the projection: {:.3} px or less in 95 % of the image",
+        "uncertainty of the projection: {:.3} px or less in 95 % of the image where it is known",
         calibration.worst_uncertainty_px()
     );
     let unknown = calibration.unknown_share();
@@ -244,7 +244,7 @@ fn calibration_json(calibration: &Calibration) -> Value {
         "rms_px": calibration.rms_px,
         "uncertainty_px": calibration.worst_uncertainty_px(),
         "seen_radius_px": calibration.seen_radius_px,
-        "unknown": calibration.unknown_share(),
+        "unknown_share": calibration.unknown_share(),
         "bend_m": calibration.bend_m,
         "tilt_deg": evidence.tilt.to_degrees(),
         "distance_ratio": evidence.distance_ratio,

@@ -191,8 +191,19 @@ impl Calibration {
     /// One standard deviation of the projection at a place of the image, in pixels along each axis (root mean square of both
     /// axes); `None` where the lens model says nothing, or points were not seen so far from the middle.
     pub fn uncertainty_px(&self, pixel: Pixel) -> Option<f64> {
-        let covariance = self.projection_covariance(pixel).filter(|_| self.is_known_at(pixel))?;
+        self.formal_uncertainty_px(pixel).filter(|_| self.is_known_at(pixel))
+    }
+
+    /// What the covariance says, also where points were not seen.
+    fn formal_uncertainty_px(&self, pixel: Pixel) -> Option<f64> {
+        let covariance = self.projection_covariance(pixel)?;
         Some(fmax(covariance.trace() / 2.0, 0.0).sqrt())
+    }
+
+    /// What 95 % of the whole image do not exceed of what the covariance says: too much of it is too few views, wherever.
+    pub(crate) fn worst_formal_uncertainty_px(&self) -> f64 {
+        let places = self.size().middles(COLUMNS, ROWS);
+        percentile_95(places.filter_map(|pixel| self.formal_uncertainty_px(pixel)).collect())
     }
 
     /// The same over the image, row by row, at the middles of equal parts.

@@ -178,7 +178,7 @@ fn judge(calibration: &Calibration) -> Result<(), Refusal> {
         return Err(Refusal::Noisy { noise_px: calibration.noise_px, max_px });
     }
     let (uncertainty_px, max_px) =
-        (calibration.worst_uncertainty_px(), limit::MAX_UNCERTAINTY_PX * large);
+        (calibration.worst_formal_uncertainty_px(), limit::MAX_UNCERTAINTY_PX * large);
     if uncertainty_px > max_px {
         return Err(Refusal::Uncertain { uncertainty_px, max_px });
     }

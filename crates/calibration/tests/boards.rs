@@ -42,6 +42,22 @@ fn sixty_views_of_a_bent_board_give_the_camera() {
 }
 
 #[test]
+fn farther_out_than_the_board_was_seen_the_lens_is_not_known() {
+    let truth = lenses()[0];
+    let all =
+        calibrate(&views(&truth.camera, &Taking::default(), 100), truth.lens, &Options::default());
+    let all = all.unwrap_or_else(|refusal| panic!("{refusal}"));
+    assert!(all.unknown_share() < 0.05, "{}", all.unknown_share());
+    let (middle, corner) = (Pixel::new(640.0, 480.0), Pixel::new(2.0, 2.0));
+    let taking = Taking { part: [0.4, 0.6, 0.4, 0.6], distances: [1.0, 1.5], ..Taking::default() };
+    let some = views(&truth.camera, &taking, 101);
+    let some = calibration::calibrate_unjudged(&some, truth.lens, &Options::default());
+    let some = some.unwrap_or_else(|refusal| panic!("{refusal}"));
+    assert!(some.uncertainty_px(middle).is_some() && some.uncertainty_px(corner).is_none());
+    assert!(some.unknown_share() > 0.1, "{}", some.unknown_share());
+}
+
+#[test]
 fn the_stated_uncertainty_is_that_of_the_errors() {
     let mut all = Vec::new();
     for truth in lenses().into_iter().filter(|truth| truth.lens != Lens::BrownConrady8) {

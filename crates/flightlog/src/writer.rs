@@ -62,7 +62,7 @@ struct Open {
     sequence: u32,
 }
 
-/// How many messages of each key could not be kept so far.
+/// How many messages of each key could not be kept so far, or never came.
 pub fn dropped(now_ns: i64, so_far: &BTreeMap<String, u64>) -> Record {
     Record {
         channel: DROPPED_CHANNEL.to_owned(),

@@ -29,15 +29,21 @@ pub struct RecorderStatus {
     pub problem: Option<String>,
 }
 
-/// Follows the key of frames that did not come to the recorder: the camera left them out, or they were lost on the way.
+/// Follows the key of frames whose numbers are missing: the simulator left them out, or they were lost on their way to the
+/// recorder. What a real camera misses has no number, and stands in its own health.
 pub const NEVER_CAME: &str = "(never came)";
 
 impl RecorderStatus {
-    /// How many messages the recorder lost, and how many frames never came to it.
-    pub fn lost(&self) -> [u64; 2] {
-        let (never_came, lost): (Vec<_>, Vec<_>) =
-            self.dropped.iter().partition(|loss| loss.key.ends_with(NEVER_CAME));
-        [lost, never_came].map(|losses| losses.iter().map(|loss| loss.count).sum())
+    /// How many messages came to the recorder and were lost by it.
+    pub fn lost(&self) -> u64 {
+        let own = self.dropped.iter().filter(|loss| !loss.key.ends_with(NEVER_CAME));
+        own.map(|loss| loss.count).sum()
+    }
+
+    /// How many frames never came to it.
+    pub fn never_came(&self) -> u64 {
+        let frames = self.dropped.iter().filter(|loss| loss.key.ends_with(NEVER_CAME));
+        frames.map(|loss| loss.count).sum()
     }
 }
 
@@ -63,6 +69,6 @@ mod tests {
             loss("camera/down/frame (never came)", 7),
         ];
         let status = RecorderStatus { dropped, ..RecorderStatus::default() };
-        assert_eq!(status.lost(), [5, 7]);
+        assert_eq!((status.lost(), status.never_came()), (5, 7));
     }
 }

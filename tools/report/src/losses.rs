@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use messages::NEVER_CAME;
+
 use crate::flight::Flight;
 
 /// Something of which a part was lost.
@@ -108,9 +110,9 @@ pub fn processes(flight: &Flight) -> Vec<Loss> {
     losses
 }
 
-/// What the recorder lost, by key.
+/// What the recorder lost, by key. Frames that never came to it are among [`frames`].
 pub fn recorder(flight: &Flight) -> Vec<Loss> {
-    let lost = flight.lost.iter().filter(|(_, count)| **count > 0);
+    let lost = flight.lost.iter().filter(|(key, count)| **count > 0 && !key.ends_with(NEVER_CAME));
     lost.map(|(key, count)| Loss {
         place: "recorder".to_owned(),
         what: format!("messages of {key}"),

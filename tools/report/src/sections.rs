@@ -237,7 +237,7 @@ fn lost(view: &View<'_>) -> Section {
         ));
     }
     counted.extend(rows(losses::tape(flight)));
-    if flight.lost.values().all(|count| *count == 0) {
+    if losses::recorder(flight).is_empty() {
         section.before.push(paragraph("The recorder counted no message as lost."));
     }
     if flight.tapes.is_empty() {

@@ -133,7 +133,10 @@ pub fn of(flight: &Flight, frames: &Frames) -> Summary {
             let before = flight.landing.as_ref().map_or(0, |it| it.detector_changes_before);
             status.detector_changes.saturating_sub(before)
         }),
-        messages_lost: flight.lost.values().copied().fold(0, u64::saturating_add),
+        messages_lost: losses::recorder(flight)
+            .iter()
+            .map(|it| it.count)
+            .fold(0, u64::saturating_add),
         wind_mean_m_s: node::stats::mean(&winds),
         wind_max_m_s: winds.iter().copied().reduce(f64::max),
         battery_min: battery_min(flight),

@@ -47,7 +47,7 @@ pub struct CalibrationNote {
     pub noise_px: f64,
     /// Root mean square of the residuals, in pixels.
     pub rms_px: f64,
-    /// One standard deviation of the projection, that 95 % of the image do not exceed, in pixels.
+    /// One standard deviation of the projection, that 95 % of the image where it is known do not exceed, in pixels.
     pub uncertainty_px: f64,
 }
 
