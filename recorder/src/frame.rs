@@ -29,7 +29,7 @@ pub(crate) struct Pictures {
     frames: Frames,
     jpeg_quality: u8,
     period_ns: i64,
-    /// When the last picture of each camera was taken, in nanoseconds.
+    /// When the last picture of each camera was taken, in nanoseconds, by the key of its frames.
     last: BTreeMap<String, i64>,
 }
 
@@ -40,12 +40,10 @@ impl Pictures {
         Self { frames, jpeg_quality: config.jpeg_quality, period_ns, last: BTreeMap::new() }
     }
 
-    /// The frame that a message is; `None` for any other message.
-    pub(crate) fn frame(&mut self, message: &Tapped) -> Option<Frame> {
-        let camera = topic::FRAME.first_name(&message.key)?;
-        let header: FrameHeader = decode(&message.attachment).ok()?;
+    /// The frame that a message with this header is.
+    pub(crate) fn frame(&mut self, message: &Tapped, header: FrameHeader) -> Frame {
         // A camera that begins anew may have other stamps.
-        let last_ns = self.last.get(camera).copied();
+        let last_ns = self.last.get(&message.key).copied();
         let is_due = last_ns.is_none_or(|last_ns| {
             header.stamp_ns.saturating_sub(last_ns).saturating_abs() >= self.period_ns
         });
@@ -59,10 +57,16 @@ impl Pictures {
         let is_whole = picture.is_some();
         let picture = picture.unwrap_or(Picture::None);
         if picture != Picture::None && (self.last.len() < MAX_CAMERAS || last_ns.is_some()) {
-            self.last.insert(camera.to_owned(), header.stamp_ns);
+            self.last.insert(message.key.clone(), header.stamp_ns);
         }
-        Some(Frame { header, picture, is_whole })
+        Frame { header, picture, is_whole }
     }
+}
+
+/// The header of a frame; `None` for any other message.
+pub(crate) fn header(message: &Tapped) -> Option<FrameHeader> {
+    topic::FRAME.first_name(&message.key)?;
+    decode(&message.attachment).ok()
 }
 
 /// A message as it came.
@@ -72,5 +76,25 @@ pub(crate) fn received(message: &Tapped) -> Received<'_> {
         payload: &message.payload,
         attachment: &message.attachment,
         received_ns: message.received_ns,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use messages::encode;
+
+    use super::*;
+
+    #[test]
+    fn only_a_frame_with_a_header_of_ours_is_a_frame() {
+        let sent = FrameHeader { sequence: 7, ..FrameHeader::sample() };
+        let message = |key: &str, attachment: Vec<u8>| Tapped {
+            key: key.into(),
+            attachment,
+            ..Tapped::default()
+        };
+        assert_eq!(header(&message("camera/down/frame", encode(&sent))), Some(sent.clone()));
+        assert_eq!(header(&message("camera/down/frame", vec![1, 2, 3])), None);
+        assert_eq!(header(&message("health/recorder/main", encode(&sent))), None);
     }
 }

@@ -7,11 +7,11 @@ use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::{Context, bail, ensure};
 use flightlog::About;
-use messages::{Delivery, RecorderLoss, RecorderStatus, Row, TOPICS, topic};
+use messages::{Delivery, FrameHeader, RecorderLoss, RecorderStatus, Row, TOPICS, topic};
 use node::{HealthCounters, Node, Shutdown, Tap, Tapped, now_ns};
 
 use crate::config::{Config, Frames};
-use crate::frame::{Frame, Pictures, received};
+use crate::frame::{Frame, Pictures, header, received};
 use crate::live::Live;
 use crate::name::named;
 use crate::recording::{Ending, Recording};
@@ -189,7 +189,7 @@ impl Recorder {
             }
             if last.is_some_and(|last| Instant::now() >= last) {
                 while let Some(message) = tap.next(Duration::ZERO) {
-                    self.unseen.take(&message);
+                    self.number(&message);
                     self.lose(message.key, 1);
                 }
                 self.count_dropped(tap);
@@ -209,9 +209,16 @@ impl Recorder {
         }
     }
 
+    /// The header of a frame, whose number is looked at; `None` for any other message.
+    fn number(&mut self, message: &Tapped) -> Option<FrameHeader> {
+        let header = header(message)?;
+        self.unseen.take(&message.key, header.sequence);
+        Some(header)
+    }
+
     /// Keeps a message, or counts it as lost; offers it to those who follow.
     fn take(&mut self, message: Tapped) {
-        self.unseen.take(&message);
+        let header = self.number(&message);
         let before_bytes = self.ending_bytes();
         let waiting_bytes = self.recording.as_ref().map(|it| it.status().waiting_bytes);
         let has_room =
@@ -221,7 +228,8 @@ impl Recorder {
             .as_mut()
             .is_some_and(|live| live.is_followed(utc_offset_ns, self.states.values()));
         let is_wanted = has_room || is_followed;
-        let frame = is_wanted.then(|| self.pictures.frame(&message)).flatten();
+        let header = header.filter(|_| is_wanted);
+        let frame = header.map(|header| self.pictures.frame(&message, header));
         if let Some(recording) = self.recording.as_mut().filter(|_| has_room) {
             match keep(recording, &message, frame.as_ref()) {
                 Ok(()) => {

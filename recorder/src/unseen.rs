@@ -3,8 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use messages::{FrameHeader, NEVER_CAME, decode, topic};
-use node::Tapped;
+use messages::NEVER_CAME;
 
 /// Maximum number of cameras whose frames are counted.
 const MAX_CAMERAS: usize = 1024;
@@ -33,30 +32,28 @@ struct Numbers {
 }
 
 impl Unseen {
-    /// Takes the number of a frame; other messages have none.
-    pub(crate) fn take(&mut self, message: &Tapped) {
-        if topic::FRAME.first_name(&message.key).is_none() {
-            return;
-        }
-        let Ok(header) = decode::<FrameHeader>(&message.attachment) else { return };
-        if let Some(numbers) = self.cameras.get_mut(&message.key) {
-            let step = header.sequence.saturating_sub(numbers.last);
-            let late = numbers.last.saturating_sub(header.sequence);
-            if (1..=MAX_GAP).contains(&step) {
-                numbers.missing += step - 1;
-            } else if (1..=MAX_LATE).contains(&late) && header.sequence > 0 {
-                // Its number was missing.
-                numbers.missing = numbers.missing.saturating_sub(1);
-                return;
-            } else if step != 0 || late != 0 {
-                // Those that were dropped before the new numbers leave no gap in them.
-                numbers.missing = numbers.missing.max(numbers.dropped);
+    /// Takes the number of a frame, by its key.
+    pub(crate) fn take(&mut self, key: &str, sequence: u64) {
+        let Some(numbers) = self.cameras.get_mut(key) else {
+            if self.cameras.len() < MAX_CAMERAS {
+                let first = Numbers { last: sequence, ..Numbers::default() };
+                self.cameras.insert(key.to_owned(), first);
             }
-            numbers.last = header.sequence;
-        } else if self.cameras.len() < MAX_CAMERAS {
-            let first = Numbers { last: header.sequence, ..Numbers::default() };
-            self.cameras.insert(message.key.clone(), first);
+            return;
+        };
+        let step = sequence.saturating_sub(numbers.last);
+        let late = numbers.last.saturating_sub(sequence);
+        if (1..=MAX_GAP).contains(&step) {
+            numbers.missing += step - 1;
+        } else if (1..=MAX_LATE).contains(&late) && sequence > 0 {
+            // Its number counted as missing, unless it comes twice.
+            numbers.missing = numbers.missing.saturating_sub(1);
+            return;
+        } else if step != 0 || late != 0 {
+            // Those that were dropped before the new numbers leave no gap in them.
+            numbers.missing = numbers.missing.max(numbers.dropped);
         }
+        numbers.last = sequence;
     }
 
     /// Takes how many messages of a key were dropped before they were looked at.
@@ -81,33 +78,25 @@ impl Unseen {
 
 #[cfg(test)]
 mod tests {
-    use messages::encode;
-
     use super::*;
 
     const KEY: &str = "camera/down/frame";
     const UNSEEN: &str = "camera/down/frame (never came)";
 
-    fn take(unseen: &mut Unseen, sequence: u64) {
-        let header = FrameHeader { sequence, ..FrameHeader::sample() };
-        let attachment = encode(&header);
-        unseen.take(&Tapped { key: KEY.into(), attachment, ..Tapped::default() });
-    }
-
     #[test]
     fn numbers_that_are_left_out_are_frames_that_never_came() {
         let mut unseen = Unseen::default();
         for sequence in [7, 8, 12, 13] {
-            take(&mut unseen, sequence);
+            unseen.take(KEY, sequence);
         }
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 3)]);
         assert_eq!(unseen.more(), []);
         // The next two are dropped before they are looked at, and told by who dropped them.
         unseen.dropped(KEY, 2);
         assert_eq!(unseen.more(), []);
-        take(&mut unseen, 16);
+        unseen.take(KEY, 16);
         assert_eq!(unseen.more(), []);
-        take(&mut unseen, 18);
+        unseen.take(KEY, 18);
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 1)]);
     }
 
@@ -115,7 +104,7 @@ mod tests {
     fn a_frame_that_comes_late_is_not_missing() {
         let mut unseen = Unseen::default();
         for sequence in [10, 12, 11, 13] {
-            take(&mut unseen, sequence);
+            unseen.take(KEY, sequence);
         }
         assert_eq!(unseen.more(), []);
     }
@@ -123,10 +112,10 @@ mod tests {
     #[test]
     fn drops_before_a_camera_begins_anew_hide_no_gap_after_it() {
         let mut unseen = Unseen::default();
-        take(&mut unseen, 900);
+        unseen.take(KEY, 900);
         unseen.dropped(KEY, 3);
-        take(&mut unseen, 0);
-        take(&mut unseen, 3);
+        unseen.take(KEY, 0);
+        unseen.take(KEY, 3);
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 2)]);
     }
 
@@ -134,11 +123,8 @@ mod tests {
     fn a_camera_that_begins_anew_left_nothing_out() {
         let mut unseen = Unseen::default();
         for sequence in [900, 0, 1, u64::MAX, 0, 5, 5] {
-            take(&mut unseen, sequence);
+            unseen.take(KEY, sequence);
         }
         assert_eq!(unseen.more(), [(UNSEEN.to_owned(), 4)]);
-        unseen.take(&Tapped { key: KEY.into(), attachment: vec![1, 2, 3], ..Tapped::default() });
-        unseen.take(&Tapped { key: "health/recorder/main".into(), ..Tapped::default() });
-        assert_eq!(unseen.more(), []);
     }
 }

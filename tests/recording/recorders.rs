@@ -11,7 +11,7 @@ use flightlog::Entry;
 use flightlog::writer::DROPPED_CHANNEL;
 use mcap::read::{LinearReader, Options};
 use mcap::records::Record;
-use messages::{ControllerCommand, Health, NEVER_CAME, Phase, decode, topic};
+use messages::{ControllerCommand, Health, NEVER_CAME, Phase, decode, has_never_come, topic};
 use rustix::process::{Signal, kill_process};
 use testing::{python, python_passes};
 use tokio::time::{Instant, sleep};
@@ -64,7 +64,7 @@ impl Contents {
 
     /// Whether the recorder lost nothing of what came to it.
     pub(crate) fn is_whole(&self) -> bool {
-        self.dropped.keys().all(|key| key.ends_with(NEVER_CAME))
+        self.dropped.keys().all(|key| has_never_come(key))
     }
 
     fn add(&mut self, record: Record<'_>, names: &mut BTreeMap<u16, String>) -> anyhow::Result<()> {
@@ -235,8 +235,8 @@ pub(crate) async fn overload() -> anyhow::Result<()> {
     let lost = told("camera/down/frame") + told(&format!("camera/down/frame {NEVER_CAME}"));
     println!("of {between} frames {kept} are kept, {lost} told: {:?}", contents.dropped);
     ensure!(lost > 0, "nothing was lost, so nothing was tried: {contents:?}");
-    // Of what is lost while the recorder is stopped it knows by the numbers only, which then must be those that are missing.
-    // Those under way at the two reports, and before and after them.
+    // What is lost while the recorder is stopped it knows by the missing numbers only. The rest are frames under way at the two
+    // reports, and before and after them.
     let untold = between.abs_diff(kept + lost);
     ensure!(untold <= MAX_UNTOLD_FRAMES, "of {between} frames {kept} are kept, {lost} told");
     Ok(())

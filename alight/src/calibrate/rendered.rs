@@ -18,7 +18,7 @@ mod opencv;
 #[path = "../../../crates/calibration/tests/synthetic/mod.rs"]
 mod synthetic;
 
-use synthetic::{Truth, lenses, map_error_px, turned_map_error_px};
+use synthetic::{Truth, known_error_px, lenses, map_error_px, turned_map_error_px};
 
 const VIEWS: usize = 60;
 
@@ -86,21 +86,6 @@ fn errors(truth: &CameraModel, camera: &CameraModel) -> [f64; 4] {
     let focal = (camera.fx / truth.fx - 1.0).abs().max((camera.fy / truth.fy - 1.0).abs());
     let principal = (camera.cx - truth.cx).hypot(camera.cy - truth.cy);
     [100.0 * focal, principal, map_error_px(truth, camera), turned_map_error_px(truth, camera)]
-}
-
-/// Where a camera shows what, in pixels, over 95 % of the part of the image where it is known.
-fn known_error_px(truth: &CameraModel, found: &Calibration) -> f64 {
-    let known = found.uncertainty_map(64, 48).into_iter().filter(|it| it.sigma_px.is_some());
-    let mut errors_px: Vec<f64> = known
-        .filter_map(|it| {
-            let shown = found
-                .camera
-                .project(Point::from_coords(truth.unproject(it.pixel)?.coords.into()))?;
-            Some(shown.distance(&it.pixel))
-        })
-        .collect();
-    errors_px.sort_by(f64::total_cmp);
-    errors_px[errors_px.len() * 95 / 100]
 }
 
 #[test]

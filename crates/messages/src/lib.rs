@@ -36,7 +36,7 @@ pub use detector::{
     EllipsePx, MarkerPose, Place, Refusal, Refusals, RefusedShape, StageTime,
 };
 pub use health::{Configuration, Count, Health, Latency, Rate};
-pub use recorder::{NEVER_CAME, RecorderLoss, RecorderStatus};
+pub use recorder::{NEVER_CAME, RecorderLoss, RecorderStatus, has_never_come};
 pub use simulation::{Touchdown, Truth, Wind};
 pub use tape::{
     Tape, TapeAction, TapeDecision, TapeEvent, TapeNote, TapeOutput, TapePad, TapeRecord,

@@ -33,17 +33,25 @@ pub struct RecorderStatus {
 /// recorder. What a real camera misses has no number, and stands in its own health.
 pub const NEVER_CAME: &str = "(never came)";
 
+/// Whether what is counted under this key are frames that never came; everything else came, and was lost by the recorder.
+pub fn has_never_come(key: &str) -> bool {
+    key.ends_with(NEVER_CAME)
+}
+
 impl RecorderStatus {
     /// How many messages came to the recorder and were lost by it.
     pub fn lost(&self) -> u64 {
-        let own = self.dropped.iter().filter(|loss| !loss.key.ends_with(NEVER_CAME));
-        own.map(|loss| loss.count).sum()
+        self.sum(|key| !has_never_come(key))
     }
 
     /// How many frames never came to it.
     pub fn never_came(&self) -> u64 {
-        let frames = self.dropped.iter().filter(|loss| loss.key.ends_with(NEVER_CAME));
-        frames.map(|loss| loss.count).sum()
+        self.sum(has_never_come)
+    }
+
+    fn sum(&self, is_of_it: impl Fn(&str) -> bool) -> u64 {
+        let losses = self.dropped.iter().filter(|loss| is_of_it(&loss.key));
+        losses.map(|loss| loss.count).sum()
     }
 }
 

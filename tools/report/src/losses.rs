@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use messages::NEVER_CAME;
+use messages::has_never_come;
 
 use crate::flight::Flight;
 
@@ -112,7 +112,7 @@ pub fn processes(flight: &Flight) -> Vec<Loss> {
 
 /// What the recorder lost, by key. Frames that never came to it are among [`frames`].
 pub fn recorder(flight: &Flight) -> Vec<Loss> {
-    let lost = flight.lost.iter().filter(|(key, count)| **count > 0 && !key.ends_with(NEVER_CAME));
+    let lost = flight.lost.iter().filter(|(key, count)| **count > 0 && !has_never_come(key));
     lost.map(|(key, count)| Loss {
         place: "recorder".to_owned(),
         what: format!("messages of {key}"),

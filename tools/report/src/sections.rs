@@ -229,7 +229,9 @@ fn lost(view: &View<'_>) -> Section {
         section.before.push(missing("frames and detections, so none can be counted as missing"));
     }
     let by_recorder = losses::recorder(flight);
-    if !by_recorder.is_empty() {
+    if by_recorder.is_empty() {
+        section.before.push(paragraph("The recorder counted no message as lost."));
+    } else {
         let all: u64 = by_recorder.iter().map(|loss| loss.count).fold(0, u64::saturating_add);
         section.after.push(details(
             &format!("{all} messages that the recorder lost, by key"),
@@ -237,9 +239,6 @@ fn lost(view: &View<'_>) -> Section {
         ));
     }
     counted.extend(rows(losses::tape(flight)));
-    if losses::recorder(flight).is_empty() {
-        section.before.push(paragraph("The recorder counted no message as lost."));
-    }
     if flight.tapes.is_empty() {
         section.before.push(missing("the controller's tape: the flight cannot be replayed"));
     }

@@ -1,7 +1,7 @@
 //! Views of a board whose truth is known: what a detector would find in them, with errors that its tags' corners share.
 #![allow(dead_code, unreachable_pub, reason = "each of the tests that share this file uses a part")]
 
-use calibration::{ImageSize, Lens, Sighting, View};
+use calibration::{Calibration, ImageSize, Lens, Sighting, View};
 use geometry::{CameraModel, Distortion, Pixel, Point};
 use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, RngExt, SeedableRng};
@@ -210,7 +210,13 @@ fn pose(camera: &CameraModel, taking: &Taking, random: &mut impl Rng) -> Option<
 
 /// How far the projections of two cameras differ, in pixels: what 95 % of the image that `truth` describes do not exceed.
 pub fn map_error_px(truth: &CameraModel, found: &CameraModel) -> f64 {
-    turned_error_px(truth, found, &UnitQuaternion::identity())
+    turned_error_px(truth, found, &UnitQuaternion::identity(), pixels())
+}
+
+/// The same over the part of the image where a calibration counts as known.
+pub fn known_error_px(truth: &CameraModel, found: &Calibration) -> f64 {
+    let known = pixels().filter(|pixel| found.is_known_at(*pixel));
+    turned_error_px(truth, &found.camera, &UnitQuaternion::identity(), known)
 }
 
 /// The same after the rotation between the two cameras' frames that brings the projections nearest: a principal point that
@@ -232,7 +238,7 @@ pub fn turned_map_error_px(truth: &CameraModel, found: &CameraModel) -> f64 {
         let step = matrix.lu().solve(&right).unwrap_or_default();
         turn = UnitQuaternion::from_scaled_axis(step) * turn;
     }
-    turned_error_px(truth, found, &turn)
+    turned_error_px(truth, found, &turn, pixels())
 }
 
 fn pixels() -> impl Iterator<Item = Pixel> {
@@ -240,13 +246,18 @@ fn pixels() -> impl Iterator<Item = Pixel> {
     (0..64 * 48).map(move |i| Pixel::new(at(i, 64), at(i / 64, 48)))
 }
 
-fn turned_error_px(truth: &CameraModel, found: &CameraModel, turn: &UnitQuaternion<f64>) -> f64 {
+fn turned_error_px(
+    truth: &CameraModel,
+    found: &CameraModel,
+    turn: &UnitQuaternion<f64>,
+    pixels: impl Iterator<Item = Pixel>,
+) -> f64 {
     let error = |pixel: Pixel| {
         let ray = turn * truth.unproject(pixel)?.coords;
         let other = found.project(Point::from_coords(ray.into()));
         Some(other.map_or(f64::INFINITY, |other| other.distance(&pixel)))
     };
-    let mut errors: Vec<f64> = pixels().filter_map(error).collect();
+    let mut errors: Vec<f64> = pixels.filter_map(error).collect();
     errors.sort_by(f64::total_cmp);
     errors[errors.len() * 95 / 100]
 }
