@@ -21,6 +21,9 @@ const MAX_VIEWS: usize = 400;
 const MIN_MOVE: f64 = 0.03;
 /// By what share of the image's width the board may move between two frames of a running camera to be held still.
 const MAX_SHAKE: f64 = 0.005;
+/// Corners whose standard deviation is larger are not used where the lens is known, in pixels: those at a fisheye's rim that
+/// could not be refined are a pixel off, and not by chance. Refined ones are known to some hundredths.
+const MAX_CORNER_PX: f64 = 0.15;
 /// An image whose outlines are wider than this is blurred, in pixels.
 pub(super) const BLURRED_PX: f64 = 5.0;
 
@@ -106,6 +109,11 @@ impl<'a> Finder<'a> {
             let Some(places_m) = self.board.corners_m(tag.family, id) else { continue };
             // A tag with wrong bits may be another one; the board has tags enough.
             if tag.wrong_bits > 1 {
+                continue;
+            }
+            // Of four corners that are equally sure the middle has half of the deviation.
+            let corner_px = (2.0 * tag.centre_covariance_px2.trace()).sqrt();
+            if camera.is_some() && corner_px > MAX_CORNER_PX {
                 continue;
             }
             widths.extend(edge_width_px(grey, &corners));

@@ -9,7 +9,7 @@ use fiducial::refine::fit::Scratch;
 use fiducial::refine::pattern::Pattern;
 use geometry::{CameraModel, Distortion, Pixel};
 use imaging::GrayView;
-use scene::errors::{BARREL, errors, guess, scene, share};
+use scene::errors::{BARREL, at_the_rim, errors, guess, scene, share};
 use scene::{Random, Scene};
 
 /// The same from afar and from near in any light, in focus and out of it, through a lens, and half hidden. Centre (px)
@@ -44,6 +44,22 @@ fn corners_are_found_in_bad_light_and_behind_bent_lenses() {
     let found = errors(4, 5, |seed| Scene { shadow: 0.6, ..scene(1818.0, 4.0, 0.3, seed) });
     found.print("shadow");
     assert!(share(&found.centre_px, 0.95) < 0.04);
+}
+
+/// As many, and as exactly, far from the axis of a fisheye lens as near it: 0.2 to 1.2 radians, where the plane before the
+/// camera has stretched seven times. Centre (px) and size (%), 95 %.
+#[test]
+fn corners_are_found_at_the_rim_of_a_fisheyes_image() {
+    for range_m in [0.5, 1.5] {
+        for off_axis in [0.2, 1.2] {
+            let found = errors(2, 4, |seed| at_the_rim(408.0, range_m, off_axis, seed));
+            found.print(&format!("{off_axis} rad off the axis, {range_m} m"));
+            assert_eq!(found.normalised.len(), found.frames, "{off_axis}");
+            let of_size: Vec<_> = found.size.iter().map(|s| 100.0 * s.abs()).collect();
+            let measured = [share(&found.centre_px, 0.95), share(&of_size, 0.95)];
+            assert!(measured[0] <= 0.04 && measured[1] <= 0.3, "{off_axis}: {measured:?}");
+        }
+    }
 }
 
 /// Range (m), then the most that is allowed: centre (px, median and 95 %), size (%, mean and 95 %).

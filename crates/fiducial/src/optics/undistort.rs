@@ -2,29 +2,54 @@
 //! straight.
 
 use geometry::{CameraModel, Distortion, Pixel, Point};
-use nalgebra::Matrix2;
+use nalgebra::{Matrix2, Matrix3, Vector3};
 
 use crate::candidates::quad::middle;
 use crate::optics::homography::{CORNERS, Homography};
 
 /// Squares with a shorter side than this, in pixels, are not refined.
 const MIN_SIDE_PX: f64 = 4.0;
-/// Newton steps per pixel; the distortion hardly changes across a marker, so that each step gains digits.
+/// Newton steps per pixel; from the ideal image that faces the marker the distortion hardly changes across it, so that each
+/// step gains digits.
 const MAX_STEPS: usize = 20;
 /// The iteration ends at this distance, in pixels.
 const CONVERGED_PX: f64 = 1e-3;
 
-/// Maps between the pixels near a marker and the ideal image, which has the same focal length and no
-/// distortion.
+/// Maps between the pixels near a marker and the ideal image: that of a camera without distortion which has the same focal
+/// length and looks at the marker's middle, as the plane before the camera itself is stretched without bound at the rim of
+/// a fisheye's image.
 #[derive(Debug)]
 pub(crate) struct Undistortion<'a> {
     /// `None` where lines are straight in the image as it is.
-    camera: Option<&'a CameraModel>,
-    /// The marker's middle, and its place in the ideal image.
-    pixel: Pixel,
-    ideal: [f64; 2],
+    lens: Option<Facing<'a>>,
+    /// The marker's middle, the same in the image and in the ideal image.
+    middle: Pixel,
     /// Derivatives of the ideal image point by the pixel there.
     jacobian: Matrix2<f64>,
+}
+
+/// A camera, and the ideal one that looks at the marker.
+#[derive(Debug)]
+struct Facing<'a> {
+    camera: &'a CameraModel,
+    /// The ideal camera's axes, as columns in the camera's frame.
+    axes: Matrix3<f64>,
+}
+
+impl<'a> Facing<'a> {
+    /// `None` where the camera's model gives this pixel no direction.
+    fn new(camera: &'a CameraModel, pixel: Pixel) -> Option<Self> {
+        let forward = camera.unproject(pixel)?.coords.normalize();
+        let right = (Vector3::x() - forward * forward.x).normalize();
+        Some(Self { camera, axes: Matrix3::from_columns(&[right, forward.cross(&right), forward]) })
+    }
+
+    /// The direction of an ideal image point, in the camera's frame.
+    fn ray(&self, ideal: [f64; 2], middle: Pixel) -> Vector3<f64> {
+        let x = (ideal[0] - middle.x) / self.camera.fx;
+        let y = (ideal[1] - middle.y) / self.camera.fy;
+        self.axes * Vector3::new(x, y, 1.0)
+    }
 }
 
 impl<'a> Undistortion<'a> {
@@ -34,17 +59,15 @@ impl<'a> Undistortion<'a> {
         if !corners.iter().all(|c| c.x.abs() < 1e6 && c.y.abs() < 1e6) {
             return None;
         }
-        let pixel = middle(corners);
+        let middle = middle(corners);
         let camera = camera.filter(|camera| {
             camera.distortion != Distortion::None
                 && corners.iter().all(|corner| camera.unproject(*corner).is_some())
         });
-        let ideal = [pixel.x, pixel.y];
-        let mut this = Self { camera, pixel, ideal, jacobian: Matrix2::identity() };
+        let mut this = Self { lens: None, middle, jacobian: Matrix2::identity() };
         if let Some(camera) = camera {
-            let ray = camera.unproject(pixel)?;
-            this.ideal = [camera.fx * ray.x() + camera.cx, camera.fy * ray.y() + camera.cy];
-            let (_, jacobian) = this.distort(this.ideal)?;
+            this.lens = Some(Facing::new(camera, middle)?);
+            let (_, jacobian) = this.distort([middle.x, middle.y])?;
             this.jacobian = jacobian.try_inverse()?;
         }
         Some(this)
@@ -52,17 +75,14 @@ impl<'a> Undistortion<'a> {
 
     /// The pixel of an ideal image point, and its derivatives by that point.
     pub(crate) fn distort(&self, ideal: [f64; 2]) -> Option<(Pixel, Matrix2<f64>)> {
-        let Some(camera) = self.camera else {
+        let Some(lens) = &self.lens else {
             return Some((Pixel::new(ideal[0], ideal[1]), Matrix2::identity()));
         };
-        let ray = [(ideal[0] - camera.cx) / camera.fx, (ideal[1] - camera.cy) / camera.fy];
-        let (pixel, by_ray) = camera.project_with_jacobian(Point::new(ray[0], ray[1], 1.0))?;
-        let jacobian = Matrix2::new(
-            by_ray[(0, 0)] / camera.fx,
-            by_ray[(0, 1)] / camera.fy,
-            by_ray[(1, 0)] / camera.fx,
-            by_ray[(1, 1)] / camera.fy,
-        );
+        let place = Point::from_coords(lens.ray(ideal, self.middle).into());
+        let (pixel, by_place) = lens.camera.project_with_jacobian(place)?;
+        let mut jacobian = by_place * lens.axes.fixed_columns::<2>(0);
+        jacobian.column_mut(0).unscale_mut(lens.camera.fx);
+        jacobian.column_mut(1).unscale_mut(lens.camera.fy);
         Some((pixel, jacobian))
     }
 
@@ -77,11 +97,11 @@ impl<'a> Undistortion<'a> {
                 to[1] + slope[(1, 0)] * dx + slope[(1, 1)] * dy,
             ]
         };
-        let mut ideal = from(self.ideal, pixel, self.pixel);
-        let Some(camera) = self.camera else { return Some(ideal) };
+        let mut ideal = from([self.middle.x, self.middle.y], pixel, self.middle);
+        let Some(lens) = &self.lens else { return Some(ideal) };
         for _ in 0..MAX_STEPS {
-            let ray = [(ideal[0] - camera.cx) / camera.fx, (ideal[1] - camera.cy) / camera.fy];
-            let projected = camera.project(Point::new(ray[0], ray[1], 1.0))?;
+            let place = Point::from_coords(lens.ray(ideal, self.middle).into());
+            let projected = lens.camera.project(place)?;
             let error = (pixel.x - projected.x).abs() + (pixel.y - projected.y).abs();
             ideal = from(ideal, pixel, projected);
             if error < CONVERGED_PX {
@@ -99,7 +119,7 @@ impl<'a> Undistortion<'a> {
     /// The homography from the square to the ideal image by the square's corners; `None` where no square
     /// looks so.
     pub(crate) fn homography(&self, corners: &[Pixel; 4]) -> Option<Homography> {
-        let origin = self.ideal;
+        let origin = [self.middle.x, self.middle.y];
         let mut relative = [[0.0; 2]; CORNERS.len()];
         for (relative, corner) in relative.iter_mut().zip(corners) {
             let [x, y] = self.undistort(*corner)?;

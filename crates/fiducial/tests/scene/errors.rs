@@ -5,7 +5,7 @@ use std::time::Instant;
 use fiducial::refine::corners::refine;
 use fiducial::refine::fit::{CornerGuess, Refined, Scratch};
 use fiducial::square_pose;
-use geometry::{CameraModel, Distortion, Pixel};
+use geometry::{CameraModel, Distortion, Pixel, Point, Rotation, Transform, Vector};
 use imaging::GrayView;
 use nalgebra::SVector;
 
@@ -130,6 +130,23 @@ pub(crate) fn scene(focal_px: f64, range_m: f64, tilt: f64, seed: u64) -> Scene 
     let mut scene = Scene::new(CameraModel::pinhole(window, window, focal_px), range_m, tilt, seed);
     let centre = scene.centre();
     let middle = f64::from(window) / 2.0;
+    scene.camera.cx += (middle - centre.x).round();
+    scene.camera.cy += (middle - centre.y).round();
+    scene
+}
+
+/// The same far from the axis of a fisheye lens, by so many radians: its image window shows the marker there.
+pub(crate) fn at_the_rim(focal_px: f64, range_m: f64, off_axis: f64, seed: u64) -> Scene {
+    let mut scene = scene(focal_px, range_m, 0.3, seed);
+    scene.camera.distortion = Distortion::KannalaBrandt([0.01, -0.008, 0.002, -0.0005]);
+    let towards = seed as f64;
+    let turn = Rotation::from_rotation_vector(Vector::new(
+        off_axis * towards.cos(),
+        off_axis * towards.sin(),
+        0.0,
+    ));
+    scene.camera_from_marker = Transform::new(turn, Point::origin()) * scene.camera_from_marker;
+    let (centre, middle) = (scene.centre(), f64::from(scene.camera.width) / 2.0);
     scene.camera.cx += (middle - centre.x).round();
     scene.camera.cy += (middle - centre.y).round();
     scene
