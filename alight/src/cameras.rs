@@ -1,9 +1,13 @@
-//! `alight cameras`: lists the cameras of this machine, says how to configure each, and takes a picture.
+//! `alight cameras`: lists the cameras of this machine and those that are announced over MAVLink, says how to configure each,
+//! and takes a picture.
+
+mod mavlink;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
+use autopilot::Address;
 use camera_pub::{
     Config, ConnectedDevice, DeviceDescription, SizeDescription, connected_devices, source_table,
     take_picture,
@@ -12,6 +16,7 @@ use clap::Args;
 use node::Layers;
 use serde::Serialize;
 
+use self::mavlink::{MavlinkCamera, Stream, announced};
 use crate::args::Format;
 use crate::terminal::{aligned, print};
 
@@ -35,6 +40,9 @@ pub(crate) struct CamerasArgs {
     /// Only this device.
     #[arg(long, value_name = "PATH")]
     device: Option<PathBuf>,
+    /// Ask there for cameras that are announced over MAVLink as well, for 5 s: for example udpin:0.0.0.0:14550, or tcp:127.0.0.1:5762.
+    #[arg(long, value_name = "ADDRESS")]
+    mavlink: Option<Address>,
     /// Format of the list: text, or one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
@@ -47,6 +55,9 @@ struct Listing {
     /// Cameras of GigE Vision and USB3 Vision.
     #[cfg(feature = "genicam")]
     genicam: Vec<camera_pub::GenicamCamera>,
+    /// Cameras that are announced over MAVLink; `None` where they were not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mavlink: Option<Vec<MavlinkCamera>>,
     /// Programs that are on this machine.
     programs: Vec<&'static str>,
 }
@@ -65,6 +76,8 @@ pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
     let listing = listing(Path::new(DEVICES), args.device.as_deref());
     #[cfg(feature = "genicam")]
     let listing = Listing { genicam: camera_pub::genicam_cameras(), ..listing };
+    let announced = args.mavlink.as_ref().map(announced).transpose()?;
+    let listing = Listing { mavlink: announced, ..listing };
     if let Some(file) = &args.picture {
         return save_picture(&listing, file);
     }
@@ -91,6 +104,7 @@ fn listing(folder: &Path, only: Option<&Path>) -> Listing {
         devices,
         #[cfg(feature = "genicam")]
         genicam: Vec::new(),
+        mavlink: None,
         programs: programs.collect(),
     }
 }
@@ -130,6 +144,14 @@ fn text(listing: &Listing) -> String {
         text +=
             &format!("{name}: {vendor} {model} at {address}\n\n[source]\ngenicam = {name:?}\n\n");
     }
+    match listing.mavlink.as_deref() {
+        Some([]) => {
+            text += "No camera is announced over MAVLink there: it must send to this address, and an autopilot in between must \
+                     pass its packets on.\n\n";
+        }
+        Some(cameras) => text.extend(cameras.iter().map(mavlink_text)),
+        None => {}
+    }
     if listing.devices.is_empty() {
         text += "No camera: there is no /dev/video*. A USB camera appears there when it is plugged in; a Raspberry Pi \
                  camera is read by rpicam-vid (docs/camera.md).\n\n";
@@ -140,6 +162,28 @@ fn text(listing: &Listing) -> String {
         [format!("  {name}"), state.to_owned(), (*purpose).to_owned()]
     };
     text + &aligned(&PROGRAMS.each_ref().map(row))
+}
+
+/// A camera that is announced over MAVLink, with the tables of its streams.
+fn mavlink_text(camera: &MavlinkCamera) -> String {
+    let MavlinkCamera { system, component, name, streams } = camera;
+    let mut text = format!("MAVLink {system}/{component}: {name}\n");
+    if streams.is_empty() {
+        text += "  it tells of no video stream\n";
+    }
+    for Stream { id, name, transport, encoding, address, width, height, rate_hz, source } in streams
+    {
+        text += &format!(
+            "  {id} {name}: {transport} {encoding} {width} x {height} at {rate_hz} Hz, {address}\n"
+        );
+        match source {
+            Some(source) => text += &format!("\n{source}\n\n"),
+            None => {
+                text += "  camera-pub does not read it by itself; ffmpeg may (`source.command`, docs/camera.md)\n";
+            }
+        }
+    }
+    text + "\n"
 }
 
 /// The formats of a device, one a line.
@@ -235,6 +279,7 @@ mod tests {
             devices: vec![entry(&formats, true)],
             #[cfg(feature = "genicam")]
             genicam: Vec::new(),
+            mavlink: None,
             programs: vec!["ffmpeg"],
         };
         let text = text(&listing);
@@ -266,6 +311,7 @@ mod tests {
                 devices: vec![other],
                 #[cfg(feature = "genicam")]
                 genicam: Vec::new(),
+                mavlink: None,
                 programs: Vec::new(),
             };
             let text = text(&listing);

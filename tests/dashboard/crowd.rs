@@ -162,6 +162,14 @@ impl Drop for Strangers {
     }
 }
 
+/// The mean of measurements, and its standard deviation.
+fn mean_and_deviation(values: &[f64]) -> [f64; 2] {
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+    [mean, (squares / (count - 1.0).max(1.0) / count).sqrt()]
+}
+
 /// Processor time of each service in a hover alone, beside one browser and twenty, and beside other work of the same size, in turn,
 /// so many times; and the page's memory.
 pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
@@ -210,20 +218,24 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
             }
         }
     }
-    let median = |windows: &[Vec<f64>], of: &dyn Fn(&[f64]) -> f64| {
-        let mut values: Vec<f64> = windows.iter().map(|window| of(window)).collect();
-        values.sort_by(f64::total_cmp);
-        values[values.len() / 2]
-    };
     let compare = |name: &str, of: &dyn Fn(&[f64]) -> f64| {
-        let [alone, one, all, strangers] =
-            windows.each_ref().map(|it| 100.0 * median(it, of) / WINDOW.as_secs_f64());
-        let more = |with: f64| 100.0 * (with / alone - 1.0);
+        let used = windows.each_ref().map(|windows| {
+            windows.iter().map(|window| 100.0 * of(window) / WINDOW.as_secs_f64()).collect()
+        });
+        let [alone, one, all, strangers]: [Vec<f64>; 4] = used;
+        let usual = mean_and_deviation(&alone)[0];
+        // Each beside the window of its own round without anything: a machine changes within minutes.
+        let more = |with: &[f64]| {
+            let more: Vec<f64> =
+                with.iter().zip(&alone).map(|(with, alone)| with - alone).collect();
+            let [mean, deviation] = mean_and_deviation(&more).map(|it| 100.0 * it / usual);
+            format!("{mean:+.1} ± {deviation:.1} %")
+        };
         println!(
-            "{name}: {alone:.1} % of a core alone, {one:.1} % with one browser ({:+.1} %), {all:.1} % with 20 ({:+.1} %), {strangers:.1} % beside other work ({:+.1} %)",
-            more(one),
-            more(all),
-            more(strangers)
+            "{name}: {usual:.1} % of a core alone, {} with one browser, {} with 20, {} beside other work",
+            more(&one),
+            more(&all),
+            more(&strangers)
         );
     };
     for (at, name) in FLIGHT.iter().enumerate() {

@@ -255,15 +255,24 @@ fn flights(seed: u64, number: u64, wanted: [&str; 2]) -> anyhow::Result<()> {
         "simulator.occluder.strength=1",
         "simulator.occluder.for_s=3600",
     ];
+    let shade = [
+        "simulator.ground.light=0.5",
+        "simulator.occluder.kind=shadow",
+        "simulator.occluder.strength=0.875",
+        "simulator.occluder.beside_m=0.5",
+        "simulator.occluder.for_s=3600",
+    ];
     let shadow = [
         "simulator.ground.light=0.5",
         "simulator.occluder.kind=shadow",
         "simulator.occluder.strength=0.875",
         "simulator.occluder.for_s=3600",
     ];
-    for (name, set) in
-        [("low sun: +2 stops, and a reflection", low_sun.as_slice()), ("shadow", &shadow)]
-    {
+    for (name, set) in [
+        ("low sun: +2 stops, and a reflection", low_sun.as_slice()),
+        ("in shade of 3 stops, its edge 0.5 m beside the pad", &shade),
+        ("a shadow's edge across the pad, 3 stops", &shadow),
+    ] {
         for way in ways().filter(|_| is_wanted(name)) {
             let mut set: Vec<String> = set.iter().map(|setting| (*setting).to_owned()).collect();
             // The camera that is flown by default: one without a tone curve sees no pad half of which is three stops darker.

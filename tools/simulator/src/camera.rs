@@ -208,7 +208,7 @@ impl SimCamera {
     }
 
     fn occluder(&self, request: &FrameRequest, truth: &VehicleTruth) -> Occluder {
-        let OccluderSettings { kind, strength, at_s, for_s, below_m } = self.occluder;
+        let OccluderSettings { kind, strength, at_s, for_s, below_m, beside_m } = self.occluder;
         let is_time = request.begun_s.is_some_and(|now_s| (at_s..at_s + for_s).contains(&now_s));
         let is_low = request.pad.position.z() - truth.position.z() < below_m;
         let camera_from_marker = self.camera_from_marker(truth, &request.pad);
@@ -235,12 +235,17 @@ impl SimCamera {
                     level: COVER_LEVEL * exposed as f32,
                 }
             }
-            OccluderKind::Shadow => Occluder::Shadow {
-                // Through the centre, turned against the marker's sides.
-                edge: Line { through: centre, normal: SHADOW_NORMAL },
-                penumbra_px: SHADOW_PENUMBRA_PX,
-                transmission: 1.0 - strength as f32,
-            },
+            OccluderKind::Shadow => {
+                // Turned against the marker's sides; the pad is in the shade when its edge is beside it.
+                let beside_px = beside_m * model.fx / camera_from_marker.origin().z();
+                let (sin, cos) = SHADOW_NORMAL.sin_cos();
+                let through = Pixel::new(centre.x - beside_px * cos, centre.y - beside_px * sin);
+                Occluder::Shadow {
+                    edge: Line { through, normal: SHADOW_NORMAL },
+                    penumbra_px: SHADOW_PENUMBRA_PX,
+                    transmission: 1.0 - strength as f32,
+                }
+            }
             OccluderKind::Haze => Occluder::Haze {
                 transmission: 1.0 - strength as f32,
                 levels: (120.0 * strength * exposed) as f32,

@@ -102,6 +102,7 @@ table! {
         at_s: f64 = 0.0..=3600.0,
         for_s: f64 = 0.0..=3600.0,
         below_m: f64 = 0.0..=1000.0,
+        beside_m: f64 = -100.0..=100.0,
     }
 }
 
@@ -117,7 +118,7 @@ pub enum OccluderKind {
     Cover,
     /// Low contrast.
     Haze,
-    /// The edge of a hard shadow across the marker.
+    /// A hard shadow, whose edge is beside the marker's middle or across it.
     Shadow,
 }
 
