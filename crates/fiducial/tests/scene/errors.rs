@@ -48,8 +48,8 @@ impl Errors {
         self.blur_px.push(refined.blur_px);
         let pose =
             square_pose(&refined.corners, &refined.covariance_px2, scene.size_m, &scene.camera);
-        let range = |pose: &geometry::Transform<_, geometry::Marker>| {
-            let origin: geometry::Point<geometry::Camera> = pose.origin();
+        let range = |pose: &Transform<_, geometry::Marker>| {
+            let origin: Point<geometry::Camera> = pose.origin();
             origin.coords.coords.norm()
         };
         if let Some(pose) = pose {
