@@ -1,23 +1,21 @@
 //! `alight cameras`: lists the cameras of this machine and those that are announced over MAVLink, says how to configure each,
 //! and takes a picture.
 
-mod mavlink;
-
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::Duration;
 
 use anyhow::{Context, bail};
-use autopilot::Address;
 use camera_pub::{
-    Config, ConnectedDevice, DeviceDescription, SizeDescription, connected_devices, source_table,
-    take_picture,
+    Announced, AnnouncedCamera, AnnouncedStream, Config, ConnectedDevice, DeviceDescription,
+    SizeDescription, announced_cameras, connected_devices, source_table, take_picture,
 };
 use clap::Args;
 use node::Layers;
 use serde::Serialize;
 
-use self::mavlink::{MavlinkCamera, Stream, announced};
 use crate::args::Format;
+use crate::runtime::runtime;
 use crate::terminal::{aligned, print};
 
 /// Where the system has its devices.
@@ -28,6 +26,14 @@ const PROGRAMS: [(&str, &str); 3] = [
     ("gst-launch-1.0", "anything GStreamer reads, Jetson cameras among them"),
     ("ffmpeg", "streams"),
 ];
+/// How long cameras may announce themselves over MAVLink and answer: they send a heartbeat each second.
+const ASK_FOR: Duration = Duration::from_secs(5);
+/// What a table with a stream of RTSP needs.
+const RTSP_HINT: &str = if cfg!(feature = "rtsp") {
+    ""
+} else {
+    "# needs a program that was built with `--features rtsp`\n"
+};
 /// Maximum number of sizes of a format that are listed for people.
 const MAX_SIZES: usize = 6;
 
@@ -41,8 +47,8 @@ pub(crate) struct CamerasArgs {
     #[arg(long, value_name = "PATH")]
     device: Option<PathBuf>,
     /// Ask there for cameras that are announced over MAVLink as well, for 5 s: for example udpin:0.0.0.0:14550, or tcp:127.0.0.1:5762.
-    #[arg(long, value_name = "ADDRESS")]
-    mavlink: Option<Address>,
+    #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["picture", "device"])]
+    mavlink: Option<String>,
     /// Format of the list: text, or one JSON object.
     #[arg(long, value_enum, default_value_t)]
     format: Format,
@@ -57,7 +63,7 @@ struct Listing {
     genicam: Vec<camera_pub::GenicamCamera>,
     /// Cameras that are announced over MAVLink; `None` where they were not asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
-    mavlink: Option<Vec<MavlinkCamera>>,
+    mavlink: Option<Announced>,
     /// Programs that are on this machine.
     programs: Vec<&'static str>,
 }
@@ -76,8 +82,11 @@ pub(crate) fn run(args: &CamerasArgs) -> anyhow::Result<ExitCode> {
     let listing = listing(Path::new(DEVICES), args.device.as_deref());
     #[cfg(feature = "genicam")]
     let listing = Listing { genicam: camera_pub::genicam_cameras(), ..listing };
-    let announced = args.mavlink.as_ref().map(announced).transpose()?;
-    let listing = Listing { mavlink: announced, ..listing };
+    let mavlink = match &args.mavlink {
+        Some(address) => Some(runtime()?.block_on(announced_cameras(address, ASK_FOR))?),
+        None => None,
+    };
+    let listing = Listing { mavlink, ..listing };
     if let Some(file) = &args.picture {
         return save_picture(&listing, file);
     }
@@ -144,16 +153,16 @@ fn text(listing: &Listing) -> String {
         text +=
             &format!("{name}: {vendor} {model} at {address}\n\n[source]\ngenicam = {name:?}\n\n");
     }
-    match listing.mavlink.as_deref() {
-        Some([]) => {
-            text += "No camera is announced over MAVLink there: it must send to this address, and an autopilot in between must \
-                     pass its packets on.\n\n";
+    if let Some(Announced { cameras, problem }) = &listing.mavlink {
+        text.extend(cameras.iter().map(announced_text));
+        if let Some(problem) = problem {
+            text += &format!("MAVLink: {problem}\n\n");
+        } else if cameras.is_empty() {
+            text += "MAVLink: nobody there says that it is a camera; an autopilot in between must pass its packets on\n\n";
         }
-        Some(cameras) => text.extend(cameras.iter().map(mavlink_text)),
-        None => {}
     }
     if listing.devices.is_empty() {
-        text += "No camera: there is no /dev/video*. A USB camera appears there when it is plugged in; a Raspberry Pi \
+        text += "No camera of Video4Linux: there is no /dev/video*. A USB camera appears there when it is plugged in; a Raspberry Pi \
                  camera is read by rpicam-vid (docs/camera.md).\n\n";
     }
     text += "Programs that camera-pub can read a camera with (`source.command`):\n";
@@ -165,19 +174,32 @@ fn text(listing: &Listing) -> String {
 }
 
 /// A camera that is announced over MAVLink, with the tables of its streams.
-fn mavlink_text(camera: &MavlinkCamera) -> String {
-    let MavlinkCamera { system, component, name, streams } = camera;
-    let mut text = format!("MAVLink {system}/{component}: {name}\n");
+fn announced_text(camera: &AnnouncedCamera) -> String {
+    let AnnouncedCamera { system, component, device, name, streams } = camera;
+    let of_several = if *device > 0 { format!(", camera {device}") } else { String::new() };
+    let name = if name.is_empty() { "a camera without a name" } else { name };
+    let mut text = format!("MAVLink {system}/{component}{of_several}: {name}\n");
     if streams.is_empty() {
         text += "  it tells of no video stream\n";
     }
-    for Stream { id, name, transport, encoding, address, width, height, rate_hz, source } in streams
+    for AnnouncedStream { id, name, transport, encoding, address, size_px, rate_hz, source } in
+        streams
     {
-        text += &format!(
-            "  {id} {name}: {transport} {encoding} {width} x {height} at {rate_hz} Hz, {address}\n"
-        );
+        let size = size_px.map(|[width, height]| format!("{width} x {height}"));
+        let rate = rate_hz.map(|rate_hz| format!("at {rate_hz} Hz"));
+        let parts = [
+            Some(format!("{id}")),
+            Some(name.clone()),
+            Some((*transport).to_owned()),
+            Some((*encoding).to_owned()),
+            size,
+            rate,
+            Some(address.clone()),
+        ];
+        let parts: Vec<String> = parts.into_iter().flatten().filter(|it| !it.is_empty()).collect();
+        text += &format!("  {}\n", parts.join(" "));
         match source {
-            Some(source) => text += &format!("\n{source}\n\n"),
+            Some(source) => text += &format!("\n{source}\n{RTSP_HINT}\n"),
             None => {
                 text += "  camera-pub does not read it by itself; ffmpeg may (`source.command`, docs/camera.md)\n";
             }
@@ -297,7 +319,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let listing = listing(folder.path(), None);
         let text = text(&listing);
-        assert!(text.contains("No camera: there is no /dev/video*"), "{text}");
+        assert!(text.contains("No camera of Video4Linux: there is no /dev/video*"), "{text}");
         assert!(text.contains("rpicam-vid") && text.contains("`source.command`"), "{text}");
         let problem = save_picture(&listing, Path::new("unused.png")).unwrap_err().to_string();
         assert!(problem.contains("no camera that can be read"), "{problem}");

@@ -678,9 +678,23 @@ impl MountConfig {
     }
 }
 
-/// An address without what stands before its host, which may be a password.
-fn without_credentials(address: &str) -> &str {
-    address.rsplit('@').next().unwrap_or_default()
+/// An address without a name and a password: without what stands between its scheme and the last `@` before the path, or, where
+/// a password has a slash in it, before the end.
+pub(crate) fn without_credentials(address: &str) -> String {
+    let (scheme, rest) = match address.split_once("://") {
+        Some((scheme, rest)) => (format!("{scheme}://"), rest),
+        None => (String::new(), address),
+    };
+    let end = rest.find(['/', '?', '#']).unwrap_or(rest.len());
+    let authority = &rest[..end];
+    let is_port = |text: &str| text.chars().all(|it| it.is_ascii_digit());
+    let has_odd_port = authority.rsplit_once(':').is_some_and(|(_, port)| !is_port(port));
+    let at = match authority.rfind('@') {
+        None if has_odd_port => rest.rfind('@'),
+        at => at,
+    };
+    let shown = at.map_or(rest, |at| &rest[at + 1..]);
+    format!("{scheme}{shown}")
 }
 
 fn holds(holds: bool, otherwise: &'static str) -> Result<(), &'static str> {

@@ -8,8 +8,10 @@
 //! finds each frame's own, `exposure` says from its stamp when the frame was exposed. `rect` publishes frames without the lens'
 //! distortion for whoever wants them.
 //! `v4l2` reads cameras without a program, `genicam` (a feature) those of that standard, `rtsp` (a feature) those that stream over a network; `clock` is the host's time
-//! of a camera's own. `marker` says how cameras are exposed for the marker; [`devices`] lists those of this machine.
+//! of a camera's own. `marker` says how cameras are exposed for the marker; [`devices`] lists those of this machine,
+//! [`announced`] those that are announced over MAVLink.
 
+pub mod announced;
 #[cfg(any(feature = "genicam", feature = "rtsp"))]
 mod clock;
 pub mod config;
@@ -28,6 +30,7 @@ pub mod service;
 mod side_channel;
 mod v4l2;
 
+pub use announced::{Announced, AnnouncedCamera, AnnouncedStream, announced_cameras};
 pub use config::Config;
 pub use devices::{ConnectedDevice, connected_devices, source_table, take_picture};
 #[cfg(feature = "genicam")]

@@ -189,7 +189,7 @@ impl Recorder {
             }
             if last.is_some_and(|last| Instant::now() >= last) {
                 while let Some(message) = tap.next(Duration::ZERO) {
-                    self.number(&message);
+                    self.take_number(&message);
                     self.lose(message.key, 1);
                 }
                 self.count_dropped(tap);
@@ -210,7 +210,7 @@ impl Recorder {
     }
 
     /// The header of a frame, whose number is looked at; `None` for any other message.
-    fn number(&mut self, message: &Tapped) -> Option<FrameHeader> {
+    fn take_number(&mut self, message: &Tapped) -> Option<FrameHeader> {
         let header = header(message)?;
         self.unseen.take(&message.key, header.sequence);
         Some(header)
@@ -218,7 +218,7 @@ impl Recorder {
 
     /// Keeps a message, or counts it as lost; offers it to those who follow.
     fn take(&mut self, message: Tapped) {
-        let header = self.number(&message);
+        let header = self.take_number(&message);
         let before_bytes = self.ending_bytes();
         let waiting_bytes = self.recording.as_ref().map(|it| it.status().waiting_bytes);
         let has_room =

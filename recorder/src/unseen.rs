@@ -46,7 +46,7 @@ impl Unseen {
         if (1..=MAX_GAP).contains(&step) {
             numbers.missing += step - 1;
         } else if (1..=MAX_LATE).contains(&late) && sequence > 0 {
-            // Its number counted as missing, unless it comes twice.
+            // Its number counted as missing. One that comes twice is taken for two, so that a gap may be told too small.
             numbers.missing = numbers.missing.saturating_sub(1);
             return;
         } else if step != 0 || late != 0 {

@@ -162,12 +162,12 @@ impl Drop for Strangers {
     }
 }
 
-/// The mean of measurements, and its standard deviation.
+/// The mean of measurements, and the standard deviation of that mean, which a single one does not tell.
 fn mean_and_deviation(values: &[f64]) -> [f64; 2] {
     let count = values.len() as f64;
     let mean = values.iter().sum::<f64>() / count;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    [mean, (squares / (count - 1.0).max(1.0) / count).sqrt()]
+    [mean, (squares / (count - 1.0) / count).sqrt()]
 }
 
 /// Processor time of each service in a hover alone, beside one browser and twenty, and beside other work of the same size, in turn,
@@ -190,9 +190,11 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
     };
     let mut windows = BESIDE.map(|_| Vec::new());
     let [mut memories_mb, mut shares, mut strangers] = [const { Vec::new() }; 3];
-    for _ in 0..times {
-        let mut share = 0.0;
-        for (beside, windows) in BESIDE.iter().zip(&mut windows) {
+    let mut share = 0.0;
+    for round in 0..times {
+        // Each round begins with another one, so that what changes within a minute favours none.
+        for at in (0..BESIDE.len()).map(|at| (at + round) % BESIDE.len()) {
+            let (beside, windows) = (&BESIDE[at], &mut windows[at]);
             let _beside: (Option<Crowd>, Option<Strangers>) = match beside {
                 Beside::Browsers(count) => (Some(Crowd::of(&page, *count)), None),
                 Beside::Strangers => (None, Some(Strangers::new(share))),
@@ -207,13 +209,14 @@ pub(crate) async fn cost(times: usize) -> anyhow::Result<()> {
                 pairs.map(|(after, before)| after - before).collect::<Vec<f64>>()
             });
             windows.push(flown);
-            share = others.iter().sum::<f64>() / WINDOW.as_secs_f64();
+            let used = others.iter().sum::<f64>() / WINDOW.as_secs_f64();
             match beside {
                 Beside::Browsers(ALL) => {
+                    share = used;
                     memories_mb.push(memory_mb(dashboard)?);
-                    shares.push(100.0 * share);
+                    shares.push(100.0 * used);
                 }
-                Beside::Strangers => strangers.push(100.0 * share),
+                Beside::Strangers => strangers.push(100.0 * used),
                 Beside::Browsers(_) => {}
             }
         }

@@ -87,6 +87,8 @@ pub(super) enum Origin {
 struct Seen {
     view: View,
     edge_px: Option<f64>,
+    /// Tags that were left out, as their corners are not known well enough.
+    unsure: usize,
 }
 
 impl<'a> Finder<'a> {
@@ -104,6 +106,7 @@ impl<'a> Finder<'a> {
         let grey = image.view().context("the image has no pixels")?;
         let mut points = Vec::new();
         let mut widths = Vec::new();
+        let mut unsure = 0;
         for tag in self.detector.detect(grey, camera, &mut ()) {
             let (Some(id), Some(corners)) = (tag.id, tag.corners) else { continue };
             let Some(places_m) = self.board.corners_m(tag.family, id) else { continue };
@@ -114,6 +117,7 @@ impl<'a> Finder<'a> {
             // Of four corners that are equally sure the middle has half of the deviation.
             let corner_px = (2.0 * tag.centre_covariance_px2.trace()).sqrt();
             if camera.is_some() && corner_px > MAX_CORNER_PX {
+                unsure += 1;
                 continue;
             }
             widths.extend(edge_width_px(grey, &corners));
@@ -123,7 +127,7 @@ impl<'a> Finder<'a> {
         widths.sort_by(f64::total_cmp);
         let size = ImageSize { width: image.width() as u32, height: image.height() as u32 };
         let edge_px = widths.get(widths.len() / 2).copied();
-        Ok(Seen { view: View { name: name.to_owned(), size, points }, edge_px })
+        Ok(Seen { view: View { name: name.to_owned(), size, points }, edge_px, unsure })
     }
 }
 
@@ -132,7 +136,7 @@ impl FoundImages {
     pub(super) fn add(&mut self, finder: &mut Finder<'_>, picture: Picture) {
         let Picture { name, image, origin } = picture;
         self.images += 1;
-        let Seen { view, edge_px } = match finder.look_at(&image, &name, None) {
+        let Seen { view, edge_px, .. } = match finder.look_at(&image, &name, None) {
             Ok(seen) => seen,
             Err(problem) => return self.unreadable.push(format!("{name}: {problem:#}")),
         };
@@ -158,17 +162,20 @@ impl FoundImages {
     /// Looks at the same images again, with the lens as it was found from the first look: it bends the edges of near tags, and
     /// corners between edges taken to be straight lie too far out.
     pub(super) fn look_again(&mut self, finder: &mut Finder<'_>, camera: &CameraModel) {
-        for (view, image) in self.views.iter_mut().zip(&self.kept) {
+        let mut looked_at = Vec::new();
+        for (mut view, image) in self.views.drain(..).zip(self.kept.drain(..)) {
             let is_its_size = (view.size.width, view.size.height) == (camera.width, camera.height);
-            if !is_its_size {
-                continue;
+            if is_its_size && let Ok(seen) = finder.look_at(&image, &view.name, Some(camera)) {
+                match (seen.view.points.is_empty(), seen.unsure) {
+                    (false, _) => view = seen.view,
+                    // What the first look found is as unsure.
+                    (true, 1..) => continue,
+                    (true, 0) => {}
+                }
             }
-            if let Ok(seen) = finder.look_at(image, &view.name, Some(camera))
-                && !seen.view.points.is_empty()
-            {
-                *view = seen.view;
-            }
+            looked_at.push((view, image));
         }
+        (self.views, self.kept) = looked_at.into_iter().unzip();
     }
 }
 

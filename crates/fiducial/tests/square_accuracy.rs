@@ -46,7 +46,7 @@ fn corners_are_found_in_bad_light_and_behind_bent_lenses() {
     assert!(share(&found.centre_px, 0.95) < 0.04);
 }
 
-/// As many, and as exactly, far from the axis of a fisheye lens as near it: 0.2 to 1.2 radians, where the plane before the
+/// All are found, within the same bounds, near the axis of a fisheye lens and 1.2 radians off it, where the plane before the
 /// camera has stretched seven times. Centre (px) and size (%), 95 %.
 #[test]
 fn corners_are_found_at_the_rim_of_a_fisheyes_image() {

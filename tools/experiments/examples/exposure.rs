@@ -248,28 +248,27 @@ fn flights(seed: u64, number: u64, wanted: [&str; 2]) -> anyhow::Result<()> {
             println!("| {stops:+} stops | {way} | {} |", landings(seed, number, set)?);
         }
     }
-    let low_sun = [
-        "simulator.ground.light=2",
-        "simulator.camera.set_for_light=0.5",
-        "simulator.occluder.kind=glare",
-        "simulator.occluder.strength=1",
-        "simulator.occluder.for_s=3600",
-    ];
-    let shade = [
-        "simulator.ground.light=0.5",
-        "simulator.occluder.kind=shadow",
-        "simulator.occluder.strength=0.875",
-        "simulator.occluder.beside_m=0.5",
-        "simulator.occluder.for_s=3600",
-    ];
+    let low_sun = |strength| {
+        [
+            "simulator.ground.light=2",
+            "simulator.camera.set_for_light=0.5",
+            "simulator.occluder.kind=glare",
+            strength,
+            "simulator.occluder.for_s=3600",
+        ]
+    };
+    let (weak, strong) =
+        (low_sun("simulator.occluder.strength=0.3"), low_sun("simulator.occluder.strength=1"));
     let shadow = [
         "simulator.ground.light=0.5",
         "simulator.occluder.kind=shadow",
         "simulator.occluder.strength=0.875",
         "simulator.occluder.for_s=3600",
     ];
+    let shade = [&shadow[..], &["simulator.occluder.beside_m=0.5"]].concat();
     for (name, set) in [
-        ("low sun: +2 stops, and a reflection", low_sun.as_slice()),
+        ("low sun: +2 stops, and a reflection of 0.3 of white", weak.as_slice()),
+        ("low sun: +2 stops, and a reflection as bright as white", &strong),
         ("in shade of 3 stops, its edge 0.5 m beside the pad", &shade),
         ("a shadow's edge across the pad, 3 stops", &shadow),
     ] {

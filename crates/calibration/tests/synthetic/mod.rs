@@ -219,7 +219,7 @@ pub fn known_error_px(truth: &CameraModel, found: &Calibration) -> f64 {
     turned_error_px(truth, &found.camera, &UnitQuaternion::identity(), known)
 }
 
-/// The same after the rotation between the two cameras' frames that brings the projections nearest: a principal point that
+/// As `map_error_px`, after the rotation between the two cameras' frames that brings the projections nearest: a principal point that
 /// is off by a pixel is then little more than a camera that is turned by as much.
 pub fn turned_map_error_px(truth: &CameraModel, found: &CameraModel) -> f64 {
     let mut turn = UnitQuaternion::identity();

@@ -9,8 +9,8 @@ use crate::optics::homography::{CORNERS, Homography};
 
 /// Squares with a shorter side than this, in pixels, are not refined.
 const MIN_SIDE_PX: f64 = 4.0;
-/// Newton steps per pixel; from the ideal image that faces the marker the distortion hardly changes across it, so that each
-/// step gains digits.
+/// Steps of Newton's method per pixel, all with the slope in the marker's middle; from the ideal image that faces the marker
+/// the distortion hardly changes across it, so that each step gains digits.
 const MAX_STEPS: usize = 20;
 /// The iteration ends at this distance, in pixels.
 const CONVERGED_PX: f64 = 1e-3;
@@ -53,8 +53,8 @@ impl<'a> Facing<'a> {
 }
 
 impl<'a> Undistortion<'a> {
-    /// Around these corners. Without a camera, or where its model is not defined, lines are taken to be
-    /// straight.
+    /// Around these corners. Without a camera, or where its model gives a corner no direction, lines are taken to be straight.
+    /// `None` for corners far outside of any image, or where the model gives only their middle no direction.
     pub(crate) fn new(camera: Option<&'a CameraModel>, corners: &[Pixel; 4]) -> Option<Self> {
         if !corners.iter().all(|c| c.x.abs() < 1e6 && c.y.abs() < 1e6) {
             return None;
@@ -128,5 +128,62 @@ impl<'a> Undistortion<'a> {
         let homography = Homography { origin, ..Homography::from_square([-1.0, 1.0], &relative)? };
         (homography.is_valid() && homography.shortest_side_px() >= MIN_SIDE_PX)
             .then_some(homography)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_4, TAU};
+
+    use super::*;
+
+    fn cameras() -> [CameraModel; 2] {
+        let fisheye = Distortion::KannalaBrandt([0.01, -0.008, 0.002, -0.0005]);
+        let barrel = Distortion::BrownConrady([-0.28, 0.07, 2e-4, 2e-5, 0.0, 0.0, 0.0, 0.0]);
+        [(408.0, fisheye), (900.0, barrel)].map(|(focal_px, distortion)| CameraModel {
+            fy: 1.1 * focal_px,
+            distortion,
+            ..CameraModel::pinhole(1280, 960, focal_px)
+        })
+    }
+
+    /// Pixels and ideal image points are each other's inverse, and the slopes are those of differences, wherever the
+    /// marker is.
+    #[test]
+    fn the_two_images_and_their_slopes_agree() {
+        let mut tried = 0;
+        for camera in cameras() {
+            for off_axis in [0.0, 0.05, 0.4, 0.8, 1.2] {
+                for around in (0..8).map(|i| f64::from(i) * FRAC_PI_4) {
+                    let (sin, cos) = f64::sin_cos(off_axis);
+                    let ray = Point::new(sin * around.cos(), sin * around.sin(), cos);
+                    let Some(middle) = camera.project(ray) else { continue };
+                    let corner = |i: u32| {
+                        let (sin, cos) = (f64::from(i) * TAU / 4.0 + 0.3).sin_cos();
+                        Pixel::new(middle.x + 40.0 * cos, middle.y + 40.0 * sin)
+                    };
+                    let corners = [0, 1, 2, 3].map(corner);
+                    let Some(lens) = Undistortion::new(Some(&camera), &corners) else { continue };
+                    for pixel in corners {
+                        let Some(ideal) = lens.undistort(pixel) else { continue };
+                        let (back, slope) = lens.distort(ideal).unwrap();
+                        assert!(back.distance(&pixel) < 2e-3, "{off_axis} {around}");
+                        for axis in 0..2 {
+                            let mut moved = ideal;
+                            moved[axis] += 1e-3;
+                            let (moved, _) = lens.distort(moved).unwrap();
+                            let by = [(moved.x - back.x) / 1e-3, (moved.y - back.y) / 1e-3];
+                            let is_slope = |row: usize| (by[row] - slope[(row, axis)]).abs() < 1e-3;
+                            assert!(
+                                is_slope(0) && is_slope(1),
+                                "{off_axis} {around} {by:?} {slope}"
+                            );
+                        }
+                        tried += 1;
+                    }
+                }
+            }
+        }
+        assert!(tried > 200, "{tried}");
     }
 }

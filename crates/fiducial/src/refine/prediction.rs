@@ -206,7 +206,8 @@ impl<'a> PatternGrid<'a> {
             let row = view.row(y);
             let columns = row.iter().enumerate().take(right).skip(left + y * 5 % skipped);
             for (column, (x, grey)) in columns.step_by(skipped).enumerate() {
-                let ideal = lens.undistort(Pixel::new(x as f64, y as f64))?;
+                // Beyond the rim of a fisheye's image there is nothing.
+                let Some(ideal) = lens.undistort(Pixel::new(x as f64, y as f64)) else { continue };
                 let ideal = [ideal[0] - origin[0], ideal[1] - origin[1]];
                 let Some(point) = self.point(&map, ideal) else { continue };
                 let lattice = if self.is_near_edge(&point) { &near } else { &far };

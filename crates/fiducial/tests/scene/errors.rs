@@ -135,11 +135,12 @@ pub(crate) fn scene(focal_px: f64, range_m: f64, tilt: f64, seed: u64) -> Scene 
     scene
 }
 
-/// The same far from the axis of a fisheye lens, by so many radians: its image window shows the marker there.
+/// The same far from the axis of a fisheye lens, by so many radians, in each of four directions in turn: the image is a window
+/// around the marker there.
 pub(crate) fn at_the_rim(focal_px: f64, range_m: f64, off_axis: f64, seed: u64) -> Scene {
     let mut scene = scene(focal_px, range_m, 0.3, seed);
     scene.camera.distortion = Distortion::KannalaBrandt([0.01, -0.008, 0.002, -0.0005]);
-    let towards = seed as f64;
+    let towards = seed as f64 * std::f64::consts::FRAC_PI_2;
     let turn = Rotation::from_rotation_vector(Vector::new(
         off_axis * towards.cos(),
         off_axis * towards.sin(),
