@@ -18,7 +18,8 @@ use serde::Serialize;
 use tokio::net::UdpSocket;
 use tokio::time::{Instant, interval, sleep_until};
 
-use crate::config::without_credentials;
+use crate::config::{RATES_HZ, without_credentials};
+use crate::v4l2::abi::text;
 
 /// Period of the questions, until they are answered.
 const ASK_PERIOD: Duration = Duration::from_millis(700);
@@ -31,8 +32,6 @@ const MAX_DATAGRAM: usize = 4096;
 /// The component id under which questions are sent (MAV_COMP_ID_ONBOARD_COMPUTER4): 191 is the controller's, whose packets a
 /// bridge takes for its own vehicle's.
 const ASKING_AS: u8 = 194;
-/// What a configuration takes, in Hz.
-const RATES_HZ: std::ops::RangeInclusive<f32> = 0.01..=1000.0;
 
 /// A camera that was announced.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -155,20 +154,23 @@ impl Port {
         match self {
             Self::Open { socket, hosts } => {
                 let mut buffer = [0; MAX_DATAGRAM];
-                // A host that has gone refuses what was sent to it.
-                let Ok((length, from)) = socket.recv_from(&mut buffer).await else {
-                    return Heard::Packets(Vec::new(), None);
-                };
-                if !hosts.contains_key(&from) && hosts.len() >= MAX_HOSTS {
-                    return Heard::Packets(Vec::new(), None);
+                loop {
+                    // A host that has gone refuses what was sent to it.
+                    let Ok((length, from)) = socket.recv_from(&mut buffer).await else { continue };
+                    if hosts.contains_key(&from) || hosts.len() < MAX_HOSTS {
+                        let packets = hosts.entry(from).or_default().push(&buffer[..length]);
+                        return Heard::Packets(packets, Some(from));
+                    }
                 }
-                let packets = hosts.entry(from).or_default().push(&buffer[..length]);
-                Heard::Packets(packets, Some(from))
             }
-            Self::Link(link) => match link.recv().await {
-                LinkEvent::Packet { packet, .. } => Heard::Packets(vec![*packet], None),
-                LinkEvent::Disconnected { reason } => Heard::Problem(reason),
-                LinkEvent::Connected { .. } => Heard::Packets(Vec::new(), None),
+            Self::Link(link) => loop {
+                match link.recv().await {
+                    LinkEvent::Packet { packet, .. } => {
+                        return Heard::Packets(vec![*packet], None);
+                    }
+                    LinkEvent::Disconnected { reason } => return Heard::Problem(reason),
+                    LinkEvent::Connected { .. } => {}
+                }
             },
         }
     }
@@ -329,11 +331,8 @@ impl Inquiry {
 }
 
 fn name(told: &CAMERA_INFORMATION_DATA) -> String {
-    let text = |bytes: &[u8]| {
-        let end = bytes.iter().position(|byte| *byte == 0).unwrap_or(bytes.len());
-        printable(&String::from_utf8_lossy(&bytes[..end]))
-    };
-    [text(&told.vendor_name), text(&told.model_name)].join(" ").trim().to_owned()
+    let parts = [&told.vendor_name, &told.model_name].map(|bytes| printable(&text(bytes)));
+    parts.join(" ").trim().to_owned()
 }
 
 fn stream(told: &VIDEO_STREAM_INFORMATION_DATA) -> AnnouncedStream {
@@ -347,7 +346,7 @@ fn stream(told: &VIDEO_STREAM_INFORMATION_DATA) -> AnnouncedStream {
     let address = without_credentials(&told_address);
     let size_px = [told.resolution_h, told.resolution_v];
     let size_px = (size_px.iter().all(|edge| (1..=16384).contains(edge))).then_some(size_px);
-    let rate_hz = Some(told.framerate).filter(|rate| RATES_HZ.contains(rate));
+    let rate_hz = Some(told.framerate).filter(|rate| RATES_HZ.contains(&f64::from(*rate)));
     let is_read = told.mavtype == VideoStreamType::VIDEO_STREAM_TYPE_RTSP
         && address.starts_with("rtsp://")
         && encoding != "H.265";

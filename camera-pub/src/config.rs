@@ -231,12 +231,15 @@ struct MountConfig {
     rotation_wxyz: [f64; 4],
 }
 
+/// Frame rates that a source may have, in Hz.
+pub(crate) const RATES_HZ: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
+
 impl Settings for Config {
     const DEFAULTS: &'static str = include_str!("../camera-pub.toml");
 
     fn check(&self, check: &mut Check<'_>) {
         check.name("id", &self.id);
-        check.range("source.rate_hz", self.source.rate_hz, 0.01..=1000.0);
+        check.range("source.rate_hz", self.source.rate_hz, RATES_HZ);
         check.parses("source.bayer", self.source.bayer_pattern());
         check.parses("source.binning", self.source.checked_binning());
         check.range("source.max_megapixels", self.source.max_megapixels, 0.001..=4294.0);

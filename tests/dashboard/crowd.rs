@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, ensure};
 use futures_util::{SinkExt, StreamExt};
 use messages::{ControllerCommand, Phase, topic};
+use node::stats::{mean, standard_deviation};
 use rustix::process::Pid;
 use tokio::net::TcpStream;
 use tokio::task::JoinSet;
@@ -162,12 +163,10 @@ impl Drop for Strangers {
     }
 }
 
-/// The mean of measurements, and the standard deviation of that mean, which a single one does not tell.
+/// The mean of measurements, and the standard deviation of that mean; a single one tells none.
 fn mean_and_deviation(values: &[f64]) -> [f64; 2] {
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    [mean, (squares / (count - 1.0) / count).sqrt()]
+    let deviation = standard_deviation(values).unwrap_or(f64::NAN);
+    [mean(values).unwrap_or(f64::NAN), deviation / (values.len() as f64).sqrt()]
 }
 
 /// Processor time of each service in a hover alone, beside one browser and twenty, and beside other work of the same size, in turn,

@@ -87,8 +87,8 @@ pub(super) enum Origin {
 struct Seen {
     view: View,
     edge_px: Option<f64>,
-    /// Tags that were left out, as their corners are not known well enough.
-    unsure: usize,
+    /// Whether tags were left out, as their corners are not known well enough.
+    has_unsure: bool,
 }
 
 impl<'a> Finder<'a> {
@@ -106,7 +106,7 @@ impl<'a> Finder<'a> {
         let grey = image.view().context("the image has no pixels")?;
         let mut points = Vec::new();
         let mut widths = Vec::new();
-        let mut unsure = 0;
+        let mut has_unsure = false;
         for tag in self.detector.detect(grey, camera, &mut ()) {
             let (Some(id), Some(corners)) = (tag.id, tag.corners) else { continue };
             let Some(places_m) = self.board.corners_m(tag.family, id) else { continue };
@@ -117,7 +117,7 @@ impl<'a> Finder<'a> {
             // Of four corners that are equally sure the middle has half of the deviation.
             let corner_px = (2.0 * tag.centre_covariance_px2.trace()).sqrt();
             if camera.is_some() && corner_px > MAX_CORNER_PX {
-                unsure += 1;
+                has_unsure = true;
                 continue;
             }
             widths.extend(edge_width_px(grey, &corners));
@@ -127,7 +127,7 @@ impl<'a> Finder<'a> {
         widths.sort_by(f64::total_cmp);
         let size = ImageSize { width: image.width() as u32, height: image.height() as u32 };
         let edge_px = widths.get(widths.len() / 2).copied();
-        Ok(Seen { view: View { name: name.to_owned(), size, points }, edge_px, unsure })
+        Ok(Seen { view: View { name: name.to_owned(), size, points }, edge_px, has_unsure })
     }
 }
 
@@ -166,11 +166,11 @@ impl FoundImages {
         for (mut view, image) in self.views.drain(..).zip(self.kept.drain(..)) {
             let is_its_size = (view.size.width, view.size.height) == (camera.width, camera.height);
             if is_its_size && let Ok(seen) = finder.look_at(&image, &view.name, Some(camera)) {
-                match (seen.view.points.is_empty(), seen.unsure) {
-                    (false, _) => view = seen.view,
+                if !seen.view.points.is_empty() {
+                    view = seen.view;
+                } else if seen.has_unsure {
                     // What the first look found is as unsure.
-                    (true, 1..) => continue,
-                    (true, 0) => {}
+                    continue;
                 }
             }
             looked_at.push((view, image));

@@ -327,7 +327,7 @@ pub(crate) const fn fourcc(letters: [u8; 4]) -> u32 {
     u32::from_le_bytes(letters)
 }
 
-/// A text of the kernel, which a zero ends.
+/// A text in a field of fixed size, which a zero ends where it is shorter.
 pub(crate) fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|byte| *byte == 0).unwrap_or(bytes.len());
     String::from_utf8_lossy(bytes.get(..end).unwrap_or_default()).trim().to_owned()
