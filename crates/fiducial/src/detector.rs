@@ -8,6 +8,7 @@ use crate::candidates::evidence::{Evidence, Needs};
 use crate::families;
 use crate::families::family::{FamilyDetector, FrameInput, Output, PredictedShape, Prediction};
 use crate::observation::{Observation, StageObserver};
+use crate::optics::shadow::ShadowFinder;
 use crate::response::{ResponseEstimate, ResponseSetting};
 use crate::schedule::{FallbackPass, FallbackStep, PassSchedule};
 use crate::settings::Settings;
@@ -34,8 +35,11 @@ pub struct Detector {
     needs: Needs,
     families: Vec<Box<dyn FamilyDetector>>,
     evidence: Evidence,
-    /// The image as an ordinary camera's tone curve shows it.
-    brightened: GrayImage,
+    /// The image that a fallback pass searches instead of the frame of which it is made.
+    derived: GrayImage,
+    shadows: ShadowFinder,
+    /// What is shared of the image without its shadow.
+    without_shadow: Evidence,
     found: Vec<Observation>,
     trace: Trace,
     /// The fallback passes of these families, in the order in which they take turns, and the number of turns.
@@ -72,7 +76,9 @@ impl Detector {
             passes: FallbackPass::ALL.into_iter().filter(has).collect(),
             families,
             evidence: Evidence::default(),
-            brightened: GrayImage::default(),
+            derived: GrayImage::default(),
+            shadows: ShadowFinder::default(),
+            without_shadow: Evidence::default(),
             found: Vec::new(),
             trace: Trace::default(),
             turns: 0,
@@ -96,8 +102,8 @@ impl Detector {
     }
 
     /// As [`Detector::detect`], in a stream of images in which nothing was found of late: the fallback passes are spread
-    /// over the images. When no marker is found without them, one of up to eight passes runs, in the next image the next
-    /// one; a marker that is occluded or far away is found up to seven images later.
+    /// over the images. When no marker is found without them, one of up to nine passes runs, in the next image the next
+    /// one; a marker that is occluded or far away is found up to eight images later.
     pub fn detect_in_turn(
         &mut self,
         view: GrayView<'_>,
@@ -139,9 +145,9 @@ impl Detector {
         self.found.clear();
         self.trace.clear();
         self.make_room(view);
-        let Self { families, evidence, brightened, found, trace, followed, response, .. } = self;
-        let response = *response;
-        let followed = followed.as_slice();
+        let Self { families, evidence, derived, without_shadow, found, trace, .. } = self;
+        let response = self.response;
+        let followed = self.followed.as_slice();
         let stages: &mut dyn StageObserver = stages;
         evidence.find(view, &self.needs, trace, stages);
         let mut out = Output { found, trace, stages };
@@ -163,11 +169,25 @@ impl Detector {
                     continue;
                 }
                 let is_first = !std::mem::replace(&mut is_prepared, true);
+                if step == FallbackStep::ShadowEdge {
+                    if is_first {
+                        let pyramid = evidence.outlines.pyramid();
+                        let Some(edge) = self.shadows.find(view, pyramid) else { break };
+                        edge.remove(view, derived);
+                        let Some(view) = derived.view() else { break };
+                        without_shadow.find(view, &self.needs, out.trace, out.stages);
+                    }
+                    let Some(view) = derived.view() else { break };
+                    let evidence = &mut *without_shadow;
+                    let input = FrameInput { view, camera, evidence, schedule, followed, response };
+                    family.detect(input, &mut out);
+                    continue;
+                }
                 let is_brightened = step == FallbackStep::Brightened;
                 if is_first && is_brightened {
-                    brightened.make_brightened(view);
+                    derived.make_brightened(view);
                 }
-                let view = brightened.view().filter(|_| is_brightened).unwrap_or(view);
+                let view = derived.view().filter(|_| is_brightened).unwrap_or(view);
                 if is_first {
                     evidence.prepare(view, step, schedule, out.stages);
                 }
@@ -226,8 +246,10 @@ impl Detector {
         self.found.reserve(MAX_AT_ONCE);
         self.trace.make_room();
         self.evidence.make_room(view, &self.needs);
-        if self.passes.contains(&FallbackPass::Brightened) {
-            self.brightened.resize(view.width(), view.height());
+        if self.passes.contains(&FallbackPass::ShadowEdge) {
+            self.derived.resize(view.width(), view.height());
+            self.shadows.make_room(view);
+            self.without_shadow.make_room(view, &self.needs);
         }
         self.families.iter_mut().for_each(|family| family.make_room());
     }

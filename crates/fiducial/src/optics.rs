@@ -7,4 +7,5 @@ pub(crate) mod homography;
 pub(crate) mod least_squares;
 pub(crate) mod mosaic;
 pub(crate) mod normal;
+pub(crate) mod shadow;
 pub(crate) mod undistort;

@@ -10,6 +10,7 @@
 //! | [`FallbackPass::Arcs`] | rings that are cut or covered, and rings under noise, on coarser levels | rings |
 //! | [`FallbackPass::Blobs`] | bright blobs that may be the paper of rings far away | rings |
 //! | [`FallbackPass::Brightened`] | rings of a camera without a tone curve that lie partly in deep shade | rings |
+//! | [`FallbackPass::ShadowEdge`] | markers that the straight edge of a shadow crosses, in the image without that shadow | all |
 //! | [`FallbackPass::FineSegments`], [`FallbackPass::CoarseSegments`] | occluded square markers, by segments of edges on two levels | square, STag |
 //! | [`FallbackPass::QuietZones`] | small square markers, by their paper, in a third of the image | square, STag |
 
@@ -24,6 +25,8 @@ pub enum FallbackPass {
     Blobs,
     /// Rings that lie partly in deep shade, in the square root of an image that is linear in light.
     Brightened,
+    /// Markers that the straight edge of a shadow crosses, in the image without that shadow.
+    ShadowEdge,
     /// Occluded square markers, by segments of edges on the finer of two levels.
     FineSegments,
     /// The same on the coarser level.
@@ -56,13 +59,14 @@ impl ImageStrip {
 
 impl FallbackPass {
     /// All passes, in the order in which they take turns in a stream.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Arcs,
         Self::QuietZones(ImageStrip::Upper),
         Self::FineSegments,
         Self::Blobs,
         Self::QuietZones(ImageStrip::Middle),
         Self::CoarseSegments,
+        Self::ShadowEdge,
         Self::Brightened,
         Self::QuietZones(ImageStrip::Lower),
     ];
@@ -72,13 +76,14 @@ impl FallbackPass {
         match self {
             Self::Arcs => FallbackStep::Arcs,
             Self::Blobs => FallbackStep::Blobs,
+            Self::ShadowEdge => FallbackStep::ShadowEdge,
             Self::Brightened => FallbackStep::Brightened,
             Self::FineSegments | Self::CoarseSegments => FallbackStep::Segments,
             Self::QuietZones(_) => FallbackStep::QuietZones,
         }
     }
 
-    fn bit(self) -> u8 {
+    fn bit(self) -> u16 {
         Self::ALL.iter().position(|pass| *pass == self).map_or(0, |index| 1 << index)
     }
 }
@@ -86,6 +91,8 @@ impl FallbackPass {
 /// A step of the fallbacks in one image: the allowed passes of one kind together.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum FallbackStep {
+    /// The search of the image without a shadow. The first step, as others place a marker under its edge less well.
+    ShadowEdge,
     Arcs,
     Blobs,
     Segments,
@@ -98,7 +105,8 @@ pub(crate) enum FallbackStep {
 
 impl FallbackStep {
     /// All steps, in the order in which they run in an image.
-    pub(crate) const ALL: [Self; 6] = [
+    pub(crate) const ALL: [Self; 7] = [
+        Self::ShadowEdge,
         Self::Arcs,
         Self::Blobs,
         Self::Segments,
@@ -110,7 +118,7 @@ impl FallbackStep {
     /// The name of its stage; `None` for steps whose families name their stages.
     pub(crate) fn stage(self) -> Option<&'static str> {
         match self {
-            Self::Arcs | Self::Blobs | Self::Brightened => None,
+            Self::Arcs | Self::Blobs | Self::ShadowEdge | Self::Brightened => None,
             Self::Segments | Self::LateSegments => Some("occluded"),
             Self::QuietZones => Some("quiet zones"),
         }
@@ -119,11 +127,11 @@ impl FallbackStep {
 
 /// The fallback passes that may run in an image.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
-pub struct PassSchedule(u8);
+pub struct PassSchedule(u16);
 
 impl PassSchedule {
     /// Every pass.
-    pub const ALL: Self = Self(0b1111_1111);
+    pub const ALL: Self = Self(0b1_1111_1111);
     /// No pass.
     pub const NONE: Self = Self(0);
 

@@ -230,6 +230,37 @@ fn rings_under_the_edge_of_deep_shade_are_found_by_a_camera_without_a_tone_curve
 }
 
 #[test]
+fn small_markers_under_the_edge_of_a_shadow_are_found_in_the_image_without_it() {
+    let camera = Binning::FourByFour.camera();
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let mut all = [0; 2];
+    for name in ["rings", "apriltag-36h11:3", "apriltag-16h5:3", "aruco-4x4-50:7", "stag-hd23:2"] {
+        let [mut with, mut without] = [Errors::default(), Errors::default()];
+        let mut detector = detector(name);
+        // 23 to 40 px.
+        let frames = square_frames(name, &[3.5, 3.9, 4.3, 4.7, 5.0, 5.3, 5.6, 6.0]);
+        for (index, (pixels, camera_from_marker)) in frames.iter().enumerate() {
+            let place = camera_from_marker.origin();
+            let (centre, range_m) = (camera.project(place).unwrap(), place.coords.coords.norm());
+            let edge = Line { through: centre, normal: 0.4 + 1.3 * index as f64 };
+            let pixels = shaded(pixels, width, edge, [0.25, 0.12][index % 2]);
+            let shown = Preset::Usb.processing().apply(&pixels, width).unwrap();
+            let view = GrayView::packed(&shown, width, height).unwrap();
+            let fewer = PassSchedule::ALL.without(FallbackPass::ShadowEdge);
+            for (schedule, errors) in [(PassSchedule::ALL, &mut with), (fewer, &mut without)] {
+                let found = detector.detect_with(view, Some(&camera), schedule, &mut ());
+                errors.note(found, centre, range_m);
+            }
+        }
+        all.iter_mut().zip([&with, &without]).for_each(|(all, of)| *all += of.centre_px.len());
+        with.expect(&format!("{name} across a shadow's edge"), 1, [0.05, 0.3], [0.5, 2.0]);
+    }
+    let [with, without] = all;
+    println!("{with} with the pass, {without} without");
+    assert!(3 * without < 2 * with, "{with} with the pass, {without} without");
+}
+
+#[test]
 fn squares_and_stags_are_where_they_are_in_processed_frames() {
     let camera = Binning::FourByFour.camera();
     let bounds = [

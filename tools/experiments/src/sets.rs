@@ -118,7 +118,7 @@ mod tests {
             ("noise", 42),
             ("light", 54),
             ("rolling", 48),
-            ("shade", 120),
+            ("shade", 160),
             ("ground", ground::COUNT),
             ("cut", cut::FRAMES),
             ("tracking", 30),

@@ -150,7 +150,8 @@ impl Evidence {
             self.min_percent = self.contrast.reached_in(PAPER_SHARE).min(PAPER_PERCENT);
         }
         match step {
-            FallbackStep::Arcs | FallbackStep::Blobs => {}
+            // The image without the shadow has its own.
+            FallbackStep::Arcs | FallbackStep::Blobs | FallbackStep::ShadowEdge => {}
             FallbackStep::Brightened => {
                 // Of the image itself.
                 self.min_percent = SHADED_PERCENT;

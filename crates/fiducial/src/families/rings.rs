@@ -363,7 +363,12 @@ impl FamilyDetector for RingDetector {
     }
 
     fn fallback_steps(&self) -> &'static [FallbackStep] {
-        &[FallbackStep::Arcs, FallbackStep::Blobs, FallbackStep::Brightened]
+        &[
+            FallbackStep::Arcs,
+            FallbackStep::Blobs,
+            FallbackStep::ShadowEdge,
+            FallbackStep::Brightened,
+        ]
     }
 
     fn make_room(&mut self) {

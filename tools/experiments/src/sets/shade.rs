@@ -1,6 +1,7 @@
 //! Light and cover as they are outdoors: edges of hard shadows of any contrast, dappled shade, leaves.
 
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 use markers::Marker;
 use rand::RngExt;
@@ -12,7 +13,7 @@ use super::scene::{Draw, discs, on_marker, view};
 use crate::frame_spec::FrameSpec;
 use crate::set::Set;
 
-/// Frames of each group.
+/// Frames of each group; of small markers half as many.
 const FRAMES: usize = 20;
 
 /// Light in the sun over light in the shade.
@@ -23,14 +24,7 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     for contrast in CONTRASTS {
         for _ in 0..FRAMES {
             let (spec, mut rng) = large(draw, marker, frames.len());
-            let occluder = Occluder::Shadow {
-                edge: Line {
-                    through: on_marker(&spec, &mut rng, 0.4),
-                    normal: rng.random_range(0.0..TAU),
-                },
-                penumbra_px: rng.random_range(1.0..4.0),
-                transmission: (1.0 / contrast) as f32,
-            };
+            let occluder = edge(&spec, &mut rng, contrast, 1.0..4.0);
             frames.push(spec.with(format!("edge1:{contrast}"), occluder));
         }
     }
@@ -53,7 +47,29 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
         let level = [25.0, 60.0, 110.0][frames.len() % 3];
         frames.push(spec.with("leaves", Occluder::Leaves { leaves, level }));
     }
+    for contrast in CONTRASTS {
+        for _ in 0..FRAMES / 2 {
+            let draw = draw.frame(Set::Shade, frames.len());
+            let (spec, mut rng) = view(draw, marker, CameraSettings::thesis(), 18.0..40.0, 0.4);
+            let occluder = edge(&spec, &mut rng, contrast, 0.5..2.0);
+            frames.push(spec.with(format!("small1:{contrast}"), occluder));
+        }
+    }
     frames
+}
+
+/// The edge of a shadow through the middle parts of the marker, with a penumbra of so many pixels.
+fn edge(
+    spec: &FrameSpec,
+    rng: &mut ChaCha8Rng,
+    contrast: f64,
+    penumbra_px: Range<f32>,
+) -> Occluder {
+    Occluder::Shadow {
+        edge: Line { through: on_marker(spec, rng, 0.4), normal: rng.random_range(0.0..TAU) },
+        penumbra_px: rng.random_range(penumbra_px),
+        transmission: (1.0 / contrast) as f32,
+    }
 }
 
 fn large(draw: Draw, marker: Marker, frame: usize) -> (FrameSpec, ChaCha8Rng) {
