@@ -1,10 +1,14 @@
 //! Decodes H.264 of a camera that is streaming, one picture at a time and without waiting for the next.
 
+use std::collections::BTreeMap;
 use std::fmt::Display;
 
 use imaging::{Converter, GrayImage, SampleFormat};
 use rust_h264::decoder::{Decoder, Frame};
 use rust_h264::nal::{NalUnit, NalUnitType, parse_annex_b, parse_sps_info};
+use rust_h264::pps::{Pps, parse_pps};
+use rust_h264::slice::parse_slice_header;
+use rust_h264::sps::{Sps, parse_sps};
 
 use crate::contained::contained;
 
@@ -23,23 +27,22 @@ impl H264Error {
 
 /// A decoder of H.264 (Baseline, Main and High profile, 8 and 10 bits) for grey images. Pictures come out in the order of the
 /// stream: with B-frames that is not the order in which they were taken.
-#[derive(Default)]
 pub struct LiveH264 {
     decoder: Decoder,
+    limits: Limits,
     /// Whether pictures depend on what was decoded: not before the first key frame, nor after a loss.
     has_begun: bool,
-    max_pixels: u64,
 }
 
 impl LiveH264 {
     /// A decoder of pictures of at most so many pixels.
     pub fn new(max_pixels: u64) -> Self {
-        Self { max_pixels, ..Self::default() }
+        Self { decoder: Decoder::default(), limits: Limits::new(max_pixels), has_begun: false }
     }
 
     /// Forgets the stream: pictures before the next key frame are not decoded, as they refer to what is missing.
     pub fn restart(&mut self) {
-        *self = Self::new(self.max_pixels);
+        *self = Self::new(self.limits.max_pixels);
     }
 
     /// Decodes a picture: all of its units, each behind a start code. `None` before the first key frame, and where there is no
@@ -59,7 +62,10 @@ impl LiveH264 {
     fn decode_unchecked(&mut self, picture: &[u8]) -> Result<Option<GrayImage>, H264Error> {
         let mut frame = None;
         for unit in parse_annex_b(picture) {
-            check_size(&unit, self.max_pixels)?;
+            if let Some(excess) = self.limits.excess(&unit) {
+                let cause = format!("it has {excess}; set the camera to a smaller size");
+                return Err(H264Error { cause });
+            }
             self.has_begun |= unit.nal_unit_type == NalUnitType::SliceIdr;
             let is_slice = unit.nal_unit_type == NalUnitType::Slice;
             if is_slice && !self.has_begun {
@@ -83,18 +89,80 @@ fn luma(frame: &Frame) -> Result<GrayImage, H264Error> {
     Ok(image)
 }
 
-/// Refuses pictures that are too large before they are decoded.
-fn check_size(unit: &NalUnit<'_>, max_pixels: u64) -> Result<(), H264Error> {
-    if unit.nal_unit_type != NalUnitType::Sps {
-        return Ok(());
+/// Maximum number of pictures that others may refer to, all of which are kept in memory, and of entries in a slice's list of them
+/// (ITU-T H.264, A.3.1 and 7.4.3).
+const MAX_REFERENCES: u32 = 16;
+const MAX_REFERENCE_LIST: u32 = 32;
+/// Maximum number of parameter sets of pictures (7.4.2.2).
+const MAX_PARAMETER_SETS: u32 = 256;
+
+/// Refuses what would make a decoder take too much memory, before it is decoded.
+pub(crate) struct Limits {
+    max_pixels: u64,
+    sequences: BTreeMap<u32, Sps>,
+    pictures: BTreeMap<u32, Pps>,
+}
+
+impl Limits {
+    /// For pictures of at most so many pixels.
+    pub(crate) fn new(max_pixels: u64) -> Self {
+        Self { max_pixels, sequences: BTreeMap::new(), pictures: BTreeMap::new() }
     }
-    let info = parse_sps_info(unit).map_err(H264Error::new)?;
-    let pixels = u64::from(info.coded_width) * u64::from(info.coded_height);
-    if pixels > max_pixels {
-        let cause = format!(
-            "it has {pixels} pixels (limit {max_pixels}); set the camera to a smaller size"
+
+    /// What of a unit is too much, if anything is. A damaged unit is left to the decoder.
+    pub(crate) fn excess(&mut self, unit: &NalUnit<'_>) -> Option<String> {
+        let beyond = |count: u32, what: &str, limit: u32| {
+            (count > limit).then(|| format!("{count} {what} (limit {limit})"))
+        };
+        match unit.nal_unit_type {
+            NalUnitType::Sps => {
+                let info = parse_sps_info(unit).ok()?;
+                let pixels = u64::from(info.coded_width) * u64::from(info.coded_height);
+                if pixels > self.max_pixels {
+                    let limit = self.max_pixels;
+                    return Some(format!("{pixels} pixels per picture (limit {limit})"));
+                }
+                let sps = parse_sps(&unit.rbsp).ok()?;
+                self.sequences.insert(sps.seq_parameter_set_id, sps);
+                let what = "pictures that others refer to";
+                beyond(info.reference_frames, what, MAX_REFERENCES)
+            }
+            NalUnitType::Pps => {
+                // Which sequence it is of changes its scaling lists only.
+                let pps = parse_pps(&unit.rbsp, None).ok()?;
+                self.pictures.insert(pps.pic_parameter_set_id, pps);
+                let count = self.pictures.len() as u32;
+                beyond(count, "sets of parameters of pictures", MAX_PARAMETER_SETS)
+            }
+            NalUnitType::Slice | NalUnitType::SliceIdr => {
+                let (kind, importance) = (unit.nal_unit_type, unit.nal_ref_idc);
+                let header = self.pictures.iter().find_map(|(id, pps)| {
+                    let sps = self.sequences.get(&pps.seq_parameter_set_id)?;
+                    let header = parse_slice_header(&unit.rbsp, sps, pps, kind, importance);
+                    Some(header.ok()?.0).filter(|header| header.pic_parameter_set_id == *id)
+                })?;
+                let count = header.num_ref_idx_l0_active.max(header.num_ref_idx_l1_active);
+                beyond(count, "references of a slice", MAX_REFERENCE_LIST)
+            }
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_slice_with_more_references_than_the_standard_allows_is_refused() {
+        // Found by fuzzing: a few pictures of it take a gigabyte.
+        let stream = include_bytes!("../../../fuzz/corpus/h264/many_references.h264");
+        let mut limits = Limits::new(1 << 20);
+        let excess: Vec<String> =
+            parse_annex_b(stream).iter().filter_map(|unit| limits.excess(unit)).collect();
+        assert!(
+            excess.iter().any(|it| it.ends_with("references of a slice (limit 32)")),
+            "{excess:?}"
         );
-        return Err(H264Error { cause });
     }
-    Ok(())
 }

@@ -6,6 +6,7 @@
 //! [`video`] reads videos frame by frame, [`h264`] decodes what a camera streams, [`calibration`] reads and writes the calibration files of other programs,
 //! [`rectify`] takes a lens's distortion out of images.
 
+mod boxes;
 mod budget;
 pub mod calibration;
 mod contained;

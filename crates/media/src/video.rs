@@ -8,10 +8,12 @@ use std::path::{Path, PathBuf};
 
 use imaging::{Converter, GrayImage, SampleFormat};
 use rust_h264::decoder::OrderedDecoder;
-use rust_h264::nal::{NalUnit, NalUnitType, parse_annex_b, parse_avcc, parse_sps_info};
+use rust_h264::nal::{NalUnit, parse_annex_b, parse_avcc};
 
+use crate::boxes;
 use crate::budget::{Budget, BudgetReader};
 use crate::contained::contained;
+use crate::h264::Limits;
 use crate::image::{ImageError, decode_image, has_extension};
 use crate::jpeg::next_jpeg;
 
@@ -103,7 +105,6 @@ impl VideoImage {
 /// An opened video.
 pub struct Video {
     path: PathBuf,
-    max_pixels: u64,
     stream: Stream,
     period_s: f64,
     next: u64,
@@ -147,13 +148,13 @@ impl Video {
                 (Stream::H264(Box::new(decoder)), period_s)
             }
             [0, 0, 1, ..] | [0, 0, 0, 1, ..] if has_extension(path, &["h264", "264"]) => {
-                let decoder = H264::from_stream(whole(file, &problems)?);
+                let decoder = H264::from_stream(whole(file, &problems)?, max_pixels);
                 (Stream::H264(Box::new(decoder)), 1.0 / DEFAULT_RATE_HZ)
             }
             _ => return Err(problems.unsupported("in an unknown container")),
         };
         let path = path.to_owned();
-        Ok(Self { path, max_pixels, stream, period_s, next: 0 })
+        Ok(Self { path, stream, period_s, next: 0 })
     }
 
     /// The next frame; `None` after the last. After an error there are no more.
@@ -166,7 +167,7 @@ impl Video {
                 Stream::Jpegs { bytes, at } => {
                     next_jpeg(bytes, at).map(|jpeg| Ok(VideoImage::Jpeg(jpeg.to_vec())))
                 }
-                Stream::H264(decoder) => decoder.next(&problems, self.max_pixels),
+                Stream::H264(decoder) => decoder.next(&problems),
                 Stream::Ended => None,
             };
             image.transpose()
@@ -391,6 +392,7 @@ fn grey_image(bytes: &[u8], width: usize, height: usize) -> Option<VideoImage> {
 /// Decodes H.264, one access unit after the other.
 struct H264 {
     decoder: OrderedDecoder,
+    limits: Limits,
     source: Source,
     /// Decoded images, in order of presentation.
     ready: VecDeque<GrayImage>,
@@ -412,11 +414,12 @@ enum Source {
 
 impl H264 {
     fn from_mp4(
-        file: BufReader<File>,
+        mut file: BufReader<File>,
         problems: &Problems<'_>,
         max_pixels: u64,
     ) -> Result<(Self, f64), VideoError> {
         let size = file.get_ref().metadata().map_err(|e| problems.unreadable(e))?.len();
+        boxes::check(&mut file, size).map_err(|e| problems.damaged(e))?;
         // The tables are read about once; in a damaged file they may refer to each other for ever.
         let budget = Budget::new(size.saturating_mul(2).saturating_add(TABLE_BYTES));
         let file = BudgetReader::new(file, budget.clone());
@@ -431,13 +434,13 @@ impl H264 {
         let Some(avc1) = &track.trak.mdia.minf.stbl.stsd.avc1 else {
             return Err(problems.unsupported("an MP4 file whose video is not H.264"));
         };
-        let mut decoder = OrderedDecoder::new();
+        let (mut decoder, mut limits) = (OrderedDecoder::new(), Limits::new(max_pixels));
         let parameters =
             avc1.avcc.sequence_parameter_sets.iter().chain(&avc1.avcc.picture_parameter_sets);
         for parameter in parameters {
             let bytes = [&[0, 0, 1], parameter.bytes.as_slice()].concat();
             for unit in parse_annex_b(&bytes) {
-                check_size(&unit, problems, max_pixels)?;
+                check(&mut limits, &unit, problems)?;
                 decoder.decode_nal(&unit).map_err(|e| problems.damaged(e))?;
             }
         }
@@ -446,21 +449,18 @@ impl H264 {
         let length_bytes = usize::from(avc1.avcc.length_size_minus_one & 3) + 1;
         let track = track.track_id();
         let source = Source::Mp4 { reader: Box::new(reader), track, next: 1, length_bytes };
-        Ok((Self { decoder, source, ready: VecDeque::new(), is_over: false }, period_s))
+        Ok((Self { decoder, limits, source, ready: VecDeque::new(), is_over: false }, period_s))
     }
 
-    fn from_stream(bytes: Vec<u8>) -> Self {
+    fn from_stream(bytes: Vec<u8>, max_pixels: u64) -> Self {
         let source = Source::Stream { bytes, at: 0 };
-        Self { decoder: OrderedDecoder::new(), source, ready: VecDeque::new(), is_over: false }
+        let (decoder, limits) = (OrderedDecoder::new(), Limits::new(max_pixels));
+        Self { decoder, limits, source, ready: VecDeque::new(), is_over: false }
     }
 
-    fn next(
-        &mut self,
-        problems: &Problems<'_>,
-        max_pixels: u64,
-    ) -> Option<Result<VideoImage, VideoError>> {
+    fn next(&mut self, problems: &Problems<'_>) -> Option<Result<VideoImage, VideoError>> {
         while self.ready.is_empty() && !self.is_over {
-            if let Err(problem) = self.decode_more(problems, max_pixels) {
+            if let Err(problem) = self.decode_more(problems) {
                 self.is_over = true;
                 return Some(Err(problem));
             }
@@ -468,10 +468,10 @@ impl H264 {
         self.ready.pop_front().map(|image| Ok(VideoImage::Grey(image)))
     }
 
-    fn decode_more(&mut self, problems: &Problems<'_>, max_pixels: u64) -> Result<(), VideoError> {
+    fn decode_more(&mut self, problems: &Problems<'_>) -> Result<(), VideoError> {
         let mut frames = Vec::new();
         let mut decode = |unit: &NalUnit<'_>| {
-            check_size(unit, problems, max_pixels)?;
+            check(&mut self.limits, unit, problems)?;
             frames.extend(self.decoder.decode_nal(unit).map_err(|e| problems.damaged(e))?);
             Ok(())
         };
@@ -520,22 +520,14 @@ fn next_unit<'a>(bytes: &'a [u8], at: &mut usize) -> Option<&'a [u8]> {
     rest.get(..len)
 }
 
-/// Refuses images of more than `max_pixels` before they are decoded.
-fn check_size(
+/// Refuses what would make the decoder take too much memory.
+fn check(
+    limits: &mut Limits,
     unit: &NalUnit<'_>,
     problems: &Problems<'_>,
-    max_pixels: u64,
 ) -> Result<(), VideoError> {
-    if unit.nal_unit_type != NalUnitType::Sps {
-        return Ok(());
-    }
-    let info = parse_sps_info(unit).map_err(|e| problems.damaged(e))?;
-    let pixels = u64::from(info.coded_width) * u64::from(info.coded_height);
-    if pixels > max_pixels {
-        return Err(problems
-            .unsupported(&format!("a video of {pixels} pixels per frame (limit {max_pixels})")));
-    }
-    Ok(())
+    let excess = limits.excess(unit);
+    excess.map_or(Ok(()), |it| Err(problems.unsupported(&format!("a video of {it}"))))
 }
 
 #[cfg(test)]
