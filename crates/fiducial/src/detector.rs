@@ -38,8 +38,6 @@ pub struct Detector {
     /// The image that a fallback pass searches instead of the frame of which it is made.
     derived: GrayImage,
     shadows: ShadowFinder,
-    /// What is shared of the image without its shadow.
-    without_shadow: Evidence,
     found: Vec<Observation>,
     trace: Trace,
     /// The fallback passes of these families, in the order in which they take turns, and the number of turns.
@@ -78,7 +76,6 @@ impl Detector {
             evidence: Evidence::default(),
             derived: GrayImage::default(),
             shadows: ShadowFinder::default(),
-            without_shadow: Evidence::default(),
             found: Vec::new(),
             trace: Trace::default(),
             turns: 0,
@@ -145,7 +142,7 @@ impl Detector {
         self.found.clear();
         self.trace.clear();
         self.make_room(view);
-        let Self { families, evidence, derived, without_shadow, found, trace, .. } = self;
+        let Self { families, evidence, derived, found, trace, .. } = self;
         let response = self.response;
         let followed = self.followed.as_slice();
         let stages: &mut dyn StageObserver = stages;
@@ -154,6 +151,32 @@ impl Detector {
         for family in families.iter_mut() {
             let input = FrameInput { view, camera, evidence, schedule, followed, response };
             family.detect(input, &mut out);
+        }
+        // Other passes place a marker under a shadow's edge less well.
+        if schedule.allows(FallbackPass::ShadowEdge)
+            && self.passes.contains(&FallbackPass::ShadowEdge)
+            && out.found.is_empty()
+        {
+            let mut is_of_frame = true;
+            let edge = self.shadows.find(view, evidence.outlines.pyramid());
+            if let Some(edge) = &edge {
+                edge.remove(view, derived);
+            }
+            out.stages.ended("shadow");
+            if let Some(view) = edge.and_then(|_| derived.view()) {
+                evidence.find(view, &self.needs, out.trace, out.stages);
+                for family in families.iter_mut() {
+                    if family.fallback_steps().contains(&FallbackStep::ShadowEdge) {
+                        let input =
+                            FrameInput { view, camera, evidence, schedule, followed, response };
+                        family.detect(input, &mut out);
+                    }
+                }
+                is_of_frame = false;
+            }
+            if !is_of_frame && schedule != PassSchedule::only(FallbackPass::ShadowEdge) {
+                evidence.find(view, &self.needs, out.trace, out.stages);
+            }
         }
         evidence.begin_fallbacks(schedule);
         for step in FallbackStep::ALL.into_iter().filter(|step| schedule.allows_step(*step)) {
@@ -169,20 +192,6 @@ impl Detector {
                     continue;
                 }
                 let is_first = !std::mem::replace(&mut is_prepared, true);
-                if step == FallbackStep::ShadowEdge {
-                    if is_first {
-                        let pyramid = evidence.outlines.pyramid();
-                        let Some(edge) = self.shadows.find(view, pyramid) else { break };
-                        edge.remove(view, derived);
-                        let Some(view) = derived.view() else { break };
-                        without_shadow.find(view, &self.needs, out.trace, out.stages);
-                    }
-                    let Some(view) = derived.view() else { break };
-                    let evidence = &mut *without_shadow;
-                    let input = FrameInput { view, camera, evidence, schedule, followed, response };
-                    family.detect(input, &mut out);
-                    continue;
-                }
                 let is_brightened = step == FallbackStep::Brightened;
                 if is_first && is_brightened {
                     derived.make_brightened(view);
@@ -249,7 +258,6 @@ impl Detector {
         if self.passes.contains(&FallbackPass::ShadowEdge) {
             self.derived.resize(view.width(), view.height());
             self.shadows.make_room(view);
-            self.without_shadow.make_room(view, &self.needs);
         }
         self.families.iter_mut().for_each(|family| family.make_room());
     }

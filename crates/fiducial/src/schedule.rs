@@ -91,7 +91,7 @@ impl FallbackPass {
 /// A step of the fallbacks in one image: the allowed passes of one kind together.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum FallbackStep {
-    /// The search of the image without a shadow. The first step, as others place a marker under its edge less well.
+    /// The search of an image without a shadow, which is none of [`FallbackStep::ALL`]: it is that of the frame once more.
     ShadowEdge,
     Arcs,
     Blobs,
@@ -104,9 +104,8 @@ pub(crate) enum FallbackStep {
 }
 
 impl FallbackStep {
-    /// All steps, in the order in which they run in an image.
-    pub(crate) const ALL: [Self; 7] = [
-        Self::ShadowEdge,
+    /// The steps in the order in which they run in an image.
+    pub(crate) const ALL: [Self; 6] = [
         Self::Arcs,
         Self::Blobs,
         Self::Segments,

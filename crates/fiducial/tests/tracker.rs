@@ -99,7 +99,7 @@ fn the_innermost_ring_alone_is_a_marker_only_where_one_is_followed() {
 }
 
 /// The slow passes' stages, in the order in which they run in one image.
-const ALL: [&str; 5] = ["arcs", "blobs", "segments", "quiet zones", "brightened"];
+const ALL: [&str; 6] = ["shadow", "arcs", "blobs", "segments", "quiet zones", "brightened"];
 
 /// Keeps the names of the slow passes' stages.
 #[derive(Default)]
@@ -131,12 +131,12 @@ fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
     // Nothing lies in shade where nothing is in the light.
     let mut slow = SlowPasses::default();
     detector.detect(bare.view().unwrap(), Some(&camera), &mut slow);
-    assert_eq!(slow.0, ALL[..4]);
+    assert_eq!(slow.0, ALL[..5]);
     (0..486).for_each(|y| bare.row_mut(y)[..300].fill(30));
     let mut passes = Vec::new();
     let mut found_after = None;
     for i in 0..20_u32 {
-        let image = if i < 8 { &bare } else { &cut };
+        let image = if i < 9 { &bare } else { &cut };
         let mut slow = SlowPasses::default();
         let view = image.view().unwrap();
         let time_s = f64::from(i) * 0.05;
@@ -149,7 +149,7 @@ fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
             passes.append(&mut slow.0);
         }
         if found {
-            found_after = Some(i - 8);
+            found_after = Some(i - 9);
             break;
         }
     }
@@ -160,9 +160,10 @@ fn what_takes_long_is_done_in_turn_until_a_damaged_marker_is_found() {
         "blobs",
         "quiet zones",
         "segments",
+        "shadow",
         "brightened",
         "quiet zones",
     ];
-    assert_eq!(passes[..8], in_turn);
-    assert!(found_after.is_some_and(|images| images < 8), "{found_after:?}");
+    assert_eq!(passes[..9], in_turn);
+    assert!(found_after.is_some_and(|images| images < 9), "{found_after:?}");
 }

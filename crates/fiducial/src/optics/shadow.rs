@@ -28,8 +28,10 @@ const PX_PER_DISTANCE: f32 = 2.0;
 /// Maximum number of pixels of the level that take part. Where texture has more, only those count that rise more, by this factor.
 const MAX_EDGE_PIXELS: usize = 10_000;
 const MIN_RISE_FACTOR: f32 = 1.5;
-/// Minimum length of a line in pixels of the level, at most; in a small image half of its shorter side.
-const MIN_LINE_PX: u32 = 30;
+/// Minimum length of a line in pixels of the level, before it is followed to its ends, and of the shorter side of an image: a side of
+/// a marker may cross a smaller one.
+const MIN_LINE_PX: u16 = 30;
+const MIN_SIDE_PX: usize = 60;
 /// Lines that are tried in an image, the longest first.
 const MAX_LINES: usize = 3;
 /// Maximum distance of a pixel of the level from the line it is part of, and of the directions of their rise as a cosine.
@@ -42,11 +44,12 @@ const PLAIN_TO_PX: i32 = 12;
 /// Places along the line that are looked at, at most, and at least for a line to be one.
 const MAX_PLACES: usize = 400;
 const MIN_PLACES: usize = 30;
-/// Maximum difference of the step at a place from the median, and of the place of the step from the line, in pixels; half of the
-/// places must be within.
+/// Maximum difference of the step at a place from the median, and of the place of the step from the line, in pixels; of the places
+/// along the line across the whole image at least this share must be within.
 const MAX_STEP_OFF: f64 = 0.3;
 const MAX_STEP_SHARE: f64 = 0.6;
 const MAX_PLACE_OFF_PX: f64 = 2.0;
+const MIN_SHARE: f64 = 0.5;
 /// Places of the profile for each pixel.
 const PROFILE_PER_PX: i32 = 2;
 const PROFILE: usize = (2 * PLAIN_TO_PX * PROFILE_PER_PX) as usize + 1;
@@ -156,12 +159,14 @@ impl ShadowFinder {
     /// The straight edge of a shadow in the image of which the pyramid was built: of several the one that changes most.
     pub(crate) fn find(&mut self, view: GrayView<'_>, pyramid: &Pyramid) -> Option<ShadowEdge> {
         let means = pyramid.level(view, LEVEL)?;
-        self.find_pixels(means);
         let size = [means.width(), means.height()];
-        let min_votes = MIN_LINE_PX.min(size[0].min(size[1]) as u32 / 2);
+        if size.iter().any(|side| *side < MIN_SIDE_PX) {
+            return None;
+        }
+        self.find_pixels(means);
         let mut best: Option<ShadowEdge> = None;
         for _ in 0..MAX_LINES {
-            let Some(line) = self.longest_line(size, min_votes) else { break };
+            let Some(line) = self.longest_line(size) else { break };
             let line = self.along_pixels(line).unwrap_or(line);
             let edge = self.measured(view, line);
             let rise = |edge: &ShadowEdge| edge.step * edge.places as f64;
@@ -206,8 +211,8 @@ impl ShadowFinder {
         true
     }
 
-    /// The straight line with the most pixels that rise across it, in pixels of the image; `None` with fewer than `min_votes`.
-    fn longest_line(&mut self, size: [usize; 2], min_votes: u32) -> Option<Bend> {
+    /// The straight line with the most pixels that rise across it, in pixels of the image; `None` where none is long enough.
+    fn longest_line(&mut self, size: [usize; 2]) -> Option<Bend> {
         static UNITS: LazyLock<[[f32; 2]; DIRECTIONS]> = LazyLock::new(|| {
             std::array::from_fn(|index| {
                 let (sin, cos) = (index as f64 * TAU / DIRECTIONS as f64).sin_cos();
@@ -232,7 +237,7 @@ impl ShadowFinder {
             }
         }
         let (index, votes) = self.votes.iter().enumerate().max_by_key(|(_, votes)| **votes)?;
-        if u32::from(*votes) < min_votes {
+        if *votes < MIN_LINE_PX {
             return None;
         }
         let across = UNITS[index / distances];
@@ -256,16 +261,13 @@ impl ShadowFinder {
         Some(line)
     }
 
-    /// The shadow's edge that a line is, where the image rises by the same step along at least half of it.
+    /// The shadow's edge that a line is, where the image rises by the same step along most of it: a side of a marker or
+    /// of other things ends in the image.
     fn measured(&mut self, view: GrayView<'_>, mut line: Bend) -> Option<ShadowEdge> {
         const STEPS: usize = 2;
-        let ends = |(first, last): (f64, f64), along: f64| (first.min(along), last.max(along));
-        let near = self.pixels.iter().filter(|pixel| pixel.is_on(&line));
-        let along = near.map(|pixel| line.place(pixel.in_image())[0]);
-        let (first, last) = along.fold((f64::INFINITY, f64::NEG_INFINITY), ends);
         let mut step = 0.0;
         for _ in 0..STEPS {
-            self.look_across(view, &line, first..last);
+            self.look_across(view, &line);
             step = self.likely_step()?;
             let likely = self.crossings.iter().filter(|it| it.is_likely(step));
             line = line.fitted(likely.map(|it| [it.along, it.at_px]))?;
@@ -273,7 +275,7 @@ impl ShadowFinder {
         let all = self.crossings.len();
         self.crossings.retain(|it| it.is_likely(step));
         let count = self.crossings.len();
-        if count < MIN_PLACES || 2 * count < all {
+        if count < MIN_PLACES || (count as f64) < MIN_SHARE * all as f64 {
             return None;
         }
         let mut edge = ShadowEdge { line, step, places: count, profile: [0.0; PROFILE] };
@@ -295,17 +297,13 @@ impl ShadowFinder {
         Some(edge)
     }
 
-    /// Lists what the image shows across the line, at places along it within this range.
-    fn look_across(&mut self, view: GrayView<'_>, line: &Bend, range: Range<f64>) {
+    /// Lists what the image shows across the line, at places along it.
+    fn look_across(&mut self, view: GrayView<'_>, line: &Bend) {
         self.crossings.clear();
-        let every = ((range.end - range.start) / MAX_PLACES as f64).max(1.0);
-        for index in 0..MAX_PLACES {
-            let along = range.start + index as f64 * every;
-            if along > range.end {
-                return;
-            }
-            self.crossings.extend(crossing(view, line, along));
-        }
+        let half = line.length;
+        let every = (2.0 * half / MAX_PLACES as f64).max(1.0);
+        let places = (0..MAX_PLACES).map(|index| index as f64 * every - half);
+        self.crossings.extend(places.filter_map(|along| crossing(view, line, along)));
     }
 
     /// The median of the steps, where that is a shadow's.
@@ -509,14 +507,14 @@ mod tests {
 
     #[test]
     fn an_image_of_any_size_is_searched() {
-        for [width, height] in [[1, 1], [24, 24], [96, 96], [97, 300], [300, 97]] {
+        for [width, height] in [[1, 1], [24, 24], [96, 96], [120, 300], [300, 97], [240, 240]] {
             let data: Vec<u8> =
                 (0..width * height).map(|i| if i % width < width / 2 { 40 } else { 160 }).collect();
             let view = GrayView::packed(&data, width, height).unwrap();
             let mut pyramid = Pyramid::default();
             pyramid.build(view, 9, 24);
             let found = ShadowFinder::default().find(view, &pyramid);
-            assert_eq!(found.is_some(), width >= 96, "{width} x {height}");
+            assert_eq!(found.is_some(), width == 240, "{width} x {height}");
         }
     }
 }
