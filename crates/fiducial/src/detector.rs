@@ -148,16 +148,18 @@ impl Detector {
         let stages: &mut dyn StageObserver = stages;
         evidence.find(view, &self.needs, trace, stages);
         let mut out = Output { found, trace, stages };
+        let shadow_removed = false;
         for family in families.iter_mut() {
-            let input = FrameInput { view, camera, evidence, schedule, followed, response };
+            let input =
+                FrameInput { view, camera, evidence, schedule, followed, response, shadow_removed };
             family.detect(input, &mut out);
         }
+        let mut is_of_frame = true;
         // Other passes place a marker under a shadow's edge less well.
         if schedule.allows(FallbackPass::ShadowEdge)
             && self.passes.contains(&FallbackPass::ShadowEdge)
             && out.found.is_empty()
         {
-            let mut is_of_frame = true;
             let edge = self.shadows.find(view, evidence.outlines.pyramid());
             if let Some(edge) = &edge {
                 edge.remove(view, derived);
@@ -165,17 +167,22 @@ impl Detector {
             out.stages.ended("shadow");
             if let Some(view) = edge.and_then(|_| derived.view()) {
                 evidence.find(view, &self.needs, out.trace, out.stages);
+                let shadow_removed = true;
                 for family in families.iter_mut() {
                     if family.fallback_steps().contains(&FallbackStep::ShadowEdge) {
-                        let input =
-                            FrameInput { view, camera, evidence, schedule, followed, response };
+                        let input = FrameInput {
+                            view,
+                            camera,
+                            evidence,
+                            schedule,
+                            followed,
+                            response,
+                            shadow_removed,
+                        };
                         family.detect(input, &mut out);
                     }
                 }
                 is_of_frame = false;
-            }
-            if !is_of_frame && schedule != PassSchedule::only(FallbackPass::ShadowEdge) {
-                evidence.find(view, &self.needs, out.trace, out.stages);
             }
         }
         evidence.begin_fallbacks(schedule);
@@ -191,6 +198,10 @@ impl Detector {
                 {
                     continue;
                 }
+                if !std::mem::replace(&mut is_of_frame, true) {
+                    evidence.find(view, &self.needs, out.trace, out.stages);
+                    evidence.begin_fallbacks(schedule);
+                }
                 let is_first = !std::mem::replace(&mut is_prepared, true);
                 let is_brightened = step == FallbackStep::Brightened;
                 if is_first && is_brightened {
@@ -200,7 +211,15 @@ impl Detector {
                 if is_first {
                     evidence.prepare(view, step, schedule, out.stages);
                 }
-                let input = FrameInput { view, camera, evidence, schedule, followed, response };
+                let input = FrameInput {
+                    view,
+                    camera,
+                    evidence,
+                    schedule,
+                    followed,
+                    response,
+                    shadow_removed,
+                };
                 family.fallback(step, input, &mut out);
             }
             if let Some(stage) = step.stage().filter(|_| is_prepared) {
@@ -239,9 +258,11 @@ impl Detector {
             evidence.outlines.begin(view);
         }
         let schedule = PassSchedule::NONE;
+        let shadow_removed = false;
         let seen = families.iter_mut().find_map(|family| {
             let followed = std::slice::from_ref(at);
-            let input = FrameInput { view, camera, evidence, schedule, followed, response };
+            let input =
+                FrameInput { view, camera, evidence, schedule, followed, response, shadow_removed };
             family.detect_at(input, at)
         })?;
         self.trace.markers.push(TracedMarker::from(&seen));

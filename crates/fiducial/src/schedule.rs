@@ -2,15 +2,15 @@
 //!
 //! Fallback passes find markers that are occluded, cut by the frame, or far away; each takes about as long as the rest of
 //! a detection. They run in images in which nothing else was found. In a stream of images without markers they take turns,
-//! one in each image, in the order of [`FallbackPass::ALL`]; in one image they run in the order of
-//! `FallbackStep::ALL`.
+//! one in each image, in the order of [`FallbackPass::ALL`]; in one image the one for a shadow's edge is the first, as the others
+//! place what they find there less well, and they run in the order of `FallbackStep::ALL`.
 //!
 //! | pass | finds | families |
 //! |---|---|---|
 //! | [`FallbackPass::Arcs`] | rings that are cut or covered, and rings under noise, on coarser levels | rings |
 //! | [`FallbackPass::Blobs`] | bright blobs that may be the paper of rings far away | rings |
 //! | [`FallbackPass::Brightened`] | rings of a camera without a tone curve that lie partly in deep shade | rings |
-//! | [`FallbackPass::ShadowEdge`] | markers that the straight edge of a shadow crosses, in the image without that shadow | all |
+//! | [`FallbackPass::ShadowEdge`] | markers that the straight edge of a shadow crosses, in the image without that shadow | rings, square, STag |
 //! | [`FallbackPass::FineSegments`], [`FallbackPass::CoarseSegments`] | occluded square markers, by segments of edges on two levels | square, STag |
 //! | [`FallbackPass::QuietZones`] | small square markers, by their paper, in a third of the image | square, STag |
 

@@ -11,7 +11,7 @@ pub struct Settings {
     /// Whether markers printed white on black are detected as well; `rings-thesis` has none.
     pub inverted: bool,
     /// Whether the fallback passes also run in images in which markers were found. Otherwise they run where none was found
-    /// and, for families of any id, where two were found, as on boards.
+    /// and, for families of any id, where two were found, as on boards. The pass for a shadow's edge runs only where none was found.
     pub thorough: bool,
     /// How the camera shows light.
     pub response: ResponseSetting,

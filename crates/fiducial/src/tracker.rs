@@ -16,6 +16,7 @@ use crate::families::family::{PredictedShape, Prediction};
 use crate::families::rings::circle_pose::CirclePose;
 use crate::observation::{Observation, StageObserver};
 use crate::response::ResponseMemory;
+use crate::schedule::{FallbackPass, PassSchedule};
 use crate::trace::Trace;
 
 /// Settings of tracking.
@@ -246,7 +247,9 @@ impl Tracker {
         match expected {
             Some(seen) => self.found.push(seen.mapped(&roi)),
             None => {
-                let found = detector.detect(part, camera.as_ref(), stages);
+                // A side of the marker itself may cross the region as a shadow's edge does the image.
+                let schedule = PassSchedule::ALL.without(FallbackPass::ShadowEdge);
+                let found = detector.detect_with(part, camera.as_ref(), schedule, stages);
                 self.found.extend(found.iter().map(|seen| seen.mapped(&roi)));
             }
         }

@@ -5,11 +5,12 @@ use std::ops::Range;
 
 /// Boxes of boxes on the way to those whose sizes the parser believes.
 const CONTAINERS: [&[u8; 4]; 4] = [b"moov", b"trak", b"udta", b"meta"];
-/// Maximum number of boxes within each other and in all.
+/// Maximum number of boxes within each other, and of those that are within others.
 const MAX_DEPTH: usize = 8;
 const MAX_BOXES: usize = 100_000;
 
-/// Refuses a file of `size` bytes with a box that reaches beyond the one it is in, and leaves `file` at its beginning.
+/// Refuses a file of `size` bytes with a box that reaches beyond the one it is in, or does not end with its last one, and leaves
+/// `file` at its beginning. The last box of a file may be cut, as of a recording that was interrupted.
 ///
 /// # Errors
 /// When there is one, when there are too many boxes, or when the file cannot be read.
@@ -29,14 +30,17 @@ fn check_within(
     let mut at = within.start;
     // Fewer bytes than a header's are no box.
     while at + 8 <= within.end {
-        let Some(fewer) = left.checked_sub(1).filter(|_| depth < MAX_DEPTH) else {
-            return damaged("it has too many boxes");
-        };
-        *left = fewer;
+        if depth > 0 {
+            let Some(fewer) = left.checked_sub(1).filter(|_| depth < MAX_DEPTH) else {
+                return damaged("it has too many boxes");
+            };
+            *left = fewer;
+        }
         file.seek(SeekFrom::Start(at))?;
         let [size, kind] = read_words(file)?;
         let (header, size) = match u32::from_be_bytes(size) {
-            0 => (8, within.end - at),
+            // Up to the end of the file.
+            0 if depth == 0 => (8, within.end - at),
             1 => (
                 16,
                 read_words(file).map(|[high, low]| {
@@ -45,10 +49,14 @@ fn check_within(
             ),
             size => (8, u64::from(size)),
         };
+        let is_container = CONTAINERS.contains(&&kind);
+        if size > within.end - at && depth == 0 && !is_container {
+            return Ok(());
+        }
         if size < header || size > within.end - at {
             return damaged("a box reaches beyond the one it is in");
         }
-        if CONTAINERS.contains(&&kind) {
+        if is_container {
             let mut content = at + header..at + size;
             // Most files have a version before the boxes of this one.
             if &kind == b"meta" && content.end - content.start >= 4 {
@@ -59,7 +67,12 @@ fn check_within(
         }
         at += size;
     }
-    Ok(())
+    // The parser would take what is left for the beginning of a box.
+    if depth > 0 && at != within.end {
+        damaged("a box does not end with its last one")
+    } else {
+        Ok(())
+    }
 }
 
 fn read_words(file: &mut impl Read) -> Result<[[u8; 4]; 2]> {
@@ -96,7 +109,13 @@ mod tests {
         }
         let deep = (0..MAX_DEPTH).fold(Vec::new(), |content, _| boxed(b"moov", &content));
         assert!(is_sound(&deep) && !is_sound(&boxed(b"moov", &boxed(b"moov", &deep))));
-        assert!(!is_sound(&boxed(b"free", &[]).repeat(MAX_BOXES + 1)));
+        let many = boxed(b"free", &[]).repeat(MAX_BOXES + 1);
+        assert!(is_sound(&many) && !is_sound(&boxed(b"moov", &many)));
+        // What is left over, and a last box that is cut.
+        let meta = boxed(b"meta", &[&[0; 4], inner.as_slice(), &[0, 0, 0, 1]].concat());
+        let file = boxed(b"moov", &boxed(b"udta", &[meta, boxed(b"free", &[])].concat()));
+        assert!(!is_sound(&file));
+        assert!(is_sound(&boxed(b"mdat", &[1; 40])[..20]));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Decodes H.264 of a camera that is streaming, one picture at a time and without waiting for the next.
 
 use std::collections::BTreeMap;
-use std::fmt::Display;
+use std::fmt::{self, Display};
 
 use imaging::{Converter, GrayImage, SampleFormat};
 use rust_h264::decoder::{Decoder, Frame};
@@ -63,8 +63,11 @@ impl LiveH264 {
         let mut frame = None;
         for unit in parse_annex_b(picture) {
             if let Some(excess) = self.limits.excess(&unit) {
-                let cause = format!("it has {excess}; set the camera to a smaller size");
-                return Err(H264Error { cause });
+                let advice = match excess {
+                    Excess::Pixels { .. } => "; set the camera to a smaller size",
+                    Excess::Standard { .. } => "",
+                };
+                return Err(H264Error { cause: format!("it has {excess}{advice}") });
             }
             self.has_begun |= unit.nal_unit_type == NalUnitType::SliceIdr;
             let is_slice = unit.nal_unit_type == NalUnitType::Slice;
@@ -93,8 +96,31 @@ fn luma(frame: &Frame) -> Result<GrayImage, H264Error> {
 /// (ITU-T H.264, A.3.1 and 7.4.3).
 const MAX_REFERENCES: u32 = 16;
 const MAX_REFERENCE_LIST: u32 = 32;
-/// Maximum number of parameter sets of pictures (7.4.2.2).
-const MAX_PARAMETER_SETS: u32 = 256;
+/// Largest numbers of parameter sets, of sequences and of pictures (7.4.2).
+const MAX_SEQUENCE: u32 = 31;
+const MAX_PICTURE: u32 = 255;
+/// Maximum bytes of a slice's header: with all of its lists it has two thousand.
+const MAX_HEADER_BYTES: usize = 4096;
+
+/// What of a stream is too much.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Excess {
+    /// The pixels of a picture.
+    Pixels { pixels: u64, limit: u64 },
+    /// A number that the standard bounds.
+    Standard { count: u32, what: &'static str, limit: u32 },
+}
+
+impl Display for Excess {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Pixels { pixels, limit } => {
+                write!(f, "{pixels} pixels per picture (limit {limit})")
+            }
+            Self::Standard { count, what, limit } => write!(f, "{count} {what} (limit {limit})"),
+        }
+    }
+}
 
 /// Refuses what would make a decoder take too much memory, before it is decoded.
 pub(crate) struct Limits {
@@ -110,43 +136,67 @@ impl Limits {
     }
 
     /// What of a unit is too much, if anything is. A damaged unit is left to the decoder.
-    pub(crate) fn excess(&mut self, unit: &NalUnit<'_>) -> Option<String> {
-        let beyond = |count: u32, what: &str, limit: u32| {
-            (count > limit).then(|| format!("{count} {what} (limit {limit})"))
+    pub(crate) fn excess(&mut self, unit: &NalUnit<'_>) -> Option<Excess> {
+        let beyond = |count: u32, what: &'static str, limit: u32| {
+            (count > limit).then_some(Excess::Standard { count, what, limit })
         };
         match unit.nal_unit_type {
             NalUnitType::Sps => {
                 let info = parse_sps_info(unit).ok()?;
                 let pixels = u64::from(info.coded_width) * u64::from(info.coded_height);
                 if pixels > self.max_pixels {
-                    let limit = self.max_pixels;
-                    return Some(format!("{pixels} pixels per picture (limit {limit})"));
+                    return Some(Excess::Pixels { pixels, limit: self.max_pixels });
                 }
                 let sps = parse_sps(&unit.rbsp).ok()?;
-                self.sequences.insert(sps.seq_parameter_set_id, sps);
-                let what = "pictures that others refer to";
-                beyond(info.reference_frames, what, MAX_REFERENCES)
+                let id = sps.seq_parameter_set_id;
+                let excess = beyond(info.reference_frames, "pictures referred to", MAX_REFERENCES);
+                let excess = excess.or_else(|| beyond(id, "as a sequence's number", MAX_SEQUENCE));
+                if excess.is_none() {
+                    self.sequences.insert(id, sps);
+                }
+                excess
             }
             NalUnitType::Pps => {
                 // Which sequence it is of changes its scaling lists only.
                 let pps = parse_pps(&unit.rbsp, None).ok()?;
-                self.pictures.insert(pps.pic_parameter_set_id, pps);
-                let count = self.pictures.len() as u32;
-                beyond(count, "sets of parameters of pictures", MAX_PARAMETER_SETS)
+                let id = pps.pic_parameter_set_id;
+                let excess = beyond(id, "as a picture's number", MAX_PICTURE);
+                if excess.is_none() {
+                    self.pictures.insert(id, pps);
+                }
+                excess
             }
             NalUnitType::Slice | NalUnitType::SliceIdr => {
+                let bytes = unit.rbsp.get(..MAX_HEADER_BYTES).unwrap_or(&unit.rbsp);
+                let pps = self.pictures.get(&picture_of_slice(bytes)?)?;
+                let sps = self.sequences.get(&pps.seq_parameter_set_id)?;
                 let (kind, importance) = (unit.nal_unit_type, unit.nal_ref_idc);
-                let header = self.pictures.iter().find_map(|(id, pps)| {
-                    let sps = self.sequences.get(&pps.seq_parameter_set_id)?;
-                    let header = parse_slice_header(&unit.rbsp, sps, pps, kind, importance);
-                    Some(header.ok()?.0).filter(|header| header.pic_parameter_set_id == *id)
-                })?;
-                let count = header.num_ref_idx_l0_active.max(header.num_ref_idx_l1_active);
-                beyond(count, "references of a slice", MAX_REFERENCE_LIST)
+                match parse_slice_header(bytes, sps, pps, kind, importance) {
+                    Ok((header, _)) => {
+                        let count = header.num_ref_idx_l0_active.max(header.num_ref_idx_l1_active);
+                        beyond(count, "references of a slice", MAX_REFERENCE_LIST)
+                    }
+                    Err(_) => {
+                        let length = u32::try_from(unit.rbsp.len()).unwrap_or(u32::MAX);
+                        beyond(length, "bytes of a slice's header", MAX_HEADER_BYTES as u32)
+                    }
+                }
             }
             _ => None,
         }
     }
+}
+
+/// The number of a slice's parameter set: the third of its header's numbers, which are exponential Golomb codes (9.1).
+fn picture_of_slice(bytes: &[u8]) -> Option<u32> {
+    let mut bits = bytes.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1 == 1));
+    let mut number = || {
+        let zeros = bits.by_ref().take_while(|bit| !bit).take(32).count();
+        let rest = bits.by_ref().take(zeros).fold(0_u64, |sum, bit| sum << 1 | u64::from(bit));
+        u32::try_from((1_u64 << zeros) - 1 + rest).ok()
+    };
+    let (_first_block, _kind) = (number()?, number()?);
+    number()
 }
 
 #[cfg(test)]
@@ -158,11 +208,13 @@ mod tests {
         // Found by fuzzing: a few pictures of it take a gigabyte.
         let stream = include_bytes!("../../../fuzz/corpus/h264/many_references.h264");
         let mut limits = Limits::new(1 << 20);
-        let excess: Vec<String> =
+        let excess: Vec<Excess> =
             parse_annex_b(stream).iter().filter_map(|unit| limits.excess(unit)).collect();
-        assert!(
-            excess.iter().any(|it| it.ends_with("references of a slice (limit 32)")),
-            "{excess:?}"
-        );
+        let is_list =
+            |it: &Excess| matches!(it, Excess::Standard { limit: MAX_REFERENCE_LIST, .. });
+        assert!(excess.iter().any(is_list), "{excess:?}");
+        // Far beyond, before the lists that are asked for are made.
+        let long = NalUnit { rbsp: vec![0xff; 5 << 20].into(), ..parse_annex_b(stream).remove(2) };
+        assert!(limits.excess(&long).is_some());
     }
 }

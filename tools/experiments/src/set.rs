@@ -28,7 +28,7 @@ pub enum Set {
     Light,
     /// Motion with a rolling shutter.
     Rolling,
-    /// Edges of hard shadows with contrasts from 2 to 10, dappled shade, leaves.
+    /// Edges of hard shadows with contrasts from 2 to 10, also across small markers, dappled shade, leaves.
     Shade,
     /// Covered by grass, dirt, snow, a rope, a hand; wet, faded, of few dots, bent, behind glass, on cloth; by low sun, by
     /// night, through a dirty lens: 40 frames each.

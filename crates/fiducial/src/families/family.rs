@@ -59,6 +59,8 @@ pub(crate) struct FrameInput<'a> {
     pub(crate) followed: &'a [Prediction],
     /// How the camera shows light, where that is known.
     pub(crate) response: Option<ResponseEstimate>,
+    /// Whether a shadow was removed: noise is stronger where it was, and along its edge something of it is left.
+    pub(crate) shadow_removed: bool,
 }
 
 /// Where detections go.

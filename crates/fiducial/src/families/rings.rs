@@ -137,6 +137,7 @@ struct Evaluation<'a> {
     camera: &'a CameraModel,
     /// Where markers that are followed should be.
     followed: &'a [Prediction],
+    shadow_removed: bool,
 }
 
 impl RingDetector {
@@ -168,10 +169,12 @@ impl RingDetector {
 
     /// Searches for complete ellipses, on coarse levels first.
     fn search(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, schedule, followed, response } = input;
+        let FrameInput { view, camera, evidence, schedule, followed, response, shadow_removed } =
+            input;
         for pass in &PASSES {
             let evidence = &mut *evidence;
-            let input = FrameInput { view, camera, evidence, schedule, followed, response };
+            let input =
+                FrameInput { view, camera, evidence, schedule, followed, response, shadow_removed };
             self.run(pass, input, out);
             self.complete += self.candidates.len();
             if out.found.len() > self.first && !self.thorough {
@@ -182,7 +185,7 @@ impl RingDetector {
 
     /// Runs one pass, and adds the markers it finds to those from the index `self.first` on.
     fn run(&mut self, pass: &RingPass, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, schedule, followed, .. } = input;
+        let FrameInput { view, camera, evidence, schedule, followed, shadow_removed, .. } = input;
         let has_outlines = evidence.has_outlines;
         let (outlines, places) = evidence.outlines_at();
         if let RingPass::Ellipses(levels) = pass
@@ -202,6 +205,7 @@ impl RingDetector {
             known_camera: camera,
             camera: camera.unwrap_or(&nominal),
             followed,
+            shadow_removed,
         };
         let coarse = schedule.allows(FallbackPass::Arcs).then_some(outlines.pyramid());
         self.evaluate_candidates(&evaluation, coarse, out.trace, out.found, self.first);
@@ -381,8 +385,11 @@ impl FamilyDetector for RingDetector {
 
     fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
         self.first = out.found.len();
+        // How many candidates the frame itself has.
+        let of_frame = input.shadow_removed.then_some(self.complete);
         self.complete = 0;
         self.search(input, out);
+        self.complete = of_frame.unwrap_or(self.complete);
     }
 
     fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
@@ -401,11 +408,18 @@ impl FamilyDetector for RingDetector {
             white_on_black: false,
             into_black_px: 0.0,
             followed,
+            shadow_removed: false,
         };
         let measured = search.measure_tracked(&pose, &mut self.buffers)?;
         let marker = self.marker;
-        let evaluation =
-            Evaluation { view, marker: &marker, known_camera: Some(camera), camera, followed };
+        let evaluation = Evaluation {
+            view,
+            marker: &marker,
+            known_camera: Some(camera),
+            camera,
+            followed,
+            shadow_removed: false,
+        };
         evaluation.observation(&measured, measured.pose, camera).ok()
     }
 
@@ -434,6 +448,7 @@ impl Evaluation<'_> {
             white_on_black: candidate.white_on_black,
             into_black_px: 0.0,
             followed: self.followed,
+            shadow_removed: self.shadow_removed,
         };
         let measured = search.measure(candidate, buffers)?;
         if search.is_target(&measured.pose) && !search.is_followed(&measured.pose) {

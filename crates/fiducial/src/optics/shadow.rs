@@ -22,15 +22,17 @@ const ROUNDING: f64 = 0.5;
 /// Minimum rise of the logarithm across two pixels of the level where a line may be, and minimum step of a shadow.
 const MIN_RISE: f32 = 0.22;
 const MIN_STEP: f64 = 0.22;
+/// Maximum step, a ratio of 16: what is darker shows little but noise.
+const MAX_STEP: f64 = 2.77;
 /// Directions and distances of the Hough transform; a distance is two pixels of the level.
 const DIRECTIONS: usize = 96;
 const PX_PER_DISTANCE: f32 = 2.0;
 /// Maximum number of pixels of the level that take part. Where texture has more, only those count that rise more, by this factor.
 const MAX_EDGE_PIXELS: usize = 10_000;
 const MIN_RISE_FACTOR: f32 = 1.5;
-/// Minimum length of a line in pixels of the level, before it is followed to its ends, and of the shorter side of an image: a side of
-/// a marker may cross a smaller one.
-const MIN_LINE_PX: u16 = 30;
+/// Minimum number of pixels of the level that agree on a line, two for each of its length; and minimum of the shorter side of an
+/// image, as a side of a marker may cross a smaller one.
+const MIN_VOTES: u16 = 30;
 const MIN_SIDE_PX: usize = 60;
 /// Lines that are tried in an image, the longest first.
 const MAX_LINES: usize = 3;
@@ -44,7 +46,7 @@ const PLAIN_TO_PX: i32 = 12;
 /// Places along the line that are looked at, at most, and at least for a line to be one.
 const MAX_PLACES: usize = 400;
 const MIN_PLACES: usize = 30;
-/// Maximum difference of the step at a place from the median, and of the place of the step from the line, in pixels; of the places
+/// Maximum difference of the step at a place from the median, also as a share of it, and of its place from the line, in pixels; of the places
 /// along the line across the whole image at least this share must be within.
 const MAX_STEP_OFF: f64 = 0.3;
 const MAX_STEP_SHARE: f64 = 0.6;
@@ -151,7 +153,10 @@ impl ShadowFinder {
             list.reserve(count.saturating_sub(list.len()));
         }
         reserve(&mut self.pixels, MAX_EDGE_PIXELS);
-        reserve(&mut self.votes, DIRECTIONS * distances([view.width(), view.height()]));
+        reserve(
+            &mut self.votes,
+            DIRECTIONS * distances([view.width(), view.height()].map(|px| px >> LEVEL)),
+        );
         reserve(&mut self.crossings, MAX_PLACES + 1);
         reserve(&mut self.values, MAX_PLACES + 1);
     }
@@ -169,7 +174,8 @@ impl ShadowFinder {
             let Some(line) = self.longest_line(size) else { break };
             let line = self.along_pixels(line).unwrap_or(line);
             let edge = self.measured(view, line);
-            let rise = |edge: &ShadowEdge| edge.step * edge.places as f64;
+            // Dark things have larger steps than most shadows.
+            let rise = |edge: &ShadowEdge| edge.step.min(1.0) * edge.places as f64;
             if let Some(edge) = edge
                 && best.as_ref().is_none_or(|best| rise(&edge) > rise(best))
             {
@@ -237,7 +243,7 @@ impl ShadowFinder {
             }
         }
         let (index, votes) = self.votes.iter().enumerate().max_by_key(|(_, votes)| **votes)?;
-        if *votes < MIN_LINE_PX {
+        if *votes < MIN_VOTES {
             return None;
         }
         let across = UNITS[index / distances];
@@ -247,7 +253,7 @@ impl ShadowFinder {
             to_level_0(f64::from(middle[axis] + across[axis] * distance), LEVEL)
         });
         let across = across.map(f64::from);
-        let length = f64::from(middle[0].hypot(middle[1])) * 4.0;
+        let length = f64::from(middle[0].hypot(middle[1])) * f64::from(1 << LEVEL);
         Some(Bend { through, across, by_place: [0.0; 3], length })
     }
 
@@ -265,12 +271,13 @@ impl ShadowFinder {
     /// of other things ends in the image.
     fn measured(&mut self, view: GrayView<'_>, mut line: Bend) -> Option<ShadowEdge> {
         const STEPS: usize = 2;
-        let mut step = 0.0;
+        self.look_across(view, &line);
+        let mut step = self.likely_step()?;
         for _ in 0..STEPS {
-            self.look_across(view, &line);
-            step = self.likely_step()?;
             let likely = self.crossings.iter().filter(|it| it.is_likely(step));
             line = line.fitted(likely.map(|it| [it.along, it.at_px]))?;
+            self.look_across(view, &line);
+            step = self.likely_step()?;
         }
         let all = self.crossings.len();
         self.crossings.retain(|it| it.is_likely(step));
@@ -315,7 +322,7 @@ impl ShadowFinder {
             return None;
         }
         let (_, median, _) = self.values.select_nth_unstable_by(middle, f64::total_cmp);
-        (*median >= MIN_STEP).then_some(*median)
+        (MIN_STEP..MAX_STEP).contains(median).then_some(*median)
     }
 }
 
@@ -354,8 +361,7 @@ impl ShadowEdge {
             *slot = gain(made(before) + share * (made(before + 1) - made(before)));
         }
         let full = gain(0.0);
-        let in_shade: [u8; 256] =
-            std::array::from_fn(|grey| (grey as f32 * full + 0.5).min(255.0) as u8);
+        let in_shade: [u8; 256] = std::array::from_fn(|grey| brightened(grey as f32, full));
         let Bend { through, across: [nx, ny], by_place: [a, b, c], length } = self.line;
         out.resize(view.width(), view.height());
         for y in 0..view.height() {
@@ -373,7 +379,7 @@ impl ShadowEdge {
                 } else {
                     let index = ((from_line + half_px) * GAINS_PER_PX) as usize;
                     let gain = gains.get(index).copied().unwrap_or(1.0);
-                    (f32::from(*from) * gain + 0.5).min(255.0) as u8
+                    brightened(f32::from(*from), gain)
                 };
             }
         }
@@ -383,6 +389,11 @@ impl ShadowEdge {
 /// Number of distances from the middle of an image of this size that lines may have.
 fn distances([width, height]: [usize; 2]) -> usize {
     (width as f32).hypot(height as f32) as usize / PX_PER_DISTANCE as usize + 2
+}
+
+/// A grey value in so much more light, rounded.
+fn brightened(grey: f32, gain: f32) -> u8 {
+    (grey * gain + 0.5).min(255.0) as u8
 }
 
 /// The logarithm of the grey value at a place.

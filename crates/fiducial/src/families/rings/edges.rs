@@ -36,6 +36,8 @@ pub(super) struct EdgeSearch<'a> {
     pub(super) into_black_px: f64,
     /// Where markers that are followed should be.
     pub(super) followed: &'a [Prediction],
+    /// Whether a shadow was removed from the image.
+    pub(super) shadow_removed: bool,
 }
 
 /// How far from its predicted place an edge is searched.

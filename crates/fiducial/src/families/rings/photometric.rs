@@ -15,7 +15,7 @@ use crate::families::rings::circle_pose::CirclePose;
 use crate::optics::mosaic::Mosaic;
 
 use model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL};
-pub(crate) use model::{PhotometricFit, PhotometricInput, PhotometricPoses};
+pub(crate) use model::{PhotometricFit, PhotometricInput, PhotometricPoses, Radii};
 pub(crate) use scene::PixelSample;
 use scene::{ALL_PIXELS_PX, FOCUSED_PX, MAX_RADII_PX, SampleSource, Scene};
 use solve::{ModelFit, Start};
