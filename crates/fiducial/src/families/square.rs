@@ -174,22 +174,10 @@ impl SquareTagDetector {
         &mut self,
         input: ImageInput<'_>,
         quads: impl Iterator<Item = &'a Quad>,
-        shadow_removed: bool,
         out: &mut Output<'_>,
     ) {
         self.found.clear();
         self.decode_all(input, quads, out.trace);
-        if shadow_removed {
-            // What is left of a shadow and of the edge of paper frames something white: the codeword without a black cell.
-            let queries = &self.queries;
-            let is_plain = |found: &Decoded| {
-                queries.get(found.query).is_some_and(|query| {
-                    let all = u64::MAX.checked_shr(64 - query.code.bits.len() as u32);
-                    query.code.codewords.get(found.id as usize).copied() == all
-                })
-            };
-            self.found.retain(|found| !is_plain(found));
-        }
         out.stages.ended("codes");
         self.observe_all(input, 0, out.found);
         out.stages.ended("poses");
@@ -490,7 +478,7 @@ impl FamilyDetector for SquareTagDetector {
     fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
         let image = ImageInput::new(&input);
         let evidence = &*input.evidence;
-        self.detect_whole(image, evidence.outline_quads.iter(), input.shadow_removed, out);
+        self.detect_whole(image, evidence.outline_quads.iter(), out);
     }
 
     fn detect_at(&mut self, input: FrameInput<'_>, at: &Prediction) -> Option<Observation> {
