@@ -189,32 +189,26 @@ impl ShadowFinder {
 
     /// Lists the pixels where the image rises, in a textured image those where it rises most.
     fn find_pixels(&mut self, means: GrayView<'_>) {
-        let mut min_rise = MIN_RISE;
-        while !self.list_pixels(means, min_rise) {
-            min_rise *= MIN_RISE_FACTOR;
-        }
-    }
-
-    /// Lists the pixels where the image rises so much; false when they are too many.
-    fn list_pixels(&mut self, means: GrayView<'_>, min_rise: f32) -> bool {
         static LOGARITHMS: LazyLock<[f32; 256]> =
             LazyLock::new(|| std::array::from_fn(|grey| (grey as f64 + STRAY_LIGHT).ln() as f32));
         let log = |grey: u8| LOGARITHMS[usize::from(grey)];
+        let square = |[x, y]: [f32; 2]| x * x + y * y;
+        let mut min_square = MIN_RISE * MIN_RISE;
         self.pixels.clear();
         for y in 1..means.height().saturating_sub(1) {
             let [above, row, below] = [y - 1, y, y + 1].map(|y| means.row(y));
             for x in 1..means.width().saturating_sub(1) {
                 let rise = [log(row[x + 1]) - log(row[x - 1]), log(below[x]) - log(above[x])];
-                if rise[0] * rise[0] + rise[1] * rise[1] < min_rise * min_rise {
-                    continue;
+                // Few are left after one round or two, as no image rises without end.
+                while self.pixels.len() == MAX_EDGE_PIXELS {
+                    min_square *= MIN_RISE_FACTOR * MIN_RISE_FACTOR;
+                    self.pixels.retain(|pixel| square(pixel.rise) >= min_square);
                 }
-                if self.pixels.len() == MAX_EDGE_PIXELS {
-                    return false;
+                if square(rise) >= min_square {
+                    self.pixels.push(EdgePixel { place: [x as f32, y as f32], rise });
                 }
-                self.pixels.push(EdgePixel { place: [x as f32, y as f32], rise });
             }
         }
-        true
     }
 
     /// The straight line with the most pixels that rise across it, in pixels of the image; `None` where none is long enough.
