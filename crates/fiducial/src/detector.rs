@@ -66,7 +66,10 @@ impl Detector {
         let families = families::detectors(markers, settings);
         let needs = families.iter().map(|family| family.needs()).fold(Needs::default(), Needs::and);
         let has = |pass: &FallbackPass| {
-            families.iter().any(|family| family.fallback_steps().contains(&pass.step()))
+            families.iter().any(|family| match pass.step() {
+                Some(step) => family.fallback_steps().contains(&step),
+                None => family.searches_without_shadow(),
+            })
         };
         Ok(Self {
             settings,
@@ -149,10 +152,10 @@ impl Detector {
         evidence.find(view, &self.needs, trace, stages);
         let mut out = Output { found, trace, stages };
         let shadow_removed = false;
+        let mut input =
+            FrameInput { view, camera, evidence, schedule, followed, response, shadow_removed };
         for family in families.iter_mut() {
-            let input =
-                FrameInput { view, camera, evidence, schedule, followed, response, shadow_removed };
-            family.detect(input, &mut out);
+            family.detect(input.again(), &mut out);
         }
         let mut is_of_frame = true;
         // Other passes place a marker under a shadow's edge less well.
@@ -160,34 +163,23 @@ impl Detector {
             && self.passes.contains(&FallbackPass::ShadowEdge)
             && out.found.is_empty()
         {
-            let edge = self.shadows.find(view, evidence.outlines.pyramid());
+            let edge = self.shadows.find(view, input.evidence.outlines.pyramid());
             if let Some(edge) = &edge {
                 edge.remove(view, derived);
             }
             out.stages.ended("shadow");
             if let Some(view) = edge.and_then(|_| derived.view()) {
-                evidence.find(view, &self.needs, out.trace, out.stages);
-                let shadow_removed = true;
-                for family in families.iter_mut() {
-                    if family.fallback_steps().contains(&FallbackStep::ShadowEdge) {
-                        let input = FrameInput {
-                            view,
-                            camera,
-                            evidence,
-                            schedule,
-                            followed,
-                            response,
-                            shadow_removed,
-                        };
-                        family.detect(input, &mut out);
-                    }
+                input.evidence.find(view, &self.needs, out.trace, out.stages);
+                for family in families.iter_mut().filter(|it| it.searches_without_shadow()) {
+                    let input = FrameInput { view, shadow_removed: true, ..input.again() };
+                    family.detect(input, &mut out);
                 }
                 is_of_frame = false;
             }
         }
-        evidence.begin_fallbacks(schedule);
+        input.evidence.begin_fallbacks(schedule);
         for step in FallbackStep::ALL.into_iter().filter(|step| schedule.allows_step(*step)) {
-            if !evidence.may_help(view, step) {
+            if !input.evidence.may_help(view, step) {
                 continue;
             }
             let mut is_prepared = false;
@@ -199,8 +191,8 @@ impl Detector {
                     continue;
                 }
                 if !std::mem::replace(&mut is_of_frame, true) {
-                    evidence.find(view, &self.needs, out.trace, out.stages);
-                    evidence.begin_fallbacks(schedule);
+                    input.evidence.find(view, &self.needs, out.trace, out.stages);
+                    input.evidence.begin_fallbacks(schedule);
                 }
                 let is_first = !std::mem::replace(&mut is_prepared, true);
                 let is_brightened = step == FallbackStep::Brightened;
@@ -209,18 +201,9 @@ impl Detector {
                 }
                 let view = derived.view().filter(|_| is_brightened).unwrap_or(view);
                 if is_first {
-                    evidence.prepare(view, step, schedule, out.stages);
+                    input.evidence.prepare(view, step, schedule, out.stages);
                 }
-                let input = FrameInput {
-                    view,
-                    camera,
-                    evidence,
-                    schedule,
-                    followed,
-                    response,
-                    shadow_removed,
-                };
-                family.fallback(step, input, &mut out);
+                family.fallback(step, FrameInput { view, ..input.again() }, &mut out);
             }
             if let Some(stage) = step.stage().filter(|_| is_prepared) {
                 out.stages.ended(stage);

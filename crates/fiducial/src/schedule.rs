@@ -71,15 +71,15 @@ impl FallbackPass {
         Self::QuietZones(ImageStrip::Lower),
     ];
 
-    /// The first step of an image that makes this pass.
-    pub(crate) fn step(self) -> FallbackStep {
+    /// The first step of an image that makes this pass; `None` of the one that searches another image as the frame is searched.
+    pub(crate) fn step(self) -> Option<FallbackStep> {
         match self {
-            Self::Arcs => FallbackStep::Arcs,
-            Self::Blobs => FallbackStep::Blobs,
-            Self::ShadowEdge => FallbackStep::ShadowEdge,
-            Self::Brightened => FallbackStep::Brightened,
-            Self::FineSegments | Self::CoarseSegments => FallbackStep::Segments,
-            Self::QuietZones(_) => FallbackStep::QuietZones,
+            Self::Arcs => Some(FallbackStep::Arcs),
+            Self::Blobs => Some(FallbackStep::Blobs),
+            Self::ShadowEdge => None,
+            Self::Brightened => Some(FallbackStep::Brightened),
+            Self::FineSegments | Self::CoarseSegments => Some(FallbackStep::Segments),
+            Self::QuietZones(_) => Some(FallbackStep::QuietZones),
         }
     }
 
@@ -91,8 +91,6 @@ impl FallbackPass {
 /// A step of the fallbacks in one image: the allowed passes of one kind together.
 #[derive(Copy, Clone, Debug, PartialEq, Eq)]
 pub(crate) enum FallbackStep {
-    /// The search of an image without a shadow, which is none of [`FallbackStep::ALL`]: it is that of the frame once more.
-    ShadowEdge,
     Arcs,
     Blobs,
     Segments,
@@ -104,7 +102,7 @@ pub(crate) enum FallbackStep {
 }
 
 impl FallbackStep {
-    /// The steps in the order in which they run in an image.
+    /// All steps, in the order in which they run in an image.
     pub(crate) const ALL: [Self; 6] = [
         Self::Arcs,
         Self::Blobs,
@@ -117,7 +115,7 @@ impl FallbackStep {
     /// The name of its stage; `None` for steps whose families name their stages.
     pub(crate) fn stage(self) -> Option<&'static str> {
         match self {
-            Self::Arcs | Self::Blobs | Self::ShadowEdge | Self::Brightened => None,
+            Self::Arcs | Self::Blobs | Self::Brightened => None,
             Self::Segments | Self::LateSegments => Some("occluded"),
             Self::QuietZones => Some("quiet zones"),
         }
@@ -152,7 +150,7 @@ impl PassSchedule {
     /// Whether a pass of a step may run.
     pub(crate) fn allows_step(self, step: FallbackStep) -> bool {
         let step = if step == FallbackStep::LateSegments { FallbackStep::Segments } else { step };
-        FallbackPass::ALL.into_iter().any(|pass| pass.step() == step && self.allows(pass))
+        FallbackPass::ALL.into_iter().any(|pass| pass.step() == Some(step) && self.allows(pass))
     }
 }
 
@@ -168,7 +166,9 @@ mod tests {
                 assert_eq!(only.allows(other), other == pass);
                 assert_eq!(PassSchedule::ALL.without(pass).allows(other), other != pass);
             }
-            assert!(only.allows_step(pass.step()) && !PassSchedule::NONE.allows_step(pass.step()));
+            if let Some(step) = pass.step() {
+                assert!(only.allows_step(step) && !PassSchedule::NONE.allows_step(step));
+            }
         }
     }
 

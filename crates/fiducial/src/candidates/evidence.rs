@@ -150,8 +150,7 @@ impl Evidence {
             self.min_percent = self.contrast.reached_in(PAPER_SHARE).min(PAPER_PERCENT);
         }
         match step {
-            // The image without the shadow has its own.
-            FallbackStep::Arcs | FallbackStep::Blobs | FallbackStep::ShadowEdge => {}
+            FallbackStep::Arcs | FallbackStep::Blobs => {}
             FallbackStep::Brightened => {
                 // Of the image itself.
                 self.min_percent = SHADED_PERCENT;

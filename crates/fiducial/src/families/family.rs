@@ -21,6 +21,11 @@ pub(crate) trait FamilyDetector: Debug + Send {
     /// The steps of the fallbacks that it has.
     fn fallback_steps(&self) -> &'static [FallbackStep];
 
+    /// Whether it also searches an image without its shadow, by [`FamilyDetector::detect`].
+    fn searches_without_shadow(&self) -> bool {
+        true
+    }
+
     /// Reserves what textured images need.
     fn make_room(&mut self) {}
 
@@ -61,6 +66,13 @@ pub(crate) struct FrameInput<'a> {
     pub(crate) response: Option<ResponseEstimate>,
     /// Whether a shadow was removed: noise is stronger where it was, and along its edge something of it is left.
     pub(crate) shadow_removed: bool,
+}
+
+impl FrameInput<'_> {
+    /// The same once more, for what comes after one that takes it.
+    pub(crate) fn again(&mut self) -> FrameInput<'_> {
+        FrameInput { evidence: &mut *self.evidence, ..*self }
+    }
 }
 
 /// Where detections go.

@@ -168,14 +168,9 @@ impl RingDetector {
     }
 
     /// Searches for complete ellipses, on coarse levels first.
-    fn search(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
-        let FrameInput { view, camera, evidence, schedule, followed, response, shadow_removed } =
-            input;
+    fn search(&mut self, mut input: FrameInput<'_>, out: &mut Output<'_>) {
         for pass in &PASSES {
-            let evidence = &mut *evidence;
-            let input =
-                FrameInput { view, camera, evidence, schedule, followed, response, shadow_removed };
-            self.run(pass, input, out);
+            self.run(pass, input.again(), out);
             self.complete += self.candidates.len();
             if out.found.len() > self.first && !self.thorough {
                 break;
@@ -367,12 +362,7 @@ impl FamilyDetector for RingDetector {
     }
 
     fn fallback_steps(&self) -> &'static [FallbackStep] {
-        &[
-            FallbackStep::Arcs,
-            FallbackStep::Blobs,
-            FallbackStep::ShadowEdge,
-            FallbackStep::Brightened,
-        ]
+        &[FallbackStep::Arcs, FallbackStep::Blobs, FallbackStep::Brightened]
     }
 
     fn make_room(&mut self) {

@@ -75,6 +75,10 @@ impl FamilyDetector for RingsThesis {
         &[]
     }
 
+    fn searches_without_shadow(&self) -> bool {
+        false
+    }
+
     fn detect(&mut self, input: FrameInput<'_>, out: &mut Output<'_>) {
         self.detect_in(input.view, input.camera, out);
     }

@@ -468,7 +468,7 @@ impl FamilyDetector for SquareTagDetector {
     }
 
     fn fallback_steps(&self) -> &'static [FallbackStep] {
-        &[FallbackStep::Segments, FallbackStep::QuietZones, FallbackStep::ShadowEdge]
+        &[FallbackStep::Segments, FallbackStep::QuietZones]
     }
 
     fn make_room(&mut self) {

@@ -445,7 +445,7 @@ impl FamilyDetector for StagDetector {
     }
 
     fn fallback_steps(&self) -> &'static [FallbackStep] {
-        &[FallbackStep::QuietZones, FallbackStep::LateSegments, FallbackStep::ShadowEdge]
+        &[FallbackStep::QuietZones, FallbackStep::LateSegments]
     }
 
     fn make_room(&mut self) {

@@ -49,8 +49,7 @@ pub(super) fn frames(draw: Draw, marker: Marker) -> Vec<FrameSpec> {
     }
     for contrast in CONTRASTS {
         for _ in 0..FRAMES / 2 {
-            let draw = draw.frame(Set::Shade, frames.len());
-            let (spec, mut rng) = view(draw, marker, CameraSettings::thesis(), 18.0..40.0, 0.4);
+            let (spec, mut rng) = of_size(18.0..40.0, draw, marker, frames.len());
             let occluder = edge(&spec, &mut rng, contrast, 0.5..2.0);
             frames.push(spec.with(format!("small1:{contrast}"), occluder));
         }
@@ -73,5 +72,15 @@ fn edge(
 }
 
 fn large(draw: Draw, marker: Marker, frame: usize) -> (FrameSpec, ChaCha8Rng) {
-    view(draw.frame(Set::Shade, frame), marker, CameraSettings::thesis(), 40.0..160.0, 0.4)
+    of_size(40.0..160.0, draw, marker, frame)
+}
+
+/// A view of a marker of so many pixels.
+fn of_size(
+    size_px: Range<f64>,
+    draw: Draw,
+    marker: Marker,
+    frame: usize,
+) -> (FrameSpec, ChaCha8Rng) {
+    view(draw.frame(Set::Shade, frame), marker, CameraSettings::thesis(), size_px, 0.4)
 }
