@@ -1,40 +1,65 @@
-//! The list of source files in ARCHITECTURE.md.
+//! The list of source files in ARCHITECTURE.md: each with the first sentence of its own documentation.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Modules by name, each with those in its folder.
-#[derive(Default)]
-struct Modules(BTreeMap<String, Modules>);
-
-impl Modules {
-    fn add(&mut self, mut path: impl Iterator<Item = String>) {
-        if let Some(name) = path.next() {
-            self.0.entry(name).or_default().add(path);
-        }
-    }
-
-    fn names(&self) -> String {
-        let names = self.0.iter().map(|(name, within)| match within.0.is_empty() {
-            true => name.clone(),
-            false => format!("{name} ({})", within.names()),
-        });
-        names.collect::<Vec<_>>().join(", ")
-    }
-}
-
-/// The rows of the list: a room, and its source files by name, those of a folder in parentheses.
-pub(crate) fn rows<'a>(files: impl Iterator<Item = &'a Path>) -> Vec<String> {
-    let mut rooms: BTreeMap<String, Modules> = BTreeMap::new();
+/// The list as it must stand in the document.
+///
+/// `files` are paths from the root of the repository; `read` gives the text of one.
+pub(crate) fn list<'a>(
+    files: impl Iterator<Item = &'a Path>,
+    read: impl Fn(&Path) -> anyhow::Result<String>,
+) -> anyhow::Result<String> {
+    let mut rooms: BTreeMap<&str, BTreeMap<String, String>> = BTreeMap::new();
     for file in files {
         let Some((room, within)) = file.to_str().and_then(|name| name.split_once("/src/")) else {
             continue;
         };
-        let Some(within) = within.strip_suffix(".rs") else { continue };
-        let path = within.trim_end_matches("/mod");
-        if !["lib", "main"].contains(&path) {
-            rooms.entry(room.to_owned()).or_default().add(path.split('/').map(str::to_owned));
-        }
+        let sentence = first_sentence(&read(file)?);
+        anyhow::ensure!(!sentence.is_empty(), "{} does not begin with `//!`", file.display());
+        rooms
+            .entry(room)
+            .or_default()
+            .insert(sort_key(within), format!("- `{within}`: {sentence}"));
     }
-    rooms.iter().map(|(room, modules)| format!("| `{room}` | {} |", modules.names())).collect()
+    let sections = rooms.iter().map(|(room, files)| {
+        let lines: Vec<&str> = files.values().map(String::as_str).collect();
+        format!("### `{room}/src`\n\n{}\n", lines.join("\n"))
+    });
+    Ok(sections.collect::<Vec<_>>().join("\n"))
+}
+
+/// A module stands before those of its folder, and a library before its modules.
+fn sort_key(within: &str) -> String {
+    match within {
+        "lib.rs" => String::new(),
+        _ => within.trim_end_matches(".rs").trim_end_matches("/mod").to_owned(),
+    }
+}
+
+/// The first sentence of a file's `//!` lines, without links.
+fn first_sentence(text: &str) -> String {
+    let lines = text.lines().map_while(|line| line.strip_prefix("//!")).map(str::trim);
+    let paragraph = lines.take_while(|line| !line.is_empty()).collect::<Vec<_>>().join(" ");
+    let sentence =
+        match paragraph.match_indices(". ").find(|(at, _)| ends_sentence(&paragraph, *at)) {
+            Some((at, _)) => &paragraph[..at],
+            None => paragraph.strip_suffix('.').unwrap_or(&paragraph),
+        };
+    without_addresses(&sentence.replace("[`", "`").replace("`]", "`"))
+}
+
+/// Whether the full stop at `at` ends a sentence: the next word begins with a capital letter, or with code.
+fn ends_sentence(paragraph: &str, at: usize) -> bool {
+    paragraph[at + 2..].starts_with(|first: char| first.is_uppercase() || first == '`')
+}
+
+/// ` (<https://...>)` says nothing about a file.
+fn without_addresses(sentence: &str) -> String {
+    match (sentence.find(" (<"), sentence.find(">)")) {
+        (Some(begin), Some(end)) if begin < end => {
+            format!("{}{}", &sentence[..begin], &sentence[end + 2..])
+        }
+        _ => sentence.to_owned(),
+    }
 }

@@ -1,3 +1,5 @@
+//! Where the recordings are: photographs, flight logs, measurements of a real autopilot.
+
 use std::path::{Path, PathBuf};
 
 /// A file or folder of the recordings: photographs, flight logs, measurements of a real autopilot.

@@ -1,3 +1,5 @@
+//! Peers written in Python and JavaScript, run for a test.
+
 #![expect(
     clippy::print_stdout,
     reason = "the output of a script is for whoever looks at a failed test"

@@ -1,3 +1,5 @@
+//! Tests that are skipped, visibly.
+
 use std::fmt::Display;
 use std::fs::OpenOptions;
 use std::io::Write;
