@@ -7,3 +7,4 @@ pub(crate) mod illumination;
 pub(crate) mod occluded;
 pub(crate) mod stag_cells;
 pub(crate) mod stag_samples;
+pub(crate) mod steps;

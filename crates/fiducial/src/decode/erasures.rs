@@ -138,7 +138,7 @@ enum Kind {
 }
 
 /// The image of a marker.
-struct Source<'a> {
+pub(crate) struct Source<'a> {
     view: GrayView<'a>,
     /// From the square's cells, whose corners are (0, 0) to (n, n), to pixels.
     homography: Homography,
@@ -147,7 +147,7 @@ struct Source<'a> {
 }
 
 impl<'a> Source<'a> {
-    fn new(view: GrayView<'a>, quad: &Quad, code: &SquareCode) -> Option<Self> {
+    pub(crate) fn new(view: GrayView<'a>, quad: &Quad, code: &SquareCode) -> Option<Self> {
         let cells = f64::from(code.cells);
         let corners = quad.corners.map(|c| [c.x, c.y]);
         let homography = Homography::from_square([0.0, cells], &corners)?;
@@ -155,7 +155,7 @@ impl<'a> Source<'a> {
     }
 
     /// The grey value at a place in cells, of the negative where the marker is printed white on black.
-    fn grey(&self, place: [f64; 2]) -> Option<f32> {
+    pub(crate) fn grey(&self, place: [f64; 2]) -> Option<f32> {
         let [x, y] = self.homography.project_visible(place)?;
         let value = imaging::bilinear(self.view, x, y)? as f32;
         Some(if self.inverted { 255.0 - value } else { value })

@@ -6,6 +6,7 @@ use markers::SquareCode;
 use crate::candidates::overlap::{Overlap, suppress_non_maxima};
 use crate::candidates::quad::{Quad, shortest_side_px};
 use crate::decode::erasures::{CellImage, Reading, has_border, have_same_cells};
+use crate::decode::steps::Steps;
 
 /// Largest number of readings in one image.
 const MAX_FOUND: usize = 64;
@@ -149,7 +150,10 @@ fn read_square<'a>(
             image = Some((code, CellImage::read(view, quad, code)));
         }
         let cells = image.as_ref().and_then(|(_, cells)| cells.as_ref());
-        if let Some(reading) = cells.and_then(|cells| cells.decode(code, ids)) {
+        let reading = cells.and_then(|cells| cells.decode(code, ids));
+        let reading = reading
+            .or_else(|| Steps::read(view, quad, code).and_then(|steps| steps.decode(code, ids)));
+        if let Some(reading) = reading {
             let mut quad = *quad;
             quad.corners.rotate_left(usize::from(reading.rotation % 4));
             let score = f64::from(reading.intact * reading.r_squared * reading.evidence);
@@ -284,6 +288,25 @@ mod tests {
             let away = (u - 0.35).hypot(v + 0.2) / 0.15;
             grey + 350.0 * (-0.5 * away * away).exp()
         });
+    }
+
+    #[test]
+    fn a_marker_in_the_light_between_leaves_is_found() {
+        let suns = [
+            [-0.42, -0.3, 0.2],
+            [0.1, -0.45, 0.14],
+            [0.35, 0.1, 0.25],
+            [-0.2, 0.2, 0.17],
+            [0.1, 0.5, 0.2],
+        ];
+        for family in FAMILIES {
+            expect(family, MIDDLE, 1.5, |[u, v], grey| {
+                let lit = suns.iter().map(|[x, y, radius]| {
+                    (1.0 + (radius - (u - x).hypot(v - y)) / 0.06).clamp(0.0, 1.0)
+                });
+                grey * (0.22 + 0.78 * lit.fold(0.0, f64::max))
+            });
+        }
     }
 
     #[test]
