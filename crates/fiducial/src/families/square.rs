@@ -13,8 +13,10 @@ use crate::candidates::overlap::Overlap;
 use crate::candidates::quad::{Quad, mean_side_px};
 use crate::candidates::quiet_zone::{MAX_CONTRAST_VARIATION, border_contrast_variation};
 use crate::decode::cells::{Cells, Layout, SquareImage};
+use crate::decode::erasures::Reading;
 use crate::decode::false_positive;
 use crate::decode::occluded::{Occluded, OccludedQuery, SquareReading};
+use crate::decode::steps::Steps;
 use crate::families::family::{FamilyDetector, FrameInput, Output, Prediction};
 use crate::families::query::{ExpectedMarker, FamilyQuery, ImageInput, segment_corner_px};
 use crate::observation::Observation;
@@ -27,6 +29,7 @@ use crate::trace::{Reason, Trace};
 /// Bounds on the work in one image, far above what frames with markers need.
 const MAX_SOLVED: usize = 500;
 const MAX_FOUND: usize = 256;
+const MAX_DOUBTFUL: usize = 64;
 
 /// Cells up to this width, in pixels, are read by their quiet zone: blur may break their border.
 const MAX_QUIET_ZONE_CELL_PX: f64 = 2.0;
@@ -77,6 +80,8 @@ pub(crate) struct SquareTagDetector {
     layouts: Vec<Layout>,
     cells: Cells,
     found: Vec<Decoded>,
+    /// Quads with a codeword that does not explain the pixels, with the index of the layout.
+    doubtful: Vec<(Quad, usize)>,
     scratch: Scratch,
     occluded: Occluded<SquareReading>,
     /// Whether markers printed white on black are looked for as well.
@@ -151,6 +156,8 @@ impl SquareTagDetector {
         }
         self.found.clear();
         self.found.reserve(MAX_FOUND);
+        self.doubtful.clear();
+        self.doubtful.reserve(MAX_DOUBTFUL);
         self.scratch.make_room();
         self.occluded.make_room();
         for query in &mut self.queries {
@@ -177,6 +184,7 @@ impl SquareTagDetector {
         out: &mut Output<'_>,
     ) {
         self.found.clear();
+        self.doubtful.clear();
         self.decode_all(input, quads, out.trace);
         out.stages.ended("codes");
         self.observe_all(input, 0, out.found);
@@ -211,6 +219,7 @@ impl SquareTagDetector {
     /// [`SquareTagDetector::note_missing`].
     fn detect_occluded(&mut self, input: ImageInput<'_>, quads: &[Quad], out: &mut Output<'_>) {
         let first = self.found.len();
+        self.decode_doubtful(input.view, out.trace);
         self.decode_occluded(input.view, quads, out.trace);
         self.observe_all(input, first, out.found);
     }
@@ -311,7 +320,12 @@ impl SquareTagDetector {
                         trace.accept_quad(quad.corners);
                         self.found.push(found);
                     }
-                    Err(reason) => trace.refuse_quad(quad.corners, reason),
+                    Err(reason) => {
+                        if reason == Reason::Confidence && self.doubtful.len() < MAX_DOUBTFUL {
+                            self.doubtful.push((*quad, layout));
+                        }
+                        trace.refuse_quad(quad.corners, reason);
+                    }
                 }
             }
             if solved >= MAX_SOLVED || self.found.len() >= MAX_FOUND {
@@ -333,6 +347,31 @@ impl SquareTagDetector {
         self.queries.iter().any(|query| query.is_missing)
     }
 
+    /// Reads doubtful quads by the steps between their cells: in uneven light no codeword explains the pixels.
+    fn decode_doubtful(&mut self, view: GrayView<'_>, trace: &mut Trace) {
+        for (quad, layout) in &self.doubtful {
+            if is_covered(&self.found, quad) {
+                continue;
+            }
+            let queries = self.queries.iter().enumerate();
+            let queries = queries.filter(|(_, it)| it.is_missing && it.layouts[0] == Some(*layout));
+            let mut read = queries.filter_map(|(index, query)| {
+                let ids = (!query.query.has_any_id()).then_some(query.missing.as_slice());
+                let reading = Steps::read(view, quad, query.code)?.decode(query.code, ids)?;
+                let mut corners = quad.corners;
+                corners.rotate_left(usize::from(reading.rotation % 4));
+                Some(Decoded {
+                    corner_px: OUTLINE_CORNER_PX,
+                    ..Decoded::read(index, corners, reading)
+                })
+            });
+            if let Some(found) = read.next() {
+                trace.accept_quad(found.corners);
+                self.found.push(found);
+            }
+        }
+    }
+
     fn decode_occluded(&mut self, view: GrayView<'_>, quads: &[Quad], trace: &mut Trace) {
         let missing = self.queries.iter().enumerate().filter(|(_, query)| query.is_missing);
         let queries = missing.map(|(family, query)| {
@@ -347,19 +386,7 @@ impl SquareTagDetector {
             let corners = marker.quad.corners;
             trace.accept_quad(corners);
             let SquareReading { family, reading } = marker.reading;
-            // Evidence of 20 bits gives the confidence of a marker in full view.
-            let decision_margin = f64::from(reading.intact * (reading.evidence / 20.0).min(1.0));
-            self.found.push(Decoded {
-                query: family,
-                id: reading.id,
-                extra_border: 0,
-                corners,
-                hamming: reading.hamming,
-                r_squared: f64::from(reading.r_squared),
-                decision_margin,
-                corner_px: segment_corner_px(&corners),
-                is_washed_out: reading.is_washed_out,
-            });
+            self.found.push(Decoded::read(family, corners, reading));
         }
     }
 
@@ -531,6 +558,23 @@ fn extra_border_cells(code: &SquareCode) -> u8 {
 }
 
 impl Decoded {
+    /// A marker whose bits were read one by one, of a quad of segments.
+    fn read(query: usize, corners: [Pixel; 4], reading: Reading) -> Self {
+        // Evidence of 20 bits gives the confidence of a marker in full view.
+        let decision_margin = f64::from(reading.intact * (reading.evidence / 20.0).min(1.0));
+        Self {
+            query,
+            id: reading.id,
+            extra_border: 0,
+            corners,
+            hamming: reading.hamming,
+            r_squared: f64::from(reading.r_squared),
+            decision_margin,
+            corner_px: segment_corner_px(&corners),
+            is_washed_out: reading.is_washed_out,
+        }
+    }
+
     /// Its refined corners; `is_near` as in [`CornerGuess`].
     fn refined(
         &self,
