@@ -13,7 +13,7 @@ use crate::decode::false_positive;
 
 /// Largest number of cells across, with the quiet zone.
 const MAX_ACROSS: usize = 12;
-/// Largest number of edges between two cells, of which one is a bit or both are known.
+/// Largest number of edges between two cells.
 const MAX_EDGES: usize = 2 * MAX_ACROSS * (MAX_ACROSS - 1);
 /// Number of times that the bits are made to agree with their neighbours.
 const SWEEPS: usize = 12;
@@ -60,7 +60,7 @@ struct Edge {
     step: f32,
 }
 
-/// The edges between the cells of a quad.
+/// The edges between the cells of a quad, but for those between two cells whose colours are known.
 pub(crate) struct Steps {
     edges: [Edge; MAX_EDGES],
     count: usize,

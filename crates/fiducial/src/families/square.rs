@@ -67,6 +67,11 @@ struct SquareQuery {
 }
 
 impl SquareQuery {
+    /// The ids that a fallback looks for; `None` stands for all.
+    fn missing_ids(&self) -> Option<&[u32]> {
+        (!self.query.has_any_id()).then_some(self.missing.as_slice())
+    }
+
     /// How many codewords are looked for.
     fn codewords(&self) -> usize {
         if self.query.has_any_id() { self.code.codewords.len() } else { self.query.markers.len() }
@@ -356,7 +361,7 @@ impl SquareTagDetector {
             let queries = self.queries.iter().enumerate();
             let queries = queries.filter(|(_, it)| it.is_missing && it.layouts[0] == Some(*layout));
             let mut read = queries.filter_map(|(index, query)| {
-                let ids = (!query.query.has_any_id()).then_some(query.missing.as_slice());
+                let ids = query.missing_ids();
                 let reading = Steps::read(view, quad, query.code)?.decode(query.code, ids)?;
                 let mut corners = quad.corners;
                 corners.rotate_left(usize::from(reading.rotation % 4));
@@ -375,7 +380,7 @@ impl SquareTagDetector {
     fn decode_occluded(&mut self, view: GrayView<'_>, quads: &[Quad], trace: &mut Trace) {
         let missing = self.queries.iter().enumerate().filter(|(_, query)| query.is_missing);
         let queries = missing.map(|(family, query)| {
-            let ids = (!query.query.has_any_id()).then_some(query.missing.as_slice());
+            let ids = query.missing_ids();
             OccludedQuery { family, code: query.code, ids }
         });
         let (known, inverted) = (&self.found, self.inverted);
