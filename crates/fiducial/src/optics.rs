@@ -4,6 +4,7 @@ pub(crate) mod camera_response;
 pub(crate) mod edge_response;
 pub(crate) mod exposure;
 pub(crate) mod homography;
+pub(crate) mod inverse_tone;
 pub(crate) mod least_squares;
 pub(crate) mod mosaic;
 pub(crate) mod normal;

@@ -167,6 +167,26 @@ fn rings_are_found_by_ordinary_cameras_at_all_positions_but_the_farthest() {
     }
 }
 
+#[test]
+fn small_squares_are_found_by_ordinary_cameras() {
+    // From 23 to 11.6 px: a tone curve makes their borders thin or breaks them, and the ground nearly as bright as the paper.
+    let heights_m: Vec<f64> = (0..13).map(|index| 6.0 + 0.5 * f64::from(index)).collect();
+    for name in ["apriltag-16h5:7", "apriltag-36h11:7", "aruco-4x4-50:7", "stag-hd23:3"] {
+        let frames = square_frames(name, &heights_m);
+        let mut detector = detector(name);
+        let camera = Binning::FourByFour.camera();
+        for preset in [Preset::Usb, Preset::RaspberryPi, Preset::ActionCamera, Preset::Phone] {
+            let mut errors = Errors::default();
+            for (pixels, pose) in &frames {
+                let found = detect(&mut detector, pixels, &preset.processing(), &camera);
+                let centre = camera.project(pose.origin()).unwrap();
+                errors.note(&found, centre, pose.origin().coords.coords.norm());
+            }
+            errors.expect(&format!("{name} {}", preset.name()), 0, [0.05, 0.12], [0.4, 1.5]);
+        }
+    }
+}
+
 /// The frame with a hard shadow to one side of a line through a pixel.
 fn shaded(pixels: &[u8], width: usize, edge: Line, transmission: f32) -> Vec<u8> {
     let shadow = Occluder::Shadow { edge, penumbra_px: 2.0, transmission };

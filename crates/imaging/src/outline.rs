@@ -29,8 +29,11 @@ pub struct Settings {
     pub min_contrast: u8,
     /// The same as a share of the brightest pixel, in percent, on all levels.
     pub min_contrast_percent: u8,
-    /// On levels 0 and 1, an outline is followed only if the grey values at its top step by half of their
-    /// range within 12 x 12 pixels (level 1: of its logarithm). This skips most of a texture.
+    /// Where the threshold of level 0 lies within the range of 12 x 12 pixels, in 256ths: 128 in the middle. Paper stands out
+    /// from its ground above that, where black ink beside it makes the range larger.
+    pub threshold_256ths: u8,
+    /// On levels 0 and 1, an outline is followed only if the grey values at its top step by as much of their
+    /// range within 12 x 12 pixels as lies above the threshold (level 1: by half of its logarithm). This skips most of a texture.
     pub steep: bool,
     /// Minimum share of its bounds that a region fills; a disc fills 0.79, a square 0.5 to 1.
     pub min_fill: f32,
@@ -49,6 +52,7 @@ impl Default for Settings {
             max_size_px: 36,
             min_contrast: 14,
             min_contrast_percent: 12,
+            threshold_256ths: 128,
             steep: true,
             min_fill: 0.3,
             max_raggedness: 1.3,
@@ -292,7 +296,7 @@ fn sharpen(view: GrayView<'_>, out: &mut GrayImage) {
 fn contrast(settings: &Settings, level: usize) -> Contrast {
     let min = settings.min_contrast;
     Contrast {
-        middle: if level == 0 { Middle::Share(128) } else { Middle::Ratio },
+        middle: if level == 0 { Middle::Share(settings.threshold_256ths) } else { Middle::Ratio },
         min_levels: (min >> level.saturating_sub(1).min(7)).max(min / 3),
         min_percent: settings.min_contrast_percent,
     }
@@ -311,6 +315,7 @@ mod tests {
         max_size_px: 0,
         min_contrast: 10,
         min_contrast_percent: 0,
+        threshold_256ths: 128,
         steep: false,
         min_fill: 0.0,
         max_raggedness: 1e6,
@@ -405,6 +410,28 @@ mod tests {
         );
         let finite = Settings { whole_level: 9, max_size_px: 3, min_size_px: 2, ..ALL };
         assert_eq!(bounds(&finite), [[3, 5, 6, 6]]);
+    }
+
+    #[test]
+    fn paper_stands_out_from_its_ground_beside_black_ink_above_the_middle() {
+        let inside = |x: usize, y: usize, margin: usize| {
+            (margin..40 - margin).contains(&x) && (margin..40 - margin).contains(&y)
+        };
+        // A frame of ink, 2 pixels wide, in white paper, on ground between the two.
+        let grey = |x, y| match () {
+            () if inside(x, y, 16) => 240,
+            () if inside(x, y, 14) => 40,
+            () if inside(x, y, 12) => 240,
+            () => 145,
+        };
+        let data: Vec<u8> = (0..40 * 40).map(|i| grey(i % 40, i / 40)).collect();
+        let paper = |threshold_256ths| {
+            let mut outlines = Outlines::default();
+            let settings = Settings { steep: true, threshold_256ths, ..ALL };
+            outlines.find(GrayView::packed(&data, 40, 40).unwrap(), &settings);
+            outlines.iter().any(|o| !o.dark && o.level == 0 && o.bounds == [12, 12, 28, 28])
+        };
+        assert!(!paper(128) && paper(160) && paper(208));
     }
 
     #[test]

@@ -10,19 +10,25 @@ use crate::observation::StageObserver;
 use crate::schedule::{FallbackPass, FallbackStep, ImageStrip, PassSchedule};
 use crate::trace::Trace;
 
-/// Outlines of the paper of square markers so small that their border cannot be told from what is in it.
-const QUIET_ZONES: outline::Settings = outline::Settings {
-    dark_from: None,
-    bright_from: Some(0),
-    whole_level: 2,
-    min_size_px: 5,
-    max_size_px: 40,
-    min_contrast: 14,
-    min_contrast_percent: 12,
-    steep: true,
-    min_fill: 0.3,
-    max_raggedness: 1.2,
-};
+/// Outlines of the paper of square markers so small that their border cannot be told from what is in it, at two thresholds: a
+/// tone curve shows the ground nearly as bright as the paper, and of markers of 8 pixels in linear light the paper is as dark.
+const QUIET_ZONES: [outline::Settings; 2] = [quiet_zones(160), quiet_zones(208)];
+
+const fn quiet_zones(threshold_256ths: u8) -> outline::Settings {
+    outline::Settings {
+        dark_from: None,
+        bright_from: Some(0),
+        whole_level: 2,
+        min_size_px: 5,
+        max_size_px: 40,
+        min_contrast: 14,
+        min_contrast_percent: 12,
+        threshold_256ths,
+        steep: true,
+        min_fill: 0.3,
+        max_raggedness: 1.2,
+    }
+}
 
 /// Share of the image in which small paper is searched at most, unless more of it has this contrast between places, in percent.
 /// Paper of markers of 8 to 12 px had 49 % at least on all grounds, texture of grass and asphalt 30 to 44 % in a tenth of its
@@ -168,8 +174,10 @@ impl Evidence {
                 for strip in ImageStrip::ALL {
                     if schedule.allows(FallbackPass::QuietZones(strip)) {
                         let rows = strip.rows(view.height());
-                        let places = self.contrast.places(self.min_percent);
-                        self.outlines.add_rows(places, view, &QUIET_ZONES, rows);
+                        for settings in &QUIET_ZONES {
+                            let places = self.contrast.places(self.min_percent);
+                            self.outlines.add_rows(places, view, settings, rows.clone());
+                        }
                     }
                 }
                 self.quiet_zones.clear();

@@ -9,6 +9,9 @@ use crate::candidates::quad::Quad;
 pub(crate) const MAX_QUIET_ZONES: usize = 64;
 /// Largest variation of the contrast around a border: standard deviation over mean.
 pub(crate) const MAX_CONTRAST_VARIATION: f64 = 0.6;
+/// The same between the quiet zone and the border of a small marker. Of 67 small markers one had 0.9 and the others less than
+/// 0.7; of 588 bright spots on asphalt, grass and tiles none had a dark border.
+const MAX_INNER_VARIATION: f64 = 1.5;
 
 /// The quads of bright outlines from the index `first` on whose border has an even contrast, as a small
 /// marker's paper has.
@@ -23,6 +26,17 @@ pub(crate) fn quiet_zone_quads<'a>(
         .filter_map(|outline| Quad::from_outline(&outline))
         .filter(move |quad| border_contrast_variation(quad, view, 0) <= MAX_CONTRAST_VARIATION)
         .take(MAX_QUIET_ZONES)
+}
+
+/// No tone curve.
+pub(crate) const LINEAR: f64 = 0.0;
+/// Tone curves with which small markers are read, as of a [`CameraResponse`](crate::optics::camera_response::CameraResponse), and the
+/// scale of the quad of their paper, which looks larger with each.
+pub(crate) const TONE_CURVES: [(f64, f64); 3] = [(LINEAR, 1.0), (1.0, 0.97), (3.0, 0.94)];
+
+/// Whether there is a darker border within a quiet zone, for the quad of that border.
+pub(crate) fn has_dark_border(border: &Quad, view: GrayView<'_>) -> bool {
+    border_contrast_variation(border, view, 0) <= MAX_INNER_VARIATION
 }
 
 /// Standard deviation of the contrast between the outside and the inside of a quad's border, over its mean:

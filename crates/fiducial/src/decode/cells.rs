@@ -11,7 +11,8 @@ use imaging::{GrayView, Pyramid, bilinear};
 use markers::SquareCode;
 
 use crate::candidates::quad::mean_side_px;
-use crate::optics::homography::{Homography, Inverse};
+use crate::optics::homography::{Homography, Inverse, pixel_bounds};
+use crate::optics::inverse_tone::{InverseTone, light_of};
 use crate::optics::normal;
 
 /// Largest number of bits of a code; with the values of dark and bright known cells, of unknowns.
@@ -146,6 +147,7 @@ pub(crate) struct Explanation {
 /// A square on the level of the pyramid on which it is read.
 pub(crate) struct SquareImage<'a> {
     view: GrayView<'a>,
+    tone: Option<InverseTone>,
     /// From the square's cells, whose corners are (0, 0) to (n, n), to pixels of the level, and back.
     homography: Homography,
     inverse: Inverse,
@@ -165,7 +167,15 @@ impl<'a> SquareImage<'a> {
         let corners = corners.map(|c| [from_level_0(c.x, level), from_level_0(c.y, level)]);
         let homography = Homography::from_square([0.0, cells as f64], &corners)?;
         let view = pyramid.level(view, level)?;
-        Some(Self { view, homography, inverse: homography.inverse() })
+        Some(Self { view, tone: None, homography, inverse: homography.inverse() })
+    }
+
+    /// As shown by a camera with this tone curve between the darkest and the brightest pixel of the square; 0 is linear.
+    pub(crate) fn through(self, curve: f64, cells: usize) -> Self {
+        let n = cells as f64;
+        let corners = [[0.0, 0.0], [n, 0.0], [n, n], [0.0, n]];
+        let corners = corners.map(|cell| self.homography.project(cell).image);
+        Self { tone: InverseTone::within(&corners, self.view, curve), ..self }
     }
 
     /// About how wide a cell is in the middle of a square of `cells` cells, in pixels of the level.
@@ -299,7 +309,8 @@ impl Cells {
             for (x, grey) in row.iter().enumerate().take(right + 1).skip(first).step_by(step) {
                 let [u, v] = image.inverse.plane([x as f64, y as f64]);
                 if u > -reach && v > -reach && u < n + reach && v < n + reach {
-                    self.add(layout, [u + margin, v + margin], blur, f64::from(*grey));
+                    let light = light_of(image.tone.as_ref(), *grey);
+                    self.add(layout, [u + margin, v + margin], blur, light);
                 }
             }
         }
@@ -423,17 +434,4 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     }
     let rest: f64 = rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum();
     sums.iter().sum::<f64>() + rest
-}
-
-/// First column and row of the pixels among these points, then the last ones, within the image.
-pub(crate) fn pixel_bounds(points: &[[f64; 2]; 4], view: GrayView<'_>) -> [usize; 4] {
-    let bounds = |axis: usize, size: usize| {
-        let low = points.iter().map(|p| p[axis]).fold(f64::MAX, f64::min);
-        let high = points.iter().map(|p| p[axis]).fold(f64::MIN, f64::max);
-        let last = size as f64 - 1.0;
-        [low.ceil().clamp(0.0, last) as usize, high.floor().clamp(0.0, last) as usize]
-    };
-    let [left, right] = bounds(0, view.width());
-    let [top, bottom] = bounds(1, view.height());
-    [left, top, right, bottom]
 }

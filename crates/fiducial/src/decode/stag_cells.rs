@@ -10,9 +10,10 @@ use imaging::GrayView;
 use markers::stag_code::{self, DISC_RADIUS, DOT_RADIUS, DOTS, QUIET_ZONE};
 use nalgebra::{SMatrix, SVector};
 
-use crate::decode::cells::{BRIGHT, DARK, Explanation, pixel_bounds};
+use crate::decode::cells::{BRIGHT, DARK, Explanation};
 use crate::optics::edge_response::EdgeResponse;
-use crate::optics::homography::Homography;
+use crate::optics::homography::{Homography, pixel_bounds};
+use crate::optics::inverse_tone::{InverseTone, light_of};
 
 /// Small cells across the square, around it, and in all; the square's outline is a border of cells.
 const CELLS: usize = 24;
@@ -110,8 +111,15 @@ fn unknown_at([x, y]: [f64; 2], dots: &[[f64; 2]; DOTS]) -> usize {
 }
 
 impl Dots {
-    /// Adds up the pixels of a square with these corners; false when there are too few.
-    pub(crate) fn add_pixels(&mut self, view: GrayView<'_>, corners: &[[f64; 2]; 4]) -> bool {
+    /// Adds up the pixels of a square with these corners, as shown by a camera with this tone curve between the darkest and the
+    /// brightest of them; false when there are too few.
+    pub(crate) fn add_pixels(
+        &mut self,
+        view: GrayView<'_>,
+        corners: &[[f64; 2]; 4],
+        curve: f64,
+    ) -> bool {
+        let tone = InverseTone::within(corners, view, curve);
         self.normal.fill(0.0);
         self.right.fill(0.0);
         (self.count, self.sum, self.squares) = (0.0, 0.0, 0.0);
@@ -130,7 +138,8 @@ impl Dots {
             for (x, grey) in view.row(y).iter().enumerate().take(right + 1).skip(left) {
                 let cell = inverse.plane([x as f64, y as f64]);
                 if (0..2).all(|i| cell[i] > -reach[i] && cell[i] < n + reach[i]) {
-                    self.add(&response, cell.map(|c| c + margin), blur, f64::from(*grey));
+                    let light = light_of(tone.as_ref(), *grey);
+                    self.add(&response, cell.map(|c| c + margin), blur, light);
                 }
             }
         }

@@ -60,6 +60,7 @@ const ARC_REGIONS: outline::Settings = outline::Settings {
     max_size_px: 36,
     min_contrast: 14,
     min_contrast_percent: 12,
+    threshold_256ths: 128,
     steep: true,
     min_fill: 0.02,
     max_raggedness: 5.0,

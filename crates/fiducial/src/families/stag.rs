@@ -15,7 +15,9 @@ use markers::{Codebook, Family, Marker};
 use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
 use crate::candidates::quad::{Quad, shortest_side_px};
-use crate::candidates::quiet_zone::{MAX_CONTRAST_VARIATION, border_contrast_variation};
+use crate::candidates::quiet_zone::{
+    LINEAR, MAX_CONTRAST_VARIATION, TONE_CURVES, border_contrast_variation, has_dark_border,
+};
 use crate::decode::occluded::{Occluded, OccludedMarker};
 use crate::decode::stag_cells::Dots;
 use crate::decode::stag_samples::{Sampled, SampledMatch, sample};
@@ -202,7 +204,7 @@ impl StagDetector {
             }
             let is_known = |known| Overlap::new(known, &quad.corners).is_concentric();
             if !self.known.iter().any(is_known)
-                && let Err(reason) = self.add(input, quad, out)
+                && let Err(reason) = self.add(input, quad, LINEAR, out)
             {
                 out.trace.refuse_quad(quad.corners, reason);
             }
@@ -222,7 +224,7 @@ impl StagDetector {
         {
             return None;
         }
-        let (reading, refined) = self.read(input, &quad).ok()?;
+        let (reading, refined) = self.read(input, &quad, LINEAR).ok()?;
         let family = self.queries.get(reading.query)?.query.family;
         let is_expected = (family, reading.id) == (expected.family, expected.id);
         (is_expected && reading.rotation == 0)
@@ -240,10 +242,13 @@ impl StagDetector {
         for quiet_zone in quiet_zones {
             let factor = 1.0 / (1.0 + 2.0 * QUIET_ZONE);
             let quad = Quad { inverted: false, ..quiet_zone.scaled(factor) };
-            if !self.is_covered(&quad) {
-                // A quiet zone without a marker is no refused candidate.
-                let _ = self.add(input, &quad, out);
+            if self.is_covered(&quad) || !has_dark_border(&quad, input.view) {
+                continue;
             }
+            // A quiet zone without a marker is no refused candidate.
+            let _ = TONE_CURVES
+                .into_iter()
+                .find(|(curve, scale)| self.add(input, &quad.scaled(*scale), *curve, out).is_ok());
         }
     }
 
@@ -274,14 +279,15 @@ impl StagDetector {
         self.known.iter().any(|known| Overlap::new(known, &quad.corners).is_covered())
     }
 
-    /// Reads a quad and adds its marker to what was found.
+    /// Reads a quad, as shown with a tone curve, and adds its marker to what was found.
     fn add(
         &mut self,
         input: ImageInput<'_>,
         quad: &Quad,
+        curve: f64,
         out: &mut Output<'_>,
     ) -> Result<(), Reason> {
-        let (reading, refined) = self.read(input, quad)?;
+        let (reading, refined) = self.read(input, quad, curve)?;
         let seen = self.observation(&reading, &refined, input).ok_or(Reason::Edges)?;
         out.trace.accept_quad(refined.corners);
         self.known.push(refined.corners);
@@ -341,8 +347,13 @@ impl StagDetector {
         all.max_by(|a, b| a.ratio.total_cmp(&b.ratio))
     }
 
-    /// The marker that a quad shows, with refined corners.
-    fn read(&mut self, input: ImageInput<'_>, quad: &Quad) -> Result<(Reading, Refined), Reason> {
+    /// The marker that a quad shows with a tone curve, with refined corners.
+    fn read(
+        &mut self,
+        input: ImageInput<'_>,
+        quad: &Quad,
+        curve: f64,
+    ) -> Result<(Reading, Refined), Reason> {
         let side_px = shortest_side_px(&quad.corners);
         if side_px < MIN_SIDE_PX {
             return Err(Reason::Small);
@@ -356,7 +367,7 @@ impl StagDetector {
         {
             return Ok((reading, refined));
         }
-        let first = self.solved(input, quad, COARSE_SIDE_PX)?;
+        let first = self.solved(input, quad, curve, COARSE_SIDE_PX)?;
         if first.r_squared < MIN_COARSE_R_SQUARED || first.ratio < MIN_COARSE_RATIO {
             return Err(Reason::Code);
         }
@@ -364,9 +375,9 @@ impl StagDetector {
         let refined = self.refined(input, quad, &first).ok_or(Reason::Edges)?;
         let mut better = Quad { corners: refined.corners, ..*quad };
         better.corners.rotate_right(usize::from(first.rotation) % 4);
-        let mut second = self.solved(input, &better, FINE_SIDE_PX)?;
+        let mut second = self.solved(input, &better, curve, FINE_SIDE_PX)?;
         if !is_certain(&second) {
-            second = self.solved(input, &better, UNSHARP_SIDE_PX)?;
+            second = self.solved(input, &better, curve, UNSHARP_SIDE_PX)?;
             if !is_certain(&second) {
                 return Err(Reason::Confidence);
             }
@@ -401,16 +412,17 @@ impl StagDetector {
         refine_design(&guess, &design, &mut self.scratch)
     }
 
-    /// The codeword that explains the pixels of a square best.
+    /// The codeword that explains the pixels of a square best, with a tone curve.
     fn solved(
         &mut self,
         input: ImageInput<'_>,
         quad: &Quad,
+        curve: f64,
         side_px: f64,
     ) -> Result<Reading, Reason> {
         let (level, corners) = on_level(&quad.corners, side_px, input);
         let image = input.pyramid.level(input.view, level).ok_or(Reason::Small)?;
-        if !self.dots.add_pixels(image, &corners) {
+        if !self.dots.add_pixels(image, &corners, curve) {
             return Err(Reason::Small);
         }
         let word = if self.dots.solve() { self.dots.word() } else { return Err(Reason::Code) };

@@ -1,6 +1,7 @@
 //! The homography from a marker's plane to the image, its inverse and its derivatives.
 
 use geometry::homography::PlanePair;
+use imaging::GrayView;
 use nalgebra::SMatrix;
 
 /// Corners of a square in its own coordinates: x right, y down, from -1 to 1, clockwise from the top left.
@@ -211,6 +212,19 @@ impl Inverse {
         let [u2, v2] = self.plane([x, y + 1.0]);
         [(u1 - u0).hypot(u2 - u0), (v1 - v0).hypot(v2 - v0)]
     }
+}
+
+/// First column and row of the pixels among these points, then the last ones, within the image.
+pub(crate) fn pixel_bounds(points: &[[f64; 2]; 4], view: GrayView<'_>) -> [usize; 4] {
+    let bounds = |axis: usize, size: usize| {
+        let low = points.iter().map(|p| p[axis]).fold(f64::MAX, f64::min);
+        let high = points.iter().map(|p| p[axis]).fold(f64::MIN, f64::max);
+        let last = size as f64 - 1.0;
+        [low.ceil().clamp(0.0, last) as usize, high.floor().clamp(0.0, last) as usize]
+    };
+    let [left, right] = bounds(0, view.width());
+    let [top, bottom] = bounds(1, view.height());
+    [left, top, right, bottom]
 }
 
 #[cfg(test)]

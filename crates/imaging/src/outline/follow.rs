@@ -42,6 +42,8 @@ pub(super) struct Limits {
     max_points: usize,
     detour_256ths: i32,
     steep: bool,
+    /// Smallest step at the top of a steep outline of level 0, in 256ths of the range.
+    min_step_256ths: i64,
     min_fill: f32,
     max_raggedness: f32,
 }
@@ -64,6 +66,7 @@ impl Limits {
             max_steps: (pixels * MAX_STEPS_PER_PIXEL) as usize + MIN_BUDGET,
             max_points: (pixels * MAX_POINTS_PER_PIXEL) as usize + MIN_BUDGET,
             steep: settings.steep && level < 2,
+            min_step_256ths: 256 - i64::from(settings.threshold_256ths),
             detour_256ths: ((settings.max_raggedness - 1.0).clamp(0.0, 1e4) * 256.0) as i32,
             min_fill: settings.min_fill,
             max_raggedness: settings.max_raggedness,
@@ -211,7 +214,7 @@ impl Search<'_> {
                 let x = index * 64 + word.trailing_zeros() as usize;
                 word &= word - 1;
                 if !self.places.include(x, y + self.top, usize::from(self.level))
-                    || limits.steep && !self.is_steep(x, y)
+                    || limits.steep && !self.is_steep(x, y, limits.min_step_256ths)
                     || self.rises(x, y, tops)
                 {
                     continue;
@@ -261,9 +264,9 @@ impl Search<'_> {
         others & !(end - 1) != 0 || others & flooded != 0
     }
 
-    /// Whether the grey values at a top step by half of their range. Two pixels up and down count, as blur
-    /// spreads a step over two or three.
-    fn is_steep(&self, x: usize, y: usize) -> bool {
+    /// Whether the grey values at a top step by this much of their range, on level 1 by half of its logarithm. Two pixels up and
+    /// down count, as blur spreads a step over two or three.
+    fn is_steep(&self, x: usize, y: usize, min_step_256ths: i64) -> bool {
         let row = |y: usize| self.sharp.row(y.min(self.sharp.height() - 1));
         let (near, far) = (row(y.saturating_sub(1)), row(y.saturating_sub(2)));
         let (here, next, last) = (row(y), row(y + 1), row(y + 2));
@@ -278,7 +281,7 @@ impl Search<'_> {
         let [low, high] = self.binarizer.extremes(x, y);
         let [bright, dark, low, high] = [bright, dark, low, high].map(i64::from);
         if self.level == 0 {
-            2 * (bright - dark) >= high - low
+            256 * (bright - dark) >= min_step_256ths * (high - low)
         } else {
             // The same in logarithms; the offset avoids the logarithm of zero.
             let [bright, dark, low, high] = [bright, dark, low, high].map(|grey| grey + 4);
