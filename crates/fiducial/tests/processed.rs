@@ -167,6 +167,23 @@ fn rings_are_found_by_ordinary_cameras_at_all_positions_but_the_farthest() {
     }
 }
 
+/// Of 23 px, between those that have outlines of their own and those that are searched as bright blobs.
+#[test]
+fn rings_behind_a_steep_curve_are_found_where_they_are_neither_large_nor_small() {
+    let (mut detector, mut errors) = (detector("rings"), Errors::default());
+    for (binning, height_m) in [(Binning::TwoByTwo, 12), (Binning::FourByFour, 6)] {
+        let mut scene = TestScene::new(binning).unwrap();
+        let camera = binning.camera();
+        for view in views(binning, 0.0, 10).into_iter().filter(|view| view.height_m == height_m) {
+            let (pixels, truth) = scene.render(&view).unwrap();
+            let found = detect(&mut detector, &pixels, &Preset::RaspberryPi.processing(), &camera);
+            let range_m = truth.camera_from_marker.origin().coords.coords.norm();
+            errors.note(&found, truth.centre, range_m);
+        }
+    }
+    errors.expect("rings of 23 px", 0, [0.02, 0.06], [0.15, 0.5]);
+}
+
 #[test]
 fn small_squares_are_found_by_ordinary_cameras() {
     // From 23 to 11.6 px: a tone curve makes their borders thin or breaks them, and the ground nearly as bright as the paper.

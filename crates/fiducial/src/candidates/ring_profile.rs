@@ -151,6 +151,8 @@ fn directions<const COUNT: usize>(order: impl Fn(usize) -> usize) -> [[f64; 2]; 
 pub(crate) fn blob(view: GrayView<'_>, outline: &Outline<'_>) -> Option<RingCandidate> {
     // The paper's edge in marker sizes, as the marker is drawn.
     const PAPER: f64 = 1.2;
+    // A tone curve makes paper larger, and the search for the size smaller again.
+    const MAX_BLOB_PX: f64 = 1.25 * SMALL_PX;
     // Step sizes that the profile tolerates.
     const STEP_PX: f64 = 0.5;
     const STEP_RATIO: f64 = 1.07;
@@ -164,7 +166,7 @@ pub(crate) fn blob(view: GrayView<'_>, outline: &Outline<'_>) -> Option<RingCand
     let scale = to_level_0(1.0, outline.level) - to_level_0(0.0, outline.level);
     let mut centre = [middle(left, right), middle(top, bottom)];
     let mut diameter_px = f64::from(outline.area).sqrt() * scale / PAPER;
-    if !(5.0..SMALL_PX).contains(&diameter_px) {
+    if !(5.0..MAX_BLOB_PX).contains(&diameter_px) {
         return None;
     }
     let means_at =

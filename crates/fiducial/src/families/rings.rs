@@ -72,7 +72,7 @@ const BLOB_REGIONS: outline::Settings = outline::Settings {
     bright_from: Some(1),
     whole_level: usize::MAX,
     min_size_px: 4,
-    max_size_px: 16,
+    max_size_px: 22,
     steep: false,
     min_fill: 0.5,
     max_raggedness: 1.3,
