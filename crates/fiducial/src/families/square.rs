@@ -10,7 +10,7 @@ use markers::{Marker, Match, SquareCode};
 
 use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
-use crate::candidates::quad::{Quad, mean_side_px};
+use crate::candidates::quad::{Quad, mean_side_px, middle};
 use crate::candidates::quiet_zone::{
     MAX_CONTRAST_VARIATION, TONE_CURVES, border_contrast_variation, has_dark_border,
 };
@@ -36,6 +36,13 @@ const MAX_DOUBTFUL: usize = 64;
 /// Cells up to this width, in pixels, are read by their quiet zone: blur or a tone curve may break their border.
 const MAX_QUIET_ZONE_CELL_PX: f64 = 4.0;
 
+/// Quads in quiet zones are moved to where their cells explain the pixels best: up to this width of the cells, in pixels, from this
+/// R² of the word of the cells on, so many in an image, their sides by these numbers of pixels.
+const MAX_ALIGNED_CELL_PX: f64 = 2.0;
+const MIN_ALIGNED_R_SQUARED: f64 = 0.6;
+const MAX_ALIGNED: usize = 8;
+const ALIGNING_PX: [f64; 4] = [0.3, 0.2, 0.15, 0.1];
+
 /// Smallest R² of a marker; textures with a codeword reach less. In 565 images without markers, the highest
 /// R² was 0.75, but for one with an ambiguous bit.
 const MIN_R_SQUARED: f64 = 0.78;
@@ -55,6 +62,36 @@ pub(crate) const INVERTED_FROM: usize = 2;
 
 /// Standard deviation of the corners of an outline, in pixels.
 const OUTLINE_CORNER_PX: f64 = 0.2;
+
+/// How a quad is moved to where its cells explain the pixels best.
+#[derive(Copy, Clone, Debug)]
+enum Move {
+    Right,
+    Down,
+    Grow,
+    Turn,
+}
+
+impl Move {
+    const ALL: [Self; 4] = [Self::Right, Self::Down, Self::Grow, Self::Turn];
+
+    /// The quad with its sides moved by so many pixels.
+    fn of(self, quad: &Quad, step_px: f64) -> Quad {
+        let ratio = 2.0 * step_px / mean_side_px(&quad.corners);
+        let centre = middle(&quad.corners);
+        let moved = |c: Pixel| {
+            let (x, y) = (c.x - centre.x, c.y - centre.y);
+            let (dx, dy) = match self {
+                Self::Right => (step_px, 0.0),
+                Self::Down => (0.0, step_px),
+                Self::Grow => (ratio * x, ratio * y),
+                Self::Turn => (-ratio * y, ratio * x),
+            };
+            Pixel::new(c.x + dx, c.y + dy)
+        };
+        Quad { corners: quad.corners.map(moved), ..*quad }
+    }
+}
 
 /// One family that is looked for.
 #[derive(Debug)]
@@ -240,9 +277,10 @@ impl SquareTagDetector {
         out: &mut Output<'_>,
     ) {
         let first = self.found.len();
+        let mut aligned = 0;
         for quiet_zone in quiet_zones {
             for layout in 0..self.layouts.len() {
-                self.decode_in_quiet_zone(input, quiet_zone, layout, out.trace);
+                self.decode_in_quiet_zone(input, quiet_zone, layout, &mut aligned, out.trace);
             }
         }
         self.observe_all(input, first, out.found);
@@ -253,6 +291,7 @@ impl SquareTagDetector {
         input: ImageInput<'_>,
         quiet_zone: &Quad,
         layout: usize,
+        aligned: &mut usize,
         trace: &mut Trace,
     ) {
         let Layout { cells, extra_border, reversed, .. } = self.layouts[layout];
@@ -267,18 +306,58 @@ impl SquareTagDetector {
         {
             return;
         }
+        let mut best: Option<(f64, Quad, f64)> = None;
         for (curve, scale) in TONE_CURVES {
             let quad = quad.scaled(scale);
-            let image = SquareImage::new(&quad.corners, cells, input.view, input.pyramid);
-            let Some(image) = image.map(|image| image.through(curve, cells)) else { return };
-            if self.cells.solve(&image, &self.layouts[layout])
-                && let Ok(found) = self.match_codewords(&quad, layout)
-            {
-                trace.accept_quad(quad.corners);
-                self.found.push(found);
-                return;
+            match self.decode_shown(input, &quad, layout, curve) {
+                Ok(found) => return self.accept(found, trace),
+                Err(r_squared) if best.is_none_or(|(least, ..)| r_squared > least) => {
+                    best = Some((r_squared, quad, curve));
+                }
+                Err(_) => {}
             }
         }
+        let best = best.filter(|best| best.0 > MIN_ALIGNED_R_SQUARED);
+        let Some((mut r_squared, mut quad, curve)) = best else { return };
+        if cell_px > MAX_ALIGNED_CELL_PX || *aligned >= MAX_ALIGNED {
+            return;
+        }
+        *aligned += 1;
+        // Where the quad is off by a fifth of a cell, cells of a pixel or two are those beside them.
+        for step_px in ALIGNING_PX {
+            for moved in Move::ALL.into_iter().flat_map(|it| [(it, step_px), (it, -step_px)]) {
+                let next = moved.0.of(&quad, moved.1);
+                match self.decode_shown(input, &next, layout, curve) {
+                    Ok(found) => return self.accept(found, trace),
+                    Err(better) if better > r_squared => (r_squared, quad) = (better, next),
+                    Err(_) => {}
+                }
+            }
+        }
+    }
+
+    /// The marker in a quad as a camera with this tone curve shows it; if there is none, the R² of the word that is nearest to the
+    /// cells.
+    fn decode_shown(
+        &mut self,
+        input: ImageInput<'_>,
+        quad: &Quad,
+        layout: usize,
+        curve: f64,
+    ) -> Result<Decoded, f64> {
+        let Layout { cells, .. } = self.layouts[layout];
+        let image = SquareImage::new(&quad.corners, cells, input.view, input.pyramid);
+        let image = image.ok_or(0.0)?.through(curve, cells);
+        if !self.cells.solve(&image, &self.layouts[layout]) {
+            return Err(0.0);
+        }
+        let r_squared = self.cells.explain(self.cells.word()).r_squared;
+        self.match_codewords(quad, layout).map_err(|_| r_squared)
+    }
+
+    fn accept(&mut self, found: Decoded, trace: &mut Trace) {
+        trace.accept_quad(found.corners);
+        self.found.push(found);
     }
 
     /// Adds the observations of what was decoded from the index `from` on, the most confident first.
