@@ -14,6 +14,8 @@ use crate::trace::Trace;
 /// tone curve shows the ground nearly as bright as the paper, and of markers of 8 pixels in linear light the paper is as dark.
 const QUIET_ZONES: [outline::Settings; 2] = [quiet_zones(160), quiet_zones(208)];
 
+/// With a contrast of up to 50 % none of 132 markers of 7 pixels and more is lost, linear or through a tone curve; texture takes half
+/// of the time from 30 % on.
 const fn quiet_zones(threshold_256ths: u8) -> outline::Settings {
     outline::Settings {
         dark_from: None,
@@ -22,7 +24,7 @@ const fn quiet_zones(threshold_256ths: u8) -> outline::Settings {
         min_size_px: 5,
         max_size_px: 40,
         min_contrast: 14,
-        min_contrast_percent: 12,
+        min_contrast_percent: 40,
         threshold_256ths,
         steep: true,
         min_fill: 0.3,
