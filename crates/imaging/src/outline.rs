@@ -292,7 +292,7 @@ fn sharpen(view: GrayView<'_>, out: &mut GrayImage) {
     }
 }
 
-/// The arithmetic mean keeps lines of a pixel's width whole; on coarser levels shadows matter more.
+/// On level 0 the arithmetic mean, or another share of the range, keeps lines of a pixel's width whole; on coarser levels shadows matter more.
 fn contrast(settings: &Settings, level: usize) -> Contrast {
     let min = settings.min_contrast;
     Contrast {

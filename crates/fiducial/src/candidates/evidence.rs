@@ -10,8 +10,8 @@ use crate::observation::StageObserver;
 use crate::schedule::{FallbackPass, FallbackStep, ImageStrip, PassSchedule};
 use crate::trace::Trace;
 
-/// Outlines of the paper of square markers so small that their border cannot be told from what is in it, at two thresholds: a
-/// tone curve shows the ground nearly as bright as the paper, and of markers of 8 pixels in linear light the paper is as dark.
+/// Outlines of the paper of small square markers whose border is no outline of its own, at two thresholds: a tone curve shows the ground
+/// nearly as bright as the paper, and in linear light blur makes the paper of markers of 8 pixels no brighter than the lower one.
 const QUIET_ZONES: [outline::Settings; 2] = [quiet_zones(160), quiet_zones(208)];
 
 /// With a contrast of up to 50 % none of 132 markers of 7 pixels and more is lost, linear or through a tone curve; texture takes half

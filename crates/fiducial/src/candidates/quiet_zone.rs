@@ -4,9 +4,10 @@ use imaging::pyramid::from_level_0;
 use imaging::{GrayView, Outlines, bilinear};
 
 use crate::candidates::quad::Quad;
+use crate::optics::camera_response::CameraResponse;
 
 /// Largest number of quiet zones in one image.
-pub(crate) const MAX_QUIET_ZONES: usize = 64;
+pub(crate) const MAX_QUIET_ZONES: usize = 128;
 /// Largest variation of the contrast around a border: standard deviation over mean.
 pub(crate) const MAX_CONTRAST_VARIATION: f64 = 0.6;
 /// The same between the quiet zone and the border of a small marker. Of 67 small markers one had 0.9 and the others less than
@@ -28,11 +29,21 @@ pub(crate) fn quiet_zone_quads<'a>(
         .take(MAX_QUIET_ZONES)
 }
 
-/// No tone curve.
-pub(crate) const LINEAR: f64 = 0.0;
-/// Tone curves with which small markers are read, as of a [`CameraResponse`](crate::optics::camera_response::CameraResponse), and the
-/// scale of the quad of their paper, which looks larger with each.
-pub(crate) const TONE_CURVES: [(f64, f64); 3] = [(LINEAR, 1.0), (1.0, 0.97), (3.0, 0.94)];
+/// How a camera with a tone curve shows a small marker on its paper.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct PaperTone {
+    /// As of a [`CameraResponse`]; 0 is linear.
+    pub(crate) curve: f64,
+    /// The scale of the paper's quad: the curve makes paper look larger.
+    pub(crate) scale: f64,
+}
+
+/// Those with which small markers are read.
+pub(crate) const TONES: [PaperTone; 3] = [
+    PaperTone { curve: CameraResponse::LINEAR.curve, scale: 1.0 },
+    PaperTone { curve: CameraResponse::ORDINARY.curve, scale: 0.97 },
+    PaperTone { curve: 3.0, scale: 0.94 },
+];
 
 /// Whether there is a darker border within a quiet zone, for the quad of that border.
 pub(crate) fn has_dark_border(border: &Quad, view: GrayView<'_>) -> bool {

@@ -2,7 +2,7 @@
 //!
 //! For each quad the cells are solved for, the codeword is matched, and its false-positive rate is weighed.
 //! Then the corners are refined and give the pose. Fallbacks read quads of segments, of which a part may be
-//! hidden, and the quiet zones of markers so small that blur breaks their border.
+//! hidden, and the quiet zones of markers whose border blur or a tone curve breaks.
 
 use geometry::Pixel;
 use imaging::GrayView;
@@ -12,7 +12,7 @@ use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
 use crate::candidates::quad::{Quad, mean_side_px, middle};
 use crate::candidates::quiet_zone::{
-    MAX_CONTRAST_VARIATION, TONE_CURVES, border_contrast_variation, has_dark_border,
+    MAX_CONTRAST_VARIATION, PaperTone, TONES, border_contrast_variation, has_dark_border,
 };
 use crate::decode::cells::{Cells, Layout, SquareImage};
 use crate::decode::erasures::Reading;
@@ -62,6 +62,15 @@ pub(crate) const INVERTED_FROM: usize = 2;
 
 /// Standard deviation of the corners of an outline, in pixels.
 const OUTLINE_CORNER_PX: f64 = 0.2;
+
+/// A quad in a quiet zone whose cells are no codeword.
+#[derive(Copy, Clone, Debug)]
+struct Unread {
+    quad: Quad,
+    /// The tone curve with which it was read, and the R² of the word that is nearest to its cells.
+    curve: f64,
+    r_squared: f64,
+}
 
 /// How a quad is moved to where its cells explain the pixels best.
 #[derive(Copy, Clone, Debug)]
@@ -126,6 +135,9 @@ pub(crate) struct SquareTagDetector {
     found: Vec<Decoded>,
     /// Quads with a codeword that does not explain the pixels, with the index of the layout.
     doubtful: Vec<(Quad, usize)>,
+    /// The number of quads in quiet zones of this image that were solved for, as they are and moved, and of those moved.
+    solved: usize,
+    aligned: usize,
     scratch: Scratch,
     occluded: Occluded<SquareReading>,
     /// Whether markers printed white on black are looked for as well.
@@ -268,7 +280,7 @@ impl SquareTagDetector {
         self.observe_all(input, first, out.found);
     }
 
-    /// Finds markers so small that blur breaks their border, by their quiet zone, which is taken to be one
+    /// Finds markers whose border blur or a tone curve breaks, by their quiet zone, which is taken to be one
     /// cell wide.
     fn detect_in_quiet_zones(
         &mut self,
@@ -277,10 +289,12 @@ impl SquareTagDetector {
         out: &mut Output<'_>,
     ) {
         let first = self.found.len();
-        let mut aligned = 0;
+        (self.solved, self.aligned) = (0, 0);
         for quiet_zone in quiet_zones {
             for layout in 0..self.layouts.len() {
-                self.decode_in_quiet_zone(input, quiet_zone, layout, &mut aligned, out.trace);
+                if self.solved < MAX_SOLVED {
+                    self.decode_in_quiet_zone(input, quiet_zone, layout, out.trace);
+                }
             }
         }
         self.observe_all(input, first, out.found);
@@ -291,7 +305,6 @@ impl SquareTagDetector {
         input: ImageInput<'_>,
         quiet_zone: &Quad,
         layout: usize,
-        aligned: &mut usize,
         trace: &mut Trace,
     ) {
         let Layout { cells, extra_border, reversed, .. } = self.layouts[layout];
@@ -306,30 +319,34 @@ impl SquareTagDetector {
         {
             return;
         }
-        let mut best: Option<(f64, Quad, f64)> = None;
-        for (curve, scale) in TONE_CURVES {
+        let mut best: Option<Unread> = None;
+        for PaperTone { curve, scale } in TONES {
             let quad = quad.scaled(scale);
             match self.decode_shown(input, &quad, layout, curve) {
                 Ok(found) => return self.accept(found, trace),
-                Err(r_squared) if best.is_none_or(|(least, ..)| r_squared > least) => {
-                    best = Some((r_squared, quad, curve));
+                Err(r_squared) if best.is_none_or(|best| r_squared > best.r_squared) => {
+                    best = Some(Unread { quad, curve, r_squared });
                 }
                 Err(_) => {}
             }
         }
-        let best = best.filter(|best| best.0 > MIN_ALIGNED_R_SQUARED);
-        let Some((mut r_squared, mut quad, curve)) = best else { return };
-        if cell_px > MAX_ALIGNED_CELL_PX || *aligned >= MAX_ALIGNED {
+        let best = best.filter(|best| best.r_squared > MIN_ALIGNED_R_SQUARED);
+        let Some(mut best) = best else { return };
+        if cell_px > MAX_ALIGNED_CELL_PX || self.aligned >= MAX_ALIGNED {
             return;
         }
-        *aligned += 1;
-        // Where the quad is off by a fifth of a cell, cells of a pixel or two are those beside them.
+        self.aligned += 1;
+        // Of cells a pixel or two wide a quad that is off by a third of a pixel shows their neighbours.
         for step_px in ALIGNING_PX {
-            for moved in Move::ALL.into_iter().flat_map(|it| [(it, step_px), (it, -step_px)]) {
-                let next = moved.0.of(&quad, moved.1);
-                match self.decode_shown(input, &next, layout, curve) {
+            for (direction, step_px) in
+                Move::ALL.into_iter().flat_map(|it| [(it, step_px), (it, -step_px)])
+            {
+                let quad = direction.of(&best.quad, step_px);
+                match self.decode_shown(input, &quad, layout, best.curve) {
                     Ok(found) => return self.accept(found, trace),
-                    Err(better) if better > r_squared => (r_squared, quad) = (better, next),
+                    Err(r_squared) if r_squared > best.r_squared => {
+                        best = Unread { quad, r_squared, ..best };
+                    }
                     Err(_) => {}
                 }
             }
@@ -348,6 +365,7 @@ impl SquareTagDetector {
         let Layout { cells, .. } = self.layouts[layout];
         let image = SquareImage::new(&quad.corners, cells, input.view, input.pyramid);
         let image = image.ok_or(0.0)?.through(curve, cells);
+        self.solved += 1;
         if !self.cells.solve(&image, &self.layouts[layout]) {
             return Err(0.0);
         }

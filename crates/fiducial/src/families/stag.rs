@@ -16,7 +16,7 @@ use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
 use crate::candidates::quad::{Quad, shortest_side_px};
 use crate::candidates::quiet_zone::{
-    LINEAR, MAX_CONTRAST_VARIATION, TONE_CURVES, border_contrast_variation, has_dark_border,
+    MAX_CONTRAST_VARIATION, PaperTone, TONES, border_contrast_variation, has_dark_border,
 };
 use crate::decode::occluded::{Occluded, OccludedMarker};
 use crate::decode::stag_cells::Dots;
@@ -25,6 +25,7 @@ use crate::families::family::{FamilyDetector, FrameInput, Output, Prediction};
 use crate::families::query::{ExpectedMarker, FamilyQuery, ImageInput, segment_corner_px};
 use crate::families::square::INVERTED_FROM;
 use crate::observation::Observation;
+use crate::optics::camera_response::CameraResponse;
 use crate::optics::homography::Homography;
 use crate::refine::corners::refine_design;
 use crate::refine::fit::{CornerGuess, Refined, Scratch};
@@ -204,7 +205,7 @@ impl StagDetector {
             }
             let is_known = |known| Overlap::new(known, &quad.corners).is_concentric();
             if !self.known.iter().any(is_known)
-                && let Err(reason) = self.add(input, quad, LINEAR, out)
+                && let Err(reason) = self.add(input, quad, CameraResponse::LINEAR.curve, out)
             {
                 out.trace.refuse_quad(quad.corners, reason);
             }
@@ -224,7 +225,7 @@ impl StagDetector {
         {
             return None;
         }
-        let (reading, refined) = self.read(input, &quad, LINEAR).ok()?;
+        let (reading, refined) = self.read(input, &quad, CameraResponse::LINEAR.curve).ok()?;
         let family = self.queries.get(reading.query)?.query.family;
         let is_expected = (family, reading.id) == (expected.family, expected.id);
         (is_expected && reading.rotation == 0)
@@ -246,9 +247,9 @@ impl StagDetector {
                 continue;
             }
             // A quiet zone without a marker is no refused candidate.
-            let _ = TONE_CURVES
-                .into_iter()
-                .find(|(curve, scale)| self.add(input, &quad.scaled(*scale), *curve, out).is_ok());
+            let _ = TONES.into_iter().find(|PaperTone { curve, scale }| {
+                self.add(input, &quad.scaled(*scale), *curve, out).is_ok()
+            });
         }
     }
 
