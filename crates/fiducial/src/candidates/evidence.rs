@@ -14,7 +14,7 @@ use crate::trace::Trace;
 /// nearly as bright as the paper, and in linear light blur makes the paper of markers of 8 pixels no brighter than the lower one.
 const QUIET_ZONES: [outline::Settings; 2] = [quiet_zones(160), quiet_zones(208)];
 
-/// With a contrast of up to 50 % none of 132 markers of 7 pixels and more is lost, linear or through a tone curve; texture takes half
+/// With a contrast of up to 50 % none of 178 markers of 7 pixels and more is lost, linear or through a tone curve; texture takes half
 /// of the time from 30 % on.
 const fn quiet_zones(threshold_256ths: u8) -> outline::Settings {
     outline::Settings {
@@ -176,8 +176,8 @@ impl Evidence {
                 for strip in ImageStrip::ALL {
                     if schedule.allows(FallbackPass::QuietZones(strip)) {
                         let rows = strip.rows(view.height());
+                        let places = self.contrast.places(self.min_percent);
                         for settings in &QUIET_ZONES {
-                            let places = self.contrast.places(self.min_percent);
                             self.outlines.add_rows(places, view, settings, rows.clone());
                         }
                     }

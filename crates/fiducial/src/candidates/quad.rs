@@ -40,14 +40,19 @@ pub(crate) fn diagonal_px(corners: &[Pixel; 4]) -> f64 {
 }
 
 impl Quad {
+    /// The quad with its corners, as seen from its middle, moved by a function.
+    pub(crate) fn moved(&self, to: impl Fn([f64; 2]) -> [f64; 2]) -> Self {
+        let centre = middle(&self.corners);
+        let corner = |c: Pixel| {
+            let [x, y] = to([c.x - centre.x, c.y - centre.y]);
+            Pixel::new(centre.x + x, centre.y + y)
+        };
+        Self { corners: self.corners.map(corner), ..*self }
+    }
+
     /// The quad scaled about its middle.
     pub(crate) fn scaled(&self, factor: f64) -> Self {
-        let centre = middle(&self.corners);
-        let inner = |c: Pixel| {
-            let (dx, dy) = (c.x - centre.x, c.y - centre.y);
-            Pixel::new(centre.x + factor * dx, centre.y + factor * dy)
-        };
-        Self { corners: self.corners.map(inner), ..*self }
+        self.moved(|[x, y]| [factor * x, factor * y])
     }
 
     /// The quad whose sides fit an outline's points; `None` when the outline is not four-sided.

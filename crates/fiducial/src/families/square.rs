@@ -10,7 +10,7 @@ use markers::{Marker, Match, SquareCode};
 
 use crate::candidates::evidence::{Needs, OutlineNeeds};
 use crate::candidates::overlap::Overlap;
-use crate::candidates::quad::{Quad, mean_side_px, middle};
+use crate::candidates::quad::{Quad, mean_side_px};
 use crate::candidates::quiet_zone::{
     MAX_CONTRAST_VARIATION, PaperTone, TONES, border_contrast_variation, has_dark_border,
 };
@@ -87,18 +87,12 @@ impl Move {
     /// The quad with its sides moved by so many pixels.
     fn of(self, quad: &Quad, step_px: f64) -> Quad {
         let ratio = 2.0 * step_px / mean_side_px(&quad.corners);
-        let centre = middle(&quad.corners);
-        let moved = |c: Pixel| {
-            let (x, y) = (c.x - centre.x, c.y - centre.y);
-            let (dx, dy) = match self {
-                Self::Right => (step_px, 0.0),
-                Self::Down => (0.0, step_px),
-                Self::Grow => (ratio * x, ratio * y),
-                Self::Turn => (-ratio * y, ratio * x),
-            };
-            Pixel::new(c.x + dx, c.y + dy)
-        };
-        Quad { corners: quad.corners.map(moved), ..*quad }
+        match self {
+            Self::Right => quad.moved(|[x, y]| [x + step_px, y]),
+            Self::Down => quad.moved(|[x, y]| [x, y + step_px]),
+            Self::Grow => quad.scaled(1.0 + ratio),
+            Self::Turn => quad.moved(|[x, y]| [x - ratio * y, y + ratio * x]),
+        }
     }
 }
 
@@ -424,10 +418,7 @@ impl SquareTagDetector {
                 let found =
                     if is_solved { self.match_codewords(quad, layout) } else { Err(Reason::Small) };
                 match found {
-                    Ok(found) => {
-                        trace.accept_quad(quad.corners);
-                        self.found.push(found);
-                    }
+                    Ok(found) => self.accept(found, trace),
                     Err(reason) => {
                         if reason == Reason::Confidence && self.doubtful.len() < MAX_DOUBTFUL {
                             self.doubtful.push((*quad, layout));
