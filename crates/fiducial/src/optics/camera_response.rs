@@ -12,6 +12,22 @@ pub(crate) const SHARPENING_PX: f64 = 1.0;
 /// paper.
 const MAX_CURVE: f64 = 4.0;
 
+/// What is known of a number before it is measured.
+#[derive(Copy, Clone, Debug)]
+pub(crate) struct Prior {
+    pub(crate) mean: f64,
+    pub(crate) deviation: f64,
+}
+
+impl CameraResponse {
+    /// What cameras do: sRGB's curve is about 1.1, and that of a camera module of the Raspberry Pi 3.
+    pub(crate) const CURVE_PRIOR: Prior = Prior { mean: 1.2, deviation: 1.0 };
+    pub(crate) const SHARPENING_PRIOR: Prior = Prior { mean: 0.4, deviation: 0.3 };
+    /// The grey level of black ink as a share of white paper's: ink reflects a twentieth of the light, of which a tone curve
+    /// makes a tenth to a fifth; glare lifts it, sharpening lowers it.
+    pub(crate) const BLACK_PRIOR: Prior = Prior { mean: 0.2, deviation: 0.15 };
+}
+
 /// What a camera makes of an image that is linear in light.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct CameraResponse {

@@ -17,7 +17,7 @@ use crate::optics::mosaic::Mosaic;
 use model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL};
 pub(crate) use model::{PhotometricFit, PhotometricInput, PhotometricPoses, Radii};
 pub(crate) use scene::PixelSample;
-use scene::{ALL_PIXELS_PX, FOCUSED_PX, MAX_RADII_PX, SampleSource, Scene};
+use scene::{ALL_PIXELS_PX, FOCUSED_PX, MAX_RADII_PX, MAX_TARGETS_PX, SampleSource, Scene};
 use solve::{ModelFit, Start};
 
 pub(crate) use scene::MAX_DIAMETER_PX;
@@ -103,6 +103,7 @@ impl PhotometricInput<'_> {
             (all.extras, all.mosaic) = (sparse.extras, sparse.mosaic);
         }
         all.radii_count = diameter_px < MAX_RADII_PX;
+        all.targets_count = diameter_px < MAX_TARGETS_PX;
         let fit_all = |fit: ModelFit| match stride {
             1 => Some(fit),
             _ => all.fitted(Start::like(&fit.model.pose, &fit)),

@@ -13,6 +13,8 @@ use crate::response::ResponseEstimate;
 pub(super) const MAX_GREY: f64 = 254.5;
 /// A root mean square residual above this, in units of the contrast, is not a marker's.
 pub(super) const MAX_RESIDUAL: f64 = 0.2;
+/// Maximum share of a plain disc's squared residuals that a marker's rings leave.
+pub(super) const MAX_DISC_RATIO: f64 = 0.12;
 /// Pose (5), blur, black, white, and the gradient of white to the right and down.
 pub(super) const UNKNOWNS: usize = 10;
 /// The same and two numbers of the motion or of the camera's response.
@@ -85,12 +87,14 @@ pub(crate) struct PhotometricFit {
     pub(crate) mosaic: Option<Mosaic>,
     /// Of a small marker: how far the radii that fit best are from its own.
     pub(crate) radii: Option<Radii>,
+    /// Of a smaller one that needs no camera's processing: the least cost of a target of evenly wide rings fitted to the same
+    /// pixels, over this fit's. A camera's tone curve and compression hide the difference.
+    pub(crate) target_cost: Option<f64>,
 }
 
 impl PhotometricFit {
     /// Whether the rings are there: much closer to the image than a plain disc, with two equally dark rings.
     pub(crate) fn has_rings(&self) -> bool {
-        const MAX_DISC_RATIO: f64 = 0.12;
         self.disc_ratio < MAX_DISC_RATIO && (0.8..1.25).contains(&self.ring_balance)
     }
 }

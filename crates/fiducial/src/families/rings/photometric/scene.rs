@@ -20,6 +20,8 @@ const MIN_DIAMETER_PX: f64 = 5.0;
 pub(super) const ALL_PIXELS_PX: f64 = 22.0;
 /// Up to this diameter the radii are compared with other rings'.
 pub(super) const MAX_RADII_PX: f64 = 48.0;
+/// Up to this diameter they are compared with a fit of other rings.
+pub(super) const MAX_TARGETS_PX: f64 = 26.0;
 /// Approximate number of pixels used of a larger marker.
 const EDGE_SAMPLES: f64 = 260.0;
 /// Blur of a lens in focus together with the pixel's own extent, as a standard deviation in pixels.
@@ -56,6 +58,8 @@ pub(super) struct Scene<'a> {
     pub(super) mosaic: Option<Mosaic>,
     /// Whether the radii that fit best are asked for.
     pub(super) radii_count: bool,
+    /// Whether targets of evenly wide rings are fitted as well.
+    pub(super) targets_count: bool,
 }
 
 impl<'a> Scene<'a> {
@@ -83,6 +87,7 @@ impl<'a> Scene<'a> {
             extras: Extras::Nothing,
             mosaic: None,
             radii_count: false,
+            targets_count: false,
         }
     }
 

@@ -4,10 +4,11 @@ use nalgebra::{SMatrix, SVector};
 
 use super::blur::{FREE_RADII, PixelResponse};
 use super::model::{
-    Alternative, Extras, MAX_GREY, PhotometricFit, Radii, UNKNOWNS, UNKNOWNS_WITH_EXTRAS,
+    Alternative, Extras, MAX_DISC_RATIO, MAX_GREY, PhotometricFit, Radii, UNKNOWNS,
+    UNKNOWNS_WITH_EXTRAS,
 };
 use super::scene::{PixelSample, Scene};
-use super::solve::{ModelFit, RingModel, Sums};
+use super::solve::{ModelFit, RingModel, Start, Sums};
 use crate::optics::camera_response::CameraResponse;
 use crate::optics::least_squares::huber;
 use crate::response::{Measured, ResponseEstimate};
@@ -15,11 +16,28 @@ use crate::response::{Measured, ResponseEstimate};
 /// Prior standard deviation of the normal, in radians.
 const PRIOR_NORMAL: f64 = 0.6;
 
+/// Targets as people like to draw them, of two and of three evenly wide rings: the radii of their circles in units of the
+/// outermost. The first has no dot.
+const TARGETS: [[f64; CIRCLES]; 2] = [
+    [1.0, 0.75, 0.5, 0.25, NO_DOT, NO_DOT],
+    [1.0, 5.0 / 6.0, 4.0 / 6.0, 3.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0],
+];
+/// Two circles of one radius leave nothing between them.
+const NO_DOT: f64 = 1e-3;
+
 /// The figures that distinguish a marker from other things.
 pub(super) struct Score {
     disc_ratio: f64,
     ring_balance: f64,
     r_squared: f64,
+}
+
+impl Score {
+    /// Whether as much is explained as of any marker, so that it is worth while to compare it with targets.
+    fn may_be_marker(&self) -> bool {
+        const MIN_R_SQUARED: f64 = 0.85;
+        self.r_squared > MIN_R_SQUARED && self.disc_ratio < MAX_DISC_RATIO
+    }
 }
 
 impl RingModel {
@@ -128,6 +146,13 @@ impl RingModel {
             matrix.syger(weight, &gradient, &gradient, 1.0);
             right += gradient * (weight * residual);
         })?;
+        for prior in self.priors(scene, huber_limit) {
+            let mut gradient = SVector::<f64, COLUMNS>::zeros();
+            gradient.fixed_rows_mut::<UNKNOWNS_WITH_EXTRAS>(0).copy_from(&prior.gradient);
+            matrix.syger(prior.weight, &gradient, &gradient, 1.0);
+            right -= gradient * (prior.weight * prior.residual);
+            squares += prior.cost();
+        }
         for i in 0..COLUMNS {
             matrix[(i, i)] += 1e-9;
         }
@@ -281,7 +306,25 @@ impl Scene<'_> {
             told,
             mosaic: self.mosaic,
             radii: self.radii_count.then(|| fit.model.radii(self, fit.huber_limit)).flatten(),
+            target_cost: (self.targets_count
+                && self.extras != Extras::Response
+                && score.may_be_marker())
+            .then(|| self.target_cost(fit))
+            .flatten(),
         })
+    }
+
+    /// The least cost of a target of evenly wide rings fitted to the same pixels, over that of this fit.
+    fn target_cost(&self, fit: &ModelFit) -> Option<f64> {
+        let [(outer, _), ..] = self.radii;
+        // From this fit, and from its pose with nothing known of blur and light: with the marker's radii these may be far off.
+        let starts = [Start::like(&fit.model.pose, fit), Start::Pose(&fit.model.pose)];
+        let costs = TARGETS.iter().flat_map(|radii| {
+            let radii = radii.map(|radius| (radius * outer, (radius * outer).ln()));
+            let scene = Scene { radii, early_reject: [f64::MAX; 3], ..*self };
+            starts.into_iter().filter_map(move |start| Some(scene.fitted(start)?.cost()))
+        });
+        costs.min_by(f64::total_cmp).map(|least| least / fit.cost())
     }
 
     /// Covariance of all that was fitted, from the remaining residuals: noise and errors of the model.

@@ -7,7 +7,7 @@ use super::model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL, UNKNOWNS, UNKNOWNS_WI
 use super::scene::{FOCUSED_PX, PixelSample, Scene};
 use super::{MAX_MOSAIC_STEP, MAX_PROCESSED_STEP};
 use crate::families::rings::circle_pose::CirclePose;
-use crate::optics::camera_response::{CameraResponse, SHARPENING_PX};
+use crate::optics::camera_response::{CameraResponse, Prior, SHARPENING_PX};
 use crate::optics::exposure::ClippedExposure;
 use crate::optics::least_squares::{
     Damping, Influence, Next, NormalEquations, Problem, Schedule, huber, minimise,
@@ -21,6 +21,14 @@ const MAX_BLUR_PX: f64 = 6.0;
 const MAX_BLUR_STEP_PX: f64 = 0.3;
 /// A single step that lowers the cost by a larger share than this is too long for the quadratic model.
 const MAX_GAIN: f64 = 0.5;
+/// The Huber limit in root mean square residuals, and in grey levels beyond that.
+const HUBER_SIGMAS: f64 = 3.0;
+const HUBER_OFFSET: f64 = 1.0;
+/// Interpolation and compression disturb neighbouring pixels alike: so many say as much as one.
+const CORRELATED: f64 = 2.0;
+/// Places of black and white among the unknowns.
+const BLACK: usize = 6;
+const WHITE: usize = 7;
 /// Added to the diagonal of the normal equations.
 const RIDGE: f64 = 1e-9;
 
@@ -226,9 +234,49 @@ impl RingModel {
             }
         })?;
         let pose_variance = if pose_weight > 0.0 { pose_squares / pose_weight } else { 0.0 };
-        let (matrix, right) = with_extras(&fixed, &extras, scene.extras != Extras::Nothing);
+        let are_fitted = scene.extras != Extras::Nothing;
+        let (mut matrix, mut right) = with_extras(&fixed, &extras, are_fitted);
+        for prior in self.priors(scene, limit) {
+            matrix.ger(prior.weight, &prior.gradient, &prior.gradient, 1.0);
+            right -= prior.gradient * (prior.weight * prior.residual);
+            total += prior.cost();
+        }
         let extra = Sums { count, pose_variance };
         total.is_finite().then_some(NormalEquations { matrix, right, cost: total, extra })
+    }
+
+    /// What is known of cameras in general, where this one's processing is fitted. Of a small marker the pixels alone leave tone
+    /// curve, sharpening, blur and black nearly open: without a prior the fit explains noise by a camera that there is not, and
+    /// then other radii fit best. `limit` is the Huber limit of the residuals, in grey levels.
+    pub(super) fn priors(
+        &self,
+        scene: &Scene<'_>,
+        limit: f64,
+    ) -> impl Iterator<Item = PriorTerm> + use<> {
+        let is_fitted = scene.extras == Extras::Response;
+        is_fitted.then(|| self.prior_terms(limit)).into_iter().flatten()
+    }
+
+    fn prior_terms(&self, limit: f64) -> [PriorTerm; 3] {
+        let CameraResponse { curve, sharpening } = self.response;
+        let variance = CORRELATED * noise_of(limit).powi(2);
+        let term = |index: usize, off: f64, deviation: f64| {
+            let mut gradient = SVector::zeros();
+            gradient[index] = 1.0;
+            PriorTerm { gradient, residual: off, weight: variance / (deviation * deviation) }
+        };
+        let of_response = |index: usize, value: f64, prior: Prior| {
+            term(index, value - prior.mean, prior.deviation)
+        };
+        let Prior { mean, deviation } = CameraResponse::BLACK_PRIOR;
+        let off = self.black - mean * self.white;
+        let mut black = term(BLACK, off, deviation * self.white.abs().max(1.0));
+        black.gradient[WHITE] = -mean;
+        [
+            of_response(UNKNOWNS, curve, CameraResponse::CURVE_PRIOR),
+            of_response(UNKNOWNS + 1, sharpening, CameraResponse::SHARPENING_PRIOR),
+            black,
+        ]
     }
 
     /// The same with a lens as sharp as it is when a part of the blur is that of a mosaic.
@@ -259,6 +307,27 @@ impl RingModel {
             response,
         })
     }
+}
+
+/// A residual of the unknowns themselves, linear in them: how far they are from what is expected of them.
+pub(super) struct PriorTerm {
+    pub(super) gradient: SVector<f64, UNKNOWNS_WITH_EXTRAS>,
+    pub(super) residual: f64,
+    /// Of its square, so that the cost is in squared grey levels.
+    pub(super) weight: f64,
+}
+
+impl PriorTerm {
+    /// Its part of the cost.
+    pub(super) fn cost(&self) -> f64 {
+        self.weight * self.residual * self.residual
+    }
+}
+
+/// The noise in grey levels to which a Huber limit belongs, as [`Scene::huber_limit`] sets it.
+fn noise_of(limit: f64) -> f64 {
+    const MIN_NOISE: f64 = 0.7;
+    ((limit - HUBER_OFFSET) / HUBER_SIGMAS).max(MIN_NOISE)
 }
 
 /// Sums that come with the normal equations.
@@ -482,6 +551,6 @@ impl Scene<'_> {
 
     /// A limit that residuals of a good fit hardly exceed, but no more than before.
     pub(super) fn huber_limit(&self, before: f64, cost: f64) -> f64 {
-        before.min(3.0 * (cost / self.count()).sqrt() + 1.0)
+        before.min(HUBER_SIGMAS * (cost / self.count()).sqrt() + HUBER_OFFSET)
     }
 }
