@@ -1,9 +1,9 @@
 //! How a camera shows light: in proportion to it, or with a tone curve and sharpened, as cameras do for people.
 //!
 //! After an unknown monotonic curve and a symmetric kernel a blurred edge has another shape and another place. Both are
-//! those of every other edge between the same black and white, so that the marker itself tells the two numbers.
+//! those of every other edge between the same black and white, so that a marker that is not small tells the two numbers itself.
 
-use crate::response::ResponseEstimate;
+use crate::response::{Measured, ResponseEstimate};
 
 /// Standard deviation of the kernel with which cameras sharpen, in pixels.
 pub(crate) const SHARPENING_PX: f64 = 1.0;
@@ -12,20 +12,14 @@ pub(crate) const SHARPENING_PX: f64 = 1.0;
 /// paper.
 const MAX_CURVE: f64 = 4.0;
 
-/// What is known of a number before it is measured.
-#[derive(Copy, Clone, Debug)]
-pub(crate) struct Prior {
-    pub(crate) mean: f64,
-    pub(crate) deviation: f64,
-}
-
 impl CameraResponse {
-    /// What cameras do: sRGB's curve is about 1.1, and that of a camera module of the Raspberry Pi 3.
-    pub(crate) const CURVE_PRIOR: Prior = Prior { mean: 1.2, deviation: 1.0 };
-    pub(crate) const SHARPENING_PRIOR: Prior = Prior { mean: 0.4, deviation: 0.3 };
-    /// The grey level of black ink as a share of white paper's: ink reflects a twentieth of the light, of which a tone curve
-    /// makes a tenth to a fifth; glare lifts it, sharpening lowers it.
-    pub(crate) const BLACK_PRIOR: Prior = Prior { mean: 0.2, deviation: 0.15 };
+    /// What curves are expected to be before a marker tells: sRGB's is 1.1, that of a Raspberry Pi's camera module 3.
+    pub(crate) const CURVE_PRIOR: Measured = Measured { value: 1.2, deviation: 0.7 };
+    /// Unsharp masks of cameras made for people have about 0.2 to 0.6.
+    pub(crate) const SHARPENING_PRIOR: Measured = Measured { value: 0.4, deviation: 0.2 };
+    /// The grey level of black ink as a share of white paper's: ink that reflects a twentieth of the light shows a tenth of it
+    /// with a gamma of 1.25, a quarter with sRGB's curve; sharpening lowers it, glare lifts it.
+    pub(crate) const BLACK_PRIOR: Measured = Measured { value: 0.2, deviation: 0.1 };
 }
 
 /// What a camera makes of an image that is linear in light.

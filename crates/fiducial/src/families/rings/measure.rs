@@ -36,23 +36,24 @@ const MIN_R_SQUARED_INTERPOLATED: f64 = 0.88;
 const INTERPOLATED_PX: f64 = 20.0;
 const R_SQUARED_INTERPOLATED_PER_PX: f64 = 0.01;
 /// ... where the lens' blur is no larger than this share of the diameter, as rings that are a tenth of it wide run into each other
-/// (markers at the positions of the thesis have 0.058 at most, a target that passed 0.1), ...
+/// (markers at the positions of the thesis have 0.058 at most, a target that passed 0.1)
 const MAX_BLUR_INTERPOLATED: f64 = 0.06;
+/// (or more than this is explained), ...
+const MIN_R_SQUARED_BLURRED: f64 = 0.975;
 /// ... ink is no blacker than this grey level, the tone curve no flatter than this, ...
 const MIN_BLACK: f64 = 0.0;
 const MIN_CURVE: f64 = -0.1;
 /// ... the image lies below this between the marker (0) and a target of evenly wide rings (1) at two deviations (of other circles
 /// of 10 px and more in 4160 scenes the nearest that passes the other bounds had 0.58), ...
 const MAX_EVENNESS_INTERPOLATED: f64 = 0.4;
-const EVENNESS_SIGMAS: f64 = 2.0;
-/// ... the radii are known to this share of the marker's, and differ from its own by no more than [`MAX_RADII_OFF_CLEAR`] and two
+/// ... the radii are known to this share of the marker's radius, and differ from its own by no more than [`MAX_RADII_OFF_CLEAR`] and two
 /// deviations.
 const MAX_RADII_DEVIATION_INTERPOLATED: f64 = 0.05;
 const RADII_SIGMAS: f64 = 2.0;
-/// Maximum difference of the radii of a larger marker from its own, as a share of its radius, with this standard deviation, ...
+/// Maximum difference of the radii of other markers from their own, as a share of the radius, with this standard deviation, ...
 const MAX_RADII_OFF: f64 = 0.028;
 const MAX_RADII_DEVIATION: f64 = 0.03;
-/// ... or where the image is by two deviations not that of evenly wide rings. A single radius is hardly seen through compression,
+/// ... or this one where the image is below [`MAX_EVENNESS`] at two deviations. A single radius is hardly seen through compression,
 /// how all of them differ together is.
 const MAX_RADII_OFF_CLEAR: f64 = 0.045;
 /// Maximum place between the marker (0) and a target of evenly wide rings (1). True markers at the positions of the thesis have
@@ -70,8 +71,6 @@ const KNOWN_DEVIATION: f64 = 0.05;
 const MIN_TARGET_COST: f64 = 0.7;
 /// Maximum blackness beyond black of the ink, as a share of the contrast. Halos of sharpening give 0.13.
 const MAX_BLACKNESS: f64 = 0.15;
-/// Maximum standard deviation of the sharpening by which a small marker is explained: of 170 markers 0.46 at most.
-const MAX_SHARPENING_DEVIATION: f64 = 1.0;
 /// Minimum diameter in pixels of a marker that is recognised by one ring.
 const MIN_SINGLE_RING_PX: f64 = 90.0;
 /// Distance by which a camera's processing moves edges into the black, at least in pixels, and at most in pixels and in widths of
@@ -321,8 +320,8 @@ impl EdgeSearch<'_> {
             || is_interpolated_marker(fit, candidate_px)
             || self.shadow_removed && is_marker_under_edge(fit))
             && !has_other_widths(fit)
-            && !is_far_fetched(fit)
-            && !is_explained_by_target(fit)
+            && !is_blacker_than_ink(fit)
+            && (self.is_followed(&fit.pose) || !is_explained_by_target(fit))
             && fit.contrast > 2.0 * MIN_STEP
             && fit.has_rings()
             && self.is_near(start, &fit.pose, 1.5, 0.3);
@@ -502,16 +501,8 @@ fn from_photometric(fit: &PhotometricPoses, confidence: f64) -> Option<MeasuredM
             rms_px: rms_px(other.blur_px, other.residual),
         }),
         confidence,
-        response: best.told.filter(is_measured),
+        response: best.told,
     })
-}
-
-/// Whether the pixels tell a camera's response, rather than what is expected of any camera: the mean over many markers would
-/// count that again with each of them.
-fn is_measured(told: &ResponseEstimate) -> bool {
-    const MAX_SHARE: f64 = 1.0 / 3.0;
-    told.curve.deviation < MAX_SHARE * CameraResponse::CURVE_PRIOR.deviation
-        && told.sharpening.deviation < MAX_SHARE * CameraResponse::SHARPENING_PRIOR.deviation
 }
 
 /// Whether a fit is a marker's with nothing on it.
@@ -544,7 +535,7 @@ fn is_small_marker(fit: &PhotometricFit, candidate_px: f64) -> bool {
 /// Whether a fit to pixels interpolated from a colour mosaic is a small marker's. Compression is a large part of what it
 /// leaves, so that the radii that would fit best decide, and of these how far all together are from evenly wide rings.
 fn is_interpolated_marker(fit: &PhotometricFit, diameter_px: f64) -> bool {
-    let has_marker_radii = |radii: Radii| {
+    let are_radii_likely = |radii: Radii| {
         radii.is_below_evenness(MAX_EVENNESS_INTERPOLATED)
             && radii.deviation < MAX_RADII_DEVIATION_INTERPOLATED
             && radii.off < MAX_RADII_OFF_CLEAR + RADII_SIGMAS * radii.deviation
@@ -554,11 +545,12 @@ fn is_interpolated_marker(fit: &PhotometricFit, diameter_px: f64) -> bool {
     fit.mosaic.is_some()
         && fit.r_squared > min_r_squared
         && fit.residual < MAX_RESIDUAL
-        && fit.blur_px < MAX_BLUR_INTERPOLATED * diameter_px
+        && (fit.blur_px < MAX_BLUR_INTERPOLATED * diameter_px
+            || fit.r_squared > MIN_R_SQUARED_BLURRED)
         && fit.black > MIN_BLACK
         && fit.response.curve > MIN_CURVE
         && has_balance(fit)
-        && fit.radii.is_some_and(has_marker_radii)
+        && fit.radii.is_some_and(are_radii_likely)
 }
 
 /// Whether a fit is a small marker's where the edge of a shadow was: what is left of it disturbs the grey values, but not which
@@ -598,12 +590,6 @@ fn is_blacker_than_ink(fit: &PhotometricFit) -> bool {
     fit.black < -MAX_BLACKNESS * fit.contrast && !is_sharpened(fit)
 }
 
-/// Whether a fit to a small marker explains the image by what no camera does, or by what the image does not tell.
-fn is_far_fetched(fit: &PhotometricFit) -> bool {
-    is_blacker_than_ink(fit)
-        || fit.told.is_some_and(|it| it.sharpening.deviation > MAX_SHARPENING_DEVIATION)
-}
-
 /// Whether the radii that would fit best are the marker's, as far as they can be told.
 fn has_marker_radii(fit: &PhotometricFit) -> bool {
     has_balance(fit)
@@ -621,13 +607,6 @@ fn has_marker_radii(fit: &PhotometricFit) -> bool {
 fn has_balance(fit: &PhotometricFit) -> bool {
     const BALANCE: std::ops::Range<f64> = 0.975..1.05;
     BALANCE.contains(&fit.ring_balance)
-}
-
-impl Radii {
-    /// Whether the image is by two standard deviations nearer to the marker than to evenly wide rings.
-    fn is_below_evenness(&self, max_evenness: f64) -> bool {
-        self.evenness + EVENNESS_SIGMAS * self.evenness_deviation < max_evenness
-    }
 }
 
 /// Whether a fit needs no camera's processing, or is so close with it that rings of other radii are not: a tone curve

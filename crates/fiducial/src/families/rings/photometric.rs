@@ -61,7 +61,9 @@ impl PhotometricInput<'_> {
         start: &CirclePose,
         samples: &mut Vec<PixelSample>,
     ) -> Option<PhotometricPoses> {
-        let Self { camera, size_m, .. } = *self;
+        let Self { camera, size_m, white_on_black, .. } = *self;
+        // Turned grey values have another tone curve.
+        let has_prior = !white_on_black;
         samples.clear();
         let source = SampleSource(*self);
         let outline = start.projected(size_m / 2.0, camera)?;
@@ -72,7 +74,8 @@ impl PhotometricInput<'_> {
         source.gather(start, FOCUSED_PX, samples)?;
         let tilted = |pose: &CirclePose| pose.with_min_tilt(MIN_START_TILT);
         let stride = sparse_stride(samples);
-        let mut sparse = Scene { stride, ..Scene::new(samples, size_m, camera, early_reject) };
+        let mut sparse =
+            Scene { stride, has_prior, ..Scene::new(samples, size_m, camera, early_reject) };
         let mut first = match sparse.fitted(Start::Pose(&tilted(start))) {
             Some(fit) => fit,
             None => {
@@ -85,6 +88,7 @@ impl PhotometricInput<'_> {
             stride,
             extras,
             mosaic,
+            has_prior,
             ..Scene::new(samples, size_m, camera, early_reject)
         };
         // With the blur known, pixels reached by light from beyond the paper are left out.
@@ -101,9 +105,13 @@ impl PhotometricInput<'_> {
             first = sparse.with_extras(plain);
             first = sparse.with_mosaic(plain, first);
             (all.extras, all.mosaic) = (sparse.extras, sparse.mosaic);
+            if sparse.extras == Extras::Response {
+                // So far the noise was that of a fit without a camera's processing.
+                first = sparse.fitted_with_own_noise(&first).unwrap_or(first);
+            }
         }
         all.radii_count = diameter_px < MAX_RADII_PX;
-        all.targets_count = diameter_px < MAX_TARGETS_PX;
+        all.compares_targets = diameter_px < MAX_TARGETS_PX;
         let fit_all = |fit: ModelFit| match stride {
             1 => Some(fit),
             _ => all.fitted(Start::like(&fit.model.pose, &fit)),

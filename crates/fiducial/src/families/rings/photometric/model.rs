@@ -87,7 +87,7 @@ pub(crate) struct PhotometricFit {
     pub(crate) mosaic: Option<Mosaic>,
     /// Of a small marker: how far the radii that fit best are from its own.
     pub(crate) radii: Option<Radii>,
-    /// Of a smaller one that needs no camera's processing: the least cost of a target of evenly wide rings fitted to the same
+    /// Of one of up to 26 px that needs no camera's processing: the least cost of a target of evenly wide rings fitted to the same
     /// pixels, over this fit's. A camera's tone curve and compression hide the difference.
     pub(crate) target_cost: Option<f64>,
 }
@@ -136,4 +136,12 @@ pub(crate) struct Radii {
     /// deviation of that.
     pub(crate) evenness: f64,
     pub(crate) evenness_deviation: f64,
+}
+
+impl Radii {
+    /// Whether evenness is below a bound by two of its standard deviations.
+    pub(crate) fn is_below_evenness(&self, max_evenness: f64) -> bool {
+        const SIGMAS: f64 = 2.0;
+        self.evenness + SIGMAS * self.evenness_deviation < max_evenness
+    }
 }

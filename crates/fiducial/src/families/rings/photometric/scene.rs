@@ -59,7 +59,9 @@ pub(super) struct Scene<'a> {
     /// Whether the radii that fit best are asked for.
     pub(super) radii_count: bool,
     /// Whether targets of evenly wide rings are fitted as well.
-    pub(super) targets_count: bool,
+    pub(super) compares_targets: bool,
+    /// Whether a camera's processing is held to what cameras do.
+    pub(super) has_prior: bool,
 }
 
 impl<'a> Scene<'a> {
@@ -87,7 +89,8 @@ impl<'a> Scene<'a> {
             extras: Extras::Nothing,
             mosaic: None,
             radii_count: false,
-            targets_count: false,
+            compares_targets: false,
+            has_prior: true,
         }
     }
 

@@ -7,12 +7,13 @@ use super::model::{Effort, Extras, MAX_GREY, MAX_RESIDUAL, UNKNOWNS, UNKNOWNS_WI
 use super::scene::{FOCUSED_PX, PixelSample, Scene};
 use super::{MAX_MOSAIC_STEP, MAX_PROCESSED_STEP};
 use crate::families::rings::circle_pose::CirclePose;
-use crate::optics::camera_response::{CameraResponse, Prior, SHARPENING_PX};
+use crate::optics::camera_response::{CameraResponse, SHARPENING_PX};
 use crate::optics::exposure::ClippedExposure;
 use crate::optics::least_squares::{
     Damping, Influence, Next, NormalEquations, Problem, Schedule, huber, minimise,
 };
 use crate::optics::mosaic::Mosaic;
+use crate::response::Measured;
 
 /// Bounds of the blur in any direction, as a standard deviation in pixels.
 const MIN_BLUR_PX: f64 = 0.3;
@@ -24,8 +25,6 @@ const MAX_GAIN: f64 = 0.5;
 /// The Huber limit in root mean square residuals, and in grey levels beyond that.
 const HUBER_SIGMAS: f64 = 3.0;
 const HUBER_OFFSET: f64 = 1.0;
-/// Interpolation and compression disturb neighbouring pixels alike: so many say as much as one.
-const CORRELATED: f64 = 2.0;
 /// Places of black and white among the unknowns.
 const BLACK: usize = 6;
 const WHITE: usize = 7;
@@ -236,16 +235,18 @@ impl RingModel {
         let pose_variance = if pose_weight > 0.0 { pose_squares / pose_weight } else { 0.0 };
         let are_fitted = scene.extras != Extras::Nothing;
         let (mut matrix, mut right) = with_extras(&fixed, &extras, are_fitted);
+        let mut prior_cost = 0.0;
         for prior in self.priors(scene, limit) {
             matrix.ger(prior.weight, &prior.gradient, &prior.gradient, 1.0);
             right -= prior.gradient * (prior.weight * prior.residual);
-            total += prior.cost();
+            prior_cost += prior.cost();
         }
-        let extra = Sums { count, pose_variance };
+        total += prior_cost;
+        let extra = Sums { count, pose_variance, prior_cost };
         total.is_finite().then_some(NormalEquations { matrix, right, cost: total, extra })
     }
 
-    /// What is known of cameras in general, where this one's processing is fitted. Of a small marker the pixels alone leave tone
+    /// What is known of cameras in general, where this one's processing is fitted. The pixels of a small marker alone leave tone
     /// curve, sharpening, blur and black nearly open: without a prior the fit explains noise by a camera that there is not, and
     /// then other radii fit best. `limit` is the Huber limit of the residuals, in grey levels.
     pub(super) fn priors(
@@ -253,28 +254,26 @@ impl RingModel {
         scene: &Scene<'_>,
         limit: f64,
     ) -> impl Iterator<Item = PriorTerm> + use<> {
-        let is_fitted = scene.extras == Extras::Response;
-        is_fitted.then(|| self.prior_terms(limit)).into_iter().flatten()
+        let has_prior = scene.extras == Extras::Response && scene.has_prior;
+        has_prior.then(|| self.prior_terms(noise_of(limit).powi(2))).into_iter().flatten()
     }
 
-    fn prior_terms(&self, limit: f64) -> [PriorTerm; 3] {
+    fn prior_terms(&self, variance: f64) -> [PriorTerm; 3] {
         let CameraResponse { curve, sharpening } = self.response;
-        let variance = CORRELATED * noise_of(limit).powi(2);
-        let term = |index: usize, off: f64, deviation: f64| {
+        let term = |index: usize, value: f64, prior: Measured| {
             let mut gradient = SVector::zeros();
             gradient[index] = 1.0;
-            PriorTerm { gradient, residual: off, weight: variance / (deviation * deviation) }
+            let weight = variance / (prior.deviation * prior.deviation);
+            PriorTerm { gradient, residual: value - prior.value, weight }
         };
-        let of_response = |index: usize, value: f64, prior: Prior| {
-            term(index, value - prior.mean, prior.deviation)
-        };
-        let Prior { mean, deviation } = CameraResponse::BLACK_PRIOR;
-        let off = self.black - mean * self.white;
-        let mut black = term(BLACK, off, deviation * self.white.abs().max(1.0));
-        black.gradient[WHITE] = -mean;
+        let of_white = 1.0 / self.white.max(1.0);
+        let share = self.black * of_white;
+        let mut black = term(BLACK, share, CameraResponse::BLACK_PRIOR);
+        black.gradient[BLACK] = of_white;
+        black.gradient[WHITE] = -share * of_white;
         [
-            of_response(UNKNOWNS, curve, CameraResponse::CURVE_PRIOR),
-            of_response(UNKNOWNS + 1, sharpening, CameraResponse::SHARPENING_PRIOR),
+            term(UNKNOWNS, curve, CameraResponse::CURVE_PRIOR),
+            term(UNKNOWNS + 1, sharpening, CameraResponse::SHARPENING_PRIOR),
             black,
         ]
     }
@@ -326,7 +325,7 @@ impl PriorTerm {
 
 /// The noise in grey levels to which a Huber limit belongs, as [`Scene::huber_limit`] sets it.
 fn noise_of(limit: f64) -> f64 {
-    const MIN_NOISE: f64 = 0.7;
+    const MIN_NOISE: f64 = 0.5;
     ((limit - HUBER_OFFSET) / HUBER_SIGMAS).max(MIN_NOISE)
 }
 
@@ -337,6 +336,8 @@ pub(super) struct Sums {
     pub(super) count: f64,
     /// Mean squared residual, weighted by the squared dependence on the pose.
     pub(super) pose_variance: f64,
+    /// The part of the cost that is no residual of a pixel.
+    pub(super) prior_cost: f64,
 }
 
 type Equations = NormalEquations<UNKNOWNS_WITH_EXTRAS, Sums>;
@@ -376,8 +377,9 @@ pub(super) struct ModelFit {
 }
 
 impl ModelFit {
+    /// Of the pixels, without the prior's.
     pub(super) fn cost(&self) -> f64 {
-        self.equations.cost
+        self.equations.cost - self.equations.extra.prior_cost
     }
 }
 
@@ -449,7 +451,8 @@ impl Problem<UNKNOWNS_WITH_EXTRAS> for Solver<'_> {
         equations: &mut Equations,
     ) -> Next {
         if self.is_first && self.scene.effort.rough_steps == Some(tried + 1) {
-            self.huber_limit = self.scene.huber_limit(self.huber_limit, equations.cost);
+            let of_pixels = equations.cost - equations.extra.prior_cost;
+            self.huber_limit = self.scene.huber_limit(self.huber_limit, of_pixels);
             let Some(next) = self.linearised(best) else { return Next::Fail };
             *equations = next;
             return Next::Continue;
@@ -512,6 +515,12 @@ impl Scene<'_> {
         fits.then_some(ModelFit { model, equations, huber_limit: solver.huber_limit })
     }
 
+    /// The same fit once more, with a limit, and so a prior, for the residuals that it has.
+    pub(super) fn fitted_with_own_noise(&self, fit: &ModelFit) -> Option<ModelFit> {
+        let huber_limit = self.huber_limit(fit.huber_limit, fit.cost());
+        self.fitted(Start::like(&fit.model.pose, &ModelFit { huber_limit, ..*fit }))
+    }
+
     /// One step from a fit close to this scene's. The cost after it is that of the quadratic model.
     pub(super) fn stepped(&self, fit: &ModelFit) -> Option<ModelFit> {
         const DAMPING: f64 = 1e-6;
@@ -528,7 +537,7 @@ impl Scene<'_> {
     /// The mosaic of which one step from a linear fit explains most, where that is more than without one.
     pub(super) fn likely_mosaic(&self, fit: &ModelFit) -> Option<Mosaic> {
         let cost = |model: &RingModel, mosaic: Option<Mosaic>| {
-            let scene = Scene { mosaic, ..*self };
+            let scene = Scene { mosaic, has_prior: false, ..*self };
             let equations = model.linearised(&scene, fit.huber_limit)?;
             let step = equations.step(1e-6, RIDGE)?;
             Some(equations.cost - step.dot(&equations.right))
@@ -543,7 +552,7 @@ impl Scene<'_> {
 
     /// The share of a linear fit's cost that a camera's processing would explain, by the quadratic model.
     pub(super) fn response_gain(&self, fit: &ModelFit) -> Option<f64> {
-        let processed = Scene { extras: Extras::Response, ..*self };
+        let processed = Scene { extras: Extras::Response, has_prior: false, ..*self };
         let equations = fit.model.linearised(&processed, fit.huber_limit)?;
         let step = equations.step(1e-6, RIDGE)?;
         Some(step.dot(&equations.right) / equations.cost)
