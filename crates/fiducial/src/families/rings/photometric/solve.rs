@@ -308,7 +308,7 @@ impl RingModel {
     }
 }
 
-/// A residual of the unknowns themselves, linear in them: how far they are from what is expected of them.
+/// A residual of the unknowns themselves, how far they are from what is expected of them, and its gradient.
 pub(super) struct PriorTerm {
     pub(super) gradient: SVector<f64, UNKNOWNS_WITH_EXTRAS>,
     pub(super) residual: f64,
