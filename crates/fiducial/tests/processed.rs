@@ -10,7 +10,7 @@ use imaging::GrayView;
 use markers::Marker;
 use rendering::occluder::{Line, Occluder};
 use rendering::processing::{Sharpen, ToneCurve};
-use rendering::views::{Binning, SIZE_M, TestScene, views};
+use rendering::views::{Binning, SIZE_M, TestScene, View, views};
 use rendering::{PadInScene, Preset, Processing, Renderer, Scene, Surface};
 
 const SHARPEN: Sharpen = Sharpen { radius_px: 1.0, amount: 0.8, limit_levels: 255.0 };
@@ -144,24 +144,32 @@ fn square_frames(
 #[test]
 fn rings_are_found_by_ordinary_cameras_at_nearly_all_positions() {
     let presets = [Preset::Usb, Preset::RaspberryPi, Preset::ActionCamera, Preset::Phone];
-    let mut errors = presets.map(|_| Errors::default());
+    let mut near = presets.map(|_| Errors::default());
+    let mut farthest = presets.map(|_| Errors::default());
     let mut detector = detector("rings");
     for binning in [Binning::TwoByTwo, Binning::FourByFour] {
         let mut scene = TestScene::new(binning).unwrap();
         let camera = binning.camera();
-        for view in views(binning, 0.0, 1).into_iter().step_by(2) {
-            let (pixels, truth) = scene.render(&view).unwrap();
-            let range_m = truth.camera_from_marker.origin().coords.coords.norm();
-            for (preset, errors) in presets.iter().zip(&mut errors) {
-                let found = detect(&mut detector, &pixels, &preset.processing(), &camera);
-                errors.note(&found, truth.centre, range_m);
+        // The colour mosaic leaves little of the rings of a marker of 12.7 px or less, from 11 m on with 4 x 4 binning.
+        let is_near = |view: &View| binning == Binning::TwoByTwo || view.height_m < 11;
+        let (near_views, far_views): (Vec<View>, Vec<View>) =
+            views(binning, 0.0, 1).into_iter().partition(is_near);
+        for (views, every, errors) in [(near_views, 2, &mut near), (far_views, 1, &mut farthest)] {
+            for view in views.into_iter().step_by(every) {
+                let (pixels, truth) = scene.render(&view).unwrap();
+                let range_m = truth.camera_from_marker.origin().coords.coords.norm();
+                for (preset, errors) in presets.iter().zip(errors.iter_mut()) {
+                    let found = detect(&mut detector, &pixels, &preset.processing(), &camera);
+                    errors.note(&found, truth.centre, range_m);
+                }
             }
         }
     }
-    for (preset, errors) in presets.iter().zip(&mut errors) {
-        // The strongest compression leaves least of the rings below 16 px.
-        let max_missed = if *preset == Preset::ActionCamera { 4 } else { 2 };
-        errors.expect(preset.name(), max_missed, [0.02, 0.06], [0.15, 0.8]);
+    for ((preset, near), farthest) in presets.iter().zip(&mut near).zip(&mut farthest) {
+        near.expect(preset.name(), 0, [0.02, 0.06], [0.15, 0.5]);
+        // The strongest compression leaves least of the rings.
+        let max_missed = if *preset == Preset::ActionCamera { 5 } else { 2 };
+        farthest.expect(preset.name(), max_missed, [0.04, 0.08], [0.8, 1.5]);
     }
 }
 
