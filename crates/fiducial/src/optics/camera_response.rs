@@ -12,16 +12,6 @@ pub(crate) const SHARPENING_PX: f64 = 1.0;
 /// paper.
 const MAX_CURVE: f64 = 4.0;
 
-impl CameraResponse {
-    /// What curves are expected to be before a marker tells: sRGB's is 1.1, that of a Raspberry Pi's camera module 3.
-    pub(crate) const CURVE_PRIOR: Measured = Measured { value: 1.2, deviation: 0.7 };
-    /// Unsharp masks of cameras made for people have about 0.2 to 0.6.
-    pub(crate) const SHARPENING_PRIOR: Measured = Measured { value: 0.4, deviation: 0.2 };
-    /// The grey level of black ink as a share of white paper's: ink that reflects a twentieth of the light shows a tenth of it
-    /// with a gamma of 1.25, a quarter with sRGB's curve; sharpening lowers it, glare lifts it.
-    pub(crate) const BLACK_PRIOR: Measured = Measured { value: 0.2, deviation: 0.1 };
-}
-
 /// What a camera makes of an image that is linear in light.
 #[derive(Copy, Clone, Debug, PartialEq)]
 pub(crate) struct CameraResponse {
@@ -48,6 +38,13 @@ impl CameraResponse {
     pub(crate) const LINEAR: Self = Self { curve: 0.0, sharpening: 0.0 };
     /// What most cameras do: a start for a fit.
     pub(crate) const ORDINARY: Self = Self { curve: 1.0, sharpening: 0.0 };
+    /// What curves are expected to be before a marker tells: sRGB's is 1.1, that of a Raspberry Pi's camera module 3.
+    pub(crate) const CURVE_PRIOR: Measured = Measured { value: 1.2, deviation: 0.7 };
+    /// Unsharp masks of cameras made for people have about 0.2 to 0.6.
+    pub(crate) const SHARPENING_PRIOR: Measured = Measured { value: 0.4, deviation: 0.2 };
+    /// The grey level of black ink as a share of white paper's: ink that reflects a twentieth of the light shows a tenth of it
+    /// with a gamma of 1.25, a quarter with sRGB's curve; sharpening lowers it, glare lifts it.
+    pub(crate) const BLACK_PRIOR: Measured = Measured { value: 0.2, deviation: 0.1 };
 
     /// As it is known before a fit.
     pub(crate) fn known(known: &ResponseEstimate) -> Self {

@@ -16,18 +16,6 @@ use crate::response::{Measured, ResponseEstimate};
 /// Prior standard deviation of the normal, in radians.
 const PRIOR_NORMAL: f64 = 0.6;
 
-/// Targets as people like to draw them, of two and of three evenly wide rings: the radii of their circles in units of the
-/// outermost. The first has no dot.
-const TARGETS: [[f64; CIRCLES]; 2] = [
-    [1.0, 0.75, 0.5, 0.25, NO_DOT, NO_DOT],
-    [1.0, 5.0 / 6.0, 4.0 / 6.0, 3.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0],
-];
-/// They are fitted where the radii lie above this between the marker's (0) and evenly wide ones (1): targets that are taken for
-/// markers have 0.28 and more at two deviations, 98 % of markers at the positions of the thesis less than 0.17.
-const MIN_TARGET_EVENNESS: f64 = 0.2;
-/// Two circles of one radius leave nothing between them.
-const NO_DOT: f64 = 1e-3;
-
 /// The figures that distinguish a marker from other things.
 pub(super) struct Score {
     disc_ratio: f64,
@@ -96,6 +84,20 @@ const COLUMNS: usize = UNKNOWNS_WITH_RADII + 1;
 const UNKNOWNS_WITH_EVENNESS: usize = UNKNOWNS_WITH_EXTRAS + 1;
 /// Radii of the circles between the outermost and the dot of a target of evenly wide rings, in units of the outermost.
 const EVEN_RADII: [f64; FREE_RADII] = [0.75, 0.5, 0.25];
+/// Targets as people like to draw them, of two and of three evenly wide rings: the radii of their circles in units of the
+/// outermost. The first has no dot.
+const TARGETS: [[f64; CIRCLES]; 2] = {
+    let [outer, middle, inner] = EVEN_RADII;
+    [
+        [1.0, outer, middle, inner, NO_DOT, NO_DOT],
+        [1.0, 5.0 / 6.0, 4.0 / 6.0, 3.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0],
+    ]
+};
+/// Two circles of one radius leave nothing between them.
+const NO_DOT: f64 = 1e-3;
+/// Targets are fitted where the radii lie above this between the marker's (0) and evenly wide ones (1): targets that are taken for
+/// markers have 0.28 and more at two deviations, 98 % of markers at the positions of the thesis less than 0.17.
+const MIN_TARGET_EVENNESS: f64 = 0.2;
 
 impl RingModel {
     /// One step of a fit in which the radii of the circles between the outermost and the dot are free, and one of a fit in

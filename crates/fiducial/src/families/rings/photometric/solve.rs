@@ -342,6 +342,10 @@ pub(super) struct Sums {
 
 type Equations = NormalEquations<UNKNOWNS_WITH_EXTRAS, Sums>;
 
+fn cost_of_pixels(equations: &Equations) -> f64 {
+    equations.cost - equations.extra.prior_cost
+}
+
 /// The normal equations with the rows of the extras; those that are not fitted get a prior that keeps them.
 fn with_extras(
     (matrix, right): &([[f64; UNKNOWNS]; UNKNOWNS], [f64; UNKNOWNS]),
@@ -379,7 +383,7 @@ pub(super) struct ModelFit {
 impl ModelFit {
     /// Of the pixels, without the prior's.
     pub(super) fn cost(&self) -> f64 {
-        self.equations.cost - self.equations.extra.prior_cost
+        cost_of_pixels(&self.equations)
     }
 }
 
@@ -451,8 +455,8 @@ impl Problem<UNKNOWNS_WITH_EXTRAS> for Solver<'_> {
         equations: &mut Equations,
     ) -> Next {
         if self.is_first && self.scene.effort.rough_steps == Some(tried + 1) {
-            let of_pixels = equations.cost - equations.extra.prior_cost;
-            self.huber_limit = self.scene.huber_limit(self.huber_limit, of_pixels);
+            let cost = cost_of_pixels(equations);
+            self.huber_limit = self.scene.huber_limit(self.huber_limit, cost);
             let Some(next) = self.linearised(best) else { return Next::Fail };
             *equations = next;
             return Next::Continue;
